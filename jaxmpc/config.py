@@ -1,0 +1,399 @@
+"""A sweep written down in a TOML file: read, checked, and turned into the problem.
+
+    name = "joint"
+
+    [system]  A, B, c, dt, continuous, state_names, state_units, input_names, input_units
+    [limits]  x_min, x_max  or  H_x, h_x;  u_min, u_max
+    [cost]    Q, R, P
+    [mpc]     horizon, terminal, constrain_initial
+    [sweep]   grid, lower, upper, axes, fixed | projection, iterations, dtype
+
+The fields below say what each key means. Every error is a ValueError that names the
+file and the key (or the option of the command line that set it) and what would be right.
+"""
+
+import dataclasses
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
+
+from jaxmpc.checks import fail
+from jaxmpc.control.invariant import maximal_invariant_set
+from jaxmpc.control.riccati import lqr
+from jaxmpc.control.sets import Box, Polytope
+from jaxmpc.control.system import LinearSystem
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.sweeps.feasible_set import grid as grid_points
+
+
+def _not_nan(value: float) -> float:
+    if np.isnan(value):
+        raise ValueError("is NaN; use inf or -inf where there is no limit")
+    return value
+
+
+def _rectangular(rows: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
+    if len({len(row) for row in rows}) != 1:
+        raise ValueError("is no matrix: give at least one row and rows of one length")
+    return rows
+
+
+_STRICT = ConfigDict(extra="forbid", ser_json_inf_nan="strings")
+
+Limit = Annotated[float, AfterValidator(_not_nan)]
+Limits = tuple[Limit, ...]
+Vector = tuple[FiniteFloat, ...]
+Matrix = Annotated[tuple[Vector, ...], AfterValidator(_rectangular)]
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class SystemSection:
+    """x⁺ = A x + B u + c, or with `continuous` dx/dt = A x + B u + c held over dt."""
+
+    A: Matrix  # (n, n)
+    B: Matrix  # (n, m)
+    c: Vector | None = None  # (n,), none means zero
+    dt: Annotated[FiniteFloat, Field(gt=0)]  # seconds
+    continuous: bool = False  # True: convert by zero-order hold
+    state_names: tuple[str, ...] | None = None
+    state_units: tuple[str, ...] | None = None
+    input_names: tuple[str, ...] | None = None
+    input_units: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class LimitsSection:
+    """Box limits of states and inputs, or H_x x <= h_x in place of the state box."""
+
+    x_min: Limits | None = None  # (n,), -inf where free
+    x_max: Limits | None = None  # (n,), inf where free
+    H_x: Matrix | None = None  # (r, n)
+    h_x: Vector | None = None  # (r,)
+    u_min: Vector  # (m,)
+    u_max: Vector  # (m,)
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class CostSection:
+    """J = Σ x'Qx + u'Ru + x_N'P x_N, without ½. A flat list is a diagonal."""
+
+    Q: Vector | Matrix
+    R: Vector | Matrix
+    P: Literal["lqr", "Q", "none"] | Vector | Matrix = "lqr"  # "lqr": the Riccati solution
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class MPCSection:
+    """Horizon and terminal set: "invariant" = O_inf of the LQR, "box" = the state limits."""
+
+    horizon: Annotated[int, Field(ge=1)]
+    terminal: Literal["none", "invariant", "box"] = "none"
+    constrain_initial: bool = True  # False: no state limits at k = 0
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class SweepSection:
+    """Which initial states are asked: a grid over the mapped states."""
+
+    grid: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)] = (256, 256)
+    lower: Vector | None = None  # (d,), none means the state limits widened by 5 % each side
+    upper: Vector | None = None  # (d,)
+    axes: tuple[int | str, ...] | None = None  # names or indices, none means the first two
+    fixed: Vector | None = None  # (n - d,) values of the other states: a slice
+    projection: bool = False  # True: some value of the other states
+    iterations: Annotated[int, Field(ge=1)] = 50  # ADMM steps in the first pass over all states
+    dtype: Literal["float32", "float64"] = "float32"  # of the iterates; proofs are float64
+
+
+class SweepPoints(NamedTuple):
+    """The initial states of a sweep, as `map_feasible_set` takes them."""
+
+    points: np.ndarray  # (B, d)
+    axes: tuple[int, ...]  # the d states mapped
+    fixed: np.ndarray | None  # (n,) for a slice; None: all states mapped, or a projection
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Config:
+    """One sweep: problem and initial states, as a file says it."""
+
+    name: str = "mpc"
+    system: SystemSection
+    limits: LimitsSection
+    cost: CostSection
+    mpc: MPCSection
+    sweep: SweepSection = SweepSection()
+
+    @staticmethod
+    def default(overrides: Mapping[str, Any] | None = None) -> "Config":
+        """The lesson's joint: inertia 0.05 kg m², period 0.01 s, x = (q, dq), u = τ."""
+        return _parse(_JOINT, "built-in joint", overrides or {})
+
+    def to_dict(self) -> dict[str, Any]:
+        """The sections as plain JSON data; infinity is written "Infinity"."""
+        return json.loads(_ADAPTER.dump_json(self))
+
+    def build_mpc(self) -> MPC:
+        """The problem itself, checked. Raises ValueError as `MPC.validate` does."""
+        s, limits, cost = self.system, self.limits, self.cost
+        make = LinearSystem.from_continuous if s.continuous else LinearSystem
+        system = make(
+            A=np.asarray(s.A),
+            B=np.asarray(s.B),
+            c=None if s.c is None else np.asarray(s.c),
+            dt=s.dt,
+            state_names=s.state_names or (),
+            input_names=s.input_names or (),
+            state_units=s.state_units or (),
+            input_units=s.input_units or (),
+        )
+        states = self._states()
+        inputs = Box(np.asarray(limits.u_min), np.asarray(limits.u_max))
+        Q, R = _matrix(cost.Q), _matrix(cost.R)
+        terminal_cost: Any = Q if cost.P == "Q" else None
+        if not isinstance(cost.P, str):
+            terminal_cost = _matrix(cost.P)
+        terminal_set = states if self.mpc.terminal == "box" else None
+        if cost.P == "lqr" or self.mpc.terminal == "invariant":
+            regulator = lqr(system, Q, R)
+            if cost.P == "lqr":
+                terminal_cost = regulator.P
+            if self.mpc.terminal == "invariant" and states is not None:
+                terminal_set = maximal_invariant_set(system, regulator.K, states, inputs)
+        mpc = MPC(
+            system=system,
+            Q=Q,
+            R=R,
+            horizon=self.mpc.horizon,
+            states=states,
+            inputs=inputs,
+            terminal_cost=terminal_cost,
+            terminal_set=terminal_set,
+            constrain_initial=self.mpc.constrain_initial,
+        )
+        mpc.validate()
+        return mpc
+
+    def build_points(self) -> SweepPoints:
+        """The grid of initial states and the axes it lies on."""
+        axes = self._axes()
+        lower, upper = self._bounds(axes)
+        points = grid_points(lower, upper, self.sweep.grid)
+        if self.sweep.fixed is None:
+            return SweepPoints(points, axes, None)
+        fixed = np.zeros(len(self.system.A))
+        fixed[[i for i in range(len(fixed)) if i not in axes]] = self.sweep.fixed
+        return SweepPoints(points, axes, fixed)
+
+    def build(self) -> tuple[MPC, SweepPoints]:
+        """The problem and the initial states to ask."""
+        points = self.build_points()
+        return self.build_mpc(), points
+
+    def check(self) -> None:
+        """Raise ValueError where keys, each good alone, do not fit one another."""
+        s, limits, sweep = self.system, self.limits, self.sweep
+        n, m = len(s.A), len(s.B[0])
+        for key, value, count in (
+            ("system.A", s.A[0], n),
+            ("system.B", s.B, n),
+            ("system.c", s.c, n),
+            ("system.state_names", s.state_names, n),
+            ("system.state_units", s.state_units, n),
+            ("system.input_names", s.input_names, m),
+            ("system.input_units", s.input_units, m),
+            ("limits.x_min", limits.x_min, n),
+            ("limits.x_max", limits.x_max, n),
+            ("limits.u_min", limits.u_min, m),
+            ("limits.u_max", limits.u_max, m),
+            ("cost.Q", self.cost.Q, n),
+            ("cost.R", self.cost.R, m),
+            ("cost.P", None if isinstance(self.cost.P, str) else self.cost.P, n),
+        ):
+            if value is not None and len(value) != count:
+                what = f"{m} inputs" if count == m != n else f"{n} states, {m} inputs"
+                fail(key, f"has {len(value)} entries where {count} are needed", f"A, B: {what}")
+        for low, high in (("x_min", "x_max"), ("u_min", "u_max")):
+            _check_order("limits", low, high, getattr(limits, low), getattr(limits, high))
+        self._check_state_limits()
+        d = len(self._axes())
+        for key, count in (("grid", d), ("lower", d), ("upper", d), ("fixed", n - d)):
+            value = getattr(sweep, key)
+            if value is not None and len(value) != count:
+                cure = f"{n} states, of which {d} are mapped (sweep.axes)"
+                fail(f"sweep.{key}", f"has {len(value)} entries where {count} are needed", cure)
+        _check_order("sweep", "lower", "upper", sweep.lower, sweep.upper)
+        if d < n and (sweep.fixed is None) != sweep.projection:
+            cure = f"Give the {n - d} other values in sweep.fixed (a slice) or projection = true"
+            both = "fixed and projection exclude each other"
+            fail("sweep.fixed", both if sweep.projection else f"{n} states, {d} mapped", cure)
+        self._bounds(self._axes())
+
+    def _check_state_limits(self) -> None:
+        limits = self.limits
+        box = limits.x_min is not None or limits.x_max is not None
+        polytope = limits.H_x is not None or limits.h_x is not None
+        if (limits.x_min is None) != (limits.x_max is None):
+            fail("limits.x_min", "x_min and x_max go together", "Use inf for a side without limit")
+        if (limits.H_x is None) != (limits.h_x is None):
+            fail("limits.H_x", "H_x and h_x go together", "Give both: H_x x <= h_x")
+        if box and polytope:
+            fail("limits.H_x", "given beside x_min, x_max", "Write the box as rows of H_x")
+        if limits.H_x is not None and limits.h_x is not None:
+            shape = np.shape(limits.H_x)
+            if shape != (len(limits.h_x), len(self.system.A)):
+                fail("limits.H_x", f"shape {shape} for {len(limits.h_x)} rows", "One h_x a row")
+        if not (box or polytope) and self.mpc.terminal != "none":
+            fail("mpc.terminal", f'"{self.mpc.terminal}" without state limits', "Give x_min, x_max")
+
+    def _states(self) -> Box | Polytope | None:
+        limits = self.limits
+        if limits.H_x is not None:
+            return Polytope(np.asarray(limits.H_x), np.asarray(limits.h_x))
+        if limits.x_min is not None:
+            return Box(np.asarray(limits.x_min), np.asarray(limits.x_max))
+        return None
+
+    def _axes(self) -> tuple[int, ...]:
+        """Indices of the states mapped, from names or indices."""
+        n = len(self.system.A)
+        names = self.system.state_names or ()
+        given = self.sweep.axes if self.sweep.axes is not None else tuple(range(min(2, n)))
+        axes = tuple(
+            names.index(axis) if axis in names else int(axis) if str(axis).isdecimal() else axis
+            for axis in given
+        )
+        known = f"States are {', '.join(map(str, [*names, *range(n)]))}"
+        for axis in axes:
+            if axis not in range(n):
+                fail("sweep.axes", f"no state {axis!r}", known)
+        if not axes or len(set(axes)) != len(axes):
+            fail("sweep.axes", f"{list(given)} repeats a state or is empty", known)
+        return tuple(int(axis) for axis in axes)
+
+    def _bounds(self, axes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of the grid: as given, else the state limits and 5 % more on each side."""
+        sweep = self.sweep
+        if sweep.lower is not None and sweep.upper is not None:
+            return np.asarray(sweep.lower), np.asarray(sweep.upper)
+        states = self._states()
+        low = high = np.full(len(self.system.A), np.inf)
+        if isinstance(states, Box):
+            low, high = np.asarray(states.lower), np.asarray(states.upper)
+        elif isinstance(states, Polytope):
+            corners = np.asarray(states.vertices())
+            low, high = corners.min(axis=0), corners.max(axis=0)
+        low, high = low[list(axes)], high[list(axes)]
+        margin = 0.05 * (high - low) if np.all(np.isfinite([low, high])) else np.nan
+        lower = np.asarray(sweep.lower) if sweep.lower is not None else low - margin
+        upper = np.asarray(sweep.upper) if sweep.upper is not None else high + margin
+        if not np.all(np.isfinite([lower, upper])):
+            cure = "Give sweep.lower and sweep.upper: the state limits do not bound the mapped axes"
+            fail("sweep.lower", "no finite range to sweep", cure)
+        if np.any(lower >= upper):
+            fail("sweep.lower", f"{lower.tolist()} not below upper {upper.tolist()}", "Swap them")
+        return lower, upper
+
+
+def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config:
+    """Read a TOML file; `overrides` ("horizon", "grid", ...) replace keys of [mpc] and [sweep].
+
+    Raises ValueError, naming file and key, where the file is absent or unreadable, is no
+    TOML, or holds an unknown key or a value that cannot be.
+    """
+    try:
+        document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        fail(str(path), f"cannot be read ({error.strerror})", "Give the path of a TOML file")
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        fail(str(path), f"is no TOML ({error})", "See the keys with: jaxmpc sweep --help")
+    return _parse(document, str(path), overrides or {})
+
+
+def _parse(document: Mapping[str, Any], source: str, overrides: Mapping[str, Any]) -> Config:
+    merged = dict(document)
+    # A slice and a projection exclude each other: choosing either drops the file's choice.
+    dropped = {"fixed", "projection"} if {"fixed", "projection"} & set(overrides) else set()
+    for name in ("mpc", "sweep"):
+        known = {field.name for field in dataclasses.fields(_SECTIONS[name])}
+        changes = {key: value for key, value in overrides.items() if key in known}
+        if changes and isinstance(merged.get(name, {}), dict):
+            kept = {k: v for k, v in merged.get(name, {}).items() if k not in dropped}
+            merged[name] = {**kept, **changes}
+    try:
+        config = _ADAPTER.validate_python(merged)
+        config.check()
+    except ValidationError as error:
+        raise ValueError(_sentence(error, source, overrides)) from None
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
+    return config
+
+
+def _sentence(error: ValidationError, source: str, overrides: Mapping[str, Any]) -> str:
+    """The first thing wrong, in one line: where, what, and what is allowed there."""
+    unknown = "unexpected_keyword_argument"  # first: a misspelt key is also a missing one
+    first = min(error.errors(), key=lambda e: e["type"] != unknown)
+    where = [str(part) for part in first["loc"][:2]]
+    key = ".".join(where)
+    if first["type"] == unknown:
+        owner = _SECTIONS.get(where[0], Config) if len(where) == 2 else Config
+        allowed = ", ".join(field.name for field in dataclasses.fields(owner))
+        place = f"[{where[0]}]" if len(where) == 2 else "the top of the file"
+        return f"{source}: unknown key {where[-1]!r} in {place}. Keys allowed there: {allowed}"
+    same = [e for e in error.errors() if [str(part) for part in e["loc"][:2]] == where]
+    problems = dict.fromkeys(e["msg"].removeprefix("Value error, ") for e in same)
+    if first["type"] == "missing":
+        return f"{source}: {key} is missing. Add it (jaxmpc sweep --help lists all keys)"
+    if where[-1] in overrides:
+        source, key = "command line", f"--{where[-1]}"
+    value = repr(first["input"])
+    shown = value if len(value) < 60 else value[:57] + "..."
+    return f"{source}: {key}: {'; or '.join(problems)}. Got {shown}"
+
+
+def _matrix(value: Any) -> np.ndarray:
+    array = np.asarray(value, dtype=np.float64)
+    return np.diag(array) if array.ndim == 1 else array
+
+
+def _check_order(
+    where: str, low: str, high: str, lower: tuple[float, ...] | None, upper: Any
+) -> None:
+    for i, (a, b) in enumerate(zip(lower or (), upper or (), strict=False)):
+        if a > b or (where == "sweep" and a == b):
+            fail(
+                f"{where}.{low}", f"entry {i} is {a:g}, above {high} {b:g}", f"Check {low}, {high}"
+            )
+
+
+_SECTIONS = {
+    "system": SystemSection,
+    "limits": LimitsSection,
+    "cost": CostSection,
+    "mpc": MPCSection,
+    "sweep": SweepSection,
+}
+_ADAPTER = TypeAdapter(Config)
+_JOINT: dict[str, Any] = {
+    "name": "joint",
+    "system": {
+        "A": [[1.0, 0.01], [0.0, 1.0]],
+        "B": [[0.0], [0.2]],
+        "dt": 0.01,
+        "state_names": ["q", "dq"],
+        "state_units": ["rad", "rad/s"],
+        "input_names": ["tau"],
+        "input_units": ["N m"],
+    },
+    "limits": {"x_min": [-1.5, -2.0], "x_max": [1.5, 2.0], "u_min": [-2.0], "u_max": [2.0]},
+    "cost": {"Q": [50.0, 1.0], "R": [0.1], "P": "Q"},
+    "mpc": {"horizon": 20},
+    "sweep": {"grid": [256, 256]},
+}

@@ -1,0 +1,12 @@
+"""First floor: linear systems, convex sets, linear-quadratic control, invariant sets.
+
+Conventions, once for the whole floor: x+ = A x + B u + c, and feedback u = K x.
+Sets describe themselves in the coordinates (and units) of the system they constrain.
+"""
+
+from jaxmpc.control.invariant import maximal_invariant_set
+from jaxmpc.control.riccati import LQR, lqr
+from jaxmpc.control.sets import Box, Polytope
+from jaxmpc.control.system import LinearSystem
+
+__all__ = ["LQR", "Box", "LinearSystem", "Polytope", "lqr", "maximal_invariant_set"]

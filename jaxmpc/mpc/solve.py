@@ -1,0 +1,100 @@
+"""solve: one plan from one state; Controller: the same with the factorization done once."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import fail
+from jaxmpc.mpc.condense import Condensed, condense
+from jaxmpc.mpc.problem import MPC, Multipliers, Plan
+from jaxmpc.qp.admm import ADMM, Factor, factor
+from jaxmpc.qp.problem import QPSolution
+from jaxmpc.qp.solve import solve_factored
+
+
+def solve(
+    mpc: MPC, x0: Any, reference: Any = None, solver: ADMM = ADMM(), warm_start: Any = None  # noqa: B008
+) -> Plan:  # fmt: skip
+    """Solve one MPC problem from the state x0 (n,).
+
+    reference: state to track, (n,) or (N+1, n); None for the origin. warm_start: an earlier
+    Plan. `jax.vmap(solve, in_axes=(None, 0))(mpc, x0s)` solves for many states and factors
+    once. Raises ValueError for an ill-posed problem or wrong shapes, before any compile; what
+    depends on values inside a batch is answered by `plan.status`.
+    """
+    return Controller(mpc, solver).plan(x0, reference, warm_start)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Controller:
+    """An MPC law whose matrices are condensed and factored once, at construction.
+
+    `controller(x, carry) -> (u, carry, plan)`: u (m,) is the first input of the plan; carry is
+    None at the start and the previous plan's solution afterwards (warm start). When the plan is
+    not SOLVED, u is still the first input of the best iterate: look at plan.status. `condensed`
+    and `factor` are filled in at construction; leave them alone.
+    """
+
+    mpc: MPC
+    solver: ADMM = ADMM()  # noqa: RUF009
+    condensed: Condensed | None = None
+    factor: Factor | None = None
+
+    def __post_init__(self) -> None:
+        # JAX rebuilds this object with its parts present, or with placeholders: leave those be.
+        if self.condensed is None and isinstance(self.mpc, MPC):
+            self.mpc.validate()
+            condensed = condense(self.mpc)
+            self.solver.validate(condensed.C.shape[0])
+            object.__setattr__(self, "condensed", condensed)
+            object.__setattr__(self, "factor", factor(condensed.P, condensed.C, self.solver))
+
+    def __call__(self, x: Any, carry: Any = None) -> tuple[Array, QPSolution, Plan]:
+        """First input from state x (n,), what to carry to the next sample, and the whole plan."""
+        plan = self.plan(x, warm_start=carry)
+        return plan.inputs[0], plan.qp, plan
+
+    def plan(self, x0: Any, reference: Any = None, warm_start: Any = None) -> Plan:
+        """Plan from x0 (n,); arguments as in `solve`."""
+        c = self.condensed
+        assert c is not None and self.factor is not None
+        n, steps = c.Phi.shape[1], c.Phi.shape[0]
+        if np.shape(x0) != (n,):
+            fail("x0", f"shape {np.shape(x0)}", f"Give one state ({n},); use jax.vmap for many")
+        x0 = jnp.asarray(x0, c.P.dtype)
+        if reference is not None:
+            if np.shape(reference) not in ((n,), (steps, n)):
+                fail("reference", f"shape {np.shape(reference)}", f"Give ({n},) or ({steps}, {n})")
+            reference = jnp.broadcast_to(jnp.asarray(reference, c.P.dtype), (steps, n))
+        start = warm_start.qp if isinstance(warm_start, Plan) else warm_start
+        solution = solve_factored(c.qp(x0, reference), self.factor, self.solver, start)
+
+        states, inputs = c.trajectory(x0, solution.z)
+        error = states if reference is None else states - reference
+        square = lambda v, W: jnp.einsum("ka,ab,kb->", v, W, v, precision="highest")
+        cost = square(error[:-1], c.Q) + square(inputs, c.R) + square(error[-1:], c.P_N)
+        return Plan(
+            states=states, inputs=inputs, cost=cost, multipliers=self.multipliers(solution.y),
+            status=solution.status, primal_residual=solution.primal_residual,
+            dual_residual=solution.dual_residual, gap=solution.gap,
+            iterations=solution.iterations, qp=solution,
+        )  # fmt: skip
+
+    def multipliers(self, y: Array) -> Multipliers:
+        """Sort the QP's multipliers y (rows,) by constraint and step."""
+        mpc, c = self.mpc, self.condensed
+        assert c is not None
+        count = lambda set_: 0 if set_ is None else set_.rows()[0].shape[0]
+        N, steps = mpc.horizon, mpc.horizon - c.first_step
+        ends = np.cumsum([N * count(mpc.inputs), steps * count(mpc.states)])
+        inputs, states, terminal = jnp.split(y, ends)
+        return Multipliers(
+            states=states.reshape(steps, count(mpc.states)),
+            inputs=inputs.reshape(N, count(mpc.inputs)),
+            terminal=terminal,
+        )

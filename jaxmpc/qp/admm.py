@@ -1,0 +1,163 @@
+"""ADMM with a fixed number of steps: scale, factor once, iterate one matrix product a step.
+
+The program min ½ z'Pz + q'z, l ≤ Az ≤ u is solved in coordinates w, z = T w, in which the
+Hessian H = T'PT is the identity (as nearly as P is definite) and the rows of A_w = E A T have
+length one. Splitting s = A_w w with penalty R = diag(rho) and over-relaxation alpha gives
+(Boyd et al. 2011, §3.4.3; Stellato et al. 2020, eq. 17–20, without the proximal term)
+
+    w  = M⁻¹ (A_w' R (s − v) − q_w),        M = H + A_w' R A_w
+    s⁺ = clip(alpha A_w w + (1 − alpha) s + v, l, u)
+    v⁺ = v + alpha A_w w + (1 − alpha) s − s⁺
+
+where R v is the multiplier. Both s and v are functions of their sum t = s + v, because
+s = clip(t) and v = t − clip(t), so a step needs one vector and, with r = s − v = 2 clip(t) − t,
+
+    t⁺ = t + alpha (A_w M⁻¹ A_w' R r + b − clip(t)),        b = −A_w M⁻¹ q_w.
+
+M, and all that is computed from it, depends on P, A and rho only: a batch that shares these
+pays for one factorization and then for one matrix product a step.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.scipy.linalg import cho_solve, solve_triangular
+
+from jaxmpc.checks import concrete, fail
+from jaxmpc.qp.problem import matmul
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ADMM:
+    """Settings of the solver.
+
+    iterations: ADMM steps, always all of them. rho: penalty in the scaled coordinates above;
+    a number, one value a row (m,), a schedule (stages, m) or (stages, 1) whose stages share the
+    iterations equally, or None for an automatic value. alpha: over-relaxation in (0, 2).
+    refine: Newton steps after the loop (`refine.py`), accepted only where they help.
+    eps: tolerance of status SOLVED on primal residual, dual residual and gap, absolute, plus
+    the rounding floor 100·machine epsilon·(size of the terms); None: 1e-6 in float64, 1e-3 in
+    float32.
+    """
+
+    iterations: int = field(default=100, metadata={"static": True})
+    rho: Any = None
+    alpha: Any = 1.6
+    refine: int = field(default=10, metadata={"static": True})
+    eps: Any = None
+
+    def validate(self, rows: int) -> None:
+        """Raise ValueError for settings that make no iteration."""
+        if self.iterations < 0 or self.refine < 0:
+            fail("iterations, refine", f"{self.iterations}, {self.refine}", "Give counts ≥ 0")
+        if self.rho is not None:
+            shape = np.shape(self.rho)
+            if len(shape) > 2 or (shape and shape[-1] not in (1, rows)):
+                fail("rho", f"shape {shape}", f"Give (), ({rows},) or (stages, {rows})")
+            if concrete(self.rho) and not np.all(np.asarray(self.rho) > 0):
+                fail("rho", "holds a value that is not positive", "Penalties are positive")
+            if len(shape) == 2 and self.iterations % shape[0]:
+                fail("iterations", f"{self.iterations} for {shape[0]} stages", "Use a multiple")
+        if concrete(self.alpha) and not 0 < float(np.asarray(self.alpha)) < 2:
+            fail("alpha", f"{self.alpha}", "Over-relaxation lies in (0, 2); 1.6 is usual")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Factor:
+    """What P, A and rho alone decide; shared by every instance of a batch.
+
+    T (n, n): z = T w. E (m,): row scale, 0 for a zero row. H (n, n), A (m, n): Hessian and
+    rows in w. rho (S, m), and a stage each of F = M⁻¹A'R (S, n, m), iteration matrix
+    G = A F (S, m, m), and Minv (S, n, n).
+    """
+
+    T: Array
+    E: Array
+    H: Array
+    A: Array
+    rho: Array
+    F: Array
+    G: Array
+    Minv: Array
+
+
+def scale(P: Array, A: Array) -> tuple[Array, Array, Array, Array]:
+    """Coordinates z = T w and row scale E with T'PT ≈ I and rows of E A T of length one.
+
+    T is the inverse transposed Cholesky factor of P + δI, δ = 1e-6 of the mean curvature, so
+    that singular P (δ = 1 for P = 0) has coordinates too; the Hessian T'PT stays exact.
+    Returns T, E, T'PT, E A T. A zero row keeps scale 0: it constrains nothing in z.
+    """
+    n = P.shape[0]
+    mean = jnp.trace(P) / n
+    metric = P + jnp.where(mean > 0, 1e-6 * mean, 1.0) * jnp.eye(n, dtype=P.dtype)
+    L = jnp.linalg.cholesky(metric)
+    T = solve_triangular(L, jnp.eye(n, dtype=P.dtype), lower=True).T
+    H = matmul(T.T, matmul(P, T))
+    rows = matmul(A, T)
+    squared = jnp.sum(rows**2, axis=1)
+    # A row is zero when it is rounding noise beside the others (Euler: q₁ does not feel u₀).
+    zero = squared <= (100 * jnp.finfo(P.dtype).eps) ** 2 * jnp.max(squared, initial=0.0)
+    E = jnp.where(zero, 0.0, 1 / jnp.sqrt(jnp.where(zero, 1.0, squared)))
+    return T, E, (H + H.T) / 2, E[:, None] * rows
+
+
+def factor(P: Array, A: Array, solver: ADMM) -> Factor:
+    """Scale, choose rho and invert; depends on nothing that differs between initial states."""
+    T, E, H, A_w = scale(P, A)
+    n, m = A_w.shape[1], A_w.shape[0]
+    rho = automatic_rho(A_w) if solver.rho is None else jnp.asarray(solver.rho, P.dtype)
+    rho = jnp.broadcast_to(rho if rho.ndim == 2 else rho[None], (max(rho.ndim == 2 and
+          rho.shape[0], 1), m))  # fmt: skip
+    ridge = 10 * jnp.finfo(P.dtype).eps
+
+    def stage(R: Array) -> tuple[Array, Array]:
+        M = H + matmul(A_w.T, R[:, None] * A_w)
+        M = M + ridge * jnp.trace(M) / n * jnp.eye(n, dtype=P.dtype)
+        Minv = cho_solve((jnp.linalg.cholesky(M), True), jnp.eye(n, dtype=P.dtype))
+        return matmul(Minv, A_w.T * R), Minv
+
+    stages = [stage(R) for R in rho]
+    F = jnp.stack([F for F, _ in stages])
+    return Factor(T, E, H, A_w, rho, F, matmul(A_w, F), jnp.stack([Minv for _, Minv in stages]))
+
+
+def automatic_rho(A_w: Array) -> Array:
+    """One penalty for all rows, from the singular values of the scaled rows."""
+    return jnp.asarray(1.0, A_w.dtype)
+
+
+def step(t: Array, b: Array, l: Array, u: Array, G: Array, alpha: Any) -> Array:
+    """One ADMM step on t = s + v. Columns of t are instances when it is a matrix."""
+    s = jnp.clip(t, l, u)
+    return t + alpha * (matmul(G, 2 * s - t) + b - s)
+
+
+def iterate(
+    factor: Factor, q: Array, l: Array, u: Array, t: Array, iterations: int, alpha: Any
+) -> tuple[Array, Array]:
+    """Run the fixed loop in scaled coordinates; returns the last two t.
+
+    q (n,) or (n, B) is T'q; l, u, t are (m,) or (m, B).
+    """
+    stages = factor.rho.shape[0]
+    previous = t
+    for i in range(stages):
+        b = -matmul(factor.A, matmul(factor.Minv[i], q))
+        if i > 0:  # the multiplier R v is what carries over, not v
+            ratio = factor.rho[i - 1] / factor.rho[i]
+            s = jnp.clip(t, l, u)
+            t = s + (ratio if t.ndim == 1 else ratio[:, None]) * (t - s)
+        G = factor.G[i]
+
+        def body(carry, _, b=b, G=G):
+            return (step(carry[0], b, l, u, G, alpha), carry[0]), None
+
+        (t, previous), _ = jax.lax.scan(body, (t, previous), length=iterations // stages)
+    return t, previous

@@ -1,0 +1,66 @@
+"""Proofs of infeasibility for one QP, made safe against rounding.
+
+A vector y proves l ≤ Az ≤ u empty when A'y = 0 and Σ u y⁺ − l y⁻ < 0 (Farkas). Iterates never
+satisfy A'y = 0 exactly. Where a row bounds a single variable on both sides its multiplier can
+be chosen to absorb what is left of A'y, exactly up to one rounding (Neumaier & Shcherbina
+2004, safe bounds; here with the box rows in the role of the correction). Convergence of y then
+buys tightness, not validity.
+"""
+
+import jax.numpy as jnp
+from jax import Array
+
+from jaxmpc.qp.problem import QP, admissible, bound_product, matmul
+
+
+def farkas(qp: QP, y: Array) -> tuple[Array, Array]:
+    """The candidate y made into a certificate: returns (y, proved).
+
+    y is scaled to length one, freed of pushes against infinite bounds, and corrected on rows
+    that bound one variable. `proved` is True when Σ u y⁺ − l y⁻ is below zero by more than the
+    rounding of the sum and of A'y (over the box of the bounded variables); a variable without
+    such a row must have (A'y)_j at rounding level. A zero y proves nothing.
+    """
+    eps = jnp.finfo(y.dtype).eps
+    m, n = qp.A.shape
+    length = jnp.max(jnp.abs(y), initial=0.0)
+    y = admissible(jnp.where(length > 0, y / jnp.where(length > 0, length, 1.0), 0.0), qp.l, qp.u)
+
+    # Row i(j) bounds variable j alone and on both sides.
+    bounded = jnp.isfinite(qp.l) & jnp.isfinite(qp.u)
+    single = (jnp.sum(qp.A != 0, axis=1) == 1) & bounded
+    entries = jnp.where(single[:, None], jnp.abs(qp.A), 0.0)
+    row = jnp.argmax(entries, axis=0) if m else jnp.zeros(n, int)
+    has_row = jnp.max(entries, axis=0, initial=0.0) > 0
+    pivot = jnp.where(has_row, qp.A[row, jnp.arange(n)], 1.0)
+    y = y.at[row].add(jnp.where(has_row, -matmul(y, qp.A) / pivot, 0.0))
+
+    left = jnp.abs(matmul(y, qp.A))
+    terms = matmul(jnp.abs(y), jnp.abs(qp.A))
+    gamma = 2 * (m + n + 2) * eps
+    absorbed = has_row | (left <= gamma * terms)
+    bound = jnp.where(bounded, jnp.maximum(jnp.abs(qp.l), jnp.abs(qp.u)), 0.0)
+    reach = jnp.where(has_row, bound[row] / jnp.abs(pivot), 0.0)
+    size = bound_product(
+        y, jnp.where(y < 0, -jnp.abs(qp.l), 0.0), jnp.where(y > 0, jnp.abs(qp.u), 0.0)
+    )
+    safe = bound_product(y, qp.l, qp.u) + gamma * (size + jnp.sum(terms * reach))
+    proved = jnp.all(absorbed) & (safe < 0) & jnp.any(y != 0)
+    return jnp.where(proved, y, 0.0), proved
+
+
+def descent_ray(qp: QP, d: Array, tolerance: Array) -> tuple[Array, Array]:
+    """The candidate direction d made into a ray of unbounded descent: returns (d, proved).
+
+    Scaled to length one, d must satisfy |Pd| ≤ tolerance, q'd < −tolerance, and A d ≤ tolerance
+    where u is finite, ≥ −tolerance where l is finite. A zero direction proves nothing.
+    """
+    length = jnp.max(jnp.abs(d), initial=0.0)
+    d = jnp.where(length > 0, d / jnp.where(length > 0, length, 1.0), 0.0)
+    Ad = matmul(qp.A, d)
+    flat = jnp.all(jnp.abs(matmul(qp.P, d)) <= tolerance)
+    stays = jnp.all(jnp.isposinf(qp.u) | (Ad <= tolerance)) & jnp.all(
+        jnp.isneginf(qp.l) | (Ad >= -tolerance)
+    )
+    proved = flat & stays & (jnp.sum(qp.q * d) < -tolerance)
+    return jnp.where(proved, d, 0.0), proved

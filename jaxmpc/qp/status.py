@@ -1,0 +1,41 @@
+"""What became of a quadratic program: one number an instance, and a sentence for people."""
+
+from enum import IntEnum
+
+
+class Status(IntEnum):
+    """Outcome of one QP or one state of a sweep. OSQP's numbers; 0 is never an answer.
+
+    A status is derived from residuals and certificates that are computed in the units of
+    the problem as given, never from the fact that a loop came to its end.
+    """
+
+    NOT_RUN = 0
+    SOLVED = 1
+    PRIMAL_INFEASIBLE = 3
+    DUAL_INFEASIBLE = 5
+    ITERATION_LIMIT = 7
+    NON_FINITE = 12
+
+    @property
+    def sentence(self) -> str:
+        """What happened and what to try."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Status.NOT_RUN: "Not run yet.",
+    Status.SOLVED: "Solved: primal residual, dual residual and gap are within tolerance.",
+    Status.PRIMAL_INFEASIBLE: (
+        "No point satisfies the constraints; a Farkas vector proves it. "
+        "Relax a limit, lengthen the horizon or soften rows."
+    ),
+    Status.DUAL_INFEASIBLE: (
+        "The cost falls without bound along a feasible ray. Add a cost or a bound on that ray."
+    ),
+    Status.ITERATION_LIMIT: (
+        "Neither solved nor proved infeasible within the fixed iterations. "
+        "Raise iterations or refine, or compute in float64."
+    ),
+    Status.NON_FINITE: "The data of this instance hold NaN, or l > u, or an infinite cost.",
+}

@@ -1,0 +1,187 @@
+"""Exact boundary of the feasible set along rays: one linear program a ray, both ends proved.
+
+For a ray centre + t d the LP max t over (t, w) gives the boundary point; its dual gives a facet
+of the feasible set there. HiGHS solves the LP; what is reported is what `proofs.py` confirms: a
+point proved feasible just inside, and a half-space that holds on the whole set.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy.optimize import linprog
+
+from jaxmpc.checks import fail
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.sweeps import proofs
+from jaxmpc.sweeps.ladder import Rows, cut_of, inputs_of, rows
+from jaxmpc.sweeps.proofs import Problem, View, make_view
+
+# How far a boundary point is pulled towards the centre before it is proved: the least that works.
+PULLS = 10.0 ** np.arange(-14, -1)
+HIGHS = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """Rays from `center` (d,) along `directions` (K, d), and what was proved on each.
+
+    inner (K,): largest t for which centre + t d was proved feasible (NaN: none). outer (K,):
+    where the ray leaves all the half-spaces (inf: never). points (K, d): the points at `inner`.
+    normals (K, d), offsets (K,): half-spaces a'x ≤ b that hold on the whole feasible set
+    (b = inf where the LP gave none).
+    """
+
+    center: np.ndarray
+    directions: np.ndarray
+    inner: np.ndarray
+    outer: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    offsets: np.ndarray
+
+
+def boundary(
+    mpc: MPC, directions: int | np.ndarray, *, center: np.ndarray | None = None,
+    axes: tuple[int, ...] | None = None, fixed: np.ndarray | None = None,
+) -> Boundary:  # fmt: skip
+    """Exact boundary points and facets of the feasible set of `mpc` along rays.
+
+    directions: a number of rays (equally spaced in 2-D, random in more dimensions) or an array
+    (K, d). center: a feasible point (d,); None: the point with the largest margin. axes, fixed:
+    a slice or projection as in `map_feasible_set`. Raises ValueError where the feasible set is
+    empty or flat, or the centre is not inside it.
+    """
+    mpc.validate()
+    view = make_view(mpc, axes, fixed)
+    d = len(view.axes)
+    if isinstance(directions, int | np.integer):
+        directions = spread(int(directions), d)
+    directions = np.asarray(directions, np.float64)
+    if directions.ndim != 2 or directions.shape[1] != d or not np.all(np.isfinite(directions)):
+        fail("directions", f"shape {directions.shape}", f"Give finite rays (K, {d}) or a number")
+    if not np.all(np.any(directions != 0, axis=1)):
+        fail("directions", "holds a zero row", "A ray needs a direction")
+    if center is not None and np.shape(center) != (d,):
+        fail("center", f"shape {np.shape(center)}", f"Give one point ({d},)")
+    return Rays(mpc, view, center).shoot(directions)
+
+
+def spread(count: int, d: int) -> np.ndarray:
+    """`count` directions in R^d: equally spaced in 2-D, random with a fixed seed above."""
+    if d == 1:
+        return np.array([[1.0], [-1.0]])
+    if d == 2:
+        angle = 2 * np.pi * np.arange(count) / count
+        return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    normal = np.random.default_rng(0).standard_normal((count, d))
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+class Rays:
+    """The ray LP of one problem and view, set up once for many rays."""
+
+    def __init__(self, mpc: MPC, view: View, center: np.ndarray | None = None) -> None:
+        self.rows = rows(mpc, view)
+        self.center, self.w = self._centre(center)
+        d = len(self.center)
+        both = np.concatenate([np.eye(d), -np.eye(d)])
+        extent = np.array([self._lp(e)[0] for e in both]).reshape(2, d).max(axis=0)
+        self.problem = proofs.problem(mpc, view, np.abs(self.center) + extent * (1 + 1e-6))
+
+    def _centre(self, center: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """θ (the given one, or the best) and w with the largest common margin of all rows."""
+        U, D = self.rows.U, self.rows.D
+        k, d = U.shape[1], D.shape[1]
+        size = np.linalg.norm(np.hstack([U, D]), axis=1)
+        A = np.block([[U, D, size[:, None]], [-U, -D, size[:, None]]])
+        b = np.concatenate([self.rows.upper, -self.rows.lower])
+        keep = np.isfinite(b)
+        pinned = [(None, None)] * d if center is None else [(v, v) for v in np.asarray(center)]
+        largest = max(1.0, np.abs(b[keep]).max(initial=0.0))
+        result = linprog(
+            -np.eye(k + d + 1)[-1], A_ub=A[keep], b_ub=b[keep],
+            bounds=[(None, None)] * k + pinned + [(None, largest)], options=HIGHS,
+        )  # fmt: skip
+        if result.x is None or result.x[-1] <= 1e-9:
+            if center is not None:
+                fail("center", f"{center} is not inside the feasible set", "Give None or another")
+            fail(
+                "mpc", "its feasible set is empty or flat: no initial state keeps a margin",
+                "Relax a limit, lengthen the horizon or enlarge the terminal set",
+            )  # fmt: skip
+        return result.x[k : k + d], result.x[:k]
+
+    def _lp(self, direction: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """max t with centre + t d feasible: (t, w, multipliers of the rows); t = inf: unbounded."""
+        r = self.rows
+        count, k = r.U.shape
+        A = np.hstack([r.U, (r.D @ direction)[:, None]])
+        shift = r.D @ self.center
+        low, high = np.isfinite(r.lower), np.isfinite(r.upper)
+        result = linprog(
+            -np.eye(k + 1)[-1], A_ub=np.vstack([A[high], -A[low]]),
+            b_ub=np.concatenate([(r.upper - shift)[high], (shift - r.lower)[low]]),
+            bounds=[(None, None)] * k + [(0, None)], options=HIGHS,
+        )  # fmt: skip
+        if result.x is None:
+            return np.inf, np.zeros(k), np.zeros(count)
+        push, y = -result.ineqlin.marginals, np.zeros(count)
+        y[high] += push[: high.sum()]
+        y[low] -= push[high.sum() :]
+        return float(result.x[-1]), result.x[:k], y
+
+    def shoot(self, directions: np.ndarray) -> Boundary:
+        """Solve, pull and prove along every direction (K, d)."""
+        solved = [self._lp(direction) for direction in directions]
+        t, w, y = (np.array(part) for part in zip(*solved, strict=True))
+        bounded = np.isfinite(t)
+        # Shrinking a feasible pair (θ, w) towards the centre's pair gives every row a margin.
+        reach = np.where(bounded, t, 0.0)[:, None] * (1 - PULLS)
+        theta = self.center + reach[:, :, None] * directions[:, None, :]
+        w = self.w + (w - self.w)[:, None, :] * (1 - PULLS)[:, None]
+        # Repeated rays fill up to a power of two, so that few shapes compile.
+        count = len(directions)
+        fill = np.arange(max(32, 1 << (count - 1).bit_length())) % count
+        with jax.enable_x64(True):
+            feasible, normals, offsets = (
+                np.asarray(v)[:count]
+                for v in prove(self.problem, self.rows, theta[fill], w[fill], y[fill])
+            )
+        feasible = feasible & bounded[:, None]
+        best, each = np.argmax(feasible, axis=1), np.arange(len(directions))
+        found = feasible.any(axis=1)
+        return Boundary(
+            center=self.center,
+            directions=directions,
+            inner=np.where(found, reach[each, best], np.nan),
+            outer=leaving(self.center, directions, normals, offsets),
+            points=np.where(found[:, None], theta[each, best], np.nan),
+            normals=normals,
+            offsets=offsets,
+        )
+
+
+@jax.jit
+def prove(p: Problem, rows: Rows, theta: Any, w: Any, y: Any) -> tuple[Array, Array, Array]:
+    """For each ray: which of its pulled points (K, pulls, d) are feasible, and its cut."""
+
+    def feasible(theta: Array, w: Array) -> Array:
+        inputs, free = inputs_of(p, rows, theta, w)
+        return proofs.prove_feasible(p, theta, free, inputs)[0]
+
+    normals, offsets = jax.vmap(lambda y: cut_of(p, rows, y))(y)
+    return jax.vmap(jax.vmap(feasible))(theta, w), normals, offsets
+
+
+def leaving(
+    center: np.ndarray, directions: np.ndarray, normals: np.ndarray, offsets: np.ndarray
+) -> np.ndarray:
+    """Where each ray leaves the intersection of the half-spaces (inf: never)."""
+    slope = directions @ normals.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = (offsets - normals @ center) / slope
+    return np.where(slope > 0, t, np.inf).min(axis=1, initial=np.inf)

@@ -1,0 +1,356 @@
+"""Maps of the feasible set: every point proved feasible, proved infeasible, or said undecided."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+from tqdm.auto import tqdm
+
+from jaxmpc.checks import fail
+from jaxmpc.control.sets import Polytope
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.status import Status
+from jaxmpc.sweeps import proofs
+from jaxmpc.sweeps.boundary import Rays
+from jaxmpc.sweeps.ladder import Verdict, admm_rung, newton_rung, rows
+from jaxmpc.sweeps.proofs import make_view
+
+# Points a compiled program takes at once. 8,192 keep a step's data within a CPU's cache; larger
+# chunks serve a GPU. Undecided points are gathered into batches of one size, so that one program
+# compiles, and leave them as they are decided.
+CHUNK = 8192
+NEWTON_BATCH = 512
+NEWTON_STEPS = 8
+NEWTON_ROUNDS = 8
+# Volumes are sums of rounded products; bounds are widened by more than that.
+VOLUME_ROUNDING = 1e-12
+
+
+def grid(lower: Any, upper: Any, shape: Any) -> np.ndarray:
+    """Points of a regular grid, end points included: (Π shape, d), first coordinate slowest."""
+    lower, upper = np.atleast_1d(np.asarray(lower, float)), np.atleast_1d(np.asarray(upper, float))
+    shape = tuple(int(k) for k in np.atleast_1d(shape))
+    if not lower.shape == upper.shape == (len(shape),):
+        fail("grid", f"lower {lower.shape}, upper {upper.shape}, shape {shape}", "Same length each")
+    if not (np.all(np.isfinite(lower)) and np.all(np.isfinite(upper)) and np.all(lower <= upper)):
+        fail("grid", f"lower {lower}, upper {upper}", "Give finite lower ≤ upper")
+    if min(shape) < 1:
+        fail("grid", f"shape {shape}", "Give at least one point along each axis")
+    lines = [np.linspace(*ends) for ends in zip(lower, upper, shape, strict=True)]
+    return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(shape))
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Labels of b points and their proofs.
+
+    label (b,) int8: 1 proved feasible, −1 proved infeasible, 0 undecided. status (b,) int8:
+    `Status` (NOT_RUN, NON_FINITE, or SOLVED / PRIMAL_INFEASIBLE / ITERATION_LIMIT for the three
+    labels). plans (b, N, m): inputs that prove 1, else NaN. cut_normals (b, d), cut_offsets (b,):
+    the half-space a'x ≤ b, valid on the whole feasible set, that proves −1, else NaN. Seconds
+    spent compiling and running.
+    """
+
+    label: np.ndarray
+    status: np.ndarray
+    plans: np.ndarray
+    cut_normals: np.ndarray
+    cut_offsets: np.ndarray
+    compile_seconds: float = 0.0
+    run_seconds: float = 0.0
+
+    @classmethod
+    def empty(cls, count: int, horizon: int, m: int, d: int) -> "Labels":
+        """Labels of points that have not been run."""
+        return cls(
+            np.zeros(count, np.int8), np.full(count, Status.NOT_RUN, np.int8),
+            np.full((count, horizon, m), np.nan), np.full((count, d), np.nan),
+            np.full(count, np.nan),
+        )  # fmt: skip
+
+    def put(self, where: Any, verdict: Verdict) -> None:
+        """Write what was proved at positions `where`; the decided keep their proof for good."""
+        label = verdict.label
+        self.label[where] = label
+        self.status[where] = np.select(
+            [label == 1, label == -1],
+            [Status.SOLVED, Status.PRIMAL_INFEASIBLE],
+            Status.ITERATION_LIMIT,
+        )
+        feasible, infeasible = label == 1, label == -1
+        self.plans[where] = np.where(feasible[:, None, None], verdict.inputs, np.nan)
+        self.cut_normals[where] = np.where(infeasible[:, None], verdict.normal, np.nan)
+        self.cut_offsets[where] = np.where(infeasible, verdict.offset, np.nan)
+
+
+class Compiled:
+    """A jitted function whose compilation is timed apart, once for each shape."""
+
+    def __init__(self, function: Any) -> None:
+        self.function, self.programs, self.seconds = function, {}, 0.0
+
+    def __call__(self, *args: Any) -> Any:
+        key = tuple(np.shape(leaf) for leaf in jax.tree.leaves(args))
+        if key not in self.programs:
+            start = time.perf_counter()
+            self.programs[key] = self.function.lower(*args).compile()
+            self.seconds += time.perf_counter() - start
+        return jax.tree.map(np.asarray, self.programs[key](*args))
+
+
+def label_chunks(
+    mpc: MPC, points: Any, *, axes: Any = None, fixed: Any = None, iterations: int = 50,
+    dtype: Any = "float32", chunk: int = CHUNK,
+) -> Iterator[tuple[slice, Labels]]:  # fmt: skip
+    """Label points chunk by chunk; yields (slice of the points, Labels). See `map_feasible_set`."""
+    mpc.validate()
+    view = make_view(mpc, axes, fixed)
+    d = len(view.axes)
+    points = np.asarray(points, np.float64)
+    if points.ndim != 2 or points.shape[1] != d:
+        fail("x0s", f"shape {points.shape}", f"Give points (B, {d}), one column a mapped state")
+    if iterations < 1 or chunk < 1:
+        fail("iterations, chunk", f"{iterations}, {chunk}", "Give counts of at least 1")
+    dtype = np.dtype(dtype)
+    if dtype not in (np.float32, np.float64):
+        fail("dtype", f"{dtype}", "Iterate in 'float32' or 'float64'")
+
+    usable = np.all(np.isfinite(points), axis=1)
+    radius = np.abs(points[usable]).max(axis=0, initial=0.0)
+    problem, moving = proofs.problem(mpc, view, radius), rows(mpc, view)
+    admm = Compiled(admm_rung(iterations, dtype))
+    newton = Compiled(newton_rung(NEWTON_STEPS))
+    chunk = min(chunk, max(len(points), 1))
+
+    for start in range(0, len(points), chunk):
+        begun, compiled = time.perf_counter(), admm.seconds + newton.seconds
+        here = slice(start, min(start + chunk, len(points)))
+        ok = usable[here]
+        x = np.where(ok[:, None], points[here], 0.0)
+        labels = Labels.empty(len(x), mpc.horizon, mpc.system.m, d)
+        with jax.enable_x64(True):
+            verdict, w = admm(problem, moving, padded(x, chunk))
+            labels.put(slice(None), jax.tree.map(lambda v, b=len(x): v[:b], verdict))
+            w = w[: len(x)].astype(np.float64)
+            for _ in range(NEWTON_ROUNDS):
+                left = np.flatnonzero((labels.label == 0) & ok)
+                for i in range(0, len(left), NEWTON_BATCH):
+                    batch = left[i : i + NEWTON_BATCH]
+                    verdict, better = newton(
+                        problem, moving, padded(x[batch], NEWTON_BATCH),
+                        padded(w[batch], NEWTON_BATCH),
+                    )  # fmt: skip
+                    labels.put(batch, jax.tree.map(lambda v, b=len(batch): v[:b], verdict))
+                    w[batch] = better[: len(batch)]
+        blank = Labels.empty(int(np.sum(~ok)), mpc.horizon, mpc.system.m, d)
+        for name in ("label", "plans", "cut_normals", "cut_offsets"):
+            getattr(labels, name)[~ok] = getattr(blank, name)
+        labels.status[~ok] = Status.NON_FINITE
+        compiled = admm.seconds + newton.seconds - compiled
+        spent = time.perf_counter() - begun - compiled
+        yield here, replace(labels, compile_seconds=compiled, run_seconds=spent)
+
+
+def padded(x: np.ndarray, size: int) -> np.ndarray:
+    """Rows repeated up to `size`, so that few shapes compile."""
+    return np.concatenate([x, np.broadcast_to(x[:1], (size - len(x), *x.shape[1:]))])
+
+
+@dataclass(frozen=True)
+class FeasibleSetMap:
+    """Points of a state space, each with its label and the proof of it (see `Labels`).
+
+    points (B, d) in the states `axes`; fixed: values of the other states (slice) or None
+    (projection, or all states mapped). extra_points (K, d), extra_normals, extra_offsets: points
+    proved feasible and half-spaces proved valid by `refine`.
+    """
+
+    mpc: MPC
+    points: np.ndarray
+    axes: tuple[int, ...]
+    fixed: np.ndarray | None
+    labels: Labels
+    extra_points: np.ndarray
+    extra_normals: np.ndarray
+    extra_offsets: np.ndarray
+
+    @classmethod
+    def of(cls, mpc: MPC, points: Any, axes: Any, fixed: Any, labels: Labels) -> "FeasibleSetMap":
+        """A map from labels that were made elsewhere, by chunks or from a store."""
+        view = make_view(mpc, axes, fixed)
+        d = len(view.axes)
+        fixed = None if fixed is None else np.asarray(fixed, float)
+        none = np.zeros((0, d)), np.zeros((0, d)), np.zeros(0)
+        return cls(mpc, np.asarray(points, float), view.axes, fixed, labels, *none)
+
+    @property
+    def label(self) -> np.ndarray:
+        """(B,) int8: 1 proved feasible, −1 proved infeasible, 0 undecided."""
+        return self.labels.label
+
+    @property
+    def status(self) -> np.ndarray:
+        """(B,) int8, values of `Status`."""
+        return self.labels.status
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Labels of the mapped states with their units."""
+        return tuple(self.mpc.system.state_labels[i] for i in self.axes)
+
+    def counts(self) -> dict[str, int]:
+        """How many points are feasible, infeasible, undecided, not finite, not run."""
+        status, label = self.status, self.label
+        return {
+            "feasible": int(np.sum(label == 1)),
+            "infeasible": int(np.sum(label == -1)),
+            "undecided": int(np.sum(status == Status.ITERATION_LIMIT)),
+            "not finite": int(np.sum(status == Status.NON_FINITE)),
+            "not run": int(np.sum(status == Status.NOT_RUN)),
+        }
+
+    def inner(self) -> Polytope:
+        """Convex hull of all points proved feasible: a subset of the feasible set.
+
+        Raises ValueError while these points have no interior.
+        """
+        return Polytope.from_points(
+            np.concatenate([self.points[self.label == 1], self.extra_points])
+        )
+
+    def outer(self) -> Polytope:
+        """Intersection of all half-spaces proved valid: a superset of the feasible set.
+
+        Raises ValueError where there are none.
+        """
+        proved = self.label == -1
+        normals = np.concatenate([self.labels.cut_normals[proved], self.extra_normals])
+        offsets = np.concatenate([self.labels.cut_offsets[proved], self.extra_offsets])
+        keep = np.isfinite(offsets) & np.any(normals != 0, axis=1)
+        if not keep.any():
+            fail("outer", "no half-space is proved yet", "Map points outside the set, or refine()")
+        return Polytope(normals[keep], offsets[keep]).reduce()
+
+    def volume_bounds(self) -> tuple[float, float]:
+        """Certified bounds on the volume (area in 2-D) of the feasible set, or of its section."""
+        try:
+            low = self.inner().volume() * (1 - VOLUME_ROUNDING)
+        except ValueError:
+            low = 0.0
+        try:
+            high = self.outer().volume() * (1 + VOLUME_ROUNDING)
+        except ValueError:
+            high = np.inf
+        return low, high
+
+    def terminal_section(self) -> Polytope | None:
+        """The terminal set in the mapped states (slice or all states), None where there is none."""
+        set_ = self.mpc.terminal_set
+        others = [i for i in range(self.mpc.system.n) if i not in self.axes]
+        if set_ is None or (others and self.fixed is None):
+            return None
+        body = set_ if isinstance(set_, Polytope) else set_.to_polytope()
+        H, h = np.asarray(body.H, float), np.asarray(body.h, float)
+        if others:
+            assert self.fixed is not None
+            h = h - H[:, others] @ self.fixed[others]
+        return Polytope(H[:, list(self.axes)], h)
+
+    def refine(self, tolerance: float = 1e-6, rounds: int = 30) -> "FeasibleSetMap":
+        """Shoot rays at the vertices of the outer polytope until the volume bounds meet.
+
+        Each ray adds a proved boundary point and a proved facet (`boundary`); in up to four
+        mapped dimensions this ends at the exact polytope. tolerance: relative gap of the volume
+        bounds at which to stop. A set without interior, or unbounded, is returned as it is.
+        """
+        view = make_view(self.mpc, self.axes, self.fixed)
+        d = len(self.axes)
+        try:
+            rays = Rays(self.mpc, view)
+        except ValueError:
+            return self
+        directions = np.concatenate([np.eye(d), -np.eye(d), -np.ones((1, d))])
+        points, normals, offsets = self.extra_points, self.extra_normals, self.extra_offsets
+        for _ in range(rounds):
+            found = rays.shoot(directions)
+            proved = np.isfinite(found.inner)
+            points = np.concatenate([points, found.points[proved]])
+            valid = np.isfinite(found.offsets)
+            normals = np.concatenate([normals, found.normals[valid]])
+            offsets = np.concatenate([offsets, found.offsets[valid]])
+            try:
+                outer, inner = Polytope(normals, offsets).reduce(), Polytope.from_points(points)
+                low, high = inner.volume(), outer.volume()
+                directions = outer.vertices() - rays.center
+            except ValueError:  # not bounded yet
+                directions = np.random.default_rng(len(points)).standard_normal((4 * d, d))
+                continue
+            if high - low <= tolerance * high:
+                break
+        return replace(self, extra_points=points, extra_normals=normals, extra_offsets=offsets)
+
+    def to_xarray(self) -> Any:
+        """The map as an xarray.Dataset along the dimension `sample`, names and units attached."""
+        import xarray
+
+        data = {
+            "label": ("sample", self.label),
+            "status": ("sample", self.status),
+            "plan": (("sample", "time", "input"), self.labels.plans),
+            "cut_normal": (("sample", "state"), self.labels.cut_normals),
+            "cut_offset": ("sample", self.labels.cut_offsets),
+            "point": (("sample", "state"), self.points),
+        }
+        names = {"state": list(self.names), "input": list(self.mpc.system.input_labels)}
+        return xarray.Dataset(data, coords=names)
+
+
+def map_feasible_set(
+    mpc: MPC, x0s: Any, *, axes: Any = None, fixed: Any = None, iterations: int = 50,
+    dtype: Any = "float32", chunk: int = CHUNK, refine: float | None = None,
+    progress: bool = False,
+) -> FeasibleSetMap:  # fmt: skip
+    """Label each point: is there an input sequence that keeps every hard constraint of `mpc`?
+
+    x0s: points (B, d). axes: indices of the d mapped states (None: all n). fixed: values (n,) of
+    all states, for a slice through them; None with d < n: a projection (feasible if some value
+    of the other states is). The cost plays no part. Every label rests on a proof in float64
+    (`proofs.py`): an input sequence whose roll-out keeps all rows, or a half-space that excludes
+    the point, each by more than rounding; what is neither is 0, undecided. iterations and dtype
+    govern the ADMM rung alone and cannot make a label wrong. chunk: points a compiled program
+    takes at once. refine: tolerance of `FeasibleSetMap.refine`, None to skip it. progress: show
+    a bar.
+
+    A point with NaN or infinity gets status NON_FINITE and label 0. Raises ValueError for wrong
+    shapes and ill-posed problems before anything compiles.
+    """
+    points = np.asarray(x0s, np.float64)
+    chunks = label_chunks(
+        mpc, points, axes=axes, fixed=fixed, iterations=iterations, dtype=dtype, chunk=chunk
+    )
+    labels = None
+    with tqdm(total=len(points), unit="pt", disable=not progress) as bar:
+        for here, part in chunks:
+            if labels is None:
+                shape = part.plans.shape[1:]
+                labels = Labels.empty(len(points), *shape, part.cut_normals.shape[1])
+            labels = joined(labels, here, part)
+            bar.update(len(part.label))
+    if labels is None:
+        labels = Labels.empty(0, mpc.horizon, mpc.system.m, len(make_view(mpc, axes, fixed).axes))
+    result = FeasibleSetMap.of(mpc, points, axes, fixed, labels)
+    return result if refine is None else result.refine(refine)
+
+
+def joined(labels: Labels, here: slice, part: Labels) -> Labels:
+    """`labels` with a chunk written in (in place) and its seconds added."""
+    for name in ("label", "status", "plans", "cut_normals", "cut_offsets"):
+        getattr(labels, name)[here] = getattr(part, name)
+    return replace(
+        labels,
+        compile_seconds=labels.compile_seconds + part.compile_seconds,
+        run_seconds=labels.run_seconds + part.run_seconds,
+    )

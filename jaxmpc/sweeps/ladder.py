@@ -1,0 +1,180 @@
+"""The ladder that labels points: short ADMM on all, least-distance Newton on what is left.
+
+For the question "feasible or not" the cost is dropped. In an orthonormal basis U of the range
+of the (row-normalised) constraint matrix a zero-cost ADMM step is t⁺ = t + α(U U'r − clip(t)):
+the alternating projection of Douglas and Rachford between {U w} and the box of the bounds.
+Iterates may be float32. Nothing here decides a label: every candidate, a w or a multiplier,
+goes to `proofs.py`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.mpc.condense import condense
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.problem import matmul
+from jaxmpc.qp.refine import least_distance
+from jaxmpc.sweeps import proofs
+from jaxmpc.sweeps.proofs import Problem, View
+
+ALPHA = 1.6
+INSET = 1e-10
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Rows:
+    """Rows of the condensed constraints: lower ≤ (U w)_i + D_i θ ≤ upper, i = 1..R.
+
+    U (R, k) is an orthonormal basis of what the decision variables (inputs, prestabilised or
+    not, and in a projection the free states) can do to the normalised rows; back (nz, k) leads
+    from w to the variables. A row that nothing moves (k = 0; Euler's q₁ does not feel u₀) has
+    U = 0: a half-space on θ alone. weight (R,) brings multipliers to the units of the problem's
+    rows, and index says where the multiplier of each state and terminal row of the problem
+    stands among the R (R where there is none). Psi, Omega, psi: inputs from θ and the variables.
+    """
+
+    U: Any
+    back: Any
+    D: Any
+    lower: Any
+    upper: Any
+    weight: Any
+    index: Any
+    Psi: Any
+    Omega: Any
+    psi: Any
+
+
+def rows(mpc: MPC, view: View) -> Rows:
+    """Condense, restrict to the view and normalise; all on the host in float64."""
+    with jax.enable_x64(True):
+        c = jax.tree.map(np.asarray, condense(jax.tree.map(np.float64, mpc)))
+    axes, others = list(view.axes), list(view.others)
+    C, D, lower, upper = c.C, c.D[:, axes], c.lower - c.d, c.upper - c.d
+    Psi, Omega, psi = c.Psi[:, :, axes], c.Omega, c.psi
+    if view.projects:
+        extra = len(others)
+        C = np.block([[C, c.D[:, others]], [np.zeros((extra, C.shape[1])), np.eye(extra)]])
+        D = np.concatenate([D, np.zeros((extra, len(axes)))])
+        lower, upper = np.append(lower, view.lower), np.append(upper, view.upper)
+        Omega = np.concatenate([Omega, c.Psi[:, :, others]], axis=2)
+    elif others:
+        rest = np.asarray(view.fixed)[others]
+        lower, upper = lower - c.D[:, others] @ rest, upper - c.D[:, others] @ rest
+        psi = psi + c.Psi[:, :, others] @ rest
+
+    norm = np.linalg.norm(C, axis=1)
+    still = norm <= 1e-13 * norm.max(initial=0.0)
+    C = np.where(still[:, None], 0.0, C)
+    keep = np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
+    weight = 1 / np.where(still, np.maximum(np.linalg.norm(D, axis=1), 1e-300), norm)[keep]
+    U, singular, Vt = np.linalg.svd(weight[:, None] * C[keep], full_matrices=False)
+    rank = int(np.sum(singular > 1e-12 * singular.max(initial=0.0)))
+    U, back = U[:, :rank], Vt[:rank].T / singular[:rank]
+
+    n_inputs = 0 if mpc.inputs is None else mpc.horizon * mpc.system.m
+    n_rows = len(c.lower) - n_inputs
+    index = np.full(n_rows, len(keep))
+    ours = (keep >= n_inputs) & (keep < len(c.lower))
+    index[keep[ours] - n_inputs] = np.flatnonzero(ours)
+    return Rows(
+        U, back, weight[:, None] * D[keep], weight * lower[keep], weight * upper[keep], weight,
+        index, Psi, Omega, psi,
+    )  # fmt: skip
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Verdict:
+    """What was proved of one point: label 1, −1 or 0, and the inputs or the cut that prove it."""
+
+    label: Array
+    inputs: Array
+    normal: Array
+    offset: Array
+
+
+def inputs_of(p: Problem, rows: Rows, theta: Array, w: Array) -> tuple[Array, Array]:
+    """Inputs (N, m) and free states that the coordinates w stand for."""
+    variables = matmul(jnp.asarray(rows.back), w)
+    inputs = matmul(jnp.asarray(rows.Psi), theta) + matmul(jnp.asarray(rows.Omega), variables)
+    return inputs + rows.psi, variables[p.horizon * p.B.shape[1] :]
+
+
+def cut_of(p: Problem, rows: Rows, y: Array) -> tuple[Array, Array]:
+    """The half-space (a, b) that multipliers y (R,) of the rows give."""
+    y = jnp.append(y * rows.weight, 0.0)[jnp.asarray(rows.index)]
+    steps, r = p.horizon - p.first_step, p.H.shape[0]
+    return proofs.cut(p, y[: steps * r].reshape(steps, r), y[steps * r :])
+
+
+def judge(p: Problem, rows: Rows, theta: Array, w: Array, candidates: list[Array]) -> Verdict:
+    """Try to prove the point θ feasible by w, and infeasible by each candidate multiplier."""
+    theta, w = theta.astype(jnp.float64), w.astype(jnp.float64)
+    inputs, free = inputs_of(p, rows, theta, w)
+    feasible, inputs = proofs.prove_feasible(p, theta, free, inputs)
+    normal, offset = jnp.zeros_like(theta), jnp.asarray(jnp.inf, jnp.float64)
+    infeasible = jnp.asarray(False)
+    for y in candidates:
+        a, b = cut_of(p, rows, y.astype(jnp.float64))
+        here = proofs.excludes(a, b, theta) & ~infeasible
+        normal, offset = jnp.where(here, a, normal), jnp.where(here, b, offset)
+        infeasible = infeasible | here
+    label = jnp.where(feasible, 1, jnp.where(infeasible, -1, 0)).astype(jnp.int8)
+    return Verdict(label, inputs, normal, offset)
+
+
+def admm_rung(iterations: int, dtype: Any) -> Callable[..., tuple[Verdict, Array]]:
+    """The compiled first rung: (p, rows, points (B, d)) → verdicts and w (B, k)."""
+
+    @jax.jit
+    def rung(p: Problem, rows: Rows, points: Array) -> tuple[Verdict, Array]:
+        U = jnp.asarray(rows.U, dtype)
+        shift = matmul(jnp.asarray(rows.D), points.T)  # (R, B): columns are points
+        l = (jnp.asarray(rows.lower)[:, None] - shift).astype(dtype)
+        u = (jnp.asarray(rows.upper)[:, None] - shift).astype(dtype)
+
+        def step(carry, _):
+            t, _ = carry
+            s = jnp.clip(t, l, u)
+            return (t + ALPHA * (matmul(U, matmul(U.T, 2 * s - t)) - s), t), None
+
+        t = jnp.clip(jnp.zeros_like(l), l, u)
+        (t, before), _ = jax.lax.scan(step, (t, t), length=iterations)
+        excess = lambda t: t - jnp.clip(t, l, u)
+        w = matmul(U.T, jnp.clip(t, l, u) - excess(t))
+        change = excess(t) - excess(before)
+        verdict = jax.vmap(lambda *a: judge(p, rows, a[0], a[1], [a[2], a[3]]))(
+            points, w.T, change.T, excess(t).T
+        )
+        return verdict, w.T
+
+    return rung
+
+
+def newton_rung(steps: int) -> Callable[..., tuple[Verdict, Array]]:
+    """The compiled second rung: (p, rows, points (B, d), w (B, k)) → verdicts and w."""
+
+    @jax.jit
+    def rung(p: Problem, rows: Rows, points: Array, w: Array) -> tuple[Verdict, Array]:
+        U = jnp.asarray(rows.U)
+
+        def one(theta: Array, w: Array) -> tuple[Verdict, Array]:
+            shift = matmul(jnp.asarray(rows.D), theta)
+            l, u = rows.lower - shift, rows.upper - shift
+            # The nearest feasible w lies on a face, where a roll-out has no margin for its
+            # rounding: aim a little inside. Cuts are judged on the true bounds all the same.
+            inset = jnp.minimum(INSET * (1 + jnp.fmin(jnp.abs(l), jnp.abs(u))), (u - l) / 4)
+            w, e = least_distance(U, l + inset, u - inset, w.astype(jnp.float64), steps)
+            return judge(p, rows, theta, w, [e]), w
+
+        return jax.vmap(one)(points, w)
+
+    return rung

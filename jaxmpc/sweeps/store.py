@@ -1,0 +1,191 @@
+"""A sweep kept chunk by chunk, so that a killed run loses one chunk at most.
+
+The store is a zarr v3 group, one row a sample, written in whole zarr chunks:
+
+    points (sample, coordinate), label (sample), status (sample), plan (sample, time, input),
+    cut_normal (sample, coordinate), cut_offset (sample), done (chunk)
+
+The group appears under its name by one rename, complete with its attributes. A chunk counts
+only once its entry of `done` is set, which happens after all its rows are written; zarr
+writes each chunk to a side file and renames it. Fill values (label and status 0, NaN) are
+no answers, so that a row not reached is never taken for one. Power cuts are not covered:
+zarr does not sync to the disk.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+import zarr
+
+from jaxmpc.checks import fail
+
+
+def open_sweep(
+    path: str | Path,
+    points: np.ndarray,
+    plan_shape: tuple[int, int],
+    config: Mapping[str, Any],
+    chunk: int,
+) -> zarr.Group:
+    """Open the store at `path` to write; make it where there is none.
+
+    `points` (B, d) are the samples, `plan_shape` is (N, m), `config` is JSON data that says
+    what is swept, `chunk` is the number of rows a commit. Raises ValueError where the store
+    was made with another configuration, or where something else lies there.
+    """
+    path = Path(path)
+    attributes = {
+        "config": dict(config),
+        "chunk": chunk,
+        "fingerprint": _fingerprint(config, points, plan_shape, chunk),
+        "versions": _versions(),
+    }
+    if not path.exists():
+        _create(path, points, plan_shape, attributes)
+    group = _open(path, "r+")
+    if group.attrs["fingerprint"] != attributes["fingerprint"]:
+        stored: Any = {"config": group.attrs["config"], "chunk": group.attrs["chunk"]}
+        changes = _differences(stored, {"config": dict(config), "chunk": chunk})
+        fail(
+            str(path),
+            f"holds a sweep of another configuration ({'; '.join(changes) or 'other points'})",
+            "Resume with that configuration, choose another output, or overwrite",
+        )
+    return group
+
+
+def pending(group: zarr.Group) -> list[int]:
+    """Indices of the chunks that are not committed."""
+    return np.flatnonzero(_array(group, "done")[:] == 0).tolist()
+
+
+def chunk_rows(group: zarr.Group, index: int) -> slice:
+    """Rows that belong to one chunk; the last may be short."""
+    chunk = _chunk(group)
+    return slice(index * chunk, min((index + 1) * chunk, _array(group, "points").shape[0]))
+
+
+def commit(group: zarr.Group, index: int, **rows: np.ndarray) -> None:
+    """Write all rows of chunk `index`, then mark it done.
+
+    `rows` are label, status, plan, cut_normal, cut_offset; other processes may commit other
+    chunks at the same time.
+    """
+    where = chunk_rows(group, index)
+    for name in ("label", "status", "plan", "cut_normal", "cut_offset"):
+        _array(group, name)[where] = rows[name]
+    _array(group, "done")[index] = 1
+
+
+def read(path: str | Path) -> xr.Dataset:
+    """The store as an xarray Dataset (lazy); rows of chunks not done hold the fill values."""
+    _open(Path(path), "r")
+    return xr.open_zarr(path, consolidated=False, mask_and_scale=False)
+
+
+def remove(path: str | Path) -> None:
+    """Delete the store at `path`; ValueError, and nothing deleted, where it is no store."""
+    _open(Path(path), "r")
+    shutil.rmtree(path)
+
+
+def _create(
+    path: Path, points: np.ndarray, plan_shape: tuple[int, int], attributes: dict[str, Any]
+) -> None:
+    rows, d = points.shape
+    chunk = attributes["chunk"]
+    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+    group = zarr.open_group(partial, mode="w", zarr_format=3, attributes=attributes)
+    fields: dict[str, tuple[tuple[int, ...], str, Any, tuple[str, ...]]] = {
+        "points": ((d,), "float64", np.nan, ("coordinate",)),
+        "label": ((), "int8", 0, ()),
+        "status": ((), "int8", 0, ()),
+        "plan": (plan_shape, "float64", np.nan, ("time", "input")),
+        "cut_normal": ((d,), "float64", np.nan, ("coordinate",)),
+        "cut_offset": ((), "float64", np.nan, ()),
+    }
+    for name, (tail, dtype, fill, dimensions) in fields.items():
+        group.create_array(
+            name,
+            shape=(rows, *tail),
+            chunks=(chunk, *tail),
+            dtype=dtype,
+            fill_value=fill,
+            dimension_names=("sample", *dimensions),
+        )
+    # One marker a file: markers that share a zarr chunk are lost when two processes write.
+    group.create_array(
+        "done",
+        shape=(-(-rows // chunk),),
+        chunks=(1,),
+        dtype="uint8",
+        fill_value=0,
+        dimension_names=("chunk",),
+    )
+    _array(group, "points")[:] = points
+    try:
+        os.rename(partial, path)
+    except OSError:  # another process was first: use its store
+        shutil.rmtree(partial)
+        if not path.exists():
+            raise
+
+
+def _open(path: Path, mode: Any) -> zarr.Group:
+    try:
+        group = zarr.open_group(path, mode=mode)
+    except (OSError, ValueError) as error:  # zarr's own errors derive from these
+        fail(str(path), f"is no sweep store ({error})", "Choose another output folder")
+    if "fingerprint" not in group.attrs:
+        fail(str(path), "is a zarr group but no sweep store", "Choose another output folder")
+    return group
+
+
+def _array(group: zarr.Group, name: str) -> zarr.Array[Any]:
+    array = group[name]
+    assert isinstance(array, zarr.Array)
+    return array
+
+
+def _chunk(group: zarr.Group) -> int:
+    return int(group.attrs["chunk"])  # type: ignore[arg-type]
+
+
+def _fingerprint(
+    config: Mapping[str, Any], points: np.ndarray, plan_shape: tuple[int, int], chunk: int
+) -> str:
+    text = json.dumps([config, points.shape, plan_shape, chunk], sort_keys=True)
+    return hashlib.sha256(text.encode() + points.tobytes()).hexdigest()
+
+
+def _differences(there: Any, here: Any, key: str = "") -> list[str]:
+    """Leaves that differ, as "mpc.horizon: 20 there, 10 here"."""
+    if isinstance(there, Mapping) and isinstance(here, Mapping):
+        names = dict.fromkeys([*there, *here])
+        return [
+            line
+            for name in names
+            for line in _differences(there.get(name), here.get(name), f"{key}.{name}")
+        ]
+    there, here = json.dumps(there), json.dumps(here)
+    label = key.removeprefix(".").removeprefix("config.")
+    return [] if there == here else [f"{label}: {there} there, {here} here"]
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for package in ("jaxmpc", "jax", "jaxlib", "numpy", "zarr"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found

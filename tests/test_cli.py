@@ -1,0 +1,180 @@
+"""The command: files and table when all is well, one line and an exit code when not."""
+
+import json
+import shlex
+import signal
+import subprocess
+import sys
+from importlib.metadata import version
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from jaxmpc import cli
+
+
+@pytest.fixture(autouse=True)
+def _in_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+
+
+@pytest.fixture
+def no_compile(monkeypatch):
+    """Fail if the sweep starts: errors must be found before."""
+    monkeypatch.setattr(cli, "label_chunks", lambda *a, **k: pytest.fail("the sweep started"))
+
+
+def run(line):
+    return cli.main(shlex.split(line))
+
+
+def test_sweep_writes_files_and_table(tmp_path, capsys):
+    assert run("sweep --grid 16 12 --horizon 5") == 0
+    out = capsys.readouterr().out
+    folder = tmp_path / "jaxmpc-sweep"
+    assert {path.name for path in folder.iterdir()} == {"sweep.zarr", "map.png", "summary.json"}
+    data = xr.open_zarr(folder / "sweep.zarr", consolidated=False)
+    assert data["label"].shape == (192,) and data["plan"].shape == (192, 5, 1)
+    summary = json.loads((folder / "summary.json").read_text())
+    labels = data["label"].values
+    feasible, infeasible = np.count_nonzero(labels == 1), np.count_nonzero(labels == -1)
+    assert summary["counts"] == {
+        "feasible": feasible,
+        "infeasible": infeasible,
+        "undecided": 192 - feasible - infeasible,
+        "not finite": 0,
+        "not run": 0,
+    }
+    assert summary["config"]["mpc"]["horizon"] == 5
+    assert 0 < summary["volume"]["inner"] <= summary["volume"]["outer"] <= 12
+    for word in ("feasible", "undecided", "area from", "rad·rad/s", "QPs/s", "map.png"):
+        assert word in out
+    # States beyond the limits |q| <= 1.5, |dq| <= 2 are never feasible.
+    beyond = np.any(np.abs(data["points"].values) > [1.5, 2.0], axis=1)
+    assert np.all(labels[beyond] == -1)
+
+
+def test_file_slice_and_overwrite(tmp_path, capsys):
+    (tmp_path / "case.toml").write_text(
+        """
+        name = "two carts"
+        [system]
+        A = [[1, 0.1, 0], [0, 1, 0], [0, 0, 0.5]]
+        B = [[0], [0.1], [1]]
+        dt = 0.1
+        state_names = ["p", "v", "w"]
+        [limits]
+        x_min = [-1, -1, -1]
+        x_max = [1, 1, 1]
+        u_min = [-1]
+        u_max = [1]
+        [cost]
+        Q = [1, 1, 1]
+        R = [1]
+        [mpc]
+        horizon = 4
+        [sweep]
+        grid = [6, 6]
+        axes = ["p", "v"]
+        projection = true
+        """
+    )
+    assert run("sweep --config case.toml --fixed 0.25 --output out --no-refine") == 0
+    assert "two carts" in capsys.readouterr().out
+    assert run("sweep --config case.toml --fixed 0.5 --output out") == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert run("sweep --config case.toml --fixed 0.5 --output out --resume") == 2
+    assert "sweep.fixed: [0.25] there, [0.5] here" in capsys.readouterr().err
+    command = "sweep --config case.toml --axes 0 --grid 5 --fixed 0 0.5 --output out --overwrite"
+    assert run(command) == 0
+    assert "length from" in capsys.readouterr().out
+
+
+def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "CHUNK", 50)
+    real = cli.label_chunks
+
+    def interrupted(*args, **kwargs):
+        for k, chunk in enumerate(real(*args, **kwargs)):
+            if k == 1:
+                signal.raise_signal(signal.SIGINT)
+            yield chunk
+
+    monkeypatch.setattr(cli, "label_chunks", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    assert run("sweep --grid 16 12 --horizon 5 --output 'my maps'") == 130
+    assert signal.getsignal(signal.SIGINT) is before
+    out = capsys.readouterr().out
+    assert "jaxmpc sweep --grid 16 12 --horizon 5 --output 'my maps' --resume" in out
+    assert "chunks left  2" in out
+    asked = []
+
+    def counted(mpc, points, **kwargs):
+        asked.append(points)
+        return real(mpc, points, **kwargs)
+
+    monkeypatch.setattr(cli, "label_chunks", counted)
+    resume = "sweep --grid 16 12 --horizon 5 --output 'my maps' --resume"
+    assert run(resume) == 0
+    data = xr.open_zarr(tmp_path / "my maps" / "sweep.zarr", consolidated=False)
+    np.testing.assert_array_equal(asked[0], data["points"][100:])
+    assert np.all(data["status"] != 0)
+    assert run(resume) == 0 and len(asked) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--horizon 0", "--horizon"),
+        ("--grid 1 5", "--grid"),
+        ("--grid 5", "sweep.grid: has 1 entries where 2"),
+        ("--lower 1 0 --upper -1 0", "sweep.lower"),
+        ("--lower nan 0 --upper 1 1", "--lower"),
+        ("--axes q w", "no state 'w'. States are q, dq"),
+        ("--axes q --grid 5", "sweep.fixed: 2 states, 1 mapped"),
+        ("--config absent.toml", "absent.toml: cannot be read"),
+        ("--output file/below", "--output file/below"),
+        ("--resume --overwrite", "Choose one"),
+    ],
+)
+@pytest.mark.usefixtures("no_compile")
+def test_errors_are_one_line_before_any_compile(tmp_path, capsys, arguments, message):
+    (tmp_path / "file").touch()
+    assert run(f"sweep {arguments}") == 2
+    err = capsys.readouterr().err
+    assert err.startswith("jaxmpc: error: ") and err.count("\n") == 1
+    assert message in err
+
+
+@pytest.mark.usefixtures("no_compile")
+@pytest.mark.parametrize("arguments", ["", "sweep --grid 1.5 2", "sweep --horizont 3", "swep"])
+def test_wrong_usage(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        run(arguments)
+    assert caught.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_help_is_a_page_a_stranger_can_use(capsys):
+    with pytest.raises(SystemExit) as caught:
+        run("sweep --help")
+    assert caught.value.code == 0
+    text = capsys.readouterr().out
+    options = """config output horizon terminal grid lower upper axes fixed projection iterations
+        dtype resume overwrite no-refine"""
+    for word in options.split():
+        assert f"--{word}" in text
+    assert text.count("(default:") >= 14
+    assert text.count("$ jaxmpc sweep") == 2
+    for section in ("[system]", "[limits]", "[cost]", "[mpc]", "[sweep]"):
+        assert section in text
+    for word in ("feasible", "undecided", "map.png", "summary.json", "sweep.zarr", "130"):
+        assert word in text
+
+
+def test_version_and_module_entry():
+    command = [sys.executable, "-m", "jaxmpc", "--version"]
+    out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert out == f"jaxmpc {version('jaxmpc')}\n"

@@ -1,0 +1,96 @@
+"""The picture shows what the map holds, in any figure, without a window."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from jaxmpc.control.sets import Box, Polytope
+from jaxmpc.control.system import LinearSystem
+from jaxmpc.plots import plot_feasible_set
+
+
+@dataclasses.dataclass(frozen=True)
+class Map:
+    """What the picture asks of a FeasibleSetMap: |x| <= 1.1 feasible, to 1.3 undecided."""
+
+    points: np.ndarray
+    n: int = 2
+    fixed: np.ndarray | None = None
+    axes: tuple[int, int] = (0, 1)
+
+    @property
+    def label(self) -> np.ndarray:
+        distance = np.abs(self.points).max(axis=1)
+        return np.where(distance <= 1.1, 1, np.where(distance <= 1.3, 0, -1)).astype(np.int8)
+
+    @property
+    def mpc(self):
+        names, units = ("q", "dq", "r", "dr")[: self.n], ("rad", "rad/s", "m", "m/s")[: self.n]
+        B = np.ones((self.n, 1))
+        system = LinearSystem(np.eye(self.n), B, state_names=names, state_units=units)
+        return SimpleNamespace(system=system, horizon=7)
+
+    @property
+    def names(self):
+        return self.mpc.system.state_labels[:2]
+
+    def inner(self) -> Polytope:
+        return Box(-np.ones(2), np.ones(2)).to_polytope()
+
+    def outer(self) -> Polytope:
+        return Box(-1.2 * np.ones(2), 1.2 * np.ones(2)).to_polytope()
+
+    def terminal_section(self) -> Polytope | None:
+        return Box(-0.5 * np.ones(2), 0.5 * np.ones(2)).to_polytope() if self.n == 2 else None
+
+
+def square(count):
+    side = np.linspace(-2, 2, count)
+    return np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def texts(ax):
+    return [text.get_text() for text in ax.get_legend().get_texts()]
+
+
+def test_grid_becomes_an_image_with_first_state_to_the_right():
+    points = square(21)
+    fmap = Map(points)
+    ax = plot_feasible_set(fmap)
+    image = ax.images[0].get_array()
+    np.testing.assert_array_equal(image[3, :], fmap.label.reshape(21, 21)[:, 3])
+    assert ax.images[0].get_extent() == pytest.approx((-2.1, 2.1, -2.1, 2.1))
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("q [rad]", "dq [rad/s]")
+    assert ax.get_title(loc="left") == "Feasible initial states, horizon N = 7"
+    assert texts(ax) == [
+        "feasible (121)",
+        "infeasible (272)",
+        "undecided (48)",
+        "terminal set",
+        "outer bound",
+        "inner bound",
+    ]
+    reach = [np.abs(line.get_xdata()).max() for line in ax.lines]
+    np.testing.assert_allclose(reach, [0.5, 1.2, 1.0])
+
+
+def test_scattered_points_slice_and_projection(tmp_path):
+    points = np.random.default_rng(0).uniform(-2, 2, (300, 2))
+    figure = Figure()
+    ax = figure.add_subplot()
+    assert plot_feasible_set(Map(points, 4, np.array([0.0, 0.0, 0.5, -1.0])), ax) is ax
+    assert not ax.images and len(ax.collections) == 3
+    assert ax.get_title(loc="left").endswith("slice at r [m] = 0.5, dr [m/s] = -1")
+    assert "terminal set" not in texts(ax)
+    ax = plot_feasible_set(Map(points, 3))
+    assert ax.get_title(loc="left").endswith("projection: some value of r [m]")
+    figure.savefig(tmp_path / "map.png")
+    assert (tmp_path / "map.png").stat().st_size > 1000
+
+
+def test_only_two_states():
+    with pytest.raises(ValueError, match="fmap: maps 3 states.*Choose|choose `axes`"):
+        plot_feasible_set(Map(np.zeros((5, 3))))
