@@ -34,13 +34,14 @@ def _option(metavar: str | None, default: str) -> Any:
 class Sweep:
     """From which initial states can this controller keep all its limits? A map, with proofs.
 
-    Lays a grid over the initial states of a constrained linear MPC and decides each one:
-      feasible    a plan was found and rolled out within all limits
-      infeasible  a certificate proves that there is no plan
-      undecided   neither
-    Then bounds the set of feasible states by polytopes, from inside and from outside. Without
-    a file the problem is one robot joint: x = (q, dq), torque u, 20 steps of 0.01 s. An option
-    given here wins over the file.
+    What it does
+      Lays a grid over the initial states of a constrained linear MPC and decides each one:
+        feasible    a plan was found and rolled out within all limits
+        infeasible  a certificate proves that there is no plan
+        undecided   neither
+      Then bounds the set of feasible states by polytopes, from inside and from outside.
+      Without a file the problem is one robot joint: x = (q, dq), torque u, 20 steps of 0.01 s.
+      An option given here wins over the file.
 
     How to start
       $ jaxmpc sweep
@@ -82,11 +83,11 @@ class Sweep:
     )
     """Points along each mapped axis, ends included."""
     lower: Annotated[
-        tuple[float, ...] | None, _option("X [X ...]", "state limits, 5 % wider on each side")
+        tuple[float, ...] | None, _option("X [X ...]", "state limits, 3 % wider on each side")
     ] = None
     """Lower end of each mapped axis, in the units of the state."""
     upper: Annotated[
-        tuple[float, ...] | None, _option("X [X ...]", "state limits, 5 % wider on each side")
+        tuple[float, ...] | None, _option("X [X ...]", "state limits, 3 % wider on each side")
     ] = None
     """Upper end of each mapped axis, in the units of the state."""
     axes: Annotated[tuple[str, ...] | None, _option("AXIS [AXIS ...]", "first two states")] = None
@@ -225,7 +226,7 @@ def _sweep(command: Sweep, resume: str) -> int:
     rows = [
         (f"{what} from", f"{low:.9g}{unit} (inner bound)"),
         (f"{what} to", f"{high:.9g}{unit} (outer bound, gap {high - low:.2g})"),
-        ("total", f"{seconds:.2f} s"),
+        ("total", f"{seconds:.2f} s with set-up, bounds and files"),
         ("files", " ".join(str(command.output / name) for name in files)),
     ]
     print(_table(fmap, tally, rows))

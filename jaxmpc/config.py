@@ -102,7 +102,7 @@ class SweepSection:
     """Which initial states are asked: a grid over the mapped states."""
 
     grid: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)] = (256, 256)
-    lower: Vector | None = None  # (d,), none means the state limits widened by 5 % each side
+    lower: Vector | None = None  # (d,), none means the state limits widened by 3 % each side
     upper: Vector | None = None  # (d,)
     axes: tuple[int | str, ...] | None = None  # names or indices, none means the first two
     fixed: Vector | None = None  # (n - d,) values of the other states: a slice
@@ -278,7 +278,7 @@ class Config:
         return tuple(int(axis) for axis in axes)
 
     def _bounds(self, axes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-        """Corners of the grid: as given, else the state limits and 5 % more on each side."""
+        """Corners of the grid: as given, else the state limits and 3 % more on each side."""
         sweep = self.sweep
         if sweep.lower is not None and sweep.upper is not None:
             return np.asarray(sweep.lower), np.asarray(sweep.upper)
@@ -290,7 +290,7 @@ class Config:
             corners = np.asarray(states.vertices())
             low, high = corners.min(axis=0), corners.max(axis=0)
         low, high = low[list(axes)], high[list(axes)]
-        margin = 0.05 * (high - low) if np.all(np.isfinite([low, high])) else np.nan
+        margin = 0.03 * (high - low) if np.all(np.isfinite([low, high])) else np.nan
         lower = np.asarray(sweep.lower) if sweep.lower is not None else low - margin
         upper = np.asarray(sweep.upper) if sweep.upper is not None else high + margin
         if not np.all(np.isfinite([lower, upper])):

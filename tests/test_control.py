@@ -151,6 +151,8 @@ def test_from_object_reads_python_control_and_itself():
     drifting = replace(JOINT, c=np.ones(2), dt=None)
     again = LinearSystem.from_object(drifting, dt=0.01)
     assert again.dt == 0.01 and again.c is drifting.c
+    with pytest.raises(ValueError, match="dt: 0 is not a positive"):
+        LinearSystem.from_object(replace(JOINT, dt=0), dt=0.01)
 
 
 @pytest.mark.parametrize(
@@ -275,6 +277,9 @@ def test_polytope_basics():
     assert triangle.support([1, 3]) == pytest.approx(3, abs=1e-14)
     assert Polytope([[1, 0]], [1]).support([0, 1]) == INF
     assert Polytope([[1, 0]], [1]).support([2, 0]) == pytest.approx(2)
+    everything = Box([-INF, -INF], [INF, INF]).to_polytope()
+    everything.validate("states", 2)
+    assert everything.support([0, 1]) == INF and everything.contains([1e9, 0])
     H, lower, upper = triangle.rows()
     assert np.all(lower == -INF) and H.shape == (4, 2)
     np.testing.assert_array_equal(upper, triangle.h)
@@ -325,6 +330,8 @@ def test_scales_and_units_do_not_matter():
     assert polytope.volume() == pytest.approx(1.5, rel=1e-11)
     scale = upper - lower
     assert_same_points((polytope.vertices() - lower) / scale, (box.vertices() - lower) / scale)
+    touching = Polytope([[1, 0], [-1, 0], [0, 1], [0, -1], [-1, -1]], [1, 1e-17, 1e3, 1e-17, 0])
+    assert touching.volume() == pytest.approx(1e3, rel=1e-12)
     tiny = cube(2, 1e-8)
     assert tiny.volume() == pytest.approx(4e-16, rel=1e-12)
     assert tiny.support([1, 1]) == pytest.approx(2e-8, rel=1e-12)

@@ -221,8 +221,8 @@ class Polytope:
 
         Method: about an interior point c the row a'x <= b reads y'(x - c) <= 1 with
         y = a / (b - a'c), and it is irredundant exactly if y is a vertex of the convex hull
-        of all the y (polarity; Ziegler 1995, section 2.3). In more than
-        six dimensions: one LP per row.
+        of all the y (polarity; Ziegler 1995, section 2.3). In more than six dimensions:
+        one LP per row.
         """
         G, g = self._rows()
         Y, _, scale = self._dual(G, g)
@@ -240,8 +240,7 @@ class Polytope:
         The vertex dual to the facet {y : v'y = 1} of the hull described in `reduce` is
         c + v. Raises ValueError if the set is empty, flat or unbounded.
         """
-        reduced = self.reduce()
-        Y, centre, scale = self._dual(reduced.H, reduced.h)
+        Y, centre, scale = self._dual(*self.reduce()._rows())
         if self.dimension == 1:
             return np.sort(centre + 1 / Y, axis=0)
         V = _dual_hull(Y * scale).intersections
@@ -311,7 +310,9 @@ def maximise(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> Optimum:
 
 def _typical(g: np.ndarray) -> float:
     """The median distance of the hyperplanes from the origin, 1 if all pass through it."""
-    distances = np.abs(g[g != 0])
+    distances = np.abs(g)
+    # Below that they are zeros with rounding.
+    distances = distances[distances > 1e-13 * distances.max(initial=0.0)]
     return float(np.median(distances)) if distances.size else 1.0
 
 

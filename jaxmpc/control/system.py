@@ -137,7 +137,8 @@ class LinearSystem:
         Raises ValueError for bad shapes or values, or dt <= 0.
         """
         require_period("dt", dt)
-        continuous = cls(A, B, c, dt, **{key: tuple(value) for key, value in names.items()})
+        tuples: dict[str, Any] = {key: tuple(value) for key, value in names.items()}
+        continuous = cls(A, B, c, dt, **tuples)
         continuous.validate()
         n, m = continuous.n, continuous.m
         M = np.zeros((n + m + 1, n + m + 1))
@@ -168,12 +169,14 @@ class LinearSystem:
         from dt, or an object that does not say whether it is continuous.
         """
         if isinstance(obj, LinearSystem):
-            system, period = obj, True if obj.dt is None else obj.dt
+            obj.validate()
+            system = obj
+            period: Any = True if obj.dt is None else obj.dt
         else:
             for name in ("A", "B", "dt"):
                 if not hasattr(obj, name):
                     fail("obj", f"has no .{name}", "Give a state-space object (in scipy: .to_ss())")
-            names = {
+            names: dict[str, Any] = {
                 f"{kind}_names": tuple(getattr(obj, f"{kind}_labels", None) or ())
                 for kind in ("state", "input")
             }

@@ -10,7 +10,7 @@ step), states (step by step), terminal set; the cost is ½ z'Pz + (F x0 + f(refe
 P, F, C, D depend on nothing that moves between samples. Rows at k = 0 have C = 0.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -21,7 +21,7 @@ from jax import Array
 from jaxmpc.checks import concrete, fail
 from jaxmpc.control.riccati import lqr
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.qp.problem import QP, floating_dtype, matmul
+from jaxmpc.qp.problem import QP, arrays, floating_dtype, matmul
 
 
 @jax.tree_util.register_dataclass
@@ -72,17 +72,19 @@ class Condensed:
 
 
 def prestabilising_gain(mpc: MPC) -> Any:
-    """The gain K of u = Kx + v that `mpc.prestabilise` asks for, or None."""
-    wish = mpc.prestabilise
-    if wish is False or (wish is not None and wish is not True):
-        return None if wish is False else wish
+    """The gain K of u = Kx + v that `mpc.prestabilise` asks for; zero for none."""
+    wish, none = mpc.prestabilise, np.zeros((mpc.system.m, mpc.system.n))
+    if wish is False:
+        return none
+    if wish is not None and wish is not True:
+        return wish
     if not concrete(mpc.system.A, mpc.system.B, mpc.Q, mpc.R):
         if wish is True:
             fail("prestabilise", "is True where A, B are traced", "Give the gain K (m, n) itself")
-        return None
+        return none
     spectral_radius = np.abs(np.linalg.eigvals(np.asarray(mpc.system.A, float))).max()
     if wish is None and spectral_radius <= 1 + 1e-9:
-        return None
+        return none
     # Any stabilising gain serves; a little weight on every state makes the DARE solvable.
     Q = np.asarray(mpc.Q, float)
     weight = 1e-3 * max(np.trace(Q) / len(Q), 1e-9)
@@ -91,19 +93,23 @@ def prestabilising_gain(mpc: MPC) -> Any:
     except ValueError:
         if wish is True:
             raise
-        return None
+        return none
 
 
 def condense(mpc: MPC) -> Condensed:
     """Build the parametric QP. Differentiable in every array of `mpc`."""
+    return _condense(arrays(replace(mpc, prestabilise=prestabilising_gain(mpc))))
+
+
+@jax.jit
+def _condense(mpc: MPC) -> Condensed:
     system, N = mpc.system, mpc.horizon
     n, m = system.n, system.m
-    dtype = floating_dtype(mpc)
+    dtype = floating_dtype(replace(mpc, prestabilise=None))
     cast = lambda v: jnp.asarray(v, dtype)
     A, B = cast(system.A), cast(system.B)
     c = jnp.zeros(n, dtype) if system.c is None else cast(system.c)
-    gain = prestabilising_gain(mpc)
-    K = jnp.zeros((m, n), dtype) if gain is None else cast(gain)
+    K = cast(mpc.prestabilise)
 
     A_K = A + matmul(B, K)
     _, Phi = jax.lax.scan(lambda M, _: (matmul(A_K, M), M), jnp.eye(n, dtype=dtype), length=N + 1)
@@ -121,9 +127,12 @@ def condense(mpc: MPC) -> Condensed:
     P_N = jnp.zeros((n, n), dtype) if mpc.terminal_cost is None else cast(mpc.terminal_cost)
     weights = jnp.concatenate([jnp.broadcast_to(Q, (N, n, n)), P_N[None]])
     # Σ_k M_k' W_k X_k with W on the states and R on the inputs: Hessian, its x0 and constant part.
-    form = lambda X, U: 2 * (
-        jnp.einsum("kai,kab,kb...->i...", Gamma, weights, X, precision="highest")
-        + jnp.einsum("kai,ab,kb...->i...", Omega, R, U, precision="highest")
+    form = lambda X, U: (
+        2
+        * (
+            jnp.einsum("kai,kab,kb...->i...", Gamma, weights, X, precision="highest")
+            + jnp.einsum("kai,ab,kb...->i...", Omega, R, U, precision="highest")
+        )
     )
     P = form(Gamma, Omega)
 

@@ -11,8 +11,9 @@ from jax import Array
 from jaxmpc.checks import fail
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.problem import MPC, Multipliers, Plan
-from jaxmpc.qp.admm import ADMM, Factor, factor
-from jaxmpc.qp.problem import QPSolution
+from jaxmpc.qp.admm import ADMM, Factor
+from jaxmpc.qp.admm import factor as factorise
+from jaxmpc.qp.problem import QPSolution, arrays, matmul
 from jaxmpc.qp.solve import solve_factored
 
 
@@ -52,7 +53,7 @@ class Controller:
             condensed = condense(self.mpc)
             self.solver.validate(condensed.C.shape[0])
             object.__setattr__(self, "condensed", condensed)
-            object.__setattr__(self, "factor", factor(condensed.P, condensed.C, self.solver))
+            object.__setattr__(self, "factor", _factor(condensed, arrays(self.solver)))
 
     def __call__(self, x: Any, carry: Any = None) -> tuple[Array, QPSolution, Plan]:
         """First input from state x (n,), what to carry to the next sample, and the whole plan."""
@@ -62,7 +63,7 @@ class Controller:
     def plan(self, x0: Any, reference: Any = None, warm_start: Any = None) -> Plan:
         """Plan from x0 (n,); arguments as in `solve`."""
         c = self.condensed
-        assert c is not None and self.factor is not None
+        assert c is not None
         n, steps = c.Phi.shape[1], c.Phi.shape[0]
         if np.shape(x0) != (n,):
             fail("x0", f"shape {np.shape(x0)}", f"Give one state ({n},); use jax.vmap for many")
@@ -72,18 +73,28 @@ class Controller:
                 fail("reference", f"shape {np.shape(reference)}", f"Give ({n},) or ({steps}, {n})")
             reference = jnp.broadcast_to(jnp.asarray(reference, c.P.dtype), (steps, n))
         start = warm_start.qp if isinstance(warm_start, Plan) else warm_start
-        solution = solve_factored(c.qp(x0, reference), self.factor, self.solver, start)
+        return _plan(*arrays((self, x0, reference, start)))
 
+    def _plan(self, x0: Array, reference: Array | None, start: Any) -> Plan:
+        c = self.condensed
+        assert c is not None and self.factor is not None
+        solution = solve_factored(c.qp(x0, reference), self.factor, self.solver, start)
         states, inputs = c.trajectory(x0, solution.z)
-        error = states if reference is None else states - reference
-        square = lambda v, W: jnp.einsum("ka,ab,kb->", v, W, v, precision="highest")
-        cost = square(error[:-1], c.Q) + square(inputs, c.R) + square(error[-1:], c.P_N)
+        cost = self.cost(states, inputs, reference)
         return Plan(
             states=states, inputs=inputs, cost=cost, multipliers=self.multipliers(solution.y),
             status=solution.status, primal_residual=solution.primal_residual,
             dual_residual=solution.dual_residual, gap=solution.gap,
             iterations=solution.iterations, qp=solution,
         )  # fmt: skip
+
+    def cost(self, states: Array, inputs: Array, reference: Array | None = None) -> Array:
+        """J (without ½) of a trajectory: states (N+1, n), inputs (N, m)."""
+        c = self.condensed
+        assert c is not None
+        error = states if reference is None else states - reference
+        square = lambda v, W: jnp.sum(v * matmul(v, W))
+        return square(error[:-1], c.Q) + square(inputs, c.R) + square(error[-1:], c.P_N)
 
     def multipliers(self, y: Array) -> Multipliers:
         """Sort the QP's multipliers y (rows,) by constraint and step."""
@@ -98,3 +109,13 @@ class Controller:
             inputs=inputs.reshape(N, count(mpc.inputs)),
             terminal=terminal,
         )
+
+
+@jax.jit
+def _factor(condensed: Condensed, solver: ADMM) -> Factor:
+    return factorise(condensed.P, condensed.C, solver)
+
+
+@jax.jit
+def _plan(controller: Controller, x0: Array, reference: Array | None, start: Any) -> Plan:
+    return controller._plan(x0, reference, start)

@@ -37,8 +37,9 @@ class ADMM:
     """Settings of the solver.
 
     iterations: ADMM steps, always all of them. rho: penalty in the scaled coordinates above;
-    a number, one value a row (m,), a schedule (stages, m) or (stages, 1) whose stages share the
-    iterations equally, or None for an automatic value. alpha: over-relaxation in (0, 2).
+    a number, one value a row (m,), or a schedule (stages, m) or (stages, 1) whose stages share
+    the iterations equally; 1 suits these coordinates whatever the problem's units.
+    alpha: over-relaxation in (0, 2).
     refine: Newton steps after the loop (`refine.py`), accepted only where they help.
     eps: tolerance of status SOLVED on primal residual, dual residual and gap, absolute, plus
     the rounding floor 100·machine epsilon·(size of the terms); None: 1e-6 in float64, 1e-3 in
@@ -46,7 +47,7 @@ class ADMM:
     """
 
     iterations: int = field(default=100, metadata={"static": True})
-    rho: Any = None
+    rho: Any = 1.0
     alpha: Any = 1.6
     refine: int = field(default=10, metadata={"static": True})
     eps: Any = None
@@ -55,14 +56,13 @@ class ADMM:
         """Raise ValueError for settings that make no iteration."""
         if self.iterations < 0 or self.refine < 0:
             fail("iterations, refine", f"{self.iterations}, {self.refine}", "Give counts ≥ 0")
-        if self.rho is not None:
-            shape = np.shape(self.rho)
-            if len(shape) > 2 or (shape and shape[-1] not in (1, rows)):
-                fail("rho", f"shape {shape}", f"Give (), ({rows},) or (stages, {rows})")
-            if concrete(self.rho) and not np.all(np.asarray(self.rho) > 0):
-                fail("rho", "holds a value that is not positive", "Penalties are positive")
-            if len(shape) == 2 and self.iterations % shape[0]:
-                fail("iterations", f"{self.iterations} for {shape[0]} stages", "Use a multiple")
+        shape = np.shape(self.rho)
+        if len(shape) > 2 or (shape and shape[-1] not in (1, rows)):
+            fail("rho", f"shape {shape}", f"Give (), ({rows},) or (stages, {rows})")
+        if concrete(self.rho) and not np.all(np.asarray(self.rho) > 0):
+            fail("rho", "holds a value that is not positive", "Penalties are positive")
+        if len(shape) == 2 and self.iterations % shape[0]:
+            fail("iterations", f"{self.iterations} for {shape[0]} stages", "Use a multiple")
         if concrete(self.alpha) and not 0 < float(np.asarray(self.alpha)) < 2:
             fail("alpha", f"{self.alpha}", "Over-relaxation lies in (0, 2); 1.6 is usual")
 
@@ -112,9 +112,8 @@ def factor(P: Array, A: Array, solver: ADMM) -> Factor:
     """Scale, choose rho and invert; depends on nothing that differs between initial states."""
     T, E, H, A_w = scale(P, A)
     n, m = A_w.shape[1], A_w.shape[0]
-    rho = automatic_rho(A_w) if solver.rho is None else jnp.asarray(solver.rho, P.dtype)
-    rho = jnp.broadcast_to(rho if rho.ndim == 2 else rho[None], (max(rho.ndim == 2 and
-          rho.shape[0], 1), m))  # fmt: skip
+    rho = jnp.asarray(solver.rho, P.dtype)
+    rho = jnp.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, m))
     ridge = 10 * jnp.finfo(P.dtype).eps
 
     def stage(R: Array) -> tuple[Array, Array]:
@@ -128,36 +127,32 @@ def factor(P: Array, A: Array, solver: ADMM) -> Factor:
     return Factor(T, E, H, A_w, rho, F, matmul(A_w, F), jnp.stack([Minv for _, Minv in stages]))
 
 
-def automatic_rho(A_w: Array) -> Array:
-    """One penalty for all rows, from the singular values of the scaled rows."""
-    return jnp.asarray(1.0, A_w.dtype)
-
-
 def step(t: Array, b: Array, l: Array, u: Array, G: Array, alpha: Any) -> Array:
-    """One ADMM step on t = s + v. Columns of t are instances when it is a matrix."""
+    """One ADMM step on t = s + v (m,)."""
     s = jnp.clip(t, l, u)
-    return t + alpha * (matmul(G, 2 * s - t) + b - s)
+    return t + alpha * (matmul(2 * s - t, G.T) + b - s)
 
 
 def iterate(
     factor: Factor, q: Array, l: Array, u: Array, t: Array, iterations: int, alpha: Any
 ) -> tuple[Array, Array]:
-    """Run the fixed loop in scaled coordinates; returns the last two t.
-
-    q (n,) or (n, B) is T'q; l, u, t are (m,) or (m, B).
-    """
+    """Run the fixed loop in scaled coordinates, q = T'q (n,), l, u, t (m,); the last two t."""
     stages = factor.rho.shape[0]
     previous = t
     for i in range(stages):
-        b = -matmul(factor.A, matmul(factor.Minv[i], q))
+        G, b = factor.G[i], -matmul(matmul(q, factor.Minv[i]), factor.A.T)
         if i > 0:  # the multiplier R v is what carries over, not v
-            ratio = factor.rho[i - 1] / factor.rho[i]
             s = jnp.clip(t, l, u)
-            t = s + (ratio if t.ndim == 1 else ratio[:, None]) * (t - s)
-        G = factor.G[i]
-
-        def body(carry, _, b=b, G=G):
-            return (step(carry[0], b, l, u, G, alpha), carry[0]), None
-
-        (t, previous), _ = jax.lax.scan(body, (t, previous), length=iterations // stages)
+            t = s + factor.rho[i - 1] / factor.rho[i] * (t - s)
+        advance = lambda t, _=None, G=G, b=b: (step(t, b, l, u, G, alpha), None)
+        if iterations:
+            previous, _ = jax.lax.scan(advance, t, length=iterations // stages - 1)
+            t, _ = advance(previous)
     return t, previous
+
+
+def read(factor: Factor, t: Array, q: Array, l: Array, u: Array) -> tuple[Array, Array]:
+    """Primal w (n,) and multiplier R v (m,), both scaled, that t stands for at the last stage."""
+    s = jnp.clip(t, l, u)
+    w = matmul(2 * s - t, factor.F[-1].T) - matmul(q, factor.Minv[-1])
+    return w, factor.rho[-1] * (t - s)

@@ -23,16 +23,18 @@ def farkas(qp: QP, y: Array) -> tuple[Array, Array]:
     """
     eps = jnp.finfo(y.dtype).eps
     m, n = qp.A.shape
+    if m == 0:
+        return y, jnp.asarray(False)
     length = jnp.max(jnp.abs(y), initial=0.0)
     y = admissible(jnp.where(length > 0, y / jnp.where(length > 0, length, 1.0), 0.0), qp.l, qp.u)
 
-    # Row i(j) bounds variable j alone and on both sides.
-    bounded = jnp.isfinite(qp.l) & jnp.isfinite(qp.u)
-    single = (jnp.sum(qp.A != 0, axis=1) == 1) & bounded
+    # Row i(j) bounds variable j alone. The choice rests on A only, so a batch shares it.
+    single = jnp.sum(qp.A != 0, axis=1) == 1
     entries = jnp.where(single[:, None], jnp.abs(qp.A), 0.0)
-    row = jnp.argmax(entries, axis=0) if m else jnp.zeros(n, int)
-    has_row = jnp.max(entries, axis=0, initial=0.0) > 0
-    pivot = jnp.where(has_row, qp.A[row, jnp.arange(n)], 1.0)
+    row = jnp.argmax(entries, axis=0)
+    pivot = jnp.where(entries[row, jnp.arange(n)] > 0, qp.A[row, jnp.arange(n)], 1.0)
+    bounded = jnp.isfinite(qp.l) & jnp.isfinite(qp.u)
+    has_row = (entries[row, jnp.arange(n)] > 0) & bounded[row]
     y = y.at[row].add(jnp.where(has_row, -matmul(y, qp.A) / pivot, 0.0))
 
     left = jnp.abs(matmul(y, qp.A))
@@ -57,8 +59,8 @@ def descent_ray(qp: QP, d: Array, tolerance: Array) -> tuple[Array, Array]:
     """
     length = jnp.max(jnp.abs(d), initial=0.0)
     d = jnp.where(length > 0, d / jnp.where(length > 0, length, 1.0), 0.0)
-    Ad = matmul(qp.A, d)
-    flat = jnp.all(jnp.abs(matmul(qp.P, d)) <= tolerance)
+    Ad = matmul(d, qp.A.T)
+    flat = jnp.all(jnp.abs(matmul(d, qp.P)) <= tolerance)
     stays = jnp.all(jnp.isposinf(qp.u) | (Ad <= tolerance)) & jnp.all(
         jnp.isneginf(qp.l) | (Ad >= -tolerance)
     )

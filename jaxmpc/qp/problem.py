@@ -15,13 +15,26 @@ PRECISION = jax.lax.Precision.HIGHEST
 
 
 def matmul(a: Array, b: Array) -> Array:
-    """Matrix product at full precision of the data's type."""
+    """Matrix product at full precision of the data's type.
+
+    Vectors stand on the left, x'M: under `vmap` with M unbatched that is one product of the
+    batch (B, n)·(n, m) without a transposition.
+    """
     return jnp.matmul(a, b, precision=PRECISION)
+
+
+def arrays(tree: Any) -> Any:
+    """Leaves as JAX arrays of the present precision, before they enter `jit`.
+
+    (`jit` mixes up host arrays that it has seen under the other setting of 64-bit mode.)
+    """
+    cast = lambda v: jnp.asarray(v, jax.dtypes.canonicalize_dtype(jnp.result_type(v)))
+    return jax.tree.map(cast, tree)
 
 
 def floating_dtype(tree: Any) -> Any:
     """The widest floating type among the leaves; JAX's default float where there is none."""
-    types = [leaf.dtype for leaf in map(jnp.asarray, jax.tree.leaves(tree))]
+    types = [leaf.dtype for leaf in jax.tree.leaves(arrays(tree))]
     floats = [dtype for dtype in types if jnp.issubdtype(dtype, jnp.floating)]
     return jnp.result_type(*floats) if floats else jnp.result_type(float)
 
@@ -140,7 +153,7 @@ def residuals(qp: QP, z: Array, y: Array) -> tuple[Array, Array, Array]:
 def residual_sizes(qp: QP, z: Array, y: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
     """The three residuals followed by the size of the terms each is a difference of."""
     norm = lambda v: jnp.max(jnp.abs(v), initial=0.0)
-    Az, Pz, Aty = matmul(qp.A, z), matmul(qp.P, z), matmul(y, qp.A)
+    Az, Pz, Aty = matmul(z, qp.A.T), matmul(z, qp.P), matmul(y, qp.A)
     support = bound_product(y, qp.l, qp.u)
     quadratic, linear = jnp.sum(z * Pz), jnp.sum(z * qp.q)
     return (

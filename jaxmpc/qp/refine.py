@@ -48,33 +48,30 @@ def newton_step(
     this set as it was has reached the minimum.
     """
     n = w.shape[0]
-    s = matmul(A, w) + y / rho
+    s = matmul(w, A.T) + y / rho
     e = s - jnp.clip(s, l, u)
     active = (e != 0).astype(w.dtype)
-    gradient = matmul(H, w) + q + rho * matmul(e, A)
+    gradient = matmul(w, H) + q + rho * matmul(e, A)
     K = H + rho * products(active)
     # Keeps K definite where active rows and curvature leave a direction free.
     ridge = 10 * jnp.finfo(w.dtype).eps * (jnp.trace(K) / n + rho)
     d = -cho_solve((jnp.linalg.cholesky(K + ridge * jnp.eye(n, dtype=w.dtype)), True), gradient)
 
     # φ along w + t d costs no product with A: three scalars and A d.
-    Ad, slope, curvature = matmul(A, d), jnp.sum(d * (matmul(H, w) + q)), jnp.sum(
-        d * matmul(H, d)
-    )  # fmt: skip
+    Ad = matmul(d, A.T)
+    slope, curvature = jnp.sum(d * (matmul(w, H) + q)), jnp.sum(d * matmul(d, H))
 
-    def value(t: float) -> tuple[Array, Array]:
-        moved = s + t * Ad
-        excess = moved - jnp.clip(moved, l, u)
-        return t * slope + 0.5 * t * t * curvature + 0.5 * rho * jnp.sum(excess**2), excess
+    def excess(t: Array | float) -> Array:
+        return s + t * Ad - jnp.clip(s + t * Ad, l, u)
 
-    trials = [value(t) for t in STEP_LENGTHS]
-    values = jnp.stack([phi for phi, _ in trials])
-    best = jnp.argmin(values)
-    t = jnp.asarray(STEP_LENGTHS, w.dtype)[best]
-    moved = s + t * Ad
-    e_next = moved - jnp.clip(moved, l, u)
-    minimised = (best == 0) & jnp.all((e_next != 0) == (e != 0))
-    return w + t * d, e_next, minimised
+    def value(t: float) -> Array:
+        return t * slope + 0.5 * t * t * curvature + 0.5 * rho * jnp.sum(excess(t) ** 2)
+
+    # Where the full step keeps the set it is the minimum, whatever rounding makes of the values.
+    minimised = jnp.all(jnp.sign(excess(1.0)) == jnp.sign(e))
+    best = jnp.argmin(jnp.stack([value(t) for t in STEP_LENGTHS]))
+    t = jnp.where(minimised, 1.0, jnp.asarray(STEP_LENGTHS, w.dtype)[best])
+    return w + t * d, excess(t), minimised
 
 
 def least_distance(A: Array, l: Array, u: Array, w: Array, steps: int) -> tuple[Array, Array]:
@@ -96,17 +93,21 @@ def least_distance(A: Array, l: Array, u: Array, w: Array, steps: int) -> tuple[
 
 def polish(
     H: Array, q: Array, A: Array, l: Array, u: Array, w: Array, y: Array, steps: int
-) -> tuple[Array, Array]:
-    """Method of multipliers on (w, y) from ADMM's answer: a Newton step each time, and a
+) -> tuple[Array, Array, Array]:
+    """Method of multipliers on (w, y) from ADMM's answer: a Newton step each time, and the
     multiplier update y = ρ e each time φ is minimised; linear convergence with factor ~1/ρ.
+
+    Returns w, y and the last change of y, which on an infeasible program tends to a Farkas
+    vector.
     """
     products = gram(A)
     rho = 1e4 if w.dtype == jnp.float64 else 1e2
 
     def body(carry, _):
-        w, y = carry
+        w, y, change = carry
         w, e, minimised = newton_step(w, y, H, q, A, l, u, rho, products)
-        return (w, jnp.where(minimised, rho * e, y)), None
+        change = jnp.where(minimised, rho * e - y, change)
+        return (w, jnp.where(minimised, rho * e, y), change), None
 
-    (w, y), _ = jax.lax.scan(body, (w, y), length=steps)
-    return w, y
+    (w, y, change), _ = jax.lax.scan(body, (w, y, jnp.zeros_like(y)), length=steps)
+    return w, y, change

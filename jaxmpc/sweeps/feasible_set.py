@@ -15,6 +15,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
 from jaxmpc.sweeps import proofs
 from jaxmpc.sweeps.boundary import Rays
+from jaxmpc.sweeps.compiled import Compiled, first_rows, padded
 from jaxmpc.sweeps.ladder import Verdict, admm_rung, newton_rung, rows
 from jaxmpc.sweeps.proofs import make_view
 
@@ -86,21 +87,6 @@ class Labels:
         self.cut_offsets[where] = np.where(infeasible, verdict.offset, np.nan)
 
 
-class Compiled:
-    """A jitted function whose compilation is timed apart, once for each shape."""
-
-    def __init__(self, function: Any) -> None:
-        self.function, self.programs, self.seconds = function, {}, 0.0
-
-    def __call__(self, *args: Any) -> Any:
-        key = tuple(np.shape(leaf) for leaf in jax.tree.leaves(args))
-        if key not in self.programs:
-            start = time.perf_counter()
-            self.programs[key] = self.function.lower(*args).compile()
-            self.seconds += time.perf_counter() - start
-        return jax.tree.map(np.asarray, self.programs[key](*args))
-
-
 def label_chunks(
     mpc: MPC, points: Any, *, axes: Any = None, fixed: Any = None, iterations: int = 50,
     dtype: Any = "float32", chunk: int = CHUNK,
@@ -133,7 +119,7 @@ def label_chunks(
         labels = Labels.empty(len(x), mpc.horizon, mpc.system.m, d)
         with jax.enable_x64(True):
             verdict, w = admm(problem, moving, padded(x, chunk))
-            labels.put(slice(None), jax.tree.map(lambda v, b=len(x): v[:b], verdict))
+            labels.put(slice(None), first_rows(verdict, len(x)))
             w = w[: len(x)].astype(np.float64)
             for _ in range(NEWTON_ROUNDS):
                 left = np.flatnonzero((labels.label == 0) & ok)
@@ -143,7 +129,7 @@ def label_chunks(
                         problem, moving, padded(x[batch], NEWTON_BATCH),
                         padded(w[batch], NEWTON_BATCH),
                     )  # fmt: skip
-                    labels.put(batch, jax.tree.map(lambda v, b=len(batch): v[:b], verdict))
+                    labels.put(batch, first_rows(verdict, len(batch)))
                     w[batch] = better[: len(batch)]
         blank = Labels.empty(int(np.sum(~ok)), mpc.horizon, mpc.system.m, d)
         for name in ("label", "plans", "cut_normals", "cut_offsets"):
@@ -152,11 +138,6 @@ def label_chunks(
         compiled = admm.seconds + newton.seconds - compiled
         spent = time.perf_counter() - begun - compiled
         yield here, replace(labels, compile_seconds=compiled, run_seconds=spent)
-
-
-def padded(x: np.ndarray, size: int) -> np.ndarray:
-    """Rows repeated up to `size`, so that few shapes compile."""
-    return np.concatenate([x, np.broadcast_to(x[:1], (size - len(x), *x.shape[1:]))])
 
 
 @dataclass(frozen=True)
@@ -335,12 +316,13 @@ def map_feasible_set(
     with tqdm(total=len(points), unit="pt", disable=not progress) as bar:
         for here, part in chunks:
             if labels is None:
-                shape = part.plans.shape[1:]
-                labels = Labels.empty(len(points), *shape, part.cut_normals.shape[1])
+                _, N, m = part.plans.shape
+                labels = Labels.empty(len(points), N, m, part.cut_normals.shape[1])
             labels = joined(labels, here, part)
             bar.update(len(part.label))
     if labels is None:
-        labels = Labels.empty(0, mpc.horizon, mpc.system.m, len(make_view(mpc, axes, fixed).axes))
+        d = len(make_view(mpc, axes, fixed).axes)
+        labels = Labels.empty(0, mpc.horizon, mpc.system.m, d)
     result = FeasibleSetMap.of(mpc, points, axes, fixed, labels)
     return result if refine is None else result.refine(refine)
 

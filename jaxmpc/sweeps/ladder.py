@@ -141,13 +141,12 @@ def admm_rung(iterations: int, dtype: Any) -> Callable[..., tuple[Verdict, Array
         l = (jnp.asarray(rows.lower)[:, None] - shift).astype(dtype)
         u = (jnp.asarray(rows.upper)[:, None] - shift).astype(dtype)
 
-        def step(carry, _):
-            t, _ = carry
+        def step(t, _=None):
             s = jnp.clip(t, l, u)
-            return (t + ALPHA * (matmul(U, matmul(U.T, 2 * s - t)) - s), t), None
+            return t + ALPHA * (matmul(U, matmul(U.T, 2 * s - t)) - s), None
 
-        t = jnp.clip(jnp.zeros_like(l), l, u)
-        (t, before), _ = jax.lax.scan(step, (t, t), length=iterations)
+        before, _ = jax.lax.scan(step, jnp.clip(jnp.zeros_like(l), l, u), length=iterations - 1)
+        t, _ = step(before)
         excess = lambda t: t - jnp.clip(t, l, u)
         w = matmul(U.T, jnp.clip(t, l, u) - excess(t))
         change = excess(t) - excess(before)

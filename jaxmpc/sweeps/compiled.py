@@ -1,0 +1,33 @@
+"""What the drivers of batches share: compile once a shape, timed apart; pad to few shapes."""
+
+import time
+from typing import Any
+
+import jax
+import numpy as np
+
+
+class Compiled:
+    """A jitted function, compiled ahead once for each shape; `seconds` spent on that so far."""
+
+    def __init__(self, function: Any) -> None:
+        self.function, self.seconds = function, 0.0
+        self.programs: dict[tuple[tuple[int, ...], ...], Any] = {}
+
+    def __call__(self, *args: Any) -> Any:
+        key = tuple(np.shape(leaf) for leaf in jax.tree.leaves(args))
+        if key not in self.programs:
+            start = time.perf_counter()
+            self.programs[key] = self.function.lower(*args).compile()
+            self.seconds += time.perf_counter() - start
+        return jax.tree.map(np.asarray, self.programs[key](*args))
+
+
+def padded(x: np.ndarray, size: int) -> np.ndarray:
+    """The first row repeated up to `size` rows."""
+    return np.concatenate([x, np.broadcast_to(x[:1], (size - len(x), *x.shape[1:]))])
+
+
+def first_rows(tree: Any, count: int) -> Any:
+    """The leaves without what `padded` added."""
+    return jax.tree.map(lambda v: v[:count], tree)

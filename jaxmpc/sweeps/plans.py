@@ -1,0 +1,155 @@
+"""Optimal plans from many states: the adaptive driver round the fixed-count solver.
+
+`jax.vmap(solve)` gives every state the same number of steps. Here a short ADMM run, in float32
+if wished, and one Newton step serve all; the states whose residuals are not small enough are
+gathered, and Newton goes on with these until they are solved or proved infeasible.
+"""
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import fail
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.solve import Controller
+from jaxmpc.qp.admm import ADMM, Factor, iterate, read
+from jaxmpc.qp.problem import QP, QPSolution
+from jaxmpc.qp.refine import polish
+from jaxmpc.qp.solve import assess, cleaned, marked, scaled
+from jaxmpc.qp.status import Status
+from jaxmpc.sweeps.compiled import Compiled, padded
+
+CHUNK = 8192
+NEWTON_BATCH = 512
+NEWTON_STEPS = 4
+NEWTON_ROUNDS = 8
+
+
+@dataclass(frozen=True)
+class Plans:
+    """Plans from B states as host arrays: inputs (B, N, m), cost (B,) without ½, status (B,),
+    residuals (B,) of each condensed QP, and the seconds spent compiling and running.
+    """
+
+    inputs: np.ndarray
+    cost: np.ndarray
+    status: np.ndarray
+    primal_residual: np.ndarray
+    dual_residual: np.ndarray
+    gap: np.ndarray
+    compile_seconds: float
+    run_seconds: float
+
+
+def solve_many(
+    mpc: MPC, x0s: Any, solver: ADMM = ADMM(), *, dtype: Any = "float32", chunk: int = CHUNK  # noqa: B008
+) -> Plans:  # fmt: skip
+    """Solve the MPC problem from each state x0s (B, n) to residuals of solver.eps in float64.
+
+    dtype: type of the ADMM iterates; polish, residuals and status are float64 whatever it is.
+    `solver.refine` is not used: Newton steps go where they are needed. A state with NaN gets
+    status NON_FINITE. Raises ValueError for wrong shapes and ill-posed problems.
+    """
+    x0s = np.asarray(x0s, np.float64)
+    if x0s.ndim != 2 or x0s.shape[1] != mpc.system.n:
+        fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.system.n})")
+    with jax.enable_x64(True):
+        begun = time.perf_counter()
+        controller = Controller(jax.tree.map(np.float64, mpc), solver)
+        first, more = Compiled(first_rung(np.dtype(dtype))), Compiled(newton_rung)
+        size = min(chunk, max(len(x0s), 1))
+        parts = [
+            one_chunk(controller, first, more, x0s[i : i + size], size)
+            for i in range(0, len(x0s), size)
+        ]
+        compiled = first.seconds + more.seconds
+        spent = time.perf_counter() - begun - compiled
+    if not parts:
+        parts = [(np.zeros((0, mpc.horizon, mpc.system.m)), *(np.zeros(0),) * 5)]
+    inputs, cost, status, primal, dual, gap = map(np.concatenate, zip(*parts, strict=True))
+    return Plans(inputs, cost, status, primal, dual, gap, compiled, spent)
+
+
+def one_chunk(
+    controller: Controller, first: Compiled, more: Compiled, x: np.ndarray, size: int
+) -> tuple[np.ndarray, ...]:
+    """All rungs on one chunk of states."""
+    keep = len(x)
+    answer = [np.array(v[:keep]) for v in first(controller, padded(x, size))]
+    for _ in range(NEWTON_ROUNDS):
+        left = np.flatnonzero(answer[2] == Status.ITERATION_LIMIT)
+        for i in range(0, len(left), NEWTON_BATCH):
+            batch = left[i : i + NEWTON_BATCH]
+            w, y = answer[-2][batch], answer[-1][batch]
+            better = more(controller, *(padded(v, NEWTON_BATCH) for v in (x[batch], w, y)))
+            for old, new in zip(answer, better, strict=True):
+                old[batch] = new[: len(batch)]
+    return tuple(answer[:-2])
+
+
+def first_rung(dtype: Any) -> Any:
+    """Compiled: ADMM in `dtype` and one Newton step in float64, for all states."""
+
+    @jax.jit
+    def rung(controller: Controller, x: Array) -> tuple[Array, ...]:
+        solver, f = controller.solver, controller.factor
+        assert f is not None
+        short = jax.tree.map(lambda v: v.astype(dtype), f)
+
+        def one(x0: Array) -> tuple[Array, ...]:
+            qp, finite = program(controller, x0)
+            q, l, u = (v.astype(dtype) for v in scaled(f, qp))
+            t, before = iterate(short, q, l, u, jnp.zeros_like(l), solver.iterations, solver.alpha)
+            (w, y), (_, y_old) = read(short, t, q, l, u), read(short, before, q, l, u)
+            w, y, change = (v.astype(x0.dtype) for v in (w, y, y - y_old))
+            return finish(controller, f, x0, qp, finite, w, y, [change], 1)
+
+        return jax.vmap(one)(x)
+
+    return rung
+
+
+@jax.jit
+def newton_rung(controller: Controller, x: Array, w: Array, y: Array) -> tuple[Array, ...]:
+    """Compiled: more Newton steps in float64 from (w, y), for gathered states."""
+    f = controller.factor
+    assert f is not None
+
+    def one(x0: Array, w: Array, y: Array) -> tuple[Array, ...]:
+        qp, finite = program(controller, x0)
+        return finish(controller, f, x0, qp, finite, w, y, [], NEWTON_STEPS)
+
+    return jax.vmap(one)(x, w, y)
+
+
+def program(controller: Controller, x0: Array) -> tuple[QP, Array]:
+    """The QP at x0, made harmless where x0 is not finite."""
+    assert controller.condensed is not None
+    return cleaned(controller.condensed.qp(x0))
+
+
+def finish(
+    controller: Controller, f: Factor, x0: Array, qp: QP, finite: Array, w: Array, y: Array,
+    proofs: list[Array], steps: int,
+) -> tuple[Array, ...]:  # fmt: skip
+    """Polish, judge, and lay out: inputs, cost, status, three residuals, and (w, y) to go on."""
+    c = controller.condensed
+    assert c is not None
+    w, y, change = polish(f.H, *scaled_rows(f, qp), w, y, steps)
+    s: QPSolution = marked(
+        assess(qp, f, [(w, y)], [*proofs, change], jnp.zeros_like(w), controller.solver), finite
+    )
+    states, inputs = c.trajectory(x0, s.z)
+    cost = controller.cost(states, inputs)
+    return inputs, cost, s.status, s.primal_residual, s.dual_residual, s.gap, w, y
+
+
+def scaled_rows(f: Factor, qp: QP) -> tuple[Array, Array, Array, Array]:
+    """q, A, l, u in scaled coordinates, as `polish` takes them."""
+    q, l, u = scaled(f, qp)
+    return q, f.A, l, u

@@ -1,0 +1,199 @@
+"""Independent checks in exact rational arithmetic. Nothing here uses the library's algorithms.
+
+A float64 is a rational number, so the feasible set of a planar problem with the very data that
+the library is given can be found without any rounding, by the backward recursion
+S_k = X_k ∩ A⁻¹(S_{k+1} − c ⊕ −B U) on polygons.
+"""
+
+from dataclasses import dataclass
+from fractions import Fraction as Q
+
+import numpy as np
+
+import jaxmpc as jm
+
+
+def rational(array) -> list:
+    """Nested lists of Fractions, each exactly the float it comes from."""
+    array = np.asarray(array, np.float64)
+    return [rational(row) for row in array] if array.ndim else Q(float(array))
+
+
+def dot(a, b) -> Q:
+    """Exact a'b."""
+    return sum((x * y for x, y in zip(a, b, strict=True)), Q(0))
+
+
+def two_sided(set_) -> list:
+    """Rows (h, lower, upper) of a set as Fractions; None for an infinite bound."""
+    if set_ is None:
+        return []
+    if isinstance(set_, jm.Box):
+        H, lower, upper = np.eye(len(set_.lower)), set_.lower, set_.upper
+    else:
+        H, lower, upper = set_.H, np.full(len(set_.h), -np.inf), set_.h
+    limit = lambda v: Q(float(v)) if np.isfinite(v) else None
+    return [(rational(h), limit(lo), limit(hi)) for h, lo, hi in zip(H, lower, upper, strict=True)]
+
+
+def holds(rows, x) -> bool:
+    """True if x keeps every row, exactly."""
+    values = [(dot(h, x), lo, hi) for h, lo, hi in rows]
+    return all((lo is None or lo <= v) and (hi is None or v <= hi) for v, lo, hi in values)
+
+
+def keeps_all_rows(mpc, x0, plan) -> bool:
+    """True if the inputs (N, m) keep every constraint from x0, exactly."""
+    A, B = rational(mpc.system.A), rational(mpc.system.B)
+    c = [Q(0)] * len(A) if mpc.system.c is None else rational(mpc.system.c)
+    states, last, inputs = (two_sided(s) for s in (mpc.states, mpc.terminal_set, mpc.inputs))
+    x = rational(x0)
+    for k, u in enumerate(rational(plan)):
+        if (k > 0 or mpc.constrain_initial) and not holds(states, x):
+            return False
+        if not holds(inputs, u):
+            return False
+        x = [dot(a, x) + dot(b, u) + drift for a, b, drift in zip(A, B, c, strict=True)]
+    return holds(last, x)
+
+
+def proves_empty(A, l, u, y) -> bool:
+    """True if y proves {z: l ≤ Az ≤ u} empty, exactly: Σ u y⁺ − l y⁻ < min (A'y)'z over the box
+    that rows of a single entry put around z; a variable without such a box must have (A'y)_j = 0.
+    """
+    y, rows = rational(y), rational(A)
+    support = Q(0)
+    for value, lo, hi in zip(y, l, u, strict=True):
+        bound = hi if value > 0 else lo
+        if value != 0 and not np.isfinite(bound):
+            return False
+        support += value * Q(float(bound)) if value != 0 else 0
+    least = Q(0)
+    for j in range(len(rows[0])):
+        left = dot([row[j] for row in rows], y)
+        if left == 0:
+            continue
+        values = []
+        for row, lo, hi in zip(rows, l, u, strict=True):
+            entries = [i for i, v in enumerate(row) if v != 0]
+            if entries == [j] and np.isfinite(lo) and np.isfinite(hi):
+                values.append(sorted([Q(float(lo)) / row[j], Q(float(hi)) / row[j]]))
+        if not values:
+            return False
+        # Any one of the boxes is valid; the best one proves most.
+        least += max(min(left * lo, left * hi) for lo, hi in values)
+    return support < least
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """A convex polygon: vertices counter-clockwise, pairs of Fractions."""
+
+    vertices: tuple
+
+    @property
+    def area(self) -> Q:
+        """Exact area (shoelace formula)."""
+        v = self.vertices
+        return sum(p[0] * q[1] - p[1] * q[0] for p, q in zip(v, v[1:] + v[:1], strict=True)) / 2
+
+    @property
+    def facets(self) -> list:
+        """[(a, b)] with a'x ≤ b on the polygon."""
+        v = self.vertices
+        normals = [(q[1] - p[1], p[0] - q[0]) for p, q in zip(v, v[1:] + v[:1], strict=True)]
+        return [(a, dot(a, p)) for a, p in zip(normals, v, strict=True)]
+
+    def support(self, a) -> Q:
+        """Exact maximum of a'x."""
+        a = rational(a)
+        return max(dot(a, v) for v in self.vertices)
+
+    def contains(self, points) -> np.ndarray:
+        """Exact membership of float points (B, 2). Floats decide where they are sure to."""
+        points = np.asarray(points, float)
+        inside = np.ones(len(points), bool)
+        for a, b in self.facets:
+            scale = max(abs(a[0]), abs(a[1]))
+            a, b = (a[0] / scale, a[1] / scale), b / scale
+            value = points @ np.array([float(a[0]), float(a[1])]) - float(b)
+            sure = np.abs(value) > 1e-13 * (1 + np.abs(points).sum(axis=1) + abs(float(b)))
+            inside &= np.where(sure, value < 0, True)
+            for i in np.flatnonzero(~sure & inside):
+                inside[i] = dot(a, rational(points[i])) <= b
+        return inside
+
+    def distance(self, points) -> np.ndarray:
+        """Least facet slack |b − a'x|/|a| of each point, as floats: how near to a tie it is."""
+        slack = [
+            (float(b) - points @ np.array([float(a[0]), float(a[1])]))
+            / np.hypot(float(a[0]), float(a[1]))
+            for a, b in self.facets
+        ]
+        return np.abs(np.min(slack, axis=0))
+
+    def clip(self, a, b) -> "Polygon":
+        """The part with a'x ≤ b (Sutherland & Hodgman)."""
+        v, kept = self.vertices, []
+        for p, q in zip(v, v[1:] + v[:1], strict=True):
+            s, t = dot(a, p) - b, dot(a, q) - b
+            if s <= 0:
+                kept.append(p)
+            if (s < 0 < t) or (t < 0 < s):
+                w = s / (s - t)
+                kept.append((p[0] + w * (q[0] - p[0]), p[1] + w * (q[1] - p[1])))
+        return hull(kept)
+
+    def within(self, rows) -> "Polygon":
+        """The part that keeps two-sided rows."""
+        body = self
+        for h, lower, upper in rows:
+            body = body if upper is None else body.clip(h, upper)
+            body = body if lower is None else body.clip([-v for v in h], -lower)
+        return body
+
+
+def hull(points) -> Polygon:
+    """Exact convex hull without collinear points (Andrew's monotone chain)."""
+    points = sorted(set(points))
+
+    def chain(points):
+        out = []
+        for p in points:
+            while len(out) > 1 and (
+                (out[-1][0] - out[-2][0]) * (p[1] - out[-2][1])
+                <= (out[-1][1] - out[-2][1]) * (p[0] - out[-2][0])
+            ):
+                out.pop()
+            out.append(p)
+        return out[:-1]
+
+    return Polygon(tuple(chain(points) + chain(points[::-1])) if len(points) > 2 else tuple(points))
+
+
+def feasible_polygon(mpc) -> Polygon:
+    """Exact feasible set of a planar problem with bounded sets and inputs, invertible A."""
+    (a, b), (c, d) = rational(mpc.system.A)
+    drift = [Q(0)] * 2 if mpc.system.c is None else rational(mpc.system.c)
+    determinant = a * d - b * c
+    back = lambda p: (
+        (d * (p[0] - drift[0]) - b * (p[1] - drift[1])) / determinant,
+        (a * (p[1] - drift[1]) - c * (p[0] - drift[0])) / determinant,
+    )
+    far = Q(10) ** 6
+    plane = Polygon(((-far, -far), (far, -far), (far, far), (-far, far)))
+    states = two_sided(mpc.states)
+    body = plane.within(two_sided(mpc.terminal_set)) if mpc.terminal_set is not None else None
+    for k in reversed(range(mpc.horizon)):
+        if body is not None:
+            points = body.vertices
+            for column, (_, lo, hi) in zip(
+                zip(*rational(mpc.system.B), strict=True), two_sided(mpc.inputs), strict=True
+            ):
+                points = hull(
+                    [(p[0] - column[0] * u, p[1] - column[1] * u) for p in points for u in (lo, hi)]
+                ).vertices
+            body = hull([back(p) for p in points])
+        if k > 0 or mpc.constrain_initial:
+            body = (plane if body is None else body).within(states)
+    return body

@@ -1,0 +1,620 @@
+"""The QP solver against programs with known answers, exact certificates and finite differences."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import chex
+import exact
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import enable_x64
+
+import jaxmpc as jm
+from jaxmpc.qp.problem import bound_product, residuals
+
+INF = np.inf
+FINE = jm.ADMM(iterations=400, refine=30, eps=1e-9)
+
+
+def constructed(n: int, seed: int, curvature: str = "definite"):
+    """A QP built from its answer: (qp, z, y), with z and y unique.
+
+    Draw z, one multiplier for each active row, and derive q = −Pz − A'y, l and u. Rows: active
+    above, active below, equality, inactive, free, zero. With singular or zero P the n active
+    rows fix z alone.
+    """
+    rng = np.random.default_rng(seed)
+    active = n if curvature != "definite" else max(n // 2, 1)
+    kinds = rng.permutation(
+        ["upper", "lower", "equal"] * (active // 3) + ["upper"] * (active % 3)
+        + ["inactive"] * n + ["free", "zero", "one-sided"]
+    )  # fmt: skip
+    m = len(kinds)
+    A, z, y = rng.standard_normal((m, n)), rng.standard_normal(n), np.zeros(m)
+    A[kinds == "zero"] = 0.0
+    rank = {"definite": n, "singular": n // 2, "zero": 0}[curvature]
+    factor = rng.standard_normal((n, rank))
+    P = factor @ factor.T + (0.5 * np.eye(n) if curvature == "definite" else 0.0)
+    value, slack = A @ z, rng.uniform(0.2, 2.0, (2, m))
+    l, u = value - slack[0], value + slack[1]
+    l[np.isin(kinds, ["free", "one-sided"])], u[kinds == "free"] = -INF, INF
+    push = rng.uniform(0.1, 3.0, m)
+    upper, lower, equal = kinds == "upper", kinds == "lower", kinds == "equal"
+    u[upper], y[upper] = value[upper], push[upper]
+    l[lower], y[lower] = value[lower], -push[lower]
+    l[upper & (rng.uniform(size=m) < 0.5)] = -INF
+    l[equal], u[equal] = value[equal], value[equal]
+    y[equal] = (push * rng.choice([-1, 1], m))[equal]
+    return jm.QP(P=P, q=-P @ z - A.T @ y, A=A, l=l, u=u), z, y
+
+
+def box(n: int, radius: float = 1.0, **fields) -> jm.QP:
+    """min ½|z|² over |z_i| ≤ radius."""
+    r = np.full(n, radius)
+    return replace(jm.QP(P=np.eye(n), q=np.zeros(n), A=np.eye(n), l=-r, u=r), **fields)
+
+
+def as32(qp: jm.QP) -> jm.QP:
+    return jax.tree.map(np.float32, qp)
+
+
+@pytest.fixture
+def x64():
+    with enable_x64(True):
+        yield
+
+
+class TestKnownAnswers:
+    @pytest.mark.parametrize("n", [1, 2, 5, 20, 60])
+    @pytest.mark.parametrize("curvature", ["definite", "singular", "zero"])
+    def test_float64(self, x64, n, curvature):
+        for seed in range(3):
+            qp, z, y = constructed(n, seed, curvature)
+            sol = jm.solve_qp(qp, FINE)
+            assert sol.status == jm.Status.SOLVED
+            assert sol.z.dtype == jnp.float64
+            np.testing.assert_allclose(sol.z, z, atol=1e-8 * (1 + np.abs(z).max()))
+            np.testing.assert_allclose(sol.y, y, atol=1e-6)
+
+    @pytest.mark.parametrize("n", [2, 8, 20])
+    def test_float32(self, n):
+        for seed in range(3):
+            qp, z, y = constructed(n, seed)
+            sol = jm.solve_qp(as32(qp), jm.ADMM(iterations=400))
+            assert sol.status == jm.Status.SOLVED
+            assert sol.z.dtype == jnp.float32
+            np.testing.assert_allclose(sol.z, z, atol=2e-3)
+            np.testing.assert_allclose(sol.y, y, atol=2e-2)
+
+    def test_default_settings_solve_most(self, x64):
+        status = [jm.solve_qp(constructed(10, seed)[0]).status for seed in range(20)]
+        assert np.mean(np.array(status) == jm.Status.SOLVED) >= 0.9
+
+    @pytest.mark.parametrize("scale", [1e-6, 1e6])
+    def test_units_do_not_matter(self, x64, scale):
+        """Rows, cost and variables in other units: same solution."""
+        qp, z, _ = constructed(6, 1)
+        rows = np.geomspace(1 / scale, scale, len(qp.l))
+        other = jm.QP(
+            P=qp.P * scale, q=qp.q * scale, A=rows[:, None] * qp.A, l=rows * qp.l, u=rows * qp.u
+        )
+        sol = jm.solve_qp(other, replace(FINE, eps=1e-3))
+        np.testing.assert_allclose(sol.z, z, atol=1e-7)
+
+    def test_no_rows(self, x64):
+        P, q = np.diag([1.0, 4.0]), np.array([1.0, -2.0])
+        sol = jm.solve_qp(jm.QP(P, q, np.zeros((0, 2)), np.zeros(0), np.zeros(0)))
+        assert sol.status == jm.Status.SOLVED
+        np.testing.assert_allclose(sol.z, [-1.0, 0.5], atol=1e-9)
+
+    def test_equality_alone(self, x64):
+        """KKT system solved by numpy."""
+        rng = np.random.default_rng(3)
+        P, A = np.diag(rng.uniform(0.5, 2, 6)), rng.standard_normal((3, 6))
+        q, b = rng.standard_normal(6), rng.standard_normal(3)
+        kkt = np.block([[P, A.T], [A, np.zeros((3, 3))]])
+        answer = np.linalg.solve(kkt, np.concatenate([-q, b]))
+        sol = jm.solve_qp(jm.QP(P, q, A, b, b), FINE)
+        np.testing.assert_allclose(np.concatenate([sol.z, sol.y]), answer, atol=1e-8)
+
+    def test_one_point_is_feasible(self, x64):
+        """l = u fixes every variable: never called infeasible, zero data included."""
+        for value in (0.0, 1.0, -3.0):
+            v = np.full(3, value)
+            sol = jm.solve_qp(box(3, l=v, u=v))
+            assert sol.status == jm.Status.SOLVED
+            np.testing.assert_allclose(sol.z, v, atol=1e-8)
+
+    def test_zero_everything(self):
+        zeros = np.zeros
+        sol = jm.solve_qp(jm.QP(zeros((2, 2)), zeros(2), zeros((3, 2)), zeros(3), zeros(3)))
+        assert sol.status == jm.Status.SOLVED
+        for iterations in (0, 1, 100):
+            sol = jm.solve_qp(
+                jm.QP(np.eye(2), zeros(2), np.ones((3, 2)), zeros(3), zeros(3)),
+                jm.ADMM(iterations=iterations),
+            )
+            assert sol.status != jm.Status.PRIMAL_INFEASIBLE
+
+    def test_duplicate_and_redundant_rows(self, x64):
+        qp, z, _ = constructed(5, 2)
+        twice = replace(
+            qp, A=np.vstack([qp.A, qp.A, 2 * qp.A]), l=np.concatenate([qp.l, qp.l, 2 * qp.l]),
+            u=np.concatenate([qp.u, qp.u, 2 * qp.u]),
+        )  # fmt: skip
+        sol = jm.solve_qp(twice, FINE)
+        assert sol.status == jm.Status.SOLVED
+        np.testing.assert_allclose(sol.z, z, atol=1e-7)
+
+    @pytest.mark.parametrize("name", ["osqp", "clarabel", "piqp"])
+    def test_another_solver(self, x64, name):
+        pytest.importorskip(name)
+        sparse = pytest.importorskip("scipy.sparse")
+        qpsolvers = pytest.importorskip("qpsolvers")
+        rng = np.random.default_rng(0)
+        n = 8
+        M = rng.standard_normal((n, n))
+        data = dict(
+            P=M @ M.T + np.eye(n), q=rng.standard_normal(n), G=rng.standard_normal((5, n)),
+            h=rng.uniform(0.1, 1, 5), A=rng.standard_normal((2, n)), b=rng.uniform(-0.2, 0.2, 2),
+            lb=-np.ones(n), ub=np.full(n, 1.5),
+        )  # fmt: skip
+        settings = dict(eps_abs=1e-10, eps_rel=1e-10, max_iter=100000) if name == "osqp" else {}
+        compressed = {k: sparse.csc_matrix(v) if k in "PGA" else v for k, v in data.items()}
+        known = qpsolvers.solve_qp(**compressed, solver=name, **settings)
+        sol = jm.solve_qp(jm.QP.from_qpsolvers(**compressed), FINE)
+        assert sol.status == jm.Status.SOLVED
+        np.testing.assert_allclose(sol.z, known, atol=1e-6)
+
+
+class TestFromQpsolvers:
+    def test_rows_and_order(self):
+        qp = jm.QP.from_qpsolvers(
+            np.eye(2), [0, 1], G=[[1, 2]], h=[3], A=[4, 5], b=6, lb=[-1, -2], ub=None
+        )
+        np.testing.assert_array_equal(qp.A, [[1, 2], [4, 5], [1, 0], [0, 1]])
+        np.testing.assert_array_equal(qp.l, [-INF, 6, -1, -2])
+        np.testing.assert_array_equal(qp.u, [3, 6, INF, INF])
+
+    def test_nothing_but_cost(self, x64):
+        qp = jm.QP.from_qpsolvers(2 * np.eye(2), [2, -4])
+        assert qp.A.shape == (0, 2)
+        np.testing.assert_allclose(jm.solve_qp(qp).z, [-1, 2], atol=1e-9)
+
+    def test_bounds_only_above(self, x64):
+        qp = jm.QP.from_qpsolvers(np.eye(2), [-2, -2], ub=[1, 5])
+        np.testing.assert_allclose(jm.solve_qp(qp, FINE).z, [1, 2], atol=1e-9)
+
+
+class TestResiduals:
+    def test_formulas(self, x64):
+        rng = np.random.default_rng(5)
+        qp, _, _ = constructed(6, 5)
+        z, y = rng.standard_normal(6), rng.standard_normal(len(qp.l))
+        y = np.where(np.isinf(qp.u), np.minimum(y, 0), y)
+        y = np.where(np.isinf(qp.l), np.maximum(y, 0), y)
+        v = qp.A @ z
+        primal = max(max(0, lo - x, x - hi) for x, lo, hi in zip(v, qp.l, qp.u, strict=True))
+        dual = np.abs(qp.P @ z + qp.q + qp.A.T @ y).max()
+        support = sum(
+            a * (hi if a > 0 else lo) if a else 0 for a, lo, hi in zip(y, qp.l, qp.u, strict=True)
+        )
+        gap = abs(z @ qp.P @ z + qp.q @ z + support)
+        np.testing.assert_allclose(residuals(qp, z, y), [primal, dual, gap], rtol=1e-12)
+
+    def test_wrong_sign_at_an_infinite_bound(self, x64):
+        qp = box(1, u=np.array([INF]))
+        assert residuals(qp, np.zeros(1), np.ones(1))[2] == INF
+        assert bound_product(jnp.zeros(2), jnp.array([-INF] * 2), jnp.array([INF] * 2)) == 0
+
+    def test_reported_ones_are_those_of_the_answer(self, x64):
+        qp, _, _ = constructed(6, 7)
+        sol = jm.solve_qp(qp, jm.ADMM(iterations=20, refine=0))
+        got = sol.primal_residual, sol.dual_residual, sol.gap
+        np.testing.assert_allclose(got, residuals(qp, sol.z, sol.y), rtol=1e-9, atol=1e-14)
+
+    def test_multiplier_sign(self, x64):
+        """min ½(z − 3)² over |z| ≤ 1: y = 2 pushes down from above; mirrored below."""
+        for side in (1.0, -1.0):
+            sol = jm.solve_qp(box(1, q=np.array([-3 * side])), FINE)
+            np.testing.assert_allclose([sol.z[0], sol.y[0]], [side, 2 * side], atol=1e-8)
+
+
+class TestHonestStatus:
+    @pytest.mark.parametrize("iterations", [0, 1, 5, 20, 60, 200])
+    @pytest.mark.parametrize("refine", [0, 3])
+    @pytest.mark.parametrize("eps", [1e-2, 1e-6])
+    def test_solved_means_small_residuals(self, x64, iterations, refine, eps):
+        """SOLVED exactly where residuals recomputed by numpy are within eps and rounding."""
+        batch = [constructed(8, seed) for seed in range(8)]
+        for qp, _, _ in batch:
+            sol = jm.solve_qp(qp, jm.ADMM(iterations=iterations, refine=refine, eps=eps))
+            z, y = np.asarray(sol.z), np.asarray(sol.y)
+            v, support = qp.A @ z, 0.0
+            support = float(bound_product(sol.y, jnp.asarray(qp.l), jnp.asarray(qp.u)))
+            worst = max(
+                np.abs(v - np.clip(v, qp.l, qp.u)).max(),
+                np.abs(qp.P @ z + qp.q + qp.A.T @ y).max(),
+                abs(z @ qp.P @ z + qp.q @ z + support),
+            )
+            if sol.status == jm.Status.SOLVED:
+                assert worst <= eps * (1 + 1e-6) + 1e-10
+            else:
+                assert sol.status == jm.Status.ITERATION_LIMIT
+                assert worst > eps
+
+    def test_one_iteration_is_a_limit(self, x64):
+        sol = jm.solve_qp(constructed(10, 0)[0], jm.ADMM(iterations=1, refine=0))
+        assert sol.status == jm.Status.ITERATION_LIMIT
+        assert sol.iterations == 1
+        assert "iterations" in jm.Status(int(sol.status)).sentence
+
+    def test_numbers_of_osqp_and_sentences(self):
+        assert [int(s) for s in jm.Status] == [0, 1, 3, 5, 7, 12]
+        assert all(s.sentence.endswith(".") for s in jm.Status)
+
+    @pytest.mark.parametrize("n", [1, 3, 8, 20])
+    def test_infeasible_with_box(self, x64, n):
+        """Oblique rows that miss a box; certificate checked in rationals."""
+        for seed in range(5):
+            rng = np.random.default_rng(seed)
+            a = rng.standard_normal((2, n))
+            reach = np.abs(a).sum(axis=1)
+            A = np.vstack([np.eye(n), a])
+            l = np.concatenate([-np.ones(n), [1.05 * reach[0], -1.0]])
+            u = np.concatenate([np.ones(n), [INF, 1.0]])
+            M = rng.standard_normal((n, n))
+            qp = jm.QP(M @ M.T + 0.1 * np.eye(n), rng.standard_normal(n), A, l, u)
+            sol = jm.solve_qp(qp)
+            assert sol.status == jm.Status.PRIMAL_INFEASIBLE
+            assert exact.proves_empty(A, l, u, sol.certificate)
+            np.testing.assert_array_equal(sol.ray, 0)
+
+    def test_infeasible_without_box(self, x64):
+        """Integer rows z₁ + z₂ ≥ 2, z₁ + z₂ ≤ 1: the certificate is (−t, t)."""
+        A = np.array([[1.0, 1.0], [1.0, 1.0]])
+        l, u = np.array([2.0, -INF]), np.array([INF, 1.0])
+        sol = jm.solve_qp(jm.QP(np.eye(2), np.ones(2), A, l, u))
+        assert sol.status == jm.Status.PRIMAL_INFEASIBLE
+        y = np.asarray(sol.certificate)
+        np.testing.assert_allclose(A.T @ y, 0, atol=1e-12)
+        assert y[0] < 0 < y[1] and u[1] * y[1] + l[0] * y[0] < 0
+
+    def test_infeasible_zero_row(self, x64):
+        """0'z ≥ 1 contradicts itself."""
+        qp = jm.QP(np.eye(2), np.ones(2), np.zeros((1, 2)), np.ones(1), np.array([INF]))
+        sol = jm.solve_qp(qp)
+        assert sol.status == jm.Status.PRIMAL_INFEASIBLE
+        assert exact.proves_empty(qp.A, qp.l, qp.u, sol.certificate)
+
+    def test_infeasible_float32(self):
+        A = np.array([[1, 0], [0, 1], [1, 1]], np.float32)
+        l, u = np.array([-1, -1, 2.5], np.float32), np.array([1, 1, INF], np.float32)
+        sol = jm.solve_qp(jm.QP(np.eye(2, dtype=np.float32), np.ones(2, np.float32), A, l, u))
+        assert sol.status == jm.Status.PRIMAL_INFEASIBLE
+        assert exact.proves_empty(A, l, u, np.asarray(sol.certificate))
+
+    @pytest.mark.parametrize("gap", [1e-1, 1e-2, 1e-3, -1e-3, -1e-2])
+    def test_never_infeasible_when_feasible(self, x64, gap):
+        """A corner of the box misses (gap > 0) or meets (gap < 0) an oblique row by |gap|."""
+        for seed in range(4):
+            rng = np.random.default_rng(seed)
+            a = rng.standard_normal((1, 5))
+            A = np.vstack([np.eye(5), a])
+            l = np.append(-np.ones(5), np.abs(a).sum() + gap)
+            u = np.append(np.ones(5), INF)
+            sol = jm.solve_qp(jm.QP(np.eye(5), rng.standard_normal(5), A, l, u), FINE)
+            if gap < 0:
+                assert sol.status == jm.Status.SOLVED
+            else:
+                assert sol.status in (jm.Status.PRIMAL_INFEASIBLE, jm.Status.ITERATION_LIMIT)
+                if sol.status == jm.Status.PRIMAL_INFEASIBLE:
+                    assert exact.proves_empty(A, l, u, sol.certificate)
+
+    @pytest.mark.parametrize("P", [np.zeros((2, 2)), np.diag([1.0, 0.0])], ids=["P=0", "flat"])
+    def test_unbounded(self, x64, P):
+        """Cost falls along −z₂, which only a bound from above limits."""
+        A, l, u = np.eye(2), np.array([-1, -INF]), np.array([1.0, 3.0])
+        qp = jm.QP(P, np.array([0.3, 1.0]), A, l, u)
+        sol = jm.solve_qp(qp)
+        assert sol.status == jm.Status.DUAL_INFEASIBLE
+        d = np.asarray(sol.ray)
+        np.testing.assert_allclose(np.abs(d).max(), 1)
+        np.testing.assert_allclose(P @ d, 0, atol=1e-7)
+        assert qp.q @ d < 0 and d[1] <= 1e-7 and abs(d[0]) <= 1e-7
+
+    def test_unbounded_without_rows(self, x64):
+        sol = jm.solve_qp(
+            jm.QP(np.zeros((2, 2)), np.ones(2), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+        )
+        assert sol.status == jm.Status.DUAL_INFEASIBLE
+
+    def test_slow_descent_is_not_called_unbounded(self, x64):
+        """A flat but bounded direction: curvature 1e-6 is not none."""
+        qp = jm.QP(np.diag([1.0, 1e-6]), np.array([0.0, 1e-3]), np.eye(2), -INF * np.ones(2),
+                   INF * np.ones(2))  # fmt: skip
+        sol = jm.solve_qp(qp, FINE)
+        assert sol.status != jm.Status.DUAL_INFEASIBLE
+        np.testing.assert_allclose(sol.z, [0, -1e3], rtol=1e-6, atol=1e-6)
+
+
+class TestBatches:
+    def spoiled(self):
+        """Five good QPs, then one for each way data can be bad."""
+        good, _, _ = constructed(6, 11)
+        q = np.tile(good.q, (9, 1)) + np.linspace(0, 0.5, 9)[:, None]
+        l, u = np.tile(good.l, (9, 1)), np.tile(good.u, (9, 1))
+        clean = jm.QP(good.P, q.copy(), good.A, l.copy(), u.copy())
+        q[1, 2] = np.nan
+        l[3, 0], u[3, 0] = 2.0, 1.0
+        u[5, 1] = np.nan
+        q[7, 0] = INF
+        return clean, jm.QP(good.P, q, good.A, l, u)
+
+    @pytest.mark.parametrize("x32", [False, True])
+    def test_bad_neighbours_change_nothing(self, x32):
+        with enable_x64(not x32):
+            clean, spoiled = self.spoiled()
+            if x32:
+                clean, spoiled = as32(clean), as32(spoiled)
+            axes = (jm.QP(P=None, q=0, A=None, l=0, u=0),)
+            solve = jax.jit(jax.vmap(jm.solve_qp, in_axes=axes))
+            expected, got = solve(clean), solve(spoiled)
+            bad = np.isin(np.arange(9), [1, 3, 5, 7])
+            np.testing.assert_array_equal(np.asarray(got.status)[bad], jm.Status.NON_FINITE)
+            assert np.isnan(got.z[bad]).all() and np.isnan(got.primal_residual[bad]).all()
+            chex.assert_trees_all_equal(
+                jax.tree.map(lambda v: v[~bad], got), jax.tree.map(lambda v: v[~bad], expected)
+            )
+
+    def test_batch_agrees_with_single(self, x64):
+        clean, _ = self.spoiled()
+        axes = jm.QP(P=None, q=0, A=None, l=0, u=0)
+        batch = jax.vmap(jm.solve_qp, in_axes=(axes,))(clean)
+        for i in range(9):
+            one = jm.solve_qp(replace(clean, q=clean.q[i], l=clean.l[i], u=clean.u[i]))
+            np.testing.assert_allclose(batch.z[i], one.z, atol=1e-9)
+            assert batch.status[i] == one.status
+
+    def test_infinite_bounds_on_the_wrong_side(self, x64):
+        """l = +inf or u = −inf: no value is allowed."""
+        solve = jax.vmap(jm.solve_qp, in_axes=(jm.QP(P=None, q=0, A=None, l=0, u=0),))
+        qp = box(2)
+        batch = lambda v: np.tile(v, (3, 1))
+        l, u = batch(qp.l), batch(qp.u)
+        l[0], u[0], l[1], u[1] = INF, INF, -INF, -INF
+        status = solve(replace(qp, q=batch(qp.q), l=l, u=u)).status
+        assert status[2] == jm.Status.SOLVED
+        assert jm.Status.SOLVED not in status[:2]
+
+    def cholesky_shapes(self, function, *args) -> list:
+        """Shapes of all Cholesky factorizations in the traced program, loops included."""
+        shapes = []
+
+        def walk(jaxpr):
+            for equation in jaxpr.eqns:
+                if "cholesky" in equation.primitive.name:
+                    shapes.append(equation.outvars[0].aval.shape)
+                for inner in jax.tree.leaves(
+                    equation.params, is_leaf=lambda v: hasattr(v, "eqns") or hasattr(v, "jaxpr")
+                ):
+                    walk(inner.jaxpr if hasattr(inner, "jaxpr") else inner) if hasattr(
+                        inner, "eqns"
+                    ) or hasattr(inner, "jaxpr") else None
+
+        walk(jax.make_jaxpr(function)(*args).jaxpr)
+        return shapes
+
+    def test_one_factorization_for_shared_matrices(self, x64):
+        clean, _ = self.spoiled()
+        solver = jm.ADMM(refine=0)
+        shared = jax.vmap(
+            lambda qp: jm.solve_qp(qp, solver), in_axes=(jm.QP(P=None, q=0, A=None, l=0, u=0),)
+        )
+        shapes = self.cholesky_shapes(shared, clean)
+        assert shapes and all(shape == (6, 6) for shape in shapes)
+        assert len(shapes) == 2  # coordinates, and one stage of rho
+        own = jax.vmap(lambda qp: jm.solve_qp(qp, solver))
+        each = replace(clean, P=np.tile(clean.P, (9, 1, 1)), A=np.tile(clean.A, (9, 1, 1)))
+        assert set(self.cholesky_shapes(own, each)) == {(9, 6, 6)}
+
+    def test_one_trace(self, x64):
+        solve = jax.jit(chex.assert_max_traces(lambda qp: jm.solve_qp(qp).z, n=1))
+        for seed in range(3):
+            qp, _, _ = constructed(5, seed)
+            solve(jm.QP(qp.P, qp.q, qp.A, qp.l, qp.u))
+
+
+class TestSettings:
+    def test_warm_start_at_the_solution_stays(self, x64):
+        for seed in range(5):
+            qp, z, y = constructed(8, seed)
+            for start in ((z, y), jm.solve_qp(qp, FINE)):
+                sol = jm.solve_qp(qp, jm.ADMM(iterations=2, refine=0), warm_start=start)
+                assert sol.status == jm.Status.SOLVED
+                np.testing.assert_allclose(sol.z, z, atol=1e-6)
+
+    def test_warm_start_helps(self, x64):
+        qp, _, _ = constructed(8, 0)
+        near = replace(qp, q=qp.q * 1.01)
+        few = jm.ADMM(iterations=10, refine=0)
+        cold = jm.solve_qp(near, few)
+        warm = jm.solve_qp(near, few, warm_start=jm.solve_qp(qp, FINE))
+        assert warm.primal_residual + warm.dual_residual < cold.primal_residual + cold.dual_residual
+
+    def test_warm_start_that_is_not_finite_counts_as_none(self, x64):
+        qp, z, y = constructed(4, 0)
+        sol = jm.solve_qp(qp, FINE, warm_start=(np.full(4, np.nan), np.full(len(y), INF)))
+        np.testing.assert_allclose(sol.z, z, atol=1e-8)
+
+    def test_warm_start_of_wrong_shape(self):
+        qp, z, y = constructed(4, 0)
+        with pytest.raises(ValueError, match="warm_start y"):
+            jm.solve_qp(qp, warm_start=(z, y[:-1]))
+        with pytest.raises(ValueError, match="warm_start z"):
+            jm.solve_qp(qp, warm_start=(z[:-1], y))
+
+    def test_rho_of_every_shape(self, x64):
+        qp, z, _ = constructed(6, 4)
+        m = len(qp.l)
+        rng = np.random.default_rng(0)
+        shapes = [(), (m,), (1,), (4, m), (4, 1), (1, m)]
+        for shape in shapes:
+            rho = 10 ** rng.uniform(-0.7, 0.7, shape)
+            for alpha in (1.0, 1.6):
+                sol = jm.solve_qp(qp, jm.ADMM(iterations=2000, rho=rho, alpha=alpha, refine=0))
+                assert sol.status == jm.Status.SOLVED, (shape, sol.primal_residual)
+                np.testing.assert_allclose(sol.z, z, atol=1e-5)
+
+    def test_schedule_of_equal_stages_is_no_schedule(self, x64):
+        qp, _, _ = constructed(6, 4)
+        one = jm.solve_qp(qp, jm.ADMM(iterations=60, rho=2.0, refine=0))
+        four = jm.solve_qp(qp, jm.ADMM(iterations=60, rho=np.full((4, 1), 2.0), refine=0))
+        np.testing.assert_allclose(one.z, four.z, atol=1e-12)
+
+    def test_refine_never_hurts(self, x64):
+        for seed in range(10):
+            qp, z, _ = constructed(8, seed)
+            plain = jm.solve_qp(qp, jm.ADMM(iterations=30, refine=0))
+            better = jm.solve_qp(qp, jm.ADMM(iterations=30, refine=30))
+            assert np.abs(better.z - z).max() <= np.abs(plain.z - z).max() * (1 + 1e-6) + 1e-9
+
+    def test_vmap_over_rho(self, x64):
+        qp, z, _ = constructed(6, 4)
+        solve = lambda rho: jm.solve_qp(qp, jm.ADMM(iterations=1000, rho=rho, refine=0)).z
+        answers = jax.vmap(solve)(jnp.array([0.3, 1.0, 3.0]))
+        np.testing.assert_allclose(answers, np.tile(z, (3, 1)), atol=1e-5)
+
+    def test_integers_are_numbers(self):
+        sol = jm.solve_qp(jm.QP([[2, 0], [0, 2]], [-2, -6], [[1, 0], [0, 1]], [0, 0], [2, 2]))
+        np.testing.assert_allclose(sol.z, [1, 2], atol=1e-4)
+
+
+class TestGradients:
+    """Unrolled gradients against central differences, where the active set does not change."""
+
+    def loss(self, qp, rho=1.0, weight=None):
+        sol = jm.solve_qp(qp, jm.ADMM(iterations=300, rho=rho, refine=0))
+        weight = jnp.arange(1.0, sol.z.size + 1) if weight is None else weight
+        return jnp.sum(weight * sol.z)
+
+    @pytest.mark.parametrize("field", ["P", "q", "A", "l", "u"])
+    def test_every_field(self, x64, field):
+        qp, _, _ = constructed(4, 3)
+        finite = lambda v: np.clip(v, -1e3, 1e3)
+        qp = jax.tree.map(jnp.asarray, replace(qp, l=finite(qp.l), u=finite(qp.u)))
+        rng = np.random.default_rng(0)
+        value = getattr(qp, field)
+        direction = rng.standard_normal(value.shape)
+        if field == "P":
+            direction = direction + direction.T
+        if field in "lu":  # keep equalities what they are
+            direction = direction * (np.asarray(qp.u - qp.l) > 0)
+        along = lambda t: self.loss(replace(qp, **{field: value + t * direction}))
+        h = 1e-5
+        numeric = (along(h) - along(-h)) / (2 * h)
+        np.testing.assert_allclose(jax.grad(along)(0.0), numeric, rtol=1e-5, atol=1e-7)
+        np.testing.assert_allclose(jax.jvp(along, (0.0,), (1.0,))[1], numeric, rtol=1e-5, atol=1e-7)
+
+    def test_rho(self, x64):
+        """With few steps the answer depends on rho, and its gradient is that of the program."""
+        qp, _, _ = constructed(4, 3)
+        few = lambda rho: jnp.sum(jm.solve_qp(qp, jm.ADMM(iterations=7, rho=rho, refine=0)).z ** 2)
+        h = 1e-6
+        np.testing.assert_allclose(
+            jax.grad(few)(0.7), (few(0.7 + h) - few(0.7 - h)) / (2 * h), rtol=1e-5
+        )
+
+    def test_through_refine(self, x64):
+        """Gradients stay finite, and right, with the polish on."""
+        qp, _, _ = constructed(4, 3)
+        f = lambda q: jm.solve_qp(replace(qp, q=q), jm.ADMM(iterations=300)).z[0]
+        gradient, h = jax.grad(f)(jnp.asarray(qp.q)), 1e-5
+        numeric = [(f(qp.q + h * e) - f(qp.q - h * e)) / (2 * h) for e in np.eye(4)]
+        np.testing.assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-6)
+
+    def test_free_rows_give_no_nan(self, x64):
+        qp, _, _ = constructed(4, 3)  # has free and zero rows
+        gradient = jax.grad(lambda q: self.loss(replace(qp, q=q)))(jnp.asarray(qp.q))
+        assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (dict(q=np.zeros((2, 1))), "q"),
+        (dict(q=3.0), "q"),
+        (dict(P=np.eye(3)), "P"),
+        (dict(P=np.array([[1.0, 0.5], [0.0, 1.0]])), "symmetric"),
+        (dict(P=-np.eye(2)), "positive semidefinite"),
+        (dict(P=np.full((2, 2), np.nan)), "P"),
+        (dict(q=np.array([np.nan, 0])), "q"),
+        (dict(q=np.array([INF, 0])), "q"),
+        (dict(A=np.eye(3)), "A"),
+        (dict(A=np.ones(2)), "A"),
+        (dict(A=np.full((2, 2), np.nan)), "A"),
+        (dict(l=np.zeros(3)), "l"),
+        (dict(u=np.zeros(1)), "u"),
+        (dict(l=np.array([2.0, 0.0])), "row 0 has l = 2.0"),
+        (dict(u=np.array([1.0, np.nan])), "row 1"),
+    ],
+)
+def test_bad_data_raise(change, words):
+    with pytest.raises(ValueError, match=words):
+        jm.solve_qp(replace(box(2), **change))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (dict(iterations=-1), "iterations"),
+        (dict(refine=-1), "refine"),
+        (dict(rho=0.0), "rho"),
+        (dict(rho=np.array([1.0, -1.0])), "rho"),
+        (dict(rho=np.ones(5)), "rho"),
+        (dict(rho=np.ones((2, 2, 2))), "rho"),
+        (dict(rho=np.nan), "rho"),
+        (dict(rho=np.ones((3, 1)), iterations=100), "iterations"),
+        (dict(alpha=2.0), "alpha"),
+        (dict(alpha=0.0), "alpha"),
+    ],
+)
+def test_bad_settings_raise(settings, words):
+    with pytest.raises(ValueError, match=words):
+        jm.solve_qp(box(2), jm.ADMM(**settings))
+
+
+def test_settings_and_programs_are_trees_with_any_leaves():
+    """JAX puts None, integers and sentinels where arrays were."""
+    for tree in (box(2), jm.ADMM(rho=1.0)):
+        leaves, structure = jax.tree.flatten(tree)
+        for filler in (None, 0, object()):
+            jax.tree.unflatten(structure, [filler] * len(leaves))
+
+
+HANG = """
+import jax, jax.numpy as jnp, numpy as np, jaxmpc as jm
+rng = np.random.default_rng(0)
+M, A = rng.standard_normal((2, 20, 20)).astype(np.float32)
+P, one = jnp.asarray(M @ M.T + np.eye(20, dtype=np.float32)), jnp.ones(20)
+q = jnp.asarray(rng.standard_normal((16384, 20)), jnp.float32)
+solver = jm.ADMM(iterations=10, refine=2)
+shared = jax.jit(jax.vmap(lambda q: jm.solve_qp(jm.QP(P, q, A, -one, one), solver).status))
+shared(q).block_until_ready()
+own = jax.jit(jax.vmap(lambda s: jm.solve_qp(jm.QP(s * P, q[0], A, -one, one), solver).status))
+own(jnp.linspace(1, 2, 2048)).block_until_ready()
+"""
+
+
+@pytest.mark.parametrize("cured", [True, False])
+def test_large_batches_of_newton_steps_end(cured):
+    """On two cores, with and without the environment's cures for old jaxlibs."""
+    environment = dict(os.environ)
+    if not cured:
+        environment.pop("NPROC", None)
+        environment.pop("XLA_FLAGS", None)
+    subprocess.run([sys.executable, "-c", HANG], env=environment, check=True, timeout=120)

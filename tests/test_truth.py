@@ -1,0 +1,284 @@
+"""Feasible-set maps against sets that are known exactly: closed forms, polygons, a product."""
+
+from fractions import Fraction
+
+import exact
+import numpy as np
+import problems
+import pytest
+
+import jaxmpc as jm
+from jaxmpc.qp.status import Status
+
+
+def assert_right(fmap, inside, tie, allow=1e-9):
+    """No label is wrong, ties included, and none is open farther than `allow` from the boundary."""
+    np.testing.assert_array_equal(fmap.label[fmap.label != 0] == 1, inside[fmap.label != 0])
+    assert np.all(tie[fmap.label == 0] <= allow)
+
+
+# (settings, radius): |x_0| ≤ radius, by hand.
+N, X, U = 5, 1.0, 0.3
+SCALAR = {
+    "k = 0..N": (dict(terminal=X), X),
+    "k = 1..N": (dict(terminal=X, constrain_initial=False), X + U),
+    "k = N": (dict(x_max=None, terminal=X), X + N * U),
+    "k = 0..N-1": (dict(), X),
+    "k = 1..N-1": (dict(constrain_initial=False), X + U),
+    "x_N = 0": (dict(terminal=0.0), X),
+    "|x_N| ≤ 1/4": (dict(terminal=0.25), X),
+    "x_N = 0, short": (dict(terminal=0.0, horizon=2), 2 * U),
+    "x_N = 0, states free": (dict(terminal=0.0, x_max=None), N * U),
+    "strong input": (dict(terminal=X, u_max=2.0, horizon=3, constrain_initial=False), X + 2),
+    "unstable": (dict(a=2.0, x_max=5.0, u_max=1.0, terminal=5.0), 1 + 4 * 2.0**-N),
+    "unstable, N = 20": (dict(a=2.0, x_max=5.0, u_max=1.0, terminal=5.0, horizon=20),
+                         1 + 4 * 2.0**-20),
+    "flip": (dict(a=-2.0, x_max=5.0, u_max=1.0, terminal=5.0), 1 + 4 * 2.0**-N),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SCALAR)
+def test_scalar_closed_forms(name):
+    settings, radius = SCALAR[name]
+    steps = 10.0 ** -np.arange(1, 9)
+    radii = np.concatenate([radius * (1 + steps), radius * (1 - steps), [0.0, 1e12]])
+    points = np.concatenate([radii, -radii, np.linspace(-2 * radius, 2 * radius, 51)])[:, None]
+    fmap = jm.map_feasible_set(problems.scalar(**settings), points, chunk=128)
+    assert_right(fmap, np.abs(points[:, 0]) <= radius, np.abs(np.abs(points[:, 0]) - radius))
+    # A terminal point leaves no margin to prove a state with, but the cuts are all there.
+    assert fmap.outer().support(np.ones(1)) == pytest.approx(radius, rel=1e-6)
+
+
+@pytest.fixture(scope="module", params=problems.PLANAR)
+def planar(request):
+    """(mpc, exact polygon, refined map of a grid that reaches outside)."""
+    mpc = problems.PLANAR[request.param]()
+    polygon = exact.feasible_polygon(mpc)
+    corners = np.array([[float(v) for v in p] for p in polygon.vertices])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    margin = 0.15 * (high - low)
+    points = jm.grid(low - margin, high + margin, (24, 24))
+    # Vertices themselves and points of the facets are ties, a margin away from rounding they are not.
+    middle = corners.mean(axis=0)
+    near = [middle + (corners - middle) * (1 + s) for s in (1e-3, -1e-3, 1e-6, -1e-6, 0.0)]
+    points = np.concatenate([points, *near])
+    return mpc, polygon, jm.map_feasible_set(mpc, points, chunk=1024).refine(1e-7)
+
+
+def test_published_areas():
+    """The exact checker itself, against areas known in closed form."""
+    area = lambda mpc: float(exact.feasible_polygon(mpc).area)
+    assert area(problems.double_integrator()) == problems.C_INF_DOUBLE_INTEGRATOR
+    assert exact.feasible_polygon(problems.double_integrator()).area == Fraction(1375, 24)
+    for u_max, value in problems.AREA_LECTURE.items():
+        assert area(problems.lecture(u_max)) == pytest.approx(value, rel=1e-14)
+    assert area(problems.joint()) == pytest.approx(problems.AREA_JOINT, rel=1e-14)
+    assert area(problems.joint_o_inf()) == pytest.approx(problems.AREA_JOINT_O_INF, rel=1e-12)
+
+
+def test_labels(planar):
+    _, polygon, fmap = planar
+    assert_right(fmap, polygon.contains(fmap.points), polygon.distance(fmap.points))
+    assert fmap.counts()["feasible"] > 50 and fmap.counts()["infeasible"] > 50
+
+
+def test_plans_in_rationals(planar):
+    mpc, _, fmap = planar
+    found = np.flatnonzero(fmap.label == 1)
+    assert np.isnan(fmap.labels.plans[fmap.label != 1]).all()
+    chosen = np.random.default_rng(0).choice(found, 25, replace=False)
+    near = np.flatnonzero((fmap.label == 1) & (np.arange(len(fmap.label)) >= 576))
+    for i in np.concatenate([chosen, near]):
+        assert exact.keeps_all_rows(mpc, fmap.points[i], fmap.labels.plans[i])
+
+
+def test_cuts_in_rationals(planar):
+    _, polygon, fmap = planar
+    assert np.isnan(fmap.labels.cut_offsets[fmap.label != -1]).all()
+    for i in np.flatnonzero(fmap.label == -1):
+        a, b = fmap.labels.cut_normals[i], Fraction(float(fmap.labels.cut_offsets[i]))
+        assert polygon.support(a) <= b
+        assert exact.dot(exact.rational(a), exact.rational(fmap.points[i])) > b
+
+
+def test_what_refine_adds_in_rationals(planar):
+    _, polygon, fmap = planar
+    assert polygon.contains(fmap.extra_points).all()
+    for a, b in zip(fmap.extra_normals, fmap.extra_offsets, strict=True):
+        assert polygon.support(a) <= Fraction(float(b))
+
+
+def test_volume_and_polytopes(planar):
+    _, polygon, fmap = planar
+    low, high = fmap.volume_bounds()
+    assert low <= polygon.area <= high
+    assert high - low <= 1e-6 * high
+    outer, inner = fmap.outer(), fmap.inner()
+    assert len(outer.vertices()) == len(polygon.vertices)
+    for a in np.random.default_rng(1).standard_normal((20, 2)):
+        exactly = float(polygon.support(a))
+        assert inner.support(a) <= exactly * (1 + 1e-12) + 1e-12
+        assert outer.support(a) >= exactly * (1 - 1e-12) - 1e-12
+
+
+def test_boundary(planar):
+    mpc, polygon, _ = planar
+    found = jm.boundary(mpc, 40)
+    assert polygon.contains(found.points).all()
+    length = np.linalg.norm(found.directions, axis=1)
+    np.testing.assert_array_less((found.outer - found.inner) * length, 1e-9)
+    exactly = exits(polygon, found.center, found.directions)
+    assert np.all(found.inner <= exactly * (1 + 1e-13))
+    assert np.all(found.outer >= exactly * (1 - 1e-13))
+    for a, b in zip(found.normals, found.offsets, strict=True):
+        support = polygon.support(a)
+        assert support <= Fraction(float(b))
+        assert float(Fraction(float(b)) - support) <= 1e-9 * np.linalg.norm(a)
+
+
+def exits(polygon, center, directions):
+    """Where the rays leave the polygon."""
+    a = np.array([[float(v) for v in a] for a, _ in polygon.facets])
+    b = np.array([float(b) for _, b in polygon.facets])
+    with np.errstate(divide="ignore"):
+        t = (b - a @ center) / (directions @ a.T)
+    return np.where(directions @ a.T > 0, t, np.inf).min(axis=1)
+
+
+def near_boundary(polygon, count):
+    """Points within 1e-2 .. 1e-6 (relative, along rays from the origin) on both sides."""
+    rng = np.random.default_rng(7)
+    angle = rng.uniform(0, 2 * np.pi, count)
+    directions = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    shift = rng.choice([-1, 1], count) * 10 ** -rng.choice([2.0, 3, 4, 5, 6], count)
+    return directions * (exits(polygon, np.zeros(2), directions) * (1 + shift))[:, None], shift < 0
+
+
+@pytest.mark.parametrize(
+    "count", [1000, pytest.param(12000, marks=pytest.mark.slow)], ids=["1,000", "12,000"]
+)
+@pytest.mark.parametrize("name", ["joint", "joint, terminal O_inf"])
+def test_nothing_wrong_and_nothing_open_near_the_boundary(name, count):
+    mpc = problems.PLANAR[name]()
+    polygon = exact.feasible_polygon(mpc)
+    points, inside = near_boundary(polygon, count)
+    fmap = jm.map_feasible_set(mpc, points, chunk=1024)
+    np.testing.assert_array_equal(fmap.label, np.where(inside, 1, -1))
+    np.testing.assert_array_equal(polygon.contains(points), inside)
+    chosen = np.random.default_rng(0).choice(count, 30, replace=False)
+    for i in chosen[fmap.label[chosen] == 1]:
+        assert exact.keeps_all_rows(mpc, points[i], fmap.labels.plans[i])
+    cuts = np.flatnonzero(fmap.label == -1)
+    for i in np.random.default_rng(1).choice(cuts, 200, replace=False):
+        assert polygon.support(fmap.labels.cut_normals[i]) <= Fraction(
+            float(fmap.labels.cut_offsets[i])
+        )
+
+
+class TestHiddenProduct:
+    """Two joints behind a change of coordinates with determinant 1: x = T (joint 1, joint 2)."""
+
+    @pytest.fixture(scope="class")
+    def blocks(self):
+        return [exact.feasible_polygon(problems.product_block(i)) for i in (0, 1)]
+
+    def contains(self, blocks, points):
+        v = points @ problems.T_INVERSE.T
+        return blocks[0].contains(v[:, :2]) & blocks[1].contains(v[:, 2:])
+
+    def corners(self, blocks):
+        """All vertices (280, 4) of the feasible set."""
+        lists = [np.array([[float(c) for c in p] for p in b.vertices]) for b in blocks]
+        both = np.array([np.concatenate([p, q]) for p in lists[0] for q in lists[1]])
+        return both @ np.linalg.inv(problems.T_INVERSE).T
+
+    def facets(self, blocks):
+        """a (34, 4), b (34,)."""
+        parts = []
+        for i, block in enumerate(blocks):
+            a = np.array([[float(v) for v in a] for a, _ in block.facets])
+            b = np.array([float(b) for _, b in block.facets])
+            parts.append((a @ problems.T_INVERSE[2 * i : 2 * i + 2], b))
+        return tuple(np.concatenate(p) for p in zip(*parts, strict=True))
+
+    def near(self, blocks, count):
+        """Points at relative distances 1e-1 .. 1e-5 on both sides along rays."""
+        rng = np.random.default_rng(3)
+        directions = rng.standard_normal((count, 4))
+        a, b = self.facets(blocks)
+        reach = 1 / (directions @ a.T / b).max(axis=1)
+        shift = rng.choice([-1, 1], count) * 10 ** rng.uniform(-5, -1, count)
+        return directions * (reach * (1 + shift))[:, None], shift < 0
+
+    def test_the_facts(self, blocks):
+        assert len(self.corners(blocks)) == 280 and len(self.facets(blocks)[1]) == 34
+        assert float(blocks[0].area * blocks[1].area) == pytest.approx(problems.VOLUME_PRODUCT)
+
+    @pytest.fixture(scope="class")
+    def fmap(self, blocks):
+        return jm.map_feasible_set(problems.hidden_product(), self.near(blocks, 600)[0], chunk=1024)
+
+    def test_labels(self, blocks, fmap):
+        points, inside = self.near(blocks, 600)
+        np.testing.assert_array_equal(fmap.label, np.where(inside, 1, -1))
+        np.testing.assert_array_equal(self.contains(blocks, points), inside)
+
+    def test_proofs(self, blocks, fmap):
+        mpc, corners = problems.hidden_product(), self.corners(blocks)
+        for i in np.flatnonzero(fmap.label == 1)[:15]:
+            assert exact.keeps_all_rows(mpc, fmap.points[i], fmap.labels.plans[i])
+        out = fmap.label == -1
+        a, b = fmap.labels.cut_normals[out], fmap.labels.cut_offsets[out]
+        support = (a @ corners.T).max(axis=1)
+        # The float data is a product only up to its own rounding.
+        assert np.all(support <= b + 1e-12 * np.linalg.norm(a, axis=1))
+
+    def test_volume(self, blocks, fmap):
+        refined = fmap.refine(1e-6)
+        low, high = refined.volume_bounds()
+        assert low <= problems.VOLUME_PRODUCT * (1 + 1e-12)
+        assert high >= problems.VOLUME_PRODUCT * (1 - 1e-12)
+        assert high - low <= 1e-6 * high
+        assert len(refined.outer().h) == 34
+
+    def test_boundary(self, blocks):
+        found = jm.boundary(problems.hidden_product(), 24)
+        a, b = self.facets(blocks)
+        exactly = 1 / (found.directions @ a.T / (b - a @ found.center)).max(axis=1)
+        assert np.all(found.inner <= exactly + 1e-12) and np.all(found.outer >= exactly - 1e-12)
+        np.testing.assert_array_less(found.outer - found.inner, 1e-9)
+
+    @pytest.mark.parametrize("axes", [(0, 1), (3, 2), (0, 1, 2)])
+    def test_slice(self, blocks, axes):
+        fixed = np.array([0.2, -0.1, 0.15, 0.4])
+        rng = np.random.default_rng(2)
+        theta = rng.uniform(-3, 3, (300, len(axes)))
+        whole = np.tile(fixed, (300, 1))
+        whole[:, axes] = theta
+        fmap = jm.map_feasible_set(problems.hidden_product(), theta, axes=axes, fixed=fixed)
+        np.testing.assert_array_equal(fmap.label, np.where(self.contains(blocks, whole), 1, -1))
+        for i in np.flatnonzero(fmap.label == 1)[:5]:
+            assert exact.keeps_all_rows(problems.hidden_product(), whole[i], fmap.labels.plans[i])
+
+    @pytest.mark.parametrize("axes", [(0, 3), (1, 2)])
+    def test_projection(self, blocks, axes):
+        """Exact projection: the hull of the projected vertices."""
+        shadow = exact.hull([tuple(exact.rational(p)) for p in self.corners(blocks)[:, list(axes)]])
+        rng = np.random.default_rng(4)
+        points = rng.uniform(-6, 6, (300, 2))
+        fmap = jm.map_feasible_set(problems.hidden_product(), points, axes=axes)
+        assert_right(fmap, shadow.contains(points), shadow.distance(points))
+        refined = fmap.refine(1e-6)
+        low, high = refined.volume_bounds()
+        assert low <= float(shadow.area) * (1 + 1e-12) and high >= float(shadow.area) * (1 - 1e-12)
+        assert high - low <= 1e-6 * high
+
+
+def test_terminal_section_of_a_slice():
+    """Slices cut the terminal set too: the polygon of the first joint for joint 2 at rest."""
+    fmap = jm.map_feasible_set(
+        problems.hidden_product(), np.zeros((1, 2)), axes=(0, 3), fixed=np.zeros(4)
+    )
+    section = fmap.terminal_section()
+    assert section.contains(np.zeros(2)) and not section.contains(np.array([2.0, 0.0]))
+    assert fmap.status[0] == Status.SOLVED
