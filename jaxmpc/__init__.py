@@ -20,3 +20,5 @@ from jaxmpc.sweeps.boundary import boundary as boundary
 from jaxmpc.sweeps.feasible_set import FeasibleSetMap as FeasibleSetMap
 from jaxmpc.sweeps.feasible_set import grid as grid
 from jaxmpc.sweeps.feasible_set import map_feasible_set as map_feasible_set
+from jaxmpc.sweeps.plans import Plans as Plans
+from jaxmpc.sweeps.plans import solve_many as solve_many

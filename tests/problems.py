@@ -145,6 +145,6 @@ PLANAR = {
     "lecture, |u| ≤ 0.3": lambda: lecture(0.3),
     "joint": joint,
     "joint, terminal O_inf": joint_o_inf,
-    "unstable": unstable,
+    "unstable": lambda: unstable(10),
     "drifting": drifting,
 }

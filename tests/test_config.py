@@ -57,8 +57,8 @@ def test_default_is_the_lessons_joint():
     assert (mpc.horizon, mpc.terminal_set, mpc.constrain_initial) == (20, None, True)
     assert region.points.shape == (256 * 256, 2)
     # The state limits 1.5 and 2, widened by 3 % of their range on each side.
-    np.testing.assert_allclose(region.points[0], [-1.65, -2.2])
-    np.testing.assert_allclose(region.points[-1], [1.65, 2.2])
+    np.testing.assert_allclose(region.points[0], [-1.59, -2.12])
+    np.testing.assert_allclose(region.points[-1], [1.59, 2.12])
     assert (region.axes, region.fixed) == ((0, 1), None)
 
 

@@ -167,6 +167,13 @@ class Polytope:
         if concrete((self.H, self.h)):
             _largest_ball(argument, *unit_rows(self.H, self.h, argument))
 
+    def is_empty(self) -> bool:
+        """True if no point satisfies all rows, by one LP (relative tolerance 1e-10). Host."""
+        H, h = host_array("H", self.H), host_array("h", self.h)
+        if np.any((h == -np.inf) | (~H.any(axis=1) & (h < 0))):
+            return True
+        return maximise(np.zeros(self.dimension), *unit_rows(H, h)).value == -np.inf
+
     def contains(self, x: ArrayLike, tolerance: float = 0.0) -> jax.Array:
         """True if H x <= h + tolerance (in the scale of each row), x of shape (n,)."""
         _require_shapes("Polytope", self, ("H", "h"), 2)
@@ -251,13 +258,7 @@ class Polytope:
 
     def volume(self) -> float:
         """Length, area or volume. Host; ValueError if empty, flat or unbounded."""
-        V = self.vertices()
-        if self.dimension == 1:
-            return float(V[1, 0] - V[0, 0])
-        # qhull works best in coordinates of like size.
-        scale = np.ptp(V, axis=0)
-        with _explained("Polytope"):
-            return float(ConvexHull((V - V.mean(axis=0)) / scale).volume * np.prod(scale))
+        return hull_volume(self.vertices())
 
     def _rows(self) -> tuple[np.ndarray, np.ndarray]:
         _require_shapes("Polytope", self, ("H", "h"), 2)
@@ -274,6 +275,24 @@ class Polytope:
             fail("Polytope", f"is flat (largest ball of radius {radius:.1e})", cure)
         Y = G / (g - G @ centre)[:, None]
         return Y, centre, 1 / np.abs(Y).max(axis=0)
+
+
+def hull_volume(points: ArrayLike) -> float:
+    """Volume of the convex hull of points (k, n): 0 where they lie in a hyperplane. Host."""
+    points = host_array("points", points)
+    if len(points) <= points.shape[1]:
+        return 0.0
+    # qhull works best in coordinates of like size.
+    scale = np.ptp(points, axis=0)
+    if not scale.all():
+        return 0.0
+    if len(scale) == 1:
+        return float(scale[0])
+    try:
+        hull = ConvexHull((points - points.mean(axis=0)) / scale)
+    except QhullError:  # flat
+        return 0.0
+    return float(hull.volume * np.prod(scale))
 
 
 class Optimum(NamedTuple):

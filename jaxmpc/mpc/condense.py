@@ -101,6 +101,11 @@ def condense(mpc: MPC) -> Condensed:
     return _condense(arrays(replace(mpc, prestabilise=prestabilising_gain(mpc))))
 
 
+def in_float64(mpc: MPC) -> MPC:
+    """The problem as host arrays in float64, with the prestabilising gain filled in."""
+    return jax.tree.map(np.float64, replace(mpc, prestabilise=prestabilising_gain(mpc)))
+
+
 @jax.jit
 def _condense(mpc: MPC) -> Condensed:
     system, N = mpc.system, mpc.horizon

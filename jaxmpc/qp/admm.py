@@ -30,6 +30,9 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxmpc.checks import concrete, fail
 from jaxmpc.qp.problem import matmul
 
+# Least eigenvalue, relative to the mean, below which a Hessian counts as singular.
+SINGULAR = 1e-6
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -90,13 +93,16 @@ class Factor:
 def scale(P: Array, A: Array) -> tuple[Array, Array, Array, Array]:
     """Coordinates z = T w and row scale E with T'PT ≈ I and rows of E A T of length one.
 
-    T is the inverse transposed Cholesky factor of P + δI, δ = 1e-6 of the mean curvature, so
-    that singular P (δ = 1 for P = 0) has coordinates too; the Hessian T'PT stays exact.
+    T is the inverse transposed Cholesky factor of P + δI. Where P is definite δ is 1e-6 of the
+    mean curvature and T'PT ≈ I. Where it is singular, T must not stretch its null space until
+    all rows look alike: δ is 1e-4 of the mean curvature (1 for P = 0). T'PT stays exact.
     Returns T, E, T'PT, E A T. A zero row keeps scale 0: it constrains nothing in z.
     """
     n = P.shape[0]
     mean = jnp.trace(P) / n
-    metric = P + jnp.where(mean > 0, 1e-6 * mean, 1.0) * jnp.eye(n, dtype=P.dtype)
+    definite = jnp.linalg.eigvalsh(jax.lax.stop_gradient(P))[0] > SINGULAR * mean
+    delta = jnp.where(definite, 1e-6, 1e-4) * mean + jnp.where(mean > 0, 0.0, 1.0)
+    metric = P + delta * jnp.eye(n, dtype=P.dtype)
     L = jnp.linalg.cholesky(metric)
     T = solve_triangular(L, jnp.eye(n, dtype=P.dtype), lower=True).T
     H = matmul(T.T, matmul(P, T))
@@ -118,7 +124,7 @@ def factor(P: Array, A: Array, solver: ADMM) -> Factor:
 
     def stage(R: Array) -> tuple[Array, Array]:
         M = H + matmul(A_w.T, R[:, None] * A_w)
-        M = M + ridge * jnp.trace(M) / n * jnp.eye(n, dtype=P.dtype)
+        M = M + ridge * (1 + jnp.trace(M) / n) * jnp.eye(n, dtype=P.dtype)
         Minv = cho_solve((jnp.linalg.cholesky(M), True), jnp.eye(n, dtype=P.dtype))
         return matmul(Minv, A_w.T * R), Minv
 
@@ -130,7 +136,7 @@ def factor(P: Array, A: Array, solver: ADMM) -> Factor:
 def step(t: Array, b: Array, l: Array, u: Array, G: Array, alpha: Any) -> Array:
     """One ADMM step on t = s + v (m,)."""
     s = jnp.clip(t, l, u)
-    return t + alpha * (matmul(2 * s - t, G.T) + b - s)
+    return t + jnp.asarray(alpha, t.dtype) * (matmul(2 * s - t, G.T) + b - s)
 
 
 def iterate(

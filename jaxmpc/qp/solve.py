@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
@@ -32,7 +33,7 @@ def solve_qp(qp: QP, solver: ADMM = ADMM(), warm_start: Any = None) -> QPSolutio
     unrolling. Raises ValueError for bad shapes and, where values can be read, bad values.
     """
     qp.validate()
-    solver.validate(jnp.shape(qp.A)[0])
+    solver.validate(np.shape(qp.A)[0])
     return _solve(as_arrays(qp), *arrays((solver, warm_start)))
 
 
@@ -115,7 +116,7 @@ def assess(
         z, y = jnp.where(better, z, z_other), jnp.where(better, y, y_other)
 
     eps = (1e-6 if dtype == jnp.float64 else 1e-3) if solver.eps is None else solver.eps
-    floor = 100 * jnp.finfo(dtype).eps
+    eps, floor = jnp.asarray(eps, dtype), 100 * jnp.finfo(dtype).eps
     primal, dual, gap, *sizes = residual_sizes(qp, z, y)
     solved = (
         (primal <= eps + floor * sizes[0])

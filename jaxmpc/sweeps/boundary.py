@@ -16,12 +16,11 @@ from scipy.optimize import linprog
 from jaxmpc.checks import fail
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.sweeps import proofs
-from jaxmpc.sweeps.ladder import Rows, cut_of, inputs_of, rows
+from jaxmpc.sweeps.ladder import HIGHS, Rows, cut_of, extent, inputs_of, rows, support
 from jaxmpc.sweeps.proofs import Problem, View, make_view
 
 # How far a boundary point is pulled towards the centre before it is proved: the least that works.
 PULLS = 10.0 ** np.arange(-14, -1)
-HIGHS = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 
 
 @dataclass(frozen=True)
@@ -58,14 +57,14 @@ def boundary(
     view = make_view(mpc, axes, fixed)
     d = len(view.axes)
     if isinstance(directions, int | np.integer):
-        directions = spread(int(directions), d)
+        directions = spread(max(int(directions), 0), d)
     directions = np.asarray(directions, np.float64)
     if directions.ndim != 2 or directions.shape[1] != d or not np.all(np.isfinite(directions)):
         fail("directions", f"shape {directions.shape}", f"Give finite rays (K, {d}) or a number")
-    if not np.all(np.any(directions != 0, axis=1)):
-        fail("directions", "holds a zero row", "A ray needs a direction")
-    if center is not None and np.shape(center) != (d,):
-        fail("center", f"shape {np.shape(center)}", f"Give one point ({d},)")
+    if not len(directions) or not np.all(np.any(directions != 0, axis=1)):
+        fail("directions", "holds no ray, or a zero row", "Give at least one direction")
+    if center is not None and (np.shape(center) != (d,) or not np.all(np.isfinite(center))):
+        fail("center", f"{center}", f"Give one finite point ({d},)")
     return Rays(mpc, view, center).shoot(directions)
 
 
@@ -86,10 +85,7 @@ class Rays:
     def __init__(self, mpc: MPC, view: View, center: np.ndarray | None = None) -> None:
         self.rows = rows(mpc, view)
         self.center, self.w = self._centre(center)
-        d = len(self.center)
-        both = np.concatenate([np.eye(d), -np.eye(d)])
-        extent = np.array([self._lp(e)[0] for e in both]).reshape(2, d).max(axis=0)
-        self.problem = proofs.problem(mpc, view, np.abs(self.center) + extent * (1 + 1e-6))
+        self.problem = proofs.problem(mpc, view, extent(self.rows, np.abs(self.center)))
 
     def _centre(self, center: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """θ (the given one, or the best) and w with the largest common margin of all rows."""
@@ -114,28 +110,9 @@ class Rays:
             )  # fmt: skip
         return result.x[k : k + d], result.x[:k]
 
-    def _lp(self, direction: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        """max t with centre + t d feasible: (t, w, multipliers of the rows); t = inf: unbounded."""
-        r = self.rows
-        count, k = r.U.shape
-        A = np.hstack([r.U, (r.D @ direction)[:, None]])
-        shift = r.D @ self.center
-        low, high = np.isfinite(r.lower), np.isfinite(r.upper)
-        result = linprog(
-            -np.eye(k + 1)[-1], A_ub=np.vstack([A[high], -A[low]]),
-            b_ub=np.concatenate([(r.upper - shift)[high], (shift - r.lower)[low]]),
-            bounds=[(None, None)] * k + [(0, None)], options=HIGHS,
-        )  # fmt: skip
-        if result.x is None:
-            return np.inf, np.zeros(k), np.zeros(count)
-        push, y = -result.ineqlin.marginals, np.zeros(count)
-        y[high] += push[: high.sum()]
-        y[low] -= push[high.sum() :]
-        return float(result.x[-1]), result.x[:k], y
-
     def shoot(self, directions: np.ndarray) -> Boundary:
         """Solve, pull and prove along every direction (K, d)."""
-        solved = [self._lp(direction) for direction in directions]
+        solved = [support(self.rows, direction, self.center) for direction in directions]
         t, w, y = (np.array(part) for part in zip(*solved, strict=True))
         bounded = np.isfinite(t)
         # Shrinking a feasible pair (θ, w) towards the centre's pair gives every row a margin.
@@ -172,7 +149,7 @@ def prove(p: Problem, rows: Rows, theta: Any, w: Any, y: Any) -> tuple[Array, Ar
         inputs, free = inputs_of(p, rows, theta, w)
         return proofs.prove_feasible(p, theta, free, inputs)[0]
 
-    normals, offsets = jax.vmap(lambda y: cut_of(p, rows, y))(y)
+    normals, offsets, _ = jax.vmap(lambda y: cut_of(p, rows, y))(y)
     return jax.vmap(jax.vmap(feasible))(theta, w), normals, offsets
 
 

@@ -10,13 +10,13 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from jaxmpc.checks import fail
-from jaxmpc.control.sets import Polytope
+from jaxmpc.control.sets import Polytope, hull_volume
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
 from jaxmpc.sweeps import proofs
 from jaxmpc.sweeps.boundary import Rays
 from jaxmpc.sweeps.compiled import Compiled, first_rows, padded
-from jaxmpc.sweeps.ladder import Verdict, admm_rung, newton_rung, rows
+from jaxmpc.sweeps.ladder import Verdict, admm_rung, extent, newton_rung, rows
 from jaxmpc.sweeps.proofs import make_view
 
 # Points a compiled program takes at once. 8,192 keep a step's data within a CPU's cache; larger
@@ -27,7 +27,7 @@ NEWTON_BATCH = 512
 NEWTON_STEPS = 8
 NEWTON_ROUNDS = 8
 # Volumes are sums of rounded products; bounds are widened by more than that.
-VOLUME_ROUNDING = 1e-12
+VOLUME_ROUNDING = 1e-11
 
 
 def grid(lower: Any, upper: Any, shape: Any) -> np.ndarray:
@@ -105,8 +105,9 @@ def label_chunks(
         fail("dtype", f"{dtype}", "Iterate in 'float32' or 'float64'")
 
     usable = np.all(np.isfinite(points), axis=1)
-    radius = np.abs(points[usable]).max(axis=0, initial=0.0)
-    problem, moving = proofs.problem(mpc, view, radius), rows(mpc, view)
+    moving = rows(mpc, view)
+    region = np.abs(points[usable]).max(axis=0, initial=0.0)
+    problem = proofs.problem(mpc, view, extent(moving, region))
     admm = Compiled(admm_rung(iterations, dtype))
     newton = Compiled(newton_rung(NEWTON_STEPS))
     chunk = min(chunk, max(len(points), 1))
@@ -202,25 +203,34 @@ class FeasibleSetMap:
             np.concatenate([self.points[self.label == 1], self.extra_points])
         )
 
-    def outer(self) -> Polytope:
-        """Intersection of all half-spaces proved valid: a superset of the feasible set.
-
-        Raises ValueError where there are none.
-        """
+    def cuts(self) -> tuple[np.ndarray, np.ndarray]:
+        """All half-spaces a'x ≤ b proved valid for the feasible set: a (K, d), b (K,)."""
         proved = self.label == -1
         normals = np.concatenate([self.labels.cut_normals[proved], self.extra_normals])
         offsets = np.concatenate([self.labels.cut_offsets[proved], self.extra_offsets])
-        keep = np.isfinite(offsets) & np.any(normals != 0, axis=1)
-        if not keep.any():
+        return normals, offsets
+
+    def outer(self) -> Polytope:
+        """Intersection of all half-spaces proved valid: a superset of the feasible set.
+
+        Raises ValueError where it is unbounded, empty or flat.
+        """
+        normals, offsets = self.cuts()
+        if not len(offsets):
             fail("outer", "no half-space is proved yet", "Map points outside the set, or refine()")
-        return Polytope(normals[keep], offsets[keep]).reduce()
+        return Polytope(normals, offsets).reduce()
 
     def volume_bounds(self) -> tuple[float, float]:
-        """Certified bounds on the volume (area in 2-D) of the feasible set, or of its section."""
-        try:
-            low = self.inner().volume() * (1 - VOLUME_ROUNDING)
-        except ValueError:
-            low = 0.0
+        """Certified bounds on the volume (area in 2-D) of the feasible set, or of its section.
+
+        (0, 0) where the half-spaces leave nothing, an upper bound of inf where they leave an
+        unbounded set.
+        """
+        points = np.concatenate([self.points[self.label == 1], self.extra_points])
+        low = hull_volume(points) * (1 - VOLUME_ROUNDING)
+        normals, offsets = self.cuts()
+        if len(offsets) and Polytope(normals, offsets).is_empty():
+            return low, 0.0
         try:
             high = self.outer().volume() * (1 + VOLUME_ROUNDING)
         except ValueError:
@@ -263,8 +273,8 @@ class FeasibleSetMap:
             normals = np.concatenate([normals, found.normals[valid]])
             offsets = np.concatenate([offsets, found.offsets[valid]])
             try:
-                outer, inner = Polytope(normals, offsets).reduce(), Polytope.from_points(points)
-                low, high = inner.volume(), outer.volume()
+                outer = Polytope(normals, offsets).reduce()
+                low, high = hull_volume(points), outer.volume()
                 directions = outer.vertices() - rays.center
             except ValueError:  # not bounded yet
                 directions = np.random.default_rng(len(points)).standard_normal((4 * d, d))

@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from scipy.optimize import linprog
 
-from jaxmpc.mpc.condense import condense
+from jaxmpc.mpc.condense import condense, in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.problem import matmul
 from jaxmpc.qp.refine import least_distance
@@ -24,6 +25,7 @@ from jaxmpc.sweeps import proofs
 from jaxmpc.sweeps.proofs import Problem, View
 
 ALPHA = 1.6
+HIGHS = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 INSET = 1e-10
 
 
@@ -55,7 +57,7 @@ class Rows:
 def rows(mpc: MPC, view: View) -> Rows:
     """Condense, restrict to the view and normalise; all on the host in float64."""
     with jax.enable_x64(True):
-        c = jax.tree.map(np.asarray, condense(jax.tree.map(np.float64, mpc)))
+        c = jax.tree.map(np.asarray, condense(in_float64(mpc)))
     axes, others = list(view.axes), list(view.others)
     C, D, lower, upper = c.C, c.D[:, axes], c.lower - c.d, c.upper - c.d
     Psi, Omega, psi = c.Psi[:, :, axes], c.Omega, c.psi
@@ -90,6 +92,46 @@ def rows(mpc: MPC, view: View) -> Rows:
     )  # fmt: skip
 
 
+def support(
+    rows: Rows, direction: np.ndarray, center: np.ndarray | None = None
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Without a centre max direction'θ over the set; with one max t ≥ 0 on center + t·direction.
+
+    Returns the optimum (inf: unbounded, −inf: empty), w, and the multipliers of the rows (HiGHS).
+    """
+    R, k = rows.U.shape
+    bounds: list[Any]
+    low, high = np.isfinite(rows.lower), np.isfinite(rows.upper)
+    if center is None:
+        A, shift = np.hstack([rows.U, rows.D]), np.zeros(R)
+        cost, bounds = np.append(np.zeros(k), direction), [(None, None)] * A.shape[1]
+    else:
+        A, shift = np.hstack([rows.U, (rows.D @ direction)[:, None]]), rows.D @ center
+        cost, bounds = np.append(np.zeros(k), 1.0), [(None, None)] * k + [(0, None)]
+    result = linprog(
+        -cost, A_ub=np.vstack([A[high], -A[low]]),
+        b_ub=np.concatenate([(rows.upper - shift)[high], (shift - rows.lower)[low]]),
+        bounds=bounds, options=HIGHS,
+    )  # fmt: skip
+    y = np.zeros(R)
+    if result.x is None:
+        return -np.inf if result.status == 2 else np.inf, np.zeros(k), y
+    push = -result.ineqlin.marginals
+    y[high] += push[: high.sum()]
+    y[low] -= push[high.sum() :]
+    return float(-result.fun), result.x[:k], y
+
+
+def extent(rows: Rows, otherwise: np.ndarray) -> np.ndarray:
+    """|θ| ≤ extent (d,) on the feasible set: twice the LPs' answer, which outweighs tolerances.
+
+    Where the LPs find the set empty, `otherwise`: the region that is looked at.
+    """
+    d = rows.D.shape[1]
+    ends = np.array([[support(rows, s * e)[0] for e in np.eye(d)] for s in (1.0, -1.0)])
+    return otherwise if np.any(ends == -np.inf) else 2 * np.abs(ends).max(axis=0) + 1e-300
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Verdict:
@@ -108,8 +150,8 @@ def inputs_of(p: Problem, rows: Rows, theta: Array, w: Array) -> tuple[Array, Ar
     return inputs + rows.psi, variables[p.horizon * p.B.shape[1] :]
 
 
-def cut_of(p: Problem, rows: Rows, y: Array) -> tuple[Array, Array]:
-    """The half-space (a, b) that multipliers y (R,) of the rows give."""
+def cut_of(p: Problem, rows: Rows, y: Array) -> tuple[Array, Array, Array]:
+    """The half-space (a, b, rounding) that multipliers y (R,) of the rows give."""
     y = jnp.append(y * rows.weight, 0.0)[jnp.asarray(rows.index)]
     steps, r = p.horizon - p.first_step, p.H.shape[0]
     return proofs.cut(p, y[: steps * r].reshape(steps, r), y[steps * r :])
@@ -123,8 +165,8 @@ def judge(p: Problem, rows: Rows, theta: Array, w: Array, candidates: list[Array
     normal, offset = jnp.zeros_like(theta), jnp.asarray(jnp.inf, jnp.float64)
     infeasible = jnp.asarray(False)
     for y in candidates:
-        a, b = cut_of(p, rows, y.astype(jnp.float64))
-        here = proofs.excludes(a, b, theta) & ~infeasible
+        a, b, rounding = cut_of(p, rows, y.astype(jnp.float64))
+        here = proofs.excludes(p, a, b, rounding, theta) & ~infeasible
         normal, offset = jnp.where(here, a, normal), jnp.where(here, b, offset)
         infeasible = infeasible | here
     label = jnp.where(feasible, 1, jnp.where(infeasible, -1, 0)).astype(jnp.int8)

@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
+from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import Controller
 from jaxmpc.qp.admm import ADMM, Factor, iterate, read
@@ -60,7 +61,7 @@ def solve_many(
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.system.n})")
     with jax.enable_x64(True):
         begun = time.perf_counter()
-        controller = Controller(jax.tree.map(np.float64, mpc), solver)
+        controller = Controller(in_float64(mpc), solver)
         first, more = Compiled(first_rung(np.dtype(dtype))), Compiled(newton_rung)
         size = min(chunk, max(len(x0s), 1))
         parts = [

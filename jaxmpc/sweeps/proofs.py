@@ -26,7 +26,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.control.sets import Box
+from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.mpc.problem import MPC
 
 UNIT_ROUNDOFF = 2.0**-53
@@ -78,9 +78,7 @@ def make_view(mpc: MPC, axes: Any = None, fixed: Any = None) -> View:
         require_finite("fixed", np.asarray(fixed, float)[list(others)])
         fixed = np.asarray(fixed, np.float64)
         return View(axes, others, np.where(np.isin(np.arange(n), others), fixed, 0.0), None, None)
-    lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
-    if mpc.constrain_initial and isinstance(mpc.states, Box):
-        lower, upper = np.asarray(mpc.states.lower, float), np.asarray(mpc.states.upper, float)
+    lower, upper = bounding_box(mpc.states if mpc.constrain_initial and others else None, n)
     return View(axes, others, None, lower[list(others)], upper[list(others)])
 
 
@@ -91,7 +89,7 @@ class Problem:
 
     H, lower, upper: state rows (r rows) that hold at k = first_step..N−1; the same with
     suffix _N at k = N. u_lower, u_upper (m,). reach (N+1, n): |x_k| ≤ reach_k on every feasible
-    trajectory from the mapped region.
+    trajectory.
     """
 
     A: Any
@@ -111,8 +109,8 @@ class Problem:
     first_step: int = field(metadata={"static": True})
 
 
-def problem(mpc: MPC, view: View, radius: np.ndarray) -> Problem:
-    """Collect the exact data. radius (d,): largest |θ| in the map."""
+def problem(mpc: MPC, view: View, extent: np.ndarray) -> Problem:
+    """Collect the exact data. extent (d,): |θ| ≤ extent for every feasible θ."""
     to64 = lambda v: np.asarray(v, np.float64)
     n, m, N = mpc.system.n, mpc.system.m, mpc.horizon
     A, B = to64(mpc.system.A), to64(mpc.system.B)
@@ -129,13 +127,14 @@ def problem(mpc: MPC, view: View, radius: np.ndarray) -> Problem:
 
     first = 0 if mpc.constrain_initial else 1
     start = np.full(n, np.inf)
-    start[list(view.axes)] = radius
+    start[list(view.axes)] = extent
     if view.projects:
         start[list(view.others)] = np.maximum(np.abs(view.lower), np.abs(view.upper))
     elif view.others:
         start[list(view.others)] = np.abs(view.fixed)[list(view.others)]
-    size = magnitudes(H, lower, upper)
-    size_N = magnitudes(H_N, lower_N, upper_N)
+    size, size_N = (
+        np.abs(bounding_box(set_, n)).max(axis=0) for set_ in (mpc.states, mpc.terminal_set)
+    )
     u_size = np.maximum(np.abs(u_lower), np.abs(u_upper))
     reach = [np.minimum(start, size) if first == 0 else start]
     for k in range(1, N + 1):
@@ -151,15 +150,16 @@ def problem(mpc: MPC, view: View, radius: np.ndarray) -> Problem:
     )  # fmt: skip
 
 
-def magnitudes(H: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Bounds on |x_i| that rows of a single entry imply; inf where there is none."""
-    size = np.full(H.shape[1], np.inf)
-    for row, lo, hi in zip(H, lower, upper, strict=True):
-        (where,) = np.nonzero(row)
-        if where.size == 1 and np.isfinite(lo) and np.isfinite(hi):
-            i = where[0]
-            size[i] = min(size[i], max(abs(lo), abs(hi)) / abs(row[i]) * (1 + 1e-9))
-    return size
+def bounding_box(set_: Box | Polytope | None, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds (n,) of each coordinate on a set; a polytope's by LP, a part in 10⁶ outwards."""
+    if set_ is None:
+        return np.full(n, -np.inf), np.full(n, np.inf)
+    if isinstance(set_, Box):
+        return np.asarray(set_.lower, np.float64), np.asarray(set_.upper, np.float64)
+    upper = np.array([set_.support(row) for row in np.eye(n)])
+    lower = -np.array([set_.support(row) for row in -np.eye(n)])
+    margin = 1e-6 * (1e-6 + np.maximum(np.abs(lower), np.abs(upper)))
+    return lower - margin, upper + margin
 
 
 def gamma(terms: int) -> float:
@@ -202,12 +202,12 @@ def prove_feasible(p: Problem, theta: Array, free: Array, inputs: Array) -> tupl
     return proved & jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(inputs)), inputs
 
 
-def cut(p: Problem, y_states: Array, y_N: Array) -> tuple[Array, Array]:
+def cut(p: Problem, y_states: Array, y_N: Array) -> tuple[Array, Array, Array]:
     """The half-space a'θ ≤ b, valid for every feasible θ, that multipliers give.
 
     y_states (N − first_step, r) and y_N (r_N,): y > 0 on the upper bound, y < 0 on the lower.
-    b already includes the rounding bound; it is +inf where nothing can be said. (a, b) is scaled
-    by a power of two, which is exact.
+    Returns a (d,), b and the part of b that covers rounding; b = inf where nothing can be said.
+    All are scaled by a power of two, which is exact.
     """
     n, m = p.B.shape
     N, r = p.horizon, p.H.shape[0]
@@ -255,12 +255,19 @@ def cut(p: Problem, y_states: Array, y_N: Array) -> tuple[Array, Array]:
     total = total - jnp.sum(rest * value)
     size = size + times(jnp.abs(rest), jnp.abs(value))
     terms = N * (r + m + 3) + 2 * n + p.H_N.shape[0] + 8
-    b = total + 2 * gamma(terms) * size
+    rounding = 2 * gamma(terms) * size
+    b = total + rounding
     # 0'θ ≤ b says nothing, unless b < 0: then no θ at all is feasible.
-    return a, jnp.where(jnp.isfinite(b) & (jnp.any(a != 0) | (b < 0)), b, jnp.inf)
+    return a, jnp.where(jnp.isfinite(b) & (jnp.any(a != 0) | (b < 0)), b, jnp.inf), rounding
 
 
-def excludes(a: Array, b: Array, theta: Array) -> Array:
-    """True when the half-space a'θ ≤ b excludes θ by more than the rounding of a'θ."""
+def excludes(p: Problem, a: Array, b: Array, rounding: Array, theta: Array) -> Array:
+    """True when the half-space of `cut` excludes θ by more than all rounding.
+
+    b covers trajectories within `reach`. One from a θ outside it, λ times as far, is within
+    λ·reach, because the recursion of `reach` grows no faster than its start.
+    """
     slack = 2 * gamma(theta.shape[-1] + 2) * (jnp.sum(jnp.abs(a * theta), axis=-1) + jnp.abs(b))
-    return jnp.sum(a * theta, axis=-1) - b > slack
+    start = p.reach[0][np.array(p.view.axes)]
+    far = jnp.max(jnp.where(start > 0, jnp.abs(theta) / jnp.where(start > 0, start, 1.0), 1.0))
+    return jnp.sum(a * theta, axis=-1) - b > slack + 2 * jnp.maximum(far, 1.0) * rounding

@@ -1,0 +1,515 @@
+"""MPC against theorems and stacked, sparse and Riccati constructions that share no code with it."""
+
+from dataclasses import replace
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+import scipy
+from jax import enable_x64
+
+import jaxmpc as jm
+from jaxmpc.mpc.condense import condense
+
+FINE = jm.ADMM(iterations=400, refine=30, eps=1e-8)
+
+
+@pytest.fixture(autouse=True)
+def x64():
+    with enable_x64(True):
+        yield
+
+
+def free(horizon=8, terminal_cost=None) -> jm.MPC:
+    """An unstable plant without any limit."""
+    return jm.MPC(
+        system=jm.LinearSystem(
+            np.array([[1.2, 0.5, 0.0], [0.0, 0.9, 0.3], [0.1, 0.0, 1.0]]),
+            np.array([[0.0, 0.2], [1.0, 0.0], [0.0, 0.7]]),
+        ),
+        Q=np.diag([2.0, 1.0, 0.5]), R=np.array([[1.0, 0.2], [0.2, 2.0]]), horizon=horizon,
+        terminal_cost=terminal_cost,
+    )  # fmt: skip
+
+
+class Stacked:
+    """The problem with its states kept: v = (x_0, …, x_N, u_0, …, u_{N−1}), dynamics as rows.
+
+    min v'Wv subject to G v = g(x0) and lower ≤ M v ≤ upper, built with numpy and loops.
+    """
+
+    def __init__(self, mpc: jm.MPC):
+        A, B = np.asarray(mpc.system.A), np.asarray(mpc.system.B)
+        n, m = B.shape
+        N = mpc.horizon
+        c = np.zeros(n) if mpc.system.c is None else mpc.system.c
+        size = (N + 1) * n + N * m
+        x = [slice(k * n, (k + 1) * n) for k in range(N + 1)]
+        u = [slice((N + 1) * n + k * m, (N + 1) * n + (k + 1) * m) for k in range(N)]
+        self.W, self.G = np.zeros((size, size)), np.zeros(((N + 1) * n, size))
+        self.g = np.zeros((N + 1) * n)
+        self.G[x[0], x[0]] = np.eye(n)
+        for k in range(N):
+            self.W[x[k], x[k]], self.W[u[k], u[k]] = mpc.Q, mpc.R
+            rows = x[k + 1]
+            self.G[rows, x[k + 1]], self.G[rows, x[k]], self.G[rows, u[k]] = np.eye(n), -A, -B
+            self.g[rows] = c
+        if mpc.terminal_cost is not None:
+            self.W[x[N], x[N]] = mpc.terminal_cost
+        M, lower, upper = [np.zeros((0, size))], [[]], [[]]
+
+        def add(set_, where):
+            if set_ is None:
+                return
+            box = isinstance(set_, jm.Box)
+            H = np.eye(len(set_.lower)) if box else np.asarray(set_.H)
+            row = np.zeros((len(H), size))
+            row[:, where] = H
+            M.append(row)
+            lower.append(set_.lower if box else np.full(len(H), -np.inf))
+            upper.append(set_.upper if box else set_.h)
+
+        for k in range(N):
+            add(mpc.inputs, u[k])
+        for k in range(0 if mpc.constrain_initial else 1, N):
+            add(mpc.states, x[k])
+        add(mpc.terminal_set, x[N])
+        self.M, self.lower, self.upper = map(np.concatenate, (M, lower, upper))
+        self.n, self.size, self.states = n, size, (N + 1) * n
+        self.shape = (N, m)
+
+    def right(self, x0):
+        """g with x_0 in it."""
+        g = self.g.copy()
+        g[: self.n] = x0
+        return g
+
+    def from_inputs(self, x0, inputs):
+        """v of an input sequence, by solving the dynamics."""
+        u = np.asarray(inputs).reshape(-1)
+        x = np.linalg.solve(self.G[:, : self.states], self.right(x0) - self.G[:, self.states :] @ u)
+        return np.concatenate([x, u])
+
+    def solve(self, x0, linear=None):
+        """(v'Wv + linear'v, v) by OSQP."""
+        osqp, sparse = pytest.importorskip("osqp"), scipy.sparse.csc_matrix
+        linear = np.zeros(self.size) if linear is None else linear
+        g = self.right(x0)
+        solver = osqp.OSQP()
+        solver.setup(
+            sparse(2 * self.W), linear, sparse(np.vstack([self.G, self.M])),
+            np.concatenate([g, self.lower]), np.concatenate([g, self.upper]),
+            eps_abs=1e-10, eps_rel=1e-10, max_iter=200000, polishing=True, verbose=False,
+        )  # fmt: skip
+        result = solver.solve(raise_error=True)
+        assert result.info.status == "solved"
+        return result.x @ self.W @ result.x + linear @ result.x, result.x
+
+
+CASES = {
+    "drifting": problems.drifting,
+    "drifting, k from 1": lambda: replace(problems.drifting(), constrain_initial=False),
+    "joint": lambda: problems.joint(horizon=6),
+    "joint, terminal O_inf": lambda: problems.joint_o_inf(horizon=10),
+    "hidden product": lambda: problems.hidden_product(horizon=4),
+    "unstable": lambda: problems.unstable(horizon=6),
+    "free": free,
+}
+X0 = {"drifting": [0.2, 0.3], "joint": [0.4, -1.2], "hidden product": [1.48, -0.98, -0.38, 1.0],
+      "unstable": [0.6, 0.3], "free": [1.0, -2.0, 0.5]}  # fmt: skip
+start = lambda name: np.array(X0[name.split(",")[0]])
+
+
+class TestCondensing:
+    @pytest.mark.parametrize("name", CASES)
+    @pytest.mark.parametrize("prestabilise", [False, "gain"])
+    def test_entry_by_entry(self, name, prestabilise):
+        """P, F, f, C, D, d from the stacked matrices, x = G_x⁻¹ (g − G_u u), one column each."""
+        mpc = CASES[name]()
+        stacked, n = Stacked(mpc), mpc.system.n
+        N, m = stacked.shape
+        K = np.zeros((m, n))
+        if prestabilise:
+            K = np.random.default_rng(0).standard_normal((m, n)) * 0.3
+        c = condense(replace(mpc, prestabilise=K if prestabilise else False))
+
+        def unfold(x0, z, drift):
+            """v for u_k = K x_k + z_k, step by step."""
+            offset = np.zeros(n) if mpc.system.c is None or not drift else mpc.system.c
+            xs, us = [x0], []
+            for k in range(N):
+                us.append(K @ xs[-1] + z.reshape(N, m)[k])
+                xs.append(mpc.system.A @ xs[-1] + mpc.system.B @ us[-1] + offset)
+            return np.concatenate([*xs, *us])
+
+        zero, rest = np.zeros(n), np.zeros(N * m)
+        by_z = np.stack([unfold(zero, e, False) for e in np.eye(N * m)], axis=1)
+        by_x = np.stack([unfold(e, rest, False) for e in np.eye(n)], axis=1)
+        constant = unfold(zero, rest, True)
+        close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
+        close(c.P, 2 * by_z.T @ stacked.W @ by_z)
+        close(c.F, 2 * by_z.T @ stacked.W @ by_x)
+        close(c.f, 2 * by_z.T @ stacked.W @ constant)
+        close(c.C, stacked.M @ by_z)
+        close(c.D, stacked.M @ by_x)
+        close(c.d, stacked.M @ constant)
+        close(c.lower, stacked.lower)
+        close(c.upper, stacked.upper)
+        x0, z = start(name), np.linspace(-1, 1, N * m)
+        states, inputs = c.trajectory(x0, z)
+        close(np.concatenate([np.ravel(states), np.ravel(inputs)]), unfold(x0, z, True))
+
+    def test_no_input_moves_the_rows_at_zero(self):
+        c = condense(problems.joint(horizon=3))
+        np.testing.assert_array_equal(c.C[3:5], 0)  # after 3 input rows: the state at k = 0
+
+
+class TestAnotherSolver:
+    @pytest.mark.parametrize("name", CASES)
+    def test_states_kept(self, name):
+        mpc, x0 = CASES[name](), start(name)
+        cost, v = Stacked(mpc).solve(x0)
+        plan = jm.solve(mpc, x0, solver=FINE)
+        assert plan.status == jm.Status.SOLVED
+        got = np.concatenate([np.ravel(plan.states), np.ravel(plan.inputs)])
+        np.testing.assert_allclose(got, v, atol=1e-6 * (1 + np.abs(v).max()))
+        np.testing.assert_allclose(plan.cost, cost, rtol=1e-6)
+
+    @pytest.mark.parametrize("name", CASES)
+    def test_optimality(self, name):
+        """KKT of the stacked problem: costates recovered by the adjoint leave no gradient in u."""
+        mpc, x0 = CASES[name](), start(name)
+        stacked, plan = Stacked(mpc), jm.solve(mpc, x0, solver=FINE)
+        assert plan.status == jm.Status.SOLVED
+        v = stacked.from_inputs(x0, plan.inputs)
+        y = plan.multipliers
+        y = np.concatenate([np.ravel(y.inputs), np.ravel(y.states), np.ravel(y.terminal)])
+        gradient = 2 * stacked.W @ v + stacked.M.T @ y
+        costates = np.linalg.solve(stacked.G[:, : stacked.states].T, -gradient[: stacked.states])
+        left = gradient[stacked.states :] + stacked.G[:, stacked.states :].T @ costates
+        np.testing.assert_allclose(left, 0, atol=1e-6 * (1 + np.abs(gradient).max()))
+        value = stacked.M @ v
+        assert np.all(value <= stacked.upper + 1e-7) and np.all(value >= stacked.lower - 1e-7)
+        slack = np.where(y > 0, stacked.upper - value, value - stacked.lower)
+        np.testing.assert_allclose(np.where(np.abs(y) > 1e-6, slack, 0), 0, atol=1e-6)
+
+    def test_limits_bind(self):
+        """The cases above are no unconstrained problems in disguise."""
+        for name in ("drifting", "joint", "hidden product", "unstable"):
+            plan = jm.solve(CASES[name](), start(name), solver=FINE)
+            assert max(np.abs(v).max(initial=0) for v in jax.tree.leaves(plan.multipliers)) > 1e-3
+
+
+class TestRiccati:
+    @pytest.mark.parametrize("horizon", [1, 2, 5, 20])
+    def test_unconstrained_is_lqr_at_every_horizon(self, horizon):
+        mpc = free(horizon)
+        lqr = jm.lqr(mpc.system, mpc.Q, mpc.R)
+        x = start("free")
+        plan = jm.solve(replace(mpc, terminal_cost=lqr.P), x)
+        assert plan.status == jm.Status.SOLVED
+        np.testing.assert_allclose(plan.cost, x @ lqr.P @ x, rtol=1e-9)
+        for k in range(horizon):
+            np.testing.assert_allclose(plan.states[k], x, atol=1e-8)
+            np.testing.assert_allclose(plan.inputs[k], lqr.K @ x, atol=1e-8)
+            x = mpc.system.A @ x + mpc.system.B @ (lqr.K @ x)
+
+    def test_loose_limits_are_lqr_too(self):
+        mpc = free(6)
+        lqr = jm.lqr(mpc.system, mpc.Q, mpc.R)
+        mpc = replace(
+            mpc, terminal_cost=lqr.P, states=problems.symmetric(50, 50, 50),
+            inputs=problems.symmetric(20, 20),
+        )  # fmt: skip
+        plan = jm.solve(mpc, start("free"), solver=FINE)
+        np.testing.assert_allclose(plan.inputs[0], lqr.K @ start("free"), atol=1e-7)
+
+    def test_finite_horizon_recursion(self):
+        """No terminal cost: the Riccati difference equation from P_N = 0."""
+        mpc = free(7)
+        A, B, P = mpc.system.A, mpc.system.B, np.zeros((3, 3))
+        for _ in range(7):
+            K = -np.linalg.solve(mpc.R + B.T @ P @ B, B.T @ P @ A)
+            P = mpc.Q + A.T @ P @ A + A.T @ P @ B @ K
+        x = start("free")
+        plan = jm.solve(mpc, x)
+        np.testing.assert_allclose(plan.inputs[0], K @ x, atol=1e-8)
+        np.testing.assert_allclose(plan.cost, x @ P @ x, rtol=1e-9)
+
+    def test_cost_falls_along_the_closed_loop(self):
+        """With O_inf and the DARE's P, J* falls by at least the stage cost (Mayne et al. 2000)."""
+        mpc = problems.joint_o_inf(horizon=12)
+        controller, x, carry = jm.Controller(mpc, FINE), np.array([0.35, -1.0]), None
+        step = jax.jit(lambda c, x, carry: c(x, carry))
+        last = np.inf
+        for _ in range(15):
+            u, carry, plan = step(controller, x, carry)
+            assert plan.status == jm.Status.SOLVED
+            assert plan.cost <= last + 1e-7
+            last = plan.cost - x @ mpc.Q @ x - u @ mpc.R @ u
+            x = mpc.system.A @ x + mpc.system.B @ np.asarray(u)
+
+
+class TestPrestabilising:
+    def test_same_plan(self):
+        mpc = problems.unstable(horizon=12)
+        x0 = np.array([0.5, 0.4])
+        plain, auto, given = (
+            jm.solve(replace(mpc, prestabilise=choice), x0, solver=FINE)
+            for choice in (False, None, np.array([[-1.5, -0.8]]))
+        )
+        for plan in (plain, auto, given):
+            assert plan.status == jm.Status.SOLVED
+            np.testing.assert_allclose(plan.inputs, plain.inputs, atol=1e-6)
+            np.testing.assert_allclose(plan.cost, plain.cost, rtol=1e-7)
+            np.testing.assert_allclose(plan.multipliers.inputs, plain.multipliers.inputs, atol=1e-4)
+
+    @pytest.mark.slow
+    def test_long_horizon(self):
+        """2^40 in float32: the plan keeps its limits and meets that of float64."""
+        mpc = problems.unstable(horizon=40)
+        x0 = np.array([0.4, 0.2])
+        fine = jm.solve(mpc, x0, solver=FINE)
+        assert fine.status == jm.Status.SOLVED
+        with enable_x64(False):
+            coarse = jm.solve(mpc, x0)
+        assert coarse.inputs.dtype == jnp.float32
+        np.testing.assert_allclose(coarse.inputs, fine.inputs, atol=1e-2)
+
+
+class TestReferences:
+    @pytest.mark.parametrize("name", ["drifting", "hidden product", "unstable"])
+    def test_tracking(self, name):
+        """Cost Σ (x − r)'Q(x − r) + u'Ru + …, with the states kept, by another solver."""
+        mpc, x0 = CASES[name](), start(name)
+        stacked = Stacked(mpc)
+        rng = np.random.default_rng(0)
+        for shape in ((mpc.system.n,), (mpc.horizon + 1, mpc.system.n)):
+            reference = 0.3 * rng.standard_normal(shape)
+            r = np.zeros(stacked.size)
+            r[: stacked.states] = np.broadcast_to(
+                reference, (mpc.horizon + 1, mpc.system.n)
+            ).ravel()
+            cost, v = stacked.solve(x0, linear=-2 * stacked.W @ r)
+            plan = jm.solve(mpc, x0, reference=reference, solver=FINE)
+            assert plan.status == jm.Status.SOLVED
+            got = np.concatenate([np.ravel(plan.states), np.ravel(plan.inputs)])
+            np.testing.assert_allclose(got, v, atol=1e-5)
+            np.testing.assert_allclose(plan.cost, cost + r @ stacked.W @ r, rtol=1e-6)
+
+    def test_zero_reference_is_none(self):
+        mpc, x0 = problems.drifting(), start("drifting")
+        a, b = jm.solve(mpc, x0), jm.solve(mpc, x0, reference=np.zeros(2))
+        np.testing.assert_allclose(a.inputs, b.inputs, atol=1e-12)
+
+
+class TestMultipliers:
+    """dJ*/d(bound) = −y, by central differences."""
+
+    @pytest.mark.parametrize("side", ["upper", "lower"])
+    @pytest.mark.parametrize("which", ["inputs", "states", "terminal_set"])
+    def test_sensitivity(self, which, side):
+        # Strictly active: the inputs at first, dq between, the terminal box at the end.
+        mpc = replace(
+            problems.joint(horizon=8), states=problems.symmetric(1.5, 1.0),
+            terminal_set=jm.Box(np.array([0.0, 0.0]) - 0.25, np.array([0.5, 0.25])),
+            terminal_cost=10 * np.array(problems.P_JOINT),
+        )  # fmt: skip
+        x0 = np.array([0.4, 0.8])
+        plan = jm.solve(mpc, x0, solver=FINE)
+        assert plan.status == jm.Status.SOLVED
+        y = np.asarray(plan.multipliers.terminal if which == "terminal_set" else
+                       getattr(plan.multipliers, which))  # fmt: skip
+        y = np.atleast_2d(y).sum(axis=0)  # a bound is shared by all steps
+
+        def cost(entry, h):
+            set_ = getattr(mpc, which)
+            bound = np.array(getattr(set_, side))
+            bound[entry] += h
+            return jm.solve(
+                replace(mpc, **{which: replace(set_, **{side: bound})}), x0, solver=FINE
+            ).cost
+
+        each = np.atleast_2d(np.asarray(
+            plan.multipliers.terminal if which == "terminal_set"
+            else getattr(plan.multipliers, which)
+        ))  # fmt: skip
+        push = np.maximum(each, 0) if side == "upper" else np.minimum(each, 0)
+        for entry in range(len(y)):
+            h = 1e-5
+            slope = (cost(entry, h) - cost(entry, -h)) / (2 * h)
+            np.testing.assert_allclose(slope, -push.sum(axis=0)[entry], rtol=1e-3, atol=1e-3)
+
+    def test_shapes(self):
+        mpc = replace(problems.drifting(), constrain_initial=False)
+        y = jm.solve(mpc, start("drifting")).multipliers
+        assert (y.states.shape, y.inputs.shape, y.terminal.shape) == ((3, 5), (4, 2), (2,))
+        y = jm.solve(free(), start("free")).multipliers
+        assert (y.states.shape, y.inputs.shape, y.terminal.shape) == ((8, 0), (8, 0), (0,))
+
+
+class TestIndexSet:
+    def test_initial_state_outside(self):
+        """x0 beyond its limit is infeasible with k = 0 and may be saved without it."""
+        mpc = problems.scalar(terminal=1.0)
+        x0 = np.array([1.2])
+        assert jm.solve(mpc, x0).status == jm.Status.PRIMAL_INFEASIBLE
+        plan = jm.solve(replace(mpc, constrain_initial=False), x0)
+        assert plan.status == jm.Status.SOLVED
+        assert np.all(np.abs(plan.states[1:]) <= 1 + 1e-6)
+
+    def test_infeasible_far_away(self):
+        plan = jm.solve(replace(problems.scalar(terminal=1.0), constrain_initial=False), [3.0])
+        assert plan.status == jm.Status.PRIMAL_INFEASIBLE
+
+
+class TestManyStates:
+    def test_vmap(self):
+        mpc = problems.lecture()
+        x0s = np.random.default_rng(0).uniform(-1, 1, (40, 2))
+        plans = jax.vmap(jm.solve, in_axes=(None, 0))(mpc, x0s)
+        assert plans.states.shape == (40, 4, 2) and plans.inputs.shape == (40, 3, 1)
+        for i in range(0, 40, 8):
+            one = jm.solve(mpc, x0s[i])
+            assert plans.status[i] == one.status
+            if one.status == jm.Status.SOLVED:
+                np.testing.assert_allclose(plans.inputs[i], one.inputs, atol=1e-6)
+        found = np.asarray(plans.status)
+        assert {jm.Status.SOLVED, jm.Status.PRIMAL_INFEASIBLE} <= set(found)
+
+    def test_bad_states_stay_alone(self):
+        mpc = problems.lecture()
+        x0s = np.random.default_rng(0).uniform(-0.5, 0.5, (6, 2))
+        solve = jax.jit(jax.vmap(jm.solve, in_axes=(None, 0)))
+        clean = solve(mpc, x0s)
+        x0s[2, 1], x0s[4, 0] = np.nan, np.inf
+        spoiled = solve(mpc, x0s)
+        bad = np.isin(np.arange(6), [2, 4])
+        np.testing.assert_array_equal(np.asarray(spoiled.status)[bad], jm.Status.NON_FINITE)
+        chex.assert_trees_all_equal(
+            jax.tree.map(lambda v: v[~bad], spoiled), jax.tree.map(lambda v: v[~bad], clean)
+        )
+
+    def test_batch_of_plants(self):
+        """Leaves of the problem may be batched: one MPC for each inertia."""
+        mpc = problems.joint(horizon=4)
+        gains = np.array([0.1, 0.2, 0.4])
+        solve = lambda b: (
+            jm.solve(
+                replace(mpc, system=jm.LinearSystem(mpc.system.A, jnp.array([[0.0], [1.0]]) * b)),
+                np.array([0.3, 0.1]),
+            ).inputs
+        )
+        batch = jax.vmap(solve)(gains)
+        for b, inputs in zip(gains, batch, strict=True):
+            np.testing.assert_allclose(inputs, solve(b), atol=1e-7)
+
+
+class TestController:
+    def test_warm_start_saves_steps(self):
+        mpc = problems.joint_o_inf(horizon=10)
+        x = np.array([0.35, -0.5])
+        fine = jm.Controller(mpc, FINE)
+        _, carry, _ = fine(x)
+        few = jm.Controller(mpc, jm.ADMM(iterations=5, refine=0))
+        cold, warm = few(x)[2], few(x, carry)[2]
+        assert warm.status == jm.Status.SOLVED != cold.status
+        again = few.plan(x, warm_start=fine.plan(x))
+        np.testing.assert_allclose(again.inputs, warm.inputs, atol=1e-9)
+
+    def test_same_as_solve_and_under_scan(self):
+        mpc = problems.lecture()
+        controller = jm.Controller(mpc)
+        x0 = np.array([0.3, -0.2])
+        u, carry, plan = controller(x0)
+        np.testing.assert_allclose(plan.inputs, jm.solve(mpc, x0).inputs, atol=1e-12)
+        np.testing.assert_array_equal(u, plan.inputs[0])
+
+        def body(state, _):
+            x, carry = state
+            u, carry, plan = controller(x, carry)
+            return (mpc.system.A @ x + mpc.system.B @ u, carry), (x, plan.status)
+
+        _, (xs, status) = jax.jit(lambda s: jax.lax.scan(body, s, length=12))(
+            (jnp.asarray(x0), carry)
+        )
+        assert np.all(np.asarray(status) == jm.Status.SOLVED)
+        assert np.abs(xs[-1]).max() < 0.2
+
+    def test_is_a_tree(self):
+        controller = jm.Controller(problems.lecture())
+        leaves, structure = jax.tree.flatten(controller)
+        again = jax.tree.unflatten(structure, leaves)
+        np.testing.assert_array_equal(again(np.ones(2) * 0.1)[0], controller(np.ones(2) * 0.1)[0])
+        for filler in (None, 0, object()):
+            jax.tree.unflatten(structure, [filler] * len(leaves))
+
+
+class TestTypes:
+    def test_dtype_follows_data(self):
+        mpc = problems.lecture()
+        assert jm.solve(mpc, np.zeros(2)).inputs.dtype == jnp.float64
+        single = jax.tree.map(np.float32, mpc)
+        assert jm.solve(single, np.zeros(2, np.float32)).inputs.dtype == jnp.float32
+
+    def test_integers(self):
+        system = jm.LinearSystem(np.array([[1, 1], [0, 1]]), np.array([[0], [1]]))
+        mpc = jm.MPC(system, np.eye(2, dtype=int), np.eye(1, dtype=int), 3)
+        assert jnp.issubdtype(jm.solve(mpc, np.array([1, 0])).inputs.dtype, jnp.floating)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (dict(horizon=0), "horizon"),
+        (dict(horizon=-3), "horizon"),
+        (dict(horizon=2.5), "horizon"),
+        (dict(Q=np.diag([1.0, -1.0])), "Q.*semidefinite"),
+        (dict(Q=np.array([[1.0, 0.5], [0.0, 1.0]])), "Q.*symmetric"),
+        (dict(Q=np.eye(3)), "Q"),
+        (dict(Q=np.full((2, 2), np.nan)), "Q"),
+        (dict(R=np.zeros((1, 1))), "R.*definite"),
+        (dict(R=-np.eye(1)), "R.*definite"),
+        (dict(R=np.eye(2)), "R"),
+        (dict(terminal_cost=-np.eye(2)), "terminal_cost"),
+        (dict(terminal_cost=np.eye(3)), "terminal_cost"),
+        (dict(states=problems.symmetric(1.0)), "states"),
+        (dict(states=jm.Box(np.ones(2), -np.ones(2))), "states"),
+        (dict(states=jm.Box(np.full(2, np.nan), np.ones(2))), "states"),
+        (dict(inputs=jm.Box(np.ones(1), np.zeros(1))), "inputs"),
+        (dict(inputs=jm.Box(-np.ones(1), np.full(1, np.nan))), "inputs"),
+        (dict(inputs=problems.symmetric(1.0, 1.0)), "inputs"),
+        (dict(inputs=jm.Polytope(np.array([[1.0], [-1.0]]), np.ones(2))), "inputs.*Polytope"),
+        (dict(terminal_set=problems.symmetric(1.0, 1.0, 1.0)), "terminal_set"),
+        (dict(terminal_set=jm.Polytope(np.eye(2), np.array([np.nan, 1.0]))), "terminal_set"),
+        (dict(states=jm.Polytope(np.array([[1.0, 0.0], [-1.0, 0.0]]), np.array([1.0, -2.0]))),
+         "states.*empty"),
+        (dict(states=(-1.0, 1.0)), "states"),
+        (dict(system=jm.LinearSystem(np.ones((2, 3)), np.ones((2, 1)))), "A"),
+        (dict(system=jm.LinearSystem(np.eye(2), np.ones((3, 1)))), "B"),
+        (dict(system=jm.LinearSystem(np.eye(2) * np.nan, np.ones((2, 1)))), "A"),
+        (dict(system=(np.eye(2), np.ones((2, 1)))), "system"),
+        (dict(prestabilise=np.ones((2, 2))), "prestabilise"),
+    ],
+)  # fmt: skip
+def test_bad_problems_raise(change, words):
+    mpc = replace(problems.lecture(), **change)
+    for use in (lambda: jm.solve(mpc, np.zeros(2)), lambda: jm.Controller(mpc),
+                lambda: jm.map_feasible_set(mpc, np.zeros((1, 2)))):  # fmt: skip
+        with pytest.raises(ValueError, match=words):
+            use()
+
+
+@pytest.mark.parametrize("x0", [np.zeros(3), 0.0, np.zeros((2, 1)), np.zeros((5, 2))])
+def test_bad_state_raises(x0):
+    with pytest.raises(ValueError, match="x0"):
+        jm.solve(problems.lecture(), x0)
+
+
+@pytest.mark.parametrize("reference", [np.zeros(3), np.zeros((3, 2)), 0.0])
+def test_bad_reference_raises(reference):
+    with pytest.raises(ValueError, match="reference"):
+        jm.solve(problems.lecture(), np.zeros(2), reference=reference)

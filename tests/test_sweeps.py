@@ -1,0 +1,346 @@
+"""Maps, proofs and boundaries: bad points, shapes, empty sets, repeatability, compile counts."""
+
+import warnings
+from dataclasses import replace
+from fractions import Fraction
+
+import exact
+import jax
+import numpy as np
+import problems
+import pytest
+from jax import enable_x64
+
+import jaxmpc as jm
+from jaxmpc.qp.status import Status
+from jaxmpc.sweeps import feasible_set, proofs
+
+
+@pytest.fixture(scope="module")
+def polygon():
+    return exact.feasible_polygon(problems.lecture())
+
+
+@pytest.fixture(scope="module")
+def points():
+    return jm.grid([-1.2, -1.2], [1.2, 1.2], (13, 13))
+
+
+@pytest.fixture(scope="module")
+def fmap(points):
+    return jm.map_feasible_set(problems.lecture(), points)
+
+
+EMPTY = replace(problems.lecture(), terminal_set=jm.Box(np.array([5.0, 5.0]), np.array([6.0, 6.0])))
+
+
+class TestGrid:
+    def test_ends_and_order(self):
+        expected = [[0, 5], [0, 6], [0, 7], [1, 5], [1, 6], [1, 7]]
+        np.testing.assert_array_equal(jm.grid([0, 5], [1, 7], (2, 3)), expected)
+
+    def test_one_dimension(self):
+        np.testing.assert_array_equal(jm.grid(0, 1, 3), [[0], [0.5], [1]])
+
+    @pytest.mark.parametrize(
+        "arguments",
+        [([0, 0], [1], (2, 2)), ([0], [1], (2, 2)), ([1], [0], 2), ([0], [1], 0),
+         ([0], [np.inf], 2), ([np.nan], [1], 2)],
+    )  # fmt: skip
+    def test_errors(self, arguments):
+        with pytest.raises(ValueError, match="grid"):
+            jm.grid(*arguments)
+
+
+class TestBadPoints:
+    def test_not_finite(self, points, fmap):
+        """NaN and infinity get their own status; every other label stays."""
+        spoiled = points.copy()
+        spoiled[3, 0], spoiled[80, 1], spoiled[81] = np.nan, np.inf, -np.inf
+        got = jm.map_feasible_set(problems.lecture(), spoiled)
+        bad = np.isin(np.arange(len(points)), [3, 80, 81])
+        assert np.all(got.status[bad] == Status.NON_FINITE) and np.all(got.label[bad] == 0)
+        assert np.isnan(got.labels.plans[bad]).all() and np.isnan(got.labels.cut_offsets[bad]).all()
+        np.testing.assert_array_equal(got.label[~bad], fmap.label[~bad])
+        np.testing.assert_array_equal(got.labels.plans[~bad], fmap.labels.plans[~bad])
+        assert got.counts()["not finite"] == 3
+
+    def test_all_bad(self):
+        got = jm.map_feasible_set(problems.lecture(), np.full((3, 2), np.nan))
+        assert got.counts()["not finite"] == 3
+
+    @pytest.mark.parametrize("huge", [1e12, 1e30])
+    def test_far_away(self, points, fmap, huge):
+        far = points.copy()
+        far[0], far[5] = huge, [-huge, huge]
+        got = jm.map_feasible_set(problems.lecture(), far)
+        assert np.all(got.label[[0, 5]] == -1)
+        rest = ~np.isin(np.arange(len(points)), [0, 5])
+        np.testing.assert_array_equal(got.label[rest], fmap.label[rest])
+
+    def test_largest_numbers(self, points, fmap):
+        """1e300 may stay undecided, but warns of nothing and moves nobody."""
+        far = points.copy()
+        far[0] = [1e300, -1e300]
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            got = jm.map_feasible_set(problems.lecture(), far)
+        assert got.label[0] <= 0
+        np.testing.assert_array_equal(got.label[1:], fmap.label[1:])
+
+    @pytest.mark.parametrize("name", ["k = 1..N", "k = N"])
+    def test_far_away_where_nothing_limits_the_initial_state(self, name):
+        """One huge point must not cost its neighbours their proofs."""
+        settings = dict(terminal=1.0, constrain_initial=False)
+        radius = 1.3
+        if name == "k = N":
+            settings, radius = dict(terminal=1.0, x_max=None), 2.5
+        points = radius * np.array([[1 + 1e-2], [1 + 1e-6], [1 - 1e-6], [-1 - 1e-6], [1e12]])
+        got = jm.map_feasible_set(problems.scalar(**settings), points)
+        np.testing.assert_array_equal(got.label, [-1, -1, 1, -1, -1])
+
+    def test_cuts_hold_beyond_the_map(self):
+        """A cut is valid on the whole set, mapped or not."""
+        mpc = replace(problems.lecture(), constrain_initial=False)
+        polygon = exact.feasible_polygon(mpc)
+        got = jm.map_feasible_set(mpc, np.array([[0.0, 0.8], [0.1, -0.9], [1.4, 0.3], [0.9, 0.9]]))
+        for i in np.flatnonzero(got.label == -1):
+            b = Fraction(float(got.labels.cut_offsets[i]))
+            assert polygon.support(got.labels.cut_normals[i]) <= b
+
+    @pytest.mark.parametrize("shape", [(2,), (3, 3), (3, 1), (2, 2, 2)])
+    def test_wrong_shape(self, shape):
+        with pytest.raises(ValueError, match="x0s"):
+            jm.map_feasible_set(problems.lecture(), np.zeros(shape))
+
+    def test_no_points(self):
+        got = jm.map_feasible_set(problems.lecture(), np.zeros((0, 2)))
+        assert got.label.shape == (0,)
+        assert got.volume_bounds() == (0.0, np.inf)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (dict(iterations=0), "iterations"), (dict(chunk=0), "chunk"),
+        (dict(dtype="int32"), "dtype"), (dict(dtype="float16"), "dtype"), (dict(axes=(0, 2)), "axes"), (dict(axes=(0, 0)), "axes"),
+        (dict(axes=()), "axes"), (dict(axes=(-1, 0)), "axes"),
+        (dict(axes=(0,), fixed=np.zeros(3)), "fixed"),
+        (dict(axes=(0,), fixed=np.array([0.0, np.nan])), "fixed"),
+    ],
+)  # fmt: skip
+def test_bad_settings_raise(settings, words):
+    with pytest.raises(ValueError, match=words):
+        jm.map_feasible_set(problems.lecture(), np.zeros((1, 2)), **settings)
+
+
+class TestEmptySet:
+    def test_labels(self, points):
+        got = jm.map_feasible_set(EMPTY, points)
+        assert np.all(got.label == -1)
+        low, high = got.volume_bounds()
+        assert low == 0
+        with pytest.raises(ValueError):
+            got.inner()
+        refined = got.refine()
+        assert refined.volume_bounds()[0] == 0
+
+    def test_volume_is_zero(self, points):
+        """The half-spaces prove the set empty, so its volume is known."""
+        assert jm.map_feasible_set(EMPTY, points).volume_bounds() == (0.0, 0.0)
+
+    def test_boundary(self):
+        with pytest.raises(ValueError, match="empty"):
+            jm.boundary(EMPTY, 4)
+
+
+class TestIndependenceOf:
+    """What must not change a label."""
+
+    def test_chunks(self, points, fmap):
+        for chunk in (40, 1000):
+            got = jm.map_feasible_set(problems.lecture(), points, chunk=chunk)
+            np.testing.assert_array_equal(got.label, fmap.label)
+            np.testing.assert_array_equal(got.status, fmap.status)
+
+    def test_run(self, points, fmap):
+        again = jm.map_feasible_set(problems.lecture(), points)
+        for name in ("label", "status", "plans", "cut_normals", "cut_offsets"):
+            np.testing.assert_array_equal(getattr(again.labels, name), getattr(fmap.labels, name))
+
+    def test_order(self, points, fmap):
+        order = np.random.default_rng(0).permutation(len(points))
+        got = jm.map_feasible_set(problems.lecture(), points[order])
+        np.testing.assert_array_equal(got.label, fmap.label[order])
+
+    @pytest.mark.parametrize("iterations", [1, 300])
+    @pytest.mark.parametrize("dtype", ["float32", "float64"])
+    def test_iterates(self, points, fmap, polygon, iterations, dtype):
+        got = jm.map_feasible_set(problems.lecture(), points, iterations=iterations, dtype=dtype)
+        np.testing.assert_array_equal(got.label, fmap.label)
+        np.testing.assert_array_equal(got.label == 1, polygon.contains(points))
+
+    def test_mode(self, points, fmap):
+        with enable_x64(True):
+            got = jm.map_feasible_set(problems.lecture(), points)
+        np.testing.assert_array_equal(got.label, fmap.label)
+        assert not jax.config.jax_enable_x64
+
+    def test_prestabilising(self):
+        mpc = problems.unstable(8)
+        polygon = exact.feasible_polygon(mpc)
+        points = jm.grid([-2, -5], [2, 5], (15, 15))
+        for choice in (False, None, np.array([[-1.5, -0.8]])):
+            got = jm.map_feasible_set(replace(mpc, prestabilise=choice), points)
+            np.testing.assert_array_equal(got.label, np.where(polygon.contains(points), 1, -1))
+
+    def test_cost(self, points, fmap):
+        other = replace(problems.lecture(), Q=np.zeros((2, 2)), R=1e-3 * np.eye(1))
+        np.testing.assert_array_equal(jm.map_feasible_set(other, points).label, fmap.label)
+
+
+def test_compiles_once_for_all_chunks(monkeypatch):
+    """Two programs, whatever the number of chunks."""
+    made = []
+
+    class Counted(feasible_set.Compiled):
+        def __init__(self, function):
+            super().__init__(function)
+            made.append(self)
+
+    monkeypatch.setattr(feasible_set, "Compiled", Counted)
+    points = np.random.default_rng(0).uniform(-1.2, 1.2, (333, 2))
+    jm.map_feasible_set(problems.lecture(), points, chunk=50)
+    assert sum(len(compiled.programs) for compiled in made) <= 2
+
+
+class TestProofs:
+    """The two provers on their own, fed with what no solver would give."""
+
+    def setup_method(self):
+        self.mpc = problems.drifting()
+        view = proofs.make_view(self.mpc)
+        self.problem = proofs.problem(self.mpc, view, np.array([3.0, 3.0]))
+        self.polygon = exact.feasible_polygon(self.mpc)
+
+    def test_any_multipliers_give_a_valid_cut(self):
+        rng = np.random.default_rng(0)
+        scales = 10.0 ** rng.uniform(-12, 12, 300)
+        with enable_x64(True):
+            y = rng.standard_normal((300, 4, 5)) * scales[:, None, None]
+            y_N = rng.standard_normal((300, 2)) * scales[:, None]
+            y[:100] = np.maximum(y[:100], 0)
+            normals, offsets = jax.vmap(lambda a, b: proofs.cut(self.problem, a, b))(y, y_N)
+        finite = np.flatnonzero(np.isfinite(offsets))
+        assert len(finite) > 100
+        for i in finite:
+            assert self.polygon.support(normals[i]) <= Fraction(float(offsets[i]))
+
+    def test_zero_and_nan_multipliers_say_nothing(self):
+        with enable_x64(True):
+            for fill in (0.0, np.nan, np.inf):
+                _, b = proofs.cut(self.problem, np.full((4, 5), fill), np.full(2, fill))
+                assert b == np.inf
+
+    def test_inputs_that_are_proved_keep_all_rows(self):
+        """Random inputs, beyond their limits too, from random states."""
+        rng = np.random.default_rng(1)
+        x0s, plans = rng.uniform(-1.2, 1.2, (4000, 2)), rng.uniform(-0.6, 0.6, (4000, 4, 2))
+        prove = jax.vmap(lambda x, u: proofs.prove_feasible(self.problem, x, x[:0], u))
+        with enable_x64(True):
+            proved, clipped = map(np.asarray, prove(x0s, plans))
+        assert proved.sum() > 50
+        for i in np.flatnonzero(proved):
+            assert exact.keeps_all_rows(self.mpc, x0s[i], clipped[i])
+        for i in np.flatnonzero(~proved)[:300]:
+            assert not exact.keeps_all_rows(self.mpc, x0s[i], clipped[i])
+
+    def test_nan_inputs_prove_nothing(self):
+        with enable_x64(True):
+            for plan in (np.full((4, 2), np.nan), np.where(np.eye(4, 2), np.nan, 0.0)):
+                proved, _ = proofs.prove_feasible(self.problem, np.zeros(2), np.zeros(0), plan)
+                assert not proved
+
+    def test_margin_of_one_rounding(self):
+        """Ties: x_N exactly on its limit in rationals must not be proved wrongly."""
+        mpc = problems.scalar(a=1.0, horizon=3, x_max=None, u_max=0.1, terminal=0.3)
+        problem = proofs.problem(mpc, proofs.make_view(mpc), np.ones(1))
+        with enable_x64(True):
+            for ulps in range(-40, 41, 4):
+                x0 = np.array([0.6 + ulps * 2.0**-53])
+                plan = np.full((3, 1), -0.1)
+                proved, clipped = proofs.prove_feasible(problem, x0, x0[:0], plan)
+                if proved:
+                    assert exact.keeps_all_rows(mpc, x0, clipped)
+
+    def test_empty_set_cut(self):
+        """0'θ ≤ b < 0 excludes every point, and only then may a normal be zero."""
+        got = jm.map_feasible_set(EMPTY, np.zeros((1, 2)))
+        assert got.label[0] == -1
+
+
+class TestMapObject:
+    def test_names_and_counts(self, fmap):
+        assert fmap.names == ("x1", "x2")
+        counts = fmap.counts()
+        assert sum(counts.values()) == len(fmap.label)
+
+    def test_refine_from_nothing(self, polygon):
+        got = jm.map_feasible_set(problems.lecture(), np.zeros((0, 2)), refine=1e-8)
+        low, high = got.volume_bounds()
+        assert low <= polygon.area <= high and high - low <= 1e-7 * high
+
+    def test_inner_within_outer(self, fmap, polygon):
+        outer = fmap.outer()
+        for vertex in fmap.inner().vertices():
+            assert outer.contains(vertex, 1e-6)
+        assert fmap.volume_bounds()[0] <= polygon.area <= fmap.volume_bounds()[1]
+
+    def test_to_xarray(self, fmap):
+        data = fmap.to_xarray()
+        np.testing.assert_array_equal(data["label"], fmap.label)
+        assert data["plan"].dims == ("sample", "time", "input")
+        assert list(data["state"].values) == list(fmap.names)
+
+    def test_terminal_section(self, fmap):
+        section = fmap.terminal_section()
+        assert section.volume() == pytest.approx(4.0)
+        nothing = jm.map_feasible_set(replace(problems.lecture(), terminal_set=None), [[0.0, 0.0]])
+        assert nothing.terminal_section() is None
+
+
+class TestBoundaryArguments:
+    def test_center_and_slice(self, polygon):
+        found = jm.boundary(problems.lecture(), np.array([[1.0, 0.0], [0.0, 2.0]]),
+                            center=np.array([0.1, 0.2]))  # fmt: skip
+        np.testing.assert_array_equal(found.center, [0.1, 0.2])
+        assert polygon.contains(found.points).all()
+        # x₁ + x₂/… facets by hand: the ray along x₁ ends where x₁ + x₂ = 1.1, at x₁ = 0.9.
+        assert found.inner[0] == pytest.approx(0.8, abs=1e-9)
+
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            (dict(directions=np.zeros((1, 2))), "directions"),
+            (dict(directions=np.ones((1, 3))), "directions"),
+            (dict(directions=np.array([[np.nan, 1.0]])), "directions"),
+            (dict(directions=4, center=np.zeros(3)), "center"),
+            (dict(directions=4, center=np.array([5.0, 5.0])), "center"),
+            (dict(directions=4, center=np.array([np.nan, 0.0])), "center"),
+            (dict(directions=0), "directions"),
+            (dict(directions=-1), "directions"),
+        ],
+    )
+    def test_errors(self, arguments, words):
+        with pytest.raises(ValueError, match=words):
+            jm.boundary(problems.lecture(), **arguments)
+
+    def test_unbounded_ray(self):
+        """No limit on x₁: the ray along it never ends, the other does."""
+        mpc = replace(
+            problems.lecture(), states=jm.Box(np.array([-np.inf, -1.0]), np.array([np.inf, 1.0])),
+            terminal_set=None,
+        )  # fmt: skip
+        found = jm.boundary(mpc, np.array([[1.0, 0.0], [0.0, 1.0]]), center=np.zeros(2))
+        assert found.outer[0] == np.inf
+        assert found.inner[1] == pytest.approx(1.0, abs=1e-9)
