@@ -106,7 +106,7 @@ def test_polytope_limits_bound_the_grid(write):
     path = write("x_min = [-5.0, -5.0]\nx_max = [5.0, 5.0]", H)
     mpc, region = load(path).build()
     assert isinstance(mpc.states, Polytope)
-    np.testing.assert_allclose(region.points[0], [-2.3, -1.1])
+    np.testing.assert_allclose(region.points[0], [-2.18, -1.06])
 
 
 def test_axes_by_name_index_and_slice(write):

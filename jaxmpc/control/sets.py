@@ -288,8 +288,10 @@ def hull_volume(points: ArrayLike) -> float:
         return 0.0
     if len(scale) == 1:
         return float(scale[0])
+    scaled = (points - points.mean(axis=0)) / scale
+    # Clusters confuse qhull; one point of each spans a hull that is no larger.
     try:
-        hull = ConvexHull((points - points.mean(axis=0)) / scale)
+        hull = ConvexHull(scaled[_distinct(scaled, 1e-11)])
     except QhullError:  # flat
         return 0.0
     return float(hull.volume * np.prod(scale))

@@ -93,15 +93,11 @@ class Factor:
 def scale(P: Array, A: Array) -> tuple[Array, Array, Array, Array]:
     """Coordinates z = T w and row scale E with T'PT ≈ I and rows of E A T of length one.
 
-    T is the inverse transposed Cholesky factor of P + δI. Where P is definite δ is 1e-6 of the
-    mean curvature and T'PT ≈ I. Where it is singular, T must not stretch its null space until
-    all rows look alike: δ is 1e-4 of the mean curvature (1 for P = 0). T'PT stays exact.
+    T is the inverse transposed Cholesky factor of P + δI; T'PT stays exact.
     Returns T, E, T'PT, E A T. A zero row keeps scale 0: it constrains nothing in z.
     """
     n = P.shape[0]
-    mean = jnp.trace(P) / n
-    definite = jnp.linalg.eigvalsh(jax.lax.stop_gradient(P))[0] > SINGULAR * mean
-    delta = jnp.where(definite, 1e-6, 1e-4) * mean + jnp.where(mean > 0, 0.0, 1.0)
+    delta = jax.lax.stop_gradient(null_curvature(P, A))
     metric = P + delta * jnp.eye(n, dtype=P.dtype)
     L = jnp.linalg.cholesky(metric)
     T = solve_triangular(L, jnp.eye(n, dtype=P.dtype), lower=True).T
@@ -112,6 +108,27 @@ def scale(P: Array, A: Array) -> tuple[Array, Array, Array, Array]:
     zero = squared <= (100 * jnp.finfo(P.dtype).eps) ** 2 * jnp.max(squared, initial=0.0)
     E = jnp.where(zero, 0.0, 1 / jnp.sqrt(jnp.where(zero, 1.0, squared)))
     return T, E, (H + H.T) / 2, E[:, None] * rows
+
+
+def null_curvature(P: Array, A: Array) -> Array:
+    """The curvature δ that stands in for P where P has none.
+
+    Where P is definite, 1e-6 of its mean. Where it is singular, the scale of its null space
+    relative to its range is free, and ADMM is slow when rows feel mostly one of them: δ makes
+    both parts of the median row alike, |a_null|²/δ = Σ (a'v)²/λ over P's range; the mean
+    curvature if no row has both parts, 1 for P = 0.
+    """
+    curvature, V = jnp.linalg.eigh(P)
+    mean = jnp.trace(P) / P.shape[0]
+    null = curvature <= SINGULAR * mean
+    parts = matmul(A, V) ** 2
+    in_null = jnp.sum(jnp.where(null, parts, 0.0), axis=1)
+    in_range = jnp.sum(jnp.where(null, 0.0, parts / jnp.where(null, 1.0, curvature)), axis=1)
+    noise = SINGULAR**2
+    both = (in_null > noise * jnp.sum(parts, axis=1)) & (in_range > 0)
+    ratio = jnp.nanmedian(jnp.where(both, in_null / jnp.where(both, in_range, 1.0), jnp.nan))
+    singular = jnp.where(jnp.any(both), ratio, jnp.where(mean > 0, mean, 1.0))
+    return jnp.where(jnp.any(null), singular, 1e-6 * mean)
 
 
 def factor(P: Array, A: Array, solver: ADMM) -> Factor:

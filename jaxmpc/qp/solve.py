@@ -59,7 +59,7 @@ def solve_factored(qp: QP, factor: Factor, solver: ADMM, warm_start: Any = None)
     if solver.refine:
         w_new, y_new, change = polish(factor.H, q, factor.A, l, u, w, y, solver.refine)
         pairs, proofs = [(w_new, y_new), *pairs], [*proofs, change]
-    solution = assess(clean, factor, pairs, proofs, w - w_old, solver)
+    solution = assess(clean, factor, pairs, proofs, [w - w_old, w], solver)
     return marked(solution, finite)
 
 
@@ -102,11 +102,11 @@ def start(factor: Factor, qp: QP, l: Array, u: Array, warm_start: Any) -> Array:
 
 def assess(
     qp: QP, factor: Factor, pairs: list[tuple[Array, Array]], proofs: list[Array],
-    direction: Array, solver: ADMM,
+    directions: list[Array], solver: ADMM,
 ) -> QPSolution:  # fmt: skip
     """The best of the scaled pairs (w, y), judged in the units of `qp`.
 
-    proofs: scaled candidates for a Farkas vector. direction: scaled candidate for a ray.
+    proofs: scaled candidates for a Farkas vector. directions: scaled candidates for a ray.
     """
     dtype, E = qp.q.dtype, factor.E
     unscaled = [(matmul(w, factor.T.T), admissible(E * y, qp.l, qp.u)) for w, y in pairs]
@@ -130,7 +130,11 @@ def assess(
         other, proved = farkas(qp, E * candidate)
         certificate = jnp.where(infeasible, certificate, other)
         infeasible = infeasible | proved
-    ray, unbounded = descent_ray(qp, matmul(direction, factor.T.T), jnp.sqrt(jnp.finfo(dtype).eps))
+    ray, unbounded = jnp.zeros_like(z), jnp.asarray(False)
+    for direction in directions:
+        tolerance = jnp.sqrt(jnp.finfo(dtype).eps)
+        other, proved = descent_ray(qp, matmul(direction, factor.T.T), tolerance)
+        ray, unbounded = jnp.where(unbounded, ray, other), unbounded | proved
 
     # Rows that contradict each other by less than eps are both solved and proved empty: say solved.
     infeasible = infeasible & ~solved

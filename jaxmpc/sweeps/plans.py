@@ -143,7 +143,7 @@ def finish(
     assert c is not None
     w, y, change = polish(f.H, *scaled_rows(f, qp), w, y, steps)
     s: QPSolution = marked(
-        assess(qp, f, [(w, y)], [*proofs, change], jnp.zeros_like(w), controller.solver), finite
+        assess(qp, f, [(w, y)], [*proofs, change], [], controller.solver), finite
     )
     states, inputs = c.trajectory(x0, s.z)
     cost = controller.cost(states, inputs)
