@@ -121,13 +121,14 @@ def null_curvature(P: Array, A: Array) -> Array:
     curvature, V = jnp.linalg.eigh(P)
     mean = jnp.trace(P) / P.shape[0]
     null = curvature <= SINGULAR * mean
-    parts = matmul(A, V) ** 2
-    in_null = jnp.sum(jnp.where(null, parts, 0.0), axis=1)
-    in_range = jnp.sum(jnp.where(null, 0.0, parts / jnp.where(null, 1.0, curvature)), axis=1)
-    noise = SINGULAR**2
-    both = (in_null > noise * jnp.sum(parts, axis=1)) & (in_range > 0)
-    ratio = jnp.nanmedian(jnp.where(both, in_null / jnp.where(both, in_range, 1.0), jnp.nan))
-    singular = jnp.where(jnp.any(both), ratio, jnp.where(mean > 0, mean, 1.0))
+    singular = jnp.where(mean > 0, mean, 1.0)
+    if A.shape[0]:
+        parts = matmul(A, V) ** 2
+        in_null = jnp.sum(jnp.where(null, parts, 0.0), axis=1)
+        in_range = jnp.sum(jnp.where(null, 0.0, parts / jnp.where(null, 1.0, curvature)), axis=1)
+        both = (in_null > SINGULAR**2 * jnp.sum(parts, axis=1)) & (in_range > 0)
+        ratio = jnp.where(both, in_null / jnp.where(both, in_range, 1.0), jnp.nan)
+        singular = jnp.where(jnp.any(both), jnp.nanmedian(ratio), singular)
     return jnp.where(jnp.any(null), singular, 1e-6 * mean)
 
 
