@@ -23,7 +23,8 @@ from jaxmpc.checks import fail
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.plots import plot_feasible_set
 from jaxmpc.sweeps import store
-from jaxmpc.sweeps.feasible_set import CHUNK, FeasibleSetMap, Labels, label_chunks
+from jaxmpc.sweeps.compiled import CHUNK
+from jaxmpc.sweeps.feasible_set import FeasibleSetMap, Labels, label_chunks
 
 
 def _option(metavar: str | None, default: str) -> Any:

@@ -15,15 +15,18 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
 from jaxmpc.sweeps import proofs
 from jaxmpc.sweeps.boundary import Rays
-from jaxmpc.sweeps.compiled import Compiled, first_rows, padded
+from jaxmpc.sweeps.compiled import (
+    Compiled,
+    default_chunk,
+    first_rows,
+    gather_size,
+    padded,
+    require_step_type,
+)
 from jaxmpc.sweeps.ladder import Verdict, admm_rung, extent, newton_rung, rows
 from jaxmpc.sweeps.proofs import make_view
 
-# Points a compiled program takes at once. 8,192 keep a step's data within a CPU's cache; larger
-# chunks serve a GPU. Undecided points are gathered into batches of one size, so that one program
-# compiles, and leave them as they are decided.
-CHUNK = 8192
-NEWTON_BATCH = 512
+# Newton steps between two attempts at a proof, and how often; the decided leave in between.
 NEWTON_STEPS = 8
 NEWTON_ROUNDS = 8
 # Volumes are sums of rounded products; bounds are widened by more than that.
@@ -89,7 +92,7 @@ class Labels:
 
 def label_chunks(
     mpc: MPC, points: Any, *, axes: Any = None, fixed: Any = None, iterations: int = 50,
-    dtype: Any = "float32", chunk: int = CHUNK,
+    dtype: Any = "float32", chunk: int | None = None,
 ) -> Iterator[tuple[slice, Labels]]:  # fmt: skip
     """Label points chunk by chunk; yields (slice of the points, Labels). See `map_feasible_set`."""
     mpc.validate()
@@ -98,19 +101,19 @@ def label_chunks(
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != d:
         fail("x0s", f"shape {points.shape}", f"Give points (B, {d}), one column a mapped state")
+    chunk = default_chunk() if chunk is None else chunk
     if iterations < 1 or chunk < 1:
         fail("iterations, chunk", f"{iterations}, {chunk}", "Give counts of at least 1")
-    dtype = np.dtype(dtype)
-    if dtype not in (np.float32, np.float64):
-        fail("dtype", f"{dtype}", "Iterate in 'float32' or 'float64'")
+    require_step_type(dtype)
 
     usable = np.all(np.isfinite(points), axis=1)
     moving = rows(mpc, view)
     region = np.abs(points[usable]).max(axis=0, initial=0.0)
     problem = proofs.problem(mpc, view, extent(moving, region))
-    admm = Compiled(admm_rung(iterations, dtype))
+    admm = Compiled(admm_rung(iterations, np.dtype(dtype)))
     newton = Compiled(newton_rung(NEWTON_STEPS))
     chunk = min(chunk, max(len(points), 1))
+    size = gather_size(chunk)
 
     for start in range(0, len(points), chunk):
         begun, compiled = time.perf_counter(), admm.seconds + newton.seconds
@@ -124,11 +127,11 @@ def label_chunks(
             w = w[: len(x)].astype(np.float64)
             for _ in range(NEWTON_ROUNDS):
                 left = np.flatnonzero((labels.label == 0) & ok)
-                for i in range(0, len(left), NEWTON_BATCH):
-                    batch = left[i : i + NEWTON_BATCH]
+                for i in range(0, len(left), size):
+                    batch = left[i : i + size]
                     verdict, better = newton(
-                        problem, moving, padded(x[batch], NEWTON_BATCH),
-                        padded(w[batch], NEWTON_BATCH),
+                        problem, moving, padded(x[batch], size),
+                        padded(w[batch], size),
                     )  # fmt: skip
                     labels.put(batch, first_rows(verdict, len(batch)))
                     w[batch] = better[: len(batch)]
@@ -301,7 +304,7 @@ class FeasibleSetMap:
 
 def map_feasible_set(
     mpc: MPC, x0s: Any, *, axes: Any = None, fixed: Any = None, iterations: int = 50,
-    dtype: Any = "float32", chunk: int = CHUNK, refine: float | None = None,
+    dtype: Any = "float32", chunk: int | None = None, refine: float | None = None,
     progress: bool = False,
 ) -> FeasibleSetMap:  # fmt: skip
     """Label each point: is there an input sequence that keeps every hard constraint of `mpc`?
@@ -312,8 +315,8 @@ def map_feasible_set(
     (`proofs.py`): an input sequence whose roll-out keeps all rows, or a half-space that excludes
     the point, each by more than rounding; what is neither is 0, undecided. iterations and dtype
     govern the ADMM rung alone and cannot make a label wrong. chunk: points a compiled program
-    takes at once. refine: tolerance of `FeasibleSetMap.refine`, None to skip it. progress: show
-    a bar.
+    takes at once (None: by device). refine: tolerance of `FeasibleSetMap.refine`, None to skip
+    it. progress: show a bar.
 
     A point with NaN or infinity gets status NON_FINITE and label 0. Raises ValueError for wrong
     shapes and ill-posed problems before anything compiles.

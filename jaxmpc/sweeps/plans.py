@@ -23,10 +23,8 @@ from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.refine import polish
 from jaxmpc.qp.solve import assess, cleaned, marked, scaled
 from jaxmpc.qp.status import Status
-from jaxmpc.sweeps.compiled import Compiled, padded
+from jaxmpc.sweeps.compiled import Compiled, default_chunk, gather_size, padded, require_step_type
 
-CHUNK = 8192
-NEWTON_BATCH = 512
 NEWTON_STEPS = 4
 NEWTON_ROUNDS = 8
 
@@ -48,7 +46,7 @@ class Plans:
 
 
 def solve_many(
-    mpc: MPC, x0s: Any, solver: ADMM = ADMM(), *, dtype: Any = "float32", chunk: int = CHUNK  # noqa: B008
+    mpc: MPC, x0s: Any, solver: ADMM = ADMM(), *, dtype: Any = "float32", chunk: int | None = None  # noqa: B008
 ) -> Plans:  # fmt: skip
     """Solve the MPC problem from each state x0s (B, n) to residuals of solver.eps in float64.
 
@@ -56,9 +54,14 @@ def solve_many(
     `solver.refine` is not used: Newton steps go where they are needed. A state with NaN gets
     status NON_FINITE. Raises ValueError for wrong shapes and ill-posed problems.
     """
+    mpc.validate()
     x0s = np.asarray(x0s, np.float64)
     if x0s.ndim != 2 or x0s.shape[1] != mpc.system.n:
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.system.n})")
+    require_step_type(dtype)
+    chunk = default_chunk() if chunk is None else chunk
+    if chunk < 1:
+        fail("chunk", f"{chunk}", "Give a count of at least 1")
     with jax.enable_x64(True):
         begun = time.perf_counter()
         controller = Controller(in_float64(mpc), solver)
@@ -80,14 +83,14 @@ def one_chunk(
     controller: Controller, first: Compiled, more: Compiled, x: np.ndarray, size: int
 ) -> tuple[np.ndarray, ...]:
     """All rungs on one chunk of states."""
-    keep = len(x)
+    keep, gathered = len(x), gather_size(size)
     answer = [np.array(v[:keep]) for v in first(controller, padded(x, size))]
     for _ in range(NEWTON_ROUNDS):
         left = np.flatnonzero(answer[2] == Status.ITERATION_LIMIT)
-        for i in range(0, len(left), NEWTON_BATCH):
-            batch = left[i : i + NEWTON_BATCH]
+        for i in range(0, len(left), gathered):
+            batch = left[i : i + gathered]
             w, y = answer[-2][batch], answer[-1][batch]
-            better = more(controller, *(padded(v, NEWTON_BATCH) for v in (x[batch], w, y)))
+            better = more(controller, *(padded(v, gathered) for v in (x[batch], w, y)))
             for old, new in zip(answer, better, strict=True):
                 old[batch] = new[: len(batch)]
     return tuple(answer[:-2])

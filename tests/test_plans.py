@@ -1,0 +1,66 @@
+"""solve_many: the answers of `solve`, for every state, whatever the chunk."""
+
+import jax
+import numpy as np
+import problems
+import pytest
+
+import jaxmpc as jm
+
+
+@pytest.fixture(scope="module")
+def states():
+    return jm.grid([-1.6, -2.1], [1.6, 2.1], (24, 24))
+
+
+@pytest.fixture(scope="module", params=["float32", "float64"])
+def plans(request, states):
+    return jm.solve_many(problems.joint_o_inf(10), states, dtype=request.param, chunk=200)
+
+
+def test_status_agrees_with_the_proved_labels(plans, states):
+    label = jm.map_feasible_set(problems.joint_o_inf(10), states).label
+    np.testing.assert_array_equal(plans.status == jm.Status.SOLVED, label == 1)
+    np.testing.assert_array_equal(plans.status == jm.Status.PRIMAL_INFEASIBLE, label == -1)
+
+
+def test_residuals_and_limits(plans):
+    solved = plans.status == jm.Status.SOLVED
+    for residual in (plans.primal_residual, plans.dual_residual, plans.gap):
+        assert residual[solved].max() <= 1e-6 + 1e-9
+    assert np.abs(plans.inputs[solved]).max() <= 2 + 1e-6
+
+
+def test_plans_are_those_of_solve(plans, states):
+    mpc = problems.joint_o_inf(10)
+    some = np.flatnonzero(plans.status == jm.Status.SOLVED)[::17]
+    with jax.enable_x64(True):
+        solver = jm.ADMM(iterations=1000, refine=20)
+        one = jax.vmap(lambda x: jm.solve(mpc, x, solver=solver))(states[some])
+    np.testing.assert_allclose(plans.inputs[some], one.inputs, atol=1e-5)
+    np.testing.assert_allclose(plans.cost[some], one.cost, rtol=1e-6, atol=1e-6)
+
+
+def test_a_state_with_nan_is_marked_and_changes_nothing_else(states):
+    mpc = problems.joint_o_inf(10)
+    clean = jm.solve_many(mpc, states[:50], chunk=50)
+    spoilt = states[:50].copy()
+    spoilt[7] = np.nan
+    dirty = jm.solve_many(mpc, spoilt, chunk=50)
+    others = np.arange(50) != 7
+    assert dirty.status[7] == jm.Status.NON_FINITE
+    assert np.isnan(dirty.inputs[7]).all() and np.isnan(dirty.cost[7])
+    np.testing.assert_array_equal(clean.inputs[others], dirty.inputs[others])
+    np.testing.assert_array_equal(clean.status[others], dirty.status[others])
+
+
+def test_no_states_and_wrong_shapes():
+    mpc = problems.joint_o_inf(10)
+    empty = jm.solve_many(mpc, np.zeros((0, 2)))
+    assert empty.inputs.shape == (0, 10, 1) and empty.status.shape == (0,)
+    with pytest.raises(ValueError, match="x0s"):
+        jm.solve_many(mpc, np.zeros(2))
+    with pytest.raises(ValueError, match="dtype"):
+        jm.solve_many(mpc, np.zeros((1, 2)), dtype="int32")
+    with pytest.raises(ValueError, match="chunk"):
+        jm.solve_many(mpc, np.zeros((1, 2)), chunk=0)
