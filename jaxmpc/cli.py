@@ -54,6 +54,7 @@ class Sweep:
       summary.json  Counts, bounds of the area, seconds, configuration, versions.
       sweep.zarr    Each state with its label (1 feasible, -1 infeasible, 0 undecided), its plan,
                     and the half-space cut_normal'x <= cut_offset that no feasible state leaves.
+                    start holds the x_0 of the plan; bound_* the points and facets of the bounds.
                     Opens with xarray.open_zarr(path, consolidated=False).
       Ctrl-C        Stops after the chunk in hand; --resume goes on from there.
       Exit code     0 done, 2 error (one line on stderr says which), 130 stopped by Ctrl-C.
@@ -111,7 +112,7 @@ class Sweep:
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff, _option(None, "off")] = False
     """Delete the sweep in --output and start again."""
     refine: Annotated[bool, _option(None, "on")] = True
-    """Move inner and outer bound together to a relative gap of 1e-6 (two or three axes)."""
+    """Move inner and outer bound together to a relative gap of 1e-6 (up to three axes)."""
 
     def overrides(self) -> dict[str, Any]:
         """The keys of [mpc] and [sweep] that the command line sets."""
@@ -155,7 +156,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     resume = shlex.join(["jaxmpc", *again, "--resume"])
     try:
         return _sweep(command, resume)
-    except OSError as error:
+    except (OSError, MemoryError) as error:
         return _error(error)
     except KeyboardInterrupt:
         print(f"\nstopped; chunks that were done are kept. Go on with:\n  {resume}")
@@ -183,8 +184,10 @@ def prepare(command: Sweep) -> Job:
         store.remove(path)
     elif path.exists() and not command.resume:
         fail(str(path), "exists", "Add --resume to go on with it or --overwrite to start again")
-    plan_shape = (mpc.horizon, mpc.system.m)
-    group = store.open_sweep(path, region.points, plan_shape, config.to_dict(), CHUNK)
+    shape = (mpc.system.n, mpc.horizon, mpc.system.m)
+    group = store.open_sweep(path, region.points, shape, config.to_dict(), CHUNK)
+    for name in ("map.png", "summary.json"):  # of an earlier run
+        (command.output / name).unlink(missing_ok=True)
     return Job(config, mpc, region, group)
 
 
@@ -203,8 +206,10 @@ def _sweep(command: Sweep, resume: str) -> int:
         print(f"stopped; what is done is kept. Go on with:\n  {resume}")
         return 130
     dimension = len(job.region.axes)
-    if command.refine and dimension in (2, 3):
+    if command.refine and dimension <= 3:
+        print("closing the bounds by rays; long horizons take a while", file=sys.stderr)
         fmap = fmap.refine()
+        store.save_bounds(job.group, fmap.extra_points, fmap.extra_normals, fmap.extra_offsets)
     files = ["sweep.zarr", "summary.json"]
     if dimension == 2:
         figure = plot_feasible_set(fmap).get_figure(root=True)
@@ -261,6 +266,7 @@ def _label(job: Job) -> Tally:
                 index,
                 label=labels.label,
                 status=labels.status,
+                start=labels.starts,
                 plan=labels.plans,
                 cut_normal=labels.cut_normals,
                 cut_offset=labels.cut_offsets,
@@ -299,6 +305,7 @@ def _read_map(path: Path, job: Job) -> FeasibleSetMap:
     labels = Labels(
         label=data["label"].values,
         status=data["status"].values,
+        starts=data["start"].values,
         plans=data["plan"].values,
         cut_normals=data["cut_normal"].values,
         cut_offsets=data["cut_offset"].values,

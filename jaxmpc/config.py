@@ -92,7 +92,7 @@ class CostSection:
 class MPCSection:
     """Horizon and terminal set: "invariant" = O_inf of the LQR, "box" = the state limits."""
 
-    horizon: Annotated[int, Field(ge=1)]
+    horizon: Annotated[int, Field(ge=1, strict=True)]
     terminal: Literal["none", "invariant", "box"] = "none"
     constrain_initial: bool = True  # False: no state limits at k = 0
 
@@ -101,7 +101,7 @@ class MPCSection:
 class SweepSection:
     """Which initial states are asked: a grid over the mapped states."""
 
-    grid: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)] = (256, 256)
+    grid: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)] | None = None
     lower: Vector | None = None  # (d,), none means the state limits widened by 3 % each side
     upper: Vector | None = None  # (d,)
     axes: tuple[int | str, ...] | None = None  # names or indices, none means the first two
@@ -184,7 +184,10 @@ class Config:
         """The grid of initial states and the axes it lies on."""
         axes = self._axes()
         lower, upper = self._bounds(axes)
-        points = grid_points(lower, upper, self.sweep.grid)
+        d = len(axes)
+        # 256 along each of two axes; about as many points in all along more.
+        shape = self.sweep.grid or (min(256, int(65_536.5 ** (1 / d))),) * d
+        points = grid_points(lower, upper, shape)
         if self.sweep.fixed is None:
             return SweepPoints(points, axes, None)
         fixed = np.zeros(len(self.system.A))
@@ -297,7 +300,11 @@ class Config:
             cure = "Give sweep.lower and sweep.upper: the state limits do not bound the mapped axes"
             fail("sweep.lower", "no finite range to sweep", cure)
         if np.any(lower >= upper):
-            fail("sweep.lower", f"{lower.tolist()} not below upper {upper.tolist()}", "Swap them")
+            fail(
+                "sweep.lower",
+                f"{lower.tolist()} not below upper {upper.tolist()}",
+                "Lower must be below upper",
+            )
         return lower, upper
 
 

@@ -20,6 +20,7 @@ def rows(count, value):
     return {
         "label": np.full(count, value, np.int8),
         "status": np.full(count, 1, np.int8),
+        "start": np.full((count, 2), float(value)),
         "plan": np.full((count, 3, 1), float(value)),
         "cut_normal": np.full((count, 2), np.nan),
         "cut_offset": np.full(count, 2.0),
@@ -27,7 +28,7 @@ def rows(count, value):
 
 
 def open_store(path, config=CONFIG, points=POINTS, chunk=4):
-    return store.open_sweep(path, points, (3, 1), config, chunk)
+    return store.open_sweep(path, points, (2, 3, 1), config, chunk)
 
 
 def test_chunks_resume_and_open_in_xarray(tmp_path):
@@ -49,6 +50,17 @@ def test_chunks_resume_and_open_in_xarray(tmp_path):
     assert plain.attrs["config"] == CONFIG
     assert {"jax", "zarr"} <= set(plain.attrs["versions"])
     assert [child.name for child in tmp_path.iterdir()] == ["sweep.zarr"]
+
+
+def test_bounds_are_kept_and_replaced(tmp_path):
+    path = tmp_path / "sweep.zarr"
+    group = open_store(path)
+    for count in (3, 5):
+        store.save_bounds(group, np.ones((count, 2)), np.ones((4, 2)), np.arange(4.0))
+    data = store.read(path)
+    assert data["bound_point"].shape == (5, 2)
+    assert data["bound_normal"].dims == ("facet", "coordinate")
+    np.testing.assert_array_equal(data["bound_offset"], np.arange(4.0))
 
 
 def test_another_configuration_is_refused(tmp_path):
@@ -85,7 +97,7 @@ WRITER = """
     from jaxmpc.sweeps import store
     count, chunk = 64_000, 1000
     points = np.arange(2.0 * count).reshape(count, 2)
-    group = store.open_sweep(sys.argv[1], points, (3, 1), {}, chunk)
+    group = store.open_sweep(sys.argv[1], points, (2, 3, 1), {}, chunk)
     print("open", flush=True)
     random = np.random.default_rng(0)
     for index in store.pending(group):
@@ -93,7 +105,8 @@ WRITER = """
         x = points[rows, 0]
         store.commit(
             group, index, label=np.ones(chunk, np.int8), status=np.ones(chunk, np.int8),
-            plan=np.repeat(x, 3).reshape(chunk, 3, 1), cut_normal=points[rows], cut_offset=x,
+            start=points[rows], plan=np.repeat(x, 3).reshape(chunk, 3, 1),
+            cut_normal=points[rows], cut_offset=x,
         )
 """
 

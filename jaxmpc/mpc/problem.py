@@ -48,7 +48,8 @@ class MPC:
             fail("system", f"is a {type(self.system).__name__}", "Give a jm.LinearSystem")
         self.system.validate()
         n, m = self.system.n, self.system.m
-        if not isinstance(self.horizon, int | np.integer) or self.horizon < 1:
+        whole = isinstance(self.horizon, int | np.integer) and not isinstance(self.horizon, bool)
+        if not whole or self.horizon < 1:
             fail("horizon", f"{self.horizon!r}", "Give a whole number of steps, at least 1")
         require_shape("Q", self.Q, (n, n), "Q weighs the states: one row for each")
         require_shape("R", self.R, (m, m), "R weighs the inputs: one row for each")
@@ -94,6 +95,7 @@ class Multipliers:
 class Plan:
     """Answer of `solve`: states (N+1, n), inputs (N, m), cost J (without ½), multipliers, status.
 
+    Unless the status is SOLVED, cost and trajectory are those of the best iterate and mean little.
     The status is that of the QP (`jaxmpc.Status`); residuals are those of the condensed QP in
     the units of states and inputs. `qp` holds the QP's own solution and serves as warm start.
     """

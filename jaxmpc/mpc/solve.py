@@ -35,10 +35,11 @@ def solve(
 class Controller:
     """An MPC law whose matrices are condensed and factored once, at construction.
 
-    `controller(x, carry) -> (u, carry, plan)`: u (m,) is the first input of the plan; carry is
-    None at the start and the previous plan's solution afterwards (warm start). When the plan is
-    not SOLVED, u is still the first input of the best iterate: look at plan.status. `condensed`
-    and `factor` are filled in at construction; leave them alone.
+    `controller(x, carry) -> (u, carry, plan)`: u (m,) is the first input of the plan, clipped
+    into its limits; carry is None at the start and the previous plan's solution afterwards (warm
+    start). When the plan is not SOLVED, u is still the first input of the best iterate: look at
+    plan.status. `condensed` and `factor` are filled in at construction: for another problem or
+    solver make another Controller, `dataclasses.replace` would keep the old ones.
     """
 
     mpc: MPC
@@ -52,13 +53,20 @@ class Controller:
             self.mpc.validate()
             condensed = condense(self.mpc)
             self.solver.validate(condensed.C.shape[0])
+            # Arrays from here on, so that a sample need not convert the whole object again.
+            object.__setattr__(self, "mpc", arrays(self.mpc))
+            object.__setattr__(self, "solver", arrays(self.solver))
             object.__setattr__(self, "condensed", condensed)
-            object.__setattr__(self, "factor", _factor(condensed, arrays(self.solver)))
+            object.__setattr__(self, "factor", _factor(condensed, self.solver))
 
     def __call__(self, x: Any, carry: Any = None) -> tuple[Array, QPSolution, Plan]:
         """First input from state x (n,), what to carry to the next sample, and the whole plan."""
         plan = self.plan(x, warm_start=carry)
-        return plan.inputs[0], plan.qp, plan
+        u = plan.inputs[0]
+        if self.mpc.inputs is not None:  # an actuator takes no rounding beyond its limit
+            lower, upper = arrays((self.mpc.inputs.lower, self.mpc.inputs.upper))
+            u = jnp.clip(u, jnp.asarray(lower, u.dtype), jnp.asarray(upper, u.dtype))
+        return u, plan.qp, plan
 
     def plan(self, x0: Any, reference: Any = None, warm_start: Any = None) -> Plan:
         """Plan from x0 (n,); arguments as in `solve`."""
@@ -73,7 +81,7 @@ class Controller:
                 fail("reference", f"shape {np.shape(reference)}", f"Give ({n},) or ({steps}, {n})")
             reference = jnp.broadcast_to(jnp.asarray(reference, c.P.dtype), (steps, n))
         start = warm_start.qp if isinstance(warm_start, Plan) else warm_start
-        return _plan(*arrays((self, x0, reference, start)))
+        return _plan(self, *arrays((x0, reference, start)))
 
     def _plan(self, x0: Array, reference: Array | None, start: Any) -> Plan:
         c = self.condensed

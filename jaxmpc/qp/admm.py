@@ -97,15 +97,19 @@ def scale(P: Array, A: Array) -> tuple[Array, Array, Array, Array]:
     Returns T, E, T'PT, E A T. A zero row keeps scale 0: it constrains nothing in z.
     """
     n = P.shape[0]
-    delta = jax.lax.stop_gradient(null_curvature(P, A))
+    delta = null_curvature(*jax.lax.stop_gradient((P, A)))
     metric = P + delta * jnp.eye(n, dtype=P.dtype)
     L = jnp.linalg.cholesky(metric)
     T = solve_triangular(L, jnp.eye(n, dtype=P.dtype), lower=True).T
     H = matmul(T.T, matmul(P, T))
     rows = matmul(A, T)
     squared = jnp.sum(rows**2, axis=1)
-    # A row is zero when it is rounding noise beside the others (Euler: q₁ does not feel u₀).
-    zero = squared <= (100 * jnp.finfo(P.dtype).eps) ** 2 * jnp.max(squared, initial=0.0)
+    # A row is zero when it is rounding noise of its own terms, or beside the others (Euler: q₁
+    # does not feel u₀).
+    eps = jnp.finfo(P.dtype).eps
+    own = jnp.sum(matmul(jnp.abs(A), jnp.abs(T)) ** 2, axis=1)
+    noise = jnp.maximum((100 * eps) ** 2 * own, eps**2 * jnp.max(squared, initial=0.0))
+    zero = squared <= noise
     E = jnp.where(zero, 0.0, 1 / jnp.sqrt(jnp.where(zero, 1.0, squared)))
     return T, E, (H + H.T) / 2, E[:, None] * rows
 
@@ -129,7 +133,8 @@ def null_curvature(P: Array, A: Array) -> Array:
         both = (in_null > SINGULAR**2 * jnp.sum(parts, axis=1)) & (in_range > 0)
         ratio = jnp.where(both, in_null / jnp.where(both, in_range, 1.0), jnp.nan)
         singular = jnp.where(jnp.any(both), jnp.nanmedian(ratio), singular)
-    return jnp.where(jnp.any(null), singular, 1e-6 * mean)
+    # Rounding may have left P slightly indefinite.
+    return jnp.where(jnp.any(null), singular, 1e-6 * mean) + jnp.maximum(-2 * curvature[0], 0.0)
 
 
 def factor(P: Array, A: Array, solver: ADMM) -> Factor:

@@ -46,13 +46,17 @@ def farkas(qp: QP, y: Array) -> tuple[Array, Array]:
     size = bound_product(
         y, jnp.where(y < 0, -jnp.abs(qp.l), 0.0), jnp.where(y > 0, jnp.abs(qp.u), 0.0)
     )
-    safe = bound_product(y, qp.l, qp.u) + gamma * (size + jnp.sum(terms * reach))
+    # What the correction leaves of A'y meets at most |z| ≤ reach.
+    leak = jnp.sum((2 * left + gamma * terms) * reach)
+    safe = bound_product(y, qp.l, qp.u) + gamma * size + leak
     proved = jnp.all(absorbed) & (safe < 0) & jnp.any(y != 0)
     return jnp.where(proved, y, 0.0), proved
 
 
 def descent_ray(qp: QP, d: Array, tolerance: Array) -> tuple[Array, Array]:
-    """The candidate direction d made into a ray of unbounded descent: returns (d, proved).
+    """The candidate direction d made into a ray of unbounded descent: returns (d, found).
+
+    Numerically unbounded, to `tolerance`: a slight curvature along d cannot be told from none.
 
     Scaled to length one, d must satisfy |Pd| ≤ tolerance, q'd < −tolerance, and A d ≤ tolerance
     where u is finite, ≥ −tolerance where l is finite. A zero direction proves nothing.

@@ -146,21 +146,27 @@ def residuals(qp: QP, z: Array, y: Array) -> tuple[Array, Array, Array]:
     gap = |z'Pz + q'z + Σ u y⁺ − l y⁻|; a y with the wrong sign at an infinite bound gives an
     infinite gap.
     """
-    sizes = residual_sizes(qp, z, y)
-    return sizes[0], sizes[1], sizes[2]
-
-
-def residual_sizes(qp: QP, z: Array, y: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """The three residuals followed by the size of the terms each is a difference of."""
+    primal, dual, gap = (value for value, _ in residual_terms(qp, z, y))
     norm = lambda v: jnp.max(jnp.abs(v), initial=0.0)
+    return norm(primal), norm(dual), jnp.abs(gap)
+
+
+def residual_terms(qp: QP, z: Array, y: Array) -> list[tuple[Array, Array]]:
+    """Residual vectors of rows (m,), variables (n,) and the gap, each with the size, entry by
+    entry, of the terms that it is a difference of: rounding is a share of that.
+    """
     Az, Pz, Aty = matmul(z, qp.A.T), matmul(z, qp.P), matmul(y, qp.A)
     support = bound_product(y, qp.l, qp.u)
     quadratic, linear = jnp.sum(z * Pz), jnp.sum(z * qp.q)
-    return (
-        norm(Az - jnp.clip(Az, qp.l, qp.u)),
-        norm(Pz + qp.q + Aty),
-        jnp.abs(quadratic + linear + support),
-        norm(Az),
-        jnp.maximum(norm(Pz), jnp.maximum(norm(qp.q), norm(Aty))),
-        jnp.abs(quadratic) + jnp.abs(linear) + jnp.abs(support),
-    )
+    size_z, size_y = jnp.abs(z), jnp.abs(y)
+    return [
+        (Az - jnp.clip(Az, qp.l, qp.u), matmul(size_z, jnp.abs(qp.A).T)),
+        (
+            Pz + qp.q + Aty,
+            matmul(size_z, jnp.abs(qp.P)) + jnp.abs(qp.q) + matmul(size_y, jnp.abs(qp.A)),
+        ),
+        (
+            quadratic + linear + support,
+            jnp.abs(quadratic) + jnp.sum(size_z * jnp.abs(qp.q)) + jnp.abs(support),
+        ),
+    ]

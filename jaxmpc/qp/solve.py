@@ -18,7 +18,8 @@ from jaxmpc.qp.problem import (
     arrays,
     floating_dtype,
     matmul,
-    residual_sizes,
+    residual_terms,
+    residuals,
 )
 from jaxmpc.qp.refine import polish
 from jaxmpc.qp.status import Status
@@ -84,7 +85,12 @@ def cleaned(qp: QP) -> tuple[QP, Array]:
 def scaled(factor: Factor, qp: QP) -> tuple[Array, Array, Array]:
     """q, l, u in ADMM's coordinates. A zero row (scale 0) is free there; `assess` checks it."""
     E, zero = factor.E, factor.E == 0
-    bound = lambda v, free: jnp.where(zero, free, E * jnp.where(zero, 0.0, v))
+
+    def bound(v: Array, free: float) -> Array:
+        # E·inf would give NaN gradients with respect to P and A, which E depends on.
+        keep = jnp.isfinite(v) & ~zero
+        return jnp.where(zero, free, jnp.where(keep, E * jnp.where(keep, v, 0.0), v))
+
     return matmul(qp.q, factor.T), bound(qp.l, -jnp.inf), bound(qp.u, jnp.inf)
 
 
@@ -117,12 +123,10 @@ def assess(
 
     eps = (1e-6 if dtype == jnp.float64 else 1e-3) if solver.eps is None else solver.eps
     eps, floor = jnp.asarray(eps, dtype), 100 * jnp.finfo(dtype).eps
-    primal, dual, gap, *sizes = residual_sizes(qp, z, y)
-    solved = (
-        (primal <= eps + floor * sizes[0])
-        & (dual <= eps + floor * sizes[1])
-        & (gap <= eps + floor * sizes[2])
-    )
+    solved = jnp.asarray(True)
+    for value, size in residual_terms(qp, z, y):
+        solved = solved & jnp.all(jnp.abs(value) <= eps + floor * size)
+    primal, dual, gap = residuals(qp, z, y)
     # Rows that z cannot move prove emptiness by themselves.
     fixed = jnp.where(E == 0, -jnp.clip(jnp.zeros(()), qp.l, qp.u), 0.0)
     certificate, infeasible = farkas(qp, fixed)
@@ -164,7 +168,6 @@ def marked(solution: QPSolution, finite: Array) -> QPSolution:
 
 def worst(qp: QP, z: Array, y: Array) -> Array:
     """Largest residual, each relative to the size of its terms: what refinement must lower."""
-    primal, dual, gap, *sizes = residual_sizes(qp, z, y)
-    return jnp.maximum(
-        primal / (1 + sizes[0]), jnp.maximum(dual / (1 + sizes[1]), gap / (1 + sizes[2]))
-    )
+    norm = lambda v: jnp.max(jnp.abs(v), initial=0.0)
+    relative = [norm(value) / (1 + norm(size)) for value, size in residual_terms(qp, z, y)]
+    return jnp.max(jnp.stack(relative))

@@ -31,7 +31,8 @@ _SENTENCES = {
         "Relax a limit, lengthen the horizon or soften rows."
     ),
     Status.DUAL_INFEASIBLE: (
-        "The cost falls without bound along a feasible ray. Add a cost or a bound on that ray."
+        "The cost falls without bound, to working precision, along a feasible ray. "
+        "Add a cost or a bound on that ray."
     ),
     Status.ITERATION_LIMIT: (
         "Neither solved nor proved infeasible within the fixed iterations. "

@@ -30,7 +30,7 @@ class Boundary:
     inner (K,): largest t for which centre + t d was proved feasible (NaN: none). outer (K,):
     where the ray leaves all the half-spaces (inf: never). points (K, d): the points at `inner`.
     normals (K, d), offsets (K,): half-spaces a'x ≤ b that hold on the whole feasible set
-    (b = inf where the LP gave none).
+    (b = inf where the LP gave none); roundings (K,): the part of b that covers rounding.
     """
 
     center: np.ndarray
@@ -40,6 +40,7 @@ class Boundary:
     points: np.ndarray
     normals: np.ndarray
     offsets: np.ndarray
+    roundings: np.ndarray
 
 
 def boundary(
@@ -110,6 +111,16 @@ class Rays:
             )  # fmt: skip
         return result.x[k : k + d], result.x[:k]
 
+    def box(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Half-spaces (normals, offsets, roundings) of the bounding box, as far as there is one."""
+        d = len(self.center)
+        y = np.array([support(self.rows, s * e)[2] for s in (1.0, -1.0) for e in np.eye(d)])
+        with jax.enable_x64(True):
+            cuts = jax.vmap(lambda y: cut_of(self.problem, self.rows, y))(y)
+        normals, offsets, roundings = (np.asarray(v) for v in cuts)
+        valid = np.isfinite(offsets)
+        return normals[valid], offsets[valid], roundings[valid]
+
     def shoot(self, directions: np.ndarray) -> Boundary:
         """Solve, pull and prove along every direction (K, d)."""
         solved = [support(self.rows, direction, self.center) for direction in directions]
@@ -123,7 +134,7 @@ class Rays:
         count = len(directions)
         fill = np.arange(max(32, 1 << (count - 1).bit_length())) % count
         with jax.enable_x64(True):
-            feasible, normals, offsets = (
+            feasible, normals, offsets, roundings = (
                 np.asarray(v)[:count]
                 for v in prove(self.problem, self.rows, theta[fill], w[fill], y[fill])
             )
@@ -138,19 +149,19 @@ class Rays:
             points=np.where(found[:, None], theta[each, best], np.nan),
             normals=normals,
             offsets=offsets,
+            roundings=roundings,
         )
 
 
 @jax.jit
-def prove(p: Problem, rows: Rows, theta: Any, w: Any, y: Any) -> tuple[Array, Array, Array]:
+def prove(p: Problem, rows: Rows, theta: Any, w: Any, y: Any) -> tuple[Array, ...]:
     """For each ray: which of its pulled points (K, pulls, d) are feasible, and its cut."""
 
     def feasible(theta: Array, w: Array) -> Array:
         inputs, free = inputs_of(p, rows, theta, w)
         return proofs.prove_feasible(p, theta, free, inputs)[0]
 
-    normals, offsets, _ = jax.vmap(lambda y: cut_of(p, rows, y))(y)
-    return jax.vmap(jax.vmap(feasible))(theta, w), normals, offsets
+    return jax.vmap(jax.vmap(feasible))(theta, w), *jax.vmap(lambda y: cut_of(p, rows, y))(y)
 
 
 def leaving(

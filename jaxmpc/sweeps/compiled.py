@@ -23,18 +23,23 @@ def gather_size(chunk: int) -> int:
 
 
 class Compiled:
-    """A jitted function, compiled ahead once for each shape; `seconds` spent on that so far."""
+    """A jitted function, compiled ahead once for each shape. `Compiled.seconds`: spent on that
+    in this process so far.
+    """
+
+    seconds = 0.0
 
     def __init__(self, function: Any) -> None:
-        self.function, self.seconds = function, 0.0
-        self.programs: dict[tuple[tuple[int, ...], ...], Any] = {}
+        self.function = function
+        self.programs: dict[Any, Any] = {}
 
     def __call__(self, *args: Any) -> Any:
-        key = tuple(np.shape(leaf) for leaf in jax.tree.leaves(args))
+        leaves, tree = jax.tree.flatten(args)
+        key = tree, tuple((np.shape(leaf), np.result_type(leaf)) for leaf in leaves)
         if key not in self.programs:
             start = time.perf_counter()
             self.programs[key] = self.function.lower(*args).compile()
-            self.seconds += time.perf_counter() - start
+            Compiled.seconds += time.perf_counter() - start
         return jax.tree.map(np.asarray, self.programs[key](*args))
 
 
@@ -50,5 +55,9 @@ def first_rows(tree: Any, count: int) -> Any:
 
 def require_step_type(dtype: Any) -> None:
     """Raise unless iterates of this type are offered."""
-    if np.dtype(dtype) not in (np.float32, np.float64):
-        fail("dtype", f"{np.dtype(dtype)}", "Iterate in 'float32' or 'float64'")
+    try:
+        known = np.dtype(dtype) in (np.float32, np.float64)
+    except TypeError:
+        known = False
+    if not known:
+        fail("dtype", f"{dtype!r}", "Iterate in 'float32' or 'float64'")

@@ -27,8 +27,10 @@ from jaxmpc.sweeps.ladder import Verdict, admm_rung, extent, newton_rung, rows
 from jaxmpc.sweeps.proofs import make_view
 
 # Newton steps between two attempts at a proof, and how often; the decided leave in between.
+# What resists all of them gets a longer ADMM run and Newton once more.
 NEWTON_STEPS = 8
 NEWTON_ROUNDS = 8
+LONGER = 20
 # Volumes are sums of rounded products; bounds are widened by more than that.
 VOLUME_ROUNDING = 1e-11
 
@@ -47,19 +49,24 @@ def grid(lower: Any, upper: Any, shape: Any) -> np.ndarray:
     return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(shape))
 
 
+# The arrays of `Labels`.
+ARRAYS = ("label", "status", "starts", "plans", "cut_normals", "cut_offsets")
+
+
 @dataclass(frozen=True)
 class Labels:
     """Labels of b points and their proofs.
 
     label (b,) int8: 1 proved feasible, −1 proved infeasible, 0 undecided. status (b,) int8:
     `Status` (NOT_RUN, NON_FINITE, or SOLVED / PRIMAL_INFEASIBLE / ITERATION_LIMIT for the three
-    labels). plans (b, N, m): inputs that prove 1, else NaN. cut_normals (b, d), cut_offsets (b,):
-    the half-space a'x ≤ b, valid on the whole feasible set, that proves −1, else NaN. Seconds
-    spent compiling and running.
+    labels). starts (b, n), plans (b, N, m): x_0 and inputs that prove 1, else NaN.
+    cut_normals (b, d), cut_offsets (b,): the half-space a'x ≤ b, valid on the whole feasible set,
+    that proves −1, else NaN. Seconds spent compiling and running.
     """
 
     label: np.ndarray
     status: np.ndarray
+    starts: np.ndarray
     plans: np.ndarray
     cut_normals: np.ndarray
     cut_offsets: np.ndarray
@@ -67,12 +74,13 @@ class Labels:
     run_seconds: float = 0.0
 
     @classmethod
-    def empty(cls, count: int, horizon: int, m: int, d: int) -> "Labels":
-        """Labels of points that have not been run."""
+    def empty(cls, count: int, mpc: MPC, d: int) -> "Labels":
+        """Labels of `count` points (d,) that have not been run."""
+        n, m, horizon = mpc.system.n, mpc.system.m, mpc.horizon
         return cls(
             np.zeros(count, np.int8), np.full(count, Status.NOT_RUN, np.int8),
-            np.full((count, horizon, m), np.nan), np.full((count, d), np.nan),
-            np.full(count, np.nan),
+            np.full((count, n), np.nan), np.full((count, horizon, m), np.nan),
+            np.full((count, d), np.nan), np.full(count, np.nan),
         )  # fmt: skip
 
     def put(self, where: Any, verdict: Verdict) -> None:
@@ -85,6 +93,7 @@ class Labels:
             Status.ITERATION_LIMIT,
         )
         feasible, infeasible = label == 1, label == -1
+        self.starts[where] = np.where(feasible[:, None], verdict.start, np.nan)
         self.plans[where] = np.where(feasible[:, None, None], verdict.inputs, np.nan)
         self.cut_normals[where] = np.where(infeasible[:, None], verdict.normal, np.nan)
         self.cut_offsets[where] = np.where(infeasible, verdict.offset, np.nan)
@@ -110,36 +119,34 @@ def label_chunks(
     moving = rows(mpc, view)
     region = np.abs(points[usable]).max(axis=0, initial=0.0)
     problem = proofs.problem(mpc, view, extent(moving, region))
-    admm = Compiled(admm_rung(iterations, np.dtype(dtype)))
-    newton = Compiled(newton_rung(NEWTON_STEPS))
+    admm, newton = admm_rung(iterations, np.dtype(dtype)), newton_rung(NEWTON_STEPS)
+    longer = admm_rung(LONGER * iterations, np.dtype(np.float64))
     chunk = min(chunk, max(len(points), 1))
     size = gather_size(chunk)
 
     for start in range(0, len(points), chunk):
-        begun, compiled = time.perf_counter(), admm.seconds + newton.seconds
+        begun, compiled = time.perf_counter(), Compiled.seconds
         here = slice(start, min(start + chunk, len(points)))
         ok = usable[here]
         x = np.where(ok[:, None], points[here], 0.0)
-        labels = Labels.empty(len(x), mpc.horizon, mpc.system.m, d)
+        labels = Labels.empty(len(x), mpc, d)
         with jax.enable_x64(True):
             verdict, w = admm(problem, moving, padded(x, chunk))
             labels.put(slice(None), first_rows(verdict, len(x)))
             w = w[: len(x)].astype(np.float64)
-            for _ in range(NEWTON_ROUNDS):
+            for rung in (*[newton] * NEWTON_ROUNDS, longer, *[newton] * NEWTON_ROUNDS):
                 left = np.flatnonzero((labels.label == 0) & ok)
                 for i in range(0, len(left), size):
                     batch = left[i : i + size]
-                    verdict, better = newton(
-                        problem, moving, padded(x[batch], size),
-                        padded(w[batch], size),
-                    )  # fmt: skip
+                    start_w = (padded(w[batch], size),) if rung is newton else ()
+                    verdict, better = rung(problem, moving, padded(x[batch], size), *start_w)
                     labels.put(batch, first_rows(verdict, len(batch)))
                     w[batch] = better[: len(batch)]
-        blank = Labels.empty(int(np.sum(~ok)), mpc.horizon, mpc.system.m, d)
-        for name in ("label", "plans", "cut_normals", "cut_offsets"):
+        blank = Labels.empty(int(np.sum(~ok)), mpc, d)
+        for name in ARRAYS:
             getattr(labels, name)[~ok] = getattr(blank, name)
         labels.status[~ok] = Status.NON_FINITE
-        compiled = admm.seconds + newton.seconds - compiled
+        compiled = Compiled.seconds - compiled
         spent = time.perf_counter() - begun - compiled
         yield here, replace(labels, compile_seconds=compiled, run_seconds=spent)
 
@@ -257,7 +264,8 @@ class FeasibleSetMap:
         """Shoot rays at the vertices of the outer polytope until the volume bounds meet.
 
         Each ray adds a proved boundary point and a proved facet (`boundary`); in up to four
-        mapped dimensions this ends at the exact polytope. tolerance: relative gap of the volume
+        mapped dimensions this ends at the exact polytope. Undecided points that a facet excludes
+        are labelled infeasible. tolerance: relative gap of the volume
         bounds at which to stop. A set without interior, or unbounded, is returned as it is.
         """
         view = make_view(self.mpc, self.axes, self.fixed)
@@ -267,7 +275,8 @@ class FeasibleSetMap:
         except ValueError:
             return self
         directions = np.concatenate([np.eye(d), -np.eye(d), -np.ones((1, d))])
-        points, normals, offsets = self.extra_points, self.extra_normals, self.extra_offsets
+        points = np.zeros((0, d))
+        normals, offsets, roundings = rays.box()
         for _ in range(rounds):
             found = rays.shoot(directions)
             proved = np.isfinite(found.inner)
@@ -275,16 +284,19 @@ class FeasibleSetMap:
             valid = np.isfinite(found.offsets)
             normals = np.concatenate([normals, found.normals[valid]])
             offsets = np.concatenate([offsets, found.offsets[valid]])
+            roundings = np.concatenate([roundings, found.roundings[valid]])
             try:
                 outer = Polytope(normals, offsets).reduce()
                 low, high = hull_volume(points), outer.volume()
                 directions = outer.vertices() - rays.center
-            except ValueError:  # not bounded yet
-                directions = np.random.default_rng(len(points)).standard_normal((4 * d, d))
-                continue
+            except ValueError:  # unbounded, or too thin for qhull
+                break
             if high - low <= tolerance * high:
                 break
-        return replace(self, extra_points=points, extra_normals=normals, extra_offsets=offsets)
+        labels = excluded(self.labels, rays, self.points, normals, offsets, roundings)
+        return replace(
+            self, labels=labels, extra_points=points, extra_normals=normals, extra_offsets=offsets
+        )
 
     def to_xarray(self) -> Any:
         """The map as an xarray.Dataset along the dimension `sample`, names and units attached."""
@@ -293,13 +305,42 @@ class FeasibleSetMap:
         data = {
             "label": ("sample", self.label),
             "status": ("sample", self.status),
+            "points": (("sample", "coordinate"), self.points),
+            "start": (("sample", "state"), self.labels.starts),
             "plan": (("sample", "time", "input"), self.labels.plans),
-            "cut_normal": (("sample", "state"), self.labels.cut_normals),
+            "cut_normal": (("sample", "coordinate"), self.labels.cut_normals),
             "cut_offset": ("sample", self.labels.cut_offsets),
-            "point": (("sample", "state"), self.points),
+            "bound_point": (("ray", "coordinate"), self.extra_points),
+            "bound_normal": (("facet", "coordinate"), self.extra_normals),
+            "bound_offset": ("facet", self.extra_offsets),
         }
-        names = {"state": list(self.names), "input": list(self.mpc.system.input_labels)}
+        system = self.mpc.system
+        names = {
+            "coordinate": list(self.names),
+            "state": list(system.state_labels),
+            "input": list(system.input_labels),
+        }
         return xarray.Dataset(data, coords=names)
+
+
+def excluded(
+    labels: Labels, rays: Rays, points: np.ndarray, normals: np.ndarray, offsets: np.ndarray,
+    roundings: np.ndarray,
+) -> Labels:  # fmt: skip
+    """Labels where undecided points that one of the half-spaces excludes are infeasible."""
+    left = np.flatnonzero(labels.status == Status.ITERATION_LIMIT)
+    if not len(left) or not len(offsets):
+        return labels
+    with jax.enable_x64(True):
+        one = lambda a, b, r, x: proofs.excludes(rays.problem, a, b, r, x)
+        table = jax.vmap(jax.vmap(one, in_axes=(0, 0, 0, None)), in_axes=(None, None, None, 0))
+        excludes = np.asarray(table(normals, offsets, roundings, points[left]))
+    out = np.flatnonzero(excludes.any(axis=1))
+    left, by = left[out], np.argmax(excludes[out], axis=1)
+    copy = replace(labels, **{name: getattr(labels, name).copy() for name in ARRAYS})
+    copy.label[left], copy.status[left] = -1, Status.PRIMAL_INFEASIBLE
+    copy.cut_normals[left], copy.cut_offsets[left] = normals[by], offsets[by]
+    return copy
 
 
 def map_feasible_set(
@@ -329,20 +370,19 @@ def map_feasible_set(
     with tqdm(total=len(points), unit="pt", disable=not progress) as bar:
         for here, part in chunks:
             if labels is None:
-                _, N, m = part.plans.shape
-                labels = Labels.empty(len(points), N, m, part.cut_normals.shape[1])
+                labels = Labels.empty(len(points), mpc, part.cut_normals.shape[1])
             labels = joined(labels, here, part)
             bar.update(len(part.label))
     if labels is None:
         d = len(make_view(mpc, axes, fixed).axes)
-        labels = Labels.empty(0, mpc.horizon, mpc.system.m, d)
+        labels = Labels.empty(0, mpc, d)
     result = FeasibleSetMap.of(mpc, points, axes, fixed, labels)
     return result if refine is None else result.refine(refine)
 
 
 def joined(labels: Labels, here: slice, part: Labels) -> Labels:
     """`labels` with a chunk written in (in place) and its seconds added."""
-    for name in ("label", "status", "plans", "cut_normals", "cut_offsets"):
+    for name in ARRAYS:
         getattr(labels, name)[here] = getattr(part, name)
     return replace(
         labels,

@@ -7,7 +7,7 @@ Iterates may be float32. Nothing here decides a label: every candidate, a w or a
 goes to `proofs.py`.
 """
 
-from collections.abc import Callable
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +22,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.problem import matmul
 from jaxmpc.qp.refine import least_distance
 from jaxmpc.sweeps import proofs
+from jaxmpc.sweeps.compiled import Compiled
 from jaxmpc.sweeps.proofs import Problem, View
 
 ALPHA = 1.6
@@ -76,7 +77,8 @@ def rows(mpc: MPC, view: View) -> Rows:
     still = norm <= 1e-13 * norm.max(initial=0.0)
     C = np.where(still[:, None], 0.0, C)
     keep = np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
-    weight = 1 / np.where(still, np.maximum(np.linalg.norm(D, axis=1), 1e-300), norm)[keep]
+    size = np.where(still, np.linalg.norm(D, axis=1), norm)[keep]
+    weight = 1 / np.where(size > 0, size, 1.0)
     U, singular, Vt = np.linalg.svd(weight[:, None] * C[keep], full_matrices=False)
     rank = int(np.sum(singular > 1e-12 * singular.max(initial=0.0)))
     U, back = U[:, :rank], Vt[:rank].T / singular[:rank]
@@ -135,9 +137,10 @@ def extent(rows: Rows, otherwise: np.ndarray) -> np.ndarray:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Verdict:
-    """What was proved of one point: label 1, −1 or 0, and the inputs or the cut that prove it."""
+    """What was proved of one point: label 1, −1 or 0, and x_0 with inputs, or the cut."""
 
     label: Array
+    start: Array
     inputs: Array
     normal: Array
     offset: Array
@@ -170,10 +173,11 @@ def judge(p: Problem, rows: Rows, theta: Array, w: Array, candidates: list[Array
         normal, offset = jnp.where(here, a, normal), jnp.where(here, b, offset)
         infeasible = infeasible | here
     label = jnp.where(feasible, 1, jnp.where(infeasible, -1, 0)).astype(jnp.int8)
-    return Verdict(label, inputs, normal, offset)
+    return Verdict(label, p.view.initial_state(theta, free), inputs, normal, offset)
 
 
-def admm_rung(iterations: int, dtype: Any) -> Callable[..., tuple[Verdict, Array]]:
+@functools.cache
+def admm_rung(iterations: int, dtype: Any) -> Compiled:
     """The compiled first rung: (p, rows, points (B, d)) → verdicts and w (B, k)."""
 
     @jax.jit
@@ -197,10 +201,11 @@ def admm_rung(iterations: int, dtype: Any) -> Callable[..., tuple[Verdict, Array
         )
         return verdict, w.T
 
-    return rung
+    return Compiled(rung)
 
 
-def newton_rung(steps: int) -> Callable[..., tuple[Verdict, Array]]:
+@functools.cache
+def newton_rung(steps: int) -> Compiled:
     """The compiled second rung: (p, rows, points (B, d), w (B, k)) → verdicts and w."""
 
     @jax.jit
@@ -218,4 +223,4 @@ def newton_rung(steps: int) -> Callable[..., tuple[Verdict, Array]]:
 
         return jax.vmap(one)(points, w)
 
-    return rung
+    return Compiled(rung)

@@ -5,6 +5,7 @@ if wished, and one Newton step serve all; the states whose residuals are not sma
 gathered, and Newton goes on with these until they are solved or proved infeasible.
 """
 
+import functools
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -65,13 +66,13 @@ def solve_many(
     with jax.enable_x64(True):
         begun = time.perf_counter()
         controller = Controller(in_float64(mpc), solver)
-        first, more = Compiled(first_rung(np.dtype(dtype))), Compiled(newton_rung)
+        before = Compiled.seconds
         size = min(chunk, max(len(x0s), 1))
         parts = [
-            one_chunk(controller, first, more, x0s[i : i + size], size)
+            one_chunk(controller, first_rung(np.dtype(dtype)), x0s[i : i + size], size)
             for i in range(0, len(x0s), size)
         ]
-        compiled = first.seconds + more.seconds
+        compiled = Compiled.seconds - before
         spent = time.perf_counter() - begun - compiled
     if not parts:
         parts = [(np.zeros((0, mpc.horizon, mpc.system.m)), *(np.zeros(0),) * 5)]
@@ -80,7 +81,7 @@ def solve_many(
 
 
 def one_chunk(
-    controller: Controller, first: Compiled, more: Compiled, x: np.ndarray, size: int
+    controller: Controller, first: Compiled, x: np.ndarray, size: int
 ) -> tuple[np.ndarray, ...]:
     """All rungs on one chunk of states."""
     keep, gathered = len(x), gather_size(size)
@@ -90,13 +91,14 @@ def one_chunk(
         for i in range(0, len(left), gathered):
             batch = left[i : i + gathered]
             w, y = answer[-2][batch], answer[-1][batch]
-            better = more(controller, *(padded(v, gathered) for v in (x[batch], w, y)))
+            better = newton_rung(controller, *(padded(v, gathered) for v in (x[batch], w, y)))
             for old, new in zip(answer, better, strict=True):
                 old[batch] = new[: len(batch)]
     return tuple(answer[:-2])
 
 
-def first_rung(dtype: Any) -> Any:
+@functools.cache
+def first_rung(dtype: Any) -> Compiled:
     """Compiled: ADMM in `dtype` and one Newton step in float64, for all states."""
 
     @jax.jit
@@ -115,9 +117,10 @@ def first_rung(dtype: Any) -> Any:
 
         return jax.vmap(one)(x)
 
-    return rung
+    return Compiled(rung)
 
 
+@Compiled
 @jax.jit
 def newton_rung(controller: Controller, x: Array, w: Array, y: Array) -> tuple[Array, ...]:
     """Compiled: more Newton steps in float64 from (w, y), for gathered states."""

@@ -14,7 +14,9 @@ every trajectory; with σ the support function of each set this bounds every fea
 
 No property of y is needed, so any iterate gives a valid half-space; a converged one gives a
 tight one. (Neumaier & Shcherbina 2004: the input limits absorb the dual residual.) Rounding
-moves p_k by at most γ(|A|'|p_{k+1}| + |H_k|'|y_k|), which meets |x_k| ≤ reach_k.
+moves p_k by at most γ(|A|'|p_{k+1}| + |H_k|'|y_k|), which meets |x_k| ≤ reach_k. Where the
+limits leave x_0 unbounded, reach_0 is twice the extent that LPs find (`ladder.extent`); this is
+the one figure that is taken from a solver, and it only scales the rounding bound.
 """
 
 from dataclasses import dataclass, field
@@ -30,6 +32,8 @@ from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.mpc.problem import MPC
 
 UNIT_ROUNDOFF = 2.0**-53
+# Covers products that underflow; data smaller than this are not told from zero.
+TINY = 1e-290
 
 
 @jax.tree_util.register_dataclass
@@ -65,11 +69,16 @@ class View:
 def make_view(mpc: MPC, axes: Any = None, fixed: Any = None) -> View:
     """Check and complete the choice of states to map; raise ValueError for a wrong one.
 
-    axes: indices of the mapped states, None for all. fixed: values (n,) of all states (those at
-    `axes` are ignored) for a slice, None for a projection along the others.
+    axes: indices or names of the mapped states, None for all. fixed: values (n,) of all states
+    (those at `axes` are ignored) for a slice, None for a projection along the others.
     """
     n = mpc.system.n
-    axes = tuple(range(n)) if axes is None else tuple(int(i) for i in axes)
+    names = list(mpc.system.state_names)
+    axes = tuple(range(n)) if axes is None else tuple(axes)
+    axes = tuple(names.index(i) if isinstance(i, str) and i in names else i for i in axes)
+    if not all(isinstance(i, int | np.integer) for i in axes):
+        fail("axes", f"{axes}", f"Give state indices or names ({', '.join(names) or 'none set'})")
+    axes = tuple(int(i) for i in axes)
     if not axes or len(set(axes)) != len(axes) or not all(0 <= i < n for i in axes):
         fail("axes", f"{axes}", f"Give different state indices from 0 to {n - 1}")
     others = tuple(i for i in range(n) if i not in axes)
@@ -194,7 +203,7 @@ def prove_feasible(p: Problem, theta: Array, free: Array, inputs: Array) -> tupl
         x, error = carry
         inside = holds(p.H, p.lower, p.upper, x, error)
         bound = jnp.abs(A) @ jnp.abs(x) + jnp.abs(B) @ jnp.abs(u) + jnp.abs(c)
-        error = jnp.abs(A) @ error * (1 + 1e-9) + growth * bound
+        error = jnp.abs(A) @ error * (1 + 1e-9) + growth * bound + TINY
         return (A @ x + B @ u + c, error), inside
 
     (x, error), inside = jax.lax.scan(advance, (x, jnp.zeros_like(x)), inputs)
@@ -207,7 +216,7 @@ def cut(p: Problem, y_states: Array, y_N: Array) -> tuple[Array, Array, Array]:
 
     y_states (N − first_step, r) and y_N (r_N,): y > 0 on the upper bound, y < 0 on the lower.
     Returns a (d,), b and the part of b that covers rounding; b = inf where nothing can be said.
-    All are scaled by a power of two, which is exact.
+    The multipliers are scaled to about one first; any multipliers give a valid half-space.
     """
     n, m = p.B.shape
     N, r = p.horizon, p.H.shape[0]
@@ -255,7 +264,7 @@ def cut(p: Problem, y_states: Array, y_N: Array) -> tuple[Array, Array, Array]:
     total = total - jnp.sum(rest * value)
     size = size + times(jnp.abs(rest), jnp.abs(value))
     terms = N * (r + m + 3) + 2 * n + p.H_N.shape[0] + 8
-    rounding = 2 * gamma(terms) * size
+    rounding = 2 * gamma(terms) * size + TINY
     b = total + rounding
     # 0'θ ≤ b says nothing, unless b < 0: then no θ at all is feasible.
     return a, jnp.where(jnp.isfinite(b) & (jnp.any(a != 0) | (b < 0)), b, jnp.inf), rounding

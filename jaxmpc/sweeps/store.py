@@ -2,8 +2,11 @@
 
 The store is a zarr v3 group, one row a sample, written in whole zarr chunks:
 
-    points (sample, coordinate), label (sample), status (sample), plan (sample, time, input),
-    cut_normal (sample, coordinate), cut_offset (sample), done (chunk)
+    points (sample, coordinate), label (sample), status (sample),
+    start (sample, state), plan (sample, time, input): x_0 and inputs that prove feasible,
+    cut_normal (sample, coordinate), cut_offset (sample): the half-space that proves infeasible,
+    done (chunk); after refinement bound_point (ray, coordinate), bound_normal (facet,
+    coordinate), bound_offset (facet): proved boundary points and half-spaces
 
 The group appears under its name by one rename, complete with its attributes. A chunk counts
 only once its entry of `done` is set, which happens after all its rows are written; zarr
@@ -32,13 +35,13 @@ from jaxmpc.checks import fail
 def open_sweep(
     path: str | Path,
     points: np.ndarray,
-    plan_shape: tuple[int, int],
+    shape: tuple[int, int, int],
     config: Mapping[str, Any],
     chunk: int,
 ) -> zarr.Group:
     """Open the store at `path` to write; make it where there is none.
 
-    `points` (B, d) are the samples, `plan_shape` is (N, m), `config` is JSON data that says
+    `points` (B, d) are the samples, `shape` is (n, N, m), `config` is JSON data that says
     what is swept, `chunk` is the number of rows a commit. Raises ValueError where the store
     was made with another configuration, or where something else lies there.
     """
@@ -46,11 +49,11 @@ def open_sweep(
     attributes = {
         "config": dict(config),
         "chunk": chunk,
-        "fingerprint": _fingerprint(config, points, plan_shape, chunk),
+        "fingerprint": _fingerprint(config, points, shape, chunk),
         "versions": _versions(),
     }
     if not path.exists():
-        _create(path, points, plan_shape, attributes)
+        _create(path, points, shape, attributes)
     group = _open(path, "r+")
     if group.attrs["fingerprint"] != attributes["fingerprint"]:
         stored: Any = {"config": group.attrs["config"], "chunk": group.attrs["chunk"]}
@@ -77,13 +80,25 @@ def chunk_rows(group: zarr.Group, index: int) -> slice:
 def commit(group: zarr.Group, index: int, **rows: np.ndarray) -> None:
     """Write all rows of chunk `index`, then mark it done.
 
-    `rows` are label, status, plan, cut_normal, cut_offset; other processes may commit other
-    chunks at the same time.
+    `rows` are label, status, start, plan, cut_normal, cut_offset; other processes may commit
+    other chunks at the same time.
     """
     where = chunk_rows(group, index)
-    for name in ("label", "status", "plan", "cut_normal", "cut_offset"):
+    for name in ("label", "status", "start", "plan", "cut_normal", "cut_offset"):
         _array(group, name)[where] = rows[name]
     _array(group, "done")[index] = 1
+
+
+def save_bounds(
+    group: zarr.Group, points: np.ndarray, normals: np.ndarray, offsets: np.ndarray
+) -> None:
+    """Write what refinement proved: points (K, d) and half-spaces normals (F, d), offsets (F,)."""
+    for name, value, dimensions in (
+        ("bound_point", points, ("ray", "coordinate")),
+        ("bound_normal", normals, ("facet", "coordinate")),
+        ("bound_offset", offsets, ("facet",)),
+    ):
+        group.create_array(name, data=value, overwrite=True, dimension_names=dimensions)
 
 
 def read(path: str | Path) -> xr.Dataset:
@@ -99,9 +114,10 @@ def remove(path: str | Path) -> None:
 
 
 def _create(
-    path: Path, points: np.ndarray, plan_shape: tuple[int, int], attributes: dict[str, Any]
+    path: Path, points: np.ndarray, shape: tuple[int, int, int], attributes: dict[str, Any]
 ) -> None:
     rows, d = points.shape
+    n, *plan_shape = shape
     chunk = attributes["chunk"]
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     group = zarr.open_group(partial, mode="w", zarr_format=3, attributes=attributes)
@@ -109,7 +125,8 @@ def _create(
         "points": ((d,), "float64", np.nan, ("coordinate",)),
         "label": ((), "int8", 0, ()),
         "status": ((), "int8", 0, ()),
-        "plan": (plan_shape, "float64", np.nan, ("time", "input")),
+        "start": ((n,), "float64", np.nan, ("state",)),
+        "plan": (tuple(plan_shape), "float64", np.nan, ("time", "input")),
         "cut_normal": ((d,), "float64", np.nan, ("coordinate",)),
         "cut_offset": ((), "float64", np.nan, ()),
     }
@@ -161,9 +178,9 @@ def _chunk(group: zarr.Group) -> int:
 
 
 def _fingerprint(
-    config: Mapping[str, Any], points: np.ndarray, plan_shape: tuple[int, int], chunk: int
+    config: Mapping[str, Any], points: np.ndarray, shape: tuple[int, int, int], chunk: int
 ) -> str:
-    text = json.dumps([config, points.shape, plan_shape, chunk], sort_keys=True)
+    text = json.dumps([config, points.shape, shape, chunk], sort_keys=True)
     return hashlib.sha256(text.encode() + points.tobytes()).hexdigest()
 
 
