@@ -35,7 +35,7 @@ class Compiled:
 
     def __call__(self, *args: Any) -> Any:
         leaves, tree = jax.tree.flatten(args)
-        key = tree, tuple((np.shape(leaf), np.result_type(leaf)) for leaf in leaves)
+        key = tree, tuple(jax.typeof(leaf) for leaf in leaves)
         if key not in self.programs:
             start = time.perf_counter()
             self.programs[key] = self.function.lower(*args).compile()
