@@ -513,3 +513,21 @@ def test_bad_state_raises(x0):
 def test_bad_reference_raises(reference):
     with pytest.raises(ValueError, match="reference"):
         jm.solve(problems.lecture(), np.zeros(2), reference=reference)
+
+
+def test_gradients_are_finite_with_half_open_rows():
+    """A polytope's rows have no lower bound: its gradients equal those of the same box."""
+    box_mpc = problems.joint(5)
+    polytope_mpc = replace(
+        box_mpc, states=box_mpc.states.to_polytope(), terminal_set=box_mpc.states.to_polytope()
+    )
+    with jax.enable_x64(True):
+        cost = lambda Q, mpc: jm.solve(replace(mpc, Q=Q), np.array([1.2, 1.5])).cost
+        gradients = [jax.grad(cost)(np.diag([50.0, 1.0]), m) for m in (box_mpc, polytope_mpc)]
+    assert np.isfinite(gradients[1]).all()
+    np.testing.assert_allclose(gradients[1], gradients[0], rtol=1e-6)
+
+
+def test_applied_input_stays_within_its_limits():
+    u, _, plan = jm.Controller(problems.joint(5))(np.array([1.4, 1.0]))
+    assert plan.status == jm.Status.SOLVED and -2 <= u[0] <= 2

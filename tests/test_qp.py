@@ -646,3 +646,21 @@ def test_large_batches_of_newton_steps_end(cured):
         environment.pop("NPROC", None)
         environment.pop("XLA_FLAGS", None)
     subprocess.run([sys.executable, "-c", HANG], env=environment, check=True, timeout=120)
+
+
+class TestOneRowDoesNotExcuseAnother:
+    """A tolerance for rounding belongs to the row whose terms are large, not to the rest."""
+
+    def test_contradiction_beside_a_large_row(self):
+        f32 = lambda v: np.asarray(v, np.float32)
+        rows = f32([[1, 0], [1, 0], [0, 1e5]])
+        qp = jm.QP(f32(np.eye(2)), f32([0, 0]), rows, f32([1, -np.inf, 1e5]), f32([np.inf, 0, 1e5]))
+        assert jm.solve_qp(qp).status == jm.Status.PRIMAL_INFEASIBLE
+
+    def test_small_remainder_of_a_large_multiplier_proves_nothing(self):
+        """-10 ≤ z ≤ 10 and z ≤ -1 is feasible; absorbing 1e-5 in 1000 loses it to rounding."""
+        f32 = lambda v: np.asarray(v, np.float32)
+        qp = jm.QP(f32([[1]]), f32([0]), f32([[1], [1]]), f32([-10, -np.inf]), f32([10, -1]))
+        solver = jm.ADMM(iterations=0, refine=0)
+        start = f32([10]), f32([1000, 1e-5])
+        assert jm.solve_qp(qp, solver, warm_start=start).status != jm.Status.PRIMAL_INFEASIBLE

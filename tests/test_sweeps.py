@@ -346,3 +346,55 @@ class TestBoundaryArguments:
         found = jm.boundary(mpc, np.array([[1.0, 0.0], [0.0, 1.0]]), center=np.zeros(2))
         assert found.outer[0] == np.inf
         assert found.inner[1] == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("width", [0.1, 0.01])
+def test_refine_bounds_thin_tilted_sets(width):
+    c, s = np.cos(0.7), np.sin(0.7)
+    H = np.array([[c, s], [-s, c], [-c, -s], [s, -c]])
+    mpc = jm.MPC(
+        jm.LinearSystem(np.eye(2) / 2, np.eye(2)), np.eye(2), np.eye(2), 2,
+        states=jm.Polytope(H, np.array([0.5, width / 2, 0.5, width / 2])),
+        inputs=problems.symmetric(1.0, 1.0),
+    )  # fmt: skip
+    low, high = jm.map_feasible_set(mpc, np.zeros((1, 2))).refine().volume_bounds()
+    assert low <= width * (1 + 1e-12) and width * (1 - 1e-12) <= high
+    assert high - low <= 1e-6 * width
+
+
+def test_slice_through_a_broken_limit_is_infeasible_everywhere():
+    mpc = problems.hidden_product(3)
+    box = replace(mpc, states=problems.symmetric(1.5, 2.0, 1.0, 1.5))
+    points = jm.grid([-1, -1], [1, 1], (3, 3))
+    fmap = jm.map_feasible_set(box, points, axes=(0, 1), fixed=np.array([0, 0, 5.0, 0]))
+    assert (fmap.label == -1).all()
+    assert fmap.volume_bounds()[0] == 0
+
+
+def test_projection_keeps_the_state_it_starts_from():
+    mpc = problems.hidden_product(3)
+    fmap = jm.map_feasible_set(mpc, jm.grid([-1, -1], [1, 1], (5, 5)), axes=(0, 3))
+    feasible = fmap.label == 1
+    starts = fmap.labels.starts
+    assert feasible.any()
+    np.testing.assert_array_equal(starts[feasible][:, [0, 3]], fmap.points[feasible])
+    H, h = np.asarray(mpc.states.H, float), np.asarray(mpc.states.h, float)
+    assert (starts[feasible] @ H.T <= h).all()
+    assert np.isnan(starts[~feasible]).all()
+
+
+def test_undecided_points_are_labelled_by_the_facets_of_refine():
+    mpc = problems.joint(6)
+    fmap = jm.map_feasible_set(mpc, np.array([[1.49, 1.9], [0.0, 0.0]]))
+    label, status = fmap.labels.label.copy(), fmap.labels.status.copy()
+    label[0], status[0] = 0, jm.Status.ITERATION_LIMIT
+    forgot = replace(fmap, labels=replace(fmap.labels, label=label, status=status))
+    again = forgot.refine()
+    assert again.label.tolist() == [-1, 1]
+    assert again.labels.cut_normals[0] @ fmap.points[0] > again.labels.cut_offsets[0]
+
+
+def test_second_call_compiles_nothing():
+    mpc, points = problems.joint(5), np.zeros((7, 2))
+    jm.map_feasible_set(mpc, points)
+    assert jm.map_feasible_set(mpc, points).labels.compile_seconds == 0
