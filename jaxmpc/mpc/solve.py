@@ -83,19 +83,6 @@ class Controller:
         start = warm_start.qp if isinstance(warm_start, Plan) else warm_start
         return _plan(self, *arrays((x0, reference, start)))
 
-    def _plan(self, x0: Array, reference: Array | None, start: Any) -> Plan:
-        c = self.condensed
-        assert c is not None and self.factor is not None
-        solution = solve_factored(c.qp(x0, reference), self.factor, self.solver, start)
-        states, inputs = c.trajectory(x0, solution.z)
-        cost = self.cost(states, inputs, reference)
-        return Plan(
-            states=states, inputs=inputs, cost=cost, multipliers=self.multipliers(solution.y),
-            status=solution.status, primal_residual=solution.primal_residual,
-            dual_residual=solution.dual_residual, gap=solution.gap,
-            iterations=solution.iterations, qp=solution,
-        )  # fmt: skip
-
     def cost(self, states: Array, inputs: Array, reference: Array | None = None) -> Array:
         """J (without ½) of a trajectory: states (N+1, n), inputs (N, m)."""
         c = self.condensed
@@ -126,4 +113,14 @@ def _factor(condensed: Condensed, solver: ADMM) -> Factor:
 
 @jax.jit
 def _plan(controller: Controller, x0: Array, reference: Array | None, start: Any) -> Plan:
-    return controller._plan(x0, reference, start)
+    c = controller.condensed
+    assert c is not None and controller.factor is not None
+    qp = c.qp(x0, reference)
+    solution = solve_factored(qp, controller.factor, controller.solver, start)
+    states, inputs = c.trajectory(x0, solution.z)
+    return Plan(
+        states=states, inputs=inputs, cost=controller.cost(states, inputs, reference),
+        multipliers=controller.multipliers(solution.y), status=solution.status,
+        primal_residual=solution.primal_residual, dual_residual=solution.dual_residual,
+        gap=solution.gap, iterations=solution.iterations, qp=solution,
+    )  # fmt: skip

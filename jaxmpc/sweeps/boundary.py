@@ -16,7 +16,7 @@ from scipy.optimize import linprog
 from jaxmpc.checks import fail
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.sweeps import proofs
-from jaxmpc.sweeps.ladder import HIGHS, Rows, cut_of, extent, inputs_of, rows, support
+from jaxmpc.sweeps.ladder import HIGHS, Rows, bounding_box, cut_of, inputs_of, rows, support
 from jaxmpc.sweeps.proofs import Problem, View, make_view
 
 # How far a boundary point is pulled towards the centre before it is proved: the least that works.
@@ -86,7 +86,8 @@ class Rays:
     def __init__(self, mpc: MPC, view: View, center: np.ndarray | None = None) -> None:
         self.rows = rows(mpc, view)
         self.center, self.w = self._centre(center)
-        self.problem = proofs.problem(mpc, view, extent(self.rows, np.abs(self.center)))
+        extent, self.sides = bounding_box(self.rows, np.abs(self.center))
+        self.problem = proofs.problem(mpc, view, extent)
 
     def _centre(self, center: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """θ (the given one, or the best) and w with the largest common margin of all rows."""
@@ -113,10 +114,8 @@ class Rays:
 
     def box(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Half-spaces (normals, offsets, roundings) of the bounding box, as far as there is one."""
-        d = len(self.center)
-        y = np.array([support(self.rows, s * e)[2] for s in (1.0, -1.0) for e in np.eye(d)])
         with jax.enable_x64(True):
-            cuts = jax.vmap(lambda y: cut_of(self.problem, self.rows, y))(y)
+            cuts = jax.vmap(lambda y: cut_of(self.problem, self.rows, y))(self.sides)
         normals, offsets, roundings = (np.asarray(v) for v in cuts)
         valid = np.isfinite(offsets)
         return normals[valid], offsets[valid], roundings[valid]

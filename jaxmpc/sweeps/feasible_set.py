@@ -23,7 +23,7 @@ from jaxmpc.sweeps.compiled import (
     padded,
     require_step_type,
 )
-from jaxmpc.sweeps.ladder import Verdict, admm_rung, extent, newton_rung, rows
+from jaxmpc.sweeps.ladder import Verdict, admm_rung, bounding_box, newton_rung, rows
 from jaxmpc.sweeps.proofs import make_view
 
 # Newton steps between two attempts at a proof, and how often; the decided leave in between.
@@ -118,7 +118,7 @@ def label_chunks(
     usable = np.all(np.isfinite(points), axis=1)
     moving = rows(mpc, view)
     region = np.abs(points[usable]).max(axis=0, initial=0.0)
-    problem = proofs.problem(mpc, view, extent(moving, region))
+    problem = proofs.problem(mpc, view, bounding_box(moving, region)[0])
     admm, newton = admm_rung(iterations, np.dtype(dtype)), newton_rung(NEWTON_STEPS)
     longer = admm_rung(LONGER * iterations, np.dtype(np.float64))
     chunk = min(chunk, max(len(points), 1))
@@ -132,7 +132,7 @@ def label_chunks(
         labels = Labels.empty(len(x), mpc, d)
         with jax.enable_x64(True):
             verdict, w = admm(problem, moving, padded(x, chunk))
-            labels.put(slice(None), first_rows(verdict, len(x)))
+            labels.put(ok, jax.tree.map(lambda v, ok=ok: v[: len(ok)][ok], verdict))
             w = w[: len(x)].astype(np.float64)
             for rung in (*[newton] * NEWTON_ROUNDS, longer, *[newton] * NEWTON_ROUNDS):
                 left = np.flatnonzero((labels.label == 0) & ok)
@@ -142,9 +142,6 @@ def label_chunks(
                     verdict, better = rung(problem, moving, padded(x[batch], size), *start_w)
                     labels.put(batch, first_rows(verdict, len(batch)))
                     w[batch] = better[: len(batch)]
-        blank = Labels.empty(int(np.sum(~ok)), mpc, d)
-        for name in ARRAYS:
-            getattr(labels, name)[~ok] = getattr(blank, name)
         labels.status[~ok] = Status.NON_FINITE
         compiled = Compiled.seconds - compiled
         spent = time.perf_counter() - begun - compiled
@@ -265,8 +262,8 @@ class FeasibleSetMap:
 
         Each ray adds a proved boundary point and a proved facet (`boundary`); in up to four
         mapped dimensions this ends at the exact polytope. Undecided points that a facet excludes
-        are labelled infeasible. tolerance: relative gap of the volume
-        bounds at which to stop. A set without interior, or unbounded, is returned as it is.
+        are labelled infeasible. tolerance: relative gap of the volume bounds at which to stop.
+        A set without interior, or unbounded, is returned as it is.
         """
         view = make_view(self.mpc, self.axes, self.fixed)
         d = len(self.axes)
@@ -366,16 +363,12 @@ def map_feasible_set(
     chunks = label_chunks(
         mpc, points, axes=axes, fixed=fixed, iterations=iterations, dtype=dtype, chunk=chunk
     )
-    labels = None
+    mpc.validate()
+    labels = Labels.empty(len(points), mpc, len(make_view(mpc, axes, fixed).axes))
     with tqdm(total=len(points), unit="pt", disable=not progress) as bar:
         for here, part in chunks:
-            if labels is None:
-                labels = Labels.empty(len(points), mpc, part.cut_normals.shape[1])
             labels = joined(labels, here, part)
             bar.update(len(part.label))
-    if labels is None:
-        d = len(make_view(mpc, axes, fixed).axes)
-        labels = Labels.empty(0, mpc, d)
     result = FeasibleSetMap.of(mpc, points, axes, fixed, labels)
     return result if refine is None else result.refine(refine)
 

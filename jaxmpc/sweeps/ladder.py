@@ -124,14 +124,16 @@ def support(
     return float(-result.fun), result.x[:k], y
 
 
-def extent(rows: Rows, otherwise: np.ndarray) -> np.ndarray:
-    """|θ| ≤ extent (d,) on the feasible set: twice the LPs' answer, which outweighs tolerances.
+def bounding_box(rows: Rows, otherwise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Extent (d,), |θ| ≤ extent on the feasible set, and the multipliers (2d, R) of its sides.
 
-    Where the LPs find the set empty, `otherwise`: the region that is looked at.
+    The extent is twice the LPs' answer, which outweighs their tolerances; where they find the
+    set empty, `otherwise`: the region that is looked at.
     """
     d = rows.D.shape[1]
-    ends = np.array([[support(rows, s * e)[0] for e in np.eye(d)] for s in (1.0, -1.0)])
-    return otherwise if np.any(ends == -np.inf) else 2 * np.abs(ends).max(axis=0) + 1e-300
+    ends, _, y = zip(*(support(rows, s * e) for s in (1.0, -1.0) for e in np.eye(d)), strict=True)
+    reach = np.abs(ends).reshape(2, d).max(axis=0)
+    return otherwise if -np.inf in ends else 2 * reach + 1e-300, np.array(y)
 
 
 @jax.tree_util.register_dataclass

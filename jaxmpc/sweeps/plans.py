@@ -147,16 +147,11 @@ def finish(
     """Polish, judge, and lay out: inputs, cost, status, three residuals, and (w, y) to go on."""
     c = controller.condensed
     assert c is not None
-    w, y, change = polish(f.H, *scaled_rows(f, qp), w, y, steps)
+    q, l, u = scaled(f, qp)
+    w, y, change = polish(f.H, q, f.A, l, u, w, y, steps)
     s: QPSolution = marked(
         assess(qp, f, [(w, y)], [*proofs, change], [], controller.solver), finite
     )
     states, inputs = c.trajectory(x0, s.z)
     cost = controller.cost(states, inputs)
     return inputs, cost, s.status, s.primal_residual, s.dual_residual, s.gap, w, y
-
-
-def scaled_rows(f: Factor, qp: QP) -> tuple[Array, Array, Array, Array]:
-    """q, A, l, u in scaled coordinates, as `polish` takes them."""
-    q, l, u = scaled(f, qp)
-    return q, f.A, l, u
