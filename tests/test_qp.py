@@ -15,7 +15,8 @@ import scipy
 from jax import enable_x64
 
 import jaxmpc as jm
-from jaxmpc.qp.problem import bound_product, residuals
+from jaxmpc.qp.problem import residuals
+from jaxmpc.qp.projection import Bounds
 
 INF = np.inf
 FINE = jm.ADMM(iterations=400, refine=30, eps=1e-9)
@@ -237,7 +238,7 @@ class TestResiduals:
     def test_wrong_sign_at_an_infinite_bound(self, x64):
         qp = box(1, u=np.array([INF]))
         assert residuals(qp, np.zeros(1), np.ones(1))[2] == INF
-        assert bound_product(jnp.zeros(2), jnp.array([-INF] * 2), jnp.array([INF] * 2)) == 0
+        assert Bounds(jnp.array([-INF] * 2), jnp.array([INF] * 2)).support(jnp.zeros(2)) == 0
 
     def test_reported_ones_are_those_of_the_answer(self, x64):
         qp, _, _ = constructed(6, 7)
@@ -263,7 +264,7 @@ class TestHonestStatus:
             sol = solve(qp, jm.ADMM(iterations=iterations, refine=refine, eps=eps))
             z, y = np.asarray(sol.z), np.asarray(sol.y)
             v, support = qp.A @ z, 0.0
-            support = float(bound_product(sol.y, jnp.asarray(qp.l), jnp.asarray(qp.u)))
+            support = float(Bounds(qp.l, qp.u).support(sol.y))
             worst = max(
                 np.abs(v - np.clip(v, qp.l, qp.u)).max(),
                 np.abs(qp.P @ z + qp.q + qp.A.T @ y).max(),
@@ -445,7 +446,7 @@ class TestBatches:
         )
         shapes = self.cholesky_shapes(shared, clean)
         assert shapes and all(shape == (6, 6) for shape in shapes)
-        assert len(shapes) == 2  # coordinates, and one stage of rho
+        assert len(shapes) == 3  # curvature, coordinates, and one stage of rho
         own = jax.vmap(lambda qp: jm.solve_qp(qp, solver))
         each = replace(clean, P=np.tile(clean.P, (9, 1, 1)), A=np.tile(clean.A, (9, 1, 1)))
         assert set(self.cholesky_shapes(own, each)) == {(9, 6, 6)}
@@ -523,7 +524,7 @@ class TestSettings:
 
 
 class TestGradients:
-    """Unrolled gradients against central differences, where the active set does not change."""
+    """Gradients of both kinds against central differences, where the active set does not change."""
 
     def loss(self, qp, rho=1.0, weight=None):
         sol = jm.solve_qp(qp, jm.ADMM(iterations=300, rho=rho, refine=0))
@@ -551,7 +552,10 @@ class TestGradients:
     def test_rho(self, x64):
         """With few steps the answer depends on rho, and its gradient is that of the program."""
         qp, _, _ = constructed(4, 3)
-        few = lambda rho: jnp.sum(jm.solve_qp(qp, jm.ADMM(iterations=7, rho=rho, refine=0)).z ** 2)
+        few = lambda rho: jnp.sum(
+            jm.solve_qp(qp, jm.ADMM(iterations=7, rho=rho, refine=0, differentiate="unrolled")).z
+            ** 2
+        )
         h = 1e-6
         np.testing.assert_allclose(
             jax.grad(few)(0.7), (few(0.7 + h) - few(0.7 - h)) / (2 * h), rtol=1e-5

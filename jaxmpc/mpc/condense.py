@@ -21,7 +21,8 @@ from jax import Array
 from jaxmpc.checks import concrete, fail
 from jaxmpc.control.riccati import lqr
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.qp.problem import QP, arrays, floating_dtype, matmul
+from jaxmpc.qp.precision import arrays, floating_dtype, matmul
+from jaxmpc.qp.problem import QP
 
 
 @jax.tree_util.register_dataclass

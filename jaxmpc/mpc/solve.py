@@ -13,7 +13,8 @@ from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.problem import MPC, Multipliers, Plan
 from jaxmpc.qp.admm import ADMM, Factor
 from jaxmpc.qp.admm import factor as factorise
-from jaxmpc.qp.problem import QPSolution, arrays, matmul
+from jaxmpc.qp.precision import arrays, matmul
+from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.solve import solve_factored
 
 

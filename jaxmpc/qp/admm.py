@@ -1,24 +1,27 @@
 """ADMM with a fixed number of steps: scale, factor once, iterate one matrix product a step.
 
-The program min ½ z'Pz + q'z, l ≤ Az ≤ u is solved in coordinates w, z = T w, in which the
-Hessian H = T'PT is the identity (as nearly as P is definite) and the rows of A_w = E A T have
-length one. Splitting s = A_w w with penalty R = diag(rho) and over-relaxation alpha gives
-(Boyd et al. 2011, §3.4.3; Stellato et al. 2020, eq. 17–20, without the proximal term)
+The program min ½ z'Pz + q'z + g(Az), g from `projection.py`, is solved in coordinates w, z = T w,
+in which the Hessian H = T'PT is the identity (as nearly as P is definite) and the rows of
+A_w = E A T have length one. Splitting s = A_w w with penalty R = diag(rho) and over-relaxation
+alpha gives (Boyd et al. 2011, §3.4.3; Stellato et al. 2020, eq. 17–20, without the proximal term)
 
     w  = M⁻¹ (A_w' R (s − v) − q_w),        M = H + A_w' R A_w
-    s⁺ = clip(alpha A_w w + (1 − alpha) s + v, l, u)
+    s⁺ = prox(alpha A_w w + (1 − alpha) s + v)
     v⁺ = v + alpha A_w w + (1 − alpha) s − s⁺
 
 where R v is the multiplier. Both s and v are functions of their sum t = s + v, because
-s = clip(t) and v = t − clip(t), so a step needs one vector and, with r = s − v = 2 clip(t) − t,
+s = prox(t) and v = t − prox(t), so a step needs one vector and, with r = s − v = 2 prox(t) − t,
 
-    t⁺ = t + alpha (A_w M⁻¹ A_w' R r + b − clip(t)),        b = −A_w M⁻¹ q_w.
+    t⁺ = t + alpha (A_w M⁻¹ A_w' R r + b − prox(t)),        b = −A_w M⁻¹ q_w.
 
 M, and all that is computed from it, depends on P, A and rho only: a batch that shares these
-pays for one factorization and then for one matrix product a step.
+pays for one factorization and then for one matrix product a step. prox is the projection onto
+[l, u] where all rows are hard.
 """
 
-from dataclasses import dataclass, field
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -28,9 +31,11 @@ from jax import Array
 from jax.scipy.linalg import cho_solve, solve_triangular
 
 from jaxmpc.checks import concrete, fail
-from jaxmpc.qp.problem import matmul
+from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.problem import QP
+from jaxmpc.qp.projection import Bounds
 
-# Least eigenvalue, relative to the mean, below which a Hessian counts as singular.
+# Eigenvalue, relative to the mean, below which a direction counts as without curvature.
 SINGULAR = 1e-6
 
 
@@ -43,10 +48,15 @@ class ADMM:
     a number, one value a row (m,), or a schedule (stages, m) or (stages, 1) whose stages share
     the iterations equally; 1 suits these coordinates whatever the problem's units.
     alpha: over-relaxation in (0, 2).
-    refine: Newton steps after the loop (`refine.py`), accepted only where they help.
+    refine: Newton steps after the loop (`refine.py`), accepted only where they help; 10 serve
+    MPC, 60 solve whatever comes (linear programs, singular or ill-conditioned P).
     eps: tolerance of status SOLVED on primal residual, dual residual and gap, absolute, plus
-    the rounding floor 100·machine epsilon·(size of the terms); None: 1e-6 in float64, 1e-3 in
-    float32.
+    a rounding floor, a multiple of machine epsilon·(size of the terms): 100 in float64, 4 in
+    float32. None: 1e-6 in float64, 1e-3 in float32.
+    differentiate: "implicit", derivatives of the solution itself (`derivative.py`), zero with
+    respect to rho, alpha and the warm start; or "unrolled", derivatives of the steps as they
+    were taken. smoothing: 0, or μ > 0 to round off the kinks of the implicit derivative as an
+    interior-point method stopped at slack·multiplier = μ (scaled coordinates) would.
     """
 
     iterations: int = field(default=100, metadata={"static": True})
@@ -54,6 +64,8 @@ class ADMM:
     alpha: Any = 1.6
     refine: int = field(default=10, metadata={"static": True})
     eps: Any = None
+    differentiate: str = field(default="implicit", metadata={"static": True})
+    smoothing: Any = 0.0
 
     def validate(self, rows: int) -> None:
         """Raise ValueError for settings that make no iteration."""
@@ -68,6 +80,10 @@ class ADMM:
             fail("iterations", f"{self.iterations} for {shape[0]} stages", "Use a multiple")
         if concrete(self.alpha) and not 0 < float(np.asarray(self.alpha)) < 2:
             fail("alpha", f"{self.alpha}", "Over-relaxation lies in (0, 2); 1.6 is usual")
+        if self.differentiate not in ("implicit", "unrolled"):
+            fail("differentiate", f"{self.differentiate!r}", 'Give "implicit" or "unrolled"')
+        if concrete(self.smoothing) and not float(np.asarray(self.smoothing)) >= 0:
+            fail("smoothing", f"{self.smoothing}", "Give 0 (none) or a positive number")
 
 
 @jax.tree_util.register_dataclass
@@ -76,70 +92,85 @@ class Factor:
     """What P, A and rho alone decide; shared by every instance of a batch.
 
     T (n, n): z = T w. E (m,): row scale, 0 for a zero row. H (n, n), A (m, n): Hessian and
-    rows in w. rho (S, m), and a stage each of F = M⁻¹A'R (S, n, m), iteration matrix
-    G = A F (S, m, m), and Minv (S, n, n).
+    rows in w. flat: whether P is singular. rho (S, m), and a stage each of F = M⁻¹A'R (S, n, m),
+    iteration matrix G = A F (S, m, m), and Minv (S, n, n).
     """
 
     T: Array
     E: Array
     H: Array
     A: Array
+    flat: Array
     rho: Array
     F: Array
     G: Array
     Minv: Array
 
 
-def scale(P: Array, A: Array) -> tuple[Array, Array, Array, Array]:
+def scale(
+    P: Array, A: Array, balls: tuple[int, ...] = ()
+) -> tuple[Array, Array, Array, Array, Array]:
     """Coordinates z = T w and row scale E with T'PT ≈ I and rows of E A T of length one.
 
-    T is the inverse transposed Cholesky factor of P + δI; T'PT stays exact.
-    Returns T, E, T'PT, E A T. A zero row keeps scale 0: it constrains nothing in z.
+    Variables first get units of their own, by P's diagonal or, where that is zero, by the
+    columns of A; then T is the inverse transposed Cholesky factor of P + δI. T'PT stays exact.
+    Returns T, E, T'PT, E A T and whether P is singular. A zero row keeps scale 0: it constrains
+    nothing in z. The rows of a ball share one scale, so that it stays one.
     """
-    n = P.shape[0]
-    delta = null_curvature(*jax.lax.stop_gradient((P, A)))
-    metric = P + delta * jnp.eye(n, dtype=P.dtype)
-    L = jnp.linalg.cholesky(metric)
-    T = solve_triangular(L, jnp.eye(n, dtype=P.dtype), lower=True).T
+    n, dtype = P.shape[0], P.dtype
+    size = jnp.where(jnp.diag(P) > 0, jnp.diag(P), jnp.sum(A**2, axis=0))
+    unit = jax.lax.stop_gradient(1 / jnp.sqrt(jnp.where(size > 0, size, 1.0)))
+    P_1, A_1 = unit[:, None] * P * unit, A * unit
+    delta, flat = null_curvature(*jax.lax.stop_gradient((P_1, A_1)))
+    L = jnp.linalg.cholesky(P_1 + delta * jnp.eye(n, dtype=dtype))
+    T = unit[:, None] * solve_triangular(L, jnp.eye(n, dtype=dtype), lower=True).T
     H = matmul(T.T, matmul(P, T))
     rows = matmul(A, T)
     squared = jnp.sum(rows**2, axis=1)
     # A row is zero when it is rounding noise of its own terms, or beside the others (Euler: q₁
     # does not feel u₀).
-    eps = jnp.finfo(P.dtype).eps
+    eps = jnp.finfo(dtype).eps
     own = jnp.sum(matmul(jnp.abs(A), jnp.abs(T)) ** 2, axis=1)
     noise = jnp.maximum((100 * eps) ** 2 * own, eps**2 * jnp.max(squared, initial=0.0))
+    last = A.shape[0]
+    for count in reversed(balls):
+        block, last = slice(last - count, last), last - count
+        squared = squared.at[block].set(jnp.mean(squared[block]))
+        noise = noise.at[block].set(jnp.mean(noise[block]))
     zero = squared <= noise
     E = jnp.where(zero, 0.0, 1 / jnp.sqrt(jnp.where(zero, 1.0, squared)))
-    return T, E, (H + H.T) / 2, E[:, None] * rows
+    return T, E, (H + H.T) / 2, E[:, None] * rows, flat
 
 
-def null_curvature(P: Array, A: Array) -> Array:
-    """The curvature δ that stands in for P where P has none.
+def null_curvature(P: Array, A: Array) -> tuple[Array, Array]:
+    """The curvature δ that stands in for P where P has none, and whether there is such a part.
 
-    Where P is definite, 1e-6 of its mean. Where it is singular, the scale of its null space
-    relative to its range is free, and ADMM is slow when rows feel mostly one of them: δ makes
-    both parts of the median row alike, |a_null|²/δ = Σ (a'v)²/λ over P's range; the mean
-    curvature if no row has both parts, 1 for P = 0.
+    Where P is definite, δ is a small share ε of its mean. Where it is singular, the scale of its
+    null space relative to its range is free, and ADMM is slow when rows feel mostly one of them:
+    δ makes both parts of the median row alike, |a_null|²/δ = Σ (a'v)²/λ over P's range; 1 if
+    no row has both parts. With x = (P + εI)⁻¹a the null part is ε|x|, and the range part x'Px.
     """
-    curvature, V = jnp.linalg.eigh(P)
-    mean = jnp.trace(P) / P.shape[0]
-    null = curvature <= SINGULAR * mean
-    singular = jnp.where(mean > 0, mean, 1.0)
+    n = P.shape[0]
+    mean = jnp.trace(P) / n
+    share = jnp.maximum(SINGULAR, 4 * n * jnp.finfo(P.dtype).eps)
+    epsilon = jnp.where(mean > 0, share * mean, 1.0)
+    L = jnp.linalg.cholesky(P + epsilon * jnp.eye(n, dtype=P.dtype))
+    root = solve_triangular(L, jnp.eye(n, dtype=P.dtype), lower=True)
+    # Σ ε/(λ + ε) counts the directions without curvature.
+    singular = epsilon * jnp.sum(root**2) > 0.5
+    delta = jnp.ones((), P.dtype)
     if A.shape[0]:
-        parts = matmul(A, V) ** 2
-        in_null = jnp.sum(jnp.where(null, parts, 0.0), axis=1)
-        in_range = jnp.sum(jnp.where(null, 0.0, parts / jnp.where(null, 1.0, curvature)), axis=1)
-        both = (in_null > SINGULAR**2 * jnp.sum(parts, axis=1)) & (in_range > 0)
+        x = matmul(matmul(A, root.T), root)
+        in_null, in_range = epsilon**2 * jnp.sum(x**2, axis=1), jnp.sum(x * matmul(x, P), axis=1)
+        both = (in_null > 1e-8 * jnp.sum(A**2, axis=1)) & (in_range > 0)
         ratio = jnp.where(both, in_null / jnp.where(both, in_range, 1.0), jnp.nan)
-        singular = jnp.where(jnp.any(both), jnp.nanmedian(ratio), singular)
-    # Rounding may have left P slightly indefinite.
-    return jnp.where(jnp.any(null), singular, 1e-6 * mean) + jnp.maximum(-2 * curvature[0], 0.0)
+        delta = jnp.where(jnp.any(both), jnp.nanmedian(ratio), delta)
+    return jnp.where(singular, delta, epsilon), singular
 
 
-def factor(P: Array, A: Array, solver: ADMM) -> Factor:
-    """Scale, choose rho and invert; depends on nothing that differs between initial states."""
-    T, E, H, A_w = scale(P, A)
+def factor(P: Array, A: Array, solver: ADMM, balls: tuple[int, ...] = ()) -> Factor:
+    """Scale and invert; depends on nothing that differs between initial states."""
+    T, E, H, A_w, flat = scale(P, A, balls)
     n, m = A_w.shape[1], A_w.shape[0]
     rho = jnp.asarray(solver.rho, P.dtype)
     rho = jnp.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, m))
@@ -153,35 +184,71 @@ def factor(P: Array, A: Array, solver: ADMM) -> Factor:
 
     stages = [stage(R) for R in rho]
     F = jnp.stack([F for F, _ in stages])
-    return Factor(T, E, H, A_w, rho, F, matmul(A_w, F), jnp.stack([Minv for _, Minv in stages]))
+    Minv = jnp.stack([Minv for _, Minv in stages])
+    return Factor(T, E, H, A_w, flat, rho, F, matmul(A_w, F), Minv)
 
 
-def step(t: Array, b: Array, l: Array, u: Array, G: Array, alpha: Any) -> Array:
+def scaled(factor: Factor, qp: QP) -> tuple[Array, Bounds]:
+    """q and bounds in ADMM's coordinates: distances in row i grow by E_i, so penalties on them
+    shrink. A zero row (scale 0) is free there; `assess` in solve.py looks after it."""
+    E, zero, bounds = factor.E, factor.E == 0, qp.bounds
+
+    def bound(v: Array, free: float) -> Array:
+        # E·inf would give NaN gradients with respect to P and A, which E depends on.
+        keep = jnp.isfinite(v) & ~zero
+        return jnp.where(zero, free, jnp.where(keep, E * jnp.where(keep, v, 0.0), v))
+
+    bounds = replace(bounds, l=bound(qp.l, -jnp.inf), u=bound(qp.u, jnp.inf))
+    E = jnp.where(zero, 1.0, E)
+    if bounds.linear is not None:
+        bounds = replace(bounds, linear=bounds.linear / E, quadratic=bounds.quadratic / E**2)
+    for i, (rows, radius) in enumerate(bounds.blocks()):
+        centre = jnp.where(zero[rows], 0.0, E[rows] * qp.l[rows])
+        radius = jnp.where(zero[rows][0], jnp.inf, E[rows][0] * radius)
+        bounds = replace(
+            bounds, l=bounds.l.at[rows].set(centre), u=bounds.u.at[rows].set(centre),
+            radius=bounds.radius.at[i].set(radius),
+        )  # fmt: skip
+    return matmul(qp.q, factor.T), bounds
+
+
+def step(t: Array, b: Array, bounds: Bounds, rho: Array, G: Array, alpha: Any) -> Array:
     """One ADMM step on t = s + v (m,)."""
-    s = jnp.clip(t, l, u)
+    s = bounds.project(t, rho)
     return t + jnp.asarray(alpha, t.dtype) * (matmul(2 * s - t, G.T) + b - s)
 
 
 def iterate(
-    factor: Factor, q: Array, l: Array, u: Array, t: Array, iterations: int, alpha: Any
+    factor: Factor, q: Array, bounds: Bounds, t: Array, iterations: int, alpha: Any
 ) -> tuple[Array, Array]:
-    """Run the fixed loop in scaled coordinates, q = T'q (n,), l, u, t (m,); the last two t."""
+    """Run the fixed loop in scaled coordinates, q = T'q (n,), t (m,); the last two t."""
     stages = factor.rho.shape[0]
     previous = t
     for i in range(stages):
-        G, b = factor.G[i], -matmul(matmul(q, factor.Minv[i]), factor.A.T)
+        rho, G = factor.rho[i], factor.G[i]
+        b = -matmul(matmul(q, factor.Minv[i]), factor.A.T)
         if i > 0:  # the multiplier R v is what carries over, not v
-            s = jnp.clip(t, l, u)
-            t = s + factor.rho[i - 1] / factor.rho[i] * (t - s)
-        advance = lambda t, _=None, G=G, b=b: (step(t, b, l, u, G, alpha), None)
+            s = bounds.project(t, factor.rho[i - 1])
+            t = s + factor.rho[i - 1] / rho * (t - s)
+        advance = lambda t, rho=rho, G=G, b=b: step(t, b, bounds, rho, G, alpha)
         if iterations:
-            previous, _ = jax.lax.scan(advance, t, length=iterations // stages - 1)
-            t, _ = advance(previous)
+            previous = repeat(advance, t, iterations // stages - 1)
+            t = advance(previous)
     return t, previous
 
 
-def read(factor: Factor, t: Array, q: Array, l: Array, u: Array) -> tuple[Array, Array]:
+def repeat(advance: Callable[[Array], Array], t: Array, count: int) -> Array:
+    """`count` steps. Backward through them, only the starts of √count blocks are kept in memory;
+    the steps of a block are computed again."""
+    inner = max(math.isqrt(count), 1)
+    block = lambda t, length: jax.lax.scan(lambda t, _: (advance(t), None), t, length=length)[0]
+    outer = jax.checkpoint(lambda t: block(t, inner), prevent_cse=False)
+    t, _ = jax.lax.scan(lambda t, _: (outer(t), None), t, length=count // inner)
+    return block(t, count % inner)
+
+
+def read(factor: Factor, t: Array, q: Array, bounds: Bounds) -> tuple[Array, Array]:
     """Primal w (n,) and multiplier R v (m,), both scaled, that t stands for at the last stage."""
-    s = jnp.clip(t, l, u)
+    s = bounds.project(t, factor.rho[-1])
     w = matmul(2 * s - t, factor.F[-1].T) - matmul(q, factor.Minv[-1])
     return w, factor.rho[-1] * (t - s)

@@ -1,16 +1,22 @@
 """Proofs of infeasibility for one QP, made safe against rounding.
 
-A vector y proves l ≤ Az ≤ u empty when A'y = 0 and Σ u y⁺ − l y⁻ < 0 (Farkas). Iterates never
-satisfy A'y = 0 exactly. Where a row bounds a single variable on both sides its multiplier can
-be chosen to absorb what is left of A'y, exactly up to one rounding (Neumaier & Shcherbina
-2004, safe bounds; here with the box rows in the role of the correction). Convergence of y then
-buys tightness, not validity.
+A vector y proves l ≤ Az ≤ u empty when A'y = 0 and Σ u y⁺ − l y⁻ < 0 (Farkas); a ball adds
+radius·|y_b| to the sum, soft rows never take part. Iterates never satisfy A'y = 0 exactly.
+Where a row bounds a single variable on both sides its multiplier can be chosen to absorb what is
+left of A'y, exactly up to one rounding (Neumaier & Shcherbina 2004, safe bounds; here with the
+box rows in the role of the correction). Convergence of y then buys tightness, not validity.
 """
+
+from dataclasses import replace
 
 import jax.numpy as jnp
 from jax import Array
+from jax.scipy.linalg import cho_solve
 
-from jaxmpc.qp.problem import QP, admissible, bound_product, matmul
+from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.problem import QP
+from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.refine import cholesky
 
 
 def farkas(qp: QP, y: Array) -> tuple[Array, Array]:
@@ -25,15 +31,19 @@ def farkas(qp: QP, y: Array) -> tuple[Array, Array]:
     m, n = qp.A.shape
     if m == 0:
         return y, jnp.asarray(False)
+    bounds = qp.bounds.hard()
+    l, u = bounds.l, bounds.u
     length = jnp.max(jnp.abs(y), initial=0.0)
-    y = admissible(jnp.where(length > 0, y / jnp.where(length > 0, length, 1.0), 0.0), qp.l, qp.u)
+    y = bounds.admissible(jnp.where(length > 0, y / jnp.where(length > 0, length, 1.0), 0.0))
 
     # Row i(j) bounds variable j alone. The choice rests on A only, so a batch shares it.
-    single = jnp.sum(qp.A != 0, axis=1) == 1
+    single = (jnp.sum(qp.A != 0, axis=1) == 1) & (jnp.arange(m) < m - sum(qp.balls))
+    if qp.bounds.linear is not None:
+        single = single & jnp.isinf(qp.bounds.linear)
     entries = jnp.where(single[:, None], jnp.abs(qp.A), 0.0)
     row = jnp.argmax(entries, axis=0)
     pivot = jnp.where(entries[row, jnp.arange(n)] > 0, qp.A[row, jnp.arange(n)], 1.0)
-    bounded = jnp.isfinite(qp.l) & jnp.isfinite(qp.u)
+    bounded = jnp.isfinite(l) & jnp.isfinite(u)
     has_row = (entries[row, jnp.arange(n)] > 0) & bounded[row]
     y = y.at[row].add(jnp.where(has_row, -matmul(y, qp.A) / pivot, 0.0))
 
@@ -41,16 +51,42 @@ def farkas(qp: QP, y: Array) -> tuple[Array, Array]:
     terms = matmul(jnp.abs(y), jnp.abs(qp.A))
     gamma = 2 * (m + n + 2) * eps
     absorbed = has_row | (left <= gamma * terms)
-    bound = jnp.where(bounded, jnp.maximum(jnp.abs(qp.l), jnp.abs(qp.u)), 0.0)
+    bound = jnp.where(bounded, jnp.maximum(jnp.abs(l), jnp.abs(u)), 0.0)
     reach = jnp.where(has_row, bound[row] / jnp.abs(pivot), 0.0)
-    size = bound_product(
-        y, jnp.where(y < 0, -jnp.abs(qp.l), 0.0), jnp.where(y > 0, jnp.abs(qp.u), 0.0)
-    )
+    absolute = replace(bounds, l=-jnp.abs(l), u=jnp.abs(u))
+    size = absolute.support(y)
     # What the correction leaves of A'y meets at most |z| ≤ reach.
     leak = jnp.sum((2 * left + gamma * terms) * reach)
-    safe = bound_product(y, qp.l, qp.u) + gamma * size + leak
+    safe = bounds.support(y) + gamma * size + leak
     proved = jnp.all(absorbed) & (safe < 0) & jnp.any(y != 0)
     return jnp.where(proved, y, 0.0), proved
+
+
+def sharpen(A: Array, y: Array) -> Array:
+    """The vector nearest to y, with no entries where y has none, that satisfies A'y = 0.
+
+    Least squares y − DA(A'DA)⁻¹A'y with D the support of y, twice for the sake of rounding.
+    """
+    least = 0.01 * jnp.sqrt(jnp.finfo(y.dtype).eps)
+    support = jnp.abs(y) > least * jnp.max(jnp.abs(y), initial=0.0)
+    y = jnp.where(support, y, 0.0)
+    L = cholesky(matmul(A.T * support, A), 1.0)
+    for _ in range(2):
+        y = y - support * matmul(cho_solve((L, True), matmul(y, A)), A.T)
+    return y
+
+
+def recession(q: Array, H: Array, A: Array, bounds: Bounds) -> tuple[Array, Bounds]:
+    """Rows that a ray of descent d satisfies: Hd = 0, q'd = −|q|, A d in the cone of directions
+    that no bound stops. Soft rows count as hard."""
+    l = jnp.where(jnp.isneginf(bounds.l), -jnp.inf, 0.0)
+    u = jnp.where(jnp.isposinf(bounds.u), jnp.inf, 0.0)
+    length = jnp.linalg.norm(q)
+    along = q / jnp.where(length > 0, length, 1.0)
+    down = -jnp.ones(1, q.dtype)
+    still = jnp.zeros_like(q)
+    cone = Bounds(jnp.concatenate([still, down, l]), jnp.concatenate([still, down, u]))
+    return jnp.concatenate([H, along[None], A]), cone
 
 
 def descent_ray(qp: QP, d: Array, tolerance: Array) -> tuple[Array, Array]:

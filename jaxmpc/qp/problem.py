@@ -1,6 +1,6 @@
 """The quadratic program, its solution, and the residuals that say how good a solution is."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -9,34 +9,8 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import concrete, fail, require_finite, require_shape, require_symmetric_psd
-
-# float32 products on NVIDIA cards drop to 10 bits (TF32) unless told otherwise.
-PRECISION = jax.lax.Precision.HIGHEST
-
-
-def matmul(a: Array, b: Array) -> Array:
-    """Matrix product at full precision of the data's type.
-
-    Vectors stand on the left, x'M: under `vmap` with M unbatched that is one product of the
-    batch (B, n)·(n, m) without a transposition.
-    """
-    return jnp.matmul(a, b, precision=PRECISION)
-
-
-def arrays(tree: Any) -> Any:
-    """Leaves as JAX arrays of the present precision, before they enter `jit`.
-
-    (`jit` mixes up host arrays that it has seen under the other setting of 64-bit mode.)
-    """
-    cast = lambda v: jnp.asarray(v, jax.dtypes.canonicalize_dtype(jnp.result_type(v)))
-    return jax.tree.map(cast, tree)
-
-
-def floating_dtype(tree: Any) -> Any:
-    """The widest floating type among the leaves; JAX's default float where there is none."""
-    types = [leaf.dtype for leaf in jax.tree.leaves(arrays(tree))]
-    floats = [dtype for dtype in types if jnp.issubdtype(dtype, jnp.floating)]
-    return jnp.result_type(*floats) if floats else jnp.result_type(float)
+from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.projection import Bounds
 
 
 @jax.tree_util.register_dataclass
@@ -47,6 +21,15 @@ class QP:
     P (n, n) symmetric positive semidefinite, q (n,), A (m, n), l and u (m,). Entries of l may
     be -inf and of u +inf; l = u is an equality. For a batch that shares matrices keep P and
     A unbatched: `jax.vmap(solve_qp, in_axes=(QP(P=None, q=0, A=None, l=0, u=0),))`.
+
+    Soft rows: where soft_linear (m,) is finite, row i may be violated by d ≥ 0 at the cost
+    soft_linear_i d + ½ soft_quadratic_i d² (an L1 penalty is exact where it exceeds the row's
+    multiplier); inf: a hard row. None: all rows are hard, or with soft_quadratic alone those
+    with weight 0 are. No variables are added.
+
+    Balls: the last sum(balls) rows form blocks of balls[i] rows each, and block i asks
+    |A_b z − l_b| ≤ radius_i, with l_b = u_b its centre. An ellipsoid {x: (x − c)'M(x − c) ≤ r²}
+    is a ball in the rows L'x, M = LL'.
     """
 
     P: Any
@@ -54,6 +37,20 @@ class QP:
     A: Any
     l: Any
     u: Any
+    soft_linear: Any = None
+    soft_quadratic: Any = None
+    radius: Any = None
+    balls: tuple[int, ...] = field(default=(), metadata={"static": True})
+
+    @property
+    def bounds(self) -> Bounds:
+        """What the program asks of Az."""
+        linear, quadratic = self.soft_linear, self.soft_quadratic
+        if linear is None and quadratic is not None:
+            linear = jnp.where(quadratic > 0, 0.0, jnp.inf)
+        if linear is not None and quadratic is None:
+            quadratic = jnp.zeros_like(linear)
+        return Bounds(self.l, self.u, linear, quadratic, self.radius, self.balls)
 
     @classmethod
     def from_qpsolvers(
@@ -102,6 +99,35 @@ class QP:
             if bad.size:
                 i = bad[0]
                 fail("l, u", f"row {i} has l = {l[i]} and u = {u[i]}", "Each row needs l ≤ u")
+        for name in ("soft_linear", "soft_quadratic"):
+            weight = getattr(self, name)
+            if weight is None:
+                continue
+            require_shape(name, weight, (m,), "One weight for each row of A")
+            if concrete(weight) and not np.all(np.asarray(weight) >= 0):
+                fail(name, "holds a negative weight or NaN", "Penalties are ≥ 0; inf is a hard row")
+        if self.soft_quadratic is not None:
+            require_finite("soft_quadratic", self.soft_quadratic)
+        self._validate_balls(m)
+
+    def _validate_balls(self, m: int) -> None:
+        sizes, rows = self.balls, sum(self.balls)
+        if (self.radius is None) != (not sizes):
+            fail("balls, radius", f"{sizes}, {self.radius}", "Give both, or neither")
+        if not sizes:
+            return
+        if min(sizes) < 1 or rows > m:
+            fail("balls", f"{sizes} with {m} rows", "Give counts ≥ 1 of the last rows of A")
+        require_shape("radius", self.radius, (len(sizes),), "One radius for each ball")
+        if concrete(self.radius) and not np.all(np.asarray(self.radius) >= 0):
+            fail("radius", f"{self.radius}", "Radii are ≥ 0")
+        if concrete(self.l, self.u):
+            l, u = np.asarray(self.l)[m - rows :], np.asarray(self.u)[m - rows :]
+            if not np.array_equal(l, u):
+                fail("l, u", "differ in the rows of a ball", "There l = u is the centre")
+        if self.soft_linear is not None and concrete(self.soft_linear):
+            if np.any(np.isfinite(np.asarray(self.soft_linear)[m - rows :])):
+                fail("soft_linear", "is finite in the rows of a ball", "Balls are hard: give inf")
 
 
 @jax.tree_util.register_dataclass
@@ -110,13 +136,15 @@ class QPSolution:
     """A primal-dual pair and what is known about it.
 
     z (n,) primal. y (m,) multipliers: Pz + q + A'y = 0, y > 0 pushes against the upper bound,
-    y < 0 against the lower. Residuals are in the problem's own units (see `residuals`).
+    y < 0 against the lower. cost: ½ z'Pz + q'z plus what soft rows pay; its derivative is that
+    of the optimal value. Residuals are in the problem's own units (see `residuals`).
     certificate (m,): for PRIMAL_INFEASIBLE the Farkas vector, else zeros. ray (n,): for
     DUAL_INFEASIBLE a direction of unbounded descent, else zeros. iterations: ADMM steps run.
     """
 
     z: Array
     y: Array
+    cost: Array
     status: Array
     primal_residual: Array
     dual_residual: Array
@@ -126,25 +154,13 @@ class QPSolution:
     ray: Array
 
 
-def bound_product(y: Array, l: Array, u: Array) -> Array:
-    """Support of the box: max y'v over l ≤ v ≤ u = Σ u y⁺ − l y⁻, with 0·inf = 0."""
-    upper = jnp.where(y > 0, u, 0.0)
-    lower = jnp.where(y < 0, l, 0.0)
-    return jnp.sum(jnp.where(y > 0, y * upper, 0.0) + jnp.where(y < 0, y * lower, 0.0))
-
-
-def admissible(y: Array, l: Array, u: Array) -> Array:
-    """The nearest multiplier of finite support: no push against a bound that is not there."""
-    y = jnp.where(jnp.isposinf(u), jnp.minimum(y, 0.0), y)
-    return jnp.where(jnp.isneginf(l), jnp.maximum(y, 0.0), y)
-
-
 def residuals(qp: QP, z: Array, y: Array) -> tuple[Array, Array, Array]:
     """Primal residual, dual residual and duality gap of (z, y), infinity norms, own units.
 
-    primal = max |Az − clip(Az, l, u)|, dual = max |Pz + q + A'y|,
-    gap = |z'Pz + q'z + Σ u y⁺ − l y⁻|; a y with the wrong sign at an infinite bound gives an
-    infinite gap.
+    primal = max |Az − its projection| over hard constraints, dual = max |Pz + q + A'y|,
+    gap = |z'Pz + q'z + g(Az) + g*(y)| with the penalties g of soft rows and the conjugate
+    g*(y) = Σ u y⁺ − l y⁻ + … (`Bounds.support`). A multiplier that is not admissible (a push
+    against an absent bound) must be made so before.
     """
     primal, dual, gap = (value for value, _ in residual_terms(qp, z, y))
     norm = lambda v: jnp.max(jnp.abs(v), initial=0.0)
@@ -156,17 +172,18 @@ def residual_terms(qp: QP, z: Array, y: Array) -> list[tuple[Array, Array]]:
     entry, of the terms that it is a difference of: rounding is a share of that.
     """
     Az, Pz, Aty = matmul(z, qp.A.T), matmul(z, qp.P), matmul(y, qp.A)
-    support = bound_product(y, qp.l, qp.u)
+    bounds = qp.bounds
     quadratic, linear = jnp.sum(z * Pz), jnp.sum(z * qp.q)
+    penalty, support = bounds.cost(Az), bounds.support(y)
     size_z, size_y = jnp.abs(z), jnp.abs(y)
     return [
-        (Az - jnp.clip(Az, qp.l, qp.u), matmul(size_z, jnp.abs(qp.A).T)),
+        (bounds.violation(Az), matmul(size_z, jnp.abs(qp.A).T)),
         (
             Pz + qp.q + Aty,
             matmul(size_z, jnp.abs(qp.P)) + jnp.abs(qp.q) + matmul(size_y, jnp.abs(qp.A)),
         ),
         (
-            quadratic + linear + support,
-            jnp.abs(quadratic) + jnp.sum(size_z * jnp.abs(qp.q)) + jnp.abs(support),
+            quadratic + linear + penalty + support,
+            jnp.abs(quadratic) + jnp.sum(size_z * jnp.abs(qp.q)) + penalty + jnp.abs(support),
         ),
     ]

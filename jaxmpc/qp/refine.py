@@ -3,111 +3,238 @@
 Both minimise one convex, piecewise quadratic function, the augmented Lagrangian with the
 splitting variable minimised out (Rockafellar 1976; Hermans, Themelis, Patrinos 2019)
 
-    φ(w) = ½ w'Hw + q'w + ½ ρ dist²(A w + y/ρ, [l, u]),
+    φ(w) = ½ w'Hw + q'w + min_p g(p) + ½ρ|A w + y/ρ − p|²
 
-whose gradient with e = A w + y/ρ − clip(A w + y/ρ, l, u) is Hw + q + ρ A'e and whose
-generalised Hessian is H + ρ A_a'A_a over the rows with e ≠ 0. With H = q = y = 0 and ρ = 1 the
-minimum is the distance to feasibility: there e = 0 (a feasible w), or A'e = 0 with e ≠ 0, which
-is a Farkas vector: e'A w is 0 for all w but at least Σ u e⁺ − l e⁻ fails by |e|².
+with g of `projection.py`. Its gradient, with the excess e of v = A w + y/ρ, is Hw + q + ρ A'e,
+its generalised Hessian H + ρ A'DA with D the derivative of the excess. With H = q = y = 0 and
+ρ = 1 the minimum is the distance to feasibility: there e = 0 (a feasible w), or A'e = 0 with
+e ≠ 0, which is a Farkas vector: e'A w is 0 for all w but at least g*(e) fails by |e|².
 """
 
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.scipy.linalg import cho_solve
 
-from jaxmpc.qp.problem import matmul
+from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.projection import Bounds
 
-# Line search: one full step, one long one (the kinks of φ are often crossed), four short ones.
-STEP_LENGTHS = (1.0, 1.9, 0.5, 0.25, 0.1, 0.03)
-# Largest table of row outer products that is kept: above it A_a'A_a is formed for each instance.
+# Steps of the line search, a scalar Newton method.
+LINE_STEPS = 6
+# Largest table of row outer products that is kept: above it A'DA is formed for each instance.
 TABLE_ENTRIES = 4_000_000
 
 
-def gram(A: Array) -> Callable[[Array], Array]:
-    """The function mask (m,) → Σ mask_i a_i a_i', as one product with a shared table if it fits.
+class Constants(NamedTuple):
+    """What the precision decides. rho: first and last penalty of the method of multipliers.
+    sigma: last proximal weight. damping: proximal weight of least distance, little but far above
+    rounding. far: |w| beyond which w has
+    run off along a ray. linear: penalty of the linearised optimality conditions."""
 
-    In a batch that shares A the table turns B small products into one (B, m)·(m, n²).
+    rho: tuple[float, float]
+    sigma: float
+    damping: float
+    far: float
+    linear: float
+
+    @classmethod
+    def of(cls, dtype: Any) -> "Constants":
+        double = jnp.finfo(dtype).eps < 1e-10
+        return cls((1e6, 1e8), 1e-8, 1e-10, 1e10, 1e6) if double else (
+            cls((1e3, 1e4), 1e-4, 1e-5, 1e5, 1e3)
+        )  # fmt: skip
+
+
+def gram(A: Array) -> Callable[[Array, list[Array]], Array]:
+    """The function (weights (m,), normals) → A'(diag(weights) + Σ h h')A.
+
+    In a batch that shares A a table of row outer products, if it fits, turns B small products
+    into one (B, m)·(m, n²).
     """
     m, n = A.shape
-    if m * n * n > TABLE_ENTRIES:
-        return lambda mask: matmul(A.T * mask, A)
-    table = (A[:, :, None] * A[:, None, :]).reshape(m, n * n)
-    return lambda mask: matmul(mask, table).reshape(n, n)
+    kept = m * n * n <= TABLE_ENTRIES
+    table = (A[:, :, None] * A[:, None, :]).reshape(m, n * n) if kept else None
+
+    def product(weights: Array, normals: list[Array]) -> Array:
+        if table is None:
+            K = matmul(A.T * weights, A)
+        else:
+            K = matmul(weights, table).reshape(n, n)
+        for h in normals:
+            a = matmul(h, A)
+            K = K + a[:, None] * a[None, :]
+        return K
+
+    return product
+
+
+def cholesky(K: Array, scale: Any = 0.0) -> Array:
+    """Factor of K + a ridge at rounding level, for directions that nothing in K sees."""
+    n = K.shape[0]
+    ridge = 10 * jnp.finfo(K.dtype).eps * (jnp.trace(K) / n + scale)
+    return jnp.linalg.cholesky(K + ridge * jnp.eye(n, dtype=K.dtype))
+
+
+class Newton(NamedTuple):
+    """What one step gives: w, its excess, the gradient of φ, and whether φ was minimised."""
+
+    w: Array
+    excess: Array
+    gradient: Array
+    minimised: Array
 
 
 def newton_step(
-    w: Array, y: Array, H: Array, q: Array, A: Array, l: Array, u: Array,
-    rho: float, products: Callable[[Array], Array],
-) -> tuple[Array, Array, Array]:  # fmt: skip
-    """One damped Newton step on φ. Returns the new w, its e, and whether φ was minimised.
+    w: Array, y: Array, H: Array, q: Array, A: Array, bounds: Bounds, rho: Array, sigma: Array,
+    products: Callable[[Array, list[Array]], Array],
+) -> Newton:  # fmt: skip
+    """One step on φ + ½σ d'(I − H)d with exact line search.
 
-    φ is quadratic where the set of rows with e ≠ 0 stands still, so a full step that leaves
-    this set as it was has reached the minimum.
+    The proximal term acts where the cost has no curvature (H = I elsewhere in ADMM's
+    coordinates) and keeps linear programs from running off. φ is quadratic where no row changes
+    its piece, so a full step that leaves all pieces as they were has reached the minimum.
     """
-    n = w.shape[0]
-    s = matmul(w, A.T) + y / rho
-    e = s - jnp.clip(s, l, u)
-    active = (e != 0).astype(w.dtype)
+    v = matmul(w, A.T) + y / rho
+    e = bounds.excess(v, rho)
     gradient = matmul(w, H) + q + rho * matmul(e, A)
-    K = H + rho * products(active)
-    # Keeps K definite where active rows and curvature leave a direction free.
-    ridge = 10 * jnp.finfo(w.dtype).eps * (jnp.trace(K) / n + rho)
-    d = -cho_solve((jnp.linalg.cholesky(K + ridge * jnp.eye(n, dtype=w.dtype)), True), gradient)
+    weights, normals = bounds.curvature(v, rho)
+    smooth = H + sigma * (jnp.eye(w.shape[0], dtype=w.dtype) - H)
+    L = cholesky(smooth + rho * products(weights, normals), rho)
+    d = -cho_solve((L, True), gradient)
 
-    # φ along w + t d costs no product with A: three scalars and A d.
-    Ad = matmul(d, A.T)
-    slope, curvature = jnp.sum(d * (matmul(w, H) + q)), jnp.sum(d * matmul(d, H))
+    # φ along w + t d costs no product with A: two scalars and A d.
+    Ad, Hd = matmul(d, A.T), matmul(d, smooth)
+    slope, bend = jnp.sum(d * (matmul(w, H) + q)), jnp.sum(d * Hd)
+    minimised = jnp.all(bounds.piece(v + Ad, rho) == bounds.piece(v, rho))
 
-    def excess(t: Array | float) -> Array:
-        return s + t * Ad - jnp.clip(s + t * Ad, l, u)
+    def search(carry: tuple[Array, Array, Array], _: None) -> tuple[Any, None]:
+        """Newton on the derivative of φ, which grows with t, between what it has bracketed."""
+        t, low, high = carry
+        at = v + t * Ad
+        derivative = slope + t * bend + rho * jnp.sum(bounds.excess(at, rho) * Ad)
+        D, hs = bounds.curvature(at, rho)
+        second = bend + rho * (jnp.sum(D * Ad**2) + sum(jnp.sum(h * Ad) ** 2 for h in hs))
+        low, high = jnp.where(derivative < 0, t, low), jnp.where(derivative < 0, high, t)
+        move = t - derivative / jnp.maximum(second, jnp.finfo(w.dtype).tiny)
+        middle = jnp.where(jnp.isinf(high), 4 * t, (low + high) / 2)
+        inside = (move > low) & (move < high) & (move < 10 * t)
+        return (jnp.where(inside, move, middle), low, high), None
 
-    def value(t: float) -> Array:
-        return t * slope + 0.5 * t * t * curvature + 0.5 * rho * jnp.sum(excess(t) ** 2)
+    one = jnp.ones((), w.dtype)
+    (t, _, _), _ = jax.lax.scan(search, (one, 0 * one, jnp.inf * one), length=LINE_STEPS)
+    t = jnp.where(minimised, 1.0, t)
+    w_new, e_new = w + t * d, bounds.excess(v + t * Ad, rho)
+    if not bounds.balls:
+        # The excess moves linearly within its piece. Adding the move keeps the rounding of a
+        # small e small; ρ will multiply it.
+        e_new = jnp.where(minimised, e + weights * Ad, e_new)
+    return Newton(w_new, e_new, matmul(w_new, H) + q + rho * matmul(e_new, A), minimised)
 
-    # Where the full step keeps the set it is the minimum, whatever rounding makes of the values.
-    minimised = jnp.all(jnp.sign(excess(1.0)) == jnp.sign(e))
-    best = jnp.argmin(jnp.stack([value(t) for t in STEP_LENGTHS]))
-    t = jnp.where(minimised, 1.0, jnp.asarray(STEP_LENGTHS, w.dtype)[best])
-    return w + t * d, excess(t), minimised
 
-
-def least_distance(A: Array, l: Array, u: Array, w: Array, steps: int) -> tuple[Array, Array]:
-    """Minimise ½ dist²(A w, [l, u]) from w; returns w and e = A w − clip(A w, l, u).
+def least_distance(
+    A: Array, bounds: Bounds, w: Array, steps: int, damping: float = 0.0
+) -> tuple[Array, Array]:
+    """Minimise ½ dist²(A w, set) from w; returns w and e = A w − its projection.
 
     e = 0: w satisfies the rows. A'e = 0 with e ≠ 0: no w does, and e is the Farkas vector.
+    damping: weight of a proximal term; a little keeps w still where rows only touch.
     """
-    products = gram(A)
+    products, bounds = gram(A), bounds.hard()
     H, q = jnp.zeros((w.shape[0], w.shape[0]), w.dtype), jnp.zeros_like(w)
-    y = jnp.zeros_like(l)
+    y, one = jnp.zeros_like(bounds.l), jnp.ones((), w.dtype)
+    sigma = damping * one
 
-    def body(carry, _):
-        w, e, _ = newton_step(carry[0], y, H, q, A, l, u, 1.0, products)
-        return (w, e), None
+    def body(carry: tuple[Array, Array], _: None) -> tuple[Any, None]:
+        step = newton_step(carry[0], y, H, q, A, bounds, one, sigma, products)
+        return (step.w, step.excess), None
 
     (w, e), _ = jax.lax.scan(body, (w, y), length=steps)
     return w, e
 
 
+class Polish(NamedTuple):
+    """w, y; `change`: the last change of y, on an infeasible program nearly a Farkas vector;
+    `move`: the last change of w, on an unbounded one nearly a ray."""
+
+    w: Array
+    y: Array
+    change: Array
+    move: Array
+
+
 def polish(
-    H: Array, q: Array, A: Array, l: Array, u: Array, w: Array, y: Array, steps: int
-) -> tuple[Array, Array, Array]:
-    """Method of multipliers on (w, y) from ADMM's answer: a Newton step each time, and the
-    multiplier update y = ρ e each time φ is minimised; linear convergence with factor ~1/ρ.
+    H: Array, q: Array, A: Array, bounds: Bounds, w: Array, y: Array, steps: int
+) -> Polish:  # fmt: skip
+    """Proximal method of multipliers on (w, y) from ADMM's answer, a Newton step each time.
 
-    Returns w, y and the last change of y, which on an infeasible program tends to a Farkas
-    vector.
+    Whenever φ is minimised the multipliers become ρ e; ρ grows tenfold if the violation has not
+    fallen tenfold, and σ falls a hundredfold. "Minimised" is exact (`newton_step`), or the
+    gradient is below a tolerance that falls tenfold each time: where many rows only touch, the
+    pieces never come to rest.
     """
-    products = gram(A)
-    rho = 1e4 if w.dtype == jnp.float64 else 1e2
+    products, constants = gram(A), Constants.of(w.dtype)
+    (first, last), least = constants.rho, constants.sigma
+    scalar = lambda v: jnp.asarray(v, w.dtype)
+    size = lambda v: jnp.max(jnp.abs(v), initial=0.0)
 
-    def body(carry, _):
-        w, y, change = carry
-        w, e, minimised = newton_step(w, y, H, q, A, l, u, rho, products)
-        change = jnp.where(minimised, rho * e - y, change)
-        return (w, jnp.where(minimised, rho * e, y), change), None
+    def body(carry: tuple[Array, ...], _: None) -> tuple[Any, None]:
+        w, y, change, _, rho, sigma, before, tolerance = carry
+        step = newton_step(w, y, H, q, A, bounds, rho, sigma, products)
+        terms = size(q) + size(step.w) + rho * size(step.excess)
+        noise = 10 * jnp.finfo(w.dtype).eps * terms
+        done = step.minimised | (size(step.gradient) <= jnp.maximum(tolerance, noise))
+        new = jnp.where(done, rho * step.excess, y)
+        violation = size(new - y) / rho
+        grow = done & (violation > 0.1 * before)
+        far = size(step.w) > constants.far
+        carry = (
+            jnp.where(far, w, step.w), new, jnp.where(done, new - y, change), step.w - w,
+            jnp.where(grow, jnp.minimum(10 * rho, last), rho),
+            jnp.where(done, jnp.maximum(sigma / 100, least), sigma),
+            jnp.where(done, violation, before),
+            jnp.where(done, tolerance / 10, tolerance),
+        )  # fmt: skip
+        return carry, None
 
-    (w, y, change), _ = jax.lax.scan(body, (w, y, jnp.zeros_like(y)), length=steps)
-    return w, y, change
+    tolerance = 0.1 * (size(q) + size(y))
+    zeros = (jnp.zeros_like(y), jnp.zeros_like(w))
+    start = (w, y, *zeros, scalar(first), scalar(1.0), scalar(jnp.inf), tolerance)
+    (w, y, change, move, *_), _ = jax.lax.scan(body, start, length=steps)
+    return Polish(w, y, change, move)
+
+
+def linearised(
+    H: Array, A: Array, weights: Array, normals: list[Array], rho: float
+) -> Callable[[Array, Array], tuple[Array, Array]]:
+    """Solver of the optimality conditions with the pieces of g held fixed.
+
+    The conditions Hw + q + A'y = 0 and excess(Aw + y/ρ) = y/ρ, moved by a (n,) and c (m,), move
+    their solution by
+
+        H dw + A'dy = −a,        dy/ρ = D (A dw + dy/ρ) + c,        D = diag(weights) + Σ h h'.
+
+    The function returned maps (a, c) to (dw, dy); it is linear. D is singular or not: eliminating
+    dy by the method of multipliers needs only the definite K = H + σ(I − H) + ρ A'DA, and three
+    sweeps leave an error (1 + ρ s²)⁻³ for active rows with least singular value s. Where active
+    rows contradict each other, dw tends to their least-squares solution and dy stays bounded by
+    3ρ times the contradiction.
+    """
+    identity = jnp.eye(H.shape[0], dtype=H.dtype)
+    sigma = Constants.of(H.dtype).sigma
+    K = H + sigma * (identity - H) + rho * gram(A)(weights, normals)
+    L = cholesky(K, rho)
+    D = lambda v: weights * v + sum(h * jnp.sum(h * v) for h in normals)
+
+    def solve(a: Array, c: Array) -> tuple[Array, Array]:
+        dw, dy = jnp.zeros_like(a), jnp.zeros_like(c)
+        for _ in range(3):
+            rows = D(matmul(dw, A.T) + dy / rho) + c - dy / rho
+            gradient = a + matmul(dw, H) + matmul(dy, A)
+            step = -cho_solve((L, True), gradient + rho * matmul(rows, A))
+            dw, dy = dw + step, dy + rho * (D(matmul(step, A.T)) + rows)
+        return dw, dy
+
+    return solve

@@ -1,5 +1,6 @@
-"""solve_qp: loop, polish and honest status joined."""
+"""solve_qp: loop, polish, honest status and derivative joined."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -9,29 +10,27 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
-from jaxmpc.qp.admm import ADMM, Factor, factor, iterate, read
-from jaxmpc.qp.certificate import descent_ray, farkas
-from jaxmpc.qp.problem import (
-    QP,
-    QPSolution,
-    admissible,
-    arrays,
-    floating_dtype,
-    matmul,
-    residual_terms,
-    residuals,
-)
-from jaxmpc.qp.refine import polish
+from jaxmpc.qp.admm import ADMM, Factor, factor, iterate, read, scaled
+from jaxmpc.qp.certificate import descent_ray, farkas, recession, sharpen
+from jaxmpc.qp.derivative import activity, implicit
+from jaxmpc.qp.precision import arrays, floating_dtype, in_float64, matmul
+from jaxmpc.qp.problem import QP, QPSolution, residual_terms, residuals
+from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.refine import Constants, least_distance, linearised, polish
 from jaxmpc.qp.status import Status
 
 
 def solve_qp(qp: QP, solver: ADMM = ADMM(), warm_start: Any = None) -> QPSolution:  # noqa: B008
     """Minimise ½ z'Pz + q'z subject to l ≤ Az ≤ u by a fixed number of ADMM steps and a polish.
 
-    One instance; `jax.vmap` for many. Where P and A are not batched they are factored once.
+    One instance; `jax.vmap` for many. Where P and A are not batched they are factored once;
+    where they are, each instance has its own factor. Soft rows and balls: see `QP`.
     warm_start: a (z, y) pair or an earlier QPSolution. The status comes from residuals in the
-    units of `qp` (see `ADMM.eps`) or from a certificate (`certificate.py`). Differentiable by
-    unrolling. Raises ValueError for bad shapes and, where values can be read, bad values.
+    units of `qp` (see `ADMM.eps`), computed in float64 even for float32 data, or from a
+    certificate (`certificate.py`). z, y and cost are differentiable with respect to every array
+    of `qp`, forward and reverse, for every status (`derivative.py`); an instance with NON_FINITE
+    data has derivative zero. Raises ValueError for bad shapes and, where values can be read, bad
+    values.
     """
     qp.validate()
     solver.validate(np.shape(qp.A)[0])
@@ -40,28 +39,72 @@ def solve_qp(qp: QP, solver: ADMM = ADMM(), warm_start: Any = None) -> QPSolutio
 
 @jax.jit
 def _solve(qp: QP, solver: ADMM, warm_start: Any) -> QPSolution:
-    return solve_factored(qp, factor(qp.P, qp.A, solver), solver, warm_start)
+    usable = finite_matrices(qp)
+    return solve_factored(qp, factor(usable.P, usable.A, solver, qp.balls), solver, warm_start)
 
 
 def as_arrays(qp: QP) -> QP:
-    """The same program with all fields in one floating type: the widest among them."""
+    """The same program with all fields in one floating type, the widest among them, and P made
+    exactly symmetric."""
     dtype = floating_dtype(qp)
-    return QP(*(jnp.asarray(v, dtype) for v in (qp.P, qp.q, qp.A, qp.l, qp.u)))
+    qp = jax.tree.map(lambda v: jnp.asarray(v, dtype), qp, is_leaf=lambda v: isinstance(v, list))
+    return replace(qp, P=(qp.P + qp.P.T) / 2)
 
 
 def solve_factored(qp: QP, factor: Factor, solver: ADMM, warm_start: Any = None) -> QPSolution:
     """`solve_qp` after its factorization: what a controller repeats at each sample."""
     clean, finite = cleaned(qp)
-    q, l, u = scaled(factor, clean)
-    t = jnp.zeros_like(l) if warm_start is None else start(factor, clean, l, u, warm_start)
-    t, previous = iterate(factor, q, l, u, t, solver.iterations, solver.alpha)
-    (w, y), (w_old, y_old) = read(factor, t, q, l, u), read(factor, previous, q, l, u)
-    pairs, proofs = [(w, y)], [y - y_old, y]
-    if solver.refine:
-        w_new, y_new, change = polish(factor.H, q, factor.A, l, u, w, y, solver.refine)
-        pairs, proofs = [(w_new, y_new), *pairs], [*proofs, change]
-    solution = assess(clean, factor, pairs, proofs, [w - w_old, w], solver)
+    if solver.differentiate == "implicit":
+        constants = jax.lax.stop_gradient((clean, factor, solver, warm_start))
+        found = search(*constants)
+        z, y = implicit(clean, constants[1], solver.smoothing, found.z, found.y)
+    else:
+        found = search(clean, factor, solver, warm_start)
+        z, y = found.z, found.y
+    solution = replace(found, z=z, y=y, cost=value(clean, z, y))
     return marked(solution, finite)
+
+
+def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any) -> QPSolution:
+    """Loop, polish, correction, proofs."""
+    q, bounds = scaled(factor, qp)
+    t = jnp.zeros_like(qp.l)
+    if warm_start is not None:
+        t = start(factor, qp, bounds, warm_start)
+    t, previous = iterate(factor, q, bounds, t, solver.iterations, solver.alpha)
+    (w, y), (w_old, y_old) = read(factor, t, q, bounds), read(factor, previous, q, bounds)
+    z, y_z = unscaled(qp, factor, w, y)
+    proofs, directions = [y - y_old, y], [w - w_old, w]
+    if solver.refine:
+        end = polish(factor.H, q, factor.A, bounds, w, y, solver.refine)
+        z, y_z = corrected(qp, factor, *best(qp, unscaled(qp, factor, end.w, end.y), (z, y_z)))
+        # Each step waits for the one before: jaxlib 0.10 can hang on two factorizations at once.
+        w, _ = jax.lax.optimization_barrier((end.w, z))
+        steps = max(solver.refine // 5, 1)
+        _, e = least_distance(factor.A, bounds, w, steps, Constants.of(w.dtype).damping)
+        proofs += [end.change, sharpen(factor.A, e)]
+        move, _ = jax.lax.optimization_barrier((end.move, e))
+        directions += [move, ray(factor, q, bounds, move, steps)]
+    return assess(qp, factor, (z, y_z), proofs, directions, solver)
+
+
+def ray(factor: Factor, q: Array, bounds: Bounds, d: Array, steps: int) -> Array:
+    """A direction of unbounded descent, searched from d, if P is singular."""
+    rows, cone = recession(q, factor.H, factor.A, bounds)
+    length = jnp.linalg.norm(d)
+    d = d / jnp.where(length > 0, length, 1.0)
+    damping = Constants.of(d.dtype).damping
+    seek = lambda d: least_distance(rows, cone, d, 2 * steps, damping)[0]
+    return jax.lax.cond(factor.flat, seek, lambda d: d, d)
+
+
+def finite_matrices(qp: QP) -> QP:
+    """The program with harmless P and A where its own hold NaN or infinity."""
+    finite = lambda v: jnp.all(jnp.isfinite(v))
+    identity = jnp.eye(qp.P.shape[0], dtype=qp.P.dtype)
+    return replace(
+        qp, P=jnp.where(finite(qp.P), qp.P, identity), A=jnp.where(finite(qp.A), qp.A, 0.0)
+    )
 
 
 def cleaned(qp: QP) -> tuple[QP, Array]:
@@ -76,69 +119,141 @@ def cleaned(qp: QP) -> tuple[QP, Array]:
         & jnp.all(qp.l <= qp.u)
         & ~jnp.any(jnp.isposinf(qp.l) | jnp.isneginf(qp.u))
     )
-    return replace(
-        qp, q=jnp.where(finite, qp.q, 0.0), l=jnp.where(finite, qp.l, -jnp.inf),
-        u=jnp.where(finite, qp.u, jnp.inf),
-    ), finite  # fmt: skip
+    # The rows of a ball have l = u = its centre, and a free centre is no centre.
+    ball = jnp.arange(qp.l.shape[0]) >= qp.l.shape[0] - sum(qp.balls)
+    finite = finite & jnp.all(~ball | (jnp.isfinite(qp.l) & (qp.l == qp.u)))
+    harmless: dict[str, Any] = {
+        "q": 0.0,
+        "l": jnp.where(ball, 0.0, -jnp.inf),
+        "u": jnp.where(ball, 0.0, jnp.inf),
+    }
+    if qp.soft_linear is not None:
+        finite = finite & jnp.all(qp.soft_linear >= 0)
+        harmless["soft_linear"] = jnp.inf
+    if qp.soft_quadratic is not None:
+        finite = finite & jnp.all((qp.soft_quadratic >= 0) & jnp.isfinite(qp.soft_quadratic))
+        harmless["soft_quadratic"] = 0.0
+    if qp.radius is not None:
+        finite = finite & jnp.all(qp.radius >= 0)
+        harmless["radius"] = 1.0
+    fields: dict[str, Any] = {
+        name: jnp.where(finite, getattr(qp, name), v) for name, v in harmless.items()
+    }
+    return replace(finite_matrices(qp), **fields), finite
 
 
-def scaled(factor: Factor, qp: QP) -> tuple[Array, Array, Array]:
-    """q, l, u in ADMM's coordinates. A zero row (scale 0) is free there; `assess` checks it."""
-    E, zero = factor.E, factor.E == 0
-
-    def bound(v: Array, free: float) -> Array:
-        # E·inf would give NaN gradients with respect to P and A, which E depends on.
-        keep = jnp.isfinite(v) & ~zero
-        return jnp.where(zero, free, jnp.where(keep, E * jnp.where(keep, v, 0.0), v))
-
-    return matmul(qp.q, factor.T), bound(qp.l, -jnp.inf), bound(qp.u, jnp.inf)
-
-
-def start(factor: Factor, qp: QP, l: Array, u: Array, warm_start: Any) -> Array:
+def start(factor: Factor, qp: QP, bounds: Bounds, warm_start: Any) -> Array:
     """t = s + v of a warm start (z, y), a pair or a solution; what is not finite counts as 0."""
     z, y = (warm_start.z, warm_start.y) if hasattr(warm_start, "z") else warm_start
     for name, value, like in (("z", z, qp.q), ("y", y, qp.l)):
         if jnp.shape(value) != like.shape:
             fail(f"warm_start {name}", f"shape {jnp.shape(value)}", f"Needed: {like.shape}")
     clean = lambda v: jnp.nan_to_num(jnp.asarray(v, qp.q.dtype), posinf=0.0, neginf=0.0)
+    E, rho = factor.E, factor.rho[0]
+    v = jnp.where(E == 0, 0.0, clean(y) / jnp.where(E == 0, 1.0, E)) / rho
+    # Soft rows may stay outside their interval: s is what prox leaves of s + v.
+    return bounds.project(E * matmul(clean(z), qp.A.T) + v, rho) + v
+
+
+def unscaled(qp: QP, factor: Factor, w: Array, y: Array) -> tuple[Array, Array]:
+    """z and an admissible y in the units of `qp`."""
+    return matmul(w, factor.T.T), qp.bounds.admissible(factor.E * y)
+
+
+def best(qp: QP, *pairs: tuple[Array, Array]) -> tuple[Array, Array]:
+    """The pair (z, y) with the least residuals; the first where none is finite."""
+    z, y = pairs[0]
+    for z_other, y_other in pairs[1:]:
+        better = worst(qp, z_other, y_other) < worst(qp, z, y)  # False for NaN
+        z, y = jnp.where(better, z_other, z), jnp.where(better, y_other, y)
+    return z, y
+
+
+def corrected(qp: QP, factor: Factor, z: Array, y: Array) -> tuple[Array, Array]:
+    """Iterative refinement: (z, y) moved twice by their residuals, which are computed in float64
+    from the data as given, with the active rows held fixed; kept only where residuals fall."""
+    rho, E = Constants.of(z.dtype).linear, factor.E
+    v, y_w = scaled_rows(qp, factor, z, y)
+    weights, normals = activity(scaled(factor, qp)[1], v, y_w, 0.0, rho)
+    solve = linearised(factor.H, factor.A, weights, normals, rho)
+
+    def conditions(qp: QP, factor: Factor, z: Array, y: Array) -> tuple[Array, Array]:
+        v, y_w = scaled_rows(qp, factor, z, y)
+        dual = matmul(matmul(z, qp.P) + qp.q + matmul(y, qp.A), factor.T)
+        return dual, scaled(factor, qp)[1].excess(v + y_w / rho, rho) - y_w / rho
+
+    for _ in range(2):
+        dw, dy = solve(*precisely(conditions, qp, factor, z, y))
+        moved = z + matmul(dw, factor.T.T), qp.bounds.admissible(y + E * dy)
+        z, y = best(qp, (z, y), moved)
+    return z, y
+
+
+def scaled_rows(qp: QP, factor: Factor, z: Array, y: Array) -> tuple[Array, Array]:
+    """Az and y in ADMM's coordinates."""
     E = factor.E
-    v = jnp.where(E == 0, 0.0, clean(y) / jnp.where(E == 0, 1.0, E)) / factor.rho[0]
-    return jnp.clip(E * matmul(clean(z), qp.A.T), l, u) + v
+    return E * matmul(z, qp.A.T), jnp.where(E > 0, y / jnp.where(E > 0, E, 1.0), 0.0)
+
+
+def precisely(function: Callable, qp: QP, *arguments: Any) -> Any:
+    """function(qp, …) in float64, also for float32 data."""
+    wide = qp.q.dtype == jnp.float64
+    return (function if wide else in_float64(function))(qp, *arguments)
+
+
+def worst(qp: QP, z: Array, y: Array) -> Array:
+    """Largest residual, each relative to the size of its terms: what refinement must lower."""
+    norm = lambda v: jnp.max(jnp.abs(v), initial=0.0)
+
+    def relative(qp: QP, z: Array, y: Array) -> Array:
+        terms = residual_terms(qp, z, y)
+        return jnp.max(jnp.stack([norm(value) / (1 + norm(size)) for value, size in terms]))
+
+    return precisely(relative, qp, z, y)
+
+
+def value(qp: QP, z: Array, y: Array) -> Array:
+    """The cost at z, with the derivative of the optimal value: that of the Lagrangian
+    ½ z'Pz + q'z + y'Az − g*(y) at (z, y) (envelope theorem)."""
+    own = 0.5 * jnp.sum(z * matmul(z, qp.P)) + jnp.sum(qp.q * z)
+    Az = matmul(z, qp.A.T)
+    lagrangian = own + jnp.sum(y * Az) - qp.bounds.support(y)
+    fixed = jax.lax.stop_gradient
+    return fixed(own + qp.bounds.cost(Az)) + (lagrangian - fixed(lagrangian))
 
 
 def assess(
-    qp: QP, factor: Factor, pairs: list[tuple[Array, Array]], proofs: list[Array],
+    qp: QP, factor: Factor, pair: tuple[Array, Array], proofs: list[Array],
     directions: list[Array], solver: ADMM,
 ) -> QPSolution:  # fmt: skip
-    """The best of the scaled pairs (w, y), judged in the units of `qp`.
+    """The pair (z, y) judged in the units of `qp`, in float64.
 
     proofs: scaled candidates for a Farkas vector. directions: scaled candidates for a ray.
     """
-    dtype, E = qp.q.dtype, factor.E
-    unscaled = [(matmul(w, factor.T.T), admissible(E * y, qp.l, qp.u)) for w, y in pairs]
-    z, y = unscaled[0]
-    for z_other, y_other in unscaled[1:]:
-        better = worst(qp, z, y) < worst(qp, z_other, y_other)  # False for NaN
-        z, y = jnp.where(better, z, z_other), jnp.where(better, y, y_other)
+    (z, y), dtype, E = pair, qp.q.dtype, factor.E
+    single = dtype != jnp.float64
+    eps = (1e-3 if single else 1e-6) if solver.eps is None else solver.eps
+    floor = (4 if single else 100) * float(jnp.finfo(dtype).eps)
 
-    eps = (1e-6 if dtype == jnp.float64 else 1e-3) if solver.eps is None else solver.eps
-    eps, floor = jnp.asarray(eps, dtype), 100 * jnp.finfo(dtype).eps
-    solved = jnp.asarray(True)
-    for value, size in residual_terms(qp, z, y):
-        solved = solved & jnp.all(jnp.abs(value) <= eps + floor * size)
-    primal, dual, gap = residuals(qp, z, y)
+    def measure(qp: QP, z: Array, y: Array, eps: Array) -> tuple[Array, ...]:
+        solved = jnp.asarray(True)
+        for value, size in residual_terms(qp, z, y):
+            solved = solved & jnp.all(jnp.abs(value) <= eps + floor * size)
+        return (solved, *residuals(qp, z, y))
+
+    solved, primal, dual, gap = precisely(measure, qp, z, y, jnp.asarray(eps, dtype))
     # Rows that z cannot move prove emptiness by themselves.
-    fixed = jnp.where(E == 0, -jnp.clip(jnp.zeros(()), qp.l, qp.u), 0.0)
+    fixed = jnp.where(E == 0, qp.bounds.violation(jnp.zeros_like(y)), 0.0)
     certificate, infeasible = farkas(qp, fixed)
     for candidate in proofs:
         other, proved = farkas(qp, E * candidate)
         certificate = jnp.where(infeasible, certificate, other)
         infeasible = infeasible | proved
-    ray, unbounded = jnp.zeros_like(z), jnp.asarray(False)
+    found, unbounded = jnp.zeros_like(z), jnp.asarray(False)
     for direction in directions:
         tolerance = jnp.sqrt(jnp.finfo(dtype).eps)
         other, proved = descent_ray(qp, matmul(direction, factor.T.T), tolerance)
-        ray, unbounded = jnp.where(unbounded, ray, other), unbounded | proved
+        found, unbounded = jnp.where(unbounded, found, other), unbounded | proved
 
     # Rows that contradict each other by less than eps are both solved and proved empty: say solved.
     infeasible = infeasible & ~solved
@@ -149,9 +264,10 @@ def assess(
         Status.ITERATION_LIMIT,
     )
     return QPSolution(
-        z=z, y=y, status=status.astype(jnp.int32), primal_residual=primal, dual_residual=dual,
-        gap=gap, iterations=jnp.asarray(solver.iterations, jnp.int32),
-        certificate=jnp.where(infeasible, certificate, 0.0), ray=jnp.where(unbounded, ray, 0.0),
+        z=z, y=y, cost=jnp.zeros((), dtype), status=status.astype(jnp.int32),
+        primal_residual=primal, dual_residual=dual, gap=gap,
+        iterations=jnp.asarray(solver.iterations, jnp.int32),
+        certificate=jnp.where(infeasible, certificate, 0.0), ray=jnp.where(unbounded, found, 0.0),
     )  # fmt: skip
 
 
@@ -160,14 +276,7 @@ def marked(solution: QPSolution, finite: Array) -> QPSolution:
     nan = lambda v: jnp.where(finite, v, jnp.nan)
     s = solution
     return replace(
-        s, z=nan(s.z), y=nan(s.y), primal_residual=nan(s.primal_residual),
+        s, z=nan(s.z), y=nan(s.y), cost=nan(s.cost), primal_residual=nan(s.primal_residual),
         dual_residual=nan(s.dual_residual), gap=nan(s.gap),
         status=jnp.where(finite, s.status, jnp.int32(Status.NON_FINITE)),
     )  # fmt: skip
-
-
-def worst(qp: QP, z: Array, y: Array) -> Array:
-    """Largest residual, each relative to the size of its terms: what refinement must lower."""
-    norm = lambda v: jnp.max(jnp.abs(v), initial=0.0)
-    relative = [norm(value) / (1 + norm(size)) for value, size in residual_terms(qp, z, y)]
-    return jnp.max(jnp.stack(relative))

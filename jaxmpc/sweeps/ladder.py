@@ -19,7 +19,8 @@ from scipy.optimize import linprog
 
 from jaxmpc.mpc.condense import condense, in_float64
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.qp.problem import matmul
+from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.refine import least_distance
 from jaxmpc.sweeps import proofs
 from jaxmpc.sweeps.compiled import Compiled
@@ -220,7 +221,8 @@ def newton_rung(steps: int) -> Compiled:
             # The nearest feasible w lies on a face, where a roll-out has no margin for its
             # rounding: aim a little inside. Cuts are judged on the true bounds all the same.
             inset = jnp.minimum(INSET * (1 + jnp.fmin(jnp.abs(l), jnp.abs(u))), (u - l) / 4)
-            w, e = least_distance(U, l + inset, u - inset, w.astype(jnp.float64), steps)
+            inner = Bounds(l + inset, u - inset)
+            w, e = least_distance(U, inner, w.astype(jnp.float64), steps)
             return judge(p, rows, theta, w, [e]), w
 
         return jax.vmap(one)(points, w)

@@ -19,10 +19,10 @@ from jaxmpc.checks import fail
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import Controller
-from jaxmpc.qp.admm import ADMM, Factor, iterate, read
+from jaxmpc.qp.admm import ADMM, Factor, iterate, read, scaled
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.refine import polish
-from jaxmpc.qp.solve import assess, cleaned, marked, scaled
+from jaxmpc.qp.solve import assess, cleaned, marked, unscaled
 from jaxmpc.qp.status import Status
 from jaxmpc.sweeps.compiled import Compiled, default_chunk, gather_size, padded, require_step_type
 
@@ -105,13 +105,15 @@ def first_rung(dtype: Any) -> Compiled:
     def rung(controller: Controller, x: Array) -> tuple[Array, ...]:
         solver, f = controller.solver, controller.factor
         assert f is not None
-        short = jax.tree.map(lambda v: v.astype(dtype), f)
+        cast = lambda tree: jax.tree.map(lambda v: v.astype(dtype), tree)
+        short = cast(f)
 
         def one(x0: Array) -> tuple[Array, ...]:
             qp, finite = program(controller, x0)
-            q, l, u = (v.astype(dtype) for v in scaled(f, qp))
-            t, before = iterate(short, q, l, u, jnp.zeros_like(l), solver.iterations, solver.alpha)
-            (w, y), (_, y_old) = read(short, t, q, l, u), read(short, before, q, l, u)
+            q, bounds = cast(scaled(f, qp))
+            t = jnp.zeros_like(bounds.l)
+            t, before = iterate(short, q, bounds, t, solver.iterations, solver.alpha)
+            (w, y), (_, y_old) = read(short, t, q, bounds), read(short, before, q, bounds)
             w, y, change = (v.astype(x0.dtype) for v in (w, y, y - y_old))
             return finish(controller, f, x0, qp, finite, w, y, [change], 1)
 
@@ -147,11 +149,10 @@ def finish(
     """Polish, judge, and lay out: inputs, cost, status, three residuals, and (w, y) to go on."""
     c = controller.condensed
     assert c is not None
-    q, l, u = scaled(f, qp)
-    w, y, change = polish(f.H, q, f.A, l, u, w, y, steps)
-    s: QPSolution = marked(
-        assess(qp, f, [(w, y)], [*proofs, change], [], controller.solver), finite
-    )
+    q, bounds = scaled(f, qp)
+    end = polish(f.H, q, f.A, bounds, w, y, steps)
+    pair, proofs = unscaled(qp, f, end.w, end.y), [*proofs, end.change]
+    s: QPSolution = marked(assess(qp, f, pair, proofs, [], controller.solver), finite)
     states, inputs = c.trajectory(x0, s.z)
     cost = controller.cost(states, inputs)
-    return inputs, cost, s.status, s.primal_residual, s.dual_residual, s.gap, w, y
+    return inputs, cost, s.status, s.primal_residual, s.dual_residual, s.gap, end.w, end.y

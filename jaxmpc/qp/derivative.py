@@ -1,0 +1,92 @@
+"""Derivatives of the solution map (P, q, A, l, u, …) → (z, y), by the implicit function theorem.
+
+At a solution the conditions Pz + q + A'y = 0 and excess(Az + y/ρ) = y/ρ hold for every ρ > 0
+(`projection.py`). With the pieces of the excess held fixed they are smooth, and a change of the
+data moves (z, y) by one linear system, which `refine.linearised` solves in ADMM's coordinates.
+JAX transposes that for reverse mode and differentiates it again for higher orders.
+
+Which element of the generalised derivative is taken, and what it means where none exists:
+
+* A row counts as active where it has a multiplier: Az + y lies beyond its bound. A row that only
+  touches, y = 0, counts as inactive.
+* Smoothing μ > 0 replaces the 0 or 1 of "active" by k/(ρ + k), k = Σ μ/s² over both sides, with
+  the slacks s = (τ + √(τ² + 4μ))/2, τ = slack − multiplier, of the central path (Chen, Harker,
+  Kanzow, Smale): the stiffness of a log barrier. Equalities, soft rows and balls stay as they are.
+* Where active rows depend on each other, the least-squares answer (see `linearised`).
+* A row that is violated although its multiplier pushes (the program is infeasible, or not yet
+  solved) counts as the spring with stiffness k = y/violation that holds (z, y) in balance. For
+  an infeasible program the polish of `refine.py` ends at the point that violates the rows
+  least, with stiff springs: the derivative is that of the closest feasible program
+  (Bambade et al. 2024, QPLayer), up to about 1/k.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxmpc.qp.admm import Factor, scaled
+from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.problem import QP
+from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.refine import Constants, linearised
+
+
+@jax.custom_jvp
+def implicit(qp: QP, factor: Factor, smoothing: Any, z: Array, y: Array) -> tuple[Array, Array]:
+    """The solution (z, y) of qp, given as constants, with its derivatives with respect to qp."""
+    return z, y
+
+
+@implicit.defjvp
+def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple:
+    qp, factor, smoothing, z, y = primals
+    # As a result of this function, z and y carry the derivatives that higher orders need.
+    z, y = implicit(qp, factor, smoothing, z, y)
+    T, E = factor.T, factor.E
+    A = E[:, None] * matmul(qp.A, T)
+    H = matmul(T.T, matmul(qp.P, T))
+    rho = Constants.of(z.dtype).linear
+    y_w = jnp.where(E > 0, y / jnp.where(E > 0, E, 1.0), 0.0)
+
+    def conditions(qp: QP) -> tuple[Array, Array]:
+        _, bounds = scaled(factor, qp)
+        v = E * matmul(z, qp.A.T) + y_w / rho
+        return matmul(matmul(z, qp.P) + qp.q + matmul(y, qp.A), T), bounds.excess(v, rho)
+
+    _, moved = jax.jvp(conditions, (qp,), (tangents[0],))
+    _, bounds = scaled(factor, qp)
+    weights, normals = activity(bounds, E * matmul(z, qp.A.T), y_w, smoothing, rho)
+    dw, dy = linearised(H, A, weights, normals, rho)(*moved)
+    return (z, y), (matmul(dw, T.T), E * dy)
+
+
+def activity(
+    bounds: Bounds, v: Array, y: Array, smoothing: Any, rho: float
+) -> tuple[Array, list[Array]]:
+    """Derivative D of the excess at v + y/ρ, v = Az, as weights in [0, 1] and normals, with the
+    choices made at the top of this file."""
+    tiny = jnp.sqrt(jnp.finfo(v.dtype).eps) * 0.1
+    # Multipliers at rounding level are none.
+    noise = tiny**1.5 * (1 + jnp.max(jnp.abs(y), initial=0.0))
+    weights, normals = bounds.curvature(v + jnp.where(jnp.abs(y) > noise, y, 0.0) / rho, rho)
+    out = jax.lax.stop_gradient(bounds.violation(v))
+    held = y * out > 0
+    spring = held & (jnp.abs(out) > tiny * (1 + jnp.abs(v)))
+    k = jnp.where(spring, y / jnp.where(spring, out, 1.0), 0.0)
+    weights = jnp.where(spring, weights * jax.lax.stop_gradient(k / (rho + k)), weights)
+
+    smoothing = jnp.asarray(smoothing, v.dtype)
+    mu = jnp.where(smoothing > 0, smoothing, 1.0)
+    stiffness = jnp.zeros_like(v)
+    for slack, push in ((bounds.u - v, jnp.maximum(y, 0)), (v - bounds.l, jnp.maximum(-y, 0))):
+        finite = jnp.isfinite(slack)
+        tau = jnp.where(finite, slack - push, 1.0)
+        s = (jnp.abs(tau) + jnp.sqrt(tau**2 + 4 * mu)) / 2
+        s = jnp.where(tau > 0, s, mu / s)  # the product of both roots is μ
+        stiffness = stiffness + jnp.where(finite, mu / s**2, 0.0)
+    rounded = (smoothing > 0) & (bounds.l < bounds.u) & ~spring
+    if bounds.linear is not None:
+        rounded = rounded & jnp.isinf(bounds.linear)
+    return jnp.where(rounded, stiffness / (rho + stiffness), weights), normals

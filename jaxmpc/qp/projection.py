@@ -1,0 +1,152 @@
+"""What a QP asks of v = Az: intervals, hard or soft, and balls; and the projection onto them.
+
+The constraints are one convex function g(v), a sum over rows and balls:
+
+    hard row   0 if l ≤ v ≤ u, else ∞
+    soft row   c d + ½ k d²,  d = dist(v, [l, u])        (L1 weight c, quadratic weight k)
+    ball       0 if |v_b − centre| ≤ radius, else ∞       (v_b: the rows of the ball)
+
+ADMM and the Newton method need of it only the proximal map p = argmin_p g(p) + ½ρ|p − v|²,
+here through the excess e = v − p, which is closed: zero inside; the whole distance s to the set
+for a hard row or a ball; for a soft row s as long as ρ s ≤ c, and beyond that s − d with
+d = (ρ s − c)/(ρ + k). ρ e is a subgradient of g at p: the multiplier.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Bounds:
+    """The function g above. l, u (m,): intervals; in the rows of a ball l = u is its centre.
+
+    linear, quadratic (m,): weights c and k of soft rows, c = inf for a hard row; None: all are
+    hard. balls: number of rows of each ball; these are the last rows. radius (len(balls),).
+    """
+
+    l: Any
+    u: Any
+    linear: Any = None
+    quadratic: Any = None
+    radius: Any = None
+    balls: tuple[int, ...] = field(default=(), metadata={"static": True})
+
+    def blocks(self) -> list[tuple[slice, Array]]:
+        """Rows and radius of each ball."""
+        first = self.l.shape[0] - sum(self.balls)
+        ends = [first + sum(self.balls[: i + 1]) for i in range(len(self.balls))]
+        sizes = zip(self.balls, ends, strict=True)
+        return [(slice(end - k, end), self.radius[i]) for i, (k, end) in enumerate(sizes)]
+
+    def excess(self, v: Array, rho: Any) -> Array:
+        """e = v − prox(v) with penalty rho, a number or (m,)."""
+        s = v - jnp.clip(v, self.l, self.u)
+        if self.linear is not None:
+            s = s - jnp.sign(s) * self._yield(s, rho)
+        for rows, radius in self.blocks():
+            s = s.at[rows].multiply(1 - self._shrink(s[rows], radius))
+        return s
+
+    def project(self, v: Array, rho: Any) -> Array:
+        """prox(v) = v − excess."""
+        plain = self.linear is None and not self.balls
+        return jnp.clip(v, self.l, self.u) if plain else v - self.excess(v, rho)
+
+    def cost(self, p: Array) -> Array:
+        """The penalty that soft rows pay at p; hard rows and balls cost nothing here."""
+        if self.linear is None:
+            return jnp.zeros((), p.dtype)
+        soft = jnp.isfinite(self.linear)
+        d = jnp.where(soft, jnp.abs(p - jnp.clip(p, self.l, self.u)), 0.0)
+        return jnp.sum(d * (jnp.where(soft, self.linear, 0.0) + 0.5 * self.quadratic * d))
+
+    def violation(self, v: Array) -> Array:
+        """v minus its projection where a constraint is hard; 0 in soft rows."""
+        return self.hard().excess(v, 1.0)
+
+    def curvature(self, v: Array, rho: Any) -> tuple[Array, list[Array]]:
+        """The derivative of the excess at v (one element of it at a kink): diag(weights) plus
+        h h' for each h of the list, both (m,)."""
+        s = v - jnp.clip(v, self.l, self.u)
+        weights = (s != 0).astype(v.dtype)
+        if self.linear is not None:
+            beyond = self._yield(s, rho) > 0
+            weights = jnp.where(beyond, self.quadratic / (rho + self.quadratic), weights)
+        normals = []
+        for rows, radius in self.blocks():
+            # In the ball's own directions the excess turns, along its normal it grows.
+            shrink, length = self._shrink(s[rows], radius), self._length(s[rows])
+            outside = (length > radius).astype(v.dtype)
+            weights = weights.at[rows].set(outside * (1 - shrink))
+            normal = jnp.sqrt(outside * shrink) * s[rows] / jnp.where(length > 0, length, 1.0)
+            normals.append(jnp.zeros_like(v).at[rows].set(normal))
+        return weights, normals
+
+    def piece(self, v: Array, rho: Any) -> Array:
+        """Which formula of the excess holds in each row: 0 inside, ±1 at a bound, ±2 beyond."""
+        s = v - jnp.clip(v, self.l, self.u)
+        if self.linear is None and not self.balls:
+            return jnp.sign(s)
+        count = jnp.ones_like(s)
+        if self.linear is not None:
+            count = count + (self._yield(s, rho) > 0)
+        piece = jnp.sign(s) * count
+        for rows, radius in self.blocks():
+            piece = piece.at[rows].set((self._length(s[rows]) > radius).astype(v.dtype))
+        return piece
+
+    def support(self, y: Array) -> Array:
+        """The conjugate g*(y) = max over v of y'v − g(v); inf where y is not admissible.
+
+        Σ u y⁺ − l y⁻, with 0·inf = 0, plus (|y| − c)²/2k for soft rows with |y| > c, plus
+        radius·|y_b| for balls.
+        """
+        value = jnp.sum(jnp.where(y > 0, y * jnp.where(y > 0, self.u, 0.0), 0.0))
+        value = value + jnp.sum(jnp.where(y < 0, y * jnp.where(y < 0, self.l, 0.0), 0.0))
+        if self.linear is not None:
+            over = jnp.maximum(jnp.abs(y) - self.linear, 0.0)
+            k = jnp.where(self.quadratic > 0, self.quadratic, 1.0)
+            infinite = (over > 0) & (self.quadratic == 0)
+            value = value + jnp.sum(jnp.where(infinite, jnp.inf, over**2 / (2 * k)))
+        for rows, radius in self.blocks():
+            value = value + radius * self._length(y[rows])
+        return value
+
+    def admissible(self, y: Array) -> Array:
+        """The nearest y of finite conjugate: no push against a bound that is not there, and none
+        beyond the weight of an L1 penalty."""
+        y = jnp.where(jnp.isposinf(self.u), jnp.minimum(y, 0.0), y)
+        y = jnp.where(jnp.isneginf(self.l), jnp.maximum(y, 0.0), y)
+        if self.linear is not None:
+            limit = jnp.where(self.quadratic > 0, jnp.inf, self.linear)
+            y = jnp.clip(y, -limit, limit)
+        return y
+
+    def hard(self) -> "Bounds":
+        """The constraints alone: soft rows become free."""
+        if self.linear is None:
+            return self
+        soft = jnp.isfinite(self.linear)
+        l, u = jnp.where(soft, -jnp.inf, self.l), jnp.where(soft, jnp.inf, self.u)
+        return replace(self, l=l, u=u, linear=None, quadratic=None)
+
+    def _yield(self, s: Array, rho: Any) -> Array:
+        """d ≥ 0: how far prox(v) stays outside a soft row, s = signed distance of v."""
+        over = jnp.abs(s) - self.linear / rho
+        return jnp.where(over > 0, rho / (rho + self.quadratic) * jnp.where(over > 0, over, 0), 0)
+
+    def _length(self, v: Array) -> Array:
+        """|v|, with derivative 0 at v = 0."""
+        squared = jnp.sum(v**2)
+        return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+
+    def _shrink(self, s: Array, radius: Array) -> Array:
+        """Factor that projects s onto the ball: radius/|s| outside, 1 inside."""
+        length = self._length(s)
+        outside = length > radius
+        return jnp.where(outside, radius / jnp.where(outside, length, 1.0), 1.0)
