@@ -16,7 +16,7 @@ from jax.scipy.linalg import cho_solve
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.refine import cholesky
+from jaxmpc.qp.refine import cholesky, gram
 
 
 def farkas(qp: QP, y: Array) -> tuple[Array, Array]:
@@ -70,7 +70,7 @@ def sharpen(A: Array, y: Array) -> Array:
     least = 0.01 * jnp.sqrt(jnp.finfo(y.dtype).eps)
     support = jnp.abs(y) > least * jnp.max(jnp.abs(y), initial=0.0)
     y = jnp.where(support, y, 0.0)
-    L = cholesky(matmul(A.T * support, A), 1.0)
+    L = cholesky(gram(A)(support.astype(y.dtype), []), 1.0)
     for _ in range(2):
         y = y - support * matmul(cho_solve((L, True), matmul(y, A)), A.T)
     return y

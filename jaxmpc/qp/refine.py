@@ -43,7 +43,7 @@ class Constants(NamedTuple):
     @classmethod
     def of(cls, dtype: Any) -> "Constants":
         double = jnp.finfo(dtype).eps < 1e-10
-        return cls((1e6, 1e8), 1e-8, 1e-10, 1e10, 1e6) if double else (
+        return cls((1e4, 1e8), 1e-8, 1e-10, 1e10, 1e6) if double else (
             cls((1e3, 1e4), 1e-4, 1e-5, 1e5, 1e3)
         )  # fmt: skip
 
@@ -124,8 +124,9 @@ def newton_step(
         return (jnp.where(inside, move, middle), low, high), None
 
     one = jnp.ones((), w.dtype)
-    (t, _, _), _ = jax.lax.scan(search, (one, 0 * one, jnp.inf * one), length=LINE_STEPS)
-    t = jnp.where(minimised, 1.0, t)
+    (t, low, high), _ = jax.lax.scan(search, (one, 0 * one, jnp.inf * one), length=LINE_STEPS)
+    # Where no t was found too long, the last try is none to rely on.
+    t = jnp.where(minimised, 1.0, jnp.where(jnp.isinf(high), low, t))
     w_new, e_new = w + t * d, bounds.excess(v + t * Ad, rho)
     if not bounds.balls:
         # The excess moves linearly within its piece. Adding the move keeps the rounding of a
