@@ -11,6 +11,7 @@ from jaxmpc.mpc.problem import Plan as Plan
 from jaxmpc.mpc.solve import Controller as Controller
 from jaxmpc.mpc.solve import solve as solve
 from jaxmpc.qp.admm import ADMM as ADMM
+from jaxmpc.qp.margin import feasibility_margin as feasibility_margin
 from jaxmpc.qp.problem import QP as QP
 from jaxmpc.qp.problem import QPSolution as QPSolution
 from jaxmpc.qp.solve import solve_qp as solve_qp

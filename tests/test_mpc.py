@@ -413,12 +413,35 @@ class TestController:
         mpc = problems.joint_o_inf(horizon=10)
         x = np.array([0.35, -0.5])
         fine = jm.Controller(mpc, FINE)
-        _, carry, _ = fine(x)
         few = jm.Controller(mpc, jm.ADMM(iterations=5, refine=0))
-        cold, warm = few(x)[2], few(x, carry)[2]
+        plan = fine.plan(x)
+        cold, warm = few.plan(x), few.plan(x, warm_start=plan)
         assert warm.status == jm.Status.SOLVED != cold.status
-        again = few.plan(x, warm_start=fine.plan(x))
+        again = few.plan(x, warm_start=plan.qp)
         np.testing.assert_allclose(again.inputs, warm.inputs, atol=1e-9)
+
+    @pytest.mark.parametrize("prestabilise", [False, True])
+    def test_shifted_plan_is_the_solution_one_sample_later(self, prestabilise):
+        """With the DARE's terminal cost and inactive limits the optimal plan extends by LQR."""
+        mpc = replace(problems.joint(horizon=10), prestabilise=prestabilise)
+        x = np.array([0.02, -0.01])
+        plan = jm.Controller(mpc, FINE).plan(x)
+        x = mpc.system.A @ x + mpc.system.B @ plan.inputs[0]
+        controller = jm.Controller(mpc, jm.ADMM(iterations=0, refine=0))
+        start = controller.shifted(plan)
+        inputs = controller.condensed.trajectory(x, start[0])[1]
+        np.testing.assert_allclose(inputs, jm.solve(mpc, x, solver=FINE).inputs, atol=1e-7)
+
+    def test_shifted_multipliers_move_up(self):
+        mpc = problems.joint(horizon=6)
+        controller = jm.Controller(mpc, FINE)
+        plan = controller.plan(np.array([-1.4, 1.7]))
+        before, after = plan.multipliers, controller.multipliers(controller.shifted(plan)[1])
+        assert np.abs(before.states).max() > 1  # limits are active
+        np.testing.assert_array_equal(after.states[:-1], before.states[1:])
+        np.testing.assert_array_equal(after.states[-1], before.terminal)
+        np.testing.assert_array_equal(after.inputs[:-1], before.inputs[1:])
+        np.testing.assert_array_equal(after.inputs[-1], 0)
 
     def test_same_as_solve_and_under_scan(self):
         mpc = problems.lecture()

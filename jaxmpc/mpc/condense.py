@@ -32,7 +32,8 @@ class Condensed:
 
     Phi (N+1, n, n), Gamma (N+1, n, N·m), phi (N+1, n): predicted states. Psi (N, m, n),
     Omega (N, m, N·m), psi (N, m): predicted inputs. P (N·m, N·m), F (N·m, n): cost. C, D, d,
-    lower, upper: rows. Q, P_N: weights, for references. first_step: first k with state rows.
+    lower, upper: rows. Q, R, P_N: weights. K (m, n): prestabilising gain. K_N (m, n): gain of the
+    unconstrained input of one more step, u_N = K_N x_N. first_step: first k with state rows.
     """
 
     Phi: Array
@@ -52,6 +53,8 @@ class Condensed:
     Q: Array
     R: Array
     P_N: Array
+    K: Array
+    K_N: Array
     first_step: int = field(metadata={"static": True})
 
     def qp(self, x0: Array, reference: Array | None = None) -> QP:
@@ -142,6 +145,10 @@ def _condense(mpc: MPC) -> Condensed:
     )
     P = form(Gamma, Omega)
 
+    # argmin over u of u'Ru + (Ax + Bu)'P(Ax + Bu).
+    BtP = matmul(B.T, P_N)
+    K_N = -jnp.linalg.solve(R + matmul(BtP, B), matmul(BtP, A))
+
     first = 0 if mpc.constrain_initial else 1
     blocks = [(Omega, Psi, psi, rows_of(mpc.inputs, m, dtype))]
     blocks.append((Gamma[first:N], Phi[first:N], phi[first:N], rows_of(mpc.states, n, dtype)))
@@ -152,7 +159,7 @@ def _condense(mpc: MPC) -> Condensed:
     )
     return Condensed(
         Phi, Gamma, phi, Psi, Omega, psi, (P + P.T) / 2, form(Phi, Psi), form(phi, psi),
-        C, D, d, lower, upper, Q, R, P_N, first,
+        C, D, d, lower, upper, Q, R, P_N, K, K_N, first,
     )  # fmt: skip
 
 

@@ -14,7 +14,6 @@ from jaxmpc.mpc.problem import MPC, Multipliers, Plan
 from jaxmpc.qp.admm import ADMM, Factor
 from jaxmpc.qp.admm import factor as factorise
 from jaxmpc.qp.precision import arrays, matmul
-from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.solve import solve_factored
 
 
@@ -37,10 +36,11 @@ class Controller:
     """An MPC law whose matrices are condensed and factored once, at construction.
 
     `controller(x, carry) -> (u, carry, plan)`: u (m,) is the first input of the plan, clipped
-    into its limits; carry is None at the start and the previous plan's solution afterwards (warm
-    start). When the plan is not SOLVED, u is still the first input of the best iterate: look at
-    plan.status. `condensed` and `factor` are filled in at construction: for another problem or
-    solver make another Controller, `dataclasses.replace` would keep the old ones.
+    into its limits; carry is None at the start and the previous plan afterwards, whose `shifted`
+    form is the warm start. When the plan is not SOLVED, u is still the first input of the best
+    iterate: look at plan.status. `condensed` and `factor` are filled in at construction: for
+    another problem or solver make another Controller, `dataclasses.replace` would keep the old
+    ones.
     """
 
     mpc: MPC
@@ -60,14 +60,38 @@ class Controller:
             object.__setattr__(self, "condensed", condensed)
             object.__setattr__(self, "factor", _factor(condensed, self.solver))
 
-    def __call__(self, x: Any, carry: Any = None) -> tuple[Array, QPSolution, Plan]:
+    def __call__(self, x: Any, carry: Plan | None = None) -> tuple[Array, Plan, Plan]:
         """First input from state x (n,), what to carry to the next sample, and the whole plan."""
-        plan = self.plan(x, warm_start=carry)
-        u = plan.inputs[0]
-        if self.mpc.inputs is not None:  # an actuator takes no rounding beyond its limit
-            lower, upper = arrays((self.mpc.inputs.lower, self.mpc.inputs.upper))
-            u = jnp.clip(u, jnp.asarray(lower, u.dtype), jnp.asarray(upper, u.dtype))
-        return u, plan.qp, plan
+        plan = self.plan(x, warm_start=None if carry is None else self.shifted(carry))
+        u = self._limited(plan.inputs[0])
+        return u, plan, plan
+
+    def shifted(self, plan: Plan) -> tuple[Array, Array]:
+        """The plan seen one sample later, as a warm start (z, y).
+
+        Inputs and multipliers move up by one step. The new last input is the unconstrained
+        optimum of that step for the terminal cost, inside its limits; its rows push with nothing.
+        What bounded x_N through the terminal set bounds it as a state from now on, where both
+        have the same rows.
+        """
+        c = self.condensed
+        assert c is not None
+        u = matmul(c.K_N, plan.states[-1])
+        u = self._limited(u)
+        v = (u - matmul(c.K, plan.states[-1]))[None]
+        z = jnp.concatenate([plan.qp.z.reshape(-1, v.shape[1])[1:], v])
+        y = plan.multipliers
+        same = y.terminal.shape[0] == y.states.shape[1]
+        last = y.terminal[None] if same else jnp.zeros_like(y.states[-1:])
+        blocks = (y.inputs[1:], jnp.zeros_like(y.inputs[:1]), y.states[1:], last[: len(y.states)])
+        return z.ravel(), jnp.concatenate([*(b.ravel() for b in blocks), y.terminal])
+
+    def _limited(self, u: Array) -> Array:
+        """u inside the input limits: an actuator takes no rounding beyond them."""
+        if self.mpc.inputs is None:
+            return u
+        lower, upper = arrays((self.mpc.inputs.lower, self.mpc.inputs.upper))
+        return jnp.clip(u, jnp.asarray(lower, u.dtype), jnp.asarray(upper, u.dtype))
 
     def plan(self, x0: Any, reference: Any = None, warm_start: Any = None) -> Plan:
         """Plan from x0 (n,); arguments as in `solve`."""

@@ -182,7 +182,7 @@ def polish(
     size = lambda v: jnp.max(jnp.abs(v), initial=0.0)
 
     def body(carry: tuple[Array, ...], _: None) -> tuple[Any, None]:
-        w, y, change, _, rho, sigma, before, tolerance = carry
+        w, y, change, _move, rho, sigma, before, tolerance = carry
         step = newton_step(w, y, H, q, A, bounds, rho, sigma, products)
         terms = size(q) + size(step.w) + rho * size(step.excess)
         noise = 10 * jnp.finfo(w.dtype).eps * terms
@@ -230,12 +230,13 @@ def linearised(
     D = lambda v: weights * v + sum(h * jnp.sum(h * v) for h in normals)
 
     def solve(a: Array, c: Array) -> tuple[Array, Array]:
-        dw, dy = jnp.zeros_like(a), jnp.zeros_like(c)
-        for _ in range(3):
+        def sweep(carry: tuple[Array, Array], _: None) -> tuple[Any, None]:
+            dw, dy = carry
             rows = D(matmul(dw, A.T) + dy / rho) + c - dy / rho
             gradient = a + matmul(dw, H) + matmul(dy, A)
             step = -cho_solve((L, True), gradient + rho * matmul(rows, A))
-            dw, dy = dw + step, dy + rho * (D(matmul(step, A.T)) + rows)
-        return dw, dy
+            return (dw + step, dy + rho * (D(matmul(step, A.T)) + rows)), None
+
+        return jax.lax.scan(sweep, (jnp.zeros_like(a), jnp.zeros_like(c)), length=3)[0]
 
     return solve

@@ -182,11 +182,13 @@ def corrected(qp: QP, factor: Factor, z: Array, y: Array) -> tuple[Array, Array]
         dual = matmul(matmul(z, qp.P) + qp.q + matmul(y, qp.A), factor.T)
         return dual, scaled(factor, qp)[1].excess(v + y_w / rho, rho) - y_w / rho
 
-    for _ in range(2):
+    def move(pair: tuple[Array, Array], _: None) -> tuple[Any, None]:
+        z, y = pair
         dw, dy = solve(*precisely(conditions, qp, factor, z, y))
         moved = z + matmul(dw, factor.T.T), qp.bounds.admissible(y + E * dy)
-        z, y = best(qp, (z, y), moved)
-    return z, y
+        return best(qp, pair, moved), None
+
+    return jax.lax.scan(move, (z, y), length=2)[0]
 
 
 def scaled_rows(qp: QP, factor: Factor, z: Array, y: Array) -> tuple[Array, Array]:
@@ -244,16 +246,11 @@ def assess(
     solved, primal, dual, gap = precisely(measure, qp, z, y, jnp.asarray(eps, dtype))
     # Rows that z cannot move prove emptiness by themselves.
     fixed = jnp.where(E == 0, qp.bounds.violation(jnp.zeros_like(y)), 0.0)
-    certificate, infeasible = farkas(qp, fixed)
-    for candidate in proofs:
-        other, proved = farkas(qp, E * candidate)
-        certificate = jnp.where(infeasible, certificate, other)
-        infeasible = infeasible | proved
-    found, unbounded = jnp.zeros_like(z), jnp.asarray(False)
-    for direction in directions:
-        tolerance = jnp.sqrt(jnp.finfo(dtype).eps)
-        other, proved = descent_ray(qp, matmul(direction, factor.T.T), tolerance)
-        found, unbounded = jnp.where(unbounded, found, other), unbounded | proved
+    candidates = jnp.stack([fixed, *(E * y for y in proofs)])
+    certificate, infeasible = first(*jax.vmap(lambda y: farkas(qp, y))(candidates))
+    tolerance = jnp.sqrt(jnp.finfo(dtype).eps)
+    candidates = matmul(jnp.stack(directions), factor.T.T)
+    found, unbounded = first(*jax.vmap(lambda d: descent_ray(qp, d, tolerance))(candidates))
 
     # Rows that contradict each other by less than eps are both solved and proved empty: say solved.
     infeasible = infeasible & ~solved
@@ -269,6 +266,11 @@ def assess(
         iterations=jnp.asarray(solver.iterations, jnp.int32),
         certificate=jnp.where(infeasible, certificate, 0.0), ray=jnp.where(unbounded, found, 0.0),
     )  # fmt: skip
+
+
+def first(vectors: Array, proved: Array) -> tuple[Array, Array]:
+    """The first vector that is proved, and whether there is one."""
+    return vectors[jnp.argmax(proved)], jnp.any(proved)
 
 
 def marked(solution: QPSolution, finite: Array) -> QPSolution:
