@@ -3,12 +3,13 @@
     python experiments/qp_derivatives.py
 
 Part "agreement": random families with known answers (`qp_families.py`), as many as have all
-multipliers of active rows and all slacks of others above 1e-2 (slacks in rows of length one).
+multipliers of active rows and all slacks of others above 1e-2 (in rows of length one), the active
+rows independent.
 Each field moves along a random direction in proportion to its entries; "bounds" moves l and u
 alike, equalities included. dz and dy along it are compared with central differences at two step
 widths; where those differ from each other by more than 1e-6 of their size, or where a program is
 not SOLVED, the differences decide nothing ("decided" is the share that is left). within: share of
-the decided whose dz (dy) is within 1e-5 of its largest entry.
+the decided whose dz (dy) is within 1e-5 of its largest entry, or of 1e-3 of z's where that is more.
 
 Part "time": QPs of a robot joint's MPC that share P and A; median of the repeats, the functions
 taking turns, compilation apart. backward is (forward and gradient) less forward.
@@ -54,15 +55,18 @@ class Settings:
 
 
 def regular(instance: Instance) -> bool:
-    """Whether each row is clearly active or clearly not."""
+    """Whether each row is clearly active or clearly not, and the active ones are independent."""
     qp, z, y = instance.qp, instance.z, instance.y
     length = np.maximum(np.linalg.norm(qp.A, axis=1), 1e-300)
     slack = np.minimum(qp.u - qp.A @ z, qp.A @ z - qp.l) / length
-    return bool(np.all((np.abs(y) * length > 1e-2) | (slack > 1e-2)))
+    pushed = np.abs(y) * length > 1e-2
+    active = (qp.A / length[:, None])[pushed]
+    independent = np.linalg.matrix_rank(active, 1e-10) == len(active) if len(active) else True
+    return bool(np.all(pushed | (slack > 1e-2)) and independent)
 
 
 def direction(qp: jm.QP, field: str, rng: np.random.Generator) -> jm.QP:
-    """A random change of one field in proportion to its entries."""
+    """A random change of one field in proportion to its entries; P stays semidefinite."""
     still = jax.tree.map(np.zeros_like, qp)
     finite = lambda v: np.where(np.isfinite(v), v, 0.0)
     if field == "bounds":
@@ -72,8 +76,9 @@ def direction(qp: jm.QP, field: str, rng: np.random.Generator) -> jm.QP:
         )
     value = getattr(qp, field)
     d = rng.standard_normal(value.shape) * finite(value)
-    if field == "P":
-        d = (d + d.T) / 2
+    if field == "P":  # (I + hS)P(I + hS) to first order
+        S = rng.standard_normal(len(value))
+        d = value * (S[:, None] + S)
     return replace(still, **{field: d * (qp.l < qp.u) if field in "lu" else d})
 
 
@@ -109,7 +114,7 @@ def agreement(s: Settings) -> None:
             stack = lambda trees: jax.tree.map(lambda *v: np.stack(v), *trees)
             batch = stack(filled)
             d = stack([direction(qp, field, rng) for qp in filled])
-            _, exact, status = evaluate(batch, d)
+            at, exact, status = evaluate(batch, d)
             solved, numeric = [np.asarray(status) == jm.Status.SOLVED], []
             for h in (STEP, 2 * STEP):
                 sides = []
@@ -123,7 +128,7 @@ def agreement(s: Settings) -> None:
             columns = []
             for k in range(2):
                 fine, coarse, got = numeric[0][k], numeric[1][k], np.asarray(exact[k])
-                scale = size(fine) + 1e-12
+                scale = np.maximum(size(fine), 1e-3 * size(np.asarray(at[k]))) + 1e-12
                 decided = np.all(solved, axis=0) & (size(fine - coarse) <= 1e-6 * scale)
                 columns.append((decided[:count], (size(got - fine) / scale)[:count]))
             (decided, error), (decided_y, error_y) = columns
@@ -163,7 +168,7 @@ def joint(count: int, seed: int) -> tuple[jm.QP, Any]:
 def medians(
     functions: dict[str, Callable], arguments: tuple, repeats: int
 ) -> dict[str, np.ndarray]:
-    """Seconds of each, median and least, taking turns; compiled before, with the time of that printed."""
+    """Seconds of each, median and least, taking turns; the first call, which compiles, apart."""
     times: dict[str, list[float]] = {name: [] for name in functions}
     for name, function in functions.items():
         begun = time.perf_counter()

@@ -41,7 +41,7 @@ def outputs(qp: jm.QP, solver: jm.ADMM) -> tuple:
 
 
 @cache
-def program(iterations: int = 100, refine: int = 20, differentiate: str = "implicit"):
+def program(iterations: int = 200, refine: int = 30, differentiate: str = "implicit"):
     """(qp, d, ct, smoothing) → outputs, status, J d, J'ct for BATCH programs of one shape."""
 
     @jax.jit
@@ -158,7 +158,7 @@ class TestEveryField:
         "first", [0, *(pytest.param(32 * i, marks=pytest.mark.slow) for i in range(1, 9))]
     )
     def test_central_differences(self, x64, first):
-        h, cases = 1e-5, [(first + seed, name) for seed in range(32) for name in DIRECTIONS]
+        h, cases = 1e-4, [(first + seed, name) for seed in range(32) for name in DIRECTIONS]
         programs = [everything(seed) for seed, _ in cases]
         qps = [qp for qp, _, _ in programs]
         ds = [direction(qp, name, seed) for qp, (seed, name) in zip(qps, cases, strict=True)]
@@ -169,18 +169,20 @@ class TestEveryField:
         np.testing.assert_allclose(at[0], np.stack([z for _, z, _ in programs]), atol=1e-8)
         np.testing.assert_allclose(at[1], np.stack([y for _, _, y in programs]), atol=1e-7)
         sides = []
-        for side in (h, -h):
+        for side in (h, -h, 2 * h, -2 * h):
             values, status, _, _ = evaluate(
                 [moved(qp, d, side) for qp, d in zip(qps, ds, strict=True)], ds
             )
             np.testing.assert_array_equal(status, jm.Status.SOLVED)
             sides.append(values)
+        # Differences of fourth order, so that h is large enough for the rounding of z.
+        central = lambda a, b, c, d: (8 * (a - b) - (c - d)) / (12 * h)
+        numeric = jax.tree.map(central, *sides)
         for i, case in enumerate(cases):
-            for name, a, plus, minus in zip(("z", "y", "cost"), exact, *sides, strict=True):
-                numeric = (plus[i] - minus[i]) / (2 * h)
-                tolerance = 1e-5 * (1e-2 + np.abs(numeric).max())
+            for name, a, b in zip(("z", "y", "cost"), exact, numeric, strict=True):
+                tolerance = 1e-5 * (1e-2 + np.abs(b[i]).max())
                 note = f"d {name}, seed and field {case}"
-                np.testing.assert_allclose(a[i], numeric, rtol=0, atol=tolerance, err_msg=note)
+                np.testing.assert_allclose(a[i], b[i], rtol=0, atol=tolerance, err_msg=note)
             # <ct, J d> = <J'ct, d>
             left, right = inner(ct, item(exact, i)), inner(item(gradient, i), ds[i])
             np.testing.assert_allclose(right, left, rtol=1e-8, atol=1e-8, err_msg=str(case))
@@ -595,7 +597,7 @@ class TestFiniteForEveryStatus:
 
     @pytest.mark.slow
     @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-    @pytest.mark.parametrize("steps", [(100, 20), (20, 0), (3, 0)])
+    @pytest.mark.parametrize("steps", [(200, 30), (20, 0), (3, 0)])
     def test_ten_thousand(self, dtype, steps):
         with enable_x64(dtype == np.float64):
             for first in range(BATCH, 10_000, BATCH):

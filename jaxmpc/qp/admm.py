@@ -48,8 +48,9 @@ class ADMM:
     a number, one value a row (m,), or a schedule (stages, m) or (stages, 1) whose stages share
     the iterations equally; 1 suits these coordinates whatever the problem's units.
     alpha: over-relaxation in (0, 2).
-    refine: Newton steps after the loop (`refine.py`), accepted only where they help; 10 serve
-    MPC, 60 solve whatever comes (linear programs, singular or ill-conditioned P).
+    refine: Newton steps after the loop (`refine.py`), accepted only where they help. 20 serve
+    MPC and well-conditioned programs, 60 solve whatever comes (linear programs, P singular or of
+    condition 1e8, nearly parallel rows).
     eps: tolerance of status SOLVED on primal residual, dual residual and gap, absolute, plus
     a rounding floor, a multiple of machine epsilon·(size of the terms): 100 in float64, 4 in
     float32. None: 1e-6 in float64, 1e-3 in float32.
@@ -62,7 +63,7 @@ class ADMM:
     iterations: int = field(default=100, metadata={"static": True})
     rho: Any = 1.0
     alpha: Any = 1.6
-    refine: int = field(default=10, metadata={"static": True})
+    refine: int = field(default=20, metadata={"static": True})
     eps: Any = None
     differentiate: str = field(default="implicit", metadata={"static": True})
     smoothing: Any = 0.0
@@ -201,7 +202,9 @@ def scaled(factor: Factor, qp: QP) -> tuple[Array, Bounds]:
     bounds = replace(bounds, l=bound(qp.l, -jnp.inf), u=bound(qp.u, jnp.inf))
     E = jnp.where(zero, 1.0, E)
     if bounds.linear is not None:
-        bounds = replace(bounds, linear=bounds.linear / E, quadratic=bounds.quadratic / E**2)
+        soft = jnp.isfinite(bounds.linear)
+        linear = jnp.where(soft, jnp.where(soft, bounds.linear, 0.0) / E, jnp.inf)
+        bounds = replace(bounds, linear=linear, quadratic=bounds.quadratic / E**2)
     for i, (rows, radius) in enumerate(bounds.blocks()):
         centre = jnp.where(zero[rows], 0.0, E[rows] * qp.l[rows])
         radius = jnp.where(zero[rows][0], jnp.inf, E[rows][0] * radius)

@@ -7,8 +7,9 @@ JAX transposes that for reverse mode and differentiates it again for higher orde
 
 Which element of the generalised derivative is taken, and what it means where none exists:
 
-* A row counts as active where it has a multiplier: Az + y lies beyond its bound. A row that only
-  touches, y = 0, counts as inactive.
+* A hard row counts as active where it has a multiplier. One that only touches, y = 0, counts as
+  inactive. An equality is always active; its multiplier's sign says which of l, u it follows (each
+  by half where y = 0).
 * Smoothing μ > 0 replaces the 0 or 1 of "active" by k/(ρ + k), k = Σ μ/s² over both sides, with
   the slacks s = (τ + √(τ² + 4μ))/2, τ = slack − multiplier, of the central path (Chen, Harker,
   Kanzow, Smale): the stiffness of a log barrier. Equalities, soft rows and balls stay as they are.
@@ -50,43 +51,62 @@ def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple:
     rho = Constants.of(z.dtype).linear
     y_w = jnp.where(E > 0, y / jnp.where(E > 0, E, 1.0), 0.0)
 
+    v = E * matmul(z, qp.A.T)
+    _, bounds = scaled(factor, qp)
+    upper, lower, kept = activity(bounds, v, y_w, smoothing, rho)
+
     def conditions(qp: QP) -> tuple[Array, Array]:
         _, bounds = scaled(factor, qp)
-        v = E * matmul(z, qp.A.T) + y_w / rho
-        return matmul(matmul(z, qp.P) + qp.q + matmul(y, qp.A), T), bounds.excess(v, rho)
+        v = E * matmul(z, qp.A.T)
+        sides = upper * (v - bounds.u) + lower * (v - bounds.l)
+        rows = jnp.where(kept, bounds.excess(v + y_w / rho, rho), sides)
+        return matmul(matmul(z, qp.P) + qp.q + matmul(y, qp.A), T), rows
 
     _, moved = jax.jvp(conditions, (qp,), (tangents[0],))
-    _, bounds = scaled(factor, qp)
-    weights, normals = activity(bounds, E * matmul(z, qp.A.T), y_w, smoothing, rho)
+    weights, normals = bounds.curvature(v + y_w / rho, rho)
+    weights = jnp.where(kept, weights, upper + lower)
     dw, dy = linearised(H, A, weights, normals, rho)(*moved)
     return (z, y), (matmul(dw, T.T), E * dy)
 
 
 def activity(
     bounds: Bounds, v: Array, y: Array, smoothing: Any, rho: float
-) -> tuple[Array, list[Array]]:
-    """Derivative D of the excess at v + y/ρ, v = Az, as weights in [0, 1] and normals, with the
-    choices made at the top of this file."""
-    tiny = jnp.sqrt(jnp.finfo(v.dtype).eps) * 0.1
+) -> tuple[Array, Array, Array]:
+    """How far each hard row counts as active, with the choices made at the top of this file:
+    weights in [0, 1] of its upper and its lower bound. And the other rows (soft ones, balls),
+    which keep the excess as it is."""
+    precision = jnp.finfo(v.dtype).eps
+    kept = jnp.arange(v.shape[0]) >= v.shape[0] - sum(bounds.balls)
+    if bounds.linear is not None:
+        kept = kept | jnp.isfinite(bounds.linear)
+
     # Multipliers at rounding level are none.
-    noise = tiny**1.5 * (1 + jnp.max(jnp.abs(y), initial=0.0))
-    weights, normals = bounds.curvature(v + jnp.where(jnp.abs(y) > noise, y, 0.0) / rho, rho)
+    pushes = jnp.abs(y) > precision**0.75 * (1 + jnp.max(jnp.abs(y), initial=0.0))
     out = jax.lax.stop_gradient(bounds.violation(v))
-    held = y * out > 0
-    spring = held & (jnp.abs(out) > tiny * (1 + jnp.abs(v)))
-    k = jnp.where(spring, y / jnp.where(spring, out, 1.0), 0.0)
-    weights = jnp.where(spring, weights * jax.lax.stop_gradient(k / (rho + k)), weights)
+    spring = (y * out > 0) & (jnp.abs(out) > 0.1 * jnp.sqrt(precision) * (1 + jnp.abs(v)))
+    k = jax.lax.stop_gradient(jnp.where(spring, y / jnp.where(spring, out, 1.0), 0.0))
+    active = jnp.where(spring, k / (rho + k), 1.0)
+    upper = jnp.where(pushes & (y > 0), active, 0.0)
+    lower = jnp.where(pushes & (y < 0), active, 0.0)
+    equal = bounds.l == bounds.u
+    upper, lower = (jnp.where(equal & ~pushes, 0.5, side) for side in (upper, lower))
 
     smoothing = jnp.asarray(smoothing, v.dtype)
     mu = jnp.where(smoothing > 0, smoothing, 1.0)
-    stiffness = jnp.zeros_like(v)
-    for slack, push in ((bounds.u - v, jnp.maximum(y, 0)), (v - bounds.l, jnp.maximum(-y, 0))):
+
+    def stiffness(slack: Array, push: Array) -> Array:
         finite = jnp.isfinite(slack)
         tau = jnp.where(finite, slack - push, 1.0)
         s = (jnp.abs(tau) + jnp.sqrt(tau**2 + 4 * mu)) / 2
         s = jnp.where(tau > 0, s, mu / s)  # the product of both roots is μ
-        stiffness = stiffness + jnp.where(finite, mu / s**2, 0.0)
-    rounded = (smoothing > 0) & (bounds.l < bounds.u) & ~spring
-    if bounds.linear is not None:
-        rounded = rounded & jnp.isinf(bounds.linear)
-    return jnp.where(rounded, stiffness / (rho + stiffness), weights), normals
+        return jnp.where(finite, mu / s**2, 0.0)
+
+    above = stiffness(bounds.u - v, jnp.maximum(y, 0.0))
+    below = stiffness(v - bounds.l, jnp.maximum(-y, 0.0))
+    rounded = (smoothing > 0) & ~equal & ~spring
+    total = rho + above + below
+    return (
+        jnp.where(kept, 0.0, jnp.where(rounded, above / total, upper)),
+        jnp.where(kept, 0.0, jnp.where(rounded, below / total, lower)),
+        kept,
+    )

@@ -111,12 +111,13 @@ class QP:
         self._validate_balls(m)
 
     def _validate_balls(self, m: int) -> None:
-        sizes, rows = self.balls, sum(self.balls)
+        sizes = self.balls
         if (self.radius is None) != (not sizes):
             fail("balls, radius", f"{sizes}, {self.radius}", "Give both, or neither")
         if not sizes:
             return
-        if min(sizes) < 1 or rows > m:
+        rows = sum(sizes)
+        if not all(isinstance(k, int) and k > 0 for k in sizes) or rows > m:
             fail("balls", f"{sizes} with {m} rows", "Give counts ≥ 1 of the last rows of A")
         require_shape("radius", self.radius, (len(sizes),), "One radius for each ball")
         if concrete(self.radius) and not np.all(np.asarray(self.radius) >= 0):
@@ -125,9 +126,12 @@ class QP:
             l, u = np.asarray(self.l)[m - rows :], np.asarray(self.u)[m - rows :]
             if not np.array_equal(l, u):
                 fail("l, u", "differ in the rows of a ball", "There l = u is the centre")
-        if self.soft_linear is not None and concrete(self.soft_linear):
-            if np.any(np.isfinite(np.asarray(self.soft_linear)[m - rows :])):
-                fail("soft_linear", "is finite in the rows of a ball", "Balls are hard: give inf")
+        for name, hard in (("soft_linear", np.inf), ("soft_quadratic", 0.0)):
+            weight = getattr(self, name)
+            if weight is None or not concrete(weight):
+                continue
+            if np.any(np.asarray(weight)[m - rows :] != hard):
+                fail(name, "softens the rows of a ball", f"Balls are hard: give {hard} there")
 
 
 @jax.tree_util.register_dataclass

@@ -65,6 +65,15 @@ class Bounds:
         d = jnp.where(soft, jnp.abs(p - jnp.clip(p, self.l, self.u)), 0.0)
         return jnp.sum(d * (jnp.where(soft, self.linear, 0.0) + 0.5 * self.quadratic * d))
 
+    def push(self, v: Array) -> Array:
+        """The multiplier of soft rows that v leaves outside, as their penalty's slope; else 0."""
+        if self.linear is None:
+            return jnp.zeros_like(v)
+        s = v - jnp.clip(v, self.l, self.u)
+        soft = jnp.isfinite(self.linear)
+        slope = jnp.where(soft, self.linear, 0.0) + self.quadratic * jnp.abs(s)
+        return jnp.where(soft, jnp.sign(s) * slope, 0.0)
+
     def violation(self, v: Array) -> Array:
         """v minus its projection where a constraint is hard; 0 in soft rows."""
         return self.hard().excess(v, 1.0)
@@ -83,7 +92,10 @@ class Bounds:
             shrink, length = self._shrink(s[rows], radius), self._length(s[rows])
             outside = (length > radius).astype(v.dtype)
             weights = weights.at[rows].set(outside * (1 - shrink))
-            normal = jnp.sqrt(outside * shrink) * s[rows] / jnp.where(length > 0, length, 1.0)
+            root = jnp.where(
+                length > radius, jnp.sqrt(jnp.where(length > radius, shrink, 1.0)), 0.0
+            )
+            normal = root * s[rows] / jnp.where(length > 0, length, 1.0)
             normals.append(jnp.zeros_like(v).at[rows].set(normal))
         return weights, normals
 
@@ -114,7 +126,8 @@ class Bounds:
             infinite = (over > 0) & (self.quadratic == 0)
             value = value + jnp.sum(jnp.where(infinite, jnp.inf, over**2 / (2 * k)))
         for rows, radius in self.blocks():
-            value = value + radius * self._length(y[rows])
+            length = self._length(y[rows])
+            value = value + jnp.where(length > 0, length * jnp.where(length > 0, radius, 0.0), 0.0)
         return value
 
     def admissible(self, y: Array) -> Array:
@@ -137,8 +150,10 @@ class Bounds:
 
     def _yield(self, s: Array, rho: Any) -> Array:
         """d ≥ 0: how far prox(v) stays outside a soft row, s = signed distance of v."""
-        over = jnp.abs(s) - self.linear / rho
-        return jnp.where(over > 0, rho / (rho + self.quadratic) * jnp.where(over > 0, over, 0), 0)
+        soft = jnp.isfinite(self.linear)
+        over = jnp.abs(s) - jnp.where(soft, self.linear, 0.0) / rho
+        beyond = soft & (over > 0)
+        return jnp.where(beyond, rho / (rho + self.quadratic) * jnp.where(beyond, over, 0.0), 0.0)
 
     def _length(self, v: Array) -> Array:
         """|v|, with derivative 0 at v = 0."""

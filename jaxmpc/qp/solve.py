@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from jax import Array
 from jaxmpc.checks import fail
 from jaxmpc.qp.admm import ADMM, Factor, factor, iterate, read, scaled
 from jaxmpc.qp.certificate import descent_ray, farkas, recession, sharpen
-from jaxmpc.qp.derivative import activity, implicit
+from jaxmpc.qp.derivative import implicit
 from jaxmpc.qp.precision import arrays, floating_dtype, in_float64, matmul
 from jaxmpc.qp.problem import QP, QPSolution, residual_terms, residuals
 from jaxmpc.qp.projection import Bounds
@@ -73,19 +73,24 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any) -> QPSolution:
         t = start(factor, qp, bounds, warm_start)
     t, previous = iterate(factor, q, bounds, t, solver.iterations, solver.alpha)
     (w, y), (w_old, y_old) = read(factor, t, q, bounds), read(factor, previous, q, bounds)
-    z, y_z = unscaled(qp, factor, w, y)
+    pair = unscaled(qp, factor, w, y)
     proofs, directions = [y - y_old, y], [w - w_old, w]
-    if solver.refine:
-        end = polish(factor.H, q, factor.A, bounds, w, y, solver.refine)
-        z, y_z = corrected(qp, factor, *best(qp, unscaled(qp, factor, end.w, end.y), (z, y_z)))
-        # Each step waits for the one before: jaxlib 0.10 can hang on two factorizations at once.
-        w, _ = jax.lax.optimization_barrier((end.w, z))
-        steps = max(solver.refine // 5, 1)
-        _, e = least_distance(factor.A, bounds, w, steps, Constants.of(w.dtype).damping)
-        proofs += [end.change, sharpen(factor.A, e)]
-        move, _ = jax.lax.optimization_barrier((end.move, e))
-        directions += [move, ray(factor, q, bounds, move, steps)]
-    return assess(qp, factor, (z, y_z), proofs, directions, solver)
+    if not solver.refine:
+        return assess(qp, pair, prove(qp, factor, proofs, directions), solver)
+    end = polish(factor.H, q, factor.A, bounds, w, y, solver.refine)
+    polished = unscaled(qp, factor, end.w, end.y)
+    pair = corrected(qp, factor, *best(qp, polished, pair))
+    # Each step waits for the one before: jaxlib 0.10 can hang on two factorizations at once.
+    w, _ = jax.lax.optimization_barrier((end.w, pair))
+    steps = max(solver.refine // 5, 1)
+    _, e = least_distance(factor.A, bounds, w, steps, Constants.of(w.dtype).damping)
+    move, _ = jax.lax.optimization_barrier((end.move, e))
+    proofs += [end.change, sharpen(factor.A, e)]
+    directions += [move, ray(factor, q, bounds, move, steps)]
+    proof = prove(qp, factor, proofs, directions)
+    # The polish ends at the point of least violation, the best answer where there is none.
+    z, y = (jnp.where(proof.infeasible, p, v) for p, v in zip(polished, pair, strict=True))
+    return assess(qp, (z, y), proof, solver)
 
 
 def ray(factor: Factor, q: Array, bounds: Bounds, d: Array, steps: int) -> Array:
@@ -122,6 +127,8 @@ def cleaned(qp: QP) -> tuple[QP, Array]:
     # The rows of a ball have l = u = its centre, and a free centre is no centre.
     ball = jnp.arange(qp.l.shape[0]) >= qp.l.shape[0] - sum(qp.balls)
     finite = finite & jnp.all(~ball | (jnp.isfinite(qp.l) & (qp.l == qp.u)))
+    if qp.bounds.linear is not None:  # and balls are hard
+        finite = finite & jnp.all(~ball | jnp.isposinf(qp.bounds.linear))
     harmless: dict[str, Any] = {
         "q": 0.0,
         "l": jnp.where(ball, 0.0, -jnp.inf),
@@ -156,8 +163,11 @@ def start(factor: Factor, qp: QP, bounds: Bounds, warm_start: Any) -> Array:
 
 
 def unscaled(qp: QP, factor: Factor, w: Array, y: Array) -> tuple[Array, Array]:
-    """z and an admissible y in the units of `qp`."""
-    return matmul(w, factor.T.T), qp.bounds.admissible(factor.E * y)
+    """z and an admissible y in the units of `qp`. Soft rows that z cannot move (scale 0) push with
+    their penalty, for the gap's sake."""
+    zero = factor.E == 0
+    y = jnp.where(zero, qp.bounds.push(jnp.zeros_like(y)), factor.E * y)
+    return matmul(w, factor.T.T), qp.bounds.admissible(y)
 
 
 def best(qp: QP, *pairs: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -174,7 +184,7 @@ def corrected(qp: QP, factor: Factor, z: Array, y: Array) -> tuple[Array, Array]
     from the data as given, with the active rows held fixed; kept only where residuals fall."""
     rho, E = Constants.of(z.dtype).linear, factor.E
     v, y_w = scaled_rows(qp, factor, z, y)
-    weights, normals = activity(scaled(factor, qp)[1], v, y_w, 0.0, rho)
+    weights, normals = scaled(factor, qp)[1].curvature(v + y_w / rho, rho)
     solve = linearised(factor.H, factor.A, weights, normals, rho)
 
     def conditions(qp: QP, factor: Factor, z: Array, y: Array) -> tuple[Array, Array]:
@@ -199,8 +209,9 @@ def scaled_rows(qp: QP, factor: Factor, z: Array, y: Array) -> tuple[Array, Arra
 
 def precisely(function: Callable, qp: QP, *arguments: Any) -> Any:
     """function(qp, …) in float64, also for float32 data."""
-    wide = qp.q.dtype == jnp.float64
-    return (function if wide else in_float64(function))(qp, *arguments)
+    if qp.q.dtype == jnp.float64:
+        return function(qp, *arguments)
+    return in_float64(function)(*jax.lax.stop_gradient((qp, *arguments)))
 
 
 def worst(qp: QP, z: Array, y: Array) -> Array:
@@ -216,23 +227,47 @@ def worst(qp: QP, z: Array, y: Array) -> Array:
 
 def value(qp: QP, z: Array, y: Array) -> Array:
     """The cost at z, with the derivative of the optimal value: that of the Lagrangian
-    ½ z'Pz + q'z + y'Az − g*(y) at (z, y) (envelope theorem)."""
+    ½ z'Pz + q'z + y'Az − g*(y) at (z, y) (envelope theorem). Penalties that are being paid stand
+    there as themselves, for at |y| = c the conjugate of an L1 penalty has no derivative."""
     own = 0.5 * jnp.sum(z * matmul(z, qp.P)) + jnp.sum(qp.q * z)
-    Az = matmul(z, qp.A.T)
-    lagrangian = own + jnp.sum(y * Az) - qp.bounds.support(y)
+    Az, bounds = matmul(z, qp.A.T), qp.bounds
+    cost = bounds.cost(Az)
+    if bounds.linear is None:
+        lagrangian = own + jnp.sum(y * Az) - bounds.support(y)
+    else:
+        paid = jnp.isfinite(bounds.linear) & (jnp.abs(y) >= bounds.linear)
+        y = jnp.where(paid, 0.0, y)
+        penalty = replace(bounds, linear=jnp.where(paid, bounds.linear, jnp.inf)).cost(Az)
+        lagrangian = own + penalty + jnp.sum(y * Az) - bounds.support(y)
     fixed = jax.lax.stop_gradient
-    return fixed(own + qp.bounds.cost(Az)) + (lagrangian - fixed(lagrangian))
+    return fixed(own + cost) + (lagrangian - fixed(lagrangian))
 
 
-def assess(
-    qp: QP, factor: Factor, pair: tuple[Array, Array], proofs: list[Array],
-    directions: list[Array], solver: ADMM,
-) -> QPSolution:  # fmt: skip
-    """The pair (z, y) judged in the units of `qp`, in float64.
+class Proof(NamedTuple):
+    """A Farkas vector and a descent ray, and whether they are proved to be."""
 
-    proofs: scaled candidates for a Farkas vector. directions: scaled candidates for a ray.
-    """
-    (z, y), dtype, E = pair, qp.q.dtype, factor.E
+    certificate: Array
+    infeasible: Array
+    ray: Array
+    unbounded: Array
+
+
+def prove(qp: QP, factor: Factor, proofs: list[Array], directions: list[Array]) -> Proof:
+    """What is proved of the program by scaled candidates for a Farkas vector and for a ray."""
+    E = factor.E
+    # Rows that z cannot move prove emptiness by themselves.
+    fixed = jnp.where(E == 0, qp.bounds.violation(jnp.zeros_like(E)), 0.0)
+    candidates = jnp.stack([fixed, *(E * y for y in proofs)])
+    certificate, infeasible = first(*jax.vmap(lambda y: farkas(qp, y))(candidates))
+    tolerance = jnp.sqrt(jnp.finfo(E.dtype).eps)
+    candidates = matmul(jnp.stack(directions), factor.T.T)
+    ray, unbounded = first(*jax.vmap(lambda d: descent_ray(qp, d, tolerance))(candidates))
+    return Proof(certificate, infeasible, ray, unbounded)
+
+
+def assess(qp: QP, pair: tuple[Array, Array], proof: Proof, solver: ADMM) -> QPSolution:
+    """The pair (z, y) judged in the units of `qp`, in float64."""
+    (z, y), dtype = pair, qp.q.dtype
     single = dtype != jnp.float64
     eps = (1e-3 if single else 1e-6) if solver.eps is None else solver.eps
     floor = (4 if single else 100) * float(jnp.finfo(dtype).eps)
@@ -244,17 +279,9 @@ def assess(
         return (solved, *residuals(qp, z, y))
 
     solved, primal, dual, gap = precisely(measure, qp, z, y, jnp.asarray(eps, dtype))
-    # Rows that z cannot move prove emptiness by themselves.
-    fixed = jnp.where(E == 0, qp.bounds.violation(jnp.zeros_like(y)), 0.0)
-    candidates = jnp.stack([fixed, *(E * y for y in proofs)])
-    certificate, infeasible = first(*jax.vmap(lambda y: farkas(qp, y))(candidates))
-    tolerance = jnp.sqrt(jnp.finfo(dtype).eps)
-    candidates = matmul(jnp.stack(directions), factor.T.T)
-    found, unbounded = first(*jax.vmap(lambda d: descent_ray(qp, d, tolerance))(candidates))
-
     # Rows that contradict each other by less than eps are both solved and proved empty: say solved.
-    infeasible = infeasible & ~solved
-    unbounded = unbounded & ~solved & ~infeasible
+    infeasible = proof.infeasible & ~solved
+    unbounded = proof.unbounded & ~solved & ~infeasible
     status = jnp.select(
         [solved, infeasible, unbounded],
         [Status.SOLVED, Status.PRIMAL_INFEASIBLE, Status.DUAL_INFEASIBLE],
@@ -264,7 +291,8 @@ def assess(
         z=z, y=y, cost=jnp.zeros((), dtype), status=status.astype(jnp.int32),
         primal_residual=primal, dual_residual=dual, gap=gap,
         iterations=jnp.asarray(solver.iterations, jnp.int32),
-        certificate=jnp.where(infeasible, certificate, 0.0), ray=jnp.where(unbounded, found, 0.0),
+        certificate=jnp.where(infeasible, proof.certificate, 0.0),
+        ray=jnp.where(unbounded, proof.ray, 0.0),
     )  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from jaxmpc.mpc.solve import Controller
 from jaxmpc.qp.admm import ADMM, Factor, iterate, read, scaled
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.refine import polish
-from jaxmpc.qp.solve import assess, cleaned, marked, unscaled
+from jaxmpc.qp.solve import assess, cleaned, marked, prove, unscaled
 from jaxmpc.qp.status import Status
 from jaxmpc.sweeps.compiled import Compiled, default_chunk, gather_size, padded, require_step_type
 
@@ -151,8 +151,9 @@ def finish(
     assert c is not None
     q, bounds = scaled(f, qp)
     end = polish(f.H, q, f.A, bounds, w, y, steps)
-    pair, proofs = unscaled(qp, f, end.w, end.y), [*proofs, end.change]
-    s: QPSolution = marked(assess(qp, f, pair, proofs, [], controller.solver), finite)
+    proof = prove(qp, f, [*proofs, end.change], [end.move])
+    pair = unscaled(qp, f, end.w, end.y)
+    s: QPSolution = marked(assess(qp, pair, proof, controller.solver), finite)
     states, inputs = c.trajectory(x0, s.z)
     cost = controller.cost(states, inputs)
     return inputs, cost, s.status, s.primal_residual, s.dual_residual, s.gap, end.w, end.y
