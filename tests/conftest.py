@@ -8,9 +8,12 @@ unknown to later versions, which abort on it, so both cures depend on the versio
 library itself never touches the environment.
 """
 
+import gc
 import os
 import re
 from importlib.metadata import version
+
+import pytest
 
 _jaxlib = tuple(int(part) for part in re.findall(r"\d+", version("jaxlib"))[:3])
 if (0, 7, 0) <= _jaxlib < (0, 11, 1):
@@ -18,3 +21,13 @@ if (0, 7, 0) <= _jaxlib < (0, 11, 1):
     os.environ["XLA_FLAGS"] = f"{_flags} --xla_cpu_use_fusion_emitters=false".strip()
 if (0, 10, 0) <= _jaxlib < (0, 11, 1):
     os.environ.setdefault("NPROC", "1")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forget_programs():
+    """Compiled programs keep memory maps, of which a process may have 65,530."""
+    yield
+    import jax
+
+    jax.clear_caches()
+    gc.collect()

@@ -370,7 +370,8 @@ class TestSecondOrder:
         np.testing.assert_allclose(hessian, hessian.T, atol=1e-10)
         assert np.linalg.eigvalsh(hessian).max() < 1e-10
 
-    @pytest.mark.parametrize("slack_ball", [False, pytest.param(True, marks=pytest.mark.slow)])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("slack_ball", [False, True])
     def test_finite_differences_of_the_gradient(self, x64, slack_ball):
         """Second derivatives along two directions that change all fields at once, in both orders,
         with a ball that is met, and with one beside it that is not."""

@@ -83,13 +83,21 @@ def test_gradient_against_differences():
     """Both signs: at a state inside the joint's feasible set and at one outside."""
     condensed = jm.Controller(problems.joint()).condensed
     f = jax.jit(lambda x: jm.feasibility_margin(condensed.qp(x))[0])
+    gradient = jax.jit(jax.grad(f))
     for x in (np.array([0.3, 1.2]), np.array([1.4, 1.7]), np.array([-1.9, -2.5])):
         numeric = [(f(x + h) - f(x - h)) / 2e-5 for h in 1e-5 * np.eye(2)]
-        np.testing.assert_allclose(jax.grad(f)(x), numeric, atol=1e-6)
+        np.testing.assert_allclose(gradient(x), numeric, atol=1e-6)
 
 
-@pytest.mark.parametrize("mpc", [problems.joint(), problems.joint_o_inf()], ids=["joint", "O_inf"])
-@pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("mpc", "count"),
+    [
+        (problems.joint(), 60),
+        pytest.param(problems.joint(), 1000, marks=pytest.mark.slow),
+        pytest.param(problems.joint_o_inf(), 1000, marks=pytest.mark.slow),
+    ],
+    ids=["joint, 60", "joint", "O_inf"],
+)
 def test_climbing_the_margin_leads_into_the_feasible_set(mpc, count):
     """Polyak steps on the concave margin bring every infeasible state in; labels prove it."""
     condensed = jm.Controller(mpc).condensed

@@ -642,7 +642,7 @@ own(jnp.linspace(1, 2, 2048)).block_until_ready()
 """
 
 
-@pytest.mark.parametrize("cured", [True, False])
+@pytest.mark.parametrize("cured", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_large_batches_of_newton_steps_end(cured):
     """On two cores, with and without the environment's cures for old jaxlibs."""
     environment = dict(os.environ)

@@ -12,8 +12,8 @@ Which element of the generalised derivative is taken, and what it means where no
   by half where y = 0).
 * Smoothing μ > 0 replaces the 0 or 1 of "active" by k/(ρ + k), k = Σ μ/s² over both sides, with
   the slacks s = (τ + √(τ² + 4μ))/2, τ = slack − multiplier, of the central path (Chen, Harker,
-  Kanzow, Smale): the stiffness of a log barrier. (z, y) stay those of the exact solution; equalities, soft rows
-  and balls are not smoothed.
+  Kanzow, Smale): the stiffness of a log barrier. (z, y) stay those of the exact solution;
+  equalities, soft rows and balls are not smoothed.
 * Where active rows depend on each other, the least-squares answer (see `linearised`).
 * A row that is violated although its multiplier pushes (the program is infeasible, or not yet
   solved) counts as the spring with stiffness k = y/violation that holds (z, y) in balance. For
