@@ -48,8 +48,8 @@ class Settings:
     the solvers in JAX. solvers: packages to run (none: all). each: print a line a problem."""
 
     problems: Path
-    iterations: int = 500
-    refine: int = 20
+    iterations: int = 200
+    refine: int = 60
     dtype: Literal["float64", "float32"] = "float64"
     solvers: tuple[str, ...] = ()
     each: bool = False

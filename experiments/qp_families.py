@@ -248,8 +248,8 @@ class Settings:
     count: int = 1000
     seed: int = 0
     families: tuple[str, ...] = ()
-    iterations: int = 500
-    refine: int = 20
+    iterations: int = 200
+    refine: int = 60
     dtype: Literal["float64", "float32"] = "float64"
     reference: bool = False
 
