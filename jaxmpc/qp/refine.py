@@ -44,7 +44,7 @@ class Constants(NamedTuple):
     @classmethod
     def of(cls, dtype: Any) -> "Constants":
         double = jnp.finfo(dtype).eps < 1e-10
-        return cls((1e3, 1e8), 1e-8, 1e-10, 1e10, 1e5) if double else (
+        return cls((1e3, 1e8), 1e-8, 1e-10, 1e10, 1e6) if double else (
             cls((1e3, 1e4), 1e-4, 1e-5, 1e5, 1e3)
         )  # fmt: skip
 
@@ -221,9 +221,9 @@ def linearised(
 
     The function returned maps (a, c) to (dw, dy); it is linear. D is singular or not: eliminating
     dy by the method of multipliers needs only the definite K = H + ρ A'DA (with a ridge), and
-    four sweeps leave an error (1 + ρ s²)⁻⁴ for active rows with least singular value s. Where
+    eight sweeps leave an error (1 + ρ s²)⁻⁸ for active rows with least singular value s. Where
     active rows contradict each other, dw tends to their least-squares solution and dy stays
-    bounded by 4ρ times the contradiction.
+    bounded by 8ρ times the contradiction.
     """
     L = cholesky(H + rho * gram(A)(weights, normals), rho)
     D = lambda v: weights * v + sum(h * jnp.sum(h * v) for h in normals)
@@ -236,6 +236,6 @@ def linearised(
             step = -cho_solve((L, True), gradient + rho * matmul(rows, A))
             return (dw + step, dy + rho * (D(matmul(step, A.T)) + rows)), None
 
-        return jax.lax.scan(sweep, (jnp.zeros_like(a), jnp.zeros_like(c)), length=4)[0]
+        return jax.lax.scan(sweep, (jnp.zeros_like(a), jnp.zeros_like(c)), length=8)[0]
 
     return solve
