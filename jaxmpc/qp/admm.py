@@ -215,6 +215,12 @@ def scaled(factor: Factor, qp: QP) -> tuple[Array, Bounds]:
     return matmul(qp.q, factor.T), bounds
 
 
+def scaled_rows(factor: Factor, qp: QP, z: Array, y: Array) -> tuple[Array, Array]:
+    """Az and y in ADMM's coordinates; 0 in a zero row."""
+    E = factor.E
+    return E * matmul(z, qp.A.T), jnp.where(E > 0, y / jnp.where(E > 0, E, 1.0), 0.0)
+
+
 def step(t: Array, b: Array, bounds: Bounds, rho: Array, G: Array, alpha: Any) -> Array:
     """One ADMM step on t = s + v (m,)."""
     s = bounds.project(t, rho)

@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.qp.admm import Factor, scaled
+from jaxmpc.qp.admm import Factor, scaled, scaled_rows
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
@@ -50,9 +50,7 @@ def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple:
     A = E[:, None] * matmul(qp.A, T)
     H = matmul(T.T, matmul(qp.P, T))
     rho = Constants.of(z.dtype).linear
-    y_w = jnp.where(E > 0, y / jnp.where(E > 0, E, 1.0), 0.0)
-
-    v = E * matmul(z, qp.A.T)
+    v, y_w = scaled_rows(factor, qp, z, y)
     _, bounds = scaled(factor, qp)
     upper, lower, kept = activity(bounds, v, y_w, smoothing, rho)
 

@@ -32,8 +32,8 @@ TABLE_ENTRIES = 4_000_000
 class Constants(NamedTuple):
     """What the precision decides. rho: first and last penalty of the method of multipliers.
     sigma: last proximal weight. damping: proximal weight of least distance, little but far above
-    rounding. far: |w| beyond which w has
-    run off along a ray. linear: penalty of the linearised optimality conditions."""
+    rounding. far: |w| beyond which w has run off along a ray. linear: penalty of the linearised
+    optimality conditions."""
 
     rho: tuple[float, float]
     sigma: float
@@ -168,9 +168,7 @@ class Polish(NamedTuple):
     move: Array
 
 
-def polish(
-    H: Array, q: Array, A: Array, bounds: Bounds, w: Array, y: Array, steps: int
-) -> Polish:  # fmt: skip
+def polish(H: Array, q: Array, A: Array, bounds: Bounds, w: Array, y: Array, steps: int) -> Polish:
     """Proximal method of multipliers on (w, y) from ADMM's answer, a Newton step each time.
 
     Whenever φ is minimised the multipliers become ρ e; ρ grows tenfold if the violation has not

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
-from jaxmpc.qp.admm import ADMM, Factor, factor, iterate, read, scaled
+from jaxmpc.qp.admm import ADMM, Factor, factor, iterate, read, scaled, scaled_rows
 from jaxmpc.qp.certificate import descent_ray, farkas, recession, sharpen
 from jaxmpc.qp.derivative import implicit
 from jaxmpc.qp.precision import arrays, floating_dtype, in_float64, matmul
@@ -156,10 +156,10 @@ def start(factor: Factor, qp: QP, bounds: Bounds, warm_start: Any) -> Array:
         if jnp.shape(value) != like.shape:
             fail(f"warm_start {name}", f"shape {jnp.shape(value)}", f"Needed: {like.shape}")
     clean = lambda v: jnp.nan_to_num(jnp.asarray(v, qp.q.dtype), posinf=0.0, neginf=0.0)
-    E, rho = factor.E, factor.rho[0]
-    v = jnp.where(E == 0, 0.0, clean(y) / jnp.where(E == 0, 1.0, E)) / rho
+    rho = factor.rho[0]
+    Az, y = scaled_rows(factor, qp, clean(z), clean(y))
     # Soft rows may stay outside their interval: s is what prox leaves of s + v.
-    return bounds.project(E * matmul(clean(z), qp.A.T) + v, rho) + v
+    return bounds.project(Az + y / rho, rho) + y / rho
 
 
 def unscaled(qp: QP, factor: Factor, w: Array, y: Array) -> tuple[Array, Array]:
@@ -170,25 +170,22 @@ def unscaled(qp: QP, factor: Factor, w: Array, y: Array) -> tuple[Array, Array]:
     return matmul(w, factor.T.T), qp.bounds.admissible(y)
 
 
-def best(qp: QP, *pairs: tuple[Array, Array]) -> tuple[Array, Array]:
-    """The pair (z, y) with the least residuals; the first where none is finite."""
-    z, y = pairs[0]
-    for z_other, y_other in pairs[1:]:
-        better = worst(qp, z_other, y_other) < worst(qp, z, y)  # False for NaN
-        z, y = jnp.where(better, z_other, z), jnp.where(better, y_other, y)
-    return z, y
+def best(qp: QP, pair: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
+    """The one of two pairs (z, y) with the smaller residuals; the first where none is finite."""
+    better = worst(qp, *other) < worst(qp, *pair)  # False for NaN
+    return jnp.where(better, other[0], pair[0]), jnp.where(better, other[1], pair[1])
 
 
 def corrected(qp: QP, factor: Factor, z: Array, y: Array) -> tuple[Array, Array]:
     """Iterative refinement: (z, y) moved twice by their residuals, which are computed in float64
     from the data as given, with the active rows held fixed; kept only where residuals fall."""
     rho, E = Constants.of(z.dtype).linear, factor.E
-    v, y_w = scaled_rows(qp, factor, z, y)
+    v, y_w = scaled_rows(factor, qp, z, y)
     weights, normals = scaled(factor, qp)[1].curvature(v + y_w / rho, rho)
     solve = linearised(factor.H, factor.A, weights, normals, rho)
 
     def conditions(qp: QP, factor: Factor, z: Array, y: Array) -> tuple[Array, Array]:
-        v, y_w = scaled_rows(qp, factor, z, y)
+        v, y_w = scaled_rows(factor, qp, z, y)
         dual = matmul(matmul(z, qp.P) + qp.q + matmul(y, qp.A), factor.T)
         return dual, scaled(factor, qp)[1].excess(v + y_w / rho, rho) - y_w / rho
 
@@ -199,12 +196,6 @@ def corrected(qp: QP, factor: Factor, z: Array, y: Array) -> tuple[Array, Array]
         return best(qp, pair, moved), None
 
     return jax.lax.scan(move, (z, y), length=2)[0]
-
-
-def scaled_rows(qp: QP, factor: Factor, z: Array, y: Array) -> tuple[Array, Array]:
-    """Az and y in ADMM's coordinates."""
-    E = factor.E
-    return E * matmul(z, qp.A.T), jnp.where(E > 0, y / jnp.where(E > 0, E, 1.0), 0.0)
 
 
 def precisely(function: Callable, qp: QP, *arguments: Any) -> Any:
