@@ -11,6 +11,7 @@ from fractions import Fraction as Q
 import numpy as np
 
 import jaxmpc as jm
+from jaxmpc.control.sets import Ellipsoid
 
 
 def rational(array) -> list:
@@ -42,19 +43,75 @@ def holds(rows, x) -> bool:
     return all((lo is None or lo <= v) and (hi is None or v <= hi) for v, lo, hi in values)
 
 
+def steps_of(mpc, rows=None) -> tuple:
+    """The k at which the state limits hold, or those of an `Outputs`."""
+    N = mpc.horizon
+    steps = mpc.constrained_steps
+    if steps is None:
+        steps = range(N) if mpc.constrain_initial else range(1, N)
+    if rows is None:
+        return tuple(steps)
+    if rows.steps is not None:
+        return tuple(rows.steps)
+    return tuple(k for k in steps if k < N or rows.D is None)
+
+
+def stage_rows(mpc, k) -> list:
+    """Hard rows on (x_k, u_k), or on x_N, as (h_x, h_u, lower, upper) in Fractions. No rates."""
+    n, m = np.shape(mpc.system.B)
+    still, free = [Q(0)] * m, [Q(0)] * n
+    found = []
+    if k < mpc.horizon:
+        found += [(free, h, lo, hi) for h, lo, hi in two_sided(mpc.inputs)]
+    if k in steps_of(mpc):
+        found += [(h, still, lo, hi) for h, lo, hi in two_sided(mpc.states)]
+    if k == mpc.horizon and not isinstance(mpc.terminal_set, Ellipsoid):
+        found += [(h, still, lo, hi) for h, lo, hi in two_sided(mpc.terminal_set)]
+    every = mpc.outputs if isinstance(mpc.outputs, tuple | list) else (mpc.outputs,)
+    for rows in every:
+        if k in steps_of(mpc, rows):
+            D = np.zeros((len(rows.C), m)) if rows.D is None else rows.D
+            limit = lambda v: Q(float(v)) if np.isfinite(v) else None
+            bounds = zip(map(limit, rows.lower), map(limit, rows.upper), strict=True)
+            both = zip(rational(rows.C), rational(D), bounds, strict=True)
+            found += [(h, d, lo, hi) for h, d, (lo, hi) in both]
+    return found
+
+
 def keeps_all_rows(mpc, x0, plan) -> bool:
-    """True if the inputs (N, m) keep every constraint from x0, exactly."""
+    """True if the inputs (N, m) keep every hard constraint from x0, exactly.
+
+    x0 is (x, u_{−1}) where input rates are limited.
+    """
     A, B = rational(mpc.system.A), rational(mpc.system.B)
     c = [Q(0)] * len(A) if mpc.system.c is None else rational(mpc.system.c)
-    states, last, inputs = (two_sided(s) for s in (mpc.states, mpc.terminal_set, mpc.inputs))
-    x = rational(x0)
-    for k, u in enumerate(rational(plan)):
-        if (k > 0 or mpc.constrain_initial) and not holds(states, x):
+    x, before = rational(x0)[: len(A)], rational(x0)[len(A) :]
+    limit = mpc.input_rate_limit
+    if limit is not None and not isinstance(limit, jm.Box):
+        limit = np.broadcast_to(np.asarray(limit, float), np.shape(B[0]))
+        limit = jm.Box(-limit, limit)
+    inputs = rational(plan)
+    moves = range(mpc.horizon)
+    if isinstance(mpc.control_horizon, int):
+        moves = [min(k, mpc.control_horizon - 1) for k in moves]
+    elif mpc.control_horizon is not None:
+        moves = [i for i, length in enumerate(mpc.control_horizon) for _ in range(length)]
+    for k, u in enumerate(inputs):
+        if k and moves[k] == moves[k - 1] and u != inputs[k - 1]:
             return False
-        if not holds(inputs, u):
+        if not holds([(hx + hu, lo, hi) for hx, hu, lo, hi in stage_rows(mpc, k)], x + u):
             return False
+        if limit is not None:
+            if not holds(two_sided(limit), [a - b for a, b in zip(u, before, strict=True)]):
+                return False
+            before = u
         x = [dot(a, x) + dot(b, u) + drift for a, b, drift in zip(A, B, c, strict=True)]
-    return holds(last, x)
+    if not holds([(hx, lo, hi) for hx, _, lo, hi in stage_rows(mpc, mpc.horizon)], x):
+        return False
+    if isinstance(mpc.terminal_set, Ellipsoid):
+        level = Q(float(mpc.terminal_set.level))
+        return dot(x, [dot(row, x) for row in rational(mpc.terminal_set.P)]) <= level
+    return True
 
 
 def proves_empty(A, l, u, y) -> bool:
@@ -196,4 +253,50 @@ def feasible_polygon(mpc) -> Polygon:
             body = hull([back(p) for p in points])
         if k > 0 or mpc.constrain_initial:
             body = (plane if body is None else body).within(states)
+    return body
+
+
+def eliminate(rows) -> list:
+    """Rows (h, b), h'v ≤ b, of the projection that drops the last entry of v (Fourier, Motzkin)."""
+    up, down = ([r for r in rows if sign * r[0][-1] > 0] for sign in (1, -1))
+    left = [(h[:-1], b) for h, b in rows if h[-1] == 0]
+    for h, b in up:
+        for g, c in down:
+            s, t = -g[-1], h[-1]
+            pair = zip(h[:-1], g[:-1], strict=True)
+            left.append(([s * p + t * q for p, q in pair], s * b + t * c))
+    return left
+
+
+def feasible_polygon_by_elimination(mpc) -> Polygon:
+    """Exact feasible set of a planar problem by S_k = {x: ∃u: rows of stage k, Ax + Bu + c ∈ S}.
+
+    Any polyhedral sets of states and inputs, outputs with D, any index set; no rates, no blocks.
+    """
+    A, B = rational(mpc.system.A), rational(mpc.system.B)
+    c = [Q(0)] * 2 if mpc.system.c is None else rational(mpc.system.c)
+    far = Q(10) ** 6
+    body = None
+    for k in reversed(range(mpc.horizon + 1)):
+        rows = []
+        for hx, hu, lower, upper in stage_rows(mpc, k):
+            rows += [] if upper is None else [(hx + hu, upper)]
+            rows += [] if lower is None else [([-v for v in hx + hu], -lower)]
+        if body is not None:
+            for a, b in body.facets:
+                columns = list(zip(*A, strict=True)) + list(zip(*B, strict=True))
+                rows.append(([dot(a, column) for column in columns], b - dot(a, c)))
+        for _ in B[0]:
+            rows = eliminate(rows)
+        body = Polygon(((-far, -far), (far, -far), (far, far), (-far, far)))
+        for h, b in rows:
+            scale = max(map(abs, h))
+            if scale == 0:  # what is left of rows on u alone: 0 ≤ b
+                assert b >= 0
+                continue
+            h, b = [v / scale for v in h], b / scale
+            reach = max(float(h[0]) * float(v[0]) + float(h[1]) * float(v[1]) for v in
+                        body.vertices)  # fmt: skip
+            if reach > float(b) - 1e-6 * (1 + abs(float(b))):  # else it surely cuts nothing off
+                body = body.clip(h, b)
     return body

@@ -6,7 +6,15 @@ Sets describe themselves in the coordinates (and units) of the system they const
 
 from jaxmpc.control.invariant import maximal_invariant_set
 from jaxmpc.control.riccati import LQR, lqr
-from jaxmpc.control.sets import Box, Polytope
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
 
-__all__ = ["LQR", "Box", "LinearSystem", "Polytope", "lqr", "maximal_invariant_set"]
+__all__ = [
+    "LQR",
+    "Box",
+    "Ellipsoid",
+    "LinearSystem",
+    "Polytope",
+    "lqr",
+    "maximal_invariant_set",
+]

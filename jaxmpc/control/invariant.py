@@ -1,17 +1,33 @@
-"""Invariant sets of the closed loop x+ = (A + BK) x."""
+"""Invariant sets of x+ = A x + B u + c + w: under u = K x, or under the best u there is.
 
+The recursions are made of LPs, hulls and Fourier-Motzkin eliminations in float64. What is
+said of their result rests on a check of the result itself: upper bounds from LP multipliers,
+valid whatever the LP's error, and inputs found for its vertices.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Literal, overload
 
+import jax
 import numpy as np
+import scipy
 from jax.typing import ArrayLike
 
-from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.control.sets import Box, Polytope, maximise, unit_rows
+from jaxmpc.checks import fail, require_finite, require_shape, require_symmetric_psd
+from jaxmpc.control import geometry
+from jaxmpc.control.geometry import maximise, unit_rows
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem, host_array
 
 # A row counts as redundant if it is exceeded by no more than this, relative to its bound.
 # Rounding alone makes rows that exactly touch the set stand out by about 1e-16.
 _REDUNDANT = 1e-12
+# The same for a predecessor's rows, where rounding in 12 dimensions reaches 1e-12.
+_ROUNDING = 1e-11
+_CUT = 1e-7  # the last step of a recursion that ends cuts off more than this
+_FLAT = 1e-9  # a set whose largest ball is smaller than this, relative to its limits, is flat
+_VERTICES = 500  # up to this many vertices, an input is found for each
 
 
 @overload
@@ -21,6 +37,7 @@ def maximal_invariant_set(
     states: Box | Polytope,
     inputs: Box | Polytope | None,
     *,
+    disturbance: Box | Polytope | None = ...,
     max_iterations: int = ...,
     return_index: Literal[False] = ...,
 ) -> Polytope: ...
@@ -31,6 +48,7 @@ def maximal_invariant_set(
     states: Box | Polytope,
     inputs: Box | Polytope | None,
     *,
+    disturbance: Box | Polytope | None = ...,
     max_iterations: int = ...,
     return_index: Literal[True],
 ) -> tuple[Polytope, int]: ...
@@ -40,37 +58,45 @@ def maximal_invariant_set(
     states: Box | Polytope,
     inputs: Box | Polytope | None,
     *,
+    disturbance: Box | Polytope | None = None,
     max_iterations: int = 500,
     return_index: bool = False,
 ) -> Polytope | tuple[Polytope, int]:
     """O_inf, the states from which u = K x keeps all constraints for ever.
 
-    O_inf = {x : x_k in states and K x_k in inputs for all k >= 0}, x_k = (A + BK)^k x.
+    O_inf = {x : x_k in states and K x_k in inputs for all k >= 0 and all w_k in disturbance},
+    x_{k+1} = (A + BK) x_k + w_k.
 
     Arguments:
         system: n states, m inputs; c must be None or zero.
         K: (m, n), with the sign of u = K x (as `lqr` returns it).
         states: set in R^n with the origin in its interior; it need not be bounded.
         inputs: set in R^m with the origin in its interior, or None.
+        disturbance: bounded set in R^n that holds the origin, or None for w = 0.
         max_iterations: how far ahead to look at most.
         return_index: also return the index of determination.
 
     Returns O_inf with irredundant rows of norm 1, or (O_inf, t*): t* is the least t for
     which constraints kept at k = 0..t are kept for ever.
 
-    With the constraints written as F x <= 1 and O_t = {x : F (A+BK)^j x <= 1, j = 0..t},
-    O_inf = O_t as soon as max {F_i (A+BK)^(t+1) x : x in O_t} <= 1 for every i. The maximum
-    is judged by an upper bound made from the LP's multipliers, valid whatever the LP's
-    error, and may exceed 1 by 1e-12. Host, float64.
+    With the constraints written as F x <= 1 and W the disturbance,
+    O_t = {x : F_i (A+BK)^j x <= b_ij, j = 0..t}, where b_i0 = 1 and
+    b_i,j+1 = b_ij - max {F_i (A+BK)^j w : w in W}; O_inf = O_t as soon as
+    max {F_i (A+BK)^(t+1) x : x in O_t} <= b_i,t+1 for every i. The maximum is judged by an
+    upper bound made from the LP's multipliers, valid whatever the LP's error, and may exceed
+    the right-hand side by 1e-12 of it. Host, float64.
 
     Raises ValueError if A + BK is not strictly stable, the origin is not in the interior of
-    the constraints, O_inf is unbounded, or max_iterations is reached.
+    the constraints, the disturbance leaves no set around the origin, O_inf is unbounded, or
+    max_iterations is reached.
 
-    Source: Gilbert & Tan 1991, IEEE TAC 36(9), algorithm 3.2 and theorem 4.1; Neumaier &
+    Source: Gilbert & Tan 1991, IEEE TAC 36(9), algorithm 3.2 and theorem 4.1; Kolmanovsky &
+    Gilbert 1998, Math. Problems in Engineering 4, section 6, for the disturbance; Neumaier &
     Shcherbina 2004, Math. Programming 99, for the bound.
     """
     closed, F = _closed_loop(system, K, states, inputs)
     n = system.n
+    W = disturbance_set(disturbance, n)
     radius = np.abs(np.linalg.eigvals(closed)).max()
     if not radius < 1:
         fail(
@@ -78,16 +104,26 @@ def maximal_invariant_set(
             f"A + BK has spectral radius {radius:.9g}, which is not below 1",
             "Use a stabilizing K with u = Kx (python-control's K has the other sign)",
         )
-    rows, newest = F, F
+    rows, newest, b = F, F, np.ones(len(F))
     extent = np.full(n, np.inf)
     for t in range(max_iterations + 1):
         if not np.isfinite(extent).all():
-            extent = _extent(rows, n)
-        # A row once redundant stays so: if F_i Acl^(t+1) x <= 1 on O_t, and Acl maps O_(t+1)
-        # into O_t, then F_i Acl^(t+2) x <= 1 on O_(t+1). Only the others are followed.
-        candidates = newest @ closed
-        values, bounds = np.array([_bound(row, rows, extent) for row in candidates]).T
-        newest = candidates[bounds > 1 + _REDUNDANT]
+            extent = _extent(rows)
+        # A row once redundant stays so: if F_i Acl^(t+1) x <= b_(t+1) on O_t, and Acl x + w is
+        # in O_t for x in O_(t+1) and w in W, then F_i Acl^(t+2) x <= b_(t+2) on O_(t+1).
+        # Only the others are followed.
+        b, candidates = b - supports(W, newest), newest @ closed
+        if b.min() <= 0:
+            fail(
+                "disturbance",
+                f"moves the state by {1 - b.min():.6g} of the way from the origin to a limit "
+                f"within {t + 1} steps, which leaves no invariant set around the origin",
+                "Shrink it, widen the limits, or use a K that rejects it better",
+            )
+        scaled = candidates / b[:, None]
+        values, bounds = np.array([_bound(row, rows, extent) for row in scaled]).T
+        follow = bounds > 1 + _REDUNDANT
+        newest, b = candidates[follow], b[follow]
         if len(newest) == 0 and np.isfinite(extent).all():
             invariant = Polytope(rows, np.ones(len(rows))).reduce()
             return (invariant, t) if return_index else invariant
@@ -97,7 +133,7 @@ def maximal_invariant_set(
                 "the invariant set is unbounded: some motion is never constrained",
                 "Bound the states on every side",
             )
-        rows = np.vstack([rows, newest])
+        rows = np.vstack([rows, scaled[follow]])
     fail(
         "max_iterations",
         f"{max_iterations} steps do not determine the set (spectral radius {radius:.6g})",
@@ -105,8 +141,502 @@ def maximal_invariant_set(
     )
 
 
+def predecessor(
+    system: LinearSystem,
+    target: Box | Polytope,
+    states: Box | Polytope | None,
+    inputs: Box | Polytope | None,
+    disturbance: Box | Polytope | None = None,
+) -> Polytope:
+    """The states that some input takes into a target within one step, whatever w does.
+
+    Pre = {x in states : there is u in inputs with A x + B u + c + w in target for all w in
+    disturbance}, the one-step controllable set.
+
+    Arguments:
+        system: n states, m inputs; A may be singular, c may be anything.
+        target: set in R^n with volume.
+        states: set in R^n, or None for all of R^n.
+        inputs: set in R^m, or None for all of R^m. A Box may be flat, a Polytope may not.
+        disturbance: bounded set in R^n that holds the origin, or None for w = 0.
+
+    Returns irredundant rows of norm 1; rows of a flat set are not reduced. An empty set comes
+    as the row 0'x <= -1 (`is_empty()` is True), all of R^n as 0'x <= 1.
+
+    With T = {H y <= h - max Hw} the target shrunk by the disturbance, Pre is the preimage of
+    the Minkowski sum T + (-B inputs) under x -> A x + c. The sum is the projection to y of
+    {(y, u) : y + B u in T, u in inputs}, so that A need not be inverted. Host, float64.
+
+    Raises ValueError for wrong shapes, empty or flat arguments, or as `Polytope.project` does.
+
+    Source: Kerrigan 2000, thesis, Cambridge, section 2.3.
+    """
+    step = one_step(system, inputs, disturbance)
+    X = [] if states is None else [_polytope("states", states, step.n)]
+    return step.back(_polytope("target", target, step.n), *X)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ControlInvariantSet(Polytope):
+    """{H x <= h}, a set that some admissible input never lets the state leave.
+
+    exact: True if it is the maximal one, C_inf, to the tolerances that `reason` gives.
+    outer: a set that contains C_inf; the same set if exact.
+    iterations: k with C_k = C_{k+1} if exact; else how far the recursion went.
+    gap: least s for which `outer` lies in the set enlarged by 1 + s about its centre
+        (0 if exact, inf if the set has no interior).
+    reason: what was found and how it was checked, in words.
+    """
+
+    exact: bool = field(metadata={"static": True})
+    outer: Polytope
+    iterations: int = field(metadata={"static": True})
+    gap: float = field(metadata={"static": True})
+    reason: str = field(metadata={"static": True})
+
+
+def maximal_control_invariant_set(
+    system: LinearSystem,
+    states: Box | Polytope,
+    inputs: Box | Polytope | None,
+    *,
+    disturbance: Box | Polytope | None = None,
+    max_iterations: int = 100,
+    tolerance: float = 1e-9,
+) -> ControlInvariantSet:
+    """C_inf, the states from which some inputs keep all constraints for ever.
+
+    C_inf is the largest set C within `states` such that for every x in C there is a u in
+    `inputs` with A x + B u + c + w in C for all w in `disturbance`.
+
+    Arguments:
+        system: n states, m inputs; A may be singular, c may be anything.
+        states: bounded set in R^n with volume.
+        inputs: set in R^m, or None for all of R^m.
+        disturbance: bounded set in R^n that holds the origin, or None for w = 0.
+        max_iterations: largest k of the recursion C_0 = states, C_{k+1} = Pre(C_k) & C_k.
+        tolerance: gap below which an inner and an outer set count as one.
+
+    Returns one of three:
+    - exact. The recursion ends: no row of Pre(C_k) cuts C_k, by upper bounds made from LP
+      multipliers, to 1e-11 of the set's extent along the row, after one that cut it by more
+      than 1e-7. The set is C_k.
+    - not exact. It need not end: for x+ = 2x + u, |x| <= 5, |u| <= 1 it gives
+      |x| <= 1 + 4 / 2^k. Then `outer` is C_k and the set returned, as large as could be found,
+      is control invariant by the same bounds. If none was found it is empty.
+    - exact and empty (`is_empty()`; the row is 0'x <= -1). Without disturbance C_inf is empty
+      exactly if no equilibrium x = A x + B u + c lies within the limits: a compact convex C
+      within Pre(C) holds one, by Kakutani's theorem.
+    For up to 500 vertices in up to four dimensions, LPs also find an input for each vertex,
+    without use of Pre; by convexity that proves invariance once more. `reason` says all that.
+
+    The inner set. To shrink C and its inputs about an equilibrium leaves the dynamics as they
+    are, so a C_k that is almost invariant is often invariant when shrunk by a little more than
+    the last cut, as the limits of the inputs stay. If not, C <- Pre(x_e + s (C - x_e)) & C
+    with s < 1 is run until C lies within Pre(C); that ends if there is an s-contractive set.
+    Either is then grown by C <- Pre(C), which keeps invariance.
+
+    Host, float64. Raises ValueError for wrong or unbounded arguments.
+
+    Source: Bertsekas 1972, IEEE TAC 17(5), for the recursion; Blanchini 1994, IEEE TAC 39(2),
+    for contractive sets; Kerrigan 2000, thesis, Cambridge, sections 2.6 and 3.2.
+    """
+    if not (isinstance(max_iterations, int) and max_iterations >= 1):
+        fail("max_iterations", f"{max_iterations!r} is no positive integer", "Give one")
+    if not 0 < tolerance < 1:
+        fail("tolerance", f"{tolerance!r} is not between 0 and 1", "Give a relative gap")
+    step = one_step(system, inputs, disturbance)
+    X = _polytope("states", states, step.n)
+    if not np.isfinite(geometry.extent(*unit_rows(X.H, X.h))).all():
+        fail("states", "is unbounded", "Bound every coordinate")
+    size = X.chebyshev()[1]
+    empty = Polytope(np.zeros((1, step.n)), np.array([-1.0]))
+
+    def result(inner, outer, k, reason, gap=0.0, exact=True):
+        return ControlInvariantSet(
+            inner.H, inner.h, inner.labels,
+            exact=exact, outer=outer, iterations=k, gap=gap, reason=reason,
+        )  # fmt: skip
+
+    centre, margin = _equilibrium(step, X)
+    if margin < -_FLAT:
+        short = (
+            "" if margin == -np.inf else f" (the best misses them by {-margin:.3g} of their size)"
+        )
+        return result(
+            empty, empty, 0,
+            f"empty: no equilibrium x = A x + B u + c lies within the limits{short}",
+        )  # fmt: skip
+    C, cut, last, outer = X.reduce(), 1.0, np.inf, None
+    stop = "max_iterations is reached"
+    for k in range(max_iterations + 1):
+        try:
+            before = step.back(C)
+            following = C if before.is_empty() else C.intersect(before)
+            if before.is_empty() or following.is_empty():
+                against = "" if step.W is None else " against every disturbance"
+                return result(
+                    empty, empty, k + 1,
+                    f"empty: from no state do the limits hold for {k + 1} steps{against}",
+                )  # fmt: skip
+            cut = largest_cut(before, C, enough=_CUT)
+            # Convergence without end makes each cut a fraction of the last; an end makes it 0.
+            if cut <= _ROUNDING and last > _CUT:
+                return result(
+                    C, C, k,
+                    f"exact: C_{k} = C_{k + 1}; rows of its predecessor cut off at most "
+                    f"{max(cut, 0.0):.0e} of its extent (upper bound){_vertex_proof(step, C)}",
+                )  # fmt: skip
+            if cut <= tolerance / 10:
+                stop = f"C_k converges without end: step {k} cuts off {cut:.0e} of its extent"
+                break
+            if k < max_iterations:
+                radius = following.chebyshev()[1]
+                if radius <= _FLAT * size:
+                    outer = following
+                    stop = f"C_k converges to a set without volume (radius {radius:.0e})"
+                    break
+                C, last = following.reduce(), cut
+        except ValueError as error:
+            stop = f"the recursion is given up at step {k} ({error})"
+            break
+    outer = C if outer is None else outer
+    inner, gap = _inside(step, C, X, centre, max(cut, _ROUNDING), max_iterations, tolerance)
+    if inner is None:
+        found = "no control invariant set with volume was found in it"
+        if step.W is None:
+            inner = Polytope(np.vstack([np.eye(step.n), -np.eye(step.n)]), np.r_[centre, -centre])
+            found += ", so the set returned is an equilibrium alone"
+        return result(inner or empty, outer, k, f"outer bound: {stop}; {found}", np.inf, False)
+    return result(
+        inner, outer, k,
+        f"inner and outer set: {stop}; the inner one is invariant, as its predecessor's rows cut "
+        f"off nothing (upper bound, to {_ROUNDING:.0e}){_vertex_proof(step, inner)}; enlarged "
+        f"about its centre by 1 + {gap:.1e} it holds the outer one",
+        gap, False,
+    )  # fmt: skip
+
+
+def invariant_ellipsoid(
+    system: LinearSystem,
+    K: ArrayLike,
+    P: ArrayLike,
+    states: Box | Polytope | None,
+    inputs: Box | Polytope | None,
+    disturbance: Box | Polytope | None = None,
+    *,
+    return_contraction: bool = False,
+) -> Ellipsoid | tuple[Ellipsoid, float]:
+    """The largest {x : x'P x <= alpha} within the limits; u = K x never lets the state leave it.
+
+    Arguments:
+        system: n states, m inputs; c must be None or zero.
+        K: (m, n), with the sign of u = K x.
+        P: (n, n), symmetric positive definite, with (A+BK)'P (A+BK) <= P. That of `lqr` is one.
+        states, inputs: sets with the origin in their interior, or None for no limit.
+        disturbance: bounded set that holds the origin, or None for w = 0.
+        return_contraction: also return gamma2.
+
+    Returns the ellipsoid, or (ellipsoid, gamma2). With rows a_i'x <= b_i of the states and of
+    K x in inputs,
+        alpha = min_i b_i^2 / (a_i'P^-1 a_i),
+        gamma2 = max |P^(1/2) (A+BK) P^(-1/2)|^2, so x+'P x+ <= gamma2 x'P x for w = 0.
+    With w, |x+|_P <= gamma |x|_P + |w|_P, |x|_P^2 = x'P x: the ellipsoid is invariant if
+    gamma sqrt(alpha) + max |w|_P <= sqrt(alpha), which holds for alpha >= (max |w|_P /
+    (1 - gamma))^2. Host, float64.
+
+    Raises ValueError if P is no Lyapunov matrix of A + BK (the message has gamma2), if alpha
+    is less than the disturbance needs (the message has both), if nothing limits the set, or if
+    the origin is not strictly within the limits.
+
+    Source: Boyd, El Ghaoui, Feron & Balakrishnan 1994, Linear Matrix Inequalities, section
+    5.2; Rawlings, Mayne & Diehl 2017, Model Predictive Control, section 2.5.5.
+    """
+    closed, F = _closed_loop(system, K, states, inputs, optional=("states", "inputs"))
+    n = system.n
+    require_shape("P", P, (n, n), "Give one matrix for the states")
+    P = host_array("P", P)
+    require_symmetric_psd("P", P, definite=True)
+    P = (P + P.T) / 2
+    W = disturbance_set(disturbance, n)
+    gamma2 = contraction(closed, P)
+    if gamma2 > 1 + _REDUNDANT:
+        fail(
+            "P",
+            f"is no Lyapunov matrix of A + BK: x'Px grows by the factor {gamma2:.9g} in a step",
+            "Use the P of lqr, or one that solves (A+BK)'P(A+BK) - P = -Q",
+        )
+    level = float(1 / np.einsum("ij,ij->i", F, np.linalg.solve(P, F.T).T).max())
+    if W is not None:
+        push, gamma = largest_norm(W, P), np.sqrt(gamma2)
+        needed = np.inf if gamma >= 1 else (push / (1 - gamma)) ** 2
+        if push > 0 and needed > level:
+            fail(
+                "disturbance",
+                f"needs the level {needed:.9g} = (max |w|_P / (1 - gamma))^2 with max |w|_P = "
+                f"{push:.6g} and gamma = {gamma:.6g}; the limits leave {level:.9g}, which is "
+                f"{needed - level:.6g} too little",
+                "Shrink the disturbance, widen the limits, or use another K and P",
+            )
+    ellipsoid = Ellipsoid(P, level)
+    return (ellipsoid, gamma2) if return_contraction else ellipsoid
+
+
+def contraction(closed: np.ndarray, P: np.ndarray) -> float:
+    """gamma2, the least factor with closed'P closed <= gamma2 P."""
+    return max(float(scipy.linalg.eigh(closed.T @ P @ closed, P, eigvals_only=True)[-1]), 0.0)
+
+
+def largest_norm(W: Box | Polytope, P: np.ndarray) -> float:
+    """max sqrt(w'P w) over W: a convex function is largest at a vertex."""
+    vertices = W.vertices()
+    return float(np.sqrt(np.einsum("ij,jk,ik->i", vertices, P, vertices).max()))
+
+
+def disturbance_set(disturbance: Box | Polytope | None, n: int) -> Box | Polytope | None:
+    """The disturbance, or ValueError unless it is None or a bounded set that holds 0."""
+    if disturbance is None:
+        return None
+    W = _polytope("disturbance", disturbance, n)
+    G, g = unit_rows(W.H, W.h, "disturbance")
+    if not np.isfinite(geometry.extent(G, g)).all():
+        fail("disturbance", "is unbounded", "Bound every coordinate")
+    if g.min() < 0:
+        fail("disturbance", "does not hold the origin", "Add its centre to the system's c")
+    return disturbance
+
+
+def supports(W: Box | Polytope | None, rows: np.ndarray) -> np.ndarray:
+    """max {row w : w in W} for each row; 0 if W is None."""
+    if W is None or not len(rows):
+        return np.zeros(len(rows))
+    limits = Polytope(rows, np.zeros(len(rows))).pontryagin_difference(W).h
+    return -host_array("disturbance", limits)
+
+
+@dataclass(frozen=True)
+class OneStep:
+    """x+ = A x + B u + c + w with u in U, w in W.
+
+    U is {u : u = moving v + fixed, v in V}, with V None if nothing bounds v.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    c: np.ndarray
+    V: Polytope | None
+    moving: np.ndarray
+    fixed: np.ndarray
+    W: Box | Polytope | None
+
+    @property
+    def n(self) -> int:
+        return len(self.A)
+
+    def back(self, target: Polytope, states: Polytope | None = None) -> Polytope:
+        """`predecessor`, with `states` None for all of R^n."""
+        n, k = self.n, self.moving.shape[1]
+        T = Polytope(target.H, target.h)
+        if self.W is not None:
+            T = T.pontryagin_difference(self.W)
+            if T.is_empty():
+                return _tidy(T)
+        # y in T - B u, where the inputs are u = moving v + fixed
+        T = T.preimage(np.eye(n), self.B @ self.fixed)
+        if k:
+            T = T.preimage(np.hstack([np.eye(n), self.B @ self.moving]))
+            if self.V is not None:
+                T = T.intersect(self.V.preimage(np.hstack([np.zeros((k, n)), np.eye(k)])))
+            T = T.project(range(n))
+        before = T.preimage(self.A, self.c)
+        H, h = host_array("H", before.H), host_array("h", before.h)
+        # Of a singular A, rows of T whose product with it is 0 but for rounding.
+        H[np.linalg.norm(H, axis=1) <= 1e-13 * np.linalg.norm(self.A, 2)] = 0.0
+        h[~H.any(axis=1) & (np.abs(h) <= 1e-12 * np.abs(h).max(initial=0.0))] = 0.0
+        before = Polytope(H, h)
+        return _tidy(before if states is None else states.intersect(before))
+
+
+def one_step(
+    system: LinearSystem, inputs: Box | Polytope | None, disturbance: Box | Polytope | None
+) -> OneStep:
+    system.validate()
+    n, m = system.n, system.m
+    A, B = host_array("A", system.A), host_array("B", system.B)
+    c = np.zeros(n) if system.c is None else host_array("c", system.c)
+    V, moving, fixed = None, np.eye(m), np.zeros(m)
+    if inputs is not None:
+        V = _polytope("inputs", inputs, m)
+    if isinstance(inputs, Box):
+        lower, upper = host_array("inputs", inputs.lower), host_array("inputs", inputs.upper)
+        free = upper > lower
+        moving, fixed = np.eye(m)[:, free], np.where(free, 0.0, lower)
+        V = Box(lower[free], upper[free]).to_polytope() if free.any() else None
+    return OneStep(A, B, c, V, moving, fixed, disturbance_set(disturbance, n))
+
+
+def _tidy(polytope: Polytope) -> Polytope:
+    """The same set with irredundant unit rows; 0'x <= -1 if empty, 0'x <= 1 if all of R^n."""
+    zero = np.zeros((1, polytope.dimension))
+    if polytope.is_empty():
+        return Polytope(zero, np.array([-1.0]))
+    G, g = unit_rows(polytope.H, polytope.h)
+    if not len(G):
+        return Polytope(zero, np.array([1.0]))
+    _, radius, size = geometry.largest_ball("Polytope", G, g)
+    if radius <= _FLAT * size:
+        return Polytope(G, g)
+    if geometry.positively_spanning(G):
+        return polytope.reduce()
+    keep = geometry.irredundant(geometry.about_centre("Polytope", G, g)[0])
+    return Polytope(G[keep], g[keep])
+
+
+def _equilibrium(step: OneStep, X: Polytope) -> tuple[np.ndarray, float]:
+    """(x_e, margin) of the equilibrium x = A x + B u + c farthest inside the limits.
+
+    The margin is the least distance to a limit over the radius of the largest ball within
+    `states` (inputs: theirs), negative if a limit is exceeded, -inf if there is none at all.
+    """
+    n = step.n
+    M = np.hstack([step.A - np.eye(n), step.B @ step.moving])
+    drift = step.c + step.B @ step.fixed
+    z0 = -np.linalg.lstsq(M, drift, rcond=None)[0]
+    if np.abs(M @ z0 + drift).max() > 1e-9 * max(np.abs(drift).max(), np.abs(M @ z0).max()):
+        return np.zeros(n), -np.inf
+    free = scipy.linalg.null_space(M)
+    rows, limits = [], []
+    for part, polytope in ((slice(0, n), X), (slice(n, None), step.V)):
+        if polytope is None:
+            continue
+        G, g = unit_rows(polytope.H, polytope.h)
+        _, radius, size = geometry.largest_ball("limits", G, g)
+        weight = radius if _FLAT * size < radius < np.inf else 1.0
+        rows.append(np.column_stack([G @ free[part], np.full(len(g), weight)]))
+        limits.append(g - G @ z0[part])
+    top = maximise(np.eye(free.shape[1] + 1)[-1], *unit_rows(np.vstack(rows), np.hstack(limits)))
+    assert top.x is not None  # feasible with a margin low enough, bounded as X is
+    return z0[:n] + free[:n] @ top.x[:-1], float(top.x[-1])
+
+
+def _inside(
+    step: OneStep, C: Polytope, X: Polytope, centre: np.ndarray, cut: float, rounds: int,
+    tolerance: float,
+) -> tuple[Polytope | None, float]:  # fmt: skip
+    """A control invariant set within C_k, as large as `rounds` steps make it, and the gap."""
+    found = next(_candidates(step, C, centre, cut), None)
+    if found is None:
+        return None, np.inf
+    inner, before = found
+    gap = _gap(C, inner)
+    for _ in range(rounds):
+        if gap <= tolerance:
+            break
+        larger = _tidy(X.intersect(before))
+        before = step.back(larger)
+        narrower = _gap(C, larger)
+        if narrower > 0.999 * gap or largest_cut(before, larger, enough=_ROUNDING) > _ROUNDING:
+            break
+        inner, gap = larger, narrower
+    return inner, gap
+
+
+def _candidates(
+    step: OneStep, C: Polytope, centre: np.ndarray, cut: float
+) -> Iterator[tuple[Polytope, Polytope]]:
+    """Control invariant sets within C, found as `maximal_control_invariant_set` says, and Pre."""
+    margins = [m for m in 4 * cut * 30.0 ** np.arange(9) if m < 0.5] + [0.5]
+    for margin in margins:
+        inner = _about(C, centre, 1 - margin)
+        before = step.back(inner)
+        if not before.is_empty() and largest_cut(before, inner, enough=_ROUNDING) <= _ROUNDING:
+            yield inner, before
+    for margin in margins:
+        inner = C
+        for _ in range(30):
+            inner = _tidy(inner.intersect(step.back(_about(inner, centre, 1 - margin))))
+            if inner.is_empty() or inner.chebyshev()[1] <= _FLAT * C.chebyshev()[1]:
+                break
+            before = step.back(inner)
+            if not before.is_empty() and largest_cut(before, inner, enough=_ROUNDING) <= _ROUNDING:
+                yield inner, before
+
+
+def _about(C: Polytope, centre: np.ndarray, factor: float) -> Polytope:
+    """{centre + factor (x - centre) : x in C}."""
+    H, h = unit_rows(C.H, C.h)
+    return Polytope(H, factor * h + (1 - factor) * (H @ centre))
+
+
+def largest_cut(before: Polytope, C: Polytope, enough: float = np.inf) -> float:
+    """The largest share of C's extent, from its centre along a row of `before`, cut off by it.
+
+    An upper bound of it; or a share above `enough` as soon as one is met.
+    """
+    H, h = unit_rows(before.H, before.h)
+    level, worst = H @ C.chebyshev()[0], -np.inf
+    for i, top in _tops(H, C):
+        worst = max(worst, (top - h[i]) / max(top - level[i], np.finfo(float).tiny))
+        if worst > enough:
+            break
+    return worst
+
+
+def _gap(outer: Polytope, inner: Polytope) -> float:
+    """The least s with outer within the inner set enlarged by 1 + s about its centre."""
+    H, h = unit_rows(inner.H, inner.h)
+    slack = h - H @ inner.chebyshev()[0]
+    return max(0.0, *((top - h[i]) / slack[i] for i, top in _tops(H, outer)))
+
+
+def _tops(H: np.ndarray, C: Polytope) -> Iterator[tuple[int, float]]:
+    """(i, upper bound of max H_i x over a bounded C), by LPs in the coordinates of C's factors."""
+    G, g = unit_rows(C.H, C.h)
+    for rows, Z in geometry.factors(np.vstack([G, H]))[0]:
+        own = rows < len(G)
+        limits, reach = g[rows[own]], None
+        # What an elimination made comes last, and cuts most.
+        for i, row in zip(rows[~own][::-1] - len(G), Z[~own][::-1], strict=True):
+            reach = _extent(Z[own], limits) if reach is None else reach
+            yield int(i), _bound(row, Z[own], reach, limits)[1]
+
+
+def _vertex_proof(step: OneStep, C: Polytope) -> str:
+    """Words on the worst of all vertices of C, with the best input for each; "" if too many."""
+    if step.n > 4:
+        return ""
+    vertices = C.vertices()
+    if len(vertices) > _VERTICES:
+        return ""
+    G, g = unit_rows(C.H, C.h)
+    g = g - supports(step.W, G)
+    BU = step.B @ step.moving
+    k = BU.shape[1]
+    rows, worst = np.column_stack([G @ BU, np.ones(len(G))]), 0.0
+    H, h = np.zeros((0, k)), np.zeros(0)
+    if step.V is not None:
+        H, h = unit_rows(step.V.H, step.V.h)
+    for v in vertices:
+        drift = step.A @ v + step.c + step.B @ step.fixed
+        limits = np.r_[g - G @ drift, h]
+        top = maximise(
+            np.eye(k + 1)[k],
+            *unit_rows(np.vstack([rows, np.column_stack([H, np.zeros(len(H))])]), limits),
+        )
+        assert top.x is not None  # any u within its limits is feasible, with a slack low enough
+        u = top.x[:-1]
+        worst = max(worst, float((G @ (drift + BU @ u) - g).max()))
+        worst = max(worst, float((H @ u - h).max(initial=0.0)))
+    return f"; each of its {len(vertices)} vertices has an input that keeps it in, to {worst:.0e}"
+
+
 def _closed_loop(
-    system: LinearSystem, K: ArrayLike, states: Box | Polytope, inputs: Box | Polytope | None
+    system: LinearSystem,
+    K: ArrayLike,
+    states: Box | Polytope | None,
+    inputs: Box | Polytope | None,
+    optional: tuple[str, ...] = ("inputs",),
 ) -> tuple[np.ndarray, np.ndarray]:
     """A + BK, and F of the constraints F x <= 1 on the state, inputs included."""
     system.validate()
@@ -123,12 +653,9 @@ def _closed_loop(
     parts = []
     constraints = [("states", states, n, np.eye(n)), ("inputs", inputs, m, K)]
     for argument, constraint, dimension, output in constraints:
-        if constraint is None and argument == "inputs":
+        if constraint is None and argument in optional:
             continue
-        if not isinstance(constraint, Box | Polytope):
-            fail(argument, f"{type(constraint).__name__} is no Box or Polytope", "Give one")
-        constraint.validate(argument, dimension)
-        polytope = constraint.to_polytope() if isinstance(constraint, Box) else constraint
+        polytope = _polytope(argument, constraint, dimension)
         H, h = host_array(argument, polytope.H), host_array(argument, polytope.h)
         if not np.all(h > 0):
             fail(
@@ -137,30 +664,38 @@ def _closed_loop(
                 "Shift the coordinates, or widen the bounds around 0",
             )
         parts.append(H @ output / h[:, None])
-    F = np.vstack(parts)
+    F = np.vstack(parts) if parts else np.zeros((0, n))
     F = F[np.abs(F).max(axis=1, initial=0.0) > 0]
     if len(F) == 0:
         fail("states", "the invariant set is unbounded: nothing is constrained", "Add bounds")
     return host_array("A", system.A) + host_array("B", system.B) @ K, F
 
 
-def _extent(rows: np.ndarray, n: int) -> np.ndarray:
-    """Bounds on |x_i| over rows x <= 1, with a margin for the LP's error; inf if unbounded."""
-    G, g = unit_rows(rows, np.ones(len(rows)))
-    reach = [max(maximise(e, G, g).value, maximise(-e, G, g).value) for e in np.eye(n)]
-    return np.array(reach) * (1 + 1e-6)
+def _polytope(argument: str, value: Box | Polytope | None, n: int) -> Polytope:
+    if not isinstance(value, Box | Polytope):
+        fail(argument, f"{type(value).__name__} is no Box or Polytope", "Give one")
+    value.validate(argument, n)
+    return value.to_polytope() if isinstance(value, Box) else value
 
 
-def _bound(row: np.ndarray, rows: np.ndarray, extent: np.ndarray) -> tuple[float, float]:
-    """(maximum, upper bound of it) of row x over rows x <= 1.
+def _extent(rows: np.ndarray, limits: ArrayLike = 1.0) -> np.ndarray:
+    """Bounds on |x_i| over rows x <= limits, with a margin for the LP's error; inf allowed."""
+    return geometry.extent(*unit_rows(rows, np.broadcast_to(limits, len(rows)))) * (1 + 1e-6)
 
-    For any y >= 0,  row x = y'(rows x) + (row - rows'y)'x <= 1'y + |row - rows'y|'extent.
+
+def _bound(
+    row: np.ndarray, rows: np.ndarray, extent: np.ndarray, limits: ArrayLike = 1.0
+) -> tuple[float, float]:
+    """(maximum, upper bound of it) of row x over rows x <= limits.
+
+    For any y >= 0,
+        row x = y'(rows x) + (row - rows'y)'x <= y'limits + |row - rows'y|'extent.
     """
-    G, g = unit_rows(rows, np.ones(len(rows)))
-    top = maximise(row, G, g)
+    limits = np.broadcast_to(limits, len(rows))
+    top = maximise(row, *unit_rows(rows, limits))
     if top.y is None:
         return top.value, top.value
-    y = top.y * g  # of rows x <= 1, whose norms are 1 / g
+    y = top.y / np.linalg.norm(rows, axis=1)
     error = np.abs(row - rows.T @ y)
     off = error > 0
-    return top.value, float(y.sum() + error[off] @ extent[off])
+    return top.value, float(y @ limits + error[off] @ extent[off])

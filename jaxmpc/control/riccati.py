@@ -59,8 +59,8 @@ def lqr(system: LinearSystem, Q: ArrayLike, R: ArrayLike) -> LQR:
     Q, R = (Q + Q.T) / 2, (R + R.T) / 2
     weights, axes = np.linalg.eigh(Q)
     output = np.sqrt(np.maximum(weights, 0.0))[:, None] * axes.T  # Q = output'output
-    control, control_mode = _least_reached(A, B)
-    cost, cost_mode = _least_reached(A.T, output.T)
+    control, control_mode = least_reached(A, B)
+    cost, cost_mode = least_reached(A.T, output.T)
     unmoved = ("B", f"does not move the mode with eigenvalue {control_mode}", "Actuate it")
     unseen = ("Q", f"puts no weight on the mode with eigenvalue {cost_mode}", "Give it some")
     if control <= _UNREACHED:
@@ -108,7 +108,7 @@ def _refine(
     return P
 
 
-def _least_reached(A: np.ndarray, B: np.ndarray) -> tuple[float, str]:
+def least_reached(A: np.ndarray, B: np.ndarray) -> tuple[float, str]:
     """How far the modes that do not decay are from unreachable, and the worst eigenvalue.
 
     Popov-Belevitch-Hautus: all are reached if [A - s I, B] has full row rank at every

@@ -1,31 +1,52 @@
-"""Convex sets: boxes and polytopes.
+"""Convex sets: boxes, polytopes and ellipsoids.
 
-`contains` and `Box.support` are JAX functions of one point (map them with `jax.vmap`).
-Everything that needs an LP (HiGHS) or a convex hull (qhull) runs on the host, in float64,
-and raises ValueError for sets that are empty, flat or unbounded where those make no sense.
+`contains`, `Box.support` and `Ellipsoid.support` are JAX functions of one point (map them with
+`jax.vmap`). Everything that needs an LP (HiGHS) or a convex hull (qhull) runs on the host, in
+float64, and raises ValueError for sets that are empty, flat or unbounded where those make no
+sense.
 """
 
 import itertools
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax.typing import ArrayLike
-from scipy.optimize import linprog
-from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
+from scipy.spatial import ConvexHull
 
-from jaxmpc.checks import concrete, fail, require_finite, require_shape
+from jaxmpc.checks import (
+    concrete,
+    fail,
+    require_finite,
+    require_shape,
+    require_symmetric_psd,
+)
+from jaxmpc.control.geometry import FLAT as _FLAT
+from jaxmpc.control.geometry import (
+    Optimum,
+    about_centre,
+    binding_rows,
+    distinct,
+    dual_hull,
+    eliminate,
+    explained,
+    extent,
+    factors,
+    hull_volume,
+    largest_ball,
+    maximise,
+    positively_spanning,
+    unit_rows,
+)
+from jaxmpc.control.geometry import irredundant as _irredundant
 from jaxmpc.control.system import as_array, host_array
 
-# A set is called empty or flat if no ball of this radius fits, relative to the median
-# distance of its hyperplanes from the origin; well above HiGHS' own tolerance of 1e-10.
-_FLAT = 1e-9
-_MERGE = "C-1e-12"  # qhull's option: merge facets of the dual that are flat to 1e-12
-_HULL_DIMENSIONS = 6  # above, a hull has too many facets and one LP per row is faster
+__all__ = ["Box", "Ellipsoid", "Optimum", "Polytope", "hull_volume", "maximise", "unit_rows"]
 
 
 @jax.tree_util.register_dataclass
@@ -94,6 +115,17 @@ class Box:
             np.concatenate([upper[above], -lower[below]]),
         )
 
+    def intersect(self, other: "Box | Polytope") -> "Box | Polytope":
+        """The points in both sets: a Box with a Box (perhaps empty), else a Polytope. Host."""
+        if not isinstance(other, Box):
+            return self.to_polytope().intersect(other)
+        lower, upper = self._bounds()
+        other.validate("other", len(lower))
+        return Box(
+            np.maximum(lower, host_array("other.lower", other.lower)),
+            np.minimum(upper, host_array("other.upper", other.upper)),
+        )
+
     def vertices(self) -> np.ndarray:
         """(2^n, n) corners; counter-clockwise in 2-D. Host; ValueError if unbounded."""
         lower, upper = self._finite_bounds()
@@ -124,10 +156,13 @@ class Polytope:
     Arguments:
         H: (rows, n) outward normals, of any length.
         h: (rows,) offsets; inf for a row that does not bind.
+        labels: names of the rows, such as "q1 <= 1.5 rad"; empty for none. A row that comes
+            out of `intersect`, `reduce` or `preimage` keeps the label it went in with.
     """
 
     H: ArrayLike
     h: ArrayLike
+    labels: tuple[str, ...] = field(default=(), metadata={"static": True})
 
     @classmethod
     def from_points(cls, points: ArrayLike) -> "Polytope":
@@ -147,9 +182,9 @@ class Polytope:
         if points.shape[1] == 1:
             return cls(np.array([[1.0], [-1.0]]), np.array([points.max(), -points.min()]))
         # qhull's facets are simplices: a facet with more corners comes several times.
-        with _explained("points"):
+        with explained("points"):
             facets = ConvexHull(scaled).equations
-        facets = facets[_distinct(facets, 1e-10)]
+        facets = facets[distinct(facets, 1e-10)]
         normals, offsets = facets[:, :-1] / scale, -facets[:, -1]
         return cls(*unit_rows(normals, offsets + normals @ centre))
 
@@ -163,9 +198,9 @@ class Polytope:
 
         Emptiness is decided by one LP, with a relative tolerance of 1e-9.
         """
-        _require_shapes(argument, self, ("H", "h"), 2, dimension)
+        self._require_fields(argument, dimension)
         if concrete((self.H, self.h)):
-            _largest_ball(argument, *unit_rows(self.H, self.h, argument))
+            largest_ball(argument, *unit_rows(self.H, self.h, argument))
 
     def is_empty(self) -> bool:
         """True if no point satisfies all rows, by one LP (relative tolerance 1e-10). Host."""
@@ -203,43 +238,185 @@ class Polytope:
         The radius of a flat set is 0. Raises ValueError if the set is empty, or holds balls
         of every radius.
         """
-        centre, radius, _ = _largest_ball("Polytope", *self._rows())
+        centre, radius, _ = largest_ball("Polytope", *self._rows())
         if radius == np.inf:
             fail("Polytope", "is unbounded: it holds arbitrarily large balls", "Add rows")
         return centre, max(radius, 0.0)
 
     def intersect(self, other: "Box | Polytope") -> "Polytope":
-        """The points in both sets: the rows of both, not reduced. Host."""
+        """The points in both sets: the rows of both, not reduced. Host.
+
+        If one of the two has labels, the unlabelled rows of the other get the label "".
+        """
+        parts = (self, _as_polytope("other", other))
+        for argument, part in zip(("Polytope", "other"), parts, strict=True):
+            part._require_fields(argument, self.dimension)
+        H = [host_array("H", part.H) for part in parts]
+        h = [host_array("h", part.h) for part in parts]
+        labels = [part.labels or ("",) * np.size(part.h) for part in parts]
+        named = any(part.labels for part in parts)
+        return Polytope(np.vstack(H), np.concatenate(h), labels[0] + labels[1] if named else ())
+
+    def scale(self, factor: float) -> "Polytope":
+        """{factor x : x in the set}, factor > 0. Host."""
+        self._require_fields("Polytope")
+        if not (np.ndim(factor) == 0 and np.isfinite(factor) and factor > 0):
+            fail("factor", f"{factor!r} is not a positive number", "Give a finite factor > 0")
+        return Polytope(host_array("H", self.H), host_array("h", self.h) * float(factor))
+
+    def preimage(self, M: ArrayLike, t: ArrayLike | None = None) -> "Polytope":
+        """{x : M x + t in the set} = {x : H M x <= h - H t}, row by row, not reduced. Host.
+
+        Arguments:
+            M: (n, k), any matrix.
+            t: (n,), or None for 0.
+        """
+        self._require_fields("Polytope")
+        H, h = host_array("Polytope.H", self.H), host_array("Polytope.h", self.h)
+        M, t = _affine(M, t, (self.dimension, None))
+        return Polytope(H @ M, h - H @ t, self.labels)
+
+    def image(self, M: ArrayLike, t: ArrayLike | None = None) -> "Polytope":
+        """{M x + t : x in the set}, reduced unless M is square. Host.
+
+        Arguments:
+            M: (k, n) of rank k.
+            t: (k,), or None for 0.
+
+        With k < n, y = M x is solved for k entries of x, which leaves the set of all (y, rest
+        of x); `project` then eliminates the rest.
+
+        Raises ValueError if rank M < k (the image is flat), or as `project` does.
+        """
+        M, t = _affine(M, t, (None, self.dimension))
+        k, n = M.shape
+        # Units of x and y must not decide the rank.
+        scale = np.abs(M).max(axis=1, initial=0.0)[:, None]
+        scaled = M / np.where(scale > 0, scale, 1.0)
+        column = np.abs(scaled).max(axis=0)
+        scaled = scaled / np.where(column > 0, column, 1.0)
+        if np.linalg.matrix_rank(scaled, rtol=_FLAT) < k:
+            fail("M", f"has rank below {k}, so the image is flat", "Map to fewer coordinates")
+        order = scipy.linalg.qr(scaled, mode="r", pivoting=True)[1]
+        # z = (y - t, x[order[k:]]) = T x
+        T = np.vstack([M, np.eye(n)[order[k:]]])
+        lifted = self.preimage(np.linalg.inv(T))
+        image = lifted if k == n else lifted.project(range(k))
+        return Polytope(image.H, image.h + image.H @ t, image.labels)
+
+    def project(self, axes: Sequence[int]) -> "Polytope":
+        """The set of (x_i for i in axes) over all x in the set, with irredundant unit rows. Host.
+
+        Arguments:
+            axes: the coordinates to keep, in the order wanted.
+
+        Exact up to rounding: Fourier-Motzkin elimination of the other coordinates, redundant
+        rows removed after each (Ziegler 1995, section 1.2). The set may be unbounded.
+
+        Raises ValueError if the set is empty or flat, or has too many rows to eliminate.
+        """
+        axes, n = list(axes), self.dimension
+        wrong = not axes or len(set(axes)) < len(axes) or not set(axes) <= set(range(n))
+        if wrong:
+            fail("axes", f"{axes} are not distinct numbers in 0..{n - 1}", "Name those to keep")
+        Y, centre = about_centre("Polytope", *self._rows())
+        Y = eliminate(Y, sorted(set(range(n)) - set(axes)))[:, np.argsort(np.argsort(axes))]
+        return Polytope(*unit_rows(Y, 1 + Y @ centre[axes]))
+
+    def minkowski_sum(self, other: "Box | Polytope | ArrayLike") -> "Polytope":
+        """{x + w : x in the set, w in other}, with irredundant unit rows. Host.
+
+        Arguments:
+            other: Box, Polytope with volume, or points (k, n), which stand for their convex hull;
+                boxes and hulls of points may be flat (a segment, say).
+
+        Bounded sets in up to three dimensions: the hull of all sums of vertices. Else the
+        projection to x of {(x, w) : x - w in the set, w in other}.
+
+        Raises ValueError if this set, or a Polytope `other`, is empty or flat.
+        """
+        n = self.dimension
+        points: np.ndarray | None
         if not isinstance(other, Box | Polytope):
-            fail("other", f"{type(other).__name__} is no Box or Polytope", "Give one")
-        other = other.to_polytope() if isinstance(other, Box) else other
-        for argument, part in (("Polytope", self), ("other", other)):
-            _require_shapes(argument, part, ("H", "h"), 2, self.dimension)
-        H = [host_array("H", part.H) for part in (self, other)]
-        h = [host_array("h", part.h) for part in (self, other)]
-        return Polytope(np.vstack(H), np.concatenate(h))
+            points = host_array("other", other)
+            if points.ndim != 2 or points.shape[1] != n or not len(points):
+                fail("other", f"shape {points.shape} is not (k, {n})", "Give a set, or points")
+            require_finite("other", points)
+        else:
+            other.validate("other", n)
+            bounded = positively_spanning(_as_polytope("other", other)._rows()[0])
+            points = other.vertices() if bounded and n <= 3 else None
+        if n <= 3 and points is not None and positively_spanning(self._rows()[0]):
+            vertices = self.vertices()
+            return Polytope.from_points((vertices[:, None] + points).reshape(-1, n))
+        # x = s + shift + D w with s in the set and w in `weights`, a set with volume.
+        weights, D, shift = _generated(other, points)
+        lifted = self.preimage(np.hstack([np.eye(n), -D]), -shift)
+        if weights is not None:
+            k = D.shape[1]
+            lifted = lifted.intersect(weights.preimage(np.eye(k, n + k, n)))
+        return lifted.project(range(n))
+
+    def pontryagin_difference(self, other: "Box | Polytope | Ellipsoid | ArrayLike") -> "Polytope":
+        """{x : x + w in the set for all w in other}: H x <= h - max {H w : w in other}. Host.
+
+        Arguments:
+            other: Box, Polytope, Ellipsoid, or points (k, n), which stand for their convex hull.
+
+        Row by row, not reduced, and exact (Kolmanovsky & Gilbert 1998, Math. Problems in Eng. 4,
+        theorem 2.3). The result may be empty (`is_empty` tells).
+        """
+        self._require_fields("Polytope")
+        H, h = host_array("Polytope.H", self.H), host_array("Polytope.h", self.h)
+        binding = binding_rows(H, h)
+        reach = np.zeros(len(h))
+        reach[binding] = _supports(other, H[binding])
+        return Polytope(H, h - reach)
+
+    def is_subset(self, other: "Box | Polytope", tolerance: float = 1e-9) -> bool:
+        """True if no point of the set violates a row of `other` by more than `tolerance`. Host.
+
+        The violation is the distance from the row's hyperplane, in the units of x. Each row is
+        judged by an upper bound of its maximum made from an LP's multipliers y >= 0,
+            row x = y'(G x) + (row - G'y)'x <= y'g + |row - G'y|'|x|,
+        valid whatever the LP's error (Neumaier & Shcherbina 2004, Math. Programming 99); along
+        coordinates in which the set is unbounded the second term is left out. An empty set is
+        a subset of every set.
+        """
+        if self.is_empty():
+            return True
+        other = _as_polytope("other", other)
+        other._require_fields("other", self.dimension)
+        rows, offsets = unit_rows(other.H, other.h, "other")
+        G, g = self._rows()
+        reach = extent(G, g) * (1 + 1e-6)
+        reach[np.isinf(reach)] = 0.0
+        for row, offset in zip(rows, offsets, strict=True):
+            y = maximise(row, G, g).y
+            if y is None or y @ g + np.abs(row - G.T @ y) @ reach > offset + tolerance:
+                return False
+        return True
 
     def reduce(self) -> "Polytope":
         """The same set with the fewest rows, each of norm 1. Host.
 
-        Rows that cut off less than about 1e-12 of the set's size (near-duplicates, rows
-        that touch a vertex) are dropped. Raises ValueError if the set is empty, flat or
-        unbounded.
+        Rows that cut off less than about 1e-12 of the set's size (near-duplicates, rows that
+        touch a vertex) are dropped; 1e-10 in more than six dimensions. Raises ValueError if
+        the set is empty, flat or unbounded.
 
         Method: about an interior point c the row a'x <= b reads y'(x - c) <= 1 with
         y = a / (b - a'c), and it is irredundant exactly if y is a vertex of the convex hull
-        of all the y (polarity; Ziegler 1995, section 2.3). In more than six dimensions:
-        one LP per row.
+        of all the y (polarity; Ziegler 1995, section 2.3). A product of sets is reduced factor by
+        factor; factors of more than six dimensions by one LP per row.
         """
         G, g = self._rows()
         Y, _, scale = self._dual(G, g)
-        if self.dimension == 1:
-            keep = np.array([np.argmax(Y[:, 0]), np.argmin(Y[:, 0])])
-        elif self.dimension <= _HULL_DIMENSIONS:
-            keep = np.unique(np.concatenate(_dual_hull(Y * scale).dual_facets))
-        else:
-            keep = _irredundant(Y * scale)
-        return Polytope(G[keep], g[keep])
+        keep = _irredundant(Y * scale)
+        labels: tuple[str, ...] = ()
+        if self.labels:
+            binding = binding_rows(host_array("H", self.H), host_array("h", self.h))
+            labels = tuple(self.labels[i] for i in binding[keep])
+        return Polytope(G[keep], g[keep], labels)
 
     def vertices(self) -> np.ndarray:
         """(k, n) vertices; counter-clockwise in 2-D, ascending in 1-D. Host.
@@ -250,165 +427,190 @@ class Polytope:
         Y, centre, scale = self._dual(*self.reduce()._rows())
         if self.dimension == 1:
             return np.sort(centre + 1 / Y, axis=0)
-        V = _dual_hull(Y * scale).intersections
-        V = V[_distinct(V / np.abs(V).max(axis=0), 1e-10)]
+        V = dual_hull(Y * scale).intersections
+        V = V[distinct(V / np.abs(V).max(axis=0), 1e-10)]
         if self.dimension == 2:
             V = V[np.argsort(np.arctan2(V[:, 1], V[:, 0]))]
         return centre + V * scale
 
     def volume(self) -> float:
-        """Length, area or volume. Host; ValueError if empty, flat or unbounded."""
-        return hull_volume(self.vertices())
+        """Length, area or volume, of a product of sets factor by factor. Host.
+
+        Raises ValueError if the set is empty, flat or unbounded.
+        """
+        Y, _, scale = self._dual(*self.reduce()._rows())
+        parts, S = factors(Y * scale)
+        if len(parts) == 1:
+            return hull_volume(self.vertices())
+        volumes = [Polytope(Z, np.ones(len(Z))).volume() for _, Z in parts]
+        return float(np.prod(volumes) * np.prod(scale) / abs(np.linalg.det(S)))
+
+    def _require_fields(self, argument: str, dimension: int | None = None) -> None:
+        _require_shapes(argument, self, ("H", "h"), 2, dimension)
+        require_labels(f"{argument}.labels", self.labels, np.shape(as_array(self.h))[0])
 
     def _rows(self) -> tuple[np.ndarray, np.ndarray]:
-        _require_shapes("Polytope", self, ("H", "h"), 2)
+        self._require_fields("Polytope")
         return unit_rows(self.H, self.h)
 
     @staticmethod
     def _dual(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Y, centre, scale: G x <= g is Y (x - centre) <= 1, and Y * scale has entries <= 1."""
-        cure = "Check the rows: this needs a bounded set with volume"
-        centre, radius, size = _largest_ball("Polytope", G, g)
-        if not _positively_spanning(G):
-            fail("Polytope", "is unbounded", cure)
-        if radius <= _FLAT * size:
-            fail("Polytope", f"is flat (largest ball of radius {radius:.1e})", cure)
-        Y = G / (g - G @ centre)[:, None]
+        largest_ball("Polytope", G, g)
+        if not positively_spanning(G):
+            fail("Polytope", "is unbounded", "Check the rows: this needs a bounded set")
+        Y, centre = about_centre("Polytope", G, g)
         return Y, centre, 1 / np.abs(Y).max(axis=0)
 
 
-def hull_volume(points: ArrayLike) -> float:
-    """Volume of the convex hull of points (k, n): 0 where they lie in a hyperplane. Host."""
-    points = host_array("points", points)
-    if len(points) <= points.shape[1]:
-        return 0.0
-    # qhull works best in coordinates of like size.
-    scale = np.ptp(points, axis=0)
-    if not scale.all():
-        return 0.0
-    if len(scale) == 1:
-        return float(scale[0])
-    scaled = (points - points.mean(axis=0)) / scale
-    # Clusters confuse qhull; one point of each spans a hull that is no larger.
-    try:
-        hull = ConvexHull(scaled[_distinct(scaled, 1e-11)])
-    except QhullError:  # flat
-        return 0.0
-    return float(hull.volume * np.prod(scale))
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Ellipsoid:
+    """{x in R^n : x'P x <= level}, centred at the origin.
 
-
-class Optimum(NamedTuple):
-    """An LP's maximum, where it is attained (n,), and the multipliers (rows,)."""
-
-    value: float
-    x: np.ndarray | None = None
-    y: np.ndarray | None = None
-
-
-def maximise(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> Optimum:
-    """max d'x over G x <= g: value inf (x and y None) if unbounded, -inf if empty.
-
-    The multipliers y >= 0 obey G'y = d and g'y = value up to rounding. Rows of G should
-    have norms of about 1. Dual simplex (HiGHS): a vertex, in float64, on the host.
+    Arguments:
+        P: (n, n), symmetric positive definite.
+        level: a number > 0.
     """
-    # HiGHS' tolerances are absolute, hence the scaling of g and d.
-    size, length = _typical(g), np.linalg.norm(d) or 1.0
-    result = linprog(
-        -d / length,
-        A_ub=G,
-        b_ub=g / size,
-        bounds=(None, None),
-        method="highs-ds",
-        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
-    )
-    if result.status == 0:
-        x = result.x * size
-        return Optimum(float(d @ x), x, np.maximum(-result.ineqlin.marginals, 0.0) * length)
-    if result.status not in (2, 3):
-        fail("LP", f"HiGHS stopped: {result.message}", "Scale the rows to like size")
-    return Optimum(-np.inf if result.status == 2 else np.inf)
+
+    P: ArrayLike
+    level: ArrayLike
+
+    @property
+    def dimension(self) -> int:
+        """n, the number of coordinates."""
+        return np.shape(as_array(self.P))[-1]
+
+    def validate(self, argument: str, dimension: int | None = None) -> None:
+        """Raise ValueError, naming `argument`, for wrong shapes, P not positive definite,
+        or level <= 0."""
+        self._require_fields(argument, dimension)
+        if not concrete((self.P, self.level)):
+            return
+        require_symmetric_psd(f"{argument}.P", self.P, definite=True)
+        level = host_array(f"{argument}.level", self.level)
+        if not (np.isfinite(level) and level > 0):
+            fail(f"{argument}.level", f"{level:g} is not a positive number", "Give x'Px's maximum")
+
+    def contains(self, x: ArrayLike, tolerance: float = 0.0) -> jax.Array:
+        """True if x'P x <= level + tolerance, x of shape (n,)."""
+        self._require_fields("Ellipsoid")
+        require_shape("x", x, (self.dimension,), "Give one point; use jax.vmap for many")
+        P, x = jnp.asarray(self.P), jnp.asarray(x)
+        value = jnp.vdot(x, jnp.matmul(P, x, precision="highest"), precision="highest")
+        return value <= jnp.asarray(self.level) + tolerance
+
+    def support(self, d: ArrayLike) -> jax.Array:
+        """max d'x over the ellipsoid = sqrt(level d'P^-1 d), d of shape (n,)."""
+        self._require_fields("Ellipsoid")
+        require_shape("d", d, (self.dimension,), "Give one direction; use jax.vmap for many")
+        d = jnp.asarray(d)
+        return jnp.sqrt(jnp.asarray(self.level) * (d @ jnp.linalg.solve(jnp.asarray(self.P), d)))
+
+    def volume(self) -> float:
+        """Length, area or volume: pi^(n/2) / Gamma(n/2 + 1) level^(n/2) / sqrt(det P). Host."""
+        P, level = self._values()
+        half = len(P) / 2
+        logarithm = half * np.log(np.pi * level) - math.lgamma(half + 1)
+        return float(np.exp(logarithm - np.linalg.slogdet(P)[1] / 2))
+
+    def bounding_box(self) -> Box:
+        """The least box around it: |x_i| <= sqrt(level (P^-1)_ii). Host."""
+        P, level = self._values()
+        reach = np.sqrt(level * np.diag(np.linalg.inv(P)))
+        return Box(-reach, reach)
+
+    def boundary(self, count: int = 200) -> np.ndarray:
+        """(count, 2) points of an ellipse, counter-clockwise, for pictures. Host, 2-D only."""
+        P, level = self._values()
+        if len(P) != 2:
+            fail("Ellipsoid", f"has dimension {len(P)}", "Only an ellipse can be drawn")
+        angles = np.arange(count) * 2 * np.pi / count
+        # P = L L' and x = L'^-1 w give x'Px = |w|^2.
+        circle = math.sqrt(level) * np.array([np.cos(angles), np.sin(angles)])
+        return np.linalg.solve(np.linalg.cholesky(P).T, circle).T
+
+    def _values(self) -> tuple[np.ndarray, float]:
+        self.validate("Ellipsoid")
+        P = host_array("Ellipsoid.P", self.P)
+        return (P + P.T) / 2, float(host_array("Ellipsoid.level", self.level))
+
+    def _require_fields(self, argument: str, dimension: int | None = None) -> None:
+        shape = np.shape(as_array(self.P))
+        if len(shape) != 2 or shape[0] != shape[1] or not shape[0]:
+            fail(f"{argument}.P", f"shape {shape} is not (n, n)", "Give a square matrix")
+        _require_dimension(argument, shape[0], dimension)
+        require_shape(f"{argument}.level", as_array(self.level), (), "Give one number")
 
 
-def _typical(g: np.ndarray) -> float:
-    """The median distance of the hyperplanes from the origin, 1 if all pass through it."""
-    distances = np.abs(g)
-    # Below that they are zeros with rounding.
-    distances = distances[distances > 1e-13 * distances.max(initial=0.0)]
-    return float(np.median(distances)) if distances.size else 1.0
+def require_labels(argument: str, labels: Any, rows: int) -> None:
+    """Raise unless `labels` is a tuple of strings, one a row or none."""
+    if not isinstance(labels, tuple) or not all(isinstance(label, str) for label in labels):
+        fail(argument, f"{labels!r} is not a tuple of strings", 'Write it as ("q <= 1", "q >= -1")')
+    if len(labels) not in (0, rows):
+        fail(argument, f"{len(labels)} entries for {rows} rows", "Label all rows or none")
 
 
-def _largest_ball(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """(centre, radius, typical size) of {G x <= g} with unit rows; ValueError if empty.
-
-    The LP max r subject to G x + r <= g (Boyd & Vandenberghe 2004, section 4.3.1), with r
-    of either sign so that it is always feasible. Radius inf if it is unbounded.
-    """
-    size, n = _typical(g), G.shape[1]
-    top = maximise(np.eye(n + 1)[n], np.column_stack([G, np.ones(len(g))]), g)
-    if top.x is None:
-        return np.zeros(n), np.inf, size
-    centre = top.x[:n]
-    radius = float((g - G @ centre).min())
-    if radius < -_FLAT * size:
-        fail(argument, "is empty: no point satisfies all its rows", "Loosen its rows")
-    return centre, radius, size
+def _as_polytope(argument: str, value: Any) -> Polytope:
+    if not isinstance(value, Box | Polytope):
+        fail(argument, f"{type(value).__name__} is no Box or Polytope", "Give one")
+    return value.to_polytope() if isinstance(value, Box) else value
 
 
-def _positively_spanning(G: np.ndarray) -> bool:
-    """True if {G x <= g} is bounded: G'y = 0 for some y > 0 and rank G = n (Stiemke)."""
-    if len(G) <= G.shape[1] or np.linalg.matrix_rank(G) < G.shape[1]:
-        return False
-    zero = np.zeros(G.shape[1])
-    return linprog(np.zeros(len(G)), A_eq=G.T, b_eq=zero, bounds=(1, None)).status == 0
+def _affine(
+    M: ArrayLike, t: ArrayLike | None, shape: tuple[int | None, int | None]
+) -> tuple[np.ndarray, np.ndarray]:
+    """M and t of x -> M x + t, checked: M has this shape (None: any), t one entry a row of M."""
+    M = host_array("M", M)
+    fits = [size is None or size == given for size, given in zip(shape, M.shape, strict=False)]
+    if M.ndim != 2 or 0 in M.shape or not all(fits):
+        wanted = ", ".join("k" if size is None else str(size) for size in shape)
+        fail("M", f"shape {M.shape} is not ({wanted})", "Give a matrix, one row an entry of Mx")
+    require_finite("M", M)
+    t = np.zeros(len(M)) if t is None else host_array("t", t)
+    require_shape("t", t, (len(M),), "Give one entry a row of M")
+    require_finite("t", t)
+    return M, t
 
 
-def unit_rows(H: Any, h: Any, argument: str = "Polytope") -> tuple[np.ndarray, np.ndarray]:
-    """The rows of H x <= h that can bind, scaled to norm 1, in float64."""
-    H, h = host_array(f"{argument}.H", H), host_array(f"{argument}.h", h)
-    require_finite(f"{argument}.H", H)
-    if np.isnan(h).any():
-        fail(f"{argument}.h", "holds NaN", "Use inf for a row that does not bind")
-    length = np.linalg.norm(H, axis=1)
-    if np.any((h == -np.inf) | ((length == 0) & (h < 0))):
-        fail(argument, "is empty: a row reads 0'x <= h < 0 or has h = -inf", "Remove that row")
-    binding = (length > 0) & (h < np.inf)
-    length = length[binding]
-    return H[binding] / length[:, None], h[binding] / length
+def _generated(
+    other: "Box | Polytope | ArrayLike", points: np.ndarray | None
+) -> tuple[Polytope | None, np.ndarray, np.ndarray]:
+    """(W, D, shift) with {D w + shift : w in W} = other, W with volume; None: other = {shift}."""
+    if isinstance(other, Box):
+        lower, upper = host_array("lower", other.lower), host_array("upper", other.upper)
+        wide = upper > lower
+        weights = Box(lower[wide], upper[wide]).to_polytope() if wide.any() else None
+        return weights, np.eye(len(lower))[:, wide], np.where(wide, 0.0, lower)
+    if isinstance(other, Polytope):
+        return other, np.eye(other.dimension), np.zeros(other.dimension)
+    assert points is not None
+    # Weights >= 0 of all points but the last, with a sum <= 1; the last gets the rest.
+    k = len(points) - 1
+    weights = Polytope(np.vstack([-np.eye(k), np.ones((1, k))]), np.r_[np.zeros(k), 1.0])
+    return weights if k else None, (points[:-1] - points[-1]).T, points[-1]
 
 
-def _dual_hull(Y: np.ndarray) -> HalfspaceIntersection:
-    """Vertices of {Y x <= 1}, and the rows that meet in each: a convex hull of Y (qhull)."""
-    halfspaces = np.column_stack([Y, -np.ones(len(Y))])
-    with _explained("Polytope"):
-        return HalfspaceIntersection(halfspaces, np.zeros(Y.shape[1]), qhull_options=_MERGE)
-
-
-@contextmanager
-def _explained(argument: str) -> Iterator[None]:
-    """qhull's errors as ours."""
-    try:
-        yield
-    except QhullError as error:
-        reason = str(error).splitlines()[0]
-        fail(argument, f"too ill-conditioned for qhull ({reason})", "Rescale the coordinates")
-
-
-def _irredundant(Y: np.ndarray) -> np.ndarray:
-    """Indices of the rows of Y x <= 1 that the others do not imply, by one LP per row."""
-    keep = np.arange(len(Y))
-    for i in range(len(Y)):
-        others = keep[keep != i]
-        # The row itself, loosened, keeps the LP bounded.
-        loosened = np.append(np.ones(len(others)), 2.0)
-        top = maximise(Y[i], *unit_rows(np.vstack([Y[others], Y[i]]), loosened))
-        keep = others if top.value <= 1 + 1e-10 else keep
-    return keep
-
-
-def _distinct(points: np.ndarray, tolerance: float) -> np.ndarray:
-    """Indices of the points, one of each cluster closer than `tolerance`."""
-    close = KDTree(points).query_pairs(tolerance, output_type="ndarray")
-    return np.setdiff1d(np.arange(len(points)), close.max(axis=1, initial=-1))
+def _supports(other: Any, H: np.ndarray) -> np.ndarray:
+    """max H_i w over w in other for each row of H; inf if unbounded."""
+    n = H.shape[1]
+    if isinstance(other, Box | Polytope | Ellipsoid):
+        other.validate("other", n)
+    if isinstance(other, Box):
+        lower, upper = host_array("lower", other.lower), host_array("upper", other.upper)
+        # 0 where a row does not contain the coordinate: 0 * inf would be NaN.
+        ends = np.where(H > 0, upper, np.where(H < 0, lower, 0.0))
+        return (H * ends).sum(axis=1)
+    if isinstance(other, Polytope):
+        return np.array([other.support(row) for row in H])
+    if isinstance(other, Ellipsoid):
+        P, level = other._values()
+        return np.sqrt(level * (H * np.linalg.solve(P, H.T).T).sum(axis=1))
+    points = host_array("other", other)
+    if points.ndim != 2 or points.shape[1] != n or not len(points):
+        fail("other", f"shape {points.shape} is not (k, {n})", "Give a set, or points")
+    require_finite("other", points)
+    return (H @ points.T).max(axis=1)
 
 
 def _as_floats(value: Any) -> Any:
@@ -434,10 +636,14 @@ def _require_shapes(
     if len(shape) != ndim or shape[-1] == 0:
         wanted = "(n,)" if ndim == 1 else "(rows, n)"
         fail(f"{argument}.{names[0]}", f"shape {shape} is not {wanted}", "Give a list or array")
-    if dimension is not None and shape[-1] != dimension:
+    _require_dimension(argument, shape[-1], dimension)
+    require_shape(f"{argument}.{names[1]}", second, shape[:1], f"Match {names[0]}")
+
+
+def _require_dimension(argument: str, given: int, wanted: int | None) -> None:
+    if wanted is not None and given != wanted:
         fail(
             argument,
-            f"has dimension {shape[-1]} where {dimension} is needed",
+            f"has dimension {given} where {wanted} is needed",
             "Bound every coordinate (inf for no bound)",
         )
-    require_shape(f"{argument}.{names[1]}", second, shape[:1], f"Match {names[0]}")

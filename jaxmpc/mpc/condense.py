@@ -1,13 +1,14 @@
 """From an MPC problem to a small dense QP: the states are eliminated ("condensing").
 
 With u_k = K x_k + v_k (K = 0 unless prestabilised) and z = (v_0, …, v_{N−1}) all predictions
-are affine in z and x0:
+are affine in z and in the parameter θ = x_0, or θ = (x_0, u_{−1}) where input rates matter:
 
-    x_k = Φ_k x0 + Γ_k z + φ_k,        u_k = K x_k + v_k.
+    x_k = Φ_k θ + Γ_k z + φ_k,        u_k = K x_k + v_k = Ψ_k θ + Ω_k z + ψ_k.
 
-Every constraint is then a row lower ≤ C z + D x0 + d ≤ upper, in the order inputs (step by
-step), states (step by step), terminal set; the cost is ½ z'Pz + (F x0 + f(reference))'z + const.
-P, F, C, D depend on nothing that moves between samples. Rows at k = 0 have C = 0.
+With a control horizon z holds the free moves only. Every constraint is then a row
+lower ≤ C z + D θ + d ≤ upper, in the order of `rows.blocks`; the cost is
+½ z'Pz + (F θ + f(references))'z + const. P, F, C, D depend on nothing that moves between samples.
+Rows at k = 0 have C = 0 unless they bound inputs.
 """
 
 from dataclasses import dataclass, field, replace
@@ -21,6 +22,7 @@ from jax import Array
 from jaxmpc.checks import concrete, fail
 from jaxmpc.control.riccati import lqr
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.rows import blocks, stacked
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 from jaxmpc.qp.problem import QP
 
@@ -28,12 +30,15 @@ from jaxmpc.qp.problem import QP
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Condensed:
-    """The parametric QP of an MPC problem; `qp(x0)` is its member at one initial state.
+    """The parametric QP of an MPC problem; `qp(theta)` is its member at one initial state.
 
-    Phi (N+1, n, n), Gamma (N+1, n, N·m), phi (N+1, n): predicted states. Psi (N, m, n),
-    Omega (N, m, N·m), psi (N, m): predicted inputs. P (N·m, N·m), F (N·m, n): cost. C, D, d,
-    lower, upper: rows. Q, R, P_N: weights. K (m, n): prestabilising gain. K_N (m, n): gain of the
-    unconstrained input of one more step, u_N = K_N x_N. first_step: first k with state rows.
+    With p = n, or n + m where the previous input counts, and nz variables: Phi (N+1, n, p),
+    Gamma (N+1, n, nz), phi (N+1, n): predicted states. Psi (N, m, p), Omega (N, m, nz), psi (N, m):
+    predicted inputs. P (nz, nz), F (nz, p), f (nz,): cost. C, D, d, lower, upper: rows.
+    soft_linear, soft_quadratic (rows,): weights of soft rows, inf and 0 where hard; None without
+    any. radius: of the terminal ball, whose rows are the last `balls`. Q, R, P_N, W: weights, W of
+    input rates. K (m, n): prestabilising gain. K_N (m, n): gain of the unconstrained input of one
+    more step, u_N = K_N x_N. layout: (kind, steps, rows a step) of each block of rows.
     """
 
     Phi: Array
@@ -50,28 +55,40 @@ class Condensed:
     d: Array
     lower: Array
     upper: Array
+    soft_linear: Any
+    soft_quadratic: Any
+    radius: Any
     Q: Array
     R: Array
     P_N: Array
+    W: Array
     K: Array
     K_N: Array
-    first_step: int = field(metadata={"static": True})
+    layout: tuple[tuple[str, tuple[int, ...], int], ...] = field(metadata={"static": True})
+    balls: tuple[int, ...] = field(metadata={"static": True})
 
-    def qp(self, x0: Array, reference: Array | None = None) -> QP:
-        """QP at x0 (n,). reference (N+1, n): states to track, None for the origin."""
-        q = matmul(self.F, x0) + self.f
+    def qp(self, theta: Array, reference: Any = None, input_reference: Any = None) -> QP:
+        """QP at θ (p,). reference (N+1, n), input_reference (N, m): what to track, None for 0."""
+        q = matmul(self.F, theta) + self.f
         if reference is not None:
             weighted = jnp.concatenate(
                 [matmul(reference[:-1], self.Q), matmul(reference[-1:], self.P_N)]
             )
             q = q - 2 * jnp.einsum("kni,kn->i", self.Gamma, weighted, precision="highest")
-        shift = matmul(self.D, x0) + self.d
-        return QP(P=self.P, q=q, A=self.C, l=self.lower - shift, u=self.upper - shift)
+        if input_reference is not None:
+            weighted = matmul(input_reference, self.R)
+            q = q - 2 * jnp.einsum("kmi,km->i", self.Omega, weighted, precision="highest")
+        shift = matmul(self.D, theta) + self.d
+        return QP(
+            P=self.P, q=q, A=self.C, l=self.lower - shift, u=self.upper - shift,
+            soft_linear=self.soft_linear, soft_quadratic=self.soft_quadratic, radius=self.radius,
+            balls=self.balls,
+        )  # fmt: skip
 
-    def trajectory(self, x0: Array, z: Array) -> tuple[Array, Array]:
-        """States (N+1, n) and inputs (N, m) that z predicts from x0."""
-        states = matmul(self.Phi, x0) + matmul(self.Gamma, z) + self.phi
-        inputs = matmul(self.Psi, x0) + matmul(self.Omega, z) + self.psi
+    def trajectory(self, theta: Array, z: Array) -> tuple[Array, Array]:
+        """States (N+1, n) and inputs (N, m) that z predicts from θ."""
+        states = matmul(self.Phi, theta) + matmul(self.Gamma, z) + self.phi
+        inputs = matmul(self.Psi, theta) + matmul(self.Omega, z) + self.psi
         return states, inputs
 
 
@@ -82,6 +99,8 @@ def prestabilising_gain(mpc: MPC) -> Any:
         return none
     if wish is not None and wish is not True:
         return wish
+    if mpc.control_horizon is not None:
+        return none
     if not concrete(mpc.system.A, mpc.system.B, mpc.Q, mpc.R):
         if wish is True:
             fail("prestabilise", "is True where A, B are traced", "Give the gain K (m, n) itself")
@@ -113,7 +132,7 @@ def in_float64(mpc: MPC) -> MPC:
 @jax.jit
 def _condense(mpc: MPC) -> Condensed:
     system, N = mpc.system, mpc.horizon
-    n, m = system.n, system.m
+    n, m, p = system.n, system.m, mpc.dimension
     dtype = floating_dtype(replace(mpc, prestabilise=None))
     cast = lambda v: jnp.asarray(v, dtype)
     A, B = cast(system.A), cast(system.B)
@@ -121,66 +140,75 @@ def _condense(mpc: MPC) -> Condensed:
     K = cast(mpc.prestabilise)
 
     A_K = A + matmul(B, K)
-    _, Phi = jax.lax.scan(lambda M, _: (matmul(A_K, M), M), jnp.eye(n, dtype=dtype), length=N + 1)
-    response = matmul(Phi[:N], B)  # A_K^j B
+    _, powers = jax.lax.scan(
+        lambda M, _: (matmul(A_K, M), M), jnp.eye(n, dtype=dtype), length=N + 1
+    )
+    response = matmul(powers[:N], B)  # A_K^j B
     lag = np.arange(N + 1)[:, None] - 1 - np.arange(N)[None, :]
     Gamma = jnp.where((lag >= 0)[:, :, None, None], response[np.maximum(lag, 0)], 0.0)
     Gamma = Gamma.transpose(0, 2, 1, 3).reshape(N + 1, n, N * m)
-    drift = matmul(Phi[:N], c)  # A_K^j c
+    drift = matmul(powers[:N], c)  # A_K^j c
     phi = jnp.concatenate([jnp.zeros((1, n), dtype), jnp.cumsum(drift, axis=0)])
+    Phi = jnp.pad(powers, ((0, 0), (0, 0), (0, p - n)))
 
     own = jnp.eye(N * m, dtype=dtype).reshape(N, m, N * m)
     Psi, Omega, psi = matmul(K, Phi[:N]), matmul(K, Gamma[:N]) + own, matmul(phi[:N], K.T)
+    if mpc.control_horizon is not None:  # v = E z: the steps of a block share their move
+        E = np.kron(np.eye(max(mpc.moves) + 1)[list(mpc.moves)], np.eye(m))
+        Gamma, Omega = matmul(Gamma, cast(E)), matmul(Omega, cast(E))
+
+    # Δu_k = u_k − u_{k−1}, with u_{−1} the last m coordinates of θ.
+    previous = jnp.pad(jnp.eye(m, dtype=dtype), ((0, 0), (n, 0))) if p > n else jnp.zeros((m, p))
+    before = (jnp.zeros_like(Omega[0]), cast(previous), jnp.zeros_like(psi[0]))
+    rates = tuple(
+        M - jnp.concatenate([M_0[None], M[:-1]])
+        for M, M_0 in zip((Omega, Psi, psi), before, strict=True)
+    )
 
     Q, R = cast(mpc.Q), cast(mpc.R)
     P_N = jnp.zeros((n, n), dtype) if mpc.terminal_cost is None else cast(mpc.terminal_cost)
+    W = jnp.zeros((m, m), dtype) if mpc.input_rate_weight is None else cast(mpc.input_rate_weight)
+    W = jnp.diag(W) if W.ndim == 1 else W
     weights = jnp.concatenate([jnp.broadcast_to(Q, (N, n, n)), P_N[None]])
-    # Σ_k M_k' W_k X_k with W on the states and R on the inputs: Hessian, its x0 and constant part.
-    form = lambda X, U: (
-        2
-        * (
-            jnp.einsum("kai,kab,kb...->i...", Gamma, weights, X, precision="highest")
-            + jnp.einsum("kai,ab,kb...->i...", Omega, R, U, precision="highest")
-        )
+    product = lambda M, weight, X: jnp.einsum(
+        f"kai,{'kab' if weight.ndim == 3 else 'ab'},kb...->i...", M, weight, X, precision="highest"
     )
-    P = form(Gamma, Omega)
+    # 2 Σ_k M_k' W_k X_k with the weights of states, inputs and rates: Hessian, its θ and constant
+    # part.
+    form = lambda X, U, V: (
+        2 * (product(Gamma, weights, X) + product(Omega, R, U) + product(rates[0], W, V))
+    )
+    if mpc.input_rate_weight is None:
+        form = lambda X, U, V: 2 * (product(Gamma, weights, X) + product(Omega, R, U))
+    P = form(Gamma, Omega, rates[0])
 
     # argmin over u of u'Ru + (Ax + Bu)'P(Ax + Bu).
     BtP = matmul(B.T, P_N)
     K_N = -jnp.linalg.solve(R + matmul(BtP, B), matmul(BtP, A))
 
-    first = 0 if mpc.constrain_initial else 1
-    blocks = [(Omega, Psi, psi, rows_of(mpc.inputs, m, dtype))]
-    blocks.append((Gamma[first:N], Phi[first:N], phi[first:N], rows_of(mpc.states, n, dtype)))
-    blocks.append((Gamma[N:], Phi[N:], phi[N:], rows_of(mpc.terminal_set, n, dtype)))
-    C, D, d, lower, upper = (
-        jnp.concatenate(parts)
-        for parts in zip(*(stack_rows(*block) for block in blocks), strict=True)
+    found = blocks(mpc, dtype)
+    states, inputs = (Gamma, Phi, phi), (Omega, Psi, psi)
+    empty = (
+        jnp.zeros((0, P.shape[0]), dtype),
+        jnp.zeros((0, p), dtype),
+        *[jnp.zeros(0, dtype)] * 3,
     )
+    parts = [empty] + [stacked(b, states, rates if b.rate else inputs) for b in found]
+    C, D, d, lower, upper = (jnp.concatenate(part) for part in zip(*parts, strict=True))
+    linear = quadratic = radius = None
+    if any(b.linear is not None for b in found):
+        spread = lambda name, hard: jnp.concatenate([
+            jnp.tile(jnp.full(b.size, hard, dtype) if b.linear is None else getattr(b, name),
+                     len(b.steps))
+            for b in found
+        ])  # fmt: skip
+        linear, quadratic = spread("linear", jnp.inf), spread("quadratic", 0.0)
+    round_ones = [b for b in found if b.radius is not None]
+    if round_ones:
+        radius = jnp.stack([b.radius for b in round_ones])
     return Condensed(
-        Phi, Gamma, phi, Psi, Omega, psi, (P + P.T) / 2, form(Phi, Psi), form(phi, psi),
-        C, D, d, lower, upper, Q, R, P_N, K, K_N, first,
+        Phi, Gamma, phi, Psi, Omega, psi, (P + P.T) / 2, form(Phi, Psi, rates[1]),
+        form(phi, psi, rates[2]), C, D, d, lower, upper, linear, quadratic, radius, Q, R, P_N, W,
+        K, K_N, tuple((b.kind, b.steps, b.size) for b in found),
+        tuple(b.size for b in round_ones),
     )  # fmt: skip
-
-
-def rows_of(set_: Any, size: int, dtype: Any) -> tuple[Array, Array, Array]:
-    """Two-sided rows (H, lower, upper) of a set in R^size; none for None."""
-    if set_ is None:
-        return jnp.zeros((0, size), dtype), jnp.zeros(0, dtype), jnp.zeros(0, dtype)
-    H, lower, upper = (jnp.asarray(v, dtype) for v in set_.rows())
-    return H, lower, upper
-
-
-def stack_rows(
-    M: Array, by_x0: Array, constant: Array, rows: tuple[Array, Array, Array]
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Rows H v_k with v_k = M_k z + by_x0_k x0 + constant_k for a number of steps, flattened."""
-    H, lower, upper = rows
-    steps = M.shape[0]
-    return (
-        matmul(H, M).reshape(steps * H.shape[0], M.shape[2]),
-        matmul(H, by_x0).reshape(steps * H.shape[0], by_x0.shape[2]),
-        matmul(constant, H.T).reshape(-1),
-        jnp.tile(lower, steps),
-        jnp.tile(upper, steps),
-    )

@@ -1,16 +1,58 @@
 """The constrained MPC problem as a user states it, and the plan that answers it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
 import numpy as np
 from jax import Array
 
-from jaxmpc.checks import concrete, fail, require_shape, require_symmetric_psd
-from jaxmpc.control.sets import Box, Polytope
+from jaxmpc.checks import concrete, fail, require_finite, require_shape, require_symmetric_psd
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.qp.problem import QPSolution
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Soft:
+    """Rows that may be violated at a price (the lesson's section 4):
+
+        C x_k + D u_k ≤ d + ε_k,  ε_k ≥ 0,   cost + ρ Σ ε_k + quadratic Σ ε_k²   (no ½).
+
+    C (p, n), d (p,), rho ρ ≥ 0 and quadratic ≥ 0: numbers or (p,). D (p, m) or None. steps: the
+    k at which the rows hold; None: k = 0..N, with D k = 0..N−1. names, units: of the p rows.
+    For ρ above the greatest multiplier of the hard rows (`exact_penalty`) the plan violates them
+    only where the hard problem has no solution.
+    """
+
+    C: Any
+    d: Any
+    rho: Any = 1e3
+    quadratic: Any = 0.0
+    D: Any = None
+    steps: tuple[int, ...] | None = field(default=None, metadata={"static": True})
+    names: tuple[str, ...] = field(default=(), metadata={"static": True})
+    units: tuple[str, ...] = field(default=(), metadata={"static": True})
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Outputs:
+    """Hard limits of outputs, lower ≤ C x_k + D u_k ≤ upper (±inf for none).
+
+    C (p, n), lower and upper (p,), D (p, m) or None. steps: the k at which they hold; None: those
+    of the state limits, and where the state limits hold at k = N, without D there too. names,
+    units: of the p outputs.
+    """
+
+    C: Any
+    lower: Any
+    upper: Any
+    D: Any = None
+    steps: tuple[int, ...] | None = field(default=None, metadata={"static": True})
+    names: tuple[str, ...] = field(default=(), metadata={"static": True})
+    units: tuple[str, ...] = field(default=(), metadata={"static": True})
 
 
 @jax.tree_util.register_dataclass
@@ -24,11 +66,22 @@ class MPC:
              u_k ∈ inputs (k = 0..N−1),  x_N ∈ terminal_set.
 
     system: LinearSystem. Q (n, n) ⪰ 0, R (m, m) ≻ 0, terminal_cost P (n, n) ⪰ 0 or None (no
-    terminal cost). states: Box, Polytope or None; inputs: Box or None; terminal_set: Box,
-    Polytope or None. prestabilise: gain K (m, n) of the substitution u = Kx + v, which keeps
-    long predictions of unstable plants well-conditioned; True: the LQR gain; False: none; None:
-    the LQR gain where A has an eigenvalue outside the unit circle. It changes rounding, not
-    the problem. Inside `jit` with A as an argument give K itself: None and True read values.
+    terminal cost). states, inputs: Box, Polytope or None; terminal_set: these or an Ellipsoid.
+    constrained_steps: the k in 0..N at which `states` hold, where that is another index set.
+    outputs: `Outputs`, or a tuple of them; soft: `Soft`, or a tuple of them.
+
+    control_horizon: number of free moves m ≤ N, u_k = u_{m−1} from k = m − 1 on, or a tuple of
+    block lengths that add up to N (move blocking). input_rate_weight W: adds Σ Δu_k'W Δu_k,
+    W (m, m) or its diagonal (m,), with Δu_k = u_k − u_{k−1}; input_rate_limit: |Δu_k| ≤ limit,
+    (m,) or a number, or a Box. With either, the previous input u_{−1} is part of the state of the
+    controller: `solve(..., previous_input=)`; in sweeps the states are (x, u_{−1}), n + m in all,
+    if there is a limit.
+
+    prestabilise: gain K (m, n) of the substitution u = Kx + v, which keeps long predictions of
+    unstable plants well-conditioned; True: the LQR gain; False: none; None: the LQR gain where A
+    has an eigenvalue outside the unit circle. It changes rounding, not the problem; with
+    control_horizon there is none. Inside `jit` with A as an argument give K itself: None and True
+    read values.
     """
 
     system: LinearSystem
@@ -36,11 +89,56 @@ class MPC:
     R: Any
     horizon: int = field(metadata={"static": True})
     states: Box | Polytope | None = None
-    inputs: Box | None = None
+    inputs: Box | Polytope | None = None
     terminal_cost: Any = None
-    terminal_set: Box | Polytope | None = None
+    terminal_set: Box | Polytope | Ellipsoid | None = None
     constrain_initial: bool = field(default=True, metadata={"static": True})
     prestabilise: Any = None
+    soft: tuple[Soft, ...] | Soft = ()
+    outputs: tuple[Outputs, ...] | Outputs = ()
+    constrained_steps: tuple[int, ...] | None = field(default=None, metadata={"static": True})
+    control_horizon: int | tuple[int, ...] | None = field(default=None, metadata={"static": True})
+    input_rate_weight: Any = None
+    input_rate_limit: Any = None
+
+    @property
+    def rate_limited(self) -> bool:
+        """True when the feasible set depends on the previous input."""
+        return self.input_rate_limit is not None
+
+    @property
+    def remembers(self) -> bool:
+        """True when the plan depends on the previous input."""
+        return self.rate_limited or self.input_rate_weight is not None
+
+    @property
+    def dimension(self) -> int:
+        """Number of coordinates of the parameter (x_0, u_{−1}) of the problem: n, or n + m."""
+        return self.system.n + (self.system.m if self.remembers else 0)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of these coordinates, with units."""
+        system = self.system
+        previous = tuple(f"previous {label}" for label in system.input_labels)
+        return system.state_labels + (previous if self.remembers else ())
+
+    @property
+    def state_steps(self) -> tuple[int, ...]:
+        """The k at which `states` hold."""
+        if self.constrained_steps is not None:
+            return tuple(sorted(self.constrained_steps))
+        return tuple(range(0 if self.constrain_initial else 1, self.horizon))
+
+    @property
+    def moves(self) -> tuple[int, ...]:
+        """Number of the free move that each of the N inputs is."""
+        blocks, N = self.control_horizon, self.horizon
+        if blocks is None:
+            return tuple(range(N))
+        if isinstance(blocks, int | np.integer):
+            return tuple(min(k, int(blocks) - 1) for k in range(N))
+        return tuple(int(i) for i in np.repeat(np.arange(len(blocks)), blocks))
 
     def validate(self) -> None:
         """Raise ValueError that names the field, its value and the cure, before any compile."""
@@ -60,8 +158,8 @@ class MPC:
             require_symmetric_psd("terminal_cost", self.terminal_cost)
         for name, kinds, size in (
             ("states", (Box, Polytope), n),
-            ("inputs", (Box,), m),
-            ("terminal_set", (Box, Polytope), n),
+            ("inputs", (Box, Polytope), m),
+            ("terminal_set", (Box, Polytope, Ellipsoid), n),
         ):
             value = getattr(self, name)
             if value is None:
@@ -73,6 +171,147 @@ class MPC:
                 value.validate(name, size)
         if self.prestabilise is not None and not isinstance(self.prestabilise, bool):
             require_shape("prestabilise", self.prestabilise, (m, n), "A gain K with u = Kx + v")
+        self._validate_steps()
+        for i, soft in enumerate(_tuple("soft", self.soft, Soft)):
+            self._validate_rows(f"soft[{i}]", soft, ("d",))
+            for name in ("rho", "quadratic"):
+                weight = getattr(soft, name)
+                if np.shape(weight) not in ((), np.shape(soft.d)):
+                    fail(
+                        f"soft[{i}].{name}", f"shape {np.shape(weight)}", "One number, or one a row"
+                    )
+                require_finite(f"soft[{i}].{name}", weight)
+                if concrete(weight) and np.any(np.asarray(weight) < 0):
+                    fail(f"soft[{i}].{name}", f"{weight}", "Penalties are at least 0")
+        for i, outputs in enumerate(_tuple("outputs", self.outputs, Outputs)):
+            self._validate_rows(f"outputs[{i}]", outputs, ("lower", "upper"))
+            if concrete(outputs.lower, outputs.upper):
+                Box(outputs.lower, outputs.upper).validate(f"outputs[{i}]")
+        self._validate_rates()
+
+    def _validate_steps(self) -> None:
+        N = self.horizon
+        self._require_steps("constrained_steps", self.constrained_steps, N)
+        blocks = self.control_horizon
+        if blocks is None:
+            return
+        if self.prestabilise is not None and self.prestabilise is not False:
+            fail("prestabilise", "given beside control_horizon", "Blocked inputs are u, not u − Kx")
+        lengths = blocks if isinstance(blocks, tuple) else (blocks,)
+        whole = all(isinstance(b, int | np.integer) and not isinstance(b, bool) for b in lengths)
+        if not whole or min(lengths, default=0) < 1 or not lengths:
+            fail("control_horizon", f"{blocks!r}", "Give a number of moves, or block lengths")
+        if isinstance(blocks, tuple) and sum(blocks) != N:
+            fail("control_horizon", f"{blocks} adds up to {sum(blocks)}", f"Make it {N} steps")
+        if not isinstance(blocks, tuple) and blocks > N:
+            fail("control_horizon", f"{blocks} moves in {N} steps", f"Give at most {N}")
+
+    def _validate_rows(self, name: str, rows: Any, bounds: tuple[str, ...]) -> None:
+        n, m = self.system.n, self.system.m
+        if np.ndim(rows.C) != 2 or np.shape(rows.C)[1] != n or not np.shape(rows.C)[0]:
+            fail(f"{name}.C", f"shape {np.shape(rows.C)}", f"Give (p, {n}), one column a state")
+        p = np.shape(rows.C)[0]
+        require_finite(f"{name}.C", rows.C)
+        if rows.D is not None:
+            require_shape(f"{name}.D", rows.D, (p, m), "One column an input, or None")
+            require_finite(f"{name}.D", rows.D)
+        for bound in bounds:
+            value = getattr(rows, bound)
+            require_shape(f"{name}.{bound}", value, (p,), "One bound for each row of C")
+            if concrete(value) and np.isnan(np.asarray(value, float)).any():
+                fail(f"{name}.{bound}", "holds NaN", "Use inf where there is no limit")
+        for what in ("names", "units"):
+            if len(getattr(rows, what)) not in (0, p):
+                fail(f"{name}.{what}", f"{len(getattr(rows, what))} for {p} rows", "All or none")
+        last = self.horizon - (rows.D is not None)
+        self._require_steps(f"{name}.steps", rows.steps, last)
+
+    def _require_steps(self, name: str, steps: Any, last: int) -> None:
+        if steps is None:
+            return
+        whole = isinstance(steps, tuple) and all(isinstance(k, int | np.integer) for k in steps)
+        if not whole or len(set(steps)) != len(steps) or not all(0 <= k <= last for k in steps):
+            fail(name, f"{steps!r}", f"Give a tuple of different steps from 0 to {last}")
+
+    def _validate_rates(self) -> None:
+        m, W, limit = self.system.m, self.input_rate_weight, self.input_rate_limit
+        if W is not None:
+            if np.shape(W) not in ((m,), (m, m)):
+                fail("input_rate_weight", f"shape {np.shape(W)}", f"Give ({m}, {m}) or ({m},)")
+            if concrete(W):
+                W = np.asarray(W, float)
+                require_symmetric_psd("input_rate_weight", np.diag(W) if W.ndim == 1 else W)
+        if isinstance(limit, Box):
+            limit.validate("input_rate_limit", m)
+        elif limit is not None:
+            if np.shape(limit) not in ((), (m,)):
+                fail("input_rate_limit", f"shape {np.shape(limit)}", f"Give ({m},) or a Box")
+            if concrete(limit) and not np.all(np.asarray(limit, float) >= 0):
+                fail("input_rate_limit", f"{limit}", "|Δu| ≤ limit needs limit ≥ 0 (inf: none)")
+
+
+def soften(mpc: MPC, rho: Any, quadratic: Any = 0.0) -> MPC:
+    """The same problem with all state, output and terminal rows soft; inputs and rates stay hard.
+
+    rho, quadratic: weights of every row, as in `Soft`. Rows keep their units: a violation is
+    measured as H x − h in the row as given. Raises ValueError for an Ellipsoid as terminal set,
+    which has no rows.
+    """
+    mpc.validate()
+    system, N, soft = mpc.system, mpc.horizon, list(_tuple("soft", mpc.soft, Soft))
+    if isinstance(mpc.terminal_set, Ellipsoid):
+        fail("terminal_set", "is an Ellipsoid, which stays hard", "Use a Polytope inside it")
+
+    def one_sided(
+        C: Any, D: Any, lower: Any, upper: Any, steps: Any, names: Any, units: Any
+    ) -> None:
+        C, lower, upper = (np.asarray(v, np.float64) for v in (C, lower, upper))
+        up, low = np.isfinite(upper), np.isfinite(lower)
+        both = lambda M: np.concatenate([np.asarray(M)[up], -np.asarray(M)[low]])
+        names = [names[i] for i in np.flatnonzero(up)] + [
+            f"-{names[i]}" for i in np.flatnonzero(low)
+        ]
+        units = [units[i] for keep in (up, low) for i in np.flatnonzero(keep)] if units else ()
+        d = np.concatenate([upper[up], -lower[low]])
+        if len(d) and len(steps):
+            D = None if D is None else both(D)
+            soft.append(
+                Soft(both(C), d, rho, quadratic, D, tuple(steps), tuple(names), tuple(units))
+            )
+
+    for kind, set_, steps in (
+        ("state", mpc.states, mpc.state_steps), ("terminal", mpc.terminal_set, (N,))
+    ):  # fmt: skip
+        if set_ is not None:
+            C, lower, upper = set_.rows()
+            names = (
+                set_.labels
+                if isinstance(set_, Polytope)
+                else (system.state_names or tuple(f"x{i + 1}" for i in range(system.n)))
+            )
+            names = names or tuple(f"{kind} row {i + 1}" for i in range(len(lower)))
+            units = system.state_units if isinstance(set_, Box) else ()
+            one_sided(C, None, lower, upper, steps, names, units)
+    for rows in _tuple("outputs", mpc.outputs, Outputs):
+        names = rows.names or tuple(f"output row {i + 1}" for i in range(len(rows.lower)))
+        steps = output_steps(mpc, rows)
+        one_sided(rows.C, rows.D, rows.lower, rows.upper, steps, names, rows.units)
+    return replace(mpc, states=None, terminal_set=None, outputs=(), soft=tuple(soft))
+
+
+def output_steps(mpc: MPC, rows: Outputs) -> tuple[int, ...]:
+    """The k at which output limits hold."""
+    if rows.steps is not None:
+        return rows.steps
+    return tuple(k for k in mpc.state_steps if k < mpc.horizon or rows.D is None)
+
+
+def _tuple(name: str, value: Any, kind: type) -> tuple:
+    """One or several as a tuple; ValueError for anything else."""
+    value = (value,) if isinstance(value, kind) else value
+    if not isinstance(value, tuple | list) or not all(isinstance(v, kind) for v in value):
+        fail(name, f"{type(value).__name__}", f"Give a jm.{kind.__name__}, or a tuple of them")
+    return tuple(value)
 
 
 @jax.tree_util.register_dataclass
@@ -81,13 +320,19 @@ class Multipliers:
     """Lagrange multipliers of a plan, for the cost without ½; y > 0 pushes against the upper
     bound of the row, y < 0 against the lower.
 
-    states (K, r): rows of `states` at the steps where they hold, inputs (N, m), terminal (r_f,).
+    states (K, r): rows of `states` at the steps where they hold, inputs (N, m or rows), terminal
+    (r_f,) (for an Ellipsoid {x'Px ≤ level}: of the rows L'x with P = LL', n of them). outputs and
+    soft: one array (steps, rows) for each of the problem's; rates (N, m).
     dJ*/d(upper bound) = −y where y > 0, dJ*/d(lower bound) = −y where y < 0.
+    `active_constraints` lists them by name, step and unit.
     """
 
     states: Array
     inputs: Array
     terminal: Array
+    outputs: tuple[Array, ...] = ()
+    rates: Any = None
+    soft: tuple[Array, ...] = ()
 
 
 @jax.tree_util.register_dataclass
@@ -95,6 +340,8 @@ class Multipliers:
 class Plan:
     """Answer of `solve`: states (N+1, n), inputs (N, m), cost J (without ½), multipliers, status.
 
+    cost includes what soft rows and input rates pay. slack (N+1, p): violation of the p soft rows,
+    in the order of `mpc.soft`, zero at steps where a row does not hold.
     Unless the status is SOLVED, cost and trajectory are those of the best iterate and mean little.
     The status is that of the QP (`jaxmpc.Status`); residuals are those of the condensed QP in
     the units of states and inputs. `qp` holds the QP's own solution and serves as warm start.
@@ -103,6 +350,7 @@ class Plan:
     states: Array
     inputs: Array
     cost: Array
+    slack: Array
     multipliers: Multipliers
     status: Array
     primal_residual: Array

@@ -9,8 +9,10 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
+from jaxmpc.control.sets import Box
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.problem import MPC, Multipliers, Plan
+from jaxmpc.mpc.rows import blocks
 from jaxmpc.qp.admm import ADMM, Factor
 from jaxmpc.qp.admm import factor as factorise
 from jaxmpc.qp.precision import arrays, matmul
@@ -18,16 +20,22 @@ from jaxmpc.qp.solve import solve_factored
 
 
 def solve(
-    mpc: MPC, x0: Any, reference: Any = None, solver: ADMM = ADMM(), warm_start: Any = None  # noqa: B008
+    mpc: MPC, x0: Any, reference: Any = None, solver: ADMM = ADMM(), warm_start: Any = None, *,  # noqa: B008
+    input_reference: Any = None, previous_input: Any = None,
 ) -> Plan:  # fmt: skip
     """Solve one MPC problem from the state x0 (n,).
 
-    reference: state to track, (n,) or (N+1, n); None for the origin. warm_start: an earlier
-    Plan. `jax.vmap(solve, in_axes=(None, 0))(mpc, x0s)` solves for many states and factors
+    reference: state to track, (n,) or (N+1, n), in place of the origin: the cost becomes
+    Σ (x_k − r_k)'Q(x_k − r_k) + …; constraints, the terminal set too, stay where they are.
+    input_reference: input to track, (m,) or (N, m), such as that of `equilibrium`; None for zero.
+    previous_input: u_{−1} (m,) where the problem limits or weighs input rates; None for zero.
+    warm_start: an earlier Plan.
+
+    `jax.vmap(solve, in_axes=(None, 0))(mpc, x0s)` solves for many states and factors
     once. Raises ValueError for an ill-posed problem or wrong shapes, before any compile; what
     depends on values inside a batch is answered by `plan.status`.
     """
-    return Controller(mpc, solver).plan(x0, reference, warm_start)
+    return Controller(mpc, solver).plan(x0, reference, warm_start, input_reference, previous_input)
 
 
 @jax.tree_util.register_dataclass
@@ -36,8 +44,9 @@ class Controller:
     """An MPC law whose matrices are condensed and factored once, at construction.
 
     `controller(x, carry) -> (u, carry, plan)`: u (m,) is the first input of the plan, clipped
-    into its limits; carry is None at the start and the previous plan afterwards, whose `shifted`
-    form is the warm start. When the plan is not SOLVED, u is still the first input of the best
+    into its limits if these are a Box; carry is None at the start and the previous plan
+    afterwards, whose `shifted` form is the warm start and whose first input is the previous one
+    (zero at the start). When the plan is not SOLVED, u is still the first input of the best
     iterate: look at plan.status. `condensed` and `factor` are filled in at construction: for
     another problem or solver make another Controller, `dataclasses.replace` would keep the old
     ones.
@@ -60,11 +69,19 @@ class Controller:
             object.__setattr__(self, "condensed", condensed)
             object.__setattr__(self, "factor", _factor(condensed, self.solver))
 
-    def __call__(self, x: Any, carry: Plan | None = None) -> tuple[Array, Plan, Plan]:
-        """First input from state x (n,), what to carry to the next sample, and the whole plan."""
-        plan = self.plan(x, warm_start=None if carry is None else self.shifted(carry))
-        u = self._limited(plan.inputs[0])
-        return u, plan, plan
+    def __call__(
+        self, x: Any, carry: Plan | None = None, reference: Any = None, *,
+        input_reference: Any = None, previous_input: Any = None,
+    ) -> tuple[Array, Plan, Plan]:  # fmt: skip
+        """First input from state x (n,), what to carry to the next sample, and the whole plan.
+
+        References and previous_input as in `solve`; previous_input None: what the carry says.
+        """
+        start = None if carry is None else self.shifted(carry)
+        if carry is not None and previous_input is None and self.mpc.remembers:
+            previous_input = self._limited(carry.inputs[0])
+        plan = self.plan(x, reference, start, input_reference, previous_input)
+        return self._limited(plan.inputs[0]), plan, plan
 
     def shifted(self, plan: Plan) -> tuple[Array, Array]:
         """The plan seen one sample later, as a warm start (z, y).
@@ -72,80 +89,152 @@ class Controller:
         Inputs and multipliers move up by one step. The new last input is the unconstrained
         optimum of that step for the terminal cost, inside its limits; its rows push with nothing.
         What bounded x_N through the terminal set bounds it as a state from now on, where both
-        have the same rows.
+        have the same rows. Blocked moves stay as they are.
         """
         c = self.condensed
         assert c is not None
-        u = matmul(c.K_N, plan.states[-1])
-        u = self._limited(u)
-        v = (u - matmul(c.K, plan.states[-1]))[None]
-        z = jnp.concatenate([plan.qp.z.reshape(-1, v.shape[1])[1:], v])
-        y = plan.multipliers
-        same = y.terminal.shape[0] == y.states.shape[1]
-        last = y.terminal[None] if same else jnp.zeros_like(y.states[-1:])
-        blocks = (y.inputs[1:], jnp.zeros_like(y.inputs[:1]), y.states[1:], last[: len(y.states)])
-        return z.ravel(), jnp.concatenate([*(b.ravel() for b in blocks), y.terminal])
+        x = plan.states[-1]
+        moves = plan.qp.z.reshape(-1, c.R.shape[0])
+        if self.mpc.control_horizon is None:
+            v = self._limited(matmul(c.K_N, x)) - matmul(c.K, x)
+            moves = jnp.concatenate([moves[1:], v[None]])
+        parts, terminal = self._split(plan.qp.y), plan.multipliers.terminal
+        for i, (kind, steps, size) in enumerate(c.layout):
+            if kind == "terminal":
+                continue
+            # Step k takes over from k + 1: from the block itself, else from the terminal set.
+            place = {k: j for j, k in enumerate(steps)}
+            same = kind == "state" and not c.balls and terminal.shape[0] == size
+            last = terminal if same else jnp.zeros(size, moves.dtype)
+            source = jnp.concatenate([parts[i], last[None], jnp.zeros((1, size), moves.dtype)])
+            end = len(steps)
+            later = [place.get(k + 1, end if k + 1 == self.mpc.horizon else end + 1) for k in steps]
+            parts[i] = source[np.array(later, int)]
+        return moves.ravel(), jnp.concatenate([*(part.ravel() for part in parts), plan.qp.y[:0]])
 
     def _limited(self, u: Array) -> Array:
         """u inside the input limits: an actuator takes no rounding beyond them."""
-        if self.mpc.inputs is None:
+        if not isinstance(self.mpc.inputs, Box):
             return u
         lower, upper = arrays((self.mpc.inputs.lower, self.mpc.inputs.upper))
         return jnp.clip(u, jnp.asarray(lower, u.dtype), jnp.asarray(upper, u.dtype))
 
-    def plan(self, x0: Any, reference: Any = None, warm_start: Any = None) -> Plan:
+    def plan(
+        self, x0: Any, reference: Any = None, warm_start: Any = None, input_reference: Any = None,
+        previous_input: Any = None,
+    ) -> Plan:  # fmt: skip
         """Plan from x0 (n,); arguments as in `solve`."""
         c = self.condensed
         assert c is not None
-        n, steps = c.Phi.shape[1], c.Phi.shape[0]
+        (steps, n, p), m, dtype = c.Phi.shape, c.R.shape[0], c.P.dtype
         if np.shape(x0) != (n,):
             fail("x0", f"shape {np.shape(x0)}", f"Give one state ({n},); use jax.vmap for many")
-        x0 = jnp.asarray(x0, c.P.dtype)
-        if reference is not None:
-            if np.shape(reference) not in ((n,), (steps, n)):
-                fail("reference", f"shape {np.shape(reference)}", f"Give ({n},) or ({steps}, {n})")
-            reference = jnp.broadcast_to(jnp.asarray(reference, c.P.dtype), (steps, n))
+        theta = jnp.asarray(x0, dtype)
+        if previous_input is not None and np.shape(previous_input) != (m,):
+            fail("previous_input", f"shape {np.shape(previous_input)}", f"Give one input ({m},)")
+        if p > n:
+            previous = jnp.zeros(m, dtype) if previous_input is None else previous_input
+            theta = jnp.concatenate([theta, jnp.asarray(previous, dtype)])
+        tracked = []
+        for name, value, shape in (
+            ("reference", reference, (steps, n)),
+            ("input_reference", input_reference, (steps - 1, m)),
+        ):
+            if value is not None:
+                if np.shape(value) not in (shape[1:], shape):
+                    fail(name, f"shape {np.shape(value)}", f"Give {shape[1:]} or {shape}")
+                value = jnp.broadcast_to(jnp.asarray(value, dtype), shape)
+            tracked.append(value)
         start = warm_start.qp if isinstance(warm_start, Plan) else warm_start
-        return _plan(self, *arrays((x0, reference, start)))
+        return _plan(self, *arrays((theta, *tracked, start)))
 
-    def cost(self, states: Array, inputs: Array, reference: Array | None = None) -> Array:
-        """J (without ½) of a trajectory: states (N+1, n), inputs (N, m)."""
+    def cost(
+        self, states: Array, inputs: Array, reference: Any = None, input_reference: Any = None,
+        previous_input: Any = None,
+    ) -> Array:  # fmt: skip
+        """J (without ½) of a trajectory, states (N+1, n) and inputs (N, m), with what input rates
+        and soft rows pay. previous_input (m,): None for zero."""
         c = self.condensed
         assert c is not None
         error = states if reference is None else states - reference
+        effort = inputs if input_reference is None else inputs - input_reference
         square = lambda v, W: jnp.sum(v * matmul(v, W))
-        return square(error[:-1], c.Q) + square(inputs, c.R) + square(error[-1:], c.P_N)
+        J = square(error[:-1], c.Q) + square(effort, c.R) + square(error[-1:], c.P_N)
+        if self.mpc.input_rate_weight is not None:
+            first = jnp.zeros_like(inputs[0]) if previous_input is None else previous_input
+            J = J + square(jnp.diff(inputs, axis=0, prepend=first[None]), c.W)
+        for block, e in self._violations(states, inputs):
+            J = J + jnp.sum(e * (block.linear + 0.5 * block.quadratic * e))
+        return J
+
+    def slack(self, states: Array, inputs: Array) -> Array:
+        """Violation of the soft rows along a trajectory: (N+1, p), zero where none holds."""
+        columns = [
+            jnp.zeros((len(states), block.size), e.dtype).at[np.array(block.steps, int)].set(e)
+            for block, e in self._violations(states, inputs)
+        ]
+        return jnp.concatenate([jnp.zeros((len(states), 0), states.dtype), *columns], axis=1)
+
+    def _violations(self, states: Array, inputs: Array) -> list[tuple[Any, Array]]:
+        """Each soft block with its violations (steps, rows)."""
+        if self.condensed is None or self.condensed.soft_linear is None:
+            return []
+        found = []
+        for block in blocks(self.mpc, states.dtype):
+            if block.linear is not None:
+                steps = np.array(block.steps, int)
+                value = matmul(states[steps], block.H.T) - block.upper
+                if block.D is not None:
+                    value = value + matmul(inputs[steps], block.D.T)
+                found.append((block, jnp.maximum(value, 0.0)))
+        return found
 
     def multipliers(self, y: Array) -> Multipliers:
         """Sort the QP's multipliers y (rows,) by constraint and step."""
-        mpc, c = self.mpc, self.condensed
+        c = self.condensed
         assert c is not None
-        count = lambda set_: 0 if set_ is None else set_.rows()[0].shape[0]
-        N, steps = mpc.horizon, mpc.horizon - c.first_step
-        ends = np.cumsum([N * count(mpc.inputs), steps * count(mpc.states)])
-        inputs, states, terminal = jnp.split(y, ends)
+        of: dict[str, list[Array]] = {}
+        for (kind, _, _), part in zip(c.layout, self._split(y), strict=True):
+            of.setdefault(kind, []).append(part)
+        empty = lambda *shape: [jnp.zeros(shape, y.dtype)]
         return Multipliers(
-            states=states.reshape(steps, count(mpc.states)),
-            inputs=inputs.reshape(N, count(mpc.inputs)),
-            terminal=terminal,
-        )
+            states=of.get("state", empty(len(self.mpc.state_steps), 0))[0],
+            inputs=of.get("input", empty(self.mpc.horizon, 0))[0],
+            terminal=of.get("terminal", empty(1, 0))[0][0],
+            outputs=tuple(of.get("output", ())), soft=tuple(of.get("soft", ())),
+            rates=of.get("rate", [None])[0],
+        )  # fmt: skip
+
+    def _split(self, y: Array) -> list[Array]:
+        """y (rows,) as one array (steps, rows a step) for each block."""
+        c = self.condensed
+        assert c is not None
+        ends = np.cumsum([len(steps) * size for _, steps, size in c.layout], dtype=int)
+        shapes = [(len(steps), size) for _, steps, size in c.layout]
+        parts = jnp.split(y, ends)[: len(shapes)]
+        return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
 
 
 @jax.jit
 def _factor(condensed: Condensed, solver: ADMM) -> Factor:
-    return factorise(condensed.P, condensed.C, solver)
+    return factorise(condensed.P, condensed.C, solver, condensed.balls)
 
 
 @jax.jit
-def _plan(controller: Controller, x0: Array, reference: Array | None, start: Any) -> Plan:
+def _plan(
+    controller: Controller, theta: Array, reference: Any, input_reference: Any, start: Any
+) -> Plan:
     c = controller.condensed
     assert c is not None and controller.factor is not None
-    qp = c.qp(x0, reference)
+    qp = c.qp(theta, reference, input_reference)
     solution = solve_factored(qp, controller.factor, controller.solver, start)
-    states, inputs = c.trajectory(x0, solution.z)
+    states, inputs = c.trajectory(theta, solution.z)
+    previous = theta[c.Q.shape[0] :] if controller.mpc.remembers else None
     return Plan(
-        states=states, inputs=inputs, cost=controller.cost(states, inputs, reference),
-        multipliers=controller.multipliers(solution.y), status=solution.status,
-        primal_residual=solution.primal_residual, dual_residual=solution.dual_residual,
-        gap=solution.gap, iterations=solution.iterations, qp=solution,
+        states=states, inputs=inputs,
+        cost=controller.cost(states, inputs, reference, input_reference, previous),
+        slack=controller.slack(states, inputs), multipliers=controller.multipliers(solution.y),
+        status=solution.status, primal_residual=solution.primal_residual,
+        dual_residual=solution.dual_residual, gap=solution.gap, iterations=solution.iterations,
+        qp=solution,
     )  # fmt: skip

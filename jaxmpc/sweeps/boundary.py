@@ -11,13 +11,12 @@ from typing import Any
 import jax
 import numpy as np
 from jax import Array
-from scipy.optimize import linprog
 
 from jaxmpc.checks import fail
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.sweeps import proofs
-from jaxmpc.sweeps.ladder import HIGHS, Rows, bounding_box, cut_of, inputs_of, rows, support
-from jaxmpc.sweeps.proofs import Problem, View, make_view
+from jaxmpc.sweeps.ladder import Rows, Tangents, bounding_box, cut_of, inputs_of, rows, support
+from jaxmpc.sweeps.proofs import Problem, View, hard_part, make_view
 
 # How far a boundary point is pulled towards the centre before it is proved: the least that works.
 PULLS = 10.0 ** np.arange(-14, -1)
@@ -55,6 +54,7 @@ def boundary(
     empty or flat, or the centre is not inside it.
     """
     mpc.validate()
+    mpc = hard_part(mpc)
     view = make_view(mpc, axes, fixed)
     d = len(view.axes)
     if isinstance(directions, int | np.integer):
@@ -85,6 +85,7 @@ class Rays:
 
     def __init__(self, mpc: MPC, view: View, center: np.ndarray | None = None) -> None:
         self.rows = rows(mpc, view)
+        self.tangents = Tangents(self.rows)
         self.center, self.w = self._centre(center)
         extent, self.sides = bounding_box(self.rows, np.abs(self.center))
         self.problem = proofs.problem(mpc, view, extent)
@@ -94,14 +95,14 @@ class Rays:
         U, D = self.rows.U, self.rows.D
         k, d = U.shape[1], D.shape[1]
         size = np.linalg.norm(np.hstack([U, D]), axis=1)
-        A = np.block([[U, D, size[:, None]], [-U, -D, size[:, None]]])
-        b = np.concatenate([self.rows.upper, -self.rows.lower])
-        keep = np.isfinite(b)
         pinned = [(None, None)] * d if center is None else [(v, v) for v in np.asarray(center)]
-        largest = max(1.0, np.abs(b[keep]).max(initial=0.0))
-        result = linprog(
-            -np.eye(k + d + 1)[-1], A_ub=A[keep], b_ub=b[keep],
-            bounds=[(None, None)] * k + pinned + [(None, largest)], options=HIGHS,
+        ends = np.concatenate([self.rows.upper, self.rows.lower])
+        largest = max(1.0, np.abs(ends[np.isfinite(ends)]).max(initial=0.0))
+        if self.rows.balls:
+            size[-sum(self.rows.balls) :] = size[-sum(self.rows.balls) :].max()
+        result, _ = self.tangents.solve(
+            np.eye(k + d + 1)[-1], np.hstack([U, D, np.zeros((len(U), 1))]), self.rows.lower,
+            self.rows.upper, [(None, None)] * k + pinned + [(None, largest)], size,
         )  # fmt: skip
         if result.x is None or result.x[-1] <= 1e-9:
             if center is not None:
@@ -122,7 +123,7 @@ class Rays:
 
     def shoot(self, directions: np.ndarray) -> Boundary:
         """Solve, pull and prove along every direction (K, d)."""
-        solved = [support(self.rows, direction, self.center) for direction in directions]
+        solved = [support(self.rows, d, self.center, self.tangents) for d in directions]
         t, w, y = (np.array(part) for part in zip(*solved, strict=True))
         bounded = np.isfinite(t)
         # Shrinking a feasible pair (θ, w) towards the centre's pair gives every row a margin.

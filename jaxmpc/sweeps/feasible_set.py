@@ -10,7 +10,7 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from jaxmpc.checks import fail
-from jaxmpc.control.sets import Polytope, hull_volume
+from jaxmpc.control.sets import Ellipsoid, Polytope, hull_volume
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
 from jaxmpc.sweeps import proofs
@@ -24,13 +24,15 @@ from jaxmpc.sweeps.compiled import (
     require_step_type,
 )
 from jaxmpc.sweeps.ladder import Verdict, admm_rung, bounding_box, newton_rung, rows
-from jaxmpc.sweeps.proofs import make_view
+from jaxmpc.sweeps.proofs import hard_part, make_view
 
 # Newton steps between two attempts at a proof, and how often; the decided leave in between.
 # What resists all of them gets a longer ADMM run and Newton once more.
 NEWTON_STEPS = 8
 NEWTON_ROUNDS = 8
 LONGER = 20
+# Rays that `refine` shoots in one round at most.
+MOST_RAYS = 2000
 # Volumes are sums of rounded products; bounds are widened by more than that.
 VOLUME_ROUNDING = 1e-11
 
@@ -76,7 +78,7 @@ class Labels:
     @classmethod
     def empty(cls, count: int, mpc: MPC, d: int) -> "Labels":
         """Labels of `count` points (d,) that have not been run."""
-        n, m, horizon = mpc.system.n, mpc.system.m, mpc.horizon
+        n, m, horizon = hard_part(mpc).dimension, mpc.system.m, mpc.horizon
         return cls(
             np.zeros(count, np.int8), np.full(count, Status.NOT_RUN, np.int8),
             np.full((count, n), np.nan), np.full((count, horizon, m), np.nan),
@@ -105,6 +107,7 @@ def label_chunks(
 ) -> Iterator[tuple[slice, Labels]]:  # fmt: skip
     """Label points chunk by chunk; yields (slice of the points, Labels). See `map_feasible_set`."""
     mpc.validate()
+    mpc = hard_part(mpc)
     view = make_view(mpc, axes, fixed)
     d = len(view.axes)
     points = np.asarray(points, np.float64)
@@ -169,7 +172,7 @@ class FeasibleSetMap:
     @classmethod
     def of(cls, mpc: MPC, points: Any, axes: Any, fixed: Any, labels: Labels) -> "FeasibleSetMap":
         """A map from labels that were made elsewhere, by chunks or from a store."""
-        view = make_view(mpc, axes, fixed)
+        view = make_view(hard_part(mpc), axes, fixed)
         d = len(view.axes)
         fixed = None if fixed is None else np.asarray(fixed, float)
         none = np.zeros((0, d)), np.zeros((0, d)), np.zeros(0)
@@ -188,7 +191,7 @@ class FeasibleSetMap:
     @property
     def names(self) -> tuple[str, ...]:
         """Labels of the mapped states with their units."""
-        return tuple(self.mpc.system.state_labels[i] for i in self.axes)
+        return tuple(hard_part(self.mpc).labels[i] for i in self.axes)
 
     def counts(self) -> dict[str, int]:
         """How many points are feasible, infeasible, undecided, not finite, not run."""
@@ -245,17 +248,24 @@ class FeasibleSetMap:
         return low, high
 
     def terminal_section(self) -> Polytope | None:
-        """The terminal set in the mapped states (slice or all states), None where there is none."""
+        """The terminal set in the mapped states (slice or all states), None where there is none.
+
+        An Ellipsoid is given as a polygon of 256 of its boundary points, in two mapped states.
+        """
         set_ = self.mpc.terminal_set
-        others = [i for i in range(self.mpc.system.n) if i not in self.axes]
-        if set_ is None or (others and self.fixed is None):
+        n = hard_part(self.mpc).dimension
+        others = [i for i in range(n) if i not in self.axes]
+        if set_ is None or n > self.mpc.system.n or (others and self.fixed is None):
             return None
+        rest = np.zeros(0) if self.fixed is None else np.asarray(self.fixed)[others]
+        axes = list(self.axes)
+        if isinstance(set_, Ellipsoid):
+            return ellipse(
+                np.asarray(set_.P, float), float(np.asarray(set_.level)), axes, others, rest
+            )
         body = set_ if isinstance(set_, Polytope) else set_.to_polytope()
         H, h = np.asarray(body.H, float), np.asarray(body.h, float)
-        if others:
-            assert self.fixed is not None
-            h = h - H[:, others] @ self.fixed[others]
-        return Polytope(H[:, list(self.axes)], h)
+        return Polytope(H[:, axes], h - H[:, others] @ rest)
 
     def refine(self, tolerance: float = 1e-6, rounds: int = 30) -> "FeasibleSetMap":
         """Shoot rays at the vertices of the outer polytope until the volume bounds meet.
@@ -265,10 +275,11 @@ class FeasibleSetMap:
         are labelled infeasible. tolerance: relative gap of the volume bounds at which to stop.
         A set without interior, or unbounded, is returned as it is.
         """
-        view = make_view(self.mpc, self.axes, self.fixed)
+        mpc = hard_part(self.mpc)
+        view = make_view(mpc, self.axes, self.fixed)
         d = len(self.axes)
         try:
-            rays = Rays(self.mpc, view)
+            rays = Rays(mpc, view)
         except ValueError:
             return self
         directions = np.concatenate([np.eye(d), -np.eye(d), -np.ones((1, d))])
@@ -288,7 +299,8 @@ class FeasibleSetMap:
                 directions = outer.vertices() - rays.center
             except ValueError:  # unbounded, or too thin for qhull
                 break
-            if high - low <= tolerance * high:
+            # Sets with a curved boundary have no end of vertices.
+            if high - low <= tolerance * high or len(directions) > MOST_RAYS:
                 break
         labels = excluded(self.labels, rays, self.points, normals, offsets, roundings)
         return replace(
@@ -314,10 +326,29 @@ class FeasibleSetMap:
         system = self.mpc.system
         names = {
             "coordinate": list(self.names),
-            "state": list(system.state_labels),
+            "state": list(hard_part(self.mpc).labels),
             "input": list(system.input_labels),
         }
         return xarray.Dataset(data, coords=names)
+
+
+def ellipse(
+    P: np.ndarray, level: float, axes: list[int], others: list[int], rest: np.ndarray
+) -> Polytope | None:
+    """Polygon in the section {y: (y, rest)'P(y, rest) ≤ level}; None unless y has two entries.
+
+    With S the block of P at y, c = −S⁻¹ P_yo rest and α = level − rest'P_oo rest + c'S c the
+    section is (y − c)'S(y − c) ≤ α.
+    """
+    S, cross = P[np.ix_(axes, axes)], P[np.ix_(axes, others)] @ rest
+    centre = -np.linalg.solve(S, cross)
+    inside = level - rest @ P[np.ix_(others, others)] @ rest + centre @ S @ centre
+    if len(axes) != 2 or inside <= 0:
+        return None
+    angle = 2 * np.pi * np.arange(256) / 256
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    points = np.sqrt(inside) * np.linalg.solve(np.linalg.cholesky(S).T, circle).T
+    return Polytope.from_points(centre + points)
 
 
 def excluded(
@@ -364,7 +395,7 @@ def map_feasible_set(
         mpc, points, axes=axes, fixed=fixed, iterations=iterations, dtype=dtype, chunk=chunk
     )
     mpc.validate()
-    labels = Labels.empty(len(points), mpc, len(make_view(mpc, axes, fixed).axes))
+    labels = Labels.empty(len(points), mpc, len(make_view(hard_part(mpc), axes, fixed).axes))
     with tqdm(total=len(points), unit="pt", disable=not progress) as bar:
         for here, part in chunks:
             labels = joined(labels, here, part)

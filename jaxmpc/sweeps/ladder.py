@@ -8,7 +8,7 @@ goes to `proofs.py`.
 """
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -40,8 +40,10 @@ class Rows:
     not, and in a projection the free states) can do to the normalised rows; back (nz, k) leads
     from w to the variables. A row that nothing moves (k = 0; Euler's q₁ does not feel u₀) has
     U = 0: a half-space on θ alone. weight (R,) brings multipliers to the units of the problem's
-    rows, and index says where the multiplier of each state and terminal row of the problem
-    stands among the R (R where there is none). Psi, Omega, psi: inputs from θ and the variables.
+    rows, and index says where the multiplier of each row of `proofs.Problem` (step by step, then
+    terminal rows, then those of the terminal ellipsoid) stands among the R (R where there is
+    none). The last `balls` rows are those of the ellipsoid: |v − lower| ≤ radius. Psi, Omega, psi:
+    inputs from θ and the variables.
     """
 
     U: Any
@@ -54,20 +56,28 @@ class Rows:
     Psi: Any
     Omega: Any
     psi: Any
+    radius: Any
+    balls: tuple[int, ...] = field(metadata={"static": True})
+
+    def bounds(self, theta: Array) -> Bounds:
+        """What θ leaves for U w."""
+        shift = matmul(jnp.asarray(self.D), theta)
+        return Bounds(self.lower - shift, self.upper - shift, radius=self.radius, balls=self.balls)
 
 
 def rows(mpc: MPC, view: View) -> Rows:
     """Condense, restrict to the view and normalise; all on the host in float64."""
     with jax.enable_x64(True):
-        c = jax.tree.map(np.asarray, condense(in_float64(mpc)))
+        c = jax.tree.map(np.asarray, condense(in_float64(proofs.hard_part(mpc))))
     axes, others = list(view.axes), list(view.others)
     C, D, lower, upper = c.C, c.D[:, axes], c.lower - c.d, c.upper - c.d
     Psi, Omega, psi = c.Psi[:, :, axes], c.Omega, c.psi
-    if view.projects:
+    extra = 0
+    if view.projects:  # rows of the free states' box come first
         extra = len(others)
-        C = np.block([[C, c.D[:, others]], [np.zeros((extra, C.shape[1])), np.eye(extra)]])
-        D = np.concatenate([D, np.zeros((extra, len(axes)))])
-        lower, upper = np.append(lower, view.lower), np.append(upper, view.upper)
+        C = np.block([[np.zeros((extra, C.shape[1])), np.eye(extra)], [C, c.D[:, others]]])
+        D = np.concatenate([np.zeros((extra, len(axes))), D])
+        lower, upper = np.append(view.lower, lower), np.append(view.upper, upper)
         Omega = np.concatenate([Omega, c.Psi[:, :, others]], axis=2)
     elif others:
         rest = np.asarray(view.fixed)[others]
@@ -78,50 +88,120 @@ def rows(mpc: MPC, view: View) -> Rows:
     still = norm <= 1e-13 * norm.max(initial=0.0)
     C = np.where(still[:, None], 0.0, C)
     keep = np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
-    size = np.where(still, np.linalg.norm(D, axis=1), norm)[keep]
+    size = np.where(still, np.linalg.norm(D, axis=1), norm)
+    first = len(size) - sum(c.balls)
+    if c.balls:  # one scale for all rows of the ball
+        moved = norm[first:].max() > 0
+        size[first:] = norm[first:].max() if moved else np.linalg.norm(D[first:], axis=1).max()
+    size = size[keep]
     weight = 1 / np.where(size > 0, size, 1.0)
     U, singular, Vt = np.linalg.svd(weight[:, None] * C[keep], full_matrices=False)
     rank = int(np.sum(singular > 1e-12 * singular.max(initial=0.0)))
     U, back = U[:, :rank], Vt[:rank].T / singular[:rank]
 
-    n_inputs = 0 if mpc.inputs is None else mpc.horizon * mpc.system.m
-    n_rows = len(c.lower) - n_inputs
-    index = np.full(n_rows, len(keep))
-    ours = (keep >= n_inputs) & (keep < len(c.lower))
-    index[keep[ours] - n_inputs] = np.flatnonzero(ours)
+    place = np.full(len(lower), len(keep))
+    place[keep] = np.arange(len(keep))
     return Rows(
         U, back, weight[:, None] * D[keep], weight * lower[keep], weight * upper[keep], weight,
-        index, Psi, Omega, psi,
+        multiplier_index(mpc, c.layout, place[extra:], len(keep)), Psi, Omega, psi,
+        weight[-1:] * c.radius if c.balls else None, c.balls,
     )  # fmt: skip
 
 
+def multiplier_index(mpc: MPC, layout: tuple[Any, ...], place: np.ndarray, none: int) -> np.ndarray:
+    """`Rows.index`. place: where each row of the condensed QP stands among those that are kept."""
+    N, offset, hard = mpc.horizon, 0, proofs.hard_blocks(proofs.hard_part(mpc))
+    columns, last, ball = [], [np.zeros(0, int)], np.zeros(0, int)
+    for block, (_, steps, size) in zip(hard, layout, strict=True):
+        table = np.full((N + 1, size), none)
+        table[list(steps)] = place[offset : offset + len(steps) * size].reshape(-1, size)
+        offset += len(steps) * size
+        if proofs.absorbed(mpc, block):
+            continue
+        if block.radius is not None:
+            ball = table[N]
+            continue
+        if any(k < N for k in steps):
+            columns.append(table[:N])
+        if N in steps:
+            last.append(table[N])
+    by_step = np.concatenate([np.zeros((N, 0), int), *columns], axis=1)
+    return np.concatenate([by_step.ravel(), *last, ball])
+
+
+class Tangents:
+    """A linear program over rows, one of which may be a ball: tangent planes until they suffice.
+
+    The ball |v| ≤ radius is the intersection of its tangent half-spaces n'v ≤ radius. Those found
+    for one program serve the next (Kelley 1960).
+    """
+
+    def __init__(self, rows: Rows) -> None:
+        self.rows, k = rows, sum(rows.balls)
+        self.normals = np.concatenate([np.eye(k), -np.eye(k)])
+
+    def solve(
+        self, cost: np.ndarray, U: np.ndarray, lower: np.ndarray, upper: np.ndarray,
+        bounds: list[Any], margin: np.ndarray | None = None,
+    ) -> tuple[Any, np.ndarray]:  # fmt: skip
+        """max cost'x over lower ≤ U x ≤ upper and the ball: HiGHS' result, multipliers (R,).
+
+        margin (R,): the last variable times this is kept from every bound.
+        """
+        balls, R = sum(self.rows.balls), len(lower)
+        flat = slice(0, R - balls)
+        size = np.zeros(R) if margin is None else margin
+        up, low = U[flat].copy(), -U[flat]
+        up[:, -1] += size[flat]
+        low[:, -1] += size[flat]
+        high, has_low = np.isfinite(upper[flat]), np.isfinite(lower[flat])
+        A = np.concatenate([up[high], low[has_low]])
+        b = np.concatenate([upper[flat][high], -lower[flat][has_low]])
+        radius = float(self.rows.radius[0]) if balls else 0.0
+        for _ in range(200):
+            planes = self.normals @ U[R - balls :]
+            planes[:, -1] += size[-1] if balls else 0.0
+            reach = radius + self.normals @ lower[R - balls :]
+            result = linprog(
+                -cost, A_ub=np.concatenate([A, planes]), b_ub=np.append(b, reach), bounds=bounds,
+                options=HIGHS,
+            )  # fmt: skip
+            if result.x is None or not balls:
+                break
+            v = U[R - balls :] @ result.x - lower[R - balls :]
+            kept = radius - size[-1] * result.x[-1]
+            length = np.linalg.norm(v)
+            if length <= kept + 10 * HIGHS["primal_feasibility_tolerance"] * radius:
+                break
+            self.normals = np.concatenate([self.normals, v[None] / length])
+        y = np.zeros(R)
+        if result.x is not None:
+            push, first, second = -result.ineqlin.marginals, high.sum(), len(A)
+            y[flat][high] += push[:first]
+            y[flat][has_low] -= push[first:second]
+            y[R - balls :] = push[second : second + len(planes)] @ self.normals[: len(planes)]
+        return result, y
+
+
 def support(
-    rows: Rows, direction: np.ndarray, center: np.ndarray | None = None
+    rows: Rows, direction: np.ndarray, center: np.ndarray | None = None, tangents: Any = None
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Without a centre max direction'θ over the set; with one max t ≥ 0 on center + t·direction.
 
     Returns the optimum (inf: unbounded, −inf: empty), w, and the multipliers of the rows (HiGHS).
     """
     R, k = rows.U.shape
-    bounds: list[Any]
-    low, high = np.isfinite(rows.lower), np.isfinite(rows.upper)
     if center is None:
-        A, shift = np.hstack([rows.U, rows.D]), np.zeros(R)
-        cost, bounds = np.append(np.zeros(k), direction), [(None, None)] * A.shape[1]
+        U, shift = np.hstack([rows.U, rows.D]), np.zeros(R)
+        cost, low = np.append(np.zeros(k), direction), None
     else:
-        A, shift = np.hstack([rows.U, (rows.D @ direction)[:, None]]), rows.D @ center
-        cost, bounds = np.append(np.zeros(k), 1.0), [(None, None)] * k + [(0, None)]
-    result = linprog(
-        -cost, A_ub=np.vstack([A[high], -A[low]]),
-        b_ub=np.concatenate([(rows.upper - shift)[high], (shift - rows.lower)[low]]),
-        bounds=bounds, options=HIGHS,
-    )  # fmt: skip
-    y = np.zeros(R)
+        U, shift = np.hstack([rows.U, (rows.D @ direction)[:, None]]), rows.D @ center
+        cost, low = np.append(np.zeros(k), 1.0), 0
+    bounds = [(None, None)] * k + [(low, None)] * (U.shape[1] - k)
+    program = Tangents(rows) if tangents is None else tangents
+    result, y = program.solve(cost, U, rows.lower - shift, rows.upper - shift, bounds)
     if result.x is None:
         return -np.inf if result.status == 2 else np.inf, np.zeros(k), y
-    push = -result.ineqlin.marginals
-    y[high] += push[: high.sum()]
-    y[low] -= push[high.sum() :]
     return float(-result.fun), result.x[:k], y
 
 
@@ -159,8 +239,9 @@ def inputs_of(p: Problem, rows: Rows, theta: Array, w: Array) -> tuple[Array, Ar
 def cut_of(p: Problem, rows: Rows, y: Array) -> tuple[Array, Array, Array]:
     """The half-space (a, b, rounding) that multipliers y (R,) of the rows give."""
     y = jnp.append(y * rows.weight, 0.0)[jnp.asarray(rows.index)]
-    steps, r = p.horizon - p.first_step, p.H.shape[0]
-    return proofs.cut(p, y[: steps * r].reshape(steps, r), y[steps * r :])
+    staged, last = p.horizon * p.H.shape[0], p.H_N.shape[0]
+    y_states, y_N, y_ball = jnp.split(y, [staged, staged + last])
+    return proofs.cut(p, y_states.reshape(p.horizon, p.H.shape[0]), y_N, y_ball)
 
 
 def judge(p: Problem, rows: Rows, theta: Array, w: Array, candidates: list[Array]) -> Verdict:
@@ -190,14 +271,20 @@ def admm_rung(iterations: int, dtype: Any) -> Compiled:
         l = (jnp.asarray(rows.lower)[:, None] - shift).astype(dtype)
         u = (jnp.asarray(rows.upper)[:, None] - shift).astype(dtype)
 
+        project = lambda t: jnp.clip(t, l, u)
+        if rows.balls:
+            radius = jnp.asarray(rows.radius, dtype)
+            one = lambda t, l, u: Bounds(l, u, radius=radius, balls=rows.balls).project(t, 1.0)
+            project = lambda t: jax.vmap(one, in_axes=1, out_axes=1)(t, l, u)
+
         def step(t, _=None):
-            s = jnp.clip(t, l, u)
+            s = project(t)
             return t + ALPHA * (matmul(U, matmul(U.T, 2 * s - t)) - s), None
 
-        before, _ = jax.lax.scan(step, jnp.clip(jnp.zeros_like(l), l, u), length=iterations - 1)
+        before, _ = jax.lax.scan(step, project(jnp.zeros_like(l)), length=iterations - 1)
         t, _ = step(before)
-        excess = lambda t: t - jnp.clip(t, l, u)
-        w = matmul(U.T, jnp.clip(t, l, u) - excess(t))
+        excess = lambda t: t - project(t)
+        w = matmul(U.T, project(t) - excess(t))
         change = excess(t) - excess(before)
         verdict = jax.vmap(lambda *a: judge(p, rows, a[0], a[1], [a[2], a[3]]))(
             points, w.T, change.T, excess(t).T
@@ -216,12 +303,14 @@ def newton_rung(steps: int) -> Compiled:
         U = jnp.asarray(rows.U)
 
         def one(theta: Array, w: Array) -> tuple[Verdict, Array]:
-            shift = matmul(jnp.asarray(rows.D), theta)
-            l, u = rows.lower - shift, rows.upper - shift
+            bounds = rows.bounds(theta)
+            l, u = bounds.l, bounds.u
             # The nearest feasible w lies on a face, where a roll-out has no margin for its
             # rounding: aim a little inside. Cuts are judged on the true bounds all the same.
             inset = jnp.minimum(INSET * (1 + jnp.fmin(jnp.abs(l), jnp.abs(u))), (u - l) / 4)
-            inner = Bounds(l + inset, u - inset)
+            inner = replace(bounds, l=l + inset, u=u - inset)
+            if rows.balls:
+                inner = replace(inner, radius=bounds.radius * (1 - INSET))
             w, e = least_distance(U, inner, w.astype(jnp.float64), steps)
             return judge(p, rows, theta, w, [e]), w
 

@@ -7,7 +7,7 @@ gathered, and Newton goes on with these until they are solved or proved infeasib
 
 import functools
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -22,12 +22,13 @@ from jaxmpc.mpc.solve import Controller
 from jaxmpc.qp.admm import ADMM, Factor, iterate, read, scaled
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.refine import polish
-from jaxmpc.qp.solve import assess, cleaned, marked, prove, unscaled
+from jaxmpc.qp.solve import assess, cleaned, marked, prove, solve_factored, unscaled
 from jaxmpc.qp.status import Status
 from jaxmpc.sweeps.compiled import Compiled, default_chunk, gather_size, padded, require_step_type
 
 NEWTON_STEPS = 4
 NEWTON_ROUNDS = 8
+LAST_STEPS = 60
 
 
 @dataclass(frozen=True)
@@ -51,14 +52,18 @@ def solve_many(
 ) -> Plans:  # fmt: skip
     """Solve the MPC problem from each state x0s (B, n) to residuals of solver.eps in float64.
 
+    Where input rates are limited or weighted x0s may be (B, n + m), with the previous inputs in the
+    last columns; (B, n) takes them as zero. The plans track the origin.
+
     dtype: type of the ADMM iterates; polish, residuals and status are float64 whatever it is.
     `solver.refine` is not used: Newton steps go where they are needed. A state with NaN gets
     status NON_FINITE. Raises ValueError for wrong shapes and ill-posed problems.
     """
     mpc.validate()
     x0s = np.asarray(x0s, np.float64)
-    if x0s.ndim != 2 or x0s.shape[1] != mpc.system.n:
+    if x0s.ndim != 2 or x0s.shape[1] not in (mpc.system.n, mpc.dimension):
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.system.n})")
+    x0s = np.pad(x0s, ((0, 0), (0, mpc.dimension - x0s.shape[1])))
     require_step_type(dtype)
     chunk = default_chunk() if chunk is None else chunk
     if chunk < 1:
@@ -94,6 +99,12 @@ def one_chunk(
             better = newton_rung(controller, *(padded(v, gathered) for v in (x[batch], w, y)))
             for old, new in zip(answer, better, strict=True):
                 old[batch] = new[: len(batch)]
+    left = np.flatnonzero(answer[2] == Status.ITERATION_LIMIT)
+    for i in range(0, len(left), gathered):
+        batch = left[i : i + gathered]
+        better = last_rung(controller, padded(x[batch], gathered))
+        for old, new in zip(answer, better, strict=False):
+            old[batch] = new[: len(batch)]
     return tuple(answer[:-2])
 
 
@@ -136,6 +147,22 @@ def newton_rung(controller: Controller, x: Array, w: Array, y: Array) -> tuple[A
     return jax.vmap(one)(x, w, y)
 
 
+@Compiled
+@jax.jit
+def last_rung(controller: Controller, x: Array) -> tuple[Array, ...]:
+    """Compiled: the whole solver with many refinement steps, for the few states still open."""
+    f = controller.factor
+    assert f is not None
+    solver = replace(controller.solver, refine=LAST_STEPS)
+
+    def one(x0: Array) -> tuple[Array, ...]:
+        qp, _ = program(controller, x0)
+        s = solve_factored(qp, f, solver)
+        return results(controller, x0, s)
+
+    return jax.vmap(one)(x)
+
+
 def program(controller: Controller, x0: Array) -> tuple[QP, Array]:
     """The QP at x0, made harmless where x0 is not finite."""
     assert controller.condensed is not None
@@ -147,13 +174,19 @@ def finish(
     proofs: list[Array], steps: int,
 ) -> tuple[Array, ...]:  # fmt: skip
     """Polish, judge, and lay out: inputs, cost, status, three residuals, and (w, y) to go on."""
-    c = controller.condensed
-    assert c is not None
     q, bounds = scaled(f, qp)
     end = polish(f.H, q, f.A, bounds, w, y, steps)
     proof = prove(qp, f, [*proofs, end.change], [end.move])
     pair = unscaled(qp, f, end.w, end.y)
     s: QPSolution = marked(assess(qp, pair, proof, controller.solver), finite)
+    return *results(controller, x0, s), end.w, end.y
+
+
+def results(controller: Controller, x0: Array, s: QPSolution) -> tuple[Array, ...]:
+    """What `Plans` holds of a solution."""
+    c = controller.condensed
+    assert c is not None
     states, inputs = c.trajectory(x0, s.z)
-    cost = controller.cost(states, inputs)
-    return inputs, cost, s.status, s.primal_residual, s.dual_residual, s.gap, end.w, end.y
+    previous = x0[c.Q.shape[0] :] if controller.mpc.remembers else None
+    cost = controller.cost(states, inputs, previous_input=previous)
+    return inputs, cost, s.status, s.primal_residual, s.dual_residual, s.gap

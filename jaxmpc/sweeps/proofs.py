@@ -1,25 +1,31 @@
 """Proofs that a state is feasible or infeasible, evaluated in float64 and safe against rounding.
 
-Both work on the exact data of the problem (A, B, c and the sets), not on condensed matrices.
+Both work on the exact data of the problem (A, B, c and the sets), not on condensed matrices. Where
+input rates are limited x stands for (x, u_{k−1}). Soft rows are no constraints and play no part.
 
 *Feasible*: inputs clipped into their limits are rolled out, x_{k+1} = A x_k + B u_k + c, with a
 running bound on the rounding error, ε_{k+1} = |A| ε_k + γ(|A||x_k| + |B||u_k| + |c|). Every
 row must hold with a margin no less than |H| ε_k plus the rounding of the row's own product.
 
-*Infeasible*: for any multipliers y_k of the rows H_k x_k the costates p_N = H_N'y_N,
-p_k = A'p_{k+1} + H_k'y_k satisfy Σ y_k'H_k x_k = p_0'x_0 + Σ (B'p_{k+1})'u_k + c'p_{k+1} along
-every trajectory; with σ the support function of each set this bounds every feasible x_0,
+*Infeasible*: for any multipliers y_k of the rows H x_k + D u_k the costates p_N = H_N'y_N,
+p_k = A'p_{k+1} + H'y_k satisfy Σ y_k'(H x_k + D u_k) = p_0'x_0 + Σ (B'p_{k+1} + D'y_k)'u_k +
+c'p_{k+1} along every trajectory; with σ the support function of each set this bounds every
+feasible x_0,
 
-    p_0'x_0 ≤ Σ_k σ(y_k) + Σ_k [σ_U(−B'p_{k+1}) − c'p_{k+1}].
+    p_0'x_0 ≤ Σ_k σ(y_k) + Σ_k [σ_U(−B'p_{k+1} − D'y_k) − c'p_{k+1}].
+
+Inputs that must be equal (a control horizon) share one σ_U of their sum. A terminal ellipsoid
+{x'Px ≤ α} adds Pw to p_N and its support √(α w'Pw), for any w.
 
 No property of y is needed, so any iterate gives a valid half-space; a converged one gives a
 tight one. (Neumaier & Shcherbina 2004: the input limits absorb the dual residual.) Rounding
-moves p_k by at most γ(|A|'|p_{k+1}| + |H_k|'|y_k|), which meets |x_k| ≤ reach_k. Where the
+moves p_k by at most γ(|A|'|p_{k+1}| + |H|'|y_k|), which meets |x_k| ≤ reach_k. Where the
 limits leave x_0 unbounded, reach_0 is twice the extent that LPs find (`ladder.extent`); this is
-the one figure that is taken from a solver, and it only scales the rounding bound.
+the one figure that is taken from a solver, and it only scales the rounding bound. The same holds
+for the box round a polytope of inputs.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -28,8 +34,9 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.control.sets import Box, Polytope
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.rows import Block, blocks
 
 UNIT_ROUNDOFF = 2.0**-53
 # Covers products that underflow; data smaller than this are not told from zero.
@@ -72,7 +79,7 @@ def make_view(mpc: MPC, axes: Any = None, fixed: Any = None) -> View:
     axes: indices or names of the mapped states, None for all. fixed: values (n,) of all states
     (those at `axes` are ignored) for a slice, None for a projection along the others.
     """
-    n = mpc.system.n
+    n = mpc.dimension
     names = list(mpc.system.state_names)
     axes = tuple(range(n)) if axes is None else tuple(axes)
     axes = tuple(names.index(i) if isinstance(i, str) and i in names else i for i in axes)
@@ -87,86 +94,164 @@ def make_view(mpc: MPC, axes: Any = None, fixed: Any = None) -> View:
         require_finite("fixed", np.asarray(fixed, float)[list(others)])
         fixed = np.asarray(fixed, np.float64)
         return View(axes, others, np.where(np.isin(np.arange(n), others), fixed, 0.0), None, None)
-    lower, upper = bounding_box(mpc.states if mpc.constrain_initial and others else None, n)
+    constrained = others and 0 in mpc.state_steps
+    sides = bounding_box(mpc.states if constrained else None, mpc.system.n)
+    if n > mpc.system.n:  # a previous input is one that could be applied
+        limits = bounding_box(mpc.inputs, mpc.system.m)
+        sides = (np.append(sides[0], limits[0]), np.append(sides[1], limits[1]))
+    lower, upper = sides
     return View(axes, others, None, lower[list(others)], upper[list(others)])
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Problem:
-    """The constraints of an MPC problem as float64 arrays: exact data for proofs.
+    """The hard constraints of an MPC problem as float64 arrays: exact data for proofs.
 
-    H, lower, upper: state rows (r rows) that hold at k = first_step..N−1; the same with
-    suffix _N at k = N. u_lower, u_upper (m,). reach (N+1, n): |x_k| ≤ reach_k on every feasible
-    trajectory.
+    lower_k ≤ H x_k + D u_k ≤ upper_k for k < N: H (r, n), D (r, m), lower and upper (N, r), ±inf at
+    steps where a row does not hold. lower_N ≤ H_N x_N ≤ upper_N. P, level: terminal ellipsoid
+    x'Px ≤ level, None without; back (n, rows) leads from multipliers of its rows L'x to w.
+    u_lower, u_upper (m,): a box round the inputs. reach (N+1, n): |x_k| ≤ reach_k on every feasible
+    trajectory. moves: number of the free move that each input is.
     """
 
     A: Any
     B: Any
     c: Any
     H: Any
+    D: Any
     lower: Any
     upper: Any
     H_N: Any
     lower_N: Any
     upper_N: Any
+    P: Any
+    level: Any
+    back: Any
     u_lower: Any
     u_upper: Any
     reach: Any
     view: View
-    horizon: int = field(metadata={"static": True})
-    first_step: int = field(metadata={"static": True})
+    moves: tuple[int, ...] = field(metadata={"static": True})
+
+    @property
+    def horizon(self) -> int:
+        """N."""
+        return len(self.moves)
+
+
+def hard_part(mpc: MPC) -> MPC:
+    """The problem without soft rows and rate weights, which have no part in what is feasible."""
+    return replace(mpc, soft=(), input_rate_weight=None)
+
+
+def dynamics(mpc: MPC) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A, B, c of x⁺ = Ax + Bu + c, for (x, u_{−1}) where input rates are limited."""
+    to64 = lambda v: np.asarray(v, np.float64)
+    n, m = mpc.system.n, mpc.system.m
+    A, B = to64(mpc.system.A), to64(mpc.system.B)
+    c = np.zeros(n) if mpc.system.c is None else to64(mpc.system.c)
+    if mpc.rate_limited:
+        A = np.block([[A, np.zeros((n, m))], [np.zeros((m, n + m))]])
+        B, c = np.concatenate([B, np.eye(m)]), np.concatenate([c, np.zeros(m)])
+    return A, B, c
+
+
+def hard_blocks(mpc: MPC) -> list[Block]:
+    """Hard blocks as float64 host arrays; those of rates written as rows of (x, u_{−1}) and u."""
+    with jax.enable_x64(True):
+        found = blocks(mpc, np.float64)
+    to64 = lambda v: np.asarray(v, np.float64)
+    n, m, p = mpc.system.n, mpc.system.m, mpc.dimension
+    hard = []
+    for b in found:
+        r = b.size
+        H = np.zeros((r, p))
+        D = np.zeros((r, m)) if b.D is None else to64(b.D)
+        if b.rate:
+            H[:, n:] = -D
+        elif b.H is not None:
+            H[:, :n] = to64(b.H)
+        if b.linear is None:
+            lower, upper = to64(b.lower), to64(b.upper)
+            hard.append(replace(b, H=H, D=D, lower=lower, upper=upper))
+    return hard
+
+
+def absorbed(mpc: MPC, block: Block) -> bool:
+    """True for input limits that the clip and the support function look after: those of a box."""
+    return block.kind == "input" and isinstance(mpc.inputs, Box)
 
 
 def problem(mpc: MPC, view: View, extent: np.ndarray) -> Problem:
     """Collect the exact data. extent (d,): |θ| ≤ extent for every feasible θ."""
-    to64 = lambda v: np.asarray(v, np.float64)
-    n, m, N = mpc.system.n, mpc.system.m, mpc.horizon
-    A, B = to64(mpc.system.A), to64(mpc.system.B)
-    c = np.zeros(n) if mpc.system.c is None else to64(mpc.system.c)
-    rows = lambda set_: (
-        tuple(to64(v) for v in set_.rows())
-        if set_ is not None
-        else (np.zeros((0, n)), np.zeros(0), np.zeros(0))
-    )
-    H, lower, upper = rows(mpc.states)
-    H_N, lower_N, upper_N = rows(mpc.terminal_set)
-    u_lower = np.full(m, -np.inf) if mpc.inputs is None else to64(mpc.inputs.lower)
-    u_upper = np.full(m, np.inf) if mpc.inputs is None else to64(mpc.inputs.upper)
+    n, m, N, p = mpc.system.n, mpc.system.m, mpc.horizon, mpc.dimension
+    A, B, c = dynamics(mpc)
+    u_lower, u_upper = bounding_box(mpc.inputs, m)
+    H, D, lower, upper = [np.zeros((0, p))], [np.zeros((0, m))], [], []
+    H_N, lower_N, upper_N = [np.zeros((0, p))], [np.zeros(0)], [np.zeros(0)]
+    for b in hard_blocks(mpc):
+        if absorbed(mpc, b) or b.radius is not None:
+            continue
+        if any(k < N for k in b.steps):
+            holds = np.isin(np.arange(N), b.steps)[:, None]
+            H, D = [*H, b.H], [*D, b.D]
+            lower.append(np.where(holds, b.lower, -np.inf))
+            upper.append(np.where(holds, b.upper, np.inf))
+        if N in b.steps:
+            H_N, lower_N, upper_N = [*H_N, b.H], [*lower_N, b.lower], [*upper_N, b.upper]
+    P = level = back = None
+    if isinstance(mpc.terminal_set, Ellipsoid):
+        P = np.zeros((p, p))
+        P[:n, :n] = np.asarray(mpc.terminal_set.P, np.float64)
+        level = np.asarray(mpc.terminal_set.level, np.float64)
+        back = np.zeros((p, n))
+        back[:n] = np.linalg.inv(np.linalg.cholesky(P[:n, :n])).T
 
-    first = 0 if mpc.constrain_initial else 1
-    start = np.full(n, np.inf)
+    start = np.full(p, np.inf)
     start[list(view.axes)] = extent
     if view.projects:
         start[list(view.others)] = np.maximum(np.abs(view.lower), np.abs(view.upper))
     elif view.others:
         start[list(view.others)] = np.abs(view.fixed)[list(view.others)]
-    size, size_N = (
-        np.abs(bounding_box(set_, n)).max(axis=0) for set_ in (mpc.states, mpc.terminal_set)
-    )
     u_size = np.maximum(np.abs(u_lower), np.abs(u_upper))
-    reach = [np.minimum(start, size) if first == 0 else start]
+
+    def size(k: int) -> np.ndarray:
+        bound = np.full(p, np.inf)
+        sets = [mpc.states] if k in mpc.state_steps else []
+        for set_ in [*sets, mpc.terminal_set] if k == N else sets:
+            bound[:n] = np.minimum(bound[:n], np.abs(boxes[id(set_)]).max(axis=0))
+        return bound
+
+    boxes = {id(set_): bounding_box(set_, n) for set_ in (mpc.states, mpc.terminal_set)}
+    reach = [np.minimum(start, size(0))]
     for k in range(1, N + 1):
         with np.errstate(invalid="ignore"):  # 0·inf below counts as 0
             moved = np.nansum(np.abs(A) * reach[-1], axis=1) + np.abs(c)
             moved = moved + np.nansum(np.abs(B) * u_size, axis=1)
         # One part in 10⁹ outweighs the rounding of this recursion.
-        moved = moved * (1 + 1e-9)
-        reach.append(np.minimum(moved, size if k < N else size_N))
+        reach.append(np.minimum(moved * (1 + 1e-9), size(k)))
+    every_step = lambda parts: np.concatenate([np.zeros((N, 0)), *parts], axis=1)
     return Problem(
-        A, B, c, H, lower, upper, H_N, lower_N, upper_N, u_lower, u_upper, np.array(reach),
-        view, N, first,
+        A, B, c, np.concatenate(H), np.concatenate(D), every_step(lower), every_step(upper),
+        np.concatenate(H_N), np.concatenate(lower_N), np.concatenate(upper_N), P, level, back,
+        u_lower, u_upper, np.array(reach), view, mpc.moves,
     )  # fmt: skip
 
 
-def bounding_box(set_: Box | Polytope | None, n: int) -> tuple[np.ndarray, np.ndarray]:
+def bounding_box(set_: Box | Polytope | Ellipsoid | None, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Bounds (n,) of each coordinate on a set; a polytope's by LP, a part in 10⁶ outwards."""
     if set_ is None:
         return np.full(n, -np.inf), np.full(n, np.inf)
     if isinstance(set_, Box):
         return np.asarray(set_.lower, np.float64), np.asarray(set_.upper, np.float64)
-    upper = np.array([set_.support(row) for row in np.eye(n)])
-    lower = -np.array([set_.support(row) for row in -np.eye(n)])
+    if isinstance(set_, Ellipsoid):
+        inverse = np.linalg.inv(np.asarray(set_.P, np.float64))
+        upper = np.sqrt(np.asarray(set_.level, np.float64) * np.diag(inverse))
+        lower = -upper
+    else:
+        upper = np.array([set_.support(row) for row in np.eye(n)])
+        lower = -np.array([set_.support(row) for row in -np.eye(n)])
     margin = 1e-6 * (1e-6 + np.maximum(np.abs(lower), np.abs(upper)))
     return lower - margin, upper + margin
 
@@ -182,48 +267,63 @@ def row_gamma(H: Array) -> Array:
     return jnp.where(exact, 0.0, gamma(H.shape[1] + 1))
 
 
+def first_of_block(moves: tuple[int, ...]) -> np.ndarray:
+    """For each step the first step that has the same move."""
+    return np.searchsorted(np.array(moves), np.array(moves))
+
+
 def prove_feasible(p: Problem, theta: Array, free: Array, inputs: Array) -> tuple[Array, Array]:
     """Roll out inputs (N, m) from the point θ: (proved, inputs clipped into their limits).
 
     All arithmetic in float64. Not proved means only that this input sequence is no proof.
     """
     n, m = p.B.shape
-    inputs = jnp.clip(inputs, p.u_lower, p.u_upper)
+    inputs = jnp.clip(inputs, p.u_lower, p.u_upper)[first_of_block(p.moves)]
     x = p.view.initial_state(theta, free)
     A, B, c = jnp.asarray(p.A), jnp.asarray(p.B), jnp.asarray(p.c)
+    rows, rows_N = jnp.concatenate([p.H, p.D], axis=1), jnp.asarray(p.H_N)
     # Twice the first-order bound covers the rounding of the bound itself.
     growth = 2 * gamma(n + m + 2)
 
     def holds(H, lower, upper, x, error):
-        value = jnp.asarray(H) @ x
+        value = H @ x
         size = jnp.abs(H) @ error * (1 + 1e-9) + 2 * row_gamma(H) * (jnp.abs(H) @ jnp.abs(x))
         return jnp.all((value + size <= upper) & (value - size >= lower))
 
-    def advance(carry, u):
-        x, error = carry
-        inside = holds(p.H, p.lower, p.upper, x, error)
+    def advance(carry, step):
+        (x, error), (u, lower, upper) = carry, step
+        here = jnp.concatenate([x, u]), jnp.concatenate([error, jnp.zeros_like(u)])
+        inside = holds(rows, lower, upper, *here)
         bound = jnp.abs(A) @ jnp.abs(x) + jnp.abs(B) @ jnp.abs(u) + jnp.abs(c)
         error = jnp.abs(A) @ error * (1 + 1e-9) + growth * bound + TINY
         return (A @ x + B @ u + c, error), inside
 
-    (x, error), inside = jax.lax.scan(advance, (x, jnp.zeros_like(x)), inputs)
-    proved = jnp.all(inside[p.first_step :]) & holds(p.H_N, p.lower_N, p.upper_N, x, error)
+    steps = (inputs, jnp.asarray(p.lower), jnp.asarray(p.upper))
+    (x, error), inside = jax.lax.scan(advance, (x, jnp.zeros_like(x)), steps)
+    proved = jnp.all(inside) & holds(rows_N, p.lower_N, p.upper_N, x, error)
+    if p.P is not None:
+        # (x + e)'P(x + e) ≤ x'Px + 2|x|'|P|ε + ε'|P|ε for |e| ≤ ε.
+        size = jnp.abs(p.P)
+        spread = (2 * jnp.abs(x) + error) @ (size @ error) * (1 + 1e-9)
+        spread = spread + 2 * gamma(2 * n + 2) * (jnp.abs(x) @ (size @ jnp.abs(x)))
+        proved = proved & (x @ (p.P @ x) + spread <= p.level)
     return proved & jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(inputs)), inputs
 
 
-def cut(p: Problem, y_states: Array, y_N: Array) -> tuple[Array, Array, Array]:
+def cut(p: Problem, y_states: Array, y_N: Array, y_ball: Array) -> tuple[Array, Array, Array]:
     """The half-space a'θ ≤ b, valid for every feasible θ, that multipliers give.
 
-    y_states (N − first_step, r) and y_N (r_N,): y > 0 on the upper bound, y < 0 on the lower.
+    y_states (N, r) and y_N (r_N,): y > 0 on the upper bound, y < 0 on the lower. y_ball: of the
+    rows L'x of the terminal ellipsoid P = LL', any length without one.
     Returns a (d,), b and the part of b that covers rounding; b = inf where nothing can be said.
     The multipliers are scaled to about one first; any multipliers give a valid half-space.
     """
     n, m = p.B.shape
     N, r = p.horizon, p.H.shape[0]
-    A, B, c, H = (jnp.asarray(v) for v in (p.A, p.B, p.c, p.H))
-    largest = jnp.max(jnp.abs(y_states), initial=0.0) + jnp.max(jnp.abs(y_N), initial=0.0)
+    A, B, c, H, D = (jnp.asarray(v) for v in (p.A, p.B, p.c, p.H, p.D))
+    parts = (y_states, y_N, y_ball) if p.P is not None else (y_states, y_N)
+    largest = sum(jnp.max(jnp.abs(y), initial=0.0) for y in parts)
     scale = jnp.exp2(-jnp.floor(jnp.log2(jnp.where(largest > 0, largest, 1.0))))
-    y_states = jnp.concatenate([jnp.zeros((p.first_step, r)), y_states * scale])
 
     def support(y, lower, upper):  # Σ u y⁺ − l y⁻, and the same with |u|, |l|
         y = jnp.where(jnp.isposinf(upper), jnp.minimum(y, 0.0), y)
@@ -235,35 +335,45 @@ def cut(p: Problem, y_states: Array, y_N: Array) -> tuple[Array, Array, Array]:
         return jnp.sum(jnp.where(weight == 0, 0.0, weight * size))
 
     y_N, total, size = support(y_N * scale, p.lower_N, p.upper_N)
-    moved = jnp.abs(p.H_N).T @ jnp.abs(y_N)
+    p_N, moved = jnp.asarray(p.H_N).T @ y_N, jnp.abs(p.H_N).T @ jnp.abs(y_N)
+    if p.P is not None:
+        w = jnp.asarray(p.back) @ (y_ball * scale)
+        # The rounding of w'Pw is added before the root, that of the root itself with the rest.
+        squared = jnp.abs(w) @ (jnp.abs(p.P) @ jnp.abs(w))
+        squared = jnp.maximum(w @ (p.P @ w), 0.0) + 2 * gamma(2 * n + 2) * squared
+        value = jnp.sqrt(p.level * squared)
+        p_N, moved = p_N + p.P @ w, moved + jnp.abs(p.P) @ jnp.abs(w)
+        total, size = total + value, size + value
     size = size + times(moved, p.reach[N])
 
     def back(carry, step):
         p_next, total, size = carry
-        y, reach = step
-        push = -(B.T @ p_next)
-        y, row_total, row_size = support(y, p.lower, p.upper)
-        u = jnp.where(push > 0, p.u_upper, jnp.where(push < 0, p.u_lower, 0.0))
-        u_size = jnp.maximum(jnp.abs(p.u_lower), jnp.abs(p.u_upper))
+        y, lower, upper, reach = step
+        y, row_total, row_size = support(y, lower, upper)
         moved = jnp.abs(A).T @ jnp.abs(p_next) + jnp.abs(H).T @ jnp.abs(y)
-        total = total + row_total + jnp.sum(push * u) - c @ p_next
+        total = total + row_total - c @ p_next
         size = size + row_size + times(moved, reach) + jnp.abs(c) @ jnp.abs(p_next)
-        size = size + times(jnp.abs(B).T @ jnp.abs(p_next), u_size)
-        return (A.T @ p_next + H.T @ y, total, size), None
+        push = -(B.T @ p_next) - D.T @ y
+        pushed = jnp.abs(B).T @ jnp.abs(p_next) + jnp.abs(D).T @ jnp.abs(y)
+        return (A.T @ p_next + H.T @ y, total, size), (push, pushed)
 
-    start = (jnp.asarray(p.H_N).T @ y_N, total, size)
-    (p_0, total, size), _ = jax.lax.scan(
-        back, start, (y_states, jnp.asarray(p.reach[:N])), reverse=True
-    )
+    steps = (y_states * scale, jnp.asarray(p.lower), jnp.asarray(p.upper), jnp.asarray(p.reach[:N]))
+    (p_0, total, size), (push, pushed) = jax.lax.scan(back, (p_N, total, size), steps, reverse=True)
+    same = np.equal.outer(np.arange(max(p.moves) + 1), np.array(p.moves)).astype(float)
+    push = push if len(same) == N else same @ push
+    u = jnp.where(push > 0, p.u_upper, jnp.where(push < 0, p.u_lower, 0.0))
+    total = total + jnp.sum(jnp.where(push == 0, 0.0, push * u))
+    size = size + times(pushed, jnp.maximum(jnp.abs(p.u_lower), jnp.abs(p.u_upper)))
+
     axes, others = np.array(p.view.axes), np.array(p.view.others, int)
     a, rest = p_0[axes], p_0[others]
     if p.view.projects:  # the other states may take any value in their box
         value = jnp.where(rest < 0, p.view.upper, jnp.where(rest > 0, p.view.lower, 0.0))
     else:
         value = jnp.zeros(len(others)) if p.view.fixed is None else p.view.fixed[others]
-    total = total - jnp.sum(rest * value)
+    total = total - jnp.sum(jnp.where(rest == 0, 0.0, rest * value))
     size = size + times(jnp.abs(rest), jnp.abs(value))
-    terms = N * (r + m + 3) + 2 * n + p.H_N.shape[0] + 8
+    terms = N * (r + 2 * m + 4) + 4 * n + p.H_N.shape[0] + 12
     rounding = 2 * gamma(terms) * size + TINY
     b = total + rounding
     # 0'θ ≤ b says nothing, unless b < 0: then no θ at all is feasible.

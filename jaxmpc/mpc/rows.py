@@ -1,0 +1,247 @@
+"""All constraints of an MPC problem as blocks of rows, in the order of the condensed QP.
+
+A block asks lower ≤ H x_k + D v_k ≤ upper at some steps k, with v_k = u_k or, for rates,
+v_k = u_k − u_{k−1}. The order is inputs, states, outputs, rates, soft rows, terminal set; within
+a block step by step. The condensed QP, the proofs and the names of multipliers are all made from
+this one list.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import fail
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope
+from jaxmpc.mpc.problem import MPC, Outputs, Plan, Soft, output_steps
+from jaxmpc.qp.precision import matmul
+
+
+@dataclass(frozen=True)
+class Block:
+    """lower ≤ H x_k + D v_k ≤ upper at `steps`: H (r, n) or None, D (r, m) or None.
+
+    rate: v_k is Δu_k. linear, quadratic (r,): weights c e + ½ k e² of a violation e where the rows
+    are soft, None where they are hard. radius: the rows are those of a ball |H x| ≤ radius.
+    """
+
+    kind: str
+    H: Any
+    D: Any
+    lower: Any
+    upper: Any
+    steps: tuple[int, ...]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    rate: bool = False
+    linear: Any = None
+    quadratic: Any = None
+    radius: Any = None
+
+    @property
+    def size(self) -> int:
+        """Rows at each step."""
+        return len(self.names)
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one row of the condensed QP stands for.
+
+    kind: "input", "state", "output", "rate", "soft" or "terminal". step: its k. name, unit: of the
+    quantity that is bounded. index: of the row within its block. soft: whether it may be violated.
+    """
+
+    kind: str
+    step: int
+    name: str
+    unit: str
+    index: int
+    soft: bool
+
+
+def blocks(mpc: MPC, dtype: Any) -> list[Block]:
+    """The blocks of a problem; arrays in `dtype`. Traceable in every array of `mpc`."""
+    system, N, found = mpc.system, mpc.horizon, []
+    n, m = system.n, system.m
+    cast = lambda v: jnp.asarray(v, dtype)
+    state_names = system.state_names or tuple(f"x{i + 1}" for i in range(n))
+    input_names = system.input_names or tuple(f"u{i + 1}" for i in range(m))
+
+    def add(kind: str, H: Any, D: Any, lower: Any, upper: Any, steps: Any, names: Any, units: Any,
+            **more: Any) -> None:  # fmt: skip
+        H, D = (None if M is None else cast(M) for M in (H, D))
+        r = (H if D is None else D).shape[0]
+        names = tuple(names) or tuple(f"{kind} row {i + 1}" for i in range(r))
+        units = tuple(units) or ("",) * r
+        found.append(
+            Block(kind, H, D, cast(lower), cast(upper), tuple(steps), names, units, **more)
+        )
+
+    def described(set_: Box | Polytope, names: Any, units: Any) -> tuple[Any, Any]:
+        return (set_.labels, ()) if isinstance(set_, Polytope) else (names, units)
+
+    if mpc.inputs is not None:
+        D, lower, upper = mpc.inputs.rows()
+        texts = described(mpc.inputs, input_names, system.input_units)
+        add("input", None, D, lower, upper, range(N), *texts)
+    if mpc.states is not None:
+        H, lower, upper = mpc.states.rows()
+        texts = described(mpc.states, state_names, system.state_units)
+        add("state", H, None, lower, upper, mpc.state_steps, *texts)
+    for rows in (mpc.outputs,) if isinstance(mpc.outputs, Outputs) else mpc.outputs:
+        steps = output_steps(mpc, rows)
+        add("output", rows.C, rows.D, rows.lower, rows.upper, steps, rows.names, rows.units)
+    if mpc.rate_limited:
+        limit: Any = mpc.input_rate_limit
+        if not isinstance(limit, Box):
+            limit = Box(-jnp.broadcast_to(cast(limit), (m,)), jnp.broadcast_to(cast(limit), (m,)))
+        units = tuple(f"{unit}/step" for unit in system.input_units)
+        names = tuple(f"rate of {name}" for name in input_names)
+        add(
+            "rate",
+            None,
+            limit.rows()[0],
+            limit.lower,
+            limit.upper,
+            range(N),
+            names,
+            units,
+            rate=True,
+        )
+    for soft in (mpc.soft,) if isinstance(mpc.soft, Soft) else mpc.soft:
+        every = range(N + 1) if soft.D is None else range(N)
+        d = cast(soft.d)
+        weight = lambda w, d=d: jnp.broadcast_to(cast(w), d.shape)
+        add(
+            "soft", soft.C, soft.D, jnp.full_like(d, -jnp.inf), d,
+            every if soft.steps is None else soft.steps, soft.names, soft.units,
+            linear=weight(soft.rho), quadratic=2 * weight(soft.quadratic),
+        )  # fmt: skip
+    last = mpc.terminal_set
+    if isinstance(last, Ellipsoid):  # x'Px = |L'x|²
+        L = jnp.linalg.cholesky(cast(last.P))
+        names = ("terminal ellipsoid",) * n
+        zero, radius = jnp.zeros(n, dtype), jnp.sqrt(cast(last.level))
+        add("terminal", L.T, None, zero, zero, (N,), names, (), radius=radius)
+    elif last is not None:
+        H, lower, upper = last.rows()
+        add(
+            "terminal",
+            H,
+            None,
+            lower,
+            upper,
+            (N,),
+            *described(last, state_names, system.state_units),
+        )
+    return found
+
+
+def row_table(mpc: MPC) -> tuple[Row, ...]:
+    """One entry for each row of the condensed QP, in its order."""
+    mpc.validate()
+    return tuple(
+        Row(b.kind, k, b.names[i], b.units[i], i, b.linear is not None)
+        for b in blocks(mpc, float)
+        for k in b.steps
+        for i in range(b.size)
+    )
+
+
+def stacked(
+    block: Block, states: tuple[Array, ...], inputs: tuple[Array, ...]
+) -> tuple[Array, Array, Array, Array, Array]:
+    """(C, D, d, lower, upper) of a block: its rows are C z + D θ + d.
+
+    states (Γ, Φ, φ): x_k = Γ_k z + Φ_k θ + φ_k. inputs: the same for v_k.
+    """
+    steps, r = np.array(block.steps, int), block.size
+    parts = []
+    for x, v in zip(states, inputs, strict=True):
+        part: Any = 0.0
+        if block.H is not None:
+            part = part + _each(block.H, x[steps])
+        if block.D is not None:
+            part = part + _each(block.D, v[steps])
+        parts.append(part.reshape((len(steps) * r, *x.shape[2:])))
+    repeat = lambda v: jnp.tile(v, len(steps))
+    return (*parts, repeat(block.lower), repeat(block.upper))
+
+
+def _each(H: Array, M: Array) -> Array:
+    """H M_k, or H v_k for vectors, for every step."""
+    return matmul(H, M) if M.ndim == 3 else matmul(M, H.T)
+
+
+@dataclass(frozen=True)
+class ActiveConstraint:
+    """One limit that shapes a plan.
+
+    constraint: kind of the row (see `Row`). name, unit: of the quantity that is bounded. step: its
+    k. bound: "upper" or "lower". multiplier > 0: by how much the least cost J (without ½) falls for
+    each unit that this one bound is relaxed. For an ellipsoid bound is "radius", the root of its
+    level. violation: how far a soft row is broken.
+    """
+
+    constraint: str
+    name: str
+    unit: str
+    step: int
+    bound: str
+    multiplier: float
+    violation: float = 0.0
+
+    def __str__(self) -> str:
+        unit = f" per {self.unit}" if self.unit else ""
+        broken = f", broken by {self.violation:.3g} {self.unit}".rstrip() if self.violation else ""
+        name = (
+            self.name if self.name.startswith(self.constraint) else f"{self.constraint} {self.name}"
+        )
+        return f"{name}, {self.bound} at k = {self.step}: {self.multiplier:.6g}{unit}{broken}"
+
+
+def active_constraints(
+    mpc: MPC, plan: Plan, tolerance: float = 1e-6
+) -> tuple[ActiveConstraint, ...]:
+    """The limits with a multiplier above `tolerance`, largest first (the lesson's problem 1).
+
+    plan: of `mpc`, one instance. The multiplier of a bound is the sensitivity of the optimal cost:
+    dJ*/d(bound) = −multiplier for an upper bound, +multiplier for a lower one. Host.
+    """
+    y = np.asarray(plan.qp.y, np.float64)
+    table = row_table(mpc)
+    if y.shape != (len(table),):
+        fail("plan", f"has {y.shape} multipliers, mpc {len(table)} rows", "Give one plan of mpc")
+    found = []
+    last = isinstance(mpc.terminal_set, Ellipsoid)
+    slack = np.asarray(plan.slack)
+    column = soft_columns(mpc)
+    for i, (row, value) in enumerate(zip(table, y, strict=True)):
+        if abs(value) > tolerance and not (last and row.kind == "terminal"):
+            broken = slack[row.step, column[i]] if row.soft else 0.0
+            found.append(
+                ActiveConstraint(
+                    row.kind, row.name, row.unit, row.step, "upper" if value > 0 else "lower",
+                    float(abs(value)), float(broken),
+                )
+            )  # fmt: skip
+    if last:
+        push = float(np.linalg.norm(np.asarray(plan.multipliers.terminal)))
+        if push > tolerance:
+            found.append(ActiveConstraint("terminal", "ellipsoid", "", mpc.horizon, "radius", push))
+    return tuple(sorted(found, key=lambda constraint: -constraint.multiplier))
+
+
+def soft_columns(mpc: MPC) -> dict[int, int]:
+    """Column of `Plan.slack` for each soft row of the condensed QP."""
+    offset, first, columns = 0, 0, {}
+    for b in blocks(mpc, float):
+        if b.linear is not None:
+            for j in range(len(b.steps) * b.size):
+                columns[offset + j] = first + j % b.size
+            first += b.size
+        offset += len(b.steps) * b.size
+    return columns

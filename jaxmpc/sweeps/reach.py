@@ -1,0 +1,198 @@
+"""One step of a controller as a polytope: states, feasible plans, and where their first move leads.
+
+A state θ and a plan z are one vector v = (θ, z); the hard rows of the condensed problem are a
+polytope G v ≤ g of such pairs, and the state after the first move is θ⁺ = M v + t. The feasible
+set is the shadow of this polytope on θ; "every first move" and "some first move" are linear
+programs over it. Host, float64, HiGHS.
+"""
+
+import time
+from dataclasses import dataclass
+from functools import cached_property
+
+import jax
+import numpy as np
+
+from jaxmpc.checks import fail
+from jaxmpc.control.sets import Polytope, maximise
+from jaxmpc.mpc.condense import condense, in_float64
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.sweeps.proofs import hard_part
+
+# Bounds of linear programs are trusted to this, relative to the size of the set.
+TOLERANCE = 1e-9
+# Facets are enumerated up to this dimension, and this many of them.
+DIMENSIONS, FACETS = 4, 2000
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """The polytope {v = (θ, z): G v ≤ g} of states θ (p,) and plans; G (rows, p + nz), unit rows.
+
+    M (p, p + nz), t (p,): the state after the first move is M v + t. exact: False where a
+    constraint is no row (the terminal ellipsoid), so that the polytope holds more than the pairs.
+    """
+
+    G: np.ndarray
+    g: np.ndarray
+    M: np.ndarray
+    t: np.ndarray
+    exact: bool
+
+    @property
+    def p(self) -> int:
+        """Number of coordinates of θ."""
+        return len(self.t)
+
+    @cached_property
+    def extent(self) -> np.ndarray:
+        """|v_i| ≤ extent_i on the polytope (twice what LPs find, which outweighs their error)."""
+        size = self.G.shape[1]
+        ends = [maximise(s * e, self.G, self.g).value for e in np.eye(size) for s in (1, -1)]
+        return 2 * np.abs(ends).reshape(size, 2).max(axis=1) + 1e-300
+
+    def twice(self) -> "Pairs":
+        """The pairs that can go on: (θ, z, z⁺) with (θ, z) and (θ⁺, z⁺) both feasible."""
+        p = self.p
+        plan = self.G[:, p:]
+        first = np.hstack([self.G, np.zeros_like(plan)])
+        then = np.hstack([self.G[:, :p] @ self.M, plan])
+        g = np.concatenate([self.g, self.g - self.G[:, :p] @ self.t])
+        G = np.vstack([first, then])
+        size = np.linalg.norm(G, axis=1)
+        size[size == 0] = 1.0
+        M = np.hstack([self.M, np.zeros((p, plan.shape[1]))])
+        return Pairs(G / size[:, None], g / size, M, self.t, self.exact)
+
+    def largest(self, normal: np.ndarray) -> tuple[float, float, np.ndarray | None]:
+        """max normal'θ⁺ over all pairs: (attained value, upper bound, v).
+
+        The bound holds whatever the LP's error: for any y ≥ 0,
+        d'v = y'G v + (d − G'y)'v ≤ y'g + |d − G'y|'extent.
+        """
+        d = normal @ self.M
+        top, shift = maximise(d, self.G, self.g), float(normal @ self.t)
+        if top.x is None or top.y is None:
+            return top.value, top.value, None
+        return top.value + shift, self._bound(d, top.y) + shift, top.x
+
+    def support(self, direction: np.ndarray) -> float:
+        """Upper bound of direction'θ over all pairs, in the same way."""
+        d = np.append(direction, np.zeros(self.G.shape[1] - self.p))
+        top = maximise(d, self.G, self.g)
+        return top.value if top.y is None else self._bound(d, top.y)
+
+    def _bound(self, d: np.ndarray, y: np.ndarray) -> float:
+        left = np.abs(d - self.G.T @ y)
+        off = left > 0
+        return float(y @ self.g + left[off] @ self.extent[off])
+
+    def centre(self) -> np.ndarray | None:
+        """The θ of the pair with the largest margin to all rows; None if no pair has a margin."""
+        rows, size = self.G.shape
+        wide = np.vstack([np.hstack([self.G, np.ones((rows, 1))]), np.eye(size + 1)[-1:]])
+        room = max(1.0, float(np.abs(self.g).max(initial=0.0)))
+        top = maximise(np.eye(size + 1)[-1], wide, np.append(self.g, room))
+        return None if top.x is None or top.value <= TOLERANCE else top.x[: self.p]
+
+    def ray(self, centre: np.ndarray, direction: np.ndarray) -> tuple[float, np.ndarray, float]:
+        """max s with centre + s·direction in the shadow, and a half-space a'θ ≤ b of the shadow.
+
+        (s, a, b). The LP's multipliers y give a = G_θ'y and b = y'g, plus what their error G_z'y
+        can add. Raises ValueError where the ray does not end.
+        """
+        p = self.p
+        G = np.column_stack([self.G[:, :p] @ direction, self.G[:, p:]])
+        top = maximise(np.eye(G.shape[1])[0], G, self.g - self.G[:, :p] @ centre)
+        if top.x is None or top.y is None:
+            fail("centre", "the ray does not end inside the set", "Give a bounded problem")
+        normal = self.G[:, :p].T @ top.y
+        b = self._bound(np.append(normal, np.zeros(G.shape[1] - 1)), top.y)
+        length = np.linalg.norm(normal)
+        return top.value, normal / length, b / length
+
+
+def pairs(mpc: MPC) -> Pairs:
+    """All pairs of a state and a plan that keep every hard row of `mpc`; soft rows count for none.
+
+    Where input rates are limited, θ = (x, u_{−1}).
+    """
+    with jax.enable_x64(True):
+        c = jax.tree.map(np.asarray, condense(in_float64(hard_part(mpc))))
+    kept = len(c.C) - sum(c.balls)
+    C, D, shift = c.C[:kept], c.D[:kept], c.d[:kept]
+    lower, upper = c.lower[:kept] - shift, c.upper[:kept] - shift
+    up, low = np.isfinite(upper), np.isfinite(lower)
+    rows = np.hstack([D, C])
+    G = np.vstack([rows[up], -rows[low]])
+    g = np.concatenate([upper[up], -lower[low]])
+    size = np.linalg.norm(G, axis=1)
+    size[size == 0] = 1.0
+    p = D.shape[1]
+    M = np.vstack([np.hstack([c.Phi[1], c.Gamma[1]]), np.hstack([c.Psi[0], c.Omega[0]])])
+    t = np.concatenate([c.phi[1], c.psi[0]])
+    return Pairs(G / size[:, None], g / size, M[:p], t[:p], not c.balls)
+
+
+@dataclass(frozen=True)
+class Shadow:
+    """A polytope that is the shadow of pairs: normals (K, p) of length 1, offsets (K,), vertices.
+
+    The half-spaces are valid; each vertex of their intersection was reached to `TOLERANCE`.
+    """
+
+    center: np.ndarray
+    normals: np.ndarray
+    offsets: np.ndarray
+    vertices: np.ndarray
+
+    @property
+    def size(self) -> float:
+        """Largest distance of a facet from the centre, the scale of tolerances."""
+        return float(np.max(self.offsets - self.normals @ self.center))
+
+    @property
+    def polytope(self) -> Polytope:
+        """The same as H x ≤ h."""
+        return Polytope(self.normals, self.offsets)
+
+    def excess(self, points: np.ndarray) -> np.ndarray:
+        """Largest distance (B,) by which each point (B, p) exceeds a half-space."""
+        return np.max(points @ self.normals.T - self.offsets, axis=1)
+
+
+def shadow(pairs: Pairs, deadline: float = np.inf) -> Shadow | str:
+    """All facets and vertices of the states θ of `pairs`, or the reason why there are none.
+
+    Rays at the vertices of an outer polytope add half-spaces, the duals of their LPs, until every
+    vertex is reached (beneath-beyond). deadline: of `time.monotonic`, in seconds.
+    """
+    if pairs.p > DIMENSIONS:
+        return f"facets are not enumerated in {pairs.p} dimensions (up to {DIMENSIONS} they are)"
+    center = pairs.centre()
+    if center is None:
+        return "the feasible set is empty or flat"
+    p = pairs.p
+    directions = normals = np.concatenate([np.eye(p), -np.eye(p)])
+    offsets, reached = np.array([pairs.support(d) for d in normals]), np.zeros((0, p))
+    if not np.all(np.isfinite(offsets)):
+        return "the feasible set is unbounded"
+    while time.monotonic() < deadline and len(offsets) < FACETS:
+        missed = []
+        for direction in directions:
+            s, normal, offset = pairs.ray(center, direction)
+            missed.append(s < 1 - TOLERANCE)
+            normals, offsets = np.vstack([normals, normal]), np.append(offsets, offset)
+        reached = np.vstack([reached, (center + directions)[~np.array(missed)]])
+        try:
+            outer = Polytope(normals, offsets).reduce()
+            vertices = outer.vertices()
+        except ValueError as error:
+            return f"its facets are too ill-conditioned ({error})"
+        normals, offsets = np.asarray(outer.H), np.asarray(outer.h)
+        scale = TOLERANCE * np.abs(vertices - center).max()
+        near = np.abs(vertices[:, None] - reached).max(axis=2, initial=0.0) <= scale
+        directions = vertices[~near.any(axis=1)] - center
+        if not len(directions):
+            return Shadow(center, normals, offsets, vertices)
+    return "its facets are too many to enumerate in the time given"

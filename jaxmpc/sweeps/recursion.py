@@ -1,0 +1,583 @@
+"""Recursive feasibility: does a controller that has a plan now have one at the next sample?
+
+Three claims about the feasible set X_N of an MPC problem, each weaker than the one before:
+
+    strong  every first move of a feasible plan leads to a state in X_N,
+    law     the optimal first move does,
+    weak    some first move of a feasible plan does.
+
+A claim is proved by Theorem 1 of the lesson (an invariant terminal set), by linear programs over
+all pairs of a state and a plan (`reach.py`), or by the critical regions of the law. It is refuted
+by a counterexample: a state with a feasible plan, and a half-space that excludes the next state.
+Counterexamples are looked for among samples and by gradient ascent (`law.py`).
+"""
+
+import time
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.checks import fail
+from jaxmpc.control.sets import Polytope
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.status import Status
+from jaxmpc.sweeps.boundary import boundary, spread
+from jaxmpc.sweeps.compiled import default_chunk
+from jaxmpc.sweeps.feasible_set import FeasibleSetMap, grid, map_feasible_set
+from jaxmpc.sweeps.law import Bound, Law, ascend
+from jaxmpc.sweeps.proofs import hard_part
+from jaxmpc.sweeps.reach import DIMENSIONS, TOLERANCE, Pairs, Shadow, pairs, shadow
+from jaxmpc.sweeps.regions import critical_regions
+
+# Distance from X_N, relative to its size, from which a state counts as outside: well above the
+# residuals of plans. Next states are moved towards the centre by as much before they are judged.
+CLEAR = 1e-7
+STARTS = 96
+# How far a counterexample is pulled towards the centre until its plan is proved.
+PULLS = 10.0 ** np.arange(-9, -3)
+# `lost_at` of samples that cannot be lost, and of those that were not decided.
+NOT_FEASIBLE, UNDECIDED = -1, -2
+NONE = np.zeros(0)
+
+
+@dataclass(frozen=True)
+class Rung:
+    """A claim: holds True (proved), False (refuted by a counterexample) or None (open); and why."""
+
+    holds: bool | None
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{ {True: 'proved', False: 'refuted', None: 'open'}[self.holds]}: {self.reason}"
+
+
+@dataclass(frozen=True)
+class Counterexample:
+    """A feasible state whose optimal first move leads to an infeasible one.
+
+    state x (p,) is feasible by proof: `feasible_inputs` (N, m) keep all rows in a float64 roll-out
+    with margins above rounding. inputs (N, m): the optimal plan, to the given residuals.
+    next_state: A x + B u_0 + c. The half-space normal'x ≤ offset holds on the whole feasible set,
+    by proof, and excludes next_state by `distance` = (normal'x⁺ − offset)/|normal|. found:
+    "search", "sample" or "regions". Where input rates are limited, states are (x, u_{−1}).
+    """
+
+    state: np.ndarray
+    inputs: np.ndarray
+    next_state: np.ndarray
+    normal: np.ndarray
+    offset: float
+    distance: float
+    feasible_inputs: np.ndarray
+    primal_residual: float
+    dual_residual: float
+    found: str
+
+    def __str__(self) -> str:
+        return (
+            f"from x = {_point(self.state)} the optimal u = {_point(self.inputs[0])} leads to "
+            f"{_point(self.next_state)}, outside the feasible set by {self.distance:.6g}"
+        )
+
+
+@dataclass(frozen=True)
+class RecursionReport:
+    """What is known about the recursive feasibility of one MPC problem.
+
+    strong, law, weak: `Rung`s. counterexample: the worst to the law that was found, or None.
+    feasible_set: X_N (half-spaces valid and vertices reached, to 1e-9 of its size), None where
+    facets were not enumerated. volume: of X_N; lost_by_any: of the part from which every first
+    move leaves X_N; lost_by_law: of the part from which the optimal one does, from critical
+    regions. NaN where not computed.
+
+    states (B, p): the samples. label (B,): 1 proved feasible, −1 proved infeasible, 0 undecided.
+    inputs (B, m), next_states (B, p): the optimal first move and where it leads (NaN where
+    label ≠ 1). lost_at (B,): first step k ≥ 1 of the closed loop at which the problem is proved
+    infeasible; 0: feasible at all `steps`; −1: not proved feasible at the start; −2: undecided,
+    from step undecided_at (B,) on (0 elsewhere).
+    """
+
+    mpc: MPC
+    strong: Rung
+    law: Rung
+    weak: Rung
+    counterexample: Counterexample | None
+    feasible_set: Polytope | None
+    volume: float
+    lost_by_any: float
+    lost_by_law: float
+    states: np.ndarray
+    label: np.ndarray
+    inputs: np.ndarray
+    next_states: np.ndarray
+    lost_at: np.ndarray
+    undecided_at: np.ndarray
+    steps: int
+    seconds: float
+
+    def counts(self) -> dict[str, int]:
+        """How many samples are feasible; of these lost at once, later, kept, undecided."""
+        lost = self.lost_at
+        return {
+            "feasible": int(np.sum(self.label == 1)),
+            "lost after one step": int(np.sum(lost == 1)),
+            "lost later": int(np.sum(lost > 1)),
+            "kept": int(np.sum(lost == 0)),
+            "undecided": int(np.sum(lost == UNDECIDED)),
+        }
+
+    def __str__(self) -> str:
+        """Rungs with reasons, worst counterexample, volumes and counts, one a line."""
+        rows = [(name, str(getattr(self, name))) for name in ("strong", "law", "weak")]
+        if self.counterexample is not None:
+            rows.append(("worst", f"{self.counterexample} (found by {self.counterexample.found})"))
+        volumes = ("volume", self.volume), ("lost by any", self.lost_by_any)
+        for name, value in (*volumes, ("lost by law", self.lost_by_law)):
+            if np.isfinite(value):
+                share = "" if name == "volume" else f"  {value / self.volume:.4%}"
+                rows.append((name, f"{value:.9g}{share}"))
+        counts = self.counts()
+        for name, count in counts.items():
+            share = "" if name == "feasible" else f"  {count / max(counts['feasible'], 1):8.3%}"
+            rows.append((name, f"{count:>10,}{share}"))
+        return "\n".join(f"  {name:<20} {value}" for name, value in rows)
+
+    def to_xarray(self) -> Any:
+        """The samples as an xarray.Dataset along the dimension `sample`, names attached."""
+        import xarray
+
+        data = {
+            "state": (("sample", "coordinate"), self.states),
+            "label": ("sample", self.label),
+            "input": (("sample", "move"), self.inputs),
+            "next_state": (("sample", "coordinate"), self.next_states),
+            "lost_at": ("sample", self.lost_at),
+            "undecided_at": ("sample", self.undecided_at),
+        }
+        names = {
+            "coordinate": list(self.mpc.labels[: self.states.shape[1]]),
+            "move": list(self.mpc.system.input_labels),
+        }
+        return xarray.Dataset(data, coords=names, attrs={"steps": self.steps})
+
+
+def recursive_feasibility(
+    mpc: MPC, x0s: Any = None, *, steps: int = 20, search: bool = True, regions: int = 2000,
+    seconds: float = 60.0,
+) -> RecursionReport:  # fmt: skip
+    """Is `mpc` recursively feasible? Proofs, the worst counterexample, and the states lost.
+
+    x0s: sample states (B, n), or (B, n + m) with the previous input where input rates are
+    limited; None: a grid over X_N, random states in more than three dimensions. steps: length of
+    the closed loops x⁺ = A x + B u_0(x) + c from each sample. search: look for a counterexample to
+    the law by gradient ascent too. regions: critical regions to enumerate at most for a proof of
+    the law (0: none). seconds: when these are spent, search and enumeration of facets end, and
+    what they have not settled is open.
+
+    Linear programs are believed to 1e-9 of the size of X_N, by bounds from their multipliers. A
+    state counts as outside X_N when it is so by more than 1e-7 of that size. In the closed loops
+    each next state is moved towards the centre by 1e-7 of its distance (plans ride on limits,
+    where residuals decide the side) and then labelled: infeasible by proof means lost.
+
+    Raises ValueError for ill-posed problems and wrong arguments before anything compiles, and
+    where x0s is None and X_N is empty, flat or unbounded.
+
+    Sources: the lesson's Theorem 1; Kerrigan & Maciejowski 2001 (CDC) for strong feasibility;
+    Löfberg 2012, Automatica 48, for the law; Bemporad et al. 2002 for critical regions.
+    """
+    begun = time.monotonic()
+    mpc.validate()
+    _check(steps=(steps, 1), regions=(regions, 0))
+    if not isinstance(seconds, int | float) or not seconds > 0:
+        fail("seconds", f"{seconds!r}", "Give a positive number")
+    deadline = begun + seconds
+    if x0s is not None:
+        x0s, p = np.asarray(x0s, np.float64), hard_part(mpc).dimension
+        if x0s.ndim != 2 or x0s.shape[1] != p or not len(x0s):
+            fail("x0s", f"shape {x0s.shape}", f"Give at least one state, (B, {p})")
+    ladder = climb(mpc, deadline)
+    bound, starts = _bound(ladder)
+    if x0s is None:
+        if bound is None:
+            fail("x0s", f"None, and {ladder.why}", "Give the states to look at, (B, n)")
+        x0s = _samples(ladder, starts, bound.center)
+    easy = x0s[0] if bound is None else bound.center
+    law = Law(mpc, easy, 1024 if len(x0s) <= 16_384 else default_chunk())
+    fmap = law_map(law, x0s)
+    loops = _closed_loops(law, x0s, fmap.label, steps)
+
+    worst = None
+    if bound is not None and ladder.law.holds is not True:
+        candidates = _worst_samples(bound, x0s, loops)
+        found = ["sample"] * len(candidates)
+        if search:
+            feasible = x0s[fmap.label == 1]
+            near = feasible[_order(bound, loops.next_states[fmap.label == 1])[: STARTS // 4]]
+            tops = ascend(law, bound, np.concatenate([starts, near]), deadline)
+            candidates, found = np.concatenate([candidates, tops]), found + ["search"] * len(tops)
+        worst = _certified(law, bound, candidates, found)
+    lost = 0.0 if ladder.law.holds and ladder.shadow else np.nan
+    if regions and ladder.shadow and not ladder.law.holds and time.monotonic() < deadline:
+        verdict, lost, beyond = _by_regions(ladder, regions)
+        if verdict.holds is False and worst is None:  # the search has missed it
+            worst = _certified(law, bound, beyond, ["regions"] * len(beyond))
+        if verdict.holds is not False:
+            ladder = replace(ladder, law=verdict)
+    if worst is not None:
+        refuted = Rung(False, str(worst))
+        strong = ladder.strong if ladder.strong.holds is False else refuted
+        ladder = replace(ladder, law=refuted, strong=strong)
+    elif ladder.law.holds is None:
+        tried = f"{np.sum(fmap.label == 1):,} samples" + search * f" and {STARTS} ascents"
+        why = f"no counterexample among {tried}, no proof: {ladder.law.reason}"
+        ladder = replace(ladder, law=Rung(None, why))
+    return RecursionReport(
+        mpc, ladder.strong, ladder.law, ladder.weak, worst,
+        ladder.shadow.polytope if ladder.shadow else None, ladder.volume, ladder.lost, lost,
+        x0s, fmap.label, loops.inputs, loops.next_states, loops.lost_at, loops.undecided_at,
+        int(steps), time.monotonic() - begun,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """The three rungs as far as they can be settled without the law, and X_N.
+
+    shadow: facets and vertices of X_N, or None and `why`. later: the same for the states with a
+    first move that stays. volume of X_N, and of the part lost by any move; NaN where unknown.
+    """
+
+    mpc: MPC
+    pairs: Pairs
+    shadow: Shadow | None
+    why: str
+    strong: Rung
+    law: Rung
+    weak: Rung
+    volume: float = np.nan
+    lost: float = np.nan
+
+
+def climb(mpc: MPC, deadline: float = np.inf) -> Ladder:
+    """Settle the rungs by Theorem 1 and linear programs."""
+    all_pairs = pairs(mpc)
+    body = shadow(all_pairs, deadline) if all_pairs.exact else "the terminal set has no facets"
+    found, why = (None, body) if isinstance(body, str) else (body, "")
+    volume = np.nan if found is None else found.polytope.volume()
+    if not np.any(all_pairs.G[:, : all_pairs.p]) and all_pairs.exact:
+        strong = Rung(True, "no limit depends on the state")
+    else:
+        strong = _theorem(mpc)
+    if strong.holds is None and found is not None:
+        strong = _every_move(mpc, all_pairs, found)
+    if strong.holds:
+        follows = Rung(True, f"follows from strong ({strong.reason})")
+        lost = np.nan if found is None else 0.0
+        return Ladder(mpc, all_pairs, found, why, strong, follows, follows, volume, lost)
+    weak, lost = _some_move(all_pairs, found, why, deadline)
+    law = Rung(None, "weak is refuted" if weak.holds is False else why or "needs the law itself")
+    return Ladder(mpc, all_pairs, found, why, strong, law, weak, volume, lost)
+
+
+def _every_move(mpc: MPC, all_pairs: Pairs, body: Shadow) -> Rung:
+    """Strong: one LP for each facet of X_N over all pairs."""
+    tops = [all_pairs.largest(normal) for normal in body.normals]
+    excess = np.array([top[1] for top in tops]) - body.offsets
+    worst = int(np.argmax(excess))
+    count = f"{len(excess)} facets"
+    if excess[worst] <= TOLERANCE * body.size:
+        slack = f"one LP for each of {count}, largest excess {excess[worst]:.1e}"
+        same = _set_before(mpc, body)
+        return Rung(True, f"every feasible first move stays ({same}{slack})")
+    value, _, v = tops[worst]
+    if v is None or value - body.offsets[worst] <= CLEAR * body.size:
+        return Rung(None, f"an LP is within {CLEAR:g} of the size of X_N: {excess[worst]:.1e}")
+    after = _point(all_pairs.M @ v + all_pairs.t)
+    where = f"from x = {_point(v[: all_pairs.p])} a feasible first move leads to {after}"
+    return Rung(False, f"{where}, {value - body.offsets[worst]:.6g} beyond a facet of X_N")
+
+
+def _set_before(mpc: MPC, body: Shadow) -> str:
+    """In words, that one step less gives the same set, where it does."""
+    if mpc.horizon < 2 or mpc.control_horizon is not None or mpc.constrained_steps is not None:
+        return ""
+    shorter = pairs(replace(mpc, horizon=mpc.horizon - 1))
+    ends = [shorter.support(normal) for normal in body.normals]
+    if shorter.p != body.vertices.shape[1] or np.any(
+        np.array(ends) > body.offsets + TOLERANCE * body.size
+    ):
+        return ""
+    N = mpc.horizon
+    return f"X_{N - 1} = X_{N}; " if _nested(mpc) else f"X_{N - 1} lies in X_{N}; "
+
+
+def _nested(mpc: MPC) -> bool:
+    """True where a longer horizon can only make X_N smaller: nothing but state limits at the end."""
+    return mpc.constrain_initial and (mpc.terminal_set is None or mpc.terminal_set is mpc.states)
+
+
+def _some_move(
+    all_pairs: Pairs, body: Shadow | None, why: str, deadline: float
+) -> tuple[Rung, float]:
+    """Weak, and the volume lost whatever the move: X_N against the states that can go on."""
+    if body is None:
+        return Rung(None, why), np.nan
+    later = shadow(all_pairs.twice(), deadline)
+    if isinstance(later, str):
+        return Rung(None, f"of the states that can go on, {later}"), np.nan
+    excess = later.excess(body.vertices)
+    i = int(np.argmax(excess))
+    lost = max(body.polytope.volume() - later.polytope.volume(), 0.0)
+    if excess[i] <= TOLERANCE * body.size:
+        what = f"all {len(excess)} vertices of X_N have a first move that stays"
+        return Rung(True, f"{what} (largest excess {max(excess[i], 0.0):.1e})"), 0.0
+    if excess[i] <= CLEAR * body.size:
+        return Rung(None, f"a vertex is within {CLEAR:g} of the size of X_N: {excess[i]:.1e}"), lost
+    x = _point(body.vertices[i])
+    return Rung(False, f"from x = {x} every feasible first move leaves X_N"), lost
+
+
+def _theorem(mpc: MPC) -> Rung:
+    """Strong by Theorem 1, where the terminal set is invariant."""
+    return Rung(None, "Theorem 1 does not apply")
+
+
+def _by_regions(ladder: Ladder, limit: int) -> tuple[Rung, float, np.ndarray]:
+    """The law by its critical regions; the volume it loses; states (K, n) it loses most.
+
+    On a region x⁺ is affine, so its excess over a facet is largest at a vertex.
+    """
+    body, mpc = ladder.shadow, ladder.mpc
+    assert body is not None
+    none = np.zeros((0, ladder.pairs.p))
+    try:
+        found = critical_regions(hard_part(mpc) if not mpc.soft else mpc, limit=limit)
+    except ValueError as error:
+        return Rung(None, f"no critical regions ({error})"), np.nan, none
+    A, B = np.asarray(mpc.system.A, float), np.asarray(mpc.system.B, float)
+    c = np.zeros(len(A)) if mpc.system.c is None else np.asarray(mpc.system.c, float)
+    excess, states, lost = [-np.inf], [none], 0.0
+    for region in found.regions:
+        E, e = A + B @ region.K, B @ region.k + c
+        beyond = body.excess(region.vertices @ E.T + e)
+        excess.extend(beyond)
+        states.append(region.vertices)
+        if beyond.max() > CLEAR * body.size:
+            H, h = np.asarray(region.polytope.H), np.asarray(region.polytope.h)
+            stays = Polytope(
+                np.vstack([H, body.normals @ E]), np.append(h, body.offsets - body.normals @ e)
+            )
+            lost += region.volume - _volume(stays)
+    values, states = np.array(excess[1:]), np.concatenate(states)
+    top = values.max(initial=-np.inf)
+    if top > CLEAR * body.size:
+        worst = np.argsort(-values)[:6]
+        rung = Rung(False, f"a critical region leads {top:.6g} beyond a facet of X_N")
+        return rung, lost if found.complete else np.nan, states[worst]
+    if not found.complete:
+        return Rung(None, f"critical regions are incomplete: {found.reason}"), np.nan, none
+    if top > TOLERANCE * body.size:
+        return Rung(None, f"a region is within {CLEAR:g} of the size of X_N: {top:.1e}"), lost, none
+    count = f"{len(found)} critical regions fill X_N"
+    return Rung(True, f"{count}, and the images of their vertices are in it"), 0.0, none
+
+
+def _volume(body: Polytope) -> float:
+    try:
+        return body.volume()
+    except ValueError:  # empty or flat
+        return 0.0
+
+
+@dataclass(frozen=True)
+class Loops:
+    """What the closed loops gave; fields as in `RecursionReport`."""
+
+    inputs: np.ndarray
+    next_states: np.ndarray
+    lost_at: np.ndarray
+    undecided_at: np.ndarray
+
+
+def law_map(law: Law, states: np.ndarray) -> FeasibleSetMap:
+    """Labels of states (B, p or more columns), in programs of one shape."""
+    p = hard_part(law.mpc).dimension
+    fmap = map_feasible_set(law.mpc, law.filled(states[:, :p]), chunk=law.chunk)
+    labels = replace(fmap.labels, **{
+        name: value[: len(states)]
+        for name, value in vars(fmap.labels).items() if isinstance(value, np.ndarray)
+    })  # fmt: skip
+    return replace(fmap, points=fmap.points[: len(states)], labels=labels)
+
+
+def _closed_loops(law: Law, x0s: np.ndarray, label: np.ndarray, steps: int) -> Loops:
+    """Run the closed loop from every feasible sample until it is lost, undecided or over."""
+    count, p = x0s.shape
+    lost_at = np.where(label == 1, 0, NOT_FEASIBLE)
+    undecided_at = np.zeros(count, int)
+    first = np.full((count, law.mpc.system.m), np.nan)
+    after = np.full((count, p), np.nan)
+    center = x0s[label == 1].mean(axis=0) if np.any(label == 1) else np.zeros(p)
+    # The previous input travels along where the plan depends on it.
+    states = np.pad(x0s, ((0, 0), (0, law.mpc.dimension - p)))
+    for k in range(1, steps + 1):
+        alive = np.flatnonzero(lost_at == 0)
+        if not len(alive):
+            break
+        plans = law.plans(states[alive])
+        u = law.limited(plans.inputs[:, 0])
+        x = law.following(states[alive], u)
+        if k == 1:
+            first[alive], after[alive] = u, x[:, :p]
+        x[:, :p] = center + (1 - CLEAR) * (x[:, :p] - center)
+        verdict = law_map(law, x).label
+        solved = plans.status == Status.SOLVED
+        open_ = ~solved | (verdict == 0)
+        lost_at[alive[solved & (verdict == -1)]] = k
+        lost_at[alive[open_]], undecided_at[alive[open_]] = UNDECIDED, k
+        states[alive] = x
+    return Loops(first, after, lost_at, undecided_at)
+
+
+def _bound(ladder: Ladder) -> tuple[Bound | None, np.ndarray]:
+    """Half-spaces of X_N and starts (S, p) near its boundary; None and no starts without them."""
+    body, p = ladder.shadow, ladder.pairs.p
+    random = np.random.default_rng(0)
+    if body is not None:
+        # Vertices, middles of facets, and random points of facets: convex combinations.
+        parts = [body.vertices]
+        tight = body.offsets - body.vertices @ body.normals.T <= 1e-7 * body.size
+        corners = [body.vertices[column] for column in tight.T]
+        parts += [part.mean(axis=0, keepdims=True) for part in corners]
+        while sum(map(len, parts)) < STARTS:
+            parts += [random.dirichlet(np.ones(len(part)), 1) @ part for part in corners]
+        return Bound(body.center, body.normals, body.offsets), np.concatenate(parts)[:STARTS]
+    try:
+        rays = boundary(ladder.mpc, np.concatenate([spread(STARTS, p), np.eye(p), -np.eye(p)]))
+    except ValueError:  # empty or flat
+        return None, np.zeros((0, p))
+    valid = np.isfinite(rays.offsets) & np.any(rays.normals != 0, axis=1)
+    found = np.all(np.isfinite(rays.points), axis=1)
+    if not valid.any() or not found.any():
+        return None, np.zeros((0, p))
+    length = np.linalg.norm(rays.normals[valid], axis=1)
+    half = np.column_stack([rays.normals[valid] / length[:, None], rays.offsets[valid] / length])
+    half = half[np.unique(np.round(half, 9), axis=0, return_index=True)[1]]
+    return Bound(rays.center, half[:, :p], half[:, p]), rays.points[found]
+
+
+def _samples(ladder: Ladder, starts: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """The middles of a grid's cells over the box of X_N in up to three dimensions; above, random points on the way out."""
+    p = ladder.pairs.p
+    if ladder.shadow is not None and p <= 3:
+        V, count = ladder.shadow.vertices, {1: 1000, 2: 64, 3: 16}[p]
+        half = np.ptp(V, axis=0) / (2 * count)
+        return grid(V.min(axis=0) + half, V.max(axis=0) - half, (count,) * p)
+    random = np.random.default_rng(0)
+    ends = starts[random.integers(len(starts), size=4096)] - center
+    return center + random.uniform(0, 1, (len(ends), 1)) ** (1 / p) * ends
+
+
+def _order(bound: Bound, after: np.ndarray) -> np.ndarray:
+    """Indices of next states, the farthest outside first; NaN last."""
+    return np.argsort(-np.nan_to_num(bound.excess(after), nan=-np.inf))
+
+
+def _worst_samples(bound: Bound, x0s: np.ndarray, loops: Loops) -> np.ndarray:
+    lost = np.flatnonzero(loops.lost_at == 1)
+    return x0s[lost[_order(bound, loops.next_states[lost])[:3]]]
+
+
+def _certified(
+    law: Law, bound: Bound | None, candidates: np.ndarray, found: list[str]
+) -> Counterexample | None:
+    """The candidate (K, p) whose next state is farthest outside, with both ends proved; or None.
+
+    Each candidate is pulled towards the centre by as little as it takes to prove its plan.
+    """
+    if bound is None or not len(candidates):
+        return None
+    pulled = bound.center + (1 - PULLS)[:, None, None] * (candidates - bound.center)
+    states = pulled.reshape(-1, candidates.shape[1])
+    plans = law.plans(states)
+    inputs = plans.inputs.copy()
+    inputs[:, 0] = law.limited(inputs[:, 0])
+    after = law.following(states, inputs[:, 0])
+    fmap = law_map(law, np.concatenate([states, after]))
+    here, there = np.split(fmap.label, 2)
+    good = (here == 1) & (there == -1) & (plans.status == Status.SOLVED)
+    outside = np.where(good, bound.excess(after), -np.inf)
+    if not np.any(outside > CLEAR * bound.size):
+        return None
+    best = int(np.argmax(outside))
+    normal, offset = _deepest(law.mpc, bound, fmap, after[best])
+    distance = float((normal @ after[best] - offset) / np.linalg.norm(normal))
+    return Counterexample(
+        states[best], inputs[best], after[best], normal, offset, distance,
+        fmap.labels.plans[best], float(plans.primal_residual[best]),
+        float(plans.dual_residual[best]), found[best % len(candidates)],
+    )  # fmt: skip
+
+
+def _deepest(
+    mpc: MPC, bound: Bound, fmap: FeasibleSetMap, x: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Of the half-spaces proved by labels, and by rays that end on the side of x, the deepest."""
+    normals, offsets = fmap.cuts()
+    facet = int(np.argmax(bound.normals @ x - bound.offsets))
+    towards = [bound.nearest(x[None])[0], x, x - 2 * bound.excess(x[None])[0] * bound.normals[facet]]
+    rays = boundary(mpc, np.array(towards) - bound.center, center=bound.center)
+    valid = np.isfinite(rays.offsets)
+    normals = np.concatenate([normals, rays.normals[valid]])
+    offsets = np.concatenate([offsets, rays.offsets[valid]])
+    depth = (normals @ x - offsets) / np.linalg.norm(normals, axis=1)
+    best = int(np.nanargmax(depth))
+    return normals[best], float(offsets[best])
+
+
+@dataclass(frozen=True)
+class SmallestHorizon:
+    """The least horizon at which the law is proved recursively feasible, None if none up to limit.
+
+    strong: the least at which every feasible first move is proved to stay (None: none). reasons:
+    of the law rung at each horizon looked at.
+    """
+
+    horizon: int | None
+    strong: int | None
+    reasons: dict[int, Rung] = field(default_factory=dict)
+
+
+def smallest_horizon(mpc: MPC, limit: int = 20, *, regions: int = 2000) -> SmallestHorizon:
+    """Try horizons 1, 2, … up to `limit` with proofs alone (no samples, no search).
+
+    The horizon of `mpc` itself plays no part. The answer is the least horizon with a proof; a
+    smaller one that is neither proved nor refuted is in `reasons` with holds None. Raises
+    ValueError for an ill-posed problem.
+    """
+    mpc.validate()
+    _check(limit=(limit, 1), regions=(regions, 0))
+    least, reasons = None, {}
+    for N in range(1, limit + 1):
+        ladder = climb(replace(mpc, horizon=N))
+        law = ladder.law
+        if ladder.weak.holds is False:
+            law = Rung(False, ladder.weak.reason)
+        elif law.holds is None and least is None and regions and ladder.shadow is not None:
+            law = _by_regions(ladder, regions)[0]
+        reasons[N] = law
+        least = N if law.holds and least is None else least
+        if ladder.strong.holds:
+            return SmallestHorizon(least, N, reasons)
+    return SmallestHorizon(least, None, reasons)
+
+
+def _check(**counts: tuple[Any, int]) -> None:
+    for name, (value, least) in counts.items():
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+            fail(name, f"{value!r}", f"Give a whole number, at least {least}")
+
+
+def _point(x: np.ndarray) -> str:
+    return "(" + ", ".join(f"{v:.6g}" for v in np.round(x, 9) + 0.0) + ")"
