@@ -1,25 +1,88 @@
 """Constrained model predictive control for robots: solved by the million, and proved."""
 
-from jaxmpc.control.invariant import maximal_invariant_set as maximal_invariant_set
-from jaxmpc.control.riccati import LQR as LQR
-from jaxmpc.control.riccati import lqr as lqr
-from jaxmpc.control.sets import Box as Box
-from jaxmpc.control.sets import Polytope as Polytope
-from jaxmpc.control.system import LinearSystem as LinearSystem
-from jaxmpc.mpc.problem import MPC as MPC
-from jaxmpc.mpc.problem import Plan as Plan
-from jaxmpc.mpc.solve import Controller as Controller
-from jaxmpc.mpc.solve import solve as solve
-from jaxmpc.qp.admm import ADMM as ADMM
-from jaxmpc.qp.margin import feasibility_margin as feasibility_margin
-from jaxmpc.qp.problem import QP as QP
-from jaxmpc.qp.problem import QPSolution as QPSolution
-from jaxmpc.qp.solve import solve_qp as solve_qp
-from jaxmpc.qp.status import Status as Status
-from jaxmpc.sweeps.boundary import Boundary as Boundary
-from jaxmpc.sweeps.boundary import boundary as boundary
-from jaxmpc.sweeps.feasible_set import FeasibleSetMap as FeasibleSetMap
-from jaxmpc.sweeps.feasible_set import grid as grid
-from jaxmpc.sweeps.feasible_set import map_feasible_set as map_feasible_set
-from jaxmpc.sweeps.plans import Plans as Plans
-from jaxmpc.sweeps.plans import solve_many as solve_many
+from jaxmpc.closed_loop import Run, lyapunov_decrease, simulate
+from jaxmpc.control.equilibrium import equilibrium
+from jaxmpc.control.invariant import (
+    ControlInvariantSet,
+    invariant_ellipsoid,
+    maximal_control_invariant_set,
+    maximal_invariant_set,
+    predecessor,
+)
+from jaxmpc.control.limits import JointLimits, joint_limits, output_limits
+from jaxmpc.control.riccati import LQR, lqr
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope
+from jaxmpc.control.system import LinearSystem
+from jaxmpc.control.terminal import TerminalReport, verify_terminal
+from jaxmpc.mpc.problem import MPC, Outputs, Plan, Soft, harden, soften
+from jaxmpc.mpc.rows import active_constraints, row_table
+from jaxmpc.mpc.solve import Controller, solve
+from jaxmpc.qp.admm import ADMM
+from jaxmpc.qp.margin import feasibility_margin
+from jaxmpc.qp.problem import QP, QPSolution
+from jaxmpc.qp.solve import solve_qp
+from jaxmpc.qp.status import Status
+from jaxmpc.sweeps.boundary import Boundary, boundary
+from jaxmpc.sweeps.exact_penalty import ExactPenalty, exact_penalty
+from jaxmpc.sweeps.feasible_set import FeasibleSetMap, grid, map_feasible_set
+from jaxmpc.sweeps.plans import Plans, solve_many
+from jaxmpc.sweeps.recursion import RecursionReport, recursive_feasibility, smallest_horizon
+from jaxmpc.sweeps.regions import CriticalRegions, critical_regions
+from jaxmpc.workflow import Design, OfflineReport, design, offline_report
+
+__all__ = [
+    "ADMM",
+    "LQR",
+    "MPC",
+    "QP",
+    "Boundary",
+    "Box",
+    "ControlInvariantSet",
+    "Controller",
+    "CriticalRegions",
+    "Design",
+    "Ellipsoid",
+    "ExactPenalty",
+    "FeasibleSetMap",
+    "JointLimits",
+    "LinearSystem",
+    "OfflineReport",
+    "Outputs",
+    "Plan",
+    "Plans",
+    "Polytope",
+    "QPSolution",
+    "RecursionReport",
+    "Run",
+    "Soft",
+    "Status",
+    "TerminalReport",
+    "active_constraints",
+    "boundary",
+    "critical_regions",
+    "design",
+    "equilibrium",
+    "exact_penalty",
+    "feasibility_margin",
+    "grid",
+    "harden",
+    "invariant_ellipsoid",
+    "joint_limits",
+    "lqr",
+    "lyapunov_decrease",
+    "map_feasible_set",
+    "maximal_control_invariant_set",
+    "maximal_invariant_set",
+    "offline_report",
+    "output_limits",
+    "predecessor",
+    "recursive_feasibility",
+    "row_table",
+    "simulate",
+    "smallest_horizon",
+    "soften",
+    "solve",
+    "solve_many",
+    "solve_qp",
+    "verify_terminal",
+]

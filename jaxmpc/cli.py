@@ -6,9 +6,8 @@ import json
 import shlex
 import signal
 import sys
-import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -20,15 +19,13 @@ from tqdm.std import tqdm
 
 from jaxmpc import config as configs
 from jaxmpc.checks import fail
+from jaxmpc.commands.options import open_folder, option, report_error
+from jaxmpc.commands.recursion import Recursion
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.plots import plot_feasible_set
 from jaxmpc.sweeps import store
 from jaxmpc.sweeps.compiled import CHUNK
 from jaxmpc.sweeps.feasible_set import FeasibleSetMap, Labels, label_chunks
-
-
-def _option(metavar: str | None, default: str) -> Any:
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,49 +66,49 @@ class Sweep:
       [sweep]   all optional: grid, lower, upper, axes, fixed, projection, iterations, dtype
     """
 
-    config: Annotated[Path | None, _option("FILE", "the built-in joint")] = None
+    config: Annotated[Path | None, option("FILE", "the built-in joint")] = None
     """TOML file with the problem and the sweep."""
-    output: Annotated[Path, _option("DIR", "jaxmpc-sweep")] = Path("jaxmpc-sweep")
+    output: Annotated[Path, option("DIR", "jaxmpc-sweep")] = Path("jaxmpc-sweep")
     """Folder for sweep.zarr, map.png and summary.json; made where absent."""
-    horizon: Annotated[int | None, _option("N", "from the file; joint 20")] = None
+    horizon: Annotated[int | None, option("N", "from the file; joint 20")] = None
     """Prediction horizon, in steps of dt."""
     terminal: Annotated[
         Literal["none", "invariant", "box"] | None,
-        _option("{none,invariant,box}", "from the file, else none"),
+        option("{none,invariant,box}", "from the file, else none"),
     ] = None
     """Set for the last state: none, largest set that the LQR keeps within limits, state limits."""
-    grid: Annotated[tuple[int, ...] | None, _option("K [K ...]", "from the file, else 256 256")] = (
+    grid: Annotated[tuple[int, ...] | None, option("K [K ...]", "from the file, else 256 256")] = (
         None
     )
     """Points along each mapped axis, ends included."""
     lower: Annotated[
-        tuple[float, ...] | None, _option("X [X ...]", "state limits, 3 % wider on each side")
+        tuple[float, ...] | None, option("X [X ...]", "state limits, 3 % wider on each side")
     ] = None
     """Lower end of each mapped axis, in the units of the state."""
     upper: Annotated[
-        tuple[float, ...] | None, _option("X [X ...]", "state limits, 3 % wider on each side")
+        tuple[float, ...] | None, option("X [X ...]", "state limits, 3 % wider on each side")
     ] = None
     """Upper end of each mapped axis, in the units of the state."""
-    axes: Annotated[tuple[str, ...] | None, _option("AXIS [AXIS ...]", "first two states")] = None
+    axes: Annotated[tuple[str, ...] | None, option("AXIS [AXIS ...]", "first two states")] = None
     """States to map, by name or index from 0."""
-    fixed: Annotated[tuple[float, ...] | None, _option("X [X ...]", "from the file")] = None
+    fixed: Annotated[tuple[float, ...] | None, option("X [X ...]", "from the file")] = None
     """With more states than axes: values of the other states, in their order (a slice)."""
     projection: Annotated[
-        bool, tyro.conf.FlagCreatePairsOff, _option(None, "from the file, else off")
+        bool, tyro.conf.FlagCreatePairsOff, option(None, "from the file, else off")
     ] = False
     """With more states than axes: feasible for some value of the other states."""
-    iterations: Annotated[int | None, _option("K", "from the file, else 50")] = None
+    iterations: Annotated[int | None, option("K", "from the file, else 50")] = None
     """Solver steps of the first pass over all states; what is left open gets more."""
     dtype: Annotated[
         Literal["float32", "float64"] | None,
-        _option("{float32,float64}", "from the file, else float32"),
+        option("{float32,float64}", "from the file, else float32"),
     ] = None
     """Precision of the solver's steps. Proofs are in float64 always."""
-    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff, _option(None, "off")] = False
+    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
     """Go on with the sweep in --output."""
-    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff, _option(None, "off")] = False
+    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
     """Delete the sweep in --output and start again."""
-    refine: Annotated[bool, _option(None, "on")] = True
+    refine: Annotated[bool, option(None, "on")] = True
     """Move inner and outer bound together to a relative gap of 1e-6 (up to three axes)."""
 
     def overrides(self) -> dict[str, Any]:
@@ -147,19 +144,27 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"jaxmpc {version('jaxmpc')}")
         return 0
     command = tyro.extras.subcommand_cli_from_dict(
-        {"sweep": Sweep},
+        {"sweep": Sweep, "recursion": Recursion},
         prog="jaxmpc",
         description="Constrained MPC in batches, with proofs. Also: jaxmpc --version",
         args=argv,
     )
+    if isinstance(command, Recursion):
+        return _guarded(command.run)
     again = [word for word in argv if word not in ("--overwrite", "--resume")]
     resume = shlex.join(["jaxmpc", *again, "--resume"])
+    kept = f"chunks that were done are kept. Go on with:\n  {resume}"
+    return _guarded(lambda: _sweep(command, resume), kept)
+
+
+def _guarded(run: Callable[[], int], kept: str = "nothing is kept") -> int:
+    """Run a command; what the machine or Ctrl-C ends is told in a line."""
     try:
-        return _sweep(command, resume)
+        return run()
     except (OSError, MemoryError) as error:
-        return _error(error)
+        return report_error(error)
     except KeyboardInterrupt:
-        print(f"\nstopped; chunks that were done are kept. Go on with:\n  {resume}")
+        print(f"\nstopped; {kept}")
         return 130
 
 
@@ -173,12 +178,7 @@ def prepare(command: Sweep) -> Job:
     mpc, region = config.build()
     if command.resume and command.overwrite:
         fail("--overwrite", "given beside --resume", "Choose one")
-    try:
-        command.output.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=command.output):
-            pass
-    except OSError as error:
-        fail(f"--output {command.output}", f"{error.strerror}", "Give a folder you can write to")
+    open_folder(command.output)
     path = command.output / "sweep.zarr"
     if path.exists() and command.overwrite:
         store.remove(path)
@@ -197,7 +197,7 @@ def _sweep(command: Sweep, resume: str) -> int:
     try:
         job = prepare(command)
     except ValueError as error:
-        return _error(error)
+        return report_error(error)
     print(f"{job.config.name}: {len(job.region.points):,} initial states -> {command.output}")
     tally = _label(job)
     fmap = _read_map(command.output / "sweep.zarr", job)
@@ -330,8 +330,3 @@ def _unit(job: Job) -> str:
     """Unit of a volume over the mapped axes, such as " rad·rad/s"."""
     units = job.config.system.state_units
     return " " + "·".join(units[i] for i in job.region.axes) if units else ""
-
-
-def _error(error: Exception) -> int:
-    print(f"jaxmpc: error: {' '.join(str(error).split())}", file=sys.stderr)
-    return 2

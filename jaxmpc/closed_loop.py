@@ -143,10 +143,13 @@ def _simulate(
             v if target is None else v - (target if target.ndim == 1 else target[0])
             for v, target in ((x, r), (u, s))
         )
-        stage_cost = square(error, c.Q) + square(effort, c.R)
+        record = Run(
+            states=x, inputs=u, cost=plan.cost, status=plan.status,
+            stage_cost=square(error, c.Q) + square(effort, c.R),
+            violation=_violation(controller, x), slack=plan.slack[0],
+        )  # fmt: skip
         after = jnp.asarray(step(x, u), x.dtype)
-        after = after if w is None else after + w
-        return (after, plan), (x, u, plan.cost, plan.status, stage_cost, plan.slack[0])
+        return (after if w is None else after + w, plan), record
 
     # A plan of zeros is a cold start, so that one solve is compiled, not two.
     shapes = jax.eval_shape(lambda x: controller(x)[1], x0)
@@ -154,17 +157,20 @@ def _simulate(
     if previous_input is not None:
         nothing = replace(nothing, inputs=nothing.inputs + previous_input)
     samples = (jnp.arange(steps), disturbance)
-    (last, _), record = jax.lax.scan(sample, (x0, nothing), samples, length=steps)
-    states = jnp.concatenate([record[0], last[None]])
-    return Run(states, *record[1:5], _violation(controller, states), record[5])
+    run: Run
+    (last, _), run = jax.lax.scan(sample, (x0, nothing), samples, length=steps)
+    return replace(
+        run, states=jnp.concatenate([run.states, last[None]]),
+        violation=jnp.append(run.violation, _violation(controller, last)),
+    )  # fmt: skip
 
 
-def _violation(controller: Controller, states: Array) -> Array:
-    """The most by which each state exceeds a row of the state limits."""
+def _violation(controller: Controller, x: Array) -> Array:
+    """The most by which x exceeds a row of the state limits."""
     if controller.mpc.states is None:
-        return jnp.zeros(states.shape[:1], states.dtype)
-    H, lower, upper = (jnp.asarray(v, states.dtype) for v in controller.mpc.states.rows())
-    value = matmul(states, H.T)
-    worst = jnp.max(jnp.maximum(value - upper, lower - value), axis=1, initial=0.0)
+        return jnp.zeros((), x.dtype)
+    H, lower, upper = (jnp.asarray(v, x.dtype) for v in controller.mpc.states.rows())
+    value = matmul(H, x)
+    worst = jnp.max(jnp.maximum(value - upper, lower - value), initial=0.0)
     # A maximum need not propagate NaN (XLA on CPUs).
-    return jnp.where(jnp.all(jnp.isfinite(states), axis=1), worst, jnp.nan)
+    return jnp.where(jnp.all(jnp.isfinite(x)), worst, jnp.nan)

@@ -1,4 +1,4 @@
-"""A sweep written down in a TOML file: read, checked, and turned into the problem.
+"""A problem and what to ask of it, as a TOML file: read, checked, and turned into an MPC.
 
     name = "joint"
 
@@ -7,6 +7,7 @@
     [cost]    Q, R, P
     [mpc]     horizon, terminal, constrain_initial
     [sweep]   grid, lower, upper, axes, fixed | projection, iterations, dtype
+    [recursion]  steps, grid, lower, upper, regions, seconds
 
 The fields below say what each key means. Every error is a ValueError that names the
 file and the key (or the option of the command line that set it) and what would be right.
@@ -111,6 +112,18 @@ class SweepSection:
     dtype: Literal["float32", "float64"] = "float32"  # of the iterates; proofs are float64
 
 
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class RecursionSection:
+    """How recursive feasibility is examined: sample states, closed loops, effort."""
+
+    steps: Annotated[int, Field(ge=1, strict=True)] = 20  # length of the closed loops
+    grid: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)] | None = None
+    lower: Vector | None = None  # (n,), none means the state limits widened by 3 % each side
+    upper: Vector | None = None  # (n,)
+    regions: Annotated[int, Field(ge=0, strict=True)] = 2000  # critical regions at most, 0: none
+    seconds: Annotated[FiniteFloat, Field(gt=0)] = 60.0  # for search and proofs
+
+
 class SweepPoints(NamedTuple):
     """The initial states of a sweep, as `map_feasible_set` takes them."""
 
@@ -121,7 +134,7 @@ class SweepPoints(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Config:
-    """One sweep: problem and initial states, as a file says it."""
+    """A problem and what is asked of it, as a file says it."""
 
     name: str = "mpc"
     system: SystemSection
@@ -129,15 +142,17 @@ class Config:
     cost: CostSection
     mpc: MPCSection
     sweep: SweepSection = SweepSection()
+    recursion: RecursionSection = RecursionSection()
 
     @staticmethod
-    def default(overrides: Mapping[str, Any] | None = None) -> "Config":
+    def default(overrides: Mapping[str, Any] | None = None, command: str = "sweep") -> "Config":
         """The lesson's joint: inertia 0.05 kg m², period 0.01 s, x = (q, dq), u = τ."""
-        return _parse(_JOINT, "built-in joint", overrides or {})
+        return _parse(_JOINT, "built-in joint", overrides or {}, command)
 
-    def to_dict(self) -> dict[str, Any]:
-        """The sections as plain JSON data; infinity is written "Infinity"."""
-        return json.loads(_ADAPTER.dump_json(self))
+    def to_dict(self, command: str = "sweep") -> dict[str, Any]:
+        """The sections a command reads as plain JSON data; infinity is written "Infinity"."""
+        data = json.loads(_ADAPTER.dump_json(self))
+        return {key: part for key, part in data.items() if key == command or key not in _COMMANDS}
 
     def build_mpc(self) -> MPC:
         """The problem itself, checked. Raises ValueError as `MPC.validate` does."""
@@ -183,7 +198,7 @@ class Config:
     def build_points(self) -> SweepPoints:
         """The grid of initial states and the axes it lies on."""
         axes = self._axes()
-        lower, upper = self._bounds(axes)
+        lower, upper = self._bounds(axes, self.sweep)
         d = len(axes)
         # 256 along each of two axes; about as many points in all along more.
         shape = self.sweep.grid or (min(256, int(65_536.5 ** (1 / d))),) * d
@@ -199,9 +214,17 @@ class Config:
         points = self.build_points()
         return self.build_mpc(), points
 
-    def check(self) -> None:
+    def build_samples(self) -> np.ndarray | None:
+        """States (B, n) for `recursive_feasibility`; None for its own choice (above 3 states)."""
+        n, recursion = len(self.system.A), self.recursion
+        if recursion.grid is None and n > 3:
+            return None
+        shape = recursion.grid or {1: (1001,), 2: (128, 128), 3: (24, 24, 24)}[n]
+        return grid_points(*self._bounds(tuple(range(n)), recursion), shape)
+
+    def check(self, command: str = "sweep") -> None:
         """Raise ValueError where keys, each good alone, do not fit one another."""
-        s, limits, sweep = self.system, self.limits, self.sweep
+        s, limits = self.system, self.limits
         n, m = len(s.A), len(s.B[0])
         for key, value, count in (
             ("system.A", s.A[0], n),
@@ -225,6 +248,13 @@ class Config:
         for low, high in (("x_min", "x_max"), ("u_min", "u_max")):
             _check_order("limits", low, high, getattr(limits, low), getattr(limits, high))
         self._check_state_limits()
+        if command == "sweep":
+            self._check_sweep(n)
+        else:
+            self._check_recursion(n)
+
+    def _check_sweep(self, n: int) -> None:
+        sweep = self.sweep
         d = len(self._axes())
         for key, count in (("grid", d), ("lower", d), ("upper", d), ("fixed", n - d)):
             value = getattr(sweep, key)
@@ -236,7 +266,17 @@ class Config:
             cure = f"Give the {n - d} other values in sweep.fixed (a slice) or projection = true"
             both = "fixed and projection exclude each other"
             fail("sweep.fixed", both if sweep.projection else f"{n} states, {d} mapped", cure)
-        self._bounds(self._axes())
+        self._bounds(self._axes(), sweep)
+
+    def _check_recursion(self, n: int) -> None:
+        recursion = self.recursion
+        for key in ("grid", "lower", "upper"):
+            value = getattr(recursion, key)
+            if value is not None and len(value) != n:
+                what = f"has {len(value)} entries where {n} are needed"
+                fail(f"recursion.{key}", what, "One for each state")
+        _check_order("recursion", "lower", "upper", recursion.lower, recursion.upper)
+        self.build_samples()
 
     def _check_state_limits(self) -> None:
         limits = self.limits
@@ -280,9 +320,11 @@ class Config:
             fail("sweep.axes", f"{list(given)} repeats a state or is empty", known)
         return tuple(int(axis) for axis in axes)
 
-    def _bounds(self, axes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    def _bounds(
+        self, axes: tuple[int, ...], sweep: SweepSection | RecursionSection
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Corners of the grid: as given, else the state limits and 3 % more on each side."""
-        sweep = self.sweep
+        where = "sweep" if isinstance(sweep, SweepSection) else "recursion"
         if sweep.lower is not None and sweep.upper is not None:
             return np.asarray(sweep.lower), np.asarray(sweep.upper)
         states = self._states()
@@ -297,19 +339,23 @@ class Config:
         lower = np.asarray(sweep.lower) if sweep.lower is not None else low - margin
         upper = np.asarray(sweep.upper) if sweep.upper is not None else high + margin
         if not np.all(np.isfinite([lower, upper])):
-            cure = "Give sweep.lower and sweep.upper: the state limits do not bound the mapped axes"
-            fail("sweep.lower", "no finite range to sweep", cure)
+            ends = f"Give {where}.lower and {where}.upper"
+            cure = f"{ends}: the state limits do not bound the mapped axes"
+            fail(f"{where}.lower", "no finite range to sweep", cure)
         if np.any(lower >= upper):
             fail(
-                "sweep.lower",
+                f"{where}.lower",
                 f"{lower.tolist()} not below upper {upper.tolist()}",
                 "Lower must be below upper",
             )
         return lower, upper
 
 
-def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config:
-    """Read a TOML file; `overrides` ("horizon", "grid", ...) replace keys of [mpc] and [sweep].
+def load(
+    path: str | Path, overrides: Mapping[str, Any] | None = None, command: str = "sweep"
+) -> Config:
+    """Read a TOML file; `overrides` ("horizon", "grid", ...) replace keys of [mpc] and of the
+    section of the command ("sweep" or "recursion"), whose keys are checked against each other.
 
     Raises ValueError, naming file and key, where the file is absent or unreadable, is no
     TOML, or holds an unknown key or a value that cannot be.
@@ -320,14 +366,16 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config
         fail(str(path), f"cannot be read ({error.strerror})", "Give the path of a TOML file")
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         fail(str(path), f"is no TOML ({error})", "See the keys with: jaxmpc sweep --help")
-    return _parse(document, str(path), overrides or {})
+    return _parse(document, str(path), overrides or {}, command)
 
 
-def _parse(document: Mapping[str, Any], source: str, overrides: Mapping[str, Any]) -> Config:
+def _parse(
+    document: Mapping[str, Any], source: str, overrides: Mapping[str, Any], command: str
+) -> Config:
     merged = dict(document)
     # A slice and a projection exclude each other: choosing either drops the file's choice.
     dropped = {"fixed", "projection"} if {"fixed", "projection"} & set(overrides) else set()
-    for name in ("mpc", "sweep"):
+    for name in ("mpc", command):
         known = {field.name for field in dataclasses.fields(_SECTIONS[name])}
         changes = {key: value for key, value in overrides.items() if key in known}
         if changes and isinstance(merged.get(name, {}), dict):
@@ -335,7 +383,7 @@ def _parse(document: Mapping[str, Any], source: str, overrides: Mapping[str, Any
             merged[name] = {**kept, **changes}
     try:
         config = _ADAPTER.validate_python(merged)
-        config.check()
+        config.check(command)
     except ValidationError as error:
         raise ValueError(_sentence(error, source, overrides)) from None
     except ValueError as error:
@@ -374,7 +422,7 @@ def _check_order(
     where: str, low: str, high: str, lower: tuple[float, ...] | None, upper: Any
 ) -> None:
     for i, (a, b) in enumerate(zip(lower or (), upper or (), strict=False)):
-        if a > b or (where == "sweep" and a == b):
+        if a > b or (where in _COMMANDS and a == b):
             fail(
                 f"{where}.{low}", f"entry {i} is {a:g}, above {high} {b:g}", f"Check {low}, {high}"
             )
@@ -386,7 +434,9 @@ _SECTIONS = {
     "cost": CostSection,
     "mpc": MPCSection,
     "sweep": SweepSection,
+    "recursion": RecursionSection,
 }
+_COMMANDS = ("sweep", "recursion")
 _ADAPTER = TypeAdapter(Config)
 _JOINT: dict[str, Any] = {
     "name": "joint",

@@ -10,7 +10,7 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.closed_loop import lyapunov_decrease, simulate
+from jaxmpc.closed_loop import Run, lyapunov_decrease, simulate
 from jaxmpc.mpc.problem import Soft
 
 # Compiles quickly.
@@ -32,6 +32,14 @@ def test_one_step_horizon_by_hand():
     assert run.feasible_steps == 4
     # 4x² − x² + x² > 0: without a terminal cost the value is no Lyapunov function.
     np.testing.assert_allclose(lyapunov_decrease(run)[:3], [1.0, 4.0, 16.0], atol=1e-8)
+
+
+def test_feasible_steps_end_at_the_first_failure():
+    """A plan that is solved again later does not count; batches have their axes in front."""
+    empty = np.zeros((3, 3))
+    status = np.array([[1, 3, 1], [1, 1, 1], [12, 1, 1]])
+    run = Run(empty, empty, empty, status, empty, empty, empty)
+    np.testing.assert_array_equal(run.feasible_steps, [1, 3, 0])
 
 
 @pytest.mark.slow

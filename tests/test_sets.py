@@ -172,6 +172,20 @@ def test_projection_in_twelve_dimensions_without_product_structure():
     assert same(shadow, expected.intersect(Polytope([row], [3])), 1e-9)
 
 
+def test_unbounded_is_not_called_empty():
+    # 0 is in the set; HiGHS' presolve calls this LP infeasible.
+    H = [
+        [0, 0.407, -0.407, 0.814, -0.081], [1, -0.005, 0.01, 0.01, 0],
+        [-0.998, 0.04, -0.04, 0, -0.001], [0.998, 0.02, -0.04, 0.04, 0.003],
+        [0.999, 0.02, 0.02, -0.02, 0.001], [1, 0, -0.003, 0.007, 0],
+    ]  # fmt: skip
+    polytope = Polytope(H, [0, 0.15, 0.3, 0.499, 0.1, 0.033])
+    d = np.array([-1.381, -0.07, 0.04, 0.028, -0.022])
+    ray = linprog(-d, A_ub=H, b_ub=np.zeros(6), bounds=(-1, 1))  # a direction that never leaves
+    assert -ray.fun > 0.01 and (np.array(H) @ ray.x).max() <= 1e-12
+    assert polytope.support(d) == INF and not polytope.is_empty()
+
+
 # --- Redundant rows ---------------------------------------------------------------------
 
 

@@ -132,7 +132,8 @@ def osqp(qp: Condensed, tolerance: float = 1e-11) -> np.ndarray:
     solver = osqp.OSQP()
     solver.setup(
         P=scipy.sparse.csc_matrix(np.triu(qp.H)), q=qp.f,
-        A=scipy.sparse.csc_matrix(qp.G), l=qp.l, u=qp.u, eps_abs=tolerance, eps_rel=tolerance, max_iter=200_000, verbose=False,
+        A=scipy.sparse.csc_matrix(qp.G), l=qp.l, u=qp.u,
+        eps_abs=tolerance, eps_rel=tolerance, max_iter=200_000, verbose=False,
     )  # fmt: skip
     result = solver.solve(raise_error=False)
     if result.info.status_val != 1:

@@ -125,7 +125,7 @@ class Plant:
 
 
 def deviations(arm: Arm, q: np.ndarray) -> JointLimits:
-    """Limits about rest at q: |q1| ≤ 1.2, −0.3 ≤ q2 ≤ 2 rad, |dq| ≤ 2 rad/s, |tau| ≤ (40, 12) N m."""
+    """About rest at q: |q1| ≤ 1.2, −0.3 ≤ q2 ≤ 2 rad, |dq| ≤ 2 rad/s, |tau| ≤ (40, 12) N m."""
     q_min, q_max = np.array([-1.2, -0.3]), np.array([1.2, 2.0])
     tau_max, load = np.array([40.0, 12.0]), np.asarray(arm.gravload(q))
     position, torque = (q_min - q, q_max - q), (-tau_max - load, tau_max - load)

@@ -5,6 +5,7 @@ Sets describe themselves in the coordinates (and units) of the system they const
 """
 
 from jaxmpc.control.invariant import maximal_invariant_set
+from jaxmpc.control.limits import JointLimits, joint_limits, output_limits
 from jaxmpc.control.riccati import LQR, lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
@@ -13,8 +14,11 @@ __all__ = [
     "LQR",
     "Box",
     "Ellipsoid",
+    "JointLimits",
     "LinearSystem",
     "Polytope",
+    "joint_limits",
     "lqr",
     "maximal_invariant_set",
+    "output_limits",
 ]

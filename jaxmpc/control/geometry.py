@@ -44,14 +44,22 @@ def maximise(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> Optimum:
     """
     # HiGHS' tolerances are absolute, hence the scaling of g and d.
     size, length = _typical(g), np.linalg.norm(d) or 1.0
-    result = linprog(
-        -d / length,
-        A_ub=G,
-        b_ub=g / size,
-        bounds=(None, None),
-        method="highs-ds",
-        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
-    )
+    # Its presolve calls some unbounded LPs infeasible (HiGHS of scipy 1.18, six variables).
+    for presolve in (True, False):
+        result = linprog(
+            -d / length,
+            A_ub=G,
+            b_ub=g / size,
+            bounds=(None, None),
+            method="highs-ds",
+            options={
+                "presolve": presolve,
+                "primal_feasibility_tolerance": 1e-10,
+                "dual_feasibility_tolerance": 1e-10,
+            },
+        )
+        if result.status in (0, 3):
+            break
     if result.status == 0:
         x = result.x * size
         return Optimum(float(d @ x), x, np.maximum(-result.ineqlin.marginals, 0.0) * length)
@@ -309,7 +317,9 @@ def eliminate(Y: np.ndarray, axes: Sequence[int]) -> np.ndarray:
 
     Raises ValueError if a step makes more than 100,000 rows.
     """
-    Y = Y[irredundant(Y)]
+    scale = np.abs(Y).max(axis=0, initial=0.0)
+    scale[scale == 0] = 1.0
+    Y = Y[irredundant(Y)] / scale
     reach = np.full(Y.shape[1], np.inf)
     reach[list(axes)] = extent(*unit_rows(Y, np.ones(len(Y))), axes)
     left = list(axes)
@@ -335,4 +345,4 @@ def eliminate(Y: np.ndarray, axes: Sequence[int]) -> np.ndarray:
         old[:, j] = 0.0
         Y = np.vstack([old, new.reshape(-1, Y.shape[1])])
         Y = Y[irredundant(Y, np.arange(len(old)))]
-    return np.delete(Y, list(axes), axis=1)
+    return np.delete(Y * scale, list(axes), axis=1)

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import scipy
 from jax.typing import ArrayLike
+from scipy.spatial import KDTree
 
 from jaxmpc.checks import fail, require_finite, require_shape, require_symmetric_psd
 from jaxmpc.control import geometry
@@ -27,6 +28,7 @@ _REDUNDANT = 1e-12
 _ROUNDING = 1e-11
 _CUT = 1e-7  # the last step of a recursion that ends cuts off more than this
 _FLAT = 1e-9  # a set whose largest ball is smaller than this, relative to its limits, is flat
+_MANY = 60  # rows of a target from which ridges are looked for, instead of pairs of rows
 _VERTICES = 500  # up to this many vertices, an input is found for each
 
 
@@ -158,7 +160,8 @@ def predecessor(
         target: set in R^n with volume.
         states: set in R^n, or None for all of R^n.
         inputs: set in R^m, or None for all of R^m. A Box may be flat, a Polytope may not.
-        disturbance: bounded set in R^n that holds the origin, or None for w = 0.
+        disturbance: bounded set in R^n that holds the origin, or None for w = 0. If it leaves
+            of the target a flat set only, that is enlarged by 4e-9 of its size.
 
     Returns irredundant rows of norm 1; rows of a flat set are not reduced. An empty set comes
     as the row 0'x <= -1 (`is_empty()` is True), all of R^n as 0'x <= 1.
@@ -251,6 +254,8 @@ def maximal_control_invariant_set(
     if not np.isfinite(geometry.extent(*unit_rows(X.H, X.h))).all():
         fail("states", "is unbounded", "Bound every coordinate")
     size = X.chebyshev()[1]
+    if size <= _FLAT * np.abs(unit_rows(X.H, X.h)[1]).max():
+        fail("states", f"is flat (largest ball of radius {size:.1e})", "Give a set with volume")
     empty = Polytope(np.zeros((1, step.n)), np.array([-1.0]))
 
     def result(inner, outer, k, reason, gap=0.0, exact=True):
@@ -283,10 +288,14 @@ def maximal_control_invariant_set(
             cut = largest_cut(before, C, enough=_CUT)
             # Convergence without end makes each cut a fraction of the last; an end makes it 0.
             if cut <= _ROUNDING and last > _CUT:
+                text, worst = _vertex_proof(step, C)
+                if worst > _FLAT * size:
+                    stop = f"C_k = C_k+1 at k = {k}, but for rounding{text}"
+                    break
                 return result(
                     C, C, k,
                     f"exact: C_{k} = C_{k + 1}; rows of its predecessor cut off at most "
-                    f"{max(cut, 0.0):.0e} of its extent (upper bound){_vertex_proof(step, C)}",
+                    f"{max(cut, 0.0):.0e} of its extent (upper bound){text}",
                 )  # fmt: skip
             if cut <= tolerance / 10:
                 stop = f"C_k converges without end: step {k} cuts off {cut:.0e} of its extent"
@@ -312,7 +321,7 @@ def maximal_control_invariant_set(
     return result(
         inner, outer, k,
         f"inner and outer set: {stop}; the inner one is invariant, as its predecessor's rows cut "
-        f"off nothing (upper bound, to {_ROUNDING:.0e}){_vertex_proof(step, inner)}; enlarged "
+        f"off nothing (upper bound, to {_ROUNDING:.0e}){_vertex_proof(step, inner)[0]}; enlarged "
         f"about its centre by 1 + {gap:.1e} it holds the outer one",
         gap, False,
     )  # fmt: skip
@@ -419,7 +428,8 @@ def supports(W: Box | Polytope | None, rows: np.ndarray) -> np.ndarray:
 class OneStep:
     """x+ = A x + B u + c + w with u in U, w in W.
 
-    U is {u : u = moving v + fixed, v in V}, with V None if nothing bounds v.
+    U is {u : u = moving v + fixed, v in V}, with V None if nothing bounds v; `box` is V if V is
+    a bounded box.
     """
 
     A: np.ndarray
@@ -429,6 +439,7 @@ class OneStep:
     moving: np.ndarray
     fixed: np.ndarray
     W: Box | Polytope | None
+    box: Box | None
 
     @property
     def n(self) -> int:
@@ -442,9 +453,18 @@ class OneStep:
             T = T.pontryagin_difference(self.W)
             if T.is_empty():
                 return _tidy(T)
+            G, g = unit_rows(T.H, T.h)
+            size = np.abs(unit_rows(target.H, target.h)[1]).max()
+            if geometry.largest_ball("target", G, g)[1] <= _FLAT * size:
+                T = Polytope(G, g + 4 * _FLAT * size)  # an elimination needs a set with volume
         # y in T - B u, where the inputs are u = moving v + fixed
         T = T.preimage(np.eye(n), self.B @ self.fixed)
-        if k:
+        if k and self.box is not None and n in (3, 4) and len(T.h) > _MANY and _bounded(T):
+            for b, lower, upper in zip(
+                (self.B @ self.moving).T, self.box.lower, self.box.upper, strict=True
+            ):
+                T = _plus_segment(T, -b, lower, upper)
+        elif k:
             T = T.preimage(np.hstack([np.eye(n), self.B @ self.moving]))
             if self.V is not None:
                 T = T.intersect(self.V.preimage(np.hstack([np.zeros((k, n)), np.eye(k)])))
@@ -465,15 +485,44 @@ def one_step(
     n, m = system.n, system.m
     A, B = host_array("A", system.A), host_array("B", system.B)
     c = np.zeros(n) if system.c is None else host_array("c", system.c)
-    V, moving, fixed = None, np.eye(m), np.zeros(m)
+    V, moving, fixed, box = None, np.eye(m), np.zeros(m), None
     if inputs is not None:
         V = _polytope("inputs", inputs, m)
     if isinstance(inputs, Box):
         lower, upper = host_array("inputs", inputs.lower), host_array("inputs", inputs.upper)
         free = upper > lower
         moving, fixed = np.eye(m)[:, free], np.where(free, 0.0, lower)
-        V = Box(lower[free], upper[free]).to_polytope() if free.any() else None
-    return OneStep(A, B, c, V, moving, fixed, disturbance_set(disturbance, n))
+        box = Box(lower[free], upper[free])
+        V = box.to_polytope() if free.any() else None
+        box = box if np.isfinite([box.lower, box.upper]).all() else None
+    return OneStep(A, B, c, V, moving, fixed, disturbance_set(disturbance, n), box)
+
+
+def _bounded(polytope: Polytope) -> bool:
+    return geometry.positively_spanning(unit_rows(polytope.H, polytope.h)[0])
+
+
+def _plus_segment(T: Polytope, b: np.ndarray, lower: float, upper: float) -> Polytope:
+    """{y + b v : y in T, lower <= v <= upper}, for a bounded T with volume, n >= 2.
+
+    Its facets are those of T, shifted, and the sums of the segment and a ridge of T where facets
+    p and q meet with p'b > 0 > q'b. A ridge has at least n - 1 vertices: of all pairs (p, q),
+    those that share so many are combined, few of those that an elimination would make.
+    """
+    G, g = unit_rows(T.H, T.h)
+    slope, n = G @ b, G.shape[1]
+    slope[np.abs(slope) <= 1e-13 * np.linalg.norm(b)] = 0.0
+    V = T.vertices()
+    touches = (np.abs(V @ G.T - g) <= 1e-7 * np.ptp(V, axis=0).max()).T.astype(float)
+    up, down = np.flatnonzero(slope > 0), np.flatnonzero(slope < 0)
+    p, q = np.nonzero(touches[up] @ touches[down].T >= n - 1)
+    p, q = up[p], down[q]
+    share = -slope[q] / (slope[p] - slope[q])
+    H = share[:, None] * G[p] + (1 - share)[:, None] * G[q]
+    h = share * g[p] + (1 - share) * g[q]
+    new = np.linalg.norm(H, axis=1) > 1e-12
+    shifted = g + np.maximum(slope * lower, slope * upper)
+    return Polytope(np.vstack([G, H[new]]), np.r_[shifted, h[new]]).reduce()
 
 
 def _tidy(polytope: Polytope) -> Polytope:
@@ -525,7 +574,10 @@ def _inside(
     tolerance: float,
 ) -> tuple[Polytope | None, float]:  # fmt: skip
     """A control invariant set within C_k, as large as `rounds` steps make it, and the gap."""
-    found = next(_candidates(step, C, centre, cut), None)
+    try:
+        found = next(_candidates(step, C, centre, cut), None)
+    except ValueError:  # an elimination with too many rows, or a set too thin for qhull
+        found = None
     if found is None:
         return None, np.inf
     inner, before = found
@@ -533,9 +585,11 @@ def _inside(
     for _ in range(rounds):
         if gap <= tolerance:
             break
-        larger = _tidy(X.intersect(before))
-        before = step.back(larger)
-        narrower = _gap(C, larger)
+        try:
+            larger = _tidy(X.intersect(before))
+            before, narrower = step.back(larger), _gap(C, larger)
+        except ValueError:
+            break
         if narrower > 0.999 * gap or largest_cut(before, larger, enough=_ROUNDING) > _ROUNDING:
             break
         inner, gap = larger, narrower
@@ -576,7 +630,7 @@ def largest_cut(before: Polytope, C: Polytope, enough: float = np.inf) -> float:
     """
     H, h = unit_rows(before.H, before.h)
     level, worst = H @ C.chebyshev()[0], -np.inf
-    for i, top in _tops(H, C):
+    for i, top in _tops(H, C, h):
         worst = max(worst, (top - h[i]) / max(top - level[i], np.finfo(float).tiny))
         if worst > enough:
             break
@@ -590,25 +644,30 @@ def _gap(outer: Polytope, inner: Polytope) -> float:
     return max(0.0, *((top - h[i]) / slack[i] for i, top in _tops(H, outer)))
 
 
-def _tops(H: np.ndarray, C: Polytope) -> Iterator[tuple[int, float]]:
-    """(i, upper bound of max H_i x over a bounded C), by LPs in the coordinates of C's factors."""
+def _tops(H: np.ndarray, C: Polytope, h: np.ndarray | None = None) -> Iterator[tuple[int, float]]:
+    """(i, upper bound of max H_i x over a bounded C), by LPs in the coordinates of C's factors.
+
+    With h, where a row of C next to H_i x <= h_i implies it, that row's bound.
+    """
     G, g = unit_rows(C.H, C.h)
     for rows, Z in geometry.factors(np.vstack([G, H]))[0]:
         own = rows < len(G)
         limits, reach = g[rows[own]], None
+        near = KDTree(Z[own]).query(Z[~own])[1][::-1] if own.any() and not own.all() else []
         # What an elimination made comes last, and cuts most.
-        for i, row in zip(rows[~own][::-1] - len(G), Z[~own][::-1], strict=True):
+        for i, row, j in zip(rows[~own][::-1] - len(G), Z[~own][::-1], near, strict=True):
             reach = _extent(Z[own], limits) if reach is None else reach
-            yield int(i), _bound(row, Z[own], reach, limits)[1]
+            top = limits[j] + np.abs(row - Z[own][j]) @ reach
+            if h is None or top > h[i]:
+                top = _bound(row, Z[own], reach, limits)[1]
+            yield int(i), float(top)
 
 
-def _vertex_proof(step: OneStep, C: Polytope) -> str:
-    """Words on the worst of all vertices of C, with the best input for each; "" if too many."""
-    if step.n > 4:
-        return ""
-    vertices = C.vertices()
-    if len(vertices) > _VERTICES:
-        return ""
+def _vertex_proof(step: OneStep, C: Polytope) -> tuple[str, float]:
+    """How far the worst vertex of C leaves it, with the best input for each, in words and in x."""
+    vertices = C.vertices() if step.n <= 4 else np.zeros((0, step.n))
+    if not 0 < len(vertices) <= _VERTICES:
+        return "", 0.0
     G, g = unit_rows(C.H, C.h)
     g = g - supports(step.W, G)
     BU = step.B @ step.moving
@@ -628,7 +687,8 @@ def _vertex_proof(step: OneStep, C: Polytope) -> str:
         u = top.x[:-1]
         worst = max(worst, float((G @ (drift + BU @ u) - g).max()))
         worst = max(worst, float((H @ u - h).max(initial=0.0)))
-    return f"; each of its {len(vertices)} vertices has an input that keeps it in, to {worst:.0e}"
+    text = f"; each of its {len(vertices)} vertices has an input that keeps it in, to {worst:.0e}"
+    return text, worst
 
 
 def _closed_loop(

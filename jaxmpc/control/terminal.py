@@ -482,12 +482,12 @@ def _lyapunov(
     if closed is None or P is None:
         return Check(name, None, None, unit, no_law, (3,))
     top = float(np.linalg.eigvalsh(closed.T @ P @ closed - P + Q + K.T @ R @ K)[-1])
-    scale = np.linalg.norm(P, 2) * max(1.0, np.linalg.norm(closed, 2) ** 2)
-    scale += np.linalg.norm(Q, 2) + np.linalg.norm(R, 2) * np.linalg.norm(K, 2) ** 2
+    size, spread = np.linalg.norm(P, 2), np.linalg.norm(closed, 2)
+    scale = size + size * spread**2 + np.linalg.norm(Q, 2) + np.linalg.norm(K.T @ R @ K, 2)
     holds = top <= _TOUCH * scale
     sentence = (
         f"The largest eigenvalue of (A+BK)'P(A+BK) - P + Q + K'RK is {top:.3g}, "
-        f"for |P| = {np.linalg.norm(P, 2):.3g}."
+        f"for |P| = {size:.3g}."
     )
     return Check(name, bool(holds), -top, unit, sentence, (3,))
 

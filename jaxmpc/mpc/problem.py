@@ -1,6 +1,7 @@
 """The constrained MPC problem as a user states it, and the plan that answers it."""
 
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from typing import Any
 
 import jax
@@ -273,7 +274,7 @@ def soften(mpc: MPC, rho: Any, quadratic: Any = 0.0) -> MPC:
         ]
         units = [units[i] for keep in (up, low) for i in np.flatnonzero(keep)] if units else ()
         d = np.concatenate([upper[up], -lower[low]])
-        if len(d) and len(steps):
+        if d.size and steps:
             D = None if D is None else both(D)
             soft.append(
                 Soft(both(C), d, rho, quadratic, D, tuple(steps), tuple(names), tuple(units))
@@ -289,7 +290,7 @@ def soften(mpc: MPC, rho: Any, quadratic: Any = 0.0) -> MPC:
                 if isinstance(set_, Polytope)
                 else (system.state_names or tuple(f"x{i + 1}" for i in range(system.n)))
             )
-            names = names or tuple(f"{kind} row {i + 1}" for i in range(len(lower)))
+            names = names or tuple(f"{kind} row {i + 1}" for i in range(np.size(lower)))
             units = system.state_units if isinstance(set_, Box) else ()
             one_sided(C, None, lower, upper, steps, names, units)
     for rows in _tuple("outputs", mpc.outputs, Outputs):
@@ -297,6 +298,34 @@ def soften(mpc: MPC, rho: Any, quadratic: Any = 0.0) -> MPC:
         steps = output_steps(mpc, rows)
         one_sided(rows.C, rows.D, rows.lower, rows.upper, steps, names, rows.units)
     return replace(mpc, states=None, terminal_set=None, outputs=(), soft=tuple(soft))
+
+
+def harden(mpc: MPC) -> MPC:
+    """The same problem with every soft row hard: what a large enough penalty enforces where it can.
+
+    The opposite of `soften`: rows that hold at all steps of the state limits join `states`, rows at
+    k = N the terminal set, where these are not sets of another kind; the rest become `outputs`.
+    """
+    N, every = mpc.horizon, mpc.state_steps
+    states, terminal, outputs = [], [], list(_tuple("outputs", mpc.outputs, Outputs))
+    for s in _tuple("soft", mpc.soft, Soft):
+        steps = tuple(range(N + (s.D is None))) if s.steps is None else s.steps
+        rows = Polytope(s.C, s.d, s.names)
+        whole = s.D is None and set(every) <= set(steps) <= {*every, N}
+        if whole and mpc.states is None:
+            states.append(rows)
+            steps = tuple(set(steps) - set(every))
+        if s.D is None and steps == (N,) and mpc.terminal_set is None:
+            terminal.append(rows)
+            steps = ()
+        if steps:
+            free = np.full(np.shape(s.d), -np.inf)
+            outputs.append(Outputs(s.C, free, s.d, s.D, steps, s.names, s.units))
+    join = lambda given, found: reduce(Polytope.intersect, found) if found else given
+    return replace(
+        mpc, soft=(), outputs=tuple(outputs), states=join(mpc.states, states),
+        terminal_set=join(mpc.terminal_set, terminal),
+    )  # fmt: skip
 
 
 def output_steps(mpc: MPC, rows: Outputs) -> tuple[int, ...]:

@@ -14,9 +14,11 @@ from jaxmpc.qp.status import Status
 from jaxmpc.sweeps.regions import (
     LP,
     SMALLEST,
+    STOPPED,
     CriticalRegions,
     Law,
     Program,
+    exchange,
     explore,
     largest_ball,
     law,
@@ -26,12 +28,13 @@ from jaxmpc.sweeps.regions import (
 
 # "auto" enumerates regions up to this dimension of the state.
 ENUMERATED = 4
-# The sampled search: where on a ray to the boundary of X_N samples lie, how many local searches
-# and moves, and at what distances from the best state of a region its neighbours are looked for.
+# The sampled search: where on a ray to the boundary of X_N samples lie, how many regions it starts
+# from, after how many that lead to nothing better it ends,
+# and how many rays look for the facets of a region.
 SHARES = (0.5, 0.9, 0.99, 1 - 1e-4, 1 - 1e-7)
-STARTS = 8
-MOVES = 100
-STEPS = (1e-2, 1e-3, 1e-4, 1e-6)
+STARTS = 32
+PATIENCE = 12
+RAYS = 64
 # Relative rounding of rho_bar up to which a weight is called equal to it.
 ROUNDING = 1e-9
 # Row kinds that `soften` makes soft.
@@ -222,7 +225,7 @@ class Thresholds:
             b_ub=np.zeros(mine.sum()), bounds=(0, None), method="highs-ds", options=LP,
         )  # fmt: skip
         if result.x is None:
-            fail("mpc", f"HiGHS stopped: {result.message}", "Scale states and inputs to like size")
+            fail("mpc", *STOPPED)
         each = np.where(mine, result.x[:count] * per_row, 0.0)
         return float(result.fun * unit * size), int(rows[np.argmax(each)])
 
@@ -280,48 +283,55 @@ def ascend(
     p: Program, weigh: Thresholds, found: dict[tuple[int, ...], Worst | None], samples: int,
     random: np.random.Generator,
 ) -> None:  # fmt: skip
-    """Add to `found` the regions that samples and local searches from the best of them meet."""
-    n = len(p.center)
-    seen: dict[tuple[int, ...], tuple[float, np.ndarray]] = {}
+    """Add to `found` the regions that samples, and a search from the best of them, meet.
 
-    def visit(xi: np.ndarray) -> tuple[int, ...] | None:
-        active = p.basis(xi)
+    The search goes on from the best region not yet left, across its facets, until PATIENCE
+    regions in turn have led to nothing better.
+    """
+    seen: dict[tuple[int, ...], float] = {}
+    n, corners = len(p.center), []
+    for direction in random.standard_normal((max(samples // 2, 1), n)):
+        corners.append(p.support(direction)[1])
+    # Directions at random, and towards points between corners of X_N.
+    mixed = random.dirichlet(np.full(len(corners), 1 / len(corners)), samples // 2) @ corners
+    for direction in [*random.standard_normal((samples - samples // 2, n)), *(mixed - p.interior)]:
+        end = p.leave(direction)
+        for share in SHARES if end is not None else ():
+            solution = p.solution(p.interior + share * (end - p.interior))
+            if solution is not None:
+                rows = list(solution.active)
+                pushes = (solution.multipliers / p.length[rows])[weigh.soft[rows]]
+                seen[solution.active] = max(seen.get(solution.active, 0.0), pushes.max(initial=0.0))
+
+    def visit(active: tuple[int, ...] | None) -> None:
         if active is not None and active not in found:
             here = law(p, active)
             found[active] = None if here is None else weigh.maximal(here)
-        return active
 
-    def value(active: tuple[int, ...] | None) -> float:
-        worst = None if active is None else found[active]
-        return -1.0 if worst is None else worst.value
-
-    for direction in random.standard_normal((samples, n)):
-        end = p.leave(direction / np.linalg.norm(direction))
-        for share in SHARES:
-            xi = p.interior + share * (end - p.interior)
-            solution = p.solution(xi)
-            if solution is not None:
-                mine = weigh.soft[list(solution.active)]
-                lam = solution.multipliers / p.length[list(solution.active)]
-                seen.setdefault(solution.active, (lam[mine].max(initial=0.0), xi))
-    visit(p.interior)
-    # The regions with the largest multipliers at a sample are maximised; the best are left.
-    for _, xi in sorted(seen.values(), key=lambda s: -s[0])[: 4 * STARTS]:
-        visit(xi)
-    for start in sorted(found, key=value, reverse=True)[:STARTS]:
-        here = start
-        for _ in range(MOVES):
-            worst = found[here]
-            if worst is None:
-                break
-            inward = p.interior - worst.xi
-            around = [
-                visit(worst.xi + step * (inward + direction))
-                for step in STEPS
-                for direction in random.standard_normal((2 * n, n))
-            ]
-            best = max(around, key=value)
-            if value(best) <= worst.value * (1 + 1e-12):
-                break
-            assert best is not None
-            here = best
+    visit(p.basis(p.interior))
+    for active in sorted(seen, key=lambda a: -seen[a])[:STARTS]:
+        visit(active)
+    left: set[tuple[int, ...]] = set()
+    best, stale = -1.0, 0
+    while stale < PATIENCE:
+        waiting = {a: w for a, w in found.items() if w is not None and a not in left}
+        if not waiting:
+            return
+        here, worst = max(waiting.items(), key=lambda item: item[1].value)
+        stale = 0 if worst.value > best * (1 + ROUNDING) else stale + 1
+        best = max(best, worst.value)
+        left.add(here)
+        leaving = law(p, here)
+        assert leaving is not None
+        # Random rays inside the region hit its facets: from its middle, and from near the corner
+        # where the multiplier is largest.
+        middle, _ = largest_ball(leaving.H, leaving.h)
+        facets: set[int] = set()
+        for start in (middle, middle + 0.95 * (worst.xi - middle)):
+            slope = leaving.H @ random.standard_normal((len(start), RAYS))
+            gap = (leaving.h - leaving.H @ start)[:, None]
+            with np.errstate(divide="ignore"):
+                facets.update(np.where(slope > 0, gap / slope, np.inf).argmin(axis=0).tolist())
+        for row in sorted(leaving.which[list(facets)].tolist()):
+            for active in exchange(p, here, row) or []:
+                visit(tuple(sorted(active)))

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from scipy.spatial import KDTree
 from tqdm.auto import tqdm
 
 from jaxmpc.checks import fail
@@ -285,6 +286,7 @@ class FeasibleSetMap:
         directions = np.concatenate([np.eye(d), -np.eye(d), -np.ones((1, d))])
         points = np.zeros((0, d))
         normals, offsets, roundings = rays.box()
+        shot = unit(directions)
         for _ in range(rounds):
             found = rays.shoot(directions)
             proved = np.isfinite(found.inner)
@@ -296,11 +298,12 @@ class FeasibleSetMap:
             try:
                 outer = Polytope(normals, offsets).reduce()
                 low, high = hull_volume(points), outer.volume()
-                directions = outer.vertices() - rays.center
+                directions = fresh(outer.vertices() - rays.center, shot)
+                shot = np.concatenate([shot, unit(directions)])
             except ValueError:  # unbounded, or too thin for qhull
                 break
             # Sets with a curved boundary have no end of vertices.
-            if high - low <= tolerance * high or len(directions) > MOST_RAYS:
+            if high - low <= tolerance * high or not 0 < len(directions) <= MOST_RAYS:
                 break
         labels = excluded(self.labels, rays, self.points, normals, offsets, roundings)
         return replace(
@@ -330,6 +333,17 @@ class FeasibleSetMap:
             "input": list(system.input_labels),
         }
         return xarray.Dataset(data, coords=names)
+
+
+def unit(directions: np.ndarray) -> np.ndarray:
+    """Directions (K, d) scaled to length one."""
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def fresh(directions: np.ndarray, shot: np.ndarray) -> np.ndarray:
+    """The directions in which no ray of `shot` (unit length) has been sent."""
+    distance = KDTree(shot).query(unit(directions))[0]
+    return directions[distance > 1e-9]
 
 
 def ellipse(

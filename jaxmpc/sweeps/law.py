@@ -7,7 +7,7 @@ gradient, and within a piece be maximised exactly by a linear program.
 """
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -114,8 +114,10 @@ class Law:
     def plans(self, states: np.ndarray) -> Plans:
         """Plans from states (B, p), in programs of one shape."""
         found = solve_many(self.mpc, self.filled(states), ADMM(eps=EPS), chunk=self.chunk)
-        keep = lambda v: v[: len(states)] if isinstance(v, np.ndarray) else v
-        return Plans(*(keep(v) for v in vars(found).values()))
+        kept: dict[str, Any] = {
+            name: v[: len(states)] for name, v in vars(found).items() if isinstance(v, np.ndarray)
+        }
+        return replace(found, **kept)
 
     def limited(self, u: np.ndarray) -> np.ndarray:
         """Inputs (B, m) inside a box of limits: an actuator takes no rounding beyond them."""
@@ -144,20 +146,18 @@ class Law:
         excess = self.C @ z + self.D @ theta - self.b
         near = TOUCHING * (1 + np.abs(self.b))
         over, touching = excess > near, np.flatnonzero(np.abs(excess) <= near)
-        S = self.C[over] * self.kappa[over, None]
-        P = c.P + self.C[over].T @ S
+        S = self.kappa[over, None] * self.C[over]
+        P = c.P + S.T @ self.C[over]
         # q(x) = Q (x, 1), likewise for the bounds of the active rows.
         Q = np.column_stack([c.F, c.f])
-        Q += self.C[over].T @ np.column_stack(
-            [self.kappa[over, None] * self.D[over], self.rho[over] - self.kappa[over] * self.b[over]]
-        )
+        Q += S.T @ np.column_stack([self.D[over], -self.b[over]])
+        Q[:, -1] += self.C[over].T @ self.rho[over]
         one = np.append(theta, 1.0)
         force = -(P @ z + Q @ one)
         y = self._multipliers(self.C[touching].T, force, self.rho[touching])
         scale = 1 + np.abs(force).max(initial=0.0)
-        full = y >= self.rho[touching] * (1 - 1e-9)
-        active = touching[(y > 1e-9 * scale) & ~full]
-        full = touching[full]
+        most = y >= self.rho[touching] * (1 - 1e-9)
+        active, full = touching[(y > 1e-9 * scale) & ~most], touching[most]
         Q[:, -1] += self.C[full].T @ self.rho[full]
         zero = np.zeros((len(active), len(active)))
         KKT = np.block([[P, self.C[active].T], [self.C[active], zero]])
@@ -173,8 +173,8 @@ class Law:
         slack = np.column_stack([self.D, -self.b]) + self.C @ Z
         slack[over | np.isin(np.arange(len(slack)), full)] *= -1
         limited = np.isfinite(self.rho[active])
-        most = Y[limited] - np.outer(self.rho[active][limited], np.append(0 * theta, 1.0))
-        rows = np.vstack([np.delete(slack, active, axis=0), -Y, most])
+        above = Y[limited] - np.outer(self.rho[active][limited], np.append(0 * theta, 1.0))
+        rows = np.vstack([np.delete(slack, active, axis=0), -Y, above])
         # Columns of a previous input that is not among the states meet a zero; rows that are
         # constant to rounding say nothing.
         rows = np.column_stack([rows[:, :p], rows[:, -1]])
@@ -204,10 +204,10 @@ class Law:
 def ascend(law: Law, bound: Bound, starts: np.ndarray, deadline: float) -> np.ndarray:
     """States (K, p) where the next state exceeds a half-space most, the best first.
 
-    starts (S, p): raised by v(x) = max_j (a_j'x⁺(x) − b_j) along its gradient (A + B ∂u_0/∂x)'a_j
-    within the half-spaces, in halving steps of which those are taken that raise v; then the best are led from
-    region to region, each to the maximum of a_j'x⁺ on its region. A local method: what it finds
-    is real, what it does not find is not proved absent.
+    starts (S, p) follow the gradient (A + B ∂u_0/∂x)'a_j of v(x) = max_j (a_j'x⁺(x) − b_j) within
+    the half-spaces, in steps of halving length of which those are taken that raise v. Then the
+    best are led from region to region, each to the maximum of a_j'x⁺ on its region. A local
+    method: what it finds is real, what it does not find is not proved absent.
     """
     inset = 1e-9 * bound.size
     x = bound.nearest(starts, inset)
@@ -239,9 +239,7 @@ def _value(
     return value, gradient
 
 
-def _climb(
-    law: Law, bound: Bound, x: np.ndarray, value: np.ndarray, deadline: float
-) -> np.ndarray:
+def _climb(law: Law, bound: Bound, x: np.ndarray, value: np.ndarray, deadline: float) -> np.ndarray:
     """From the best of x (S, p): to the best vertex of the region there, and on from beside it."""
     random = np.random.default_rng(0)
     inset = 1e-9 * bound.size
@@ -254,9 +252,8 @@ def _climb(
         around = bound.nearest(np.concatenate([best, *(best + beside)]), inset)
         plans = law.plans(around)
         found = []
-        for state, inputs in zip(around[plans.status == Status.SOLVED],
-                                 plans.inputs[plans.status == Status.SOLVED], strict=True):  # fmt: skip
-            piece = law.piece(state, inputs)
+        for i in np.flatnonzero(plans.status == Status.SOLVED):
+            state, piece = around[i], law.piece(around[i], plans.inputs[i])
             if piece is None:
                 continue
             facet = int(np.argmax(bound.normals @ (piece.E @ state + piece.e) - bound.offsets))

@@ -9,12 +9,14 @@ programs over it. Host, float64, HiGHS.
 import time
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import jax
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.control.sets import Polytope, maximise
+from jaxmpc.control.invariant import predecessor
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope, maximise, unit_rows
 from jaxmpc.mpc.condense import condense, in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.sweeps.proofs import hard_part
@@ -47,9 +49,7 @@ class Pairs:
     @cached_property
     def extent(self) -> np.ndarray:
         """|v_i| ≤ extent_i on the polytope (twice what LPs find, which outweighs their error)."""
-        size = self.G.shape[1]
-        ends = [maximise(s * e, self.G, self.g).value for e in np.eye(size) for s in (1, -1)]
-        return 2 * np.abs(ends).reshape(size, 2).max(axis=1) + 1e-300
+        return _extent(self.G, self.g)
 
     def twice(self) -> "Pairs":
         """The pairs that can go on: (θ, z, z⁺) with (θ, z) and (θ⁺, z⁺) both feasible."""
@@ -83,9 +83,7 @@ class Pairs:
         return top.value if top.y is None else self._bound(d, top.y)
 
     def _bound(self, d: np.ndarray, y: np.ndarray) -> float:
-        left = np.abs(d - self.G.T @ y)
-        off = left > 0
-        return float(y @ self.g + left[off] @ self.extent[off])
+        return _bound(d, y, self.G, self.g, self.extent)
 
     def centre(self) -> np.ndarray | None:
         """The θ of the pair with the largest margin to all rows; None if no pair has a margin."""
@@ -109,7 +107,19 @@ class Pairs:
         normal = self.G[:, :p].T @ top.y
         b = self._bound(np.append(normal, np.zeros(G.shape[1] - 1)), top.y)
         length = np.linalg.norm(normal)
-        return top.value, normal / length, b / length
+        return top.value, normal / length, float(b / length)
+
+
+def _extent(G: np.ndarray, g: np.ndarray) -> np.ndarray:
+    size = G.shape[1]
+    ends = [maximise(s * e, G, g).value for e in np.eye(size) for s in (1, -1)]
+    return 2 * np.abs(ends).reshape(size, 2).max(axis=1) + 1e-300
+
+
+def _bound(d: np.ndarray, y: np.ndarray, G: np.ndarray, g: np.ndarray, extent: np.ndarray) -> float:
+    left = np.abs(d - G.T @ y)
+    off = left > 0
+    return float(y @ g + left[off] @ extent[off])
 
 
 def pairs(mpc: MPC) -> Pairs:
@@ -136,9 +146,10 @@ def pairs(mpc: MPC) -> Pairs:
 
 @dataclass(frozen=True)
 class Shadow:
-    """A polytope that is the shadow of pairs: normals (K, p) of length 1, offsets (K,), vertices.
+    """The states θ of pairs as a polytope: normals (K, p) of length 1, offsets (K,), vertices.
 
     The half-spaces are valid; each vertex of their intersection was reached to `TOLERANCE`.
+    vertices (0, p): not enumerated, the half-spaces come from `backward`.
     """
 
     center: np.ndarray
@@ -150,6 +161,18 @@ class Shadow:
     def size(self) -> float:
         """Largest distance of a facet from the centre, the scale of tolerances."""
         return float(np.max(self.offsets - self.normals @ self.center))
+
+    @cached_property
+    def extent(self) -> np.ndarray:
+        """|θ_i| ≤ extent_i, as in `Pairs`."""
+        return _extent(self.normals, self.offsets)
+
+    def support(self, direction: np.ndarray) -> tuple[float, np.ndarray | None]:
+        """Upper bound of max direction'θ, as in `Pairs.largest`, and where it is attained."""
+        top = maximise(direction, self.normals, self.offsets)
+        if top.y is None:
+            return top.value, None
+        return _bound(direction, top.y, self.normals, self.offsets, self.extent), top.x
 
     @property
     def polytope(self) -> Polytope:
@@ -168,7 +191,7 @@ def shadow(pairs: Pairs, deadline: float = np.inf) -> Shadow | str:
     vertex is reached (beneath-beyond). deadline: of `time.monotonic`, in seconds.
     """
     if pairs.p > DIMENSIONS:
-        return f"facets are not enumerated in {pairs.p} dimensions (up to {DIMENSIONS} they are)"
+        return f"vertices are not enumerated in {pairs.p} dimensions (up to {DIMENSIONS} they are)"
     center = pairs.centre()
     if center is None:
         return "the feasible set is empty or flat"
@@ -196,3 +219,41 @@ def shadow(pairs: Pairs, deadline: float = np.inf) -> Shadow | str:
         if not len(directions):
             return Shadow(center, normals, offsets, vertices)
     return "its facets are too many to enumerate in the time given"
+
+
+def backward(mpc: MPC, deadline: float = np.inf) -> tuple[Shadow, Shadow, Shadow] | str:
+    """X_{N−1}, X_N and X_{N+1} by X_{k+1} = states ∩ Pre(X_k), or the reason why not.
+
+    Half-spaces without vertices, by elimination (`predecessor`): for problems of many states
+    whose limits couple few of them. Only for limits on states and inputs at the usual steps.
+    """
+    last: Any = mpc.terminal_set
+    if not usual(mpc) or not mpc.constrain_initial or mpc.states is None or mpc.horizon < 2:
+        return "its facets are enumerated for limits of states and inputs alone"
+    if isinstance(last, Ellipsoid):
+        return "the terminal set has no facets"
+    # Without a terminal set x_0 ∈ X is all that a horizon of 1 asks.
+    body, count = (mpc.states, mpc.horizon) if last is None else (last, mpc.horizon + 1)
+    found = []
+    for k in range(count):
+        try:
+            body = predecessor(mpc.system, body, mpc.states, mpc.inputs).reduce()
+        except ValueError as error:
+            return f"its facets are not found ({error})"
+        if time.monotonic() > deadline or np.size(body.h) > FACETS // 4:
+            return "its facets are too many to enumerate in the time given"
+        if k >= count - 3:
+            found.append(body)
+    if last is None and mpc.horizon == 2:
+        found = [mpc.states.to_polytope() if isinstance(mpc.states, Box) else mpc.states, *found]
+    none = np.zeros((0, mpc.system.n))
+    one, two, three = (
+        Shadow(part.chebyshev()[0], *unit_rows(part.H, part.h), none) for part in found[-3:]
+    )
+    return one, two, three
+
+
+def usual(mpc: MPC) -> bool:
+    """True for limits on states and inputs alone, at the usual steps, inputs free at each step."""
+    free = not (mpc.outputs or mpc.rate_limited) and mpc.control_horizon is None
+    return free and mpc.constrained_steps is None

@@ -20,6 +20,7 @@ import numpy as np
 
 from jaxmpc.checks import fail
 from jaxmpc.control.sets import Polytope
+from jaxmpc.control.terminal import verify_terminal
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
 from jaxmpc.sweeps.boundary import boundary, spread
@@ -27,7 +28,7 @@ from jaxmpc.sweeps.compiled import default_chunk
 from jaxmpc.sweeps.feasible_set import FeasibleSetMap, grid, map_feasible_set
 from jaxmpc.sweeps.law import Bound, Law, ascend
 from jaxmpc.sweeps.proofs import hard_part
-from jaxmpc.sweeps.reach import DIMENSIONS, TOLERANCE, Pairs, Shadow, pairs, shadow
+from jaxmpc.sweeps.reach import DIMENSIONS, TOLERANCE, Pairs, Shadow, backward, pairs, shadow, usual
 from jaxmpc.sweeps.regions import critical_regions
 
 # Distance from X_N, relative to its size, from which a state counts as outside: well above the
@@ -43,13 +44,17 @@ NONE = np.zeros(0)
 
 @dataclass(frozen=True)
 class Rung:
-    """A claim: holds True (proved), False (refuted by a counterexample) or None (open); and why."""
+    """A claim: holds True (proved), False (refuted) or None (open); and why.
+
+    state (p,): where it is refuted, the state of the counterexample; else None.
+    """
 
     holds: bool | None
     reason: str
+    state: np.ndarray | None = None
 
     def __str__(self) -> str:
-        return f"{ {True: 'proved', False: 'refuted', None: 'open'}[self.holds]}: {self.reason}"
+        return f"{ {True: 'proved', False: 'refuted', None: 'open'}[self.holds] }: {self.reason}"
 
 
 @dataclass(frozen=True)
@@ -217,8 +222,13 @@ def recursive_feasibility(
             tops = ascend(law, bound, np.concatenate([starts, near]), deadline)
             candidates, found = np.concatenate([candidates, tops]), found + ["search"] * len(tops)
         worst = _certified(law, bound, candidates, found)
-    lost = 0.0 if ladder.law.holds and ladder.shadow else np.nan
-    if regions and ladder.shadow and not ladder.law.holds and time.monotonic() < deadline:
+    lost = 0.0 if ladder.law.holds and np.isfinite(ladder.volume) else np.nan
+    if (
+        regions
+        and np.isfinite(ladder.volume)
+        and not ladder.law.holds
+        and time.monotonic() < deadline
+    ):
         verdict, lost, beyond = _by_regions(ladder, regions)
         if verdict.holds is False and worst is None:  # the search has missed it
             worst = _certified(law, bound, beyond, ["regions"] * len(beyond))
@@ -227,7 +237,12 @@ def recursive_feasibility(
     if worst is not None:
         refuted = Rung(False, str(worst))
         strong = ladder.strong if ladder.strong.holds is False else refuted
-        ladder = replace(ladder, law=refuted, strong=strong)
+        weak = ladder.weak
+        if weak.holds is None and _no_way_on(ladder.pairs, worst.state):
+            weak = Rung(
+                False, f"from x = {_point(worst.state)} every feasible first move leaves X_N"
+            )
+        ladder = replace(ladder, law=refuted, strong=strong, weak=weak)
     elif ladder.law.holds is None:
         tried = f"{np.sum(fmap.label == 1):,} samples" + search * f" and {STARTS} ascents"
         why = f"no counterexample among {tried}, no proof: {ladder.law.reason}"
@@ -262,20 +277,34 @@ class Ladder:
 def climb(mpc: MPC, deadline: float = np.inf) -> Ladder:
     """Settle the rungs by Theorem 1 and linear programs."""
     all_pairs = pairs(mpc)
-    body = shadow(all_pairs, deadline) if all_pairs.exact else "the terminal set has no facets"
+    before = after = None
+    body: Shadow | str = "the terminal set has no facets"
+    if all_pairs.exact and all_pairs.p <= DIMENSIONS:
+        body = shadow(all_pairs, deadline)
+    elif all_pairs.exact:
+        sets = backward(mpc, deadline)
+        before, body, after = (None, sets, None) if isinstance(sets, str) else sets
     found, why = (None, body) if isinstance(body, str) else (body, "")
-    volume = np.nan if found is None else found.polytope.volume()
+    countable = found is not None and len(found.vertices)
+    volume = found.polytope.volume() if found is not None and countable else np.nan
     if not np.any(all_pairs.G[:, : all_pairs.p]) and all_pairs.exact:
         strong = Rung(True, "no limit depends on the state")
     else:
         strong = _theorem(mpc)
     if strong.holds is None and found is not None:
         strong = _every_move(mpc, all_pairs, found)
+    elif strong.holds is None:
+        strong = Rung(None, f"{strong.reason}; {why}")
     if strong.holds:
-        follows = Rung(True, f"follows from strong ({strong.reason})")
+        follows = Rung(True, "follows from strong")
         lost = np.nan if found is None else 0.0
         return Ladder(mpc, all_pairs, found, why, strong, follows, follows, volume, lost)
-    weak, lost = _some_move(all_pairs, found, why, deadline)
+    if found is None:
+        weak, lost = Rung(None, why), np.nan
+    elif before is not None and after is not None:
+        weak, lost = _longer(before, found, after), np.nan
+    else:
+        weak, lost = _some_move(all_pairs, found, deadline)
     law = Rung(None, "weak is refuted" if weak.holds is False else why or "needs the law itself")
     return Ladder(mpc, all_pairs, found, why, strong, law, weak, volume, lost)
 
@@ -300,29 +329,23 @@ def _every_move(mpc: MPC, all_pairs: Pairs, body: Shadow) -> Rung:
 
 def _set_before(mpc: MPC, body: Shadow) -> str:
     """In words, that one step less gives the same set, where it does."""
-    if mpc.horizon < 2 or mpc.control_horizon is not None or mpc.constrained_steps is not None:
+    if mpc.horizon < 2 or not usual(mpc):
         return ""
     shorter = pairs(replace(mpc, horizon=mpc.horizon - 1))
     ends = [shorter.support(normal) for normal in body.normals]
-    if shorter.p != body.vertices.shape[1] or np.any(
-        np.array(ends) > body.offsets + TOLERANCE * body.size
-    ):
+    if np.any(np.array(ends) > body.offsets + TOLERANCE * body.size):
         return ""
     N = mpc.horizon
     return f"X_{N - 1} = X_{N}; " if _nested(mpc) else f"X_{N - 1} lies in X_{N}; "
 
 
 def _nested(mpc: MPC) -> bool:
-    """True where a longer horizon can only make X_N smaller: nothing but state limits at the end."""
+    """True where a longer horizon can only make X_N smaller: the end has state limits at most."""
     return mpc.constrain_initial and (mpc.terminal_set is None or mpc.terminal_set is mpc.states)
 
 
-def _some_move(
-    all_pairs: Pairs, body: Shadow | None, why: str, deadline: float
-) -> tuple[Rung, float]:
+def _some_move(all_pairs: Pairs, body: Shadow, deadline: float) -> tuple[Rung, float]:
     """Weak, and the volume lost whatever the move: X_N against the states that can go on."""
-    if body is None:
-        return Rung(None, why), np.nan
     later = shadow(all_pairs.twice(), deadline)
     if isinstance(later, str):
         return Rung(None, f"of the states that can go on, {later}"), np.nan
@@ -338,9 +361,51 @@ def _some_move(
     return Rung(False, f"from x = {x} every feasible first move leaves X_N"), lost
 
 
+def _longer(before: Shadow, body: Shadow, after: Shadow) -> Rung:
+    """Weak by half-spaces alone: X_N ⊆ X_{N+1}, and X_N ⊆ X_{N−1}, so that a first move into X_N
+    is that of a feasible plan.
+    """
+    tops = [body.support(normal) for normal in after.normals]
+    excess = np.array([top[0] for top in tops]) - after.offsets
+    i = int(np.argmax(excess))
+    x = tops[i][1]
+    if excess[i] > CLEAR * body.size and x is not None:
+        return Rung(False, f"from x = {_point(x)} every feasible first move leaves X_N")
+    nested = np.array([body.support(normal)[0] for normal in before.normals]) - before.offsets
+    if max(excess[i], nested.max()) <= TOLERANCE * body.size:
+        return Rung(True, f"X_N lies in X_N+1 and in X_N-1 ({len(excess)} facets by LPs)")
+    return Rung(None, "X_N lies in X_N+1, but its plans may not reach there")
+
+
+def _no_way_on(all_pairs: Pairs, state: np.ndarray) -> bool:
+    """True if no feasible first move from `state` stays: it is beyond the states that can go on."""
+    later = all_pairs.twice()
+    center = later.centre()
+    if center is None or not all_pairs.exact:
+        return False
+    _, normal, offset = later.ray(center, state - center)
+    return bool(normal @ state - offset > CLEAR * np.linalg.norm(state - center))
+
+
 def _theorem(mpc: MPC) -> Rung:
-    """Strong by Theorem 1, where the terminal set is invariant."""
-    return Rung(None, "Theorem 1 does not apply")
+    """Strong by Theorem 1: a plan shifted by one step and ended inside the terminal set is a plan.
+
+    That needs limits on states and inputs alone, at the usual steps, and inputs free at each step.
+    Without a terminal set, X takes its place at horizon N − 1. Convexity and compactness, which
+    the theorem asks for, are used nowhere in this argument.
+    """
+    if not usual(mpc) or (mpc.terminal_set is None and mpc.horizon == 1):
+        return Rung(None, "Theorem 1 does not cover these limits")
+    report = verify_terminal(
+        mpc.system, mpc.Q, mpc.R, mpc.terminal_cost, mpc.terminal_set, mpc.states, mpc.inputs
+    )
+    needed = [report["terminal set within states"], report["control invariance"]]
+    if all(check.holds for check in needed):
+        what = "the terminal set" if mpc.terminal_set is not None else "the set of state limits"
+        words = f"{what} is within the limits and control invariant"
+        return Rung(True, f"Theorem 1: {words}. {needed[1].sentence}")
+    missing = next(check for check in needed if not check.holds)
+    return Rung(None, f"Theorem 1 does not apply: {missing.name}")
 
 
 def _by_regions(ladder: Ladder, limit: int) -> tuple[Rung, float, np.ndarray]:
@@ -352,24 +417,26 @@ def _by_regions(ladder: Ladder, limit: int) -> tuple[Rung, float, np.ndarray]:
     assert body is not None
     none = np.zeros((0, ladder.pairs.p))
     try:
-        found = critical_regions(hard_part(mpc) if not mpc.soft else mpc, limit=limit)
+        if mpc.remembers:
+            fail("mpc", "its law depends on the previous input", "They are not enumerated then")
+        found = critical_regions(mpc, limit=limit)
     except ValueError as error:
         return Rung(None, f"no critical regions ({error})"), np.nan, none
     A, B = np.asarray(mpc.system.A, float), np.asarray(mpc.system.B, float)
     c = np.zeros(len(A)) if mpc.system.c is None else np.asarray(mpc.system.c, float)
-    excess, states, lost = [-np.inf], [none], 0.0
+    excess, parts, lost = [-np.inf], [none], 0.0
     for region in found.regions:
         E, e = A + B @ region.K, B @ region.k + c
         beyond = body.excess(region.vertices @ E.T + e)
         excess.extend(beyond)
-        states.append(region.vertices)
+        parts.append(region.vertices)
         if beyond.max() > CLEAR * body.size:
             H, h = np.asarray(region.polytope.H), np.asarray(region.polytope.h)
             stays = Polytope(
                 np.vstack([H, body.normals @ E]), np.append(h, body.offsets - body.normals @ e)
             )
             lost += region.volume - _volume(stays)
-    values, states = np.array(excess[1:]), np.concatenate(states)
+    values, states = np.array(excess[1:]), np.concatenate(parts)
     top = values.max(initial=-np.inf)
     if top > CLEAR * body.size:
         worst = np.argsort(-values)[:6]
@@ -404,11 +471,13 @@ def law_map(law: Law, states: np.ndarray) -> FeasibleSetMap:
     """Labels of states (B, p or more columns), in programs of one shape."""
     p = hard_part(law.mpc).dimension
     fmap = map_feasible_set(law.mpc, law.filled(states[:, :p]), chunk=law.chunk)
-    labels = replace(fmap.labels, **{
+    kept: dict[str, Any] = {
         name: value[: len(states)]
-        for name, value in vars(fmap.labels).items() if isinstance(value, np.ndarray)
-    })  # fmt: skip
-    return replace(fmap, points=fmap.points[: len(states)], labels=labels)
+        for name, value in vars(fmap.labels).items()
+        if isinstance(value, np.ndarray)
+    }
+    points, labels = fmap.points[: len(states)], replace(fmap.labels, **kept)
+    return replace(fmap, points=points, labels=labels)
 
 
 def _closed_loops(law: Law, x0s: np.ndarray, label: np.ndarray, steps: int) -> Loops:
@@ -444,7 +513,7 @@ def _bound(ladder: Ladder) -> tuple[Bound | None, np.ndarray]:
     """Half-spaces of X_N and starts (S, p) near its boundary; None and no starts without them."""
     body, p = ladder.shadow, ladder.pairs.p
     random = np.random.default_rng(0)
-    if body is not None:
+    if body is not None and len(body.vertices):
         # Vertices, middles of facets, and random points of facets: convex combinations.
         parts = [body.vertices]
         tight = body.offsets - body.vertices @ body.normals.T <= 1e-7 * body.size
@@ -459,6 +528,8 @@ def _bound(ladder: Ladder) -> tuple[Bound | None, np.ndarray]:
         return None, np.zeros((0, p))
     valid = np.isfinite(rays.offsets) & np.any(rays.normals != 0, axis=1)
     found = np.all(np.isfinite(rays.points), axis=1)
+    if body is not None and found.any():
+        return Bound(rays.center, body.normals, body.offsets), rays.points[found]
     if not valid.any() or not found.any():
         return None, np.zeros((0, p))
     length = np.linalg.norm(rays.normals[valid], axis=1)
@@ -468,9 +539,9 @@ def _bound(ladder: Ladder) -> tuple[Bound | None, np.ndarray]:
 
 
 def _samples(ladder: Ladder, starts: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """The middles of a grid's cells over the box of X_N in up to three dimensions; above, random points on the way out."""
+    """Middles of a grid's cells on the box of X_N up to 3-D; above, random points on rays."""
     p = ladder.pairs.p
-    if ladder.shadow is not None and p <= 3:
+    if ladder.shadow is not None and len(ladder.shadow.vertices) and p <= 3:
         V, count = ladder.shadow.vertices, {1: 1000, 2: 64, 3: 16}[p]
         half = np.ptp(V, axis=0) / (2 * count)
         return grid(V.min(axis=0) + half, V.max(axis=0) - half, (count,) * p)
@@ -526,8 +597,9 @@ def _deepest(
     """Of the half-spaces proved by labels, and by rays that end on the side of x, the deepest."""
     normals, offsets = fmap.cuts()
     facet = int(np.argmax(bound.normals @ x - bound.offsets))
-    towards = [bound.nearest(x[None])[0], x, x - 2 * bound.excess(x[None])[0] * bound.normals[facet]]
-    rays = boundary(mpc, np.array(towards) - bound.center, center=bound.center)
+    depth = bound.normals[facet] @ x - bound.offsets[facet]
+    towards = np.array([x, bound.nearest(x[None])[0], x - depth * bound.normals[facet]])
+    rays = boundary(mpc, towards - bound.center, center=bound.center)
     valid = np.isfinite(rays.offsets)
     normals = np.concatenate([normals, rays.normals[valid]])
     offsets = np.concatenate([offsets, rays.offsets[valid]])
@@ -564,7 +636,7 @@ def smallest_horizon(mpc: MPC, limit: int = 20, *, regions: int = 2000) -> Small
         law = ladder.law
         if ladder.weak.holds is False:
             law = Rung(False, ladder.weak.reason)
-        elif law.holds is None and least is None and regions and ladder.shadow is not None:
+        elif law.holds is None and least is None and regions and np.isfinite(ladder.volume):
             law = _by_regions(ladder, regions)[0]
         reasons[N] = law
         least = N if law.holds and least is None else least

@@ -41,6 +41,7 @@ ZERO = 1e-11
 STEPS = (1e-2, 1e-4, 1e-6)
 REPAIRS = 20
 DIMENSIONS = 6
+STOPPED = "HiGHS stopped early on its linear programs", "Scale states and inputs to like size"
 LP = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 
 
@@ -163,7 +164,7 @@ def critical_regions(
     (least distance by NNLS).
     """
     mpc.validate()
-    if getattr(mpc, "soft", ()):
+    if mpc.soft:
         fail("mpc.soft", "has rows, and slacks make another QP", "Make the rows hard first")
     return explore(program(mpc, within), limit).report(mpc)
 
@@ -198,17 +199,17 @@ class Program:
     def support(self, d: np.ndarray) -> tuple[float, np.ndarray]:
         """max d'ξ over X_N, and where."""
         value, xi = maximum(d, np.hstack([self.U, -self.V]), self.v)
-        assert xi is not None
+        if xi is None:
+            fail("mpc", *STOPPED)
         return value, xi
 
-    def leave(self, direction: np.ndarray) -> np.ndarray:
-        """Where the ray from the interior point along `direction` leaves X_N."""
+    def leave(self, direction: np.ndarray) -> np.ndarray | None:
+        """Where the ray from the interior point along `direction` leaves X_N; None: not found."""
         t = maximum(
             np.ones(1), np.column_stack([self.U, -self.V @ direction]),
             self.v + self.V @ self.interior,
         )[1]  # fmt: skip
-        assert t is not None
-        return self.interior + t * direction
+        return None if t is None else self.interior + t * direction
 
     def margin(self, xi: np.ndarray) -> float:
         """Upper bound of the greatest t ≤ 1 with M y + t ≤ v + V ξ: ξ is outside X_N if t < 0."""
@@ -293,9 +294,9 @@ def program(mpc: MPC, within: Box | Polytope | None = None) -> Program:
     """The least-distance form with all rows of `mpc` hard, on X_N or on X_N ∩ within."""
     with jax.enable_x64(True):
         c: Condensed = jax.tree.map(np.asarray, condense(in_float64(mpc)))
-    if getattr(c, "balls", None):
+    if c.balls:
         fail("terminal_set", "is an ellipsoid: its law is not affine", "Give a Polytope")
-    n = mpc.system.n
+    n = mpc.dimension
     try:
         factor = np.linalg.cholesky(c.P)
     except np.linalg.LinAlgError:
@@ -328,6 +329,8 @@ def program(mpc: MPC, within: Box | Polytope | None = None) -> Program:
     unit = 1 / np.maximum(np.abs(V).max(axis=0), 1e-300)
     ends = [maximum(d, np.hstack([U, -V * unit]), v)[0] for d in (*np.eye(n), *-np.eye(n))]
     high, low = np.array(ends[:n]) * unit, -np.array(ends[n:]) * unit
+    if np.isnan(ends).any():
+        fail("mpc", *STOPPED)
     if -np.inf in ends:
         fail("mpc", "its feasible set is empty", "Relax a limit or lengthen the horizon")
     free = ~np.isfinite(high - low)
@@ -353,7 +356,9 @@ def program(mpc: MPC, within: Box | Polytope | None = None) -> Program:
 
 
 def maximum(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> tuple[float, np.ndarray | None]:
-    """max d'(last coordinates of w) over G w ≤ g, and those coordinates; ±inf and None without.
+    """max d'(last coordinates of w) over G w ≤ g, and those coordinates.
+
+    ±inf and None where there is none, NaN and None where HiGHS stops for another reason.
 
     Where the rows that push carry d to rounding, the value is that of their multipliers: an upper
     bound by weak duality, and free of HiGHS' tolerances.
@@ -373,7 +378,7 @@ def maximum(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> tuple[float, np.ndar
             exact = np.all(y >= 0) and np.abs(G[push].T @ y - cost).max() <= 1e-13 * (1 + y.sum())
             value = g[push] @ y if exact else -result.fun * size
             return float(value), result.x[-len(d) :] * size
-    fail("mpc", f"HiGHS stopped: {result.message}", "Scale states and inputs to like size")
+    return np.nan, None
 
 
 def half_spaces(set_: Box | Polytope | None, n: int) -> tuple[np.ndarray, np.ndarray]:

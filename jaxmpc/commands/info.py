@@ -1,0 +1,81 @@
+"""The command `jaxmpc info`: arguments to calls, no mathematics."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from jaxmpc import config as configs
+from jaxmpc.checks import fail
+from jaxmpc.commands.options import option, report_error
+from jaxmpc.workflow import offline_report
+
+
+@dataclasses.dataclass(frozen=True)
+class Info:
+    """What is known of this controller before it runs: an offline test report.
+
+    What it does
+      Prints, for a constrained linear MPC:
+        Problem                 sizes, and each limit with the steps at which it holds
+        Feasible set            proved bounds of its volume (up to three states), sampled labels
+        Recursive feasibility   the claims of jaxmpc recursion, proved, refuted or open
+        Exact penalty           the L1 weight above which soft limits are kept wherever they can be
+        Terminal ingredients    each hypothesis of the theorems on recursive feasibility (1) and
+                                stability (3): holds or not, by how much
+        Closed loops            nominal runs from feasible states: violations, Lyapunov decrease
+      Soft limits count as hard, but for the closed loops.
+      Without a file the problem is one robot joint: x = (q, dq), torque u, 20 steps of 0.01 s.
+      An option given here wins over the file.
+
+    How to start
+      $ jaxmpc info
+      $ jaxmpc info --config pendulum.toml --terminal invariant
+
+    How to read the output
+      "proved" rests on linear programs or certificates with the tolerance that is named, "refuted"
+      on a counterexample; closed loops are tried, not proved. Nothing is written to disk.
+      Exit code  0 done, whatever the answers; 2 error (one line on stderr says which).
+
+    What the TOML file holds
+      The sections [system], [limits], [cost], [mpc] of jaxmpc sweep --help.
+    """
+
+    config: Annotated[Path | None, option("FILE", "the built-in joint")] = None
+    """TOML file with the problem."""
+    horizon: Annotated[int | None, option("N", "from the file; joint 20")] = None
+    """Prediction horizon, in steps of dt."""
+    terminal: Annotated[
+        Literal["none", "invariant", "ellipsoid", "box"] | None,
+        option("{none,invariant,ellipsoid,box}", "from the file, else none"),
+    ] = None
+    """Set for the last state: none, largest set or largest ellipsoid that the LQR keeps within
+    limits, state limits."""
+    steps: Annotated[int, option("K", "50")] = 50
+    """Length of the closed loops."""
+    loops: Annotated[int, option("K", "128")] = 128
+    """Number of the closed loops."""
+    seconds: Annotated[float, option("S", "60")] = 60.0
+    """Time for the search for counterexamples; what is not settled by then is open."""
+
+    def overrides(self) -> dict[str, Any]:
+        """The keys of [mpc] that the command line sets."""
+        keys = ("horizon", "terminal")
+        return {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
+
+    def run(self) -> int:
+        """Do it; the result is the exit code."""
+        try:
+            if self.config is None:
+                config = configs.Config.default(self.overrides(), "info")
+            else:
+                config = configs.load(self.config, self.overrides(), "info")
+            for name in ("steps", "loops", "seconds"):
+                if not getattr(self, name) > 0:
+                    fail(f"--{name}", f"{getattr(self, name)}", "Give a positive number")
+            report = offline_report(
+                config.build_mpc(), steps=self.steps, loops=self.loops, seconds=self.seconds
+            )
+        except ValueError as error:
+            return report_error(error)
+        print(f"{config.name}\n\n{report}")
+        return 0

@@ -1,0 +1,42 @@
+"""What the commands of the command line share."""
+
+import contextlib
+import sys
+import tempfile
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from jaxmpc.checks import fail
+
+
+def option(metavar: str | None, default: str) -> Any:
+    """How an option and its default appear in the help."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
+
+
+def open_folder(path: Path) -> None:
+    """Make the folder of --output; ValueError where nothing can be written there."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        fail(f"--output {path}", f"{error.strerror}", "Give a folder you can write to")
+
+
+def report_error(error: Exception) -> int:
+    """One line on stderr; the exit code."""
+    print(f"jaxmpc: error: {' '.join(str(error).split())}", file=sys.stderr)
+    return 2
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on, as far as they are installed as packages."""
+    found = {}
+    for name in ("jaxmpc", "jax", "jaxlib", "numpy", "scipy"):
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found

@@ -1,0 +1,201 @@
+"""The command `jaxmpc recursion`: arguments to calls, no mathematics."""
+
+import dataclasses
+import json
+import time
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+
+from jaxmpc import config as configs
+from jaxmpc.checks import fail
+from jaxmpc.commands.options import open_folder, option, report_error, versions
+from jaxmpc.plots import plot_recursion
+from jaxmpc.sweeps.recursion import (
+    RecursionReport,
+    SmallestHorizon,
+    recursive_feasibility,
+    smallest_horizon,
+)
+
+FILES = ("summary.json", "recursion.npz", "recursion.png")
+
+
+@dataclasses.dataclass(frozen=True)
+class Recursion:
+    """Once this controller has a plan, will it always have one? Proof, or counterexample.
+
+    What it does
+      An MPC without a suitable terminal set can steer itself into a state from which no input
+      keeps its limits. Three claims about the set X_N of states that have a plan over N steps:
+        strong  every first move of a plan within the limits leads back into X_N
+        law     the optimal first move does (what one wants of the controller)
+        weak    some first move does
+      Each is proved, refuted by a counterexample, or open, with the reason; strong implies law,
+      law implies weak. Closed loops from a grid of states show which states are lost, and when.
+      Without a file the problem is one robot joint: x = (q, dq), torque u, 20 steps of 0.01 s.
+      An option given here wins over the file.
+
+    How to start
+      $ jaxmpc recursion --horizon 4
+      $ jaxmpc recursion --config pendulum.toml --terminal invariant --output checks/a
+
+    How to read the output, all in the folder of --output
+      recursion.png   Blue: kept for all steps. Red to yellow: lost after 1, 2, ... steps. Grey:
+                      infeasible from the start. Arrow: the worst counterexample, from x to the
+                      next state, with the half-space (line) that proves it infeasible; the
+                      right panel enlarges it. Two states only.
+      summary.json    The claims with reasons, the counterexample, areas, counts, configuration.
+      recursion.npz   state, label (1 feasible, -1 infeasible, 0 undecided), input (the optimal
+                      first move), next_state, lost_at (step at which the problem is proved
+                      infeasible; 0 never, -1 infeasible at the start, -2 undecided), and
+                      facet_normals, facet_offsets of X_N. Opens with numpy.load(path).
+      Exit code       0 done, whatever the answer; 2 error (one line on stderr says which); 130
+                      stopped by Ctrl-C (nothing is kept).
+
+    What the TOML file holds
+      The sections [system], [limits], [cost], [mpc] of jaxmpc sweep --help, and
+      [recursion]  all optional: steps, grid, lower, upper, regions, seconds
+    """
+
+    config: Annotated[Path | None, option("FILE", "the built-in joint")] = None
+    """TOML file with the problem."""
+    output: Annotated[Path, option("DIR", "jaxmpc-recursion")] = Path("jaxmpc-recursion")
+    """Folder for the files; made where absent."""
+    horizon: Annotated[int | None, option("N", "from the file; joint 20")] = None
+    """Prediction horizon, in steps of dt."""
+    terminal: Annotated[
+        Literal["none", "invariant", "box"] | None,
+        option("{none,invariant,box}", "from the file, else none"),
+    ] = None
+    """Set for the last state: none, largest set that the LQR keeps within limits, state limits."""
+    steps: Annotated[int | None, option("K", "from the file, else 20")] = None
+    """Length of the closed loops."""
+    grid: Annotated[
+        tuple[int, ...] | None, option("K [K ...]", "128 128; above 3 states: random states")
+    ] = None
+    """Points along each state, ends included."""
+    lower: Annotated[
+        tuple[float, ...] | None, option("X [X ...]", "state limits, 3 % wider on each side")
+    ] = None
+    """Lower end of the grid along each state, in its units."""
+    upper: Annotated[
+        tuple[float, ...] | None, option("X [X ...]", "state limits, 3 % wider on each side")
+    ] = None
+    """Upper end of the grid along each state, in its units."""
+    regions: Annotated[int | None, option("K", "from the file, else 2000")] = None
+    """Critical regions of the law to enumerate at most for a proof; 0: none."""
+    seconds: Annotated[float | None, option("S", "from the file, else 60")] = None
+    """Time for search and proofs; what is not settled by then is open."""
+    search: Annotated[bool, option(None, "on")] = True
+    """Look for a counterexample by gradient ascent, beside the samples."""
+    smallest: Annotated[int | None, option("N", "off")] = None
+    """Look also for the smallest horizon, up to N, that is proved recursively feasible."""
+    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
+    """Replace the results in --output."""
+
+    def overrides(self) -> dict[str, Any]:
+        """The keys of [mpc] and [recursion] that the command line sets."""
+        keys = "horizon terminal steps grid lower upper regions seconds".split()
+        return {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
+
+    def run(self) -> int:
+        """Do it; the result is the exit code."""
+        begun = time.perf_counter()
+        try:
+            config, mpc, samples = self.prepare()
+            print(f"{config.name}: horizon {mpc.horizon} -> {self.output}")
+            settings = config.recursion
+            report = recursive_feasibility(
+                mpc, samples, steps=settings.steps, search=self.search, regions=settings.regions,
+                seconds=settings.seconds,
+            )  # fmt: skip
+            least = None
+            if self.smallest is not None:
+                least = smallest_horizon(mpc, self.smallest, regions=settings.regions)
+        except ValueError as error:
+            return report_error(error)
+        files = self.save(config, report, least)
+        print(report)
+        if least is not None:
+            print(f"  {'smallest horizon':<20} {_words(least, self.smallest)}")
+        print(f"  {'total':<20} {time.perf_counter() - begun:.2f} s with set-up and files")
+        print(f"  {'files':<20} {' '.join(str(self.output / name) for name in files)}")
+        return 0
+
+    def prepare(self) -> tuple[configs.Config, Any, np.ndarray | None]:
+        """Read, check and open everything. Raises ValueError, compiles nothing."""
+        if self.config is None:
+            config = configs.Config.default(self.overrides(), "recursion")
+        else:
+            config = configs.load(self.config, self.overrides(), "recursion")
+        if self.smallest is not None and self.smallest < 1:
+            fail("--smallest", f"{self.smallest}", "Give a horizon of at least 1")
+        samples, mpc = config.build_samples(), config.build_mpc()
+        open_folder(self.output)
+        there = [name for name in FILES if (self.output / name).exists()]
+        if there and not self.overwrite:
+            fail(str(self.output / there[0]), "exists", "Add --overwrite to replace it")
+        for name in there:
+            (self.output / name).unlink()
+        return config, mpc, samples
+
+    def save(
+        self, config: configs.Config, report: RecursionReport, least: SmallestHorizon | None
+    ) -> list[str]:
+        """Write the files; their names."""
+        body, worst = report.feasible_set, report.counterexample
+        facets: dict[str, Any] = {}
+        if body is not None:
+            facets = {"facet_normals": np.asarray(body.H), "facet_offsets": np.asarray(body.h)}
+        np.savez_compressed(
+            self.output / "recursion.npz", state=report.states, label=report.label,
+            input=report.inputs, next_state=report.next_states, lost_at=report.lost_at,
+            undecided_at=report.undecided_at, **facets,
+        )  # fmt: skip
+        finite = lambda v: v if np.isfinite(v) else None
+        summary = {
+            "name": config.name,
+            "claims": {
+                name: dataclasses.asdict(getattr(report, name))
+                for name in ("strong", "law", "weak")
+            },
+            "counterexample": None if worst is None else _plain(dataclasses.asdict(worst)),
+            "volume": finite(report.volume),
+            "lost_by_any": finite(report.lost_by_any),
+            "lost_by_law": finite(report.lost_by_law),
+            "counts": report.counts(),
+            "steps": report.steps,
+            "seconds": report.seconds,
+            "config": config.to_dict("recursion"),
+            "versions": versions(),
+        }
+        if least is not None:
+            summary["smallest_horizon"] = _plain(dataclasses.asdict(least))
+        (self.output / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+        if report.states.shape[1] != 2:
+            return ["summary.json", "recursion.npz"]
+        figure = Figure(figsize=(13 if worst is not None else 8.4, 5.2), layout="constrained")
+        axes = figure.subplots(1, 2 if worst is not None else 1, squeeze=False)[0]
+        plot_recursion(report, axes[0])
+        if worst is not None:
+            plot_recursion(report, axes[1], enlarge=True)
+        figure.savefig(self.output / "recursion.png", dpi=150)
+        return list(FILES)
+
+
+def _words(least: SmallestHorizon, limit: int | None) -> str:
+    if least.horizon is None:
+        return f"none up to {limit} is proved"
+    strong = f"; strong from {least.strong}" if least.strong is not None else ""
+    return f"{least.horizon} ({least.reasons[least.horizon].reason}){strong}"
+
+
+def _plain(value: Any) -> Any:
+    """Arrays and numpy numbers as lists and numbers that JSON takes."""
+    if isinstance(value, dict):
+        return {str(key): _plain(part) for key, part in value.items()}
+    return np.asarray(value).tolist() if isinstance(value, np.ndarray | np.generic) else value
