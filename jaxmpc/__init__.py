@@ -26,6 +26,7 @@ from jaxmpc.sweeps.boundary import Boundary, boundary
 from jaxmpc.sweeps.exact_penalty import ExactPenalty, exact_penalty
 from jaxmpc.sweeps.feasible_set import FeasibleSetMap, grid, map_feasible_set
 from jaxmpc.sweeps.plans import Plans, solve_many
+from jaxmpc.sweeps.reach import feasible_growth, feasible_polytope
 from jaxmpc.sweeps.recursion import RecursionReport, recursive_feasibility, smallest_horizon
 from jaxmpc.sweeps.regions import CriticalRegions, critical_regions
 from jaxmpc.workflow import Design, OfflineReport, design, offline_report
@@ -64,6 +65,8 @@ __all__ = [
     "equilibrium",
     "exact_penalty",
     "feasibility_margin",
+    "feasible_growth",
+    "feasible_polytope",
     "grid",
     "harden",
     "invariant_ellipsoid",

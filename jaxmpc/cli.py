@@ -19,6 +19,7 @@ from tqdm.std import tqdm
 
 from jaxmpc import config as configs
 from jaxmpc.checks import fail
+from jaxmpc.commands.info import Info
 from jaxmpc.commands.options import open_folder, option, report_error
 from jaxmpc.commands.recursion import Recursion
 from jaxmpc.mpc.problem import MPC
@@ -61,8 +62,10 @@ class Sweep:
       [system]  A, B, dt; optional c, state_names, state_units, input_names, input_units,
                 continuous = true (A, B, c of dx/dt, the input held over dt)
       [limits]  u_min, u_max, and x_min, x_max (inf allowed) or H_x, h_x (H_x x <= h_x)
-      [cost]    Q, R, P = "lqr" | "Q" | "none" | matrix; a flat list is a diagonal
-      [mpc]     horizon; optional terminal, constrain_initial = false (no limits at k = 0)
+      [cost]    Q, R, P = "lqr" | "Q" | "none" | matrix; a flat list is a diagonal; optional rho,
+                the L1 weight of soft limits, a number or "exact" (jaxmpc info; sets stay hard)
+      [mpc]     horizon; optional terminal, constrain_initial = false (no limits at k = 0),
+                control_horizon (free moves, the last one is held)
       [sweep]   all optional: grid, lower, upper, axes, fixed, projection, iterations, dtype
     """
 
@@ -73,10 +76,11 @@ class Sweep:
     horizon: Annotated[int | None, option("N", "from the file; joint 20")] = None
     """Prediction horizon, in steps of dt."""
     terminal: Annotated[
-        Literal["none", "invariant", "box"] | None,
-        option("{none,invariant,box}", "from the file, else none"),
+        Literal["none", "invariant", "ellipsoid", "box"] | None,
+        option("{none,invariant,ellipsoid,box}", "from the file, else none"),
     ] = None
-    """Set for the last state: none, largest set that the LQR keeps within limits, state limits."""
+    """Set for the last state: none, largest set or ellipsoid that the LQR keeps within limits,
+    state limits."""
     grid: Annotated[tuple[int, ...] | None, option("K [K ...]", "from the file, else 256 256")] = (
         None
     )
@@ -144,12 +148,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"jaxmpc {version('jaxmpc')}")
         return 0
     command = tyro.extras.subcommand_cli_from_dict(
-        {"sweep": Sweep, "recursion": Recursion},
+        {"sweep": Sweep, "recursion": Recursion, "info": Info},
         prog="jaxmpc",
         description="Constrained MPC in batches, with proofs. Also: jaxmpc --version",
         args=argv,
     )
-    if isinstance(command, Recursion):
+    if isinstance(command, Recursion | Info):
         return _guarded(command.run)
     again = [word for word in argv if word not in ("--overwrite", "--resume")]
     resume = shlex.join(["jaxmpc", *again, "--resume"])

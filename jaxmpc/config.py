@@ -4,8 +4,8 @@
 
     [system]  A, B, c, dt, continuous, state_names, state_units, input_names, input_units
     [limits]  x_min, x_max  or  H_x, h_x;  u_min, u_max
-    [cost]    Q, R, P
-    [mpc]     horizon, terminal, constrain_initial
+    [cost]    Q, R, P, rho
+    [mpc]     horizon, terminal, constrain_initial, control_horizon
     [sweep]   grid, lower, upper, axes, fixed | projection, iterations, dtype
     [recursion]  steps, grid, lower, upper, regions, seconds
 
@@ -25,11 +25,12 @@ from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from jaxmpc.checks import fail
-from jaxmpc.control.invariant import maximal_invariant_set
+from jaxmpc.control.invariant import invariant_ellipsoid, maximal_invariant_set
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.control.system import LinearSystem
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import MPC, soften
+from jaxmpc.sweeps.exact_penalty import exact_penalty
 from jaxmpc.sweeps.feasible_set import grid as grid_points
 
 
@@ -87,14 +88,19 @@ class CostSection:
     Q: Vector | Matrix
     R: Vector | Matrix
     P: Literal["lqr", "Q", "none"] | Vector | Matrix = "lqr"  # "lqr": the Riccati solution
+    # L1 weight that makes state and terminal limits soft in the controller; "exact": the least one
+    # that changes nothing where they can be kept, and a margin. Sets are those of the hard limits.
+    rho: Annotated[FiniteFloat, Field(ge=0)] | Literal["exact"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class MPCSection:
-    """Horizon and terminal set: "invariant" = O_inf of the LQR, "box" = the state limits."""
+    """Horizon and terminal set: "invariant" = O_inf of the LQR, "ellipsoid" = largest level set of
+    its cost inside the limits, "box" = the state limits."""
 
     horizon: Annotated[int, Field(ge=1, strict=True)]
-    terminal: Literal["none", "invariant", "box"] = "none"
+    terminal: Literal["none", "invariant", "ellipsoid", "box"] = "none"
+    control_horizon: Annotated[int, Field(ge=1, strict=True)] | None = None  # free moves
     constrain_initial: bool = True  # False: no state limits at k = 0
 
 
@@ -174,13 +180,15 @@ class Config:
         terminal_cost: Any = Q if cost.P == "Q" else None
         if not isinstance(cost.P, str):
             terminal_cost = _matrix(cost.P)
-        terminal_set = states if self.mpc.terminal == "box" else None
-        if cost.P == "lqr" or self.mpc.terminal == "invariant":
-            regulator = lqr(system, Q, R)
+        terminal_set: Any = states if self.mpc.terminal == "box" else None
+        if cost.P == "lqr" or self.mpc.terminal in ("invariant", "ellipsoid"):
+            law = lqr(system, Q, R)
             if cost.P == "lqr":
-                terminal_cost = regulator.P
+                terminal_cost = law.P
             if self.mpc.terminal == "invariant" and states is not None:
-                terminal_set = maximal_invariant_set(system, regulator.K, states, inputs)
+                terminal_set = maximal_invariant_set(system, law.K, states, inputs)
+            if self.mpc.terminal == "ellipsoid":
+                terminal_set = invariant_ellipsoid(system, law.K, law.P, states, inputs)
         mpc = MPC(
             system=system,
             Q=Q,
@@ -191,9 +199,17 @@ class Config:
             terminal_cost=terminal_cost,
             terminal_set=terminal_set,
             constrain_initial=self.mpc.constrain_initial,
+            control_horizon=self.mpc.control_horizon,
         )
         mpc.validate()
         return mpc
+
+    def build_controlled(self) -> MPC:
+        """The problem that the controller solves: that of `build_mpc`, softened by cost.rho."""
+        mpc, rho = self.build_mpc(), self.cost.rho
+        if rho is None:
+            return mpc
+        return soften(mpc, exact_penalty(mpc).advised if isinstance(rho, str) else rho)
 
     def build_points(self) -> SweepPoints:
         """The grid of initial states and the axes it lies on."""
@@ -250,7 +266,7 @@ class Config:
         self._check_state_limits()
         if command == "sweep":
             self._check_sweep(n)
-        else:
+        elif command == "recursion":
             self._check_recursion(n)
 
     def _check_sweep(self, n: int) -> None:
@@ -375,7 +391,7 @@ def _parse(
     merged = dict(document)
     # A slice and a projection exclude each other: choosing either drops the file's choice.
     dropped = {"fixed", "projection"} if {"fixed", "projection"} & set(overrides) else set()
-    for name in ("mpc", command):
+    for name in ("mpc", *({command} & set(_COMMANDS))):
         known = {field.name for field in dataclasses.fields(_SECTIONS[name])}
         changes = {key: value for key, value in overrides.items() if key in known}
         if changes and isinstance(merged.get(name, {}), dict):

@@ -20,7 +20,7 @@ from jaxmpc.control.invariant import (
     predecessor,
 )
 from jaxmpc.control.sets import Ellipsoid
-from jaxmpc.control.terminal import verify_terminal
+from jaxmpc.control.terminal import _exact_factor, _Rows, verify_terminal
 
 INF = np.inf
 JOINT = LinearSystem(np.array([[1, 0.01], [0, 1]]), np.array([[0], [0.2]]), dt=0.01)
@@ -75,6 +75,22 @@ def test_predecessor_with_a_triangle_of_inputs():
     before = predecessor(system, symmetric(1, 1), symmetric(5, 5), triangle)
     # area of a sum: 4 + 1/2 + twice the mixed area, 2 (1 + 1)
     assert before.volume() == pytest.approx(8.5, abs=1e-12) and len(before.h) == 5
+
+
+def test_predecessor_by_ridges_and_by_elimination(monkeypatch):
+    rng = np.random.default_rng(0)
+    normals = rng.standard_normal((66, 4))
+    target = Polytope(normals / np.linalg.norm(normals, axis=1)[:, None], 1 + 0.2 * rng.random(66))
+    system = LinearSystem(np.eye(4), rng.standard_normal((4, 2)))
+    inputs = Box([-0.3, -0.1], [0.2, 0.4])
+    by_ridges = predecessor(system, target, None, inputs)
+    monkeypatch.setattr("jaxmpc.control.invariant._MANY", 1000)
+    by_pairs = predecessor(system, target, None, inputs)
+    assert len(by_ridges.h) == len(by_pairs.h) > 250
+    assert by_ridges.volume() == pytest.approx(by_pairs.volume(), rel=1e-12)
+    for direction in rng.standard_normal((10, 4)):  # a sum of sets: their supports add up
+        expected = target.support(direction) + float(inputs.support(-direction @ system.B))
+        assert by_ridges.support(direction) == pytest.approx(expected, rel=1e-6)
 
 
 # --- Maximal control invariant sets ----------------------------------------------------
@@ -449,6 +465,14 @@ def test_rational_certificates_of_dyadic_data():
     assert report["control invariance"].holds is False
     report = verify_terminal(**(arguments | {"K": [[0.0, 1.25]]}))
     assert report.exact_factor == 1 and report["inputs of K admissible"].margin == -0.25
+
+
+def test_rational_bound_charges_the_residual():
+    # Without multipliers all of H (A+BK) x is residual: |x| <= 1, up to the LPs' margin, bounds it.
+    system = [[0.5, 0.25], [0.0, -0.25]], np.zeros((2, 1)), np.zeros((1, 2))
+    body = _Rows(np.vstack([np.eye(2), -np.eye(2)]), np.ones(4))
+    factor = _exact_factor(np.zeros((4, 4)), body, np.zeros(2), None, system)
+    assert Fraction(3, 4) <= factor <= Fraction(3, 4) * (1 + Fraction(1, 10**5))
 
 
 def scalar_report(**changes):

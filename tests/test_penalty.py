@@ -142,9 +142,10 @@ class TestRegions:
             (duplicated(), 15, 1043 / 400),
             (apex(), None, None),
             (pair(), 15 * 15, (1043 / 400) ** 2),
+            (replace(problems.lecture(), input_rate_limit=0.2), None, None),
         ],
         ids=["lecture", "joint", "joint O_inf", "drifting", "double", "scalar", "duplicated",
-             "apex", "pair"],
+             "apex", "pair", "rates"],
     )  # fmt: skip
     def test_complete(self, mpc, count, area):
         """The regions tile X_N, their number and volume are known, and their plans are optimal."""
@@ -212,6 +213,7 @@ class TestRegions:
         for changed, message in [
             (replace(mpc, terminal_set=nowhere), "empty"),
             (replace(mpc, states=line), "flat"),
+            (replace(mpc, terminal_set=jm.Ellipsoid(np.eye(2), 0.5)), "ellipsoid"),
             (replace(mpc, soft=(Soft(np.eye(2), np.ones(2)),)), "soft"),
         ]:
             with pytest.raises(ValueError, match=message):
@@ -247,11 +249,16 @@ class TestExactPenalty:
         assert found.row.step == 3 and "k = 3" in found.label and "x1" in found.label
         assert ("lower bound" in found.sentence.split(",")[0]) is (method == "samples")
 
-    @pytest.mark.parametrize("mpc", [problems.drifting(), problems.joint_o_inf(5), pair()],
-                             ids=["drifting", "joint O_inf", "pair"])  # fmt: skip
+    @pytest.mark.parametrize(
+        "mpc", [problems.drifting(), problems.joint_o_inf(5), pair(), duplicated(), apex()],
+        ids=["drifting", "joint O_inf", "pair", "duplicated", "apex"],
+    )  # fmt: skip
     def test_samples_reach_regions(self, mpc):
         exact = exact_penalty(mpc, method="regions")
-        found = exact_penalty(mpc, method="samples", samples=40)
+        corners = np.concatenate([region.vertices for region in exact.regions.regions[:20]])
+        found = exact_penalty(mpc, corners, method="samples", samples=40)
+        np.testing.assert_array_equal(found.status, Status.SOLVED)
+        assert np.all(found.thresholds <= exact.rho_bar * (1 + 1e-9))
         assert exact.exact and not found.exact
         assert found.rho_bar == pytest.approx(exact.rho_bar, rel=1e-3)
         assert found.rho_bar <= exact.rho_bar * (1 + 1e-9)

@@ -102,7 +102,8 @@ def lecture_penalty():
     system = jm.LinearSystem(np.eye(1), np.eye(1))
     for q, r, u_max, rho in ((1.0, 2.0, 1.0, 2.0), (1.0, 5.0, 0.5, 3.0), (3.0, 1.0, 1.0, 0.0)):
         mpc = jm.MPC(
-            system=system, Q=np.eye(1), R=r * np.eye(1), horizon=1, inputs=problems.symmetric(u_max),
+            system=system, Q=np.eye(1), R=r * np.eye(1), horizon=1,
+            inputs=problems.symmetric(u_max),
             terminal_cost=q * np.eye(1), terminal_set=problems.symmetric(1.0),
         )  # fmt: skip
         assert jm.exact_penalty(mpc).rho_bar == pytest.approx(rho, abs=1e-6)

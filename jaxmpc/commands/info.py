@@ -73,7 +73,7 @@ class Info:
                 if not getattr(self, name) > 0:
                     fail(f"--{name}", f"{getattr(self, name)}", "Give a positive number")
             report = offline_report(
-                config.build_mpc(), steps=self.steps, loops=self.loops, seconds=self.seconds
+                config.build_controlled(), steps=self.steps, loops=self.loops, seconds=self.seconds
             )
         except ValueError as error:
             return report_error(error)

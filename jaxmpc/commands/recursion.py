@@ -68,10 +68,11 @@ class Recursion:
     horizon: Annotated[int | None, option("N", "from the file; joint 20")] = None
     """Prediction horizon, in steps of dt."""
     terminal: Annotated[
-        Literal["none", "invariant", "box"] | None,
-        option("{none,invariant,box}", "from the file, else none"),
+        Literal["none", "invariant", "ellipsoid", "box"] | None,
+        option("{none,invariant,ellipsoid,box}", "from the file, else none"),
     ] = None
-    """Set for the last state: none, largest set that the LQR keeps within limits, state limits."""
+    """Set for the last state: none, largest set or ellipsoid that the LQR keeps within limits,
+    state limits."""
     steps: Annotated[int | None, option("K", "from the file, else 20")] = None
     """Length of the closed loops."""
     grid: Annotated[
@@ -160,7 +161,7 @@ class Recursion:
         summary = {
             "name": config.name,
             "claims": {
-                name: dataclasses.asdict(getattr(report, name))
+                name: _plain(dataclasses.asdict(getattr(report, name)))
                 for name in ("strong", "law", "weak")
             },
             "counterexample": None if worst is None else _plain(dataclasses.asdict(worst)),

@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 from jaxmpc.checks import fail, require_finite, require_shape, require_symmetric_psd
 from jaxmpc.control import geometry
 from jaxmpc.control.geometry import maximise, unit_rows
+from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem, host_array
 
@@ -236,9 +237,10 @@ def maximal_control_invariant_set(
 
     The inner set. To shrink C and its inputs about an equilibrium leaves the dynamics as they
     are, so a C_k that is almost invariant is often invariant when shrunk by a little more than
-    the last cut, as the limits of the inputs stay. If not, C <- Pre(x_e + s (C - x_e)) & C
-    with s < 1 is run until C lies within Pre(C); that ends if there is an s-contractive set.
-    Either is then grown by C <- Pre(C), which keeps invariance.
+    the last cut, as the limits of the inputs stay. If not, O_inf of an LQR about the equilibrium
+    is taken; if there is none, C <- Pre(x_e + s (C - x_e)) & C with s < 1 is run until C lies
+    within Pre(C), which ends if there is an s-contractive set. Each is then grown by
+    C <- Pre(C), which keeps invariance.
 
     Host, float64. Raises ValueError for wrong or unbounded arguments.
 
@@ -315,7 +317,10 @@ def maximal_control_invariant_set(
     if inner is None:
         found = "no control invariant set with volume was found in it"
         if step.W is None:
-            inner = Polytope(np.vstack([np.eye(step.n), -np.eye(step.n)]), np.r_[centre, -centre])
+            inner = Polytope(
+                np.vstack([np.eye(step.n), -np.eye(step.n)]),
+                np.r_[centre[: step.n], -centre[: step.n]],
+            )
             found += ", so the set returned is an equilibrium alone"
         return result(inner or empty, outer, k, f"outer bound: {stop}; {found}", np.inf, False)
     return result(
@@ -428,8 +433,8 @@ def supports(W: Box | Polytope | None, rows: np.ndarray) -> np.ndarray:
 class OneStep:
     """x+ = A x + B u + c + w with u in U, w in W.
 
-    U is {u : u = moving v + fixed, v in V}, with V None if nothing bounds v; `box` is V if V is
-    a bounded box.
+    U is {u : u = moving v + fixed, v in V}, with V None if nothing bounds v; where V is a
+    bounded box, `ends` has its (lower, upper), else it is None.
     """
 
     A: np.ndarray
@@ -439,7 +444,7 @@ class OneStep:
     moving: np.ndarray
     fixed: np.ndarray
     W: Box | Polytope | None
-    box: Box | None
+    ends: np.ndarray | None
 
     @property
     def n(self) -> int:
@@ -459,10 +464,8 @@ class OneStep:
                 T = Polytope(G, g + 4 * _FLAT * size)  # an elimination needs a set with volume
         # y in T - B u, where the inputs are u = moving v + fixed
         T = T.preimage(np.eye(n), self.B @ self.fixed)
-        if k and self.box is not None and n in (3, 4) and len(T.h) > _MANY and _bounded(T):
-            for b, lower, upper in zip(
-                (self.B @ self.moving).T, self.box.lower, self.box.upper, strict=True
-            ):
+        if k and self.ends is not None and n in (3, 4) and np.size(T.h) > _MANY and _bounded(T):
+            for b, (lower, upper) in zip((self.B @ self.moving).T, self.ends, strict=True):
                 T = _plus_segment(T, -b, lower, upper)
         elif k:
             T = T.preimage(np.hstack([np.eye(n), self.B @ self.moving]))
@@ -485,17 +488,17 @@ def one_step(
     n, m = system.n, system.m
     A, B = host_array("A", system.A), host_array("B", system.B)
     c = np.zeros(n) if system.c is None else host_array("c", system.c)
-    V, moving, fixed, box = None, np.eye(m), np.zeros(m), None
+    V, moving, fixed, ends = None, np.eye(m), np.zeros(m), None
     if inputs is not None:
         V = _polytope("inputs", inputs, m)
     if isinstance(inputs, Box):
         lower, upper = host_array("inputs", inputs.lower), host_array("inputs", inputs.upper)
         free = upper > lower
         moving, fixed = np.eye(m)[:, free], np.where(free, 0.0, lower)
-        box = Box(lower[free], upper[free])
-        V = box.to_polytope() if free.any() else None
-        box = box if np.isfinite([box.lower, box.upper]).all() else None
-    return OneStep(A, B, c, V, moving, fixed, disturbance_set(disturbance, n), box)
+        V = Box(lower[free], upper[free]).to_polytope() if free.any() else None
+        ends = np.column_stack([lower, upper])[free]
+        ends = ends if np.isfinite(ends).all() else None
+    return OneStep(A, B, c, V, moving, fixed, disturbance_set(disturbance, n), ends)
 
 
 def _bounded(polytope: Polytope) -> bool:
@@ -543,7 +546,7 @@ def _tidy(polytope: Polytope) -> Polytope:
 
 
 def _equilibrium(step: OneStep, X: Polytope) -> tuple[np.ndarray, float]:
-    """(x_e, margin) of the equilibrium x = A x + B u + c farthest inside the limits.
+    """((x_e, v_e), margin) of the equilibrium farthest inside the limits, u_e = moving v_e + fixed.
 
     The margin is the least distance to a limit over the radius of the largest ball within
     `states` (inputs: theirs), negative if a limit is exceeded, -inf if there is none at all.
@@ -553,7 +556,7 @@ def _equilibrium(step: OneStep, X: Polytope) -> tuple[np.ndarray, float]:
     drift = step.c + step.B @ step.fixed
     z0 = -np.linalg.lstsq(M, drift, rcond=None)[0]
     if np.abs(M @ z0 + drift).max() > 1e-9 * max(np.abs(drift).max(), np.abs(M @ z0).max()):
-        return np.zeros(n), -np.inf
+        return z0, -np.inf
     free = scipy.linalg.null_space(M)
     rows, limits = [], []
     for part, polytope in ((slice(0, n), X), (slice(n, None), step.V)):
@@ -566,7 +569,7 @@ def _equilibrium(step: OneStep, X: Polytope) -> tuple[np.ndarray, float]:
         limits.append(g - G @ z0[part])
     top = maximise(np.eye(free.shape[1] + 1)[-1], *unit_rows(np.vstack(rows), np.hstack(limits)))
     assert top.x is not None  # feasible with a margin low enough, bounded as X is
-    return z0[:n] + free[:n] @ top.x[:-1], float(top.x[-1])
+    return z0 + free @ top.x[:-1], float(top.x[-1])
 
 
 def _inside(
@@ -574,10 +577,17 @@ def _inside(
     tolerance: float,
 ) -> tuple[Polytope | None, float]:  # fmt: skip
     """A control invariant set within C_k, as large as `rounds` steps make it, and the gap."""
-    try:
-        found = next(_candidates(step, C, centre, cut), None)
-    except ValueError:  # an elimination with too many rows, or a set too thin for qhull
-        found = None
+    found = None
+    margins = [m for m in 4 * cut * 30.0 ** np.arange(9) if m < 0.5] + [0.5]
+    for candidates in (
+        _shrunk(step, C, centre, margins),
+        _of_regulator(step, X, centre),
+        _contractive(step, C, centre, margins),
+    ):
+        try:
+            found = found or next(candidates, None)
+        except ValueError:  # too many rows to eliminate, a set too thin for qhull, no such law
+            continue
     if found is None:
         return None, np.inf
     inner, before = found
@@ -596,25 +606,56 @@ def _inside(
     return inner, gap
 
 
-def _candidates(
-    step: OneStep, C: Polytope, centre: np.ndarray, cut: float
+def _shrunk(
+    step: OneStep, C: Polytope, centre: np.ndarray, margins: list[float]
 ) -> Iterator[tuple[Polytope, Polytope]]:
-    """Control invariant sets within C, found as `maximal_control_invariant_set` says, and Pre."""
-    margins = [m for m in 4 * cut * 30.0 ** np.arange(9) if m < 0.5] + [0.5]
+    """C_k shrunk about the equilibrium by each margin, and Pre, if that is invariant."""
     for margin in margins:
-        inner = _about(C, centre, 1 - margin)
-        before = step.back(inner)
-        if not before.is_empty() and largest_cut(before, inner, enough=_ROUNDING) <= _ROUNDING:
-            yield inner, before
+        yield from _kept(step, _about(C, centre[: step.n], 1 - margin))
+
+
+def _contractive(
+    step: OneStep, C: Polytope, centre: np.ndarray, margins: list[float]
+) -> Iterator[tuple[Polytope, Polytope]]:
+    """The end of C <- Pre(x_e + (1 - margin) (C - x_e)) & C for each margin, and Pre."""
     for margin in margins:
         inner = C
         for _ in range(30):
-            inner = _tidy(inner.intersect(step.back(_about(inner, centre, 1 - margin))))
+            before = step.back(_about(inner, centre[: step.n], 1 - margin))
+            inner = _tidy(inner.intersect(before))
             if inner.is_empty() or inner.chebyshev()[1] <= _FLAT * C.chebyshev()[1]:
                 break
-            before = step.back(inner)
-            if not before.is_empty() and largest_cut(before, inner, enough=_ROUNDING) <= _ROUNDING:
-                yield inner, before
+            found = list(_kept(step, inner))
+            if found:
+                yield from found
+                break
+
+
+def _of_regulator(
+    step: OneStep, X: Polytope, centre: np.ndarray
+) -> Iterator[tuple[Polytope, Polytope]]:
+    """O_inf of an LQR about the equilibrium (x_e, v_e), and Pre."""
+    n, k = step.n, step.moving.shape[1]
+    system = LinearSystem(step.A, step.B @ step.moving)
+    x_e, v_e = centre[:n], centre[n:]
+    G, g = unit_rows(X.H, X.h)
+    V = None
+    if step.V is not None:
+        H, h = unit_rows(step.V.H, step.V.h)
+        V = Polytope(H, h - H @ v_e)
+    law = lqr(system, np.diag(1 / _extent(G, g) ** 2), np.eye(k))
+    invariant = maximal_invariant_set(
+        system, law.K, Polytope(G, g - G @ x_e), V, disturbance=step.W
+    )
+    H, h = unit_rows(invariant.H, invariant.h)
+    yield from _kept(step, Polytope(H, h + H @ x_e))
+
+
+def _kept(step: OneStep, C: Polytope) -> Iterator[tuple[Polytope, Polytope]]:
+    """(C, Pre(C)) if no row of Pre(C) cuts C."""
+    before = step.back(C)
+    if not before.is_empty() and largest_cut(before, C, enough=_ROUNDING) <= _ROUNDING:
+        yield C, before
 
 
 def _about(C: Polytope, centre: np.ndarray, factor: float) -> Polytope:

@@ -245,10 +245,11 @@ class _Rows:
             return np.full(self.G.shape[1], np.inf)
         return geometry.extent(self.G, self.g) * (1 + 1e-6)
 
-    def width(self, rows: np.ndarray) -> np.ndarray:
-        """How far the set reaches along each row from the centre of its largest ball."""
+    def width(self, rows: np.ndarray | None = None) -> np.ndarray:
+        """How far the set reaches along each row (None: its own) from its largest ball's centre."""
         centre = geometry.largest_ball("terminal_set", self.G, self.g)[0]
-        width = np.maximum(self.top(rows)[0] - rows @ centre, 0.0)
+        tops = self.g if rows is None else self.top(rows)[0]
+        width = np.maximum(tops - (self.G if rows is None else rows) @ centre, 0.0)
         return np.where(width > _TOUCH * width.max(initial=0.0), width, 1.0)
 
 
@@ -331,7 +332,7 @@ def _rows_kept(
         return Check(name, False, -np.inf, unit, sentence, (3,)), None, None, None
     reached = images + G @ c + supports(W, G)
     residual = float(np.abs(M @ G - G @ closed).max())
-    share = (g - reached) / X_f.width(G)
+    share = (g - reached) / X_f.width()
     worst = int(np.argmin(share))
     holds = bool(share[worst] >= -_TOUCH)
     factor = float((reached / g).max()) if g.min() > 0 else None

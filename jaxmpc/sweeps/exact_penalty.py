@@ -29,11 +29,11 @@ from jaxmpc.sweeps.regions import (
 # "auto" enumerates regions up to this dimension of the state.
 ENUMERATED = 4
 # The sampled search: where on a ray to the boundary of X_N samples lie, how many regions it starts
-# from, after how many that lead to nothing better it ends,
-# and how many rays look for the facets of a region.
+# from, after how many that lead to nothing better it ends, and how many rays look for the facets of
+# a region.
 SHARES = (0.5, 0.9, 0.99, 1 - 1e-4, 1 - 1e-7)
 STARTS = 32
-PATIENCE = 12
+PATIENCE = 20
 RAYS = 64
 # Relative rounding of rho_bar up to which a weight is called equal to it.
 ROUNDING = 1e-9
@@ -46,7 +46,7 @@ class ExactPenalty:
     """The least ρ for which the penalty ρ·Σ slack is exact (see `exact_penalty`).
 
     rho_bar: sup over X_N of the threshold, or with exact False a lower bound of it, in cost per
-    unit of the rows as given. state (n,): where it is approached, row: the soft row that needs it
+    unit of the rows as given. state (p,): where it is approached, row: the soft row that needs it
     (None where rho_bar is 0), label: that row with bound, step and unit. method: "regions" or
     "samples". advised: a weight with a margin. thresholds (B,), status (B,): at the states asked
     for, NaN and PRIMAL_INFEASIBLE or NON_FINITE where there is none. sufficient: whether the
@@ -104,8 +104,8 @@ def exact_penalty(
     x0s (B, p) or None: states at which to give the threshold as well; p = mpc.dimension.
     method: "regions": λ is affine on each critical region and its maximum is at a vertex; exact
     when the regions are complete. "samples": a lower bound, from `samples` rays to the boundary of
-    X_N and local searches across regions from the best states (λ is maximised on a region by an
-    LP, then its neighbours there are looked at). "auto": regions up to four states, and samples
+    X_N and a search across facets from the best regions met (on a region λ is maximised by LPs);
+    it can miss the greatest. "auto": regions up to four states, and samples
     as well where `limit` regions are not all. Where active rows are dependent the multipliers are
     not unique, and an LP finds those with the least maximum. rho: a weight to judge; None: those
     of `mpc.soft`, if any. within: initial states to look at, needed where X_N is unbounded.
@@ -118,7 +118,7 @@ def exact_penalty(
     """
     if method not in ("auto", "regions", "samples"):
         fail("method", f"{method!r}", 'Give "auto", "regions" or "samples"')
-    if not isinstance(samples, int | np.integer) or samples < 1:
+    if not isinstance(samples, int | np.integer) or isinstance(samples, bool) or samples < 1:
         fail("samples", f"{samples!r}", "Give a number of rays, at least 1")
     if rho is not None and not (np.ndim(rho) == 0 and np.isfinite(rho) and rho >= 0):
         fail("rho", f"{rho!r}", "Give one finite weight of at least 0, or None")
@@ -207,25 +207,29 @@ class Thresholds:
     def __init__(self, p: Program, soft: np.ndarray) -> None:
         self.p, self.soft = p, soft
 
-    def least(self, rows: np.ndarray, y: np.ndarray) -> tuple[float, int]:
-        """min t over λ ≥ 0 with Σ λ_i M_i = −y over `rows` and λ_i ≤ t over the soft ones; the
-        value, and a soft row that attains it.
+    def least(
+        self, rows: np.ndarray, active: tuple[int, ...], multipliers: np.ndarray
+    ) -> tuple[float, int]:
+        """min t over λ ≥ 0 on `rows` that push like the given ones on `active`, λ_i ≤ t over soft
+        rows; the value (NaN: HiGHS stops), and a soft row that attains it.
         """
-        mine, size = self.soft[rows], np.abs(y).max(initial=0.0)
+        push = self.p.M[list(active)].T @ np.maximum(multipliers, 0.0)
+        mine, size = self.soft[rows], np.abs(push).max(initial=0.0)
         if not mine.any() or size == 0:
             return 0.0, -1
-        # In units of y, and per row of M; t counts in the rows as given.
+        # In units of the push, and per row of M; t counts in the rows as given.
         per_row = 1 / self.p.length[rows]
         unit = per_row[mine].max()
         count = len(rows)
+        A, b = self.p.balance(rows, push / size)
         result = linprog(
             np.eye(count + 1)[count],
-            A_eq=np.column_stack([self.p.M[rows].T, np.zeros(len(y))]), b_eq=-y / size,
+            A_eq=np.column_stack([A, np.zeros(len(b))]), b_eq=b,
             A_ub=np.column_stack([np.diag(per_row / unit)[mine], -np.ones(mine.sum())]),
             b_ub=np.zeros(mine.sum()), bounds=(0, None), method="highs-ds", options=LP,
         )  # fmt: skip
         if result.x is None:
-            fail("mpc", *STOPPED)
+            return np.nan, -1
         each = np.where(mine, result.x[:count] * per_row, 0.0)
         return float(result.fun * unit * size), int(rows[np.argmax(each)])
 
@@ -238,7 +242,9 @@ class Thresholds:
         rows = np.array((*found.active, *found.also_active), int)
         affine = np.column_stack([points, np.ones(len(points))])
         if found.also_active and self.soft[rows].any():
-            each = [self.least(rows, found.y @ point) for point in affine]
+            each = [self.least(rows, found.active, found.multipliers @ at) for at in affine]
+            if np.isnan([value for value, _ in each]).any():
+                fail("mpc", *STOPPED)
             best = int(np.argmax([value for value, _ in each]))
             return Worst(each[best][0], points[best], each[best][1])
         mine = [i for i, row in enumerate(found.active) if self.soft[row]]
@@ -272,7 +278,8 @@ class Thresholds:
             xi = (x0s[i] - self.p.center) / self.p.size
             found = self.p.solution(xi)
             if found is not None:
-                values[i], status[i] = self.least(found.touching, found.y)[0], Status.SOLVED
+                values[i], _ = self.least(found.touching, found.active, found.multipliers)
+                status[i] = Status.ITERATION_LIMIT if np.isnan(values[i]) else Status.SOLVED
             else:
                 empty = self.p.margin(xi) < -1e-9
                 status[i] = Status.PRIMAL_INFEASIBLE if empty else Status.ITERATION_LIMIT
@@ -289,26 +296,28 @@ def ascend(
     regions in turn have led to nothing better.
     """
     seen: dict[tuple[int, ...], float] = {}
-    n, corners = len(p.center), []
-    for direction in random.standard_normal((max(samples // 2, 1), n)):
-        corners.append(p.support(direction)[1])
-    # Directions at random, and towards points between corners of X_N.
-    mixed = random.dirichlet(np.full(len(corners), 1 / len(corners)), samples // 2) @ corners
-    for direction in [*random.standard_normal((samples - samples // 2, n)), *(mixed - p.interior)]:
+    n, half = len(p.center), samples // 2
+    tops = [p.support(d)[1] for d in random.standard_normal((max(half, 1), n))]
+    corners = np.array([xi for xi in tops if xi is not None]).reshape(-1, n)
+    # At random, and towards points between corners of X_N, where regions are smallest.
+    weights = random.dirichlet(np.full(max(len(corners), 1), 1 / max(len(corners), 1)), half)
+    between = weights @ corners - p.interior if len(corners) else np.zeros((0, n))
+    for direction in [*random.standard_normal((samples - half, n)), *between]:
         end = p.leave(direction)
         for share in SHARES if end is not None else ():
             solution = p.solution(p.interior + share * (end - p.interior))
             if solution is not None:
                 rows = list(solution.active)
                 pushes = (solution.multipliers / p.length[rows])[weigh.soft[rows]]
-                seen[solution.active] = max(seen.get(solution.active, 0.0), pushes.max(initial=0.0))
+                active = p.basis(solution) or ()
+                seen[active] = max(seen.get(active, 0.0), pushes.max(initial=0.0))
 
     def visit(active: tuple[int, ...] | None) -> None:
         if active is not None and active not in found:
             here = law(p, active)
             found[active] = None if here is None else weigh.maximal(here)
 
-    visit(p.basis(p.interior))
+    visit(p.active(p.interior))
     for active in sorted(seen, key=lambda a: -seen[a])[:STARTS]:
         visit(active)
     left: set[tuple[int, ...]] = set()

@@ -63,7 +63,10 @@ class Bound:
         for i in np.flatnonzero(room.min(axis=1) < 0):
             scale = -room[i].min()
             E = -np.vstack([self.normals.T, room[i] / scale])
-            y, _ = nnls(E, target)
+            try:
+                y, _ = nnls(E, target, maxiter=20 * E.shape[1])
+            except RuntimeError:  # stays outside, where there is no plan
+                continue
             r = E @ y - target
             if r[-1] < -1e-12:
                 answer[i] -= scale * r[:-1] / r[-1]
@@ -146,6 +149,8 @@ class Law:
         excess = self.C @ z + self.D @ theta - self.b
         near = TOUCHING * (1 + np.abs(self.b))
         over, touching = excess > near, np.flatnonzero(np.abs(excess) <= near)
+        if np.any(np.isinf(self.rho[over])):  # no plan
+            return None
         S = self.kappa[over, None] * self.C[over]
         P = c.P + S.T @ self.C[over]
         # q(x) = Q (x, 1), likewise for the bounds of the active rows.
@@ -190,9 +195,12 @@ class Law:
         """y with A y = force as nearly as can be, 0 ≤ y ≤ rho."""
         if not A.shape[1]:
             return np.zeros(0)
-        if np.all(np.isinf(rho)):
-            return nnls(A, force)[0]
-        return lsq_linear(A, force, (0, rho)).x
+        if np.any(np.isfinite(rho)):
+            return lsq_linear(A, force, (0, rho)).x
+        try:
+            return nnls(A, force, maxiter=20 * A.shape[1])[0]
+        except RuntimeError:  # no multipliers, which the check of the plan notices
+            return np.zeros(A.shape[1])
 
     def _touches_ball(self, theta: np.ndarray, z: np.ndarray) -> bool:
         c = self.condensed

@@ -7,7 +7,8 @@ programs over it. Host, float64, HiGHS.
 """
 
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -33,6 +34,7 @@ class Pairs:
 
     M (p, p + nz), t (p,): the state after the first move is M v + t. exact: False where a
     constraint is no row (the terminal ellipsoid), so that the polytope holds more than the pairs.
+    equal (rows,): the rows of equalities, which leave no margin.
     """
 
     G: np.ndarray
@@ -40,6 +42,7 @@ class Pairs:
     M: np.ndarray
     t: np.ndarray
     exact: bool
+    equal: np.ndarray
 
     @property
     def p(self) -> int:
@@ -62,7 +65,9 @@ class Pairs:
         size = np.linalg.norm(G, axis=1)
         size[size == 0] = 1.0
         M = np.hstack([self.M, np.zeros((p, plan.shape[1]))])
-        return Pairs(G / size[:, None], g / size, M, self.t, self.exact)
+        return Pairs(
+            G / size[:, None], g / size, M, self.t, self.exact, np.tile(self.equal, 2)
+        )  # fmt: skip
 
     def largest(self, normal: np.ndarray) -> tuple[float, float, np.ndarray | None]:
         """max normal'θ⁺ over all pairs: (attained value, upper bound, v).
@@ -86,9 +91,10 @@ class Pairs:
         return _bound(d, y, self.G, self.g, self.extent)
 
     def centre(self) -> np.ndarray | None:
-        """The θ of the pair with the largest margin to all rows; None if no pair has a margin."""
-        rows, size = self.G.shape
-        wide = np.vstack([np.hstack([self.G, np.ones((rows, 1))]), np.eye(size + 1)[-1:]])
+        """The θ of the pair with the largest margin to all rows but equalities; None without one."""
+        size = self.G.shape[1]
+        margin = np.where(self.equal, 0.0, 1.0)[:, None]
+        wide = np.vstack([np.hstack([self.G, margin]), np.eye(size + 1)[-1:]])
         room = max(1.0, float(np.abs(self.g).max(initial=0.0)))
         top = maximise(np.eye(size + 1)[-1], wide, np.append(self.g, room))
         return None if top.x is None or top.value <= TOLERANCE else top.x[: self.p]
@@ -141,7 +147,8 @@ def pairs(mpc: MPC) -> Pairs:
     p = D.shape[1]
     M = np.vstack([np.hstack([c.Phi[1], c.Gamma[1]]), np.hstack([c.Psi[0], c.Omega[0]])])
     t = np.concatenate([c.phi[1], c.psi[0]])
-    return Pairs(G / size[:, None], g / size, M[:p], t[:p], not c.balls)
+    equal = np.concatenate([(lower == upper)[up], (lower == upper)[low]])
+    return Pairs(G / size[:, None], g / size, M[:p], t[:p], not c.balls, equal)
 
 
 @dataclass(frozen=True)
@@ -257,3 +264,49 @@ def usual(mpc: MPC) -> bool:
     """True for limits on states and inputs alone, at the usual steps, inputs free at each step."""
     free = not (mpc.outputs or mpc.rate_limited) and mpc.control_horizon is None
     return free and mpc.constrained_steps is None
+
+
+def feasible_polytope(mpc: MPC) -> Polytope:
+    """The feasible set X_N as a polytope, every facet once: {θ : some plan keeps every hard row}.
+
+    θ is x, or (x, u_{−1}) where input rates are limited. Facets come from the duals of linear
+    programs and are valid; each vertex was reached by one, to 1e-9 of the set's size. For a map
+    with proofs against rounding, slices, projections or an ellipsoidal terminal set use
+    `map_feasible_set(...).refine()`; one step at a time, `predecessor`.
+
+    Raises ValueError in more than four dimensions, where X_N is empty, flat or unbounded, for an
+    ellipsoidal terminal set, and where there are more than 2,000 facets. Host, float64.
+    """
+    mpc.validate()
+    everything = pairs(mpc)
+    if not everything.exact:
+        fail("terminal_set", "is an Ellipsoid, so X_N has a curved boundary", "Map it and refine()")
+    body = shadow(everything)
+    if isinstance(body, str):
+        fail("mpc", body, "Map it with map_feasible_set, which has no such limit")
+    return body.polytope
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Feasible sets at several horizons: horizons (H,), volume (H,), facets (H,), and the sets."""
+
+    horizons: np.ndarray
+    volume: np.ndarray
+    facets: np.ndarray
+    sets: tuple[Polytope, ...]
+
+
+def feasible_growth(mpc: MPC, horizons: Sequence[int]) -> Growth:
+    """How X_N grows or shrinks with N: `feasible_polytope` at each of `horizons`.
+
+    Raises ValueError as `feasible_polytope` does, and where steps or blocks of `mpc` fit one
+    horizon only.
+    """
+    sets = tuple(feasible_polytope(replace(mpc, horizon=int(N))) for N in horizons)
+    return Growth(
+        horizons=np.array(horizons, int),
+        volume=np.array([body.volume() for body in sets]),
+        facets=np.array([len(np.asarray(body.h)) for body in sets]),
+        sets=sets,
+    )

@@ -39,7 +39,6 @@ STARTS = 96
 PULLS = 10.0 ** np.arange(-9, -3)
 # `lost_at` of samples that cannot be lost, and of those that were not decided.
 NOT_FEASIBLE, UNDECIDED = -1, -2
-NONE = np.zeros(0)
 
 
 @dataclass(frozen=True)
@@ -219,34 +218,30 @@ def recursive_feasibility(
         if search:
             feasible = x0s[fmap.label == 1]
             near = feasible[_order(bound, loops.next_states[fmap.label == 1])[: STARTS // 4]]
-            tops = ascend(law, bound, np.concatenate([starts, near]), deadline)
+            starts = np.concatenate([ladder.seeds, starts[:STARTS], near])
+            tops = ascend(law, bound, starts, deadline)
             candidates, found = np.concatenate([candidates, tops]), found + ["search"] * len(tops)
         worst = _certified(law, bound, candidates, found)
     lost = 0.0 if ladder.law.holds and np.isfinite(ladder.volume) else np.nan
-    if (
-        regions
-        and np.isfinite(ladder.volume)
-        and not ladder.law.holds
-        and time.monotonic() < deadline
-    ):
+    enumerable = regions and np.isfinite(ladder.volume) and time.monotonic() < deadline
+    if enumerable and not ladder.law.holds:
         verdict, lost, beyond = _by_regions(ladder, regions)
         if verdict.holds is False and worst is None:  # the search has missed it
             worst = _certified(law, bound, beyond, ["regions"] * len(beyond))
-        if verdict.holds is not False:
+        if verdict.holds is not False and ladder.law.holds is None:
             ladder = replace(ladder, law=verdict)
     if worst is not None:
-        refuted = Rung(False, str(worst))
+        refuted = Rung(False, str(worst), worst.state)
         strong = ladder.strong if ladder.strong.holds is False else refuted
         weak = ladder.weak
         if weak.holds is None and _no_way_on(ladder.pairs, worst.state):
-            weak = Rung(
-                False, f"from x = {_point(worst.state)} every feasible first move leaves X_N"
-            )
+            reason = f"from x = {_point(worst.state)} every feasible first move leaves X_N"
+            weak = Rung(False, reason, worst.state)
         ladder = replace(ladder, law=refuted, strong=strong, weak=weak)
     elif ladder.law.holds is None:
-        tried = f"{np.sum(fmap.label == 1):,} samples" + search * f" and {STARTS} ascents"
-        why = f"no counterexample among {tried}, no proof: {ladder.law.reason}"
-        ladder = replace(ladder, law=Rung(None, why))
+        tried = f"{np.sum(fmap.label == 1):,} samples" + search * f" and {len(starts)} ascents"
+        reason = f"no counterexample among {tried}; no proof: {ladder.law.reason}"
+        ladder = replace(ladder, law=Rung(None, reason))
     return RecursionReport(
         mpc, ladder.strong, ladder.law, ladder.weak, worst,
         ladder.shadow.polytope if ladder.shadow else None, ladder.volume, ladder.lost, lost,
@@ -259,8 +254,8 @@ def recursive_feasibility(
 class Ladder:
     """The three rungs as far as they can be settled without the law, and X_N.
 
-    shadow: facets and vertices of X_N, or None and `why`. later: the same for the states with a
-    first move that stays. volume of X_N, and of the part lost by any move; NaN where unknown.
+    shadow: X_N, or None and `why`. volume of X_N, and of the part lost whatever the move; NaN where
+    unknown. seeds (S, p): states with a first move that leaves X_N, or without one that stays.
     """
 
     mpc: MPC
@@ -270,13 +265,15 @@ class Ladder:
     strong: Rung
     law: Rung
     weak: Rung
-    volume: float = np.nan
-    lost: float = np.nan
+    volume: float
+    lost: float
+    seeds: np.ndarray
 
 
 def climb(mpc: MPC, deadline: float = np.inf) -> Ladder:
     """Settle the rungs by Theorem 1 and linear programs."""
     all_pairs = pairs(mpc)
+    none = np.zeros((0, all_pairs.p))
     before = after = None
     body: Shadow | str = "the terminal set has no facets"
     if all_pairs.exact and all_pairs.p <= DIMENSIONS:
@@ -285,46 +282,53 @@ def climb(mpc: MPC, deadline: float = np.inf) -> Ladder:
         sets = backward(mpc, deadline)
         before, body, after = (None, sets, None) if isinstance(sets, str) else sets
     found, why = (None, body) if isinstance(body, str) else (body, "")
-    countable = found is not None and len(found.vertices)
-    volume = found.polytope.volume() if found is not None and countable else np.nan
+    volume = np.nan
+    if found is not None and len(found.vertices):
+        volume = found.polytope.volume()
     if not np.any(all_pairs.G[:, : all_pairs.p]) and all_pairs.exact:
-        strong = Rung(True, "no limit depends on the state")
+        strong, leaving = Rung(True, "no limit depends on the state"), none
     else:
-        strong = _theorem(mpc)
+        strong, leaving = _theorem(mpc), none
     if strong.holds is None and found is not None:
-        strong = _every_move(mpc, all_pairs, found)
+        strong, leaving = _every_move(mpc, all_pairs, found)
     elif strong.holds is None:
         strong = Rung(None, f"{strong.reason}; {why}")
     if strong.holds:
-        follows = Rung(True, "follows from strong")
-        lost = np.nan if found is None else 0.0
-        return Ladder(mpc, all_pairs, found, why, strong, follows, follows, volume, lost)
-    if found is None:
-        weak, lost = Rung(None, why), np.nan
-    elif before is not None and after is not None:
-        weak, lost = _longer(before, found, after), np.nan
-    else:
-        weak, lost = _some_move(all_pairs, found, deadline)
-    law = Rung(None, "weak is refuted" if weak.holds is False else why or "needs the law itself")
-    return Ladder(mpc, all_pairs, found, why, strong, law, weak, volume, lost)
+        follows, lost = Rung(True, "follows from strong"), 0 * volume
+        return Ladder(mpc, all_pairs, found, why, strong, follows, follows, volume, lost, none)
+    weak, lost, stuck = Rung(None, why), np.nan, none
+    if found is not None and before is not None and after is not None:
+        weak, stuck = _longer(before, found, after)
+    elif found is not None:
+        weak, lost, stuck = _some_move(all_pairs, found, deadline)
+    law = Rung(None, why or "the critical regions were not looked at")
+    if weak.holds is False:
+        law = replace(weak, reason=f"{weak.reason}, the optimal one too")
+    seeds = np.concatenate([stuck, leaving])
+    return Ladder(mpc, all_pairs, found, why, strong, law, weak, volume, lost, seeds)
 
 
-def _every_move(mpc: MPC, all_pairs: Pairs, body: Shadow) -> Rung:
-    """Strong: one LP for each facet of X_N over all pairs."""
+def _every_move(mpc: MPC, all_pairs: Pairs, body: Shadow) -> tuple[Rung, np.ndarray]:
+    """Strong: one LP for each facet of X_N over all pairs; and the states that are led outside."""
     tops = [all_pairs.largest(normal) for normal in body.normals]
     excess = np.array([top[1] for top in tops]) - body.offsets
-    worst = int(np.argmax(excess))
-    count = f"{len(excess)} facets"
-    if excess[worst] <= TOLERANCE * body.size:
-        slack = f"one LP for each of {count}, largest excess {excess[worst]:.1e}"
-        same = _set_before(mpc, body)
-        return Rung(True, f"every feasible first move stays ({same}{slack})")
-    value, _, v = tops[worst]
-    if v is None or value - body.offsets[worst] <= CLEAR * body.size:
-        return Rung(None, f"an LP is within {CLEAR:g} of the size of X_N: {excess[worst]:.1e}")
-    after = _point(all_pairs.M @ v + all_pairs.t)
-    where = f"from x = {_point(v[: all_pairs.p])} a feasible first move leads to {after}"
-    return Rung(False, f"{where}, {value - body.offsets[worst]:.6g} beyond a facet of X_N")
+    beyond = np.array([top[0] for top in tops]) - body.offsets
+    i, p = int(np.argmax(beyond)), all_pairs.p
+    outside = np.flatnonzero(beyond > CLEAR * body.size)
+    points = [v for _, _, v in tops if v is not None]
+    if excess.max() <= TOLERANCE * body.size:
+        count = f"one LP for each of {len(excess)} facets, largest excess {excess.max():.1e}"
+        reason = f"every feasible first move stays ({_set_before(mpc, body)}{count})"
+        return Rung(True, reason), np.zeros((0, p))
+    if not len(outside) or len(points) < len(tops):
+        reason = f"an LP is within {CLEAR:g} of the size of X_N, {excess.max():.1e}"
+        return Rung(None, reason), np.zeros((0, p))
+    where, after = points[i][:p], all_pairs.M @ points[i] + all_pairs.t
+    reason = (
+        f"from x = {_point(where)} a feasible first move leads to {_point(after)}, "
+        f"{beyond[i]:.6g} beyond a facet of X_N"
+    )
+    return Rung(False, reason, where), np.array(points)[outside, :p]
 
 
 def _set_before(mpc: MPC, body: Shadow) -> str:
@@ -344,37 +348,45 @@ def _nested(mpc: MPC) -> bool:
     return mpc.constrain_initial and (mpc.terminal_set is None or mpc.terminal_set is mpc.states)
 
 
-def _some_move(all_pairs: Pairs, body: Shadow, deadline: float) -> tuple[Rung, float]:
-    """Weak, and the volume lost whatever the move: X_N against the states that can go on."""
+def _some_move(all_pairs: Pairs, body: Shadow, deadline: float) -> tuple[Rung, float, np.ndarray]:
+    """Weak: X_N against the states that can go on. The volume lost whatever the move, and the
+    vertices of X_N lost.
+    """
+    none = np.zeros((0, all_pairs.p))
     later = shadow(all_pairs.twice(), deadline)
     if isinstance(later, str):
-        return Rung(None, f"of the states that can go on, {later}"), np.nan
+        return Rung(None, f"of the states that can go on, {later}"), np.nan, none
     excess = later.excess(body.vertices)
     i = int(np.argmax(excess))
     lost = max(body.polytope.volume() - later.polytope.volume(), 0.0)
     if excess[i] <= TOLERANCE * body.size:
         what = f"all {len(excess)} vertices of X_N have a first move that stays"
-        return Rung(True, f"{what} (largest excess {max(excess[i], 0.0):.1e})"), 0.0
+        return Rung(True, f"{what} (largest excess {max(excess[i], 0.0):.1e})"), 0.0, none
     if excess[i] <= CLEAR * body.size:
-        return Rung(None, f"a vertex is within {CLEAR:g} of the size of X_N: {excess[i]:.1e}"), lost
-    x = _point(body.vertices[i])
-    return Rung(False, f"from x = {x} every feasible first move leaves X_N"), lost
+        reason = f"a vertex is within {CLEAR:g} of the size of X_N, {excess[i]:.1e}"
+        return Rung(None, reason), lost, none
+    x = body.vertices[i]
+    reason = f"from x = {_point(x)} every feasible first move leaves X_N"
+    return Rung(False, reason, x), lost, body.vertices[excess > CLEAR * body.size]
 
 
-def _longer(before: Shadow, body: Shadow, after: Shadow) -> Rung:
+def _longer(before: Shadow, body: Shadow, after: Shadow) -> tuple[Rung, np.ndarray]:
     """Weak by half-spaces alone: X_N ⊆ X_{N+1}, and X_N ⊆ X_{N−1}, so that a first move into X_N
-    is that of a feasible plan.
+    is that of a feasible plan. And the states that are not in X_{N+1}.
     """
     tops = [body.support(normal) for normal in after.normals]
-    excess = np.array([top[0] for top in tops]) - after.offsets
+    excess = np.array([top for top, _ in tops]) - after.offsets
     i = int(np.argmax(excess))
-    x = tops[i][1]
-    if excess[i] > CLEAR * body.size and x is not None:
-        return Rung(False, f"from x = {_point(x)} every feasible first move leaves X_N")
+    outside = [x for (_, x), e in zip(tops, excess, strict=True) if e > CLEAR * body.size]
+    seeds = np.array([x for x in outside if x is not None]).reshape(-1, len(body.center))
+    if len(seeds):
+        x = tops[i][1]
+        assert x is not None
+        return Rung(False, f"from x = {_point(x)} every feasible first move leaves X_N", x), seeds
     nested = np.array([body.support(normal)[0] for normal in before.normals]) - before.offsets
     if max(excess[i], nested.max()) <= TOLERANCE * body.size:
-        return Rung(True, f"X_N lies in X_N+1 and in X_N-1 ({len(excess)} facets by LPs)")
-    return Rung(None, "X_N lies in X_N+1, but its plans may not reach there")
+        return Rung(True, f"X_N lies in X_N+1 and in X_N-1 ({len(excess)} facets, by LPs)"), seeds
+    return Rung(None, "X_N lies in X_N+1, but not in X_N-1: its plans may lead elsewhere"), seeds
 
 
 def _no_way_on(all_pairs: Pairs, state: np.ndarray) -> bool:
@@ -521,7 +533,7 @@ def _bound(ladder: Ladder) -> tuple[Bound | None, np.ndarray]:
         parts += [part.mean(axis=0, keepdims=True) for part in corners]
         while sum(map(len, parts)) < STARTS:
             parts += [random.dirichlet(np.ones(len(part)), 1) @ part for part in corners]
-        return Bound(body.center, body.normals, body.offsets), np.concatenate(parts)[:STARTS]
+        return Bound(body.center, body.normals, body.offsets), np.concatenate(parts)
     try:
         rays = boundary(ladder.mpc, np.concatenate([spread(STARTS, p), np.eye(p), -np.eye(p)]))
     except ValueError:  # empty or flat
@@ -625,18 +637,22 @@ def smallest_horizon(mpc: MPC, limit: int = 20, *, regions: int = 2000) -> Small
     """Try horizons 1, 2, … up to `limit` with proofs alone (no samples, no search).
 
     The horizon of `mpc` itself plays no part. The answer is the least horizon with a proof; a
-    smaller one that is neither proved nor refuted is in `reasons` with holds None. Raises
-    ValueError for an ill-posed problem.
+    smaller one that is neither proved nor refuted is in `reasons` with holds None, and one at
+    which the problem is ill-posed (more free moves than steps) is not. Raises ValueError for an
+    ill-posed problem.
     """
     mpc.validate()
     _check(limit=(limit, 1), regions=(regions, 0))
     least, reasons = None, {}
     for N in range(1, limit + 1):
-        ladder = climb(replace(mpc, horizon=N))
+        problem = replace(mpc, horizon=N)
+        try:
+            problem.validate()
+        except ValueError:  # such as more free moves than steps
+            continue
+        ladder = climb(problem)
         law = ladder.law
-        if ladder.weak.holds is False:
-            law = Rung(False, ladder.weak.reason)
-        elif law.holds is None and least is None and regions and np.isfinite(ladder.volume):
+        if law.holds is None and least is None and regions and np.isfinite(ladder.volume):
             law = _by_regions(ladder, regions)[0]
         reasons[N] = law
         least = N if law.holds and least is None else least

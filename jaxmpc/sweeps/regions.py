@@ -196,12 +196,9 @@ class Program:
     size: np.ndarray
     interior: np.ndarray
 
-    def support(self, d: np.ndarray) -> tuple[float, np.ndarray]:
-        """max d'ξ over X_N, and where."""
-        value, xi = maximum(d, np.hstack([self.U, -self.V]), self.v)
-        if xi is None:
-            fail("mpc", *STOPPED)
-        return value, xi
+    def support(self, d: np.ndarray) -> tuple[float, np.ndarray | None]:
+        """max d'ξ over X_N, and where; NaN and None where HiGHS stops."""
+        return maximum(d, np.hstack([self.U, -self.V]), self.v)
 
     def leave(self, direction: np.ndarray) -> np.ndarray | None:
         """Where the ray from the interior point along `direction` leaves X_N; None: not found."""
@@ -268,17 +265,27 @@ class Program:
                 return Solution(active, np.union1d(touching, active).astype(int), multipliers, y)
         return None
 
-    def basis(self, xi: np.ndarray) -> tuple[int, ...] | None:
-        """Active set at ξ of the perturbed problem; None where there is no solution."""
-        found = self.solution(xi)
+    def basis(self, found: "Solution | None") -> tuple[int, ...] | None:
+        """Active set of the perturbed problem at the ξ of a solution; None for none."""
         if found is None or len(found.touching) == len(found.active):
             return None if found is None else found.active
         # The limit of the perturbed multipliers minimises ε'λ.
         on = found.touching
-        best = linprog(self.epsilon[on], A_eq=self.M[on].T, b_eq=-found.y, method="highs-ds")
+        A, b = self.balance(on, -found.y)
+        best = linprog(self.epsilon[on], A_eq=A, b_eq=b, method="highs-ds")
         if best.x is None:
             return found.active
         return tuple(on[best.x > 1e-12 * best.x.max(initial=0.0)].tolist())
+
+    def balance(self, rows: np.ndarray, push: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Σ λ_i M_i = push over `rows`, which hold it in their span, as independent equations."""
+        span, size, _ = np.linalg.svd(self.M[rows].T, full_matrices=False)
+        span = span[:, size > 1e-10 * size.max(initial=0.0)]
+        return span.T @ self.M[rows].T, span.T @ push
+
+    def active(self, xi: np.ndarray) -> tuple[int, ...] | None:
+        """Active set of the perturbed problem at ξ; None where there is no solution."""
+        return self.basis(self.solution(xi))
 
 
 class Solution(NamedTuple):
@@ -579,7 +586,7 @@ class Search:
             return
         # Several rows vanish on the facet at once: look just behind it.
         for step in STEPS:
-            behind = self.visit(self.p.basis(middle + step * here.radius * here.H[i]))
+            behind = self.visit(self.p.active(middle + step * here.radius * here.H[i]))
             if touches(behind):
                 return
 
@@ -604,15 +611,17 @@ class Search:
             if beyond.max() <= FILL and abs(gap) <= FILL:
                 return True, why
             before = len(self.found)
-            for corner in (xi for (_, xi), far in zip(tops, beyond, strict=True) if far > FILL):
-                self.visit(self.p.basis(self.p.interior + (corner - self.p.interior) * (1 - 1e-6)))
+            for (_, corner), far in zip(tops, beyond, strict=True):
+                if corner is not None and far > FILL:
+                    inside = self.p.interior + (corner - self.p.interior) * (1 - 1e-6)
+                    self.visit(self.p.active(inside))
             for c in list(self.found):
                 for middle, normal in zip(c.middles, c.H, strict=True):
                     corner = c.vertices[random.integers(len(c.vertices))]
                     # Anywhere on the facet, which is convex, and a little behind it.
                     to = corner - normal * (normal @ (corner - middle))
                     point = middle + 0.9 * random.random() * (to - middle)
-                    self.visit(self.p.basis(point + 1e-6 * c.radius * normal))
+                    self.visit(self.p.active(point + 1e-6 * c.radius * normal))
             self.spread()
             if len(self.found) == before:
                 break
@@ -637,7 +646,7 @@ def explore(p: Program, limit: Any) -> Search:
             f"Regions serve up to {DIMENSIONS}; exact_penalty(method='samples') serves more",
         )  # fmt: skip
     search = Search(p, int(limit))
-    search.visit(p.basis(p.interior))
+    search.visit(p.active(p.interior))
     search.spread()
     if not search.found:
         fail("mpc", "no critical region was found: too ill-conditioned", "Scale states and inputs")
