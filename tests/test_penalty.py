@@ -236,7 +236,7 @@ class TestExactPenalty:
         assert found.rho_bar == pytest.approx(max(0.0, 2 * (r * u_max - q)), rel=1e-9)
         assert found.exact is (method == "regions")
         if found.rho_bar > 0:
-            assert abs(found.state[0]) == pytest.approx(1 + u_max) and found.row.step == 1
+            assert abs(found.at[0]) == pytest.approx(1 + u_max) and found.row.step == 1
             assert found.advised > found.rho_bar
         else:
             assert found.row is None and found.advised > 0
@@ -245,7 +245,7 @@ class TestExactPenalty:
     def test_lecture(self, method):
         found = exact_penalty(problems.lecture(), method=method, samples=20)
         assert found.rho_bar == pytest.approx(11.25, rel=1e-9)
-        np.testing.assert_allclose(np.abs(found.state), [0.25, 0.6], rtol=1e-9)
+        np.testing.assert_allclose(np.abs(found.at), [0.25, 0.6], rtol=1e-9)
         assert found.row.step == 3 and "k = 3" in found.label and "x1" in found.label
         assert ("lower bound" in found.sentence.split(",")[0]) is (method == "samples")
 
@@ -268,7 +268,7 @@ class TestExactPenalty:
     def test_slack_starts_below(self, mpc):
         """Another solver, states not eliminated: slack below rho_bar and none above."""
         found = exact_penalty(mpc, method="regions")
-        at = found.state * (1 - 1e-7)  # rho_bar is a limit from inside X_N, which holds 0
+        at = found.at * (1 - 1e-7)  # rho_bar is a limit from inside X_N, which holds 0
         assert slack_by_osqp(mpc, at, 0.99 * found.rho_bar) > 1e-5
         assert slack_by_osqp(mpc, at, 1.001 * found.rho_bar) < 1e-8
 

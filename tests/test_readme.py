@@ -1,19 +1,36 @@
-"""The README's snippet runs as it stands, and says what it promises."""
+"""The README's snippets run as they stand, and say what they promise."""
 
 import re
 from pathlib import Path
 
+import pytest
+
 README = Path(__file__).resolve().parents[1] / "README.md"
 
 
-def test_snippet(capsys):
-    (snippet,) = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
-    code = snippet.split("import jaxmpc as jm\n\n")[1]
-    assert len(code.splitlines()) <= 10
+def run(*which):
+    """Execute snippets one after the other; the names they leave."""
+    snippets = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
     names: dict[str, object] = {}
-    exec(compile(snippet, str(README), "exec"), names)
+    for i in which:
+        exec(compile(snippets[i], str(README), "exec"), names)
+    return snippets, names
+
+
+def test_first_snippet(capsys):
+    snippets, names = run(0)
+    assert len(snippets[0].split("import jaxmpc as jm\n\n")[1].splitlines()) <= 10
     fmap = names["fmap"]
     low, high = fmap.volume_bounds()
     assert low <= 1489 / 125 <= high and high - low < 1e-6
     assert fmap.counts()["undecided"] == 0
     assert capsys.readouterr().out.startswith("Solved")
+
+
+@pytest.mark.slow
+def test_workflow_snippet(capsys):
+    """Theorem 1 holds of the design, and the weight it advises is exact."""
+    _, names = run(0, 1)
+    text = capsys.readouterr().out
+    assert "Theorem 1 (recursive feasibility) applies" in text and "weight given is exact" in text
+    assert names["controller"].mpc.soft

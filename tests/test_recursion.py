@@ -10,6 +10,8 @@ import problems
 import pytest
 
 import jaxmpc as jm
+from jaxmpc.mpc.problem import Soft
+from jaxmpc.sweeps import law
 from jaxmpc.sweeps.law import Bound, Law
 from jaxmpc.sweeps.reach import backward, pairs, shadow
 from jaxmpc.sweeps.recursion import _theorem, climb, recursive_feasibility, smallest_horizon
@@ -179,24 +181,38 @@ class TestProofs:
 
     def test_scalar_in_closed_form(self):
         """x⁺ = 2x + u, |x| ≤ 5, |u| ≤ 1: X_N is |x| ≤ 1 + 4·2⁻ᴺ, X_{N+1} half as far from 1."""
-        for N in (1, 3):
-            found = climb(problems.scalar(2.0, N, 5.0, 1.0, terminal=5.0))
-            assert found.volume == pytest.approx(2 * (1 + 4 * 2.0**-N), rel=1e-12)
-            assert found.lost == pytest.approx(4 * 2.0**-N, rel=1e-9)
-            assert rungs(found) == (False, False, False)
+        found = climb(problems.scalar(2.0, 3, 5.0, 1.0, terminal=5.0))
+        assert found.volume == pytest.approx(2 * (1 + 4 / 8), rel=1e-12)
+        assert found.lost == pytest.approx(4 / 8, rel=1e-9)
+        assert rungs(found) == (False, False, False)
 
-    def test_half_spaces_by_recursion_are_those_by_rays(self):
-        for mpc in (problems.lecture(0.25, 3), replace(problems.lecture(), terminal_set=None)):
-            body = shadow(pairs(mpc))
-            before, same, after = backward(mpc)
-            order = lambda s: np.unique(
-                np.round(np.column_stack([s.normals, s.offsets]), 9), axis=0
-            )
-            np.testing.assert_allclose(order(body), order(same), atol=1e-8)
-            for part, N in ((before, 2), (after, 4)):
-                exact_body = exact.feasible_polygon(replace(mpc, horizon=N))
-                ends = [float(exact_body.support(normal)) for normal in part.normals]
-                np.testing.assert_allclose(part.offsets, ends, atol=1e-9)
+    @pytest.mark.parametrize("end", ["states", pytest.param(None, marks=pytest.mark.slow)])
+    def test_half_spaces_by_recursion_are_those_by_rays(self, end):
+        mpc = problems.lecture(0.25, 3)
+        mpc = mpc if end else replace(mpc, terminal_set=None)
+        body = shadow(pairs(mpc))
+        before, same, after = backward(mpc)
+        order = lambda s: np.unique(np.round(np.column_stack([s.normals, s.offsets]), 9), axis=0)
+        np.testing.assert_allclose(order(body), order(same), atol=1e-8)
+        for part, N in ((before, 2), (after, 4)):
+            exact_body = exact.feasible_polygon(replace(mpc, horizon=N))
+            ends = [float(exact_body.support(normal)) for normal in part.normals]
+            np.testing.assert_allclose(part.offsets, ends, atol=1e-9)
+
+    @pytest.mark.slow
+    def test_weak_where_sets_do_not_nest(self):
+        """The first move must be that of a feasible plan: X_N against Pre(X_N ∩ X_{N−1})."""
+        mpc = problems.drifting()
+        body = exact.feasible_polygon(mpc)
+        shorter = exact.feasible_polygon(replace(mpc, horizon=mpc.horizon - 1))
+        facets = [*body.facets, *shorter.facets]
+        both = jm.Polytope(*(np.array([f[i] for f in facets], float) for i in (0, 1)))
+        later = exact.feasible_polygon(replace(mpc, horizon=1, terminal_set=both))
+        for normal, offset in body.facets:
+            later = later.clip(normal, offset)
+        found = climb(mpc)
+        assert found.lost == pytest.approx(float(body.area - later.area), abs=1e-9)
+        assert found.lost > 0.007 and found.weak.holds is False
 
     @pytest.mark.slow
     def test_twelve_states(self):
@@ -216,26 +232,24 @@ class TestProofs:
 class TestLaw:
     """The affine pieces and the projection that the ascent uses."""
 
-    def test_piece_predicts_the_plan_beside(self):
-        soft = problems.lecture(0.25, 3)
-        soft = replace(
-            soft,
-            soft=(jm_soft(np.array([[0.0, 1.0]]), np.array([0.2]), 2.0, 0.5),),
-        )
+    @pytest.mark.parametrize(
+        "soft", [(), pytest.param((Soft([[0.0, 1.0]], [0.2], 2.0, 0.5),), marks=pytest.mark.slow)]
+    )
+    def test_piece_predicts_the_plan_beside(self, soft):
+        mpc = replace(problems.lecture(0.25, 3), soft=soft)
         random = np.random.default_rng(0)
-        for mpc in (problems.lecture(0.25, 3), soft):
-            law = Law(mpc, np.zeros(2), 128)
-            x = random.uniform(-1, 1, (100, 2)) * [0.9, 0.5]
-            plans = law.plans(x)
-            pieces = [law.piece(*pair) for pair in zip(x, plans.inputs, strict=True)]
-            beside = x + 1e-4 * random.standard_normal(x.shape)
-            after = law.following(beside, law.plans(beside).inputs[:, 0])
-            compared = 0
-            for piece, here, there in zip(pieces, beside, after, strict=True):
-                if piece is not None and np.all(piece.R @ here <= piece.r):
-                    np.testing.assert_allclose(piece.E @ here + piece.e, there, atol=1e-7)
-                    compared += 1
-            assert compared > 60
+        affine = Law(mpc, np.zeros(2), 1024)
+        x = random.uniform(-1, 1, (100, 2)) * [0.9, 0.5]
+        plans = affine.plans(x)
+        pieces = [affine.piece(*pair) for pair in zip(x, plans.inputs, strict=True)]
+        beside = x + 1e-4 * random.standard_normal(x.shape)
+        after = affine.following(beside, affine.plans(beside).inputs[:, 0])
+        compared = 0
+        for piece, here, there in zip(pieces, beside, after, strict=True):
+            if piece is not None and np.all(piece.R @ here <= piece.r):
+                np.testing.assert_allclose(piece.E @ here + piece.e, there, atol=1e-7)
+                compared += 1
+        assert compared > 60
 
     def test_nearest_point_of_a_polytope(self):
         square = Bound(np.zeros(2), np.vstack([np.eye(2), -np.eye(2)]), np.ones(4))
@@ -244,12 +258,6 @@ class TestLaw:
         np.testing.assert_allclose(square.nearest(points), near, atol=1e-12)
         np.testing.assert_allclose(square.excess(points), [2.0, 4.0, -0.7], atol=1e-12)
         assert square.size == 1.0
-
-
-def jm_soft(C, d, rho, quadratic):
-    from jaxmpc.mpc.problem import Soft
-
-    return Soft(C, d, rho, quadratic)
 
 
 class TestReport:
@@ -349,6 +357,19 @@ class TestSlow:
         share = report.counts()["lost after one step"] / report.counts()["feasible"]
         assert share == pytest.approx(lost / report.volume, abs=0.01)
         check_counterexample(mpc, report.counterexample)
+
+    def test_gradient_alone_and_regions_alone_find_the_worst(self, monkeypatch):
+        """From one sample and the starts on the boundary; the worst state is no vertex of X_1."""
+        mpc, one = problems.lecture(0.25, 1), np.zeros((1, 2))
+        found = lambda: recursive_feasibility(mpc, one, steps=1, regions=0).counterexample.distance
+        climb_regions, value = law._climb, law._value
+        monkeypatch.setattr(law, "_climb", lambda _, b, x, v, d: x[np.argsort(-v)[:6]])
+        assert found() == pytest.approx(0.546401, abs=1e-4)
+        still = lambda *a, **k: (value(*a, **k)[0], np.zeros_like(a[2]))
+        monkeypatch.setattr(law, "_value", still)
+        assert found() < 0.546
+        monkeypatch.setattr(law, "_climb", climb_regions)
+        assert found() == pytest.approx(0.546401, abs=1e-5)
 
     def test_joint_of_five_steps(self):
         report = recursive_feasibility(problems.joint(5), steps=30)

@@ -44,10 +44,10 @@ class Recursion:
       $ jaxmpc recursion --config pendulum.toml --terminal invariant --output checks/a
 
     How to read the output, all in the folder of --output
-      recursion.png   Blue: kept for all steps. Red to yellow: lost after 1, 2, ... steps. Grey:
-                      infeasible from the start. Arrow: the worst counterexample, from x to the
-                      next state, with the half-space (line) that proves it infeasible; the
-                      right panel enlarges it. Two states only.
+      recursion.png   Blue: kept for all steps. Dark red to light orange: lost at step 1, 2, ...
+                      Grey: infeasible from the start. Arrow: the worst counterexample, from x
+                      to the next state, with the half-space (line) that proves it infeasible;
+                      the right panel enlarges it. Two states only.
       summary.json    The claims with reasons, the counterexample, areas, counts, configuration.
       recursion.npz   state, label (1 feasible, -1 infeasible, 0 undecided), input (the optimal
                       first move), next_state, lost_at (step at which the problem is proved

@@ -17,18 +17,21 @@ def equilibrium(
     """(x, u) with x = A x + B u + c and C x = target: what to track and the input that holds it.
 
     target (p,): of the outputs C x, C (p, n); without C of all states. Among several equilibria the
-    one of least norm. states, inputs: Box limits to stay in, or None. Give x and u to `solve` as
-    reference and input_reference, so that the cost vanishes at the target.
+    one of least norm, if that keeps the limits. states, inputs: Box limits to stay in, or None.
+    Give x and u to `solve` as reference and input_reference, so that the cost vanishes there.
 
     Raises ValueError where no equilibrium meets the target, within the limits if there are any:
     the message says how far the closest one stays from it. Host, float64; residual below 1e-9
-    relative to the size of the terms.
+    (1 + the size of its terms).
     """
+    if not isinstance(system, LinearSystem):
+        fail("system", f"is a {type(system).__name__}", "Give a jm.LinearSystem")
     system.validate()
     n, m = system.n, system.m
     C = np.eye(n) if C is None else host_array("C", C)
     if C.ndim != 2 or C.shape[1] != n:
         fail("C", f"shape {C.shape}", f"Give (p, {n}), one column a state")
+    require_finite("C", C)
     require_shape("target", target, (len(C),), "One value for each row of C")
     target = host_array("target", target)
     require_finite("target", target)
@@ -54,7 +57,7 @@ def equilibrium(
         found = np.clip(found, low, high)
     error = M @ found - value
     size = np.abs(M) @ np.abs(found) + np.abs(value)
-    if not np.all(np.abs(error) <= 1e-9 * (1e-3 + size)):
+    if not np.all(np.abs(error) <= 1e-9 * (1 + size)):
         closest = C @ found[:n]
         drift = np.abs(error[:n]).max()
         fail(

@@ -10,7 +10,7 @@ from jax import Array
 
 from jaxmpc.checks import concrete, fail, require_finite, require_shape, require_symmetric_psd
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
-from jaxmpc.control.system import LinearSystem
+from jaxmpc.control.system import LinearSystem, host_array
 from jaxmpc.qp.problem import QPSolution
 
 
@@ -175,8 +175,12 @@ class MPC:
         self._validate_steps()
         for i, soft in enumerate(_tuple("soft", self.soft, Soft)):
             self._validate_rows(f"soft[{i}]", soft, ("d",))
+            if concrete(soft.d) and np.any(np.asarray(soft.d) == -np.inf):
+                fail(f"soft[{i}].d", "holds -inf", "No violation reaches that: remove the row")
             for name in ("rho", "quadratic"):
                 weight = getattr(soft, name)
+                if concrete(weight):
+                    host_array(f"soft[{i}].{name}", weight)
                 if np.shape(weight) not in ((), np.shape(soft.d)):
                     fail(
                         f"soft[{i}].{name}", f"shape {np.shape(weight)}", "One number, or one a row"
@@ -196,7 +200,9 @@ class MPC:
         blocks = self.control_horizon
         if blocks is None:
             return
-        if self.prestabilise is not None and self.prestabilise is not False:
+        gain = self.prestabilise
+        given = gain is True or (gain is not None and concrete(gain) and np.any(gain))
+        if given:
             fail("prestabilise", "given beside control_horizon", "Blocked inputs are u, not u − Kx")
         lengths = blocks if isinstance(blocks, tuple) else (blocks,)
         whole = all(isinstance(b, int | np.integer) and not isinstance(b, bool) for b in lengths)
@@ -222,8 +228,11 @@ class MPC:
             if concrete(value) and np.isnan(np.asarray(value, float)).any():
                 fail(f"{name}.{bound}", "holds NaN", "Use inf where there is no limit")
         for what in ("names", "units"):
-            if len(getattr(rows, what)) not in (0, p):
-                fail(f"{name}.{what}", f"{len(getattr(rows, what))} for {p} rows", "All or none")
+            given = getattr(rows, what)
+            if not isinstance(given, tuple) or not all(isinstance(text, str) for text in given):
+                fail(f"{name}.{what}", f"{given!r}", "Give a tuple of strings")
+            if len(given) not in (0, p):
+                fail(f"{name}.{what}", f"{len(given)} for {p} rows", "All or none")
         last = self.horizon - (rows.D is not None)
         self._require_steps(f"{name}.steps", rows.steps, last)
 
@@ -245,6 +254,8 @@ class MPC:
         if isinstance(limit, Box):
             limit.validate("input_rate_limit", m)
         elif limit is not None:
+            if concrete(limit):
+                host_array("input_rate_limit", limit)
             if np.shape(limit) not in ((), (m,)):
                 fail("input_rate_limit", f"shape {np.shape(limit)}", f"Give ({m},) or a Box")
             if concrete(limit) and not np.all(np.asarray(limit, float) >= 0):
@@ -297,7 +308,9 @@ def soften(mpc: MPC, rho: Any, quadratic: Any = 0.0) -> MPC:
         names = rows.names or tuple(f"output row {i + 1}" for i in range(len(rows.lower)))
         steps = output_steps(mpc, rows)
         one_sided(rows.C, rows.D, rows.lower, rows.upper, steps, names, rows.units)
-    return replace(mpc, states=None, terminal_set=None, outputs=(), soft=tuple(soft))
+    softened = replace(mpc, states=None, terminal_set=None, outputs=(), soft=tuple(soft))
+    softened.validate()
+    return softened
 
 
 def harden(mpc: MPC) -> MPC:

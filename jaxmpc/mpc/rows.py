@@ -122,7 +122,8 @@ def blocks(mpc: MPC, dtype: Any) -> list[Block]:
         )  # fmt: skip
     last = mpc.terminal_set
     if isinstance(last, Ellipsoid):  # x'Px = |L'x|²
-        L = jnp.linalg.cholesky(cast(last.P))
+        P = cast(last.P)
+        L = jnp.linalg.cholesky((P + P.T) / 2)
         names = ("terminal ellipsoid",) * n
         zero, radius = jnp.zeros(n, dtype), jnp.sqrt(cast(last.level))
         add("terminal", L.T, None, zero, zero, (N,), names, (), radius=radius)
@@ -209,7 +210,9 @@ def active_constraints(
     """The limits with a multiplier above `tolerance`, largest first (the lesson's problem 1).
 
     plan: of `mpc`, one instance. The multiplier of a bound is the sensitivity of the optimal cost:
-    dJ*/d(bound) = −multiplier for an upper bound, +multiplier for a lower one. Host.
+    dJ*/d(bound) = −multiplier for an upper bound, +multiplier for a lower one. Where rows coincide
+    (inputs of one block of a control horizon, states at N beside the terminal set) they share it in
+    an arbitrary way: only their sum is a sensitivity, of relaxing all of them. Host.
     """
     y = np.asarray(plan.qp.y, np.float64)
     table = row_table(mpc)

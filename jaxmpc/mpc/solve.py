@@ -89,15 +89,17 @@ class Controller:
         Inputs and multipliers move up by one step. The new last input is the unconstrained
         optimum of that step for the terminal cost, inside its limits; its rows push with nothing.
         What bounded x_N through the terminal set bounds it as a state from now on, where both
-        have the same rows. Blocked moves stay as they are.
+        have the same rows. With a control horizon each move becomes what the plan did one step
+        after its beginning.
         """
         c = self.condensed
         assert c is not None
-        x = plan.states[-1]
-        moves = plan.qp.z.reshape(-1, c.R.shape[0])
-        if self.mpc.control_horizon is None:
-            v = self._limited(matmul(c.K_N, x)) - matmul(c.K, x)
-            moves = jnp.concatenate([moves[1:], v[None]])
+        x, moves, N = plan.states[-1], np.array(self.mpc.moves), self.mpc.horizon
+        tail = self._limited(matmul(c.K_N, x)) - matmul(c.K, x)
+        z = jnp.concatenate([plan.qp.z.reshape(-1, c.R.shape[0]), tail[None]])
+        # A move takes over what the old plan did one step after the move begins.
+        begins = np.unique(moves, return_index=True)[1]
+        z = z[np.append(moves, moves[-1] + 1)[begins + 1]]
         parts, terminal = self._split(plan.qp.y), plan.multipliers.terminal
         for i, (kind, steps, size) in enumerate(c.layout):
             if kind == "terminal":
@@ -105,12 +107,12 @@ class Controller:
             # Step k takes over from k + 1: from the block itself, else from the terminal set.
             place = {k: j for j, k in enumerate(steps)}
             same = kind == "state" and not c.balls and terminal.shape[0] == size
-            last = terminal if same else jnp.zeros(size, moves.dtype)
-            source = jnp.concatenate([parts[i], last[None], jnp.zeros((1, size), moves.dtype)])
+            last = terminal if same else jnp.zeros(size, z.dtype)
+            source = jnp.concatenate([parts[i], last[None], jnp.zeros((1, size), z.dtype)])
             end = len(steps)
-            later = [place.get(k + 1, end if k + 1 == self.mpc.horizon else end + 1) for k in steps]
+            later = [place.get(k + 1, end if k + 1 == N else end + 1) for k in steps]
             parts[i] = source[np.array(later, int)]
-        return moves.ravel(), jnp.concatenate([*(part.ravel() for part in parts), plan.qp.y[:0]])
+        return z.ravel(), jnp.concatenate([*(part.ravel() for part in parts), plan.qp.y[:0]])
 
     def _limited(self, u: Array) -> Array:
         """u inside the input limits: an actuator takes no rounding beyond them."""

@@ -46,16 +46,17 @@ class ExactPenalty:
     """The least ρ for which the penalty ρ·Σ slack is exact (see `exact_penalty`).
 
     rho_bar: sup over X_N of the threshold, or with exact False a lower bound of it, in cost per
-    unit of the rows as given. state (p,): where it is approached, row: the soft row that needs it
-    (None where rho_bar is 0), label: that row with bound, step and unit. method: "regions" or
-    "samples". advised: a weight with a margin. thresholds (B,), status (B,): at the states asked
-    for, NaN and PRIMAL_INFEASIBLE or NON_FINITE where there is none. sufficient: whether the
-    weight ρ asked about is exact on all of X_N; None where that is not known, or none was given.
-    regions: the critical regions, where they were enumerated. evaluated: number of active sets.
+    unit of the rows as given. at (p,): the state where it is approached, row: the soft row that
+    needs it (None where rho_bar is 0), label: that row with bound, step and unit. method:
+    "regions" or "samples". advised: a weight with a margin. thresholds (B,), status (B,): at the
+    states asked for, NaN and PRIMAL_INFEASIBLE or NON_FINITE where there is none. sufficient:
+    whether the weight ρ asked about is exact on all of X_N; None where that is not known, or none
+    was given. regions: the critical regions, where they were enumerated. evaluated: number of
+    active sets.
     """
 
     rho_bar: float
-    state: np.ndarray
+    at: np.ndarray
     row: Row | None
     label: str
     method: str
@@ -70,7 +71,7 @@ class ExactPenalty:
     @property
     def sentence(self) -> str:
         """What was found, and what it rests on."""
-        value, at = f"{self.rho_bar:.6g}", np.array2string(self.state, precision=6)
+        value, at = f"{self.rho_bar:.6g}", np.array2string(self.at, precision=6)
         if self.exact:
             found = f"rho_bar = {value} over the feasible set, by {self.evaluated} critical regions"
         else:
@@ -148,7 +149,7 @@ def exact_penalty(
     thresholds, status = weigh.at(x0s)
     return ExactPenalty(
         rho_bar=value,
-        state=p.center + p.size * worst.xi,
+        at=p.center + p.size * worst.xi,
         row=row,
         label="" if row is None else label(row, p.side[worst.row]),
         method="regions" if exact or method == "regions" else "samples",

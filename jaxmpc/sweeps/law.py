@@ -25,7 +25,9 @@ from jaxmpc.sweeps.plans import Plans, solve_many
 EPS = 1e-8
 # Slack, and error of a reconstructed plan, that count as zero; relative to the data.
 TOUCHING, MATCHING = 1e-7, 1e-6
-# Gradient ascent: step lengths relative to the size of the set.
+# Gradient ascent: how far inside the half-spaces it stays (on the boundary, where a single plan is
+# left, solvers crawl), and step lengths; relative to the size of the set.
+INSET = 1e-6
 LENGTHS = 0.3 * 0.5 ** np.arange(16)
 # At the end regions are climbed: how many at once, in how many rounds, from how many neighbours
 # at what distance.
@@ -217,7 +219,7 @@ def ascend(law: Law, bound: Bound, starts: np.ndarray, deadline: float) -> np.nd
     best are led from region to region, each to the maximum of a_j'x⁺ on its region. A local
     method: what it finds is real, what it does not find is not proved absent.
     """
-    inset = 1e-9 * bound.size
+    inset = INSET * bound.size
     x = bound.nearest(starts, inset)
     value, gradient = _value(law, bound, x)
     for length in LENGTHS:
@@ -250,7 +252,7 @@ def _value(
 def _climb(law: Law, bound: Bound, x: np.ndarray, value: np.ndarray, deadline: float) -> np.ndarray:
     """From the best of x (S, p): to the best vertex of the region there, and on from beside it."""
     random = np.random.default_rng(0)
-    inset = 1e-9 * bound.size
+    inset = INSET * bound.size
     order = np.argsort(-value)[:KEPT]
     best, top = x[order], value[order]
     for tried in range(ROUNDS):

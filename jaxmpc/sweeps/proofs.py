@@ -204,6 +204,7 @@ def problem(mpc: MPC, view: View, extent: np.ndarray) -> Problem:
     if isinstance(mpc.terminal_set, Ellipsoid):
         P = np.zeros((p, p))
         P[:n, :n] = np.asarray(mpc.terminal_set.P, np.float64)
+        P = (P + P.T) / 2
         level = np.asarray(mpc.terminal_set.level, np.float64)
         back = np.zeros((p, n))
         back[:n] = np.linalg.inv(np.linalg.cholesky(P[:n, :n])).T

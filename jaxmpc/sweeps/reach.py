@@ -91,7 +91,7 @@ class Pairs:
         return _bound(d, y, self.G, self.g, self.extent)
 
     def centre(self) -> np.ndarray | None:
-        """The θ of the pair with the largest margin to all rows but equalities; None without one."""
+        """The θ of the pair with the largest margin, equalities apart; None without any."""
         size = self.G.shape[1]
         margin = np.where(self.equal, 0.0, 1.0)[:, None]
         wide = np.vstack([np.hstack([self.G, margin]), np.eye(size + 1)[-1:]])

@@ -4,7 +4,8 @@ Three claims about the feasible set X_N of an MPC problem, each weaker than the 
 
     strong  every first move of a feasible plan leads to a state in X_N,
     law     the optimal first move does,
-    weak    some first move of a feasible plan does.
+    weak    some first move of a feasible plan does (X_N ⊆ X_{N+1}, where longer horizons can only
+            make these sets smaller; else it asks for a little more).
 
 A claim is proved by Theorem 1 of the lesson (an invariant terminal set), by linear programs over
 all pairs of a state and a plan (`reach.py`), or by the critical regions of the law. It is refuted
@@ -36,7 +37,7 @@ from jaxmpc.sweeps.regions import critical_regions
 CLEAR = 1e-7
 STARTS = 96
 # How far a counterexample is pulled towards the centre until its plan is proved.
-PULLS = 10.0 ** np.arange(-9, -3)
+PULLS = 10.0 ** np.arange(-8, -3)
 # `lost_at` of samples that cannot be lost, and of those that were not decided.
 NOT_FEASIBLE, UNDECIDED = -1, -2
 
