@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, Union
 
 import numpy as np
 import tyro
@@ -141,24 +141,35 @@ class Tally:
     stopped: bool = False
 
 
+COMMANDS: dict[str, Any] = {"sweep": Sweep, "recursion": Recursion, "info": Info}
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; the result is the exit code (0 done, 2 error, 130 interrupted)."""
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv == ["--version"]:
         print(f"jaxmpc {version('jaxmpc')}")
         return 0
-    command = tyro.extras.subcommand_cli_from_dict(
-        {"sweep": Sweep, "recursion": Recursion, "info": Info},
-        prog="jaxmpc",
-        description="Constrained MPC in batches, with proofs. Also: jaxmpc --version",
-        args=argv,
-    )
+    command = _parse(argv)
     if isinstance(command, Recursion | Info):
         return _guarded(command.run)
     again = [word for word in argv if word not in ("--overwrite", "--resume")]
     resume = shlex.join(["jaxmpc", *again, "--resume"])
     kept = f"chunks that were done are kept. Go on with:\n  {resume}"
     return _guarded(lambda: _sweep(command, resume), kept)
+
+
+def _parse(argv: Sequence[str]) -> Any:
+    """The command with its options. A command's help is a page, `jaxmpc --help` a line for each."""
+    if argv and argv[0] in COMMANDS:
+        return tyro.cli(COMMANDS[argv[0]], prog=f"jaxmpc {argv[0]}", args=argv[1:])
+    lines = [
+        Annotated[kind, tyro.conf.subcommand(name, description=str(kind.__doc__).splitlines()[0])]
+        for name, kind in COMMANDS.items()
+    ]
+    description = "Constrained MPC in batches, with proofs. Also: jaxmpc --version"
+    choice: Any = Union[tuple(lines)]  # noqa: UP007
+    return tyro.cli(choice, prog="jaxmpc", description=description, args=argv)
 
 
 def _guarded(run: Callable[[], int], kept: str = "nothing is kept") -> int:

@@ -15,13 +15,13 @@ from jaxmpc.sweeps.regions import (
     LP,
     SMALLEST,
     STOPPED,
+    ActivePiece,
     CriticalRegions,
-    Law,
     Program,
+    active_piece,
     exchange,
     explore,
     largest_ball,
-    law,
     maximum,
     program,
 )
@@ -234,7 +234,7 @@ class Thresholds:
         each = np.where(mine, result.x[:count] * per_row, 0.0)
         return float(result.fun * unit * size), int(rows[np.argmax(each)])
 
-    def over(self, found: Law, points: np.ndarray) -> Worst:
+    def over(self, found: ActivePiece, points: np.ndarray) -> Worst:
         """The largest threshold at points ξ (k, p) of a region, as limits from its inside.
 
         Inside a region the multipliers of `active` are the only ones, unless other rows are active
@@ -255,7 +255,7 @@ class Thresholds:
         best, which = np.unravel_index(values.argmax(), values.shape)
         return Worst(max(float(values[best, which]), 0.0), points[best], int(rows[mine[which]]))
 
-    def maximal(self, found: Law) -> Worst | None:
+    def maximal(self, found: ActivePiece) -> Worst | None:
         """The same over a whole region, each multiplier maximised by an LP; None if it is flat.
 
         Where rows are dependent the LPs maximise multipliers that need not be the least: what they
@@ -315,7 +315,7 @@ def ascend(
 
     def visit(active: tuple[int, ...] | None) -> None:
         if active is not None and active not in found:
-            here = law(p, active)
+            here = active_piece(p, active)
             found[active] = None if here is None else weigh.maximal(here)
 
     visit(p.active(p.interior))
@@ -331,7 +331,7 @@ def ascend(
         stale = 0 if worst.value > best * (1 + ROUNDING) else stale + 1
         best = max(best, worst.value)
         left.add(here)
-        leaving = law(p, here)
+        leaving = active_piece(p, here)
         assert leaving is not None
         # Random rays inside the region hit its facets: from its middle, and from near the corner
         # where the multiplier is largest.

@@ -274,14 +274,21 @@ def feasible_polytope(mpc: MPC) -> Polytope:
     with proofs against rounding, slices, projections or an ellipsoidal terminal set use
     `map_feasible_set(...).refine()`; one step at a time, `predecessor`.
 
-    Raises ValueError in more than four dimensions, where X_N is empty, flat or unbounded, for an
-    ellipsoidal terminal set, and where there are more than 2,000 facets. Host, float64.
+    In more than four dimensions X_N comes from N steps of `predecessor` instead, for limits of
+    states and inputs alone; that works while the limits couple few states.
+
+    Raises ValueError where X_N is empty, flat or unbounded, for an ellipsoidal terminal set, and
+    where there are too many facets. Host, float64.
     """
     mpc.validate()
     everything = pairs(mpc)
     if not everything.exact:
         fail("terminal_set", "is an Ellipsoid, so X_N has a curved boundary", "Map it and refine()")
-    body = shadow(everything)
+    if everything.p <= DIMENSIONS:
+        body = shadow(everything)
+    else:
+        sets = backward(mpc)
+        body = sets if isinstance(sets, str) else sets[1]
     if isinstance(body, str):
         fail("mpc", body, "Map it with map_feasible_set, which has no such limit")
     return body.polytope

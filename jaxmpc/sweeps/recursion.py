@@ -121,6 +121,21 @@ class RecursionReport:
     steps: int
     seconds: float
 
+    @property
+    def S(self) -> bool | None:
+        """Whether every feasible first move stays: `strong.holds`."""
+        return self.strong.holds
+
+    @property
+    def M(self) -> bool | None:
+        """Whether the MPC law stays, that is recursive feasibility: `law.holds`."""
+        return self.law.holds
+
+    @property
+    def W(self) -> bool | None:
+        """Whether some feasible first move stays: `weak.holds`."""
+        return self.weak.holds
+
     def counts(self) -> dict[str, int]:
         """How many samples are feasible; of these lost at once, later, kept, undecided."""
         lost = self.lost_at

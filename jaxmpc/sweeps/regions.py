@@ -400,7 +400,7 @@ def half_spaces(set_: Box | Polytope | None, n: int) -> tuple[np.ndarray, np.nda
 
 
 @dataclass(frozen=True, eq=False)
-class Law:
+class ActivePiece:
     """λ (a, p + 1) and y (nz, p + 1) of an active set, affine in ξ with the constant last, where
     H ξ ≤ h (unit rows; `which`: their rows in the program). also_active: see `Region`.
     """
@@ -414,7 +414,7 @@ class Law:
     which: np.ndarray
 
 
-def law(p: Program, active: tuple[int, ...]) -> Law | None:
+def active_piece(p: Program, active: tuple[int, ...]) -> ActivePiece | None:
     """The law of an active set; None where its rows are dependent or it holds nowhere."""
     solved = p.solve(active)
     if solved is None:
@@ -436,7 +436,7 @@ def law(p: Program, active: tuple[int, ...]) -> Law | None:
     H, h = -a[which] / size[which, None], b[which] / size[which]
     zero[rows] = False
     also_active = tuple(np.flatnonzero(zero & ~p.still).tolist())
-    return Law(active, also_active, multipliers[:, :-1], y[:, :-1], H, h, which)
+    return ActivePiece(active, also_active, multipliers[:, :-1], y[:, :-1], H, h, which)
 
 
 @dataclass(frozen=True, eq=False)
@@ -446,7 +446,7 @@ class Cell:
     largest ball.
     """
 
-    law: Law
+    law: ActivePiece
     H: np.ndarray
     h: np.ndarray
     behind: tuple[np.ndarray, ...]
@@ -457,7 +457,7 @@ class Cell:
 
 def cell(p: Program, active: tuple[int, ...]) -> Cell | None:
     """The region of an active set; None where its rows are dependent or it has no volume."""
-    found = law(p, active)
+    found = active_piece(p, active)
     body = None if found is None else interior(found.H, found.h)
     if found is None or body is None:
         return None
