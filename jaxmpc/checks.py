@@ -7,6 +7,7 @@ checked and values are not (a batch answers bad values with a status instead).
 from typing import Any, NoReturn
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 
@@ -22,8 +23,9 @@ def concrete(*values: Any) -> bool:
 
 def require_shape(argument: str, value: Any, shape: tuple[int, ...], cure: str) -> None:
     """Raise unless `value` has exactly this shape."""
-    if np.shape(value) != shape:
-        fail(argument, f"shape {np.shape(value)} where {shape} is needed", cure)
+    given = np.shape(value if concrete(value) else jnp.asarray(value))  # lists of traced numbers
+    if given != shape:
+        fail(argument, f"shape {given} where {shape} is needed", cure)
 
 
 def require_finite(argument: str, value: Any) -> None:

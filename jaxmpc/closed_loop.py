@@ -89,7 +89,8 @@ def simulate(
 def lyapunov_decrease(run: Run) -> Array:
     """V_N(x_{t+1}) − V_N(x_t) + l(x_t, u_t) along the loop, (T−1,), l the stage cost.
 
-    Nowhere positive where the optimal value is a Lyapunov function: for the nominal plant,
+    Nowhere positive where the optimal value is a Lyapunov function: for the nominal plant, inputs
+    free at each step and no weight on their rates (which the stage cost here leaves out),
     references at an equilibrium, a terminal set that a law u = Kx keeps invariant inside the
     limits, and a terminal cost P ⪰ Q + K'RK + (A+BK)'P(A+BK) (Mayne, Rawlings, Rao & Scokaert
     2000, Automatica 36, section 3.3; the lesson's Theorem 3). Says nothing from
@@ -135,10 +136,10 @@ def _simulate(
             return whole
         return jax.lax.dynamic_slice_in_dim(whole, t, length)
 
-    def sample(carry: tuple[Array, Plan], at: tuple[Array, Array | None]) -> tuple:
-        (x, before), (t, w) = carry, at
+    def sample(carry: tuple[Array, Plan, Array], at: tuple[Array, Array | None]) -> tuple:
+        (x, before, previous), (t, w) = carry, at
         r, s = seen(references[0], t, N + 1), seen(references[1], t, N)
-        u, _, plan = controller(x, before, r, input_reference=s)
+        u, _, plan = controller(x, before, r, input_reference=s, previous_input=previous)
         error, effort = (
             v if target is None else v - (target if target.ndim == 1 else target[0])
             for v, target in ((x, r), (u, s))
@@ -149,16 +150,15 @@ def _simulate(
             violation=_violation(controller, x), slack=plan.slack[0],
         )  # fmt: skip
         after = jnp.asarray(step(x, u), x.dtype)
-        return (after if w is None else after + w, plan), record
+        return (after if w is None else after + w, plan, u), record
 
     # A plan of zeros is a cold start, so that one solve is compiled, not two.
     shapes = jax.eval_shape(lambda x: controller(x)[1], x0)
     nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
-    if previous_input is not None:
-        nothing = replace(nothing, inputs=nothing.inputs + previous_input)
+    previous = jnp.zeros_like(nothing.inputs[0]) if previous_input is None else previous_input
     samples = (jnp.arange(steps), disturbance)
     run: Run
-    (last, _), run = jax.lax.scan(sample, (x0, nothing), samples, length=steps)
+    (last, *_), run = jax.lax.scan(sample, (x0, nothing, previous), samples, length=steps)
     return replace(
         run, states=jnp.concatenate([run.states, last[None]]),
         violation=jnp.append(run.violation, _violation(controller, last)),

@@ -102,7 +102,7 @@ def _ring(make: Callable[[], Polytope | None]) -> np.ndarray:
 
 def _title(fmap: FeasibleSetMap) -> str:
     """What is shown, and for more than two states how the others are treated."""
-    labels = fmap.mpc.system.state_labels
+    labels = fmap.mpc.labels if fmap.mpc.rate_limited else fmap.mpc.system.state_labels
     others = [i for i in range(len(labels)) if i not in fmap.axes]
     what = f"Feasible initial states, horizon N = {fmap.mpc.horizon}"
     if not others:

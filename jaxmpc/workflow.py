@@ -29,9 +29,10 @@ from jaxmpc.sweeps.boundary import boundary
 from jaxmpc.sweeps.exact_penalty import ExactPenalty, exact_penalty
 from jaxmpc.sweeps.feasible_set import FeasibleSetMap, grid, map_feasible_set
 from jaxmpc.sweeps.proofs import hard_part
+from jaxmpc.sweeps.reach import usual
 from jaxmpc.sweeps.recursion import RecursionReport, recursive_feasibility
 
-TERMINALS = ("invariant", "ellipsoid", "states", "none")
+TERMINALS = ("invariant", "ellipsoid", "states", "box", "none")
 # Rounding of optimal values, relative: a Lyapunov increase below that is none.
 ROUNDING = 1e-7
 
@@ -64,9 +65,10 @@ def design(
 
     limits: of `joint_limits`; or states and inputs themselves. terminal: "invariant", the maximal
     invariant set of the LQR; "ellipsoid", the largest level set of its cost inside the limits;
-    "states", the state limits; "none"; or a set. The terminal cost is the LQR's unless settings
-    hold another. soft: None keeps all limits hard; a number is the L1 weight of state and terminal
-    rows; "exact" computes the least weight that changes nothing on the feasible set, and a margin.
+    "states" or "box", the state limits; "none"; or a set. The terminal cost is the LQR's unless
+    settings hold another. soft: None keeps all limits hard; a number is the L1 weight of state and
+    terminal rows; "exact" computes the least weight that changes nothing on the feasible set, and a
+    margin.
     settings: further fields of `MPC`, such as control_horizon or input_rate_limit.
 
     Raises ValueError for ill-posed data, as `lqr`, `maximal_invariant_set` and `MPC` do.
@@ -79,7 +81,11 @@ def design(
             named: dict[str, Any] = limits.names
             system = replace(system, **named)
     regulator = lqr(system, Q, R)
-    sets: dict[str, Any] = {"none": lambda: None, "states": lambda: states}
+    sets: dict[str, Any] = {
+        "none": lambda: None,
+        "states": lambda: states,
+        "box": lambda: states,
+    }
     if isinstance(terminal, str):
         if terminal not in TERMINALS:
             fail("terminal", f"{terminal!r}", f"Give a set, or one of {', '.join(TERMINALS)}")
@@ -166,7 +172,7 @@ class OfflineReport:
         )
         lines = section("Problem", problem, "")
         lines += section("Feasible set (limits hard)", f"{size}samples: {known}", "")
-        lines += section("Recursive feasibility", self.recursion, "recursion")
+        lines += section("Recursive feasibility (limits hard)", self.recursion, "recursion")
         penalty = None if self.penalty is None else self.penalty.sentence
         lines += section("Exact penalty", penalty, "penalty")
         lines += section("Terminal ingredients", self.terminal, "terminal")
@@ -183,14 +189,21 @@ def offline_report(
     The feasible set and its volume, recursive feasibility, the exact penalty, every hypothesis of
     the terminal theorems, and `loops` closed loops of `steps` samples from feasible states. Soft
     rows count as hard but for the closed loops.
-    x0s: states (B, n) to look at; None: a grid over the feasible set, in more than three states
-    random points of its bounding box. K: terminal law to verify; None: that of the LQR. seconds:
-    about how long the search for counterexamples may take.
+    x0s: states (B, n), or (B, n + m) with the previous input where input rates are limited, to map,
+    and in more than three dimensions to follow in the recursion test; None: a grid over the
+    feasible set, in more than three dimensions random points of its bounding box. K: terminal law
+    to verify; None: that of the LQR. seconds: about how long the search for counterexamples may
+    take.
 
     Raises ValueError for an ill-posed problem, and where x0s is None and the feasible set is
     empty, flat or unbounded. Host; proofs in float64.
     """
     mpc.validate()
+    for name, value, least in (("steps", steps, 2), ("loops", loops, 1)):
+        if not isinstance(value, int | np.integer) or value < least:
+            fail(name, f"{value!r}", f"Give a whole number, at least {least}")
+    if not seconds > 0:
+        fail("seconds", f"{seconds!r}", "Give a positive number")
     hard = harden(mpc)
     notes: dict[str, str] = {}
     d = hard_part(hard).dimension
@@ -212,24 +225,12 @@ def offline_report(
         lambda: recursive_feasibility(hard, x0s if d > 3 else None, steps=steps, seconds=seconds),
     )
     penalty = attempt("penalty", lambda: exact_penalty(mpc))
-    terminal = attempt(
-        "terminal",
-        lambda: verify_terminal(
-            mpc.system,
-            mpc.Q,
-            mpc.R,
-            mpc.terminal_cost,
-            hard.terminal_set,
-            hard.states,
-            hard.inputs,
-            K,
-        ),
-    )
+    terminal = attempt("terminal", lambda: theorems(hard, K))
     notes["loops"] = "none of the samples is feasible"
     closed = None
     if len(inside):
         pick = np.unique(np.linspace(0, len(inside) - 1, min(loops, len(inside))).astype(int))
-        closed = closed_loops(mpc, inside[pick][:, : mpc.system.n], steps)
+        closed = closed_loops(mpc, inside[pick], steps)
     with jax.enable_x64(True):
         condensed = condense(in_float64(mpc))
     return OfflineReport(
@@ -239,6 +240,17 @@ def offline_report(
     )  # fmt: skip
 
 
+def theorems(mpc: MPC, K: Any = None) -> TerminalReport:
+    """`verify_terminal` of a problem that the theorems cover; ValueError for another."""
+    if not usual(mpc) or (mpc.terminal_set is None and mpc.horizon == 1):
+        fail("mpc", "is not of the theorems' form", "They cover limits of states and inputs alone, "
+             "at the usual steps, inputs free at each")  # fmt: skip
+    if mpc.input_rate_weight is not None:
+        fail("mpc", "weighs input rates", "The theorems' optimal value depends on x alone")
+    P = np.zeros((mpc.system.n,) * 2) if mpc.terminal_cost is None else mpc.terminal_cost
+    return verify_terminal(mpc.system, mpc.Q, mpc.R, P, mpc.terminal_set, mpc.states, mpc.inputs, K)
+
+
 def samples(mpc: MPC, d: int) -> np.ndarray:
     """States to look at: over the bounding box of the feasible set, 3 % wider on each side."""
     edges = boundary(mpc, np.concatenate([np.eye(d), -np.eye(d)]))
@@ -246,8 +258,8 @@ def samples(mpc: MPC, d: int) -> np.ndarray:
         fail("x0s", "is None and the feasible set is unbounded", "Give states to look at, (B, n)")
     corners = edges.points[np.isfinite(edges.points).all(axis=1)]
     lower, upper = corners.min(axis=0), corners.max(axis=0)
-    if mpc.states is not None and d == mpc.system.n:
-        ends = Box(lower, upper) if not isinstance(mpc.states, Box) else mpc.states
+    if isinstance(mpc.states, Box) and d == mpc.system.n:
+        ends = mpc.states
         wide = np.isfinite(np.asarray(ends.lower)) & np.isfinite(np.asarray(ends.upper))
         lower = np.where(wide, ends.lower, lower)
         upper = np.where(wide, ends.upper, upper)
@@ -262,21 +274,26 @@ def samples(mpc: MPC, d: int) -> np.ndarray:
 
 
 def closed_loops(mpc: MPC, starts: np.ndarray, steps: int) -> ClosedLoops:
-    """Simulate the nominal loop from each start (B, n), in float64."""
+    """Simulate the nominal loop from each start (B, n) or (B, n + m), in float64."""
     with jax.enable_x64(True):
         controller = Controller(in_float64(mpc), ADMM(refine=30))
-        loop = jax.jit(jax.vmap(lambda x: simulate(controller, mpc.system, x, steps)))
-        run = loop(starts)
+        n = mpc.system.n
+
+        def loop(start: Any) -> Any:  # from x, or (x, u_{−1}) where input rates are limited
+            previous = start[n:] if len(start) > n else None
+            return simulate(controller, mpc.system, start[:n], steps, previous_input=previous)
+
+        run = jax.jit(jax.vmap(loop))(starts)
         change = np.asarray(lyapunov_decrease(run))
         run = jax.tree.map(np.asarray, run)
     solved = np.all(run.status == Status.SOLVED, axis=1)
     scale = np.abs(run.cost[:, :-1]) + 1e-12
     relative = np.where(solved[:, None], change / scale, -np.inf)
     worst = np.unravel_index(np.argmax(relative), relative.shape)
-    size = np.abs(starts).max(axis=0)
+    size = np.abs(starts[:, :n]).max(axis=0)
     size = np.where(size > 0, size, 1.0)
     norm = lambda x: np.abs(x / size).max(axis=1)
-    left = norm(run.states[:, -1]) / np.maximum(norm(starts), 1e-9)
+    left = norm(run.states[:, -1]) / np.maximum(norm(starts[:, :n]), 1e-9)
     kept = lambda v: float(np.max(v[solved], initial=0.0))
     return ClosedLoops(
         starts=starts, steps=steps, feasible=int(solved.sum()), violation=kept(run.violation),
@@ -290,7 +307,7 @@ def loops_text(c: ClosedLoops) -> str:
     count = len(c.starts)
     lines = [
         f"{c.feasible:,} of {count:,} feasible starts kept every plan solved for {c.steps} steps",
-        f"worst violation of a state limit {c.violation:.3g}, of a soft row {c.slack:.3g}",
+        f"worst violation of a hard state limit {c.violation:.3g}, of a soft row {c.slack:.3g}",
         f"largest state left, relative to the start: {c.left:.3g}",
     ]
     if np.isfinite(c.increase):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy
 
-from jaxmpc.control import LQR, Box, LinearSystem, Polytope, lqr, maximal_invariant_set
+from jaxmpc import LQR, Box, LinearSystem, Polytope, lqr, maximal_invariant_set
 from jaxmpc.control.invariant import _bound
 from jaxmpc.control.sets import _irredundant
 

@@ -10,7 +10,7 @@ import problems
 import pytest
 from problems import symmetric
 
-from jaxmpc.control import Box, LinearSystem, Polytope, lqr, maximal_invariant_set
+from jaxmpc import Box, LinearSystem, Polytope, lqr, maximal_invariant_set
 from jaxmpc.control.invariant import (
     ControlInvariantSet,
     invariant_ellipsoid,

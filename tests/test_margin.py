@@ -89,6 +89,7 @@ def test_gradient_against_differences():
         np.testing.assert_allclose(gradient(x), numeric, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mpc", "count"),
     [

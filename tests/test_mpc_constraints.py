@@ -659,6 +659,7 @@ def test_float32(name):
     np.testing.assert_allclose(plan.cost, plans.cost[i], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_gradients():
     """dJ*/d(ρ, quadratic, d) over a batch of states, by differences of Clarabel's cost."""
     soft = Soft(np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([0.25, 0.1]), np.array([0.9, 0.5]),
@@ -786,6 +787,7 @@ def circle(count):
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
+@pytest.mark.slow
 def test_feasible_set_of_rates_blocks_and_ellipsoid():
     """A slice at one previous input: inner ⊂ truth ⊂ outer, labels right close to the boundary."""
     mpc, previous = moving(), np.array([0.15, -0.1])

@@ -32,7 +32,7 @@ class Map:
         names, units = ("q", "dq", "r", "dr")[: self.n], ("rad", "rad/s", "m", "m/s")[: self.n]
         B = np.ones((self.n, 1))
         system = LinearSystem(np.eye(self.n), B, state_names=names, state_units=units)
-        return SimpleNamespace(system=system, horizon=7)
+        return SimpleNamespace(system=system, horizon=7, rate_limited=False)
 
     @property
     def names(self):

@@ -636,6 +636,7 @@ class TestSoftRows:
         np.testing.assert_array_equal(sol.status, jm.Status.SOLVED)
         np.testing.assert_allclose(sol.z, z, rtol=0, atol=1e-6)
 
+    @pytest.mark.slow
     def test_penalty_sweep_float32(self):
         """Weights from 1e-3 to 1e4: no NaN, a status that holds, and moderate ones solved."""
         scale = np.geomspace(1e-3, 1e4, COUNT)
@@ -816,6 +817,7 @@ class TestBalls:
         np.testing.assert_allclose(sol.y, y, atol=5e-2)
         assert_honest(qp, sol, 1e-3)
 
+    @pytest.mark.slow
     def test_coarse_steps_are_honest(self, x64):
         qp, z, y = ball_batch()
         solved = 0

@@ -284,6 +284,7 @@ class TestReport:
         data = report.to_xarray()
         assert data["lost_at"].shape == (5,) and data.attrs["steps"] == 4
 
+    @pytest.mark.slow
     def test_lecture_with_more_input_is_proved_by_regions(self):
         report = recursive_feasibility(problems.lecture(0.3, 3), steps=3)
         assert rungs(report) == (False, True, True)

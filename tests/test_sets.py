@@ -14,7 +14,7 @@ import scipy
 from scipy.optimize import linprog
 
 import jaxmpc.control.geometry as geometry
-from jaxmpc.control import LinearSystem
+from jaxmpc import LinearSystem
 from jaxmpc.control.geometry import factors, irredundant
 from jaxmpc.control.limits import joint_limits, output_limits
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope

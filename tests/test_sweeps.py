@@ -6,6 +6,7 @@ from fractions import Fraction
 
 import exact
 import jax
+import jax.numpy as jnp
 import numpy as np
 import problems
 import pytest
@@ -231,7 +232,7 @@ class TestProofs:
             y = rng.standard_normal((300, 4, 5)) * scales[:, None, None]
             y_N = rng.standard_normal((300, 2)) * scales[:, None]
             y[:100] = np.maximum(y[:100], 0)
-            cut = lambda a, b: proofs.cut(self.problem, a, b)[:2]
+            cut = lambda a, b: proofs.cut(self.problem, a, b, jnp.zeros(0))[:2]
             normals, offsets = jax.vmap(cut)(y, y_N)
         finite = np.flatnonzero(np.isfinite(offsets))
         assert len(finite) > 100
@@ -241,7 +242,8 @@ class TestProofs:
     def test_zero_and_nan_multipliers_say_nothing(self):
         with enable_x64(True):
             for fill in (0.0, np.nan, np.inf):
-                _, b, *_ = proofs.cut(self.problem, np.full((4, 5), fill), np.full(2, fill))
+                y, y_N = np.full((4, 5), fill), np.full(2, fill)
+                _, b, *_ = proofs.cut(self.problem, y, y_N, np.zeros(0))
                 assert b == np.inf
 
     def test_inputs_that_are_proved_keep_all_rows(self):

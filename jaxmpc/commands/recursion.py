@@ -116,7 +116,9 @@ class Recursion:
             )  # fmt: skip
             least = None
             if self.smallest is not None:
-                least = smallest_horizon(mpc, self.smallest, regions=settings.regions)
+                least = smallest_horizon(
+                    mpc, self.smallest, regions=settings.regions, seconds=settings.seconds
+                )
         except ValueError as error:
             return report_error(error)
         files = self.save(config, report, least)

@@ -21,8 +21,8 @@ def equilibrium(
     Give x and u to `solve` as reference and input_reference, so that the cost vanishes there.
 
     Raises ValueError where no equilibrium meets the target, within the limits if there are any:
-    the message says how far the closest one stays from it. Host, float64; residual below 1e-9
-    (1 + the size of its terms).
+    the message says how far the closest one stays from it. Host, float64; residual below
+    1e-11 + 1e-9 times the size of its terms.
     """
     if not isinstance(system, LinearSystem):
         fail("system", f"is a {type(system).__name__}", "Give a jm.LinearSystem")
@@ -57,7 +57,7 @@ def equilibrium(
         found = np.clip(found, low, high)
     error = M @ found - value
     size = np.abs(M) @ np.abs(found) + np.abs(value)
-    if not np.all(np.abs(error) <= 1e-9 * (1 + size)):
+    if not np.all(np.abs(error) <= 1e-11 + 1e-9 * size):
         closest = C @ found[:n]
         drift = np.abs(error[:n]).max()
         fail(

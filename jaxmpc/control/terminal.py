@@ -127,7 +127,7 @@ def verify_terminal(
         terminal_cost: P (n, n), symmetric, of x_N'P x_N; None for the P of `lqr`.
         terminal_set: X_f. None: X takes its place, since x_N is free, so that the problem of
             horizon N is that of horizon N - 1 with terminal set X; Theorem 1 then asks that X
-            itself be control invariant.
+            itself be control invariant, and Theorem 3 is never claimed.
         states, inputs: X and U; None for no limit.
         K: (m, n), of u = K x; None for that of `lqr`.
         disturbance: bounded set of w that holds the origin, or None.
@@ -212,6 +212,14 @@ def verify_terminal(
         )
     )  # fmt: skip
     checks.append(_origin_inside(X_f))
+    if terminal_set is None:
+        checks.append(
+            Check(
+                "terminal cost where x_N is free", None, None, "",
+                "x_N may leave X, where the Lyapunov inequality and K in U say nothing: Theorem 3 "
+                "asks for a terminal set.", (3,),
+            )
+        )  # fmt: skip
     return TerminalReport(tuple(checks), gain, certificate, factor, exact)
 
 

@@ -10,7 +10,7 @@ from jax import Array
 
 from jaxmpc.checks import concrete, fail, require_finite, require_shape, require_symmetric_psd
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
-from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.control.system import LinearSystem, as_array, host_array
 from jaxmpc.qp.problem import QPSolution
 
 
@@ -181,7 +181,7 @@ class MPC:
                 weight = getattr(soft, name)
                 if concrete(weight):
                     host_array(f"soft[{i}].{name}", weight)
-                if np.shape(weight) not in ((), np.shape(soft.d)):
+                if np.shape(weight) not in ((), np.shape(as_array(soft.d))):
                     fail(
                         f"soft[{i}].{name}", f"shape {np.shape(weight)}", "One number, or one a row"
                     )
@@ -215,9 +215,10 @@ class MPC:
 
     def _validate_rows(self, name: str, rows: Any, bounds: tuple[str, ...]) -> None:
         n, m = self.system.n, self.system.m
-        if np.ndim(rows.C) != 2 or np.shape(rows.C)[1] != n or not np.shape(rows.C)[0]:
-            fail(f"{name}.C", f"shape {np.shape(rows.C)}", f"Give (p, {n}), one column a state")
-        p = np.shape(rows.C)[0]
+        shape = np.shape(as_array(rows.C))
+        if len(shape) != 2 or shape[1] != n or not shape[0]:
+            fail(f"{name}.C", f"shape {shape}", f"Give (p, {n}), one column a state")
+        p = shape[0]
         require_finite(f"{name}.C", rows.C)
         if rows.D is not None:
             require_shape(f"{name}.D", rows.D, (p, m), "One column an input, or None")
@@ -324,7 +325,7 @@ def harden(mpc: MPC) -> MPC:
     for s in _tuple("soft", mpc.soft, Soft):
         steps = tuple(range(N + (s.D is None))) if s.steps is None else s.steps
         rows = Polytope(s.C, s.d, s.names)
-        whole = s.D is None and set(every) <= set(steps) <= {*every, N}
+        whole = s.D is None and every and set(every) <= set(steps) <= {*every, N}
         if whole and mpc.states is None:
             states.append(rows)
             steps = tuple(set(steps) - set(every))

@@ -1,6 +1,6 @@
 """solve: one plan from one state; Controller: the same with the factorization done once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -64,7 +64,8 @@ class Controller:
             condensed = condense(self.mpc)
             self.solver.validate(condensed.C.shape[0])
             # Arrays from here on, so that a sample need not convert the whole object again.
-            object.__setattr__(self, "mpc", arrays(self.mpc))
+            mpc = replace(self.mpc, prestabilise=condensed.K)
+            object.__setattr__(self, "mpc", arrays(mpc))
             object.__setattr__(self, "solver", arrays(self.solver))
             object.__setattr__(self, "condensed", condensed)
             object.__setattr__(self, "factor", _factor(condensed, self.solver))

@@ -20,9 +20,9 @@ Inputs that must be equal (a control horizon) share one σ_U of their sum. A ter
 No property of y is needed, so any iterate gives a valid half-space; a converged one gives a
 tight one. (Neumaier & Shcherbina 2004: the input limits absorb the dual residual.) Rounding
 moves p_k by at most γ(|A|'|p_{k+1}| + |H|'|y_k|), which meets |x_k| ≤ reach_k. Where the
-limits leave x_0 unbounded, reach_0 is twice the extent that LPs find (`ladder.extent`); this is
-the one figure that is taken from a solver, and it only scales the rounding bound. The same holds
-for the box round a polytope of inputs.
+limits leave x_0 unbounded, reach_0 is twice the extent that LPs find (`ladder.bounding_box`);
+this is the one figure that is taken from a solver, and it only scales the rounding bound. The
+same holds for the box round a polytope of inputs.
 """
 
 from dataclasses import dataclass, field, replace

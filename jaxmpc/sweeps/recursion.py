@@ -244,7 +244,9 @@ def recursive_feasibility(
         verdict, lost, beyond = _by_regions(ladder, regions)
         if verdict.holds is False and worst is None:  # the search has missed it
             worst = _certified(law, bound, beyond, ["regions"] * len(beyond))
-        if verdict.holds is not False and ladder.law.holds is None:
+        if verdict.holds is False:
+            verdict = Rung(None, f"{verdict.reason}, which is not certified", verdict.state)
+        if ladder.law.holds is None:
             ladder = replace(ladder, law=verdict)
     if worst is not None:
         refuted = Rung(False, str(worst), worst.state)
@@ -396,8 +398,7 @@ def _longer(before: Shadow, body: Shadow, after: Shadow) -> tuple[Rung, np.ndarr
     outside = [x for (_, x), e in zip(tops, excess, strict=True) if e > CLEAR * body.size]
     seeds = np.array([x for x in outside if x is not None]).reshape(-1, len(body.center))
     if len(seeds):
-        x = tops[i][1]
-        assert x is not None
+        x = seeds[0]
         return Rung(False, f"from x = {_point(x)} every feasible first move leaves X_N", x), seeds
     nested = np.array([body.support(normal)[0] for normal in before.normals]) - before.offsets
     if max(excess[i], nested.max()) <= TOLERANCE * body.size:
@@ -411,7 +412,10 @@ def _no_way_on(all_pairs: Pairs, state: np.ndarray) -> bool:
     center = later.centre()
     if center is None or not all_pairs.exact:
         return False
-    _, normal, offset = later.ray(center, state - center)
+    try:
+        _, normal, offset = later.ray(center, state - center)
+    except ValueError:  # the ray does not end
+        return False
     return bool(normal @ state - offset > CLEAR * np.linalg.norm(state - center))
 
 
@@ -649,10 +653,13 @@ class SmallestHorizon:
     reasons: dict[int, Rung] = field(default_factory=dict)
 
 
-def smallest_horizon(mpc: MPC, limit: int = 20, *, regions: int = 2000) -> SmallestHorizon:
+def smallest_horizon(
+    mpc: MPC, limit: int = 20, *, regions: int = 2000, seconds: float = 60.0
+) -> SmallestHorizon:
     """Try horizons 1, 2, … up to `limit` with proofs alone (no samples, no search).
 
-    The horizon of `mpc` itself plays no part. The answer is the least horizon with a proof; a
+    seconds: when these are spent, larger horizons are left out. The horizon of `mpc` itself plays
+    no part. The answer is the least horizon with a proof; a
     smaller one that is neither proved nor refuted is in `reasons` with holds None, and one at
     which the problem is ill-posed (more free moves than steps) is not. Raises ValueError for an
     ill-posed problem.
@@ -660,13 +667,16 @@ def smallest_horizon(mpc: MPC, limit: int = 20, *, regions: int = 2000) -> Small
     mpc.validate()
     _check(limit=(limit, 1), regions=(regions, 0))
     least, reasons = None, {}
+    deadline = time.monotonic() + seconds
     for N in range(1, limit + 1):
+        if time.monotonic() > deadline:
+            break
         problem = replace(mpc, horizon=N)
         try:
             problem.validate()
         except ValueError:  # such as more free moves than steps
             continue
-        ladder = climb(problem)
+        ladder = climb(problem, deadline)
         law = ladder.law
         if law.holds is None and least is None and regions and np.isfinite(ladder.volume):
             law = _by_regions(ladder, regions)[0]

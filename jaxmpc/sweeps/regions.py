@@ -313,6 +313,9 @@ def program(mpc: MPC, within: Box | Polytope | None = None) -> Program:
     G, V = side[:, None] * c.C[row], -side[:, None] * c.D[row]
     v = side * (np.where(side > 0, c.upper[row], c.lower[row]) - c.d[row])
     H, h = half_spaces(within, n)
+    if mpc.remembers and mpc.inputs is not None:  # a previous input is one that was applied
+        H_u, h_u = half_spaces(mpc.inputs, mpc.system.m)
+        H, h = np.vstack([H, np.pad(H_u, ((0, 0), (mpc.system.n, 0)))]), np.append(h, h_u)
     G, V, v = np.vstack([G, np.zeros((len(h), G.shape[1]))]), np.vstack([V, -H]), np.append(v, h)
     row, side = np.append(row, np.full(len(h), -1)), np.append(side, np.ones(len(h)))
 
