@@ -14,8 +14,9 @@ from jaxmpc.control.riccati import LQR, lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.control.terminal import TerminalReport, verify_terminal
-from jaxmpc.mpc.problem import MPC, Outputs, Plan, Soft, harden, soften
+from jaxmpc.mpc.problem import MPC, Outputs, Plan, Soft
 from jaxmpc.mpc.rows import active_constraints, row_table
+from jaxmpc.mpc.soften import harden, soften
 from jaxmpc.mpc.solve import Controller, solve
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.margin import feasibility_margin

@@ -29,7 +29,8 @@ from jaxmpc.control.invariant import invariant_ellipsoid, maximal_invariant_set
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.control.system import LinearSystem
-from jaxmpc.mpc.problem import MPC, soften
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.soften import soften
 from jaxmpc.sweeps.exact_penalty import exact_penalty
 from jaxmpc.sweeps.feasible_set import grid as grid_points
 

@@ -20,8 +20,9 @@ from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.control.terminal import TerminalReport, verify_terminal
 from jaxmpc.mpc.condense import condense, in_float64
-from jaxmpc.mpc.problem import MPC, harden, soften
+from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import row_table
+from jaxmpc.mpc.soften import harden, soften
 from jaxmpc.mpc.solve import Controller
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status

@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 
 from jaxmpc import cli
-from jaxmpc.commands import recursion
+from jaxmpc.commands import recursion, sweep
 from jaxmpc.control.sets import Box
 from jaxmpc.sweeps.recursion import Counterexample, RecursionReport, Rung, SmallestHorizon
 
@@ -26,7 +26,7 @@ def _in_empty_folder(tmp_path, monkeypatch):
 @pytest.fixture
 def no_compile(monkeypatch):
     """Fail if the sweep starts: errors must be found before."""
-    monkeypatch.setattr(cli, "label_chunks", lambda *a, **k: pytest.fail("the sweep started"))
+    monkeypatch.setattr(sweep, "label_chunks", lambda *a, **k: pytest.fail("the sweep started"))
 
 
 def run(line):
@@ -96,8 +96,8 @@ def test_file_slice_and_overwrite(tmp_path, capsys):
 
 
 def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(cli, "CHUNK", 50)
-    real = cli.label_chunks
+    monkeypatch.setattr(sweep, "CHUNK", 50)
+    real = sweep.label_chunks
 
     def interrupted(*args, **kwargs):
         for k, chunk in enumerate(real(*args, **kwargs)):
@@ -105,7 +105,7 @@ def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsy
                 signal.raise_signal(signal.SIGINT)
             yield chunk
 
-    monkeypatch.setattr(cli, "label_chunks", interrupted)
+    monkeypatch.setattr(sweep, "label_chunks", interrupted)
     before = signal.getsignal(signal.SIGINT)
     assert run("sweep --grid 16 12 --horizon 5 --output 'my maps'") == 130
     assert signal.getsignal(signal.SIGINT) is before
@@ -118,7 +118,7 @@ def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsy
         asked.append(points)
         return real(mpc, points, **kwargs)
 
-    monkeypatch.setattr(cli, "label_chunks", counted)
+    monkeypatch.setattr(sweep, "label_chunks", counted)
     resume = "sweep --grid 16 12 --horizon 5 --output 'my maps' --resume"
     assert run(resume) == 0
     data = xr.open_zarr(tmp_path / "my maps" / "sweep.zarr", consolidated=False)

@@ -17,8 +17,9 @@ from jax import enable_x64
 import jaxmpc as jm
 from jaxmpc.control.equilibrium import equilibrium
 from jaxmpc.control.sets import Ellipsoid
-from jaxmpc.mpc.problem import Outputs, Soft, soften
+from jaxmpc.mpc.problem import Outputs, Soft
 from jaxmpc.mpc.rows import active_constraints, row_table
+from jaxmpc.mpc.soften import soften
 from jaxmpc.sweeps import proofs
 
 ONE, EYE = np.ones(2), np.eye(2)

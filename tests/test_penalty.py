@@ -13,7 +13,8 @@ from scipy.optimize import linprog
 
 import jaxmpc as jm
 from jaxmpc.mpc.condense import condense, in_float64
-from jaxmpc.mpc.problem import Soft, soften
+from jaxmpc.mpc.problem import Soft
+from jaxmpc.mpc.soften import soften
 from jaxmpc.qp.status import Status
 from jaxmpc.sweeps.exact_penalty import exact_penalty
 from jaxmpc.sweeps.regions import critical_regions, program

@@ -26,7 +26,7 @@ from jax import Array
 import jaxmpc as jm
 from jaxmpc.closed_loop import simulate
 from jaxmpc.control.limits import JointLimits, joint_limits
-from jaxmpc.mpc.problem import soften
+from jaxmpc.mpc.soften import soften
 
 
 @dataclass(frozen=True)

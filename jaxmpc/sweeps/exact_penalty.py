@@ -19,9 +19,9 @@ from jaxmpc.sweeps.regions import (
     CriticalRegions,
     Program,
     active_piece,
+    capped_ball,
     exchange,
     explore,
-    largest_ball,
     maximum,
     program,
 )
@@ -140,7 +140,7 @@ def exact_penalty(
             found[c.law.active] = weigh.over(c.law, c.vertices)
     exact = regions is not None and regions.complete
     if method == "samples" or (method == "auto" and not exact):
-        ascend(p, weigh, found, samples, np.random.default_rng(seed))
+        climb_regions(p, weigh, found, samples, np.random.default_rng(seed))
     worsts = [worst for worst in found.values() if worst is not None]
     worst = max(worsts, key=lambda w: w.value, default=Worst(0.0, p.interior, -1))
 
@@ -261,7 +261,7 @@ class Thresholds:
         Where rows are dependent the LPs maximise multipliers that need not be the least: what they
         lead to is a threshold of the region, but perhaps not the greatest.
         """
-        middle, radius = largest_ball(found.H, found.h)
+        middle, radius = capped_ball(found.H, found.h)
         if radius <= SMALLEST:
             return None
         points = [middle]
@@ -287,7 +287,7 @@ class Thresholds:
         return values, status
 
 
-def ascend(
+def climb_regions(
     p: Program, weigh: Thresholds, found: dict[tuple[int, ...], Worst | None], samples: int,
     random: np.random.Generator,
 ) -> None:  # fmt: skip
@@ -335,7 +335,7 @@ def ascend(
         assert leaving is not None
         # Random rays inside the region hit its facets: from its middle, and from near the corner
         # where the multiplier is largest.
-        middle, _ = largest_ball(leaving.H, leaving.h)
+        middle, _ = capped_ball(leaving.H, leaving.h)
         facets: set[int] = set()
         for start in (middle, middle + 0.95 * (worst.xi - middle)):
             slope = leaving.H @ random.standard_normal((len(start), RAYS))

@@ -490,7 +490,7 @@ def interior(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float] | None:
     if n == 1:
         high, low = h[H[:, 0] > 0].min(), -h[H[:, 0] < 0].min()
         return (np.array([[low], [high]]), (high - low) / 2) if high - low > SMALLEST else None
-    middle, radius = largest_ball(H, h)
+    middle, radius = capped_ball(H, h)
     if radius <= SMALLEST:
         return None
     gap = h - H @ middle
@@ -510,7 +510,7 @@ def interior(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float] | None:
     return points[distinct(points, 1e-7 * radius)], radius
 
 
-def largest_ball(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float]:
+def capped_ball(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float]:
     """Centre and radius of the largest ball in H ξ ≤ h (unit rows), at most 1; −1 for none."""
     n = H.shape[1]
     ball = linprog(

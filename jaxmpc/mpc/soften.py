@@ -1,0 +1,90 @@
+"""Hard limits made soft, and soft ones hard."""
+
+from dataclasses import replace
+from functools import reduce
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.checks import fail
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope
+from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple, output_steps
+
+
+def soften(mpc: MPC, rho: Any, quadratic: Any = 0.0) -> MPC:
+    """The same problem with all state, output and terminal rows soft; inputs and rates stay hard.
+
+    rho, quadratic: weights of every row, as in `Soft`. Rows keep their units: a violation is
+    measured as H x − h in the row as given. Raises ValueError for an Ellipsoid as terminal set,
+    which has no rows.
+    """
+    mpc.validate()
+    system, N, soft = mpc.system, mpc.horizon, list(as_tuple("soft", mpc.soft, Soft))
+    if isinstance(mpc.terminal_set, Ellipsoid):
+        fail("terminal_set", "is an Ellipsoid, which stays hard", "Use a Polytope inside it")
+
+    def one_sided(
+        C: Any, D: Any, lower: Any, upper: Any, steps: Any, names: Any, units: Any
+    ) -> None:
+        C, lower, upper = (np.asarray(v, np.float64) for v in (C, lower, upper))
+        up, low = np.isfinite(upper), np.isfinite(lower)
+        both = lambda M: np.concatenate([np.asarray(M)[up], -np.asarray(M)[low]])
+        names = [names[i] for i in np.flatnonzero(up)] + [
+            f"-{names[i]}" for i in np.flatnonzero(low)
+        ]
+        units = [units[i] for keep in (up, low) for i in np.flatnonzero(keep)] if units else ()
+        d = np.concatenate([upper[up], -lower[low]])
+        if d.size and steps:
+            D = None if D is None else both(D)
+            soft.append(
+                Soft(both(C), d, rho, quadratic, D, tuple(steps), tuple(names), tuple(units))
+            )
+
+    for kind, set_, steps in (
+        ("state", mpc.states, mpc.state_steps), ("terminal", mpc.terminal_set, (N,))
+    ):  # fmt: skip
+        if set_ is not None:
+            C, lower, upper = set_.rows()
+            names = (
+                set_.labels
+                if isinstance(set_, Polytope)
+                else (system.state_names or tuple(f"x{i + 1}" for i in range(system.n)))
+            )
+            names = names or tuple(f"{kind} row {i + 1}" for i in range(np.size(lower)))
+            units = system.state_units if isinstance(set_, Box) else ()
+            one_sided(C, None, lower, upper, steps, names, units)
+    for rows in as_tuple("outputs", mpc.outputs, Outputs):
+        names = rows.names or tuple(f"output row {i + 1}" for i in range(len(rows.lower)))
+        steps = output_steps(mpc, rows)
+        one_sided(rows.C, rows.D, rows.lower, rows.upper, steps, names, rows.units)
+    softened = replace(mpc, states=None, terminal_set=None, outputs=(), soft=tuple(soft))
+    softened.validate()
+    return softened
+
+
+def harden(mpc: MPC) -> MPC:
+    """The same problem with every soft row hard: what a large enough penalty enforces where it can.
+
+    The opposite of `soften`: rows that hold at all steps of the state limits join `states`, rows at
+    k = N the terminal set, where these are not sets of another kind; the rest become `outputs`.
+    """
+    N, every = mpc.horizon, mpc.state_steps
+    states, terminal, outputs = [], [], list(as_tuple("outputs", mpc.outputs, Outputs))
+    for s in as_tuple("soft", mpc.soft, Soft):
+        steps = tuple(range(N + (s.D is None))) if s.steps is None else s.steps
+        rows = Polytope(s.C, s.d, s.names)
+        whole = s.D is None and every and set(every) <= set(steps) <= {*every, N}
+        if whole and mpc.states is None:
+            states.append(rows)
+            steps = tuple(set(steps) - set(every))
+        if s.D is None and steps == (N,) and mpc.terminal_set is None:
+            terminal.append(rows)
+            steps = ()
+        if steps:
+            free = np.full(np.shape(s.d), -np.inf)
+            outputs.append(Outputs(s.C, free, s.d, s.D, steps, s.names, s.units))
+    join = lambda given, found: reduce(Polytope.intersect, found) if found else given
+    return replace(
+        mpc, soft=(), outputs=tuple(outputs), states=join(mpc.states, states),
+        terminal_set=join(mpc.terminal_set, terminal),
+    )  # fmt: skip
