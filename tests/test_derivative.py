@@ -591,6 +591,7 @@ class TestFiniteForEveryStatus:
             assert share > 0.8, (kind, np.unique(status[kinds == kind], return_counts=True))
         assert jm.Status.DUAL_INFEASIBLE in status[kinds == "unbounded"]
 
+    @pytest.mark.slow
     def test_float32_without_polish(self):
         """Some of them unfinished."""
         _, status = self.check(0, np.float32, program(20, 0))
@@ -787,6 +788,7 @@ class TestUnrolled:
         gradient = jax.grad(lambda q: loss(replace(qp, q=q), solver))(q)
         assert gradient.dtype == jnp.float32 and np.isfinite(gradient).all()
 
+    @pytest.mark.slow
     def test_memory_grows_like_the_square_root(self, x64):
         """Reverse mode through 16 times as many steps: about 4 times the memory, not 16."""
         qp, axes = joint_batch(256)

@@ -98,6 +98,7 @@ def test_section_7_and_9_closed_loops():
     np.testing.assert_allclose(table["inputs"], table["cvxpy"], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_section_11_open_loop():
     table = run("mathematica")
     np.testing.assert_allclose(table["inputs"], table["stated"], atol=1e-7)

@@ -239,6 +239,7 @@ class TestRiccati:
         np.testing.assert_allclose(plan.inputs[0], K @ x, atol=1e-8)
         np.testing.assert_allclose(plan.cost, x @ P @ x, rtol=1e-9)
 
+    @pytest.mark.slow
     def test_cost_falls_along_the_closed_loop(self):
         """With O_inf and the DARE's P, J* falls by at least the stage cost (Mayne et al. 2000)."""
         mpc = problems.joint_o_inf(horizon=12)
@@ -301,6 +302,7 @@ class TestReferences:
             np.testing.assert_allclose(got, v, atol=1e-5)
             np.testing.assert_allclose(plan.cost, cost + r @ stacked.W @ r, rtol=1e-6)
 
+    @pytest.mark.slow
     def test_zero_reference_is_none(self):
         mpc, x0 = problems.drifting(), start("drifting")
         a, b = jm.solve(mpc, x0), jm.solve(mpc, x0, reference=np.zeros(2))
@@ -353,6 +355,7 @@ class TestMultipliers:
 
 
 class TestIndexSet:
+    @pytest.mark.slow
     def test_initial_state_outside(self):
         """x0 beyond its limit is infeasible with k = 0 and may be saved without it."""
         mpc = problems.scalar(terminal=1.0)

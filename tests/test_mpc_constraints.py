@@ -553,6 +553,7 @@ class TestActiveConstraints:
                 assert [v.shape[1:] for v in y.soft] == [(7, 2), (2, 1)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     ["rated", *(pytest.param(name, marks=pytest.mark.slow) for name in ("blocked", "rounded"))],
@@ -733,6 +734,7 @@ def assert_proofs(mpc, fmap, plans=30, seed=0):
         assert exact.dot(a, exact.rational(fmap.points[i])) > b
 
 
+@pytest.mark.slow
 def test_feasible_set_by_elimination():
     mpc = staged()
     polygon = exact.feasible_polygon_by_elimination(mpc)

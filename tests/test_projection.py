@@ -767,6 +767,7 @@ class TestBalls:
             l[i, 6], u[i, 6] = -INF, reach - margin[i] * np.linalg.norm(w)
         return replace(qp, A=A, l=l, u=u)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("wide", [True, False])
     def test_ball_against_half_space(self, wide):
         """PRIMAL_INFEASIBLE with a Farkas vector: A'y = 0 and Σ u y⁺ − l y⁻ + c'y_b + r|y_b| < 0.

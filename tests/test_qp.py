@@ -487,6 +487,7 @@ class TestSettings:
         with pytest.raises(ValueError, match="warm_start z"):
             jm.solve_qp(qp, warm_start=(z[:-1], y))
 
+    @pytest.mark.slow
     def test_rho_of_every_shape(self, x64):
         qp, z, _ = constructed(6, 4)
         m = len(qp.l)
