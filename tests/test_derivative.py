@@ -737,6 +737,7 @@ class TestKinks:
 class TestUnrolled:
     """Derivatives of the steps as they were taken, of the settings and the start too."""
 
+    @pytest.mark.slow
     def test_settings_and_start(self, x64):
         qp, _, _ = everything(0)
         rng = np.random.default_rng(0)

@@ -79,6 +79,7 @@ def test_random_rows_against_another_solver():
         assert t[i] == pytest.approx(-best.fun, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_gradient_against_differences():
     """Both signs: at a state inside the joint's feasible set and at one outside."""
     condensed = jm.Controller(problems.joint()).condensed

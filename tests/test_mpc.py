@@ -346,6 +346,7 @@ class TestMultipliers:
             slope = (cost(entry, h) - cost(entry, -h)) / (2 * h)
             np.testing.assert_allclose(slope, -push.sum(axis=0)[entry], rtol=1e-3, atol=1e-3)
 
+    @pytest.mark.slow
     def test_shapes(self):
         mpc = replace(problems.drifting(), constrain_initial=False)
         y = jm.solve(mpc, start("drifting")).multipliers
@@ -425,6 +426,7 @@ class TestController:
         again = few.plan(x, warm_start=plan.qp)
         np.testing.assert_allclose(again.inputs, warm.inputs, atol=1e-9)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("prestabilise", [False, True])
     def test_shifted_plan_is_the_solution_one_sample_later(self, prestabilise):
         """With the DARE's terminal cost and inactive limits the optimal plan extends by LQR."""

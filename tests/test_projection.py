@@ -808,6 +808,7 @@ class TestBalls:
         np.testing.assert_allclose(sol.z, z, atol=1e-8)
         np.testing.assert_array_equal(sol.status, jm.Status.SOLVED)
 
+    @pytest.mark.slow
     def test_float32(self):
         qp, z, y = ball_batch()
         qp = as32(qp)
@@ -869,6 +870,7 @@ class TestOwnMatrices:
                 np.testing.assert_allclose(batch.z[i], alone.z, atol=1e-2 if x32 else 1e-7)
                 assert batch.status[i] == alone.status
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("make", [soft_batch, ball_batch], ids=["soft", "balls"])
     @pytest.mark.parametrize("wide", [True, False])
     def test_bad_matrices_stay_alone(self, make, wide):

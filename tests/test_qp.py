@@ -286,6 +286,7 @@ class TestHonestStatus:
         assert [int(s) for s in jm.Status] == [0, 1, 3, 5, 7, 12]
         assert all(s.sentence.endswith(".") for s in jm.Status)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("n", [1, 3, 20])
     def test_infeasible_with_box(self, x64, n):
         """Oblique rows that miss a box; certificate checked in rationals."""
@@ -459,6 +460,7 @@ class TestBatches:
 
 
 class TestSettings:
+    @pytest.mark.slow
     def test_warm_start_at_the_solution_stays(self, x64):
         for seed in range(5):
             qp, z, y = constructed(8, seed)
@@ -562,6 +564,7 @@ class TestGradients:
             jax.grad(few)(0.7), (few(0.7 + h) - few(0.7 - h)) / (2 * h), rtol=1e-5
         )
 
+    @pytest.mark.slow
     def test_through_refine(self, x64):
         """Gradients stay finite, and right, with the polish on."""
         qp, _, _ = constructed(4, 3)

@@ -52,7 +52,16 @@ def test_scalar_closed_forms(name):
     assert fmap.outer().support(np.ones(1)) == pytest.approx(radius, rel=1e-12)
 
 
-@pytest.fixture(scope="module", params=problems.PLANAR)
+FAST = ("double integrator", "joint, terminal O_inf", "drifting")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        name if name in FAST else pytest.param(name, marks=pytest.mark.slow)
+        for name in problems.PLANAR
+    ],
+)
 def planar(request):
     """(mpc, exact polygon, refined map of a grid that reaches outside)."""
     mpc = problems.PLANAR[request.param]()
@@ -256,6 +265,7 @@ class TestHiddenProduct:
         # The float data is a product only up to its own rounding.
         assert np.all(support <= b + 1e-12 * np.linalg.norm(a, axis=1))
 
+    @pytest.mark.slow
     def test_volume(self, blocks, product_map):
         refined = product_map.refine(1e-6)
         low, high = refined.volume_bounds()

@@ -19,7 +19,7 @@ P_DARE, K_DARE = np.array(problems.P_JOINT), np.array(problems.K_JOINT)
 
 def scalar_integrator():
     """x⁺ = x + u: |x_0| ≤ radius for each index set of the state limit, by hand."""
-    for N, X, U in ((5, 1.0, 0.3), (10, 2.0, 0.5), (3, 1.0, 2.0)):
+    for N, X, U in ((5, 1.0, 0.3), (3, 1.0, 2.0)):
         for steps, terminal, radius in (
             (range(N + 1), None, X),
             (range(1, N + 1), None, X + U),
@@ -167,15 +167,14 @@ def joint_lqr():
 
 
 # Area of X_N with terminal set O_inf.
-GROWTH = {5: 2.8660955786866498, 10: 3.924085658995761, 20: 5.523166981610873,
-          40: 8.723166981610873, 60: 11.740489512145142}  # fmt: skip
+GROWTH = {5: 2.8660955786866498, 20: 5.523166981610873, 60: 11.740489512145142}
 
 
 def joint_o_inf():
     """X_N with terminal set O_inf grows by 0.8 for 5 steps; 22 vertices at N = 20."""
     growth = jm.feasible_growth(problems.joint_o_inf(), tuple(GROWTH))
     np.testing.assert_allclose(growth.volume, list(GROWTH.values()), rtol=1e-8)
-    np.testing.assert_array_equal(growth.facets, [16, 24, 22, 22, 16])
+    np.testing.assert_array_equal(growth.facets, [16, 22, 16])
 
 
 def hidden_product():
