@@ -28,7 +28,7 @@ from jaxmpc.sweeps.compiled import Compiled, default_chunk, gather_size, padded,
 
 NEWTON_STEPS = 4
 NEWTON_ROUNDS = 8
-LAST_STEPS = 60
+LAST_STEPS, FEW = 60, 32
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,10 @@ def one_chunk(
             for old, new in zip(answer, better, strict=True):
                 old[batch] = new[: len(batch)]
     left = np.flatnonzero(answer[2] == Status.ITERATION_LIMIT)
-    for i in range(0, len(left), gathered):
-        batch = left[i : i + gathered]
-        better = last_rung(controller, padded(x[batch], gathered))
+    few = min(gathered, FEW)
+    for i in range(0, len(left), few):
+        batch = left[i : i + few]
+        better = last_rung(controller, padded(x[batch], few))
         for old, new in zip(answer, better, strict=False):
             old[batch] = new[: len(batch)]
     return tuple(answer[:-2])
