@@ -2,11 +2,11 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from jaxmpc import config as configs
 from jaxmpc.checks import fail
-from jaxmpc.commands.options import option, report_error
+from jaxmpc.commands.options import Horizon, Terminal, option, report_error
 from jaxmpc.workflow import offline_report
 
 
@@ -42,12 +42,9 @@ class Info:
 
     config: Annotated[Path | None, option("FILE", "the built-in joint")] = None
     """TOML file with the problem."""
-    horizon: Annotated[int | None, option("N", "from the file; joint 20")] = None
+    horizon: Horizon = None
     """Prediction horizon, in steps of dt."""
-    terminal: Annotated[
-        Literal["none", "invariant", "ellipsoid", "box"] | None,
-        option("{none,invariant,ellipsoid,box}", "from the file, else none"),
-    ] = None
+    terminal: Terminal = None
     """Set for the last state: none, largest set or largest ellipsoid that the LQR keeps within
     limits, state limits."""
     steps: Annotated[int, option("K", "50")] = 50

@@ -5,7 +5,7 @@ import sys
 import tempfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -15,6 +15,17 @@ from jaxmpc.checks import fail
 def option(metavar: str | None, default: str) -> Any:
     """How an option and its default appear in the help."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
+
+
+# Options that several commands have.
+Horizon = Annotated[int | None, option("N", "from the file; joint 20")]
+Terminal = Annotated[
+    Literal["none", "invariant", "ellipsoid", "box"] | None,
+    option("{none,invariant,ellipsoid,box}", "from the file, else none"),
+]
+End = Annotated[
+    tuple[float, ...] | None, option("X [X ...]", "state limits, 3 % wider on each side")
+]
 
 
 def open_folder(path: Path) -> None:

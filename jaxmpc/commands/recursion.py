@@ -4,7 +4,7 @@ import dataclasses
 import json
 import time
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -12,7 +12,15 @@ from matplotlib.figure import Figure
 
 from jaxmpc import config as configs
 from jaxmpc.checks import fail
-from jaxmpc.commands.options import open_folder, option, report_error, versions
+from jaxmpc.commands.options import (
+    End,
+    Horizon,
+    Terminal,
+    open_folder,
+    option,
+    report_error,
+    versions,
+)
 from jaxmpc.plots import plot_recursion
 from jaxmpc.sweeps.recursion import (
     RecursionReport,
@@ -65,12 +73,9 @@ class Recursion:
     """TOML file with the problem."""
     output: Annotated[Path, option("DIR", "jaxmpc-recursion")] = Path("jaxmpc-recursion")
     """Folder for the files; made where absent."""
-    horizon: Annotated[int | None, option("N", "from the file; joint 20")] = None
+    horizon: Horizon = None
     """Prediction horizon, in steps of dt."""
-    terminal: Annotated[
-        Literal["none", "invariant", "ellipsoid", "box"] | None,
-        option("{none,invariant,ellipsoid,box}", "from the file, else none"),
-    ] = None
+    terminal: Terminal = None
     """Set for the last state: none, largest set or ellipsoid that the LQR keeps within limits,
     state limits."""
     steps: Annotated[int | None, option("K", "from the file, else 20")] = None
@@ -79,13 +84,9 @@ class Recursion:
         tuple[int, ...] | None, option("K [K ...]", "128 128; above 3 states: random states")
     ] = None
     """Points along each state, ends included."""
-    lower: Annotated[
-        tuple[float, ...] | None, option("X [X ...]", "state limits, 3 % wider on each side")
-    ] = None
+    lower: End = None
     """Lower end of the grid along each state, in its units."""
-    upper: Annotated[
-        tuple[float, ...] | None, option("X [X ...]", "state limits, 3 % wider on each side")
-    ] = None
+    upper: End = None
     """Upper end of the grid along each state, in its units."""
     regions: Annotated[int | None, option("K", "from the file, else 2000")] = None
     """Critical regions of the law to enumerate at most for a proof; 0: none."""

@@ -17,7 +17,7 @@ from tqdm.std import tqdm
 
 from jaxmpc import config as configs
 from jaxmpc.checks import fail
-from jaxmpc.commands.options import open_folder, option, report_error
+from jaxmpc.commands.options import End, Horizon, Terminal, open_folder, option, report_error
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.plots import plot_feasible_set
 from jaxmpc.sweeps import store
@@ -69,25 +69,18 @@ class Sweep:
     """TOML file with the problem and the sweep."""
     output: Annotated[Path, option("DIR", "jaxmpc-sweep")] = Path("jaxmpc-sweep")
     """Folder for sweep.zarr, map.png and summary.json; made where absent."""
-    horizon: Annotated[int | None, option("N", "from the file; joint 20")] = None
+    horizon: Horizon = None
     """Prediction horizon, in steps of dt."""
-    terminal: Annotated[
-        Literal["none", "invariant", "ellipsoid", "box"] | None,
-        option("{none,invariant,ellipsoid,box}", "from the file, else none"),
-    ] = None
+    terminal: Terminal = None
     """Set for the last state: none, largest set or ellipsoid that the LQR keeps within limits,
     state limits."""
     grid: Annotated[tuple[int, ...] | None, option("K [K ...]", "from the file, else 256 256")] = (
         None
     )
     """Points along each mapped axis, ends included."""
-    lower: Annotated[
-        tuple[float, ...] | None, option("X [X ...]", "state limits, 3 % wider on each side")
-    ] = None
+    lower: End = None
     """Lower end of each mapped axis, in the units of the state."""
-    upper: Annotated[
-        tuple[float, ...] | None, option("X [X ...]", "state limits, 3 % wider on each side")
-    ] = None
+    upper: End = None
     """Upper end of each mapped axis, in the units of the state."""
     axes: Annotated[tuple[str, ...] | None, option("AXIS [AXIS ...]", "first two states")] = None
     """States to map, by name or index from 0."""

@@ -484,6 +484,7 @@ class OneStep:
 def one_step(
     system: LinearSystem, inputs: Box | Polytope | None, disturbance: Box | Polytope | None
 ) -> OneStep:
+    """The exact data of x⁺ = A x + B u + c + w, inputs that are fixed (lower = upper) taken out."""
     system.validate()
     n, m = system.n, system.m
     A, B = host_array("A", system.A), host_array("B", system.B)
