@@ -1,6 +1,6 @@
 """Constrained model predictive control for robots: solved by the million, and proved."""
 
-from jaxmpc.closed_loop import Run, lyapunov_decrease, simulate
+from jaxmpc.closed_loop import Run, lyapunov_decrease, simulate, simulate_many
 from jaxmpc.control.equilibrium import equilibrium
 from jaxmpc.control.invariant import (
     ControlInvariantSet,
@@ -14,15 +14,21 @@ from jaxmpc.control.riccati import LQR, lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.control.terminal import TerminalReport, verify_terminal
+from jaxmpc.mpc.feedback import LinearFeedback
 from jaxmpc.mpc.problem import MPC, Outputs, Plan, Soft
 from jaxmpc.mpc.rows import active_constraints, row_table
 from jaxmpc.mpc.soften import harden, soften
 from jaxmpc.mpc.solve import Controller, solve
+from jaxmpc.mpc.stagewise import solve_stagewise
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.margin import feasibility_margin
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.solve import solve_qp
 from jaxmpc.qp.status import Status
+from jaxmpc.robots.control import RobotController, robot_mpc
+from jaxmpc.robots.linear import LinearPlant
+from jaxmpc.robots.load import load_robot
+from jaxmpc.robots.robot import Robot
 from jaxmpc.sweeps.boundary import Boundary, boundary
 from jaxmpc.sweeps.exact_penalty import ExactPenalty, exact_penalty
 from jaxmpc.sweeps.feasible_set import FeasibleSetMap, grid, map_feasible_set
@@ -47,6 +53,8 @@ __all__ = [
     "ExactPenalty",
     "FeasibleSetMap",
     "JointLimits",
+    "LinearFeedback",
+    "LinearPlant",
     "LinearSystem",
     "OfflineReport",
     "Outputs",
@@ -55,6 +63,8 @@ __all__ = [
     "Polytope",
     "QPSolution",
     "RecursionReport",
+    "Robot",
+    "RobotController",
     "Run",
     "Soft",
     "Status",
@@ -72,6 +82,7 @@ __all__ = [
     "harden",
     "invariant_ellipsoid",
     "joint_limits",
+    "load_robot",
     "lqr",
     "lyapunov_decrease",
     "map_feasible_set",
@@ -81,12 +92,15 @@ __all__ = [
     "output_limits",
     "predecessor",
     "recursive_feasibility",
+    "robot_mpc",
     "row_table",
     "simulate",
+    "simulate_many",
     "smallest_horizon",
     "soften",
     "solve",
     "solve_many",
     "solve_qp",
+    "solve_stagewise",
     "verify_terminal",
 ]

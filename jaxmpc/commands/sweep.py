@@ -18,10 +18,10 @@ from tqdm.std import tqdm
 from jaxmpc import config as configs
 from jaxmpc.checks import fail
 from jaxmpc.commands.options import End, Horizon, Terminal, open_folder, option, report_error
+from jaxmpc.compiled import CHUNK
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.plots import plot_feasible_set
 from jaxmpc.sweeps import store
-from jaxmpc.sweeps.compiled import CHUNK
 from jaxmpc.sweeps.feasible_set import FeasibleSetMap, Labels, label_chunks
 
 

@@ -62,7 +62,7 @@ def joint_limits(
     Raises ValueError for limits that are not pairs, of different lengths, NaN or empty.
     """
     limits = {"position": position, "velocity": velocity, "torque": torque}
-    pairs = {key: _pair(key, value) for key, value in limits.items()}
+    pairs = {key: limit_pair(key, value) for key, value in limits.items()}
     sizes = {key: np.size(end) for key, pair in pairs.items() for end in pair if np.ndim(end)}
     n = len(names) if names is not None else max(sizes.values(), default=1)
     for key, pair in pairs.items():
@@ -139,7 +139,7 @@ def output_limits(
     )
 
 
-def _pair(argument: str, limit: Any) -> tuple[np.ndarray, np.ndarray]:
+def limit_pair(argument: str, limit: Any) -> tuple[np.ndarray, np.ndarray]:
     """(lower, upper) of a limit as `joint_limits` takes it."""
     if limit is None:
         return np.array(-np.inf), np.array(np.inf)

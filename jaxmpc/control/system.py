@@ -84,6 +84,11 @@ class LinearSystem:
         return np.shape(as_array(self.B))[-1]
 
     @property
+    def state_size(self) -> int:
+        """Numbers in the state of this plant: n (a robot with orientations has more)."""
+        return self.n
+
+    @property
     def state_labels(self) -> tuple[str, ...]:
         """n labels for axes and tables, such as "q [rad]"."""
         return _labels(self.state_names or _numbered("x", self.n), self.state_units)
@@ -92,6 +97,14 @@ class LinearSystem:
     def input_labels(self) -> tuple[str, ...]:
         """m labels for axes and tables, such as "torque [N m]"."""
         return _labels(self.input_names or _numbered("u", self.m), self.input_units)
+
+    def step(self, x: ArrayLike, u: ArrayLike) -> jax.Array:
+        """A x + B u + c, x (n,), u (m,); computed in the dtype of x."""
+        x = jnp.asarray(x)
+        A, B = jnp.asarray(self.A, x.dtype), jnp.asarray(self.B, x.dtype)
+        product = lambda M, v: jnp.matmul(M, v, precision="highest")
+        after = product(A, x) + product(B, jnp.asarray(u, x.dtype))
+        return after if self.c is None else after + jnp.asarray(self.c, x.dtype)
 
     def validate(self) -> None:
         """Raise ValueError for wrong shapes, non-finite entries, bad dt or bad names."""

@@ -18,10 +18,12 @@ from jaxmpc.qp.problem import QPSolution
 class Soft:
     """Rows that may be violated at a price (the lesson's section 4):
 
-        C x_k + D u_k ≤ d + ε_k,  ε_k ≥ 0,   cost + ρ Σ ε_k + quadratic Σ ε_k²   (no ½).
+        lower − ε_k ≤ C x_k + D u_k ≤ d + ε_k,  ε_k ≥ 0,   cost + ρ Σ ε_k + quadratic Σ ε_k²
+        (no ½).
 
-    C (p, n), d (p,), rho ρ ≥ 0 and quadratic ≥ 0: numbers or (p,). D (p, m) or None. steps: the
-    k at which the rows hold; None: k = 0..N, with D k = 0..N−1. names, units: of the p rows.
+    C (p, n), d (p,), lower (p,) or None (no such side; −inf and inf likewise), rho ρ ≥ 0 and
+    quadratic ≥ 0: numbers or (p,). D (p, m) or None. steps: the k at which the rows hold; None:
+    k = 0..N, with D k = 0..N−1. names, units: of the p rows.
     For ρ above the greatest multiplier of the hard rows (`exact_penalty`) the plan violates them
     only where the hard problem has no solution.
     """
@@ -34,6 +36,13 @@ class Soft:
     steps: tuple[int, ...] | None = field(default=None, metadata={"static": True})
     names: tuple[str, ...] = field(default=(), metadata={"static": True})
     units: tuple[str, ...] = field(default=(), metadata={"static": True})
+    lower: Any = None
+
+    @property
+    def sides(self) -> tuple[Any, Any]:
+        """(lower, d), −inf for no lower side."""
+        free = np.full(np.shape(as_array(self.d)), -np.inf)
+        return (free if self.lower is None else self.lower), self.d
 
 
 @jax.tree_util.register_dataclass
@@ -173,9 +182,10 @@ class MPC:
             require_shape("prestabilise", self.prestabilise, (m, n), "A gain K with u = Kx + v")
         self._validate_steps()
         for i, soft in enumerate(as_tuple("soft", self.soft, Soft)):
-            self._validate_rows(f"soft[{i}]", soft, ("d",))
-            if concrete(soft.d) and np.any(np.asarray(soft.d) == -np.inf):
-                fail(f"soft[{i}].d", "holds -inf", "No violation reaches that: remove the row")
+            sides = ("d",) if soft.lower is None else ("d", "lower")
+            self._validate_rows(f"soft[{i}]", soft, sides)
+            if concrete(soft.sides):  # −inf above or inf below: no violation reaches that
+                Box(*soft.sides).validate(f"soft[{i}].lower, d")
             for name in ("rho", "quadratic"):
                 weight = getattr(soft, name)
                 if concrete(weight):

@@ -113,10 +113,9 @@ def blocks(mpc: MPC, dtype: Any) -> list[Block]:
         )
     for soft in (mpc.soft,) if isinstance(mpc.soft, Soft) else mpc.soft:
         every = range(N + 1) if soft.D is None else range(N)
-        d = cast(soft.d)
-        weight = lambda w, d=d: jnp.broadcast_to(cast(w), d.shape)
+        weight = lambda w, d=soft.d: jnp.broadcast_to(cast(w), cast(d).shape)
         add(
-            "soft", soft.C, soft.D, jnp.full_like(d, -jnp.inf), d,
+            "soft", soft.C, soft.D, *soft.sides,
             every if soft.steps is None else soft.steps, soft.names, soft.units,
             linear=weight(soft.rho), quadratic=2 * weight(soft.quadratic),
         )  # fmt: skip

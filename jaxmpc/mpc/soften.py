@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail
+from jaxmpc.control.limits import output_limits
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple, output_steps
 
@@ -23,40 +24,30 @@ def soften(mpc: MPC, rho: Any, quadratic: Any = 0.0) -> MPC:
     if isinstance(mpc.terminal_set, Ellipsoid):
         fail("terminal_set", "is an Ellipsoid, which stays hard", "Use a Polytope inside it")
 
-    def one_sided(
-        C: Any, D: Any, lower: Any, upper: Any, steps: Any, names: Any, units: Any
-    ) -> None:
-        C, lower, upper = (np.asarray(v, np.float64) for v in (C, lower, upper))
-        up, low = np.isfinite(upper), np.isfinite(lower)
-        both = lambda M: np.concatenate([np.asarray(M)[up], -np.asarray(M)[low]])
-        names = [names[i] for i in np.flatnonzero(up)] + [
-            f"-{names[i]}" for i in np.flatnonzero(low)
-        ]
-        units = [units[i] for keep in (up, low) for i in np.flatnonzero(keep)] if units else ()
-        d = np.concatenate([upper[up], -lower[low]])
-        if d.size and steps:
-            D = None if D is None else both(D)
-            soft.append(
-                Soft(both(C), d, rho, quadratic, D, tuple(steps), tuple(names), tuple(units))
-            )
+    def add(C: Any, D: Any, lower: Any, upper: Any, steps: Any, names: Any, units: Any) -> None:
+        bounded = np.isfinite(lower) | np.isfinite(upper)
+        if not bounded.any() or not steps:
+            return
+        keep = lambda v: None if v is None else np.asarray(v)[bounded]
+        texts = (tuple(str(v) for v in np.asarray(t)[bounded]) if t else () for t in (names, units))
+        below = keep(lower) if np.isfinite(lower).any() else None
+        soft.append(
+            Soft(keep(C), keep(upper), rho, quadratic, keep(D), tuple(steps), *texts, below)
+        )
 
     for kind, set_, steps in (
         ("state", mpc.states, mpc.state_steps), ("terminal", mpc.terminal_set, (N,))
     ):  # fmt: skip
         if set_ is not None:
             C, lower, upper = set_.rows()
-            names = (
-                set_.labels
-                if isinstance(set_, Polytope)
-                else (system.state_names or tuple(f"x{i + 1}" for i in range(system.n)))
-            )
+            named = isinstance(set_, Box)
+            names = system.state_names if named else set_.labels
             names = names or tuple(f"{kind} row {i + 1}" for i in range(np.size(lower)))
-            units = system.state_units if isinstance(set_, Box) else ()
-            one_sided(C, None, lower, upper, steps, names, units)
+            add(C, None, lower, upper, steps, names, system.state_units if named else ())
     for rows in as_tuple("outputs", mpc.outputs, Outputs):
         names = rows.names or tuple(f"output row {i + 1}" for i in range(len(rows.lower)))
         steps = output_steps(mpc, rows)
-        one_sided(rows.C, rows.D, rows.lower, rows.upper, steps, names, rows.units)
+        add(rows.C, rows.D, rows.lower, rows.upper, steps, names, rows.units)
     softened = replace(mpc, states=None, terminal_set=None, outputs=(), soft=tuple(soft))
     softened.validate()
     return softened
@@ -73,6 +64,8 @@ def harden(mpc: MPC) -> MPC:
     for s in as_tuple("soft", mpc.soft, Soft):
         steps = tuple(range(N + (s.D is None))) if s.steps is None else s.steps
         rows = Polytope(s.C, s.d, s.names)
+        if s.lower is not None:
+            rows = output_limits(s.C, *s.sides, s.names, s.units)
         whole = s.D is None and every and set(every) <= set(steps) <= {*every, N}
         if whole and mpc.states is None:
             states.append(rows)
@@ -81,8 +74,7 @@ def harden(mpc: MPC) -> MPC:
             terminal.append(rows)
             steps = ()
         if steps:
-            free = np.full(np.shape(s.d), -np.inf)
-            outputs.append(Outputs(s.C, free, s.d, s.D, steps, s.names, s.units))
+            outputs.append(Outputs(s.C, *s.sides, s.D, steps, s.names, s.units))
     join = lambda given, found: reduce(Polytope.intersect, found) if found else given
     return replace(
         mpc, soft=(), outputs=tuple(outputs), states=join(mpc.states, states),

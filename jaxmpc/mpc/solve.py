@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
-from jaxmpc.control.sets import Box
+from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.problem import MPC, Multipliers, Plan
 from jaxmpc.mpc.rows import blocks
@@ -17,6 +17,9 @@ from jaxmpc.qp.admm import ADMM, Factor
 from jaxmpc.qp.admm import factor as factorise
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.solve import solve_factored
+
+# (kind, steps, rows a step) of each block of rows.
+Layout = tuple[tuple[str, tuple[int, ...], int], ...]
 
 
 def solve(
@@ -70,6 +73,33 @@ class Controller:
             object.__setattr__(self, "condensed", condensed)
             object.__setattr__(self, "factor", _factor(condensed, self.solver))
 
+    @property
+    def dtype(self) -> Any:
+        """In what the controller computes."""
+        assert self.condensed is not None
+        return self.condensed.P.dtype
+
+    @property
+    def state_size(self) -> int:
+        """Numbers in the state that the controller is given."""
+        return self.mpc.system.n
+
+    @property
+    def limits(self) -> Box | Polytope | None:
+        """Limits of the state that a closed loop is judged by."""
+        return self.mpc.states
+
+    def coordinates(self, x: Array) -> Array:
+        """The state in which `mpc` is written: x itself."""
+        return x
+
+    def start(self, x: Array, input_reference: Any = None) -> Plan:
+        """What to carry into the first sample: a plan of zeros, a cold start.
+
+        (So that a scan compiles one solve, not two: without a warm start and with.)"""
+        shapes = jax.eval_shape(lambda x: self(x)[1], x)
+        return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+
     def __call__(
         self, x: Any, carry: Plan | None = None, reference: Any = None, *,
         input_reference: Any = None, previous_input: Any = None,
@@ -101,19 +131,7 @@ class Controller:
         # A move takes over what the old plan did one step after the move begins.
         begins = np.unique(moves, return_index=True)[1]
         z = z[np.append(moves, moves[-1] + 1)[begins + 1]]
-        parts, terminal = self._split(plan.qp.y), plan.multipliers.terminal
-        for i, (kind, steps, size) in enumerate(c.layout):
-            if kind == "terminal":
-                continue
-            # Step k takes over from k + 1: from the block itself, else from the terminal set.
-            place = {k: j for j, k in enumerate(steps)}
-            same = kind == "state" and not c.balls and terminal.shape[0] == size
-            last = terminal if same else jnp.zeros(size, z.dtype)
-            source = jnp.concatenate([parts[i], last[None], jnp.zeros((1, size), z.dtype)])
-            end = len(steps)
-            later = [place.get(k + 1, end if k + 1 == N else end + 1) for k in steps]
-            parts[i] = source[np.array(later, int)]
-        return z.ravel(), jnp.concatenate([*(part.ravel() for part in parts), plan.qp.y[:0]])
+        return z.ravel(), shifted_multipliers(c.layout, N, plan.qp.y, bool(c.balls))
 
     def _limited(self, u: Array) -> Array:
         """u inside the input limits: an actuator takes no rounding beyond them."""
@@ -157,65 +175,110 @@ class Controller:
     ) -> Array:  # fmt: skip
         """J (without ½) of a trajectory, states (N+1, n) and inputs (N, m), with what input rates
         and soft rows pay. previous_input (m,): None for zero."""
-        c = self.condensed
-        assert c is not None
-        error = states if reference is None else states - reference
-        effort = inputs if input_reference is None else inputs - input_reference
-        square = lambda v, W: jnp.sum(v * matmul(v, W))
-        J = square(error[:-1], c.Q) + square(effort, c.R) + square(error[-1:], c.P_N)
-        if self.mpc.input_rate_weight is not None:
-            first = jnp.zeros_like(inputs[0]) if previous_input is None else previous_input
-            J = J + square(jnp.diff(inputs, axis=0, prepend=first[None]), c.W)
-        for block, e in self._violations(states, inputs):
-            J = J + jnp.sum(e * (block.linear + 0.5 * block.quadratic * e))
-        return J
+        return cost(self.mpc, states, inputs, reference, input_reference, previous_input)
 
     def slack(self, states: Array, inputs: Array) -> Array:
         """Violation of the soft rows along a trajectory: (N+1, p), zero where none holds."""
-        columns = [
-            jnp.zeros((len(states), block.size), e.dtype).at[np.array(block.steps, int)].set(e)
-            for block, e in self._violations(states, inputs)
-        ]
-        return jnp.concatenate([jnp.zeros((len(states), 0), states.dtype), *columns], axis=1)
-
-    def _violations(self, states: Array, inputs: Array) -> list[tuple[Any, Array]]:
-        """Each soft block with its violations (steps, rows)."""
-        if self.condensed is None or self.condensed.soft_linear is None:
-            return []
-        found = []
-        for block in blocks(self.mpc, states.dtype):
-            if block.linear is not None:
-                steps = np.array(block.steps, int)
-                value = matmul(states[steps], block.H.T) - block.upper
-                if block.D is not None:
-                    value = value + matmul(inputs[steps], block.D.T)
-                found.append((block, jnp.maximum(value, 0.0)))
-        return found
+        return slack(self.mpc, states, inputs)
 
     def multipliers(self, y: Array) -> Multipliers:
         """Sort the QP's multipliers y (rows,) by constraint and step."""
         c = self.condensed
         assert c is not None
-        of: dict[str, list[Array]] = {}
-        for (kind, _, _), part in zip(c.layout, self._split(y), strict=True):
-            of.setdefault(kind, []).append(part)
-        empty = lambda *shape: [jnp.zeros(shape, y.dtype)]
-        return Multipliers(
-            states=of.get("state", empty(len(self.mpc.state_steps), 0))[0],
-            inputs=of.get("input", empty(self.mpc.horizon, 0))[0],
-            terminal=of.get("terminal", empty(1, 0))[0][0],
-            outputs=tuple(of.get("output", ())), soft=tuple(of.get("soft", ())),
-            rates=of.get("rate", [None])[0],
-        )  # fmt: skip
+        return multipliers(self.mpc, c.layout, y)
 
-    def _split(self, y: Array) -> list[Array]:
-        """y (rows,) as one array (steps, rows a step) for each block."""
-        c = self.condensed
-        assert c is not None
-        ends = np.cumsum([len(steps) * size for _, steps, size in c.layout], dtype=int)
-        shapes = [(len(steps), size) for _, steps, size in c.layout]
-        parts = jnp.split(y, ends)[: len(shapes)]
-        return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+
+def cost(
+    mpc: MPC, states: Array, inputs: Array, reference: Any = None, input_reference: Any = None,
+    previous_input: Any = None,
+) -> Array:  # fmt: skip
+    """J (without ½) of a trajectory; see `Controller.cost`."""
+    error = states if reference is None else states - reference
+    effort = inputs if input_reference is None else inputs - input_reference
+    cast = lambda W: jnp.asarray(W, states.dtype)
+    square = lambda v, W: jnp.sum(v * matmul(v, cast(W)))
+    J = square(error[:-1], mpc.Q) + square(effort, mpc.R)
+    if mpc.terminal_cost is not None:
+        J = J + square(error[-1:], mpc.terminal_cost)
+    if mpc.input_rate_weight is not None:
+        W = cast(mpc.input_rate_weight)
+        first = jnp.zeros_like(inputs[0]) if previous_input is None else previous_input
+        rates = jnp.diff(inputs, axis=0, prepend=first[None])
+        J = J + square(rates, jnp.diag(W) if W.ndim == 1 else W)
+    for block, e in _violations(mpc, states, inputs):
+        J = J + jnp.sum(e * (block.linear + 0.5 * block.quadratic * e))
+    return J
+
+
+def slack(mpc: MPC, states: Array, inputs: Array) -> Array:
+    """Violation of the soft rows along a trajectory; see `Controller.slack`."""
+    columns = [
+        jnp.zeros((len(states), block.size), e.dtype).at[np.array(block.steps, int)].set(e)
+        for block, e in _violations(mpc, states, inputs)
+    ]
+    return jnp.concatenate([jnp.zeros((len(states), 0), states.dtype), *columns], axis=1)
+
+
+def _violations(mpc: MPC, states: Array, inputs: Array) -> list[tuple[Any, Array]]:
+    """Each soft block with its violations (steps, rows)."""
+    if not mpc.soft:
+        return []
+    found = []
+    for block in blocks(mpc, states.dtype):
+        if block.linear is not None:
+            steps = np.array(block.steps, int)
+            value = matmul(states[steps], block.H.T)
+            if block.D is not None:
+                value = value + matmul(inputs[steps], block.D.T)
+            beyond = jnp.maximum(value - block.upper, block.lower - value)
+            found.append((block, jnp.maximum(beyond, 0.0)))
+    return found
+
+
+def multipliers(mpc: MPC, layout: Layout, y: Array) -> Multipliers:
+    """The multipliers y (rows,) of all rows sorted by constraint and step."""
+    of: dict[str, list[Array]] = {}
+    for (kind, _, _), part in zip(layout, split(layout, y), strict=True):
+        of.setdefault(kind, []).append(part)
+    empty = lambda *shape: [jnp.zeros(shape, y.dtype)]
+    return Multipliers(
+        states=of.get("state", empty(len(mpc.state_steps), 0))[0],
+        inputs=of.get("input", empty(mpc.horizon, 0))[0],
+        terminal=of.get("terminal", empty(1, 0))[0][0],
+        outputs=tuple(of.get("output", ())), soft=tuple(of.get("soft", ())),
+        rates=of.get("rate", [None])[0],
+    )  # fmt: skip
+
+
+def shifted_multipliers(layout: Layout, horizon: int, y: Array, round_end: bool = False) -> Array:
+    """Multipliers (rows,) of a plan as a warm start one sample later: see `Controller.shifted`.
+
+    round_end: the terminal set is an ellipsoid, whose rows are no state limits.
+    """
+    parts = split(layout, y)
+    terminal = next((part[0] for (kind, *_), part in zip(layout, parts, strict=True)
+                     if kind == "terminal"), y[:0])  # fmt: skip
+    moved = []
+    for (kind, steps, size), part in zip(layout, parts, strict=True):
+        if kind != "terminal":
+            # Step k takes over from k + 1: from the block itself, else from the terminal set.
+            place = {k: j for j, k in enumerate(steps)}
+            same = kind == "state" and not round_end and terminal.shape[0] == size
+            last = terminal if same else jnp.zeros(size, y.dtype)
+            source = jnp.concatenate([part, last[None], jnp.zeros((1, size), y.dtype)])
+            end = len(steps)
+            later = [place.get(k + 1, end if k + 1 == horizon else end + 1) for k in steps]
+            part = source[np.array(later, int)]
+        moved.append(part.ravel())
+    return jnp.concatenate([*moved, y[:0]])
+
+
+def split(layout: Layout, y: Array) -> list[Array]:
+    """y (rows,) as one array (steps, rows a step) for each block."""
+    ends = np.cumsum([len(steps) * size for _, steps, size in layout], dtype=int)
+    shapes = [(len(steps), size) for _, steps, size in layout]
+    parts = jnp.split(y, ends)[: len(shapes)]
+    return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
 
 
 @jax.jit

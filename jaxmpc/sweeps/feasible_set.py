@@ -11,12 +11,7 @@ from scipy.spatial import KDTree
 from tqdm.auto import tqdm
 
 from jaxmpc.checks import fail
-from jaxmpc.control.sets import Ellipsoid, Polytope, hull_volume
-from jaxmpc.mpc.problem import MPC
-from jaxmpc.qp.status import Status
-from jaxmpc.sweeps import proofs
-from jaxmpc.sweeps.boundary import Rays
-from jaxmpc.sweeps.compiled import (
+from jaxmpc.compiled import (
     Compiled,
     default_chunk,
     first_rows,
@@ -24,6 +19,11 @@ from jaxmpc.sweeps.compiled import (
     padded,
     require_step_type,
 )
+from jaxmpc.control.sets import Ellipsoid, Polytope, hull_volume
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.status import Status
+from jaxmpc.sweeps import proofs
+from jaxmpc.sweeps.boundary import Rays
 from jaxmpc.sweeps.ladder import Verdict, admm_rung, bounding_box, newton_rung, rows
 from jaxmpc.sweeps.proofs import hard_part, make_view
 

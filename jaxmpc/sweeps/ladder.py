@@ -17,13 +17,13 @@ import numpy as np
 from jax import Array
 from scipy.optimize import linprog
 
+from jaxmpc.compiled import Compiled
 from jaxmpc.mpc.condense import condense, in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.refine import least_distance
 from jaxmpc.sweeps import proofs
-from jaxmpc.sweeps.compiled import Compiled
 from jaxmpc.sweeps.proofs import Problem, View
 
 ALPHA = 1.6

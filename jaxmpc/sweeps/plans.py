@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
+from jaxmpc.compiled import Compiled, default_chunk, gather_size, padded, require_step_type
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import Controller
@@ -24,7 +25,6 @@ from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.refine import polish
 from jaxmpc.qp.solve import assess, cleaned, marked, prove, solve_factored, unscaled
 from jaxmpc.qp.status import Status
-from jaxmpc.sweeps.compiled import Compiled, default_chunk, gather_size, padded, require_step_type
 
 NEWTON_STEPS = 4
 NEWTON_ROUNDS = 8

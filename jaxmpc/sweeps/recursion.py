@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail
+from jaxmpc.compiled import default_chunk
 from jaxmpc.control.sets import Polytope
 from jaxmpc.control.terminal import verify_terminal
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
 from jaxmpc.sweeps.boundary import boundary, spread
-from jaxmpc.sweeps.compiled import default_chunk
 from jaxmpc.sweeps.feasible_set import FeasibleSetMap, grid, map_feasible_set
 from jaxmpc.sweeps.law import Bound, Law, ascend
 from jaxmpc.sweeps.proofs import hard_part

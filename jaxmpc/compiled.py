@@ -34,13 +34,17 @@ class Compiled:
         self.programs: dict[Any, Any] = {}
 
     def __call__(self, *args: Any) -> Any:
+        return jax.tree.map(np.asarray, self.program(*args)(*args))
+
+    def program(self, *args: Any) -> Any:
+        """The program for arguments of these shapes."""
         leaves, tree = jax.tree.flatten(args)
         key = tree, tuple(jax.typeof(leaf) for leaf in leaves)
         if key not in self.programs:
             start = time.perf_counter()
             self.programs[key] = self.function.lower(*args).compile()
             Compiled.seconds += time.perf_counter() - start
-        return jax.tree.map(np.asarray, self.programs[key](*args))
+        return self.programs[key]
 
 
 def padded(x: np.ndarray, size: int) -> np.ndarray:

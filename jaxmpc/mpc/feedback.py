@@ -1,0 +1,94 @@
+"""Linear feedback with clipping: what an MPC is compared with, and what it falls back to nowhere."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import fail, require_finite, require_shape
+from jaxmpc.control.sets import Box
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.precision import arrays, floating_dtype
+from jaxmpc.qp.status import Status
+
+
+class NoPlan(NamedTuple):
+    """What a law without a plan says of one: no cost (NaN), status NOT_RUN, no slack."""
+
+    cost: Array
+    status: Array
+    slack: Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class LinearFeedback:
+    """u = clip(s + K (ξ − r)) into the input limits of `mpc`: LQR or PD control, saturated.
+
+    mpc: weights, limits and horizon that runs are judged by, as for a Controller. K (m, n).
+    plant: a Robot where ξ are its coordinates and limits its own; None: ξ = x. References r (n,),
+    or rows of them, and s as in `Controller`; zero for none.
+    """
+
+    mpc: MPC
+    K: Any
+    plant: Any = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.mpc, MPC):
+            return  # JAX rebuilds this object with placeholders
+        n, m = self.mpc.system.n, self.mpc.system.m
+        require_shape("K", self.K, (m, n), "u = K x, one row an input")
+        require_finite("K", self.K)
+
+    @property
+    def dtype(self) -> Any:
+        """In what the law computes."""
+        return floating_dtype((self.mpc.Q, self.mpc.R, self.K))
+
+    @property
+    def state_size(self) -> int:
+        """Numbers in the state that the law is given."""
+        return self.mpc.system.n if self.plant is None else self.plant.state_size
+
+    @property
+    def limits(self) -> Any:
+        """Limits of the state that a closed loop is judged by."""
+        return self.mpc.states if self.plant is None else self.plant.state_limits
+
+    def coordinates(self, x: Array) -> Array:
+        """ξ of a state."""
+        return x if self.plant is None else self.plant.coordinates(x)
+
+    def start(self, x: Array, input_reference: Any = None) -> tuple:
+        """Nothing is carried."""
+        return ()
+
+    def __call__(
+        self, x: Any, carry: Any = None, reference: Any = None, *, input_reference: Any = None,
+        previous_input: Any = None,
+    ) -> tuple[Array, tuple, NoPlan]:  # fmt: skip
+        """The input at x, nothing to carry, and no plan."""
+        if np.shape(x) != (self.state_size,):
+            fail("x", f"shape {np.shape(x)}", f"Give one state ({self.state_size},)")
+        x = jnp.asarray(x, self.dtype)
+        first = lambda v, size: (
+            jnp.zeros(size, x.dtype) if v is None
+            else jnp.asarray(v, x.dtype) if np.ndim(v) == 1 else jnp.asarray(v, x.dtype)[0]
+        )  # fmt: skip
+        r = first(reference, self.mpc.system.n)
+        u = first(input_reference, self.mpc.system.m)
+        u = u + jnp.matmul(
+            jnp.asarray(self.K, x.dtype), self.coordinates(x) - r, precision="highest"
+        )
+        if isinstance(self.mpc.inputs, Box):
+            lower, upper = arrays((self.mpc.inputs.lower, self.mpc.inputs.upper))
+            u = jnp.clip(u, jnp.asarray(lower, u.dtype), jnp.asarray(upper, u.dtype))
+        nothing = NoPlan(
+            jnp.asarray(jnp.nan, x.dtype), jnp.asarray(Status.NOT_RUN, jnp.int32),
+            jnp.zeros((1, 0), x.dtype),
+        )  # fmt: skip
+        return u, (), nothing

@@ -1,0 +1,717 @@
+"""ADMM stage by stage: MPC whose A, B, c differ for every problem of a batch or every step.
+
+The iteration is that of `qp/admm.py` on the condensed QP, the iterates are the same; only the
+condensed matrices are never formed. A step needs "linear terms on the rows, minimise the quadratic
+with its penalties", which is an LQR problem: with gains from one Riccati recursion a backward
+and a forward pass over the stages, N products with n×n matrices each, where the dense step reads
+a matrix of (rows)² entries. With the weights doubled (J has no ½, the QP has) and W = diag(ρE²)
+the stage cost is
+
+    ½ [x; u]' [2Q + H'WH, H'WD; D'WH, 2R + D'WD] [x; u] − g_x'x − g_u'u
+
+and the value function ½ x'S x + p'x of the steps after k gives (Rawlings, Mayne, Diehl 2017, §1.3)
+
+    G = 2R + D'WD + B'S⁺B,   K = −G⁻¹(B'S⁺A + D'WH),   u = K x + G⁻¹(g_u − B'p⁺),
+    p = (A + BK)'p⁺ − g_x − K'g_u.
+
+Only p runs backward and only x forward; all else is done for all stages at once.
+
+The row scale E of `qp/admm.scale` makes the rows a_i of all inputs one unit long in the metric of
+the Hessian: 1/E_i² = a_i' P⁻¹ a_i. P⁻¹ is the covariance of inputs drawn with density exp(−J): by
+the same recursion without penalties u_k = K x_k + e_k with e_k of covariance G⁻¹, hence that of x_k
+runs forward, Σ⁺ = (A + BK) Σ (A + BK)' + B G⁻¹ B' from Σ_0 = 0. (The dense solver adds 1e-6 of
+the mean curvature to P first; E differs by that share.)
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.scipy.linalg import cho_solve
+
+from jaxmpc.checks import concrete, fail, require_finite
+from jaxmpc.control.sets import Box, Ellipsoid
+from jaxmpc.control.system import LinearSystem, as_array, host_array
+from jaxmpc.mpc.problem import MPC, Plan
+from jaxmpc.mpc.rows import blocks
+from jaxmpc.mpc.solve import Layout, cost, multipliers, slack
+from jaxmpc.qp.admm import ADMM, repeat
+from jaxmpc.qp.precision import arrays, floating_dtype, in_float64, matmul
+from jaxmpc.qp.problem import QPSolution
+from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.refine import Constants
+from jaxmpc.qp.status import Status
+
+# Most stages that the passes of an ADMM step write out, without a loop over them. Loops reorder
+# (batch, N, …) to (N, batch, …) at each step, which takes longer than the products.
+UNROLL = 32
+
+
+def solve_stagewise(
+    mpc: MPC, system: LinearSystem, x0: Any, reference: Any = None, solver: ADMM = ADMM(),  # noqa: B008
+    warm_start: Any = None, *, input_reference: Any = None,
+) -> Plan:  # fmt: skip
+    """Solve `mpc` with `system` in place of its own, whose A (n, n), B (n, m) and c (n,) may have
+    a leading axis N: x_{k+1} = A_k x_k + B_k u_k + c_k.
+
+    x0, references, solver and the Plan are those of `solve`, and so is the status: residuals and
+    gap of the returned inputs and multipliers, evaluated from the data in float64. What differs:
+    no infeasibility is proved (a problem without a solution ends as ITERATION_LIMIT: soften the
+    rows that may not hold), the derivative is that of the steps as they were taken, `qp.z` are the
+    inputs, `qp.cost` is the plan's. warm_start: an earlier Plan, or inputs (N, m) or (N m,) and
+    multipliers (rows,). solver.refine: Newton steps, a Riccati recursion each; 5 suffice where
+    ADMM has found the active rows. mpc.prestabilise is not read: the inputs are the variables, so
+    a plant that grows more than 1e5-fold over the horizon in open loop (1e3-fold in float32) has
+    residuals above eps by rounding alone; `solve` takes those.
+
+    `jax.vmap` over system, x0, references or the arrays of `mpc`. Raises ValueError for bad data
+    that can be read, and for what only `solve` knows: Ellipsoids, control horizons, input rates.
+    """
+    factor = factor_stages(mpc, system, solver)
+    return plan_stages(
+        factor, replace(mpc, system=system), x0, reference, solver, warm_start,
+        input_reference=input_reference,
+    )  # fmt: skip
+
+
+def factor_stages(mpc: MPC, system: LinearSystem, solver: ADMM = ADMM()) -> "StageFactor":  # noqa: B008
+    """What x0, references and warm start do not change: row scale and Riccati gains.
+
+    Arguments and errors as in `solve_stagewise`; `plan_stages` does the rest.
+    """
+    return _factor(*arrays((checked(mpc, system, solver), solver.rho)))
+
+
+def checked(mpc: MPC, system: LinearSystem, solver: ADMM) -> MPC:
+    """The problem with `system` in it; ValueError for what is wrong with either."""
+    if not isinstance(system, LinearSystem):
+        fail("system", f"is a {type(system).__name__}", "Give a jm.LinearSystem")
+    for name, found in (
+        ("terminal_set is an Ellipsoid", isinstance(mpc.terminal_set, Ellipsoid)),
+        ("control_horizon is given", mpc.control_horizon is not None),
+        ("input rates are limited or weighed", mpc.remembers),
+    ):
+        if found:
+            fail("mpc", name, "Stage by stage there is no such thing: use jm.solve")
+    first: dict[str, Any] = {}
+    for name, dimensions in (("A", 2), ("B", 2), ("c", 1)):
+        value = getattr(system, name)
+        if value is None:
+            continue
+        if concrete(value):
+            require_finite(name, host_array(name, value))
+        value = as_array(value)
+        shape = np.shape(value)
+        staged = len(shape) == dimensions + 1
+        if staged and shape[0] != mpc.horizon:
+            fail(name, f"shape {shape}", f"A leading axis counts the {mpc.horizon} steps")
+        first[name] = value[0] if staged and shape[0] else value
+    replace(mpc, system=replace(system, **first), prestabilise=None).validate()
+    mpc = replace(mpc, system=system, prestabilise=None)
+    solver.validate(sum(len(steps) * size for _, steps, size in layout(mpc)))
+    return mpc
+
+
+def layout(mpc: MPC) -> Layout:
+    """(kind, steps, rows a step) of each block of rows."""
+    return tuple((b.kind, b.steps, b.size) for b in blocks(mpc, float))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Stages:
+    """The data of a problem in one floating type.
+
+    A (n, n), B (n, m), c (n,), or with a leading axis N. Q, R, P: weights, without ½; P of x_N.
+    H (r, n) and D (r, m) of each block of rows (`rows.blocks`), None for zero. lower, upper,
+    linear, quadratic (rows,): as in `Bounds`. layout: (kind, steps, rows a step) of each block;
+    boxes: whether its matrix is the identity.
+    """
+
+    A: Array
+    B: Array
+    c: Array
+    Q: Array
+    R: Array
+    P: Array
+    H: tuple[Any, ...]
+    D: tuple[Any, ...]
+    lower: Array
+    upper: Array
+    linear: Any
+    quadratic: Any
+    layout: Layout = field(metadata={"static": True})
+    boxes: tuple[bool, ...] = field(metadata={"static": True})
+    horizon: int = field(metadata={"static": True})
+
+    @property
+    def bounds(self) -> Bounds:
+        """What the problem asks of its rows."""
+        return Bounds(self.lower, self.upper, self.linear, self.quadratic)
+
+    def blocks(self) -> list[tuple[slice, tuple[int, ...], int, Any, Any, bool]]:
+        """(its rows, steps, rows a step, H, D, whether that is the identity) of each block."""
+        found, first = [], 0
+        for (_, steps, size), H, D, box in zip(
+            self.layout, self.H, self.D, self.boxes, strict=True
+        ):
+            last = first + len(steps) * size
+            found.append((slice(first, last), steps, size, H, D, box))
+            first = last
+        return found
+
+    def rows(self, x: Array, u: Array) -> Array:
+        """H x_k + D u_k of all blocks (rows,) along x (N+1, n), u (N, m)."""
+        parts = [jnp.zeros(0, x.dtype)]
+        for _, steps, _, H, D, box in self.blocks():
+            value: Any = 0.0
+            for M, v in ((H, x), (D, u)):
+                if M is not None:
+                    v = at(v, steps)
+                    value = value + (v if box else matmul(v, M.T))
+            parts.append(value.ravel())
+        return jnp.concatenate(parts)
+
+    def pull(self, weights: Array) -> tuple[Array, Array]:
+        """Σ weights·(gradient of the row) in x (N+1, n) and u (N, m): the transpose of `rows`."""
+        N, n, m = self.horizon, self.A.shape[-1], self.B.shape[-1]
+        gx: Any = jnp.zeros((N + 1, n), weights.dtype)
+        gu: Any = jnp.zeros((N, m), weights.dtype)
+        for rows, steps, size, H, D, box in self.blocks():
+            w = weights[rows].reshape(len(steps), size)
+            if H is not None:
+                gx = gx + spread(w if box else matmul(w, H), steps, N + 1)
+            if D is not None:
+                gu = gu + spread(w if box else matmul(w, D), steps, N)
+        return gx, gu
+
+    def varying(self, *names: str) -> list[Any]:
+        """The named ones of A, B, c where they differ from step to step, else None."""
+        values = [(getattr(self, name), 1 if name == "c" else 2) for name in names]
+        return [v if v.ndim > dimensions else None for v, dimensions in values]
+
+
+def consecutive(steps: tuple[int, ...]) -> bool:
+    """Whether the steps are k, k + 1, …"""
+    return bool(steps) and steps == tuple(range(steps[0], steps[0] + len(steps)))
+
+
+def at(v: Array, steps: tuple[int, ...]) -> Array:
+    """v_k at the steps."""
+    if consecutive(steps):
+        return v[steps[0] : steps[0] + len(steps)]
+    return v[np.array(steps, int)]
+
+
+def spread(part: Array, steps: tuple[int, ...], length: int) -> Array:
+    """The array of so many steps that is `part` at the steps and zero elsewhere."""
+    if consecutive(steps):
+        ends = (steps[0], length - steps[0] - len(steps))
+        return jnp.pad(part, (ends, *[(0, 0)] * (part.ndim - 1)))
+    return jnp.zeros((length, *part.shape[1:]), part.dtype).at[np.array(steps, int)].add(part)
+
+
+def apply(M: Array, v: Array) -> Array:
+    """M_k v_k, or M v_k, for all steps: M (N, a, b) or (a, b), v (N, b)."""
+    return matmul(v, M.T) if M.ndim == 2 else matmul(M, v[..., None])[..., 0]
+
+
+def apply_transposed(M: Array, v: Array) -> Array:
+    """M_k'v_k, or M'v_k, for all steps."""
+    return matmul(v, M) if M.ndim == 2 else matmul(v[..., None, :], M)[..., 0, :]
+
+
+def stages(mpc: MPC) -> Stages:
+    """The data of `mpc`. Traceable in every array."""
+    system, n = mpc.system, mpc.system.n
+    dtype = floating_dtype(mpc)
+    cast = lambda v: jnp.asarray(v, dtype)
+    found = blocks(mpc, dtype)
+    box = {
+        kind: isinstance(set_, Box)
+        for kind, set_ in (
+            ("input", mpc.inputs), ("state", mpc.states), ("terminal", mpc.terminal_set)
+        )
+    }  # fmt: skip
+    none = [jnp.zeros(0, dtype)]
+    tiled = lambda values: jnp.concatenate(none + [
+        jnp.tile(v, len(b.steps)) for v, b in zip(values, found, strict=True)
+    ])  # fmt: skip
+    linear = quadratic = None
+    if any(b.linear is not None for b in found):
+        weight = lambda b, name, hard: (
+            jnp.full(b.size, hard, dtype) if b.linear is None else getattr(b, name)
+        )
+        linear = tiled([weight(b, "linear", jnp.inf) for b in found])
+        quadratic = tiled([weight(b, "quadratic", 0.0) for b in found])
+    return Stages(
+        A=cast(system.A), B=cast(system.B),
+        c=jnp.zeros(n, dtype) if system.c is None else cast(system.c),
+        Q=cast(mpc.Q), R=cast(mpc.R),
+        P=jnp.zeros((n, n), dtype) if mpc.terminal_cost is None else cast(mpc.terminal_cost),
+        H=tuple(b.H for b in found), D=tuple(b.D for b in found),
+        lower=tiled([b.lower for b in found]), upper=tiled([b.upper for b in found]),
+        linear=linear, quadratic=quadratic,
+        layout=tuple((b.kind, b.steps, b.size) for b in found),
+        boxes=tuple(box.get(b.kind, False) for b in found), horizon=mpc.horizon,
+    )  # fmt: skip
+
+
+def usable(s: Stages) -> tuple[Stages, Array]:
+    """The data with harmless ones in their place where they are not usable, and whether they
+    were (see `qp.solve.cleaned`)."""
+    ok = jnp.all(s.lower <= s.upper) & ~jnp.any(jnp.isposinf(s.lower) | jnp.isneginf(s.upper))
+    for value in jax.tree.leaves((s.A, s.B, s.c, s.Q, s.R, s.P, s.H, s.D)):
+        ok = ok & jnp.all(jnp.isfinite(value))
+    if s.linear is not None:
+        ok = ok & jnp.all(s.linear >= 0)
+        ok = ok & jnp.all((s.quadratic >= 0) & jnp.isfinite(s.quadratic))
+    clean = lambda tree, harmless=0.0: jax.tree.map(lambda v: jnp.where(ok, v, harmless), tree)
+    return replace(
+        s, A=clean(s.A), B=clean(s.B), c=clean(s.c), Q=clean(s.Q), P=clean(s.P),
+        R=clean(s.R, jnp.eye(s.R.shape[0], dtype=s.R.dtype)), H=clean(s.H), D=clean(s.D),
+        lower=clean(s.lower, -jnp.inf), upper=clean(s.upper, jnp.inf),
+        linear=clean(s.linear, jnp.inf), quadratic=clean(s.quadratic),
+    ), ok  # fmt: skip
+
+
+class Gains(NamedTuple):
+    """Of a Riccati recursion, for each step: A + BK (N, n, n), K (N, m, n), G⁻¹ (N, m, m)."""
+
+    closed: Array
+    K: Array
+    inverse: Array
+
+
+def riccati(s: Stages, weights: Any = None) -> Gains:
+    """Gains for the cost and ½ Σ weights·row², weights (rows,) or None."""
+    N, n, m = s.horizon, s.A.shape[-1], s.B.shape[-1]
+    Q = 2 * jnp.concatenate([jnp.broadcast_to(s.Q, (N, n, n)), s.P[None]])
+    R = jnp.broadcast_to(2 * s.R, (N, m, m))
+    cross = None
+    for rows, steps, size, H, D, box in s.blocks() if weights is not None else ():
+        w = weights[rows].reshape(len(steps), size)
+        diagonal = lambda w: w[:, :, None] * jnp.eye(w.shape[1], dtype=w.dtype)
+        form = lambda M, L, w=w: matmul(M.T * w[:, None, :], L)
+        if H is not None:
+            Q = Q + spread(diagonal(w) if box else form(H, H), steps, N + 1)
+        if D is not None:
+            R = R + spread(diagonal(w) if box else form(D, D), steps, N)
+        if H is not None and D is not None:
+            cross = (0.0 if cross is None else cross) + spread(form(D, H), steps, N)
+    identity = jnp.eye(m, dtype=Q.dtype)
+
+    def stage(S: Array, stage: tuple) -> tuple[Array, Gains]:
+        Q, R, M, A, B = stage
+        A, B = s.A if A is None else A, s.B if B is None else B
+        BtS = matmul(B.T, S)
+        L = jnp.linalg.cholesky(R + matmul(BtS, B))
+        Y = matmul(BtS, A) + (0.0 if M is None else M)
+        solved = cho_solve((L, True), jnp.concatenate([Y, identity], axis=1))
+        K, inverse = -solved[:, :n], solved[:, n:]
+        closed = A + matmul(B, K)
+        # Joseph's form of Q + A'SA + Y'K: no difference of large terms, S stays semidefinite.
+        S = Q + matmul(closed.T, matmul(S, closed)) + matmul(K.T, matmul(R, K))
+        if M is not None:
+            S = S + matmul(K.T, M) + matmul(M.T, K)
+        return (S + S.T) / 2, Gains(closed, K, inverse)
+
+    xs = (Q[:-1], R, cross, *s.varying("A", "B"))
+    return jax.lax.scan(stage, Q[-1], xs, reverse=True)[1]
+
+
+def minimise(s: Stages, gains: Gains, gx: Array, gu: Array, unroll: int = 1) -> tuple[Array, Array]:
+    """x (N+1, n), u (N, m) of least penalised cost − gx·x − gu·u from x_0 = 0, without c and
+    references."""
+    h = gx[:-1] + apply_transposed(gains.K, gu)
+
+    def backward(p: Array, stage: tuple) -> tuple[Array, Array]:
+        closed, h = stage
+        return matmul(p, closed) - h, p
+
+    _, p = jax.lax.scan(backward, -gx[-1], (gains.closed, h), reverse=True, unroll=unroll)
+    d = apply(gains.inverse, gu - apply_transposed(s.B, p))
+    x = follow(gains, jnp.zeros_like(gx[0]), apply(s.B, d), unroll)
+    return x, apply(gains.K, x[:-1]) + d
+
+
+def follow(gains: Gains, x0: Array, w: Array, unroll: int = 1) -> Array:
+    """x (N+1, n) of x⁺ = (A + BK) x + w from x0 (n,), w (N, n)."""
+
+    def forward(x: Array, stage: tuple) -> tuple[Array, Array]:
+        closed, w = stage
+        x = matmul(x, closed.T) + w
+        return x, x
+
+    _, x = jax.lax.scan(forward, x0, (gains.closed, w), unroll=unroll)
+    return jnp.concatenate([x0[None], x])
+
+
+def predict(s: Stages, x0: Array, u: Array) -> Array:
+    """x (N+1, n) from x0 (n,) under the inputs u (N, m)."""
+    w = apply(s.B, u) + s.c
+
+    def forward(x: Array, stage: tuple) -> tuple[Array, Array]:
+        A, w = stage
+        x = matmul(x, (s.A if A is None else A).T) + w
+        return x, x
+
+    _, x = jax.lax.scan(forward, x0, (*s.varying("A"), w))
+    return jnp.concatenate([x0[None], x])
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class StageFactor:
+    """What data and penalties decide: row scale E (rows,), 0 for a row that no input moves; rho
+    (S, rows) with the gains of each of the S penalties of a schedule; usable: whether the data
+    were."""
+
+    stages: Stages
+    E: Array
+    rho: Array
+    gains: Gains
+    usable: Array
+
+
+@jax.jit
+def _factor(mpc: MPC, rho: Array) -> StageFactor:
+    s, ok = usable(stages(mpc))
+    E = row_scale(s)
+    rho = jnp.asarray(rho, E.dtype)
+    rho = jnp.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, E.shape[0]))
+    return StageFactor(s, E, rho, jax.lax.map(lambda rho: riccati(s, rho * E**2), rho), ok)
+
+
+def row_scale(s: Stages) -> Array:
+    """E (rows,): 1/E² is the variance of the row under exp(−J); 0 where that is zero."""
+    gains = riccati(s)
+
+    def forward(Sigma: Array, stage: tuple) -> tuple[Array, Array]:
+        (closed, _, inverse), B = stage
+        B = s.B if B is None else B
+        spread = matmul(B, matmul(inverse, B.T))
+        return matmul(closed, matmul(Sigma, closed.T)) + spread, Sigma
+
+    start = jnp.zeros_like(s.Q)
+    last, Sigma = jax.lax.scan(forward, start, (gains, *s.varying("B")))
+    Sigma = jnp.concatenate([Sigma, last[None]])
+    variance, own = [jnp.zeros(0, s.Q.dtype)], [jnp.zeros(0, s.Q.dtype)]
+    square = lambda M, V: jnp.sum(matmul(M, V) * M, axis=-1)
+    deviation = lambda V: jnp.sqrt(jnp.maximum(jnp.diagonal(V, axis1=-2, axis2=-1), 0.0))
+    for _, steps, _, H, D, _ in s.blocks():
+        # H x + D (K x + e), e of covariance G⁻¹.
+        F: Any = 0.0 if H is None else H
+        noise: Any = 0.0
+        V = at(Sigma, steps)
+        if D is not None:
+            K, inverse = at(gains.K, steps), at(gains.inverse, steps)
+            F, noise = F + matmul(D, K), square(D, inverse)
+        value = square(F, V) + noise
+        size = jnp.sum(jnp.abs(F) * deviation(jax.lax.stop_gradient(V))[:, None, :], axis=-1) ** 2
+        variance.append(value.ravel())
+        own.append((size + noise).ravel())
+    squared, terms = jnp.concatenate(variance), jnp.concatenate(own)
+    # A row is zero when it is rounding noise, of its own terms or beside the others.
+    eps = jnp.finfo(squared.dtype).eps
+    noise = jnp.maximum((100 * eps) ** 2 * terms, eps**2 * jnp.max(squared, initial=0.0))
+    zero = squared <= noise
+    return jnp.where(zero, 0.0, 1 / jnp.sqrt(jnp.where(zero, 1.0, squared)))
+
+
+def scaled(bounds: Bounds, E: Array) -> Bounds:
+    """Bounds of E·row: as `qp.admm.scaled`."""
+    zero = E == 0
+    E = jnp.where(zero, 1.0, E)
+
+    def bound(v: Array, free: float) -> Array:
+        keep = jnp.isfinite(v) & ~zero  # E·inf would give NaN gradients
+        return jnp.where(zero, free, jnp.where(keep, E * jnp.where(keep, v, 0.0), v))
+
+    bounds = replace(bounds, l=bound(bounds.l, -jnp.inf), u=bound(bounds.u, jnp.inf))
+    if bounds.linear is None:
+        return bounds
+    soft = jnp.isfinite(bounds.linear)
+    linear = jnp.where(soft, jnp.where(soft, bounds.linear, 0.0) / E, jnp.inf)
+    return replace(bounds, linear=linear, quadratic=bounds.quadratic / E**2)
+
+
+class Sample(NamedTuple):
+    """What differs from sample to sample: x0 (n,), references (N+1, n) and (N, m)."""
+
+    x0: Array
+    states: Array
+    inputs: Array
+
+    def gradient(self, s: Stages, x: Array, u: Array) -> tuple[Array, Array]:
+        """Of J at x, u: (N+1, n) and (N, m)."""
+        e = 2 * (x - self.states)
+        gx = jnp.concatenate([matmul(e[:-1], s.Q.T), matmul(e[-1:], s.P.T)])
+        return gx, 2 * matmul(u - self.inputs, s.R.T)
+
+
+def unconstrained(s: Stages, gains: Gains, weights: Array, sample: Sample) -> tuple[Array, Array]:
+    """x, u of least cost with the penalties ½ Σ weights·row²."""
+    # From a trajectory that the gains keep bounded, one minimisation of what is left.
+    x = follow(gains, sample.x0, jnp.broadcast_to(s.c, (s.horizon, s.c.shape[-1])))
+    u = apply(gains.K, x[:-1])
+    moved = jax.tree.map(jnp.add, sample.gradient(s, x, u), s.pull(weights * s.rows(x, u)))
+    dx, du = minimise(s, gains, -moved[0], -moved[1])
+    return x + dx, u + du
+
+
+def iterate(
+    factor: StageFactor, sample: Sample, bounds: Bounds, t: Array, iterations: int, alpha: Any
+) -> tuple[Array, tuple[Array, Array]]:
+    """The fixed loop of `qp.admm.iterate` from t (rows,); the last t, and its x and u.
+
+    Here t, bounds and E·row include what x0 and c put into the rows; in the condensed QP they are
+    moved by that.
+    """
+    s, E, count = factor.stages, factor.E, factor.rho.shape[0]
+    alpha = jnp.asarray(alpha, t.dtype)
+    for i in range(count):
+        rho, gains = factor.rho[i], jax.tree.map(lambda v, i=i: v[i], factor.gains)
+        free = unconstrained(s, gains, rho * E**2, sample)
+        b = E * s.rows(*free)
+        if i > 0:  # the multiplier carries over
+            before = bounds.project(t, factor.rho[i - 1])
+            t = before + factor.rho[i - 1] / rho * (t - before)
+
+        def answer(t: Array, unroll: int, rho: Array = rho, gains: Gains = gains) -> tuple:
+            p = bounds.project(t, rho)
+            return p, minimise(s, gains, *s.pull(rho * E * (2 * p - t)), unroll)
+
+        def advance(t: Array, b: Array = b, answer: Any = answer) -> Array:
+            p, moved = answer(t, min(s.horizon, UNROLL))
+            return t + alpha * (E * s.rows(*moved) + b - p)
+
+        if iterations:
+            t = repeat(advance, t, iterations // count)
+    moved = answer(t, 1)[1]
+    return t, (free[0] + moved[0], free[1] + moved[1])
+
+
+class Conditions(NamedTuple):
+    """Rows (rows,) and gradient (N, m) of the Lagrangian with respect to the inputs, and the
+    sizes of the terms of both."""
+
+    rows: Array
+    gradient: Array
+    row_size: Array
+    gradient_size: Array
+
+
+def conditions(s: Stages, sample: Sample, u: Array, y: Array) -> Conditions:
+    """Optimality conditions of inputs u (N, m) and multipliers y (rows,), by the states that u
+    leads to and the costates λ_k = ∂J/∂x_k + H'y + A'λ_{k+1}."""
+    x = predict(s, sample.x0, u)
+    (gx, own), (px, pushed) = sample.gradient(s, x, u), s.pull(y)
+
+    def backward(costate: Array, stage: tuple) -> tuple[Array, Array]:
+        A, g = stage
+        return matmul(costate, s.A if A is None else A) + g, costate
+
+    g = gx + px
+    xs = (*s.varying("A"), g[:-1])
+    _, costate = jax.lax.scan(backward, g[-1], xs, reverse=True)
+    absolute = jax.tree.map(jnp.abs, replace(s, linear=None, quadratic=None))
+    return Conditions(
+        s.rows(x, u), own + pushed + apply_transposed(s.B, costate),
+        absolute.rows(jnp.abs(x), jnp.abs(u)),
+        jnp.abs(own) + absolute.pull(jnp.abs(y))[1]
+        + apply_transposed(absolute.B, jnp.abs(costate)),
+    )  # fmt: skip
+
+
+def residual_terms(s: Stages, sample: Sample, u: Array, y: Array) -> list[tuple[Array, Array]]:
+    """As `qp.problem.residual_terms`, for the condensed QP in the inputs.
+
+    With the gradient g of the Lagrangian the gap z'Pz + q'z + g(Az) + g*(y) is
+    u'g + g(rows) + g*(y) − y'rows: at the optimum both parts are zero.
+    """
+    found, bounds = conditions(s, sample, u, y), s.bounds
+    penalty, support, product = bounds.cost(found.rows), bounds.support(y), y * found.rows
+    gap = jnp.sum(u * found.gradient) + penalty + support - jnp.sum(product)
+    size = jnp.sum(jnp.abs(u) * found.gradient_size) + penalty + jnp.abs(support)
+    return [
+        (bounds.violation(found.rows), found.row_size),
+        (found.gradient, found.gradient_size),
+        (gap, size + jnp.sum(jnp.abs(product))),
+    ]
+
+
+def largest(v: Array) -> Array:
+    """The norm of residuals."""
+    return jnp.max(jnp.abs(v), initial=0.0)
+
+
+def precisely(function: Any, *arguments: Any) -> Any:
+    """function(…) in float64; for float32 data without derivative."""
+    if arguments[1].x0.dtype == jnp.float64:
+        return function(*arguments)
+    return in_float64(function)(*jax.lax.stop_gradient(arguments))
+
+
+def worst(s: Stages, sample: Sample, u: Array, y: Array) -> Array:
+    """Largest residual, each relative to the size of its terms."""
+
+    def relative(*arguments: Any) -> Array:
+        terms = residual_terms(*arguments)
+        return jnp.max(jnp.stack([largest(v) / (1 + largest(size)) for v, size in terms]))
+
+    return precisely(relative, s, sample, u, y)
+
+
+def polish(
+    factor: StageFactor, sample: Sample, bounds: Bounds, u: Array, y: Array, steps: int
+) -> tuple[Array, Array]:
+    """Semismooth Newton on the optimality conditions from ADMM's u (N, m) and y (rows,).
+
+    In scaled rows v, multipliers y/E and with the excess of `projection.py` the conditions are
+    gradient = 0 and excess(v + y/ρ) = y/ρ. With the derivative D of the excess a step asks
+
+        gradient + P du + rows'dy = 0,        dy (1 − D)/ρ = D dv + c,    c = excess − y/ρ.
+
+    Where D = 1 (a row held at its bound) 0·dy becomes dy/κ with a large κ, a proximal step on y:
+    dy = ω dv + ω_c c, with ω = ρ D/(1 − D + D ρ/κ) and ω_c = ρ/(1 − D + D ρ/κ). What is left is an
+    LQR problem with penalties ω. Rows are held by v + y/ρ of ADMM's own ρ, so that κ does not
+    disturb the guess; it costs accuracy only within a step, since each starts from residuals of
+    the data.
+    """
+    s, E, rho = factor.stages, factor.E, factor.rho[-1]
+    strong = Constants.of(u.dtype).linear
+
+    def errors(
+        s: Stages, sample: Sample, E: Array, rho: Array, u: Array, y: Array
+    ) -> tuple[Array, ...]:
+        """v + y/ρ, c and the gradient."""
+        found, push = conditions(s, sample, u, y), unscaled(E, y) / rho
+        v = E * found.rows + push
+        return v, scaled(s.bounds, E).excess(v, rho) - push, found.gradient
+
+    def body(pair: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+        u, y = pair
+        found = errors(s, sample, E, rho, u, y)
+        if u.dtype != jnp.float64:  # values of float64, derivatives of float32
+            fixed = jax.lax.stop_gradient
+            exact = precisely(errors, s, sample, E, rho, u, y)
+            found = jax.tree.map(lambda p, e: p + fixed(e - p), found, exact)
+        v, c, gradient = found
+        D = bounds.curvature(v, rho)[0]
+        loose = 1 - D + D * rho / strong
+        omega, push = rho * D / loose, rho * c / loose
+        gx, gu = s.pull(E * push)
+        dx, du = minimise(s, riccati(s, omega * E**2), -gx, -gu - gradient)
+        return (u + du, y + E * (omega * E * s.rows(dx, du) + push)), None
+
+    return jax.lax.scan(body, (u, y), length=steps)[0]
+
+
+def unscaled(E: Array, y: Array) -> Array:
+    """Multipliers of E·row from those of the rows; 0 where E is 0."""
+    return jnp.where(E > 0, y / jnp.where(E > 0, E, 1.0), 0.0)
+
+
+def plan_stages(
+    factor: StageFactor, mpc: MPC, x0: Any, reference: Any = None, solver: ADMM = ADMM(),  # noqa: B008
+    warm_start: Any = None, *, input_reference: Any = None,
+) -> Plan:  # fmt: skip
+    """The rest of `solve_stagewise`, for the same mpc and solver; mpc.system is not read."""
+    s, dtype = factor.stages, factor.E.dtype
+    N, n, m = s.horizon, s.A.shape[-1], s.B.shape[-1]
+    if np.shape(x0) != (n,):
+        fail("x0", f"shape {np.shape(x0)}", f"Give one state ({n},); use jax.vmap for many")
+    aims = []
+    for name, value, shape in (
+        ("reference", reference, (N + 1, n)), ("input_reference", input_reference, (N, m))
+    ):  # fmt: skip
+        value = jnp.zeros(shape[1:], dtype) if value is None else value
+        if np.shape(value) not in (shape[1:], shape):
+            fail(name, f"shape {np.shape(value)}", f"Give {shape[1:]} or {shape}")
+        aims.append(jnp.broadcast_to(jnp.asarray(value, dtype), shape))
+    if isinstance(warm_start, Plan):
+        warm_start = (warm_start.inputs, warm_start.qp.y)
+    mpc = replace(mpc, prestabilise=None)
+    sample = Sample(jnp.asarray(x0, dtype), *aims)
+    return _plan(*arrays((factor, mpc, solver, sample, warm_start)))
+
+
+@jax.jit
+def _plan(factor: StageFactor, mpc: MPC, solver: ADMM, sample: Sample, warm_start: Any) -> Plan:
+    s = factor.stages
+    finite = factor.usable
+    for v in sample:
+        finite = finite & jnp.all(jnp.isfinite(v))
+    sample = jax.tree.map(lambda v: jnp.where(finite, v, 0.0), sample)
+    bounds = scaled(s.bounds, factor.E)
+    t, (x, u) = iterate(
+        factor, sample, bounds, start(factor, sample, bounds, warm_start), solver.iterations,
+        solver.alpha,
+    )  # fmt: skip
+    # Soft rows that no input moves push with their penalty, for the gap's sake.
+    rho = factor.rho[-1]
+    y = factor.E * rho * (t - bounds.project(t, rho))
+    y = jnp.where(factor.E == 0, s.bounds.push(s.rows(x, u)), y)
+    u, y = u, s.bounds.admissible(y)
+    if solver.refine:
+        new_u, new_y = polish(factor, sample, bounds, u, y, solver.refine)
+        new_y = s.bounds.admissible(new_y)
+        both = (jnp.stack([u, new_u]), jnp.stack([y, new_y]))
+        found = jax.vmap(lambda u, y: worst(s, sample, u, y))(*both)
+        better = found[1] < found[0]  # False for NaN
+        u, y = (jnp.where(better, pair[1], pair[0]) for pair in both)
+    status, primal, dual, gap = assess(s, sample, u, y, solver.eps)
+    x = predict(s, sample.x0, u)
+    J = cost(mpc, x, u, sample.states, sample.inputs)
+    nan = lambda v: jnp.where(finite, v, jnp.nan)
+    solution = QPSolution(
+        z=nan(u.ravel()), y=nan(y), cost=nan(J),
+        status=jnp.where(finite, status, Status.NON_FINITE).astype(jnp.int32),
+        primal_residual=nan(primal), dual_residual=nan(dual), gap=nan(gap),
+        iterations=jnp.asarray(solver.iterations, jnp.int32),
+        certificate=jnp.zeros_like(y), ray=jnp.zeros_like(u.ravel()),
+    )  # fmt: skip
+    return Plan(
+        states=nan(x), inputs=nan(u), cost=solution.cost, slack=nan(slack(mpc, x, u)),
+        multipliers=multipliers(mpc, s.layout, solution.y), status=solution.status,
+        primal_residual=solution.primal_residual, dual_residual=solution.dual_residual,
+        gap=solution.gap, iterations=solution.iterations, qp=solution,
+    )  # fmt: skip
+
+
+def start(factor: StageFactor, sample: Sample, bounds: Bounds, warm_start: Any) -> Array:
+    """t = s + v of a warm start (u, y); what is not finite counts as 0. None: u = 0, y = 0."""
+    s, rho, dtype = factor.stages, factor.rho[0], factor.E.dtype
+    shape = (s.horizon, s.B.shape[-1])
+    if warm_start is None:
+        return factor.E * s.rows(predict(s, sample.x0, u := jnp.zeros(shape, dtype)), u)
+    u, y = warm_start
+    if np.shape(u) not in (shape, (shape[0] * shape[1],)):
+        fail("warm_start z", f"shape {np.shape(u)}", f"Needed: {shape}")
+    if np.shape(y) != factor.E.shape:
+        fail("warm_start y", f"shape {np.shape(y)}", f"Needed: {factor.E.shape}")
+    clean = lambda v: jnp.nan_to_num(jnp.asarray(v, dtype), posinf=0.0, neginf=0.0)
+    u, push = clean(u).reshape(shape), unscaled(factor.E, clean(y)) / rho
+    rows = factor.E * s.rows(predict(s, sample.x0, u), u)
+    return bounds.project(rows + push, rho) + push
+
+
+def assess(s: Stages, sample: Sample, u: Array, y: Array, eps: Any) -> tuple[Array, ...]:
+    """Status and residuals of u and y by the rule of `qp.solve.assess`, in float64."""
+    dtype = u.dtype
+    single = dtype != jnp.float64
+    eps = (1e-3 if single else 1e-6) if eps is None else eps
+    floor = (4 if single else 100) * float(jnp.finfo(dtype).eps)
+
+    def measure(s: Stages, sample: Sample, u: Array, y: Array, eps: Array) -> tuple[Array, ...]:
+        solved, terms = jnp.asarray(True), residual_terms(s, sample, u, y)
+        for value, size in terms:
+            solved = solved & jnp.all(jnp.abs(value) <= eps + floor * size)
+        return (solved, *(largest(value) for value, _ in terms))
+
+    solved, *found = precisely(measure, s, sample, u, y, jnp.asarray(eps, dtype))
+    return (jnp.where(solved, Status.SOLVED, Status.ITERATION_LIMIT), *found)

@@ -1,0 +1,93 @@
+"""A linear system as a plant, behind the interface of robots."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import fail
+from jaxmpc.control.equilibrium import equilibrium
+from jaxmpc.control.sets import Box
+from jaxmpc.control.system import LinearSystem
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class LinearPlant:
+    """x⁺ = A x + B u + c with limits: what `Robot` is, for a plant that is linear indeed.
+
+    system: LinearSystem with dt. state_limits (n,), input_limits (m,): Boxes, ±inf for no limit.
+    home (n,): set-point, zeros if not given.
+    """
+
+    system: LinearSystem
+    state_limits: Box
+    input_limits: Box
+    home: Any = None
+    name: str = field(default="linear", metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        if isinstance(self.system, LinearSystem) and self.home is None:
+            object.__setattr__(self, "home", np.zeros(self.n))
+
+    def validate(self) -> None:
+        """Raise ValueError for a bad system, or limits of other sizes."""
+        if not isinstance(self.system, LinearSystem):
+            fail("system", f"is a {type(self.system).__name__}", "Give a jm.LinearSystem")
+        self.system.validate()
+        if self.system.dt is None:
+            fail("system.dt", "is None", "Give the sampling period in seconds")
+        self.state_limits.validate("state_limits", self.n)
+        self.input_limits.validate("input_limits", self.m)
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return self.system.n
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return self.system.m
+
+    @property
+    def state_size(self) -> int:
+        """Numbers in the state, n."""
+        return self.system.n
+
+    @property
+    def dt(self) -> float:
+        """Control period (s)."""
+        assert self.system.dt is not None
+        return self.system.dt
+
+    def step(self, x: Any, u: Any) -> Array:
+        """The next state (n,)."""
+        return self.system.step(x, u)
+
+    def linearize(self, x: Any, u: Any, *, exact: bool = True) -> LinearSystem:
+        """The system itself, whatever x and u."""
+        return self.system
+
+    def coordinates(self, x: Any) -> Any:
+        """x itself."""
+        return x
+
+    def state(self, coordinates: Any) -> Any:
+        """The coordinates themselves."""
+        return coordinates
+
+    def equilibrium(self, x: Any = None) -> tuple[np.ndarray, np.ndarray]:
+        """(x, u): the state x (n,), None for home, and the input that holds it; see
+        `jaxmpc.equilibrium`. Raises ValueError where none does, or only beyond the limits."""
+        target = self.home if x is None else x
+        return equilibrium(self.system, target, states=self.state_limits, inputs=self.input_limits)
+
+    def vary(self, **numbers: Any) -> "LinearPlant":
+        """The plant with another A, B or c."""
+        strange = set(numbers) - {"A", "B", "c"}
+        if strange:
+            fail(sorted(strange)[0], "is no number of a linear plant", "Give A, B or c")
+        return replace(self, system=replace(self.system, **numbers))

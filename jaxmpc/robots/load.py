@@ -1,0 +1,281 @@
+"""load_robot: from a model file to a Robot, its limits read and checked."""
+
+import copy
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxmpc.checks import fail
+from jaxmpc.control.limits import Limit, limit_pair
+from jaxmpc.control.sets import Box
+from jaxmpc.control.system import require_period
+from jaxmpc.robots.physics import Physics
+from jaxmpc.robots.robot import Robot
+
+if TYPE_CHECKING:
+    import mujoco
+
+MODELS = ("joint", "pendulum", "cartpole", "arm2", "arm6", "arm7", "quadrotor")
+
+
+def load_robot(
+    model: "str | Path | mujoco.MjModel", *, position: Limit = None, velocity: Limit = None,
+    torque: Limit = None, home: Any = None, control_period: float | None = None,
+    timestep: float | None = None,
+) -> Robot:  # fmt: skip
+    """A robot from a model of ours, an MJCF or URDF file, or a mujoco.MjModel.
+
+    Arguments:
+        model: "joint" (the lesson's), "pendulum", "cartpole", "arm2", "arm6" (UR5e), "arm7" (Franka
+            FER), "quadrotor" (Crazyflie 2), or a path. A URDF gets a motor for each joint
+            with its `effort` as limit, its `velocity` limits are read, and its meshes are left out.
+        position, velocity, torque: limits in place of the file's, as `joint_limits` takes them:
+            (lower, upper), each a number or one a dof (torque: one an actuator), or v for
+            |.| ≤ v. They bind the controller; the joint stops of the plant stay.
+        home: configuration (nq,) in place of the file's.
+        control_period: seconds between inputs; a multiple of timestep, the physics step (s).
+
+    What the file does not say by `<numeric name="velocity_limit">`, `<numeric name=
+    "control_period">` and `<key name="home">` is: none, 10 ms (rounded to physics steps), and the
+    model's qpos0 moved inside the joint ranges. Input limits are the narrowest of `ctrlrange`,
+    and for motors `forcerange` and the joint's `actuatorfrcrange`.
+
+    Raises ValueError for files that MuJoCo cannot read, models without actuators or joints or with
+    activation states, what MJX does not support, and limits that contradict each other.
+    Contacts and other constraints act in the plant and not in the linear models (`Robot`).
+    """
+    import mujoco
+
+    velocities: dict[str, float] = {}
+    name = "robot"
+    if isinstance(model, str | Path):
+        name = Path(model).stem
+        model, velocities = _read(model)
+    elif not isinstance(model, mujoco.MjModel):
+        fail("model", f"is a {type(model).__name__}", "Give a name, a path or a mujoco.MjModel")
+    host = copy.deepcopy(model)
+    if host.nv == 0:
+        fail("model", f"{name} has no joints", "A robot has something to move")
+    if host.nu == 0:
+        fail("model", f"{name} has no actuators", "Add <actuator><motor joint=.../></actuator>")
+    if host.na:
+        fail("model", f"{name} has {host.na} activation states", "Use actuators with dyntype none")
+    if timestep is not None:
+        require_period("timestep", timestep)
+        host.opt.timestep = timestep
+    h = host.opt.timestep
+    if control_period is None:
+        control_period = float(_numeric(host, "control_period", max(1, round(0.01 / h)) * h))
+    require_period("control_period", control_period)
+    substeps = round(control_period / h)
+    if substeps < 1 or abs(substeps * h - control_period) > 1e-9 * control_period:
+        fail(
+            "control_period", f"{control_period:g} s is no multiple of the physics step {h:g} s",
+            "Give whole multiples, or another timestep",
+        )  # fmt: skip
+
+    host.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
+    inputs = _input_limits(host, torque)
+    smooth = copy.deepcopy(host)
+    smooth.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    smooth.actuator_forcelimited[:] = 0
+    smooth.jnt_actfrclimited[:] = 0
+    names, units = _state_names(host)
+    states = _state_limits(host, position, velocity, velocities)
+    robot = Robot(
+        state_limits=states, input_limits=inputs, home=None, plant=Physics(host),
+        predictor=Physics(smooth), substeps=substeps, dt=control_period, name=name,
+        state_names=names, state_units=units,
+        input_names=tuple(_names(host, mujoco.mjtObj.mjOBJ_ACTUATOR, host.nu, "u")),
+        input_units=tuple(_input_unit(host, i) for i in range(host.nu)),
+    )  # fmt: skip
+    q = _home(host) if home is None else robot._configurations("home", home)
+    if q.ndim != 1:
+        fail("home", f"shape {q.shape}", f"Give one configuration ({host.nq},)")
+    return replace(robot, home=np.concatenate([q, np.zeros(host.nv)]))
+
+
+def _read(model: str | Path) -> tuple["mujoco.MjModel", dict[str, float]]:
+    """The compiled model, and the velocity limits of a URDF by joint."""
+    import mujoco
+
+    path = Path(model)
+    if str(model) in MODELS:
+        path = Path(str(resources.files("jaxmpc.robots"))) / "models" / f"{model}.xml"
+    elif not path.is_file():
+        fail("model", f"{str(model)!r} is no file", f"Give a path, or one of {', '.join(MODELS)}")
+    velocities: dict[str, float] = {}
+    try:
+        if path.suffix.lower() == ".urdf":
+            text, velocities = _without_meshes(path.read_text())
+            spec = mujoco.MjSpec.from_string(text)
+            _add_motors(spec)
+            return spec.compile(), velocities
+        return mujoco.MjModel.from_xml_path(str(path)), velocities
+    except (ValueError, ElementTree.ParseError) as error:
+        text = " ".join(str(error).split())
+        fail("model", f"{path} cannot be read: {text}", "Mend the file")
+
+
+def _without_meshes(text: str) -> tuple[str, dict[str, float]]:
+    """A URDF without visual and collision geometry, and the velocity limit of each joint."""
+    root = ElementTree.fromstring(text)
+    for link in root.iter("link"):
+        for kind in ("visual", "collision"):
+            for element in link.findall(kind):
+                link.remove(element)
+    limits = ((joint.get("name"), joint.find("limit")) for joint in root.iter("joint"))
+    velocities = {
+        str(name): float(limit.get("velocity", "inf"))
+        for name, limit in limits
+        if limit is not None
+    }
+    return ElementTree.tostring(root, encoding="unicode"), velocities
+
+
+def _add_motors(spec: "mujoco.MjSpec") -> None:
+    """A motor for each hinge and slide joint; a URDF cannot have any."""
+    import mujoco
+
+    single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    for joint in spec.joints:
+        if joint.type in single:
+            motor = spec.add_actuator(name=joint.name, target=joint.name)
+            motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
+            motor.set_to_motor()
+
+
+def _numeric(host: "mujoco.MjModel", name: str, default: Any) -> Any:
+    """The custom numbers of this name in the file."""
+    import mujoco
+
+    i = mujoco.mj_name2id(host, mujoco.mjtObj.mjOBJ_NUMERIC, name)
+    if i < 0:
+        return default
+    start, size = host.numeric_adr[i], host.numeric_size[i]
+    value = host.numeric_data[start : start + size].copy()
+    return value[0] if size == 1 else value
+
+
+def _names(host: "mujoco.MjModel", kind: Any, count: int, letter: str) -> list[str]:
+    import mujoco
+
+    return [mujoco.mj_id2name(host, kind, i) or f"{letter}{i + 1}" for i in range(count)]
+
+
+def _state_names(host: "mujoco.MjModel") -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names and units of the coordinates, positions first."""
+    import mujoco
+
+    free, ball, slide, _ = range(4)
+    positions: list[tuple[str, str]] = []
+    for name, kind in zip(
+        _names(host, mujoco.mjtObj.mjOBJ_JOINT, host.njnt, "q"), host.jnt_type, strict=True
+    ):
+        if kind == free:
+            positions += [(f"{name} {axis}", "m") for axis in "xyz"]
+        if kind in (free, ball):
+            positions += [(f"{name} rotation {axis}", "rad") for axis in "xyz"]
+        else:
+            positions.append((name, "m" if kind == slide else "rad"))
+    names = [name for name, _ in positions] + [f"{name} velocity" for name, _ in positions]
+    units = [unit for _, unit in positions] + [f"{unit}/s" for _, unit in positions]
+    return tuple(names), tuple(units)
+
+
+def _input_unit(host: "mujoco.MjModel", i: int) -> str:
+    """Unit of an actuator's input: force or torque of a joint's motor, else unknown."""
+    if not _is_motor(host, i):
+        return ""
+    return "N" if host.jnt_type[host.actuator_trnid[i, 0]] == 2 else "N m"
+
+
+def _is_motor(host: "mujoco.MjModel", i: int) -> bool:
+    """Whether an actuator puts a multiple of its input on one hinge or slide joint."""
+    import mujoco
+
+    return (
+        host.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
+        and host.jnt_type[host.actuator_trnid[i, 0]] in (2, 3)
+        and host.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
+        and host.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
+    )
+
+
+def _input_limits(host: "mujoco.MjModel", override: Limit) -> Box:
+    """The box of inputs; what it takes over of a motor's force limits is dropped in `host`."""
+    lower, upper = np.full(host.nu, -np.inf), np.full(host.nu, np.inf)
+    limited = host.actuator_ctrllimited.astype(bool)
+    lower[limited], upper[limited] = host.actuator_ctrlrange[limited].T
+    joints = host.actuator_trnid[:, 0]
+    for i in range(host.nu):
+        gain, gear = host.actuator_gainprm[i, 0], host.actuator_gear[i, 0]
+        if not _is_motor(host, i) or gain * gear == 0:
+            continue
+        alone = np.sum(joints == joints[i]) == 1
+        ends = []
+        if host.actuator_forcelimited[i]:
+            ends.append(host.actuator_forcerange[i] / gain)
+            host.actuator_forcelimited[i] = 0
+        if host.jnt_actfrclimited[joints[i]] and alone:
+            ends.append(host.jnt_actfrcrange[joints[i]] / (gain * gear))
+            host.jnt_actfrclimited[joints[i]] = 0
+        for end in ends:
+            lower[i], upper[i] = max(lower[i], end.min()), min(upper[i], end.max())
+    limits = Box(lower, upper)
+    return _overridden("torque", limits, override, slice(None))
+
+
+def _state_limits(
+    host: "mujoco.MjModel", position: Limit, velocity: Limit, of_file: dict[str, float]
+) -> Box:
+    """Limits of the coordinates ξ: joint ranges and velocities."""
+    import mujoco
+
+    nv = host.nv
+    lower, upper = np.full(2 * nv, -np.inf), np.full(2 * nv, np.inf)
+    names = _names(host, mujoco.mjtObj.mjOBJ_JOINT, host.njnt, "q")
+    for j in range(host.njnt):
+        dof = host.jnt_dofadr[j]
+        if host.jnt_limited[j] and host.jnt_type[j] in (2, 3):
+            lower[dof], upper[dof] = host.jnt_range[j]
+        lower[nv + dof], upper[nv + dof] = np.array([-1, 1]) * of_file.get(names[j], np.inf)
+    speeds = np.atleast_1d(_numeric(host, "velocity_limit", np.inf))
+    if speeds.size not in (1, nv):
+        fail("velocity_limit", f"{speeds.size} numbers in the file, {nv} dofs", "Give one a dof")
+    speeds = np.broadcast_to(speeds, nv)
+    lower[nv:], upper[nv:] = np.maximum(lower[nv:], -speeds), np.minimum(upper[nv:], speeds)
+    limits = _overridden("position", Box(lower, upper), position, slice(0, nv))
+    return _overridden("velocity", limits, velocity, slice(nv, None))
+
+
+def _overridden(argument: str, limits: Box, override: Limit, part: slice) -> Box:
+    """The box with some of its bounds replaced; ValueError where it is empty."""
+    lower, upper = np.array(limits.lower), np.array(limits.upper)
+    if override is not None:
+        size = len(lower[part])
+        for ends, end in zip((lower, upper), limit_pair(argument, override), strict=True):
+            if np.shape(end) not in ((), (size,)):
+                fail(argument, f"{np.size(end)} entries where {size} are needed", "Or one number")
+            ends[part] = end
+    Box(lower[part], upper[part]).validate(argument)
+    return Box(lower, upper)
+
+
+def _home(host: "mujoco.MjModel") -> np.ndarray:
+    """qpos of the key "home", else of the first key, else qpos0 moved inside the ranges."""
+    import mujoco
+
+    i = mujoco.mj_name2id(host, mujoco.mjtObj.mjOBJ_KEY, "home")
+    if host.nkey:
+        return host.key_qpos[max(i, 0)].copy()
+    q = host.qpos0.copy()
+    for j in range(host.njnt):
+        if host.jnt_limited[j] and host.jnt_type[j] in (2, 3):
+            i = host.jnt_qposadr[j]
+            q[i] = np.clip(q[i], *host.jnt_range[j])
+    return q

@@ -1,0 +1,337 @@
+"""A robot of MuJoCo as a plant: one control period forward, and its affine model.
+
+Two models of one file. The plant is the model as written. The predictor is the same without
+constraint rows (joint limits, contacts, friction loss, equalities): a stiff spring at a joint's
+end makes a linear model useless one sample later, so limits belong into the MPC. Both take inputs
+as they are, without MuJoCo's clamp to `ctrlrange`, whose derivative is wrong at the bound, where
+MPC sits: keeping u inside `input_limits` is the controller's work.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import fail, require_finite, require_shape
+from jaxmpc.control.sets import Box
+from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.qp.precision import matmul
+from jaxmpc.robots.physics import Physics, with_forward_jacobian
+from jaxmpc.robots.tangent import difference, quaternions, retract
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A MuJoCo model as a plant with sampled inputs; made by `load_robot`.
+
+    State of the plant: x = (qpos, qvel), size nq + nv. State of models and controllers: coordinates
+    ξ = (q ⊖ anchor, qvel), size n = 2 nv: hinge and slide joints as they are, free positions as
+    they are, orientations as the rotation vector (rad) from that of `home`. Without quaternions
+    both are the same numbers. The input u (m,) is MuJoCo's ctrl, held for a control period dt (s)
+    of `substeps` physics steps. Units are MuJoCo's: m, rad, s, kg, N, N m.
+
+    state_limits (in ξ), input_limits: Boxes, ±inf for no limit. home (nq + nv,): the set-point of
+    the file. plant, predictor: `Physics`, constants of compiled programs (twice to ten times as
+    fast as arguments); numbers: what a batch varies of the plant (masses, damping), see `vary`.
+    """
+
+    state_limits: Box
+    input_limits: Box
+    home: Any
+    plant: Physics = field(metadata={"static": True})
+    predictor: Physics = field(metadata={"static": True})
+    substeps: int = field(metadata={"static": True})
+    dt: float = field(metadata={"static": True})
+    name: str = field(default="", metadata={"static": True})
+    state_names: tuple[str, ...] = field(default=(), metadata={"static": True})
+    state_units: tuple[str, ...] = field(default=(), metadata={"static": True})
+    input_names: tuple[str, ...] = field(default=(), metadata={"static": True})
+    input_units: tuple[str, ...] = field(default=(), metadata={"static": True})
+    numbers: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def mujoco(self) -> "mujoco.MjModel":
+        """The plant as MuJoCo's own model, for rendering and the C engine."""
+        return self.plant.model
+
+    @property
+    def n(self) -> int:
+        """Number of coordinates ξ, 2 nv."""
+        return 2 * self.mujoco.nv
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return self.mujoco.nu
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """mjtJoint of each joint."""
+        return tuple(int(joint) for joint in self.mujoco.jnt_type)
+
+    @property
+    def state_size(self) -> int:
+        """Numbers in the state x, nq + nv."""
+        return self.mujoco.nq + self.mujoco.nv
+
+    def step(self, x: Any, u: Any) -> Array:
+        """The state x (nq + nv,) one control period later under the input u (m,), held.
+
+        Differentiable in x, u and the numbers of `plant`, in forward and reverse mode, also where
+        MJX's constraint solver loops: each physics step gives its Jacobian by forward mode. Second
+        derivatives: forward mode over either.
+        """
+        x, u = self._read(x, u)
+        advance = with_forward_jacobian(self.plant.step)
+        body = lambda x, _: (advance(x, u, self.numbers), None)
+        return jax.lax.scan(body, x, length=self.substeps)[0]
+
+    def linearize(self, x: Any, u: Any, *, exact: bool = False) -> LinearSystem:
+        """Affine model ξ⁺ = A ξ + B u + c of a whole control period about x (nq + nv,), u (m,).
+
+        Of the predictor, by automatic differentiation. exact=False: one physics step is linearised
+        and its affine map applied `substeps` times (a tenth of the cost; on a 7-joint arm A is off
+        by 1 %, B by 0.05 %). exact=True: Jacobians along the physics steps, and c such that the
+        model passes through the predictor's own next state.
+        """
+        x, u = self._read(x, u)
+        advance = lambda s, u: self.coordinates(self.predictor.step(self.state(s), u))
+
+        def affine(s: Array) -> tuple[Array, Array, Array]:
+            moved = lambda s, u: (advance(s, u),) * 2
+            (A, B), after = jax.jacfwd(moved, argnums=(0, 1), has_aux=True)(s, u)
+            return A, B, after
+
+        start = self.coordinates(x)
+        zero = jnp.zeros((self.n, self.m), x.dtype)
+        if exact:
+
+            def chain(carry: tuple, _: None) -> tuple[tuple, None]:
+                s, A, B = carry
+                A_1, B_1, after = affine(s)
+                return (after, matmul(A_1, A), matmul(A_1, B) + B_1), None
+
+            first = (start, jnp.eye(self.n, dtype=x.dtype), zero)
+            (after, A, B), _ = jax.lax.scan(chain, first, length=self.substeps)
+            c = after - matmul(A, start) - matmul(B, u)
+        else:
+            A_1, B_1, after = affine(start)
+            c_1 = after - matmul(A_1, start) - matmul(B_1, u)
+            A, B, c = A_1, B_1, c_1
+            for _ in range(self.substeps - 1):
+                A, B, c = matmul(A_1, A), matmul(A_1, B) + B_1, matmul(A_1, c) + c_1
+        return LinearSystem(
+            A, B, c, self.dt, state_names=self.state_names, state_units=self.state_units,
+            input_names=self.input_names, input_units=self.input_units,
+        )  # fmt: skip
+
+    def transition(self, x: Any, u: Any) -> tuple[Array, Array]:
+        """A (n, n), B (n, m) of one physics step of the plant about x, u, small motions against
+        small motions: those of mujoco.mjd_transitionFD, by automatic differentiation."""
+        x, u = self._read(x, u)
+        nq, nv = self.mujoco.nq, self.mujoco.nv
+        after = self.plant.step(x, u, self.numbers)
+
+        def motion(d: Array, u: Array) -> Array:
+            moved = jnp.concatenate([retract(self.joints, x[:nq], d[:nv]), x[nq:] + d[nv:]])
+            y = self.plant.step(moved, u, self.numbers)
+            return jnp.concatenate([difference(self.joints, after[:nq], y[:nq]), y[nq:]])
+
+        A, B = jax.jacfwd(motion, argnums=(0, 1))(jnp.zeros(self.n, x.dtype), u)
+        return A, B
+
+    def coordinates(self, x: Any) -> Array:
+        """ξ (n,) of a state x (nq + nv,)."""
+        x = jnp.asarray(x)
+        if not quaternions(self.joints):
+            return x
+        nq = self.mujoco.nq
+        anchor = jnp.asarray(self.anchor, x.dtype)
+        return jnp.concatenate([difference(self.joints, anchor, x[:nq]), x[nq:]])
+
+    def state(self, coordinates: Any) -> Array:
+        """x (nq + nv,) with the coordinates ξ (n,)."""
+        xi = jnp.asarray(coordinates)
+        if not quaternions(self.joints):
+            return xi
+        nv = self.mujoco.nv
+        anchor = jnp.asarray(self.anchor, xi.dtype)
+        return jnp.concatenate([retract(self.joints, anchor, xi[:nv]), xi[nv:]])
+
+    @property
+    def anchor(self) -> np.ndarray:
+        """Configuration (nq,) with ξ = 0: zeros, with the orientations of `home`."""
+        anchor, home = np.zeros(self.mujoco.nq), np.asarray(self.home)
+        for joint, i in zip(self.joints, self.mujoco.jnt_qposadr, strict=True):
+            i = i + (3 if joint == 0 else 0)
+            if joint in (0, 1):
+                anchor[i : i + 4] = home[i : i + 4]
+        return anchor
+
+    def equilibrium(self, q: Any = None) -> tuple[np.ndarray, np.ndarray]:
+        """(x, u): the robot at rest in the configuration q (nq,), and the input that holds it.
+
+        q: None for that of `home`; (..., nq) for many. u solves J'u = bias − passive forces
+        (gravity compensation), the least one where there are several. Limits' springs, contacts and
+        dry friction do not help. Host, float64, by MuJoCo's C engine.
+
+        Raises ValueError where the actuators cannot hold q at all, or only beyond input_limits.
+        """
+        q = self._configurations("q", self.home[: self.mujoco.nq] if q is None else q)
+        still = np.zeros((*q.shape[:-1], self.mujoco.nv))
+        u = self.inverse_dynamics(q, still, still)
+        lower, upper = np.asarray(self.input_limits.lower), np.asarray(self.input_limits.upper)
+        over = np.maximum(lower - u, u - upper)
+        if np.any(over > 1e-9):
+            i = int(np.argmax(over.reshape(-1, self.m).max(axis=0)))
+            fail(
+                "q", f"needs {self.input_names[i]} = {u.reshape(-1, self.m)[:, i]}, the limits are "
+                f"[{lower[i]:g}, {upper[i]:g}]", "Choose a configuration that the actuators hold",
+            )  # fmt: skip
+        return np.concatenate([q, still], axis=-1), u
+
+    def inverse_dynamics(self, q: Any, velocity: Any, acceleration: Any) -> np.ndarray:
+        """Inputs u (..., m) that give `acceleration` (..., nv) at q (..., nq), velocity (..., nv).
+
+        Of the predictor, in continuous time. Host, float64, by MuJoCo's C engine (mj_inverse).
+        Raises ValueError where no input does.
+        """
+        import mujoco
+
+        nv = self.mujoco.nv
+        q = self._configurations("q", q)
+        rates = []
+        for argument, value in (("velocity", velocity), ("acceleration", acceleration)):
+            require_shape(argument, value, (*q.shape[:-1], nv), "One number for each dof")
+            require_finite(argument, value)
+            rates.append(host_array(argument, value).reshape(-1, nv))
+        smooth = self.predictor.model
+        data, found = mujoco.MjData(smooth), []
+        for position, speed, change in zip(q.reshape(-1, q.shape[-1]), *rates, strict=True):
+            data.qpos, data.qvel, data.qacc = position, speed, change
+            data.ctrl = 0
+            mujoco.mj_inverse(smooth, data)
+            needed = data.qfrc_inverse.copy()
+            forces = []
+            for i in range(-1, self.m):  # forces of the actuators are affine in u
+                data.ctrl = np.arange(self.m) == i
+                mujoco.mj_fwdPosition(smooth, data)
+                mujoco.mj_fwdVelocity(smooth, data)
+                mujoco.mj_fwdActuation(smooth, data)
+                forces.append(data.qfrc_actuator.copy())
+            J, offset = np.array(forces[1:]).T - forces[0][:, None], forces[0]
+            u = np.linalg.lstsq(J, needed - offset, rcond=None)[0]
+            missing = np.abs(J @ u + offset - needed)
+            if np.any(missing > 1e-6 * (1 + np.abs(needed).max())):
+                dof = self.state_names[int(np.argmax(missing))]
+                fail(
+                    "q", f"{position}: no input balances the forces; {missing.max():.3g} are "
+                    f"missing at {dof}", "Choose a motion that the actuators can make",
+                )  # fmt: skip
+            found.append(u)
+        return np.array(found).reshape(*q.shape[:-1], self.m)
+
+    def trajectory(self, positions: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Reference and input reference of a motion given by its positions, for `simulate`.
+
+        positions (K, nv): coordinates of the joints once a control period. Returns states (K, n)
+        with velocities by central differences, and inputs (K, m) by inverse dynamics. Host.
+        """
+        nv = self.mujoco.nv
+        given = host_array("positions", positions)
+        if given.ndim != 2 or given.shape[1] != nv or len(given) < 3:
+            fail("positions", f"shape {given.shape}", f"Give (K, {nv}) with K ≥ 3 samples")
+        require_finite("positions", given)
+        velocity = np.gradient(given, self.dt, axis=0)
+        acceleration = np.gradient(velocity, self.dt, axis=0)
+        with jax.enable_x64(True):
+            q = np.array([self.state(np.append(p, 0 * p))[: self.mujoco.nq] for p in given])
+        return np.hstack([given, velocity]), self.inverse_dynamics(q, velocity, acceleration)
+
+    def vary(self, **numbers: Any) -> "Robot":
+        """The same robot with other numbers in its plant; models and controllers keep theirs.
+
+        numbers: fields of mjx.Model by name, such as body_mass (nbody,), dof_damping (nv,),
+        dof_frictionloss, dof_armature, actuator_gear; or payload (kg): a point mass at the site
+        "tool", a number. Works under `jax.vmap`, which is how a batch gets a robot each; the
+        inverse weights that shape MuJoCo's soft limits stay those of the file.
+        """
+        payload = numbers.pop("payload", None)
+        for key, value in numbers.items():
+            present = getattr(self.plant.mjx, key, None)
+            if key.startswith("_") or not hasattr(present, "shape"):
+                fail(key, "is no array of mjx.Model", "Give fields such as body_mass, dof_damping")
+            require_shape(key, value, np.shape(present), "As in robot.plant.mjx")
+            require_finite(key, value)
+        varied = {**self.numbers, **numbers}
+        if payload is not None:
+            varied |= self._loaded(payload, varied)
+        return replace(self, numbers=varied)
+
+    def _loaded(self, payload: Any, varied: dict[str, Any]) -> dict[str, Array]:
+        """Mass, centre and inertia of the body that carries the site "tool", with a point mass
+        there: parallel axes about the new centre (Steiner), then principal axes."""
+        import mujoco
+
+        site = mujoco.mj_name2id(self.mujoco, mujoco.mjtObj.mjOBJ_SITE, "tool")
+        if site < 0:
+            fail("payload", "the model has no site named tool", "Add one where loads are held")
+        require_shape("payload", payload, (), "Mass in kg")
+        i, at = int(self.mujoco.site_bodyid[site]), jnp.asarray(self.mujoco.site_pos[site])
+        of = lambda key: jnp.asarray(varied.get(key, getattr(self.plant.mjx, key)))
+        mass, centre = of("body_mass")[i], of("body_ipos")[i]
+        total = mass + payload
+        middle = (mass * centre + payload * at) / total
+        w, *v = of("body_iquat")[i]
+        v = jnp.asarray(v)
+        cross = lambda a: jnp.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
+        turn = jnp.eye(3) + 2 * w * cross(v) + 2 * matmul(cross(v), cross(v))
+        inertia = matmul(turn * of("body_inertia")[i], turn.T)
+        for m, p in ((mass, centre), (payload, at)):
+            inertia = inertia + m * matmul(cross(p - middle).T, cross(p - middle))
+        principal, axes = jnp.linalg.eigh(inertia)
+        axes = axes * jnp.sign(jnp.linalg.det(axes))
+        put = lambda key, value: of(key).at[i].set(value)
+        return {
+            "body_mass": put("body_mass", total), "body_ipos": put("body_ipos", middle),
+            "body_inertia": put("body_inertia", principal),
+            "body_iquat": put("body_iquat", _quaternion(axes)),
+        }  # fmt: skip
+
+    def _read(self, x: Any, u: Any) -> tuple[Array, Array]:
+        size = self.mujoco.nq + self.mujoco.nv
+        problem = "Give (qpos, qvel) of one robot; use jax.vmap for many"
+        if np.shape(x) == (self.n,) != (size,):
+            problem = "That is the size of the coordinates: robot.state(ξ) makes a state of them"
+        require_shape("x", x, (size,), problem)
+        require_shape("u", u, (self.m,), "One number for each actuator")
+        dtype = jnp.result_type(float, *(v for v in (x, u) if hasattr(v, "dtype")))
+        return jnp.asarray(x, dtype), jnp.asarray(u, dtype)
+
+    def _configurations(self, argument: str, q: Any) -> np.ndarray:
+        q = host_array(argument, q)
+        if q.shape[-1:] != (self.mujoco.nq,):
+            fail(argument, f"shape {q.shape}", f"Give (..., {self.mujoco.nq}), as in qpos")
+        require_finite(argument, q)
+        return q
+
+
+def _quaternion(R: Array) -> Array:
+    """Unit quaternion (w first) of a rotation matrix: the eigenvector of Bar-Itzhack's K (2000,
+    J. Guidance 23, eq. 6) with the largest eigenvalue, right for every rotation."""
+    x, y, z = R[:, 0], R[:, 1], R[:, 2]
+    K = jnp.array([
+        [x[0] - y[1] - z[2], y[0] + x[1], z[0] + x[2], y[2] - z[1]],
+        [y[0] + x[1], y[1] - x[0] - z[2], z[1] + y[2], z[0] - x[2]],
+        [z[0] + x[2], z[1] + y[2], z[2] - x[0] - y[1], x[1] - y[0]],
+        [y[2] - z[1], z[0] - x[2], x[1] - y[0], x[0] + y[1] + z[2]],
+    ])  # fmt: skip
+    q = jnp.linalg.eigh(K / 3)[1][:, -1]
+    return jnp.array([q[3], q[0], q[1], q[2]])

@@ -1,0 +1,85 @@
+"""Configurations and their tangent space, joint by joint, as MuJoCo defines them.
+
+A configuration q (nq,) has four numbers for an orientation (unit quaternion, w first), a small
+motion dq (nv,) three: a rotation vector in the frame of the body. For hinge and slide joints
+both are the same number. `retract` is mj_integratePos over unit time, `difference` its inverse,
+mj_differentiatePos; both are smooth where the rotation is zero, and differentiable there.
+"""
+
+import jax.numpy as jnp
+from jax import Array
+
+# mjtJoint: free (3 + 4 numbers), ball (4), slide (1), hinge (1).
+FREE, BALL = 0, 1
+
+# Below this angle² the series of sin and cos are exact in float64.
+SMALL = 1e-8
+
+
+def retract(joints: tuple[int, ...], q: Array, dq: Array) -> Array:
+    """q ⊕ dq (nq,): the configuration q (nq,) moved by dq (nv,). joints: mjtJoint numbers."""
+    if not quaternions(joints):
+        return q + dq
+    parts, i, j = [], 0, 0
+    for joint in joints:
+        if joint == FREE:
+            parts.append(q[i : i + 3] + dq[j : j + 3])
+            i, j = i + 3, j + 3
+        if joint in (FREE, BALL):
+            parts.append(_product(q[i : i + 4], _exponential(dq[j : j + 3])))
+            i, j = i + 4, j + 3
+        else:
+            parts.append(q[i : i + 1] + dq[j : j + 1])
+            i, j = i + 1, j + 1
+    return jnp.concatenate(parts)
+
+
+def difference(joints: tuple[int, ...], start: Array, end: Array) -> Array:
+    """end ⊖ start (nv,): the motion dq with start ⊕ dq = end, rotations of at most π."""
+    if not quaternions(joints):
+        return end - start
+    parts, i = [], 0
+    for joint in joints:
+        if joint == FREE:
+            parts.append(end[i : i + 3] - start[i : i + 3])
+            i += 3
+        if joint in (FREE, BALL):
+            inverse = start[i : i + 4] * jnp.array([1.0, -1.0, -1.0, -1.0], start.dtype)
+            parts.append(_logarithm(_product(inverse, end[i : i + 4])))
+            i += 4
+        else:
+            parts.append(end[i : i + 1] - start[i : i + 1])
+            i += 1
+    return jnp.concatenate(parts)
+
+
+def quaternions(joints: tuple[int, ...]) -> bool:
+    """Whether an orientation is among the joints, so that nq and nv differ."""
+    return any(joint in (FREE, BALL) for joint in joints)
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Hamilton product."""
+    vector = a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])
+    return jnp.concatenate([(a[0] * b[0] - jnp.dot(a[1:], b[1:]))[None], vector])
+
+
+def _exponential(w: Array) -> Array:
+    """Quaternion of the rotation by |w| about w: (cos |w|/2, w sin(|w|/2)/|w|)."""
+    squared = jnp.dot(w, w)
+    small = squared < SMALL
+    angle = jnp.sqrt(jnp.where(small, 1.0, squared))  # no sqrt at 0: its derivative is infinite
+    real = jnp.where(small, 1 - squared / 8, jnp.cos(angle / 2))
+    ratio = jnp.where(small, 0.5 - squared / 48, jnp.sin(angle / 2) / angle)
+    return jnp.concatenate([real[None], ratio * w])
+
+
+def _logarithm(q: Array) -> Array:
+    """Rotation vector of a unit quaternion, the shorter way: 2 atan2(|v|, w) v/|v|."""
+    q = jnp.where(q[0] < 0, -q, q)
+    v = q[1:]
+    squared = jnp.dot(v, v)
+    small = squared < SMALL
+    size = jnp.sqrt(jnp.where(small, 1.0, squared))
+    # With w = √(1 − |v|²): 2 asin|v|/|v| = 2 + |v|²/3 + …
+    return jnp.where(small, 2 + squared / 3, 2 * jnp.arctan2(size, q[0]) / size) * v

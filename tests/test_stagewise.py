@@ -1,0 +1,278 @@
+"""ADMM stage by stage against the dense solver and a condensed QP built here with numpy."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import enable_x64
+from problems import symmetric
+
+import jaxmpc as jm
+from jaxmpc.mpc import stagewise
+from jaxmpc.mpc.stagewise import factor_stages, plan_stages, solve_stagewise
+from jaxmpc.qp import admm
+from jaxmpc.qp.problem import residuals
+
+N, n, m = 8, 3, 2
+SOLVER = jm.ADMM(iterations=20, refine=5)  # ADMM alone leaves 1e-3
+
+
+@pytest.fixture(autouse=True)
+def x64():
+    with enable_x64(True):
+        yield
+
+
+@cache
+def problem() -> jm.MPC:
+    """Every kind of row that there is; soft ones that must give way."""
+    rng = np.random.default_rng(1)
+    A = np.array([[1.0, 0.3, 0.0], [-0.2, 0.9, 0.2], [0.0, 0.1, 0.8]])
+    B, c = np.array([[0.0, 0.1], [0.6, 0.0], [0.0, 0.5]]), np.array([0.02, 0, -0.01])
+    system = jm.LinearSystem(A, B, c)
+    Q, R = np.diag([2.0, 1.0, 0.5]), np.array([[0.4, 0.1], [0.1, 0.3]])
+    H = rng.normal(size=(4, n))
+    return jm.MPC(
+        system, Q, R, N, states=symmetric(1.0, 0.7, 1.2), inputs=symmetric(0.4, 0.3),
+        terminal_cost=jm.lqr(system, Q, R).P,
+        terminal_set=jm.Polytope(np.vstack([H, -H]), np.full(8, 0.9)),
+        outputs=jm.Outputs(
+            [[0.2, 0.5, 0.0], [0.0, 0.3, 0.4]], [-0.3, -0.3], [0.35, np.inf],
+            [[1.0, 0.0], [0.5, -1.0]], steps=(0, 2, 5),
+        ),
+        soft=jm.Soft(
+            np.array([[0.0, 1.0, 0.5]]), np.array([-0.5]), rho=0.3, quadratic=2.0,
+            steps=(1, 2, 3, 4),
+        ),
+        prestabilise=False,
+    )  # fmt: skip
+
+
+X0 = np.array([0.7, 0.35, -0.4])
+
+
+@cache
+def varying(drift: bool = True) -> jm.LinearSystem:
+    """Another A, B, c at each step."""
+    rng, system = np.random.default_rng(2), problem().system
+    move = lambda M: np.asarray(M) + 0.05 * rng.normal(size=(N, *np.shape(M)))
+    return jm.LinearSystem(*(move(M) for M in (system.A, system.B, system.c)))
+
+
+def condensed(mpc: jm.MPC, system: jm.LinearSystem, x0: np.ndarray) -> tuple:
+    """(QP in the inputs, what x0 and c add to its rows), with numpy and loops."""
+    A, B, c = (
+        np.broadcast_to(M, (N, *shape))
+        for M, shape in zip((system.A, system.B, system.c), ((n, n), (n, m), (n,)), strict=True)
+    )
+    x, X = [x0], [np.zeros((n, N * m))]  # x_k = x[k] + X[k] z
+    U = np.eye(N * m).reshape(N, m, N * m)
+    for k in range(N):
+        x.append(A[k] @ x[k] + c[k])
+        X.append(A[k] @ X[k] + B[k] @ U[k])
+    W = [mpc.Q] * N + [mpc.terminal_cost]
+    P = 2 * sum(X[k].T @ W[k] @ X[k] for k in range(N + 1)) + 2 * sum(u.T @ mpc.R @ u for u in U)
+    q = 2 * sum(X[k].T @ W[k] @ x[k] for k in range(N + 1))
+    o, s, last = mpc.outputs, mpc.soft, mpc.terminal_set
+    none = np.full(len(last.h), -np.inf)
+    blocks = (
+        (np.zeros((m, n)), np.eye(m), mpc.inputs.lower, mpc.inputs.upper, range(N)),
+        (np.eye(n), np.zeros((n, m)), mpc.states.lower, mpc.states.upper, range(N)),
+        (np.array(o.C), np.array(o.D), o.lower, o.upper, o.steps),
+        (np.array(s.C), np.zeros((1, m)), [-np.inf], s.d, s.steps),
+        (last.H, np.zeros((len(last.h), m)), none, last.h, (N,)),
+    )
+    C, shift, lower, upper = [], [], [], []
+    for H, D, low, high, steps in blocks:
+        for k in steps:
+            C.append(H @ X[k] + (D @ U[k] if k < N else 0))
+            shift.append(H @ x[k])
+            lower.append(low)
+            upper.append(high)
+    C, shift, lower, upper = map(np.concatenate, (C, shift, lower, upper))
+    soft = np.zeros(len(C), bool)
+    soft[-len(last.h) - len(s.steps) : -len(last.h)] = True
+    qp = jm.QP(
+        (P + P.T) / 2, q, C, lower - shift, upper - shift, np.where(soft, s.rho, np.inf),
+        np.where(soft, 2 * s.quadratic, 0.0),
+    )  # fmt: skip
+    return jax.tree.map(jnp.asarray, qp), shift
+
+
+@pytest.mark.parametrize("kind", ["constant", "varying"])
+def test_iterates_are_those_of_the_dense_solver(kind):
+    mpc = problem()
+    system = mpc.system if kind == "constant" else varying()
+    qp, shift = condensed(mpc, system, X0)
+    count = qp.l.shape[0]
+    # Two penalties a row, one after the other.
+    rho = np.stack([np.geomspace(0.3, 3, count), np.geomspace(5, 0.5, count)])
+    settings = jm.ADMM(iterations=50, rho=rho)
+    dense = admm.factor(qp.P, qp.A, settings)
+    factor = factor_stages(mpc, system, settings)
+    E, E_dense = np.asarray(factor.E), np.asarray(dense.E)
+    np.testing.assert_array_equal(E == 0, E_dense == 0)
+    np.testing.assert_allclose(E, E_dense, rtol=1e-4)
+    # In rows of the problem's own units the penalties are rho E²: make them the same.
+    moved = E > 0
+    rho = np.where(moved, settings.rho * (E / np.where(moved, E_dense, 1)) ** 2, 1)
+    dense = admm.factor(qp.P, qp.A, replace(settings, rho=rho))
+    q, bounds = admm.scaled(dense, qp)
+    t, _ = admm.iterate(dense, q, bounds, jnp.zeros(count), 50, settings.alpha)
+    sample = stagewise.Sample(jnp.asarray(X0), jnp.zeros((N + 1, n)), jnp.zeros((N, m)))
+    bounds = stagewise.scaled(factor.stages.bounds, factor.E)
+    first = stagewise.start(factor, sample, bounds, None)
+    t_stages, (_, u) = stagewise.iterate(factor, sample, bounds, first, 50, settings.alpha)
+    expected = np.asarray(t)[moved] / E_dense[moved] + shift[moved]
+    np.testing.assert_allclose(np.asarray(t_stages)[moved] / E[moved], expected, atol=1e-9)
+    w, y = admm.read(dense, t, q, admm.scaled(dense, qp)[1])
+    np.testing.assert_allclose(u.ravel(), dense.T @ w, atol=1e-9)
+    s = bounds.project(t_stages, factor.rho[-1])
+    y_stages = E * factor.rho[-1] * (t_stages - s)
+    np.testing.assert_allclose(y_stages, np.where(moved, E_dense * y, 0), atol=1e-8)
+
+
+def test_plan_is_that_of_solve():
+    """All fields, with references."""
+    mpc = problem()
+    rng = np.random.default_rng(3)
+    aims = rng.normal(size=(N + 1, n)) / 10, rng.normal(size=(N, m)) / 10
+    plan = solve_stagewise(mpc, mpc.system, X0, aims[0], SOLVER, input_reference=aims[1])
+    exact = jm.solve(mpc, X0, aims[0], jm.ADMM(iterations=400), input_reference=aims[1])
+    assert plan.status == exact.status == jm.Status.SOLVED
+    assert np.max(exact.slack) > 0.01 and np.sum(np.abs(exact.qp.y) > 1e-3) > 5
+    for name in ("states", "inputs", "cost", "slack"):
+        np.testing.assert_allclose(
+            getattr(plan, name), getattr(exact, name), atol=1e-8, err_msg=name
+        )
+    ours, theirs = jax.tree.leaves(plan.multipliers), jax.tree.leaves(exact.multipliers)
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+    assert max(plan.primal_residual, plan.dual_residual, plan.gap) < 1e-9
+    assert jax.tree.structure(plan) == jax.tree.structure(exact)
+
+
+def test_varying_system():
+    """Optimal for the QP built by hand, to rounding after five Newton steps."""
+    mpc, system = problem(), varying()
+    plan = solve_stagewise(mpc, system, X0, solver=SOLVER)
+    assert plan.status == jm.Status.SOLVED
+    qp, _ = condensed(mpc, system, X0)
+    assert max(residuals(qp, plan.qp.z, plan.qp.y)) < 1e-9
+    assert max(plan.primal_residual, plan.dual_residual, plan.gap) < 1e-9
+    # Signs and sizes of the multipliers are admissible: their conjugate is finite.
+    assert np.isfinite(qp.bounds.support(plan.qp.y)) and np.max(plan.slack) > 0.01
+
+
+@pytest.mark.slow
+def test_derivative():
+    """Backward against differences, in A, x0 and a limit; zero where the data are NaN."""
+    mpc, system = problem(), varying()
+    batch = jax.tree.map(lambda v: np.stack([v, v]), system)
+    batch.A[1, 3, 0, 0] = np.nan
+    rng = np.random.default_rng(5)
+    dA, dx, dd = (rng.normal(size=shape) for shape in ((N, n, n), n, 1))
+
+    def total(h, system):
+        moved = replace(system, A=system.A + h * dA)
+        soft = replace(mpc.soft, d=mpc.soft.d + h * dd)
+        plan = solve_stagewise(replace(mpc, soft=soft), moved, X0 + h * dx, solver=SOLVER)
+        return jnp.sum(plan.inputs)
+
+    backward = jax.jit(jax.vmap(jax.grad(total), in_axes=(None, 0)))(0.0, batch)
+    h = 1e-5
+    difference = (total(h, system) - total(-h, system)) / (2 * h)
+    np.testing.assert_allclose(backward, [difference, 0], rtol=1e-6)
+
+
+def test_residuals_are_those_of_the_qp():
+    """Far from the optimum: the residuals of `residuals(qp, z, y)`, from adjoints."""
+    mpc, system = problem(), varying()
+    qp, _ = condensed(mpc, system, X0)
+    plan = solve_stagewise(mpc, system, X0, solver=jm.ADMM(iterations=2, refine=0))
+    assert plan.status == jm.Status.ITERATION_LIMIT
+    found = plan.primal_residual, plan.dual_residual, plan.gap
+    np.testing.assert_allclose(found, residuals(qp, plan.qp.z, plan.qp.y), rtol=1e-9)
+    assert min(found) > 1e-4
+
+
+def test_rows_that_no_input_moves():
+    """x_0 outside hard limits: violated, and said; outside soft ones: their slack."""
+    mpc = problem()
+    far = np.array([1.05, 0.0, 0.0])
+    plan = solve_stagewise(mpc, mpc.system, far, solver=SOLVER)
+    assert plan.status == jm.Status.ITERATION_LIMIT
+    assert plan.primal_residual >= 0.05 - 1e-12
+    soft = replace(
+        mpc, states=None, outputs=(), terminal_set=None,
+        soft=jm.Soft(np.eye(n), np.array([1.0, 0.7, 1.2]), rho=10.0),
+    )  # fmt: skip
+    plan = solve_stagewise(soft, mpc.system, far, solver=SOLVER)
+    assert plan.status == jm.Status.SOLVED and plan.gap < 1e-9
+    np.testing.assert_allclose(plan.slack[0], [0.05, 0, 0], atol=1e-12)
+
+
+def test_warm_start_and_parts():
+    mpc, system = problem(), varying()
+    plan = solve_stagewise(mpc, system, X0, solver=SOLVER)
+    again = jm.ADMM(iterations=2, refine=0)
+    cold = solve_stagewise(mpc, system, X0, solver=again)
+    assert cold.status != jm.Status.SOLVED
+    factor = factor_stages(mpc, system, again)
+    for start in (plan, (plan.inputs, plan.qp.y)):
+        warm = plan_stages(factor, mpc, X0, solver=again, warm_start=start)
+        assert warm.status == jm.Status.SOLVED
+        np.testing.assert_allclose(warm.inputs, plan.inputs, atol=1e-9)
+    with pytest.raises(ValueError, match="warm_start"):
+        solve_stagewise(mpc, system, X0, warm_start=(plan.inputs, plan.qp.y[1:]))
+
+
+def test_float32_and_bad_elements():
+    """Penalties, and with them factors, differ in the batch; NaN stays in its element."""
+    mpc, system = problem(), varying()
+    exact = solve_stagewise(mpc, system, X0, solver=SOLVER)
+    batch, x0s = jax.tree.map(lambda v: np.stack([v] * 4), system), np.stack([X0] * 4)
+    batch.A[1, 3, 0, 0], x0s[2, 1] = np.nan, np.inf
+    with enable_x64(False):
+        plans = jax.vmap(
+            lambda s, x, rho: solve_stagewise(mpc, s, x, solver=replace(SOLVER, rho=rho))
+        )(batch, x0s, jnp.array([0.5, 1.0, 1.0, 1.0]))
+    assert plans.inputs.dtype == jnp.float32
+    S, good = jm.Status, np.array([0, 3])
+    assert list(plans.status) == [S.SOLVED, S.NON_FINITE, S.NON_FINITE, S.SOLVED]
+    found = np.stack([plans.primal_residual, plans.dual_residual, plans.gap])[:, good]
+    assert np.max(found) < 1e-5
+    np.testing.assert_allclose(plans.inputs[good], [exact.inputs] * 2, atol=1e-5)
+    assert np.isnan(plans.inputs[1:3]).all() and np.isnan(plans.states[1:3]).all()
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda mpc, s: (replace(mpc, terminal_set=jm.Ellipsoid(np.eye(n), 1.0)), s), "jm.solve"),
+        (lambda mpc, s: (replace(mpc, control_horizon=2), s), "jm.solve"),
+        (lambda mpc, s: (replace(mpc, input_rate_limit=1.0), s), "jm.solve"),
+        (lambda mpc, s: (mpc, replace(s, A=s.A[:-1])), "A: shape"),
+        (lambda mpc, s: (mpc, replace(s, B=s.B[:, :, :, None])), "B"),
+        (lambda mpc, s: (mpc, replace(s, c=s.c * np.nan)), "c: holds NaN"),
+        (lambda mpc, s: (mpc, s.A), "system"),
+        (lambda mpc, s: (replace(mpc, R=-mpc.R), s), "R"),
+    ],
+)
+def test_bad_problems_raise(change, words):
+    mpc, system = change(problem(), varying())
+    with pytest.raises(ValueError, match=words):
+        solve_stagewise(mpc, system, X0)
+
+
+def test_bad_arguments_raise():
+    mpc, system = problem(), varying()
+    with pytest.raises(ValueError, match="x0"):
+        solve_stagewise(mpc, system, X0[:2])
+    with pytest.raises(ValueError, match="reference"):
+        solve_stagewise(mpc, system, X0, np.zeros((N, n)))
+    with pytest.raises(ValueError, match="rho"):
+        factor_stages(mpc, system, jm.ADMM(rho=np.ones(3)))
