@@ -242,7 +242,7 @@ def _simulate(
     tolerance = 1e-6 if x0.dtype == jnp.float64 else 1e-3
     square = lambda v, W: jnp.sum(v * matmul(W, v))
 
-    def seen(whole: Array | None, t: Array, length: int) -> Array | None:
+    def seen(whole: Array | None, t: Any, length: int) -> Array | None:
         """The rows of a reference that the plan at sample t looks at."""
         if whole is None or whole.ndim == 1:
             return whole

@@ -38,7 +38,7 @@ def test_feasible_steps_end_at_the_first_failure():
     """A plan that is solved again later does not count; batches have their axes in front."""
     empty = np.zeros((3, 3))
     status = np.array([[1, 3, 1], [1, 1, 1], [12, 1, 1]])
-    run = Run(empty, empty, empty, status, empty, empty, empty)
+    run = Run(empty, empty, empty, status, empty, empty, empty, empty)
     np.testing.assert_array_equal(run.feasible_steps, [1, 3, 0])
 
 

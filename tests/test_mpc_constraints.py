@@ -124,7 +124,7 @@ class Explicit:
             steps = range(N + (soft.D is None)) if soft.steps is None else soft.steps
             for k in steps:
                 parts = [(self.x[k], soft.C)] + ([] if soft.D is None else [(self.u[k], soft.D)])
-                self._add("soft", k, names, parts, np.full(p, -np.inf), soft.d, weights)
+                self._add("soft", k, names, parts, soft.sides[0], soft.d, weights)
 
     def keys(self):
         """Row names of the library, made as unique as those here."""
@@ -921,15 +921,15 @@ class TestSoften:
         for (kind, k, _), (h, lower, upper, weight) in soft.rows.items():
             assert kind not in kinds
             if kind == "soft":
-                assert lower == -np.inf and weight in ((7.0, 0.5), (0.3, 0.5))
-                found.append((k, *h, upper))
+                assert weight in ((7.0, 0.5), (0.3, 0.5))
+                found += [(k, *h, upper)] * bool(np.isfinite(upper))
+                found += [(k, *-h, -lower)] * bool(np.isfinite(lower))
         np.testing.assert_allclose(sorted(expected), sorted(found))
         keep = lambda e: {key for key in e.rows if key[0] in ("input", "rate")}
         assert keep(hard) == keep(soft) and keep(hard)
         table = [row for row in row_table(soft.mpc) if row.soft]
-        assert {"q", "-q", "-dq", "right", "power", "-power"} <= {row.name for row in table}
-        assert "dq" not in {row.name for row in table}  # its upper limit is inf
-        assert {row.unit for row in table if row.name in ("q", "-q")} == {"rad"}
+        assert {"q", "dq", "right", "power"} <= {row.name for row in table}
+        assert {row.unit for row in table if row.name == "q"} == {"rad"}
         assert {row.unit for row in table if row.name == "power"} == {"W"}
 
     def test_exact_penalty(self):

@@ -1,4 +1,4 @@
-"""Linear feedback with clipping: what an MPC is compared with, and what it falls back to nowhere."""
+"""Linear feedback with clipping: the law that an MPC is compared with."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -11,7 +11,7 @@ from jax import Array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.control.sets import Box
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.qp.precision import arrays, floating_dtype
+from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 from jaxmpc.qp.status import Status
 
 
@@ -81,9 +81,7 @@ class LinearFeedback:
         )  # fmt: skip
         r = first(reference, self.mpc.system.n)
         u = first(input_reference, self.mpc.system.m)
-        u = u + jnp.matmul(
-            jnp.asarray(self.K, x.dtype), self.coordinates(x) - r, precision="highest"
-        )
+        u = u + matmul(jnp.asarray(self.K, x.dtype), self.coordinates(x) - r)
         if isinstance(self.mpc.inputs, Box):
             lower, upper = arrays((self.mpc.inputs.lower, self.mpc.inputs.upper))
             u = jnp.clip(u, jnp.asarray(lower, u.dtype), jnp.asarray(upper, u.dtype))

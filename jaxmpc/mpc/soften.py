@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxmpc.checks import fail
 from jaxmpc.control.limits import output_limits
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope
+from jaxmpc.control.sets import Ellipsoid, Polytope
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple, output_steps
 
 
@@ -29,10 +29,19 @@ def soften(mpc: MPC, rho: Any, quadratic: Any = 0.0) -> MPC:
         if not bounded.any() or not steps:
             return
         keep = lambda v: None if v is None else np.asarray(v)[bounded]
-        texts = (tuple(str(v) for v in np.asarray(t)[bounded]) if t else () for t in (names, units))
-        below = keep(lower) if np.isfinite(lower).any() else None
+        text = lambda v: tuple(str(part) for part in np.asarray(v)[bounded]) if v else ()
         soft.append(
-            Soft(keep(C), keep(upper), rho, quadratic, keep(D), tuple(steps), *texts, below)
+            Soft(
+                keep(C),
+                keep(upper),
+                rho,
+                quadratic,
+                keep(D),
+                tuple(steps),
+                text(names),
+                text(units),
+                keep(lower) if np.isfinite(lower).any() else None,
+            )  # fmt: skip
         )
 
     for kind, set_, steps in (
@@ -40,10 +49,11 @@ def soften(mpc: MPC, rho: Any, quadratic: Any = 0.0) -> MPC:
     ):  # fmt: skip
         if set_ is not None:
             C, lower, upper = set_.rows()
-            named = isinstance(set_, Box)
-            names = system.state_names if named else set_.labels
+            names, units = system.state_names, system.state_units
+            if isinstance(set_, Polytope):
+                names, units = set_.labels, ()
             names = names or tuple(f"{kind} row {i + 1}" for i in range(np.size(lower)))
-            add(C, None, lower, upper, steps, names, system.state_units if named else ())
+            add(C, None, lower, upper, steps, names, units)
     for rows in as_tuple("outputs", mpc.outputs, Outputs):
         names = rows.names or tuple(f"output row {i + 1}" for i in range(len(rows.lower)))
         steps = output_steps(mpc, rows)
@@ -63,9 +73,10 @@ def harden(mpc: MPC) -> MPC:
     states, terminal, outputs = [], [], list(as_tuple("outputs", mpc.outputs, Outputs))
     for s in as_tuple("soft", mpc.soft, Soft):
         steps = tuple(range(N + (s.D is None))) if s.steps is None else s.steps
+        lower, upper = s.sides
         rows = Polytope(s.C, s.d, s.names)
         if s.lower is not None:
-            rows = output_limits(s.C, *s.sides, s.names, s.units)
+            rows = output_limits(s.C, lower, upper, s.names, s.units)
         whole = s.D is None and every and set(every) <= set(steps) <= {*every, N}
         if whole and mpc.states is None:
             states.append(rows)
@@ -74,7 +85,7 @@ def harden(mpc: MPC) -> MPC:
             terminal.append(rows)
             steps = ()
         if steps:
-            outputs.append(Outputs(s.C, *s.sides, s.D, steps, s.names, s.units))
+            outputs.append(Outputs(s.C, lower, upper, s.D, steps, s.names, s.units))
     join = lambda given, found: reduce(Polytope.intersect, found) if found else given
     return replace(
         mpc, soft=(), outputs=tuple(outputs), states=join(mpc.states, states),

@@ -57,13 +57,13 @@ def robot_mpc(
         robot.state_limits.lower, robot.state_limits.upper
     ))  # fmt: skip
     width = np.where(np.isfinite(upper - lower), upper - lower, 0.0)
-    states = Box(lower + margin * width / 2, upper - margin * width / 2)
-    outside = np.maximum(states.lower - point, point - states.upper)
+    lower, upper = lower + margin * width / 2, upper - margin * width / 2
+    outside = np.maximum(lower - point, point - upper)
     if np.any(outside > 0):
         i = int(np.argmax(outside))
         fail(
             "target", f"has {system.state_names[i] or i} = {point[i]:g}, limits with margin are "
-            f"[{states.lower[i]:g}, {states.upper[i]:g}]", "Choose another target, or less margin",
+            f"[{lower[i]:g}, {upper[i]:g}]", "Choose another target, or less margin",
         )  # fmt: skip
     steps = (
         tuple(range(1, int(horizon) + 1))
@@ -71,7 +71,13 @@ def robot_mpc(
         else None
     )
     mpc = MPC(
-        system, Q, R, horizon, states=states, inputs=robot.input_limits, constrained_steps=steps
+        system,
+        Q,
+        R,
+        horizon,
+        states=Box(lower, upper),
+        inputs=robot.input_limits,
+        constrained_steps=steps,
     )
     if isinstance(terminal_cost, str):
         if terminal_cost != "lqr":

@@ -265,7 +265,7 @@ class Robot:
         """
         payload = numbers.pop("payload", None)
         for key, value in numbers.items():
-            present = getattr(self.plant.mjx, key, None)
+            present: Any = getattr(self.plant.mjx, key, None)
             if key.startswith("_") or not hasattr(present, "shape"):
                 fail(key, "is no array of mjx.Model", "Give fields such as body_mass, dof_damping")
             require_shape(key, value, np.shape(present), "As in robot.plant.mjx")
@@ -289,8 +289,7 @@ class Robot:
         mass, centre = of("body_mass")[i], of("body_ipos")[i]
         total = mass + payload
         middle = (mass * centre + payload * at) / total
-        w, *v = of("body_iquat")[i]
-        v = jnp.asarray(v)
+        w, v = of("body_iquat")[i, 0], of("body_iquat")[i, 1:]
         cross = lambda a: jnp.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
         turn = jnp.eye(3) + 2 * w * cross(v) + 2 * matmul(cross(v), cross(v))
         inertia = matmul(turn * of("body_inertia")[i], turn.T)
@@ -306,7 +305,7 @@ class Robot:
         }  # fmt: skip
 
     def _read(self, x: Any, u: Any) -> tuple[Array, Array]:
-        size = self.mujoco.nq + self.mujoco.nv
+        size = self.state_size
         problem = "Give (qpos, qvel) of one robot; use jax.vmap for many"
         if np.shape(x) == (self.n,) != (size,):
             problem = "That is the size of the coordinates: robot.state(ξ) makes a state of them"
