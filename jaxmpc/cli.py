@@ -11,9 +11,12 @@ import tyro
 from jaxmpc.commands.info import Info
 from jaxmpc.commands.options import report_error
 from jaxmpc.commands.recursion import Recursion
+from jaxmpc.commands.simulate import Simulate
 from jaxmpc.commands.sweep import Sweep, sweep
 
-COMMANDS: dict[str, Any] = {"sweep": Sweep, "recursion": Recursion, "info": Info}
+COMMANDS: dict[str, Any] = {
+    "sweep": Sweep, "recursion": Recursion, "info": Info, "simulate": Simulate,
+}  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -23,12 +26,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"jaxmpc {version('jaxmpc')}")
         return 0
     command = _parse(argv)
-    if not isinstance(command, Sweep):
+    if not isinstance(command, Sweep | Simulate):
         return _guarded(command.run)
     again = [word for word in argv if word not in ("--overwrite", "--resume")]
     resume = shlex.join(["jaxmpc", *again, "--resume"])
     kept = f"chunks that were done are kept. Go on with:\n  {resume}"
-    return _guarded(lambda: sweep(command, resume), kept)
+    run = (lambda: sweep(command, resume)) if isinstance(command, Sweep) else command.run
+    return _guarded(run, kept)
 
 
 def _parse(argv: Sequence[str]) -> Any:

@@ -21,6 +21,7 @@ from jaxmpc.commands.options import (
     report_error,
     versions,
 )
+from jaxmpc.commands.robot_map import RobotJob, refused
 from jaxmpc.plots import plot_recursion
 from jaxmpc.sweeps.recursion import (
     RecursionReport,
@@ -50,6 +51,7 @@ class Recursion:
     How to start
       $ jaxmpc recursion --horizon 4
       $ jaxmpc recursion --config pendulum.toml --terminal invariant --output checks/a
+      $ jaxmpc recursion --robot pendulum --horizon 40 --steps 100
 
     How to read the output, all in the folder of --output
       recursion.png   Blue: kept for all steps. Dark red to light orange: lost at step 1, 2, ...
@@ -64,6 +66,11 @@ class Recursion:
       Exit code       0 done, whatever the answer; 2 error (one line on stderr says which); 130
                       stopped by Ctrl-C (nothing is kept).
 
+    With --robot NAME or FILE: the promise and the robot
+      As in jaxmpc sweep --help, with another promise: the linear closed loop has a plan at each
+      of --steps samples (of the robot's control period). The robot keeps it where its own loop
+      has: each plan solved without breaking a limit. Files as there; robot_map.png too.
+
     What the TOML file holds
       The sections [system], [limits], [cost], [mpc] of jaxmpc sweep --help, and
       [recursion]  all optional: steps, grid, lower, upper, regions, seconds
@@ -71,6 +78,8 @@ class Recursion:
 
     config: Annotated[Path | None, option("FILE", "the built-in joint")] = None
     """TOML file with the problem."""
+    robot: Annotated[str | None, option("NAME|FILE", "none: a linear system")] = None
+    """Map a robot instead, linear promise against nonlinear closed loop."""
     output: Annotated[Path, option("DIR", "jaxmpc-recursion")] = Path("jaxmpc-recursion")
     """Folder for the files; made where absent."""
     horizon: Horizon = None
@@ -78,16 +87,23 @@ class Recursion:
     terminal: Terminal = None
     """Set for the last state: none, largest set or ellipsoid that the LQR keeps within limits,
     state limits."""
-    steps: Annotated[int | None, option("K", "from the file, else 20")] = None
+    steps: Annotated[int | None, option("K", "from the file, else 20; robots 100")] = None
     """Length of the closed loops."""
     grid: Annotated[
-        tuple[int, ...] | None, option("K [K ...]", "128 128; above 3 states: random states")
+        tuple[int, ...] | None,
+        option("K [K ...]", "128 128; above 3 states: random states; robots 32 32"),
     ] = None
     """Points along each state, ends included."""
     lower: End = None
     """Lower end of the grid along each state, in its units."""
     upper: End = None
     """Upper end of the grid along each state, in its units."""
+    axes: Annotated[
+        tuple[str, ...] | None, option("AXIS [AXIS ...]", "with --robot: the first joint's two")
+    ] = None
+    """With --robot: coordinates to map, by name or index from 0."""
+    fixed: Annotated[tuple[float, ...] | None, option("X [X ...]", "with --robot: home")] = None
+    """With --robot: values of the other coordinates, in their order."""
     regions: Annotated[int | None, option("K", "from the file, else 2000")] = None
     """Critical regions of the law to enumerate at most for a proof; 0: none."""
     seconds: Annotated[float | None, option("S", "from the file, else 60")] = None
@@ -98,6 +114,8 @@ class Recursion:
     """Look also for the smallest horizon, up to N, that is proved recursively feasible."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
     """Replace the results in --output."""
+    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
+    """With --robot: go on with the map in --output."""
 
     def overrides(self) -> dict[str, Any]:
         """The keys of [mpc] and [recursion] that the command line sets."""
@@ -108,6 +126,10 @@ class Recursion:
         """Do it; the result is the exit code."""
         begun = time.perf_counter()
         try:
+            if self.robot is not None:
+                return self.run_robot()
+            given = {"axes": self.axes, "fixed": self.fixed, "resume": self.resume}
+            refused(given, None, "It is for maps of robots")
             config, mpc, samples = self.prepare()
             print(f"{config.name}: horizon {mpc.horizon} -> {self.output}")
             settings = config.recursion
@@ -128,6 +150,27 @@ class Recursion:
             print(f"  {'smallest horizon':<20} {_words(least, self.smallest)}")
         print(f"  {'total':<20} {time.perf_counter() - begun:.2f} s with set-up and files")
         print(f"  {'files':<20} {' '.join(str(self.output / name) for name in files)}")
+        return 0
+
+    def run_robot(self) -> int:
+        """The map of --robot; the exit code. Raises ValueError before it compiles."""
+        given = {"config": self.config, "smallest": self.smallest, "regions": self.regions}
+        refused(given, self.robot, "Claims about all states are those of a linear problem")
+        if self.steps is not None and self.steps < 1:
+            fail("--steps", f"{self.steps}", "Give at least 1")
+        if self.seconds is not None and not self.seconds > 0:
+            fail("--seconds", f"{self.seconds}", "Give a positive number")
+        job = RobotJob(
+            str(self.robot), self.output, "recursion", steps=self.steps or 100,
+            horizon=self.horizon, terminal=self.terminal, axes=self.axes, values=self.fixed,
+            grid=self.grid, lower=self.lower, upper=self.upper, resume=self.resume,
+            overwrite=self.overwrite, search_seconds=self.seconds or 60.0,
+        )  # fmt: skip
+        try:
+            job.run()
+        except KeyboardInterrupt:
+            print("\nstopped; chunks that were done are kept. Go on with --resume")
+            return 130
         return 0
 
     def prepare(self) -> tuple[configs.Config, Any, np.ndarray | None]:

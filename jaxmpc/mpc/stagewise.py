@@ -30,11 +30,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.scipy.linalg import cho_solve
 
 from jaxmpc.checks import concrete, fail, require_finite
 from jaxmpc.control.sets import Box, Ellipsoid
 from jaxmpc.control.system import LinearSystem, as_array, host_array
+from jaxmpc.mpc.kernels import Gains, recurrence, riccati_recursion
 from jaxmpc.mpc.problem import MPC, Plan
 from jaxmpc.mpc.rows import blocks
 from jaxmpc.mpc.solve import Layout, cost, multipliers, slack
@@ -52,7 +52,7 @@ UNROLL = 32
 
 def solve_stagewise(
     mpc: MPC, system: LinearSystem, x0: Any, reference: Any = None, solver: ADMM = ADMM(),  # noqa: B008
-    warm_start: Any = None, *, input_reference: Any = None,
+    warm_start: Any = None, *, input_reference: Any = None, scale: Any = None,
 ) -> Plan:  # fmt: skip
     """Solve `mpc` with `system` in place of its own, whose A (n, n), B (n, m) and c (n,) may have
     a leading axis N: x_{k+1} = A_k x_k + B_k u_k + c_k.
@@ -65,24 +65,32 @@ def solve_stagewise(
     multipliers (rows,). solver.refine: Newton steps, a Riccati recursion each; 5 suffice where
     ADMM has found the active rows. mpc.prestabilise is not read: the inputs are the variables, so
     a plant that grows more than 1e5-fold over the horizon in open loop (1e3-fold in float32) has
-    residuals above eps by rounding alone; `solve` takes those.
+    residuals above eps by rounding alone; `solve` takes those. scale (rows,): the row scale of a
+    similar problem (`factor_stages(...).E`), which saves one of two Riccati recursions; it
+    changes the path of ADMM, not the answer.
 
     `jax.vmap` over system, x0, references or the arrays of `mpc`. Raises ValueError for bad data
     that can be read, and for what only `solve` knows: Ellipsoids, control horizons, input rates.
     """
-    factor = factor_stages(mpc, system, solver)
+    factor = factor_stages(mpc, system, solver, scale)
     return plan_stages(
         factor, replace(mpc, system=system), x0, reference, solver, warm_start,
         input_reference=input_reference,
     )  # fmt: skip
 
 
-def factor_stages(mpc: MPC, system: LinearSystem, solver: ADMM = ADMM()) -> "StageFactor":  # noqa: B008
+def factor_stages(
+    mpc: MPC, system: LinearSystem, solver: ADMM = ADMM(), scale: Any = None  # noqa: B008
+) -> "StageFactor":  # fmt: skip
     """What x0, references and warm start do not change: row scale and Riccati gains.
 
     Arguments and errors as in `solve_stagewise`; `plan_stages` does the rest.
     """
-    return _factor(*arrays((checked(mpc, system, solver), solver.rho)))
+    mpc = checked(mpc, system, solver)
+    rows = sum(len(steps) * size for _, steps, size in layout(mpc))
+    if scale is not None and np.shape(scale) != (rows,):
+        fail("scale", f"shape {np.shape(scale)}", f"Give ({rows},), one number a row")
+    return _factor(*arrays((mpc, solver.rho, scale)))
 
 
 def checked(mpc: MPC, system: LinearSystem, solver: ADMM) -> MPC:
@@ -278,14 +286,6 @@ def usable(s: Stages) -> tuple[Stages, Array]:
     ), ok  # fmt: skip
 
 
-class Gains(NamedTuple):
-    """Of a Riccati recursion, for each step: A + BK (N, n, n), K (N, m, n), G⁻¹ (N, m, m)."""
-
-    closed: Array
-    K: Array
-    inverse: Array
-
-
 def riccati(s: Stages, weights: Any = None) -> Gains:
     """Gains for the cost and ½ Σ weights·row², weights (rows,) or None."""
     N, n, m = s.horizon, s.A.shape[-1], s.B.shape[-1]
@@ -302,25 +302,7 @@ def riccati(s: Stages, weights: Any = None) -> Gains:
             R = R + spread(diagonal(w) if box else form(D, D), steps, N)
         if H is not None and D is not None:
             cross = (0.0 if cross is None else cross) + spread(form(D, H), steps, N)
-    identity = jnp.eye(m, dtype=Q.dtype)
-
-    def stage(S: Array, stage: tuple) -> tuple[Array, Gains]:
-        Q, R, M, A, B = stage
-        A, B = s.A if A is None else A, s.B if B is None else B
-        BtS = matmul(B.T, S)
-        L = jnp.linalg.cholesky(R + matmul(BtS, B))
-        Y = matmul(BtS, A) + (0.0 if M is None else M)
-        solved = cho_solve((L, True), jnp.concatenate([Y, identity], axis=1))
-        K, inverse = -solved[:, :n], solved[:, n:]
-        closed = A + matmul(B, K)
-        # Joseph's form of Q + A'SA + Y'K: no difference of large terms, S stays semidefinite.
-        S = Q + matmul(closed.T, matmul(S, closed)) + matmul(K.T, matmul(R, K))
-        if M is not None:
-            S = S + matmul(K.T, M) + matmul(M.T, K)
-        return (S + S.T) / 2, Gains(closed, K, inverse)
-
-    xs = (Q[:-1], R, cross, *s.varying("A", "B"))
-    return jax.lax.scan(stage, Q[-1], xs, reverse=True)[1]
+    return riccati_recursion(Q, R, cross, s.A, s.B)
 
 
 def minimise(s: Stages, gains: Gains, gx: Array, gu: Array, unroll: int = 1) -> tuple[Array, Array]:
@@ -328,11 +310,8 @@ def minimise(s: Stages, gains: Gains, gx: Array, gu: Array, unroll: int = 1) -> 
     references."""
     h = gx[:-1] + apply_transposed(gains.K, gu)
 
-    def backward(p: Array, stage: tuple) -> tuple[Array, Array]:
-        closed, h = stage
-        return matmul(p, closed) - h, p
-
-    _, p = jax.lax.scan(backward, -gx[-1], (gains.closed, h), reverse=True, unroll=unroll)
+    p = recurrence(gains.closed, -h, -gx[-1], adjoint=True, unroll=unroll)
+    p = jnp.concatenate([p[1:], -gx[-1:]])  # of the step after
     d = apply(gains.inverse, gu - apply_transposed(s.B, p))
     x = follow(gains, jnp.zeros_like(gx[0]), apply(s.B, d), unroll)
     return x, apply(gains.K, x[:-1]) + d
@@ -341,26 +320,14 @@ def minimise(s: Stages, gains: Gains, gx: Array, gu: Array, unroll: int = 1) -> 
 def follow(gains: Gains, x0: Array, w: Array, unroll: int = 1) -> Array:
     """x (N+1, n) of x⁺ = (A + BK) x + w from x0 (n,), w (N, n)."""
 
-    def forward(x: Array, stage: tuple) -> tuple[Array, Array]:
-        closed, w = stage
-        x = matmul(x, closed.T) + w
-        return x, x
-
-    _, x = jax.lax.scan(forward, x0, (gains.closed, w), unroll=unroll)
+    x = recurrence(gains.closed, w, x0, unroll=unroll)
     return jnp.concatenate([x0[None], x])
 
 
 def predict(s: Stages, x0: Array, u: Array) -> Array:
     """x (N+1, n) from x0 (n,) under the inputs u (N, m)."""
-    w = apply(s.B, u) + s.c
-
-    def forward(x: Array, stage: tuple) -> tuple[Array, Array]:
-        A, w = stage
-        x = matmul(x, (s.A if A is None else A).T) + w
-        return x, x
-
-    _, x = jax.lax.scan(forward, x0, (*s.varying("A"), w))
-    return jnp.concatenate([x0[None], x])
+    w = jnp.broadcast_to(apply(s.B, u) + s.c, (s.horizon, len(x0)))
+    return jnp.concatenate([x0[None], recurrence(s.A, w, x0)])
 
 
 @jax.tree_util.register_dataclass
@@ -378,9 +345,9 @@ class StageFactor:
 
 
 @jax.jit
-def _factor(mpc: MPC, rho: Array) -> StageFactor:
+def _factor(mpc: MPC, rho: Array, scale: Any = None) -> StageFactor:
     s, ok = usable(stages(mpc))
-    E = row_scale(s)
+    E = row_scale(s) if scale is None else jnp.asarray(scale, s.Q.dtype)
     rho = jnp.asarray(rho, E.dtype)
     rho = jnp.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, E.shape[0]))
     return StageFactor(s, E, rho, jax.lax.map(lambda rho: riccati(s, rho * E**2), rho), ok)
@@ -511,13 +478,8 @@ def conditions(s: Stages, sample: Sample, u: Array, y: Array) -> Conditions:
     x = predict(s, sample.x0, u)
     (gx, own), (px, pushed) = sample.gradient(s, x, u), s.pull(y)
 
-    def backward(costate: Array, stage: tuple) -> tuple[Array, Array]:
-        A, g = stage
-        return matmul(costate, s.A if A is None else A) + g, costate
-
     g = gx + px
-    xs = (*s.varying("A"), g[:-1])
-    _, costate = jax.lax.scan(backward, g[-1], xs, reverse=True)
+    costate = jnp.concatenate([recurrence(s.A, g[:-1], g[-1], adjoint=True)[1:], g[-1:]])
     absolute = jax.tree.map(jnp.abs, replace(s, linear=None, quadratic=None))
     return Conditions(
         s.rows(x, u), own + pushed + apply_transposed(s.B, costate),

@@ -15,7 +15,7 @@ from jaxmpc.control.system import LinearSystem
 from jaxmpc.mpc.problem import MPC, Plan
 from jaxmpc.mpc.soften import soften
 from jaxmpc.mpc.solve import Controller, shifted_multipliers
-from jaxmpc.mpc.stagewise import layout, solve_stagewise
+from jaxmpc.mpc.stagewise import factor_stages, layout, solve_stagewise
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.precision import arrays, floating_dtype
 from jaxmpc.robots.linear import LinearPlant
@@ -107,17 +107,19 @@ class RobotController:
 
     `controller(x, carry, reference, input_reference=)` as `Controller`, x (nq + nv,) the state of
     the robot, references in its coordinates (see `robot.trajectory`). `start` gives the first
-    carry, and takes the first point of linearisation from input_reference.
+    carry, and takes the first point of linearisation from input_reference. soft, fixed and scale
+    (of rows, from mpc.system) are filled in at construction.
     """
 
     robot: Any
     mpc: MPC
-    solver: ADMM = ADMM(iterations=50, refine=0)  # noqa: RUF009
+    solver: ADMM = ADMM(iterations=50, refine=3)  # noqa: RUF009
     linearize: str = field(default="state", metadata={"static": True})
     exact: bool = field(default=False, metadata={"static": True})
     penalty: Any = 1e4
     soft: Any = None
     fixed: Any = None
+    scale: Any = None
 
     def __post_init__(self) -> None:
         if self.soft is not None or not isinstance(self.mpc, MPC):
@@ -136,7 +138,7 @@ class RobotController:
         if self.linearize == "set-point":
             put("fixed", Controller(soft, self.solver))
         else:
-            self.solver.validate(sum(len(steps) * size for _, steps, size in layout(soft)))
+            put("scale", factor_stages(soft, soft.system, self.solver).E)
         put("soft", arrays(soft))
         put("solver", arrays(self.solver))
 
@@ -196,7 +198,7 @@ class RobotController:
         system = self._model(x, states, inputs, carry)
         plan = solve_stagewise(
             self.soft, system, self.coordinates(x), reference, self.solver, start,
-            input_reference=input_reference,
+            input_reference=input_reference, scale=self.scale,
         )  # fmt: skip
         return self._limited(plan.inputs[0]), plan, plan
 

@@ -1,6 +1,6 @@
-"""A sweep kept chunk by chunk, so that a killed run loses one chunk at most.
+"""A batch of results kept chunk by chunk, so that a killed run loses one chunk at most.
 
-The store is a zarr v3 group, one row a sample, written in whole zarr chunks:
+The store is a zarr v3 group, one row a sample, written in whole zarr chunks. That of a sweep:
 
     points (sample, coordinate), label (sample), status (sample),
     start (sample, state), plan (sample, time, input): x_0 and inputs that prove feasible,
@@ -23,7 +23,7 @@ import uuid
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -39,11 +39,45 @@ def open_sweep(
     config: Mapping[str, Any],
     chunk: int,
 ) -> zarr.Group:
-    """Open the store at `path` to write; make it where there is none.
+    """Open the store of a sweep at `path` to write; make it where there is none.
 
-    `points` (B, d) are the samples, `shape` is (n, N, m), `config` is JSON data that says
-    what is swept, `chunk` is the number of rows a commit. Raises ValueError where the store
-    was made with another configuration, or where something else lies there.
+    `points` (B, d) are the samples, `shape` is (n, N, m), the rest as in `open_store`.
+    """
+    d, (n, *plan_shape) = points.shape[1], shape
+    fields: dict[str, Field] = {
+        "label": Field((), "int8", 0, ()),
+        "status": Field((), "int8", 0, ()),
+        "start": Field((n,), "float64", np.nan, ("state",)),
+        "plan": Field(tuple(plan_shape), "float64", np.nan, ("time", "input")),
+        "cut_normal": Field((d,), "float64", np.nan, ("coordinate",)),
+        "cut_offset": Field((), "float64", np.nan, ()),
+    }
+    return open_store(path, points, fields, config, chunk, shape)
+
+
+class Field(NamedTuple):
+    """What a sample has one of: its shape, type, value while not written, names of its axes."""
+
+    shape: tuple[int, ...]
+    dtype: str
+    fill: Any
+    dimensions: tuple[str, ...]
+
+
+def open_store(
+    path: str | Path,
+    points: np.ndarray,
+    fields: Mapping[str, Field],
+    config: Mapping[str, Any],
+    chunk: int,
+    shape: tuple[int, ...],
+) -> zarr.Group:
+    """Open the store at `path` to write; make it where there is none, with these fields.
+
+    `points` (B, d) are the samples, `config` is JSON data that says what is done with them,
+    `shape` the sizes that fields follow from, `chunk` is the number of rows a commit. Raises
+    ValueError where the store was made with another configuration, or where something else lies
+    there.
     """
     path = Path(path)
     attributes = {
@@ -53,14 +87,14 @@ def open_sweep(
         "versions": _versions(),
     }
     if not path.exists():
-        _create(path, points, shape, attributes)
+        _create(path, points, fields, attributes)
     group = _open(path, "r+")
     if group.attrs["fingerprint"] != attributes["fingerprint"]:
         stored: Any = {"config": group.attrs["config"], "chunk": group.attrs["chunk"]}
         changes = _differences(stored, {"config": dict(config), "chunk": chunk})
         fail(
             str(path),
-            f"holds a sweep of another configuration ({'; '.join(changes) or 'other points'})",
+            f"holds results of another configuration ({'; '.join(changes) or 'other points'})",
             "Resume with that configuration, choose another output, or overwrite",
         )
     return group
@@ -80,12 +114,11 @@ def chunk_rows(group: zarr.Group, index: int) -> slice:
 def commit(group: zarr.Group, index: int, **rows: np.ndarray) -> None:
     """Write all rows of chunk `index`, then mark it done.
 
-    `rows` are label, status, start, plan, cut_normal, cut_offset; other processes may commit
-    other chunks at the same time.
+    `rows` has all fields of the store; other processes may commit other chunks at the same time.
     """
     where = chunk_rows(group, index)
-    for name in ("label", "status", "start", "plan", "cut_normal", "cut_offset"):
-        _array(group, name)[where] = rows[name]
+    for name, value in rows.items():
+        _array(group, name)[where] = value
     _array(group, "done")[index] = 1
 
 
@@ -114,23 +147,13 @@ def remove(path: str | Path) -> None:
 
 
 def _create(
-    path: Path, points: np.ndarray, shape: tuple[int, int, int], attributes: dict[str, Any]
+    path: Path, points: np.ndarray, fields: Mapping[str, Field], attributes: dict[str, Any]
 ) -> None:
-    rows, d = points.shape
-    n, *plan_shape = shape
-    chunk = attributes["chunk"]
+    rows, chunk = len(points), attributes["chunk"]
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     group = zarr.open_group(partial, mode="w", zarr_format=3, attributes=attributes)
-    fields: dict[str, tuple[tuple[int, ...], str, Any, tuple[str, ...]]] = {
-        "points": ((d,), "float64", np.nan, ("coordinate",)),
-        "label": ((), "int8", 0, ()),
-        "status": ((), "int8", 0, ()),
-        "start": ((n,), "float64", np.nan, ("state",)),
-        "plan": (tuple(plan_shape), "float64", np.nan, ("time", "input")),
-        "cut_normal": ((d,), "float64", np.nan, ("coordinate",)),
-        "cut_offset": ((), "float64", np.nan, ()),
-    }
-    for name, (tail, dtype, fill, dimensions) in fields.items():
+    samples = Field(points.shape[1:], "float64", np.nan, ("coordinate",))
+    for name, (tail, dtype, fill, dimensions) in {"points": samples, **fields}.items():
         group.create_array(
             name,
             shape=(rows, *tail),
@@ -178,7 +201,7 @@ def _chunk(group: zarr.Group) -> int:
 
 
 def _fingerprint(
-    config: Mapping[str, Any], points: np.ndarray, shape: tuple[int, int, int], chunk: int
+    config: Mapping[str, Any], points: np.ndarray, shape: tuple[int, ...], chunk: int
 ) -> str:
     text = json.dumps([config, points.shape, shape, chunk], sort_keys=True)
     return hashlib.sha256(text.encode() + points.tobytes()).hexdigest()

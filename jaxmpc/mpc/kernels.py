@@ -1,0 +1,208 @@
+"""The two recursions of `stagewise.py`, each one kernel a batch on NVIDIA GPUs.
+
+As a scan every stage is a launch of its own, or several: 5 to 200 µs each whatever the batch. Here
+one warp runs all stages of one problem with the running vector or matrix in its registers (Pallas,
+Triton). Everywhere else, and for derivatives, the scans serve.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.scipy.linalg import cho_solve
+
+from jaxmpc.qp.precision import matmul
+
+# Numbers along a side that a warp's registers hold; Triton's products need 16 at least.
+SIDES = (16, 32)
+
+
+class Gains(NamedTuple):
+    """What a Riccati recursion leaves: closed A + BK (N, n, n), K (N, m, n), inverse G⁻¹ (N, m, m),
+    G = R + B'SB."""
+
+    closed: Array
+    K: Array
+    inverse: Array
+
+
+def recurrence(
+    M: Array, w: Array, start: Array, *, adjoint: bool = False, unroll: int = 1
+) -> Array:
+    """y (N, n): y_k = M_k y_{k−1} + w_k for k = 0, 1, … from y_{−1} = start; or, adjoint,
+    y_k = M_k' y_{k+1} + w_k for k = N−1, N−2, … from y_N = start.
+
+    M (N, n, n), or (n, n) the same at all stages; w (N, n); start (n,).
+    """
+    scan = partial(_scan, adjoint=adjoint, unroll=unroll)
+    return _or_kernel(scan, partial(_recurrence_kernel, adjoint=adjoint), M, w, start)
+
+
+def riccati_recursion(Q: Array, R: Array, cross: Any, A: Array, B: Array) -> Gains:
+    """Gains of the stage costs ½ x'Q_k x + ½ u'R_k u + u'M_k x under x⁺ = A x + B u.
+
+    Q (N+1, n, n), R (N, m, m), cross M (N, m, n) or None; A (n, n) and B (n, m), or one a stage.
+    """
+    if cross is not None:
+        return _riccati_scan(Q, R, A, B, cross)
+    return _or_kernel(_riccati_scan, _riccati_kernel, Q, R, A, B)
+
+
+def _or_kernel(scan: Callable, kernel: Callable, *args: Array) -> Any:
+    """The kernel where it runs, with the derivative of the scan."""
+    side = max(size for v in args for size in v.shape[-1:])
+    if jax.default_backend() != "gpu" or side > SIDES[-1]:
+        return scan(*args)
+    fast = jax.custom_jvp(kernel)
+    fast.defjvp(lambda primals, tangents: jax.jvp(scan, primals, tangents))
+    return fast(*args)
+
+
+def _scan(M: Array, w: Array, start: Array, *, adjoint: bool, unroll: int) -> Array:
+    def stage(y: Array, at: tuple) -> tuple[Array, Array]:
+        own, w = at
+        own = M if own is None else own
+        y = matmul(y, own if adjoint else own.T) + w
+        return y, y
+
+    xs = (None if M.ndim == 2 else M, w)
+    return jax.lax.scan(stage, start, xs, reverse=adjoint, unroll=unroll)[1]
+
+
+def _riccati_scan(Q: Array, R: Array, A: Array, B: Array, cross: Any = None) -> Gains:
+    n, identity = Q.shape[-1], jnp.eye(R.shape[-1], dtype=Q.dtype)
+    fixed = (A if A.ndim == 2 else None, B if B.ndim == 2 else None)
+
+    def stage(S: Array, stage: tuple) -> tuple[Array, Gains]:
+        Q, R, M, *own = stage
+        A, B = (v if f is None else f for v, f in zip(own, fixed, strict=True))
+        BtS = matmul(B.T, S)
+        L = jnp.linalg.cholesky(R + matmul(BtS, B))
+        Y = matmul(BtS, A) + (0.0 if M is None else M)
+        solved = cho_solve((L, True), jnp.concatenate([Y, identity], axis=1))
+        K, inverse = -solved[:, :n], solved[:, n:]
+        closed = A + matmul(B, K)
+        # Joseph's form of Q + A'SA + Y'K: no difference of large terms, S stays semidefinite.
+        S = Q + matmul(closed.T, matmul(S, closed)) + matmul(K.T, matmul(R, K))
+        if M is not None:
+            S = S + matmul(K.T, M) + matmul(M.T, K)
+        return (S + S.T) / 2, Gains(closed, K, inverse)
+
+    own = (v if f is None else None for v, f in zip((A, B), fixed, strict=True))
+    return jax.lax.scan(stage, Q[-1], (Q[:-1], R, cross, *own), reverse=True)[1]
+
+
+def _recurrence_kernel(
+    M: Array, w: Array, start: Array, *, adjoint: bool, interpret: bool = False
+) -> Array:
+    N, n = w.shape
+
+    def kernel(M_ref: Any, w_ref: Any, start_ref: Any, out_ref: Any) -> None:
+        i = jnp.arange(_side(n), dtype=jnp.int32)
+        here = i < n
+        shared = _matrix(M_ref, None, n, n) if M.ndim == 2 else None
+
+        def stage(step: Array, y: Array) -> Array:
+            k = N - 1 - step if adjoint else step
+            own = _matrix(M_ref, k, n, n) if shared is None else shared
+            product = own * (y[:, None] if adjoint else y[None, :])
+            y = jnp.sum(product, axis=0 if adjoint else 1) + _load(w_ref.at[k, i], here)
+            _store(out_ref.at[k, i], y, here)
+            return y
+
+        jax.lax.fori_loop(jnp.int32(0), jnp.int32(N), stage, _load(start_ref.at[i], here))
+
+    return _call(kernel, jax.ShapeDtypeStruct((N, n), w.dtype), interpret)(M, w, start)
+
+
+def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array, *, interpret: bool = False) -> Gains:
+    N, n, m, dtype = len(R), Q.shape[-1], R.shape[-1], Q.dtype
+    side = _side(max(n, m))
+    # Three products of halves are as good as a product of float32; float64 is itself.
+    precision: Any = jax.lax.DotAlgorithmPreset.BF16_BF16_F32_X6
+    precision = None if dtype == jnp.float64 or interpret else precision
+
+    def dot(a: Array, b: Array) -> Array:
+        return jax.lax.dot_general(
+            a, b, (((1,), (0,)), ((), ())), precision=precision, preferred_element_type=dtype
+        )
+
+    def kernel(Q_ref: Any, R_ref: Any, A_ref: Any, B_ref: Any, closed_ref: Any, K_ref: Any,
+               inverse_ref: Any) -> None:  # fmt: skip
+        i = jnp.arange(side, dtype=jnp.int32)
+        row, column = i[:, None], i[None, :]
+        load = lambda ref, k, rows, columns: _matrix(ref, k, rows, columns, side)
+
+        def stage(step: Array, S: Array) -> Array:
+            k = N - 1 - step
+            at = lambda ref, given: k if given.ndim == 3 else None
+            A_k, B_k = load(A_ref, at(A_ref, A), n, n), load(B_ref, at(B_ref, B), n, m)
+            R_k = load(R_ref, k, m, m)
+            BtS = dot(B_k.T, S)
+            # Gauss-Jordan in place: R + B'SB is definite, no pivoting.
+            G = R_k + dot(BtS, B_k)
+            for j in range(m):
+                along = jnp.sum(jnp.where(row == j, G, 0.0), axis=0)
+                down = jnp.sum(jnp.where(column == j, G, 0.0), axis=1)
+                pivot = 1 / jnp.sum(jnp.where(i == j, along, 0.0))
+                G = jnp.where(
+                    row == j,
+                    jnp.where(column == j, pivot, along[None, :] * pivot),
+                    jnp.where(column == j, -down[:, None] * pivot,
+                              G - down[:, None] * (along * pivot)[None, :]),
+                )  # fmt: skip
+            K = -dot(G, dot(BtS, A_k))
+            closed = A_k + dot(B_k, K)
+            for ref, v, rows, columns in (
+                (closed_ref, closed, n, n), (K_ref, K, m, n), (inverse_ref, G, m, m)
+            ):  # fmt: skip
+                inside = (row < rows) & (column < columns)
+                _store(ref.at[k, row, column], v, inside)
+            S = load(Q_ref, k, n, n) + dot(closed.T, dot(S, closed)) + dot(K.T, dot(R_k, K))
+            return (S + S.T) / 2
+
+        jax.lax.fori_loop(jnp.int32(0), jnp.int32(N), stage, load(Q_ref, N, n, n))
+
+    shapes = [(N, n, n), (N, m, n), (N, m, m)]
+    out = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
+    return Gains(*_call(kernel, out, interpret)(Q, R, A, B))
+
+
+def _call(kernel: Callable, shapes: Any, interpret: bool) -> Callable:
+    """One program, a warp, for each instance: `vmap` makes the grid."""
+    from jax.experimental import pallas
+    from jax.experimental.pallas import triton
+
+    options = triton.CompilerParams(num_warps=1, num_stages=1)
+    return pallas.pallas_call(
+        kernel, out_shape=shapes, compiler_params=options, interpret=interpret
+    )
+
+
+def _side(n: int) -> int:
+    """The least power of two that Triton takes and that holds n."""
+    return next(side for side in SIDES if n <= side)
+
+
+def _matrix(ref: Any, k: Any, rows: int, columns: int, side: int | None = None) -> Array:
+    """The matrix (rows, columns) at stage k (None: the only one), filled up with zeros."""
+    side = _side(max(rows, columns)) if side is None else side
+    i = jnp.arange(side, dtype=jnp.int32)
+    row, column = i[:, None], i[None, :]
+    place = ref.at[row, column] if k is None else ref.at[k, row, column]
+    return _load(place, (row < rows) & (column < columns))
+
+
+def _load(place: Any, mask: Array) -> Array:
+    from jax.experimental.pallas import triton
+
+    return triton.load(place, mask=mask, other=0.0)
+
+
+def _store(place: Any, value: Array, mask: Array) -> None:
+    from jax.experimental.pallas import triton
+
+    triton.store(place, value, mask=mask)
