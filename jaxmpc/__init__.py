@@ -20,6 +20,7 @@ from jaxmpc.mpc.rows import active_constraints, row_table
 from jaxmpc.mpc.soften import harden, soften
 from jaxmpc.mpc.solve import Controller, solve
 from jaxmpc.mpc.stagewise import solve_stagewise
+from jaxmpc.outcome import Outcome, judge
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.margin import feasibility_margin
 from jaxmpc.qp.problem import QP, QPSolution
@@ -36,6 +37,7 @@ from jaxmpc.sweeps.plans import Plans, solve_many
 from jaxmpc.sweeps.reach import feasible_growth, feasible_polytope
 from jaxmpc.sweeps.recursion import RecursionReport, recursive_feasibility, smallest_horizon
 from jaxmpc.sweeps.regions import CriticalRegions, critical_regions
+from jaxmpc.sweeps.robots import RobotMap, map_robot
 from jaxmpc.workflow import Design, OfflineReport, design, offline_report
 
 __all__ = [
@@ -57,6 +59,7 @@ __all__ = [
     "LinearPlant",
     "LinearSystem",
     "OfflineReport",
+    "Outcome",
     "Outputs",
     "Plan",
     "Plans",
@@ -65,6 +68,7 @@ __all__ = [
     "RecursionReport",
     "Robot",
     "RobotController",
+    "RobotMap",
     "Run",
     "Soft",
     "Status",
@@ -82,10 +86,12 @@ __all__ = [
     "harden",
     "invariant_ellipsoid",
     "joint_limits",
+    "judge",
     "load_robot",
     "lqr",
     "lyapunov_decrease",
     "map_feasible_set",
+    "map_robot",
     "maximal_control_invariant_set",
     "maximal_invariant_set",
     "offline_report",

@@ -52,7 +52,7 @@ def judge(run: Run, plant: Any, reference: Any, *, tolerance: float = 0.02) -> O
 
     run: of `simulate` or `simulate_many`, with or without a batch axis. plant: the Robot or
     LinearPlant whose limits count, without margin. reference (n,): the set-point, in coordinates.
-    tolerance: the band, as a share of each coordinate's `half_widths`. Raises ValueError for
+    tolerance: the band, as a share of each coordinate's `Box.half_widths`. Raises ValueError for
     other shapes.
     """
     run = batch_of(run)
@@ -61,7 +61,7 @@ def judge(run: Run, plant: Any, reference: Any, *, tolerance: float = 0.02) -> O
     if not tolerance > 0:
         fail("tolerance", f"{tolerance}", "Give a positive share")
     xi, inputs = coordinates(plant, run.states), np.asarray(run.inputs, float)
-    band = tolerance * half_widths(plant.state_limits)
+    band = tolerance * plant.state_limits.half_widths()
     excesses, kept = [], np.ones(len(xi), bool)
     for value, limits in ((xi, plant.state_limits), (inputs, plant.input_limits)):
         excess, within = beyond(value, limits)
@@ -77,13 +77,6 @@ def judge(run: Run, plant: Any, reference: Any, *, tolerance: float = 0.02) -> O
         cost=np.asarray(run.stage_cost, float).sum(axis=1),
         promised=((status == Status.SOLVED) & ~fallback).all(axis=1),
     )  # fmt: skip
-
-
-def half_widths(limits: Box) -> np.ndarray:
-    """Half the distance between the two limits of each number; 1 where it has not two."""
-    lower, upper = np.asarray(limits.lower, float), np.asarray(limits.upper, float)
-    both = np.isfinite(lower) & np.isfinite(upper)
-    return np.where(both, np.where(both, upper, 1) - np.where(both, lower, -1), 2.0) / 2
 
 
 def coordinates(plant: Any, states: Any) -> np.ndarray:

@@ -147,19 +147,19 @@ def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
     [
         "--robot arm2 --dtype float64 --damping 0.5 --payload 0.5",
         "--robot cartpole --linearize lqr --spread 0.05",
-        "--robot quadrotor --linearize trajectory --spread 0.1",
+        "--robot pendulum --linearize trajectory",
     ],
 )
 def test_other_robots_and_laws(tmp_path, capsys, arguments):
     assert run(f"{arguments} --count 3 --seconds 0.1 --output out --video 0") == 0
     table = rows(capsys.readouterr().out)
     data = xr.open_zarr(tmp_path / "out" / "runs.zarr", consolidated=False).load()
-    assert np.isfinite(data["states"]).all() and np.ptp(data["points"], axis=0).min() >= 0
+    assert np.isfinite(data["states"]).all()
     if "lqr" in arguments:
         assert "plans solved" not in table and "control steps/s" in table["run"]
         assert np.all(data["status"] == 0)
     else:
-        assert np.mean(data["status"] == 1) > 0.5 and "fallback" in table
+        assert np.mean(data["status"].values == 1) > 0.5 and "fallback" in table
     if "float64" in arguments:
         assert data["states"].dtype == np.float64 and data["damping"].shape == (3, 2)
         assert np.all((data["payload"] >= 0) & (data["payload"] <= 0.5))

@@ -33,6 +33,7 @@ class Settings:
     iterations: int = 20
     refine: int = 2
     repeats: int = 3
+    pieces: bool = True
     loop: bool = True  # also the closed loop, whose compilation takes longest
 
 
@@ -118,15 +119,18 @@ def run(settings: Settings) -> dict[str, Any]:
         f"{robot.dt * 1e3:g} ms, {robot.substeps} physics steps each, N = {s.horizon}"
     )
     rows: dict[str, Any] = {}
-    for name, (function, *args) in pieces.items():
+    for name, (function, *args) in pieces.items() if s.pieces else ():
         compiled, seconds = timed(function, *args, repeats=s.repeats)
         rows[name] = {"compile": compiled, "seconds": seconds * steps / few}
         print(f"  {name:22} {rows[name]['seconds']:9.4f} s  compile {compiled:6.1f} s", flush=True)
-    physics = s.count * steps * robot.substeps
-    table = {name: row["seconds"] for name, row in rows.items()}
-    print(f"  physics steps a second {physics / table['physics']:,.0f} "
-          f"(mjx.step alone {physics / table['mjx.step alone']:,.0f}), linear models a second "
-          f"{s.count * steps / table['linear models']:,.0f}")  # fmt: skip
+    if s.pieces:
+        physics = s.count * steps * robot.substeps
+        table = {name: row["seconds"] for name, row in rows.items()}
+        print(
+            f"  physics steps a second {physics / table['physics']:,.0f} (mjx.step alone "
+            f"{physics / table['mjx.step alone']:,.0f}), linear models a second "
+            f"{s.count * steps / table['linear models']:,.0f}"
+        )
     if s.loop:
         loop = lambda c, x: jax.vmap(
             lambda x: jm.simulate(c, robot, x, steps, reference=reference, input_reference=inputs)

@@ -51,7 +51,6 @@ class Recursion:
     How to start
       $ jaxmpc recursion --horizon 4
       $ jaxmpc recursion --config pendulum.toml --terminal invariant --output checks/a
-      $ jaxmpc recursion --robot pendulum --horizon 40 --steps 100
 
     How to read the output, all in the folder of --output
       recursion.png   Blue: kept for all steps. Dark red to light orange: lost at step 1, 2, ...
@@ -67,6 +66,7 @@ class Recursion:
                       stopped by Ctrl-C (nothing is kept).
 
     With --robot NAME or FILE: the promise and the robot
+      Such as jaxmpc recursion --robot pendulum --horizon 40 --steps 100
       As in jaxmpc sweep --help, with another promise: the linear closed loop has a plan at each
       of --steps samples (of the robot's control period). The robot keeps it where its own loop
       has: each plan solved without breaking a limit. Files as there; robot_map.png too.
@@ -156,12 +156,11 @@ class Recursion:
         """The map of --robot; the exit code. Raises ValueError before it compiles."""
         given = {"config": self.config, "smallest": self.smallest, "regions": self.regions}
         refused(given, self.robot, "Claims about all states are those of a linear problem")
-        if self.steps is not None and self.steps < 1:
-            fail("--steps", f"{self.steps}", "Give at least 1")
         if self.seconds is not None and not self.seconds > 0:
             fail("--seconds", f"{self.seconds}", "Give a positive number")
+        steps = 100 if self.steps is None else self.steps
         job = RobotJob(
-            str(self.robot), self.output, "recursion", steps=self.steps or 100,
+            str(self.robot), self.output, "recursion", steps=steps,
             horizon=self.horizon, terminal=self.terminal, axes=self.axes, values=self.fixed,
             grid=self.grid, lower=self.lower, upper=self.upper, resume=self.resume,
             overwrite=self.overwrite, search_seconds=self.seconds or 60.0,

@@ -78,18 +78,25 @@ class RobotJob:
         if self.resume and self.overwrite:
             fail("--overwrite", "given beside --resume", "Choose one")
         robot = load_robot(self.robot)
-        mpc = default_mpc(robot, self.horizon or 20, self.terminal)
         axes = self._axes(robot)
+        points = self._points(robot, axes)
         others = [i for i in range(robot.n) if i not in axes]
+        if self.values is not None and len(self.values) != len(others):
+            what = f"has {len(self.values)} entries where {len(others)} are needed"
+            fail("--fixed", what, "One for each coordinate that is not on an axis")
+        for name in ("horizon", "steps", "seconds"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                fail(f"--{name}", f"{value}", "Give a positive number")
+        if self.terminal == "ellipsoid":
+            fail("--terminal", "ellipsoid: a robot's limits are soft rows", "Give invariant or box")
+        # From here on things compile.
         fixed = _home(robot)
-        if self.values is not None:
-            if len(self.values) != len(others):
-                what = f"has {len(self.values)} entries where {len(others)} are needed"
-                fail("--fixed", what, "One for each coordinate that is not on an axis")
-            fixed[others] = self.values
-        seconds = self.seconds if self.steps is None else self.steps * robot.dt
+        fixed[others] = fixed[others] if self.values is None else self.values
+        mpc = default_mpc(robot, self.horizon or 20, self.terminal)
+        seconds = 2.0 if self.seconds is None else self.seconds
         setting = RobotSetting.of(
-            robot, mpc, self._points(robot, axes), 2.0 if seconds is None else seconds,
+            robot, mpc, points, seconds if self.steps is None else self.steps * robot.dt,
             axes=axes, fixed=fixed, claim=self.claim,
         )  # fmt: skip
         config = {
@@ -212,6 +219,7 @@ class RobotJob:
             "claim": rmap.claim,
             "counts": rmap.counts(),
             "broken": int(np.sum(rmap.broken)),
+            "broken_after_an_unsolved_plan": int(np.sum(rmap.unsure)),
             "deepest_broken": None if worst is None else {
                 "state": setting.states(rmap.points)[worst].tolist(),
                 "sample": int(rmap.first_loss[worst]),
@@ -240,24 +248,16 @@ class RobotJob:
 
 
 def default_mpc(robot: Robot, horizon: int, terminal: str | None = None) -> MPC:
-    """An MPC of any robot: weights one over the squares of its limits (Bryson's rule), inputs a
-    tenth of that; limits from the model. terminal: None or "none", "box": the state limits of
+    """An MPC of any robot, weights and limits those of `robot_mpc`. terminal: None or "none", "box": the state limits of
     the problem, "invariant": the largest set that the LQR keeps within all limits."""
-    half = lambda box: (np.asarray(box.upper) - np.asarray(box.lower)) / 2
-    one = lambda v: np.where(np.isfinite(v) & (v > 0), v, 1.0)
-    Q = np.diag(1 / one(half(robot.state_limits)) ** 2)
-    R = np.diag(0.1 / one(half(robot.input_limits)) ** 2)
-    mpc = robot_mpc(robot, Q, R, horizon)
+    mpc = robot_mpc(robot, horizon=horizon)
     if terminal in (None, "none"):
         return mpc
-    if terminal == "ellipsoid":
-        fail("--terminal", "ellipsoid: a robot's limits are soft rows", "Give invariant or box")
     if terminal == "box":
         return replace(mpc, terminal_set=mpc.states)
-    x, u = robot.equilibrium()
-    x = _home(robot)
+    x, (_, u) = _home(robot), robot.equilibrium()
     about = deviations(mpc, x, u)
-    law = lqr(about.system, Q, R)
+    law = lqr(about.system, mpc.Q, mpc.R)
     # At the set-point c is rounding.
     system = replace(about.system, c=None)
     assert about.states is not None
@@ -277,7 +277,7 @@ def refused(given: dict[str, Any], robot: str | None, needs: str) -> None:
 def _home(robot: Robot) -> np.ndarray:
     """Coordinates of `robot.home`."""
     with jax.enable_x64(True):
-        return np.asarray(robot.coordinates(np.asarray(robot.home)), np.float64)
+        return np.array(robot.coordinates(np.asarray(robot.home)), np.float64)
 
 
 def _fingerprint(robot: Robot, points: np.ndarray) -> str:

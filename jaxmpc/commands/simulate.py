@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import hashlib
+import importlib
 import io
 import json
 import os
@@ -25,7 +26,7 @@ from jaxmpc.commands.options import open_folder, option, report_error
 from jaxmpc.compiled import Compiled, first_rows, padded
 from jaxmpc.control.riccati import lqr
 from jaxmpc.mpc.feedback import LinearFeedback
-from jaxmpc.outcome import KEPT, Outcome, half_widths, judge
+from jaxmpc.outcome import KEPT, Outcome, judge
 from jaxmpc.plots import plot_runs
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
@@ -118,7 +119,7 @@ class Simulate:
     """L1 weight of state limits; too small a weight breaks limits that could be kept."""
     iterations: Annotated[int, option("K", "50")] = 50
     """ADMM steps of each plan."""
-    refine: Annotated[int, option("K", "0")] = 0
+    refine: Annotated[int | None, option("K", "2; with float64 3")] = None
     """Newton steps after them; 3 solve nearly all plans, in two to four times the time."""
     mass: Annotated[float, option("SHARE", "0")] = 0.0
     """Each body's mass and inertia times a number from 1 - SHARE to 1 + SHARE.
@@ -173,6 +174,11 @@ class Simulate:
             fail(str(path), "exists", "Add --resume to go on with it or --overwrite to start again")
         if self.video:
             _choose_renderer()
+        try:
+            importlib.import_module("mujoco")
+        except (AttributeError, ImportError, RuntimeError) as error:
+            problem = f"mujoco does not start with {os.environ.get('MUJOCO_GL')!r} ({error})"
+            fail("MUJOCO_GL", problem, "Unset it, or install the OpenGL library that it names")
         with contextlib.redirect_stdout(io.StringIO()):  # MJX tells of absent optional parts
             robot = load_robot(self.robot)
         sizes = (
@@ -183,19 +189,18 @@ class Simulate:
         for name, given, size in sizes:
             if given is not None and len(given) != size:
                 fail(name, f"has {len(given)} numbers", f"{robot.name} needs {size}")
-        nv, widths = robot.mujoco.nv, half_widths(robot.state_limits)
-        share = np.repeat([1.0, 0.01], nv)
-        Q = share / widths**2 if self.state_weights is None else np.array(self.state_weights)
-        R = 0.01 / half_widths(robot.input_limits) ** 2
-        R = R if self.input_weights is None else np.array(self.input_weights)
         target = None if self.target is None else np.array(self.target)
-        mpc = robot_mpc(robot, Q, R, self.horizon, target=target, margin=self.margin)
+        weights = [
+            None if given is None else np.array(given)
+            for given in (self.state_weights, self.input_weights)
+        ]
+        mpc = robot_mpc(robot, *weights, self.horizon, target=target, margin=self.margin)
         controller: Any
         with jax.enable_x64(self.dtype == "float64"):
             if self.linearize == "lqr":
                 controller = LinearFeedback(mpc, lqr(mpc.system, mpc.Q, mpc.R).K, robot)
             else:
-                solver = ADMM(iterations=self.iterations, refine=self.refine)
+                solver = ADMM(iterations=self.iterations, refine=self.newton_steps)
                 controller = RobotController(
                     robot, mpc, solver, linearize=self.linearize, penalty=self.penalty
                 )
@@ -292,7 +297,13 @@ class Simulate:
             "state_weights": np.diag(mpc.Q).tolist(),
             "input_weights": np.diag(mpc.R).tolist(),
         }
-        return {**options, **weights, "model": _fingerprint(robot)}
+        options |= {**weights, "refine": self.newton_steps, "model": _fingerprint(robot)}
+        return options
+
+    @property
+    def newton_steps(self) -> int:
+        """`refine`, or what the precision asks for: ADMM alone seldom comes to 1e-6."""
+        return (3 if self.dtype == "float64" else 2) if self.refine is None else self.refine
 
     def drive(self, job: "Job") -> "Speed":
         """Run the chunks not yet done, and commit each."""
@@ -345,7 +356,7 @@ class Simulate:
         units = [*robot.state_units, *robot.input_units]
         excess = [outcome.state_excess, outcome.input_excess]
         worst = np.concatenate([np.nanmax(e, axis=(0, 1), initial=0.0) for e in excess])
-        widths = [half_widths(b) for b in (robot.state_limits, robot.input_limits)]
+        widths = [b.half_widths() for b in (robot.state_limits, robot.input_limits)]
         i = int(np.argmax(worst / np.concatenate(widths)))
         finite = lambda v: float(v) if np.isfinite(v) else None
         level = lambda v, q: finite(

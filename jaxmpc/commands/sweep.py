@@ -42,7 +42,6 @@ class Sweep:
     How to start
       $ jaxmpc sweep
       $ jaxmpc sweep --config pendulum.toml --terminal invariant --grid 512 512 --output maps/a
-      $ jaxmpc sweep --robot pendulum --terminal invariant --seconds 2
 
     How to read the output, all in the folder of --output
       map.png       Blue feasible, grey infeasible, yellow undecided. The true boundary lies
@@ -56,6 +55,7 @@ class Sweep:
       Exit code     0 done, 2 error (one line on stderr says which), 130 stopped by Ctrl-C.
 
     With --robot NAME or FILE: the promise and the robot
+      Such as jaxmpc sweep --robot pendulum --terminal invariant --seconds 2
       The MPC of a robot (joint, pendulum, cartpole, arm2, arm6, arm7, quadrotor, or an MJCF or
       URDF file), linear about its home, weights from its limits. The grid is a slice: the first
       joint's position and velocity unless --axes says otherwise, the rest at home unless --fixed.

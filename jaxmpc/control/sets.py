@@ -100,6 +100,12 @@ class Box:
         # The maximiser, with 0 where d is 0: there 0 * inf would be NaN.
         return d @ jnp.where(d > 0, upper, jnp.where(d < 0, lower, 0))
 
+    def half_widths(self) -> np.ndarray:
+        """(n,): half the distance between the two ends of each coordinate; 1 where it has not two,
+        or where they coincide. Units for weights and tolerances. Host."""
+        width = (host_array("upper", self.upper) - host_array("lower", self.lower)) / 2
+        return np.where(np.isfinite(width) & (width > 0), width, 1.0)
+
     def rows(self) -> tuple[ArrayLike, ArrayLike, ArrayLike]:
         """(H, lower, upper) of the two-sided rows lower <= H x <= upper; H is the identity."""
         lower, upper = _as_floats(self.lower), _as_floats(self.upper)

@@ -38,7 +38,7 @@ class LinearFeedback:
     plant: Any = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.mpc, MPC):
+        if not isinstance(self.mpc, MPC) or not isinstance(self.K, np.ndarray | jax.Array | list):
             return  # JAX rebuilds this object with placeholders
         n, m = self.mpc.system.n, self.mpc.system.m
         require_shape("K", self.K, (m, n), "u = K x, one row an input")

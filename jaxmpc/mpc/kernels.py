@@ -1,4 +1,4 @@
-"""The two recursions of `stagewise.py`, each one kernel a batch on NVIDIA GPUs.
+"""The recursions of `stagewise.py`, each one kernel a batch on NVIDIA GPUs.
 
 As a scan every stage is a launch of its own, or several: 5 to 200 µs each whatever the batch. Here
 one warp runs all stages of one problem with the running vector or matrix in its registers (Pallas,
@@ -18,6 +18,9 @@ from jaxmpc.qp.precision import matmul
 
 # Numbers along a side that a warp's registers hold; Triton's products need 16 at least.
 SIDES = (16, 32)
+
+# float32 products from six of bfloat16, as exact as float32's own, on tensor cores.
+PRODUCT: Any = jax.lax.DotAlgorithmPreset.BF16_BF16_F32_X6
 
 
 class Gains(NamedTuple):
@@ -39,6 +42,20 @@ def recurrence(
     """
     scan = partial(_scan, adjoint=adjoint, unroll=unroll)
     return _or_kernel(scan, partial(_recurrence_kernel, adjoint=adjoint), M, w, start)
+
+
+def tracking(
+    gains: Gains, A: Array, B: Array, gx: Array, gu: Array, unroll: int = 1
+) -> tuple[Array, Array]:
+    """x (N+1, n), u (N, m) of least Σ ½ quadratic − g_x·x − g_u·u from x_0 = 0 under
+    x⁺ = A x + B u, the quadratic that of the gains: with q = g_u − B'p⁺
+
+        p = A'p⁺ − K'q − g_x,  d = G⁻¹q  backward,    u = K x + d  forward.
+
+    gx (N+1, n), gu (N, m); A (n, n) and B (n, m), or one a stage.
+    """
+    scan = partial(_tracking_scan, unroll=unroll)
+    return _or_kernel(scan, _tracking_kernel, *gains, A, B, gx, gu)
 
 
 def riccati_recursion(Q: Array, R: Array, cross: Any, A: Array, B: Array) -> Gains:
@@ -70,6 +87,22 @@ def _scan(M: Array, w: Array, start: Array, *, adjoint: bool, unroll: int) -> Ar
 
     xs = (None if M.ndim == 2 else M, w)
     return jax.lax.scan(stage, start, xs, reverse=adjoint, unroll=unroll)[1]
+
+
+def _tracking_scan(
+    closed: Array, K: Array, inverse: Array, A: Array, B: Array, gx: Array, gu: Array, *,
+    unroll: int = 1,
+) -> tuple[Array, Array]:  # fmt: skip
+    apply = lambda M, v: jnp.einsum("...ij,...j->...i", M, v, precision="highest")
+    turned = lambda M, v: apply(jnp.swapaxes(M, -1, -2), v)
+    h = gx[:-1] + turned(K, gu)
+    p = _scan(closed, -h, -gx[-1], adjoint=True, unroll=unroll)
+    p = jnp.concatenate([p[1:], -gx[-1:]])  # of the stage after
+    d = apply(inverse, gu - turned(B, p))
+    start = jnp.zeros_like(gx[0])
+    x = _scan(closed, apply(B, d), start, adjoint=False, unroll=unroll)
+    x = jnp.concatenate([start[None], x])
+    return x, apply(K, x[:-1]) + d
 
 
 def _riccati_scan(Q: Array, R: Array, A: Array, B: Array, cross: Any = None) -> Gains:
@@ -118,12 +151,58 @@ def _recurrence_kernel(
     return _call(kernel, jax.ShapeDtypeStruct((N, n), w.dtype), interpret)(M, w, start)
 
 
+def _tracking_kernel(
+    closed: Array, K: Array, inverse: Array, A: Array, B: Array, gx: Array, gu: Array, *,
+    interpret: bool = False,
+) -> tuple[Array, Array]:  # fmt: skip
+    # K and G⁻¹ are half of what `closed` is to read, and reading is what takes the time.
+    (N, m), n = gu.shape, gx.shape[-1]
+
+    def kernel(K_ref: Any, inverse_ref: Any, A_ref: Any, B_ref: Any, gx_ref: Any, gu_ref: Any,
+               x_ref: Any, u_ref: Any) -> None:  # fmt: skip
+        side = _side(max(n, m))
+        i = jnp.arange(side, dtype=jnp.int32)
+        state, moved = i < n, i < m
+        load = lambda ref, k, rows, columns: _matrix(ref, k, rows, columns, side)
+        once = lambda ref, v, columns: load(ref, None, n, columns) if v.ndim == 2 else None
+        A_0, B_0 = once(A_ref, A, n), once(B_ref, B, m)
+        own = lambda k: (
+            load(A_ref, k, n, n) if A_0 is None else A_0,
+            load(B_ref, k, n, m) if B_0 is None else B_0,
+        )
+        apply = lambda M, v: jnp.sum(M * v[None, :], axis=1)
+        turned = lambda M, v: jnp.sum(M * v[:, None], axis=0)
+
+        def backward(step: Array, p: Array) -> Array:
+            k = N - 1 - step
+            A_k, B_k = own(k)
+            q = _load(gu_ref.at[k, i], moved) - turned(B_k, p)
+            _store(u_ref.at[k, i], apply(load(inverse_ref, k, m, m), q), moved)
+            return turned(A_k, p) - turned(load(K_ref, k, m, n), q) - _load(gx_ref.at[k, i], state)
+
+        def forward(k: Array, x: Array) -> Array:
+            A_k, B_k = own(k)
+            _store(x_ref.at[k, i], x, state)
+            u = apply(load(K_ref, k, m, n), x) + _load(u_ref.at[k, i], moved)
+            _store(u_ref.at[k, i], u, moved)
+            return apply(A_k, x) + apply(B_k, u)
+
+        zero, end = jnp.int32(0), jnp.int32(N)
+        jax.lax.fori_loop(zero, end, backward, -_load(gx_ref.at[N, i], state))
+        if not interpret:
+            _barrier()
+        x = jax.lax.fori_loop(zero, end, forward, jnp.zeros(side, gx.dtype))
+        _store(x_ref.at[N, i], x, state)
+
+    out = [jax.ShapeDtypeStruct(v.shape, v.dtype) for v in (gx, gu)]
+    x, u = _call(kernel, out, interpret)(K, inverse, A, B, gx, gu)
+    return x, u
+
+
 def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array, *, interpret: bool = False) -> Gains:
     N, n, m, dtype = len(R), Q.shape[-1], R.shape[-1], Q.dtype
     side = _side(max(n, m))
-    # Three products of halves are as good as a product of float32; float64 is itself.
-    precision: Any = jax.lax.DotAlgorithmPreset.BF16_BF16_F32_X6
-    precision = None if dtype == jnp.float64 or interpret else precision
+    precision = None if dtype == jnp.float64 or interpret else PRODUCT
 
     def dot(a: Array, b: Array) -> Array:
         return jax.lax.dot_general(
@@ -206,3 +285,10 @@ def _store(place: Any, value: Array, mask: Array) -> None:
     from jax.experimental.pallas import triton
 
     triton.store(place, value, mask=mask)
+
+
+def _barrier() -> None:
+    """What the program has stored may be loaded from here on."""
+    from jax.experimental.pallas import triton
+
+    triton.debug_barrier()

@@ -34,7 +34,7 @@ from jax import Array
 from jaxmpc.checks import concrete, fail, require_finite
 from jaxmpc.control.sets import Box, Ellipsoid
 from jaxmpc.control.system import LinearSystem, as_array, host_array
-from jaxmpc.mpc.kernels import Gains, recurrence, riccati_recursion
+from jaxmpc.mpc.kernels import Gains, recurrence, riccati_recursion, tracking
 from jaxmpc.mpc.problem import MPC, Plan
 from jaxmpc.mpc.rows import blocks
 from jaxmpc.mpc.solve import Layout, cost, multipliers, slack
@@ -308,13 +308,7 @@ def riccati(s: Stages, weights: Any = None) -> Gains:
 def minimise(s: Stages, gains: Gains, gx: Array, gu: Array, unroll: int = 1) -> tuple[Array, Array]:
     """x (N+1, n), u (N, m) of least penalised cost − gx·x − gu·u from x_0 = 0, without c and
     references."""
-    h = gx[:-1] + apply_transposed(gains.K, gu)
-
-    p = recurrence(gains.closed, -h, -gx[-1], adjoint=True, unroll=unroll)
-    p = jnp.concatenate([p[1:], -gx[-1:]])  # of the step after
-    d = apply(gains.inverse, gu - apply_transposed(s.B, p))
-    x = follow(gains, jnp.zeros_like(gx[0]), apply(s.B, d), unroll)
-    return x, apply(gains.K, x[:-1]) + d
+    return tracking(gains, s.A, s.B, gx, gu, unroll)
 
 
 def follow(gains: Gains, x0: Array, w: Array, unroll: int = 1) -> Array:
@@ -518,14 +512,15 @@ def precisely(function: Any, *arguments: Any) -> Any:
     return in_float64(function)(*jax.lax.stop_gradient(arguments))
 
 
-def worst(s: Stages, sample: Sample, u: Array, y: Array) -> Array:
-    """Largest residual, each relative to the size of its terms."""
+def measures(s: Stages, sample: Sample, u: Array, y: Array) -> tuple[Array, Array]:
+    """Primal and dual residual and gap (3,), and the sizes (3,) of the terms they come from."""
 
-    def relative(*arguments: Any) -> Array:
+    def both(*arguments: Any) -> tuple[Array, Array]:
         terms = residual_terms(*arguments)
-        return jnp.max(jnp.stack([largest(v) / (1 + largest(size)) for v, size in terms]))
+        of = lambda i: jnp.stack([largest(term[i]) for term in terms])
+        return of(0), of(1)
 
-    return precisely(relative, s, sample, u, y)
+    return precisely(both, s, sample, u, y)
 
 
 def polish(
@@ -623,8 +618,10 @@ def _plan(factor: StageFactor, mpc: MPC, solver: ADMM, sample: Sample, warm_star
         new_u, new_y = polish(factor, sample, bounds, u, y, solver.refine)
         new_y = s.bounds.admissible(new_y)
         both = (jnp.stack([u, new_u]), jnp.stack([y, new_y]))
-        found = jax.vmap(lambda u, y: worst(s, sample, u, y))(*both)
-        better = found[1] < found[0]  # False for NaN
+        values, sizes = jax.vmap(lambda u, y: measures(s, sample, u, y))(*both)
+        # By the lesser sizes: a plan that pays for slack has large terms, and is none the better.
+        relative = jnp.max(values / (1 + jnp.min(sizes, axis=0)), axis=1)
+        better = relative[1] < relative[0]  # False for NaN
         u, y = (jnp.where(better, pair[1], pair[0]) for pair in both)
     status, primal, dual, gap = assess(s, sample, u, y, solver.eps)
     x = predict(s, sample.x0, u)

@@ -25,13 +25,15 @@ LINEARIZATIONS = ("set-point", "state", "trajectory")
 
 
 def robot_mpc(
-    robot: Robot | LinearPlant, Q: Any, R: Any, horizon: int = 20, *, target: Any = None,
+    robot: Robot | LinearPlant, Q: Any = None, R: Any = None, horizon: int = 20, *, target: Any = None,
     margin: float = 0.02, terminal_cost: Any = "lqr", exact: bool = True, **fields: Any,
 ) -> MPC:  # fmt: skip
     """The MPC of a robot about a set-point, its limits read from the model.
 
     Arguments:
-        Q (n, n) or its diagonal (n,), R (m, m) or (m,): weights in the coordinates ξ.
+        Q (n, n) or its diagonal (n,), R (m, m) or (m,): weights in the coordinates ξ. None, with
+            the half-widths w of the limits (1 where there are none): 1/w² for the positions and
+            0.01/w² for velocities and inputs (Bryson's rule, slow motion and effort forgiven).
         target: configuration (nq,) to linearise about (of a LinearPlant the state), None for
             `robot.home`. It must be one that the actuators can hold.
         margin: share by which state limits are tightened, of the limit's half-width on each
@@ -47,6 +49,10 @@ def robot_mpc(
     """
     if not 0 <= margin < 1:
         fail("margin", f"{margin}", "Give a share in [0, 1)")
+    if Q is None:
+        Q = np.repeat([1.0, 0.01], [robot.n - robot.n // 2, robot.n // 2])
+        Q = Q / robot.state_limits.half_widths() ** 2
+    R = 0.01 / robot.input_limits.half_widths() ** 2 if R is None else R
     diagonal = lambda W: np.diag(W) if np.ndim(W) == 1 else W
     Q, R = diagonal(Q), diagonal(R)
     x, u = robot.equilibrium(target)

@@ -2,14 +2,13 @@
 
 import copy
 import xml.etree.ElementTree as ElementTree
-from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.control.limits import Limit, limit_pair
 from jaxmpc.control.sets import Box
 from jaxmpc.control.system import require_period
@@ -86,17 +85,30 @@ def load_robot(
     smooth.jnt_actfrclimited[:] = 0
     names, units = _state_names(host)
     states = _state_limits(host, position, velocity, velocities)
-    robot = Robot(
-        state_limits=states, input_limits=inputs, home=None, plant=Physics(host),
-        predictor=Physics(smooth), substeps=substeps, dt=control_period, name=name,
-        state_names=names, state_units=units,
+    q = _home(host) if home is None else _configuration(host, home)
+    return Robot(
+        state_limits=states, input_limits=inputs, home=np.concatenate([q, np.zeros(host.nv)]),
+        plant=Physics(host), predictor=Physics(smooth), anchor=_anchor(host, q),
+        substeps=substeps, dt=control_period, name=name, state_names=names, state_units=units,
         input_names=tuple(_names(host, mujoco.mjtObj.mjOBJ_ACTUATOR, host.nu, "u")),
         input_units=tuple(_input_unit(host, i) for i in range(host.nu)),
     )  # fmt: skip
-    q = _home(host) if home is None else robot._configurations("home", home)
-    if q.ndim != 1:
-        fail("home", f"shape {q.shape}", f"Give one configuration ({host.nq},)")
-    return replace(robot, home=np.concatenate([q, np.zeros(host.nv)]))
+
+
+def _configuration(host: "mujoco.MjModel", home: Any) -> np.ndarray:
+    require_shape("home", home, (host.nq,), "One configuration, as in qpos")
+    require_finite("home", home)
+    return np.array(home, float)
+
+
+def _anchor(host: "mujoco.MjModel", home: np.ndarray) -> tuple[float, ...]:
+    """Zeros, with the orientations of the configuration `home`."""
+    anchor = np.zeros(host.nq)
+    for kind, i in zip(host.jnt_type, host.jnt_qposadr, strict=True):
+        if kind in (0, 1):  # free, ball
+            i = i + (3 if kind == 0 else 0)
+            anchor[i : i + 4] = home[i : i + 4] / np.linalg.norm(home[i : i + 4])
+    return tuple(anchor.tolist())
 
 
 def _read(model: str | Path) -> tuple["mujoco.MjModel", dict[str, float]]:

@@ -1,5 +1,7 @@
 """One physics step of a MuJoCo model in MJX, and how it is differentiated."""
 
+import contextlib
+import io
 import re
 import warnings
 from collections.abc import Callable, Mapping
@@ -14,12 +16,16 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
 from jaxmpc.checks import fail
+from jaxmpc.robots.tangent import quaternions, retract
 
 if TYPE_CHECKING:
     import mujoco
 
 
 JAXLIB = tuple(int(part) for part in re.findall(r"\d+", version("jaxlib"))[:3])
+
+# mjtIntegrator.
+EULER = 0
 
 # Operations that old jaxlibs may fuse on a CPU.
 PIECE = 15
@@ -34,15 +40,13 @@ class Physics:
 
     def __init__(self, model: "mujoco.MjModel") -> None:
         self.model = model
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            from mujoco import mjx
-
-            try:
-                with jax.enable_x64(True):
-                    self.mjx: Any = jax.tree.map(np.asarray, mjx.put_model(model))
-            except NotImplementedError as error:
-                fail("model", f"MJX does not support it: {error}", "Take that out of the file")
+        self.joints = tuple(int(joint) for joint in model.jnt_type)
+        try:
+            with warnings.catch_warnings(), jax.enable_x64(True):
+                warnings.simplefilter("ignore")
+                self.mjx: Any = jax.tree.map(np.asarray, mjx_module().put_model(model))
+        except NotImplementedError as error:
+            fail("model", f"MJX does not support it: {error}", "Take that out of the file")
 
     def step(self, x: Array, u: Array, numbers: Mapping[str, Any] | None = None) -> Array:
         """x = (qpos, qvel) one physics step later: a function of x, u and nothing carried along.
@@ -53,15 +57,25 @@ class Physics:
         return in_pieces(self._step)(x, u, numbers)
 
     def _step(self, x: Array, u: Array, numbers: dict[str, Array]) -> Array:
-        from mujoco import mjx
-
+        mjx = mjx_module()
         cast = lambda tree: jax.tree.map(
             lambda v: jnp.asarray(v, x.dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v, tree
         )
         blank, nq = cast(mjx.make_data(self.model)), self.model.nq
         model = cast(self.mjx.replace(**numbers))
         data = mjx.step(model, blank.replace(qpos=x[:nq], qvel=x[nq:], ctrl=u))
-        return jnp.concatenate([data.qpos, data.qvel])
+        q = data.qpos
+        if quaternions(self.joints) and self.model.opt.integrator == EULER:
+            # The same step; MJX's own has the derivative 0 for a body that does not turn.
+            q = retract(self.joints, x[:nq], model.opt.timestep * data.qvel)
+        return jnp.concatenate([q, data.qvel])
+
+
+def mjx_module() -> Any:
+    """mujoco.mjx, which says on stdout that Warp is not installed when it is first imported."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        from mujoco import mjx
+    return mjx
 
 
 def in_pieces(function: Callable, size: int = PIECE) -> Callable:

@@ -18,7 +18,7 @@ from jax import Array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.control.sets import Box
 from jaxmpc.control.system import LinearSystem, host_array
-from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.precision import floating_dtype, matmul
 from jaxmpc.robots.physics import Physics, with_forward_jacobian
 from jaxmpc.robots.tangent import difference, quaternions, retract
 
@@ -38,8 +38,9 @@ class Robot:
     of `substeps` physics steps. Units are MuJoCo's: m, rad, s, kg, N, N m.
 
     state_limits (in ξ), input_limits: Boxes, ±inf for no limit. home (nq + nv,): the set-point of
-    the file. plant, predictor: `Physics`, constants of compiled programs (twice to ten times as
-    fast as arguments); numbers: what a batch varies of the plant (masses, damping), see `vary`.
+    the file. anchor (nq,): zeros, with the orientations of home. plant, predictor: `Physics`,
+    constants of compiled programs (twice to ten times as fast as arguments). numbers: what a batch
+    varies of the plant (masses, damping), see `vary`.
     """
 
     state_limits: Box
@@ -47,6 +48,7 @@ class Robot:
     home: Any
     plant: Physics = field(metadata={"static": True})
     predictor: Physics = field(metadata={"static": True})
+    anchor: tuple[float, ...] = field(metadata={"static": True})
     substeps: int = field(metadata={"static": True})
     dt: float = field(metadata={"static": True})
     name: str = field(default="", metadata={"static": True})
@@ -164,16 +166,6 @@ class Robot:
         nv = self.mujoco.nv
         anchor = jnp.asarray(self.anchor, xi.dtype)
         return jnp.concatenate([retract(self.joints, anchor, xi[:nv]), xi[nv:]])
-
-    @property
-    def anchor(self) -> np.ndarray:
-        """Configuration (nq,) with ξ = 0: zeros, with the orientations of `home`."""
-        anchor, home = np.zeros(self.mujoco.nq), np.asarray(self.home)
-        for joint, i in zip(self.joints, self.mujoco.jnt_qposadr, strict=True):
-            i = i + (3 if joint == 0 else 0)
-            if joint in (0, 1):
-                anchor[i : i + 4] = home[i : i + 4]
-        return anchor
 
     def equilibrium(self, q: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """(x, u): the robot at rest in the configuration q (nq,), and the input that holds it.
@@ -311,7 +303,7 @@ class Robot:
             problem = "That is the size of the coordinates: robot.state(ξ) makes a state of them"
         require_shape("x", x, (size,), problem)
         require_shape("u", u, (self.m,), "One number for each actuator")
-        dtype = jnp.result_type(float, *(v for v in (x, u) if hasattr(v, "dtype")))
+        dtype = floating_dtype((x, u))
         return jnp.asarray(x, dtype), jnp.asarray(u, dtype)
 
     def _configurations(self, argument: str, q: Any) -> np.ndarray:

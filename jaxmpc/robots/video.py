@@ -1,6 +1,7 @@
 """Films of robots, by MuJoCo's renderer and without a window."""
 
 import copy
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,9 @@ def render(
         -1, len(range(0, states.shape[-2], int(every))), model.nq
     )
     try:
-        renderer = mujoco.Renderer(model, height, width)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # GLFW warns of what follows as an error
+            renderer = mujoco.Renderer(model, height, width)
     except Exception as error:  # MuJoCo's, OpenGL's and EGL's: whatever the system lacks
         raise RuntimeError(
             f"no video: MuJoCo finds no renderer ({' '.join(str(error).split())[:120]}). Without "

@@ -155,6 +155,13 @@ class RobotMap:
         return np.where(self.held == -1, found, -1)
 
     @property
+    def unsure(self) -> np.ndarray:
+        """(B,) whether a broken promise was preceded by a plan that is not SOLVED: the solver may
+        be to blame, not the model."""
+        unsolved = self.loops.unsolved_at
+        return self.broken & (unsolved >= 0) & (unsolved < self.first_loss)
+
+    @property
     def outcome(self) -> np.ndarray:
         """(B,) int: index into `OUTCOMES`, their number for undecided."""
         same = [(self.promised == p) & (self.held == h) for p, h in OUTCOMES.values()]
@@ -214,13 +221,12 @@ class RobotMap:
             "limits": "all limits kept", "recursion": "a plan at each sample"
         }[self.claim]  # fmt: skip
         rows = [("claim", f"{what} for {self.seconds:g} s, {self.steps} samples")]
-        total = max(len(self.points), 1)
         for name, row in self.counts().items():
             if sum(row.values()) or name != "undecided":
                 cells = "".join(f"{k:>10,} {word}" for word, k in row.items() if k)
                 rows.append((name, f"{sum(row.values()):>10,}  {cells}"))
-        rows.append(("broken promises", f"{np.sum(self.broken):>10,}  {np.mean(self.broken):.2%}"
-                     if total else ""))  # fmt: skip
+        share = f"{np.mean(self.broken):.2%}, {np.sum(self.unsure):,} after a plan not SOLVED"
+        rows.append(("broken promises", f"{np.sum(self.broken):>10,}  {share}"))
         rows.append(("plans", ", ".join(f"{k:,} {n}" for n, k in self.plan_counts().items())))
         i = self.worst()
         if i is not None:

@@ -1,0 +1,85 @@
+"""The GPU kernels of the stage recursions, run by Pallas' interpreter, against the scans."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmpc.mpc import kernels
+
+
+def batch(rng, N, n, m, staged):
+    """Two random problems: Q, R, A, B, gx, gu."""
+    square = lambda *shape: (
+        lambda W: jnp.asarray(W @ W.swapaxes(-1, -2) + np.eye(shape[-1]), jnp.float32)
+    )(rng.normal(size=(2, *shape)))
+    stages = (N,) if staged else ()
+    random = lambda *shape: jnp.asarray(0.4 * rng.normal(size=(2, *shape)), jnp.float32)
+    return (
+        square(N + 1, n, n), square(N, m, m), random(*stages, n, n), random(*stages, n, m),
+        random(N + 1, n), random(N, m),
+    )  # fmt: skip
+
+
+def close(found, expected):
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-5 * float(jnp.max(jnp.abs(b))))
+
+
+@pytest.mark.parametrize("staged", [False, True])
+def test_kernels_equal_the_scans(staged):
+    """N, n and m that are no powers of two, under vmap, as all programs of a batch run."""
+    rng = np.random.default_rng(3)
+    Q, R, A, B, gx, gu = batch(rng, 3, 5, 2, staged)
+    both = lambda scan, kernel, *args, **options: (
+        jax.vmap(lambda *a: kernel(*a, interpret=True, **options))(*args),
+        jax.vmap(lambda *a: scan(*a, **options))(*args),
+    )
+    found, gains = both(kernels._riccati_scan, kernels._riccati_kernel, Q, R, A, B)
+    close(found, gains)
+    close(*both(kernels._tracking_scan, kernels._tracking_kernel, *gains, A, B, gx, gu))
+    for adjoint in (False, True):
+        scan = lambda *a, adjoint: kernels._scan(*a, adjoint=adjoint, unroll=1)
+        close(*both(scan, kernels._recurrence_kernel, A, gx[:, 1:], gx[:, 0], adjoint=adjoint))
+
+
+def test_tracking_is_the_minimiser():
+    """Gradient of Σ ½ x'Qx + ½ u'Ru − g·(x, u) along its own x, u: zero (float64, by autodiff)."""
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(0)
+        Q, R, A, B, gx, gu = (
+            jnp.asarray(v[0], jnp.float64) for v in batch(rng, 4, 3, 2, True)
+        )  # fmt: skip
+        gains = kernels.riccati_recursion(Q, R, None, A, B)
+        x, u = kernels.tracking(gains, A, B, gx, gu)
+
+        def value(u):
+            states = [jnp.zeros(3)]
+            for k in range(4):
+                states.append(A[k] @ states[-1] + B[k] @ u[k])
+            s = jnp.stack(states)
+            quadratic = jnp.einsum("ki,kij,kj", s, Q, s) + jnp.einsum("ki,kij,kj", u, R, u)
+            return quadratic / 2 - jnp.sum(gx * s) - jnp.sum(gu * u), s
+
+        gradient, states = jax.grad(value, has_aux=True)(u)
+        np.testing.assert_allclose(states, x, atol=1e-12)
+        np.testing.assert_allclose(gradient, 0, atol=1e-11)
+
+
+def test_a_kernel_is_chosen_on_gpus_only(monkeypatch):
+    """And only for sides that a warp holds; its derivative is the scan's."""
+    calls = []
+
+    def kernel(v):
+        calls.append(v.shape)
+        return v**2
+
+    scan = lambda v: v**2
+    assert kernels._or_kernel(scan, kernel, jnp.ones(3)).shape == (3,) and not calls
+    monkeypatch.setattr(kernels.jax, "default_backend", lambda: "gpu")
+    kernels._or_kernel(scan, kernel, jnp.ones(33))
+    assert not calls
+    one = jnp.array([3.0])
+    assert jax.grad(lambda v: kernels._or_kernel(scan, kernel, v)[0])(one) == 6
+    assert calls == [] or set(calls) == {(1,)}
+    assert kernels._or_kernel(scan, kernel, one) == 9 and calls
