@@ -26,7 +26,7 @@ def close(found, expected):
         np.testing.assert_allclose(a, b, atol=2e-5 * float(jnp.max(jnp.abs(b))))
 
 
-@pytest.mark.parametrize("staged", [False, True])
+@pytest.mark.parametrize("staged", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_kernels_equal_the_scans(staged):
     """N, n and m that are no powers of two, under vmap, as all programs of a batch run."""
     rng = np.random.default_rng(3)

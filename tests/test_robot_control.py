@@ -227,7 +227,7 @@ def test_chunks_and_variations(linear_mpc):
     # References and offsets, and a NaN start that stays alone.
     starts = np.where(np.arange(5)[:, None] == 2, np.nan, LINEAR_STARTS)
     moved = jm.simulate_many(
-        feedback, PLANT, starts, 400, reference=np.array([0.3, 0.0]), input_reference=[0.0]
+        feedback, PLANT, starts, 400, reference=np.array([0.3, 0.0]), input_reference=np.zeros(1)
     )
     keep = [0, 1, 3, 4]
     np.testing.assert_allclose(moved.states[keep, -1], [[0.3, 0]] * 4, atol=1e-3)

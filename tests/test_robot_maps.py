@@ -127,6 +127,7 @@ def lecture_with_end(size):
     return linear(mpc, terminal_set=jm.Polytope(end.H, size * end.h))
 
 
+@pytest.mark.slow
 def test_linear_robot_keeps_every_promise_with_an_invariant_end():
     plant, mpc = lecture_with_end(1.0)
     points = jm.grid([-1.0, -1.0], [1.0, 1.0], (12, 12))

@@ -632,7 +632,7 @@ BAD_FILES = {
     "short period": (single(), {"control_period": 0.001}, "control_period: .*no multiple"),
     "no period": (single(), {"control_period": 0}, "control_period: 0 is not a positive number"),
     "timestep": (single(), {"timestep": -1.0}, "timestep: -1.0 is not a positive number"),
-    "home": (single(), {"home": [1, 2]}, r"home: shape \(2,\)\. Give"),
+    "home": (single(), {"home": [1, 2]}, r"home: shape \(2,\)"),
 }  # fmt: skip
 
 

@@ -69,9 +69,7 @@ def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
     real, asked = simulate.simulate_many, []
 
     def default(robot, Q, R, horizon, *, target, margin):
-        assert (horizon, target, margin) == (mpc.horizon, None, 0.02)
-        np.testing.assert_allclose(np.diag(Q), mpc.Q)
-        np.testing.assert_allclose(np.diag(R), mpc.R)
+        assert (Q, R, horizon, target, margin) == (None, None, mpc.horizon, None, 0.02)
         return mpc
 
     def interrupted(*args, **kwargs):

@@ -248,8 +248,8 @@ class RobotJob:
 
 
 def default_mpc(robot: Robot, horizon: int, terminal: str | None = None) -> MPC:
-    """An MPC of any robot, weights and limits those of `robot_mpc`. terminal: None or "none", "box": the state limits of
-    the problem, "invariant": the largest set that the LQR keeps within all limits."""
+    """The MPC of `robot_mpc` with a terminal set: None or "none"; "box", the state limits of the
+    problem; "invariant", the largest set that the LQR keeps within all limits."""
     mpc = robot_mpc(robot, horizon=horizon)
     if terminal in (None, "none"):
         return mpc

@@ -190,11 +190,11 @@ class Simulate:
             if given is not None and len(given) != size:
                 fail(name, f"has {len(given)} numbers", f"{robot.name} needs {size}")
         target = None if self.target is None else np.array(self.target)
-        weights = [
-            None if given is None else np.array(given)
-            for given in (self.state_weights, self.input_weights)
-        ]
-        mpc = robot_mpc(robot, *weights, self.horizon, target=target, margin=self.margin)
+        array = lambda v: None if v is None else np.array(v)
+        mpc = robot_mpc(
+            robot, array(self.state_weights), array(self.input_weights), self.horizon,
+            target=target, margin=self.margin,
+        )  # fmt: skip
         controller: Any
         with jax.enable_x64(self.dtype == "float64"):
             if self.linearize == "lqr":

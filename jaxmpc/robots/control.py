@@ -25,8 +25,9 @@ LINEARIZATIONS = ("set-point", "state", "trajectory")
 
 
 def robot_mpc(
-    robot: Robot | LinearPlant, Q: Any = None, R: Any = None, horizon: int = 20, *, target: Any = None,
-    margin: float = 0.02, terminal_cost: Any = "lqr", exact: bool = True, **fields: Any,
+    robot: Robot | LinearPlant, Q: Any = None, R: Any = None, horizon: int = 20, *,
+    target: Any = None, margin: float = 0.02, terminal_cost: Any = "lqr", exact: bool = True,
+    **fields: Any,
 ) -> MPC:  # fmt: skip
     """The MPC of a robot about a set-point, its limits read from the model.
 
