@@ -105,6 +105,9 @@ def simulate_many(
     if chunk is not None and chunk < 1:
         fail("chunk", f"{chunk}", "Give a count of at least 1")
     _checked(controller, plant, x0s[0], steps, reference, input_reference, None, None)
+    reference, input_reference = (
+        None if v is None else np.asarray(v) for v in (reference, input_reference)
+    )
     opaque = jax.tree_util.all_leaves([plant])  # no pytree: a constant of the program
     setting = Steps(int(steps), None if opaque else plant, plant if opaque else None)
     parts = arrays((controller, setting, reference, input_reference))

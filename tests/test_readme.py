@@ -8,12 +8,13 @@ import pytest
 README = Path(__file__).resolve().parents[1] / "README.md"
 
 
-def run(*which):
+def run(*which, instead=()):
     """Execute snippets one after the other; the names they leave."""
     snippets = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
     names: dict[str, object] = {}
     for i in which:
-        exec(compile(snippets[i], str(README), "exec"), names)
+        text = snippets[i].replace(*instead) if instead else snippets[i]
+        exec(compile(text, str(README), "exec"), names)
     return snippets, names
 
 
@@ -30,7 +31,16 @@ def test_first_snippet(capsys):
 @pytest.mark.slow
 def test_workflow_snippet(capsys):
     """Theorem 1 holds of the design, and the weight it advises is exact."""
-    _, names = run(0, 1)
+    _, names = run(0, 2)
     text = capsys.readouterr().out
     assert "Theorem 1 (recursive feasibility) applies" in text and "weight given is exact" in text
     assert names["controller"].mpc.soft
+
+
+@pytest.mark.slow
+def test_robot_snippet():
+    """With the robot that compiles fastest."""
+    _, names = run(1, instead=("arm7", "joint"))
+    assert names["run"].states.shape == (64, 101, 2)
+    assert names["run"].violation.max() == 0 and not names["run"].fallback.any()
+    assert abs(names["run"].states[:, -1]).max() < 1e-2

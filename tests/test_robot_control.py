@@ -192,7 +192,8 @@ def linear_mpc():
 LINEAR_STARTS = np.array([[0.5, 0.0], [-1.0, 1.5], [0.2, -0.5], [1.4, 1.0], [0.9, -1.9]])
 
 
-@pytest.mark.parametrize("mode", ["state", pytest.param("trajectory", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["state", "trajectory"])
 def test_linear_plant_is_the_linear_loop(mode, linear_mpc):
     """Whatever the linearisation, a linear plant's loop is that of jm.Controller on the softened
     problem."""

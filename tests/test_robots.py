@@ -219,6 +219,7 @@ def assert_linear(found, wanted):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-7 * max(1e-2, np.abs(b).max()))
 
 
+@pytest.mark.slow
 def test_linear_model_of_the_quadrotor_in_the_chart(quadrotor):
     """Turned by 0.5, 1 and 2 rad from home: A, B, c of the whole period by the C engine, and the
     plant's transition at 100 random orientations."""
@@ -684,3 +685,16 @@ def test_what_cannot_be_held_is_named(pendulum):
         pendulum.equilibrium([1.0])
     with pytest.raises(ValueError, match="needs torque"):
         pendulum.equilibrium([[0.0], [1.0]])
+
+
+def test_a_hovering_body_feels_its_rates():
+    """At rest d(rotation)/d(rate) is one physics step, not 0: MJX's own integration of quaternions
+    has the derivative 0 there, and hover would not be stabilizable."""
+    robot = jm.load_robot("quadrotor")
+    with jax.enable_x64(True):
+        x, u = map(jnp.asarray, robot.equilibrium())
+        rates = jnp.zeros(13).at[10:].set(jnp.array([1.0, -2.0, 0.5]))
+        step = lambda x: robot.plant.step(x, u)
+        moved = jax.jit(lambda x, d: jax.jvp(step, (x,), (d,))[1])(x, rates)
+        h = robot.mujoco.opt.timestep
+        np.testing.assert_allclose(moved[3:7], [0, *(h / 2 * rates[10:])], rtol=1e-3, atol=1e-12)

@@ -58,7 +58,6 @@ def robot_mpc(
     Q, R = diagonal(Q), diagonal(R)
     x, u = robot.equilibrium(target)
     with jax.enable_x64(True):
-        system = jax.tree.map(np.asarray, robot.linearize(x, u, exact=exact))
         point = np.asarray(robot.coordinates(x))
     lower, upper = (np.asarray(end, float) for end in (
         robot.state_limits.lower, robot.state_limits.upper
@@ -69,23 +68,14 @@ def robot_mpc(
     if np.any(outside > 0):
         i = int(np.argmax(outside))
         fail(
-            "target", f"has {system.state_names[i] or i} = {point[i]:g}, limits with margin are "
-            f"[{lower[i]:g}, {upper[i]:g}]", "Choose another target, or less margin",
+            "target", f"has {(robot.state_names or range(len(point)))[i]} = {point[i]:g}, limits "
+            f"with margin are [{lower[i]:g}, {upper[i]:g}]", "Choose another target, less margin",
         )  # fmt: skip
-    steps = (
-        tuple(range(1, int(horizon) + 1))
-        if np.isfinite(lower).any() | np.isfinite(upper).any()
-        else None
-    )
-    mpc = MPC(
-        system,
-        Q,
-        R,
-        horizon,
-        states=Box(lower, upper),
-        inputs=robot.input_limits,
-        constrained_steps=steps,
-    )
+    with jax.enable_x64(True):
+        system = jax.tree.map(np.asarray, robot.linearize(x, u, exact=exact))
+    mpc = MPC(system, Q, R, horizon, states=Box(lower, upper), inputs=robot.input_limits)
+    mpc.validate()
+    mpc = replace(mpc, constrained_steps=tuple(range(1, horizon + 1)))
     if isinstance(terminal_cost, str):
         if terminal_cost != "lqr":
             fail("terminal_cost", f"{terminal_cost!r}", 'Give "lqr", a matrix or None')

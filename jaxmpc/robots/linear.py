@@ -58,6 +58,11 @@ class LinearPlant:
         return self.system.n
 
     @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states, if the system has any."""
+        return self.system.state_names
+
+    @property
     def dt(self) -> float:
         """Control period (s)."""
         assert self.system.dt is not None

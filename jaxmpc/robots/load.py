@@ -98,7 +98,15 @@ def load_robot(
 def _configuration(host: "mujoco.MjModel", home: Any) -> np.ndarray:
     require_shape("home", home, (host.nq,), "One configuration, as in qpos")
     require_finite("home", home)
-    return np.array(home, float)
+    q = np.array(home, float)
+    for kind, i in zip(host.jnt_type, host.jnt_qposadr, strict=True):
+        if kind in (0, 1):  # free, ball
+            i = i + (3 if kind == 0 else 0)
+            size = np.linalg.norm(q[i : i + 4])
+            if not 0.5 < size < 2:
+                fail("home", f"quaternion {q[i : i + 4]} of length {size:g}", "Give unit length")
+            q[i : i + 4] /= size
+    return q
 
 
 def _anchor(host: "mujoco.MjModel", home: np.ndarray) -> tuple[float, ...]:
@@ -262,7 +270,13 @@ def _state_limits(
     speeds = np.broadcast_to(speeds, nv)
     lower[nv:], upper[nv:] = np.maximum(lower[nv:], -speeds), np.minimum(upper[nv:], speeds)
     limits = _overridden("position", Box(lower, upper), position, slice(0, nv))
-    return _overridden("velocity", limits, velocity, slice(nv, None))
+    limits = _overridden("velocity", limits, velocity, slice(nv, None))
+    slow, fast = np.asarray(limits.lower)[nv:], np.asarray(limits.upper)[nv:]
+    if np.any((slow > 0) | (fast < 0)):
+        i = int(np.argmax((slow > 0) | (fast < 0)))
+        cure = "Give (lower, upper) with 0 inside, or one number v for |.| ≤ v"
+        fail("velocity", f"[{slow[i]:g}, {fast[i]:g}] of dof {i} leaves out rest", cure)
+    return limits
 
 
 def _overridden(argument: str, limits: Box, override: Limit, part: slice) -> Box:

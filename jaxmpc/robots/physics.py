@@ -100,7 +100,8 @@ def in_pieces(function: Callable, size: int = PIECE) -> Callable:
         )
         for start in range(0, len(jaxpr.eqns), size):
             eqns, later = jaxpr.eqns[start : start + size], jaxpr.eqns[start + size :]
-            needed = reads(later) | dict.fromkeys(jaxpr.outvars)
+            ends = (v for v in jaxpr.outvars if not isinstance(v, Literal))
+            needed = reads(later) | dict.fromkeys(ends)
             made = [v for eqn in eqns for v in eqn.outvars if v in needed]
             given = [v for v in reads(eqns) if v in values]
             piece = jaxpr.replace(constvars=[], invars=given, outvars=made, eqns=eqns)

@@ -90,7 +90,9 @@ class Robot:
         MJX's constraint solver loops: each physics step gives its Jacobian by forward mode. Second
         derivatives: forward mode over either.
         """
-        x, u = self._read(x, u)
+        return _stepped(self, *self._read(x, u))
+
+    def _step(self, x: Array, u: Array) -> Array:
         advance = with_forward_jacobian(self.plant.step)
         body = lambda x, _: (advance(x, u, self.numbers), None)
         return jax.lax.scan(body, x, length=self.substeps)[0]
@@ -103,7 +105,9 @@ class Robot:
         by 1 %, B by 0.05 %). exact=True: Jacobians along the physics steps, and c such that the
         model passes through the predictor's own next state.
         """
-        x, u = self._read(x, u)
+        return _linearized(self, *self._read(x, u), exact=exact)
+
+    def _linearize(self, x: Array, u: Array, exact: bool) -> LinearSystem:
         advance = lambda s, u: self.coordinates(self.predictor.step(self.state(s), u))
 
         def affine(s: Array) -> tuple[Array, Array, Array]:
@@ -137,7 +141,9 @@ class Robot:
     def transition(self, x: Any, u: Any) -> tuple[Array, Array]:
         """A (n, n), B (n, m) of one physics step of the plant about x, u, small motions against
         small motions: those of mujoco.mjd_transitionFD, by automatic differentiation."""
-        x, u = self._read(x, u)
+        return _differentiated(self, *self._read(x, u))
+
+    def _transition(self, x: Array, u: Array) -> tuple[Array, Array]:
         nq, nv = self.mujoco.nq, self.mujoco.nv
         after = self.plant.step(x, u, self.numbers)
 
@@ -152,6 +158,7 @@ class Robot:
     def coordinates(self, x: Any) -> Array:
         """ξ (n,) of a state x (nq + nv,)."""
         x = jnp.asarray(x)
+        require_shape("x", x, (self.state_size,), "Give (qpos, qvel) of one robot")
         if not quaternions(self.joints):
             return x
         nq = self.mujoco.nq
@@ -161,6 +168,7 @@ class Robot:
     def state(self, coordinates: Any) -> Array:
         """x (nq + nv,) with the coordinates ξ (n,)."""
         xi = jnp.asarray(coordinates)
+        require_shape("coordinates", xi, (self.n,), "Two numbers a dof; use jax.vmap for many")
         if not quaternions(self.joints):
             return xi
         nv = self.mujoco.nv
@@ -312,6 +320,12 @@ class Robot:
             fail(argument, f"shape {q.shape}", f"Give (..., {self.mujoco.nq}), as in qpos")
         require_finite(argument, q)
         return q
+
+
+# Compiled once a robot, also where the user calls them outside `jit`.
+_stepped = jax.jit(Robot._step)
+_linearized = jax.jit(Robot._linearize, static_argnames="exact")
+_differentiated = jax.jit(Robot._transition)
 
 
 def _quaternion(R: Array) -> Array:
