@@ -109,7 +109,7 @@ def simulate_many(
         None if v is None else np.asarray(v) for v in (reference, input_reference)
     )
     opaque = jax.tree_util.all_leaves([plant])  # no pytree: a constant of the program
-    setting = Steps(int(steps), None if opaque else plant, plant if opaque else None)
+    setting = Steps(int(steps), None if opaque else plant, Opaque(plant) if opaque else None)
     parts = arrays((controller, setting, reference, input_reference))
     rows = lambda start, size: arrays(
         jax.tree.map(lambda v: _rows(np.asarray(v), start, size), (x0s, varied))
@@ -129,6 +129,13 @@ def simulate_many(
     return jax.tree.map(lambda *v: np.concatenate(v), *found)
 
 
+@dataclass(frozen=True, eq=False)
+class Opaque:
+    """A plant that is no pytree, told apart by identity."""
+
+    plant: Any
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Steps:
@@ -146,7 +153,7 @@ def _loops(
     """Closed loops from x0s (B, n), each with its own numbers in the plant."""
 
     def loop(x0: Array, numbers: dict[str, Array]) -> Run:
-        plant = steps.opaque or steps.plant
+        plant = steps.plant if steps.opaque is None else steps.opaque.plant
         plant = plant.vary(**numbers) if numbers else plant
         return simulate(
             controller, plant, x0, steps.count, reference=reference,

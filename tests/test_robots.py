@@ -557,7 +557,10 @@ def test_urdf_gets_motors_and_limits_and_no_meshes(tmp_path):
     np.testing.assert_array_equal(robot.input_limits.lower, [-30, -5])
     np.testing.assert_array_equal(robot.state_limits.lower, [-1, -np.inf, -3, -4])
     np.testing.assert_array_equal(robot.state_limits.upper, [2, np.inf, 3, 4])
-    assert robot.input_names == ("first", "second") and robot.input_units == ("N m", "N m")
+    assert robot.input_names == ("first torque", "second torque") and robot.input_units == (
+        "N m",
+        "N m",
+    )
     # Gravity at rest, both rods along x: by hand, about y.
     _, u = robot.equilibrium([0.0, 0.0])
     np.testing.assert_allclose(u, [-9.81 * (2 * 0.25 + 0.75), -9.81 * 0.25], rtol=1e-9)
@@ -687,10 +690,16 @@ def test_what_cannot_be_held_is_named(pendulum):
         pendulum.equilibrium([[0.0], [1.0]])
 
 
-def test_a_hovering_body_feels_its_rates():
+@pytest.mark.parametrize(
+    "integrator", ["Euler", pytest.param("implicitfast", marks=pytest.mark.slow)]
+)
+def test_a_hovering_body_feels_its_rates(integrator):
     """At rest d(rotation)/d(rate) is one physics step, not 0: MJX's own integration of quaternions
     has the derivative 0 there, and hover would not be stabilizable."""
-    robot = jm.load_robot("quadrotor")
+    model = jm.load_robot("quadrotor").mujoco
+    names = {"Euler": 0, "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST}
+    model.opt.integrator = names[integrator]
+    robot = jm.load_robot(model)
     with jax.enable_x64(True):
         x, u = map(jnp.asarray, robot.equilibrium())
         rates = jnp.zeros(13).at[10:].set(jnp.array([1.0, -2.0, 0.5]))

@@ -25,7 +25,7 @@ class Settings:
     """models: by name or path. states: at which linear models are compared. stretch: width of the
     random positions in joint ranges (above 1 some stops push)."""
 
-    models: tuple[str, ...] = ("joint", "pendulum", "cartpole", "arm2", "quadrotor")
+    models: tuple[str, ...] = ("joint", "pendulum", "cartpole", "arm2", "arm6", "arm7", "quadrotor")
     states: int = 100
     steps: int = 500
     stretch: float = 1.1

@@ -1,15 +1,18 @@
 """What the commands of the command line share."""
 
 import contextlib
+import hashlib
 import sys
 import tempfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import tyro
 
 from jaxmpc.checks import fail
+from jaxmpc.robots.robot import Robot
 
 
 def option(metavar: str | None, default: str) -> Any:
@@ -51,3 +54,12 @@ def versions() -> dict[str, str]:
         with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
     return found
+
+
+def model_hash(robot: Robot) -> str:
+    """Of the compiled model, so that --resume notices another file under the same name."""
+    import mujoco
+
+    binary = np.zeros(mujoco.mj_sizeModel(robot.mujoco), np.uint8)
+    mujoco.mj_saveModel(robot.mujoco, None, binary)
+    return hashlib.sha256(binary.tobytes()).hexdigest()

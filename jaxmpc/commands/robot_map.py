@@ -15,7 +15,7 @@ import numpy as np
 from tqdm.std import tqdm
 
 from jaxmpc.checks import fail
-from jaxmpc.commands.options import open_folder, versions
+from jaxmpc.commands.options import model_hash, open_folder, versions
 from jaxmpc.control.invariant import maximal_invariant_set
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Polytope
@@ -156,6 +156,8 @@ class RobotJob:
     def _open_chunks(self, config: dict[str, Any]) -> None:
         """The folder of the chunks, empty or of the same map."""
         folder, said = self.output / CHUNKS, self.output / CHUNKS / "config.json"
+        if folder.exists() and not said.exists():
+            fail(str(folder), "holds no map", "Choose another output folder")
         if folder.exists() and self.overwrite:
             shutil.rmtree(folder)
         elif folder.exists() and not self.resume:
@@ -281,10 +283,10 @@ def _home(robot: Robot) -> np.ndarray:
 
 
 def _fingerprint(robot: Robot, points: np.ndarray) -> str:
-    """Of the model's masses and limits, and of all points."""
-    host = robot.mujoco
-    parts = (host.body_mass, host.body_inertia, host.jnt_range, host.dof_damping, points)
-    return hashlib.sha256(b"".join(np.asarray(v).tobytes() for v in parts)).hexdigest()[:16]
+    """Of the compiled model, its home and control period, and of all points."""
+    parts = (np.asarray(robot.home), np.array([robot.dt]), points)
+    text = model_hash(robot).encode() + b"".join(v.tobytes() for v in parts)
+    return hashlib.sha256(text).hexdigest()[:16]
 
 
 def _length(rows: slice) -> int:

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import hashlib
 import importlib
 import io
 import json
@@ -22,7 +21,7 @@ from tqdm.std import tqdm
 
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop import Run, simulate_many
-from jaxmpc.commands.options import open_folder, option, report_error
+from jaxmpc.commands.options import model_hash, open_folder, option, report_error
 from jaxmpc.compiled import Compiled, first_rows, padded
 from jaxmpc.control.riccati import lqr
 from jaxmpc.mpc.feedback import LinearFeedback
@@ -297,7 +296,7 @@ class Simulate:
             "state_weights": np.diag(mpc.Q).tolist(),
             "input_weights": np.diag(mpc.R).tolist(),
         }
-        options |= {**weights, "refine": self.newton_steps, "model": _fingerprint(robot)}
+        options |= {**weights, "refine": self.newton_steps, "model": model_hash(robot)}
         return options
 
     @property
@@ -386,7 +385,10 @@ class Simulate:
             "promised": count(outcome.promised) if mpc else None,
             "promised_and_kept": count(outcome.promised & outcome.kept) if mpc else None,
             "worst_violation": {"of": names[i], "by": float(worst[i]), "unit": units[i]},
-            "violations": dict(zip(names, worst.tolist(), strict=True)),
+            "violations": {
+                "states": dict(zip(robot.state_names, worst[: robot.n].tolist(), strict=True)),
+                "inputs": dict(zip(robot.input_names, worst[robot.n :].tolist(), strict=True)),
+            },
             "plans": plans if mpc else 0,
             "plans_solved": count(run.status == Status.SOLVED),
             "fallback_plans": count(run.fallback),
@@ -499,15 +501,6 @@ def _read(path: Path) -> Run:
     # x_0 is measured and no limit binds it, so that there is no soft row at k = 0.
     found["slack"] = np.zeros((*found["status"].shape, 0))
     return Run(**found)
-
-
-def _fingerprint(robot: Robot) -> str:
-    """Of the compiled model, so that --resume notices another file under the same name."""
-    import mujoco
-
-    binary = np.zeros(mujoco.mj_sizeModel(robot.mujoco), np.uint8)
-    mujoco.mj_saveModel(robot.mujoco, None, binary)
-    return hashlib.sha256(binary.tobytes()).hexdigest()
 
 
 def _choose_renderer() -> None:

@@ -31,10 +31,12 @@ def load_robot(
     Arguments:
         model: "joint" (the lesson's), "pendulum", "cartpole", "arm2", "arm6" (UR5e), "arm7" (Franka
             FER), "quadrotor" (Crazyflie 2), or a path. A URDF gets a motor for each joint
-            with its `effort` as limit, its `velocity` limits are read, and its meshes are left out.
+            with its `effort` as limit, its `velocity` limits are read (0: none), and its shapes are
+            left out, so that it needs inertias and touches nothing.
         position, velocity, torque: limits in place of the file's, as `joint_limits` takes them:
             (lower, upper), each a number or one a dof (torque: one an actuator), or v for
-            |.| ≤ v. They bind the controller; the joint stops of the plant stay.
+            |.| ≤ v, inputs in units of ctrl. They bind the controller; the joint stops of the plant
+            stay, motors push as hard as they are told.
         home: configuration (nq,) in place of the file's.
         control_period: seconds between inputs; a multiple of timestep, the physics step (s).
 
@@ -68,7 +70,8 @@ def load_robot(
         host.opt.timestep = timestep
     h = host.opt.timestep
     if control_period is None:
-        control_period = float(_numeric(host, "control_period", max(1, round(0.01 / h)) * h))
+        found = np.atleast_1d(_numeric(host, "control_period", max(1, round(0.01 / h)) * h))
+        control_period = float(found[0])
     require_period("control_period", control_period)
     substeps = round(control_period / h)
     if substeps < 1 or abs(substeps * h - control_period) > 1e-9 * control_period:
@@ -150,7 +153,7 @@ def _without_meshes(text: str) -> tuple[str, dict[str, float]]:
                 link.remove(element)
     limits = ((joint.get("name"), joint.find("limit")) for joint in root.iter("joint"))
     velocities = {
-        str(name): float(limit.get("velocity", "inf"))
+        str(name): float(limit.get("velocity", "inf")) or np.inf
         for name, limit in limits
         if limit is not None
     }
@@ -164,7 +167,7 @@ def _add_motors(spec: "mujoco.MjSpec") -> None:
     single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     for joint in spec.joints:
         if joint.type in single:
-            motor = spec.add_actuator(name=joint.name, target=joint.name)
+            motor = spec.add_actuator(name=f"{joint.name} torque", target=joint.name)
             motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
             motor.set_to_motor()
 
@@ -209,7 +212,7 @@ def _state_names(host: "mujoco.MjModel") -> tuple[tuple[str, ...], tuple[str, ..
 
 def _input_unit(host: "mujoco.MjModel", i: int) -> str:
     """Unit of an actuator's input: force or torque of a joint's motor, else unknown."""
-    if not _is_motor(host, i):
+    if not _is_motor(host, i) or abs(host.actuator_gainprm[i, 0] * host.actuator_gear[i, 0]) != 1:
         return ""
     return "N" if host.jnt_type[host.actuator_trnid[i, 0]] == 2 else "N m"
 
@@ -228,10 +231,13 @@ def _is_motor(host: "mujoco.MjModel", i: int) -> bool:
 
 def _input_limits(host: "mujoco.MjModel", override: Limit) -> Box:
     """The box of inputs; what it takes over of a motor's force limits is dropped in `host`."""
+    import mujoco
+
     lower, upper = np.full(host.nu, -np.inf), np.full(host.nu, np.inf)
     limited = host.actuator_ctrllimited.astype(bool)
     lower[limited], upper[limited] = host.actuator_ctrlrange[limited].T
-    joints = host.actuator_trnid[:, 0]
+    on_joint = host.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    joints = np.where(on_joint, host.actuator_trnid[:, 0], -1)
     for i in range(host.nu):
         gain, gear = host.actuator_gainprm[i, 0], host.actuator_gear[i, 0]
         if not _is_motor(host, i) or gain * gear == 0:

@@ -16,7 +16,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
 from jaxmpc.checks import fail
-from jaxmpc.robots.tangent import quaternions, retract
+from jaxmpc.robots.tangent import normalised, quaternions, retract
 
 if TYPE_CHECKING:
     import mujoco
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 JAXLIB = tuple(int(part) for part in re.findall(r"\d+", version("jaxlib"))[:3])
 
-# mjtIntegrator.
-EULER = 0
+# mjtIntegrator; it moves the configuration by several velocities, not by the last.
+RK4 = 1
 
 # Operations that old jaxlibs may fuse on a CPU.
 PIECE = 15
@@ -44,9 +44,13 @@ class Physics:
         try:
             with warnings.catch_warnings(), jax.enable_x64(True):
                 warnings.simplefilter("ignore")
-                self.mjx: Any = jax.tree.map(np.asarray, mjx_module().put_model(model))
+                mjx = mjx_module()
+                self.mjx: Any = jax.tree.map(np.asarray, mjx.put_model(model))
+                mjx.make_data(model)
         except NotImplementedError as error:
             fail("model", f"MJX does not support it: {error}", "Take that out of the file")
+        if quaternions(self.joints) and model.opt.integrator == RK4:
+            fail("model", "moves orientations by RK4", 'Use integrator="Euler" or "implicitfast"')
 
     def step(self, x: Array, u: Array, numbers: Mapping[str, Any] | None = None) -> Array:
         """x = (qpos, qvel) one physics step later: a function of x, u and nothing carried along.
@@ -65,9 +69,10 @@ class Physics:
         model = cast(self.mjx.replace(**numbers))
         data = mjx.step(model, blank.replace(qpos=x[:nq], qvel=x[nq:], ctrl=u))
         q = data.qpos
-        if quaternions(self.joints) and self.model.opt.integrator == EULER:
+        if quaternions(self.joints):
             # The same step; MJX's own has the derivative 0 for a body that does not turn.
-            q = retract(self.joints, x[:nq], model.opt.timestep * data.qvel)
+            start = normalised(self.joints, x[:nq])
+            q = retract(self.joints, start, model.opt.timestep * data.qvel)
         return jnp.concatenate([q, data.qvel])
 
 

@@ -1,6 +1,7 @@
 """A robot of MuJoCo as a plant: one control period forward, and its affine model.
 
-Two models of one file. The plant is the model as written. The predictor is the same without
+Two models of one file. The plant is the model as written, but for the force limits of motors, which
+become `input_limits`. The predictor is the same without
 constraint rows (joint limits, contacts, friction loss, equalities): a stiff spring at a joint's
 end makes a linear model useless one sample later, so limits belong into the MPC. Both take inputs
 as they are, without MuJoCo's clamp to `ctrlrange`, whose derivative is wrong at the bound, where
@@ -182,7 +183,8 @@ class Robot:
         (gravity compensation), the least one where there are several. Limits' springs, contacts and
         dry friction do not help. Host, float64, by MuJoCo's C engine.
 
-        Raises ValueError where the actuators cannot hold q at all, or only beyond input_limits.
+        Raises ValueError where the actuators cannot hold q at all, or only beyond input_limits
+        (force limits of actuators other than motors are not looked at).
         """
         q = self._configurations("q", self.home[: self.mujoco.nq] if q is None else q)
         still = np.zeros((*q.shape[:-1], self.mujoco.nv))
@@ -242,13 +244,17 @@ class Robot:
         """Reference and input reference of a motion given by its positions, for `simulate`.
 
         positions (K, nv): coordinates of the joints once a control period. Returns states (K, n)
-        with velocities by central differences, and inputs (K, m) by inverse dynamics. Host.
+        with velocities by central differences, and inputs (K, m) by inverse dynamics. Host. Raises
+        ValueError for wrong shapes, or orientations that turn.
         """
         nv = self.mujoco.nv
         given = host_array("positions", positions)
         if given.ndim != 2 or given.shape[1] != nv or len(given) < 3:
             fail("positions", f"shape {given.shape}", f"Give (K, {nv}) with K ≥ 3 samples")
         require_finite("positions", given)
+        turned = [i for i, name in enumerate(self.state_names[:nv]) if " rotation " in name]
+        if quaternions(self.joints) and np.any(given[:, turned]):
+            fail("positions", "turn a free or ball joint", "Only its translation can be given")
         velocity = np.gradient(given, self.dt, axis=0)
         acceleration = np.gradient(velocity, self.dt, axis=0)
         with jax.enable_x64(True):
@@ -259,9 +265,9 @@ class Robot:
         """The same robot with other numbers in its plant; models and controllers keep theirs.
 
         numbers: fields of mjx.Model by name, such as body_mass (nbody,), dof_damping (nv,),
-        dof_frictionloss, dof_armature, actuator_gear; or payload (kg): a point mass at the site
-        "tool", a number. Works under `jax.vmap`, which is how a batch gets a robot each; the
-        inverse weights that shape MuJoCo's soft limits stay those of the file.
+        dof_armature, actuator_gear, dof_frictionloss (where the file has some); or payload (kg): a
+        point mass at the site "tool", a number. Works under `jax.vmap`, which is how a batch gets
+        a robot each; the inverse weights that shape MuJoCo's soft limits stay those of the file.
         """
         payload = numbers.pop("payload", None)
         for key, value in numbers.items():
@@ -270,6 +276,9 @@ class Robot:
                 fail(key, "is no array of mjx.Model", "Give fields such as body_mass, dof_damping")
             require_shape(key, value, np.shape(present), "As in robot.plant.mjx")
             require_finite(key, value)
+            if key == "dof_frictionloss" and not np.all(present > 0):
+                cure = "Give those joints a little frictionloss in the file"
+                fail(key, "is zero for some joints of the file, which then have no such row", cure)
         varied = {**self.numbers, **numbers}
         if payload is not None:
             varied |= self._loaded(payload, varied)

@@ -58,6 +58,17 @@ def quaternions(joints: tuple[int, ...]) -> bool:
     return any(joint in (FREE, BALL) for joint in joints)
 
 
+def normalised(joints: tuple[int, ...], q: Array) -> Array:
+    """q (nq,) with quaternions of length 1."""
+    i = 0
+    for joint in joints:
+        i += 3 if joint == FREE else 0
+        if joint in (FREE, BALL):
+            q = q.at[i : i + 4].set(q[i : i + 4] / jnp.linalg.norm(q[i : i + 4]))
+        i += 4 if joint in (FREE, BALL) else 1
+    return q
+
+
 def _product(a: Array, b: Array) -> Array:
     """Hamilton product."""
     vector = a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])

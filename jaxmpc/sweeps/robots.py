@@ -53,7 +53,8 @@ class Loops:
     the units of that limit; NaN where something is not finite. broken_at (b,): first sample 0 … T
     with an excess above the tolerance or a number that is not finite, −1 for none. lost_at (b,):
     first sample 0 … T−1 at which the state is beyond its limits or its plan, SOLVED, breaks soft
-    rows (`Run.fallback`): there the hard problem has no plan. −1: none. unsolved_at (b,): first
+    rows (`Run.fallback`): there the hard problem has no plan whose multipliers stay below the
+    controller's penalty. −1: none. unsolved_at (b,): first
     sample whose plan is not SOLVED, −1 for none. statuses (b, S): how many plans had each `Status`,
     in the order of the enumeration.
     """
