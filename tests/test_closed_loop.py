@@ -53,6 +53,7 @@ def test_feasibility_lost_on_the_way():
     assert run.feasible_steps == 1
 
 
+@pytest.mark.slow
 def test_lyapunov_decrease_with_terminal_ingredients():
     """Terminal set O_inf and the cost of the DARE: V falls by at least the stage cost, from every
     feasible start; starts outside and NaN are told apart."""

@@ -60,6 +60,7 @@ def has_plan(mpc, x):
     return result.status == 0
 
 
+@pytest.mark.slow
 def test_promise_is_that_of_the_linear_map(hanging):
     robot, mpc, points, _, rmap = hanging
     feasible = np.array([has_plan(mpc, x) for x in points])
@@ -73,6 +74,7 @@ def test_promise_is_that_of_the_linear_map(hanging):
     np.testing.assert_array_equal(rmap.outcome == 1, rmap.broken)
 
 
+@pytest.mark.slow
 def test_loops_equal_the_c_engine(hanging):
     """The recorded inputs through mujoco.mj_step give the same labels."""
     robot, mpc, points, controller, rmap = hanging
@@ -100,6 +102,7 @@ def test_loops_equal_the_c_engine(hanging):
             assert rmap.loops.worst[i] == pytest.approx(max(*excess, 0), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_picture(hanging):
     rmap = hanging[-1]
     ax = plot_robot_map(rmap)

@@ -182,6 +182,7 @@ def test_transition_equals_the_c_engines_at_100_states(name):
     assert_transition(robot, *draw(robot, 100, stretch=1.2))
 
 
+@pytest.mark.slow
 def test_transition_of_the_pendulum_and_its_inputs(pendulum):
     """100 states, some in the stops. Inputs at their bound and beyond are not clamped: B stays."""
     x, u = draw(pendulum, 100, stretch=1.2)
@@ -394,6 +395,7 @@ def test_trajectory_followed_open_loop(name):
 # --- variations ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_varied_robots_are_other_models():
     """Masses, damping and a payload under vmap, 100 control periods into the stops and back under
     random inputs, against files edited and compiled by MuJoCo."""

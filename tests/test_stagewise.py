@@ -102,7 +102,7 @@ def condensed(mpc: jm.MPC, system: jm.LinearSystem, x0: np.ndarray) -> tuple:
     return jax.tree.map(jnp.asarray, qp), shift
 
 
-@pytest.mark.parametrize("kind", ["constant", "varying"])
+@pytest.mark.parametrize("kind", [pytest.param("constant", marks=pytest.mark.slow), "varying"])
 def test_iterates_are_those_of_the_dense_solver(kind):
     mpc = problem()
     system = mpc.system if kind == "constant" else varying()
@@ -155,6 +155,7 @@ def test_plan_is_that_of_solve():
     assert jax.tree.structure(plan) == jax.tree.structure(exact)
 
 
+@pytest.mark.slow
 def test_varying_system():
     """Optimal for the QP built by hand, to rounding after five Newton steps."""
     mpc, system = problem(), varying()
@@ -199,6 +200,7 @@ def test_residuals_are_those_of_the_qp():
     assert min(found) > 1e-4
 
 
+@pytest.mark.slow
 def test_rows_that_no_input_moves():
     """x_0 outside hard limits: violated, and said; outside soft ones: their slack."""
     mpc = problem()
