@@ -14,7 +14,7 @@ from jax.tree_util import Partial
 from tqdm.std import tqdm
 
 from jaxmpc.checks import fail
-from jaxmpc.compiled import Compiled
+from jaxmpc.compiled import Compiled, first_rows, padded
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.status import Status
@@ -112,7 +112,7 @@ def simulate_many(
     setting = Steps(int(steps), None if opaque else plant, Opaque(plant) if opaque else None)
     parts = arrays((controller, setting, reference, input_reference))
     rows = lambda start, size: arrays(
-        jax.tree.map(lambda v: _rows(np.asarray(v), start, size), (x0s, varied))
+        jax.tree.map(lambda v: padded(np.asarray(v)[start : start + size], size), (x0s, varied))
     )
     size = min(chunk or len(x0s), len(x0s))
     while chunk is None and size > 1:
@@ -124,7 +124,7 @@ def simulate_many(
         for start in range(0, len(x0s), size):
             run = _LOOPS(*parts, *rows(start, size))
             here = min(size, len(x0s) - start)
-            found.append(jax.tree.map(lambda v, n=here: v[:n], run))
+            found.append(first_rows(run, here))
             bar.update(here)
     return jax.tree.map(lambda *v: np.concatenate(v), *found)
 
@@ -220,12 +220,6 @@ def _step_of(plant: Any, n: int, m: int) -> Partial:
     if jax.tree_util.all_leaves([plant]):  # no pytree
         return Partial(plant.step)
     return Partial(type(plant).step, arrays(plant))
-
-
-def _rows(v: np.ndarray, start: int, size: int) -> np.ndarray:
-    """Rows from `start` on, the first of them repeated where fewer than `size` are left."""
-    part = v[start : start + size]
-    return np.concatenate([part, np.broadcast_to(part[:1], (size - len(part), *v.shape[1:]))])
 
 
 def _needed(program: Any) -> float:

@@ -9,9 +9,9 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.control.sets import Box
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.qp.precision import arrays, floating_dtype, matmul
+from jaxmpc.mpc.solve import limited
+from jaxmpc.qp.precision import floating_dtype, matmul
 from jaxmpc.qp.status import Status
 
 
@@ -82,9 +82,7 @@ class LinearFeedback:
         r = first(reference, self.mpc.system.n)
         u = first(input_reference, self.mpc.system.m)
         u = u + matmul(jnp.asarray(self.K, x.dtype), self.coordinates(x) - r)
-        if isinstance(self.mpc.inputs, Box):
-            lower, upper = arrays((self.mpc.inputs.lower, self.mpc.inputs.upper))
-            u = jnp.clip(u, jnp.asarray(lower, u.dtype), jnp.asarray(upper, u.dtype))
+        u = limited(self.mpc.inputs, u)
         nothing = NoPlan(
             jnp.asarray(jnp.nan, x.dtype), jnp.asarray(Status.NOT_RUN, jnp.int32),
             jnp.zeros((1, 0), x.dtype),

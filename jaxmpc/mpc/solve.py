@@ -110,9 +110,9 @@ class Controller:
         """
         start = None if carry is None else self.shifted(carry)
         if carry is not None and previous_input is None and self.mpc.remembers:
-            previous_input = self._limited(carry.inputs[0])
+            previous_input = limited(self.mpc.inputs, carry.inputs[0])
         plan = self.plan(x, reference, start, input_reference, previous_input)
-        return self._limited(plan.inputs[0]), plan, plan
+        return limited(self.mpc.inputs, plan.inputs[0]), plan, plan
 
     def shifted(self, plan: Plan) -> tuple[Array, Array]:
         """The plan seen one sample later, as a warm start (z, y).
@@ -126,19 +126,12 @@ class Controller:
         c = self.condensed
         assert c is not None
         x, moves, N = plan.states[-1], np.array(self.mpc.moves), self.mpc.horizon
-        tail = self._limited(matmul(c.K_N, x)) - matmul(c.K, x)
+        tail = limited(self.mpc.inputs, matmul(c.K_N, x)) - matmul(c.K, x)
         z = jnp.concatenate([plan.qp.z.reshape(-1, c.R.shape[0]), tail[None]])
         # A move takes over what the old plan did one step after the move begins.
         begins = np.unique(moves, return_index=True)[1]
         z = z[np.append(moves, moves[-1] + 1)[begins + 1]]
         return z.ravel(), shifted_multipliers(c.layout, N, plan.qp.y, bool(c.balls))
-
-    def _limited(self, u: Array) -> Array:
-        """u inside the input limits: an actuator takes no rounding beyond them."""
-        if not isinstance(self.mpc.inputs, Box):
-            return u
-        lower, upper = arrays((self.mpc.inputs.lower, self.mpc.inputs.upper))
-        return jnp.clip(u, jnp.asarray(lower, u.dtype), jnp.asarray(upper, u.dtype))
 
     def plan(
         self, x0: Any, reference: Any = None, warm_start: Any = None, input_reference: Any = None,
@@ -186,6 +179,14 @@ class Controller:
         c = self.condensed
         assert c is not None
         return multipliers(self.mpc, c.layout, y)
+
+
+def limited(inputs: Any, u: Array) -> Array:
+    """u inside the input limits, if these are a Box: an actuator takes no rounding beyond them."""
+    if not isinstance(inputs, Box):
+        return u
+    lower, upper = arrays((inputs.lower, inputs.upper))
+    return jnp.clip(u, jnp.asarray(lower, u.dtype), jnp.asarray(upper, u.dtype))
 
 
 def cost(

@@ -14,7 +14,7 @@ from jaxmpc.control.sets import Box
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.mpc.problem import MPC, Plan
 from jaxmpc.mpc.soften import soften
-from jaxmpc.mpc.solve import Controller, shifted_multipliers
+from jaxmpc.mpc.solve import Controller, limited, shifted_multipliers
 from jaxmpc.mpc.stagewise import factor_stages, layout, solve_stagewise
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.precision import arrays, floating_dtype
@@ -162,10 +162,15 @@ class RobotController:
         """A plan that rests at x under the first input of input_reference (zero for none)."""
         shapes = jax.eval_shape(lambda x: self(x, None, input_reference=input_reference)[2], x)
         zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
-        xi, (N, m) = self.coordinates(x), zeros.inputs.shape
-        u = jnp.zeros(m, xi.dtype) if input_reference is None else input_reference
+        states, inputs = self._resting(x, input_reference)
+        return replace(zeros, states=states, inputs=inputs)
+
+    def _resting(self, x: Array, input_reference: Any) -> tuple[Array, Array]:
+        """States (N+1, n) that stay at x, inputs (N, m) the first of input_reference."""
+        xi, N, m = self.coordinates(x), self.soft.horizon, self.robot.m
+        u = jnp.zeros(m, xi.dtype) if input_reference is None else jnp.asarray(input_reference)
         u = jnp.broadcast_to(u[0] if u.ndim == 2 else u, (N, m)).astype(xi.dtype)
-        return replace(zeros, states=jnp.broadcast_to(xi, (N + 1, len(xi))), inputs=u)
+        return jnp.broadcast_to(xi, (N + 1, len(xi))), u
 
     def __call__(
         self, x: Any, carry: Plan | None = None, reference: Any = None, *,
@@ -181,10 +186,7 @@ class RobotController:
                 previous_input=previous_input,
             )  # fmt: skip
         if carry is None:
-            N, m = self.soft.horizon, self.robot.m
-            u = jnp.zeros(m, x.dtype) if input_reference is None else jnp.asarray(input_reference)
-            inputs = jnp.broadcast_to(u[0] if u.ndim == 2 else u, (N, m)).astype(x.dtype)
-            states = jnp.broadcast_to(self.coordinates(x), (N + 1, self.robot.n))
+            states, inputs = self._resting(x, input_reference)
             start = None
         else:
             # One sample later, its last step twice.
@@ -197,22 +199,13 @@ class RobotController:
             self.soft, system, self.coordinates(x), reference, self.solver, start,
             input_reference=input_reference, scale=self.scale,
         )  # fmt: skip
-        return self._limited(plan.inputs[0]), plan, plan
+        return limited(self.soft.inputs, plan.inputs[0]), plan, plan
 
     def _model(self, x: Array, states: Array, inputs: Array, carry: Plan | None) -> LinearSystem:
         """The linear model about x, or about each step of a plan."""
         if self.linearize == "state":
             u = inputs[0] if carry is None else carry.inputs[0]
-            return self.robot.linearize(x, self._limited(u), exact=self.exact)
+            return self.robot.linearize(x, limited(self.soft.inputs, u), exact=self.exact)
         states = states.at[0].set(self.coordinates(x))
         at = lambda xi, u: self.robot.linearize(self.robot.state(xi), u, exact=self.exact)
         return jax.vmap(at)(states[:-1], inputs)
-
-    def _limited(self, u: Array) -> Array:
-        """u inside the input limits: an actuator takes no rounding beyond them."""
-        if not isinstance(self.soft.inputs, Box):
-            return u
-        lower, upper = (
-            jnp.asarray(v, u.dtype) for v in (self.soft.inputs.lower, self.soft.inputs.upper)
-        )
-        return jnp.clip(u, lower, upper)

@@ -22,6 +22,7 @@ from jaxmpc.compiled import default_chunk, padded
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
+from jaxmpc.outcome import coordinates
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.control import RobotController
@@ -70,7 +71,7 @@ class Loops:
         """From closed loops with the batch in front, judged by the robot's own limits."""
         states = np.asarray(run.states)
         excess = np.maximum(
-            _excess(np.asarray(_coordinates(robot, states)), robot.state_limits),
+            _excess(coordinates(robot, states), robot.state_limits),
             # An input belongs to the sample that it leaves.
             np.pad(_excess(np.asarray(run.inputs), robot.input_limits), ((0, 0), (0, 1))),
         )
@@ -473,13 +474,6 @@ def deviations(mpc: MPC, x: Any, u: Any) -> MPC:
         mpc, system=replace(system, c=A @ x + B @ u + c - x), states=moved(mpc.states, x),
         inputs=moved(mpc.inputs, u), terminal_set=moved(mpc.terminal_set, x), outputs=tuple(rows),
     )  # fmt: skip
-
-
-def _coordinates(robot: Any, states: np.ndarray) -> Any:
-    """ξ of plant states (..., nq + nv)."""
-    if robot.state_size == robot.n:
-        return states
-    return jax.jit(jax.vmap(jax.vmap(robot.coordinates)))(states)
 
 
 def _states(robot: Any, xi: np.ndarray) -> np.ndarray:
