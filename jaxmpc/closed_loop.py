@@ -54,6 +54,7 @@ class Run:
 def simulate(
     controller: Any, plant: Any, x0: Any, steps: int, *, reference: Any = None,
     input_reference: Any = None, disturbance: Any = None, previous_input: Any = None,
+    checkpoint: bool = False,
 ) -> Run:  # fmt: skip
     """Drive `plant` from x0 (n,) with `controller` for T = steps samples.
 
@@ -64,6 +65,8 @@ def simulate(
     look ahead: the plan at sample t sees the rows t … t+N. input_reference: the same for inputs,
     (m,) or (T + N − 1, m). disturbance (T, n): added to the next states. previous_input (m,):
     u_{−1} where the problem limits or weighs input rates. All in the controller's dtype.
+    checkpoint: in reverse mode keep only what is carried from sample to sample, and compute the
+    samples again: less memory, more time.
 
     One instance: `jax.vmap(lambda x: simulate(controller, plant, x, 50))(x0s)` runs thousands and
     compiles once; `simulate_many` does so by chunks that fit into memory. The loop goes on after a
@@ -76,6 +79,7 @@ def simulate(
             controller, plant, x0, steps, reference, input_reference, disturbance, previous_input
         ),
         int(steps),
+        checkpoint,
     )
 
 
@@ -108,15 +112,14 @@ def simulate_many(
     reference, input_reference = (
         None if v is None else np.asarray(v) for v in (reference, input_reference)
     )
-    opaque = jax.tree_util.all_leaves([plant])  # no pytree: a constant of the program
-    setting = Steps(int(steps), None if opaque else plant, Opaque(plant) if opaque else None)
+    setting = Steps.of(steps, plant)
     parts = arrays((controller, setting, reference, input_reference))
     rows = lambda start, size: arrays(
         jax.tree.map(lambda v: padded(np.asarray(v)[start : start + size], size), (x0s, varied))
     )
     size = min(chunk or len(x0s), len(x0s))
     while chunk is None and size > 1:
-        if _needed(_LOOPS.program(*parts, *rows(0, size))) <= 0.8 * _memory():
+        if needed(_LOOPS.program(*parts, *rows(0, size))) <= 0.8 * memory():
             break
         size = -(-size // 2)
     found = []
@@ -145,25 +148,31 @@ class Steps:
     plant: Any
     opaque: Any = field(metadata={"static": True})
 
+    @classmethod
+    def of(cls, count: int, plant: Any) -> "Steps":
+        """So many steps of a plant."""
+        opaque = jax.tree_util.all_leaves([plant])  # no pytree: a constant of the program
+        return cls(int(count), None if opaque else plant, Opaque(plant) if opaque else None)
 
-def _loops(
+
+def loops(
     controller: Any, steps: Steps, reference: Any, input_reference: Any, x0s: Array,
-    varied: dict[str, Array],
+    varied: dict[str, Array], checkpoint: bool = False,
 ) -> Run:  # fmt: skip
-    """Closed loops from x0s (B, n), each with its own numbers in the plant."""
+    """Closed loops from x0s (B, n), each with its own numbers in the plant. Traceable."""
 
     def loop(x0: Array, numbers: dict[str, Array]) -> Run:
         plant = steps.plant if steps.opaque is None else steps.opaque.plant
         plant = plant.vary(**numbers) if numbers else plant
         return simulate(
             controller, plant, x0, steps.count, reference=reference,
-            input_reference=input_reference,
+            input_reference=input_reference, checkpoint=checkpoint,
         )  # fmt: skip
 
     return jax.vmap(loop)(x0s, varied)
 
 
-_LOOPS = Compiled(jax.jit(_loops))
+_LOOPS = Compiled(jax.jit(loops))
 
 
 def lyapunov_decrease(run: Run) -> Array:
@@ -222,13 +231,13 @@ def _step_of(plant: Any, n: int, m: int) -> Partial:
     return Partial(type(plant).step, arrays(plant))
 
 
-def _needed(program: Any) -> float:
+def needed(program: Any) -> float:
     """Bytes that a compiled program takes."""
     found = program.memory_analysis()
     return 0.0 if found is None else found.temp_size_in_bytes + found.output_size_in_bytes
 
 
-def _memory() -> float:
+def memory() -> float:
     """Bytes that the present device has."""
     found = jax.devices()[0].memory_stats()
     if found and "bytes_limit" in found:
@@ -236,10 +245,10 @@ def _memory() -> float:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-@partial(jax.jit, static_argnames="steps")
+@partial(jax.jit, static_argnames=("steps", "checkpoint"))
 def _simulate(
     controller: Any, step: Partial, x0: Array, references: tuple[Array | None, Array | None],
-    disturbance: Array | None, previous_input: Array | None, steps: int,
+    disturbance: Array | None, previous_input: Array | None, steps: int, checkpoint: bool,
 ) -> Run:  # fmt: skip
     mpc = controller.mpc
     N, Q, R = mpc.horizon, jnp.asarray(mpc.Q, x0.dtype), jnp.asarray(mpc.R, x0.dtype)
@@ -273,6 +282,8 @@ def _simulate(
     previous = jnp.zeros(mpc.system.m, x0.dtype) if previous_input is None else previous_input
     samples = (jnp.arange(steps), disturbance)
     run: Run
+    if checkpoint:
+        sample = jax.checkpoint(sample, prevent_cse=False)
     (last, *_), run = jax.lax.scan(sample, (x0, before, previous), samples, length=steps)
     return replace(
         run, states=jnp.concatenate([run.states, last[None]]),

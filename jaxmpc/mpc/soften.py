@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import concrete, fail
 from jaxmpc.control.limits import output_limits
 from jaxmpc.control.sets import Ellipsoid, Polytope
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple, output_steps
@@ -25,10 +25,15 @@ def soften(mpc: MPC, rho: Any, quadratic: Any = 0.0) -> MPC:
         fail("terminal_set", "is an Ellipsoid, which stays hard", "Use a Polytope inside it")
 
     def add(C: Any, D: Any, lower: Any, upper: Any, steps: Any, names: Any, units: Any) -> None:
-        bounded = np.isfinite(lower) | np.isfinite(upper)
+        # Limits inside a trace cannot be read: all their rows are taken. One at infinity asks for
+        # nothing.
+        read = concrete(C, D, lower, upper)
+        bounded, below = np.ones(np.shape(lower), bool), True
+        if read:
+            bounded, below = np.isfinite(lower) | np.isfinite(upper), np.isfinite(lower).any()
         if not bounded.any() or not steps:
             return
-        keep = lambda v: None if v is None else np.asarray(v)[bounded]
+        keep = lambda v: None if v is None else (np.asarray(v) if read else v)[bounded]
         text = lambda v: tuple(str(part) for part in np.asarray(v)[bounded]) if v else ()
         soft.append(
             Soft(
@@ -40,7 +45,7 @@ def soften(mpc: MPC, rho: Any, quadratic: Any = 0.0) -> MPC:
                 tuple(steps),
                 text(names),
                 text(units),
-                keep(lower) if np.isfinite(lower).any() else None,
+                keep(lower) if below else None,
             )  # fmt: skip
         )
 

@@ -23,6 +23,7 @@ runs forward, Σ⁺ = (A + BK) Σ (A + BK)' + B G⁻¹ B' from Σ_0 = 0. (The de
 the mean curvature to P first; E differs by that share.)
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -60,14 +61,14 @@ def solve_stagewise(
     x0, references, solver and the Plan are those of `solve`, and so is the status: residuals and
     gap of the returned inputs and multipliers, evaluated from the data in float64. What differs:
     no infeasibility is proved (a problem without a solution ends as ITERATION_LIMIT: soften the
-    rows that may not hold), the derivative is that of the steps as they were taken, `qp.z` are the
-    inputs, `qp.cost` is the plan's. warm_start: an earlier Plan, or inputs (N, m) or (N m,) and
-    multipliers (rows,). solver.refine: Newton steps, a Riccati recursion each; 5 suffice where
-    ADMM has found the active rows. mpc.prestabilise is not read: the inputs are the variables, so
-    a plant that grows more than 1e5-fold over the horizon in open loop (1e3-fold in float32) has
-    residuals above eps by rounding alone; `solve` takes those. scale (rows,): the row scale of a
-    similar problem (`factor_stages(...).E`), which saves one of two Riccati recursions; it
-    changes the path of ADMM, not the answer.
+    rows that may not hold), `qp.z` are the inputs, `qp.cost` is the plan's. Derivatives with
+    respect to every array of data are those of solver.differentiate. warm_start: an earlier Plan,
+    or inputs (N, m) or (N m,) and multipliers (rows,). solver.refine: Newton steps, a Riccati
+    recursion each; 5 suffice where ADMM has found the active rows. mpc.prestabilise is not read:
+    the inputs are the variables, so a plant that grows more than 1e5-fold over the horizon in open
+    loop (1e3-fold in float32) has residuals above eps by rounding alone; `solve` takes those. scale
+    (rows,): the row scale of a similar problem (`factor_stages(...).E`), which saves one of two
+    Riccati recursions; it changes the path of ADMM, not the answer.
 
     `jax.vmap` over system, x0, references or the arrays of `mpc`. Raises ValueError for bad data
     that can be read, and for what only `solve` knows: Ellipsoids, control horizons, input rates.
@@ -540,15 +541,6 @@ def polish(
     the data.
     """
     s, E, rho = factor.stages, factor.E, factor.rho[-1]
-    strong = Constants.of(u.dtype).linear
-
-    def errors(
-        s: Stages, sample: Sample, E: Array, rho: Array, u: Array, y: Array
-    ) -> tuple[Array, ...]:
-        """v + y/ρ, c and the gradient."""
-        found, push = conditions(s, sample, u, y), unscaled(E, y) / rho
-        v = E * found.rows + push
-        return v, scaled(s.bounds, E).excess(v, rho) - push, found.gradient
 
     def body(pair: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         u, y = pair
@@ -557,15 +549,70 @@ def polish(
             fixed = jax.lax.stop_gradient
             exact = precisely(errors, s, sample, E, rho, u, y)
             found = jax.tree.map(lambda p, e: p + fixed(e - p), found, exact)
-        v, c, gradient = found
-        D = bounds.curvature(v, rho)[0]
-        loose = 1 - D + D * rho / strong
-        omega, push = rho * D / loose, rho * c / loose
-        gx, gu = s.pull(E * push)
-        dx, du = minimise(s, riccati(s, omega * E**2), -gx, -gu - gradient)
-        return (u + du, y + E * (omega * E * s.rows(dx, du) + push)), None
+        D = bounds.curvature(found[0], rho)[0]
+        du, dy = newton(s, E, rho, D)(*found[1:])
+        return (u + du, y + dy), None
 
     return jax.lax.scan(body, (u, y), length=steps)[0]
+
+
+def errors(
+    s: Stages, sample: Sample, E: Array, rho: Array, u: Array, y: Array
+) -> tuple[Array, Array, Array]:
+    """v + y/ρ, c and the gradient, see `polish`."""
+    found, push = conditions(s, sample, u, y), unscaled(E, y) / rho
+    v = E * found.rows + push
+    return v, scaled(s.bounds, E).excess(v, rho) - push, found.gradient
+
+
+def newton(s: Stages, E: Array, rho: Array, D: Array) -> Callable[[Array, Array], Any]:
+    """(c, gradient) → (du, dy) of `polish`: linear."""
+    loose = 1 - D + D * rho / Constants.of(E.dtype).linear
+    omega = rho * D / loose
+    gains = riccati(s, omega * E**2)
+
+    def step(c: Array, gradient: Array) -> tuple[Array, Array]:
+        push = rho * c / loose
+        gx, gu = s.pull(E * push)
+        dx, du = minimise(s, gains, -gx, -gu - gradient)
+        return du, E * (omega * E * s.rows(dx, du) + push)
+
+    return step
+
+
+@jax.custom_jvp
+def implicit(
+    s: Stages, sample: Sample, E: Array, rho: Array, u: Array, y: Array
+) -> tuple[Array, Array]:
+    """The solution (u, y), given as constants, with its derivative with respect to the data.
+
+    The conditions F(data, u, y) = 0 of `polish` hold at a solution, hence J d(u, y) = −dF with
+    the matrix J of a Newton step and u, y held fixed in dF: one Riccati recursion, whatever the
+    number of iterations. Rows that touch without pushing count as inactive, as in
+    `qp/derivative.py`.
+    """
+    return u, y
+
+
+@implicit.defjvp
+def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple:
+    s, sample, E, rho, u, y = primals
+    # As results of this function u and y carry the derivatives that higher orders need.
+    u, y = implicit(s, sample, E, rho, u, y)
+    at_data = lambda s, sample: errors(s, sample, E, rho, u, y)
+    (v, c, gradient), (_, *moved) = jax.jvp(at_data, (s, sample), tangents[:2])
+    step = newton(s, E, rho, scaled(s.bounds, E).curvature(v, rho)[0])
+
+    def follow(moved: Any) -> Any:
+        # The step is linear; as a derivative of itself it can be transposed, kernels or not.
+        return jax.jvp(step, (c, gradient), tuple(moved))[1]
+
+    # What the proximal step on y leaves, of relative size ρ/κ, is taken up by a second step.
+    first = follow(moved)
+    of_pair = lambda u, y: errors(s, sample, E, rho, u, y)[1:]
+    left = jax.jvp(of_pair, (u, y), first)[1]
+    second = follow(jax.tree.map(jnp.add, moved, list(left)))
+    return (u, y), jax.tree.map(jnp.add, first, second)
 
 
 def unscaled(E: Array, y: Array) -> Array:
@@ -599,11 +646,42 @@ def plan_stages(
 
 @jax.jit
 def _plan(factor: StageFactor, mpc: MPC, solver: ADMM, sample: Sample, warm_start: Any) -> Plan:
-    s = factor.stages
     finite = factor.usable
     for v in sample:
         finite = finite & jnp.all(jnp.isfinite(v))
     sample = jax.tree.map(lambda v: jnp.where(finite, v, 0.0), sample)
+    if solver.differentiate == "implicit":
+        constants = jax.lax.stop_gradient((factor, sample, solver, warm_start))
+        u, y = implicit(
+            factor.stages, sample, constants[0].E, constants[0].rho[-1], *search(*constants)
+        )
+    else:
+        u, y = search(factor, sample, solver, warm_start)
+    s = factor.stages
+    status, primal, dual, gap = assess(s, sample, u, y, solver.eps)
+    x = predict(s, sample.x0, u)
+    J = cost(mpc, x, u, sample.states, sample.inputs)
+    nan = lambda v: jnp.where(finite, v, jnp.nan)
+    solution = QPSolution(
+        z=nan(u.ravel()), y=nan(y), cost=nan(J),
+        status=jnp.where(finite, status, Status.NON_FINITE).astype(jnp.int32),
+        primal_residual=nan(primal), dual_residual=nan(dual), gap=nan(gap),
+        iterations=jnp.asarray(solver.iterations, jnp.int32),
+        certificate=jnp.zeros_like(y), ray=jnp.zeros_like(u.ravel()),
+    )  # fmt: skip
+    return Plan(
+        states=nan(x), inputs=nan(u), cost=solution.cost, slack=nan(slack(mpc, x, u)),
+        multipliers=multipliers(mpc, s.layout, solution.y), status=solution.status,
+        primal_residual=solution.primal_residual, dual_residual=solution.dual_residual,
+        gap=solution.gap, iterations=solution.iterations, qp=solution,
+    )  # fmt: skip
+
+
+def search(
+    factor: StageFactor, sample: Sample, solver: ADMM, warm_start: Any
+) -> tuple[Array, Array]:
+    """Inputs u (N, m) and multipliers y (rows,): loop and polish."""
+    s = factor.stages
     bounds = scaled(s.bounds, factor.E)
     t, (x, u) = iterate(
         factor, sample, bounds, start(factor, sample, bounds, warm_start), solver.iterations,
@@ -623,23 +701,7 @@ def _plan(factor: StageFactor, mpc: MPC, solver: ADMM, sample: Sample, warm_star
         relative = jnp.max(values / (1 + jnp.min(sizes, axis=0)), axis=1)
         better = relative[1] < relative[0]  # False for NaN
         u, y = (jnp.where(better, pair[1], pair[0]) for pair in both)
-    status, primal, dual, gap = assess(s, sample, u, y, solver.eps)
-    x = predict(s, sample.x0, u)
-    J = cost(mpc, x, u, sample.states, sample.inputs)
-    nan = lambda v: jnp.where(finite, v, jnp.nan)
-    solution = QPSolution(
-        z=nan(u.ravel()), y=nan(y), cost=nan(J),
-        status=jnp.where(finite, status, Status.NON_FINITE).astype(jnp.int32),
-        primal_residual=nan(primal), dual_residual=nan(dual), gap=nan(gap),
-        iterations=jnp.asarray(solver.iterations, jnp.int32),
-        certificate=jnp.zeros_like(y), ray=jnp.zeros_like(u.ravel()),
-    )  # fmt: skip
-    return Plan(
-        states=nan(x), inputs=nan(u), cost=solution.cost, slack=nan(slack(mpc, x, u)),
-        multipliers=multipliers(mpc, s.layout, solution.y), status=solution.status,
-        primal_residual=solution.primal_residual, dual_residual=solution.dual_residual,
-        gap=solution.gap, iterations=solution.iterations, qp=solution,
-    )  # fmt: skip
+    return u, y
 
 
 def start(factor: StageFactor, sample: Sample, bounds: Bounds, warm_start: Any) -> Array:

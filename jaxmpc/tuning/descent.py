@@ -1,0 +1,227 @@
+"""Gradient descent with guards: the loop that every tuner shares.
+
+The optimiser is optax's. Around it: validation on data apart, the best iterate kept, steps that
+lead to numbers which are not finite taken back and halved, and everything on disk after each step.
+"""
+
+import hashlib
+import json
+import os
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import optax
+from tqdm.std import tqdm
+
+from jaxmpc.checks import fail
+
+# (loss, numbers to record) and (loss, gradient, numbers to record).
+Validate = Callable[[Any], tuple[float, Mapping[str, float]]]
+Gradient = Callable[[Any, int], tuple[float, Any, Mapping[str, float]]]
+
+
+@dataclass(frozen=True)
+class Descent:
+    """The record of T steps from θ_0 to θ_T.
+
+    theta: the θ of least validation loss, `best` its number. thetas: all of them, leaves (T+1, …).
+    loss, gradient_norm (T,): at θ_t on the step's own data. accepted (T,): False where loss or
+    gradient was not finite; θ_{t+1} is then the last good θ moved by half the step. validation
+    (T+1,): of each θ, NaN where not finite. numbers {name: (T,)} and validation_numbers {name:
+    (T+1,)}: what else was measured with them. seconds: of all runs that a checkpoint joins.
+    """
+
+    theta: Any
+    best: int
+    thetas: Any
+    loss: np.ndarray
+    gradient_norm: np.ndarray
+    accepted: np.ndarray
+    validation: np.ndarray
+    numbers: dict[str, np.ndarray]
+    validation_numbers: dict[str, np.ndarray]
+    seconds: float
+
+    @property
+    def steps(self) -> int:
+        """T."""
+        return len(self.loss)
+
+
+@dataclass
+class State:
+    """All that a step depends on: where it is and how it came there.
+
+    good: the last θ with a finite gradient, its gradient and the optimiser's state before it.
+    share: of the optimiser's step that is taken, 1 until a step fails.
+    """
+
+    theta: Any
+    good: tuple[Any, Any, Any] | None
+    share: float = 1.0
+    seconds: float = 0.0
+    rows: list[dict[str, float]] = field(default_factory=list)
+    checks: list[dict[str, float]] = field(default_factory=list)
+    thetas: list[Any] = field(default_factory=list)
+
+
+def descend(
+    theta: Any, gradient: Gradient, validate: Validate, optimizer: optax.GradientTransformation,
+    updates: int, *, checkpoint: str | Path | None = None, settings: Any = None,
+    progress: bool = False,
+) -> Descent:  # fmt: skip
+    """Minimise by `updates` steps of `optimizer` from θ = `theta`, a pytree of arrays (host).
+
+    gradient(θ, t): loss, gradient and further numbers on the data of step t; a function of its
+    arguments alone, so that a run can be taken up again. validate(θ): loss and numbers on data
+    apart, also before the first step: the result is the best of T + 1 iterates, never worse than
+    the start. checkpoint: file (.npz) replaced in one move after every step; where it is present
+    the run goes on from there, and ends where it would have ended. settings: JSON data that decide
+    the run, kept in it. Raises ValueError for a checkpoint of other settings, and where θ_0 itself
+    has no finite validation loss.
+    """
+    if not isinstance(updates, int | np.integer) or isinstance(updates, bool) or updates < 0:
+        fail("updates", f"{updates!r}", "Give a whole number of steps")
+    theta = jax.tree.map(lambda v: np.asarray(v, np.float64), theta)
+    path = None if checkpoint is None else Path(checkpoint)
+    state = State(theta, None, thetas=[theta])
+    mark = _fingerprint(settings, theta)
+    if path is not None and path.exists():
+        state = _load(path, theta, optimizer, mark)
+    if not state.checks:
+        begun = time.perf_counter()
+        state.checks.append(_checked(validate, theta))
+        if not np.isfinite(state.checks[0]["loss"]):
+            fail("parameters", "have no finite validation loss at the start", "Start elsewhere")
+        state.seconds += time.perf_counter() - begun
+        _save(path, state, mark, settings)
+    with tqdm(total=updates, unit=" steps", disable=not progress) as bar:
+        bar.update(len(state.rows))
+        while len(state.rows) < updates:
+            begun = time.perf_counter()
+            _step(state, gradient, optimizer)
+            state.checks.append(_checked(validate, state.theta))
+            state.thetas.append(state.theta)
+            state.seconds += time.perf_counter() - begun
+            _save(path, state, mark, settings)
+            losses = [check["loss"] for check in state.checks]
+            bar.set_postfix_str(f"validation {losses[-1]:.4g}, best {np.nanmin(losses):.4g}")
+            bar.update(1)
+    return _record(state)
+
+
+def _step(state: State, gradient: Gradient, optimizer: optax.GradientTransformation) -> None:
+    """One step forward, or one back and half of it again."""
+    loss, slope, numbers = gradient(state.theta, len(state.rows))
+    slope = jax.tree.map(lambda v: np.asarray(v, np.float64), slope)
+    norm = float(np.sqrt(sum(np.sum(v**2) for v in jax.tree.leaves(slope))))
+    accepted = bool(np.isfinite(loss) and np.isfinite(norm))
+    row = {"loss": float(loss), "gradient_norm": norm, "accepted": accepted, "share": state.share}
+    state.rows.append({**row, **{name: float(value) for name, value in numbers.items()}})
+    with jax.enable_x64(True):  # the optimiser's own numbers, like θ
+        if accepted:
+            # The optimiser's state before its update here: a step may have to be taken again.
+            if state.good is None:
+                before = optimizer.init(state.theta)
+            else:
+                good, previous, before = state.good
+                before = optimizer.update(previous, before, good)[1]
+            state.good = (state.theta, slope, before)
+            state.share = min(1.0, 2 * state.share)
+        elif state.good is None:  # the start fails on this step's data: other data may serve
+            return
+        else:
+            state.share /= 2
+        good, slope, before = state.good
+        moves, _ = optimizer.update(slope, before, good)
+    state.theta = jax.tree.map(
+        lambda v, move: v + state.share * np.asarray(move, np.float64), good, moves
+    )
+
+
+def _checked(validate: Validate, theta: Any) -> dict[str, float]:
+    """The numbers of a validation; a loss that is not finite is NaN."""
+    loss, numbers = validate(theta)
+    loss = float(loss) if np.isfinite(loss) else np.nan
+    return {"loss": loss, **{name: float(value) for name, value in numbers.items()}}
+
+
+def _record(state: State) -> Descent:
+    """What a user sees of it."""
+    column = lambda rows, name: np.array([row.get(name, np.nan) for row in rows])
+    names = lambda rows, apart: [n for n in dict.fromkeys(n for r in rows for n in r)
+                                 if n not in apart]  # fmt: skip
+    known = ("loss", "gradient_norm", "accepted")
+    validation = column(state.checks, "loss")
+    best = int(np.nanargmin(validation))
+    return Descent(
+        theta=state.thetas[best], best=best,
+        thetas=jax.tree.map(lambda *v: np.stack(v), *state.thetas),
+        loss=column(state.rows, "loss"), gradient_norm=column(state.rows, "gradient_norm"),
+        accepted=column(state.rows, "accepted").astype(bool), validation=validation,
+        numbers={n: column(state.rows, n) for n in names(state.rows, known)},
+        validation_numbers={n: column(state.checks, n) for n in names(state.checks, ("loss",))},
+        seconds=state.seconds,
+    )  # fmt: skip
+
+
+def _fingerprint(settings: Any, theta: Any) -> str:
+    """Of what decides a run but its length."""
+    text = json.dumps(settings, sort_keys=True) + str(jax.tree.structure(theta))
+    data = b"".join(np.ascontiguousarray(v).tobytes() for v in jax.tree.leaves(theta))
+    return hashlib.sha256(text.encode() + data).hexdigest()
+
+
+def _save(path: Path | None, state: State, mark: str, settings: Any) -> None:
+    """Write to a side file, then rename: a reader sees the old state or the new one."""
+    if path is None:
+        return
+    leaves: dict[str, Any] = {
+        f"good_{i}": np.asarray(v) for i, v in enumerate(jax.tree.leaves(state.good))
+    }
+    for k, theta in enumerate((state.theta, jax.tree.map(lambda *v: np.stack(v), *state.thetas))):
+        leaves |= {f"theta_{k}_{i}": v for i, v in enumerate(jax.tree.leaves(theta))}
+    plain = {
+        "fingerprint": mark, "settings": settings, "share": state.share, "seconds": state.seconds,
+        "rows": state.rows, "checks": state.checks, "moved": state.good is not None,
+    }  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, side = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, record=np.array(json.dumps(plain)), **leaves)
+        os.replace(side, path)
+    except BaseException:
+        Path(side).unlink(missing_ok=True)
+        raise
+
+
+def _load(path: Path, theta: Any, optimizer: optax.GradientTransformation, mark: str) -> State:
+    """The state of a run that was cut off. ValueError where the file is none of this run's."""
+    try:
+        with np.load(path) as data:
+            arrays = {name: data[name] for name in data.files}
+        plain = json.loads(str(arrays.pop("record")))
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        fail(str(path), f"is no checkpoint ({error})", "Choose another file, or remove it")
+    if plain["fingerprint"] != mark:
+        fail(str(path), "holds a run of other settings", "Choose another file, or remove it")
+
+    def restored(like: Any, name: str) -> Any:
+        leaves, tree = jax.tree.flatten(like)
+        return jax.tree.unflatten(tree, [arrays[f"{name}_{i}"] for i in range(len(leaves))])
+
+    every, good, count = restored(theta, "theta_1"), None, len(plain["checks"])
+    if plain["moved"]:
+        with jax.enable_x64(True):
+            good = restored((theta, theta, optimizer.init(theta)), "good")
+    return State(
+        restored(theta, "theta_0"), good, plain["share"], plain["seconds"], plain["rows"], plain["checks"],
+        [jax.tree.map(lambda v, t=t: v[t], every) for t in range(count)],
+    )  # fmt: skip

@@ -1,0 +1,103 @@
+"""What a closed loop costs, as one number with a derivative."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import fail, require_symmetric_psd
+from jaxmpc.closed_loop import Run
+from jaxmpc.control.sets import Box, Polytope
+from jaxmpc.qp.precision import matmul
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoopLoss:
+    """Loss of one closed loop: tracking, effort, violations and time to settle,
+
+        (1/T) Σ_{t<T} [ e_t'Q e_t + v_t'R v_t ] + violation·(1/T) Σ_{t≤T} Σ_i excess_i(x_t)
+        + settling·(time to settle),    e_t = x_t − r_t,  v_t = u_t − s_t.
+
+    Its Q (n, n) and R (m, m), or their diagonals, are fixed: those of the controller, which
+    `Run.stage_cost` uses, would be driven to zero. reference r, input_reference s: (n,) and (m,),
+    or with at least T rows; None for zero. limits: Box or Polytope of x; excess_i is by how much
+    row i is exceeded, in its unit, of a Box in shares of its half-width (1 where infinite).
+    Its weight acts as an exact penalty: with enough of it limits are kept wherever they can be.
+
+    Time to settle, in samples: the number of t after which the loop is still once outside the band
+    |e_i| ≤ band_i. With d_t = max_i |e_i|/band_i it counts Σ_t (1 − Π_{s≥t} σ((1 − d_s)/softness)),
+    which tends to that number as softness → 0 (σ the logistic function). band (n,) is needed where
+    settling > 0.
+
+    plant: a robot whose `coordinates` turn its states into x; None: x is the state itself.
+    """
+
+    Q: Any
+    R: Any
+    reference: Any = None
+    input_reference: Any = None
+    limits: Box | Polytope | None = None
+    violation: float = 10.0
+    settling: float = 0.0
+    band: Any = None
+    softness: float = 0.1
+    plant: Any = None
+
+    def __post_init__(self) -> None:
+        for name in ("Q", "R"):
+            W = np.asarray(getattr(self, name), np.float64)
+            W = np.diag(W) if W.ndim == 1 else W
+            if W.ndim != 2 or W.shape[0] != W.shape[1]:
+                fail(name, f"shape {W.shape}", "Give a square matrix or its diagonal")
+            require_symmetric_psd(name, W)
+            object.__setattr__(self, name, W)
+        for name in ("violation", "settling"):
+            if not 0 <= getattr(self, name) < np.inf:
+                fail(name, f"{getattr(self, name)}", "Give a weight ≥ 0")
+        if self.settling and self.band is None:
+            fail("band", "is None", "Give the size (n,) of what counts as settled")
+        if self.band is not None and not np.all(np.asarray(self.band) > 0):
+            fail("band", f"{self.band}", "Give positive numbers")
+        if not self.softness > 0:
+            fail("softness", f"{self.softness}", "Give a positive number")
+
+    def __call__(self, run: Run) -> Array:
+        """The loss of one run."""
+        T, dtype = run.inputs.shape[0], run.inputs.dtype
+        x = run.states
+        if self.plant is not None:
+            x = jax.vmap(self.plant.coordinates)(x)
+        e, v = x - self._aim(self.reference, T + 1), run.inputs - self._aim(self.input_reference, T)
+        square = lambda v, W: jnp.sum(v * matmul(v, jnp.asarray(W, dtype)))
+        total = (square(e[:-1], self.Q) + square(v, self.R)) / T
+        if self.limits is not None and self.violation:
+            total = total + self.violation * jnp.sum(self.excess(x)) / T
+        if self.settling:
+            d = jnp.max(jnp.abs(e[1:]) / jnp.asarray(self.band, dtype), axis=1)
+            inside = jax.nn.log_sigmoid((1 - d) / self.softness)
+            stays = jnp.exp(jnp.cumsum(inside[::-1])[::-1])
+            total = total + self.settling * jnp.sum(1 - stays)
+        return total
+
+    def excess(self, x: Array) -> Array:
+        """By how much the states x (T+1, n) exceed each row of the limits."""
+        assert self.limits is not None
+        H, lower, upper = (jnp.asarray(v, x.dtype) for v in self.limits.rows())
+        size = jnp.ones_like(upper)
+        if isinstance(self.limits, Box):
+            size = jnp.asarray(self.limits.half_widths(), x.dtype)
+        value = matmul(x, H.T)
+        return jnp.maximum(jnp.maximum(value - upper, lower - value), 0.0) / size
+
+    @staticmethod
+    def _aim(reference: Any, length: int) -> Any:
+        """A reference for so many samples; its last row again where it ends one too early."""
+        if reference is None:
+            return 0.0
+        reference = jnp.asarray(reference)
+        if reference.ndim == 2 and len(reference) < length:
+            reference = jnp.concatenate([reference, reference[-1:]])
+        return reference[:length] if reference.ndim == 2 else reference

@@ -1,0 +1,136 @@
+"""What is tuned: numbers and matrices that stay in their domain at whatever the optimiser does.
+
+An optimiser moves free real numbers θ; `values` maps them to what the problem takes:
+
+    real       v = θ
+    positive   v = exp(θ), entry by entry
+    interval   v = lower + (upper − lower)/(1 + exp(−θ)), entry by entry
+    diagonal   V = diag(exp(θ))
+    definite   V = L L', L lower triangular with θ below and exp(θ) on the diagonal: every
+               symmetric positive definite V has exactly one such L (Golub & Van Loan 2013, §4.2.3)
+
+so that a step of θ is a relative change of a weight, whatever its units.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import fail, require_finite, require_symmetric_psd
+
+DOMAINS = ("real", "positive", "interval", "diagonal", "definite")
+
+
+@dataclass(frozen=True, eq=False)
+class Parameter:
+    """One quantity to tune: where it starts, where it may go, which of its entries move.
+
+    value: a number or an array; for "diagonal" and "definite" a matrix (n, n), for "diagonal" also
+    its diagonal (n,). domain: see above. lower, upper: ends of an "interval", numbers or arrays of
+    the value's shape. train: True, False, or a mask of the shape of what is free: of value itself,
+    of the diagonal (n,) for "diagonal", of L (n, n) for "definite" (its upper triangle does not
+    count). Entries not trained keep their value. Raises ValueError for values outside the domain.
+    """
+
+    value: Any
+    domain: str = "real"
+    lower: Any = None
+    upper: Any = None
+    train: Any = True
+
+    def __post_init__(self) -> None:
+        if self.domain not in DOMAINS:
+            fail("domain", f"{self.domain!r}", f"Give one of {', '.join(DOMAINS)}")
+        value = np.asarray(self.value, np.float64)
+        require_finite("value", value)
+        if self.domain in ("diagonal", "definite"):
+            if self.domain == "diagonal" and value.ndim == 1:
+                value = np.diag(value)
+            if value.ndim != 2 or value.shape[0] != value.shape[1]:
+                fail("value", f"shape {value.shape}", "Give a square matrix")
+            require_symmetric_psd("value", value, definite=True)
+            if self.domain == "diagonal" and np.any(value != np.diag(np.diag(value))):
+                fail("value", "is not diagonal", 'Use the domain "definite"')
+        if self.domain == "positive" and not np.all(value > 0):
+            fail("value", "holds an entry that is not positive", 'Use "real" or "interval"')
+        if (self.domain == "interval") != (self.lower is not None and self.upper is not None):
+            fail("lower, upper", "belong to an interval, both of them", 'domain="interval"')
+        object.__setattr__(self, "value", value)
+        if self.domain == "interval":
+            for name in ("lower", "upper"):
+                end = np.asarray(getattr(self, name), np.float64)
+                if end.shape not in ((), value.shape):
+                    fail(name, f"shape {end.shape}", f"Give a number or shape {value.shape}")
+                object.__setattr__(self, name, end)
+            if not (np.all(self.lower < value) and np.all(value < self.upper)):
+                fail("value", f"{value.tolist()}", "Start inside the interval, not at its ends")
+        free = self._free(value)
+        train = np.asarray(self.train)
+        if train.dtype != bool or train.shape not in ((), free.shape):
+            fail("train", f"{self.train!r}", f"Give True, False or a mask of shape {free.shape}")
+        train = np.broadcast_to(train, free.shape)
+        if self.domain == "definite":
+            train = np.tril(train)
+        object.__setattr__(self, "train", train)
+
+    def _free(self, value: np.ndarray) -> np.ndarray:
+        """θ of a value, all entries."""
+        if self.domain == "positive":
+            return np.log(value)
+        if self.domain == "interval":
+            return np.log(value - self.lower) - np.log(self.upper - value)
+        if self.domain == "diagonal":
+            return np.log(np.diag(value))
+        if self.domain == "definite":
+            L = np.linalg.cholesky((value + value.T) / 2)
+            return np.tril(L, -1) + np.diag(np.log(np.diag(L)))
+        return value
+
+    def raw(self) -> np.ndarray:
+        """θ of the entries that are trained, (k,)."""
+        return self._free(self.value)[self.train]
+
+    def at(self, raw: Any) -> Array:
+        """The value where the trained entries have the θ (k,). Traceable."""
+        raw = jnp.asarray(raw)
+        theta = jnp.asarray(self._free(self.value), raw.dtype).at[self.train].set(raw)
+        if self.domain == "positive":
+            return jnp.exp(theta)
+        if self.domain == "interval":
+            return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(theta)
+        if self.domain == "diagonal":
+            return jnp.diag(jnp.exp(theta))
+        if self.domain == "definite":
+            L = jnp.tril(theta, -1) + jnp.diag(jnp.exp(jnp.diag(theta)))
+            return jnp.matmul(L, L.T, precision="highest")
+        return theta
+
+
+Parameters = Mapping[str, Parameter]
+
+
+def require_parameters(parameters: Parameters) -> None:
+    """Raise ValueError unless this is a mapping of Parameters of which something is trained."""
+    if not isinstance(parameters, Mapping) or not parameters:
+        fail("parameters", f"is a {type(parameters).__name__}", 'Give {"Q": jm.Parameter(...)}')
+    for name, parameter in parameters.items():
+        if not isinstance(parameter, Parameter):
+            kind = type(parameter).__name__
+            fail(f"parameters[{name!r}]", f"is a {kind}", "Wrap it in a jm.Parameter")
+    if not any(parameter.train.any() for parameter in parameters.values()):
+        fail("parameters", "none is trained", "Set train=True for what is to move")
+
+
+def raw(parameters: Parameters) -> dict[str, np.ndarray]:
+    """θ of all parameters, trained entries only."""
+    return {name: parameter.raw() for name, parameter in parameters.items()}
+
+
+def values(parameters: Parameters, theta: Mapping[str, Any]) -> dict[str, Array]:
+    """The values at θ. Traceable."""
+    return {name: parameter.at(theta[name]) for name, parameter in parameters.items()}
