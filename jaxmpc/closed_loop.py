@@ -99,13 +99,7 @@ def simulate_many(
     if np.ndim(x0s) != 2 or not len(x0s):
         fail("x0s", f"shape {np.shape(x0s)}", f"Give (B, {controller.state_size}), B ≥ 1")
     x0s, varied = np.asarray(x0s), dict(variations or {})
-    for key, value in varied.items():
-        if np.shape(value)[:1] != (len(x0s),):
-            fail(f"variations[{key!r}]", f"shape {np.shape(value)}", f"Put {len(x0s)} in front")
-    if varied and not hasattr(plant, "vary"):
-        fail("variations", f"given for a {type(plant).__name__}", "Give a Robot or LinearPlant")
-    if varied:  # names and shapes, before any compile
-        plant.vary(**{key: np.asarray(value)[0] for key, value in varied.items()})
+    require_variations(plant, varied, len(x0s))
     if chunk is not None and chunk < 1:
         fail("chunk", f"{chunk}", "Give a count of at least 1")
     _checked(controller, plant, x0s[0], steps, reference, input_reference, None, None)
@@ -130,6 +124,17 @@ def simulate_many(
             found.append(first_rows(run, here))
             bar.update(here)
     return jax.tree.map(lambda *v: np.concatenate(v), *found)
+
+
+def require_variations(plant: Any, varied: Mapping[str, Any], count: int) -> None:
+    """Raise ValueError unless `count` plants can differ by these numbers."""
+    for key, value in varied.items():
+        if np.shape(value)[:1] != (count,):
+            fail(f"variations[{key!r}]", f"shape {np.shape(value)}", f"Put {count} in front")
+    if varied and not hasattr(plant, "vary"):
+        fail("variations", f"given for a {type(plant).__name__}", "Give a Robot or LinearPlant")
+    if varied:  # names and shapes
+        plant.vary(**{key: np.asarray(value)[0] for key, value in varied.items()})
 
 
 @dataclass(frozen=True, eq=False)

@@ -215,13 +215,17 @@ def _load(path: Path, theta: Any, optimizer: optax.GradientTransformation, mark:
 
     def restored(like: Any, name: str) -> Any:
         leaves, tree = jax.tree.flatten(like)
-        return jax.tree.unflatten(tree, [arrays[f"{name}_{i}"] for i in range(len(leaves))])
+        names = [f"{name}_{i}" for i in range(len(leaves))]
+        if set(names) != {n for n in arrays if n.startswith(f"{name}_")}:
+            fail(str(path), "holds the state of another optimizer", "Give the one it began with")
+        return jax.tree.unflatten(tree, [arrays[n] for n in names])
 
     every, good, count = restored(theta, "theta_1"), None, len(plain["checks"])
     if plain["moved"]:
         with jax.enable_x64(True):
             good = restored((theta, theta, optimizer.init(theta)), "good")
     return State(
-        restored(theta, "theta_0"), good, plain["share"], plain["seconds"], plain["rows"], plain["checks"],
-        [jax.tree.map(lambda v, t=t: v[t], every) for t in range(count)],
+        restored(theta, "theta_0"), good,
+        thetas=[jax.tree.map(lambda v, t=t: v[t], every) for t in range(count)],
+        **{name: plain[name] for name in ("share", "seconds", "rows", "checks")},
     )  # fmt: skip

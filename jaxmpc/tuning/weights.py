@@ -16,7 +16,7 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 
 from jaxmpc.checks import fail
-from jaxmpc.closed_loop import Run, Steps, loops, memory, needed
+from jaxmpc.closed_loop import Run, Steps, loops, memory, needed, require_variations
 from jaxmpc.compiled import Compiled
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import Controller
@@ -138,14 +138,13 @@ def tune_weights(
     if x0s.ndim != 2 or not len(x0s):
         fail("x0s", f"shape {x0s.shape}", "Give initial states (B, n)")
     variations = {name: np.asarray(v) for name, v in dict(variations or {}).items()}
-    for name, v in variations.items():
-        if v.shape[:1] != (len(x0s),):
-            fail(f"variations[{name!r}]", f"shape {v.shape}", f"Put {len(x0s)} in front")
+    require_variations(plant, variations, len(x0s))
     if mode not in MODES:
         fail("mode", f"{mode!r}", f"Give one of {', '.join(MODES)}")
     if batch is not None and batch < 1:
         fail("batch", f"{batch}", "Give a count of at least 1")
     train, test = split((x0s, variations), validation)
+    require_variations(plant, test[1], len(test[0]))
     size = len(train[0]) if batch is None else min(batch, len(train[0]))
     start = raw(parameters)
     initial = {name: np.asarray(p.value) for name, p in parameters.items()}
@@ -196,15 +195,13 @@ def tune_weights(
         return value, slopes, numbers(aux, weights)
 
     def validate(theta: Any) -> tuple[float, dict[str, float]]:
-        value, aux = evaluate(*problem.arguments(theta, *test, np.ones(len(test[0]))))
-        finite = np.isfinite(aux["losses"])
+        _, aux = evaluate(*problem.arguments(theta, test[0], test[1], np.ones(len(test[0]))))
         if not sound:
-            sound.append(finite)
-        # A loop that was finite at the start and is not now counts; others are left out.
-        weights = sound[0].astype(float)
-        if not finite.all() and np.all(finite[sound[0]]) and sound[0].any():
-            value = np.mean(aux["losses"][sound[0]]) + aux["design"]
-        return float(value), numbers(aux, weights)
+            sound.append(np.isfinite(aux["losses"]))
+        # Loops that are not finite at the start are left out for good; another makes the loss NaN.
+        used = aux["losses"][sound[0]]
+        value = np.mean(used) + aux["design"] if len(used) else np.nan
+        return float(value), numbers(aux, sound[0])
 
     history = descend(
         start, gradient, validate, optax.adam(0.05) if optimizer is None else optimizer, updates,
@@ -232,7 +229,7 @@ def controller_of(make_mpc: Any, given: Mapping[str, Any], solver: ADMM) -> Any:
 
 def numbers(aux: dict[str, np.ndarray], weights: np.ndarray) -> dict[str, float]:
     """Means over the loops with weight, see `TuningRun`."""
-    used = weights > 0
+    used = np.asarray(weights) > 0
     names = ("unsolved", "infeasible", "fallback", "violation")
     found = {name: float(np.mean(aux[name][used])) if used.any() else np.nan for name in names}
     return {**found, "excluded": float(np.sum(~used))}
@@ -265,8 +262,6 @@ def split(data: Data, validation: Any) -> tuple[Data, Data]:
     states, varied = np.asarray(states), {k: np.asarray(v) for k, v in dict(varied).items()}
     if states.ndim != 2 or states.shape[1] != x0s.shape[1] or not len(states):
         fail("validation", f"shape {states.shape}", f"Give states (B, {x0s.shape[1]})")
-    if any(v.shape[:1] != (len(states),) for v in varied.values()):
-        fail("validation", "variations of another length", f"Put {len(states)} in front")
     return data, (states, varied)
 
 
@@ -315,8 +310,8 @@ class Problem:
 
     def check(self, theta: Any, data: Data) -> None:
         """Raise what tracing raises, before anything compiles."""
-        one = jax.tree.map(lambda v: v[:1], data)
-        total, aux = jax.eval_shape(self.total, *self.arguments(theta, *one, np.ones(1)))
+        x0s, varied = jax.tree.map(lambda v: v[:1], data)
+        total, aux = jax.eval_shape(self.total, *self.arguments(theta, x0s, varied, np.ones(1)))
         if aux["losses"].shape != (1,) or total.shape != ():
             fail("loss", f"has shape {aux['losses'].shape[1:]}", "Return one number")
 
