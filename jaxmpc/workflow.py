@@ -248,6 +248,8 @@ def theorems(mpc: MPC, K: Any = None) -> TerminalReport:
              "at the usual steps, inputs free at each")  # fmt: skip
     if mpc.input_rate_weight is not None:
         fail("mpc", "weighs input rates", "The theorems' optimal value depends on x alone")
+    if mpc.stage_weights is not None:
+        fail("mpc", "weighs its stages", "The theorems' optimal value has one cost for all stages")
     P = np.zeros((mpc.system.n,) * 2) if mpc.terminal_cost is None else mpc.terminal_cost
     return verify_terminal(mpc.system, mpc.Q, mpc.R, P, mpc.terminal_set, mpc.states, mpc.inputs, K)
 

@@ -83,3 +83,25 @@ def test_a_kernel_is_chosen_on_gpus_only(monkeypatch):
     assert jax.grad(lambda v: kernels._or_kernel(scan, kernel, v)[0])(one) == 6
     assert calls == [] or set(calls) == {(1,)}
     assert kernels._or_kernel(scan, kernel, one) == 9 and calls
+
+
+def test_derivatives_under_vmap_and_jit(monkeypatch):
+    """Where the kernels run, a batched loop has the derivative of the scans, in both modes."""
+    rng = np.random.default_rng(1)
+    _, _, A, _, gx, _ = batch(rng, 3, 4, 2, False)
+
+    def loop(A, gx):
+        def sample(x, w):
+            states = kernels.recurrence(A, jnp.stack([w, w]), x)
+            return jnp.concatenate([x[None], states])[2], None
+
+        return jnp.sum(jax.lax.scan(sample, gx[0], gx[1:])[0] ** 2)
+
+    total = lambda A, gx: jnp.sum(jax.vmap(loop)(A, gx))
+    by = lambda mode: jax.jit(mode(lambda A, gx: total(A, gx)))(A, gx)
+    scans = by(jax.grad)
+    real = kernels._call
+    monkeypatch.setattr(kernels, "_call", lambda kernel, shapes, _: real(kernel, shapes, True))
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    close(by(jax.grad), scans)
+    close(by(jax.jacfwd), scans)

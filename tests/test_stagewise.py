@@ -189,6 +189,36 @@ def test_derivative():
     np.testing.assert_allclose(backward, [difference, 0], rtol=1e-6)
 
 
+def test_stage_weights():
+    """Without limits the plan is a least-squares solution, here numpy's; both solvers find it."""
+    s, rng = np.array([1.0, 0.5, 2.0, 0.1]), np.random.default_rng(0)
+    A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.0], [0.1]])
+    r, v, x0 = rng.normal(size=(5, 2)), rng.normal(size=(4, 1)), np.array([1.0, -0.5])
+    mpc = jm.MPC(
+        jm.LinearSystem(A, B), np.eye(2), np.eye(1), 4, terminal_cost=np.eye(2), stage_weights=s
+    )
+    free = [np.linalg.matrix_power(A, k) @ x0 for k in range(5)]
+    push = np.zeros((5, 2, 4))
+    for k in range(1, 5):
+        for j in range(k):
+            push[k, :, j] = (np.linalg.matrix_power(A, k - 1 - j) @ B)[:, 0]
+    root = np.sqrt(np.append(s, 1.0))
+    rows = np.concatenate([(root[:, None, None] * push).reshape(10, 4), np.diag(root[:4])])
+    aim = np.concatenate([(root[:, None] * (r - free)).ravel(), root[:4] * v[:, 0]])
+    exact = np.linalg.lstsq(rows, aim, rcond=None)[0]
+    solver = jm.ADMM(iterations=1, refine=0)
+    for plan in (
+        jm.solve(mpc, x0, r, solver, input_reference=v),
+        solve_stagewise(mpc, mpc.system, x0, r, solver, input_reference=v),
+    ):
+        np.testing.assert_allclose(plan.inputs[:, 0], exact, rtol=1e-9)
+        np.testing.assert_allclose(plan.cost, np.sum((rows @ exact - aim) ** 2), rtol=1e-9)
+    with pytest.raises(ValueError, match="stage_weights.*positive"):
+        replace(mpc, stage_weights=[1.0, 0.0, 1.0, 1.0]).validate()
+    with pytest.raises(ValueError, match=r"stage_weights.*\(4,\)"):
+        replace(mpc, stage_weights=s[:3]).validate()
+
+
 def test_residuals_are_those_of_the_qp():
     """Far from the optimum: the residuals of `residuals(qp, z, y)`, from adjoints."""
     mpc, system = problem(), varying()

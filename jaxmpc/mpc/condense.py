@@ -37,8 +37,9 @@ class Condensed:
     predicted inputs. P (nz, nz), F (nz, p), f (nz,): cost. C, D, d, lower, upper: rows.
     soft_linear, soft_quadratic (rows,): weights of soft rows, inf and 0 where hard; None without
     any. radius: of the terminal ball, whose rows are the last `balls`. Q, R, P_N, W: weights, W of
-    input rates. K (m, n): prestabilising gain. K_N (m, n): gain of the unconstrained input of one
-    more step, u_N = K_N x_N. layout: (kind, steps, rows a step) of each block of rows.
+    input rates, stage (N,) of the stages. K (m, n): prestabilising gain. K_N (m, n): gain of the
+    unconstrained input of one more step, u_N = K_N x_N. layout: (kind, steps, rows a step) of each
+    block of rows.
     """
 
     Phi: Array
@@ -62,6 +63,7 @@ class Condensed:
     R: Array
     P_N: Array
     W: Array
+    stage: Array
     K: Array
     K_N: Array
     layout: tuple[tuple[str, tuple[int, ...], int], ...] = field(metadata={"static": True})
@@ -71,12 +73,11 @@ class Condensed:
         """QP at θ (p,). reference (N+1, n), input_reference (N, m): what to track, None for 0."""
         q = matmul(self.F, theta) + self.f
         if reference is not None:
-            weighted = jnp.concatenate(
-                [matmul(reference[:-1], self.Q), matmul(reference[-1:], self.P_N)]
-            )
+            stages = self.stage[:, None] * matmul(reference[:-1], self.Q)
+            weighted = jnp.concatenate([stages, matmul(reference[-1:], self.P_N)])
             q = q - 2 * jnp.einsum("kni,kn->i", self.Gamma, weighted, precision="highest")
         if input_reference is not None:
-            weighted = matmul(input_reference, self.R)
+            weighted = self.stage[:, None] * matmul(input_reference, self.R)
             q = q - 2 * jnp.einsum("kmi,km->i", self.Omega, weighted, precision="highest")
         shift = matmul(self.D, theta) + self.d
         return QP(
@@ -101,7 +102,7 @@ def prestabilising_gain(mpc: MPC) -> Any:
         return wish
     if mpc.control_horizon is not None:
         return none
-    if not concrete(mpc.system.A, mpc.system.B, mpc.Q, mpc.R):
+    if not concrete(mpc.system.A, mpc.system.B):
         if wish is True:
             fail("prestabilise", "is True where A, B are traced", "Give the gain K (m, n) itself")
         return none
@@ -109,10 +110,12 @@ def prestabilising_gain(mpc: MPC) -> Any:
     if wish is None and spectral_radius <= 1 + 1e-9:
         return none
     # Any stabilising gain serves; a little weight on every state makes the DARE solvable.
-    Q = np.asarray(mpc.Q, float)
+    Q, R = np.eye(mpc.system.n), np.eye(mpc.system.m)
+    if concrete(mpc.Q, mpc.R):
+        Q, R = np.asarray(mpc.Q, float), np.asarray(mpc.R, float)
     weight = 1e-3 * max(np.trace(Q) / len(Q), 1e-9)
     try:
-        return lqr(mpc.system, Q + weight * np.eye(len(Q)), mpc.R).K
+        return lqr(mpc.system, Q + weight * np.eye(len(Q)), R).K
     except ValueError:
         if wish is True:
             raise
@@ -169,17 +172,19 @@ def _condense(mpc: MPC) -> Condensed:
     P_N = jnp.zeros((n, n), dtype) if mpc.terminal_cost is None else cast(mpc.terminal_cost)
     W = jnp.zeros((m, m), dtype) if mpc.input_rate_weight is None else cast(mpc.input_rate_weight)
     W = jnp.diag(W) if W.ndim == 1 else W
-    weights = jnp.concatenate([jnp.broadcast_to(Q, (N, n, n)), P_N[None]])
+    stage = jnp.ones(N, dtype) if mpc.stage_weights is None else cast(mpc.stage_weights)
+    weights = jnp.concatenate([stage[:, None, None] * Q, P_N[None]])
+    efforts = R if mpc.stage_weights is None else stage[:, None, None] * R
     product = lambda M, weight, X: jnp.einsum(
         f"kai,{'kab' if weight.ndim == 3 else 'ab'},kb...->i...", M, weight, X, precision="highest"
     )
     # 2 Σ_k M_k' W_k X_k with the weights of states, inputs and rates: Hessian, its θ and constant
     # part.
     form = lambda X, U, V: (
-        2 * (product(Gamma, weights, X) + product(Omega, R, U) + product(rates[0], W, V))
+        2 * (product(Gamma, weights, X) + product(Omega, efforts, U) + product(rates[0], W, V))
     )
     if mpc.input_rate_weight is None:
-        form = lambda X, U, V: 2 * (product(Gamma, weights, X) + product(Omega, R, U))
+        form = lambda X, U, V: 2 * (product(Gamma, weights, X) + product(Omega, efforts, U))
     P = form(Gamma, Omega, rates[0])
 
     # argmin over u of u'Ru + (Ax + Bu)'P(Ax + Bu).
@@ -209,6 +214,6 @@ def _condense(mpc: MPC) -> Condensed:
     return Condensed(
         Phi, Gamma, phi, Psi, Omega, psi, (P + P.T) / 2, form(Phi, Psi, rates[1]),
         form(phi, psi, rates[2]), C, D, d, lower, upper, linear, quadratic, radius, Q, R, P_N, W,
-        K, K_N, tuple((b.kind, b.steps, b.size) for b in found),
+        stage, K, K_N, tuple((b.kind, b.steps, b.size) for b in found),
         tuple(b.size for b in round_ones),
     )  # fmt: skip

@@ -74,7 +74,9 @@ def _or_kernel(scan: Callable, kernel: Callable, *args: Array) -> Any:
     if jax.default_backend() != "gpu" or side > SIDES[-1]:
         return scan(*args)
     fast = jax.custom_jvp(kernel)
-    fast.defjvp(lambda primals, tangents: jax.jvp(scan, primals, tangents))
+    # The value is the kernel's here too: under `vmap` within `jit` JAX takes the place of the batch
+    # axis from the function as it stands, and a scan would put it elsewhere.
+    fast.defjvp(lambda primals, tangents: (fast(*primals), jax.jvp(scan, primals, tangents)[1]))
     return fast(*args)
 
 

@@ -77,7 +77,8 @@ class MPC:
     system: LinearSystem. Q (n, n) ⪰ 0, R (m, m) ≻ 0, terminal_cost P (n, n) ⪰ 0 or None (no
     terminal cost). states, inputs: Box, Polytope or None; terminal_set: these or an Ellipsoid.
     constrained_steps: the k in 0..N at which `states` hold, where that is another index set.
-    outputs: `Outputs`, or a tuple of them; soft: `Soft`, or a tuple of them.
+    outputs: `Outputs`, or a tuple of them; soft: `Soft`, or a tuple of them. stage_weights s (N,) >
+    0: weighs the stages, Σ s_k (x_k'Q x_k + u_k'R u_k); None: all 1.
 
     control_horizon: number of free moves m ≤ N, u_k = u_{m−1} from k = m − 1 on, or a tuple of
     block lengths that add up to N (move blocking). input_rate_weight W: adds Σ Δu_k'W Δu_k,
@@ -109,6 +110,7 @@ class MPC:
     control_horizon: int | tuple[int, ...] | None = field(default=None, metadata={"static": True})
     input_rate_weight: Any = None
     input_rate_limit: Any = None
+    stage_weights: Any = None
 
     @property
     def rate_limited(self) -> bool:
@@ -165,6 +167,11 @@ class MPC:
         if self.terminal_cost is not None:
             require_shape("terminal_cost", self.terminal_cost, (n, n), "P weighs the last state")
             require_symmetric_psd("terminal_cost", self.terminal_cost)
+        if self.stage_weights is not None:
+            s, N = self.stage_weights, self.horizon
+            require_shape("stage_weights", s, (N,), "One number for each k = 0..N−1")
+            if concrete(s) and not (np.all(np.isfinite(s)) and np.all(np.asarray(s) > 0)):
+                fail("stage_weights", f"{np.asarray(s).tolist()}", "Give positive numbers")
         for name, kinds, size in (
             ("states", (Box, Polytope), n),
             ("inputs", (Box, Polytope), m),

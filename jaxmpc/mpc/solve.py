@@ -197,8 +197,9 @@ def cost(
     error = states if reference is None else states - reference
     effort = inputs if input_reference is None else inputs - input_reference
     cast = lambda W: jnp.asarray(W, states.dtype)
-    square = lambda v, W: jnp.sum(v * matmul(v, cast(W)))
-    J = square(error[:-1], mpc.Q) + square(effort, mpc.R)
+    square = lambda v, W, s=1.0: jnp.sum(s * v * matmul(v, cast(W)))
+    stage = 1.0 if mpc.stage_weights is None else cast(mpc.stage_weights)[:, None]
+    J = square(error[:-1], mpc.Q, stage) + square(effort, mpc.R, stage)
     if mpc.terminal_cost is not None:
         J = J + square(error[-1:], mpc.terminal_cost)
     if mpc.input_rate_weight is not None:

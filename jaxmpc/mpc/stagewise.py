@@ -134,7 +134,8 @@ def layout(mpc: MPC) -> Layout:
 class Stages:
     """The data of a problem in one floating type.
 
-    A (n, n), B (n, m), c (n,), or with a leading axis N. Q, R, P: weights, without ½; P of x_N.
+    A (n, n), B (n, m), c (n,), or with a leading axis N. Q, R, P: weights, without ½; P of x_N;
+    stage (N,): weights of the stages.
     H (r, n) and D (r, m) of each block of rows (`rows.blocks`), None for zero. lower, upper,
     linear, quadratic (rows,): as in `Bounds`. layout: (kind, steps, rows a step) of each block;
     boxes: whether its matrix is the identity.
@@ -146,6 +147,7 @@ class Stages:
     Q: Array
     R: Array
     P: Array
+    stage: Array
     H: tuple[Any, ...]
     D: tuple[Any, ...]
     lower: Array
@@ -261,6 +263,7 @@ def stages(mpc: MPC) -> Stages:
         c=jnp.zeros(n, dtype) if system.c is None else cast(system.c),
         Q=cast(mpc.Q), R=cast(mpc.R),
         P=jnp.zeros((n, n), dtype) if mpc.terminal_cost is None else cast(mpc.terminal_cost),
+        stage=cast(np.ones(mpc.horizon) if mpc.stage_weights is None else mpc.stage_weights),
         H=tuple(b.H for b in found), D=tuple(b.D for b in found),
         lower=tiled([b.lower for b in found]), upper=tiled([b.upper for b in found]),
         linear=linear, quadratic=quadratic,
@@ -273,7 +276,7 @@ def usable(s: Stages) -> tuple[Stages, Array]:
     """The data with harmless ones in their place where they are not usable, and whether they
     were (see `qp.solve.cleaned`)."""
     ok = jnp.all(s.lower <= s.upper) & ~jnp.any(jnp.isposinf(s.lower) | jnp.isneginf(s.upper))
-    for value in jax.tree.leaves((s.A, s.B, s.c, s.Q, s.R, s.P, s.H, s.D)):
+    for value in jax.tree.leaves((s.A, s.B, s.c, s.Q, s.R, s.P, s.stage, s.H, s.D)):
         ok = ok & jnp.all(jnp.isfinite(value))
     if s.linear is not None:
         ok = ok & jnp.all(s.linear >= 0)
@@ -281,6 +284,7 @@ def usable(s: Stages) -> tuple[Stages, Array]:
     clean = lambda tree, harmless=0.0: jax.tree.map(lambda v: jnp.where(ok, v, harmless), tree)
     return replace(
         s, A=clean(s.A), B=clean(s.B), c=clean(s.c), Q=clean(s.Q), P=clean(s.P),
+        stage=clean(s.stage, 1.0),
         R=clean(s.R, jnp.eye(s.R.shape[0], dtype=s.R.dtype)), H=clean(s.H), D=clean(s.D),
         lower=clean(s.lower, -jnp.inf), upper=clean(s.upper, jnp.inf),
         linear=clean(s.linear, jnp.inf), quadratic=clean(s.quadratic),
@@ -289,9 +293,9 @@ def usable(s: Stages) -> tuple[Stages, Array]:
 
 def riccati(s: Stages, weights: Any = None) -> Gains:
     """Gains for the cost and ½ Σ weights·row², weights (rows,) or None."""
-    N, n, m = s.horizon, s.A.shape[-1], s.B.shape[-1]
-    Q = 2 * jnp.concatenate([jnp.broadcast_to(s.Q, (N, n, n)), s.P[None]])
-    R = jnp.broadcast_to(2 * s.R, (N, m, m))
+    N, stage = s.horizon, s.stage[:, None, None]
+    Q = 2 * jnp.concatenate([stage * s.Q, s.P[None]])
+    R = 2 * stage * s.R
     cross = None
     for rows, steps, size, H, D, box in s.blocks() if weights is not None else ():
         w = weights[rows].reshape(len(steps), size)
@@ -410,9 +414,9 @@ class Sample(NamedTuple):
 
     def gradient(self, s: Stages, x: Array, u: Array) -> tuple[Array, Array]:
         """Of J at x, u: (N+1, n) and (N, m)."""
-        e = 2 * (x - self.states)
-        gx = jnp.concatenate([matmul(e[:-1], s.Q.T), matmul(e[-1:], s.P.T)])
-        return gx, 2 * matmul(u - self.inputs, s.R.T)
+        e, stage = 2 * (x - self.states), s.stage[:, None]
+        gx = jnp.concatenate([stage * matmul(e[:-1], s.Q.T), matmul(e[-1:], s.P.T)])
+        return gx, 2 * stage * matmul(u - self.inputs, s.R.T)
 
 
 def unconstrained(s: Stages, gains: Gains, weights: Array, sample: Sample) -> tuple[Array, Array]:
