@@ -218,7 +218,7 @@ class TestClosedForms:
         push, turn = np.einsum("aj,i->aij", inverse[:, :n], y), inverse[:, n:, None] * z
         near(of_A, -push - turn)
 
-    @pytest.mark.parametrize("mode", ["implicit", "unrolled"])
+    @pytest.mark.parametrize("mode", ["implicit", pytest.param("unrolled", marks=pytest.mark.slow)])
     def test_box(self, x64, mode):
         """P = I, A = I: z = clip(−q, l, u), so dz/dq, dz/dl, dz/du are masks, and exactly so."""
         q, one = jnp.array([0.3, -0.8, 2.0, -1.5, 5.0]), jnp.ones(5)
@@ -657,7 +657,7 @@ class TestInfeasible:
         plus, minus = (evaluate(shifted(s), ds)[0][0] for s in (h, -h))
         numeric = (plus - minus) / (2 * h)
         error = np.abs(exact[0] - numeric).max(axis=1) / (np.abs(numeric).max(axis=1) + 0.1)
-        bad = [(case, float(e)) for case, e in zip(cases, error, strict=True) if not e < 3e-3]
+        bad = [(case, float(e)) for case, e in zip(cases, error, strict=True) if not e < 5e-3]
         assert not bad, bad
 
 

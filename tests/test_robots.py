@@ -298,6 +298,7 @@ def test_steps_equal_the_c_engines(name, mixed):
 # --- configurations --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_retract_and_difference_are_mujocos(mixed):
     """mj_integratePos and mj_differentiatePos, for large, tiny and no rotations; derivatives."""
     m, joints, rng = mixed.mujoco, mixed.joints, np.random.default_rng(0)

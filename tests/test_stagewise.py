@@ -102,7 +102,8 @@ def condensed(mpc: jm.MPC, system: jm.LinearSystem, x0: np.ndarray) -> tuple:
     return jax.tree.map(jnp.asarray, qp), shift
 
 
-@pytest.mark.parametrize("kind", [pytest.param("constant", marks=pytest.mark.slow), "varying"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["constant", "varying"])
 def test_iterates_are_those_of_the_dense_solver(kind):
     mpc = problem()
     system = mpc.system if kind == "constant" else varying()

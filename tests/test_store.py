@@ -111,6 +111,7 @@ WRITER = """
 """
 
 
+@pytest.mark.slow
 def test_killed_writer_loses_no_committed_chunk(tmp_path):
     path = tmp_path / "sweep.zarr"
     command = [sys.executable, "-c", textwrap.dedent(WRITER), str(path)]

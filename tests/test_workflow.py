@@ -60,6 +60,7 @@ def test_wrong_arguments(settings, message):
         jm.design(mpc.system, mpc.Q, mpc.R, 5, **given)
 
 
+@pytest.mark.slow
 def test_report_of_the_command(capsys):
     """Joint, N = 2, no terminal set: refuted, with the reasons; every section is there."""
     assert main(["info", "--horizon", "2", "--steps", "5", "--loops", "8"]) == 0
