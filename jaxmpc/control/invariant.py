@@ -7,20 +7,23 @@ valid whatever the LP's error, and inputs found for its vertices.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Literal, overload
+from typing import Any, Literal, overload
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy
+from jax.scipy.linalg import solve_triangular
 from jax.typing import ArrayLike
 from scipy.spatial import KDTree
 
-from jaxmpc.checks import fail, require_finite, require_shape, require_symmetric_psd
+from jaxmpc.checks import concrete, fail, require_finite, require_shape, require_symmetric_psd
 from jaxmpc.control import geometry
 from jaxmpc.control.geometry import maximise, unit_rows
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 
 # A row counts as redundant if it is exceeded by no more than this, relative to its bound.
 # Rounding alone makes rows that exactly touch the set stand out by about 1e-16.
@@ -360,6 +363,10 @@ def invariant_ellipsoid(
     gamma sqrt(alpha) + max |w|_P <= sqrt(alpha), which holds for alpha >= (max |w|_P /
     (1 - gamma))^2. Host, float64.
 
+    Where anything but the disturbance is traced by `jit`, `vmap` or `grad`, P and alpha are JAX
+    arrays with derivatives (alpha's is that of the row that decides), and alpha is NaN where an
+    error would be raised. A disturbance cannot be given there.
+
     Raises ValueError if P is no Lyapunov matrix of A + BK (the message has gamma2), if alpha
     is less than the disturbance needs (the message has both), if nothing limits the set, or if
     the origin is not strictly within the limits.
@@ -367,6 +374,11 @@ def invariant_ellipsoid(
     Source: Boyd, El Ghaoui, Feron & Balakrishnan 1994, Linear Matrix Inequalities, section
     5.2; Rawlings, Mayne & Diehl 2017, Model Predictive Control, section 2.5.5.
     """
+    if not concrete(system.A, system.B, system.c, K, P, states, inputs):
+        if disturbance is not None:
+            fail("disturbance", "given inside a trace", "Compute the ellipsoid outside, or omit it")
+        traced = _traced_ellipsoid(system, K, P, states, inputs)
+        return traced if return_contraction else traced[0]
     closed, F = _closed_loop(system, K, states, inputs, optional=("states", "inputs"))
     n = system.n
     require_shape("P", P, (n, n), "Give one matrix for the states")
@@ -395,6 +407,40 @@ def invariant_ellipsoid(
             )
     ellipsoid = Ellipsoid(P, level)
     return (ellipsoid, gamma2) if return_contraction else ellipsoid
+
+
+def _traced_ellipsoid(
+    system: LinearSystem, K: Any, P: Any, states: Box | Polytope | None,
+    inputs: Box | Polytope | None,
+) -> tuple[Ellipsoid, Any]:  # fmt: skip
+    """`invariant_ellipsoid` in JAX, with NaN for errors."""
+    system.validate()
+    n, m = system.n, system.m
+    require_shape("K", K, (m, n), "Give u = Kx one row an input, one column a state")
+    require_shape("P", P, (n, n), "Give one matrix for the states")
+    if states is None and inputs is None:
+        fail("states", "the invariant set is unbounded: nothing is constrained", "Add bounds")
+    data = arrays((jnp.asarray(system.A), jnp.asarray(system.B), jnp.asarray(K), jnp.asarray(P)))
+    dtype = floating_dtype(data)
+    A, B, K, P = (part.astype(dtype) for part in data)
+    P = (P + P.T) / 2
+    L = jnp.linalg.cholesky(P)  # NaN if P is not definite
+    most, inside = jnp.zeros((), dtype), jnp.asarray(True)  # 1/alpha
+    for limits, output in ((states, jnp.eye(n, dtype=dtype)), (inputs, K)):
+        if limits is None:
+            continue
+        H, lower, upper = (jnp.asarray(part, dtype) for part in limits.rows())
+        reach = jnp.minimum(upper, -lower)
+        inside = inside & jnp.all(reach > 0)
+        # 1/alpha_i = a_i'P^-1 a_i / b_i^2 = |L^-1 a_i|^2 / b_i^2, 0 where b_i = inf.
+        rows = solve_triangular(L, matmul(H, output).T, lower=True)
+        most = jnp.maximum(most, jnp.max(jnp.sum(rows**2, axis=0) / reach**2, initial=0.0))
+    # With P = LL', (A+BK)'P(A+BK) <= gamma2 P says |M|^2 <= gamma2 for M' = L^-1 (A+BK)'L.
+    M = solve_triangular(L, matmul((A + matmul(B, K)).T, L), lower=True)
+    gamma2 = jnp.linalg.eigvalsh(matmul(M, M.T))[-1]
+    rest = jnp.zeros((), dtype) if system.c is None else jnp.max(jnp.abs(jnp.asarray(system.c)))
+    sound = (gamma2 <= 1 + 100 * jnp.finfo(dtype).eps) & inside & (most > 0) & (rest == 0)
+    return Ellipsoid(P, jnp.where(sound, 1 / most, jnp.nan)), gamma2
 
 
 def contraction(closed: np.ndarray, P: np.ndarray) -> float:

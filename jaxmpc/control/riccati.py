@@ -1,17 +1,25 @@
 """The infinite-horizon linear-quadratic regulator in discrete time."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy
+from jax import Array
 from jax.typing import ArrayLike
 
-from jaxmpc.checks import fail, require_shape, require_symmetric_psd
+from jaxmpc.checks import concrete, fail, require_shape, require_symmetric_psd
 from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.qp.precision import arrays, floating_dtype, in_float64, matmul
 
 # Modes closer than this to unreachable (least singular value, relative) count as such.
 _UNREACHED = 1e-10
+# Doublings at most: 2^40 steps of a loop with spectral radius 1 - 1e-10 leave 1e-48.
+_DOUBLINGS = 40
+# Relative residual of the Riccati equation above which a traced P is no solution.
+_RESIDUAL = 1e-6
 
 
 @jax.tree_util.register_dataclass
@@ -45,13 +53,26 @@ def lqr(system: LinearSystem, Q: ArrayLike, R: ArrayLike) -> LQR:
     decay by itself cannot be moved by u (not stabilizable) or costs nothing (not
     detectable). The message names its eigenvalue.
 
+    Under `jit`, `vmap` and `grad`, where any of A, B, Q, R is traced, K and P are JAX arrays in
+    the type of the data (computed in float64 all the same), differentiable in both modes and
+    any number of times with respect to all four. Data without a stabilizing solution give NaN
+    there. With K held at its optimum (which moves P to second order only) a change of data
+    moves P by the solution of the Lyapunov equation
+        dP = Acl'dP Acl + dQ + K'dR K + F + F',    F = Acl'P (dA + dB K),    Acl = A + BK.
+
     Source: Anderson & Moore 1990, Optimal Control: Linear Quadratic Methods, chapter 2;
-    Arnold & Laub 1984, Proc. IEEE 72(12), for the solver.
+    Arnold & Laub 1984, Proc. IEEE 72(12), for the solver on the host; Chu, Fan, Lin & Wang 2004,
+    Int. J. Control 77(8), for the doubling algorithm in a trace; Kao & Hennequin 2020,
+    arXiv:2011.11430, for the derivative.
     """
     system.validate()
     n, m = system.n, system.m
     require_shape("Q", Q, (n, n), "Give one weight matrix for the states")
     require_shape("R", R, (m, m), "Give one weight matrix for the inputs")
+    if not concrete(system.A, system.B, Q, R):
+        require_symmetric_psd("Q", Q)
+        require_symmetric_psd("R", R, definite=True)
+        return _traced(system.A, system.B, Q, R)
     A, B = host_array("A", system.A), host_array("B", system.B)
     Q, R = host_array("Q", Q), host_array("R", R)
     require_symmetric_psd("Q", Q)
@@ -77,6 +98,36 @@ def lqr(system: LinearSystem, Q: ArrayLike, R: ArrayLike) -> LQR:
         argument, problem, cure = unmoved if control <= cost else unseen
         fail(argument, f"hardly {problem}, so the Riccati equation was not solved", cure)
     return LQR(K=K, P=P)
+
+
+def cost_of_law(system: LinearSystem, K: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Any:
+    """P with x'P x = sum over k >= 0 of x_k'Q x_k + u_k'R u_k under u = K x.
+
+    P = (A+BK)'P(A+BK) + Q + K'RK: as terminal cost it falls by the stage cost along u = K x, which
+    is what stability asks of it (Rawlings, Mayne & Diehl 2017, assumption 2.14), whatever K is; in
+    a terminal set where K keeps the limits it need not be the LQR's. Host, float64, or traced as
+    `lqr` is (NaN where A + BK is not stable). Raises ValueError for wrong shapes, and on the host
+    if the spectral radius of A + BK is not below 1.
+    """
+    system.validate()
+    n, m = system.n, system.m
+    for name, value, shape in (("K", K, (m, n)), ("Q", Q, (n, n)), ("R", R, (m, m))):
+        require_shape(name, value, shape, "u = Kx, and one weight for each pair")
+    data = (system.A, system.B, K, Q, R)
+    if concrete(*data):
+        a, b, k, q, r = (host_array("system, K, Q, R", part) for part in data)
+        closed = a + b @ k
+        radius = np.abs(np.linalg.eigvals(closed)).max()
+        if not radius < 1:
+            fail("K", f"A + BK has spectral radius {radius:.9g}", "Use a stabilizing K with u = Kx")
+        P = scipy.linalg.solve_discrete_lyapunov(closed.T, q + k.T @ r @ k)
+        return (P + P.T) / 2
+    dtype = floating_dtype(tuple(jnp.asarray(part) for part in data))
+    A, B, gain, W, V = (jnp.asarray(part, dtype) for part in data)
+    loop = A + matmul(B, gain)
+    cost = _lyapunov(loop, W + matmul(gain.T, matmul(V, gain)))
+    _, left = _sum(jax.lax.stop_gradient(loop), jnp.zeros_like(W))
+    return jnp.where(left < 1e-3, (cost + cost.T) / 2, jnp.nan)
 
 
 def _gain(A: np.ndarray, B: np.ndarray, R: np.ndarray, P: np.ndarray) -> np.ndarray:
@@ -106,6 +157,105 @@ def _refine(
             break
         P, newer = newer, newest
     return P
+
+
+def _traced(*data: Any) -> LQR:
+    """K and P of traced A, B, Q, R."""
+    data = tuple(jnp.asarray(v) for v in data)  # lists of traced numbers
+    dtype = floating_dtype(data)
+    A, B, Q, R = (v.astype(dtype) for v in arrays(data))
+    Q, R = (Q + Q.T) / 2, (R + R.T) / 2
+    P = _solution(A, B, Q, R)
+    return LQR(K=_gain_of(A, B, R, P), P=P)
+
+
+def _gain_of(A: Array, B: Array, R: Array, P: Array) -> Array:
+    BtP = matmul(B.T, P)
+    return -jnp.linalg.solve(R + matmul(BtP, B), matmul(BtP, A))
+
+
+@jax.custom_jvp
+def _solution(A: Array, B: Array, Q: Array, R: Array) -> Array:
+    """P of the Riccati equation, NaN where no stabilizing one is found."""
+    double = A.dtype == jnp.float64
+    return (_doubling if double else in_float64(_doubling))(A, B, Q, R)
+
+
+@_solution.defjvp
+def _solution_jvp(data: tuple[Array, ...], moves: tuple[Array, ...]) -> tuple[Array, Array]:
+    A, B, Q, R = data
+    dA, dB, dQ, dR = moves
+    P = _solution(A, B, Q, R)
+    K = _gain_of(A, B, R, P)
+    closed = A + matmul(B, K)
+    F = matmul(matmul(closed.T, P), dA + matmul(dB, K))
+    dP = _lyapunov(closed, dQ + matmul(K.T, matmul(dR, K)) + F + F.T)
+    return P, dP * jnp.where(jnp.isfinite(P), 1.0, jnp.nan)  # no number without a solution
+
+
+def _doubling(A: Array, B: Array, Q: Array, R: Array) -> Array:
+    """The structure-preserving doubling algorithm.
+
+    Step k holds the data (A_k, G_k, H_k) of 2^k steps of the Hamiltonian recursion at once, with
+    G_0 = B R^-1 B' and H_0 = Q: H_k is the cost of 2^k steps with no cost at their end, A_k goes
+    to 0 and H_k to P, both quadratically.
+    """
+
+    def double(carry: tuple[Array, ...]) -> tuple[Array, ...]:
+        k, A, G, H, _ = carry
+        W = jnp.eye(A.shape[0], dtype=A.dtype) + matmul(G, H)
+        WA, WG = jnp.split(jnp.linalg.solve(W, jnp.concatenate([A, G], axis=1)), 2, axis=1)
+        grown = matmul(A.T, matmul(H, WA))
+        G, H_next = G + matmul(A, matmul(WG, A.T)), H + grown
+        return k + 1, matmul(A, WA), (G + G.T) / 2, (H_next + H_next.T) / 2, H
+
+    def moving(carry: tuple[Array, ...]) -> Array:
+        k, *_, H, before = carry
+        return (k < _DOUBLINGS) & (_size(H - before) > jnp.finfo(H.dtype).eps * _size(H))
+
+    G = matmul(B, jnp.linalg.solve(R, B.T))
+    start: tuple[Array, ...] = (jnp.asarray(0), A, G, Q, jnp.full_like(Q, jnp.inf))
+    P = jax.lax.while_loop(moving, double, start)[3]
+
+    def recursion(P: Array) -> tuple[Array, Array]:  # as in `_refine`
+        K = _gain_of(A, B, R, P)
+        closed = A + matmul(B, K)
+        P = matmul(closed.T, matmul(P, closed)) + Q + matmul(K.T, matmul(R, K))
+        return (P + P.T) / 2, closed
+
+    P, _ = recursion(P)
+    P, _ = recursion(P)
+    again, closed = recursion(P)
+    _, left = _sum(closed, Q)
+    good = (_size(again - P) <= _RESIDUAL * _size(P)) & (left < 1e-3)
+    return jnp.where(good, again, jnp.nan)
+
+
+def _size(M: Array) -> Array:
+    return jnp.max(jnp.abs(M))
+
+
+def _sum(M: Array, S: Array) -> tuple[Array, Array]:
+    """Sum over k of (M')^k S M^k by doubling, and the size of the power of M that is left."""
+
+    def double(carry: tuple[Array, ...]) -> tuple[Array, ...]:
+        k, M, X = carry
+        return k + 1, matmul(M, M), X + matmul(M.T, matmul(X, M))
+
+    def moving(carry: tuple[Array, ...]) -> Array:  # below eps one more term changes nothing
+        return (carry[0] < _DOUBLINGS) & (_size(carry[1]) > jnp.finfo(M.dtype).eps)
+
+    start: tuple[Array, ...] = (jnp.asarray(0), M, S)
+    _, M, X = jax.lax.while_loop(moving, double, start)
+    return X, _size(M)
+
+
+def _lyapunov(M: Array, S: Array) -> Array:
+    """X = M'X M + S for M with spectral radius below 1."""
+    return jax.lax.custom_linear_solve(
+        lambda X: X - matmul(M.T, matmul(X, M)), S,
+        solve=lambda _, S: _sum(M, S)[0], transpose_solve=lambda _, S: _sum(M.T, S)[0],
+    )  # fmt: skip
 
 
 def least_reached(A: np.ndarray, B: np.ndarray) -> tuple[float, str]:
