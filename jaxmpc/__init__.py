@@ -38,6 +38,11 @@ from jaxmpc.sweeps.reach import feasible_growth, feasible_polytope
 from jaxmpc.sweeps.recursion import RecursionReport, recursive_feasibility, smallest_horizon
 from jaxmpc.sweeps.regions import CriticalRegions, critical_regions
 from jaxmpc.sweeps.robots import RobotMap, map_robot
+from jaxmpc.tuning.feasibility import feasible_share, tune_feasible_set
+from jaxmpc.tuning.losses import ClosedLoopLoss
+from jaxmpc.tuning.parameters import Parameter
+from jaxmpc.tuning.penalties import Penalties, learn_penalties, tune_penalties
+from jaxmpc.tuning.weights import TuningRun, tune_weights
 from jaxmpc.workflow import Design, OfflineReport, design, offline_report
 
 __all__ = [
@@ -47,6 +52,7 @@ __all__ = [
     "QP",
     "Boundary",
     "Box",
+    "ClosedLoopLoss",
     "ControlInvariantSet",
     "Controller",
     "CriticalRegions",
@@ -61,6 +67,8 @@ __all__ = [
     "OfflineReport",
     "Outcome",
     "Outputs",
+    "Parameter",
+    "Penalties",
     "Plan",
     "Plans",
     "Polytope",
@@ -73,6 +81,7 @@ __all__ = [
     "Soft",
     "Status",
     "TerminalReport",
+    "TuningRun",
     "active_constraints",
     "boundary",
     "critical_regions",
@@ -82,11 +91,13 @@ __all__ = [
     "feasibility_margin",
     "feasible_growth",
     "feasible_polytope",
+    "feasible_share",
     "grid",
     "harden",
     "invariant_ellipsoid",
     "joint_limits",
     "judge",
+    "learn_penalties",
     "load_robot",
     "lqr",
     "lyapunov_decrease",
@@ -108,5 +119,8 @@ __all__ = [
     "solve_many",
     "solve_qp",
     "solve_stagewise",
+    "tune_feasible_set",
+    "tune_penalties",
+    "tune_weights",
     "verify_terminal",
 ]

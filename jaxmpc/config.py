@@ -1,36 +1,41 @@
-"""A problem and what to ask of it, as a TOML file: read, checked, and turned into an MPC.
+"""A problem and what to ask of it, as a TOML file: read, checked, turned into an MPC, written.
 
     name = "joint"
 
     [system]  A, B, c, dt, continuous, state_names, state_units, input_names, input_units
-    [limits]  x_min, x_max  or  H_x, h_x;  u_min, u_max
+    [limits]  x_min, x_max, margin  or  H_x, h_x;  u_min, u_max
     [cost]    Q, R, P, rho
-    [mpc]     horizon, terminal, constrain_initial, control_horizon
+    [mpc]     horizon, terminal  or  H_f, h_f  or  P_f, level_f;  constrain_initial, control_horizon
+    [solver]  iterations, rho, alpha, refine
     [sweep]   grid, lower, upper, axes, fixed | projection, iterations, dtype
     [recursion]  steps, grid, lower, upper, regions, seconds
 
 The fields below say what each key means. Every error is a ValueError that names the
 file and the key (or the option of the command line that set it) and what would be right.
+A robot's weights have a file of their own, with the sections [robot] and [cost].
 """
 
 import dataclasses
 import json
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
+import tomli_w
 from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from jaxmpc.checks import fail
 from jaxmpc.control.invariant import invariant_ellipsoid, maximal_invariant_set
 from jaxmpc.control.riccati import lqr
-from jaxmpc.control.sets import Box, Polytope
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.soften import soften
+from jaxmpc.qp.admm import ADMM
 from jaxmpc.sweeps.exact_penalty import exact_penalty
 from jaxmpc.sweeps.feasible_set import grid as grid_points
 
@@ -76,6 +81,8 @@ class LimitsSection:
 
     x_min: Limits | None = None  # (n,), -inf where free
     x_max: Limits | None = None  # (n,), inf where free
+    # Share of the half-width of x_min, x_max that the MPC keeps away from them, on each side.
+    margin: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.0
     H_x: Matrix | None = None  # (r, n)
     h_x: Vector | None = None  # (r,)
     u_min: Vector  # (m,)
@@ -97,10 +104,14 @@ class CostSection:
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class MPCSection:
     """Horizon and terminal set: "invariant" = O_inf of the LQR, "ellipsoid" = largest level set of
-    its cost inside the limits, "box" = the state limits."""
+    its cost inside the limits, "box" = the state limits; or the set itself."""
 
     horizon: Annotated[int, Field(ge=1, strict=True)]
     terminal: Literal["none", "invariant", "ellipsoid", "box"] = "none"
+    H_f: Matrix | None = None  # (r, n): H_f x_N <= h_f
+    h_f: Vector | None = None  # (r,)
+    P_f: Matrix | None = None  # (n, n): x_N'P_f x_N <= level_f
+    level_f: Annotated[FiniteFloat, Field(gt=0)] | None = None
     control_horizon: Annotated[int, Field(ge=1, strict=True)] | None = None  # free moves
     constrain_initial: bool = True  # False: no state limits at k = 0
 
@@ -131,6 +142,16 @@ class RecursionSection:
     seconds: Annotated[FiniteFloat, Field(gt=0)] = 60.0  # for search and proofs
 
 
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class SolverSection:
+    """ADMM as the controller runs it; see `ADMM`. What jaxmpc tune penalties learns."""
+
+    iterations: Annotated[int, Field(ge=0, strict=True)] = 100
+    rho: FiniteFloat | Vector | Matrix = 1.0  # number, one a row of the QP, or (stages, rows)
+    alpha: Annotated[FiniteFloat, Field(gt=0, lt=2)] = 1.6
+    refine: Annotated[int, Field(ge=0, strict=True)] = 20  # Newton steps after them
+
+
 class SweepPoints(NamedTuple):
     """The initial states of a sweep, as `map_feasible_set` takes them."""
 
@@ -150,6 +171,7 @@ class Config:
     mpc: MPCSection
     sweep: SweepSection = SweepSection()
     recursion: RecursionSection = RecursionSection()
+    solver: SolverSection | None = None
 
     @staticmethod
     def default(overrides: Mapping[str, Any] | None = None, command: str = "sweep") -> "Config":
@@ -160,6 +182,10 @@ class Config:
         """The sections a command reads as plain JSON data; infinity is written "Infinity"."""
         data = json.loads(_ADAPTER.dump_json(self))
         return {key: part for key, part in data.items() if key == command or key not in _COMMANDS}
+
+    def to_toml(self) -> str:
+        """The file that `load` reads back as this very configuration."""
+        return to_toml(_ADAPTER.dump_python(self, exclude_none=True))
 
     def build_mpc(self) -> MPC:
         """The problem itself, checked. Raises ValueError as `MPC.validate` does."""
@@ -176,12 +202,18 @@ class Config:
             input_units=s.input_units or (),
         )
         states = self._states()
+        if isinstance(states, Box) and limits.margin:
+            states = tightened(states, limits.margin)
         inputs = Box(np.asarray(limits.u_min), np.asarray(limits.u_max))
         Q, R = _matrix(cost.Q), _matrix(cost.R)
         terminal_cost: Any = Q if cost.P == "Q" else None
         if not isinstance(cost.P, str):
             terminal_cost = _matrix(cost.P)
         terminal_set: Any = states if self.mpc.terminal == "box" else None
+        if self.mpc.H_f is not None:
+            terminal_set = Polytope(np.asarray(self.mpc.H_f), np.asarray(self.mpc.h_f))
+        if self.mpc.P_f is not None:
+            terminal_set = Ellipsoid(np.asarray(self.mpc.P_f), np.asarray(self.mpc.level_f))
         if cost.P == "lqr" or self.mpc.terminal in ("invariant", "ellipsoid"):
             law = lqr(system, Q, R)
             if cost.P == "lqr":
@@ -211,6 +243,30 @@ class Config:
         if rho is None:
             return mpc
         return soften(mpc, exact_penalty(mpc).advised if isinstance(rho, str) else rho)
+
+    def build_solver(self) -> ADMM | None:
+        """The solver of [solver]; None without that section."""
+        if self.solver is None:
+            return None
+        rho = np.asarray(self.solver.rho, float)
+        return ADMM(
+            iterations=self.solver.iterations, rho=rho if rho.ndim else float(rho),
+            alpha=self.solver.alpha, refine=self.solver.refine,
+        )  # fmt: skip
+
+    def state_limits(self) -> Box | Polytope | None:
+        """The limits themselves, without the margin."""
+        return self._states()
+
+    def state_range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Ends (n,), (n,) of the smallest box round the state limits; ±inf where there is none."""
+        states, n = self._states(), len(self.system.A)
+        if isinstance(states, Box):
+            return np.asarray(states.lower), np.asarray(states.upper)
+        if isinstance(states, Polytope):
+            corners = np.asarray(states.vertices())
+            return corners.min(axis=0), corners.max(axis=0)
+        return np.full(n, -np.inf), np.full(n, np.inf)
 
     def build_points(self) -> SweepPoints:
         """The grid of initial states and the axes it lies on."""
@@ -265,6 +321,7 @@ class Config:
         for low, high in (("x_min", "x_max"), ("u_min", "u_max")):
             _check_order("limits", low, high, getattr(limits, low), getattr(limits, high))
         self._check_state_limits()
+        self._check_terminal_set(n)
         if command == "sweep":
             self._check_sweep(n)
         elif command == "recursion":
@@ -301,6 +358,8 @@ class Config:
         polytope = limits.H_x is not None or limits.h_x is not None
         if (limits.x_min is None) != (limits.x_max is None):
             fail("limits.x_min", "x_min and x_max go together", "Use inf for a side without limit")
+        if limits.margin and not box:
+            fail("limits.margin", "given without x_min, x_max", "A Box of limits has half-widths")
         if (limits.H_x is None) != (limits.h_x is None):
             fail("limits.H_x", "H_x and h_x go together", "Give both: H_x x <= h_x")
         if box and polytope:
@@ -311,6 +370,22 @@ class Config:
                 fail("limits.H_x", f"shape {shape} for {len(limits.h_x)} rows", "One h_x a row")
         if not (box or polytope) and self.mpc.terminal != "none":
             fail("mpc.terminal", f'"{self.mpc.terminal}" without state limits', "Give x_min, x_max")
+
+    def _check_terminal_set(self, n: int) -> None:
+        mpc = self.mpc
+        for rows, ends in (("H_f", "h_f"), ("P_f", "level_f")):
+            if (getattr(mpc, rows) is None) != (getattr(mpc, ends) is None):
+                fail(f"mpc.{rows}", f"{rows} and {ends} go together", "Give both")
+            if getattr(mpc, rows) is not None and mpc.terminal != "none":
+                fail(f"mpc.{rows}", f'given beside terminal "{mpc.terminal}"', "Choose one")
+        if mpc.H_f is not None and mpc.P_f is not None:
+            fail("mpc.P_f", "given beside H_f", "Choose one terminal set")
+        if mpc.H_f is not None and mpc.h_f is not None:
+            if np.shape(mpc.H_f) != (len(mpc.h_f), n):
+                what = f"shape {np.shape(mpc.H_f)} for {len(mpc.h_f)} rows"
+                fail("mpc.H_f", what, f"One h_f a row, {n} columns")
+        if mpc.P_f is not None and np.shape(mpc.P_f) != (n, n):
+            fail("mpc.P_f", f"shape {np.shape(mpc.P_f)}", f"Give ({n}, {n})")
 
     def _states(self) -> Box | Polytope | None:
         limits = self.limits
@@ -344,14 +419,7 @@ class Config:
         where = "sweep" if isinstance(sweep, SweepSection) else "recursion"
         if sweep.lower is not None and sweep.upper is not None:
             return np.asarray(sweep.lower), np.asarray(sweep.upper)
-        states = self._states()
-        low = high = np.full(len(self.system.A), np.inf)
-        if isinstance(states, Box):
-            low, high = np.asarray(states.lower), np.asarray(states.upper)
-        elif isinstance(states, Polytope):
-            corners = np.asarray(states.vertices())
-            low, high = corners.min(axis=0), corners.max(axis=0)
-        low, high = low[list(axes)], high[list(axes)]
+        low, high = (end[list(axes)] for end in self.state_range())
         margin = 0.03 * (high - low) if np.all(np.isfinite([low, high])) else np.nan
         lower = np.asarray(sweep.lower) if sweep.lower is not None else low - margin
         upper = np.asarray(sweep.upper) if sweep.upper is not None else high + margin
@@ -377,13 +445,92 @@ def load(
     Raises ValueError, naming file and key, where the file is absent or unreadable, is no
     TOML, or holds an unknown key or a value that cannot be.
     """
+    return _parse(_read(path), str(path), overrides or {}, command)
+
+
+def _read(path: str | Path) -> dict[str, Any]:
     try:
-        document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         fail(str(path), f"cannot be read ({error.strerror})", "Give the path of a TOML file")
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         fail(str(path), f"is no TOML ({error})", "See the keys with: jaxmpc sweep --help")
-    return _parse(document, str(path), overrides or {}, command)
+
+
+def to_toml(document: Mapping[str, Any]) -> str:
+    """TOML text with each vector, and each row of a matrix, on a line."""
+    text = tomli_w.dumps(document)
+    line = lambda found: f"[{' '.join(part.strip() for part in found[1].splitlines())}]"
+    # What holds a bracket of its own, a matrix or a name with one, stays as it is.
+    return re.sub(r"\[\n([^\[\]]+?),?\n *\]", line, text)
+
+
+def tightened(limits: Box, share: Any) -> Box:
+    """The limits moved inwards by a share of their half-width on each side, where there are two.
+    Traceable in `share`."""
+    lower, upper = np.asarray(limits.lower, float), np.asarray(limits.upper, float)
+    half = np.where(np.isfinite(upper - lower), upper - lower, 0.0) / 2
+    return Box(lower + share * half, upper - share * half)
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class RobotSection:
+    """Which robot's MPC this is, and what of it `robot_mpc` and RobotController take."""
+
+    name: str
+    horizon: Annotated[int, Field(ge=1, strict=True)] = 20
+    margin: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.02
+    linearize: Literal["set-point", "state", "trajectory"] = "state"
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class RobotCostSection:
+    """As in a linear problem. rho: the L1 weight of state limits, always soft."""
+
+    Q: Vector | Matrix
+    R: Vector | Matrix
+    P: Literal["lqr", "none"] | Matrix = "lqr"
+    rho: Annotated[FiniteFloat, Field(gt=0)] = 1e4
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class RobotConfig:
+    """The weights of a robot's MPC, as a file says them."""
+
+    robot: RobotSection
+    cost: RobotCostSection
+
+    def weights(self, robot: Any) -> dict[str, Any]:
+        """Q, R and terminal_cost, as `robot_mpc` takes them. Raises ValueError where the file is of
+        another robot."""
+        if self.robot.name != robot.name:
+            fail("robot.name", f"{self.robot.name!r}, asked is {robot.name!r}", "Give that --robot")
+        cost = self.cost
+        for key, value, size in (
+            ("Q", cost.Q, robot.n),
+            ("R", cost.R, robot.m),
+            ("P", cost.P, robot.n),
+        ):
+            if not isinstance(value, str) and len(value) != size:
+                fail(f"cost.{key}", f"has {len(value)} entries", f"{robot.name} needs {size}")
+        P: Any = None if cost.P == "none" else cost.P
+        terminal = P if P is None or isinstance(P, str) else _matrix(P)
+        return {"Q": _matrix(cost.Q), "R": _matrix(cost.R), "terminal_cost": terminal}
+
+    def to_toml(self) -> str:
+        """The file that `load_robot_config` reads back."""
+        return to_toml(_ROBOT_ADAPTER.dump_python(self, exclude_none=True))
+
+
+def load_robot_config(path: str | Path) -> RobotConfig:
+    """Read the file of a robot's weights; ValueError as `load`."""
+    document = _read(path)
+    if "robot" not in document:
+        fail(str(path), "has no section [robot]", "Give what jaxmpc tune weights --robot wrote")
+    try:
+        return _ROBOT_ADAPTER.validate_python(document)
+    except ValidationError as error:
+        raise ValueError(_sentence(error, str(path), {}, _ROBOT_SECTIONS)) from None
 
 
 def _parse(
@@ -391,7 +538,10 @@ def _parse(
 ) -> Config:
     merged = dict(document)
     # A slice and a projection exclude each other: choosing either drops the file's choice.
-    dropped = {"fixed", "projection"} if {"fixed", "projection"} & set(overrides) else set()
+    # So do the names of a terminal set and the sets themselves.
+    dropped = set()
+    for rivals in ({"fixed", "projection"}, {"terminal", "H_f", "h_f", "P_f", "level_f"}):
+        dropped |= rivals if rivals & set(overrides) else set()
     for name in ("mpc", *({command} & set(_COMMANDS))):
         known = {field.name for field in dataclasses.fields(_SECTIONS[name])}
         changes = {key: value for key, value in overrides.items() if key in known}
@@ -408,15 +558,19 @@ def _parse(
     return config
 
 
-def _sentence(error: ValidationError, source: str, overrides: Mapping[str, Any]) -> str:
+def _sentence(
+    error: ValidationError, source: str, overrides: Mapping[str, Any],
+    sections: Mapping[str, Any] | None = None,
+) -> str:  # fmt: skip
     """The first thing wrong, in one line: where, what, and what is allowed there."""
+    sections = _SECTIONS if sections is None else sections
     unknown = "unexpected_keyword_argument"  # first: a misspelt key is also a missing one
     first = min(error.errors(), key=lambda e: e["type"] != unknown)
     where = [str(part) for part in first["loc"][:2]]
     key = ".".join(where)
     if first["type"] == unknown:
-        owner = _SECTIONS.get(where[0], Config) if len(where) == 2 else Config
-        allowed = ", ".join(field.name for field in dataclasses.fields(owner))
+        names = list(sections) if sections is not _SECTIONS else _names(Config)
+        allowed = ", ".join(_names(sections[where[0]]) if len(where) == 2 else names)
         place = f"[{where[0]}]" if len(where) == 2 else "the top of the file"
         return f"{source}: unknown key {where[-1]!r} in {place}. Keys allowed there: {allowed}"
     same = [e for e in error.errors() if [str(part) for part in e["loc"][:2]] == where]
@@ -428,6 +582,10 @@ def _sentence(error: ValidationError, source: str, overrides: Mapping[str, Any])
     value = repr(first["input"])
     shown = value if len(value) < 60 else value[:57] + "..."
     return f"{source}: {key}: {'; or '.join(problems)}. Got {shown}"
+
+
+def _names(section: Any) -> list[str]:
+    return [field.name for field in dataclasses.fields(section)]
 
 
 def _matrix(value: Any) -> np.ndarray:
@@ -452,9 +610,12 @@ _SECTIONS = {
     "mpc": MPCSection,
     "sweep": SweepSection,
     "recursion": RecursionSection,
+    "solver": SolverSection,
 }
+_ROBOT_SECTIONS = {"robot": RobotSection, "cost": RobotCostSection}
 _COMMANDS = ("sweep", "recursion")
 _ADAPTER = TypeAdapter(Config)
+_ROBOT_ADAPTER = TypeAdapter(RobotConfig)
 _JOINT: dict[str, Any] = {
     "name": "joint",
     "system": {

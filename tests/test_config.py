@@ -5,12 +5,13 @@ import math
 import re
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from jaxmpc.config import Config, load
-from jaxmpc.control.sets import Polytope
+from jaxmpc.config import Config, load, load_robot_config, tightened
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 
@@ -167,3 +168,134 @@ def test_errors_name_the_file_or_the_option(write):
         load(path, {"horizon": -2})
     with pytest.raises(ValueError, match="absent.toml: cannot be read"):
         load("absent.toml")
+
+
+# Numbers that no short decimal stands for.
+FULL = """
+P = [[7.123456789012345e-3, 0.1], [0.1, 2.718281828459045]]
+[solver]
+iterations = 8
+rho = [[0.1, 0.30000000000000004, 3.0], [1e-300, 2.0, 1.0]]
+alpha = 1.3333333333333333
+refine = 0
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("", ""),
+        ("[-5.0, -5.0]", "[-inf, -5.0]\nmargin = 0.1"),
+        ("horizon = 3", "horizon = 3\nH_f = [[1.0, 0.1], [-1.0, 0.3]]\nh_f = [0.1, 0.7]"),
+        ("horizon = 3", "horizon = 3\nP_f = [[2.0, 0.1], [0.1, 1.0]]\nlevel_f = 0.3"),
+        ("horizon = 3", 'horizon = 3\nterminal = "invariant"\nconstrain_initial = false'),
+        ("Q = [1.0, 2.0]", "Q = [[1.0, 0.1], [0.1, 0.3333333333333333]]\nrho = 12.3"),
+        ('["p", "v"]', '["p [a]", "v, \\"w\\"  x"]\nstate_units = ["[m]", "]"]'),
+    ],
+)
+@pytest.mark.parametrize("full", [False, True])
+def test_written_file_gives_the_same_problem_to_the_last_bit(write, tmp_path, old, new, full):
+    more = "lower = [-1.0, -2.0]\nupper = [1.0, 2.0]\n"
+    path = write(old, new, more)
+    if full:
+        cost, rest = path.read_text().split("R = [1.0]")
+        matrix, solver = FULL.split("[solver]")
+        path.write_text(f"{cost}R = [1.0]{matrix}{rest}[solver]{solver}")
+    config = load(path)
+    again = tmp_path / "again.toml"
+    again.write_text(config.to_toml())
+    read = load(again)
+    assert read == config
+    first, second = (
+        jax.tree.flatten((m.build_mpc(), m.build_controlled(), m.build_solver()))
+        for m in (config, read)
+    )
+    assert first[1] == second[1]
+    for a, b in zip(first[0], second[0], strict=True):
+        np.testing.assert_array_equal(a, b, strict=True)
+
+
+def test_each_row_of_a_matrix_is_a_line(write):
+    text = load(write()).to_toml()
+    assert "A = [\n    [1.0, 1.0],\n    [0.0, 1.0],\n]" in text
+    assert "Q = [1.0, 2.0]" in text
+
+
+def test_margin_terminal_set_and_solver_become_what_they_say(write):
+    path = write("[5.0, 5.0]", "[15.0, inf]\nmargin = 0.2", "lower = [-1, -1]\nupper = [1, 1]")
+    config = load(path, {"terminal": "box"})
+    mpc = config.build_mpc()
+    # Half of 20 is 10, of which 20 % stay free; where one side is open nothing moves.
+    np.testing.assert_allclose([mpc.states.lower, mpc.states.upper], [[-3, -5], [13, np.inf]])
+    assert mpc.terminal_set is mpc.states
+    np.testing.assert_array_equal(config.state_limits().lower, [-5, -5])
+    box = tightened(Box(np.array([-1.0]), np.array([3.0])), 0.5)
+    np.testing.assert_array_equal([box.lower, box.upper], [[0.0], [2.0]])
+
+    path = write("horizon = 3", "horizon = 3\nP_f = [[2.0, 0.0], [0.0, 1.0]]\nlevel_f = 0.3")
+    assert isinstance(load(path).build_mpc().terminal_set, Ellipsoid)
+    assert load(path, {"terminal": "none"}).build_mpc().terminal_set is None  # an option wins
+
+    path = write("[sweep]", "[solver]\nrho = [1.0, 2.0]\niterations = 7\n[sweep]")
+    solver = load(path).build_solver()
+    assert (solver.iterations, solver.alpha, solver.refine) == (7, 1.6, 20)
+    np.testing.assert_array_equal(solver.rho, [1.0, 2.0])
+    assert load(write()).build_solver() is None
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("u_min", "margin = 1.0\nu_min", "limits.margin"),
+        ("x_min = [-5.0, -5.0]\nx_max = [5.0, 5.0]", "margin = 0.1", "without x_min, x_max"),
+        ("horizon = 3", "horizon = 3\nH_f = [[1.0, 0.0]]", "H_f and h_f go together"),
+        ("horizon = 3", "horizon = 3\nH_f = [[1.0]]\nh_f = [1.0]", "2 columns"),
+        ("horizon = 3", "horizon = 3\nP_f = [[1.0]]\nlevel_f = 1.0", "mpc.P_f: shape"),
+        ("horizon = 3", 'horizon = 3\nterminal = "box"\nh_f = [1.0]\nH_f = [[1.0, 1.0]]', "beside"),
+        ("[sweep]", "[solver]\nalpha = 2.0\n[sweep]", "solver.alpha"),
+        ("[sweep]", "[solver]\nsteps = 2\n[sweep]", r"unknown key 'steps' in \[solver\].*alpha"),
+    ],
+)
+def test_bad_sections_of_tuning_are_named(write, old, new, message):
+    with pytest.raises(ValueError, match=message):
+        load(write(old, new)).build_mpc()
+
+
+ROBOT = """
+[robot]
+name = "arm"
+horizon = 7
+linearize = "set-point"
+[cost]
+Q = [1.0, 2.0]
+R = [[0.3333333333333333]]
+P = [[1.0, 0.1], [0.1, 1.0]]
+"""
+
+
+class Arm:
+    name, n, m = "arm", 2, 1
+
+
+def test_weights_of_a_robot_round_trip(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text(ROBOT)
+    config = load_robot_config(path)
+    assert (config.robot.margin, config.cost.rho) == (0.02, 1e4)
+    path.write_text(config.to_toml())
+    assert load_robot_config(path) == config
+    weights = config.weights(Arm)
+    np.testing.assert_array_equal(weights["Q"], np.diag([1.0, 2.0]))
+    np.testing.assert_array_equal(weights["R"], [[1 / 3]])
+    np.testing.assert_array_equal(weights["terminal_cost"], [[1, 0.1], [0.1, 1]])
+    for old, new, message in (
+        ('"arm"', '"leg"', "robot.name: 'leg', asked is 'arm'"),
+        ("[1.0, 2.0]", "[1.0]", "cost.Q: has 1 entries. arm needs 2"),
+        ("[robot]", "[robots]", r"has no section \[robot\]"),
+        ("[cost]", "[costs]", "unknown key 'costs'.*robot, cost"),
+        ("horizon = 7", "horizons = 7", "unknown key 'horizons'.*name, horizon, margin"),
+        ("[1.0, 2.0]", "[nan, 2.0]", "cost.Q"),
+    ):
+        path.write_text(ROBOT.replace(old, new, 1))
+        with pytest.raises(ValueError, match=message):
+            load_robot_config(path).weights(Arm)

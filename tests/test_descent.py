@@ -208,6 +208,16 @@ def test_parameters_start_at_their_value_and_stay_in_their_domain(parameter):
                 assert np.all((value > parameter.lower) & (value < parameter.upper))
 
 
+def test_the_precision_of_a_program_is_that_of_theta():
+    """A value may be asked for in float32 within `jit` and in float64 afterwards."""
+    parameter = Parameter(0.02, "interval", lower=0.0, upper=0.5)
+    single = jax.jit(lambda theta: parameter.at(theta))(np.float32(parameter.raw()))
+    with jax.enable_x64(True):
+        double = jax.jit(lambda theta: parameter.at(theta))(parameter.raw())
+    assert single.dtype == np.float32 and double.dtype == np.float64
+    np.testing.assert_allclose([single, double], 0.02, rtol=1e-6)
+
+
 def test_masks_hold_entries():
     parameters = {
         "Q": Parameter(np.diag([4.0, 9.0]), "definite", train=np.array([[True, False]] * 2)),

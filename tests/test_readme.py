@@ -31,7 +31,7 @@ def test_first_snippet(capsys):
 @pytest.mark.slow
 def test_workflow_snippet(capsys):
     """Theorem 1 holds of the design, and the weight it advises is exact."""
-    _, names = run(0, 2)
+    _, names = run(0, 3)
     text = capsys.readouterr().out
     assert "Theorem 1 (recursive feasibility) applies" in text and "weight given is exact" in text
     assert names["controller"].mpc.soft
@@ -44,3 +44,11 @@ def test_robot_snippet():
     assert names["run"].states.shape == (64, 101, 2)
     assert names["run"].violation.max() == 0 and not names["run"].fallback.any()
     assert abs(names["run"].states[:, -1]).max() < 1e-2
+
+
+@pytest.mark.slow
+def test_tuning_snippet():
+    """The loss on states set apart falls, and the penalties learned solve them."""
+    _, names = run(0, 2)
+    assert names["run"].improvement > 0.01
+    assert names["solver"].rho.shape[0] == 4

@@ -23,6 +23,7 @@ from jaxmpc.checks import fail
 from jaxmpc.closed_loop import Run, simulate_many
 from jaxmpc.commands.options import model_hash, open_folder, option, report_error
 from jaxmpc.compiled import Compiled, first_rows, padded
+from jaxmpc.config import load_robot_config
 from jaxmpc.control.riccati import lqr
 from jaxmpc.mpc.feedback import LinearFeedback
 from jaxmpc.outcome import KEPT, Outcome, judge
@@ -37,6 +38,8 @@ from jaxmpc.sweeps import store
 
 # Seconds between frames of the video.
 FRAME = 0.04
+# What --config says where an option does not, and what holds without either.
+USUAL = {"horizon": 20, "margin": 0.02, "linearize": "state", "penalty": 1e4}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,6 +88,9 @@ class Simulate:
 
     robot: Annotated[str, option("NAME|FILE", "joint")] = "joint"
     """joint, pendulum, cartpole, arm2, arm6, arm7, quadrotor, or an MJCF or URDF file."""
+    config: Annotated[Path | None, option("FILE", "none: the options below")] = None
+    """TOML file of jaxmpc tune weights --robot: [robot] name, horizon, margin, linearize, [cost] Q,
+    R, P, rho. An option given here wins over the file."""
     count: Annotated[int, option("B", "64")] = 64
     """Number of robots."""
     seconds: Annotated[float, option("S", "2")] = 2.0
@@ -97,24 +103,25 @@ class Simulate:
     seed: Annotated[int, option("K", "0")] = 0
     """Of starts, masses, damping and payloads."""
     linearize: Annotated[
-        Literal["set-point", "state", "trajectory", "lqr"],
-        option("{set-point,state,trajectory,lqr}", "state"),
-    ] = "state"
+        Literal["set-point", "state", "trajectory", "lqr"] | None,
+        option("{set-point,state,trajectory,lqr}", "from --config, else state"),
+    ] = None
     """Linear models: once at the target, at each measured state, along the last plan.
     lqr: no MPC but linear feedback, clipped to the input limits, to compare with."""
-    horizon: Annotated[int, option("N", "20")] = 20
+    horizon: Annotated[int | None, option("N", "from --config, else 20")] = None
     """Prediction horizon, in control periods."""
     state_weights: Annotated[
-        tuple[float, ...] | None, option("Q [Q ...]", "Bryson's rule, velocities x 0.01")
+        tuple[float, ...] | None,
+        option("Q [Q ...]", "from --config, else Bryson's rule, velocities x 0.01"),
     ] = None
     """Diagonal of Q: positions, then velocities. Bryson's rule: 1/(half the range)^2."""
     input_weights: Annotated[
-        tuple[float, ...] | None, option("R [R ...]", "Bryson's rule x 0.01")
+        tuple[float, ...] | None, option("R [R ...]", "from --config, else Bryson's rule x 0.01")
     ] = None
     """Diagonal of R, one number an actuator."""
-    margin: Annotated[float, option("SHARE", "0.02")] = 0.02
+    margin: Annotated[float | None, option("SHARE", "from --config, else 0.02")] = None
     """Room that the MPC leaves to state limits, in shares of half the range."""
-    penalty: Annotated[float, option("RHO", "1e4")] = 1e4
+    penalty: Annotated[float | None, option("RHO", "from --config, else 1e4")] = None
     """L1 weight of state limits; too small a weight breaks limits that could be kept."""
     iterations: Annotated[int, option("K", "50")] = 50
     """ADMM steps of each plan."""
@@ -147,9 +154,26 @@ class Simulate:
     def run(self) -> int:
         """Do it; the result is the exit code."""
         try:
-            job = self.prepare()
+            command = self.settled()
+            job = command.prepare()
         except ValueError as error:
             return report_error(error)
+        return command.finish(job)
+
+    def settled(self) -> "Simulate":
+        """The command with what --config or `USUAL` says for options that are not given."""
+        found: dict[str, Any] = dict(USUAL)
+        if self.config is not None:
+            file = load_robot_config(self.config)
+            found |= {
+                "horizon": file.robot.horizon, "margin": file.robot.margin,
+                "linearize": file.robot.linearize, "penalty": file.cost.rho,
+            }  # fmt: skip
+        missing = {key: value for key, value in found.items() if getattr(self, key) is None}
+        return dataclasses.replace(self, **missing)
+
+    def finish(self, job: "Job") -> int:
+        """Run what `prepare` opened; the exit code."""
         robot = job.robot
         print(f"{robot.name}: {self.count:,} robots for {self.seconds:g} s -> {self.output}")
         speed = self.drive(job)
@@ -189,10 +213,16 @@ class Simulate:
             if given is not None and len(given) != size:
                 fail(name, f"has {len(given)} numbers", f"{robot.name} needs {size}")
         target = None if self.target is None else np.array(self.target)
-        array = lambda v: None if v is None else np.array(v)
+        file: dict[str, Any] = {}
+        if self.config is not None:
+            file = load_robot_config(self.config).weights(robot)
+        options = {"Q": self.state_weights, "R": self.input_weights}
+        file |= {key: np.array(value) for key, value in options.items() if value is not None}
+        more = {"terminal_cost": file["terminal_cost"]} if "terminal_cost" in file else {}
+        horizon: Any = self.horizon
         mpc = robot_mpc(
-            robot, array(self.state_weights), array(self.input_weights), self.horizon,
-            target=target, margin=self.margin,
+            robot, file.get("Q"), file.get("R"), horizon, target=target, margin=self.margin or 0.0,
+            **more,
         )  # fmt: skip
         controller: Any
         with jax.enable_x64(self.dtype == "float64"):
@@ -201,21 +231,21 @@ class Simulate:
             else:
                 solver = ADMM(iterations=self.iterations, refine=self.newton_steps)
                 controller = RobotController(
-                    robot, mpc, solver, linearize=self.linearize, penalty=self.penalty
+                    robot, mpc, solver, linearize=str(self.linearize), penalty=self.penalty
                 )
         x, input_reference = robot.equilibrium(target)
         with jax.enable_x64(True):
             reference = np.asarray(robot.coordinates(x))
         starts, variations = self.draw(robot)
         if variations:
-            robot.vary(**{key: value[0] for key, value in _numbers(robot, variations).items()})
+            robot.vary(**{key: value[0] for key, value in plant_numbers(robot, variations).items()})
         open_folder(self.output)
         if path.exists() and self.overwrite:
             store.remove(path)
         steps = max(1, round(self.seconds / robot.dt))
         chunk = self.chunk or (256 if jax.default_backend() == "cpu" else 4096)
         group = store.open_store(
-            path, starts, self.fields(robot, steps), self.config(robot, mpc),
+            path, starts, self.fields(robot, steps), self.settings(robot, mpc),
             min(chunk, self.count), (steps, robot.state_size, robot.m),
         )  # fmt: skip
         for name in ("summary.json", "runs.png", "robots.gif"):  # of an earlier run
@@ -288,7 +318,7 @@ class Simulate:
             found["payload"] = factor(())
         return found
 
-    def config(self, robot: Robot, mpc: Any) -> dict[str, Any]:
+    def settings(self, robot: Robot, mpc: Any) -> dict[str, Any]:
         """What decides the results, as JSON data."""
         apart = ("output", "video", "tolerance", "resume", "overwrite", "chunk")
         options = {k: v for k, v in dataclasses.asdict(self).items() if k not in apart}
@@ -296,6 +326,14 @@ class Simulate:
             "state_weights": np.diag(mpc.Q).tolist(),
             "input_weights": np.diag(mpc.R).tolist(),
         }
+        if self.config is None:
+            del options["config"]
+        else:  # what is in the file, not where it lies
+            weights |= {
+                name: np.asarray(value, float).tolist()
+                for name, value in (("Q", mpc.Q), ("R", mpc.R), ("P", mpc.terminal_cost))
+            }
+            options["config"] = "tuned"
         options |= {**weights, "refine": self.newton_steps, "model": model_hash(robot)}
         return options
 
@@ -320,7 +358,7 @@ class Simulate:
                         reference=job.reference, input_reference=job.input_reference,
                         variations={
                             key: padded(value, size)
-                            for key, value in _numbers(job.robot, varied).items()
+                            for key, value in plant_numbers(job.robot, varied).items()
                         },
                     )  # fmt: skip
                 compiling = Compiled.seconds - compiled
@@ -477,7 +515,7 @@ class Speed:
     run_seconds: float = 0.0
 
 
-def _numbers(robot: Robot, variations: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def plant_numbers(robot: Robot, variations: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Factors as the numbers that `Robot.vary` takes."""
     model, found = robot.mujoco, {}
     if "mass" in variations:

@@ -24,7 +24,16 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
 from jaxmpc.sweeps import proofs
 from jaxmpc.sweeps.boundary import Rays
-from jaxmpc.sweeps.ladder import Verdict, admm_rung, bounding_box, newton_rung, rows
+from jaxmpc.sweeps.ladder import (
+    ALPHA,
+    RungPenalties,
+    Verdict,
+    admm_rung,
+    bounding_box,
+    newton_rung,
+    rows,
+    weighted,
+)
 from jaxmpc.sweeps.proofs import hard_part, make_view
 
 # Newton steps between two attempts at a proof, and how often; the decided leave in between.
@@ -104,7 +113,7 @@ class Labels:
 
 def label_chunks(
     mpc: MPC, points: Any, *, axes: Any = None, fixed: Any = None, iterations: int = 50,
-    dtype: Any = "float32", chunk: int | None = None,
+    dtype: Any = "float32", chunk: int | None = None, penalties: RungPenalties | None = None,
 ) -> Iterator[tuple[slice, Labels]]:  # fmt: skip
     """Label points chunk by chunk; yields (slice of the points, Labels). See `map_feasible_set`."""
     mpc.validate()
@@ -121,6 +130,12 @@ def label_chunks(
 
     usable = np.all(np.isfinite(points), axis=1)
     moving = rows(mpc, view)
+    quick, alpha, back = moving, ALPHA, None
+    if penalties is not None:
+        if np.shape(penalties.weight) != moving.lower.shape:
+            shape = np.shape(penalties.weight)
+            fail("penalties", f"weights {shape}", f"Learn them for this map: {moving.lower.shape}")
+        (quick, back), alpha = weighted(moving, penalties.weight), penalties.alpha
     region = np.abs(points[usable]).max(axis=0, initial=0.0)
     problem = proofs.problem(mpc, view, bounding_box(moving, region)[0])
     admm, newton = admm_rung(iterations, np.dtype(dtype)), newton_rung(NEWTON_STEPS)
@@ -135,15 +150,16 @@ def label_chunks(
         x = np.where(ok[:, None], points[here], 0.0)
         labels = Labels.empty(len(x), mpc, d)
         with jax.enable_x64(True):
-            verdict, w = admm(problem, moving, padded(x, chunk))
+            verdict, w = admm(problem, quick, padded(x, chunk), np.float64(alpha))
             labels.put(ok, jax.tree.map(lambda v, ok=ok: v[: len(ok)][ok], verdict))
             w = w[: len(x)].astype(np.float64)
+            w = w if back is None else w @ back.T
             for rung in (*[newton] * NEWTON_ROUNDS, longer, *[newton] * NEWTON_ROUNDS):
                 left = np.flatnonzero((labels.label == 0) & ok)
                 for i in range(0, len(left), size):
                     batch = left[i : i + size]
-                    start_w = (padded(w[batch], size),) if rung is newton else ()
-                    verdict, better = rung(problem, moving, padded(x[batch], size), *start_w)
+                    last = padded(w[batch], size) if rung is newton else np.float64(ALPHA)
+                    verdict, better = rung(problem, moving, padded(x[batch], size), last)
                     labels.put(batch, first_rows(verdict, len(batch)))
                     w[batch] = better[: len(batch)]
         labels.status[~ok] = Status.NON_FINITE
@@ -388,7 +404,7 @@ def excluded(
 def map_feasible_set(
     mpc: MPC, x0s: Any, *, axes: Any = None, fixed: Any = None, iterations: int = 50,
     dtype: Any = "float32", chunk: int | None = None, refine: float | None = None,
-    progress: bool = False,
+    penalties: RungPenalties | None = None, progress: bool = False,
 ) -> FeasibleSetMap:  # fmt: skip
     """Label each point: is there an input sequence that keeps every hard constraint of `mpc`?
 
@@ -399,15 +415,16 @@ def map_feasible_set(
     the point, each by more than rounding; what is neither is 0, undecided. iterations and dtype
     govern the ADMM rung alone and cannot make a label wrong. chunk: points a compiled program
     takes at once (None: by device). refine: tolerance of `FeasibleSetMap.refine`, None to skip
-    it. progress: show a bar.
+    it. penalties: of the ADMM rung, from `tune_sweep_penalties`. progress: show a bar.
 
     A point with NaN or infinity gets status NON_FINITE and label 0. Raises ValueError for wrong
     shapes and ill-posed problems before anything compiles.
     """
     points = np.asarray(x0s, np.float64)
     chunks = label_chunks(
-        mpc, points, axes=axes, fixed=fixed, iterations=iterations, dtype=dtype, chunk=chunk
-    )
+        mpc, points, axes=axes, fixed=fixed, iterations=iterations, dtype=dtype, chunk=chunk,
+        penalties=penalties,
+    )  # fmt: skip
     mpc.validate()
     labels = Labels.empty(len(points), mpc, len(make_view(hard_part(mpc), axes, fixed).axes))
     with tqdm(total=len(points), unit="pt", disable=not progress) as bar:

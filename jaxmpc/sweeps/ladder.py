@@ -3,6 +3,7 @@
 For the question "feasible or not" the cost is dropped. In an orthonormal basis U of the range
 of the (row-normalised) constraint matrix a zero-cost ADMM step is t⁺ = t + α(U U'r − clip(t)):
 the alternating projection of Douglas and Rachford between {U w} and the box of the bounds.
+Rows multiplied by √rho_i before U is made are the same as penalties rho_i (`RungPenalties`).
 Iterates may be float32. Nothing here decides a label: every candidate, a w or a multiplier,
 goes to `proofs.py`.
 """
@@ -106,6 +107,27 @@ def rows(mpc: MPC, view: View) -> Rows:
         multiplier_index(mpc, c.layout, place[extra:], len(keep)), Psi, Omega, psi,
         weight[-1:] * c.radius if c.balls else None, c.balls,
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RungPenalties:
+    """Of the first rung: weight (R,) of the rows of `Rows`, the root of ADMM's rho, and its
+    over-relaxation. A label does not depend on them, only which rung finds it."""
+
+    weight: np.ndarray
+    alpha: float = ALPHA
+
+
+def weighted(rows: Rows, weight: np.ndarray) -> tuple[Rows, np.ndarray]:
+    """The rows multiplied by weights > 0 (R,), alike in a ball, and M (k, k): w = M w', the old
+    coordinates from the new."""
+    U, singular, Vt = np.linalg.svd(weight[:, None] * rows.U, full_matrices=False)
+    M = Vt.T / singular
+    return replace(
+        rows, U=U, back=rows.back @ M, D=weight[:, None] * rows.D, lower=weight * rows.lower,
+        upper=weight * rows.upper, weight=weight * rows.weight,
+        radius=None if rows.radius is None else weight[-1:] * rows.radius,
+    ), M  # fmt: skip
 
 
 def multiplier_index(mpc: MPC, layout: tuple[Any, ...], place: np.ndarray, none: int) -> np.ndarray:
@@ -262,11 +284,11 @@ def judge(p: Problem, rows: Rows, theta: Array, w: Array, candidates: list[Array
 
 @functools.cache
 def admm_rung(iterations: int, dtype: Any) -> Compiled:
-    """The compiled first rung: (p, rows, points (B, d)) → verdicts and w (B, k)."""
+    """The compiled first rung: (p, rows, points (B, d), alpha) → verdicts and w (B, k)."""
 
     @jax.jit
-    def rung(p: Problem, rows: Rows, points: Array) -> tuple[Verdict, Array]:
-        U = jnp.asarray(rows.U, dtype)
+    def rung(p: Problem, rows: Rows, points: Array, alpha: Array) -> tuple[Verdict, Array]:
+        U, alpha = jnp.asarray(rows.U, dtype), jnp.asarray(alpha, dtype)
         shift = matmul(jnp.asarray(rows.D), points.T)  # (R, B): columns are points
         l = (jnp.asarray(rows.lower)[:, None] - shift).astype(dtype)
         u = (jnp.asarray(rows.upper)[:, None] - shift).astype(dtype)
@@ -279,7 +301,7 @@ def admm_rung(iterations: int, dtype: Any) -> Compiled:
 
         def step(t, _=None):
             s = project(t)
-            return t + ALPHA * (matmul(U, matmul(U.T, 2 * s - t)) - s), None
+            return t + alpha * (matmul(U, matmul(U.T, 2 * s - t)) - s), None
 
         before, _ = jax.lax.scan(step, project(jnp.zeros_like(l)), length=iterations - 1)
         t, _ = step(before)

@@ -67,9 +67,7 @@ class ClosedLoopLoss:
     def __call__(self, run: Run) -> Array:
         """The loss of one run."""
         T, dtype = run.inputs.shape[0], run.inputs.dtype
-        x = run.states
-        if self.plant is not None:
-            x = jax.vmap(self.plant.coordinates)(x)
+        x = self._coordinates(run)
         e, v = x - self._aim(self.reference, T + 1), run.inputs - self._aim(self.input_reference, T)
         square = lambda v, W: jnp.sum(v * matmul(v, jnp.asarray(W, dtype)))
         total = (square(e[:-1], self.Q) + square(v, self.R)) / T
@@ -91,6 +89,14 @@ class ClosedLoopLoss:
             size = jnp.asarray(self.limits.half_widths(), x.dtype)
         value = matmul(x, H.T)
         return jnp.maximum(jnp.maximum(value - upper, lower - value), 0.0) / size
+
+    def worst(self, run: Run) -> Array:
+        """The largest excess of a run."""
+        return jnp.max(self.excess(self._coordinates(run)))
+
+    def _coordinates(self, run: Run) -> Array:
+        """The states as the problem has them."""
+        return run.states if self.plant is None else jax.vmap(self.plant.coordinates)(run.states)
 
     @staticmethod
     def _aim(reference: Any, length: int) -> Any:

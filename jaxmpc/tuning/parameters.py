@@ -102,7 +102,8 @@ class Parameter:
         if self.domain == "positive":
             return jnp.exp(theta)
         if self.domain == "interval":
-            return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(theta)
+            lower, upper = (jnp.asarray(end, raw.dtype) for end in (self.lower, self.upper))
+            return lower + (upper - lower) * jax.nn.sigmoid(theta)
         if self.domain == "diagonal":
             return jnp.diag(jnp.exp(theta))
         if self.domain == "definite":

@@ -42,8 +42,8 @@ class TuningRun:
         unsolved    share of plans that are not SOLVED, infeasible ones and others
         infeasible  share of plans proved infeasible
         fallback    share of plans that break soft rows
-        violation   share of loops that leave the controller's own limits by more than 1e-6
-                    (1e-3 in float32)
+        violation   share of loops that leave the limits of a ClosedLoopLoss (of another loss:
+                    the controller's own) by more than 1e-6 (1e-3 in float32)
         excluded    loops left out because their loss was not finite
 
     mode: "forward", "reverse" or "reverse, checkpointed". settings: what was asked, JSON data.
@@ -97,8 +97,9 @@ def tune_weights(
     make_mpc: Callable[[Mapping[str, Any]], Any], parameters: Parameters, plant: Any, x0s: Any,
     loss: Callable[[Run], Any] | None = None, steps: int = 50, *, reference: Any = None,
     input_reference: Any = None, variations: Mapping[str, Any] | None = None,
-    solver: ADMM = ADMM(), optimizer: optax.GradientTransformation | None = None,  # noqa: B008
-    updates: int = 100, batch: int | None = None, validation: Any = 0.25,
+    solver: ADMM = ADMM(iterations=50, refine=3),  # noqa: B008
+    optimizer: optax.GradientTransformation | None = None, updates: int = 100,
+    batch: int | None = None, validation: Any = 0.25,
     design_loss: Callable[[MPC], Any] | None = None, mode: str = "auto", seed: int = 0,
     checkpoint: str | Path | None = None, progress: bool = False,
 ) -> TuningRun:  # fmt: skip
@@ -249,7 +250,7 @@ Data = tuple[np.ndarray, dict[str, np.ndarray]]
 def split(data: Data, validation: Any) -> tuple[Data, Data]:
     """Initial states and variations for training and for validation."""
     x0s, variations = data
-    if np.ndim(validation) == 0 and not isinstance(validation, tuple):
+    if not isinstance(validation, tuple) and np.ndim(validation) == 0:
         if not 0 < validation < 1:
             fail("validation", f"{validation}", "Give a share in (0, 1), or initial states")
         count = max(1, round(validation * len(x0s)))
@@ -297,6 +298,9 @@ class Problem:
         design = jnp.zeros(())
         if self.design_loss is not None:
             design = jnp.asarray(self.design_loss(controller.mpc))
+        beyond = jnp.max(run.violation, axis=1)
+        if isinstance(self.loss, ClosedLoopLoss) and self.loss.limits is not None:
+            beyond = jax.vmap(self.loss.worst)(run)
         share = lambda v: jnp.mean(v.astype(float), axis=1)
         tolerance = 1e-6 if run.states.dtype == jnp.float64 else 1e-3
         aux = {
@@ -304,7 +308,7 @@ class Problem:
             "unsolved": share(run.status != Status.SOLVED),
             "infeasible": share(run.status == Status.PRIMAL_INFEASIBLE),
             "fallback": share(run.fallback),
-            "violation": jnp.max(run.violation, axis=1) > tolerance,
+            "violation": beyond > tolerance,
         }  # fmt: skip
         return total + design, aux
 
