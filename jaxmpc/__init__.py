@@ -42,6 +42,7 @@ from jaxmpc.tuning.feasibility import feasible_share, tune_feasible_set
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
 from jaxmpc.tuning.penalties import Penalties, learn_penalties, tune_penalties
+from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
 from jaxmpc.tuning.weights import TuningRun, tune_weights
 from jaxmpc.workflow import Design, OfflineReport, design, offline_report
 
@@ -121,6 +122,7 @@ __all__ = [
     "solve_stagewise",
     "tune_feasible_set",
     "tune_penalties",
+    "tune_sweep_penalties",
     "tune_weights",
     "verify_terminal",
 ]

@@ -25,7 +25,7 @@ _SHARES = (
     ("unsolved", "plans not solved", "#0072b2", "-"),
     ("infeasible", "plans proved infeasible", "#a50f15", "--"),
     ("fallback", "plans that break soft limits", "#e69f00", "-"),
-    ("violation", "loops beyond the controller's limits", "#006f52", ":"),
+    ("violation", "loops beyond the limits", "#006f52", ":"),
 )
 # Lines of a panel that get a name each; more are named by the groups they belong to.
 _NAMED = 10

@@ -120,6 +120,7 @@ def terminal_law(v) -> jm.MPC:
     return replace(MPC, terminal_set=ellipsoid, terminal_cost=cost)
 
 
+@pytest.mark.slow
 def test_tuning_grows_the_set_and_the_terminal_set_stays_invariant():
     run = tune_feasible_set(
         terminal_law, {"Qt": Parameter(MPC.Q, "diagonal")}, STATES[3:], 0.1, updates=6,

@@ -94,6 +94,7 @@ def test_bad_states_are_left_out_and_infeasible_ones_count(x64):
     )
 
 
+@pytest.mark.slow
 def test_design_loss_references_and_other_fields(x64):
     """A design loss alone is followed; references and limits are parameters like others."""
     parameters = {
