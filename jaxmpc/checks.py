@@ -21,6 +21,13 @@ def concrete(*values: Any) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
+def whole(argument: str, value: Any, least: int) -> int:
+    """The value as an int; raise unless it is a whole number of at least `least`."""
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
+        fail(argument, f"{value!r}", f"Give a whole number of at least {least}")
+    return int(value)
+
+
 def require_shape(argument: str, value: Any, shape: tuple[int, ...], cure: str) -> None:
     """Raise unless `value` has exactly this shape."""
     given = np.shape(value if concrete(value) else jnp.asarray(value))  # lists of traced numbers

@@ -184,7 +184,8 @@ def lyapunov_decrease(run: Run) -> Array:
     """V_N(x_{t+1}) − V_N(x_t) + l(x_t, u_t) along the loop, (T−1,), l the stage cost.
 
     Nowhere positive where the optimal value is a Lyapunov function: for the nominal plant, inputs
-    free at each step and no weight on their rates (which the stage cost here leaves out),
+    free at each step and no weights on their rates or of single stages (which the stage cost here
+    leaves out),
     references at an equilibrium, a terminal set that a law u = Kx keeps invariant inside the
     limits, and a terminal cost P ⪰ Q + K'RK + (A+BK)'P(A+BK) (Mayne, Rawlings, Rao & Scokaert
     2000, Automatica 36, section 3.3; the lesson's Theorem 3). Says nothing from

@@ -59,6 +59,7 @@ def test_sweep_writes_files_and_table(tmp_path, capsys):
     assert np.all(labels[beyond] == -1)
 
 
+@pytest.mark.slow
 def test_file_slice_and_overwrite(tmp_path, capsys):
     (tmp_path / "case.toml").write_text(
         """

@@ -18,6 +18,7 @@ CHEAP = jm.ADMM(iterations=400, refine=0)
 ONE_STEP = problems.scalar(a=2.0, horizon=1, x_max=5.0, u_max=1.0)
 
 
+@pytest.mark.slow
 def test_one_step_horizon_by_hand():
     """N = 1 without terminal cost: u = 0 is optimal, V(x) = x², and x doubles at each step."""
     with jax.enable_x64(True):

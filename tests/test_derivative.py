@@ -356,6 +356,7 @@ class TestOptimalValue:
 
 
 class TestSecondOrder:
+    @pytest.mark.slow
     def test_value(self, x64):
         """dV/dq = z, hence d²V/dq² = dz/dq, and V is concave in q."""
         qp, _, _ = everything(0)
@@ -462,7 +463,8 @@ class TestTransformations:
             error = np.abs(got - expected).reshape(64, -1).max(axis=1)
             assert (error <= 1e-3 * (scale + 1)).all(), (name, (error / (scale + 1)).max())
 
-    @pytest.mark.parametrize("build", ["solve", pytest.param("controller", marks=pytest.mark.slow)])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("build", ["solve", "controller"])
     def test_closed_loop(self, x64, build):
         """Cost of eight closed-loop steps, inputs at their limit in the first ones: gradient with
         respect to x0 and Q through `scan` against central differences."""

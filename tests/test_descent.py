@@ -89,6 +89,8 @@ def test_a_start_without_finite_loss_is_refused():
         descend(START, slope, lambda theta: (np.nan, {}), optax.sgd(0.1), 3)
     with pytest.raises(ValueError, match="updates"):
         bowl(-1)
+    with pytest.raises(ValueError, match="optimizer.*gradient alone"):
+        bowl(optimizer=optax.lbfgs())
 
 
 class Killed(BaseException):
@@ -140,9 +142,20 @@ def test_checkpoints_that_do_not_fit(tmp_path):
         bowl(3, checkpoint=path, settings={"problem": "other"})
     with pytest.raises(ValueError, match="another optimizer"):
         bowl(3, checkpoint=path, settings=SETTINGS, optimizer=optax.sgd(0.1))
-    path.write_bytes(b"nothing")
-    with pytest.raises(ValueError, match="is no checkpoint"):
-        bowl(3, checkpoint=path, settings=SETTINGS)
+    with pytest.raises(ValueError, match="another optimizer"):  # as many numbers, another step
+        bowl(3, checkpoint=path, settings=SETTINGS, optimizer=optax.adam(0.2))
+    with pytest.raises(ValueError, match=r"began with the validation loss 14, which is 28 now"):
+        other = lambda theta: (2 * distance(theta), {})
+        descend(START, slope, other, optax.adam(0.3), 3, checkpoint=path, settings=SETTINGS)
+    whole = path.read_bytes()
+    for damaged in (b"nothing", whole[: len(whole) // 2], b""):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match="is no checkpoint"):
+            bowl(3, checkpoint=path, settings=SETTINGS)
+    path.unlink()
+    (tmp_path / ".run.npz.left").write_bytes(b"by a killed process")
+    bowl(1, checkpoint=path, settings=SETTINGS)
+    assert [p.name for p in tmp_path.iterdir()] == ["run.npz"]
 
 
 CHILD = """
@@ -246,6 +259,7 @@ def test_masks_hold_entries():
         (lambda: Parameter(np.ones((2, 3)), "definite"), r"value.*\(2, 3\)"),
         (lambda: Parameter(1.0, "interval"), "lower, upper"),
         (lambda: Parameter(1.0, "interval", lower=0.0, upper=1.0), "inside the interval"),
+        (lambda: Parameter(1.0, "interval", lower=0.0, upper=np.inf), "upper.*infinity"),
         (lambda: Parameter(1.0, "interval", lower=[0.0, 0.0], upper=2.0), "lower.*shape"),
         (lambda: Parameter(1.0, lower=0.0, upper=1.0), "interval"),
         (lambda: Parameter([1.0, 2.0], train=[True]), "train"),

@@ -235,7 +235,9 @@ def hidden(blocks):
     return system, states, Polytope(np.vstack([V, -V]), np.full(2 * blocks, 2.0)), T
 
 
-@pytest.mark.parametrize("blocks", [2, 3, 6])
+@pytest.mark.parametrize(
+    "blocks", [pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow), 6]
+)
 def test_hidden_products(blocks):
     system, states, inputs, T = hidden(blocks)
     assert abs(np.linalg.det(T)) == pytest.approx(1)

@@ -43,6 +43,7 @@ def test_kernels_equal_the_scans(staged):
         close(*both(scan, kernels._recurrence_kernel, A, gx[:, 1:], gx[:, 0], adjoint=adjoint))
 
 
+@pytest.mark.slow
 def test_tracking_is_the_minimiser():
     """Gradient of Σ ½ x'Qx + ½ u'Ru − g·(x, u) along its own x, u: zero (float64, by autodiff)."""
     with jax.enable_x64(True):

@@ -86,6 +86,7 @@ def test_independent_solver_solves():
             independent.active_set(H, f, contradiction, np.array([-1.0, -1.0]))
 
 
+@pytest.mark.slow
 def test_section_7_and_9_closed_loops():
     """50 steps to 1 rad: jaxmpc, CVXPY + OSQP and an active-set solver press the same torques."""
     table = run("java_ejml_ojalgo")

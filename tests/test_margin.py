@@ -60,6 +60,7 @@ def test_soft_rows_do_not_count():
     assert margin(qp) == pytest.approx(1.0, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_random_rows_against_another_solver():
     rng = np.random.default_rng(0)
     A = rng.standard_normal((30, 12, 5))

@@ -351,7 +351,7 @@ def rounded() -> jm.MPC:
 
 PROBLEMS = {"rated": rated, "blocked": blocked, "rounded": rounded}
 # Each problem compiles for seconds.
-NAMES = ["rated", "blocked", pytest.param("rounded", marks=pytest.mark.slow)]
+NAMES = ["rated", *(pytest.param(name, marks=pytest.mark.slow) for name in ("blocked", "rounded"))]
 ACTIVE = {
     "rated": {"input", "state", "output", "rate", "soft", "terminal"},
     "blocked": {"input", "state", "soft", "terminal"},

@@ -13,7 +13,7 @@ def states():
     return jm.grid([-1.6, -2.1], [1.6, 2.1], (24, 24))
 
 
-@pytest.fixture(scope="module", params=["float32", "float64"])
+@pytest.fixture(scope="module", params=["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def plans(request, states):
     return jm.solve_many(problems.joint_o_inf(10), states, dtype=request.param, chunk=200)
 

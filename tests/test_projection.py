@@ -660,6 +660,7 @@ class TestSoftRows:
         np.testing.assert_allclose(sol.z, z, atol=1e-8)
         np.testing.assert_array_equal(sol.status, jm.Status.SOLVED)
 
+    @pytest.mark.slow
     def test_coarse_steps_are_honest(self, x64):
         """Three steps and no polish, cold and from the answer; wide and narrow tolerances."""
         qp, z, y = soft_batch()

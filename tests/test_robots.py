@@ -254,6 +254,7 @@ def test_frozen_linear_model_is_powers_of_one_step(name):
         assert_linear(at(powers), (A, B, c))
 
 
+@pytest.mark.slow
 def test_the_lessons_joint_is_exact():
     """[[1, T], [0, 1]], [[T²/J], [T/J]], a step of the plant to 1e-10."""
     joint = jm.load_robot("joint")
@@ -693,9 +694,8 @@ def test_what_cannot_be_held_is_named(pendulum):
         pendulum.equilibrium([[0.0], [1.0]])
 
 
-@pytest.mark.parametrize(
-    "integrator", ["Euler", pytest.param("implicitfast", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+@pytest.mark.slow
 def test_a_hovering_body_feels_its_rates(integrator):
     """At rest d(rotation)/d(rate) is one physics step, not 0: MJX's own integration of quaternions
     has the derivative 0 there, and hover would not be stabilizable."""

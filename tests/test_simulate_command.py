@@ -251,6 +251,7 @@ def test_outcome_and_picture_of_runs_made_by_hand(joint):
         plot_runs(run, joint, robots=[4])
 
 
+@pytest.mark.slow
 def test_runs_with_orientations_and_of_linear_plants(tmp_path):
     """A quadrotor has 13 numbers in its state, 12 coordinates and 4 inputs: 16 panels."""
     robot = jm.load_robot("quadrotor")

@@ -248,6 +248,7 @@ def test_rows_that_no_input_moves():
     np.testing.assert_allclose(plan.slack[0], [0.05, 0, 0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_warm_start_and_parts():
     mpc, system = problem(), varying()
     plan = solve_stagewise(mpc, system, X0, solver=SOLVER)

@@ -385,6 +385,7 @@ def test_projection_keeps_the_state_it_starts_from():
     assert np.isnan(starts[~feasible]).all()
 
 
+@pytest.mark.slow
 def test_undecided_points_are_labelled_by_the_facets_of_refine():
     mpc = problems.joint(6)
     fmap = jm.map_feasible_set(mpc, np.array([[1.49, 1.9], [0.0, 0.0]]))

@@ -52,7 +52,7 @@ def test_scalar_closed_forms(name):
     assert fmap.outer().support(np.ones(1)) == pytest.approx(radius, rel=1e-12)
 
 
-FAST = ("joint, terminal O_inf", "drifting")
+FAST = ("joint, terminal O_inf",)
 
 
 @pytest.fixture(

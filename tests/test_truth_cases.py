@@ -193,11 +193,14 @@ def hidden_product_12d():
 
 
 FAST = (
-    scalar_integrator, double_integrator, double_integrator_lqr, lecture_sets, lecture_penalty,
-    joint_sets, joint_lqr, joint_o_inf, hidden_product,
+    scalar_integrator, double_integrator, double_integrator_lqr, lecture_penalty, joint_lqr,
+    hidden_product,
 )  # fmt: skip
-# Recursion has fast tests of its own in test_recursion.py.
-SLOW = (joint_recursion, lecture_weaker, lecture_recursion, joint_needle, hidden_product_12d)
+# Recursion and sets have fast tests of their own.
+SLOW = (
+    joint_recursion, lecture_weaker, lecture_recursion, joint_needle, hidden_product_12d,
+    lecture_sets, joint_sets, joint_o_inf,
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(

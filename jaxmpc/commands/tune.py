@@ -352,7 +352,7 @@ class TuneWeights:
         refine = settings.refine if self.refine is None else self.refine
         solver = dataclasses.replace(settings, iterations=count, refine=refine)
         dtype = self.dtype or "float64"
-        x0s, dropped = self.starts(config, soften(hard, rho) if rho else hard)
+        x0s, dropped = self.starts(config, hard if rho is None else soften(hard, rho))
         steps = self.steps or 50
         if self.seconds is not None:
             steps = max(1, round(self.seconds / plant.dt))
@@ -698,7 +698,7 @@ def linear_family(
             mpc = dataclasses.replace(
                 mpc, states=states, terminal_set=states if box else mpc.terminal_set
             )
-        return soften(mpc, values.get("rho", rho)) if rho else mpc
+        return mpc if rho is None else soften(mpc, values.get("rho", rho))
 
     return make
 

@@ -32,7 +32,7 @@ from jaxmpc.qp.status import Status
 from jaxmpc.tuning.penalties import Penalties, learn_penalties
 from jaxmpc.tuning_plots import plot_penalties
 
-FILES = ("penalties.json", "penalties.png")
+FILES = ("penalties.json", TUNED, "penalties.png")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -263,7 +263,7 @@ class TunePenalties:
             f"  {'learning':<13} {seconds:.1f} s, compiler included",
             f"  {'safeguard':<13} {kept}",
             f"  {'files':<13} "
-            + " ".join(str(self.output / name) for name in (TUNED, *FILES, CHECKPOINT)),
+            + " ".join(str(self.output / name) for name in (*FILES, CHECKPOINT)),
         ])  # fmt: skip
 
 

@@ -135,6 +135,10 @@ def label_chunks(
         if np.shape(penalties.weight) != moving.lower.shape:
             shape = np.shape(penalties.weight)
             fail("penalties", f"weights {shape}", f"Learn them for this map: {moving.lower.shape}")
+        if not (np.all(np.isfinite(penalties.weight)) and np.all(penalties.weight > 0)):
+            fail("penalties", "hold a weight that is not positive", "Learn them again")
+        if not 0 < penalties.alpha < 2:
+            fail("penalties", f"alpha {penalties.alpha}", "Over-relaxation lies in (0, 2)")
         (quick, back), alpha = weighted(moving, penalties.weight), penalties.alpha
     region = np.abs(points[usable]).max(axis=0, initial=0.0)
     problem = proofs.problem(mpc, view, bounding_box(moving, region)[0])

@@ -112,7 +112,8 @@ def rows(mpc: MPC, view: View) -> Rows:
 @dataclass(frozen=True)
 class RungPenalties:
     """Of the first rung: weight (R,) of the rows of `Rows`, the root of ADMM's rho, and its
-    over-relaxation. A label does not depend on them, only which rung finds it."""
+    over-relaxation. No proof depends on them: they decide which points the rung decides, and what
+    the next rungs start from."""
 
     weight: np.ndarray
     alpha: float = ALPHA

@@ -6,8 +6,6 @@ lead to numbers which are not finite taken back and halved, and everything on di
 
 import hashlib
 import json
-import os
-import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -19,7 +17,8 @@ import numpy as np
 import optax
 from tqdm.std import tqdm
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, whole
+from jaxmpc.tuning import archive
 
 # (loss, numbers to record) and (loss, gradient, numbers to record).
 Validate = Callable[[Any], tuple[float, Mapping[str, float]]]
@@ -86,14 +85,18 @@ def descend(
     the run, kept in it. Raises ValueError for a checkpoint of other settings, and where θ_0 itself
     has no finite validation loss.
     """
-    if not isinstance(updates, int | np.integer) or isinstance(updates, bool) or updates < 0:
-        fail("updates", f"{updates!r}", "Give a whole number of steps")
+    whole("updates", updates, 0)
     theta = jax.tree.map(lambda v: np.asarray(v, np.float64), theta)
     path = None if checkpoint is None else Path(checkpoint)
     state = State(theta, None, thetas=[theta])
     mark = _fingerprint(settings, theta)
+    _try(optimizer, theta)
     if path is not None and path.exists():
         state = _load(path, theta, optimizer, mark)
+        first, now = state.checks[0]["loss"], _checked(validate, theta)["loss"]
+        if not np.isclose(now, first, rtol=1e-4, atol=0):
+            problem = f"began with the validation loss {first:.9g}, which is {now:.9g} now"
+            fail(str(path), problem, "Give it the same data, loss, plant and solver, or remove it")
     if not state.checks:
         begun = time.perf_counter()
         state.checks.append(_checked(validate, theta))
@@ -116,13 +119,22 @@ def descend(
     return _record(state)
 
 
+def _try(optimizer: optax.GradientTransformation, theta: Any) -> None:
+    """Raise ValueError for an optimiser that asks for more than a gradient."""
+    zeros = jax.tree.map(np.zeros_like, theta)
+    try:
+        jax.eval_shape(lambda g: optimizer.update(g, optimizer.init(g), g)[0], zeros)
+    except (TypeError, AttributeError) as error:
+        fail("optimizer", f"does not take a gradient alone ({error})", "Such as optax.adam(0.05)")
+
+
 def _step(state: State, gradient: Gradient, optimizer: optax.GradientTransformation) -> None:
     """One step forward, or one back and half of it again."""
     loss, slope, numbers = gradient(state.theta, len(state.rows))
     slope = jax.tree.map(lambda v: np.asarray(v, np.float64), slope)
     norm = float(np.sqrt(sum(np.sum(v**2) for v in jax.tree.leaves(slope))))
     accepted = bool(np.isfinite(loss) and np.isfinite(norm))
-    row = {"loss": float(loss), "gradient_norm": norm, "accepted": accepted, "share": state.share}
+    row = {"loss": float(loss), "gradient_norm": norm, "accepted": accepted}
     state.rows.append({**row, **{name: float(value) for name, value in numbers.items()}})
     with jax.enable_x64(True):  # the optimiser's own numbers, like θ
         if accepted:
@@ -138,11 +150,15 @@ def _step(state: State, gradient: Gradient, optimizer: optax.GradientTransformat
             return
         else:
             state.share /= 2
-        good, slope, before = state.good
-        moves, _ = optimizer.update(slope, before, good)
-    state.theta = jax.tree.map(
-        lambda v, move: v + state.share * np.asarray(move, np.float64), good, moves
-    )
+    state.theta = _moved(state.good, state.share, optimizer)
+
+
+def _moved(good: tuple[Any, Any, Any], share: float, optimizer: Any) -> Any:
+    """θ after this share of the optimiser's step."""
+    theta, slope, before = good
+    with jax.enable_x64(True):
+        moves, _ = optimizer.update(slope, before, theta)
+    return jax.tree.map(lambda v, move: v + share * np.asarray(move, np.float64), theta, moves)
 
 
 def _checked(validate: Validate, theta: Any) -> dict[str, float]:
@@ -179,7 +195,7 @@ def _fingerprint(settings: Any, theta: Any) -> str:
 
 
 def _save(path: Path | None, state: State, mark: str, settings: Any) -> None:
-    """Write to a side file, then rename: a reader sees the old state or the new one."""
+    """The state as it is."""
     if path is None:
         return
     leaves: dict[str, Any] = {
@@ -191,25 +207,15 @@ def _save(path: Path | None, state: State, mark: str, settings: Any) -> None:
         "fingerprint": mark, "settings": settings, "share": state.share, "seconds": state.seconds,
         "rows": state.rows, "checks": state.checks, "moved": state.good is not None,
     }  # fmt: skip
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, side = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, record=np.array(json.dumps(plain)), **leaves)
-        os.replace(side, path)
-    except BaseException:
-        Path(side).unlink(missing_ok=True)
-        raise
+    archive.write(path, plain, **leaves)
 
 
 def _load(path: Path, theta: Any, optimizer: optax.GradientTransformation, mark: str) -> State:
     """The state of a run that was cut off. ValueError where the file is none of this run's."""
-    try:
-        with np.load(path) as data:
-            arrays = {name: data[name] for name in data.files}
-        plain = json.loads(str(arrays.pop("record")))
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        fail(str(path), f"is no checkpoint ({error})", "Choose another file, or remove it")
+    kept = archive.read(path)
+    if kept is None or "fingerprint" not in kept[0]:
+        fail(str(path), "is no checkpoint", "Choose another file, or remove it")
+    plain, arrays = kept
     if plain["fingerprint"] != mark:
         fail(str(path), "holds a run of other settings", "Choose another file, or remove it")
 
@@ -224,8 +230,14 @@ def _load(path: Path, theta: Any, optimizer: optax.GradientTransformation, mark:
     if plain["moved"]:
         with jax.enable_x64(True):
             good = restored((theta, theta, optimizer.init(theta)), "good")
-    return State(
+    state = State(
         restored(theta, "theta_0"), good,
         thetas=[jax.tree.map(lambda v, t=t: v[t], every) for t in range(count)],
         **{name: plain[name] for name in ("share", "seconds", "rows", "checks")},
     )  # fmt: skip
+    if good is not None:  # the step that was taken is the one that this optimiser takes
+        again = _moved(good, state.share, optimizer)
+        close = lambda a, b: np.allclose(a, b, rtol=1e-6, atol=1e-9)
+        if not all(map(close, *map(jax.tree.leaves, (again, state.theta)))):
+            fail(str(path), "holds the state of another optimizer", "Give the one it began with")
+    return state

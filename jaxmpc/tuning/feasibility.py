@@ -24,7 +24,7 @@ import optax
 from jax import Array
 from jax.scipy.linalg import cho_solve
 
-from jaxmpc.checks import concrete, fail, require_shape
+from jaxmpc.checks import concrete, fail, require_shape, whole
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
@@ -70,6 +70,10 @@ def membership(
     the feasible set. It is a number to climb, no proof: that is `map_feasible_set`. In the type
     of the problem's arrays; float64 is advised. Raises ValueError for wrong shapes.
     """
+    if mpc.soft and mpc.states is None and mpc.terminal_set is None and not mpc.outputs:
+        fail(
+            "mpc", "has only soft limits of its states", "Give the hard problem, or jm.harden(mpc)"
+        )
     mpc = replace(mpc, soft=(), input_rate_weight=None)  # no part in what is feasible
     mpc.validate()
     x0s, width = arrays((x0s, width))
@@ -185,10 +189,12 @@ def tune_feasible_set(
     x0s = np.asarray(x0s, np.float64)
     if x0s.ndim != 2 or not len(x0s):
         fail("x0s", f"shape {x0s.shape}", "Give states (B, n), one a row")
-    if batch is not None and batch < 1:
-        fail("batch", f"{batch}", "Give a count of at least 1")
+    batch = len(x0s) if batch is None else whole("batch", batch, 1)
+    updates, seed = whole("updates", updates, 0), whole("seed", seed, 0)
+    # A grid is in order, and validation takes the last.
+    x0s = np.random.default_rng(seed).permutation(x0s)
     (train, _), (test, _) = split((x0s, {}), validation)
-    size = len(train) if batch is None else min(batch, len(train))
+    size = min(batch, len(train))
     start = raw(parameters)
     initial = {name: np.asarray(p.value) for name, p in parameters.items()}
 
@@ -215,10 +221,7 @@ def tune_feasible_set(
         return float(loss), numbers
 
     settings = {
-        "parameters": {
-            name: {"domain": p.domain, "trained": int(p.train.sum()), "value": p.value.tolist()}
-            for name, p in parameters.items()
-        },
+        "parameters": {name: p.record() for name, p in parameters.items()},
         "width": float(width), "batch": size, "train": len(train), "validation": len(test),
         "steps": steps, "seed": seed, "data": digest((train, test)), "dtype": "float64",
     }  # fmt: skip

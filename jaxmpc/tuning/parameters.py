@@ -34,7 +34,8 @@ class Parameter:
     its diagonal (n,). domain: see above. lower, upper: ends of an "interval", numbers or arrays of
     the value's shape. train: True, False, or a mask of the shape of what is free: of value itself,
     of the diagonal (n,) for "diagonal", of L (n, n) for "definite" (its upper triangle does not
-    count). Entries not trained keep their value. Raises ValueError for values outside the domain.
+    count). Entries not trained keep their value, but for rounding. Raises ValueError for values
+    outside the domain.
     """
 
     value: Any
@@ -64,6 +65,7 @@ class Parameter:
         if self.domain == "interval":
             for name in ("lower", "upper"):
                 end = np.asarray(getattr(self, name), np.float64)
+                require_finite(name, end)
                 if end.shape not in ((), value.shape):
                     fail(name, f"shape {end.shape}", f"Give a number or shape {value.shape}")
                 object.__setattr__(self, name, end)
@@ -90,6 +92,16 @@ class Parameter:
             L = np.linalg.cholesky((value + value.T) / 2)
             return np.tril(L, -1) + np.diag(np.log(np.diag(L)))
         return value
+
+    def record(self) -> dict[str, Any]:
+        """What decides the map from θ, as JSON data."""
+        ends = [
+            None if end is None else np.asarray(end).tolist() for end in (self.lower, self.upper)
+        ]
+        return {
+            "domain": self.domain, "value": self.value.tolist(), "train": self.train.tolist(),
+            "ends": ends,
+        }  # fmt: skip
 
     def raw(self) -> np.ndarray:
         """θ of the entries that are trained, (k,)."""

@@ -14,10 +14,7 @@ iteration are the solutions: a bad rho costs steps, it cannot make an answer wro
 
 import hashlib
 import json
-import os
-import tempfile
 import warnings
-import zipfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +25,7 @@ import numpy as np
 import optax
 from jax import Array
 
-from jaxmpc.checks import fail, require_finite
+from jaxmpc.checks import fail, require_finite, whole
 from jaxmpc.compiled import padded
 from jaxmpc.mpc.condense import Condensed, condense, in_float64
 from jaxmpc.mpc.problem import MPC, Plan
@@ -36,6 +33,7 @@ from jaxmpc.qp.admm import ADMM, factor, iterate, read, scaled
 from jaxmpc.qp.problem import QP, residual_terms
 from jaxmpc.qp.solve import solve_factored, start, unscaled
 from jaxmpc.qp.status import Status
+from jaxmpc.tuning import archive
 from jaxmpc.tuning.descent import Descent, descend
 
 # Of the algorithm: what an older one cached is learned anew.
@@ -79,6 +77,11 @@ class Penalties:
     history: Descent | None = field(default=None, repr=False)
 
     @property
+    def knots(self) -> int:
+        """Values of a group along the horizon."""
+        return min(KNOTS, self.horizon + 1)
+
+    @property
     def improved(self) -> bool:
         """Whether `solver` is better than what was given."""
         return better((self.solved, self.residual), (self.solved_before, self.residual_before))
@@ -101,16 +104,21 @@ class Penalties:
             kinds = lambda blocks: [(kind, size) for kind, _, size in blocks]
             if kinds(c.layout) != kinds(self.blocks) or len(c.balls) != len(self.balls):
                 fail("mpc", f"blocks {kinds(c.layout)}", f"Needed: {kinds(self.blocks)}")
-            rho = np.exp(self.log_rho @ spread(self.groups, c.layout, mpc.horizon, c.balls).T)
+            W = spread(self.groups, c.layout, mpc.horizon, c.balls, self.knots)
+            if W.shape[1] != self.log_rho.shape[1]:
+                fail("mpc", "has blocks of one step, or more where one was", "Learn for it")
+            rho = np.exp(self.log_rho @ W.T)
         solver = replace(self.solver, iterations=count, rho=rho)
         solver.validate(rho.shape[-1] if rho.ndim else 1)
         return solver
 
 
-def spread(groups: str, blocks: Blocks, horizon: int, balls: tuple[int, ...] = ()) -> np.ndarray:
+def spread(
+    groups: str, blocks: Blocks, horizon: int, balls: tuple[int, ...] = (), knots: int = KNOTS
+) -> np.ndarray:
     """W (rows, parameters): log rho = W θ.
 
-    "row": one parameter a row. "step": for each row of a block KNOTS values at k/N in [0, 1],
+    "row": one parameter a row. "step": for each row of a block `knots` values at k/N in [0, 1],
     linear between them; one value where a block has one step. The rows of a ball share theirs,
     since it stays a ball only so.
     """
@@ -122,10 +130,8 @@ def spread(groups: str, blocks: Blocks, horizon: int, balls: tuple[int, ...] = (
         elif len(steps) == 1:
             along = np.ones((1, 1))
         else:
-            knots = np.linspace(0, 1, min(KNOTS, horizon + 1))
-            hats = np.eye(len(knots))
-            at = np.array(steps) / horizon
-            along = np.stack([np.interp(at, knots, hat) for hat in hats], axis=1)
+            ends, at = np.linspace(0, 1, knots), np.array(steps) / horizon
+            along = np.stack([np.interp(at, ends, hat) for hat in np.eye(knots)], axis=1)
         columns.append(np.kron(along, np.ones((size, 1)) if ball else np.eye(size)))
     rows, parameters = (sum(part.shape[k] for part in columns) for k in (0, 1))
     W, row, column = np.zeros((rows, parameters)), 0, 0
@@ -273,9 +279,11 @@ def learn_penalties(
     if cache is not None and optimizer is not None:
         fail("cache", "given beside an optimiser, which has no fingerprint", "Leave one out")
     plain = {
-        "version": VERSION, "iterations": iterations, "stages": stages, "groups": groups,
-        "updates": updates, "batch": batch, "seed": seed,
+        "version": VERSION, "iterations": int(iterations), "stages": int(stages), "groups": groups,
+        "batch": int(batch), "seed": int(seed),
     }  # fmt: skip
+    if optimizer is None:  # they decide its schedule; with another one a run may be made longer
+        plain["updates"] = int(updates)
     given = replace(solver, iterations=iterations)
     mark = fingerprint(plain, setting, samples, apart, given.rho, given.alpha)
     path = None if cache is None else Path(cache) / f"{mark}.npz"
@@ -334,15 +342,9 @@ def warned(found: Penalties) -> Penalties:
     if not found.improved:
         warnings.warn(
             "tune_penalties: nothing found is better on the validation states than the solver "
-            f"given ({found.solved:.1%} solved); that one is returned", UserWarning, stacklevel=4,
+            f"given ({found.solved:.1%} solved); that one is returned", UserWarning, stacklevel=3,
         )  # fmt: skip
     return found
-
-
-def whole(name: str, value: Any, least: int) -> None:
-    """Raise unless `value` is a whole number of at least `least`."""
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-        fail(name, f"{value!r}", f"Give a whole number of at least {least}")
 
 
 def prepared(
@@ -411,7 +413,7 @@ def prepared(
         apart = Samples(states("validation", validation))
         if not len(apart):
             fail("validation", "no states", "Give some, or a share in (0, 1)")
-    W = spread(groups, c.layout, steps, c.balls)
+    W = spread(groups, c.layout, steps, c.balls, min(KNOTS, steps + 1))
     plain = replace(
         solver, iterations=int(iterations), rho=1.0, alpha=1.6, refine=0, differentiate="unrolled"
     )
@@ -504,12 +506,14 @@ NUMBERS = ("solved", "residual", "solved_before", "residual_before", "infeasible
 def save(path: Path, found: Penalties) -> None:
     """Keep what was learned."""
     plain = {name: getattr(found, name) for name in (*NUMBERS, "groups", "horizon", "balls")}
-    write(path, {**plain, "blocks": found.blocks, "alpha": found.alpha}, log_rho=found.log_rho)
+    archive.write(
+        path, {**plain, "blocks": found.blocks, "alpha": found.alpha}, log_rho=found.log_rho
+    )
 
 
 def load(path: Path, given: ADMM, W: np.ndarray) -> Penalties | None:
     """What `save` wrote; None where there is nothing, or nothing whole."""
-    kept = reread(path)
+    kept = archive.read(path)
     if kept is None:
         return None
     try:
@@ -522,26 +526,3 @@ def load(path: Path, given: ADMM, W: np.ndarray) -> Penalties | None:
     except (ValueError, KeyError, TypeError):
         return None
     return replace(found, solver=solver) if found.improved else found
-
-
-def write(path: Path, plain: dict[str, Any], **arrays: Any) -> None:
-    """Write to a side file, then rename: a reader sees nothing or all of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, side = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, record=np.array(json.dumps(plain)), **arrays)
-        os.replace(side, path)
-    except BaseException:
-        Path(side).unlink(missing_ok=True)
-        raise
-
-
-def reread(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
-    """What `write` wrote; None where there is nothing, or nothing whole."""
-    try:
-        with open(path, "rb") as file, np.load(file) as data:
-            arrays = {name: data[name] for name in data.files}
-        return json.loads(str(arrays.pop("record"))), arrays
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        return None

@@ -22,7 +22,7 @@ import optax
 from jax import Array
 from jax.scipy.linalg import cho_solve
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, whole
 from jaxmpc.compiled import default_chunk, padded, require_step_type
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.precision import matmul
@@ -40,8 +40,9 @@ from jaxmpc.sweeps.ladder import (
     weighted,
 )
 from jaxmpc.sweeps.proofs import hard_part, make_view
+from jaxmpc.tuning import archive
 from jaxmpc.tuning.descent import descend
-from jaxmpc.tuning.penalties import fingerprint, reread, whole, write
+from jaxmpc.tuning.penalties import fingerprint
 
 VERSION = 1
 # In normalised rows; iterates in float32 end near 1e-5.
@@ -79,8 +80,8 @@ def tune_sweep_penalties(
     if points.ndim != 2 or points.shape[1] != len(view.axes):
         fail("x0s", f"shape {points.shape}", f"Give points (B, {len(view.axes)})")
     points = points[np.all(np.isfinite(points), axis=1)]
-    for name, value in {"iterations": iterations, "batch": batch, "updates": updates}.items():
-        whole(name, value, 2 if name == "iterations" else 1)
+    iterations, batch = whole("iterations", iterations, 2), whole("batch", batch, 1)
+    updates, seed = whole("updates", updates, 1), whole("seed", seed, 0)
     require_step_type(dtype)
     if len(points) < FEWEST:
         fail("x0s", f"{len(points)} finite points", f"Learning needs at least {FEWEST}")
@@ -234,12 +235,12 @@ def save(path: Path, found: SweepPenalties) -> None:
     p = found.penalties
     plain = {"decided": found.decided, "decided_before": found.decided_before}
     arrays = {} if p is None else {"weight": p.weight, "alpha": p.alpha}
-    write(path, plain, **arrays)
+    archive.write(path, plain, **arrays)
 
 
 def load(path: Path, count: int) -> SweepPenalties | None:
     """What `save` wrote; None where there is nothing, or nothing whole."""
-    kept = reread(path)
+    kept = archive.read(path)
     if kept is None:
         return None
     try:

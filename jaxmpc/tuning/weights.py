@@ -15,10 +15,11 @@ import optax
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, whole
 from jaxmpc.closed_loop import Run, Steps, loops, memory, needed, require_variations
 from jaxmpc.compiled import Compiled
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.soften import harden
 from jaxmpc.mpc.solve import Controller
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.precision import arrays
@@ -130,7 +131,9 @@ def tune_weights(
         mode: "forward" (cost grows with the number of parameters, memory does not), "reverse"
             (the other way round; samples are computed twice where memory asks for it), "auto":
             both are timed on the first step's data where there are at most 32 parameters.
-        checkpoint: as in `descend`.
+        checkpoint: file that is replaced after every step (`descend`); where it is present the
+            run goes on from there. It must be of the same run: parameters and data are compared,
+            and the loss at the start is computed again.
 
     Raises ValueError for what does not fit together, before any compile.
     """
@@ -142,19 +145,23 @@ def tune_weights(
     require_variations(plant, variations, len(x0s))
     if mode not in MODES:
         fail("mode", f"{mode!r}", f"Give one of {', '.join(MODES)}")
-    if batch is not None and batch < 1:
-        fail("batch", f"{batch}", "Give a count of at least 1")
+    batch = len(x0s) if batch is None else whole("batch", batch, 1)
+    steps, updates = whole("steps", steps, 1), whole("updates", updates, 0)
+    seed = whole("seed", seed, 0)
     train, test = split((x0s, variations), validation)
     require_variations(plant, test[1], len(test[0]))
-    size = len(train[0]) if batch is None else min(batch, len(train[0]))
+    size = min(batch, len(train[0]))
     start = raw(parameters)
     initial = {name: np.asarray(p.value) for name, p in parameters.items()}
     controller = controller_of(make_mpc, initial, solver)
     if loss is None:
         mpc = controller.mpc
         r, s = (aim(initial) if callable(aim) else aim for aim in (reference, input_reference))
+        limits = controller.limits
+        if limits is None and mpc.soft:
+            limits = harden(mpc).states
         loss = ClosedLoopLoss(
-            np.asarray(mpc.Q), np.asarray(mpc.R), r, s, controller.limits,
+            np.asarray(mpc.Q), np.asarray(mpc.R), r, s, limits,
             plant=plant if hasattr(plant, "coordinates") else None,
         )  # fmt: skip
     problem = Problem(
@@ -163,11 +170,8 @@ def tune_weights(
     )  # fmt: skip
     problem.check(start, train)
     settings = {
-        "parameters": {
-            name: {"domain": p.domain, "trained": int(p.train.sum()), "value": p.value.tolist()}
-            for name, p in parameters.items()
-        },
-        "steps": int(steps), "batch": size, "train": len(train[0]), "validation": len(test[0]),
+        "parameters": {name: p.record() for name, p in parameters.items()},
+        "steps": steps, "batch": size, "train": len(train[0]), "validation": len(test[0]),
         "seed": seed, "data": digest((train, test)), "dtype": np.dtype(controller.dtype).name,
     }  # fmt: skip
 
@@ -178,13 +182,15 @@ def tune_weights(
         chosen = np.random.default_rng([seed, step]).choice(len(train[0]), size, replace=False)
         return jax.tree.map(lambda v: v[chosen], train)
 
-    chosen, slope = problem.gradient(start, data(0), mode)
+    slopes_by: list[tuple[str, Callable]] = []  # the mode chosen, once a step is asked for
     evaluate = Compiled(jax.jit(problem.total))
     sound: list[np.ndarray] = []  # of the validation loops, those finite at the start
 
     def gradient(theta: Any, step: int) -> tuple[float, Any, dict[str, float]]:
         x, varied = data(step)
-        weights = np.ones(len(x))
+        if not slopes_by:
+            slopes_by.append(problem.gradient(start, data(0), mode))
+        slope, weights = slopes_by[0][1], np.ones(len(x))
         value, slopes, aux = slope(theta, x, varied, weights)
         finite = np.isfinite(value) and all(np.all(np.isfinite(v)) for v in jax.tree.leaves(slopes))
         bad = ~np.isfinite(aux["losses"])
@@ -208,7 +214,8 @@ def tune_weights(
         start, gradient, validate, optax.adam(0.05) if optimizer is None else optimizer, updates,
         checkpoint=checkpoint, settings=settings, progress=progress,
     )  # fmt: skip
-    best = {n: np.asarray(v) for n, v in exact_values(parameters, history.theta).items()}
+    best = exact_values(parameters, history.theta)
+    chosen = slopes_by[0][0] if slopes_by else mode
     return TuningRun(best, initial, history, chosen, settings, parameters, make_mpc, solver)
 
 
