@@ -351,10 +351,14 @@ class Problem:
             tried["forward"] = Compiled(jax.jit(forward))
         if mode != "forward":
             name, plain = "reverse", Compiled(jax.jit(reverse))
-            if needed(plain.program(*arguments)) > 0.5 * memory():
-                name = "reverse, checkpointed"
-                plain = Compiled(jax.jit(partial(reverse, checkpoint=True)))
-            tried[name] = plain
+            try:
+                if needed(plain.program(*arguments)) > 0.5 * memory():
+                    name = "reverse, checkpointed"
+                    plain = Compiled(jax.jit(partial(reverse, checkpoint=True)))
+                tried[name] = plain
+            except ValueError:  # a plant with a loop that JAX cannot transpose
+                if not tried:
+                    raise
         name = next(iter(tried))
         if len(tried) > 1:
             name = min(tried, key=lambda name: seconds(tried[name], arguments))
