@@ -372,6 +372,7 @@ class TestIndexSet:
 
 
 class TestManyStates:
+    @pytest.mark.slow
     def test_vmap(self):
         mpc = problems.lecture()
         x0s = np.random.default_rng(0).uniform(-1, 1, (40, 2))

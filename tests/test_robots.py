@@ -457,6 +457,7 @@ def test_payload_on_an_arm_in_space():
 # --- derivatives -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_reverse_mode_through_an_active_stop():
     """A control period in the stop: reverse mode = finite differences through the C engine, in x,
     u and the mass."""

@@ -193,13 +193,12 @@ def hidden_product_12d():
 
 
 FAST = (
-    scalar_integrator, double_integrator, double_integrator_lqr, lecture_penalty, joint_lqr,
-    hidden_product,
+    double_integrator, double_integrator_lqr, lecture_penalty, joint_lqr, hidden_product,
 )  # fmt: skip
 # Recursion and sets have fast tests of their own.
 SLOW = (
     joint_recursion, lecture_weaker, lecture_recursion, joint_needle, hidden_product_12d,
-    lecture_sets, joint_sets, joint_o_inf,
+    lecture_sets, joint_sets, joint_o_inf, scalar_integrator,
 )  # fmt: skip
 
 

@@ -118,6 +118,23 @@ def test_design_loss_references_and_other_fields(x64):
     assert found.values["goal"][1] == 0.0
 
 
+class Looping:
+    """The same plant, by a loop that reverse mode cannot go through."""
+
+    def step(self, x, u):
+        once = lambda carry: (carry[0] + 1, SYSTEM.A @ carry[1] + SYSTEM.B @ u)
+        return jax.lax.while_loop(lambda carry: carry[0] < 1, once, (0, x))[1]
+
+
+@pytest.mark.slow
+def test_auto_goes_forward_where_it_must(x64):
+    settings = {"steps": 4, "solver": SOLVER, "updates": 1}
+    found = tune_weights(weighed, PARAMETERS, Looping(), starts(8), LOSS, **settings)
+    assert found.mode == "forward" and found.history.accepted.all()
+    with pytest.raises(ValueError, match="while_loop"):
+        tune_weights(weighed, PARAMETERS, Looping(), starts(8), LOSS, mode="reverse", **settings)
+
+
 @pytest.mark.slow
 def test_derivatives_of_100_random_problems(x64):
     """Every entry of Q, R, the soft penalty and ADMM's rho against central differences, to 1e-4."""
