@@ -203,7 +203,7 @@ class Config:
         )
         states = self._states()
         if isinstance(states, Box) and limits.margin:
-            states = tightened(states, limits.margin)
+            states = states.tightened(limits.margin)
         inputs = Box(np.asarray(limits.u_min), np.asarray(limits.u_max))
         Q, R = _matrix(cost.Q), _matrix(cost.R)
         terminal_cost: Any = Q if cost.P == "Q" else None
@@ -463,14 +463,6 @@ def to_toml(document: Mapping[str, Any]) -> str:
     line = lambda found: f"[{' '.join(part.strip() for part in found[1].splitlines())}]"
     # What holds a bracket of its own, a matrix or a name with one, stays as it is.
     return re.sub(r"\[\n([^\[\]]+?),?\n *\]", line, text)
-
-
-def tightened(limits: Box, share: Any) -> Box:
-    """The limits moved inwards by a share of their half-width on each side, where there are two.
-    Traceable in `share`."""
-    lower, upper = np.asarray(limits.lower, float), np.asarray(limits.upper, float)
-    half = np.where(np.isfinite(upper - lower), upper - lower, 0.0) / 2
-    return Box(lower + share * half, upper - share * half)
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)

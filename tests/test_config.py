@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from jaxmpc.config import Config, load, load_robot_config, tightened
+from jaxmpc.config import Config, load, load_robot_config
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
@@ -229,7 +229,7 @@ def test_margin_terminal_set_and_solver_become_what_they_say(write):
     np.testing.assert_allclose([mpc.states.lower, mpc.states.upper], [[-3, -5], [13, np.inf]])
     assert mpc.terminal_set is mpc.states
     np.testing.assert_array_equal(config.state_limits().lower, [-5, -5])
-    box = tightened(Box(np.array([-1.0]), np.array([3.0])), 0.5)
+    box = Box(np.array([-1.0]), np.array([3.0])).tightened(0.5)
     np.testing.assert_array_equal([box.lower, box.upper], [[0.0], [2.0]])
 
     path = write("horizon = 3", "horizon = 3\nP_f = [[2.0, 0.0], [0.0, 1.0]]\nlevel_f = 0.3")

@@ -2,6 +2,8 @@
 
 import contextlib
 import hashlib
+import json
+import os
 import sys
 import tempfile
 from importlib.metadata import PackageNotFoundError, version
@@ -54,6 +56,13 @@ def versions() -> dict[str, str]:
         with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
     return found
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Write a file that is there as a whole or not at all."""
+    side = path.with_name(f".{path.name}.partial")
+    side.write_text(json.dumps(document, indent=2) + "\n")
+    os.replace(side, path)
 
 
 def model_hash(robot: Robot) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from tqdm.std import tqdm
 
 from jaxmpc.checks import fail
-from jaxmpc.commands.options import model_hash, open_folder, versions
+from jaxmpc.commands.options import model_hash, open_folder, versions, write_json
 from jaxmpc.control.invariant import maximal_invariant_set
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Polytope
@@ -166,7 +166,7 @@ class RobotJob:
             )
         folder.mkdir(exist_ok=True)
         if not said.exists():
-            _write(said, json.dumps(config, indent=2).encode())
+            write_json(said, config)
         there = json.loads(said.read_text())
         if there != json.loads(json.dumps(config)):
             keys = [key for key in {**there, **config} if there.get(key) != config.get(key)]
@@ -239,7 +239,7 @@ class RobotJob:
             summary["linear"]["recursion"] = {
                 name: str(getattr(report, name)) for name in ("strong", "law", "weak")
             } | {"counts": report.counts()}
-        _write(self.output / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
+        write_json(self.output / "summary.json", summary)
         if rmap.points.shape[1] != 2:
             return ["summary.json", "robot_map.npz"]
         figure = plot_robot_map(rmap).get_figure(root=True)
@@ -301,11 +301,4 @@ def _save(path: Path, arrays: dict[str, Any]) -> None:
     """Write an .npz that is there as a whole or not at all."""
     partial = path.with_name(f".{path.name}.partial.npz")
     np.savez_compressed(partial, **arrays)
-    os.replace(partial, path)
-
-
-def _write(path: Path, data: bytes) -> None:
-    """The same for any file."""
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_bytes(data)
     os.replace(partial, path)

@@ -25,6 +25,7 @@ from jaxmpc.commands.options import (
     option,
     report_error,
     versions,
+    write_json,
 )
 from jaxmpc.commands.robot_map import refused
 from jaxmpc.commands.simulate import Simulate, plant_numbers
@@ -34,8 +35,8 @@ from jaxmpc.commands.tuning import (
     feasible_states,
     open_run,
     optimizer_of,
+    problem_file,
     start_range,
-    write_json,
 )
 from jaxmpc.compiled import Compiled
 from jaxmpc.control.riccati import lqr
@@ -302,15 +303,7 @@ class TuneWeights:
 
     def linear(self) -> "Problem":
         """The problem of a file."""
-        overrides = {
-            key: getattr(self, key)
-            for key in ("horizon", "terminal")
-            if getattr(self, key) is not None
-        }
-        if self.config is None:
-            config = configs.Config.default(overrides, "tune")
-        else:
-            config = configs.load(self.config, overrides, "tune")
+        config = problem_file(self)
         margin = config.limits.margin if self.margin is None else self.margin
         if "tightening" in self.tune and self.margin is None and not margin:
             margin = 0.02
@@ -446,7 +439,7 @@ class TuneWeights:
             changed = dataclasses.replace(mpc, Q=values.get("Q", Q), R=values.get("R", R))
             changed = dataclasses.replace(changed, terminal_cost=follower(changed, values, follow))
             if "tightening" in values:
-                states = configs.tightened(robot.state_limits, values["tightening"])
+                states = robot.state_limits.tightened(values["tightening"])
                 changed = dataclasses.replace(changed, states=states)
             return controller(changed, values.get("rho", rho), said.linearize)
 
@@ -694,7 +687,7 @@ def linear_family(
         mpc = dataclasses.replace(base, Q=values.get("Q", hard.Q), R=values.get("R", hard.R))
         mpc = dataclasses.replace(mpc, terminal_cost=follower(mpc, values, follow))
         if "tightening" in values:
-            states = configs.tightened(limits, values["tightening"])
+            states = limits.tightened(values["tightening"])
             mpc = dataclasses.replace(
                 mpc, states=states, terminal_set=states if box else mpc.terminal_set
             )

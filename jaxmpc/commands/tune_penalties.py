@@ -15,15 +15,22 @@ import tyro
 
 from jaxmpc import config as configs
 from jaxmpc.checks import fail
-from jaxmpc.commands.options import Horizon, Terminal, option, report_error, versions
+from jaxmpc.commands.options import (
+    Horizon,
+    Terminal,
+    option,
+    report_error,
+    versions,
+    write_json,
+)
 from jaxmpc.commands.tuning import (
     CHECKPOINT,
     TUNED,
     feasible_states,
     open_run,
     optimizer_of,
+    problem_file,
     start_range,
-    write_json,
 )
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import solve
@@ -170,15 +177,7 @@ class TunePenalties:
         if self.learning_rate is not None and not 0 < self.learning_rate < np.inf:
             fail("--learning-rate", f"{self.learning_rate}", "Give a positive number")
         self.stepper(np.zeros(1))
-        overrides = {
-            key: getattr(self, key)
-            for key in ("horizon", "terminal")
-            if getattr(self, key) is not None
-        }
-        if self.config is None:
-            config = configs.Config.default(overrides, "tune")
-        else:
-            config = configs.load(self.config, overrides, "tune")
+        config = problem_file(self)
         ends = start_range(config, self.lower, self.upper, 1.0)
         mpc = config.build_controlled()
         apart = ("config", "output", "resume", "overwrite", "updates")

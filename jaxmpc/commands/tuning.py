@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from scipy.optimize import linprog
 
 from jaxmpc import config as configs
 from jaxmpc.checks import fail
-from jaxmpc.commands.options import open_folder
+from jaxmpc.commands.options import open_folder, write_json
 from jaxmpc.control.sets import Polytope
 from jaxmpc.mpc.condense import condense, in_float64
 from jaxmpc.mpc.problem import MPC
@@ -37,6 +36,15 @@ def optimizer_of(name: str, rate: float, tried: Any = None) -> optax.GradientTra
     except Exception:  # whatever a function that is no such optimizer does
         fail("--optimizer", f"{name!r} is no optimizer of optax that serves here", cure)
     return made
+
+
+def problem_file(command: Any) -> configs.Config:
+    """The file of --config, or the built-in joint, with --horizon and --terminal."""
+    given = {key: getattr(command, key) for key in ("horizon", "terminal")}
+    overrides = {key: value for key, value in given.items() if value is not None}
+    if command.config is None:
+        return configs.Config.default(overrides, "tune")
+    return configs.load(command.config, overrides, "tune")
 
 
 def start_range(
@@ -120,10 +128,3 @@ def open_run(
     for name in (*files, *([CHECKPOINT] if overwrite else [])):  # of an earlier run
         (folder / name).unlink(missing_ok=True)
     write_json(record, {"options": options, "finished": False})
-
-
-def write_json(path: Path, document: Any) -> None:
-    """Write a file that is there as a whole or not at all."""
-    side = path.with_name(f".{path.name}.partial")
-    side.write_text(json.dumps(document, indent=2) + "\n")
-    os.replace(side, path)

@@ -59,11 +59,8 @@ def robot_mpc(
     x, u = robot.equilibrium(target)
     with jax.enable_x64(True):
         point = np.asarray(robot.coordinates(x))
-    lower, upper = (np.asarray(end, float) for end in (
-        robot.state_limits.lower, robot.state_limits.upper
-    ))  # fmt: skip
-    width = np.where(np.isfinite(upper - lower), upper - lower, 0.0)
-    lower, upper = lower + margin * width / 2, upper - margin * width / 2
+    states = robot.state_limits.tightened(margin)
+    lower, upper = np.asarray(states.lower), np.asarray(states.upper)
     outside = np.maximum(lower - point, point - upper)
     if np.any(outside > 0):
         i = int(np.argmax(outside))
@@ -73,7 +70,7 @@ def robot_mpc(
         )  # fmt: skip
     with jax.enable_x64(True):
         system = jax.tree.map(np.asarray, robot.linearize(x, u, exact=exact))
-    mpc = MPC(system, Q, R, horizon, states=Box(lower, upper), inputs=robot.input_limits)
+    mpc = MPC(system, Q, R, horizon, states=states, inputs=robot.input_limits)
     mpc.validate()
     mpc = replace(mpc, constrained_steps=tuple(range(1, horizon + 1)))
     if isinstance(terminal_cost, str):

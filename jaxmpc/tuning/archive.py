@@ -1,5 +1,6 @@
 """Arrays and JSON data in one file (.npz), there as a whole or not at all."""
 
+import hashlib
 import json
 import os
 import tempfile
@@ -7,14 +8,28 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
+
+
+def fingerprint(plain: Any, *data: Any) -> str:
+    """Of JSON data and of pytrees of arrays."""
+    leaves, tree = jax.tree.flatten(data)
+    state = hashlib.sha256(json.dumps(plain, sort_keys=True).encode() + str(tree).encode())
+    for leaf in map(np.asarray, leaves):
+        state.update(str((leaf.shape, leaf.dtype)).encode() + np.ascontiguousarray(leaf).tobytes())
+    return state.hexdigest()[:32]
+
+
+def clear(path: Path) -> None:
+    """Remove what a process left that was killed while writing; for the only writer of `path`."""
+    for left in path.parent.glob(f".{path.name}.*"):
+        left.unlink(missing_ok=True)
 
 
 def write(path: Path, plain: Any, **arrays: Any) -> None:
     """Write to a side file, then rename: a reader sees the old file or the new one."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    for left in path.parent.glob(f".{path.name}.*"):  # by a process that was killed while writing
-        left.unlink(missing_ok=True)
     handle, side = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:

@@ -4,8 +4,6 @@ The optimiser is optax's. Around it: validation on data apart, the best iterate 
 lead to numbers which are not finite taken back and halved, and everything on disk after each step.
 """
 
-import hashlib
-import json
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -89,8 +87,10 @@ def descend(
     theta = jax.tree.map(lambda v: np.asarray(v, np.float64), theta)
     path = None if checkpoint is None else Path(checkpoint)
     state = State(theta, None, thetas=[theta])
-    mark = _fingerprint(settings, theta)
+    mark = archive.fingerprint(settings, theta)
     _try(optimizer, theta)
+    if path is not None:
+        archive.clear(path)
     if path is not None and path.exists():
         state = _load(path, theta, optimizer, mark)
         first, now = state.checks[0]["loss"], _checked(validate, theta)["loss"]
@@ -117,6 +117,13 @@ def descend(
             bar.set_postfix_str(f"validation {losses[-1]:.4g}, best {np.nanmin(losses):.4g}")
             bar.update(1)
     return _record(state)
+
+
+def minibatch(total: int, size: int, seed: int, step: int) -> Any:
+    """Which of `total` samples a step sees: a function of its number, so that a run can go on."""
+    if size == total:
+        return slice(None)
+    return np.random.default_rng([seed, step]).choice(total, size, replace=False)
 
 
 def _try(optimizer: optax.GradientTransformation, theta: Any) -> None:
@@ -185,13 +192,6 @@ def _record(state: State) -> Descent:
         validation_numbers={n: column(state.checks, n) for n in names(state.checks, ("loss",))},
         seconds=state.seconds,
     )  # fmt: skip
-
-
-def _fingerprint(settings: Any, theta: Any) -> str:
-    """Of what decides a run but its length."""
-    text = json.dumps(settings, sort_keys=True) + str(jax.tree.structure(theta))
-    data = b"".join(np.ascontiguousarray(v).tobytes() for v in jax.tree.leaves(theta))
-    return hashlib.sha256(text.encode() + data).hexdigest()
 
 
 def _save(path: Path | None, state: State, mark: str, settings: Any) -> None:

@@ -31,9 +31,10 @@ from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.refine import Constants, cholesky, gram, newton_step
-from jaxmpc.tuning.descent import descend
+from jaxmpc.tuning import archive
+from jaxmpc.tuning.descent import descend, minibatch
 from jaxmpc.tuning.parameters import Parameters, raw, require_parameters, values
-from jaxmpc.tuning.weights import TuningRun, digest, exact_values, split
+from jaxmpc.tuning.weights import TuningRun, exact_values, split
 
 # Newton steps at most: most states need 3 to 20.
 STEPS = 60
@@ -209,8 +210,7 @@ def tune_feasible_set(
     slope, value = jax.jit(jax.value_and_grad(total, has_aux=True)), jax.jit(total)
 
     def gradient(theta: Any, step: int) -> tuple[float, Any, dict[str, float]]:
-        rng = np.random.default_rng([seed, step])
-        chosen = rng.choice(len(train), size, replace=False) if size < len(train) else slice(None)
+        chosen = minibatch(len(train), size, seed, step)
         with jax.enable_x64(True):
             (loss, numbers), slopes = slope(arrays(theta), arrays(train[chosen]))
         return float(loss), slopes, numbers
@@ -223,7 +223,8 @@ def tune_feasible_set(
     settings = {
         "parameters": {name: p.record() for name, p in parameters.items()},
         "width": float(width), "batch": size, "train": len(train), "validation": len(test),
-        "steps": steps, "seed": seed, "data": digest((train, test)), "dtype": "float64",
+        "steps": steps, "seed": seed, "dtype": "float64",
+        "data": archive.fingerprint(None, train, test),
     }  # fmt: skip
     history = descend(
         start, gradient, validate, optax.adam(0.05) if optimizer is None else optimizer, updates,

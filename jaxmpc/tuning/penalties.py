@@ -12,8 +12,6 @@ LeCun 2010; penalties of ADMM for QPs: Ichnowski et al. 2021, by reinforcement; 
 iteration are the solutions: a bad rho costs steps, it cannot make an answer wrong.
 """
 
-import hashlib
-import json
 import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -34,7 +32,7 @@ from jaxmpc.qp.problem import QP, residual_terms
 from jaxmpc.qp.solve import solve_factored, start, unscaled
 from jaxmpc.qp.status import Status
 from jaxmpc.tuning import archive
-from jaxmpc.tuning.descent import Descent, descend
+from jaxmpc.tuning.descent import Descent, descend, minibatch
 
 # Of the algorithm: what an older one cached is learned anew.
 VERSION = 1
@@ -285,7 +283,7 @@ def learn_penalties(
     if optimizer is None:  # they decide its schedule; with another one a run may be made longer
         plain["updates"] = int(updates)
     given = replace(solver, iterations=iterations)
-    mark = fingerprint(plain, setting, samples, apart, given.rho, given.alpha)
+    mark = archive.fingerprint(plain, setting, samples, apart, given.rho, given.alpha)
     path = None if cache is None else Path(cache) / f"{mark}.npz"
     kept = None if path is None else load(path, given, setting.W)
     if kept is not None:
@@ -461,7 +459,7 @@ def learned(
     batch = min(batch, len(samples))
 
     def gradient(theta: Any, step: int) -> tuple[float, Any, dict[str, float]]:
-        chosen = np.random.default_rng((seed, step)).choice(len(samples), batch, replace=False)
+        chosen = minibatch(len(samples), batch, seed, step)
         value, direction = slope(theta, setting, samples.take(chosen))
         return float(value), jax.tree.map(np.asarray, direction), {}
 
@@ -488,15 +486,6 @@ def learned(
         solver, history.theta["rho"], alpha, groups, setting.condensed.layout, mpc.horizon,
         setting.condensed.balls, *after, *before, int(known[0].sum() + known[1].sum()), history,
     )  # fmt: skip
-
-
-def fingerprint(plain: dict[str, Any], *data: Any) -> str:
-    """Of all that decides the result but the optimiser."""
-    leaves, tree = jax.tree.flatten(data)
-    state = hashlib.sha256(json.dumps(plain, sort_keys=True).encode() + str(tree).encode())
-    for leaf in map(np.asarray, leaves):
-        state.update(str((leaf.shape, leaf.dtype)).encode() + np.ascontiguousarray(leaf).tobytes())
-    return state.hexdigest()[:32]
 
 
 # What a cached file holds beside the arrays.

@@ -42,7 +42,6 @@ from jaxmpc.sweeps.ladder import (
 from jaxmpc.sweeps.proofs import hard_part, make_view
 from jaxmpc.tuning import archive
 from jaxmpc.tuning.descent import descend
-from jaxmpc.tuning.penalties import fingerprint
 
 VERSION = 1
 # In normalised rows; iterates in float32 end near 1e-5.
@@ -96,7 +95,7 @@ def tune_sweep_penalties(
         "version": VERSION, "iterations": iterations, "dtype": str(np.dtype(dtype)),
         "updates": updates, "batch": batch, "seed": seed,
     }  # fmt: skip
-    mark = fingerprint(plain, problem, moving, samples, apart)
+    mark = archive.fingerprint(plain, problem, moving, samples, apart)
     path = None if cache is None else Path(cache) / f"{mark}.npz"
     kept = None if path is None else load(path, len(moving.lower))
     if kept is not None:

@@ -1,6 +1,5 @@
 """tune_weights: the numbers of an MPC problem by gradient through its closed loops."""
 
-import hashlib
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -24,7 +23,8 @@ from jaxmpc.mpc.solve import Controller
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.precision import arrays
 from jaxmpc.qp.status import Status
-from jaxmpc.tuning.descent import Descent, descend
+from jaxmpc.tuning import archive
+from jaxmpc.tuning.descent import Descent, descend, minibatch
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameters, raw, require_parameters, values
 
@@ -172,14 +172,13 @@ def tune_weights(
     settings = {
         "parameters": {name: p.record() for name, p in parameters.items()},
         "steps": steps, "batch": size, "train": len(train[0]), "validation": len(test[0]),
-        "seed": seed, "data": digest((train, test)), "dtype": np.dtype(controller.dtype).name,
+        "seed": seed, "data": archive.fingerprint(None, train, test),
+        "dtype": np.dtype(controller.dtype).name,
     }  # fmt: skip
 
     def data(step: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """The initial states of a step: a function of its number, so that a run can go on."""
-        if size == len(train[0]):
-            return train
-        chosen = np.random.default_rng([seed, step]).choice(len(train[0]), size, replace=False)
+        """The initial states of a step."""
+        chosen = minibatch(len(train[0]), size, seed, step)
         return jax.tree.map(lambda v: v[chosen], train)
 
     slopes_by: list[tuple[str, Callable]] = []  # the mode chosen, once a step is asked for
@@ -241,14 +240,6 @@ def numbers(aux: dict[str, np.ndarray], weights: np.ndarray) -> dict[str, float]
     names = ("unsolved", "infeasible", "fallback", "violation")
     found = {name: float(np.mean(aux[name][used])) if used.any() else np.nan for name in names}
     return {**found, "excluded": float(np.sum(~used))}
-
-
-def digest(tree: Any) -> str:
-    """Hash of arrays, in short."""
-    state = hashlib.sha256()
-    for leaf in jax.tree.leaves(tree):
-        state.update(str((leaf.shape, leaf.dtype)).encode() + np.ascontiguousarray(leaf).tobytes())
-    return state.hexdigest()[:16]
 
 
 Data = tuple[np.ndarray, dict[str, np.ndarray]]
