@@ -1,13 +1,9 @@
-"""Runs before any test module, hence before jax is imported: two CPU bugs of old jaxlibs.
+"""Runs before any test module, hence before jax is imported: a CPU bug of old jaxlibs.
 
 From 0.7.0 until 0.11.1, XLA's fusion emitters recompute long chains of small operations
-again and again (a step of a 7-joint robot is 500 times slower). From 0.10.0 until 0.11.1,
-independent batched Cholesky factorizations or triangular solves in one program can wait for
-each other for ever when the thread pool is small; with one thread they cannot. The flag is
-unknown to later versions, which abort on it, so both cures depend on the version. And one thread
-for OpenBLAS: JAX's small triangular solves go through it, and its threads wait for each other on
-busy cores (a linear model of a 7-joint arm takes 70 times as long). The library itself never
-touches the environment.
+again and again (a step of a 7-joint robot is 500 times slower). The flag is unknown to later
+versions, which abort on it. And one thread for OpenBLAS, whose threads wait for each other on busy
+cores. The library itself never touches the environment.
 """
 
 import gc
@@ -21,8 +17,6 @@ _jaxlib = tuple(int(part) for part in re.findall(r"\d+", version("jaxlib"))[:3])
 if (0, 7, 0) <= _jaxlib < (0, 11, 1):
     _flags = os.environ.get("XLA_FLAGS", "")
     os.environ["XLA_FLAGS"] = f"{_flags} --xla_cpu_use_fusion_emitters=false".strip()
-if (0, 10, 0) <= _jaxlib < (0, 11, 1):
-    os.environ.setdefault("NPROC", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 

@@ -1,8 +1,5 @@
 """The QP solver against programs with known answers, exact certificates and finite differences."""
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 
 import chex
@@ -283,7 +280,7 @@ class TestHonestStatus:
         assert "iterations" in jm.Status(int(sol.status)).sentence
 
     def test_numbers_of_osqp_and_sentences(self):
-        assert [int(s) for s in jm.Status] == [0, 1, 3, 5, 7, 12]
+        assert [int(s) for s in jm.Status] == [0, 1, 3, 5, 7, 9, 12]
         assert all(s.sentence.endswith(".") for s in jm.Status)
 
     @pytest.mark.slow
@@ -447,7 +444,7 @@ class TestBatches:
         )
         shapes = self.cholesky_shapes(shared, clean)
         assert shapes and all(shape == (6, 6) for shape in shapes)
-        assert len(shapes) == 3  # curvature, coordinates, and one stage of rho
+        assert len(shapes) == 4  # convexity, curvature, coordinates, and one stage of rho
         own = jax.vmap(lambda qp: jm.solve_qp(qp, solver))
         each = replace(clean, P=np.tile(clean.P, (9, 1, 1)), A=np.tile(clean.A, (9, 1, 1)))
         assert set(self.cholesky_shapes(own, each)) == {(9, 6, 6)}
@@ -630,30 +627,6 @@ def test_settings_and_programs_are_trees_with_any_leaves():
         leaves, structure = jax.tree.flatten(tree)
         for filler in (None, 0, object()):
             jax.tree.unflatten(structure, [filler] * len(leaves))
-
-
-HANG = """
-import jax, jax.numpy as jnp, numpy as np, jaxmpc as jm
-rng = np.random.default_rng(0)
-M, A = rng.standard_normal((2, 20, 20)).astype(np.float32)
-P, one = jnp.asarray(M @ M.T + np.eye(20, dtype=np.float32)), jnp.ones(20)
-q = jnp.asarray(rng.standard_normal((16384, 20)), jnp.float32)
-solver = jm.ADMM(iterations=10, refine=2)
-shared = jax.jit(jax.vmap(lambda q: jm.solve_qp(jm.QP(P, q, A, -one, one), solver).status))
-shared(q).block_until_ready()
-own = jax.jit(jax.vmap(lambda s: jm.solve_qp(jm.QP(s * P, q[0], A, -one, one), solver).status))
-own(jnp.linspace(1, 2, 2048)).block_until_ready()
-"""
-
-
-@pytest.mark.parametrize("cured", [pytest.param(True, marks=pytest.mark.slow), False])
-def test_large_batches_of_newton_steps_end(cured):
-    """On two cores, with and without the environment's cures for old jaxlibs."""
-    environment = dict(os.environ)
-    if not cured:
-        environment.pop("NPROC", None)
-        environment.pop("XLA_FLAGS", None)
-    subprocess.run([sys.executable, "-c", HANG], env=environment, check=True, timeout=120)
 
 
 class TestOneRowDoesNotExcuseAnother:

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jax.scipy.linalg import solve_triangular
 from jax.typing import ArrayLike
 from scipy.spatial import KDTree
 
@@ -23,6 +22,7 @@ from jaxmpc.control.geometry import maximise, unit_rows
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.qp.linalg import cholesky, eigh, solve_triangular
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 
 # A row counts as redundant if it is exceeded by no more than this, relative to its bound.
@@ -424,7 +424,7 @@ def _traced_ellipsoid(
     dtype = floating_dtype(data)
     A, B, K, P = (part.astype(dtype) for part in data)
     P = (P + P.T) / 2
-    L = jnp.linalg.cholesky(P)  # NaN if P is not definite
+    L = cholesky(P)  # NaN if P is not definite
     most, inside = jnp.zeros((), dtype), jnp.asarray(True)  # 1/alpha
     for limits, output in ((states, jnp.eye(n, dtype=dtype)), (inputs, K)):
         if limits is None:
@@ -433,11 +433,11 @@ def _traced_ellipsoid(
         reach = jnp.minimum(upper, -lower)
         inside = inside & jnp.all(reach > 0)
         # 1/alpha_i = a_i'P^-1 a_i / b_i^2 = |L^-1 a_i|^2 / b_i^2, 0 where b_i = inf.
-        rows = solve_triangular(L, matmul(H, output).T, lower=True)
+        rows = solve_triangular(L, matmul(H, output).T)
         most = jnp.maximum(most, jnp.max(jnp.sum(rows**2, axis=0) / reach**2, initial=0.0))
     # With P = LL', (A+BK)'P(A+BK) <= gamma2 P says |M|^2 <= gamma2 for M' = L^-1 (A+BK)'L.
-    M = solve_triangular(L, matmul((A + matmul(B, K)).T, L), lower=True)
-    gamma2 = jnp.linalg.eigvalsh(matmul(M, M.T))[-1]
+    M = solve_triangular(L, matmul((A + matmul(B, K)).T, L))
+    gamma2 = eigh(matmul(M, M.T))[0][-1]
     rest = jnp.zeros((), dtype) if system.c is None else jnp.max(jnp.abs(jnp.asarray(system.c)))
     sound = (gamma2 <= 1 + 100 * jnp.finfo(dtype).eps) & inside & (most > 0) & (rest == 0)
     return Ellipsoid(P, jnp.where(sound, 1 / most, jnp.nan)), gamma2

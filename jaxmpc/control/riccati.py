@@ -12,6 +12,7 @@ from jax.typing import ArrayLike
 
 from jaxmpc.checks import concrete, fail, require_shape, require_symmetric_psd
 from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.qp.linalg import solve, solve_general
 from jaxmpc.qp.precision import arrays, floating_dtype, in_float64, matmul
 
 # Modes closer than this to unreachable (least singular value, relative) count as such.
@@ -171,7 +172,7 @@ def _traced(*data: Any) -> LQR:
 
 def _gain_of(A: Array, B: Array, R: Array, P: Array) -> Array:
     BtP = matmul(B.T, P)
-    return -jnp.linalg.solve(R + matmul(BtP, B), matmul(BtP, A))
+    return -solve(R + matmul(BtP, B), matmul(BtP, A))
 
 
 @jax.custom_jvp
@@ -204,7 +205,7 @@ def _doubling(A: Array, B: Array, Q: Array, R: Array) -> Array:
     def double(carry: tuple[Array, ...]) -> tuple[Array, ...]:
         k, A, G, H, _ = carry
         W = jnp.eye(A.shape[0], dtype=A.dtype) + matmul(G, H)
-        WA, WG = jnp.split(jnp.linalg.solve(W, jnp.concatenate([A, G], axis=1)), 2, axis=1)
+        WA, WG = jnp.split(solve_general(W, jnp.concatenate([A, G], axis=1)), 2, axis=1)
         grown = matmul(A.T, matmul(H, WA))
         G, H_next = G + matmul(A, matmul(WG, A.T)), H + grown
         return k + 1, matmul(A, WA), (G + G.T) / 2, (H_next + H_next.T) / 2, H
@@ -213,7 +214,7 @@ def _doubling(A: Array, B: Array, Q: Array, R: Array) -> Array:
         k, *_, H, before = carry
         return (k < _DOUBLINGS) & (_size(H - before) > jnp.finfo(H.dtype).eps * _size(H))
 
-    G = matmul(B, jnp.linalg.solve(R, B.T))
+    G = matmul(B, solve(R, B.T))
     start: tuple[Array, ...] = (jnp.asarray(0), A, G, Q, jnp.full_like(Q, jnp.inf))
     P = jax.lax.while_loop(moving, double, start)[3]
 

@@ -45,6 +45,7 @@ from jaxmpc.control.geometry import (
 )
 from jaxmpc.control.geometry import irredundant as _irredundant
 from jaxmpc.control.system import as_array, host_array
+from jaxmpc.qp.linalg import solve
 
 __all__ = ["Box", "Ellipsoid", "Optimum", "Polytope", "hull_volume", "maximise", "unit_rows"]
 
@@ -518,7 +519,7 @@ class Ellipsoid:
         self._require_fields("Ellipsoid")
         require_shape("d", d, (self.dimension,), "Give one direction; use jax.vmap for many")
         d = jnp.asarray(d)
-        return jnp.sqrt(jnp.asarray(self.level) * (d @ jnp.linalg.solve(jnp.asarray(self.P), d)))
+        return jnp.sqrt(jnp.asarray(self.level) * (d @ solve(jnp.asarray(self.P), d)))
 
     def volume(self) -> float:
         """Length, area or volume: pi^(n/2) / Gamma(n/2 + 1) level^(n/2) / sqrt(det P). Host."""

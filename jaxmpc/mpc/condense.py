@@ -23,6 +23,7 @@ from jaxmpc.checks import concrete, fail
 from jaxmpc.control.riccati import lqr
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import blocks, stacked
+from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 from jaxmpc.qp.problem import QP
 
@@ -189,7 +190,7 @@ def _condense(mpc: MPC) -> Condensed:
 
     # argmin over u of u'Ru + (Ax + Bu)'P(Ax + Bu).
     BtP = matmul(B.T, P_N)
-    K_N = -jnp.linalg.solve(R + matmul(BtP, B), matmul(BtP, A))
+    K_N = -solve(R + matmul(BtP, B), matmul(BtP, A))
 
     found = blocks(mpc, dtype)
     states, inputs = (Gamma, Phi, phi), (Omega, Psi, psi)

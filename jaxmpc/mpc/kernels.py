@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.scipy.linalg import cho_solve
 
+from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import matmul
 
 # Numbers along a side that a warp's registers hold; Triton's products need 16 at least.
@@ -115,9 +115,8 @@ def _riccati_scan(Q: Array, R: Array, A: Array, B: Array, cross: Any = None) -> 
         Q, R, M, *own = stage
         A, B = (v if f is None else f for v, f in zip(own, fixed, strict=True))
         BtS = matmul(B.T, S)
-        L = jnp.linalg.cholesky(R + matmul(BtS, B))
         Y = matmul(BtS, A) + (0.0 if M is None else M)
-        solved = cho_solve((L, True), jnp.concatenate([Y, identity], axis=1))
+        solved = solve(R + matmul(BtS, B), jnp.concatenate([Y, identity], axis=1))
         K, inverse = -solved[:, :n], solved[:, n:]
         closed = A + matmul(B, K)
         # Joseph's form of Q + A'SA + Y'K: no difference of large terms, S stays semidefinite.

@@ -16,6 +16,7 @@ from jax import Array
 from jaxmpc.checks import fail
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.mpc.problem import MPC, Outputs, Plan, Soft, output_steps
+from jaxmpc.qp.linalg import cholesky
 from jaxmpc.qp.precision import matmul
 
 
@@ -122,7 +123,7 @@ def blocks(mpc: MPC, dtype: Any) -> list[Block]:
     last = mpc.terminal_set
     if isinstance(last, Ellipsoid):  # x'Px = |L'x|²
         P = cast(last.P)
-        L = jnp.linalg.cholesky((P + P.T) / 2)
+        L = cholesky((P + P.T) / 2)
         names = ("terminal ellipsoid",) * n
         zero, radius = jnp.zeros(n, dtype), jnp.sqrt(cast(last.level))
         add("terminal", L.T, None, zero, zero, (N,), names, (), radius=radius)

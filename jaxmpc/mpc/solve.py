@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import concrete, fail
 from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.problem import MPC, Multipliers, Plan
@@ -16,7 +16,8 @@ from jaxmpc.mpc.rows import blocks
 from jaxmpc.qp.admm import ADMM, Factor
 from jaxmpc.qp.admm import factor as factorise
 from jaxmpc.qp.precision import arrays, matmul
-from jaxmpc.qp.solve import solve_factored
+from jaxmpc.qp.solve import marked, solve_factored
+from jaxmpc.qp.status import Status
 
 # (kind, steps, rows a step) of each block of rows.
 Layout = tuple[tuple[str, tuple[int, ...], int], ...]
@@ -64,10 +65,13 @@ class Controller:
         # JAX rebuilds this object with its parts present, or with placeholders: leave those be.
         if self.condensed is None and isinstance(self.mpc, MPC):
             self.mpc.validate()
-            condensed = condense(self.mpc)
+            mpc, finite = harmless(self.mpc)
+            condensed = condense(mpc)
+            # The factorization reads from P what is wrong with the data.
+            condensed = replace(condensed, P=jnp.where(finite, condensed.P, jnp.nan))
             self.solver.validate(condensed.C.shape[0])
             # Arrays from here on, so that a sample need not convert the whole object again.
-            mpc = replace(self.mpc, prestabilise=condensed.K)
+            mpc = replace(mpc, prestabilise=condensed.K)
             object.__setattr__(self, "mpc", arrays(mpc))
             object.__setattr__(self, "solver", arrays(self.solver))
             object.__setattr__(self, "condensed", condensed)
@@ -179,6 +183,20 @@ class Controller:
         c = self.condensed
         assert c is not None
         return multipliers(self.mpc, c.layout, y)
+
+
+def harmless(mpc: MPC) -> tuple[MPC, Any]:
+    """Return the problem with harmless dynamics and weights where they are not finite, and whether
+    they are: numbers that are being traced cannot be refused."""
+    fields = ("system", "Q", "R", "terminal_cost", "stage_weights", "input_rate_weight")
+    data = {name: getattr(mpc, name) for name in fields}
+    if concrete(data):
+        return mpc, True
+    leaves = jax.tree.leaves(data)
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(jnp.asarray(v))) for v in leaves]))
+    clean = jax.tree.map(lambda v: jnp.where(finite, jnp.asarray(v), 0), data)
+    clean["R"] = jnp.where(finite, jnp.asarray(mpc.R), np.eye(mpc.system.m))
+    return replace(mpc, **clean), finite
 
 
 def limited(inputs: Any, u: Array) -> Array:
@@ -294,15 +312,22 @@ def _plan(
 ) -> Plan:
     c = controller.condensed
     assert c is not None and controller.factor is not None
+    given = (theta, reference, input_reference)
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(given)]))
+    # Harmless numbers until all is computed: the derivative of a product with NaN is NaN.
+    theta, reference, input_reference = jax.tree.map(lambda v: jnp.where(finite, v, 0.0), given)
     qp = c.qp(theta, reference, input_reference)
-    solution = solve_factored(qp, controller.factor, controller.solver, start)
-    states, inputs = c.trajectory(theta, solution.z)
+    found, fault = solve_factored(qp, controller.factor, controller.solver, start)
+    fault = jnp.where(finite, fault, Status.NON_FINITE)
+    states, inputs = c.trajectory(theta, found.z)
     previous = theta[c.Q.shape[0] :] if controller.mpc.remembers else None
+    cost = controller.cost(states, inputs, reference, input_reference, previous)
+    slack, solution = controller.slack(states, inputs), marked(found, fault)
+    nan = lambda v: jnp.where(fault == Status.NOT_RUN, v, jnp.nan)
     return Plan(
-        states=states, inputs=inputs,
-        cost=controller.cost(states, inputs, reference, input_reference, previous),
-        slack=controller.slack(states, inputs), multipliers=controller.multipliers(solution.y),
-        status=solution.status, primal_residual=solution.primal_residual,
-        dual_residual=solution.dual_residual, gap=solution.gap, iterations=solution.iterations,
+        states=nan(states), inputs=nan(inputs), cost=nan(cost), slack=nan(slack),
+        multipliers=controller.multipliers(solution.y), status=solution.status,
+        primal_residual=solution.primal_residual, dual_residual=solution.dual_residual,
+        gap=solution.gap, iterations=solution.iterations,
         qp=solution,
     )  # fmt: skip

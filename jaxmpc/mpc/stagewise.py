@@ -39,8 +39,9 @@ from jaxmpc.mpc.kernels import Gains, recurrence, riccati_recursion, tracking
 from jaxmpc.mpc.problem import MPC, Plan
 from jaxmpc.mpc.rows import blocks
 from jaxmpc.mpc.solve import Layout, cost, multipliers, slack
-from jaxmpc.qp.admm import ADMM, repeat
-from jaxmpc.qp.precision import arrays, floating_dtype, in_float64, matmul
+from jaxmpc.qp.admm import ADMM, convex, repeat
+from jaxmpc.qp.linalg import cholesky
+from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely, rounding
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.refine import Constants
@@ -272,15 +273,24 @@ def stages(mpc: MPC) -> Stages:
     )  # fmt: skip
 
 
-def usable(s: Stages) -> tuple[Stages, Array]:
-    """The data with harmless ones in their place where they are not usable, and whether they
-    were (see `qp.solve.cleaned`)."""
+def cleaned(s: Stages) -> tuple[Stages, Array]:
+    """The data with harmless ones in their place where they are not usable, and the fault in
+    them (see `qp.solve.cleaned`): NOT_RUN for none, NON_CONVEX where Q, R or P is indefinite or R
+    singular."""
     ok = jnp.all(s.lower <= s.upper) & ~jnp.any(jnp.isposinf(s.lower) | jnp.isneginf(s.upper))
     for value in jax.tree.leaves((s.A, s.B, s.c, s.Q, s.R, s.P, s.stage, s.H, s.D)):
         ok = ok & jnp.all(jnp.isfinite(value))
     if s.linear is not None:
         ok = ok & jnp.all(s.linear >= 0)
         ok = ok & jnp.all((s.quadratic >= 0) & jnp.isfinite(s.quadratic))
+    weights = [jnp.where(ok, (W + W.T) / 2, 0.0) for W in (s.Q, s.R, s.P)]
+    definite = jnp.all(jnp.isfinite(cholesky(jax.lax.stop_gradient(weights[1]))))
+    for W in weights:
+        definite = definite & convex(W)
+    definite = definite & jnp.all(s.stage >= 0)
+    fault = jnp.where(definite, Status.NOT_RUN, Status.NON_CONVEX)
+    fault = jnp.where(ok, fault, Status.NON_FINITE).astype(jnp.int32)
+    ok = ok & definite
     clean = lambda tree, harmless=0.0: jax.tree.map(lambda v: jnp.where(ok, v, harmless), tree)
     return replace(
         s, A=clean(s.A), B=clean(s.B), c=clean(s.c), Q=clean(s.Q), P=clean(s.P),
@@ -288,7 +298,7 @@ def usable(s: Stages) -> tuple[Stages, Array]:
         R=clean(s.R, jnp.eye(s.R.shape[0], dtype=s.R.dtype)), H=clean(s.H), D=clean(s.D),
         lower=clean(s.lower, -jnp.inf), upper=clean(s.upper, jnp.inf),
         linear=clean(s.linear, jnp.inf), quadratic=clean(s.quadratic),
-    ), ok  # fmt: skip
+    ), fault  # fmt: skip
 
 
 def riccati(s: Stages, weights: Any = None) -> Gains:
@@ -333,23 +343,28 @@ def predict(s: Stages, x0: Array, u: Array) -> Array:
 @dataclass(frozen=True)
 class StageFactor:
     """What data and penalties decide: row scale E (rows,), 0 for a row that no input moves; rho
-    (S, rows) with the gains of each of the S penalties of a schedule; usable: whether the data
-    were."""
+    (S, rows) with the gains of each of the S penalties of a schedule; fault: NOT_RUN where the
+    data are usable, else the status that says why not."""
 
     stages: Stages
     E: Array
     rho: Array
     gains: Gains
-    usable: Array
+    fault: Array
 
 
 @jax.jit
 def _factor(mpc: MPC, rho: Array, scale: Any = None) -> StageFactor:
-    s, ok = usable(stages(mpc))
+    s, fault = cleaned(stages(mpc))
     E = row_scale(s) if scale is None else jnp.asarray(scale, s.Q.dtype)
     rho = jnp.asarray(rho, E.dtype)
     rho = jnp.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, E.shape[0]))
-    return StageFactor(s, E, rho, jax.lax.map(lambda rho: riccati(s, rho * E**2), rho), ok)
+    gains = jax.lax.map(lambda rho: riccati(s, rho * E**2), rho)
+    # Finite data can still overflow, or be too near singular for their precision.
+    leaves = jax.tree.leaves((E, gains))
+    sound = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in leaves]))
+    E, gains = jax.tree.map(lambda v: jnp.where(sound, v, 0.0), (E, gains))
+    return StageFactor(s, E, rho, gains, jnp.where(sound, fault, jnp.int32(Status.ITERATION_LIMIT)))
 
 
 def row_scale(s: Stages) -> Array:
@@ -510,13 +525,6 @@ def largest(v: Array) -> Array:
     return jnp.max(jnp.abs(v), initial=0.0)
 
 
-def precisely(function: Any, *arguments: Any) -> Any:
-    """function(…) in float64; for float32 data without derivative."""
-    if arguments[1].x0.dtype == jnp.float64:
-        return function(*arguments)
-    return in_float64(function)(*jax.lax.stop_gradient(arguments))
-
-
 def measures(s: Stages, sample: Sample, u: Array, y: Array) -> tuple[Array, Array]:
     """Primal and dual residual and gap (3,), and the sizes (3,) of the terms they come from."""
 
@@ -650,10 +658,11 @@ def plan_stages(
 
 @jax.jit
 def _plan(factor: StageFactor, mpc: MPC, solver: ADMM, sample: Sample, warm_start: Any) -> Plan:
-    finite = factor.usable
-    for v in sample:
-        finite = finite & jnp.all(jnp.isfinite(v))
-    sample = jax.tree.map(lambda v: jnp.where(finite, v, 0.0), sample)
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in sample]))
+    fault = jnp.where(finite, factor.fault, jnp.int32(Status.NON_FINITE))
+    usable = fault == Status.NOT_RUN
+    # Only cost and slack are read from the problem as given.
+    sample, mpc = jax.tree.map(lambda v: jnp.where(usable, v, 0), (sample, mpc))
     if solver.differentiate == "implicit":
         constants = jax.lax.stop_gradient((factor, sample, solver, warm_start))
         u, y = implicit(
@@ -665,10 +674,10 @@ def _plan(factor: StageFactor, mpc: MPC, solver: ADMM, sample: Sample, warm_star
     status, primal, dual, gap = assess(s, sample, u, y, solver.eps)
     x = predict(s, sample.x0, u)
     J = cost(mpc, x, u, sample.states, sample.inputs)
-    nan = lambda v: jnp.where(finite, v, jnp.nan)
+    nan = lambda v: jnp.where(usable, v, jnp.nan)
     solution = QPSolution(
         z=nan(u.ravel()), y=nan(y), cost=nan(J),
-        status=jnp.where(finite, status, Status.NON_FINITE).astype(jnp.int32),
+        status=jnp.where(usable, status, fault).astype(jnp.int32),
         primal_residual=nan(primal), dual_residual=nan(dual), gap=nan(gap),
         iterations=jnp.asarray(solver.iterations, jnp.int32),
         certificate=jnp.zeros_like(y), ray=jnp.zeros_like(u.ravel()),
@@ -728,9 +737,8 @@ def start(factor: StageFactor, sample: Sample, bounds: Bounds, warm_start: Any) 
 def assess(s: Stages, sample: Sample, u: Array, y: Array, eps: Any) -> tuple[Array, ...]:
     """Status and residuals of u and y by the rule of `qp.solve.assess`, in float64."""
     dtype = u.dtype
-    single = dtype != jnp.float64
-    eps = (1e-3 if single else 1e-6) if eps is None else eps
-    floor = (4 if single else 100) * float(jnp.finfo(dtype).eps)
+    eps = (1e-6 if dtype == jnp.float64 else 1e-3) if eps is None else eps
+    floor = rounding(dtype)
 
     def measure(s: Stages, sample: Sample, u: Array, y: Array, eps: Array) -> tuple[Array, ...]:
         solved, terms = jnp.asarray(True), residual_terms(s, sample, u, y)

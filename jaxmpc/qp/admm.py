@@ -28,12 +28,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.scipy.linalg import cho_solve, solve_triangular
 
 from jaxmpc.checks import concrete, fail
-from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.linalg import cholesky, inverse_root
+from jaxmpc.qp.precision import matmul, precisely, rounding
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.status import Status
 
 # Eigenvalue, relative to the mean, below which a direction counts as without curvature.
 SINGULAR = 1e-6
@@ -94,7 +95,8 @@ class Factor:
 
     T (n, n): z = T w. E (m,): row scale, 0 for a zero row. H (n, n), A (m, n): Hessian and
     rows in w. flat: whether P is singular. rho (S, m), and a stage each of F = M⁻¹A'R (S, n, m),
-    iteration matrix G = A F (S, m, m), and Minv (S, n, n).
+    iteration matrix G = A F (S, m, m), and Minv (S, n, n). fault: NOT_RUN where P and A are
+    usable, else the status that says why not; the rest is then that of min ½|z|² without rows.
     """
 
     T: Array
@@ -106,6 +108,7 @@ class Factor:
     F: Array
     G: Array
     Minv: Array
+    fault: Array
 
 
 def scale(
@@ -123,8 +126,7 @@ def scale(
     unit = jax.lax.stop_gradient(1 / jnp.sqrt(jnp.where(size > 0, size, 1.0)))
     P_1, A_1 = unit[:, None] * P * unit, A * unit
     delta, flat = null_curvature(*jax.lax.stop_gradient((P_1, A_1)))
-    L = jnp.linalg.cholesky(P_1 + delta * jnp.eye(n, dtype=dtype))
-    T = unit[:, None] * solve_triangular(L, jnp.eye(n, dtype=dtype), lower=True).T
+    T = unit[:, None] * inverse_root(P_1 + delta * jnp.eye(n, dtype=dtype)).T
     H = matmul(T.T, matmul(P, T))
     rows = matmul(A, T)
     squared = jnp.sum(rows**2, axis=1)
@@ -155,8 +157,7 @@ def null_curvature(P: Array, A: Array) -> tuple[Array, Array]:
     mean = jnp.trace(P) / n
     share = jnp.maximum(SINGULAR, 4 * n * jnp.finfo(P.dtype).eps)
     epsilon = jnp.where(mean > 0, share * mean, 1.0)
-    L = jnp.linalg.cholesky(P + epsilon * jnp.eye(n, dtype=P.dtype))
-    root = solve_triangular(L, jnp.eye(n, dtype=P.dtype), lower=True)
+    root = inverse_root(P + epsilon * jnp.eye(n, dtype=P.dtype))
     # Σ ε/(λ + ε) counts the directions without curvature.
     singular = epsilon * jnp.sum(root**2) > 0.5
     delta = jnp.ones((), P.dtype)
@@ -166,11 +167,14 @@ def null_curvature(P: Array, A: Array) -> tuple[Array, Array]:
         both = (in_null > 1e-8 * jnp.sum(A**2, axis=1)) & (in_range > 0)
         ratio = jnp.where(both, in_null / jnp.where(both, in_range, 1.0), jnp.nan)
         delta = jnp.where(jnp.any(both), jnp.nanmedian(ratio), delta)
-    return jnp.where(singular, delta, epsilon), singular
+    # Below ε the sum would not be definite to rounding.
+    return jnp.where(singular, jnp.maximum(delta, epsilon), epsilon), singular
 
 
 def factor(P: Array, A: Array, solver: ADMM, balls: tuple[int, ...] = ()) -> Factor:
     """Scale and invert; depends on nothing that differs between initial states."""
+    fault = matrix_fault(P, A)
+    P, A = harmless_matrices(P, A, fault == Status.NOT_RUN)
     T, E, H, A_w, flat = scale(P, A, balls)
     n, m = A_w.shape[1], A_w.shape[0]
     rho = jnp.asarray(solver.rho, P.dtype)
@@ -180,13 +184,54 @@ def factor(P: Array, A: Array, solver: ADMM, balls: tuple[int, ...] = ()) -> Fac
     def stage(R: Array) -> tuple[Array, Array]:
         M = H + matmul(A_w.T, R[:, None] * A_w)
         M = M + ridge * (1 + jnp.trace(M) / n) * jnp.eye(n, dtype=P.dtype)
-        Minv = cho_solve((jnp.linalg.cholesky(M), True), jnp.eye(n, dtype=P.dtype))
+        W = inverse_root(M)
+        Minv = matmul(W.T, W)
         return matmul(Minv, A_w.T * R), Minv
 
     stages = [stage(R) for R in rho]
     F = jnp.stack([F for F, _ in stages])
     Minv = jnp.stack([Minv for _, Minv in stages])
-    return Factor(T, E, H, A_w, flat, rho, F, matmul(A_w, F), Minv)
+    made = Factor(T, E, H, A_w, flat, rho, F, matmul(A_w, F), Minv, fault)
+    # Finite data can still overflow, or be too near singular for their precision.
+    parts = (T, E, H, A_w, F, made.G, Minv)
+    sound = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in parts]))
+    none = jax.tree.map(jnp.zeros_like, made)
+    one, failed = jnp.eye(n, dtype=P.dtype), jnp.int32(Status.ITERATION_LIMIT)
+    ones = jnp.broadcast_to(one, Minv.shape)
+    harmless = replace(none, T=one, H=one, Minv=ones, rho=rho, fault=failed)
+    return jax.tree.map(lambda a, b: jnp.where(sound, a, b), made, harmless)
+
+
+def matrix_fault(P: Array, A: Array) -> Array:
+    """Return the status of an unusable P or A: NON_FINITE, NON_CONVEX, or NOT_RUN for none."""
+    finite = jnp.all(jnp.isfinite(P)) & jnp.all(jnp.isfinite(A))
+    definite = convex(jnp.where(finite, P, 0.0))
+    fault = jnp.where(definite, Status.NOT_RUN, Status.NON_CONVEX)
+    return jnp.where(finite, fault, Status.NON_FINITE).astype(jnp.int32)
+
+
+def harmless_matrices(P: Array, A: Array, usable: Array) -> tuple[Array, Array]:
+    """Return P and A where they are usable, else the identity and zeros."""
+    identity = jnp.eye(P.shape[0], dtype=P.dtype)
+    return jnp.where(usable, P, identity), jnp.where(usable, A, 0.0)
+
+
+def convex(P: Array) -> Array:
+    """Return whether P (n, n) is positive semidefinite but for rounding.
+
+    A direction d counts as rounding where d'Pd ≥ −ε|d|'|P||d|, ε as for residuals: tested, since
+    |d|'|P||d| ≤ Σ_i d_i² Σ_j |P_ij|, by a Cholesky factorization of P + ε diag(Σ_j |P_ij|), with
+    rows and columns scaled and in float64. A variable's units play no part.
+    """
+    floor = max(rounding(P.dtype), 4 * P.shape[0] * float(jnp.finfo(jnp.float64).eps))
+
+    def factored(P: Array) -> Array:
+        size = jnp.sum(jnp.abs(P), axis=1)
+        unit = 1 / jnp.sqrt(jnp.where(size > 0, size, 1.0))
+        scaled = unit[:, None] * P * unit
+        return jnp.all(jnp.isfinite(cholesky(scaled + floor * jnp.eye(P.shape[0], dtype=P.dtype))))
+
+    return precisely(factored, jax.lax.stop_gradient(P))
 
 
 def scaled(factor: Factor, qp: QP) -> tuple[Array, Bounds]:

@@ -11,12 +11,15 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 from jax import Array
-from jax.scipy.linalg import cho_solve
 
-from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.linalg import definite_solver
+from jaxmpc.qp.precision import matmul, rounding
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.refine import cholesky, gram
+from jaxmpc.qp.refine import gram, ridged
+
+# Rounding of a ray's products beside that of residuals: rays are solutions of linear systems.
+RAY = 25
 
 
 def farkas(qp: QP, y: Array) -> tuple[Array, Array]:
@@ -70,9 +73,9 @@ def sharpen(A: Array, y: Array) -> Array:
     least = 0.01 * jnp.sqrt(jnp.finfo(y.dtype).eps)
     support = jnp.abs(y) > least * jnp.max(jnp.abs(y), initial=0.0)
     y = jnp.where(support, y, 0.0)
-    L = cholesky(gram(A)(support.astype(y.dtype), []), 1.0)
+    inverse = definite_solver(ridged(gram(A)(support.astype(y.dtype), []), 1.0))
     for _ in range(2):
-        y = y - support * matmul(cho_solve((L, True), matmul(y, A)), A.T)
+        y = y - support * matmul(inverse(matmul(y, A)), A.T)
     return y
 
 
@@ -89,20 +92,21 @@ def recession(q: Array, H: Array, A: Array, bounds: Bounds) -> tuple[Array, Boun
     return jnp.concatenate([H, along[None], A]), cone
 
 
-def descent_ray(qp: QP, d: Array, tolerance: Array) -> tuple[Array, Array]:
+def descent_ray(qp: QP, d: Array) -> tuple[Array, Array]:
     """The candidate direction d made into a ray of unbounded descent: returns (d, found).
 
-    Numerically unbounded, to `tolerance`: a slight curvature along d cannot be told from none.
-
-    Scaled to length one, d must satisfy |Pd| ≤ tolerance, q'd < −tolerance, and A d ≤ tolerance
-    where u is finite, ≥ −tolerance where l is finite. A zero direction proves nothing.
+    Pd = 0, q'd < 0, and A d ≤ 0 where u is finite, ≥ 0 where l is finite, each product to within
+    the rounding of its own terms, (|P||d|)_i, |q|'|d| and (|A||d|)_i. Units of
+    rows and variables play no part; a curvature that is rounding in this sense cannot be told from
+    none. d is scaled to length one. A zero direction proves nothing.
     """
+    tolerance = RAY * rounding(d.dtype)
     length = jnp.max(jnp.abs(d), initial=0.0)
     d = jnp.where(length > 0, d / jnp.where(length > 0, length, 1.0), 0.0)
-    Ad = matmul(d, qp.A.T)
-    flat = jnp.all(jnp.abs(matmul(d, qp.P)) <= tolerance)
-    stays = jnp.all(jnp.isposinf(qp.u) | (Ad <= tolerance)) & jnp.all(
-        jnp.isneginf(qp.l) | (Ad >= -tolerance)
-    )
-    proved = flat & stays & (jnp.sum(qp.q * d) < -tolerance)
+    size = jnp.abs(d)
+    Ad, noise = matmul(d, qp.A.T), tolerance * matmul(size, jnp.abs(qp.A).T)
+    flat = jnp.all(jnp.abs(matmul(d, qp.P)) <= tolerance * matmul(size, jnp.abs(qp.P)))
+    stays = jnp.all(jnp.isposinf(qp.u) | (Ad <= noise))
+    stays = stays & jnp.all(jnp.isneginf(qp.l) | (Ad >= -noise))
+    proved = flat & stays & (jnp.sum(qp.q * d) < -tolerance * jnp.sum(jnp.abs(qp.q) * size))
     return jnp.where(proved, d, 0.0), proved

@@ -56,6 +56,21 @@ def in_float64(function: Callable) -> Callable:
     return _with_x64(evaluate)
 
 
+def precisely(function: Callable, *arguments: Any) -> Any:
+    """Return function(*arguments), evaluated in float64 also where the data are float32.
+
+    Not differentiable where they are (`in_float64`): the derivative is zero.
+    """
+    if floating_dtype(arguments) == jnp.float64:
+        return function(*arguments)
+    return in_float64(function)(*jax.lax.stop_gradient(arguments))
+
+
+def rounding(dtype: Any) -> float:
+    """Return the relative size of what counts as rounding in a residual of data of this type."""
+    return (100 if jnp.finfo(dtype).eps < 1e-10 else 4) * float(jnp.finfo(dtype).eps)
+
+
 def _with_x64(function: Callable) -> Callable:
     @custom_vmap
     def wrapped(*arguments: Any) -> Any:

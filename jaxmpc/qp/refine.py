@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.scipy.linalg import cho_solve
 
+from jaxmpc.qp.linalg import definite_solver, solve
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
 
@@ -72,11 +72,11 @@ def gram(A: Array) -> Callable[[Array, list[Array]], Array]:
     return product
 
 
-def cholesky(K: Array, scale: Any = 0.0) -> Array:
-    """Factor of K + a ridge at rounding level, for directions that nothing in K sees."""
+def ridged(K: Array, scale: Any = 0.0) -> Array:
+    """Return K plus a ridge at rounding level, for directions that nothing in K sees."""
     n = K.shape[0]
     ridge = 10 * jnp.finfo(K.dtype).eps * (jnp.trace(K) / n + scale)
-    return jnp.linalg.cholesky(K + ridge * jnp.eye(n, dtype=K.dtype))
+    return K + ridge * jnp.eye(n, dtype=K.dtype)
 
 
 class Newton(NamedTuple):
@@ -103,8 +103,7 @@ def newton_step(
     gradient = matmul(w, H) + q + rho * matmul(e, A)
     weights, normals = bounds.curvature(v, rho)
     smooth = H + sigma * (jnp.eye(w.shape[0], dtype=w.dtype) - H)
-    L = cholesky(smooth + rho * products(weights, normals), rho)
-    d = -cho_solve((L, True), gradient)
+    d = -solve(ridged(smooth + rho * products(weights, normals), rho), gradient)
 
     # φ along w + t d costs no product with A: two scalars and A d.
     Ad, Hd = matmul(d, A.T), matmul(d, smooth)
@@ -223,17 +222,17 @@ def linearised(
     active rows contradict each other, dw tends to their least-squares solution and dy stays
     bounded by 8ρ times the contradiction.
     """
-    L = cholesky(H + rho * gram(A)(weights, normals), rho)
+    inverse = definite_solver(ridged(H + rho * gram(A)(weights, normals), rho))
     D = lambda v: weights * v + sum(h * jnp.sum(h * v) for h in normals)
 
-    def solve(a: Array, c: Array) -> tuple[Array, Array]:
+    def solved(a: Array, c: Array) -> tuple[Array, Array]:
         def sweep(carry: tuple[Array, Array], _: None) -> tuple[Any, None]:
             dw, dy = carry
             rows = D(matmul(dw, A.T) + dy / rho) + c - dy / rho
             gradient = a + matmul(dw, H) + matmul(dy, A)
-            step = -cho_solve((L, True), gradient + rho * matmul(rows, A))
+            step = -inverse(gradient + rho * matmul(rows, A))
             return (dw + step, dy + rho * (D(matmul(step, A.T)) + rows)), None
 
         return jax.lax.scan(sweep, (jnp.zeros_like(a), jnp.zeros_like(c)), length=8)[0]
 
-    return solve
+    return solved

@@ -1,6 +1,5 @@
 """solve_qp: loop, polish, honest status and derivative joined."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -10,10 +9,19 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
-from jaxmpc.qp.admm import ADMM, Factor, factor, iterate, read, scaled, scaled_rows
+from jaxmpc.qp.admm import (
+    ADMM,
+    Factor,
+    factor,
+    harmless_matrices,
+    iterate,
+    read,
+    scaled,
+    scaled_rows,
+)
 from jaxmpc.qp.certificate import descent_ray, farkas, recession, sharpen
 from jaxmpc.qp.derivative import implicit
-from jaxmpc.qp.precision import arrays, floating_dtype, in_float64, matmul
+from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely, rounding
 from jaxmpc.qp.problem import QP, QPSolution, residual_terms, residuals
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.refine import Constants, least_distance, linearised, polish
@@ -39,8 +47,7 @@ def solve_qp(qp: QP, solver: ADMM = ADMM(), warm_start: Any = None) -> QPSolutio
 
 @jax.jit
 def _solve(qp: QP, solver: ADMM, warm_start: Any) -> QPSolution:
-    usable = finite_matrices(qp)
-    return solve_factored(qp, factor(usable.P, usable.A, solver, qp.balls), solver, warm_start)
+    return marked(*solve_factored(qp, factor(qp.P, qp.A, solver, qp.balls), solver, warm_start))
 
 
 def as_arrays(qp: QP) -> QP:
@@ -51,9 +58,16 @@ def as_arrays(qp: QP) -> QP:
     return replace(qp, P=(qp.P + qp.P.T) / 2)
 
 
-def solve_factored(qp: QP, factor: Factor, solver: ADMM, warm_start: Any = None) -> QPSolution:
-    """`solve_qp` after its factorization: what a controller repeats at each sample."""
-    clean, finite = cleaned(qp)
+def solve_factored(
+    qp: QP, factor: Factor, solver: ADMM, warm_start: Any = None
+) -> tuple[QPSolution, Array]:
+    """`solve_qp` after its factorization: what a controller repeats at each sample.
+
+    Returns the solution and the fault of the data, NOT_RUN for none. Where there is one the
+    solution is that of harmless data: `marked` says so, after all that is computed from it, for
+    the derivative of a product with NaN is NaN even where nobody looks at it.
+    """
+    clean, fault = cleaned(qp, factor.fault)
     if solver.differentiate == "implicit":
         constants = jax.lax.stop_gradient((clean, factor, solver, warm_start))
         found = search(*constants)
@@ -61,8 +75,7 @@ def solve_factored(qp: QP, factor: Factor, solver: ADMM, warm_start: Any = None)
     else:
         found = search(clean, factor, solver, warm_start)
         z, y = found.z, found.y
-    solution = replace(found, z=z, y=y, cost=value(clean, z, y))
-    return marked(solution, finite)
+    return replace(found, z=z, y=y, cost=value(clean, z, y)), fault
 
 
 def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any) -> QPSolution:
@@ -103,24 +116,14 @@ def ray(factor: Factor, q: Array, bounds: Bounds, d: Array, steps: int) -> Array
     return jax.lax.cond(factor.flat, seek, lambda d: d, d)
 
 
-def finite_matrices(qp: QP) -> QP:
-    """The program with harmless P and A where its own hold NaN or infinity."""
-    finite = lambda v: jnp.all(jnp.isfinite(v))
-    identity = jnp.eye(qp.P.shape[0], dtype=qp.P.dtype)
-    return replace(
-        qp, P=jnp.where(finite(qp.P), qp.P, identity), A=jnp.where(finite(qp.A), qp.A, 0.0)
-    )
+def cleaned(qp: QP, matrix_fault: Array) -> tuple[QP, Array]:
+    """The program with harmless data where its own are not usable, and the fault in them.
 
-
-def cleaned(qp: QP) -> tuple[QP, Array]:
-    """The program with harmless data where its own are not usable, and whether they were.
-
-    Bad data must not reach the loop: NaN would pass through clip unseen on a CPU.
+    matrix_fault: that of P and A, `Factor.fault`. Bad data must not reach the loop: NaN would pass
+    through clip unseen on a CPU.
     """
     finite = (
         jnp.all(jnp.isfinite(qp.q))
-        & jnp.all(jnp.isfinite(qp.A))
-        & jnp.all(jnp.isfinite(qp.P))
         & jnp.all(qp.l <= qp.u)
         & ~jnp.any(jnp.isposinf(qp.l) | jnp.isneginf(qp.u))
     )
@@ -143,10 +146,13 @@ def cleaned(qp: QP) -> tuple[QP, Array]:
     if qp.radius is not None:
         finite = finite & jnp.all(qp.radius >= 0)
         harmless["radius"] = 1.0
+    fault = jnp.where(finite, matrix_fault, jnp.int32(Status.NON_FINITE))
+    usable = fault == Status.NOT_RUN
     fields: dict[str, Any] = {
-        name: jnp.where(finite, getattr(qp, name), v) for name, v in harmless.items()
+        name: jnp.where(usable, getattr(qp, name), v) for name, v in harmless.items()
     }
-    return replace(finite_matrices(qp), **fields), finite
+    P, A = harmless_matrices(qp.P, qp.A, matrix_fault == Status.NOT_RUN)
+    return replace(qp, P=P, A=A, **fields), fault
 
 
 def start(factor: Factor, qp: QP, bounds: Bounds, warm_start: Any) -> Array:
@@ -198,13 +204,6 @@ def corrected(qp: QP, factor: Factor, z: Array, y: Array) -> tuple[Array, Array]
     return jax.lax.scan(move, (z, y), length=2)[0]
 
 
-def precisely(function: Callable, qp: QP, *arguments: Any) -> Any:
-    """function(qp, …) in float64, also for float32 data."""
-    if qp.q.dtype == jnp.float64:
-        return function(qp, *arguments)
-    return in_float64(function)(*jax.lax.stop_gradient((qp, *arguments)))
-
-
 def worst(qp: QP, z: Array, y: Array) -> Array:
     """Largest residual, each relative to the size of its terms: what refinement must lower."""
     norm = lambda v: jnp.max(jnp.abs(v), initial=0.0)
@@ -250,18 +249,16 @@ def prove(qp: QP, factor: Factor, proofs: list[Array], directions: list[Array]) 
     fixed = jnp.where(E == 0, qp.bounds.violation(jnp.zeros_like(E)), 0.0)
     candidates = jnp.stack([fixed, *(E * y for y in proofs)])
     certificate, infeasible = first(*jax.vmap(lambda y: farkas(qp, y))(candidates))
-    tolerance = jnp.sqrt(jnp.finfo(E.dtype).eps)
     candidates = matmul(jnp.stack(directions), factor.T.T)
-    ray, unbounded = first(*jax.vmap(lambda d: descent_ray(qp, d, tolerance))(candidates))
+    ray, unbounded = first(*jax.vmap(lambda d: descent_ray(qp, d))(candidates))
     return Proof(certificate, infeasible, ray, unbounded)
 
 
 def assess(qp: QP, pair: tuple[Array, Array], proof: Proof, solver: ADMM) -> QPSolution:
     """The pair (z, y) judged in the units of `qp`, in float64."""
     (z, y), dtype = pair, qp.q.dtype
-    single = dtype != jnp.float64
-    eps = (1e-3 if single else 1e-6) if solver.eps is None else solver.eps
-    floor = (4 if single else 100) * float(jnp.finfo(dtype).eps)
+    eps = (1e-6 if dtype == jnp.float64 else 1e-3) if solver.eps is None else solver.eps
+    floor = rounding(dtype)
 
     def measure(qp: QP, z: Array, y: Array, eps: Array) -> tuple[Array, ...]:
         solved = jnp.asarray(True)
@@ -292,12 +289,12 @@ def first(vectors: Array, proved: Array) -> tuple[Array, Array]:
     return vectors[jnp.argmax(proved)], jnp.any(proved)
 
 
-def marked(solution: QPSolution, finite: Array) -> QPSolution:
-    """The solution where the data were usable; NaN and NON_FINITE where they were not."""
-    nan = lambda v: jnp.where(finite, v, jnp.nan)
+def marked(solution: QPSolution, fault: Array) -> QPSolution:
+    """The solution where the data were usable; NaN and the status `fault` where they were not."""
+    nan = lambda v: jnp.where(fault == Status.NOT_RUN, v, jnp.nan)
     s = solution
     return replace(
         s, z=nan(s.z), y=nan(s.y), cost=nan(s.cost), primal_residual=nan(s.primal_residual),
         dual_residual=nan(s.dual_residual), gap=nan(s.gap),
-        status=jnp.where(finite, s.status, jnp.int32(Status.NON_FINITE)),
+        status=jnp.where(fault == Status.NOT_RUN, s.status, fault),
     )  # fmt: skip

@@ -15,6 +15,7 @@ class Status(IntEnum):
     PRIMAL_INFEASIBLE = 3
     DUAL_INFEASIBLE = 5
     ITERATION_LIMIT = 7
+    NON_CONVEX = 9
     NON_FINITE = 12
 
     @property
@@ -37,6 +38,10 @@ _SENTENCES = {
     Status.ITERATION_LIMIT: (
         "Neither solved nor proved infeasible within the fixed iterations. "
         "Raise iterations or refine, or compute in float64."
+    ),
+    Status.NON_CONVEX: (
+        "The Hessian of the cost has a negative eigenvalue beyond rounding. "
+        "Make the weights positive semidefinite: check their signs."
     ),
     Status.NON_FINITE: "The data of this instance hold NaN, or l > u, or an infinite cost.",
 }

@@ -19,8 +19,9 @@ from jax import Array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.control.sets import Box
 from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.qp.linalg import eigh
 from jaxmpc.qp.precision import floating_dtype, matmul
-from jaxmpc.robots.physics import Physics, with_forward_jacobian
+from jaxmpc.robots.physics import Physics
 from jaxmpc.robots.tangent import difference, quaternions, retract
 
 if TYPE_CHECKING:
@@ -87,15 +88,14 @@ class Robot:
     def step(self, x: Any, u: Any) -> Array:
         """The state x (nq + nv,) one control period later under the input u (m,), held.
 
-        Differentiable in x, u and the numbers of `plant`, in forward and reverse mode, also where
-        MJX's constraint solver loops: each physics step gives its Jacobian by forward mode. Second
-        derivatives: forward mode over either.
+        Differentiable in x, u and the numbers of `plant`, in forward and reverse mode: each physics
+        step gives its Jacobian by forward mode, and that of constraint forces by their balance, not
+        through MJX's solver. Second derivatives: forward mode over either.
         """
         return _stepped(self, *self._read(x, u))
 
     def _step(self, x: Array, u: Array) -> Array:
-        advance = with_forward_jacobian(self.plant.step)
-        body = lambda x, _: (advance(x, u, self.numbers), None)
+        body = lambda x, _: (self.plant.step(x, u, self.numbers), None)
         return jax.lax.scan(body, x, length=self.substeps)[0]
 
     def linearize(self, x: Any, u: Any, *, exact: bool = False) -> LinearSystem:
@@ -146,12 +146,12 @@ class Robot:
 
     def _transition(self, x: Array, u: Array) -> tuple[Array, Array]:
         nq, nv = self.mujoco.nq, self.mujoco.nv
-        after = self.plant.step(x, u, self.numbers)
 
         def motion(d: Array, u: Array) -> Array:
             moved = jnp.concatenate([retract(self.joints, x[:nq], d[:nv]), x[nq:] + d[nv:]])
             y = self.plant.step(moved, u, self.numbers)
-            return jnp.concatenate([difference(self.joints, after[:nq], y[:nq]), y[nq:]])
+            at = jax.lax.stop_gradient(y[:nq])
+            return jnp.concatenate([difference(self.joints, at, y[:nq]), y[nq:]])
 
         A, B = jax.jacfwd(motion, argnums=(0, 1))(jnp.zeros(self.n, x.dtype), u)
         return A, B
@@ -304,7 +304,7 @@ class Robot:
         inertia = matmul(turn * of("body_inertia")[i], turn.T)
         for m, p in ((mass, centre), (payload, at)):
             inertia = inertia + m * matmul(cross(p - middle).T, cross(p - middle))
-        principal, axes = jnp.linalg.eigh(inertia)
+        principal, axes = eigh(inertia)
         axes = axes * jnp.sign(jnp.linalg.det(axes))
         put = lambda key, value: of(key).at[i].set(value)
         return {
@@ -347,5 +347,5 @@ def _quaternion(R: Array) -> Array:
         [z[0] + x[2], z[1] + y[2], z[2] - x[0] - y[1], x[1] - y[0]],
         [y[2] - z[1], z[0] - x[2], x[1] - y[0], x[0] + y[1] + z[2]],
     ])  # fmt: skip
-    q = jnp.linalg.eigh(K / 3)[1][:, -1]
+    q = eigh(K / 3)[1][:, -1]
     return jnp.array([q[3], q[0], q[1], q[2]])

@@ -158,20 +158,19 @@ def last_rung(controller: Controller, x: Array) -> tuple[Array, ...]:
 
     def one(x0: Array) -> tuple[Array, ...]:
         qp, _ = program(controller, x0)
-        s = solve_factored(qp, f, solver)
-        return results(controller, x0, s)
+        return results(controller, x0, marked(*solve_factored(qp, f, solver)))
 
     return jax.vmap(one)(x)
 
 
 def program(controller: Controller, x0: Array) -> tuple[QP, Array]:
-    """The QP at x0, made harmless where x0 is not finite."""
-    assert controller.condensed is not None
-    return cleaned(controller.condensed.qp(x0))
+    """The QP at x0, made harmless where x0 is not finite, and the fault in it."""
+    assert controller.condensed is not None and controller.factor is not None
+    return cleaned(controller.condensed.qp(x0), controller.factor.fault)
 
 
 def finish(
-    controller: Controller, f: Factor, x0: Array, qp: QP, finite: Array, w: Array, y: Array,
+    controller: Controller, f: Factor, x0: Array, qp: QP, fault: Array, w: Array, y: Array,
     proofs: list[Array], steps: int,
 ) -> tuple[Array, ...]:  # fmt: skip
     """Polish, judge, and lay out: inputs, cost, status, three residuals, and (w, y) to go on."""
@@ -179,7 +178,7 @@ def finish(
     end = polish(f.H, q, f.A, bounds, w, y, steps)
     proof = prove(qp, f, [*proofs, end.change], [end.move])
     pair = unscaled(qp, f, end.w, end.y)
-    s: QPSolution = marked(assess(qp, pair, proof, controller.solver), finite)
+    s: QPSolution = marked(assess(qp, pair, proof, controller.solver), fault)
     return *results(controller, x0, s), end.w, end.y
 
 

@@ -22,15 +22,15 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
-from jax.scipy.linalg import cho_solve
 
 from jaxmpc.checks import concrete, fail, require_shape, whole
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp import linalg
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.refine import Constants, cholesky, gram, newton_step
+from jaxmpc.qp.refine import Constants, gram, newton_step, ridged
 from jaxmpc.tuning import archive
 from jaxmpc.tuning.descent import descend, minibatch
 from jaxmpc.tuning.parameters import Parameters, raw, require_parameters, values
@@ -105,14 +105,14 @@ def _membership(c: Condensed, x0s: Array, width: Array, scale: Any, steps: int) 
     # Newton starts where two-sided rows are nearest their centres, by least squares.
     both = jnp.isfinite(tight.l) & jnp.isfinite(tight.u)
     centred = jax.lax.stop_gradient(jnp.where(both[:, None], C, 0.0))
-    factor = cholesky(matmul(centred.T, centred), 1.0)
+    normal = ridged(matmul(centred.T, centred), 1.0)
 
     def one(x0: Array) -> Array:
         # The minimiser, and which states have one that numbers can hold: constants here.
         given = jnp.all(jnp.isfinite(x0))
         x0 = jnp.where(given, x0, 0.0)
         fixed, bounds = jax.lax.stop_gradient((C, at(C, D, tight, x0)))
-        z = cho_solve((factor, True), matmul(jnp.where(both, bounds.l + bounds.u, 0) / 2, centred))
+        z = linalg.solve(normal, matmul(jnp.where(both, bounds.l + bounds.u, 0) / 2, centred))
         z, e = nearest(fixed, bounds, z, steps)
         usable = given & jnp.isfinite(jnp.sum(e**2) / width**4) & jnp.all(jnp.isfinite(z))
         x0, z = jnp.where(usable, x0, 0.0), jax.lax.stop_gradient(jnp.where(usable, z, 0.0))

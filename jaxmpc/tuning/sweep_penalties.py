@@ -20,11 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
-from jax.scipy.linalg import cho_solve
 
 from jaxmpc.checks import fail, whole
 from jaxmpc.compiled import default_chunk, padded, require_step_type
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp import linalg
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.sweeps import proofs
@@ -184,9 +184,9 @@ def shortfall(
     """How far the rung's answer at θ is from a proof of its label; ≤ 0: none is missing."""
     U, bounds = jnp.asarray(rows.U), rows.bounds(theta)
     A = weight[:, None] * U
-    cholesky = (jnp.linalg.cholesky(matmul(A.T, A)), True)
-    onto = lambda v: cho_solve(cholesky, matmul(A.T, v))
-    P = matmul(A, cho_solve(cholesky, A.T))
+    pseudoinverse = linalg.solve(matmul(A.T, A), A.T)
+    onto = lambda v: matmul(pseudoinverse, v)
+    P = matmul(A, pseudoinverse)
 
     def scaled(bound: Array) -> Array:
         finite = jnp.isfinite(bound)

@@ -1,0 +1,301 @@
+"""Factorizations and solves of small dense matrices, in batches that cannot wait for each other.
+
+`jax.vmap` of `jnp.linalg.cholesky` and its like becomes one LAPACK call for a whole batch. On CPUs
+jaxlib 0.10.0 to 0.11.0 (the newest for Python 3.11) spreads that call over the thread pool and
+waits for its parts on a thread of the same pool: two such calls at once, in one program or in
+two, can wait for each other for ever. The functions here are the only ones of the package that
+factor under `vmap`. One matrix is a LAPACK call of its own, which uses no pool. A batch on a CPU is
+
+* up to SMALL rows, eliminated in plain XLA operations, LANES matrices side by side: 1.5 to 5 times
+  as fast as LAPACK one by one;
+* above, one LAPACK call a matrix on those jaxlibs, and one call for all where that is safe.
+
+On other devices JAX's batched routines serve. Nested `vmap`s are one batch. All functions here have
+derivatives of any order, forward and reverse. A matrix that is not positive definite gives NaN.
+"""
+
+import re
+from collections.abc import Callable
+from functools import partial
+from importlib.metadata import version
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+from jax.custom_batching import custom_vmap
+
+from jaxmpc.qp.precision import matmul
+
+JAXLIB = tuple(int(part) for part in re.findall(r"\d+", version("jaxlib"))[:3])
+# Versions whose batched LAPACK calls can wait for each other.
+WAITS = (0, 10, 0) <= JAXLIB < (0, 11, 1)
+SMALL = 12
+LANES = 64
+
+
+def _batched(one: Callable, plain: Callable | None = None, columns: bool = False) -> Callable:
+    """The function `one` of a matrix (and right-hand sides), whose `vmap` follows the rules above.
+
+    one: LAPACK's answer for one matrix. plain: the same in plain operations for matrices side by
+    side, all arguments and results with the batch as last axis. columns: the second argument is
+    right-hand sides (n, k), the batch of which needs one factorization where it shares the matrix.
+    """
+
+    def on_cpu(*args: Array) -> Any:
+        if plain is not None and args[0].shape[-1] <= SMALL:
+            return _side_by_side(plain, args)
+        return lax.map(lambda each: one(*each), args) if WAITS else jax.vmap(one)(*args)
+
+    @custom_vmap
+    def many(*args: Array) -> Any:
+        return lax.platform_dependent(*args, cpu=on_cpu, default=jax.vmap(one))
+
+    @many.def_vmap
+    def _(size: int, in_batched: Any, *args: Array) -> Any:
+        args = _all_batched(size, in_batched, args)
+        out = many(*(v.reshape(-1, *v.shape[2:]) for v in args))
+        out = jax.tree.map(lambda v: v.reshape(size, -1, *v.shape[1:]), out)
+        return out, jax.tree.map(lambda _: True, out)
+
+    single = custom_vmap(one)
+
+    @single.def_vmap
+    def _(size: int, in_batched: Any, *args: Array) -> Any:
+        if columns and not in_batched[0]:
+            M, B = args
+            out = single(M, jnp.moveaxis(B, 0, -1).reshape(len(M), -1))
+            return jnp.moveaxis(out.reshape(*B.shape[1:], size), -1, 0), True
+        out = many(*_all_batched(size, in_batched, args))
+        return out, jax.tree.map(lambda _: True, out)
+
+    return single
+
+
+def _all_batched(size: int, in_batched: Any, args: tuple[Array, ...]) -> tuple[Array, ...]:
+    pairs = zip(args, in_batched, strict=True)
+    return tuple(v if b else jnp.broadcast_to(v, (size, *v.shape)) for v, b in pairs)
+
+
+def _side_by_side(plain: Callable, args: tuple[Array, ...]) -> Any:
+    """`plain` on groups of LANES, whose data stay within the cache."""
+    count = args[0].shape[0]
+    lanes = min(LANES, count)
+    missing = -count % lanes
+
+    def grouped(v: Array) -> Array:
+        v = jnp.concatenate([v, jnp.broadcast_to(v[:1], (missing, *v.shape[1:]))]) if missing else v
+        return jnp.moveaxis(v.reshape(-1, lanes, *v.shape[1:]), 1, -1)
+
+    out = lax.map(lambda group: plain(*group), tuple(grouped(v) for v in args))
+    return jax.tree.map(
+        lambda v: jnp.moveaxis(v, -1, 1).reshape(-1, *v.shape[1:-1])[:count], out
+    )  # fmt: skip
+
+
+def _eliminated(M: Array) -> tuple[Array, Array]:
+    """Gaussian elimination of M = [K, B] (n, n + k, lanes) without pivoting, K = L D L'.
+
+    Returns [D L', L⁻¹B], L with unit diagonal, and D (n, lanes), NaN in all of a lane where a
+    pivot is not positive.
+    """
+    n = M.shape[0]
+    row = jnp.arange(n)[:, None]
+
+    def column(j: Array, M: Array) -> Array:
+        pivot = lax.dynamic_index_in_dim(M, j, 0, keepdims=False)
+        down = lax.dynamic_index_in_dim(M, j, 1, keepdims=False)
+        factors = jnp.where(row > j, down / lax.dynamic_index_in_dim(down, j, 0), 0.0)
+        # Unless they are materialised, XLA computes them again for each entry of M.
+        factors, pivot = lax.optimization_barrier((factors, pivot))
+        return M - factors[:, None] * pivot
+
+    M = lax.fori_loop(0, n, column, M)
+    D = jnp.stack([M[i, i] for i in range(n)])
+    return M, jnp.where(jnp.all(D > 0, axis=0), D, jnp.nan)
+
+
+def _substituted(U: Array, D: Array, B: Array) -> Array:
+    """U⁻¹B by columns from the last, U (n, n, lanes) upper triangular with diagonal D."""
+    n = U.shape[0]
+    row = jnp.arange(n)[:, None, None]
+
+    def column(i: Array, X: Array) -> Array:
+        j = n - 1 - i
+        x = lax.dynamic_index_in_dim(X, j, 0) / lax.dynamic_index_in_dim(D, j, 0)[:, None]
+        u = lax.dynamic_index_in_dim(U, j, 1)
+        u, x = lax.optimization_barrier((u, x))
+        return jnp.where(row < j, X - u * x, jnp.where(row == j, x, X))
+
+    return lax.fori_loop(0, n, column, B)
+
+
+def _solve_plain(K: Array, B: Array) -> Array:
+    n = K.shape[0]
+    M, D = _eliminated(jnp.concatenate([K, B], axis=1))
+    return _substituted(M[:, :n], D, M[:, n:])
+
+
+def _solve_lapack(K: Array, B: Array) -> Array:
+    L = lax.linalg.cholesky(K, symmetrize_input=False)
+    half = lax.linalg.triangular_solve(L, B, left_side=True, lower=True)
+    return lax.linalg.triangular_solve(L, half, left_side=True, lower=True, transpose_a=True)
+
+
+def _cholesky_plain(K: Array) -> Array:
+    M, D = _eliminated(K)
+    upper = jnp.arange(K.shape[0])[:, None] <= jnp.arange(K.shape[0])
+    return jnp.where(upper[..., None], M / jnp.sqrt(D)[:, None], 0.0).swapaxes(0, 1)
+
+
+def _inverse_root_plain(K: Array) -> Array:
+    n = K.shape[0]
+    identity = jnp.broadcast_to(jnp.eye(n, dtype=K.dtype)[..., None], K.shape)
+    M, D = _eliminated(jnp.concatenate([K, identity], axis=1))
+    return M[:, n:] / jnp.sqrt(D)[:, None]
+
+
+def _inverse_root_lapack(K: Array) -> Array:
+    L = lax.linalg.cholesky(K, symmetrize_input=False)
+    return _triangular_lapack(L, jnp.eye(len(K), dtype=K.dtype))
+
+
+def _triangular_plain(L: Array, B: Array) -> Array:
+    flipped = L[::-1, ::-1]
+    D = jnp.stack([flipped[i, i] for i in range(L.shape[0])])
+    return _substituted(flipped, D, B[::-1])[::-1]
+
+
+def _triangular_lapack(L: Array, B: Array) -> Array:
+    return lax.linalg.triangular_solve(L, B, left_side=True, lower=True)
+
+
+_solve = _batched(_solve_lapack, _solve_plain, columns=True)
+_cholesky = _batched(partial(lax.linalg.cholesky, symmetrize_input=False), _cholesky_plain)
+_inverse_root = _batched(_inverse_root_lapack, _inverse_root_plain)
+_triangular = _batched(_triangular_lapack, _triangular_plain, columns=True)
+_general = _batched(jnp.linalg.solve, columns=True)
+_eigh = _batched(lambda K: tuple(jnp.linalg.eigh(K)))
+
+
+def solve(K: Array, B: Array) -> Array:
+    """Return K⁻¹B for K (n, n) symmetric positive definite and B (n,) or (n, k)."""
+    fixed = lax.stop_gradient(K)
+    return lax.custom_linear_solve(
+        lambda X: matmul(K, X), B, lambda _, B: _columns(_solve, fixed, B), symmetric=True
+    )
+
+
+def solve_general(M: Array, B: Array) -> Array:
+    """Return M⁻¹B for M (n, n) nonsingular and B (n,) or (n, k)."""
+    fixed = lax.stop_gradient(M)
+    return lax.custom_linear_solve(
+        lambda X: matmul(M, X), B, lambda _, B: _columns(_general, fixed, B),
+        lambda _, B: _columns(_general, fixed.T, B),
+    )  # fmt: skip
+
+
+def solve_triangular(L: Array, B: Array) -> Array:
+    """Return L⁻¹B for L (n, n), of which the lower triangle is read, and B (n,) or (n, k)."""
+    L = jnp.tril(L)
+    fixed = lax.stop_gradient(L)
+    turned = lambda _, B: _columns(_triangular, fixed.T[::-1, ::-1], B[::-1])[::-1]
+    return lax.custom_linear_solve(
+        lambda X: matmul(L, X), B, lambda _, B: _columns(_triangular, fixed, B), turned
+    )
+
+
+def _columns(function: Callable, M: Array, B: Array) -> Array:
+    return function(M, B) if B.ndim == 2 else function(M, B[:, None])[:, 0]
+
+
+@jax.custom_jvp
+def cholesky(K: Array) -> Array:
+    """Return the lower triangular L with L L' = K, symmetric positive definite (n, n)."""
+    return _cholesky(K)
+
+
+@cholesky.defjvp
+def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    # L⁻¹ dK L⁻' = S + S' with S = L⁻¹ dL lower triangular (Murray 2016, arXiv:1602.07527, eq. 8).
+    L = cholesky(*primals)
+    half = solve_triangular(L, tangents[0])
+    return L, matmul(L, _lower_half(solve_triangular(L, half.T).T))
+
+
+@jax.custom_jvp
+def inverse_root(K: Array) -> Array:
+    """Return the lower triangular W with W K W' = I, for K symmetric positive definite (n, n).
+
+    W is the inverse of the Cholesky factor: K⁻¹ = W'W.
+    """
+    return _inverse_root(K)
+
+
+@inverse_root.defjvp
+def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    W = inverse_root(*primals)
+    return W, -matmul(_lower_half(matmul(W, matmul(tangents[0], W.T))), W)
+
+
+def definite_solver(K: Array) -> Callable[[Array], Array]:
+    """Return the function v (n,) → K⁻¹v for K (n, n) symmetric positive definite, factored once.
+
+    By products with the inverse root, which batches take in one; a step of iterative refinement
+    makes up for what an explicit inverse loses on ill-conditioned K (Higham 2002, §12.1).
+    """
+    W = inverse_root(K)
+    rough = lambda v: matmul(matmul(v, W.T), W)
+
+    def solved(v: Array) -> Array:
+        x = rough(v)
+        return x + rough(v - matmul(x, K))
+
+    return solved
+
+
+def _lower_half(S: Array) -> Array:
+    """The lower triangle of S with half of its diagonal."""
+    return jnp.tril(S) - 0.5 * jnp.diag(jnp.diag(S))
+
+
+@jax.custom_jvp
+def eigh(K: Array) -> tuple[Array, Array]:
+    """Return the eigenvalues (n,), rising, and eigenvectors as columns (n, n) of a symmetric K."""
+    return _eigh(K)
+
+
+@eigh.defjvp
+def _(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+    w, V = eigh(*primals)
+    moved = matmul(V.T, matmul(tangents[0], V))
+    gaps = w[None, :] - w[:, None] + jnp.eye(len(w), dtype=w.dtype)
+    turned = moved * (1 - jnp.eye(len(w), dtype=w.dtype)) / gaps
+    return (w, V), (jnp.diag(moved), matmul(V, turned))
+
+
+def _cholesky_in_place(K: Array, **_: Any) -> Array:
+    return cholesky(K)
+
+
+def _triangular_in_place(
+    M: Array, B: Array, *, left_side: bool, lower: bool, transpose_a: bool, unit_diagonal: bool,
+    **_: Any,
+) -> Array:  # fmt: skip
+    """The operation of `jax.lax.linalg.triangular_solve` for one real matrix."""
+    if not left_side:  # X M = B is M'X' = B'
+        B, transpose_a = B.T, not transpose_a
+    M = jnp.tril(M) if lower else jnp.triu(M)
+    if unit_diagonal:
+        M = M - jnp.diag(jnp.diag(M)) + jnp.eye(len(M), dtype=M.dtype)
+    if transpose_a:
+        M, lower = M.T, not lower
+    X = solve_triangular(M, B) if lower else solve_triangular(M[::-1, ::-1], B[::-1])[::-1]
+    return X if left_side else X.T
+
+
+# What stands in for JAX's own operations in functions of other libraries (`robots/rewrite.py`).
+STAND_INS = {
+    lax.linalg.cholesky_p: _cholesky_in_place,
+    lax.linalg.triangular_solve_p: _triangular_in_place,
+}

@@ -1,0 +1,85 @@
+"""Factorizations and solves in batches: values, derivatives, and no LAPACK call for a batch."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmpc.qp import linalg
+
+FUNCTIONS = {  # ours, and NumPy's answer
+    "solve": (linalg.solve, lambda K, B: np.linalg.solve(K, B)),
+    "solve_general": (linalg.solve_general, lambda K, B: np.linalg.solve(K, B)),
+    "solve_triangular": (linalg.solve_triangular, lambda K, B: np.linalg.solve(np.tril(K), B)),
+    "cholesky": (lambda K, B: linalg.cholesky(K), lambda K, B: np.linalg.cholesky(K)),
+    "inverse_root": (
+        lambda K, B: linalg.inverse_root(K), lambda K, B: np.linalg.inv(np.linalg.cholesky(K)),
+    ),
+    "eigh": (
+        lambda K, B: (lambda w, V: (V * w) @ V.T)(*linalg.eigh(K)), lambda K, B: K,
+    ),
+}  # fmt: skip
+# What jax differentiates by itself, for the derivatives.
+PEERS = {
+    "solve": jnp.linalg.solve,
+    "solve_general": jnp.linalg.solve,
+    "solve_triangular": lambda K, B: jax.scipy.linalg.solve_triangular(K, B, lower=True),
+    "cholesky": lambda K, B: jnp.linalg.cholesky(K),
+    "inverse_root": lambda K, B: jnp.linalg.inv(jnp.linalg.cholesky(K)),
+    "eigh": lambda K, B: (lambda w, V: (V * w) @ V.T)(*jnp.linalg.eigh(K)),
+}
+
+
+def matrices(count, n, seed=0, k=3):
+    """Well-conditioned definite matrices (count, n, n) and right-hand sides (count, n, k)."""
+    rng = np.random.default_rng(seed)
+    M = rng.normal(size=(count, n, n))
+    return M @ M.swapaxes(1, 2) / n + np.eye(n), rng.normal(size=(count, n, k))
+
+
+@pytest.mark.parametrize("n", [1, 3, linalg.SMALL, linalg.SMALL + 1])
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_values(name, n):
+    """One, a batch that is no multiple of the group, nested batches, and a shared matrix."""
+    function, expected = FUNCTIONS[name]
+    with jax.enable_x64(True):
+        K, B = matrices(linalg.LANES + 6, n)
+        truth = np.stack([expected(*pair) for pair in zip(K, B, strict=True)])
+        close = lambda found, of: np.testing.assert_allclose(found, of, rtol=1e-9, atol=1e-11)
+        close(function(jnp.asarray(K[0]), jnp.asarray(B[0])), truth[0])
+        close(jax.vmap(function)(K, B), truth)
+        nested = jax.vmap(jax.vmap(function))(K.reshape(10, 7, n, n), B.reshape(10, 7, n, 3))
+        close(nested.reshape(truth.shape), truth)
+        shared = jax.vmap(function, in_axes=(None, 0))(K[0], B)
+        close(shared, np.stack([expected(K[0], b) for b in B]))
+
+
+@pytest.mark.parametrize("n", [3, linalg.SMALL + 1])
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_derivatives(name, n):
+    """Reverse, forward, and forward over reverse, under vmap: those of JAX's own routines."""
+    with jax.enable_x64(True):
+        K, B = matrices(3, n, seed=1)
+
+        def total(function):
+            return lambda K, B: jnp.sum(jnp.sin(function((K + K.T) / 2, B)))
+
+        ours, theirs = total(FUNCTIONS[name][0]), total(PEERS[name])
+        for derivative in (
+            lambda f: jax.grad(f, argnums=(0, 1)),
+            lambda f: jax.jacfwd(f, argnums=(0, 1)),
+            lambda f: lambda K, B: jax.jvp(lambda K: jax.grad(f)(K, B), (K,), (jnp.cos(K),))[1],
+        ):
+            found, expected = (jax.vmap(derivative(f))(K, B) for f in (ours, theirs))
+            for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+                np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-8 * (1 + np.abs(b).max()))
+
+
+@pytest.mark.parametrize("n", [3, linalg.SMALL + 1])
+def test_an_indefinite_matrix_is_nan_alone(n):
+    K, B = matrices(4, n)
+    K[1, 0, 0] = -1.0
+    for name in ("solve", "cholesky", "inverse_root"):
+        found = jax.vmap(FUNCTIONS[name][0])(jnp.asarray(K), jnp.asarray(B))
+        bad = [bool(jnp.any(jnp.isnan(part))) for part in found]
+        assert bad == [False, True, False, False]

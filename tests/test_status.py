@@ -1,0 +1,181 @@
+"""A status is true whatever the units are, and a bad instance spoils nobody else's derivative."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmpc as jm
+
+INF = np.inf
+PRECISIONS = pytest.mark.parametrize("x64", [False, True], ids=["float32", "float64"])
+solve = jax.jit(jax.vmap(jm.solve_qp))
+N, M = 6, 12
+
+
+def batch(programs, dtype):
+    """One QP whose fields have a leading axis."""
+    return jm.QP(*(jnp.asarray(np.stack(part), dtype) for part in zip(*programs, strict=True)))
+
+
+def bounded(rng):
+    """Feasible, with N independent rows bounded on both sides: neither empty nor unbounded."""
+    factor, A = rng.normal(size=(rng.integers(0, N), N)), rng.normal(size=(M, N))
+    value = A @ rng.normal(size=N)
+    l, u = value - rng.uniform(0, 1, M), value + rng.uniform(0, 1, M)
+    single, above = np.arange(M) >= N, rng.random(M) < 0.5
+    l, u = np.where(single & above, -INF, l), np.where(single & ~above, INF, u)
+    return factor.T @ factor, rng.normal(size=N), A, l, u
+
+
+def unbounded(rng):
+    """Feasible, and the cost falls along a direction d without curvature that no row stops."""
+    d = rng.normal(size=N)
+    across = lambda M: M - np.outer(M @ d, d) / (d @ d)
+    factor = across(rng.normal(size=(rng.integers(0, N), N)))
+    A, count = rng.normal(size=(M, N)), rng.integers(0, M // 3)
+    A[:count] = across(A[:count])
+    value, slope = A @ rng.normal(size=N), A @ d
+    l, u = value - rng.uniform(0.1, 1, M), value + rng.uniform(0.1, 1, M)
+    free = np.arange(M) >= count
+    l, u = np.where(free & (slope < 0), -INF, l), np.where(free & (slope > 0), INF, u)
+    q = rng.normal(size=N)
+    return factor.T @ factor, q - d * (q @ d + 1) / (d @ d), A, l, u
+
+
+def empty(rng):
+    """Two of the rows contradict each other."""
+    P, q, A, l, u = bounded(rng)
+    A[1], l[0], u[0], l[1], u[1] = A[0], 1.0, 2.0, -2.0, -1.0
+    return P, q, A, l, u
+
+
+def rescaled(program, rng, decades):
+    """The program in other units: variables and rows multiplied by 10^±decades/2."""
+    P, q, A, l, u = program
+    unit, row = (10.0 ** rng.uniform(-decades / 2, decades / 2, k) for k in (N, M))
+    return P * unit * unit[:, None], q * unit, row[:, None] * A * unit, row * l, row * u
+
+
+@PRECISIONS
+@pytest.mark.parametrize("decades", [0, 4, 12])
+@pytest.mark.parametrize("make", [bounded, unbounded, empty])
+def test_no_false_status_in_any_units(make, decades, x64):
+    """What is not decided may stay so; what is said must be true."""
+    allowed = {
+        bounded: (jm.Status.SOLVED,),
+        unbounded: (jm.Status.DUAL_INFEASIBLE,),
+        empty: (jm.Status.PRIMAL_INFEASIBLE,),
+    }[make]
+    rng = np.random.default_rng(7)
+    with jax.enable_x64(x64):
+        qps = [rescaled(make(rng), rng, decades) for _ in range(150)]
+        status = np.asarray(solve(batch(qps, float if x64 else np.float32)).status)
+    assert set(status) <= {*allowed, jm.Status.ITERATION_LIMIT}
+    if x64 and decades < 12:
+        assert np.mean(np.isin(status, allowed)) >= 0.95
+
+
+@pytest.mark.parametrize(
+    ("x64", "least"), [(False, 1e-5), (False, 1e-6), (False, 1e-9), (True, 1e-10), (True, 1e-13)]
+)
+def test_a_small_coefficient_still_bounds(x64, least):
+    """min ½ z₂² − z₁ with least·z₁ ≤ 1: the optimum lies at 1/least, it is not at infinity."""
+    with jax.enable_x64(x64):
+        sol = jm.solve_qp(
+            jm.QP(
+                P=np.diag([0.0, 1.0]), q=np.array([-1.0, 0.0]), A=np.array([[least, 0], [1, 1]]),
+                l=np.array([-INF, -1]), u=np.array([1, INF]),
+            )
+        )  # fmt: skip
+    assert sol.status in (jm.Status.SOLVED, jm.Status.ITERATION_LIMIT)
+
+
+@PRECISIONS
+def test_negative_curvature_has_a_status(x64):
+    """Indefinite but for rounding; whatever stands on the diagonal, and in whatever units."""
+    rng = np.random.default_rng(3)
+    M = rng.normal(size=(3, 6))
+    singular = M.T @ M
+    negative = singular - 1e-3 * np.eye(6)
+    units = 10.0 ** np.linspace(-3, 3, 6)
+    small = np.eye(6)
+    small[5, 5] = -3e-7
+    crossed = np.zeros((6, 6))
+    crossed[0, 1] = crossed[1, 0] = 1.0
+    P = [singular, singular * units * units[:, None], np.zeros((6, 6)), np.eye(6), negative,
+         negative * units * units[:, None], small, crossed]  # fmt: skip
+    with jax.enable_x64(x64):
+        box = 1e4 * np.ones(6)
+        dtype = float if x64 else np.float32
+        status = solve(
+            batch([(p, np.ones(6) * 0.1, np.eye(6), -box, box) for p in P], dtype)
+        ).status
+        sol = solve(batch([(negative, np.ones(6), np.eye(6), -box, box)], dtype))
+    bad = np.asarray(status) == jm.Status.NON_CONVEX
+    np.testing.assert_array_equal(bad, [False] * 4 + [True] * 4)
+    assert np.all(np.isnan(sol.z)) and np.isnan(sol.cost[0])
+    assert "negative eigenvalue" in jm.Status(int(sol.status[0])).sentence
+
+
+def test_an_overflow_has_a_status():
+    """Finite numbers whose squares are not: their neighbours are solved."""
+    A = np.stack([np.eye(2), 1e30 * np.eye(2)]).astype(np.float32)
+    qp = jm.QP(P=jnp.eye(2), q=jnp.ones(2), A=jnp.asarray(A), l=-jnp.ones(2), u=jnp.ones(2))
+    axes = jm.QP(P=None, q=None, A=0, l=None, u=None)
+    status = jax.jit(jax.vmap(jm.solve_qp, in_axes=(axes,)))(qp).status
+    assert status[0] == jm.Status.SOLVED and status[1] != jm.Status.PRIMAL_INFEASIBLE
+
+
+@PRECISIONS
+@pytest.mark.parametrize("mode", [jax.grad, jax.jacfwd])
+def test_a_bad_program_leaves_the_shared_gradient(mode, x64):
+    """Of a parameter that an indefinite, a NaN and an empty program share with two good ones."""
+    kinds = np.stack([np.eye(2), np.diag([1.0, -1.0]), np.full((2, 2), np.nan), 2 * np.eye(2)])
+
+    def loss(t, P):
+        qp = jm.QP(P=P * t, q=jnp.array([1.0, -3.0]) * t, A=jnp.eye(2) * t, l=-jnp.ones(2),
+                   u=jnp.ones(2) * t)  # fmt: skip
+        sol = jm.solve_qp(qp)
+        return jnp.where(sol.status == jm.Status.SOLVED, jnp.sum(sol.z) + sol.cost, 0.0)
+
+    with jax.enable_x64(x64):
+        total = lambda t, P: jnp.sum(jax.vmap(loss, in_axes=(None, 0))(t, jnp.asarray(P)))
+        everyone, good = mode(total)(1.0, kinds), mode(total)(1.0, kinds[[0, 3]])
+    assert np.isfinite(good) and good != 0
+    np.testing.assert_allclose(everyone, good, rtol=1e-5)
+
+
+@pytest.mark.parametrize("stagewise", [False, True])
+def test_a_bad_plan_leaves_the_shared_gradient(stagewise):
+    """Of the dynamics, which a plan with indefinite Q, with NaN in Q and one from NaN share."""
+    A, B = jnp.array([[1.0, 0.1], [0.0, 1.0]]), jnp.array([[0.0], [0.1]])
+    limit = jm.Box(-np.ones(1), np.ones(1))
+
+    def plan(a, weight, x):
+        system = jm.LinearSystem(A * a, B * a)
+        mpc = jm.MPC(system, Q=jnp.eye(2) * weight, R=np.eye(1), horizon=5, inputs=limit)
+        return jm.solve_stagewise(mpc, system, x) if stagewise else jm.solve(mpc, x)
+
+    def loss(a, weights, x):
+        plans = jax.vmap(plan, in_axes=(None, 0, 0))(a, weights, x)
+        solved = plans.status == jm.Status.SOLVED
+        states = jnp.where(solved[:, None, None], plans.states, 0.0)
+        return jnp.sum(jnp.where(solved, plans.cost, 0.0)) + jnp.sum(states), plans.status
+
+    weights = jnp.array([1.0, -500.0, 1.0, jnp.nan, 2.0])
+    x = jnp.array([[1.0, 0], [1, 0], [jnp.nan, 0], [1, 0], [2, 0]])
+    gradient = jax.jit(jax.grad(loss, has_aux=True))
+    everyone, status = gradient(1.0, weights, x)
+    np.testing.assert_array_equal(status, [1, 9, 12, 12, 1])
+    good, _ = gradient(1.0, weights[jnp.array([0, 4])], x[jnp.array([0, 4])])
+    assert np.isfinite(good) and good != 0
+    np.testing.assert_allclose(everyone, good, rtol=1e-4)
+
+
+def test_the_mpc_of_an_indefinite_weight_is_refused_where_it_can_be_read():
+    mpc = jm.MPC(jm.LinearSystem(np.eye(1), np.eye(1)), np.eye(1), np.eye(1), 3)
+    with pytest.raises(ValueError, match="Q: .*not positive semidefinite"):
+        jm.solve(replace(mpc, Q=-np.eye(1)), [0.0])
