@@ -232,8 +232,9 @@ class TestProofs:
             y = rng.standard_normal((300, 4, 5)) * scales[:, None, None]
             y_N = rng.standard_normal((300, 2)) * scales[:, None]
             y[:100] = np.maximum(y[:100], 0)
-            cut = lambda a, b: proofs.cut(self.problem, a, b, jnp.zeros(0))[:2]
-            normals, offsets = jax.vmap(cut)(y, y_N)
+            cut = lambda a, b: proofs.cut(self.problem, a, b, jnp.zeros(0))
+            everywhere = lambda a, b: proofs.everywhere(self.problem, *cut(a, b))
+            normals, offsets = jax.vmap(everywhere)(y, y_N)
         finite = np.flatnonzero(np.isfinite(offsets))
         assert len(finite) > 100
         for i in finite:

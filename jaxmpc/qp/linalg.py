@@ -294,8 +294,12 @@ def _triangular_in_place(
     return X if left_side else X.T
 
 
-# What stands in for JAX's own operations in functions of other libraries (`robots/rewrite.py`).
-STAND_INS = {
-    lax.linalg.cholesky_p: _cholesky_in_place,
-    lax.linalg.triangular_solve_p: _triangular_in_place,
-}
+def stand_ins() -> dict[Any, Callable]:
+    """Return what replaces JAX's own operations in functions of other libraries
+    (`robots/rewrite.py`), by primitive: nothing where batches of them are safe."""
+    if not WAITS:
+        return {}
+    return {
+        lax.linalg.cholesky_p: _cholesky_in_place,
+        lax.linalg.triangular_solve_p: _triangular_in_place,
+    }

@@ -1,31 +1,33 @@
 """One physics step of a MuJoCo model in MJX, and how it is differentiated."""
 
 import contextlib
+import copy
 import io
-import re
 import warnings
 from collections.abc import Callable, Mapping
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+from jax.extend.core.primitives import sqrt_p
 
 from jaxmpc.checks import fail
-from jaxmpc.robots.tangent import normalised, quaternions, retract
+from jaxmpc.qp.linalg import JAXLIB, solve, stand_ins
+from jaxmpc.robots.rewrite import moving, rewritten
+from jaxmpc.robots.tangent import normalised, retract
 
 if TYPE_CHECKING:
     import mujoco
 
 
-JAXLIB = tuple(int(part) for part in re.findall(r"\d+", version("jaxlib"))[:3])
+# mjtIntegrator.
+EULER, RK4 = 0, 1
 
-# mjtIntegrator; it moves the configuration by several velocities, not by the last.
-RK4 = 1
+# mjtDisableBit.
+NO_CONSTRAINTS = 1
 
 # Operations that old jaxlibs may fuse on a CPU.
 PIECE = 15
@@ -49,31 +51,129 @@ class Physics:
                 mjx.make_data(model)
         except NotImplementedError as error:
             fail("model", f"MJX does not support it: {error}", "Take that out of the file")
-        if quaternions(self.joints) and model.opt.integrator == RK4:
-            fail("model", "moves orientations by RK4", 'Use integrator="Euler" or "implicitfast"')
 
     def step(self, x: Array, u: Array, numbers: Mapping[str, Any] | None = None) -> Array:
         """x = (qpos, qvel) one physics step later: a function of x, u and nothing carried along.
 
-        numbers: fields of mjx.Model to replace.
+        numbers: fields of mjx.Model to replace. Differentiable in all three, forward and reverse;
+        with constraints by `with_forward_jacobian`.
         """
         numbers = jax.tree.map(jnp.asarray, dict(numbers or {}))
-        return in_pieces(self._step)(x, u, numbers)
+        if self.model.opt.disableflags & NO_CONSTRAINTS:
+            return in_pieces(rewritten(self._step, stand_ins()))(x, u, numbers)
+        step = in_pieces(rewritten(self._step, {**stand_ins(), sqrt_p: root}))
+        return with_forward_jacobian(step)(x, u, numbers)
 
     def _step(self, x: Array, u: Array, numbers: dict[str, Array]) -> Array:
         mjx = mjx_module()
         cast = lambda tree: jax.tree.map(
             lambda v: jnp.asarray(v, x.dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v, tree
         )
-        blank, nq = cast(mjx.make_data(self.model)), self.model.nq
-        model = cast(self.mjx.replace(**numbers))
-        data = mjx.step(model, blank.replace(qpos=x[:nq], qvel=x[nq:], ctrl=u))
-        q = data.qpos
-        if quaternions(self.joints):
-            # The same step; MJX's own has the derivative 0 for a body that does not turn.
-            start = normalised(self.joints, x[:nq])
-            q = retract(self.joints, start, model.opt.timestep * data.qvel)
-        return jnp.concatenate([q, data.qvel])
+        # A copy for each program. JAX remembers by their identity how it read NumPy arrays, also
+        # for programs of the other precision, and MJX hands it arrays of the model.
+        model = cast(copy.deepcopy(self.mjx).replace(**numbers))
+        blank, h = cast(mjx.make_data(self.model)), model.opt.timestep
+        x_q, v = jnp.split(x, [self.model.nq])
+        q = normalised(self.joints, x_q)
+        forward = lambda q, v: accelerated(model, blank.replace(qpos=q, qvel=v, ctrl=u))
+        if self.model.opt.integrator == RK4:
+            return self._runge_kutta(forward, q, v, h)
+        integrate = mjx.euler if self.model.opt.integrator == EULER else mjx.implicit
+        v = integrate(model, forward(x_q, v)).qvel
+        # MJX's own move has the derivative 0 for a body that does not turn.
+        return jnp.concatenate([retract(self.joints, q, h * v), v])
+
+    def _runge_kutta(self, forward: Callable, q: Array, v: Array, h: Array) -> Array:
+        """(qpos, qvel) after a step of length h by the classical method of fourth order.
+
+        MJX's own cannot be used: its tableau is a NumPy array of the module, and what is said
+        about those in `_step` makes it fail in the second of two precisions.
+        """
+        move = lambda rate: retract(self.joints, q, h * rate)
+
+        def stage(carry: tuple, weights: Array) -> tuple[tuple, None]:
+            rate, acceleration, rates, accelerations = carry
+            a, b = weights
+            moved, rate = move(a * rate), v + a * h * acceleration
+            acceleration = forward(moved, rate).qacc
+            return (rate, acceleration, rates + b * rate, accelerations + b * acceleration), None
+
+        table = jnp.array([[0, 1 / 6], [1 / 2, 1 / 3], [1 / 2, 1 / 3], [1, 1 / 6]], v.dtype)
+        end, _ = jax.lax.scan(in_pieces(stage), (jnp.zeros_like(v),) * 4, table)
+        return jnp.concatenate([move(end[2]), v + h * end[3]])
+
+
+def accelerated(model: Any, data: Any) -> Any:
+    """mjx.Data with the accelerations and constraint forces at its state, as by mjx.forward."""
+    mjx = mjx_module()
+    for part in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
+        data = part(model, data)
+    rows = data._impl
+    if rows.efc_J.size == 0:
+        return data.replace(qacc=data.qacc_smooth)
+    # Rows of what does not touch push nothing, whatever the derivative of the distance: it does not
+    # always exist.
+    idle = jnp.all(rows.efc_J == 0, axis=1) & (rows.efc_aref == 0)
+    still = lambda v: jnp.where(idle, jax.lax.stop_gradient(v.T), v.T).T
+    data = data.tree_replace(
+        {f"_impl.{key}": still(getattr(rows, key)) for key in ("efc_J", "efc_D", "efc_aref")}
+    )
+    a = constrained(model, data)
+    return data.replace(qacc=a, qfrc_constraint=_pushes(model, data, a))
+
+
+@jax.custom_jvp
+def constrained(model: Any, data: Any) -> Array:
+    """The accelerations (nv,) by MJX's constraint solver.
+
+    Their derivatives are those of the forces' balance there (implicit function theorem), not of the
+    iterations of the solver. Those have none where elliptic contacts do not touch, and are as far
+    from the solution's as the iterates are.
+    """
+    return mjx_module().solve(model, data).qacc
+
+
+def _balance(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    a = constrained(*primals)
+
+    def missing(a: Array, model: Any, data: Any) -> Array:
+        carried = mjx_module().mul_m(model, data, a) - data.qfrc_smooth
+        return carried - _pushes(model, data, a)
+
+    of, at, directions = moving(lambda *rest: missing(a, *rest), primals, tangents)
+    matrix = jax.jacfwd(missing)(a, *primals)
+    return a, -solve((matrix + matrix.T) / 2, jax.jvp(of, at, directions)[1])
+
+
+constrained.defjvp(_balance, symbolic_zeros=True)
+
+
+def _pushes(model: Any, data: Any, a: Array) -> Array:
+    """Generalised forces (nv,) of the constraints under the accelerations a (nv,)."""
+    from mujoco.mjx._src.solver import Context
+
+    return Context.create(model, data.replace(qacc=a), grad=False).qfrc_constraint
+
+
+@jax.custom_jvp
+def _root(x: Array) -> Array:
+    return jax.lax.sqrt(x)
+
+
+@_root.defjvp
+def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    y = _root(*primals)
+    inside = y > 0
+    return y, jnp.where(inside, tangents[0] / (2 * jnp.where(inside, y, 1)), 0)
+
+
+def root(x: Array, **_: Any) -> Array:
+    """The square root, with the derivative 0 at 0 instead of an infinite one.
+
+    MJX takes lengths by it that can be 0, such as how far a point inside a cylinder is from it, and
+    the chain rule multiplies infinity by 0 there.
+    """
+    return _root(x)
 
 
 def mjx_module() -> Any:
@@ -121,27 +221,18 @@ def in_pieces(function: Callable, size: int = PIECE) -> Callable:
 def with_forward_jacobian(function: Callable) -> Callable:
     """The same function of pytrees, its derivative a Jacobian made by forward mode.
 
-    Reverse mode then transposes one matrix product instead of the function, so it works
-    through while loops (MJX's constraint solver) and remembers a Jacobian a step.
+    Reverse mode then transposes one matrix product instead of the function. It remembers a
+    Jacobian a step, and does not multiply infinite derivatives, as those of distances of shapes
+    that do not touch can be, by zeros.
     """
     wrapped = jax.custom_jvp(function)
 
     def rule(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-        leaves, tree = jax.tree.flatten(primals)
-        directions = jax.tree.leaves(tangents, is_leaf=lambda t: isinstance(t, SymbolicZero))
-        moving = [i for i, t in enumerate(directions) if not isinstance(t, SymbolicZero)]
-
-        def of(*values: Array) -> tuple[Array, Array]:
-            new = list(leaves)
-            for i, value in zip(moving, values, strict=True):
-                new[i] = value
-            return (function(*jax.tree.unflatten(tree, new)),) * 2
-
-        at = [leaves[i] for i in moving]
+        of, at, directions = moving(lambda *args: (function(*args),) * 2, primals, tangents)
         jacobians, value = jax.jacfwd(of, argnums=tuple(range(len(at))), has_aux=True)(*at)
         products = (
-            jnp.tensordot(J, directions[i], directions[i].ndim, precision="highest")
-            for J, i in zip(jacobians, moving, strict=True)
+            jnp.tensordot(J, d, d.ndim, precision="highest")
+            for J, d in zip(jacobians, directions, strict=True)
         )
         return value, sum(products, jnp.zeros_like(value))
 

@@ -29,7 +29,7 @@ class Boundary:
     inner (K,): largest t for which centre + t d was proved feasible (NaN: none). outer (K,):
     where the ray leaves all the half-spaces (inf: never). points (K, d): the points at `inner`.
     normals (K, d), offsets (K,): half-spaces a'x ≤ b that hold on the whole feasible set
-    (b = inf where the LP gave none); roundings (K,): the part of b that covers rounding.
+    (b = inf where the LP gave none).
     """
 
     center: np.ndarray
@@ -39,7 +39,6 @@ class Boundary:
     points: np.ndarray
     normals: np.ndarray
     offsets: np.ndarray
-    roundings: np.ndarray
 
 
 def boundary(
@@ -113,13 +112,14 @@ class Rays:
             )  # fmt: skip
         return result.x[k : k + d], result.x[:k]
 
-    def box(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Half-spaces (normals, offsets, roundings) of the bounding box, as far as there is one."""
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Half-spaces (normals, offsets) of the bounding box, as far as there is one."""
         with jax.enable_x64(True):
-            cuts = jax.vmap(lambda y: cut_of(self.problem, self.rows, y))(self.sides)
-        normals, offsets, roundings = (np.asarray(v) for v in cuts)
+            normals, offsets = (
+                np.asarray(v) for v in half_spaces(self.problem, self.rows, self.sides)
+            )
         valid = np.isfinite(offsets)
-        return normals[valid], offsets[valid], roundings[valid]
+        return normals[valid], offsets[valid]
 
     def shoot(self, directions: np.ndarray) -> Boundary:
         """Solve, pull and prove along every direction (K, d)."""
@@ -134,7 +134,7 @@ class Rays:
         count = len(directions)
         fill = np.arange(max(32, 1 << (count - 1).bit_length())) % count
         with jax.enable_x64(True):
-            feasible, normals, offsets, roundings = (
+            feasible, normals, offsets = (
                 np.asarray(v)[:count]
                 for v in prove(self.problem, self.rows, theta[fill], w[fill], y[fill])
             )
@@ -149,7 +149,6 @@ class Rays:
             points=np.where(found[:, None], theta[each, best], np.nan),
             normals=normals,
             offsets=offsets,
-            roundings=roundings,
         )
 
 
@@ -161,7 +160,12 @@ def prove(p: Problem, rows: Rows, theta: Any, w: Any, y: Any) -> tuple[Array, ..
         inputs, free = inputs_of(p, rows, theta, w)
         return proofs.prove_feasible(p, theta, free, inputs)[0]
 
-    return jax.vmap(jax.vmap(feasible))(theta, w), *jax.vmap(lambda y: cut_of(p, rows, y))(y)
+    return jax.vmap(jax.vmap(feasible))(theta, w), *half_spaces(p, rows, y)
+
+
+def half_spaces(p: Problem, rows: Rows, y: Any) -> tuple[Array, Array]:
+    """Those valid on the whole feasible set, normals (K, d) and offsets (K,), from multipliers."""
+    return jax.vmap(lambda y: proofs.everywhere(p, *cut_of(p, rows, y)))(y)
 
 
 def leaving(

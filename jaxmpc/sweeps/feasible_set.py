@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 from tqdm.auto import tqdm
@@ -73,7 +74,10 @@ class Labels:
     `Status` (NOT_RUN, NON_FINITE, or SOLVED / PRIMAL_INFEASIBLE / ITERATION_LIMIT for the three
     labels). starts (b, n), plans (b, N, m): x_0 and inputs that prove 1, else NaN.
     cut_normals (b, d), cut_offsets (b,): the half-space a'x ≤ b, valid on the whole feasible set,
-    that proves −1, else NaN. Seconds spent compiling and running.
+    that proves −1, else NaN. An offset of ∞ says that −1 is proved at the point but that no such
+    half-space is known: on sets that extend both ways without end, or very far, along a facet,
+    the rounding of its normal outweighs what the point is outside. Seconds spent compiling and
+    running.
     """
 
     label: np.ndarray
@@ -140,8 +144,9 @@ def label_chunks(
         if not 0 < penalties.alpha < 2:
             fail("penalties", f"alpha {penalties.alpha}", "Over-relaxation lies in (0, 2)")
         (quick, back), alpha = weighted(moving, penalties.weight), penalties.alpha
-    region = np.abs(points[usable]).max(axis=0, initial=0.0)
-    problem = proofs.problem(mpc, view, bounding_box(moving, region)[0])
+    sizes = np.abs(points[usable]) if usable.any() else np.zeros((1, d))
+    extent, _ = bounding_box(moving, sizes.max(axis=0))
+    problem = proofs.problem(mpc, view, extent, np.median(sizes, axis=0))
     admm, newton = admm_rung(iterations, np.dtype(dtype)), newton_rung(NEWTON_STEPS)
     longer = admm_rung(LONGER * iterations, np.dtype(np.float64))
     chunk = min(chunk, max(len(points), 1))
@@ -236,7 +241,7 @@ class FeasibleSetMap:
 
     def cuts(self) -> tuple[np.ndarray, np.ndarray]:
         """All half-spaces a'x ≤ b proved valid for the feasible set: a (K, d), b (K,)."""
-        proved = self.label == -1
+        proved = (self.label == -1) & np.isfinite(self.labels.cut_offsets)
         normals = np.concatenate([self.labels.cut_normals[proved], self.extra_normals])
         offsets = np.concatenate([self.labels.cut_offsets[proved], self.extra_offsets])
         return normals, offsets
@@ -248,7 +253,8 @@ class FeasibleSetMap:
         """
         normals, offsets = self.cuts()
         if not len(offsets):
-            fail("outer", "no half-space is proved yet", "Map points outside the set, or refine()")
+            what = "no half-space is proved that holds on the whole set"
+            fail("outer", what, "Map points outside the set, or refine(), if it is bounded")
         return Polytope(normals, offsets).reduce()
 
     def volume_bounds(self) -> tuple[float, float]:
@@ -305,7 +311,7 @@ class FeasibleSetMap:
             return self
         directions = np.concatenate([np.eye(d), -np.eye(d), -np.ones((1, d))])
         points = np.zeros((0, d))
-        normals, offsets, roundings = rays.box()
+        normals, offsets = rays.box()
         shot = unit(directions)
         for _ in range(rounds):
             found = rays.shoot(directions)
@@ -314,7 +320,6 @@ class FeasibleSetMap:
             valid = np.isfinite(found.offsets)
             normals = np.concatenate([normals, found.normals[valid]])
             offsets = np.concatenate([offsets, found.offsets[valid]])
-            roundings = np.concatenate([roundings, found.roundings[valid]])
             try:
                 outer = Polytope(normals, offsets).reduce()
                 low, high = hull_volume(points), outer.volume()
@@ -325,7 +330,7 @@ class FeasibleSetMap:
             # Sets with a curved boundary have no end of vertices.
             if high - low <= tolerance * high or not 0 < len(directions) <= MOST_RAYS:
                 break
-        labels = excluded(self.labels, rays, self.points, normals, offsets, roundings)
+        labels = excluded(self.labels, rays, self.points, normals, offsets)
         return replace(
             self, labels=labels, extra_points=points, extra_normals=normals, extra_offsets=offsets
         )
@@ -361,7 +366,8 @@ def unit(directions: np.ndarray) -> np.ndarray:
 
 
 def fresh(directions: np.ndarray, shot: np.ndarray) -> np.ndarray:
-    """The directions in which no ray of `shot` (unit length) has been sent."""
+    """The directions, zeros apart, in which no ray of `shot` (unit length) has been sent."""
+    directions = directions[np.any(directions != 0, axis=1)]
     distance = KDTree(shot).query(unit(directions))[0]
     return directions[distance > 1e-9]
 
@@ -386,17 +392,22 @@ def ellipse(
 
 
 def excluded(
-    labels: Labels, rays: Rays, points: np.ndarray, normals: np.ndarray, offsets: np.ndarray,
-    roundings: np.ndarray,
+    labels: Labels, rays: Rays, points: np.ndarray, normals: np.ndarray, offsets: np.ndarray
 ) -> Labels:  # fmt: skip
-    """Labels where undecided points that one of the half-spaces excludes are infeasible."""
-    left = np.flatnonzero(labels.status == Status.ITERATION_LIMIT)
+    """Labels where undecided points that one of the half-spaces excludes are infeasible.
+
+    Only within the extent of the feasible set that LPs found: there a half-space of
+    `proofs.everywhere` is one of `proofs.cut`, and no label rests on an LP.
+    """
+    p = rays.problem
+    within = np.all(np.abs(points) + p.side_0 * points <= p.reach_0, axis=1)
+    left = np.flatnonzero((labels.status == Status.ITERATION_LIMIT) & within)
     if not len(left) or not len(offsets):
         return labels
     with jax.enable_x64(True):
-        one = lambda a, b, r, x: proofs.excludes(rays.problem, a, b, r, x)
-        table = jax.vmap(jax.vmap(one, in_axes=(0, 0, 0, None)), in_axes=(None, None, None, 0))
-        excludes = np.asarray(table(normals, offsets, roundings, points[left]))
+        one = lambda a, b, x: proofs.excludes(a, b, jnp.zeros_like(a), x)
+        table = jax.vmap(jax.vmap(one, in_axes=(0, 0, None)), in_axes=(None, None, 0))
+        excludes = np.asarray(table(normals, offsets, points[left]))
     out = np.flatnonzero(excludes.any(axis=1))
     left, by = left[out], np.argmax(excludes[out], axis=1)
     copy = replace(labels, **{name: getattr(labels, name).copy() for name in ARRAYS})

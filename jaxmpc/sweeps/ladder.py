@@ -44,7 +44,7 @@ class Rows:
     rows, and index says where the multiplier of each row of `proofs.Problem` (step by step, then
     terminal rows, then those of the terminal ellipsoid) stands among the R (R where there is
     none). The last `balls` rows are those of the ellipsoid: |v − lower| ≤ radius. Psi, Omega, psi:
-    inputs from θ and the variables.
+    inputs from θ and the variables. still: the rows that nothing moves, but for those of a ball.
     """
 
     U: Any
@@ -57,6 +57,7 @@ class Rows:
     Psi: Any
     Omega: Any
     psi: Any
+    still: Any
     radius: Any
     balls: tuple[int, ...] = field(metadata={"static": True})
 
@@ -105,6 +106,7 @@ def rows(mpc: MPC, view: View) -> Rows:
     return Rows(
         U, back, weight[:, None] * D[keep], weight * lower[keep], weight * upper[keep], weight,
         multiplier_index(mpc, c.layout, place[extra:], len(keep)), Psi, Omega, psi,
+        np.flatnonzero(~U[: len(keep) - sum(c.balls)].any(axis=1)),
         weight[-1:] * c.radius if c.balls else None, c.balls,
     )  # fmt: skip
 
@@ -229,21 +231,27 @@ def support(
 
 
 def bounding_box(rows: Rows, otherwise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Extent (d,), |θ| ≤ extent on the feasible set, and the multipliers (2d, R) of its sides.
+    """Bounds (2, d) of every feasible θ, lower and upper, and the multipliers (2d, R) of the sides.
 
-    The extent is twice the LPs' answer, which outweighs their tolerances; where they find the
-    set empty, `otherwise`: the region that is looked at.
+    Each side is moved out by the larger of the coordinate's two finite ends, which outweighs the
+    tolerances of the LPs that find them; where these find the set empty, |θ| ≤ `otherwise`: the
+    region that is looked at.
     """
     d = rows.D.shape[1]
     ends, _, y = zip(*(support(rows, s * e) for s in (1.0, -1.0) for e in np.eye(d)), strict=True)
-    reach = np.abs(ends).reshape(2, d).max(axis=0)
-    return otherwise if -np.inf in ends else 2 * reach + 1e-300, np.array(y)
+    if -np.inf in ends:
+        return np.array([-otherwise, otherwise]), np.array(y)
+    ends = np.reshape(ends, (2, d))
+    margin = np.where(np.isfinite(ends), np.abs(ends), 0.0).max(axis=0) + 1e-300
+    return np.array([-ends[1] - margin, ends[0] + margin]), np.array(y)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Verdict:
-    """What was proved of one point: label 1, −1 or 0, and x_0 with inputs, or the cut."""
+    """What was proved of one point: label 1, −1 or 0, and x_0 with inputs, or the half-space
+    normal'θ ≤ offset that holds on the whole feasible set and excludes it (∞: none is known, and
+    −1 rests on `proofs.cut` at the point)."""
 
     label: Array
     start: Array
@@ -256,15 +264,32 @@ def inputs_of(p: Problem, rows: Rows, theta: Array, w: Array) -> tuple[Array, Ar
     """Inputs (N, m) and free states that the coordinates w stand for."""
     variables = matmul(jnp.asarray(rows.back), w)
     inputs = matmul(jnp.asarray(rows.Psi), theta) + matmul(jnp.asarray(rows.Omega), variables)
-    return inputs + rows.psi, variables[p.horizon * p.B.shape[1] :]
+    free = len(p.view.others) if p.view.projects else 0
+    return inputs + rows.psi, variables[len(variables) - free :]
 
 
 def cut_of(p: Problem, rows: Rows, y: Array) -> tuple[Array, Array, Array]:
-    """The half-space (a, b, rounding) that multipliers y (R,) of the rows give."""
+    """What multipliers y (R,) of the rows say of every feasible θ: (a, b, w) of `proofs.cut`."""
     y = jnp.append(y * rows.weight, 0.0)[jnp.asarray(rows.index)]
     staged, last = p.horizon * p.H.shape[0], p.H_N.shape[0]
     y_states, y_N, y_ball = jnp.split(y, [staged, staged + last])
     return proofs.cut(p, y_states.reshape(p.horizon, p.H.shape[0]), y_N, y_ball)
+
+
+def with_broken_limit(rows: Rows, theta: Array, y: Array) -> Array:
+    """The multipliers y (R,), or that of one row alone: the one that θ breaks most among the rows
+    that nothing moves. It is a proof whatever the inputs, limited or not.
+    """
+    if not len(rows.still):
+        return y
+    still, D = jnp.asarray(rows.still), jnp.asarray(rows.D)[rows.still]
+    value = D @ theta
+    broken = value - jnp.clip(value, rows.lower[still], rows.upper[still])
+    worst = jnp.argmax(jnp.abs(broken))
+    # Broken by no more than rounding is not broken: then the other rows tell more.
+    rounding = 1e-13 * jnp.sum(jnp.abs(D[worst] * theta))
+    alone = jnp.where(np.arange(len(y)) == still[worst], jnp.sign(broken[worst]), 0.0)
+    return jnp.where(jnp.abs(broken[worst]) > rounding, alone, y)
 
 
 def judge(p: Problem, rows: Rows, theta: Array, w: Array, candidates: list[Array]) -> Verdict:
@@ -272,13 +297,19 @@ def judge(p: Problem, rows: Rows, theta: Array, w: Array, candidates: list[Array
     theta, w = theta.astype(jnp.float64), w.astype(jnp.float64)
     inputs, free = inputs_of(p, rows, theta, w)
     feasible, inputs = proofs.prove_feasible(p, theta, free, inputs)
-    normal, offset = jnp.zeros_like(theta), jnp.asarray(jnp.inf, jnp.float64)
+    zero = jnp.zeros_like(theta)
+    normal, offset, slope = zero, jnp.asarray(jnp.inf, jnp.float64), zero
     infeasible = jnp.asarray(False)
-    for y in candidates:
-        a, b, rounding = cut_of(p, rows, y.astype(jnp.float64))
-        here = proofs.excludes(p, a, b, rounding, theta) & ~infeasible
-        normal, offset = jnp.where(here, a, normal), jnp.where(here, b, offset)
+    *others, last = (y.astype(jnp.float64) for y in candidates)
+    for y in (*others, with_broken_limit(rows, theta, last)):
+        cut = cut_of(p, rows, y)
+        here = proofs.excludes(*cut, theta) & ~infeasible
+        normal, offset, slope = (
+            jnp.where(here, new, old) for new, old in zip(cut, (normal, offset, slope), strict=True)
+        )
         infeasible = infeasible | here
+    normal, offset = proofs.everywhere(p, normal, offset, slope)
+    offset = jnp.where(proofs.excludes(normal, offset, zero, theta), offset, jnp.inf)
     label = jnp.where(feasible, 1, jnp.where(infeasible, -1, 0)).astype(jnp.int8)
     return Verdict(label, p.view.initial_state(theta, free), inputs, normal, offset)
 

@@ -15,16 +15,27 @@ feasible x_0,
     p_0'x_0 ≤ Σ_k σ(y_k) + Σ_k [σ_U(−B'p_{k+1} − D'y_k) − c'p_{k+1}].
 
 Inputs that must be equal (a control horizon) share one σ_U of their sum. A terminal ellipsoid
-{x'Px ≤ α} adds Pw to p_N and its support √(α w'Pw), for any w.
+{x'Px ≤ α} adds Pv to p_N and its support √(α v'Pv), for any v.
 
 No property of y is needed, so any iterate gives a valid half-space; a converged one gives a
-tight one. (Neumaier & Shcherbina 2004: the input limits absorb the dual residual.) Rounding
-moves p_k by at most γ(|A|'|p_{k+1}| + |H|'|y_k|), which meets |x_k| ≤ reach_k. Where the
-limits leave x_0 unbounded, reach_0 is twice the extent that LPs find (`ladder.bounding_box`);
-this is the one figure that is taken from a solver, and it only scales the rounding bound. The
-same holds for the box round a polytope of inputs.
+tight one. (Neumaier & Shcherbina 2004: the input limits absorb the dual residual.)
+
+*Rounding.* The computed p_k is off by at most e_k = |A|'e_{k+1} + γ(|A|'|p_{k+1}| + |H|'|y_k|).
+Such an error meets x_k, and is settled there where limits on x_k are near, or else is left to the
+steps before, e_k → |A|'e_k, with what it meets of u and c on the way. To settle it, p_k is moved
+by s∘e_k, s_i ∈ {−1, 0, 1}, at the price of e_k'reach_k, where |x_k| + s∘x_k ≤ reach_k: a limit
+on one side of x_k suffices, since |x| + x ≤ 2 max(x, 0). What arrives at k = 0 gives
+
+    a'θ ≤ b + w'|θ|   for every feasible θ,
+
+which decides about θ whether the feasible set is bounded or not, and takes no figure from a solver
+(but for the box round a polytope, a part in 10⁶ outwards). In the same way it becomes a half-space
+for the whole set, with (a + s∘w)'θ ≤ b + w'reach_0, as far as limits on x_0, or the extent that
+LPs find (`ladder.bounding_box`), doubled, leave θ_i a finite side for each w_i ≠ 0. (Where a set
+extends both ways without end along a facet there is none: its normal is no vector of floats.)
 """
 
+import itertools
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -110,9 +121,12 @@ class Problem:
 
     lower_k ≤ H x_k + D u_k ≤ upper_k for k < N: H (r, n), D (r, m), lower and upper (N, r), ±inf at
     steps where a row does not hold. lower_N ≤ H_N x_N ≤ upper_N. P, level: terminal ellipsoid
-    x'Px ≤ level, None without; back (n, rows) leads from multipliers of its rows L'x to w.
-    u_lower, u_upper (m,): a box round the inputs. reach (N+1, n): |x_k| ≤ reach_k on every feasible
-    trajectory. moves: number of the free move that each input is.
+    x'Px ≤ level, None without; back (n, rows) leads from multipliers of its rows L'x to v.
+    u_lower, u_upper (m,): a box round the inputs; move_lower, move_upper (moves, m): what limits on
+    the states leave of it to each free move. left (N, n): 1 where errors of p_k, k = 1..N, are left
+    to the steps before; elsewhere, and there side and reach are 0 too, |x_k| + side∘x_k ≤ reach on
+    every feasible trajectory. side_0, reach_0 (d,): the same of every feasible θ, ∞ where nothing
+    bounds it. moves: number of the free move that each input is.
     """
 
     A: Any
@@ -130,7 +144,13 @@ class Problem:
     back: Any
     u_lower: Any
     u_upper: Any
+    move_lower: Any
+    move_upper: Any
+    left: Any
+    side: Any
     reach: Any
+    side_0: Any
+    reach_0: Any
     view: View
     moves: tuple[int, ...] = field(metadata={"static": True})
 
@@ -183,8 +203,13 @@ def absorbed(mpc: MPC, block: Block) -> bool:
     return block.kind == "input" and isinstance(mpc.inputs, Box)
 
 
-def problem(mpc: MPC, view: View, extent: np.ndarray) -> Problem:
-    """Collect the exact data. extent (d,): |θ| ≤ extent for every feasible θ."""
+def problem(mpc: MPC, view: View, extent: np.ndarray, size: np.ndarray | None = None) -> Problem:
+    """Collect the exact data.
+
+    extent (2, d): lower and upper bounds of every feasible θ, which no label rests on; (d,): of
+    |θ|. size (d,): how large θ typically is (None: as large as extent says), by which is chosen how
+    rounding errors are bounded, not whether they are.
+    """
     n, m, N, p = mpc.system.n, mpc.system.m, mpc.horizon, mpc.dimension
     A, B, c = dynamics(mpc)
     u_lower, u_upper = bounding_box(mpc.inputs, m)
@@ -209,34 +234,47 @@ def problem(mpc: MPC, view: View, extent: np.ndarray) -> Problem:
         back = np.zeros((p, n))
         back[:n] = np.linalg.inv(np.linalg.cholesky(P[:n, :n])).T
 
-    start = np.full(p, np.inf)
-    start[list(view.axes)] = extent
-    if view.projects:
-        start[list(view.others)] = np.maximum(np.abs(view.lower), np.abs(view.upper))
-    elif view.others:
-        start[list(view.others)] = np.abs(view.fixed)[list(view.others)]
-    u_size = np.maximum(np.abs(u_lower), np.abs(u_upper))
+    boxes = {id(set_): bounding_box(set_, n) for set_ in (mpc.states, mpc.terminal_set)}
 
-    def size(k: int) -> np.ndarray:
-        bound = np.full(p, np.inf)
+    def limits(k: int) -> np.ndarray:
+        """Bounds (2, p) of x_k, without those that the inputs have on it."""
         sets = [mpc.states] if k in mpc.state_steps else []
+        bound = np.repeat([[-np.inf], [np.inf]], p, axis=1)
         for set_ in [*sets, mpc.terminal_set] if k == N else sets:
-            bound[:n] = np.minimum(bound[:n], np.abs(boxes[id(set_)]).max(axis=0))
+            lower, upper = boxes[id(set_)]
+            bound[:, :n] = np.maximum(bound[0, :n], lower), np.minimum(bound[1, :n], upper)
         return bound
 
-    boxes = {id(set_): bounding_box(set_, n) for set_ in (mpc.states, mpc.terminal_set)}
-    reach = [np.minimum(start, size(0))]
+    axes, others = list(view.axes), list(view.others)
+    extent = np.asarray(extent) if np.ndim(extent) == 2 else np.array([-extent, extent])
+    first = limits(0)[:, axes]
+    side_0, reach_0 = one_sided(np.maximum(extent[0], first[0]), np.minimum(extent[1], first[1]))
+    start = np.zeros(p)
+    start[axes] = reach_0 if size is None else size
+    if view.projects:
+        start[others] = one_sided(view.lower, view.upper)[1]
+    elif others:
+        start[others] = np.abs(view.fixed)[others]
+    grown, u_size = np.where(np.isfinite(start), start, 0.0), largest(u_lower, u_upper)
+    errors = []
     for k in range(1, N + 1):
         with np.errstate(invalid="ignore"):  # 0·inf below counts as 0
-            moved = np.nansum(np.abs(A) * reach[-1], axis=1) + np.abs(c)
-            moved = moved + np.nansum(np.abs(B) * u_size, axis=1)
-        # One part in 10⁹ outweighs the rounding of this recursion.
-        reach.append(np.minimum(moved * (1 + 1e-9), size(k)))
+            grown = np.nansum(np.abs(A) * grown, axis=1) + np.abs(c)
+            grown = grown + np.nansum(np.abs(B) * u_size, axis=1)
+        side, bound = one_sided(*limits(k))
+        far = (bound > grown) | np.isinf(bound)
+        errors.append((1.0 * far, np.where(far, 0.0, side), np.where(far, 0.0, bound)))
+        grown = np.minimum(grown, bound)
+    x_size = [largest(*limits(k)[:, :n]) for k in range(N + 1)]
+    implied = input_size(A[:n, :n], B[:n], c[:n], x_size)
+    steps = [np.equal(mpc.moves, i) for i in range(max(mpc.moves) + 1)]
+    implied = np.array([implied[same].min(axis=0) for same in steps])
     every_step = lambda parts: np.concatenate([np.zeros((N, 0)), *parts], axis=1)
     return Problem(
         A, B, c, np.concatenate(H), np.concatenate(D), every_step(lower), every_step(upper),
         np.concatenate(H_N), np.concatenate(lower_N), np.concatenate(upper_N), P, level, back,
-        u_lower, u_upper, np.array(reach), view, mpc.moves,
+        u_lower, u_upper, np.maximum(u_lower, -implied), np.minimum(u_upper, implied),
+        *np.array(errors).transpose(1, 0, 2), side_0, reach_0, view, mpc.moves,
     )  # fmt: skip
 
 
@@ -253,8 +291,40 @@ def bounding_box(set_: Box | Polytope | Ellipsoid | None, n: int) -> tuple[np.nd
     else:
         upper = np.array([set_.support(row) for row in np.eye(n)])
         lower = -np.array([set_.support(row) for row in -np.eye(n)])
-    margin = 1e-6 * (1e-6 + np.maximum(np.abs(lower), np.abs(upper)))
+    size = [np.where(np.isfinite(v), np.abs(v), 0.0) for v in (lower, upper)]
+    margin = 1e-6 * (1e-6 + np.maximum(*size))
     return lower - margin, upper + margin
+
+
+def input_size(A: np.ndarray, B: np.ndarray, c: np.ndarray, size: list[np.ndarray]) -> np.ndarray:
+    """Bounds (N, m) of |u_k| from those of |x_k|, k = 0..N: u_k = B⁺(x_{k+1} − A x_k − c).
+
+    ∞ where there is none, and where B has dependent columns.
+    """
+    M, (n, m) = np.linalg.pinv(B), B.shape
+    off = np.abs(M @ B - np.eye(m)) + n * 1e-15 * np.abs(M) @ np.abs(B)
+    if off.max() > 1e-8:
+        return np.full((len(size) - 1, m), np.inf)
+    with np.errstate(invalid="ignore"):  # 0·inf below counts as 0
+        terms = [
+            after + np.nansum(np.abs(A) * before, axis=1) + np.abs(c)
+            for before, after in itertools.pairwise(size)
+        ]
+        bound = np.nansum(np.abs(M) * np.array(terms)[:, None, :], axis=2)
+    # B⁺B is the unit matrix to 1e-8, and sums are rounded.
+    return bound + 1e-6 * bound.max(axis=1, keepdims=True)
+
+
+def one_sided(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(s, r) with the least r for which |x| + s x ≤ r on lower ≤ x ≤ upper, s in {0, 1, −1}."""
+    ways = np.array([largest(lower, upper), 2 * np.maximum(upper, 0), 2 * np.maximum(-lower, 0)])
+    best = np.argmin(ways, axis=0)
+    return np.array([0.0, 1.0, -1.0])[best], ways.min(axis=0)
+
+
+def largest(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Bound of |x| on lower ≤ x ≤ upper."""
+    return np.maximum(np.abs(lower), np.abs(upper))
 
 
 def gamma(terms: int) -> float:
@@ -312,19 +382,20 @@ def prove_feasible(p: Problem, theta: Array, free: Array, inputs: Array) -> tupl
 
 
 def cut(p: Problem, y_states: Array, y_N: Array, y_ball: Array) -> tuple[Array, Array, Array]:
-    """The half-space a'θ ≤ b, valid for every feasible θ, that multipliers give.
+    """What multipliers say: a'θ ≤ b + w'|θ| for every feasible θ; a (d,), b, w (d,) ≥ 0.
 
     y_states (N, r) and y_N (r_N,): y > 0 on the upper bound, y < 0 on the lower. y_ball: of the
-    rows L'x of the terminal ellipsoid P = LL', any length without one.
-    Returns a (d,), b and the part of b that covers rounding; b = inf where nothing can be said.
-    The multipliers are scaled to about one first; any multipliers give a valid half-space.
+    rows L'x of the terminal ellipsoid P = LL', any length without one. w covers rounding;
+    b = inf where nothing can be said. The multipliers are scaled to about one first.
     """
     n, m = p.B.shape
     N, r = p.horizon, p.H.shape[0]
     A, B, c, H, D = (jnp.asarray(v) for v in (p.A, p.B, p.c, p.H, p.D))
     parts = (y_states, y_N, y_ball) if p.P is not None else (y_states, y_N)
-    largest = sum(jnp.max(jnp.abs(y), initial=0.0) for y in parts)
-    scale = jnp.exp2(-jnp.floor(jnp.log2(jnp.where(largest > 0, largest, 1.0))))
+    top = sum(jnp.max(jnp.abs(y), initial=0.0) for y in parts)
+    scale = jnp.exp2(-jnp.floor(jnp.log2(jnp.where(top > 0, top, 1.0))))
+    # Twice what a sum of so many terms can be off by covers the rounding of the bound itself.
+    unit = 2 * gamma(N * (r + 2 * m + 6) + 4 * n + p.H_N.shape[0] + 12)
 
     def support(y, lower, upper):  # Σ u y⁺ − l y⁻, and the same with |u|, |l|
         y = jnp.where(jnp.isposinf(upper), jnp.minimum(y, 0.0), y)
@@ -332,62 +403,67 @@ def cut(p: Problem, y_states: Array, y_N: Array, y_ball: Array) -> tuple[Array, 
         bound = jnp.where(y > 0, upper, jnp.where(y < 0, lower, 0.0))
         return y, jnp.sum(y * bound), jnp.sum(jnp.abs(y * bound))
 
-    def times(weight, size):  # 0·inf = 0
-        return jnp.sum(jnp.where(weight == 0, 0.0, weight * size))
+    def most(value, moved, lower, upper):  # of v'u in a box, over all |v − value| ≤ unit·moved
+        worth = lambda v: v * jnp.where(v > 0, upper, jnp.where(v < 0, lower, 0.0))
+        found = jnp.maximum(worth(value + unit * moved), worth(value - unit * moved))
+        return jnp.sum(found), jnp.sum(jnp.abs(found))
 
     y_N, total, size = support(y_N * scale, p.lower_N, p.upper_N)
+    # Errors are counted in units: p_k is off by no more than unit·moved.
     p_N, moved = jnp.asarray(p.H_N).T @ y_N, jnp.abs(p.H_N).T @ jnp.abs(y_N)
     if p.P is not None:
-        w = jnp.asarray(p.back) @ (y_ball * scale)
-        # The rounding of w'Pw is added before the root, that of the root itself with the rest.
-        squared = jnp.abs(w) @ (jnp.abs(p.P) @ jnp.abs(w))
-        squared = jnp.maximum(w @ (p.P @ w), 0.0) + 2 * gamma(2 * n + 2) * squared
+        v = jnp.asarray(p.back) @ (y_ball * scale)
+        # The rounding of v'Pv is added before the root, that of the root itself with the rest.
+        squared = jnp.abs(v) @ (jnp.abs(p.P) @ jnp.abs(v))
+        squared = jnp.maximum(v @ (p.P @ v), 0.0) + 2 * gamma(2 * n + 2) * squared
         value = jnp.sqrt(p.level * squared)
-        p_N, moved = p_N + p.P @ w, moved + jnp.abs(p.P) @ jnp.abs(w)
+        p_N, moved = p_N + p.P @ v, moved + jnp.abs(p.P) @ jnp.abs(v)
         total, size = total + value, size + value
-    size = size + times(moved, p.reach[N])
 
     def back(carry, step):
-        p_next, total, size = carry
-        y, lower, upper, reach = step
+        p_next, moved, total, size = carry
+        y, lower, upper, left, side, reach = step
         y, row_total, row_size = support(y, lower, upper)
-        moved = jnp.abs(A).T @ jnp.abs(p_next) + jnp.abs(H).T @ jnp.abs(y)
+        p_next, size = p_next + unit * side * moved, size + reach @ moved
+        moved = left * moved + jnp.abs(p_next)
         total = total + row_total - c @ p_next
-        size = size + row_size + times(moved, reach) + jnp.abs(c) @ jnp.abs(p_next)
+        size = size + row_size + jnp.abs(c) @ moved
         push = -(B.T @ p_next) - D.T @ y
-        pushed = jnp.abs(B).T @ jnp.abs(p_next) + jnp.abs(D).T @ jnp.abs(y)
-        return (A.T @ p_next + H.T @ y, total, size), (push, pushed)
+        pushed = jnp.abs(B).T @ moved + jnp.abs(D).T @ jnp.abs(y)
+        moved = jnp.abs(A).T @ moved + jnp.abs(H).T @ jnp.abs(y)
+        return (A.T @ p_next + H.T @ y, moved, total, size), (push, pushed)
 
-    steps = (y_states * scale, jnp.asarray(p.lower), jnp.asarray(p.upper), jnp.asarray(p.reach[:N]))
-    (p_0, total, size), (push, pushed) = jax.lax.scan(back, (p_N, total, size), steps, reverse=True)
+    errors = map(jnp.asarray, (p.left, p.side, p.reach))
+    steps = (y_states * scale, jnp.asarray(p.lower), jnp.asarray(p.upper), *errors)
+    start = (p_N, moved, total, size)
+    (p_0, moved, total, size), inputs = jax.lax.scan(back, start, steps, reverse=True)
     same = np.equal.outer(np.arange(max(p.moves) + 1), np.array(p.moves)).astype(float)
-    push = push if len(same) == N else same @ push
-    u = jnp.where(push > 0, p.u_upper, jnp.where(push < 0, p.u_lower, 0.0))
-    total = total + jnp.sum(jnp.where(push == 0, 0.0, push * u))
-    size = size + times(pushed, jnp.maximum(jnp.abs(p.u_lower), jnp.abs(p.u_upper)))
+    push, pushed = inputs if len(same) == N else (same @ v for v in inputs)
+    value, value_size = most(push, pushed, p.move_lower, p.move_upper)
+    total, size = total + value, size + value_size
 
     axes, others = np.array(p.view.axes), np.array(p.view.others, int)
-    a, rest = p_0[axes], p_0[others]
     if p.view.projects:  # the other states may take any value in their box
-        value = jnp.where(rest < 0, p.view.upper, jnp.where(rest > 0, p.view.lower, 0.0))
-    else:
-        value = jnp.zeros(len(others)) if p.view.fixed is None else p.view.fixed[others]
-    total = total - jnp.sum(jnp.where(rest == 0, 0.0, rest * value))
-    size = size + times(jnp.abs(rest), jnp.abs(value))
-    terms = N * (r + 2 * m + 4) + 4 * n + p.H_N.shape[0] + 12
-    rounding = 2 * gamma(terms) * size + TINY
-    b = total + rounding
+        value, value_size = most(-p_0[others], moved[others], p.view.lower, p.view.upper)
+        total, size = total + value, size + value_size
+    elif len(others):
+        fixed = p.view.fixed[others]
+        total, size = total - p_0[others] @ fixed, size + moved[others] @ jnp.abs(fixed)
+    a, b, w = p_0[axes], total + unit * size + TINY, unit * moved[axes]
     # 0'θ ≤ b says nothing, unless b < 0: then no θ at all is feasible.
-    return a, jnp.where(jnp.isfinite(b) & (jnp.any(a != 0) | (b < 0)), b, jnp.inf), rounding
+    return a, jnp.where(jnp.isfinite(b) & (jnp.any(a != 0) | (b < 0)), b, jnp.inf), w
 
 
-def excludes(p: Problem, a: Array, b: Array, rounding: Array, theta: Array) -> Array:
-    """True when the half-space of `cut` excludes θ by more than all rounding.
-
-    b covers trajectories within `reach`. One from a θ outside it, λ times as far, is within
-    λ·reach, because the recursion of `reach` grows no faster than its start.
+def everywhere(p: Problem, a: Array, b: Array, w: Array) -> tuple[Array, Array]:
+    """The half-space a'θ ≤ b, valid for every feasible θ, that follows from those (a, b, w) of
+    `cut`; b = inf where none does.
     """
-    slack = 2 * gamma(theta.shape[-1] + 2) * (jnp.sum(jnp.abs(a * theta), axis=-1) + jnp.abs(b))
-    start = p.reach[0][np.array(p.view.axes)]
-    far = jnp.max(jnp.where(start > 0, jnp.abs(theta) / jnp.where(start > 0, start, 1.0), 1.0))
-    return jnp.sum(a * theta, axis=-1) - b > slack + 2 * jnp.maximum(far, 1.0) * rounding
+    w = w + jnp.where(p.side_0 == 0, 0.0, 2 * UNIT_ROUNDOFF * jnp.abs(a))
+    return a + p.side_0 * w, b + jnp.sum(jnp.where(w == 0, 0.0, w * p.reach_0))
+
+
+def excludes(a: Array, b: Array, w: Array, theta: Array) -> Array:
+    """True when θ breaks a'θ ≤ b + w'|θ| by more than the rounding of this test."""
+    beyond = jnp.sum(a * theta, axis=-1) - jnp.sum(w * jnp.abs(theta), axis=-1) - b
+    size = jnp.sum((jnp.abs(a) + w) * jnp.abs(theta), axis=-1) + jnp.abs(b)
+    return beyond > 2 * gamma(2 * theta.shape[-1] + 3) * size

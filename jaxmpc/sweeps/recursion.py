@@ -28,7 +28,7 @@ from jaxmpc.qp.status import Status
 from jaxmpc.sweeps.boundary import boundary, spread
 from jaxmpc.sweeps.feasible_set import FeasibleSetMap, grid, map_feasible_set
 from jaxmpc.sweeps.law import Bound, Law, ascend
-from jaxmpc.sweeps.proofs import hard_part
+from jaxmpc.sweeps.proofs import bounding_box, hard_part
 from jaxmpc.sweeps.reach import DIMENSIONS, TOLERANCE, Pairs, Shadow, backward, pairs, shadow, usual
 from jaxmpc.sweeps.regions import critical_regions
 
@@ -258,7 +258,9 @@ def recursive_feasibility(
         ladder = replace(ladder, law=refuted, strong=strong, weak=weak)
     elif ladder.law.holds is None:
         tried = f"{np.sum(fmap.label == 1):,} samples" + search * f" and {len(starts)} ascents"
-        reason = f"no counterexample among {tried}; no proof: {ladder.law.reason}"
+        lost_now = np.sum(loops.lost_at == 1)
+        what = f"{lost_now:,} lost after one step, but no" if lost_now else "no"
+        reason = f"{what} counterexample among {tried}; no proof: {ladder.law.reason}"
         ladder = replace(ladder, law=Rung(None, reason))
     return RecursionReport(
         mpc, ladder.strong, ladder.law, ladder.weak, worst,
@@ -428,9 +430,15 @@ def _theorem(mpc: MPC) -> Rung:
     """
     if not usual(mpc) or (mpc.terminal_set is None and mpc.horizon == 1):
         return Rung(None, "Theorem 1 does not cover these limits")
-    report = verify_terminal(
-        mpc.system, mpc.Q, mpc.R, mpc.terminal_cost, mpc.terminal_set, mpc.states, mpc.inputs
-    )
+    last = mpc.states if mpc.terminal_set is None else mpc.terminal_set
+    if not np.isfinite(bounding_box(last, mpc.system.n)).all():
+        return Rung(None, "Theorem 1 is checked for bounded sets alone")
+    try:
+        report = verify_terminal(
+            mpc.system, mpc.Q, mpc.R, mpc.terminal_cost, mpc.terminal_set, mpc.states, mpc.inputs
+        )
+    except ValueError as error:  # such as a set too long for its width
+        return Rung(None, f"Theorem 1 is not checked ({error})")
     needed = [report["terminal set within states"], report["control invariance"]]
     if all(check.holds for check in needed):
         what = "the terminal set" if mpc.terminal_set is not None else "the set of state limits"

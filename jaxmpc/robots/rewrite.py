@@ -1,0 +1,108 @@
+"""A function with some of JAX's operations replaced by others, wherever they stand in it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+from jax.custom_derivatives import SymbolicZero
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun
+
+
+def rewritten(function: Callable, rules: Mapping[Primitive, Callable]) -> Callable:
+    """The same function of pytrees of arrays, with the primitives of `rules` replaced.
+
+    rules: for a primitive the function that stands in for it. It takes the primitive's operands,
+    its parameters as keywords, and returns what it returns: one array, or a list of them for a
+    primitive with several results, of the same shapes and types. Bodies of jit, scan, while, cond,
+    checkpoint and custom_jvp are rewritten too, the last with their rules. Not rewritten are rules
+    of custom_vjp and what JAX does not show in a jaxpr (the parts of custom_root since 0.12).
+
+    The result can be differentiated, batched and compiled as the function itself; its derivatives
+    are those of the functions that stand in.
+    """
+
+    def run(*args: Any) -> Any:
+        closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
+        out = _evaluated(closed, rules, jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(shape), out)
+
+    return run
+
+
+def _evaluated(closed: ClosedJaxpr, rules: Mapping[Primitive, Callable], args: Sequence) -> list:
+    """What the traced function gives, its equations one by one."""
+    jaxpr = closed.jaxpr
+    values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*closed.consts, *args), strict=True))
+    read = lambda v: v.val if isinstance(v, Literal) else values[v]
+    for eqn in jaxpr.eqns:
+        if eqn.primitive in rules:
+            made = rules[eqn.primitive](*map(read, eqn.invars), **eqn.params)
+            made = made if eqn.primitive.multiple_results else [made]
+        else:
+            given = list(dict.fromkeys(v for v in eqn.invars if not isinstance(v, Literal)))
+            params = {key: _replaced(value, rules) for key, value in eqn.params.items()}
+            alone = lambda eqn, given=given: jaxpr_as_fun(
+                ClosedJaxpr(
+                    jaxpr.replace(constvars=[], invars=given, outvars=eqn.outvars, eqns=[eqn]), ()
+                )
+            )
+            apply = alone(eqn.replace(params=params))
+            if eqn.primitive.name == "custom_jvp_call":
+                apply = _with_rule(apply, alone(eqn), rules)
+            made = apply(*map(read, given))
+        values.update(zip(eqn.outvars, made, strict=True))
+    return [read(v) for v in jaxpr.outvars]
+
+
+def _with_rule(values: Callable, original: Callable, rules: Mapping[Primitive, Callable]) -> Any:
+    """The function `values`, its derivative that of `original`, rewritten."""
+    stand_in = jax.custom_jvp(values)
+
+    def rule(primals: tuple, tangents: tuple) -> tuple:
+        of, at, directions = moving(original, primals, tangents)
+        return rewritten(lambda *pair: jax.jvp(of, *pair), rules)(at, directions)
+
+    stand_in.defjvp(rule, symbolic_zeros=True)
+    return stand_in
+
+
+def _holds(value: Any, rules: Mapping[Primitive, Callable]) -> bool:
+    """Whether a traced function, or one among parameters, has a primitive to replace."""
+    if isinstance(value, ClosedJaxpr | Jaxpr):  # one class since JAX 0.12
+        return any(eqn.primitive in rules or _holds(eqn.params, rules) for eqn in value.eqns)
+    if isinstance(value, dict):
+        return any(_holds(part, rules) for part in value.values())
+    return isinstance(value, tuple | list) and any(_holds(part, rules) for part in value)
+
+
+def _replaced(value: Any, rules: Mapping[Primitive, Callable]) -> Any:
+    """A parameter with the traced functions in it rewritten."""
+    if not _holds(value, rules):
+        return value
+    if isinstance(value, tuple | list):
+        parts = [_replaced(part, rules) for part in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
+    closed = value if isinstance(value, ClosedJaxpr) else ClosedJaxpr(value, ())
+    shapes = [
+        jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=aval.weak_type)
+        for aval in closed.in_avals
+    ]
+    new = jax.make_jaxpr(lambda *args: _evaluated(closed, rules, args))(*shapes)
+    return new if isinstance(value, ClosedJaxpr) else new.jaxpr
+
+
+def moving(function: Callable, primals: Sequence, tangents: Sequence) -> tuple:
+    """What a rule of `jax.custom_jvp` with symbolic zeros differentiates: `function` of the leaves
+    of its arguments that move, these leaves of the primals, and their tangents."""
+    leaves, tree = jax.tree.flatten(tuple(primals))
+    is_zero = lambda t: isinstance(t, SymbolicZero)
+    directions = jax.tree.leaves(tuple(tangents), is_leaf=is_zero)
+    which = [i for i, t in enumerate(directions) if not is_zero(t)]
+
+    def of(*values: Any) -> Any:
+        new = list(leaves)
+        for i, value in zip(which, values, strict=True):
+            new[i] = value
+        return function(*jax.tree.unflatten(tree, new))
+
+    return of, tuple(leaves[i] for i in which), tuple(directions[i] for i in which)
