@@ -270,11 +270,12 @@ def problem(mpc: MPC, view: View, extent: np.ndarray, size: np.ndarray | None = 
     steps = [np.equal(mpc.moves, i) for i in range(max(mpc.moves) + 1)]
     implied = np.array([implied[same].min(axis=0) for same in steps])
     every_step = lambda parts: np.concatenate([np.zeros((N, 0)), *parts], axis=1)
+    left, sides, reach = np.array(errors).transpose(1, 0, 2)
     return Problem(
         A, B, c, np.concatenate(H), np.concatenate(D), every_step(lower), every_step(upper),
         np.concatenate(H_N), np.concatenate(lower_N), np.concatenate(upper_N), P, level, back,
         u_lower, u_upper, np.maximum(u_lower, -implied), np.minimum(u_upper, implied),
-        *np.array(errors).transpose(1, 0, 2), side_0, reach_0, view, mpc.moves,
+        left, sides, reach, side_0, reach_0, view, mpc.moves,
     )  # fmt: skip
 
 

@@ -29,7 +29,7 @@ from jaxmpc.mpc.condense import Condensed, condense, in_float64
 from jaxmpc.mpc.problem import MPC, Plan
 from jaxmpc.qp.admm import ADMM, factor, iterate, read, scaled
 from jaxmpc.qp.problem import QP, residual_terms
-from jaxmpc.qp.solve import solve_factored, start, unscaled
+from jaxmpc.qp.solve import marked, solve_factored, start, unscaled
 from jaxmpc.qp.status import Status
 from jaxmpc.tuning import archive
 from jaxmpc.tuning.descent import Descent, descend, minibatch
@@ -219,7 +219,7 @@ def judge(rho: Array, alpha: Array, setting: Setting, samples: Samples) -> tuple
     made = factor(c.P, c.C, solver, c.balls)
 
     def one(sample: Samples) -> tuple[Array, Array]:
-        s = solve_factored(setting.qp(sample.x), made, solver, sample.start)
+        s = marked(*solve_factored(setting.qp(sample.x), made, solver, sample.start))
         worst = jnp.maximum(jnp.maximum(s.primal_residual, s.dual_residual), jnp.abs(s.gap))
         return s.status, worst
 
