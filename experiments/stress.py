@@ -195,9 +195,8 @@ def watched(s: Settings, name: str, batch: int) -> dict[str, Any]:
             process.kill()
             break
     reader.join()
-    assert process.stderr is not None
-    error = process.stderr.read().strip().splitlines()
-    if process.wait() and not hung:
+    error = process.communicate()[1].strip().splitlines()
+    if process.returncode and not hung:
         raise RuntimeError(f"{name}: " + "\n".join(error[-5:]))
     calls = seconds[1:]
     return {

@@ -309,7 +309,8 @@ def margin(mpc, pinned) -> float:
     limits += [(mpc.inputs, u[k + 1]) for k in range(N)] + [(mpc.terminal_set, x[N])]
     if mpc.rate_limited:
         rate = problems.symmetric(*mpc.input_rate_limit)
-        limits += [(rate, u[k + 1] - u[k]) for k in range(N)] + [(mpc.inputs, u[0])]
+        limits += [(rate, u[k + 1] - u[k]) for k in range(N)]
+        limits += [(mpc.inputs, u[0])] if max(pinned) < n else []
     rows, bounds = [], []
     for box, value in limits:
         if box is not None:

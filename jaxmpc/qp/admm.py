@@ -155,7 +155,8 @@ def null_curvature(P: Array, A: Array) -> tuple[Array, Array]:
     """
     n = P.shape[0]
     mean = jnp.trace(P) / n
-    share = jnp.maximum(SINGULAR, 4 * n * jnp.finfo(P.dtype).eps)
+    least = 4 * n * jnp.finfo(P.dtype).eps
+    share = jnp.maximum(SINGULAR, least)
     epsilon = jnp.where(mean > 0, share * mean, 1.0)
     root = inverse_root(P + epsilon * jnp.eye(n, dtype=P.dtype))
     # Σ ε/(λ + ε) counts the directions without curvature.
@@ -167,8 +168,8 @@ def null_curvature(P: Array, A: Array) -> tuple[Array, Array]:
         both = (in_null > 1e-8 * jnp.sum(A**2, axis=1)) & (in_range > 0)
         ratio = jnp.where(both, in_null / jnp.where(both, in_range, 1.0), jnp.nan)
         delta = jnp.where(jnp.any(both), jnp.nanmedian(ratio), delta)
-    # Below ε the sum would not be definite to rounding.
-    return jnp.where(singular, jnp.maximum(delta, epsilon), epsilon), singular
+    # With less the sum would not be definite to rounding.
+    return jnp.where(singular, jnp.maximum(delta, least * mean), epsilon), singular
 
 
 def factor(P: Array, A: Array, solver: ADMM, balls: tuple[int, ...] = ()) -> Factor:

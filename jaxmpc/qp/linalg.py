@@ -131,9 +131,12 @@ def _substituted(U: Array, D: Array, B: Array) -> Array:
 
 
 def _solve_plain(K: Array, B: Array) -> Array:
-    n = K.shape[0]
-    M, D = _eliminated(jnp.concatenate([K, B], axis=1))
-    return _substituted(M[:, :n], D, M[:, n:])
+    """By the inverse root W, K⁻¹ = W'W, and a step of iterative refinement."""
+    W = _inverse_root_plain(K)
+    product = lambda M, X: jnp.sum(M[:, :, None] * X[None], axis=1)
+    rough = lambda X: product(W.swapaxes(0, 1), product(W, X))
+    X = rough(B)
+    return X + rough(B - product(K, X))
 
 
 def _solve_lapack(K: Array, B: Array) -> Array:
