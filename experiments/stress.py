@@ -182,7 +182,7 @@ def watched(s: Settings, name: str, batch: int) -> dict[str, Any]:
     ]  # fmt: skip
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     seconds: list[float] = []
-    assert process.stdout is not None
+    assert process.stdout is not None and process.stderr is not None
     reader = threading.Thread(target=lambda: seconds.extend(map(float, process.stdout)))
     reader.start()
     made, last, hung = 0, time.monotonic(), False
@@ -195,7 +195,10 @@ def watched(s: Settings, name: str, batch: int) -> dict[str, Any]:
             process.kill()
             break
     reader.join()
-    error = process.communicate()[1].strip().splitlines()
+    error = process.stderr.read().strip().splitlines()
+    process.wait()
+    process.stdout.close()
+    process.stderr.close()
     if process.returncode and not hung:
         raise RuntimeError(f"{name}: " + "\n".join(error[-5:]))
     calls = seconds[1:]
@@ -232,6 +235,7 @@ def run(s: Settings) -> list[dict[str, Any]]:
     finally:
         for process in spin:
             process.kill()
+            process.wait()
     return rows
 
 
