@@ -4,7 +4,8 @@ The store is a zarr v3 group, one row a sample, written in whole zarr chunks. Th
 
     points (sample, coordinate), label (sample), status (sample),
     start (sample, state), plan (sample, time, input): x_0 and inputs that prove feasible,
-    cut_normal (sample, coordinate), cut_offset (sample): the half-space that proves infeasible,
+    cut_normal (sample, coordinate), cut_offset (sample): the half-space that proves infeasible
+    (offset inf: none that holds on the whole feasible set is known),
     done (chunk); after refinement bound_point (ray, coordinate), bound_normal (facet,
     coordinate), bound_offset (facet): proved boundary points and half-spaces
 
