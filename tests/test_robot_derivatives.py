@@ -20,11 +20,11 @@ EPS = 1e-6
 
 
 def pair(first, second, cone="elliptic"):
-    """A shape on a slide before a fixed one, 0.5 m away: they touch at 0.4 m."""
+    """A shape on a slide with dry friction before a fixed one, 0.5 m away: they touch at 0.4 m."""
     model = mujoco.MjModel.from_xml_string(f"""
         <mujoco><option timestep="0.005" cone="{cone}" gravity="0 0 0"/>
         <worldbody><geom type="{first}" size=".05 .1 .1" pos=".5 0 0"/>
-        <body><joint name="slide" type="slide" axis="1 0 0"/>
+        <body><joint name="slide" type="slide" axis="1 0 0" frictionloss=".2"/>
         <geom type="{second}" size=".05 .1 .1" mass="1"/></body></worldbody>
         <actuator><motor joint="slide" ctrlrange="-9 9"/></actuator></mujoco>""")
     return jm.load_robot(model)
@@ -154,7 +154,8 @@ AT = [np.array([q, 0.1]) for q in (0.1, 0.39, 0.403)]
 
 
 def test_derivatives_with_elliptic_contacts():
-    """NaN if differentiated through MJX's solver, though nothing touches."""
+    """NaN if differentiated through MJX's solver, which friction makes iterate, though nothing
+    touches."""
     robot, u = pair("sphere", "sphere"), np.array([2.0])
     with jax.enable_x64(True):
         transition = jax.jit(robot.transition)
