@@ -477,6 +477,18 @@ def test_rational_bound_charges_the_residual():
     assert Fraction(3, 4) <= factor <= Fraction(3, 4) * (1 + Fraction(1, 10**5))
 
 
+def test_invariance_of_a_set_without_bound():
+    """|x_2| ≤ 1 with x_2+ = 0.69 x_2, x_1 free: kept, with the factor in rationals, not a crash."""
+    system = LinearSystem([[0.3, 0.1], [0.0, 0.7]], [[0.0], [0.1]])
+    strip = Box([-np.inf, -1], [np.inf, 1])
+    report = verify_terminal(
+        system, np.eye(2), np.eye(1), None, strip, strip, symmetric(1), K=[[0.0, -0.1]]
+    )
+    assert report["invariance under K"].holds
+    assert report.exact_factor == pytest.approx(0.69, rel=1e-14)
+    assert report["states compact"].holds is False
+
+
 def scalar_report(**changes):
     """x+ = x/2 + u, u = x/4, so that x+ = 3/4 x; Q = R = 1, P = 4 and |x_N| <= 1."""
     arguments = {

@@ -37,7 +37,7 @@ def matrices(count, n, seed=0, k=3):
     return M @ M.swapaxes(1, 2) / n + np.eye(n), rng.normal(size=(count, n, k))
 
 
-@pytest.mark.parametrize("n", [1, 3, linalg.SMALL, linalg.SMALL + 1])
+@pytest.mark.parametrize("n", [1, 3, 6, 12, 13])
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_values(name, n):
     """One, a batch that is no multiple of the group, nested batches, and a shared matrix."""
@@ -54,7 +54,7 @@ def test_values(name, n):
         close(shared, np.stack([expected(K[0], b) for b in B]))
 
 
-@pytest.mark.parametrize("n", [3, linalg.SMALL + 1])
+@pytest.mark.parametrize("n", [3, 13])
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_derivatives(name, n):
     """Reverse, forward, and forward over reverse, under vmap: those of JAX's own routines."""
@@ -75,7 +75,7 @@ def test_derivatives(name, n):
                 np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-8 * (1 + np.abs(b).max()))
 
 
-@pytest.mark.parametrize("n", [3, linalg.SMALL + 1])
+@pytest.mark.parametrize("n", [3, 13])
 def test_an_indefinite_matrix_is_nan_alone(n):
     K, B = matrices(4, n)
     K[1, 0, 0] = -1.0

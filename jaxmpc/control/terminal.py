@@ -366,7 +366,8 @@ def _exact_factor(
     """max_i (M h + |M H - H(A+BK)| |x| + H c + max Hw)_i / h_i, without rounding.
 
     Where the rows that M uses are n and independent, their multipliers are solved anew from
-    M H = H(A+BK), so that no residual is left. |x| is bounded by LPs and a margin.
+    M H = H(A+BK), so that no residual is left. |x| is bounded by LPs and a margin. None where the
+    set is too large for it, or unbounded where a residual is left.
     """
     H, h, n = X_f.G, X_f.g, len(c)
     if len(h) ** 2 * n > _EXACT_PRODUCTS:
@@ -375,7 +376,6 @@ def _exact_factor(
     A = [[a + _dot(b, column) for a, column in zip(row, zip(*K, strict=True), strict=True)]
          for row, b in zip(A, B, strict=True)]  # fmt: skip
     rows, limits, drift = _fractions(H), _fractions(h), _fractions(c)
-    reach = _fractions(X_f.reach)
     lower, upper = (None, None) if W is None else (_fractions(W.lower), _fractions(W.upper))
     factor = None
     for i, row in enumerate(rows):
@@ -390,7 +390,9 @@ def _exact_factor(
         bound = _dot(y, [limits[j] for j in used]) + _dot(row, drift)
         for k in range(n):
             left = image[k] - _dot(y, [rows[j][k] for j in used])
-            bound += abs(left) * reach[k] if left else 0
+            if left and not np.isfinite(X_f.reach[k]):
+                return None
+            bound += abs(left) * Fraction(float(X_f.reach[k])) if left else 0
         if lower is not None and upper is not None:
             bound += sum(max(r * lo, r * hi) for r, lo, hi in zip(row, lower, upper, strict=True))
         ratio = bound / limits[i]

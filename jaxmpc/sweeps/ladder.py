@@ -88,25 +88,25 @@ def rows(mpc: MPC, view: View) -> Rows:
 
     norm = np.linalg.norm(C, axis=1)
     still = norm <= 1e-13 * norm.max(initial=0.0)
-    C = np.where(still[:, None], 0.0, C)
     keep = np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
     size = np.where(still, np.linalg.norm(D, axis=1), norm)
     first = len(size) - sum(c.balls)
     if c.balls:  # one scale for all rows of the ball
         moved = norm[first:].max() > 0
         size[first:] = norm[first:].max() if moved else np.linalg.norm(D[first:], axis=1).max()
-    size = size[keep]
+    size, still = size[keep], still[keep]
     weight = 1 / np.where(size > 0, size, 1.0)
-    U, singular, Vt = np.linalg.svd(weight[:, None] * C[keep], full_matrices=False)
+    scaled = np.where(still[:, None], 0.0, weight[:, None] * C[keep])
+    U, singular, Vt = np.linalg.svd(scaled, full_matrices=False)
     rank = int(np.sum(singular > 1e-12 * singular.max(initial=0.0)))
-    U, back = U[:, :rank], Vt[:rank].T / singular[:rank]
+    U, back = np.where(still[:, None], 0.0, U[:, :rank]), Vt[:rank].T / singular[:rank]
 
     place = np.full(len(lower), len(keep))
     place[keep] = np.arange(len(keep))
     return Rows(
         U, back, weight[:, None] * D[keep], weight * lower[keep], weight * upper[keep], weight,
         multiplier_index(mpc, c.layout, place[extra:], len(keep)), Psi, Omega, psi,
-        np.flatnonzero(~U[: len(keep) - sum(c.balls)].any(axis=1)),
+        np.flatnonzero(still[: len(keep) - sum(c.balls)]),
         weight[-1:] * c.radius if c.balls else None, c.balls,
     )  # fmt: skip
 
