@@ -769,6 +769,7 @@ class TestUnrolled:
         for part in jax.jit(jax.grad(f, (0, 1)))(1.0, z):
             np.testing.assert_array_equal(part, 0)
 
+    @pytest.mark.slow
     def test_converged_is_implicit(self, x64):
         """Where the steps have converged, their derivative has too: all fields."""
         qp, _, _ = everything(0)

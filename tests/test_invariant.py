@@ -151,6 +151,7 @@ def test_recursion_without_end_gives_a_pair():
     assert found.volume() == pytest.approx(55 / 3, rel=1e-8)
 
 
+@pytest.mark.slow
 def test_robust_control_invariant_sets():
     w = symmetric(0.1)
     found = maximal_control_invariant_set(UNSTABLE, symmetric(5), symmetric(1), disturbance=w)

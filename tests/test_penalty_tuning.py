@@ -245,6 +245,7 @@ def test_the_first_pass_of_a_sweep_decides_more_and_labels_stay(tmp_path):
         jm.map_feasible_set(mpc(5), POINTS, penalties=found.penalties)
 
 
+@pytest.mark.slow
 def test_sweep_shortfalls_against_the_rungs_own_verdicts():
     """Where nothing is missing the rung decides (in float32, the edge apart); infeasible states it
     decides only there."""

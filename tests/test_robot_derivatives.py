@@ -93,7 +93,12 @@ NARROW_LAST, WIDE_LAST = (True, False), (False, True)
 
 @pytest.mark.parametrize(
     "integrator, order",
-    [("RK4", NARROW_LAST), ("RK4", WIDE_LAST), ("Euler", NARROW_LAST), ("implicitfast", WIDE_LAST)],
+    [
+        ("RK4", NARROW_LAST),
+        ("implicitfast", WIDE_LAST),
+        pytest.param("RK4", WIDE_LAST, marks=pytest.mark.slow),
+        pytest.param("Euler", NARROW_LAST, marks=pytest.mark.slow),
+    ],
 )
 def test_every_integrator_in_both_precisions(integrator, order):
     """Of one robot, one after the other: JAX remembers how it read MJX's NumPy constants."""
@@ -300,7 +305,7 @@ def looped(x, tree):
     return jax.lax.while_loop(lambda c: c[0] < 3, step, (0, x))[1]
 
 
-@pytest.mark.parametrize("function", [nested, looped])
+@pytest.mark.parametrize("function", [pytest.param(nested, marks=pytest.mark.slow), looped])
 def test_rewritten_functions_are_the_same(function):
     """Values, vmap, forward and reverse mode and both."""
     rules = {cholesky_p: by_hand, triangular_solve_p: substituted}

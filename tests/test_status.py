@@ -60,7 +60,7 @@ def rescaled(program, rng, decades):
 
 
 @PRECISIONS
-@pytest.mark.parametrize("decades", [0, 4, 12])
+@pytest.mark.parametrize("decades", [0, pytest.param(4, marks=pytest.mark.slow), 12])
 @pytest.mark.parametrize("make", [bounded, unbounded, empty])
 def test_no_false_status_in_any_units(make, decades, x64):
     """What is not decided may stay so; what is said must be true."""
@@ -132,7 +132,7 @@ def test_an_overflow_has_a_status():
 
 
 @PRECISIONS
-@pytest.mark.parametrize("mode", [jax.grad, jax.jacfwd])
+@pytest.mark.parametrize("mode", [jax.grad, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
 def test_a_bad_program_leaves_the_shared_gradient(mode, x64):
     """Of a parameter that an indefinite and a NaN program share with two good ones."""
     kinds = np.stack([np.eye(2), np.diag([1.0, -1.0]), np.full((2, 2), np.nan), 2 * np.eye(2)])

@@ -50,6 +50,7 @@ def rows(out):
     return {line[2:16].strip(): line[16:].strip() for line in lines}
 
 
+@pytest.mark.slow
 def test_weights_cut_off_resumed_and_read_back(tmp_path, monkeypatch, capsys, given_starts):
     """Ctrl-C keeps the checkpoint; tuned.toml is the problem that was tuned."""
     real = tune.tune_weights

@@ -65,6 +65,7 @@ def test_validation_loss_falls_and_is_that_of_the_returned_values(tuned):
     assert record["numbers"]["unsolved"] == [0.0] * 12 and record["mode"] == "forward"
 
 
+@pytest.mark.slow
 def test_reverse_mode_checkpoint_and_forward_mode_agree(tuned, tmp_path):
     """The same run by the transposed derivative, cut off and taken up again."""
     path = tmp_path / "run.npz"
