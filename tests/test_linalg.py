@@ -76,6 +76,14 @@ def test_derivatives(name, n):
 
 
 @pytest.mark.parametrize("n", [3, 13])
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_an_empty_batch(name, n):
+    function, shape = FUNCTIONS[name][0], (0, n, n)
+    found = jax.vmap(function)(np.zeros(shape), np.zeros(shape))
+    assert found.shape == shape
+
+
+@pytest.mark.parametrize("n", [3, 13])
 def test_an_indefinite_matrix_is_nan_alone(n):
     K, B = matrices(4, n)
     K[1, 0, 0] = -1.0

@@ -23,8 +23,8 @@ spec.loader.exec_module(stress)
 
 # Driven from the host: their programs are not to be had from outside.
 HOST = ("solve_many", "simulate_many", "map_feasible_set")
-# The others are made of the same parts.
-SHORT = ("plan", "plan, gradient", "solve_qp, own matrices, gradient", "lqr",
+# Traced in the fast tests; the others are made of the same parts.
+FAST = ("plan", "plan, gradient", "solve_qp, own matrices, gradient", "lqr",
          "solve_stagewise, own systems", "linear models of arm2")  # fmt: skip
 
 
@@ -51,7 +51,7 @@ def spread_calls(text: str) -> list[str]:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[] if name in SHORT else [pytest.mark.slow])
+        pytest.param(name, marks=[] if name in FAST else [pytest.mark.slow])
         for name in stress.programs()
         if name not in HOST
     ],
@@ -82,11 +82,11 @@ def test_beside_busy_loops(tmp_path):
     """A short form of the stress test."""
     rows = stress.run(
         stress.Settings(
-            programs=("solve_qp, own matrices",), batches=(300,), calls=10,
+            programs=("plan", "solve_qp, own matrices"), batches=(300,), calls=10,
             output=tmp_path / "rows.json",
         )
     )  # fmt: skip
-    assert [row["calls"] for row in rows] == [10]
+    assert [row["calls"] for row in rows] == [10, 10]
     assert not any(row["hung"] for row in rows)
 
 

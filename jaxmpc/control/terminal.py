@@ -376,6 +376,7 @@ def _exact_factor(
     A = [[a + _dot(b, column) for a, column in zip(row, zip(*K, strict=True), strict=True)]
          for row, b in zip(A, B, strict=True)]  # fmt: skip
     rows, limits, drift = _fractions(H), _fractions(h), _fractions(c)
+    reach = [_fractions(v) if np.isfinite(v) else None for v in X_f.reach]
     lower, upper = (None, None) if W is None else (_fractions(W.lower), _fractions(W.upper))
     factor = None
     for i, row in enumerate(rows):
@@ -390,9 +391,10 @@ def _exact_factor(
         bound = _dot(y, [limits[j] for j in used]) + _dot(row, drift)
         for k in range(n):
             left = image[k] - _dot(y, [rows[j][k] for j in used])
-            if left and not np.isfinite(X_f.reach[k]):
+            farthest = reach[k] if left else Fraction(0)
+            if farthest is None:
                 return None
-            bound += abs(left) * Fraction(float(X_f.reach[k])) if left else 0
+            bound += abs(left) * farthest
         if lower is not None and upper is not None:
             bound += sum(max(r * lo, r * hi) for r, lo, hi in zip(row, lower, upper, strict=True))
         ratio = bound / limits[i]

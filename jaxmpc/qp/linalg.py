@@ -54,7 +54,7 @@ def _batched(
 
     def on_cpu(*args: Array) -> Any:
         batch, n = args[0].shape[:2]
-        if n <= small:
+        if plain is not None and n <= small:
             return _side_by_side(plain, args)
         if not WAITS:
             return jax.vmap(one)(*args)
@@ -91,10 +91,10 @@ def _all_batched(size: int, in_batched: Any, args: tuple[Array, ...]) -> tuple[A
     return tuple(v if b else jnp.broadcast_to(v, (size, *v.shape)) for v, b in pairs)
 
 
-def _side_by_side(plain: Any, args: tuple[Array, ...]) -> Any:
+def _side_by_side(plain: Callable, args: tuple[Array, ...]) -> Any:
     """`plain` on groups of LANES, whose data stay within the cache."""
     count = args[0].shape[0]
-    lanes = min(LANES, count)
+    lanes = min(LANES, max(count, 1))
     missing = -count % lanes
 
     def grouped(v: Array) -> Array:
@@ -153,8 +153,11 @@ def _solve_plain(K: Array, B: Array) -> Array:
     return X + rough(B - product(K, X))
 
 
+_cholesky_lapack = partial(lax.linalg.cholesky, symmetrize_input=False)
+
+
 def _solve_lapack(K: Array, B: Array) -> Array:
-    L = lax.linalg.cholesky(K, symmetrize_input=False)
+    L = _cholesky_lapack(K)
     half = lax.linalg.triangular_solve(L, B, left_side=True, lower=True)
     return lax.linalg.triangular_solve(L, half, left_side=True, lower=True, transpose_a=True)
 
@@ -173,7 +176,7 @@ def _inverse_root_plain(K: Array) -> Array:
 
 
 def _inverse_root_lapack(K: Array) -> Array:
-    L = lax.linalg.cholesky(K, symmetrize_input=False)
+    L = _cholesky_lapack(K)
     return _triangular_lapack(L, jnp.eye(len(K), dtype=K.dtype))
 
 
@@ -188,7 +191,7 @@ def _triangular_lapack(L: Array, B: Array) -> Array:
 
 
 _solve = _batched(_solve_lapack, _solve_plain, small=6, columns=True)
-_cholesky = _batched(partial(lax.linalg.cholesky, symmetrize_input=False), _cholesky_plain, 12)
+_cholesky = _batched(_cholesky_lapack, _cholesky_plain, small=12)
 _inverse_root = _batched(_inverse_root_lapack, _inverse_root_plain, small=12)
 _triangular = _batched(_triangular_lapack, _triangular_plain, small=6, columns=True)
 _general = _batched(jnp.linalg.solve, columns=True)
