@@ -15,6 +15,7 @@ from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.control.terminal import TerminalReport, verify_terminal
 from jaxmpc.mpc.feedback import LinearFeedback
+from jaxmpc.mpc.many import solve_many
 from jaxmpc.mpc.problem import MPC, Outputs, Plan, Soft
 from jaxmpc.mpc.rows import active_constraints, row_table
 from jaxmpc.mpc.soften import harden, soften
@@ -33,7 +34,6 @@ from jaxmpc.robots.robot import Robot
 from jaxmpc.sweeps.boundary import Boundary, boundary
 from jaxmpc.sweeps.exact_penalty import ExactPenalty, exact_penalty
 from jaxmpc.sweeps.feasible_set import FeasibleSetMap, grid, map_feasible_set
-from jaxmpc.sweeps.plans import Plans, solve_many
 from jaxmpc.sweeps.reach import feasible_growth, feasible_polytope
 from jaxmpc.sweeps.recursion import RecursionReport, recursive_feasibility, smallest_horizon
 from jaxmpc.sweeps.regions import CriticalRegions, critical_regions
@@ -71,7 +71,6 @@ __all__ = [
     "Parameter",
     "Penalties",
     "Plan",
-    "Plans",
     "Polytope",
     "QPSolution",
     "RecursionReport",

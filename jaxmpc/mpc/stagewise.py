@@ -25,6 +25,7 @@ the mean curvature to P first; E differs by that share.)
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -39,12 +40,14 @@ from jaxmpc.mpc.kernels import Gains, recurrence, riccati_recursion, tracking
 from jaxmpc.mpc.problem import MPC, Plan
 from jaxmpc.mpc.rows import blocks
 from jaxmpc.mpc.solve import Layout, cost, multipliers, slack
-from jaxmpc.qp.admm import ADMM, convex, repeat
+from jaxmpc.qp.admm import ADMM, convex, default_rho, repeat
+from jaxmpc.qp.batches import repeat_while
 from jaxmpc.qp.linalg import cholesky
+from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely, rounding
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.refine import Constants
+from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
 
 # Most stages that the passes of an ADMM step write out, without a loop over them. Loops reorder
@@ -354,10 +357,11 @@ class StageFactor:
 
 
 @jax.jit
-def _factor(mpc: MPC, rho: Array, scale: Any = None) -> StageFactor:
+def _factor(mpc: MPC, rho: Any, scale: Any = None) -> StageFactor:
     s, fault = cleaned(stages(mpc))
     E = row_scale(s) if scale is None else jnp.asarray(scale, s.Q.dtype)
-    rho = jnp.asarray(rho, E.dtype)
+    inputs = s.horizon * s.B.shape[-1]
+    rho = default_rho(E, inputs) if rho is None else jnp.asarray(rho, E.dtype)
     rho = jnp.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, E.shape[0]))
     gains = jax.lax.map(lambda rho: riccati(s, rho * E**2), rho)
     # Finite data can still overflow, or be too near singular for their precision.
@@ -536,8 +540,22 @@ def measures(s: Stages, sample: Sample, u: Array, y: Array) -> tuple[Array, Arra
     return precisely(both, s, sample, u, y)
 
 
-def polish(
-    factor: StageFactor, sample: Sample, bounds: Bounds, u: Array, y: Array, steps: int
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Search:
+    """One instance on its way: inputs u (N, m) and multipliers y (rows,) of the last Newton step,
+    the best of all so far with its relative error, the steps taken, and whether to go on."""
+
+    u: Array
+    y: Array
+    best: tuple[Array, Array]
+    error: Array
+    steps: Array
+    open: Array
+
+
+def newton_step(
+    factor: StageFactor, sample: Sample, bounds: Bounds, u: Array, y: Array
 ) -> tuple[Array, Array]:
     """Semismooth Newton on the optimality conditions from ADMM's u (N, m) and y (rows,).
 
@@ -553,19 +571,29 @@ def polish(
     the data.
     """
     s, E, rho = factor.stages, factor.E, factor.rho[-1]
+    found = errors(s, sample, E, rho, u, y)
+    if u.dtype != jnp.float64:  # values of float64, derivatives of float32
+        fixed = jax.lax.stop_gradient
+        exact = precisely(errors, s, sample, E, rho, u, y)
+        found = jax.tree.map(lambda p, e: p + fixed(e - p), found, exact)
+    D = bounds.curvature(found[0], rho)[0]
+    du, dy = newton(s, E, rho, D)(*found[1:])
+    return u + du, y + dy
 
-    def body(pair: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
-        u, y = pair
-        found = errors(s, sample, E, rho, u, y)
-        if u.dtype != jnp.float64:  # values of float64, derivatives of float32
-            fixed = jax.lax.stop_gradient
-            exact = precisely(errors, s, sample, E, rho, u, y)
-            found = jax.tree.map(lambda p, e: p + fixed(e - p), found, exact)
-        D = bounds.curvature(found[0], rho)[0]
-        du, dy = newton(s, E, rho, D)(*found[1:])
-        return (u + du, y + dy), None
 
-    return jax.lax.scan(body, (u, y), length=steps)[0]
+def search_step(steps: int, constants: tuple, state: Search) -> Search:
+    """One Newton step; the search ends after `steps`, or below a thousandth of eps."""
+    factor, sample, bounds, eps = constants
+    s = factor.stages
+    u, y = newton_step(factor, sample, bounds, state.u, state.y)
+    given = s.bounds.admissible(y)
+    values, sizes = measures(s, sample, u, given)
+    small = jnp.all(values <= 1e-3 * eps + rounding(u.dtype) * sizes)
+    error = jnp.where(jnp.all(jnp.isfinite(values)), jnp.max(values / (1 + sizes)), jnp.inf)
+    take = small | (error < state.error)
+    best = tuple(jnp.where(take, a, b) for a, b in zip((u, given), state.best, strict=True))
+    count = state.steps + 1
+    return Search(u, y, best, jnp.where(take, error, state.error), count, ~small & (count < steps))
 
 
 def errors(
@@ -671,7 +699,7 @@ def _plan(factor: StageFactor, mpc: MPC, solver: ADMM, sample: Sample, warm_star
     else:
         u, y = search(factor, sample, solver, warm_start)
     s = factor.stages
-    status, primal, dual, gap = assess(s, sample, u, y, solver.eps)
+    status, primal, dual, gap = assess(s, sample, u, y, tolerance(solver, u.dtype))
     x = predict(s, sample.x0, u)
     J = cost(mpc, x, u, sample.states, sample.inputs)
     nan = lambda v: jnp.where(usable, v, jnp.nan)
@@ -705,15 +733,22 @@ def search(
     y = factor.E * rho * (t - bounds.project(t, rho))
     y = jnp.where(factor.E == 0, s.bounds.push(s.rows(x, u)), y)
     u, y = u, s.bounds.admissible(y)
-    if solver.refine:
-        new_u, new_y = polish(factor, sample, bounds, u, y, solver.refine)
-        new_y = s.bounds.admissible(new_y)
-        both = (jnp.stack([u, new_u]), jnp.stack([y, new_y]))
-        values, sizes = jax.vmap(lambda u, y: measures(s, sample, u, y))(*both)
-        # By the lesser sizes: a plan that pays for slack has large terms, and is none the better.
-        relative = jnp.max(values / (1 + jnp.min(sizes, axis=0)), axis=1)
-        better = relative[1] < relative[0]  # False for NaN
-        u, y = (jnp.where(better, pair[1], pair[0]) for pair in both)
+    if solver.refine and solver.differentiate == "unrolled":
+        step = lambda pair, _: (newton_step(factor, sample, bounds, *pair), None)
+        u, y = jax.lax.scan(step, (u, y), length=solver.refine)[0]
+        y = s.bounds.admissible(y)
+    elif solver.refine:
+        values, sizes = measures(s, sample, u, y)
+        eps = jnp.asarray(tolerance(solver, u.dtype), u.dtype)
+        state = Search(u, y, (u, y), jnp.max(values / (1 + sizes)), jnp.int32(0), jnp.asarray(True))
+        constants = (factor, sample, bounds, eps)
+        step = partial(search_step, solver.refine)
+        if solver.fixed:
+            again = lambda state, _: (step(constants, state), None)
+            state = jax.lax.scan(again, state, length=solver.refine)[0]
+        else:
+            state = repeat_while(lambda state: state.open, step, constants, state)
+        u, y = state.best
     return u, y
 
 
@@ -737,7 +772,6 @@ def start(factor: StageFactor, sample: Sample, bounds: Bounds, warm_start: Any) 
 def assess(s: Stages, sample: Sample, u: Array, y: Array, eps: Any) -> tuple[Array, ...]:
     """Status and residuals of u and y by the rule of `qp.solve.assess`, in float64."""
     dtype = u.dtype
-    eps = (1e-6 if dtype == jnp.float64 else 1e-3) if eps is None else eps
     floor = rounding(dtype)
 
     def measure(s: Stages, sample: Sample, u: Array, y: Array, eps: Array) -> tuple[Array, ...]:

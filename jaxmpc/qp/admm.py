@@ -22,6 +22,7 @@ pays for one factorization and then for one matrix product a step. prox is the p
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -37,7 +38,7 @@ from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.status import Status
 
 # Eigenvalue, relative to the mean, below which a direction counts as without curvature.
-SINGULAR = 1e-6
+SINGULAR = {8: 1e-10, 4: 1e-6}
 
 
 @jax.tree_util.register_dataclass
@@ -46,12 +47,13 @@ class ADMM:
     """Settings of the solver.
 
     iterations: ADMM steps, always all of them. rho: penalty in the scaled coordinates above;
-    a number, one value a row (m,), or a schedule (stages, m) or (stages, 1) whose stages share
-    the iterations equally; 1 suits these coordinates whatever the problem's units.
+    None: 1/√(mean eigenvalue of A_w A_w'), √(n/m) for m ≥ n rows; or a number, one value a row
+    (m,), or a schedule (stages, m) or (stages, 1) whose stages have equally many iterations.
     alpha: over-relaxation in (0, 2).
-    refine: Newton steps after the loop (`refine.py`), accepted only where they help. 20 serve
-    MPC and well-conditioned programs, 60 solve whatever comes (linear programs, P singular or of
-    condition 1e8, nearly parallel rows).
+    refine: Newton steps after the loop at most, 0 for none (`active_set.py`, `newton.py`). An
+    instance leaves when its residuals are small enough, also in a batch. fixed: take all `refine`
+    steps of the method of multipliers, for every instance: constant time. dtype: floating type
+    of the ADMM iterates, None: that of the data; Newton steps are float64 whatever it is.
     eps: tolerance of status SOLVED on primal residual, dual residual and gap, absolute, plus
     a rounding floor, a multiple of machine epsilon·(size of the terms): 100 in float64, 4 in
     float32. None: 1e-6 in float64, 1e-3 in float32.
@@ -61,22 +63,24 @@ class ADMM:
     interior-point method stopped at slack·multiplier = μ (scaled coordinates) would.
     """
 
-    iterations: int = field(default=100, metadata={"static": True})
-    rho: Any = 1.0
-    alpha: Any = 1.6
-    refine: int = field(default=20, metadata={"static": True})
+    iterations: int = field(default=50, metadata={"static": True})
+    rho: Any = None
+    alpha: Any = 1.9
+    refine: int = field(default=60, metadata={"static": True})
     eps: Any = None
     differentiate: str = field(default="implicit", metadata={"static": True})
     smoothing: Any = 0.0
+    fixed: bool = field(default=False, metadata={"static": True})
+    dtype: str | None = field(default=None, metadata={"static": True})
 
     def validate(self, rows: int) -> None:
         """Raise ValueError for settings that make no iteration."""
         if self.iterations < 0 or self.refine < 0:
             fail("iterations, refine", f"{self.iterations}, {self.refine}", "Give counts ≥ 0")
-        shape = np.shape(self.rho)
+        shape = () if self.rho is None else np.shape(self.rho)
         if len(shape) > 2 or (shape and shape[-1] not in (1, rows)):
             fail("rho", f"shape {shape}", f"Give (), ({rows},) or (stages, {rows})")
-        if concrete(self.rho) and not np.all(np.asarray(self.rho) > 0):
+        if self.rho is not None and concrete(self.rho) and not np.all(np.asarray(self.rho) > 0):
             fail("rho", "holds a value that is not positive", "Penalties are positive")
         if len(shape) == 2 and self.iterations % shape[0]:
             fail("iterations", f"{self.iterations} for {shape[0]} stages", "Use a multiple")
@@ -94,8 +98,9 @@ class Factor:
     """What P, A and rho alone decide; shared by every instance of a batch.
 
     T (n, n): z = T w. E (m,): row scale, 0 for a zero row. H (n, n), A (m, n): Hessian and
-    rows in w. flat: whether P is singular. rho (S, m), and a stage each of F = M⁻¹A'R (S, n, m),
-    iteration matrix G = A F (S, m, m), and Minv (S, n, n). fault: NOT_RUN where P and A are
+    rows in w. flat: whether P is singular. rho (S, m), and a stage each of F = M⁻¹A'R (S, n, m)
+    and Minv (S, n, n); G = A F (S, m, m), or None where two thin products cost less. S = A A'
+    (m, m). fault: NOT_RUN where P and A are
     usable, else the status that says why not; the rest is then that of min ½|z|² without rows.
     """
 
@@ -106,9 +111,16 @@ class Factor:
     flat: Array
     rho: Array
     F: Array
-    G: Array
+    G: Array | None
     Minv: Array
+    S: Array
     fault: Array
+
+    def image(self, stage: int, r: Array) -> Array:
+        """Return A M⁻¹A'R r (m,) with the penalties of a stage."""
+        if self.G is None:
+            return matmul(matmul(r, self.F[stage].T), self.A.T)
+        return matmul(r, self.G[stage].T)
 
 
 def scale(
@@ -148,16 +160,16 @@ def scale(
 def null_curvature(P: Array, A: Array) -> tuple[Array, Array]:
     """The curvature δ that stands in for P where P has none, and whether there is such a part.
 
-    Where P is definite, δ is a small share ε of its mean. Where it is singular, the scale of its
+    Where P is definite, δ is rounding. Where it is singular, the scale of its
     null space relative to its range is free, and ADMM is slow when rows feel mostly one of them:
     δ makes both parts of the median row alike, |a_null|²/δ = Σ (a'v)²/λ over P's range; 1 if
     no row has both parts. With x = (P + εI)⁻¹a the null part is ε|x|, and the range part x'Px.
     """
     n = P.shape[0]
     mean = jnp.trace(P) / n
-    least = 4 * n * jnp.finfo(P.dtype).eps
-    share = jnp.maximum(SINGULAR, least)
-    epsilon = jnp.where(mean > 0, share * mean, 1.0)
+    least = 4 * n * float(jnp.finfo(P.dtype).eps)
+    fraction = max(SINGULAR[P.dtype.itemsize], least)
+    epsilon = jnp.where(mean > 0, fraction * mean, 1.0)
     root = inverse_root(P + epsilon * jnp.eye(n, dtype=P.dtype))
     # Σ ε/(λ + ε) counts the directions without curvature.
     singular = epsilon * jnp.sum(root**2) > 0.5
@@ -169,7 +181,7 @@ def null_curvature(P: Array, A: Array) -> tuple[Array, Array]:
         ratio = jnp.where(both, in_null / jnp.where(both, in_range, 1.0), jnp.nan)
         delta = jnp.where(jnp.any(both), jnp.nanmedian(ratio), delta)
     # With less the sum would not be definite to rounding.
-    return jnp.where(singular, jnp.maximum(delta, least * mean), epsilon), singular
+    return jnp.maximum(jnp.where(singular, delta, 0.0), least * mean), singular
 
 
 def factor(P: Array, A: Array, solver: ADMM, balls: tuple[int, ...] = ()) -> Factor:
@@ -178,7 +190,7 @@ def factor(P: Array, A: Array, solver: ADMM, balls: tuple[int, ...] = ()) -> Fac
     P, A = harmless_matrices(P, A, fault == Status.NOT_RUN)
     T, E, H, A_w, flat = scale(P, A, balls)
     n, m = A_w.shape[1], A_w.shape[0]
-    rho = jnp.asarray(solver.rho, P.dtype)
+    rho = default_rho(E, n) if solver.rho is None else jnp.asarray(solver.rho, P.dtype)
     rho = jnp.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, m))
     ridge = 10 * jnp.finfo(P.dtype).eps
 
@@ -192,15 +204,26 @@ def factor(P: Array, A: Array, solver: ADMM, balls: tuple[int, ...] = ()) -> Fac
     stages = [stage(R) for R in rho]
     F = jnp.stack([F for F, _ in stages])
     Minv = jnp.stack([Minv for _, Minv in stages])
-    made = Factor(T, E, H, A_w, flat, rho, F, matmul(A_w, F), Minv, fault)
+    G = None if 2 * n < m else matmul(A_w, F)
+    made = Factor(T, E, H, A_w, flat, rho, F, G, Minv, matmul(A_w, A_w.T), fault)
     # Finite data can still overflow, or be too near singular for their precision.
-    parts = (T, E, H, A_w, F, made.G, Minv)
+    parts = jax.tree.leaves((T, E, H, A_w, F, G, Minv))
     sound = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in parts]))
     none = jax.tree.map(jnp.zeros_like, made)
     one, failed = jnp.eye(n, dtype=P.dtype), jnp.int32(Status.ITERATION_LIMIT)
     ones = jnp.broadcast_to(one, Minv.shape)
     harmless = replace(none, T=one, H=one, Minv=ones, rho=rho, fault=failed)
     return jax.tree.map(lambda a, b: jnp.where(sound, a, b), made, harmless)
+
+
+def default_rho(E: Array, n: int) -> Array:
+    """Return √(n / rows), at most 1, for n variables and the rows of scale E (m,) that move.
+
+    That is 1/√(mean eigenvalue of A_w A_w') over its range. For rows that are all active
+    1/√(largest · least) is best (Ghadimi et al. 2015, IEEE TAC 60, theorem 4); which rows are
+    active is not known, and they are few.
+    """
+    return jnp.sqrt(n / jnp.maximum(jnp.sum(E > 0), n)).astype(E.dtype)
 
 
 def matrix_fault(P: Array, A: Array) -> Array:
@@ -267,10 +290,12 @@ def scaled_rows(factor: Factor, qp: QP, z: Array, y: Array) -> tuple[Array, Arra
     return E * matmul(z, qp.A.T), jnp.where(E > 0, y / jnp.where(E > 0, E, 1.0), 0.0)
 
 
-def step(t: Array, b: Array, bounds: Bounds, rho: Array, G: Array, alpha: Any) -> Array:
-    """One ADMM step on t = s + v (m,)."""
+def step(
+    t: Array, b: Array, bounds: Bounds, rho: Array, image: Callable[[Array], Array], alpha: Any
+) -> Array:
+    """One ADMM step on t = s + v (m,); image: r → A M⁻¹A'R r."""
     s = bounds.project(t, rho)
-    return t + jnp.asarray(alpha, t.dtype) * (matmul(2 * s - t, G.T) + b - s)
+    return t + jnp.asarray(alpha, t.dtype) * (image(2 * s - t) + b - s)
 
 
 def iterate(
@@ -280,12 +305,12 @@ def iterate(
     stages = factor.rho.shape[0]
     previous = t
     for i in range(stages):
-        rho, G = factor.rho[i], factor.G[i]
+        rho, image = factor.rho[i], partial(factor.image, i)
         b = -matmul(matmul(q, factor.Minv[i]), factor.A.T)
         if i > 0:  # the multiplier R v is what carries over, not v
             s = bounds.project(t, factor.rho[i - 1])
             t = s + factor.rho[i - 1] / rho * (t - s)
-        advance = lambda t, rho=rho, G=G, b=b: step(t, b, bounds, rho, G, alpha)
+        advance = lambda t, rho=rho, image=image, b=b: step(t, b, bounds, rho, image, alpha)
         if iterations:
             previous = repeat(advance, t, iterations // stages - 1)
             t = advance(previous)

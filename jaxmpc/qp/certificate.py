@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.qp.linalg import definite_solver
+from jaxmpc.qp.newton import gram, ridged
 from jaxmpc.qp.precision import matmul, rounding
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.refine import gram, ridged
 
 # Rounding of a ray's products beside that of residuals: rays are solutions of linear systems.
 RAY = 25

@@ -2,7 +2,7 @@
 
 At a solution the conditions Pz + q + A'y = 0 and excess(Az + y/ρ) = y/ρ hold for every ρ > 0
 (`projection.py`). With the pieces of the excess held fixed they are smooth, and a change of the
-data moves (z, y) by one linear system, which `refine.linearised` solves in ADMM's coordinates.
+data moves (z, y) by one linear system, which `newton.linearised` solves in ADMM's coordinates.
 JAX transposes that for reverse mode and differentiates it again for higher orders.
 
 Which element of the generalised derivative is taken, and what it means where none exists:
@@ -17,7 +17,7 @@ Which element of the generalised derivative is taken, and what it means where no
 * Where active rows depend on each other, the least-squares answer (see `linearised`).
 * A row that is violated although its multiplier pushes (the program is infeasible, or not yet
   solved) counts as the spring with stiffness k = y/violation that holds (z, y) in balance. For
-  an infeasible program the polish of `refine.py` ends at the point that violates the rows
+  an infeasible program the polish of `newton.py` ends at the point that violates the rows
   least, with stiff springs: the derivative is that of the closest feasible program
   (Bambade et al. 2024, QPLayer), up to about 1/k.
 """
@@ -29,10 +29,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.qp.admm import Factor, scaled, scaled_rows
+from jaxmpc.qp.newton import Constants, linearised
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.refine import Constants, linearised
 
 
 @jax.custom_jvp

@@ -1,14 +1,16 @@
 """solve_qp: loop, polish, honest status and derivative joined."""
 
-from dataclasses import replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from jaxmpc.checks import fail
+from jaxmpc.qp.active_set import DualPoint, dual_point, dual_step
 from jaxmpc.qp.admm import (
     ADMM,
     Factor,
@@ -19,12 +21,22 @@ from jaxmpc.qp.admm import (
     scaled,
     scaled_rows,
 )
-from jaxmpc.qp.certificate import descent_ray, farkas, recession, sharpen
+from jaxmpc.qp.batches import in_blocks, repeat_while
+from jaxmpc.qp.certificate import descent_ray, farkas, recession
 from jaxmpc.qp.derivative import implicit
+from jaxmpc.qp.newton import (
+    Constants,
+    Multipliers,
+    gram,
+    largest,
+    multipliers_start,
+    multipliers_step,
+    multipliers_update,
+    newton_step,
+)
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely, rounding
 from jaxmpc.qp.problem import QP, QPSolution, residual_terms, residuals
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.refine import Constants, least_distance, linearised, polish
 from jaxmpc.qp.status import Status
 
 
@@ -79,41 +91,242 @@ def solve_factored(
 
 
 def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any) -> QPSolution:
-    """Loop, polish, correction, proofs."""
+    """Loop, Newton steps, proofs."""
     q, bounds = scaled(factor, qp)
     t = jnp.zeros_like(qp.l)
     if warm_start is not None:
         t = start(factor, qp, bounds, warm_start)
-    t, previous = iterate(factor, q, bounds, t, solver.iterations, solver.alpha)
-    (w, y), (w_old, y_old) = read(factor, t, q, bounds), read(factor, previous, q, bounds)
-    pair = unscaled(qp, factor, w, y)
-    proofs, directions = [y - y_old, y], [w - w_old, w]
+    unrolled = solver.differentiate == "unrolled"
+    rough = "float32" if solver.refine and not unrolled else qp.q.dtype
+    dtype = rough if solver.dtype is None else jnp.dtype(solver.dtype)
+    cast = lambda tree, dtype=dtype: jax.tree.map(
+        lambda v: v.astype(dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v, tree
+    )
+    run = partial(loop, solver.iterations)
+    arguments = cast(((factor, jnp.asarray(solver.alpha)), (q, bounds, t)))
+    (w, y), (w_old, y_old) = cast(
+        run(*arguments) if unrolled else in_blocks(run, *arguments), qp.q.dtype
+    )
+    eps = jnp.asarray(tolerance(solver, qp.q.dtype), qp.q.dtype)
+    p = Program(qp, factor, q, bounds, eps)
+    begin = replace(multipliers_start(q, w, y), change=y - y_old, move=w - w_old)
+    if unrolled:
+        advance = lambda s, _: (multipliers_step(factor.H, q, factor.A, bounds, s), None)
+        end = lax.scan(advance, begin, length=solver.refine)[0]
+        pair = better(p, (end.w, end.y), (w, y)) if solver.refine else unscaled(qp, factor, w, y)
+        return assess(qp, pair, prove(qp, factor, end.change, end.move), solver)
     if not solver.refine:
-        return assess(qp, pair, prove(qp, factor, proofs, directions), solver)
-    end = polish(factor.H, q, factor.A, bounds, w, y, solver.refine)
-    polished = unscaled(qp, factor, end.w, end.y)
-    pair = corrected(qp, factor, *best(qp, polished, pair))
-    # Each step waits for the one before: jaxlib 0.10 can hang on two factorizations at once.
-    w, _ = jax.lax.optimization_barrier((end.w, pair))
-    steps = max(solver.refine // 5, 1)
-    _, e = least_distance(factor.A, bounds, w, steps, Constants.of(w.dtype).damping)
-    move, _ = jax.lax.optimization_barrier((end.move, e))
-    proofs += [end.change, sharpen(factor.A, e)]
-    directions += [move, ray(factor, q, bounds, move, steps)]
-    proof = prove(qp, factor, proofs, directions)
-    # The polish ends at the point of least violation, the best answer where there is none.
-    z, y = (jnp.where(proof.infeasible, p, v) for p, v in zip(polished, pair, strict=True))
-    return assess(qp, (z, y), proof, solver)
+        pair = unscaled(qp, factor, w, y)
+        return assess(qp, pair, prove(qp, factor, begin.change, begin.move), solver)
+    pair, proof = precisely(partial(improve, solver.refine, solver.fixed), p, begin)
+    return assess(qp, pair, proof, solver)
 
 
-def ray(factor: Factor, q: Array, bounds: Bounds, d: Array, steps: int) -> Array:
-    """A direction of unbounded descent, searched from d, if P is singular."""
-    rows, cone = recession(q, factor.H, factor.A, bounds)
-    length = jnp.linalg.norm(d)
-    d = d / jnp.where(length > 0, length, 1.0)
-    damping = Constants.of(d.dtype).damping
-    seek = lambda d: least_distance(rows, cone, d, 2 * steps, damping)[0]
-    return jax.lax.cond(factor.flat, seek, lambda d: d, d)
+def loop(iterations: int, constants: tuple, data: tuple) -> list[tuple[Array, Array]]:
+    """Scaled w (n,) and y (m,) after `iterations` steps of ADMM from t (m,), and one step before.
+    constants: the factor and alpha; data: q, bounds, t."""
+    (factor, alpha), (q, bounds, t) = constants, data
+    ends = iterate(factor, q, bounds, t, iterations, alpha)
+    return [read(factor, t, q, bounds) for t in ends]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Program:
+    """A program in its own units and, as `q` (n,) and `bounds`, in ADMM's coordinates; eps: the
+    residuals that are asked for."""
+
+    qp: QP
+    factor: Factor
+    q: Array
+    bounds: Bounds
+    eps: Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Pair:
+    """z (n,) and y (m,) in the units of the program, the largest of its residuals, each relative
+    to the size of its terms, and whether all are small enough."""
+
+    z: Array
+    y: Array
+    error: Array
+    solved: Array
+
+    @classmethod
+    def of(cls, p: Program, w: Array, y: Array) -> "Pair":
+        """The pair of scaled w and y. Small enough: below a thousandth of eps or rounding."""
+        return cls.and_gradient(p, w, y)[0]
+
+    @classmethod
+    def and_gradient(cls, p: Program, w: Array, y: Array) -> "tuple[Pair, Array]":
+        """The pair, and the gradient T'(Pz + q + A'y) (n,) of the Lagrangian at it."""
+        z, y = unscaled(p.qp, p.factor, w, y)
+        small, error, floor = jnp.asarray(True), jnp.zeros((), z.dtype), rounding(z.dtype)
+        terms = residual_terms(p.qp, z, y)
+        for value, size in terms:
+            small = small & jnp.all(jnp.abs(value) <= 1e-3 * p.eps + floor * size)
+            error = jnp.maximum(error, largest(value) / (1 + largest(size)))
+        # A maximum need not propagate NaN (XLA on CPUs).
+        finite = jnp.all(jnp.isfinite(z)) & jnp.all(jnp.isfinite(y))
+        pair = cls(z, y, jnp.where(finite, error, jnp.inf), small & finite)
+        return pair, matmul(terms[1][0], p.factor.T)
+
+    def or_better(self, other: "Pair") -> "Pair":
+        """The other pair where that is solved or its residuals are smaller."""
+        take = ~self.solved & (other.solved | (other.error < self.error))
+        return jax.tree.map(lambda old, new: jnp.where(take, new, old), self, other)
+
+
+def better(p: Program, pair: tuple[Array, Array], other: tuple[Array, Array]) -> tuple:
+    """The one of two scaled pairs (w, y) with the smaller residuals, in the program's units."""
+    first, second = (Pair.of(*lax.stop_gradient((p, *both))) for both in (pair, other))
+    take = second.error < first.error
+    pair, other = unscaled(p.qp, p.factor, *pair), unscaled(p.qp, p.factor, *other)
+    return tuple(jnp.where(take, b, a) for a, b in zip(pair, other, strict=True))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Search:
+    """One instance on its way: the point of the method of multipliers; q (n,) corrected by what
+    rounding leaves of the gradient; the best pair so far; Newton steps taken; what is proved;
+    w (n,) of the search for a proof, and whether to go on."""
+
+    point: Multipliers
+    q: Array
+    best: Pair
+    steps: Array
+    proof: "Proof"
+    w: Array
+    open: Array
+
+
+# Steps on the dual before the method of multipliers takes over, and those after which rows join
+# one at a time.
+DUAL_STEPS, JOINTLY = 24, 2
+
+
+def improve(
+    refine: int, fixed: bool, p: Program, begin: Multipliers
+) -> tuple[tuple[Array, Array], "Proof"]:
+    """The pair (z, y) and what is proved, after `refine` Newton steps at most; in float64.
+
+    Steps on the dual in the rows that push solve most programs (`active_set.py`). The method of
+    multipliers (`newton.py`) takes the others: P singular, balls, degenerate or infeasible rows.
+    """
+    qp, factor = p.qp, p.factor
+    proof = prove(qp, factor, begin.change, begin.move)
+    best = Pair.of(p, begin.w, begin.y)
+    go_on = ~proof.unbounded & ~best.solved
+    if not qp.balls and qp.A.shape[0] and not fixed:
+        usable = go_on & ~factor.flat & ~proof.infeasible
+        dual = dual_point(factor.A, p.q, p.bounds, begin.y)
+        state = DualSearch(dual, p.q, best, jnp.int32(0), usable)
+        most = min(DUAL_STEPS, refine)
+        state = repeat_while(lambda s: s.open, partial(on_the_dual, most), p, state)
+        best, go_on = state.best, go_on & ~state.best.solved
+    s = Search(begin, p.q, best, jnp.int32(0), proof, begin.w, go_on)
+    if fixed:
+        length = refine + 3 * proof_steps(refine)
+        s = lax.scan(lambda s, _: (by_multipliers(refine, p, s), None), s, length=length)[0]
+    else:
+        s = repeat_while(lambda s: s.open, partial(by_multipliers, refine), p, s)
+    # The method of multipliers ends at the point of least violation, the best answer where there
+    # is none.
+    end = unscaled(qp, factor, s.point.w, s.point.y)
+    infeasible = s.proof.infeasible & ~s.best.solved
+    z, y = (jnp.where(infeasible, a, b) for a, b in zip(end, (s.best.z, s.best.y), strict=True))
+    return (z, y), s.proof
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class DualSearch:
+    """One instance among the dual steps, with q (n,) corrected as in `Search`."""
+
+    dual: DualPoint
+    q: Array
+    best: Pair
+    steps: Array
+    open: Array
+
+
+def on_the_dual(most: int, p: Program, s: DualSearch) -> DualSearch:
+    """One step of `active_set.py`, and whether it solved the program."""
+    A, steps = p.factor.A, s.steps + 1
+    dual = dual_step(A, p.factor.S, s.q, p.bounds, s.dual, steps > JOINTLY)
+    pair, gradient = Pair.and_gradient(p, dual.w, dual.y)
+    best = s.best.or_better(pair)
+    # In exact arithmetic the gradient is zero here. Where P is ill-conditioned it is rounding of
+    # T'PT, which the next step takes for a part of q (defect correction).
+    q = s.q + gradient
+    dual = replace(dual, w=dual.w - gradient, v=dual.v - matmul(gradient, A.T))
+    return DualSearch(dual, q, best, steps, ~best.solved & (steps < most))
+
+
+def proof_steps(refine: int) -> int:
+    """Return the Newton steps towards a Farkas vector; twice as many towards a ray."""
+    return max(refine // 5, 1)
+
+
+def by_multipliers(refine: int, p: Program, s: Search) -> Search:
+    """One Newton step: of the method of multipliers; after `refine` of these of least distance to
+    the rows, whose excess becomes a Farkas vector; then, if P is singular, to those of a ray."""
+    f, few, (n, dtype) = p.factor, proof_steps(refine), (s.w.shape[0], s.w.dtype)
+    primal, distance = s.steps < refine, s.steps < refine + few
+    pick = lambda one, other: jnp.where(primal, one, other)
+    rows, bounds = stacked(p, primal, distance)
+    w = jnp.where(s.steps == refine, s.point.w, s.w)
+    length = jnp.linalg.norm(s.point.move)
+    along = s.point.move / jnp.where(length > 0, length, 1.0)
+    w = jnp.where(s.steps == refine + few, along, w)
+    step = newton_step(
+        pick(s.point.w, w), jnp.append(jnp.zeros(n + 1, dtype), pick(s.point.y, 0.0)),
+        pick(f.H, 0.0), pick(s.q, 0.0), rows, bounds, pick(s.point.rho, 1.0),
+        pick(s.point.sigma, Constants.of(dtype).damping), gram(rows),
+    )  # fmt: skip
+    step = step._replace(excess=step.excess[n + 1 :])
+    point = jax.tree.map(pick, multipliers_update(s.q, s.point, step), s.point)
+    pair, gradient = Pair.and_gradient(p, point.w, point.y)
+    best = jax.tree.map(pick, s.best.or_better(pair), s.best)
+    # What rounding of T'PT hides of the gradient counts as a part of q (defect correction).
+    q = s.q + gradient - (matmul(point.w, f.H) + s.q + matmul(point.y, f.A))
+    ray = jnp.where(distance, point.move, step.w)
+    proof = s.proof.joined(prove(p.qp, f, pick(point.change, step.excess), ray))
+
+    steps = s.steps + 1
+    # A proof of infeasibility ends the search for one; the point of least violation goes on.
+    settled = largest(point.move) <= 1e-9 * (1 + largest(point.w))
+    settled = settled & (point.rho >= Constants.of(dtype).rho[1])
+    last = refine + jnp.where(f.flat, 3 * few, few)
+    ended = best.solved | proof.unbounded | (steps >= last)
+    ended = ended | (proof.infeasible & (settled | (steps >= refine)))
+    found = Search(point, q, best, steps, proof, step.w, ~ended)
+    return jax.tree.map(lambda old, new: jnp.where(s.open, new, old), s, found)
+
+
+def stacked(p: Program, primal: Array, distance: Array) -> tuple[Array, Bounds]:
+    """The rows of a ray above those of the program, and what is asked of them: the bounds of the
+    program, these without soft rows, or the cone of a ray."""
+    n, given, hard = p.q.shape[0], p.bounds, p.bounds.hard()
+    rows, cone = recession(p.q, p.factor.H, p.factor.A, given)
+    free = jnp.full(n + 1, jnp.inf, p.q.dtype)
+    side = lambda all_rows, hard_rows, free, cone: jnp.where(
+        distance, jnp.append(free, jnp.where(primal, all_rows, hard_rows)), cone
+    )
+    bounds = replace(
+        given, l=side(given.l, hard.l, -free, cone.l), u=side(given.u, hard.u, free, cone.u)
+    )
+    if given.linear is not None:
+        bounds = replace(
+            bounds, linear=jnp.append(free, given.linear),
+            quadratic=jnp.append(0.0 * p.q, jnp.append(0.0, given.quadratic)),
+        )  # fmt: skip
+    if given.balls:
+        bounds = replace(bounds, radius=jnp.where(distance, given.radius, 0.0))
+    return rows, bounds
 
 
 def cleaned(qp: QP, matrix_fault: Array) -> tuple[QP, Array]:
@@ -176,45 +389,6 @@ def unscaled(qp: QP, factor: Factor, w: Array, y: Array) -> tuple[Array, Array]:
     return matmul(w, factor.T.T), qp.bounds.admissible(y)
 
 
-def best(qp: QP, pair: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
-    """The one of two pairs (z, y) with the smaller residuals; the first where none is finite."""
-    better = worst(qp, *other) < worst(qp, *pair)  # False for NaN
-    return jnp.where(better, other[0], pair[0]), jnp.where(better, other[1], pair[1])
-
-
-def corrected(qp: QP, factor: Factor, z: Array, y: Array) -> tuple[Array, Array]:
-    """Iterative refinement: (z, y) moved twice by their residuals, which are computed in float64
-    from the data as given, with the active rows held fixed; kept only where residuals fall."""
-    rho, E = Constants.of(z.dtype).linear, factor.E
-    v, y_w = scaled_rows(factor, qp, z, y)
-    weights, normals = scaled(factor, qp)[1].curvature(v + y_w / rho, rho)
-    solve = linearised(factor.H, factor.A, weights, normals, rho)
-
-    def conditions(qp: QP, factor: Factor, z: Array, y: Array) -> tuple[Array, Array]:
-        v, y_w = scaled_rows(factor, qp, z, y)
-        dual = matmul(matmul(z, qp.P) + qp.q + matmul(y, qp.A), factor.T)
-        return dual, scaled(factor, qp)[1].excess(v + y_w / rho, rho) - y_w / rho
-
-    def move(pair: tuple[Array, Array], _: None) -> tuple[Any, None]:
-        z, y = pair
-        dw, dy = solve(*precisely(conditions, qp, factor, z, y))
-        moved = z + matmul(dw, factor.T.T), qp.bounds.admissible(y + E * dy)
-        return best(qp, pair, moved), None
-
-    return jax.lax.scan(move, (z, y), length=2)[0]
-
-
-def worst(qp: QP, z: Array, y: Array) -> Array:
-    """Largest residual, each relative to the size of its terms: what refinement must lower."""
-    norm = lambda v: jnp.max(jnp.abs(v), initial=0.0)
-
-    def relative(qp: QP, z: Array, y: Array) -> Array:
-        terms = residual_terms(qp, z, y)
-        return jnp.max(jnp.stack([norm(value) / (1 + norm(size)) for value, size in terms]))
-
-    return precisely(relative, qp, z, y)
-
-
 def value(qp: QP, z: Array, y: Array) -> Array:
     """The cost at z, with the derivative of the optimal value: that of the Lagrangian
     ½ z'Pz + q'z + y'Az − g*(y) at (z, y) (envelope theorem). Penalties that are being paid stand
@@ -233,7 +407,9 @@ def value(qp: QP, z: Array, y: Array) -> Array:
     return fixed(own + cost) + (lagrangian - fixed(lagrangian))
 
 
-class Proof(NamedTuple):
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Proof:
     """A Farkas vector and a descent ray, and whether they are proved to be."""
 
     certificate: Array
@@ -241,32 +417,49 @@ class Proof(NamedTuple):
     ray: Array
     unbounded: Array
 
+    def joined(self, other: "Proof") -> "Proof":
+        """What either proves."""
+        old, new = self, other
+        return Proof(
+            jnp.where(old.infeasible, old.certificate, new.certificate),
+            old.infeasible | new.infeasible,
+            jnp.where(old.unbounded, old.ray, new.ray), old.unbounded | new.unbounded,
+        )  # fmt: skip
 
-def prove(qp: QP, factor: Factor, proofs: list[Array], directions: list[Array]) -> Proof:
-    """What is proved of the program by scaled candidates for a Farkas vector and for a ray."""
+
+def prove(qp: QP, factor: Factor, y: Array, d: Array) -> Proof:
+    """What is proved of the program by scaled candidates for a Farkas vector y and for a ray d."""
     E = factor.E
     # Rows that z cannot move prove emptiness by themselves.
     fixed = jnp.where(E == 0, qp.bounds.violation(jnp.zeros_like(E)), 0.0)
-    candidates = jnp.stack([fixed, *(E * y for y in proofs)])
-    certificate, infeasible = first(*jax.vmap(lambda y: farkas(qp, y))(candidates))
-    candidates = matmul(jnp.stack(directions), factor.T.T)
-    ray, unbounded = first(*jax.vmap(lambda d: descent_ray(qp, d))(candidates))
+    certificate, infeasible = farkas(qp, jnp.where(jnp.any(fixed != 0), fixed, E * y))
+    ray, unbounded = descent_ray(qp, matmul(d, factor.T.T))
     return Proof(certificate, infeasible, ray, unbounded)
+
+
+def tolerance(solver: ADMM, dtype: Any) -> Any:
+    """Return the residuals that `solver` asks for."""
+    return (1e-6 if dtype == jnp.float64 else 1e-3) if solver.eps is None else solver.eps
+
+
+def within(qp: QP, z: Array, y: Array, eps: Any, floor: float | None = None) -> Array:
+    """Whether each residual of (z, y) is at most eps + floor·(size of its terms)."""
+    floor = rounding(z.dtype) if floor is None else floor
+    return jnp.all(jnp.stack([
+        jnp.all(jnp.abs(value) <= eps + floor * size) for value, size in residual_terms(qp, z, y)
+    ]))  # fmt: skip
 
 
 def assess(qp: QP, pair: tuple[Array, Array], proof: Proof, solver: ADMM) -> QPSolution:
     """The pair (z, y) judged in the units of `qp`, in float64."""
     (z, y), dtype = pair, qp.q.dtype
-    eps = (1e-6 if dtype == jnp.float64 else 1e-3) if solver.eps is None else solver.eps
     floor = rounding(dtype)
 
     def measure(qp: QP, z: Array, y: Array, eps: Array) -> tuple[Array, ...]:
-        solved = jnp.asarray(True)
-        for value, size in residual_terms(qp, z, y):
-            solved = solved & jnp.all(jnp.abs(value) <= eps + floor * size)
-        return (solved, *residuals(qp, z, y))
+        return (within(qp, z, y, eps, floor), *residuals(qp, z, y))
 
-    solved, primal, dual, gap = precisely(measure, qp, z, y, jnp.asarray(eps, dtype))
+    eps = jnp.asarray(tolerance(solver, dtype), dtype)
+    solved, primal, dual, gap = precisely(measure, qp, z, y, eps)
     # Rows that contradict each other by less than eps are both solved and proved empty: say solved.
     infeasible = proof.infeasible & ~solved
     unbounded = proof.unbounded & ~solved & ~infeasible
@@ -282,11 +475,6 @@ def assess(qp: QP, pair: tuple[Array, Array], proof: Proof, solver: ADMM) -> QPS
         certificate=jnp.where(infeasible, proof.certificate, 0.0),
         ray=jnp.where(unbounded, proof.ray, 0.0),
     )  # fmt: skip
-
-
-def first(vectors: Array, proved: Array) -> tuple[Array, Array]:
-    """The first vector that is proved, and whether there is one."""
-    return vectors[jnp.argmax(proved)], jnp.any(proved)
 
 
 def marked(solution: QPSolution, fault: Array) -> QPSolution:

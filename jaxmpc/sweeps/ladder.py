@@ -23,7 +23,7 @@ from jaxmpc.mpc.condense import condense, in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.refine import least_distance
+from jaxmpc.qp.newton import least_distance
 from jaxmpc.sweeps import proofs
 from jaxmpc.sweeps.proofs import Problem, View
 

@@ -19,7 +19,8 @@ from jaxmpc.mpc.condense import condense, in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
-from jaxmpc.sweeps.plans import Plans, solve_many
+from jaxmpc.mpc.many import solve_many
+from jaxmpc.mpc.problem import Plan
 
 # Residuals to which plans are solved.
 EPS = 1e-8
@@ -116,7 +117,7 @@ class Law:
         easy = np.pad(self.easy, (0, states.shape[1] - len(self.easy)))
         return np.vstack([states, np.tile(easy, (-len(states) % self.chunk, 1))])
 
-    def plans(self, states: np.ndarray) -> Plans:
+    def plans(self, states: np.ndarray) -> Plan:
         """Plans from states (B, p), in programs of one shape."""
         found = solve_many(self.mpc, self.filled(states), ADMM(eps=EPS), chunk=self.chunk)
         kept: dict[str, Any] = {

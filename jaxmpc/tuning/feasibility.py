@@ -30,7 +30,7 @@ from jaxmpc.qp import linalg
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.refine import Constants, gram, newton_step, ridged
+from jaxmpc.qp.newton import Constants, gram, newton_step, ridged
 from jaxmpc.tuning import archive
 from jaxmpc.tuning.descent import descend, minibatch
 from jaxmpc.tuning.parameters import Parameters, raw, require_parameters, values

@@ -12,6 +12,7 @@ e ≠ 0, which is a Farkas vector: e'A w is 0 for all w but at least g*(e) fails
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -25,8 +26,6 @@ from jaxmpc.qp.projection import Bounds
 # Steps of the line search, a scalar Newton method. Penalties put almost vertical pieces into the
 # derivative, which only bisection finds.
 LINE_STEPS, LINE_STEPS_SOFT = 6, 24
-# Largest table of row outer products that is kept: above it A'DA is formed for each instance.
-TABLE_ENTRIES = 4_000_000
 
 
 class Constants(NamedTuple):
@@ -50,20 +49,10 @@ class Constants(NamedTuple):
 
 
 def gram(A: Array) -> Callable[[Array, list[Array]], Array]:
-    """The function (weights (m,), normals) → A'(diag(weights) + Σ h h')A.
-
-    In a batch that shares A a table of row outer products, if it fits, turns B small products
-    into one (B, m)·(m, n²).
-    """
-    m, n = A.shape
-    kept = m * n * n <= TABLE_ENTRIES
-    table = (A[:, :, None] * A[:, None, :]).reshape(m, n * n) if kept else None
+    """Return the function (weights (m,), normals) → A'(diag(weights) + Σ h h')A."""
 
     def product(weights: Array, normals: list[Array]) -> Array:
-        if table is None:
-            K = matmul(A.T * weights, A)
-        else:
-            K = matmul(weights, table).reshape(n, n)
+        K = matmul(A.T * weights, A)
         for h in normals:
             a = matmul(h, A)
             K = K + a[:, None] * a[None, :]
@@ -157,53 +146,68 @@ def least_distance(
     return w, e
 
 
-class Polish(NamedTuple):
-    """w, y; `change`: the last change of y, on an infeasible program nearly a Farkas vector;
-    `move`: the last change of w, on an unbounded one nearly a ray."""
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Multipliers:
+    """State of the proximal method of multipliers: w (n,), y (m,); `change`: the last change of y,
+    on an infeasible program nearly a Farkas vector; `move`: the last change of w, on an unbounded
+    one nearly a ray; the penalties rho and sigma, the violation before and the tolerance for φ."""
 
     w: Array
     y: Array
     change: Array
     move: Array
+    rho: Array
+    sigma: Array
+    before: Array
+    tolerance: Array
 
 
-def polish(H: Array, q: Array, A: Array, bounds: Bounds, w: Array, y: Array, steps: int) -> Polish:
-    """Proximal method of multipliers on (w, y) from ADMM's answer, a Newton step each time.
+def largest(v: Array) -> Array:
+    """Return the infinity norm of v."""
+    return jnp.max(jnp.abs(v), initial=0.0)
+
+
+def multipliers_start(q: Array, w: Array, y: Array) -> Multipliers:
+    """Return the state of the method of multipliers at (w, y)."""
+    scalar = lambda v: jnp.asarray(v, w.dtype)
+    return Multipliers(
+        w, y, jnp.zeros_like(y), jnp.zeros_like(w), scalar(Constants.of(w.dtype).rho[0]),
+        scalar(1.0), scalar(jnp.inf), 0.1 * (largest(q) + largest(y)),
+    )  # fmt: skip
+
+
+def multipliers_step(
+    H: Array, q: Array, A: Array, bounds: Bounds, state: Multipliers
+) -> Multipliers:
+    """One Newton step of the proximal method of multipliers."""
+    s = state
+    step = newton_step(s.w, s.y, H, q, A, bounds, s.rho, s.sigma, gram(A))
+    return multipliers_update(q, s, step)
+
+
+def multipliers_update(q: Array, state: Multipliers, step: Newton) -> Multipliers:
+    """The state after a Newton step on φ.
 
     Whenever φ is minimised the multipliers become ρ e; ρ grows tenfold if the violation has not
     fallen tenfold, and σ falls a hundredfold. "Minimised" is exact (`newton_step`), or the
     gradient is below a tolerance that falls tenfold each time: where many rows only touch, the
     pieces never come to rest.
     """
-    products, constants = gram(A), Constants.of(w.dtype)
-    (first, last), least = constants.rho, constants.sigma
-    scalar = lambda v: jnp.asarray(v, w.dtype)
-    size = lambda v: jnp.max(jnp.abs(v), initial=0.0)
-
-    def body(carry: tuple[Array, ...], _: None) -> tuple[Any, None]:
-        w, y, change, _move, rho, sigma, before, tolerance = carry
-        step = newton_step(w, y, H, q, A, bounds, rho, sigma, products)
-        terms = size(q) + size(step.w) + rho * size(step.excess)
-        noise = 10 * jnp.finfo(w.dtype).eps * terms
-        done = step.minimised | (size(step.gradient) <= jnp.maximum(tolerance, noise))
-        new = jnp.where(done, rho * step.excess, y)
-        violation = size(new - y) / rho
-        grow = done & (violation > 0.1 * before)
-        far = size(step.w) > constants.far
-        carry = (
-            jnp.where(far, w, step.w), new, jnp.where(done, new - y, change), step.w - w,
-            jnp.where(grow, jnp.minimum(10 * rho, last), rho),
-            jnp.where(done, jnp.maximum(sigma / 100, least), sigma),
-            jnp.where(done, violation, before),
-            jnp.where(done, tolerance / 10, tolerance),
-        )  # fmt: skip
-        return carry, None
-
-    tolerance = 0.1 * (size(q) + size(y))
-    zeros = (jnp.zeros_like(y), jnp.zeros_like(w))
-    start = (w, y, *zeros, scalar(first), scalar(1.0), scalar(jnp.inf), tolerance)
-    (w, y, change, move, *_), _ = jax.lax.scan(body, start, length=steps)
-    return Polish(w, y, change, move)
+    constants, s = Constants.of(state.w.dtype), state
+    terms = largest(q) + largest(step.w) + s.rho * largest(step.excess)
+    noise = 10 * jnp.finfo(s.w.dtype).eps * terms
+    done = step.minimised | (largest(step.gradient) <= jnp.maximum(s.tolerance, noise))
+    new = jnp.where(done, s.rho * step.excess, s.y)
+    violation = largest(new - s.y) / s.rho
+    grow = done & (violation > 0.1 * s.before)
+    far = largest(step.w) > constants.far
+    return Multipliers(
+        jnp.where(far, s.w, step.w), new, jnp.where(done, new - s.y, s.change), step.w - s.w,
+        jnp.where(grow, jnp.minimum(10 * s.rho, constants.rho[1]), s.rho),
+        jnp.where(done, jnp.maximum(s.sigma / 100, constants.sigma), s.sigma),
+        jnp.where(done, violation, s.before), jnp.where(done, s.tolerance / 10, s.tolerance),
+    )  # fmt: skip
 
 
 def linearised(

@@ -1,0 +1,61 @@
+"""solve_many: plans from many states, in chunks that fit into memory."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import fail
+from jaxmpc.compiled import default_chunk, first_rows, padded, require_step_type
+from jaxmpc.mpc.condense import in_float64
+from jaxmpc.mpc.problem import MPC, Plan
+from jaxmpc.mpc.solve import Controller
+from jaxmpc.qp.admm import ADMM
+
+DEFAULT = ADMM()
+
+
+def solve_many(
+    mpc: MPC, x0s: Any, solver: ADMM = DEFAULT, *, dtype: Any = "float32", chunk: int | None = None
+) -> Plan:
+    """Solve the MPC problem from each state x0s (B, n); every leaf of the Plan has B in front.
+
+    Where input rates are limited or weighted x0s may be (B, n + m), with the previous inputs in the
+    last columns; (B, n) takes them as zero. The plans track the origin.
+
+    dtype: type of the ADMM iterates; Newton steps, residuals, status and the answer are float64
+    whatever it is, and whether or not 64-bit mode is on. chunk: states that a compiled program
+    takes at once; None: by device. A state with NaN gets status NON_FINITE. Raises ValueError for
+    wrong shapes and ill-posed problems.
+    """
+    mpc.validate()
+    x0s = np.asarray(x0s, np.float64)
+    if x0s.ndim != 2 or x0s.shape[1] not in (mpc.system.n, mpc.dimension):
+        fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.system.n})")
+    x0s = np.pad(x0s, ((0, 0), (0, mpc.dimension - x0s.shape[1])))
+    require_step_type(dtype)
+    chunk = default_chunk() if chunk is None else chunk
+    if chunk < 1:
+        fail("chunk", f"{chunk}", "Give a count of at least 1")
+    with jax.enable_x64(True):
+        controller = Controller(in_float64(mpc), replace(solver, dtype=np.dtype(dtype).name))
+        size = min(chunk, max(len(x0s), 1))
+        parts = []
+        for start in range(0, max(len(x0s), 1), size):
+            here = x0s[start : start + size]
+            rows = padded(here, size) if len(here) else np.zeros((0, mpc.dimension))
+            parts.append(first_rows(_plans(controller, rows), len(here)))
+        return parts[0] if len(parts) == 1 else jax.tree.map(lambda *v: jnp.concatenate(v), *parts)
+
+
+@jax.jit
+def _plans(controller: Controller, x0s: Array) -> Plan:
+    n = controller.mpc.system.n
+
+    def one(x: Array) -> Plan:
+        return controller.plan(x[:n], previous_input=x[n:] if controller.mpc.remembers else None)
+
+    return jax.vmap(one)(x0s)

@@ -1,0 +1,145 @@
+"""Loops that each instance of a batch leaves when it is done.
+
+Under `jax.vmap` a plain `jax.lax.while_loop` runs until its slowest instance has finished, and all
+others wait. `repeat_while` gathers, on the device, the instances that are still open into groups of
+static size, advances a group at a time, and scatters the results back: the cost is that of the mean
+number of steps, not of the largest. Nothing returns to the host in between.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.custom_batching import custom_vmap
+
+# Instances in a group: an eighth of the batch; when fewer are open a sixteenth of that, and so on,
+# but not below LEAST, where a step costs little more than its launches.
+PART, SMALLER, LEAST = 8, 16, 32
+# Instances in a block on a CPU, whose data stay within the cache.
+BLOCK = 128
+
+
+def group_sizes(batch: int) -> list[int]:
+    """Return the sizes of the groups of a batch, from the largest."""
+    sizes = [batch if batch <= PART * LEAST else -(-batch // PART)]
+    while sizes[-1] > SMALLER * LEAST:
+        sizes.append(-(-sizes[-1] // SMALLER))
+    return sizes if sizes[-1] <= LEAST or batch <= PART * LEAST else [*sizes, LEAST]
+
+
+def in_blocks(function: Callable, constants: Any, data: Any) -> Any:
+    """Return function(constants, data), for a batch on a CPU in blocks, one after the other.
+
+    `function` must close over no arrays. A batch of constants makes no blocks.
+    """
+    one = custom_vmap(lambda constants, data: function(constants, data))
+
+    @one.def_vmap
+    def _(size: int, in_batched: Any, constants: Any, data: Any) -> Any:
+        axes = jax.tree.map(lambda b: 0 if b else None, in_batched[0])
+        data = _broadcast(size, in_batched[1], data)
+        together = lambda constants, data: jax.vmap(function, in_axes=(axes, 0))(constants, data)
+
+        def blocks(constants: Any, data: Any) -> Any:
+            missing = -size % BLOCK
+            padded = lambda v: jnp.pad(v, ((0, missing), *[(0, 0)] * (v.ndim - 1)), mode="edge")
+            grouped = jax.tree.map(lambda v: padded(v).reshape(-1, BLOCK, *v.shape[1:]), data)
+            out = lax.map(lambda block: together(constants, block), grouped)
+            return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:])[:size], out)
+
+        if size <= BLOCK or any(jax.tree.leaves(in_batched[0])):
+            out = together(constants, data)
+        else:
+            out = lax.platform_dependent(constants, data, cpu=blocks, default=together)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return one(constants, data)
+
+
+def repeat_while(is_open: Callable, step: Callable, constants: Any, state: Any) -> Any:
+    """Return `state` after state = step(constants, state) while is_open(state), a scalar.
+
+    Both functions must close over no arrays: what they read stands in `constants`. One instance is
+    one `while_loop`. A batch, also one of nested `vmap`s, is worked off in groups (top of this
+    file). Not differentiable.
+    """
+    one = lambda constants, state: lax.while_loop(is_open, lambda s: step(constants, s), state)
+    single = custom_vmap(one)
+
+    @single.def_vmap
+    def _(size: int, in_batched: Any, constants: Any, state: Any) -> Any:
+        leaves, tree = jax.tree.flatten(constants)
+        batched = tuple(jax.tree.leaves(in_batched[0]))
+        state = _broadcast(size, in_batched[1], state)
+        out = _in_groups(is_open, step, tree, batched)(tuple(leaves), state)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return single(constants, state)
+
+
+def _in_groups(is_open: Callable, step: Callable, tree: Any, batched: tuple[bool, ...]) -> Callable:
+    """The loop for a batch: (leaves of the constants, states) → states. batched: which leaves have
+    the batch axis."""
+
+    def advance(leaves: tuple, state: Any) -> Any:
+        return step(jax.tree.unflatten(tree, leaves), state)
+
+    axes = tuple(0 if b else None for b in batched)
+    many = jax.vmap(advance, in_axes=(axes, 0))
+
+    def run(leaves: tuple, state: Any) -> Any:
+        size = jax.tree.leaves(state)[0].shape[0]
+        if not size:
+            return state
+        open_ones = lambda state: jax.vmap(is_open)(state)
+
+        def group(count: int, state: Any) -> Any:
+            if count == size:
+                found = many(leaves, state)
+                still = open_ones(state)
+                keep = lambda new, old: jnp.where(
+                    still.reshape(-1, *[1] * (new.ndim - 1)), new, old
+                )
+                return jax.tree.map(keep, found, state)
+            (where,) = jnp.nonzero(open_ones(state), size=count, fill_value=size)
+            taken = lambda v: v.at[where].get(mode="clip")
+            part = tuple(taken(v) if b else v for v, b in zip(leaves, batched, strict=True))
+            found = many(part, jax.tree.map(taken, state))
+            put = lambda old, new: old.at[where].set(new, mode="drop")
+            return jax.tree.map(put, state, found)
+
+        counts = group_sizes(size)
+        for count, least in zip(counts, [*counts[1:], 0], strict=True):
+            more = lambda state, least=least: jnp.sum(open_ones(state)) > least
+            state = lax.while_loop(more, lambda s, count=count: group(count, s), state)
+        return state
+
+    batch = custom_vmap(run)
+
+    @batch.def_vmap
+    def _(size: int, in_batched: Any, leaves: tuple, state: Any) -> Any:
+        outer = in_batched[0]
+        state = _broadcast(size, in_batched[1], state)
+        mixed = any(o and not b for o, b in zip(outer, batched, strict=True))
+        if mixed:
+            # Each outer instance has constants that its inner batch shares: copies would not fit.
+            out = jax.vmap(run, in_axes=(tuple(0 if o else None for o in outer), 0))(leaves, state)
+        else:
+            inner = jax.tree.leaves(state)[0].shape[1]
+            merged = lambda v: v.reshape(size * inner, *v.shape[2:])
+            flat = tuple(
+                merged(v if o else jnp.broadcast_to(v, (size, *v.shape))) if b else v
+                for v, b, o in zip(leaves, batched, outer, strict=True)
+            )
+            out = batch(flat, jax.tree.map(merged, state))
+            out = jax.tree.map(lambda v: v.reshape(size, inner, *v.shape[1:]), out)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return batch
+
+
+def _broadcast(size: int, batched: Any, tree: Any) -> Any:
+    give = lambda v, b: v if b else jnp.broadcast_to(v, (size, *jnp.shape(v)))
+    return jax.tree.map(give, tree, batched)
