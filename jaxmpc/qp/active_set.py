@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxmpc.qp.batches import true_places
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
@@ -74,7 +75,7 @@ def dual_step(
     paid = beyond & (quadratic == 0) & (sign * outside > 0)
     bound = jnp.where(sign > 0, bounds.u, bounds.l)
 
-    (W,) = jnp.nonzero(((y != 0) | joins) & ~paid, size=min(m, n, MOST_ROWS), fill_value=m)
+    W = true_places(((y != 0) | joins) & ~paid, min(m, n, MOST_ROWS))
     inside = W < m
     of = lambda x: jnp.where(inside, x.at[W].get(mode="clip"), 0.0)
     y_W, sign_W, cap, beyond_W = of(y), of(sign), of(linear), of(beyond.astype(y.dtype)) > 0
@@ -105,6 +106,8 @@ def dual_step(
     if bounds.linear is not None:
         cost = jnp.where(stiff > 0, 0.5 / jnp.where(stiff > 0, stiff, 1.0), 0.0)
         loss = loss + jnp.sum(cost * (excess(tried) ** 2 - excess(y_W) ** 2), axis=1)
-    best = tried[jnp.argmin(loss)]
+    best, least = tried[0], loss[0]
+    for other, value in zip(tried[1:], loss[1:], strict=True):
+        best, least = jnp.where(value < least, other, best), jnp.minimum(value, least)
     new = y.at[W].set(best, mode="drop")
     return replace(dual_point(A, q, bounds, new), d=new - y)

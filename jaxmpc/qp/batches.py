@@ -11,7 +11,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import lax
+import numpy as np
+from jax import Array, lax
 from jax.custom_batching import custom_vmap
 
 # Instances in a group: an eighth of the batch; when fewer are open a sixteenth of that, and so on,
@@ -103,7 +104,7 @@ def _in_groups(is_open: Callable, step: Callable, tree: Any, batched: tuple[bool
                     still.reshape(-1, *[1] * (new.ndim - 1)), new, old
                 )
                 return jax.tree.map(keep, found, state)
-            (where,) = jnp.nonzero(open_ones(state), size=count, fill_value=size)
+            where = true_places(open_ones(state), count)
             taken = lambda v: v.at[where].get(mode="clip")
             part = tuple(taken(v) if b else v for v, b in zip(leaves, batched, strict=True))
             found = many(part, jax.tree.map(taken, state))
@@ -138,6 +139,17 @@ def _in_groups(is_open: Callable, step: Callable, tree: Any, batched: tuple[bool
         return out, jax.tree.map(lambda _: True, out)
 
     return batch
+
+
+def true_places(mask: Array, size: int) -> Array:
+    """Return the first `size` places where mask (m,) is true as int32, filled up with m.
+
+    (`jnp.nonzero` counts in int64 where 64-bit mode is on, which cannot be lowered where it is
+    off.)"""
+    m = mask.shape[0]
+    rank = jnp.cumsum(mask, dtype=jnp.int32) - 1
+    place = jnp.where(mask, jnp.minimum(rank, size), size)
+    return jnp.full(size, m, jnp.int32).at[place].set(np.arange(m, dtype=np.int32), mode="drop")
 
 
 def _broadcast(size: int, batched: Any, tree: Any) -> Any:

@@ -10,10 +10,9 @@ box rows in the role of the correction). Convergence of y then buys tightness, n
 from dataclasses import replace
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from jaxmpc.qp.linalg import definite_solver
-from jaxmpc.qp.newton import gram, ridged
 from jaxmpc.qp.precision import matmul, rounding
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
@@ -40,14 +39,18 @@ def farkas(qp: QP, y: Array) -> tuple[Array, Array]:
     y = bounds.admissible(jnp.where(length > 0, y / jnp.where(length > 0, length, 1.0), 0.0))
 
     # Row i(j) bounds variable j alone. The choice rests on A only, so a batch shares it.
-    single = (jnp.sum(qp.A != 0, axis=1) == 1) & (jnp.arange(m) < m - sum(qp.balls))
+    single = (jnp.sum(qp.A != 0, axis=1) == 1) & (np.arange(m, dtype=np.int32) < m - sum(qp.balls))
     if qp.bounds.linear is not None:
         single = single & jnp.isinf(qp.bounds.linear)
     entries = jnp.where(single[:, None], jnp.abs(qp.A), 0.0)
-    row = jnp.argmax(entries, axis=0)
-    pivot = jnp.where(entries[row, jnp.arange(n)] > 0, qp.A[row, jnp.arange(n)], 1.0)
+    largest = (entries == jnp.max(entries, axis=0)).astype(jnp.int32)
+    rows = np.arange(m, dtype=np.int32)[:, None]
+    row = jnp.min(jnp.where(largest > 0, rows, np.int32(m - 1)), axis=0)
+    pivot = jnp.where(
+        entries[row, np.arange(n, dtype=np.int32)] > 0, qp.A[row, np.arange(n, dtype=np.int32)], 1.0
+    )
     bounded = jnp.isfinite(l) & jnp.isfinite(u)
-    has_row = (entries[row, jnp.arange(n)] > 0) & bounded[row]
+    has_row = (entries[row, np.arange(n, dtype=np.int32)] > 0) & bounded[row]
     y = y.at[row].add(jnp.where(has_row, -matmul(y, qp.A) / pivot, 0.0))
 
     left = jnp.abs(matmul(y, qp.A))
@@ -63,20 +66,6 @@ def farkas(qp: QP, y: Array) -> tuple[Array, Array]:
     safe = bounds.support(y) + gamma * size + leak
     proved = jnp.all(absorbed) & (safe < 0) & jnp.any(y != 0)
     return jnp.where(proved, y, 0.0), proved
-
-
-def sharpen(A: Array, y: Array) -> Array:
-    """The vector nearest to y, with no entries where y has none, that satisfies A'y = 0.
-
-    Least squares y − DA(A'DA)⁻¹A'y with D the support of y, twice for the sake of rounding.
-    """
-    least = 0.01 * jnp.sqrt(jnp.finfo(y.dtype).eps)
-    support = jnp.abs(y) > least * jnp.max(jnp.abs(y), initial=0.0)
-    y = jnp.where(support, y, 0.0)
-    inverse = definite_solver(ridged(gram(A)(support.astype(y.dtype), []), 1.0))
-    for _ in range(2):
-        y = y - support * matmul(inverse(matmul(y, A)), A.T)
-    return y
 
 
 def recession(q: Array, H: Array, A: Array, bounds: Bounds) -> tuple[Array, Bounds]:

@@ -147,36 +147,44 @@ class Program:
 @dataclass(frozen=True)
 class Pair:
     """z (n,) and y (m,) in the units of the program, the largest of its residuals, each relative
-    to the size of its terms, and whether all are small enough."""
+    to the size of its terms, whether all are small, and whether there is no more to gain."""
 
     z: Array
     y: Array
     error: Array
+    near: Array
     solved: Array
 
     @classmethod
     def of(cls, p: Program, w: Array, y: Array) -> "Pair":
-        """The pair of scaled w and y. Small enough: below a thousandth of eps or rounding."""
+        """The pair of scaled w and y. near: below a thousandth of eps; solved: a millionth."""
         return cls.and_gradient(p, w, y)[0]
 
     @classmethod
     def and_gradient(cls, p: Program, w: Array, y: Array) -> "tuple[Pair, Array]":
         """The pair, and the gradient T'(Pz + q + A'y) (n,) of the Lagrangian at it."""
         z, y = unscaled(p.qp, p.factor, w, y)
-        small, error, floor = jnp.asarray(True), jnp.zeros((), z.dtype), rounding(z.dtype)
+        error, floor = jnp.zeros((), z.dtype), rounding(z.dtype)
+        near = solved = jnp.isfinite(error)
         terms = residual_terms(p.qp, z, y)
-        for value, size in terms:
-            small = small & jnp.all(jnp.abs(value) <= 1e-3 * p.eps + floor * size)
+        # The gap of soft rows is of second order in the error of z; this residual is of first.
+        v, push = scaled_rows(p.factor, p.qp, z, y)
+        prox = p.bounds.excess(v + push, 1.0) - push
+        for value, size in [*terms, (prox, jnp.abs(v) + jnp.abs(push))]:
+            near = near & jnp.all(jnp.abs(value) <= 1e-3 * p.eps + floor * size)
+            solved = solved & jnp.all(jnp.abs(value) <= 1e-6 * p.eps + floor * size)
             error = jnp.maximum(error, largest(value) / (1 + largest(size)))
         # A maximum need not propagate NaN (XLA on CPUs).
         finite = jnp.all(jnp.isfinite(z)) & jnp.all(jnp.isfinite(y))
-        pair = cls(z, y, jnp.where(finite, error, jnp.inf), small & finite)
+        pair = cls(z, y, jnp.where(finite, error, jnp.inf), near & finite, solved & finite)
         return pair, matmul(terms[1][0], p.factor.T)
 
     def or_better(self, other: "Pair") -> "Pair":
-        """The other pair where that is solved or its residuals are smaller."""
+        """The other pair where that is solved or its residuals are smaller. What was near before
+        counts as solved: one step more is rounding."""
         take = ~self.solved & (other.solved | (other.error < self.error))
-        return jax.tree.map(lambda old, new: jnp.where(take, new, old), self, other)
+        best = jax.tree.map(lambda old, new: jnp.where(take, new, old), self, other)
+        return replace(best, solved=best.solved | self.near)
 
 
 def better(p: Program, pair: tuple[Array, Array], other: tuple[Array, Array]) -> tuple:
