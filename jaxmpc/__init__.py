@@ -14,6 +14,11 @@ from jaxmpc.control.riccati import LQR, lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.control.terminal import TerminalReport, verify_terminal
+from jaxmpc.explicit.exact_penalty import ExactPenalty, exact_penalty
+from jaxmpc.explicit.regions import CriticalRegions, critical_regions
+from jaxmpc.feasible.map import FeasibleSetMap, grid, map_feasible_set
+from jaxmpc.feasible.polytope import feasible_growth, feasible_polytope
+from jaxmpc.feasible.rays import Boundary, boundary
 from jaxmpc.mpc.feedback import LinearFeedback
 from jaxmpc.mpc.problem import MPC, Outputs, Plan, Soft
 from jaxmpc.mpc.rows import active_constraints, row_table
@@ -26,18 +31,13 @@ from jaxmpc.qp.margin import feasibility_margin
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.solve import solve_qp
 from jaxmpc.qp.status import Status
+from jaxmpc.recursion.recursion import RecursionReport, recursive_feasibility, smallest_horizon
+from jaxmpc.robot_maps.robot_map import RobotMap, map_robot
 from jaxmpc.robots.control import RobotController, robot_mpc
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import Robot
-from jaxmpc.sweeps.boundary import Boundary, boundary
-from jaxmpc.sweeps.exact_penalty import ExactPenalty, exact_penalty
-from jaxmpc.sweeps.feasible_set import FeasibleSetMap, grid, map_feasible_set
 from jaxmpc.sweeps.plans import Plans, solve_many
-from jaxmpc.sweeps.reach import feasible_growth, feasible_polytope
-from jaxmpc.sweeps.recursion import RecursionReport, recursive_feasibility, smallest_horizon
-from jaxmpc.sweeps.regions import CriticalRegions, critical_regions
-from jaxmpc.sweeps.robots import RobotMap, map_robot
 from jaxmpc.tuning.feasibility import feasible_share, tune_feasible_set
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter

@@ -33,11 +33,11 @@ from jaxmpc.control.invariant import invariant_ellipsoid, maximal_invariant_set
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
+from jaxmpc.explicit.exact_penalty import exact_penalty
+from jaxmpc.feasible.map import grid as grid_points
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.soften import soften
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.sweeps.exact_penalty import exact_penalty
-from jaxmpc.sweeps.feasible_set import grid as grid_points
 
 
 def _not_nan(value: float) -> float:

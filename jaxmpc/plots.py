@@ -13,10 +13,10 @@ from matplotlib.patches import Patch
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop import Run
 from jaxmpc.control.sets import Polytope
+from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.outcome import batch_of, beyond, coordinates
+from jaxmpc.recursion.recursion import Counterexample, RecursionReport
 from jaxmpc.robots.robot import Robot
-from jaxmpc.sweeps.feasible_set import FeasibleSetMap
-from jaxmpc.sweeps.recursion import Counterexample, RecursionReport
 
 # Okabe and Ito's palette: told apart with any colour vision, and in grey by lightness.
 _INFEASIBLE, _FEASIBLE, _UNDECIDED = "#dddcd8", "#9fcbe6", "#f0d024"

@@ -19,7 +19,7 @@ from jaxmpc.plots import (
     _draw_values,
     _ring,
 )
-from jaxmpc.sweeps.robots import OUTCOMES, RobotMap
+from jaxmpc.robot_maps.robot_map import OUTCOMES, RobotMap
 
 _BROKEN, _BETTER = "#cc4b1c", "#8ccfae"
 

@@ -13,9 +13,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop import Run
+from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.outcome import batch_of, coordinates
 from jaxmpc.plots import _INFEASIBLE, _TERMINAL, _columns, _draw_limits, _ring
-from jaxmpc.sweeps.feasible_set import FeasibleSetMap
 from jaxmpc.tuning.descent import Descent
 from jaxmpc.tuning.penalties import Penalties
 

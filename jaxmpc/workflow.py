@@ -19,6 +19,11 @@ from jaxmpc.control.riccati import LQR, lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.control.terminal import TerminalReport, verify_terminal
+from jaxmpc.explicit.exact_penalty import ExactPenalty, exact_penalty
+from jaxmpc.feasible.map import FeasibleSetMap, grid, map_feasible_set
+from jaxmpc.feasible.polytope import usual
+from jaxmpc.feasible.proofs import hard_part
+from jaxmpc.feasible.rays import boundary
 from jaxmpc.mpc.condense import condense, in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import row_table
@@ -26,12 +31,7 @@ from jaxmpc.mpc.soften import harden, soften
 from jaxmpc.mpc.solve import Controller
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
-from jaxmpc.sweeps.boundary import boundary
-from jaxmpc.sweeps.exact_penalty import ExactPenalty, exact_penalty
-from jaxmpc.sweeps.feasible_set import FeasibleSetMap, grid, map_feasible_set
-from jaxmpc.sweeps.proofs import hard_part
-from jaxmpc.sweeps.reach import usual
-from jaxmpc.sweeps.recursion import RecursionReport, recursive_feasibility
+from jaxmpc.recursion.recursion import RecursionReport, recursive_feasibility
 
 TERMINALS = ("invariant", "ellipsoid", "states", "box", "none")
 # Rounding of optimal values, relative: a Lyapunov increase below that is none.

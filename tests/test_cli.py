@@ -14,7 +14,7 @@ import xarray as xr
 from jaxmpc import cli
 from jaxmpc.commands import recursion, sweep
 from jaxmpc.control.sets import Box
-from jaxmpc.sweeps.recursion import Counterexample, RecursionReport, Rung, SmallestHorizon
+from jaxmpc.recursion.recursion import Counterexample, RecursionReport, Rung, SmallestHorizon
 
 
 @pytest.fixture(autouse=True)

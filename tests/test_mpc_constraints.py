@@ -17,10 +17,10 @@ from jax import enable_x64
 import jaxmpc as jm
 from jaxmpc.control.equilibrium import equilibrium
 from jaxmpc.control.sets import Ellipsoid
+from jaxmpc.feasible import proofs
 from jaxmpc.mpc.problem import Outputs, Soft
 from jaxmpc.mpc.rows import active_constraints, row_table
 from jaxmpc.mpc.soften import soften
-from jaxmpc.sweeps import proofs
 
 ONE, EYE = np.ones(2), np.eye(2)
 FINE = jm.ADMM(iterations=300, refine=30, eps=1e-8)

@@ -12,8 +12,9 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.cli import main
 from jaxmpc.commands import sweep
-from jaxmpc.sweeps import ladder, proofs
-from jaxmpc.sweeps.ladder import RungPenalties
+from jaxmpc.feasible import candidates as ladder
+from jaxmpc.feasible import proofs
+from jaxmpc.feasible.candidates import RungPenalties
 from jaxmpc.tuning import penalties as module
 from jaxmpc.tuning import sweep_penalties
 from jaxmpc.tuning.penalties import learn_penalties, spread, tune_penalties

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.plots import plot_feasible_set, plot_recursion
-from jaxmpc.sweeps.recursion import Counterexample, RecursionReport, Rung
+from jaxmpc.recursion.recursion import Counterexample, RecursionReport, Rung
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,13 +19,13 @@ from jaxmpc.commands.options import model_hash, open_folder, versions, write_jso
 from jaxmpc.control.invariant import maximal_invariant_set
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Polytope
+from jaxmpc.feasible.map import ARRAYS, grid, joined
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.robot_maps.robot_map import Loops, RobotMap, RobotSetting, deviations
 from jaxmpc.robot_plots import plot_robot_map
 from jaxmpc.robots.control import robot_mpc
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import Robot
-from jaxmpc.sweeps.feasible_set import ARRAYS, grid, joined
-from jaxmpc.sweeps.robots import Loops, RobotMap, RobotSetting, deviations
 
 # Points along each of two axes, and in all along another number of them.
 SIDE, POINTS = 32, 1024

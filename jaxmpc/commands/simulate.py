@@ -25,6 +25,7 @@ from jaxmpc.commands.options import model_hash, open_folder, option, report_erro
 from jaxmpc.compiled import Compiled, first_rows, padded
 from jaxmpc.config import load_robot_config
 from jaxmpc.control.riccati import lqr
+from jaxmpc.feasible import store
 from jaxmpc.mpc.feedback import LinearFeedback
 from jaxmpc.outcome import KEPT, Outcome, judge
 from jaxmpc.plots import plot_runs
@@ -34,7 +35,6 @@ from jaxmpc.robots.control import RobotController, robot_mpc
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import Robot
 from jaxmpc.robots.video import render, save_video
-from jaxmpc.sweeps import store
 
 # Seconds between frames of the video.
 FRAME = 0.04

@@ -21,11 +21,11 @@ from jaxmpc.checks import fail
 from jaxmpc.commands.options import End, Horizon, Terminal, open_folder, option, report_error
 from jaxmpc.commands.robot_map import RobotJob, refused
 from jaxmpc.compiled import CHUNK
+from jaxmpc.feasible import store
+from jaxmpc.feasible.candidates import RungPenalties
+from jaxmpc.feasible.map import FeasibleSetMap, Labels, label_chunks
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.plots import plot_feasible_set
-from jaxmpc.sweeps import store
-from jaxmpc.sweeps.feasible_set import FeasibleSetMap, Labels, label_chunks
-from jaxmpc.sweeps.ladder import RungPenalties
 from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
 
 

@@ -41,6 +41,7 @@ from jaxmpc.commands.tuning import (
 from jaxmpc.compiled import Compiled
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
+from jaxmpc.feasible.map import grid, map_feasible_set
 from jaxmpc.mpc.condense import prestabilising_gain
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.soften import soften
@@ -51,7 +52,6 @@ from jaxmpc.qp.status import Status
 from jaxmpc.robots.control import RobotController, robot_mpc
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.load import load_robot
-from jaxmpc.sweeps.feasible_set import grid, map_feasible_set
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
 from jaxmpc.tuning.weights import TuningRun, tune_weights

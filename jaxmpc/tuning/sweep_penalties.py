@@ -23,13 +23,8 @@ from jax import Array
 
 from jaxmpc.checks import fail, whole
 from jaxmpc.compiled import default_chunk, padded, require_step_type
-from jaxmpc.mpc.problem import MPC
-from jaxmpc.qp import linalg
-from jaxmpc.qp.precision import matmul
-from jaxmpc.qp.projection import Bounds
-from jaxmpc.sweeps import proofs
-from jaxmpc.sweeps.feasible_set import map_feasible_set
-from jaxmpc.sweeps.ladder import (
+from jaxmpc.feasible import proofs
+from jaxmpc.feasible.candidates import (
     ALPHA,
     Rows,
     RungPenalties,
@@ -39,7 +34,12 @@ from jaxmpc.sweeps.ladder import (
     rows,
     weighted,
 )
-from jaxmpc.sweeps.proofs import hard_part, make_view
+from jaxmpc.feasible.map import map_feasible_set
+from jaxmpc.feasible.proofs import hard_part, make_view
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp import linalg
+from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.projection import Bounds
 from jaxmpc.tuning import archive
 from jaxmpc.tuning.descent import descend
 

@@ -15,7 +15,8 @@ from jax import enable_x64
 from scipy.optimize import linprog
 
 import jaxmpc as jm
-from jaxmpc.sweeps import proofs, recursion
+from jaxmpc.feasible import proofs
+from jaxmpc.recursion import recursion
 
 NONE = (np.inf, 1e9, 1e12, 1e20)
 

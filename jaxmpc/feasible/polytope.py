@@ -18,9 +18,9 @@ import numpy as np
 from jaxmpc.checks import fail
 from jaxmpc.control.invariant import predecessor
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope, maximise, unit_rows
+from jaxmpc.feasible.proofs import hard_part
 from jaxmpc.mpc.condense import condense, in_float64
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.sweeps.proofs import hard_part
 
 # Bounds of linear programs are trusted to this, relative to the size of the set.
 TOLERANCE = 1e-9

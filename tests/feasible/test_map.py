@@ -13,8 +13,9 @@ import pytest
 from jax import enable_x64
 
 import jaxmpc as jm
+from jaxmpc.feasible import map as feasible_map
+from jaxmpc.feasible import proofs
 from jaxmpc.qp.status import Status
-from jaxmpc.sweeps import feasible_set, proofs
 
 
 @pytest.fixture(scope="module")
@@ -205,12 +206,12 @@ def test_compiles_once_for_all_chunks(monkeypatch):
     """Two programs, whatever the number of chunks."""
     made = []
 
-    class Counted(feasible_set.Compiled):
+    class Counted(feasible_map.Compiled):
         def __init__(self, function):
             super().__init__(function)
             made.append(self)
 
-    monkeypatch.setattr(feasible_set, "Compiled", Counted)
+    monkeypatch.setattr(feasible_map, "Compiled", Counted)
     points = np.random.default_rng(0).uniform(-1.2, 1.2, (333, 2))
     jm.map_feasible_set(problems.lecture(), points, chunk=50)
     assert sum(len(compiled.programs) for compiled in made) <= 2

@@ -21,11 +21,8 @@ from jaxmpc.compiled import (
     require_step_type,
 )
 from jaxmpc.control.sets import Ellipsoid, Polytope, hull_volume
-from jaxmpc.mpc.problem import MPC
-from jaxmpc.qp.status import Status
-from jaxmpc.sweeps import proofs
-from jaxmpc.sweeps.boundary import Rays
-from jaxmpc.sweeps.ladder import (
+from jaxmpc.feasible import proofs
+from jaxmpc.feasible.candidates import (
     ALPHA,
     RungPenalties,
     Verdict,
@@ -35,7 +32,10 @@ from jaxmpc.sweeps.ladder import (
     rows,
     weighted,
 )
-from jaxmpc.sweeps.proofs import hard_part, make_view
+from jaxmpc.feasible.proofs import hard_part, make_view
+from jaxmpc.feasible.rays import Rays
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.status import Status
 
 # Newton steps between two attempts at a proof, and how often; the decided leave in between.
 # What resists all of them gets a longer ADMM run and Newton once more.

@@ -10,11 +10,11 @@ import problems
 import pytest
 
 import jaxmpc as jm
+from jaxmpc.explicit import law
+from jaxmpc.explicit.law import Bound, Law
+from jaxmpc.feasible.polytope import backward, pairs, shadow
 from jaxmpc.mpc.problem import Soft
-from jaxmpc.sweeps import law
-from jaxmpc.sweeps.law import Bound, Law
-from jaxmpc.sweeps.reach import backward, pairs, shadow
-from jaxmpc.sweeps.recursion import _theorem, climb, recursive_feasibility, smallest_horizon
+from jaxmpc.recursion.recursion import _theorem, climb, recursive_feasibility, smallest_horizon
 
 
 def rungs(found) -> tuple:
@@ -339,7 +339,7 @@ class TestSlow:
         check_counterexample(mpc, c)
 
     def test_needle_is_found_without_the_seeds_of_linear_programs(self, monkeypatch):
-        from jaxmpc.sweeps import recursion
+        from jaxmpc.recursion import recursion
 
         real = recursion.climb
         bare = lambda *a: replace(real(*a), seeds=np.zeros((0, 2)))
@@ -383,7 +383,7 @@ class TestSlow:
         assert rungs(report) == (False, False, False)
         check_counterexample(mpc, report.counterexample)
         # The regions know the worst vertex: the search has found it.
-        from jaxmpc.sweeps.regions import critical_regions
+        from jaxmpc.explicit.regions import critical_regions
 
         worst = -np.inf
         for region in critical_regions(mpc).regions:

@@ -13,10 +13,18 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
+from jaxmpc.feasible import proofs
+from jaxmpc.feasible.candidates import (
+    Rows,
+    Tangents,
+    bounding_box,
+    cut_of,
+    inputs_of,
+    rows,
+    support,
+)
+from jaxmpc.feasible.proofs import Problem, View, hard_part, make_view
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.sweeps import proofs
-from jaxmpc.sweeps.ladder import Rows, Tangents, bounding_box, cut_of, inputs_of, rows, support
-from jaxmpc.sweeps.proofs import Problem, View, hard_part, make_view
 
 # How far a boundary point is pulled towards the centre before it is proved: the least that works.
 PULLS = 10.0 ** np.arange(-14, -1)

@@ -21,16 +21,16 @@ from jaxmpc.closed_loop import Run, simulate_many
 from jaxmpc.compiled import default_chunk, padded
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
+from jaxmpc.feasible.map import FeasibleSetMap, Labels, joined, label_chunks
+from jaxmpc.feasible.proofs import hard_part, make_view
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
 from jaxmpc.outcome import coordinates
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
+from jaxmpc.recursion.recursion import RecursionReport, recursive_feasibility
 from jaxmpc.robots.control import RobotController
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
-from jaxmpc.sweeps.feasible_set import FeasibleSetMap, Labels, joined, label_chunks
-from jaxmpc.sweeps.proofs import hard_part, make_view
-from jaxmpc.sweeps.recursion import RecursionReport, recursive_feasibility
 
 # Excess, in the units of the limit, up to which a limit counts as kept: rounding of the plans.
 TOLERANCE = {"float64": 1e-6, "float32": 1e-4}

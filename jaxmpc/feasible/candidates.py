@@ -19,13 +19,13 @@ from jax import Array
 from scipy.optimize import linprog
 
 from jaxmpc.compiled import Compiled
+from jaxmpc.feasible import proofs
+from jaxmpc.feasible.proofs import Problem, View
 from jaxmpc.mpc.condense import condense, in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.refine import least_distance
-from jaxmpc.sweeps import proofs
-from jaxmpc.sweeps.proofs import Problem, View
 
 ALPHA = 1.6
 HIGHS = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}

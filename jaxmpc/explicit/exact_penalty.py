@@ -8,10 +8,7 @@ from scipy.optimize import linprog
 
 from jaxmpc.checks import fail
 from jaxmpc.control.sets import Box, Polytope
-from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.rows import Row, row_table
-from jaxmpc.qp.status import Status
-from jaxmpc.sweeps.regions import (
+from jaxmpc.explicit.regions import (
     LP,
     SMALLEST,
     STOPPED,
@@ -25,6 +22,9 @@ from jaxmpc.sweeps.regions import (
     maximum,
     program,
 )
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.rows import Row, row_table
+from jaxmpc.qp.status import Status
 
 # "auto" enumerates regions up to this dimension of the state.
 ENUMERATED = 4

@@ -12,12 +12,12 @@ from jax import enable_x64
 from scipy.optimize import linprog
 
 import jaxmpc as jm
+from jaxmpc.explicit.exact_penalty import exact_penalty
+from jaxmpc.explicit.regions import critical_regions, program
 from jaxmpc.mpc.condense import condense, in_float64
 from jaxmpc.mpc.problem import Soft
 from jaxmpc.mpc.soften import soften
 from jaxmpc.qp.status import Status
-from jaxmpc.sweeps.exact_penalty import exact_penalty
-from jaxmpc.sweeps.regions import critical_regions, program
 
 
 def one_step(q, r, u_max, rows=None):
@@ -193,8 +193,8 @@ class TestRegions:
 
     def test_missing_part_is_seen(self, monkeypatch):
         """Completeness rests on volumes: a search that loses its way does not say so."""
-        monkeypatch.setattr("jaxmpc.sweeps.regions.Search.cross", lambda *_: None)
-        monkeypatch.setattr("jaxmpc.sweeps.regions.REPAIRS", 1)
+        monkeypatch.setattr("jaxmpc.explicit.regions.Search.cross", lambda *_: None)
+        monkeypatch.setattr("jaxmpc.explicit.regions.REPAIRS", 1)
         found = critical_regions(problems.lecture())
         assert not found.complete and "not found" in found.reason
 

@@ -13,9 +13,8 @@ from scipy.optimize import linprog
 
 import jaxmpc as jm
 from jaxmpc import cli
-from jaxmpc.robot_plots import plot_robot_map
-from jaxmpc.sweeps import robots
-from jaxmpc.sweeps.robots import (
+from jaxmpc.robot_maps import robot_map as robots
+from jaxmpc.robot_maps.robot_map import (
     OUTCOMES,
     Loops,
     RobotSetting,
@@ -23,6 +22,7 @@ from jaxmpc.sweeps.robots import (
     map_robot,
     with_initial_limits,
 )
+from jaxmpc.robot_plots import plot_robot_map
 
 SECONDS = 0.8
 

@@ -186,7 +186,7 @@ def hidden_product():
 
 def hidden_product_12d():
     """10,000 states at relative distances down to 5e-5: none wrong, none undecided."""
-    sys.path.append(str(Path(__file__).parents[1] / "experiments"))
+    sys.path.append(str(Path(__file__).parents[2] / "experiments"))
     module = importlib.import_module("hidden_product")
     found = module.run(module.Settings())
     assert found["wrong"] == found["undecided"] == 0 and found["feasible"] > 4000

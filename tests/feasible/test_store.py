@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from jaxmpc.sweeps import store
+from jaxmpc.feasible import store
 
 POINTS = np.arange(22.0).reshape(11, 2)
 CONFIG = {"mpc": {"horizon": 3}, "limits": {"x_min": ["-Infinity", 0.0]}}
@@ -94,7 +94,7 @@ def test_remove(tmp_path):
 WRITER = """
     import sys
     import numpy as np
-    from jaxmpc.sweeps import store
+    from jaxmpc.feasible import store
     count, chunk = 64_000, 1000
     points = np.arange(2.0 * count).reshape(count, 2)
     group = store.open_sweep(sys.argv[1], points, (2, 3, 1), {}, chunk)

@@ -23,14 +23,23 @@ from jaxmpc.checks import fail
 from jaxmpc.compiled import default_chunk
 from jaxmpc.control.sets import Polytope
 from jaxmpc.control.terminal import verify_terminal
+from jaxmpc.explicit.law import Bound, Law, ascend
+from jaxmpc.explicit.regions import critical_regions
+from jaxmpc.feasible.map import FeasibleSetMap, grid, map_feasible_set
+from jaxmpc.feasible.polytope import (
+    DIMENSIONS,
+    TOLERANCE,
+    Pairs,
+    Shadow,
+    backward,
+    pairs,
+    shadow,
+    usual,
+)
+from jaxmpc.feasible.proofs import bounding_box, hard_part
+from jaxmpc.feasible.rays import boundary, spread
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
-from jaxmpc.sweeps.boundary import boundary, spread
-from jaxmpc.sweeps.feasible_set import FeasibleSetMap, grid, map_feasible_set
-from jaxmpc.sweeps.law import Bound, Law, ascend
-from jaxmpc.sweeps.proofs import bounding_box, hard_part
-from jaxmpc.sweeps.reach import DIMENSIONS, TOLERANCE, Pairs, Shadow, backward, pairs, shadow, usual
-from jaxmpc.sweeps.regions import critical_regions
 
 # Distance from X_N, relative to its size, from which a state counts as outside: well above the
 # residuals of plans. Next states are moved towards the centre by as much before they are judged.
