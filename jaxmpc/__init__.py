@@ -14,11 +14,16 @@ from jaxmpc.control.riccati import LQR, lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.control.terminal import TerminalReport, verify_terminal
-from jaxmpc.explicit.exact_penalty import ExactPenalty, exact_penalty
-from jaxmpc.explicit.regions import CriticalRegions, critical_regions
-from jaxmpc.feasible.map import FeasibleSetMap, grid, map_feasible_set
-from jaxmpc.feasible.polytope import feasible_growth, feasible_polytope
-from jaxmpc.feasible.rays import Boundary, boundary
+from jaxmpc.explicit import CriticalRegions, ExactPenalty, critical_regions, exact_penalty
+from jaxmpc.feasible import (
+    Boundary,
+    FeasibleSetMap,
+    boundary,
+    feasible_growth,
+    feasible_polytope,
+    grid,
+    map_feasible_set,
+)
 from jaxmpc.mpc.feedback import LinearFeedback
 from jaxmpc.mpc.problem import MPC, Outputs, Plan, Soft
 from jaxmpc.mpc.rows import active_constraints, row_table
@@ -31,8 +36,8 @@ from jaxmpc.qp.margin import feasibility_margin
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.solve import solve_qp
 from jaxmpc.qp.status import Status
-from jaxmpc.recursion.recursion import RecursionReport, recursive_feasibility, smallest_horizon
-from jaxmpc.robot_maps.robot_map import RobotMap, map_robot
+from jaxmpc.recursion import RecursionReport, recursive_feasibility, smallest_horizon
+from jaxmpc.robot_maps import RobotMap, map_robot
 from jaxmpc.robots.control import RobotController, robot_mpc
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.load import load_robot

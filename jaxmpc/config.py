@@ -29,7 +29,7 @@ from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from jaxmpc.checks import fail
-from jaxmpc.control.invariant import invariant_ellipsoid, maximal_invariant_set
+from jaxmpc.control.named_terminal import named_terminal_set
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
@@ -209,19 +209,17 @@ class Config:
         terminal_cost: Any = Q if cost.P == "Q" else None
         if not isinstance(cost.P, str):
             terminal_cost = _matrix(cost.P)
-        terminal_set: Any = states if self.mpc.terminal == "box" else None
+        terminal_set: Any = None
         if self.mpc.H_f is not None:
             terminal_set = Polytope(np.asarray(self.mpc.H_f), np.asarray(self.mpc.h_f))
         if self.mpc.P_f is not None:
             terminal_set = Ellipsoid(np.asarray(self.mpc.P_f), np.asarray(self.mpc.level_f))
-        if cost.P == "lqr" or self.mpc.terminal in ("invariant", "ellipsoid"):
+        if cost.P == "lqr" or self.mpc.terminal != "none":
             law = lqr(system, Q, R)
             if cost.P == "lqr":
                 terminal_cost = law.P
-            if self.mpc.terminal == "invariant" and states is not None:
-                terminal_set = maximal_invariant_set(system, law.K, states, inputs)
-            if self.mpc.terminal == "ellipsoid":
-                terminal_set = invariant_ellipsoid(system, law.K, law.P, states, inputs)
+            if self.mpc.terminal != "none":
+                terminal_set = named_terminal_set(self.mpc.terminal, system, law, states, inputs)
         mpc = MPC(
             system=system,
             Q=Q,

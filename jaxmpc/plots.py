@@ -15,7 +15,7 @@ from jaxmpc.closed_loop import Run
 from jaxmpc.control.sets import Polytope
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.outcome import batch_of, beyond, coordinates
-from jaxmpc.recursion.recursion import Counterexample, RecursionReport
+from jaxmpc.recursion import Counterexample, RecursionReport
 from jaxmpc.robots.robot import Robot
 
 # Okabe and Ito's palette: told apart with any colour vision, and in grey by lightness.

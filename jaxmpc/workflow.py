@@ -13,27 +13,27 @@ import numpy as np
 
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop import lyapunov_decrease, simulate
-from jaxmpc.control.invariant import invariant_ellipsoid, maximal_invariant_set
 from jaxmpc.control.limits import JointLimits
+from jaxmpc.control.named_terminal import named_terminal_set
 from jaxmpc.control.riccati import LQR, lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.control.terminal import TerminalReport, verify_terminal
 from jaxmpc.explicit.exact_penalty import ExactPenalty, exact_penalty
 from jaxmpc.feasible.map import FeasibleSetMap, grid, map_feasible_set
-from jaxmpc.feasible.polytope import usual
-from jaxmpc.feasible.proofs import hard_part
+from jaxmpc.feasible.polytope import is_standard_form
+from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import boundary
-from jaxmpc.mpc.condense import condense, in_float64
+from jaxmpc.mpc.condense import in_float64
+from jaxmpc.mpc.inequalities import condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import row_table
 from jaxmpc.mpc.soften import harden, soften
 from jaxmpc.mpc.solve import Controller
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
-from jaxmpc.recursion.recursion import RecursionReport, recursive_feasibility
+from jaxmpc.recursion.analysis import RecursionReport, recursive_feasibility
 
-TERMINALS = ("invariant", "ellipsoid", "states", "box", "none")
 # Rounding of optimal values, relative: a Lyapunov increase below that is none.
 ROUNDING = 1e-7
 
@@ -66,7 +66,7 @@ def design(
 
     limits: of `joint_limits`; or states and inputs themselves. terminal: "invariant", the maximal
     invariant set of the LQR; "ellipsoid", the largest level set of its cost inside the limits;
-    "states" or "box", the state limits; "none"; or a set. The terminal cost is the LQR's unless
+    "box", the state limits; "none"; or a set. The terminal cost is the LQR's unless
     settings hold another. soft: None keeps all limits hard; a number is the L1 weight of state and
     terminal rows; "exact" computes the least weight that changes nothing on the feasible set, and a
     margin.
@@ -82,21 +82,8 @@ def design(
             named: dict[str, Any] = limits.names
             system = replace(system, **named)
     regulator = lqr(system, Q, R)
-    sets: dict[str, Any] = {
-        "none": lambda: None,
-        "states": lambda: states,
-        "box": lambda: states,
-    }
     if isinstance(terminal, str):
-        if terminal not in TERMINALS:
-            fail("terminal", f"{terminal!r}", f"Give a set, or one of {', '.join(TERMINALS)}")
-        if terminal in ("invariant", "ellipsoid") and states is None and inputs is None:
-            fail("terminal", f"{terminal!r} without limits", "Give states or inputs, or 'none'")
-        K, P = regulator.K, regulator.P
-        sets["ellipsoid"] = lambda: invariant_ellipsoid(system, K, P, states, inputs)
-        free = Box(np.full(system.n, -np.inf), np.full(system.n, np.inf))
-        sets["invariant"] = lambda: maximal_invariant_set(system, K, states or free, inputs)
-        terminal_set = sets[terminal]()
+        terminal_set = named_terminal_set(terminal, system, regulator, states, inputs)
     else:
         terminal_set = terminal
     mpc = MPC(
@@ -207,7 +194,7 @@ def offline_report(
         fail("seconds", f"{seconds!r}", "Give a positive number")
     hard = harden(mpc)
     notes: dict[str, str] = {}
-    d = hard_part(hard).dimension
+    d = FeasibilityProblem.of(hard).dimension
     if x0s is None:
         x0s = samples(hard, d)
     fmap = map_feasible_set(hard, x0s)
@@ -232,18 +219,17 @@ def offline_report(
     if len(inside):
         pick = np.unique(np.linspace(0, len(inside) - 1, min(loops, len(inside))).astype(int))
         closed = closed_loops(mpc, inside[pick], steps)
-    with jax.enable_x64(True):
-        condensed = condense(in_float64(mpc))
+    condensed = condensed_in_float64(mpc)
     return OfflineReport(
         mpc, fmap, fmap.volume_bounds() if d <= 3 else (0.0, np.inf), recursion, penalty, terminal,
         closed, condensed.P.shape[0], condensed.C.shape[0],
-        float(np.linalg.cond(np.asarray(condensed.P))), notes,
+        float(np.linalg.cond(condensed.P)), notes,
     )  # fmt: skip
 
 
 def theorems(mpc: MPC, K: Any = None) -> TerminalReport:
     """`verify_terminal` of a problem that the theorems cover; ValueError for another."""
-    if not usual(mpc) or (mpc.terminal_set is None and mpc.horizon == 1):
+    if not is_standard_form(mpc) or (mpc.terminal_set is None and mpc.horizon == 1):
         fail("mpc", "is not of the theorems' form", "They cover limits of states and inputs alone, "
              "at the usual steps, inputs free at each")  # fmt: skip
     if mpc.input_rate_weight is not None:

@@ -14,7 +14,7 @@ import xarray as xr
 from jaxmpc import cli
 from jaxmpc.commands import recursion, sweep
 from jaxmpc.control.sets import Box
-from jaxmpc.recursion.recursion import Counterexample, RecursionReport, Rung, SmallestHorizon
+from jaxmpc.recursion import Claim, Counterexample, RecursionReport, SmallestHorizon
 
 
 @pytest.fixture(autouse=True)
@@ -189,9 +189,9 @@ def canned(mpc, x0s, **settings):
         feasible_inputs=np.ones((mpc.horizon, 1)), primal_residual=0.0, dual_residual=0.0,
         found="search",
     )  # fmt: skip
-    refuted = Rung(False, "an example", x0s[0])
+    refuted = Claim(False, "an example", x0s[0])
     return RecursionReport(
-        mpc=mpc, strong=refuted, law=refuted, weak=Rung(None, "no facets"), counterexample=worst,
+        mpc=mpc, strong=refuted, law=refuted, weak=Claim(None, "no facets"), counterexample=worst,
         feasible_set=Box(-np.ones(n), np.ones(n)).to_polytope(), volume=4.0, lost_by_any=np.nan,
         lost_by_law=0.5, states=x0s, label=np.ones(count, np.int8), inputs=np.zeros((count, 1)),
         next_states=x0s, lost_at=np.arange(count) % 3, undecided_at=np.zeros(count, int),
@@ -209,7 +209,7 @@ def examined(monkeypatch):
         return canned(mpc, x0s, **settings)
 
     monkeypatch.setattr(recursion, "recursive_feasibility", record)
-    least = SmallestHorizon(5, 6, {5: Rung(True, "by regions")})
+    least = SmallestHorizon(5, 6, {5: Claim(True, "by regions")})
     monkeypatch.setattr(recursion, "smallest_horizon", lambda *a, **k: least)
     return calls
 

@@ -12,9 +12,9 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.cli import main
 from jaxmpc.commands import sweep
-from jaxmpc.feasible import candidates as ladder
-from jaxmpc.feasible import proofs
-from jaxmpc.feasible.candidates import RungPenalties
+from jaxmpc.feasible.candidates import StagePenalties, admm_stage
+from jaxmpc.feasible.constraint_rows import weighted
+from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.tuning import penalties as module
 from jaxmpc.tuning import sweep_penalties
 from jaxmpc.tuning.penalties import learn_penalties, spread, tune_penalties
@@ -196,7 +196,7 @@ def test_bad_input(settings, match):
 
 
 def moving(problem):
-    return ladder.rows(problem, proofs.make_view(problem))
+    return FeasibilityProblem.of(problem).rows
 
 
 @pytest.mark.parametrize("ball", [False, True])
@@ -207,7 +207,7 @@ def test_weighted_rows_are_the_same_rows(ball):
     old, rng = moving(problem), np.random.default_rng(0)
     weight = np.exp(rng.normal(size=len(old.lower)))
     weight[len(weight) - sum(old.balls) :] = 3.0
-    new, M = ladder.weighted(old, weight)
+    new, M = weighted(old, weight)
     assert np.allclose(new.U.T @ new.U, np.eye(new.U.shape[1]))
     w, theta, y = rng.normal(size=M.shape[1]), rng.normal(size=2), rng.normal(size=len(weight))
     assert np.allclose(new.U @ w, weight * (old.U @ (M @ w)))
@@ -250,12 +250,11 @@ def test_the_first_pass_of_a_sweep_decides_more_and_labels_stay(tmp_path):
 def test_sweep_shortfalls_against_the_rungs_own_verdicts():
     """Where nothing is missing the rung decides (in float32, the edge apart); infeasible states it
     decides only there."""
-    x, rows, view = POINTS[800:], moving(mpc(4)), proofs.make_view(mpc(4))
-    box = ladder.bounding_box(rows, np.abs(POINTS).max(axis=0))[0]
+    x, problem = POINTS[800:], FeasibilityProblem.of(mpc(4))
+    rows, p = problem.rows, problem.exact(np.abs(POINTS).max(axis=0))
     truth = jm.map_feasible_set(mpc(4), x, **SWEEP).label
     with jax.enable_x64(True):
-        p = proofs.problem(mpc(4), view, box)
-        decided = ladder.admm_rung(8, np.dtype(np.float32))(p, rows, x, np.float64(1.6))[0].label
+        decided = admm_stage(8, np.dtype(np.float32))(p, rows, x, np.float64(1.6))[0].label
         one = lambda x, label: sweep_penalties.shortfall(
             p, rows, x, label, np.ones(len(rows.lower)), 1.6, 8
         )
@@ -296,7 +295,7 @@ def test_sweep_command_learns_and_its_labels_agree(tmp_path, monkeypatch, capsys
     def tune(problem, points, cache, **settings):
         asked.append((cache, settings))
         weight = np.exp(np.random.default_rng(0).normal(size=len(moving(problem).lower)))
-        return sweep_penalties.SweepPenalties(RungPenalties(weight, 1.4), 0.9, 0.8)
+        return sweep_penalties.SweepPenalties(StagePenalties(weight, 1.4), 0.9, 0.8)
 
     monkeypatch.setattr(sweep, "tune_sweep_penalties", tune)
     command = "sweep --config case.toml --grid 40 20 --iterations 8 --no-refine --output"

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.plots import plot_feasible_set, plot_recursion
-from jaxmpc.recursion.recursion import Counterexample, RecursionReport, Rung
+from jaxmpc.recursion import Claim, Counterexample, RecursionReport
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +110,7 @@ def recursion_report(points, worst=True):
     system = LinearSystem(np.eye(2), np.ones((2, 1)), state_names=("q", "dq"))
     return RecursionReport(
         mpc=SimpleNamespace(system=system, horizon=7, labels=system.state_labels),
-        strong=Rung(False, "a"), law=Rung(False, "b"), weak=Rung(None, "c"),
+        strong=Claim(False, "a"), law=Claim(False, "b"), weak=Claim(None, "c"),
         counterexample=counterexample if worst else None,
         feasible_set=Box(-np.ones(2), np.ones(2)).to_polytope(), volume=4.0, lost_by_any=np.nan,
         lost_by_law=0.1, states=points, label=np.where(inside, 1, -1).astype(np.int8),

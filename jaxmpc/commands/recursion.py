@@ -23,7 +23,7 @@ from jaxmpc.commands.options import (
 )
 from jaxmpc.commands.robot_map import RobotJob, refused
 from jaxmpc.plots import plot_recursion
-from jaxmpc.recursion.recursion import (
+from jaxmpc.recursion import (
     RecursionReport,
     SmallestHorizon,
     recursive_feasibility,

@@ -16,12 +16,15 @@ from tqdm.std import tqdm
 
 from jaxmpc.checks import fail
 from jaxmpc.commands.options import model_hash, open_folder, versions, write_json
-from jaxmpc.control.invariant import maximal_invariant_set
+from jaxmpc.control.named_terminal import named_terminal_set
 from jaxmpc.control.riccati import lqr
-from jaxmpc.control.sets import Polytope
-from jaxmpc.feasible.map import ARRAYS, grid, joined
+from jaxmpc.feasible.labels import ARRAYS, joined
+from jaxmpc.feasible.map import grid
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.robot_maps.robot_map import Loops, RobotMap, RobotSetting, deviations
+from jaxmpc.robot_maps.loops import RobotLoops
+from jaxmpc.robot_maps.robot_map import RobotMap
+from jaxmpc.robot_maps.set_point import deviations, moved
+from jaxmpc.robot_maps.setting import RobotSetting
 from jaxmpc.robot_plots import plot_robot_map
 from jaxmpc.robots.control import robot_mpc
 from jaxmpc.robots.load import load_robot
@@ -93,7 +96,7 @@ class RobotJob:
         # From here on things compile.
         fixed = _home(robot)
         fixed[others] = fixed[others] if self.values is None else self.values
-        mpc = default_mpc(robot, self.horizon or 20, self.terminal)
+        mpc = default_mpc(robot, self.horizon or 20, self.terminal or "none")
         seconds = 2.0 if self.seconds is None else self.seconds
         setting = RobotSetting.of(
             robot, mpc, points, seconds if self.steps is None else self.steps * robot.dt,
@@ -181,21 +184,21 @@ class RobotJob:
         with tqdm(total=sum(_length(slices[k]) for k in todo), unit=" loops", disable=None) as bar:
             for k, labels, loops in self._chunks(setting, slices, todo):
                 arrays = {name: getattr(labels, name) for name in ARRAYS}
-                arrays |= {f.name: getattr(loops, f.name) for f in fields(Loops)}
+                arrays |= {f.name: getattr(loops, f.name) for f in fields(RobotLoops)}
                 _save(path(k), arrays)
                 bar.update(_length(slices[k]))
         labels, parts = setting.none(), []
         for k, here in enumerate(slices):
             with np.load(path(k)) as stored:
                 part = {name: stored[name] for name in stored.files}
-            parts.append(Loops(**{f.name: part[f.name] for f in fields(Loops)}))
+            parts.append(RobotLoops(**{f.name: part[f.name] for f in fields(RobotLoops)}))
             labels = joined(labels, here, replace(labels, **{name: part[name] for name in ARRAYS}))
         refine = 1e-6 if self.refine and len(setting.axes) <= 3 else None
         return setting.map(labels, parts, refine=refine, search_seconds=self.search_seconds)
 
     def _chunks(
         self, setting: RobotSetting, slices: list[slice], todo: list[int]
-    ) -> Iterator[tuple[int, Any, Loops]]:
+    ) -> Iterator[tuple[int, Any, RobotLoops]]:
         """The chunks that are left, with their numbers."""
         if not todo:
             return
@@ -207,7 +210,7 @@ class RobotJob:
 
     def save(self, setting: RobotSetting, rmap: RobotMap, config: dict[str, Any]) -> list[str]:
         """Write the files; their names."""
-        loops = {f.name: getattr(rmap.loops, f.name) for f in fields(Loops)}
+        loops = {f.name: getattr(rmap.loops, f.name) for f in fields(RobotLoops)}
         _save(self.output / "robot_map.npz", {
             "points": rmap.points, "states": setting.states(rmap.points),
             "promised": rmap.promised, "held": rmap.held, "kept": rmap.kept,
@@ -249,23 +252,19 @@ class RobotJob:
         return ["summary.json", "robot_map.npz", "robot_map.png"]
 
 
-def default_mpc(robot: Robot, horizon: int, terminal: str | None = None) -> MPC:
-    """The MPC of `robot_mpc` with a terminal set: None or "none"; "box", the state limits of the
-    problem; "invariant", the largest set that the LQR keeps within all limits."""
+def default_mpc(robot: Robot, horizon: int, terminal: str = "none") -> MPC:
+    """The MPC of `robot_mpc` with the terminal set of this name (`named_terminal_set`), other than
+    "ellipsoid", about the set-point."""
     mpc = robot_mpc(robot, horizon=horizon)
-    if terminal in (None, "none"):
+    if terminal == "none":
         return mpc
-    if terminal == "box":
-        return replace(mpc, terminal_set=mpc.states)
     x, (_, u) = _home(robot), robot.equilibrium()
     about = deviations(mpc, x, u)
     law = lqr(about.system, mpc.Q, mpc.R)
     # At the set-point c is rounding.
     system = replace(about.system, c=None)
-    assert about.states is not None
-    found = maximal_invariant_set(system, law.K, about.states, about.inputs)
-    H, h = np.asarray(found.H), np.asarray(found.h)
-    return replace(mpc, terminal_set=Polytope(H, h + H @ x))
+    found = named_terminal_set(terminal, system, law, about.states, about.inputs)
+    return replace(mpc, terminal_set=moved(found, -x))
 
 
 def refused(given: dict[str, Any], robot: str | None, needs: str) -> None:

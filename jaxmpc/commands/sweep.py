@@ -22,8 +22,10 @@ from jaxmpc.commands.options import End, Horizon, Terminal, open_folder, option,
 from jaxmpc.commands.robot_map import RobotJob, refused
 from jaxmpc.compiled import CHUNK
 from jaxmpc.feasible import store
-from jaxmpc.feasible.candidates import RungPenalties
-from jaxmpc.feasible.map import FeasibleSetMap, Labels, label_chunks
+from jaxmpc.feasible.candidates import StagePenalties
+from jaxmpc.feasible.labels import Labels, label_chunks
+from jaxmpc.feasible.map import FeasibleSetMap
+from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.plots import plot_feasible_set
 from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
@@ -163,6 +165,7 @@ class Job(NamedTuple):
 
     config: configs.Config
     mpc: MPC
+    problem: FeasibilityProblem
     region: configs.SweepPoints
     group: zarr.Group
 
@@ -193,11 +196,12 @@ def prepare(command: Sweep) -> Job:
         store.remove(path)
     elif path.exists() and not command.resume:
         fail(str(path), "exists", "Add --resume to go on with it or --overwrite to start again")
+    problem = FeasibilityProblem.of(mpc, region.axes, region.fixed)
     shape = (mpc.system.n, mpc.horizon, mpc.system.m)
     group = store.open_sweep(path, region.points, shape, config.to_dict(), CHUNK)
     for name in ("map.png", "summary.json"):  # of an earlier run
         (command.output / name).unlink(missing_ok=True)
-    return Job(config, mpc, region, group)
+    return Job(config, mpc, problem, region, group)
 
 
 def sweep(command: Sweep, resume: str) -> int:
@@ -264,7 +268,7 @@ def cache_folder() -> Path:
     return (Path(home) if Path(home).is_absolute() else Path.home() / ".cache") / "jaxmpc/penalties"
 
 
-def _penalties(job: Job) -> RungPenalties | None:
+def _penalties(job: Job) -> StagePenalties | None:
     """Learned for the problem in hand, or from the cache. Raises ValueError for too few states."""
     if not store.pending(job.group):
         return None
@@ -283,7 +287,7 @@ def _penalties(job: Job) -> RungPenalties | None:
     return found.penalties
 
 
-def _label(job: Job, penalties: RungPenalties | None) -> Tally:
+def _label(job: Job, penalties: StagePenalties | None) -> Tally:
     """Label the chunks not yet done and commit each; Ctrl-C ends it after the chunk in hand."""
     todo = store.pending(job.group)
     rows = [np.arange(len(job.region.points))[store.chunk_rows(job.group, k)] for k in todo]
@@ -291,10 +295,8 @@ def _label(job: Job, penalties: RungPenalties | None) -> Tally:
     if not todo:
         return tally
     chunks = label_chunks(
-        job.mpc,
+        job.problem,
         job.region.points[np.concatenate(rows)],
-        axes=job.region.axes,
-        fixed=job.region.fixed,
         iterations=job.config.sweep.iterations,
         dtype=job.config.sweep.dtype,
         chunk=CHUNK,
@@ -355,8 +357,7 @@ def _read_map(path: Path, job: Job) -> FeasibleSetMap:
         cut_normals=data["cut_normal"].values,
         cut_offsets=data["cut_offset"].values,
     )
-    region = job.region
-    return FeasibleSetMap.of(job.mpc, region.points, region.axes, region.fixed, labels)
+    return FeasibleSetMap.of(job.problem, job.region.points, labels)
 
 
 def _table(fmap: FeasibleSetMap, tally: Tally, more: Sequence[tuple[str, Any]]) -> str:

@@ -1,6 +1,5 @@
 """What the commands `jaxmpc tune weights` and `jaxmpc tune penalties` share."""
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,8 @@ from jaxmpc import config as configs
 from jaxmpc.checks import fail
 from jaxmpc.commands.options import open_folder, write_json
 from jaxmpc.control.sets import Polytope
-from jaxmpc.mpc.condense import condense, in_float64
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.mpc.inequalities import Inequalities
 from jaxmpc.mpc.problem import MPC
 
 CHECKPOINT = "checkpoint.npz"
@@ -76,22 +76,16 @@ def feasible_states(
     Asked of linear programs on the host: nothing compiles for it, and hard rows are all linear but
     for an elliptic terminal set, which is left out.
     """
-    mpc = dataclasses.replace(mpc, soft=(), input_rate_weight=None)
-    with jax.enable_x64(True):
-        c = jax.tree.map(np.asarray, condense(in_float64(mpc)))
-    rows = len(c.C) - sum(c.balls)
-    C, D, d, low, high = (v[:rows] for v in (c.C, c.D, c.d, c.lower, c.upper))
-    has = np.isfinite(high), np.isfinite(low)
-    A = np.concatenate([C[has[0]], -C[has[1]]])
+    rows = Inequalities.of(FeasibilityProblem.of(mpc).condensed)
     random, dropped = np.random.default_rng(seed), 0
     found: list[np.ndarray] = []
     for _ in range(TRIES * count):
         x = random.uniform(lower, upper)
         if isinstance(limits, Polytope) and np.any(np.asarray(limits.H) @ x > limits.h):
             continue
-        shift = D @ np.pad(x, (0, D.shape[1] - len(x))) + d
-        b = np.concatenate([(high - shift)[has[0]], (shift - low)[has[1]]])
-        if len(A) and linprog(np.zeros(A.shape[1]), A, b, bounds=(None, None)).status == 2:
+        b = rows.b - rows.D @ np.pad(x, (0, rows.D.shape[1] - len(x)))
+        zero = np.zeros(rows.C.shape[1])
+        if len(b) and linprog(zero, rows.C, b, bounds=(None, None)).status == 2:
             dropped += 1
             continue
         found.append(x)

@@ -8,20 +8,17 @@ from scipy.optimize import linprog
 
 from jaxmpc.checks import fail
 from jaxmpc.control.sets import Box, Polytope
-from jaxmpc.explicit.regions import (
+from jaxmpc.explicit.cells import ActivePiece, active_piece, capped_ball
+from jaxmpc.explicit.least_distance import (
     LP,
     SMALLEST,
     STOPPED,
-    ActivePiece,
-    CriticalRegions,
-    Program,
-    active_piece,
-    capped_ball,
-    exchange,
-    explore,
+    LeastDistanceForm,
+    least_distance_form,
     maximum,
-    program,
 )
+from jaxmpc.explicit.regions import CriticalRegions
+from jaxmpc.explicit.search import exchange, explore
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Row, row_table
 from jaxmpc.qp.status import Status
@@ -31,7 +28,7 @@ ENUMERATED = 4
 # The sampled search: where on a ray to the boundary of X_N samples lie, how many regions it starts
 # from, after how many that lead to nothing better it ends, and how many rays look for the facets of
 # a region.
-SHARES = (0.5, 0.9, 0.99, 1 - 1e-4, 1 - 1e-7)
+FRACTIONS = (0.5, 0.9, 0.99, 1 - 1e-4, 1 - 1e-7)
 STARTS = 32
 PATIENCE = 20
 RAYS = 64
@@ -128,14 +125,14 @@ def exact_penalty(
     if x0s.ndim != 2 or x0s.shape[1] != mpc.dimension:
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.dimension})")
 
-    p, table = program(mpc, within), row_table(mpc)
+    p, table = least_distance_form(mpc, within), row_table(mpc)
     weigh = Thresholds(p, softened(p, table))
     found: dict[tuple[int, ...], Worst | None] = {}
     regions: CriticalRegions | None = None
     few = len(p.center) <= ENUMERATED
     if method == "regions" or (method == "auto" and few):
         search = explore(p, limit)
-        regions = search.report(mpc)
+        regions = CriticalRegions.of(mpc, search)
         for c in search.found:
             found[c.law.active] = weigh.over(c.law, c.vertices)
     exact = regions is not None and regions.complete
@@ -151,20 +148,20 @@ def exact_penalty(
         rho_bar=value,
         at=p.center + p.size * worst.xi,
         row=row,
-        label="" if row is None else label(row, p.side[worst.row]),
+        label="" if row is None else row_in_words(row, p.side[worst.row]),
         method="regions" if exact or method == "regions" else "samples",
         exact=exact,
         # At rho_bar = 0 every positive weight is exact.
         advised=(1.1 if exact else 2.0) * value if value > 0 else 1.0,
         thresholds=thresholds,
         status=status,
-        sufficient=judged(p, value, exact, rho),
+        sufficient=is_sufficient(p, value, exact, rho),
         regions=regions,
         evaluated=len(worsts),
     )
 
 
-def softened(p: Program, table: tuple[Row, ...]) -> np.ndarray:
+def softened(p: LeastDistanceForm, table: tuple[Row, ...]) -> np.ndarray:
     """(r,) bool: the soft rows of the program that inputs can move."""
     any_soft = any(row.soft for row in table)
     soft = np.array([row.soft if any_soft else row.kind in SOFTENED for row in table], bool)
@@ -174,7 +171,9 @@ def softened(p: Program, table: tuple[Row, ...]) -> np.ndarray:
     return mine & ~p.still
 
 
-def judged(p: Program, value: float, exact: bool, rho: float | None) -> bool | None:
+def is_sufficient(
+    p: LeastDistanceForm, value: float, exact: bool, rho: float | None
+) -> bool | None:
     """Whether the weight rho (None: those of the soft rows) is exact; None where unknown."""
     weights = p.condensed.soft_linear if rho is None else np.array([rho])
     if weights is None:
@@ -186,7 +185,7 @@ def judged(p: Program, value: float, exact: bool, rho: float | None) -> bool | N
     return False if weights.max() < value * (1 - ROUNDING) else None
 
 
-def label(row: Row, side: float) -> str:
+def row_in_words(row: Row, side: float) -> str:
     """The row in words: "upper bound of dq at k = 3 [rad/s]"."""
     bound = "upper" if side > 0 else "lower"
     spoken = any(sign in row.name for sign in "<>≤≥")
@@ -205,24 +204,24 @@ class Worst(NamedTuple):
 class Thresholds:
     """Least maximal multipliers of the soft rows of a program."""
 
-    def __init__(self, p: Program, soft: np.ndarray) -> None:
+    def __init__(self, p: LeastDistanceForm, soft: np.ndarray) -> None:
         self.p, self.soft = p, soft
 
     def least(
         self, rows: np.ndarray, active: tuple[int, ...], multipliers: np.ndarray
     ) -> tuple[float, int]:
-        """min t over λ ≥ 0 on `rows` that push like the given ones on `active`, λ_i ≤ t over soft
-        rows; the value (NaN: HiGHS stops), and a soft row that attains it.
+        """min t over λ ≥ 0 on `rows` with the same Σ λ_i M_i as those on `active`, λ_i ≤ t over
+        soft rows; the value (NaN: HiGHS stops), and a soft row that attains it.
         """
-        push = self.p.M[list(active)].T @ np.maximum(multipliers, 0.0)
-        mine, size = self.soft[rows], np.abs(push).max(initial=0.0)
+        total = self.p.M[list(active)].T @ np.maximum(multipliers, 0.0)
+        mine, size = self.soft[rows], np.abs(total).max(initial=0.0)
         if not mine.any() or size == 0:
             return 0.0, -1
-        # In units of the push, and per row of M; t counts in the rows as given.
+        # In units of that sum, and per row of M; t counts in the rows as given.
         per_row = 1 / self.p.length[rows]
         unit = per_row[mine].max()
         count = len(rows)
-        A, b = self.p.balance(rows, push / size)
+        A, b = self.p.balance(rows, total / size)
         result = linprog(
             np.eye(count + 1)[count],
             A_eq=np.column_stack([A, np.zeros(len(b))]), b_eq=b,
@@ -288,8 +287,8 @@ class Thresholds:
 
 
 def climb_regions(
-    p: Program, weigh: Thresholds, found: dict[tuple[int, ...], Worst | None], samples: int,
-    random: np.random.Generator,
+    p: LeastDistanceForm, weigh: Thresholds, found: dict[tuple[int, ...], Worst | None],
+    samples: int, random: np.random.Generator,
 ) -> None:  # fmt: skip
     """Add to `found` the regions that samples, and a search from the best of them, meet.
 
@@ -305,13 +304,13 @@ def climb_regions(
     between = weights @ corners - p.interior if len(corners) else np.zeros((0, n))
     for direction in [*random.standard_normal((samples - half, n)), *between]:
         end = p.leave(direction)
-        for share in SHARES if end is not None else ():
-            solution = p.solution(p.interior + share * (end - p.interior))
+        for fraction in FRACTIONS if end is not None else ():
+            solution = p.solution(p.interior + fraction * (end - p.interior))
             if solution is not None:
                 rows = list(solution.active)
-                pushes = (solution.multipliers / p.length[rows])[weigh.soft[rows]]
+                loads = (solution.multipliers / p.length[rows])[weigh.soft[rows]]
                 active = p.basis(solution) or ()
-                seen[active] = max(seen.get(active, 0.0), pushes.max(initial=0.0))
+                seen[active] = max(seen.get(active, 0.0), loads.max(initial=0.0))
 
     def visit(active: tuple[int, ...] | None) -> None:
         if active is not None and active not in found:

@@ -1,82 +1,30 @@
-"""The MPC law seen from its states: plans, next states, the affine pieces, and ascent over them.
+"""The MPC law at given states: plans, next states, and the affine piece of the law there.
 
 The optimal plan is piecewise affine in the state. Its piece at a state is found from the active
 rows of the plan there, as implicit differentiation of the optimality conditions does, and holds
-on a polytope, the critical region. So a convex function of the next state can be raised by its
-gradient, and within a piece be maximised exactly by a linear program.
+on a polytope, the critical region.
 """
 
-import time
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax
 import numpy as np
 from scipy.optimize import lsq_linear, nnls
 
-from jaxmpc.control.sets import Box, maximise, unit_rows
-from jaxmpc.mpc.condense import condense, in_float64
+from jaxmpc.control.sets import Box, unit_rows
+from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.qp.status import Status
 from jaxmpc.sweeps.plans import Plans, solve_many
 
 # Residuals to which plans are solved.
 EPS = 1e-8
 # Slack, and error of a reconstructed plan, that count as zero; relative to the data.
 TOUCHING, MATCHING = 1e-7, 1e-6
-# Gradient ascent: how far inside the half-spaces it stays (on the boundary, where a single plan is
-# left, solvers crawl), and step lengths; relative to the size of the set.
-INSET = 1e-6
-LENGTHS = 0.3 * 0.5 ** np.arange(16)
-# At the end regions are climbed: how many at once, in how many rounds, from how many neighbours
-# at what distance.
-KEPT, ROUNDS, NEIGHBOURS, NEAR = 6, 10, 4, 1e-4
 
 
-@dataclass(frozen=True)
-class Bound:
-    """Half-spaces normals·x ≤ offsets (unit rows) that hold on the feasible set, and its centre.
-
-    size: largest distance of a half-space from the centre, the scale of lengths.
-    """
-
-    center: np.ndarray
-    normals: np.ndarray
-    offsets: np.ndarray
-
-    @property
-    def size(self) -> float:
-        """Scale of lengths."""
-        return float(np.max(self.offsets - self.normals @ self.center))
-
-    def excess(self, points: np.ndarray) -> np.ndarray:
-        """Largest distance (B,) by which points (B, p) exceed a half-space."""
-        return np.max(points @ self.normals.T - self.offsets, axis=1)
-
-    def nearest(self, points: np.ndarray, inset: float = 0.0) -> np.ndarray:
-        """The point nearest to each of `points` (B, p) that keeps all half-spaces by `inset`.
-
-        Least distance by non-negative least squares (Lawson & Hanson 1974, ch. 23).
-        """
-        answer = np.array(points, float)
-        room = self.offsets - inset - answer @ self.normals.T
-        target = np.append(np.zeros(answer.shape[1]), 1.0)
-        for i in np.flatnonzero(room.min(axis=1) < 0):
-            scale = -room[i].min()
-            E = -np.vstack([self.normals.T, room[i] / scale])
-            try:
-                y, _ = nnls(E, target, maxiter=20 * E.shape[1])
-            except RuntimeError:  # stays outside, where there is no plan
-                continue
-            r = E @ y - target
-            if r[-1] < -1e-12:
-                answer[i] -= scale * r[:-1] / r[-1]
-        return answer
-
-
-@dataclass(frozen=True)
-class Piece:
+@dataclass(frozen=True, eq=False)
+class AffinePiece:
     """x⁺ = E x + e on the region R x ≤ r (unit rows) where one set of rows is active."""
 
     E: np.ndarray
@@ -97,16 +45,10 @@ class Law:
         system = mpc.system
         self.A, self.B = np.asarray(system.A, np.float64), np.asarray(system.B, np.float64)
         self.c = np.zeros(system.n) if system.c is None else np.asarray(system.c, np.float64)
-        with jax.enable_x64(True):
-            self.condensed = c = jax.tree.map(np.asarray, condense(in_float64(mpc)))
-        kept = len(c.C) - sum(c.balls)
-        up, low = (np.flatnonzero(np.isfinite(v[:kept])) for v in (c.upper, c.lower))
-        row, side = np.append(up, low), np.repeat([1.0, -1.0], [len(up), len(low)])
-        C, D = side[:, None] * c.C[row], side[:, None] * c.D[row]
-        b = side * (np.where(side > 0, c.upper[row], c.lower[row]) - c.d[row])
-        size = np.linalg.norm(np.hstack([C, D]), axis=1)
-        size[size == 0] = 1.0
-        self.C, self.D, self.b = C / size[:, None], D / size[:, None], b / size
+        self.condensed = c = condensed_in_float64(mpc)
+        rows, size = Inequalities.of(c).normalised()
+        self.C, self.D, self.b = rows.C, rows.D, rows.b
+        row = rows.row
         hard = np.full(len(row), np.inf)
         self.rho = hard if c.soft_linear is None else c.soft_linear[row] * size
         self.kappa = 0 * self.b if c.soft_quadratic is None else c.soft_quadratic[row] * size**2
@@ -130,12 +72,12 @@ class Law:
         return np.clip(u, box.lower, box.upper) if isinstance(box, Box) else u
 
     def following(self, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-        """The states (B, p) after inputs (B, m): A x + B u + c, and u where it is remembered."""
+        """The states (B, p) after inputs (B, m): A x + B u + c, and u where the state holds it."""
         x = states[:, : self.mpc.system.n]
         after = x @ self.A.T + inputs @ self.B.T + self.c
         return np.hstack([after, inputs])[:, : states.shape[1]]
 
-    def piece(self, state: np.ndarray, inputs: np.ndarray) -> Piece | None:
+    def piece(self, state: np.ndarray, inputs: np.ndarray) -> AffinePiece | None:
         """The piece at a state (p,) whose optimal inputs (N, m) are given; None if none is found.
 
         With P z + F x + f + C_a'y = 0 and C_a z + D_a x = b_a on the active rows a, plan and
@@ -148,9 +90,9 @@ class Law:
         z = np.linalg.lstsq(c.Omega.reshape(len(moves), -1), moves, rcond=None)[0]
         if c.balls and self._touches_ball(theta, z):
             return None
-        excess = self.C @ z + self.D @ theta - self.b
+        gap = self.C @ z + self.D @ theta - self.b
         near = TOUCHING * (1 + np.abs(self.b))
-        over, touching = excess > near, np.flatnonzero(np.abs(excess) <= near)
+        over, touching = gap > near, np.flatnonzero(np.abs(gap) <= near)
         if np.any(np.isinf(self.rho[over])):  # no plan
             return None
         S = self.kappa[over, None] * self.C[over]
@@ -191,7 +133,7 @@ class Law:
         k = c.psi[0] + c.Omega[0] @ Z[:, -1]
         E = np.vstack([self.B @ K[:, :p], K[:, :p]])[:p]
         E[: len(self.A), : len(self.A)] += self.A
-        return Piece(E, np.append(self.B @ k + self.c, k)[:p], *unit_rows(R, r))
+        return AffinePiece(E, np.append(self.B @ k + self.c, k)[:p], *unit_rows(R, r))
 
     def _multipliers(self, A: np.ndarray, force: np.ndarray, rho: np.ndarray) -> np.ndarray:
         """y with A y = force as nearly as can be, 0 ≤ y ≤ rho."""
@@ -209,77 +151,3 @@ class Law:
         last = slice(len(c.C) - sum(c.balls), None)
         centred = c.C[last] @ z + c.D[last] @ theta + c.d[last] - c.lower[last]
         return bool(np.linalg.norm(centred) > (1 - TOUCHING) * float(np.ravel(c.radius)[0]))
-
-
-def ascend(law: Law, bound: Bound, starts: np.ndarray, deadline: float) -> np.ndarray:
-    """States (K, p) where the next state exceeds a half-space most, the best first.
-
-    starts (S, p) follow the gradient (A + B ∂u_0/∂x)'a_j of v(x) = max_j (a_j'x⁺(x) − b_j) within
-    the half-spaces, in steps of halving length of which those are taken that raise v. Then the
-    best are led from region to region, each to the maximum of a_j'x⁺ on its region. A local
-    method: what it finds is real, what it does not find is not proved absent.
-    """
-    inset = INSET * bound.size
-    x = bound.nearest(starts, inset)
-    value, gradient = _value(law, bound, x)
-    for length in LENGTHS:
-        if time.monotonic() > deadline:
-            break
-        trial = bound.nearest(x + length * bound.size * gradient, inset)
-        better, slope = _value(law, bound, trial, than=value)
-        grown = better > value
-        x[grown], value[grown], gradient[grown] = trial[grown], better[grown], slope[grown]
-    return _climb(law, bound, x, value, deadline)
-
-
-def _value(
-    law: Law, bound: Bound, x: np.ndarray, than: Any = -np.inf
-) -> tuple[np.ndarray, np.ndarray]:
-    """v (S,) at x (S, p), −inf where there is no plan; its unit gradient where v > than."""
-    plans = law.plans(x)
-    after = law.following(x, plans.inputs[:, 0])
-    beyond = after @ bound.normals.T - bound.offsets
-    value = np.where(plans.status == Status.SOLVED, beyond.max(axis=1), -np.inf)
-    gradient = np.zeros_like(x)
-    for i in np.flatnonzero((value > than) & np.isfinite(value)):
-        piece = law.piece(x[i], plans.inputs[i])
-        if piece is not None:
-            slope = piece.E.T @ bound.normals[np.argmax(beyond[i])]
-            gradient[i] = slope / max(np.linalg.norm(slope), 1e-12)
-    return value, gradient
-
-
-def _climb(law: Law, bound: Bound, x: np.ndarray, value: np.ndarray, deadline: float) -> np.ndarray:
-    """From the best of x (S, p): to the best vertex of the region there, and on from beside it."""
-    random = np.random.default_rng(0)
-    inset = INSET * bound.size
-    order = np.argsort(-value)[:KEPT]
-    best, top = x[order], value[order]
-    for tried in range(ROUNDS):
-        if time.monotonic() > deadline:
-            break
-        beside = random.standard_normal((NEIGHBOURS, *best.shape)) * NEAR * bound.size
-        around = bound.nearest(np.concatenate([best, *(best + beside)]), inset)
-        plans = law.plans(around)
-        found = []
-        for i in np.flatnonzero(plans.status == Status.SOLVED):
-            state, piece = around[i], law.piece(around[i], plans.inputs[i])
-            if piece is None:
-                continue
-            facet = int(np.argmax(bound.normals @ (piece.E @ state + piece.e) - bound.offsets))
-            up = piece.E.T @ bound.normals[facet]
-            R = np.vstack([piece.R, bound.normals])
-            peak = maximise(up, R, np.append(piece.r, bound.offsets)).x
-            if peak is not None:
-                found.append((float(bound.excess((piece.E @ peak + piece.e)[None])[0]), peak))
-        values = np.append(top, [v for v, _ in found])
-        states = np.concatenate([best, *(peak[None] for _, peak in found)])
-        kept: list[int] = []
-        for i in np.argsort(-values):
-            if all(np.abs(states[i] - states[j]).max() > 1e-6 * bound.size for j in kept):
-                kept.append(int(i))
-        before, kept = top.max(initial=-np.inf), kept[:KEPT]
-        best, top = states[kept], values[kept]
-        if tried > 1 and top.max(initial=-np.inf) <= before + 1e-12 * bound.size:
-            break
-    return best

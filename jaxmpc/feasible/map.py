@@ -1,7 +1,5 @@
 """Maps of the feasible set: every point proved feasible, proved infeasible, or said undecided."""
 
-import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,36 +10,15 @@ from scipy.spatial import KDTree
 from tqdm.auto import tqdm
 
 from jaxmpc.checks import fail
-from jaxmpc.compiled import (
-    Compiled,
-    default_chunk,
-    first_rows,
-    gather_size,
-    padded,
-    require_step_type,
-)
 from jaxmpc.control.sets import Ellipsoid, Polytope, hull_volume
 from jaxmpc.feasible import proofs
-from jaxmpc.feasible.candidates import (
-    ALPHA,
-    RungPenalties,
-    Verdict,
-    admm_rung,
-    bounding_box,
-    newton_rung,
-    rows,
-    weighted,
-)
-from jaxmpc.feasible.proofs import hard_part, make_view
+from jaxmpc.feasible.candidates import StagePenalties
+from jaxmpc.feasible.labels import ARRAYS, Labels, joined, label_chunks
+from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
 
-# Newton steps between two attempts at a proof, and how often; the decided leave in between.
-# What resists all of them gets a longer ADMM run and Newton once more.
-NEWTON_STEPS = 8
-NEWTON_ROUNDS = 8
-LONGER = 20
 # Rays that `refine` shoots in one round at most.
 MOST_RAYS = 2000
 # Volumes are sums of rounded products; bounds are widened by more than that.
@@ -62,147 +39,43 @@ def grid(lower: Any, upper: Any, shape: Any) -> np.ndarray:
     return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(shape))
 
 
-# The arrays of `Labels`.
-ARRAYS = ("label", "status", "starts", "plans", "cut_normals", "cut_offsets")
-
-
-@dataclass(frozen=True)
-class Labels:
-    """Labels of b points and their proofs.
-
-    label (b,) int8: 1 proved feasible, −1 proved infeasible, 0 undecided. status (b,) int8:
-    `Status` (NOT_RUN, NON_FINITE, or SOLVED / PRIMAL_INFEASIBLE / ITERATION_LIMIT for the three
-    labels). starts (b, n), plans (b, N, m): x_0 and inputs that prove 1, else NaN.
-    cut_normals (b, d), cut_offsets (b,): the half-space a'x ≤ b, valid on the whole feasible set,
-    that proves −1, else NaN. An offset of ∞ says that −1 is proved at the point but that no such
-    half-space is known: on sets that extend both ways without end, or very far, along a facet,
-    the rounding of its normal outweighs what the point is outside. Seconds spent compiling and
-    running.
-    """
-
-    label: np.ndarray
-    status: np.ndarray
-    starts: np.ndarray
-    plans: np.ndarray
-    cut_normals: np.ndarray
-    cut_offsets: np.ndarray
-    compile_seconds: float = 0.0
-    run_seconds: float = 0.0
-
-    @classmethod
-    def empty(cls, count: int, mpc: MPC, d: int) -> "Labels":
-        """Labels of `count` points (d,) that have not been run."""
-        n, m, horizon = hard_part(mpc).dimension, mpc.system.m, mpc.horizon
-        return cls(
-            np.zeros(count, np.int8), np.full(count, Status.NOT_RUN, np.int8),
-            np.full((count, n), np.nan), np.full((count, horizon, m), np.nan),
-            np.full((count, d), np.nan), np.full(count, np.nan),
-        )  # fmt: skip
-
-    def put(self, where: Any, verdict: Verdict) -> None:
-        """Write what was proved at positions `where`; the decided keep their proof for good."""
-        label = verdict.label
-        self.label[where] = label
-        self.status[where] = np.select(
-            [label == 1, label == -1],
-            [Status.SOLVED, Status.PRIMAL_INFEASIBLE],
-            Status.ITERATION_LIMIT,
-        )
-        feasible, infeasible = label == 1, label == -1
-        self.starts[where] = np.where(feasible[:, None], verdict.start, np.nan)
-        self.plans[where] = np.where(feasible[:, None, None], verdict.inputs, np.nan)
-        self.cut_normals[where] = np.where(infeasible[:, None], verdict.normal, np.nan)
-        self.cut_offsets[where] = np.where(infeasible, verdict.offset, np.nan)
-
-
-def label_chunks(
-    mpc: MPC, points: Any, *, axes: Any = None, fixed: Any = None, iterations: int = 50,
-    dtype: Any = "float32", chunk: int | None = None, penalties: RungPenalties | None = None,
-) -> Iterator[tuple[slice, Labels]]:  # fmt: skip
-    """Label points chunk by chunk; yields (slice of the points, Labels). See `map_feasible_set`."""
-    mpc.validate()
-    mpc = hard_part(mpc)
-    view = make_view(mpc, axes, fixed)
-    d = len(view.axes)
-    points = np.asarray(points, np.float64)
-    if points.ndim != 2 or points.shape[1] != d:
-        fail("x0s", f"shape {points.shape}", f"Give points (B, {d}), one column a mapped state")
-    chunk = default_chunk() if chunk is None else chunk
-    if iterations < 1 or chunk < 1:
-        fail("iterations, chunk", f"{iterations}, {chunk}", "Give counts of at least 1")
-    require_step_type(dtype)
-
-    usable = np.all(np.isfinite(points), axis=1)
-    moving = rows(mpc, view)
-    quick, alpha, back = moving, ALPHA, None
-    if penalties is not None:
-        if np.shape(penalties.weight) != moving.lower.shape:
-            shape = np.shape(penalties.weight)
-            fail("penalties", f"weights {shape}", f"Learn them for this map: {moving.lower.shape}")
-        if not (np.all(np.isfinite(penalties.weight)) and np.all(penalties.weight > 0)):
-            fail("penalties", "hold a weight that is not positive", "Learn them again")
-        if not 0 < penalties.alpha < 2:
-            fail("penalties", f"alpha {penalties.alpha}", "Over-relaxation lies in (0, 2)")
-        (quick, back), alpha = weighted(moving, penalties.weight), penalties.alpha
-    sizes = np.abs(points[usable]) if usable.any() else np.zeros((1, d))
-    extent, _ = bounding_box(moving, sizes.max(axis=0))
-    problem = proofs.problem(mpc, view, extent, np.median(sizes, axis=0))
-    admm, newton = admm_rung(iterations, np.dtype(dtype)), newton_rung(NEWTON_STEPS)
-    longer = admm_rung(LONGER * iterations, np.dtype(np.float64))
-    chunk = min(chunk, max(len(points), 1))
-    size = gather_size(chunk)
-
-    for start in range(0, len(points), chunk):
-        begun, compiled = time.perf_counter(), Compiled.seconds
-        here = slice(start, min(start + chunk, len(points)))
-        ok = usable[here]
-        x = np.where(ok[:, None], points[here], 0.0)
-        labels = Labels.empty(len(x), mpc, d)
-        with jax.enable_x64(True):
-            verdict, w = admm(problem, quick, padded(x, chunk), np.float64(alpha))
-            labels.put(ok, jax.tree.map(lambda v, ok=ok: v[: len(ok)][ok], verdict))
-            w = w[: len(x)].astype(np.float64)
-            w = w if back is None else w @ back.T
-            for rung in (*[newton] * NEWTON_ROUNDS, longer, *[newton] * NEWTON_ROUNDS):
-                left = np.flatnonzero((labels.label == 0) & ok)
-                for i in range(0, len(left), size):
-                    batch = left[i : i + size]
-                    last = padded(w[batch], size) if rung is newton else np.float64(ALPHA)
-                    verdict, better = rung(problem, moving, padded(x[batch], size), last)
-                    labels.put(batch, first_rows(verdict, len(batch)))
-                    w[batch] = better[: len(batch)]
-        labels.status[~ok] = Status.NON_FINITE
-        compiled = Compiled.seconds - compiled
-        spent = time.perf_counter() - begun - compiled
-        yield here, replace(labels, compile_seconds=compiled, run_seconds=spent)
-
-
 @dataclass(frozen=True)
 class FeasibleSetMap:
     """Points of a state space, each with its label and the proof of it (see `Labels`).
 
-    points (B, d) in the states `axes`; fixed: values of the other states (slice) or None
-    (projection, or all states mapped). extra_points (K, d), extra_normals, extra_offsets: points
-    proved feasible and half-spaces proved valid by `refine`.
+    points (B, d) in the states `axes`. extra_points (K, d), extra_normals (F, d), extra_offsets
+    (F,): points proved feasible and half-spaces proved valid by `refine`.
     """
 
-    mpc: MPC
+    problem: FeasibilityProblem
     points: np.ndarray
-    axes: tuple[int, ...]
-    fixed: np.ndarray | None
     labels: Labels
     extra_points: np.ndarray
     extra_normals: np.ndarray
     extra_offsets: np.ndarray
 
     @classmethod
-    def of(cls, mpc: MPC, points: Any, axes: Any, fixed: Any, labels: Labels) -> "FeasibleSetMap":
+    def of(cls, problem: FeasibilityProblem, points: Any, labels: Labels) -> "FeasibleSetMap":
         """A map from labels that were made elsewhere, by chunks or from a store."""
-        view = make_view(hard_part(mpc), axes, fixed)
-        d = len(view.axes)
-        fixed = None if fixed is None else np.asarray(fixed, float)
+        d = problem.dimension
         none = np.zeros((0, d)), np.zeros((0, d)), np.zeros(0)
-        return cls(mpc, np.asarray(points, float), view.axes, fixed, labels, *none)
+        return cls(problem, np.asarray(points, float), labels, *none)
+
+    @property
+    def mpc(self) -> MPC:
+        """The MPC problem, without soft rows and weights of input rates."""
+        return self.problem.mpc
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """Indices of the d mapped states."""
+        return self.problem.view.axes
+
+    @property
+    def fixed(self) -> np.ndarray | None:
+        """Values (n,) of the other states in a slice, zero at `axes`; None for a projection or
+        where all states are mapped."""
+        return self.problem.view.fixed
 
     @property
     def label(self) -> np.ndarray:
@@ -217,7 +90,7 @@ class FeasibleSetMap:
     @property
     def names(self) -> tuple[str, ...]:
         """Labels of the mapped states with their units."""
-        return tuple(hard_part(self.mpc).labels[i] for i in self.axes)
+        return self.problem.labels
 
     def counts(self) -> dict[str, int]:
         """How many points are feasible, infeasible, undecided, not finite, not run."""
@@ -280,12 +153,11 @@ class FeasibleSetMap:
         An Ellipsoid is given as a polygon of 256 of its boundary points, in two mapped states.
         """
         set_ = self.mpc.terminal_set
-        n = hard_part(self.mpc).dimension
-        others = [i for i in range(n) if i not in self.axes]
-        if set_ is None or n > self.mpc.system.n or (others and self.fixed is None):
+        view = self.problem.view
+        axes, others = list(view.axes), list(view.others)
+        if set_ is None or self.mpc.dimension > self.mpc.system.n or view.projects:
             return None
-        rest = np.zeros(0) if self.fixed is None else np.asarray(self.fixed)[others]
-        axes = list(self.axes)
+        rest = view.fixed[others] if others else np.zeros(0)
         if isinstance(set_, Ellipsoid):
             return ellipse(
                 np.asarray(set_.P, float), float(np.asarray(set_.level)), axes, others, rest
@@ -302,11 +174,9 @@ class FeasibleSetMap:
         are labelled infeasible. tolerance: relative gap of the volume bounds at which to stop.
         A set without interior, or unbounded, is returned as it is.
         """
-        mpc = hard_part(self.mpc)
-        view = make_view(mpc, self.axes, self.fixed)
-        d = len(self.axes)
+        d = self.problem.dimension
         try:
-            rays = Rays(mpc, view)
+            rays = Rays.of(self.problem)
         except ValueError:
             return self
         directions = np.concatenate([np.eye(d), -np.eye(d), -np.ones((1, d))])
@@ -354,7 +224,7 @@ class FeasibleSetMap:
         system = self.mpc.system
         names = {
             "coordinate": list(self.names),
-            "state": list(hard_part(self.mpc).labels),
+            "state": list(self.mpc.labels),
             "input": list(system.input_labels),
         }
         return xarray.Dataset(data, coords=names)
@@ -366,7 +236,7 @@ def unit(directions: np.ndarray) -> np.ndarray:
 
 
 def fresh(directions: np.ndarray, shot: np.ndarray) -> np.ndarray:
-    """The directions, zeros apart, in which no ray of `shot` (unit length) has been sent."""
+    """The directions, except zeros, along which no ray of `shot` (unit length) has been sent."""
     directions = directions[np.any(directions != 0, axis=1)]
     distance = KDTree(shot).query(unit(directions))[0]
     return directions[distance > 1e-9]
@@ -399,7 +269,7 @@ def excluded(
     Only within the extent of the feasible set that LPs found: there a half-space of
     `proofs.everywhere` is one of `proofs.cut`, and no label rests on an LP.
     """
-    p = rays.problem
+    p = rays.exact
     within = np.all(np.abs(points) + p.side_0 * points <= p.reach_0, axis=1)
     left = np.flatnonzero((labels.status == Status.ITERATION_LIMIT) & within)
     if not len(left) or not len(offsets):
@@ -419,7 +289,7 @@ def excluded(
 def map_feasible_set(
     mpc: MPC, x0s: Any, *, axes: Any = None, fixed: Any = None, iterations: int = 50,
     dtype: Any = "float32", chunk: int | None = None, refine: float | None = None,
-    penalties: RungPenalties | None = None, progress: bool = False,
+    penalties: StagePenalties | None = None, progress: bool = False,
 ) -> FeasibleSetMap:  # fmt: skip
     """Label each point: is there an input sequence that keeps every hard constraint of `mpc`?
 
@@ -428,34 +298,29 @@ def map_feasible_set(
     of the other states is). The cost plays no part. Every label rests on a proof in float64
     (`proofs.py`): an input sequence whose roll-out keeps all rows, or a half-space that excludes
     the point, each by more than rounding; what is neither is 0, undecided. iterations and dtype
-    govern the ADMM rung alone and cannot make a label wrong. chunk: points a compiled program
+    govern the ADMM stage alone and cannot make a label wrong. chunk: points a compiled program
     takes at once (None: by device). refine: tolerance of `FeasibleSetMap.refine`, None to skip
-    it. penalties: of the ADMM rung, from `tune_sweep_penalties`. progress: show a bar.
+    it. penalties: of the ADMM stage, from `tune_sweep_penalties`. progress: show a bar.
 
     A point with NaN or infinity gets status NON_FINITE and label 0. Raises ValueError for wrong
     shapes and ill-posed problems before anything compiles.
     """
-    points = np.asarray(x0s, np.float64)
-    chunks = label_chunks(
-        mpc, points, axes=axes, fixed=fixed, iterations=iterations, dtype=dtype, chunk=chunk,
-        penalties=penalties,
+    problem = FeasibilityProblem.of(mpc, axes, fixed)
+    result = map_points(
+        problem, x0s, iterations=iterations, dtype=dtype, chunk=chunk, penalties=penalties,
+        progress=progress,
     )  # fmt: skip
-    mpc.validate()
-    labels = Labels.empty(len(points), mpc, len(make_view(hard_part(mpc), axes, fixed).axes))
-    with tqdm(total=len(points), unit="pt", disable=not progress) as bar:
-        for here, part in chunks:
-            labels = joined(labels, here, part)
-            bar.update(len(part.label))
-    result = FeasibleSetMap.of(mpc, points, axes, fixed, labels)
     return result if refine is None else result.refine(refine)
 
 
-def joined(labels: Labels, here: slice, part: Labels) -> Labels:
-    """`labels` with a chunk written in (in place) and its seconds added."""
-    for name in ARRAYS:
-        getattr(labels, name)[here] = getattr(part, name)
-    return replace(
-        labels,
-        compile_seconds=labels.compile_seconds + part.compile_seconds,
-        run_seconds=labels.run_seconds + part.run_seconds,
-    )
+def map_points(
+    problem: FeasibilityProblem, points: Any, *, progress: bool = False, **settings: Any
+) -> FeasibleSetMap:
+    """Label the points (B, d) of a feasibility problem; settings: those of `label_chunks`."""
+    points = np.asarray(points, np.float64)
+    labels = Labels.empty(len(points), problem)
+    with tqdm(total=len(points), unit="pt", disable=not progress) as bar:
+        for here, part in label_chunks(problem, points, **settings):
+            labels = joined(labels, here, part)
+            bar.update(len(part.label))
+    return FeasibleSetMap.of(problem, points, labels)

@@ -14,16 +14,10 @@ from jax import Array
 
 from jaxmpc.checks import fail
 from jaxmpc.feasible import proofs
-from jaxmpc.feasible.candidates import (
-    Rows,
-    Tangents,
-    bounding_box,
-    cut_of,
-    inputs_of,
-    rows,
-    support,
-)
-from jaxmpc.feasible.proofs import Problem, View, hard_part, make_view
+from jaxmpc.feasible.candidates import cut_of, inputs_of
+from jaxmpc.feasible.constraint_rows import ConstraintRows
+from jaxmpc.feasible.exact_data import ExactData
+from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 
 # How far a boundary point is pulled towards the centre before it is proved: the least that works.
@@ -60,12 +54,10 @@ def boundary(
     a slice or projection as in `map_feasible_set`. Raises ValueError where the feasible set is
     empty or flat, or the centre is not inside it.
     """
-    mpc.validate()
-    mpc = hard_part(mpc)
-    view = make_view(mpc, axes, fixed)
-    d = len(view.axes)
+    problem = FeasibilityProblem.of(mpc, axes, fixed)
+    d = problem.dimension
     if isinstance(directions, int | np.integer):
-        directions = spread(max(int(directions), 0), d)
+        directions = ray_directions(max(int(directions), 0), d)
     directions = np.asarray(directions, np.float64)
     if directions.ndim != 2 or directions.shape[1] != d or not np.all(np.isfinite(directions)):
         fail("directions", f"shape {directions.shape}", f"Give finite rays (K, {d}) or a number")
@@ -73,10 +65,10 @@ def boundary(
         fail("directions", "holds no ray, or a zero row", "Give at least one direction")
     if center is not None and (np.shape(center) != (d,) or not np.all(np.isfinite(center))):
         fail("center", f"{center}", f"Give one finite point ({d},)")
-    return Rays(mpc, view, center).shoot(directions)
+    return Rays.of(problem, center).shoot(directions)
 
 
-def spread(count: int, d: int) -> np.ndarray:
+def ray_directions(count: int, d: int) -> np.ndarray:
     """`count` directions in R^d: equally spaced in 2-D, random with a fixed seed above."""
     if d == 1:
         return np.array([[1.0], [-1.0]])
@@ -87,51 +79,40 @@ def spread(count: int, d: int) -> np.ndarray:
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
+@dataclass(frozen=True, eq=False)
 class Rays:
-    """The ray LP of one problem and view, set up once for many rays."""
+    """Rays from one centre of the feasible set, for any number of directions.
 
-    def __init__(self, mpc: MPC, view: View, center: np.ndarray | None = None) -> None:
-        self.rows = rows(mpc, view)
-        self.tangents = Tangents(self.rows)
-        self.center, self.w = self._centre(center)
-        extent, self.sides = bounding_box(self.rows, np.abs(self.center))
-        self.problem = proofs.problem(mpc, view, extent)
+    center (d,) with w: a feasible pair with a margin. exact: the data for proofs.
+    """
 
-    def _centre(self, center: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """θ (the given one, or the best) and w with the largest common margin of all rows."""
-        U, D = self.rows.U, self.rows.D
-        k, d = U.shape[1], D.shape[1]
-        size = np.linalg.norm(np.hstack([U, D]), axis=1)
-        pinned = [(None, None)] * d if center is None else [(v, v) for v in np.asarray(center)]
-        ends = np.concatenate([self.rows.upper, self.rows.lower])
-        largest = max(1.0, np.abs(ends[np.isfinite(ends)]).max(initial=0.0))
-        if self.rows.balls:
-            size[-sum(self.rows.balls) :] = size[-sum(self.rows.balls) :].max()
-        result, _ = self.tangents.solve(
-            np.eye(k + d + 1)[-1], np.hstack([U, D, np.zeros((len(U), 1))]), self.rows.lower,
-            self.rows.upper, [(None, None)] * k + pinned + [(None, largest)], size,
-        )  # fmt: skip
-        if result.x is None or result.x[-1] <= 1e-9:
-            if center is not None:
-                fail("center", f"{center} is not inside the feasible set", "Give None or another")
-            fail(
-                "mpc", "its feasible set is empty or flat: no initial state keeps a margin",
-                "Relax a limit, lengthen the horizon or enlarge the terminal set",
-            )  # fmt: skip
-        return result.x[k : k + d], result.x[:k]
+    problem: FeasibilityProblem
+    center: np.ndarray
+    w: np.ndarray
+    exact: ExactData
+
+    @classmethod
+    def of(cls, problem: FeasibilityProblem, center: np.ndarray | None = None) -> "Rays":
+        """Rays from the given centre, or from the point with the largest margin.
+
+        Raises ValueError where the feasible set is empty or flat, or the centre not inside it.
+        """
+        center, w = problem.programs.centre(center)
+        return cls(problem, center, w, problem.exact(np.abs(center)))
 
     def box(self) -> tuple[np.ndarray, np.ndarray]:
         """Half-spaces (normals, offsets) of the bounding box, as far as there is one."""
+        _, sides = self.problem.programs.bounding_box
         with jax.enable_x64(True):
             normals, offsets = (
-                np.asarray(v) for v in half_spaces(self.problem, self.rows, self.sides)
+                np.asarray(v) for v in half_spaces(self.exact, self.problem.rows, sides)
             )
         valid = np.isfinite(offsets)
         return normals[valid], offsets[valid]
 
     def shoot(self, directions: np.ndarray) -> Boundary:
         """Solve, pull and prove along every direction (K, d)."""
-        solved = [support(self.rows, d, self.center, self.tangents) for d in directions]
+        solved = [self.problem.programs.ray(self.center, d) for d in directions]
         t, w, y = (np.array(part) for part in zip(*solved, strict=True))
         bounded = np.isfinite(t)
         # Shrinking a feasible pair (θ, w) towards the centre's pair gives every row a margin.
@@ -144,7 +125,7 @@ class Rays:
         with jax.enable_x64(True):
             feasible, normals, offsets = (
                 np.asarray(v)[:count]
-                for v in prove(self.problem, self.rows, theta[fill], w[fill], y[fill])
+                for v in prove(self.exact, self.problem.rows, theta[fill], w[fill], y[fill])
             )
         feasible = feasible & bounded[:, None]
         best, each = np.argmax(feasible, axis=1), np.arange(len(directions))
@@ -161,8 +142,9 @@ class Rays:
 
 
 @jax.jit
-def prove(p: Problem, rows: Rows, theta: Any, w: Any, y: Any) -> tuple[Array, ...]:
-    """For each ray: which of its pulled points (K, pulls, d) are feasible, and its cut."""
+def prove(p: ExactData, rows: ConstraintRows, theta: Any, w: Any, y: Any) -> tuple[Array, ...]:
+    """For each ray: which of its pulled points (K, pulls, d) are proved feasible, and the
+    half-space that its multipliers give."""
 
     def feasible(theta: Array, w: Array) -> Array:
         inputs, free = inputs_of(p, rows, theta, w)
@@ -171,15 +153,16 @@ def prove(p: Problem, rows: Rows, theta: Any, w: Any, y: Any) -> tuple[Array, ..
     return jax.vmap(jax.vmap(feasible))(theta, w), *half_spaces(p, rows, y)
 
 
-def half_spaces(p: Problem, rows: Rows, y: Any) -> tuple[Array, Array]:
-    """Those valid on the whole feasible set, normals (K, d) and offsets (K,), from multipliers."""
+def half_spaces(p: ExactData, rows: ConstraintRows, y: Any) -> tuple[Array, Array]:
+    """Normals (K, d) and offsets (K,) of half-spaces that hold on the whole feasible set, from
+    multipliers (K, R)."""
     return jax.vmap(lambda y: proofs.everywhere(p, *cut_of(p, rows, y)))(y)
 
 
 def leaving(
     center: np.ndarray, directions: np.ndarray, normals: np.ndarray, offsets: np.ndarray
 ) -> np.ndarray:
-    """Where each ray leaves the intersection of the half-spaces (inf: never)."""
+    """t (K,) at which each ray leaves the intersection of the half-spaces; inf for never."""
     slope = directions @ normals.T
     with np.errstate(divide="ignore", invalid="ignore"):
         t = (offsets - normals @ center) / slope

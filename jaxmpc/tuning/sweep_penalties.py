@@ -1,13 +1,13 @@
-"""Penalties of a sweep's first rung, learned: more states are decided before Newton starts.
+"""Penalties of a sweep's first stage, learned: more states are decided before Newton starts.
 
-The first rung (`sweeps/ladder.py`) is an ADMM without cost, its penalties are weights of rows.
-What is minimised here is how far its answers are from being proofs,
+The first stage (`feasible/candidates.py`) is an ADMM without cost; its penalties are weights of
+rows. What is minimised here is how far its answers are from being proofs,
 
     mean over states of log10(1 + shortfall / FLOOR),
 
 where the shortfall of a feasible state is the largest violation (normalised rows) of the plan that
 the rung ends with, and of an infeasible one how far the half-space of its multipliers is from
-excluding the state. The states come labelled by the whole ladder; half of each batch are those
+excluding the state. The states come labelled by the whole cascade; half of each batch are those
 that the rung leaves open. Proofs decide labels with any penalties: these only change who decides.
 """
 
@@ -23,19 +23,11 @@ from jax import Array
 
 from jaxmpc.checks import fail, whole
 from jaxmpc.compiled import default_chunk, padded, require_step_type
-from jaxmpc.feasible import proofs
-from jaxmpc.feasible.candidates import (
-    ALPHA,
-    Rows,
-    RungPenalties,
-    admm_rung,
-    bounding_box,
-    cut_of,
-    rows,
-    weighted,
-)
-from jaxmpc.feasible.map import map_feasible_set
-from jaxmpc.feasible.proofs import hard_part, make_view
+from jaxmpc.feasible.candidates import ALPHA, StagePenalties, admm_stage, cut_of
+from jaxmpc.feasible.constraint_rows import ConstraintRows, weighted
+from jaxmpc.feasible.exact_data import ExactData
+from jaxmpc.feasible.map import map_points
+from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp import linalg
 from jaxmpc.qp.precision import matmul
@@ -56,7 +48,7 @@ class SweepPenalties:
     decided_before: share of states apart that the first rung decides with and without them.
     """
 
-    penalties: RungPenalties | None
+    penalties: StagePenalties | None
     decided: float
     decided_before: float
 
@@ -66,18 +58,16 @@ def tune_sweep_penalties(
     dtype: Any = "float32", chunk: int | None = None, updates: int = 100, batch: int = 128,
     seed: int = 0, cache: str | Path | None = None, progress: bool = False,
 ) -> SweepPenalties:  # fmt: skip
-    """Learn penalties of the first rung of `map_feasible_set(mpc, points, ...)`.
+    """Learn penalties of the ADMM stage of `map_feasible_set(mpc, points, ...)`.
 
     points (B, d), axes, fixed, iterations, dtype, chunk: as there; states are drawn from the
     points. cache: folder that keeps the result by a fingerprint of all of this. Raises ValueError
     for bad input and for fewer than 64 points that are finite.
     """
-    mpc.validate()
-    mpc = hard_part(mpc)
-    view = make_view(mpc, axes, fixed)
+    feasibility = FeasibilityProblem.of(mpc, axes, fixed)
     points = np.asarray(points, np.float64)
-    if points.ndim != 2 or points.shape[1] != len(view.axes):
-        fail("x0s", f"shape {points.shape}", f"Give points (B, {len(view.axes)})")
+    if points.ndim != 2 or points.shape[1] != feasibility.dimension:
+        fail("x0s", f"shape {points.shape}", f"Give points (B, {feasibility.dimension})")
     points = points[np.all(np.isfinite(points), axis=1)]
     iterations, batch = whole("iterations", iterations, 2), whole("batch", batch, 1)
     updates, seed = whole("updates", updates, 1), whole("seed", seed, 0)
@@ -89,8 +79,7 @@ def tune_sweep_penalties(
     count = min(APART, len(points) // 2)
     apart, samples = points[order[:count]], points[order[count:][:chunk]]
 
-    moving = rows(mpc, view)
-    problem = proofs.problem(mpc, view, bounding_box(moving, np.abs(points).max(axis=0))[0])
+    moving, problem = feasibility.rows, feasibility.exact(np.abs(points).max(axis=0))
     plain = {
         "version": VERSION, "iterations": iterations, "dtype": str(np.dtype(dtype)),
         "updates": updates, "batch": batch, "seed": seed,
@@ -100,8 +89,7 @@ def tune_sweep_penalties(
     kept = None if path is None else load(path, len(moving.lower))
     if kept is not None:
         return kept
-    settings = {"axes": axes, "fixed": fixed, "iterations": iterations, "dtype": dtype}
-    label = map_feasible_set(mpc, samples, chunk=chunk, **settings).label
+    label = map_points(feasibility, samples, chunk=chunk, iterations=iterations, dtype=dtype).label
     with jax.enable_x64(True):
         found = learned(
             problem, moving, samples, label, apart, iterations, dtype, updates, batch, seed,
@@ -113,17 +101,17 @@ def tune_sweep_penalties(
 
 
 @dataclass(frozen=True)
-class Rung:
-    """The first rung with given penalties, on one size of batch."""
+class Stage:
+    """The ADMM stage with given penalties, on one size of batch."""
 
-    problem: proofs.Problem
-    rows: Rows
+    problem: ExactData
+    rows: ConstraintRows
     iterations: int
     dtype: Any
 
-    def undecided(self, x: np.ndarray, penalties: RungPenalties, size: int) -> np.ndarray:
+    def undecided(self, x: np.ndarray, penalties: StagePenalties, size: int) -> np.ndarray:
         """Which states (B,) it leaves open."""
-        run = admm_rung(self.iterations, np.dtype(self.dtype))
+        run = admm_stage(self.iterations, np.dtype(self.dtype))
         made = weighted(self.rows, penalties.weight)[0]
         parts = [
             run(self.problem, made, padded(part, size), np.float64(penalties.alpha))[0].label
@@ -133,22 +121,22 @@ class Rung:
 
 
 def learned(
-    problem: proofs.Problem, moving: Rows, samples: np.ndarray, label: np.ndarray,
+    problem: ExactData, moving: ConstraintRows, samples: np.ndarray, label: np.ndarray,
     apart: np.ndarray, iterations: int, dtype: Any, updates: int, batch: int, seed: int,
     progress: bool,
 ) -> SweepPenalties:  # fmt: skip
     """Descend from equal weights; the best on the states apart."""
     R, size = len(moving.lower), len(apart)
-    rung, plain = Rung(problem, moving, iterations, dtype), RungPenalties(np.ones(R))
+    stage, plain = Stage(problem, moving, iterations, dtype), StagePenalties(np.ones(R))
     balls = sum(moving.balls)
     W = np.eye(R)
     if balls:  # its rows share one weight
         W[R - balls :, R - balls] = 1.0
         W = W[:, : R - balls + 1]
-    share = lambda penalties: float(np.mean(rung.undecided(apart, penalties, size)))
+    share = lambda penalties: float(np.mean(stage.undecided(apart, penalties, size)))
     open_before = share(plain)
     known = np.flatnonzero(label)
-    hard = np.flatnonzero(rung.undecided(samples, plain, size) & (label != 0))
+    hard = np.flatnonzero(stage.undecided(samples, plain, size) & (label != 0))
     if not open_before or not len(hard):
         return SweepPenalties(None, 1 - open_before, 1 - open_before)
 
@@ -161,8 +149,8 @@ def learned(
         )
         return float(value), jax.tree.map(np.asarray, slope), {}
 
-    def at(theta: Any) -> RungPenalties:
-        return RungPenalties(np.exp(W @ theta["weight"]), float(2 / (1 + np.exp(-theta["alpha"]))))
+    def at(theta: Any) -> StagePenalties:
+        return StagePenalties(np.exp(W @ theta["weight"]), float(2 / (1 + np.exp(-theta["alpha"]))))
 
     def validate(theta: Any) -> tuple[float, dict[str, float]]:
         value = share(at(theta))
@@ -178,10 +166,10 @@ def learned(
 
 
 def shortfall(
-    problem: proofs.Problem, rows: Rows, theta: Array, label: Array, weight: Array, alpha: Array,
-    iterations: int,
+    problem: ExactData, rows: ConstraintRows, theta: Array, label: Array, weight: Array,
+    alpha: Array, iterations: int,
 ) -> Array:  # fmt: skip
-    """How far the rung's answer at θ is from a proof of its label; ≤ 0: none is missing."""
+    """How far the stage's answer at θ is from a proof of its label; ≤ 0: none is missing."""
     U, bounds = jnp.asarray(rows.U), rows.bounds(theta)
     A = weight[:, None] * U
     pseudoinverse = linalg.solve(matmul(A.T, A), A.T)
@@ -215,7 +203,7 @@ def shortfall(
 
 
 def loss(
-    theta: Any, W: Array, problem: proofs.Problem, rows: Rows, x: Array, label: Array,
+    theta: Any, W: Array, problem: ExactData, rows: ConstraintRows, x: Array, label: Array,
     iterations: int,
 ) -> Array:  # fmt: skip
     """The number that is minimised; see above."""
@@ -249,7 +237,7 @@ def load(path: Path, count: int) -> SweepPenalties | None:
             weight, alpha = np.asarray(arrays["weight"], float), float(arrays["alpha"])
             if weight.shape != (count,) or not np.all((weight > 0) & np.isfinite(weight)):
                 return None
-            found = replace(found, penalties=RungPenalties(weight, alpha))
+            found = replace(found, penalties=StagePenalties(weight, alpha))
     except (ValueError, KeyError, TypeError):
         return None
     return found

@@ -2,19 +2,18 @@
 
 from dataclasses import replace
 
-import jax
 import numpy as np
 import osqp
 import problems
 import pytest
 import scipy.sparse as sparse
-from jax import enable_x64
 from scipy.optimize import linprog
 
 import jaxmpc as jm
 from jaxmpc.explicit.exact_penalty import exact_penalty
-from jaxmpc.explicit.regions import critical_regions, program
-from jaxmpc.mpc.condense import condense, in_float64
+from jaxmpc.explicit.least_distance import least_distance_form
+from jaxmpc.explicit.regions import critical_regions
+from jaxmpc.mpc.inequalities import condensed_in_float64
 from jaxmpc.mpc.problem import Soft
 from jaxmpc.mpc.soften import soften
 from jaxmpc.qp.status import Status
@@ -62,15 +61,9 @@ def pair():
     )  # fmt: skip
 
 
-def host(mpc):
-    """The condensed problem as numpy arrays."""
-    with enable_x64(True):
-        return jax.tree.map(np.asarray, condense(in_float64(mpc)))
-
-
 def kkt(mpc, found, count=100):
     """Largest KKT residual of the regions' plans at random states of each region."""
-    c, random, worst = host(mpc), np.random.default_rng(0), 0.0
+    c, random, worst = condensed_in_float64(mpc), np.random.default_rng(0), 0.0
     for region in found.regions[:count]:
         x = random.dirichlet(np.ones(len(region.vertices))) @ region.vertices
         z, y = region.Z @ x + region.z0, np.zeros(len(c.C))
@@ -193,8 +186,8 @@ class TestRegions:
 
     def test_missing_part_is_seen(self, monkeypatch):
         """Completeness rests on volumes: a search that loses its way does not say so."""
-        monkeypatch.setattr("jaxmpc.explicit.regions.Search.cross", lambda *_: None)
-        monkeypatch.setattr("jaxmpc.explicit.regions.REPAIRS", 1)
+        monkeypatch.setattr("jaxmpc.explicit.search.RegionSearch.cross", lambda *_: None)
+        monkeypatch.setattr("jaxmpc.explicit.search.REPAIRS", 1)
         found = critical_regions(problems.lecture())
         assert not found.complete and "not found" in found.reason
 
@@ -295,7 +288,7 @@ class TestExactPenalty:
         """At a vertex of X_N multipliers are unbounded; the threshold is not."""
         mpc, x = problems.lecture(), np.array([-0.25, -0.6])
         assert exact_penalty(mpc, [x]).thresholds[0] == pytest.approx(11.25, rel=1e-9)
-        c = host(mpc)
+        c = condensed_in_float64(mpc)
         C, bound = np.vstack([c.C, -c.C]), np.concatenate([c.upper - c.d, c.d - c.lower])
         slack = bound - np.concatenate([c.D, -c.D]) @ x
         z = critical_regions(mpc).plan(x[None])[0]
@@ -379,7 +372,7 @@ class TestExactPenalty:
     def test_program_is_the_condensed_qp(self):
         """M y ≤ v + V ξ is lower ≤ C z + D x + d ≤ upper, row by row."""
         mpc = problems.drifting()
-        p, c, random = program(mpc), host(mpc), np.random.default_rng(3)
+        p, c, random = least_distance_form(mpc), condensed_in_float64(mpc), np.random.default_rng(3)
         xi, z = random.standard_normal(2), random.standard_normal(c.P.shape[0])
         x = p.center + p.size * xi
         y = p.factor.T @ z + p.shift @ np.append(x, 1.0)

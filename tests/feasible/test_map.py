@@ -13,8 +13,9 @@ import pytest
 from jax import enable_x64
 
 import jaxmpc as jm
-from jaxmpc.feasible import map as feasible_map
-from jaxmpc.feasible import proofs
+from jaxmpc.feasible import candidates, proofs
+from jaxmpc.feasible.exact_data import exact_data, hard_blocks
+from jaxmpc.feasible.view import make_view
 from jaxmpc.qp.status import Status
 
 
@@ -206,15 +207,20 @@ def test_compiles_once_for_all_chunks(monkeypatch):
     """Two programs, whatever the number of chunks."""
     made = []
 
-    class Counted(feasible_map.Compiled):
+    class Counted(candidates.Compiled):
         def __init__(self, function):
             super().__init__(function)
             made.append(self)
 
-    monkeypatch.setattr(feasible_map, "Compiled", Counted)
+    monkeypatch.setattr(candidates, "Compiled", Counted)
     points = np.random.default_rng(0).uniform(-1.2, 1.2, (333, 2))
     jm.map_feasible_set(problems.lecture(), points, chunk=50)
     assert sum(len(compiled.programs) for compiled in made) <= 2
+
+
+def exact_form(mpc, extent):
+    """The exact data of a problem whose states are no larger than `extent`."""
+    return exact_data(mpc, make_view(mpc), hard_blocks(mpc), extent)
 
 
 class TestProofs:
@@ -222,8 +228,7 @@ class TestProofs:
 
     def setup_method(self):
         self.mpc = problems.drifting()
-        view = proofs.make_view(self.mpc)
-        self.problem = proofs.problem(self.mpc, view, np.array([3.0, 3.0]))
+        self.problem = exact_form(self.mpc, np.array([3.0, 3.0]))
         self.polygon = exact.feasible_polygon(self.mpc)
 
     def test_any_multipliers_give_a_valid_cut(self):
@@ -270,7 +275,7 @@ class TestProofs:
     def test_margin_of_one_rounding(self):
         """Ties: x_N exactly on its limit in rationals must not be proved wrongly."""
         mpc = problems.scalar(a=1.0, horizon=3, x_max=None, u_max=0.1, terminal=0.3)
-        problem = proofs.problem(mpc, proofs.make_view(mpc), np.ones(1))
+        problem = exact_form(mpc, np.ones(1))
         with enable_x64(True):
             for ulps in range(-40, 41, 4):
                 x0 = np.array([0.6 + ulps * 2.0**-53])

@@ -16,7 +16,10 @@ from scipy.optimize import linprog
 
 import jaxmpc as jm
 from jaxmpc.feasible import proofs
-from jaxmpc.recursion import recursion
+from jaxmpc.feasible.exact_data import exact_data, hard_blocks
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.view import make_view
+from jaxmpc.recursion.claims import settle_claims
 
 NONE = (np.inf, 1e9, 1e12, 1e20)
 
@@ -225,7 +228,7 @@ def test_multipliers_say_what_holds_on_an_unbounded_set():
     with enable_x64(True):
         y, y_N = rng.standard_normal((100, 4, 2)), np.zeros((100, 0))
         for extent in (np.full(2, 1e-3), np.full(2, np.inf)):
-            problem = proofs.problem(mpc, proofs.make_view(mpc), extent)
+            problem = exact_data(mpc, make_view(mpc), hard_blocks(mpc), extent)
             say = jax.vmap(lambda y, y_N, p=problem: proofs.cut(p, y, y_N, np.zeros(0)))
             a, b, w = map(np.asarray, say(y, y_N))
             known = np.flatnonzero(np.isfinite(b))
@@ -275,9 +278,10 @@ class TestOtherQuestions:
     )  # fmt: skip
 
     def test_claims_about_recursion_stay_open(self):
-        ladder = recursion.climb(self.car)
-        assert ladder.strong.holds is ladder.law.holds is ladder.weak.holds is None
-        assert "bounded sets" in ladder.strong.reason and "unbounded" in ladder.law.reason
+        problem = FeasibilityProblem.of(self.car)
+        claims = settle_claims(self.car, problem)
+        assert claims.strong.holds is claims.law.holds is claims.weak.holds is None
+        assert "bounded sets" in claims.strong.reason and "unbounded" in claims.law.reason
 
     @pytest.mark.slow
     def test_recursion(self):

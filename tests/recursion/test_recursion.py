@@ -10,14 +10,22 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.explicit import law
-from jaxmpc.explicit.law import Bound, Law
-from jaxmpc.feasible.polytope import backward, pairs, shadow
+from jaxmpc.explicit.law import Law
+from jaxmpc.feasible.centered_polytope import CenteredPolytope
+from jaxmpc.feasible.plan_polytope import projected
+from jaxmpc.feasible.polytope import backward
+from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import Soft
-from jaxmpc.recursion.recursion import _theorem, climb, recursive_feasibility, smallest_horizon
+from jaxmpc.recursion import analysis, ascent, recursive_feasibility, smallest_horizon
+from jaxmpc.recursion.claims import _by_theorem, settle_claims
 
 
-def rungs(found) -> tuple:
+def settled(mpc):
+    """The claims as theorems and linear programs settle them."""
+    return settle_claims(mpc, FeasibilityProblem.of(mpc))
+
+
+def holds(found) -> tuple:
     return found.strong.holds, found.law.holds, found.weak.holds
 
 
@@ -91,7 +99,7 @@ class TestProofs:
     """Claims that linear programs settle; nothing here is sampled."""
 
     @pytest.mark.parametrize(
-        ("problem", "settled", "volume", "lost"),
+        ("problem", "expected", "volume", "lost"),
         [
             pytest.param(
                 lambda: problems.lecture(0.25, 1),
@@ -136,21 +144,21 @@ class TestProofs:
             (lambda: problems.joint(6), (True, True, True), 11.912, 0.0),
         ],
     )
-    def test_known_cases(self, problem, settled, volume, lost):
+    def test_known_cases(self, problem, expected, volume, lost):
         mpc = problem()
-        found = climb(mpc)
-        assert rungs(found) == settled
+        found = settled(mpc)
+        assert holds(found) == expected
         assert found.volume == pytest.approx(volume, rel=1e-9)
         assert found.lost == pytest.approx(lost, abs=1e-9)
         body = exact.feasible_polygon(mpc)
-        assert len(found.shadow.offsets) == len(body.facets)
-        ends = [float(body.support(normal)) for normal in found.shadow.normals]
-        np.testing.assert_allclose(found.shadow.offsets, ends, atol=1e-9)
+        assert len(found.feasible_set.offsets) == len(body.facets)
+        ends = [float(body.support(normal)) for normal in found.feasible_set.normals]
+        np.testing.assert_allclose(found.feasible_set.offsets, ends, atol=1e-9)
 
     def test_reasons_name_the_proof_and_the_counterexample(self):
-        reason = climb(problems.joint(6)).strong.reason
+        reason = settled(problems.joint(6)).strong.reason
         assert "X_5 = X_6" in reason and "14 facets" in reason
-        found = climb(problems.lecture(0.25, 3))
+        found = settled(problems.lecture(0.25, 3))
         body = exact.feasible_polygon(problems.lecture(0.25, 4))
         assert "every feasible first move leaves X_N" in found.weak.reason
         assert not body.contains(found.weak.state[None])[0]  # it is not in X_4
@@ -158,39 +166,39 @@ class TestProofs:
         assert str(found.strong).startswith("refuted: from x = (")
 
     def test_theorem_1(self):
-        found = climb(problems.joint_o_inf(6))
-        assert rungs(found) == (True, True, True)
+        found = settled(problems.joint_o_inf(6))
+        assert holds(found) == (True, True, True)
         assert found.strong.reason.startswith("Theorem 1: the terminal set is within the limits")
         # Where the shifted plan need not be a plan, the theorem says nothing.
         for change in ({"input_rate_limit": 0.1}, {"control_horizon": 2}):
-            blocked = _theorem(replace(problems.joint_o_inf(6), **change))
+            blocked = _by_theorem(replace(problems.joint_o_inf(6), **change))
             assert blocked.holds is None and "does not cover" in blocked.reason
         short = replace(problems.scalar(0.5, 1, 1.0, 0.1), terminal_set=None)
-        assert _theorem(short).holds is None  # its first move may leave the limits
-        assert _theorem(replace(short, horizon=2)).holds is True
+        assert _by_theorem(short).holds is None  # its first move may leave the limits
+        assert _by_theorem(replace(short, horizon=2)).holds is True
 
     def test_no_limit_on_the_state(self):
         free = replace(problems.lecture(), states=None, terminal_set=None)
-        assert rungs(climb(free)) == (True, True, True)
+        assert holds(settled(free)) == (True, True, True)
 
     def test_unbounded_set_stays_open(self):
         mpc = problems.scalar(2.0, horizon=3, x_max=None, terminal=1.0)
-        found = climb(replace(mpc, inputs=None))
-        assert found.shadow is None and "unbounded" in found.why
+        found = settled(replace(mpc, inputs=None))
+        assert found.feasible_set is None and "unbounded" in found.why
         assert found.strong.holds is True or found.weak.holds is None
 
     def test_scalar_in_closed_form(self):
         """x⁺ = 2x + u, |x| ≤ 5, |u| ≤ 1: X_N is |x| ≤ 1 + 4·2⁻ᴺ, X_{N+1} half as far from 1."""
-        found = climb(problems.scalar(2.0, 3, 5.0, 1.0, terminal=5.0))
+        found = settled(problems.scalar(2.0, 3, 5.0, 1.0, terminal=5.0))
         assert found.volume == pytest.approx(2 * (1 + 4 / 8), rel=1e-12)
         assert found.lost == pytest.approx(4 / 8, rel=1e-9)
-        assert rungs(found) == (False, False, False)
+        assert holds(found) == (False, False, False)
 
     @pytest.mark.parametrize("end", ["states", pytest.param(None, marks=pytest.mark.slow)])
     def test_half_spaces_by_recursion_are_those_by_rays(self, end):
         mpc = problems.lecture(0.25, 3)
         mpc = mpc if end else replace(mpc, terminal_set=None)
-        body = shadow(pairs(mpc))
+        body = projected(FeasibilityProblem.of(mpc).plan_polytope)
         before, same, after = backward(mpc)
         order = lambda s: np.unique(np.round(np.column_stack([s.normals, s.offsets]), 9), axis=0)
         np.testing.assert_allclose(order(body), order(same), atol=1e-8)
@@ -210,7 +218,7 @@ class TestProofs:
         later = exact.feasible_polygon(replace(mpc, horizon=1, terminal_set=both))
         for normal, offset in body.facets:
             later = later.clip(normal, offset)
-        found = climb(mpc)
+        found = settled(mpc)
         assert found.lost == pytest.approx(float(body.area - later.area), abs=1e-9)
         assert found.lost > 0.007 and found.weak.holds is False
 
@@ -224,9 +232,9 @@ class TestProofs:
             system=jm.LinearSystem(A, B), Q=np.eye(2 * k), R=np.eye(k), horizon=6, states=limit,
             inputs=problems.symmetric(*([2.0] * k)), terminal_set=limit,
         )  # fmt: skip
-        assert rungs(climb(mpc)) == (True, True, True)
-        assert rungs(climb(replace(mpc, horizon=5))) == (False, None, True)
-        assert rungs(climb(replace(mpc, horizon=4))) == (False, False, False)
+        assert holds(settled(mpc)) == (True, True, True)
+        assert holds(settled(replace(mpc, horizon=5))) == (False, None, True)
+        assert holds(settled(replace(mpc, horizon=4))) == (False, False, False)
 
 
 class TestLaw:
@@ -252,11 +260,13 @@ class TestLaw:
         assert compared > 60
 
     def test_nearest_point_of_a_polytope(self):
-        square = Bound(np.zeros(2), np.vstack([np.eye(2), -np.eye(2)]), np.ones(4))
+        square = CenteredPolytope(
+            np.zeros(2), np.vstack([np.eye(2), -np.eye(2)]), np.ones(4), np.zeros((0, 2))
+        )
         points = np.array([[3.0, 0.5], [2.0, -5.0], [0.2, 0.3]])
         near = [[1.0, 0.5], [1.0, -1.0], [0.2, 0.3]]
         np.testing.assert_allclose(square.nearest(points), near, atol=1e-12)
-        np.testing.assert_allclose(square.excess(points), [2.0, 4.0, -0.7], atol=1e-12)
+        np.testing.assert_allclose(square.signed_distance(points), [2.0, 4.0, -0.7], atol=1e-12)
         assert square.size == 1.0
 
 
@@ -265,7 +275,7 @@ class TestReport:
         mpc = problems.lecture(0.25, 3)
         states = np.array([[-1.0, 1.0], [-0.999, 0.999], [0.0, 0.0], [1.0, 1.0], [np.nan, 0.0]])
         report = recursive_feasibility(mpc, states, steps=4)
-        assert rungs(report) == (False, False, False)
+        assert holds(report) == (False, False, False)
         c = report.counterexample
         assert c.found == "search"
         assert c.distance == pytest.approx(0.0474341649, abs=1e-6)
@@ -287,7 +297,7 @@ class TestReport:
     @pytest.mark.slow
     def test_lecture_with_more_input_is_proved_by_regions(self):
         report = recursive_feasibility(problems.lecture(0.3, 3), steps=3)
-        assert rungs(report) == (False, True, True)
+        assert holds(report) == (False, True, True)
         assert "13 critical regions fill X_N" in report.law.reason
         assert report.counterexample is None and report.lost_by_law == 0.0
         counts = report.counts()
@@ -331,7 +341,7 @@ class TestSlow:
         mpc = problems.joint(4)
         report = recursive_feasibility(mpc, regions=0)
         c = report.counterexample
-        assert rungs(report) == (False, False, False) and c.found == "search"
+        assert holds(report) == (False, False, False) and c.found == "search"
         assert c.distance == pytest.approx(0.0039968, abs=1e-6)
         np.testing.assert_allclose(np.abs(c.state), [1.444, 2.0], atol=1e-5)
         np.testing.assert_allclose(np.abs(c.next_state), [1.464, 1.6], atol=1e-5)
@@ -339,11 +349,9 @@ class TestSlow:
         check_counterexample(mpc, c)
 
     def test_needle_is_found_without_the_seeds_of_linear_programs(self, monkeypatch):
-        from jaxmpc.recursion import recursion
-
-        real = recursion.climb
+        real = analysis.settle_claims
         bare = lambda *a: replace(real(*a), seeds=np.zeros((0, 2)))
-        monkeypatch.setattr(recursion, "climb", bare)
+        monkeypatch.setattr(analysis, "settle_claims", bare)
         c = recursive_feasibility(problems.joint(4), regions=0).counterexample
         assert c.distance == pytest.approx(0.0039968, abs=1e-6)
 
@@ -355,32 +363,32 @@ class TestSlow:
         report = recursive_feasibility(mpc)
         assert report.counterexample.distance == pytest.approx(distance, abs=1e-5)
         assert report.lost_by_law == pytest.approx(lost, abs=1e-6)
-        share = report.counts()["lost after one step"] / report.counts()["feasible"]
-        assert share == pytest.approx(lost / report.volume, abs=0.01)
+        fraction = report.counts()["lost after one step"] / report.counts()["feasible"]
+        assert fraction == pytest.approx(lost / report.volume, abs=0.01)
         check_counterexample(mpc, report.counterexample)
 
     def test_gradient_alone_and_regions_alone_find_the_worst(self, monkeypatch):
         """From one sample and the starts on the boundary; the worst state is no vertex of X_1."""
         mpc, one = problems.lecture(0.25, 1), np.zeros((1, 2))
         found = lambda: recursive_feasibility(mpc, one, steps=1, regions=0).counterexample.distance
-        climb_regions, value = law._climb, law._value
-        monkeypatch.setattr(law, "_climb", lambda _, b, x, v, d: x[np.argsort(-v)[:6]])
+        climb_regions, value = ascent._climb_regions, ascent._value_and_gradient
+        monkeypatch.setattr(ascent, "_climb_regions", lambda _, b, x, v, d: x[np.argsort(-v)[:6]])
         assert found() == pytest.approx(0.546401, abs=1e-4)
         still = lambda *a, **k: (value(*a, **k)[0], np.zeros_like(a[2]))
-        monkeypatch.setattr(law, "_value", still)
+        monkeypatch.setattr(ascent, "_value_and_gradient", still)
         assert found() < 0.546
-        monkeypatch.setattr(law, "_climb", climb_regions)
+        monkeypatch.setattr(ascent, "_climb_regions", climb_regions)
         assert found() == pytest.approx(0.546401, abs=1e-5)
 
     def test_joint_of_five_steps(self):
         report = recursive_feasibility(problems.joint(5), steps=30)
-        assert rungs(report) == (False, True, True)
+        assert holds(report) == (False, True, True)
         assert report.counts()["kept"] == report.counts()["feasible"]
 
     def test_oblique_limits_and_drift(self):
         mpc = problems.drifting()
         report = recursive_feasibility(mpc)
-        assert rungs(report) == (False, False, False)
+        assert holds(report) == (False, False, False)
         check_counterexample(mpc, report.counterexample)
         # The regions know the worst vertex: the search has found it.
         from jaxmpc.explicit.regions import critical_regions
@@ -418,13 +426,13 @@ class TestSlow:
         mpc = replace(problems.lecture(), input_rate_limit=0.2)
         report = recursive_feasibility(mpc, steps=3)
         c = report.counterexample
-        assert report.states.shape[1] == 3 and rungs(report) == (False, False, False)
+        assert report.states.shape[1] == 3 and holds(report) == (False, False, False)
         assert abs(c.next_state[2] - c.state[2]) <= 0.2 + 1e-9
         assert c.next_state[2] == c.inputs[0, 0]
 
     def test_limits_from_the_first_step_on(self):
         report = recursive_feasibility(replace(problems.lecture(), constrain_initial=False))
-        assert rungs(report) == (False, False, False)
+        assert holds(report) == (False, False, False)
         check_counterexample(report.mpc, report.counterexample)
 
     def test_six_states(self):
@@ -436,6 +444,6 @@ class TestSlow:
             inputs=problems.symmetric(*([2.0] * k)), terminal_set=limit,
         )  # fmt: skip
         report = recursive_feasibility(mpc, steps=3)
-        assert rungs(report) == (False, False, False)
+        assert holds(report) == (False, False, False)
         assert report.counterexample.distance == pytest.approx(0.0039968, abs=1e-5)
         assert dataclasses.asdict(report)["feasible_set"] is not None

@@ -13,15 +13,9 @@ from scipy.optimize import linprog
 
 import jaxmpc as jm
 from jaxmpc import cli
-from jaxmpc.robot_maps import robot_map as robots
-from jaxmpc.robot_maps.robot_map import (
-    OUTCOMES,
-    Loops,
-    RobotSetting,
-    deviations,
-    map_robot,
-    with_initial_limits,
-)
+from jaxmpc.robot_maps import OUTCOMES, RobotLoops, map_robot, setting
+from jaxmpc.robot_maps.set_point import deviations, with_initial_limits
+from jaxmpc.robot_maps.setting import RobotSetting
 from jaxmpc.robot_plots import plot_robot_map
 
 SECONDS = 0.8
@@ -176,7 +170,7 @@ def test_labels_of_loops_by_hand():
     run = jm.Run(
         states[..., None], inputs[..., None], none, status, none, none, none, fallback
     )  # fmt: skip
-    loops = Loops.of(run, plant, 1e-6)
+    loops = RobotLoops.of(run, plant, "float64")
     np.testing.assert_allclose(loops.worst, [0, 1, 0.25, np.nan, 0.25, 0])
     np.testing.assert_array_equal(loops.broken_at, [-1, 1, 2, 1, 1, -1])
     np.testing.assert_array_equal(loops.lost_at, [-1, 1, -1, 1, 1, 1])
@@ -247,7 +241,7 @@ def run(line):
 @pytest.mark.slow
 def test_command_goes_on_where_it_was_stopped(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(robots, "default_chunk", lambda: 32 * 8)
+    monkeypatch.setattr(setting, "default_chunk", lambda: 32 * 8)
     real, calls = RobotSetting.run, []
 
     def stopped(self, points, size):
