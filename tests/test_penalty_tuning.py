@@ -12,7 +12,7 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.cli import main
 from jaxmpc.commands import sweep
-from jaxmpc.feasible.candidates import StagePenalties, admm_stage
+from jaxmpc.feasible.candidates import StagePenalties, compiled_admm
 from jaxmpc.feasible.constraint_rows import weighted
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.tuning import penalties as module
@@ -254,7 +254,7 @@ def test_sweep_shortfalls_against_the_rungs_own_verdicts():
     rows, p = problem.rows, problem.exact(np.abs(POINTS).max(axis=0))
     truth = jm.map_feasible_set(mpc(4), x, **SWEEP).label
     with jax.enable_x64(True):
-        decided = admm_stage(8, np.dtype(np.float32))(p, rows, x, np.float64(1.6))[0].label
+        decided = compiled_admm(8, np.dtype(np.float32))(p, rows, x, np.float64(1.6))[0].label
         one = lambda x, label: sweep_penalties.shortfall(
             p, rows, x, label, np.ones(len(rows.lower)), 1.6, 8
         )

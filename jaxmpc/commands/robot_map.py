@@ -18,7 +18,7 @@ from jaxmpc.checks import fail
 from jaxmpc.commands.options import model_hash, open_folder, versions, write_json
 from jaxmpc.control.named_terminal import named_terminal_set
 from jaxmpc.control.riccati import lqr
-from jaxmpc.feasible.labels import ARRAYS, joined
+from jaxmpc.feasible.labels import ARRAYS, Labels
 from jaxmpc.feasible.map import grid
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.robot_maps.loops import RobotLoops
@@ -187,14 +187,16 @@ class RobotJob:
                 arrays |= {f.name: getattr(loops, f.name) for f in fields(RobotLoops)}
                 _save(path(k), arrays)
                 bar.update(_length(slices[k]))
-        labels, parts = setting.none(), []
-        for k, here in enumerate(slices):
+        labels, parts = [], []
+        for k in range(len(slices)):
             with np.load(path(k)) as stored:
                 part = {name: stored[name] for name in stored.files}
             parts.append(RobotLoops(**{f.name: part[f.name] for f in fields(RobotLoops)}))
-            labels = joined(labels, here, replace(labels, **{name: part[name] for name in ARRAYS}))
+            labels.append(Labels.of(**{name: part[name] for name in ARRAYS}))
         refine = 1e-6 if self.refine and len(setting.axes) <= 3 else None
-        return setting.map(labels, parts, refine=refine, search_seconds=self.search_seconds)
+        return setting.map(
+            Labels.joined(labels), parts, refine=refine, search_seconds=self.search_seconds
+        )
 
     def _chunks(
         self, setting: RobotSetting, slices: list[slice], todo: list[int]

@@ -23,7 +23,8 @@ from jaxmpc.commands.robot_map import RobotJob, refused
 from jaxmpc.compiled import CHUNK
 from jaxmpc.feasible import store
 from jaxmpc.feasible.candidates import StagePenalties
-from jaxmpc.feasible.labels import Labels, label_chunks
+from jaxmpc.feasible.cascade import label_chunks
+from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
@@ -349,7 +350,7 @@ def _stop_on_interrupt(tally: Tally) -> Iterator[None]:
 def _read_map(path: Path, job: Job) -> FeasibleSetMap:
     """The map as far as it is in the store."""
     data = store.read(path).load()
-    labels = Labels(
+    labels = Labels.of(
         label=data["label"].values,
         status=data["status"].values,
         starts=data["start"].values,

@@ -84,8 +84,8 @@ def cell(p: LeastDistanceForm, active: tuple[int, ...]) -> Cell | None:
     spanning = []
     for group in facets.values():
         corners = vertices[tight[:, group[0]]]
-        spread = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
-        if n == 1 or spread[n - 2] > 1e-6 * radius:
+        size = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
+        if n == 1 or size[n - 2] > 1e-6 * radius:
             spanning.append((group, corners.mean(axis=0)))
     first = [group[0] for group, _ in spanning]
     return Cell(
@@ -139,12 +139,12 @@ def volume(points: np.ndarray) -> float:
     """
     if points.shape[1] == 1:
         return float(np.ptp(points))
-    _, spread, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
-    if len(points) <= points.shape[1] or spread[-1] == 0:
+    _, size, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    if len(points) <= points.shape[1] or size[-1] == 0:
         return 0.0
-    alike = (points - points.mean(axis=0)) @ axes.T / spread
+    alike = (points - points.mean(axis=0)) @ axes.T / size
     try:
         hull = ConvexHull(alike)
     except QhullError:
         hull = ConvexHull(alike, qhull_options="QJ")
-    return float(hull.volume * np.prod(spread))
+    return float(hull.volume * np.prod(size))

@@ -1,4 +1,4 @@
-"""The cascade that finds candidates for proofs: short ADMM, then least-distance Newton steps.
+"""Stages that find candidates for proofs, plans or multipliers: ADMM, least-distance Newton.
 
 For the question "feasible or not" the cost is dropped. In an orthonormal basis U of the range
 of the (row-normalised) constraint matrix a zero-cost ADMM step is t⁺ = t + α(U U'r − clip(t)):
@@ -27,6 +27,9 @@ from jaxmpc.qp.refine import least_distance
 
 ALPHA = 1.6
 INSET = 1e-10
+# Newton steps between two attempts at a proof, and how often; the decided leave in between.
+NEWTON_STEPS = 8
+NEWTON_ROUNDS = 8
 
 
 @dataclass(frozen=True)
@@ -113,62 +116,92 @@ def check_candidates(
     return Verdict(label, p.view.initial_state(theta, free), inputs, normal, offset)
 
 
-@functools.cache
-def admm_stage(iterations: int, dtype: Any) -> Compiled:
-    """The compiled ADMM stage: (p, rows, points (B, d), alpha) → verdicts and w (B, k)."""
+def admm_stage(
+    p: ExactData, rows: ConstraintRows, points: Array, alpha: Array, iterations: int, dtype: Any
+) -> tuple[Verdict, Array]:
+    """Verdicts on points (B, d) after ADMM steps in `dtype`, and the last w (B, k)."""
+    U, alpha = jnp.asarray(rows.U, dtype), jnp.asarray(alpha, dtype)
+    shift = matmul(jnp.asarray(rows.D), points.T)  # (R, B): columns are points
+    l = (jnp.asarray(rows.lower)[:, None] - shift).astype(dtype)
+    u = (jnp.asarray(rows.upper)[:, None] - shift).astype(dtype)
 
-    @jax.jit
-    def stage(
-        p: ExactData, rows: ConstraintRows, points: Array, alpha: Array
-    ) -> tuple[Verdict, Array]:
-        U, alpha = jnp.asarray(rows.U, dtype), jnp.asarray(alpha, dtype)
-        shift = matmul(jnp.asarray(rows.D), points.T)  # (R, B): columns are points
-        l = (jnp.asarray(rows.lower)[:, None] - shift).astype(dtype)
-        u = (jnp.asarray(rows.upper)[:, None] - shift).astype(dtype)
+    project = lambda t: jnp.clip(t, l, u)
+    if rows.balls:
+        radius = jnp.asarray(rows.radius, dtype)
+        one = lambda t, l, u: Bounds(l, u, radius=radius, balls=rows.balls).project(t, 1.0)
+        project = lambda t: jax.vmap(one, in_axes=1, out_axes=1)(t, l, u)
 
-        project = lambda t: jnp.clip(t, l, u)
+    def step(t, _=None):
+        s = project(t)
+        return t + alpha * (matmul(U, matmul(U.T, 2 * s - t)) - s), None
+
+    before, _ = jax.lax.scan(step, project(jnp.zeros_like(l)), length=iterations - 1)
+    t, _ = step(before)
+    residual = lambda t: t - project(t)
+    w = matmul(U.T, project(t) - residual(t)).T
+    multipliers = (residual(t) - residual(before)).T, residual(t).T
+    check = lambda x, w, change, y: check_candidates(p, rows, x, w, [change, y])
+    return jax.vmap(check)(points, w, *multipliers), w
+
+
+def newton_stage(
+    p: ExactData, rows: ConstraintRows, points: Array, w: Array, steps: int
+) -> tuple[Verdict, Array]:
+    """Verdicts on points (B, d) after Newton steps from w (B, k) in float64, and the last w."""
+    U = jnp.asarray(rows.U)
+
+    def one(theta: Array, w: Array) -> tuple[Verdict, Array]:
+        bounds = rows.bounds(theta)
+        l, u = bounds.l, bounds.u
+        # The nearest feasible w lies on a face, where a roll-out has no margin for its rounding:
+        # aim a little inside. Half-spaces are checked on the true bounds all the same.
+        inset = jnp.minimum(INSET * (1 + jnp.fmin(jnp.abs(l), jnp.abs(u))), (u - l) / 4)
+        inner = replace(bounds, l=l + inset, u=u - inset)
         if rows.balls:
-            radius = jnp.asarray(rows.radius, dtype)
-            one = lambda t, l, u: Bounds(l, u, radius=radius, balls=rows.balls).project(t, 1.0)
-            project = lambda t: jax.vmap(one, in_axes=1, out_axes=1)(t, l, u)
+            inner = replace(inner, radius=bounds.radius * (1 - INSET))
+        w, e = least_distance(U, inner, w.astype(jnp.float64), steps)
+        return check_candidates(p, rows, theta, w, [e]), w
 
-        def step(t, _=None):
-            s = project(t)
-            return t + alpha * (matmul(U, matmul(U.T, 2 * s - t)) - s), None
-
-        before, _ = jax.lax.scan(step, project(jnp.zeros_like(l)), length=iterations - 1)
-        t, _ = step(before)
-        residual = lambda t: t - project(t)
-        w = matmul(U.T, project(t) - residual(t))
-        change = residual(t) - residual(before)
-        verdict = jax.vmap(lambda *a: check_candidates(p, rows, a[0], a[1], [a[2], a[3]]))(
-            points, w.T, change.T, residual(t).T
-        )
-        return verdict, w.T
-
-    return Compiled(stage)
+    return jax.vmap(one)(points, w)
 
 
 @functools.cache
-def newton_stage(steps: int) -> Compiled:
-    """The compiled Newton stage: (p, rows, points (B, d), w (B, k)) → verdicts and w."""
+def compiled_admm(iterations: int, dtype: Any) -> Compiled:
+    """The compiled ADMM stage: (p, rows, points (B, d), alpha) → verdicts and w (B, k)."""
+    stage = lambda p, rows, points, alpha: admm_stage(p, rows, points, alpha, iterations, dtype)
+    return Compiled(jax.jit(stage))
+
+
+@functools.cache
+def compiled_newton(batch: int) -> Compiled:
+    """The compiled Newton stages: (p, rows, points (B, d), usable (B,), verdicts, w (B, k)) →
+    verdicts.
+
+    Usable points that are left open are gathered in batches of `batch`, on the device, until none
+    is open or each has met Newton NEWTON_ROUNDS times; those that met it least often come first.
+    """
 
     @jax.jit
-    def stage(p: ExactData, rows: ConstraintRows, points: Array, w: Array) -> tuple[Verdict, Array]:
-        U = jnp.asarray(rows.U)
+    def run(
+        p: ExactData, rows: ConstraintRows, points: Array, usable: Array, verdict: Verdict,
+        w: Array,
+    ) -> Verdict:  # fmt: skip
+        def waiting(verdict: Verdict, rounds: Array) -> Array:
+            return usable & (verdict.label == 0) & (rounds < NEWTON_ROUNDS)
 
-        def one(theta: Array, w: Array) -> tuple[Verdict, Array]:
-            bounds = rows.bounds(theta)
-            l, u = bounds.l, bounds.u
-            # The nearest feasible w lies on a face, where a roll-out has no margin for its
-            # rounding: aim a little inside. Cuts are judged on the true bounds all the same.
-            inset = jnp.minimum(INSET * (1 + jnp.fmin(jnp.abs(l), jnp.abs(u))), (u - l) / 4)
-            inner = replace(bounds, l=l + inset, u=u - inset)
-            if rows.balls:
-                inner = replace(inner, radius=bounds.radius * (1 - INSET))
-            w, e = least_distance(U, inner, w.astype(jnp.float64), steps)
-            return check_candidates(p, rows, theta, w, [e]), w
+        def newton(carry: tuple[Verdict, Array, Array]) -> tuple[Verdict, Array, Array]:
+            verdict, w, rounds = carry
+            open_ = waiting(verdict, rounds)
+            least = jnp.min(jnp.where(open_, rounds, NEWTON_ROUNDS))
+            (index,) = jnp.nonzero(open_ & (rounds == least), size=batch, fill_value=len(points))
+            take = lambda v: v.at[index].get(mode="clip")
+            put = lambda old, new: old.at[index].set(new, mode="drop")
+            found, better = newton_stage(p, rows, take(points), take(w), NEWTON_STEPS)
+            verdict = jax.tree.map(put, verdict, found)
+            return verdict, put(w, better), rounds.at[index].add(1, mode="drop")
 
-        return jax.vmap(one)(points, w)
+        go_on = lambda carry: jnp.any(waiting(carry[0], carry[2]))
+        start = verdict, w.astype(jnp.float64), jnp.zeros(len(points), int)
+        return jax.lax.while_loop(go_on, newton, start)[0]
 
-    return Compiled(stage)
+    return Compiled(run)

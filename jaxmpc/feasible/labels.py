@@ -1,38 +1,38 @@
-"""Labels of points, each with its proof, made by a cascade of stages chunk by chunk."""
+"""Labels of points, each with its proof."""
 
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax
 import numpy as np
 
-from jaxmpc.checks import fail
-from jaxmpc.compiled import (
-    Compiled,
-    default_chunk,
-    first_rows,
-    gather_size,
-    padded,
-    require_step_type,
-)
-from jaxmpc.feasible.candidates import ALPHA, StagePenalties, Verdict, admm_stage, newton_stage
-from jaxmpc.feasible.constraint_rows import weighted
+from jaxmpc.feasible.candidates import Verdict
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.qp.status import Status
 
-# Newton steps between two attempts at a proof, and how often; the decided leave in between.
-# What resists all of them gets a longer ADMM run and Newton once more.
-NEWTON_STEPS = 8
-NEWTON_ROUNDS = 8
-LONGER = 20
-
 # The arrays of `Labels`.
 ARRAYS = ("label", "status", "starts", "plans", "cut_normals", "cut_offsets")
+PROOFS = ARRAYS[2:]
+# The status of labels −1, 0 and 1.
+STATUS = np.array([Status.PRIMAL_INFEASIBLE, Status.ITERATION_LIMIT, Status.SOLVED], np.int8)
 
 
-@dataclass(frozen=True)
+class OnDemand:
+    """An array that is fetched once, when it is first asked for."""
+
+    def __init__(self, fetch: Callable[[], np.ndarray]) -> None:
+        self._fetch: Callable[[], np.ndarray] | None = fetch
+        self._value: np.ndarray | None = None
+
+    def get(self) -> np.ndarray:
+        """The array."""
+        if self._value is None:
+            assert self._fetch is not None
+            self._value, self._fetch = self._fetch(), None
+        return self._value
+
+
+@dataclass(frozen=True, eq=False)
 class Labels:
     """Labels of b points and their proofs.
 
@@ -44,112 +44,118 @@ class Labels:
     half-space is known: on sets that extend both ways without end, or very far, along a facet,
     the rounding of its normal outweighs what the point is outside. Seconds spent compiling and
     running.
+
+    The proofs may still be on the device: each of the four arrays is copied when first asked for.
     """
 
     label: np.ndarray
     status: np.ndarray
-    starts: np.ndarray
-    plans: np.ndarray
-    cut_normals: np.ndarray
-    cut_offsets: np.ndarray
+    proofs: dict[str, OnDemand]
     compile_seconds: float = 0.0
     run_seconds: float = 0.0
+
+    @property
+    def starts(self) -> np.ndarray:
+        """x_0 (b, n) of the points proved feasible, NaN elsewhere."""
+        return self.proofs["starts"].get()
+
+    @property
+    def plans(self) -> np.ndarray:
+        """Inputs (b, N, m) that prove points feasible, NaN elsewhere."""
+        return self.proofs["plans"].get()
+
+    @property
+    def cut_normals(self) -> np.ndarray:
+        """Normals (b, d) of the half-spaces that prove points infeasible, NaN elsewhere."""
+        return self.proofs["cut_normals"].get()
+
+    @property
+    def cut_offsets(self) -> np.ndarray:
+        """Offsets (b,) of these half-spaces."""
+        return self.proofs["cut_offsets"].get()
+
+    @classmethod
+    def of(
+        cls, *, label: Any, status: Any, starts: Any, plans: Any, cut_normals: Any,
+        cut_offsets: Any, **seconds: float,
+    ) -> "Labels":  # fmt: skip
+        """Labels from their arrays, which may be a device's."""
+        given = dict(starts=starts, plans=plans, cut_normals=cut_normals, cut_offsets=cut_offsets)
+        fetch = lambda v: OnDemand(lambda: np.asarray(v))
+        proofs = {name: fetch(v) for name, v in given.items()}
+        return cls(np.asarray(label), np.asarray(status), proofs, **seconds)
+
+    @classmethod
+    def proved(cls, verdict: Verdict, usable: np.ndarray) -> "Labels":
+        """Labels from the verdicts on a batch (B,); waits for the device. usable (B,): which
+        points are finite."""
+        label = np.where(usable, np.asarray(verdict.label), np.int8(0))
+        status = np.where(usable, STATUS[label + 1], np.int8(Status.NON_FINITE))
+
+        def proof(rows: Any, of: int) -> OnDemand:  # NaN where it proves nothing
+            return OnDemand(lambda: _put(np.asarray(rows), label != of, np.nan))
+
+        proofs = {
+            "starts": proof(verdict.start, 1),
+            "plans": proof(verdict.inputs, 1),
+            "cut_normals": proof(verdict.normal, -1),
+            "cut_offsets": proof(verdict.offset, -1),
+        }
+        return cls(label, status, proofs)
 
     @classmethod
     def empty(cls, count: int, problem: FeasibilityProblem) -> "Labels":
         """Labels of `count` points that have not been run."""
         mpc, d = problem.mpc, problem.dimension
-        n, m, horizon = mpc.dimension, mpc.system.m, mpc.horizon
-        return cls(
-            np.zeros(count, np.int8), np.full(count, Status.NOT_RUN, np.int8),
-            np.full((count, n), np.nan), np.full((count, horizon, m), np.nan),
-            np.full((count, d), np.nan), np.full(count, np.nan),
+        return cls.of(
+            label=np.zeros(count, np.int8), status=np.full(count, Status.NOT_RUN, np.int8),
+            starts=np.full((count, mpc.dimension), np.nan),
+            plans=np.full((count, mpc.horizon, mpc.system.m), np.nan),
+            cut_normals=np.full((count, d), np.nan), cut_offsets=np.full(count, np.nan),
         )  # fmt: skip
+
+    @classmethod
+    def joined(cls, parts: Sequence["Labels"]) -> "Labels":
+        """The labels of several batches of points, one after the other."""
+        several = lambda name: OnDemand(
+            lambda: np.concatenate([part.proofs[name].get() for part in parts])
+        )
+        return cls(
+            np.concatenate([part.label for part in parts]),
+            np.concatenate([part.status for part in parts]),
+            {name: several(name) for name in PROOFS},
+            sum(part.compile_seconds for part in parts),
+            sum(part.run_seconds for part in parts),
+        )
 
     def first(self, count: int) -> "Labels":
         """Labels of the first `count` points."""
-        return replace(self, **{name: getattr(self, name)[:count] for name in ARRAYS})
+        head = lambda proof: OnDemand(lambda: proof.get()[:count])
+        proofs = {name: head(proof) for name, proof in self.proofs.items()}
+        return replace(self, label=self.label[:count], status=self.status[:count], proofs=proofs)
 
-    def put(self, where: Any, verdict: Verdict) -> None:
-        """Write what was proved at positions `where`; the decided keep their proof for good."""
-        label = verdict.label
-        self.label[where] = label
-        self.status[where] = np.select(
-            [label == 1, label == -1],
-            [Status.SOLVED, Status.PRIMAL_INFEASIBLE],
-            Status.ITERATION_LIMIT,
+    def changed(
+        self, where: np.ndarray, label: Any, status: Any, proofs: dict[str, OnDemand]
+    ) -> "Labels":
+        """These labels with others at indices `where` (k,), and with these rows of their proofs."""
+        merged = lambda name, rows: OnDemand(
+            lambda: _put(self.proofs[name].get(), where, rows.get())
         )
-        feasible, infeasible = label == 1, label == -1
-        self.starts[where] = np.where(feasible[:, None], verdict.start, np.nan)
-        self.plans[where] = np.where(feasible[:, None, None], verdict.inputs, np.nan)
-        self.cut_normals[where] = np.where(infeasible[:, None], verdict.normal, np.nan)
-        self.cut_offsets[where] = np.where(infeasible, verdict.offset, np.nan)
+        return replace(
+            self,
+            label=_put(self.label, where, label),
+            status=_put(self.status, where, status),
+            proofs=self.proofs | {name: merged(name, rows) for name, rows in proofs.items()},
+        )
+
+    def fetch(self) -> None:
+        """Copy all proofs from the device."""
+        for proof in self.proofs.values():
+            proof.get()
 
 
-def label_chunks(
-    problem: FeasibilityProblem, points: Any, *, iterations: int = 50, dtype: Any = "float32",
-    chunk: int | None = None, penalties: StagePenalties | None = None,
-) -> Iterator[tuple[slice, Labels]]:  # fmt: skip
-    """Label points chunk by chunk; yields (slice of the points, Labels). See `map_feasible_set`."""
-    d = problem.dimension
-    points = np.asarray(points, np.float64)
-    if points.ndim != 2 or points.shape[1] != d:
-        fail("x0s", f"shape {points.shape}", f"Give points (B, {d}), one column a mapped state")
-    chunk = default_chunk() if chunk is None else chunk
-    if iterations < 1 or chunk < 1:
-        fail("iterations, chunk", f"{iterations}, {chunk}", "Give counts of at least 1")
-    require_step_type(dtype)
-
-    usable = np.all(np.isfinite(points), axis=1)
-    rows = problem.rows
-    quick, alpha, back = rows, ALPHA, None
-    if penalties is not None:
-        if np.shape(penalties.weight) != rows.lower.shape:
-            shape = np.shape(penalties.weight)
-            fail("penalties", f"weights {shape}", f"Learn them for this map: {rows.lower.shape}")
-        if not (np.all(np.isfinite(penalties.weight)) and np.all(penalties.weight > 0)):
-            fail("penalties", "hold a weight that is not positive", "Learn them again")
-        if not 0 < penalties.alpha < 2:
-            fail("penalties", f"alpha {penalties.alpha}", "Over-relaxation lies in (0, 2)")
-        (quick, back), alpha = weighted(rows, penalties.weight), penalties.alpha
-    sizes = np.abs(points[usable]) if usable.any() else np.zeros((1, d))
-    exact = problem.exact(sizes.max(axis=0), np.median(sizes, axis=0))
-    admm, newton = admm_stage(iterations, np.dtype(dtype)), newton_stage(NEWTON_STEPS)
-    longer = admm_stage(LONGER * iterations, np.dtype(np.float64))
-    chunk = min(chunk, max(len(points), 1))
-    size = gather_size(chunk)
-
-    for start in range(0, len(points), chunk):
-        begun, compiled = time.perf_counter(), Compiled.seconds
-        here = slice(start, min(start + chunk, len(points)))
-        ok = usable[here]
-        x = np.where(ok[:, None], points[here], 0.0)
-        labels = Labels.empty(len(x), problem)
-        with jax.enable_x64(True):
-            verdict, w = admm(exact, quick, padded(x, chunk), np.float64(alpha))
-            labels.put(ok, jax.tree.map(lambda v, ok=ok: v[: len(ok)][ok], verdict))
-            w = w[: len(x)].astype(np.float64)
-            w = w if back is None else w @ back.T
-            for stage in (*[newton] * NEWTON_ROUNDS, longer, *[newton] * NEWTON_ROUNDS):
-                left = np.flatnonzero((labels.label == 0) & ok)
-                for i in range(0, len(left), size):
-                    batch = left[i : i + size]
-                    last = padded(w[batch], size) if stage is newton else np.float64(ALPHA)
-                    verdict, better = stage(exact, rows, padded(x[batch], size), last)
-                    labels.put(batch, first_rows(verdict, len(batch)))
-                    w[batch] = better[: len(batch)]
-        labels.status[~ok] = Status.NON_FINITE
-        compiled = Compiled.seconds - compiled
-        spent = time.perf_counter() - begun - compiled
-        yield here, replace(labels, compile_seconds=compiled, run_seconds=spent)
-
-
-def joined(labels: Labels, here: slice, part: Labels) -> Labels:
-    """`labels` with a chunk written in (in place) and its seconds added."""
-    for name in ARRAYS:
-        getattr(labels, name)[here] = getattr(part, name)
-    return replace(
-        labels,
-        compile_seconds=labels.compile_seconds + part.compile_seconds,
-        run_seconds=labels.run_seconds + part.run_seconds,
-    )
+def _put(array: np.ndarray, where: np.ndarray, rows: Any) -> np.ndarray:
+    """A copy of the array with `rows` at indices `where`."""
+    copy = array.copy()
+    copy[where] = rows
+    return copy

@@ -13,7 +13,8 @@ from jaxmpc.checks import fail
 from jaxmpc.control.sets import Ellipsoid, Polytope, hull_volume
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.candidates import StagePenalties
-from jaxmpc.feasible.labels import ARRAYS, Labels, joined, label_chunks
+from jaxmpc.feasible.cascade import label_chunks
+from jaxmpc.feasible.labels import Labels, OnDemand
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays
 from jaxmpc.mpc.problem import MPC
@@ -280,10 +281,10 @@ def excluded(
         excludes = np.asarray(table(normals, offsets, points[left]))
     out = np.flatnonzero(excludes.any(axis=1))
     left, by = left[out], np.argmax(excludes[out], axis=1)
-    copy = replace(labels, **{name: getattr(labels, name).copy() for name in ARRAYS})
-    copy.label[left], copy.status[left] = -1, Status.PRIMAL_INFEASIBLE
-    copy.cut_normals[left], copy.cut_offsets[left] = normals[by], offsets[by]
-    return copy
+    found = {
+        "cut_normals": OnDemand(lambda: normals[by]), "cut_offsets": OnDemand(lambda: offsets[by])
+    }  # fmt: skip
+    return labels.changed(left, -1, Status.PRIMAL_INFEASIBLE, found)
 
 
 def map_feasible_set(
@@ -318,9 +319,9 @@ def map_points(
 ) -> FeasibleSetMap:
     """Label the points (B, d) of a feasibility problem; settings: those of `label_chunks`."""
     points = np.asarray(points, np.float64)
-    labels = Labels.empty(len(points), problem)
+    parts = [Labels.empty(0, problem)]
     with tqdm(total=len(points), unit="pt", disable=not progress) as bar:
-        for here, part in label_chunks(problem, points, **settings):
-            labels = joined(labels, here, part)
+        for _, part in label_chunks(problem, points, **settings):
+            parts.append(part)
             bar.update(len(part.label))
-    return FeasibleSetMap.of(problem, points, labels)
+    return FeasibleSetMap.of(problem, points, Labels.joined(parts))

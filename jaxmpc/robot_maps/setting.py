@@ -12,7 +12,8 @@ from tqdm.std import tqdm
 from jaxmpc.checks import fail, require_shape
 from jaxmpc.closed_loop import simulate_many
 from jaxmpc.compiled import default_chunk, padded
-from jaxmpc.feasible.labels import Labels, joined, label_chunks
+from jaxmpc.feasible.cascade import label_chunks
+from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
@@ -63,14 +64,13 @@ def map_robot(
         claim=claim,
     )  # fmt: skip
     parts = setting.chunks(chunk=chunk)
-    labels, loops = None, []
+    labels, loops = [], []
     with tqdm(total=len(setting.points), unit=" loops", disable=not progress) as bar:
-        for here, part, looped in parts:
-            labels = setting.none() if labels is None else labels
-            labels = joined(labels, here, part)
+        for _, part, looped in parts:
+            labels.append(part)
             loops.append(looped)
             bar.update(len(part.label))
-    return setting.map(labels, loops, refine=refine, search_seconds=search_seconds)
+    return setting.map(Labels.joined(labels), loops, refine=refine, search_seconds=search_seconds)
 
 
 @dataclass(frozen=True)

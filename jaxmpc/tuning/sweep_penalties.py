@@ -23,7 +23,7 @@ from jax import Array
 
 from jaxmpc.checks import fail, whole
 from jaxmpc.compiled import default_chunk, padded, require_step_type
-from jaxmpc.feasible.candidates import ALPHA, StagePenalties, admm_stage, cut_of
+from jaxmpc.feasible.candidates import ALPHA, StagePenalties, compiled_admm, cut_of
 from jaxmpc.feasible.constraint_rows import ConstraintRows, weighted
 from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.map import map_points
@@ -111,7 +111,7 @@ class Stage:
 
     def undecided(self, x: np.ndarray, penalties: StagePenalties, size: int) -> np.ndarray:
         """Which states (B,) it leaves open."""
-        run = admm_stage(self.iterations, np.dtype(self.dtype))
+        run = compiled_admm(self.iterations, np.dtype(self.dtype))
         made = weighted(self.rows, penalties.weight)[0]
         parts = [
             run(self.problem, made, padded(part, size), np.float64(penalties.alpha))[0].label

@@ -6,16 +6,13 @@ from fractions import Fraction
 
 import exact
 import jax
-import jax.numpy as jnp
 import numpy as np
 import problems
 import pytest
 from jax import enable_x64
 
 import jaxmpc as jm
-from jaxmpc.feasible import candidates, proofs
-from jaxmpc.feasible.exact_data import exact_data, hard_blocks
-from jaxmpc.feasible.view import make_view
+from jaxmpc.feasible import candidates
 from jaxmpc.qp.status import Status
 
 
@@ -203,91 +200,28 @@ class TestIndependenceOf:
         np.testing.assert_array_equal(jm.map_feasible_set(other, points).label, fmap.label)
 
 
-def test_compiles_once_for_all_chunks(monkeypatch):
-    """Two programs, whatever the number of chunks."""
-    made = []
-
-    class Counted(candidates.Compiled):
-        def __init__(self, function):
-            super().__init__(function)
-            made.append(self)
-
-    monkeypatch.setattr(candidates, "Compiled", Counted)
+def test_compiles_once_for_all_chunks():
+    """One program of each stage, whatever the number of chunks."""
+    stages = candidates.compiled_admm(7, np.dtype(np.float32)), candidates.compiled_newton(64)
+    before = [len(stage.programs) for stage in stages]
     points = np.random.default_rng(0).uniform(-1.2, 1.2, (333, 2))
-    jm.map_feasible_set(problems.lecture(), points, chunk=50)
-    assert sum(len(compiled.programs) for compiled in made) <= 2
+    got = jm.map_feasible_set(problems.lecture(), points, chunk=50, iterations=7)
+    assert np.all(got.label != 0)
+    more = [len(stage.programs) - k for stage, k in zip(stages, before, strict=True)]
+    assert more[0] == 1 and more[1] <= 1
 
 
-def exact_form(mpc, extent):
-    """The exact data of a problem whose states are no larger than `extent`."""
-    return exact_data(mpc, make_view(mpc), hard_blocks(mpc), extent)
-
-
-class TestProofs:
-    """The two provers on their own, fed with what no solver would give."""
-
-    def setup_method(self):
-        self.mpc = problems.drifting()
-        self.problem = exact_form(self.mpc, np.array([3.0, 3.0]))
-        self.polygon = exact.feasible_polygon(self.mpc)
-
-    def test_any_multipliers_give_a_valid_cut(self):
-        rng = np.random.default_rng(0)
-        scales = 10.0 ** rng.uniform(-12, 12, 300)
-        with enable_x64(True):
-            y = rng.standard_normal((300, 4, 5)) * scales[:, None, None]
-            y_N = rng.standard_normal((300, 2)) * scales[:, None]
-            y[:100] = np.maximum(y[:100], 0)
-            cut = lambda a, b: proofs.cut(self.problem, a, b, jnp.zeros(0))
-            everywhere = lambda a, b: proofs.everywhere(self.problem, *cut(a, b))
-            normals, offsets = jax.vmap(everywhere)(y, y_N)
-        finite = np.flatnonzero(np.isfinite(offsets))
-        assert len(finite) > 100
-        for i in finite:
-            assert self.polygon.support(normals[i]) <= Fraction(float(offsets[i]))
-
-    def test_zero_and_nan_multipliers_say_nothing(self):
-        with enable_x64(True):
-            for fill in (0.0, np.nan, np.inf):
-                y, y_N = np.full((4, 5), fill), np.full(2, fill)
-                _, b, *_ = proofs.cut(self.problem, y, y_N, np.zeros(0))
-                assert b == np.inf
-
-    def test_inputs_that_are_proved_keep_all_rows(self):
-        """Random inputs, beyond their limits too, from random states."""
-        rng = np.random.default_rng(1)
-        x0s, plans = rng.uniform(-1.2, 1.2, (4000, 2)), rng.uniform(-0.6, 0.6, (4000, 4, 2))
-        prove = jax.vmap(lambda x, u: proofs.prove_feasible(self.problem, x, x[:0], u))
-        with enable_x64(True):
-            proved, clipped = map(np.asarray, prove(x0s, plans))
-        assert proved.sum() > 50
-        for i in np.flatnonzero(proved):
-            assert exact.keeps_all_rows(self.mpc, x0s[i], clipped[i])
-        for i in np.flatnonzero(~proved)[:300]:
-            assert not exact.keeps_all_rows(self.mpc, x0s[i], clipped[i])
-
-    def test_nan_inputs_prove_nothing(self):
-        with enable_x64(True):
-            for plan in (np.full((4, 2), np.nan), np.where(np.eye(4, 2), np.nan, 0.0)):
-                proved, _ = proofs.prove_feasible(self.problem, np.zeros(2), np.zeros(0), plan)
-                assert not proved
-
-    def test_margin_of_one_rounding(self):
-        """Ties: x_N exactly on its limit in rationals must not be proved wrongly."""
-        mpc = problems.scalar(a=1.0, horizon=3, x_max=None, u_max=0.1, terminal=0.3)
-        problem = exact_form(mpc, np.ones(1))
-        with enable_x64(True):
-            for ulps in range(-40, 41, 4):
-                x0 = np.array([0.6 + ulps * 2.0**-53])
-                plan = np.full((3, 1), -0.1)
-                proved, clipped = proofs.prove_feasible(problem, x0, x0[:0], plan)
-                if proved:
-                    assert exact.keeps_all_rows(mpc, x0, clipped)
-
-    def test_empty_set_cut(self):
-        """0'θ ≤ b < 0 excludes every point, and only then may a normal be zero."""
-        got = jm.map_feasible_set(EMPTY, np.zeros((1, 2)))
-        assert got.label[0] == -1
+def test_proofs_are_copied_when_asked_for(points, fmap):
+    """And are the same rows whichever part of the cascade found them."""
+    labels = jm.map_feasible_set(problems.lecture(), points, iterations=1, chunk=64).labels
+    np.testing.assert_array_equal(labels.label, fmap.label)
+    inside, outside = labels.label == 1, labels.label == -1
+    np.testing.assert_array_equal(np.isfinite(labels.plans).all(axis=(1, 2)), inside)
+    np.testing.assert_array_equal(labels.starts[inside], points[inside])
+    np.testing.assert_array_equal(np.isfinite(labels.cut_normals).all(axis=1), outside)
+    beyond = np.sum(labels.cut_normals * points, axis=1) - labels.cut_offsets
+    assert np.all(beyond[outside] > 0)
+    assert np.array_equal(labels.first(5).plans, labels.plans[:5], equal_nan=True)
 
 
 class TestMapObject:
@@ -318,43 +252,6 @@ class TestMapObject:
         assert section.volume() == pytest.approx(4.0)
         nothing = jm.map_feasible_set(replace(problems.lecture(), terminal_set=None), [[0.0, 0.0]])
         assert nothing.terminal_section() is None
-
-
-class TestBoundaryArguments:
-    def test_center_and_slice(self, polygon):
-        found = jm.boundary(problems.lecture(), np.array([[1.0, 0.0], [0.0, 2.0]]),
-                            center=np.array([0.1, 0.2]))  # fmt: skip
-        np.testing.assert_array_equal(found.center, [0.1, 0.2])
-        assert polygon.contains(found.points).all()
-        # x₁ + x₂/… facets by hand: the ray along x₁ ends where x₁ + x₂ = 1.1, at x₁ = 0.9.
-        assert found.inner[0] == pytest.approx(0.8, abs=1e-9)
-
-    @pytest.mark.parametrize(
-        ("arguments", "words"),
-        [
-            (dict(directions=np.zeros((1, 2))), "directions"),
-            (dict(directions=np.ones((1, 3))), "directions"),
-            (dict(directions=np.array([[np.nan, 1.0]])), "directions"),
-            (dict(directions=4, center=np.zeros(3)), "center"),
-            (dict(directions=4, center=np.array([5.0, 5.0])), "center"),
-            (dict(directions=4, center=np.array([np.nan, 0.0])), "center"),
-            (dict(directions=0), "directions"),
-            (dict(directions=-1), "directions"),
-        ],
-    )
-    def test_errors(self, arguments, words):
-        with pytest.raises(ValueError, match=words):
-            jm.boundary(problems.lecture(), **arguments)
-
-    def test_unbounded_ray(self):
-        """No limit on x₁: the ray along it never ends, the other does."""
-        mpc = replace(
-            problems.lecture(), states=jm.Box(np.array([-np.inf, -1.0]), np.array([np.inf, 1.0])),
-            terminal_set=None,
-        )  # fmt: skip
-        found = jm.boundary(mpc, np.array([[1.0, 0.0], [0.0, 1.0]]), center=np.zeros(2))
-        assert found.outer[0] == np.inf
-        assert found.inner[1] == pytest.approx(1.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("width", [0.1, 0.01])
