@@ -106,7 +106,8 @@ def exact_penalty(
     it can miss the greatest. "auto": regions up to four states, and samples
     as well where `limit` regions are not all. Where active rows are dependent the multipliers are
     not unique, and an LP finds those with the least maximum. rho: a weight to
-    check; None: those of `mpc.soft`, if any. within: initial states to look at, needed where X_N is unbounded.
+    check; None: those of `mpc.soft`, if any. within: initial states to look at, needed where X_N
+    is unbounded.
 
     Raises ValueError for ill-posed problems, wrong arguments, an ellipsoidal terminal set, no soft
     row, and where X_N is empty, flat or unbounded. Host, float64.
