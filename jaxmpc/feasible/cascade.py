@@ -1,5 +1,6 @@
 """The cascade that labels points, chunk by chunk: ADMM on all, Newton on those left open."""
 
+import itertools
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -86,7 +87,7 @@ def label_chunks(
 
     slices = [slice(i, min(i + chunk, len(points))) for i in range(0, len(points), chunk)]
     begun, compiled, ahead = time.perf_counter(), Compiled.seconds, None
-    for here, following in zip(slices, [*slices[1:], None], strict=True):
+    for here, following in itertools.zip_longest(slices, slices[1:]):
         with jax.enable_x64(True):
             now = started(here) if ahead is None else ahead
             ahead = None if following is None else started(following)
