@@ -40,7 +40,7 @@ import tyro
 from jax.scipy.linalg import expm
 
 import jaxmpc as jm
-from jaxmpc.config import load
+from jaxmpc.app.config import load
 from jaxmpc.control.riccati import cost_of_law
 from jaxmpc.tuning.feasibility import feasible_share, tune_feasible_set
 from jaxmpc.tuning.losses import ClosedLoopLoss

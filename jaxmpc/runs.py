@@ -79,8 +79,9 @@ def as_json(value: Any) -> Any:
 
 def write_arrays(path: Path, plain: Any = None, **arrays: Any) -> None:
     """Write JSON data and arrays to one compressed file (.npz), whole or not at all."""
+    record: dict[str, Any] = {} if plain is None else {"record": np.array(json.dumps(plain))}
     with _replacing(path) as file:
-        np.savez_compressed(file, record=np.array(json.dumps(plain)), **arrays)
+        np.savez_compressed(file, **record, **arrays)
 
 
 def read_arrays(path: Path) -> tuple[Any, dict[str, np.ndarray]] | None:
@@ -88,8 +89,8 @@ def read_arrays(path: Path) -> tuple[Any, dict[str, np.ndarray]] | None:
     try:
         with open(path, "rb") as file, np.load(file) as data:
             arrays = {name: data[name] for name in data.files}
-        return json.loads(str(arrays.pop("record"))), arrays
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return json.loads(str(arrays.pop("record", "null"))), arrays
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
         return None
 
 

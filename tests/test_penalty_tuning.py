@@ -10,8 +10,8 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.cli import main
-from jaxmpc.commands import sweep
+from jaxmpc.app.cli import main
+from jaxmpc.app.commands import sweep
 from jaxmpc.sweeps import ladder, proofs
 from jaxmpc.sweeps.ladder import RungPenalties
 from jaxmpc.tuning import penalties as module

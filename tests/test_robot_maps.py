@@ -9,11 +9,11 @@ import mujoco
 import numpy as np
 import problems
 import pytest
+from jaxmpc.app.plots import plot_robot_map
 from scipy.optimize import linprog
 
 import jaxmpc as jm
-from jaxmpc import cli
-from jaxmpc.robot_plots import plot_robot_map
+from jaxmpc.app import cli
 from jaxmpc.sweeps import robots
 from jaxmpc.sweeps.robots import (
     OUTCOMES,

@@ -5,7 +5,7 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.cli import main
+from jaxmpc.app.cli import main
 
 
 def test_design_builds_what_its_parts_say():

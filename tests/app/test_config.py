@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from jaxmpc.config import Config, load, load_robot_config
+from jaxmpc.app.config import Config, load, load_robot_config, sweep_points
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 
-EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
 MINIMAL = """
 [system]
@@ -50,7 +50,8 @@ def write(tmp_path):
 
 
 def test_default_is_the_lessons_joint():
-    mpc, region = Config.default().build()
+    config = load(None)
+    mpc, region = config.build_mpc(), sweep_points(config)
     np.testing.assert_allclose(mpc.system.A, [[1, 0.01], [0, 1]])
     np.testing.assert_allclose(mpc.system.B, [[0], [0.01 / 0.05]])
     np.testing.assert_array_equal(mpc.Q, np.diag([50.0, 1.0]))
@@ -65,7 +66,8 @@ def test_default_is_the_lessons_joint():
 
 @pytest.mark.parametrize("path", sorted(EXPERIMENTS.glob("*.toml")), ids=lambda path: path.stem)
 def test_experiments_build(path):
-    mpc, region = load(path).build()
+    config = load(path)
+    mpc, region = config.build_mpc(), sweep_points(config)
     assert len(region.points) == 256 * 256
     assert mpc.system.n == 2
 
@@ -105,7 +107,8 @@ def test_overrides_win_over_the_file(write):
 def test_polytope_limits_bound_the_grid(write):
     H = "H_x = [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]\nh_x = [4.0, 2.0, 1.0, 1.0]"
     path = write("x_min = [-5.0, -5.0]\nx_max = [5.0, 5.0]", H)
-    mpc, region = load(path).build()
+    config = load(path)
+    mpc, region = config.build_mpc(), sweep_points(config)
     assert isinstance(mpc.states, Polytope)
     np.testing.assert_allclose(region.points[0], [-2.18, -1.06])
 
@@ -113,12 +116,12 @@ def test_polytope_limits_bound_the_grid(write):
 def test_axes_by_name_index_and_slice(write):
     path = write('state_names = ["p", "v"]', 'state_names = ["p", "v"]')
     sweep = {"axes": ("v",), "grid": (3,), "fixed": (0.5,)}
-    _, region = load(path, sweep).build()
+    region = sweep_points(load(path, sweep))
     assert region.axes == (1,)
     np.testing.assert_array_equal(region.fixed, [0.5, 0.0])
     assert region.points.shape == (3, 1)
-    assert load(path, {**sweep, "axes": ("1",)}).build_points().axes == (1,)
-    projected = load(path, {"axes": (1,), "grid": (3,), "projection": True}).build_points()
+    assert sweep_points(load(path, {**sweep, "axes": ("1",)})).axes == (1,)
+    projected = sweep_points(load(path, {"axes": (1,), "grid": (3,), "projection": True}))
     assert projected.fixed is None
 
 
@@ -156,7 +159,7 @@ def test_axes_by_name_index_and_slice(write):
 def test_bad_input_is_named(write, old, new, message):
     path = write(old, new)
     with pytest.raises(ValueError, match=message) as caught:
-        load(path).build()
+        load(path).build_mpc()
     assert "\n" not in str(caught.value)
 
 

@@ -1,28 +1,28 @@
-"""The command `jaxmpc recursion`: arguments to calls, no mathematics."""
+"""The command `jaxmpc recursion`."""
 
 import dataclasses
-import json
 import time
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import tyro
-from matplotlib.figure import Figure
 
-from jaxmpc import config as configs
-from jaxmpc.checks import fail
-from jaxmpc.commands.options import (
+from jaxmpc.app import config as configs
+from jaxmpc.app.commands.options import (
     End,
     Horizon,
+    Switch,
     Terminal,
+    check_positive,
     open_folder,
     option,
-    report_error,
-    versions,
+    print_table,
+    refuse,
 )
-from jaxmpc.commands.robot_map import RobotJob, refused
-from jaxmpc.plots import plot_recursion
+from jaxmpc.app.commands.robot_map import RobotMapCommand
+from jaxmpc.app.config.states import recursion_states
+from jaxmpc.checks import fail
+from jaxmpc.runs import versions, write_arrays, write_json
 from jaxmpc.sweeps.recursion import (
     RecursionReport,
     SmallestHorizon,
@@ -112,107 +112,84 @@ class Recursion:
     """Look for a counterexample by gradient ascent, beside the samples."""
     smallest: Annotated[int | None, option("N", "off")] = None
     """Look also for the smallest horizon, up to N, that is proved recursively feasible."""
-    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
+    overwrite: Switch = False
     """Replace the results in --output."""
-    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
+    resume: Switch = False
     """With --robot: go on with the map in --output."""
 
-    def overrides(self) -> dict[str, Any]:
-        """The keys of [mpc] and [recursion] that the command line sets."""
-        keys = "horizon terminal steps grid lower upper regions seconds".split()
-        return {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
+    @property
+    def keeps(self) -> str:
+        """What is kept of a run that is stopped."""
+        return "chunks" if self.robot else ""
 
-    def run(self) -> int:
-        """Do it; the result is the exit code."""
+    def run(self) -> None:
+        """Examine the claims, write the files, print the table. Raises ValueError."""
         begun = time.perf_counter()
-        try:
-            if self.robot is not None:
-                return self.run_robot()
-            given = {"axes": self.axes, "fixed": self.fixed, "resume": self.resume}
-            refused(given, None, "It is for maps of robots")
-            config, mpc, samples = self.prepare()
-            print(f"{config.name}: horizon {mpc.horizon} -> {self.output}")
-            settings = config.recursion
-            report = recursive_feasibility(
-                mpc, samples, steps=settings.steps, search=self.search, regions=settings.regions,
-                seconds=settings.seconds,
-            )  # fmt: skip
-            least = None
-            if self.smallest is not None:
-                least = smallest_horizon(
-                    mpc, self.smallest, regions=settings.regions, seconds=settings.seconds
-                )
-        except ValueError as error:
-            return report_error(error)
+        check_positive(self, "seconds", "smallest")
+        if self.robot is not None:
+            self.robot_map(self.robot).run()
+            return
+        given = {"axes": self.axes, "fixed": self.fixed, "resume": self.resume}
+        refuse(given, None, "It is for maps of robots")
+        keys = "horizon terminal steps grid lower upper regions seconds".split()
+        overrides = {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
+        config = configs.load(self.config, overrides, "recursion")
+        mpc, states, settings = config.build_mpc(), recursion_states(config), config.recursion
+        there = [self.output / name for name in FILES if (self.output / name).exists()]
+        if there and not self.overwrite:
+            fail(str(there[0]), "exists", "Add --overwrite to replace it")
+        open_folder(self.output, *FILES)
+        print(f"{config.name}: horizon {mpc.horizon} -> {self.output}")
+        report = recursive_feasibility(
+            mpc, states, steps=settings.steps, search=self.search, regions=settings.regions,
+            seconds=settings.seconds,
+        )  # fmt: skip
+        rows, least = [], None
+        if self.smallest is not None:
+            least = smallest_horizon(
+                mpc, self.smallest, regions=settings.regions, seconds=settings.seconds
+            )
+            rows.append(("smallest horizon", _sentence(least, self.smallest)))
         files = self.save(config, report, least)
         print(report)
-        if least is not None:
-            print(f"  {'smallest horizon':<20} {_words(least, self.smallest)}")
-        print(f"  {'total':<20} {time.perf_counter() - begun:.2f} s with set-up and files")
-        print(f"  {'files':<20} {' '.join(str(self.output / name) for name in files)}")
-        return 0
+        rows.append(("total", f"{time.perf_counter() - begun:.2f} s with set-up and files"))
+        rows.append(("files", " ".join(str(self.output / name) for name in files)))
+        print_table(rows, 20)
 
-    def run_robot(self) -> int:
-        """The map of --robot; the exit code. Raises ValueError before it compiles."""
+    def robot_map(self, robot: str) -> RobotMapCommand:
+        """Return the map of --robot. Raises ValueError for options that do not go with it."""
         given = {"config": self.config, "smallest": self.smallest, "regions": self.regions}
-        refused(given, self.robot, "Claims about all states are those of a linear problem")
-        if self.seconds is not None and not self.seconds > 0:
-            fail("--seconds", f"{self.seconds}", "Give a positive number")
-        steps = 100 if self.steps is None else self.steps
-        job = RobotJob(
-            str(self.robot), self.output, "recursion", steps=steps,
+        refuse(given, robot, "Claims about all states are those of a linear problem")
+        return RobotMapCommand(
+            robot, self.output, "recursion", steps=100 if self.steps is None else self.steps,
             horizon=self.horizon, terminal=self.terminal, axes=self.axes, values=self.fixed,
             grid=self.grid, lower=self.lower, upper=self.upper, resume=self.resume,
             overwrite=self.overwrite, search_seconds=self.seconds or 60.0,
         )  # fmt: skip
-        try:
-            job.run()
-        except KeyboardInterrupt:
-            print("\nstopped; chunks that were done are kept. Go on with --resume")
-            return 130
-        return 0
-
-    def prepare(self) -> tuple[configs.Config, Any, np.ndarray | None]:
-        """Read, check and open everything. Raises ValueError, compiles nothing."""
-        if self.config is None:
-            config = configs.Config.default(self.overrides(), "recursion")
-        else:
-            config = configs.load(self.config, self.overrides(), "recursion")
-        if self.smallest is not None and self.smallest < 1:
-            fail("--smallest", f"{self.smallest}", "Give a horizon of at least 1")
-        samples, mpc = config.build_samples(), config.build_mpc()
-        open_folder(self.output)
-        there = [name for name in FILES if (self.output / name).exists()]
-        if there and not self.overwrite:
-            fail(str(self.output / there[0]), "exists", "Add --overwrite to replace it")
-        for name in there:
-            (self.output / name).unlink()
-        return config, mpc, samples
 
     def save(
         self, config: configs.Config, report: RecursionReport, least: SmallestHorizon | None
     ) -> list[str]:
-        """Write the files; their names."""
+        """Write the files and return their names."""
         body, worst = report.feasible_set, report.counterexample
         facets: dict[str, Any] = {}
         if body is not None:
             facets = {"facet_normals": np.asarray(body.H), "facet_offsets": np.asarray(body.h)}
-        np.savez_compressed(
+        write_arrays(
             self.output / "recursion.npz", state=report.states, label=report.label,
             input=report.inputs, next_state=report.next_states, lost_at=report.lost_at,
             undecided_at=report.undecided_at, **facets,
         )  # fmt: skip
-        finite = lambda v: v if np.isfinite(v) else None
         summary = {
             "name": config.name,
             "claims": {
-                name: _plain(dataclasses.asdict(getattr(report, name)))
+                name: dataclasses.asdict(getattr(report, name))
                 for name in ("strong", "law", "weak")
             },
-            "counterexample": None if worst is None else _plain(dataclasses.asdict(worst)),
-            "volume": finite(report.volume),
-            "lost_by_any": finite(report.lost_by_any),
-            "lost_by_law": finite(report.lost_by_law),
+            "counterexample": None if worst is None else dataclasses.asdict(worst),
+            "volume": report.volume,
+            "lost_by_any": report.lost_by_any,
+            "lost_by_law": report.lost_by_law,
             "counts": report.counts(),
             "steps": report.steps,
             "seconds": report.seconds,
@@ -220,28 +197,18 @@ class Recursion:
             "versions": versions(),
         }
         if least is not None:
-            summary["smallest_horizon"] = _plain(dataclasses.asdict(least))
-        (self.output / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+            summary["smallest_horizon"] = dataclasses.asdict(least)
+        write_json(self.output / "summary.json", summary)
         if report.states.shape[1] != 2:
             return ["summary.json", "recursion.npz"]
-        figure = Figure(figsize=(13 if worst is not None else 8.4, 5.2), layout="constrained")
-        axes = figure.subplots(1, 2 if worst is not None else 1, squeeze=False)[0]
-        plot_recursion(report, axes[0])
-        if worst is not None:
-            plot_recursion(report, axes[1], enlarge=True)
-        figure.savefig(self.output / "recursion.png", dpi=150)
+        from jaxmpc.app.plots.recursion import draw_recursion
+
+        draw_recursion(report).savefig(self.output / "recursion.png", dpi=150)
         return list(FILES)
 
 
-def _words(least: SmallestHorizon, limit: int | None) -> str:
+def _sentence(least: SmallestHorizon, limit: int) -> str:
     if least.horizon is None:
         return f"none up to {limit} is proved"
     strong = f"; strong from {least.strong}" if least.strong is not None else ""
     return f"{least.horizon} ({least.reasons[least.horizon].reason}){strong}"
-
-
-def _plain(value: Any) -> Any:
-    """Arrays and numpy numbers as lists and numbers that JSON takes."""
-    if isinstance(value, dict):
-        return {str(key): _plain(part) for key, part in value.items()}
-    return np.asarray(value).tolist() if isinstance(value, np.ndarray | np.generic) else value

@@ -1,13 +1,12 @@
-"""The command `jaxmpc info`: arguments to calls, no mathematics."""
+"""The command `jaxmpc info`."""
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from jaxmpc import config as configs
-from jaxmpc.checks import fail
-from jaxmpc.commands.options import Horizon, Terminal, option, report_error
-from jaxmpc.workflow import offline_report
+from jaxmpc.app import config as configs
+from jaxmpc.app.commands.options import Horizon, Terminal, check_positive, option
+from jaxmpc.workflow.offline_test import offline_report
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,25 +53,15 @@ class Info:
     seconds: Annotated[float, option("S", "60")] = 60.0
     """Time for the search for counterexamples; what is not settled by then is open."""
 
-    def overrides(self) -> dict[str, Any]:
-        """The keys of [mpc] that the command line sets."""
-        keys = ("horizon", "terminal")
-        return {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
+    keeps = ""
 
-    def run(self) -> int:
-        """Do it; the result is the exit code."""
-        try:
-            if self.config is None:
-                config = configs.Config.default(self.overrides(), "info")
-            else:
-                config = configs.load(self.config, self.overrides(), "info")
-            for name in ("steps", "loops", "seconds"):
-                if not getattr(self, name) > 0:
-                    fail(f"--{name}", f"{getattr(self, name)}", "Give a positive number")
-            report = offline_report(
-                config.build_controlled(), steps=self.steps, loops=self.loops, seconds=self.seconds
-            )
-        except ValueError as error:
-            return report_error(error)
+    def run(self) -> None:
+        """Print the report. Raises ValueError for options and files that make no sense."""
+        check_positive(self, "steps", "loops", "seconds")
+        given = {"horizon": self.horizon, "terminal": self.terminal}
+        overrides = {key: value for key, value in given.items() if value is not None}
+        config = configs.load(self.config, overrides, "info")
+        report = offline_report(
+            config.build_controlled(), steps=self.steps, loops=self.loops, seconds=self.seconds
+        )
         print(f"{config.name}\n\n{report}")
-        return 0

@@ -15,21 +15,17 @@ import numpy as np
 import optax
 import tyro
 
-from jaxmpc import config as configs
-from jaxmpc.checks import fail
-from jaxmpc.closed_loop import Run, simulate_many
-from jaxmpc.commands.options import (
+from jaxmpc.app import config as configs
+from jaxmpc.app.commands.options import (
     Horizon,
     Terminal,
     model_hash,
     option,
+    refuse,
     report_error,
-    versions,
-    write_json,
 )
-from jaxmpc.commands.robot_map import refused
-from jaxmpc.commands.simulate import Simulate, plant_numbers
-from jaxmpc.commands.tuning import (
+from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
+from jaxmpc.app.commands.tuning import (
     CHECKPOINT,
     TUNED,
     feasible_states,
@@ -38,6 +34,8 @@ from jaxmpc.commands.tuning import (
     problem_file,
     start_range,
 )
+from jaxmpc.checks import fail
+from jaxmpc.closed_loop import Run, simulate_many
 from jaxmpc.compiled import Compiled
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
@@ -51,6 +49,7 @@ from jaxmpc.qp.status import Status
 from jaxmpc.robots.control import RobotController, robot_mpc
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.load import load_robot
+from jaxmpc.runs import versions, write_json
 from jaxmpc.sweeps.feasible_set import grid, map_feasible_set
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
@@ -219,6 +218,8 @@ class TuneWeights:
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
     """Delete the run in --output and start again."""
 
+    keeps = "steps"
+
     def run(self) -> int:
         """Do it; the result is the exit code."""
         begun, compiled = time.perf_counter(), Compiled.seconds
@@ -267,10 +268,10 @@ class TuneWeights:
         if self.robot is None:
             given = {name: getattr(self, name) for name in
                      ("target", "linearize", "mass", "damping", "payload")}  # fmt: skip
-            refused({k: v or None for k, v in given.items()}, None, "It is of robots")
+            refuse({k: v or None for k, v in given.items()}, None, "It is of robots")
         else:
             given = {"lower": self.lower, "upper": self.upper, "terminal": self.terminal}
-            refused(given, self.robot, "Starts are drawn by --spread, and no terminal set is used")
+            refuse(given, self.robot, "Starts are drawn by --spread, and no terminal set is used")
         if not self.tune or len(set(self.tune)) != len(self.tune):
             fail("--tune", f"{' '.join(self.tune) or 'nothing'}", "Name each quantity once")
         if self.steps is not None and self.seconds is not None:
@@ -420,11 +421,10 @@ class TuneWeights:
             iterations=20 if self.iterations is None else self.iterations,
             refine=2 if self.refine is None else self.refine,
         )
-        drawn = Simulate(
-            count=self.count, spread=0.5 if self.spread is None else self.spread, seed=self.seed,
+        x0s, variations = draw_robots(
+            robot, self.count, self.seed, spread=0.5 if self.spread is None else self.spread,
             mass=self.mass, damping=self.damping, payload=self.payload,
         )  # fmt: skip
-        x0s, variations = drawn.draw(robot)
         variations = plant_numbers(robot, variations)
         if variations:
             robot.vary(**{key: value[0] for key, value in variations.items()})

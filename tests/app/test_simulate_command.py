@@ -12,13 +12,13 @@ import mujoco
 import numpy as np
 import pytest
 import xarray as xr
+from jaxmpc.app.plots import plot_runs
 from PIL import Image
 
 import jaxmpc as jm
-from jaxmpc import cli
-from jaxmpc.commands import simulate
+from jaxmpc.app import cli
+from jaxmpc.app.commands import robot_runs
 from jaxmpc.outcome import judge
-from jaxmpc.plots import plot_runs
 from jaxmpc.robots.video import render, save_video
 
 # Models at the set-point compile in half the time.
@@ -47,7 +47,7 @@ def _in_empty_folder(tmp_path, monkeypatch, joint):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
     given = lambda name: joint if name == "joint" else jm.load_robot(name)
-    monkeypatch.setattr(simulate, "load_robot", given)
+    monkeypatch.setattr(robot_runs, "load_robot", given)
 
 
 def run(line):
@@ -66,7 +66,7 @@ def rows(out):
 
 def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
     """Ctrl-C in the second chunk loses that chunk only; the table is that of the states."""
-    real, asked = simulate.simulate_many, []
+    real, asked = robot_runs.simulate_many, []
 
     def default(robot, Q, R, horizon, *, target, margin):
         assert (Q, R, horizon, target, margin) == (None, None, mpc.horizon, None, 0.02)
@@ -78,8 +78,8 @@ def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
             raise KeyboardInterrupt
         return real(*args, **kwargs)
 
-    monkeypatch.setattr(simulate, "robot_mpc", default)
-    monkeypatch.setattr(simulate, "simulate_many", interrupted)
+    monkeypatch.setattr(robot_runs, "robot_mpc", default)
+    monkeypatch.setattr(robot_runs, "simulate_many", interrupted)
     assert run(f"{LINE} --output 'my runs'") == 130
     out = capsys.readouterr().out
     assert f"jaxmpc simulate {LINE} --output 'my runs' --resume" in out
@@ -123,10 +123,10 @@ def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
     assert summary["settling"] == {"median": median, "95 %": last}
     solved, fallback = (data["status"] == 1).values, data["fallback"].values
     assert summary["plans_solved"] == solved.sum() and summary["fallback_plans"] == fallback.sum()
-    assert summary["promised"] == (solved & ~fallback).all(axis=1).sum()
+    assert summary["plans_valid"] == (solved & ~fallback).all(axis=1).sum()
     cost = np.sum((x[:, :-1] ** 2) @ [1 / 1.5**2, 0.01 / 4] + 0.01 / 4 * u[:, :, 0] ** 2, axis=1)
     assert summary["cost"]["median"] == pytest.approx(np.sort(cost)[3], rel=1e-4)
-    assert summary["this_run"]["robots"] == 2 and summary["config"]["horizon"] == 10
+    assert summary["this_run"]["count"] == 2 and summary["config"]["horizon"] == 10
     table = rows(captured.out)
     assert table["success"].startswith(f"{summary['success']}  ")
     assert table["limits kept"].startswith(f"{kept.sum()}  ")
@@ -178,7 +178,7 @@ def test_other_robots_and_laws(tmp_path, capsys, arguments):
     ],
 )
 def test_errors_are_one_line_before_any_compile(tmp_path, capsys, monkeypatch, arguments, message):
-    monkeypatch.setattr(simulate, "simulate_many", lambda *a, **k: pytest.fail("it started"))
+    monkeypatch.setattr(robot_runs, "simulate_many", lambda *a, **k: pytest.fail("it started"))
     assert run(arguments) == 2
     err = capsys.readouterr().err
     assert err.startswith("jaxmpc: error: ") and err.count("\n") == 1
@@ -277,8 +277,8 @@ def test_runs_with_orientations_and_of_linear_plants(tmp_path):
 FILM = """
 import sys
 import numpy as np
-from jaxmpc.commands.simulate import _choose_renderer
-_choose_renderer()
+from jaxmpc.app.commands.film import choose_renderer
+choose_renderer()
 import jaxmpc as jm
 from jaxmpc.robots.video import render, save_video
 q = np.linspace(0, 1.2, 9)

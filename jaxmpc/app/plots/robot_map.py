@@ -1,27 +1,28 @@
-"""Pictures of what robots do with the promises of their linear models."""
+"""The picture of a robot map: what the linear model promises and what the robot does."""
 
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
-from jaxmpc.checks import fail
-from jaxmpc.plots import (
-    _FEASIBLE,
-    _INFEASIBLE,
-    _INNER,
-    _OUTER,
-    _TERMINAL,
-    _UNDECIDED,
-    _draw_values,
-    _ring,
+from jaxmpc.app.plots.style import (
+    FEASIBLE,
+    INFEASIBLE,
+    INNER,
+    OUTER,
+    TERMINAL,
+    UNDECIDED,
+    draw_polygons,
+    draw_values,
+    legend,
+    new_axes,
+    patch,
 )
+from jaxmpc.checks import fail
 from jaxmpc.sweeps.robots import OUTCOMES, RobotMap
 
-_BROKEN, _BETTER = "#cc4b1c", "#8ccfae"
+BROKEN, BETTER = "#cc4b1c", "#8ccfae"
 
 
 def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
@@ -36,29 +37,22 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
     points = rmap.points
     if points.shape[1] != 2:
         fail("rmap", f"maps {points.shape[1]} coordinates", "A picture needs 2: choose `axes`")
-    if ax is None:
-        ax = Figure(figsize=(9.6, 4.8), layout="constrained").add_subplot()
-    colours = (_FEASIBLE, _BROKEN, _INFEASIBLE, _BETTER, _UNDECIDED)
-    _draw_values(ax, points, rmap.outcome, dict(enumerate(colours)))
+    ax = new_axes(9.6) if ax is None else ax
+    colours = (FEASIBLE, BROKEN, INFEASIBLE, BETTER, UNDECIDED)
+    draw_values(ax, points, rmap.outcome, dict(enumerate(colours)))
     handles: list[Any] = []
     for i, (name, colour) in enumerate(zip(_words(rmap), colours, strict=True)):
         count = np.count_nonzero(rmap.outcome == i)
         if count:
-            label = f"{name} ({count:,})"
-            handles.append(Patch(facecolor=colour, edgecolor="#8a8a8a", linewidth=0.6, label=label))
+            handles.append(patch(name, colour, count))
     linear = rmap.linear
-    lines: tuple[tuple[Any, str, dict[str, Any]], ...] = (
-        (linear.terminal_section, "terminal set", {"color": _TERMINAL, "lw": 1.6}),
-        (linear.outer, "linear feasible set, outer bound", {"color": _OUTER, "lw": 2.4}),
-        (linear.inner, "linear feasible set, inner bound",
-         {"color": _INNER, "lw": 1.4, "ls": (0, (3, 3))}),
-    )  # fmt: skip
     ax.autoscale(False)
-    for make, name, style in lines:
-        corners = _ring(make)
-        if len(corners):
-            ax.plot(*corners.T, solid_joinstyle="round", **style)
-            handles.append(Line2D([], [], label=name, **style))
+    handles += draw_polygons(ax, [
+        (linear.terminal_section, "terminal set", {"color": TERMINAL, "lw": 1.6}),
+        (linear.outer, "linear feasible set, outer bound", {"color": OUTER, "lw": 2.4}),
+        (linear.inner, "linear feasible set, inner bound",
+         {"color": INNER, "lw": 1.4, "ls": (0, (3, 3))}),
+    ])  # fmt: skip
     marks: list[tuple[Any, str, dict[str, Any]]] = [(
         rmap.set_point[list(linear.axes)], "set-point",
         {"marker": "+", "ms": 9, "mew": 1.6, "color": "black"},
@@ -75,15 +69,12 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
     ax.set_xlabel(rmap.names[0])
     ax.set_ylabel(rmap.names[1])
     ax.set_title(_title(rmap), loc="left", fontsize=11)
-    ax.legend(
-        handles=handles, loc="upper left", bbox_to_anchor=(1.02, 1.0), frameon=False,
-        handlelength=2.4,
-    )  # fmt: skip
+    legend(ax, handles)
     return ax
 
 
 def _words(rmap: RobotMap) -> tuple[str, ...]:
-    """The outcomes in the words of the claim."""
+    """Return the names of the outcomes in the words of the claim."""
     if rmap.claim == "limits":
         words = (
             "promise kept: limits kept", "promise broken: beyond a limit",
@@ -100,7 +91,7 @@ def _words(rmap: RobotMap) -> tuple[str, ...]:
 
 
 def _title(rmap: RobotMap) -> str:
-    """Which robot, how long, and the values of the coordinates that are not mapped."""
+    """Return which robot, how long, and the values of the coordinates that are not mapped."""
     name = rmap.robot.name
     mpc = rmap.linear.mpc
     what = {

@@ -5,11 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from jaxmpc.app.plots import plot_feasible_set, plot_recursion
 from matplotlib.figure import Figure
 
 from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.control.system import LinearSystem
-from jaxmpc.plots import plot_feasible_set, plot_recursion
 from jaxmpc.sweeps.recursion import Counterexample, RecursionReport, Rung
 
 

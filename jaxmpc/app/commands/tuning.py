@@ -10,12 +10,13 @@ import numpy as np
 import optax
 from scipy.optimize import linprog
 
-from jaxmpc import config as configs
+from jaxmpc.app import config as configs
+from jaxmpc.app.commands.options import open_folder
 from jaxmpc.checks import fail
-from jaxmpc.commands.options import open_folder, write_json
 from jaxmpc.control.sets import Polytope
 from jaxmpc.mpc.condense import condense, in_float64
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.runs import write_json
 
 CHECKPOINT = "checkpoint.npz"
 TUNED = "tuned.toml"
@@ -42,8 +43,6 @@ def problem_file(command: Any) -> configs.Config:
     """The file of --config, or the built-in joint, with --horizon and --terminal."""
     given = {key: getattr(command, key) for key in ("horizon", "terminal")}
     overrides = {key: value for key, value in given.items() if value is not None}
-    if command.config is None:
-        return configs.Config.default(overrides, "tune")
     return configs.load(command.config, overrides, "tune")
 
 

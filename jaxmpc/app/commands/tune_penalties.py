@@ -13,17 +13,14 @@ import numpy as np
 import optax
 import tyro
 
-from jaxmpc import config as configs
-from jaxmpc.checks import fail
-from jaxmpc.commands.options import (
+from jaxmpc.app import config as configs
+from jaxmpc.app.commands.options import (
     Horizon,
     Terminal,
     option,
     report_error,
-    versions,
-    write_json,
 )
-from jaxmpc.commands.tuning import (
+from jaxmpc.app.commands.tuning import (
     CHECKPOINT,
     TUNED,
     feasible_states,
@@ -32,10 +29,12 @@ from jaxmpc.commands.tuning import (
     problem_file,
     start_range,
 )
+from jaxmpc.checks import fail
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import solve
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
+from jaxmpc.runs import versions, write_json
 from jaxmpc.tuning.penalties import Penalties, learn_penalties
 from jaxmpc.tuning_plots import plot_penalties
 
@@ -126,6 +125,8 @@ class TunePenalties:
     """Go on with the run in --output."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
     """Delete the run in --output and start again."""
+
+    keeps = "steps"
 
     def run(self) -> int:
         """Do it; the result is the exit code."""

@@ -1,0 +1,95 @@
+"""The initial states that the commands sweep and recursion ask about: grids over state limits."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxmpc.app.config.problem import Config
+from jaxmpc.app.config.sections import RecursionSection, SweepSection
+from jaxmpc.checks import fail
+from jaxmpc.sweeps.feasible_set import grid
+
+
+class SweepPoints(NamedTuple):
+    """Initial states of a sweep, as `map_feasible_set` takes them."""
+
+    points: np.ndarray  # (B, d)
+    axes: tuple[int, ...]  # the d states mapped
+    fixed: np.ndarray | None  # (n,) for a slice; None: all states mapped, or a projection
+
+
+def sweep_points(config: Config) -> SweepPoints:
+    """Return the grid of initial states that [sweep] describes."""
+    axes = mapped_axes(config)
+    lower, upper = grid_ends(config, axes, config.sweep)
+    d = len(axes)
+    # 256 along each of two axes; about as many points in all along more.
+    shape = config.sweep.grid or (min(256, int(65_536.5 ** (1 / d))),) * d
+    points = grid(lower, upper, shape)
+    if config.sweep.fixed is None:
+        return SweepPoints(points, axes, None)
+    fixed = np.zeros(len(config.system.A))
+    fixed[[i for i in range(len(fixed)) if i not in axes]] = config.sweep.fixed
+    return SweepPoints(points, axes, fixed)
+
+
+def recursion_states(config: Config) -> np.ndarray | None:
+    """Return states (B, n) for `recursive_feasibility`; None for its own choice (n > 3)."""
+    n, recursion = len(config.system.A), config.recursion
+    if recursion.grid is None and n > 3:
+        return None
+    shape = recursion.grid or {1: (1001,), 2: (128, 128), 3: (24, 24, 24)}[n]
+    return grid(*grid_ends(config, tuple(range(n)), recursion), shape)
+
+
+def mapped_axes(config: Config) -> tuple[int, ...]:
+    """Return the indices of the mapped states, which [sweep] gives by name or index."""
+    n, axes = len(config.system.A), config.sweep.axes
+    given = tuple(range(min(2, n))) if axes is None else axes
+    return axis_indices("sweep.axes", "state", given, config.system.state_names or (), n)
+
+
+def axis_indices(
+    where: str, what: str, given: Sequence[int | str], names: Sequence[str], n: int
+) -> tuple[int, ...]:
+    """Return the indices of axes that are given by name or by index below n.
+
+    where, what: the option and the kind of axis, for the ValueError that is raised for an axis
+    which does not exist or is repeated.
+    """
+    names = list(names)
+    known = f"{what.capitalize()}s are {', '.join(map(str, [*names, *range(n)]))}"
+    axes = []
+    for axis in given:
+        i = names.index(str(axis)) if axis in names else int(axis) if f"{axis}".isdecimal() else -1
+        if not 0 <= i < n:
+            fail(where, f"no {what} {axis!r}", known)
+        axes.append(i)
+    if not axes or len(set(axes)) != len(axes):
+        fail(where, f"{list(given)} repeats a {what} or is empty", known)
+    return tuple(axes)
+
+
+def grid_ends(
+    config: Config, axes: tuple[int, ...], sweep: SweepSection | RecursionSection
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of the grid: as given, else the state limits widened by 3 %."""
+    where = "sweep" if isinstance(sweep, SweepSection) else "recursion"
+    if sweep.lower is not None and sweep.upper is not None:
+        return np.asarray(sweep.lower), np.asarray(sweep.upper)
+    low, high = (end[list(axes)] for end in config.state_range())
+    margin = 0.03 * (high - low) if np.all(np.isfinite([low, high])) else np.nan
+    lower = np.asarray(sweep.lower) if sweep.lower is not None else low - margin
+    upper = np.asarray(sweep.upper) if sweep.upper is not None else high + margin
+    if not np.all(np.isfinite([lower, upper])):
+        ends = f"Give {where}.lower and {where}.upper"
+        cure = f"{ends}: the state limits do not bound the mapped axes"
+        fail(f"{where}.lower", "no finite range to sweep", cure)
+    if np.any(lower >= upper):
+        fail(
+            f"{where}.lower",
+            f"{lower.tolist()} not below upper {upper.tolist()}",
+            "Lower must be below upper",
+        )
+    return lower, upper
