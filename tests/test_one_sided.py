@@ -16,6 +16,7 @@ from scipy.optimize import linprog
 
 import jaxmpc as jm
 from jaxmpc.sweeps import proofs, recursion
+from jaxmpc.sweeps.feasible_set import FeasibleSetMap
 
 NONE = (np.inf, 1e9, 1e12, 1e20)
 
@@ -117,7 +118,7 @@ def near(polygon, center, count) -> np.ndarray:
     return (center + rays * (t * (1 + shift[:, None]))[:, :, None]).reshape(-1, 2)
 
 
-def check(mpc, allow=0, whole=True) -> jm.FeasibleSetMap:
+def check(mpc, allow=0, whole=True) -> FeasibleSetMap:
     """Labels, plans and half-spaces in rationals, within 1e6, where the oracle ends.
 
     allow: how many labels may be open. whole: every −1 has a half-space for the whole set.

@@ -51,7 +51,7 @@ def learned(tmp_path_factory):
 
 def test_more_states_are_solved_on_others(learned):
     found, x = learned[0], states(300, 1)
-    rows = len(jm.row_table(mpc()))
+    rows = len(jm.mpc.row_table(mpc()))
     assert found.solver.iterations == 30 and found.solver.refine == 0
     assert np.shape(found.solver.rho) == (2, rows)
     # Two stages, so that one program serves both.
@@ -65,7 +65,7 @@ def test_more_states_are_solved_on_others(learned):
 def test_gradient_against_differences():
     """Of the loss with respect to log rho and alpha, with warm starts and a reference."""
     rng = np.random.default_rng(0)
-    x, rows = states(12, 2), len(jm.row_table(mpc()))
+    x, rows = states(12, 2), len(jm.mpc.row_table(mpc()))
     start = rng.normal(size=(12, 5)), rng.normal(size=(12, rows))
     setting, samples, _ = module.prepared(
         mpc(), x, 20, 2, "step", DEFAULT, 4, 0.5, start, np.array([0.3, 0.1]), None, 0, 1
@@ -134,7 +134,7 @@ def test_groups_over_horizons(learned):
     longer = found.for_mpc(mpc(10), 40)
     assert longer.iterations == 40 and longer.alpha == found.solver.alpha
     # Step 2k of ten stands where step k of five does.
-    tables = [jm.row_table(problem) for problem in (mpc(), mpc(10))]
+    tables = [jm.mpc.row_table(problem) for problem in (mpc(), mpc(10))]
     of = {(r.kind, r.step, r.index): rho for r, rho in zip(tables[1], longer.rho.T, strict=True)}
     assert len(of) == len(tables[1])
     for row, rho in zip(tables[0], found.solver.rho.T, strict=True):

@@ -9,11 +9,11 @@ import mujoco
 import numpy as np
 import problems
 import pytest
-from jaxmpc.app.plots import plot_robot_map
 from scipy.optimize import linprog
 
 import jaxmpc as jm
 from jaxmpc.app import cli
+from jaxmpc.app.plots import plot_robot_map
 from jaxmpc.sweeps import robots
 from jaxmpc.sweeps.robots import (
     OUTCOMES,
@@ -173,7 +173,7 @@ def test_labels_of_loops_by_hand():
     fallback = np.zeros((6, 2), bool)
     fallback[5, 1] = True
     none = np.zeros((6, 2))
-    run = jm.Run(
+    run = jm.closed_loop.Run(
         states[..., None], inputs[..., None], none, status, none, none, none, fallback
     )  # fmt: skip
     loops = Loops.of(run, plant, 1e-6)

@@ -3,11 +3,9 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from jaxmpc.checks import fail
-from jaxmpc.control.invariant import invariant_ellipsoid, maximal_invariant_set
 from jaxmpc.control.limits import JointLimits
+from jaxmpc.control.named_terminal import named_terminal_set
 from jaxmpc.control.riccati import LQR, lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
@@ -17,8 +15,6 @@ from jaxmpc.mpc.solve import Controller
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.sweeps.exact_penalty import ExactPenalty, exact_penalty
 from jaxmpc.workflow.offline_test import OfflineReport, offline_report
-
-TERMINALS = ("invariant", "ellipsoid", "states", "box", "none")
 
 
 @dataclass(frozen=True)
@@ -86,30 +82,3 @@ def design(
     if soft is not None:
         mpc = soften(mpc, soft if penalty is None else penalty.advised)
     return Design(mpc, regulator, penalty)
-
-
-def named_terminal_set(
-    name: str, system: LinearSystem, regulator: LQR | None,
-    states: Box | Polytope | None, inputs: Box | Polytope | None,
-) -> Box | Polytope | Ellipsoid | None:  # fmt: skip
-    """Return the terminal set with this name.
-
-    "none": None. "box" or "states": the state limits. "invariant": the largest set that the
-    regulator keeps within all limits. "ellipsoid": the largest level set of its cost x'Px within
-    them. Only the last two need the regulator. Raises ValueError for another name, and for these
-    two where there are no limits.
-    """
-    if name not in TERMINALS:
-        fail("terminal", f"{name!r}", f"Give a set, or one of {', '.join(TERMINALS)}")
-    if name == "none":
-        return None
-    if name in ("box", "states"):
-        return states
-    if states is None and inputs is None:
-        fail("terminal", f"{name!r} without limits", "Give states or inputs, or 'none'")
-    assert regulator is not None
-    if name == "ellipsoid":
-        found: Any = invariant_ellipsoid(system, regulator.K, regulator.P, states, inputs)
-        return found
-    free = Box(np.full(system.n, -np.inf), np.full(system.n, np.inf))
-    return maximal_invariant_set(system, regulator.K, free if states is None else states, inputs)

@@ -26,7 +26,9 @@ def _in_empty_folder(tmp_path, monkeypatch):
 @pytest.fixture
 def no_compile(monkeypatch):
     """Fail if the sweep starts: errors must be found before."""
-    monkeypatch.setattr(linear_sweep, "label_chunks", lambda *a, **k: pytest.fail("the sweep started"))
+    monkeypatch.setattr(
+        linear_sweep, "label_chunks", lambda *a, **k: pytest.fail("the sweep started")
+    )
 
 
 def run(line):

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from jaxmpc.app.plots import plot_feasible_set, plot_recursion
 from matplotlib.figure import Figure
 
+from jaxmpc.app.plots import plot_feasible_set, plot_recursion
 from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.sweeps.recursion import Counterexample, RecursionReport, Rung

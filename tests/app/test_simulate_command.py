@@ -12,12 +12,12 @@ import mujoco
 import numpy as np
 import pytest
 import xarray as xr
-from jaxmpc.app.plots import plot_runs
 from PIL import Image
 
 import jaxmpc as jm
 from jaxmpc.app import cli
 from jaxmpc.app.commands import robot_runs
+from jaxmpc.app.plots import plot_runs
 from jaxmpc.outcome import judge
 from jaxmpc.robots.video import render, save_video
 
@@ -209,7 +209,7 @@ def by_hand(states, inputs, **fields):
         "violation": np.zeros((count, samples + 1)), "slack": np.zeros((count, samples, 0)),
         "fallback": np.zeros((count, samples), bool), **fields,
     }  # fmt: skip
-    return jm.Run(states=states, inputs=inputs, **given)
+    return jm.closed_loop.Run(states=states, inputs=inputs, **given)
 
 
 def test_outcome_and_picture_of_runs_made_by_hand(joint):

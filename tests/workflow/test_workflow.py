@@ -15,18 +15,18 @@ def test_design_builds_what_its_parts_say():
         terminal: jm.design(
             mpc.system, mpc.Q, mpc.R, 5, states=mpc.states, inputs=mpc.inputs, terminal=terminal
         )
-        for terminal in ("invariant", "ellipsoid", "states", "none")
+        for terminal in ("invariant", "ellipsoid", "box", "none")
     }
     law = jm.lqr(mpc.system, mpc.Q, mpc.R)
     body = made["invariant"].mpc.terminal_set
     assert body.volume() == pytest.approx(0.9473310116683459, rel=1e-8)
     assert made["ellipsoid"].mpc.terminal_set.level == pytest.approx(1.4137628195913876, rel=1e-8)
-    assert made["states"].mpc.terminal_set is mpc.states and made["none"].mpc.terminal_set is None
+    assert made["box"].mpc.terminal_set is mpc.states and made["none"].mpc.terminal_set is None
     for design in made.values():
         np.testing.assert_allclose(design.mpc.terminal_cost, law.P)
         assert not design.mpc.soft and design.penalty is None
     exact = jm.design(
-        mpc.system, mpc.Q, mpc.R, 3, states=mpc.states, inputs=mpc.inputs, terminal="states",
+        mpc.system, mpc.Q, mpc.R, 3, states=mpc.states, inputs=mpc.inputs, terminal="box",
         soft="exact",
     )  # fmt: skip
     assert exact.penalty.exact and exact.mpc.states is None
@@ -36,12 +36,12 @@ def test_design_builds_what_its_parts_say():
 def test_harden_undoes_soften():
     """Rows at all state steps become states, rows at N the terminal set; the set is the same."""
     mpc = problems.drifting(3)
-    back = jm.harden(jm.soften(mpc, 10.0))
+    back = jm.mpc.harden(jm.soften(mpc, 10.0))
     assert not back.soft and not back.outputs
     before, after = jm.feasible_polytope(mpc), jm.feasible_polytope(back)
     assert before.is_subset(after) and after.is_subset(before)
     odd = jm.Soft(np.array([[1.0, 0.0]]), np.array([0.5]), steps=(2,))
-    assert jm.harden(jm.MPC(mpc.system, mpc.Q, mpc.R, 3, soft=odd)).outputs[0].steps == (2,)
+    assert jm.mpc.harden(jm.MPC(mpc.system, mpc.Q, mpc.R, 3, soft=odd)).outputs[0].steps == (2,)
 
 
 @pytest.mark.parametrize(

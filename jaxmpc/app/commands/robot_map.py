@@ -14,6 +14,7 @@ from tqdm.std import tqdm
 from jaxmpc.app.commands.options import check_positive, check_results, model_hash, open_folder
 from jaxmpc.app.config.states import axis_indices
 from jaxmpc.checks import fail
+from jaxmpc.control.named_terminal import named_terminal_set
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Polytope
 from jaxmpc.mpc.problem import MPC
@@ -25,7 +26,6 @@ from jaxmpc.runs import versions, write_arrays, write_json
 from jaxmpc.sweeps import store
 from jaxmpc.sweeps.feasible_set import ARRAYS, grid
 from jaxmpc.sweeps.robots import Loops, RobotMap, RobotSetting, deviations
-from jaxmpc.workflow.controller_design import named_terminal_set
 
 # Points along each of two axes, and in all along another number of them.
 SIDE, POINTS = 32, 1024

@@ -19,6 +19,7 @@ from jaxmpc.app.config.sections import (
     SystemSection,
     matrix,
 )
+from jaxmpc.control.named_terminal import named_terminal_set
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
@@ -26,7 +27,6 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.soften import soften
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.sweeps.exact_penalty import exact_penalty
-from jaxmpc.workflow.controller_design import named_terminal_set
 
 # Commands that have a section of their own.
 COMMANDS = ("sweep", "recursion")
