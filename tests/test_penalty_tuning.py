@@ -11,7 +11,7 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.app.cli import main
-from jaxmpc.app.commands import sweep
+from jaxmpc.app.commands import linear_sweep
 from jaxmpc.sweeps import ladder, proofs
 from jaxmpc.sweeps.ladder import RungPenalties
 from jaxmpc.tuning import penalties as module
@@ -287,7 +287,7 @@ terminal = "box"
 
 def test_sweep_command_learns_and_its_labels_agree(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sweep, "CHUNK", 800)
+    monkeypatch.setattr(linear_sweep, "CHUNK", 800)
     Path("case.toml").write_text(CASE)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     asked = []
@@ -297,13 +297,15 @@ def test_sweep_command_learns_and_its_labels_agree(tmp_path, monkeypatch, capsys
         weight = np.exp(np.random.default_rng(0).normal(size=len(moving(problem).lower)))
         return sweep_penalties.SweepPenalties(RungPenalties(weight, 1.4), 0.9, 0.8)
 
-    monkeypatch.setattr(sweep, "tune_sweep_penalties", tune)
+    monkeypatch.setattr(linear_sweep, "tune_sweep_penalties", tune)
     command = "sweep --config case.toml --grid 40 20 --iterations 8 --no-refine --output"
     assert main([*command.split(), "a"]) == 0 and not asked
     assert main([*command.split(), "b", "--learn-penalties"]) == 0
     assert "80.00% -> 90.00% decided" in capsys.readouterr().err
     assert asked[0][0] == tmp_path / "cache/jaxmpc/penalties" and asked[0][1]["iterations"] == 8
-    labels = [np.asarray(sweep.store.read(tmp_path / k / "sweep.zarr")["label"]) for k in "ab"]
+    labels = [
+        np.asarray(linear_sweep.store.read(tmp_path / k / "sweep.zarr")["label"]) for k in "ab"
+    ]
     both = (labels[0] != 0) & (labels[1] != 0)
     assert np.array_equal(labels[0][both], labels[1][both]) and both.mean() > 0.99
     assert main([*command.split(), "b", "--resume", "--learn-penalties"]) == 0 and len(asked) == 1

@@ -3,7 +3,7 @@
 QP, solve_qp         a problem, and its solution -> QPSolution
 ADMM                 settings of the solver
 Status               how a solve ended, with a sentence for each
-Bounds               the set l ≤ Az ≤ u of a QP, with second-order cones
+Bounds               the constraints of a QP on Az: intervals, hard or soft, and balls
 feasibility_margin   by how much all limits can be tightened, or must be widened
 """
 

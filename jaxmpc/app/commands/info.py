@@ -44,8 +44,6 @@ class Info:
     horizon: Horizon = None
     """Prediction horizon, in steps of dt."""
     terminal: Terminal = None
-    """Set for the last state: none, largest set or largest ellipsoid that the LQR keeps within
-    limits, state limits."""
     steps: Annotated[int, option("K", "50")] = 50
     """Length of the closed loops."""
     loops: Annotated[int, option("K", "128")] = 128

@@ -20,6 +20,7 @@ from jaxmpc.runs import versions, write_json
 from jaxmpc.sweeps import store
 from jaxmpc.sweeps.feasible_set import FeasibleSetMap, Labels, label_chunks
 from jaxmpc.sweeps.ladder import RungPenalties
+from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
 
 # Names in the store, one row a state, and the fields of `Labels` that they hold.
 STORED = {
@@ -108,8 +109,6 @@ class LinearSweep:
 
         Raises ValueError for too few states, and where there is no folder to keep them in.
         """
-        from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
-
         if not store.pending(self.group):
             return None
         start, region, settings = time.perf_counter(), self.region, self.config.sweep

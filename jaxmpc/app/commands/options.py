@@ -14,16 +14,24 @@ from jaxmpc.checks import fail
 from jaxmpc.robots.robot import Robot
 
 
-def option(metavar: str | None, default: str) -> Any:
-    """Return how an option and its default appear in the help."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
+def option(metavar: str | None, default: str, text: str | None = None) -> Any:
+    """Return how an option and its default appear in the help.
+
+    text: what it means, where that takes more than a line; else the string below the field.
+    """
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})", help=text)
 
 
 # Options that several commands have.
 Horizon = Annotated[int | None, option("N", "from the file; joint 20")]
 Terminal = Annotated[
     Literal["none", "invariant", "ellipsoid", "box"] | None,
-    option("{none,invariant,ellipsoid,box}", "from the file, else none"),
+    option(
+        "{none,invariant,ellipsoid,box}",
+        "from the file, else none",
+        "Set for the last state: none, largest set or largest ellipsoid that the LQR keeps within "
+        "limits, state limits.",
+    ),
 ]
 End = Annotated[
     tuple[float, ...] | None, option("X [X ...]", "state limits, 3 % wider on each side")

@@ -78,15 +78,13 @@ class Recursion:
 
     config: Annotated[Path | None, option("FILE", "the built-in joint")] = None
     """TOML file with the problem."""
-    robot: Annotated[str | None, option("NAME|FILE", "none: a linear system")] = None
+    robot: Annotated[str | None, option("NAME|FILE", "none, a linear system")] = None
     """Map a robot instead, linear promise against nonlinear closed loop."""
     output: Annotated[Path, option("DIR", "jaxmpc-recursion")] = Path("jaxmpc-recursion")
     """Folder for the files; made where absent."""
     horizon: Horizon = None
     """Prediction horizon, in steps of dt."""
     terminal: Terminal = None
-    """Set for the last state: none, largest set or ellipsoid that the LQR keeps within limits,
-    state limits."""
     steps: Annotated[int | None, option("K", "from the file, else 20; robots 100")] = None
     """Length of the closed loops."""
     grid: Annotated[
@@ -99,10 +97,10 @@ class Recursion:
     upper: End = None
     """Upper end of the grid along each state, in its units."""
     axes: Annotated[
-        tuple[str, ...] | None, option("AXIS [AXIS ...]", "with --robot: the first joint's two")
+        tuple[str, ...] | None, option("AXIS [AXIS ...]", "those of the first joint")
     ] = None
     """With --robot: coordinates to map, by name or index from 0."""
-    fixed: Annotated[tuple[float, ...] | None, option("X [X ...]", "with --robot: home")] = None
+    fixed: Annotated[tuple[float, ...] | None, option("X [X ...]", "home")] = None
     """With --robot: values of the other coordinates, in their order."""
     regions: Annotated[int | None, option("K", "from the file, else 2000")] = None
     """Critical regions of the law to enumerate at most for a proof; 0: none."""
@@ -119,11 +117,14 @@ class Recursion:
 
     @property
     def keeps(self) -> str:
-        """What is kept of a run that is stopped."""
+        """Return what is kept of a run that is stopped."""
         return "chunks" if self.robot else ""
 
     def run(self) -> None:
-        """Examine the claims, write the files, print the table. Raises ValueError."""
+        """Examine the claims, write the files, print the table.
+
+        Raises ValueError for options and files that make no sense.
+        """
         begun = time.perf_counter()
         check_positive(self, "seconds", "smallest")
         if self.robot is not None:

@@ -33,7 +33,7 @@ class Simulate:
     How to start
       $ jaxmpc simulate
       $ jaxmpc simulate --robot arm7 --count 256 --seconds 1 --mass 0.1 --output runs/a
-      The first samples come after the compiler: 20 s for one joint, a minute for seven.
+      Compiling takes 20 s for one joint and a minute for seven, before the first samples.
 
     How to read the table
       success        robots that kept all limits and ended at the target: each coordinate within
@@ -65,20 +65,26 @@ class Simulate:
 
     robot: Annotated[str, option("NAME|FILE", "joint")] = "joint"
     """joint, pendulum, cartpole, arm2, arm6, arm7, quadrotor, or an MJCF or URDF file."""
-    config: Annotated[Path | None, option("FILE", "none: the options below")] = None
-    """TOML file of jaxmpc tune weights --robot: [robot] name, horizon, margin, linearize, [cost] Q,
-    R, P, rho. An option given here wins over the file."""
+    config: Annotated[
+        Path | None,
+        option(
+            "FILE",
+            "none",
+            "TOML file of jaxmpc tune weights --robot: [robot] name, horizon, margin, linearize, "
+            "[cost] Q, R, P, rho. An option given here wins over the file.",
+        ),
+    ] = None
     count: Annotated[int, option("B", "64")] = 64
     """Number of robots."""
     seconds: Annotated[float, option("S", "2")] = 2.0
-    """Simulated time."""
+    """Simulated time of each robot."""
     target: Annotated[tuple[float, ...] | None, option("Q [Q ...]", "home of the model")] = None
     """Configuration to rest at, one number a joint, in rad or m (qpos of MuJoCo)."""
     spread: Annotated[float, option("FRACTION", "0.5")] = 0.5
     """Starts are uniform around home, up to this fraction of the way to the limits.
     Where there is no limit, up to this number itself. In positions and velocities."""
     seed: Annotated[int, option("K", "0")] = 0
-    """Of starts, masses, damping and payloads."""
+    """Seed of starts, masses, damping and payloads."""
     linearize: Annotated[
         Literal["set-point", "state", "trajectory", "lqr"] | None,
         option("{set-point,state,trajectory,lqr}", "from --config, else state"),
@@ -108,7 +114,7 @@ class Simulate:
     """Each body's mass and inertia times a number from 1 - FRACTION to 1 + FRACTION.
     The MPC does not know: it has the model of the file."""
     damping: Annotated[float, option("FRACTION", "0")] = 0.0
-    """The same for the damping of each joint."""
+    """Each joint's damping times a number from 1 - FRACTION to 1 + FRACTION."""
     payload: Annotated[float, option("KG", "0")] = 0.0
     """Mass from 0 to KG at the site "tool" of the model; the MPC does not know."""
     tolerance: Annotated[float, option("FRACTION", "0.02")] = 0.02
@@ -131,7 +137,10 @@ class Simulate:
     keeps = "chunks"
 
     def run(self) -> None:
-        """Simulate all robots, write the files, print the table. Raises ValueError."""
+        """Simulate all robots, write the files, print the table.
+
+        Raises ValueError for options and files that make no sense.
+        """
         self.check()
         command = self.settled()
         runs = RobotRuns.open(command)

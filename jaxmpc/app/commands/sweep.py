@@ -74,17 +74,15 @@ class Sweep:
 
     config: Annotated[Path | None, option("FILE", "the built-in joint")] = None
     """TOML file with the problem and the sweep."""
-    robot: Annotated[str | None, option("NAME|FILE", "none: a linear system")] = None
+    robot: Annotated[str | None, option("NAME|FILE", "none, a linear system")] = None
     """Map a robot instead, linear promise against nonlinear closed loop."""
-    seconds: Annotated[float | None, option("S", "with --robot: 2")] = None
-    """Length of the robot's closed loops."""
+    seconds: Annotated[float | None, option("S", "2")] = None
+    """With --robot: length of its closed loops."""
     output: Annotated[Path, option("DIR", "jaxmpc-sweep")] = Path("jaxmpc-sweep")
     """Folder for sweep.zarr, map.png and summary.json; made where absent."""
     horizon: Horizon = None
     """Prediction horizon, in steps of dt."""
     terminal: Terminal = None
-    """Set for the last state: none, largest set or ellipsoid that the LQR keeps within limits,
-    state limits."""
     grid: Annotated[tuple[int, ...] | None, option("K [K ...]", "from the file, else 256 256")] = (
         None
     )
@@ -108,10 +106,18 @@ class Sweep:
         option("{float32,float64}", "from the file, else float32"),
     ] = None
     """Precision of the solver's steps. Proofs are in float64 always."""
-    learn_penalties: Switch = False
-    """Learn penalties of the first pass for this problem (kept in ~/.cache/jaxmpc/penalties), so
-    that it leaves fewer states open. Learning costs about what a million states cost, and saves up
-    to a quarter of that: for problems that are swept again and again."""
+    learn_penalties: Annotated[
+        bool,
+        tyro.conf.FlagCreatePairsOff,
+        option(
+            None,
+            "off",
+            "Learn penalties of the first pass for this problem (kept in "
+            "~/.cache/jaxmpc/penalties), so that it leaves fewer states open. Learning costs about "
+            "what a million states cost, and saves up to a quarter of that: for problems that are "
+            "swept again and again.",
+        ),
+    ] = False
     resume: Switch = False
     """Go on with the sweep in --output."""
     overwrite: Switch = False
@@ -122,7 +128,10 @@ class Sweep:
     keeps = "chunks"
 
     def run(self) -> None:
-        """Label all states, write the files, print the table. Raises ValueError."""
+        """Label all states, write the files, print the table.
+
+        Raises ValueError for options and files that make no sense.
+        """
         if self.robot is not None:
             self.robot_map(self.robot).run()
             return

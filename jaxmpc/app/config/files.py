@@ -1,4 +1,4 @@
-"""TOML files."""
+"""Reading and writing of TOML files."""
 
 import re
 import tomllib
@@ -12,6 +12,7 @@ from jaxmpc.checks import fail
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
+    """Return what a file holds. Raises ValueError where it cannot be read or is no TOML."""
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
@@ -21,7 +22,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 
 def to_toml(document: Mapping[str, Any]) -> str:
-    """TOML text with each vector, and each row of a matrix, on a line."""
+    """Return TOML text with each vector, and each row of a matrix, on a line."""
     text = tomli_w.dumps(document)
     line = lambda found: f"[{' '.join(part.strip() for part in found[1].splitlines())}]"
     # What holds a bracket of its own, a matrix or a name with one, stays as it is.

@@ -12,7 +12,7 @@ from jaxmpc.checks import fail
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class RobotSection:
-    """Which robot's MPC this is, and what of it `robot_mpc` and RobotController take."""
+    """Which robot's MPC this is, with arguments of `robot_mpc` and `RobotController`."""
 
     name: str
     horizon: Annotated[int, Field(ge=1, strict=True)] = 20
@@ -22,7 +22,7 @@ class RobotSection:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class RobotCostSection:
-    """As in a linear problem. rho: the L1 weight of state limits, always soft."""
+    """J as in a linear problem. rho: the L1 weight of state limits, which are always soft."""
 
     Q: Vector | Matrix
     R: Vector | Matrix
@@ -32,14 +32,16 @@ class RobotCostSection:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class RobotConfig:
-    """The weights of a robot's MPC, as a file says them."""
+    """The weights of a robot's MPC: the sections of the file."""
 
     robot: RobotSection
     cost: RobotCostSection
 
     def weights(self, robot: Any) -> dict[str, Any]:
-        """Q, R and terminal_cost, as `robot_mpc` takes them. Raises ValueError where the file is of
-        another robot."""
+        """Return Q, R and terminal_cost as `robot_mpc` takes them.
+
+        Raises ValueError where the file is of another robot, or of other sizes.
+        """
         if self.robot.name != robot.name:
             fail("robot.name", f"{self.robot.name!r}, asked is {robot.name!r}", "Give that --robot")
         cost = self.cost
@@ -55,7 +57,7 @@ class RobotConfig:
         return {"Q": matrix(cost.Q), "R": matrix(cost.R), "terminal_cost": terminal}
 
     def to_toml(self) -> str:
-        """The file that `load_robot_config` reads back."""
+        """Return the text of a file that `load_robot_config` reads back."""
         return to_toml(ROBOT_ADAPTER.dump_python(self, exclude_none=True))
 
 
