@@ -4,7 +4,9 @@ import dataclasses
 import os
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -60,6 +62,9 @@ class LinearSweep:
         """Label all states, write map and summary, print the table."""
         start = time.perf_counter()
         print(f"{self.config.name}: {len(self.region.points):,} initial states -> {self.output}")
+        # The compiler keeps one core busy; meanwhile another can load matplotlib.
+        plots = Thread(target=import_module, args=("jaxmpc.app.plots.feasible_set",), daemon=True)
+        plots.start()
         timing = self.label(self.penalties() if learn_penalties else None)
         fmap = self.map()
         dimension = len(self.region.axes)
