@@ -2,6 +2,8 @@
 
 import functools
 import inspect
+import subprocess
+import sys
 import types
 import typing
 
@@ -39,6 +41,14 @@ def test_a_namespace_lists_itself(name):
     for entry in module.__all__:
         assert getattr(module, entry) is not None
         assert entry in module.__doc__, f"{entry} is missing in the docstring of {name}"
+
+
+def test_what_few_need_is_imported_late():
+    """By `import jaxmpc`, and by the command before it knows what to do."""
+    late = {"mujoco", "matplotlib", "zarr", "xarray", "pydantic", "PIL"}
+    program = f"import sys, jaxmpc, jaxmpc.app.cli; sys.exit(', '.join({late} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stderr.strip() == ""
 
 
 def test_every_public_object_says_what_it_is():

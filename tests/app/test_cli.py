@@ -161,6 +161,19 @@ def test_wrong_usage(arguments, capsys):
     assert "Traceback" not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("line", "names"),
+    [("--help", "sweep recursion info simulate tune"), ("tune --help", "weights penalties")],
+)
+def test_help_has_a_line_for_each_command(line, names, capsys):
+    with pytest.raises(SystemExit) as caught:
+        run(line)
+    assert caught.value.code == 0
+    text = capsys.readouterr().out
+    for name in names.split():
+        assert f"• {name} " in text
+
+
 def test_help_is_a_page_a_stranger_can_use(capsys):
     with pytest.raises(SystemExit) as caught:
         run("sweep --help")

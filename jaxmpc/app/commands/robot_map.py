@@ -12,7 +12,7 @@ import zarr
 from tqdm.std import tqdm
 
 from jaxmpc.app.commands.options import check_positive, check_results, model_hash, open_folder
-from jaxmpc.app.config.states import axis_indices
+from jaxmpc.app.config.states import axis_indices, grid_ends
 from jaxmpc.checks import fail
 from jaxmpc.control.named_terminal import named_terminal_set
 from jaxmpc.control.riccati import lqr
@@ -128,18 +128,13 @@ class RobotMapCommand:
         """Return the grid (B, d) over the axes. Raises ValueError for options of other sizes."""
         d = len(axes)
         shape = tuple(self.grid or ((SIDE, SIDE) if d == 2 else (int(POINTS ** (1 / d)),) * d))
-        limits = (np.asarray(v)[list(axes)] for v in vars(robot.state_limits).values())
-        low, high = limits
-        room = 0.03 * np.where(np.isfinite(high - low), high - low, 0.0)
-        lower = low - room if self.lower is None else np.asarray(self.lower)
-        upper = high + room if self.upper is None else np.asarray(self.upper)
-        for name, value in (("--grid", shape), ("--lower", lower), ("--upper", upper)):
-            if len(value) != d:
-                fail(name, f"has {len(value)} entries where {d} are needed", "One for each axis")
-        if not np.all(np.isfinite([lower, upper])) or np.any(lower >= upper):
-            ends = f"from {lower.tolist()} to {upper.tolist()}"
-            fail("--lower", f"no range to map: {ends}", "Give --lower below --upper, finite")
-        return grid(lower, upper, shape)
+        for name, value in (("grid", shape), ("lower", self.lower), ("upper", self.upper)):
+            if value is not None and len(value) != d:
+                what = f"has {len(value)} entries where {d} are needed"
+                fail(f"--{name}", what, "One for each axis")
+        box = robot.state_limits
+        limits = lambda: tuple(np.asarray(end)[list(axes)] for end in (box.lower, box.upper))
+        return grid(*grid_ends("--", self.lower, self.upper, limits), shape)
 
     def label(self, setting: RobotSetting, group: zarr.Group) -> None:
         """Label the chunks that are not done, and commit each."""

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.app.config.problem import COMMANDS, Config
-from jaxmpc.app.config.states import grid_ends, mapped_axes, recursion_states
+from jaxmpc.app.config.states import mapped_axes, recursion_states, section_ends
 from jaxmpc.checks import fail
 
 
@@ -55,7 +55,7 @@ def _check_sweep(config: Config, n: int) -> None:
         cure = f"Give the {n - d} other values in sweep.fixed (a slice) or projection = true"
         both = "fixed and projection exclude each other"
         fail("sweep.fixed", both if sweep.projection else f"{n} states, {d} mapped", cure)
-    grid_ends(config, mapped_axes(config), sweep)
+    section_ends(config, mapped_axes(config), sweep)
 
 
 def _check_recursion(config: Config, n: int) -> None:

@@ -1,6 +1,6 @@
 """The initial states that the commands sweep and recursion ask about: grids over state limits."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +22,7 @@ class SweepPoints(NamedTuple):
 def sweep_points(config: Config) -> SweepPoints:
     """Return the grid of initial states that [sweep] describes."""
     axes = mapped_axes(config)
-    lower, upper = grid_ends(config, axes, config.sweep)
+    lower, upper = section_ends(config, axes, config.sweep)
     d = len(axes)
     # 256 along each of two axes; about as many points in all along more.
     shape = config.sweep.grid or (min(256, int(65_536.5 ** (1 / d))),) * d
@@ -40,7 +40,7 @@ def recursion_states(config: Config) -> np.ndarray | None:
     if recursion.grid is None and n > 3:
         return None
     shape = recursion.grid or {1: (1001,), 2: (128, 128), 3: (24, 24, 24)}[n]
-    return grid(*grid_ends(config, tuple(range(n)), recursion), shape)
+    return grid(*section_ends(config, range(n), recursion), shape)
 
 
 def mapped_axes(config: Config) -> tuple[int, ...]:
@@ -71,25 +71,34 @@ def axis_indices(
     return tuple(axes)
 
 
-def grid_ends(
-    config: Config, axes: tuple[int, ...], sweep: SweepSection | RecursionSection
+def section_ends(
+    config: Config, axes: Sequence[int], section: SweepSection | RecursionSection
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of the grid: as given, else the state limits widened by 3 %."""
-    where = "sweep" if isinstance(sweep, SweepSection) else "recursion"
-    if sweep.lower is not None and sweep.upper is not None:
-        return np.asarray(sweep.lower), np.asarray(sweep.upper)
-    low, high = (end[list(axes)] for end in config.state_range())
-    margin = 0.03 * (high - low) if np.all(np.isfinite([low, high])) else np.nan
-    lower = np.asarray(sweep.lower) if sweep.lower is not None else low - margin
-    upper = np.asarray(sweep.upper) if sweep.upper is not None else high + margin
-    if not np.all(np.isfinite([lower, upper])):
-        ends = f"Give {where}.lower and {where}.upper"
-        cure = f"{ends}: the state limits do not bound the mapped axes"
-        fail(f"{where}.lower", "no finite range to sweep", cure)
-    if np.any(lower >= upper):
-        fail(
-            f"{where}.lower",
-            f"{lower.tolist()} not below upper {upper.tolist()}",
-            "Lower must be below upper",
-        )
-    return lower, upper
+    """Return the corners of the grid of [sweep] or [recursion]; see `grid_ends`."""
+    where = "sweep." if isinstance(section, SweepSection) else "recursion."
+    limits = lambda: tuple(end[list(axes)] for end in config.state_range())
+    return grid_ends(where, section.lower, section.upper, limits)
+
+
+def grid_ends(
+    where: str, lower: Sequence[float] | None, upper: Sequence[float] | None,
+    limits: Callable[[], tuple[np.ndarray, ...]],
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the corners of a grid: as given, else the limits widened by 3 % on each side.
+
+    where: what stands before lower and upper in the ValueError that is raised where an end is not
+    finite, or lower not below upper.
+    """
+    low, high = limits() if lower is None or upper is None else (lower, upper)
+    room = 0.03 * np.where(np.isfinite([low, high]).all(axis=0), np.subtract(high, low), 0.0)
+    ends = (
+        np.asarray(low - room if lower is None else lower),
+        np.asarray(high + room if upper is None else upper),
+    )
+    if not np.all(np.isfinite(ends)):
+        cure = f"Give {where}lower and {where}upper: the limits do not bound the mapped axes"
+        fail(f"{where}lower", "no finite range to map", cure)
+    if np.any(ends[0] >= ends[1]):
+        what = f"{ends[0].tolist()} not below upper {ends[1].tolist()}"
+        fail(f"{where}lower", what, "Lower must be below upper")
+    return ends
