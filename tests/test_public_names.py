@@ -60,7 +60,7 @@ def test_every_public_object_says_what_it_is():
 def returned(found):
     """The functions, methods and properties whose results a user of `found` can get."""
     if not inspect.isclass(found):
-        return [found]
+        return [found] if callable(found) else []
     members = [member for name, member in vars(found).items() if not name.startswith("_")]
     wrapped = (staticmethod, classmethod)
     plain = [member.__func__ if isinstance(member, wrapped) else member for member in members]
