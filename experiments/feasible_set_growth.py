@@ -40,8 +40,9 @@ import tyro
 from jax.scipy.linalg import expm
 
 import jaxmpc as jm
-from jaxmpc.config import load
+from jaxmpc.app.config import load
 from jaxmpc.control.riccati import cost_of_law
+from jaxmpc.feasible import FeasibleSetMap
 from jaxmpc.tuning.feasibility import feasible_share, tune_feasible_set
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
@@ -108,13 +109,13 @@ def samples(mpc: jm.MPC, count: int, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(box.lower, box.upper, (count, mpc.system.n))
 
 
-def area(mpc: jm.MPC, s: Settings) -> tuple[jm.FeasibleSetMap, tuple[float, float]]:
+def area(mpc: jm.MPC, s: Settings) -> tuple[FeasibleSetMap, tuple[float, float]]:
     """The refined map, and the proved bounds of its area."""
     fmap = jm.map_feasible_set(mpc, samples(mpc, 64, s.seed + 1)).refine(s.tolerance)
     return fmap, fmap.volume_bounds()
 
 
-def inside(fmap: jm.FeasibleSetMap, count: int, seed: int) -> np.ndarray:
+def inside(fmap: FeasibleSetMap, count: int, seed: int) -> np.ndarray:
     """States spread evenly over the inner polytope of a map."""
     polytope = fmap.inner()
     H, h = np.asarray(polytope.H), np.asarray(polytope.h)

@@ -35,7 +35,7 @@ from hidden_product import Settings as Product
 from scipy import sparse
 
 import jaxmpc as jm
-from jaxmpc import config
+from jaxmpc.app import config
 from jaxmpc.mpc.condense import Condensed, condense, in_float64
 from jaxmpc.qp.admm import factor, iterate, read, scaled
 from jaxmpc.qp.problem import residual_terms
@@ -110,7 +110,7 @@ def case(name: str) -> Case:
         tracked = {"reference": home, "input_reference": np.asarray(u)}
         wide = np.array([1.0, 1.0, 3.5, 5.5])
         return Case(mpc, lambda rng, k: home + rng.uniform(-wide, wide, (k, 4)), tracked)
-    mpc = joint() if name == "joint" else config.load(HERE / f"{name}.toml", {}).build()[0]
+    mpc = joint() if name == "joint" else config.load(HERE / f"{name}.toml").build_mpc()
     lower, upper = np.asarray(mpc.states.lower), np.asarray(mpc.states.upper)
     return Case(mpc, lambda rng, k: rng.uniform(lower, upper, (k, len(lower))), tracked)
 

@@ -16,6 +16,7 @@ from tqdm.std import tqdm
 from jaxmpc.checks import fail
 from jaxmpc.compiled import Compiled, first_rows, padded
 from jaxmpc.control.system import LinearSystem
+from jaxmpc.mpc.feedback import LinearFeedback as LinearFeedback
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.status import Status
 

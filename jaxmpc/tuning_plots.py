@@ -11,11 +11,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
+from jaxmpc.app.plots.closed_loops import draw_limits, panel_columns
+from jaxmpc.app.plots.style import INFEASIBLE, TERMINAL, ring
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop import Run
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.outcome import batch_of, coordinates
-from jaxmpc.plots import _INFEASIBLE, _TERMINAL, _columns, _draw_limits, _ring
 from jaxmpc.tuning.descent import Descent
 from jaxmpc.tuning.penalties import Penalties
 
@@ -168,7 +169,7 @@ def plot_before_after(
         (coordinates(plant, run.states)[shown], np.asarray(run.inputs, float)[shown])
         for run in (before, after)
     ]
-    columns = _columns(plant)
+    columns = panel_columns(plant)
     rows = max(len(panels) for _, panels in columns)
     figure = Figure(
         figsize=(3.4 * len(columns) + 0.2, max(1.35 * rows, 2.4) + 1.0), layout="constrained"
@@ -191,7 +192,7 @@ def plot_before_after(
                 style: dict[str, Any] = {"drawstyle": "steps-post"} if kind else {}
                 ax.plot(time, lines, color=colour, lw=width, alpha=0.9, **style)
             ends = [float(np.asarray(end)[i]) for end in (limits.lower, limits.upper)]
-            _draw_limits(ax, ends, None if target is None else float(np.asarray(target)[i]))
+            draw_limits(ax, ends, None if target is None else float(np.asarray(target)[i]))
             ax.set_ylabel(label, fontsize=8)
             ax.tick_params(labelsize=7)
             ax.set_xlim(0, time[-1])
@@ -199,10 +200,10 @@ def plot_before_after(
     handles: list[Any] = [
         Line2D([], [], color=_BEFORE, lw=2.2, label="before"),
         Line2D([], [], color=_AFTER, lw=1.0, label="after"),
-        Patch(facecolor=_INFEASIBLE, edgecolor="#8a8a8a", linewidth=0.6, label="outside limits"),
+        Patch(facecolor=INFEASIBLE, edgecolor="#8a8a8a", linewidth=0.6, label="outside limits"),
     ]
     if reference is not None or input_reference is not None:
-        style = {"color": _TERMINAL, "lw": 1.0, "ls": (0, (4, 2))}
+        style = {"color": TERMINAL, "lw": 1.0, "ls": (0, (4, 2))}
         handles.append(Line2D([], [], label="set-point", **style))
     figure.suptitle(title, fontsize=9, x=0.01, ha="left")
     figure.legend(
@@ -219,7 +220,7 @@ def plot_maps(before: FeasibleSetMap, after: FeasibleSetMap) -> Figure:
         (before, "before", _BEFORE, (0, (4, 2))),
         (after, "after", _AFTER, "-"),
     ):
-        corners = _ring(fmap.inner)
+        corners = ring(fmap.inner)
         low, high = fmap.volume_bounds()
         if len(corners):
             label = f"{name}: area {low:.5g} to {high:.5g}"

@@ -10,8 +10,8 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.cli import main
-from jaxmpc.commands import sweep
+from jaxmpc.app.cli import main
+from jaxmpc.app.commands import linear_sweep
 from jaxmpc.feasible.candidates import StagePenalties, compiled_admm
 from jaxmpc.feasible.constraint_rows import weighted
 from jaxmpc.feasible.problem import FeasibilityProblem
@@ -52,7 +52,7 @@ def learned(tmp_path_factory):
 
 def test_more_states_are_solved_on_others(learned):
     found, x = learned[0], states(300, 1)
-    rows = len(jm.row_table(mpc()))
+    rows = len(jm.mpc.row_table(mpc()))
     assert found.solver.iterations == 30 and found.solver.refine == 0
     assert np.shape(found.solver.rho) == (2, rows)
     # Two stages, so that one program serves both.
@@ -66,7 +66,7 @@ def test_more_states_are_solved_on_others(learned):
 def test_gradient_against_differences():
     """Of the loss with respect to log rho and alpha, with warm starts and a reference."""
     rng = np.random.default_rng(0)
-    x, rows = states(12, 2), len(jm.row_table(mpc()))
+    x, rows = states(12, 2), len(jm.mpc.row_table(mpc()))
     start = rng.normal(size=(12, 5)), rng.normal(size=(12, rows))
     setting, samples, _ = module.prepared(
         mpc(), x, 20, 2, "step", DEFAULT, 4, 0.5, start, np.array([0.3, 0.1]), None, 0, 1
@@ -135,7 +135,7 @@ def test_groups_over_horizons(learned):
     longer = found.for_mpc(mpc(10), 40)
     assert longer.iterations == 40 and longer.alpha == found.solver.alpha
     # Step 2k of ten stands where step k of five does.
-    tables = [jm.row_table(problem) for problem in (mpc(), mpc(10))]
+    tables = [jm.mpc.row_table(problem) for problem in (mpc(), mpc(10))]
     of = {(r.kind, r.step, r.index): rho for r, rho in zip(tables[1], longer.rho.T, strict=True)}
     assert len(of) == len(tables[1])
     for row, rho in zip(tables[0], found.solver.rho.T, strict=True):
@@ -287,7 +287,7 @@ terminal = "box"
 
 def test_sweep_command_learns_and_its_labels_agree(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sweep, "CHUNK", 800)
+    monkeypatch.setattr(linear_sweep, "CHUNK", 800)
     Path("case.toml").write_text(CASE)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     asked = []
@@ -297,13 +297,15 @@ def test_sweep_command_learns_and_its_labels_agree(tmp_path, monkeypatch, capsys
         weight = np.exp(np.random.default_rng(0).normal(size=len(moving(problem).lower)))
         return sweep_penalties.SweepPenalties(StagePenalties(weight, 1.4), 0.9, 0.8)
 
-    monkeypatch.setattr(sweep, "tune_sweep_penalties", tune)
+    monkeypatch.setattr(linear_sweep, "tune_sweep_penalties", tune)
     command = "sweep --config case.toml --grid 40 20 --iterations 8 --no-refine --output"
     assert main([*command.split(), "a"]) == 0 and not asked
     assert main([*command.split(), "b", "--learn-penalties"]) == 0
     assert "80.00% -> 90.00% decided" in capsys.readouterr().err
     assert asked[0][0] == tmp_path / "cache/jaxmpc/penalties" and asked[0][1]["iterations"] == 8
-    labels = [np.asarray(sweep.store.read(tmp_path / k / "sweep.zarr")["label"]) for k in "ab"]
+    labels = [
+        np.asarray(linear_sweep.store.read(tmp_path / k / "sweep.zarr")["label"]) for k in "ab"
+    ]
     both = (labels[0] != 0) & (labels[1] != 0)
     assert np.array_equal(labels[0][both], labels[1][both]) and both.mean() > 0.99
     assert main([*command.split(), "b", "--resume", "--learn-penalties"]) == 0 and len(asked) == 1

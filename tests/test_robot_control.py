@@ -10,6 +10,7 @@ import pytest
 from test_robots import c_affine, c_steps
 
 import jaxmpc as jm
+from jaxmpc.closed_loop import LinearFeedback
 
 T, J = 0.01, 0.05
 DOUBLE = jm.LinearSystem(np.array([[1, T], [0, 1]]), np.array([[T * T / J], [T / J]]), dt=T)
@@ -209,7 +210,7 @@ def test_linear_plant_is_the_linear_loop(mode, linear_mpc):
 def test_chunks_and_variations(linear_mpc):
     """Chunks give what one does; variations change the plant alone, loop by loop."""
     gain = jm.lqr(DOUBLE, np.diag([50.0, 1.0]), np.array([[0.1]])).K
-    feedback = jm.LinearFeedback(linear_mpc, gain, PLANT)
+    feedback = LinearFeedback(linear_mpc, gain, PLANT)
     B = np.asarray(DOUBLE.B) * np.linspace(0.5, 1.5, 5)[:, None, None]
     whole = jm.simulate_many(feedback, PLANT, LINEAR_STARTS, 40, variations={"B": B})
     parts = jm.simulate_many(feedback, PLANT, LINEAR_STARTS, 40, variations={"B": B}, chunk=2)
@@ -347,15 +348,18 @@ def test_bad_problems_and_controllers_are_named(pendulum, linear_mpc):
         ),
         (lambda: jm.RobotController(pendulum, mpc, solver, penalty=-1.0), "rho"),
         (lambda: jm.RobotController(pendulum, mpc, jm.ADMM(rho=[1.0, 2.0])), "rho: shape"),
-        (lambda: jm.LinearFeedback(mpc, [1.0, 2.0]), "K: shape .2,. where .1, 2. is needed"),
-        (lambda: jm.LinearFeedback(mpc, [[np.nan, 2.0]]), "K: holds NaN"),
+        (
+            lambda: LinearFeedback(mpc, [1.0, 2.0]),
+            "K: shape .2,. where .1, 2. is needed",
+        ),
+        (lambda: LinearFeedback(mpc, [[np.nan, 2.0]]), "K: holds NaN"),
     ):
         with pytest.raises(ValueError, match=message):
             call()
 
 
 def test_bad_loops_are_named(pendulum, linear_mpc):
-    law = jm.LinearFeedback(linear_mpc, [[-1.0, -1.0]], PLANT)
+    law = LinearFeedback(linear_mpc, [[-1.0, -1.0]], PLANT)
     x0s = LINEAR_STARTS
     many = jm.simulate_many
     quadrotor = jm.load_robot("quadrotor")

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import jaxmpc as jm
-from jaxmpc import cli
-from jaxmpc.commands import tune, tune_penalties
-from jaxmpc.commands.sweep import Sweep, prepare
-from jaxmpc.config import Config, load, load_robot_config
+from jaxmpc.app import cli
+from jaxmpc.app.commands import tune, tune_penalties
+from jaxmpc.app.commands.sweep import Sweep
+from jaxmpc.app.config import load, load_robot_config
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.tuning.penalties import Penalties
 
@@ -93,14 +93,14 @@ def test_weights_cut_off_resumed_and_read_back(tmp_path, monkeypatch, capsys, gi
 
     # The file holds the tuned weights, its P = "Q" follows, and other commands take it.
     config = load(folder / "tuned.toml")
-    mpc, region = config.build()
+    mpc = config.build_mpc()
     np.testing.assert_array_equal(mpc.Q, made.values["Q"])
     np.testing.assert_array_equal(mpc.R, made.values["R"])
     np.testing.assert_array_equal(mpc.terminal_cost, mpc.Q)
-    assert mpc.horizon == 3 and not np.array_equal(mpc.Q, Config.default().build_mpc().Q)
+    assert mpc.horizon == 3 and not np.array_equal(mpc.Q, load(None).build_mpc().Q)
     same = replace(made.mpc, Q=mpc.Q, R=mpc.R)
     assert jax.tree.structure(replace(same, prestabilise=None)) == jax.tree.structure(mpc)
-    job = prepare(Sweep(config=folder / "tuned.toml", output=tmp_path / "maps"))
+    job = Sweep(config=folder / "tuned.toml", output=tmp_path / "maps").open()
     np.testing.assert_array_equal(job.mpc.Q, mpc.Q)
     # The loops after tuning, counted from outside: |q| <= 1.5, |dq| <= 2.
     with jax.enable_x64(True):
@@ -139,7 +139,7 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
     solver = config.build_solver()
     np.testing.assert_array_equal(solver.rho, rho)
     assert (solver.iterations, solver.alpha, solver.refine) == (6, 1.7, 0)
-    assert replace(config, solver=None) == Config.default({"horizon": 3})
+    assert replace(config, solver=None) == load(None, {"horizon": 3})
     record = json.loads((tmp_path / "out" / "penalties.json").read_text())
     assert record["finished"] and record["result"]["solved"] == 0.5
     assert (tmp_path / "out" / "penalties.png").read_bytes()[:4] == b"\x89PNG"
@@ -199,7 +199,7 @@ def test_errors_are_one_line_before_any_run(capsys, monkeypatch, given_starts, a
 
 
 def test_start_without_positive_weight_is_named(tmp_path, capsys, given_starts):
-    text = Config.default({"horizon": 3}).to_toml()
+    text = load(None, {"horizon": 3}).to_toml()
     for old, new, options, message in (
         ("Q = [50.0, 1.0]", "Q = [50.0, 0.0]", "", "Q is not positive definite"),
         ("Q = [50.0, 1.0]", "Q = [[2.0, 1.0], [1.0, 2.0]]", "", "Add --weights full"),

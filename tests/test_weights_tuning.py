@@ -169,7 +169,7 @@ def test_derivatives_of_100_random_problems(x64):
 
     compare(lambda v, x: cost(v, x, jm.ADMM(iterations=50, refine=20)), settings)
     # ADMM's own penalty, one a row and stage, of a loop that is far from converged.
-    rows = len(jm.row_table(jm.soften(MPC, 1.0)))
+    rows = len(jm.mpc.row_table(jm.soften(MPC, 1.0)))
     settings = {"rho_admm": np.exp(0.5 * rng.normal(size=(100, 2, rows)))}
     few = lambda v: jm.ADMM(iterations=8, refine=0, rho=v["rho_admm"], differentiate="unrolled")
     fixed = {"Q": MPC.Q, "R": MPC.R, "P": MPC.Q, "rho": 5.0}

@@ -25,6 +25,7 @@ import optax
 import tyro
 
 import jaxmpc as jm
+from jaxmpc.closed_loop import Run
 from jaxmpc.tuning.parameters import Parameter
 from jaxmpc.tuning.weights import tune_weights
 
@@ -106,10 +107,10 @@ def arm2(s: Settings, rng: np.random.Generator) -> Case:
     return Case(robot, controller, hidden, x_ref + shift, aims, robot.state_limits.half_widths())
 
 
-def imitation(starts: np.ndarray, states: np.ndarray, size: np.ndarray) -> Callable[[jm.Run], Any]:
+def imitation(starts: np.ndarray, states: np.ndarray, size: np.ndarray) -> Callable[[Run], Any]:
     """Mean squared distance of a run to the expert's states (B, T+1, n) from the same start."""
 
-    def loss(run: jm.Run) -> Any:
+    def loss(run: Run) -> Any:
         same = jnp.argmin(jnp.sum((jnp.asarray(starts) - run.states[0]) ** 2, axis=1))
         return jnp.mean(((run.states - jnp.asarray(states)[same]) / jnp.asarray(size)) ** 2)
 

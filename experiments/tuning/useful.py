@@ -37,6 +37,7 @@ from searchers import SEARCHERS, Space, search, within
 import jaxmpc as jm
 from jaxmpc.closed_loop import Steps
 from jaxmpc.compiled import Compiled
+from jaxmpc.robots import Robot
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter, raw
 from jaxmpc.tuning.weights import Problem, tune_weights
@@ -80,7 +81,7 @@ class Settings:
     seed: int = 0
 
 
-def world(s: Settings, robot: jm.Robot, count: int, seed: int) -> tuple[np.ndarray, dict]:
+def world(s: Settings, robot: Robot, count: int, seed: int) -> tuple[np.ndarray, dict]:
     """Starts (B, n), and masses, inertias, damping, payloads of B robots."""
     rng, model = np.random.default_rng([s.seed, seed]), robot.mujoco
     shift = s.spread * rng.uniform(-1, 1, (count, robot.state_size))
@@ -96,7 +97,7 @@ def world(s: Settings, robot: jm.Robot, count: int, seed: int) -> tuple[np.ndarr
     return np.asarray(robot.home) + shift, varied
 
 
-def law(s: Settings, robot: jm.Robot) -> tuple[dict, Callable, jm.ADMM]:
+def law(s: Settings, robot: Robot) -> tuple[dict, Callable, jm.ADMM]:
     """The guess, and the controller as a function of the diagonals of Q and R."""
     mpc = jm.robot_mpc(robot, horizon=s.horizon, margin=s.margin)
     solver = jm.ADMM(s.iterations, refine=s.refine)

@@ -8,10 +8,8 @@ grid                 points of a regular grid
 FeasibilityProblem   the hard constraints of an MPC problem, transcribed once
 Labels               labels of points with their proofs
 StagePenalties       learned penalties of the first stage of the labels
-store                results kept chunk by chunk on the disk
 """
 
-from jaxmpc.feasible import store
 from jaxmpc.feasible.candidates import StagePenalties
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import FeasibleSetMap, grid, map_feasible_set
@@ -31,5 +29,4 @@ __all__ = [
     "feasible_polytope",
     "grid",
     "map_feasible_set",
-    "store",
 ]

@@ -24,13 +24,15 @@ import uuid
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import xarray as xr
 import zarr
 
 from jaxmpc.checks import fail
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 def open_sweep(
@@ -135,8 +137,10 @@ def save_bounds(
         group.create_array(name, data=value, overwrite=True, dimension_names=dimensions)
 
 
-def read(path: str | Path) -> xr.Dataset:
+def read(path: str | Path) -> "xr.Dataset":
     """The store as an xarray Dataset (lazy); rows of chunks not done hold the fill values."""
+    import xarray as xr  # takes longer to import than to read
+
     _open(Path(path), "r")
     return xr.open_zarr(path, consolidated=False, mask_and_scale=False)
 

@@ -13,6 +13,8 @@ import problems
 import pytest
 
 import jaxmpc as jm
+from jaxmpc.feasible import feasible_growth
+from jaxmpc.recursion import smallest_horizon
 
 P_DARE, K_DARE = np.array(problems.P_JOINT), np.array(problems.K_JOINT)
 
@@ -88,7 +90,7 @@ def lecture_recursion():
     assert np.abs(np.abs(worst.state) - [0.95, 1.0]).max() < 1e-3
     assert worst.normal @ worst.next_state > worst.offset
     assert report.lost_by_law == pytest.approx(0.02, abs=1e-6)
-    assert jm.smallest_horizon(problems.lecture(), 5).horizon == 4
+    assert smallest_horizon(problems.lecture(), 5).horizon == 4
 
 
 def lecture_weaker():
@@ -172,7 +174,7 @@ GROWTH = {5: 2.8660955786866498, 20: 5.523166981610873, 60: 11.740489512145142}
 
 def joint_o_inf():
     """X_N with terminal set O_inf grows by 0.8 for 5 steps; 22 vertices at N = 20."""
-    growth = jm.feasible_growth(problems.joint_o_inf(), tuple(GROWTH))
+    growth = feasible_growth(problems.joint_o_inf(), tuple(GROWTH))
     np.testing.assert_allclose(growth.volume, list(GROWTH.values()), rtol=1e-8)
     np.testing.assert_array_equal(growth.facets, [16, 22, 16])
 

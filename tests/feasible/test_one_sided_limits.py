@@ -17,6 +17,7 @@ from scipy.optimize import linprog
 import jaxmpc as jm
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.exact_data import exact_data, hard_blocks
+from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.view import make_view
 from jaxmpc.recursion.claims import settle_claims
@@ -121,7 +122,7 @@ def near(polygon, center, count) -> np.ndarray:
     return (center + rays * (t * (1 + shift[:, None]))[:, :, None]).reshape(-1, 2)
 
 
-def check(mpc, allow=0, whole=True) -> jm.FeasibleSetMap:
+def check(mpc, allow=0, whole=True) -> FeasibleSetMap:
     """Labels, plans and half-spaces in rationals, within 1e6, where the oracle ends.
 
     allow: how many labels may be open. whole: every −1 has a half-space for the whole set.

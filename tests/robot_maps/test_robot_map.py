@@ -12,11 +12,11 @@ import pytest
 from scipy.optimize import linprog
 
 import jaxmpc as jm
-from jaxmpc import cli
+from jaxmpc.app import cli
+from jaxmpc.app.plots import plot_robot_map
 from jaxmpc.robot_maps import OUTCOMES, RobotLoops, map_robot, setting
 from jaxmpc.robot_maps.set_point import deviations, with_initial_limits
 from jaxmpc.robot_maps.setting import RobotSetting
-from jaxmpc.robot_plots import plot_robot_map
 
 SECONDS = 0.8
 
@@ -167,7 +167,7 @@ def test_labels_of_loops_by_hand():
     fallback = np.zeros((6, 2), bool)
     fallback[5, 1] = True
     none = np.zeros((6, 2))
-    run = jm.Run(
+    run = jm.closed_loop.Run(
         states[..., None], inputs[..., None], none, status, none, none, none, fallback
     )  # fmt: skip
     loops = RobotLoops.of(run, plant, "float64")
