@@ -1,6 +1,12 @@
 """Constrained model predictive control for robots: solved by the million, and proved."""
 
-from jaxmpc.closed_loop import Run, lyapunov_decrease, simulate, simulate_many
+from jaxmpc.closed_loop.linear_feedback import LinearFeedback
+from jaxmpc.closed_loop.outcome import Outcome, evaluate_runs
+from jaxmpc.closed_loop.robot_controller import RobotController
+from jaxmpc.closed_loop.robot_mpc import robot_mpc
+from jaxmpc.closed_loop.run import Run, lyapunov_decrease
+from jaxmpc.closed_loop.simulate import simulate
+from jaxmpc.closed_loop.simulate_many import simulate_many
 from jaxmpc.control.equilibrium import equilibrium
 from jaxmpc.control.invariant import (
     ControlInvariantSet,
@@ -14,19 +20,16 @@ from jaxmpc.control.riccati import LQR, lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.control.terminal import TerminalReport, verify_terminal
-from jaxmpc.mpc.feedback import LinearFeedback
 from jaxmpc.mpc.problem import MPC, Outputs, Plan, Soft
 from jaxmpc.mpc.rows import active_constraints, row_table
 from jaxmpc.mpc.soften import harden, soften
 from jaxmpc.mpc.solve import Controller, solve
 from jaxmpc.mpc.stagewise import solve_stagewise
-from jaxmpc.outcome import Outcome, judge
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.margin import feasibility_margin
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.solve import solve_qp
 from jaxmpc.qp.status import Status
-from jaxmpc.robots.control import RobotController, robot_mpc
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import Robot
@@ -88,6 +91,7 @@ __all__ = [
     "critical_regions",
     "design",
     "equilibrium",
+    "evaluate_runs",
     "exact_penalty",
     "feasibility_margin",
     "feasible_growth",
@@ -97,7 +101,6 @@ __all__ = [
     "harden",
     "invariant_ellipsoid",
     "joint_limits",
-    "judge",
     "learn_penalties",
     "load_robot",
     "lqr",

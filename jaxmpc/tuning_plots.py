@@ -12,8 +12,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
 from jaxmpc.checks import fail
-from jaxmpc.closed_loop import Run
-from jaxmpc.outcome import batch_of, coordinates
+from jaxmpc.closed_loop.outcome import coordinates
+from jaxmpc.closed_loop.run import Run
 from jaxmpc.plots import _INFEASIBLE, _TERMINAL, _columns, _draw_limits, _ring
 from jaxmpc.sweeps.feasible_set import FeasibleSetMap
 from jaxmpc.tuning.descent import Descent
@@ -157,7 +157,7 @@ def plot_before_after(
     are lines, grey outside. reference (n,), input_reference (m,): set-points to draw. loops: which
     ones; None: 6 spread over all. Raises ValueError for loops that are not there.
     """
-    before, after = batch_of(before), batch_of(after)
+    before, after = before.on_host(), after.on_host()
     count, samples = np.shape(before.inputs)[:2]
     shown = np.unique(np.linspace(0, count - 1, min(count, 6)).astype(int))
     shown = shown if loops is None else np.asarray(loops, int)

@@ -12,7 +12,8 @@ import jax
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.closed_loop import lyapunov_decrease, simulate
+from jaxmpc.closed_loop.run import lyapunov_decrease
+from jaxmpc.closed_loop.simulate import simulate
 from jaxmpc.control.invariant import invariant_ellipsoid, maximal_invariant_set
 from jaxmpc.control.limits import JointLimits
 from jaxmpc.control.riccati import LQR, lqr

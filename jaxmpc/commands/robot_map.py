@@ -15,13 +15,13 @@ import numpy as np
 from tqdm.std import tqdm
 
 from jaxmpc.checks import fail
+from jaxmpc.closed_loop.robot_mpc import robot_mpc
 from jaxmpc.commands.options import model_hash, open_folder, versions, write_json
 from jaxmpc.control.invariant import maximal_invariant_set
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Polytope
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.robot_plots import plot_robot_map
-from jaxmpc.robots.control import robot_mpc
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sweeps.feasible_set import ARRAYS, grid, joined

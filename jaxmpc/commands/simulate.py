@@ -20,17 +20,20 @@ import zarr
 from tqdm.std import tqdm
 
 from jaxmpc.checks import fail
-from jaxmpc.closed_loop import Run, simulate_many
+from jaxmpc.closed_loop.linear_feedback import LinearFeedback
+from jaxmpc.closed_loop.outcome import Outcome, evaluate_runs
+from jaxmpc.closed_loop.robot_controller import RobotController
+from jaxmpc.closed_loop.robot_mpc import robot_mpc
+from jaxmpc.closed_loop.run import Run
+from jaxmpc.closed_loop.simulate_many import simulate_many
 from jaxmpc.commands.options import model_hash, open_folder, option, report_error
 from jaxmpc.compiled import Compiled, first_rows, padded
 from jaxmpc.config import load_robot_config
 from jaxmpc.control.riccati import lqr
-from jaxmpc.mpc.feedback import LinearFeedback
-from jaxmpc.outcome import KEPT, Outcome, judge
+from jaxmpc.control.violation import TOLERANCE
 from jaxmpc.plots import plot_runs
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
-from jaxmpc.robots.control import RobotController, robot_mpc
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import Robot
 from jaxmpc.robots.video import render, save_video
@@ -178,7 +181,7 @@ class Simulate:
         print(f"{robot.name}: {self.count:,} robots for {self.seconds:g} s -> {self.output}")
         speed = self.drive(job)
         run = _read(self.output / "runs.zarr")
-        outcome = judge(run, robot, job.reference, tolerance=self.tolerance)
+        outcome = evaluate_runs(run, robot, job.reference, tolerance=self.tolerance)
         files = ["runs.zarr", "summary.json", "runs.png"]
         figure = plot_runs(run, robot, reference=job.reference, input_reference=job.input_reference)
         figure.savefig(self.output / "runs.png", dpi=150)
@@ -417,11 +420,11 @@ class Simulate:
             "control_period": robot.dt,
             "success": count(outcome.success),
             "limits_kept": count(outcome.kept),
-            "limits_kept_to": KEPT,
+            "limits_kept_to": TOLERANCE["float64"],
             "reached": count(outcome.reached),
             "not_finite": count(~np.isfinite(run.states).all(axis=(1, 2))),
-            "promised": count(outcome.promised) if mpc else None,
-            "promised_and_kept": count(outcome.promised & outcome.kept) if mpc else None,
+            "promised": count(outcome.plans_valid) if mpc else None,
+            "promised_and_kept": count(outcome.plans_valid & outcome.kept) if mpc else None,
             "worst_violation": {"of": names[i], "by": float(worst[i]), "unit": units[i]},
             "violations": {
                 "states": dict(zip(robot.state_names, worst[: robot.n].tolist(), strict=True)),
@@ -457,7 +460,7 @@ class Simulate:
         rows = [
             ("robots", f"{s['robots']:>9,}  {length}"),
             ("success", f"{share('success')}  limits kept, and at the target at the end"),
-            ("limits kept", f"{share('limits_kept')}  to {KEPT:g}, all samples"),
+            ("limits kept", f"{share('limits_kept')}  to {TOLERANCE['float64']:g}, all samples"),
         ]
         if s["not_finite"]:
             rows.append(("not finite", share("not_finite")))

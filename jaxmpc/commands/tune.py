@@ -17,7 +17,11 @@ import tyro
 
 from jaxmpc import config as configs
 from jaxmpc.checks import fail
-from jaxmpc.closed_loop import Run, simulate_many
+from jaxmpc.closed_loop.outcome import evaluate_runs
+from jaxmpc.closed_loop.robot_controller import RobotController
+from jaxmpc.closed_loop.robot_mpc import robot_mpc
+from jaxmpc.closed_loop.run import Run
+from jaxmpc.closed_loop.simulate_many import simulate_many
 from jaxmpc.commands.options import (
     Horizon,
     Terminal,
@@ -39,16 +43,15 @@ from jaxmpc.commands.tuning import (
     start_range,
 )
 from jaxmpc.compiled import Compiled
+from jaxmpc.control import violation
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.mpc.condense import prestabilising_gain
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.soften import soften
 from jaxmpc.mpc.solve import Controller
-from jaxmpc.outcome import KEPT, beyond, coordinates, judge
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
-from jaxmpc.robots.control import RobotController, robot_mpc
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.load import load_robot
 from jaxmpc.sweeps.feasible_set import grid, map_feasible_set
@@ -658,16 +661,16 @@ class Problem(NamedTuple):
     def counted(self, run: Run, tolerance: float) -> dict[str, Any]:
         """What became of the loops, judged from their states and inputs."""
         goal = np.zeros(self.plant.n) if self.reference is None else self.reference
-        outcome = judge(run, self.plant, goal, tolerance=tolerance)
+        outcome = evaluate_runs(run, self.plant, goal, tolerance=tolerance)
         kept = outcome.kept
         if isinstance(self.limits, Polytope):
-            H, low, high = (np.asarray(v, float) for v in self.limits.rows())
-            values = coordinates(self.plant, run.states) @ H.T
-            kept = kept & beyond(values, Box(low, high))[1].all(axis=(1, 2))
+            limits = jax.tree.map(lambda v: np.asarray(v, float), self.limits)
+            kept = kept & violation.kept(limits, outcome.coordinates).all(axis=(1, 2))
         status = np.asarray(run.status)
         return {
             "loops": len(kept), "plans": int(status.size), "beyond": float(np.mean(~kept)),
-            "kept_to": KEPT, "unsolved": float(np.mean(status != Status.SOLVED)),
+            "kept_to": violation.TOLERANCE["float64"],
+            "unsolved": float(np.mean(status != Status.SOLVED)),
             "infeasible": float(np.mean(status == Status.PRIMAL_INFEASIBLE)),
             "fallback": float(np.mean(run.fallback)),
             "at_target": float(np.mean(outcome.reached)),

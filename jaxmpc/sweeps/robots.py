@@ -17,15 +17,16 @@ import numpy as np
 from tqdm.std import tqdm
 
 from jaxmpc.checks import fail, require_shape
-from jaxmpc.closed_loop import Run, simulate_many
+from jaxmpc.closed_loop.outcome import coordinates
+from jaxmpc.closed_loop.robot_controller import RobotController
+from jaxmpc.closed_loop.run import Run
+from jaxmpc.closed_loop.simulate_many import simulate_many
 from jaxmpc.compiled import default_chunk, padded
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
-from jaxmpc.outcome import coordinates
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
-from jaxmpc.robots.control import RobotController
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sweeps.feasible_set import FeasibleSetMap, Labels, joined, label_chunks

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail, require_symmetric_psd
-from jaxmpc.closed_loop import Run
+from jaxmpc.closed_loop.run import Run
 from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.qp.precision import matmul
 

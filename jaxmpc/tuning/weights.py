@@ -15,7 +15,9 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 
 from jaxmpc.checks import fail, whole
-from jaxmpc.closed_loop import Run, Steps, loops, memory, needed, require_variations
+from jaxmpc.closed_loop.memory import device_bytes, program_bytes
+from jaxmpc.closed_loop.run import Run
+from jaxmpc.closed_loop.simulate_many import as_argument, require_variations, simulate_batch
 from jaxmpc.compiled import Compiled
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.soften import harden
@@ -165,8 +167,8 @@ def tune_weights(
             plant=plant if hasattr(plant, "coordinates") else None,
         )  # fmt: skip
     problem = Problem(
-        make_mpc, parameters, solver, Steps.of(steps, plant), loss, reference, input_reference,
-        design_loss,
+        make_mpc, parameters, solver, as_argument(plant), steps, loss, reference,
+        input_reference, design_loss,
     )  # fmt: skip
     problem.check(start, train)
     settings = {
@@ -271,7 +273,8 @@ class Problem:
     make_mpc: Any
     parameters: Parameters
     solver: ADMM
-    steps: Steps
+    plant: Any
+    steps: int
     loss: Any
     reference: Any
     input_reference: Any
@@ -279,18 +282,20 @@ class Problem:
 
     def arguments(self, theta: Any, x0s: Any, varied: Any, weights: Any) -> tuple:
         """Of `total`, as arrays of the present precision."""
-        return arrays((theta, self.steps, x0s, varied, weights))
+        return arrays((theta, self.plant, x0s, varied, weights))
 
     def total(
-        self, theta: Any, steps: Steps, x0s: Array, varied: dict[str, Array], weights: Array,
-        checkpoint: bool = False,
+        self, theta: Any, plant: Any, x0s: Array, varied: dict[str, Array], weights: Array,
+        recompute: bool = False,
     ) -> tuple[Array, dict[str, Array]]:  # fmt: skip
         """Weighted mean loss, and what is counted of each loop."""
         given = values(self.parameters, theta)
         controller = controller_of(self.make_mpc, given, self.solver)
         aims = (self.reference, self.input_reference)
         r, s = (aim(given) if callable(aim) else aim for aim in aims)
-        run = loops(controller, steps, r, s, x0s.astype(controller.dtype), varied, checkpoint)
+        run = simulate_batch(
+            controller, plant, r, s, x0s.astype(controller.dtype), varied, self.steps, recompute
+        )
         losses = jax.vmap(self.loss)(run)
         total = jnp.sum(jnp.where(weights > 0, weights * losses, 0.0)) / jnp.sum(weights)
         design = jnp.zeros(())
@@ -330,8 +335,8 @@ class Problem:
             )
             return value, unravel(slope), aux
 
-        def reverse(theta: Any, *rest: Any, checkpoint: bool = False) -> tuple[Array, Any, Any]:
-            at = partial(self.total, checkpoint=checkpoint)
+        def reverse(theta: Any, *rest: Any, recompute: bool = False) -> tuple[Array, Any, Any]:
+            at = partial(self.total, recompute=recompute)
             (value, aux), slope = jax.value_and_grad(at, has_aux=True)(theta, *rest)
             return value, slope, aux
 
@@ -343,9 +348,9 @@ class Problem:
         if mode != "forward":
             name, plain = "reverse", Compiled(jax.jit(reverse))
             try:
-                if needed(plain.program(*arguments)) > 0.5 * memory():
+                if program_bytes(plain.program(*arguments)) > 0.5 * device_bytes():
                     name = "reverse, checkpointed"
-                    plain = Compiled(jax.jit(partial(reverse, checkpoint=True)))
+                    plain = Compiled(jax.jit(partial(reverse, recompute=True)))
                 tried[name] = plain
             except ValueError:  # a plant with a loop that JAX cannot transpose
                 if not tried:

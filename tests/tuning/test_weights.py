@@ -10,7 +10,7 @@ import pytest
 from problems import symmetric
 
 import jaxmpc as jm
-from jaxmpc.closed_loop import Run
+from jaxmpc.closed_loop.run import Run
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
 from jaxmpc.tuning.weights import tune_weights
