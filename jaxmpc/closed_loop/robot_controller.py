@@ -56,7 +56,7 @@ class RobotController:
     linearize: str
     exact: bool
     penalty: Any
-    soft: MPC = field(init=False)
+    soft: Any = field(init=False)
     fixed: Controller | None = field(init=False)
     scale: Any = field(init=False)
 
