@@ -41,12 +41,15 @@ from jaxmpc.sweeps.reach import feasible_growth, feasible_polytope
 from jaxmpc.sweeps.recursion import RecursionReport, recursive_feasibility, smallest_horizon
 from jaxmpc.sweeps.regions import CriticalRegions, critical_regions
 from jaxmpc.sweeps.robots import RobotMap, map_robot
-from jaxmpc.tuning.feasibility import feasible_share, tune_feasible_set
+from jaxmpc.tuning.feasible_fraction import feasible_fraction
+from jaxmpc.tuning.feasible_set import tune_feasible_set
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
-from jaxmpc.tuning.penalties import Penalties, learn_penalties, tune_penalties
+from jaxmpc.tuning.penalties import tune_penalties
+from jaxmpc.tuning.penalty_schedule import transfer_penalties
+from jaxmpc.tuning.result import TuningRun
 from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
-from jaxmpc.tuning.weights import TuningRun, tune_weights
+from jaxmpc.tuning.weights import tune_weights
 from jaxmpc.workflow import Design, OfflineReport, design, offline_report
 
 __all__ = [
@@ -72,7 +75,6 @@ __all__ = [
     "Outcome",
     "Outputs",
     "Parameter",
-    "Penalties",
     "Plan",
     "Plans",
     "Polytope",
@@ -94,14 +96,13 @@ __all__ = [
     "evaluate_runs",
     "exact_penalty",
     "feasibility_margin",
+    "feasible_fraction",
     "feasible_growth",
     "feasible_polytope",
-    "feasible_share",
     "grid",
     "harden",
     "invariant_ellipsoid",
     "joint_limits",
-    "learn_penalties",
     "load_robot",
     "lqr",
     "lyapunov_decrease",
@@ -123,6 +124,7 @@ __all__ = [
     "solve_many",
     "solve_qp",
     "solve_stagewise",
+    "transfer_penalties",
     "tune_feasible_set",
     "tune_penalties",
     "tune_sweep_penalties",

@@ -276,11 +276,12 @@ def _penalties(job: Job) -> RungPenalties | None:
         )  # fmt: skip
     except OSError as error:
         fail(str(cache_folder()), f"{error.strerror}", "Set XDG_CACHE_HOME to a folder of yours")
-    verdict = f"{found.decided_before:.2%} -> {found.decided:.2%} decided by the first pass"
-    if found.penalties is None:
-        verdict = f"nothing better found, {found.decided:.2%} decided by the first pass"
+    first, best = found.before["decided"], found.after["decided"]
+    verdict = f"{first:.2%} -> {best:.2%} decided by the first pass"
+    if not found.improved:
+        verdict = f"nothing better found, {best:.2%} decided by the first pass"
     print(f"penalties: {verdict}, {time.perf_counter() - start:.1f} s", file=sys.stderr)
-    return found.penalties
+    return found.result
 
 
 def _label(job: Job, penalties: RungPenalties | None) -> Tally:

@@ -510,7 +510,7 @@ class TuneWeights:
         before, after = (
             problem.simulated(controller)
             for controller in (
-                lambda: run.make_mpc(run.initial), lambda: problem.read(self.output / TUNED)
+                lambda: run.build(run.initial), lambda: problem.read(self.output / TUNED)
             )
         )  # fmt: skip
         counts = [problem.counted(loops, self.tolerance) for loops in (before, after)]
@@ -593,7 +593,7 @@ class TuneWeights:
             lines.append(row(name, f"{a:.5g}", f"{b:.5g}", ratio))
         if len(entries) > SHOWN:
             lines.append(f"  {'...':<{wide}} {len(entries) - SHOWN} more in {TUNED}")
-        if any(p.domain == "definite" for p in run.parameters.values()):
+        if any(p.domain == "definite" for p in problem.parameters.values()):
             lines.append(f"  {'':<{wide}} of full matrices the diagonal; all of it in {TUNED}")
         if not result["improved"]:
             words = (
@@ -608,7 +608,7 @@ class TuneWeights:
         what = f"best is {h.best} of {h.steps}; {result['rejected']} rejected as not finite"
         lines += [
             f"  {'steps':<{wide}} {what}",
-            f"  {'mode':<{wide}} {run.mode}",
+            f"  {'mode':<{wide}} {run.settings['mode']}",
             f"  {'compile':<{wide}} {seconds['compile']:.1f} s",
             f"  {'run':<{wide}} {seconds['run']:.1f} s",
             f"  {'total':<{wide}} {seconds['total']:.1f} s with set-up, checks and files",

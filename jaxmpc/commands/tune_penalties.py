@@ -36,7 +36,8 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import solve
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
-from jaxmpc.tuning.penalties import Penalties, learn_penalties
+from jaxmpc.tuning.penalties import tune_penalties
+from jaxmpc.tuning.result import TuningRun
 from jaxmpc.tuning_plots import plot_penalties
 
 FILES = ("penalties.json", TUNED, "penalties.png")
@@ -144,7 +145,7 @@ class TunePenalties:
             given, learning = ADMM(refine=0), time.perf_counter()
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "tune_penalties", UserWarning)
-                found = learn_penalties(
+                found = tune_penalties(
                     mpc, train, self.iterations, stages=self.stages, groups=self.groups,
                     solver=given, updates=self.updates, optimizer=self.stepper(),
                     batch=self.batch, validation=test, seed=self.seed,
@@ -195,7 +196,7 @@ class TunePenalties:
         return optimizer_of(self.optimizer, self.learning_rate or 0.1, tried)
 
     def save(
-        self, config: configs.Config, found: Penalties, worst: np.ndarray, dropped: int,
+        self, config: configs.Config, found: TuningRun, worst: np.ndarray, dropped: int,
         seconds: float,
     ) -> None:  # fmt: skip
         """Write the files."""
@@ -209,22 +210,16 @@ class TunePenalties:
         (self.output / TUNED).write_text(text)
         h = found.history
         numbers = {
-            name: getattr(found, name)
-            for name in (
-                "improved",
-                "solved_before",
-                "solved",
-                "residual_before",
-                "residual",
-                "alpha",
-            )
-        }
+            "improved": found.improved, "before": found.before, "after": found.after,
+            "alpha": solver.alpha,
+        }  # fmt: skip
         finite = lambda v: [float(x) if np.isfinite(x) else None for x in v]
         document = {
             "name": config.name,
             "options": json.loads((self.output / FILES[0]).read_text())["options"],
             "finished": True, "result": numbers, "validation_states": worst.shape[1],
-            "states_without_plan": dropped + found.infeasible, "learning_seconds": seconds,
+            "states_without_plan": dropped + round(found.after["infeasible"]),
+            "learning_seconds": seconds,
             "loss": finite(h.loss) if h else [],
             "gradient_norm": finite(h.gradient_norm) if h else [],
             "accepted": h.accepted.tolist() if h else [],
@@ -238,10 +233,11 @@ class TunePenalties:
         figure = plot_penalties(found, worst[0], worst[1], 1e-6, title)
         figure.savefig(self.output / "penalties.png", dpi=150)
 
-    def table(self, found: Penalties, count: int, dropped: int, seconds: float) -> str:
+    def table(self, found: TuningRun, count: int, dropped: int, seconds: float) -> str:
         """The result for the eye."""
         row = lambda name, a, b, more="": f"  {name:<13} {a:>12} {b:>12}  {more}".rstrip()
-        share = lambda v: f"{100 * v:.2f} %"
+        first, last = found.before, found.after
+        percent = lambda numbers: f"{100 * numbers['solved']:.2f} %"
         alpha = float(np.asarray(found.solver.alpha))
         rho = np.asarray(found.solver.rho, float)
         spread = (
@@ -252,11 +248,11 @@ class TunePenalties:
             if found.improved
             else "nothing learned is better on the validation states: the default is kept"
         )
-        out = dropped + found.infeasible
+        out = dropped + round(found.after["infeasible"])
         return "\n".join([
             row("", "default", "as written"),
-            row("solved", share(found.solved_before), share(found.solved), f"of {count} states"),
-            row("residual", f"{found.residual_before:.3g}", f"{found.residual:.3g}", "median"),
+            row("solved", percent(first), percent(last), f"of {count} states"),
+            row("residual", f"{first['residual']:.3g}", f"{last['residual']:.3g}", "median"),
             row("rho", "1", spread), row("alpha", "1.6", f"{alpha:.4g}"),
             f"  {'infeasible':<13} {out:,} states drawn have no plan: left out",
             f"  {'learning':<13} {seconds:.1f} s, compiler included",

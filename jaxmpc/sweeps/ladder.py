@@ -9,6 +9,7 @@ goes to `proofs.py`.
 """
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -314,6 +315,24 @@ def judge(p: Problem, rows: Rows, theta: Array, w: Array, candidates: list[Array
     return Verdict(label, p.view.initial_state(theta, free), inputs, normal, offset)
 
 
+def feasibility_steps(
+    project: Callable[[Array], Array], onto: Callable[[Array], Array], t: Array, alpha: Any,
+    iterations: int,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Take zero-cost ADMM steps t⁺ = t + α (P (2s − t) − s), s = project(t).
+
+    project: onto the bounds. onto: v → P v, the orthogonal projection onto the range of the rows.
+    Returns the last t and the one before.
+    """
+
+    def step(t: Array, _: None = None) -> tuple[Array, None]:
+        s = project(t)
+        return t + alpha * (onto(2 * s - t) - s), None
+
+    before, _ = jax.lax.scan(step, t, length=iterations - 1)
+    return step(before)[0], before
+
+
 @functools.cache
 def admm_rung(iterations: int, dtype: Any) -> Compiled:
     """The compiled first rung: (p, rows, points (B, d), alpha) → verdicts and w (B, k)."""
@@ -331,12 +350,8 @@ def admm_rung(iterations: int, dtype: Any) -> Compiled:
             one = lambda t, l, u: Bounds(l, u, radius=radius, balls=rows.balls).project(t, 1.0)
             project = lambda t: jax.vmap(one, in_axes=1, out_axes=1)(t, l, u)
 
-        def step(t, _=None):
-            s = project(t)
-            return t + alpha * (matmul(U, matmul(U.T, 2 * s - t)) - s), None
-
-        before, _ = jax.lax.scan(step, project(jnp.zeros_like(l)), length=iterations - 1)
-        t, _ = step(before)
+        onto = lambda v: matmul(U, matmul(U.T, v))
+        t, before = feasibility_steps(project, onto, project(jnp.zeros_like(l)), alpha, iterations)
         excess = lambda t: t - project(t)
         w = matmul(U.T, project(t) - excess(t))
         change = excess(t) - excess(before)

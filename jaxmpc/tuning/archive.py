@@ -1,4 +1,4 @@
-"""Arrays and JSON data in one file (.npz), there as a whole or not at all."""
+"""Arrays and JSON data in one file (.npz), written whole or not at all."""
 
 import hashlib
 import json
@@ -13,7 +13,7 @@ import numpy as np
 
 
 def fingerprint(plain: Any, *data: Any) -> str:
-    """Of JSON data and of pytrees of arrays."""
+    """Return a hash (32 hexadecimal digits) of JSON data and of pytrees of arrays."""
     leaves, tree = jax.tree.flatten(data)
     state = hashlib.sha256(json.dumps(plain, sort_keys=True).encode() + str(tree).encode())
     for leaf in map(np.asarray, leaves):
@@ -22,13 +22,13 @@ def fingerprint(plain: Any, *data: Any) -> str:
 
 
 def clear(path: Path) -> None:
-    """Remove what a process left that was killed while writing; for the only writer of `path`."""
+    """Remove side files that killed processes left; for the only writer of `path`."""
     for left in path.parent.glob(f".{path.name}.*"):
         left.unlink(missing_ok=True)
 
 
 def write(path: Path, plain: Any, **arrays: Any) -> None:
-    """Write to a side file, then rename: a reader sees the old file or the new one."""
+    """Write to a side file and rename it: a reader finds the old file or the new one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, side = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
@@ -41,7 +41,7 @@ def write(path: Path, plain: Any, **arrays: Any) -> None:
 
 
 def read(path: Path) -> tuple[Any, dict[str, np.ndarray]] | None:
-    """What `write` wrote; None where there is nothing, or nothing whole."""
+    """Return (plain, arrays) of a file of `write`; None where it is absent or damaged."""
     try:
         with open(path, "rb") as file, np.load(file) as data:
             arrays = {name: data[name] for name in data.files}

@@ -14,7 +14,7 @@ from jaxmpc.commands import tune, tune_penalties
 from jaxmpc.commands.sweep import Sweep, prepare
 from jaxmpc.config import Config, load, load_robot_config
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.tuning.penalties import Penalties
+from jaxmpc.tuning.result import TuningRun
 
 # The built-in joint with a horizon that is too short for its terminal weight.
 LINE = (
@@ -122,12 +122,16 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
     def learn(mpc, x0s, iterations, **more):
         asked.update(more, count=len(x0s), iterations=iterations)
         solver = ADMM(iterations=iterations, rho=rho, alpha=1.7, refine=0)
-        blocks = (("input", (0, 1, 2), 1), ("state", (0, 1, 2), 2))
-        found = Penalties(solver, rho, 1.7, "step", blocks, 3, (), 0.5, 1e-6, 0.25, 1e-2, 2)
+        blocks = [["input", [0, 1, 2], 1], ["state", [0, 1, 2], 2]]
+        before, after = (
+            {"solved": solved, "residual": residual, "infeasible": 2.0}
+            for solved, residual in ((0.25, 1e-2), (0.5, 1e-6))
+        )
+        found = TuningRun({}, {}, before, after, True, {"blocks": blocks}, lambda _: solver)
         made.append(found)
         return found
 
-    monkeypatch.setattr(tune_penalties, "learn_penalties", learn)
+    monkeypatch.setattr(tune_penalties, "tune_penalties", learn)
     line = "penalties --horizon 3 --iterations 6 --stages 2 --count 16 --updates 1"
     assert run(f"{line} --output out") == 0
     table = rows(capsys.readouterr().out)
@@ -141,11 +145,11 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
     assert (solver.iterations, solver.alpha, solver.refine) == (6, 1.7, 0)
     assert replace(config, solver=None) == Config.default({"horizon": 3})
     record = json.loads((tmp_path / "out" / "penalties.json").read_text())
-    assert record["finished"] and record["result"]["solved"] == 0.5
+    assert record["finished"] and record["result"]["after"]["solved"] == 0.5
     assert (tmp_path / "out" / "penalties.png").read_bytes()[:4] == b"\x89PNG"
 
     # Where nothing learned is better the words say so.
-    default = replace(made[0], solver=ADMM(refine=0), solved=0.25, residual=1e-2)
+    default = replace(made[0], improved=False, build=lambda _: ADMM(refine=0))
     table = rows(tune_penalties.TunePenalties().table(default, 4, 0, 1.0))
     assert "the default is kept" in table["safeguard"]
 
@@ -191,7 +195,7 @@ def test_starts_are_feasible_and_others_counted():
     ],
 )
 def test_errors_are_one_line_before_any_run(capsys, monkeypatch, given_starts, arguments, message):
-    for module, name in ((tune, "tune_weights"), (tune_penalties, "learn_penalties")):
+    for module, name in ((tune, "tune_weights"), (tune_penalties, "tune_penalties")):
         monkeypatch.setattr(module, name, lambda *a, **k: pytest.fail("it started"))
     assert run(arguments) == 2
     err = capsys.readouterr().err
