@@ -45,14 +45,7 @@ def tune_feasible_set(
     x0s = np.asarray(x0s, np.float64)
     if x0s.ndim != 2 or not len(x0s):
         fail("x0s", f"shape {x0s.shape}", "Give states (B, n), one a row")
-    # A grid is in order, and validation takes the last.
-    train = np.random.default_rng(chosen.seed).permutation(x0s)
-    if chosen.splits:
-        train, test = chosen.split(train)
-    else:
-        test = np.asarray(chosen.validation, np.float64)
-        if test.ndim != 2 or test.shape[1] != x0s.shape[1] or not len(test):
-            fail("validation", f"shape {test.shape}", f"Give states (B, {x0s.shape[1]})")
+    train, test = chosen.split(x0s, shuffle=True)
 
     def total(theta: Any, x0s: Array) -> tuple[Array, dict[str, Array]]:
         mpc = make_mpc(values(parameters, theta))

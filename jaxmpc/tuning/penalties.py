@@ -74,8 +74,6 @@ def tune_penalties(
         mpc, x0s, iterations, stages, groups, solver, warm_start, reference, input_reference,
         chosen,
     )  # fmt: skip
-    if cache is not None and chosen.optimizer is not None:
-        fail("cache", "given beside an optimizer, which has no fingerprint", "Leave one out")
     given = replace(solver, iterations=iterations)
     c = objective.condensed
     decides: dict[str, Any] = {
@@ -86,8 +84,9 @@ def tune_penalties(
     }  # fmt: skip
     if chosen.optimizer is None:  # its schedule knows their number; with another, a run may grow
         decides["updates"] = chosen.updates
-    mark = archive.fingerprint(decides, objective, train, test, given.rho, given.alpha)
-    decides["fingerprint"] = mark
+    decides["fingerprint"] = archive.fingerprint(
+        decides, objective, train, test, given.rho, given.alpha
+    )
 
     def build(improved: bool) -> Callable[[Any], ADMM]:
         return partial(_with_penalties, given, objective.W) if improved else lambda _: given
@@ -97,7 +96,7 @@ def tune_penalties(
             return search(objective, train, test, given, stages, chosen, decides, build)
 
     shapes = {"log_rho": (stages, objective.W.shape[1]), "alpha": ()}
-    run = cached(None if cache is None else Path(cache) / f"{mark}.npz", shapes, build, tune)
+    run = cached(cache, decides, chosen, shapes, build, tune)
     if not run.improved:
         warnings.warn(
             "tune_penalties: nothing found is better on the validation set than the solver given "
@@ -225,11 +224,10 @@ def _prepared(
                 fail("warm_start", f"shape {part.shape}", f"Needed: {(len(x), size)}")
     samples = Samples(x, warm_start)
     if settings.splits:
-        order = np.random.default_rng(settings.seed).permutation(len(x))
-        train, test = settings.split(samples.take(order), FEWEST_VALIDATION)
+        train, test = settings.split(samples, FEWEST_VALIDATION, shuffle=True)
+    elif warm_start is not None:
+        fail("validation", "given as states beside warm starts", "Give a fraction in (0, 1)")
     else:
-        if warm_start is not None:
-            fail("validation", "given as states beside warm starts", "Give a fraction in (0, 1)")
         train, test = samples, Samples(states("validation", settings.validation))
     W = interpolation(groups, c.layout, mpc.horizon, c.balls, _knots(mpc))
     plain = replace(

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from jaxmpc.checks import fail
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.tuning import archive
 from jaxmpc.tuning.descent import Descent
 from jaxmpc.tuning.parameters import Parameters, exact_values, trajectory
+from jaxmpc.tuning.settings import Settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,25 +107,29 @@ class TuningRun:
 
 
 def cached(
-    path: Path | None, shapes: Mapping[str, tuple[int, ...]], build: Callable[[bool], Any],
+    cache: str | Path | None, decides: Mapping[str, Any], settings: Settings,
+    shapes: Mapping[str, tuple[int, ...]], build: Callable[[bool], Any],
     tune: Callable[[], TuningRun],
 ) -> TuningRun:  # fmt: skip
-    """Return the run kept in the file `path`, else the run of `tune`, which is kept there.
+    """Return the run kept in the folder `cache`, else the run of `tune`, which is kept there.
 
-    shapes: of the values; a file with others, or a damaged one, counts as absent. build: from
-    `improved` to `TuningRun.build`. path None: nothing is kept.
+    decides["fingerprint"]: names the file. shapes: of the values; a file with others, or a damaged
+    one, counts as absent. build: from `improved` to `TuningRun.build`. cache None: nothing is kept.
     """
-    kept = None if path is None else archive.read(path)
-    if kept is not None:
-        run = _restored(*kept, build)
-        if run is not None and {name: v.shape for name, v in run.values.items()} == dict(shapes):
-            return run
+    if cache is None:
+        return tune()
+    if settings.optimizer is not None:
+        fail("cache", "given beside an optimizer, which has no fingerprint", "Leave one out")
+    path = Path(cache) / f"{decides['fingerprint']}.npz"
+    kept = archive.read(path)
+    run = None if kept is None else _restored(*kept, build)
+    if run is not None and {name: v.shape for name, v in run.values.items()} == dict(shapes):
+        return run
     run = tune()
-    if path is not None:
-        names = ("before", "after", "improved", "settings")
-        pairs = (("values", run.values), ("initial", run.initial))
-        arrays = {f"{key}_{name}": v for key, tree in pairs for name, v in tree.items()}
-        archive.write(path, {name: getattr(run, name) for name in names}, **arrays)
+    trees = (("values", run.values), ("initial", run.initial))
+    arrays = {f"{key}_{name}": v for key, tree in trees for name, v in tree.items()}
+    plain = {name: getattr(run, name) for name in ("before", "after", "improved", "settings")}
+    archive.write(path, plain, **arrays)
     return run
 
 

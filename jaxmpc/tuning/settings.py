@@ -48,20 +48,33 @@ class Settings:
         """Return whether `validation` is a fraction of the samples, not samples of its own."""
         return not isinstance(self.validation, tuple) and np.ndim(self.validation) == 0
 
-    def split(self, samples: Any, least: int = 1) -> tuple[Any, Any]:
-        """Divide samples (B, …), a pytree, into those for training and the last for validation.
+    def split(self, samples: Any, least: int = 1, shuffle: bool = False) -> tuple[Any, Any]:
+        """Divide samples into those for training and those for validation.
 
-        The latter are the fraction `validation`, at least `least`. Raises ValueError where none
-        is left for training.
+        samples: states (B, n), or a pytree (B, …) whose first leaf they are. Where `validation` is
+        a fraction the last samples are for validation, at least `least` of them, or random ones
+        where `shuffle`; else all are for training. Raises ValueError where none is left.
         """
-        total = len(jax.tree.leaves(samples)[0])
+        first = jax.tree.leaves(samples)[0]
+        total = len(first)
+        if not self.splits:
+            pair = isinstance(self.validation, tuple)
+            states = np.asarray(self.validation[0] if pair else self.validation, float)
+            if states.ndim != 2 or states.shape[1] != first.shape[1] or not len(states):
+                fail("validation", f"shape {states.shape}", f"Give states (B, {first.shape[1]})")
+            if isinstance(samples, tuple):
+                more = self.validation[1] if pair else {}
+                return samples, (states, {name: np.asarray(v) for name, v in more.items()})
+            return samples, states
         count = max(least, round(float(self.validation) * total))
         if count >= total:
             cure = "Give more: some to learn from, some for validation"
             fail("x0s", f"{total} states, {count} of them for validation", cure)
-        cut = total - count
+        order = np.roll(np.arange(total), count)
+        if shuffle:
+            order = np.random.default_rng(self.seed).permutation(total)
         part = lambda where: jax.tree.map(lambda v: v[where], samples)
-        return part(slice(None, cut)), part(slice(cut, None))
+        return part(order[count:]), part(order[:count])
 
     def minibatch(self, total: int, step: int) -> Any:
         """Return which of `total` samples a step sees: a function of its number, so that a run can

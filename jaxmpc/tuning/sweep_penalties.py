@@ -88,11 +88,7 @@ def tune_sweep_penalties(
     usual = {"batch": 128, "validation": min(VALIDATION / len(points), 0.5)}
     chosen = Settings(**{**usual, **settings})
     chosen.validate()
-    points = np.random.default_rng(chosen.seed).permutation(points)
-    train, test = chosen.split(points) if chosen.splits else (points, chosen.validation)
-    test = np.asarray(test, np.float64)
-    if test.ndim != 2 or test.shape[1] != points.shape[1] or not len(test):
-        fail("validation", f"shape {test.shape}", f"Give points (B, {points.shape[1]})")
+    train, test = chosen.split(points, shuffle=True)
     chunk = default_chunk() if chunk is None else chunk
     train = train[:chunk]
 
@@ -115,9 +111,8 @@ def tune_sweep_penalties(
         with jax.enable_x64(True):
             return search(stage, train, label, test, chosen, decides, build)
 
-    path = None if cache is None else Path(cache) / f"{decides['fingerprint']}.npz"
     shapes: dict[str, tuple[int, ...]] = {"weight": (len(moving.lower),), "alpha": ()}
-    return cached(path, shapes, build, tune)
+    return cached(cache, decides, chosen, shapes, build, tune)
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,7 +91,7 @@ def tune_weights(
     if mode not in MODES:
         fail("mode", f"{mode!r}", f"Give one of {', '.join(MODES)}")
     steps = whole("steps", steps, 1)
-    train, test = _divided((x0s, variations), chosen)
+    train, test = chosen.split((x0s, variations))
     require_variations(plant, test[1], len(test[0]))
     start = raw(parameters)
     initial = {name: np.asarray(p.value) for name, p in parameters.items()}
@@ -148,18 +148,6 @@ def tune_weights(
     history = descend(start, gradient, validate, optax.adam(0.05), chosen, decides)
     decides["mode"] = gradients[0][0] if gradients else mode
     return TuningRun.of_parameters(parameters, history, decides, build)
-
-
-def _divided(data: Data, settings: Settings) -> tuple[Data, Data]:
-    """Return initial states and variations for training and for validation."""
-    if settings.splits:
-        return settings.split(data)
-    given = settings.validation
-    states, variations = given if isinstance(given, tuple) else (given, {})
-    states, n = np.asarray(states), data[0].shape[1]
-    if states.ndim != 2 or states.shape[1] != n or not len(states):
-        fail("validation", f"shape {states.shape}", f"Give states (B, {n})")
-    return data, (states, {name: np.asarray(v) for name, v in dict(variations).items()})
 
 
 def _default_loss(controller: Any, plant: Any, r: Any, s: Any) -> ClosedLoopLoss:

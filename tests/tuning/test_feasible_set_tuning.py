@@ -37,7 +37,7 @@ POINT = np.array([300.0, 0, 0, 0, 0.05, 0.1, 0])
 
 @pytest.fixture(scope="module")
 def fraction():
-    """(fraction, its gradient, membership of each state) as a function of the numbers of `changed`."""
+    """(fraction, its gradient, membership of each state) by the numbers of `changed`."""
 
     def both(v):
         values = membership(changed(v), STATES, 0.05)

@@ -10,8 +10,9 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc import cli
-from jaxmpc.commands import tune, tune_penalties
+from jaxmpc.commands import tune, tune_penalties, tuning_task
 from jaxmpc.commands.sweep import Sweep, prepare
+from jaxmpc.commands.tuning import feasible_states
 from jaxmpc.config import Config, load, load_robot_config
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.tuning.result import TuningRun
@@ -36,7 +37,7 @@ def given_starts(monkeypatch):
     def uniform(mpc, limits, lower, upper, count, seed):
         return np.random.default_rng(seed).uniform(lower, upper, (count, len(lower))), 3
 
-    for module in (tune, tune_penalties):
+    for module in (tuning_task, tune_penalties):
         monkeypatch.setattr(module, "feasible_states", uniform)
 
 
@@ -111,7 +112,7 @@ def test_weights_cut_off_resumed_and_read_back(tmp_path, monkeypatch, capsys, gi
     after = record["result"]["after"]
     assert after["unsolved"] == np.mean(loops.status != 1) and after["loops"] == 2
     beyond = (np.abs(loops.states) > [1.5 + 2e-6, 2 + 2e-6]).any(axis=(1, 2))
-    assert after["beyond"] == np.mean(beyond)
+    assert after["violated"] == np.mean(beyond)
 
 
 def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsys, given_starts):
@@ -159,12 +160,12 @@ def test_starts_are_feasible_and_others_counted():
     system = jm.LinearSystem([[1, 1], [0, 1]], [[0.5], [1]], dt=1.0)
     box = lambda *v: jm.Box(-np.array(v), np.array(v))
     mpc = jm.MPC(system, np.eye(2), np.eye(1), 4, states=box(1.0, 2.0), inputs=box(0.5))
-    x0s, dropped = tune.feasible_states(mpc, mpc.states, -np.ones(2), np.ones(2), 40, 0)
+    x0s, dropped = feasible_states(mpc, mpc.states, -np.ones(2), np.ones(2), 40, 0)
     assert x0s.shape == (40, 2) and 0 < dropped < 60
     # One step ahead |q + dq + u/2| <= 1 with |u| <= 0.5: necessary.
     assert np.all(np.abs(x0s.sum(axis=1)) <= 1.25 + 1e-6)
     with pytest.raises(ValueError, match="initial states: 0 of 40 drawn have a plan"):
-        tune.feasible_states(mpc, mpc.states, np.array([0.8, 1.6]), np.array([1.0, 2.0]), 4, 0)
+        feasible_states(mpc, mpc.states, np.array([0.8, 1.6]), np.array([1.0, 2.0]), 4, 0)
 
 
 @pytest.mark.parametrize(
