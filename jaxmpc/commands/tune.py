@@ -15,7 +15,14 @@ import tyro
 from jaxmpc.checks import fail
 from jaxmpc.commands.options import Horizon, Terminal, option, report_error
 from jaxmpc.commands.robot_map import refused
-from jaxmpc.commands.tuning import CHECKPOINT, TUNED, open_run, optimizer_of
+from jaxmpc.commands.tuning import (
+    CHECKPOINT,
+    TUNED,
+    open_run,
+    optimizer_of,
+    require_counts,
+    require_positive,
+)
 from jaxmpc.commands.tuning_report import save_results
 from jaxmpc.commands.tuning_task import TuningTask, linear_task, robot_task
 from jaxmpc.compiled import Compiled
@@ -239,22 +246,11 @@ class TuneWeights:
             fail("--tune", f"{' '.join(self.tune) or 'nothing'}", "Name each quantity once")
         if self.steps is not None and self.seconds is not None:
             fail("--seconds", "given beside --steps", "Give one of them")
-        for name, least in (
-            ("updates", 0), ("count", 2), ("batch", 1), ("steps", 1), ("iterations", 1),
-            ("refine", 0), ("seed", 0),
-        ):  # fmt: skip
-            value = getattr(self, name)
-            if value is not None and value < least:
-                fail(f"--{name}", f"{value}", f"Give a whole number, at least {least}")
-        for name in ("seconds", "learning_rate", "tolerance"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < np.inf:
-                fail(f"--{name.replace('_', '-')}", f"{value}", "Give a positive number")
+        require_counts(self, updates=0, count=2, batch=1, steps=1, iterations=1, refine=0, seed=0)
+        require_positive(self, "seconds", "learning_rate", "tolerance")
         for name in ("violation", "settling", "payload"):
             if not 0 <= getattr(self, name) < np.inf:
                 fail(f"--{name}", f"{getattr(self, name)}", "Give a number, at least 0")
-        if not 0 < self.validation < 1:
-            fail("--validation", f"{self.validation}", "Give a fraction above 0 and below 1")
         for name in ("margin", "mass", "damping"):
             if not 0 <= (getattr(self, name) or 0.0) < 1:
                 fail(f"--{name}", f"{getattr(self, name)}", "Give a fraction from 0 to below 1")

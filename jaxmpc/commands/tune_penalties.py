@@ -30,6 +30,8 @@ from jaxmpc.commands.tuning import (
     open_run,
     optimizer_of,
     problem_file,
+    require_counts,
+    require_positive,
     start_range,
 )
 from jaxmpc.mpc.problem import MPC
@@ -164,20 +166,12 @@ class TunePenalties:
 
         Nothing compiles. Raises ValueError for options that do not fit together.
         """
-        for name, least in (
-            ("iterations", 1), ("stages", 1), ("updates", 0), ("count", 16), ("batch", 1),
-            ("seed", 0),
-        ):  # fmt: skip
-            if getattr(self, name) < least:
-                fail(f"--{name}", f"{getattr(self, name)}", f"Give a whole number from {least} on")
+        require_counts(self, iterations=1, stages=1, updates=0, count=16, batch=1, seed=0)
+        require_positive(self, "learning_rate")
         if self.iterations % self.stages:
             fail("--iterations", f"{self.iterations} for {self.stages} stages", "Use a multiple")
-        if not 0 < self.validation < 1:
-            fail("--validation", f"{self.validation}", "Give a fraction above 0 and below 1")
         if self.learning_rate is not None and self.optimizer is None:
             fail("--learning-rate", "given without --optimizer", "Name one, such as adam")
-        if self.learning_rate is not None and not 0 < self.learning_rate < np.inf:
-            fail("--learning-rate", f"{self.learning_rate}", "Give a positive number")
         self.stepper(np.zeros(1))
         config = problem_file(self)
         ends = start_range(config, self.lower, self.upper, 1.0)

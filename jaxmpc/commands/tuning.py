@@ -38,6 +38,24 @@ def optimizer_of(name: str, rate: float, tried: Any = None) -> optax.GradientTra
     return made
 
 
+def require_counts(command: Any, **least: int) -> None:
+    """Raise ValueError for a count below its least, or a fraction of validation outside (0, 1)."""
+    for name, lowest in least.items():
+        value = getattr(command, name)
+        if value is not None and value < lowest:
+            fail(f"--{name}", f"{value}", f"Give a whole number, at least {lowest}")
+    if not 0 < command.validation < 1:
+        fail("--validation", f"{command.validation}", "Give a fraction above 0 and below 1")
+
+
+def require_positive(command: Any, *names: str) -> None:
+    """Raise ValueError for an option that is given and not a positive number."""
+    for name in names:
+        value = getattr(command, name)
+        if value is not None and not 0 < value < np.inf:
+            fail(f"--{name.replace('_', '-')}", f"{value}", "Give a positive number")
+
+
 def problem_file(command: Any) -> configs.Config:
     """Return the problem of --config, or the built-in joint, with --horizon and --terminal."""
     given = {key: getattr(command, key) for key in ("horizon", "terminal")}
