@@ -281,7 +281,7 @@ def _penalties(job: Job) -> RungPenalties | None:
     if not found.improved:
         verdict = f"nothing better found, {best:.2%} decided by the first pass"
     print(f"penalties: {verdict}, {time.perf_counter() - start:.1f} s", file=sys.stderr)
-    return found.result
+    return found.result if found.improved else None
 
 
 def _label(job: Job, penalties: RungPenalties | None) -> Tally:

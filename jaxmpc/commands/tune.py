@@ -211,9 +211,7 @@ class TuneWeights:
             return report_error(error)
         compiling = Compiled.seconds - compiled
         seconds = {"compile": compiling, "run": time.perf_counter() - begun - compiling}
-        # The start has no rounding of exp(log(v)) in it.
-        best = run.values if run.improved else run.initial
-        (self.output / TUNED).write_text(task.write(best))
+        (self.output / TUNED).write_text(task.write(run.values))
         print(save_results(self, task, run, seconds, begun))
         return 0
 

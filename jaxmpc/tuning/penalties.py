@@ -1,7 +1,6 @@
 """tune_penalties: ADMM's penalties rho and over-relaxation alpha, tuned for one MPC problem."""
 
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -88,15 +87,11 @@ def tune_penalties(
         decides, objective, train, test, given.rho, given.alpha
     )
 
-    def build(improved: bool) -> Callable[[Any], ADMM]:
-        return partial(_with_penalties, given, objective.W) if improved else lambda _: given
-
     def tune() -> TuningRun:
         with jax.enable_x64(True):
-            return search(objective, train, test, given, stages, chosen, decides, build)
+            return search(objective, train, test, given, stages, chosen, decides)
 
-    shapes = {"log_rho": (stages, objective.W.shape[1]), "alpha": ()}
-    run = cached(cache, decides, chosen, shapes, build, tune)
+    run = cached(cache, decides, chosen, partial(_with_values, given), tune)
     if not run.improved:
         warnings.warn(
             "tune_penalties: nothing found is better on the validation set than the solver given "
@@ -107,7 +102,7 @@ def tune_penalties(
 
 def search(
     objective: PenaltyObjective, train: Samples, test: Samples, given: ADMM, stages: int,
-    settings: Settings, decides: dict[str, Any], build: Callable[[bool], Any],
+    settings: Settings, decides: dict[str, Any],
 ) -> TuningRun:  # fmt: skip
     """Start at the best constant penalty, descend, and compare with `given`."""
     rows, parameters = objective.W.shape
@@ -143,8 +138,7 @@ def search(
         return float(value), jax.tree.map(np.asarray, slope), {}
 
     def validate(theta: Any) -> tuple[float, dict[str, float]]:
-        solver = _with_penalties(given, objective.W, _values(theta))
-        found = score(*measure(solver.rho, solver.alpha, test))
+        found = score(*measure(**_values(theta, objective.W), samples=test))
         return found.pop("loss"), found
 
     schedule = optax.cosine_decay_schedule(0.1, max(settings.updates, 1), 0.03)
@@ -152,25 +146,24 @@ def search(
     after = {"loss": history.validation[history.best]} | {
         name: float(v[history.best]) for name, v in history.validation_numbers.items()
     }
-    before = score(*measure(np.asarray(given.rho), given.alpha, test))
+    initial = {"rho": np.asarray(given.rho), "alpha": np.asarray(given.alpha)}
+    before = score(*measure(**initial, samples=test))
     improved = bool(after["loss"] < before["loss"])
     return TuningRun(
-        _values(history.theta), _values(theta), before | left_out,
-        (after if improved else before) | left_out, improved, decides, build(improved), history,
-        _values(history.thetas),
+        _values(history.theta, objective.W) if improved else initial, initial, before | left_out,
+        (after if improved else before) | left_out, improved, decides,
+        partial(_with_values, given), history, _values(history.thetas, objective.W),
     )  # fmt: skip
 
 
-def _values(theta: Any) -> dict[str, np.ndarray]:
-    """Return log_rho (stages, parameters) and alpha of θ."""
-    return {"log_rho": theta["log_rho"], "alpha": 2 / (1 + np.exp(-theta["alpha"]))}
-
-
-def _with_penalties(solver: ADMM, W: np.ndarray, values: Any) -> ADMM:
-    """Return the solver with the penalties (stages, rows) and over-relaxation of these values."""
+def _values(theta: Any, W: np.ndarray) -> dict[str, np.ndarray]:
+    """Return rho (stages, rows) and alpha of θ."""
     with np.errstate(over="ignore"):  # inf, with which no state is solved
-        rho = np.exp(np.asarray(values["log_rho"]) @ W.T)
-    return replace(solver, rho=rho, alpha=float(values["alpha"]))
+        return {"rho": np.exp(theta["log_rho"] @ W.T), "alpha": 2 / (1 + np.exp(-theta["alpha"]))}
+
+
+def _with_values(solver: ADMM, values: Any) -> ADMM:
+    return replace(solver, rho=np.asarray(values["rho"]), alpha=float(values["alpha"]))
 
 
 def _knots(mpc: MPC) -> int:

@@ -61,17 +61,21 @@ def transfer_penalties(run: TuningRun, mpc: MPC, iterations: int | None = None) 
     if run.improved:
         with jax.enable_x64(True):
             c = condense(in_float64(mpc))
-        blocks = [(kind, list(steps), size) for kind, steps, size in c.layout]
-        learned = [(kind, list(steps), size) for kind, steps, size in said["blocks"]]
-        if said["groups"] == "row" and blocks != learned:
+        blocks = tuple((kind, tuple(steps), size) for kind, steps, size in said["blocks"])
+        if said["groups"] == "row" and c.layout != blocks:
             fail("mpc", "has other rows than the problem tuned", 'Use groups="step"')
         kinds = lambda blocks: [(kind, size) for kind, _, size in blocks]
-        if kinds(blocks) != kinds(learned) or len(c.balls) != len(said["balls"]):
-            fail("mpc", f"blocks {kinds(blocks)}", f"Needed: {kinds(learned)}")
+        if kinds(c.layout) != kinds(blocks) or len(c.balls) != len(said["balls"]):
+            fail("mpc", f"blocks {kinds(c.layout)}", f"Needed: {kinds(blocks)}")
         W = interpolation(said["groups"], c.layout, mpc.horizon, c.balls, said["knots"])
-        if W.shape[1] != run.values["log_rho"].shape[1]:
+        balls, knots = tuple(said["balls"]), said["knots"]
+        old = interpolation(said["groups"], blocks, said["horizon"], balls, knots)
+        if W.shape[1] != old.shape[1]:
             fail("mpc", "has blocks of one step, or more where one was", "Tune it anew")
-        rho = np.exp(run.values["log_rho"] @ W.T)
+        # A parameter that no row feels takes the mean of the others.
+        mean = np.mean(np.log(rho), axis=1, keepdims=True)
+        theta = np.linalg.lstsq(old, (np.log(rho) - mean).T, rcond=None)[0]
+        rho = np.exp(mean + theta.T @ W.T)
     count = solver.iterations if iterations is None else iterations
     solver = replace(solver, iterations=count, rho=rho)
     solver.validate(rho.shape[-1] if rho.ndim else 1)

@@ -20,10 +20,11 @@ from jaxmpc.tuning.settings import Settings
 class TuningRun:
     """What a tuner found: the values that do best on the validation set.
 
-    values, initial: name → array, the best and the first of the search.
-    before, after: name → number, measured on the validation set with what was given and with
-        `result`: "loss", and the numbers that the tuner documents.
-    improved: whether `values` do better than what was given.
+    values, initial: name → array, the best values and those given; the latter too where no step
+        is better.
+    before, after: name → number, measured on the validation set with `initial` and `values`:
+        "loss", and the numbers that the tuner documents.
+    improved: whether a step is better than what was given.
     settings: what was asked, JSON data.
     build: values → what was tuned.
     history: record of every step (`Descent`); None where the run comes from a cache.
@@ -50,10 +51,11 @@ class TuningRun:
             "loss": float(history.validation[k]),
             **{name: float(v[k]) for name, v in history.validation_numbers.items()},
         }
+        initial = {name: np.asarray(p.value) for name, p in parameters.items()}
+        improved = history.best > 0
         return cls(
-            exact_values(parameters, history.theta),
-            {name: np.asarray(p.value) for name, p in parameters.items()}, at(0),
-            at(history.best), history.best > 0, settings, build, history,
+            exact_values(parameters, history.theta) if improved else initial, initial, at(0),
+            at(history.best), improved, settings, build, history,
             trajectory(parameters, history.thetas),
         )  # fmt: skip
 
@@ -62,8 +64,7 @@ class TuningRun:
         """Return what was tuned, with the values found.
 
         From `tune_weights` a controller, from `tune_feasible_set` an MPC, from `tune_penalties`
-        an ADMM, from `tune_sweep_penalties` the penalties for `map_feasible_set`. The last two
-        return what was given (the solver, None) where nothing better was found.
+        an ADMM, from `tune_sweep_penalties` the penalties for `map_feasible_set`.
         """
         return self.build(self.values)
 
@@ -108,13 +109,12 @@ class TuningRun:
 
 def cached(
     cache: str | Path | None, decides: Mapping[str, Any], settings: Settings,
-    shapes: Mapping[str, tuple[int, ...]], build: Callable[[bool], Any],
-    tune: Callable[[], TuningRun],
+    build: Callable[[Mapping[str, Any]], Any], tune: Callable[[], TuningRun],
 ) -> TuningRun:  # fmt: skip
     """Return the run kept in the folder `cache`, else the run of `tune`, which is kept there.
 
-    decides["fingerprint"]: names the file. shapes: of the values; a file with others, or a damaged
-    one, counts as absent. build: from `improved` to `TuningRun.build`. cache None: nothing is kept.
+    decides["fingerprint"]: names the file; a damaged one counts as absent. build: of the run.
+    cache None: nothing is kept.
     """
     if cache is None:
         return tune()
@@ -122,27 +122,14 @@ def cached(
         fail("cache", "given beside an optimizer, which has no fingerprint", "Leave one out")
     path = Path(cache) / f"{decides['fingerprint']}.npz"
     kept = archive.read(path)
-    run = None if kept is None else _restored(*kept, build)
-    if run is not None and {name: v.shape for name, v in run.values.items()} == dict(shapes):
-        return run
+    if kept is not None:
+        part = lambda key: {
+            name.removeprefix(key): v for name, v in kept[1].items() if name.startswith(key)
+        }
+        return TuningRun(part("values_"), part("initial_"), **kept[0], build=build)
     run = tune()
     trees = (("values", run.values), ("initial", run.initial))
     arrays = {f"{key}_{name}": v for key, tree in trees for name, v in tree.items()}
     plain = {name: getattr(run, name) for name in ("before", "after", "improved", "settings")}
     archive.write(path, plain, **arrays)
     return run
-
-
-def _restored(
-    plain: Any, arrays: Mapping[str, np.ndarray], build: Callable[[bool], Any]
-) -> TuningRun | None:  # fmt: skip
-    """Return the run that a file of `cached` holds; None where something is missing."""
-    part = lambda key: {
-        name.removeprefix(f"{key}_"): np.asarray(v, float)
-        for name, v in arrays.items()
-        if name.startswith(f"{key}_")
-    }
-    try:
-        return TuningRun(part("values"), part("initial"), **plain, build=build(plain["improved"]))
-    except (KeyError, TypeError, ValueError):
-        return None

@@ -12,7 +12,6 @@ those that the first stage leaves open. Proofs decide labels with any penalties:
 which stage decides.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -69,10 +68,10 @@ def tune_sweep_penalties(
     settings: of `Settings`, as updates=50; here batch is 128 and validation half of the points, at
     most 2,048, unless given. optimizer None: Adam with a cosine schedule and clipped gradients.
 
-    Returns a `TuningRun` whose result is the `RungPenalties` for `map_feasible_set`, or None where
-    nothing better was found. Numbers in before and after: decided, the fraction of the validation
-    set that the stage decides. Raises ValueError for bad input and for fewer than 64 points that
-    are finite.
+    Returns a `TuningRun` whose result is the `RungPenalties` for `map_feasible_set`, with equal
+    weights where nothing better was found. Numbers in before and after: decided, the fraction of
+    the validation set that the stage decides. Raises ValueError for bad input and for fewer than 64
+    points that are finite.
     """
     mpc.validate()
     mpc = hard_part(mpc)
@@ -101,18 +100,14 @@ def tune_sweep_penalties(
     }  # fmt: skip
     decides["fingerprint"] = archive.fingerprint(decides, problem, moving, train, test)
 
-    def build(improved: bool) -> Callable[[Any], RungPenalties | None]:
-        return _penalties if improved else lambda _: None
-
     def tune() -> TuningRun:
         label = map_feasible_set(
             mpc, train, axes=axes, fixed=fixed, iterations=iterations, dtype=dtype, chunk=chunk
         ).label
         with jax.enable_x64(True):
-            return search(stage, train, label, test, chosen, decides, build)
+            return search(stage, train, label, test, chosen, decides)
 
-    shapes: dict[str, tuple[int, ...]] = {"weight": (len(moving.lower),), "alpha": ()}
-    return cached(cache, decides, chosen, shapes, build, tune)
+    return cached(cache, decides, chosen, _penalties, tune)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +139,7 @@ class Stage:
 
 def search(
     stage: Stage, train: np.ndarray, label: np.ndarray, test: np.ndarray, settings: Settings,
-    decides: dict[str, Any], build: Callable[[bool], Any],
+    decides: dict[str, Any],
 ) -> TuningRun:  # fmt: skip
     """Descend from equal weights; return the best on the validation set."""
     W, size = stage.free_weights(), len(test)
@@ -175,7 +170,7 @@ def search(
     loss, numbers = validate(theta)
     before = {"loss": loss, **numbers}
     if not loss or not len(hard):  # nothing to gain, or nothing to learn from
-        return TuningRun(initial, initial, before, before, False, decides, build(False))
+        return TuningRun(initial, initial, before, before, False, decides, _penalties)
     schedule = optax.cosine_decay_schedule(0.05, max(settings.updates, 1), 0.03)
     optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule, b2=0.99))
     history = descend(theta, gradient, validate, optimizer, settings, decides)
@@ -183,8 +178,8 @@ def search(
     improved = least < loss
     after = {"loss": least, "decided": 1 - least} if improved else before
     return TuningRun(
-        at(history.theta), initial, before, after, improved, decides, build(improved), history,
-        at(history.thetas),
+        at(history.theta) if improved else initial, initial, before, after, improved, decides,
+        _penalties, history, at(history.thetas),
     )  # fmt: skip
 
 

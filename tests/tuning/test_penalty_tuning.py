@@ -125,8 +125,13 @@ def test_cache(learned, monkeypatch):
         assert again().alpha == found.solver.alpha and not calls
 
 
+def unimproved(run):
+    """The run as it would be had no step been better than the solver given."""
+    return replace(run, improved=False, values=run.initial, after=run.before)
+
+
 def test_a_cached_failure_warns_again(tmp_path, learned, monkeypatch):
-    failed = replace(learned[0], improved=False, after=learned[0].before, build=lambda _: DEFAULT)
+    failed = unimproved(learned[0])
     monkeypatch.setattr(penalties, "search", lambda *_: failed)
     for _ in range(2):
         with pytest.warns(UserWarning, match="nothing found is better"):
@@ -155,7 +160,7 @@ def test_groups_over_horizons(learned):
     with pytest.raises(ValueError, match="multiple"):
         transfer_penalties(found, mpc(10), 41)
     # Nothing learned: what was given.
-    kept = replace(found, improved=False, build=lambda _: DEFAULT)
+    kept = unimproved(found)
     assert transfer_penalties(kept, mpc(10), 41) == replace(
         DEFAULT, iterations=41, rho=np.asarray(1.0)
     )
