@@ -67,15 +67,15 @@ def transfer_penalties(run: TuningRun, mpc: MPC, iterations: int | None = None) 
         kinds = lambda blocks: [(kind, size) for kind, _, size in blocks]
         if kinds(c.layout) != kinds(blocks) or len(c.balls) != len(said["balls"]):
             fail("mpc", f"blocks {kinds(c.layout)}", f"Needed: {kinds(blocks)}")
-        W = interpolation(said["groups"], c.layout, mpc.horizon, c.balls, said["knots"])
-        balls, knots = tuple(said["balls"]), said["knots"]
-        old = interpolation(said["groups"], blocks, said["horizon"], balls, knots)
-        if W.shape[1] != old.shape[1]:
-            fail("mpc", "has blocks of one step, or more where one was", "Tune it anew")
-        # A parameter that no row feels takes the mean of the others.
-        mean = np.mean(np.log(rho), axis=1, keepdims=True)
-        theta = np.linalg.lstsq(old, (np.log(rho) - mean).T, rcond=None)[0]
-        rho = np.exp(mean + theta.T @ W.T)
+        if c.layout != blocks:
+            sizes = (blocks, said["horizon"]), (c.layout, mpc.horizon)
+            old, new = (interpolation("step", *size, c.balls, said["knots"]) for size in sizes)
+            if old.shape[1] != new.shape[1]:
+                fail("mpc", "has blocks of one step, or more where one was", "Tune it anew")
+            # A parameter that no row feels takes the mean of the others.
+            mean = np.mean(np.log(rho), axis=1, keepdims=True)
+            theta = np.linalg.lstsq(old, (np.log(rho) - mean).T, rcond=None)[0]
+            rho = np.exp(mean + theta.T @ new.T)
     count = solver.iterations if iterations is None else iterations
     solver = replace(solver, iterations=count, rho=rho)
     solver.validate(rho.shape[-1] if rho.ndim else 1)
