@@ -68,8 +68,8 @@ def transfer_penalties(run: TuningRun, mpc: MPC, iterations: int | None = None) 
         if kinds(c.layout) != kinds(blocks) or len(c.balls) != len(said["balls"]):
             fail("mpc", f"blocks {kinds(c.layout)}", f"Needed: {kinds(blocks)}")
         if c.layout != blocks:
-            sizes = (blocks, said["horizon"]), (c.layout, mpc.horizon)
-            old, new = (interpolation("step", *size, c.balls, said["knots"]) for size in sizes)
+            shape = lambda blocks, N: interpolation("step", blocks, N, c.balls, said["knots"])
+            old, new = shape(blocks, said["horizon"]), shape(c.layout, mpc.horizon)
             if old.shape[1] != new.shape[1]:
                 fail("mpc", "has blocks of one step, or more where one was", "Tune it anew")
             # A parameter that no row feels takes the mean of the others.
