@@ -43,7 +43,8 @@ import jaxmpc as jm
 from jaxmpc.app.config import load
 from jaxmpc.control.riccati import cost_of_law
 from jaxmpc.feasible import FeasibleSetMap
-from jaxmpc.tuning.feasibility import feasible_share, tune_feasible_set
+from jaxmpc.tuning.feasible_fraction import feasible_fraction
+from jaxmpc.tuning.feasible_set import tune_feasible_set
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
 from jaxmpc.tuning.weights import tune_weights
@@ -299,7 +300,7 @@ def trade(name: str, s: Settings) -> None:
                 mpc.system, x0s, loss, s.steps,
                 solver=jm.ADMM(iterations=50, refine=5), optimizer=optax.adam(s.rate),
                 updates=s.updates, batch=16, seed=s.seed, mode="forward",
-                design_loss=lambda made, k=scale: -k * feasible_share(made, points, s.width),
+                design_loss=lambda made, k=scale: -k * feasible_fraction(made, points, s.width),
             )  # fmt: skip
             print(f"  weight {weight:g}: {run.history.seconds:.0f} s, best {run.history.best}",
                   flush=True)  # fmt: skip

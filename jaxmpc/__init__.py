@@ -26,7 +26,7 @@ from jaxmpc import (
     tuning,
     workflow,
 )
-from jaxmpc.closed_loop import simulate, simulate_many
+from jaxmpc.closed_loop import RobotController, robot_mpc, simulate, simulate_many
 from jaxmpc.control.invariant import (
     invariant_ellipsoid,
     maximal_control_invariant_set,
@@ -47,7 +47,6 @@ from jaxmpc.qp.problem import QP
 from jaxmpc.qp.solve import solve_qp
 from jaxmpc.qp.status import Status
 from jaxmpc.recursion import recursive_feasibility
-from jaxmpc.robots.control import RobotController, robot_mpc
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.load import load_robot
 from jaxmpc.sweeps.plans import solve_many

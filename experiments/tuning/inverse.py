@@ -140,7 +140,8 @@ def trial(s: Settings, name: str, seed: int) -> None:
     print(
         f"\n{name}, trial {seed}: {len(case.starts[seen])} starts to learn from (a quarter to "
         f"validate), {len(case.starts[unseen])} unseen, {s.samples} samples, N = {s.horizon}, "
-        f"{s.updates} updates, {tuned.mode} mode, {tuned.history.seconds:.0f} s, float{s.bits}"
+        f"{s.updates} updates, {tuned.settings['mode']} mode, {tuned.history.seconds:.0f} s, "
+        f"float{s.bits}"
     )
     print(f"{'':8}{'weights, by the first':>54}{'mean square':>13}{'worst':>9}{'unsolved':>10}")
     mean = {}

@@ -5,7 +5,6 @@ boundary             points and facets on the boundary along rays -> Boundary
 feasible_polytope    the whole set as a Polytope
 feasible_growth      how it grows with the horizon -> Growth
 grid                 points of a regular grid
-FeasibilityProblem   the hard constraints of an MPC problem, transcribed once
 Labels               labels of points with their proofs
 StagePenalties       learned penalties of the first stage of the labels
 """
@@ -14,12 +13,10 @@ from jaxmpc.feasible.candidates import StagePenalties
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import FeasibleSetMap, grid, map_feasible_set
 from jaxmpc.feasible.polytope import Growth, feasible_growth, feasible_polytope
-from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Boundary, boundary
 
 __all__ = [
     "Boundary",
-    "FeasibilityProblem",
     "FeasibleSetMap",
     "Growth",
     "Labels",

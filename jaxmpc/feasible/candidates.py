@@ -9,6 +9,7 @@ goes to `proofs.py`.
 """
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -116,6 +117,24 @@ def check_candidates(
     return Verdict(label, p.view.initial_state(theta, free), inputs, normal, offset)
 
 
+def feasibility_steps(
+    project: Callable[[Array], Array], onto: Callable[[Array], Array], t: Array, alpha: Any,
+    iterations: int,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Take zero-cost ADMM steps t⁺ = t + α (P (2s − t) − s), s = project(t).
+
+    project: onto the bounds. onto: v → P v, the orthogonal projection onto the range of the rows.
+    Returns the last t and the one before.
+    """
+
+    def step(t: Array, _: None = None) -> tuple[Array, None]:
+        s = project(t)
+        return t + alpha * (onto(2 * s - t) - s), None
+
+    before, _ = jax.lax.scan(step, t, length=iterations - 1)
+    return step(before)[0], before
+
+
 def admm_stage(
     p: ExactData, rows: ConstraintRows, points: Array, alpha: Array, iterations: int, dtype: Any
 ) -> tuple[Verdict, Array]:
@@ -131,12 +150,8 @@ def admm_stage(
         one = lambda t, l, u: Bounds(l, u, radius=radius, balls=rows.balls).project(t, 1.0)
         project = lambda t: jax.vmap(one, in_axes=1, out_axes=1)(t, l, u)
 
-    def step(t, _=None):
-        s = project(t)
-        return t + alpha * (matmul(U, matmul(U.T, 2 * s - t)) - s), None
-
-    before, _ = jax.lax.scan(step, project(jnp.zeros_like(l)), length=iterations - 1)
-    t, _ = step(before)
+    onto = lambda v: matmul(U, matmul(U.T, v))
+    t, before = feasibility_steps(project, onto, project(jnp.zeros_like(l)), alpha, iterations)
     residual = lambda t: t - project(t)
     w = matmul(U.T, project(t) - residual(t)).T
     multipliers = (residual(t) - residual(before)).T, residual(t).T

@@ -3,6 +3,7 @@
 MPC, Outputs, Soft    a problem, with rows of outputs and soft rows
 solve, Controller     one plan, or a factored law u = controller(x) -> Plan with Multipliers
 solve_stagewise       one plan, factored along the horizon
+solve_many            one plan for each of many states -> Plans
 active_constraints    which rows of a plan are active -> ActiveConstraint
 row_table             each row of the problem: kind, name, unit, step -> Row
 soften, harden        make rows soft or hard
@@ -13,6 +14,7 @@ from jaxmpc.mpc.rows import ActiveConstraint, Row, active_constraints, row_table
 from jaxmpc.mpc.soften import harden, soften
 from jaxmpc.mpc.solve import Controller, solve
 from jaxmpc.mpc.stagewise import solve_stagewise
+from jaxmpc.sweeps.plans import Plans, solve_many
 
 __all__ = [
     "MPC",
@@ -21,6 +23,7 @@ __all__ = [
     "Multipliers",
     "Outputs",
     "Plan",
+    "Plans",
     "Row",
     "Soft",
     "active_constraints",
@@ -28,5 +31,6 @@ __all__ = [
     "row_table",
     "soften",
     "solve",
+    "solve_many",
     "solve_stagewise",
 ]

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.closed_loop import Run
+from jaxmpc.closed_loop.outcome import coordinates
+from jaxmpc.closed_loop.run import Run
 from jaxmpc.control.violation import kept, worst_excess
-from jaxmpc.outcome import coordinates
 from jaxmpc.qp.status import Status
 
 

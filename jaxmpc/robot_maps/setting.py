@@ -10,7 +10,8 @@ import numpy as np
 from tqdm.std import tqdm
 
 from jaxmpc.checks import fail, require_shape
-from jaxmpc.closed_loop import simulate_many
+from jaxmpc.closed_loop.robot_controller import RobotController
+from jaxmpc.closed_loop.simulate_many import simulate_many
 from jaxmpc.compiled import default_chunk, padded
 from jaxmpc.feasible.cascade import label_chunks
 from jaxmpc.feasible.labels import Labels
@@ -22,7 +23,6 @@ from jaxmpc.recursion.analysis import recursive_feasibility
 from jaxmpc.robot_maps.loops import RobotLoops
 from jaxmpc.robot_maps.robot_map import RobotMap
 from jaxmpc.robot_maps.set_point import deviations, with_initial_limits
-from jaxmpc.robots.control import RobotController
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
 

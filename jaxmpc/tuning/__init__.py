@@ -1,31 +1,34 @@
 """Tuning by gradient descent, kept after each step.
 
-tune_weights                         fields of an MPC, through its closed loops -> TuningRun
-Parameter                            a quantity that is tuned, and its domain
-ClosedLoopLoss                       tracking, effort, violations and settling of a closed loop
-tune_feasible_set, feasible_share    states from which all limits can be kept, as an objective
-tune_penalties, learn_penalties      ADMM's penalties -> ADMM, Penalties
-tune_sweep_penalties                 those of the first pass of a map -> SweepPenalties
-Descent                              the record of a descent
+tune_weights                              fields of an MPC, through its closed loops
+Parameter                                 a quantity that is tuned, and its domain
+ClosedLoopLoss                            tracking, effort, violations and settling
+tune_feasible_set, feasible_fraction      states from which all limits can be kept
+tune_penalties, transfer_penalties        penalties of ADMM, also for another horizon
+tune_sweep_penalties                      penalties of the first stage of a map
+Settings, TuningRun, Descent              what all take and return
 """
 
 from jaxmpc.tuning.descent import Descent
-from jaxmpc.tuning.feasibility import feasible_share, tune_feasible_set
+from jaxmpc.tuning.feasible_fraction import feasible_fraction
+from jaxmpc.tuning.feasible_set import tune_feasible_set
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
-from jaxmpc.tuning.penalties import Penalties, learn_penalties, tune_penalties
-from jaxmpc.tuning.sweep_penalties import SweepPenalties, tune_sweep_penalties
-from jaxmpc.tuning.weights import TuningRun, tune_weights
+from jaxmpc.tuning.penalties import tune_penalties
+from jaxmpc.tuning.penalty_schedule import transfer_penalties
+from jaxmpc.tuning.result import TuningRun
+from jaxmpc.tuning.settings import Settings
+from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
+from jaxmpc.tuning.weights import tune_weights
 
 __all__ = [
     "ClosedLoopLoss",
     "Descent",
     "Parameter",
-    "Penalties",
-    "SweepPenalties",
+    "Settings",
     "TuningRun",
-    "feasible_share",
-    "learn_penalties",
+    "feasible_fraction",
+    "transfer_penalties",
     "tune_feasible_set",
     "tune_penalties",
     "tune_sweep_penalties",

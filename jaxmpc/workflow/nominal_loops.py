@@ -6,7 +6,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxmpc.closed_loop import lyapunov_decrease, simulate
+from jaxmpc.closed_loop.run import lyapunov_decrease
+from jaxmpc.closed_loop.simulate import simulate
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import Controller

@@ -18,7 +18,7 @@ import jaxmpc as jm
 from jaxmpc.app import cli
 from jaxmpc.app.commands import robot_runs
 from jaxmpc.app.plots import plot_runs
-from jaxmpc.outcome import judge
+from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.robots.video import render, save_video
 
 # Models at the set-point compile in half the time.
@@ -222,17 +222,18 @@ def test_outcome_and_picture_of_runs_made_by_hand(joint):
     fallback = np.zeros((4, 10), bool)
     fallback[1, 2] = True
     run = by_hand(x, u, fallback=fallback)
-    outcome = judge(run, joint, np.array([1.0, 0.0]))
+    outcome = evaluate_runs(run, joint, np.array([1.0, 0.0]))
     assert list(outcome.kept) == [True, False, True, False]
     assert list(outcome.reached) == [True, True, False, True]
     assert list(outcome.success) == [True, False, False, False]
-    assert list(outcome.promised) == [True, False, True, True]
+    assert list(outcome.plans_valid) == [True, False, True, True]
     # q = 0.8 at sample 4, 1 from sample 5 on: 0.05 s.
     np.testing.assert_allclose(outcome.settling, [0.05, 0.05, np.inf, 0.06])
     np.testing.assert_allclose(outcome.cost, 10.0)
     np.testing.assert_allclose(outcome.state_excess[1, 3], [0, 1e-5], atol=1e-12)
     # Within 1e-6 of the limit it counts as kept.
-    assert judge(by_hand(np.where(x == -2.00001, -2.000001, x), u), joint, [1.0, 0.0]).kept[1]
+    nearly = by_hand(np.where(x == -2.00001, -2.000001, x), u)
+    assert evaluate_runs(nearly, joint, [1.0, 0.0]).kept[1]
 
     figure = plot_runs(run, joint, reference=np.array([1.0, 0.0]), robots=[0, 1, 2])
     labels = [(ax.get_title(), ax.get_ylabel()) for ax in figure.axes if ax.axison]
@@ -258,7 +259,7 @@ def test_runs_with_orientations_and_of_linear_plants(tmp_path):
     x = np.broadcast_to(robot.home, (3, 13)).copy()
     x[-1, 3:7] = [np.cos(0.1), 0, np.sin(0.1), 0]  # 0.2 rad about y
     run = by_hand(x[None], np.full((1, 2, 4), 0.05))
-    outcome = judge(run, robot, np.asarray(robot.coordinates(robot.home)))
+    outcome = evaluate_runs(run, robot, np.asarray(robot.coordinates(robot.home)))
     np.testing.assert_allclose(outcome.coordinates[0, -1, 3:6], [0, 0.2, 0], atol=1e-9)
     assert outcome.kept[0] and not outcome.reached[0]
     figure = plot_runs(run, robot)
@@ -280,6 +281,7 @@ import numpy as np
 from jaxmpc.app.commands.film import choose_renderer
 choose_renderer()
 import jaxmpc as jm
+from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.robots.video import render, save_video
 q = np.linspace(0, 1.2, 9)
 states = np.zeros((3, 9, 2))

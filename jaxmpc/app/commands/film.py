@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxmpc.closed_loop import Run
+from jaxmpc.closed_loop.run import Run
 from jaxmpc.robots.robot import Robot
 from jaxmpc.robots.video import render, save_video
 

@@ -130,11 +130,12 @@ class LinearSweep:
             )  # fmt: skip
         except OSError as error:
             fail(str(cache), f"{error.strerror}", "Set XDG_CACHE_HOME to a folder of yours")
-        verdict = f"{found.decided_before:.2%} -> {found.decided:.2%} decided by the first pass"
-        if found.penalties is None:
-            verdict = f"nothing better found, {found.decided:.2%} decided by the first pass"
+        first, best = found.before["decided"], found.after["decided"]
+        verdict = f"{first:.2%} -> {best:.2%} decided by the first pass"
+        if not found.improved:
+            verdict = f"nothing better found, {best:.2%} decided by the first pass"
         print(f"penalties: {verdict}, {time.perf_counter() - start:.1f} s", file=sys.stderr)
-        return found.penalties
+        return found.result if found.improved else None
 
     def label(self, penalties: StagePenalties | None) -> Timing:
         """Label the chunks that are not done, and commit each."""

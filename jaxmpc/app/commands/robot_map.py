@@ -14,6 +14,7 @@ from tqdm.std import tqdm
 from jaxmpc.app.commands.options import check_positive, check_results, model_hash, open_folder
 from jaxmpc.app.config.states import axis_indices, grid_ends
 from jaxmpc.checks import fail
+from jaxmpc.closed_loop.robot_mpc import robot_mpc
 from jaxmpc.control.named_terminal import named_terminal_set
 from jaxmpc.control.riccati import lqr
 from jaxmpc.feasible import store
@@ -25,7 +26,6 @@ from jaxmpc.robot_maps.loops import RobotLoops
 from jaxmpc.robot_maps.robot_map import RobotMap
 from jaxmpc.robot_maps.set_point import deviations, moved
 from jaxmpc.robot_maps.setting import RobotSetting
-from jaxmpc.robots.control import robot_mpc
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import Robot
 from jaxmpc.runs import versions, write_arrays, write_json

@@ -18,15 +18,17 @@ from jaxmpc.app.commands.options import Timing, check_results, model_hash, open_
 from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
 from jaxmpc.app.config import load_robot_config
 from jaxmpc.checks import fail
-from jaxmpc.closed_loop import Run, simulate_many
+from jaxmpc.closed_loop.linear_feedback import LinearFeedback
+from jaxmpc.closed_loop.robot_controller import RobotController
+from jaxmpc.closed_loop.robot_mpc import robot_mpc
+from jaxmpc.closed_loop.run import Run
+from jaxmpc.closed_loop.simulate_many import simulate_many
 from jaxmpc.compiled import Compiled, first_rows, padded
 from jaxmpc.control.riccati import lqr
 from jaxmpc.feasible import store
-from jaxmpc.mpc.feedback import LinearFeedback
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
-from jaxmpc.robots.control import RobotController, robot_mpc
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import Robot
 

@@ -8,8 +8,9 @@ import numpy as np
 
 from jaxmpc.app.commands.options import Timing
 from jaxmpc.app.commands.robot_runs import RobotRuns
-from jaxmpc.closed_loop import Run
-from jaxmpc.outcome import KEPT, Outcome
+from jaxmpc.closed_loop.outcome import Outcome
+from jaxmpc.closed_loop.run import Run
+from jaxmpc.control.violation import TOLERANCE
 from jaxmpc.qp.status import Status
 from jaxmpc.runs import versions
 
@@ -43,11 +44,11 @@ def summarise(runs: RobotRuns, run: Run, outcome: Outcome, timing: Timing) -> di
         "control_period": robot.dt,
         "success": count(outcome.success),
         "limits_kept": count(outcome.kept),
-        "limits_kept_to": KEPT,
+        "limits_kept_to": TOLERANCE["float64"],
         "reached": count(outcome.reached),
         "not_finite": count(~np.isfinite(run.states).all(axis=(1, 2))),
-        "plans_valid": count(outcome.promised) if mpc else None,
-        "plans_valid_and_kept": count(outcome.promised & outcome.kept) if mpc else None,
+        "plans_valid": count(outcome.plans_valid) if mpc else None,
+        "plans_valid_and_kept": count(outcome.plans_valid & outcome.kept) if mpc else None,
         "worst_violation": {"of": names[i], "by": float(worst[i]), "unit": units[i]},
         "violations": {
             "states": dict(zip(robot.state_names, worst[: robot.n].tolist(), strict=True)),
@@ -79,7 +80,7 @@ def table(s: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [
         ("robots", f"{s['robots']:>9,}  {length}"),
         ("success", f"{fraction('success')}  limits kept, and at the target at the end"),
-        ("limits kept", f"{fraction('limits_kept')}  to {KEPT:g}, all samples"),
+        ("limits kept", f"{fraction('limits_kept')}  to {s['limits_kept_to']:g}, all samples"),
     ]
     if s["not_finite"]:
         rows.append(("not finite", fraction("not_finite")))

@@ -12,7 +12,7 @@ from jaxmpc.app.commands.robot_runs import RobotRuns
 from jaxmpc.app.commands.runs_summary import summarise, table
 from jaxmpc.app.config import load_robot_config
 from jaxmpc.checks import fail
-from jaxmpc.outcome import judge
+from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.runs import write_json
 
 # What --config says where an option does not, and what holds without either.
@@ -148,7 +148,7 @@ class Simulate:
         print(f"{robot.name}: {self.count:,} robots for {self.seconds:g} s -> {self.output}")
         timing = runs.simulate()
         run = runs.read()
-        outcome = judge(run, robot, runs.reference, tolerance=self.tolerance)
+        outcome = evaluate_runs(run, robot, runs.reference, tolerance=self.tolerance)
         files = ["runs.zarr", "summary.json", "runs.png"]
         from jaxmpc.app.plots.closed_loops import plot_runs
 

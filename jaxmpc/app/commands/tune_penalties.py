@@ -1,4 +1,4 @@
-"""The command `jaxmpc tune penalties`: arguments to calls, no mathematics."""
+"""The command `jaxmpc tune penalties`: its options, files and table."""
 
 import dataclasses
 import json
@@ -27,32 +27,35 @@ from jaxmpc.app.commands.tuning import (
     open_run,
     optimizer_of,
     problem_file,
+    require_counts,
+    require_positive,
     start_range,
 )
+from jaxmpc.app.plots.tuning import plot_penalties
 from jaxmpc.checks import fail
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import solve
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.runs import versions, write_json
-from jaxmpc.tuning.penalties import Penalties, learn_penalties
-from jaxmpc.tuning_plots import plot_penalties
+from jaxmpc.tuning.penalties import tune_penalties
+from jaxmpc.tuning.result import TuningRun
 
 FILES = ("penalties.json", TUNED, "penalties.png")
 
 
 @dataclasses.dataclass(frozen=True)
 class TunePenalties:
-    """Learn the penalties of the solver (ADMM), so that few steps solve an MPC's states.
+    """Tune the penalties of the solver (ADMM), so that fewer steps solve an MPC problem.
 
     What it does
-      ADMM solves each plan by a fixed number of steps. How many states of a problem come out
-      solved depends on its penalties rho, one a limit and stage, and on its over-relaxation alpha.
-      Draws initial states, runs the steps, and moves rho and alpha down the gradient of the digits
-      that the residuals lack. A part of the states is kept apart (--validation): the result is
-      the best of all steps on those; where none is better than the default (rho = 1,
-      alpha = 1.6) that is kept, and said.
-      Whatever rho is, what ADMM converges to is the plan: a bad rho costs steps, never truth.
+      ADMM computes each plan by a fixed number of steps. For how many states these suffice depends
+      on its penalties rho, one for each limit and stage, and on its over-relaxation alpha. Draws
+      initial states, runs the steps, and moves rho and alpha down the gradient of the number of
+      digits by which the residuals are too large. Some of the states (--validation) are the
+      validation set: the result is the best of all steps on these; where none is better than the
+      default (rho = 1, alpha = 1.6) the table says so and the default is kept.
+      ADMM converges to the same plan whatever rho is: a bad rho costs steps, not correctness.
       Without a file the problem is one robot joint: x = (q, dq), torque u, 20 steps of 0.01 s.
 
     How to start
@@ -62,22 +65,22 @@ class TunePenalties:
 
     How to read the table
       solved      validation states whose residuals (primal, dual, gap) are all within 1e-6 after
-                  --iterations steps, without Newton steps; with the default and as learned
-      residual    median over them of the largest residual
-      infeasible  states drawn from within the limits from which linear programs find no plan: not
-                  counted above, not learned from
-      learning    seconds, compiler included
-      safeguard   whether the learned penalties are used or the default is kept
+                  --iterations steps, without Newton steps; with the default and with the result
+      residual    median over these states of the largest residual
+      infeasible  states drawn within the limits from which no plan keeps the limits, by linear
+                  programs; neither counted above nor learned from
+      learning    seconds, compiling included
+      safeguard   whether the tuned penalties are used or the default is kept
 
     Files, all in the folder of --output
       tuned.toml      The whole problem with [solver] iterations, rho, alpha, refine = 0, for
                       --config of jaxmpc tune weights; in Python Config.build_solver() makes an
                       ADMM of it for jm.solve, jm.Controller, jm.solve_many.
-      penalties.json  Options, the table's numbers, loss of every step, versions.
+      penalties.json  Options, the numbers of the table, loss of every step, versions.
       penalties.png   rho by kind of limit, step of the horizon and stage; distribution of the
                       residuals before and after.
-      checkpoint.npz  What --resume goes on from, written after every step.
-      Ctrl-C          Stops; steps that are done are kept, --resume goes on from there.
+      checkpoint.npz  The state of the run after every step, from which --resume goes on.
+      Ctrl-C          Stops. Finished steps are kept, and --resume goes on from there.
       Exit code       0 done, better or not; 2 error (one line on stderr says which); 130 stopped
                       by Ctrl-C.
 
@@ -91,36 +94,34 @@ class TunePenalties:
     iterations: Annotated[int, option("K", "100")] = 100
     """ADMM steps of each plan."""
     stages: Annotated[int, option("K", "4")] = 4
-    """Number of penalties of a row, one after the other for equal shares of the steps."""
+    """Number of penalties for each row, each used for an equal part of the steps, in turn."""
     groups: Annotated[Literal["step", "row"], option("{step,row}", "step")] = "step"
-    """step: five values along the horizon for each limit, linear between.
-    row: one for each limit and step."""
+    """step: five penalties along the horizon for each limit, linear between them.
+    row: one for each limit and step of the horizon."""
     updates: Annotated[int, option("K", "300")] = 300
     """Steps of the optimizer."""
     count: Annotated[int, option("B", "1024")] = 1024
-    """Number of initial states, validation included, infeasible ones not."""
+    """Number of feasible initial states, validation included."""
     batch: Annotated[int, option("B", "128")] = 128
-    """States of one step, drawn anew each time."""
-    validation: Annotated[float, option("SHARE", "0.25")] = 0.25
-    """Share of the initial states kept apart."""
-    optimizer: Annotated[str | None, option("NAME", "adam, its step falling to 3 % on the way")] = (
-        None
-    )
+    """Number of states of each step, drawn anew."""
+    validation: Annotated[float, option("FRACTION", "0.25")] = 0.25
+    """Fraction of the initial states in the validation set."""
+    optimizer: Annotated[str | None, option("NAME", "adam, its rate falling to 3 %")] = None
     """Optimizer of optax, by name: adam, adamw, sgd, rmsprop, lion, ..."""
     learning_rate: Annotated[float | None, option("X", "0.1")] = None
-    """Its step, in log rho; needs --optimizer."""
+    """Learning rate, in log rho; needs --optimizer."""
     lower: Annotated[tuple[float, ...] | None, option("X [X ...]", "state limits")] = None
     """Lower ends of the initial states, one number a state."""
     upper: Annotated[tuple[float, ...] | None, option("X [X ...]", "state limits")] = None
-    """Upper ends."""
+    """Upper ends of the initial states."""
     horizon: Horizon = None
     """Prediction horizon, in steps of dt."""
     terminal: Terminal = None
-    """Set for the last state, as in jaxmpc sweep."""
+    """Terminal set, as in jaxmpc sweep."""
     seed: Annotated[int, option("K", "0")] = 0
-    """Of initial states and batches."""
+    """Seed of initial states and batches."""
     output: Annotated[Path, option("DIR", "jaxmpc-penalties")] = Path("jaxmpc-penalties")
-    """Folder for the files; made where absent."""
+    """Folder for the files; created if absent."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
     """Go on with the run in --output."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
@@ -129,7 +130,7 @@ class TunePenalties:
     keeps = "steps"
 
     def run(self) -> int:
-        """Do it; the result is the exit code."""
+        """Run the command and return the exit code."""
         begun = time.perf_counter()
         try:
             config, mpc, (lower, upper) = self.prepare()
@@ -145,7 +146,7 @@ class TunePenalties:
             given, learning = ADMM(refine=0), time.perf_counter()
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "tune_penalties", UserWarning)
-                found = learn_penalties(
+                found = tune_penalties(
                     mpc, train, self.iterations, stages=self.stages, groups=self.groups,
                     solver=given, updates=self.updates, optimizer=self.stepper(),
                     batch=self.batch, validation=test, seed=self.seed,
@@ -162,27 +163,22 @@ class TunePenalties:
         return 0
 
     def prepare(self) -> tuple[configs.Config, MPC, tuple[np.ndarray, np.ndarray]]:
-        """Check and open everything. Raises ValueError, compiles nothing."""
-        for name, least in (
-            ("iterations", 1), ("stages", 1), ("updates", 0), ("count", 16), ("batch", 1),
-            ("seed", 0),
-        ):  # fmt: skip
-            if getattr(self, name) < least:
-                fail(f"--{name}", f"{getattr(self, name)}", f"Give a whole number from {least} on")
+        """Return the problem and the ends of the initial states; open the folder.
+
+        Nothing compiles. Raises ValueError for options that do not fit together.
+        """
+        require_counts(self, iterations=1, stages=1, updates=0, count=16, batch=1, seed=0)
+        require_positive(self, "learning_rate")
         if self.iterations % self.stages:
             fail("--iterations", f"{self.iterations} for {self.stages} stages", "Use a multiple")
-        if not 0 < self.validation < 1:
-            fail("--validation", f"{self.validation}", "Give a share above 0 and below 1")
         if self.learning_rate is not None and self.optimizer is None:
             fail("--learning-rate", "given without --optimizer", "Name one, such as adam")
-        if self.learning_rate is not None and not 0 < self.learning_rate < np.inf:
-            fail("--learning-rate", f"{self.learning_rate}", "Give a positive number")
         self.stepper(np.zeros(1))
         config = problem_file(self)
         ends = start_range(config, self.lower, self.upper, 1.0)
         mpc = config.build_controlled()
-        apart = ("config", "output", "resume", "overwrite", "updates")
-        options = {k: v for k, v in dataclasses.asdict(self).items() if k not in apart}
+        ignored = ("config", "output", "resume", "overwrite", "updates")
+        options = {k: v for k, v in dataclasses.asdict(self).items() if k not in ignored}
         if self.optimizer is None:  # its schedule knows the number of steps
             options["updates"] = self.updates
         options = json.loads(json.dumps({**options, "problem": config.to_dict("tune")}))
@@ -190,13 +186,13 @@ class TunePenalties:
         return config, mpc, ends
 
     def stepper(self, tried: Any = None) -> optax.GradientTransformation | None:
-        """The optimizer; None for the usual one."""
+        """Return the optimizer; None for the default one."""
         if self.optimizer is None:
             return None
         return optimizer_of(self.optimizer, self.learning_rate or 0.1, tried)
 
     def save(
-        self, config: configs.Config, found: Penalties, worst: np.ndarray, dropped: int,
+        self, config: configs.Config, found: TuningRun, worst: np.ndarray, dropped: int,
         seconds: float,
     ) -> None:  # fmt: skip
         """Write the files."""
@@ -210,22 +206,16 @@ class TunePenalties:
         (self.output / TUNED).write_text(text)
         h = found.history
         numbers = {
-            name: getattr(found, name)
-            for name in (
-                "improved",
-                "solved_before",
-                "solved",
-                "residual_before",
-                "residual",
-                "alpha",
-            )
-        }
+            "improved": found.improved, "before": found.before, "after": found.after,
+            "alpha": solver.alpha,
+        }  # fmt: skip
         finite = lambda v: [float(x) if np.isfinite(x) else None for x in v]
         document = {
             "name": config.name,
             "options": json.loads((self.output / FILES[0]).read_text())["options"],
             "finished": True, "result": numbers, "validation_states": worst.shape[1],
-            "states_without_plan": dropped + found.infeasible, "learning_seconds": seconds,
+            "states_without_plan": dropped + round(found.after["infeasible"]),
+            "learning_seconds": seconds,
             "loss": finite(h.loss) if h else [],
             "gradient_norm": finite(h.gradient_norm) if h else [],
             "accepted": h.accepted.tolist() if h else [],
@@ -234,30 +224,31 @@ class TunePenalties:
             "versions": versions(),
         }  # fmt: skip
         write_json(self.output / FILES[0], document)
-        words = "learned" if found.improved else "default kept, nothing learned is better"
+        words = "tuned" if found.improved else "default kept, no step is better"
         title = f"{config.name}: {self.iterations} ADMM steps, {words}"
         figure = plot_penalties(found, worst[0], worst[1], 1e-6, title)
         figure.savefig(self.output / "penalties.png", dpi=150)
 
-    def table(self, found: Penalties, count: int, dropped: int, seconds: float) -> str:
-        """The result for the eye."""
+    def table(self, found: TuningRun, count: int, dropped: int, seconds: float) -> str:
+        """Return the result as a table of text."""
         row = lambda name, a, b, more="": f"  {name:<13} {a:>12} {b:>12}  {more}".rstrip()
-        share = lambda v: f"{100 * v:.2f} %"
+        first, last = found.before, found.after
+        percent = lambda numbers: f"{100 * numbers['solved']:.2f} %"
         alpha = float(np.asarray(found.solver.alpha))
         rho = np.asarray(found.solver.rho, float)
         spread = (
             f"{rho.min():.3g}" if rho.min() == rho.max() else f"{rho.min():.3g}-{rho.max():.3g}"
         )
         kept = (
-            "passed: the learned penalties are used"
+            "passed: the tuned penalties are used"
             if found.improved
-            else "nothing learned is better on the validation states: the default is kept"
+            else "no step is better on the validation states: the default is kept"
         )
-        out = dropped + found.infeasible
+        out = dropped + round(found.after["infeasible"])
         return "\n".join([
             row("", "default", "as written"),
-            row("solved", share(found.solved_before), share(found.solved), f"of {count} states"),
-            row("residual", f"{found.residual_before:.3g}", f"{found.residual:.3g}", "median"),
+            row("solved", percent(first), percent(last), f"of {count} states"),
+            row("residual", f"{first['residual']:.3g}", f"{last['residual']:.3g}", "median"),
             row("rho", "1", spread), row("alpha", "1.6", f"{alpha:.4g}"),
             f"  {'infeasible':<13} {out:,} states drawn have no plan: left out",
             f"  {'learning':<13} {seconds:.1f} s, compiler included",
@@ -268,7 +259,8 @@ class TunePenalties:
 
 
 def residuals(mpc: MPC, states: np.ndarray, solvers: tuple[ADMM, ADMM]) -> np.ndarray:
-    """Largest residual (2, B) with each solver, of the states that neither proves infeasible."""
+    """Return the largest residual (2, B) with each solver, of the states that neither proves
+    infeasible."""
     shape = np.broadcast_shapes(*(np.shape(solver.rho) for solver in solvers))
     wide = [
         dataclasses.replace(s, rho=np.broadcast_to(np.asarray(s.rho, float), shape))

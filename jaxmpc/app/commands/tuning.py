@@ -1,4 +1,4 @@
-"""What the commands `jaxmpc tune weights` and `jaxmpc tune penalties` share."""
+"""What `jaxmpc tune weights` and `tune penalties` share: optimizer, initial states, folder."""
 
 import json
 from pathlib import Path
@@ -25,7 +25,7 @@ TRIES = 10
 
 
 def optimizer_of(name: str, rate: float, tried: Any = None) -> optax.GradientTransformation:
-    """The optimizer of optax with this name; ValueError where there is none."""
+    """Return the optimizer of optax with this name; raise ValueError where there is none."""
     cure = "Give one that takes a learning rate: adam, adamw, sgd, rmsprop, lion, ..."
     make = None if name.startswith("_") else getattr(optax, name, None)
     try:
@@ -39,17 +39,35 @@ def optimizer_of(name: str, rate: float, tried: Any = None) -> optax.GradientTra
     return made
 
 
+def require_counts(command: Any, **least: int) -> None:
+    """Raise ValueError for a count below its least, or a fraction of validation outside (0, 1)."""
+    for name, lowest in least.items():
+        value = getattr(command, name)
+        if value is not None and value < lowest:
+            fail(f"--{name}", f"{value}", f"Give a whole number, at least {lowest}")
+    if not 0 < command.validation < 1:
+        fail("--validation", f"{command.validation}", "Give a fraction above 0 and below 1")
+
+
+def require_positive(command: Any, *names: str) -> None:
+    """Raise ValueError for an option that is given and not a positive number."""
+    for name in names:
+        value = getattr(command, name)
+        if value is not None and not 0 < value < np.inf:
+            fail(f"--{name.replace('_', '-')}", f"{value}", "Give a positive number")
+
+
 def problem_file(command: Any) -> configs.Config:
-    """The file of --config, or the built-in joint, with --horizon and --terminal."""
+    """Return the problem of --config, or the built-in joint, with --horizon and --terminal."""
     given = {key: getattr(command, key) for key in ("horizon", "terminal")}
     overrides = {key: value for key, value in given.items() if value is not None}
     return configs.load(command.config, overrides, "tune")
 
 
 def start_range(
-    config: configs.Config, lower: Any, upper: Any, share: float
+    config: configs.Config, lower: Any, upper: Any, fraction: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of the initial states: as given, else this share of the state limits."""
+    """Return the ends of the initial states: as given, else this fraction of the state limits."""
     low, high = config.state_range()
     n = len(low)
     for name, given in (("--lower", lower), ("--upper", upper)):
@@ -58,8 +76,8 @@ def start_range(
     middle, half = (high + low) / 2, (high - low) / 2
     bounded = np.isfinite(half)
     middle, half = np.where(bounded, middle, np.nan), np.where(bounded, half, np.nan)
-    low = middle - share * half if lower is None else np.array(lower)
-    high = middle + share * half if upper is None else np.array(upper)
+    low = middle - fraction * half if lower is None else np.array(lower)
+    high = middle + fraction * half if upper is None else np.array(upper)
     if not np.all(np.isfinite([low, high])):
         fail("--lower, --upper", "the state limits do not bound all states", "Give both ends")
     if np.any(low >= high):
@@ -70,10 +88,10 @@ def start_range(
 def feasible_states(
     mpc: MPC, limits: Any, lower: np.ndarray, upper: np.ndarray, count: int, seed: int
 ) -> tuple[np.ndarray, int]:
-    """Uniform states (count, n) within limits that have a plan, and how many drawn had none.
+    """Return uniform states (count, n) within limits that have a plan, and how many had none.
 
-    Asked of linear programs on the host: nothing compiles for it, and hard rows are all linear but
-    for an elliptic terminal set, which is left out.
+    Whether a state has a plan is decided by linear programs on the host, without compiling: hard
+    rows are all linear but for an ellipsoidal terminal set, which is left out.
     """
     rows = Inequalities.of(FeasibilityProblem.of(mpc).condensed)
     random, dropped = np.random.default_rng(seed), 0
@@ -97,8 +115,12 @@ def feasible_states(
 def open_run(
     folder: Path, files: tuple[str, ...], options: dict[str, Any], resume: bool, overwrite: bool
 ) -> None:
-    """Open the folder of a run that is new, or goes on with the same options; files[0] is its
-    record, which holds them. ValueError otherwise."""
+    """Open the folder of a new run, or of one that goes on with the same options.
+
+    files[0] is the record of the run, a JSON file that holds the options; all files are removed,
+    and the record is begun. Raises ValueError where the folder holds a run with other options, or
+    any run without `resume` or `overwrite`.
+    """
     if resume and overwrite:
         fail("--overwrite", "given beside --resume", "Choose one")
     record = folder / files[0]

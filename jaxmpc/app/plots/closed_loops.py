@@ -10,8 +10,9 @@ from matplotlib.lines import Line2D
 
 from jaxmpc.app.plots.style import EDGE, INFEASIBLE, OUTER, TERMINAL, patch
 from jaxmpc.checks import fail
-from jaxmpc.closed_loop import Run
-from jaxmpc.outcome import batch_of, beyond, coordinates
+from jaxmpc.closed_loop.outcome import with_limits
+from jaxmpc.closed_loop.run import Run
+from jaxmpc.control import violation
 from jaxmpc.robots.robot import Robot
 
 RUN, BROKEN = "#0072b2", "#a50f15"
@@ -29,14 +30,14 @@ def plot_runs(
     set-points to draw. robots: which of the batch to draw, 24 at most by default; the title
     counts all. Raises ValueError for robots that are not there.
     """
-    run = batch_of(run)
+    run = run.on_host()
     inputs, failed = np.asarray(run.inputs), np.asarray(run.fallback)
     count, samples = inputs.shape[:2]
     shown = np.arange(min(count, 24)) if robots is None else np.asarray(robots, int)
     if not len(shown) or np.any((shown < 0) | (shown >= count)):
         fail("robots", f"{robots}", f"Give indices from 0 to {count - 1}")
-    xi = coordinates(plant, run.states)
-    kept = [beyond(xi, plant.state_limits)[1], beyond(inputs, plant.input_limits)[1]]
+    pairs = with_limits(plant, run)
+    xi, kept = pairs[0][1], [violation.kept(*pair) for pair in pairs]
     columns = panel_columns(plant)
     rows = max(len(panels) for _, panels in columns)
     size = (2.6 * len(columns) + 0.2, max(1.15 * rows, 2.0) + 1.1)

@@ -15,9 +15,12 @@ from jaxmpc.app.commands import linear_sweep
 from jaxmpc.feasible.candidates import StagePenalties, compiled_admm
 from jaxmpc.feasible.constraint_rows import weighted
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.tuning import penalties as module
-from jaxmpc.tuning import sweep_penalties
-from jaxmpc.tuning.penalties import learn_penalties, spread, tune_penalties
+from jaxmpc.tuning import penalties, sweep_penalties
+from jaxmpc.tuning.penalties import tune_penalties
+from jaxmpc.tuning.penalty_objective import loss_and_gradient
+from jaxmpc.tuning.penalty_schedule import interpolation, transfer_penalties
+from jaxmpc.tuning.result import TuningRun
+from jaxmpc.tuning.settings import Settings
 from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
 
 # The double integrator of five steps: 5 variables, 17 rows.
@@ -38,7 +41,7 @@ plans = jax.jit(jax.vmap(jm.Controller.plan, in_axes=(None, 0)))
 
 
 def solved(solver, x, problem):
-    """Share of the states that a Controller solves, in float64."""
+    """Fraction of the states that a Controller solves, in float64."""
     with jax.enable_x64(True):
         controller = jm.Controller(jax.tree.map(np.float64, problem), solver)
         return np.mean(np.asarray(plans(controller, x).status) == jm.Status.SOLVED)
@@ -47,7 +50,7 @@ def solved(solver, x, problem):
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory):
     folder = tmp_path_factory.mktemp("penalties")
-    return learn_penalties(mpc(), states(160, 0), cache=folder, **SETTINGS), folder
+    return tune_penalties(mpc(), states(160, 0), cache=folder, **SETTINGS), folder
 
 
 def test_more_states_are_solved_on_others(learned):
@@ -59,7 +62,8 @@ def test_more_states_are_solved_on_others(learned):
     before = solved(replace(DEFAULT, iterations=30, rho=np.ones((2, rows))), x, mpc())
     after = solved(found.solver, x, mpc())
     assert found.improved and before < 0.1 and after > 0.85
-    assert abs(after - found.solved) < 0.1 and abs(before - found.solved_before) < 0.1
+    assert abs(after - found.after["solved"]) < 0.1
+    assert abs(before - found.before["solved"]) < 0.1
     assert found.history.best > 0 and np.isfinite(found.history.loss).all()
 
 
@@ -68,18 +72,20 @@ def test_gradient_against_differences():
     rng = np.random.default_rng(0)
     x, rows = states(12, 2), len(jm.mpc.row_table(mpc()))
     start = rng.normal(size=(12, 5)), rng.normal(size=(12, rows))
-    setting, samples, _ = module.prepared(
-        mpc(), x, 20, 2, "step", DEFAULT, 4, 0.5, start, np.array([0.3, 0.1]), None, 0, 1
-    )
-    theta = {"rho": 0.3 * rng.normal(size=(2, setting.W.shape[1])), "alpha": np.array(1.2)}
+    objective, samples, _ = penalties._prepared(
+        mpc(), x, 20, 2, "step", DEFAULT, start, np.array([0.3, 0.1]), None,
+        Settings(validation=0.5),
+    )  # fmt: skip
+    parameters = objective.W.shape[1]
+    theta = {"log_rho": 0.3 * rng.normal(size=(2, parameters)), "alpha": np.array(1.2)}
     with jax.enable_x64(True):
-        value = lambda theta: float(module.slope(theta, setting, samples)[0])
-        slope = jax.tree.map(np.asarray, module.slope(theta, setting, samples)[1])
+        value = lambda theta: float(loss_and_gradient(theta, objective, samples)[0])
+        slope = jax.tree.map(np.asarray, loss_and_gradient(theta, objective, samples)[1])
         for _ in range(10):
             d = jax.tree.map(lambda v: rng.normal(size=v.shape), theta)
             move = lambda h, d=d: jax.tree.map(lambda v, w: v + h * w, theta, d)
             difference = (value(move(1e-6)) - value(move(-1e-6))) / 2e-6
-            product = np.sum(slope["rho"] * d["rho"]) + slope["alpha"] * d["alpha"]
+            product = np.sum(slope["log_rho"] * d["log_rho"]) + slope["alpha"] * d["alpha"]
             assert product == pytest.approx(difference, rel=1e-4)
 
 
@@ -87,22 +93,22 @@ def test_gradient_against_differences():
 def test_sabotaged_learning_returns_the_given_solver(learned, rate):
     given = learned[0].solver
     with pytest.warns(UserWarning, match="nothing found is better"):
-        found = learn_penalties(
+        found = tune_penalties(
             mpc(), states(160, 0), solver=given, optimizer=optax.sgd(rate),
             **{**SETTINGS, "updates": 4},
         )  # fmt: skip
     assert found.solver is not learned[0].solver and not found.improved
     assert np.array_equal(found.solver.rho, given.rho) and found.solver.alpha == given.alpha
-    assert (found.solved, found.residual) == (learned[0].solved, learned[0].residual)
+    assert found.after == found.before == learned[0].after
 
 
 def test_cache(learned, monkeypatch):
     found, folder = learned
-    again = lambda **more: tune_penalties(
-        mpc(), states(160, 0), cache=folder, **{**SETTINGS, **more}
+    again = lambda **more: (
+        tune_penalties(mpc(), states(160, 0), cache=folder, **{**SETTINGS, **more}).solver
     )
     calls = []
-    monkeypatch.setattr(module, "learned", lambda *_: calls.append(1) or found)
+    monkeypatch.setattr(penalties, "search", lambda *_: calls.append(1) or found)
     assert np.array_equal(again().rho, found.solver.rho) and not calls
     assert again().alpha == found.solver.alpha
     assert again(solver=jm.ADMM(refine=3)).refine == 3 and not calls  # plays no part in learning
@@ -120,19 +126,26 @@ def test_cache(learned, monkeypatch):
         assert again().alpha == found.solver.alpha and not calls
 
 
-def test_a_cached_failure_warns_again(tmp_path, learned):
-    found = replace(learned[0], solved=0.5, solved_before=0.6, solver=DEFAULT)
-    module.save(tmp_path / "a.npz", found)
-    kept = module.load(tmp_path / "a.npz", DEFAULT, np.eye(17))
-    assert not kept.improved and kept.solver == DEFAULT
-    with pytest.warns(UserWarning, match="nothing found is better"):
-        module.warned(kept)
+def unimproved(run):
+    """The run as it would be had no step been better than the solver given."""
+    return replace(run, improved=False, values=run.initial, after=run.before)
+
+
+def test_a_cached_failure_warns_again(tmp_path, learned, monkeypatch):
+    failed = unimproved(learned[0])
+    monkeypatch.setattr(penalties, "search", lambda *_: failed)
+    for _ in range(2):
+        with pytest.warns(UserWarning, match="nothing found is better"):
+            kept = tune_penalties(mpc(), states(160, 0), cache=tmp_path, **SETTINGS)
+        monkeypatch.setattr(penalties, "search", lambda *_: pytest.fail("searched again"))
+    assert not kept.improved and kept.solver == replace(DEFAULT, iterations=30)
+    assert kept.before == failed.before and kept.history is None
 
 
 def test_groups_over_horizons(learned):
     found = learned[0]
-    assert np.array_equal(found.for_mpc(mpc()).rho, found.solver.rho)
-    longer = found.for_mpc(mpc(10), 40)
+    assert np.array_equal(transfer_penalties(found, mpc()).rho, found.solver.rho)
+    longer = transfer_penalties(found, mpc(10), 40)
     assert longer.iterations == 40 and longer.alpha == found.solver.alpha
     # Step 2k of ten stands where step k of five does.
     tables = [jm.mpc.row_table(problem) for problem in (mpc(), mpc(10))]
@@ -141,25 +154,28 @@ def test_groups_over_horizons(learned):
     for row, rho in zip(tables[0], found.solver.rho.T, strict=True):
         assert np.allclose(of[row.kind, 2 * row.step, row.index], rho)
     with pytest.raises(ValueError, match="blocks"):
-        found.for_mpc(problems.scalar())
+        transfer_penalties(found, problems.scalar())
+    by_row = {**found.settings, "groups": "row"}
     with pytest.raises(ValueError, match='groups="step"'):
-        replace(found, groups="row").for_mpc(mpc(10))
+        transfer_penalties(replace(found, settings=by_row), mpc(10))
     with pytest.raises(ValueError, match="multiple"):
-        found.for_mpc(mpc(10), 41)
+        transfer_penalties(found, mpc(10), 41)
     # Nothing learned: what was given.
-    kept = replace(found, solved=0.0, residual=np.inf, solver=DEFAULT)
-    assert kept.for_mpc(mpc(10), 41) == replace(DEFAULT, iterations=41, rho=np.asarray(1.0))
+    kept = unimproved(found)
+    assert transfer_penalties(kept, mpc(10), 41) == replace(
+        DEFAULT, iterations=41, rho=np.asarray(1.0)
+    )
 
 
 def test_parameters_stand_for_rows():
     blocks = (("input", (0, 1, 2, 3), 1), ("state", (0, 1, 2, 3), 2), ("terminal", (4,), 3))
     for groups, balls in (("row", ()), ("row", (3,)), ("step", ()), ("step", (3,))):
-        W = spread(groups, blocks, 4, balls)
+        W = interpolation(groups, blocks, 4, balls)
         assert W.shape[0] == 15 and np.allclose(W.sum(axis=1), 1)
         assert (len(np.unique(W[-3:], axis=0)) == 1) == bool(balls)
     # A function of k/N that is linear is represented, for all horizons alike.
     for horizon in (8, 20):
-        W = spread("step", (("state", tuple(range(horizon)), 2),), horizon)
+        W = interpolation("step", (("state", tuple(range(horizon)), 2),), horizon)
         line = lambda at: np.outer(at, [1, -2]).ravel()
         assert np.allclose(W @ line(np.linspace(0, 1, 5)), line(np.arange(horizon) / horizon))
 
@@ -231,24 +247,24 @@ def test_the_first_pass_of_a_sweep_decides_more_and_labels_stay(tmp_path):
         mpc(4), POINTS, updates=25, batch=64, cache=tmp_path, **SWEEP
     )
     found = learn()
-    assert found.decided > found.decided_before + 0.01 and found.penalties is not None
-    assert np.all(found.penalties.weight > 0) and 0 < found.penalties.alpha < 2
-    fmap = jm.map_feasible_set(mpc(4), POINTS, penalties=found.penalties, **SWEEP)
+    assert found.after["decided"] > found.before["decided"] + 0.01 and found.improved
+    assert np.all(found.result.weight > 0) and 0 < found.result.alpha < 2
+    fmap = jm.map_feasible_set(mpc(4), POINTS, penalties=found.result, **SWEEP)
     plain = jm.map_feasible_set(mpc(4), POINTS, **SWEEP)
     both = (fmap.label != 0) & (plain.label != 0)
     assert np.array_equal(fmap.label[both], plain.label[both]) and both.mean() > 0.995
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweep_penalties, "learned", lambda *_: pytest.fail("learned again"))
+        patch.setattr(sweep_penalties, "search", lambda *_: pytest.fail("searched again"))
         again = learn()
-    assert np.array_equal(again.penalties.weight, found.penalties.weight)
-    assert again.decided == found.decided
+    assert np.array_equal(again.result.weight, found.result.weight)
+    assert again.after == found.after
     with pytest.raises(ValueError, match="Learn them for this map"):
-        jm.map_feasible_set(mpc(5), POINTS, penalties=found.penalties)
+        jm.map_feasible_set(mpc(5), POINTS, penalties=found.result)
 
 
 @pytest.mark.slow
-def test_sweep_shortfalls_against_the_rungs_own_verdicts():
-    """Where nothing is missing the rung decides (in float32, the edge apart); infeasible states it
+def test_sweep_shortfalls_against_the_stages_own_verdicts():
+    """Where nothing is missing the stage decides (in float32, the edge apart); infeasible states it
     decides only there."""
     x, problem = POINTS[800:], FeasibilityProblem.of(mpc(4))
     rows, p = problem.rows, problem.exact(np.abs(POINTS).max(axis=0))
@@ -295,7 +311,9 @@ def test_sweep_command_learns_and_its_labels_agree(tmp_path, monkeypatch, capsys
     def tune(problem, points, cache, **settings):
         asked.append((cache, settings))
         weight = np.exp(np.random.default_rng(0).normal(size=len(moving(problem).lower)))
-        return sweep_penalties.SweepPenalties(StagePenalties(weight, 1.4), 0.9, 0.8)
+        values = {"weight": weight, "alpha": np.array(1.4)}
+        build = lambda v: StagePenalties(v["weight"], float(v["alpha"]))
+        return TuningRun(values, values, {"decided": 0.8}, {"decided": 0.9}, True, {}, build)
 
     monkeypatch.setattr(linear_sweep, "tune_sweep_penalties", tune)
     command = "sweep --config case.toml --grid 40 20 --iterations 8 --no-refine --output"
@@ -324,7 +342,7 @@ def test_the_joint_is_solved_in_a_hundred_steps():
     problem = problems.joint(20)
     x = np.random.default_rng(0).uniform([-1.5, -2], [1.5, 2], (6000, 2))
     x = x[jm.map_feasible_set(problem, x).label == 1]
-    solver = tune_penalties(problem, x[:3000], updates=400)
+    solver = tune_penalties(problem, x[:3000], updates=400).solver
     assert solver.iterations == 100 and solver.refine == 0
     assert solved(solver, x[3000:], problem) > 0.97
     assert solved(jm.ADMM(refine=0), x[3000:], problem) < 0.1
@@ -334,7 +352,7 @@ def test_the_joint_is_solved_in_a_hundred_steps():
 
 @pytest.mark.slow
 def test_penalties_of_a_short_horizon_serve_a_long_one(learned):
-    longer, x = learned[0].for_mpc(mpc(10), 40), states(300, 3)
+    longer, x = transfer_penalties(learned[0], mpc(10), 40), states(300, 3)
     default = replace(DEFAULT, iterations=40, rho=np.ones_like(longer.rho))
     assert solved(longer, x, mpc(10)) > solved(default, x, mpc(10)) + 0.3
 
@@ -347,9 +365,9 @@ def test_warm_starts_have_penalties_of_their_own():
         controller = jm.Controller(jax.tree.map(np.float64, problem), jm.ADMM(refine=30))
         near = jax.tree.map(np.asarray, plans(controller, 0.98 * x))
     start = near.qp.z, near.qp.y
-    found = learn_penalties(problem, x, 20, stages=2, updates=150, warm_start=start)
-    cold = learn_penalties(problem, x, 20, stages=2, updates=150)
-    assert found.improved and found.solved > found.solved_before + 0.1
+    found = tune_penalties(problem, x, 20, stages=2, updates=150, warm_start=start)
+    cold = tune_penalties(problem, x, 20, stages=2, updates=150)
+    assert found.improved and found.after["solved"] > found.before["solved"] + 0.1
     with jax.enable_x64(True):
         one = lambda c, x, z, y: c.plan(x, warm_start=(z, y)).status
         run = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)))

@@ -10,7 +10,8 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.closed_loop import Run, lyapunov_decrease, simulate
+from jaxmpc.closed_loop.run import Run, lyapunov_decrease
+from jaxmpc.closed_loop.simulate import simulate
 from jaxmpc.mpc.problem import Soft
 
 # Compiles quickly.

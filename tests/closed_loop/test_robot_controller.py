@@ -322,8 +322,9 @@ def test_bad_problems_and_controllers_are_named(pendulum, linear_mpc):
     two, mpc, Q, R = jm.load_robot("arm2"), linear_mpc, [50.0, 1.0], [0.1]
     solver = jm.ADMM(iterations=10, refine=0)
     make = jm.robot_mpc
+    follow = lambda K: jm.simulate(jm.closed_loop.LinearFeedback(mpc, K), PLANT, [0.0, 0.0], 1)
     for call, message in (
-        (lambda: make(PLANT, Q, R, margin=1.0), r"margin: 1.0. Give a share in \[0, 1\)"),
+        (lambda: make(PLANT, Q, R, margin=1.0), r"margin: 1.0. Give a fraction in \[0, 1\)"),
         (lambda: make(PLANT, Q, R, margin=-0.1), "margin: -0.1"),
         (lambda: make(PLANT, [1.0, 2.0, 3.0], R), "Q: "),
         (lambda: make(PLANT, Q, [1.0, 1.0]), "R: "),
@@ -348,11 +349,8 @@ def test_bad_problems_and_controllers_are_named(pendulum, linear_mpc):
         ),
         (lambda: jm.RobotController(pendulum, mpc, solver, penalty=-1.0), "rho"),
         (lambda: jm.RobotController(pendulum, mpc, jm.ADMM(rho=[1.0, 2.0])), "rho: shape"),
-        (
-            lambda: LinearFeedback(mpc, [1.0, 2.0]),
-            "K: shape .2,. where .1, 2. is needed",
-        ),
-        (lambda: LinearFeedback(mpc, [[np.nan, 2.0]]), "K: holds NaN"),
+        (lambda: follow([1.0, 2.0]), "K: shape .2,. where .1, 2. is needed"),
+        (lambda: follow([[np.nan, 2.0]]), "K: holds NaN"),
     ):
         with pytest.raises(ValueError, match=message):
             call()

@@ -1,4 +1,4 @@
-"""The smoothed share of feasible states, its derivative, and the growth of feasible sets."""
+"""The smoothed fraction of feasible states, its derivative, and the growth of feasible sets."""
 
 from dataclasses import replace
 
@@ -12,7 +12,8 @@ from problems import AREA_JOINT, AREA_JOINT_O_INF, O_INF_JOINT, P_JOINT, joint
 
 import jaxmpc as jm
 from jaxmpc.control.riccati import cost_of_law
-from jaxmpc.tuning.feasibility import feasible_share, membership, tune_feasible_set
+from jaxmpc.tuning.feasible_fraction import feasible_fraction, membership
+from jaxmpc.tuning.feasible_set import tune_feasible_set
 from jaxmpc.tuning.parameters import Parameter
 
 MPC = joint(6)
@@ -35,8 +36,8 @@ POINT = np.array([300.0, 0, 0, 0, 0.05, 0.1, 0])
 
 
 @pytest.fixture(scope="module")
-def share():
-    """(share, its gradient, membership of each state) as a function of the numbers of `changed`."""
+def fraction():
+    """(fraction, its gradient, membership of each state) by the numbers of `changed`."""
 
     def both(v):
         values = membership(changed(v), STATES, 0.05)
@@ -52,29 +53,31 @@ def share():
     return evaluate
 
 
-def test_gradient_by_central_differences(share):
-    _, gradient, _ = share(POINT)
+def test_gradient_by_central_differences(fraction):
+    _, gradient, _ = fraction(POINT)
     for i, step in enumerate([1e-2, 1e-2, 1e-3, 1e-5, 1e-6, 1e-6, 1e-6]):
         move = step * np.eye(7)[i]
-        expected = (share(POINT + move)[0] - share(POINT - move)[0]) / (2 * step)
+        expected = (fraction(POINT + move)[0] - fraction(POINT - move)[0]) / (2 * step)
         np.testing.assert_allclose(gradient[i], expected, rtol=1e-4, err_msg=str(i))
 
 
-def test_states_that_are_no_numbers_count_zero_and_spoil_nothing(share):
-    value, gradient, each = share(POINT)
+def test_states_that_are_no_numbers_count_zero_and_spoil_nothing(fraction):
+    value, gradient, each = fraction(POINT)
     np.testing.assert_array_equal(each[:4], [0, 0, 0, 1])
     assert np.isfinite(value) and np.isfinite(gradient).all()
     assert np.all((each >= 0) & (each <= 1))
-    assert np.isnan(share([np.nan, *POINT[1:]])[0])  # of the problem itself: descent takes it back
+    assert np.isnan(
+        fraction([np.nan, *POINT[1:]])[0]
+    )  # of the problem itself: descent takes it back
 
 
-def test_larger_terminal_sets_never_lose_a_state(share):
-    members = [share([level, *POINT[1:]])[2] for level in (1e-3, 30.0, 300.0, 3000.0)]
+def test_larger_terminal_sets_never_lose_a_state(fraction):
+    members = [fraction([level, *POINT[1:]])[2] for level in (1e-3, 30.0, 300.0, 3000.0)]
     assert np.all(np.diff(members, axis=0) >= -1e-9)
     assert np.all(np.diff(np.mean(members, axis=1)) > 0.01)
 
 
-def test_share_of_a_fine_grid_is_the_exact_area():
+def test_fraction_of_a_fine_grid_is_the_exact_area():
     """As the width goes to 0; the polygons are exact, their areas known in closed form."""
     cells = lambda k: (np.arange(k) + 0.5) / k * 2 - 1
     grid = np.stack(np.meshgrid(1.5 * cells(50), 2 * cells(50), indexing="ij"), -1).reshape(-1, 2)
@@ -102,7 +105,7 @@ def test_tightening_and_rows_that_no_input_moves():
     np.testing.assert_allclose(found, 1 / (1 + (beyond / 0.1) ** 2), rtol=1e-12)
     soft = replace(still, soft=jm.Soft([[1.0]], [0.1]), input_rate_weight=[1.0])
     with jax.enable_x64(True):  # what has no part in feasibility has none here
-        assert float(feasible_share(soft, x0s, 0.1)) == float(found.mean())
+        assert float(feasible_fraction(soft, x0s, 0.1)) == float(found.mean())
     for arguments, message in (
         ((still, x0s[:, 0]), "x0s: shape"),
         ((still, x0s, 0.0), "width: 0.0"),
@@ -129,7 +132,7 @@ def test_tuning_grows_the_set_and_the_terminal_set_stays_invariant():
     history = run.history
     assert history.steps == 6 and history.accepted.all()
     assert history.validation[history.best] < history.validation[0] - 0.02
-    np.testing.assert_allclose(-history.validation, history.validation_numbers["share"])
+    np.testing.assert_allclose(-history.validation, history.validation_numbers["fraction"])
     P, K = np.asarray(run.mpc.terminal_set.P), jm.lqr(MPC.system, run.values["Qt"], MPC.R).K
     closed = MPC.system.A + MPC.system.B @ K
     assert np.linalg.eigvalsh(P - closed.T @ P @ closed)[0] > 0

@@ -14,10 +14,11 @@ import pytest
 
 from jaxmpc.tuning.descent import descend
 from jaxmpc.tuning.parameters import Parameter, raw, require_parameters, values
+from jaxmpc.tuning.settings import Settings
 
 TARGET = {"a": np.array([1.0, -2.0]), "b": np.array(3.0)}
 START = {"a": np.zeros(2), "b": np.array(0.0)}
-SETTINGS = {"problem": "bowl"}
+DECIDES = {"problem": "bowl"}
 
 
 def distance(theta):
@@ -36,8 +37,9 @@ def check(theta):
 
 
 def bowl(updates=40, gradient=slope, **more):
-    more = {"optimizer": optax.adam(0.3), **more}
-    return descend(START, gradient, check, updates=updates, **more)
+    decides = more.pop("decides", None)
+    settings = Settings(updates, **{"optimizer": optax.adam(0.3), **more})
+    return descend(START, gradient, check, optax.sgd(0.0), settings, decides)
 
 
 def assert_same(one, other):
@@ -78,7 +80,7 @@ def test_steps_that_are_not_finite_are_taken_back_and_halved(bad):
         return loss, gradient, numbers
 
     found = bowl(12, fragile, optimizer=optax.sgd(0.4))
-    # b: 0 → 2.4, refused, → 1.2, refused, → 0.6 and on from there with the step that worked.
+    # b: 0 → 2.4, refuse, → 1.2, refuse, → 0.6 and on from there with the step that worked.
     assert found.accepted[:4].tolist() == [True, False, False, True]
     np.testing.assert_allclose(calls[:4], [0.0, 2.4, 1.2, 0.6])
     assert np.isfinite(found.thetas["a"]).all() and found.validation[-1] < 0.1
@@ -86,7 +88,7 @@ def test_steps_that_are_not_finite_are_taken_back_and_halved(bad):
 
 def test_a_start_without_finite_loss_is_refused():
     with pytest.raises(ValueError, match=r"parameters.*no finite validation loss"):
-        descend(START, slope, lambda theta: (np.nan, {}), optax.sgd(0.1), 3)
+        descend(START, slope, lambda theta: (np.nan, {}), optax.sgd(0.1), Settings(3))
     with pytest.raises(ValueError, match="updates"):
         bowl(-1)
     with pytest.raises(ValueError, match="optimizer.*gradient alone"):
@@ -130,31 +132,31 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path, monkeypatch, target, late):
         with monkeypatch.context() as m:
             m.setattr(module, name, trap)
             with pytest.raises(Killed):
-                bowl(12, checkpoint=path, settings=SETTINGS)
-    assert_same(bowl(12, checkpoint=path, settings=SETTINGS), whole)
+                bowl(12, checkpoint=path, decides=DECIDES)
+    assert_same(bowl(12, checkpoint=path, decides=DECIDES), whole)
     assert [p.name for p in tmp_path.iterdir()] == ["run.npz"]  # no side files left
 
 
 def test_checkpoints_that_do_not_fit(tmp_path):
     path = tmp_path / "run.npz"
-    bowl(3, checkpoint=path, settings=SETTINGS)
+    bowl(3, checkpoint=path, decides=DECIDES)
     with pytest.raises(ValueError, match="other settings"):
-        bowl(3, checkpoint=path, settings={"problem": "other"})
+        bowl(3, checkpoint=path, decides={"problem": "other"})
     with pytest.raises(ValueError, match="another optimizer"):
-        bowl(3, checkpoint=path, settings=SETTINGS, optimizer=optax.sgd(0.1))
+        bowl(3, checkpoint=path, decides=DECIDES, optimizer=optax.sgd(0.1))
     with pytest.raises(ValueError, match="another optimizer"):  # as many numbers, another step
-        bowl(3, checkpoint=path, settings=SETTINGS, optimizer=optax.adam(0.2))
+        bowl(3, checkpoint=path, decides=DECIDES, optimizer=optax.adam(0.2))
     with pytest.raises(ValueError, match=r"began with the validation loss 14, which is 28 now"):
         other = lambda theta: (2 * distance(theta), {})
-        descend(START, slope, other, optax.adam(0.3), 3, checkpoint=path, settings=SETTINGS)
+        descend(START, slope, other, optax.adam(0.3), Settings(3, checkpoint=path), DECIDES)
     whole = path.read_bytes()
     for damaged in (b"nothing", whole[: len(whole) // 2], b""):
         path.write_bytes(damaged)
         with pytest.raises(ValueError, match="is no checkpoint"):
-            bowl(3, checkpoint=path, settings=SETTINGS)
+            bowl(3, checkpoint=path, decides=DECIDES)
     path.unlink()
     (tmp_path / ".run.npz.left").write_bytes(b"by a killed process")
-    bowl(1, checkpoint=path, settings=SETTINGS)
+    bowl(1, checkpoint=path, decides=DECIDES)
     assert [p.name for p in tmp_path.iterdir()] == ["run.npz"]
 
 
@@ -163,7 +165,7 @@ import sys, time
 sys.path.insert(0, {tests!r})
 import test_descent as t
 slow = lambda theta, step: (time.sleep(0.02), t.slope(theta, step))[1]
-t.bowl(200, slow, checkpoint={path!r}, settings=t.SETTINGS)
+t.bowl(200, slow, checkpoint={path!r}, decides=t.DECIDES)
 """
 
 
@@ -189,7 +191,7 @@ def test_sigkill_twenty_times_loses_at_most_a_step(tmp_path):
         child.wait()
         assert steps() >= before >= done
         done = steps()
-    assert_same(bowl(200, checkpoint=path, settings=SETTINGS), bowl(200))
+    assert_same(bowl(200, checkpoint=path, decides=DECIDES), bowl(200))
 
 
 @pytest.mark.parametrize(

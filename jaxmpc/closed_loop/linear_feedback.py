@@ -1,4 +1,4 @@
-"""Linear feedback with clipping: the law that an MPC is compared with."""
+"""LinearFeedback: LQR or PD control with clipped inputs, to compare an MPC with."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from jaxmpc.qp.status import Status
 
 
 class NoPlan(NamedTuple):
-    """What a law without a plan says of one: no cost (NaN), status NOT_RUN, no slack."""
+    """The plan of a law that makes none: cost NaN, status NOT_RUN, no slack."""
 
     cost: Array
     status: Array
@@ -26,52 +26,52 @@ class NoPlan(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class LinearFeedback:
-    """u = clip(s + K (ξ − r)) into the input limits of `mpc`: LQR or PD control, saturated.
+    """The law u = clip(s + K (ξ − r)): linear state feedback inside the input limits of `mpc`.
 
-    mpc: weights, limits and horizon that runs are judged by, as for a Controller. K (m, n).
-    plant: a Robot where ξ are its coordinates and limits its own; None: ξ = x. References r (n,),
-    or rows of them, and s as in `Controller`; zero for none.
+    mpc: weights, limits and horizon by which runs are evaluated, as for a Controller. K (m, n).
+    plant: a Robot, whose coordinates are ξ and whose limits count; None: ξ = x. References r (n,)
+    and s (m,), or rows of them of which the first counts, as in `Controller`; zero for none.
     """
 
     mpc: MPC
     K: Any
     plant: Any = None
 
-    def __post_init__(self) -> None:
-        if not isinstance(self.mpc, MPC) or not isinstance(self.K, np.ndarray | jax.Array | list):
-            return  # JAX rebuilds this object with placeholders
+    def validate(self) -> None:
+        """Raise ValueError unless K is finite and (m, n)."""
         n, m = self.mpc.system.n, self.mpc.system.m
         require_shape("K", self.K, (m, n), "u = K x, one row an input")
         require_finite("K", self.K)
 
     @property
     def dtype(self) -> Any:
-        """In what the law computes."""
+        """Return the precision of the inputs."""
         return floating_dtype((self.mpc.Q, self.mpc.R, self.K))
 
     @property
     def state_size(self) -> int:
-        """Numbers in the state that the law is given."""
+        """Return the length of the state x."""
         return self.mpc.system.n if self.plant is None else self.plant.state_size
 
     @property
     def limits(self) -> Any:
-        """Limits of the state that a closed loop is judged by."""
+        """Return the state limits by which a closed loop is evaluated."""
         return self.mpc.states if self.plant is None else self.plant.state_limits
 
     def coordinates(self, x: Array) -> Array:
-        """ξ of a state."""
+        """Return the coordinates ξ (n,) of a state."""
         return x if self.plant is None else self.plant.coordinates(x)
 
     def start(self, x: Array, input_reference: Any = None) -> tuple:
-        """Nothing is carried."""
+        """Return the first carry, which is empty."""
         return ()
 
     def __call__(
         self, x: Any, carry: Any = None, reference: Any = None, *, input_reference: Any = None,
         previous_input: Any = None,
     ) -> tuple[Array, tuple, NoPlan]:  # fmt: skip
-        """The input at x, nothing to carry, and no plan."""
+        """Return the input (m,) at the state x, an empty carry, and no plan."""
+        self.validate()
         if np.shape(x) != (self.state_size,):
             fail("x", f"shape {np.shape(x)}", f"Give one state ({self.state_size},)")
         x = jnp.asarray(x, self.dtype)

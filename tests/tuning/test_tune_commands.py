@@ -10,11 +10,12 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.app import cli
-from jaxmpc.app.commands import tune, tune_penalties
+from jaxmpc.app.commands import tune, tune_penalties, tuning_task
 from jaxmpc.app.commands.sweep import Sweep
+from jaxmpc.app.commands.tuning import feasible_states
 from jaxmpc.app.config import load, load_robot_config
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.tuning.penalties import Penalties
+from jaxmpc.tuning.result import TuningRun
 
 # The built-in joint with a horizon that is too short for its terminal weight.
 LINE = (
@@ -36,7 +37,7 @@ def given_starts(monkeypatch):
     def uniform(mpc, limits, lower, upper, count, seed):
         return np.random.default_rng(seed).uniform(lower, upper, (count, len(lower))), 3
 
-    for module in (tune, tune_penalties):
+    for module in (tuning_task, tune_penalties):
         monkeypatch.setattr(module, "feasible_states", uniform)
 
 
@@ -111,7 +112,7 @@ def test_weights_cut_off_resumed_and_read_back(tmp_path, monkeypatch, capsys, gi
     after = record["result"]["after"]
     assert after["unsolved"] == np.mean(loops.status != 1) and after["loops"] == 2
     beyond = (np.abs(loops.states) > [1.5 + 2e-6, 2 + 2e-6]).any(axis=(1, 2))
-    assert after["beyond"] == np.mean(beyond)
+    assert after["violated"] == np.mean(beyond)
 
 
 def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsys, given_starts):
@@ -122,12 +123,16 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
     def learn(mpc, x0s, iterations, **more):
         asked.update(more, count=len(x0s), iterations=iterations)
         solver = ADMM(iterations=iterations, rho=rho, alpha=1.7, refine=0)
-        blocks = (("input", (0, 1, 2), 1), ("state", (0, 1, 2), 2))
-        found = Penalties(solver, rho, 1.7, "step", blocks, 3, (), 0.5, 1e-6, 0.25, 1e-2, 2)
+        blocks = [["input", [0, 1, 2], 1], ["state", [0, 1, 2], 2]]
+        before, after = (
+            {"solved": solved, "residual": residual, "infeasible": 2.0}
+            for solved, residual in ((0.25, 1e-2), (0.5, 1e-6))
+        )
+        found = TuningRun({}, {}, before, after, True, {"blocks": blocks}, lambda _: solver)
         made.append(found)
         return found
 
-    monkeypatch.setattr(tune_penalties, "learn_penalties", learn)
+    monkeypatch.setattr(tune_penalties, "tune_penalties", learn)
     line = "penalties --horizon 3 --iterations 6 --stages 2 --count 16 --updates 1"
     assert run(f"{line} --output out") == 0
     table = rows(capsys.readouterr().out)
@@ -141,11 +146,11 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
     assert (solver.iterations, solver.alpha, solver.refine) == (6, 1.7, 0)
     assert replace(config, solver=None) == load(None, {"horizon": 3})
     record = json.loads((tmp_path / "out" / "penalties.json").read_text())
-    assert record["finished"] and record["result"]["solved"] == 0.5
+    assert record["finished"] and record["result"]["after"]["solved"] == 0.5
     assert (tmp_path / "out" / "penalties.png").read_bytes()[:4] == b"\x89PNG"
 
     # Where nothing learned is better the words say so.
-    default = replace(made[0], solver=ADMM(refine=0), solved=0.25, residual=1e-2)
+    default = replace(made[0], improved=False, build=lambda _: ADMM(refine=0))
     table = rows(tune_penalties.TunePenalties().table(default, 4, 0, 1.0))
     assert "the default is kept" in table["safeguard"]
 
@@ -155,12 +160,12 @@ def test_starts_are_feasible_and_others_counted():
     system = jm.LinearSystem([[1, 1], [0, 1]], [[0.5], [1]], dt=1.0)
     box = lambda *v: jm.Box(-np.array(v), np.array(v))
     mpc = jm.MPC(system, np.eye(2), np.eye(1), 4, states=box(1.0, 2.0), inputs=box(0.5))
-    x0s, dropped = tune.feasible_states(mpc, mpc.states, -np.ones(2), np.ones(2), 40, 0)
+    x0s, dropped = feasible_states(mpc, mpc.states, -np.ones(2), np.ones(2), 40, 0)
     assert x0s.shape == (40, 2) and 0 < dropped < 60
     # One step ahead |q + dq + u/2| <= 1 with |u| <= 0.5: necessary.
     assert np.all(np.abs(x0s.sum(axis=1)) <= 1.25 + 1e-6)
     with pytest.raises(ValueError, match="initial states: 0 of 40 drawn have a plan"):
-        tune.feasible_states(mpc, mpc.states, np.array([0.8, 1.6]), np.array([1.0, 2.0]), 4, 0)
+        feasible_states(mpc, mpc.states, np.array([0.8, 1.6]), np.array([1.0, 2.0]), 4, 0)
 
 
 @pytest.mark.parametrize(
@@ -191,7 +196,7 @@ def test_starts_are_feasible_and_others_counted():
     ],
 )
 def test_errors_are_one_line_before_any_run(capsys, monkeypatch, given_starts, arguments, message):
-    for module, name in ((tune, "tune_weights"), (tune_penalties, "learn_penalties")):
+    for module, name in ((tune, "tune_weights"), (tune_penalties, "tune_penalties")):
         monkeypatch.setattr(module, name, lambda *a, **k: pytest.fail("it started"))
     assert run(arguments) == 2
     err = capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Pictures of what tuning did: losses and weights by step, closed loops before and after."""
+"""Plots of tuning: losses and weights by step, closed loops, maps and penalties."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,15 +14,15 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 from jaxmpc.app.plots.closed_loops import draw_limits, panel_columns
 from jaxmpc.app.plots.style import INFEASIBLE, TERMINAL, ring
 from jaxmpc.checks import fail
-from jaxmpc.closed_loop import Run
+from jaxmpc.closed_loop.outcome import coordinates
+from jaxmpc.closed_loop.run import Run
 from jaxmpc.feasible.map import FeasibleSetMap
-from jaxmpc.outcome import batch_of, coordinates
 from jaxmpc.tuning.descent import Descent
-from jaxmpc.tuning.penalties import Penalties
+from jaxmpc.tuning.result import TuningRun
 
 # Okabe and Ito, as in `plots`.
 _BEFORE, _AFTER, _REJECTED, _BEST = "#d55e00", "#0072b2", "#a50f15", "#006f52"
-_SHARES = (
+_FRACTIONS = (
     ("unsolved", "plans not solved", "#0072b2", "-"),
     ("infeasible", "plans proved infeasible", "#a50f15", "--"),
     ("fallback", "plans that break soft limits", "#e69f00", "-"),
@@ -41,11 +41,11 @@ def plot_tuning(
 
     Loss of the steps and of the validation loops, each relative to its first value where that is
     positive, the best of them marked; norm of the gradient;
-    `weights`, group → entry → positive values (T+1,), relative to the start; shares of the
-    validation plans and loops where something went wrong. Red crosses: steps that were rejected.
+    `weights`, group → entry → positive values (T+1,), relative to the start; fractions of
+    the validation plans and loops where something went wrong. Red crosses: rejected steps.
     """
     figure = Figure(figsize=(11, 6.6), layout="constrained")
-    ((top, norm), (ratio, share)) = figure.subplots(2, 2)
+    ((top, norm), (ratio, counts)) = figure.subplots(2, 2)
     every, steps, best = np.arange(history.steps + 1), np.arange(history.steps), history.best
     loss, validation = history.loss, history.validation
     # Training and validation loops differ: what they share is by how much they fall.
@@ -68,18 +68,18 @@ def plot_tuning(
     _scale(norm, history.gradient_norm)
     _draw_weights(ratio, every, weights)
     highest = 0.0
-    for key, label, colour, dashes in _SHARES:
+    for key, label, colour, dashes in _FRACTIONS:
         values = history.validation_numbers.get(key)
         if values is not None:
-            share.plot(every, 100 * values, color=colour, ls=dashes, lw=1.4, label=label)
+            counts.plot(every, 100 * values, color=colour, ls=dashes, lw=1.4, label=label)
             highest = max(highest, 100 * float(np.nanmax(values, initial=0.0)))
     highest = max(highest, 1.0)
-    share.set_ylim(-0.03 * highest, 1.35 * highest if highest < 75 else 105)
+    counts.set_ylim(-0.03 * highest, 1.35 * highest if highest < 75 else 105)
     for ax, name in (
         (top, "loss relative to the start" if relative else "loss"),
         (norm, "norm of the gradient"),
         (ratio, "weight relative to the start"),
-        (share, "share in the validation loops [%]"),
+        (counts, "fraction in the validation loops [%]"),
     ):
         ax.set_xlabel("step")
         ax.set_ylabel(name)
@@ -158,7 +158,7 @@ def plot_before_after(
     are lines, grey outside. reference (n,), input_reference (m,): set-points to draw. loops: which
     ones; None: 6 spread over all. Raises ValueError for loops that are not there.
     """
-    before, after = batch_of(before), batch_of(after)
+    before, after = before.on_host(), after.on_host()
     count, samples = np.shape(before.inputs)[:2]
     shown = np.unique(np.linspace(0, count - 1, min(count, 6)).astype(int))
     shown = shown if loops is None else np.asarray(loops, int)
@@ -234,21 +234,21 @@ def plot_maps(before: FeasibleSetMap, after: FeasibleSetMap) -> Figure:
 
 
 def plot_penalties(
-    found: Penalties, before: np.ndarray, after: np.ndarray, eps: float, title: str = ""
+    run: TuningRun, before: np.ndarray, after: np.ndarray, eps: float, title: str = ""
 ) -> Figure:
-    """Draw learned penalties by kind of row and stage, and what they do to the residuals.
+    """Draw the penalties of `tune_penalties` by kind of row and stage, and the residuals.
 
     before, after (B,): largest residual of each validation state with the solver that was given
-    and with the learned one. eps: what counts as solved. Rows of a kind are drawn over the step k
+    and with the tuned one. eps: what counts as solved. Rows of a kind are drawn over the step k
     of the horizon at which they hold, those of one step by their number.
     """
-    blocks = [block for block in found.blocks if block[2] and block[1]]
+    blocks = [block for block in run.settings["blocks"] if block[2] and block[1]]
     figure = Figure(figsize=(max(3.0 * (len(blocks) + 1.4), 8.0), 4.4), layout="constrained")
     axes = figure.subplots(
         1, len(blocks) + 1, width_ratios=[*(1.0,) * len(blocks), 1.5], squeeze=False
     )[0]
     rows = sum(len(steps) * size for _, steps, size in blocks)
-    rho = np.asarray(found.solver.rho, float)
+    rho = np.asarray(run.solver.rho, float)
     rho = np.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, rows))
     shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.85, len(rho)))
     first = 0
@@ -286,17 +286,17 @@ def plot_penalties(
     for values, name, colour in ((before, "before", _BEFORE), (after, "after", _AFTER)):
         # What is not finite stays unsolved at the right end.
         values = np.sort(np.where(np.isfinite(values), values, np.inf))
-        share = 100 * np.arange(1, len(values) + 1) / len(values)
+        fraction = 100 * np.arange(1, len(values) + 1) / len(values)
         solved = 100 * np.mean(values <= eps)
         last.step(
-            np.maximum(values, 1e-17), share, where="post", color=colour, lw=1.6,
+            np.maximum(values, 1e-17), fraction, where="post", color=colour, lw=1.6,
             label=f"{name}: {solved:.1f} % ≤ {eps:g}",
         )  # fmt: skip
     last.axvline(eps, color="#8a8a8a", lw=0.9, ls=(0, (4, 2)))
     last.set_xscale("log")
     last.set_ylim(0, 103)
     last.set_xlabel("largest residual")
-    last.set_ylabel("share of validation states [%]")
+    last.set_ylabel("fraction of validation states [%]")
     last.grid(color="#ececec", lw=0.7)
     last.set_axisbelow(True)
     last.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)

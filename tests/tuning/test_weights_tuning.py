@@ -10,7 +10,7 @@ import pytest
 from problems import symmetric
 
 import jaxmpc as jm
-from jaxmpc.closed_loop import Run
+from jaxmpc.closed_loop.run import Run
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
 from jaxmpc.tuning.weights import tune_weights
@@ -56,13 +56,13 @@ def test_validation_loss_falls_and_is_that_of_the_returned_values(tuned):
     best = history.validation.min() / history.validation[0]
     np.testing.assert_allclose(tuned.improvement, 1 - best, rtol=1e-12)
     # The loss of the last four starts, which no step saw, recomputed from outside.
-    run = jax.vmap(lambda x: jm.simulate(tuned.controller, SYSTEM, x, 8))(starts(16)[-4:])
+    run = jax.vmap(lambda x: jm.simulate(tuned.result, SYSTEM, x, 8))(starts(16)[-4:])
     again = np.mean([LOSS(jax.tree.map(lambda v, i=i: v[i], run)) for i in range(4)])
     np.testing.assert_allclose(again, history.validation[history.best], rtol=1e-9)
     np.testing.assert_array_equal(tuned.mpc.Q, tuned.values["Q"])
     record = tuned.record()
     np.testing.assert_allclose(record["values_by_step"]["Q"][history.best], tuned.values["Q"])
-    assert record["numbers"]["unsolved"] == [0.0] * 12 and record["mode"] == "forward"
+    assert record["numbers"]["unsolved"] == [0.0] * 12 and record["settings"]["mode"] == "forward"
 
 
 @pytest.mark.slow
@@ -131,7 +131,7 @@ class Looping:
 def test_auto_goes_forward_where_it_must(x64):
     settings = {"steps": 4, "solver": SOLVER, "updates": 1}
     found = tune_weights(weighed, PARAMETERS, Looping(), starts(8), LOSS, **settings)
-    assert found.mode == "forward" and found.history.accepted.all()
+    assert found.settings["mode"] == "forward" and found.history.accepted.all()
     with pytest.raises(ValueError, match="while_loop"):
         tune_weights(weighed, PARAMETERS, Looping(), starts(8), LOSS, mode="reverse", **settings)
 

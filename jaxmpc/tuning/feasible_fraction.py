@@ -1,65 +1,57 @@
-"""The size of the feasible set as a number with a derivative, and its growth by gradient.
+"""feasible_fraction: the size of the feasible set, smoothed to have a derivative.
 
 How far x_0 is from keeping all limits is a least-distance problem in the plan z,
 
     δ(x_0)² = min_z Σ_i dist(C_i z + D_i x_0 + d_i, [l_i + w s_i, u_i − w s_i])² / s_i²,
 
-over the rows of the condensed QP and the terminal ball, each limit tightened by a share w of its
-own size s_i. The minimum of a convex, once differentiable function has a derivative that takes no
-derivative of the minimiser (Danskin 1966): with z held fixed, everything else moves. 1/(1 + (δ/w)²)
-is then 1 where all limits can be kept with a margin of w, at most ½ where one has to be met
-exactly, and falls to 0 outside.
+over the rows of the condensed QP and the terminal ball, each limit tightened by a fraction w of
+its own size s_i. The minimum of a convex, once differentiable function has a derivative that takes
+no derivative of the minimiser (Danskin 1966): with z held fixed, everything else moves.
+1/(1 + (δ/w)²) is then 1 where all limits can be kept with a margin of w, at most ½ where one has to
+be met exactly, and falls to 0 outside.
 """
 
 import functools
-from collections.abc import Callable, Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jax import Array
 
-from jaxmpc.checks import concrete, fail, require_shape, whole
+from jaxmpc.checks import concrete, fail, require_shape
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp import linalg
-from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.refine import Constants, gram, newton_step, ridged
-from jaxmpc.tuning import archive
-from jaxmpc.tuning.descent import descend, minibatch
-from jaxmpc.tuning.parameters import Parameters, raw, require_parameters, values
-from jaxmpc.tuning.weights import TuningRun, exact_values, split
 
 # Newton steps at most: most states need 3 to 20.
 STEPS = 60
 
 
-def feasible_share(
-    mpc: MPC, x0s: Any, width: float = 0.02, *, scale: Any = None, steps: int = STEPS
+def feasible_fraction(
+    mpc: MPC, x0s: Any, width: float = 0.02, *, scale: Any = None, newton_steps: int = STEPS
 ) -> Array:
-    """Smoothed share of the states x0s (B, n) from which the hard constraints can be kept.
+    """Return the smoothed fraction of states x0s (B, n) from which hard constraints can be kept.
 
     The mean of `membership`. Times the volume of the region that x0s samples evenly it is the
     volume of the feasible set, but for the smoothing. Differentiable with respect to every array
     of `mpc` and x0s, in both modes, once.
     """
-    return jnp.mean(membership(mpc, x0s, width, scale=scale, steps=steps))
+    return jnp.mean(membership(mpc, x0s, width, scale=scale, newton_steps=newton_steps))
 
 
 def membership(
-    mpc: MPC, x0s: Any, width: float = 0.02, *, scale: Any = None, steps: int = STEPS
+    mpc: MPC, x0s: Any, width: float = 0.02, *, scale: Any = None, newton_steps: int = STEPS
 ) -> Array:
-    """1/(1 + (δ/width)²) for each of the states x0s (B, n): (B,), between 0 and 1.
+    """Return 1/(1 + (δ/width)²) for each of the states x0s (B, n): (B,), between 0 and 1.
 
     δ: least distance of any plan from the limits tightened by `width`; see above. width > 0: a
-    share of each limit's size, which is half the distance of its two sides, the absolute value of
-    the only side of a one-sided row, the radius (root of the level) of a terminal ellipsoid.
+    fraction of each limit's size, which is half the distance of its two sides, the absolute value
+    of the only side of a one-sided row, the radius (root of the level) of a terminal ellipsoid.
     scale: these sizes (rows,), in the order of `row_table`, if others are wanted. 1: all limits
     can be kept with a margin of `width`; from the boundary of the feasible set outwards at most ½
     (as no plan keeps all limits with a margin there), except where an equality decides: those are
@@ -81,14 +73,14 @@ def membership(
     if x0s.ndim != 2 or x0s.shape[1] != mpc.dimension:
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.dimension}), one a row")
     if concrete(width) and not (np.ndim(width) == 0 and 0 < width < 1):
-        fail("width", f"{width}", "Give a share of the limits between 0 and 1, such as 0.02")
+        fail("width", f"{width}", "Give a fraction of the limits between 0 and 1, such as 0.02")
     condensed = condense(mpc)
     if scale is not None:
         require_shape("scale", scale, condensed.lower.shape, "One size for each row")
         if concrete(scale) and not np.all(np.asarray(scale) > 0):
             fail("scale", "holds an entry that is not positive", "Sizes are positive")
         scale = arrays(scale)
-    return _membership(condensed, x0s, width, scale, steps)
+    return _membership(condensed, x0s, width, scale, newton_steps)
 
 
 @functools.partial(jax.jit, static_argnames="steps")
@@ -125,10 +117,10 @@ def _membership(c: Condensed, x0s: Array, width: Array, scale: Any, steps: int) 
 
 
 def nearest(A: Array, bounds: Bounds, w: Array, steps: int) -> tuple[Array, Array]:
-    """Minimise ½ dist²(A w, set) as `least_distance` does, until it is done: w and the excess.
+    """Minimise ½ dist²(A w, set) as `least_distance` does; return w and the prox residual.
 
-    Done: the gradient A'e is small beside e, or as small as rounding leaves it for bounds of size
-    one. In a batch all wait for the slowest.
+    It ends when the gradient A'e is small beside e, or as small as rounding leaves it for bounds
+    of size one. In a batch all wait for the slowest.
     """
     products, damping = gram(A), jnp.asarray(Constants.of(w.dtype).damping, w.dtype)
     H, q = jnp.zeros((w.shape[0], w.shape[0]), w.dtype), jnp.zeros_like(w)
@@ -147,7 +139,7 @@ def nearest(A: Array, bounds: Bounds, w: Array, steps: int) -> tuple[Array, Arra
 
 
 def _tightened(c: Condensed, width: Array, scale: Any) -> tuple[Array, Bounds]:
-    """Size of each row, and the bounds tightened by `width` of it and divided by it."""
+    """Return the size of each row, and the bounds tightened by `width` of it and divided by it."""
     has_low, has_high = jnp.isfinite(c.lower), jnp.isfinite(c.upper)
     low, high = jnp.where(has_low, c.lower, 0.0), jnp.where(has_high, c.upper, 0.0)
     room = (high - low) / 2
@@ -165,70 +157,3 @@ def _tightened(c: Condensed, width: Array, scale: Any) -> tuple[Array, Bounds]:
     l = jnp.where(has_low, (low + take) / scale, -jnp.inf)
     u = jnp.where(has_high, (high - take) / scale, jnp.inf)
     return scale, Bounds(l, u, radius=radius, balls=c.balls)
-
-
-def tune_feasible_set(
-    make_mpc: Callable[[Mapping[str, Any]], MPC], parameters: Parameters, x0s: Any,
-    width: float = 0.02, *, penalty: Callable[[MPC], Any] | None = None,
-    optimizer: optax.GradientTransformation | None = None, updates: int = 100,
-    batch: int | None = None, validation: Any = 0.25, steps: int = STEPS, seed: int = 0,
-    checkpoint: str | Path | None = None, progress: bool = False,
-) -> TuningRun:  # fmt: skip
-    """Grow the feasible set by gradient: maximise feasible_share(mpc(θ), x0s, width) − penalty.
-
-    make_mpc, parameters, optimizer, batch, updates, validation, seed, checkpoint: as in
-    `tune_weights`; the loss is −share + penalty. x0s (B, n): states spread evenly over the region
-    that matters, such as a `grid` or a uniform sample. penalty(mpc): what growth is traded
-    against, a number computed from the problem alone. To trade it against the cost of closed
-    loops instead, give `tune_weights` design_loss=lambda mpc: -weight * feasible_share(mpc, ...).
-
-    In float64. The share is smoothed and sampled: what was gained is proved by `map_feasible_set`
-    of `run.mpc`, before and after. Numbers of the history: share, and penalty.
-    Raises ValueError for what does not fit together, before any compile.
-    """
-    require_parameters(parameters)
-    x0s = np.asarray(x0s, np.float64)
-    if x0s.ndim != 2 or not len(x0s):
-        fail("x0s", f"shape {x0s.shape}", "Give states (B, n), one a row")
-    batch = len(x0s) if batch is None else whole("batch", batch, 1)
-    updates, seed = whole("updates", updates, 0), whole("seed", seed, 0)
-    # A grid is in order, and validation takes the last.
-    x0s = np.random.default_rng(seed).permutation(x0s)
-    (train, _), (test, _) = split((x0s, {}), validation)
-    size = min(batch, len(train))
-    start = raw(parameters)
-    initial = {name: np.asarray(p.value) for name, p in parameters.items()}
-
-    def total(theta: Any, x0s: Array) -> tuple[Array, dict[str, Array]]:
-        mpc = make_mpc(values(parameters, theta))
-        if not isinstance(mpc, MPC):
-            fail("make_mpc", f"returns a {type(mpc).__name__}", "Return a jm.MPC")
-        share = feasible_share(mpc, x0s, width, steps=steps)
-        price = jnp.zeros(()) if penalty is None else jnp.asarray(penalty(mpc))
-        return price - share, {"share": share, "penalty": price}
-
-    slope, value = jax.jit(jax.value_and_grad(total, has_aux=True)), jax.jit(total)
-
-    def gradient(theta: Any, step: int) -> tuple[float, Any, dict[str, float]]:
-        chosen = minibatch(len(train), size, seed, step)
-        with jax.enable_x64(True):
-            (loss, numbers), slopes = slope(arrays(theta), arrays(train[chosen]))
-        return float(loss), slopes, numbers
-
-    def validate(theta: Any) -> tuple[float, dict[str, float]]:
-        with jax.enable_x64(True):
-            loss, numbers = value(arrays(theta), arrays(test))
-        return float(loss), numbers
-
-    settings = {
-        "parameters": {name: p.record() for name, p in parameters.items()},
-        "width": float(width), "batch": size, "train": len(train), "validation": len(test),
-        "steps": steps, "seed": seed, "dtype": "float64",
-        "data": archive.fingerprint(None, train, test),
-    }  # fmt: skip
-    history = descend(
-        start, gradient, validate, optax.adam(0.05) if optimizer is None else optimizer, updates,
-        checkpoint=checkpoint, settings=settings, progress=progress,
-    )  # fmt: skip
-    best = exact_values(parameters, history.theta)
-    return TuningRun(best, initial, history, "reverse", settings, parameters, make_mpc, ADMM())
