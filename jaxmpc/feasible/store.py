@@ -16,13 +16,10 @@ no answers, so that a row not reached is never taken for one. Power cuts are not
 zarr does not sync to the disk.
 """
 
-import hashlib
-import json
 import os
 import shutil
 import uuid
 from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -30,6 +27,7 @@ import numpy as np
 import zarr
 
 from jaxmpc.checks import fail
+from jaxmpc.runs import differences, fingerprint, versions
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -86,15 +84,15 @@ def open_store(
     attributes = {
         "config": dict(config),
         "chunk": chunk,
-        "fingerprint": _fingerprint(config, points, shape, chunk),
-        "versions": _versions(),
+        "fingerprint": fingerprint([dict(config), shape, chunk], points),
+        "versions": versions(),
     }
     if not path.exists():
         _create(path, points, fields, attributes)
     group = _open(path, "r+")
     if group.attrs["fingerprint"] != attributes["fingerprint"]:
-        stored: Any = {"config": group.attrs["config"], "chunk": group.attrs["chunk"]}
-        changes = _differences(stored, {"config": dict(config), "chunk": chunk})
+        stored: Any = group.attrs["config"]
+        changes = differences({**stored, "chunk": group.attrs["chunk"]}, {**config, "chunk": chunk})
         fail(
             str(path),
             f"holds results of another configuration ({'; '.join(changes) or 'other points'})",
@@ -203,34 +201,3 @@ def _array(group: zarr.Group, name: str) -> zarr.Array[Any]:
 
 def _chunk(group: zarr.Group) -> int:
     return int(group.attrs["chunk"])  # type: ignore[arg-type]
-
-
-def _fingerprint(
-    config: Mapping[str, Any], points: np.ndarray, shape: tuple[int, ...], chunk: int
-) -> str:
-    text = json.dumps([config, points.shape, shape, chunk], sort_keys=True)
-    return hashlib.sha256(text.encode() + points.tobytes()).hexdigest()
-
-
-def _differences(there: Any, here: Any, key: str = "") -> list[str]:
-    """Leaves that differ, as "mpc.horizon: 20 there, 10 here"."""
-    if isinstance(there, Mapping) and isinstance(here, Mapping):
-        names = dict.fromkeys([*there, *here])
-        return [
-            line
-            for name in names
-            for line in _differences(there.get(name), here.get(name), f"{key}.{name}")
-        ]
-    there, here = json.dumps(there), json.dumps(here)
-    label = key.removeprefix(".").removeprefix("config.")
-    return [] if there == here else [f"{label}: {there} there, {here} here"]
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for package in ("jaxmpc", "jax", "jaxlib", "numpy", "zarr"):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found

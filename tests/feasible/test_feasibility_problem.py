@@ -7,7 +7,8 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.feasible import FeasibilityProblem, problem
+from jaxmpc.feasible import problem
+from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
 from jaxmpc.mpc.soften import soften
 

@@ -16,7 +16,7 @@ from jaxmpc.control.sets import Polytope
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.inequalities import Inequalities
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.runs import write_json
+from jaxmpc.runs import differences, write_json
 
 CHECKPOINT = "checkpoint.npz"
 TUNED = "tuned.toml"
@@ -133,12 +133,8 @@ def open_run(
             said = json.loads(record.read_text())["options"]
         except (ValueError, KeyError, TypeError):
             fail(str(record), "holds no run", "Add --overwrite to start again")
-        for key in {**said, **options}:
-            if said.get(key) != options.get(key):
-                values = [str(part.get(key)) for part in (said, options)]
-                shown = [v if len(v) < 60 else f"{v[:57]}..." for v in values]
-                what = f"{key}: {shown[0]} there, {shown[1]} here"
-                fail(str(record), what, "Give the same options, or --overwrite")
+        if changes := differences(said, options):
+            fail(str(record), "; ".join(changes), "Give the same options, or --overwrite")
     open_folder(folder)
     for name in (*files, *([CHECKPOINT] if overwrite else [])):  # of an earlier run
         (folder / name).unlink(missing_ok=True)
