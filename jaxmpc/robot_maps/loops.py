@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.closed_loop.outcome import coordinates
+from jaxmpc.closed_loop.outcome import with_limits
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.control.violation import kept, worst_excess
 from jaxmpc.qp.status import Status
@@ -34,14 +34,11 @@ class RobotLoops:
     @classmethod
     def of(cls, run: Run, robot: Any, dtype: Any) -> "RobotLoops":
         """From closed loops with the batch in front, run in `dtype`, by the robot's own limits."""
-        of_states = coordinates(robot, np.asarray(run.states)), robot.state_limits
-        of_inputs = np.asarray(run.inputs, float), robot.input_limits
+        states, inputs = with_limits(robot, run)
         # An input belongs to the sample that it leaves.
         last = lambda v: np.pad(v, ((0, 0), (0, 1)))
-        excess = np.maximum(
-            worst_excess(of_states[1], of_states[0]), last(worst_excess(of_inputs[1], of_inputs[0]))
-        )
-        within = [kept(limits, x, dtype).all(axis=-1) for x, limits in (of_states, of_inputs)]
+        excess = np.maximum(worst_excess(*states), last(worst_excess(*inputs)))
+        within = [kept(*pair, dtype).all(axis=-1) for pair in (states, inputs)]
         beyond = ~within[0] | last(~within[1])
         status = np.asarray(run.status)
         solved = status == Status.SOLVED
