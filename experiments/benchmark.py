@@ -24,7 +24,7 @@ import scipy.sparse as sparse
 import tyro
 
 import jaxmpc as jm
-from jaxmpc.config import Config
+from jaxmpc.app.config import load
 from jaxmpc.mpc.condense import Condensed, condense, in_float64
 
 
@@ -191,7 +191,7 @@ def moreau_batch(c: Condensed, x: np.ndarray, label: np.ndarray, rounds: int) ->
 
 def main_table(settings: Settings) -> list[Row]:
     """All contestants on the joint, N = 20, no terminal set."""
-    mpc = Config.default().build_mpc()
+    mpc = load(None).build_mpc()
     x, c = draw(settings.states, settings.seed), condensed(mpc)
     first, label = ours_labels(mpc, x, settings.rounds, "float32")
     rows = [first, ours_labels(mpc, x, settings.rounds, "float64")[0]]
@@ -212,7 +212,7 @@ def growth(settings: Settings) -> dict[str, list[tuple[int, float, float]]]:
         plans, _ = best(2, lambda: (jm.solve_many(mpc, x, solver).run_seconds, None))
         return labels / count * 1e6, plans / count * 1e6
 
-    mpc = Config.default().build_mpc()
+    mpc = load(None).build_mpc()
     batches = [2**k for k in range(8, 19, 2)]
     horizons = [10, 20, 40, 80]
     return {

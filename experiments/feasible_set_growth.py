@@ -40,9 +40,11 @@ import tyro
 from jax.scipy.linalg import expm
 
 import jaxmpc as jm
-from jaxmpc.config import load
+from jaxmpc.app.config import load
 from jaxmpc.control.riccati import cost_of_law
-from jaxmpc.tuning.feasibility import feasible_share, tune_feasible_set
+from jaxmpc.feasible import FeasibleSetMap
+from jaxmpc.tuning.feasible_fraction import feasible_fraction
+from jaxmpc.tuning.feasible_set import tune_feasible_set
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
 from jaxmpc.tuning.weights import tune_weights
@@ -108,13 +110,13 @@ def samples(mpc: jm.MPC, count: int, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(box.lower, box.upper, (count, mpc.system.n))
 
 
-def area(mpc: jm.MPC, s: Settings) -> tuple[jm.FeasibleSetMap, tuple[float, float]]:
+def area(mpc: jm.MPC, s: Settings) -> tuple[FeasibleSetMap, tuple[float, float]]:
     """The refined map, and the proved bounds of its area."""
     fmap = jm.map_feasible_set(mpc, samples(mpc, 64, s.seed + 1)).refine(s.tolerance)
     return fmap, fmap.volume_bounds()
 
 
-def inside(fmap: jm.FeasibleSetMap, count: int, seed: int) -> np.ndarray:
+def inside(fmap: FeasibleSetMap, count: int, seed: int) -> np.ndarray:
     """States spread evenly over the inner polytope of a map."""
     polytope = fmap.inner()
     H, h = np.asarray(polytope.H), np.asarray(polytope.h)
@@ -298,7 +300,7 @@ def trade(name: str, s: Settings) -> None:
                 mpc.system, x0s, loss, s.steps,
                 solver=jm.ADMM(iterations=50, refine=5), optimizer=optax.adam(s.rate),
                 updates=s.updates, batch=16, seed=s.seed, mode="forward",
-                design_loss=lambda made, k=scale: -k * feasible_share(made, points, s.width),
+                design_loss=lambda made, k=scale: -k * feasible_fraction(made, points, s.width),
             )  # fmt: skip
             print(f"  weight {weight:g}: {run.history.seconds:.0f} s, best {run.history.best}",
                   flush=True)  # fmt: skip

@@ -73,7 +73,7 @@ def polygon(mpc: jm.MPC) -> jm.Polytope:
     """The exact feasible polygon of one joint, scaled to h = 1."""
     body = mpc.states.to_polytope()
     for _ in range(mpc.horizon):
-        body = jm.predecessor(mpc.system, body, mpc.states, mpc.inputs)
+        body = jm.sets.predecessor(mpc.system, body, mpc.states, mpc.inputs)
     return jm.Polytope(body.H / body.h[:, None], np.ones(len(body.h)))
 
 

@@ -35,12 +35,14 @@ from hidden_product import Settings as Product
 from scipy import sparse
 
 import jaxmpc as jm
-from jaxmpc import config
+from jaxmpc.app import config
 from jaxmpc.mpc.condense import Condensed, condense, in_float64
 from jaxmpc.qp.admm import factor, iterate, read, scaled
 from jaxmpc.qp.problem import residual_terms
 from jaxmpc.qp.solve import unscaled
-from jaxmpc.tuning.penalties import Penalties, learn_penalties
+from jaxmpc.tuning.penalties import tune_penalties
+from jaxmpc.tuning.penalty_schedule import transfer_penalties
+from jaxmpc.tuning.result import TuningRun
 from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
 
 HERE = Path(__file__).parent
@@ -110,7 +112,7 @@ def case(name: str) -> Case:
         tracked = {"reference": home, "input_reference": np.asarray(u)}
         wide = np.array([1.0, 1.0, 3.5, 5.5])
         return Case(mpc, lambda rng, k: home + rng.uniform(-wide, wide, (k, 4)), tracked)
-    mpc = joint() if name == "joint" else config.load(HERE / f"{name}.toml", {}).build()[0]
+    mpc = joint() if name == "joint" else config.load(HERE / f"{name}.toml").build_mpc()
     lower, upper = np.asarray(mpc.states.lower), np.asarray(mpc.states.upper)
     return Case(mpc, lambda rng, k: rng.uniform(lower, upper, (k, len(lower))), tracked)
 
@@ -239,14 +241,14 @@ class Table:
         z, y = (jnp.asarray(v) for v in zip(*answers, strict=True))
         return np.asarray(judged(self.condensed, self.tracked, x, z, y))
 
-    def learn(self, iterations: int, stages: int, groups: str) -> Penalties:
+    def learn(self, iterations: int, stages: int, groups: str) -> TuningRun:
         """Penalties learned on the first part."""
-        return learn_penalties(
+        return tune_penalties(
             self.mpc, self.first, iterations, stages=stages, groups=groups, seed=self.s.seed,
             updates=self.s.updates, batch=self.s.batch, **self.given,
         )  # fmt: skip
 
-    def learned(self, stages: int, groups: str) -> tuple[Penalties, str, float, str]:
+    def learned(self, stages: int, groups: str) -> tuple[TuningRun, str, float, str]:
         """The same of learned penalties."""
         begun = time.perf_counter()
         found = self.learn(self.s.steps, stages, groups)
@@ -318,7 +320,7 @@ def report(s: Settings) -> None:
         print(f"  twice the horizon, N = {mpc.horizon}, {table.condensed.C.shape[0]} rows")
         for steps in (s.steps, 2 * s.steps):
             show(f"{steps} steps: default", table.solved(jm.ADMM(steps, refine=0)))
-            show("groups of the shorter one", table.solved(found.for_mpc(mpc, steps)))
+            show("groups of the shorter one", table.solved(transfer_penalties(found, mpc, steps)))
             show("learned anew", table.solved(table.learn(steps, 4, "step").solver))
 
 
@@ -340,8 +342,10 @@ def sweeps(s: Settings) -> None:
     found = tune_sweep_penalties(mpc, points, chunk=8192)
     learning = clock() - begun
     print(f"{s.problem}, {len(points):,} states; compiling {compiling:.1f} s")
-    print(f"  learning {learning:.1f} s, first pass decides {found.decided_before:.2%} -> ", end="")
-    print(f"{found.decided:.2%} of states apart")
+    print(
+        f"  learning {learning:.1f} s, first pass decides {found.before['decided']:.2%} -> ", end=""
+    )
+    print(f"{found.after['decided']:.2%} of the validation set")
     times: dict[bool, list[float]] = {False: [], True: []}
     labels = {}
     for _ in range(3 if len(points) < 2**18 else 1):

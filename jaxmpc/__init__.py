@@ -1,127 +1,112 @@
-"""Constrained model predictive control for robots: solved by the million, and proved."""
+"""Constrained model predictive control for robots: solved by the million, and proved.
 
-from jaxmpc.closed_loop import Run, lyapunov_decrease, simulate, simulate_many
-from jaxmpc.control.equilibrium import equilibrium
+Problems       LinearSystem, MPC, Box, Polytope, Ellipsoid, Outputs, Soft, joint_limits, design
+Plans          solve, solve_many, Controller -> Plan, Status; solve_qp of a QP by ADMM
+Closed loops   load_robot, LinearPlant, robot_mpc, RobotController, simulate, simulate_many
+Proofs         map_feasible_set, boundary, feasible_polytope, recursive_feasibility,
+               verify_terminal, exact_penalty, offline_report
+Sets and laws  lqr, maximal_invariant_set, maximal_control_invariant_set, invariant_ellipsoid
+Tuning         tune_weights, tune_penalties with Parameter and ClosedLoopLoss
+
+The rest, and the types of all results, are in `qp`, `control`, `sets`, `mpc`, `feasible`,
+`recursion`, `explicit`, `robots`, `robot_maps`, `closed_loop`, `tuning` and `workflow`.
+"""
+
+from jaxmpc import (
+    closed_loop,
+    control,
+    explicit,
+    feasible,
+    mpc,
+    qp,
+    recursion,
+    robot_maps,
+    robots,
+    sets,
+    tuning,
+    workflow,
+)
+from jaxmpc.closed_loop import RobotController, robot_mpc, simulate, simulate_many
 from jaxmpc.control.invariant import (
-    ControlInvariantSet,
     invariant_ellipsoid,
     maximal_control_invariant_set,
     maximal_invariant_set,
-    predecessor,
 )
-from jaxmpc.control.limits import JointLimits, joint_limits, output_limits
-from jaxmpc.control.riccati import LQR, lqr
+from jaxmpc.control.limits import joint_limits
+from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
-from jaxmpc.control.terminal import TerminalReport, verify_terminal
-from jaxmpc.mpc.feedback import LinearFeedback
+from jaxmpc.control.terminal import verify_terminal
+from jaxmpc.explicit import exact_penalty
+from jaxmpc.feasible import boundary, feasible_polytope, grid, map_feasible_set
 from jaxmpc.mpc.many import solve_many
 from jaxmpc.mpc.problem import MPC, Outputs, Plan, Soft
-from jaxmpc.mpc.rows import active_constraints, row_table
-from jaxmpc.mpc.soften import harden, soften
+from jaxmpc.mpc.soften import soften
 from jaxmpc.mpc.solve import Controller, solve
-from jaxmpc.mpc.stagewise import solve_stagewise
-from jaxmpc.outcome import Outcome, judge
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.qp.margin import feasibility_margin
-from jaxmpc.qp.problem import QP, QPSolution
+from jaxmpc.qp.problem import QP
 from jaxmpc.qp.solve import solve_qp
 from jaxmpc.qp.status import Status
-from jaxmpc.robots.control import RobotController, robot_mpc
+from jaxmpc.recursion import recursive_feasibility
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.load import load_robot
-from jaxmpc.robots.robot import Robot
-from jaxmpc.sweeps.boundary import Boundary, boundary
-from jaxmpc.sweeps.exact_penalty import ExactPenalty, exact_penalty
-from jaxmpc.sweeps.feasible_set import FeasibleSetMap, grid, map_feasible_set
-from jaxmpc.sweeps.reach import feasible_growth, feasible_polytope
-from jaxmpc.sweeps.recursion import RecursionReport, recursive_feasibility, smallest_horizon
-from jaxmpc.sweeps.regions import CriticalRegions, critical_regions
-from jaxmpc.sweeps.robots import RobotMap, map_robot
-from jaxmpc.tuning.feasibility import feasible_share, tune_feasible_set
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
-from jaxmpc.tuning.penalties import Penalties, learn_penalties, tune_penalties
-from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
-from jaxmpc.tuning.weights import TuningRun, tune_weights
-from jaxmpc.workflow import Design, OfflineReport, design, offline_report
+from jaxmpc.tuning.penalties import tune_penalties
+from jaxmpc.tuning.weights import tune_weights
+from jaxmpc.workflow import design, offline_report
 
 __all__ = [
     "ADMM",
-    "LQR",
     "MPC",
     "QP",
-    "Boundary",
     "Box",
     "ClosedLoopLoss",
-    "ControlInvariantSet",
     "Controller",
-    "CriticalRegions",
-    "Design",
     "Ellipsoid",
-    "ExactPenalty",
-    "FeasibleSetMap",
-    "JointLimits",
-    "LinearFeedback",
     "LinearPlant",
     "LinearSystem",
-    "OfflineReport",
-    "Outcome",
     "Outputs",
     "Parameter",
-    "Penalties",
     "Plan",
     "Polytope",
-    "QPSolution",
-    "RecursionReport",
-    "Robot",
     "RobotController",
-    "RobotMap",
-    "Run",
     "Soft",
     "Status",
-    "TerminalReport",
-    "TuningRun",
-    "active_constraints",
     "boundary",
-    "critical_regions",
+    "closed_loop",
+    "control",
     "design",
-    "equilibrium",
     "exact_penalty",
-    "feasibility_margin",
-    "feasible_growth",
+    "explicit",
+    "feasible",
     "feasible_polytope",
-    "feasible_share",
     "grid",
-    "harden",
     "invariant_ellipsoid",
     "joint_limits",
-    "judge",
-    "learn_penalties",
     "load_robot",
     "lqr",
-    "lyapunov_decrease",
     "map_feasible_set",
-    "map_robot",
     "maximal_control_invariant_set",
     "maximal_invariant_set",
+    "mpc",
     "offline_report",
-    "output_limits",
-    "predecessor",
+    "qp",
+    "recursion",
     "recursive_feasibility",
+    "robot_maps",
     "robot_mpc",
-    "row_table",
+    "robots",
+    "sets",
     "simulate",
     "simulate_many",
-    "smallest_horizon",
     "soften",
     "solve",
     "solve_many",
     "solve_qp",
-    "solve_stagewise",
-    "tune_feasible_set",
     "tune_penalties",
-    "tune_sweep_penalties",
     "tune_weights",
+    "tuning",
     "verify_terminal",
+    "workflow",
 ]

@@ -2,7 +2,7 @@
 
 import sys
 
-from jaxmpc.cli import main
+from jaxmpc.app.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import scipy
 
-from jaxmpc import LQR, Box, LinearSystem, Polytope, lqr, maximal_invariant_set
+from jaxmpc import Box, LinearSystem, Polytope, lqr, maximal_invariant_set
+from jaxmpc.control import LQR
 from jaxmpc.control.invariant import _bound
 from jaxmpc.control.sets import _irredundant
 

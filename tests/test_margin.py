@@ -29,7 +29,7 @@ def rows(A, l, u, **fields) -> jm.QP:
 
 
 def margin(qp, **settings) -> float:
-    t, status = jm.feasibility_margin(qp, **settings)
+    t, status = jm.qp.feasibility_margin(qp, **settings)
     assert status == jm.Status.SOLVED
     return float(t)
 
@@ -69,7 +69,7 @@ def test_random_rows_against_another_solver():
     l[:, :3], u[:, 3:5] = -INF, INF
     batch = jm.QP(np.eye(5), np.zeros(5), A, l, u)
     axes = (jm.QP(P=None, q=None, A=0, l=0, u=0),)
-    t, status = jax.jit(jax.vmap(jm.feasibility_margin, in_axes=axes))(batch)
+    t, status = jax.jit(jax.vmap(jm.qp.feasibility_margin, in_axes=axes))(batch)
     np.testing.assert_array_equal(status, jm.Status.SOLVED)
     for i in range(30):
         ones = np.ones((12, 1))
@@ -84,7 +84,7 @@ def test_random_rows_against_another_solver():
 def test_gradient_against_differences():
     """Both signs: at a state inside the joint's feasible set and at one outside."""
     condensed = jm.Controller(problems.joint()).condensed
-    f = jax.jit(lambda x: jm.feasibility_margin(condensed.qp(x))[0])
+    f = jax.jit(lambda x: jm.qp.feasibility_margin(condensed.qp(x))[0])
     gradient = jax.jit(jax.grad(f))
     for x in (np.array([0.3, 1.2]), np.array([1.4, 1.7]), np.array([-1.9, -2.5])):
         numeric = [(f(x + h) - f(x - h)) / 2e-5 for h in 1e-5 * np.eye(2)]
@@ -104,7 +104,7 @@ def test_gradient_against_differences():
 def test_climbing_the_margin_leads_into_the_feasible_set(mpc, count):
     """Polyak steps on the concave margin bring every infeasible state in; labels prove it."""
     condensed = jm.Controller(mpc).condensed
-    value = lambda x: jm.feasibility_margin(condensed.qp(x))
+    value = lambda x: jm.qp.feasibility_margin(condensed.qp(x))
     climb = jax.jit(jax.vmap(jax.value_and_grad(value, has_aux=True)))
     x = np.random.default_rng(1).uniform([-3, -4], [3, 4], (4 * count, 2))
     x = x[jm.map_feasible_set(mpc, x).label == -1][:count]
@@ -120,8 +120,8 @@ def test_climbing_the_margin_leads_into_the_feasible_set(mpc, count):
 def test_bad_input():
     qp = rows([[1]], [-1], [1])
     with pytest.raises(ValueError, match="scale"):
-        jm.feasibility_margin(qp, scale=np.ones(2))
+        jm.qp.feasibility_margin(qp, scale=np.ones(2))
     ball = replace(qp, l=np.zeros(1), u=np.zeros(1), radius=np.ones(1), balls=(1,))
     with pytest.raises(ValueError, match="balls"):
-        jm.feasibility_margin(ball)
-    assert jnp.isfinite(jm.feasibility_margin(qp)[0])
+        jm.qp.feasibility_margin(ball)
+    assert jnp.isfinite(jm.qp.feasibility_margin(qp)[0])

@@ -17,10 +17,12 @@ from jax import enable_x64
 import jaxmpc as jm
 from jaxmpc.control.equilibrium import equilibrium
 from jaxmpc.control.sets import Ellipsoid
+from jaxmpc.feasible import proofs
+from jaxmpc.feasible.exact_data import exact_data, hard_blocks
+from jaxmpc.feasible.view import make_view
 from jaxmpc.mpc.problem import Outputs, Soft
 from jaxmpc.mpc.rows import active_constraints, row_table
 from jaxmpc.mpc.soften import soften
-from jaxmpc.sweeps import proofs
 
 ONE, EYE = np.ones(2), np.eye(2)
 FINE = jm.ADMM(iterations=300, refine=30, eps=1e-8)
@@ -891,7 +893,7 @@ def test_cut_of_an_asymmetric_ellipsoid():
         inputs=problems.symmetric(1.0), terminal_set=Ellipsoid(P, 1.0),
     )  # fmt: skip
     mpc.validate()
-    problem = proofs.problem(mpc, proofs.make_view(mpc), np.array([10.0, 1e4]))
+    problem = exact_data(mpc, make_view(mpc), hard_blocks(mpc), np.array([10.0, 1e4]))
     S, worst = (P + P.T) / 2, 0.0
     cut = jax.jit(lambda y: proofs.cut(problem, np.zeros((1, 0)), np.zeros(0), y))
     for angle in np.linspace(0, np.pi, 9):

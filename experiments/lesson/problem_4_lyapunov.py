@@ -17,7 +17,8 @@ import tyro
 from lesson_joint import LIMITS, SYSTEM, TORQUE, A, B, Q, R, joint
 
 import jaxmpc as jm
-from jaxmpc.closed_loop import lyapunov_decrease, simulate
+from jaxmpc.closed_loop.run import lyapunov_decrease
+from jaxmpc.closed_loop.simulate import simulate
 
 
 @dataclass(frozen=True)

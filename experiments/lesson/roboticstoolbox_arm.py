@@ -24,7 +24,7 @@ import tyro
 from jax import Array
 
 import jaxmpc as jm
-from jaxmpc.closed_loop import simulate
+from jaxmpc.closed_loop.simulate import simulate
 from jaxmpc.control.limits import JointLimits, joint_limits
 from jaxmpc.mpc.soften import soften
 

@@ -17,6 +17,7 @@ import tyro
 from jax import Array
 
 import jaxmpc as jm
+from jaxmpc.robots import Robot
 from jaxmpc.robots.physics import Physics
 
 
@@ -32,7 +33,7 @@ class Settings:
     seed: int = 0
 
 
-def draw(robot: jm.Robot, count: int, stretch: float, rng: np.random.Generator) -> np.ndarray:
+def draw(robot: Robot, count: int, stretch: float, rng: np.random.Generator) -> np.ndarray:
     """Random states (count, nq + nv), joint speeds of 0.5 rad/s."""
     m = robot.mujoco
     q = np.tile(robot.home[: m.nq], (count, 1))
@@ -49,7 +50,7 @@ def draw(robot: jm.Robot, count: int, stretch: float, rng: np.random.Generator) 
     return np.hstack([q, 0.5 * rng.normal(size=(count, m.nv))])
 
 
-def c_run(robot: jm.Robot, x: np.ndarray, inputs: np.ndarray, warm: bool) -> np.ndarray:
+def c_run(robot: Robot, x: np.ndarray, inputs: np.ndarray, warm: bool) -> np.ndarray:
     """States (T, nq + nv) after each input by mj_step."""
     m, found = robot.mujoco, []
     data = mujoco.MjData(m)
@@ -68,7 +69,7 @@ def mjx_run(physics: Physics, x: Array, inputs: Array) -> Array:
     return jax.lax.scan(lambda x, u: (physics.step(x, u),) * 2, x, inputs)[1]
 
 
-def c_transition(robot: jm.Robot, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def c_transition(robot: Robot, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A, B by mjd_transitionFD."""
     m = robot.mujoco
     data = mujoco.MjData(m)

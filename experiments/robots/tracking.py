@@ -25,6 +25,8 @@ import numpy as np
 import tyro
 
 import jaxmpc as jm
+from jaxmpc.closed_loop import LinearFeedback, Run
+from jaxmpc.robots import Robot
 
 TOLERANCE = 1e-6
 
@@ -49,7 +51,7 @@ class Settings:
     seed: int = 0
 
 
-def tasks(s: Settings, robot: jm.Robot, steps: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def tasks(s: Settings, robot: Robot, steps: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """References (steps + N, n) and (steps + N − 1, m): the home, and sinusoids about it."""
     nv, length = robot.mujoco.nv, steps + s.horizon
     home = np.asarray(robot.home)[:nv]
@@ -64,7 +66,7 @@ def tasks(s: Settings, robot: jm.Robot, steps: int) -> dict[str, tuple[np.ndarra
     return made
 
 
-def laws(s: Settings, robot: jm.Robot) -> dict[str, Any]:
+def laws(s: Settings, robot: Robot) -> dict[str, Any]:
     """The MPCs and the two feedbacks, with one set of weights."""
     nv = robot.mujoco.nv
     torque = np.asarray(robot.input_limits.upper)
@@ -74,15 +76,15 @@ def laws(s: Settings, robot: jm.Robot) -> dict[str, Any]:
     found: dict[str, Any] = {
         f"MPC, {mode}": jm.RobotController(robot, mpc, solver, linearize=mode) for mode in s.modes
     }
-    found["LQR, clipped"] = jm.LinearFeedback(mpc, jm.lqr(mpc.system, mpc.Q, mpc.R).K, robot)
+    found["LQR, clipped"] = LinearFeedback(mpc, jm.lqr(mpc.system, mpc.Q, mpc.R).K, robot)
     # PD of 20 rad/s and critical damping, with the inertias at home.
     B = np.asarray(mpc.system.B)[nv:] / robot.dt
     gains = 20.0**2 * np.eye(nv), 2 * 20.0 * np.eye(nv)
-    found["PD, clipped"] = jm.LinearFeedback(mpc, -np.linalg.solve(B, np.hstack(gains)), robot)
+    found["PD, clipped"] = LinearFeedback(mpc, -np.linalg.solve(B, np.hstack(gains)), robot)
     return found
 
 
-def loops(law: Any, robot: jm.Robot, starts: np.ndarray, steps: int, task: tuple) -> jm.Run:
+def loops(law: Any, robot: Robot, starts: np.ndarray, steps: int, task: tuple) -> Run:
     """Closed loops of one law, on the host."""
     if isinstance(law, jm.RobotController):
         return jm.simulate_many(

@@ -25,6 +25,7 @@ import optax
 import tyro
 
 import jaxmpc as jm
+from jaxmpc.closed_loop import Run
 from jaxmpc.tuning.parameters import Parameter
 from jaxmpc.tuning.weights import tune_weights
 
@@ -106,10 +107,10 @@ def arm2(s: Settings, rng: np.random.Generator) -> Case:
     return Case(robot, controller, hidden, x_ref + shift, aims, robot.state_limits.half_widths())
 
 
-def imitation(starts: np.ndarray, states: np.ndarray, size: np.ndarray) -> Callable[[jm.Run], Any]:
+def imitation(starts: np.ndarray, states: np.ndarray, size: np.ndarray) -> Callable[[Run], Any]:
     """Mean squared distance of a run to the expert's states (B, T+1, n) from the same start."""
 
-    def loss(run: jm.Run) -> Any:
+    def loss(run: Run) -> Any:
         same = jnp.argmin(jnp.sum((jnp.asarray(starts) - run.states[0]) ** 2, axis=1))
         return jnp.mean(((run.states - jnp.asarray(states)[same]) / jnp.asarray(size)) ** 2)
 
@@ -139,7 +140,8 @@ def trial(s: Settings, name: str, seed: int) -> None:
     print(
         f"\n{name}, trial {seed}: {len(case.starts[seen])} starts to learn from (a quarter to "
         f"validate), {len(case.starts[unseen])} unseen, {s.samples} samples, N = {s.horizon}, "
-        f"{s.updates} updates, {tuned.mode} mode, {tuned.history.seconds:.0f} s, float{s.bits}"
+        f"{s.updates} updates, {tuned.settings['mode']} mode, {tuned.history.seconds:.0f} s, "
+        f"float{s.bits}"
     )
     print(f"{'':8}{'weights, by the first':>54}{'mean square':>13}{'worst':>9}{'unsolved':>10}")
     mean = {}

@@ -28,11 +28,11 @@ import tyro
 from rivals import RIVALS, Joint, with_torch
 
 import jaxmpc as jm
-from jaxmpc.closed_loop import Steps
+from jaxmpc.closed_loop.simulate_many import as_argument
 from jaxmpc.compiled import Compiled
+from jaxmpc.tuning.closed_loop_objective import ClosedLoopObjective
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter, raw
-from jaxmpc.tuning.weights import Problem
 
 JOINT = Joint()
 # Of the reference: at 1e-5 it steps across a change of active rows in one loop of 256, and the
@@ -63,7 +63,7 @@ class Settings:
     seed: int = 0
 
 
-def problem(s: Settings, limits: str, solver: jm.ADMM) -> Problem:
+def problem(s: Settings, limits: str, solver: jm.ADMM) -> ClosedLoopObjective:
     """The closed loops as a function of θ, as `tune_weights` sees them."""
     j = JOINT
     system = jm.LinearSystem(j.A, j.B, dt=0.01)
@@ -74,7 +74,10 @@ def problem(s: Settings, limits: str, solver: jm.ADMM) -> Problem:
     )  # fmt: skip
     make = lambda v: replace(mpc, Q=v["Q"], R=v["R"], terminal_cost=v["Q"])
     loss = ClosedLoopLoss(j.Q, j.R, violation=0.0)
-    return Problem(make, START, solver, Steps.of(s.samples, system), loss, None, None, None)
+    return ClosedLoopObjective(
+        lambda v: jm.Controller(make(v), solver), START, as_argument(system), s.samples, loss,
+        None, None, None,
+    )  # fmt: skip
 
 
 def central(at: Callable, theta: dict, h: float) -> np.ndarray:

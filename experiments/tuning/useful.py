@@ -35,11 +35,13 @@ from jax.flatten_util import ravel_pytree
 from searchers import SEARCHERS, Space, search, within
 
 import jaxmpc as jm
-from jaxmpc.closed_loop import Steps
+from jaxmpc.closed_loop.simulate_many import as_argument
 from jaxmpc.compiled import Compiled
+from jaxmpc.robots import Robot
+from jaxmpc.tuning.closed_loop_objective import ClosedLoopObjective
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter, raw
-from jaxmpc.tuning.weights import Problem, tune_weights
+from jaxmpc.tuning.weights import tune_weights
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ class Settings:
     seed: int = 0
 
 
-def world(s: Settings, robot: jm.Robot, count: int, seed: int) -> tuple[np.ndarray, dict]:
+def world(s: Settings, robot: Robot, count: int, seed: int) -> tuple[np.ndarray, dict]:
     """Starts (B, n), and masses, inertias, damping, payloads of B robots."""
     rng, model = np.random.default_rng([s.seed, seed]), robot.mujoco
     shift = s.spread * rng.uniform(-1, 1, (count, robot.state_size))
@@ -96,7 +98,7 @@ def world(s: Settings, robot: jm.Robot, count: int, seed: int) -> tuple[np.ndarr
     return np.asarray(robot.home) + shift, varied
 
 
-def law(s: Settings, robot: jm.Robot) -> tuple[dict, Callable, jm.ADMM]:
+def law(s: Settings, robot: Robot) -> tuple[dict, Callable, jm.ADMM]:
     """The guess, and the controller as a function of the diagonals of Q and R."""
     mpc = jm.robot_mpc(robot, horizon=s.horizon, margin=s.margin)
     solver = jm.ADMM(s.iterations, refine=s.refine)
@@ -107,7 +109,7 @@ def law(s: Settings, robot: jm.Robot) -> tuple[dict, Callable, jm.ADMM]:
         made = replace(mpc, Q=Q, R=R, terminal_cost=P)
         return jm.RobotController(robot, made, solver, linearize=s.linearize)
 
-    return {"q": np.diag(mpc.Q), "r": np.diag(mpc.R)}, make, solver
+    return {"q": np.diag(mpc.Q), "r": np.diag(mpc.R)}, make
 
 
 def run(s: Settings) -> None:
@@ -118,7 +120,7 @@ def run(s: Settings) -> None:
     robot = jm.load_robot(s.robot, velocity=(-speed, speed))
     x_ref, u_ref = robot.equilibrium()
     aims = {"reference": np.asarray(robot.coordinates(x_ref)), "input_reference": u_ref}
-    guess, make, solver = law(s, robot)
+    guess, make = law(s, robot)
     loss = ClosedLoopLoss(
         guess["q"] * np.repeat([s.tracking, s.damped], nv), guess["r"] * s.effort,
         *aims.values(), robot.state_limits, violation=s.violation, plant=robot,
@@ -138,8 +140,8 @@ def run(s: Settings) -> None:
 
     # The oracle of the others, and of the numbers in the column "data".
     start, back = ravel_pytree(raw(parameters))
-    problem = Problem(
-        make, parameters, solver, Steps.of(s.samples, robot), loss, *aims.values(), None
+    problem = ClosedLoopObjective(
+        make, parameters, as_argument(robot), s.samples, loss, *aims.values(), None
     )
     total = lambda theta, *rest: problem.total(back(theta), *rest)[0]
     several = Compiled(jax.jit(jax.vmap(total, in_axes=(0, None, None, None, None))))
@@ -154,7 +156,8 @@ def run(s: Settings) -> None:
     oracle(flat(guess)[None])  # compiles
     ended = float(oracle(flat(tuned.values)[None])[0])
     print(
-        f"gradient, {tuned.mode}: {wall:.1f} s for {s.updates} updates, compiling {compiling:.0f} s"
+        f"gradient, {tuned.settings['mode']}: {wall:.1f} s for {s.updates} updates, "
+        f"compiling {compiling:.0f} s"
         f", rejected {np.sum(~tuned.history.accepted)}, best after {tuned.history.best}, "
         f"validation {tuned.history.validation[0]:.5g} to {np.nanmin(tuned.history.validation):.5g}"
     )

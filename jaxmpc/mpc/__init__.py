@@ -1,0 +1,35 @@
+"""Model predictive control of linear systems.
+
+MPC, Outputs, Soft    a problem, with rows of outputs and soft rows
+solve, Controller     one plan, or a factored law u = controller(x) -> Plan with Multipliers
+solve_stagewise       one plan, factored along the horizon
+solve_many            one plan for each of many states -> Plan with a batch axis
+active_constraints    which rows of a plan are active -> ActiveConstraint
+row_table             each row of the problem: kind, name, unit, step -> Row
+soften, harden        make rows soft or hard
+"""
+
+from jaxmpc.mpc.many import solve_many
+from jaxmpc.mpc.problem import MPC, Multipliers, Outputs, Plan, Soft
+from jaxmpc.mpc.rows import ActiveConstraint, Row, active_constraints, row_table
+from jaxmpc.mpc.soften import harden, soften
+from jaxmpc.mpc.solve import Controller, solve
+from jaxmpc.mpc.stagewise import solve_stagewise
+
+__all__ = [
+    "MPC",
+    "ActiveConstraint",
+    "Controller",
+    "Multipliers",
+    "Outputs",
+    "Plan",
+    "Row",
+    "Soft",
+    "active_constraints",
+    "harden",
+    "row_table",
+    "soften",
+    "solve",
+    "solve_many",
+    "solve_stagewise",
+]

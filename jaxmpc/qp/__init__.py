@@ -1,0 +1,17 @@
+"""Quadratic programs: minimise ½z'Pz + q'z subject to l ≤ Az ≤ u.
+
+QP, solve_qp         a problem, and its solution -> QPSolution
+ADMM                 settings of the solver
+Status               how a solve ended, with a sentence for each
+Bounds               the constraints of a QP on Az: intervals, hard or soft, and balls
+feasibility_margin   by how much all limits can be tightened, or must be widened
+"""
+
+from jaxmpc.qp.admm import ADMM
+from jaxmpc.qp.margin import feasibility_margin
+from jaxmpc.qp.problem import QP, QPSolution
+from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.solve import solve_qp
+from jaxmpc.qp.status import Status
+
+__all__ = ["ADMM", "QP", "Bounds", "QPSolution", "Status", "feasibility_margin", "solve_qp"]

@@ -1,0 +1,13 @@
+"""Plants: robots in MuJoCo MJX, and linear systems in their place.
+
+load_robot            a robot by name, or from an MJCF or URDF file -> Robot
+LinearPlant           a linear system with limits, in the place of a robot
+render, save_video    pictures of a motion, and a video of them
+"""
+
+from jaxmpc.robots.linear import LinearPlant
+from jaxmpc.robots.load import load_robot
+from jaxmpc.robots.robot import Robot
+from jaxmpc.robots.video import render, save_video
+
+__all__ = ["LinearPlant", "Robot", "load_robot", "render", "save_video"]

@@ -1,0 +1,36 @@
+"""Tuning by gradient descent, kept after each step.
+
+tune_weights                              fields of an MPC, through its closed loops
+Parameter                                 a quantity that is tuned, and its domain
+ClosedLoopLoss                            tracking, effort, violations and settling
+tune_feasible_set, feasible_fraction      states from which all limits can be kept
+tune_penalties, transfer_penalties        penalties of ADMM, also for another horizon
+tune_sweep_penalties                      penalties of the first stage of a map
+Settings, TuningRun, Descent              what all take and return
+"""
+
+from jaxmpc.tuning.descent import Descent
+from jaxmpc.tuning.feasible_fraction import feasible_fraction
+from jaxmpc.tuning.feasible_set import tune_feasible_set
+from jaxmpc.tuning.losses import ClosedLoopLoss
+from jaxmpc.tuning.parameters import Parameter
+from jaxmpc.tuning.penalties import tune_penalties
+from jaxmpc.tuning.penalty_schedule import transfer_penalties
+from jaxmpc.tuning.result import TuningRun
+from jaxmpc.tuning.settings import Settings
+from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
+from jaxmpc.tuning.weights import tune_weights
+
+__all__ = [
+    "ClosedLoopLoss",
+    "Descent",
+    "Parameter",
+    "Settings",
+    "TuningRun",
+    "feasible_fraction",
+    "transfer_penalties",
+    "tune_feasible_set",
+    "tune_penalties",
+    "tune_sweep_penalties",
+    "tune_weights",
+]

@@ -1,7 +1,8 @@
 """Gradient descent with guards: the loop that every tuner shares.
 
-The optimiser is optax's. Around it: validation on data apart, the best iterate kept, steps that
-lead to numbers which are not finite taken back and halved, and everything on disk after each step.
+The optimiser is one of optax. Around it: the loss on a validation set, by which the best iterate is
+chosen; steps that lead to numbers which are not finite are taken back and halved; and everything is
+on disk after each step.
 """
 
 import time
@@ -15,8 +16,9 @@ import numpy as np
 import optax
 from tqdm.std import tqdm
 
-from jaxmpc.checks import fail, whole
-from jaxmpc.tuning import archive
+from jaxmpc.checks import fail
+from jaxmpc.runs import fingerprint, read_arrays, remove_partial, write_arrays
+from jaxmpc.tuning.settings import Settings
 
 # (loss, numbers to record) and (loss, gradient, numbers to record).
 Validate = Callable[[Any], tuple[float, Mapping[str, float]]]
@@ -27,11 +29,12 @@ Gradient = Callable[[Any, int], tuple[float, Any, Mapping[str, float]]]
 class Descent:
     """The record of T steps from θ_0 to θ_T.
 
-    theta: the θ of least validation loss, `best` its number. thetas: all of them, leaves (T+1, …).
-    loss, gradient_norm (T,): at θ_t on the step's own data. accepted (T,): False where loss or
+    theta: the θ of least validation loss; best: its number. thetas: all of them, leaves (T+1, …).
+    loss, gradient_norm (T,): at θ_t on the batch of the step. accepted (T,): False where loss or
     gradient was not finite; θ_{t+1} is then the last good θ moved by half the step. validation
-    (T+1,): of each θ, NaN where not finite. numbers {name: (T,)} and validation_numbers {name:
-    (T+1,)}: what else was measured with them. seconds: of all runs that a checkpoint joins.
+    (T+1,): loss of each θ on the validation set, NaN where not finite. numbers {name: (T,)},
+    validation_numbers {name: (T+1,)}: what else was measured. seconds: time taken, the interrupted
+    runs that a checkpoint joins included.
     """
 
     theta: Any
@@ -47,21 +50,21 @@ class Descent:
 
     @property
     def steps(self) -> int:
-        """T."""
+        """Return T."""
         return len(self.loss)
 
 
 @dataclass
 class State:
-    """All that a step depends on: where it is and how it came there.
+    """What the next step depends on, and the record so far.
 
     good: the last θ with a finite gradient, its gradient and the optimiser's state before it.
-    share: of the optimiser's step that is taken, 1 until a step fails.
+    fraction: of the optimiser's step that is taken, 1 until a step fails.
     """
 
     theta: Any
     good: tuple[Any, Any, Any] | None
-    share: float = 1.0
+    fraction: float = 1.0
     seconds: float = 0.0
     rows: list[dict[str, float]] = field(default_factory=list)
     checks: list[dict[str, float]] = field(default_factory=list)
@@ -70,27 +73,29 @@ class State:
 
 def descend(
     theta: Any, gradient: Gradient, validate: Validate, optimizer: optax.GradientTransformation,
-    updates: int, *, checkpoint: str | Path | None = None, settings: Any = None,
-    progress: bool = False,
+    settings: Settings, decides: Any = None,
 ) -> Descent:  # fmt: skip
-    """Minimise by `updates` steps of `optimizer` from θ = `theta`, a pytree of arrays (host).
+    """Minimise from θ = `theta`, a pytree of host arrays, by `settings.updates` optimiser steps.
 
-    gradient(θ, t): loss, gradient and further numbers on the data of step t; a function of its
-    arguments alone, so that a run can be taken up again. validate(θ): loss and numbers on data
-    apart, also before the first step: the result is the best of T + 1 iterates, never worse than
-    the start. checkpoint: file (.npz) replaced in one move after every step; where it is present
-    the run goes on from there, and ends where it would have ended. settings: JSON data that decide
-    the run, kept in it. Raises ValueError for a checkpoint of other settings, and where θ_0 itself
-    has no finite validation loss.
+    gradient(θ, t): loss, gradient and further numbers on the batch of step t; a function of its
+    arguments alone, so that an interrupted run can go on.
+    validate(θ): loss and numbers on the validation set. It is called before the first step too:
+    the result is the best of T + 1 iterates, never worse than the start.
+    optimizer: used where settings.optimizer is None.
+    decides: JSON data that decide the run; kept in the checkpoint and compared on resuming.
+
+    Raises ValueError for a checkpoint of another run, and where θ_0 has no finite validation loss.
     """
-    whole("updates", updates, 0)
+    settings.validate()
+    updates = settings.updates
+    optimizer = optimizer if settings.optimizer is None else settings.optimizer
     theta = jax.tree.map(lambda v: np.asarray(v, np.float64), theta)
-    path = None if checkpoint is None else Path(checkpoint)
+    path = None if settings.checkpoint is None else Path(settings.checkpoint)
     state = State(theta, None, thetas=[theta])
-    mark = archive.fingerprint(settings, theta)
-    _try(optimizer, theta)
+    mark = fingerprint(decides, theta)
+    _require_first_order(optimizer, theta)
     if path is not None:
-        archive.clear(path)
+        remove_partial(path)
     if path is not None and path.exists():
         state = _load(path, theta, optimizer, mark)
         first, now = state.checks[0]["loss"], _checked(validate, theta)["loss"]
@@ -103,8 +108,8 @@ def descend(
         if not np.isfinite(state.checks[0]["loss"]):
             fail("parameters", "have no finite validation loss at the start", "Start elsewhere")
         state.seconds += time.perf_counter() - begun
-        _save(path, state, mark, settings)
-    with tqdm(total=updates, unit=" steps", disable=not progress) as bar:
+        _save(path, state, mark, decides)
+    with tqdm(total=updates, unit=" steps", disable=not settings.progress) as bar:
         bar.update(len(state.rows))
         while len(state.rows) < updates:
             begun = time.perf_counter()
@@ -112,21 +117,14 @@ def descend(
             state.checks.append(_checked(validate, state.theta))
             state.thetas.append(state.theta)
             state.seconds += time.perf_counter() - begun
-            _save(path, state, mark, settings)
+            _save(path, state, mark, decides)
             losses = [check["loss"] for check in state.checks]
             bar.set_postfix_str(f"validation {losses[-1]:.4g}, best {np.nanmin(losses):.4g}")
             bar.update(1)
     return _record(state)
 
 
-def minibatch(total: int, size: int, seed: int, step: int) -> Any:
-    """Which of `total` samples a step sees: a function of its number, so that a run can go on."""
-    if size == total:
-        return slice(None)
-    return np.random.default_rng([seed, step]).choice(total, size, replace=False)
-
-
-def _try(optimizer: optax.GradientTransformation, theta: Any) -> None:
+def _require_first_order(optimizer: optax.GradientTransformation, theta: Any) -> None:
     """Raise ValueError for an optimiser that asks for more than a gradient."""
     zeros = jax.tree.map(np.zeros_like, theta)
     try:
@@ -136,7 +134,7 @@ def _try(optimizer: optax.GradientTransformation, theta: Any) -> None:
 
 
 def _step(state: State, gradient: Gradient, optimizer: optax.GradientTransformation) -> None:
-    """One step forward, or one back and half of it again."""
+    """Take a step; where its gradient is not finite take back the last one and go half as far."""
     loss, slope, numbers = gradient(state.theta, len(state.rows))
     slope = jax.tree.map(lambda v: np.asarray(v, np.float64), slope)
     norm = float(np.sqrt(sum(np.sum(v**2) for v in jax.tree.leaves(slope))))
@@ -152,34 +150,34 @@ def _step(state: State, gradient: Gradient, optimizer: optax.GradientTransformat
                 good, previous, before = state.good
                 before = optimizer.update(previous, before, good)[1]
             state.good = (state.theta, slope, before)
-            state.share = min(1.0, 2 * state.share)
+            state.fraction = min(1.0, 2 * state.fraction)
         elif state.good is None:  # the start fails on this step's data: other data may serve
             return
         else:
-            state.share /= 2
-    state.theta = _moved(state.good, state.share, optimizer)
+            state.fraction /= 2
+    state.theta = _moved(state.good, state.fraction, optimizer)
 
 
-def _moved(good: tuple[Any, Any, Any], share: float, optimizer: Any) -> Any:
-    """θ after this share of the optimiser's step."""
+def _moved(good: tuple[Any, Any, Any], fraction: float, optimizer: Any) -> Any:
+    """Return θ after this fraction of the optimiser's step."""
     theta, slope, before = good
     with jax.enable_x64(True):
         moves, _ = optimizer.update(slope, before, theta)
-    return jax.tree.map(lambda v, move: v + share * np.asarray(move, np.float64), theta, moves)
+    return jax.tree.map(lambda v, move: v + fraction * np.asarray(move, np.float64), theta, moves)
 
 
 def _checked(validate: Validate, theta: Any) -> dict[str, float]:
-    """The numbers of a validation; a loss that is not finite is NaN."""
+    """Return loss and numbers on the validation set; a loss that is not finite becomes NaN."""
     loss, numbers = validate(theta)
     loss = float(loss) if np.isfinite(loss) else np.nan
     return {"loss": loss, **{name: float(value) for name, value in numbers.items()}}
 
 
 def _record(state: State) -> Descent:
-    """What a user sees of it."""
+    """Return the record that a user sees."""
     column = lambda rows, name: np.array([row.get(name, np.nan) for row in rows])
-    names = lambda rows, apart: [n for n in dict.fromkeys(n for r in rows for n in r)
-                                 if n not in apart]  # fmt: skip
+    names = lambda rows, known: [n for n in dict.fromkeys(n for r in rows for n in r)
+                                 if n not in known]  # fmt: skip
     known = ("loss", "gradient_norm", "accepted")
     validation = column(state.checks, "loss")
     best = int(np.nanargmin(validation))
@@ -194,8 +192,8 @@ def _record(state: State) -> Descent:
     )  # fmt: skip
 
 
-def _save(path: Path | None, state: State, mark: str, settings: Any) -> None:
-    """The state as it is."""
+def _save(path: Path | None, state: State, mark: str, decides: Any) -> None:
+    """Write the checkpoint, if there is to be one."""
     if path is None:
         return
     leaves: dict[str, Any] = {
@@ -204,16 +202,17 @@ def _save(path: Path | None, state: State, mark: str, settings: Any) -> None:
     for k, theta in enumerate((state.theta, jax.tree.map(lambda *v: np.stack(v), *state.thetas))):
         leaves |= {f"theta_{k}_{i}": v for i, v in enumerate(jax.tree.leaves(theta))}
     plain = {
-        "fingerprint": mark, "settings": settings, "share": state.share, "seconds": state.seconds,
-        "rows": state.rows, "checks": state.checks, "moved": state.good is not None,
+        "fingerprint": mark, "decides": decides, "fraction": state.fraction,
+        "seconds": state.seconds, "rows": state.rows, "checks": state.checks,
+        "moved": state.good is not None,
     }  # fmt: skip
-    archive.write(path, plain, **leaves)
+    write_arrays(path, plain, **leaves)
 
 
 def _load(path: Path, theta: Any, optimizer: optax.GradientTransformation, mark: str) -> State:
-    """The state of a run that was cut off. ValueError where the file is none of this run's."""
-    kept = archive.read(path)
-    if kept is None or "fingerprint" not in kept[0]:
+    """Return the state of an interrupted run; raise ValueError for a file of another run."""
+    kept = read_arrays(path)
+    if kept is None or "fingerprint" not in (kept[0] or {}):
         fail(str(path), "is no checkpoint", "Choose another file, or remove it")
     plain, arrays = kept
     if plain["fingerprint"] != mark:
@@ -233,10 +232,10 @@ def _load(path: Path, theta: Any, optimizer: optax.GradientTransformation, mark:
     state = State(
         restored(theta, "theta_0"), good,
         thetas=[jax.tree.map(lambda v, t=t: v[t], every) for t in range(count)],
-        **{name: plain[name] for name in ("share", "seconds", "rows", "checks")},
+        **{name: plain[name] for name in ("fraction", "seconds", "rows", "checks")},
     )  # fmt: skip
     if good is not None:  # the step that was taken is the one that this optimiser takes
-        again = _moved(good, state.share, optimizer)
+        again = _moved(good, state.fraction, optimizer)
         close = lambda a, b: np.allclose(a, b, rtol=1e-6, atol=1e-9)
         if not all(map(close, *map(jax.tree.leaves, (again, state.theta)))):
             fail(str(path), "holds the state of another optimizer", "Give the one it began with")

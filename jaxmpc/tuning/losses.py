@@ -1,4 +1,4 @@
-"""What a closed loop costs, as one number with a derivative."""
+"""ClosedLoopLoss: what a closed loop costs, as one number with a derivative."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +9,8 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail, require_symmetric_psd
-from jaxmpc.closed_loop import Run
+from jaxmpc.closed_loop.run import Run
+from jaxmpc.control import violation
 from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.qp.precision import matmul
 
@@ -24,7 +25,7 @@ class ClosedLoopLoss:
     Its Q (n, n) and R (m, m), or their diagonals, are fixed: those of the controller, which
     `Run.stage_cost` uses, would be driven to zero. reference r, input_reference s: (n,) and (m,),
     or with at least T rows; None for zero. limits: Box or Polytope of x; excess_i is by how much
-    row i is exceeded, in its unit, of a Box in shares of its half-width (1 where infinite).
+    row i is exceeded, in its unit, of a Box as a fraction of its half-width (1 where infinite).
     Its weight acts as an exact penalty: with enough of it limits are kept wherever they can be.
 
     Time to settle, in samples: the number of t after which the loop is still once outside the band
@@ -65,7 +66,7 @@ class ClosedLoopLoss:
             fail("softness", f"{self.softness}", "Give a positive number")
 
     def __call__(self, run: Run) -> Array:
-        """The loss of one run."""
+        """Return the loss of one run."""
         T, dtype = run.inputs.shape[0], run.inputs.dtype
         x = self._coordinates(run)
         e, v = x - self._aim(self.reference, T + 1), run.inputs - self._aim(self.input_reference, T)
@@ -81,26 +82,22 @@ class ClosedLoopLoss:
         return total
 
     def excess(self, x: Array) -> Array:
-        """By how much the states x (T+1, n) exceed each row of the limits."""
-        assert self.limits is not None
-        H, lower, upper = (jnp.asarray(v, x.dtype) for v in self.limits.rows())
-        size = jnp.ones_like(upper)
-        if isinstance(self.limits, Box):
-            size = jnp.asarray(self.limits.half_widths(), x.dtype)
-        value = matmul(x, H.T)
-        return jnp.maximum(jnp.maximum(value - upper, lower - value), 0.0) / size
+        """Return by how much the states x (T+1, n) exceed each row of the limits, (T+1, rows)."""
+        limits = jax.tree.map(lambda v: jnp.asarray(v, x.dtype), self.limits)
+        size = self.limits.half_widths() if isinstance(self.limits, Box) else 1.0
+        return violation.excess(limits, x) / jnp.asarray(size, x.dtype)
 
     def worst(self, run: Run) -> Array:
-        """The largest excess of a run."""
+        """Return the largest excess of a run."""
         return jnp.max(self.excess(self._coordinates(run)))
 
     def _coordinates(self, run: Run) -> Array:
-        """The states as the problem has them."""
+        """Return the states in the coordinates of the problem, (T+1, n)."""
         return run.states if self.plant is None else jax.vmap(self.plant.coordinates)(run.states)
 
     @staticmethod
     def _aim(reference: Any, length: int) -> Any:
-        """A reference for so many samples; its last row again where it ends one too early."""
+        """Return a reference for `length` samples, its last row again where it is one short."""
         if reference is None:
             return 0.0
         reference = jnp.asarray(reference)

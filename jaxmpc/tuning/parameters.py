@@ -1,4 +1,4 @@
-"""What is tuned: numbers and matrices that stay in their domain at whatever the optimiser does.
+"""Parameters: numbers and matrices that stay in their domain whatever the optimiser does.
 
 An optimiser moves free real numbers θ; `values` maps them to what the problem takes:
 
@@ -14,6 +14,7 @@ so that a step of θ is a relative change of a weight, whatever its units.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -81,7 +82,7 @@ class Parameter:
         object.__setattr__(self, "train", train)
 
     def _free(self, value: np.ndarray) -> np.ndarray:
-        """θ of a value, all entries."""
+        """Return θ of a value, all entries."""
         if self.domain == "positive":
             return np.log(value)
         if self.domain == "interval":
@@ -94,7 +95,7 @@ class Parameter:
         return value
 
     def record(self) -> dict[str, Any]:
-        """What decides the map from θ, as JSON data."""
+        """Return what decides the map from θ, as JSON data."""
         ends = [
             None if end is None else np.asarray(end).tolist() for end in (self.lower, self.upper)
         ]
@@ -104,11 +105,11 @@ class Parameter:
         }  # fmt: skip
 
     def raw(self) -> np.ndarray:
-        """θ of the entries that are trained, (k,)."""
+        """Return θ of the entries that are trained, (k,)."""
         return self._free(self.value)[self.train]
 
     def at(self, raw: Any) -> Array:
-        """The value where the trained entries have the θ (k,). Traceable."""
+        """Return the value where the trained entries have the θ (k,). Traceable."""
         raw = jnp.asarray(raw)
         theta = jnp.asarray(self._free(self.value), raw.dtype).at[self.train].set(raw)
         if self.domain == "positive":
@@ -140,10 +141,23 @@ def require_parameters(parameters: Parameters) -> None:
 
 
 def raw(parameters: Parameters) -> dict[str, np.ndarray]:
-    """θ of all parameters, trained entries only."""
+    """Return θ of all parameters, trained entries only."""
     return {name: parameter.raw() for name, parameter in parameters.items()}
 
 
 def values(parameters: Parameters, theta: Mapping[str, Any]) -> dict[str, Array]:
-    """The values at θ. Traceable."""
+    """Return the values at θ. Traceable."""
     return {name: parameter.at(theta[name]) for name, parameter in parameters.items()}
+
+
+def exact_values(parameters: Parameters, theta: Any) -> dict[str, np.ndarray]:
+    """Return the values at θ in float64, on the host."""
+    with jax.enable_x64(True):
+        return jax.tree.map(np.asarray, values(parameters, theta))
+
+
+def trajectory(parameters: Parameters, thetas: Any) -> dict[str, np.ndarray]:
+    """Return the values at each of T points θ, leaves (T, …), in float64, on the host."""
+    with jax.enable_x64(True):
+        found = jax.vmap(partial(values, parameters))(jax.tree.map(jnp.asarray, thetas))
+        return jax.tree.map(np.asarray, found)

@@ -1,0 +1,1 @@
+"""The command `jaxmpc`, and what only it needs: options, problem files, pictures."""

@@ -1,0 +1,65 @@
+"""The command `jaxmpc info`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+from jaxmpc.app import config as configs
+from jaxmpc.app.commands.options import Horizon, Terminal, check_positive, option
+from jaxmpc.workflow.offline_test import offline_report
+
+
+@dataclasses.dataclass(frozen=True)
+class Info:
+    """What is known of this controller before it runs: an offline test report.
+
+    What it does
+      Prints, for a constrained linear MPC:
+        Problem                 sizes, and each limit with the steps at which it holds
+        Feasible set            proved bounds of its volume (up to three states), sampled labels
+        Recursive feasibility   the claims of jaxmpc recursion, proved, refuted or open
+        Exact penalty           the L1 weight above which soft limits are kept wherever they can be
+        Terminal ingredients    each hypothesis of the theorems on recursive feasibility (1) and
+                                stability (3): holds or not, by how much
+        Closed loops            nominal runs from feasible states: violations, Lyapunov decrease
+      Soft limits count as hard, but for the closed loops.
+      Without a file the problem is one robot joint: x = (q, dq), torque u, 20 steps of 0.01 s.
+      An option given here wins over the file.
+
+    How to start
+      $ jaxmpc info
+      $ jaxmpc info --config pendulum.toml --terminal invariant
+
+    How to read the output
+      "proved" rests on linear programs or certificates with the tolerance that is named, "refuted"
+      on a counterexample; closed loops are tried, not proved. Nothing is written to disk.
+      Exit code  0 done, whatever the answers; 2 error (one line on stderr says which).
+
+    What the TOML file holds
+      The sections [system], [limits], [cost], [mpc] of jaxmpc sweep --help.
+    """
+
+    config: Annotated[Path | None, option("FILE", "the built-in joint")] = None
+    """TOML file with the problem."""
+    horizon: Horizon = None
+    """Prediction horizon, in steps of dt."""
+    terminal: Terminal = None
+    steps: Annotated[int, option("K", "50")] = 50
+    """Length of the closed loops."""
+    loops: Annotated[int, option("K", "128")] = 128
+    """Number of the closed loops."""
+    seconds: Annotated[float, option("S", "60")] = 60.0
+    """Time for the search for counterexamples; what is not settled by then is open."""
+
+    keeps = ""
+
+    def run(self) -> None:
+        """Print the report. Raises ValueError for options and files that make no sense."""
+        check_positive(self, "steps", "loops", "seconds")
+        given = {"horizon": self.horizon, "terminal": self.terminal}
+        overrides = {key: value for key, value in given.items() if value is not None}
+        config = configs.load(self.config, overrides, "info")
+        report = offline_report(
+            config.build_controlled(), steps=self.steps, loops=self.loops, seconds=self.seconds
+        )
+        print(f"{config.name}\n\n{report}")

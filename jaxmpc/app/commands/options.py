@@ -1,0 +1,107 @@
+"""What the commands share: options, their checks, opening of results, and one line for errors."""
+
+import hashlib
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+from jaxmpc.checks import fail
+from jaxmpc.robots.robot import Robot
+
+
+def option(metavar: str | None, default: str, text: str | None = None) -> Any:
+    """Return how an option and its default appear in the help.
+
+    text: what it means, where that takes more than a line; else the string below the field.
+    """
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})", help=text)
+
+
+# Options that several commands have.
+Horizon = Annotated[int | None, option("N", "from the file; joint 20")]
+Terminal = Annotated[
+    Literal["none", "invariant", "ellipsoid", "box"] | None,
+    option(
+        "{none,invariant,ellipsoid,box}",
+        "from the file, else none",
+        "Set for the last state: none, largest set or largest ellipsoid that the LQR keeps within "
+        "limits, state limits.",
+    ),
+]
+End = Annotated[
+    tuple[float, ...] | None, option("X [X ...]", "state limits, 3 % wider on each side")
+]
+Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")]
+
+
+@dataclass
+class Timing:
+    """How much one process did, of a run that may have been resumed, and how long it took."""
+
+    count: int = 0
+    compile_seconds: float = 0.0
+    run_seconds: float = 0.0
+
+
+def check_results(path: Path, resume: bool, overwrite: bool) -> None:
+    """Raise ValueError where `path` exists and the options don't say what becomes of it."""
+    if resume and overwrite:
+        fail("--overwrite", "given beside --resume", "Choose one")
+    if path.exists() and not (resume or overwrite):
+        fail(str(path), "exists", "Add --resume to go on with it or --overwrite to start again")
+
+
+def check_positive(command: Any, *names: str) -> None:
+    """Raise ValueError for an option that is given and not a positive number."""
+    for name in names:
+        value = getattr(command, name)
+        if value is not None and not 0 < value < np.inf:
+            fail(f"--{name.replace('_', '-')}", f"{value}", "Give a positive number")
+
+
+def refuse(given: dict[str, Any], robot: str | None, needs: str) -> None:
+    """Raise ValueError where an option is given that does not go with (or without) --robot."""
+    for name, value in given.items():
+        if value not in (None, False):
+            problem = f"given beside --robot {robot}" if robot else "given without --robot"
+            fail(f"--{name}", problem, needs)
+
+
+def open_folder(path: Path, *files: str) -> None:
+    """Make the folder of --output, without these files of an earlier run.
+
+    Raises ValueError where nothing can be written there.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+        for name in files:
+            (path / name).unlink(missing_ok=True)
+    except OSError as error:
+        fail(f"--output {path}", f"{error.strerror}", "Give a folder you can write to")
+
+
+def report_error(error: Exception) -> int:
+    """Print one line on stderr and return the exit code, 2."""
+    print(f"jaxmpc: error: {' '.join(str(error).split())}", file=sys.stderr)
+    return 2
+
+
+def print_table(rows: list[tuple[str, Any]], width: int) -> None:
+    """Print names and values, one pair a line."""
+    print("\n".join(f"  {name:<{width}} {value}" for name, value in rows))
+
+
+def model_hash(robot: Robot) -> str:
+    """Return a hash of the compiled model, so that --resume notices a file that has changed."""
+    import mujoco
+
+    binary = np.zeros(mujoco.mj_sizeModel(robot.mujoco), np.uint8)
+    mujoco.mj_saveModel(robot.mujoco, None, binary)
+    return hashlib.sha256(binary.tobytes()).hexdigest()

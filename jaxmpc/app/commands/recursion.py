@@ -1,0 +1,215 @@
+"""The command `jaxmpc recursion`."""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+
+from jaxmpc.app import config as configs
+from jaxmpc.app.commands.options import (
+    End,
+    Horizon,
+    Switch,
+    Terminal,
+    check_positive,
+    open_folder,
+    option,
+    print_table,
+    refuse,
+)
+from jaxmpc.app.commands.robot_map import RobotMapCommand
+from jaxmpc.app.config.states import recursion_states
+from jaxmpc.checks import fail
+from jaxmpc.recursion import (
+    RecursionReport,
+    SmallestHorizon,
+    recursive_feasibility,
+    smallest_horizon,
+)
+from jaxmpc.runs import versions, write_arrays, write_json
+
+FILES = ("summary.json", "recursion.npz", "recursion.png")
+
+
+@dataclasses.dataclass(frozen=True)
+class Recursion:
+    """Once this controller has a plan, will it always have one? Proof, or counterexample.
+
+    What it does
+      An MPC without a suitable terminal set can steer itself into a state from which no input
+      keeps its limits. Three claims about the set X_N of states that have a plan over N steps:
+        strong  every first move of a plan within the limits leads back into X_N
+        law     the optimal first move does (what one wants of the controller)
+        weak    some first move does
+      Each is proved, refuted by a counterexample, or open, with the reason; strong implies law,
+      law implies weak. Closed loops from a grid of states show which states are lost, and when.
+      Without a file the problem is one robot joint: x = (q, dq), torque u, 20 steps of 0.01 s.
+      An option given here wins over the file.
+
+    How to start
+      $ jaxmpc recursion --horizon 4
+      $ jaxmpc recursion --config pendulum.toml --terminal invariant --output checks/a
+
+    How to read the output, all in the folder of --output
+      recursion.png   Blue: kept for all steps. Dark red to light orange: lost at step 1, 2, ...
+                      Grey: infeasible from the start. Arrow: the worst counterexample, from x
+                      to the next state, with the half-space (line) that proves it infeasible;
+                      the right panel enlarges it. Two states only.
+      summary.json    The claims with reasons, the counterexample, areas, counts, configuration.
+      recursion.npz   state, label (1 feasible, -1 infeasible, 0 undecided), input (the optimal
+                      first move), next_state, lost_at (step at which the problem is proved
+                      infeasible; 0 never, -1 infeasible at the start, -2 undecided), and
+                      facet_normals, facet_offsets of X_N. Opens with numpy.load(path).
+      Exit code       0 done, whatever the answer; 2 error (one line on stderr says which); 130
+                      stopped by Ctrl-C (nothing is kept).
+
+    With --robot NAME or FILE: the promise and the robot
+      Such as jaxmpc recursion --robot pendulum --horizon 40 --steps 100
+      As in jaxmpc sweep --help, with another promise: the linear closed loop has a plan at each
+      of --steps samples (of the robot's control period). The robot keeps it where its own loop
+      has: each plan solved without breaking a limit. Files as there; robot_map.png too.
+
+    What the TOML file holds
+      The sections [system], [limits], [cost], [mpc] of jaxmpc sweep --help, and
+      [recursion]  all optional: steps, grid, lower, upper, regions, seconds
+    """
+
+    config: Annotated[Path | None, option("FILE", "the built-in joint")] = None
+    """TOML file with the problem."""
+    robot: Annotated[str | None, option("NAME|FILE", "none, a linear system")] = None
+    """Map a robot instead, linear promise against nonlinear closed loop."""
+    output: Annotated[Path, option("DIR", "jaxmpc-recursion")] = Path("jaxmpc-recursion")
+    """Folder for the files; made where absent."""
+    horizon: Horizon = None
+    """Prediction horizon, in steps of dt."""
+    terminal: Terminal = None
+    steps: Annotated[int | None, option("K", "from the file, else 20; robots 100")] = None
+    """Length of the closed loops."""
+    grid: Annotated[
+        tuple[int, ...] | None,
+        option("K [K ...]", "128 128; above 3 states: random states; robots 32 32"),
+    ] = None
+    """Points along each state, ends included."""
+    lower: End = None
+    """Lower end of the grid along each state, in its units."""
+    upper: End = None
+    """Upper end of the grid along each state, in its units."""
+    axes: Annotated[
+        tuple[str, ...] | None, option("AXIS [AXIS ...]", "those of the first joint")
+    ] = None
+    """With --robot: coordinates to map, by name or index from 0."""
+    fixed: Annotated[tuple[float, ...] | None, option("X [X ...]", "home")] = None
+    """With --robot: values of the other coordinates, in their order."""
+    regions: Annotated[int | None, option("K", "from the file, else 2000")] = None
+    """Critical regions of the law to enumerate at most for a proof; 0: none."""
+    seconds: Annotated[float | None, option("S", "from the file, else 60")] = None
+    """Time for search and proofs; what is not settled by then is open."""
+    search: Annotated[bool, option(None, "on")] = True
+    """Look for a counterexample by gradient ascent, beside the samples."""
+    smallest: Annotated[int | None, option("N", "off")] = None
+    """Look also for the smallest horizon, up to N, that is proved recursively feasible."""
+    overwrite: Switch = False
+    """Replace the results in --output."""
+    resume: Switch = False
+    """With --robot: go on with the map in --output."""
+
+    @property
+    def keeps(self) -> str:
+        """Return what is kept of a run that is stopped."""
+        return "chunks" if self.robot else ""
+
+    def run(self) -> None:
+        """Examine the claims, write the files, print the table.
+
+        Raises ValueError for options and files that make no sense.
+        """
+        begun = time.perf_counter()
+        check_positive(self, "seconds", "smallest")
+        if self.robot is not None:
+            self.robot_map(self.robot).run()
+            return
+        given = {"axes": self.axes, "fixed": self.fixed, "resume": self.resume}
+        refuse(given, None, "It is for maps of robots")
+        keys = "horizon terminal steps grid lower upper regions seconds".split()
+        overrides = {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
+        config = configs.load(self.config, overrides, "recursion")
+        mpc, states, settings = config.build_mpc(), recursion_states(config), config.recursion
+        there = [self.output / name for name in FILES if (self.output / name).exists()]
+        if there and not self.overwrite:
+            fail(str(there[0]), "exists", "Add --overwrite to replace it")
+        open_folder(self.output, *FILES)
+        print(f"{config.name}: horizon {mpc.horizon} -> {self.output}")
+        report = recursive_feasibility(
+            mpc, states, steps=settings.steps, search=self.search, regions=settings.regions,
+            seconds=settings.seconds,
+        )  # fmt: skip
+        rows, least = [], None
+        if self.smallest is not None:
+            least = smallest_horizon(
+                mpc, self.smallest, regions=settings.regions, seconds=settings.seconds
+            )
+            rows.append(("smallest horizon", _sentence(least, self.smallest)))
+        files = self.save(config, report, least)
+        print(report)
+        rows.append(("total", f"{time.perf_counter() - begun:.2f} s with set-up and files"))
+        rows.append(("files", " ".join(str(self.output / name) for name in files)))
+        print_table(rows, 20)
+
+    def robot_map(self, robot: str) -> RobotMapCommand:
+        """Return the map of --robot. Raises ValueError for options that do not go with it."""
+        given = {"config": self.config, "smallest": self.smallest, "regions": self.regions}
+        refuse(given, robot, "Claims about all states are those of a linear problem")
+        return RobotMapCommand(
+            robot, self.output, "recursion", steps=100 if self.steps is None else self.steps,
+            horizon=self.horizon, terminal=self.terminal, axes=self.axes, values=self.fixed,
+            grid=self.grid, lower=self.lower, upper=self.upper, resume=self.resume,
+            overwrite=self.overwrite, search_seconds=self.seconds or 60.0,
+        )  # fmt: skip
+
+    def save(
+        self, config: configs.Config, report: RecursionReport, least: SmallestHorizon | None
+    ) -> list[str]:
+        """Write the files and return their names."""
+        body, worst = report.feasible_set, report.counterexample
+        facets: dict[str, Any] = {}
+        if body is not None:
+            facets = {"facet_normals": np.asarray(body.H), "facet_offsets": np.asarray(body.h)}
+        write_arrays(
+            self.output / "recursion.npz", state=report.states, label=report.label,
+            input=report.inputs, next_state=report.next_states, lost_at=report.lost_at,
+            undecided_at=report.undecided_at, **facets,
+        )  # fmt: skip
+        summary = {
+            "name": config.name,
+            "claims": {
+                name: dataclasses.asdict(getattr(report, name))
+                for name in ("strong", "law", "weak")
+            },
+            "counterexample": None if worst is None else dataclasses.asdict(worst),
+            "volume": report.volume,
+            "lost_by_any": report.lost_by_any,
+            "lost_by_law": report.lost_by_law,
+            "counts": report.counts(),
+            "steps": report.steps,
+            "seconds": report.seconds,
+            "config": config.to_dict("recursion"),
+            "versions": versions(),
+        }
+        if least is not None:
+            summary["smallest_horizon"] = dataclasses.asdict(least)
+        write_json(self.output / "summary.json", summary)
+        if report.states.shape[1] != 2:
+            return ["summary.json", "recursion.npz"]
+        from jaxmpc.app.plots.recursion import draw_recursion
+
+        draw_recursion(report).savefig(self.output / "recursion.png", dpi=150)
+        return list(FILES)
+
+
+def _sentence(least: SmallestHorizon, limit: int) -> str:
+    if least.horizon is None:
+        return f"none up to {limit} is proved"
+    strong = f"; strong from {least.strong}" if least.strong is not None else ""
+    return f"{least.horizon} ({least.reasons[least.horizon].reason}){strong}"

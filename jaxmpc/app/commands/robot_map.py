@@ -1,0 +1,247 @@
+"""`--robot` of the commands sweep and recursion: a robot's map, kept chunk by chunk."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import zarr
+from tqdm.std import tqdm
+
+from jaxmpc.app.commands.options import check_positive, check_results, model_hash, open_folder
+from jaxmpc.app.config.states import axis_indices, grid_ends
+from jaxmpc.checks import fail
+from jaxmpc.closed_loop.robot_mpc import robot_mpc
+from jaxmpc.control.named_terminal import named_terminal_set
+from jaxmpc.control.riccati import lqr
+from jaxmpc.feasible import store
+from jaxmpc.feasible.labels import ARRAYS, Labels
+from jaxmpc.feasible.map import grid
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.status import Status
+from jaxmpc.robot_maps.loops import RobotLoops
+from jaxmpc.robot_maps.robot_map import RobotMap
+from jaxmpc.robot_maps.set_point import deviations, moved
+from jaxmpc.robot_maps.setting import RobotSetting
+from jaxmpc.robots.load import load_robot
+from jaxmpc.robots.robot import Robot
+from jaxmpc.runs import versions, write_arrays, write_json
+
+# Points along each of two axes, and in all along another number of them.
+SIDE, POINTS = 32, 1024
+
+
+@dataclass(frozen=True)
+class RobotMapCommand:
+    """What to map, as the command line says it; None where it says nothing.
+
+    claim: as in `map_robot`, and so is search_seconds. axes: names or indices of coordinates;
+    values: of the other coordinates, in their order. settings: iterations and dtype of the linear
+    labels.
+    """
+
+    robot: str
+    output: Path
+    claim: str
+    steps: int | None = None
+    seconds: float | None = None
+    horizon: int | None = None
+    terminal: str | None = None
+    axes: Sequence[str] | None = None
+    values: Sequence[float] | None = None
+    grid: Sequence[int] | None = None
+    lower: Sequence[float] | None = None
+    upper: Sequence[float] | None = None
+    refine: bool = True
+    search_seconds: float = 60.0
+    resume: bool = False
+    overwrite: bool = False
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def run(self) -> None:
+        """Make the map, write the files, print the table. Raises ValueError before it compiles."""
+        begun = time.perf_counter()
+        setting, config, group = self.prepare()
+        count = len(setting.points)
+        print(f"{setting.robot.name}: {count:,} states, {setting.steps} samples -> {self.output}")
+        self.label(setting, group)
+        rmap = self.map(setting, group)
+        files = self.save(setting, rmap, config)
+        print(rmap)
+        if rmap.recursion is not None:
+            print(f"linear model, in deviations from the set-point\n{rmap.recursion}")
+        print(f"  {'total':<16} {time.perf_counter() - begun:.2f} s with set-up and files")
+        print(f"  {'files':<16} {' '.join(str(self.output / name) for name in files)}")
+
+    def prepare(self) -> tuple[RobotSetting, dict[str, Any], zarr.Group]:
+        """Return the checked map, what says which it is, and the opened store of its chunks."""
+        path = self.output / "robot_map.zarr"
+        check_results(path, self.resume, self.overwrite)
+        robot = load_robot(self.robot)
+        names = robot.state_names
+        # By default the first joint, its position and velocity.
+        given = self.axes or (names[0], names[robot.n // 2])
+        axes = axis_indices("--axes", "coordinate", given, names, robot.n)
+        points = self._points(robot, axes)
+        others = [i for i in range(robot.n) if i not in axes]
+        if self.values is not None and len(self.values) != len(others):
+            what = f"has {len(self.values)} entries where {len(others)} are needed"
+            fail("--fixed", what, "One for each coordinate that is not on an axis")
+        check_positive(self, "horizon", "steps", "seconds")
+        if self.terminal == "ellipsoid":
+            fail("--terminal", "ellipsoid: a robot's limits are soft rows", "Give invariant or box")
+        # From here on things compile.
+        fixed = _home(robot)
+        fixed[others] = fixed[others] if self.values is None else self.values
+        mpc = default_mpc(robot, self.horizon or 20, self.terminal or "none")
+        seconds = 2.0 if self.seconds is None else self.seconds
+        setting = RobotSetting.of(
+            robot, mpc, points, seconds if self.steps is None else self.steps * robot.dt,
+            axes=axes, fixed=fixed, claim=self.claim,
+        )  # fmt: skip
+        config = {
+            "robot": self.robot,
+            "claim": self.claim,
+            "samples": setting.steps,
+            "horizon": mpc.horizon,
+            "terminal": self.terminal or "none",
+            "axes": [robot.state_names[i] for i in setting.axes],
+            "fixed": {robot.state_names[i]: float(fixed[i]) for i in others},
+            "lower": setting.points.min(axis=0).tolist(),
+            "upper": setting.points.max(axis=0).tolist(),
+            "Q": np.diag(mpc.Q).tolist(),
+            "R": np.diag(mpc.R).tolist(),
+            "model": model_hash(robot),
+            "home": np.asarray(robot.home).tolist(),
+            "period": robot.dt,
+            **self.settings,
+        }
+        open_folder(self.output, "robot_map.npz", "robot_map.png", "summary.json")
+        if path.exists() and self.overwrite:
+            store.remove(path)
+        shape = (robot.n, mpc.horizon, robot.m)
+        chunk = setting.chunk(None)
+        group = store.open_store(path, setting.points, _fields(setting), config, chunk, shape)
+        return setting, config, group
+
+    def _points(self, robot: Robot, axes: tuple[int, ...]) -> np.ndarray:
+        """Return the grid (B, d) over the axes. Raises ValueError for options of other sizes."""
+        d = len(axes)
+        shape = tuple(self.grid or ((SIDE, SIDE) if d == 2 else (int(POINTS ** (1 / d)),) * d))
+        for name, value in (("grid", shape), ("lower", self.lower), ("upper", self.upper)):
+            if value is not None and len(value) != d:
+                what = f"has {len(value)} entries where {d} are needed"
+                fail(f"--{name}", what, "One for each axis")
+        box = robot.state_limits
+        limits = lambda: tuple(np.asarray(end)[list(axes)] for end in (box.lower, box.upper))
+        return grid(*grid_ends("--", self.lower, self.upper, limits), shape)
+
+    def label(self, setting: RobotSetting, group: zarr.Group) -> None:
+        """Label the chunks that are not done, and commit each."""
+        todo = store.pending(group)
+        if not todo:
+            return
+        slices = [store.chunk_rows(group, k) for k in todo]
+        rows = np.concatenate([np.arange(here.start, here.stop) for here in slices])
+        # Whole chunks but for the last of all, so the chunks of the rest are those of the whole.
+        size = store.chunk_rows(group, 0).stop
+        chunks = setting.chunks(rows, chunk=size, **self.settings)
+        with tqdm(total=len(rows), unit=" loops", disable=None) as bar:
+            for k, (_, labels, loops) in zip(todo, chunks, strict=True):
+                arrays = {name: getattr(labels, name) for name in ARRAYS}
+                store.commit(group, k, **arrays, **vars(loops))
+                bar.update(len(labels.label))
+
+    def map(self, setting: RobotSetting, group: zarr.Group) -> RobotMap:
+        """Return the map that the store holds."""
+        data: dict[str, Any] = {name: np.asarray(group[name]) for name in _fields(setting)}
+        labels = Labels.of(**{name: data[name] for name in ARRAYS})
+        loops = RobotLoops(**{f.name: data[f.name] for f in fields(RobotLoops)})
+        refine = 1e-6 if self.refine and len(setting.axes) <= 3 else None
+        return setting.map(labels, [loops], refine=refine, search_seconds=self.search_seconds)
+
+    def save(self, setting: RobotSetting, rmap: RobotMap, config: dict[str, Any]) -> list[str]:
+        """Write the files and return their names."""
+        loops = vars(rmap.loops)
+        arrays = {
+            "points": rmap.points, "states": setting.states(rmap.points),
+            "promised": rmap.promised, "held": rmap.held, "kept": rmap.kept,
+            "recursive": rmap.recursive, "feasible": rmap.linear.label,
+            "depth": rmap.depth, **loops,
+        }  # fmt: skip
+        write_arrays(self.output / "robot_map.npz", **arrays)
+        low, high = rmap.linear.volume_bounds()
+        worst = rmap.worst()
+        summary: dict[str, Any] = {
+            "name": rmap.robot.name,
+            "claim": rmap.claim,
+            "counts": rmap.counts(),
+            "broken": int(np.sum(rmap.broken)),
+            "broken_after_an_unsolved_plan": int(np.sum(rmap.unsure)),
+            "deepest_broken": None if worst is None else {
+                "state": setting.states(rmap.points)[worst].tolist(),
+                "sample": int(rmap.first_loss[worst]),
+                "beyond": rmap.loops.worst[worst],
+            },
+            "linear": {"counts": rmap.linear.counts(), "volume": [low, high]},
+            "plans": rmap.plan_counts(),
+            "seconds": rmap.seconds,
+            "precision": setting.dtype,
+            "config": config,
+            "versions": versions(),
+        }  # fmt: skip
+        if rmap.recursion is not None:
+            report = rmap.recursion
+            summary["linear"]["recursion"] = {
+                name: str(getattr(report, name)) for name in ("strong", "law", "weak")
+            } | {"counts": report.counts()}
+        write_json(self.output / "summary.json", summary)
+        if rmap.points.shape[1] != 2:
+            return ["summary.json", "robot_map.npz"]
+        from jaxmpc.app.plots.robot_map import plot_robot_map
+        from jaxmpc.app.plots.style import save
+
+        save(plot_robot_map(rmap), self.output / "robot_map.png")
+        return ["summary.json", "robot_map.npz", "robot_map.png"]
+
+
+def _fields(setting: RobotSetting) -> dict[str, store.Field]:
+    """Return what the store keeps of each state: its labels and its closed loop."""
+    labels = {name: getattr(setting.none(), name) for name in ARRAYS}
+    found = {
+        name: store.Field(
+            value.shape[1:], str(value.dtype), value.flat[0],
+            tuple(f"{name}_{i}" for i in range(1, value.ndim)),
+        )
+        for name, value in labels.items()
+    }  # fmt: skip
+    for name in ("broken_at", "lost_at", "unsolved_at"):
+        found[name] = store.Field((), "int64", -1, ())
+    found["worst"] = store.Field((), "float64", np.nan, ())
+    found["statuses"] = store.Field((len(Status),), "int64", 0, ("kind",))
+    return found
+
+
+def default_mpc(robot: Robot, horizon: int, terminal: str = "none") -> MPC:
+    """Return the MPC of `robot_mpc` with the terminal set "none", "box" or "invariant"."""
+    mpc = robot_mpc(robot, horizon=horizon)
+    if terminal != "invariant":
+        return replace(
+            mpc, terminal_set=named_terminal_set(terminal, mpc.system, None, mpc.states, None)
+        )
+    x, (_, u) = _home(robot), robot.equilibrium()
+    about = deviations(mpc, x, u)
+    # At the set-point c is rounding.
+    system = replace(about.system, c=None)
+    regulator = lqr(system, mpc.Q, mpc.R)
+    found = named_terminal_set(terminal, system, regulator, about.states, about.inputs)
+    return replace(mpc, terminal_set=moved(found, -x))
+
+
+def _home(robot: Robot) -> np.ndarray:
+    """Return the coordinates of `robot.home`."""
+    with jax.enable_x64(True):
+        return np.array(robot.coordinates(np.asarray(robot.home)), np.float64)

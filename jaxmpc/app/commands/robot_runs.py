@@ -1,0 +1,206 @@
+"""Closed loops of many robots, simulated chunk by chunk into a store."""
+
+import contextlib
+import dataclasses
+import importlib
+import io
+import os
+import time
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+import zarr
+from tqdm.std import tqdm
+
+from jaxmpc.app.commands.film import choose_renderer
+from jaxmpc.app.commands.options import Timing, check_results, model_hash, open_folder
+from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
+from jaxmpc.app.config import load_robot_config
+from jaxmpc.checks import fail
+from jaxmpc.closed_loop.linear_feedback import LinearFeedback
+from jaxmpc.closed_loop.robot_controller import RobotController
+from jaxmpc.closed_loop.robot_mpc import robot_mpc
+from jaxmpc.closed_loop.run import Run
+from jaxmpc.closed_loop.simulate_many import simulate_many
+from jaxmpc.compiled import Compiled, first_rows, padded
+from jaxmpc.control.riccati import lqr
+from jaxmpc.feasible import store
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.admm import ADMM
+from jaxmpc.qp.status import Status
+from jaxmpc.robots.load import load_robot
+from jaxmpc.robots.robot import Robot
+
+if TYPE_CHECKING:
+    from jaxmpc.app.commands.simulate import Simulate
+
+
+@dataclasses.dataclass(frozen=True)
+class RobotRuns:
+    """Runs that are checked and open, before any loop compiles.
+
+    command: the options, none of them missing. reference (n,), input_reference (m,): the target,
+    at rest. steps: samples of a run. starts (B, nq + nv). variations: factors of each plant, as
+    `draw_robots` returns them. group: the store.
+    """
+
+    command: "Simulate"
+    robot: Robot
+    controller: Any
+    reference: np.ndarray
+    input_reference: np.ndarray
+    steps: int
+    starts: np.ndarray
+    variations: dict[str, np.ndarray]
+    group: zarr.Group
+
+    @classmethod
+    def open(cls, command: "Simulate") -> "RobotRuns":
+        """Open new runs, or some to go on with. Raises ValueError; compiles no loop."""
+        path = command.output / "runs.zarr"
+        check_results(path, command.resume, command.overwrite)
+        if command.video:
+            choose_renderer()
+        try:
+            importlib.import_module("mujoco")
+        except (AttributeError, ImportError, RuntimeError) as error:
+            problem = f"mujoco does not start with {os.environ.get('MUJOCO_GL')!r} ({error})"
+            fail("MUJOCO_GL", problem, "Unset it, or install the OpenGL library that it names")
+        with contextlib.redirect_stdout(io.StringIO()):  # MJX tells of absent optional parts
+            robot = load_robot(command.robot)
+        sizes = (
+            ("--target", command.target, robot.mujoco.nq),
+            ("--state-weights", command.state_weights, robot.n),
+            ("--input-weights", command.input_weights, robot.m),
+        )
+        for name, given, size in sizes:
+            if given is not None and len(given) != size:
+                fail(name, f"has {len(given)} numbers", f"{robot.name} needs {size}")
+        target = None if command.target is None else np.array(command.target)
+        file: dict[str, Any] = {}
+        if command.config is not None:
+            file = load_robot_config(command.config).weights(robot)
+        options = {"Q": command.state_weights, "R": command.input_weights}
+        file |= {key: np.array(value) for key, value in options.items() if value is not None}
+        more = {"terminal_cost": file["terminal_cost"]} if "terminal_cost" in file else {}
+        horizon: Any = command.horizon
+        mpc = robot_mpc(
+            robot, file.get("Q"), file.get("R"), horizon, target=target,
+            margin=command.margin or 0.0, **more,
+        )  # fmt: skip
+        controller: Any
+        with jax.enable_x64(command.dtype == "float64"):
+            if command.linearize == "lqr":
+                controller = LinearFeedback(mpc, lqr(mpc.system, mpc.Q, mpc.R).K, robot)
+            else:
+                solver = ADMM(iterations=command.iterations, refine=newton_steps(command))
+                controller = RobotController(
+                    robot, mpc, solver, linearize=str(command.linearize), penalty=command.penalty
+                )
+        x, input_reference = robot.equilibrium(target)
+        with jax.enable_x64(True):
+            reference = np.asarray(robot.coordinates(x))
+        starts, variations = draw_robots(
+            robot, command.count, command.seed, spread=command.spread, mass=command.mass,
+            damping=command.damping, payload=command.payload,
+        )  # fmt: skip
+        if variations:
+            robot.vary(**{key: value[0] for key, value in plant_numbers(robot, variations).items()})
+        open_folder(command.output, "summary.json", "runs.png", "robots.gif")
+        if path.exists() and command.overwrite:
+            store.remove(path)
+        steps = max(1, round(command.seconds / robot.dt))
+        chunk = command.chunk or (256 if jax.default_backend() == "cpu" else 4096)
+        group = store.open_store(
+            path, starts, _fields(command, robot, steps), _decisive(command, robot, mpc),
+            min(chunk, command.count), (steps, robot.state_size, robot.m),
+        )  # fmt: skip
+        return cls(
+            command, robot, controller, reference, input_reference, steps, starts, variations, group
+        )
+
+    def simulate(self) -> Timing:
+        """Run the chunks that are not done, and commit each."""
+        todo, timing = store.pending(self.group), Timing()
+        slices = [store.chunk_rows(self.group, k) for k in todo]
+        size = store.chunk_rows(self.group, 0).stop
+        total = sum(rows.stop - rows.start for rows in slices)
+        with tqdm(total=total, unit=" robots", disable=None) as bar:
+            for index, rows in zip(todo, slices, strict=True):
+                factors = {key: value[rows] for key, value in self.variations.items()}
+                numbers = plant_numbers(self.robot, factors)
+                begun, compiled = time.perf_counter(), Compiled.seconds
+                with jax.enable_x64(self.command.dtype == "float64"):
+                    run = simulate_many(
+                        self.controller, self.robot, padded(self.starts[rows], size), self.steps,
+                        reference=self.reference, input_reference=self.input_reference,
+                        variations={key: padded(value, size) for key, value in numbers.items()},
+                    )  # fmt: skip
+                compiling = Compiled.seconds - compiled
+                count = rows.stop - rows.start
+                timing.compile_seconds += compiling
+                timing.run_seconds += time.perf_counter() - begun - compiling
+                timing.count += count
+                run = first_rows(run, count)
+                results = {name: getattr(run, name) for name in STORED}
+                store.commit(self.group, index, **results, **factors)
+                bar.update(count)
+        return timing
+
+    def read(self) -> Run:
+        """Return the runs in the store, on the host."""
+        data: dict[str, Any] = {name: np.asarray(self.group[name]) for name in STORED}
+        # x_0 is measured and no limit binds it, so that there is no soft row at k = 0.
+        return Run(**data | {"slack": np.zeros((*data["status"].shape, 0))})
+
+
+# The fields of `Run` that the store keeps.
+STORED = tuple(field.name for field in dataclasses.fields(Run) if field.name != "slack")
+
+
+def _fields(command: "Simulate", robot: Robot, steps: int) -> dict[str, store.Field]:
+    """Return what the store keeps of each robot."""
+    number = lambda shape, *axes: store.Field(shape, command.dtype, np.nan, axes)
+    found = {
+        "states": number((steps + 1, robot.state_size), "sample_time", "state"),
+        "inputs": number((steps, robot.m), "time", "input"),
+        "cost": number((steps,), "time"),
+        "status": store.Field((steps,), "int8", int(Status.NOT_RUN), ("time",)),
+        "stage_cost": number((steps,), "time"),
+        "violation": number((steps + 1,), "sample_time"),
+        "fallback": store.Field((steps,), "bool", False, ("time",)),
+    }
+    sizes = {"mass": (robot.mujoco.nbody,), "damping": (robot.mujoco.nv,), "payload": ()}
+    for name in ("mass", "damping", "payload"):
+        if getattr(command, name):
+            axes = (f"{name}_of",) * len(sizes[name])
+            found[name] = store.Field(sizes[name], "float64", np.nan, axes)
+    return found
+
+
+def _decisive(command: "Simulate", robot: Robot, mpc: MPC) -> dict[str, Any]:
+    """Return what decides the results, as JSON data."""
+    irrelevant = ("output", "video", "tolerance", "resume", "overwrite", "chunk")
+    options = {k: v for k, v in dataclasses.asdict(command).items() if k not in irrelevant}
+    weights = {
+        "state_weights": np.diag(mpc.Q).tolist(),
+        "input_weights": np.diag(mpc.R).tolist(),
+    }
+    if command.config is None:
+        del options["config"]
+    else:  # what is in the file, not where it lies
+        weights |= {
+            name: np.asarray(value, float).tolist()
+            for name, value in (("Q", mpc.Q), ("R", mpc.R), ("P", mpc.terminal_cost))
+        }
+        options["config"] = "tuned"
+    options |= {**weights, "refine": newton_steps(command), "model": model_hash(robot)}
+    return options
+
+
+def newton_steps(command: "Simulate") -> int:
+    """Return --refine, or what the precision asks for: ADMM alone seldom comes to 1e-6."""
+    if command.refine is not None:
+        return command.refine
+    return 3 if command.dtype == "float64" else 2

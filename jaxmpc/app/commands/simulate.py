@@ -1,0 +1,196 @@
+"""The command `jaxmpc simulate`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+
+from jaxmpc.app.commands.film import film
+from jaxmpc.app.commands.options import Switch, check_positive, option, print_table
+from jaxmpc.app.commands.robot_runs import RobotRuns
+from jaxmpc.app.commands.runs_summary import summarise, table
+from jaxmpc.app.config import load_robot_config
+from jaxmpc.checks import fail
+from jaxmpc.closed_loop.outcome import evaluate_runs
+from jaxmpc.runs import write_json
+
+# What --config says where an option does not, and what holds without either.
+USUAL = {"horizon": 20, "margin": 0.02, "linearize": "state", "penalty": 1e4}
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulate:
+    """Drive thousands of robots to a target under constrained MPC, and count what holds.
+
+    What it does
+      Puts many copies of a robot at random states, each with its own masses if asked for, and
+      drives all of them to a target: physics by MuJoCo MJX, at each sample a linear model and an
+      MPC that keeps joint, velocity and torque limits. Then assesses every run by its own
+      states and inputs, not by what the MPC planned.
+      Limits that a plan cannot keep are broken as little as --penalty asks (fallback), and counted.
+
+    How to start
+      $ jaxmpc simulate
+      $ jaxmpc simulate --robot arm7 --count 256 --seconds 1 --mass 0.1 --output runs/a
+      Compiling takes 20 s for one joint and a minute for seven, before the first samples.
+
+    How to read the table
+      success        robots that kept all limits and ended at the target: each coordinate within
+                     --tolerance of half its range (limits' half-width; 1 where it has none)
+      limits kept    robots with all states and inputs within the limits at all samples, to 1e-6
+                     (1e-6 of the limit, where that is above 1). The margin is not counted in.
+      plans valid    robots all of whose plans were solved without fallback; how many kept limits
+      worst          the largest violation relative to half the range, in its own unit
+      plans solved   plans whose residuals pass: 1e-6 in float64, 1e-3 in float32
+      fallback       plans that break soft limits somewhere on their horizon
+      settling       time after which a robot stays within the tolerance for the rest of its run
+      cost           sum of (x - x_target)'Q(x - x_target) + (u - u_target)'R(u - u_target)
+      run            wall time without compiler, files and pictures
+      real time      robot-seconds simulated in a second of wall time; the second number is
+                     simulated time by wall time for all robots at once: above 1 is real time
+
+    Files, all in the folder of --output
+      runs.png       Positions, velocities and inputs of some robots over time, limits in grey.
+                     Orange: fallback plans. Red: limits exceeded.
+      robots.gif     Some of the robots, in real time. Needs OpenGL: without a display libegl1
+                     libegl-mesa0 libgl1-mesa-dri libgl1 (Debian, Ubuntu); without it no video.
+      summary.json   The table's numbers, target, worst violation of each coordinate, versions.
+      runs.zarr      points (the start), states, inputs, status, cost, fallback, ... of every
+                     robot. Opens with xarray.open_zarr(path, consolidated=False).
+      Ctrl-C         Stops; finished chunks are kept, --resume goes on from there.
+      Exit code      0 done, whatever the robots did; 2 error (one line on stderr says which);
+                     130 stopped by Ctrl-C.
+    """
+
+    robot: Annotated[str, option("NAME|FILE", "joint")] = "joint"
+    """joint, pendulum, cartpole, arm2, arm6, arm7, quadrotor, or an MJCF or URDF file."""
+    config: Annotated[
+        Path | None,
+        option(
+            "FILE",
+            "none",
+            "TOML file of jaxmpc tune weights --robot: [robot] name, horizon, margin, linearize, "
+            "[cost] Q, R, P, rho. An option given here wins over the file.",
+        ),
+    ] = None
+    count: Annotated[int, option("B", "64")] = 64
+    """Number of robots."""
+    seconds: Annotated[float, option("S", "2")] = 2.0
+    """Simulated time of each robot."""
+    target: Annotated[tuple[float, ...] | None, option("Q [Q ...]", "home of the model")] = None
+    """Configuration to rest at, one number a joint, in rad or m (qpos of MuJoCo)."""
+    spread: Annotated[float, option("FRACTION", "0.5")] = 0.5
+    """Starts are uniform around home, up to this fraction of the way to the limits.
+    Where there is no limit, up to this number itself. In positions and velocities."""
+    seed: Annotated[int, option("K", "0")] = 0
+    """Seed of starts, masses, damping and payloads."""
+    linearize: Annotated[
+        Literal["set-point", "state", "trajectory", "lqr"] | None,
+        option("{set-point,state,trajectory,lqr}", "from --config, else state"),
+    ] = None
+    """Linear models: once at the target, at each measured state, along the last plan.
+    lqr: no MPC but linear feedback, clipped to the input limits, to compare with."""
+    horizon: Annotated[int | None, option("N", "from --config, else 20")] = None
+    """Prediction horizon, in control periods."""
+    state_weights: Annotated[
+        tuple[float, ...] | None,
+        option("Q [Q ...]", "from --config, else Bryson's rule, velocities x 0.01"),
+    ] = None
+    """Diagonal of Q: positions, then velocities. Bryson's rule: 1/(half the range)^2."""
+    input_weights: Annotated[
+        tuple[float, ...] | None, option("R [R ...]", "from --config, else Bryson's rule x 0.01")
+    ] = None
+    """Diagonal of R, one number an actuator."""
+    margin: Annotated[float | None, option("FRACTION", "from --config, else 0.02")] = None
+    """Room that the MPC leaves to state limits, as a fraction of half the range."""
+    penalty: Annotated[float | None, option("RHO", "from --config, else 1e4")] = None
+    """L1 weight of state limits; too small a weight breaks limits that could be kept."""
+    iterations: Annotated[int, option("K", "50")] = 50
+    """ADMM steps of each plan."""
+    refine: Annotated[int | None, option("K", "2; with float64 3")] = None
+    """Newton steps after them; 3 solve nearly all plans, in two to four times the time."""
+    mass: Annotated[float, option("FRACTION", "0")] = 0.0
+    """Each body's mass and inertia times a number from 1 - FRACTION to 1 + FRACTION.
+    The MPC does not know: it has the model of the file."""
+    damping: Annotated[float, option("FRACTION", "0")] = 0.0
+    """Each joint's damping times a number from 1 - FRACTION to 1 + FRACTION."""
+    payload: Annotated[float, option("KG", "0")] = 0.0
+    """Mass from 0 to KG at the site "tool" of the model; the MPC does not know."""
+    tolerance: Annotated[float, option("FRACTION", "0.02")] = 0.02
+    """How near the target counts as there, as a fraction of half the range."""
+    dtype: Annotated[Literal["float32", "float64"], option("{float32,float64}", "float32")] = (
+        "float32"
+    )
+    """Precision of physics and MPC."""
+    chunk: Annotated[int | None, option("B", "256 on a CPU, 4096 on others")] = None
+    """Robots at a time: what is written at once, and lost at most."""
+    video: Annotated[int, option("K", "4")] = 4
+    """Number of robots in the video; 0: none."""
+    output: Annotated[Path, option("DIR", "jaxmpc-simulate")] = Path("jaxmpc-simulate")
+    """Folder for the files; made where absent."""
+    resume: Switch = False
+    """Go on with the run in --output."""
+    overwrite: Switch = False
+    """Delete the run in --output and start again."""
+
+    keeps = "chunks"
+
+    def run(self) -> None:
+        """Simulate all robots, write the files, print the table.
+
+        Raises ValueError for options and files that make no sense.
+        """
+        self.check()
+        command = self.settled()
+        runs = RobotRuns.open(command)
+        robot = runs.robot
+        print(f"{robot.name}: {self.count:,} robots for {self.seconds:g} s -> {self.output}")
+        timing = runs.simulate()
+        run = runs.read()
+        outcome = evaluate_runs(run, robot, runs.reference, tolerance=self.tolerance)
+        files = ["runs.zarr", "summary.json", "runs.png"]
+        from jaxmpc.app.plots.closed_loops import plot_runs
+
+        figure = plot_runs(
+            run, robot, reference=runs.reference, input_reference=runs.input_reference
+        )
+        figure.savefig(self.output / "runs.png", dpi=150)
+        if self.video and film(robot, run, self.video, self.output / "robots.gif"):
+            files.append("robots.gif")
+        summary = summarise(runs, run, outcome, timing)
+        write_json(self.output / "summary.json", summary)
+        rows = table(summary)
+        rows.append(("files", " ".join(str(self.output / name) for name in files)))
+        print_table(rows, 13)
+
+    def settled(self) -> "Simulate":
+        """Return the command with what --config or `USUAL` says for options not given."""
+        found: dict[str, Any] = dict(USUAL)
+        if self.config is not None:
+            file = load_robot_config(self.config)
+            found |= {
+                "horizon": file.robot.horizon, "margin": file.robot.margin,
+                "linearize": file.robot.linearize, "penalty": file.cost.rho,
+            }  # fmt: skip
+        missing = {key: value for key, value in found.items() if getattr(self, key) is None}
+        return dataclasses.replace(self, **missing)
+
+    def check(self) -> None:
+        """Raise ValueError for options that make no sense."""
+        for name, least in (
+            ("count", 1), ("horizon", 1), ("iterations", 1), ("refine", 0), ("video", 0),
+            ("seed", 0), ("chunk", 1),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if value is not None and value < least:
+                fail(f"--{name}", f"{value}", f"Give a whole number, at least {least}")
+        check_positive(self, "seconds", "penalty", "tolerance")
+        if not 0 <= self.payload < np.inf:
+            fail("--payload", f"{self.payload}", "Give a mass in kg")
+        if not 0 <= self.spread <= 1:
+            fail("--spread", f"{self.spread}", "Give a fraction from 0 to 1")
+        for name in ("margin", "mass", "damping"):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value < 1:
+                fail(f"--{name}", f"{value}", "Give a fraction from 0 to below 1")

@@ -1,0 +1,161 @@
+"""The command `jaxmpc sweep`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from jaxmpc.app import config as configs
+from jaxmpc.app.commands.linear_sweep import LinearSweep
+from jaxmpc.app.commands.options import End, Horizon, Switch, Terminal, option, refuse
+from jaxmpc.app.commands.robot_map import RobotMapCommand
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """From which initial states can this controller keep all its limits? A map, with proofs.
+
+    What it does
+      Lays a grid over the initial states of a constrained linear MPC and decides each one:
+        feasible    a plan was found and rolled out within all limits
+        infeasible  a certificate proves that there is no plan
+        undecided   neither
+      Then bounds the set of feasible states by polytopes, from inside and from outside.
+      Without a file the problem is one robot joint: x = (q, dq), torque u, 20 steps of 0.01 s.
+      An option given here wins over the file.
+
+    How to start
+      $ jaxmpc sweep
+      $ jaxmpc sweep --config pendulum.toml --terminal invariant --grid 512 512 --output maps/a
+
+    How to read the output, all in the folder of --output
+      map.png       Blue feasible, grey infeasible, yellow undecided. The true boundary lies
+                    between the dashed line (inner) and the solid one (outer). Two axes only.
+      summary.json  Counts, bounds of the area, seconds, configuration, versions.
+      sweep.zarr    Each state with its label (1 feasible, -1 infeasible, 0 undecided), its plan,
+                    and the half-space cut_normal'x <= cut_offset that no feasible state leaves.
+                    start holds the x_0 of the plan; bound_* the points and facets of the bounds.
+                    Opens with xarray.open_zarr(path, consolidated=False).
+      Ctrl-C        Stops; finished chunks are kept, --resume goes on from there.
+      Exit code     0 done, 2 error (one line on stderr says which), 130 stopped by Ctrl-C.
+
+    With --robot NAME or FILE: the promise and the robot
+      Such as jaxmpc sweep --robot pendulum --terminal invariant --seconds 2
+      The MPC of a robot (joint, pendulum, cartpole, arm2, arm6, arm7, quadrotor, or an MJCF or
+      URDF file), linear about its home, weights from its limits. The grid is a slice: the first
+      joint's position and velocity unless --axes says otherwise, the rest at home unless --fixed.
+      Each state is labelled as above, by the linear model, and by the closed loop of the
+      nonlinear robot in MJX: are all its limits kept for --seconds? Costs about 0.3 ms a state
+      and sample on one CPU core.
+      robot_map.png  Blue: promise kept. Red: promise broken (feasible by the linear model, the
+                     robot leaves its limits). Grey: infeasible, and the robot fails. Green:
+                     infeasible, yet the robot keeps its limits. Circle: the broken promise
+                     deepest in the linear feasible set.
+                     Without an invariant terminal set a plan promises its horizon only.
+      summary.json   Counts, plans by status, deepest broken promise, configuration.
+      robot_map.npz  points, states, promised, held (1 yes, -1 no, 0 undecided), kept, recursive,
+                     feasible, depth, worst (most beyond a limit), broken_at, lost_at, unsolved_at.
+      robot_map.zarr What --resume goes on from: a killed run loses one chunk of 256 states.
+
+    What the TOML file holds (n states, m inputs; dt in seconds, other units are yours)
+      name = "joint"
+      [system]  A, B, dt; optional c, state_names, state_units, input_names, input_units,
+                continuous = true (A, B, c of dx/dt, the input held over dt)
+      [limits]  u_min, u_max, and x_min, x_max (inf allowed) or H_x, h_x (H_x x <= h_x)
+      [cost]    Q, R, P = "lqr" | "Q" | "none" | matrix; a flat list is a diagonal; optional rho,
+                the L1 weight of soft limits, a number or "exact" (jaxmpc info; sets stay hard)
+      [mpc]     horizon; optional terminal, constrain_initial = false (no limits at k = 0),
+                control_horizon (free moves, the last one is held)
+      and what jaxmpc tune writes, see its help: [limits] margin, [mpc] H_f, h_f or P_f, level_f,
+      [solver]
+      [sweep]   all optional: grid, lower, upper, axes, fixed, projection, iterations, dtype
+    """
+
+    config: Annotated[Path | None, option("FILE", "the built-in joint")] = None
+    """TOML file with the problem and the sweep."""
+    robot: Annotated[str | None, option("NAME|FILE", "none, a linear system")] = None
+    """Map a robot instead, linear promise against nonlinear closed loop."""
+    seconds: Annotated[float | None, option("S", "2")] = None
+    """With --robot: length of its closed loops."""
+    output: Annotated[Path, option("DIR", "jaxmpc-sweep")] = Path("jaxmpc-sweep")
+    """Folder for sweep.zarr, map.png and summary.json; made where absent."""
+    horizon: Horizon = None
+    """Prediction horizon, in steps of dt."""
+    terminal: Terminal = None
+    grid: Annotated[tuple[int, ...] | None, option("K [K ...]", "from the file, else 256 256")] = (
+        None
+    )
+    """Points along each mapped axis, ends included."""
+    lower: End = None
+    """Lower end of each mapped axis, in the units of the state."""
+    upper: End = None
+    """Upper end of each mapped axis, in the units of the state."""
+    axes: Annotated[tuple[str, ...] | None, option("AXIS [AXIS ...]", "first two states")] = None
+    """States to map, by name or index from 0."""
+    fixed: Annotated[tuple[float, ...] | None, option("X [X ...]", "from the file")] = None
+    """With more states than axes: values of the other states, in their order (a slice)."""
+    projection: Annotated[
+        bool, tyro.conf.FlagCreatePairsOff, option(None, "from the file, else off")
+    ] = False
+    """With more states than axes: feasible for some value of the other states."""
+    iterations: Annotated[int | None, option("K", "from the file, else 50")] = None
+    """Solver steps of the first pass over all states; what is left open gets more."""
+    dtype: Annotated[
+        Literal["float32", "float64"] | None,
+        option("{float32,float64}", "from the file, else float32"),
+    ] = None
+    """Precision of the solver's steps. Proofs are in float64 always."""
+    learn_penalties: Annotated[
+        bool,
+        tyro.conf.FlagCreatePairsOff,
+        option(
+            None,
+            "off",
+            "Learn penalties of the first pass for this problem (kept in "
+            "~/.cache/jaxmpc/penalties), so that it leaves fewer states open. Learning costs about "
+            "what a million states cost, and saves up to a quarter of that: for problems that are "
+            "swept again and again.",
+        ),
+    ] = False
+    resume: Switch = False
+    """Go on with the sweep in --output."""
+    overwrite: Switch = False
+    """Delete the sweep in --output and start again."""
+    refine: Annotated[bool, option(None, "on")] = True
+    """Move inner and outer bound together to a relative gap of 1e-6 (up to three axes)."""
+
+    keeps = "chunks"
+
+    def run(self) -> None:
+        """Label all states, write the files, print the table.
+
+        Raises ValueError for options and files that make no sense.
+        """
+        if self.robot is not None:
+            self.robot_map(self.robot).run()
+            return
+        refuse({"seconds": self.seconds}, None, "It is how long a robot's loops last")
+        self.open().run(refine=self.refine, learn_penalties=self.learn_penalties)
+
+    def open(self) -> LinearSweep:
+        """Read, check and open what a sweep needs. Raises ValueError; compiles nothing."""
+        keys = "horizon terminal grid lower upper axes fixed iterations dtype".split()
+        given = {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
+        overrides = {**given, **({"projection": True} if self.projection else {})}
+        config = configs.load(self.config, overrides)
+        return LinearSweep.open(config, self.output, self.resume, self.overwrite)
+
+    def robot_map(self, robot: str) -> RobotMapCommand:
+        """Return the map of --robot. Raises ValueError for options that do not go with it."""
+        given = {"config": self.config, "projection": self.projection}
+        refuse(given, robot, "Give a problem or a robot; a robot's map is a slice")
+        refuse({"learn-penalties": self.learn_penalties}, robot, "They are for linear maps")
+        settings: dict[str, Any] = {"iterations": self.iterations, "dtype": self.dtype}
+        return RobotMapCommand(
+            robot, self.output, "limits", seconds=self.seconds, horizon=self.horizon,
+            terminal=self.terminal, axes=self.axes, values=self.fixed, grid=self.grid,
+            lower=self.lower, upper=self.upper, refine=self.refine, resume=self.resume,
+            overwrite=self.overwrite,
+            settings={key: value for key, value in settings.items() if value is not None},
+        )  # fmt: skip

@@ -1,0 +1,141 @@
+"""What `jaxmpc tune weights` and `tune penalties` share: optimizer, initial states, folder."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import optax
+from scipy.optimize import linprog
+
+from jaxmpc.app import config as configs
+from jaxmpc.app.commands.options import open_folder
+from jaxmpc.checks import fail
+from jaxmpc.control.sets import Polytope
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.mpc.inequalities import Inequalities
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.runs import differences, write_json
+
+CHECKPOINT = "checkpoint.npz"
+TUNED = "tuned.toml"
+# Random states that are tried at most for each that is wanted.
+TRIES = 10
+
+
+def optimizer_of(name: str, rate: float, tried: Any = None) -> optax.GradientTransformation:
+    """Return the optimizer of optax with this name; raise ValueError where there is none."""
+    cure = "Give one that takes a learning rate: adam, adamw, sgd, rmsprop, lion, ..."
+    make = None if name.startswith("_") else getattr(optax, name, None)
+    try:
+        assert make is not None
+        made = make(learning_rate=rate)
+        assert isinstance(made, optax.GradientTransformation)
+        if tried is not None:
+            jax.eval_shape(lambda v: made.update(v, made.init(v), v)[0], tried)
+    except Exception:  # whatever a function that is no such optimizer does
+        fail("--optimizer", f"{name!r} is no optimizer of optax that serves here", cure)
+    return made
+
+
+def require_counts(command: Any, **least: int) -> None:
+    """Raise ValueError for a count below its least, or a fraction of validation outside (0, 1)."""
+    for name, lowest in least.items():
+        value = getattr(command, name)
+        if value is not None and value < lowest:
+            fail(f"--{name}", f"{value}", f"Give a whole number, at least {lowest}")
+    if not 0 < command.validation < 1:
+        fail("--validation", f"{command.validation}", "Give a fraction above 0 and below 1")
+
+
+def require_positive(command: Any, *names: str) -> None:
+    """Raise ValueError for an option that is given and not a positive number."""
+    for name in names:
+        value = getattr(command, name)
+        if value is not None and not 0 < value < np.inf:
+            fail(f"--{name.replace('_', '-')}", f"{value}", "Give a positive number")
+
+
+def problem_file(command: Any) -> configs.Config:
+    """Return the problem of --config, or the built-in joint, with --horizon and --terminal."""
+    given = {key: getattr(command, key) for key in ("horizon", "terminal")}
+    overrides = {key: value for key, value in given.items() if value is not None}
+    return configs.load(command.config, overrides, "tune")
+
+
+def start_range(
+    config: configs.Config, lower: Any, upper: Any, fraction: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends of the initial states: as given, else this fraction of the state limits."""
+    low, high = config.state_range()
+    n = len(low)
+    for name, given in (("--lower", lower), ("--upper", upper)):
+        if given is not None and len(given) != n:
+            fail(name, f"has {len(given)} numbers", f"The problem has {n} states")
+    middle, half = (high + low) / 2, (high - low) / 2
+    bounded = np.isfinite(half)
+    middle, half = np.where(bounded, middle, np.nan), np.where(bounded, half, np.nan)
+    low = middle - fraction * half if lower is None else np.array(lower)
+    high = middle + fraction * half if upper is None else np.array(upper)
+    if not np.all(np.isfinite([low, high])):
+        fail("--lower, --upper", "the state limits do not bound all states", "Give both ends")
+    if np.any(low >= high):
+        fail("--lower", f"{low.tolist()} not below upper {high.tolist()}", "Lower must be below")
+    return low, high
+
+
+def feasible_states(
+    mpc: MPC, limits: Any, lower: np.ndarray, upper: np.ndarray, count: int, seed: int
+) -> tuple[np.ndarray, int]:
+    """Return uniform states (count, n) within limits that have a plan, and how many had none.
+
+    Whether a state has a plan is decided by linear programs on the host, without compiling: hard
+    rows are all linear but for an ellipsoidal terminal set, which is left out.
+    """
+    rows = Inequalities.of(FeasibilityProblem.of(mpc).condensed)
+    random, dropped = np.random.default_rng(seed), 0
+    found: list[np.ndarray] = []
+    for _ in range(TRIES * count):
+        x = random.uniform(lower, upper)
+        if isinstance(limits, Polytope) and np.any(np.asarray(limits.H) @ x > limits.h):
+            continue
+        b = rows.b - rows.D @ np.pad(x, (0, rows.D.shape[1] - len(x)))
+        zero = np.zeros(rows.C.shape[1])
+        if len(b) and linprog(zero, rows.C, b, bounds=(None, None)).status == 2:
+            dropped += 1
+            continue
+        found.append(x)
+        if len(found) == count:
+            return np.array(found), dropped
+    cure = "Draw from a smaller region: --spread, --lower, --upper"
+    fail("initial states", f"{len(found)} of {TRIES * count} drawn have a plan", cure)
+
+
+def open_run(
+    folder: Path, files: tuple[str, ...], options: dict[str, Any], resume: bool, overwrite: bool
+) -> None:
+    """Open the folder of a new run, or of one that goes on with the same options.
+
+    files[0] is the record of the run, a JSON file that holds the options; all files are removed,
+    and the record is begun. Raises ValueError where the folder holds a run with other options, or
+    any run without `resume` or `overwrite`.
+    """
+    if resume and overwrite:
+        fail("--overwrite", "given beside --resume", "Choose one")
+    record = folder / files[0]
+    there = [name for name in (files[0], CHECKPOINT) if (folder / name).exists()]
+    if there and not (resume or overwrite):
+        what = "Add --resume to go on with it or --overwrite to start again"
+        fail(str(folder / there[0]), "exists", what)
+    if resume and record.exists():
+        try:
+            said = json.loads(record.read_text())["options"]
+        except (ValueError, KeyError, TypeError):
+            fail(str(record), "holds no run", "Add --overwrite to start again")
+        if changes := differences(said, options):
+            fail(str(record), "; ".join(changes), "Give the same options, or --overwrite")
+    open_folder(folder)
+    for name in (*files, *([CHECKPOINT] if overwrite else [])):  # of an earlier run
+        (folder / name).unlink(missing_ok=True)
+    write_json(record, {"options": options, "finished": False})

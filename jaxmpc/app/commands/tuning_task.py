@@ -1,0 +1,377 @@
+"""What `jaxmpc tune weights` tunes: problem, plant, initial states and loss from its options."""
+
+import contextlib
+import dataclasses
+import io
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxmpc.app import config as configs
+from jaxmpc.app.commands.options import model_hash
+from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
+from jaxmpc.app.commands.tuning import feasible_states, problem_file, start_range
+from jaxmpc.checks import fail
+from jaxmpc.closed_loop.outcome import evaluate_runs
+from jaxmpc.closed_loop.robot_controller import RobotController
+from jaxmpc.closed_loop.robot_mpc import robot_mpc
+from jaxmpc.closed_loop.run import Run
+from jaxmpc.closed_loop.simulate_many import simulate_many
+from jaxmpc.control import violation
+from jaxmpc.control.riccati import lqr
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope
+from jaxmpc.mpc.condense import prestabilising_gain
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.soften import soften
+from jaxmpc.mpc.solve import Controller
+from jaxmpc.qp.admm import ADMM
+from jaxmpc.qp.status import Status
+from jaxmpc.robots.linear import LinearPlant
+from jaxmpc.robots.load import load_robot
+from jaxmpc.tuning.losses import ClosedLoopLoss
+from jaxmpc.tuning.parameters import Parameter
+
+# The largest fraction by which limits can be tightened.
+TIGHTEST = 0.5
+
+
+class TuningTask(NamedTuple):
+    """What `jaxmpc tune weights` tunes, made from its options and checked.
+
+    make: values → MPC or controller. x0s (B, n or nq + nv) and variations (B, ...); train (B,):
+    which of them are for training, the others for validation. limits: of the states. write: values
+    → text of tuned.toml; read: the controller that such a file stands for. options: what else
+    decides the result. dropped: states drawn that have no plan. mpc: the hard problem before
+    tuning. config: None for robots.
+    """
+
+    name: str
+    make: Callable[[Mapping[str, Any]], Any]
+    parameters: dict[str, Parameter]
+    plant: Any
+    x0s: np.ndarray
+    variations: dict[str, np.ndarray]
+    train: np.ndarray
+    loss: ClosedLoopLoss
+    reference: np.ndarray | None
+    input_reference: np.ndarray | None
+    steps: int
+    solver: ADMM
+    dtype: str
+    limits: Box | Polytope | None
+    write: Callable[[Mapping[str, np.ndarray]], str]
+    read: Callable[[Path], Any]
+    options: dict[str, Any]
+    dropped: int
+    mpc: MPC
+    config: configs.Config | None
+
+    def simulated(self, make: Callable[[], Any]) -> Run:
+        """Return the validation loops with a controller or the Controller of an MPC."""
+        with jax.enable_x64(self.dtype == "float64"):
+            made = make()
+            controller = Controller(made, self.solver) if isinstance(made, MPC) else made
+            return simulate_many(
+                controller, self.plant, self.x0s[~self.train], self.steps,
+                reference=self.reference, input_reference=self.input_reference,
+                variations={k: v[~self.train] for k, v in self.variations.items()},
+            )  # fmt: skip
+
+    def counted(self, run: Run, tolerance: float) -> dict[str, Any]:
+        """Return counts of what the loops did, evaluated from their states and inputs."""
+        goal = np.zeros(self.plant.n) if self.reference is None else self.reference
+        outcome = evaluate_runs(run, self.plant, goal, tolerance=tolerance)
+        kept = outcome.kept
+        if isinstance(self.limits, Polytope):
+            limits = jax.tree.map(lambda v: np.asarray(v, float), self.limits)
+            kept = kept & violation.kept(limits, outcome.coordinates).all(axis=(1, 2))
+        status = np.asarray(run.status)
+        return {
+            "loops": len(kept), "plans": int(status.size), "violated": float(np.mean(~kept)),
+            "kept_to": violation.TOLERANCE["float64"],
+            "unsolved": float(np.mean(status != Status.SOLVED)),
+            "infeasible": float(np.mean(status == Status.PRIMAL_INFEASIBLE)),
+            "fallback": float(np.mean(run.fallback)),
+            "at_target": float(np.mean(outcome.reached)),
+        }  # fmt: skip
+
+
+def linear_family(
+    hard: MPC, follow: Any, rho: float | None, parameters: Mapping[str, Parameter], limits: Any
+) -> Callable[[Mapping[str, Any]], MPC]:
+    """Return the map from values to the problem that the controller solves. Traceable."""
+    # The gain that keeps predictions of unstable plants in bounds changes rounding only.
+    base = dataclasses.replace(hard, prestabilise=prestabilising_gain(hard))
+    follow = follow if isinstance(follow, str) else "none"
+    box = hard.terminal_set is hard.states
+
+    def make(values: Mapping[str, Any]) -> MPC:
+        mpc = dataclasses.replace(base, Q=values.get("Q", hard.Q), R=values.get("R", hard.R))
+        mpc = dataclasses.replace(mpc, terminal_cost=follower(mpc, values, follow))
+        if "tightening" in values:
+            states = limits.tightened(values["tightening"])
+            mpc = dataclasses.replace(
+                mpc, states=states, terminal_set=states if box else mpc.terminal_set
+            )
+        return mpc if rho is None else soften(mpc, values.get("rho", rho))
+
+    return make
+
+
+def follower(mpc: MPC, values: Mapping[str, Any], follow: str) -> Any:
+    """Return the terminal weight: tuned itself, following Q and R, or unchanged."""
+    if "P" in values:
+        return values["P"]
+    if follow == "lqr" and {"Q", "R"} & set(values):
+        return lqr(mpc.system, mpc.Q, mpc.R).P
+    return mpc.Q if follow == "Q" else mpc.terminal_cost
+
+
+def weight_parameter(name: str, value: Any, form: str) -> Parameter:
+    """Return Q, R or P as a Parameter; raise ValueError unless it is positive definite."""
+    if value is None:
+        fail(f"--tune {name}", "the problem has no terminal weight", 'Give [cost] P = "lqr"')
+    value = np.asarray(value, float)
+    diagonal = bool(np.all(value == np.diag(np.diag(value))))
+    if form == "diagonal" and not diagonal and name != "P":
+        fail("--weights", f"diagonal, and {name} of the problem is not", "Add --weights full")
+    if np.linalg.eigvalsh((value + value.T) / 2)[0] <= 0:
+        cure = "Give each direction a small weight to start from"
+        fail(f"--tune {name}", f"{name} is not positive definite", cure)
+    return Parameter(value, "diagonal" if form == "diagonal" and diagonal else "definite")
+
+
+def tightening(start: float, limits: Box, target: np.ndarray) -> Parameter:
+    """Return the fraction by which limits are tightened as a Parameter: at most TIGHTEST, and the
+    target stays inside."""
+    lower, upper = np.asarray(limits.lower, float), np.asarray(limits.upper, float)
+    half = (upper - lower) / 2
+    both = np.isfinite(half) & (half > 0)
+    if not both.any():
+        fail("--tune tightening", "no state has limits on both sides", "Tune something else")
+    room = (np.minimum(upper - target, target - lower) / np.where(both, half, 1.0))[both]
+    highest = min(TIGHTEST, 0.9 * float(room.min()))
+    if not 0 < start < highest:
+        fail("--margin", f"{start}", f"To tune it start above 0 and below {highest:.4g}")
+    return Parameter(start, "interval", lower=0.0, upper=highest)
+
+
+def tuned(config: configs.Config, values: Mapping[str, np.ndarray]) -> configs.Config:
+    """Return the problem with tuned values."""
+    changes: dict[str, Any] = {
+        name: matrix(values[name]) for name in ("Q", "R", "P") if name in values
+    }
+    if "rho" in values:
+        changes["rho"] = float(values["rho"])
+    limits = config.limits
+    if "tightening" in values:
+        limits = dataclasses.replace(limits, margin=float(values["tightening"]))
+    cost = dataclasses.replace(config.cost, **changes)
+    return dataclasses.replace(config, cost=cost, limits=limits)
+
+
+def matrix(value: Any, flat: bool = True) -> Any:
+    """Return a matrix as the file holds it: rows, or the diagonal of a diagonal one if `flat`."""
+    value = np.asarray(value, float)
+    if flat and np.all(value == np.diag(np.diag(value))):
+        return tuple(np.diag(value).tolist())
+    return tuple(map(tuple, value.tolist()))
+
+
+def linear_task(command: Any) -> TuningTask:
+    """Return the task of a TOML file."""
+    config = problem_file(command)
+    margin = config.limits.margin if command.margin is None else command.margin
+    if "tightening" in command.tune and command.margin is None and not margin:
+        margin = 0.02
+    if margin and config.limits.x_min is None:
+        fail("--tune tightening, --margin", "the problem has no x_min, x_max", "Give limits")
+    if margin != config.limits.margin:
+        section = dataclasses.replace(config.limits, margin=margin)
+        config = dataclasses.replace(config, limits=section)
+    if "tightening" in command.tune and config.mpc.terminal in ("invariant", "ellipsoid"):
+        what = f'the terminal set "{config.mpc.terminal}" rests on the limits as they are'
+        fail("--tune tightening", what, "Use --terminal box or none")
+    hard, rho = config.build_mpc(), config.cost.rho
+    if rho is not None:  # the number that "exact" stands for
+        controlled = config.build_controlled()
+        rho = float(controlled.soft[0].rho) if controlled.soft else 0.0  # type: ignore[index]
+    if "rho" in command.tune and not rho:
+        fail("--tune rho", "the problem has no soft limits", "Give it [cost] rho")
+    config = with_numbers(config, hard, rho)
+    parameters: dict[str, Parameter] = {
+        name: weight_parameter(name, value, command.weights)
+        for name, value in (("Q", hard.Q), ("R", hard.R), ("P", hard.terminal_cost))
+        if name in command.tune
+    }
+    if "rho" in command.tune:
+        parameters["rho"] = Parameter(rho, "positive")
+    limits = config.state_limits()
+    if "tightening" in command.tune:
+        assert isinstance(limits, Box)
+        parameters["tightening"] = tightening(margin, limits, np.zeros(hard.system.n))
+    n, m = hard.system.n, hard.system.m
+    free = Box(np.full(n, -np.inf), np.full(n, np.inf))
+    assert isinstance(hard.inputs, Box)
+    plant = LinearPlant(
+        hard.system, limits if isinstance(limits, Box) else free, hard.inputs,
+        name=config.name,
+    )  # fmt: skip
+    settings = config.build_solver() or ADMM(iterations=50, refine=3)
+    count = settings.iterations if command.iterations is None else command.iterations
+    refine = settings.refine if command.refine is None else command.refine
+    solver = dataclasses.replace(settings, iterations=count, refine=refine)
+    dtype = command.dtype or "float64"
+    fraction = 0.9 if command.spread is None else command.spread
+    x0s, dropped = feasible_states(
+        hard if rho is None else soften(hard, rho), config.state_limits(),
+        *start_range(config, command.lower, command.upper, fraction), command.count, command.seed,
+    )  # fmt: skip
+    steps = command.steps or 50
+    if command.seconds is not None:
+        steps = max(1, round(command.seconds / plant.dt))
+
+    def write(values: Mapping[str, np.ndarray]) -> str:
+        return tuned(config, values).to_toml()
+
+    def read(path: Path) -> Controller:
+        return Controller(configs.load(path, None, "tune").build_controlled(), solver)
+
+    make = linear_family(hard, config.cost.P, rho, parameters, limits)
+    return TuningTask(
+        config.name, make, parameters, plant, x0s, {}, training(command, len(x0s)),
+        loss_of(command, hard.Q, hard.R, n, m, limits, plant, None, None), None, None, steps,
+        solver, dtype, limits, write, read, {"problem": config.to_dict("tune")}, dropped, hard,
+        config,
+    )  # fmt: skip
+
+
+def with_numbers(config: configs.Config, hard: MPC, rho: float | None) -> configs.Config:
+    """Return the problem with numbers for what depends on its weights: rho, and a terminal set
+    that the LQR of these weights keeps invariant."""
+    cost, mpc = dataclasses.replace(config.cost, rho=rho), config.mpc
+    given, plain = hard.terminal_set, lambda v: tuple(map(tuple, np.asarray(v, float).tolist()))
+    if mpc.terminal != "box" and isinstance(given, Polytope):
+        h = tuple(np.asarray(given.h, float).tolist())
+        mpc = dataclasses.replace(mpc, terminal="none", H_f=plain(given.H), h_f=h)
+    if mpc.terminal != "box" and isinstance(given, Ellipsoid):
+        level = float(np.asarray(given.level))
+        mpc = dataclasses.replace(mpc, terminal="none", P_f=plain(given.P), level_f=level)
+    return dataclasses.replace(config, cost=cost, mpc=mpc)
+
+
+def robot_task(command: Any) -> TuningTask:
+    """Return the task of a robot."""
+    file = None if command.config is None else configs.load_robot_config(command.config)
+    with contextlib.redirect_stdout(io.StringIO()):  # MJX tells of absent optional parts
+        robot = load_robot(str(command.robot))
+    said = configs.RobotSection(name=robot.name) if file is None else file.robot
+    given: dict[str, Any] = {
+        "horizon": command.horizon, "margin": command.margin, "linearize": command.linearize,
+    }  # fmt: skip
+    said = dataclasses.replace(said, **{k: v for k, v in given.items() if v is not None})
+    if command.target is not None and len(command.target) != robot.mujoco.nq:
+        what = f"has {len(command.target)} numbers"
+        fail("--target", what, f"{robot.name} needs {robot.mujoco.nq}")
+    target = None if command.target is None else np.array(command.target)
+    # What does not compile is checked before the linear model is.
+    loss = loss_of(
+        command, np.eye(robot.n), np.eye(robot.m), robot.n, robot.m, None, None, None, None
+    )
+    weights: dict[str, Any] = {} if file is None else file.weights(robot)
+    mpc = robot_mpc(robot, horizon=said.horizon, target=target, margin=said.margin, **weights)
+    Q, R, P = mpc.Q, mpc.R, mpc.terminal_cost
+    rho = 1e4 if file is None else file.cost.rho
+    follow = "lqr" if file is None else file.cost.P
+    follow = follow if isinstance(follow, str) else "none"
+    parameters: dict[str, Parameter] = {
+        name: weight_parameter(name, value, command.weights)
+        for name, value in (("Q", Q), ("R", R), ("P", P))
+        if name in command.tune
+    }
+    if "rho" in command.tune:
+        parameters["rho"] = Parameter(rho, "positive")
+    x, s = robot.equilibrium(target)
+    with jax.enable_x64(True):
+        r = np.asarray(robot.coordinates(x))
+    if "tightening" in command.tune:
+        parameters["tightening"] = tightening(said.margin, robot.state_limits, r)
+    solver = ADMM(
+        iterations=20 if command.iterations is None else command.iterations,
+        refine=2 if command.refine is None else command.refine,
+    )
+    x0s, variations = draw_robots(
+        robot, command.count, command.seed,
+        spread=0.5 if command.spread is None else command.spread,
+        mass=command.mass, damping=command.damping, payload=command.payload,
+    )  # fmt: skip
+    variations = plant_numbers(robot, variations)
+    if variations:
+        robot.vary(**{key: value[0] for key, value in variations.items()})
+    dtype = command.dtype or "float32"
+    steps = command.steps or max(1, round((command.seconds or 1.0) / robot.dt))
+    loss = loss_of(command, Q, R, robot.n, robot.m, robot.state_limits, robot, r, s)
+
+    def controller(mpc: MPC, penalty: Any, linearize: str) -> RobotController:
+        return RobotController(robot, mpc, solver, linearize=linearize, penalty=penalty)
+
+    def make(values: Mapping[str, Any]) -> RobotController:
+        changed = dataclasses.replace(mpc, Q=values.get("Q", Q), R=values.get("R", R))
+        changed = dataclasses.replace(changed, terminal_cost=follower(changed, values, follow))
+        if "tightening" in values:
+            states = robot.state_limits.tightened(values["tightening"])
+            changed = dataclasses.replace(changed, states=states)
+        return controller(changed, values.get("rho", rho), said.linearize)
+
+    def write(values: Mapping[str, np.ndarray]) -> str:
+        end: Any = follow
+        if "P" in values or (follow == "none" and P is not None):
+            end = matrix(values.get("P", P), flat=False)
+        margin = float(values.get("tightening", said.margin))
+        return configs.RobotConfig(
+            robot=dataclasses.replace(said, margin=margin),
+            cost=configs.RobotCostSection(
+                Q=matrix(values.get("Q", Q)), R=matrix(values.get("R", R)), P=end,
+                rho=float(values.get("rho", rho)),
+            ),
+        ).to_toml()  # fmt: skip
+
+    def read(path: Path) -> RobotController:
+        file = configs.load_robot_config(path)
+        mpc = robot_mpc(
+            robot, horizon=file.robot.horizon, target=target, margin=file.robot.margin,
+            **file.weights(robot),
+        )  # fmt: skip
+        return controller(mpc, file.cost.rho, file.robot.linearize)
+
+    start = {"robot": write({}), "model": model_hash(robot)}
+    return TuningTask(
+        robot.name, make, parameters, robot, x0s, variations, training(command, len(x0s)), loss, r,
+        np.asarray(s), steps, solver, dtype, robot.state_limits, write, read, start, 0, mpc,
+        None,
+    )  # fmt: skip
+
+
+def training(command: Any, count: int) -> np.ndarray:
+    """Return which initial states (count,) are for training; the last ones are for validation."""
+    kept = min(max(1, round(command.validation * count)), count - 1)
+    return np.arange(count) < count - kept
+
+
+def loss_of(
+    command: Any, Q: Any, R: Any, n: int, m: int, limits: Any, plant: Any, r: Any, s: Any
+) -> ClosedLoopLoss:
+    """Return the loss of the options."""
+    for name, given, size in (("tracking", command.tracking, n), ("effort", command.effort, m)):
+        if given is not None and len(given) != size:
+            fail(f"--{name}", f"has {len(given)} numbers", f"The problem needs {size}")
+    Q = np.asarray(Q) if command.tracking is None else np.array(command.tracking)
+    R = np.asarray(R) if command.effort is None else np.array(command.effort)
+    half = limits.half_widths() if isinstance(limits, Box) else np.ones(n)
+    return ClosedLoopLoss(
+        Q, R, r, s, limits, command.violation, command.settling, command.tolerance * half,
+        plant=None if isinstance(plant, LinearPlant) else plant,
+    )  # fmt: skip

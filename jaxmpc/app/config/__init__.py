@@ -1,0 +1,35 @@
+"""A problem and what to ask of it, as a TOML file: read, checked, turned into an MPC, written.
+
+    name = "joint"
+
+    [system]  A, B, c, dt, continuous, state_names, state_units, input_names, input_units
+    [limits]  x_min, x_max, margin  or  H_x, h_x;  u_min, u_max
+    [cost]    Q, R, P, rho
+    [mpc]     horizon, terminal  or  H_f, h_f  or  P_f, level_f;  constrain_initial, control_horizon
+    [solver]  iterations, rho, alpha, refine
+    [sweep]   grid, lower, upper, axes, fixed | projection, iterations, dtype
+    [recursion]  steps, grid, lower, upper, regions, seconds
+
+The classes of `sections` say what each key means. Every error is a ValueError that names the
+file and the key (or the option of the command line that set it) and what would be right.
+A robot's weights have a file of their own, with the sections [robot] and [cost].
+"""
+
+from jaxmpc.app.config.problem import Config
+from jaxmpc.app.config.reading import load, load_robot_config
+from jaxmpc.app.config.robot import RobotConfig, RobotCostSection, RobotSection
+from jaxmpc.app.config.sections import SolverSection
+from jaxmpc.app.config.states import SweepPoints, recursion_states, sweep_points
+
+__all__ = [
+    "Config",
+    "RobotConfig",
+    "RobotCostSection",
+    "RobotSection",
+    "SolverSection",
+    "SweepPoints",
+    "load",
+    "load_robot_config",
+    "recursion_states",
+    "sweep_points",
+]

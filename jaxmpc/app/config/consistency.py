@@ -1,0 +1,116 @@
+"""Checks of a configuration as a whole: keys, each good alone, must fit one another."""
+
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.app.config.problem import COMMANDS, Config
+from jaxmpc.app.config.states import mapped_axes, recursion_states, section_ends
+from jaxmpc.checks import fail
+
+
+def check(config: Config, command: str = "sweep") -> None:
+    """Raise ValueError where keys, each good alone, do not fit one another."""
+    s, limits = config.system, config.limits
+    n, m = len(s.A), len(s.B[0])
+    for key, value, count in (
+        ("system.A", s.A[0], n),
+        ("system.B", s.B, n),
+        ("system.c", s.c, n),
+        ("system.state_names", s.state_names, n),
+        ("system.state_units", s.state_units, n),
+        ("system.input_names", s.input_names, m),
+        ("system.input_units", s.input_units, m),
+        ("limits.x_min", limits.x_min, n),
+        ("limits.x_max", limits.x_max, n),
+        ("limits.u_min", limits.u_min, m),
+        ("limits.u_max", limits.u_max, m),
+        ("cost.Q", config.cost.Q, n),
+        ("cost.R", config.cost.R, m),
+        ("cost.P", None if isinstance(config.cost.P, str) else config.cost.P, n),
+    ):
+        if value is not None and len(value) != count:
+            what = f"{m} inputs" if count == m != n else f"{n} states, {m} inputs"
+            fail(key, f"has {len(value)} entries where {count} are needed", f"A, B: {what}")
+    for low, high in (("x_min", "x_max"), ("u_min", "u_max")):
+        _check_order("limits", low, high, getattr(limits, low), getattr(limits, high))
+    _check_state_limits(config)
+    _check_terminal_set(config, n)
+    if command == "sweep":
+        _check_sweep(config, n)
+    elif command == "recursion":
+        _check_recursion(config, n)
+
+
+def _check_sweep(config: Config, n: int) -> None:
+    sweep = config.sweep
+    d = len(mapped_axes(config))
+    for key, count in (("grid", d), ("lower", d), ("upper", d), ("fixed", n - d)):
+        value = getattr(sweep, key)
+        if value is not None and len(value) != count:
+            cure = f"{n} states, of which {d} are mapped (sweep.axes)"
+            fail(f"sweep.{key}", f"has {len(value)} entries where {count} are needed", cure)
+    _check_order("sweep", "lower", "upper", sweep.lower, sweep.upper)
+    if d < n and (sweep.fixed is None) != sweep.projection:
+        cure = f"Give the {n - d} other values in sweep.fixed (a slice) or projection = true"
+        both = "fixed and projection exclude each other"
+        fail("sweep.fixed", both if sweep.projection else f"{n} states, {d} mapped", cure)
+    section_ends(config, mapped_axes(config), sweep)
+
+
+def _check_recursion(config: Config, n: int) -> None:
+    recursion = config.recursion
+    for key in ("grid", "lower", "upper"):
+        value = getattr(recursion, key)
+        if value is not None and len(value) != n:
+            what = f"has {len(value)} entries where {n} are needed"
+            fail(f"recursion.{key}", what, "One for each state")
+    _check_order("recursion", "lower", "upper", recursion.lower, recursion.upper)
+    recursion_states(config)
+
+
+def _check_state_limits(config: Config) -> None:
+    limits = config.limits
+    box = limits.x_min is not None or limits.x_max is not None
+    polytope = limits.H_x is not None or limits.h_x is not None
+    if (limits.x_min is None) != (limits.x_max is None):
+        fail("limits.x_min", "x_min and x_max go together", "Use inf for a side without limit")
+    if limits.margin and not box:
+        fail("limits.margin", "given without x_min, x_max", "A Box of limits has half-widths")
+    if (limits.H_x is None) != (limits.h_x is None):
+        fail("limits.H_x", "H_x and h_x go together", "Give both: H_x x <= h_x")
+    if box and polytope:
+        fail("limits.H_x", "given beside x_min, x_max", "Write the box as rows of H_x")
+    if limits.H_x is not None and limits.h_x is not None:
+        shape = np.shape(limits.H_x)
+        if shape != (len(limits.h_x), len(config.system.A)):
+            fail("limits.H_x", f"shape {shape} for {len(limits.h_x)} rows", "One h_x a row")
+    if not (box or polytope) and config.mpc.terminal != "none":
+        fail("mpc.terminal", f'"{config.mpc.terminal}" without state limits', "Give x_min, x_max")
+
+
+def _check_terminal_set(config: Config, n: int) -> None:
+    mpc = config.mpc
+    for rows, ends in (("H_f", "h_f"), ("P_f", "level_f")):
+        if (getattr(mpc, rows) is None) != (getattr(mpc, ends) is None):
+            fail(f"mpc.{rows}", f"{rows} and {ends} go together", "Give both")
+        if getattr(mpc, rows) is not None and mpc.terminal != "none":
+            fail(f"mpc.{rows}", f'given beside terminal "{mpc.terminal}"', "Choose one")
+    if mpc.H_f is not None and mpc.P_f is not None:
+        fail("mpc.P_f", "given beside H_f", "Choose one terminal set")
+    if mpc.H_f is not None and mpc.h_f is not None:
+        if np.shape(mpc.H_f) != (len(mpc.h_f), n):
+            what = f"shape {np.shape(mpc.H_f)} for {len(mpc.h_f)} rows"
+            fail("mpc.H_f", what, f"One h_f a row, {n} columns")
+    if mpc.P_f is not None and np.shape(mpc.P_f) != (n, n):
+        fail("mpc.P_f", f"shape {np.shape(mpc.P_f)}", f"Give ({n}, {n})")
+
+
+def _check_order(
+    where: str, low: str, high: str, lower: tuple[float, ...] | None, upper: Any
+) -> None:
+    for i, (a, b) in enumerate(zip(lower or (), upper or (), strict=False)):
+        if a > b or (where in COMMANDS and a == b):
+            fail(
+                f"{where}.{low}", f"entry {i} is {a:g}, above {high} {b:g}", f"Check {low}, {high}"
+            )

@@ -1,0 +1,142 @@
+"""The problem that a TOML file describes, and the `MPC` made of it."""
+
+import json
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter
+from pydantic.dataclasses import dataclass
+
+from jaxmpc.app.config.files import to_toml
+from jaxmpc.app.config.sections import (
+    STRICT,
+    CostSection,
+    LimitsSection,
+    MPCSection,
+    RecursionSection,
+    SolverSection,
+    SweepSection,
+    SystemSection,
+    matrix,
+)
+from jaxmpc.control.named_terminal import named_terminal_set
+from jaxmpc.control.riccati import lqr
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope
+from jaxmpc.control.system import LinearSystem
+from jaxmpc.explicit.exact_penalty import exact_penalty
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.soften import soften
+from jaxmpc.qp.admm import ADMM
+
+# Commands that have a section of their own.
+COMMANDS = ("sweep", "recursion")
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Config:
+    """A problem and what is asked of it: the sections of the file."""
+
+    name: str = "mpc"
+    system: SystemSection
+    limits: LimitsSection
+    cost: CostSection
+    mpc: MPCSection
+    sweep: SweepSection = SweepSection()
+    recursion: RecursionSection = RecursionSection()
+    solver: SolverSection | None = None
+
+    def to_dict(self, command: str = "sweep") -> dict[str, Any]:
+        """Return the sections that a command reads as JSON data; infinity is "Infinity"."""
+        data = json.loads(ADAPTER.dump_json(self))
+        return {key: part for key, part in data.items() if key == command or key not in COMMANDS}
+
+    def to_toml(self) -> str:
+        """Return the text of a file that `load` reads back as this very configuration."""
+        return to_toml(ADAPTER.dump_python(self, exclude_none=True))
+
+    def build_mpc(self) -> MPC:
+        """Return the problem with hard limits. Raises ValueError as `MPC.validate` does."""
+        s, limits, cost = self.system, self.limits, self.cost
+        make = LinearSystem.from_continuous if s.continuous else LinearSystem
+        system = make(
+            A=np.asarray(s.A),
+            B=np.asarray(s.B),
+            c=None if s.c is None else np.asarray(s.c),
+            dt=s.dt,
+            state_names=s.state_names or (),
+            input_names=s.input_names or (),
+            state_units=s.state_units or (),
+            input_units=s.input_units or (),
+        )
+        states = self.state_limits()
+        if isinstance(states, Box) and limits.margin:
+            states = states.tightened(limits.margin)
+        inputs = Box(np.asarray(limits.u_min), np.asarray(limits.u_max))
+        Q, R = matrix(cost.Q), matrix(cost.R)
+        name, regulator = self.mpc.terminal, None
+        if cost.P == "lqr" or name in ("invariant", "ellipsoid"):
+            regulator = lqr(system, Q, R)
+        terminal_cost: Any = Q if cost.P == "Q" else None
+        if cost.P == "lqr":
+            terminal_cost = regulator and regulator.P
+        elif not isinstance(cost.P, str):
+            terminal_cost = matrix(cost.P)
+        terminal_set: Any = named_terminal_set(name, system, regulator, states, inputs)
+        if self.mpc.H_f is not None:
+            terminal_set = Polytope(np.asarray(self.mpc.H_f), np.asarray(self.mpc.h_f))
+        if self.mpc.P_f is not None:
+            terminal_set = Ellipsoid(np.asarray(self.mpc.P_f), np.asarray(self.mpc.level_f))
+        mpc = MPC(
+            system=system,
+            Q=Q,
+            R=R,
+            horizon=self.mpc.horizon,
+            states=states,
+            inputs=inputs,
+            terminal_cost=terminal_cost,
+            terminal_set=terminal_set,
+            constrain_initial=self.mpc.constrain_initial,
+            control_horizon=self.mpc.control_horizon,
+        )
+        mpc.validate()
+        return mpc
+
+    def build_controlled(self) -> MPC:
+        """Return the problem that the controller solves: `build_mpc` softened by cost.rho."""
+        mpc, rho = self.build_mpc(), self.cost.rho
+        if rho is None:
+            return mpc
+        return soften(mpc, exact_penalty(mpc).advised if isinstance(rho, str) else rho)
+
+    def build_solver(self) -> ADMM | None:
+        """Return the solver of [solver]; None without that section."""
+        if self.solver is None:
+            return None
+        given = self.solver.rho
+        rho = None if given is None else np.asarray(given, float)
+        return ADMM(
+            iterations=self.solver.iterations, rho=given if np.ndim(given) == 0 else rho,
+            alpha=self.solver.alpha, refine=self.solver.refine,
+        )  # fmt: skip
+
+    def state_limits(self) -> Box | Polytope | None:
+        """Return the state limits without the margin; None where there are none."""
+        limits = self.limits
+        if limits.H_x is not None:
+            return Polytope(np.asarray(limits.H_x), np.asarray(limits.h_x))
+        if limits.x_min is not None:
+            return Box(np.asarray(limits.x_min), np.asarray(limits.x_max))
+        return None
+
+    def state_range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ends (n,), (n,) of the smallest box round the state limits; ±inf without."""
+        states, n = self.state_limits(), len(self.system.A)
+        if isinstance(states, Box):
+            return np.asarray(states.lower), np.asarray(states.upper)
+        if isinstance(states, Polytope):
+            corners = np.asarray(states.vertices())
+            return corners.min(axis=0), corners.max(axis=0)
+        return np.full(n, -np.inf), np.full(n, np.inf)
+
+
+ADAPTER = TypeAdapter(Config)

@@ -1,0 +1,64 @@
+"""The TOML file with the weights of a robot's MPC: what jaxmpc tune weights --robot writes."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, FiniteFloat, TypeAdapter
+from pydantic.dataclasses import dataclass
+
+from jaxmpc.app.config.files import to_toml
+from jaxmpc.app.config.sections import STRICT, Matrix, Vector, matrix
+from jaxmpc.checks import fail
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class RobotSection:
+    """Which robot's MPC this is, with arguments of `robot_mpc` and `RobotController`."""
+
+    name: str
+    horizon: Annotated[int, Field(ge=1, strict=True)] = 20
+    margin: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.02
+    linearize: Literal["set-point", "state", "trajectory"] = "state"
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class RobotCostSection:
+    """J as in a linear problem. rho: the L1 weight of state limits, which are always soft."""
+
+    Q: Vector | Matrix
+    R: Vector | Matrix
+    P: Literal["lqr", "none"] | Matrix = "lqr"
+    rho: Annotated[FiniteFloat, Field(gt=0)] = 1e4
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class RobotConfig:
+    """The weights of a robot's MPC: the sections of the file."""
+
+    robot: RobotSection
+    cost: RobotCostSection
+
+    def weights(self, robot: Any) -> dict[str, Any]:
+        """Return Q, R and terminal_cost as `robot_mpc` takes them.
+
+        Raises ValueError where the file is of another robot, or of other sizes.
+        """
+        if self.robot.name != robot.name:
+            fail("robot.name", f"{self.robot.name!r}, asked is {robot.name!r}", "Give that --robot")
+        cost = self.cost
+        for key, value, size in (
+            ("Q", cost.Q, robot.n),
+            ("R", cost.R, robot.m),
+            ("P", cost.P, robot.n),
+        ):
+            if not isinstance(value, str) and len(value) != size:
+                fail(f"cost.{key}", f"has {len(value)} entries", f"{robot.name} needs {size}")
+        P: Any = None if cost.P == "none" else cost.P
+        terminal = P if P is None or isinstance(P, str) else matrix(P)
+        return {"Q": matrix(cost.Q), "R": matrix(cost.R), "terminal_cost": terminal}
+
+    def to_toml(self) -> str:
+        """Return the text of a file that `load_robot_config` reads back."""
+        return to_toml(ROBOT_ADAPTER.dump_python(self, exclude_none=True))
+
+
+ROBOT_ADAPTER = TypeAdapter(RobotConfig)

@@ -1,0 +1,149 @@
+"""The picture of closed loops over time: positions, velocities and inputs with their limits."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from jaxmpc.app.plots.style import EDGE, INFEASIBLE, OUTER, TERMINAL, patch
+from jaxmpc.checks import fail
+from jaxmpc.closed_loop.outcome import with_limits
+from jaxmpc.closed_loop.run import Run
+from jaxmpc.control import violation
+from jaxmpc.robots.robot import Robot
+
+RUN, BROKEN = "#0072b2", "#a50f15"
+
+
+def plot_runs(
+    run: Run, plant: Any, *, reference: Any = None, input_reference: Any = None,
+    robots: Sequence[int] | None = None,
+) -> Figure:  # fmt: skip
+    """Draw closed loops over time: a panel for each position, velocity and input.
+
+    run: of `simulate` or `simulate_many`, of a Robot or LinearPlant. Limits are lines, what lies
+    outside is grey. Orange: samples whose plan breaks soft limits (fallback). Red: limits exceeded
+    by more than 1e-6 (of the limit, if that is above 1). reference (n,), input_reference (m,):
+    set-points to draw. robots: which of the batch to draw, 24 at most by default; the title
+    counts all. Raises ValueError for robots that are not there.
+    """
+    run = run.on_host()
+    inputs, failed = np.asarray(run.inputs), np.asarray(run.fallback)
+    count, samples = inputs.shape[:2]
+    shown = np.arange(min(count, 24)) if robots is None else np.asarray(robots, int)
+    if not len(shown) or np.any((shown < 0) | (shown >= count)):
+        fail("robots", f"{robots}", f"Give indices from 0 to {count - 1}")
+    pairs = with_limits(plant, run)
+    xi, kept = pairs[0][1], [violation.kept(*pair) for pair in pairs]
+    columns = panel_columns(plant)
+    rows = max(len(panels) for _, panels in columns)
+    size = (2.6 * len(columns) + 0.2, max(1.15 * rows, 2.0) + 1.1)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(rows, len(columns), sharex=True, squeeze=False)
+    time = plant.dt * np.arange(samples + 1)
+    fallback = failed[shown]
+    for column, (title, panels) in zip(grid.T, columns, strict=True):
+        for ax in column[len(panels) :]:
+            ax.set_axis_off()
+        column[0].set_title(title, fontsize=9)
+        column[len(panels) - 1].set_xlabel("time [s]", fontsize=8)
+        column[len(panels) - 1].tick_params(labelbottom=True)
+        for ax, (kind, i, label) in zip(column, panels, strict=False):
+            values, limits, target = (
+                (inputs, plant.input_limits, input_reference) if kind
+                else (xi, plant.state_limits, reference)
+            )  # fmt: skip
+            target = None if target is None else float(np.asarray(target)[i])
+            ends = [float(np.asarray(end)[i]) for end in (limits.lower, limits.upper)]
+            broken = ~kept[kind][shown, :, i]
+            _draw_lines(ax, time, values[shown, :, i].T, fallback.T, broken.T)
+            draw_limits(ax, ends, target)
+            ax.set_ylabel(label, fontsize=8)
+            ax.tick_params(labelsize=7)
+            ax.set_xlim(0, time[-1])
+    figure.align_ylabels()
+    whole = kept[0].all(axis=(1, 2)) & kept[1].all(axis=(1, 2))
+    figure.suptitle(
+        f"{plant.name}: {count:,} closed loop{'s' * (count > 1)} of {time[-1]:g} s, {len(shown):,} "
+        f"shown\nlimits kept by {np.count_nonzero(whole):,}; fallback plans: "
+        f"{np.count_nonzero(failed):,} of {failed.size:,}",
+        fontsize=9, x=0.01, ha="left",
+    )  # fmt: skip
+    line = lambda label, **style: Line2D([], [], label=label, **style)
+    handles: list[Any] = [
+        line("one robot", color=RUN, lw=0.8),
+        patch("outside limits", INFEASIBLE),
+    ]
+    if reference is not None or input_reference is not None:
+        handles.append(line("set-point", color=TERMINAL, lw=1.0, ls=(0, (4, 2))))
+    if fallback.any():
+        handles.append(line("fallback plan", color=OUTER, lw=1.2))
+    if not all(part[shown].all() for part in kept):
+        handles.append(line("limit exceeded", color=BROKEN, marker="o", ms=3, ls=""))
+    figure.legend(
+        handles=handles, loc="outside lower left", ncols=len(handles), fontsize=8, frameon=False
+    )
+    return figure
+
+
+def panel_columns(plant: Any) -> list[tuple[str, list[tuple[int, int, str]]]]:
+    """Return the titles of the columns, each with its panels.
+
+    A panel is (0 for a state, 1 for an input; its index; its label).
+    """
+    if not isinstance(plant, Robot):
+        system = plant.system
+        states = [(0, i, label) for i, label in enumerate(system.state_labels)]
+        return [
+            ("states", states),
+            ("inputs", [(1, i, label) for i, label in enumerate(system.input_labels)]),
+        ]
+    label = lambda name, unit: (
+        f"{name}{' ' if len(name) < 8 else chr(10)}[{unit}]" if unit else name
+    )
+    half, names, units = plant.n // 2, plant.state_names, plant.state_units
+    inputs = zip(plant.input_names, plant.input_units, strict=True)
+    return [
+        ("position", [(0, i, label(names[i], units[i])) for i in range(half)]),
+        ("velocity", [(0, half + i, label(names[i], units[half + i])) for i in range(half)]),
+        ("input", [(1, i, label(*both)) for i, both in enumerate(inputs)]),
+    ]
+
+
+def _draw_lines(
+    ax: Axes, time: np.ndarray, values: np.ndarray, fallback: np.ndarray, broken: np.ndarray
+) -> None:
+    """Draw thin lines (samples, robots), on top those in fallback and points beyond limits."""
+    held = len(values) < len(time)  # inputs, each held for a period
+    if held:
+        values, broken = (np.concatenate([v, v[-1:]]) for v in (values, broken))
+    style: dict[str, Any] = {"drawstyle": "steps-post"} if held else {}
+    alpha = float(np.clip(6 / values.shape[1], 0.35, 0.9))
+    ax.plot(time, values, color=RUN, lw=0.7, alpha=alpha, **style)
+    # A sample's part of the line reaches to the next sample.
+    part = np.zeros(values.shape, bool)
+    part[:-1] |= fallback
+    part[1:] |= fallback
+    if part.any():
+        ax.plot(time, np.where(part, values, np.nan), color=OUTER, lw=0.8, **style)
+    k, robot = np.nonzero(broken)
+    ax.plot(time[k], values[k, robot], ".", color=BROKEN, ms=2, zorder=4)
+
+
+def draw_limits(ax: Axes, ends: list[float], target: float | None) -> None:
+    """Draw limits in full view, grey beyond them, and the set-point."""
+    low, high = ax.get_ylim()
+    finite = [end for end in ends if np.isfinite(end)]
+    low, high = min([low, *finite]), max([high, *finite])
+    room = 0.08 * (high - low)
+    low, high = low - room, high + room
+    for end, far in zip(ends, (low, high), strict=True):
+        if np.isfinite(end):
+            ax.axhspan(min(end, far), max(end, far), color=INFEASIBLE, lw=0, zorder=0)
+            ax.axhline(end, color=EDGE, lw=0.7, zorder=1)
+    if target is not None:
+        ax.axhline(target, color=TERMINAL, lw=0.9, ls=(0, (4, 2)), zorder=3)
+    ax.set_ylim(low, high)

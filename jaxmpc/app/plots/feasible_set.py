@@ -1,0 +1,70 @@
+"""The picture of a map of two states: labels, proved bounds and terminal set."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from jaxmpc.app.plots.style import (
+    FEASIBLE,
+    INFEASIBLE,
+    INNER,
+    OUTER,
+    TERMINAL,
+    UNDECIDED,
+    draw_polygons,
+    draw_values,
+    legend,
+    new_axes,
+    patch,
+)
+from jaxmpc.checks import fail
+from jaxmpc.feasible.map import FeasibleSetMap
+
+
+def plot_feasible_set(fmap: FeasibleSetMap, ax: Axes | None = None) -> Axes:
+    """Draw a map of two states: labels, proved boundaries and terminal set.
+
+    Samples are coloured by label. The dashed line bounds the
+    inner polytope (the convex hull of states with a checked plan), the solid one the outer
+    polytope (the intersection of certified half-spaces): the true boundary lies between, and
+    where they meet one sees a dashed line on a solid one. Without `ax` a new figure is made;
+    save it with `ax.figure.savefig(path)`. Raises ValueError for a map not of two states.
+    """
+    points, label = np.asarray(fmap.points), np.asarray(fmap.label)
+    if points.ndim != 2 or points.shape[1] != 2:
+        fail("fmap", f"maps {points.shape[-1]} states", "A picture needs 2: choose `axes`")
+    ax = new_axes() if ax is None else ax
+    draw_values(ax, points, label, {-1: INFEASIBLE, 1: FEASIBLE, 0: UNDECIDED})
+    handles: list[Any] = [
+        patch(name, colour, count)
+        for value, name, colour in (
+            (1, "feasible", FEASIBLE),
+            (-1, "infeasible", INFEASIBLE),
+            (0, "undecided", UNDECIDED),
+        )
+        if (count := np.count_nonzero(label == value))
+    ]
+    handles += draw_polygons(ax, [
+        (fmap.terminal_section, "terminal set", {"color": TERMINAL, "lw": 1.8}),
+        (fmap.outer, "outer bound", {"color": OUTER, "lw": 2.4}),
+        (fmap.inner, "inner bound", {"color": INNER, "lw": 1.4, "ls": (0, (3, 3))}),
+    ])  # fmt: skip
+    ax.set_xlabel(fmap.names[0])
+    ax.set_ylabel(fmap.names[1])
+    ax.set_title(_title(fmap), loc="left", fontsize=11)
+    legend(ax, handles)
+    return ax
+
+
+def _title(fmap: FeasibleSetMap) -> str:
+    """Return what is shown, and for more than two states how the others are treated."""
+    labels = fmap.mpc.labels if fmap.mpc.rate_limited else fmap.mpc.system.state_labels
+    others = [i for i in range(len(labels)) if i not in fmap.axes]
+    what = f"Feasible initial states, horizon N = {fmap.mpc.horizon}"
+    if not others:
+        return what
+    if fmap.fixed is None:
+        return f"{what}\nprojection: some value of {', '.join(labels[i] for i in others)}"
+    values = ", ".join(f"{labels[i]} = {float(fmap.fixed[i]):g}" for i in others)
+    return f"{what}\nslice at {values}"

@@ -1,0 +1,109 @@
+"""The picture of a robot map: what the linear model promises and what the robot does."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from jaxmpc.app.plots.style import (
+    FEASIBLE,
+    INFEASIBLE,
+    INNER,
+    OUTER,
+    TERMINAL,
+    UNDECIDED,
+    draw_polygons,
+    draw_values,
+    legend,
+    new_axes,
+    patch,
+)
+from jaxmpc.checks import fail
+from jaxmpc.robot_maps.robot_map import OUTCOMES, RobotMap
+
+BROKEN, BETTER = "#cc4b1c", "#8ccfae"
+
+
+def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
+    """Draw a map of two coordinates: what the linear model promises and what the robot did.
+
+    Blue: promise kept. Red: promise broken. Grey: no promise, and the robot fails. Green: no
+    promise, yet the robot does it. Yellow: undecided. Lines as in `plot_feasible_set`: inner and
+    outer bound of the linear feasible set, and the terminal set. The circle is the broken promise
+    deepest in that set, the cross the set-point. Without `ax` a new figure is made. Raises
+    ValueError for a map not of two coordinates.
+    """
+    points = rmap.points
+    if points.shape[1] != 2:
+        fail("rmap", f"maps {points.shape[1]} coordinates", "A picture needs 2: choose `axes`")
+    ax = new_axes(9.6) if ax is None else ax
+    colours = (FEASIBLE, BROKEN, INFEASIBLE, BETTER, UNDECIDED)
+    draw_values(ax, points, rmap.outcome, dict(enumerate(colours)))
+    handles: list[Any] = []
+    for i, (name, colour) in enumerate(zip(_words(rmap), colours, strict=True)):
+        count = np.count_nonzero(rmap.outcome == i)
+        if count:
+            handles.append(patch(name, colour, count))
+    linear = rmap.linear
+    ax.autoscale(False)
+    handles += draw_polygons(ax, [
+        (linear.terminal_section, "terminal set", {"color": TERMINAL, "lw": 1.6}),
+        (linear.outer, "linear feasible set, outer bound", {"color": OUTER, "lw": 2.4}),
+        (linear.inner, "linear feasible set, inner bound",
+         {"color": INNER, "lw": 1.4, "ls": (0, (3, 3))}),
+    ])  # fmt: skip
+    marks: list[tuple[Any, str, dict[str, Any]]] = [(
+        rmap.set_point[list(linear.axes)], "set-point",
+        {"marker": "+", "ms": 9, "mew": 1.6, "color": "black"},
+    )]  # fmt: skip
+    worst = rmap.worst()
+    if worst is not None:
+        name = f"deepest broken promise, fails after {rmap.first_loss[worst] * rmap.robot.dt:.3g} s"
+        marks.append(
+            (points[worst], name, {"marker": "o", "ms": 6, "mfc": "white", "mec": "black"})
+        )
+    for (x, y), name, style in marks:
+        ax.plot(x, y, ls="", zorder=6, **style)
+        handles.append(Line2D([], [], ls="", label=name, **style))
+    ax.set_xlabel(rmap.names[0])
+    ax.set_ylabel(rmap.names[1])
+    ax.set_title(_title(rmap), loc="left", fontsize=11)
+    legend(ax, handles)
+    return ax
+
+
+def _words(rmap: RobotMap) -> tuple[str, ...]:
+    """Return the names of the outcomes in the words of the claim."""
+    if rmap.claim == "limits":
+        words = (
+            "promise kept: limits kept", "promise broken: beyond a limit",
+            "infeasible, robot beyond a limit", "infeasible, robot keeps limits", "undecided",
+        )  # fmt: skip
+    else:
+        words = (
+            "promise kept: a plan at each sample", "promise broken: plans run out",
+            "lost on the linear model, and the robot",
+            "lost on the linear model, not the robot", "undecided",
+        )  # fmt: skip
+    assert len(words) == len(OUTCOMES) + 1
+    return words
+
+
+def _title(rmap: RobotMap) -> str:
+    """Return which robot, how long, and the values of the coordinates that are not mapped."""
+    name = rmap.robot.name
+    mpc = rmap.linear.mpc
+    what = {
+        "limits": "is a feasible state safe on the robot?",
+        "recursion": "does the robot keep having plans?",
+    }[rmap.claim]
+    first = f"{name}: {what} {rmap.seconds:g} s, horizon N = {mpc.horizon} of {rmap.robot.dt:g} s"
+    labels = mpc.system.state_labels
+    others = [i for i in range(len(labels)) if i not in rmap.linear.axes]
+    fixed = rmap.linear.fixed
+    if not others or fixed is None:
+        return first
+    values = [f"{labels[i]} = {fixed[i]:.4g}" for i in others]
+    shown = ", ".join(values) if len(values) <= 4 else f"{len(values)} other coordinates as fixed"
+    return f"{first}\nslice at {shown}"

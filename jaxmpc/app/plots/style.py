@@ -1,0 +1,92 @@
+"""Colours and drawing that the pictures share. Nothing here shows a window."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from jaxmpc.control.sets import Polytope
+
+# Okabe and Ito's palette: told apart with any colour vision, and in grey by lightness.
+INFEASIBLE, FEASIBLE, UNDECIDED = "#dddcd8", "#9fcbe6", "#f0d024"
+OUTER, INNER, TERMINAL = "#d55e00", "#00486b", "#006f52"
+EDGE = "#8a8a8a"
+
+
+def new_axes(width: float = 8.4) -> Axes:
+    """Return the axes of a new figure, with room for a legend on the right."""
+    return Figure(figsize=(width, 4.8), layout="constrained").add_subplot()
+
+
+def save(ax: Axes, path: Path) -> None:
+    """Write the figure of these axes, cut to its content."""
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    figure.savefig(path, dpi=150, bbox_inches="tight", pad_inches=0.15)
+
+
+def patch(name: str, colour: str, count: Any = None) -> Patch:
+    """Return a legend entry for an area, with the number of samples that it stands for."""
+    label = name if count is None else f"{name} ({count:,})"
+    return Patch(facecolor=colour, edgecolor=EDGE, linewidth=0.6, label=label)
+
+
+def legend(ax: Axes, handles: list[Any]) -> None:
+    """Put the legend to the right of the axes."""
+    ax.legend(
+        handles=handles, loc="upper left", bbox_to_anchor=(1.02, 1.0), frameon=False,
+        handlelength=2.4,
+    )  # fmt: skip
+
+
+def draw_polygons(
+    ax: Axes, polygons: list[tuple[Callable[[], Polytope | None], str, dict[str, Any]]]
+) -> list[Any]:
+    """Draw outlines of (polytope, name, line style) and return their legend entries."""
+    handles = []
+    for make, name, line in polygons:
+        corners = ring(make)
+        if len(corners):
+            ax.plot(*corners.T, solid_joinstyle="round", **line)
+            handles.append(Line2D([], [], label=name, **line))
+    return handles
+
+
+def draw_values(ax: Axes, points: np.ndarray, value: np.ndarray, colours: dict[int, str]) -> None:
+    """Colour points (B, 2) by value (B,): an image where they are a grid, else small markers.
+
+    The last of `colours` lies on top.
+    """
+    x, y = (np.unique(column) for column in points.T)
+    is_grid = len(x) * len(y) == len(points) and min(len(x), len(y)) > 1
+    if is_grid and np.array_equal(points[:, 0], np.repeat(x, len(y))):
+        half = np.array([x[-1] - x[0], y[-1] - y[0]]) / (2 * np.array([len(x) - 1, len(y) - 1]))
+        extent = (x[0] - half[0], x[-1] + half[0], y[0] - half[1], y[-1] + half[1])
+        ax.imshow(
+            value.reshape(len(x), len(y)).T,
+            cmap=ListedColormap([colour for _, colour in sorted(colours.items())]),
+            vmin=min(colours), vmax=max(colours), extent=extent, origin="lower", aspect="auto",
+            interpolation="nearest",
+        )  # fmt: skip
+        return
+    size = float(np.clip(2e4 / len(points), 1.0, 30.0))
+    for key, colour in colours.items():
+        x, y = points[value == key].T
+        ax.scatter(x, y, s=size, color=colour, linewidths=0)
+    ax.margins(0.02)
+
+
+def ring(make: Callable[[], Polytope | None]) -> np.ndarray:
+    """Return the vertices of a polygon, the first again at the end; (0, 2) if there is none."""
+    try:
+        polytope = make()
+        corners = np.zeros((0, 2)) if polytope is None else polytope.vertices()
+    except ValueError:  # not bounded yet, or without interior: nothing to draw
+        return np.zeros((0, 2))
+    return np.vstack([corners, corners[:1]])

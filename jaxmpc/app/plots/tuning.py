@@ -1,0 +1,304 @@
+"""Plots of tuning: losses and weights by step, closed loops, maps and penalties."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
+
+from jaxmpc.app.plots.closed_loops import draw_limits, panel_columns
+from jaxmpc.app.plots.style import INFEASIBLE, TERMINAL, ring
+from jaxmpc.checks import fail
+from jaxmpc.closed_loop.outcome import coordinates
+from jaxmpc.closed_loop.run import Run
+from jaxmpc.feasible.map import FeasibleSetMap
+from jaxmpc.tuning.descent import Descent
+from jaxmpc.tuning.result import TuningRun
+
+# Okabe and Ito, as in `plots`.
+_BEFORE, _AFTER, _REJECTED, _BEST = "#d55e00", "#0072b2", "#a50f15", "#006f52"
+_FRACTIONS = (
+    ("unsolved", "plans not solved", "#0072b2", "-"),
+    ("infeasible", "plans proved infeasible", "#a50f15", "--"),
+    ("fallback", "plans that break soft limits", "#e69f00", "-"),
+    ("violation", "loops beyond the limits", "#006f52", ":"),
+)
+# Lines of a panel that get a name each; more are named by the groups they belong to.
+_NAMED = 10
+# Rows of a block.
+_DASHES: tuple[Any, ...] = ("-", (0, (4, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)))
+
+
+def plot_tuning(
+    history: Descent, weights: Mapping[str, Mapping[str, np.ndarray]], title: str = ""
+) -> Figure:
+    """Draw a `Descent` of weights in four panels over its T steps.
+
+    Loss of the steps and of the validation loops, each relative to its first value where that is
+    positive, the best of them marked; norm of the gradient;
+    `weights`, group → entry → positive values (T+1,), relative to the start; fractions of
+    the validation plans and loops where something went wrong. Red crosses: rejected steps.
+    """
+    figure = Figure(figsize=(11, 6.6), layout="constrained")
+    ((top, norm), (ratio, counts)) = figure.subplots(2, 2)
+    every, steps, best = np.arange(history.steps + 1), np.arange(history.steps), history.best
+    loss, validation = history.loss, history.validation
+    # Training and validation loops differ: what they share is by how much they fall.
+    relative = validation[0] > 0 and len(loss) > 0 and loss[0] > 0
+    if relative:
+        loss, validation = loss / loss[0], validation / validation[0]
+    top.plot(steps, loss, color="#8a8a8a", lw=1, label="training loops of the step")
+    top.plot(every, validation, color=_AFTER, lw=1.6, label="validation loops")
+    label = f"best: {history.validation[best]:.6g} at step {best}"
+    top.plot(best, validation[best], "o", color=_BEST, ms=6, label=label, zorder=4)
+    norm.plot(steps, history.gradient_norm, color=_AFTER, lw=1.2)
+    rejected = steps[~history.accepted]
+    for ax in (top, norm):
+        if len(rejected):
+            ax.plot(
+                rejected, np.full(len(rejected), 0.04), "x", color=_REJECTED, ms=5, ls="",
+                transform=ax.get_xaxis_transform(), label=f"rejected steps ({len(rejected)})",
+            )  # fmt: skip
+    _scale(top, loss, validation)
+    _scale(norm, history.gradient_norm)
+    _draw_weights(ratio, every, weights)
+    highest = 0.0
+    for key, label, colour, dashes in _FRACTIONS:
+        values = history.validation_numbers.get(key)
+        if values is not None:
+            counts.plot(every, 100 * values, color=colour, ls=dashes, lw=1.4, label=label)
+            highest = max(highest, 100 * float(np.nanmax(values, initial=0.0)))
+    highest = max(highest, 1.0)
+    counts.set_ylim(-0.03 * highest, 1.35 * highest if highest < 75 else 105)
+    for ax, name in (
+        (top, "loss relative to the start" if relative else "loss"),
+        (norm, "norm of the gradient"),
+        (ratio, "weight relative to the start"),
+        (counts, "fraction in the validation loops [%]"),
+    ):
+        ax.set_xlabel("step")
+        ax.set_ylabel(name)
+        ax.set_xlim(-0.02 * max(1, history.steps), 1.02 * max(1, history.steps))
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        ax.grid(color="#ececec", lw=0.7)
+        ax.set_axisbelow(True)
+        if ax is not ratio and (ax is not norm or len(rejected)):
+            ax.legend(fontsize=8, frameon=False)
+    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    return figure
+
+
+def _scale(ax: Axes, *columns: np.ndarray) -> None:
+    """A logarithmic axis where values are positive and range over more than a factor of 5."""
+    values = np.concatenate(columns)
+    values = values[np.isfinite(values)]
+    if len(values) and values.min() > 0 and values.max() > 5 * values.min():
+        _logarithmic(ax, values)
+    else:
+        ax.ticklabel_format(axis="y", useOffset=False)
+
+
+def _logarithmic(ax: Axes, values: np.ndarray) -> None:
+    """With ticks at 1, 2, 5 in plain numbers where powers of ten would leave too few."""
+    ax.set_yscale("log")
+    decades = np.log10(values.max() / values.min())
+    if decades < 3:
+        low, high = values.min(), values.max()
+        ax.set_ylim(low / 1.15, high * 1.15)
+        ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+        ax.yaxis.set_minor_locator(LogLocator(subs=(), numticks=2))
+
+
+def _draw_weights(
+    ax: Axes, steps: np.ndarray, weights: Mapping[str, Mapping[str, np.ndarray]]
+) -> None:
+    """Each weight over its start; a colour a line, or a colour a group where there are many."""
+    count = sum(len(entries) for entries in weights.values())
+    colours = matplotlib.colormaps["tab10"].colors  # type: ignore[attr-defined]
+    i, handles, ratios = 0, [], []
+    for g, (group, entries) in enumerate(weights.items()):
+        for name, values in entries.items():
+            colour = colours[(i if count <= _NAMED else g) % len(colours)]
+            ratios.append(values / values[0])
+            ax.plot(steps, ratios[-1], color=colour, lw=1.3, alpha=1 if count <= _NAMED else 0.6)
+            if count <= _NAMED:
+                handles.append(Line2D([], [], color=colour, label=f"{group} {name}".strip()))
+            i += 1
+        if count > _NAMED:
+            colour = colours[g % len(colours)]
+            label = f"{group} ({len(entries)})" if len(entries) > 1 else group
+            handles.append(Line2D([], [], color=colour, label=label))
+    ax.axhline(1, color="#8a8a8a", lw=0.7, zorder=0)
+    flat = np.concatenate([*ratios, np.ones(1)])
+    flat = flat[np.isfinite(flat) & (flat > 0)]
+    if flat.max() > 5 * flat.min():
+        _logarithmic(ax, flat)
+    else:
+        low, high = min(flat.min(), 0.98), max(flat.max(), 1.02)
+        ax.set_ylim(low - 0.06 * (high - low), high + 0.06 * (high - low))
+        ax.ticklabel_format(axis="y", useOffset=False)
+    ax.legend(
+        handles=handles, fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.02)
+    )
+
+
+def plot_before_after(
+    before: Run, after: Run, plant: Any, *, reference: Any = None, input_reference: Any = None,
+    loops: Sequence[int] | None = None, title: str = "",
+) -> Figure:  # fmt: skip
+    """Draw the same closed loops before and after tuning: a panel a position, velocity and input.
+
+    before, after: of `simulate_many` from the same starts, of a Robot or LinearPlant, whose limits
+    are lines, grey outside. reference (n,), input_reference (m,): set-points to draw. loops: which
+    ones; None: 6 spread over all. Raises ValueError for loops that are not there.
+    """
+    before, after = before.on_host(), after.on_host()
+    count, samples = np.shape(before.inputs)[:2]
+    shown = np.unique(np.linspace(0, count - 1, min(count, 6)).astype(int))
+    shown = shown if loops is None else np.asarray(loops, int)
+    if not len(shown) or np.any((shown < 0) | (shown >= count)):
+        fail("loops", f"{loops}", f"Give indices from 0 to {count - 1}")
+    time = plant.dt * np.arange(samples + 1)
+    values = [
+        (coordinates(plant, run.states)[shown], np.asarray(run.inputs, float)[shown])
+        for run in (before, after)
+    ]
+    columns = panel_columns(plant)
+    rows = max(len(panels) for _, panels in columns)
+    figure = Figure(
+        figsize=(3.4 * len(columns) + 0.2, max(1.35 * rows, 2.4) + 1.0), layout="constrained"
+    )
+    grid = figure.subplots(rows, len(columns), sharex=True, squeeze=False)
+    for column, (name, panels) in zip(grid.T, columns, strict=True):
+        for ax in column[len(panels) :]:
+            ax.set_axis_off()
+        column[0].set_title(name, fontsize=9)
+        column[len(panels) - 1].set_xlabel("time [s]", fontsize=8)
+        column[len(panels) - 1].tick_params(labelbottom=True)
+        for ax, (kind, i, label) in zip(column, panels, strict=False):
+            limits, target = (
+                (plant.input_limits, input_reference) if kind else (plant.state_limits, reference)
+            )
+            # Broad below narrow: where both are the same both are seen.
+            for found, colour, width in zip(values, (_BEFORE, _AFTER), (2.2, 1.0), strict=True):
+                lines = found[kind][..., i].T
+                lines = np.concatenate([lines, lines[-1:]]) if kind else lines
+                style: dict[str, Any] = {"drawstyle": "steps-post"} if kind else {}
+                ax.plot(time, lines, color=colour, lw=width, alpha=0.9, **style)
+            ends = [float(np.asarray(end)[i]) for end in (limits.lower, limits.upper)]
+            draw_limits(ax, ends, None if target is None else float(np.asarray(target)[i]))
+            ax.set_ylabel(label, fontsize=8)
+            ax.tick_params(labelsize=7)
+            ax.set_xlim(0, time[-1])
+    figure.align_ylabels()
+    handles: list[Any] = [
+        Line2D([], [], color=_BEFORE, lw=2.2, label="before"),
+        Line2D([], [], color=_AFTER, lw=1.0, label="after"),
+        Patch(facecolor=INFEASIBLE, edgecolor="#8a8a8a", linewidth=0.6, label="outside limits"),
+    ]
+    if reference is not None or input_reference is not None:
+        style = {"color": TERMINAL, "lw": 1.0, "ls": (0, (4, 2))}
+        handles.append(Line2D([], [], label="set-point", **style))
+    figure.suptitle(title, fontsize=9, x=0.01, ha="left")
+    figure.legend(
+        handles=handles, loc="outside lower left", ncols=len(handles), fontsize=8, frameon=False
+    )
+    return figure
+
+
+def plot_maps(before: FeasibleSetMap, after: FeasibleSetMap) -> Figure:
+    """Draw the proved inner bounds of the feasible sets of two states, before and after."""
+    figure = Figure(figsize=(7.6, 4.6), layout="constrained")
+    ax = figure.add_subplot()
+    for fmap, name, colour, dashes in (
+        (before, "before", _BEFORE, (0, (4, 2))),
+        (after, "after", _AFTER, "-"),
+    ):
+        corners = ring(fmap.inner)
+        low, high = fmap.volume_bounds()
+        if len(corners):
+            label = f"{name}: area {low:.5g} to {high:.5g}"
+            ax.plot(*corners.T, color=colour, ls=dashes, lw=1.6, label=label)
+    ax.set_xlabel(before.names[0])
+    ax.set_ylabel(before.names[1])
+    title = f"Feasible initial states, horizon N = {before.mpc.horizon}, inner bounds"
+    ax.set_title(title, loc="left", fontsize=11)
+    ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), frameon=False)
+    return figure
+
+
+def plot_penalties(
+    run: TuningRun, before: np.ndarray, after: np.ndarray, eps: float, title: str = ""
+) -> Figure:
+    """Draw the penalties of `tune_penalties` by kind of row and stage, and the residuals.
+
+    before, after (B,): largest residual of each validation state with the solver that was given
+    and with the tuned one. eps: what counts as solved. Rows of a kind are drawn over the step k
+    of the horizon at which they hold, those of one step by their number.
+    """
+    blocks = [block for block in run.settings["blocks"] if block[2] and block[1]]
+    figure = Figure(figsize=(max(3.0 * (len(blocks) + 1.4), 8.0), 4.4), layout="constrained")
+    axes = figure.subplots(
+        1, len(blocks) + 1, width_ratios=[*(1.0,) * len(blocks), 1.5], squeeze=False
+    )[0]
+    rows = sum(len(steps) * size for _, steps, size in blocks)
+    rho = np.asarray(run.solver.rho, float)
+    rho = np.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, rows))
+    shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.85, len(rho)))
+    first = 0
+    for ax, (kind, steps, size) in zip(axes, blocks, strict=False):
+        block = rho[:, first : first + len(steps) * size].reshape(len(rho), len(steps), size)
+        first += len(steps) * size
+        for stage, colour in zip(block, shades, strict=True):
+            if len(steps) == 1:
+                ax.plot(np.arange(1, size + 1), stage[0], "o", ms=4, color=colour)
+            for i in range(size if len(steps) > 1 else 0):
+                ax.plot(steps, stage[:, i], color=colour, ls=_DASHES[i % 4], lw=1.4)
+        ax.set_yscale("log")
+        ax.set_title(kind if len(steps) > 1 else f"{kind}, k = {steps[0]}", fontsize=10)
+        ax.set_xlabel("step k" if len(steps) > 1 else "row")
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
+        ax.grid(color="#ececec", lw=0.7)
+    low, high = rho.min() / 1.5, rho.max() * 1.5
+    for ax in axes[:-1]:
+        _logarithmic(ax, np.array([low, high]))
+        ax.set_ylim(min(low, 0.5), max(high, 2.0))
+        ax.tick_params(labelleft=bool(ax is axes[0]))
+        ax.axhline(1.0, color="#8a8a8a", lw=0.7, zorder=0)
+    axes[0].set_ylabel("penalty rho, scaled rows")
+    stages = [
+        Line2D([], [], color=colour, label=f"stage {i + 1}") for i, colour in enumerate(shades)
+    ]
+    widest = max((size for _, steps, size in blocks if len(steps) > 1), default=1)
+    stages += [
+        Line2D([], [], color="#8a8a8a", ls=dashes, label=f"row {i + 1}")
+        for i, dashes in enumerate(_DASHES[:widest])
+        if widest > 1
+    ]  # fmt: skip
+    figure.legend(handles=stages, loc="outside lower left", ncols=8, fontsize=8, frameon=False)
+    last = axes[-1]
+    for values, name, colour in ((before, "before", _BEFORE), (after, "after", _AFTER)):
+        # What is not finite stays unsolved at the right end.
+        values = np.sort(np.where(np.isfinite(values), values, np.inf))
+        fraction = 100 * np.arange(1, len(values) + 1) / len(values)
+        solved = 100 * np.mean(values <= eps)
+        last.step(
+            np.maximum(values, 1e-17), fraction, where="post", color=colour, lw=1.6,
+            label=f"{name}: {solved:.1f} % ≤ {eps:g}",
+        )  # fmt: skip
+    last.axvline(eps, color="#8a8a8a", lw=0.9, ls=(0, (4, 2)))
+    last.set_xscale("log")
+    last.set_ylim(0, 103)
+    last.set_xlabel("largest residual")
+    last.set_ylabel("fraction of validation states [%]")
+    last.grid(color="#ececec", lw=0.7)
+    last.set_axisbelow(True)
+    last.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
+    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    return figure

@@ -1,0 +1,29 @@
+"""Closed loops: plant and controller together, one sample after the other.
+
+simulate, simulate_many    one closed loop, or many chunk by chunk -> Run
+lyapunov_decrease          change of the optimal value along a run
+evaluate_runs              limits kept, target reached, when and at what cost -> Outcome
+RobotController            an MPC with the linear models of a robot
+robot_mpc                  the MPC of a robot, from the limits of its model
+LinearFeedback             LQR or PD with clipping, to compare with
+"""
+
+from jaxmpc.closed_loop.linear_feedback import LinearFeedback
+from jaxmpc.closed_loop.outcome import Outcome, evaluate_runs
+from jaxmpc.closed_loop.robot_controller import RobotController
+from jaxmpc.closed_loop.robot_mpc import robot_mpc
+from jaxmpc.closed_loop.run import Run, lyapunov_decrease
+from jaxmpc.closed_loop.simulate import simulate
+from jaxmpc.closed_loop.simulate_many import simulate_many
+
+__all__ = [
+    "LinearFeedback",
+    "Outcome",
+    "RobotController",
+    "Run",
+    "evaluate_runs",
+    "lyapunov_decrease",
+    "robot_mpc",
+    "simulate",
+    "simulate_many",
+]

@@ -1,0 +1,90 @@
+"""LinearFeedback: LQR or PD control with clipped inputs, to compare an MPC with."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import fail, require_finite, require_shape
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.solve import limited
+from jaxmpc.qp.precision import floating_dtype, matmul
+from jaxmpc.qp.status import Status
+
+
+class NoPlan(NamedTuple):
+    """The plan of a law that makes none: cost NaN, status NOT_RUN, no slack."""
+
+    cost: Array
+    status: Array
+    slack: Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class LinearFeedback:
+    """The law u = clip(s + K (ξ − r)): linear state feedback inside the input limits of `mpc`.
+
+    mpc: weights, limits and horizon by which runs are evaluated, as for a Controller. K (m, n).
+    plant: a Robot, whose coordinates are ξ and whose limits count; None: ξ = x. References r (n,)
+    and s (m,), or rows of them of which the first counts, as in `Controller`; zero for none.
+    """
+
+    mpc: MPC
+    K: Any
+    plant: Any = None
+
+    def validate(self) -> None:
+        """Raise ValueError unless K is finite and (m, n)."""
+        n, m = self.mpc.system.n, self.mpc.system.m
+        require_shape("K", self.K, (m, n), "u = K x, one row an input")
+        require_finite("K", self.K)
+
+    @property
+    def dtype(self) -> Any:
+        """Return the precision of the inputs."""
+        return floating_dtype((self.mpc.Q, self.mpc.R, self.K))
+
+    @property
+    def state_size(self) -> int:
+        """Return the length of the state x."""
+        return self.mpc.system.n if self.plant is None else self.plant.state_size
+
+    @property
+    def limits(self) -> Any:
+        """Return the state limits by which a closed loop is evaluated."""
+        return self.mpc.states if self.plant is None else self.plant.state_limits
+
+    def coordinates(self, x: Array) -> Array:
+        """Return the coordinates ξ (n,) of a state."""
+        return x if self.plant is None else self.plant.coordinates(x)
+
+    def start(self, x: Array, input_reference: Any = None) -> tuple:
+        """Return the first carry, which is empty."""
+        return ()
+
+    def __call__(
+        self, x: Any, carry: Any = None, reference: Any = None, *, input_reference: Any = None,
+        previous_input: Any = None,
+    ) -> tuple[Array, tuple, NoPlan]:  # fmt: skip
+        """Return the input (m,) at the state x, an empty carry, and no plan."""
+        self.validate()
+        if np.shape(x) != (self.state_size,):
+            fail("x", f"shape {np.shape(x)}", f"Give one state ({self.state_size},)")
+        x = jnp.asarray(x, self.dtype)
+        first = lambda v, size: (
+            jnp.zeros(size, x.dtype) if v is None
+            else jnp.asarray(v, x.dtype) if np.ndim(v) == 1 else jnp.asarray(v, x.dtype)[0]
+        )  # fmt: skip
+        r = first(reference, self.mpc.system.n)
+        u = first(input_reference, self.mpc.system.m)
+        u = u + matmul(jnp.asarray(self.K, x.dtype), self.coordinates(x) - r)
+        u = limited(self.mpc.inputs, u)
+        nothing = NoPlan(
+            jnp.asarray(jnp.nan, x.dtype), jnp.asarray(Status.NOT_RUN, jnp.int32),
+            jnp.zeros((1, 0), x.dtype),
+        )  # fmt: skip
+        return u, (), nothing

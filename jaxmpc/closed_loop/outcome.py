@@ -1,0 +1,93 @@
+"""The outcome of closed loops: limits kept, target reached, after which time, at which cost."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxmpc.checks import fail, require_finite, require_shape
+from jaxmpc.closed_loop.run import Run
+from jaxmpc.control.sets import Box
+from jaxmpc.control.system import host_array
+from jaxmpc.control.violation import excess, kept
+from jaxmpc.qp.status import Status
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What B closed loops of T samples achieved, from their states and inputs, in float64.
+
+    coordinates (B, T+1, n): the states in the coordinates of the limits. state_excess
+    (B, T+1, n), input_excess (B, T, m): by how much each limit is exceeded, in its unit; 0 inside,
+    NaN where the run is not finite. band (n,): largest distance that counts as at the target.
+    The other fields have one entry for each loop, (B,):
+      kept          all limits of states and inputs hold at all samples (to `violation.TOLERANCE`)
+      reached       the last state is within the band of the target, in every coordinate
+      settling      time in s from which on every coordinate stays within the band; inf: never
+      cost          sum of the stage costs
+      plans_valid   every plan was SOLVED and kept its limits along its horizon (no fallback)
+    """
+
+    coordinates: np.ndarray
+    state_excess: np.ndarray
+    input_excess: np.ndarray
+    band: np.ndarray
+    kept: np.ndarray
+    reached: np.ndarray
+    settling: np.ndarray
+    cost: np.ndarray
+    plans_valid: np.ndarray
+
+    @property
+    def success(self) -> np.ndarray:
+        """Return whether limits were kept and the target was reached, (B,)."""
+        return self.kept & self.reached
+
+
+def evaluate_runs(run: Run, plant: Any, reference: Any, *, tolerance: float = 0.02) -> Outcome:
+    """Evaluate closed loops that were to come to rest at `reference`.
+
+    run: from `simulate` or `simulate_many`, with or without a batch axis. plant: the Robot or
+    LinearPlant whose limits count, without margin. reference (n,): the set-point, in coordinates.
+    tolerance: the band, as a fraction of each coordinate's `Box.half_widths`. Raises ValueError
+    for other shapes.
+    """
+    run = run.on_host()
+    require_shape("reference", reference, (plant.n,), "The set-point, in coordinates")
+    require_finite("reference", reference)
+    if not tolerance > 0:
+        fail("tolerance", f"{tolerance}", "Give a positive fraction")
+    limits = with_limits(plant, run)
+    xi, band = limits[0][1], tolerance * plant.state_limits.half_widths()
+    inside = (np.abs(xi - host_array("reference", reference)) <= band).all(axis=2)
+    # Samples before the last run of samples inside: T + 1 less the length of that run.
+    before = inside.shape[1] - np.cumprod(inside[:, ::-1], axis=1).sum(axis=1)
+    status, fallback = np.asarray(run.status), np.asarray(run.fallback)
+    return Outcome(
+        coordinates=xi, state_excess=excess(*limits[0]), input_excess=excess(*limits[1]),
+        band=band, kept=np.all([kept(*pair).all(axis=(1, 2)) for pair in limits], axis=0),
+        reached=inside[:, -1], settling=np.where(inside[:, -1], before * plant.dt, np.inf),
+        cost=np.asarray(run.stage_cost, float).sum(axis=1),
+        plans_valid=((status == Status.SOLVED) & ~fallback).all(axis=1),
+    )  # fmt: skip
+
+
+def with_limits(plant: Any, run: Run) -> list[tuple[Box, np.ndarray]]:
+    """Return (limits, values) of the states, as coordinates, and of the inputs of a run, in
+    float64 on the host."""
+    on_host = lambda box: jax.tree.map(lambda v: np.asarray(v, float), box)
+    return [
+        (on_host(plant.state_limits), coordinates(plant, run.states)),
+        (on_host(plant.input_limits), np.asarray(run.inputs, float)),
+    ]
+
+
+def coordinates(plant: Any, states: Any) -> np.ndarray:
+    """Return the coordinates (..., n) of plant states (..., nq + nv), in float64."""
+    states = np.asarray(states, float)
+    if plant.n == plant.state_size:  # no orientation: the same numbers
+        return states
+    with jax.enable_x64(True):
+        flat = jax.vmap(plant.coordinates)(states.reshape(-1, states.shape[-1]))
+    return np.asarray(flat).reshape(*states.shape[:-1], plant.n)

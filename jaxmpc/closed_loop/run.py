@@ -1,0 +1,60 @@
+"""Run: what is recorded of a closed loop at each sample."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.qp.status import Status
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Run:
+    """A closed loop of T samples: x_{t+1} = plant(x_t, u_t) + w_t, u_t the first input of a plan.
+
+    states (T+1, n), inputs (T, m). Of each plan: cost (T,), the optimal value V_N(x_t) (without
+    ½), and status (T,). stage_cost (T,): (x_t − r_t)'Q(x_t − r_t) + (u_t − s_t)'R(u_t − s_t) with
+    the references r, s, zero for none. violation (T+1,): the most by which x_t exceeds a row of
+    the state limits, in the units of the row; 0 where it keeps them all. slack (T, p): violations
+    of the soft rows at k = 0 of each plan, hence of what happens. fallback (T,): whether the plan
+    breaks soft rows anywhere on its horizon by more than 1e-6 (1e-3 in float32): what is done
+    where the limits cannot all be kept. Batches have their axes in front. For robots states are
+    the plant's, (qpos, qvel), and x in costs and limits means their coordinates.
+    """
+
+    states: Array
+    inputs: Array
+    cost: Array
+    status: Array
+    stage_cost: Array
+    violation: Array
+    slack: Array
+    fallback: Array
+
+    @property
+    def feasible_steps(self) -> Array:
+        """Samples before the first plan that is not SOLVED: T if all are."""
+        solved = jnp.asarray(self.status) == Status.SOLVED
+        return jnp.sum(jnp.cumprod(solved, axis=-1), axis=-1)
+
+    def on_host(self) -> "Run":
+        """Return the run as NumPy arrays with a batch axis in front, added where there is none."""
+        run = jax.tree.map(np.asarray, self)
+        return run if run.states.ndim == 3 else jax.tree.map(lambda v: v[None], run)
+
+
+def lyapunov_decrease(run: Run) -> Array:
+    """V_N(x_{t+1}) − V_N(x_t) + l(x_t, u_t) along the loop, (T−1,), l the stage cost.
+
+    Nowhere positive where the optimal value is a Lyapunov function: for the nominal plant, inputs
+    free at each step and no weights on their rates or of single stages (which the stage cost here
+    leaves out),
+    references at an equilibrium, a terminal set that a law u = Kx keeps invariant inside the
+    limits, and a terminal cost P ⪰ Q + K'RK + (A+BK)'P(A+BK) (Mayne, Rawlings, Rao & Scokaert
+    2000, Automatica 36, section 3.3; the lesson's Theorem 3). Says nothing from
+    `run.feasible_steps` on.
+    """
+    return run.cost[..., 1:] - run.cost[..., :-1] + run.stage_cost[..., :-1]

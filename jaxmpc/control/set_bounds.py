@@ -1,0 +1,27 @@
+"""Bounds of each coordinate over a set, on the host in float64."""
+
+import numpy as np
+
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope
+
+
+def set_bounds(set_: Box | Polytope | Ellipsoid | None, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper bounds (n,) of each coordinate on a set; ±inf for None.
+
+    Those of a Box are exact. Those of a Polytope, found by linear programs, and of an Ellipsoid are
+    moved outwards by a part in 10⁶.
+    """
+    if set_ is None:
+        return np.full(n, -np.inf), np.full(n, np.inf)
+    if isinstance(set_, Box):
+        return np.asarray(set_.lower, np.float64), np.asarray(set_.upper, np.float64)
+    if isinstance(set_, Ellipsoid):
+        inverse = np.linalg.inv(np.asarray(set_.P, np.float64))
+        upper = np.sqrt(np.asarray(set_.level, np.float64) * np.diag(inverse))
+        lower = -upper
+    else:
+        upper = np.array([set_.support(row) for row in np.eye(n)])
+        lower = -np.array([set_.support(row) for row in -np.eye(n)])
+    size = [np.where(np.isfinite(v), np.abs(v), 0.0) for v in (lower, upper)]
+    margin = 1e-6 * (1e-6 + np.maximum(*size))
+    return lower - margin, upper + margin

@@ -1,0 +1,20 @@
+"""The explicit MPC law: piecewise affine in the state, and what follows from its pieces.
+
+critical_regions     all regions on which the plan is affine -> CriticalRegions of Region
+exact_penalty        the least weight on slacks that keeps limits that can be kept -> ExactPenalty
+Law                  plans and the affine piece of the law at given states -> AffinePiece
+"""
+
+from jaxmpc.explicit.exact_penalty import ExactPenalty, exact_penalty
+from jaxmpc.explicit.law import AffinePiece, Law
+from jaxmpc.explicit.regions import CriticalRegions, Region, critical_regions
+
+__all__ = [
+    "AffinePiece",
+    "CriticalRegions",
+    "ExactPenalty",
+    "Law",
+    "Region",
+    "critical_regions",
+    "exact_penalty",
+]

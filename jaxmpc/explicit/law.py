@@ -1,0 +1,150 @@
+"""The MPC law at given states: plans, next states, and the affine piece of the law there.
+
+The optimal plan is piecewise affine in the state. Its piece at a state is found from the active
+rows of the plan there, as implicit differentiation of the optimality conditions does, and holds
+on a polytope, the critical region.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from scipy.optimize import lsq_linear, nnls
+
+from jaxmpc.control.sets import Box, unit_rows
+from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
+from jaxmpc.mpc.many import solve_many
+from jaxmpc.mpc.problem import MPC, Plan
+from jaxmpc.qp.admm import ADMM
+
+# Residuals to which plans are solved.
+EPS = 1e-8
+# Slack, and error of a reconstructed plan, that count as zero; relative to the data.
+TOUCHING, MATCHING = 1e-7, 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class AffinePiece:
+    """x⁺ = E x + e on the region R x ≤ r (unit rows) where one set of rows is active."""
+
+    E: np.ndarray
+    e: np.ndarray
+    R: np.ndarray
+    r: np.ndarray
+
+
+class Law:
+    """u_0(x), the first input of the optimal plan, in batches of `chunk` states.
+
+    easy (p,): a state well inside the feasible set, which fills batches up. States may lack the
+    previous input where it only has a weight: it is zero then.
+    """
+
+    def __init__(self, mpc: MPC, easy: np.ndarray, chunk: int) -> None:
+        self.mpc, self.easy, self.chunk = mpc, easy, chunk
+        system = mpc.system
+        self.A, self.B = np.asarray(system.A, np.float64), np.asarray(system.B, np.float64)
+        self.c = np.zeros(system.n) if system.c is None else np.asarray(system.c, np.float64)
+        self.condensed = c = condensed_in_float64(mpc)
+        rows, size = Inequalities.of(c).normalised()
+        self.C, self.D, self.b = rows.C, rows.D, rows.b
+        row = rows.row
+        hard = np.full(len(row), np.inf)
+        self.rho = hard if c.soft_linear is None else c.soft_linear[row] * size
+        self.kappa = 0 * self.b if c.soft_quadratic is None else c.soft_quadratic[row] * size**2
+
+    def filled(self, states: np.ndarray) -> np.ndarray:
+        """States (B, p), and `easy` as often as completes the last batch."""
+        easy = np.pad(self.easy, (0, states.shape[1] - len(self.easy)))
+        return np.vstack([states, np.tile(easy, (-len(states) % self.chunk, 1))])
+
+    def plans(self, states: np.ndarray) -> Plan:
+        """Plans from states (B, p), in programs of one shape."""
+        found = solve_many(self.mpc, self.filled(states), ADMM(eps=EPS), chunk=self.chunk)
+        return jax.tree.map(lambda v: np.asarray(v)[: len(states)], found)
+
+    def limited(self, u: np.ndarray) -> np.ndarray:
+        """Inputs (B, m) inside a box of limits: an actuator takes no rounding beyond them."""
+        box = self.mpc.inputs
+        return np.clip(u, box.lower, box.upper) if isinstance(box, Box) else u
+
+    def following(self, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        """The states (B, p) after inputs (B, m): A x + B u + c, and u where the state holds it."""
+        x = states[:, : self.mpc.system.n]
+        after = x @ self.A.T + inputs @ self.B.T + self.c
+        return np.hstack([after, inputs])[:, : states.shape[1]]
+
+    def piece(self, state: np.ndarray, inputs: np.ndarray) -> AffinePiece | None:
+        """The piece at a state (p,) whose optimal inputs (N, m) are given; None if none is found.
+
+        With P z + F x + f + C_a'y = 0 and C_a z + D_a x = b_a on the active rows a, plan and
+        multipliers are affine in x. Non-negative least squares picks independent active rows.
+        Violated soft rows add ½κe² + ρe to the cost, and multipliers of soft rows end at ρ.
+        """
+        c, p = self.condensed, len(state)
+        theta = np.append(state, np.zeros(c.D.shape[1] - p))
+        moves = (inputs - c.Psi @ theta - c.psi).ravel()
+        z = np.linalg.lstsq(c.Omega.reshape(len(moves), -1), moves, rcond=None)[0]
+        if c.balls and self._touches_ball(theta, z):
+            return None
+        gap = self.C @ z + self.D @ theta - self.b
+        near = TOUCHING * (1 + np.abs(self.b))
+        over, touching = gap > near, np.flatnonzero(np.abs(gap) <= near)
+        if np.any(np.isinf(self.rho[over])):  # no plan
+            return None
+        S = self.kappa[over, None] * self.C[over]
+        P = c.P + S.T @ self.C[over]
+        # q(x) = Q (x, 1), likewise for the bounds of the active rows.
+        Q = np.column_stack([c.F, c.f])
+        Q += S.T @ np.column_stack([self.D[over], -self.b[over]])
+        Q[:, -1] += self.C[over].T @ self.rho[over]
+        one = np.append(theta, 1.0)
+        force = -(P @ z + Q @ one)
+        y = self._multipliers(self.C[touching].T, force, self.rho[touching])
+        scale = 1 + np.abs(force).max(initial=0.0)
+        most = y >= self.rho[touching] * (1 - 1e-9)
+        active, full = touching[(y > 1e-9 * scale) & ~most], touching[most]
+        Q[:, -1] += self.C[full].T @ self.rho[full]
+        zero = np.zeros((len(active), len(active)))
+        KKT = np.block([[P, self.C[active].T], [self.C[active], zero]])
+        right = np.vstack([-Q, np.column_stack([-self.D[active], self.b[active]])])
+        try:
+            law = np.linalg.solve(KKT, right)
+        except np.linalg.LinAlgError:
+            return None
+        Z, Y = law[: len(z)], law[len(z) :]
+        if np.abs(Z @ one - z).max() > MATCHING * (1 + np.abs(z).max()):
+            return None
+        # Region: inactive rows hold, violated ones stay so, multipliers stay in [0, ρ].
+        slack = np.column_stack([self.D, -self.b]) + self.C @ Z
+        slack[over | np.isin(np.arange(len(slack)), full)] *= -1
+        limited = np.isfinite(self.rho[active])
+        above = Y[limited] - np.outer(self.rho[active][limited], np.append(0 * theta, 1.0))
+        rows = np.vstack([np.delete(slack, active, axis=0), -Y, above])
+        # Columns of a previous input that is not among the states meet a zero; rows that are
+        # constant to rounding say nothing.
+        rows = np.column_stack([rows[:, :p], rows[:, -1]])
+        moving = np.linalg.norm(rows[:, :p], axis=1) > 1e-11 * np.abs(rows).max(axis=1, initial=0.0)
+        R, r = rows[moving, :p], -rows[moving, p]
+        K = c.Psi[0] + c.Omega[0] @ Z[:, :-1]
+        k = c.psi[0] + c.Omega[0] @ Z[:, -1]
+        E = np.vstack([self.B @ K[:, :p], K[:, :p]])[:p]
+        E[: len(self.A), : len(self.A)] += self.A
+        return AffinePiece(E, np.append(self.B @ k + self.c, k)[:p], *unit_rows(R, r))
+
+    def _multipliers(self, A: np.ndarray, force: np.ndarray, rho: np.ndarray) -> np.ndarray:
+        """y with A y = force as nearly as can be, 0 ≤ y ≤ rho."""
+        if not A.shape[1]:
+            return np.zeros(0)
+        if np.any(np.isfinite(rho)):
+            return lsq_linear(A, force, (0, rho)).x
+        try:
+            return nnls(A, force, maxiter=20 * A.shape[1])[0]
+        except RuntimeError:  # no multipliers, which the check of the plan notices
+            return np.zeros(A.shape[1])
+
+    def _touches_ball(self, theta: np.ndarray, z: np.ndarray) -> bool:
+        c = self.condensed
+        last = slice(len(c.C) - sum(c.balls), None)
+        centred = c.C[last] @ z + c.D[last] @ theta + c.d[last] - c.lower[last]
+        return bool(np.linalg.norm(centred) > (1 - TOUCHING) * float(np.ravel(c.radius)[0]))

@@ -1,0 +1,154 @@
+"""Search for all critical regions, from one to the next across their facets."""
+
+import time
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.checks import fail
+from jaxmpc.control.sets import Polytope
+from jaxmpc.explicit.cells import Cell, cell, volume
+from jaxmpc.explicit.least_distance import DEPENDENT, LeastDistanceForm
+
+# The fraction of the volume, and the distance of a facet in coordinates where X_N just fits into
+# [−1, 1]^n, up to which the regions must fill X_N.
+FILL = 1e-9
+# How far beyond a facet the region behind it is looked for, relative to the facet's region.
+STEPS = (1e-2, 1e-4, 1e-6)
+REPAIRS = 20
+DIMENSIONS = 6
+
+
+class RegionSearch:
+    """Breadth-first search across facets. cells: active set → region, None for no volume."""
+
+    def __init__(self, p: LeastDistanceForm, limit: int) -> None:
+        self.p, self.limit, self.begun = p, limit, time.perf_counter()
+        self.cells: dict[tuple[int, ...], Cell | None] = {}
+        self.found: list[Cell] = []
+        self.queue: deque[Cell] = deque()
+
+    @property
+    def full(self) -> bool:
+        """True once the limit is reached."""
+        return len(self.found) >= self.limit
+
+    def visit(self, active: tuple[int, ...] | None) -> Cell | None:
+        """The region of an active set, queued when it is new."""
+        if active is None:
+            return None
+        active = tuple(sorted(active))
+        if active not in self.cells:
+            new = cell(self.p, active)
+            self.cells[active] = new
+            if new is not None:
+                self.found.append(new)
+                self.queue.append(new)
+        return self.cells[active]
+
+    def cross_all(self) -> None:
+        """Cross every facet of every queued region."""
+        while self.queue and not self.full:
+            here = self.queue.popleft()
+            for i in range(len(here.h)):
+                if not self.full:
+                    self.cross(here, i)
+
+    def cross(self, here: Cell, i: int) -> None:
+        """Visit the regions behind facet i."""
+        candidates: list[tuple[int, ...]] = []
+        for row in here.behind[i].tolist():
+            beyond = exchange(self.p, here.law.active, row)
+            if beyond is None:  # the facet bounds X_N
+                return
+            candidates += beyond
+        reached = [self.visit(active) for active in candidates]
+        middle = here.middles[i]
+        touches = lambda c: c is not None and np.all(c.H @ middle <= c.h + 1e-9)
+        if any(touches(c) for c in reached):
+            return
+        # Several rows vanish on the facet at once: look just behind it.
+        for step in STEPS:
+            behind = self.visit(self.p.active(middle + step * here.radius * here.H[i]))
+            if touches(behind):
+                return
+
+    def fill(self) -> tuple[bool, str]:
+        """Check that the regions fill X_N, and search on from what is missing; (complete, why)."""
+        random = np.random.default_rng(0)
+        why = ""
+        for _ in range(REPAIRS):
+            if self.full:
+                return False, f"stopped at the limit of {self.limit} regions"
+            points = np.concatenate([c.vertices for c in self.found])
+            volumes, whole = sum(volume(c.vertices) for c in self.found), volume(points)
+            hull = Polytope.from_points(points)
+            tops = [self.p.support(a) for a in np.asarray(hull.H)]
+            beyond = np.array([value for value, _ in tops]) - np.asarray(hull.h)
+            gap = 1 - volumes / whole
+            why = (
+                f"the volumes of the regions sum to that of their hull (relative gap {gap:.0e}); "
+                f"X_N reaches beyond its {len(beyond)} facets by {max(beyond.max(), 0):.0e}, "
+                "relative to its size, by one linear program each"
+            )
+            if beyond.max() <= FILL and abs(gap) <= FILL:
+                return True, why
+            before = len(self.found)
+            for (_, corner), far in zip(tops, beyond, strict=True):
+                if corner is not None and far > FILL:
+                    inside = self.p.interior + (corner - self.p.interior) * (1 - 1e-6)
+                    self.visit(self.p.active(inside))
+            for c in list(self.found):
+                for middle, normal in zip(c.middles, c.H, strict=True):
+                    corner = c.vertices[random.integers(len(c.vertices))]
+                    # Anywhere on the facet, which is convex, and a little behind it.
+                    to = corner - normal * (normal @ (corner - middle))
+                    point = middle + 0.9 * random.random() * (to - middle)
+                    self.visit(self.p.active(point + 1e-6 * c.radius * normal))
+            self.cross_all()
+            if len(self.found) == before:
+                break
+        return False, why.replace("the volumes of", "a part was not found: the volumes of")
+
+
+def explore(p: LeastDistanceForm, limit: Any) -> RegionSearch:
+    """The search, ended: from an interior point across all facets."""
+    if not isinstance(limit, int | np.integer) or isinstance(limit, bool) or limit < 1:
+        fail("limit", f"{limit!r}", "Give a whole number of regions, at least 1")
+    if len(p.center) > DIMENSIONS:
+        fail(
+            "mpc", f"its states have {len(p.center)} coordinates, too many for vertices",
+            f"Regions serve up to {DIMENSIONS}; exact_penalty(method='samples') serves more",
+        )  # fmt: skip
+    search = RegionSearch(p, int(limit))
+    search.visit(p.active(p.interior))
+    search.cross_all()
+    if not search.found:
+        fail("mpc", "no critical region was found: too ill-conditioned", "Scale states and inputs")
+    return search
+
+
+def exchange(
+    p: LeastDistanceForm, active: tuple[int, ...], row: int
+) -> list[tuple[int, ...]] | None:
+    """Active sets behind a facet on which `row` vanishes; None where nothing is feasible there.
+
+    A multiplier that vanishes: its row leaves. A row that becomes active joins; if it depends on
+    the active ones, M_row = Σ α_j M_j, its multiplier t changes theirs to λ_j − t α_j, and one
+    with α_j > 0 leaves. Without such a j, M_row + Σ|α_j| M_j = 0 is a Farkas certificate.
+    """
+    rows = [j for j in active if j != row]
+    if len(rows) < len(active):
+        return [tuple(rows)]
+    if p.still[row]:
+        return None
+    Q, R = np.linalg.qr(p.M[rows].T)
+    along = Q.T @ p.M[row]
+    if np.linalg.norm(p.M[row] - Q @ along) > DEPENDENT:
+        return [(*active, row)]
+    alpha = np.linalg.solve(R, along)
+    leaving = np.flatnonzero(alpha > 1e-9 * np.abs(alpha).max(initial=0.0))
+    if not len(leaving):
+        return None
+    return [(*(k for k in active if k != rows[j]), row) for j in leaving]

@@ -1,0 +1,222 @@
+"""Stages that find candidates for proofs, plans or multipliers: ADMM, least-distance Newton.
+
+For the question "feasible or not" the cost is dropped. In an orthonormal basis U of the range
+of the (row-normalised) constraint matrix a zero-cost ADMM step is t⁺ = t + α(U U'r − clip(t)):
+the alternating projection of Douglas and Rachford between {U w} and the box of the bounds.
+Rows multiplied by √rho_i before U is made are the same as penalties rho_i (`StagePenalties`).
+Iterates may be float32. Nothing here decides a label: every candidate, a w or a multiplier,
+goes to `proofs.py`.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.compiled import Compiled
+from jaxmpc.feasible import proofs
+from jaxmpc.feasible.constraint_rows import ConstraintRows
+from jaxmpc.feasible.exact_data import ExactData
+from jaxmpc.qp.newton import least_distance
+from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.projection import Bounds
+
+ALPHA = 1.6
+INSET = 1e-10
+# Newton steps between two attempts at a proof, and how often; the decided leave in between.
+NEWTON_STEPS = 8
+NEWTON_ROUNDS = 8
+
+
+@dataclass(frozen=True)
+class StagePenalties:
+    """Penalties of the ADMM stage: weight (R,) of the constraint rows, the root of ADMM's rho, and
+    the over-relaxation alpha. No proof depends on them: they decide which points this stage
+    decides, and what the next stages start from."""
+
+    weight: np.ndarray
+    alpha: float = ALPHA
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Verdict:
+    """What was proved of one point, and by what.
+
+    label: 1 feasible, −1 infeasible, 0 undecided. start (n,), inputs (N, m): x_0 and the inputs
+    that prove 1. normal (d,), offset: the half-space normal'θ ≤ offset that holds on the whole
+    feasible set and excludes the point; ∞ where none is known, and −1 rests on `proofs.cut` at the
+    point.
+    """
+
+    label: Array
+    start: Array
+    inputs: Array
+    normal: Array
+    offset: Array
+
+
+def inputs_of(p: ExactData, rows: ConstraintRows, theta: Array, w: Array) -> tuple[Array, Array]:
+    """Inputs (N, m) and free states that the coordinates w stand for."""
+    variables = matmul(jnp.asarray(rows.back), w)
+    inputs = matmul(jnp.asarray(rows.Psi), theta) + matmul(jnp.asarray(rows.Omega), variables)
+    free = len(p.view.others) if p.view.projects else 0
+    return inputs + rows.psi, variables[len(variables) - free :]
+
+
+def cut_of(p: ExactData, rows: ConstraintRows, y: Array) -> tuple[Array, Array, Array]:
+    """The bound (a, b, w) of `proofs.cut` that follows from multipliers y (R,) of the rows."""
+    y = jnp.append(y * rows.weight, 0.0)[jnp.asarray(rows.index)]
+    staged, last = p.horizon * p.H.shape[0], p.H_N.shape[0]
+    y_states, y_N, y_ball = jnp.split(y, [staged, staged + last])
+    return proofs.cut(p, y_states.reshape(p.horizon, p.H.shape[0]), y_N, y_ball)
+
+
+def with_broken_limit(rows: ConstraintRows, theta: Array, y: Array) -> Array:
+    """The multipliers y (R,), or that of one row alone: the one that θ breaks most among the rows
+    that nothing moves. It is a proof whatever the inputs, limited or not.
+    """
+    if not len(rows.still):
+        return y
+    still, D = jnp.asarray(rows.still), jnp.asarray(rows.D)[rows.still]
+    value = D @ theta
+    broken = value - jnp.clip(value, rows.lower[still], rows.upper[still])
+    worst = jnp.argmax(jnp.abs(broken))
+    # Broken by no more than rounding is not broken: then the other rows tell more.
+    rounding = 1e-13 * jnp.sum(jnp.abs(D[worst] * theta))
+    alone = jnp.where(np.arange(len(y)) == still[worst], jnp.sign(broken[worst]), 0.0)
+    return jnp.where(jnp.abs(broken[worst]) > rounding, alone, y)
+
+
+def check_candidates(
+    p: ExactData, rows: ConstraintRows, theta: Array, w: Array, multipliers: list[Array]
+) -> Verdict:
+    """Try to prove the point θ feasible by w, and infeasible by each of the multipliers (R,)."""
+    theta, w = theta.astype(jnp.float64), w.astype(jnp.float64)
+    inputs, free = inputs_of(p, rows, theta, w)
+    feasible, inputs = proofs.prove_feasible(p, theta, free, inputs)
+    zero = jnp.zeros_like(theta)
+    normal, offset, slope = zero, jnp.asarray(jnp.inf, jnp.float64), zero
+    infeasible = jnp.asarray(False)
+    *others, last = (y.astype(jnp.float64) for y in multipliers)
+    for y in (*others, with_broken_limit(rows, theta, last)):
+        cut = cut_of(p, rows, y)
+        here = proofs.excludes(*cut, theta) & ~infeasible
+        normal, offset, slope = (
+            jnp.where(here, new, old) for new, old in zip(cut, (normal, offset, slope), strict=True)
+        )
+        infeasible = infeasible | here
+    normal, offset = proofs.everywhere(p, normal, offset, slope)
+    offset = jnp.where(proofs.excludes(normal, offset, zero, theta), offset, jnp.inf)
+    label = jnp.where(feasible, 1, jnp.where(infeasible, -1, 0)).astype(jnp.int8)
+    return Verdict(label, p.view.initial_state(theta, free), inputs, normal, offset)
+
+
+def feasibility_steps(
+    project: Callable[[Array], Array], onto: Callable[[Array], Array], t: Array, alpha: Any,
+    iterations: int,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Take zero-cost ADMM steps t⁺ = t + α (P (2s − t) − s), s = project(t).
+
+    project: onto the bounds. onto: v → P v, the orthogonal projection onto the range of the rows.
+    Returns the last t and the one before.
+    """
+
+    def step(t: Array, _: None = None) -> tuple[Array, None]:
+        s = project(t)
+        return t + alpha * (onto(2 * s - t) - s), None
+
+    before, _ = jax.lax.scan(step, t, length=iterations - 1)
+    return step(before)[0], before
+
+
+def admm_stage(
+    p: ExactData, rows: ConstraintRows, points: Array, alpha: Array, iterations: int, dtype: Any
+) -> tuple[Verdict, Array]:
+    """Verdicts on points (B, d) after ADMM steps in `dtype`, and the last w (B, k)."""
+    U, alpha = jnp.asarray(rows.U, dtype), jnp.asarray(alpha, dtype)
+    shift = matmul(jnp.asarray(rows.D), points.T)  # (R, B): columns are points
+    l = (jnp.asarray(rows.lower)[:, None] - shift).astype(dtype)
+    u = (jnp.asarray(rows.upper)[:, None] - shift).astype(dtype)
+
+    project = lambda t: jnp.clip(t, l, u)
+    if rows.balls:
+        radius = jnp.asarray(rows.radius, dtype)
+        one = lambda t, l, u: Bounds(l, u, radius=radius, balls=rows.balls).project(t, 1.0)
+        project = lambda t: jax.vmap(one, in_axes=1, out_axes=1)(t, l, u)
+
+    onto = lambda v: matmul(U, matmul(U.T, v))
+    t, before = feasibility_steps(project, onto, project(jnp.zeros_like(l)), alpha, iterations)
+    residual = lambda t: t - project(t)
+    w = matmul(U.T, project(t) - residual(t)).T
+    multipliers = (residual(t) - residual(before)).T, residual(t).T
+    check = lambda x, w, change, y: check_candidates(p, rows, x, w, [change, y])
+    return jax.vmap(check)(points, w, *multipliers), w
+
+
+def newton_stage(
+    p: ExactData, rows: ConstraintRows, points: Array, w: Array, steps: int
+) -> tuple[Verdict, Array]:
+    """Verdicts on points (B, d) after Newton steps from w (B, k) in float64, and the last w."""
+    U = jnp.asarray(rows.U)
+
+    def one(theta: Array, w: Array) -> tuple[Verdict, Array]:
+        bounds = rows.bounds(theta)
+        l, u = bounds.l, bounds.u
+        # The nearest feasible w lies on a face, where a roll-out has no margin for its rounding:
+        # aim a little inside. Half-spaces are checked on the true bounds all the same.
+        inset = jnp.minimum(INSET * (1 + jnp.fmin(jnp.abs(l), jnp.abs(u))), (u - l) / 4)
+        inner = replace(bounds, l=l + inset, u=u - inset)
+        if rows.balls:
+            inner = replace(inner, radius=bounds.radius * (1 - INSET))
+        w, e = least_distance(U, inner, w.astype(jnp.float64), steps)
+        return check_candidates(p, rows, theta, w, [e]), w
+
+    return jax.vmap(one)(points, w)
+
+
+@functools.cache
+def compiled_admm(iterations: int, dtype: Any) -> Compiled:
+    """The compiled ADMM stage: (p, rows, points (B, d), alpha) → verdicts and w (B, k)."""
+    stage = lambda p, rows, points, alpha: admm_stage(p, rows, points, alpha, iterations, dtype)
+    return Compiled(jax.jit(stage))
+
+
+@functools.cache
+def compiled_newton(batch: int) -> Compiled:
+    """The compiled Newton stages: (p, rows, points (B, d), usable (B,), verdicts, w (B, k)) →
+    verdicts.
+
+    Usable points that are left open are gathered in batches of `batch`, on the device, until none
+    is open or each has met Newton NEWTON_ROUNDS times; those that met it least often come first.
+    """
+
+    @jax.jit
+    def run(
+        p: ExactData, rows: ConstraintRows, points: Array, usable: Array, verdict: Verdict,
+        w: Array,
+    ) -> Verdict:  # fmt: skip
+        def waiting(verdict: Verdict, rounds: Array) -> Array:
+            return usable & (verdict.label == 0) & (rounds < NEWTON_ROUNDS)
+
+        def newton(carry: tuple[Verdict, Array, Array]) -> tuple[Verdict, Array, Array]:
+            verdict, w, rounds = carry
+            open_ = waiting(verdict, rounds)
+            least = jnp.min(jnp.where(open_, rounds, NEWTON_ROUNDS))
+            (index,) = jnp.nonzero(open_ & (rounds == least), size=batch, fill_value=len(points))
+            take = lambda v: v.at[index].get(mode="clip")
+            put = lambda old, new: old.at[index].set(new, mode="drop")
+            found, better = newton_stage(p, rows, take(points), take(w), NEWTON_STEPS)
+            verdict = jax.tree.map(put, verdict, found)
+            return verdict, put(w, better), rounds.at[index].add(1, mode="drop")
+
+        go_on = lambda carry: jnp.any(waiting(carry[0], carry[2]))
+        start = verdict, w.astype(jnp.float64), jnp.zeros(len(points), int)
+        return jax.lax.while_loop(go_on, newton, start)[0]
+
+    return Compiled(run)

@@ -1,0 +1,122 @@
+"""The cascade that labels points, chunk by chunk: ADMM on all, Newton on those left open."""
+
+import itertools
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmpc.checks import fail
+from jaxmpc.compiled import Compiled, default_chunk, gather_size, padded, require_step_type
+from jaxmpc.feasible.candidates import (
+    ALPHA,
+    StagePenalties,
+    Verdict,
+    compiled_admm,
+    compiled_newton,
+)
+from jaxmpc.feasible.constraint_rows import ConstraintRows, weighted
+from jaxmpc.feasible.labels import Labels
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.qp.precision import matmul
+
+# Steps of the longer ADMM run, relative to the first, on points that Newton leaves open.
+LONGER = 20
+# Proofs of so many bytes in all may stay on the device until they are asked for.
+ON_DEVICE = 2**31
+# Points from which is taken how large they typically are.
+SAMPLE = 4096
+
+
+def label_chunks(
+    problem: FeasibilityProblem, points: Any, *, iterations: int = 50, dtype: Any = "float32",
+    chunk: int | None = None, penalties: StagePenalties | None = None,
+) -> Iterator[tuple[slice, Labels]]:  # fmt: skip
+    """Label points chunk by chunk; yields (slice of the points, Labels). See `map_feasible_set`."""
+    d = problem.dimension
+    points = np.asarray(points, np.float64)
+    if points.ndim != 2 or points.shape[1] != d:
+        fail("x0s", f"shape {points.shape}", f"Give points (B, {d}), one column a mapped state")
+    chunk = default_chunk() if chunk is None else chunk
+    if iterations < 1 or chunk < 1:
+        fail("iterations, chunk", f"{iterations}, {chunk}", "Give counts of at least 1")
+    require_step_type(dtype)
+    quick, back, alpha = _penalised(problem.rows, penalties)
+
+    usable = np.all(np.isfinite(points), axis=1)
+    sample = points[:: max(1, len(points) // SAMPLE)]
+    sample = np.abs(sample[np.all(np.isfinite(sample), axis=1)])
+    size = np.median(sample, axis=0) if len(sample) else np.zeros(d)
+    exact = problem.exact(np.abs(points[usable]).max(axis=0, initial=0.0), size)
+    chunk = min(chunk, max(len(points), 1))
+    batch = gather_size(chunk)
+    short, long = (
+        compiled_admm(iterations, np.dtype(dtype)),
+        compiled_admm(LONGER * iterations, np.dtype(np.float64)),
+    )
+    newton = compiled_newton(batch)
+    with jax.enable_x64(True):
+        exact, rows, quick = jax.device_put((exact, problem.rows, quick))
+
+    def started(here: slice) -> tuple[np.ndarray, np.ndarray, tuple[Verdict, Any]]:
+        """A chunk, which of it is usable, and the ADMM stage, which the device still works on."""
+        ok = padded(usable[here], chunk)
+        x = np.where(ok[:, None], padded(points[here], chunk), 0.0)
+        return x, ok, _run(short, exact, quick, x, alpha)
+
+    def finished(x: np.ndarray, ok: np.ndarray, found: tuple[Verdict, Any]) -> Labels:
+        """The labels of a chunk, by all stages."""
+        labels, (verdict, w) = Labels.proved(found[0], ok), found
+        if np.any((labels.label == 0) & ok):
+            w = w if back is None else matmul(w.astype(np.float64), jnp.asarray(back.T))
+            labels = Labels.proved(_run(newton, exact, rows, x, ok, verdict, w), ok)
+        left = np.flatnonzero((labels.label == 0) & ok)
+        # What resists gets a longer ADMM run without weights, and Newton once more.
+        for i in range(0, len(left), batch):
+            where = left[i : i + batch]
+            again, all_ = padded(x[where], batch), np.ones(batch, bool)
+            found = _run(long, exact, rows, again, np.float64(ALPHA))
+            more = Labels.proved(_run(newton, exact, rows, again, all_, *found), all_)
+            more = more.first(len(where))
+            labels = labels.changed(where, more.label, more.status, more.proofs)
+        return labels
+
+    slices = [slice(i, min(i + chunk, len(points))) for i in range(0, len(points), chunk)]
+    begun, compiled, ahead = time.perf_counter(), Compiled.seconds, None
+    for here, following in itertools.zip_longest(slices, slices[1:]):
+        with jax.enable_x64(True):
+            now = started(here) if ahead is None else ahead
+            ahead = None if following is None else started(following)
+            labels = finished(*now).first(here.stop - here.start)
+            if len(slices) * sum(v.nbytes for v in jax.tree.leaves(now[2])) > ON_DEVICE:
+                labels.fetch()
+        compile_seconds = Compiled.seconds - compiled
+        run_seconds = time.perf_counter() - begun - compile_seconds
+        yield here, replace(labels, compile_seconds=compile_seconds, run_seconds=run_seconds)
+        begun, compiled = time.perf_counter(), Compiled.seconds
+
+
+def _run(program: Compiled, *args: Any) -> Any:
+    """The program's result, left on the device."""
+    return program.program(*args)(*args)
+
+
+def _penalised(
+    rows: ConstraintRows, penalties: StagePenalties | None
+) -> tuple[ConstraintRows, np.ndarray | None, np.float64]:
+    """The rows of the ADMM stage, the matrix that leads back from their w, None where it is the
+    same, and alpha."""
+    if penalties is None:
+        return rows, None, np.float64(ALPHA)
+    shape, right = np.shape(penalties.weight), rows.lower.shape
+    if shape != right:
+        fail("penalties", f"weights {shape}", f"Learn them for this map: {right}")
+    if not (np.all(np.isfinite(penalties.weight)) and np.all(penalties.weight > 0)):
+        fail("penalties", "hold a weight that is not positive", "Learn them again")
+    if not 0 < penalties.alpha < 2:
+        fail("penalties", f"alpha {penalties.alpha}", "Over-relaxation lies in (0, 2)")
+    return *weighted(rows, penalties.weight), np.float64(penalties.alpha)

@@ -1,0 +1,135 @@
+"""The condensed constraints in an orthonormal basis, in which candidates for proofs are found.
+
+No label rests on these numbers; proofs work on `ExactData`.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.feasible.exact_data import absorbed
+from jaxmpc.feasible.view import View
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.rows import Block
+from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.projection import Bounds
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ConstraintRows:
+    """Rows of the condensed constraints: lower ≤ (U w)_i + D_i θ ≤ upper, i = 1..R.
+
+    U (R, k) is an orthonormal basis of what the decision variables (inputs, prestabilised or
+    not, and in a projection the free states) can do to the normalised rows; back (nz, k) leads
+    from w to the variables. A row that nothing moves (k = 0; Euler's q₁ does not feel u₀) has
+    U = 0: a half-space on θ alone. weight (R,) brings multipliers to the units of the problem's
+    rows, and index says where the multiplier of each row of `ExactData` (step by step, then
+    terminal rows, then those of the terminal ellipsoid) stands among the R (R where there is
+    none). The last `balls` rows are those of the ellipsoid: |v − lower| ≤ radius. Psi, Omega, psi:
+    inputs from θ and the variables. still: the rows that nothing moves, but for those of a ball.
+    """
+
+    U: Any
+    back: Any
+    D: Any
+    lower: Any
+    upper: Any
+    weight: Any
+    index: Any
+    Psi: Any
+    Omega: Any
+    psi: Any
+    still: Any
+    radius: Any
+    balls: tuple[int, ...] = field(metadata={"static": True})
+
+    def bounds(self, theta: Array) -> Bounds:
+        """What θ leaves for U w."""
+        shift = matmul(jnp.asarray(self.D), theta)
+        return Bounds(self.lower - shift, self.upper - shift, radius=self.radius, balls=self.balls)
+
+
+def constraint_rows(mpc: MPC, view: View, c: Any, blocks: list[Block]) -> ConstraintRows:
+    """Restrict the condensed rows of a problem without soft rows to a view, and normalise them.
+
+    c: the `Condensed` problem, in NumPy; blocks: its `hard_blocks`. Host, float64.
+    """
+    axes, others = list(view.axes), list(view.others)
+    C, D, lower, upper = c.C, c.D[:, axes], c.lower - c.d, c.upper - c.d
+    Psi, Omega, psi = c.Psi[:, :, axes], c.Omega, c.psi
+    extra = 0
+    if view.projects:  # rows of the free states' box come first
+        extra = len(others)
+        C = np.block([[np.zeros((extra, C.shape[1])), np.eye(extra)], [C, c.D[:, others]]])
+        D = np.concatenate([np.zeros((extra, len(axes))), D])
+        lower, upper = np.append(view.lower, lower), np.append(view.upper, upper)
+        Omega = np.concatenate([Omega, c.Psi[:, :, others]], axis=2)
+    elif others:
+        rest = np.asarray(view.fixed)[others]
+        lower, upper = lower - c.D[:, others] @ rest, upper - c.D[:, others] @ rest
+        psi = psi + c.Psi[:, :, others] @ rest
+
+    norm = np.linalg.norm(C, axis=1)
+    still = norm <= 1e-13 * norm.max(initial=0.0)
+    keep = np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
+    size = np.where(still, np.linalg.norm(D, axis=1), norm)
+    first = len(size) - sum(c.balls)
+    if c.balls:  # one scale for all rows of the ball
+        moved = norm[first:].max() > 0
+        size[first:] = norm[first:].max() if moved else np.linalg.norm(D[first:], axis=1).max()
+    size, still = size[keep], still[keep]
+    weight = 1 / np.where(size > 0, size, 1.0)
+    scaled = np.where(still[:, None], 0.0, weight[:, None] * C[keep])
+    U, singular, Vt = np.linalg.svd(scaled, full_matrices=False)
+    rank = int(np.sum(singular > 1e-12 * singular.max(initial=0.0)))
+    U, back = np.where(still[:, None], 0.0, U[:, :rank]), Vt[:rank].T / singular[:rank]
+
+    place = np.full(len(lower), len(keep))
+    place[keep] = np.arange(len(keep))
+    return ConstraintRows(
+        U, back, weight[:, None] * D[keep], weight * lower[keep], weight * upper[keep], weight,
+        multiplier_index(mpc, blocks, c.layout, place[extra:], len(keep)), Psi, Omega, psi,
+        np.flatnonzero(still[: len(keep) - sum(c.balls)]),
+        weight[-1:] * c.radius if c.balls else None, c.balls,
+    )  # fmt: skip
+
+
+def weighted(rows: ConstraintRows, weight: np.ndarray) -> tuple[ConstraintRows, np.ndarray]:
+    """The rows multiplied by weights > 0 (R,), alike in a ball, and M (k, k): w = M w', the old
+    coordinates from the new."""
+    U, singular, Vt = np.linalg.svd(weight[:, None] * rows.U, full_matrices=False)
+    M = Vt.T / singular
+    return replace(
+        rows, U=U, back=rows.back @ M, D=weight[:, None] * rows.D, lower=weight * rows.lower,
+        upper=weight * rows.upper, weight=weight * rows.weight,
+        radius=None if rows.radius is None else weight[-1:] * rows.radius,
+    ), M  # fmt: skip
+
+
+def multiplier_index(
+    mpc: MPC, blocks: list[Block], layout: tuple[Any, ...], place: np.ndarray, none: int
+) -> np.ndarray:
+    """`ConstraintRows.index`. place: where each row of the condensed problem stands among the R
+    that are kept."""
+    N, offset = mpc.horizon, 0
+    columns, last, ball = [], [np.zeros(0, int)], np.zeros(0, int)
+    for block, (_, steps, size) in zip(blocks, layout, strict=True):
+        table = np.full((N + 1, size), none)
+        table[list(steps)] = place[offset : offset + len(steps) * size].reshape(-1, size)
+        offset += len(steps) * size
+        if absorbed(mpc, block):
+            continue
+        if block.radius is not None:
+            ball = table[N]
+            continue
+        if any(k < N for k in steps):
+            columns.append(table[:N])
+        if N in steps:
+            last.append(table[N])
+    by_step = np.concatenate([np.zeros((N, 0), int), *columns], axis=1)
+    return np.concatenate([by_step.ravel(), *last, ball])

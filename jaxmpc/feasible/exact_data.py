@@ -1,0 +1,208 @@
+"""The hard constraints of an MPC problem as float64 arrays: the exact data that proofs rest on."""
+
+import itertools
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxmpc.control.set_bounds import set_bounds
+from jaxmpc.control.sets import Box, Ellipsoid
+from jaxmpc.feasible.view import View
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.rows import Block
+from jaxmpc.mpc.rows import blocks as row_blocks
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ExactData:
+    """The hard constraints of an MPC problem as float64 arrays: exact data for proofs.
+
+    lower_k ≤ H x_k + D u_k ≤ upper_k for k < N: H (r, n), D (r, m), lower and upper (N, r), ±inf at
+    steps where a row does not hold. lower_N ≤ H_N x_N ≤ upper_N. P, level: terminal ellipsoid
+    x'Px ≤ level, None without; back (n, rows) leads from multipliers of its rows L'x to v.
+    u_lower, u_upper (m,): a box round the inputs; move_lower, move_upper (moves, m): what limits on
+    the states leave of it to each free move. left (N, n): 1 where errors of p_k, k = 1..N, are left
+    to the steps before; elsewhere, and there side and reach are 0 too, |x_k| + side∘x_k ≤ reach on
+    every feasible trajectory. side_0, reach_0 (d,): the same of every feasible θ, ∞ where nothing
+    bounds it. moves: number of the free move that each input is.
+    """
+
+    A: Any
+    B: Any
+    c: Any
+    H: Any
+    D: Any
+    lower: Any
+    upper: Any
+    H_N: Any
+    lower_N: Any
+    upper_N: Any
+    P: Any
+    level: Any
+    back: Any
+    u_lower: Any
+    u_upper: Any
+    move_lower: Any
+    move_upper: Any
+    left: Any
+    side: Any
+    reach: Any
+    side_0: Any
+    reach_0: Any
+    view: View
+    moves: tuple[int, ...] = field(metadata={"static": True})
+
+    @property
+    def horizon(self) -> int:
+        """N."""
+        return len(self.moves)
+
+
+def dynamics(mpc: MPC) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A, B, c of x⁺ = Ax + Bu + c, for (x, u_{−1}) where input rates are limited."""
+    to64 = lambda v: np.asarray(v, np.float64)
+    n, m = mpc.system.n, mpc.system.m
+    A, B = to64(mpc.system.A), to64(mpc.system.B)
+    c = np.zeros(n) if mpc.system.c is None else to64(mpc.system.c)
+    if mpc.rate_limited:
+        A = np.block([[A, np.zeros((n, m))], [np.zeros((m, n + m))]])
+        B, c = np.concatenate([B, np.eye(m)]), np.concatenate([c, np.zeros(m)])
+    return A, B, c
+
+
+def hard_blocks(mpc: MPC) -> list[Block]:
+    """Hard blocks as float64 host arrays; those of rates written as rows of (x, u_{−1}) and u."""
+    with jax.enable_x64(True):
+        found = row_blocks(mpc, np.float64)
+    to64 = lambda v: np.asarray(v, np.float64)
+    n, m, p = mpc.system.n, mpc.system.m, mpc.dimension
+    hard = []
+    for b in found:
+        r = b.size
+        H = np.zeros((r, p))
+        D = np.zeros((r, m)) if b.D is None else to64(b.D)
+        if b.rate:
+            H[:, n:] = -D
+        elif b.H is not None:
+            H[:, :n] = to64(b.H)
+        if b.linear is None:
+            lower, upper = to64(b.lower), to64(b.upper)
+            hard.append(replace(b, H=H, D=D, lower=lower, upper=upper))
+    return hard
+
+
+def absorbed(mpc: MPC, block: Block) -> bool:
+    """True for input limits that the clip and the support function look after: those of a box."""
+    return block.kind == "input" and isinstance(mpc.inputs, Box)
+
+
+def exact_data(
+    mpc: MPC, view: View, blocks: list[Block], extent: np.ndarray, size: np.ndarray | None = None
+) -> ExactData:
+    """Collect the exact data of a problem without soft rows; blocks: its `hard_blocks`.
+
+    extent (2, d): lower and upper bounds of every feasible θ, which no label rests on; (d,): of
+    |θ|. size (d,): how large θ typically is (None: as large as extent says), by which is chosen how
+    rounding errors are bounded, not whether they are.
+    """
+    n, m, N, p = mpc.system.n, mpc.system.m, mpc.horizon, mpc.dimension
+    A, B, c = dynamics(mpc)
+    u_lower, u_upper = set_bounds(mpc.inputs, m)
+    H, D, lower, upper = [np.zeros((0, p))], [np.zeros((0, m))], [], []
+    H_N, lower_N, upper_N = [np.zeros((0, p))], [np.zeros(0)], [np.zeros(0)]
+    for b in blocks:
+        if absorbed(mpc, b) or b.radius is not None:
+            continue
+        if any(k < N for k in b.steps):
+            holds = np.isin(np.arange(N), b.steps)[:, None]
+            H, D = [*H, b.H], [*D, b.D]
+            lower.append(np.where(holds, b.lower, -np.inf))
+            upper.append(np.where(holds, b.upper, np.inf))
+        if N in b.steps:
+            H_N, lower_N, upper_N = [*H_N, b.H], [*lower_N, b.lower], [*upper_N, b.upper]
+    P = level = back = None
+    if isinstance(mpc.terminal_set, Ellipsoid):
+        P = np.zeros((p, p))
+        P[:n, :n] = np.asarray(mpc.terminal_set.P, np.float64)
+        P = (P + P.T) / 2
+        level = np.asarray(mpc.terminal_set.level, np.float64)
+        back = np.zeros((p, n))
+        back[:n] = np.linalg.inv(np.linalg.cholesky(P[:n, :n])).T
+
+    boxes = {id(set_): set_bounds(set_, n) for set_ in (mpc.states, mpc.terminal_set)}
+
+    def limits(k: int) -> np.ndarray:
+        """Bounds (2, p) of x_k, without those that the inputs have on it."""
+        sets = [mpc.states] if k in mpc.state_steps else []
+        bound = np.repeat([[-np.inf], [np.inf]], p, axis=1)
+        for set_ in [*sets, mpc.terminal_set] if k == N else sets:
+            lower, upper = boxes[id(set_)]
+            bound[:, :n] = np.maximum(bound[0, :n], lower), np.minimum(bound[1, :n], upper)
+        return bound
+
+    axes, others = list(view.axes), list(view.others)
+    extent = np.asarray(extent) if np.ndim(extent) == 2 else np.array([-extent, extent])
+    first = limits(0)[:, axes]
+    side_0, reach_0 = one_sided(np.maximum(extent[0], first[0]), np.minimum(extent[1], first[1]))
+    start = np.zeros(p)
+    start[axes] = reach_0 if size is None else size
+    if view.projects:
+        start[others] = one_sided(view.lower, view.upper)[1]
+    elif others:
+        start[others] = np.abs(view.fixed)[others]
+    grown, u_size = np.where(np.isfinite(start), start, 0.0), largest(u_lower, u_upper)
+    errors = []
+    for k in range(1, N + 1):
+        with np.errstate(invalid="ignore"):  # 0·inf below counts as 0
+            grown = np.nansum(np.abs(A) * grown, axis=1) + np.abs(c)
+            grown = grown + np.nansum(np.abs(B) * u_size, axis=1)
+        side, bound = one_sided(*limits(k))
+        far = (bound > grown) | np.isinf(bound)
+        errors.append((1.0 * far, np.where(far, 0.0, side), np.where(far, 0.0, bound)))
+        grown = np.minimum(grown, bound)
+    x_size = [largest(*limits(k)[:, :n]) for k in range(N + 1)]
+    implied = input_size(A[:n, :n], B[:n], c[:n], x_size)
+    steps = [np.equal(mpc.moves, i) for i in range(max(mpc.moves) + 1)]
+    implied = np.array([implied[same].min(axis=0) for same in steps])
+    every_step = lambda parts: np.concatenate([np.zeros((N, 0)), *parts], axis=1)
+    left, sides, reach = np.array(errors).transpose(1, 0, 2)
+    return ExactData(
+        A, B, c, np.concatenate(H), np.concatenate(D), every_step(lower), every_step(upper),
+        np.concatenate(H_N), np.concatenate(lower_N), np.concatenate(upper_N), P, level, back,
+        u_lower, u_upper, np.maximum(u_lower, -implied), np.minimum(u_upper, implied),
+        left, sides, reach, side_0, reach_0, view, mpc.moves,
+    )  # fmt: skip
+
+
+def input_size(A: np.ndarray, B: np.ndarray, c: np.ndarray, size: list[np.ndarray]) -> np.ndarray:
+    """Bounds (N, m) of |u_k| from those of |x_k|, k = 0..N: u_k = B⁺(x_{k+1} − A x_k − c).
+
+    ∞ where there is none, and where B has dependent columns.
+    """
+    M, (n, m) = np.linalg.pinv(B), B.shape
+    off = np.abs(M @ B - np.eye(m)) + n * 1e-15 * np.abs(M) @ np.abs(B)
+    if off.max() > 1e-8:
+        return np.full((len(size) - 1, m), np.inf)
+    with np.errstate(invalid="ignore"):  # 0·inf below counts as 0
+        terms = [
+            after + np.nansum(np.abs(A) * before, axis=1) + np.abs(c)
+            for before, after in itertools.pairwise(size)
+        ]
+        bound = np.nansum(np.abs(M) * np.array(terms)[:, None, :], axis=2)
+    # B⁺B is the unit matrix to 1e-8, and sums are rounded.
+    return bound + 1e-6 * bound.max(axis=1, keepdims=True)
+
+
+def one_sided(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(s, r) with the least r for which |x| + s x ≤ r on lower ≤ x ≤ upper, s in {0, 1, −1}."""
+    ways = np.array([largest(lower, upper), 2 * np.maximum(upper, 0), 2 * np.maximum(-lower, 0)])
+    best = np.argmin(ways, axis=0)
+    return np.array([0.0, 1.0, -1.0])[best], ways.min(axis=0)
+
+
+def largest(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Bound of |x| on lower ≤ x ≤ upper."""
+    return np.maximum(np.abs(lower), np.abs(upper))

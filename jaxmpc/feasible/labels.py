@@ -1,0 +1,161 @@
+"""Labels of points, each with its proof."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.feasible.candidates import Verdict
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.qp.status import Status
+
+# The arrays of `Labels`.
+ARRAYS = ("label", "status", "starts", "plans", "cut_normals", "cut_offsets")
+PROOFS = ARRAYS[2:]
+# The status of labels −1, 0 and 1.
+STATUS = np.array([Status.PRIMAL_INFEASIBLE, Status.ITERATION_LIMIT, Status.SOLVED], np.int8)
+
+
+class OnDemand:
+    """An array that is fetched once, when it is first asked for."""
+
+    def __init__(self, fetch: Callable[[], np.ndarray]) -> None:
+        self._fetch: Callable[[], np.ndarray] | None = fetch
+        self._value: np.ndarray | None = None
+
+    def get(self) -> np.ndarray:
+        """The array."""
+        if self._value is None:
+            assert self._fetch is not None
+            self._value, self._fetch = self._fetch(), None
+        return self._value
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Labels of b points and their proofs.
+
+    label (b,) int8: 1 proved feasible, −1 proved infeasible, 0 undecided. status (b,) int8:
+    `Status` (NOT_RUN, NON_FINITE, or SOLVED / PRIMAL_INFEASIBLE / ITERATION_LIMIT for the three
+    labels). starts (b, n), plans (b, N, m): x_0 and inputs that prove 1, else NaN.
+    cut_normals (b, d), cut_offsets (b,): the half-space a'x ≤ b, valid on the whole feasible set,
+    that proves −1, else NaN. An offset of ∞ says that −1 is proved at the point but that no such
+    half-space is known: on sets that extend both ways without end, or very far, along a facet,
+    the rounding of its normal outweighs what the point is outside. Seconds spent compiling and
+    running.
+
+    The proofs may still be on the device: each of the four arrays is copied when first asked for.
+    """
+
+    label: np.ndarray
+    status: np.ndarray
+    proofs: dict[str, OnDemand]
+    compile_seconds: float = 0.0
+    run_seconds: float = 0.0
+
+    @property
+    def starts(self) -> np.ndarray:
+        """x_0 (b, n) of the points proved feasible, NaN elsewhere."""
+        return self.proofs["starts"].get()
+
+    @property
+    def plans(self) -> np.ndarray:
+        """Inputs (b, N, m) that prove points feasible, NaN elsewhere."""
+        return self.proofs["plans"].get()
+
+    @property
+    def cut_normals(self) -> np.ndarray:
+        """Normals (b, d) of the half-spaces that prove points infeasible, NaN elsewhere."""
+        return self.proofs["cut_normals"].get()
+
+    @property
+    def cut_offsets(self) -> np.ndarray:
+        """Offsets (b,) of these half-spaces."""
+        return self.proofs["cut_offsets"].get()
+
+    @classmethod
+    def of(
+        cls, *, label: Any, status: Any, starts: Any, plans: Any, cut_normals: Any,
+        cut_offsets: Any, **seconds: float,
+    ) -> "Labels":  # fmt: skip
+        """Labels from their arrays, which may be a device's."""
+        given = dict(starts=starts, plans=plans, cut_normals=cut_normals, cut_offsets=cut_offsets)
+        fetch = lambda v: OnDemand(lambda: np.asarray(v))
+        proofs = {name: fetch(v) for name, v in given.items()}
+        return cls(np.asarray(label), np.asarray(status), proofs, **seconds)
+
+    @classmethod
+    def proved(cls, verdict: Verdict, usable: np.ndarray) -> "Labels":
+        """Labels from the verdicts on a batch (B,); waits for the device. usable (B,): which
+        points are finite."""
+        label = np.where(usable, np.asarray(verdict.label), np.int8(0))
+        status = np.where(usable, STATUS[label + 1], np.int8(Status.NON_FINITE))
+
+        def proof(rows: Any, of: int) -> OnDemand:  # NaN where it proves nothing
+            return OnDemand(lambda: _put(np.asarray(rows), label != of, np.nan))
+
+        proofs = {
+            "starts": proof(verdict.start, 1),
+            "plans": proof(verdict.inputs, 1),
+            "cut_normals": proof(verdict.normal, -1),
+            "cut_offsets": proof(verdict.offset, -1),
+        }
+        return cls(label, status, proofs)
+
+    @classmethod
+    def empty(cls, count: int, problem: FeasibilityProblem) -> "Labels":
+        """Labels of `count` points that have not been run."""
+        mpc, d = problem.mpc, problem.dimension
+        return cls.of(
+            label=np.zeros(count, np.int8), status=np.full(count, Status.NOT_RUN, np.int8),
+            starts=np.full((count, mpc.dimension), np.nan),
+            plans=np.full((count, mpc.horizon, mpc.system.m), np.nan),
+            cut_normals=np.full((count, d), np.nan), cut_offsets=np.full(count, np.nan),
+        )  # fmt: skip
+
+    @classmethod
+    def joined(cls, parts: Sequence["Labels"]) -> "Labels":
+        """The labels of several batches of points, one after the other."""
+        several = lambda name: OnDemand(
+            lambda: np.concatenate([part.proofs[name].get() for part in parts])
+        )
+        return cls(
+            np.concatenate([part.label for part in parts]),
+            np.concatenate([part.status for part in parts]),
+            {name: several(name) for name in PROOFS},
+            sum(part.compile_seconds for part in parts),
+            sum(part.run_seconds for part in parts),
+        )
+
+    def first(self, count: int) -> "Labels":
+        """Labels of the first `count` points."""
+        head = lambda proof: OnDemand(lambda: proof.get()[:count])
+        proofs = {name: head(proof) for name, proof in self.proofs.items()}
+        return replace(self, label=self.label[:count], status=self.status[:count], proofs=proofs)
+
+    def changed(
+        self, where: np.ndarray, label: Any, status: Any, proofs: dict[str, OnDemand]
+    ) -> "Labels":
+        """These labels with others at indices `where` (k,), and with these rows of their proofs."""
+        merged = lambda name, rows: OnDemand(
+            lambda: _put(self.proofs[name].get(), where, rows.get())
+        )
+        return replace(
+            self,
+            label=_put(self.label, where, label),
+            status=_put(self.status, where, status),
+            proofs=self.proofs | {name: merged(name, rows) for name, rows in proofs.items()},
+        )
+
+    def fetch(self) -> None:
+        """Copy all proofs from the device."""
+        for proof in self.proofs.values():
+            proof.get()
+
+
+def _put(array: np.ndarray, where: np.ndarray, rows: Any) -> np.ndarray:
+    """A copy of the array with `rows` at indices `where`."""
+    copy = array.copy()
+    copy[where] = rows
+    return copy

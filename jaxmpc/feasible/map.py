@@ -1,0 +1,327 @@
+"""Maps of the feasible set: every point proved feasible, proved infeasible, or said undecided."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial import KDTree
+from tqdm.auto import tqdm
+
+from jaxmpc.checks import fail
+from jaxmpc.control.sets import Ellipsoid, Polytope, hull_volume
+from jaxmpc.feasible import proofs
+from jaxmpc.feasible.candidates import StagePenalties
+from jaxmpc.feasible.cascade import label_chunks
+from jaxmpc.feasible.labels import Labels, OnDemand
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.rays import Rays
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.status import Status
+
+# Rays that `refine` shoots in one round at most.
+MOST_RAYS = 2000
+# Volumes are sums of rounded products; bounds are widened by more than that.
+VOLUME_ROUNDING = 1e-11
+
+
+def grid(lower: Any, upper: Any, shape: Any) -> np.ndarray:
+    """Points of a regular grid, end points included: (Π shape, d), first coordinate slowest."""
+    lower, upper = np.atleast_1d(np.asarray(lower, float)), np.atleast_1d(np.asarray(upper, float))
+    shape = tuple(int(k) for k in np.atleast_1d(shape))
+    if not lower.shape == upper.shape == (len(shape),):
+        fail("grid", f"lower {lower.shape}, upper {upper.shape}, shape {shape}", "Same length each")
+    if not (np.all(np.isfinite(lower)) and np.all(np.isfinite(upper)) and np.all(lower <= upper)):
+        fail("grid", f"lower {lower}, upper {upper}", "Give finite lower ≤ upper")
+    if min(shape) < 1:
+        fail("grid", f"shape {shape}", "Give at least one point along each axis")
+    lines = [np.linspace(*ends) for ends in zip(lower, upper, shape, strict=True)]
+    return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(shape))
+
+
+@dataclass(frozen=True)
+class FeasibleSetMap:
+    """Points of a state space, each with its label and the proof of it (see `Labels`).
+
+    points (B, d) in the states `axes`. extra_points (K, d), extra_normals (F, d), extra_offsets
+    (F,): points proved feasible and half-spaces proved valid by `refine`.
+    """
+
+    problem: FeasibilityProblem
+    points: np.ndarray
+    labels: Labels
+    extra_points: np.ndarray
+    extra_normals: np.ndarray
+    extra_offsets: np.ndarray
+
+    @classmethod
+    def of(cls, problem: FeasibilityProblem, points: Any, labels: Labels) -> "FeasibleSetMap":
+        """A map from labels that were made elsewhere, by chunks or from a store."""
+        d = problem.dimension
+        none = np.zeros((0, d)), np.zeros((0, d)), np.zeros(0)
+        return cls(problem, np.asarray(points, float), labels, *none)
+
+    @property
+    def mpc(self) -> MPC:
+        """The MPC problem, without soft rows and weights of input rates."""
+        return self.problem.mpc
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """Indices of the d mapped states."""
+        return self.problem.view.axes
+
+    @property
+    def fixed(self) -> np.ndarray | None:
+        """Values (n,) of the other states in a slice, zero at `axes`; None for a projection or
+        where all states are mapped."""
+        return self.problem.view.fixed
+
+    @property
+    def label(self) -> np.ndarray:
+        """(B,) int8: 1 proved feasible, −1 proved infeasible, 0 undecided."""
+        return self.labels.label
+
+    @property
+    def status(self) -> np.ndarray:
+        """(B,) int8, values of `Status`."""
+        return self.labels.status
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Labels of the mapped states with their units."""
+        return self.problem.labels
+
+    def counts(self) -> dict[str, int]:
+        """How many points are feasible, infeasible, undecided, not finite, not run."""
+        status, label = self.status, self.label
+        return {
+            "feasible": int(np.sum(label == 1)),
+            "infeasible": int(np.sum(label == -1)),
+            "undecided": int(np.sum(status == Status.ITERATION_LIMIT)),
+            "not finite": int(np.sum(status == Status.NON_FINITE)),
+            "not run": int(np.sum(status == Status.NOT_RUN)),
+        }
+
+    def inner(self) -> Polytope:
+        """Convex hull of all points proved feasible: a subset of the feasible set.
+
+        Raises ValueError while these points have no interior.
+        """
+        return Polytope.from_points(
+            np.concatenate([self.points[self.label == 1], self.extra_points])
+        )
+
+    def cuts(self) -> tuple[np.ndarray, np.ndarray]:
+        """All half-spaces a'x ≤ b proved valid for the feasible set: a (K, d), b (K,)."""
+        proved = (self.label == -1) & np.isfinite(self.labels.cut_offsets)
+        normals = np.concatenate([self.labels.cut_normals[proved], self.extra_normals])
+        offsets = np.concatenate([self.labels.cut_offsets[proved], self.extra_offsets])
+        return normals, offsets
+
+    def outer(self) -> Polytope:
+        """Intersection of all half-spaces proved valid: a superset of the feasible set.
+
+        Raises ValueError where it is unbounded, empty or flat.
+        """
+        normals, offsets = self.cuts()
+        if not len(offsets):
+            what = "no half-space is proved that holds on the whole set"
+            fail("outer", what, "Map points outside the set, or refine(), if it is bounded")
+        return Polytope(normals, offsets).reduce()
+
+    def volume_bounds(self) -> tuple[float, float]:
+        """Certified bounds on the volume (area in 2-D) of the feasible set, or of its section.
+
+        (0, 0) where the half-spaces leave nothing, an upper bound of inf where they leave an
+        unbounded set.
+        """
+        points = np.concatenate([self.points[self.label == 1], self.extra_points])
+        low = hull_volume(points) * (1 - VOLUME_ROUNDING)
+        normals, offsets = self.cuts()
+        if len(offsets) and Polytope(normals, offsets).is_empty():
+            return low, 0.0
+        try:
+            high = self.outer().volume() * (1 + VOLUME_ROUNDING)
+        except ValueError:
+            high = np.inf
+        return low, high
+
+    def terminal_section(self) -> Polytope | None:
+        """The terminal set in the mapped states (slice or all states), None where there is none.
+
+        An Ellipsoid is given as a polygon of 256 of its boundary points, in two mapped states.
+        """
+        set_ = self.mpc.terminal_set
+        view = self.problem.view
+        axes, others = list(view.axes), list(view.others)
+        if set_ is None or self.mpc.dimension > self.mpc.system.n or view.projects:
+            return None
+        rest = view.fixed[others] if others else np.zeros(0)
+        if isinstance(set_, Ellipsoid):
+            return ellipse(
+                np.asarray(set_.P, float), float(np.asarray(set_.level)), axes, others, rest
+            )
+        body = set_ if isinstance(set_, Polytope) else set_.to_polytope()
+        H, h = np.asarray(body.H, float), np.asarray(body.h, float)
+        return Polytope(H[:, axes], h - H[:, others] @ rest)
+
+    def refine(self, tolerance: float = 1e-6, rounds: int = 30) -> "FeasibleSetMap":
+        """Shoot rays at the vertices of the outer polytope until the volume bounds meet.
+
+        Each ray adds a proved boundary point and a proved facet (`boundary`); in up to four
+        mapped dimensions this ends at the exact polytope. Undecided points that a facet excludes
+        are labelled infeasible. tolerance: relative gap of the volume bounds at which to stop.
+        A set without interior, or unbounded, is returned as it is.
+        """
+        d = self.problem.dimension
+        try:
+            rays = Rays.of(self.problem)
+        except ValueError:
+            return self
+        directions = np.concatenate([np.eye(d), -np.eye(d), -np.ones((1, d))])
+        points = np.zeros((0, d))
+        normals, offsets = rays.box()
+        shot = unit(directions)
+        for _ in range(rounds):
+            found = rays.shoot(directions)
+            proved = np.isfinite(found.inner)
+            points = np.concatenate([points, found.points[proved]])
+            valid = np.isfinite(found.offsets)
+            normals = np.concatenate([normals, found.normals[valid]])
+            offsets = np.concatenate([offsets, found.offsets[valid]])
+            try:
+                outer = Polytope(normals, offsets).reduce()
+                low, high = hull_volume(points), outer.volume()
+                directions = fresh(outer.vertices() - rays.center, shot)
+                shot = np.concatenate([shot, unit(directions)])
+            except ValueError:  # unbounded, or too thin for qhull
+                break
+            # Sets with a curved boundary have no end of vertices.
+            if high - low <= tolerance * high or not 0 < len(directions) <= MOST_RAYS:
+                break
+        labels = excluded(self.labels, rays, self.points, normals, offsets)
+        return replace(
+            self, labels=labels, extra_points=points, extra_normals=normals, extra_offsets=offsets
+        )
+
+    def to_xarray(self) -> Any:
+        """The map as an xarray.Dataset along the dimension `sample`, names and units attached."""
+        import xarray
+
+        data = {
+            "label": ("sample", self.label),
+            "status": ("sample", self.status),
+            "points": (("sample", "coordinate"), self.points),
+            "start": (("sample", "state"), self.labels.starts),
+            "plan": (("sample", "time", "input"), self.labels.plans),
+            "cut_normal": (("sample", "coordinate"), self.labels.cut_normals),
+            "cut_offset": ("sample", self.labels.cut_offsets),
+            "bound_point": (("ray", "coordinate"), self.extra_points),
+            "bound_normal": (("facet", "coordinate"), self.extra_normals),
+            "bound_offset": ("facet", self.extra_offsets),
+        }
+        system = self.mpc.system
+        names = {
+            "coordinate": list(self.names),
+            "state": list(self.mpc.labels),
+            "input": list(system.input_labels),
+        }
+        return xarray.Dataset(data, coords=names)
+
+
+def unit(directions: np.ndarray) -> np.ndarray:
+    """Directions (K, d) scaled to length one."""
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def fresh(directions: np.ndarray, shot: np.ndarray) -> np.ndarray:
+    """The directions, except zeros, along which no ray of `shot` (unit length) has been sent."""
+    directions = directions[np.any(directions != 0, axis=1)]
+    distance = KDTree(shot).query(unit(directions))[0]
+    return directions[distance > 1e-9]
+
+
+def ellipse(
+    P: np.ndarray, level: float, axes: list[int], others: list[int], rest: np.ndarray
+) -> Polytope | None:
+    """Polygon in the section {y: (y, rest)'P(y, rest) ≤ level}; None unless y has two entries.
+
+    With S the block of P at y, c = −S⁻¹ P_yo rest and α = level − rest'P_oo rest + c'S c the
+    section is (y − c)'S(y − c) ≤ α.
+    """
+    S, cross = P[np.ix_(axes, axes)], P[np.ix_(axes, others)] @ rest
+    centre = -np.linalg.solve(S, cross)
+    inside = level - rest @ P[np.ix_(others, others)] @ rest + centre @ S @ centre
+    if len(axes) != 2 or inside <= 0:
+        return None
+    angle = 2 * np.pi * np.arange(256) / 256
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    points = np.sqrt(inside) * np.linalg.solve(np.linalg.cholesky(S).T, circle).T
+    return Polytope.from_points(centre + points)
+
+
+def excluded(
+    labels: Labels, rays: Rays, points: np.ndarray, normals: np.ndarray, offsets: np.ndarray
+) -> Labels:  # fmt: skip
+    """Labels where undecided points that one of the half-spaces excludes are infeasible.
+
+    Only within the extent of the feasible set that LPs found: there a half-space of
+    `proofs.everywhere` is one of `proofs.cut`, and no label rests on an LP.
+    """
+    p = rays.exact
+    within = np.all(np.abs(points) + p.side_0 * points <= p.reach_0, axis=1)
+    left = np.flatnonzero((labels.status == Status.ITERATION_LIMIT) & within)
+    if not len(left) or not len(offsets):
+        return labels
+    with jax.enable_x64(True):
+        one = lambda a, b, x: proofs.excludes(a, b, jnp.zeros_like(a), x)
+        table = jax.vmap(jax.vmap(one, in_axes=(0, 0, None)), in_axes=(None, None, 0))
+        excludes = np.asarray(table(normals, offsets, points[left]))
+    out = np.flatnonzero(excludes.any(axis=1))
+    left, by = left[out], np.argmax(excludes[out], axis=1)
+    found = {
+        "cut_normals": OnDemand(lambda: normals[by]), "cut_offsets": OnDemand(lambda: offsets[by])
+    }  # fmt: skip
+    return labels.changed(left, -1, Status.PRIMAL_INFEASIBLE, found)
+
+
+def map_feasible_set(
+    mpc: MPC, x0s: Any, *, axes: Any = None, fixed: Any = None, iterations: int = 50,
+    dtype: Any = "float32", chunk: int | None = None, refine: float | None = None,
+    penalties: StagePenalties | None = None, progress: bool = False,
+) -> FeasibleSetMap:  # fmt: skip
+    """Label each point: is there an input sequence that keeps every hard constraint of `mpc`?
+
+    x0s: points (B, d). axes: indices of the d mapped states (None: all n). fixed: values (n,) of
+    all states, for a slice through them; None with d < n: a projection (feasible if some value
+    of the other states is). The cost plays no part. Every label rests on a proof in float64
+    (`proofs.py`): an input sequence whose roll-out keeps all rows, or a half-space that excludes
+    the point, each by more than rounding; what is neither is 0, undecided. iterations and dtype
+    govern the ADMM stage alone and cannot make a label wrong. chunk: points a compiled program
+    takes at once (None: by device). refine: tolerance of `FeasibleSetMap.refine`, None to skip
+    it. penalties: of the ADMM stage, from `tune_sweep_penalties`. progress: show a bar.
+
+    A point with NaN or infinity gets status NON_FINITE and label 0. Raises ValueError for wrong
+    shapes and ill-posed problems before anything compiles.
+    """
+    problem = FeasibilityProblem.of(mpc, axes, fixed)
+    result = map_points(
+        problem, x0s, iterations=iterations, dtype=dtype, chunk=chunk, penalties=penalties,
+        progress=progress,
+    )  # fmt: skip
+    return result if refine is None else result.refine(refine)
+
+
+def map_points(
+    problem: FeasibilityProblem, points: Any, *, progress: bool = False, **settings: Any
+) -> FeasibleSetMap:
+    """Label the points (B, d) of a feasibility problem; settings: those of `label_chunks`."""
+    points = np.asarray(points, np.float64)
+    parts = [Labels.empty(0, problem)]
+    with tqdm(total=len(points), unit="pt", disable=not progress) as bar:
+        for _, part in label_chunks(problem, points, **settings):
+            parts.append(part)
+            bar.update(len(part.label))
+    return FeasibleSetMap.of(problem, points, Labels.joined(parts))

@@ -1,0 +1,163 @@
+"""States, feasible decisions and next states as one polytope, and its projection on the states.
+
+A state θ and the decision variables z of the condensed problem are one vector v = (θ, z); the hard
+rows are a polytope G v ≤ g of such pairs, and the state after the first move is θ⁺ = M v + t. The
+feasible set is the projection of this polytope on θ; "every first move" and "some first move" are
+linear programs over it. Host, float64, HiGHS.
+"""
+
+import time
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.checks import fail
+from jaxmpc.control.sets import Polytope, maximise
+from jaxmpc.feasible.centered_polytope import (
+    CenteredPolytope,
+    coordinate_extent,
+    weak_duality_bound,
+)
+from jaxmpc.mpc.inequalities import Inequalities, row_lengths
+
+# Bounds of linear programs are trusted to this, relative to the size of the set.
+TOLERANCE = 1e-9
+# Facets are enumerated up to this dimension, and this many of them.
+DIMENSIONS, FACETS = 4, 2000
+
+
+@dataclass(frozen=True, eq=False)
+class PlanPolytope:
+    """The polytope {v = (θ, z): G v ≤ g} of states θ (p,) and decisions z that keep all rows.
+
+    G (rows, p + nz) has rows of length 1. M (p, p + nz), t (p,): the state after the first move is
+    M v + t. exact: False where a constraint is no row (the terminal ellipsoid) and the polytope is
+    too large for that. equal (rows,): the rows of equalities, which leave no margin.
+    """
+
+    G: np.ndarray
+    g: np.ndarray
+    M: np.ndarray
+    t: np.ndarray
+    exact: bool
+    equal: np.ndarray
+
+    @classmethod
+    def of(cls, c: Any) -> "PlanPolytope":
+        """The polytope of a `Condensed` problem whose arrays are NumPy's.
+
+        Where input rates are limited, θ = (x, u_{−1}).
+        """
+        rows, _ = Inequalities.of(c).normalised()
+        p = c.D.shape[1]
+        M = np.vstack([np.hstack([c.Phi[1], c.Gamma[1]]), np.hstack([c.Psi[0], c.Omega[0]])])
+        t = np.concatenate([c.phi[1], c.psi[0]])
+        equal = (c.lower == c.upper)[rows.row]
+        return cls(np.hstack([rows.D, rows.C]), rows.b, M[:p], t[:p], not c.balls, equal)
+
+    @property
+    def p(self) -> int:
+        """Number of coordinates of θ."""
+        return len(self.t)
+
+    @cached_property
+    def extent(self) -> np.ndarray:
+        """|v_i| ≤ extent_i on the polytope (twice what LPs find, which outweighs their error)."""
+        return coordinate_extent(self.G, self.g)
+
+    def followed(self) -> "PlanPolytope":
+        """The polytope of (θ, z, z⁺) with (θ, z) and (θ⁺, z⁺) both in this one: of the decisions
+        after which another one is feasible."""
+        p = self.p
+        state, plan = self.G[:, :p], self.G[:, p:]
+        G = np.block([[self.G, np.zeros_like(plan)], [state @ self.M, plan]])
+        g = np.concatenate([self.g, self.g - state @ self.t])
+        size = row_lengths(G)
+        M = np.hstack([self.M, np.zeros((p, plan.shape[1]))])
+        equal = np.tile(self.equal, 2)
+        return PlanPolytope(G / size[:, None], g / size, M, self.t, self.exact, equal)
+
+    def largest_next(self, normal: np.ndarray) -> tuple[float, float, np.ndarray | None]:
+        """max normal'θ⁺ over the polytope: (attained value, upper bound, v).
+
+        The bound holds whatever the LP's error, by weak duality.
+        """
+        d = normal @ self.M
+        top, shift = maximise(d, self.G, self.g), float(normal @ self.t)
+        if top.x is None or top.y is None:
+            return top.value, top.value, None
+        return top.value + shift, self._bound(d, top.y) + shift, top.x
+
+    def support(self, direction: np.ndarray) -> float:
+        """Upper bound of direction'θ over the polytope, as in `largest_next`."""
+        d = np.append(direction, np.zeros(self.G.shape[1] - self.p))
+        top = maximise(d, self.G, self.g)
+        return top.value if top.y is None else self._bound(d, top.y)
+
+    def _bound(self, d: np.ndarray, y: np.ndarray) -> float:
+        return weak_duality_bound(d, y, self.G, self.g, self.extent)
+
+    def centre(self) -> np.ndarray | None:
+        """The θ of the point with the largest margin of all rows but equalities, None without a
+        margin."""
+        size = self.G.shape[1]
+        margin = np.where(self.equal, 0.0, 1.0)[:, None]
+        wide = np.vstack([np.hstack([self.G, margin]), np.eye(size + 1)[-1:]])
+        room = max(1.0, float(np.abs(self.g).max(initial=0.0)))
+        top = maximise(np.eye(size + 1)[-1], wide, np.append(self.g, room))
+        return None if top.x is None or top.value <= TOLERANCE else top.x[: self.p]
+
+    def ray(self, centre: np.ndarray, direction: np.ndarray) -> tuple[float, np.ndarray, float]:
+        """max s with centre + s·direction in the projection, and a half-space a'θ ≤ b of it.
+
+        (s, a, b). The LP's multipliers y give a = G_θ'y and b = y'g, plus what their error G_z'y
+        can add. Raises ValueError where the ray does not end.
+        """
+        p = self.p
+        G = np.column_stack([self.G[:, :p] @ direction, self.G[:, p:]])
+        top = maximise(np.eye(G.shape[1])[0], G, self.g - self.G[:, :p] @ centre)
+        if top.x is None or top.y is None:
+            fail("centre", "the ray does not end inside the set", "Give a bounded problem")
+        normal = self.G[:, :p].T @ top.y
+        b = self._bound(np.append(normal, np.zeros(G.shape[1] - 1)), top.y)
+        length = np.linalg.norm(normal)
+        return top.value, normal / length, float(b / length)
+
+
+def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope | str:
+    """The projection of a plan polytope on θ, all facets and vertices, or the reason why not.
+
+    Rays at the vertices of an outer polytope add half-spaces, the duals of their LPs, until every
+    vertex is reached (beneath-beyond). deadline: of `time.monotonic`, in seconds.
+    """
+    if plans.p > DIMENSIONS:
+        return f"vertices are not enumerated in {plans.p} dimensions (up to {DIMENSIONS} they are)"
+    center = plans.centre()
+    if center is None:
+        return "the feasible set is empty or flat"
+    p = plans.p
+    directions = normals = np.concatenate([np.eye(p), -np.eye(p)])
+    offsets, reached = np.array([plans.support(d) for d in normals]), np.zeros((0, p))
+    if not np.all(np.isfinite(offsets)):
+        return "the feasible set is unbounded"
+    while time.monotonic() < deadline and len(offsets) < FACETS:
+        missed = []
+        for direction in directions:
+            s, normal, offset = plans.ray(center, direction)
+            missed.append(s < 1 - TOLERANCE)
+            normals, offsets = np.vstack([normals, normal]), np.append(offsets, offset)
+        reached = np.vstack([reached, (center + directions)[~np.array(missed)]])
+        try:
+            outer = Polytope(normals, offsets).reduce()
+            vertices = outer.vertices()
+        except ValueError as error:
+            return f"its facets are too ill-conditioned ({error})"
+        normals, offsets = np.asarray(outer.H), np.asarray(outer.h)
+        scale = TOLERANCE * np.abs(vertices - center).max()
+        near = np.abs(vertices[:, None] - reached).max(axis=2, initial=0.0) <= scale
+        directions = vertices[~near.any(axis=1)] - center
+        if not len(directions):
+            return CenteredPolytope(center, normals, offsets, vertices)
+    return "its facets are too many to enumerate in the time given"

@@ -1,0 +1,115 @@
+"""The feasible set X_N as a polytope with all its facets, and how it grows with the horizon."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.checks import fail
+from jaxmpc.control.invariant import predecessor
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope, unit_rows
+from jaxmpc.feasible.plan_polytope import DIMENSIONS, FACETS, CenteredPolytope, projected
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.mpc.problem import MPC
+
+
+def feasible_polytope(mpc: MPC) -> Polytope:
+    """The feasible set X_N as a polytope, every facet once: {θ : some plan keeps every hard row}.
+
+    θ is x, or (x, u_{−1}) where input rates are limited. Facets come from the duals of linear
+    programs and are valid; each vertex was reached by one, to 1e-9 of the set's size. For a map
+    with proofs against rounding, slices, projections or an ellipsoidal terminal set use
+    `map_feasible_set(...).refine()`; one step at a time, `predecessor`.
+
+    In more than four dimensions X_N comes from N steps of `predecessor` instead, for limits of
+    states and inputs alone; that works while the limits couple few states.
+
+    Raises ValueError where X_N is empty, flat or unbounded, for an ellipsoidal terminal set, and
+    where there are too many facets. Host, float64.
+    """
+    problem = FeasibilityProblem.of(mpc)
+    plans = problem.plan_polytope
+    if not plans.exact:
+        fail("terminal_set", "is an Ellipsoid, so X_N has a curved boundary", "Map it and refine()")
+    if plans.p <= DIMENSIONS:
+        body = projected(plans)
+    else:
+        sets = backward(problem.mpc)
+        body = sets if isinstance(sets, str) else sets[1]
+    if isinstance(body, str):
+        fail("mpc", body, "Map it with map_feasible_set, which has no such limit")
+    return body.polytope
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Feasible sets at several horizons: horizons (H,), volume (H,), facets (H,), and the sets."""
+
+    horizons: np.ndarray
+    volume: np.ndarray
+    facets: np.ndarray
+    sets: tuple[Polytope, ...]
+
+
+def feasible_growth(mpc: MPC, horizons: Sequence[int]) -> Growth:
+    """How X_N grows or shrinks with N: `feasible_polytope` at each of `horizons`.
+
+    Raises ValueError as `feasible_polytope` does, and where steps or blocks of `mpc` fit one
+    horizon only.
+    """
+    sets = tuple(feasible_polytope(replace(mpc, horizon=int(N))) for N in horizons)
+    return Growth(
+        horizons=np.array(horizons, int),
+        volume=np.array([body.volume() for body in sets]),
+        facets=np.array([len(np.asarray(body.h)) for body in sets]),
+        sets=sets,
+    )
+
+
+def backward(
+    mpc: MPC, deadline: float = np.inf
+) -> tuple[CenteredPolytope, CenteredPolytope, CenteredPolytope] | str:
+    """X_{N−1}, X_N and X_{N+1} by X_{k+1} = states ∩ Pre(X_k), or the reason why not.
+
+    Half-spaces without vertices, by elimination (`predecessor`): for problems of many states
+    whose limits couple few of them. Only for limits on states and inputs at the standard steps.
+    """
+    last: Any = mpc.terminal_set
+    if (
+        not is_standard_form(mpc)
+        or not mpc.constrain_initial
+        or mpc.states is None
+        or mpc.horizon < 2
+    ):
+        return "its facets are enumerated for limits of states and inputs alone"
+    if isinstance(last, Ellipsoid):
+        return "the terminal set has no facets"
+    # Without a terminal set x_0 ∈ X is all that a horizon of 1 asks.
+    body, count = (mpc.states, mpc.horizon) if last is None else (last, mpc.horizon + 1)
+    found = []
+    for k in range(count):
+        try:
+            body = predecessor(mpc.system, body, mpc.states, mpc.inputs).reduce()
+        except ValueError as error:
+            return f"its facets are not found ({error})"
+        if time.monotonic() > deadline or np.size(body.h) > FACETS // 4:
+            return "its facets are too many to enumerate in the time given"
+        if k >= count - 3:
+            found.append(body)
+    if last is None and mpc.horizon == 2:
+        found = [mpc.states.to_polytope() if isinstance(mpc.states, Box) else mpc.states, *found]
+    none = np.zeros((0, mpc.system.n))
+    one, two, three = (
+        CenteredPolytope(part.chebyshev()[0], *unit_rows(part.H, part.h), none)
+        for part in found[-3:]
+    )
+    return one, two, three
+
+
+def is_standard_form(mpc: MPC) -> bool:
+    """True for limits on states and inputs alone, at the standard steps, with inputs free at
+    each step."""
+    free = not (mpc.outputs or mpc.rate_limited) and mpc.control_horizon is None
+    return free and mpc.constrained_steps is None

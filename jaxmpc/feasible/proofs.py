@@ -1,0 +1,189 @@
+"""Proofs that a state is feasible or infeasible, evaluated in float64 and safe against rounding.
+
+Both work on the exact data of the problem (A, B, c and the sets), not on condensed matrices. Where
+input rates are limited x stands for (x, u_{k−1}). Soft rows are no constraints and play no part.
+
+*Feasible*: inputs clipped into their limits are rolled out, x_{k+1} = A x_k + B u_k + c, with a
+running bound on the rounding error, ε_{k+1} = |A| ε_k + γ(|A||x_k| + |B||u_k| + |c|). Every
+row must hold with a margin no less than |H| ε_k plus the rounding of the row's own product.
+
+*Infeasible*: for any multipliers y_k of the rows H x_k + D u_k the costates p_N = H_N'y_N,
+p_k = A'p_{k+1} + H'y_k satisfy Σ y_k'(H x_k + D u_k) = p_0'x_0 + Σ (B'p_{k+1} + D'y_k)'u_k +
+c'p_{k+1} along every trajectory; with σ the support function of each set this bounds every
+feasible x_0,
+
+    p_0'x_0 ≤ Σ_k σ(y_k) + Σ_k [σ_U(−B'p_{k+1} − D'y_k) − c'p_{k+1}].
+
+Inputs that must be equal (a control horizon) share one σ_U of their sum. A terminal ellipsoid
+{x'Px ≤ α} adds Pv to p_N and its support √(α v'Pv), for any v.
+
+No property of y is needed, so any iterate gives a valid half-space; a converged one gives a
+tight one. (Neumaier & Shcherbina 2004: the input limits absorb the dual residual.)
+
+*Rounding.* The computed p_k is off by at most e_k = |A|'e_{k+1} + γ(|A|'|p_{k+1}| + |H|'|y_k|).
+Such an error meets x_k, and is settled there where limits on x_k are near, or else is left to the
+steps before, e_k → |A|'e_k, with what it meets of u and c on the way. To settle it, p_k is moved
+by s∘e_k, s_i ∈ {−1, 0, 1}, at the price of e_k'reach_k, where |x_k| + s∘x_k ≤ reach_k: a limit
+on one side of x_k suffices, since |x| + x ≤ 2 max(x, 0). What arrives at k = 0 gives
+
+    a'θ ≤ b + w'|θ|   for every feasible θ,
+
+which decides about θ whether the feasible set is bounded or not, and takes no figure from a solver
+(but for the box round a polytope, a part in 10⁶ outwards). In the same way it becomes a half-space
+for the whole set, with (a + s∘w)'θ ≤ b + w'reach_0, as far as limits on x_0, or the extent that
+LPs find (`RowPrograms.bounding_box`), doubled, leave θ_i a finite side for each w_i ≠ 0. (Where a
+set extends both ways without end along a facet there is none: its normal is no vector of floats.)
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.feasible.exact_data import ExactData
+
+UNIT_ROUNDOFF = 2.0**-53
+# Covers products that underflow; data smaller than this are not told from zero.
+TINY = 1e-290
+
+
+def gamma(terms: int) -> float:
+    """Relative rounding bound of a sum of `terms` products (Higham 2002, §3.1)."""
+    return terms * UNIT_ROUNDOFF / (1 - terms * UNIT_ROUNDOFF)
+
+
+def row_gamma(H: Array) -> Array:
+    """Rounding bound of each product Hx: none where the row only picks ±x_i."""
+    exact = (jnp.sum(H != 0, axis=1) <= 1) & jnp.all((H == 0) | (jnp.abs(H) == 1), axis=1)
+    return jnp.where(exact, 0.0, gamma(H.shape[1] + 1))
+
+
+def first_of_block(moves: tuple[int, ...]) -> np.ndarray:
+    """For each step the first step that has the same move."""
+    return np.searchsorted(np.array(moves), np.array(moves))
+
+
+def prove_feasible(p: ExactData, theta: Array, free: Array, inputs: Array) -> tuple[Array, Array]:
+    """Roll out inputs (N, m) from the point θ: (proved, inputs clipped into their limits).
+
+    All arithmetic in float64. Not proved means only that this input sequence is no proof.
+    """
+    n, m = p.B.shape
+    inputs = jnp.clip(inputs, p.u_lower, p.u_upper)[first_of_block(p.moves)]
+    x = p.view.initial_state(theta, free)
+    A, B, c = jnp.asarray(p.A), jnp.asarray(p.B), jnp.asarray(p.c)
+    rows, rows_N = jnp.concatenate([p.H, p.D], axis=1), jnp.asarray(p.H_N)
+    # Twice the first-order bound covers the rounding of the bound itself.
+    growth = 2 * gamma(n + m + 2)
+
+    def holds(H, lower, upper, x, error):
+        value = H @ x
+        size = jnp.abs(H) @ error * (1 + 1e-9) + 2 * row_gamma(H) * (jnp.abs(H) @ jnp.abs(x))
+        return jnp.all((value + size <= upper) & (value - size >= lower))
+
+    def advance(carry, step):
+        (x, error), (u, lower, upper) = carry, step
+        here = jnp.concatenate([x, u]), jnp.concatenate([error, jnp.zeros_like(u)])
+        inside = holds(rows, lower, upper, *here)
+        bound = jnp.abs(A) @ jnp.abs(x) + jnp.abs(B) @ jnp.abs(u) + jnp.abs(c)
+        error = jnp.abs(A) @ error * (1 + 1e-9) + growth * bound + TINY
+        return (A @ x + B @ u + c, error), inside
+
+    steps = (inputs, jnp.asarray(p.lower), jnp.asarray(p.upper))
+    (x, error), inside = jax.lax.scan(advance, (x, jnp.zeros_like(x)), steps)
+    proved = jnp.all(inside) & holds(rows_N, p.lower_N, p.upper_N, x, error)
+    if p.P is not None:
+        # (x + e)'P(x + e) ≤ x'Px + 2|x|'|P|ε + ε'|P|ε for |e| ≤ ε.
+        size = jnp.abs(p.P)
+        rounding = (2 * jnp.abs(x) + error) @ (size @ error) * (1 + 1e-9)
+        rounding = rounding + 2 * gamma(2 * n + 2) * (jnp.abs(x) @ (size @ jnp.abs(x)))
+        proved = proved & (x @ (p.P @ x) + rounding <= p.level)
+    return proved & jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(inputs)), inputs
+
+
+def cut(p: ExactData, y_states: Array, y_N: Array, y_ball: Array) -> tuple[Array, Array, Array]:
+    """What multipliers say: a'θ ≤ b + w'|θ| for every feasible θ; a (d,), b, w (d,) ≥ 0.
+
+    y_states (N, r) and y_N (r_N,): y > 0 on the upper bound, y < 0 on the lower. y_ball: of the
+    rows L'x of the terminal ellipsoid P = LL', any length without one. w covers rounding;
+    b = inf where nothing can be said. The multipliers are scaled to about one first.
+    """
+    n, m = p.B.shape
+    N, r = p.horizon, p.H.shape[0]
+    A, B, c, H, D = (jnp.asarray(v) for v in (p.A, p.B, p.c, p.H, p.D))
+    parts = (y_states, y_N, y_ball) if p.P is not None else (y_states, y_N)
+    top = sum(jnp.max(jnp.abs(y), initial=0.0) for y in parts)
+    scale = jnp.exp2(-jnp.floor(jnp.log2(jnp.where(top > 0, top, 1.0))))
+    # Twice what a sum of so many terms can be off by covers the rounding of the bound itself.
+    unit = 2 * gamma(N * (r + 2 * m + 6) + 4 * n + p.H_N.shape[0] + 12)
+
+    def support(y, lower, upper):  # Σ u y⁺ − l y⁻, and the same with |u|, |l|
+        y = jnp.where(jnp.isposinf(upper), jnp.minimum(y, 0.0), y)
+        y = jnp.where(jnp.isneginf(lower), jnp.maximum(y, 0.0), y)
+        bound = jnp.where(y > 0, upper, jnp.where(y < 0, lower, 0.0))
+        return y, jnp.sum(y * bound), jnp.sum(jnp.abs(y * bound))
+
+    def most(value, moved, lower, upper):  # of v'u in a box, over all |v − value| ≤ unit·moved
+        worth = lambda v: v * jnp.where(v > 0, upper, jnp.where(v < 0, lower, 0.0))
+        found = jnp.maximum(worth(value + unit * moved), worth(value - unit * moved))
+        return jnp.sum(found), jnp.sum(jnp.abs(found))
+
+    y_N, total, size = support(y_N * scale, p.lower_N, p.upper_N)
+    # Errors are counted in units: p_k is off by no more than unit·moved.
+    p_N, moved = jnp.asarray(p.H_N).T @ y_N, jnp.abs(p.H_N).T @ jnp.abs(y_N)
+    if p.P is not None:
+        v = jnp.asarray(p.back) @ (y_ball * scale)
+        # The rounding of v'Pv is added before the root, that of the root itself with the rest.
+        squared = jnp.abs(v) @ (jnp.abs(p.P) @ jnp.abs(v))
+        squared = jnp.maximum(v @ (p.P @ v), 0.0) + 2 * gamma(2 * n + 2) * squared
+        value = jnp.sqrt(p.level * squared)
+        p_N, moved = p_N + p.P @ v, moved + jnp.abs(p.P) @ jnp.abs(v)
+        total, size = total + value, size + value
+
+    def back(carry, step):
+        p_next, moved, total, size = carry
+        y, lower, upper, left, side, reach = step
+        y, row_total, row_size = support(y, lower, upper)
+        p_next, size = p_next + unit * side * moved, size + reach @ moved
+        moved = left * moved + jnp.abs(p_next)
+        total = total + row_total - c @ p_next
+        size = size + row_size + jnp.abs(c) @ moved
+        slope = -(B.T @ p_next) - D.T @ y
+        slope_size = jnp.abs(B).T @ moved + jnp.abs(D).T @ jnp.abs(y)
+        moved = jnp.abs(A).T @ moved + jnp.abs(H).T @ jnp.abs(y)
+        return (A.T @ p_next + H.T @ y, moved, total, size), (slope, slope_size)
+
+    errors = map(jnp.asarray, (p.left, p.side, p.reach))
+    steps = (y_states * scale, jnp.asarray(p.lower), jnp.asarray(p.upper), *errors)
+    start = (p_N, moved, total, size)
+    (p_0, moved, total, size), inputs = jax.lax.scan(back, start, steps, reverse=True)
+    same = np.equal.outer(np.arange(max(p.moves) + 1), np.array(p.moves)).astype(float)
+    slope, slope_size = inputs if len(same) == N else (same @ v for v in inputs)
+    value, value_size = most(slope, slope_size, p.move_lower, p.move_upper)
+    total, size = total + value, size + value_size
+
+    axes, others = np.array(p.view.axes), np.array(p.view.others, int)
+    if p.view.projects:  # the other states may take any value in their box
+        value, value_size = most(-p_0[others], moved[others], p.view.lower, p.view.upper)
+        total, size = total + value, size + value_size
+    elif len(others):
+        fixed = p.view.fixed[others]
+        total, size = total - p_0[others] @ fixed, size + moved[others] @ jnp.abs(fixed)
+    a, b, w = p_0[axes], total + unit * size + TINY, unit * moved[axes]
+    # 0'θ ≤ b says nothing, unless b < 0: then no θ at all is feasible.
+    return a, jnp.where(jnp.isfinite(b) & (jnp.any(a != 0) | (b < 0)), b, jnp.inf), w
+
+
+def everywhere(p: ExactData, a: Array, b: Array, w: Array) -> tuple[Array, Array]:
+    """The half-space a'θ ≤ b, valid for every feasible θ, that follows from those (a, b, w) of
+    `cut`; b = inf where none does.
+    """
+    w = w + jnp.where(p.side_0 == 0, 0.0, 2 * UNIT_ROUNDOFF * jnp.abs(a))
+    return a + p.side_0 * w, b + jnp.sum(jnp.where(w == 0, 0.0, w * p.reach_0))
+
+
+def excludes(a: Array, b: Array, w: Array, theta: Array) -> Array:
+    """True when θ breaks a'θ ≤ b + w'|θ| by more than the rounding of this test."""
+    beyond = jnp.sum(a * theta, axis=-1) - jnp.sum(w * jnp.abs(theta), axis=-1) - b
+    size = jnp.sum((jnp.abs(a) + w) * jnp.abs(theta), axis=-1) + jnp.abs(b)
+    return beyond > 2 * gamma(2 * theta.shape[-1] + 3) * size

@@ -1,0 +1,169 @@
+"""Exact boundary of the feasible set along rays: one linear program a ray, both ends proved.
+
+For a ray centre + t d the LP max t over (t, w) gives the boundary point; its dual gives a facet
+of the feasible set there. HiGHS solves the LP; what is reported is what `proofs.py` confirms: a
+point proved feasible just inside, and a half-space that holds on the whole set.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import fail
+from jaxmpc.feasible import proofs
+from jaxmpc.feasible.candidates import cut_of, inputs_of
+from jaxmpc.feasible.constraint_rows import ConstraintRows
+from jaxmpc.feasible.exact_data import ExactData
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.mpc.problem import MPC
+
+# How far a boundary point is pulled towards the centre before it is proved: the least that works.
+PULLS = 10.0 ** np.arange(-14, -1)
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """Rays from `center` (d,) along `directions` (K, d), and what was proved on each.
+
+    inner (K,): largest t for which centre + t d was proved feasible (NaN: none). outer (K,):
+    where the ray leaves all the half-spaces (inf: never). points (K, d): the points at `inner`.
+    normals (K, d), offsets (K,): half-spaces a'x ≤ b that hold on the whole feasible set
+    (b = inf where the LP gave none).
+    """
+
+    center: np.ndarray
+    directions: np.ndarray
+    inner: np.ndarray
+    outer: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    offsets: np.ndarray
+
+
+def boundary(
+    mpc: MPC, directions: int | np.ndarray, *, center: np.ndarray | None = None,
+    axes: tuple[int, ...] | None = None, fixed: np.ndarray | None = None,
+) -> Boundary:  # fmt: skip
+    """Exact boundary points and facets of the feasible set of `mpc` along rays.
+
+    directions: a number of rays (equally spaced in 2-D, random in more dimensions) or an array
+    (K, d). center: a feasible point (d,); None: the point with the largest margin. axes, fixed:
+    a slice or projection as in `map_feasible_set`. Raises ValueError where the feasible set is
+    empty or flat, or the centre is not inside it.
+    """
+    problem = FeasibilityProblem.of(mpc, axes, fixed)
+    d = problem.dimension
+    if isinstance(directions, int | np.integer):
+        directions = ray_directions(max(int(directions), 0), d)
+    directions = np.asarray(directions, np.float64)
+    if directions.ndim != 2 or directions.shape[1] != d or not np.all(np.isfinite(directions)):
+        fail("directions", f"shape {directions.shape}", f"Give finite rays (K, {d}) or a number")
+    if not len(directions) or not np.all(np.any(directions != 0, axis=1)):
+        fail("directions", "holds no ray, or a zero row", "Give at least one direction")
+    if center is not None and (np.shape(center) != (d,) or not np.all(np.isfinite(center))):
+        fail("center", f"{center}", f"Give one finite point ({d},)")
+    return Rays.of(problem, center).shoot(directions)
+
+
+def ray_directions(count: int, d: int) -> np.ndarray:
+    """`count` directions in R^d: equally spaced in 2-D, random with a fixed seed above."""
+    if d == 1:
+        return np.array([[1.0], [-1.0]])
+    if d == 2:
+        angle = 2 * np.pi * np.arange(count) / count
+        return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    normal = np.random.default_rng(0).standard_normal((count, d))
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Rays from one centre of the feasible set, for any number of directions.
+
+    center (d,) with w: a feasible pair with a margin. exact: the data for proofs.
+    """
+
+    problem: FeasibilityProblem
+    center: np.ndarray
+    w: np.ndarray
+    exact: ExactData
+
+    @classmethod
+    def of(cls, problem: FeasibilityProblem, center: np.ndarray | None = None) -> "Rays":
+        """Rays from the given centre, or from the point with the largest margin.
+
+        Raises ValueError where the feasible set is empty or flat, or the centre not inside it.
+        """
+        center, w = problem.programs.centre(center)
+        return cls(problem, center, w, problem.exact(np.abs(center)))
+
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Half-spaces (normals, offsets) of the bounding box, as far as there is one."""
+        _, sides = self.problem.programs.bounding_box
+        with jax.enable_x64(True):
+            normals, offsets = (
+                np.asarray(v) for v in half_spaces(self.exact, self.problem.rows, sides)
+            )
+        valid = np.isfinite(offsets)
+        return normals[valid], offsets[valid]
+
+    def shoot(self, directions: np.ndarray) -> Boundary:
+        """Solve, pull and prove along every direction (K, d)."""
+        solved = [self.problem.programs.ray(self.center, d) for d in directions]
+        t, w, y = (np.array(part) for part in zip(*solved, strict=True))
+        bounded = np.isfinite(t)
+        # Shrinking a feasible pair (θ, w) towards the centre's pair gives every row a margin.
+        reach = np.where(bounded, t, 0.0)[:, None] * (1 - PULLS)
+        theta = self.center + reach[:, :, None] * directions[:, None, :]
+        w = self.w + (w - self.w)[:, None, :] * (1 - PULLS)[:, None]
+        # Repeated rays fill up to a power of two, so that few shapes compile.
+        count = len(directions)
+        fill = np.arange(max(32, 1 << (count - 1).bit_length())) % count
+        with jax.enable_x64(True):
+            feasible, normals, offsets = (
+                np.asarray(v)[:count]
+                for v in prove(self.exact, self.problem.rows, theta[fill], w[fill], y[fill])
+            )
+        feasible = feasible & bounded[:, None]
+        best, each = np.argmax(feasible, axis=1), np.arange(len(directions))
+        found = feasible.any(axis=1)
+        return Boundary(
+            center=self.center,
+            directions=directions,
+            inner=np.where(found, reach[each, best], np.nan),
+            outer=leaving(self.center, directions, normals, offsets),
+            points=np.where(found[:, None], theta[each, best], np.nan),
+            normals=normals,
+            offsets=offsets,
+        )
+
+
+@jax.jit
+def prove(p: ExactData, rows: ConstraintRows, theta: Any, w: Any, y: Any) -> tuple[Array, ...]:
+    """For each ray: which of its pulled points (K, pulls, d) are proved feasible, and the
+    half-space that its multipliers give."""
+
+    def feasible(theta: Array, w: Array) -> Array:
+        inputs, free = inputs_of(p, rows, theta, w)
+        return proofs.prove_feasible(p, theta, free, inputs)[0]
+
+    return jax.vmap(jax.vmap(feasible))(theta, w), *half_spaces(p, rows, y)
+
+
+def half_spaces(p: ExactData, rows: ConstraintRows, y: Any) -> tuple[Array, Array]:
+    """Normals (K, d) and offsets (K,) of half-spaces that hold on the whole feasible set, from
+    multipliers (K, R)."""
+    return jax.vmap(lambda y: proofs.everywhere(p, *cut_of(p, rows, y)))(y)
+
+
+def leaving(
+    center: np.ndarray, directions: np.ndarray, normals: np.ndarray, offsets: np.ndarray
+) -> np.ndarray:
+    """t (K,) at which each ray leaves the intersection of the half-spaces; inf for never."""
+    slope = directions @ normals.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = (offsets - normals @ center) / slope
+    return np.where(slope > 0, t, np.inf).min(axis=1, initial=np.inf)

@@ -1,0 +1,73 @@
+"""Which initial states a point of a map stands for: all states, a slice, or a projection."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import fail, require_finite, require_shape
+from jaxmpc.control.set_bounds import set_bounds
+from jaxmpc.mpc.problem import MPC
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class View:
+    """Which initial states a point θ (d,) of the map stands for.
+
+    x_0 has θ at `axes` and `fixed` elsewhere (slice), or, where `fixed` is None, anything in the
+    box [lower, upper] of the other states (projection: feasible if some value is).
+    """
+
+    axes: tuple[int, ...] = field(metadata={"static": True})
+    others: tuple[int, ...] = field(metadata={"static": True})
+    fixed: Any
+    lower: Any
+    upper: Any
+
+    @property
+    def projects(self) -> bool:
+        """True when the states that are not mapped are free."""
+        return self.fixed is None and bool(self.others)
+
+    def initial_state(self, theta: Array, free: Array) -> Array:
+        """x_0 (n,) of a point θ and values `free` of the other states, clipped into their box."""
+        n = len(self.axes) + len(self.others)
+        x = jnp.zeros(n, theta.dtype) if self.fixed is None else jnp.asarray(self.fixed)
+        x = x.at[np.array(self.axes)].set(theta)
+        if self.projects:
+            x = x.at[np.array(self.others)].set(jnp.clip(free, self.lower, self.upper))
+        return x
+
+
+def make_view(mpc: MPC, axes: Any = None, fixed: Any = None) -> View:
+    """Check and complete the choice of states to map; raise ValueError for a wrong one.
+
+    axes: indices or names of the mapped states, None for all. fixed: values (n,) of all states
+    (those at `axes` are ignored) for a slice, None for a projection along the others.
+    """
+    n = mpc.dimension
+    names = list(mpc.system.state_names)
+    axes = tuple(range(n)) if axes is None else tuple(axes)
+    axes = tuple(names.index(i) if isinstance(i, str) and i in names else i for i in axes)
+    if not all(isinstance(i, int | np.integer) for i in axes):
+        fail("axes", f"{axes}", f"Give state indices or names ({', '.join(names) or 'none set'})")
+    axes = tuple(int(i) for i in axes)
+    if not axes or len(set(axes)) != len(axes) or not all(0 <= i < n for i in axes):
+        fail("axes", f"{axes}", f"Give different state indices from 0 to {n - 1}")
+    others = tuple(i for i in range(n) if i not in axes)
+    if fixed is not None and others:
+        require_shape("fixed", fixed, (n,), "One value for each state; those at axes are ignored")
+        require_finite("fixed", np.asarray(fixed, float)[list(others)])
+        fixed = np.asarray(fixed, np.float64)
+        return View(axes, others, np.where(np.isin(np.arange(n), others), fixed, 0.0), None, None)
+    constrained = others and 0 in mpc.state_steps
+    sides = set_bounds(mpc.states if constrained else None, mpc.system.n)
+    if n > mpc.system.n:  # a previous input is one that could be applied
+        limits = set_bounds(mpc.inputs, mpc.system.m)
+        sides = (np.append(sides[0], limits[0]), np.append(sides[1], limits[1]))
+    lower, upper = sides
+    return View(axes, others, None, lower[list(others)], upper[list(others)])

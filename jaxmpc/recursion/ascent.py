@@ -1,0 +1,101 @@
+"""Ascent over the pieces of the MPC law: to states whose next state leaves a polytope.
+
+The law is piecewise affine in the state. So a convex function of the next state can be raised by
+its gradient, and within a piece be maximised exactly by a linear program.
+"""
+
+import time
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.control.sets import maximise
+from jaxmpc.explicit.law import Law
+from jaxmpc.feasible.centered_polytope import CenteredPolytope
+from jaxmpc.qp.status import Status
+
+# Gradient ascent: how far inside the half-spaces it stays (on the boundary, where a single plan is
+# left, solvers crawl), and step lengths; relative to the size of the set.
+INSET = 1e-6
+LENGTHS = 0.3 * 0.5 ** np.arange(16)
+# At the end regions are climbed: how many at once, in how many rounds, from how many neighbours
+# at what distance.
+KEPT, ROUNDS, NEIGHBOURS, NEAR = 6, 10, 4, 1e-4
+
+
+def ascend(law: Law, bound: CenteredPolytope, starts: np.ndarray, deadline: float) -> np.ndarray:
+    """States (K, p) from which the next state lies farthest outside `bound`, the best first.
+
+    starts (S, p) follow the gradient (A + B ∂u_0/∂x)'a_j of v(x) = max_j (a_j'x⁺(x) − b_j) within
+    the half-spaces, in steps of halving length of which those are taken that raise v. Then the
+    best are led from region to region, each to the maximum of a_j'x⁺ on its region. A local
+    method: what it finds is real, what it does not find is not proved absent.
+    """
+    inset = INSET * bound.size
+    x = bound.nearest(starts, inset)
+    value, gradient = _value_and_gradient(law, bound, x)
+    for length in LENGTHS:
+        if time.monotonic() > deadline:
+            break
+        trial = bound.nearest(x + length * bound.size * gradient, inset)
+        better, slope = _value_and_gradient(law, bound, trial, than=value)
+        grown = better > value
+        x[grown], value[grown], gradient[grown] = trial[grown], better[grown], slope[grown]
+    return _climb_regions(law, bound, x, value, deadline)
+
+
+def _value_and_gradient(
+    law: Law, bound: CenteredPolytope, x: np.ndarray, than: Any = -np.inf
+) -> tuple[np.ndarray, np.ndarray]:
+    """v (S,) at x (S, p), −inf where there is no plan; its unit gradient where v > than."""
+    plans = law.plans(x)
+    after = law.following(x, plans.inputs[:, 0])
+    beyond = after @ bound.normals.T - bound.offsets
+    value = np.where(plans.status == Status.SOLVED, beyond.max(axis=1), -np.inf)
+    gradient = np.zeros_like(x)
+    for i in np.flatnonzero((value > than) & np.isfinite(value)):
+        piece = law.piece(x[i], plans.inputs[i])
+        if piece is not None:
+            slope = piece.E.T @ bound.normals[np.argmax(beyond[i])]
+            gradient[i] = slope / max(np.linalg.norm(slope), 1e-12)
+    return value, gradient
+
+
+def _climb_regions(
+    law: Law, bound: CenteredPolytope, x: np.ndarray, value: np.ndarray, deadline: float
+) -> np.ndarray:
+    """From the best of x (S, p): to the best vertex of the region there, and on from beside it."""
+    random = np.random.default_rng(0)
+    inset = INSET * bound.size
+    order = np.argsort(-value)[:KEPT]
+    best, top = x[order], value[order]
+    for tried in range(ROUNDS):
+        if time.monotonic() > deadline:
+            break
+        beside = random.standard_normal((NEIGHBOURS, *best.shape)) * NEAR * bound.size
+        around = bound.nearest(np.concatenate([best, *(best + beside)]), inset)
+        plans = law.plans(around)
+        found = []
+        for i in np.flatnonzero(plans.status == Status.SOLVED):
+            state, piece = around[i], law.piece(around[i], plans.inputs[i])
+            if piece is None:
+                continue
+            facet = int(np.argmax(bound.normals @ (piece.E @ state + piece.e) - bound.offsets))
+            up = piece.E.T @ bound.normals[facet]
+            R = np.vstack([piece.R, bound.normals])
+            peak = maximise(up, R, np.append(piece.r, bound.offsets)).x
+            if peak is not None:
+                found.append(
+                    (float(bound.signed_distance((piece.E @ peak + piece.e)[None])[0]), peak)
+                )
+        values = np.append(top, [v for v, _ in found])
+        states = np.concatenate([best, *(peak[None] for _, peak in found)])
+        kept: list[int] = []
+        for i in np.argsort(-values):
+            if all(np.abs(states[i] - states[j]).max() > 1e-6 * bound.size for j in kept):
+                kept.append(int(i))
+        before, kept = top.max(initial=-np.inf), kept[:KEPT]
+        best, top = states[kept], values[kept]
+        if tried > 1 and top.max(initial=-np.inf) <= before + 1e-12 * bound.size:
+            break
+    return best

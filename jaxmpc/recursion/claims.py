@@ -1,0 +1,266 @@
+"""The three claims of recursive feasibility, proved or refuted by theorems and linear programs."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jaxmpc.checks import fail
+from jaxmpc.control.set_bounds import set_bounds
+from jaxmpc.control.sets import Polytope
+from jaxmpc.control.terminal import verify_terminal
+from jaxmpc.explicit.regions import critical_regions
+from jaxmpc.feasible.centered_polytope import CenteredPolytope
+from jaxmpc.feasible.plan_polytope import DIMENSIONS, TOLERANCE, PlanPolytope, projected
+from jaxmpc.feasible.polytope import backward, is_standard_form
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.recursion.report import Claim, in_words
+
+# Distance from X_N, relative to its size, from which a state counts as outside: well above the
+# residuals of plans. Next states are moved towards the centre by as much before they are labelled.
+CLEAR = 1e-7
+
+
+@dataclass(frozen=True)
+class Claims:
+    """The three claims about a problem, as far as they are settled without the law, and X_N.
+
+    feasible_set: X_N, or None and `why`. volume: of X_N; lost: of the part from which every first
+    move leaves X_N; NaN where unknown. seeds (S, p): states with a first move that leaves X_N, or
+    without one that stays.
+    """
+
+    mpc: MPC
+    problem: FeasibilityProblem
+    feasible_set: CenteredPolytope | None
+    why: str
+    strong: Claim
+    law: Claim
+    weak: Claim
+    volume: float
+    lost: float
+    seeds: np.ndarray
+
+
+def settle_claims(mpc: MPC, problem: FeasibilityProblem, deadline: float = np.inf) -> Claims:
+    """Prove or refute the claims about `mpc` by Theorem 1 and linear programs.
+
+    problem: the feasibility problem of `mpc`. deadline: of `time.monotonic`, in seconds.
+    """
+    plans = problem.plan_polytope
+    none = np.zeros((0, plans.p))
+    before = after = None
+    body: CenteredPolytope | str = "the terminal set has no facets"
+    if plans.exact and plans.p <= DIMENSIONS:
+        body = projected(plans, deadline)
+    elif plans.exact:
+        sets = backward(problem.mpc, deadline)
+        before, body, after = (None, sets, None) if isinstance(sets, str) else sets
+    found, why = (None, body) if isinstance(body, str) else (body, "")
+    volume = np.nan
+    if found is not None and len(found.vertices):
+        volume = found.polytope.volume()
+    if not np.any(plans.G[:, : plans.p]) and plans.exact:
+        strong, leaving = Claim(True, "no limit depends on the state"), none
+    else:
+        strong, leaving = _by_theorem(mpc), none
+    if strong.holds is None and found is not None:
+        strong, leaving = _every_move(mpc, plans, found)
+    elif strong.holds is None:
+        strong = Claim(None, f"{strong.reason}; {why}")
+    if strong.holds:
+        follows, lost = Claim(True, "follows from strong"), 0 * volume
+        return Claims(mpc, problem, found, why, strong, follows, follows, volume, lost, none)
+    weak, lost, stuck = Claim(None, why), np.nan, none
+    if found is not None and before is not None and after is not None:
+        weak, stuck = _longer(before, found, after)
+    elif found is not None:
+        weak, lost, stuck = _some_move(plans, found, deadline)
+    law = Claim(None, why or "the critical regions were not looked at")
+    if weak.holds is False:
+        law = replace(weak, reason=f"{weak.reason}, the optimal one too")
+    seeds = np.concatenate([stuck, leaving])
+    return Claims(mpc, problem, found, why, strong, law, weak, volume, lost, seeds)
+
+
+def _every_move(mpc: MPC, plans: PlanPolytope, body: CenteredPolytope) -> tuple[Claim, np.ndarray]:
+    """Strong, by one LP a facet of X_N over the plan polytope; and the states led outside."""
+    tops = [plans.largest_next(normal) for normal in body.normals]
+    excess = np.array([top[1] for top in tops]) - body.offsets
+    beyond = np.array([top[0] for top in tops]) - body.offsets
+    i, p = int(np.argmax(beyond)), plans.p
+    outside = np.flatnonzero(beyond > CLEAR * body.size)
+    points = [v for _, _, v in tops if v is not None]
+    if excess.max() <= TOLERANCE * body.size:
+        count = f"one LP for each of {len(excess)} facets, largest excess {excess.max():.1e}"
+        reason = f"every feasible first move stays ({_set_before(mpc, body)}{count})"
+        return Claim(True, reason), np.zeros((0, p))
+    if not len(outside) or len(points) < len(tops):
+        reason = f"an LP is within {CLEAR:g} of the size of X_N, {excess.max():.1e}"
+        return Claim(None, reason), np.zeros((0, p))
+    where, after = points[i][:p], plans.M @ points[i] + plans.t
+    reason = (
+        f"from x = {in_words(where)} a feasible first move leads to {in_words(after)}, "
+        f"{beyond[i]:.6g} beyond a facet of X_N"
+    )
+    return Claim(False, reason, where), np.array(points)[outside, :p]
+
+
+def _set_before(mpc: MPC, body: CenteredPolytope) -> str:
+    """In words, that one step less gives the same set, where it does."""
+    if mpc.horizon < 2 or not is_standard_form(mpc):
+        return ""
+    shorter = FeasibilityProblem.of(replace(mpc, horizon=mpc.horizon - 1)).plan_polytope
+    ends = [shorter.support(normal) for normal in body.normals]
+    if np.any(np.array(ends) > body.offsets + TOLERANCE * body.size):
+        return ""
+    N = mpc.horizon
+    return f"X_{N - 1} = X_{N}; " if _nested(mpc) else f"X_{N - 1} lies in X_{N}; "
+
+
+def _nested(mpc: MPC) -> bool:
+    """True where a longer horizon can only make X_N smaller: the end has state limits at most."""
+    return mpc.constrain_initial and (mpc.terminal_set is None or mpc.terminal_set is mpc.states)
+
+
+def _some_move(
+    plans: PlanPolytope, body: CenteredPolytope, deadline: float
+) -> tuple[Claim, float, np.ndarray]:
+    """Weak: X_N against the states that can go on. The volume lost whatever the move, and the
+    vertices of X_N lost.
+    """
+    none = np.zeros((0, plans.p))
+    later = projected(plans.followed(), deadline)
+    if isinstance(later, str):
+        return Claim(None, f"of the states that can go on, {later}"), np.nan, none
+    excess = later.signed_distance(body.vertices)
+    i = int(np.argmax(excess))
+    lost = max(body.polytope.volume() - later.polytope.volume(), 0.0)
+    if excess[i] <= TOLERANCE * body.size:
+        what = f"all {len(excess)} vertices of X_N have a first move that stays"
+        return Claim(True, f"{what} (largest excess {max(excess[i], 0.0):.1e})"), 0.0, none
+    if excess[i] <= CLEAR * body.size:
+        reason = f"a vertex is within {CLEAR:g} of the size of X_N, {excess[i]:.1e}"
+        return Claim(None, reason), lost, none
+    return every_move_leaves(body.vertices[i]), lost, body.vertices[excess > CLEAR * body.size]
+
+
+def _longer(
+    before: CenteredPolytope, body: CenteredPolytope, after: CenteredPolytope
+) -> tuple[Claim, np.ndarray]:
+    """Weak by half-spaces alone: X_N ⊆ X_{N+1}, and X_N ⊆ X_{N−1}, so that a first move into X_N
+    is that of a feasible plan. And the states that are not in X_{N+1}.
+    """
+    tops = [body.support(normal) for normal in after.normals]
+    excess = np.array([top for top, _ in tops]) - after.offsets
+    i = int(np.argmax(excess))
+    outside = [x for (_, x), e in zip(tops, excess, strict=True) if e > CLEAR * body.size]
+    seeds = np.array([x for x in outside if x is not None]).reshape(-1, len(body.center))
+    if len(seeds):
+        x = seeds[0]
+        return Claim(
+            False, f"from x = {in_words(x)} every feasible first move leaves X_N", x
+        ), seeds
+    nested = np.array([body.support(normal)[0] for normal in before.normals]) - before.offsets
+    if max(excess[i], nested.max()) <= TOLERANCE * body.size:
+        return Claim(True, f"X_N lies in X_N+1 and in X_N-1 ({len(excess)} facets, by LPs)"), seeds
+    return Claim(None, "X_N lies in X_N+1, but not in X_N-1: its plans may lead elsewhere"), seeds
+
+
+def every_move_leaves(state: np.ndarray) -> Claim:
+    """Weak refuted at a state."""
+    reason = f"from x = {in_words(state)} every feasible first move leaves X_N"
+    return Claim(False, reason, state)
+
+
+def no_move_stays(plans: PlanPolytope, state: np.ndarray) -> bool:
+    """True if no feasible first move from `state` stays: it is beyond the states that can go on."""
+    later = plans.followed()
+    center = later.centre()
+    if center is None or not plans.exact:
+        return False
+    try:
+        _, normal, offset = later.ray(center, state - center)
+    except ValueError:  # the ray does not end
+        return False
+    return bool(normal @ state - offset > CLEAR * np.linalg.norm(state - center))
+
+
+def _by_theorem(mpc: MPC) -> Claim:
+    """Strong by Theorem 1: a plan shifted by one step and ended inside the terminal set is a plan.
+
+    That needs limits on states and inputs alone, at the usual steps, and inputs free at each step.
+    Without a terminal set, X takes its place at horizon N − 1. Convexity and compactness, which
+    the theorem asks for, are used nowhere in this argument.
+    """
+    if not is_standard_form(mpc) or (mpc.terminal_set is None and mpc.horizon == 1):
+        return Claim(None, "Theorem 1 does not cover these limits")
+    last = mpc.states if mpc.terminal_set is None else mpc.terminal_set
+    if not np.isfinite(set_bounds(last, mpc.system.n)).all():
+        return Claim(None, "Theorem 1 is checked for bounded sets alone")
+    try:
+        report = verify_terminal(
+            mpc.system, mpc.Q, mpc.R, mpc.terminal_cost, mpc.terminal_set, mpc.states, mpc.inputs
+        )
+    except ValueError as error:  # such as a set too long for its width
+        return Claim(None, f"Theorem 1 is not checked ({error})")
+    needed = [report["terminal set within states"], report["control invariance"]]
+    if all(check.holds for check in needed):
+        what = "the terminal set" if mpc.terminal_set is not None else "the set of state limits"
+        words = f"{what} is within the limits and control invariant"
+        return Claim(True, f"Theorem 1: {words}. {needed[1].sentence}")
+    missing = next(check for check in needed if not check.holds)
+    return Claim(None, f"Theorem 1 does not apply: {missing.name}")
+
+
+def settle_by_regions(claims: Claims, limit: int) -> tuple[Claim, float, np.ndarray]:
+    """The law by its critical regions; the volume it loses; states (K, n) it loses most.
+
+    On a region x⁺ is affine, so its excess over a facet is largest at a vertex.
+    """
+    body, mpc = claims.feasible_set, claims.mpc
+    assert body is not None
+    none = np.zeros((0, claims.problem.dimension))
+    try:
+        if mpc.remembers:
+            fail("mpc", "its law depends on the previous input", "They are not enumerated then")
+        found = critical_regions(mpc, limit=limit)
+    except ValueError as error:
+        return Claim(None, f"no critical regions ({error})"), np.nan, none
+    A, B = np.asarray(mpc.system.A, float), np.asarray(mpc.system.B, float)
+    c = np.zeros(len(A)) if mpc.system.c is None else np.asarray(mpc.system.c, float)
+    excess, parts, lost = [-np.inf], [none], 0.0
+    for region in found.regions:
+        E, e = A + B @ region.K, B @ region.k + c
+        beyond = body.signed_distance(region.vertices @ E.T + e)
+        excess.extend(beyond)
+        parts.append(region.vertices)
+        if beyond.max() > CLEAR * body.size:
+            H, h = np.asarray(region.polytope.H), np.asarray(region.polytope.h)
+            stays = Polytope(
+                np.vstack([H, body.normals @ E]), np.append(h, body.offsets - body.normals @ e)
+            )
+            lost += region.volume - _volume(stays)
+    values, states = np.array(excess[1:]), np.concatenate(parts)
+    top = values.max(initial=-np.inf)
+    if top > CLEAR * body.size:
+        worst = np.argsort(-values)[:6]
+        claim = Claim(False, f"a critical region leads {top:.6g} beyond a facet of X_N")
+        return claim, lost if found.complete else np.nan, states[worst]
+    if not found.complete:
+        return Claim(None, f"critical regions are incomplete: {found.reason}"), np.nan, none
+    if top > TOLERANCE * body.size:
+        return (
+            Claim(None, f"a region is within {CLEAR:g} of the size of X_N: {top:.1e}"),
+            lost,
+            none,
+        )
+    count = f"{len(found)} critical regions fill X_N"
+    return Claim(True, f"{count}, and the images of their vertices are in it"), 0.0, none
+
+
+def _volume(body: Polytope) -> float:
+    try:
+        return body.volume()
+    except ValueError:  # empty or flat
+        return 0.0

@@ -1,0 +1,160 @@
+"""ClosedLoopObjective: the loss of closed loops as a function of what is tuned, with gradients."""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.flatten_util import ravel_pytree
+
+from jaxmpc.checks import fail
+from jaxmpc.closed_loop.memory import device_bytes, program_bytes
+from jaxmpc.closed_loop.simulate_many import simulate_batch
+from jaxmpc.compiled import Compiled
+from jaxmpc.control.violation import TOLERANCE
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.solve import Controller
+from jaxmpc.qp.admm import ADMM
+from jaxmpc.qp.precision import arrays
+from jaxmpc.qp.status import Status
+from jaxmpc.tuning.losses import ClosedLoopLoss
+from jaxmpc.tuning.parameters import Parameters, values
+
+MODES = ("auto", "forward", "reverse")
+# Parameters up to which "auto" tries forward mode, whose cost grows with their number.
+FORWARD = 32
+
+# Initial states (B, n), and the variations of the plant with B in front.
+Data = tuple[np.ndarray, dict[str, np.ndarray]]
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoopObjective:
+    """The mean loss of closed loops as a function of θ.
+
+    build: values → controller. plant: from `as_argument`. steps: samples of a loop. The rest as in
+    `tune_weights`.
+    """
+
+    build: Callable[[Mapping[str, Any]], Any]
+    parameters: Parameters
+    plant: Any
+    steps: int
+    loss: Any
+    reference: Any
+    input_reference: Any
+    design_loss: Any
+
+    def arguments(self, theta: Any, x0s: Any, varied: Any, weights: Any) -> tuple:
+        """Return the arguments of `total` as arrays of the present precision."""
+        return arrays((theta, self.plant, x0s, varied, weights))
+
+    def total(
+        self, theta: Any, plant: Any, x0s: Array, varied: dict[str, Array], weights: Array,
+        recompute: bool = False,
+    ) -> tuple[Array, dict[str, Array]]:  # fmt: skip
+        """Return the weighted mean loss, and what is counted of each loop."""
+        given = values(self.parameters, theta)
+        controller = self.build(given)
+        aims = (self.reference, self.input_reference)
+        r, s = (aim(given) if callable(aim) else aim for aim in aims)
+        run = simulate_batch(
+            controller, plant, r, s, x0s.astype(controller.dtype), varied, self.steps, recompute
+        )
+        losses = jax.vmap(self.loss)(run)
+        total = jnp.sum(jnp.where(weights > 0, weights * losses, 0.0)) / jnp.sum(weights)
+        design = jnp.zeros(())
+        if self.design_loss is not None:
+            design = jnp.asarray(self.design_loss(controller.mpc))
+        worst = jnp.max(run.violation, axis=1)
+        if isinstance(self.loss, ClosedLoopLoss) and self.loss.limits is not None:
+            worst = jax.vmap(self.loss.worst)(run)
+        fraction = lambda v: jnp.mean(v.astype(float), axis=1)
+        aux = {
+            "losses": losses, "design": design,
+            "unsolved": fraction(run.status != Status.SOLVED),
+            "infeasible": fraction(run.status == Status.PRIMAL_INFEASIBLE),
+            "fallback": fraction(run.fallback),
+            "violation": worst > TOLERANCE[run.states.dtype.name],
+        }  # fmt: skip
+        return total + design, aux
+
+    def check(self, theta: Any, data: Data) -> None:
+        """Raise what tracing raises, without compiling."""
+        x0s, varied = jax.tree.map(lambda v: v[:1], data)
+        total, aux = jax.eval_shape(self.total, *self.arguments(theta, x0s, varied, np.ones(1)))
+        if aux["losses"].shape != (1,) or total.shape != ():
+            fail("loss", f"has shape {aux['losses'].shape[1:]}", "Return one number")
+
+    def gradient(self, theta: Any, data: Data, mode: str) -> tuple[str, Callable]:
+        """Return the mode, and (θ, x0s, varied, weights) → value, gradient, what `total` counts.
+
+        Several modes are compiled and timed on `data` where `mode` leaves the choice.
+        """
+        flat, unravel = ravel_pytree(arrays(theta))
+
+        def forward(theta: Any, *rest: Any) -> tuple[Array, Any, Any]:
+            flat = ravel_pytree(theta)[0]
+            at = lambda flat: self.total(unravel(flat), *rest)
+            one = lambda v: jax.jvp(at, (flat,), (v,), has_aux=True)
+            value, slope, aux = jax.vmap(one, out_axes=(None, 0, None))(
+                jnp.eye(len(flat), dtype=flat.dtype)
+            )
+            return value, unravel(slope), aux
+
+        def reverse(theta: Any, *rest: Any, recompute: bool = False) -> tuple[Array, Any, Any]:
+            at = partial(self.total, recompute=recompute)
+            (value, aux), slope = jax.value_and_grad(at, has_aux=True)(theta, *rest)
+            return value, slope, aux
+
+        x0s, varied = data
+        arguments = self.arguments(theta, x0s, varied, np.ones(len(x0s)))
+        tried: dict[str, Compiled] = {}
+        if mode != "reverse" and (mode == "forward" or flat.size <= FORWARD):
+            tried["forward"] = Compiled(jax.jit(forward))
+        if mode != "forward":
+            name, plain = "reverse", Compiled(jax.jit(reverse))
+            try:
+                if program_bytes(plain.program(*arguments)) > 0.5 * device_bytes():
+                    name = "reverse, checkpointed"
+                    plain = Compiled(jax.jit(partial(reverse, recompute=True)))
+                tried[name] = plain
+            except ValueError:  # a plant with a loop that JAX cannot transpose
+                if not tried:
+                    raise
+        name = next(iter(tried))
+        if len(tried) > 1:
+            name = min(tried, key=lambda name: duration(tried[name], arguments))
+        program = tried[name]
+        return name, lambda theta, *rest: program(*self.arguments(theta, *rest))
+
+
+def duration(program: Compiled, arguments: tuple) -> float:
+    """Return the seconds that the second of two calls takes: without compiling."""
+    program(*arguments)
+    begun = time.perf_counter()
+    program(*arguments)
+    return time.perf_counter() - begun
+
+
+def controller_of(make_mpc: Any, given: Mapping[str, Any], solver: ADMM) -> Any:
+    """Return the controller of these values: make_mpc's own, or a Controller of its problem."""
+    made = make_mpc(given)
+    if isinstance(made, MPC):
+        return Controller(made, solver)
+    if not (callable(made) and hasattr(made, "mpc") and hasattr(made, "start")):
+        fail("make_mpc", f"returns a {type(made).__name__}", "Return a jm.MPC or a controller")
+    return made
+
+
+def means(aux: dict[str, np.ndarray], weights: np.ndarray) -> dict[str, float]:
+    """Return the means over the loops that have a weight, as `tune_weights` documents them."""
+    used = np.asarray(weights) > 0
+    names = ("unsolved", "infeasible", "fallback", "violation")
+    found = {name: float(np.mean(aux[name][used])) if used.any() else np.nan for name in names}
+    return {**found, "excluded": float(np.sum(~used))}

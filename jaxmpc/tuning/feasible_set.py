@@ -1,0 +1,78 @@
+"""tune_feasible_set: the feasible set grown by gradient."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+
+from jaxmpc.checks import fail
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.precision import arrays
+from jaxmpc.runs import fingerprint
+from jaxmpc.tuning.descent import descend
+from jaxmpc.tuning.feasible_fraction import STEPS, feasible_fraction
+from jaxmpc.tuning.parameters import Parameters, raw, require_parameters, values
+from jaxmpc.tuning.result import TuningRun
+from jaxmpc.tuning.settings import Settings
+
+
+def tune_feasible_set(
+    make_mpc: Callable[[Mapping[str, Any]], MPC], parameters: Parameters, x0s: Any,
+    width: float = 0.02, *, design_loss: Callable[[MPC], Any] | None = None,
+    newton_steps: int = STEPS, **settings: Any,
+) -> TuningRun:  # fmt: skip
+    """Grow the feasible set by gradient: min_θ design_loss(mpc) − feasible_fraction(mpc, x0s).
+
+    make_mpc, parameters: as in `tune_weights`, make_mpc to an MPC. x0s (B, n): states spread
+    evenly over the region that matters, such as a `grid` or a uniform sample. width,
+    newton_steps: as in `feasible_fraction`. design_loss: what growth is traded against, a number
+    computed from the problem alone. (To trade it against the cost of closed loops, give
+    `tune_weights` design_loss=lambda mpc: -weight * feasible_fraction(mpc, ...).)
+    settings: of `Settings`, as updates=50; optimizer None: Adam of 0.05.
+
+    Returns a `TuningRun` whose result is the MPC problem. Computes in float64. The fraction is
+    smoothed and sampled: prove what was gained by `map_feasible_set`, before and after. Numbers of
+    the history: fraction, and design, the design loss. Raises ValueError for what does not fit
+    together, before any compile.
+    """
+    require_parameters(parameters)
+    chosen = Settings(**settings)
+    chosen.validate()
+    x0s = np.asarray(x0s, np.float64)
+    if x0s.ndim != 2 or not len(x0s):
+        fail("x0s", f"shape {x0s.shape}", "Give states (B, n), one a row")
+    train, test = chosen.split(x0s, shuffle=True)
+
+    def total(theta: Any, x0s: Array) -> tuple[Array, dict[str, Array]]:
+        mpc = make_mpc(values(parameters, theta))
+        if not isinstance(mpc, MPC):
+            fail("make_mpc", f"returns a {type(mpc).__name__}", "Return a jm.MPC")
+        fraction = feasible_fraction(mpc, x0s, width, newton_steps=newton_steps)
+        design = jnp.zeros(()) if design_loss is None else jnp.asarray(design_loss(mpc))
+        return design - fraction, {"fraction": fraction, "design": design}
+
+    slope, value = jax.jit(jax.value_and_grad(total, has_aux=True)), jax.jit(total)
+
+    def gradient(theta: Any, step: int) -> tuple[float, Any, dict[str, float]]:
+        rows = chosen.minibatch(len(train), step)
+        with jax.enable_x64(True):
+            (loss, numbers), slopes = slope(arrays(theta), arrays(train[rows]))
+        return float(loss), slopes, numbers
+
+    def validate(theta: Any) -> tuple[float, dict[str, float]]:
+        with jax.enable_x64(True):
+            loss, numbers = value(arrays(theta), arrays(test))
+        return float(loss), numbers
+
+    decides = {
+        "parameters": {name: p.record() for name, p in parameters.items()},
+        "width": float(width), "batch": min(chosen.batch or len(train), len(train)),
+        "train": len(train), "validation": len(test), "newton_steps": newton_steps,
+        "seed": chosen.seed, "dtype": "float64", "data": fingerprint(None, train, test),
+    }  # fmt: skip
+    history = descend(raw(parameters), gradient, validate, optax.adam(0.05), chosen, decides)
+    return TuningRun.of_parameters(parameters, history, decides, make_mpc)

@@ -1,0 +1,147 @@
+"""PenaltyObjective: how far ADMM's answers are from solved, as a function of its penalties.
+
+ADMM with a fixed number of steps is a function of rho and alpha that can be differentiated; what
+is minimised is a smooth count of the sampled states that it leaves unsolved,
+
+    mean over states of softplus(2 (e + margin)) / 2,    e = log10 |residuals / tolerances|,
+
+the residuals being those that the status is made of. A state that is solved counts for nothing, a
+state far from it for the digits that are missing. (Learning to optimise by unrolling: Gregor,
+LeCun 2010; penalties of ADMM for QPs: Ichnowski et al. 2021, by reinforcement; Stellato et al.
+2020, §5.2, adapt one number while iterating.) Whatever rho is, the fixed points of the
+iteration are the solutions: a bad rho costs steps, it cannot make an answer wrong.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.compiled import padded
+from jaxmpc.mpc.condense import Condensed
+from jaxmpc.qp.admm import ADMM, factor, iterate, read, scaled
+from jaxmpc.qp.problem import QP, residual_terms
+from jaxmpc.qp.solve import marked, solve_factored, start, unscaled
+from jaxmpc.qp.status import Status
+
+# Digits by which the loss wants residuals below their tolerance.
+MARGIN = 0.3
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Samples:
+    """States to solve from: x (B, p), and warm starts (z (B, nz), y (B, rows)) or None."""
+
+    x: Any
+    start: Any = None
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def take(self, where: Any) -> "Samples":
+        """Return the samples at these places."""
+        return jax.tree.map(lambda v: v[where], self)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PenaltyObjective:
+    """What the penalties are tuned for: a problem, its references, and an iteration.
+
+    W: from `interpolation`. solver: its iterations, eps and smoothing are used.
+    """
+
+    condensed: Condensed
+    W: Any
+    reference: Any
+    input_reference: Any
+    solver: ADMM
+
+    def qp(self, x: Array) -> QP:
+        """Return the quadratic program at a state."""
+        return self.condensed.qp(x, self.reference, self.input_reference)
+
+    def digits(self, theta: Any, samples: Samples) -> Array:
+        """Return e (B,): log10 of the norm of all residuals over their tolerances."""
+        rho, alpha = jnp.exp(theta["log_rho"] @ self.W.T), 2 * jax.nn.sigmoid(theta["alpha"])
+        solver, c = replace(self.solver, rho=rho, alpha=alpha), self.condensed
+        made = factor(c.P, c.C, solver, c.balls)
+        eps = 1e-6 if solver.eps is None else solver.eps
+
+        def one(sample: Samples) -> Array:
+            qp = self.qp(sample.x)
+            q, bounds = scaled(made, qp)
+            t = jnp.zeros_like(qp.l)
+            if sample.start is not None:
+                t = start(made, qp, bounds, sample.start)
+            t, _ = iterate(made, q, bounds, t, solver.iterations, solver.alpha)
+            z, y = unscaled(qp, made, *read(made, t, q, bounds))
+            floor = 100 * jnp.finfo(z.dtype).eps
+            # A quarter of the rounding stays, for the sake of the logarithm's slope at 0.
+            square: Any = (floor / 4) ** 2
+            for value, size in residual_terms(qp, z, y):
+                square += jnp.sum((value / (eps + floor * size)) ** 2)
+            return 0.5 * jnp.log10(square)
+
+        return jax.vmap(one)(samples)
+
+
+@jax.jit
+@jax.value_and_grad
+def loss_and_gradient(theta: Any, objective: PenaltyObjective, samples: Samples) -> Array:
+    """Return the number that is minimised over θ, see above, and its gradient."""
+    e = objective.digits(theta, samples)
+    return jnp.mean(jax.nn.softplus(2 * (e + MARGIN)) / 2)
+
+
+def solve_samples(
+    rho: np.ndarray, alpha: Any, objective: PenaltyObjective, samples: Samples, chunk: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return status and largest residual (B,) of the samples by the solver itself.
+
+    rho (stages, rows). chunk: samples at once; one size, so that it compiles once.
+    """
+    parts = []
+    for i in range(0, len(samples), chunk):
+        part = samples.take(slice(i, i + chunk))
+        found = _solve(
+            jnp.asarray(rho), jnp.asarray(alpha, float), objective,
+            jax.tree.map(lambda v: padded(v, chunk), part),
+        )  # fmt: skip
+        parts.append([np.asarray(v)[: len(part)] for v in found])
+    status, worst = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return status, worst
+
+
+@jax.jit
+def _solve(
+    rho: Array, alpha: Array, objective: PenaltyObjective, samples: Samples
+) -> tuple[Array, Array]:  # fmt: skip
+    c, solver = objective.condensed, replace(objective.solver, rho=rho, alpha=alpha)
+    made = factor(c.P, c.C, solver, c.balls)
+
+    def one(sample: Samples) -> tuple[Array, Array]:
+        s = marked(*solve_factored(objective.qp(sample.x), made, solver, sample.start))
+        worst = jnp.maximum(jnp.maximum(s.primal_residual, s.dual_residual), jnp.abs(s.gap))
+        return s.status, worst
+
+    return jax.vmap(one)(samples)
+
+
+def score(status: np.ndarray, worst: np.ndarray) -> dict[str, float]:
+    """Return how well samples were solved, as `tune_penalties` documents it.
+
+    loss: the states that are not solved, plus a fraction of one that grows with the median
+    residual from 1e-16 to 1e16: less is better. solved: fraction SOLVED. residual: median of the
+    largest residuals; NaN counts as infinite.
+    """
+    median = float(np.median(np.nan_to_num(worst, nan=np.inf)))
+    digits = float(np.log10(np.clip(median, 1e-16, 1e16)))
+    return {
+        "loss": float(np.sum(status != Status.SOLVED)) + (digits + 17) / 34,
+        "solved": float(np.mean(status == Status.SOLVED)), "residual": median,
+    }  # fmt: skip

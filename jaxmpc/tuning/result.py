@@ -1,0 +1,135 @@
+"""TuningRun: what every tuner returns, and how it is kept in a cache."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.checks import fail
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.admm import ADMM
+from jaxmpc.runs import read_arrays, write_arrays
+from jaxmpc.tuning.descent import Descent
+from jaxmpc.tuning.parameters import Parameters, exact_values, trajectory
+from jaxmpc.tuning.settings import Settings
+
+
+@dataclass(frozen=True, eq=False)
+class TuningRun:
+    """What a tuner found: the values that do best on the validation set.
+
+    values, initial: name → array, the best values and those given; the latter too where no step
+        is better.
+    before, after: name → number, measured on the validation set with `initial` and `values`:
+        "loss", and the numbers that the tuner documents.
+    improved: whether a step is better than what was given.
+    settings: what was asked, JSON data.
+    build: values → what was tuned.
+    history: record of every step (`Descent`); None where the run comes from a cache.
+    trace: name → values at every step (T + 1, …); empty where the run comes from a cache.
+    """
+
+    values: dict[str, np.ndarray]
+    initial: dict[str, np.ndarray]
+    before: dict[str, float]
+    after: dict[str, float]
+    improved: bool
+    settings: dict[str, Any]
+    build: Callable[[Mapping[str, Any]], Any]
+    history: Any = field(default=None, repr=False)
+    trace: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of_parameters(
+        cls, parameters: Parameters, history: Descent, settings: dict[str, Any],
+        build: Callable[[Mapping[str, Any]], Any],
+    ) -> "TuningRun":  # fmt: skip
+        """Return the run of a descent of `parameters`, whose start is what was given."""
+        at = lambda k: {
+            "loss": float(history.validation[k]),
+            **{name: float(v[k]) for name, v in history.validation_numbers.items()},
+        }
+        initial = {name: np.asarray(p.value) for name, p in parameters.items()}
+        improved = history.best > 0
+        return cls(
+            exact_values(parameters, history.theta) if improved else initial, initial, at(0),
+            at(history.best), improved, settings, build, history,
+            trajectory(parameters, history.thetas),
+        )  # fmt: skip
+
+    @property
+    def result(self) -> Any:
+        """Return what was tuned, with the values found.
+
+        From `tune_weights` a controller, from `tune_feasible_set` an MPC, from `tune_penalties`
+        an ADMM, from `tune_sweep_penalties` the penalties for `map_feasible_set`.
+        """
+        return self.build(self.values)
+
+    @property
+    def mpc(self) -> MPC:
+        """Return the MPC problem with the values found."""
+        found = self.result
+        return found if isinstance(found, MPC) else found.mpc
+
+    @property
+    def solver(self) -> ADMM:
+        """Return the solver with the values found."""
+        found = self.result
+        return found if isinstance(found, ADMM) else found.solver
+
+    @property
+    def improvement(self) -> float:
+        """Return the fraction by which the validation loss fell: 0.2 for 20 %."""
+        first, best = self.before["loss"], self.after["loss"]
+        return float((first - best) / abs(first)) if first else 0.0
+
+    def record(self) -> dict[str, Any]:
+        """Return all of it as JSON data: settings, values, and the numbers of every step."""
+        listed = lambda tree: {name: np.asarray(v).tolist() for name, v in tree.items()}
+        column = lambda v: [float(x) if np.isfinite(x) else None for x in v]
+        found = {
+            "settings": self.settings, "initial": listed(self.initial),
+            "values": listed(self.values), "improved": self.improved,
+            "improvement": self.improvement, "before": self.before, "after": self.after,
+        }  # fmt: skip
+        h = self.history
+        if h is None:
+            return found
+        return found | {
+            "best_step": h.best, "loss": column(h.loss), "gradient_norm": column(h.gradient_norm),
+            "accepted": h.accepted.tolist(), "validation": column(h.validation),
+            "numbers": {name: column(v) for name, v in h.numbers.items()},
+            "validation_numbers": {name: column(v) for name, v in h.validation_numbers.items()},
+            "values_by_step": listed(self.trace), "seconds": h.seconds,
+        }  # fmt: skip
+
+
+def cached(
+    cache: str | Path | None, decides: Mapping[str, Any], settings: Settings,
+    build: Callable[[Mapping[str, Any]], Any], tune: Callable[[], TuningRun],
+) -> TuningRun:  # fmt: skip
+    """Return the run kept in the folder `cache`, else the run of `tune`, which is kept there.
+
+    decides["fingerprint"]: names the file; a damaged one counts as absent. build: of the run.
+    cache None: nothing is kept.
+    """
+    if cache is None:
+        return tune()
+    if settings.optimizer is not None:
+        fail("cache", "given beside an optimizer, which has no fingerprint", "Leave one out")
+    path = Path(cache) / f"{decides['fingerprint']}.npz"
+    kept = read_arrays(path)
+    if kept is not None and kept[0]:
+        part = lambda key: {
+            name.removeprefix(key): v for name, v in kept[1].items() if name.startswith(key)
+        }
+        return TuningRun(part("values_"), part("initial_"), **kept[0], build=build)
+    run = tune()
+    trees = (("values", run.values), ("initial", run.initial))
+    arrays = {f"{key}_{name}": v for key, tree in trees for name, v in tree.items()}
+    plain = {name: getattr(run, name) for name in ("before", "after", "improved", "settings")}
+    write_arrays(path, plain, **arrays)
+    return run

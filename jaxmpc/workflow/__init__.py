@@ -1,0 +1,18 @@
+"""From limits to a tested controller.
+
+Design: `design` chooses terminal set, terminal cost and penalties, and returns a `Design`.
+Test: `offline_report` collects in an `OfflineReport` what is proved, what was only tried, and what
+fails; its `NominalLoops` are closed loops that were simulated.
+"""
+
+from jaxmpc.workflow.controller_design import Design, design
+from jaxmpc.workflow.nominal_loops import NominalLoops
+from jaxmpc.workflow.offline_test import OfflineReport, offline_report
+
+__all__ = [
+    "Design",
+    "NominalLoops",
+    "OfflineReport",
+    "design",
+    "offline_report",
+]

@@ -1,0 +1,84 @@
+"""From limits, weights and a horizon to an MPC problem with terminal set, cost and penalties."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from jaxmpc.checks import fail
+from jaxmpc.control.limits import JointLimits
+from jaxmpc.control.named_terminal import named_terminal_set
+from jaxmpc.control.riccati import LQR, lqr
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope
+from jaxmpc.control.system import LinearSystem
+from jaxmpc.explicit.exact_penalty import ExactPenalty, exact_penalty
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.soften import soften
+from jaxmpc.mpc.solve import Controller
+from jaxmpc.qp.admm import ADMM
+from jaxmpc.workflow.offline_test import OfflineReport, offline_report
+
+
+@dataclass(frozen=True)
+class Design:
+    """The result of `design`.
+
+    mpc: the problem. regulator: the LQR law that its terminal ingredients rest on. penalty: the
+    exact penalty, where one was asked for.
+    """
+
+    mpc: MPC
+    regulator: LQR
+    penalty: ExactPenalty | None
+
+    def controller(self, solver: ADMM | None = None) -> Controller:
+        """Return the `Controller` of the problem, factored once."""
+        return Controller(self.mpc) if solver is None else Controller(self.mpc, solver)
+
+    def test(self, **settings: Any) -> OfflineReport:
+        """Return the `offline_report` of the problem, which takes the settings."""
+        return offline_report(self.mpc, K=self.regulator.K, **settings)
+
+
+def design(
+    system: LinearSystem, Q: Any, R: Any, horizon: int, *, limits: JointLimits | None = None,
+    states: Box | Polytope | None = None, inputs: Box | Polytope | None = None,
+    terminal: str | Box | Polytope | Ellipsoid = "invariant", soft: float | str | None = None,
+    **settings: Any,
+) -> Design:  # fmt: skip
+    """Make an MPC problem from limits and weights, with terminal set, terminal cost and penalties.
+
+    Arguments:
+        limits: those of `joint_limits`; or give states and inputs themselves.
+        terminal: a set, or the name of one as in `named_terminal_set`.
+        soft: None keeps all limits hard; a number is the L1 weight of state and terminal rows;
+            "exact" computes the least weight that changes nothing on the feasible set, and adds a
+            margin.
+        settings: further fields of `MPC`, such as control_horizon or input_rate_limit. The
+            terminal cost is that of the LQR unless terminal_cost is among them.
+
+    Raises ValueError for ill-posed data, as `lqr`, `maximal_invariant_set` and `MPC` do.
+    """
+    if limits is not None:
+        if states is not None or inputs is not None:
+            fail("limits", "given beside states or inputs", "Choose one way to give the limits")
+        states, inputs = limits.states, limits.inputs
+        if not system.state_names:
+            named: dict[str, Any] = limits.names
+            system = replace(system, **named)
+    regulator = lqr(system, Q, R)
+    if isinstance(terminal, str):
+        terminal_set = named_terminal_set(terminal, system, regulator, states, inputs)
+    else:
+        terminal_set = terminal
+    mpc = MPC(
+        system=system, Q=Q, R=R, horizon=horizon, states=states, inputs=inputs,
+        terminal_set=terminal_set, **{"terminal_cost": regulator.P, **settings},
+    )  # fmt: skip
+    mpc.validate()
+    penalty = None
+    if isinstance(soft, str):
+        if soft != "exact":
+            fail("soft", f"{soft!r}", 'Give a weight, "exact" or None')
+        penalty = exact_penalty(mpc)
+    if soft is not None:
+        mpc = soften(mpc, soft if penalty is None else penalty.advised)
+    return Design(mpc, regulator, penalty)

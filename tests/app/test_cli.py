@@ -1,0 +1,364 @@
+"""The command: files and table when all is well, one line and an exit code when not."""
+
+import json
+import shlex
+import signal
+import subprocess
+import sys
+from importlib.metadata import version
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from jaxmpc.app import cli
+from jaxmpc.app.commands import linear_sweep, recursion
+from jaxmpc.control.sets import Box
+from jaxmpc.recursion import Claim, Counterexample, RecursionReport, SmallestHorizon
+
+
+@pytest.fixture(autouse=True)
+def _in_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+
+
+@pytest.fixture
+def no_compile(monkeypatch):
+    """Fail if the sweep starts: errors must be found before."""
+    monkeypatch.setattr(
+        linear_sweep, "label_chunks", lambda *a, **k: pytest.fail("the sweep started")
+    )
+
+
+def run(line):
+    return cli.main(shlex.split(line))
+
+
+def test_sweep_writes_files_and_table(tmp_path, capsys):
+    assert run("sweep --grid 16 12 --horizon 5") == 0
+    out = capsys.readouterr().out
+    folder = tmp_path / "jaxmpc-sweep"
+    assert {path.name for path in folder.iterdir()} == {"sweep.zarr", "map.png", "summary.json"}
+    data = xr.open_zarr(folder / "sweep.zarr", consolidated=False)
+    assert data["label"].shape == (192,) and data["plan"].shape == (192, 5, 1)
+    summary = json.loads((folder / "summary.json").read_text())
+    labels = data["label"].values
+    feasible, infeasible = np.count_nonzero(labels == 1), np.count_nonzero(labels == -1)
+    assert summary["counts"] == {
+        "feasible": feasible,
+        "infeasible": infeasible,
+        "undecided": 192 - feasible - infeasible,
+        "not finite": 0,
+        "not run": 0,
+    }
+    assert summary["config"]["mpc"]["horizon"] == 5
+    assert 0 < summary["volume"]["inner"] <= summary["volume"]["outer"] <= 12
+    for word in ("feasible", "undecided", "area from", "rad·rad/s", "QPs/s", "map.png"):
+        assert word in out
+    # States beyond the limits |q| <= 1.5, |dq| <= 2 are never feasible.
+    beyond = np.any(np.abs(data["points"].values) > [1.5, 2.0], axis=1)
+    assert np.all(labels[beyond] == -1)
+
+
+@pytest.mark.slow
+def test_file_slice_and_overwrite(tmp_path, capsys):
+    (tmp_path / "case.toml").write_text(
+        """
+        name = "two carts"
+        [system]
+        A = [[1, 0.1, 0], [0, 1, 0], [0, 0, 0.5]]
+        B = [[0], [0.1], [1]]
+        dt = 0.1
+        state_names = ["p", "v", "w"]
+        [limits]
+        x_min = [-1, -1, -1]
+        x_max = [1, 1, 1]
+        u_min = [-1]
+        u_max = [1]
+        [cost]
+        Q = [1, 1, 1]
+        R = [1]
+        [mpc]
+        horizon = 4
+        [sweep]
+        grid = [6, 6]
+        axes = ["p", "v"]
+        projection = true
+        """
+    )
+    assert run("sweep --config case.toml --fixed 0.25 --output out --no-refine") == 0
+    assert "two carts" in capsys.readouterr().out
+    assert run("sweep --config case.toml --fixed 0.5 --output out") == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert run("sweep --config case.toml --fixed 0.5 --output out --resume") == 2
+    assert "sweep.fixed: [0.25] there, [0.5] here" in capsys.readouterr().err
+    command = "sweep --config case.toml --axes 0 --grid 5 --fixed 0 0.5 --output out --overwrite"
+    assert run(command) == 0
+    assert "length from" in capsys.readouterr().out
+
+
+def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(linear_sweep, "CHUNK", 50)
+    real = linear_sweep.label_chunks
+
+    def interrupted(*args, **kwargs):
+        for k, chunk in enumerate(real(*args, **kwargs)):
+            if k == 1:
+                signal.raise_signal(signal.SIGINT)
+            yield chunk
+
+    monkeypatch.setattr(linear_sweep, "label_chunks", interrupted)
+    assert run("sweep --grid 16 12 --horizon 5 --output 'my maps'") == 130
+    out = capsys.readouterr().out
+    assert "jaxmpc sweep --grid 16 12 --horizon 5 --output 'my maps' --resume" in out
+    assert "chunks that were done are kept" in out
+    asked = []
+
+    def counted(mpc, points, **kwargs):
+        asked.append(points)
+        return real(mpc, points, **kwargs)
+
+    monkeypatch.setattr(linear_sweep, "label_chunks", counted)
+    resume = "sweep --grid 16 12 --horizon 5 --output 'my maps' --resume"
+    assert run(resume) == 0
+    data = xr.open_zarr(tmp_path / "my maps" / "sweep.zarr", consolidated=False)
+    np.testing.assert_array_equal(asked[0], data["points"][50:])
+    assert np.all(data["status"] != 0)
+    assert run(resume) == 0 and len(asked) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--horizon 0", "--horizon"),
+        ("--grid 1 5", "--grid"),
+        ("--grid 5", "sweep.grid: has 1 entries where 2"),
+        ("--lower 1 0 --upper -1 0", "sweep.lower"),
+        ("--lower nan 0 --upper 1 1", "--lower"),
+        ("--axes q w", "no state 'w'. States are q, dq"),
+        ("--axes q --grid 5", "sweep.fixed: 2 states, 1 mapped"),
+        ("--config absent.toml", "absent.toml: cannot be read"),
+        ("--output file/below", "--output file/below"),
+        ("--resume --overwrite", "Choose one"),
+    ],
+)
+@pytest.mark.usefixtures("no_compile")
+def test_errors_are_one_line_before_any_compile(tmp_path, capsys, arguments, message):
+    (tmp_path / "file").touch()
+    assert run(f"sweep {arguments}") == 2
+    err = capsys.readouterr().err
+    assert err.startswith("jaxmpc: error: ") and err.count("\n") == 1
+    assert message in err
+
+
+@pytest.mark.usefixtures("no_compile")
+@pytest.mark.parametrize("arguments", ["", "sweep --grid 1.5 2", "sweep --horizont 3", "swep"])
+def test_wrong_usage(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        run(arguments)
+    assert caught.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "names"),
+    [("--help", "sweep recursion info simulate tune"), ("tune --help", "weights penalties")],
+)
+def test_help_has_a_line_for_each_command(line, names, capsys):
+    with pytest.raises(SystemExit) as caught:
+        run(line)
+    assert caught.value.code == 0
+    text = capsys.readouterr().out
+    for name in names.split():
+        assert f"• {name} " in text
+
+
+def test_help_is_a_page_a_stranger_can_use(capsys):
+    with pytest.raises(SystemExit) as caught:
+        run("sweep --help")
+    assert caught.value.code == 0
+    text = capsys.readouterr().out
+    options = """config output horizon terminal grid lower upper axes fixed projection iterations
+        dtype resume overwrite no-refine"""
+    for word in options.split():
+        assert f"--{word}" in text
+    assert text.count("(default:") >= 14
+    assert text.count("$ jaxmpc sweep") == 2
+    for section in ("[system]", "[limits]", "[cost]", "[mpc]", "[sweep]"):
+        assert section in text
+    for word in ("feasible", "undecided", "map.png", "summary.json", "sweep.zarr", "130"):
+        assert word in text
+
+
+def canned(mpc, x0s, **settings):
+    """A report of the right shapes, without computing anything."""
+    n = mpc.system.n
+    x0s = np.zeros((7, n)) if x0s is None else x0s
+    count = len(x0s)
+    worst = Counterexample(
+        state=x0s[0], inputs=np.ones((mpc.horizon, 1)), next_state=x0s[0] + 1.0,
+        normal=np.eye(n)[0], offset=1.0, distance=0.25,
+        feasible_inputs=np.ones((mpc.horizon, 1)), primal_residual=0.0, dual_residual=0.0,
+        found="search",
+    )  # fmt: skip
+    refuted = Claim(False, "an example", x0s[0])
+    return RecursionReport(
+        mpc=mpc, strong=refuted, law=refuted, weak=Claim(None, "no facets"), counterexample=worst,
+        feasible_set=Box(-np.ones(n), np.ones(n)).to_polytope(), volume=4.0, lost_by_any=np.nan,
+        lost_by_law=0.5, states=x0s, label=np.ones(count, np.int8), inputs=np.zeros((count, 1)),
+        next_states=x0s, lost_at=np.arange(count) % 3, undecided_at=np.zeros(count, int),
+        steps=settings["steps"], seconds=1.0,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def examined(monkeypatch):
+    """Calls of recursive_feasibility, which is replaced."""
+    calls = []
+
+    def record(mpc, x0s, **settings):
+        calls.append((mpc, x0s, settings))
+        return canned(mpc, x0s, **settings)
+
+    monkeypatch.setattr(recursion, "recursive_feasibility", record)
+    least = SmallestHorizon(5, 6, {5: Claim(True, "by regions")})
+    monkeypatch.setattr(recursion, "smallest_horizon", lambda *a, **k: least)
+    return calls
+
+
+def test_recursion_writes_files_and_table(tmp_path, capsys, examined):
+    line = "recursion --horizon 4 --grid 6 5 --steps 3 --regions 0 --seconds 9 --no-search"
+    assert run(f"{line} --smallest 8") == 0
+    mpc, x0s, settings = examined[0]
+    assert (mpc.horizon, x0s.shape) == (4, (30, 2))
+    assert settings == {"steps": 3, "search": False, "regions": 0, "seconds": 9.0}
+    np.testing.assert_allclose(x0s[0], [-1.59, -2.12])  # limits and 3 %
+    out = capsys.readouterr().out
+    for word in ("strong", "refuted: an example", "open: no facets", "0.25", "lost by law",
+                 "smallest horizon     5 (by regions); strong from 6"):  # fmt: skip
+        assert word in out
+    folder = tmp_path / "jaxmpc-recursion"
+    assert {path.name for path in folder.iterdir()} == set(recursion.FILES)
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["claims"]["law"] == {"holds": False, "reason": "an example",
+                                        "state": x0s[0].tolist()}  # fmt: skip
+    assert summary["counterexample"]["distance"] == 0.25 and summary["lost_by_any"] is None
+    assert summary["counts"]["lost after one step"] == 10
+    assert summary["config"]["recursion"]["steps"] == 3 and "sweep" not in summary["config"]
+    assert summary["smallest_horizon"]["reasons"]["5"]["holds"] is True
+    with np.load(folder / "recursion.npz") as data:
+        assert data["state"].shape == (30, 2) and data["facet_normals"].shape == (4, 2)
+        np.testing.assert_array_equal(data["lost_at"], np.arange(30) % 3)
+    assert run(line) == 2
+    assert "exists. Add --overwrite" in capsys.readouterr().err
+    assert run(f"{line} --overwrite") == 0
+
+
+def test_recursion_of_many_states_needs_no_slice(tmp_path, examined, capsys):
+    text = """
+        [system]
+        A = [[1, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.1], [0, 0, 0, 1]]
+        B = [[0, 0], [0.1, 0], [0, 0], [0, 0.1]]
+        dt = 0.1
+        [limits]
+        x_min = [-1, -1, -1, -1]
+        x_max = [1, 1, 1, 1]
+        u_min = [-1, -1]
+        u_max = [1, 1]
+        [cost]
+        Q = [1, 1, 1, 1]
+        R = [1, 1]
+        [mpc]
+        horizon = 3
+        terminal = "invariant"
+        [recursion]
+        steps = 7
+    """
+    (tmp_path / "four.toml").write_text(text)
+    assert run("recursion --config four.toml --output out") == 0
+    assert examined[0][1] is None and examined[0][2]["steps"] == 7
+    assert {path.name for path in (tmp_path / "out").iterdir()} == set(recursion.FILES[:2])
+    assert run("recursion --config four.toml --output two --grid 2 2 2 2 --steps 5") == 0
+    assert examined[1][1].shape == (16, 4) and examined[1][2]["steps"] == 5
+    assert run("sweep --config four.toml") == 2  # a sweep must be told what to do with the others
+    assert "sweep.fixed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--horizon 0", "--horizon"),
+        ("--grid 5", "recursion.grid: has 1 entries where 2"),
+        ("--grid 1 5", "--grid"),
+        ("--lower 1 0 --upper -1 0", "recursion.lower"),
+        ("--steps 0", "--steps"),
+        ("--regions -1", "--regions"),
+        ("--seconds 0", "--seconds"),
+        ("--smallest 0", "--smallest"),
+        ("--config absent.toml", "absent.toml: cannot be read"),
+        ("--output file/below", "--output file/below"),
+    ],
+)
+def test_recursion_errors_are_one_line(tmp_path, capsys, arguments, message, monkeypatch):
+    forbidden = lambda *a, **k: pytest.fail("the work started")
+    monkeypatch.setattr(recursion, "recursive_feasibility", forbidden)
+    (tmp_path / "file").touch()
+    assert run(f"recursion {arguments}") == 2
+    err = capsys.readouterr().err
+    assert err.startswith("jaxmpc: error: ") and err.count("\n") == 1
+    assert message in err
+
+
+def test_recursion_interrupted_and_refused(capsys, monkeypatch):
+    def interrupt(*a, **k):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(recursion, "recursive_feasibility", interrupt)
+    assert run("recursion") == 130
+    assert "stopped; nothing is kept" in capsys.readouterr().out
+
+    def refuse(*a, **k):
+        raise ValueError("x0s: None, and the feasible set is empty or flat. Give the states")
+
+    monkeypatch.setattr(recursion, "recursive_feasibility", refuse)
+    assert run("recursion") == 2
+    assert "empty or flat" in capsys.readouterr().err
+
+
+def test_recursion_help_is_a_page_a_stranger_can_use(capsys):
+    with pytest.raises(SystemExit) as caught:
+        run("recursion --help")
+    assert caught.value.code == 0
+    text = capsys.readouterr().out
+    options = """config output horizon terminal steps grid lower upper regions seconds no-search
+        smallest overwrite"""
+    for word in options.split():
+        assert f"--{word}" in text
+    assert text.count("(default:") >= 12 and text.count("$ jaxmpc recursion") == 2
+    for word in (
+        "strong",
+        "weak",
+        "lost_at",
+        "summary.json",
+        "recursion.png",
+        "130",
+        "[recursion]",
+    ):
+        assert word in text
+
+
+@pytest.mark.slow
+def test_recursion_of_the_joint_for_real(tmp_path, capsys):
+    assert run("recursion --horizon 4 --terminal box --grid 32 32 --steps 4 --seconds 200") == 0
+    summary = json.loads((tmp_path / "jaxmpc-recursion" / "summary.json").read_text())
+    assert [summary["claims"][name]["holds"] for name in ("strong", "law", "weak")] == [False] * 3
+    assert abs(summary["counterexample"]["distance"] - 0.0039968) < 1e-6
+    assert abs(summary["lost_by_law"] - 0.0016) < 1e-9
+    assert "found by search" in capsys.readouterr().out
+
+
+def test_version_and_module_entry():
+    command = [sys.executable, "-m", "jaxmpc", "--version"]
+    out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert out == f"jaxmpc {version('jaxmpc')}\n"

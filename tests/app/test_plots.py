@@ -1,0 +1,151 @@
+"""The picture shows what the map holds, in any figure, without a window."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from jaxmpc.app.plots import plot_feasible_set, plot_recursion
+from jaxmpc.control.sets import Box, Polytope
+from jaxmpc.control.system import LinearSystem
+from jaxmpc.recursion import Claim, Counterexample, RecursionReport
+
+
+@dataclasses.dataclass(frozen=True)
+class Map:
+    """What the picture asks of a FeasibleSetMap: |x| <= 1.1 feasible, to 1.3 undecided."""
+
+    points: np.ndarray
+    n: int = 2
+    fixed: np.ndarray | None = None
+    axes: tuple[int, int] = (0, 1)
+
+    @property
+    def label(self) -> np.ndarray:
+        distance = np.abs(self.points).max(axis=1)
+        return np.where(distance <= 1.1, 1, np.where(distance <= 1.3, 0, -1)).astype(np.int8)
+
+    @property
+    def mpc(self):
+        names, units = ("q", "dq", "r", "dr")[: self.n], ("rad", "rad/s", "m", "m/s")[: self.n]
+        B = np.ones((self.n, 1))
+        system = LinearSystem(np.eye(self.n), B, state_names=names, state_units=units)
+        return SimpleNamespace(system=system, horizon=7, rate_limited=False)
+
+    @property
+    def names(self):
+        return self.mpc.system.state_labels[:2]
+
+    def inner(self) -> Polytope:
+        return Box(-np.ones(2), np.ones(2)).to_polytope()
+
+    def outer(self) -> Polytope:
+        return Box(-1.2 * np.ones(2), 1.2 * np.ones(2)).to_polytope()
+
+    def terminal_section(self) -> Polytope | None:
+        return Box(-0.5 * np.ones(2), 0.5 * np.ones(2)).to_polytope() if self.n == 2 else None
+
+
+def square(count):
+    side = np.linspace(-2, 2, count)
+    return np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def texts(ax):
+    return [text.get_text() for text in ax.get_legend().get_texts()]
+
+
+def test_grid_becomes_an_image_with_first_state_to_the_right():
+    points = square(21)
+    fmap = Map(points)
+    ax = plot_feasible_set(fmap)
+    image = ax.images[0].get_array()
+    np.testing.assert_array_equal(image[3, :], fmap.label.reshape(21, 21)[:, 3])
+    assert ax.images[0].get_extent() == pytest.approx((-2.1, 2.1, -2.1, 2.1))
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("q [rad]", "dq [rad/s]")
+    assert ax.get_title(loc="left") == "Feasible initial states, horizon N = 7"
+    assert texts(ax) == [
+        "feasible (121)",
+        "infeasible (272)",
+        "undecided (48)",
+        "terminal set",
+        "outer bound",
+        "inner bound",
+    ]
+    reach = [np.abs(line.get_xdata()).max() for line in ax.lines]
+    np.testing.assert_allclose(reach, [0.5, 1.2, 1.0])
+
+
+def test_scattered_points_slice_and_projection(tmp_path):
+    points = np.random.default_rng(0).uniform(-2, 2, (300, 2))
+    figure = Figure()
+    ax = figure.add_subplot()
+    assert plot_feasible_set(Map(points, 4, np.array([0.0, 0.0, 0.5, -1.0])), ax) is ax
+    assert not ax.images and len(ax.collections) == 3
+    assert ax.get_title(loc="left").endswith("slice at r [m] = 0.5, dr [m/s] = -1")
+    assert "terminal set" not in texts(ax)
+    ax = plot_feasible_set(Map(points, 3))
+    assert ax.get_title(loc="left").endswith("projection: some value of r [m]")
+    figure.savefig(tmp_path / "map.png")
+    assert (tmp_path / "map.png").stat().st_size > 1000
+
+
+def test_only_two_states():
+    with pytest.raises(ValueError, match="fmap: maps 3 states.*Choose|choose `axes`"):
+        plot_feasible_set(Map(np.zeros((5, 3))))
+
+
+def recursion_report(points, worst=True):
+    """|x| <= 1 feasible; lost at step 1 above x2 = 0.9, at step 4 above 0.8, open above 0.7."""
+    inside = np.abs(points).max(axis=1) <= 1
+    height = points[:, 1]
+    lost_at = np.select([~inside, height > 0.9, height > 0.8, height > 0.7], [-1, 1, 4, -2], 0)
+    counterexample = Counterexample(
+        state=np.array([0.5, 1.0]), inputs=np.zeros((7, 1)), next_state=np.array([1.2, 0.9]),
+        normal=np.array([1.0, 0.0]), offset=1.0, distance=0.2, feasible_inputs=np.zeros((7, 1)),
+        primal_residual=0.0, dual_residual=0.0, found="search",
+    )  # fmt: skip
+    system = LinearSystem(np.eye(2), np.ones((2, 1)), state_names=("q", "dq"))
+    return RecursionReport(
+        mpc=SimpleNamespace(system=system, horizon=7, labels=system.state_labels),
+        strong=Claim(False, "a"), law=Claim(False, "b"), weak=Claim(None, "c"),
+        counterexample=counterexample if worst else None,
+        feasible_set=Box(-np.ones(2), np.ones(2)).to_polytope(), volume=4.0, lost_by_any=np.nan,
+        lost_by_law=0.1, states=points, label=np.where(inside, 1, -1).astype(np.int8),
+        inputs=np.zeros((len(points), 1)), next_states=points, lost_at=lost_at,
+        undecided_at=np.where(lost_at == -2, 1, 0), steps=9, seconds=1.0,
+    )  # fmt: skip
+
+
+def test_recursion_shows_fates_set_and_counterexample(tmp_path):
+    points = square(41)
+    report = recursion_report(points)
+    ax = plot_recursion(report)
+    image = ax.images[0].get_array().T.ravel()
+    for fate, lost in ((0, -1), (1, -2), (2, 0), (3, 1), (6, 4)):
+        np.testing.assert_array_equal(image == fate, report.lost_at == lost)
+    shown = texts(ax)
+    names = ("infeasible", -1), ("undecided", -2), ("kept for 9 steps", 0), ("lost at step 1", 1)
+    counts = [(f"{name} ({np.sum(report.lost_at == fate):,})") for name, fate in names]
+    assert shown[:4] == counts and shown[4].startswith("lost at step 4 to 5 (")
+    assert shown[-4:] == ["X_7", "counterexample x", "next state", "half-space it leaves"]
+    cut = next(line for line in ax.lines if np.allclose(line.get_xdata(), 1.0))
+    assert np.ptp(cut.get_ydata()) > 4  # across the picture
+    assert ax.get_title(loc="left") == "Closed loops of 9 steps, horizon N = 7"
+    ax = plot_recursion(report, Figure().add_subplot(), enlarge=True)
+    assert not ax.images and ax.get_xlim()[0] > -0.5 and ax.get_xlim()[1] > 1.2
+    assert "next state 0.2 outside" in ax.get_title(loc="left")
+    ax.figure.savefig(tmp_path / "enlarged.png")
+    random = np.random.default_rng(0).uniform(-2, 2, (300, 2))
+    ax = plot_recursion(recursion_report(random, worst=False))
+    assert not ax.images and "half-space it leaves" not in texts(ax)
+
+
+def test_recursion_refuses_what_it_cannot_draw():
+    report = recursion_report(square(5), worst=False)
+    with pytest.raises(ValueError, match="enlarge: without a counterexample"):
+        plot_recursion(report, enlarge=True)
+    with pytest.raises(ValueError, match="report: is of 3 states"):
+        plot_recursion(dataclasses.replace(report, states=np.zeros((5, 3))))

@@ -1,0 +1,352 @@
+"""jaxmpc simulate: files, table and picture say what the states in the store say."""
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+import xarray as xr
+from PIL import Image
+
+import jaxmpc as jm
+from jaxmpc.app import cli
+from jaxmpc.app.commands import robot_runs
+from jaxmpc.app.plots import plot_runs
+from jaxmpc.closed_loop.outcome import evaluate_runs
+from jaxmpc.robots.video import render, save_video
+
+# Models at the set-point compile in half the time.
+LINE = (
+    "--robot joint --count 6 --chunk 4 --seconds 0.4 --spread 0.9 --horizon 10 --mass 0.2 "
+    "--linearize set-point"
+)
+
+
+@pytest.fixture(scope="module")
+def joint():
+    """One robot for all commands: another would compile again."""
+    return jm.load_robot("joint")
+
+
+@pytest.fixture(scope="module")
+def mpc(joint):
+    """The problem of `LINE`, from the joint's linear model (compiled nowhere)."""
+    system = jm.LinearSystem([[1, 0.01], [0, 1]], [[0.002], [0.2]], dt=0.01)
+    plant = jm.LinearPlant(system, joint.state_limits, joint.input_limits)
+    return jm.robot_mpc(plant, [1 / 1.5**2, 0.01 / 2**2], [0.01 / 2**2], 10)
+
+
+@pytest.fixture(autouse=True)
+def _in_empty_folder(tmp_path, monkeypatch, joint):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+    given = lambda name: joint if name == "joint" else jm.load_robot(name)
+    monkeypatch.setattr(robot_runs, "load_robot", given)
+
+
+def run(line):
+    return cli.main(["simulate", *shlex.split(line)])
+
+
+def no_renderer(*args, **kwargs):
+    raise mujoco.FatalError("an OpenGL platform library has not been loaded")
+
+
+def rows(out):
+    """The table: {name: rest of the line}."""
+    lines = (line for line in out.splitlines() if line.startswith("  "))
+    return {line[2:16].strip(): line[16:].strip() for line in lines}
+
+
+def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
+    """Ctrl-C in the second chunk loses that chunk only; the table is that of the states."""
+    real, asked = robot_runs.simulate_many, []
+
+    def default(robot, Q, R, horizon, *, target, margin):
+        assert (Q, R, horizon, target, margin) == (None, None, mpc.horizon, None, 0.02)
+        return mpc
+
+    def interrupted(*args, **kwargs):
+        asked.append(args[2])
+        if len(asked) == 2:
+            raise KeyboardInterrupt
+        return real(*args, **kwargs)
+
+    monkeypatch.setattr(robot_runs, "robot_mpc", default)
+    monkeypatch.setattr(robot_runs, "simulate_many", interrupted)
+    assert run(f"{LINE} --output 'my runs'") == 130
+    out = capsys.readouterr().out
+    assert f"jaxmpc simulate {LINE} --output 'my runs' --resume" in out
+    folder = tmp_path / "my runs"
+    first = xr.open_zarr(folder / "runs.zarr", consolidated=False).load()
+    assert np.isfinite(first["states"][:4]).all() and np.isnan(first["states"][4:]).all()
+    assert not (folder / "summary.json").exists()
+
+    assert run(f"{LINE} --output 'my runs' --resume --seed 1") == 2
+    assert "seed: 0 there, 1 here" in capsys.readouterr().err
+    monkeypatch.setattr(mujoco, "Renderer", no_renderer)
+    assert run(f"{LINE} --output 'my runs' --resume") == 0
+    captured = capsys.readouterr()
+    assert len(asked) == 3, "the first chunk ran again"
+    assert "no video: MuJoCo finds no renderer" in captured.err and "libegl1" in captured.err
+    assert {p.name for p in folder.iterdir()} == {"runs.zarr", "runs.png", "summary.json"}
+
+    data = xr.open_zarr(folder / "runs.zarr", consolidated=False).load()
+    np.testing.assert_array_equal(data["states"][:4], first["states"][:4])
+    x, u = (data[name].values.astype(float) for name in ("states", "inputs"))
+    assert x.shape == (6, 41, 2) and u.shape == (6, 40, 1)
+    np.testing.assert_allclose(x[:, 0], data["points"], atol=1e-6)
+    # The plant's law by hand: J = 0.05 kg m² times the factor of the body, h = 0.01 s.
+    factor = data["mass"].values[:, 1]
+    assert np.all(np.abs(factor - 1) <= 0.2) and np.ptp(factor) > 0.05
+    dq = x[:, :-1, 1] + 0.01 * u[:, :, 0] / (0.05 * factor[:, None])
+    np.testing.assert_allclose(x[:, 1:, 1], dq, atol=1e-5)
+    np.testing.assert_allclose(x[:, 1:, 0], x[:, :-1, 0] + 0.01 * dq, atol=1e-5)
+
+    # The joint's limits are 1.5 rad, 2 rad/s, 2 N m; the band is 2 % of them.
+    kept = (np.abs(x) <= [1.5 + 1.5e-6, 2 + 2e-6]).all(axis=(1, 2)) & (np.abs(u) <= 2 + 2e-6).all(
+        axis=(1, 2)
+    )
+    near = (np.abs(x) <= [0.03, 0.04]).all(axis=2)
+    settled = [0.01 * (np.flatnonzero(~row).max(initial=-1) + 1) for row in near]
+    settled = np.sort(np.where(near[:, -1], settled, np.inf))
+    summary = json.loads((folder / "summary.json").read_text())
+    assert 0 < near[:, -1].sum() < 6, "the test should see both"
+    assert (summary["success"], summary["limits_kept"]) == ((kept & near[:, -1]).sum(), kept.sum())
+    median, last = (None if np.isinf(v) else pytest.approx(v) for v in settled[[3, 5]])
+    assert summary["settling"] == {"median": median, "95 %": last}
+    solved, fallback = (data["status"] == 1).values, data["fallback"].values
+    assert summary["plans_solved"] == solved.sum() and summary["fallback_plans"] == fallback.sum()
+    assert summary["plans_valid"] == (solved & ~fallback).all(axis=1).sum()
+    cost = np.sum((x[:, :-1] ** 2) @ [1 / 1.5**2, 0.01 / 4] + 0.01 / 4 * u[:, :, 0] ** 2, axis=1)
+    assert summary["cost"]["median"] == pytest.approx(np.sort(cost)[3], rel=1e-4)
+    assert summary["this_run"]["count"] == 2 and summary["config"]["horizon"] == 10
+    table = rows(captured.out)
+    assert table["success"].startswith(f"{summary['success']}  ")
+    assert table["limits kept"].startswith(f"{kept.sum()}  ")
+    assert f"of {solved.size}" in table["plans solved"]
+    assert "real time" in table and "MPC solves/s" in table["run"]
+
+    again = run(f"{LINE} --output 'my runs' --resume --video 0")  # nothing is left to do
+    assert again == 0 and len(asked) == 3 and "run" not in rows(capsys.readouterr().out)
+    assert run(f"{LINE} --output 'my runs'") == 2
+    assert "--overwrite" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "--robot arm2 --dtype float64 --damping 0.5 --payload 0.5",
+        "--robot cartpole --linearize lqr --spread 0.05",
+        "--robot pendulum --linearize trajectory",
+    ],
+)
+def test_other_robots_and_laws(tmp_path, capsys, arguments):
+    assert run(f"{arguments} --count 3 --seconds 0.1 --output out --video 0") == 0
+    table = rows(capsys.readouterr().out)
+    data = xr.open_zarr(tmp_path / "out" / "runs.zarr", consolidated=False).load()
+    assert np.isfinite(data["states"]).all()
+    if "lqr" in arguments:
+        assert "plans solved" not in table and "control steps/s" in table["run"]
+        assert np.all(data["status"] == 0)
+    else:
+        assert np.mean(data["status"].values == 1) > 0.5 and "fallback" in table
+    if "float64" in arguments:
+        assert data["states"].dtype == np.float64 and data["damping"].shape == (3, 2)
+        assert np.all((data["payload"] >= 0) & (data["payload"] <= 0.5))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--robot arm9", "'arm9' is no file"),
+        ("--count -3", "--count: -3"),
+        ("--seconds nan", "--seconds"),
+        ("--state-weights 1 2 3", "--state-weights: has 3 numbers. joint needs 2"),
+        ("--input-weights 1 1", "--input-weights: has 2 numbers. joint needs 1"),
+        ("--target 0 1", "--target: has 2 numbers. joint needs 1"),
+        ("--mass 1.5", "--mass: 1.5"),
+        ("--spread 2", "--spread: 2"),
+        ("--resume --overwrite", "Choose one"),
+    ],
+)
+def test_errors_are_one_line_before_any_compile(tmp_path, capsys, monkeypatch, arguments, message):
+    monkeypatch.setattr(robot_runs, "simulate_many", lambda *a, **k: pytest.fail("it started"))
+    assert run(arguments) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("jaxmpc: error: ") and err.count("\n") == 1
+    assert message in err and not (tmp_path / "jaxmpc-simulate" / "runs.zarr").exists()
+
+
+def test_help_is_a_page_a_stranger_can_use(capsys):
+    with pytest.raises(SystemExit) as caught:
+        run("--help")
+    assert caught.value.code == 0
+    text = capsys.readouterr().out
+    options = """robot count seconds target spread seed linearize horizon state-weights
+        input-weights margin penalty iterations refine mass damping payload tolerance dtype chunk
+        video output resume overwrite"""
+    for word in options.split():
+        assert f"--{word}" in text
+    assert text.count("(default:") >= 24 and text.count("$ jaxmpc simulate") == 2
+    for word in ("success", "limits kept", "runs.png", "robots.gif", "summary.json", "130"):
+        assert word in text
+
+
+def by_hand(states, inputs, **fields):
+    """A Run with these states and inputs, all plans solved."""
+    count, samples = inputs.shape[:2]
+    zeros = np.zeros((count, samples))
+    given = {
+        "cost": zeros, "status": np.ones((count, samples), np.int32), "stage_cost": zeros + 1.0,
+        "violation": np.zeros((count, samples + 1)), "slack": np.zeros((count, samples, 0)),
+        "fallback": np.zeros((count, samples), bool), **fields,
+    }  # fmt: skip
+    return jm.closed_loop.Run(states=states, inputs=inputs, **given)
+
+
+def test_outcome_and_picture_of_runs_made_by_hand(joint):
+    """Four runs to q = 1: good, over a velocity limit, off target, not finite."""
+    t = np.linspace(0, 1, 11)
+    q, dq = np.minimum(2 * t, 1.0), np.zeros(11)
+    x = np.stack([np.stack([q, dq], axis=1)] * 4)
+    x[1, 3, 1], x[2, -1, 0], x[3, 5, 0] = -2.00001, 0.5, np.nan
+    u = np.zeros((4, 10, 1))
+    fallback = np.zeros((4, 10), bool)
+    fallback[1, 2] = True
+    run = by_hand(x, u, fallback=fallback)
+    outcome = evaluate_runs(run, joint, np.array([1.0, 0.0]))
+    assert list(outcome.kept) == [True, False, True, False]
+    assert list(outcome.reached) == [True, True, False, True]
+    assert list(outcome.success) == [True, False, False, False]
+    assert list(outcome.plans_valid) == [True, False, True, True]
+    # q = 0.8 at sample 4, 1 from sample 5 on: 0.05 s.
+    np.testing.assert_allclose(outcome.settling, [0.05, 0.05, np.inf, 0.06])
+    np.testing.assert_allclose(outcome.cost, 10.0)
+    np.testing.assert_allclose(outcome.state_excess[1, 3], [0, 1e-5], atol=1e-12)
+    # Within 1e-6 of the limit it counts as kept.
+    nearly = by_hand(np.where(x == -2.00001, -2.000001, x), u)
+    assert evaluate_runs(nearly, joint, [1.0, 0.0]).kept[1]
+
+    figure = plot_runs(run, joint, reference=np.array([1.0, 0.0]), robots=[0, 1, 2])
+    labels = [(ax.get_title(), ax.get_ylabel()) for ax in figure.axes if ax.axison]
+    assert labels == [("position", "q [rad]"), ("velocity", "q [rad/s]"), ("input", "tau [N m]")]
+    assert "4 closed loops of 0.1 s, 3 shown\nlimits kept by 2; fallback plans: 1 of 40" in (
+        figure.get_suptitle()
+    )
+    (red,) = (line for line in figure.axes[1].lines if len(line.get_xdata()) == 1)
+    np.testing.assert_allclose(red.get_xydata(), [[0.03, -2.00001]])
+    low, high = figure.axes[1].get_ylim()
+    assert low < -2 < 2 < high
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "one robot", "outside limits", "set-point", "fallback plan", "limit exceeded",
+    ]  # fmt: skip
+    with pytest.raises(ValueError, match="robots: .*from 0 to 3"):
+        plot_runs(run, joint, robots=[4])
+
+
+@pytest.mark.slow
+def test_runs_with_orientations_and_of_linear_plants(tmp_path):
+    """A quadrotor has 13 numbers in its state, 12 coordinates and 4 inputs: 16 panels."""
+    robot = jm.load_robot("quadrotor")
+    x = np.broadcast_to(robot.home, (3, 13)).copy()
+    x[-1, 3:7] = [np.cos(0.1), 0, np.sin(0.1), 0]  # 0.2 rad about y
+    run = by_hand(x[None], np.full((1, 2, 4), 0.05))
+    outcome = evaluate_runs(run, robot, np.asarray(robot.coordinates(robot.home)))
+    np.testing.assert_allclose(outcome.coordinates[0, -1, 3:6], [0, 0.2, 0], atol=1e-9)
+    assert outcome.kept[0] and not outcome.reached[0]
+    figure = plot_runs(run, robot)
+    assert sum(ax.axison for ax in figure.axes) == 16
+    figure.savefig(tmp_path / "runs.png")
+
+    system = jm.LinearSystem(np.eye(3), np.ones((3, 2)), dt=0.1, state_names=("a", "b", "c"))
+    box = lambda size: jm.Box(-np.ones(size), np.ones(size))
+    plant = jm.LinearPlant(system, box(3), box(2))
+    run = by_hand(np.zeros((1, 6, 3)), np.zeros((1, 5, 2)))
+    run = jax.tree.map(lambda v: v[0], run)  # without a batch axis
+    figure = plot_runs(run, plant)
+    assert [ax.get_ylabel() for ax in figure.axes if ax.axison] == ["a", "u1", "b", "u2", "c"]
+
+
+FILM = """
+import sys
+import numpy as np
+from jaxmpc.app.commands.film import choose_renderer
+choose_renderer()
+import jaxmpc as jm
+from jaxmpc.closed_loop.outcome import evaluate_runs
+from jaxmpc.robots.video import render, save_video
+q = np.linspace(0, 1.2, 9)
+states = np.zeros((3, 9, 2))
+states[0, :, 0], states[1, :, 0] = q, -q
+try:
+    frames = render(jm.load_robot("joint"), states, every=2, width=160, height=120)
+except RuntimeError as error:
+    print(error, file=sys.stderr)
+    sys.exit(3)
+save_video("film.gif", frames, 25)
+np.save("frames.npy", frames)
+"""
+
+
+def test_film_shows_the_motion(tmp_path):
+    """Three joints turn left, right and not at all: so do the red tools in their tiles. In a
+    process of its own, since MuJoCo chooses its renderer when it is imported."""
+    paths = {**os.environ, "PYTHONPATH": str(Path(jm.__file__).parents[1])}
+    command = [sys.executable, "-c", FILM]
+    done = subprocess.run(command, capture_output=True, text=True, env=paths)
+    if done.returncode == 3:
+        pytest.skip(done.stderr.splitlines()[-1])
+    assert done.returncode == 0, done.stderr
+    frames = np.load(tmp_path / "frames.npy")
+    assert frames.shape == (5, 240, 320, 3) and frames.dtype == np.uint8
+    assert (frames[:, 125:, 165:] == 255).all(), "no fourth robot"
+
+    def tool(frame):
+        """(right, up) of the red pixels, from the middle of a tile."""
+        colour = frame.astype(int)
+        red = (colour[..., 0] > 1.6 * colour[..., 1]) & (colour[..., 0] > 2.2 * colour[..., 2])
+        red &= colour[..., 1] < 1.3 * colour[..., 2]  # not the orange hub
+        y, x = np.nonzero(red)
+        assert len(x) > 3
+        return x.mean() - 80, 60 - y.mean()
+
+    for top, left, sign in ((0, 0, 1), (0, 160, -1), (120, 0, 0)):
+        tiles = frames[:, top : top + 120, left : left + 160]
+        (x0, y0), (x1, y1) = tool(tiles[0]), tool(tiles[-1])
+        assert x0 > 20, "at q = 0 the tool is to the right"
+        assert np.sign(round((y1 - y0) / 10)) == sign and (x0 - x1 > 10) == bool(sign)
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.n_frames == 5 and film.size == (320, 240) and film.info["duration"] == 40
+
+
+def test_film_refuses_what_it_cannot_draw(tmp_path, monkeypatch, joint):
+    for states, options, message in (
+        (np.zeros((3, 3)), {}, "states: shape"),
+        (np.full((3, 2), np.nan), {}, "states: holds NaN"),
+        (np.zeros((3, 2)), {"every": 0}, "every: 0"),
+        (np.zeros((3, 2)), {"camera": "left"}, "none named 'left'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            render(joint, states, **options)
+    monkeypatch.setattr(mujoco, "Renderer", no_renderer)
+    with pytest.raises(RuntimeError, match="MUJOCO_GL=egl"):
+        render(joint, np.zeros((3, 2)))
+    frames = np.zeros((2, 4, 4, 3), np.uint8)
+    for name, given, message in (
+        ("a.avi", frames, "'.avi' is no video"),
+        ("a.gif", frames.astype(float), "frames: shape .* float64"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            save_video(tmp_path / name, given, 25)
+    monkeypatch.setitem(sys.modules, "imageio", None)
+    monkeypatch.setitem(sys.modules, "imageio.v3", None)
+    with pytest.raises(ValueError, match=r"imageio\[ffmpeg\]"):
+        save_video(tmp_path / "a.mp4", frames, 25)

@@ -1,0 +1,90 @@
+"""The two provers on their own, fed with what no solver would give."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import exact
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+from jax import enable_x64
+
+import jaxmpc as jm
+from jaxmpc.feasible import proofs
+from jaxmpc.feasible.exact_data import exact_data, hard_blocks
+from jaxmpc.feasible.view import make_view
+
+EMPTY = replace(problems.lecture(), terminal_set=jm.Box(np.array([5.0, 5.0]), np.array([6.0, 6.0])))
+
+
+def exact_form(mpc, extent):
+    """The exact data of a problem whose states are no larger than `extent`."""
+    return exact_data(mpc, make_view(mpc), hard_blocks(mpc), extent)
+
+
+class TestProofs:
+    """The two provers on their own, fed with what no solver would give."""
+
+    def setup_method(self):
+        self.mpc = problems.drifting()
+        self.problem = exact_form(self.mpc, np.array([3.0, 3.0]))
+        self.polygon = exact.feasible_polygon(self.mpc)
+
+    def test_any_multipliers_give_a_valid_cut(self):
+        rng = np.random.default_rng(0)
+        scales = 10.0 ** rng.uniform(-12, 12, 300)
+        with enable_x64(True):
+            y = rng.standard_normal((300, 4, 5)) * scales[:, None, None]
+            y_N = rng.standard_normal((300, 2)) * scales[:, None]
+            y[:100] = np.maximum(y[:100], 0)
+            cut = lambda a, b: proofs.cut(self.problem, a, b, jnp.zeros(0))
+            everywhere = lambda a, b: proofs.everywhere(self.problem, *cut(a, b))
+            normals, offsets = jax.vmap(everywhere)(y, y_N)
+        finite = np.flatnonzero(np.isfinite(offsets))
+        assert len(finite) > 100
+        for i in finite:
+            assert self.polygon.support(normals[i]) <= Fraction(float(offsets[i]))
+
+    def test_zero_and_nan_multipliers_say_nothing(self):
+        with enable_x64(True):
+            for fill in (0.0, np.nan, np.inf):
+                y, y_N = np.full((4, 5), fill), np.full(2, fill)
+                _, b, *_ = proofs.cut(self.problem, y, y_N, np.zeros(0))
+                assert b == np.inf
+
+    def test_inputs_that_are_proved_keep_all_rows(self):
+        """Random inputs, beyond their limits too, from random states."""
+        rng = np.random.default_rng(1)
+        x0s, plans = rng.uniform(-1.2, 1.2, (4000, 2)), rng.uniform(-0.6, 0.6, (4000, 4, 2))
+        prove = jax.vmap(lambda x, u: proofs.prove_feasible(self.problem, x, x[:0], u))
+        with enable_x64(True):
+            proved, clipped = map(np.asarray, prove(x0s, plans))
+        assert proved.sum() > 50
+        for i in np.flatnonzero(proved):
+            assert exact.keeps_all_rows(self.mpc, x0s[i], clipped[i])
+        for i in np.flatnonzero(~proved)[:300]:
+            assert not exact.keeps_all_rows(self.mpc, x0s[i], clipped[i])
+
+    def test_nan_inputs_prove_nothing(self):
+        with enable_x64(True):
+            for plan in (np.full((4, 2), np.nan), np.where(np.eye(4, 2), np.nan, 0.0)):
+                proved, _ = proofs.prove_feasible(self.problem, np.zeros(2), np.zeros(0), plan)
+                assert not proved
+
+    def test_margin_of_one_rounding(self):
+        """Ties: x_N exactly on its limit in rationals must not be proved wrongly."""
+        mpc = problems.scalar(a=1.0, horizon=3, x_max=None, u_max=0.1, terminal=0.3)
+        problem = exact_form(mpc, np.ones(1))
+        with enable_x64(True):
+            for ulps in range(-40, 41, 4):
+                x0 = np.array([0.6 + ulps * 2.0**-53])
+                plan = np.full((3, 1), -0.1)
+                proved, clipped = proofs.prove_feasible(problem, x0, x0[:0], plan)
+                if proved:
+                    assert exact.keeps_all_rows(mpc, x0, clipped)
+
+    def test_empty_set_cut(self):
+        """0'θ ≤ b < 0 excludes every point, and only then may a normal be zero."""
+        got = jm.map_feasible_set(EMPTY, np.zeros((1, 2)))
+        assert got.label[0] == -1

@@ -1,0 +1,52 @@
+"""Rays to the boundary: centres, slices, wrong arguments, rays without end."""
+
+from dataclasses import replace
+
+import exact
+import numpy as np
+import problems
+import pytest
+
+import jaxmpc as jm
+
+
+@pytest.fixture(scope="module")
+def polygon():
+    return exact.feasible_polygon(problems.lecture())
+
+
+class TestBoundaryArguments:
+    def test_center_and_slice(self, polygon):
+        found = jm.boundary(problems.lecture(), np.array([[1.0, 0.0], [0.0, 2.0]]),
+                            center=np.array([0.1, 0.2]))  # fmt: skip
+        np.testing.assert_array_equal(found.center, [0.1, 0.2])
+        assert polygon.contains(found.points).all()
+        # x₁ + x₂/… facets by hand: the ray along x₁ ends where x₁ + x₂ = 1.1, at x₁ = 0.9.
+        assert found.inner[0] == pytest.approx(0.8, abs=1e-9)
+
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            (dict(directions=np.zeros((1, 2))), "directions"),
+            (dict(directions=np.ones((1, 3))), "directions"),
+            (dict(directions=np.array([[np.nan, 1.0]])), "directions"),
+            (dict(directions=4, center=np.zeros(3)), "center"),
+            (dict(directions=4, center=np.array([5.0, 5.0])), "center"),
+            (dict(directions=4, center=np.array([np.nan, 0.0])), "center"),
+            (dict(directions=0), "directions"),
+            (dict(directions=-1), "directions"),
+        ],
+    )
+    def test_errors(self, arguments, words):
+        with pytest.raises(ValueError, match=words):
+            jm.boundary(problems.lecture(), **arguments)
+
+    def test_unbounded_ray(self):
+        """No limit on x₁: the ray along it never ends, the other does."""
+        mpc = replace(
+            problems.lecture(), states=jm.Box(np.array([-np.inf, -1.0]), np.array([np.inf, 1.0])),
+            terminal_set=None,
+        )  # fmt: skip
+        found = jm.boundary(mpc, np.array([[1.0, 0.0], [0.0, 1.0]]), center=np.zeros(2))
+        assert found.outer[0] == np.inf
+        assert found.inner[1] == pytest.approx(1.0, abs=1e-9)

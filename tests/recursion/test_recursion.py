@@ -1,0 +1,449 @@
+"""Recursive feasibility: every claim against exact polygons, closed forms or known answers."""
+
+import dataclasses
+from dataclasses import replace
+from fractions import Fraction
+
+import exact
+import numpy as np
+import problems
+import pytest
+
+import jaxmpc as jm
+from jaxmpc.explicit.law import Law
+from jaxmpc.feasible.centered_polytope import CenteredPolytope
+from jaxmpc.feasible.plan_polytope import projected
+from jaxmpc.feasible.polytope import backward
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.mpc.problem import Soft
+from jaxmpc.recursion import analysis, ascent, recursive_feasibility, smallest_horizon
+from jaxmpc.recursion.claims import _by_theorem, settle_claims
+
+
+def settled(mpc):
+    """The claims as theorems and linear programs settle them."""
+    return settle_claims(mpc, FeasibilityProblem.of(mpc))
+
+
+def holds(found) -> tuple:
+    return found.strong.holds, found.law.holds, found.weak.holds
+
+
+def check_counterexample(mpc, c) -> None:
+    """In rationals: the state has a plan, and the half-space of X_N excludes the next state."""
+    body = exact.feasible_polygon(mpc)
+    assert body.contains(c.state[None])[0]
+    assert exact.keeps_all_rows(mpc, c.state, c.feasible_inputs)
+    assert not body.contains(c.next_state[None])[0]
+    assert body.support(c.normal) <= Fraction(float(c.offset))
+    assert exact.dot(exact.rational(c.normal), exact.rational(c.next_state)) > Fraction(c.offset)
+    depth = (c.normal @ c.next_state - c.offset) / np.linalg.norm(c.normal)
+    assert c.distance == pytest.approx(depth, rel=1e-12)
+    A, B = mpc.system.A, mpc.system.B
+    drift = 0 if mpc.system.c is None else mpc.system.c
+    np.testing.assert_allclose(c.next_state, A @ c.state + B @ c.inputs[0] + drift, atol=1e-14)
+    check_optimal(mpc, c)
+
+
+def check_optimal(mpc, c) -> None:
+    """The plan costs no more than the best that another solver finds."""
+    assert c.primal_residual < 1e-7 and c.dual_residual < 1e-7
+    u0 = least_distance(mpc, c.state)[0]
+    np.testing.assert_allclose(c.inputs[0], u0, atol=1e-6)
+
+
+def least_distance(mpc, x):
+    """Optimal inputs (N, m) by non-negative least squares on rolled-out matrices."""
+    from scipy.optimize import nnls
+
+    N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
+    A, B = mpc.system.A, mpc.system.B
+    drift = np.zeros(n) if mpc.system.c is None else mpc.system.c
+    Phi, Gamma, phi = [np.eye(n)], [np.zeros((n, N * m))], [np.zeros(n)]
+    for k in range(N):
+        step = A @ Gamma[-1]
+        step[:, k * m : (k + 1) * m] += B
+        Phi.append(A @ Phi[-1])
+        Gamma.append(step)
+        phi.append(A @ phi[-1] + drift)
+    weights = [mpc.Q] * N + [mpc.terminal_cost]
+    P = sum(G.T @ W @ G for G, W in zip(Gamma, weights, strict=True))
+    P = P + np.kron(np.eye(N), mpc.R)
+    free = [M @ x + d for M, d in zip(Phi, phi, strict=True)]
+    q = sum(G.T @ W @ v for G, W, v in zip(Gamma, weights, free, strict=True))
+    rows, bounds = [], []
+    sets = [(mpc.states, k) for k in range(1, N)] + [(mpc.terminal_set, N)]
+    for set_, k in sets:
+        H, lower, upper = (np.asarray(v) for v in set_.rows())
+        rows += [H @ Gamma[k], -H @ Gamma[k]]
+        bounds += [upper - H @ free[k], H @ free[k] - lower]
+    eye = np.eye(N * m)
+    rows += [eye, -eye]
+    bounds += [np.tile(mpc.inputs.upper, N), -np.tile(mpc.inputs.lower, N)]
+    G, h = np.vstack(rows), np.concatenate(bounds)
+    G, h = G[np.isfinite(h)], h[np.isfinite(h)]
+    factor = np.linalg.cholesky(P)
+    M = np.linalg.solve(factor, G.T).T
+    # min |y|², M y ≤ h + M L⁻¹q (Lawson & Hanson 1974, ch. 23).
+    shift = np.linalg.solve(factor, q)
+    right = h + M @ shift
+    if right.min() < 0:
+        E = -np.vstack([M.T, right / -right.min()])
+        y, _ = nnls(E, np.eye(len(E))[-1], maxiter=10_000)
+        r = E @ y - np.eye(len(E))[-1]
+        shift = shift - right.min() * r[:-1] / r[-1]
+    return -np.linalg.solve(factor.T, shift).reshape(N, m)
+
+
+class TestProofs:
+    """Claims that linear programs settle; nothing here is sampled."""
+
+    @pytest.mark.parametrize(
+        ("problem", "expected", "volume", "lost"),
+        [
+            pytest.param(
+                lambda: problems.lecture(0.25, 1),
+                (False, False, False),
+                3.19,
+                0.4225,
+                marks=pytest.mark.slow,
+            ),
+            pytest.param(
+                lambda: problems.lecture(0.25, 2),
+                (False, False, False),
+                2.7675,
+                0.16,
+                marks=pytest.mark.slow,
+            ),
+            (lambda: problems.lecture(0.25, 3), (False, False, False), 2.6075, 0.02),
+            pytest.param(
+                lambda: problems.lecture(0.25, 4),
+                (True, True, True),
+                2.5875,
+                0.0,
+                marks=pytest.mark.slow,
+            ),
+            (lambda: problems.lecture(0.3, 3), (False, None, True), 2.8108, 0.0),
+            pytest.param(
+                lambda: problems.lecture(0.3, 4),
+                (True, True, True),
+                2.8108,
+                0.0,
+                marks=pytest.mark.slow,
+            ),
+            pytest.param(
+                lambda: problems.joint(4),
+                (False, False, False),
+                11.9136,
+                0.0016,
+                marks=pytest.mark.slow,
+            ),
+            pytest.param(
+                lambda: problems.joint(5), (False, None, True), 11.912, 0.0, marks=pytest.mark.slow
+            ),
+            (lambda: problems.joint(6), (True, True, True), 11.912, 0.0),
+        ],
+    )
+    def test_known_cases(self, problem, expected, volume, lost):
+        mpc = problem()
+        found = settled(mpc)
+        assert holds(found) == expected
+        assert found.volume == pytest.approx(volume, rel=1e-9)
+        assert found.lost == pytest.approx(lost, abs=1e-9)
+        body = exact.feasible_polygon(mpc)
+        assert len(found.feasible_set.offsets) == len(body.facets)
+        ends = [float(body.support(normal)) for normal in found.feasible_set.normals]
+        np.testing.assert_allclose(found.feasible_set.offsets, ends, atol=1e-9)
+
+    def test_reasons_name_the_proof_and_the_counterexample(self):
+        reason = settled(problems.joint(6)).strong.reason
+        assert "X_5 = X_6" in reason and "14 facets" in reason
+        found = settled(problems.lecture(0.25, 3))
+        body = exact.feasible_polygon(problems.lecture(0.25, 4))
+        assert "every feasible first move leaves X_N" in found.weak.reason
+        assert not body.contains(found.weak.state[None])[0]  # it is not in X_4
+        assert "beyond a facet of X_N" in found.strong.reason
+        assert str(found.strong).startswith("refuted: from x = (")
+
+    def test_theorem_1(self):
+        found = settled(problems.joint_o_inf(6))
+        assert holds(found) == (True, True, True)
+        assert found.strong.reason.startswith("Theorem 1: the terminal set is within the limits")
+        # Where the shifted plan need not be a plan, the theorem says nothing.
+        for change in ({"input_rate_limit": 0.1}, {"control_horizon": 2}):
+            blocked = _by_theorem(replace(problems.joint_o_inf(6), **change))
+            assert blocked.holds is None and "does not cover" in blocked.reason
+        short = replace(problems.scalar(0.5, 1, 1.0, 0.1), terminal_set=None)
+        assert _by_theorem(short).holds is None  # its first move may leave the limits
+        assert _by_theorem(replace(short, horizon=2)).holds is True
+
+    def test_no_limit_on_the_state(self):
+        free = replace(problems.lecture(), states=None, terminal_set=None)
+        assert holds(settled(free)) == (True, True, True)
+
+    def test_unbounded_set_stays_open(self):
+        mpc = problems.scalar(2.0, horizon=3, x_max=None, terminal=1.0)
+        found = settled(replace(mpc, inputs=None))
+        assert found.feasible_set is None and "unbounded" in found.why
+        assert found.strong.holds is True or found.weak.holds is None
+
+    def test_scalar_in_closed_form(self):
+        """x⁺ = 2x + u, |x| ≤ 5, |u| ≤ 1: X_N is |x| ≤ 1 + 4·2⁻ᴺ, X_{N+1} half as far from 1."""
+        found = settled(problems.scalar(2.0, 3, 5.0, 1.0, terminal=5.0))
+        assert found.volume == pytest.approx(2 * (1 + 4 / 8), rel=1e-12)
+        assert found.lost == pytest.approx(4 / 8, rel=1e-9)
+        assert holds(found) == (False, False, False)
+
+    @pytest.mark.parametrize("end", ["states", pytest.param(None, marks=pytest.mark.slow)])
+    def test_half_spaces_by_recursion_are_those_by_rays(self, end):
+        mpc = problems.lecture(0.25, 3)
+        mpc = mpc if end else replace(mpc, terminal_set=None)
+        body = projected(FeasibilityProblem.of(mpc).plan_polytope)
+        before, same, after = backward(mpc)
+        order = lambda s: np.unique(np.round(np.column_stack([s.normals, s.offsets]), 9), axis=0)
+        np.testing.assert_allclose(order(body), order(same), atol=1e-8)
+        for part, N in ((before, 2), (after, 4)):
+            exact_body = exact.feasible_polygon(replace(mpc, horizon=N))
+            ends = [float(exact_body.support(normal)) for normal in part.normals]
+            np.testing.assert_allclose(part.offsets, ends, atol=1e-9)
+
+    @pytest.mark.slow
+    def test_weak_where_sets_do_not_nest(self):
+        """The first move must be that of a feasible plan: X_N against Pre(X_N ∩ X_{N−1})."""
+        mpc = problems.drifting()
+        body = exact.feasible_polygon(mpc)
+        shorter = exact.feasible_polygon(replace(mpc, horizon=mpc.horizon - 1))
+        facets = [*body.facets, *shorter.facets]
+        both = jm.Polytope(*(np.array([f[i] for f in facets], float) for i in (0, 1)))
+        later = exact.feasible_polygon(replace(mpc, horizon=1, terminal_set=both))
+        for normal, offset in body.facets:
+            later = later.clip(normal, offset)
+        found = settled(mpc)
+        assert found.lost == pytest.approx(float(body.area - later.area), abs=1e-9)
+        assert found.lost > 0.007 and found.weak.holds is False
+
+    @pytest.mark.slow
+    def test_twelve_states(self):
+        """Six joints side by side: 12 states, millions of vertices, 84 facets."""
+        one, k = problems.joint(6), 6
+        A, B = np.kron(np.eye(k), one.system.A), np.kron(np.eye(k), one.system.B)
+        limit = problems.symmetric(*([1.5, 2.0] * k))
+        mpc = jm.MPC(
+            system=jm.LinearSystem(A, B), Q=np.eye(2 * k), R=np.eye(k), horizon=6, states=limit,
+            inputs=problems.symmetric(*([2.0] * k)), terminal_set=limit,
+        )  # fmt: skip
+        assert holds(settled(mpc)) == (True, True, True)
+        assert holds(settled(replace(mpc, horizon=5))) == (False, None, True)
+        assert holds(settled(replace(mpc, horizon=4))) == (False, False, False)
+
+
+class TestLaw:
+    """The affine pieces and the projection that the ascent uses."""
+
+    @pytest.mark.parametrize(
+        "soft", [(), pytest.param((Soft([[0.0, 1.0]], [0.2], 2.0, 0.5),), marks=pytest.mark.slow)]
+    )
+    def test_piece_predicts_the_plan_beside(self, soft):
+        mpc = replace(problems.lecture(0.25, 3), soft=soft)
+        random = np.random.default_rng(0)
+        affine = Law(mpc, np.zeros(2), 1024)
+        x = random.uniform(-1, 1, (100, 2)) * [0.9, 0.5]
+        plans = affine.plans(x)
+        pieces = [affine.piece(*pair) for pair in zip(x, plans.inputs, strict=True)]
+        beside = x + 1e-4 * random.standard_normal(x.shape)
+        after = affine.following(beside, affine.plans(beside).inputs[:, 0])
+        compared = 0
+        for piece, here, there in zip(pieces, beside, after, strict=True):
+            if piece is not None and np.all(piece.R @ here <= piece.r):
+                np.testing.assert_allclose(piece.E @ here + piece.e, there, atol=1e-7)
+                compared += 1
+        assert compared > 60
+
+    def test_nearest_point_of_a_polytope(self):
+        square = CenteredPolytope(
+            np.zeros(2), np.vstack([np.eye(2), -np.eye(2)]), np.ones(4), np.zeros((0, 2))
+        )
+        points = np.array([[3.0, 0.5], [2.0, -5.0], [0.2, 0.3]])
+        near = [[1.0, 0.5], [1.0, -1.0], [0.2, 0.3]]
+        np.testing.assert_allclose(square.nearest(points), near, atol=1e-12)
+        np.testing.assert_allclose(square.signed_distance(points), [2.0, 4.0, -0.7], atol=1e-12)
+        assert square.size == 1.0
+
+
+class TestReport:
+    def test_lecture_loses_and_keeps(self):
+        mpc = problems.lecture(0.25, 3)
+        states = np.array([[-1.0, 1.0], [-0.999, 0.999], [0.0, 0.0], [1.0, 1.0], [np.nan, 0.0]])
+        report = recursive_feasibility(mpc, states, steps=4)
+        assert holds(report) == (False, False, False)
+        c = report.counterexample
+        assert c.found == "search"
+        assert c.distance == pytest.approx(0.0474341649, abs=1e-6)
+        np.testing.assert_allclose(np.abs(c.state), [0.95, 1.0], atol=1e-6)
+        assert c.state[0] * c.state[1] < 0
+        check_counterexample(mpc, c)
+        assert report.lost_by_law == pytest.approx(0.02, abs=1e-9)
+        assert report.lost_by_any == pytest.approx(0.02, abs=1e-9)
+        np.testing.assert_array_equal(report.label, [1, 1, 1, -1, 0])
+        np.testing.assert_array_equal(report.lost_at, [1, 1, 0, -1, -1])
+        np.testing.assert_allclose(report.inputs[1], [-0.25], atol=1e-8)
+        assert np.isnan(report.next_states[3]).all()
+        assert report.counts()["lost after one step"] == 2
+        text = str(report)
+        assert "refuted" in text and "0.0474342" in text and "lost by any" in text
+        data = report.to_xarray()
+        assert data["lost_at"].shape == (5,) and data.attrs["steps"] == 4
+
+    @pytest.mark.slow
+    def test_lecture_with_more_input_is_proved_by_regions(self):
+        report = recursive_feasibility(problems.lecture(0.3, 3), steps=3)
+        assert holds(report) == (False, True, True)
+        assert "13 critical regions fill X_N" in report.law.reason
+        assert report.counterexample is None and report.lost_by_law == 0.0
+        counts = report.counts()
+        assert counts["kept"] == counts["feasible"] > 2000
+        # The middles of the grid's cells measure the area.
+        cell = np.prod(np.ptp(report.states, axis=0) * 64 / 63) / 4096
+        assert counts["feasible"] * cell == pytest.approx(2.8108, rel=0.02)
+        without = recursive_feasibility(problems.lecture(0.3, 3), steps=1, regions=0, search=False)
+        assert without.law.holds is None and "no counterexample" in without.law.reason
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            ({"x0s": np.zeros(2)}, r"x0s: shape \(2,\)"),
+            ({"x0s": np.zeros((3, 4))}, r"x0s: shape \(3, 4\)"),
+            ({"x0s": np.zeros((0, 2))}, "x0s: shape"),
+            ({"steps": 0}, "steps: 0"),
+            ({"steps": 2.5}, "steps: 2.5"),
+            ({"regions": -1}, "regions: -1"),
+            ({"seconds": 0.0}, "seconds: 0.0"),
+        ],
+    )
+    def test_bad_arguments(self, arguments, message):
+        with pytest.raises(ValueError, match=message):
+            recursive_feasibility(problems.lecture(), **arguments)
+        with pytest.raises(ValueError, match="limit: 0"):
+            smallest_horizon(problems.lecture(), 0)
+
+    def test_empty_and_unbounded_sets_ask_for_states(self):
+        empty = replace(problems.lecture(), terminal_set=jm.Box([5.0, 5.0], [6.0, 6.0]))
+        with pytest.raises(ValueError, match="x0s: None, and the feasible set is empty or flat"):
+            recursive_feasibility(empty)
+        with pytest.raises(ValueError, match="Q: "):
+            recursive_feasibility(replace(problems.lecture(), Q=-np.eye(2)))
+
+
+@pytest.mark.slow
+class TestSlow:
+    def test_needle_is_found_by_search(self):
+        """Uniform samples hit the needle of the joint, 0.0134 % of X_4, once in 7,400."""
+        mpc = problems.joint(4)
+        report = recursive_feasibility(mpc, regions=0)
+        c = report.counterexample
+        assert holds(report) == (False, False, False) and c.found == "search"
+        assert c.distance == pytest.approx(0.0039968, abs=1e-6)
+        np.testing.assert_allclose(np.abs(c.state), [1.444, 2.0], atol=1e-5)
+        np.testing.assert_allclose(np.abs(c.next_state), [1.464, 1.6], atol=1e-5)
+        assert report.lost_by_any == pytest.approx(0.0016, abs=1e-9)
+        check_counterexample(mpc, c)
+
+    def test_needle_is_found_without_the_seeds_of_linear_programs(self, monkeypatch):
+        real = analysis.settle_claims
+        bare = lambda *a: replace(real(*a), seeds=np.zeros((0, 2)))
+        monkeypatch.setattr(analysis, "settle_claims", bare)
+        c = recursive_feasibility(problems.joint(4), regions=0).counterexample
+        assert c.distance == pytest.approx(0.0039968, abs=1e-6)
+
+    @pytest.mark.parametrize(
+        ("N", "distance", "lost"), [(1, 0.546401, 0.785245), (2, 0.178885, 0.182572)]
+    )
+    def test_short_horizons(self, N, distance, lost):
+        mpc = problems.lecture(0.25, N)
+        report = recursive_feasibility(mpc)
+        assert report.counterexample.distance == pytest.approx(distance, abs=1e-5)
+        assert report.lost_by_law == pytest.approx(lost, abs=1e-6)
+        fraction = report.counts()["lost after one step"] / report.counts()["feasible"]
+        assert fraction == pytest.approx(lost / report.volume, abs=0.01)
+        check_counterexample(mpc, report.counterexample)
+
+    def test_gradient_alone_and_regions_alone_find_the_worst(self, monkeypatch):
+        """From one sample and the starts on the boundary; the worst state is no vertex of X_1."""
+        mpc, one = problems.lecture(0.25, 1), np.zeros((1, 2))
+        found = lambda: recursive_feasibility(mpc, one, steps=1, regions=0).counterexample.distance
+        climb_regions, value = ascent._climb_regions, ascent._value_and_gradient
+        monkeypatch.setattr(ascent, "_climb_regions", lambda _, b, x, v, d: x[np.argsort(-v)[:6]])
+        assert found() == pytest.approx(0.546401, abs=1e-4)
+        still = lambda *a, **k: (value(*a, **k)[0], np.zeros_like(a[2]))
+        monkeypatch.setattr(ascent, "_value_and_gradient", still)
+        assert found() < 0.546
+        monkeypatch.setattr(ascent, "_climb_regions", climb_regions)
+        assert found() == pytest.approx(0.546401, abs=1e-5)
+
+    def test_joint_of_five_steps(self):
+        report = recursive_feasibility(problems.joint(5), steps=30)
+        assert holds(report) == (False, True, True)
+        assert report.counts()["kept"] == report.counts()["feasible"]
+
+    def test_oblique_limits_and_drift(self):
+        mpc = problems.drifting()
+        report = recursive_feasibility(mpc)
+        assert holds(report) == (False, False, False)
+        check_counterexample(mpc, report.counterexample)
+        # The regions know the worst vertex: the search has found it.
+        from jaxmpc.explicit.regions import critical_regions
+
+        worst = -np.inf
+        for region in critical_regions(mpc).regions:
+            E = mpc.system.A + mpc.system.B @ region.K
+            after = region.vertices @ E.T + mpc.system.B @ region.k + mpc.system.c
+            H, h = report.feasible_set.H, report.feasible_set.h
+            worst = max(worst, (after @ np.asarray(H).T - np.asarray(h)).max())
+        assert report.counterexample.distance == pytest.approx(worst, abs=1e-6)
+
+    def test_every_state_of_the_unstable_scalar_is_lost_when_it_must_be(self):
+        """|x| = 1 + e grows to 1 + 2ᵏ e, and leaves X_N beyond 1 + 4·2⁻ᴺ."""
+        N = 5
+        e = np.array([1e-3, 0.01, 0.03, 0.06, 0.07, 0.12])
+        states = np.concatenate([1 + e, -1 - e, [0.0, 0.999, 1.2]])[:, None]
+        mpc = problems.scalar(2.0, N, 5.0, 1.0, terminal=5.0)
+        report = recursive_feasibility(mpc, states, steps=12)
+        step = np.ceil(np.log2(4 * 2.0**-N / e) + 1e-9).astype(int)
+        expected = np.concatenate([step, step, [0, 0, -1]])
+        np.testing.assert_array_equal(report.lost_at, expected)
+        assert report.volume == pytest.approx(2 * (1 + 4 * 2.0**-N))
+        assert report.counterexample.distance == pytest.approx(4 * 2.0**-N, abs=1e-6)
+
+    def test_smallest_horizon(self):
+        found = smallest_horizon(problems.joint(), 8)
+        assert (found.horizon, found.strong) == (5, 6)
+        assert [found.reasons[N].holds for N in range(1, 7)] == [False] * 4 + [True] * 2
+        assert "61 critical regions" in found.reasons[5].reason
+        found = smallest_horizon(problems.lecture(0.25), 2)
+        assert (found.horizon, found.strong) == (None, None)
+
+    def test_previous_input_is_part_of_the_state(self):
+        mpc = replace(problems.lecture(), input_rate_limit=0.2)
+        report = recursive_feasibility(mpc, steps=3)
+        c = report.counterexample
+        assert report.states.shape[1] == 3 and holds(report) == (False, False, False)
+        assert abs(c.next_state[2] - c.state[2]) <= 0.2 + 1e-9
+        assert c.next_state[2] == c.inputs[0, 0]
+
+    def test_limits_from_the_first_step_on(self):
+        report = recursive_feasibility(replace(problems.lecture(), constrain_initial=False))
+        assert holds(report) == (False, False, False)
+        check_counterexample(report.mpc, report.counterexample)
+
+    def test_six_states(self):
+        one, k = problems.joint(4), 3
+        A, B = np.kron(np.eye(k), one.system.A), np.kron(np.eye(k), one.system.B)
+        limit = problems.symmetric(*([1.5, 2.0] * k))
+        mpc = jm.MPC(
+            system=jm.LinearSystem(A, B), Q=np.eye(2 * k), R=np.eye(k), horizon=4, states=limit,
+            inputs=problems.symmetric(*([2.0] * k)), terminal_set=limit,
+        )  # fmt: skip
+        report = recursive_feasibility(mpc, steps=3)
+        assert holds(report) == (False, False, False)
+        assert report.counterexample.distance == pytest.approx(0.0039968, abs=1e-5)
+        assert dataclasses.asdict(report)["feasible_set"] is not None

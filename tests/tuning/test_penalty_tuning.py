@@ -1,0 +1,378 @@
+"""Penalties learned by unrolling: gradients, gains on other states, safeguards, cache, horizons."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import optax
+import problems
+import pytest
+
+import jaxmpc as jm
+from jaxmpc.app.cli import main
+from jaxmpc.app.commands import linear_sweep
+from jaxmpc.feasible.candidates import StagePenalties, compiled_admm
+from jaxmpc.feasible.constraint_rows import weighted
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.tuning import penalties, sweep_penalties
+from jaxmpc.tuning.penalties import tune_penalties
+from jaxmpc.tuning.penalty_objective import loss_and_gradient
+from jaxmpc.tuning.penalty_schedule import interpolation, transfer_penalties
+from jaxmpc.tuning.result import TuningRun
+from jaxmpc.tuning.settings import Settings
+from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
+
+# The double integrator of five steps: 5 variables, 17 rows.
+SETTINGS = {"iterations": 30, "stages": 2, "updates": 40, "batch": 32}
+DEFAULT = jm.ADMM(refine=0)
+
+
+def mpc(horizon=5):
+    return problems.double_integrator(horizon)
+
+
+def states(count, seed):
+    """States of the double integrator, nearly all feasible."""
+    return np.random.default_rng(seed).uniform([-4, -1.5], [4, 1.5], (count, 2))
+
+
+plans = jax.jit(jax.vmap(jm.Controller.plan, in_axes=(None, 0)))
+
+
+def solved(solver, x, problem):
+    """Fraction of the states that a Controller solves, in float64."""
+    with jax.enable_x64(True):
+        controller = jm.Controller(jax.tree.map(np.float64, problem), solver)
+        return np.mean(np.asarray(plans(controller, x).status) == jm.Status.SOLVED)
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("penalties")
+    return tune_penalties(mpc(), states(160, 0), cache=folder, **SETTINGS), folder
+
+
+def test_more_states_are_solved_on_others(learned):
+    found, x = learned[0], states(300, 1)
+    rows = len(jm.mpc.row_table(mpc()))
+    assert found.solver.iterations == 30 and found.solver.refine == 0
+    assert np.shape(found.solver.rho) == (2, rows)
+    # Two stages, so that one program serves both.
+    before = solved(replace(DEFAULT, iterations=30, rho=np.ones((2, rows))), x, mpc())
+    after = solved(found.solver, x, mpc())
+    assert found.improved and before < 0.1 and after > 0.85
+    assert abs(after - found.after["solved"]) < 0.1
+    assert abs(before - found.before["solved"]) < 0.1
+    assert found.history.best > 0 and np.isfinite(found.history.loss).all()
+
+
+def test_gradient_against_differences():
+    """Of the loss with respect to log rho and alpha, with warm starts and a reference."""
+    rng = np.random.default_rng(0)
+    x, rows = states(12, 2), len(jm.mpc.row_table(mpc()))
+    start = rng.normal(size=(12, 5)), rng.normal(size=(12, rows))
+    objective, samples, _ = penalties._prepared(
+        mpc(), x, 20, 2, "step", DEFAULT, start, np.array([0.3, 0.1]), None,
+        Settings(validation=0.5),
+    )  # fmt: skip
+    parameters = objective.W.shape[1]
+    theta = {"log_rho": 0.3 * rng.normal(size=(2, parameters)), "alpha": np.array(1.2)}
+    with jax.enable_x64(True):
+        value = lambda theta: float(loss_and_gradient(theta, objective, samples)[0])
+        slope = jax.tree.map(np.asarray, loss_and_gradient(theta, objective, samples)[1])
+        for _ in range(10):
+            d = jax.tree.map(lambda v: rng.normal(size=v.shape), theta)
+            move = lambda h, d=d: jax.tree.map(lambda v, w: v + h * w, theta, d)
+            difference = (value(move(1e-6)) - value(move(-1e-6))) / 2e-6
+            product = np.sum(slope["log_rho"] * d["log_rho"]) + slope["alpha"] * d["alpha"]
+            assert product == pytest.approx(difference, rel=1e-4)
+
+
+@pytest.mark.parametrize("rate", [1e9, -10.0])
+def test_sabotaged_learning_returns_the_given_solver(learned, rate):
+    given = learned[0].solver
+    with pytest.warns(UserWarning, match="nothing found is better"):
+        found = tune_penalties(
+            mpc(), states(160, 0), solver=given, optimizer=optax.sgd(rate),
+            **{**SETTINGS, "updates": 4},
+        )  # fmt: skip
+    assert found.solver is not learned[0].solver and not found.improved
+    assert np.array_equal(found.solver.rho, given.rho) and found.solver.alpha == given.alpha
+    assert found.after == found.before == learned[0].after
+
+
+def test_cache(learned, monkeypatch):
+    found, folder = learned
+    again = lambda **more: (
+        tune_penalties(mpc(), states(160, 0), cache=folder, **{**SETTINGS, **more}).solver
+    )
+    calls = []
+    monkeypatch.setattr(penalties, "search", lambda *_: calls.append(1) or found)
+    assert np.array_equal(again().rho, found.solver.rho) and not calls
+    assert again().alpha == found.solver.alpha
+    assert again(solver=jm.ADMM(refine=3)).refine == 3 and not calls  # plays no part in learning
+    for other in ({"seed": 1}, {"iterations": 32}, {"solver": jm.ADMM(rho=2.0, refine=0)}):
+        again(**other)
+        assert calls.pop() and not calls
+    # A damaged file is learned anew and replaced.
+    path = max(folder.glob("*.npz"), key=lambda p: p.stat().st_mtime)
+    files = {p: p.read_bytes() for p in folder.glob("*.npz")}
+    for damage in (lambda b: b[: len(b) // 2], lambda b: b"", lambda b: b"nonsense"):
+        for path, content in files.items():
+            path.write_bytes(damage(content))
+        again()
+        assert calls.pop() and not calls
+        assert again().alpha == found.solver.alpha and not calls
+
+
+def unimproved(run):
+    """The run as it would be had no step been better than the solver given."""
+    return replace(run, improved=False, values=run.initial, after=run.before)
+
+
+def test_a_cached_failure_warns_again(tmp_path, learned, monkeypatch):
+    failed = unimproved(learned[0])
+    monkeypatch.setattr(penalties, "search", lambda *_: failed)
+    for _ in range(2):
+        with pytest.warns(UserWarning, match="nothing found is better"):
+            kept = tune_penalties(mpc(), states(160, 0), cache=tmp_path, **SETTINGS)
+        monkeypatch.setattr(penalties, "search", lambda *_: pytest.fail("searched again"))
+    assert not kept.improved and kept.solver == replace(DEFAULT, iterations=30)
+    assert kept.before == failed.before and kept.history is None
+
+
+def test_groups_over_horizons(learned):
+    found = learned[0]
+    assert np.array_equal(transfer_penalties(found, mpc()).rho, found.solver.rho)
+    longer = transfer_penalties(found, mpc(10), 40)
+    assert longer.iterations == 40 and longer.alpha == found.solver.alpha
+    # Step 2k of ten stands where step k of five does.
+    tables = [jm.mpc.row_table(problem) for problem in (mpc(), mpc(10))]
+    of = {(r.kind, r.step, r.index): rho for r, rho in zip(tables[1], longer.rho.T, strict=True)}
+    assert len(of) == len(tables[1])
+    for row, rho in zip(tables[0], found.solver.rho.T, strict=True):
+        assert np.allclose(of[row.kind, 2 * row.step, row.index], rho)
+    with pytest.raises(ValueError, match="blocks"):
+        transfer_penalties(found, problems.scalar())
+    by_row = {**found.settings, "groups": "row"}
+    with pytest.raises(ValueError, match='groups="step"'):
+        transfer_penalties(replace(found, settings=by_row), mpc(10))
+    with pytest.raises(ValueError, match="multiple"):
+        transfer_penalties(found, mpc(10), 41)
+    # Nothing learned: what was given.
+    kept = unimproved(found)
+    assert transfer_penalties(kept, mpc(10), 41) == replace(
+        DEFAULT, iterations=41, rho=np.asarray(1.0)
+    )
+
+
+def test_parameters_stand_for_rows():
+    blocks = (("input", (0, 1, 2, 3), 1), ("state", (0, 1, 2, 3), 2), ("terminal", (4,), 3))
+    for groups, balls in (("row", ()), ("row", (3,)), ("step", ()), ("step", (3,))):
+        W = interpolation(groups, blocks, 4, balls)
+        assert W.shape[0] == 15 and np.allclose(W.sum(axis=1), 1)
+        assert (len(np.unique(W[-3:], axis=0)) == 1) == bool(balls)
+    # A function of k/N that is linear is represented, for all horizons alike.
+    for horizon in (8, 20):
+        W = interpolation("step", (("state", tuple(range(horizon)), 2),), horizon)
+        line = lambda at: np.outer(at, [1, -2]).ravel()
+        assert np.allclose(W @ line(np.linspace(0, 1, 5)), line(np.arange(horizon) / horizon))
+
+
+@pytest.mark.parametrize(
+    "settings, match",
+    [
+        ({"x0s": np.zeros((3, 2))}, "x0s: 3 states"),
+        ({"x0s": np.zeros((30, 3))}, "x0s: shape"),
+        ({"x0s": np.full((30, 2), np.nan)}, "NaN"),
+        ({"iterations": 100, "stages": 3}, "Use a multiple"),
+        ({"iterations": 0}, "iterations"),
+        ({"stages": 0}, "stages"),
+        ({"batch": 2.5}, "batch"),
+        ({"updates": -1}, "updates"),
+        ({"groups": "kind"}, "groups"),
+        ({"validation": 1.5}, "validation"),
+        ({"validation": np.zeros((4, 3))}, "validation: shape"),
+        ({"warm_start": (np.zeros((30, 5)), np.zeros((30, 4)))}, "warm_start"),
+        ({"warm_start": (np.zeros((30, 5)), np.zeros((30, 17))), "validation": np.zeros((9, 2))},
+         "beside warm starts"),
+        ({"reference": np.zeros(3)}, "reference"),
+        ({"solver": jm.ADMM(rho=-1.0)}, "rho"),
+        ({"mpc": replace(problems.scalar(x_max=None), inputs=None)}, "no rows"),
+        ({"cache": "x", "optimizer": optax.sgd(1.0)}, "cache"),
+    ],
+)  # fmt: skip
+def test_bad_input(settings, match):
+    settings = {"mpc": mpc(), "x0s": states(30, 0), "updates": 1, **settings}
+    if settings["mpc"].system.n == 1:
+        settings["x0s"] = settings["x0s"][:, :1]
+    with pytest.raises(ValueError, match=match):
+        tune_penalties(settings.pop("mpc"), settings.pop("x0s"), **settings)
+
+
+def moving(problem):
+    return FeasibilityProblem.of(problem).rows
+
+
+@pytest.mark.parametrize("ball", [False, True])
+def test_weighted_rows_are_the_same_rows(ball):
+    problem = mpc()
+    if ball:
+        problem = replace(problem, terminal_set=jm.Ellipsoid(np.diag([1.0, 2.0]), 3.0))
+    old, rng = moving(problem), np.random.default_rng(0)
+    weight = np.exp(rng.normal(size=len(old.lower)))
+    weight[len(weight) - sum(old.balls) :] = 3.0
+    new, M = weighted(old, weight)
+    assert np.allclose(new.U.T @ new.U, np.eye(new.U.shape[1]))
+    w, theta, y = rng.normal(size=M.shape[1]), rng.normal(size=2), rng.normal(size=len(weight))
+    assert np.allclose(new.U @ w, weight * (old.U @ (M @ w)))
+    assert np.allclose(new.back @ w, old.back @ (M @ w))
+    assert np.allclose(new.D @ theta, weight * (old.D @ theta))
+    for name in ("lower", "upper"):
+        assert np.allclose(getattr(new, name), weight * getattr(old, name))
+    # Multipliers in the units of the problem: y of the new rows is weight·y of the old.
+    assert np.allclose(y * new.weight, (weight * y) * old.weight)
+    assert not ball or np.allclose(new.radius, 3 * old.radius)
+
+
+# Eight ADMM steps, so that the first pass leaves enough open; one size, so that few compile.
+SWEEP = {"iterations": 8, "chunk": 800}
+POINTS = jm.grid([-5.2, -5.2], [5.2, 5.2], (40, 40))
+
+
+@pytest.mark.slow
+def test_the_first_pass_of_a_sweep_decides_more_and_labels_stay(tmp_path):
+    learn = lambda: tune_sweep_penalties(
+        mpc(4), POINTS, updates=25, batch=64, cache=tmp_path, **SWEEP
+    )
+    found = learn()
+    assert found.after["decided"] > found.before["decided"] + 0.01 and found.improved
+    assert np.all(found.result.weight > 0) and 0 < found.result.alpha < 2
+    fmap = jm.map_feasible_set(mpc(4), POINTS, penalties=found.result, **SWEEP)
+    plain = jm.map_feasible_set(mpc(4), POINTS, **SWEEP)
+    both = (fmap.label != 0) & (plain.label != 0)
+    assert np.array_equal(fmap.label[both], plain.label[both]) and both.mean() > 0.995
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sweep_penalties, "search", lambda *_: pytest.fail("searched again"))
+        again = learn()
+    assert np.array_equal(again.result.weight, found.result.weight)
+    assert again.after == found.after
+    with pytest.raises(ValueError, match="Learn them for this map"):
+        jm.map_feasible_set(mpc(5), POINTS, penalties=found.result)
+
+
+@pytest.mark.slow
+def test_sweep_shortfalls_against_the_stages_own_verdicts():
+    """Where nothing is missing the stage decides (in float32, the edge apart); infeasible states it
+    decides only there."""
+    x, problem = POINTS[800:], FeasibilityProblem.of(mpc(4))
+    rows, p = problem.rows, problem.exact(np.abs(POINTS).max(axis=0))
+    truth = jm.map_feasible_set(mpc(4), x, **SWEEP).label
+    with jax.enable_x64(True):
+        decided = compiled_admm(8, np.dtype(np.float32))(p, rows, x, np.float64(1.6))[0].label
+        one = lambda x, label: sweep_penalties.shortfall(
+            p, rows, x, label, np.ones(len(rows.lower)), 1.6, 8
+        )
+        short = np.asarray(jax.jit(jax.vmap(one))(x, truth))
+    outside = (truth < 0) & (np.abs(short) > 1e-4)
+    assert outside.sum() > 100 and np.any(short[outside] > 0)
+    assert np.array_equal(decided[outside] == -1, short[outside] < 0)
+    inside = (truth > 0) & (short == 0)
+    assert inside.sum() > 100 and np.mean(decided[inside] == 1) > 0.98
+
+
+CASE = """
+[system]
+A = [[1.0, 1.0], [0.0, 1.0]]
+B = [[1.0], [0.5]]
+dt = 1.0
+[limits]
+x_min = [-5.0, -5.0]
+x_max = [5.0, 5.0]
+u_min = [-1.0]
+u_max = [1.0]
+[cost]
+Q = [1.0, 1.0]
+R = [1.0]
+[mpc]
+horizon = 4
+terminal = "box"
+"""
+
+
+def test_sweep_command_learns_and_its_labels_agree(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(linear_sweep, "CHUNK", 800)
+    Path("case.toml").write_text(CASE)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    asked = []
+
+    def tune(problem, points, cache, **settings):
+        asked.append((cache, settings))
+        weight = np.exp(np.random.default_rng(0).normal(size=len(moving(problem).lower)))
+        values = {"weight": weight, "alpha": np.array(1.4)}
+        build = lambda v: StagePenalties(v["weight"], float(v["alpha"]))
+        return TuningRun(values, values, {"decided": 0.8}, {"decided": 0.9}, True, {}, build)
+
+    monkeypatch.setattr(linear_sweep, "tune_sweep_penalties", tune)
+    command = "sweep --config case.toml --grid 40 20 --iterations 8 --no-refine --output"
+    assert main([*command.split(), "a"]) == 0 and not asked
+    assert main([*command.split(), "b", "--learn-penalties"]) == 0
+    assert "80.00% -> 90.00% decided" in capsys.readouterr().err
+    assert asked[0][0] == tmp_path / "cache/jaxmpc/penalties" and asked[0][1]["iterations"] == 8
+    labels = [
+        np.asarray(linear_sweep.store.read(tmp_path / k / "sweep.zarr")["label"]) for k in "ab"
+    ]
+    both = (labels[0] != 0) & (labels[1] != 0)
+    assert np.array_equal(labels[0][both], labels[1][both]) and both.mean() > 0.99
+    assert main([*command.split(), "b", "--resume", "--learn-penalties"]) == 0 and len(asked) == 1
+    assert main(["sweep", "--robot", "pendulum", "--learn-penalties", "--output", "c"]) == 2
+    assert "--learn-penalties: given beside --robot" in capsys.readouterr().err
+
+
+def test_too_few_points_to_learn_from():
+    with pytest.raises(ValueError, match="at least 64"):
+        tune_sweep_penalties(mpc(4), np.zeros((63, 2)))
+
+
+@pytest.mark.slow
+def test_the_joint_is_solved_in_a_hundred_steps():
+    """97 % of held-out feasible states to 1e-6; constant penalties solve 2 % (rho = 1)."""
+    problem = problems.joint(20)
+    x = np.random.default_rng(0).uniform([-1.5, -2], [1.5, 2], (6000, 2))
+    x = x[jm.map_feasible_set(problem, x).label == 1]
+    solver = tune_penalties(problem, x[:3000], updates=400).solver
+    assert solver.iterations == 100 and solver.refine == 0
+    assert solved(solver, x[3000:], problem) > 0.97
+    assert solved(jm.ADMM(refine=0), x[3000:], problem) < 0.1
+    many = jm.solve_many(problem, x[:500], solver)
+    assert np.all(many.status == jm.Status.SOLVED)
+
+
+@pytest.mark.slow
+def test_penalties_of_a_short_horizon_serve_a_long_one(learned):
+    longer, x = transfer_penalties(learned[0], mpc(10), 40), states(300, 3)
+    default = replace(DEFAULT, iterations=40, rho=np.ones_like(longer.rho))
+    assert solved(longer, x, mpc(10)) > solved(default, x, mpc(10)) + 0.3
+
+
+@pytest.mark.slow
+def test_warm_starts_have_penalties_of_their_own():
+    """Learned from perturbed solutions: fewer steps serve."""
+    problem, x = mpc(10), states(300, 4)
+    with jax.enable_x64(True):
+        controller = jm.Controller(jax.tree.map(np.float64, problem), jm.ADMM(refine=30))
+        near = jax.tree.map(np.asarray, plans(controller, 0.98 * x))
+    start = near.qp.z, near.qp.y
+    found = tune_penalties(problem, x, 20, stages=2, updates=150, warm_start=start)
+    cold = tune_penalties(problem, x, 20, stages=2, updates=150)
+    assert found.improved and found.after["solved"] > found.before["solved"] + 0.1
+    with jax.enable_x64(True):
+        one = lambda c, x, z, y: c.plan(x, warm_start=(z, y)).status
+        run = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)))
+        share = [
+            np.mean(run(jm.Controller(controller.mpc, s), x, *start) == jm.Status.SOLVED)
+            for s in (found.solver, cold.solver)
+        ]
+    assert share[0] > share[1]

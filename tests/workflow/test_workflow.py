@@ -1,0 +1,98 @@
+"""The workflow as one object, on systems whose report can be told beforehand."""
+
+import numpy as np
+import problems
+import pytest
+
+import jaxmpc as jm
+from jaxmpc.app.cli import main
+
+
+def test_design_builds_what_its_parts_say():
+    """Terminal ingredients are those of the functions it names, and so is the penalty."""
+    mpc = problems.joint(5)
+    made = {
+        terminal: jm.design(
+            mpc.system, mpc.Q, mpc.R, 5, states=mpc.states, inputs=mpc.inputs, terminal=terminal
+        )
+        for terminal in ("invariant", "ellipsoid", "box", "none")
+    }
+    law = jm.lqr(mpc.system, mpc.Q, mpc.R)
+    body = made["invariant"].mpc.terminal_set
+    assert body.volume() == pytest.approx(0.9473310116683459, rel=1e-8)
+    assert made["ellipsoid"].mpc.terminal_set.level == pytest.approx(1.4137628195913876, rel=1e-8)
+    assert made["box"].mpc.terminal_set is mpc.states and made["none"].mpc.terminal_set is None
+    for design in made.values():
+        np.testing.assert_allclose(design.mpc.terminal_cost, law.P)
+        assert not design.mpc.soft and design.penalty is None
+    exact = jm.design(
+        mpc.system, mpc.Q, mpc.R, 3, states=mpc.states, inputs=mpc.inputs, terminal="box",
+        soft="exact",
+    )  # fmt: skip
+    assert exact.penalty.exact and exact.mpc.states is None
+    assert exact.mpc.soft[0].rho == exact.penalty.advised > exact.penalty.rho_bar > 0
+
+
+def test_harden_undoes_soften():
+    """Rows at all state steps become states, rows at N the terminal set; the set is the same."""
+    mpc = problems.drifting(3)
+    back = jm.mpc.harden(jm.soften(mpc, 10.0))
+    assert not back.soft and not back.outputs
+    before, after = jm.feasible_polytope(mpc), jm.feasible_polytope(back)
+    assert before.is_subset(after) and after.is_subset(before)
+    odd = jm.Soft(np.array([[1.0, 0.0]]), np.array([0.5]), steps=(2,))
+    assert jm.mpc.harden(jm.MPC(mpc.system, mpc.Q, mpc.R, 3, soft=odd)).outputs[0].steps == (2,)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (dict(terminal="largest"), "terminal: 'largest'"),
+        (dict(soft="free"), "soft: 'free'"),
+        (dict(states=None, inputs=None), "terminal: 'invariant' without limits"),
+        (dict(limits=jm.joint_limits(1.5, 2.0, 2.0)), "limits: given beside"),
+    ],
+)
+def test_wrong_arguments(settings, message):
+    mpc = problems.joint(5)
+    given = {"states": mpc.states, "inputs": mpc.inputs, **settings}
+    with pytest.raises(ValueError, match=message):
+        jm.design(mpc.system, mpc.Q, mpc.R, 5, **given)
+
+
+@pytest.mark.slow
+def test_report_of_the_command(capsys):
+    """Joint, N = 2, no terminal set: refuted, with the reasons; every section is there."""
+    assert main(["info", "--horizon", "2", "--steps", "5", "--loops", "8"]) == 0
+    text = capsys.readouterr().out
+    for section in (
+        "Problem", "Feasible set", "Recursive feasibility", "Exact penalty",
+        "Terminal ingredients", "Closed loops",
+    ):  # fmt: skip
+        assert f"\n{section}" in text
+    assert "law                  refuted" in text and "11.96" in text
+    assert "NO  control invariance" in text and "not done" not in text
+
+
+def test_info_explains_what_it_cannot_read(capsys, tmp_path):
+    assert main(["info", "--config", str(tmp_path / "none.toml")]) == 2
+    assert "cannot be read" in capsys.readouterr().err
+    assert main(["info", "--loops", "0"]) == 2
+    assert "--loops" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_report_of_an_ellipsoidal_and_of_a_4d_problem():
+    """What does not apply is said, not left out."""
+    mpc = problems.joint(6)
+    law = jm.lqr(mpc.system, mpc.Q, mpc.R)
+    last = jm.invariant_ellipsoid(mpc.system, law.K, law.P, mpc.states, mpc.inputs)
+    report = jm.offline_report(
+        jm.MPC(mpc.system, mpc.Q, mpc.R, 6, mpc.states, mpc.inputs, law.P, last), steps=10, loops=8
+    )
+    assert report.terminal.recursive_feasibility and report.terminal.stability
+    assert report.penalty is None and "ellips" in report.notes["penalty"].lower()
+    assert report.recursion.S is True
+    assert report.loops.feasible == 8 and report.loops.increase <= 1e-7
+    product = jm.offline_report(problems.hidden_product(3), steps=3, loops=8, seconds=20)
+    assert product.feasible_set.counts()["undecided"] == 0 and product.loops.feasible <= 8
