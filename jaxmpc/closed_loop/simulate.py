@@ -24,7 +24,7 @@ SLACK = {"float64": 1e-6, "float32": 1e-3}
 def simulate(
     controller: Any, plant: Any, x0: Any, steps: int, *, reference: Any = None,
     input_reference: Any = None, disturbance: Any = None, previous_input: Any = None,
-    recompute: bool = False,
+    checkpoint: bool = False,
 ) -> Run:  # fmt: skip
     """Simulate `plant` under `controller` from the state x0 (n,) for T = steps samples.
 
@@ -36,7 +36,7 @@ def simulate(
     input_reference: input to track, (m,), or (T + N − 1, m).
     disturbance (T, n): added to the next states.
     previous_input (m,): u_{−1} where the problem limits or weighs input rates; None for zero.
-    recompute: under reverse-mode differentiation store only what is carried from sample to
+    checkpoint: under reverse-mode differentiation store only what is carried from sample to
         sample and compute the samples again: less memory, more time.
 
     Returns one `Run` in the controller's precision. For many initial states use
@@ -49,7 +49,7 @@ def simulate(
     checked = checked_arguments(
         controller, plant, x0, steps, reference, input_reference, disturbance, previous_input
     )
-    return _simulate(*checked, int(steps), recompute)
+    return _simulate(*checked, int(steps), checkpoint)
 
 
 def checked_arguments(
@@ -96,10 +96,10 @@ def _step_of(plant: Any, n: int, m: int) -> Partial:
     return Partial(type(plant).step, arrays(plant))
 
 
-@partial(jax.jit, static_argnames=("steps", "recompute"))
+@partial(jax.jit, static_argnames=("steps", "checkpoint"))
 def _simulate(
     controller: Any, step: Partial, x0: Array, references: tuple[Array | None, Array | None],
-    disturbance: Array | None, previous_input: Array | None, steps: int, recompute: bool,
+    disturbance: Array | None, previous_input: Array | None, steps: int, checkpoint: bool,
 ) -> Run:  # fmt: skip
     mpc = controller.mpc
     N, Q, R = mpc.horizon, jnp.asarray(mpc.Q, x0.dtype), jnp.asarray(mpc.R, x0.dtype)
@@ -133,7 +133,7 @@ def _simulate(
     previous = jnp.zeros(mpc.system.m, x0.dtype) if previous_input is None else previous_input
     samples = (jnp.arange(steps), disturbance)
     run: Run
-    if recompute:
+    if checkpoint:
         sample = jax.checkpoint(sample, prevent_cse=False)
     (last, *_), run = jax.lax.scan(sample, (x0, before, previous), samples, length=steps)
     return replace(

@@ -95,7 +95,7 @@ def as_argument(plant: Any) -> Any:
 
 def simulate_batch(
     controller: Any, plant: Any, reference: Any, input_reference: Any, x0s: Array,
-    variations: dict[str, Array], steps: int, recompute: bool = False,
+    variations: dict[str, Array], steps: int, checkpoint: bool = False,
 ) -> Run:  # fmt: skip
     """Simulate from x0s (B, n), loop i with entry i of the variations in its plant. Traceable.
 
@@ -106,7 +106,7 @@ def simulate_batch(
     def loop(x0: Array, varied: dict[str, Array]) -> Run:
         return simulate(
             controller, plant.vary(**varied) if varied else plant, x0, steps, reference=reference,
-            input_reference=input_reference, recompute=recompute,
+            input_reference=input_reference, checkpoint=checkpoint,
         )  # fmt: skip
 
     return jax.vmap(loop)(x0s, variations)

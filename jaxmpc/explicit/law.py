@@ -6,6 +6,7 @@ on a polytope, the critical region.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.optimize import lsq_linear, nnls
 from jaxmpc.control.sets import Box, unit_rows
 from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
 from jaxmpc.mpc.many import solve_many
-from jaxmpc.mpc.problem import MPC, Plan
+from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
 
 # Residuals to which plans are solved.
@@ -58,8 +59,8 @@ class Law:
         easy = np.pad(self.easy, (0, states.shape[1] - len(self.easy)))
         return np.vstack([states, np.tile(easy, (-len(states) % self.chunk, 1))])
 
-    def plans(self, states: np.ndarray) -> Plan:
-        """Plans from states (B, p), in programs of one shape."""
+    def plans(self, states: np.ndarray) -> Any:
+        """Return a Plan of host arrays (B, ...) from states (B, p), in programs of one shape."""
         found = solve_many(self.mpc, self.filled(states), ADMM(eps=EPS), chunk=self.chunk)
         return jax.tree.map(lambda v: np.asarray(v)[: len(states)], found)
 

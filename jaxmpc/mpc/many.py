@@ -4,7 +4,6 @@ from dataclasses import replace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -21,7 +20,7 @@ DEFAULT = ADMM()
 def solve_many(
     mpc: MPC, x0s: Any, solver: ADMM = DEFAULT, *, dtype: Any = "float32", chunk: int | None = None
 ) -> Plan:
-    """Solve the MPC problem from each state x0s (B, n); every leaf of the Plan has B in front.
+    """Solve the MPC problem from each state x0s (B, n); the Plan's leaves are host arrays with B in front.
 
     Where input rates are limited or weighted x0s may be (B, n + m), with the previous inputs in the
     last columns; (B, n) takes them as zero. The plans track the origin.
@@ -47,8 +46,8 @@ def solve_many(
         for start in range(0, max(len(x0s), 1), size):
             here = x0s[start : start + size]
             rows = padded(here, size) if len(here) else np.zeros((0, mpc.dimension))
-            parts.append(first_rows(_plans(controller, rows), len(here)))
-        return parts[0] if len(parts) == 1 else jax.tree.map(lambda *v: jnp.concatenate(v), *parts)
+            parts.append(first_rows(jax.tree.map(np.asarray, _plans(controller, rows)), len(here)))
+        return jax.tree.map(lambda *v: np.concatenate(v), *parts)
 
 
 @jax.jit

@@ -591,7 +591,7 @@ def search_step(steps: int, constants: tuple, state: Search) -> Search:
     small = jnp.all(values <= 1e-3 * eps + rounding(u.dtype) * sizes)
     error = jnp.where(jnp.all(jnp.isfinite(values)), jnp.max(values / (1 + sizes)), jnp.inf)
     take = small | (error < state.error)
-    best = tuple(jnp.where(take, a, b) for a, b in zip((u, given), state.best, strict=True))
+    best = jax.tree.map(partial(jnp.where, take), (u, given), state.best)
     count = state.steps + 1
     return Search(u, y, best, jnp.where(take, error, state.error), count, ~small & (count < steps))
 
@@ -734,8 +734,8 @@ def search(
     y = jnp.where(factor.E == 0, s.bounds.push(s.rows(x, u)), y)
     u, y = u, s.bounds.admissible(y)
     if solver.refine and solver.differentiate == "unrolled":
-        step = lambda pair, _: (newton_step(factor, sample, bounds, *pair), None)
-        u, y = jax.lax.scan(step, (u, y), length=solver.refine)[0]
+        newton = lambda pair, _: (newton_step(factor, sample, bounds, *pair), None)
+        u, y = jax.lax.scan(newton, (u, y), length=solver.refine)[0]
         y = s.bounds.admissible(y)
     elif solver.refine:
         values, sizes = measures(s, sample, u, y)

@@ -39,6 +39,8 @@ from jaxmpc.qp.status import Status
 
 # Eigenvalue, relative to the mean, below which a direction counts as without curvature.
 SINGULAR = {8: 1e-10, 4: 1e-6}
+# Beside which eigenvalue, relative to the mean, range and null space are told apart.
+SPLIT = 1e-6
 
 
 @jax.tree_util.register_dataclass
@@ -77,7 +79,7 @@ class ADMM:
         """Raise ValueError for settings that make no iteration."""
         if self.iterations < 0 or self.refine < 0:
             fail("iterations, refine", f"{self.iterations}, {self.refine}", "Give counts ≥ 0")
-        shape = () if self.rho is None else np.shape(self.rho)
+        shape: tuple[int, ...] = () if self.rho is None else np.shape(self.rho)
         if len(shape) > 2 or (shape and shape[-1] not in (1, rows)):
             fail("rho", f"shape {shape}", f"Give (), ({rows},) or (stages, {rows})")
         if self.rho is not None and concrete(self.rho) and not np.all(np.asarray(self.rho) > 0):
@@ -165,14 +167,16 @@ def null_curvature(P: Array, A: Array) -> tuple[Array, Array]:
     δ makes both parts of the median row alike, |a_null|²/δ = Σ (a'v)²/λ over P's range; 1 if
     no row has both parts. With x = (P + εI)⁻¹a the null part is ε|x|, and the range part x'Px.
     """
-    n = P.shape[0]
+    n, identity = P.shape[0], jnp.eye(P.shape[0], dtype=P.dtype)
     mean = jnp.trace(P) / n
     least = 4 * n * float(jnp.finfo(P.dtype).eps)
-    fraction = max(SINGULAR[P.dtype.itemsize], least)
-    epsilon = jnp.where(mean > 0, fraction * mean, 1.0)
-    root = inverse_root(P + epsilon * jnp.eye(n, dtype=P.dtype))
+    fraction = lambda least_fraction: jnp.where(mean > 0, max(least_fraction, least) * mean, 1.0)
     # Σ ε/(λ + ε) counts the directions without curvature.
-    singular = epsilon * jnp.sum(root**2) > 0.5
+    epsilon = fraction(SINGULAR[P.dtype.itemsize])
+    singular = epsilon * jnp.sum(inverse_root(P + epsilon * identity) ** 2) > 0.5
+    # With so small an ε the parts below would be lost in rounding.
+    epsilon = fraction(SPLIT)
+    root = inverse_root(P + epsilon * identity)
     delta = jnp.ones((), P.dtype)
     if A.shape[0]:
         x = matmul(matmul(A, root.T), root)

@@ -7,6 +7,7 @@ number of steps, not of the largest. Nothing returns to the host in between.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -16,18 +17,21 @@ from jax import Array, lax
 from jax.custom_batching import custom_vmap
 
 # Instances in a group: an eighth of the batch; when fewer are open a sixteenth of that, and so on,
-# but not below LEAST, where a step costs little more than its launches.
-PART, SMALLER, LEAST = 8, 16, 32
+# but not below LEAST (on CPUs, elsewhere), where a step costs little more than its launches.
+PART, SMALLER, LEAST = 8, 16, (32, 2048)
 # Instances in a block on a CPU, whose data stay within the cache.
 BLOCK = 128
 
 
 def group_sizes(batch: int) -> list[int]:
     """Return the sizes of the groups of a batch, from the largest."""
-    sizes = [batch if batch <= PART * LEAST else -(-batch // PART)]
-    while sizes[-1] > SMALLER * LEAST:
-        sizes.append(-(-sizes[-1] // SMALLER))
-    return sizes if sizes[-1] <= LEAST or batch <= PART * LEAST else [*sizes, LEAST]
+    least = LEAST[jax.default_backend() != "cpu"]
+    if batch <= PART * least:
+        return [batch]
+    sizes = [-(-batch // PART)]
+    while sizes[-1] > least:
+        sizes.append(max(-(-sizes[-1] // SMALLER), least))
+    return sizes
 
 
 def in_blocks(function: Callable, constants: Any, data: Any) -> Any:
@@ -113,8 +117,8 @@ def _in_groups(is_open: Callable, step: Callable, tree: Any, batched: tuple[bool
 
         counts = group_sizes(size)
         for count, least in zip(counts, [*counts[1:], 0], strict=True):
-            more = lambda state, least=least: jnp.sum(open_ones(state)) > least
-            state = lax.while_loop(more, lambda s, count=count: group(count, s), state)
+            more = partial(lambda least, state: jnp.sum(open_ones(state)) > least, least)
+            state = lax.while_loop(more, partial(group, count), state)
         return state
 
     batch = custom_vmap(run)

@@ -44,7 +44,7 @@ class Constants(NamedTuple):
     def of(cls, dtype: Any) -> "Constants":
         double = jnp.finfo(dtype).eps < 1e-10
         return cls((1e3, 1e8), 1e-8, 1e-10, 1e10, 1e6) if double else (
-            cls((1e3, 1e4), 1e-4, 1e-5, 1e5, 1e3)
+            cls((1e3, 1e4), 1e-4, 1e-5, 1e4, 1e3)
         )  # fmt: skip
 
 
@@ -183,11 +183,11 @@ def multipliers_step(
     """One Newton step of the proximal method of multipliers."""
     s = state
     step = newton_step(s.w, s.y, H, q, A, bounds, s.rho, s.sigma, gram(A))
-    return multipliers_update(q, s, step)
+    return multipliers_update(q, s, step, Constants.of(s.w.dtype).far)
 
 
-def multipliers_update(q: Array, state: Multipliers, step: Newton) -> Multipliers:
-    """The state after a Newton step on φ.
+def multipliers_update(q: Array, state: Multipliers, step: Newton, far: float) -> Multipliers:
+    """The state after a Newton step on φ; w stays where it would go beyond `far`.
 
     Whenever φ is minimised the multipliers become ρ e; ρ grows tenfold if the violation has not
     fallen tenfold, and σ falls a hundredfold. "Minimised" is exact (`newton_step`), or the
@@ -201,9 +201,9 @@ def multipliers_update(q: Array, state: Multipliers, step: Newton) -> Multiplier
     new = jnp.where(done, s.rho * step.excess, s.y)
     violation = largest(new - s.y) / s.rho
     grow = done & (violation > 0.1 * s.before)
-    far = largest(step.w) > constants.far
+    off = largest(step.w) > far
     return Multipliers(
-        jnp.where(far, s.w, step.w), new, jnp.where(done, new - s.y, s.change), step.w - s.w,
+        jnp.where(off, s.w, step.w), new, jnp.where(done, new - s.y, s.change), step.w - s.w,
         jnp.where(grow, jnp.minimum(10 * s.rho, constants.rho[1]), s.rho),
         jnp.where(done, jnp.maximum(s.sigma / 100, constants.sigma), s.sigma),
         jnp.where(done, violation, s.before), jnp.where(done, s.tolerance / 10, s.tolerance),

@@ -1,6 +1,6 @@
 """solve_qp: loop, polish, honest status and derivative joined."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -108,7 +108,7 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any) -> QPSolution:
         run(*arguments) if unrolled else in_blocks(run, *arguments), qp.q.dtype
     )
     eps = jnp.asarray(tolerance(solver, qp.q.dtype), qp.q.dtype)
-    p = Program(qp, factor, q, bounds, eps)
+    p = Program(qp, factor, q, bounds, eps, Constants.of(qp.q.dtype).far)
     begin = replace(multipliers_start(q, w, y), change=y - y_old, move=w - w_old)
     if unrolled:
         advance = lambda s, _: (multipliers_step(factor.H, q, factor.A, bounds, s), None)
@@ -134,13 +134,15 @@ def loop(iterations: int, constants: tuple, data: tuple) -> list[tuple[Array, Ar
 @dataclass(frozen=True)
 class Program:
     """A program in its own units and, as `q` (n,) and `bounds`, in ADMM's coordinates; eps: the
-    residuals that are asked for."""
+    residuals that are asked for; far: |w| at which the data's precision takes a ray's end for a
+    solution."""
 
     qp: QP
     factor: Factor
     q: Array
     bounds: Bounds
     eps: Array
+    far: float = field(metadata={"static": True})
 
 
 @jax.tree_util.register_dataclass
@@ -296,7 +298,7 @@ def by_multipliers(refine: int, p: Program, s: Search) -> Search:
         pick(s.point.sigma, Constants.of(dtype).damping), gram(rows),
     )  # fmt: skip
     step = step._replace(excess=step.excess[n + 1 :])
-    point = jax.tree.map(pick, multipliers_update(s.q, s.point, step), s.point)
+    point = jax.tree.map(pick, multipliers_update(s.q, s.point, step, p.far), s.point)
     pair, gradient = Pair.and_gradient(p, point.w, point.y)
     best = jax.tree.map(pick, s.best.or_better(pair), s.best)
     # What rounding of T'PT hides of the gradient counts as a part of q (defect correction).

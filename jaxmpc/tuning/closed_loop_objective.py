@@ -56,7 +56,7 @@ class ClosedLoopObjective:
 
     def total(
         self, theta: Any, plant: Any, x0s: Array, varied: dict[str, Array], weights: Array,
-        recompute: bool = False,
+        checkpoint: bool = False,
     ) -> tuple[Array, dict[str, Array]]:  # fmt: skip
         """Return the weighted mean loss, and what is counted of each loop."""
         given = values(self.parameters, theta)
@@ -64,7 +64,7 @@ class ClosedLoopObjective:
         aims = (self.reference, self.input_reference)
         r, s = (aim(given) if callable(aim) else aim for aim in aims)
         run = simulate_batch(
-            controller, plant, r, s, x0s.astype(controller.dtype), varied, self.steps, recompute
+            controller, plant, r, s, x0s.astype(controller.dtype), varied, self.steps, checkpoint
         )
         losses = jax.vmap(self.loss)(run)
         total = jnp.sum(jnp.where(weights > 0, weights * losses, 0.0)) / jnp.sum(weights)
@@ -107,8 +107,8 @@ class ClosedLoopObjective:
             )
             return value, unravel(slope), aux
 
-        def reverse(theta: Any, *rest: Any, recompute: bool = False) -> tuple[Array, Any, Any]:
-            at = partial(self.total, recompute=recompute)
+        def reverse(theta: Any, *rest: Any, checkpoint: bool = False) -> tuple[Array, Any, Any]:
+            at = partial(self.total, checkpoint=checkpoint)
             (value, aux), slope = jax.value_and_grad(at, has_aux=True)(theta, *rest)
             return value, slope, aux
 
@@ -122,7 +122,7 @@ class ClosedLoopObjective:
             try:
                 if program_bytes(plain.program(*arguments)) > 0.5 * device_bytes():
                     name = "reverse, checkpointed"
-                    plain = Compiled(jax.jit(partial(reverse, recompute=True)))
+                    plain = Compiled(jax.jit(partial(reverse, checkpoint=True)))
                 tried[name] = plain
             except ValueError:  # a plant with a loop that JAX cannot transpose
                 if not tried:

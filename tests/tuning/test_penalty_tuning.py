@@ -24,8 +24,8 @@ from jaxmpc.tuning.settings import Settings
 from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
 
 # The double integrator of five steps: 5 variables, 17 rows.
-SETTINGS = {"iterations": 30, "stages": 2, "updates": 40, "batch": 32}
-DEFAULT = jm.ADMM(refine=0)
+DEFAULT = jm.ADMM(rho=1.0, alpha=1.6, refine=0)
+SETTINGS = {"iterations": 30, "stages": 2, "updates": 40, "batch": 32, "solver": DEFAULT}
 
 
 def mpc(horizon=5):
@@ -94,8 +94,8 @@ def test_sabotaged_learning_returns_the_given_solver(learned, rate):
     given = learned[0].solver
     with pytest.warns(UserWarning, match="nothing found is better"):
         found = tune_penalties(
-            mpc(), states(160, 0), solver=given, optimizer=optax.sgd(rate),
-            **{**SETTINGS, "updates": 4},
+            mpc(), states(160, 0), optimizer=optax.sgd(rate),
+            **{**SETTINGS, "solver": given, "updates": 4},
         )  # fmt: skip
     assert found.solver is not learned[0].solver and not found.improved
     assert np.array_equal(found.solver.rho, given.rho) and found.solver.alpha == given.alpha
@@ -111,7 +111,9 @@ def test_cache(learned, monkeypatch):
     monkeypatch.setattr(penalties, "search", lambda *_: calls.append(1) or found)
     assert np.array_equal(again().rho, found.solver.rho) and not calls
     assert again().alpha == found.solver.alpha
-    assert again(solver=jm.ADMM(refine=3)).refine == 3 and not calls  # plays no part in learning
+    assert (
+        again(solver=replace(DEFAULT, refine=3)).refine == 3 and not calls
+    )  # plays no part in learning
     for other in ({"seed": 1}, {"iterations": 32}, {"solver": jm.ADMM(rho=2.0, refine=0)}):
         again(**other)
         assert calls.pop() and not calls
