@@ -20,7 +20,7 @@ DEFAULT = ADMM()
 def solve_many(
     mpc: MPC, x0s: Any, solver: ADMM = DEFAULT, *, dtype: Any = "float32", chunk: int | None = None
 ) -> Plan:
-    """Solve the MPC problem from each state x0s (B, n); the Plan's leaves are host arrays with B in front.
+    """Solve the MPC problem from each state x0s (B, n); the Plan holds host arrays, B in front.
 
     Where input rates are limited or weighted x0s may be (B, n + m), with the previous inputs in the
     last columns; (B, n) takes them as zero. The plans track the origin.
