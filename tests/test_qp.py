@@ -444,7 +444,8 @@ class TestBatches:
         )
         shapes = self.cholesky_shapes(shared, clean)
         assert shapes and all(shape == (6, 6) for shape in shapes)
-        assert len(shapes) == 4  # convexity, curvature, coordinates, and one stage of rho
+        # Convexity, whether P is singular, its range, coordinates, and one stage of rho.
+        assert len(shapes) == 5
         own = jax.vmap(lambda qp: jm.solve_qp(qp, solver))
         each = replace(clean, P=np.tile(clean.P, (9, 1, 1)), A=np.tile(clean.A, (9, 1, 1)))
         assert set(self.cholesky_shapes(own, each)) == {(9, 6, 6)}
@@ -454,6 +455,39 @@ class TestBatches:
         for seed in range(3):
             qp, _, _ = constructed(5, seed)
             solve(jm.QP(qp.P, qp.q, qp.A, qp.l, qp.u))
+
+
+class TestHardPrograms:
+    """Each of these once ended at the iteration limit."""
+
+    @pytest.mark.parametrize("bound", [1e5, 1e12, 1e20, 1e30])
+    def test_linear_program_with_far_bounds(self, x64, bound):
+        """max x + 2y, x + y ≤ 1, x and y from 0 to far away: (0, 1)."""
+        qp = jm.QP(
+            np.zeros((2, 2)), np.array([-1.0, -2.0]), np.vstack([np.ones(2), np.eye(2)]),
+            np.array([-bound, 0.0, 0.0]), np.array([1.0, bound, bound]),
+        )  # fmt: skip
+        found = jm.solve_qp(qp)
+        assert found.status == jm.Status.SOLVED
+        np.testing.assert_allclose(found.z, [0.0, 1.0], atol=1e-8)
+
+    @pytest.mark.parametrize("s", [1e-3, 1e-5, 1e-7])
+    def test_nearly_parallel_rows(self, x64, s):
+        """min |z|²/2, x ± s y ≤ −1: both rows push with 1/2 at (−1, 0)."""
+        A = np.array([[1.0, s], [1.0, -s]])
+        qp = jm.QP(np.eye(2), np.zeros(2), A, np.full(2, -np.inf), -np.ones(2))
+        found = jm.solve_qp(qp)
+        assert found.status == jm.Status.SOLVED
+        np.testing.assert_allclose(found.z, [-1.0, 0.0], atol=1e-7)
+
+    @pytest.mark.parametrize("condition", [1e3, 1e6])
+    def test_ill_conditioned_hessian_with_defaults(self, x64, condition):
+        for seed in range(5):
+            qp, *_ = constructed(8, seed)
+            V = np.linalg.qr(np.random.default_rng(seed).standard_normal((8, 8)))[0]
+            P = V * np.geomspace(1 / condition, 1, 8) @ V.T
+            found = jm.solve_qp(replace(qp, P=(P + P.T) / 2))
+            assert found.status == jm.Status.SOLVED
 
 
 class TestSettings:

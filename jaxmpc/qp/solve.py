@@ -39,12 +39,16 @@ from jaxmpc.qp.problem import QP, QPSolution, residual_terms, residuals
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.status import Status
 
+# Bounds of this size mean none, as in OSQP, MOSEK and the MPS format.
+INFINITE = 1e20
+
 
 def solve_qp(qp: QP, solver: ADMM = ADMM(), warm_start: Any = None) -> QPSolution:  # noqa: B008
     """Minimise ½ z'Pz + q'z subject to l ≤ Az ≤ u by a fixed number of ADMM steps and a polish.
 
     One instance; `jax.vmap` for many. Where P and A are not batched they are factored once;
-    where they are, each instance has its own factor. Soft rows and balls: see `QP`.
+    where they are, each instance has its own factor. Soft rows and balls: see `QP`. Bounds of 1e20
+    and above are infinite.
     warm_start: a (z, y) pair or an earlier QPSolution. The status comes from residuals in the
     units of `qp` (see `ADMM.eps`), computed in float64 even for float32 data, or from a
     certificate (`certificate.py`). z, y and cost are differentiable with respect to every array
@@ -63,11 +67,14 @@ def _solve(qp: QP, solver: ADMM, warm_start: Any) -> QPSolution:
 
 
 def as_arrays(qp: QP) -> QP:
-    """The same program with all fields in one floating type, the widest among them, and P made
-    exactly symmetric."""
+    """The same program with all fields in one floating type, the widest among them, P made exactly
+    symmetric, and bounds of 1e20 and above as infinity."""
     dtype = floating_dtype(qp)
     qp = jax.tree.map(lambda v: jnp.asarray(v, dtype), qp, is_leaf=lambda v: isinstance(v, list))
-    return replace(qp, P=(qp.P + qp.P.T) / 2)
+    return replace(
+        qp, P=(qp.P + qp.P.T) / 2, l=jnp.where(qp.l <= -INFINITE, -jnp.inf, qp.l),
+        u=jnp.where(qp.u >= INFINITE, jnp.inf, qp.u),
+    )  # fmt: skip
 
 
 def solve_factored(
