@@ -21,7 +21,7 @@ from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
 
 LINEARIZATIONS = ("set-point", "state", "trajectory")
-SOLVER = ADMM(iterations=50, refine=3)
+SOLVER = ADMM(iterations=50, rho=1.0, alpha=1.6, refine=20)
 
 
 @dataclass(frozen=True, eq=False, init=False)

@@ -29,7 +29,7 @@ from jaxmpc.tuning.parameters import Parameters, raw, require_parameters
 from jaxmpc.tuning.result import TuningRun
 from jaxmpc.tuning.settings import Settings
 
-SOLVER = ADMM(iterations=50, refine=3)
+SOLVER = ADMM(iterations=50, rho=1.0, alpha=1.6, refine=20)
 
 
 def tune_weights(

@@ -220,7 +220,7 @@ def linear_task(command: Any) -> TuningTask:
         hard.system, limits if isinstance(limits, Box) else free, hard.inputs,
         name=config.name,
     )  # fmt: skip
-    settings = config.build_solver() or ADMM(iterations=50, refine=3)
+    settings = config.build_solver() or ADMM(iterations=50, rho=1.0, alpha=1.6, refine=20)
     count = settings.iterations if command.iterations is None else command.iterations
     refine = settings.refine if command.refine is None else command.refine
     solver = dataclasses.replace(settings, iterations=count, refine=refine)
