@@ -43,7 +43,7 @@ from jaxmpc.mpc.solve import Layout, cost, multipliers, slack
 from jaxmpc.qp.admm import ADMM, convex, default_rho, repeat
 from jaxmpc.qp.batches import repeat_while
 from jaxmpc.qp.linalg import cholesky
-from jaxmpc.qp.newton import Constants
+from jaxmpc.qp.newton import Constants, largest
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely, rounding
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.projection import Bounds
@@ -522,11 +522,6 @@ def residual_terms(s: Stages, sample: Sample, u: Array, y: Array) -> list[tuple[
         (found.gradient, found.gradient_size),
         (gap, size + jnp.sum(jnp.abs(product))),
     ]
-
-
-def largest(v: Array) -> Array:
-    """The norm of residuals."""
-    return jnp.max(jnp.abs(v), initial=0.0)
 
 
 def measures(s: Stages, sample: Sample, u: Array, y: Array) -> tuple[Array, Array]:

@@ -19,7 +19,7 @@ of Goldfarb and Idnani (1983).
 Where H is not the identity (P singular) or there are balls, nothing is done here.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -41,19 +41,18 @@ RIDGE = 1e-11
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class DualPoint:
-    """Multipliers y (m,) with w = −q − A'y (n,), v = A w (m,), and the last step d (m,) of y."""
+    """Multipliers y (m,) with w = −q − A'y (n,) and v = A w (m,)."""
 
     y: Array
     w: Array
     v: Array
-    d: Array
 
 
 def dual_point(A: Array, q: Array, bounds: Bounds, y: Array) -> DualPoint:
     """Return the point of multipliers y (m,), made admissible."""
     y = bounds.admissible(y)
     w = -q - matmul(y, A)
-    return DualPoint(y, w, matmul(w, A.T), jnp.zeros_like(y))
+    return DualPoint(y, w, matmul(w, A.T))
 
 
 def dual_step(
@@ -109,5 +108,4 @@ def dual_step(
     best, least = tried[0], loss[0]
     for other, value in zip(tried[1:], loss[1:], strict=True):
         best, least = jnp.where(value < least, other, best), jnp.minimum(value, least)
-    new = y.at[W].set(best, mode="drop")
-    return replace(dual_point(A, q, bounds, new), d=new - y)
+    return dual_point(A, q, bounds, y.at[W].set(best, mode="drop"))

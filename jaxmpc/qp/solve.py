@@ -459,9 +459,8 @@ def tolerance(solver: ADMM, dtype: Any) -> Any:
     return (1e-6 if dtype == jnp.float64 else 1e-3) if solver.eps is None else solver.eps
 
 
-def within(qp: QP, z: Array, y: Array, eps: Any, floor: float | None = None) -> Array:
+def within(qp: QP, z: Array, y: Array, eps: Any, floor: float) -> Array:
     """Whether each residual of (z, y) is at most eps + floor·(size of its terms)."""
-    floor = rounding(z.dtype) if floor is None else floor
     return jnp.all(jnp.stack([
         jnp.all(jnp.abs(value) <= eps + floor * size) for value, size in residual_terms(qp, z, y)
     ]))  # fmt: skip
