@@ -113,11 +113,8 @@ class Config:
         if self.solver is None:
             return None
         given = self.solver.rho
-        rho = None if given is None else np.asarray(given, float)
-        return ADMM(
-            iterations=self.solver.iterations, rho=given if np.ndim(given) == 0 else rho,
-            alpha=self.solver.alpha, refine=self.solver.refine,
-        )  # fmt: skip
+        rho = np.asarray(given) if isinstance(given, tuple) else given
+        return ADMM(self.solver.iterations, rho, self.solver.alpha, self.solver.refine)
 
     def state_limits(self) -> Box | Polytope | None:
         """Return the state limits without the margin; None where there are none."""

@@ -89,16 +89,15 @@ def grid_ends(
     where: what stands before lower and upper in the ValueError that is raised where an end is not
     finite, or lower not below upper.
     """
-    low, high = limits() if lower is None or upper is None else (lower, upper)
-    room = 0.03 * np.where(np.isfinite([low, high]).all(axis=0), np.subtract(high, low), 0.0)
-    ends = (
-        np.asarray(low - room if lower is None else lower),
-        np.asarray(high + room if upper is None else upper),
-    )
-    if not np.all(np.isfinite(ends)):
+    ends = limits() if lower is None or upper is None else (lower, upper)
+    low, high = (np.asarray(end, float) for end in ends)
+    room = 0.03 * np.where(np.isfinite(low) & np.isfinite(high), high - low, 0.0)
+    low = np.asarray(low - room if lower is None else lower)
+    high = np.asarray(high + room if upper is None else upper)
+    if not np.all(np.isfinite([low, high])):
         cure = f"Give {where}lower and {where}upper: the limits do not bound the mapped axes"
         fail(f"{where}lower", "no finite range to map", cure)
-    if np.any(ends[0] >= ends[1]):
-        what = f"{ends[0].tolist()} not below upper {ends[1].tolist()}"
+    if np.any(low >= high):
+        what = f"{low.tolist()} not below upper {high.tolist()}"
         fail(f"{where}lower", what, "Lower must be below upper")
-    return ends
+    return low, high
