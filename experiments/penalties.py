@@ -37,8 +37,8 @@ from scipy import sparse
 import jaxmpc as jm
 from jaxmpc.app import config
 from jaxmpc.mpc.condense import Condensed, condense, in_float64
-from jaxmpc.qp.admm import factor, iterate, read, scaled
-from jaxmpc.qp.problem import residual_terms
+from jaxmpc.qp.admm import factor, iterate, read, scaled, splittings
+from jaxmpc.qp.residuals import residual_terms
 from jaxmpc.qp.solve import unscaled
 from jaxmpc.tuning.penalties import tune_penalties
 from jaxmpc.tuning.penalty_schedule import transfer_penalties
@@ -136,7 +136,7 @@ def run(condensed: Condensed, tracked: Any, x: jax.Array, rho: Any, alpha: Any) 
         q, bounds = scaled(made, qp)
 
         def chunk(t: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
-            t, _ = iterate(made, q, bounds, t, EVERY, alpha)
+            t, _ = iterate(splittings(made, q), bounds, t, EVERY, alpha)
             return t, excess(qp, *unscaled(qp, made, *read(made, t, q, bounds)))
 
         return jax.lax.scan(chunk, jnp.zeros_like(qp.l), length=LONG // EVERY)[1]
@@ -146,10 +146,8 @@ def run(condensed: Condensed, tracked: Any, x: jax.Array, rho: Any, alpha: Any) 
 
 def excess(qp: jm.QP, z: jax.Array, y: jax.Array) -> jax.Array:
     """Largest residual over its tolerance; SOLVED is ≤ 1."""
-    tolerance = lambda size: 1e-6 + 100 * jnp.finfo(z.dtype).eps * size
-    return jnp.max(jnp.stack([
-        jnp.max(jnp.abs(value) / tolerance(size)) for value, size in residual_terms(qp, z, y)
-    ]))  # fmt: skip
+    values, sizes = residual_terms(qp, z, y)
+    return jnp.max(jnp.abs(values) / (1e-6 + 100 * jnp.finfo(z.dtype).eps * sizes))
 
 
 @jax.jit

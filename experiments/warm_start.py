@@ -17,9 +17,11 @@ import tyro
 from jax import Array
 
 import jaxmpc as jm
-from jaxmpc.qp.admm import iterate, read, scaled
-from jaxmpc.qp.problem import QP, residuals
-from jaxmpc.qp.solve import start, unscaled
+from jaxmpc.mpc.plan import WarmStart
+from jaxmpc.qp.admm import iterate, read, scaled, splittings
+from jaxmpc.qp.problem import QP
+from jaxmpc.qp.residuals import residuals
+from jaxmpc.qp.solve import unscaled, warm
 
 
 @dataclass(frozen=True)
@@ -57,13 +59,14 @@ def run(s: Settings) -> None:
 
         def look(carry: tuple[Array, Array, Array], _: None) -> tuple:
             t, count, needed = carry
-            t, _ = iterate(factor, q, bounds, t, s.every, controller.solver.alpha)
+            schedule = splittings(factor, q)
+            t, _ = iterate(schedule, bounds, t, s.every, controller.solver.alpha)
             pair = unscaled(qp, factor, *read(factor, t, q, bounds))
             done = jnp.max(jnp.stack(residuals(qp, *pair))) <= 1e-6
             count = count + s.every
             return (t, count, jnp.where(done & jnp.isinf(needed), count, needed)), None
 
-        carry = (start(factor, qp, bounds, warm_start), 0.0, jnp.inf)
+        carry = (warm(factor, qp, bounds, warm_start), 0.0, jnp.inf)
         return jax.lax.scan(look, carry, length=s.most // s.every)[0][2]
 
     def sample(carry: tuple[Array, jm.Plan], _: None) -> tuple:
@@ -71,7 +74,9 @@ def run(s: Settings) -> None:
         x = mpc.system.A @ x + mpc.system.B @ before.inputs[0]
         qp, plan = condensed.qp(x), controller.plan(x)
         zero = (jnp.zeros_like(qp.q), jnp.zeros_like(qp.l))
-        starts = (zero, (before.qp.z, before.qp.y), controller.shifted(before))
+        of = lambda plan: WarmStart.of(plan, condensed.layout, mpc.horizon, 2, 1)
+        pair = lambda w: (condensed.variables(w.states, w.inputs), w.multipliers)
+        starts = (zero, pair(of(before)), pair(controller.shifted(before)))
         return (x, plan), (*(steps_to_solve(qp, each) for each in starts), plan.status)
 
     def loop(x0: Array) -> tuple:

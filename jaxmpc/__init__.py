@@ -39,10 +39,11 @@ from jaxmpc.control.system import LinearSystem
 from jaxmpc.control.terminal import verify_terminal
 from jaxmpc.explicit import exact_penalty
 from jaxmpc.feasible import boundary, feasible_polytope, grid, map_feasible_set
-from jaxmpc.mpc.many import solve_many
-from jaxmpc.mpc.problem import MPC, Outputs, Plan, Soft
+from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.plan import Plan
+from jaxmpc.mpc.problem import MPC, Outputs, Soft
 from jaxmpc.mpc.soften import soften
-from jaxmpc.mpc.solve import Controller, solve
+from jaxmpc.mpc.solve import solve, solve_many
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.solve import solve_qp

@@ -13,6 +13,8 @@ from jax import enable_x64
 
 import jaxmpc as jm
 from jaxmpc.mpc.condense import condense
+from jaxmpc.mpc.plan import WarmStart, flat_multipliers
+from jaxmpc.mpc.rows import layout
 
 FINE = jm.ADMM(iterations=400, refine=30, eps=1e-8)
 
@@ -424,8 +426,12 @@ class TestController:
         plan = fine.plan(x)
         cold, warm = few.plan(x), few.plan(x, warm_start=plan)
         assert warm.status == jm.Status.SOLVED != cold.status
-        again = few.plan(x, warm_start=plan.qp)
-        np.testing.assert_allclose(again.inputs, warm.inputs, atol=1e-9)
+        y = flat_multipliers(layout(mpc), plan.multipliers)
+        again = few.plan(x, warm_start=WarmStart(plan.states, plan.inputs, y))
+        np.testing.assert_array_equal(again.inputs, warm.inputs)
+        for bad in ((plan.inputs, y), WarmStart(plan.states, plan.inputs[1:], y)):
+            with pytest.raises(ValueError, match="warm_start"):
+                few.plan(x, warm_start=bad)
 
     @pytest.mark.slow
     @pytest.mark.parametrize("prestabilise", [False, True])
@@ -436,15 +442,19 @@ class TestController:
         plan = jm.Controller(mpc, FINE).plan(x)
         x = mpc.system.A @ x + mpc.system.B @ plan.inputs[0]
         controller = jm.Controller(mpc, jm.ADMM(iterations=0, refine=0))
-        start = controller.shifted(plan)
-        inputs = controller.condensed.trajectory(x, start[0])[1]
+        start, condensed = controller.shifted(plan), controller.condensed
+        z = condensed.variables(start.states, start.inputs)
+        inputs = condensed.trajectory(x, z)[1]
         np.testing.assert_allclose(inputs, jm.solve(mpc, x, solver=FINE).inputs, atol=1e-7)
 
     def test_shifted_multipliers_move_up(self):
         mpc = problems.joint(horizon=6)
         controller = jm.Controller(mpc, FINE)
         plan = controller.plan(np.array([-1.4, 1.7]))
-        before, after = plan.multipliers, controller.multipliers(controller.shifted(plan)[1])
+        before, after = (
+            plan.multipliers,
+            controller.multipliers(controller.shifted(plan).multipliers),
+        )
         assert np.abs(before.states).max() > 1  # limits are active
         np.testing.assert_array_equal(after.states[:-1], before.states[1:])
         np.testing.assert_array_equal(after.states[-1], before.terminal)

@@ -12,9 +12,11 @@ from problems import symmetric
 
 import jaxmpc as jm
 from jaxmpc.mpc import stagewise
+from jaxmpc.mpc.plan import WarmStart, flat_multipliers
+from jaxmpc.mpc.rows import layout
 from jaxmpc.mpc.stagewise import factor_stages, plan_stages, solve_stagewise
 from jaxmpc.qp import admm
-from jaxmpc.qp.problem import residuals
+from jaxmpc.qp.residuals import residuals
 
 N, n, m = 8, 3, 2
 SOLVER = jm.ADMM(iterations=20, refine=5)  # ADMM alone leaves 1e-3
@@ -60,6 +62,11 @@ def varying(drift: bool = True) -> jm.LinearSystem:
     rng, system = np.random.default_rng(2), problem().system
     move = lambda M: np.asarray(M) + 0.05 * rng.normal(size=(N, *np.shape(M)))
     return jm.LinearSystem(*(move(M) for M in (system.A, system.B, system.c)))
+
+
+def rows_of(mpc, plan):
+    """Multipliers (rows,) in the order of the rows of the condensed QP."""
+    return flat_multipliers(layout(mpc), plan.multipliers)
 
 
 def condensed(mpc: jm.MPC, system: jm.LinearSystem, x0: np.ndarray) -> tuple:
@@ -122,11 +129,15 @@ def test_iterates_are_those_of_the_dense_solver(kind):
     rho = np.where(moved, settings.rho * (E / np.where(moved, E_dense, 1)) ** 2, 1)
     dense = admm.factor(qp.P, qp.A, replace(settings, rho=rho))
     q, bounds = admm.scaled(dense, qp)
-    t, _ = admm.iterate(dense, q, bounds, jnp.zeros(count), 50, settings.alpha)
+    schedule = admm.splittings(dense, q)
+    t, _ = admm.iterate(schedule, bounds, jnp.zeros(count), 50, settings.alpha)
     sample = stagewise.Sample(jnp.asarray(X0), jnp.zeros((N + 1, n)), jnp.zeros((N, m)))
-    bounds = stagewise.scaled(factor.stages.bounds, factor.E)
-    first = stagewise.start(factor, sample, bounds, None)
-    t_stages, (_, u) = stagewise.iterate(factor, sample, bounds, first, 50, settings.alpha)
+    bounds = factor.stages.bounds.scaled(factor.E)
+    still = stagewise.predict(factor.stages, sample.x0, jnp.zeros((N, m)))
+    first = E * factor.stages.rows(still, jnp.zeros((N, m)))
+    schedule, free = stagewise.splittings(factor, sample)
+    t_stages, _ = admm.iterate(schedule, bounds, first, 50, settings.alpha)
+    u, _ = stagewise.read(factor, bounds, t_stages, free[-1])
     expected = np.asarray(t)[moved] / E_dense[moved] + shift[moved]
     np.testing.assert_allclose(np.asarray(t_stages)[moved] / E[moved], expected, atol=1e-9)
     w, y = admm.read(dense, t, q, admm.scaled(dense, qp)[1])
@@ -144,7 +155,7 @@ def test_plan_is_that_of_solve():
     plan = solve_stagewise(mpc, mpc.system, X0, aims[0], SOLVER, input_reference=aims[1])
     exact = jm.solve(mpc, X0, aims[0], jm.ADMM(iterations=400), input_reference=aims[1])
     assert plan.status == exact.status == jm.Status.SOLVED
-    assert np.max(exact.slack) > 0.01 and np.sum(np.abs(exact.qp.y) > 1e-3) > 5
+    assert np.max(exact.slack) > 0.01 and np.sum(np.abs(rows_of(mpc, exact)) > 1e-3) > 5
     for name in ("states", "inputs", "cost", "slack"):
         np.testing.assert_allclose(
             getattr(plan, name), getattr(exact, name), atol=1e-8, err_msg=name
@@ -163,10 +174,10 @@ def test_varying_system():
     plan = solve_stagewise(mpc, system, X0, solver=SOLVER)
     assert plan.status == jm.Status.SOLVED
     qp, _ = condensed(mpc, system, X0)
-    assert max(residuals(qp, plan.qp.z, plan.qp.y)) < 1e-9
+    assert max(residuals(qp, plan.inputs.ravel(), rows_of(mpc, plan))) < 1e-9
     assert max(plan.primal_residual, plan.dual_residual, plan.gap) < 1e-9
     # Signs and sizes of the multipliers are admissible: their conjugate is finite.
-    assert np.isfinite(qp.bounds.support(plan.qp.y)) and np.max(plan.slack) > 0.01
+    assert np.isfinite(qp.bounds.support(rows_of(mpc, plan))).all() and np.max(plan.slack) > 0.01
 
 
 @pytest.mark.slow
@@ -227,7 +238,9 @@ def test_residuals_are_those_of_the_qp():
     plan = solve_stagewise(mpc, system, X0, solver=jm.ADMM(iterations=2, refine=0))
     assert plan.status == jm.Status.ITERATION_LIMIT
     found = plan.primal_residual, plan.dual_residual, plan.gap
-    np.testing.assert_allclose(found, residuals(qp, plan.qp.z, plan.qp.y), rtol=1e-9)
+    np.testing.assert_allclose(
+        found, residuals(qp, plan.inputs.ravel(), rows_of(mpc, plan)), rtol=1e-9
+    )
     assert min(found) > 1e-4
 
 
@@ -256,12 +269,13 @@ def test_warm_start_and_parts():
     cold = solve_stagewise(mpc, system, X0, solver=again)
     assert cold.status != jm.Status.SOLVED
     factor = factor_stages(mpc, system, again)
-    for start in (plan, (plan.inputs, plan.qp.y)):
+    y = rows_of(mpc, plan)
+    for start in (plan, WarmStart(plan.states, plan.inputs, y)):
         warm = plan_stages(factor, mpc, X0, solver=again, warm_start=start)
         assert warm.status == jm.Status.SOLVED
         np.testing.assert_allclose(warm.inputs, plan.inputs, atol=1e-9)
     with pytest.raises(ValueError, match="warm_start"):
-        solve_stagewise(mpc, system, X0, warm_start=(plan.inputs, plan.qp.y[1:]))
+        solve_stagewise(mpc, system, X0, warm_start=WarmStart(plan.states, plan.inputs, y[1:]))
 
 
 def test_float32_and_bad_elements():

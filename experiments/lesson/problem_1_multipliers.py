@@ -19,7 +19,8 @@ import tyro
 from lesson_joint import LIMITS, TAU_MAX, X_MAX, A, B, Q, R, joint
 
 import jaxmpc as jm
-from jaxmpc.mpc.rows import row_table
+from jaxmpc.mpc.plan import flat_multipliers
+from jaxmpc.mpc.rows import layout, row_table
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ def run(s: Settings) -> Table:
     for name, value in residuals.items():
         print(f"  {name:36}{value:.1e}")
 
-    y = np.asarray(plan.qp.y)
+    y = np.asarray(flat_multipliers(layout(mpc), plan.multipliers))
     active = np.flatnonzero(np.abs(y) > 1e-6 * np.abs(y).max())
     measured = prices(controller, x0, active, y[active] > 0, s.step)
     table, labels = row_table(mpc), []

@@ -9,8 +9,8 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail, require_finite, require_shape
+from jaxmpc.mpc.plan import limited
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.solve import limited
 from jaxmpc.qp.precision import floating_dtype, matmul
 from jaxmpc.qp.status import Status
 

@@ -11,10 +11,12 @@ from jax import Array
 from jaxmpc.checks import fail
 from jaxmpc.control.sets import Box
 from jaxmpc.control.system import LinearSystem
-from jaxmpc.mpc.problem import MPC, Plan
+from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.plan import Plan, WarmStart, limited
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.rows import layout
 from jaxmpc.mpc.soften import soften
-from jaxmpc.mpc.solve import Controller, limited, shifted_multipliers
-from jaxmpc.mpc.stagewise import factor_stages, layout, solve_stagewise
+from jaxmpc.mpc.stagewise import factor_stages, solve_stagewise
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.precision import arrays, floating_dtype
 from jaxmpc.robots.linear import LinearPlant
@@ -121,11 +123,8 @@ class RobotController:
             states, inputs = self._resting(x, input_reference)
             start = None
         else:
-            # One sample later, its last step twice.
-            inputs = jnp.concatenate([carry.inputs[1:], carry.inputs[-1:]])
-            states = jnp.concatenate([carry.states[1:], carry.states[-1:]])
-            y = shifted_multipliers(layout(self.soft), self.soft.horizon, carry.qp.y)
-            start = (inputs, y)
+            start = WarmStart.shifted(layout(self.soft), carry, carry.inputs[-1])
+            states, inputs = start.states, start.inputs
         system = self._model(x, states, inputs, carry)
         plan = solve_stagewise(
             self.soft, system, self.coordinates(x), reference, self.solver, start,

@@ -14,8 +14,8 @@ from scipy.optimize import lsq_linear, nnls
 
 from jaxmpc.control.sets import Box, unit_rows
 from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
-from jaxmpc.mpc.many import solve_many
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.solve import solve_many
 from jaxmpc.qp.admm import ADMM
 
 # Residuals to which plans are solved.

@@ -4,16 +4,19 @@ MPC, Outputs, Soft    a problem, with rows of outputs and soft rows
 solve, Controller     one plan, or a factored law u = controller(x) -> Plan with Multipliers
 solve_stagewise       one plan, factored along the horizon
 solve_many            one plan for each of many states -> Plan with a batch axis
+WarmStart             where a solver begins: states, inputs, multipliers
 active_constraints    which rows of a plan are active -> ActiveConstraint
 row_table             each row of the problem: kind, name, unit, step -> Row
 soften, harden        make rows soft or hard
 """
 
-from jaxmpc.mpc.many import solve_many
-from jaxmpc.mpc.problem import MPC, Multipliers, Outputs, Plan, Soft
-from jaxmpc.mpc.rows import ActiveConstraint, Row, active_constraints, row_table
+from jaxmpc.mpc.active_constraints import ActiveConstraint, active_constraints
+from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.plan import Multipliers, Plan, WarmStart
+from jaxmpc.mpc.problem import MPC, Outputs, Soft
+from jaxmpc.mpc.rows import Row, row_table
 from jaxmpc.mpc.soften import harden, soften
-from jaxmpc.mpc.solve import Controller, solve
+from jaxmpc.mpc.solve import solve, solve_many
 from jaxmpc.mpc.stagewise import solve_stagewise
 
 __all__ = [
@@ -25,6 +28,7 @@ __all__ = [
     "Plan",
     "Row",
     "Soft",
+    "WarmStart",
     "active_constraints",
     "harden",
     "row_table",

@@ -22,7 +22,7 @@ from jax import Array
 from jaxmpc.checks import concrete, fail
 from jaxmpc.control.riccati import lqr
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.rows import blocks, stacked
+from jaxmpc.mpc.rows import Layout, blocks, stacked
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 from jaxmpc.qp.problem import QP
@@ -40,7 +40,7 @@ class Condensed:
     any. radius: of the terminal ball, whose rows are the last `balls`. Q, R, P_N, W: weights, W of
     input rates, stage (N,) of the stages. K (m, n): prestabilising gain. K_N (m, n): gain of the
     unconstrained input of one more step, u_N = K_N x_N. layout: (kind, steps, rows a step) of each
-    block of rows.
+    block of rows. begins: the step at which each move begins.
     """
 
     Phi: Array
@@ -67,8 +67,9 @@ class Condensed:
     stage: Array
     K: Array
     K_N: Array
-    layout: tuple[tuple[str, tuple[int, ...], int], ...] = field(metadata={"static": True})
+    layout: Layout = field(metadata={"static": True})
     balls: tuple[int, ...] = field(metadata={"static": True})
+    begins: tuple[int, ...] = field(metadata={"static": True})
 
     def qp(self, theta: Array, reference: Any = None, input_reference: Any = None) -> QP:
         """QP at θ (p,). reference (N+1, n), input_reference (N, m): what to track, None for 0."""
@@ -86,6 +87,11 @@ class Condensed:
             soft_linear=self.soft_linear, soft_quadratic=self.soft_quadratic, radius=self.radius,
             balls=self.balls,
         )  # fmt: skip
+
+    def variables(self, states: Array, inputs: Array) -> Array:
+        """z (nz,) of a trajectory, states (N+1, n) and inputs (N, m): the inverse of
+        `trajectory`, with the input at its first step for each move."""
+        return (inputs - matmul(states[:-1], self.K.T))[np.array(self.begins)].ravel()
 
     def trajectory(self, theta: Array, z: Array) -> tuple[Array, Array]:
         """States (N+1, n) and inputs (N, m) that z predicts from θ."""
@@ -217,4 +223,5 @@ def _condense(mpc: MPC) -> Condensed:
         form(phi, psi, rates[2]), C, D, d, lower, upper, linear, quadratic, radius, Q, R, P_N, W,
         stage, K, K_N, tuple((b.kind, b.steps, b.size) for b in found),
         tuple(b.size for b in round_ones),
+        tuple(int(k) for k in np.unique(mpc.moves, return_index=True)[1]),
     )  # fmt: skip

@@ -1,16 +1,14 @@
-"""The constrained MPC problem as a user states it, and the plan that answers it."""
+"""The constrained MPC problem as a user states it."""
 
 from dataclasses import dataclass, field
 from typing import Any
 
 import jax
 import numpy as np
-from jax import Array
 
 from jaxmpc.checks import concrete, fail, require_finite, require_shape, require_symmetric_psd
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem, as_array, host_array
-from jaxmpc.qp.problem import QPSolution
 
 
 @jax.tree_util.register_dataclass
@@ -292,49 +290,3 @@ def as_tuple(name: str, value: Any, kind: type) -> tuple:
     if not isinstance(value, tuple | list) or not all(isinstance(v, kind) for v in value):
         fail(name, f"{type(value).__name__}", f"Give a jm.{kind.__name__}, or a tuple of them")
     return tuple(value)
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Multipliers:
-    """Lagrange multipliers of a plan, for the cost without ½; y > 0 pushes against the upper
-    bound of the row, y < 0 against the lower.
-
-    states (K, r): rows of `states` at the steps where they hold, inputs (N, m or rows), terminal
-    (r_f,) (for an Ellipsoid {x'Px ≤ level}: of the rows L'x with P = LL', n of them). outputs and
-    soft: one array (steps, rows) for each of the problem's; rates (N, m).
-    dJ*/d(upper bound) = −y where y > 0, dJ*/d(lower bound) = −y where y < 0.
-    `active_constraints` lists them by name, step and unit.
-    """
-
-    states: Array
-    inputs: Array
-    terminal: Array
-    outputs: tuple[Array, ...] = ()
-    rates: Any = None
-    soft: tuple[Array, ...] = ()
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Plan:
-    """Answer of `solve`: states (N+1, n), inputs (N, m), cost J (without ½), multipliers, status.
-
-    cost includes what soft rows and input rates pay. slack (N+1, p): violation of the p soft rows,
-    in the order of `mpc.soft`, zero at steps where a row does not hold.
-    Unless the status is SOLVED, cost and trajectory are those of the best iterate and mean little.
-    The status is that of the QP (`jaxmpc.Status`); residuals are those of the condensed QP in
-    the units of states and inputs. `qp` holds the QP's own solution and serves as warm start.
-    """
-
-    states: Array
-    inputs: Array
-    cost: Array
-    slack: Array
-    multipliers: Multipliers
-    status: Array
-    primal_residual: Array
-    dual_residual: Array
-    gap: Array
-    iterations: Array
-    qp: QPSolution

@@ -37,16 +37,26 @@ from jaxmpc.checks import concrete, fail, require_finite
 from jaxmpc.control.sets import Box, Ellipsoid
 from jaxmpc.control.system import LinearSystem, as_array, host_array
 from jaxmpc.mpc.kernels import Gains, recurrence, riccati_recursion, tracking
-from jaxmpc.mpc.problem import MPC, Plan
-from jaxmpc.mpc.rows import blocks
-from jaxmpc.mpc.solve import Layout, cost, multipliers, slack
-from jaxmpc.qp.admm import ADMM, convex, default_rho, repeat
+from jaxmpc.mpc.plan import Plan, WarmStart, answer
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.rows import Layout, blocks, layout
+from jaxmpc.qp.admm import (
+    ADMM,
+    DEFAULT,
+    Splitting,
+    convex,
+    default_rho,
+    iterate,
+    scaled_multipliers,
+    start,
+)
 from jaxmpc.qp.batches import repeat_while
+from jaxmpc.qp.certificate import Proof
 from jaxmpc.qp.linalg import cholesky
-from jaxmpc.qp.newton import Constants, largest
+from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely, rounding
-from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.residuals import Pair, Terms, assess
 from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
 
@@ -56,7 +66,7 @@ UNROLL = 32
 
 
 def solve_stagewise(
-    mpc: MPC, system: LinearSystem, x0: Any, reference: Any = None, solver: ADMM = ADMM(),  # noqa: B008
+    mpc: MPC, system: LinearSystem, x0: Any, reference: Any = None, solver: ADMM = DEFAULT,
     warm_start: Any = None, *, input_reference: Any = None, scale: Any = None,
 ) -> Plan:  # fmt: skip
     """Solve `mpc` with `system` in place of its own, whose A (n, n), B (n, m) and c (n,) may have
@@ -65,10 +75,10 @@ def solve_stagewise(
     x0, references, solver and the Plan are those of `solve`, and so is the status: residuals and
     gap of the returned inputs and multipliers, evaluated from the data in float64. What differs:
     no infeasibility is proved (a problem without a solution ends as ITERATION_LIMIT: soften the
-    rows that may not hold), `qp.z` are the inputs, `qp.cost` is the plan's. Derivatives with
-    respect to every array of data are those of solver.differentiate. warm_start: an earlier Plan,
-    or inputs (N, m) or (N m,) and multipliers (rows,). solver.refine: Newton steps, a Riccati
-    recursion each; 5 suffice where ADMM has found the active rows. mpc.prestabilise is not read:
+    rows that may not hold). Derivatives with respect to every array of data are those of
+    solver.differentiate. warm_start: an earlier Plan or a WarmStart, whose states are not read.
+    solver.refine: Newton steps, a Riccati recursion each; 5 suffice where ADMM has found the
+    active rows. mpc.prestabilise is not read:
     the inputs are the variables, so a plant that grows more than 1e5-fold over the horizon in open
     loop (1e3-fold in float32) has residuals above eps by rounding alone; `solve` takes those. scale
     (rows,): the row scale of a similar problem (`factor_stages(...).E`), which saves one of two
@@ -85,7 +95,7 @@ def solve_stagewise(
 
 
 def factor_stages(
-    mpc: MPC, system: LinearSystem, solver: ADMM = ADMM(), scale: Any = None  # noqa: B008
+    mpc: MPC, system: LinearSystem, solver: ADMM = DEFAULT, scale: Any = None
 ) -> "StageFactor":  # fmt: skip
     """What x0, references and warm start do not change: row scale and Riccati gains.
 
@@ -126,11 +136,6 @@ def checked(mpc: MPC, system: LinearSystem, solver: ADMM) -> MPC:
     mpc = replace(mpc, system=system, prestabilise=None)
     solver.validate(sum(len(steps) * size for _, steps, size in layout(mpc)))
     return mpc
-
-
-def layout(mpc: MPC) -> Layout:
-    """(kind, steps, rows a step) of each block of rows."""
-    return tuple((b.kind, b.steps, b.size) for b in blocks(mpc, float))
 
 
 @jax.tree_util.register_dataclass
@@ -407,23 +412,6 @@ def row_scale(s: Stages) -> Array:
     return jnp.where(zero, 0.0, 1 / jnp.sqrt(jnp.where(zero, 1.0, squared)))
 
 
-def scaled(bounds: Bounds, E: Array) -> Bounds:
-    """Bounds of E·row: as `qp.admm.scaled`."""
-    zero = E == 0
-    E = jnp.where(zero, 1.0, E)
-
-    def bound(v: Array, free: float) -> Array:
-        keep = jnp.isfinite(v) & ~zero  # E·inf would give NaN gradients
-        return jnp.where(zero, free, jnp.where(keep, E * jnp.where(keep, v, 0.0), v))
-
-    bounds = replace(bounds, l=bound(bounds.l, -jnp.inf), u=bound(bounds.u, jnp.inf))
-    if bounds.linear is None:
-        return bounds
-    soft = jnp.isfinite(bounds.linear)
-    linear = jnp.where(soft, jnp.where(soft, bounds.linear, 0.0) / E, jnp.inf)
-    return replace(bounds, linear=linear, quadratic=bounds.quadratic / E**2)
-
-
 class Sample(NamedTuple):
     """What differs from sample to sample: x0 (n,), references (N+1, n) and (N, m)."""
 
@@ -448,36 +436,39 @@ def unconstrained(s: Stages, gains: Gains, weights: Array, sample: Sample) -> tu
     return x + dx, u + du
 
 
-def iterate(
-    factor: StageFactor, sample: Sample, bounds: Bounds, t: Array, iterations: int, alpha: Any
-) -> tuple[Array, tuple[Array, Array]]:
-    """The fixed loop of `qp.admm.iterate` from t (rows,); the last t, and its x and u.
-
-    Here t, bounds and E·row include what x0 and c put into the rows; in the condensed QP they are
-    moved by that.
-    """
-    s, E, count = factor.stages, factor.E, factor.rho.shape[0]
-    alpha = jnp.asarray(alpha, t.dtype)
-    for i in range(count):
-        rho, gains = factor.rho[i], jax.tree.map(lambda v, i=i: v[i], factor.gains)
+def splittings(
+    factor: StageFactor, sample: Sample, unroll: int = 1
+) -> tuple[list[Splitting], list[tuple[Array, Array]]]:
+    """The splitting of each penalty of the schedule, and the x (N+1, n) and u (N, m) of least cost
+    with that penalty on the rows alone. Bounds and E·row include what x0 and c put into the rows;
+    in the condensed QP they are moved by that."""
+    s, E = factor.stages, factor.E
+    made, ends = [], []
+    for i, rho in enumerate(factor.rho):
+        gains = jax.tree.map(lambda v, i=i: v[i], factor.gains)
         free = unconstrained(s, gains, rho * E**2, sample)
-        b = E * s.rows(*free)
-        if i > 0:  # the multiplier carries over
-            before = bounds.project(t, factor.rho[i - 1])
-            t = before + factor.rho[i - 1] / rho * (t - before)
 
-        def answer(t: Array, unroll: int, rho: Array = rho, gains: Gains = gains) -> tuple:
-            p = bounds.project(t, rho)
-            return p, minimise(s, gains, *s.pull(rho * E * (2 * p - t)), unroll)
+        def image(r: Array, rho: Array = rho, gains: Gains = gains) -> Array:
+            return E * s.rows(*minimise(s, gains, *s.pull(rho * E * r), unroll))
 
-        def advance(t: Array, b: Array = b, answer: Any = answer) -> Array:
-            p, moved = answer(t, min(s.horizon, UNROLL))
-            return t + alpha * (E * s.rows(*moved) + b - p)
+        made.append(Splitting(rho, image, E * s.rows(*free)))
+        ends.append(free)
+    return made, ends
 
-        if iterations:
-            t = repeat(advance, t, iterations // count)
-    moved = answer(t, 1)[1]
-    return t, (free[0] + moved[0], free[1] + moved[1])
+
+def read(
+    factor: StageFactor, bounds: Bounds, t: Array, free: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """Inputs u (N, m) and multipliers y (rows,) that t stands for at the last penalty."""
+    s, E, rho = factor.stages, factor.E, factor.rho[-1]
+    gains = jax.tree.map(lambda v: v[-1], factor.gains)
+    p = bounds.project(t, rho)
+    x, u = (
+        a + b for a, b in zip(free, minimise(s, gains, *s.pull(rho * E * (2 * p - t))), strict=True)
+    )
+    # Soft rows that no input moves push with their penalty, for the gap's sake.
+    y = jnp.where(E == 0, s.bounds.push(s.rows(x, u)), E * rho * (t - p))
+    return u, s.bounds.admissible(y)
 
 
 class Conditions(NamedTuple):
@@ -507,44 +498,32 @@ def conditions(s: Stages, sample: Sample, u: Array, y: Array) -> Conditions:
     )  # fmt: skip
 
 
-def residual_terms(s: Stages, sample: Sample, u: Array, y: Array) -> list[tuple[Array, Array]]:
-    """As `qp.problem.residual_terms`, for the condensed QP in the inputs.
+def residual_terms(s: Stages, sample: Sample, u: Array, y: Array) -> Terms:
+    """As `qp.residuals.residual_terms`, for the condensed QP in the inputs.
 
     With the gradient g of the Lagrangian the gap z'Pz + q'z + g(Az) + g*(y) is
     u'g + g(rows) + g*(y) − y'rows: at the optimum both parts are zero.
     """
     found, bounds = conditions(s, sample, u, y), s.bounds
     penalty, support, product = bounds.cost(found.rows), bounds.support(y), y * found.rows
-    gap = jnp.sum(u * found.gradient) + penalty + support - jnp.sum(product)
-    size = jnp.sum(jnp.abs(u) * found.gradient_size) + penalty + jnp.abs(support)
-    return [
-        (bounds.violation(found.rows), found.row_size),
-        (found.gradient, found.gradient_size),
-        (gap, size + jnp.sum(jnp.abs(product))),
-    ]
-
-
-def measures(s: Stages, sample: Sample, u: Array, y: Array) -> tuple[Array, Array]:
-    """Primal and dual residual and gap (3,), and the sizes (3,) of the terms they come from."""
-
-    def both(*arguments: Any) -> tuple[Array, Array]:
-        terms = residual_terms(*arguments)
-        of = lambda i: jnp.stack([largest(term[i]) for term in terms])
-        return of(0), of(1)
-
-    return precisely(both, s, sample, u, y)
+    gap = jnp.sum(u * found.gradient) + jnp.sum(penalty + support - product)
+    size = jnp.sum(jnp.abs(u) * found.gradient_size)
+    size = size + jnp.sum(penalty + jnp.abs(support) + jnp.abs(product))
+    return (
+        jnp.concatenate([bounds.violation(found.rows), found.gradient.ravel(), gap[None]]),
+        jnp.concatenate([found.row_size, found.gradient_size.ravel(), size[None]]),
+    )
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Search:
     """One instance on its way: inputs u (N, m) and multipliers y (rows,) of the last Newton step,
-    the best of all so far with its relative error, the steps taken, and whether to go on."""
+    the best pair of all so far, the steps taken, and whether to go on."""
 
     u: Array
     y: Array
-    best: tuple[Array, Array]
-    error: Array
+    best: Pair
     steps: Array
     open: Array
 
@@ -576,32 +555,33 @@ def newton_step(
     return u + du, y + dy
 
 
-def search_step(steps: int, constants: tuple, state: Search) -> Search:
-    """One Newton step; the search ends after `steps`, or below a thousandth of eps."""
+def search_step(most: int, constants: tuple, state: Search) -> Search:
+    """One Newton step; the search ends after `most`, or below a thousandth of eps."""
     factor, sample, bounds, eps = constants
-    s = factor.stages
     u, y = newton_step(factor, sample, bounds, state.u, state.y)
-    given = s.bounds.admissible(y)
-    values, sizes = measures(s, sample, u, given)
-    small = jnp.all(values <= 1e-3 * eps + rounding(u.dtype) * sizes)
-    error = jnp.where(jnp.all(jnp.isfinite(values)), jnp.max(values / (1 + sizes)), jnp.inf)
-    take = small | (error < state.error)
-    best = jax.tree.map(partial(jnp.where, take), (u, given), state.best)
-    count = state.steps + 1
-    return Search(u, y, best, jnp.where(take, error, state.error), count, ~small & (count < steps))
+    pair = judged(eps, factor.stages, sample, u, y)
+    best, steps = state.best.or_better(pair), state.steps + 1
+    return Search(u, y, best, steps, ~(best.near | best.solved) & (steps < most))
+
+
+def judged(eps: Array, s: Stages, sample: Sample, u: Array, y: Array) -> Pair:
+    """The pair of inputs u (N, m) and multipliers y (rows,), judged in float64."""
+    y, floor = s.bounds.admissible(y), rounding(u.dtype)
+    judge = lambda s, sample, u, y, eps: Pair.of(u, y, residual_terms(s, sample, u, y), eps, floor)
+    return precisely(judge, s, sample, u, y, eps)
 
 
 def errors(
     s: Stages, sample: Sample, E: Array, rho: Array, u: Array, y: Array
 ) -> tuple[Array, Array, Array]:
-    """v + y/ρ, c and the gradient, see `polish`."""
-    found, push = conditions(s, sample, u, y), unscaled(E, y) / rho
+    """v + y/ρ, c and the gradient, see `newton_step`."""
+    found, push = conditions(s, sample, u, y), scaled_multipliers(E, y) / rho
     v = E * found.rows + push
-    return v, scaled(s.bounds, E).excess(v, rho) - push, found.gradient
+    return v, s.bounds.scaled(E).excess(v, rho) - push, found.gradient
 
 
 def newton(s: Stages, E: Array, rho: Array, D: Array) -> Callable[[Array, Array], Any]:
-    """(c, gradient) → (du, dy) of `polish`: linear."""
+    """(c, gradient) → (du, dy) of `newton_step`: linear."""
     loose = 1 - D + D * rho / Constants.of(E.dtype).linear
     omega = rho * D / loose
     gains = riccati(s, omega * E**2)
@@ -621,7 +601,7 @@ def implicit(
 ) -> tuple[Array, Array]:
     """The solution (u, y), given as constants, with its derivative with respect to the data.
 
-    The conditions F(data, u, y) = 0 of `polish` hold at a solution, hence J d(u, y) = −dF with
+    The conditions F(data, u, y) = 0 of `newton_step` hold at a solution, hence J d(u, y) = −dF with
     the matrix J of a Newton step and u, y held fixed in dF: one Riccati recursion, whatever the
     number of iterations. Rows that touch without pushing count as inactive, as in
     `qp/derivative.py`.
@@ -636,7 +616,7 @@ def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple:
     u, y = implicit(s, sample, E, rho, u, y)
     at_data = lambda s, sample: errors(s, sample, E, rho, u, y)
     (v, c, gradient), (_, *moved) = jax.jvp(at_data, (s, sample), tangents[:2])
-    step = newton(s, E, rho, scaled(s.bounds, E).curvature(v, rho)[0])
+    step = newton(s, E, rho, s.bounds.scaled(E).curvature(v, rho)[0])
 
     def follow(moved: Any) -> Any:
         # The step is linear; as a derivative of itself it can be transposed, kernels or not.
@@ -650,13 +630,8 @@ def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple:
     return (u, y), jax.tree.map(jnp.add, first, second)
 
 
-def unscaled(E: Array, y: Array) -> Array:
-    """Multipliers of E·row from those of the rows; 0 where E is 0."""
-    return jnp.where(E > 0, y / jnp.where(E > 0, E, 1.0), 0.0)
-
-
 def plan_stages(
-    factor: StageFactor, mpc: MPC, x0: Any, reference: Any = None, solver: ADMM = ADMM(),  # noqa: B008
+    factor: StageFactor, mpc: MPC, x0: Any, reference: Any = None, solver: ADMM = DEFAULT,
     warm_start: Any = None, *, input_reference: Any = None,
 ) -> Plan:  # fmt: skip
     """The rest of `solve_stagewise`, for the same mpc and solver; mpc.system is not read."""
@@ -672,8 +647,8 @@ def plan_stages(
         if np.shape(value) not in (shape[1:], shape):
             fail(name, f"shape {np.shape(value)}", f"Give {shape[1:]} or {shape}")
         aims.append(jnp.broadcast_to(jnp.asarray(value, dtype), shape))
-    if isinstance(warm_start, Plan):
-        warm_start = (warm_start.inputs, warm_start.qp.y)
+    if warm_start is not None:
+        warm_start = WarmStart.of(warm_start, s.layout, N, n, m)
     mpc = replace(mpc, prestabilise=None)
     sample = Sample(jnp.asarray(x0, dtype), *aims)
     return _plan(*arrays((factor, mpc, solver, sample, warm_start)))
@@ -693,49 +668,36 @@ def _plan(factor: StageFactor, mpc: MPC, solver: ADMM, sample: Sample, warm_star
         )
     else:
         u, y = search(factor, sample, solver, warm_start)
-    s = factor.stages
-    status, primal, dual, gap = assess(s, sample, u, y, tolerance(solver, u.dtype))
+    s, eps = factor.stages, tolerance(solver, u.dtype)
+    found = assess(residual_terms, (s, sample), u, y, Proof.none(u, y), eps)
+    found = replace(found, iterations=jnp.asarray(solver.iterations, jnp.int32))
     x = predict(s, sample.x0, u)
-    J = cost(mpc, x, u, sample.states, sample.inputs)
-    nan = lambda v: jnp.where(usable, v, jnp.nan)
-    solution = QPSolution(
-        z=nan(u.ravel()), y=nan(y), cost=nan(J),
-        status=jnp.where(usable, status, fault).astype(jnp.int32),
-        primal_residual=nan(primal), dual_residual=nan(dual), gap=nan(gap),
-        iterations=jnp.asarray(solver.iterations, jnp.int32),
-        certificate=jnp.zeros_like(y), ray=jnp.zeros_like(u.ravel()),
-    )  # fmt: skip
-    return Plan(
-        states=nan(x), inputs=nan(u), cost=solution.cost, slack=nan(slack(mpc, x, u)),
-        multipliers=multipliers(mpc, s.layout, solution.y), status=solution.status,
-        primal_residual=solution.primal_residual, dual_residual=solution.dual_residual,
-        gap=solution.gap, iterations=solution.iterations, qp=solution,
-    )  # fmt: skip
+    return answer(mpc, s.layout, found, fault, x, u, sample.states, sample.inputs)
 
 
 def search(
-    factor: StageFactor, sample: Sample, solver: ADMM, warm_start: Any
+    factor: StageFactor, sample: Sample, solver: ADMM, warm_start: WarmStart | None
 ) -> tuple[Array, Array]:
-    """Inputs u (N, m) and multipliers y (rows,): loop and polish."""
-    s = factor.stages
-    bounds = scaled(s.bounds, factor.E)
-    t, (x, u) = iterate(
-        factor, sample, bounds, start(factor, sample, bounds, warm_start), solver.iterations,
-        solver.alpha,
-    )  # fmt: skip
-    # Soft rows that no input moves push with their penalty, for the gap's sake.
-    rho = factor.rho[-1]
-    y = factor.E * rho * (t - bounds.project(t, rho))
-    y = jnp.where(factor.E == 0, s.bounds.push(s.rows(x, u)), y)
-    u, y = u, s.bounds.admissible(y)
+    """Inputs u (N, m) and multipliers y (rows,): ADMM, then Newton steps."""
+    s, E, rho = factor.stages, factor.E, factor.rho[0]
+    bounds = s.bounds.scaled(E)
+    u, y = jnp.zeros((s.horizon, s.B.shape[-1]), E.dtype), jnp.zeros_like(E)
+    if warm_start is not None:  # what is not finite counts as 0
+        clean = lambda v: jnp.nan_to_num(jnp.asarray(v, E.dtype), posinf=0.0, neginf=0.0)
+        u, y = clean(warm_start.inputs), clean(warm_start.multipliers)
+    rows = E * s.rows(predict(s, sample.x0, u), u)
+    t = start(bounds, rho, rows, scaled_multipliers(E, y)) if warm_start is not None else rows
+    schedule, free = splittings(factor, sample, min(s.horizon, UNROLL))
+    t, _ = iterate(schedule, bounds, t, solver.iterations, solver.alpha)
+    u, y = read(factor, bounds, t, free[-1])
     if solver.refine and solver.differentiate == "unrolled":
         newton = lambda pair, _: (newton_step(factor, sample, bounds, *pair), None)
         u, y = jax.lax.scan(newton, (u, y), length=solver.refine)[0]
         y = s.bounds.admissible(y)
     elif solver.refine:
-        values, sizes = measures(s, sample, u, y)
         eps = jnp.asarray(tolerance(solver, u.dtype), u.dtype)
-        state = Search(u, y, (u, y), jnp.max(values / (1 + sizes)), jnp.int32(0), jnp.asarray(True))
+        best = judged(eps, s, sample, u, y)
+        state = Search(u, y, best, jnp.int32(0), jnp.asarray(True))
         constants = (factor, sample, bounds, eps)
         step = partial(search_step, solver.refine)
         if solver.fixed:
@@ -743,37 +705,5 @@ def search(
             state = jax.lax.scan(again, state, length=solver.refine)[0]
         else:
             state = repeat_while(lambda state: state.open, step, constants, state)
-        u, y = state.best
+        u, y = state.best.z, state.best.y
     return u, y
-
-
-def start(factor: StageFactor, sample: Sample, bounds: Bounds, warm_start: Any) -> Array:
-    """t = s + v of a warm start (u, y); what is not finite counts as 0. None: u = 0, y = 0."""
-    s, rho, dtype = factor.stages, factor.rho[0], factor.E.dtype
-    shape = (s.horizon, s.B.shape[-1])
-    if warm_start is None:
-        return factor.E * s.rows(predict(s, sample.x0, u := jnp.zeros(shape, dtype)), u)
-    u, y = warm_start
-    if np.shape(u) not in (shape, (shape[0] * shape[1],)):
-        fail("warm_start z", f"shape {np.shape(u)}", f"Needed: {shape}")
-    if np.shape(y) != factor.E.shape:
-        fail("warm_start y", f"shape {np.shape(y)}", f"Needed: {factor.E.shape}")
-    clean = lambda v: jnp.nan_to_num(jnp.asarray(v, dtype), posinf=0.0, neginf=0.0)
-    u, push = clean(u).reshape(shape), unscaled(factor.E, clean(y)) / rho
-    rows = factor.E * s.rows(predict(s, sample.x0, u), u)
-    return bounds.project(rows + push, rho) + push
-
-
-def assess(s: Stages, sample: Sample, u: Array, y: Array, eps: Any) -> tuple[Array, ...]:
-    """Status and residuals of u and y by the rule of `qp.solve.assess`, in float64."""
-    dtype = u.dtype
-    floor = rounding(dtype)
-
-    def measure(s: Stages, sample: Sample, u: Array, y: Array, eps: Array) -> tuple[Array, ...]:
-        solved, terms = jnp.asarray(True), residual_terms(s, sample, u, y)
-        for value, size in terms:
-            solved = solved & jnp.all(jnp.abs(value) <= eps + floor * size)
-        return (solved, *(largest(value) for value, _ in terms))
-
-    solved, *found = precisely(measure, s, sample, u, y, jnp.asarray(eps, dtype))
-    return (jnp.where(solved, Status.SOLVED, Status.ITERATION_LIMIT), *found)

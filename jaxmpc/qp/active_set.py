@@ -60,52 +60,48 @@ def dual_step(
 ) -> DualPoint:
     """One step from `point`; A (m, n), S = A A'. singly: of the rows without multiplier that are
     violated only the one that is so most joins W."""
-    y, v, (m, n) = point.y, point.v, A.shape
-    linear = jnp.full_like(y, jnp.inf) if bounds.linear is None else bounds.linear
-    quadratic = jnp.zeros_like(y) if bounds.quadratic is None else bounds.quadratic
+    y, v, soft = point.y, point.v, bounds.linear is not None
     noise = 1e-13 * (1 + jnp.max(jnp.abs(v), initial=0.0))
     outside = v - jnp.clip(v, bounds.l, bounds.u)
     outside = jnp.where(jnp.abs(outside) > noise, outside, 0.0)
     new = jnp.where(y == 0, jnp.abs(outside), 0.0)
     joins = (new > 0) & (new >= jnp.where(singly, jnp.max(new, initial=0.0), 0.0))
     sign = jnp.where(y != 0, jnp.sign(y), jnp.sign(outside))
-    beyond = jnp.abs(y) >= linear
-    # An L1 penalty that is paid in full stays so while its row is outside.
-    paid = beyond & (quadratic == 0) & (sign * outside > 0)
-    bound = jnp.where(sign > 0, bounds.u, bounds.l)
+    in_W = (y != 0) | joins
+    columns = [y, sign, v - jnp.where(sign > 0, bounds.u, bounds.l), bounds.l == bounds.u]
+    if soft:
+        beyond = jnp.abs(y) >= bounds.linear
+        # An L1 penalty that is paid in full stays so while its row is outside.
+        in_W = in_W & ~(beyond & (bounds.quadratic == 0) & (sign * outside > 0))
+        columns += [bounds.linear, bounds.quadratic, beyond]
+    W = true_places(in_W, min(*A.shape, MOST_ROWS))
+    inside = W < len(y)
+    table = jnp.stack([column.astype(y.dtype) for column in columns])
+    y_W, sign_W, value, equal, *weights = table.at[:, W].get(mode="fill", fill_value=0.0)
+    S_W = S.at[W[:, None], W[None, :]].get(mode="fill", fill_value=0.0)
 
-    W = true_places(((y != 0) | joins) & ~paid, min(m, n, MOST_ROWS))
-    inside = W < m
-    of = lambda x: jnp.where(inside, x.at[W].get(mode="clip"), 0.0)
-    y_W, sign_W, cap, beyond_W = of(y), of(sign), of(linear), of(beyond.astype(y.dtype)) > 0
-    equal = of((bounds.l == bounds.u).astype(y.dtype)) > 0
-    stiff = of(quadratic)
-    slack = jnp.where(beyond_W & (stiff > 0), 1 / jnp.where(stiff > 0, stiff, 1.0), 0.0)
-    soft = jnp.isfinite(cap)
-    excess = lambda y: jnp.where(
-        soft, jnp.maximum(jnp.abs(y) - jnp.where(soft, cap, 0.0), 0.0), 0.0
-    )
-    gradient = of(v - bound) - slack * sign_W * excess(y_W)
-    both = inside[:, None] & inside[None, :]
-    clipped = jnp.minimum(W, m - 1)
-    S_W = jnp.where(both, S[clipped[:, None], clipped[None, :]], 0.0)
-    system = S_W + jnp.diag(jnp.where(inside, slack + RIDGE, 1.0))
-    d = jnp.where(inside, solve(system, gradient), 0.0)
+    gradient, slack, added = value, jnp.zeros_like(y_W), lambda y: jnp.zeros_like(y)
+    if soft:
+        cap, stiff, beyond = weights
+        capped, elastic = jnp.isfinite(cap), stiff > 0
+        give = jnp.where(elastic, 1 / jnp.where(elastic, stiff, 1.0), 0.0)
+        over = lambda y: jnp.maximum(jnp.abs(y) - jnp.where(capped, cap, jnp.inf), 0.0)
+        slack = jnp.where(beyond > 0, give, 0.0)
+        gradient = value - slack * sign_W * over(y_W)
+        added = lambda y: 0.5 * give * over(y) ** 2
+    d = solve(S_W + jnp.diag(jnp.where(inside, slack + RIDGE, 1.0)), gradient)
 
-    stops = ~equal & (sign_W * y_W > 0) & (sign_W * d < 0)
+    stops = (equal == 0) & (sign_W * d < 0) & (sign_W * y_W > 0)
     first = jnp.min(jnp.where(stops, -y_W / jnp.where(stops, d, 1.0), 1.0), initial=1.0)
     t = jnp.append(jnp.asarray(LENGTHS, y.dtype), first)[:, None]
     tried = y_W + t * d
-    tried = jnp.where(equal | (sign_W * tried > 0), tried, 0.0)
-    top = jnp.where(stiff > 0, jnp.inf, cap)
-    tried = jnp.clip(tried, -top, top)
+    tried = jnp.where((equal > 0) | (sign_W * tried > 0), tried, 0.0)
+    if soft:
+        tried = jnp.where(elastic, tried, jnp.clip(tried, -cap, cap))
     # The loss of dual value: ½ δ'S δ − δ'(v − b) and the change of what soft rows add to g*.
     moved = tried - y_W
-    loss = 0.5 * jnp.sum(moved * matmul(moved, S_W), axis=1) - matmul(moved, of(v - bound))
-    if bounds.linear is not None:
-        cost = jnp.where(stiff > 0, 0.5 / jnp.where(stiff > 0, stiff, 1.0), 0.0)
-        loss = loss + jnp.sum(cost * (excess(tried) ** 2 - excess(y_W) ** 2), axis=1)
-    best, least = tried[0], loss[0]
-    for other, value in zip(tried[1:], loss[1:], strict=True):
-        best, least = jnp.where(value < least, other, best), jnp.minimum(value, least)
+    loss = jnp.sum(moved * (0.5 * matmul(moved, S_W) - value) + added(tried) - added(y_W), axis=1)
+    # (An argmin in a float64 program cannot be lowered where 64-bit mode is off.)
+    best = (loss <= jnp.min(loss)).astype(y.dtype)
+    best = matmul(best / jnp.sum(best), tried)
     return dual_point(A, q, bounds, y.at[W].set(best, mode="drop"))

@@ -20,10 +20,10 @@ pays for one factorization and then for one matrix product a step. prox is the p
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -93,6 +93,9 @@ class ADMM:
             fail("differentiate", f"{self.differentiate!r}", 'Give "implicit" or "unrolled"')
         if concrete(self.smoothing) and not float(np.asarray(self.smoothing)) >= 0:
             fail("smoothing", f"{self.smoothing}", "Give 0 (none) or a positive number")
+
+
+DEFAULT = ADMM()
 
 
 @jax.tree_util.register_dataclass
@@ -264,62 +267,62 @@ def convex(P: Array) -> Array:
 
 
 def scaled(factor: Factor, qp: QP) -> tuple[Array, Bounds]:
-    """q and bounds in ADMM's coordinates: distances in row i grow by E_i, so penalties on them
-    shrink. A zero row (scale 0) is free there; `assess` in solve.py looks after it."""
-    E, zero, bounds = factor.E, factor.E == 0, qp.bounds
-
-    def bound(v: Array, free: float) -> Array:
-        # E·inf would give NaN gradients with respect to P and A, which E depends on.
-        keep = jnp.isfinite(v) & ~zero
-        return jnp.where(zero, free, jnp.where(keep, E * jnp.where(keep, v, 0.0), v))
-
-    bounds = replace(bounds, l=bound(qp.l, -jnp.inf), u=bound(qp.u, jnp.inf))
-    E = jnp.where(zero, 1.0, E)
-    if bounds.linear is not None:
-        soft = jnp.isfinite(bounds.linear)
-        linear = jnp.where(soft, jnp.where(soft, bounds.linear, 0.0) / E, jnp.inf)
-        bounds = replace(bounds, linear=linear, quadratic=bounds.quadratic / E**2)
-    for i, (rows, radius) in enumerate(bounds.blocks()):
-        centre = jnp.where(zero[rows], 0.0, E[rows] * qp.l[rows])
-        radius = jnp.where(zero[rows][0], jnp.inf, E[rows][0] * radius)
-        bounds = replace(
-            bounds, l=bounds.l.at[rows].set(centre), u=bounds.u.at[rows].set(centre),
-            radius=bounds.radius.at[i].set(radius),
-        )  # fmt: skip
-    return matmul(qp.q, factor.T), bounds
+    """q and bounds in ADMM's coordinates. A zero row (scale 0) is free there; `prove` and
+    `residual_terms` look after it."""
+    return matmul(qp.q, factor.T), qp.bounds.scaled(factor.E)
 
 
 def scaled_rows(factor: Factor, qp: QP, z: Array, y: Array) -> tuple[Array, Array]:
     """Az and y in ADMM's coordinates; 0 in a zero row."""
-    E = factor.E
-    return E * matmul(z, qp.A.T), jnp.where(E > 0, y / jnp.where(E > 0, E, 1.0), 0.0)
+    return factor.E * matmul(z, qp.A.T), scaled_multipliers(factor.E, y)
 
 
-def step(
-    t: Array, b: Array, bounds: Bounds, rho: Array, image: Callable[[Array], Array], alpha: Any
-) -> Array:
-    """One ADMM step on t = s + v (m,); image: r → A M⁻¹A'R r."""
-    s = bounds.project(t, rho)
-    return t + jnp.asarray(alpha, t.dtype) * (image(2 * s - t) + b - s)
+def scaled_multipliers(E: Array, y: Array) -> Array:
+    """Multipliers of the rows E·v from those of v; 0 where E is 0."""
+    return jnp.where(E > 0, y / jnp.where(E > 0, E, 1.0), 0.0)
+
+
+class Splitting(NamedTuple):
+    """What a step of ADMM needs at one penalty rho (m,), in scaled rows: image, r → A M⁻¹A'R r, and
+    offset b (m,), the rows of the minimiser for r = 0."""
+
+    rho: Array
+    image: Callable[[Array], Array]
+    offset: Array
+
+    def step(self, t: Array, bounds: Bounds, alpha: Any) -> Array:
+        """One ADMM step on t = s + v (m,)."""
+        s = bounds.project(t, self.rho)
+        return t + jnp.asarray(alpha, t.dtype) * (self.image(2 * s - t) + self.offset - s)
+
+
+def splittings(factor: Factor, q: Array) -> list[Splitting]:
+    """The splitting of each stage of the schedule; q = T'q (n,)."""
+    offset = lambda i: -matmul(matmul(q, factor.Minv[i]), factor.A.T)
+    return [Splitting(rho, partial(factor.image, i), offset(i)) for i, rho in enumerate(factor.rho)]
 
 
 def iterate(
-    factor: Factor, q: Array, bounds: Bounds, t: Array, iterations: int, alpha: Any
+    schedule: Sequence[Splitting], bounds: Bounds, t: Array, iterations: int, alpha: Any
 ) -> tuple[Array, Array]:
-    """Run the fixed loop in scaled coordinates, q = T'q (n,), t (m,); the last two t."""
-    stages = factor.rho.shape[0]
-    previous = t
-    for i in range(stages):
-        rho, image = factor.rho[i], partial(factor.image, i)
-        b = -matmul(matmul(q, factor.Minv[i]), factor.A.T)
-        if i > 0:  # the multiplier R v is what carries over, not v
-            s = bounds.project(t, factor.rho[i - 1])
-            t = s + factor.rho[i - 1] / rho * (t - s)
-        advance = lambda t, rho=rho, image=image, b=b: step(t, b, bounds, rho, image, alpha)
+    """Run the fixed loop from t (m,), equally many steps with each splitting; the last two t."""
+    previous, before = t, None
+    for splitting in schedule:
+        if before is not None:  # the multiplier R v is what carries over, not v
+            s = bounds.project(t, before)
+            t = s + before / splitting.rho * (t - s)
+        before = splitting.rho
+        advance = lambda t, splitting=splitting: splitting.step(t, bounds, alpha)
         if iterations:
-            previous = repeat(advance, t, iterations // stages - 1)
+            previous = repeat(advance, t, iterations // len(schedule) - 1)
             t = advance(previous)
     return t, previous
+
+
+def start(bounds: Bounds, rho: Array, rows: Array, y: Array) -> Array:
+    """t = s + v of a warm start: rows A w (m,) and multipliers y (m,), both scaled."""
+    # Soft rows may stay outside their interval: s is what prox leaves of s + v.
+    return bounds.project(rows + y / rho, rho) + y / rho
 
 
 def repeat(advance: Callable[[Array], Array], t: Array, count: int) -> Array:

@@ -16,21 +16,22 @@ import numpy as np
 from jax import Array, lax
 from jax.custom_batching import custom_vmap
 
-# Instances in a group: an eighth of the batch; when fewer are open a sixteenth of that, and so on,
-# but not below LEAST (on CPUs, elsewhere), where a step costs little more than its launches.
-PART, SMALLER, LEAST = 8, 16, (32, 2048)
-# Instances in a block on a CPU, whose data stay within the cache.
+# Instances in a group on a CPU, whose data stay within the cache.
 BLOCK = 128
+# Instances in a group elsewhere: an eighth of the batch; when fewer are open a sixteenth of that,
+# and so on, but not below LEAST, where a step costs little more than its launches.
+PART, SMALLER, LEAST = 8, 16, 2048
 
 
 def group_sizes(batch: int) -> list[int]:
     """Return the sizes of the groups of a batch, from the largest."""
-    least = LEAST[jax.default_backend() != "cpu"]
-    if batch <= PART * least:
+    if jax.default_backend() == "cpu":
+        return [min(batch, BLOCK)]
+    if batch <= PART * LEAST:
         return [batch]
     sizes = [-(-batch // PART)]
-    while sizes[-1] > least:
-        sizes.append(max(-(-sizes[-1] // SMALLER), least))
+    while sizes[-1] > LEAST:
+        sizes.append(max(-(-sizes[-1] // SMALLER), LEAST))
     return sizes
 
 

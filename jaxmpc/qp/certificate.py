@@ -7,8 +7,9 @@ left of A'y, exactly up to one rounding (Neumaier & Shcherbina 2004, safe bounds
 box rows in the role of the correction). Convergence of y then buys tightness, not validity.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -21,64 +22,106 @@ from jaxmpc.qp.projection import Bounds
 RAY = 25
 
 
-def farkas(qp: QP, y: Array) -> tuple[Array, Array]:
-    """The candidate y made into a certificate: returns (y, proved).
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Proof:
+    """A Farkas vector and a descent ray, and whether they are proved to be."""
 
-    y is scaled to length one, freed of pushes against infinite bounds, and corrected on rows
-    that bound one variable. `proved` is True when Σ u y⁺ − l y⁻ is below zero by more than the
-    rounding of the sum and of A'y (over the box of the bounded variables); a variable without
-    such a row must have (A'y)_j at rounding level. A zero y proves nothing.
-    """
-    eps = jnp.finfo(y.dtype).eps
+    certificate: Array
+    infeasible: Array
+    ray: Array
+    unbounded: Array
+
+    @classmethod
+    def none(cls, z: Array, y: Array) -> "Proof":
+        """Nothing proved of a program with variables like z and rows like y."""
+        false = jnp.asarray(False)
+        return cls(jnp.zeros_like(y), false, jnp.zeros_like(z), false)
+
+    def joined(self, other: "Proof") -> "Proof":
+        """What either proves."""
+        old, new = self, other
+        return Proof(
+            jnp.where(old.infeasible, old.certificate, new.certificate),
+            old.infeasible | new.infeasible,
+            jnp.where(old.unbounded, old.ray, new.ray), old.unbounded | new.unbounded,
+        )  # fmt: skip
+
+
+def prove(qp: QP, T: Array, E: Array, correcting: tuple[Array, Array], y: Array, d: Array) -> Proof:
+    """What is proved of the program by candidates for a Farkas vector y and for a ray d, both in
+    ADMM's coordinates (`admm.scale`). correcting: `correcting_rows(qp)`."""
+    ray, unbounded = descent_ray(qp, matmul(d, T.T))
+    if not y.shape[0]:
+        return Proof(y, jnp.asarray(False), ray, unbounded)
+    # Rows that z cannot move prove emptiness by themselves.
+    fixed = jnp.where(E == 0, qp.bounds.violation(jnp.zeros_like(E)), 0.0)
+    candidate = jnp.where(jnp.any(fixed != 0), fixed, E * y)
+    return Proof(*farkas(qp, candidate, correcting), ray, unbounded)
+
+
+def correcting_rows(qp: QP) -> tuple[Array, Array]:
+    """Return for each variable a row that bounds it alone, (n,), and the entry of A there, 0 where
+    there is none: the rows that correct a certificate. The choice rests on A and on which rows are
+    soft, so a batch shares it."""
     m, n = qp.A.shape
-    if m == 0:
-        return y, jnp.asarray(False)
-    bounds = qp.bounds.hard()
-    l, u = bounds.l, bounds.u
-    length = jnp.max(jnp.abs(y), initial=0.0)
-    y = bounds.admissible(jnp.where(length > 0, y / jnp.where(length > 0, length, 1.0), 0.0))
-
-    # Row i(j) bounds variable j alone. The choice rests on A only, so a batch shares it.
+    if not m:
+        return jnp.zeros(n, jnp.int32), jnp.zeros(n, qp.A.dtype)
     single = (jnp.sum(qp.A != 0, axis=1) == 1) & (np.arange(m, dtype=np.int32) < m - sum(qp.balls))
     if qp.bounds.linear is not None:
         single = single & jnp.isinf(qp.bounds.linear)
     entries = jnp.where(single[:, None], jnp.abs(qp.A), 0.0)
-    largest = (entries == jnp.max(entries, axis=0)).astype(jnp.int32)
-    rows = np.arange(m, dtype=np.int32)[:, None]
-    row = jnp.min(jnp.where(largest > 0, rows, np.int32(m - 1)), axis=0)
-    pivot = jnp.where(
-        entries[row, np.arange(n, dtype=np.int32)] > 0, qp.A[row, np.arange(n, dtype=np.int32)], 1.0
-    )
-    bounded = jnp.isfinite(l) & jnp.isfinite(u)
-    has_row = (entries[row, np.arange(n, dtype=np.int32)] > 0) & bounded[row]
+    rows, column = np.arange(m, dtype=np.int32)[:, None], np.arange(n, dtype=np.int32)
+    largest = entries == jnp.max(entries, axis=0)
+    row = jnp.min(jnp.where(largest, rows, np.int32(m - 1)), axis=0)
+    return row, jnp.where(entries[row, column] > 0, qp.A[row, column], 0.0)
+
+
+def farkas(qp: QP, y: Array, correcting: tuple[Array, Array]) -> tuple[Array, Array]:
+    """The candidate y made into a certificate: returns (y, proved).
+
+    y is scaled to length one, freed of pushes against infinite bounds, and corrected on rows
+    that bound one variable (`correcting_rows`). `proved` is True when Σ u y⁺ − l y⁻ is below zero
+    by more than the rounding of the sum and of A'y (over the box of the bounded variables); a
+    variable without such a row must have (A'y)_j at rounding level. A zero y proves nothing.
+    """
+    eps = jnp.finfo(y.dtype).eps
+    m, n = qp.A.shape
+    bounds, (row, pivot) = qp.bounds.hard(), correcting
+    y = bounds.admissible(to_length_one(y))
+    bound = jnp.maximum(jnp.abs(bounds.l), jnp.abs(bounds.u))[row]
+    has_row = (pivot != 0) & jnp.isfinite(bound)
+    pivot = jnp.where(has_row, pivot, 1.0)
     y = y.at[row].add(jnp.where(has_row, -matmul(y, qp.A) / pivot, 0.0))
 
     left = jnp.abs(matmul(y, qp.A))
-    terms = matmul(jnp.abs(y), jnp.abs(qp.A))
     gamma = 2 * (m + n + 2) * eps
-    absorbed = has_row | (left <= gamma * terms)
-    bound = jnp.where(bounded, jnp.maximum(jnp.abs(l), jnp.abs(u)), 0.0)
-    reach = jnp.where(has_row, bound[row] / jnp.abs(pivot), 0.0)
-    absolute = replace(bounds, l=-jnp.abs(l), u=jnp.abs(u))
-    size = absolute.support(y)
-    # What the correction leaves of A'y meets at most |z| ≤ reach.
-    leak = jnp.sum((2 * left + gamma * terms) * reach)
-    safe = bounds.support(y) + gamma * size + leak
-    proved = jnp.all(absorbed) & (safe < 0) & jnp.any(y != 0)
+    noise = gamma * matmul(jnp.abs(y), jnp.abs(qp.A))
+    support = bounds.support(y)
+    # What the correction leaves of A'y meets at most |z| ≤ bound / |pivot|.
+    reach = jnp.where(has_row, bound / jnp.abs(pivot), jnp.where(left <= noise, 0.0, jnp.inf))
+    leak = jnp.where(reach > 0, (2 * left + noise) * reach, 0.0)
+    proved = jnp.sum(jnp.concatenate([support + gamma * jnp.abs(support), leak])) < 0
     return jnp.where(proved, y, 0.0), proved
 
 
-def recession(q: Array, H: Array, A: Array, bounds: Bounds) -> tuple[Array, Bounds]:
-    """Rows that a ray of descent d satisfies: Hd = 0, q'd = −|q|, A d in the cone of directions
-    that no bound stops. Soft rows count as hard."""
+def to_length_one(v: Array) -> Array:
+    """Return v divided by its infinity norm; 0 stays 0."""
+    length = jnp.max(jnp.abs(v), initial=0.0)
+    return v / jnp.where(length > 0, length, 1.0)
+
+
+def recession(P: Array, q: Array, bounds: Bounds) -> tuple[Array, Array, Bounds]:
+    """Return H (n, n), g (n,) and bounds on A d for which ½ d'Hd + g'd + ½ dist²(A d, bounds) has
+    its least value −½ at rays of descent d: it is ½|Pd|² + ½(q'd/|q| + 1)² − ½ and the distance to
+    the cone of directions that no bound stops. Soft rows count as hard.
+    """
+    along = q / jnp.maximum(jnp.linalg.norm(q), jnp.finfo(q.dtype).tiny)
     l = jnp.where(jnp.isneginf(bounds.l), -jnp.inf, 0.0)
     u = jnp.where(jnp.isposinf(bounds.u), jnp.inf, 0.0)
-    length = jnp.linalg.norm(q)
-    along = q / jnp.where(length > 0, length, 1.0)
-    down = -jnp.ones(1, q.dtype)
-    still = jnp.zeros_like(q)
-    cone = Bounds(jnp.concatenate([still, down, l]), jnp.concatenate([still, down, u]))
-    return jnp.concatenate([H, along[None], A]), cone
+    radius = None if bounds.radius is None else jnp.zeros_like(bounds.radius)
+    cone = replace(bounds, l=l, u=u, linear=None, quadratic=None, radius=radius)
+    return matmul(P, P) + along[:, None] * along, along, cone
 
 
 def descent_ray(qp: QP, d: Array) -> tuple[Array, Array]:
@@ -90,12 +133,11 @@ def descent_ray(qp: QP, d: Array) -> tuple[Array, Array]:
     none. d is scaled to length one. A zero direction proves nothing.
     """
     tolerance = RAY * rounding(d.dtype)
-    length = jnp.max(jnp.abs(d), initial=0.0)
-    d = jnp.where(length > 0, d / jnp.where(length > 0, length, 1.0), 0.0)
+    d = to_length_one(d)
     size = jnp.abs(d)
     Ad, noise = matmul(d, qp.A.T), tolerance * matmul(size, jnp.abs(qp.A).T)
-    flat = jnp.all(jnp.abs(matmul(d, qp.P)) <= tolerance * matmul(size, jnp.abs(qp.P)))
-    stays = jnp.all(jnp.isposinf(qp.u) | (Ad <= noise))
-    stays = stays & jnp.all(jnp.isneginf(qp.l) | (Ad >= -noise))
-    proved = flat & stays & (jnp.sum(qp.q * d) < -tolerance * jnp.sum(jnp.abs(qp.q) * size))
+    flat = jnp.abs(matmul(d, qp.P)) <= tolerance * matmul(size, jnp.abs(qp.P))
+    stays = (jnp.isposinf(qp.u) | (Ad <= noise)) & (jnp.isneginf(qp.l) | (Ad >= -noise))
+    falls = jnp.sum(qp.q * d + tolerance * jnp.abs(qp.q) * size) < 0
+    proved = jnp.all(jnp.concatenate([flat, stays])) & falls
     return jnp.where(proved, d, 0.0), proved

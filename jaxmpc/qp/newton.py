@@ -48,17 +48,13 @@ class Constants(NamedTuple):
         )  # fmt: skip
 
 
-def gram(A: Array) -> Callable[[Array, list[Array]], Array]:
-    """Return the function (weights (m,), normals) → A'(diag(weights) + Σ h h')A."""
-
-    def product(weights: Array, normals: list[Array]) -> Array:
-        K = matmul(A.T * weights, A)
-        for h in normals:
-            a = matmul(h, A)
-            K = K + a[:, None] * a[None, :]
-        return K
-
-    return product
+def gram(A: Array, weights: Array, normals: list[Array]) -> Array:
+    """Return A'(diag(weights) + Σ h h')A for weights (m,) and normals h (m,)."""
+    K = matmul(A.T * weights, A)
+    for h in normals:
+        a = matmul(h, A)
+        K = K + a[:, None] * a[None, :]
+    return K
 
 
 def ridged(K: Array, scale: Any = 0.0) -> Array:
@@ -78,9 +74,8 @@ class Newton(NamedTuple):
 
 
 def newton_step(
-    w: Array, y: Array, H: Array, q: Array, A: Array, bounds: Bounds, rho: Array, sigma: Array,
-    products: Callable[[Array, list[Array]], Array],
-) -> Newton:  # fmt: skip
+    w: Array, y: Array, H: Array, q: Array, bounds: Bounds, rho: Array, sigma: Array, A: Array
+) -> Newton:
     """One step on φ + ½σ d'(I − H)d with exact line search.
 
     The proximal term acts where the cost has no curvature (H = I elsewhere in ADMM's
@@ -92,11 +87,11 @@ def newton_step(
     gradient = matmul(w, H) + q + rho * matmul(e, A)
     weights, normals = bounds.curvature(v, rho)
     smooth = H + sigma * (jnp.eye(w.shape[0], dtype=w.dtype) - H)
-    d = -solve(ridged(smooth + rho * products(weights, normals), rho), gradient)
+    d = -solve(ridged(smooth + rho * gram(A, weights, normals), rho), gradient)
 
     # φ along w + t d costs no product with A: two scalars and A d.
     Ad, Hd = matmul(d, A.T), matmul(d, smooth)
-    slope, bend = jnp.sum(d * (matmul(w, H) + q)), jnp.sum(d * Hd)
+    slope, bend = jnp.sum(d * jnp.stack([matmul(w, H) + q, Hd]), axis=1)
     minimised = jnp.all(bounds.piece(v + Ad, rho) == bounds.piece(v, rho))
 
     def search(carry: tuple[Array, Array, Array], _: None) -> tuple[Any, None]:
@@ -133,13 +128,13 @@ def least_distance(
     e = 0: w satisfies the rows. A'e = 0 with e ≠ 0: no w does, and e is the Farkas vector.
     damping: weight of a proximal term; a little keeps w still where rows only touch.
     """
-    products, bounds = gram(A), bounds.hard()
+    bounds = bounds.hard()
     H, q = jnp.zeros((w.shape[0], w.shape[0]), w.dtype), jnp.zeros_like(w)
     y, one = jnp.zeros_like(bounds.l), jnp.ones((), w.dtype)
     sigma = damping * one
 
     def body(carry: tuple[Array, Array], _: None) -> tuple[Any, None]:
-        step = newton_step(carry[0], y, H, q, A, bounds, one, sigma, products)
+        step = newton_step(carry[0], y, H, q, bounds, one, sigma, A)
         return (step.w, step.excess), None
 
     (w, e), _ = jax.lax.scan(body, (w, y), length=steps)
@@ -168,6 +163,11 @@ def largest(v: Array) -> Array:
     return jnp.max(jnp.abs(v), initial=0.0)
 
 
+def norms(*vectors: Array) -> Array:
+    """Return the infinity norms of vectors of one length, in one reduction."""
+    return jnp.max(jnp.abs(jnp.stack(vectors)), axis=1, initial=0.0)
+
+
 def multipliers_start(q: Array, w: Array, y: Array) -> Multipliers:
     """Return the state of the method of multipliers at (w, y)."""
     scalar = lambda v: jnp.asarray(v, w.dtype)
@@ -182,7 +182,7 @@ def multipliers_step(
 ) -> Multipliers:
     """One Newton step of the proximal method of multipliers."""
     s = state
-    step = newton_step(s.w, s.y, H, q, A, bounds, s.rho, s.sigma, gram(A))
+    step = newton_step(s.w, s.y, H, q, bounds, s.rho, s.sigma, A)
     return multipliers_update(q, s, step, Constants.of(s.w.dtype).far)
 
 
@@ -195,13 +195,13 @@ def multipliers_update(q: Array, state: Multipliers, step: Newton, far: float) -
     pieces never come to rest.
     """
     constants, s = Constants.of(state.w.dtype), state
-    terms = largest(q) + largest(step.w) + s.rho * largest(step.excess)
-    noise = 10 * jnp.finfo(s.w.dtype).eps * terms
-    done = step.minimised | (largest(step.gradient) <= jnp.maximum(s.tolerance, noise))
+    gradient, linear, w = norms(step.gradient, q, step.w)
+    noise = 10 * jnp.finfo(s.w.dtype).eps * (linear + w + s.rho * largest(step.excess))
+    done = step.minimised | (gradient <= jnp.maximum(s.tolerance, noise))
     new = jnp.where(done, s.rho * step.excess, s.y)
     violation = largest(new - s.y) / s.rho
     grow = done & (violation > 0.1 * s.before)
-    off = largest(step.w) > far
+    off = w > far
     return Multipliers(
         jnp.where(off, s.w, step.w), new, jnp.where(done, new - s.y, s.change), step.w - s.w,
         jnp.where(grow, jnp.minimum(10 * s.rho, constants.rho[1]), s.rho),
@@ -226,7 +226,7 @@ def linearised(
     active rows contradict each other, dw tends to their least-squares solution and dy stays
     bounded by 8ρ times the contradiction.
     """
-    inverse = definite_solver(ridged(H + rho * gram(A)(weights, normals), rho))
+    inverse = definite_solver(ridged(H + rho * gram(A, weights, normals), rho))
     D = lambda v: weights * v + sum(h * jnp.sum(h * v) for h in normals)
 
     def solved(a: Array, c: Array) -> tuple[Array, Array]:

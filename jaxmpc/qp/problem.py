@@ -9,7 +9,6 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import concrete, fail, require_finite, require_shape, require_symmetric_psd
-from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
 
 
@@ -156,38 +155,3 @@ class QPSolution:
     iterations: Array
     certificate: Array
     ray: Array
-
-
-def residuals(qp: QP, z: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Primal residual, dual residual and duality gap of (z, y), infinity norms, own units.
-
-    primal = max |Az − its projection| over hard constraints, dual = max |Pz + q + A'y|,
-    gap = |z'Pz + q'z + g(Az) + g*(y)| with the penalties g of soft rows and the conjugate
-    g*(y) = Σ u y⁺ − l y⁻ + … (`Bounds.support`). A multiplier that is not admissible (a push
-    against an absent bound) must be made so before.
-    """
-    primal, dual, gap = (value for value, _ in residual_terms(qp, z, y))
-    norm = lambda v: jnp.max(jnp.abs(v), initial=0.0)
-    return norm(primal), norm(dual), jnp.abs(gap)
-
-
-def residual_terms(qp: QP, z: Array, y: Array) -> list[tuple[Array, Array]]:
-    """Residual vectors of rows (m,), variables (n,) and the gap, each with the size, entry by
-    entry, of the terms that it is a difference of: rounding is a share of that.
-    """
-    Az, Pz, Aty = matmul(z, qp.A.T), matmul(z, qp.P), matmul(y, qp.A)
-    bounds = qp.bounds
-    quadratic, linear = jnp.sum(z * Pz), jnp.sum(z * qp.q)
-    penalty, support = bounds.cost(Az), bounds.support(y)
-    size_z, size_y = jnp.abs(z), jnp.abs(y)
-    return [
-        (bounds.violation(Az), matmul(size_z, jnp.abs(qp.A).T)),
-        (
-            Pz + qp.q + Aty,
-            matmul(size_z, jnp.abs(qp.P)) + jnp.abs(qp.q) + matmul(size_y, jnp.abs(qp.A)),
-        ),
-        (
-            quadratic + linear + penalty + support,
-            jnp.abs(quadratic) + jnp.sum(size_z * jnp.abs(qp.q)) + penalty + jnp.abs(support),
-        ),
-    ]

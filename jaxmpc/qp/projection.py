@@ -58,12 +58,12 @@ class Bounds:
         return jnp.clip(v, self.l, self.u) if plain else v - self.excess(v, rho)
 
     def cost(self, p: Array) -> Array:
-        """The penalty that soft rows pay at p; hard rows and balls cost nothing here."""
+        """The penalty that each soft row pays at p; hard rows and balls cost nothing here."""
         if self.linear is None:
-            return jnp.zeros((), p.dtype)
+            return jnp.zeros_like(p)
         soft = jnp.isfinite(self.linear)
         d = jnp.where(soft, jnp.abs(p - jnp.clip(p, self.l, self.u)), 0.0)
-        return jnp.sum(d * (jnp.where(soft, self.linear, 0.0) + 0.5 * self.quadratic * d))
+        return d * (jnp.where(soft, self.linear, 0.0) + 0.5 * self.quadratic * d)
 
     def push(self, v: Array) -> Array:
         """The multiplier of soft rows that v leaves outside, as their penalty's slope; else 0."""
@@ -113,21 +113,22 @@ class Bounds:
         return piece
 
     def support(self, y: Array) -> Array:
-        """The conjugate g*(y) = max over v of y'v − g(v); inf where y is not admissible.
+        """The conjugate g*(y) = max over v of y'v − g(v), as terms (m,) of a sum; inf where y is
+        not admissible.
 
-        Σ u y⁺ − l y⁻, with 0·inf = 0, plus (|y| − c)²/2k for soft rows with |y| > c, plus
-        radius·|y_b| for balls.
+        u y⁺ − l y⁻, with 0·inf = 0, plus (|y| − c)²/2k for a soft row with |y| > c; in the first
+        row of a ball also radius·|y_b|.
         """
-        value = jnp.sum(jnp.where(y > 0, y * jnp.where(y > 0, self.u, 0.0), 0.0))
-        value = value + jnp.sum(jnp.where(y < 0, y * jnp.where(y < 0, self.l, 0.0), 0.0))
+        value = y * jnp.where(y > 0, self.u, jnp.where(y < 0, self.l, 0.0))
         if self.linear is not None:
             over = jnp.maximum(jnp.abs(y) - self.linear, 0.0)
             k = jnp.where(self.quadratic > 0, self.quadratic, 1.0)
             infinite = (over > 0) & (self.quadratic == 0)
-            value = value + jnp.sum(jnp.where(infinite, jnp.inf, over**2 / (2 * k)))
+            value = value + jnp.where(infinite, jnp.inf, over**2 / (2 * k))
         for rows, radius in self.blocks():
             length = self._length(y[rows])
-            value = value + jnp.where(length > 0, length * jnp.where(length > 0, radius, 0.0), 0.0)
+            reach = jnp.where(length > 0, length * jnp.where(length > 0, radius, 0.0), 0.0)
+            value = value.at[rows.start].add(reach)
         return value
 
     def admissible(self, y: Array) -> Array:
@@ -147,6 +148,31 @@ class Bounds:
         soft = jnp.isfinite(self.linear)
         l, u = jnp.where(soft, -jnp.inf, self.l), jnp.where(soft, jnp.inf, self.u)
         return replace(self, l=l, u=u, linear=None, quadratic=None)
+
+    def scaled(self, E: Array) -> "Bounds":
+        """What is asked of E·v, E (m,) ≥ 0, when this is asked of v: distances grow by E, so
+        penalties on them shrink. A row with E = 0 is free."""
+        zero = E == 0
+
+        def bound(v: Array, free: float) -> Array:
+            # E·inf would give NaN gradients with respect to what E depends on.
+            keep = jnp.isfinite(v) & ~zero
+            return jnp.where(zero, free, jnp.where(keep, E * jnp.where(keep, v, 0.0), v))
+
+        new = replace(self, l=bound(self.l, -jnp.inf), u=bound(self.u, jnp.inf))
+        E = jnp.where(zero, 1.0, E)
+        if self.linear is not None:
+            soft = jnp.isfinite(self.linear)
+            linear = jnp.where(soft, jnp.where(soft, self.linear, 0.0) / E, jnp.inf)
+            new = replace(new, linear=linear, quadratic=self.quadratic / E**2)
+        for i, (rows, radius) in enumerate(self.blocks()):
+            centre = jnp.where(zero[rows], 0.0, E[rows] * self.l[rows])
+            radius = jnp.where(zero[rows][0], jnp.inf, E[rows][0] * radius)
+            new = replace(
+                new, l=new.l.at[rows].set(centre), u=new.u.at[rows].set(centre),
+                radius=new.radius.at[i].set(radius),
+            )  # fmt: skip
+        return new
 
     def _yield(self, s: Array, rho: Any) -> Array:
         """d ≥ 0: how far prox(v) stays outside a soft row, s = signed distance of v."""

@@ -17,8 +17,8 @@ from jaxmpc.closed_loop.memory import device_bytes, program_bytes
 from jaxmpc.closed_loop.simulate_many import simulate_batch
 from jaxmpc.compiled import Compiled
 from jaxmpc.control.violation import TOLERANCE
+from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.solve import Controller
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.precision import arrays
 from jaxmpc.qp.status import Status

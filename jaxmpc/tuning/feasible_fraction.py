@@ -24,7 +24,7 @@ from jaxmpc.checks import concrete, fail, require_shape
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp import linalg
-from jaxmpc.qp.newton import Constants, gram, newton_step, ridged
+from jaxmpc.qp.newton import Constants, newton_step, ridged
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.projection import Bounds
 
@@ -122,14 +122,14 @@ def nearest(A: Array, bounds: Bounds, w: Array, steps: int) -> tuple[Array, Arra
     It ends when the gradient A'e is small beside e, or as small as rounding leaves it for bounds
     of size one. In a batch all wait for the slowest.
     """
-    products, damping = gram(A), jnp.asarray(Constants.of(w.dtype).damping, w.dtype)
+    damping = jnp.asarray(Constants.of(w.dtype).damping, w.dtype)
     H, q = jnp.zeros((w.shape[0], w.shape[0]), w.dtype), jnp.zeros_like(w)
     y, one = jnp.zeros_like(bounds.l), jnp.ones((), w.dtype)
     size = lambda v: jnp.max(jnp.abs(v), initial=0.0)
 
     def body(carry: tuple[Array, ...]) -> tuple[Array, ...]:
         k, w, _, _ = carry
-        step = newton_step(w, y, H, q, A, bounds, one, damping, products)
+        step = newton_step(w, y, H, q, bounds, one, damping, A)
         enough = jnp.finfo(w.dtype).eps * (1e4 * size(step.excess) + 30)
         return k + 1, step.w, step.excess, size(step.gradient) <= enough
 

@@ -12,7 +12,8 @@ import optax
 
 from jaxmpc.checks import fail, require_finite, whole
 from jaxmpc.mpc.condense import condense, in_float64
-from jaxmpc.mpc.problem import MPC, Plan
+from jaxmpc.mpc.plan import Plan, WarmStart
+from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM, factor
 from jaxmpc.qp.status import Status
 from jaxmpc.runs import fingerprint
@@ -209,9 +210,11 @@ def _prepared(
     if len(x) < FEWEST:
         fail("x0s", f"{len(x)} states", f"Give at least {FEWEST}, better some hundred")
     if warm_start is not None:
-        warm_start = warm_start.qp if isinstance(warm_start, Plan) else warm_start
-        z, y = (warm_start.z, warm_start.y) if hasattr(warm_start, "z") else warm_start
-        warm_start = np.asarray(z, np.float64), np.asarray(y, np.float64)
+        if isinstance(warm_start, Plan | WarmStart):
+            of = lambda p: WarmStart.of(p, c.layout, mpc.horizon, n, mpc.system.m)
+            each = jax.vmap(of)(warm_start)
+            warm_start = jax.vmap(c.variables)(each.states, each.inputs), each.multipliers
+        warm_start = tuple(np.asarray(part, np.float64) for part in warm_start)
         for part, size in zip(warm_start, (nz, rows), strict=True):
             if part.shape != (len(x), size):
                 fail("warm_start", f"shape {part.shape}", f"Needed: {(len(x), size)}")

@@ -22,9 +22,10 @@ from jax import Array
 
 from jaxmpc.compiled import padded
 from jaxmpc.mpc.condense import Condensed
-from jaxmpc.qp.admm import ADMM, factor, iterate, read, scaled
-from jaxmpc.qp.problem import QP, residual_terms
-from jaxmpc.qp.solve import marked, solve_factored, start, unscaled
+from jaxmpc.qp.admm import ADMM, factor, iterate, read, scaled, splittings
+from jaxmpc.qp.problem import QP
+from jaxmpc.qp.residuals import marked, residual_terms
+from jaxmpc.qp.solve import solve_factored, unscaled, warm
 from jaxmpc.qp.status import Status
 
 # Digits by which the loss wants residuals below their tolerance.
@@ -77,15 +78,14 @@ class PenaltyObjective:
             q, bounds = scaled(made, qp)
             t = jnp.zeros_like(qp.l)
             if sample.start is not None:
-                t = start(made, qp, bounds, sample.start)
-            t, _ = iterate(made, q, bounds, t, solver.iterations, solver.alpha)
+                t = warm(made, qp, bounds, sample.start)
+            t, _ = iterate(splittings(made, q), bounds, t, solver.iterations, solver.alpha)
             z, y = unscaled(qp, made, *read(made, t, q, bounds))
             floor = 100 * jnp.finfo(z.dtype).eps
             # A quarter of the rounding stays, for the sake of the logarithm's slope at 0.
-            square: Any = (floor / 4) ** 2
-            for value, size in residual_terms(qp, z, y):
-                square += jnp.sum((value / (eps + floor * size)) ** 2)
-            return 0.5 * jnp.log10(square)
+            values, sizes = residual_terms(qp, z, y)
+            squares = jnp.sum((values / (eps + floor * sizes)) ** 2)
+            return 0.5 * jnp.log10((floor / 4) ** 2 + squares)
 
         return jax.vmap(one)(samples)
 

@@ -10,9 +10,9 @@ from jaxmpc.control.riccati import LQR, lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.explicit.exact_penalty import ExactPenalty, exact_penalty
+from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.soften import soften
-from jaxmpc.mpc.solve import Controller
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.workflow.offline_test import OfflineReport, offline_report
 

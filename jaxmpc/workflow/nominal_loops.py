@@ -9,8 +9,8 @@ import numpy as np
 from jaxmpc.closed_loop.run import lyapunov_decrease
 from jaxmpc.closed_loop.simulate import simulate
 from jaxmpc.mpc.condense import in_float64
+from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.solve import Controller
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 

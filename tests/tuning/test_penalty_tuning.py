@@ -366,15 +366,14 @@ def test_warm_starts_have_penalties_of_their_own():
     with jax.enable_x64(True):
         controller = jm.Controller(jax.tree.map(np.float64, problem), jm.ADMM(refine=30))
         near = jax.tree.map(np.asarray, plans(controller, 0.98 * x))
-    start = near.qp.z, near.qp.y
-    found = tune_penalties(problem, x, 20, stages=2, updates=150, warm_start=start)
+    found = tune_penalties(problem, x, 20, stages=2, updates=150, warm_start=near)
     cold = tune_penalties(problem, x, 20, stages=2, updates=150)
     assert found.improved and found.after["solved"] > found.before["solved"] + 0.1
     with jax.enable_x64(True):
-        one = lambda c, x, z, y: c.plan(x, warm_start=(z, y)).status
-        run = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)))
+        one = lambda c, x, start: c.plan(x, warm_start=start).status
+        run = jax.jit(jax.vmap(one, in_axes=(None, 0, 0)))
         share = [
-            np.mean(run(jm.Controller(controller.mpc, s), x, *start) == jm.Status.SOLVED)
+            np.mean(run(jm.Controller(controller.mpc, s), x, near) == jm.Status.SOLVED)
             for s in (found.solver, cold.solver)
         ]
     assert share[0] > share[1]

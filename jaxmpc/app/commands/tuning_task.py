@@ -24,9 +24,9 @@ from jaxmpc.control import violation
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.mpc.condense import prestabilising_gain
+from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.soften import soften
-from jaxmpc.mpc.solve import Controller
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.linear import LinearPlant

@@ -1,0 +1,212 @@
+"""Controller: an MPC law whose matrices are condensed and factored once."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import concrete, fail
+from jaxmpc.control.sets import Box, Polytope
+from jaxmpc.mpc.condense import Condensed, condense
+from jaxmpc.mpc.plan import (
+    Multipliers,
+    Plan,
+    WarmStart,
+    answer,
+    cost,
+    limited,
+    slack,
+    sorted_multipliers,
+)
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.admm import ADMM, DEFAULT, Factor
+from jaxmpc.qp.admm import factor as factorise
+from jaxmpc.qp.precision import arrays, matmul
+from jaxmpc.qp.solve import solve_factored
+from jaxmpc.qp.status import Status
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Controller:
+    """An MPC law whose matrices are condensed and factored once, at construction.
+
+    `controller(x, carry) -> (u, carry, plan)`: u (m,) is the first input of the plan, clipped
+    into its limits if these are a Box; carry is None at the start and the previous plan
+    afterwards, whose `shifted` form is the warm start and whose first input is the previous one
+    (zero at the start). When the plan is not SOLVED, u is still the first input of the best
+    iterate: look at plan.status. `condensed` and `factor` are filled in at construction: for
+    another problem or solver make another Controller, `dataclasses.replace` would keep the old
+    ones.
+    """
+
+    mpc: MPC
+    solver: ADMM = DEFAULT
+    condensed: Condensed | None = None
+    factor: Factor | None = None
+
+    def __post_init__(self) -> None:
+        # JAX rebuilds this object with its parts present, or with placeholders: leave those be.
+        if self.condensed is None and isinstance(self.mpc, MPC):
+            self.mpc.validate()
+            mpc, finite = harmless(self.mpc)
+            condensed = condense(mpc)
+            # The factorization reads from P what is wrong with the data.
+            condensed = replace(condensed, P=jnp.where(finite, condensed.P, jnp.nan))
+            self.solver.validate(condensed.C.shape[0])
+            # Arrays from here on, so that a sample need not convert the whole object again.
+            mpc = replace(mpc, prestabilise=condensed.K)
+            object.__setattr__(self, "mpc", arrays(mpc))
+            object.__setattr__(self, "solver", arrays(self.solver))
+            object.__setattr__(self, "condensed", condensed)
+            object.__setattr__(self, "factor", _factor(condensed, self.solver))
+
+    @property
+    def dtype(self) -> Any:
+        """In what the controller computes."""
+        assert self.condensed is not None
+        return self.condensed.P.dtype
+
+    @property
+    def state_size(self) -> int:
+        """Numbers in the state that the controller is given."""
+        return self.mpc.system.n
+
+    @property
+    def limits(self) -> Box | Polytope | None:
+        """Limits of the state that a closed loop is judged by."""
+        return self.mpc.states
+
+    def coordinates(self, x: Array) -> Array:
+        """The state in which `mpc` is written: x itself."""
+        return x
+
+    def start(self, x: Array, input_reference: Any = None) -> Plan:
+        """What to carry into the first sample: a plan of zeros, a cold start.
+
+        (So that a scan compiles one solve, not two: without a warm start and with.)"""
+        shapes = jax.eval_shape(lambda x: self(x)[1], x)
+        return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+
+    def __call__(
+        self, x: Any, carry: Plan | None = None, reference: Any = None, *,
+        input_reference: Any = None, previous_input: Any = None,
+    ) -> tuple[Array, Plan, Plan]:  # fmt: skip
+        """First input from state x (n,), what to carry to the next sample, and the whole plan.
+
+        References and previous_input as in `solve`; previous_input None: what the carry says.
+        """
+        start = None if carry is None else self.shifted(carry)
+        if carry is not None and previous_input is None and self.mpc.remembers:
+            previous_input = limited(self.mpc.inputs, carry.inputs[0])
+        plan = self.plan(x, reference, start, input_reference, previous_input)
+        return limited(self.mpc.inputs, plan.inputs[0]), plan, plan
+
+    def shifted(self, plan: Plan) -> WarmStart:
+        """The plan seen one sample later, as a warm start (`WarmStart.shifted`).
+
+        The new last input is the unconstrained optimum of that step for the terminal cost, inside
+        its limits. With a control horizon each move becomes what the plan did one step after its
+        beginning.
+        """
+        c = self.condensed
+        assert c is not None
+        tail = limited(self.mpc.inputs, matmul(c.K_N, plan.states[-1]))
+        return WarmStart.shifted(c.layout, plan, tail, bool(c.balls))
+
+    def plan(
+        self, x0: Any, reference: Any = None, warm_start: Any = None, input_reference: Any = None,
+        previous_input: Any = None,
+    ) -> Plan:  # fmt: skip
+        """Plan from x0 (n,); arguments as in `solve`."""
+        c = self.condensed
+        assert c is not None
+        (steps, n, p), m, dtype = c.Phi.shape, c.R.shape[0], c.P.dtype
+        if np.shape(x0) != (n,):
+            fail("x0", f"shape {np.shape(x0)}", f"Give one state ({n},); use jax.vmap for many")
+        theta = jnp.asarray(x0, dtype)
+        if previous_input is not None and np.shape(previous_input) != (m,):
+            fail("previous_input", f"shape {np.shape(previous_input)}", f"Give one input ({m},)")
+        if p > n:
+            previous = jnp.zeros(m, dtype) if previous_input is None else previous_input
+            theta = jnp.concatenate([theta, jnp.asarray(previous, dtype)])
+        tracked = []
+        for name, value, shape in (
+            ("reference", reference, (steps, n)),
+            ("input_reference", input_reference, (steps - 1, m)),
+        ):
+            if value is not None:
+                if np.shape(value) not in (shape[1:], shape):
+                    fail(name, f"shape {np.shape(value)}", f"Give {shape[1:]} or {shape}")
+                value = jnp.broadcast_to(jnp.asarray(value, dtype), shape)
+            tracked.append(value)
+        start = warm_start
+        if start is not None:
+            start = WarmStart.of(start, c.layout, steps - 1, n, m)
+        return _plan(self, *arrays((theta, *tracked, start)))
+
+    def cost(
+        self, states: Array, inputs: Array, reference: Any = None, input_reference: Any = None,
+        previous_input: Any = None,
+    ) -> Array:  # fmt: skip
+        """J (without ½) of a trajectory, states (N+1, n) and inputs (N, m), with what input rates
+        and soft rows pay. previous_input (m,): None for zero."""
+        return cost(self.mpc, states, inputs, reference, input_reference, previous_input)
+
+    def slack(self, states: Array, inputs: Array) -> Array:
+        """Violation of the soft rows along a trajectory: (N+1, p), zero where none holds."""
+        return slack(self.mpc, states, inputs)
+
+    def multipliers(self, y: Array) -> Multipliers:
+        """Sort the QP's multipliers y (rows,) by constraint and step."""
+        c = self.condensed
+        assert c is not None
+        return sorted_multipliers(self.mpc, c.layout, y)
+
+
+def harmless(mpc: MPC) -> tuple[MPC, Any]:
+    """Return the problem with harmless dynamics and weights where they are not finite, and whether
+    they are: numbers that are being traced cannot be refused."""
+    fields = ("system", "Q", "R", "terminal_cost", "stage_weights", "input_rate_weight")
+    data = {name: getattr(mpc, name) for name in fields}
+    if concrete(data):
+        return mpc, True
+    leaves = jax.tree.leaves(data)
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(jnp.asarray(v))) for v in leaves]))
+    clean = jax.tree.map(lambda v: jnp.where(finite, jnp.asarray(v), 0), data)
+    clean["R"] = jnp.where(finite, jnp.asarray(mpc.R), np.eye(mpc.system.m))
+    return replace(mpc, **clean), finite
+
+
+@jax.jit
+def _factor(condensed: Condensed, solver: ADMM) -> Factor:
+    return factorise(condensed.P, condensed.C, solver, condensed.balls)
+
+
+@jax.jit
+def _plan(
+    controller: Controller,
+    theta: Array,
+    reference: Any,
+    input_reference: Any,
+    start: WarmStart | None,
+) -> Plan:
+    c = controller.condensed
+    assert c is not None and controller.factor is not None
+    given = (theta, reference, input_reference)
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(given)]))
+    # Harmless numbers until all is computed: the derivative of a product with NaN is NaN.
+    theta, reference, input_reference = jax.tree.map(lambda v: jnp.where(finite, v, 0.0), given)
+    qp = c.qp(theta, reference, input_reference)
+    pair = None if start is None else (c.variables(start.states, start.inputs), start.multipliers)
+    found, fault = solve_factored(qp, controller.factor, controller.solver, pair)
+    fault = jnp.where(finite, fault, Status.NON_FINITE)
+    states, inputs = c.trajectory(theta, found.z)
+    previous = theta[c.Q.shape[0] :] if controller.mpc.remembers else None
+    return answer(
+        controller.mpc, c.layout, found, fault, states, inputs, reference, input_reference,
+        previous,
+    )  # fmt: skip

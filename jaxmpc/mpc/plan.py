@@ -1,0 +1,231 @@
+"""Plan, the answer of every solver; WarmStart; what a trajectory costs and violates."""
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import fail
+from jaxmpc.control.sets import Box
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.rows import Layout, blocks
+from jaxmpc.qp.precision import arrays, matmul
+from jaxmpc.qp.problem import QPSolution
+from jaxmpc.qp.residuals import marked
+from jaxmpc.qp.status import Status
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Multipliers:
+    """Lagrange multipliers of a plan, for the cost without ½; y > 0 pushes against the upper
+    bound of the row, y < 0 against the lower.
+
+    states (K, r): rows of `states` at the steps where they hold, inputs (N, m or rows), terminal
+    (r_f,) (for an Ellipsoid {x'Px ≤ level}: of the rows L'x with P = LL', n of them). outputs and
+    soft: one array (steps, rows) for each of the problem's; rates (N, m).
+    dJ*/d(upper bound) = −y where y > 0, dJ*/d(lower bound) = −y where y < 0.
+    `active_constraints` lists them by name, step and unit.
+    """
+
+    states: Array
+    inputs: Array
+    terminal: Array
+    outputs: tuple[Array, ...] = ()
+    rates: Any = None
+    soft: tuple[Array, ...] = ()
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Plan:
+    """Answer of `solve`: states (N+1, n), inputs (N, m), cost J (without ½), multipliers, status.
+
+    cost includes what soft rows and input rates pay. slack (N+1, p): violation of the p soft rows,
+    in the order of `mpc.soft`, zero at steps where a row does not hold.
+    Unless the status is SOLVED, cost and trajectory are those of the best iterate and mean little.
+    The status is that of the QP (`jaxmpc.Status`); residuals are those of the condensed QP in
+    the units of states and inputs. iterations: ADMM steps. A plan serves as warm start.
+    """
+
+    states: Array
+    inputs: Array
+    cost: Array
+    slack: Array
+    multipliers: Multipliers
+    status: Array
+    primal_residual: Array
+    dual_residual: Array
+    gap: Array
+    iterations: Array
+
+
+class WarmStart(NamedTuple):
+    """Where a solver begins: states (N+1, n), inputs (N, m), multipliers (rows,) in the order of
+    `row_table`."""
+
+    states: Array
+    inputs: Array
+    multipliers: Array
+
+    @classmethod
+    def of(cls, start: Any, layout: Layout, horizon: int, n: int, m: int) -> "WarmStart":
+        """Return a Plan or WarmStart as the latter; ValueError where it is of another problem."""
+        if isinstance(start, Plan):
+            start = cls(start.states, start.inputs, flat_multipliers(layout, start.multipliers))
+        if not isinstance(start, WarmStart):
+            kind = type(start).__name__
+            fail("warm_start", f"is a {kind}", "Give a Plan or a jm.mpc.WarmStart")
+        rows = sum(len(steps) * size for _, steps, size in layout)
+        shapes = ((horizon + 1, n), (horizon, m), (rows,))
+        for name, value, shape in zip(cls._fields, start, shapes, strict=True):
+            if np.shape(value) != shape:
+                fail(f"warm_start.{name}", f"shape {np.shape(value)}", f"Needed: {shape}")
+        return start
+
+    @classmethod
+    def shifted(
+        cls, layout: Layout, plan: Plan, tail: Array, round_end: bool = False
+    ) -> "WarmStart":
+        """Return the plan seen one sample later, with `tail` (m,) as its new last input.
+
+        Inputs and multipliers move up by one step. The rows of the last step push with nothing.
+        What bounded x_N through the terminal set bounds it as a state from now on, where both
+        have the same rows; not where it is an ellipsoid (round_end), whose rows are no limits.
+        """
+        y = flat_multipliers(layout, plan.multipliers)
+        return cls(
+            jnp.concatenate([plan.states[1:], plan.states[-1:]]),
+            jnp.concatenate([plan.inputs[1:], tail[None]]),
+            _shifted_multipliers(layout, len(plan.inputs), y, round_end),
+        )
+
+
+def answer(
+    mpc: MPC, layout: Layout, found: QPSolution, fault: Array, states: Array, inputs: Array,
+    reference: Any, input_reference: Any, previous_input: Any = None,
+) -> Plan:  # fmt: skip
+    """Return the plan of a QP's solution: NaN and the status `fault` where the data had one."""
+    J = cost(mpc, states, inputs, reference, input_reference, previous_input)
+    solution = marked(replace(found, cost=J), fault)
+    nan = lambda v: jnp.where(fault == Status.NOT_RUN, v, jnp.nan)
+    return Plan(
+        states=nan(states), inputs=nan(inputs), cost=solution.cost,
+        slack=nan(slack(mpc, states, inputs)),
+        multipliers=sorted_multipliers(mpc, layout, solution.y), status=solution.status,
+        primal_residual=solution.primal_residual, dual_residual=solution.dual_residual,
+        gap=solution.gap, iterations=solution.iterations,
+    )  # fmt: skip
+
+
+def limited(inputs: Any, u: Array) -> Array:
+    """u inside the input limits, if these are a Box: an actuator takes no rounding beyond them."""
+    if not isinstance(inputs, Box):
+        return u
+    lower, upper = arrays((inputs.lower, inputs.upper))
+    return jnp.clip(u, jnp.asarray(lower, u.dtype), jnp.asarray(upper, u.dtype))
+
+
+def cost(
+    mpc: MPC, states: Array, inputs: Array, reference: Any = None, input_reference: Any = None,
+    previous_input: Any = None,
+) -> Array:  # fmt: skip
+    """J (without ½) of a trajectory; see `Controller.cost`."""
+    error = states if reference is None else states - reference
+    effort = inputs if input_reference is None else inputs - input_reference
+    cast = lambda W: jnp.asarray(W, states.dtype)
+    square = lambda v, W, s=1.0: jnp.sum(s * v * matmul(v, cast(W)))
+    stage = 1.0 if mpc.stage_weights is None else cast(mpc.stage_weights)[:, None]
+    J = square(error[:-1], mpc.Q, stage) + square(effort, mpc.R, stage)
+    if mpc.terminal_cost is not None:
+        J = J + square(error[-1:], mpc.terminal_cost)
+    if mpc.input_rate_weight is not None:
+        W = cast(mpc.input_rate_weight)
+        first = jnp.zeros_like(inputs[0]) if previous_input is None else previous_input
+        rates = jnp.diff(inputs, axis=0, prepend=first[None])
+        J = J + square(rates, jnp.diag(W) if W.ndim == 1 else W)
+    for block, e in _violations(mpc, states, inputs):
+        J = J + jnp.sum(e * (block.linear + 0.5 * block.quadratic * e))
+    return J
+
+
+def slack(mpc: MPC, states: Array, inputs: Array) -> Array:
+    """Violation of the soft rows along a trajectory; see `Controller.slack`."""
+    columns = [
+        jnp.zeros((len(states), block.size), e.dtype).at[np.array(block.steps, int)].set(e)
+        for block, e in _violations(mpc, states, inputs)
+    ]
+    return jnp.concatenate([jnp.zeros((len(states), 0), states.dtype), *columns], axis=1)
+
+
+def _violations(mpc: MPC, states: Array, inputs: Array) -> list[tuple[Any, Array]]:
+    """Each soft block with its violations (steps, rows)."""
+    if not mpc.soft:
+        return []
+    found = []
+    for block in blocks(mpc, states.dtype):
+        if block.linear is not None:
+            steps = np.array(block.steps, int)
+            value = matmul(states[steps], block.H.T)
+            if block.D is not None:
+                value = value + matmul(inputs[steps], block.D.T)
+            beyond = jnp.maximum(value - block.upper, block.lower - value)
+            found.append((block, jnp.maximum(beyond, 0.0)))
+    return found
+
+
+def sorted_multipliers(mpc: MPC, layout: Layout, y: Array) -> Multipliers:
+    """The multipliers y (rows,) of all rows sorted by constraint and step."""
+    of: dict[str, list[Array]] = {}
+    for (kind, _, _), part in zip(layout, split(layout, y), strict=True):
+        of.setdefault(kind, []).append(part)
+    empty = lambda *shape: [jnp.zeros(shape, y.dtype)]
+    return Multipliers(
+        states=of.get("state", empty(len(mpc.state_steps), 0))[0],
+        inputs=of.get("input", empty(mpc.horizon, 0))[0],
+        terminal=of.get("terminal", empty(1, 0))[0][0],
+        outputs=tuple(of.get("output", ())), soft=tuple(of.get("soft", ())),
+        rates=of.get("rate", [None])[0],
+    )  # fmt: skip
+
+
+def flat_multipliers(layout: Layout, multipliers: Multipliers) -> Array:
+    """Return the multipliers as one vector (rows,): the inverse of `sorted_multipliers`."""
+    of = multipliers
+    kinds = {
+        "state": iter([of.states]), "input": iter([of.inputs]), "rate": iter([of.rates]),
+        "terminal": iter([of.terminal]), "output": iter(of.outputs), "soft": iter(of.soft),
+    }  # fmt: skip
+    parts = [jnp.ravel(next(kinds[kind])) for kind, _, _ in layout]
+    return jnp.concatenate(parts) if parts else jnp.zeros(0, jnp.result_type(of.states))
+
+
+def _shifted_multipliers(layout: Layout, horizon: int, y: Array, round_end: bool = False) -> Array:
+    """Multipliers (rows,) of a plan one sample later: see `WarmStart.shifted`."""
+    parts = split(layout, y)
+    terminal = next((part[0] for (kind, *_), part in zip(layout, parts, strict=True)
+                     if kind == "terminal"), y[:0])  # fmt: skip
+    moved = []
+    for (kind, steps, size), part in zip(layout, parts, strict=True):
+        if kind != "terminal":
+            # Step k takes over from k + 1: from the block itself, else from the terminal set.
+            place = {k: j for j, k in enumerate(steps)}
+            same = kind == "state" and not round_end and terminal.shape[0] == size
+            last = terminal if same else jnp.zeros(size, y.dtype)
+            source = jnp.concatenate([part, last[None], jnp.zeros((1, size), y.dtype)])
+            end = len(steps)
+            later = [place.get(k + 1, end if k + 1 == horizon else end + 1) for k in steps]
+            part = source[np.array(later, int)]
+        moved.append(part.ravel())
+    return jnp.concatenate([*moved, y[:0]])
+
+
+def split(layout: Layout, y: Array) -> list[Array]:
+    """y (rows,) as one array (steps, rows a step) for each block."""
+    ends = np.cumsum([len(steps) * size for _, steps, size in layout], dtype=int)
+    shapes = [(len(steps), size) for _, steps, size in layout]
+    parts = jnp.split(y, ends)[: len(shapes)]
+    return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
