@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxmpc.checks import fail
 from jaxmpc.control.sets import Ellipsoid
 from jaxmpc.mpc.plan import Plan, flat_multipliers
 from jaxmpc.mpc.problem import MPC
@@ -50,8 +49,6 @@ def active_constraints(
     """
     table = row_table(mpc)
     y = np.asarray(flat_multipliers(layout(mpc), plan.multipliers), np.float64)
-    if y.shape != (len(table),):
-        fail("plan", f"has {y.shape} multipliers, mpc {len(table)} rows", "Give one plan of mpc")
     found = []
     last = isinstance(mpc.terminal_set, Ellipsoid)
     slack = np.asarray(plan.slack)

@@ -193,13 +193,21 @@ def sorted_multipliers(mpc: MPC, layout: Layout, y: Array) -> Multipliers:
 
 
 def flat_multipliers(layout: Layout, multipliers: Multipliers) -> Array:
-    """Return the multipliers as one vector (rows,): the inverse of `sorted_multipliers`."""
+    """Return the multipliers of one plan as one vector (rows,): the inverse of
+    `sorted_multipliers`. Raises ValueError where they are those of another problem or of many."""
     of = multipliers
     kinds = {
-        "state": iter([of.states]), "input": iter([of.inputs]), "rate": iter([of.rates]),
-        "terminal": iter([of.terminal]), "output": iter(of.outputs), "soft": iter(of.soft),
+        "state": [of.states], "input": [of.inputs], "rate": [of.rates],
+        "terminal": [of.terminal], "output": list(of.outputs), "soft": list(of.soft),
     }  # fmt: skip
-    parts = [jnp.ravel(next(kinds[kind])) for kind, _, _ in layout]
+    parts = []
+    for kind, steps, size in layout:
+        part = kinds[kind].pop(0) if kinds[kind] else None
+        shape = (size,) if kind == "terminal" else (len(steps), size)
+        if np.shape(part) != shape:
+            found = f"has multipliers of shape {np.shape(part)} for {shape} {kind} rows"
+            fail("plan", found, "Give one plan of mpc")
+        parts.append(jnp.ravel(part))
     return jnp.concatenate(parts) if parts else jnp.zeros(0, jnp.result_type(of.states))
 
 
