@@ -480,6 +480,16 @@ class TestHardPrograms:
         assert found.status == jm.Status.SOLVED
         np.testing.assert_allclose(found.z, [-1.0, 0.0], atol=1e-7)
 
+    def test_small_curvature_beside_a_large_cost(self, x64):
+        """min ½p|z|² + q'z in a box: z = clip(−q/p), y = −q − pz, which is q but for its last
+        digits."""
+        q = np.array([-1.0, 0.5])
+        for p in 10.0 ** np.arange(-10, 3):
+            for size in 10.0 ** np.arange(-2, 7, 2):
+                found = jm.solve_qp(replace(box(2), P=p * np.eye(2), q=size * q))
+                assert found.status == jm.Status.SOLVED, (p, size)
+                np.testing.assert_allclose(found.z, np.clip(-size * q / p, -1, 1), atol=1e-9)
+
     @pytest.mark.parametrize("condition", [1e3, 1e6])
     def test_ill_conditioned_hessian_with_defaults(self, x64, condition):
         for seed in range(5):

@@ -99,11 +99,9 @@ class Controller:
 
         References and previous_input as in `solve`; previous_input None: what the carry says.
         """
-        start = None if carry is None else self.shifted(carry)
-        if carry is not None and previous_input is None and self.mpc.remembers:
-            previous_input = limited(self.mpc.inputs, carry.inputs[0])
-        plan = self.plan(x, reference, start, input_reference, previous_input)
-        return limited(self.mpc.inputs, plan.inputs[0]), plan, plan
+        given = self._checked(x, reference, input_reference, previous_input)
+        u, plan = _sample(self, *given, carry)
+        return u, plan, plan
 
     def shifted(self, plan: Plan) -> WarmStart:
         """The plan seen one sample later, as a warm start (`WarmStart.shifted`).
@@ -122,31 +120,35 @@ class Controller:
         previous_input: Any = None,
     ) -> Plan:  # fmt: skip
         """Plan from x0 (n,); arguments as in `solve`."""
-        c = self.condensed
-        assert c is not None
-        (steps, n, p), m, dtype = c.Phi.shape, c.R.shape[0], c.P.dtype
-        if np.shape(x0) != (n,):
-            fail("x0", f"shape {np.shape(x0)}", f"Give one state ({n},); use jax.vmap for many")
-        theta = jnp.asarray(x0, dtype)
-        if previous_input is not None and np.shape(previous_input) != (m,):
-            fail("previous_input", f"shape {np.shape(previous_input)}", f"Give one input ({m},)")
-        if p > n:
-            previous = jnp.zeros(m, dtype) if previous_input is None else previous_input
-            theta = jnp.concatenate([theta, jnp.asarray(previous, dtype)])
-        tracked = []
-        for name, value, shape in (
-            ("reference", reference, (steps, n)),
-            ("input_reference", input_reference, (steps - 1, m)),
+        given = self._checked(x0, reference, input_reference, previous_input)
+        if warm_start is not None:
+            c, mpc = self.condensed, self.mpc
+            assert c is not None
+            start = WarmStart.of(warm_start, c.layout, mpc.horizon, mpc.system.n, mpc.system.m)
+            warm_start = arrays(start)
+        return _plan(self, *given, warm_start)
+
+    def _checked(
+        self, x0: Any, reference: Any, input_reference: Any, previous_input: Any
+    ) -> list[Any]:
+        """The arguments in the controller's precision; ValueError for wrong shapes."""
+        N, n, m = self.mpc.horizon, self.mpc.system.n, self.mpc.system.m
+        shapes = {
+            "x0": ((n,), (n,)), "reference": ((n,), (N + 1, n)),
+            "input_reference": ((m,), (N, m)), "previous_input": ((m,), (m,)),
+        }  # fmt: skip
+        checked = []
+        for (name, (one, all_steps)), value in zip(
+            shapes.items(), (x0, reference, input_reference, previous_input), strict=True
         ):
-            if value is not None:
-                if np.shape(value) not in (shape[1:], shape):
-                    fail(name, f"shape {np.shape(value)}", f"Give {shape[1:]} or {shape}")
-                value = jnp.broadcast_to(jnp.asarray(value, dtype), shape)
-            tracked.append(value)
-        start = warm_start
-        if start is not None:
-            start = WarmStart.of(start, c.layout, steps - 1, n, m)
-        return _plan(self, *arrays((theta, *tracked, start)))
+            if value is not None or name == "x0":
+                if np.shape(value) not in (one, all_steps):
+                    cure = f"Give {one}" if one == all_steps else f"Give {one} or {all_steps}"
+                    fail(name, f"shape {np.shape(value)}", f"{cure}; use jax.vmap for many")
+                if not isinstance(value, jax.Array):
+                    value = np.asarray(value, self.dtype)
+            checked.append(value)
+        return checked
 
     def cost(
         self, states: Array, inputs: Array, reference: Any = None, input_reference: Any = None,
@@ -187,26 +189,45 @@ def _factor(condensed: Condensed, solver: ADMM) -> Factor:
 
 
 @jax.jit
+def _sample(
+    controller: Controller, x: Array, reference: Any, input_reference: Any, previous_input: Any,
+    carry: Plan | None,
+) -> tuple[Array, Plan]:  # fmt: skip
+    start, inputs = None, controller.mpc.inputs
+    if carry is not None:
+        start = controller.shifted(carry)
+        if previous_input is None:  # read where the problem limits or weighs input rates
+            previous_input = limited(inputs, carry.inputs[0])
+    plan = _plan(controller, x, reference, input_reference, previous_input, start)
+    return limited(inputs, plan.inputs[0]), plan
+
+
+@jax.jit
 def _plan(
-    controller: Controller,
-    theta: Array,
-    reference: Any,
-    input_reference: Any,
+    controller: Controller, x0: Array, reference: Any, input_reference: Any, previous_input: Any,
     start: WarmStart | None,
-) -> Plan:
-    c = controller.condensed
+) -> Plan:  # fmt: skip
+    c, mpc = controller.condensed, controller.mpc
     assert c is not None and controller.factor is not None
-    given = (theta, reference, input_reference)
+    given = (x0, reference, input_reference, previous_input if mpc.remembers else None)
+    given = jax.tree.map(lambda v: jnp.asarray(v, c.P.dtype), given)
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(given)]))
     # Harmless numbers until all is computed: the derivative of a product with NaN is NaN.
-    theta, reference, input_reference = jax.tree.map(lambda v: jnp.where(finite, v, 0.0), given)
+    x0, reference, input_reference, previous = jax.tree.map(
+        lambda v: jnp.where(finite, v, 0.0), given
+    )
+    N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
+    if reference is not None:
+        reference = jnp.broadcast_to(reference, (N + 1, n))
+    if input_reference is not None:
+        input_reference = jnp.broadcast_to(input_reference, (N, m))
+    theta = x0
+    if mpc.remembers:
+        previous = jnp.zeros(m, x0.dtype) if previous is None else previous
+        theta = jnp.concatenate([x0, previous])
     qp = c.qp(theta, reference, input_reference)
     pair = None if start is None else (c.variables(start.states, start.inputs), start.multipliers)
     found, fault = solve_factored(qp, controller.factor, controller.solver, pair)
     fault = jnp.where(finite, fault, Status.NON_FINITE)
     states, inputs = c.trajectory(theta, found.z)
-    previous = theta[c.Q.shape[0] :] if controller.mpc.remembers else None
-    return answer(
-        controller.mpc, c.layout, found, fault, states, inputs, reference, input_reference,
-        previous,
-    )  # fmt: skip
+    return answer(mpc, c.layout, found, fault, states, inputs, reference, input_reference, previous)

@@ -202,7 +202,7 @@ def flat_multipliers(layout: Layout, multipliers: Multipliers) -> Array:
     }  # fmt: skip
     parts = []
     for kind, steps, size in layout:
-        part = kinds[kind].pop(0) if kinds[kind] else None
+        part: Any = kinds[kind].pop(0) if kinds[kind] else None
         shape = (size,) if kind == "terminal" else (len(steps), size)
         if np.shape(part) != shape:
             found = f"has multipliers of shape {np.shape(part)} for {shape} {kind} rows"

@@ -55,9 +55,7 @@ def dual_point(A: Array, q: Array, bounds: Bounds, y: Array) -> DualPoint:
     return DualPoint(y, w, matmul(w, A.T))
 
 
-def dual_step(
-    A: Array, S: Array, q: Array, bounds: Bounds, point: DualPoint, singly: Array
-) -> DualPoint:
+def dual_step(A: Array, S: Array, bounds: Bounds, point: DualPoint, singly: Array) -> DualPoint:
     """One step from `point`; A (m, n), S = A A'. singly: of the rows without multiplier that are
     violated only the one that is so most joins W."""
     y, v, soft = point.y, point.v, bounds.linear is not None
@@ -94,14 +92,17 @@ def dual_step(
     stops = (equal == 0) & (sign_W * d < 0) & (sign_W * y_W > 0)
     first = jnp.min(jnp.where(stops, -y_W / jnp.where(stops, d, 1.0), 1.0), initial=1.0)
     t = jnp.append(jnp.asarray(LENGTHS, y.dtype), first)[:, None]
-    tried = y_W + t * d
-    tried = jnp.where((equal > 0) | (sign_W * tried > 0), tried, 0.0)
+    moved = t * d
+    moved = jnp.where((equal > 0) | (sign_W * (y_W + moved) > 0), moved, -y_W)
     if soft:
-        tried = jnp.where(elastic, tried, jnp.clip(tried, -cap, cap))
+        top = jnp.where(elastic, jnp.inf, cap)
+        moved = jnp.where(y_W + moved > top, top - y_W, jnp.maximum(moved, -top - y_W))
     # The loss of dual value: ½ δ'S δ − δ'(v − b) and the change of what soft rows add to g*.
-    moved = tried - y_W
-    loss = jnp.sum(moved * (0.5 * matmul(moved, S_W) - value) + added(tried) - added(y_W), axis=1)
+    loss = moved * (0.5 * matmul(moved, S_W) - value) + added(y_W + moved) - added(y_W)
+    loss = jnp.sum(loss, axis=1)
     # (An argmin in a float64 program cannot be lowered where 64-bit mode is off.)
     best = (loss <= jnp.min(loss)).astype(y.dtype)
-    best = matmul(best / jnp.sum(best), tried)
-    return dual_point(A, q, bounds, y.at[W].set(best, mode="drop"))
+    change = jnp.zeros_like(y).at[W].add(matmul(best / jnp.sum(best), moved), mode="drop")
+    # −q − A'y would lose what w is small beside q; the change of w is as exact as that of y.
+    w = point.w - matmul(change, A)
+    return DualPoint(y + change, w, matmul(w, A.T))

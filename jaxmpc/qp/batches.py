@@ -19,8 +19,9 @@ from jax.custom_batching import custom_vmap
 # Instances in a group on a CPU, whose data stay within the cache.
 BLOCK = 128
 # Instances in a group elsewhere: a quarter of the batch; when fewer are open a sixteenth of that,
-# and so on, but not below LEAST, where a step costs little more than its launches. (H100, TurboMPC's
-# problem, 4,096 at once: 2.6 µs a solve in one group, 1.6 in groups of 512, 1.2 of 1,024 and 256.)
+# and so on, but not below LEAST, where a step costs little more than its launches. (H100,
+# TurboMPC's problem, 4,096 at once: 2.6 µs a solve in one group, 1.6 in groups of 512, 1.2 of 1,024
+# and 256.)
 PART, SMALLER, LEAST = 4, 16, 256
 
 

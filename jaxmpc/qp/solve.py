@@ -167,8 +167,10 @@ def judged(p: Program, w: Array, y: Array) -> tuple[Pair, Array]:
     v, push = scaled_rows(p.factor, p.qp, z, y)
     prox = p.bounds.excess(v + push, 1.0) - push
     terms = jnp.append(values, prox), jnp.append(sizes, jnp.abs(v) + jnp.abs(push))
-    pair = Pair.of(z, y, terms, p.eps, rounding(z.dtype))
-    return pair, matmul(values[len(y) : -1], p.factor.T)
+    floor = rounding(z.dtype)
+    # What is rounding of its own terms says nothing.
+    gradient = jnp.where(jnp.abs(values) > floor * sizes, values, 0.0)[len(y) : -1]
+    return Pair.of(z, y, terms, p.eps, floor), matmul(gradient, p.factor.T)
 
 
 def better(qp: QP, pair: tuple[Array, Array], other: tuple[Array, Array]) -> tuple:
@@ -211,12 +213,12 @@ def improve(
     best, go_on = Pair.none(p.q, p.bounds.l), jnp.asarray(True)
     if not qp.balls and qp.A.shape[0] and not fixed:
         dual = dual_point(factor.A, p.q, p.bounds, begin.y)
-        state = DualSearch(dual, p.q, best, jnp.int32(0), ~factor.flat)
+        state = DualSearch(dual, best, jnp.int32(0), ~factor.flat)
         most = min(DUAL_STEPS, refine)
         state = repeat_while(lambda s: s.open, partial(on_the_dual, most), p, state)
-        best, go_on = state.best, ~state.best.solved
+        best, go_on, y = state.best, ~state.best.solved, state.dual.y
         # Multipliers that grow without bound are nearly a Farkas vector.
-        begin = replace(begin, change=jnp.where(state.diverged, state.dual.y, begin.change))
+        begin = replace(begin, change=jnp.where(diverged(p, y), y, begin.change))
     constants = (p, matmul(factor.H, factor.H), correcting_rows(qp))
     s = Search(begin, p.q, best, jnp.int32(0), Proof.none(p.q, p.bounds.l), begin.w, go_on)
     if fixed:
@@ -230,32 +232,31 @@ def improve(
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class DualSearch:
-    """One instance among the dual steps, with q (n,) corrected as in `Search`."""
+    """One instance among the dual steps: where it is, the best pair so far, the steps taken, and
+    whether to go on."""
 
     dual: DualPoint
-    q: Array
     best: Pair
     steps: Array
     open: Array
 
-    @property
-    def diverged(self) -> Array:
-        """Whether the multipliers are so large that the rows seem to contradict each other."""
-        return largest(self.dual.y) > DIVERGED * (1 + largest(self.q))
+
+def diverged(p: Program, y: Array) -> Array:
+    """Whether multipliers are so large that the rows seem to contradict each other."""
+    return largest(y) > DIVERGED * (1 + largest(p.q))
 
 
 def on_the_dual(most: int, p: Program, s: DualSearch) -> DualSearch:
     """One step of `active_set.py`, and whether it solved the program."""
     A, steps = p.factor.A, s.steps + 1
-    dual = dual_step(A, p.factor.S, s.q, p.bounds, s.dual, steps > JOINTLY)
+    dual = dual_step(A, p.factor.S, p.bounds, s.dual, steps > JOINTLY)
     pair, gradient = judged(p, dual.w, dual.y)
     best = s.best.or_better(pair)
     # In exact arithmetic the gradient is zero here. Where P is ill-conditioned it is rounding of
-    # T'PT, which the next step takes for a part of q (defect correction).
-    q = s.q + gradient
+    # T'PT, for which w makes up (defect correction).
     dual = replace(dual, w=dual.w - gradient, v=dual.v - matmul(gradient, A.T))
-    found = DualSearch(dual, q, best, steps, ~best.solved & (steps < most))
-    return replace(found, open=found.open & ~found.diverged)
+    go_on = ~best.solved & ~diverged(p, dual.y) & (steps < most)
+    return DualSearch(dual, best, steps, go_on)
 
 
 def proof_steps(refine: int) -> int:
