@@ -54,7 +54,7 @@ def test_values(name, n):
         close(shared, np.stack([expected(K[0], b) for b in B]))
 
 
-@pytest.mark.parametrize("n", [3, 13])
+@pytest.mark.parametrize("n", [3, pytest.param(13, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_derivatives(name, n):
     """Reverse, forward, and forward over reverse, under vmap: those of JAX's own routines."""

@@ -112,6 +112,7 @@ def test_every_integrator_in_both_precisions(integrator, order):
             np.testing.assert_allclose(after, wanted, rtol=0, atol=1e-12 if wide else 1e-6)
 
 
+@pytest.mark.slow
 def test_rk4_in_a_loop_in_float32():
     """The problem is made in float64, the loop runs in float32: the rod goes to its target."""
     robot = jm.load_robot(swing("RK4"))
@@ -158,6 +159,7 @@ def test_rk4_moves_orientations():
 AT = [np.array([q, 0.1]) for q in (0.1, 0.39, 0.403)]
 
 
+@pytest.mark.slow
 def test_derivatives_with_elliptic_contacts():
     """NaN if differentiated through MJX's solver, which friction makes iterate, though nothing
     touches."""

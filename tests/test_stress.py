@@ -77,6 +77,7 @@ def test_spread_calls_are_seen():
     assert len(spread_calls(text)) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_beside_busy_loops(tmp_path):
     """A short form of the stress test."""

@@ -1,6 +1,8 @@
 """Controller: an MPC law whose matrices are condensed and factored once."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -25,7 +27,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor
 from jaxmpc.qp.admm import factor as factorise
 from jaxmpc.qp.precision import arrays, matmul
-from jaxmpc.qp.solve import solve_factored
+from jaxmpc.qp.solve import in_two_parts, solve_factored
 from jaxmpc.qp.status import Status
 
 
@@ -100,8 +102,8 @@ class Controller:
         References and previous_input as in `solve`; previous_input None: what the carry says.
         """
         given = self._checked(x, reference, input_reference, previous_input)
-        u, plan = _sample(self, *given, carry)
-        return u, plan, plan
+        plan = self._in_two_parts(_sample, *given, carry)
+        return limited(self.mpc.inputs, plan.inputs[0]), plan, plan
 
     def shifted(self, plan: Plan) -> WarmStart:
         """The plan seen one sample later, as a warm start (`WarmStart.shifted`).
@@ -126,7 +128,11 @@ class Controller:
             assert c is not None
             start = WarmStart.of(warm_start, c.layout, mpc.horizon, mpc.system.n, mpc.system.m)
             warm_start = arrays(start)
-        return _plan(self, *given, warm_start)
+        return self._in_two_parts(_plan, *given, warm_start)
+
+    def _in_two_parts(self, program: Callable[..., Plan], *given: Any) -> Plan:
+        assert self.condensed is not None
+        return in_two_parts(program, bool(self.condensed.balls), self.solver, self, *given)
 
     def _checked(
         self, x0: Any, reference: Any, input_reference: Any, previous_input: Any
@@ -188,24 +194,23 @@ def _factor(condensed: Condensed, solver: ADMM) -> Factor:
     return factorise(condensed.P, condensed.C, solver, condensed.balls)
 
 
-@jax.jit
+@partial(jax.jit, static_argnames="whole")
 def _sample(
     controller: Controller, x: Array, reference: Any, input_reference: Any, previous_input: Any,
-    carry: Plan | None,
-) -> tuple[Array, Plan]:  # fmt: skip
-    start, inputs = None, controller.mpc.inputs
+    carry: Plan | None, *, whole: bool,
+) -> Plan:  # fmt: skip
+    start = None
     if carry is not None:
         start = controller.shifted(carry)
         if previous_input is None:  # read where the problem limits or weighs input rates
-            previous_input = limited(inputs, carry.inputs[0])
-    plan = _plan(controller, x, reference, input_reference, previous_input, start)
-    return limited(inputs, plan.inputs[0]), plan
+            previous_input = limited(controller.mpc.inputs, carry.inputs[0])
+    return _plan(controller, x, reference, input_reference, previous_input, start, whole=whole)
 
 
-@jax.jit
+@partial(jax.jit, static_argnames="whole")
 def _plan(
     controller: Controller, x0: Array, reference: Any, input_reference: Any, previous_input: Any,
-    start: WarmStart | None,
+    start: WarmStart | None, *, whole: bool,
 ) -> Plan:  # fmt: skip
     c, mpc = controller.condensed, controller.mpc
     assert c is not None and controller.factor is not None
@@ -227,7 +232,7 @@ def _plan(
         theta = jnp.concatenate([x0, previous])
     qp = c.qp(theta, reference, input_reference)
     pair = None if start is None else (c.variables(start.states, start.inputs), start.multipliers)
-    found, fault = solve_factored(qp, controller.factor, controller.solver, pair)
+    found, fault = solve_factored(qp, controller.factor, controller.solver, pair, whole=whole)
     fault = jnp.where(finite, fault, Status.NON_FINITE)
     states, inputs = c.trajectory(theta, found.z)
     return answer(mpc, c.layout, found, fault, states, inputs, reference, input_reference, previous)

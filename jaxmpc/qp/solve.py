@@ -1,15 +1,16 @@
 """solve_qp: loop, polish, honest status and derivative joined."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import concrete, fail
 from jaxmpc.qp.active_set import DualPoint, dual_point, dual_step
 from jaxmpc.qp.admm import (
     ADMM,
@@ -43,6 +44,8 @@ from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.residuals import Pair, assess, marked, residual_terms, small, worst
 from jaxmpc.qp.status import Status
 
+T = TypeVar("T", bound=Any)
+
 # Bounds of this size mean none, as in OSQP, MOSEK and the MPS format.
 INFINITE = 1e20
 
@@ -62,12 +65,28 @@ def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: Any = None) -> QPSoluti
     """
     qp.validate()
     solver.validate(np.shape(qp.A)[0])
-    return _solve(as_arrays(qp), *arrays((solver, warm_start)))
+    arguments = as_arrays(qp), *arrays((solver, warm_start))
+    return in_two_parts(_solve, bool(qp.balls), solver, *arguments)
 
 
-@jax.jit
-def _solve(qp: QP, solver: ADMM, warm_start: Any) -> QPSolution:
-    return marked(*solve_factored(qp, factor(qp.P, qp.A, solver, qp.balls), solver, warm_start))
+@partial(jax.jit, static_argnames="whole")
+def _solve(qp: QP, solver: ADMM, warm_start: Any, *, whole: bool) -> QPSolution:
+    made = factor(qp.P, qp.A, solver, qp.balls)
+    return marked(*solve_factored(qp, made, solver, warm_start, whole=whole))
+
+
+def in_two_parts(program: Callable[..., T], hard: bool, solver: ADMM, *arguments: Any) -> T:
+    """Return program(*arguments, whole=True), a solution or plan.
+
+    One instance from plain Python runs first without the method of multipliers, which most programs
+    do not need and which is half of what there is to compile; what it leaves open is solved again
+    with it. hard: known to need it.
+    """
+    every = hard or solver.fixed or not solver.refine or solver.differentiate != "implicit"
+    if every or not concrete(arguments):
+        return program(*arguments, whole=True)
+    found = program(*arguments, whole=False)
+    return program(*arguments, whole=True) if found.status == Status.ITERATION_LIMIT else found
 
 
 def as_arrays(qp: QP) -> QP:
@@ -82,10 +101,11 @@ def as_arrays(qp: QP) -> QP:
 
 
 def solve_factored(
-    qp: QP, factor: Factor, solver: ADMM, warm_start: Any = None
+    qp: QP, factor: Factor, solver: ADMM, warm_start: Any = None, *, whole: bool = True
 ) -> tuple[QPSolution, Array]:
     """`solve_qp` after its factorization: what a controller repeats at each sample.
 
+    whole: False leaves out the method of multipliers and proofs (`in_two_parts`).
     Returns the solution and the fault of the data, NOT_RUN for none. Where there is one the
     solution is that of harmless data: `marked` says so, after all that is computed from it, for
     the derivative of a product with NaN is NaN even where nobody looks at it.
@@ -93,16 +113,16 @@ def solve_factored(
     clean, fault = cleaned(qp, factor.fault)
     if solver.differentiate == "implicit":
         constants = jax.lax.stop_gradient((clean, factor, solver, warm_start))
-        found = search(*constants)
+        found = search(*constants, whole)
         z, y = implicit(clean, constants[1], solver.smoothing, found.z, found.y)
     else:
-        found = search(clean, factor, solver, warm_start)
+        found = search(clean, factor, solver, warm_start, whole)
         z, y = found.z, found.y
     steps = jnp.asarray(solver.iterations, jnp.int32)
     return replace(found, z=z, y=y, cost=value(clean, z, y), iterations=steps), fault
 
 
-def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any) -> QPSolution:
+def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = True) -> QPSolution:
     """Loop, Newton steps, proofs."""
     q, bounds = scaled(factor, qp)
     t = jnp.zeros_like(qp.l)
@@ -123,7 +143,8 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any) -> QPSolution:
     begin = replace(multipliers_start(q, w, y), change=y - y_old, move=w - w_old)
     if solver.refine and not unrolled:
         p = Program(qp, factor, q, bounds, eps, Constants.of(qp.q.dtype).far)
-        (z, y), proof = precisely(partial(improve, solver.refine, solver.fixed), p, begin)
+        polish = partial(improve, solver.refine, solver.fixed, whole)
+        (z, y), proof = precisely(polish, p, begin)
         return assess(residual_terms, (qp,), z, y, proof, eps)
     pair, end = unscaled(qp, factor, w, y), begin
     if solver.refine:
@@ -202,7 +223,7 @@ DUAL_STEPS, JOINTLY, DIVERGED = 24, 2, 1e6
 
 
 def improve(
-    refine: int, fixed: bool, p: Program, begin: Multipliers
+    refine: int, fixed: bool, whole: bool, p: Program, begin: Multipliers
 ) -> tuple[tuple[Array, Array], Proof]:
     """The pair (z, y) and what is proved, after `refine` Newton steps at most; in float64.
 
@@ -219,6 +240,8 @@ def improve(
         best, go_on, y = state.best, ~state.best.solved, state.dual.y
         # Multipliers that grow without bound are nearly a Farkas vector.
         begin = replace(begin, change=jnp.where(diverged(p, y), y, begin.change))
+    if not whole:
+        return (best.z, best.y), Proof.none(p.q, p.bounds.l)
     constants = (p, matmul(factor.H, factor.H), correcting_rows(qp))
     s = Search(begin, p.q, best, jnp.int32(0), Proof.none(p.q, p.bounds.l), begin.w, go_on)
     if fixed:
