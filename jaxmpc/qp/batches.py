@@ -16,8 +16,10 @@ import numpy as np
 from jax import Array, lax
 from jax.custom_batching import custom_vmap
 
-# Instances in a group on a CPU, whose data stay within the cache.
+# Instances in a block on a CPU, whose data stay within the cache.
 BLOCK = 128
+# Instances in a group on a CPU, and when fewer are open; up to PART_CPU at once are one group.
+PART_CPU, FEW_CPU = 512, 64
 # Instances in a group elsewhere: a quarter of the batch; when fewer are open a sixteenth of that,
 # and so on, but not below LEAST, where a step costs little more than its launches. (H100,
 # TurboMPC's problem, 4,096 at once: 2.6 µs a solve in one group, 1.6 in groups of 512, 1.2 of 1,024
@@ -28,7 +30,7 @@ PART, SMALLER, LEAST = 4, 16, 256
 def group_sizes(batch: int) -> list[int]:
     """Return the sizes of the groups of a batch, from the largest."""
     if jax.default_backend() == "cpu":
-        return [min(batch, BLOCK)]
+        return [batch] if batch <= PART_CPU else [PART_CPU, FEW_CPU]
     if batch <= PART * LEAST:
         return [batch]
     sizes = [-(-batch // PART)]
