@@ -27,7 +27,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor
 from jaxmpc.qp.admm import factor as factorise
 from jaxmpc.qp.precision import arrays, matmul
-from jaxmpc.qp.solve import in_two_parts, solve_factored
+from jaxmpc.qp.solve import has_dual_steps, in_two_parts, solve_factored
 from jaxmpc.qp.status import Status
 
 
@@ -102,8 +102,8 @@ class Controller:
         References and previous_input as in `solve`; previous_input None: what the carry says.
         """
         given = self._checked(x, reference, input_reference, previous_input)
-        plan = self._in_two_parts(_sample, *given, carry)
-        return limited(self.mpc.inputs, plan.inputs[0]), plan, plan
+        plan, u = self._in_two_parts(_sample, *given, carry, status=lambda found: found[0].status)
+        return u, plan, plan
 
     def shifted(self, plan: Plan) -> WarmStart:
         """The plan seen one sample later, as a warm start (`WarmStart.shifted`).
@@ -130,9 +130,11 @@ class Controller:
             warm_start = arrays(start)
         return self._in_two_parts(_plan, *given, warm_start)
 
-    def _in_two_parts(self, program: Callable[..., Plan], *given: Any) -> Plan:
-        assert self.condensed is not None
-        return in_two_parts(program, bool(self.condensed.balls), self.solver, self, *given)
+    def _in_two_parts(self, program: Callable[..., Any], *given: Any, **kwargs: Any) -> Any:
+        c = self.condensed
+        assert c is not None
+        hard = not has_dual_steps(c.balls, c.C)
+        return in_two_parts(program, hard, self.solver, self, *given, **kwargs)
 
     def _checked(
         self, x0: Any, reference: Any, input_reference: Any, previous_input: Any
@@ -198,13 +200,14 @@ def _factor(condensed: Condensed, solver: ADMM) -> Factor:
 def _sample(
     controller: Controller, x: Array, reference: Any, input_reference: Any, previous_input: Any,
     carry: Plan | None, *, whole: bool,
-) -> Plan:  # fmt: skip
-    start = None
+) -> tuple[Plan, Array]:  # fmt: skip
+    start, inputs = None, controller.mpc.inputs
     if carry is not None:
         start = controller.shifted(carry)
         if previous_input is None:  # read where the problem limits or weighs input rates
-            previous_input = limited(controller.mpc.inputs, carry.inputs[0])
-    return _plan(controller, x, reference, input_reference, previous_input, start, whole=whole)
+            previous_input = limited(inputs, carry.inputs[0])
+    plan = _plan(controller, x, reference, input_reference, previous_input, start, whole=whole)
+    return plan, limited(inputs, plan.inputs[0])
 
 
 @partial(jax.jit, static_argnames="whole")

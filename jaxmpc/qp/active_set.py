@@ -41,24 +41,22 @@ RIDGE = 1e-11
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class DualPoint:
-    """Multipliers y (m,) with w = −q − A'y (n,) and v = A w (m,)."""
+    """Multipliers y (m,) with w = −q − A'y (n,)."""
 
     y: Array
     w: Array
-    v: Array
 
 
 def dual_point(A: Array, q: Array, bounds: Bounds, y: Array) -> DualPoint:
     """Return the point of multipliers y (m,), made admissible."""
     y = bounds.admissible(y)
-    w = -q - matmul(y, A)
-    return DualPoint(y, w, matmul(w, A.T))
+    return DualPoint(y, -q - matmul(y, A))
 
 
 def dual_step(A: Array, S: Array, bounds: Bounds, point: DualPoint, singly: Array) -> DualPoint:
     """One step from `point`; A (m, n), S = A A'. singly: of the rows without multiplier that are
     violated only the one that is so most joins W."""
-    y, v, soft = point.y, point.v, bounds.linear is not None
+    y, v, soft = point.y, matmul(point.w, A.T), bounds.linear is not None
     noise = 1e-13 * (1 + jnp.max(jnp.abs(v), initial=0.0))
     outside = v - jnp.clip(v, bounds.l, bounds.u)
     outside = jnp.where(jnp.abs(outside) > noise, outside, 0.0)
@@ -104,5 +102,4 @@ def dual_step(A: Array, S: Array, bounds: Bounds, point: DualPoint, singly: Arra
     best = (loss <= jnp.min(loss)).astype(y.dtype)
     change = jnp.zeros_like(y).at[W].add(matmul(best / jnp.sum(best), moved), mode="drop")
     # −q − A'y would lose what w is small beside q; the change of w is as exact as that of y.
-    w = point.w - matmul(change, A)
-    return DualPoint(y + change, w, matmul(w, A.T))
+    return DualPoint(y + change, point.w - matmul(change, A))

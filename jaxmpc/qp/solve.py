@@ -41,7 +41,7 @@ from jaxmpc.qp.newton import (
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely, rounding
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.residuals import Pair, assess, marked, residual_terms, small, worst
+from jaxmpc.qp.residuals import Pair, assess, marked, residual_terms, worst
 from jaxmpc.qp.status import Status
 
 T = TypeVar("T", bound=Any)
@@ -66,7 +66,7 @@ def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: Any = None) -> QPSoluti
     qp.validate()
     solver.validate(np.shape(qp.A)[0])
     arguments = as_arrays(qp), *arrays((solver, warm_start))
-    return in_two_parts(_solve, bool(qp.balls), solver, *arguments)
+    return in_two_parts(_solve, not has_dual_steps(qp.balls, qp.A), solver, *arguments)
 
 
 @partial(jax.jit, static_argnames="whole")
@@ -75,8 +75,11 @@ def _solve(qp: QP, solver: ADMM, warm_start: Any, *, whole: bool) -> QPSolution:
     return marked(*solve_factored(qp, made, solver, warm_start, whole=whole))
 
 
-def in_two_parts(program: Callable[..., T], hard: bool, solver: ADMM, *arguments: Any) -> T:
-    """Return program(*arguments, whole=True), a solution or plan.
+def in_two_parts(
+    program: Callable[..., T], hard: bool, solver: ADMM, *arguments: Any,
+    status: Callable[[T], Any] = lambda found: found.status,
+) -> T:  # fmt: skip
+    """Return program(*arguments, whole=True), whose status is status(result).
 
     One instance from plain Python runs first without the method of multipliers, which most programs
     do not need and which is half of what there is to compile; what it leaves open is solved again
@@ -86,7 +89,12 @@ def in_two_parts(program: Callable[..., T], hard: bool, solver: ADMM, *arguments
     if every or not concrete(arguments):
         return program(*arguments, whole=True)
     found = program(*arguments, whole=False)
-    return program(*arguments, whole=True) if found.status == Status.ITERATION_LIMIT else found
+    return program(*arguments, whole=True) if status(found) == Status.ITERATION_LIMIT else found
+
+
+def has_dual_steps(balls: tuple[int, ...], A: Any) -> bool:
+    """Whether `active_set.py` can take steps: there are rows, and no balls."""
+    return not balls and np.shape(A)[0] > 0
 
 
 def as_arrays(qp: QP) -> QP:
@@ -232,7 +240,7 @@ def improve(
     """
     qp, factor = p.qp, p.factor
     best, go_on = Pair.none(p.q, p.bounds.l), jnp.asarray(True)
-    if not qp.balls and qp.A.shape[0] and not fixed:
+    if has_dual_steps(qp.balls, qp.A) and not fixed:
         dual = dual_point(factor.A, p.q, p.bounds, begin.y)
         state = DualSearch(dual, best, jnp.int32(0), ~factor.flat)
         most = min(DUAL_STEPS, refine)
@@ -271,13 +279,13 @@ def diverged(p: Program, y: Array) -> Array:
 
 def on_the_dual(most: int, p: Program, s: DualSearch) -> DualSearch:
     """One step of `active_set.py`, and whether it solved the program."""
-    A, steps = p.factor.A, s.steps + 1
-    dual = dual_step(A, p.factor.S, p.bounds, s.dual, steps > JOINTLY)
+    steps = s.steps + 1
+    dual = dual_step(p.factor.A, p.factor.S, p.bounds, s.dual, steps > JOINTLY)
     pair, gradient = judged(p, dual.w, dual.y)
     best = s.best.or_better(pair)
     # In exact arithmetic the gradient is zero here. Where P is ill-conditioned it is rounding of
     # T'PT, for which w makes up (defect correction).
-    dual = replace(dual, w=dual.w - gradient, v=dual.v - matmul(gradient, A.T))
+    dual = replace(dual, w=dual.w - gradient)
     go_on = ~best.solved & ~diverged(p, dual.y) & (steps < most)
     return DualSearch(dual, best, steps, go_on)
 
@@ -300,7 +308,10 @@ def by_multipliers(refine: int, constants: tuple, s: Search) -> Search:
     w = jnp.where(s.steps == refine + few, to_length_one(s.point.move), w)
     hard, (H_ray, q_ray, cone) = p.bounds.hard(), recession(squared, p.q, p.bounds)
     if p.bounds.linear is not None:
-        rigid = {"linear": jnp.inf * (1 + p.bounds.linear), "quadratic": 0 * p.bounds.quadratic}
+        rigid: dict[str, Any] = {
+            "linear": jnp.full_like(p.bounds.linear, jnp.inf),
+            "quadratic": jnp.zeros_like(p.bounds.quadratic),
+        }
         hard, cone = replace(hard, **rigid), replace(cone, **rigid)
     damping, none = Constants.of(dtype).damping, jnp.zeros_like(s.point.y)
     at, y, H, q, bounds, rho, sigma = pick(
@@ -414,8 +425,3 @@ def value(qp: QP, z: Array, y: Array) -> Array:
 def tolerance(solver: ADMM, dtype: Any) -> Any:
     """Return the residuals that `solver` asks for."""
     return (1e-6 if dtype == jnp.float64 else 1e-3) if solver.eps is None else solver.eps
-
-
-def within(qp: QP, z: Array, y: Array, eps: Any, floor: float) -> Array:
-    """Whether each residual of (z, y) is at most eps + floor·(size of its terms)."""
-    return small(residual_terms(qp, z, y), eps, floor)
