@@ -20,8 +20,8 @@ from typing import Any
 
 import jax
 import numpy as np
-import scipy.sparse as sparse
 import tyro
+from mpc_solvers import EMPTY, SOLVED, Call, moreau_batch, osqp_loop
 
 import jaxmpc as jm
 from jaxmpc.app.config import load
@@ -74,6 +74,13 @@ def residuals(c: Condensed, x: np.ndarray, z: np.ndarray, y: np.ndarray) -> np.n
     return np.max([primal, dual, gap], axis=0)
 
 
+def clocked(call: Callable[[], Any]) -> tuple[float, Any]:
+    """Seconds of a call, and its result."""
+    begun = time.perf_counter()
+    found = call()
+    return time.perf_counter() - begun, found
+
+
 def best(rounds: int, call: Callable[[], tuple[float, Any]]) -> tuple[float, Any]:
     """The least seconds of some calls, with that call's result."""
     return min((call() for _ in range(rounds)), key=lambda outcome: outcome[0])
@@ -119,75 +126,20 @@ def ours_plans(mpc: jm.MPC, x: np.ndarray, label: np.ndarray, rounds: int, dtype
     )  # fmt: skip
 
 
-def osqp_loop(c: Condensed, x: np.ndarray, label: np.ndarray, rounds: int, cost: bool) -> Row:
-    """OSQP's C solver, set up once, looped over the states with updates of q, l, u."""
-    import osqp
-
+def rival(
+    name: str, make: Callable[..., Call], c: Condensed, x: np.ndarray, label: np.ndarray,
+    rounds: int, cost: bool = True,
+) -> Row:  # fmt: skip
+    """A solver of `mpc_solvers`, set up once; cost: False asks it for feasibility alone."""
     shift = x @ c.D.T + c.d
-    L, U, q = c.lower - shift, c.upper - shift, (x @ c.F.T + c.f) * cost
-    begun = time.perf_counter()
-    solver = osqp.OSQP()
-    solver.setup(
-        sparse.csc_matrix(np.triu(c.P * cost)), q[0], sparse.csc_matrix(c.C), L[0], U[0],
-        eps_abs=1e-6, eps_rel=0.0, max_iter=20_000, verbose=False,
-    )  # fmt: skip
-    setup = time.perf_counter() - begun
-
-    def call() -> tuple[float, Any]:
-        z, y = np.zeros((len(x), c.P.shape[0])), np.zeros((len(x), len(c.lower)))
-        status = np.zeros(len(x), int)
-        begun = time.perf_counter()
-        for i in range(len(x)):
-            solver.update(q=q[i], l=L[i], u=U[i])
-            result = solver.solve()
-            z[i], y[i], status[i] = result.x, result.y, result.info.status_val
-        return time.perf_counter() - begun, (z, y, status)
-
-    seconds, (z, y, status) = best(rounds, call)
+    q, l, u = (x @ c.F.T + c.f) * cost, c.lower - shift, c.upper - shift
+    setup, call = clocked(lambda: make(replace(c, P=c.P * cost), q, l, u))
+    seconds, (z, y, status) = best(rounds, lambda: clocked(call))
     feasible = label == 1
     good = residuals(c, x[feasible], z[feasible], y[feasible]) <= 1e-6 if cost else None
-    what = "plans to 1e-6" if cost else "feasibility only, 1e-6"
     return Row(
-        f"OSQP {osqp.__version__} loop, {what}", seconds / len(x) * 1e6, setup,
-        None if good is None else float(good.mean()),
-        float(np.where(feasible, status == 1, status == 3).mean()),
-    )  # fmt: skip
-
-
-def moreau_batch(c: Condensed, x: np.ndarray, label: np.ndarray, rounds: int) -> Row:
-    """Moreau's batched CPU solver at its default tolerance."""
-    import moreau
-
-    shift = x @ c.D.T + c.d
-    P = sparse.csr_matrix(c.P)
-    A = sparse.csr_matrix(np.vstack([c.C, -c.C]))
-    b = np.hstack([c.upper - shift, shift - c.lower])
-    q = x @ c.F.T + c.f
-    begun = time.perf_counter()
-    solver = moreau.CompiledSolver(
-        n=P.shape[0], m=A.shape[0], P_row_offsets=P.indptr, P_col_indices=P.indices,
-        A_row_offsets=A.indptr, A_col_indices=A.indices,
-        cones=moreau.Cones(num_nonneg_cones=A.shape[0]),
-        settings=moreau.Settings(device="cpu", batch_size=len(x)),
-    )  # fmt: skip
-    solver.setup(P.data, A.data)
-    setup = time.perf_counter() - begun
-
-    def call() -> tuple[float, Any]:
-        begun = time.perf_counter()
-        solution = solver.solve(q, b)
-        return time.perf_counter() - begun, (solution, list(solver.info.status))
-
-    seconds, (solution, status) = best(rounds, call)
-    m = len(c.lower)
-    z, s = np.asarray(solution.x), np.asarray(solution.z)
-    names = np.array([str(v).rsplit(".", 1)[-1] for v in status])
-    feasible = label == 1
-    good = residuals(c, x[feasible], z[feasible], (s[:, :m] - s[:, m:])[feasible]) <= 1e-6
-    agree = np.where(feasible, names == "Solved", names == "PrimalInfeasible")
-    return Row(
-        f"Moreau {importlib.metadata.version('moreau')} batch, default tolerance",
-        seconds / len(x) * 1e6, setup, float(good.mean()), float(agree.mean()),
+        name, seconds / len(x) * 1e6, setup, None if good is None else float(good.mean()),
+        float(np.where(feasible, status == SOLVED, status == EMPTY).mean()),
     )  # fmt: skip
 
 
@@ -198,9 +150,12 @@ def main_table(settings: Settings) -> list[Row]:
     first, label = ours_labels(mpc, x, settings.rounds, "float32")
     rows = [first, ours_labels(mpc, x, settings.rounds, "float64")[0]]
     rows += [ours_plans(mpc, x, label, settings.rounds, t) for t in ("float32", "float64")]
-    rows += [osqp_loop(c, x, label, 1, cost) for cost in (False, True)]
+    loop = f"OSQP {importlib.metadata.version('osqp')} loop"
+    for what, cost in (("feasibility only, 1e-6", False), ("plans to 1e-6", True)):
+        rows.append(rival(f"{loop}, {what}", osqp_loop, c, x, label, 1, cost))
     if importlib.util.find_spec("moreau"):
-        rows.append(moreau_batch(c, x, label, settings.rounds))
+        batch = f"Moreau {importlib.metadata.version('moreau')} batch, default tolerance"
+        rows.append(rival(batch, moreau_batch, c, x, label, settings.rounds))
     return rows
 
 

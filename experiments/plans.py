@@ -11,18 +11,15 @@ turns, best of `rounds`; loops over C solvers run over `loop` of the states. Tim
 state, without compilation and set-up; on shared machines read their ratios.
 """
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from typing import Any
 
 import jax
 import numpy as np
 import tyro
-from benchmark import condensed, residuals
+from benchmark import clocked, condensed, residuals
 from mpc_families import FAMILIES, family
-from scipy import sparse
+from mpc_solvers import Call, daqp_loop, moreau_batch, osqp_loop, piqp_loop
 
 import jaxmpc as jm
 from jaxmpc.mpc.condense import Condensed
@@ -42,98 +39,12 @@ class Settings:
     rounds: int = 3
 
 
-# Returns z (count, nz) and y (count, rows).
-Call = Callable[[], tuple[np.ndarray, np.ndarray]]
-
-
 def pair_of(c: Condensed, plan: jm.Plan) -> tuple[np.ndarray, np.ndarray]:
     """z and y of plans."""
     with jax.enable_x64(True):
         z = jax.vmap(c.variables)(plan.states, plan.inputs)
         y = jax.vmap(lambda m: flat_multipliers(c.layout, m))(plan.multipliers)
     return np.asarray(z), np.asarray(y)
-
-
-def daqp_loop(c: Condensed, q: np.ndarray, l: np.ndarray, u: np.ndarray) -> Call:
-    """DAQP's dual active-set solver."""
-    import daqp
-
-    A, sense = np.ascontiguousarray(c.C), np.zeros(len(c.lower), np.int32)
-
-    def call() -> tuple[np.ndarray, np.ndarray]:
-        found = [daqp.solve(c.P, q[i], A, u[i], l[i], sense) for i in range(len(q))]
-        return np.array([f[0] for f in found]), np.array([f[3]["lam"] for f in found])
-
-    return call
-
-
-def piqp_loop(c: Condensed, q: np.ndarray, l: np.ndarray, u: np.ndarray) -> Call:
-    """PIQP's dense interior-point solver, set up once and updated."""
-    import piqp
-
-    solver = piqp.DenseSolver()
-    solver.settings.eps_abs, solver.settings.eps_rel = 1e-8, 0.0
-    solver.setup(c.P, q[0], None, None, c.C, l[0], u[0])
-
-    def call() -> tuple[np.ndarray, np.ndarray]:
-        z, y = np.zeros_like(q), np.zeros_like(l)
-        for i in range(len(q)):
-            solver.update(c=q[i], h_l=l[i], h_u=u[i])
-            solver.solve()
-            z[i], y[i] = solver.result.x, solver.result.z_u - solver.result.z_l
-        return z, y
-
-    return call
-
-
-def osqp_loop(c: Condensed, q: np.ndarray, l: np.ndarray, u: np.ndarray) -> Call:
-    """OSQP, set up once and updated, at 1e-6."""
-    import osqp
-
-    solver = osqp.OSQP()
-    upper, A = sparse.csc_matrix(np.triu(c.P)), sparse.csc_matrix(c.C)
-    solver.setup(
-        upper, q[0], A, l[0], u[0], eps_abs=1e-6, eps_rel=0.0, max_iter=20_000, verbose=False
-    )
-
-    def call() -> tuple[np.ndarray, np.ndarray]:
-        z, y = np.zeros_like(q), np.zeros_like(l)
-        for i in range(len(q)):
-            solver.update(q=q[i], l=l[i], u=u[i])
-            result = solver.solve()
-            z[i], y[i] = result.x, result.y
-        return z, y
-
-    return call
-
-
-def moreau_batch(c: Condensed, q: np.ndarray, l: np.ndarray, u: np.ndarray) -> Call:
-    """Moreau's batched CPU solver at its default tolerance."""
-    import moreau
-
-    P, A = sparse.csr_matrix(c.P), sparse.csr_matrix(np.vstack([c.C, -c.C]))
-    b, m = np.hstack([u, -l]), len(c.lower)
-    solver = moreau.CompiledSolver(
-        n=P.shape[0], m=A.shape[0], P_row_offsets=P.indptr, P_col_indices=P.indices,
-        A_row_offsets=A.indptr, A_col_indices=A.indices,
-        cones=moreau.Cones(num_nonneg_cones=A.shape[0]),
-        settings=moreau.Settings(device="cpu", batch_size=len(q)),
-    )  # fmt: skip
-    solver.setup(P.data, A.data)
-
-    def call() -> tuple[np.ndarray, np.ndarray]:
-        solution = solver.solve(q, b)
-        s = np.asarray(solution.z)
-        return np.asarray(solution.x), s[:, :m] - s[:, m:]
-
-    return call
-
-
-def clocked(call: Callable[[], Any]) -> tuple[float, Any]:
-    """Seconds of a call, and its result."""
-    begun = time.perf_counter()
-    found = call()
-    return time.perf_counter() - begun, found
 
 
 def measure(name: str, s: Settings) -> None:
@@ -171,7 +82,7 @@ def measure(name: str, s: Settings) -> None:
     for _ in range(s.rounds):
         times["jaxmpc"].append(clocked(call)[0] / len(x) * 1e6)
         for rival, (run, states) in rivals.items():
-            spent, (z, y) = clocked(run)
+            spent, (z, y, _) = clocked(run)
             times.setdefault(rival, []).append(spent / len(states) * 1e6)
             solved[rival] = np.mean(residuals(c, states, z, y) <= 1e-6)
     least = {rival: min(spent) for rival, spent in times.items()}
