@@ -107,21 +107,14 @@ def ours_labels(mpc: jm.MPC, x: np.ndarray, rounds: int, dtype: str) -> tuple[Ro
 def ours_plans(mpc: jm.MPC, x: np.ndarray, label: np.ndarray, rounds: int, dtype: str) -> Row:
     """Optimal plans to 1e-6, infeasible states detected on the way."""
     solver = jm.ADMM(iterations=150)
-    compiled = []
-
-    def call() -> tuple[float, Any]:
-        begun = time.perf_counter()
-        plans = jm.solve_many(mpc, x, solver, dtype=dtype)
-        spent = time.perf_counter() - begun
-        compiled.append(spent)
-        return spent, plans
-
+    call = lambda: clocked(lambda: jm.solve_many(mpc, x, solver, dtype=dtype))
+    compiled = call()[0]
     seconds, plans = best(rounds, call)
     worst = np.max([plans.primal_residual, plans.dual_residual, plans.gap], axis=0)
     feasible = label == 1
     agree = np.where(feasible, plans.status == 1, plans.status == 3)
     return Row(
-        f"jaxmpc plans to 1e-6, {dtype} steps", seconds / len(x) * 1e6, compiled[0],
+        f"jaxmpc plans to 1e-6, {dtype} steps", seconds / len(x) * 1e6, compiled,
         float(np.mean(worst[feasible] <= 1e-6)), float(agree.mean()),
     )  # fmt: skip
 
