@@ -1,6 +1,9 @@
 """What the drivers of batches share: compile once a shape, timed apart; pad to few shapes."""
 
+import os
 import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -15,6 +18,24 @@ CHUNK = 8192
 def default_chunk() -> int:
     """Points a compiled program takes at once on the present device."""
     return CHUNK if jax.default_backend() == "cpu" else 32 * CHUNK
+
+
+def workers() -> int:
+    """Return how many chunks to run side by side: one a core of a CPU, whose programs use little
+    more than one, for most of their steps are too small to be divided; one on other devices."""
+    return len(os.sched_getaffinity(0)) if jax.default_backend() == "cpu" else 1
+
+
+def side_by_side(call: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
+    """Return [call(item) for item in items], as many at once as there are `workers`.
+
+    `call` runs in threads of its own, which see none of the caller's JAX contexts.
+    """
+    items, count = list(items), workers()
+    if min(count, len(items)) < 2:
+        return [call(item) for item in items]
+    with ThreadPoolExecutor(count) as pool:
+        return list(pool.map(call, items))
 
 
 def gather_size(chunk: int) -> int:

@@ -8,7 +8,15 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
-from jaxmpc.compiled import default_chunk, first_rows, padded, require_step_type
+from jaxmpc.compiled import (
+    Compiled,
+    default_chunk,
+    first_rows,
+    padded,
+    require_step_type,
+    side_by_side,
+    workers,
+)
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Plan
@@ -54,20 +62,26 @@ def solve_many(
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.system.n})")
     x0s = np.pad(x0s, ((0, 0), (0, mpc.dimension - x0s.shape[1])))
     require_step_type(dtype)
-    chunk = default_chunk() if chunk is None else chunk
-    if chunk < 1:
+    if chunk is None:
+        chunk = min(default_chunk(), -(-len(x0s) // workers()))
+    elif chunk < 1:
         fail("chunk", f"{chunk}", "Give a count of at least 1")
+    size = max(min(chunk, len(x0s)), 1)
     with jax.enable_x64(True):
         controller = Controller(in_float64(mpc), replace(solver, dtype=np.dtype(dtype).name))
-        size = min(chunk, max(len(x0s), 1))
-        parts = []
-        for start in range(0, max(len(x0s), 1), size):
-            here = x0s[start : start + size]
-            rows = padded(here, size) if len(here) else np.zeros((0, mpc.dimension))
-            parts.append(first_rows(jax.tree.map(np.asarray, _plans(controller, rows)), len(here)))
-        return jax.tree.map(lambda *v: np.concatenate(v), *parts)
+        program = _plans.program(controller, x0s[:size])
+
+    def part(start: int) -> Plan:
+        here = x0s[start : start + size]
+        with jax.enable_x64(True):
+            plans = program(controller, padded(here, size) if len(here) else here)
+        return first_rows(jax.tree.map(np.asarray, plans), len(here))
+
+    parts = side_by_side(part, range(0, max(len(x0s), 1), size))
+    return jax.tree.map(lambda *v: np.concatenate(v), *parts)
 
 
+@Compiled
 @jax.jit
 def _plans(controller: Controller, x0s: Array) -> Plan:
     n = controller.mpc.system.n

@@ -18,8 +18,8 @@ from jax.custom_batching import custom_vmap
 
 # Instances in a block on a CPU, whose data stay within the cache.
 BLOCK = 128
-# Instances in a group on a CPU, and when fewer are open; up to PART_CPU at once are one group.
-PART_CPU, FEW_CPU = 512, 64
+# Instances in a group on a CPU at most, and when fewer are open; small batches are one group.
+PART_CPU, FEW_CPU, SMALL_CPU = 512, 64, 128
 # Instances in a group elsewhere: a quarter of the batch; when fewer are open a sixteenth of that,
 # and so on, but not below LEAST, where a step costs little more than its launches. (H100,
 # TurboMPC's problem, 4,096 at once: 2.6 µs a solve in one group, 1.6 in groups of 512, 1.2 of 1,024
@@ -30,7 +30,7 @@ PART, SMALLER, LEAST = 4, 16, 256
 def group_sizes(batch: int) -> list[int]:
     """Return the sizes of the groups of a batch, from the largest."""
     if jax.default_backend() == "cpu":
-        return [batch] if batch <= PART_CPU else [PART_CPU, FEW_CPU]
+        return [batch] if batch <= SMALL_CPU else [min(batch, PART_CPU), FEW_CPU]
     if batch <= PART * LEAST:
         return [batch]
     sizes = [-(-batch // PART)]

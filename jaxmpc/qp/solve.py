@@ -26,7 +26,7 @@ from jaxmpc.qp.admm import (
     start,
 )
 from jaxmpc.qp.batches import in_blocks, repeat_while
-from jaxmpc.qp.certificate import Proof, correcting_rows, prove, recession, to_length_one
+from jaxmpc.qp.certificate import Proof, correcting_rows, farkas, prove, recession, to_length_one
 from jaxmpc.qp.derivative import implicit
 from jaxmpc.qp.newton import (
     Constants,
@@ -36,7 +36,6 @@ from jaxmpc.qp.newton import (
     multipliers_step,
     multipliers_update,
     newton_step,
-    norms,
 )
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely, rounding
 from jaxmpc.qp.problem import QP, QPSolution
@@ -240,17 +239,21 @@ def improve(
     """
     qp, factor = p.qp, p.factor
     best, go_on = Pair.none(p.q, p.bounds.l), jnp.asarray(True)
+    correcting = correcting_rows(qp)
     if has_dual_steps(qp.balls, qp.A) and not fixed:
+        # The dual of an infeasible program has no maximum: steps towards it would be wasted.
+        _, empty = farkas(qp, factor.E * begin.change, correcting)
         dual = dual_point(factor.A, p.q, p.bounds, begin.y)
-        state = DualSearch(dual, best, jnp.int32(0), ~factor.flat)
+        state = DualSearch(dual, best, jnp.int32(0), ~factor.flat & ~empty)
         most = min(DUAL_STEPS, refine)
         state = repeat_while(lambda s: s.open, partial(on_the_dual, most), p, state)
         best, go_on, y = state.best, ~state.best.solved, state.dual.y
         # Multipliers that grow without bound are nearly a Farkas vector.
         begin = replace(begin, change=jnp.where(diverged(p, y), y, begin.change))
+        begin = least_violation(begin, empty)
     if not whole:
         return (best.z, best.y), Proof.none(p.q, p.bounds.l)
-    constants = (p, matmul(factor.H, factor.H), correcting_rows(qp))
+    constants = (p, matmul(factor.H, factor.H), correcting)
     s = Search(begin, p.q, best, jnp.int32(0), Proof.none(p.q, p.bounds.l), begin.w, go_on)
     if fixed:
         length = refine + 3 * proof_steps(refine)
@@ -321,6 +324,7 @@ def by_multipliers(refine: int, constants: tuple, s: Search) -> Search:
     )
     step = newton_step(at, y, H, q, bounds, rho, sigma, f.A)
     keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(primal, a, b), new, old)
+    stiff = s.point.rho >= Constants.of(dtype).rho[1]
     point = keep(multipliers_update(s.q, s.point, step, p.far), s.point)
     pair, gradient = judged(p, point.w, point.y)
     # What rounding of T'PT hides of the gradient counts as a part of q (defect correction).
@@ -334,11 +338,20 @@ def by_multipliers(refine: int, constants: tuple, s: Search) -> Search:
     best = jax.tree.map(lambda a, b: jnp.where(take, a, b), pair, best)
 
     steps = s.steps + 1
-    moved, size = norms(point.move, point.w)
-    settled = (moved <= 1e-9 * (1 + size)) & (point.rho >= Constants.of(dtype).rho[1])
-    ended = best.solved | proof.unbounded | (proof.infeasible & (settled | ~primal))
+    there = (stiff & step.minimised) | ~primal
+    ended = best.solved | proof.unbounded | (proof.infeasible & there)
+    point = least_violation(point, proof.infeasible & ~stiff)
     ended = ended | (steps >= refine + jnp.where(f.flat, 3 * few, few))
     return Search(point, q, best, steps, proof, step.w, ~ended)
+
+
+def least_violation(point: Multipliers, infeasible: Array) -> Multipliers:
+    """`point`, or where the program is infeasible the start of a search for the least violation of
+    the rows: the last penalty at once, and no multipliers."""
+    top = Constants.of(point.w.dtype).rho[1]
+    return replace(
+        point, rho=jnp.where(infeasible, top, point.rho), y=jnp.where(infeasible, 0.0, point.y)
+    )
 
 
 def still_open(refine: int, constants: tuple, s: Search, _: None) -> tuple[Search, None]:
