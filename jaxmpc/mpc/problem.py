@@ -181,8 +181,7 @@ class MPC:
             if not isinstance(value, kinds):
                 wanted = " or ".join(kind.__name__ for kind in kinds)
                 fail(name, f"is a {type(value).__name__}", f"Give a {wanted}, or None")
-            if concrete(value):
-                value.validate(name, size)
+            value.validate(name, size)
         if self.prestabilise is not None and not isinstance(self.prestabilise, bool):
             require_shape("prestabilise", self.prestabilise, (m, n), "A gain K with u = Kx + v")
         self._validate_steps()

@@ -19,8 +19,7 @@ Only p runs backward and only x forward; all else is done for all stages at once
 The row scale E of `qp/admm.scale` makes the rows a_i of all inputs one unit long in the metric of
 the Hessian: 1/E_i² = a_i' P⁻¹ a_i. P⁻¹ is the covariance of inputs drawn with density exp(−J): by
 the same recursion without penalties u_k = K x_k + e_k with e_k of covariance G⁻¹, hence that of x_k
-runs forward, Σ⁺ = (A + BK) Σ (A + BK)' + B G⁻¹ B' from Σ_0 = 0. (The dense solver adds 1e-6 of
-the mean curvature to P first; E differs by that share.)
+runs forward, Σ⁺ = (A + BK) Σ (A + BK)' + B G⁻¹ B' from Σ_0 = 0.
 """
 
 from collections.abc import Callable
@@ -82,7 +81,8 @@ def solve_stagewise(
     the inputs are the variables, so a plant that grows more than 1e5-fold over the horizon in open
     loop (1e3-fold in float32) has residuals above eps by rounding alone; `solve` takes those. scale
     (rows,): the row scale of a similar problem (`factor_stages(...).E`), which saves one of two
-    Riccati recursions; it changes the path of ADMM, not the answer.
+    Riccati recursions; it changes the path of ADMM, not the answer. A row of scale 0 counts as
+    one that no input moves: where that is not so, the plan does not become SOLVED.
 
     `jax.vmap` over system, x0, references or the arrays of `mpc`. Raises ValueError for bad data
     that can be read, and for what only `solve` knows: Ellipsoids, control horizons, input rates.
@@ -295,7 +295,7 @@ def cleaned(s: Stages) -> tuple[Stages, Array]:
     definite = jnp.all(jnp.isfinite(cholesky(jax.lax.stop_gradient(weights[1]))))
     for W in weights:
         definite = definite & convex(W)
-    definite = definite & jnp.all(s.stage >= 0)
+    definite = definite & jnp.all(s.stage > 0)
     fault = jnp.where(definite, Status.NOT_RUN, Status.NON_CONVEX)
     fault = jnp.where(ok, fault, Status.NON_FINITE).astype(jnp.int32)
     ok = ok & definite
@@ -697,7 +697,7 @@ def search(
     elif solver.refine:
         eps = jnp.asarray(tolerance(solver, u.dtype), u.dtype)
         best = judged(eps, s, sample, u, y)
-        state = Search(u, y, best, jnp.int32(0), jnp.asarray(True))
+        state = Search(u, y, best, jnp.int32(0), ~(best.near | best.solved))
         constants = (factor, sample, bounds, eps)
         step = partial(search_step, solver.refine)
         if solver.fixed:
