@@ -1,4 +1,4 @@
-"""Equilibria of a linear system: what a reference asks of states and inputs in steady state."""
+"""Equilibria of a linear system: the steady state and input that a reference requires."""
 
 from typing import Any
 
@@ -14,15 +14,16 @@ def equilibrium(
     system: LinearSystem, target: Any, *, C: Any = None, states: Box | None = None,
     inputs: Box | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """(x, u) with x = A x + B u + c and C x = target: what to track and the input that holds it.
+    """Return (x, u) with x = A x + B u + c and C x = target: what to track and the input that holds
+    it.
 
-    target (p,): of the outputs C x, C (p, n); without C of all states. Among several equilibria the
-    one of least norm, if that keeps the limits. states, inputs: Box limits to stay in, or None.
+    target (p,): of the outputs C x, C (p, n); without C of all states. Of several equilibria it is
+    the one of least norm, if that keeps the limits. states, inputs: Box limits to stay in, or None.
     Give x and u to `solve` as reference and input_reference, so that the cost vanishes there.
 
-    Raises ValueError where no equilibrium meets the target, within the limits if there are any:
-    the message says how far the closest one stays from it. Host, float64; residual below
-    1e-11 + 1e-9 times the size of its terms.
+    Raises ValueError where no equilibrium meets the target, within the limits if there are any: the
+    message says how far the closest one stays from it. NumPy in float64; not traceable; residual
+    below 1e-11 + 1e-9 times the size of its terms.
     """
     if not isinstance(system, LinearSystem):
         fail("system", f"is a {type(system).__name__}", "Give a jm.LinearSystem")

@@ -1,4 +1,4 @@
-"""The hypotheses under which a terminal set and cost make MPC feasible for ever, and stable."""
+"""The hypotheses under which a terminal set and cost make MPC recursively feasible and stable."""
 
 from dataclasses import dataclass
 from fractions import Fraction
@@ -32,11 +32,11 @@ _DETECTABLE = 1e-10  # as in `lqr`
 
 @dataclass(frozen=True)
 class Check:
-    """One hypothesis.
+    """One hypothesis, with the result of its check.
 
     holds: True, False, or None for undecided.
     margin: by how much, in `unit`; negative if it fails, None if there is no number.
-    theorems: of the two theorems, those that need it.
+    theorems: which of the two theorems (1, 3) need it.
     """
 
     name: str
@@ -65,7 +65,7 @@ class TerminalReport:
     exact_factor: Fraction | None
 
     def __getitem__(self, name: str) -> Check:
-        """The check of this name."""
+        """Return the check of this name."""
         for check in self.checks:
             if check.name == name:
                 return check
@@ -73,12 +73,14 @@ class TerminalReport:
 
     @property
     def recursive_feasibility(self) -> bool | None:
-        """Theorem 1 applies: all its hypotheses hold (None: some undecided, none fails)."""
+        """Return whether Theorem 1 applies: all its hypotheses hold (None: some are undecided, none
+        fails)."""
         return _all(check.holds for check in self.checks if 1 in check.theorems)
 
     @property
     def stability(self) -> bool | None:
-        """Theorem 3 applies: all its hypotheses hold (None: some undecided, none fails)."""
+        """Return whether Theorem 3 applies: all its hypotheses hold (None: some are undecided, none
+        fails)."""
         return _all(check.holds for check in self.checks if 3 in check.theorems)
 
     def __str__(self) -> str:
@@ -117,17 +119,17 @@ def verify_terminal(
 
     Theorem 1. If states X and inputs U are convex and compact and the terminal set X_f within X
     is control invariant, a feasible MPC problem stays feasible along its own closed loop.
-    Theorem 3. If besides, on X_f, u = K x keeps x in X_f and u in U, and
+    Theorem 3. If in addition, on X_f, u = K x keeps x in X_f and u in U, and
     (A+BK)'P(A+BK) - P + Q + K'RK <= 0, the origin is asymptotically stable on X_N.
-    They speak of w = 0. With a disturbance the invariance that is checked is the robust one.
+    Both are stated for w = 0. With a disturbance, robust invariance is checked.
 
     Arguments:
         system: x+ = A x + B u + c.
         Q, R: (n, n), (m, m), symmetric weights of x'Qx + u'Ru.
         terminal_cost: P (n, n), symmetric, of x_N'P x_N; None for the P of `lqr`.
         terminal_set: X_f. None: X takes its place, since x_N is free, so that the problem of
-            horizon N is that of horizon N - 1 with terminal set X; Theorem 1 then asks that X
-            itself be control invariant, and Theorem 3 is never claimed.
+            horizon N is that of horizon N - 1 with terminal set X; Theorem 1 then requires X
+            itself to be control invariant, and Theorem 3 is never claimed.
         states, inputs: X and U; None for no limit.
         K: (m, n), of u = K x; None for that of `lqr`.
         disturbance: bounded set of w that holds the origin, or None.
@@ -140,7 +142,8 @@ def verify_terminal(
     - x'P_f x <= level is invariant if (A+BK)'P_f (A+BK) <= factor P_f; with w and c, if
       sqrt(factor) sqrt(level) + max |w + c|_P <= sqrt(level), which is sufficient only.
     - If K fails, control invariance alone: X_f within Pre(X_f), row by row.
-    A limit counts as kept if it is exceeded by at most 1e-9 of the set's extent. Host, float64.
+    A limit counts as kept if it is exceeded by at most 1e-9 of the set's extent. NumPy in float64;
+    not traceable.
 
     Raises ValueError for wrong shapes, asymmetric weights or empty sets; a hypothesis that
     fails is an answer, not an error.
@@ -216,8 +219,8 @@ def verify_terminal(
         checks.append(
             Check(
                 "terminal cost where x_N is free", None, None, "",
-                "x_N may leave X, where the Lyapunov inequality and K in U say nothing: Theorem 3 "
-                "asks for a terminal set.", (3,),
+                "x_N may leave X, where the Lyapunov inequality and K in U do not hold: Theorem 3 "
+                "requires a terminal set.", (3,),
             )
         )  # fmt: skip
     return TerminalReport(tuple(checks), gain, certificate, factor, exact)
@@ -231,7 +234,8 @@ class _Rows:
     g: np.ndarray
 
     def top(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(upper bounds of max row x, M with M G = rows but for rounding); inf if unbounded."""
+        """Return (upper bounds of max row x, M with M G = rows but for rounding); inf if
+        unbounded."""
         bounds, M = np.zeros(len(rows)), np.zeros((len(rows), len(self.g)))
         for i, row in enumerate(rows):
             if not row.any():
@@ -248,13 +252,15 @@ class _Rows:
 
     @cached_property
     def reach(self) -> np.ndarray:
-        """Bounds of |x_i| over the set, with a margin for the LP's error; inf if there is none."""
+        """Return the bounds of |x_i| over the set, with a margin for the LP's error; inf if there
+        is none."""
         if not len(self.g):
             return np.full(self.G.shape[1], np.inf)
         return geometry.extent(self.G, self.g) * (1 + 1e-6)
 
     def width(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """How far the set reaches along each row (None: its own) from its largest ball's centre."""
+        """Return how far the set reaches along each row (None: its own) from its largest ball's
+        centre."""
         centre = geometry.largest_ball("terminal_set", self.G, self.g)[0]
         tops = self.g if rows is None else self.top(rows)[0]
         width = np.maximum(tops - (self.G if rows is None else rows) @ centre, 0.0)
@@ -269,12 +275,12 @@ class _Ellipse:
     level: float
 
     def top(self, rows: np.ndarray) -> tuple[np.ndarray, None]:
-        """(max row x, None)."""
+        """Return (max row x, None)."""
         squares = np.einsum("ij,ij->i", rows, np.linalg.solve(self.P, rows.T).T)
         return np.sqrt(self.level * squares), None
 
     def width(self, rows: np.ndarray) -> np.ndarray:
-        """How far the set reaches along each row from its centre."""
+        """Return how far the set reaches along each row from its centre."""
         width = self.top(rows)[0]
         return np.where(width > 0, width, 1.0)
 
@@ -303,7 +309,8 @@ def _within(
     name: str, labels: tuple[str, ...], rows: tuple[np.ndarray, np.ndarray], output: np.ndarray,
     X_f: _Set, theorems: tuple[int, ...], role: str = "",
 ) -> Check:  # fmt: skip
-    """output x within rows for all x in X_f; the margin is a distance from a row's hyperplane."""
+    """Check that `output` x lies within the rows for all x in X_f; the margin is a distance from a
+    row's hyperplane."""
     (G, g), unit = rows, "distance to the limit"
     if not len(g):
         return Check(name, True, np.inf, unit, f"Nothing limits {', '.join(labels)}.", theorems)
@@ -327,7 +334,7 @@ def _rows_kept(
     X_f: _Rows, closed: np.ndarray, c: np.ndarray, W: Any,
     law: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> tuple[Check, np.ndarray | None, float | None, Fraction | None]:  # fmt: skip
-    """Invariance of {G x <= g} under u = K x, by M >= 0 with M G = G closed."""
+    """Check invariance of {G x <= g} under u = K x, by M >= 0 with M G = G closed."""
     name, unit, G, g = "invariance under K", "of the extent", X_f.G, X_f.g
     if not len(g):
         sentence = "All of R^n is invariant."
@@ -340,9 +347,9 @@ def _rows_kept(
         return Check(name, False, -np.inf, unit, sentence, (3,)), None, None, None
     reached = images + G @ c + supports(W, G)
     residual = float(np.abs(M @ G - G @ closed).max())
-    share = (g - reached) / X_f.width()
-    worst = int(np.argmin(share))
-    holds = bool(share[worst] >= -_TOUCH)
+    slack = (g - reached) / X_f.width()
+    worst = int(np.argmin(slack))
+    holds = bool(slack[worst] >= -_TOUCH)
     factor = float((reached / g).max()) if g.min() > 0 else None
     exact = None
     if factor is not None and (W is None or isinstance(W, Box)):
@@ -356,16 +363,16 @@ def _rows_kept(
         sentence += " In rational arithmetic the factor is at most 1."
     elif exact is not None and holds:
         sentence += f" In rational arithmetic the factor exceeds 1 by {float(exact - 1):.1e}."
-    return Check(name, holds, float(share[worst]), unit, sentence, (3,)), M, factor, exact
+    return Check(name, holds, float(slack[worst]), unit, sentence, (3,)), M, factor, exact
 
 
 def _exact_factor(
     M: np.ndarray, X_f: _Rows, c: np.ndarray, W: Box | None,
     law: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> Fraction | None:  # fmt: skip
-    """max_i (M h + |M H - H(A+BK)| |x| + H c + max Hw)_i / h_i, without rounding.
+    """Return max_i (M h + |M H - H(A+BK)| |x| + H c + max Hw)_i / h_i, without rounding.
 
-    Where the rows that M uses are n and independent, their multipliers are solved anew from
+    Where the rows that M uses are n and independent, their multipliers are computed again from
     M H = H(A+BK), so that no residual is left. |x| is bounded by LPs and a margin. None where the
     set is too large for it, or unbounded where a residual is left.
     """
@@ -406,7 +413,7 @@ def _ellipse_kept(
     X_f: _Ellipse, closed: np.ndarray, c: np.ndarray, W: Any,
     law: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> tuple[Check, float, Fraction | None]:  # fmt: skip
-    """Invariance of {x'P x <= level} under u = K x."""
+    """Check invariance of {x'P x <= level} under u = K x."""
     name, P = "invariance under K", X_f.P
     factor = contraction(closed, P)
     least = float(np.linalg.eigvalsh(P - closed.T @ P @ closed)[0])
@@ -432,15 +439,15 @@ def _ellipse_kept(
             factor,
             None,
         )
-    push = float(np.sqrt(c @ P @ c)) if W is None else largest_norm(_moved(W, c), P)
+    w_norm = float(np.sqrt(c @ P @ c)) if W is None else largest_norm(_moved(W, c), P)
     radius = np.sqrt(X_f.level)
-    share = float(1 - np.sqrt(factor) - push / radius)
+    slack = float(1 - np.sqrt(factor) - w_norm / radius)
     sentence += (
-        f"; with |w + c|_P <= {push:.6g} the image reaches at most {1 - share:.9g} of the radius"
+        f"; with |w + c|_P <= {w_norm:.6g} the image reaches at most {1 - slack:.9g} of the radius"
     )
-    holds = True if share >= -_TOUCH else None if factor <= 1 else False
+    holds = True if slack >= -_TOUCH else None if factor <= 1 else False
     sentence += "." if holds else ", a bound that is sufficient only."
-    return Check(name, holds, share, "of the radius", sentence, (3,)), factor, None
+    return Check(name, holds, slack, "of the radius", sentence, (3,)), factor, None
 
 
 def _moved(W: Box | Polytope, c: np.ndarray) -> Box | Polytope:
@@ -550,7 +557,7 @@ def _origin_inside(X_f: _Set) -> Check:
 
 
 def _rows(argument: str, value: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit rows of a set; none if it is None."""
+    """Return the rows of a set, scaled to norm 1; no rows if it is None."""
     if value is None:
         return np.zeros((0, n)), np.zeros(0)
     if not isinstance(value, Box | Polytope):
@@ -575,7 +582,7 @@ def _all(answers: Any) -> bool | None:
 
 
 def _fractions(array: Any) -> Any:
-    """Nested lists of Fractions, each exactly the float it comes from."""
+    """Return nested lists of Fractions, each exactly the float it comes from."""
     array = np.asarray(array, np.float64)
     return [_fractions(row) for row in array] if array.ndim else Fraction(float(array))
 
@@ -585,7 +592,7 @@ def _dot(a: Any, b: Any) -> Fraction:
 
 
 def _solve(matrix: list, right: list) -> list | None:
-    """The solution of a square system in rationals, None if it is singular (Gauss-Jordan)."""
+    """Solve a square system in rationals by Gauss-Jordan elimination; None if it is singular."""
     rows = [[*row, b] for row, b in zip(matrix, right, strict=True)]
     for k in range(len(rows)):
         pivot = next((i for i in range(k, len(rows)) if rows[i][k]), None)
@@ -600,12 +607,12 @@ def _solve(matrix: list, right: list) -> list | None:
 
 
 def _positive(matrix: list) -> bool:
-    """True if a symmetric matrix of Fractions is positive definite (pivots of L D L')."""
+    """Return whether a symmetric matrix of Fractions is positive definite (pivots of L D L')."""
     rows = [list(row) for row in matrix]
     for k in range(len(rows)):
         if rows[k][k] <= 0:
             return False
         for i in range(k + 1, len(rows)):
-            share = rows[i][k] / rows[k][k]
-            rows[i] = [v - share * w for v, w in zip(rows[i], rows[k], strict=True)]
+            ratio = rows[i][k] / rows[k][k]
+            rows[i] = [v - ratio * w for v, w in zip(rows[i], rows[k], strict=True)]
     return True

@@ -27,7 +27,8 @@ class RowPrograms:
         self, cost: np.ndarray, U: np.ndarray, lower: np.ndarray, upper: np.ndarray,
         bounds: list[Any], margin: np.ndarray | None = None,
     ) -> tuple[Any, np.ndarray]:  # fmt: skip
-        """max cost'x over lower ≤ U x ≤ upper and the ball: HiGHS' result, multipliers (R,).
+        """Maximise cost'x over lower ≤ U x ≤ upper and the ball; return HiGHS' result and
+        multipliers (R,).
 
         margin (R,): the last variable times this is kept from every bound.
         """
@@ -66,8 +67,8 @@ class RowPrograms:
         return result, y
 
     def support(self, direction: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        """max direction'θ over the feasible set: the optimum (inf: unbounded, −inf: empty), w, and
-        the multipliers of the rows."""
+        """Return max direction'θ over the feasible set: the optimum (inf: unbounded, −inf: empty),
+        w, and the multipliers of the rows."""
         k = self.rows.U.shape[1]
         U = np.hstack([self.rows.U, self.rows.D])
         return self._maximum(np.append(np.zeros(k), direction), U, np.zeros(len(U)), None)
@@ -75,7 +76,8 @@ class RowPrograms:
     def ray(
         self, center: np.ndarray, direction: np.ndarray
     ) -> tuple[float, np.ndarray, np.ndarray]:
-        """max t ≥ 0 with center + t·direction in the feasible set; results as in `support`."""
+        """Return max t ≥ 0 with center + t·direction in the feasible set; results as in
+        `support`."""
         rows, k = self.rows, self.rows.U.shape[1]
         U = np.hstack([rows.U, (rows.D @ direction)[:, None]])
         return self._maximum(np.append(np.zeros(k), 1.0), U, rows.D @ center, 0)
@@ -92,8 +94,8 @@ class RowPrograms:
 
     @cached_property
     def bounding_box(self) -> tuple[np.ndarray | None, np.ndarray]:
-        """Bounds (2, d) of every feasible θ, lower and upper, None where the set is found empty;
-        and the multipliers (2d, R) of the upper and then the lower sides.
+        """Return bounds (2, d) of every feasible θ, lower and upper, None where the set is found
+        empty; and the multipliers (2d, R) of the upper and then the lower sides.
 
         Each side is moved out by the larger of the coordinate's two finite ends, which outweighs
         the tolerances of the linear programs.
@@ -108,7 +110,7 @@ class RowPrograms:
         return np.array([-ends[1] - margin, ends[0] + margin]), np.array(y)
 
     def centre(self, given: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """θ (the one given, or the best) and w with the largest common margin of all rows.
+        """Return θ (the one given, or the best) and w with the largest common margin of all rows.
 
         Raises ValueError where the set is empty or flat, or does not hold the given θ inside.
         """

@@ -12,7 +12,8 @@ from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
 
 
 def with_initial_limits(mpc: MPC, limits: Box) -> MPC:
-    """`mpc` with `limits` on x_0 as well, where its own state limits do not hold at k = 0."""
+    """Return `mpc` with `limits` on x_0 as well, where its own state limits do not hold at k =
+    0."""
     lower, upper = np.asarray(limits.lower, float), np.asarray(limits.upper, float)
     bounded = np.isfinite(lower) | np.isfinite(upper)
     if not bounded.any() or (mpc.states is not None and 0 in mpc.state_steps):
@@ -26,7 +27,8 @@ def with_initial_limits(mpc: MPC, limits: Box) -> MPC:
 
 
 def deviations(mpc: MPC, x: Any, u: Any) -> MPC:
-    """The same problem in z = ξ − x, v = u − u_ref, so that tracking (x, u_ref) becomes regulation.
+    """Return the same problem in z = ξ − x, v = u − u_ref, so that tracking (x, u_ref) becomes
+    regulation.
 
     z⁺ = A z + B v + (A x + B u_ref + c − x); a set H ξ ≤ h is H z ≤ h − H x. Raises ValueError
     for an Ellipsoid as terminal set away from x = 0.
@@ -50,8 +52,8 @@ def deviations(mpc: MPC, x: Any, u: Any) -> MPC:
 
 
 def moved(set_: Any, by: np.ndarray) -> Any:
-    """The set {x − by : x in set_}; None for None. Raises ValueError for an Ellipsoid, which is
-    about the origin, unless by = 0."""
+    """Return the set {x − by : x in set_}; None for None. Raises ValueError for an Ellipsoid, which
+    is about the origin, unless by = 0."""
     if isinstance(set_, Box):
         return Box(np.asarray(set_.lower) - by, np.asarray(set_.upper) - by)
     if isinstance(set_, Polytope):

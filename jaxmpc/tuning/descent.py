@@ -1,8 +1,8 @@
-"""Gradient descent with guards: the loop that every tuner shares.
+"""Gradient descent with safeguards: the loop of all tuners.
 
-The optimiser is one of optax. Around it: the loss on a validation set, by which the best iterate is
-chosen; steps that lead to numbers which are not finite are taken back and halved; and everything is
-on disk after each step.
+The optimiser comes from optax. The best iterate is chosen by the loss on a validation set. Steps
+that lead to numbers which are not finite are undone and halved. A checkpoint is written after each
+step.
 """
 
 import time
@@ -56,7 +56,7 @@ class Descent:
 
 @dataclass
 class State:
-    """What the next step depends on, and the record so far.
+    """The state of the descent: all that the next step depends on, and the record so far.
 
     good: the last θ with a finite gradient, its gradient and the optimiser's state before it.
     fraction: of the optimiser's step that is taken, 1 until a step fails.
@@ -75,14 +75,14 @@ def descend(
     theta: Any, gradient: Gradient, validate: Validate, optimizer: optax.GradientTransformation,
     settings: Settings, decides: Any = None,
 ) -> Descent:  # fmt: skip
-    """Minimise from θ = `theta`, a pytree of host arrays, by `settings.updates` optimiser steps.
+    """Minimise from θ = `theta`, a pytree of NumPy arrays, by `settings.updates` optimiser steps.
 
     gradient(θ, t): loss, gradient and further numbers on the batch of step t; a function of its
     arguments alone, so that an interrupted run can go on.
     validate(θ): loss and numbers on the validation set. It is called before the first step too:
     the result is the best of T + 1 iterates, never worse than the start.
     optimizer: used where settings.optimizer is None.
-    decides: JSON data that decide the run; kept in the checkpoint and compared on resuming.
+    decides: JSON data that determine the run, stored in the checkpoint and compared on resuming.
 
     Raises ValueError for a checkpoint of another run, and where θ_0 has no finite validation loss.
     """
@@ -125,7 +125,7 @@ def descend(
 
 
 def _require_first_order(optimizer: optax.GradientTransformation, theta: Any) -> None:
-    """Raise ValueError for an optimiser that asks for more than a gradient."""
+    """Raise ValueError for an optimiser that needs more than a gradient."""
     zeros = jax.tree.map(np.zeros_like, theta)
     try:
         jax.eval_shape(lambda g: optimizer.update(g, optimizer.init(g), g)[0], zeros)
@@ -134,7 +134,7 @@ def _require_first_order(optimizer: optax.GradientTransformation, theta: Any) ->
 
 
 def _step(state: State, gradient: Gradient, optimizer: optax.GradientTransformation) -> None:
-    """Take a step; where its gradient is not finite take back the last one and go half as far."""
+    """Take a step; where the gradient is not finite undo the last step and take half of it."""
     loss, slope, numbers = gradient(state.theta, len(state.rows))
     slope = jax.tree.map(lambda v: np.asarray(v, np.float64), slope)
     norm = float(np.sqrt(sum(np.sum(v**2) for v in jax.tree.leaves(slope))))
@@ -174,7 +174,7 @@ def _checked(validate: Validate, theta: Any) -> dict[str, float]:
 
 
 def _record(state: State) -> Descent:
-    """Return the record that a user sees."""
+    """Return the public record of the descent."""
     column = lambda rows, name: np.array([row.get(name, np.nan) for row in rows])
     names = lambda rows, known: [n for n in dict.fromkeys(n for r in rows for n in r)
                                  if n not in known]  # fmt: skip
@@ -193,7 +193,7 @@ def _record(state: State) -> Descent:
 
 
 def _save(path: Path | None, state: State, mark: str, decides: Any) -> None:
-    """Write the checkpoint, if there is to be one."""
+    """Write the checkpoint; nothing where `path` is None."""
     if path is None:
         return
     leaves: dict[str, Any] = {

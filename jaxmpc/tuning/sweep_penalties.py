@@ -1,16 +1,15 @@
 """tune_sweep_penalties: penalties with which ADMM decides more states of a feasible-set map.
 
 The first stage of `map_feasible_set` (`feasible/candidates.py`) is an ADMM without cost; its
-penalties are weights of the rows. What is minimised here is how far its answers are from being
-proofs,
+penalties are weights of the rows. The objective is how far its results are from being proofs,
 
     mean over states of log10(1 + shortfall / FLOOR),
 
 where the shortfall of a feasible state is the largest violation (normalised rows) of the plan that
 the stage ends with, and of an infeasible one how far the half-space of its multipliers is from
-excluding the state. The states come labelled by the whole cascade of stages; half of each batch are
-those that the first stage leaves open. Proofs decide labels with any penalties: these only change
-which stage decides.
+excluding the state. The states are labelled by the whole cascade of stages; half of each batch are
+those that the first stage leaves undecided. Labels rest on proofs with any penalties, which only
+change the stage that decides.
 """
 
 from dataclasses import dataclass
@@ -46,7 +45,7 @@ from jaxmpc.tuning.descent import descend
 from jaxmpc.tuning.result import TuningRun, cached
 from jaxmpc.tuning.settings import Settings
 
-# Of the algorithm: results that an older version cached are not used.
+# Version of the algorithm: results that an older version cached are not used.
 VERSION = 2
 # In normalised rows; iterates in float32 end near 1e-5.
 FLOOR = 1e-4
@@ -184,7 +183,7 @@ def shortfall(
     problem: ExactData, rows: ConstraintRows, theta: Array, label: Array, weight: Array,
     alpha: Array, iterations: int,
 ) -> Array:  # fmt: skip
-    """Return how far the stage's answer at θ is from a proof of its label; ≤ 0: none is missing."""
+    """Return how far the stage's result at θ is from a proof of the label; ≤ 0: it is a proof."""
     U, bounds = jnp.asarray(rows.U), rows.bounds(theta)
     A = weight[:, None] * U
     pseudoinverse = linalg.solve(matmul(A.T, A), A.T)
@@ -220,7 +219,7 @@ def loss_and_gradient(
     theta: Any, W: Array, problem: ExactData, rows: ConstraintRows, x: Array, label: Array,
     iterations: int,
 ) -> Array:  # fmt: skip
-    """Return the number that is minimised, see above, and its gradient."""
+    """Return the objective of the module's docstring at θ, and its gradient."""
     weight, alpha = jnp.exp(W @ theta["weight"]), 2 * jax.nn.sigmoid(theta["alpha"])
     missing = jax.vmap(
         lambda x, label: shortfall(problem, rows, x, label, weight, alpha, iterations)

@@ -32,8 +32,8 @@ class Info:
 
     How to read the output
       "proved" rests on linear programs or certificates with the tolerance that is named, "refuted"
-      on a counterexample; closed loops are tried, not proved. Nothing is written to disk.
-      Exit code  0 done, whatever the answers; 2 error (one line on stderr says which).
+      on a counterexample; closed loops are simulated, not proved. Nothing is written to disk.
+      Exit code  0 done, for any answers; 2 error (one line on stderr says which).
 
     What the TOML file holds
       The sections [system], [limits], [cost], [mpc] of jaxmpc sweep --help.
@@ -49,7 +49,7 @@ class Info:
     loops: Annotated[int, option("K", "128")] = 128
     """Number of the closed loops."""
     seconds: Annotated[float, option("S", "60")] = 60.0
-    """Time for the search for counterexamples; what is not settled by then is open."""
+    """Time limit of the search for counterexamples; claims not settled by then are open."""
 
     keeps = ""
 

@@ -62,14 +62,14 @@ class Recursion:
                       first move), next_state, lost_at (step at which the problem is proved
                       infeasible; 0 never, -1 infeasible at the start, -2 undecided), and
                       facet_normals, facet_offsets of X_N. Opens with numpy.load(path).
-      Exit code       0 done, whatever the answer; 2 error (one line on stderr says which); 130
+      Exit code       0 done, for any answer; 2 error (one line on stderr says which); 130
                       stopped by Ctrl-C (nothing is kept).
 
     With --robot NAME or FILE: the promise and the robot
       Such as jaxmpc recursion --robot pendulum --horizon 40 --steps 100
       As in jaxmpc sweep --help, with another promise: the linear closed loop has a plan at each
-      of --steps samples (of the robot's control period). The robot keeps it where its own loop
-      has: each plan solved without breaking a limit. Files as there; robot_map.png too.
+      of --steps samples (of the robot's control period). The robot keeps the promise where each
+      plan of its own loop is solved without violating a limit. Same files, and robot_map.png.
 
     What the TOML file holds
       The sections [system], [limits], [cost], [mpc] of jaxmpc sweep --help, and
@@ -113,7 +113,7 @@ class Recursion:
     overwrite: Switch = False
     """Replace the results in --output."""
     resume: Switch = False
-    """With --robot: go on with the map in --output."""
+    """With --robot: resume the map in --output."""
 
     @property
     def keeps(self) -> str:

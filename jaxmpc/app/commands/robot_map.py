@@ -1,4 +1,4 @@
-"""`--robot` of the commands sweep and recursion: a robot's map, kept chunk by chunk."""
+"""`--robot` of the commands sweep and recursion: a robot's map, stored chunk by chunk."""
 
 import time
 from collections.abc import Sequence
@@ -30,13 +30,13 @@ from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import Robot
 from jaxmpc.runs import versions, write_arrays, write_json
 
-# Points along each of two axes, and in all along another number of them.
+# Points along each of two axes; total number of points for another number of axes.
 SIDE, POINTS = 32, 1024
 
 
 @dataclass(frozen=True)
 class RobotMapCommand:
-    """What to map, as the command line says it; None where it says nothing.
+    """What to map, from the command line; None for options that are not given.
 
     claim: as in `map_robot`, and so is search_seconds. axes: names or indices of coordinates;
     values: of the other coordinates, in their order. settings: iterations and dtype of the linear
@@ -77,7 +77,7 @@ class RobotMapCommand:
         print(f"  {'files':<16} {' '.join(str(self.output / name) for name in files)}")
 
     def prepare(self) -> tuple[RobotSetting, dict[str, Any], zarr.Group]:
-        """Return the checked map, what says which it is, and the opened store of its chunks."""
+        """Return the checked setting, its configuration (JSON data), and the opened store."""
         path = self.output / "robot_map.zarr"
         check_results(path, self.resume, self.overwrite)
         robot = load_robot(self.robot)
@@ -93,7 +93,7 @@ class RobotMapCommand:
         check_positive(self, "horizon", "steps", "seconds")
         if self.terminal == "ellipsoid":
             fail("--terminal", "ellipsoid: a robot's limits are soft rows", "Give invariant or box")
-        # From here on things compile.
+        # The steps from here on compile programs.
         fixed = _home(robot)
         fixed[others] = fixed[others] if self.values is None else self.values
         mpc = default_mpc(robot, self.horizon or 20, self.terminal or "none")
@@ -209,7 +209,7 @@ class RobotMapCommand:
 
 
 def _fields(setting: RobotSetting) -> dict[str, store.Field]:
-    """Return what the store keeps of each state: its labels and its closed loop."""
+    """Return the fields that the store has of each state: its labels and its closed loop."""
     labels = {name: getattr(setting.none(), name) for name in ARRAYS}
     found = {
         name: store.Field(

@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class RobotRuns:
-    """Runs that are checked and open, before any loop compiles.
+    """Runs whose options are checked and whose store is open; no loop is compiled yet.
 
-    command: the options, none of them missing. reference (n,), input_reference (m,): the target,
+    command: the options, all with values. reference (n,), input_reference (m,): the target,
     at rest. steps: samples of a run. starts (B, nq + nv). variations: factors of each plant, as
     `draw_robots` returns them. group: the store.
     """
@@ -57,7 +57,7 @@ class RobotRuns:
 
     @classmethod
     def open(cls, command: "Simulate") -> "RobotRuns":
-        """Open new runs, or some to go on with. Raises ValueError; compiles no loop."""
+        """Open new runs, or some to resume. Raises ValueError; compiles no loop."""
         path = command.output / "runs.zarr"
         check_results(path, command.resume, command.overwrite)
         if command.video:
@@ -67,7 +67,7 @@ class RobotRuns:
         except (AttributeError, ImportError, RuntimeError) as error:
             problem = f"mujoco does not start with {os.environ.get('MUJOCO_GL')!r} ({error})"
             fail("MUJOCO_GL", problem, "Unset it, or install the OpenGL library that it names")
-        with contextlib.redirect_stdout(io.StringIO()):  # MJX tells of absent optional parts
+        with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a note
             robot = load_robot(command.robot)
         sizes = (
             ("--target", command.target, robot.mujoco.nq),
@@ -149,7 +149,7 @@ class RobotRuns:
         return timing
 
     def read(self) -> Run:
-        """Return the runs in the store, on the host."""
+        """Return the runs in the store, as NumPy arrays."""
         data: dict[str, Any] = {name: np.asarray(self.group[name]) for name in STORED}
         # x_0 is measured and no limit binds it, so that there is no soft row at k = 0.
         return Run(**data | {"slack": np.zeros((*data["status"].shape, 0))})
@@ -160,7 +160,7 @@ STORED = tuple(field.name for field in dataclasses.fields(Run) if field.name != 
 
 
 def _fields(command: "Simulate", robot: Robot, steps: int) -> dict[str, store.Field]:
-    """Return what the store keeps of each robot."""
+    """Return the fields that the store has of each robot."""
     number = lambda shape, *axes: store.Field(shape, command.dtype, np.nan, axes)
     found = {
         "states": number((steps + 1, robot.state_size), "sample_time", "state"),
@@ -180,7 +180,7 @@ def _fields(command: "Simulate", robot: Robot, steps: int) -> dict[str, store.Fi
 
 
 def _decisive(command: "Simulate", robot: Robot, mpc: MPC) -> dict[str, Any]:
-    """Return what decides the results, as JSON data."""
+    """Return the options that determine the results, as JSON data."""
     irrelevant = ("output", "video", "tolerance", "resume", "overwrite", "chunk")
     options = {k: v for k, v in dataclasses.asdict(command).items() if k not in irrelevant}
     weights = {
@@ -200,7 +200,7 @@ def _decisive(command: "Simulate", robot: Robot, mpc: MPC) -> dict[str, Any]:
 
 
 def newton_steps(command: "Simulate") -> int:
-    """Return --refine, or what the precision asks for: ADMM alone seldom comes to 1e-6."""
+    """Return --refine, or its default by precision: ADMM alone seldom reaches 1e-6."""
     if command.refine is not None:
         return command.refine
     return 3 if command.dtype == "float64" else 2

@@ -15,20 +15,20 @@ from jaxmpc.checks import fail
 from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.runs import write_json
 
-# What --config says where an option does not, and what holds without either.
+# Defaults of options that --config can give too.
 USUAL = {"horizon": 20, "margin": 0.02, "linearize": "state", "penalty": 1e4}
 
 
 @dataclasses.dataclass(frozen=True)
 class Simulate:
-    """Drive thousands of robots to a target under constrained MPC, and count what holds.
+    """Drive thousands of robots to a target under constrained MPC, and count kept limits.
 
     What it does
-      Puts many copies of a robot at random states, each with its own masses if asked for, and
+      Puts many copies of a robot at random states, each with its own masses if wanted, and
       drives all of them to a target: physics by MuJoCo MJX, at each sample a linear model and an
       MPC that keeps joint, velocity and torque limits. Then assesses every run by its own
       states and inputs, not by what the MPC planned.
-      Limits that a plan cannot keep are broken as little as --penalty asks (fallback), and counted.
+      Limits that a plan cannot keep are violated at the cost --penalty (fallback), and counted.
 
     How to start
       $ jaxmpc simulate
@@ -43,10 +43,10 @@ class Simulate:
       plans valid    robots all of whose plans were solved without fallback; how many kept limits
       worst          the largest violation relative to half the range, in its own unit
       plans solved   plans whose residuals pass: 1e-6 in float64, 1e-3 in float32
-      fallback       plans that break soft limits somewhere on their horizon
+      fallback       plans that violate soft limits somewhere on their horizon
       settling       time after which a robot stays within the tolerance for the rest of its run
       cost           sum of (x - x_target)'Q(x - x_target) + (u - u_target)'R(u - u_target)
-      run            wall time without compiler, files and pictures
+      run            wall time without compiler, files and plots
       real time      robot-seconds simulated in a second of wall time; the second number is
                      simulated time by wall time for all robots at once: above 1 is real time
 
@@ -59,7 +59,7 @@ class Simulate:
       runs.zarr      points (the start), states, inputs, status, cost, fallback, ... of every
                      robot. Opens with xarray.open_zarr(path, consolidated=False).
       Ctrl-C         Stops; finished chunks are kept, --resume goes on from there.
-      Exit code      0 done, whatever the robots did; 2 error (one line on stderr says which);
+      Exit code      0 done, for any outcome; 2 error (one line on stderr says which);
                      130 stopped by Ctrl-C.
     """
 
@@ -105,7 +105,7 @@ class Simulate:
     margin: Annotated[float | None, option("FRACTION", "from --config, else 0.02")] = None
     """Room that the MPC leaves to state limits, as a fraction of half the range."""
     penalty: Annotated[float | None, option("RHO", "from --config, else 1e4")] = None
-    """L1 weight of state limits; too small a weight breaks limits that could be kept."""
+    """L1 weight of state limits; too small a weight violates limits that could be kept."""
     iterations: Annotated[int, option("K", "50")] = 50
     """ADMM steps of each plan."""
     refine: Annotated[int | None, option("K", "2; with float64 3")] = None
@@ -130,7 +130,7 @@ class Simulate:
     output: Annotated[Path, option("DIR", "jaxmpc-simulate")] = Path("jaxmpc-simulate")
     """Folder for the files; made where absent."""
     resume: Switch = False
-    """Go on with the run in --output."""
+    """Resume the run in --output."""
     overwrite: Switch = False
     """Delete the run in --output and start again."""
 
@@ -165,7 +165,7 @@ class Simulate:
         print_table(rows, 13)
 
     def settled(self) -> "Simulate":
-        """Return the command with what --config or `USUAL` says for options not given."""
+        """Return the command with the values of --config or `USUAL` for options not given."""
         found: dict[str, Any] = dict(USUAL)
         if self.config is not None:
             file = load_robot_config(self.config)

@@ -56,7 +56,7 @@ class Sweep:
       summary.json   Counts, plans by status, deepest broken promise, configuration.
       robot_map.npz  points, states, promised, held (1 yes, -1 no, 0 undecided), kept, recursive,
                      feasible, depth, worst (most beyond a limit), broken_at, lost_at, unsolved_at.
-      robot_map.zarr What --resume goes on from: a killed run loses one chunk of 256 states.
+      robot_map.zarr The state for --resume: a killed run loses one chunk of 256 states.
 
     What the TOML file holds (n states, m inputs; dt in seconds, other units are yours)
       name = "joint"
@@ -100,7 +100,7 @@ class Sweep:
     ] = False
     """With more states than axes: feasible for some value of the other states."""
     iterations: Annotated[int | None, option("K", "from the file, else 50")] = None
-    """Solver steps of the first pass over all states; what is left open gets more."""
+    """Solver steps of the first pass over all states; states left undecided get more."""
     dtype: Annotated[
         Literal["float32", "float64"] | None,
         option("{float32,float64}", "from the file, else float32"),
@@ -119,7 +119,7 @@ class Sweep:
         ),
     ] = False
     resume: Switch = False
-    """Go on with the sweep in --output."""
+    """Resume the sweep in --output."""
     overwrite: Switch = False
     """Delete the sweep in --output and start again."""
     refine: Annotated[bool, option(None, "on")] = True

@@ -78,7 +78,7 @@ class TuneWeights:
       tuning.png        The same as curves. Red crosses: steps rejected because not finite.
       before_after.png  Some validation loops with the weights before and after.
       maps.png          The feasible set before and after; for two states, with tightening tuned.
-      checkpoint.npz    The state of the run after every step, from which --resume goes on.
+      checkpoint.npz    The state of the run after every step, for --resume.
       Ctrl-C            Stops. Finished steps are kept, and --resume goes on from there. A finished
                         run goes on with --resume and more --updates.
       Exit code         0 done, whether better or not; 2 error (one line on stderr says which); 130
@@ -111,7 +111,7 @@ class TuneWeights:
     count: Annotated[int, option("B", "64")] = 64
     """Number of initial states, validation included."""
     batch: Annotated[int | None, option("B", "all training loops")] = None
-    """Number of loops of each step, drawn anew."""
+    """Number of loops of each step, drawn again each time."""
     validation: Annotated[float, option("FRACTION", "0.25")] = 0.25
     """Fraction of the initial states in the validation set."""
     steps: Annotated[int | None, option("K", "50; robots: 1 s")] = None
@@ -183,7 +183,7 @@ class TuneWeights:
     output: Annotated[Path, option("DIR", "jaxmpc-weights")] = Path("jaxmpc-weights")
     """Folder for the files; created if absent."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
-    """Go on with the run in --output."""
+    """Resume the run in --output."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
     """Delete the run in --output and start again."""
 
@@ -261,7 +261,7 @@ class TuneWeights:
         return optimizer_of(self.optimizer, self.learning_rate, tried)
 
     def options(self, task: TuningTask) -> dict[str, Any]:
-        """Return what decides the result, as JSON data; --updates may grow on resuming."""
+        """Return the options that determine the result, as JSON data, without --updates."""
         ignored = ("config", "output", "resume", "overwrite", "updates")
         found = {k: v for k, v in dataclasses.asdict(self).items() if k not in ignored}
         solver = {"iterations": task.solver.iterations, "refine": task.solver.refine}

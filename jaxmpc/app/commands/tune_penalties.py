@@ -55,7 +55,7 @@ class TunePenalties:
       digits by which the residuals are too large. Some of the states (--validation) are the
       validation set: the result is the best of all steps on these; where none is better than the
       default (rho = 1, alpha = 1.6) the table says so and the default is kept.
-      ADMM converges to the same plan whatever rho is: a bad rho costs steps, not correctness.
+      ADMM converges to the same plan for every rho: a bad rho costs steps, not correctness.
       Without a file the problem is one robot joint: x = (q, dq), torque u, 20 steps of 0.01 s.
 
     How to start
@@ -79,7 +79,7 @@ class TunePenalties:
       penalties.json  Options, the numbers of the table, loss of every step, versions.
       penalties.png   rho by kind of limit, step of the horizon and stage; distribution of the
                       residuals before and after.
-      checkpoint.npz  The state of the run after every step, from which --resume goes on.
+      checkpoint.npz  The state of the run after every step, for --resume.
       Ctrl-C          Stops. Finished steps are kept, and --resume goes on from there.
       Exit code       0 done, better or not; 2 error (one line on stderr says which); 130 stopped
                       by Ctrl-C.
@@ -103,7 +103,7 @@ class TunePenalties:
     count: Annotated[int, option("B", "1024")] = 1024
     """Number of feasible initial states, validation included."""
     batch: Annotated[int, option("B", "128")] = 128
-    """Number of states of each step, drawn anew."""
+    """Number of states of each step, drawn again each time."""
     validation: Annotated[float, option("FRACTION", "0.25")] = 0.25
     """Fraction of the initial states in the validation set."""
     optimizer: Annotated[str | None, option("NAME", "adam, its rate falling to 3 %")] = None
@@ -123,7 +123,7 @@ class TunePenalties:
     output: Annotated[Path, option("DIR", "jaxmpc-penalties")] = Path("jaxmpc-penalties")
     """Folder for the files; created if absent."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
-    """Go on with the run in --output."""
+    """Resume the run in --output."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
     """Delete the run in --output and start again."""
 

@@ -1,4 +1,4 @@
-"""What `jaxmpc tune weights` and `tune penalties` share: optimizer, initial states, folder."""
+"""Helpers of `jaxmpc tune weights` and `tune penalties`: optimizer, initial states, folder."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ from jaxmpc.runs import differences, write_json
 
 CHECKPOINT = "checkpoint.npz"
 TUNED = "tuned.toml"
-# Random states that are tried at most for each that is wanted.
+# The most random states that are drawn for each state wanted.
 TRIES = 10
 
 
@@ -34,7 +34,7 @@ def optimizer_of(name: str, rate: float, tried: Any = None) -> optax.GradientTra
         assert isinstance(made, optax.GradientTransformation)
         if tried is not None:
             jax.eval_shape(lambda v: made.update(v, made.init(v), v)[0], tried)
-    except Exception:  # whatever a function that is no such optimizer does
+    except Exception:  # any error of a function that is no such optimizer
         fail("--optimizer", f"{name!r} is no optimizer of optax that serves here", cure)
     return made
 
@@ -90,8 +90,8 @@ def feasible_states(
 ) -> tuple[np.ndarray, int]:
     """Return uniform states (count, n) within limits that have a plan, and how many had none.
 
-    Whether a state has a plan is decided by linear programs on the host, without compiling: hard
-    rows are all linear but for an ellipsoidal terminal set, which is left out.
+    Linear programs decide whether a state has a plan, without compiling: all hard rows are linear
+    but those of an ellipsoidal terminal set, which are left out.
     """
     rows = Inequalities.of(FeasibilityProblem.of(mpc).condensed)
     random, dropped = np.random.default_rng(seed), 0
@@ -115,10 +115,10 @@ def feasible_states(
 def open_run(
     folder: Path, files: tuple[str, ...], options: dict[str, Any], resume: bool, overwrite: bool
 ) -> None:
-    """Open the folder of a new run, or of one that goes on with the same options.
+    """Open the folder of a new run, or of one that is resumed with the same options.
 
-    files[0] is the record of the run, a JSON file that holds the options; all files are removed,
-    and the record is begun. Raises ValueError where the folder holds a run with other options, or
+    files[0] is the record of the run, a JSON file that holds the options. All files are removed and
+    a new record is written. Raises ValueError where the folder holds a run with other options, or
     any run without `resume` or `overwrite`.
     """
     if resume and overwrite:
@@ -130,10 +130,10 @@ def open_run(
         fail(str(folder / there[0]), "exists", what)
     if resume and record.exists():
         try:
-            said = json.loads(record.read_text())["options"]
+            stored = json.loads(record.read_text())["options"]
         except (ValueError, KeyError, TypeError):
             fail(str(record), "holds no run", "Add --overwrite to start again")
-        if changes := differences(said, options):
+        if changes := differences(stored, options):
             fail(str(record), "; ".join(changes), "Give the same options, or --overwrite")
     open_folder(folder)
     for name in (*files, *([CHECKPOINT] if overwrite else [])):  # of an earlier run

@@ -1,4 +1,4 @@
-"""Checks of a configuration as a whole: keys, each good alone, must fit one another."""
+"""Checks of a configuration as a whole: keys that are valid alone must fit one another."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from jaxmpc.checks import fail
 
 
 def check(config: Config, command: str = "sweep") -> None:
-    """Raise ValueError where keys, each good alone, do not fit one another."""
+    """Raise ValueError where keys that are valid alone do not fit one another."""
     s, limits = config.system, config.limits
     n, m = len(s.A), len(s.B[0])
     for key, value, count in (

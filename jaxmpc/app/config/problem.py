@@ -34,7 +34,7 @@ COMMANDS = ("sweep", "recursion")
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Config:
-    """A problem and what is asked of it: the sections of the file."""
+    """A problem and the settings of commands: the sections of the file."""
 
     name: str = "mpc"
     system: SystemSection

@@ -85,7 +85,7 @@ class MPCSection:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class SweepSection:
-    """Which initial states are asked: a grid over the mapped states."""
+    """The initial states of a sweep: a grid over the mapped states."""
 
     grid: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)] | None = None
     lower: Vector | None = None  # (d,), none means the state limits widened by 3 % each side

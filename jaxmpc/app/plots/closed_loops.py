@@ -1,4 +1,4 @@
-"""The picture of closed loops over time: positions, velocities and inputs with their limits."""
+"""The plot of closed loops over time: positions, velocities and inputs with their limits."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -25,7 +25,7 @@ def plot_runs(
     """Draw closed loops over time: a panel for each position, velocity and input.
 
     run: of `simulate` or `simulate_many`, of a Robot or LinearPlant. Limits are lines, what lies
-    outside is grey. Orange: samples whose plan breaks soft limits (fallback). Red: limits exceeded
+    outside is grey. Orange: fallback plans, which violate soft limits. Red: limits violated
     by more than 1e-6 (of the limit, if that is above 1). reference (n,), input_reference (m,):
     set-points to draw. robots: which of the batch to draw, 24 at most by default; the title
     counts all. Raises ValueError for robots that are not there.

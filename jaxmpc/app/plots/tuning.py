@@ -25,7 +25,7 @@ _BEFORE, _AFTER, _REJECTED, _BEST = "#d55e00", "#0072b2", "#a50f15", "#006f52"
 _FRACTIONS = (
     ("unsolved", "plans not solved", "#0072b2", "-"),
     ("infeasible", "plans proved infeasible", "#a50f15", "--"),
-    ("fallback", "plans that break soft limits", "#e69f00", "-"),
+    ("fallback", "plans that violate soft limits", "#e69f00", "-"),
     ("violation", "loops beyond the limits", "#006f52", ":"),
 )
 # Lines of a panel that get a name each; more are named by the groups they belong to.
@@ -48,7 +48,7 @@ def plot_tuning(
     ((top, norm), (ratio, counts)) = figure.subplots(2, 2)
     every, steps, best = np.arange(history.steps + 1), np.arange(history.steps), history.best
     loss, validation = history.loss, history.validation
-    # Training and validation loops differ: what they share is by how much they fall.
+    # Training and validation loops differ, so only relative changes are comparable.
     relative = validation[0] > 0 and len(loss) > 0 and loss[0] > 0
     if relative:
         loss, validation = loss / loss[0], validation / validation[0]
@@ -94,7 +94,7 @@ def plot_tuning(
 
 
 def _scale(ax: Axes, *columns: np.ndarray) -> None:
-    """A logarithmic axis where values are positive and range over more than a factor of 5."""
+    """Use a logarithmic axis where values are positive and range over more than a factor of 5."""
     values = np.concatenate(columns)
     values = values[np.isfinite(values)]
     if len(values) and values.min() > 0 and values.max() > 5 * values.min():
@@ -104,7 +104,8 @@ def _scale(ax: Axes, *columns: np.ndarray) -> None:
 
 
 def _logarithmic(ax: Axes, values: np.ndarray) -> None:
-    """With ticks at 1, 2, 5 in plain numbers where powers of ten would leave too few."""
+    """Use a logarithmic axis, with ticks at 1, 2, 5 in plain numbers where powers of ten would
+    leave too few."""
     ax.set_yscale("log")
     decades = np.log10(values.max() / values.min())
     if decades < 3:
@@ -118,7 +119,7 @@ def _logarithmic(ax: Axes, values: np.ndarray) -> None:
 def _draw_weights(
     ax: Axes, steps: np.ndarray, weights: Mapping[str, Mapping[str, np.ndarray]]
 ) -> None:
-    """Each weight over its start; a colour a line, or a colour a group where there are many."""
+    """Draw each weight over its start: one colour a line, or one a group where there are many."""
     count = sum(len(entries) for entries in weights.values())
     colours = matplotlib.colormaps["tab10"].colors  # type: ignore[attr-defined]
     i, handles, ratios = 0, [], []
