@@ -126,8 +126,8 @@ def cost_of_law(system: LinearSystem, K: ArrayLike, Q: ArrayLike, R: ArrayLike) 
     dtype = floating_dtype(tuple(jnp.asarray(part) for part in data))
     A, B, gain, W, V = (jnp.asarray(part, dtype) for part in data)
     loop = A + matmul(B, gain)
-    cost = _lyapunov(loop, W + matmul(gain.T, matmul(V, gain)))
-    _, left = _sum(jax.lax.stop_gradient(loop), jnp.zeros_like(W))
+    cost = _solve_lyapunov(loop, W + matmul(gain.T, matmul(V, gain)))
+    _, left = _power_sum(jax.lax.stop_gradient(loop), jnp.zeros_like(W))
     return jnp.where(left < 1e-3, (cost + cost.T) / 2, jnp.nan)
 
 
@@ -190,7 +190,7 @@ def _solution_jvp(data: tuple[Array, ...], moves: tuple[Array, ...]) -> tuple[Ar
     K = _gain_of(A, B, R, P)
     closed = A + matmul(B, K)
     F = matmul(matmul(closed.T, P), dA + matmul(dB, K))
-    dP = _lyapunov(closed, dQ + matmul(K.T, matmul(dR, K)) + F + F.T)
+    dP = _solve_lyapunov(closed, dQ + matmul(K.T, matmul(dR, K)) + F + F.T)
     return P, dP * jnp.where(jnp.isfinite(P), 1.0, jnp.nan)  # no number without a solution
 
 
@@ -227,7 +227,7 @@ def _doubling(A: Array, B: Array, Q: Array, R: Array) -> Array:
     P, _ = recursion(P)
     P, _ = recursion(P)
     again, closed = recursion(P)
-    _, left = _sum(closed, Q)
+    _, left = _power_sum(closed, Q)
     good = (_size(again - P) <= _RESIDUAL * _size(P)) & (left < 1e-3)
     return jnp.where(good, again, jnp.nan)
 
@@ -236,7 +236,7 @@ def _size(M: Array) -> Array:
     return jnp.max(jnp.abs(M))
 
 
-def _sum(M: Array, S: Array) -> tuple[Array, Array]:
+def _power_sum(M: Array, S: Array) -> tuple[Array, Array]:
     """Return the sum over k of (M')^k S M^k, by doubling, and the size of the power of M that is
     left."""
 
@@ -252,11 +252,11 @@ def _sum(M: Array, S: Array) -> tuple[Array, Array]:
     return X, _size(M)
 
 
-def _lyapunov(M: Array, S: Array) -> Array:
+def _solve_lyapunov(M: Array, S: Array) -> Array:
     """Return the solution X of X = M'X M + S, for M with spectral radius below 1."""
     return jax.lax.custom_linear_solve(
         lambda X: X - matmul(M.T, matmul(X, M)), S,
-        solve=lambda _, S: _sum(M, S)[0], transpose_solve=lambda _, S: _sum(M.T, S)[0],
+        solve=lambda _, S: _power_sum(M, S)[0], transpose_solve=lambda _, S: _power_sum(M.T, S)[0],
     )  # fmt: skip
 
 

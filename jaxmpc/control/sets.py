@@ -9,7 +9,7 @@ where those make no sense.
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -574,6 +574,20 @@ class Ellipsoid:
             fail(f"{argument}.P", f"shape {shape} is not (n, n)", "Give a square matrix")
         _require_dimension(argument, shape[0], dimension)
         require_shape(f"{argument}.level", as_array(self.level), (), "Give one number")
+
+
+def translated(set_: Any, by: np.ndarray) -> Any:
+    """Return the set {x + by : x in set_}; None for None. NumPy; not traceable.
+
+    Raises ValueError for an Ellipsoid, whose centre is the origin, unless by = 0.
+    """
+    if isinstance(set_, Box):
+        return Box(np.asarray(set_.lower) + by, np.asarray(set_.upper) + by)
+    if isinstance(set_, Polytope):
+        return replace(set_, h=np.asarray(set_.h) + np.asarray(set_.H) @ by)
+    if isinstance(set_, Ellipsoid) and by.any():
+        fail("terminal_set", "is an Ellipsoid about the origin", "Use a Polytope")
+    return set_
 
 
 def require_labels(argument: str, labels: Any, rows: int) -> None:

@@ -20,7 +20,7 @@ from jaxmpc.control.invariant import (
     supports,
 )
 from jaxmpc.control.riccati import least_reached, lqr
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope, translated
 from jaxmpc.control.system import LinearSystem, host_array
 
 # A limit counts as kept if it is exceeded by no more than this, relative to the set's extent
@@ -156,7 +156,7 @@ def verify_terminal(
     A, B = host_array("A", system.A), host_array("B", system.B)
     c = np.zeros(n) if system.c is None else host_array("c", system.c)
     Q, R = _symmetric("Q", Q, n), _symmetric("R", R, m)
-    X, U = _rows("states", states, n), _rows("inputs", inputs, m)
+    X, U = _unit_rows("states", states, n), _unit_rows("inputs", inputs, m)
     law, trouble = None, ""
     if K is None or terminal_cost is None:
         try:
@@ -185,7 +185,7 @@ def verify_terminal(
     else:
         if terminal_set is None:
             role = " (there is no terminal set: X in its role, at horizon N - 1)"
-        X_f = _Rows(*(X if terminal_set is None else _rows("terminal_set", terminal_set, n)))
+        X_f = _Rows(*(X if terminal_set is None else _unit_rows("terminal_set", terminal_set, n)))
 
     checks = [_compact("states", "X", X), _compact("inputs", "U", U)]
     checks.append(
@@ -204,7 +204,7 @@ def verify_terminal(
         else:
             kept, certificate, factor, exact = _rows_kept(X_f, closed, c, W, (A, B, gain))
     checks += [_control_invariance(system, X_f, inputs, disturbance, kept, admissible, role)]
-    checks += [kept, admissible, _lyapunov(closed, gain, P, Q, R, no_law)]
+    checks += [kept, admissible, _check_lyapunov(closed, gain, P, Q, R, no_law)]
     checks += _weights(A, Q, R, P, trouble)
     shift = float(np.abs(c).max(initial=0.0))
     checks.append(
@@ -391,7 +391,7 @@ def _exact_factor(
         used = np.flatnonzero(M[i] > 0)
         y = [Fraction(float(M[i, j])) for j in used]
         if len(used) == n:
-            solved = _solve(
+            solved = _gauss_jordan(
                 [list(column) for column in zip(*(rows[j] for j in used), strict=True)], image
             )
             y = solved if solved is not None and min(solved) >= 0 else y
@@ -439,7 +439,7 @@ def _ellipse_kept(
             factor,
             None,
         )
-    w_norm = float(np.sqrt(c @ P @ c)) if W is None else largest_norm(_moved(W, c), P)
+    w_norm = float(np.sqrt(c @ P @ c)) if W is None else largest_norm(translated(W, c), P)
     radius = np.sqrt(X_f.level)
     slack = float(1 - np.sqrt(factor) - w_norm / radius)
     sentence += (
@@ -448,12 +448,6 @@ def _ellipse_kept(
     holds = True if slack >= -_TOUCH else None if factor <= 1 else False
     sentence += "." if holds else ", a bound that is sufficient only."
     return Check(name, holds, slack, "of the radius", sentence, (3,)), factor, None
-
-
-def _moved(W: Box | Polytope, c: np.ndarray) -> Box | Polytope:
-    if isinstance(W, Box):
-        return Box(host_array("w", W.lower) + c, host_array("w", W.upper) + c)
-    return Polytope(W.H, host_array("w", W.h) + host_array("w", W.H) @ c)
 
 
 def _control_invariance(
@@ -495,7 +489,7 @@ def _control_invariance(
     return Check(name, False, -cut, unit, sentence, (1,))
 
 
-def _lyapunov(
+def _check_lyapunov(
     closed: np.ndarray | None, K: Any, P: Any, Q: np.ndarray, R: np.ndarray, no_law: str
 ) -> Check:
     name, unit = "Lyapunov inequality", "cost per |x|^2"
@@ -556,7 +550,7 @@ def _origin_inside(X_f: _Set) -> Check:
     return Check(name, depth > 0, depth, unit, sentence, (3,))
 
 
-def _rows(argument: str, value: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
+def _unit_rows(argument: str, value: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows of a set, scaled to norm 1; no rows if it is None."""
     if value is None:
         return np.zeros((0, n)), np.zeros(0)
@@ -591,7 +585,7 @@ def _dot(a: Any, b: Any) -> Fraction:
     return sum((x * y for x, y in zip(a, b, strict=True)), Fraction(0))
 
 
-def _solve(matrix: list, right: list) -> list | None:
+def _gauss_jordan(matrix: list, right: list) -> list | None:
     """Solve a square system in rationals by Gauss-Jordan elimination; None if it is singular."""
     rows = [[*row, b] for row, b in zip(matrix, right, strict=True)]
     for k in range(len(rows)):

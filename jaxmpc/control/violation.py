@@ -25,7 +25,7 @@ def row_violations(limits: Limits, x: Any) -> Any:
     x: points (..., n). Returns (..., rows): 0 where a row is kept, NaN where x is not finite. A Box
     has one row a coordinate.
     """
-    value, lower, upper = _rows(limits, x)
+    value, lower, upper = _row_values(limits, x)
     xp = _namespace(value)
     return xp.maximum(xp.maximum(value - upper, lower - value), 0.0)
 
@@ -47,14 +47,14 @@ def kept(limits: Limits, x: Any, dtype: Any = None) -> Any:
 
     dtype: the precision in which x was computed, if other than that of x.
     """
-    value, lower, upper = _rows(limits, x)
+    value, lower, upper = _row_values(limits, x)
     xp = _namespace(value)
     relative = TOLERANCE[str(np.dtype(value.dtype if dtype is None else dtype))]
     room = lambda end: relative * xp.maximum(1.0, xp.where(xp.isfinite(end), xp.abs(end), 0.0))
     return (value - upper <= room(upper)) & (lower - value <= room(lower))
 
 
-def _rows(limits: Limits, x: Any) -> tuple[Any, Any, Any]:
+def _row_values(limits: Limits, x: Any) -> tuple[Any, Any, Any]:
     """Return H x (..., rows) and its bounds; NaN where x is not finite."""
     xp = _namespace(x, limits)
     x = xp.asarray(x)

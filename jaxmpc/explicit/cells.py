@@ -32,7 +32,7 @@ class ActivePiece:
 def active_piece(p: LeastDistanceForm, active: tuple[int, ...]) -> ActivePiece | None:
     """Return the affine law of an active set; None where its rows are dependent or it holds
     nowhere."""
-    solved = p.solve(active)
+    solved = p.solve_active(active)
     if solved is None:
         return None
     multipliers, y = solved

@@ -79,7 +79,7 @@ class LeastDistanceForm:
         rows = np.vstack([rows, np.eye(rows.shape[1])[-1]])
         return maximum(np.ones(1), rows, np.append(self.v + self.V @ xi, 1.0))[0]
 
-    def solve(self, active: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray] | None:
+    def solve_active(self, active: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray] | None:
         """Return λ (a, n + 2) and y (nz, n + 2), affine in ξ, constant and δ; None for dependent
         rows."""
         rows = list(active)
@@ -121,7 +121,7 @@ class LeastDistanceForm:
                 except RuntimeError:
                     continue
                 active = tuple(moving[np.flatnonzero(u)].tolist())
-            solved = self.solve(active)
+            solved = self.solve_active(active)
             if solved is None:
                 continue
             multipliers, y = (part[:, :-1] @ np.append(xi, 1.0) for part in solved)
@@ -180,9 +180,9 @@ def least_distance_form(mpc: MPC, within: Box | Polytope | None = None) -> Least
         fail("R", "leaves the condensed cost singular in float64", "Put a larger weight on inputs")
     G, D, v, row, side = Inequalities.of(c)
     V = -D
-    H, h = half_spaces(within, n)
+    H, h = unit_half_spaces(within, n)
     if mpc.remembers and mpc.inputs is not None:  # a previous input is one that was applied
-        H_u, h_u = half_spaces(mpc.inputs, mpc.system.m)
+        H_u, h_u = unit_half_spaces(mpc.inputs, mpc.system.m)
         H, h = np.vstack([H, np.pad(H_u, ((0, 0), (mpc.system.n, 0)))]), np.append(h, h_u)
     G, V, v = np.vstack([G, np.zeros((len(h), G.shape[1]))]), np.vstack([V, -H]), np.append(v, h)
     row, side = np.append(row, np.full(len(h), -1)), np.append(side, np.ones(len(h)))
@@ -259,7 +259,7 @@ def maximum(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> tuple[float, np.ndar
     return np.nan, None
 
 
-def half_spaces(set_: Box | Polytope | None, n: int) -> tuple[np.ndarray, np.ndarray]:
+def unit_half_spaces(set_: Box | Polytope | None, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the unit rows (H, h) of a set of initial states; none for None."""
     if set_ is None:
         return np.zeros((0, n)), np.zeros(0)

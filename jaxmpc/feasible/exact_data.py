@@ -155,7 +155,7 @@ def exact_data(
         start[others] = one_sided(view.lower, view.upper)[1]
     elif others:
         start[others] = np.abs(view.fixed)[others]
-    grown, u_size = np.where(np.isfinite(start), start, 0.0), largest(u_lower, u_upper)
+    grown, u_size = np.where(np.isfinite(start), start, 0.0), largest_magnitude(u_lower, u_upper)
     errors = []
     for k in range(1, N + 1):
         with np.errstate(invalid="ignore"):  # 0·inf below counts as 0
@@ -165,7 +165,7 @@ def exact_data(
         far = (bound > grown) | np.isinf(bound)
         errors.append((1.0 * far, np.where(far, 0.0, side), np.where(far, 0.0, bound)))
         grown = np.minimum(grown, bound)
-    x_size = [largest(*limits(k)[:, :n]) for k in range(N + 1)]
+    x_size = [largest_magnitude(*limits(k)[:, :n]) for k in range(N + 1)]
     implied = input_size(A[:n, :n], B[:n], c[:n], x_size)
     steps = [np.equal(mpc.moves, i) for i in range(max(mpc.moves) + 1)]
     implied = np.array([implied[same].min(axis=0) for same in steps])
@@ -202,11 +202,13 @@ def input_size(A: np.ndarray, B: np.ndarray, c: np.ndarray, size: list[np.ndarra
 def one_sided(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (s, r) with the least r for which |x| + s x ≤ r on lower ≤ x ≤ upper, s in {0, 1,
     −1}."""
-    ways = np.array([largest(lower, upper), 2 * np.maximum(upper, 0), 2 * np.maximum(-lower, 0)])
+    ways = np.array(
+        [largest_magnitude(lower, upper), 2 * np.maximum(upper, 0), 2 * np.maximum(-lower, 0)]
+    )
     best = np.argmin(ways, axis=0)
     return np.array([0.0, 1.0, -1.0])[best], ways.min(axis=0)
 
 
-def largest(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+def largest_magnitude(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """Return the largest |x| on lower ≤ x ≤ upper."""
     return np.maximum(np.abs(lower), np.abs(upper))

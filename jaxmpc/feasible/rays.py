@@ -104,9 +104,7 @@ class Rays:
         """Return the half-spaces (normals, offsets) of the bounding box, those that exist."""
         _, sides = self.problem.programs.bounding_box
         with jax.enable_x64(True):
-            normals, offsets = (
-                np.asarray(v) for v in half_spaces(self.exact, self.problem.rows, sides)
-            )
+            normals, offsets = (np.asarray(v) for v in cuts(self.exact, self.problem.rows, sides))
         valid = np.isfinite(offsets)
         return normals[valid], offsets[valid]
 
@@ -125,7 +123,7 @@ class Rays:
         with jax.enable_x64(True):
             feasible, normals, offsets = (
                 np.asarray(v)[:count]
-                for v in prove(self.exact, self.problem.rows, theta[fill], w[fill], y[fill])
+                for v in prove_rays(self.exact, self.problem.rows, theta[fill], w[fill], y[fill])
             )
         feasible = feasible & bounded[:, None]
         best, each = np.argmax(feasible, axis=1), np.arange(len(directions))
@@ -142,7 +140,7 @@ class Rays:
 
 
 @jax.jit
-def prove(p: ExactData, rows: ConstraintRows, theta: Any, w: Any, y: Any) -> tuple[Array, ...]:
+def prove_rays(p: ExactData, rows: ConstraintRows, theta: Any, w: Any, y: Any) -> tuple[Array, ...]:
     """Return which points (K, backoffs, d) of the rays are proved feasible, and the half-spaces of
     the rays' multipliers."""
 
@@ -150,10 +148,10 @@ def prove(p: ExactData, rows: ConstraintRows, theta: Any, w: Any, y: Any) -> tup
         inputs, free = inputs_of(p, rows, theta, w)
         return proofs.prove_feasible(p, theta, free, inputs)[0]
 
-    return jax.vmap(jax.vmap(feasible))(theta, w), *half_spaces(p, rows, y)
+    return jax.vmap(jax.vmap(feasible))(theta, w), *cuts(p, rows, y)
 
 
-def half_spaces(p: ExactData, rows: ConstraintRows, y: Any) -> tuple[Array, Array]:
+def cuts(p: ExactData, rows: ConstraintRows, y: Any) -> tuple[Array, Array]:
     """Return the normals (K, d) and offsets (K,) of half-spaces that hold on the whole feasible
     set, from multipliers (K, R)."""
     return jax.vmap(lambda y: proofs.everywhere(p, *cut_of(p, rows, y)))(y)

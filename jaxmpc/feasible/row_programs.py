@@ -23,7 +23,7 @@ class RowPrograms:
         self.rows, k = rows, sum(rows.balls)
         self.normals = np.concatenate([np.eye(k), -np.eye(k)])
 
-    def solve(
+    def solve_lp(
         self, cost: np.ndarray, U: np.ndarray, lower: np.ndarray, upper: np.ndarray,
         bounds: list[Any], margin: np.ndarray | None = None,
     ) -> tuple[Any, np.ndarray]:  # fmt: skip
@@ -87,7 +87,7 @@ class RowPrograms:
     ) -> tuple[float, np.ndarray, np.ndarray]:
         k = self.rows.U.shape[1]
         bounds = [(None, None)] * k + [(low, None)] * (U.shape[1] - k)
-        result, y = self.solve(cost, U, self.rows.lower - shift, self.rows.upper - shift, bounds)
+        result, y = self.solve_lp(cost, U, self.rows.lower - shift, self.rows.upper - shift, bounds)
         if result.x is None:
             return -np.inf if result.status == 2 else np.inf, np.zeros(k), y
         return float(-result.fun), result.x[:k], y
@@ -122,7 +122,7 @@ class RowPrograms:
         largest = max(1.0, np.abs(ends[np.isfinite(ends)]).max(initial=0.0))
         if rows.balls:
             size[-sum(rows.balls) :] = size[-sum(rows.balls) :].max()
-        result, _ = self.solve(
+        result, _ = self.solve_lp(
             np.eye(k + d + 1)[-1], np.hstack([rows.U, rows.D, np.zeros((len(rows.U), 1))]),
             rows.lower, rows.upper, [(None, None)] * k + pinned + [(None, largest)], size,
         )  # fmt: skip

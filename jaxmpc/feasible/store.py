@@ -135,7 +135,7 @@ def save_bounds(
         group.create_array(name, data=value, overwrite=True, dimension_names=dimensions)
 
 
-def read(path: str | Path) -> "xr.Dataset":
+def open_dataset(path: str | Path) -> "xr.Dataset":
     """Return the store as an xarray Dataset (lazy); rows of chunks not done hold the fill
     values."""
     import xarray as xr  # takes longer to import than to read

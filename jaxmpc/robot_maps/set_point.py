@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.checks import fail
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope
+from jaxmpc.control.sets import Box, translated
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
 
@@ -46,18 +45,7 @@ def deviations(mpc: MPC, x: Any, u: Any) -> MPC:
         by = np.asarray(each.C) @ x + D @ u
         rows.append(replace(each, lower=np.asarray(each.lower) - by, upper=each.upper - by))
     return replace(
-        mpc, system=replace(system, c=A @ x + B @ u + c - x), states=moved(mpc.states, x),
-        inputs=moved(mpc.inputs, u), terminal_set=moved(mpc.terminal_set, x), outputs=tuple(rows),
+        mpc, system=replace(system, c=A @ x + B @ u + c - x), states=translated(mpc.states, -x),
+        inputs=translated(mpc.inputs, -u), terminal_set=translated(mpc.terminal_set, -x),
+        outputs=tuple(rows),
     )  # fmt: skip
-
-
-def moved(set_: Any, by: np.ndarray) -> Any:
-    """Return the set {x − by : x in set_}; None for None. Raises ValueError for an Ellipsoid, which
-    is about the origin, unless by = 0."""
-    if isinstance(set_, Box):
-        return Box(np.asarray(set_.lower) - by, np.asarray(set_.upper) - by)
-    if isinstance(set_, Polytope):
-        return replace(set_, h=np.asarray(set_.h) - np.asarray(set_.H) @ by)
-    if isinstance(set_, Ellipsoid) and by.any():
-        fail("terminal_set", "is an Ellipsoid about the origin", "Use a Polytope")
-    return set_

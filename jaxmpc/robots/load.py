@@ -55,7 +55,7 @@ def load_robot(
     name = "robot"
     if isinstance(model, str | Path):
         name = Path(model).stem
-        model, velocities = _read(model)
+        model, velocities = _compiled_model(model)
     elif not isinstance(model, mujoco.MjModel):
         fail("model", f"is a {type(model).__name__}", "Give a name, a path or a mujoco.MjModel")
     host = copy.deepcopy(model)
@@ -88,12 +88,12 @@ def load_robot(
     smooth.jnt_actfrclimited[:] = 0
     names, units = _state_names(host)
     states = _state_limits(host, position, velocity, velocities)
-    q = _home(host) if home is None else _configuration(host, home)
+    q = _home_qpos(host) if home is None else _configuration(host, home)
     return Robot(
         state_limits=states, input_limits=inputs, home=np.concatenate([q, np.zeros(host.nv)]),
         plant=Physics(host), predictor=Physics(smooth), anchor=_anchor(host, q),
         substeps=substeps, dt=control_period, name=name, state_names=names, state_units=units,
-        input_names=tuple(_names(host, mujoco.mjtObj.mjOBJ_ACTUATOR, host.nu, "u")),
+        input_names=tuple(_mujoco_names(host, mujoco.mjtObj.mjOBJ_ACTUATOR, host.nu, "u")),
         input_units=tuple(_input_unit(host, i) for i in range(host.nu)),
     )  # fmt: skip
 
@@ -122,7 +122,7 @@ def _anchor(host: "mujoco.MjModel", home: np.ndarray) -> tuple[float, ...]:
     return tuple(anchor.tolist())
 
 
-def _read(model: str | Path) -> tuple["mujoco.MjModel", dict[str, float]]:
+def _compiled_model(model: str | Path) -> tuple["mujoco.MjModel", dict[str, float]]:
     """Return the compiled model, and the velocity limits of a URDF by joint."""
     import mujoco
 
@@ -184,7 +184,7 @@ def _numeric(host: "mujoco.MjModel", name: str, default: Any) -> Any:
     return value[0] if size == 1 else value
 
 
-def _names(host: "mujoco.MjModel", kind: Any, count: int, letter: str) -> list[str]:
+def _mujoco_names(host: "mujoco.MjModel", kind: Any, count: int, letter: str) -> list[str]:
     import mujoco
 
     return [mujoco.mj_id2name(host, kind, i) or f"{letter}{i + 1}" for i in range(count)]
@@ -197,7 +197,7 @@ def _state_names(host: "mujoco.MjModel") -> tuple[tuple[str, ...], tuple[str, ..
     free, ball, slide, _ = range(4)
     positions: list[tuple[str, str]] = []
     for name, kind in zip(
-        _names(host, mujoco.mjtObj.mjOBJ_JOINT, host.njnt, "q"), host.jnt_type, strict=True
+        _mujoco_names(host, mujoco.mjtObj.mjOBJ_JOINT, host.njnt, "q"), host.jnt_type, strict=True
     ):
         if kind == free:
             positions += [(f"{name} {axis}", "m") for axis in "xyz"]
@@ -264,7 +264,7 @@ def _state_limits(
 
     nv = host.nv
     lower, upper = np.full(2 * nv, -np.inf), np.full(2 * nv, np.inf)
-    names = _names(host, mujoco.mjtObj.mjOBJ_JOINT, host.njnt, "q")
+    names = _mujoco_names(host, mujoco.mjtObj.mjOBJ_JOINT, host.njnt, "q")
     for j in range(host.njnt):
         dof = host.jnt_dofadr[j]
         if host.jnt_limited[j] and host.jnt_type[j] in (2, 3):
@@ -298,7 +298,7 @@ def _overridden(argument: str, limits: Box, override: Limit, part: slice) -> Box
     return Box(lower, upper)
 
 
-def _home(host: "mujoco.MjModel") -> np.ndarray:
+def _home_qpos(host: "mujoco.MjModel") -> np.ndarray:
     """Return qpos of the key "home", else of the first key, else qpos0 moved inside the ranges."""
     import mujoco
 

@@ -163,7 +163,7 @@ def _root(x: Array) -> Array:
 
 
 @_root.defjvp
-def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+def _root_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     y = _root(*primals)
     inside = y > 0
     return y, jnp.where(inside, tangents[0] / (2 * jnp.where(inside, y, 1)), 0)

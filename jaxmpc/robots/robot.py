@@ -92,7 +92,7 @@ class Robot:
         step computes its Jacobian by forward mode, that of constraint forces by the implicit
         function theorem instead of through MJX's solver. Second derivatives: forward over either.
         """
-        return _stepped(self, *self._read(x, u))
+        return _stepped(self, *self._checked_arrays(x, u))
 
     def _step(self, x: Array, u: Array) -> Array:
         body = lambda x, _: (self.plant.step(x, u, self.numbers), None)
@@ -107,7 +107,7 @@ class Robot:
         arm A is off by 1 %, B by 0.05 %). exact=True: Jacobians along the physics steps, and c such
         that the model passes through the predictor's own next state.
         """
-        return _linearized(self, *self._read(x, u), exact=exact)
+        return _linearized(self, *self._checked_arrays(x, u), exact=exact)
 
     def _linearize(self, x: Array, u: Array, exact: bool) -> LinearSystem:
         advance = lambda s, u: self.coordinates(self.predictor.step(self.state(s), u))
@@ -143,7 +143,7 @@ class Robot:
     def transition(self, x: Any, u: Any) -> tuple[Array, Array]:
         """Return A (n, n), B (n, m) of one physics step of the plant about x, u, in tangent
         coordinates: those of mujoco.mjd_transitionFD, by automatic differentiation."""
-        return _differentiated(self, *self._read(x, u))
+        return _differentiated(self, *self._checked_arrays(x, u))
 
     def _transition(self, x: Array, u: Array) -> tuple[Array, Array]:
         nq, nv = self.mujoco.nq, self.mujoco.nv
@@ -318,7 +318,7 @@ class Robot:
             "body_iquat": put("body_iquat", _quaternion(axes)),
         }  # fmt: skip
 
-    def _read(self, x: Any, u: Any) -> tuple[Array, Array]:
+    def _checked_arrays(self, x: Any, u: Any) -> tuple[Array, Array]:
         size = self.state_size
         problem = "Give (qpos, qvel) of one robot; use jax.vmap for many"
         if np.shape(x) == (self.n,) != (size,):

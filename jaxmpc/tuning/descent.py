@@ -97,7 +97,7 @@ def descend(
     if path is not None:
         remove_partial(path)
     if path is not None and path.exists():
-        state = _load(path, theta, optimizer, mark)
+        state = _load_checkpoint(path, theta, optimizer, mark)
         first, now = state.checks[0]["loss"], _checked(validate, theta)["loss"]
         if not np.isclose(now, first, rtol=1e-4, atol=0):
             problem = f"began with the validation loss {first:.9g}, which is {now:.9g} now"
@@ -108,7 +108,7 @@ def descend(
         if not np.isfinite(state.checks[0]["loss"]):
             fail("parameters", "have no finite validation loss at the start", "Start elsewhere")
         state.seconds += time.perf_counter() - begun
-        _save(path, state, mark, decides)
+        _save_checkpoint(path, state, mark, decides)
     with tqdm(total=updates, unit=" steps", disable=not settings.progress) as bar:
         bar.update(len(state.rows))
         while len(state.rows) < updates:
@@ -117,7 +117,7 @@ def descend(
             state.checks.append(_checked(validate, state.theta))
             state.thetas.append(state.theta)
             state.seconds += time.perf_counter() - begun
-            _save(path, state, mark, decides)
+            _save_checkpoint(path, state, mark, decides)
             losses = [check["loss"] for check in state.checks]
             bar.set_postfix_str(f"validation {losses[-1]:.4g}, best {np.nanmin(losses):.4g}")
             bar.update(1)
@@ -155,10 +155,10 @@ def _step(state: State, gradient: Gradient, optimizer: optax.GradientTransformat
             return
         else:
             state.fraction /= 2
-    state.theta = _moved(state.good, state.fraction, optimizer)
+    state.theta = _after_step(state.good, state.fraction, optimizer)
 
 
-def _moved(good: tuple[Any, Any, Any], fraction: float, optimizer: Any) -> Any:
+def _after_step(good: tuple[Any, Any, Any], fraction: float, optimizer: Any) -> Any:
     """Return θ after this fraction of the optimiser's step."""
     theta, slope, before = good
     with jax.enable_x64(True):
@@ -192,7 +192,7 @@ def _record(state: State) -> Descent:
     )  # fmt: skip
 
 
-def _save(path: Path | None, state: State, mark: str, decides: Any) -> None:
+def _save_checkpoint(path: Path | None, state: State, mark: str, decides: Any) -> None:
     """Write the checkpoint; nothing where `path` is None."""
     if path is None:
         return
@@ -209,7 +209,9 @@ def _save(path: Path | None, state: State, mark: str, decides: Any) -> None:
     write_arrays(path, plain, **leaves)
 
 
-def _load(path: Path, theta: Any, optimizer: optax.GradientTransformation, mark: str) -> State:
+def _load_checkpoint(
+    path: Path, theta: Any, optimizer: optax.GradientTransformation, mark: str
+) -> State:
     """Return the state of an interrupted run; raise ValueError for a file of another run."""
     kept = read_arrays(path)
     if kept is None or "fingerprint" not in (kept[0] or {}):
@@ -235,7 +237,7 @@ def _load(path: Path, theta: Any, optimizer: optax.GradientTransformation, mark:
         **{name: plain[name] for name in ("fraction", "seconds", "rows", "checks")},
     )  # fmt: skip
     if good is not None:  # the step that was taken is the one that this optimiser takes
-        again = _moved(good, state.fraction, optimizer)
+        again = _after_step(good, state.fraction, optimizer)
         close = lambda a, b: np.allclose(a, b, rtol=1e-6, atol=1e-9)
         if not all(map(close, *map(jax.tree.leaves, (again, state.theta)))):
             fail(str(path), "holds the state of another optimizer", "Give the one it began with")

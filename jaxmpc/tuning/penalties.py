@@ -90,7 +90,7 @@ def tune_penalties(
 
     def tune() -> TuningRun:
         with jax.enable_x64(True):
-            return search(objective, train, test, given, stages, chosen, decides)
+            return tune_schedule(objective, train, test, given, stages, chosen, decides)
 
     run = cached(cache, decides, chosen, partial(_with_values, given), tune)
     if not run.improved:
@@ -101,7 +101,7 @@ def tune_penalties(
     return run
 
 
-def search(
+def tune_schedule(
     objective: PenaltyObjective, train: Samples, test: Samples, given: ADMM, stages: int,
     settings: Settings, decides: dict[str, Any],
 ) -> TuningRun:  # fmt: skip

@@ -108,7 +108,7 @@ def solve_samples(
     parts = []
     for i in range(0, len(samples), chunk):
         part = samples.take(slice(i, i + chunk))
-        found = _solve(
+        found = _solve_batch(
             jnp.asarray(rho), jnp.asarray(alpha, float), objective,
             jax.tree.map(lambda v: padded(v, chunk), part),
         )  # fmt: skip
@@ -118,7 +118,7 @@ def solve_samples(
 
 
 @jax.jit
-def _solve(
+def _solve_batch(
     rho: Array, alpha: Array, objective: PenaltyObjective, samples: Samples
 ) -> tuple[Array, Array]:  # fmt: skip
     c, solver = objective.condensed, replace(objective.solver, rho=rho, alpha=alpha)

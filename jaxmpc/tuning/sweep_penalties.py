@@ -97,7 +97,7 @@ def tune_sweep_penalties(
     def tune() -> TuningRun:
         labelled = map_points(feasibility, train, iterations=iterations, dtype=dtype, chunk=chunk)
         with jax.enable_x64(True):
-            return search(stage, train, labelled.label, test, chosen, decides)
+            return tune_row_weights(stage, train, labelled.label, test, chosen, decides)
 
     return cached(cache, decides, chosen, _penalties, tune)
 
@@ -129,7 +129,7 @@ class Stage:
         return W[:, : R - balls + 1] if balls else W
 
 
-def search(
+def tune_row_weights(
     stage: Stage, train: np.ndarray, label: np.ndarray, test: np.ndarray, settings: Settings,
     decides: dict[str, Any],
 ) -> TuningRun:  # fmt: skip
@@ -154,7 +154,7 @@ def search(
         rng = np.random.default_rng((settings.seed, step))
         half = batch // 2
         chosen = np.concatenate([rng.choice(hard, half), rng.choice(known, batch - half)])
-        value, slope = loss_and_gradient(
+        value, slope = sweep_loss_and_gradient(
             theta, W, stage.problem, stage.rows, train[chosen], label[chosen], stage.iterations
         )
         return float(value), jax.tree.map(np.asarray, slope), {}
@@ -215,7 +215,7 @@ def shortfall(
 
 @partial(jax.jit, static_argnums=6)
 @jax.value_and_grad
-def loss_and_gradient(
+def sweep_loss_and_gradient(
     theta: Any, W: Array, problem: ExactData, rows: ConstraintRows, x: Array, label: Array,
     iterations: int,
 ) -> Array:  # fmt: skip

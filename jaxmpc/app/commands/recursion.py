@@ -150,7 +150,7 @@ class Recursion:
             least = smallest_horizon(
                 mpc, self.smallest, regions=settings.regions, seconds=settings.seconds
             )
-            rows.append(("smallest horizon", _sentence(least, self.smallest)))
+            rows.append(("smallest horizon", _horizon_text(least, self.smallest)))
         files = self.save(config, report, least)
         print(report)
         rows.append(("total", f"{time.perf_counter() - begun:.2f} s with set-up and files"))
@@ -208,7 +208,7 @@ class Recursion:
         return list(FILES)
 
 
-def _sentence(least: SmallestHorizon, limit: int) -> str:
+def _horizon_text(least: SmallestHorizon, limit: int) -> str:
     if least.horizon is None:
         return f"none up to {limit} is proved"
     strong = f"; strong from {least.strong}" if least.strong is not None else ""

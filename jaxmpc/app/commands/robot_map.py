@@ -17,6 +17,7 @@ from jaxmpc.checks import fail
 from jaxmpc.closed_loop.robot_mpc import robot_mpc
 from jaxmpc.control.named_terminal import named_terminal_set
 from jaxmpc.control.riccati import lqr
+from jaxmpc.control.sets import translated
 from jaxmpc.feasible import store
 from jaxmpc.feasible.labels import ARRAYS, Labels
 from jaxmpc.feasible.map import grid
@@ -24,7 +25,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
 from jaxmpc.robot_maps.loops import RobotLoops
 from jaxmpc.robot_maps.robot_map import RobotMap
-from jaxmpc.robot_maps.set_point import deviations, moved
+from jaxmpc.robot_maps.set_point import deviations
 from jaxmpc.robot_maps.setting import RobotSetting
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import Robot
@@ -94,7 +95,7 @@ class RobotMapCommand:
         if self.terminal == "ellipsoid":
             fail("--terminal", "ellipsoid: a robot's limits are soft rows", "Give invariant or box")
         # The steps from here on compile programs.
-        fixed = _home(robot)
+        fixed = _home_coordinates(robot)
         fixed[others] = fixed[others] if self.values is None else self.values
         mpc = default_mpc(robot, self.horizon or 20, self.terminal or "none")
         seconds = 2.0 if self.seconds is None else self.seconds
@@ -124,7 +125,7 @@ class RobotMapCommand:
             store.remove(path)
         shape = (robot.n, mpc.horizon, robot.m)
         chunk = setting.chunk(None)
-        group = store.open_store(path, setting.points, _fields(setting), config, chunk, shape)
+        group = store.open_store(path, setting.points, _map_fields(setting), config, chunk, shape)
         return setting, config, group
 
     def _points(self, robot: Robot, axes: tuple[int, ...]) -> np.ndarray:
@@ -157,7 +158,7 @@ class RobotMapCommand:
 
     def map(self, setting: RobotSetting, group: zarr.Group) -> RobotMap:
         """Return the map that the store holds."""
-        data: dict[str, Any] = {name: np.asarray(group[name]) for name in _fields(setting)}
+        data: dict[str, Any] = {name: np.asarray(group[name]) for name in _map_fields(setting)}
         labels = Labels.of(**{name: data[name] for name in ARRAYS})
         loops = RobotLoops(**{f.name: data[f.name] for f in fields(RobotLoops)})
         refine = 1e-6 if self.refine and len(setting.axes) <= 3 else None
@@ -208,7 +209,7 @@ class RobotMapCommand:
         return ["summary.json", "robot_map.npz", "robot_map.png"]
 
 
-def _fields(setting: RobotSetting) -> dict[str, store.Field]:
+def _map_fields(setting: RobotSetting) -> dict[str, store.Field]:
     """Return the fields that the store has of each state: its labels and its closed loop."""
     labels = {name: getattr(setting.none(), name) for name in ARRAYS}
     found = {
@@ -232,16 +233,16 @@ def default_mpc(robot: Robot, horizon: int, terminal: str = "none") -> MPC:
         return replace(
             mpc, terminal_set=named_terminal_set(terminal, mpc.system, None, mpc.states, None)
         )
-    x, (_, u) = _home(robot), robot.equilibrium()
+    x, (_, u) = _home_coordinates(robot), robot.equilibrium()
     about = deviations(mpc, x, u)
     # At the set-point c is rounding.
     system = replace(about.system, c=None)
     regulator = lqr(system, mpc.Q, mpc.R)
     found = named_terminal_set(terminal, system, regulator, about.states, about.inputs)
-    return replace(mpc, terminal_set=moved(found, -x))
+    return replace(mpc, terminal_set=translated(found, x))
 
 
-def _home(robot: Robot) -> np.ndarray:
+def _home_coordinates(robot: Robot) -> np.ndarray:
     """Return the coordinates of `robot.home`."""
     with jax.enable_x64(True):
         return np.array(robot.coordinates(np.asarray(robot.home)), np.float64)

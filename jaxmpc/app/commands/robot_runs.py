@@ -113,7 +113,7 @@ class RobotRuns:
         steps = max(1, round(command.seconds / robot.dt))
         chunk = command.chunk or (256 if jax.default_backend() == "cpu" else 4096)
         group = store.open_store(
-            path, starts, _fields(command, robot, steps), _decisive(command, robot, mpc),
+            path, starts, _run_fields(command, robot, steps), _decisive(command, robot, mpc),
             min(chunk, command.count), (steps, robot.state_size, robot.m),
         )  # fmt: skip
         return cls(
@@ -148,7 +148,7 @@ class RobotRuns:
                 bar.update(count)
         return timing
 
-    def read(self) -> Run:
+    def load(self) -> Run:
         """Return the runs in the store, as NumPy arrays."""
         data: dict[str, Any] = {name: np.asarray(self.group[name]) for name in STORED}
         # x_0 is measured and no limit binds it, so that there is no soft row at k = 0.
@@ -159,7 +159,7 @@ class RobotRuns:
 STORED = tuple(field.name for field in dataclasses.fields(Run) if field.name != "slack")
 
 
-def _fields(command: "Simulate", robot: Robot, steps: int) -> dict[str, store.Field]:
+def _run_fields(command: "Simulate", robot: Robot, steps: int) -> dict[str, store.Field]:
     """Return the fields that the store has of each robot."""
     number = lambda shape, *axes: store.Field(shape, command.dtype, np.nan, axes)
     found = {

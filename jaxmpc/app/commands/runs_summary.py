@@ -69,7 +69,7 @@ def summarise(runs: RobotRuns, run: Run, outcome: Outcome, timing: Timing) -> di
     }  # fmt: skip
 
 
-def table(s: dict[str, Any]) -> list[tuple[str, str]]:
+def summary_rows(s: dict[str, Any]) -> list[tuple[str, str]]:
     """Return the rows of the table, name and value, from the summary."""
     fraction = lambda key: f"{s[key]:>9,}  {s[key] / s['robots']:8.2%}"
     mpc, worst, this = s["plans"] > 0, s["worst_violation"], s["this_run"]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxmpc.app.commands.film import film
 from jaxmpc.app.commands.options import Switch, check_positive, option, print_table
 from jaxmpc.app.commands.robot_runs import RobotRuns
-from jaxmpc.app.commands.runs_summary import summarise, table
+from jaxmpc.app.commands.runs_summary import summarise, summary_rows
 from jaxmpc.app.config import load_robot_config
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.outcome import evaluate_runs
@@ -147,7 +147,7 @@ class Simulate:
         robot = runs.robot
         print(f"{robot.name}: {self.count:,} robots for {self.seconds:g} s -> {self.output}")
         timing = runs.simulate()
-        run = runs.read()
+        run = runs.load()
         outcome = evaluate_runs(run, robot, runs.reference, tolerance=self.tolerance)
         files = ["runs.zarr", "summary.json", "runs.png"]
         from jaxmpc.app.plots.closed_loops import plot_runs
@@ -160,7 +160,7 @@ class Simulate:
             files.append("robots.gif")
         summary = summarise(runs, run, outcome, timing)
         write_json(self.output / "summary.json", summary)
-        rows = table(summary)
+        rows = summary_rows(summary)
         rows.append(("files", " ".join(str(self.output / name) for name in files)))
         print_table(rows, 13)
 

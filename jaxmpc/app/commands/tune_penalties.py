@@ -156,9 +156,9 @@ class TunePenalties:
             return report_error(error)
         seconds = time.perf_counter() - learning
         given = dataclasses.replace(given, iterations=self.iterations)
-        worst = residuals(mpc, test, (given, found.solver))
+        worst = largest_residuals(mpc, test, (given, found.solver))
         self.save(config, found, worst, dropped, seconds)
-        print(self.table(found, worst.shape[1], dropped, seconds))
+        print(self.report_text(found, worst.shape[1], dropped, seconds))
         print(f"  {'total':<13} {time.perf_counter() - begun:.1f} s with set-up and files")
         return 0
 
@@ -229,7 +229,7 @@ class TunePenalties:
         figure = plot_penalties(found, worst[0], worst[1], 1e-6, title)
         figure.savefig(self.output / "penalties.png", dpi=150)
 
-    def table(self, found: TuningRun, count: int, dropped: int, seconds: float) -> str:
+    def report_text(self, found: TuningRun, count: int, dropped: int, seconds: float) -> str:
         """Return the result as a table of text."""
         row = lambda name, a, b, more="": f"  {name:<13} {a:>12} {b:>12}  {more}".rstrip()
         first, last = found.before, found.after
@@ -258,7 +258,7 @@ class TunePenalties:
         ])  # fmt: skip
 
 
-def residuals(mpc: MPC, states: np.ndarray, solvers: tuple[ADMM, ADMM]) -> np.ndarray:
+def largest_residuals(mpc: MPC, states: np.ndarray, solvers: tuple[ADMM, ADMM]) -> np.ndarray:
     """Return the largest residual (2, B) with each solver, of the states that neither proves
     infeasible."""
     shape = np.broadcast_shapes(*(np.shape(solver.rho) for solver in solvers))

@@ -64,7 +64,7 @@ def save_results(
         maps(command, task).savefig(command.output / "maps.png", dpi=150)
         files.insert(4, "maps.png")
     seconds = {**seconds, "total": time.perf_counter() - begun}
-    return table(command, task, run, result, trace, seconds, files)
+    return report_text(command, task, run, result, trace, seconds, files)
 
 
 def maps(command: Any, task: TuningTask) -> Any:
@@ -76,7 +76,7 @@ def maps(command: Any, task: TuningTask) -> Any:
     return plot_maps(*found)
 
 
-def table(
+def report_text(
     command: Any, task: TuningTask, run: TuningRun, result: dict[str, Any],
     trace: dict[str, dict[str, np.ndarray]], seconds: dict[str, float], files: list[str],
 ) -> str:  # fmt: skip

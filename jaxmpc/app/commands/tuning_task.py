@@ -163,7 +163,7 @@ def tightening(start: float, limits: Box, target: np.ndarray) -> Parameter:
 def tuned(config: configs.Config, values: Mapping[str, np.ndarray]) -> configs.Config:
     """Return the problem with tuned values."""
     changes: dict[str, Any] = {
-        name: matrix(values[name]) for name in ("Q", "R", "P") if name in values
+        name: from_matrix(values[name]) for name in ("Q", "R", "P") if name in values
     }
     if "rho" in values:
         changes["rho"] = float(values["rho"])
@@ -174,7 +174,7 @@ def tuned(config: configs.Config, values: Mapping[str, np.ndarray]) -> configs.C
     return dataclasses.replace(config, cost=cost, limits=limits)
 
 
-def matrix(value: Any, flat: bool = True) -> Any:
+def from_matrix(value: Any, flat: bool = True) -> Any:
     """Return a matrix as the file holds it: rows, or the diagonal of a diagonal one if `flat`."""
     value = np.asarray(value, float)
     if flat and np.all(value == np.diag(np.diag(value))):
@@ -330,12 +330,12 @@ def robot_task(command: Any) -> TuningTask:
     def write(values: Mapping[str, np.ndarray]) -> str:
         end: Any = follow
         if "P" in values or (follow == "none" and P is not None):
-            end = matrix(values.get("P", P), flat=False)
+            end = from_matrix(values.get("P", P), flat=False)
         margin = float(values.get("tightening", section.margin))
         return configs.RobotConfig(
             robot=dataclasses.replace(section, margin=margin),
             cost=configs.RobotCostSection(
-                Q=matrix(values.get("Q", Q)), R=matrix(values.get("R", R)), P=end,
+                Q=from_matrix(values.get("Q", Q)), R=from_matrix(values.get("R", R)), P=end,
                 rho=float(values.get("rho", rho)),
             ),
         ).to_toml()  # fmt: skip

@@ -120,7 +120,7 @@ class SolverSection:
     refine: Annotated[int, Field(ge=0, strict=True)] = 150  # Newton steps after them at most
 
 
-def matrix(value: Any) -> np.ndarray:
+def to_matrix(value: Any) -> np.ndarray:
     """Return a weight as a matrix (n, n); a flat list is a diagonal."""
     array = np.asarray(value, dtype=np.float64)
     return np.diag(array) if array.ndim == 1 else array

@@ -51,12 +51,12 @@ def plot_feasible_set(fmap: FeasibleSetMap, ax: Axes | None = None) -> Axes:
     ])  # fmt: skip
     ax.set_xlabel(fmap.names[0])
     ax.set_ylabel(fmap.names[1])
-    ax.set_title(_title(fmap), loc="left", fontsize=11)
+    ax.set_title(_map_title(fmap), loc="left", fontsize=11)
     legend(ax, handles)
     return ax
 
 
-def _title(fmap: FeasibleSetMap) -> str:
+def _map_title(fmap: FeasibleSetMap) -> str:
     """Return what is shown, and for more than two states how the others are treated."""
     labels = fmap.mpc.labels if fmap.mpc.rate_limited else fmap.mpc.system.state_labels
     others = [i for i in range(len(labels)) if i not in fmap.axes]

@@ -68,7 +68,7 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
         handles.append(Line2D([], [], ls="", label=name, **style))
     ax.set_xlabel(rmap.names[0])
     ax.set_ylabel(rmap.names[1])
-    ax.set_title(_title(rmap), loc="left", fontsize=11)
+    ax.set_title(_robot_map_title(rmap), loc="left", fontsize=11)
     legend(ax, handles)
     return ax
 
@@ -90,7 +90,7 @@ def _words(rmap: RobotMap) -> tuple[str, ...]:
     return words
 
 
-def _title(rmap: RobotMap) -> str:
+def _robot_map_title(rmap: RobotMap) -> str:
     """Return which robot, how long, and the values of the coordinates that are not mapped."""
     name = rmap.robot.name
     mpc = rmap.linear.mpc
