@@ -69,6 +69,7 @@ class Tune:
 
 
 def _class(module: str, name: str) -> Any:
+    """Import a command's module and return its class."""
     return getattr(importlib.import_module(f"jaxmpc.app.commands.{module}"), name)
 
 

@@ -494,6 +494,7 @@ class OneStep:
 
     @property
     def n(self) -> int:
+        """Return the number of states."""
         return len(self.A)
 
     def back(self, target: Polytope, states: Polytope | None = None) -> Polytope:
@@ -550,6 +551,7 @@ def one_step(
 
 
 def _bounded(polytope: Polytope) -> bool:
+    """Return whether a polytope is bounded."""
     return geometry.positively_spanning(unit_rows(polytope.H, polytope.h)[0])
 
 
@@ -829,6 +831,7 @@ def _closed_loop(
 
 
 def _polytope(argument: str, value: Box | Polytope | None, n: int) -> Polytope:
+    """Return a set in R^n as a Polytope; raise ValueError, naming `argument`, for anything else."""
     if not isinstance(value, Box | Polytope):
         fail(argument, f"{type(value).__name__} is no Box or Polytope", "Give one")
     value.validate(argument, n)

@@ -132,6 +132,7 @@ def cost_of_law(system: LinearSystem, K: ArrayLike, Q: ArrayLike, R: ArrayLike) 
 
 
 def _gain(A: np.ndarray, B: np.ndarray, R: np.ndarray, P: np.ndarray) -> np.ndarray:
+    """Return K = -(R + B'PB)^-1 B'PA in NumPy."""
     return -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
 
 
@@ -167,10 +168,11 @@ def _traced(*data: Any) -> LQR:
     A, B, Q, R = (v.astype(dtype) for v in arrays(data))
     Q, R = (Q + Q.T) / 2, (R + R.T) / 2
     P = _solution(A, B, Q, R)
-    return LQR(K=_gain_of(A, B, R, P), P=P)
+    return LQR(K=_traced_gain(A, B, R, P), P=P)
 
 
-def _gain_of(A: Array, B: Array, R: Array, P: Array) -> Array:
+def _traced_gain(A: Array, B: Array, R: Array, P: Array) -> Array:
+    """Return K = -(R + B'PB)^-1 B'PA in JAX."""
     BtP = matmul(B.T, P)
     return -solve(R + matmul(BtP, B), matmul(BtP, A))
 
@@ -187,7 +189,7 @@ def _solution_jvp(data: tuple[Array, ...], moves: tuple[Array, ...]) -> tuple[Ar
     A, B, Q, R = data
     dA, dB, dQ, dR = moves
     P = _solution(A, B, Q, R)
-    K = _gain_of(A, B, R, P)
+    K = _traced_gain(A, B, R, P)
     closed = A + matmul(B, K)
     F = matmul(matmul(closed.T, P), dA + matmul(dB, K))
     dP = _solve_lyapunov(closed, dQ + matmul(K.T, matmul(dR, K)) + F + F.T)
@@ -219,7 +221,7 @@ def _doubling(A: Array, B: Array, Q: Array, R: Array) -> Array:
     P = jax.lax.while_loop(moving, double, start)[3]
 
     def recursion(P: Array) -> tuple[Array, Array]:  # as in `_refine`
-        K = _gain_of(A, B, R, P)
+        K = _traced_gain(A, B, R, P)
         closed = A + matmul(B, K)
         P = matmul(closed.T, matmul(P, closed)) + Q + matmul(K.T, matmul(R, K))
         return (P + P.T) / 2, closed

@@ -479,6 +479,7 @@ class Polytope:
         require_labels(f"{argument}.labels", self.labels, np.shape(as_array(self.h))[0])
 
     def _rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows that can bind, scaled to norm 1."""
         self._require_fields("Polytope")
         return unit_rows(self.H, self.h)
 
@@ -599,6 +600,7 @@ def require_labels(argument: str, labels: Any, rows: int) -> None:
 
 
 def _as_polytope(argument: str, value: Any) -> Polytope:
+    """Return a Box or Polytope as a Polytope; raise ValueError, naming `argument`, otherwise."""
     if not isinstance(value, Box | Polytope):
         fail(argument, f"{type(value).__name__} is no Box or Polytope", "Give one")
     return value.to_polytope() if isinstance(value, Box) else value

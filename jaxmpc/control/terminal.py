@@ -289,6 +289,7 @@ _Set = _Rows | _Ellipse
 
 
 def _compact(name: str, letter: str, rows: tuple[np.ndarray, np.ndarray]) -> Check:
+    """Check that the set of these rows is bounded."""
     reach = _Rows(*rows).reach
     holds = bool(np.isfinite(reach).all())
     sentence = f"{letter} is convex, as every set of linear rows is, and "
@@ -454,6 +455,7 @@ def _control_invariance(
     system: LinearSystem, X_f: _Set, inputs: Any, disturbance: Any, kept: Check,
     admissible: Check, role: str,
 ) -> Check:  # fmt: skip
+    """Check control invariance of X_f: by the law K, or by one step of the predecessor."""
     name, unit = "control invariance", "of the extent"
     if kept.holds and admissible.holds:
         sentence = f"u = K x is admissible and keeps the state in the terminal set{role}."
@@ -492,6 +494,7 @@ def _control_invariance(
 def _check_lyapunov(
     closed: np.ndarray | None, K: Any, P: Any, Q: np.ndarray, R: np.ndarray, no_law: str
 ) -> Check:
+    """Check (A+BK)'P(A+BK) - P + Q + K'RK <= 0."""
     name, unit = "Lyapunov inequality", "cost per |x|^2"
     if closed is None or P is None:
         return Check(name, None, None, unit, no_law, (3,))
@@ -509,6 +512,7 @@ def _check_lyapunov(
 def _weights(
     A: np.ndarray, Q: np.ndarray, R: np.ndarray, P: np.ndarray | None, trouble: str
 ) -> list[Check]:
+    """Check definiteness of the weights, and detectability."""
     checks = []
     for name, matrix, definite in (
         ("Q positive semidefinite", Q, False),
@@ -540,6 +544,7 @@ def _weights(
 
 
 def _origin_inside(X_f: _Set) -> Check:
+    """Check that the origin lies in the interior of X_f."""
     name, unit = "origin inside terminal set", "distance in x"
     if isinstance(X_f, _Ellipse):
         depth = float(np.sqrt(X_f.level / np.linalg.eigvalsh(X_f.P)[-1]))
@@ -562,6 +567,7 @@ def _unit_rows(argument: str, value: Any, n: int) -> tuple[np.ndarray, np.ndarra
 
 
 def _symmetric(argument: str, value: ArrayLike, n: int) -> np.ndarray:
+    """Return a symmetric matrix (n, n) in float64; raise ValueError unless it is one."""
     require_shape(argument, value, (n, n), "Give one square matrix")
     matrix = host_array(argument, value)
     require_finite(argument, matrix)
@@ -571,6 +577,7 @@ def _symmetric(argument: str, value: ArrayLike, n: int) -> np.ndarray:
 
 
 def _all(answers: Any) -> bool | None:
+    """Return False if any answer is False, else None if any is None, else True."""
     answers = list(answers)
     return False if False in answers else None if None in answers else True
 
@@ -582,6 +589,7 @@ def _fractions(array: Any) -> Any:
 
 
 def _dot(a: Any, b: Any) -> Fraction:
+    """Return the inner product of two sequences of Fractions."""
     return sum((x * y for x, y in zip(a, b, strict=True)), Fraction(0))
 
 

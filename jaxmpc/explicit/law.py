@@ -148,6 +148,7 @@ class Law:
             return np.zeros(A.shape[1])
 
     def _touches_ball(self, theta: np.ndarray, z: np.ndarray) -> bool:
+        """Return whether the plan reaches the boundary of the terminal ellipsoid."""
         c = self.condensed
         last = slice(len(c.C) - sum(c.balls), None)
         centred = c.C[last] @ z + c.D[last] @ theta + c.d[last] - c.lower[last]

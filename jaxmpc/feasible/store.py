@@ -153,6 +153,7 @@ def remove(path: str | Path) -> None:
 def _create(
     path: Path, points: np.ndarray, fields: Mapping[str, Field], attributes: dict[str, Any]
 ) -> None:
+    """Create the store under a temporary name, then rename it to `path`."""
     rows, chunk = len(points), attributes["chunk"]
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     group = zarr.open_group(partial, mode="w", zarr_format=3, attributes=attributes)
@@ -185,6 +186,7 @@ def _create(
 
 
 def _open(path: Path, mode: Any) -> zarr.Group:
+    """Open a store; raise ValueError where `path` holds something else."""
     try:
         group = zarr.open_group(path, mode=mode)
     except (OSError, ValueError) as error:  # zarr's own errors derive from these

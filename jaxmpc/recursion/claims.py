@@ -265,6 +265,7 @@ def settle_by_regions(claims: Claims, limit: int) -> tuple[Claim, float, np.ndar
 
 
 def _volume(body: Polytope) -> float:
+    """Return the volume of a polytope, 0 where it is empty or flat."""
     try:
         return body.volume()
     except ValueError:  # empty or flat

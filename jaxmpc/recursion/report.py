@@ -155,4 +155,5 @@ class RecursionReport:
 
 
 def in_words(x: np.ndarray) -> str:
+    """Return a vector as text, such as "(0.5, -1)", rounded to 9 decimals and 6 digits."""
     return "(" + ", ".join(f"{v:.6g}" for v in np.round(x, 9) + 0.0) + ")"

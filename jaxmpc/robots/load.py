@@ -99,6 +99,7 @@ def load_robot(
 
 
 def _configuration(host: "mujoco.MjModel", home: Any) -> np.ndarray:
+    """Return the configuration `home` (nq,), checked, with unit quaternions."""
     require_shape("home", home, (host.nq,), "One configuration, as in qpos")
     require_finite("home", home)
     q = np.array(home, float)
@@ -185,6 +186,7 @@ def _numeric(host: "mujoco.MjModel", name: str, default: Any) -> Any:
 
 
 def _mujoco_names(host: "mujoco.MjModel", kind: Any, count: int, letter: str) -> list[str]:
+    """Return the names of `count` objects of a kind; letter and number where there is none."""
     import mujoco
 
     return [mujoco.mj_id2name(host, kind, i) or f"{letter}{i + 1}" for i in range(count)]

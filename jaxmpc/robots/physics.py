@@ -136,6 +136,7 @@ def constrained(model: Any, data: Any) -> Array:
 
 
 def _balance(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    """Return the accelerations and their derivative by the implicit function theorem."""
     a = constrained(*primals)
 
     def missing(a: Array, model: Any, data: Any) -> Array:

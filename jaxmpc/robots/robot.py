@@ -319,6 +319,7 @@ class Robot:
         }  # fmt: skip
 
     def _checked_arrays(self, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return a state and an input as arrays of one dtype; raise ValueError for wrong shapes."""
         size = self.state_size
         problem = "Give (qpos, qvel) of one robot; use jax.vmap for many"
         if np.shape(x) == (self.n,) != (size,):

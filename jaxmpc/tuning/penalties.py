@@ -164,10 +164,12 @@ def _values(theta: Any, W: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _with_values(solver: ADMM, values: Any) -> ADMM:
+    """Return the solver with rho and alpha of `values`."""
     return replace(solver, rho=np.asarray(values["rho"]), alpha=float(values["alpha"]))
 
 
 def _knots(mpc: MPC) -> int:
+    """Return the number of knots along the horizon, at most one a step."""
     return min(KNOTS, mpc.horizon + 1)
 
 

@@ -121,6 +121,7 @@ def solve_samples(
 def _solve_batch(
     rho: Array, alpha: Array, objective: PenaltyObjective, samples: Samples
 ) -> tuple[Array, Array]:  # fmt: skip
+    """Return status and largest residual (B,) of a batch, in JAX."""
     c, solver = objective.condensed, replace(objective.solver, rho=rho, alpha=alpha)
     made = factor(c.P, c.C, solver, c.balls)
 

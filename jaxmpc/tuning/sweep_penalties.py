@@ -176,6 +176,7 @@ def tune_row_weights(
 
 
 def _penalties(values: Any) -> StagePenalties:
+    """Return the penalties with weight and alpha of `values`."""
     return StagePenalties(np.asarray(values["weight"]), float(values["alpha"]))
 
 

@@ -209,6 +209,7 @@ class Recursion:
 
 
 def _horizon_text(least: SmallestHorizon, limit: int) -> str:
+    """Return the smallest horizon with its reason, or that none up to `limit` is proved."""
     if least.horizon is None:
         return f"none up to {limit} is proved"
     strong = f"; strong from {least.strong}" if least.strong is not None else ""
