@@ -32,7 +32,7 @@ class RobotController:
 
     robot: Robot (its predictor is the model) or LinearPlant.
     mpc: the problem, from `robot_mpc`; its `system` is used by linearize="set-point" only.
-    solver: None for 50 ADMM steps and 3 Newton steps.
+    solver: None for 50 ADMM steps and at most 20 Newton steps.
     linearize: where the linear models are taken,
       "set-point"   once, as mpc.system says; matrices are factored once for all robots;
       "state"       about the measured state and the last input, at each sample;

@@ -7,7 +7,7 @@ from scipy.optimize import lsq_linear
 
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.control.sets import Box
-from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.control.system import LinearSystem, host_array, host_matrices
 
 
 def equilibrium(
@@ -36,8 +36,7 @@ def equilibrium(
     require_shape("target", target, (len(C),), "One value for each row of C")
     target = host_array("target", target)
     require_finite("target", target)
-    A, B = host_array("A", system.A), host_array("B", system.B)
-    c = np.zeros(n) if system.c is None else host_array("c", system.c)
+    A, B, c = host_matrices(system)
     M = np.block([[np.eye(n) - A, -B], [C, np.zeros((len(C), m))]])
     value = np.concatenate([c, target])
     low, high = np.full(n + m, -np.inf), np.full(n + m, np.inf)

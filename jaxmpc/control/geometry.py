@@ -19,6 +19,8 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 from jaxmpc.checks import fail, require_finite
 from jaxmpc.control.system import host_array
 
+# Tolerances of HiGHS' linear programs.
+HIGHS = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 # A set is called empty or flat if no ball of this radius fits, relative to the median
 # distance of its hyperplanes from the origin; well above HiGHS' own tolerance of 1e-10.
 FLAT = 1e-9
@@ -52,11 +54,7 @@ def maximise(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> Optimum:
             b_ub=g / size,
             bounds=(None, None),
             method="highs-ds",
-            options={
-                "presolve": presolve,
-                "primal_feasibility_tolerance": 1e-10,
-                "dual_feasibility_tolerance": 1e-10,
-            },
+            options={"presolve": presolve, **HIGHS},
         )
         if result.status in (0, 3):
             break

@@ -21,7 +21,7 @@ from jaxmpc.control import geometry
 from jaxmpc.control.geometry import maximise, unit_rows
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
-from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.control.system import LinearSystem, host_array, host_matrices
 from jaxmpc.qp.linalg import cholesky, eigh, solve_triangular
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 
@@ -534,9 +534,8 @@ def one_step(
     """Return the exact data of x⁺ = A x + B u + c + w, with inputs that are fixed (lower = upper)
     taken out."""
     system.validate()
-    n, m = system.n, system.m
-    A, B = host_array("A", system.A), host_array("B", system.B)
-    c = np.zeros(n) if system.c is None else host_array("c", system.c)
+    m = system.m
+    A, B, c = host_matrices(system)
     V, moving, fixed, ends = None, np.eye(m), np.zeros(m), None
     if inputs is not None:
         V = _polytope("inputs", inputs, m)
@@ -547,7 +546,7 @@ def one_step(
         V = Box(lower[free], upper[free]).to_polytope() if free.any() else None
         ends = np.column_stack([lower, upper])[free]
         ends = ends if np.isfinite(ends).all() else None
-    return OneStep(A, B, c, V, moving, fixed, disturbance_set(disturbance, n), ends)
+    return OneStep(A, B, c, V, moving, fixed, disturbance_set(disturbance, system.n), ends)
 
 
 def _bounded(polytope: Polytope) -> bool:

@@ -591,6 +591,17 @@ def translated(set_: Any, by: np.ndarray) -> Any:
     return set_
 
 
+def unit_half_spaces(argument: str, set_: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows (H, h) of a Box or Polytope in R^n, scaled to norm 1; no rows for None."""
+    if set_ is None:
+        return np.zeros((0, n)), np.zeros(0)
+    if not isinstance(set_, Box | Polytope):
+        fail(argument, f"{type(set_).__name__} is no convex set", "Give a Box or Polytope")
+    set_.validate(argument, n)
+    polytope = _as_polytope(argument, set_)
+    return unit_rows(polytope.H, polytope.h, argument)
+
+
 def require_labels(argument: str, labels: Any, rows: int) -> None:
     """Raise unless `labels` is a tuple of strings, one a row or none."""
     if not isinstance(labels, tuple) or not all(isinstance(label, str) for label in labels):

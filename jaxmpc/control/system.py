@@ -223,6 +223,12 @@ class LinearSystem:
         return system
 
 
+def host_matrices(system: LinearSystem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return A (n, n), B (n, m) and c (n,), zero for None, as float64 NumPy arrays."""
+    A, B = host_array("A", system.A), host_array("B", system.B)
+    return A, B, np.zeros(len(A)) if system.c is None else host_array("c", system.c)
+
+
 def _numbered(letter: str, count: int) -> tuple[str, ...]:
     return tuple(f"{letter}{i + 1}" for i in range(count))
 

@@ -20,8 +20,8 @@ from jaxmpc.control.invariant import (
     supports,
 )
 from jaxmpc.control.riccati import least_reached, lqr
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope, translated
-from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope, translated, unit_half_spaces
+from jaxmpc.control.system import LinearSystem, host_array, host_matrices
 
 # A limit counts as kept if it is exceeded by no more than this, relative to the set's extent
 # along the row (to |P| for matrix inequalities). Sets that touch a limit exceed it by rounding.
@@ -153,10 +153,9 @@ def verify_terminal(
     """
     system.validate()
     n, m = system.n, system.m
-    A, B = host_array("A", system.A), host_array("B", system.B)
-    c = np.zeros(n) if system.c is None else host_array("c", system.c)
+    A, B, c = host_matrices(system)
     Q, R = _symmetric("Q", Q, n), _symmetric("R", R, m)
-    X, U = _unit_rows("states", states, n), _unit_rows("inputs", inputs, m)
+    X, U = unit_half_spaces("states", states, n), unit_half_spaces("inputs", inputs, m)
     law, trouble = None, ""
     if K is None or terminal_cost is None:
         try:
@@ -185,7 +184,9 @@ def verify_terminal(
     else:
         if terminal_set is None:
             role = " (there is no terminal set: X in its role, at horizon N - 1)"
-        X_f = _Rows(*(X if terminal_set is None else _unit_rows("terminal_set", terminal_set, n)))
+        X_f = _Rows(
+            *(X if terminal_set is None else unit_half_spaces("terminal_set", terminal_set, n))
+        )
 
     checks = [_compact("states", "X", X), _compact("inputs", "U", U)]
     checks.append(
@@ -380,9 +381,7 @@ def _exact_factor(
     H, h, n = X_f.G, X_f.g, len(c)
     if len(h) ** 2 * n > _EXACT_PRODUCTS:
         return None
-    A, B, K = (_fractions(part) for part in law)
-    A = [[a + _dot(b, column) for a, column in zip(row, zip(*K, strict=True), strict=True)]
-         for row, b in zip(A, B, strict=True)]  # fmt: skip
+    A = _closed_loop_fractions(law)
     rows, limits, drift = _fractions(H), _fractions(h), _fractions(c)
     reach = [_fractions(v) if np.isfinite(v) else None for v in X_f.reach]
     lower, upper = (None, None) if W is None else (_fractions(W.lower), _fractions(W.upper))
@@ -424,10 +423,7 @@ def _ellipse_kept(
     )
     if W is None and not c.any():
         if len(P) <= 8:
-            A, B, K = (_fractions(part) for part in law)
-            A = [[a + _dot(b, column) for a, column in zip(row, zip(*K, strict=True), strict=True)]
-                 for row, b in zip(A, B, strict=True)]  # fmt: skip
-            F = _fractions(P)
+            A, F = _closed_loop_fractions(law), _fractions(P)
             FA = [[_dot(row, column) for column in zip(*A, strict=True)] for row in F]
             D = [
                 [F[i][j] - _dot([a[i] for a in A], [r[j] for r in FA]) for j in range(len(F))]
@@ -555,17 +551,6 @@ def _origin_inside(X_f: _Set) -> Check:
     return Check(name, depth > 0, depth, unit, sentence, (3,))
 
 
-def _unit_rows(argument: str, value: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows of a set, scaled to norm 1; no rows if it is None."""
-    if value is None:
-        return np.zeros((0, n)), np.zeros(0)
-    if not isinstance(value, Box | Polytope):
-        fail(argument, f"{type(value).__name__} is no convex set", "Give a Box or Polytope")
-    value.validate(argument, n)
-    polytope = value.to_polytope() if isinstance(value, Box) else value
-    return unit_rows(polytope.H, polytope.h, argument)
-
-
 def _symmetric(argument: str, value: ArrayLike, n: int) -> np.ndarray:
     """Return a symmetric matrix (n, n) in float64; raise ValueError unless it is one."""
     require_shape(argument, value, (n, n), "Give one square matrix")
@@ -586,6 +571,16 @@ def _fractions(array: Any) -> Any:
     """Return nested lists of Fractions, each exactly the float it comes from."""
     array = np.asarray(array, np.float64)
     return [_fractions(row) for row in array] if array.ndim else Fraction(float(array))
+
+
+def _closed_loop_fractions(law: tuple[np.ndarray, np.ndarray, np.ndarray]) -> list:
+    """Return A + BK of the law (A, B, K) as nested lists of Fractions."""
+    A, B, K = (_fractions(part) for part in law)
+    columns = list(zip(*K, strict=True))
+    return [
+        [a + _dot(b, column) for a, column in zip(row, columns, strict=True)]
+        for row, b in zip(A, B, strict=True)
+    ]
 
 
 def _dot(a: Any, b: Any) -> Fraction:

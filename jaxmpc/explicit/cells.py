@@ -6,8 +6,8 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
-from jaxmpc.control.geometry import distinct
-from jaxmpc.explicit.least_distance import LP, SMALLEST, LeastDistanceForm
+from jaxmpc.control.geometry import HIGHS, distinct
+from jaxmpc.explicit.least_distance import SMALLEST, LeastDistanceForm
 
 # Relative rounding of a law: below it a coefficient is zero.
 ZERO = 1e-11
@@ -130,7 +130,7 @@ def capped_ball(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float]:
     n = H.shape[1]
     ball = linprog(
         -np.eye(n + 1)[n], A_ub=np.column_stack([H, np.ones(len(h))]), b_ub=h,
-        bounds=[(None, None)] * n + [(None, 1.0)], method="highs-ds", options=LP,
+        bounds=[(None, None)] * n + [(None, 1.0)], method="highs-ds", options=HIGHS,
     )  # fmt: skip
     return (np.zeros(n), -1.0) if ball.x is None else (ball.x[:n], float(ball.x[-1]))
 

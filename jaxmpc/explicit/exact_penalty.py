@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import linprog
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, whole
+from jaxmpc.control.geometry import HIGHS
 from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.explicit.cells import ActivePiece, active_piece, capped_ball
 from jaxmpc.explicit.least_distance import (
-    LP,
     SMALLEST,
     STOPPED,
     LeastDistanceForm,
@@ -116,8 +116,7 @@ def exact_penalty(
     """
     if method not in ("auto", "regions", "samples"):
         fail("method", f"{method!r}", 'Give "auto", "regions" or "samples"')
-    if not isinstance(samples, int | np.integer) or isinstance(samples, bool) or samples < 1:
-        fail("samples", f"{samples!r}", "Give a number of rays, at least 1")
+    samples = whole("samples", samples, 1)
     if rho is not None and not (np.ndim(rho) == 0 and np.isfinite(rho) and rho >= 0):
         fail("rho", f"{rho!r}", "Give one finite weight of at least 0, or None")
     mpc.validate()
@@ -226,7 +225,7 @@ class Thresholds:
             np.eye(count + 1)[count],
             A_eq=np.column_stack([A, np.zeros(len(b))]), b_eq=b,
             A_ub=np.column_stack([np.diag(per_row / unit)[mine], -np.ones(mine.sum())]),
-            b_ub=np.zeros(mine.sum()), bounds=(0, None), method="highs-ds", options=LP,
+            b_ub=np.zeros(mine.sum()), bounds=(0, None), method="highs-ds", options=HIGHS,
         )  # fmt: skip
         if result.x is None:
             return np.nan, -1

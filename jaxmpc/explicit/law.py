@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import lsq_linear, nnls
 
 from jaxmpc.control.sets import Box, unit_rows
+from jaxmpc.control.system import host_matrices
 from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import solve_many
@@ -43,9 +44,7 @@ class Law:
 
     def __init__(self, mpc: MPC, easy: np.ndarray, chunk: int) -> None:
         self.mpc, self.easy, self.chunk = mpc, easy, chunk
-        system = mpc.system
-        self.A, self.B = np.asarray(system.A, np.float64), np.asarray(system.B, np.float64)
-        self.c = np.zeros(system.n) if system.c is None else np.asarray(system.c, np.float64)
+        self.A, self.B, self.c = host_matrices(mpc.system)
         self.condensed = c = condensed_in_float64(mpc)
         rows, size = Inequalities.of(c).normalised()
         self.C, self.D, self.b = rows.C, rows.D, rows.b

@@ -19,7 +19,8 @@ import numpy as np
 from scipy.optimize import linprog, nnls
 
 from jaxmpc.checks import fail
-from jaxmpc.control.sets import Box, Polytope, unit_rows
+from jaxmpc.control.geometry import HIGHS
+from jaxmpc.control.sets import Box, Polytope, unit_half_spaces, unit_rows
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
 from jaxmpc.mpc.problem import MPC
@@ -29,7 +30,6 @@ SMALLEST = 1e-9
 # Rows of length 1 closer to the span of others than this count as dependent on them.
 DEPENDENT = 1e-7
 STOPPED = "HiGHS stopped early on its linear programs", "Scale states and inputs to like size"
-LP = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,9 +180,9 @@ def least_distance_form(mpc: MPC, within: Box | Polytope | None = None) -> Least
         fail("R", "leaves the condensed cost singular in float64", "Put a larger weight on inputs")
     G, D, v, row, side = Inequalities.of(c)
     V = -D
-    H, h = unit_half_spaces(within, n)
+    H, h = unit_half_spaces("within", within, n)
     if mpc.remembers and mpc.inputs is not None:  # a previous input is one that was applied
-        H_u, h_u = unit_half_spaces(mpc.inputs, mpc.system.m)
+        H_u, h_u = unit_half_spaces("inputs", mpc.inputs, mpc.system.m)
         H, h = np.vstack([H, np.pad(H_u, ((0, 0), (mpc.system.n, 0)))]), np.append(h, h_u)
     G, V, v = np.vstack([G, np.zeros((len(h), G.shape[1]))]), np.vstack([V, -H]), np.append(v, h)
     row, side = np.append(row, np.full(len(h), -1)), np.append(side, np.ones(len(h)))
@@ -246,7 +246,7 @@ def maximum(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> tuple[float, np.ndar
     cost = np.append(np.zeros(G.shape[1] - len(d)), d)
     for method in ("highs-ds", "highs-ipm"):
         result = linprog(
-            -cost, A_ub=G, b_ub=g / size, bounds=(None, None), method=method, options=LP
+            -cost, A_ub=G, b_ub=g / size, bounds=(None, None), method=method, options=HIGHS
         )
         if result.status in (2, 3):
             return (-np.inf if result.status == 2 else np.inf), None
@@ -257,14 +257,3 @@ def maximum(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> tuple[float, np.ndar
             value = g[active] @ y if exact else -result.fun * size
             return float(value), result.x[-len(d) :] * size
     return np.nan, None
-
-
-def unit_half_spaces(set_: Box | Polytope | None, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the unit rows (H, h) of a set of initial states; none for None."""
-    if set_ is None:
-        return np.zeros((0, n)), np.zeros(0)
-    if not isinstance(set_, Box | Polytope):
-        fail("within", f"is a {type(set_).__name__}", "Give a Box or Polytope of states")
-    set_.validate("within", n)
-    body = set_.to_polytope() if isinstance(set_, Box) else set_
-    return unit_rows(body.H, body.h, "within")

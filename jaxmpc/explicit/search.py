@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, whole
 from jaxmpc.control.sets import Polytope
 from jaxmpc.explicit.cells import Cell, cell, volume
 from jaxmpc.explicit.least_distance import DEPENDENT, LeastDistanceForm
@@ -115,14 +115,13 @@ class RegionSearch:
 
 def explore(p: LeastDistanceForm, limit: Any) -> RegionSearch:
     """Run the search from an interior point across all facets, and return it."""
-    if not isinstance(limit, int | np.integer) or isinstance(limit, bool) or limit < 1:
-        fail("limit", f"{limit!r}", "Give a whole number of regions, at least 1")
+    limit = whole("limit", limit, 1)
     if len(p.center) > DIMENSIONS:
         fail(
             "mpc", f"its states have {len(p.center)} coordinates, too many for vertices",
             f"Regions serve up to {DIMENSIONS}; exact_penalty(method='samples') serves more",
         )  # fmt: skip
-    search = RegionSearch(p, int(limit))
+    search = RegionSearch(p, limit)
     search.visit(p.active(p.interior))
     search.cross_all()
     if not search.found:

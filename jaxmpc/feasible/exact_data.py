@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxmpc.control.set_bounds import set_bounds
 from jaxmpc.control.sets import Box, Ellipsoid
+from jaxmpc.control.system import host_matrices
 from jaxmpc.feasible.view import View
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Block
@@ -63,10 +64,8 @@ class ExactData:
 
 def dynamics(mpc: MPC) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return A, B, c of x⁺ = Ax + Bu + c, for (x, u_{−1}) where input rates are limited."""
-    to64 = lambda v: np.asarray(v, np.float64)
     n, m = mpc.system.n, mpc.system.m
-    A, B = to64(mpc.system.A), to64(mpc.system.B)
-    c = np.zeros(n) if mpc.system.c is None else to64(mpc.system.c)
+    A, B, c = host_matrices(mpc.system)
     if mpc.rate_limited:
         A = np.block([[A, np.zeros((n, m))], [np.zeros((m, n + m))]])
         B, c = np.concatenate([B, np.eye(m)]), np.concatenate([c, np.zeros(m)])

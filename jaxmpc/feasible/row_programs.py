@@ -7,16 +7,15 @@ import numpy as np
 from scipy.optimize import linprog
 
 from jaxmpc.checks import fail
+from jaxmpc.control.geometry import HIGHS
 from jaxmpc.feasible.constraint_rows import ConstraintRows
-
-HIGHS = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 
 
 class RowPrograms:
     """Linear programs over the rows of a feasibility problem, which may end in a ball.
 
     The ball |v| ≤ radius is the intersection of its tangent half-spaces n'v ≤ radius, which are
-    added until they suffice. Those found for one program serve the next (Kelley 1960).
+    added until they suffice. They are kept for the next program (Kelley 1960).
     """
 
     def __init__(self, rows: ConstraintRows) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxmpc.checks import fail
 from jaxmpc.control.set_bounds import set_bounds
 from jaxmpc.control.sets import Polytope
+from jaxmpc.control.system import host_matrices
 from jaxmpc.control.terminal import verify_terminal
 from jaxmpc.explicit.regions import critical_regions
 from jaxmpc.feasible.centered_polytope import CenteredPolytope
@@ -232,8 +233,7 @@ def settle_by_regions(claims: Claims, limit: int) -> tuple[Claim, float, np.ndar
         found = critical_regions(mpc, limit=limit)
     except ValueError as error:
         return Claim(None, f"no critical regions ({error})"), np.nan, none
-    A, B = np.asarray(mpc.system.A, float), np.asarray(mpc.system.B, float)
-    c = np.zeros(len(A)) if mpc.system.c is None else np.asarray(mpc.system.c, float)
+    A, B, c = host_matrices(mpc.system)
     violation, parts, lost = [-np.inf], [none], 0.0
     for region in found.regions:
         E, e = A + B @ region.K, B @ region.k + c

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.control.sets import Box, translated
-from jaxmpc.control.system import LinearSystem
+from jaxmpc.control.system import LinearSystem, host_matrices
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
 
 
@@ -37,8 +37,7 @@ def deviations(mpc: MPC, x: Any, u: Any) -> MPC:
         return mpc
 
     system: LinearSystem = mpc.system
-    A, B = np.asarray(system.A, float), np.asarray(system.B, float)
-    c = np.zeros(system.n) if system.c is None else np.asarray(system.c, float)
+    A, B, c = host_matrices(system)
     rows = []
     for each in as_tuple("outputs", mpc.outputs, Outputs):
         D = np.zeros((len(each.lower), system.m)) if each.D is None else np.asarray(each.D)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.checks import fail, require_finite
+from jaxmpc.checks import fail, require_finite, whole
 from jaxmpc.robots.robot import Robot
 
 
@@ -34,8 +34,7 @@ def render(
         fail("states", f"shape {states.shape}", f"Give ([robots,] samples, {robot.state_size})")
     require_finite("states", states)
     for name, value in (("every", every), ("width", width), ("height", height)):
-        if not isinstance(value, int | np.integer) or value < 1:
-            fail(name, f"{value!r}", "Give a whole number, at least 1")
+        whole(name, value, 1)
     model = copy.deepcopy(robot.mujoco)
     buffer = model.vis.global_
     buffer.offwidth, buffer.offheight = max(buffer.offwidth, width), max(buffer.offheight, height)

@@ -50,7 +50,7 @@ class Descent:
 
     @property
     def steps(self) -> int:
-        """Return T."""
+        """Return the number of steps T."""
         return len(self.loss)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import optax
 
 from jaxmpc.checks import fail, whole
+from jaxmpc.closed_loop.robot_controller import SOLVER
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.closed_loop.simulate_many import as_argument, require_variations
 from jaxmpc.compiled import Compiled
@@ -28,8 +29,6 @@ from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameters, raw, require_parameters
 from jaxmpc.tuning.result import TuningRun
 from jaxmpc.tuning.settings import Settings
-
-SOLVER = ADMM(iterations=50, rho=1.0, alpha=1.6, refine=20)
 
 
 def tune_weights(
@@ -58,7 +57,7 @@ def tune_weights(
         loss: of one run. None: `ClosedLoopLoss` with Q, R and state limits of the problem at the
             start. Do not use `run.stage_cost`: its weights are the Q and R that are tuned.
         reference, input_reference: as in `simulate`, or functions of the values.
-        solver: None for 50 ADMM steps and 3 Newton steps.
+        solver: None for 50 ADMM steps and at most 20 Newton steps.
         design_loss: of the problem alone, such as the `feasible_fraction` of sample states.
         mode: "forward" (cost grows with the number of parameters, memory does not), "reverse"
             (memory grows with the number of samples; they are computed twice if it does not

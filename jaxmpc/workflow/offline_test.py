@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, whole
 from jaxmpc.control.sets import Box
 from jaxmpc.control.terminal import TerminalReport, verify_terminal
 from jaxmpc.explicit.exact_penalty import ExactPenalty, exact_penalty
@@ -92,8 +92,7 @@ def offline_report(
     """
     mpc.validate()
     for name, value, least in (("steps", steps, 2), ("loops", loops, 1)):
-        if not isinstance(value, int | np.integer) or value < least:
-            fail(name, f"{value!r}", f"Give a whole number, at least {least}")
+        whole(name, value, least)
     if not seconds > 0:
         fail("seconds", f"{seconds!r}", "Give a positive number")
     hard = harden(mpc)

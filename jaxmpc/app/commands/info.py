@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 from jaxmpc.app import config as configs
-from jaxmpc.app.commands.options import Horizon, Terminal, check_positive, option
+from jaxmpc.app.commands.options import Horizon, Terminal, check_positive, given_options, option
 from jaxmpc.workflow.offline_test import offline_report
 
 
@@ -56,9 +56,7 @@ class Info:
     def run(self) -> None:
         """Print the report. Raises ValueError for options and files that make no sense."""
         check_positive(self, "steps", "loops", "seconds")
-        given = {"horizon": self.horizon, "terminal": self.terminal}
-        overrides = {key: value for key, value in given.items() if value is not None}
-        config = configs.load(self.config, overrides, "info")
+        config = configs.load(self.config, given_options(self, "horizon", "terminal"), "info")
         report = offline_report(
             config.build_controlled(), steps=self.steps, loops=self.loops, seconds=self.seconds
         )

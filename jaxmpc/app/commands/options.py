@@ -56,6 +56,20 @@ def check_results(path: Path, resume: bool, overwrite: bool) -> None:
         fail(str(path), "exists", "Add --resume to go on with it or --overwrite to start again")
 
 
+def given_options(command: Any, *names: str) -> dict[str, Any]:
+    """Return those of the named options that are not None."""
+    options = {name: getattr(command, name) for name in names}
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def check_counts(command: Any, **least: int) -> None:
+    """Raise ValueError for an option that is given and below its least value."""
+    for name, lowest in least.items():
+        value = getattr(command, name)
+        if value is not None and value < lowest:
+            fail(f"--{name}", f"{value}", f"Give a whole number, at least {lowest}")
+
+
 def check_positive(command: Any, *names: str) -> None:
     """Raise ValueError for an option that is given and not a positive number."""
     for name in names:

@@ -14,6 +14,7 @@ from jaxmpc.app.commands.options import (
     Switch,
     Terminal,
     check_positive,
+    given_options,
     open_folder,
     option,
     print_table,
@@ -133,8 +134,7 @@ class Recursion:
         given = {"axes": self.axes, "fixed": self.fixed, "resume": self.resume}
         refuse(given, None, "It is for maps of robots")
         keys = "horizon terminal steps grid lower upper regions seconds".split()
-        overrides = {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
-        config = configs.load(self.config, overrides, "recursion")
+        config = configs.load(self.config, given_options(self, *keys), "recursion")
         mpc, states, settings = config.build_mpc(), recursion_states(config), config.recursion
         there = [self.output / name for name in FILES if (self.output / name).exists()]
         if there and not self.overwrite:

@@ -1,9 +1,7 @@
 """Closed loops of many robots, simulated chunk by chunk into a store."""
 
-import contextlib
 import dataclasses
 import importlib
-import io
 import os
 import time
 from typing import TYPE_CHECKING, Any
@@ -67,8 +65,7 @@ class RobotRuns:
         except (AttributeError, ImportError, RuntimeError) as error:
             problem = f"mujoco does not start with {os.environ.get('MUJOCO_GL')!r} ({error})"
             fail("MUJOCO_GL", problem, "Unset it, or install the OpenGL library that it names")
-        with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a note
-            robot = load_robot(command.robot)
+        robot = load_robot(command.robot)
         sizes = (
             ("--target", command.target, robot.mujoco.nq),
             ("--state-weights", command.state_weights, robot.n),

@@ -7,7 +7,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from jaxmpc.app.commands.film import film
-from jaxmpc.app.commands.options import Switch, check_positive, option, print_table
+from jaxmpc.app.commands.options import (
+    Switch,
+    check_counts,
+    check_positive,
+    option,
+    print_table,
+)
 from jaxmpc.app.commands.robot_runs import RobotRuns
 from jaxmpc.app.commands.runs_summary import summarise, summary_rows
 from jaxmpc.app.config import load_robot_config
@@ -178,13 +184,7 @@ class Simulate:
 
     def check(self) -> None:
         """Raise ValueError for options that make no sense."""
-        for name, least in (
-            ("count", 1), ("horizon", 1), ("iterations", 1), ("refine", 0), ("video", 0),
-            ("seed", 0), ("chunk", 1),
-        ):  # fmt: skip
-            value = getattr(self, name)
-            if value is not None and value < least:
-                fail(f"--{name}", f"{value}", f"Give a whole number, at least {least}")
+        check_counts(self, count=1, horizon=1, iterations=1, refine=0, video=0, seed=0, chunk=1)
         check_positive(self, "seconds", "penalty", "tolerance")
         if not 0 <= self.payload < np.inf:
             fail("--payload", f"{self.payload}", "Give a mass in kg")

@@ -11,24 +11,25 @@ from typing import Annotated, Any, Literal
 import jax
 import numpy as np
 import optax
-import tyro
 
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import (
     Horizon,
+    Switch,
     Terminal,
+    check_counts,
+    check_positive,
     option,
     report_error,
 )
 from jaxmpc.app.commands.tuning import (
     CHECKPOINT,
     TUNED,
+    check_validation,
     feasible_states,
     open_run,
     optimizer_of,
     problem_file,
-    require_counts,
-    require_positive,
     start_range,
 )
 from jaxmpc.app.plots.tuning import plot_penalties
@@ -122,9 +123,9 @@ class TunePenalties:
     """Seed of initial states and batches."""
     output: Annotated[Path, option("DIR", "jaxmpc-penalties")] = Path("jaxmpc-penalties")
     """Folder for the files; created if absent."""
-    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
+    resume: Switch = False
     """Resume the run in --output."""
-    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
+    overwrite: Switch = False
     """Delete the run in --output and start again."""
 
     keeps = "steps"
@@ -167,8 +168,9 @@ class TunePenalties:
 
         Nothing compiles. Raises ValueError for options that do not fit together.
         """
-        require_counts(self, iterations=1, stages=1, updates=0, count=16, batch=1, seed=0)
-        require_positive(self, "learning_rate")
+        check_counts(self, iterations=1, stages=1, updates=0, count=16, batch=1, seed=0)
+        check_validation(self)
+        check_positive(self, "learning_rate")
         if self.iterations % self.stages:
             fail("--iterations", f"{self.iterations} for {self.stages} stages", "Use a multiple")
         if self.learning_rate is not None and self.optimizer is None:

@@ -10,7 +10,7 @@ import optax
 from scipy.optimize import linprog
 
 from jaxmpc.app import config as configs
-from jaxmpc.app.commands.options import open_folder
+from jaxmpc.app.commands.options import check_results, given_options, open_folder
 from jaxmpc.checks import fail
 from jaxmpc.control.sets import Polytope
 from jaxmpc.feasible.problem import FeasibilityProblem
@@ -39,29 +39,15 @@ def optimizer_of(name: str, rate: float, tried: Any = None) -> optax.GradientTra
     return made
 
 
-def require_counts(command: Any, **least: int) -> None:
-    """Raise ValueError for a count below its least, or a fraction of validation outside (0, 1)."""
-    for name, lowest in least.items():
-        value = getattr(command, name)
-        if value is not None and value < lowest:
-            fail(f"--{name}", f"{value}", f"Give a whole number, at least {lowest}")
+def check_validation(command: Any) -> None:
+    """Raise ValueError unless --validation lies in (0, 1)."""
     if not 0 < command.validation < 1:
         fail("--validation", f"{command.validation}", "Give a fraction above 0 and below 1")
 
 
-def require_positive(command: Any, *names: str) -> None:
-    """Raise ValueError for an option that is given and not a positive number."""
-    for name in names:
-        value = getattr(command, name)
-        if value is not None and not 0 < value < np.inf:
-            fail(f"--{name.replace('_', '-')}", f"{value}", "Give a positive number")
-
-
 def problem_file(command: Any) -> configs.Config:
     """Return the problem of --config, or the built-in joint, with --horizon and --terminal."""
-    given = {key: getattr(command, key) for key in ("horizon", "terminal")}
-    overrides = {key: value for key, value in given.items() if value is not None}
-    return configs.load(command.config, overrides, "tune")
+    return configs.load(command.config, given_options(command, "horizon", "terminal"), "tune")
 
 
 def start_range(
@@ -121,13 +107,9 @@ def open_run(
     a new record is written. Raises ValueError where the folder holds a run with other options, or
     any run without `resume` or `overwrite`.
     """
-    if resume and overwrite:
-        fail("--overwrite", "given beside --resume", "Choose one")
     record = folder / files[0]
-    there = [name for name in (files[0], CHECKPOINT) if (folder / name).exists()]
-    if there and not (resume or overwrite):
-        what = "Add --resume to go on with it or --overwrite to start again"
-        fail(str(folder / there[0]), "exists", what)
+    for path in (record, folder / CHECKPOINT):
+        check_results(path, resume, overwrite)
     if resume and record.exists():
         try:
             stored = json.loads(record.read_text())["options"]

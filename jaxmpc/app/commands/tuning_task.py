@@ -1,8 +1,6 @@
 """The task of `jaxmpc tune weights`: problem, plant, initial states and loss from its options."""
 
-import contextlib
 import dataclasses
-import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxmpc.app import config as configs
-from jaxmpc.app.commands.options import model_hash
+from jaxmpc.app.commands.options import given_options, model_hash
 from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
 from jaxmpc.app.commands.tuning import feasible_states, problem_file, start_range
 from jaxmpc.checks import fail
@@ -267,13 +265,10 @@ def with_numbers(config: configs.Config, hard: MPC, rho: float | None) -> config
 def robot_task(command: Any) -> TuningTask:
     """Return the task of a robot."""
     file = None if command.config is None else configs.load_robot_config(command.config)
-    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a note
-        robot = load_robot(str(command.robot))
+    robot = load_robot(str(command.robot))
     section = configs.RobotSection(name=robot.name) if file is None else file.robot
-    given: dict[str, Any] = {
-        "horizon": command.horizon, "margin": command.margin, "linearize": command.linearize,
-    }  # fmt: skip
-    section = dataclasses.replace(section, **{k: v for k, v in given.items() if v is not None})
+    given = given_options(command, "horizon", "margin", "linearize")
+    section = dataclasses.replace(section, **given)
     if command.target is not None and len(command.target) != robot.mujoco.nq:
         what = f"has {len(command.target)} numbers"
         fail("--target", what, f"{robot.name} needs {robot.mujoco.nq}")

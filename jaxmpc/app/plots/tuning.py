@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
-from jaxmpc.app.plots.closed_loops import draw_limits, panel_columns
+from jaxmpc.app.plots.closed_loops import draw_limits, panel_grid
 from jaxmpc.app.plots.style import INFEASIBLE, TERMINAL, ring
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.outcome import coordinates
@@ -170,34 +170,15 @@ def plot_before_after(
         (coordinates(plant, run.states)[shown], np.asarray(run.inputs, float)[shown])
         for run in (before, after)
     ]
-    columns = panel_columns(plant)
-    rows = max(len(panels) for _, panels in columns)
-    figure = Figure(
-        figsize=(3.4 * len(columns) + 0.2, max(1.35 * rows, 2.4) + 1.0), layout="constrained"
-    )
-    grid = figure.subplots(rows, len(columns), sharex=True, squeeze=False)
-    for column, (name, panels) in zip(grid.T, columns, strict=True):
-        for ax in column[len(panels) :]:
-            ax.set_axis_off()
-        column[0].set_title(name, fontsize=9)
-        column[len(panels) - 1].set_xlabel("time [s]", fontsize=8)
-        column[len(panels) - 1].tick_params(labelbottom=True)
-        for ax, (kind, i, label) in zip(column, panels, strict=False):
-            limits, target = (
-                (plant.input_limits, input_reference) if kind else (plant.state_limits, reference)
-            )
-            # Broad below narrow: where both are the same both are seen.
-            for found, colour, width in zip(values, (_BEFORE, _AFTER), (2.2, 1.0), strict=True):
-                lines = found[kind][..., i].T
-                lines = np.concatenate([lines, lines[-1:]]) if kind else lines
-                style: dict[str, Any] = {"drawstyle": "steps-post"} if kind else {}
-                ax.plot(time, lines, color=colour, lw=width, alpha=0.9, **style)
-            ends = [float(np.asarray(end)[i]) for end in (limits.lower, limits.upper)]
-            draw_limits(ax, ends, None if target is None else float(np.asarray(target)[i]))
-            ax.set_ylabel(label, fontsize=8)
-            ax.tick_params(labelsize=7)
-            ax.set_xlim(0, time[-1])
-    figure.align_ylabels()
+    figure, panels = panel_grid(plant, time, 3.4, (1.35, 2.4, 1.0))
+    for ax, kind, i in panels:
+        # Broad lines below narrow ones, so that both are visible where they coincide.
+        for found, colour, width in zip(values, (_BEFORE, _AFTER), (2.2, 1.0), strict=True):
+            lines = found[kind][..., i].T
+            lines = np.concatenate([lines, lines[-1:]]) if kind else lines
+            style: dict[str, Any] = {"drawstyle": "steps-post"} if kind else {}
+            ax.plot(time, lines, color=colour, lw=width, alpha=0.9, **style)
+        draw_limits(ax, plant, kind, i, (reference, input_reference)[kind])
     handles: list[Any] = [
         Line2D([], [], color=_BEFORE, lw=2.2, label="before"),
         Line2D([], [], color=_AFTER, lw=1.0, label="after"),
