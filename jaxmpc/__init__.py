@@ -1,4 +1,4 @@
-"""Constrained model predictive control for robots: solved by the million, and proved.
+"""Constrained model predictive control for robots: solved in large batches, with proofs.
 
 Problems       LinearSystem, MPC, Box, Polytope, Ellipsoid, Outputs, Soft, joint_limits, design
 Plans          solve, solve_many, Controller -> Plan, Status; solve_qp of a QP by ADMM

@@ -1,7 +1,7 @@
-"""Input checks, made where users call and before anything compiles.
+"""Input checks of public functions, made before anything compiles.
 
-Inside `jit`, `vmap` or `grad` an array has a shape but no value: there shapes are
-checked and values are not (a batch answers bad values with a status instead).
+Inside `jit`, `vmap` or `grad` an array has a shape but no value: shapes are checked there, values
+are not (a solver reports bad values of a batch by its status).
 """
 
 from typing import Any, NoReturn
@@ -12,17 +12,17 @@ import numpy as np
 
 
 def fail(argument: str, problem: str, cure: str) -> NoReturn:
-    """Raise the one kind of error users see: which argument, what is wrong, what to do."""
+    """Raise a ValueError that names the argument, what is wrong, and what to do."""
     raise ValueError(f"{argument}: {problem}. {cure}")
 
 
 def concrete(*values: Any) -> bool:
-    """True when every value can be read, i.e. none is being traced."""
+    """Return True when no value is being traced, so that all can be read."""
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
 def whole(argument: str, value: Any, least: int) -> int:
-    """The value as an int; raise unless it is a whole number of at least `least`."""
+    """Return the value as an int; raise unless it is a whole number of at least `least`."""
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
         fail(argument, f"{value!r}", f"Give a whole number of at least {least}")
     return int(value)

@@ -1,7 +1,7 @@
-"""Files of runs that may be killed and go on: written whole or not at all, and told apart.
+"""Files of runs that can be killed and resumed: written atomically, with fingerprints.
 
-Each file is written beside its place and renamed, so that a reader finds the old one or the new
-one. A fingerprint of everything that decides a result tells whether a file belongs to a run.
+Each file is written under a temporary name and renamed, so that a reader finds the old one or the
+new one. A fingerprint of all that determines a result tells whether a file belongs to a run.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import jax
 import numpy as np
 
-# What a result depends on.
+# Packages whose versions a result depends on.
 PACKAGES = ("jaxmpc", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "scipy", "zarr")
 
 
@@ -56,18 +56,18 @@ def versions() -> dict[str, str]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
+    """Write a text file atomically."""
     with _replacing(path) as file:
         file.write(text.encode())
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Write a JSON file, whole or not at all; see `as_json`."""
+    """Write a JSON file atomically; see `as_json`."""
     write_text(path, json.dumps(as_json(document), indent=2, allow_nan=False) + "\n")
 
 
 def as_json(value: Any) -> Any:
-    """Return what JSON can hold: arrays as lists, numbers that are not finite as None."""
+    """Return the value as JSON data: arrays as lists, numbers that are not finite as None."""
     if isinstance(value, Mapping):
         return {str(key): as_json(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
@@ -78,14 +78,14 @@ def as_json(value: Any) -> Any:
 
 
 def write_arrays(path: Path, plain: Any = None, **arrays: Any) -> None:
-    """Write JSON data and arrays to one compressed file (.npz), whole or not at all."""
+    """Write JSON data and arrays to one compressed file (.npz) atomically."""
     record: dict[str, Any] = {} if plain is None else {"record": np.array(json.dumps(plain))}
     with _replacing(path) as file:
         np.savez_compressed(file, **record, **arrays)
 
 
 def read_arrays(path: Path) -> tuple[Any, dict[str, np.ndarray]] | None:
-    """Return what `write_arrays` wrote, or None where there is no whole file of it."""
+    """Return the data and arrays that `write_arrays` wrote, or None without a valid file."""
     try:
         with open(path, "rb") as file, np.load(file) as data:
             arrays = {name: data[name] for name in data.files}
@@ -95,14 +95,14 @@ def read_arrays(path: Path) -> tuple[Any, dict[str, np.ndarray]] | None:
 
 
 def remove_partial(path: Path) -> None:
-    """Remove what killed processes left beside `path`; only for a path with a single writer."""
+    """Remove temporary files of killed processes beside `path`, which must have one writer only."""
     for left in path.parent.glob(f".{path.name}.*"):
         left.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def _replacing(path: Path) -> Iterator[BinaryIO]:
-    """Yield a new file that takes the place of `path` once it is written, and else is removed."""
+    """Yield a temporary file that replaces `path` once it is written; remove it after an error."""
     path.parent.mkdir(parents=True, exist_ok=True)
     side = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     try:

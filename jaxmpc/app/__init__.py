@@ -1,1 +1,1 @@
-"""The command `jaxmpc`, and what only it needs: options, problem files, pictures."""
+"""The command `jaxmpc`, with its options, problem files and plots."""

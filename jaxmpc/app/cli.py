@@ -1,4 +1,4 @@
-"""The command `jaxmpc`: find the command that is meant, run it, and tell what ended it."""
+"""The command `jaxmpc`: parse the command line, run the subcommand, and report how it ended."""
 
 import importlib
 import shlex
@@ -12,7 +12,7 @@ import tyro
 
 from jaxmpc.app.commands.options import report_error
 
-# Module and class of each command: only that which is asked for is imported.
+# Module and class of each command: only the one that is called is imported.
 COMMANDS = {
     "sweep": ("sweep", "Sweep"),
     "recursion": ("recursion", "Recursion"),
@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def parse(argv: Sequence[str]) -> Any:
     """Return the command with its options.
 
-    The help of a command is a page; `jaxmpc --help` and `jaxmpc tune --help` have a line for each.
+    `jaxmpc COMMAND --help` prints a page; `jaxmpc --help` and `jaxmpc tune --help` one line each.
     """
     prog, table, words = "jaxmpc", COMMANDS, list(argv)
     if words[:1] == ["tune"]:
@@ -69,6 +69,7 @@ class Tune:
 
 
 def _class(module: str, name: str) -> Any:
+    """Import a command's module and return its class."""
     return getattr(importlib.import_module(f"jaxmpc.app.commands.{module}"), name)
 
 

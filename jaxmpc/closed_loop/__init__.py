@@ -2,7 +2,7 @@
 
 simulate, simulate_many    one closed loop, or many chunk by chunk -> Run
 lyapunov_decrease          change of the optimal value along a run
-evaluate_runs              limits kept, target reached, when and at what cost -> Outcome
+evaluate_runs              limits kept, target reached, settling time and cost -> Outcome
 RobotController            an MPC with the linear models of a robot
 robot_mpc                  the MPC of a robot, from the limits of its model
 LinearFeedback             LQR or PD with clipping, to compare with

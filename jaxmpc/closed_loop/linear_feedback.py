@@ -16,7 +16,7 @@ from jaxmpc.qp.status import Status
 
 
 class NoPlan(NamedTuple):
-    """The plan of a law that makes none: cost NaN, status NOT_RUN, no slack."""
+    """The plan of a law without plans: cost NaN, status NOT_RUN, no slack."""
 
     cost: Array
     status: Array
@@ -29,7 +29,7 @@ class LinearFeedback:
     """The law u = clip(s + K (ξ − r)): linear state feedback inside the input limits of `mpc`.
 
     mpc: weights, limits and horizon by which runs are evaluated, as for a Controller. K (m, n).
-    plant: a Robot, whose coordinates are ξ and whose limits count; None: ξ = x. References r (n,)
+    plant: a Robot, which defines the coordinates ξ and the limits; None: ξ = x. References r (n,)
     and s (m,), or rows of them of which the first counts, as in `Controller`; zero for none.
     """
 

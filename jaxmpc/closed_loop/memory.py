@@ -1,4 +1,4 @@
-"""How much memory a compiled program takes, and how much there is."""
+"""Memory that a compiled program needs, and memory that the device has."""
 
 import os
 from typing import Any

@@ -1,4 +1,4 @@
-"""The outcome of closed loops: limits kept, target reached, after which time, at which cost."""
+"""The outcome of closed loops: limits kept, target reached, settling time, cost."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +10,7 @@ from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.control.sets import Box
 from jaxmpc.control.system import host_array
-from jaxmpc.control.violation import excess, kept
+from jaxmpc.control.violation import kept, row_violations
 from jaxmpc.qp.status import Status
 
 
@@ -19,7 +19,7 @@ class Outcome:
     """What B closed loops of T samples achieved, from their states and inputs, in float64.
 
     coordinates (B, T+1, n): the states in the coordinates of the limits. state_excess
-    (B, T+1, n), input_excess (B, T, m): by how much each limit is exceeded, in its unit; 0 inside,
+    (B, T+1, n), input_excess (B, T, m): by how much each limit is violated, in its unit; 0 inside,
     NaN where the run is not finite. band (n,): largest distance that counts as at the target.
     The other fields have one entry for each loop, (B,):
       kept          all limits of states and inputs hold at all samples (to `violation.TOLERANCE`)
@@ -46,7 +46,7 @@ class Outcome:
 
 
 def evaluate_runs(run: Run, plant: Any, reference: Any, *, tolerance: float = 0.02) -> Outcome:
-    """Evaluate closed loops that were to come to rest at `reference`.
+    """Evaluate closed loops whose target is rest at `reference`.
 
     run: from `simulate` or `simulate_many`, with or without a batch axis. plant: the Robot or
     LinearPlant whose limits count, without margin. reference (n,): the set-point, in coordinates.
@@ -65,8 +65,9 @@ def evaluate_runs(run: Run, plant: Any, reference: Any, *, tolerance: float = 0.
     before = inside.shape[1] - np.cumprod(inside[:, ::-1], axis=1).sum(axis=1)
     status, fallback = np.asarray(run.status), np.asarray(run.fallback)
     return Outcome(
-        coordinates=xi, state_excess=excess(*limits[0]), input_excess=excess(*limits[1]),
-        band=band, kept=np.all([kept(*pair).all(axis=(1, 2)) for pair in limits], axis=0),
+        coordinates=xi, state_excess=row_violations(*limits[0]),
+        input_excess=row_violations(*limits[1]), band=band,
+        kept=np.all([kept(*pair).all(axis=(1, 2)) for pair in limits], axis=0),
         reached=inside[:, -1], settling=np.where(inside[:, -1], before * plant.dt, np.inf),
         cost=np.asarray(run.stage_cost, float).sum(axis=1),
         plans_valid=((status == Status.SOLVED) & ~fallback).all(axis=1),
@@ -75,11 +76,11 @@ def evaluate_runs(run: Run, plant: Any, reference: Any, *, tolerance: float = 0.
 
 def with_limits(plant: Any, run: Run) -> list[tuple[Box, np.ndarray]]:
     """Return (limits, values) of the states, as coordinates, and of the inputs of a run, in
-    float64 on the host."""
-    on_host = lambda box: jax.tree.map(lambda v: np.asarray(v, float), box)
+    float64 NumPy arrays."""
+    plain = lambda box: jax.tree.map(lambda v: np.asarray(v, float), box)
     return [
-        (on_host(plant.state_limits), coordinates(plant, run.states)),
-        (on_host(plant.input_limits), np.asarray(run.inputs, float)),
+        (plain(plant.state_limits), coordinates(plant, run.states)),
+        (plain(plant.input_limits), np.asarray(run.inputs, float)),
     ]
 
 

@@ -1,4 +1,4 @@
-"""RobotController: MPC of a nonlinear robot by linear models of it, softened where limits fail."""
+"""RobotController: MPC of a nonlinear robot by linear models, with soft state limits."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -32,15 +32,15 @@ class RobotController:
 
     robot: Robot (its predictor is the model) or LinearPlant.
     mpc: the problem, from `robot_mpc`; its `system` is used by linearize="set-point" only.
-    solver: None for 50 ADMM steps and 3 Newton steps.
+    solver: None for 50 ADMM steps and at most 20 Newton steps.
     linearize: where the linear models are taken,
       "set-point"   once, as mpc.system says; matrices are factored once for all robots;
-      "state"       about the measured state and the last input, anew at each sample;
-      "trajectory"  about the last plan, moved up by one sample: a model for each step.
+      "state"       about the measured state and the last input, at each sample;
+      "trajectory"  about the last plan shifted by one sample, a model for each step.
     exact: see `Robot.linearize`.
     penalty: L1 weight (cost per unit) with which state limits and terminal rows are soft. Where it
       exceeds the multipliers of the hard problem, plans keep the limits whenever the model can
-      (exact penalty), and violate them as little as that weight asks where it cannot. Each such
+      (exact penalty), and elsewhere trade violations against the cost by that weight. Each such
       plan is counted: `Run.fallback`. Input limits are hard.
 
     `controller(x, carry, reference, input_reference=)` as `Controller`, x (nq + nv,) the state of
@@ -147,8 +147,8 @@ def prepared(
 ) -> dict[str, Any]:  # fmt: skip
     """Check the arguments of a RobotController and compute what all its samples share.
 
-    Returns soft, the problem with soft state limits; fixed, the Controller of the linear model
-    where that does not change, else None; scale, the row scaling where the model changes.
+    Returns soft, the problem with soft state limits; fixed, the Controller of the linear model if
+    that model does not change, else None; scale, the row scaling if it does, else None.
     """
     if linearize not in LINEARIZATIONS:
         fail("linearize", f"{linearize!r}", f"Give one of {', '.join(LINEARIZATIONS)}")

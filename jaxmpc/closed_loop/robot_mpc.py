@@ -27,11 +27,11 @@ def robot_mpc(
         target: configuration (nq,) to linearise about (of a LinearPlant the state), None for
             `robot.home`. It must be one that the actuators can hold.
         margin: fraction by which state limits are tightened, of the limit's half-width on each
-            side: room for what the linear model leaves out. Inputs keep their limits.
+            side, to allow for errors of the linear model. Input limits are not tightened.
         terminal_cost: "lqr", the Riccati solution of the model at the target; or P (n, n), None.
         exact: which model, see `Robot.linearize`.
-        fields: of `MPC`, in place of what is chosen here: state limits at k = 1 … N (x_0 is
-            measured; no input moves it), no terminal set.
+        fields: of `MPC`, in place of the defaults here: state limits at k = 1 … N (no input moves
+            x_0), no terminal set.
 
     Track the target with reference = robot.coordinates(x) and input_reference = u of
     `robot.equilibrium(target)`. Raises ValueError as MPC and `equilibrium` do, or where the

@@ -1,4 +1,4 @@
-"""Run: what is recorded of a closed loop at each sample."""
+"""Run: the record of a closed loop at each sample."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ class Run:
     the references r, s, zero for none. violation (T+1,): the most by which x_t exceeds a row of
     the state limits, in the units of the row; 0 where it keeps them all. slack (T, p): violations
     of the soft rows at k = 0 of each plan, hence of what happens. fallback (T,): whether the plan
-    breaks soft rows anywhere on its horizon by more than 1e-6 (1e-3 in float32): what is done
+    violates soft rows anywhere on its horizon by more than 1e-6 (1e-3 in float32), as happens
     where the limits cannot all be kept. Batches have their axes in front. For robots states are
     the plant's, (qpos, qvel), and x in costs and limits means their coordinates.
     """
@@ -36,7 +36,7 @@ class Run:
 
     @property
     def feasible_steps(self) -> Array:
-        """Samples before the first plan that is not SOLVED: T if all are."""
+        """Return the number of samples before the first plan that is not SOLVED: T if all are."""
         solved = jnp.asarray(self.status) == Status.SOLVED
         return jnp.sum(jnp.cumprod(solved, axis=-1), axis=-1)
 
@@ -47,14 +47,13 @@ class Run:
 
 
 def lyapunov_decrease(run: Run) -> Array:
-    """V_N(x_{t+1}) − V_N(x_t) + l(x_t, u_t) along the loop, (T−1,), l the stage cost.
+    """Return V_N(x_{t+1}) − V_N(x_t) + l(x_t, u_t) along the loop, (T−1,), l the stage cost.
 
-    Nowhere positive where the optimal value is a Lyapunov function: for the nominal plant, inputs
-    free at each step and no weights on their rates or of single stages (which the stage cost here
-    leaves out),
-    references at an equilibrium, a terminal set that a law u = Kx keeps invariant inside the
-    limits, and a terminal cost P ⪰ Q + K'RK + (A+BK)'P(A+BK) (Mayne, Rawlings, Rao & Scokaert
-    2000, Automatica 36, section 3.3; the lesson's Theorem 3). Says nothing from
-    `run.feasible_steps` on.
+    It is nowhere positive where the optimal value is a Lyapunov function: for the nominal plant,
+    inputs free at each step, no weights on input rates or of single stages (the stage cost here
+    leaves them out), references at an equilibrium, a terminal set that a law u = Kx keeps invariant
+    inside the limits, and a terminal cost P ⪰ Q + K'RK + (A+BK)'P(A+BK) (Mayne, Rawlings, Rao &
+    Scokaert 2000, Automatica 36, section 3.3; Rawlings, Mayne & Diehl 2017, section 2.4). The
+    values from `run.feasible_steps` on mean nothing.
     """
     return run.cost[..., 1:] - run.cost[..., :-1] + run.stage_cost[..., :-1]

@@ -14,10 +14,10 @@ from jaxmpc.checks import fail, whole
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.control.system import LinearSystem
-from jaxmpc.control.violation import worst_excess
+from jaxmpc.control.violation import worst_violation
 from jaxmpc.qp.precision import arrays, matmul
 
-# Slack of a plan that counts as rounding: plans are solved to these tolerances, not better.
+# Slack of a plan that counts as rounding, by precision: the accuracy of solved plans.
 SLACK = {"float64": 1e-6, "float32": 1e-3}
 
 
@@ -145,4 +145,4 @@ def _simulate(
 def _violation(controller: Any, x: Array) -> Array:
     """Return the most by which x exceeds a row of the controller's state limits."""
     limits = jax.tree.map(lambda v: jnp.asarray(v, x.dtype), controller.limits)
-    return worst_excess(limits, controller.coordinates(x))
+    return worst_violation(limits, controller.coordinates(x))

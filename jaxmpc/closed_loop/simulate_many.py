@@ -23,7 +23,7 @@ def simulate_many(
     input_reference: Any = None, variations: Mapping[str, Any] | None = None,
     chunk: int | None = None, progress: bool = False,
 ) -> Run:  # fmt: skip
-    """Simulate closed loops from many initial states x0s (B, n); return host arrays (B, ...).
+    """Simulate closed loops from many initial states x0s (B, n); return NumPy arrays (B, ...).
 
     controller, plant, steps, reference, input_reference: as in `simulate`.
     variations: parameters of the plant that differ between the B loops, as `plant.vary` takes
@@ -97,7 +97,8 @@ def simulate_batch(
     controller: Any, plant: Any, reference: Any, input_reference: Any, x0s: Array,
     variations: dict[str, Array], steps: int, checkpoint: bool = False,
 ) -> Run:  # fmt: skip
-    """Simulate from x0s (B, n), loop i with entry i of the variations in its plant. Traceable.
+    """Simulate from x0s (B, n), loop i with entry i of the variations in its plant. Works inside
+    jit, vmap and grad.
 
     plant: from `as_argument`. The rest is as in `simulate` and `simulate_many`.
     """

@@ -1,4 +1,4 @@
-"""Equilibria of a linear system: what a reference asks of states and inputs in steady state."""
+"""Equilibria of a linear system: the steady state and input that a reference requires."""
 
 from typing import Any
 
@@ -7,22 +7,23 @@ from scipy.optimize import lsq_linear
 
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.control.sets import Box
-from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.control.system import LinearSystem, host_array, host_matrices
 
 
 def equilibrium(
     system: LinearSystem, target: Any, *, C: Any = None, states: Box | None = None,
     inputs: Box | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """(x, u) with x = A x + B u + c and C x = target: what to track and the input that holds it.
+    """Return (x, u) with x = A x + B u + c and C x = target: what to track and the input that holds
+    it.
 
-    target (p,): of the outputs C x, C (p, n); without C of all states. Among several equilibria the
-    one of least norm, if that keeps the limits. states, inputs: Box limits to stay in, or None.
+    target (p,): of the outputs C x, C (p, n); without C of all states. Of several equilibria it is
+    the one of least norm, if that keeps the limits. states, inputs: Box limits to stay in, or None.
     Give x and u to `solve` as reference and input_reference, so that the cost vanishes there.
 
-    Raises ValueError where no equilibrium meets the target, within the limits if there are any:
-    the message says how far the closest one stays from it. Host, float64; residual below
-    1e-11 + 1e-9 times the size of its terms.
+    Raises ValueError where no equilibrium meets the target, within the limits if there are any: the
+    message says how far the closest one stays from it. NumPy in float64; not traceable; residual
+    below 1e-11 + 1e-9 times the size of its terms.
     """
     if not isinstance(system, LinearSystem):
         fail("system", f"is a {type(system).__name__}", "Give a jm.LinearSystem")
@@ -35,8 +36,7 @@ def equilibrium(
     require_shape("target", target, (len(C),), "One value for each row of C")
     target = host_array("target", target)
     require_finite("target", target)
-    A, B = host_array("A", system.A), host_array("B", system.B)
-    c = np.zeros(n) if system.c is None else host_array("c", system.c)
+    A, B, c = host_matrices(system)
     M = np.block([[np.eye(n) - A, -B], [C, np.zeros((len(C), m))]])
     value = np.concatenate([c, target])
     low, high = np.full(n + m, -np.inf), np.full(n + m, np.inf)

@@ -1,4 +1,4 @@
-"""Geometry of H x <= h on the host, in float64: LPs, hulls, redundant rows, elimination.
+"""Geometry of H x <= h in NumPy, in float64: LPs, hulls, redundant rows, elimination.
 
 About a point c with G c < g the set {G x <= g} reads {Y (x - c) <= 1}, Y = G / (g - G c). The rows
 of Y are points of the polar set: a row is irredundant exactly if it is a vertex of the convex
@@ -19,13 +19,15 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 from jaxmpc.checks import fail, require_finite
 from jaxmpc.control.system import host_array
 
+# Tolerances of HiGHS' linear programs.
+HIGHS = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 # A set is called empty or flat if no ball of this radius fits, relative to the median
 # distance of its hyperplanes from the origin; well above HiGHS' own tolerance of 1e-10.
 FLAT = 1e-9
 _ZERO = 1e-12  # a coefficient that moves a row by less, relative to its distance, counts as 0
 _MERGE = "C-1e-12"  # qhull's option: merge facets of the dual that are flat to 1e-12
 _HULL_DIMENSIONS = 6  # above, hulls have too many facets and one LP a row is faster
-_MOST_ROWS = 100_000  # an elimination step that makes more candidate rows is given up
+_MOST_ROWS = 100_000  # an elimination step with more candidate rows raises ValueError
 
 
 class Optimum(NamedTuple):
@@ -37,10 +39,10 @@ class Optimum(NamedTuple):
 
 
 def maximise(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> Optimum:
-    """max d'x over G x <= g: value inf (x and y None) if unbounded, -inf if empty.
+    """Maximise d'x over G x <= g: the value is inf (x and y None) if unbounded, -inf if empty.
 
     The multipliers y >= 0 obey G'y = d and g'y = value up to rounding. Rows of G should
-    have norms of about 1. Dual simplex (HiGHS): a vertex, in float64, on the host.
+    have norms of about 1. Solved by the dual simplex of HiGHS, which returns a vertex.
     """
     # HiGHS' tolerances are absolute, hence the scaling of g and d.
     size, length = _typical(g), np.linalg.norm(d) or 1.0
@@ -52,11 +54,7 @@ def maximise(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> Optimum:
             b_ub=g / size,
             bounds=(None, None),
             method="highs-ds",
-            options={
-                "presolve": presolve,
-                "primal_feasibility_tolerance": 1e-10,
-                "dual_feasibility_tolerance": 1e-10,
-            },
+            options={"presolve": presolve, **HIGHS},
         )
         if result.status in (0, 3):
             break
@@ -69,7 +67,8 @@ def maximise(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> Optimum:
 
 
 def extent(G: np.ndarray, g: np.ndarray, axes: Sequence[int] | None = None) -> np.ndarray:
-    """max |x_i| over G x <= g for each i of `axes` (None: all), by two LPs each; inf allowed."""
+    """Return max |x_i| over G x <= g for each i of `axes` (None: all), by two LPs each; inf where
+    the set is unbounded."""
     directions = np.eye(G.shape[1])[slice(None) if axes is None else list(axes)]
     return np.array(
         [max(maximise(e, G, g).value, maximise(-e, G, g).value) for e in directions], dtype=float
@@ -77,7 +76,7 @@ def extent(G: np.ndarray, g: np.ndarray, axes: Sequence[int] | None = None) -> n
 
 
 def _typical(g: np.ndarray) -> float:
-    """The median distance of the hyperplanes from the origin, 1 if all pass through it."""
+    """Return the median distance of the hyperplanes from the origin, 1 if all pass through it."""
     distances = np.abs(g)
     # Below that they are zeros with rounding.
     distances = distances[distances > 1e-13 * distances.max(initial=0.0)]
@@ -85,7 +84,7 @@ def _typical(g: np.ndarray) -> float:
 
 
 def largest_ball(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """(centre, radius, typical size) of {G x <= g} with unit rows; ValueError if empty.
+    """Return (centre, radius, typical size) of {G x <= g} with unit rows; ValueError if empty.
 
     The LP max r subject to G x + r <= g (Boyd & Vandenberghe 2004, section 4.3.1), with r
     of either sign so that it is always feasible. Radius inf if it is unbounded: the centre is
@@ -106,7 +105,8 @@ def largest_ball(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarra
 
 
 def about_centre(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(Y, c) with {G x <= g} = {Y (x - c) <= 1}, for unit rows; ValueError if empty or flat."""
+    """Return (Y, c) with {G x <= g} = {Y (x - c) <= 1}, for unit rows; ValueError if empty or
+    flat."""
     centre, radius, size = largest_ball(argument, G, g)
     if radius <= FLAT * size:
         cure = "Check the rows: this needs a set with volume"
@@ -115,7 +115,7 @@ def about_centre(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarra
 
 
 def positively_spanning(G: np.ndarray) -> bool:
-    """True if {G x <= g} is bounded: G'y = 0 for some y > 0 and rank G = n (Stiemke)."""
+    """Return True if {G x <= g} is bounded: G'y = 0 for some y > 0 and rank G = n (Stiemke)."""
     if len(G) <= G.shape[1] or np.linalg.matrix_rank(G) < G.shape[1]:
         return False
     zero = np.zeros(G.shape[1])
@@ -123,7 +123,8 @@ def positively_spanning(G: np.ndarray) -> bool:
 
 
 def binding_rows(H: np.ndarray, h: np.ndarray, argument: str = "Polytope") -> np.ndarray:
-    """Indices of the rows of H x <= h that can bind; ValueError for NaN and for empty rows."""
+    """Return the indices of the rows of H x <= h that can bind; ValueError for NaN and for empty
+    rows."""
     require_finite(f"{argument}.H", H)
     if np.isnan(h).any():
         fail(f"{argument}.h", "holds NaN", "Use inf for a row that does not bind")
@@ -134,7 +135,7 @@ def binding_rows(H: np.ndarray, h: np.ndarray, argument: str = "Polytope") -> np
 
 
 def unit_rows(H: Any, h: Any, argument: str = "Polytope") -> tuple[np.ndarray, np.ndarray]:
-    """The rows of H x <= h that can bind, scaled to norm 1, in float64."""
+    """Return the rows of H x <= h that can bind, scaled to norm 1, in float64."""
     H, h = host_array(f"{argument}.H", H), host_array(f"{argument}.h", h)
     binding = binding_rows(H, h, argument)
     H, h = H[binding], h[binding]
@@ -143,7 +144,8 @@ def unit_rows(H: Any, h: Any, argument: str = "Polytope") -> tuple[np.ndarray, n
 
 
 def hull_volume(points: ArrayLike) -> float:
-    """Volume of the convex hull of points (k, n): 0 where they lie in a hyperplane. Host."""
+    """Return the volume of the convex hull of points (k, n): 0 where they lie in a hyperplane.
+    NumPy; not traceable."""
     points = host_array("points", points)
     if len(points) <= points.shape[1]:
         return 0.0
@@ -163,7 +165,8 @@ def hull_volume(points: ArrayLike) -> float:
 
 
 def dual_hull(Y: np.ndarray) -> HalfspaceIntersection:
-    """Vertices of {Y x <= 1}, and the rows that meet in each: a convex hull of Y (qhull).
+    """Return the vertices of {Y x <= 1} and the rows that meet in each, by a convex hull of Y
+    (qhull).
 
     A zero row makes facets through 0, whose vertices are at infinity.
     """
@@ -174,7 +177,7 @@ def dual_hull(Y: np.ndarray) -> HalfspaceIntersection:
 
 @contextmanager
 def explained(argument: str) -> Iterator[None]:
-    """qhull's errors as ours."""
+    """Turn errors of qhull into a ValueError that names the argument."""
     try:
         yield
     except QhullError as error:
@@ -183,13 +186,13 @@ def explained(argument: str) -> Iterator[None]:
 
 
 def distinct(points: np.ndarray, tolerance: float) -> np.ndarray:
-    """Indices of the points, one of each cluster closer than `tolerance`."""
+    """Return the indices of the points, of each cluster closer than `tolerance` only one."""
     close = KDTree(points).query_pairs(tolerance, output_type="ndarray")
     return np.setdiff1d(np.arange(len(points)), close.max(axis=1, initial=-1))
 
 
 def factors(Y: np.ndarray) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
-    """{Y x <= 1} as a product of sets, in the finest way its rows allow.
+    """Write {Y x <= 1} as a product of sets, in the finest way its rows allow.
 
     Returns ([(rows, Z), ...], S): in the coordinates s = S x the rows `rows` read Z t <= 1 with
     t the factor's own entries of s, which no other factor's rows contain. S is square unless
@@ -223,7 +226,7 @@ def factors(Y: np.ndarray) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndar
 
 
 def irredundant(Y: np.ndarray, known: Sequence[int] | np.ndarray = ()) -> np.ndarray:
-    """Indices of the rows of Y x <= 1 that the others do not imply, ascending.
+    """Return the indices of the rows of Y x <= 1 that the others do not imply, ascending.
 
     Arguments:
         Y: (rows, n); the set may be unbounded.
@@ -261,7 +264,8 @@ def irredundant(Y: np.ndarray, known: Sequence[int] | np.ndarray = ()) -> np.nda
 
 
 def _by_programs(Y: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Indices of the irredundant rows of Y x <= 1, by LPs whose rows are known irredundant ones.
+    """Return the indices of the irredundant rows of Y x <= 1, by LPs whose rows are known
+    irredundant ones.
 
     The first row that a ray from an interior point meets is irredundant. So an LP either
     proves a row redundant, or its maximiser lies outside the set and the ray towards it finds
@@ -276,10 +280,10 @@ def _by_programs(Y: np.ndarray, known: np.ndarray) -> np.ndarray:
     start *= 0.1 / (np.linalg.norm(start) * np.linalg.norm(Y, axis=1).max())
     slack = 1 - Y @ start
     count = min(len(Y), 3_000_000 // len(Y))
-    shots = np.vstack([Y[:count], random.standard_normal((2 * count, n))])
-    nearness = shots @ (Y / slack[:, None]).T  # 1 / how far along its ray a row is met
+    rays = np.vstack([Y[:count], random.standard_normal((2 * count, n))])
+    nearness = rays @ (Y / slack[:, None]).T  # 1 / distance along the ray to the row
     second, first = np.argpartition(nearness, -2, axis=1)[:, -2:].T
-    ray = np.arange(len(shots))
+    ray = np.arange(len(rays))
     nearest = nearness[ray, first]  # not above 0: the ray meets no row
     keep[first[(nearest > 0) & (nearness[ray, second] < (1 - 1e-9) * nearest)]] = True
     open_rows = ~keep
@@ -306,7 +310,7 @@ def _by_programs(Y: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def eliminate(Y: np.ndarray, axes: Sequence[int]) -> np.ndarray:
-    """Rows, irredundant, of the projection of {x : Y x <= 1} along the coordinates `axes`.
+    """Return the irredundant rows of the projection of {x : Y x <= 1} along the coordinates `axes`.
 
     Fourier-Motzkin, one coordinate at a time, that with the fewest new rows first: of rows p
     and q with p_j > 0 > q_j the convex combination with j-th entry 0, and all rows with j-th

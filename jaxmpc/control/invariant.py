@@ -1,8 +1,8 @@
-"""Invariant sets of x+ = A x + B u + c + w: under u = K x, or under the best u there is.
+"""Invariant sets of x+ = A x + B u + c + w: under u = K x, or control invariant.
 
-The recursions are made of LPs, hulls and Fourier-Motzkin eliminations in float64. What is
-said of their result rests on a check of the result itself: upper bounds from LP multipliers,
-valid whatever the LP's error, and inputs found for its vertices.
+The recursions use LPs, hulls and Fourier-Motzkin eliminations in float64. Their results are checked
+afterwards, by upper bounds from LP multipliers, valid for any LP error, and by inputs for
+the vertices.
 """
 
 from collections.abc import Iterator
@@ -21,12 +21,12 @@ from jaxmpc.control import geometry
 from jaxmpc.control.geometry import maximise, unit_rows
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
-from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.control.system import LinearSystem, host_array, host_matrices
 from jaxmpc.qp.linalg import cholesky, eigh, solve_triangular
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 
 # A row counts as redundant if it is exceeded by no more than this, relative to its bound.
-# Rounding alone makes rows that exactly touch the set stand out by about 1e-16.
+# Rounding alone makes rows that just touch the set exceed their bound by about 1e-16.
 _REDUNDANT = 1e-12
 # The same for a predecessor's rows, where rounding in 12 dimensions reaches 1e-12.
 _ROUNDING = 1e-11
@@ -68,7 +68,7 @@ def maximal_invariant_set(
     max_iterations: int = 500,
     return_index: bool = False,
 ) -> Polytope | tuple[Polytope, int]:
-    """O_inf, the states from which u = K x keeps all constraints for ever.
+    """Return O_inf, the states from which u = K x keeps all constraints for ever.
 
     O_inf = {x : x_k in states and K x_k in inputs for all k >= 0 and all w_k in disturbance},
     x_{k+1} = (A + BK) x_k + w_k.
@@ -85,12 +85,11 @@ def maximal_invariant_set(
     Returns O_inf with irredundant rows of norm 1, or (O_inf, t*): t* is the least t for
     which constraints kept at k = 0..t are kept for ever.
 
-    With the constraints written as F x <= 1 and W the disturbance,
-    O_t = {x : F_i (A+BK)^j x <= b_ij, j = 0..t}, where b_i0 = 1 and
-    b_i,j+1 = b_ij - max {F_i (A+BK)^j w : w in W}; O_inf = O_t as soon as
-    max {F_i (A+BK)^(t+1) x : x in O_t} <= b_i,t+1 for every i. The maximum is judged by an
-    upper bound made from the LP's multipliers, valid whatever the LP's error, and may exceed
-    the right-hand side by 1e-12 of it. Host, float64.
+    With the constraints written as F x <= 1 and W the disturbance, O_t = {x : F_i (A+BK)^j x <=
+    b_ij, j = 0..t}, where b_i0 = 1 and b_i,j+1 = b_ij - max {F_i (A+BK)^j w : w in W}; O_inf = O_t
+    as soon as max {F_i (A+BK)^(t+1) x : x in O_t} <= b_i,t+1 for every i. The maximum is judged by
+    an upper bound made from the LP's multipliers, valid for any LP error, and may exceed the
+    right-hand side by 1e-12 of it. NumPy in float64; not traceable.
 
     Raises ValueError if A + BK is not strictly stable, the origin is not in the interior of
     the constraints, the disturbance leaves no set around the origin, O_inf is unbounded, or
@@ -117,7 +116,7 @@ def maximal_invariant_set(
             extent = _extent(rows)
         # A row once redundant stays so: if F_i Acl^(t+1) x <= b_(t+1) on O_t, and Acl x + w is
         # in O_t for x in O_(t+1) and w in W, then F_i Acl^(t+2) x <= b_(t+2) on O_(t+1).
-        # Only the others are followed.
+        # Only the others are propagated.
         b, candidates = b - supports(W, newest), newest @ closed
         if b.min() <= 0:
             fail(
@@ -154,7 +153,7 @@ def predecessor(
     inputs: Box | Polytope | None,
     disturbance: Box | Polytope | None = None,
 ) -> Polytope:
-    """The states that some input takes into a target within one step, whatever w does.
+    """Return the states that some input takes into a target within one step for every w.
 
     Pre = {x in states : there is u in inputs with A x + B u + c + w in target for all w in
     disturbance}, the one-step controllable set.
@@ -170,9 +169,9 @@ def predecessor(
     Returns irredundant rows of norm 1; rows of a flat set are not reduced. An empty set comes
     as the row 0'x <= -1 (`is_empty()` is True), all of R^n as 0'x <= 1.
 
-    With T = {H y <= h - max Hw} the target shrunk by the disturbance, Pre is the preimage of
-    the Minkowski sum T + (-B inputs) under x -> A x + c. The sum is the projection to y of
-    {(y, u) : y + B u in T, u in inputs}, so that A need not be inverted. Host, float64.
+    With T = {H y <= h - max Hw} the target shrunk by the disturbance, Pre is the preimage of the
+    Minkowski sum T + (-B inputs) under x -> A x + c. The sum is the projection to y of {(y, u) : y
+    + B u in T, u in inputs}, so that A need not be inverted. NumPy in float64; not traceable.
 
     Raises ValueError for wrong shapes, empty or flat arguments, or as `Polytope.project` does.
 
@@ -212,7 +211,7 @@ def maximal_control_invariant_set(
     max_iterations: int = 100,
     tolerance: float = 1e-9,
 ) -> ControlInvariantSet:
-    """C_inf, the states from which some inputs keep all constraints for ever.
+    """Return C_inf, the states from which some inputs keep all constraints for ever.
 
     C_inf is the largest set C within `states` such that for every x in C there is a u in
     `inputs` with A x + B u + c + w in C for all w in `disturbance`.
@@ -236,7 +235,7 @@ def maximal_control_invariant_set(
       exactly if no equilibrium x = A x + B u + c lies within the limits: a compact convex C
       within Pre(C) holds one, by Kakutani's theorem.
     For up to 500 vertices in up to four dimensions, LPs also find an input for each vertex,
-    without use of Pre; by convexity that proves invariance once more. `reason` says all that.
+    without use of Pre; by convexity that proves invariance a second time. `reason` names the case.
 
     The inner set. To shrink C and its inputs about an equilibrium leaves the dynamics as they
     are, so a C_k that is almost invariant is often invariant when shrunk by a little more than
@@ -245,7 +244,7 @@ def maximal_control_invariant_set(
     within Pre(C), which ends if there is an s-contractive set. Each is then grown by
     C <- Pre(C), which keeps invariance.
 
-    Host, float64. Raises ValueError for wrong or unbounded arguments.
+    NumPy in float64; not traceable. Raises ValueError for wrong or unbounded arguments.
 
     Source: Bertsekas 1972, IEEE TAC 17(5), for the recursion; Blanchini 1994, IEEE TAC 39(2),
     for contractive sets; Kerrigan 2000, thesis, Cambridge, sections 2.6 and 3.2.
@@ -345,7 +344,8 @@ def invariant_ellipsoid(
     *,
     return_contraction: bool = False,
 ) -> Ellipsoid | tuple[Ellipsoid, float]:
-    """The largest {x : x'P x <= alpha} within the limits; u = K x never lets the state leave it.
+    """Return the largest {x : x'P x <= alpha} within the limits; u = K x never lets the state leave
+    it.
 
     Arguments:
         system: n states, m inputs; c must be None or zero.
@@ -361,7 +361,7 @@ def invariant_ellipsoid(
         gamma2 = max |P^(1/2) (A+BK) P^(-1/2)|^2, so x+'P x+ <= gamma2 x'P x for w = 0.
     With w, |x+|_P <= gamma |x|_P + |w|_P, |x|_P^2 = x'P x: the ellipsoid is invariant if
     gamma sqrt(alpha) + max |w|_P <= sqrt(alpha), which holds for alpha >= (max |w|_P /
-    (1 - gamma))^2. Host, float64.
+    (1 - gamma))^2. NumPy in float64; not traceable but for the case below.
 
     Where anything but the disturbance is traced by `jit`, `vmap` or `grad`, P and alpha are JAX
     arrays with derivatives (alpha's is that of the row that decides), and alpha is NaN where an
@@ -395,13 +395,13 @@ def invariant_ellipsoid(
         )
     level = float(1 / np.einsum("ij,ij->i", F, np.linalg.solve(P, F.T).T).max())
     if W is not None:
-        push, gamma = largest_norm(W, P), np.sqrt(gamma2)
-        needed = np.inf if gamma >= 1 else (push / (1 - gamma)) ** 2
-        if push > 0 and needed > level:
+        w_norm, gamma = largest_norm(W, P), np.sqrt(gamma2)
+        needed = np.inf if gamma >= 1 else (w_norm / (1 - gamma)) ** 2
+        if w_norm > 0 and needed > level:
             fail(
                 "disturbance",
                 f"needs the level {needed:.9g} = (max |w|_P / (1 - gamma))^2 with max |w|_P = "
-                f"{push:.6g} and gamma = {gamma:.6g}; the limits leave {level:.9g}, which is "
+                f"{w_norm:.6g} and gamma = {gamma:.6g}; the limits leave {level:.9g}, which is "
                 f"{needed - level:.6g} too little",
                 "Shrink the disturbance, widen the limits, or use another K and P",
             )
@@ -413,7 +413,7 @@ def _traced_ellipsoid(
     system: LinearSystem, K: Any, P: Any, states: Box | Polytope | None,
     inputs: Box | Polytope | None,
 ) -> tuple[Ellipsoid, Any]:  # fmt: skip
-    """`invariant_ellipsoid` in JAX, with NaN for errors."""
+    """Compute `invariant_ellipsoid` in JAX, with NaN in place of errors."""
     system.validate()
     n, m = system.n, system.m
     require_shape("K", K, (m, n), "Give u = Kx one row an input, one column a state")
@@ -444,18 +444,18 @@ def _traced_ellipsoid(
 
 
 def contraction(closed: np.ndarray, P: np.ndarray) -> float:
-    """gamma2, the least factor with closed'P closed <= gamma2 P."""
+    """Return gamma2, the least factor with closed'P closed <= gamma2 P."""
     return max(float(scipy.linalg.eigh(closed.T @ P @ closed, P, eigvals_only=True)[-1]), 0.0)
 
 
 def largest_norm(W: Box | Polytope, P: np.ndarray) -> float:
-    """max sqrt(w'P w) over W: a convex function is largest at a vertex."""
+    """Return max sqrt(w'P w) over W: a convex function is largest at a vertex."""
     vertices = W.vertices()
     return float(np.sqrt(np.einsum("ij,jk,ik->i", vertices, P, vertices).max()))
 
 
 def disturbance_set(disturbance: Box | Polytope | None, n: int) -> Box | Polytope | None:
-    """The disturbance, or ValueError unless it is None or a bounded set that holds 0."""
+    """Return the disturbance; raise ValueError unless it is None or a bounded set that holds 0."""
     if disturbance is None:
         return None
     W = _polytope("disturbance", disturbance, n)
@@ -468,7 +468,7 @@ def disturbance_set(disturbance: Box | Polytope | None, n: int) -> Box | Polytop
 
 
 def supports(W: Box | Polytope | None, rows: np.ndarray) -> np.ndarray:
-    """max {row w : w in W} for each row; 0 if W is None."""
+    """Return max {row w : w in W} for each row; 0 if W is None."""
     if W is None or not len(rows):
         return np.zeros(len(rows))
     limits = Polytope(rows, np.zeros(len(rows))).pontryagin_difference(W).h
@@ -494,10 +494,11 @@ class OneStep:
 
     @property
     def n(self) -> int:
+        """Return the number of states."""
         return len(self.A)
 
     def back(self, target: Polytope, states: Polytope | None = None) -> Polytope:
-        """`predecessor`, with `states` None for all of R^n."""
+        """Return the `predecessor` of the target; `states` None stands for all of R^n."""
         n, k = self.n, self.moving.shape[1]
         T = Polytope(target.H, target.h)
         if self.W is not None:
@@ -530,11 +531,11 @@ class OneStep:
 def one_step(
     system: LinearSystem, inputs: Box | Polytope | None, disturbance: Box | Polytope | None
 ) -> OneStep:
-    """The exact data of x⁺ = A x + B u + c + w, inputs that are fixed (lower = upper) taken out."""
+    """Return the exact data of x⁺ = A x + B u + c + w, with inputs that are fixed (lower = upper)
+    taken out."""
     system.validate()
-    n, m = system.n, system.m
-    A, B = host_array("A", system.A), host_array("B", system.B)
-    c = np.zeros(n) if system.c is None else host_array("c", system.c)
+    m = system.m
+    A, B, c = host_matrices(system)
     V, moving, fixed, ends = None, np.eye(m), np.zeros(m), None
     if inputs is not None:
         V = _polytope("inputs", inputs, m)
@@ -545,19 +546,20 @@ def one_step(
         V = Box(lower[free], upper[free]).to_polytope() if free.any() else None
         ends = np.column_stack([lower, upper])[free]
         ends = ends if np.isfinite(ends).all() else None
-    return OneStep(A, B, c, V, moving, fixed, disturbance_set(disturbance, n), ends)
+    return OneStep(A, B, c, V, moving, fixed, disturbance_set(disturbance, system.n), ends)
 
 
 def _bounded(polytope: Polytope) -> bool:
+    """Return whether a polytope is bounded."""
     return geometry.positively_spanning(unit_rows(polytope.H, polytope.h)[0])
 
 
 def _plus_segment(T: Polytope, b: np.ndarray, lower: float, upper: float) -> Polytope:
-    """{y + b v : y in T, lower <= v <= upper}, for a bounded T with volume, n >= 2.
+    """Return {y + b v : y in T, lower <= v <= upper}, for a bounded T with volume, n >= 2.
 
     Its facets are those of T, shifted, and the sums of the segment and a ridge of T where facets
     p and q meet with p'b > 0 > q'b. A ridge has at least n - 1 vertices: of all pairs (p, q),
-    those that share so many are combined, few of those that an elimination would make.
+    those with so many common vertices are combined, far fewer than an elimination would make.
     """
     G, g = unit_rows(T.H, T.h)
     slope, n = G @ b, G.shape[1]
@@ -567,16 +569,17 @@ def _plus_segment(T: Polytope, b: np.ndarray, lower: float, upper: float) -> Pol
     up, down = np.flatnonzero(slope > 0), np.flatnonzero(slope < 0)
     p, q = np.nonzero(touches[up] @ touches[down].T >= n - 1)
     p, q = up[p], down[q]
-    share = -slope[q] / (slope[p] - slope[q])
-    H = share[:, None] * G[p] + (1 - share)[:, None] * G[q]
-    h = share * g[p] + (1 - share) * g[q]
+    weight = -slope[q] / (slope[p] - slope[q])
+    H = weight[:, None] * G[p] + (1 - weight)[:, None] * G[q]
+    h = weight * g[p] + (1 - weight) * g[q]
     new = np.linalg.norm(H, axis=1) > 1e-12
     shifted = g + np.maximum(slope * lower, slope * upper)
     return Polytope(np.vstack([G, H[new]]), np.r_[shifted, h[new]]).reduce()
 
 
 def _tidy(polytope: Polytope) -> Polytope:
-    """The same set with irredundant unit rows; 0'x <= -1 if empty, 0'x <= 1 if all of R^n."""
+    """Return the same set with irredundant unit rows; 0'x <= -1 if empty, 0'x <= 1 if all of
+    R^n."""
     zero = np.zeros((1, polytope.dimension))
     if polytope.is_empty():
         return Polytope(zero, np.array([-1.0]))
@@ -593,7 +596,8 @@ def _tidy(polytope: Polytope) -> Polytope:
 
 
 def _equilibrium(step: OneStep, X: Polytope) -> tuple[np.ndarray, float]:
-    """((x_e, v_e), margin) of the equilibrium farthest inside the limits, u_e = moving v_e + fixed.
+    """Return ((x_e, v_e), margin) of the equilibrium farthest inside the limits, u_e = moving v_e +
+    fixed.
 
     The margin is the least distance to a limit over the radius of the largest ball within
     `states` (inputs: theirs), negative if a limit is exceeded, -inf if there is none at all.
@@ -623,7 +627,8 @@ def _inside(
     step: OneStep, C: Polytope, X: Polytope, centre: np.ndarray, cut: float, rounds: int,
     tolerance: float,
 ) -> tuple[Polytope | None, float]:  # fmt: skip
-    """A control invariant set within C_k, as large as `rounds` steps make it, and the gap."""
+    """Return a control invariant set within C_k, as large as `rounds` steps make it, and the
+    gap."""
     found = None
     margins = [m for m in 4 * cut * 30.0 ** np.arange(9) if m < 0.5] + [0.5]
     for candidates in (
@@ -656,7 +661,8 @@ def _inside(
 def _shrunk(
     step: OneStep, C: Polytope, centre: np.ndarray, margins: list[float]
 ) -> Iterator[tuple[Polytope, Polytope]]:
-    """C_k shrunk about the equilibrium by each margin, and Pre, if that is invariant."""
+    """Yield C_k shrunk about the equilibrium by each margin, with its predecessor, where it is
+    invariant."""
     for margin in margins:
         yield from _kept(step, _about(C, centre[: step.n], 1 - margin))
 
@@ -664,7 +670,8 @@ def _shrunk(
 def _contractive(
     step: OneStep, C: Polytope, centre: np.ndarray, margins: list[float]
 ) -> Iterator[tuple[Polytope, Polytope]]:
-    """The end of C <- Pre(x_e + (1 - margin) (C - x_e)) & C for each margin, and Pre."""
+    """Yield for each margin the end of C <- Pre(x_e + (1 - margin) (C - x_e)) & C, with its
+    predecessor."""
     for margin in margins:
         inner = C
         for _ in range(30):
@@ -681,7 +688,7 @@ def _contractive(
 def _of_regulator(
     step: OneStep, X: Polytope, centre: np.ndarray
 ) -> Iterator[tuple[Polytope, Polytope]]:
-    """O_inf of an LQR about the equilibrium (x_e, v_e), and Pre."""
+    """Yield O_inf of an LQR about the equilibrium (x_e, v_e), with its predecessor."""
     n, k = step.n, step.moving.shape[1]
     system = LinearSystem(step.A, step.B @ step.moving)
     x_e, v_e = centre[:n], centre[n:]
@@ -699,22 +706,23 @@ def _of_regulator(
 
 
 def _kept(step: OneStep, C: Polytope) -> Iterator[tuple[Polytope, Polytope]]:
-    """(C, Pre(C)) if no row of Pre(C) cuts C."""
+    """Yield (C, Pre(C)) if no row of Pre(C) cuts C."""
     before = step.back(C)
     if not before.is_empty() and largest_cut(before, C, enough=_ROUNDING) <= _ROUNDING:
         yield C, before
 
 
 def _about(C: Polytope, centre: np.ndarray, factor: float) -> Polytope:
-    """{centre + factor (x - centre) : x in C}."""
+    """Return {centre + factor (x - centre) : x in C}."""
     H, h = unit_rows(C.H, C.h)
     return Polytope(H, factor * h + (1 - factor) * (H @ centre))
 
 
 def largest_cut(before: Polytope, C: Polytope, enough: float = np.inf) -> float:
-    """The largest share of C's extent, from its centre along a row of `before`, cut off by it.
+    """Return the largest fraction of C's extent, from its centre along a row of `before`, that a
+    row of `before` cuts off.
 
-    An upper bound of it; or a share above `enough` as soon as one is met.
+    The number is an upper bound; the search ends at the first fraction above `enough`.
     """
     H, h = unit_rows(before.H, before.h)
     level, worst = H @ C.chebyshev()[0], -np.inf
@@ -726,14 +734,15 @@ def largest_cut(before: Polytope, C: Polytope, enough: float = np.inf) -> float:
 
 
 def _gap(outer: Polytope, inner: Polytope) -> float:
-    """The least s with outer within the inner set enlarged by 1 + s about its centre."""
+    """Return the least s with outer within the inner set enlarged by 1 + s about its centre."""
     H, h = unit_rows(inner.H, inner.h)
     slack = h - H @ inner.chebyshev()[0]
     return max(0.0, *((top - h[i]) / slack[i] for i, top in _tops(H, outer)))
 
 
 def _tops(H: np.ndarray, C: Polytope, h: np.ndarray | None = None) -> Iterator[tuple[int, float]]:
-    """(i, upper bound of max H_i x over a bounded C), by LPs in the coordinates of C's factors.
+    """Yield (i, upper bound of max H_i x over a bounded C), by LPs in the coordinates of C's
+    factors.
 
     With h, where a row of C next to H_i x <= h_i implies it, that row's bound.
     """
@@ -752,7 +761,8 @@ def _tops(H: np.ndarray, C: Polytope, h: np.ndarray | None = None) -> Iterator[t
 
 
 def _vertex_proof(step: OneStep, C: Polytope) -> tuple[str, float]:
-    """How far the worst vertex of C leaves it, with the best input for each, in words and in x."""
+    """Return by how much the worst vertex of C leaves it under the best input for each, as a text
+    and as a number in units of x."""
     vertices = C.vertices() if step.n <= 4 else np.zeros((0, step.n))
     if not 0 < len(vertices) <= _VERTICES:
         return "", 0.0
@@ -786,7 +796,7 @@ def _closed_loop(
     inputs: Box | Polytope | None,
     optional: tuple[str, ...] = ("inputs",),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A + BK, and F of the constraints F x <= 1 on the state, inputs included."""
+    """Return A + BK, and F of the constraints F x <= 1 on the state, inputs included."""
     system.validate()
     n, m = system.n, system.m
     require_shape("K", K, (m, n), "Give u = Kx one row an input, one column a state")
@@ -820,6 +830,7 @@ def _closed_loop(
 
 
 def _polytope(argument: str, value: Box | Polytope | None, n: int) -> Polytope:
+    """Return a set in R^n as a Polytope; raise ValueError, naming `argument`, for anything else."""
     if not isinstance(value, Box | Polytope):
         fail(argument, f"{type(value).__name__} is no Box or Polytope", "Give one")
     value.validate(argument, n)
@@ -827,14 +838,15 @@ def _polytope(argument: str, value: Box | Polytope | None, n: int) -> Polytope:
 
 
 def _extent(rows: np.ndarray, limits: ArrayLike = 1.0) -> np.ndarray:
-    """Bounds on |x_i| over rows x <= limits, with a margin for the LP's error; inf allowed."""
+    """Return bounds on |x_i| over rows x <= limits, with a margin for the LP's error; inf where
+    unbounded."""
     return geometry.extent(*unit_rows(rows, np.broadcast_to(limits, len(rows)))) * (1 + 1e-6)
 
 
 def _bound(
     row: np.ndarray, rows: np.ndarray, extent: np.ndarray, limits: ArrayLike = 1.0
 ) -> tuple[float, float]:
-    """(maximum, upper bound of it) of row x over rows x <= limits.
+    """Return (maximum, upper bound of it) of row x over rows x <= limits.
 
     For any y >= 0,
         row x = y'(rows x) + (row - rows'y)'x <= y'limits + |row - rows'y|'extent.

@@ -31,7 +31,8 @@ class JointLimits:
 
     @property
     def names(self) -> dict[str, tuple[str, ...]]:
-        """The names and units as LinearSystem takes them: LinearSystem(A, B, **limits.names)."""
+        """Return the names and units as LinearSystem takes them: LinearSystem(A, B,
+        **limits.names)."""
         keys = ("state_names", "state_units", "input_names", "input_units")
         return {key: getattr(self, key) for key in keys}
 
@@ -44,7 +45,8 @@ def joint_limits(
     names: Sequence[str] | None = None,
     units: Sequence[str | Sequence[str]] = ("rad", "rad/s", "N m"),
 ) -> JointLimits:
-    """Limits of a robot's joints as sets, for x = (q, dq), q in R^n, and u the n torques.
+    """Return the limits of a robot's joints as sets, for x = (q, dq), q in R^n, and u the n
+    torques.
 
     Arguments:
         position, velocity, torque: (lower, upper), each a number for all joints or (n,) with
@@ -55,7 +57,7 @@ def joint_limits(
 
     Returns JointLimits. With S_q = [I 0] and S_dq = [0 I], `states` is G_x x <= g_x,
         G_x = [S_q; -S_q; S_dq; -S_dq],  g_x = (q_max, -q_min, dq_max, -dq_min),
-    without the rows of infinite bounds (the lesson's Problem 5); `inputs` is the Box of the
+    without the rows of infinite bounds; `inputs` is the Box of the
     torques. Rows are named after joints, such as "q1 <= 1.5 rad" and "dq1 >= -2 rad/s", or with
     the joint's own name "elbow <= 1.5 rad" and "elbow velocity >= -2 rad/s".
 
@@ -102,7 +104,7 @@ def output_limits(
     units: Sequence[str] = (),
     argument: str = "limits",
 ) -> Polytope:
-    """{x : lower <= C x <= upper} as [C; -C] x <= (upper, -lower), infinite rows dropped.
+    """Return {x : lower <= C x <= upper} as [C; -C] x <= (upper, -lower), infinite rows dropped.
 
     Arguments:
         C: (p, n), one row an output.
@@ -140,7 +142,7 @@ def output_limits(
 
 
 def limit_pair(argument: str, limit: Any) -> tuple[np.ndarray, np.ndarray]:
-    """(lower, upper) of a limit as `joint_limits` takes it."""
+    """Return (lower, upper) of a limit given as in `joint_limits`."""
     if limit is None:
         return np.array(-np.inf), np.array(np.inf)
     if not isinstance(limit, tuple | list) and np.ndim(limit) == 0:

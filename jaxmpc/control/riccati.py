@@ -50,19 +50,19 @@ def lqr(system: LinearSystem, Q: ArrayLike, R: ArrayLike) -> LQR:
         Q: (n, n), symmetric positive semidefinite.
         R: (m, m), symmetric positive definite.
 
-    Host, float64. Raises ValueError if Q or R is not as above, or if a mode that does not
-    decay by itself cannot be moved by u (not stabilizable) or costs nothing (not
+    NumPy in float64; not traceable. Raises ValueError if Q or R is not as above, or if a mode that
+    does not decay by itself cannot be moved by u (not stabilizable) or costs nothing (not
     detectable). The message names its eigenvalue.
 
     Under `jit`, `vmap` and `grad`, where any of A, B, Q, R is traced, K and P are JAX arrays in
-    the type of the data (computed in float64 all the same), differentiable in both modes and
+    the dtype of the data (computed in float64 nevertheless), differentiable in both modes and
     any number of times with respect to all four. Data without a stabilizing solution give NaN
     there. With K held at its optimum (which moves P to second order only) a change of data
     moves P by the solution of the Lyapunov equation
         dP = Acl'dP Acl + dQ + K'dR K + F + F',    F = Acl'P (dA + dB K),    Acl = A + BK.
 
     Source: Anderson & Moore 1990, Optimal Control: Linear Quadratic Methods, chapter 2;
-    Arnold & Laub 1984, Proc. IEEE 72(12), for the solver on the host; Chu, Fan, Lin & Wang 2004,
+    Arnold & Laub 1984, Proc. IEEE 72(12), for the solver in NumPy; Chu, Fan, Lin & Wang 2004,
     Int. J. Control 77(8), for the doubling algorithm in a trace; Kao & Hennequin 2020,
     arXiv:2011.11430, for the derivative.
     """
@@ -95,20 +95,20 @@ def lqr(system: LinearSystem, Q: ArrayLike, R: ArrayLike) -> LQR:
         radius = np.abs(np.linalg.eigvals(A + B @ K)).max()
     except (np.linalg.LinAlgError, ValueError):
         radius = np.inf
-    if not radius < 1:  # too near the edge for the test above: name the likelier cause
+    if not radius < 1:  # too close to the threshold for the test above: name the likelier cause
         argument, problem, cure = unmoved if control <= cost else unseen
         fail(argument, f"hardly {problem}, so the Riccati equation was not solved", cure)
     return LQR(K=K, P=P)
 
 
 def cost_of_law(system: LinearSystem, K: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Any:
-    """P with x'P x = sum over k >= 0 of x_k'Q x_k + u_k'R u_k under u = K x.
+    """Return P with x'P x = sum over k >= 0 of x_k'Q x_k + u_k'R u_k under u = K x.
 
     P = (A+BK)'P(A+BK) + Q + K'RK: as terminal cost it falls by the stage cost along u = K x, which
-    is what stability asks of it (Rawlings, Mayne & Diehl 2017, assumption 2.14), whatever K is; in
-    a terminal set where K keeps the limits it need not be the LQR's. Host, float64, or traced as
-    `lqr` is (NaN where A + BK is not stable). Raises ValueError for wrong shapes, and on the host
-    if the spectral radius of A + BK is not below 1.
+    is what stability requires (Rawlings, Mayne & Diehl 2017, assumption 2.14) of any K; in a
+    terminal set where K keeps the limits it need not be the LQR's. Computed in NumPy in float64,
+    or traced as `lqr` is (NaN where A + BK is not stable). Raises ValueError for wrong shapes, and
+    outside traces if the spectral radius of A + BK is not below 1.
     """
     system.validate()
     n, m = system.n, system.m
@@ -126,19 +126,20 @@ def cost_of_law(system: LinearSystem, K: ArrayLike, Q: ArrayLike, R: ArrayLike) 
     dtype = floating_dtype(tuple(jnp.asarray(part) for part in data))
     A, B, gain, W, V = (jnp.asarray(part, dtype) for part in data)
     loop = A + matmul(B, gain)
-    cost = _lyapunov(loop, W + matmul(gain.T, matmul(V, gain)))
-    _, left = _sum(jax.lax.stop_gradient(loop), jnp.zeros_like(W))
+    cost = _solve_lyapunov(loop, W + matmul(gain.T, matmul(V, gain)))
+    _, left = _power_sum(jax.lax.stop_gradient(loop), jnp.zeros_like(W))
     return jnp.where(left < 1e-3, (cost + cost.T) / 2, jnp.nan)
 
 
 def _gain(A: np.ndarray, B: np.ndarray, R: np.ndarray, P: np.ndarray) -> np.ndarray:
+    """Return K = -(R + B'PB)^-1 B'PA in NumPy."""
     return -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
 
 
 def _refine(
     A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray, P: np.ndarray
 ) -> np.ndarray:
-    """Up to two steps of the Riccati recursion, each kept only if the residual shrinks.
+    """Take up to two steps of the Riccati recursion, each kept only if the residual shrinks.
 
     With K the gain of P and Acl = A + BK, the right-hand side of the Riccati equation is
     Acl'P Acl + Q + K'RK, a sum of semidefinite terms: no digits cancel. The residual it
@@ -161,23 +162,24 @@ def _refine(
 
 
 def _traced(*data: Any) -> LQR:
-    """K and P of traced A, B, Q, R."""
+    """Return K and P for traced A, B, Q, R."""
     data = tuple(jnp.asarray(v) for v in data)  # lists of traced numbers
     dtype = floating_dtype(data)
     A, B, Q, R = (v.astype(dtype) for v in arrays(data))
     Q, R = (Q + Q.T) / 2, (R + R.T) / 2
     P = _solution(A, B, Q, R)
-    return LQR(K=_gain_of(A, B, R, P), P=P)
+    return LQR(K=_traced_gain(A, B, R, P), P=P)
 
 
-def _gain_of(A: Array, B: Array, R: Array, P: Array) -> Array:
+def _traced_gain(A: Array, B: Array, R: Array, P: Array) -> Array:
+    """Return K = -(R + B'PB)^-1 B'PA in JAX."""
     BtP = matmul(B.T, P)
     return -solve(R + matmul(BtP, B), matmul(BtP, A))
 
 
 @jax.custom_jvp
 def _solution(A: Array, B: Array, Q: Array, R: Array) -> Array:
-    """P of the Riccati equation, NaN where no stabilizing one is found."""
+    """Return P of the Riccati equation, NaN where no stabilizing one is found."""
     double = A.dtype == jnp.float64
     return (_doubling if double else in_float64(_doubling))(A, B, Q, R)
 
@@ -187,15 +189,15 @@ def _solution_jvp(data: tuple[Array, ...], moves: tuple[Array, ...]) -> tuple[Ar
     A, B, Q, R = data
     dA, dB, dQ, dR = moves
     P = _solution(A, B, Q, R)
-    K = _gain_of(A, B, R, P)
+    K = _traced_gain(A, B, R, P)
     closed = A + matmul(B, K)
     F = matmul(matmul(closed.T, P), dA + matmul(dB, K))
-    dP = _lyapunov(closed, dQ + matmul(K.T, matmul(dR, K)) + F + F.T)
+    dP = _solve_lyapunov(closed, dQ + matmul(K.T, matmul(dR, K)) + F + F.T)
     return P, dP * jnp.where(jnp.isfinite(P), 1.0, jnp.nan)  # no number without a solution
 
 
 def _doubling(A: Array, B: Array, Q: Array, R: Array) -> Array:
-    """The structure-preserving doubling algorithm.
+    """Solve the Riccati equation by the structure-preserving doubling algorithm.
 
     Step k holds the data (A_k, G_k, H_k) of 2^k steps of the Hamiltonian recursion at once, with
     G_0 = B R^-1 B' and H_0 = Q: H_k is the cost of 2^k steps with no cost at their end, A_k goes
@@ -219,7 +221,7 @@ def _doubling(A: Array, B: Array, Q: Array, R: Array) -> Array:
     P = jax.lax.while_loop(moving, double, start)[3]
 
     def recursion(P: Array) -> tuple[Array, Array]:  # as in `_refine`
-        K = _gain_of(A, B, R, P)
+        K = _traced_gain(A, B, R, P)
         closed = A + matmul(B, K)
         P = matmul(closed.T, matmul(P, closed)) + Q + matmul(K.T, matmul(R, K))
         return (P + P.T) / 2, closed
@@ -227,7 +229,7 @@ def _doubling(A: Array, B: Array, Q: Array, R: Array) -> Array:
     P, _ = recursion(P)
     P, _ = recursion(P)
     again, closed = recursion(P)
-    _, left = _sum(closed, Q)
+    _, left = _power_sum(closed, Q)
     good = (_size(again - P) <= _RESIDUAL * _size(P)) & (left < 1e-3)
     return jnp.where(good, again, jnp.nan)
 
@@ -236,8 +238,9 @@ def _size(M: Array) -> Array:
     return jnp.max(jnp.abs(M))
 
 
-def _sum(M: Array, S: Array) -> tuple[Array, Array]:
-    """Sum over k of (M')^k S M^k by doubling, and the size of the power of M that is left."""
+def _power_sum(M: Array, S: Array) -> tuple[Array, Array]:
+    """Return the sum over k of (M')^k S M^k, by doubling, and the size of the power of M that is
+    left."""
 
     def double(carry: tuple[Array, ...]) -> tuple[Array, ...]:
         k, M, X = carry
@@ -251,16 +254,16 @@ def _sum(M: Array, S: Array) -> tuple[Array, Array]:
     return X, _size(M)
 
 
-def _lyapunov(M: Array, S: Array) -> Array:
-    """X = M'X M + S for M with spectral radius below 1."""
+def _solve_lyapunov(M: Array, S: Array) -> Array:
+    """Return the solution X of X = M'X M + S, for M with spectral radius below 1."""
     return jax.lax.custom_linear_solve(
         lambda X: X - matmul(M.T, matmul(X, M)), S,
-        solve=lambda _, S: _sum(M, S)[0], transpose_solve=lambda _, S: _sum(M.T, S)[0],
+        solve=lambda _, S: _power_sum(M, S)[0], transpose_solve=lambda _, S: _power_sum(M.T, S)[0],
     )  # fmt: skip
 
 
 def least_reached(A: np.ndarray, B: np.ndarray) -> tuple[float, str]:
-    """How far the modes that do not decay are from unreachable, and the worst eigenvalue.
+    """Return how far the modes that do not decay are from uncontrollable, and the worst eigenvalue.
 
     Popov-Belevitch-Hautus: all are reached if [A - s I, B] has full row rank at every
     eigenvalue |s| >= 1. The distance is its least singular value, B scaled to norm 1.

@@ -1,4 +1,4 @@
-"""Bounds of each coordinate over a set, on the host in float64."""
+"""Bounds of each coordinate over a set, in NumPy in float64."""
 
 import numpy as np
 
@@ -6,10 +6,10 @@ from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 
 
 def set_bounds(set_: Box | Polytope | Ellipsoid | None, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bounds (n,) of each coordinate on a set; ±inf for None.
+    """Return the lower and upper bounds (n,) of each coordinate on a set; ±inf for None.
 
-    Those of a Box are exact. Those of a Polytope, found by linear programs, and of an Ellipsoid are
-    moved outwards by a part in 10⁶.
+    The bounds of a Box are exact; those of a Polytope, found by linear programs, and of an
+    Ellipsoid are moved outwards by a part in 10⁶.
     """
     if set_ is None:
         return np.full(n, -np.inf), np.full(n, np.inf)

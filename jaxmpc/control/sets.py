@@ -1,15 +1,15 @@
 """Convex sets: boxes, polytopes and ellipsoids.
 
 `contains`, `Box.support` and `Ellipsoid.support` are JAX functions of one point (map them with
-`jax.vmap`). Everything that needs an LP (HiGHS) or a convex hull (qhull) runs on the host, in
-float64, and raises ValueError for sets that are empty, flat or unbounded where those make no
-sense.
+`jax.vmap`). Everything that needs an LP (HiGHS) or a convex hull (qhull) runs in NumPy, in float64
+and outside JAX's transformations, and raises ValueError for sets that are empty, flat or unbounded
+where those make no sense.
 """
 
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -64,7 +64,7 @@ class Box:
 
     @property
     def dimension(self) -> int:
-        """n, the number of coordinates."""
+        """Return n, the number of coordinates."""
         return np.shape(as_array(self.lower))[-1]
 
     def validate(self, argument: str, dimension: int | None = None) -> None:
@@ -87,40 +87,42 @@ class Box:
             )
 
     def contains(self, x: ArrayLike, tolerance: float = 0.0) -> jax.Array:
-        """True if lower - tolerance <= x <= upper + tolerance, x of shape (n,)."""
+        """Return whether lower - tolerance <= x <= upper + tolerance, x of shape (n,)."""
         _require_shapes("Box", self, ("lower", "upper"), 1)
         require_shape("x", x, (self.dimension,), "Give one point; use jax.vmap for many")
         x, lower, upper = jnp.asarray(x), jnp.asarray(self.lower), jnp.asarray(self.upper)
         return jnp.all((lower - tolerance <= x) & (x <= upper + tolerance))
 
     def support(self, d: ArrayLike) -> jax.Array:
-        """max d'x over the box, d of shape (n,); inf where the box is unbounded along d."""
+        """Return max d'x over the box, d of shape (n,); inf where the box is unbounded along d."""
         _require_shapes("Box", self, ("lower", "upper"), 1)
         require_shape("d", d, (self.dimension,), "Give one direction; use jax.vmap for many")
         d, lower, upper = jnp.asarray(d), jnp.asarray(self.lower), jnp.asarray(self.upper)
         # The maximiser, with 0 where d is 0: there 0 * inf would be NaN.
         return d @ jnp.where(d > 0, upper, jnp.where(d < 0, lower, 0))
 
-    def tightened(self, share: Any) -> "Box":
-        """The box with its two-sided coordinates narrowed by a share of their half-width on each
-        side. Traceable in `share`."""
+    def tightened(self, fraction: Any) -> "Box":
+        """Return the box with its two-sided coordinates narrowed on each side by a fraction of
+        their half-width. Works inside jit, vmap and grad with respect to `fraction`."""
         lower, upper = np.asarray(self.lower, float), np.asarray(self.upper, float)
         half = np.where(np.isfinite(upper - lower), upper - lower, 0.0) / 2
-        return Box(lower + share * half, upper - share * half)
+        return Box(lower + fraction * half, upper - fraction * half)
 
     def half_widths(self) -> np.ndarray:
-        """(n,): half the distance between the two ends of each coordinate; 1 where it has not two,
-        or where they coincide. Units for weights and tolerances. Host."""
+        """Return half the distance between the two ends of each coordinate, (n,); 1 where an end
+        is infinite or both coincide. It is the unit of weights and tolerances. NumPy; not
+        traceable."""
         width = (host_array("upper", self.upper) - host_array("lower", self.lower)) / 2
         return np.where(np.isfinite(width) & (width > 0), width, 1.0)
 
     def rows(self) -> tuple[ArrayLike, ArrayLike, ArrayLike]:
-        """(H, lower, upper) of the two-sided rows lower <= H x <= upper; H is the identity."""
+        """Return (H, lower, upper) of the two-sided rows lower <= H x <= upper; H is the
+        identity."""
         lower, upper = _as_floats(self.lower), _as_floats(self.upper)
         return np.eye(self.dimension, dtype=lower.dtype), lower, upper
 
     def to_polytope(self) -> "Polytope":
-        """The same set as H x <= h, infinite bounds dropped. Host."""
+        """Return the same set as H x <= h, with infinite bounds dropped. NumPy; not traceable."""
         lower, upper = self._bounds()
         identity = np.eye(len(lower))
         above, below = np.isfinite(upper), np.isfinite(lower)
@@ -130,7 +132,8 @@ class Box:
         )
 
     def intersect(self, other: "Box | Polytope") -> "Box | Polytope":
-        """The points in both sets: a Box with a Box (perhaps empty), else a Polytope. Host."""
+        """Return the points in both sets: a Box with a Box (perhaps empty), else a Polytope. NumPy;
+        not traceable."""
         if not isinstance(other, Box):
             return self.to_polytope().intersect(other)
         lower, upper = self._bounds()
@@ -141,13 +144,15 @@ class Box:
         )
 
     def vertices(self) -> np.ndarray:
-        """(2^n, n) corners; counter-clockwise in 2-D. Host; ValueError if unbounded."""
+        """Return the corners (2^n, n); counter-clockwise in 2-D. NumPy; not traceable. Raises
+        ValueError if unbounded."""
         lower, upper = self._finite_bounds()
         corners = np.array(list(itertools.product(*zip(lower, upper, strict=True))))
         return corners[[0, 2, 3, 1]] if len(lower) == 2 else corners
 
     def volume(self) -> float:
-        """Length, area or volume. Host; ValueError if unbounded."""
+        """Return the length, area or volume. NumPy; not traceable. Raises ValueError if
+        unbounded."""
         lower, upper = self._finite_bounds()
         return float(np.prod(upper - lower))
 
@@ -180,7 +185,8 @@ class Polytope:
 
     @classmethod
     def from_points(cls, points: ArrayLike) -> "Polytope":
-        """The convex hull of `points` (k, n), one unit outward normal per facet. Host.
+        """Return the convex hull of `points` (k, n), one unit outward normal per facet. NumPy; not
+        traceable.
 
         Raises ValueError if the points are not finite or lie in a hyperplane.
         """
@@ -204,7 +210,7 @@ class Polytope:
 
     @property
     def dimension(self) -> int:
-        """n, the number of coordinates."""
+        """Return n, the number of coordinates."""
         return np.shape(as_array(self.H))[-1]
 
     def validate(self, argument: str, dimension: int | None = None) -> None:
@@ -217,21 +223,23 @@ class Polytope:
             largest_ball(argument, *unit_rows(self.H, self.h, argument))
 
     def is_empty(self) -> bool:
-        """True if no point satisfies all rows, by one LP (relative tolerance 1e-10). Host."""
+        """Return whether no point satisfies all rows, by one LP (relative tolerance 1e-10). NumPy;
+        not traceable."""
         H, h = host_array("H", self.H), host_array("h", self.h)
         if np.any((h == -np.inf) | (~H.any(axis=1) & (h < 0))):
             return True
         return maximise(np.zeros(self.dimension), *unit_rows(H, h)).value == -np.inf
 
     def contains(self, x: ArrayLike, tolerance: float = 0.0) -> jax.Array:
-        """True if H x <= h + tolerance (in the scale of each row), x of shape (n,)."""
+        """Return whether H x <= h + tolerance (in the scale of each row), x of shape (n,)."""
         _require_shapes("Polytope", self, ("H", "h"), 2)
         require_shape("x", x, (self.dimension,), "Give one point; use jax.vmap for many")
         H, h, x = jnp.asarray(self.H), jnp.asarray(self.h), jnp.asarray(x)
         return jnp.all(jnp.matmul(H, x, precision="highest") <= h + tolerance)
 
     def support(self, d: ArrayLike) -> float:
-        """max d'x over the set by one LP; inf if unbounded along d, error if empty. Host."""
+        """Return max d'x over the set, by one LP; inf if unbounded along d. NumPy; not traceable.
+        Raises ValueError if the set is empty."""
         G, g = self._rows()
         d = host_array("d", d)
         require_shape("d", d, (self.dimension,), "Give one direction")
@@ -242,12 +250,12 @@ class Polytope:
         return value
 
     def rows(self) -> tuple[ArrayLike, ArrayLike, ArrayLike]:
-        """(H, lower, upper) of the two-sided rows lower <= H x <= upper; lower is -inf."""
+        """Return (H, lower, upper) of the two-sided rows lower <= H x <= upper; lower is -inf."""
         H, h = _as_floats(self.H), _as_floats(self.h)
         return H, np.full(np.shape(h), -np.inf, dtype=h.dtype), h
 
     def chebyshev(self) -> tuple[np.ndarray, float]:
-        """(centre, radius) of the largest ball inside, by one LP. Host.
+        """Return (centre, radius) of the largest ball inside, by one LP. NumPy; not traceable.
 
         The radius of a flat set is 0. Raises ValueError if the set is empty, or holds balls
         of every radius.
@@ -258,7 +266,7 @@ class Polytope:
         return centre, max(radius, 0.0)
 
     def intersect(self, other: "Box | Polytope") -> "Polytope":
-        """The points in both sets: the rows of both, not reduced. Host.
+        """Return the points in both sets: the rows of both, not reduced. NumPy; not traceable.
 
         If one of the two has labels, the unlabelled rows of the other get the label "".
         """
@@ -272,14 +280,15 @@ class Polytope:
         return Polytope(np.vstack(H), np.concatenate(h), labels[0] + labels[1] if named else ())
 
     def scale(self, factor: float) -> "Polytope":
-        """{factor x : x in the set}, factor > 0. Host."""
+        """Return {factor x : x in the set}, factor > 0. NumPy; not traceable."""
         self._require_fields("Polytope")
         if not (np.ndim(factor) == 0 and np.isfinite(factor) and factor > 0):
             fail("factor", f"{factor!r} is not a positive number", "Give a finite factor > 0")
         return Polytope(host_array("H", self.H), host_array("h", self.h) * float(factor))
 
     def preimage(self, M: ArrayLike, t: ArrayLike | None = None) -> "Polytope":
-        """{x : M x + t in the set} = {x : H M x <= h - H t}, row by row, not reduced. Host.
+        """Return {x : M x + t in the set} = {x : H M x <= h - H t}, row by row, not reduced. NumPy;
+        not traceable.
 
         Arguments:
             M: (n, k), any matrix.
@@ -291,7 +300,7 @@ class Polytope:
         return Polytope(H @ M, h - H @ t, self.labels)
 
     def image(self, M: ArrayLike, t: ArrayLike | None = None) -> "Polytope":
-        """{M x + t : x in the set}, reduced unless M is square. Host.
+        """Return {M x + t : x in the set}, reduced unless M is square. NumPy; not traceable.
 
         Arguments:
             M: (k, n) of rank k.
@@ -319,7 +328,8 @@ class Polytope:
         return Polytope(image.H, image.h + image.H @ t, image.labels)
 
     def project(self, axes: Sequence[int]) -> "Polytope":
-        """The set of (x_i for i in axes) over all x in the set, with irredundant unit rows. Host.
+        """Return the set of (x_i for i in axes) over all x in the set, with irredundant unit rows.
+        NumPy; not traceable.
 
         Arguments:
             axes: the coordinates to keep, in the order wanted.
@@ -338,7 +348,8 @@ class Polytope:
         return Polytope(*unit_rows(Y, 1 + Y @ centre[axes]))
 
     def minkowski_sum(self, other: "Box | Polytope | ArrayLike") -> "Polytope":
-        """{x + w : x in the set, w in other}, with irredundant unit rows. Host.
+        """Return {x + w : x in the set, w in other}, with irredundant unit rows. NumPy; not
+        traceable.
 
         Arguments:
             other: Box, Polytope with volume, or points (k, n), which stand for their convex hull;
@@ -372,7 +383,8 @@ class Polytope:
         return lifted.project(range(n))
 
     def pontryagin_difference(self, other: "Box | Polytope | Ellipsoid | ArrayLike") -> "Polytope":
-        """{x : x + w in the set for all w in other}: H x <= h - max {H w : w in other}. Host.
+        """Return {x : x + w in the set for all w in other}: H x <= h - max {H w : w in other}.
+        NumPy; not traceable.
 
         Arguments:
             other: Box, Polytope, Ellipsoid, or points (k, n), which stand for their convex hull.
@@ -388,12 +400,13 @@ class Polytope:
         return Polytope(H, h - reach)
 
     def is_subset(self, other: "Box | Polytope", tolerance: float = 1e-9) -> bool:
-        """True if no point of the set violates a row of `other` by more than `tolerance`. Host.
+        """Return whether no point of the set violates a row of `other` by more than `tolerance`.
+        NumPy; not traceable.
 
         The violation is the distance from the row's hyperplane, in the units of x. Each row is
         judged by an upper bound of its maximum made from an LP's multipliers y >= 0,
             row x = y'(G x) + (row - G'y)'x <= y'g + |row - G'y|'|x|,
-        valid whatever the LP's error (Neumaier & Shcherbina 2004, Math. Programming 99); along
+        valid for any LP error (Neumaier & Shcherbina 2004, Math. Programming 99); along
         coordinates in which the set is unbounded the second term is left out. An empty set is
         a subset of every set.
         """
@@ -412,7 +425,7 @@ class Polytope:
         return True
 
     def reduce(self) -> "Polytope":
-        """The same set with the fewest rows, each of norm 1. Host.
+        """Return the same set with the fewest rows, each of norm 1. NumPy; not traceable.
 
         Rows that cut off less than about 1e-12 of the set's size (near-duplicates, rows that
         touch a vertex) are dropped; 1e-10 in more than six dimensions. Raises ValueError if
@@ -433,7 +446,8 @@ class Polytope:
         return Polytope(G[keep], g[keep], labels)
 
     def vertices(self) -> np.ndarray:
-        """(k, n) vertices; counter-clockwise in 2-D, ascending in 1-D. Host.
+        """Return the vertices (k, n); counter-clockwise in 2-D, ascending in 1-D. NumPy; not
+        traceable.
 
         The vertex dual to the facet {y : v'y = 1} of the hull described in `reduce` is
         c + v. Raises ValueError if the set is empty, flat or unbounded.
@@ -448,7 +462,8 @@ class Polytope:
         return centre + V * scale
 
     def volume(self) -> float:
-        """Length, area or volume, of a product of sets factor by factor. Host.
+        """Return the length, area or volume, of a product of sets factor by factor. NumPy; not
+        traceable.
 
         Raises ValueError if the set is empty, flat or unbounded.
         """
@@ -464,12 +479,14 @@ class Polytope:
         require_labels(f"{argument}.labels", self.labels, np.shape(as_array(self.h))[0])
 
     def _rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows that can bind, scaled to norm 1."""
         self._require_fields("Polytope")
         return unit_rows(self.H, self.h)
 
     @staticmethod
     def _dual(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Y, centre, scale: G x <= g is Y (x - centre) <= 1, and Y * scale has entries <= 1."""
+        """Return (Y, centre, scale): G x <= g is Y (x - centre) <= 1, and Y * scale has entries <=
+        1."""
         largest_ball("Polytope", G, g)
         if not positively_spanning(G):
             fail("Polytope", "is unbounded", "Check the rows: this needs a bounded set")
@@ -492,7 +509,7 @@ class Ellipsoid:
 
     @property
     def dimension(self) -> int:
-        """n, the number of coordinates."""
+        """Return n, the number of coordinates."""
         return np.shape(as_array(self.P))[-1]
 
     def validate(self, argument: str, dimension: int | None = None) -> None:
@@ -507,7 +524,7 @@ class Ellipsoid:
             fail(f"{argument}.level", f"{level:g} is not a positive number", "Give x'Px's maximum")
 
     def contains(self, x: ArrayLike, tolerance: float = 0.0) -> jax.Array:
-        """True if x'P x <= level + tolerance, x of shape (n,)."""
+        """Return whether x'P x <= level + tolerance, x of shape (n,)."""
         self._require_fields("Ellipsoid")
         require_shape("x", x, (self.dimension,), "Give one point; use jax.vmap for many")
         P, x = jnp.asarray(self.P), jnp.asarray(x)
@@ -515,27 +532,30 @@ class Ellipsoid:
         return value <= jnp.asarray(self.level) + tolerance
 
     def support(self, d: ArrayLike) -> jax.Array:
-        """max d'x over the ellipsoid = sqrt(level d'P^-1 d), d of shape (n,)."""
+        """Return max d'x over the ellipsoid = sqrt(level d'P^-1 d), d of shape (n,)."""
         self._require_fields("Ellipsoid")
         require_shape("d", d, (self.dimension,), "Give one direction; use jax.vmap for many")
         d = jnp.asarray(d)
         return jnp.sqrt(jnp.asarray(self.level) * (d @ solve(jnp.asarray(self.P), d)))
 
     def volume(self) -> float:
-        """Length, area or volume: pi^(n/2) / Gamma(n/2 + 1) level^(n/2) / sqrt(det P). Host."""
+        """Return the length, area or volume: pi^(n/2) / Gamma(n/2 + 1) level^(n/2) / sqrt(det P).
+        NumPy; not traceable."""
         P, level = self._values()
         half = len(P) / 2
         logarithm = half * np.log(np.pi * level) - math.lgamma(half + 1)
         return float(np.exp(logarithm - np.linalg.slogdet(P)[1] / 2))
 
     def bounding_box(self) -> Box:
-        """The least box around it: |x_i| <= sqrt(level (P^-1)_ii). Host."""
+        """Return the smallest box around it: |x_i| <= sqrt(level (P^-1)_ii). NumPy; not
+        traceable."""
         P, level = self._values()
         reach = np.sqrt(level * np.diag(np.linalg.inv(P)))
         return Box(-reach, reach)
 
     def boundary(self, count: int = 200) -> np.ndarray:
-        """(count, 2) points of an ellipse, counter-clockwise, for pictures. Host, 2-D only."""
+        """Return points (count, 2) of an ellipse, counter-clockwise, for plots. NumPy, 2-D only;
+        not traceable."""
         P, level = self._values()
         if len(P) != 2:
             fail("Ellipsoid", f"has dimension {len(P)}", "Only an ellipse can be drawn")
@@ -557,6 +577,31 @@ class Ellipsoid:
         require_shape(f"{argument}.level", as_array(self.level), (), "Give one number")
 
 
+def translated(set_: Any, by: np.ndarray) -> Any:
+    """Return the set {x + by : x in set_}; None for None. NumPy; not traceable.
+
+    Raises ValueError for an Ellipsoid, whose centre is the origin, unless by = 0.
+    """
+    if isinstance(set_, Box):
+        return Box(np.asarray(set_.lower) + by, np.asarray(set_.upper) + by)
+    if isinstance(set_, Polytope):
+        return replace(set_, h=np.asarray(set_.h) + np.asarray(set_.H) @ by)
+    if isinstance(set_, Ellipsoid) and by.any():
+        fail("terminal_set", "is an Ellipsoid about the origin", "Use a Polytope")
+    return set_
+
+
+def unit_half_spaces(argument: str, set_: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows (H, h) of a Box or Polytope in R^n, scaled to norm 1; no rows for None."""
+    if set_ is None:
+        return np.zeros((0, n)), np.zeros(0)
+    if not isinstance(set_, Box | Polytope):
+        fail(argument, f"{type(set_).__name__} is no convex set", "Give a Box or Polytope")
+    set_.validate(argument, n)
+    polytope = _as_polytope(argument, set_)
+    return unit_rows(polytope.H, polytope.h, argument)
+
+
 def require_labels(argument: str, labels: Any, rows: int) -> None:
     """Raise unless `labels` is a tuple of strings, one a row or none."""
     if not isinstance(labels, tuple) or not all(isinstance(label, str) for label in labels):
@@ -566,6 +611,7 @@ def require_labels(argument: str, labels: Any, rows: int) -> None:
 
 
 def _as_polytope(argument: str, value: Any) -> Polytope:
+    """Return a Box or Polytope as a Polytope; raise ValueError, naming `argument`, otherwise."""
     if not isinstance(value, Box | Polytope):
         fail(argument, f"{type(value).__name__} is no Box or Polytope", "Give one")
     return value.to_polytope() if isinstance(value, Box) else value
@@ -574,7 +620,8 @@ def _as_polytope(argument: str, value: Any) -> Polytope:
 def _affine(
     M: ArrayLike, t: ArrayLike | None, shape: tuple[int | None, int | None]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """M and t of x -> M x + t, checked: M has this shape (None: any), t one entry a row of M."""
+    """Return M and t of x -> M x + t, checked: M has this shape (None: any), t one entry a row of
+    M."""
     M = host_array("M", M)
     fits = [size is None or size == given for size, given in zip(shape, M.shape, strict=False)]
     if M.ndim != 2 or 0 in M.shape or not all(fits):
@@ -590,7 +637,8 @@ def _affine(
 def _generated(
     other: "Box | Polytope | ArrayLike", points: np.ndarray | None
 ) -> tuple[Polytope | None, np.ndarray, np.ndarray]:
-    """(W, D, shift) with {D w + shift : w in W} = other, W with volume; None: other = {shift}."""
+    """Return (W, D, shift) with {D w + shift : w in W} = other, W with volume; None: other =
+    {shift}."""
     if isinstance(other, Box):
         lower, upper = host_array("lower", other.lower), host_array("upper", other.upper)
         wide = upper > lower
@@ -606,7 +654,7 @@ def _generated(
 
 
 def _supports(other: Any, H: np.ndarray) -> np.ndarray:
-    """max H_i w over w in other for each row of H; inf if unbounded."""
+    """Return max H_i w over w in other for each row of H; inf if unbounded."""
     n = H.shape[1]
     if isinstance(other, Box | Polytope | Ellipsoid):
         other.validate("other", n)
@@ -628,7 +676,7 @@ def _supports(other: Any, H: np.ndarray) -> np.ndarray:
 
 
 def _as_floats(value: Any) -> Any:
-    """`value` as an array that keeps its floating dtype; traced values stay traced."""
+    """Return `value` as an array that keeps its floating dtype; traced values stay traced."""
     value = as_array(value)
     value = value if isinstance(value, jax.Array) else np.asarray(value)
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(float)

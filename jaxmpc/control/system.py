@@ -15,14 +15,15 @@ from jaxmpc.checks import concrete, fail, require_finite, require_shape
 
 
 def host_array(argument: str, value: Any) -> np.ndarray:
-    """`value` as a float64 numpy array; ValueError if it cannot be read as real numbers.
+    """Return `value` as a float64 NumPy array; raise ValueError if it cannot be read as real
+    numbers.
 
-    Host code (LPs, qhull, Riccati) starts here, so it computes in float64 whatever JAX's mode.
+    All NumPy code (LPs, qhull, Riccati) calls it, so it computes in float64 in either mode of JAX.
     """
     if not concrete(value):
         fail(
             argument,
-            "is traced by JAX, and this computation runs on the host",
+            "is traced by JAX, and this computation is not traceable",
             "Call it outside jit, vmap and grad",
         )
     try:
@@ -36,7 +37,7 @@ def host_array(argument: str, value: Any) -> np.ndarray:
 
 
 def as_array(value: Any) -> Any:
-    """`value`, made an array if it is nested lists of traced numbers (lists under `jit`)."""
+    """Return `value`, made an array if it is nested lists of traced numbers (lists under `jit`)."""
     return value if concrete(value) else jnp.asarray(value)
 
 
@@ -75,31 +76,31 @@ class LinearSystem:
 
     @property
     def n(self) -> int:
-        """Number of states."""
+        """Return the number of states."""
         return np.shape(as_array(self.A))[-1]
 
     @property
     def m(self) -> int:
-        """Number of inputs."""
+        """Return the number of inputs."""
         return np.shape(as_array(self.B))[-1]
 
     @property
     def state_size(self) -> int:
-        """Numbers in the state of this plant: n (a robot with orientations has more)."""
+        """Return the length of the state of this plant: n (a robot with orientations has more)."""
         return self.n
 
     @property
     def state_labels(self) -> tuple[str, ...]:
-        """n labels for axes and tables, such as "q [rad]"."""
+        """Return n labels for axes and tables, such as "q [rad]"."""
         return _labels(self.state_names or _numbered("x", self.n), self.state_units)
 
     @property
     def input_labels(self) -> tuple[str, ...]:
-        """m labels for axes and tables, such as "torque [N m]"."""
+        """Return m labels for axes and tables, such as "torque [N m]"."""
         return _labels(self.input_names or _numbered("u", self.m), self.input_units)
 
     def step(self, x: ArrayLike, u: ArrayLike) -> jax.Array:
-        """A x + B u + c, x (n,), u (m,); computed in the dtype of x."""
+        """Return A x + B u + c for x (n,) and u (m,), computed in the dtype of x."""
         x = jnp.asarray(x)
         A, B = jnp.asarray(self.A, x.dtype), jnp.asarray(self.B, x.dtype)
         product = lambda M, v: jnp.matmul(M, v, precision="highest")
@@ -166,7 +167,7 @@ class LinearSystem:
 
     @classmethod
     def from_object(cls, obj: Any, dt: float | None = None) -> "LinearSystem":
-        """The system held by any object with `.A`, `.B` and `.dt`.
+        """Return the system held by any object with `.A`, `.B` and `.dt`.
 
         Understands python-control (`dt=0` continuous, `dt=True` discrete with unspecified
         period), scipy.signal (`lti` continuous, `dlti` discrete) and LinearSystem itself.
@@ -215,11 +216,17 @@ class LinearSystem:
             fail(
                 "dt",
                 f"{dt} differs from obj.dt = {period}",
-                "Leave dt out, or sample the continuous system anew",
+                "Leave dt out, or sample the continuous system again",
             )
         system = dataclasses.replace(system, dt=period)
         system.validate()
         return system
+
+
+def host_matrices(system: LinearSystem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return A (n, n), B (n, m) and c (n,), zero for None, as float64 NumPy arrays."""
+    A, B = host_array("A", system.A), host_array("B", system.B)
+    return A, B, np.zeros(len(A)) if system.c is None else host_array("c", system.c)
 
 
 def _numbered(letter: str, count: int) -> tuple[str, ...]:

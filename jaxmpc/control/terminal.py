@@ -1,4 +1,4 @@
-"""The hypotheses under which a terminal set and cost make MPC feasible for ever, and stable."""
+"""The hypotheses under which a terminal set and cost make MPC recursively feasible and stable."""
 
 from dataclasses import dataclass
 from fractions import Fraction
@@ -20,8 +20,8 @@ from jaxmpc.control.invariant import (
     supports,
 )
 from jaxmpc.control.riccati import least_reached, lqr
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope
-from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope, translated, unit_half_spaces
+from jaxmpc.control.system import LinearSystem, host_array, host_matrices
 
 # A limit counts as kept if it is exceeded by no more than this, relative to the set's extent
 # along the row (to |P| for matrix inequalities). Sets that touch a limit exceed it by rounding.
@@ -32,11 +32,11 @@ _DETECTABLE = 1e-10  # as in `lqr`
 
 @dataclass(frozen=True)
 class Check:
-    """One hypothesis.
+    """One hypothesis, with the result of its check.
 
     holds: True, False, or None for undecided.
     margin: by how much, in `unit`; negative if it fails, None if there is no number.
-    theorems: of the two theorems, those that need it.
+    theorems: which of the two theorems (1, 3) need it.
     """
 
     name: str
@@ -65,7 +65,7 @@ class TerminalReport:
     exact_factor: Fraction | None
 
     def __getitem__(self, name: str) -> Check:
-        """The check of this name."""
+        """Return the check of this name."""
         for check in self.checks:
             if check.name == name:
                 return check
@@ -73,12 +73,14 @@ class TerminalReport:
 
     @property
     def recursive_feasibility(self) -> bool | None:
-        """Theorem 1 applies: all its hypotheses hold (None: some undecided, none fails)."""
+        """Return whether Theorem 1 applies: all its hypotheses hold (None: some are undecided, none
+        fails)."""
         return _all(check.holds for check in self.checks if 1 in check.theorems)
 
     @property
     def stability(self) -> bool | None:
-        """Theorem 3 applies: all its hypotheses hold (None: some undecided, none fails)."""
+        """Return whether Theorem 3 applies: all its hypotheses hold (None: some are undecided, none
+        fails)."""
         return _all(check.holds for check in self.checks if 3 in check.theorems)
 
     def __str__(self) -> str:
@@ -117,17 +119,17 @@ def verify_terminal(
 
     Theorem 1. If states X and inputs U are convex and compact and the terminal set X_f within X
     is control invariant, a feasible MPC problem stays feasible along its own closed loop.
-    Theorem 3. If besides, on X_f, u = K x keeps x in X_f and u in U, and
+    Theorem 3. If in addition, on X_f, u = K x keeps x in X_f and u in U, and
     (A+BK)'P(A+BK) - P + Q + K'RK <= 0, the origin is asymptotically stable on X_N.
-    They speak of w = 0. With a disturbance the invariance that is checked is the robust one.
+    Both are stated for w = 0. With a disturbance, robust invariance is checked.
 
     Arguments:
         system: x+ = A x + B u + c.
         Q, R: (n, n), (m, m), symmetric weights of x'Qx + u'Ru.
         terminal_cost: P (n, n), symmetric, of x_N'P x_N; None for the P of `lqr`.
         terminal_set: X_f. None: X takes its place, since x_N is free, so that the problem of
-            horizon N is that of horizon N - 1 with terminal set X; Theorem 1 then asks that X
-            itself be control invariant, and Theorem 3 is never claimed.
+            horizon N is that of horizon N - 1 with terminal set X; Theorem 1 then requires X
+            itself to be control invariant, and Theorem 3 is never claimed.
         states, inputs: X and U; None for no limit.
         K: (m, n), of u = K x; None for that of `lqr`.
         disturbance: bounded set of w that holds the origin, or None.
@@ -140,7 +142,8 @@ def verify_terminal(
     - x'P_f x <= level is invariant if (A+BK)'P_f (A+BK) <= factor P_f; with w and c, if
       sqrt(factor) sqrt(level) + max |w + c|_P <= sqrt(level), which is sufficient only.
     - If K fails, control invariance alone: X_f within Pre(X_f), row by row.
-    A limit counts as kept if it is exceeded by at most 1e-9 of the set's extent. Host, float64.
+    A limit counts as kept if it is exceeded by at most 1e-9 of the set's extent. NumPy in float64;
+    not traceable.
 
     Raises ValueError for wrong shapes, asymmetric weights or empty sets; a hypothesis that
     fails is an answer, not an error.
@@ -150,10 +153,9 @@ def verify_terminal(
     """
     system.validate()
     n, m = system.n, system.m
-    A, B = host_array("A", system.A), host_array("B", system.B)
-    c = np.zeros(n) if system.c is None else host_array("c", system.c)
+    A, B, c = host_matrices(system)
     Q, R = _symmetric("Q", Q, n), _symmetric("R", R, m)
-    X, U = _rows("states", states, n), _rows("inputs", inputs, m)
+    X, U = unit_half_spaces("states", states, n), unit_half_spaces("inputs", inputs, m)
     law, trouble = None, ""
     if K is None or terminal_cost is None:
         try:
@@ -182,7 +184,9 @@ def verify_terminal(
     else:
         if terminal_set is None:
             role = " (there is no terminal set: X in its role, at horizon N - 1)"
-        X_f = _Rows(*(X if terminal_set is None else _rows("terminal_set", terminal_set, n)))
+        X_f = _Rows(
+            *(X if terminal_set is None else unit_half_spaces("terminal_set", terminal_set, n))
+        )
 
     checks = [_compact("states", "X", X), _compact("inputs", "U", U)]
     checks.append(
@@ -201,7 +205,7 @@ def verify_terminal(
         else:
             kept, certificate, factor, exact = _rows_kept(X_f, closed, c, W, (A, B, gain))
     checks += [_control_invariance(system, X_f, inputs, disturbance, kept, admissible, role)]
-    checks += [kept, admissible, _lyapunov(closed, gain, P, Q, R, no_law)]
+    checks += [kept, admissible, _check_lyapunov(closed, gain, P, Q, R, no_law)]
     checks += _weights(A, Q, R, P, trouble)
     shift = float(np.abs(c).max(initial=0.0))
     checks.append(
@@ -216,8 +220,8 @@ def verify_terminal(
         checks.append(
             Check(
                 "terminal cost where x_N is free", None, None, "",
-                "x_N may leave X, where the Lyapunov inequality and K in U say nothing: Theorem 3 "
-                "asks for a terminal set.", (3,),
+                "x_N may leave X, where the Lyapunov inequality and K in U do not hold: Theorem 3 "
+                "requires a terminal set.", (3,),
             )
         )  # fmt: skip
     return TerminalReport(tuple(checks), gain, certificate, factor, exact)
@@ -231,7 +235,8 @@ class _Rows:
     g: np.ndarray
 
     def top(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(upper bounds of max row x, M with M G = rows but for rounding); inf if unbounded."""
+        """Return (upper bounds of max row x, M with M G = rows but for rounding); inf if
+        unbounded."""
         bounds, M = np.zeros(len(rows)), np.zeros((len(rows), len(self.g)))
         for i, row in enumerate(rows):
             if not row.any():
@@ -248,13 +253,15 @@ class _Rows:
 
     @cached_property
     def reach(self) -> np.ndarray:
-        """Bounds of |x_i| over the set, with a margin for the LP's error; inf if there is none."""
+        """Return the bounds of |x_i| over the set, with a margin for the LP's error; inf if there
+        is none."""
         if not len(self.g):
             return np.full(self.G.shape[1], np.inf)
         return geometry.extent(self.G, self.g) * (1 + 1e-6)
 
     def width(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """How far the set reaches along each row (None: its own) from its largest ball's centre."""
+        """Return how far the set reaches along each row (None: its own) from its largest ball's
+        centre."""
         centre = geometry.largest_ball("terminal_set", self.G, self.g)[0]
         tops = self.g if rows is None else self.top(rows)[0]
         width = np.maximum(tops - (self.G if rows is None else rows) @ centre, 0.0)
@@ -269,12 +276,12 @@ class _Ellipse:
     level: float
 
     def top(self, rows: np.ndarray) -> tuple[np.ndarray, None]:
-        """(max row x, None)."""
+        """Return (max row x, None)."""
         squares = np.einsum("ij,ij->i", rows, np.linalg.solve(self.P, rows.T).T)
         return np.sqrt(self.level * squares), None
 
     def width(self, rows: np.ndarray) -> np.ndarray:
-        """How far the set reaches along each row from its centre."""
+        """Return how far the set reaches along each row from its centre."""
         width = self.top(rows)[0]
         return np.where(width > 0, width, 1.0)
 
@@ -283,6 +290,7 @@ _Set = _Rows | _Ellipse
 
 
 def _compact(name: str, letter: str, rows: tuple[np.ndarray, np.ndarray]) -> Check:
+    """Check that the set of these rows is bounded."""
     reach = _Rows(*rows).reach
     holds = bool(np.isfinite(reach).all())
     sentence = f"{letter} is convex, as every set of linear rows is, and "
@@ -303,7 +311,8 @@ def _within(
     name: str, labels: tuple[str, ...], rows: tuple[np.ndarray, np.ndarray], output: np.ndarray,
     X_f: _Set, theorems: tuple[int, ...], role: str = "",
 ) -> Check:  # fmt: skip
-    """output x within rows for all x in X_f; the margin is a distance from a row's hyperplane."""
+    """Check that `output` x lies within the rows for all x in X_f; the margin is a distance from a
+    row's hyperplane."""
     (G, g), unit = rows, "distance to the limit"
     if not len(g):
         return Check(name, True, np.inf, unit, f"Nothing limits {', '.join(labels)}.", theorems)
@@ -327,7 +336,7 @@ def _rows_kept(
     X_f: _Rows, closed: np.ndarray, c: np.ndarray, W: Any,
     law: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> tuple[Check, np.ndarray | None, float | None, Fraction | None]:  # fmt: skip
-    """Invariance of {G x <= g} under u = K x, by M >= 0 with M G = G closed."""
+    """Check invariance of {G x <= g} under u = K x, by M >= 0 with M G = G closed."""
     name, unit, G, g = "invariance under K", "of the extent", X_f.G, X_f.g
     if not len(g):
         sentence = "All of R^n is invariant."
@@ -340,9 +349,9 @@ def _rows_kept(
         return Check(name, False, -np.inf, unit, sentence, (3,)), None, None, None
     reached = images + G @ c + supports(W, G)
     residual = float(np.abs(M @ G - G @ closed).max())
-    share = (g - reached) / X_f.width()
-    worst = int(np.argmin(share))
-    holds = bool(share[worst] >= -_TOUCH)
+    slack = (g - reached) / X_f.width()
+    worst = int(np.argmin(slack))
+    holds = bool(slack[worst] >= -_TOUCH)
     factor = float((reached / g).max()) if g.min() > 0 else None
     exact = None
     if factor is not None and (W is None or isinstance(W, Box)):
@@ -356,25 +365,23 @@ def _rows_kept(
         sentence += " In rational arithmetic the factor is at most 1."
     elif exact is not None and holds:
         sentence += f" In rational arithmetic the factor exceeds 1 by {float(exact - 1):.1e}."
-    return Check(name, holds, float(share[worst]), unit, sentence, (3,)), M, factor, exact
+    return Check(name, holds, float(slack[worst]), unit, sentence, (3,)), M, factor, exact
 
 
 def _exact_factor(
     M: np.ndarray, X_f: _Rows, c: np.ndarray, W: Box | None,
     law: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> Fraction | None:  # fmt: skip
-    """max_i (M h + |M H - H(A+BK)| |x| + H c + max Hw)_i / h_i, without rounding.
+    """Return max_i (M h + |M H - H(A+BK)| |x| + H c + max Hw)_i / h_i, without rounding.
 
-    Where the rows that M uses are n and independent, their multipliers are solved anew from
+    Where the rows that M uses are n and independent, their multipliers are computed again from
     M H = H(A+BK), so that no residual is left. |x| is bounded by LPs and a margin. None where the
     set is too large for it, or unbounded where a residual is left.
     """
     H, h, n = X_f.G, X_f.g, len(c)
     if len(h) ** 2 * n > _EXACT_PRODUCTS:
         return None
-    A, B, K = (_fractions(part) for part in law)
-    A = [[a + _dot(b, column) for a, column in zip(row, zip(*K, strict=True), strict=True)]
-         for row, b in zip(A, B, strict=True)]  # fmt: skip
+    A = _closed_loop_fractions(law)
     rows, limits, drift = _fractions(H), _fractions(h), _fractions(c)
     reach = [_fractions(v) if np.isfinite(v) else None for v in X_f.reach]
     lower, upper = (None, None) if W is None else (_fractions(W.lower), _fractions(W.upper))
@@ -384,7 +391,7 @@ def _exact_factor(
         used = np.flatnonzero(M[i] > 0)
         y = [Fraction(float(M[i, j])) for j in used]
         if len(used) == n:
-            solved = _solve(
+            solved = _gauss_jordan(
                 [list(column) for column in zip(*(rows[j] for j in used), strict=True)], image
             )
             y = solved if solved is not None and min(solved) >= 0 else y
@@ -406,7 +413,7 @@ def _ellipse_kept(
     X_f: _Ellipse, closed: np.ndarray, c: np.ndarray, W: Any,
     law: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> tuple[Check, float, Fraction | None]:  # fmt: skip
-    """Invariance of {x'P x <= level} under u = K x."""
+    """Check invariance of {x'P x <= level} under u = K x."""
     name, P = "invariance under K", X_f.P
     factor = contraction(closed, P)
     least = float(np.linalg.eigvalsh(P - closed.T @ P @ closed)[0])
@@ -416,10 +423,7 @@ def _ellipse_kept(
     )
     if W is None and not c.any():
         if len(P) <= 8:
-            A, B, K = (_fractions(part) for part in law)
-            A = [[a + _dot(b, column) for a, column in zip(row, zip(*K, strict=True), strict=True)]
-                 for row, b in zip(A, B, strict=True)]  # fmt: skip
-            F = _fractions(P)
+            A, F = _closed_loop_fractions(law), _fractions(P)
             FA = [[_dot(row, column) for column in zip(*A, strict=True)] for row in F]
             D = [
                 [F[i][j] - _dot([a[i] for a in A], [r[j] for r in FA]) for j in range(len(F))]
@@ -432,27 +436,22 @@ def _ellipse_kept(
             factor,
             None,
         )
-    push = float(np.sqrt(c @ P @ c)) if W is None else largest_norm(_moved(W, c), P)
+    w_norm = float(np.sqrt(c @ P @ c)) if W is None else largest_norm(translated(W, c), P)
     radius = np.sqrt(X_f.level)
-    share = float(1 - np.sqrt(factor) - push / radius)
+    slack = float(1 - np.sqrt(factor) - w_norm / radius)
     sentence += (
-        f"; with |w + c|_P <= {push:.6g} the image reaches at most {1 - share:.9g} of the radius"
+        f"; with |w + c|_P <= {w_norm:.6g} the image reaches at most {1 - slack:.9g} of the radius"
     )
-    holds = True if share >= -_TOUCH else None if factor <= 1 else False
+    holds = True if slack >= -_TOUCH else None if factor <= 1 else False
     sentence += "." if holds else ", a bound that is sufficient only."
-    return Check(name, holds, share, "of the radius", sentence, (3,)), factor, None
-
-
-def _moved(W: Box | Polytope, c: np.ndarray) -> Box | Polytope:
-    if isinstance(W, Box):
-        return Box(host_array("w", W.lower) + c, host_array("w", W.upper) + c)
-    return Polytope(W.H, host_array("w", W.h) + host_array("w", W.H) @ c)
+    return Check(name, holds, slack, "of the radius", sentence, (3,)), factor, None
 
 
 def _control_invariance(
     system: LinearSystem, X_f: _Set, inputs: Any, disturbance: Any, kept: Check,
     admissible: Check, role: str,
 ) -> Check:  # fmt: skip
+    """Check control invariance of X_f: by the law K, or by one step of the predecessor."""
     name, unit = "control invariance", "of the extent"
     if kept.holds and admissible.holds:
         sentence = f"u = K x is admissible and keeps the state in the terminal set{role}."
@@ -488,9 +487,10 @@ def _control_invariance(
     return Check(name, False, -cut, unit, sentence, (1,))
 
 
-def _lyapunov(
+def _check_lyapunov(
     closed: np.ndarray | None, K: Any, P: Any, Q: np.ndarray, R: np.ndarray, no_law: str
 ) -> Check:
+    """Check (A+BK)'P(A+BK) - P + Q + K'RK <= 0."""
     name, unit = "Lyapunov inequality", "cost per |x|^2"
     if closed is None or P is None:
         return Check(name, None, None, unit, no_law, (3,))
@@ -508,6 +508,7 @@ def _lyapunov(
 def _weights(
     A: np.ndarray, Q: np.ndarray, R: np.ndarray, P: np.ndarray | None, trouble: str
 ) -> list[Check]:
+    """Check definiteness of the weights, and detectability."""
     checks = []
     for name, matrix, definite in (
         ("Q positive semidefinite", Q, False),
@@ -539,6 +540,7 @@ def _weights(
 
 
 def _origin_inside(X_f: _Set) -> Check:
+    """Check that the origin lies in the interior of X_f."""
     name, unit = "origin inside terminal set", "distance in x"
     if isinstance(X_f, _Ellipse):
         depth = float(np.sqrt(X_f.level / np.linalg.eigvalsh(X_f.P)[-1]))
@@ -549,18 +551,8 @@ def _origin_inside(X_f: _Set) -> Check:
     return Check(name, depth > 0, depth, unit, sentence, (3,))
 
 
-def _rows(argument: str, value: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit rows of a set; none if it is None."""
-    if value is None:
-        return np.zeros((0, n)), np.zeros(0)
-    if not isinstance(value, Box | Polytope):
-        fail(argument, f"{type(value).__name__} is no convex set", "Give a Box or Polytope")
-    value.validate(argument, n)
-    polytope = value.to_polytope() if isinstance(value, Box) else value
-    return unit_rows(polytope.H, polytope.h, argument)
-
-
 def _symmetric(argument: str, value: ArrayLike, n: int) -> np.ndarray:
+    """Return a symmetric matrix (n, n) in float64; raise ValueError unless it is one."""
     require_shape(argument, value, (n, n), "Give one square matrix")
     matrix = host_array(argument, value)
     require_finite(argument, matrix)
@@ -570,22 +562,34 @@ def _symmetric(argument: str, value: ArrayLike, n: int) -> np.ndarray:
 
 
 def _all(answers: Any) -> bool | None:
+    """Return False if any answer is False, else None if any is None, else True."""
     answers = list(answers)
     return False if False in answers else None if None in answers else True
 
 
 def _fractions(array: Any) -> Any:
-    """Nested lists of Fractions, each exactly the float it comes from."""
+    """Return nested lists of Fractions, each exactly the float it comes from."""
     array = np.asarray(array, np.float64)
     return [_fractions(row) for row in array] if array.ndim else Fraction(float(array))
 
 
+def _closed_loop_fractions(law: tuple[np.ndarray, np.ndarray, np.ndarray]) -> list:
+    """Return A + BK of the law (A, B, K) as nested lists of Fractions."""
+    A, B, K = (_fractions(part) for part in law)
+    columns = list(zip(*K, strict=True))
+    return [
+        [a + _dot(b, column) for a, column in zip(row, columns, strict=True)]
+        for row, b in zip(A, B, strict=True)
+    ]
+
+
 def _dot(a: Any, b: Any) -> Fraction:
+    """Return the inner product of two sequences of Fractions."""
     return sum((x * y for x, y in zip(a, b, strict=True)), Fraction(0))
 
 
-def _solve(matrix: list, right: list) -> list | None:
-    """The solution of a square system in rationals, None if it is singular (Gauss-Jordan)."""
+def _gauss_jordan(matrix: list, right: list) -> list | None:
+    """Solve a square system in rationals by Gauss-Jordan elimination; None if it is singular."""
     rows = [[*row, b] for row, b in zip(matrix, right, strict=True)]
     for k in range(len(rows)):
         pivot = next((i for i in range(k, len(rows)) if rows[i][k]), None)
@@ -600,12 +604,12 @@ def _solve(matrix: list, right: list) -> list | None:
 
 
 def _positive(matrix: list) -> bool:
-    """True if a symmetric matrix of Fractions is positive definite (pivots of L D L')."""
+    """Return whether a symmetric matrix of Fractions is positive definite (pivots of L D L')."""
     rows = [list(row) for row in matrix]
     for k in range(len(rows)):
         if rows[k][k] <= 0:
             return False
         for i in range(k + 1, len(rows)):
-            share = rows[i][k] / rows[k][k]
-            rows[i] = [v - share * w for v, w in zip(rows[i], rows[k], strict=True)]
+            ratio = rows[i][k] / rows[k][k]
+            rows[i] = [v - ratio * w for v, w in zip(rows[i], rows[k], strict=True)]
     return True

@@ -1,6 +1,6 @@
-"""By how much limits are exceeded, and how much of that counts as rounding.
+"""By how much limits are violated, and how much of that counts as rounding.
 
-`excess` and its two summaries work on NumPy arrays, and on JAX arrays, traced or not.
+The functions work on NumPy arrays, and on JAX arrays, traced or not.
 """
 
 from typing import Any
@@ -18,22 +18,22 @@ TOLERANCE = {"float64": 1e-6, "float32": 1e-4}
 Limits = Box | Polytope | tuple[Any, Any, Any] | None
 
 
-def excess(limits: Limits, x: Any) -> Any:
-    """By how much points exceed each row of some limits, in the unit of the row.
+def row_violations(limits: Limits, x: Any) -> Any:
+    """Return by how much points violate each row of some limits, in the unit of the row.
 
     limits: a Box or Polytope, rows (H, lower, upper) of lower ≤ H x ≤ upper, or None for none.
     x: points (..., n). Returns (..., rows): 0 where a row is kept, NaN where x is not finite. A Box
     has one row a coordinate.
     """
-    value, lower, upper = _rows(limits, x)
+    value, lower, upper = _row_values(limits, x)
     xp = _namespace(value)
     return xp.maximum(xp.maximum(value - upper, lower - value), 0.0)
 
 
-def worst_excess(limits: Limits, x: Any) -> Any:
-    """The largest `excess` of each point, (...,): 0 where all rows are kept, NaN where x is not
-    finite."""
-    found = excess(limits, x)
+def worst_violation(limits: Limits, x: Any) -> Any:
+    """Return the largest violation of each point, (...,): 0 where all rows are kept, NaN where x is
+    not finite."""
+    found = row_violations(limits, x)
     xp = _namespace(found)
     # A maximum need not propagate NaN (XLA on CPUs).
     return xp.where(
@@ -42,20 +42,20 @@ def worst_excess(limits: Limits, x: Any) -> Any:
 
 
 def kept(limits: Limits, x: Any, dtype: Any = None) -> Any:
-    """Whether each point keeps each row to within `TOLERANCE`, (..., rows); False where x is not
-    finite.
+    """Return whether each point keeps each row to within `TOLERANCE`, (..., rows); False where x is
+    not finite.
 
     dtype: the precision in which x was computed, if other than that of x.
     """
-    value, lower, upper = _rows(limits, x)
+    value, lower, upper = _row_values(limits, x)
     xp = _namespace(value)
     relative = TOLERANCE[str(np.dtype(value.dtype if dtype is None else dtype))]
     room = lambda end: relative * xp.maximum(1.0, xp.where(xp.isfinite(end), xp.abs(end), 0.0))
     return (value - upper <= room(upper)) & (lower - value <= room(lower))
 
 
-def _rows(limits: Limits, x: Any) -> tuple[Any, Any, Any]:
-    """H x (..., rows) with its bounds; NaN where x is not finite."""
+def _row_values(limits: Limits, x: Any) -> tuple[Any, Any, Any]:
+    """Return H x (..., rows) and its bounds; NaN where x is not finite."""
     xp = _namespace(x, limits)
     x = xp.asarray(x)
     x = xp.where(xp.isfinite(x), x, xp.nan)
@@ -70,5 +70,5 @@ def _rows(limits: Limits, x: Any) -> tuple[Any, Any, Any]:
 
 
 def _namespace(*values: Any) -> Any:
-    """jax.numpy where one of the arrays is JAX's, else numpy."""
+    """Return jax.numpy where one of the arrays is JAX's, else numpy."""
     return jnp if any(isinstance(v, jax.Array) for v in jax.tree.leaves(values)) else np

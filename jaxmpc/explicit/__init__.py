@@ -1,8 +1,8 @@
-"""The explicit MPC law: piecewise affine in the state, and what follows from its pieces.
+"""The explicit MPC law: piecewise affine in the state, and what follows from it.
 
 critical_regions     all regions on which the plan is affine -> CriticalRegions of Region
 exact_penalty        the least weight on slacks that keeps limits that can be kept -> ExactPenalty
-Law                  plans and the affine piece of the law at given states -> AffinePiece
+Law                  plans, and the affine law on the region of a given state -> AffinePiece
 """
 
 from jaxmpc.explicit.exact_penalty import ExactPenalty, exact_penalty

@@ -1,4 +1,4 @@
-"""The law of one active set and the polytope on which it holds, in scaled coordinates."""
+"""The affine law of one active set and the polytope on which it holds, in scaled coordinates."""
 
 from dataclasses import dataclass
 
@@ -6,8 +6,8 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
-from jaxmpc.control.geometry import distinct
-from jaxmpc.explicit.least_distance import LP, SMALLEST, LeastDistanceForm
+from jaxmpc.control.geometry import HIGHS, distinct
+from jaxmpc.explicit.least_distance import SMALLEST, LeastDistanceForm
 
 # Relative rounding of a law: below it a coefficient is zero.
 ZERO = 1e-11
@@ -15,8 +15,9 @@ ZERO = 1e-11
 
 @dataclass(frozen=True, eq=False)
 class ActivePiece:
-    """λ (a, p + 1) and y (nz, p + 1) of an active set, affine in ξ with the constant last, where
-    H ξ ≤ h (unit rows; `which`: their rows in the program). also_active: see `Region`.
+    """The affine law of an active set: λ (a, p + 1) and y (nz, p + 1), constant last, on H ξ ≤ h.
+
+    H has unit rows; which: their rows in the program. also_active: see `Region`.
     """
 
     active: tuple[int, ...]
@@ -29,8 +30,9 @@ class ActivePiece:
 
 
 def active_piece(p: LeastDistanceForm, active: tuple[int, ...]) -> ActivePiece | None:
-    """The law of an active set; None where its rows are dependent or it holds nowhere."""
-    solved = p.solve(active)
+    """Return the affine law of an active set; None where its rows are dependent or it holds
+    nowhere."""
+    solved = p.solve_active(active)
     if solved is None:
         return None
     multipliers, y = solved
@@ -70,7 +72,7 @@ class Cell:
 
 
 def cell(p: LeastDistanceForm, active: tuple[int, ...]) -> Cell | None:
-    """The region of an active set; None where its rows are dependent or it has no volume."""
+    """Return the region of an active set; None where its rows are dependent or it has no volume."""
     found = active_piece(p, active)
     body = None if found is None else interior(found.H, found.h)
     if found is None or body is None:
@@ -95,7 +97,8 @@ def cell(p: LeastDistanceForm, active: tuple[int, ...]) -> Cell | None:
 
 
 def interior(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Vertices (k, n) and inner radius of H ξ ≤ h (unit rows) in [−2, 2]^n; None if it is flat."""
+    """Return the vertices (k, n) and inner radius of H ξ ≤ h (unit rows) in [−2, 2]^n; None if it
+    is flat."""
     n = H.shape[1]
     H, h = np.vstack([H, np.eye(n), -np.eye(n)]), np.append(h, np.full(2 * n, 2.0))
     if n == 1:
@@ -122,20 +125,22 @@ def interior(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float] | None:
 
 
 def capped_ball(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre and radius of the largest ball in H ξ ≤ h (unit rows), at most 1; −1 for none."""
+    """Return the centre and radius of the largest ball in H ξ ≤ h (unit rows), at most 1; −1 for
+    none."""
     n = H.shape[1]
     ball = linprog(
         -np.eye(n + 1)[n], A_ub=np.column_stack([H, np.ones(len(h))]), b_ub=h,
-        bounds=[(None, None)] * n + [(None, 1.0)], method="highs-ds", options=LP,
+        bounds=[(None, None)] * n + [(None, 1.0)], method="highs-ds", options=HIGHS,
     )  # fmt: skip
     return (np.zeros(n), -1.0) if ball.x is None else (ball.x[:n], float(ball.x[-1]))
 
 
 def volume(points: np.ndarray) -> float:
-    """Volume of the hull of points (k, n), in coordinates in which they spread alike.
+    """Return the volume of the convex hull of points (k, n), computed in coordinates in which they
+    spread alike.
 
-    Regions are thin along oblique directions, which qhull takes for flat; where it still fails,
-    it moves the points by some 1e-11 ("QJ").
+    Regions can be thin along oblique directions, so that qhull calls them flat; where it still
+    fails, it moves the points by some 1e-11 ("QJ").
     """
     if points.shape[1] == 1:
         return float(np.ptp(points))

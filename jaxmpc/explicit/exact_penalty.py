@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import linprog
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, whole
+from jaxmpc.control.geometry import HIGHS
 from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.explicit.cells import ActivePiece, active_piece, capped_ball
 from jaxmpc.explicit.least_distance import (
-    LP,
     SMALLEST,
     STOPPED,
     LeastDistanceForm,
@@ -25,9 +25,9 @@ from jaxmpc.qp.status import Status
 
 # "auto" enumerates regions up to this dimension of the state.
 ENUMERATED = 4
-# The sampled search: where on a ray to the boundary of X_N samples lie, how many regions it starts
-# from, after how many that lead to nothing better it ends, and how many rays look for the facets of
-# a region.
+# The sampled search: where samples lie on a ray to the boundary of X_N, from how many regions it
+# starts, after how many regions without improvement it ends, and how many rays look for the facets
+# of a region.
 FRACTIONS = (0.5, 0.9, 0.99, 1 - 1e-4, 1 - 1e-7)
 STARTS = 32
 PATIENCE = 20
@@ -46,8 +46,8 @@ class ExactPenalty:
     unit of the rows as given. at (p,): the state where it is approached, row: the soft row that
     needs it (None where rho_bar is 0), label: that row with bound, step and unit. method:
     "regions" or "samples". advised: a weight with a margin. thresholds (B,), status (B,): at the
-    states asked for, NaN and PRIMAL_INFEASIBLE or NON_FINITE where there is none. sufficient:
-    whether the weight ρ asked about is exact on all of X_N; None where that is not known, or none
+    given states, NaN and PRIMAL_INFEASIBLE or NON_FINITE where there is none. sufficient:
+    whether the given weight ρ is exact on all of X_N; None where that is not known, or none
     was given. regions: the critical regions, where they were enumerated. evaluated: number of
     active sets.
     """
@@ -67,7 +67,7 @@ class ExactPenalty:
 
     @property
     def sentence(self) -> str:
-        """What was found, and what it rests on."""
+        """Return the result and its basis as sentences."""
         value, at = f"{self.rho_bar:.6g}", np.array2string(self.at, precision=6)
         if self.exact:
             found = f"rho_bar = {value} over the feasible set, by {self.evaluated} critical regions"
@@ -89,36 +89,34 @@ def exact_penalty(
     mpc: MPC, x0s: Any = None, *, method: str = "auto", rho: float | None = None,
     limit: int = 2000, within: Box | Polytope | None = None, samples: int = 200, seed: int = 0,
 ) -> ExactPenalty:  # fmt: skip
-    """The exact-penalty threshold of an MPC problem with an L1 penalty on slacks.
+    """Return the exact-penalty threshold of an MPC problem with an L1 penalty on slacks.
 
     The soft problem min J + ρ·Σε, C z + D x ≤ bound + ε, ε ≥ 0 has the hard problem's plan at a
     state x of its feasible set X_N if and only if ρ ≥ rho_bar(x) = min over the multipliers λ of
     x of max_i λ_i, i over the soft rows. That holds for J without ½ and rows as given (a row scaled
     by s has λ/s); a quadratic slack term does not change it. rho_bar = sup over X_N.
 
-    Soft are the rows of `mpc.soft`, or if there are none all state, output and terminal rows.
+    The soft rows are those of `mpc.soft`, or if there are none all state, output and terminal rows.
     Rows that no input moves (k = 0) are constants and do not count; inputs and rates stay hard.
 
     x0s (B, p) or None: states at which to give the threshold as well; p = mpc.dimension.
     method: "regions": λ is affine on each critical region and its maximum is at a vertex; exact
     when the regions are complete. "samples": a lower bound, from `samples` rays to the boundary of
-    X_N and a search across facets from the best regions met (on a region λ is maximised by LPs);
-    it can miss the greatest. "auto": regions up to four states, and samples
-    as well where `limit` regions are not all. Where active rows are dependent the multipliers are
-    not unique, and an LP finds those with the least maximum. rho: a weight to
-    check; None: those of `mpc.soft`, if any. within: initial states to look at, needed where X_N
-    is unbounded.
+    X_N and a search across facets from the best regions found (on a region λ is maximised by LPs);
+    it can miss the greatest. "auto": regions up to four states, and samples as well where there are
+    more than `limit` regions. Where active rows are dependent the multipliers are not unique, and
+    an LP finds those with the least maximum. rho: a weight to check; None: those of `mpc.soft`, if
+    any. within: the set of initial states, needed where X_N is unbounded.
 
     Raises ValueError for ill-posed problems, wrong arguments, an ellipsoidal terminal set, no soft
-    row, and where X_N is empty, flat or unbounded. Host, float64.
+    row, and where X_N is empty, flat or unbounded. NumPy in float64; not traceable.
 
     Sources: Fletcher 1987, Practical Methods of Optimization, section 14.3; Kerrigan &
     Maciejowski 2000, Proc. UKACC Control; Hovd & Stoican 2014, Comput. Chem. Eng. 70.
     """
     if method not in ("auto", "regions", "samples"):
         fail("method", f"{method!r}", 'Give "auto", "regions" or "samples"')
-    if not isinstance(samples, int | np.integer) or isinstance(samples, bool) or samples < 1:
-        fail("samples", f"{samples!r}", "Give a number of rays, at least 1")
+    samples = whole("samples", samples, 1)
     if rho is not None and not (np.ndim(rho) == 0 and np.isfinite(rho) and rho >= 0):
         fail("rho", f"{rho!r}", "Give one finite weight of at least 0, or None")
     mpc.validate()
@@ -163,7 +161,7 @@ def exact_penalty(
 
 
 def softened(p: LeastDistanceForm, table: tuple[Row, ...]) -> np.ndarray:
-    """(r,) bool: the soft rows of the program that inputs can move."""
+    """Return which rows (r,) of the program are soft rows that inputs can move."""
     any_soft = any(row.soft for row in table)
     soft = np.array([row.soft if any_soft else row.kind in SOFTENED for row in table], bool)
     mine = (p.row >= 0) & soft[np.maximum(p.row, 0)] if len(soft) else np.zeros(len(p.row), bool)
@@ -175,7 +173,7 @@ def softened(p: LeastDistanceForm, table: tuple[Row, ...]) -> np.ndarray:
 def is_sufficient(
     p: LeastDistanceForm, value: float, exact: bool, rho: float | None
 ) -> bool | None:
-    """Whether the weight rho (None: those of the soft rows) is exact; None where unknown."""
+    """Return whether the weight rho (None: those of the soft rows) is exact; None where unknown."""
     weights = p.condensed.soft_linear if rho is None else np.array([rho])
     if weights is None:
         return None
@@ -187,7 +185,7 @@ def is_sufficient(
 
 
 def row_in_words(row: Row, side: float) -> str:
-    """The row in words: "upper bound of dq at k = 3 [rad/s]"."""
+    """Return the row as text: "upper bound of dq at k = 3 [rad/s]"."""
     bound = "upper" if side > 0 else "lower"
     spoken = any(sign in row.name for sign in "<>≤≥")
     text = row.name if spoken else f"{bound} bound of {row.name}"
@@ -211,8 +209,8 @@ class Thresholds:
     def least(
         self, rows: np.ndarray, active: tuple[int, ...], multipliers: np.ndarray
     ) -> tuple[float, int]:
-        """min t over λ ≥ 0 on `rows` with the same Σ λ_i M_i as those on `active`, λ_i ≤ t over
-        soft rows; the value (NaN: HiGHS stops), and a soft row that attains it.
+        """Return min t over λ ≥ 0 on `rows` with the same Σ λ_i M_i as those on `active` and λ_i ≤
+        t over soft rows (NaN: HiGHS stops), and a soft row that attains it.
         """
         total = self.p.M[list(active)].T @ np.maximum(multipliers, 0.0)
         mine, size = self.soft[rows], np.abs(total).max(initial=0.0)
@@ -227,7 +225,7 @@ class Thresholds:
             np.eye(count + 1)[count],
             A_eq=np.column_stack([A, np.zeros(len(b))]), b_eq=b,
             A_ub=np.column_stack([np.diag(per_row / unit)[mine], -np.ones(mine.sum())]),
-            b_ub=np.zeros(mine.sum()), bounds=(0, None), method="highs-ds", options=LP,
+            b_ub=np.zeros(mine.sum()), bounds=(0, None), method="highs-ds", options=HIGHS,
         )  # fmt: skip
         if result.x is None:
             return np.nan, -1
@@ -235,7 +233,7 @@ class Thresholds:
         return float(result.fun * unit * size), int(rows[np.argmax(each)])
 
     def over(self, found: ActivePiece, points: np.ndarray) -> Worst:
-        """The largest threshold at points ξ (k, p) of a region, as limits from its inside.
+        """Return the largest threshold at points ξ (k, p) of a region, as limits from its inside.
 
         Inside a region the multipliers of `active` are the only ones, unless other rows are active
         all over it; the threshold is convex there, hence greatest at vertices.
@@ -256,7 +254,8 @@ class Thresholds:
         return Worst(max(float(values[best, which]), 0.0), points[best], int(rows[mine[which]]))
 
     def maximal(self, found: ActivePiece) -> Worst | None:
-        """The same over a whole region, each multiplier maximised by an LP; None if it is flat.
+        """Return the largest threshold of a whole region, each multiplier maximised by an LP; None
+        if it is flat.
 
         Where rows are dependent the LPs maximise multipliers that need not be the least: what they
         lead to is a threshold of the region, but perhaps not the greatest.
@@ -273,7 +272,7 @@ class Thresholds:
         return self.over(found, np.array(points))
 
     def at(self, x0s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Thresholds (B,) and statuses (B,) at states x0s (B, p)."""
+        """Return the thresholds (B,) and statuses (B,) at states x0s (B, p)."""
         values, status = np.full(len(x0s), np.nan), np.full(len(x0s), Status.NON_FINITE, np.int8)
         for i in np.flatnonzero(np.all(np.isfinite(x0s), axis=1)):
             xi = (x0s[i] - self.p.center) / self.p.size

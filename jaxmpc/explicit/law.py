@@ -1,8 +1,8 @@
-"""The MPC law at given states: plans, next states, and the affine piece of the law there.
+"""The MPC law at given states: plans, next states, and the affine law on the region there.
 
-The optimal plan is piecewise affine in the state. Its piece at a state is found from the active
-rows of the plan there, as implicit differentiation of the optimality conditions does, and holds
-on a polytope, the critical region.
+The optimal plan is piecewise affine in the state. The affine function at a state follows from the
+active rows of the plan there, by the optimality conditions, and holds on a polytope, the critical
+region.
 """
 
 from dataclasses import dataclass
@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import lsq_linear, nnls
 
 from jaxmpc.control.sets import Box, unit_rows
+from jaxmpc.control.system import host_matrices
 from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import solve_many
@@ -43,9 +44,7 @@ class Law:
 
     def __init__(self, mpc: MPC, easy: np.ndarray, chunk: int) -> None:
         self.mpc, self.easy, self.chunk = mpc, easy, chunk
-        system = mpc.system
-        self.A, self.B = np.asarray(system.A, np.float64), np.asarray(system.B, np.float64)
-        self.c = np.zeros(system.n) if system.c is None else np.asarray(system.c, np.float64)
+        self.A, self.B, self.c = host_matrices(mpc.system)
         self.condensed = c = condensed_in_float64(mpc)
         rows, size = Inequalities.of(c).normalised()
         self.C, self.D, self.b = rows.C, rows.D, rows.b
@@ -55,28 +54,31 @@ class Law:
         self.kappa = 0 * self.b if c.soft_quadratic is None else c.soft_quadratic[row] * size**2
 
     def filled(self, states: np.ndarray) -> np.ndarray:
-        """States (B, p), and `easy` as often as completes the last batch."""
+        """Return states (B, p), followed by `easy` as often as completes the last batch."""
         easy = np.pad(self.easy, (0, states.shape[1] - len(self.easy)))
         return np.vstack([states, np.tile(easy, (-len(states) % self.chunk, 1))])
 
     def plans(self, states: np.ndarray) -> Any:
-        """Return a Plan of host arrays (B, ...) from states (B, p), in programs of one shape."""
+        """Return a Plan of NumPy arrays (B, ...) from states (B, p), in programs of one shape."""
         found = solve_many(self.mpc, self.filled(states), ADMM(eps=EPS), chunk=self.chunk)
         return jax.tree.map(lambda v: np.asarray(v)[: len(states)], found)
 
     def limited(self, u: np.ndarray) -> np.ndarray:
-        """Inputs (B, m) inside a box of limits: an actuator takes no rounding beyond them."""
+        """Return inputs (B, m) clipped into a box of limits: an actuator takes no rounding beyond
+        them."""
         box = self.mpc.inputs
         return np.clip(u, box.lower, box.upper) if isinstance(box, Box) else u
 
     def following(self, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-        """The states (B, p) after inputs (B, m): A x + B u + c, and u where the state holds it."""
+        """Return the states (B, p) after inputs (B, m): A x + B u + c, and u where the state holds
+        it."""
         x = states[:, : self.mpc.system.n]
         after = x @ self.A.T + inputs @ self.B.T + self.c
         return np.hstack([after, inputs])[:, : states.shape[1]]
 
     def piece(self, state: np.ndarray, inputs: np.ndarray) -> AffinePiece | None:
-        """The piece at a state (p,) whose optimal inputs (N, m) are given; None if none is found.
+        """Return the affine law at a state (p,) whose optimal inputs (N, m) are given; None if none
+        is found.
 
         With P z + F x + f + C_a'y = 0 and C_a z + D_a x = b_a on the active rows a, plan and
         multipliers are affine in x. Non-negative least squares picks independent active rows.
@@ -123,7 +125,7 @@ class Law:
         above = Y[limited] - np.outer(self.rho[active][limited], np.append(0 * theta, 1.0))
         rows = np.vstack([np.delete(slack, active, axis=0), -Y, above])
         # Columns of a previous input that is not among the states meet a zero; rows that are
-        # constant to rounding say nothing.
+        # constant to rounding are redundant.
         rows = np.column_stack([rows[:, :p], rows[:, -1]])
         moving = np.linalg.norm(rows[:, :p], axis=1) > 1e-11 * np.abs(rows).max(axis=1, initial=0.0)
         R, r = rows[moving, :p], -rows[moving, p]
@@ -134,7 +136,7 @@ class Law:
         return AffinePiece(E, np.append(self.B @ k + self.c, k)[:p], *unit_rows(R, r))
 
     def _multipliers(self, A: np.ndarray, force: np.ndarray, rho: np.ndarray) -> np.ndarray:
-        """y with A y = force as nearly as can be, 0 ≤ y ≤ rho."""
+        """Return y with A y = force as nearly as possible and 0 ≤ y ≤ rho."""
         if not A.shape[1]:
             return np.zeros(0)
         if np.any(np.isfinite(rho)):
@@ -145,6 +147,7 @@ class Law:
             return np.zeros(A.shape[1])
 
     def _touches_ball(self, theta: np.ndarray, z: np.ndarray) -> bool:
+        """Return whether the plan reaches the boundary of the terminal ellipsoid."""
         c = self.condensed
         last = slice(len(c.C) - sum(c.balls), None)
         centred = c.C[last] @ z + c.D[last] @ theta + c.d[last] - c.lower[last]

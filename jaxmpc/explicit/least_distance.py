@@ -1,4 +1,4 @@
-"""The MPC problem as a least-distance problem in scaled coordinates, on the host in float64.
+"""The MPC problem as a least-distance problem in scaled coordinates, in NumPy in float64.
 
 With the Cholesky factor P = ℓℓ' of the condensed cost, y = ℓ'z + ℓ⁻¹(F x + f) is the distance
 from the unconstrained plan, and the QP at x is a least-distance problem:
@@ -19,7 +19,8 @@ import numpy as np
 from scipy.optimize import linprog, nnls
 
 from jaxmpc.checks import fail
-from jaxmpc.control.sets import Box, Polytope, unit_rows
+from jaxmpc.control.geometry import HIGHS
+from jaxmpc.control.sets import Box, Polytope, unit_half_spaces, unit_rows
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
 from jaxmpc.mpc.problem import MPC
@@ -29,7 +30,6 @@ SMALLEST = 1e-9
 # Rows of length 1 closer to the span of others than this count as dependent on them.
 DEPENDENT = 1e-7
 STOPPED = "HiGHS stopped early on its linear programs", "Scale states and inputs to like size"
-LP = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +60,12 @@ class LeastDistanceForm:
     interior: np.ndarray
 
     def support(self, d: np.ndarray) -> tuple[float, np.ndarray | None]:
-        """max d'ξ over X_N, and where; NaN and None where HiGHS stops."""
+        """Return max d'ξ over X_N, and where it is attained; NaN and None where HiGHS stops."""
         return maximum(d, np.hstack([self.U, -self.V]), self.v)
 
     def leave(self, direction: np.ndarray) -> np.ndarray | None:
-        """Where the ray from the interior point along `direction` leaves X_N; None: not found."""
+        """Return where the ray from the interior point along `direction` leaves X_N; None if not
+        found."""
         t = maximum(
             np.ones(1), np.column_stack([self.U, -self.V @ direction]),
             self.v + self.V @ self.interior,
@@ -72,13 +73,15 @@ class LeastDistanceForm:
         return None if t is None else self.interior + t * direction
 
     def margin(self, xi: np.ndarray) -> float:
-        """Upper bound of the greatest t ≤ 1 with M y + t ≤ v + V ξ: ξ is outside X_N if t < 0."""
+        """Return an upper bound of the greatest t ≤ 1 with M y + t ≤ v + V ξ: ξ is outside X_N if t
+        < 0."""
         rows = np.column_stack([self.U, np.ones(len(self.v))])
         rows = np.vstack([rows, np.eye(rows.shape[1])[-1]])
         return maximum(np.ones(1), rows, np.append(self.v + self.V @ xi, 1.0))[0]
 
-    def solve(self, active: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray] | None:
-        """λ (a, n + 2) and y (nz, n + 2) on ξ, constant and by δ; None for dependent rows."""
+    def solve_active(self, active: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return λ (a, n + 2) and y (nz, n + 2), affine in ξ, constant and δ; None for dependent
+        rows."""
         rows = list(active)
         right = np.column_stack([self.V[rows], self.v[rows], self.epsilon[rows]])
         if not rows:
@@ -90,7 +93,8 @@ class LeastDistanceForm:
         return -np.linalg.solve(R, along), Q @ along
 
     def slack(self, active: tuple[int, ...], y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(r, n + 2): slack of all rows under y; (r,) size of its terms, for rounding.
+        """Return the slack (r, n + 2) of all rows under y, and the size (r,) of its terms, for
+        rounding.
 
         Not from the multipliers: these are large, and cancel, where rows are nearly dependent.
         """
@@ -100,7 +104,8 @@ class LeastDistanceForm:
         return slack, terms[:, :-1].sum(axis=1)
 
     def solution(self, xi: np.ndarray) -> "PointSolution | None":
-        """The solution at ξ; None where there is none, or none that keeps all rows to 1e-8."""
+        """Return the solution at ξ; None where there is none, or none that keeps all rows to
+        1e-8."""
         b = self.v + self.V @ xi
         if np.any(b[self.still] < -1e-9):
             return None
@@ -116,7 +121,7 @@ class LeastDistanceForm:
                 except RuntimeError:
                     continue
                 active = tuple(moving[np.flatnonzero(u)].tolist())
-            solved = self.solve(active)
+            solved = self.solve_active(active)
             if solved is None:
                 continue
             multipliers, y = (part[:, :-1] @ np.append(xi, 1.0) for part in solved)
@@ -131,7 +136,7 @@ class LeastDistanceForm:
         return None
 
     def basis(self, found: "PointSolution | None") -> tuple[int, ...] | None:
-        """Active set of the perturbed problem at the ξ of a solution; None for none."""
+        """Return the active set of the perturbed problem at the ξ of a solution; None for None."""
         if found is None or len(found.touching) == len(found.active):
             return None if found is None else found.active
         # The limit of the perturbed multipliers minimises ε'λ.
@@ -143,13 +148,14 @@ class LeastDistanceForm:
         return tuple(on[best.x > 1e-12 * best.x.max(initial=0.0)].tolist())
 
     def balance(self, rows: np.ndarray, total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Σ λ_i M_i = total over `rows`, which hold it in their span, as independent equations."""
+        """Return Σ λ_i M_i = total over `rows`, which hold `total` in their span, as independent
+        equations in λ."""
         span, size, _ = np.linalg.svd(self.M[rows].T, full_matrices=False)
         span = span[:, size > 1e-10 * size.max(initial=0.0)]
         return span.T @ self.M[rows].T, span.T @ total
 
     def active(self, xi: np.ndarray) -> tuple[int, ...] | None:
-        """Active set of the perturbed problem at ξ; None where there is no solution."""
+        """Return the active set of the perturbed problem at ξ; None where there is no solution."""
         return self.basis(self.solution(xi))
 
 
@@ -163,7 +169,7 @@ class PointSolution(NamedTuple):
 
 
 def least_distance_form(mpc: MPC, within: Box | Polytope | None = None) -> LeastDistanceForm:
-    """The least-distance form with all rows of `mpc` hard, on X_N or on X_N ∩ within."""
+    """Return the least-distance form with all rows of `mpc` hard, on X_N or on X_N ∩ within."""
     c = condensed_in_float64(mpc)
     if c.balls:
         fail("terminal_set", "is an ellipsoid: its law is not affine", "Give a Polytope")
@@ -174,9 +180,9 @@ def least_distance_form(mpc: MPC, within: Box | Polytope | None = None) -> Least
         fail("R", "leaves the condensed cost singular in float64", "Put a larger weight on inputs")
     G, D, v, row, side = Inequalities.of(c)
     V = -D
-    H, h = half_spaces(within, n)
+    H, h = unit_half_spaces("within", within, n)
     if mpc.remembers and mpc.inputs is not None:  # a previous input is one that was applied
-        H_u, h_u = half_spaces(mpc.inputs, mpc.system.m)
+        H_u, h_u = unit_half_spaces("inputs", mpc.inputs, mpc.system.m)
         H, h = np.vstack([H, np.pad(H_u, ((0, 0), (mpc.system.n, 0)))]), np.append(h, h_u)
     G, V, v = np.vstack([G, np.zeros((len(h), G.shape[1]))]), np.vstack([V, -H]), np.append(v, h)
     row, side = np.append(row, np.full(len(h), -1)), np.append(side, np.ones(len(h)))
@@ -228,7 +234,7 @@ def least_distance_form(mpc: MPC, within: Box | Polytope | None = None) -> Least
 
 
 def maximum(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> tuple[float, np.ndarray | None]:
-    """max d'(last coordinates of w) over G w ≤ g, and those coordinates.
+    """Return max d'(last coordinates of w) over G w ≤ g, and those coordinates.
 
     ±inf and None where there is none, NaN and None where HiGHS stops for another reason.
 
@@ -240,7 +246,7 @@ def maximum(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> tuple[float, np.ndar
     cost = np.append(np.zeros(G.shape[1] - len(d)), d)
     for method in ("highs-ds", "highs-ipm"):
         result = linprog(
-            -cost, A_ub=G, b_ub=g / size, bounds=(None, None), method=method, options=LP
+            -cost, A_ub=G, b_ub=g / size, bounds=(None, None), method=method, options=HIGHS
         )
         if result.status in (2, 3):
             return (-np.inf if result.status == 2 else np.inf), None
@@ -251,14 +257,3 @@ def maximum(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> tuple[float, np.ndar
             value = g[active] @ y if exact else -result.fun * size
             return float(value), result.x[-len(d) :] * size
     return np.nan, None
-
-
-def half_spaces(set_: Box | Polytope | None, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit rows (H, h) of a set of initial states; none for None."""
-    if set_ is None:
-        return np.zeros((0, n)), np.zeros(0)
-    if not isinstance(set_, Box | Polytope):
-        fail("within", f"is a {type(set_).__name__}", "Give a Box or Polytope of states")
-    set_.validate("within", n)
-    body = set_.to_polytope() if isinstance(set_, Box) else set_
-    return unit_rows(body.H, body.h, "within")

@@ -58,7 +58,7 @@ class CriticalRegions:
 
     @classmethod
     def of(cls, mpc: MPC, search: RegionSearch) -> "CriticalRegions":
-        """What a search has found, in the coordinates of x, and whether it fills X_N."""
+        """Return what a search has found, in the coordinates of x, and whether it fills X_N."""
         complete, reason = search.fill()
         regions = tuple(region(search.p, c) for c in search.found)
         total = float(sum(r.volume for r in regions))
@@ -72,11 +72,11 @@ class CriticalRegions:
         return self.regions[i]
 
     def vertices(self, i: int) -> np.ndarray:
-        """(k, p) vertices of region i."""
+        """Return (k, p) vertices of region i."""
         return self.regions[i].vertices
 
     def find(self, x: Any, tolerance: float = 1e-9) -> np.ndarray:
-        """(B,) index of the region that holds each state x (B, p), −1 where none does.
+        """Return the index (B,) of the region that holds each state x (B, p), −1 where none does.
 
         tolerance: how far outside all regions a state may lie, relative to the size of X_N.
         """
@@ -92,11 +92,12 @@ class CriticalRegions:
         return answer
 
     def plan(self, x: Any) -> np.ndarray:
-        """Optimal decisions z (B, nz) at states x (B, p); NaN where no region holds a state."""
+        """Return optimal decisions z (B, nz) at states x (B, p); NaN where no region holds a
+        state."""
         return self._evaluate(x, "Z", "z0")
 
     def law(self, x: Any) -> np.ndarray:
-        """First inputs u_0 (B, m) at states x (B, p); NaN where no region holds a state."""
+        """Return first inputs u_0 (B, m) at states x (B, p); NaN where no region holds a state."""
         return self._evaluate(x, "K", "k")
 
     def _evaluate(self, x: Any, gain: str, offset: str) -> np.ndarray:
@@ -126,14 +127,14 @@ class CriticalRegions:
 def critical_regions(
     mpc: MPC, *, limit: int = 5000, within: Box | Polytope | None = None
 ) -> CriticalRegions:
-    """All critical regions of positive volume of the MPC problem (multiparametric QP).
+    """Return all critical regions of positive volume of the MPC problem (multiparametric QP).
 
-    limit: the most regions to look for. within: initial states to look at, needed where the
+    limit: the most regions to look for. within: the set of initial states, needed where the
     feasible set X_N is unbounded. The search crosses every facet of every region: a row that
-    becomes active joins the active set, a multiplier that vanishes leaves it, and where the new
-    row depends on the others each of those that the dual ratio test may drop is tried; what this
-    leaves open is found by solving the QP just behind the facet. `complete` does not rest on the
-    search having ended but on the volumes (see `CriticalRegions`). Host, float64.
+    becomes active joins the active set, a multiplier that vanishes leaves it, and where the new row
+    depends on the others each of those that the dual ratio test may drop is tried; what this leaves
+    open is found by solving the QP just behind the facet. `complete` does not rest on the search
+    having ended but on the volumes (see `CriticalRegions`). NumPy in float64; not traceable.
 
     Raises ValueError for ill-posed problems, soft rows or an ellipsoidal terminal set (their
     laws are not piecewise affine in this form), and where X_N is empty, flat or unbounded.
@@ -149,7 +150,8 @@ def critical_regions(
 
 
 def region(p: LeastDistanceForm, c: Cell) -> Region:
-    """A cell in the coordinates of x, with the law of z, the multipliers and the first input."""
+    """Return a cell in the coordinates of x, with the law of z, the multipliers and the first
+    input."""
     rows = list(c.law.active)
     on_x = (
         lambda by_xi: (  # affine in ξ, constant last → affine in x

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, whole
 from jaxmpc.control.sets import Polytope
 from jaxmpc.explicit.cells import Cell, cell, volume
 from jaxmpc.explicit.least_distance import DEPENDENT, LeastDistanceForm
@@ -31,11 +31,11 @@ class RegionSearch:
 
     @property
     def full(self) -> bool:
-        """True once the limit is reached."""
+        """Return True once the limit is reached."""
         return len(self.found) >= self.limit
 
     def visit(self, active: tuple[int, ...] | None) -> Cell | None:
-        """The region of an active set, queued when it is new."""
+        """Return the region of an active set, and queue it when it is new."""
         if active is None:
             return None
         active = tuple(sorted(active))
@@ -75,7 +75,8 @@ class RegionSearch:
                 return
 
     def fill(self) -> tuple[bool, str]:
-        """Check that the regions fill X_N, and search on from what is missing; (complete, why)."""
+        """Check that the regions fill X_N, and search on from what is missing; return (complete,
+        reason)."""
         random = np.random.default_rng(0)
         why = ""
         for _ in range(REPAIRS):
@@ -113,15 +114,14 @@ class RegionSearch:
 
 
 def explore(p: LeastDistanceForm, limit: Any) -> RegionSearch:
-    """The search, ended: from an interior point across all facets."""
-    if not isinstance(limit, int | np.integer) or isinstance(limit, bool) or limit < 1:
-        fail("limit", f"{limit!r}", "Give a whole number of regions, at least 1")
+    """Run the search from an interior point across all facets, and return it."""
+    limit = whole("limit", limit, 1)
     if len(p.center) > DIMENSIONS:
         fail(
             "mpc", f"its states have {len(p.center)} coordinates, too many for vertices",
             f"Regions serve up to {DIMENSIONS}; exact_penalty(method='samples') serves more",
         )  # fmt: skip
-    search = RegionSearch(p, int(limit))
+    search = RegionSearch(p, limit)
     search.visit(p.active(p.interior))
     search.cross_all()
     if not search.found:
@@ -132,7 +132,8 @@ def explore(p: LeastDistanceForm, limit: Any) -> RegionSearch:
 def exchange(
     p: LeastDistanceForm, active: tuple[int, ...], row: int
 ) -> list[tuple[int, ...]] | None:
-    """Active sets behind a facet on which `row` vanishes; None where nothing is feasible there.
+    """Return the active sets behind a facet on which `row` vanishes; None where nothing is feasible
+    there.
 
     A multiplier that vanishes: its row leaves. A row that becomes active joins; if it depends on
     the active ones, M_row = Σ α_j M_j, its multiplier t changes theirs to λ_j − t α_j, and one

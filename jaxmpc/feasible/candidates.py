@@ -4,8 +4,8 @@ For the question "feasible or not" the cost is dropped. In an orthonormal basis 
 of the (row-normalised) constraint matrix a zero-cost ADMM step is t⁺ = t + α(U U'r − clip(t)):
 the alternating projection of Douglas and Rachford between {U w} and the box of the bounds.
 Rows multiplied by √rho_i before U is made are the same as penalties rho_i (`StagePenalties`).
-Iterates may be float32. Nothing here decides a label: every candidate, a w or a multiplier,
-goes to `proofs.py`.
+Iterates may be float32. No label is decided here: every candidate, a w or a multiplier, is checked
+by `proofs.py`.
 """
 
 import functools
@@ -28,7 +28,7 @@ from jaxmpc.qp.projection import Bounds
 
 ALPHA = 1.6
 INSET = 1e-10
-# Newton steps between two attempts at a proof, and how often; the decided leave in between.
+# Newton steps between two attempts at a proof, and number of attempts; decided points drop out.
 NEWTON_STEPS = 8
 NEWTON_ROUNDS = 8
 
@@ -36,8 +36,8 @@ NEWTON_ROUNDS = 8
 @dataclass(frozen=True)
 class StagePenalties:
     """Penalties of the ADMM stage: weight (R,) of the constraint rows, the root of ADMM's rho, and
-    the over-relaxation alpha. No proof depends on them: they decide which points this stage
-    decides, and what the next stages start from."""
+    the over-relaxation alpha. No proof depends on them: they influence which points this stage
+    decides, and from what iterates the next stages start."""
 
     weight: np.ndarray
     alpha: float = ALPHA
@@ -46,12 +46,12 @@ class StagePenalties:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Verdict:
-    """What was proved of one point, and by what.
+    """What was proved of one point, and the proof.
 
     label: 1 feasible, −1 infeasible, 0 undecided. start (n,), inputs (N, m): x_0 and the inputs
     that prove 1. normal (d,), offset: the half-space normal'θ ≤ offset that holds on the whole
-    feasible set and excludes the point; ∞ where none is known, and −1 rests on `proofs.cut` at the
-    point.
+    feasible set and excludes the point; ∞ where none is known; then `proofs.cut` at the point
+    proves −1.
     """
 
     label: Array
@@ -62,7 +62,7 @@ class Verdict:
 
 
 def inputs_of(p: ExactData, rows: ConstraintRows, theta: Array, w: Array) -> tuple[Array, Array]:
-    """Inputs (N, m) and free states that the coordinates w stand for."""
+    """Return the inputs (N, m) and free states that the coordinates w stand for."""
     variables = matmul(jnp.asarray(rows.back), w)
     inputs = matmul(jnp.asarray(rows.Psi), theta) + matmul(jnp.asarray(rows.Omega), variables)
     free = len(p.view.others) if p.view.projects else 0
@@ -70,27 +70,28 @@ def inputs_of(p: ExactData, rows: ConstraintRows, theta: Array, w: Array) -> tup
 
 
 def cut_of(p: ExactData, rows: ConstraintRows, y: Array) -> tuple[Array, Array, Array]:
-    """The bound (a, b, w) of `proofs.cut` that follows from multipliers y (R,) of the rows."""
+    """Return the bound (a, b, w) of `proofs.cut` that follows from multipliers y (R,) of the
+    rows."""
     y = jnp.append(y * rows.weight, 0.0)[jnp.asarray(rows.index)]
     staged, last = p.horizon * p.H.shape[0], p.H_N.shape[0]
     y_states, y_N, y_ball = jnp.split(y, [staged, staged + last])
     return proofs.cut(p, y_states.reshape(p.horizon, p.H.shape[0]), y_N, y_ball)
 
 
-def with_broken_limit(rows: ConstraintRows, theta: Array, y: Array) -> Array:
-    """The multipliers y (R,), or that of one row alone: the one that θ breaks most among the rows
-    that nothing moves. It is a proof whatever the inputs, limited or not.
+def with_violated_limit(rows: ConstraintRows, theta: Array, y: Array) -> Array:
+    """Return the multipliers y (R,), or that of a single row: the one that θ violates most among
+    the rows that nothing moves. It is a proof for any inputs, limited or not.
     """
     if not len(rows.still):
         return y
     still, D = jnp.asarray(rows.still), jnp.asarray(rows.D)[rows.still]
     value = D @ theta
-    broken = value - jnp.clip(value, rows.lower[still], rows.upper[still])
-    worst = jnp.argmax(jnp.abs(broken))
-    # Broken by no more than rounding is not broken: then the other rows tell more.
+    violation = value - jnp.clip(value, rows.lower[still], rows.upper[still])
+    worst = jnp.argmax(jnp.abs(violation))
+    # A violation within rounding is none: then the other rows may prove more.
     rounding = 1e-13 * jnp.sum(jnp.abs(D[worst] * theta))
-    alone = jnp.where(np.arange(len(y)) == still[worst], jnp.sign(broken[worst]), 0.0)
-    return jnp.where(jnp.abs(broken[worst]) > rounding, alone, y)
+    alone = jnp.where(np.arange(len(y)) == still[worst], jnp.sign(violation[worst]), 0.0)
+    return jnp.where(jnp.abs(violation[worst]) > rounding, alone, y)
 
 
 def check_candidates(
@@ -104,7 +105,7 @@ def check_candidates(
     normal, offset, slope = zero, jnp.asarray(jnp.inf, jnp.float64), zero
     infeasible = jnp.asarray(False)
     *others, last = (y.astype(jnp.float64) for y in multipliers)
-    for y in (*others, with_broken_limit(rows, theta, last)):
+    for y in (*others, with_violated_limit(rows, theta, last)):
         cut = cut_of(p, rows, y)
         here = proofs.excludes(*cut, theta) & ~infeasible
         normal, offset, slope = (
@@ -138,7 +139,7 @@ def feasibility_steps(
 def admm_stage(
     p: ExactData, rows: ConstraintRows, points: Array, alpha: Array, iterations: int, dtype: Any
 ) -> tuple[Verdict, Array]:
-    """Verdicts on points (B, d) after ADMM steps in `dtype`, and the last w (B, k)."""
+    """Return verdicts on points (B, d) after ADMM steps in `dtype`, and the last w (B, k)."""
     U, alpha = jnp.asarray(rows.U, dtype), jnp.asarray(alpha, dtype)
     shift = matmul(jnp.asarray(rows.D), points.T)  # (R, B): columns are points
     l = (jnp.asarray(rows.lower)[:, None] - shift).astype(dtype)
@@ -162,7 +163,8 @@ def admm_stage(
 def newton_stage(
     p: ExactData, rows: ConstraintRows, points: Array, w: Array, steps: int
 ) -> tuple[Verdict, Array]:
-    """Verdicts on points (B, d) after Newton steps from w (B, k) in float64, and the last w."""
+    """Return verdicts on points (B, d) after Newton steps from w (B, k) in float64, and the last
+    w."""
     U = jnp.asarray(rows.U)
 
     def one(theta: Array, w: Array) -> tuple[Verdict, Array]:
@@ -182,18 +184,18 @@ def newton_stage(
 
 @functools.cache
 def compiled_admm(iterations: int, dtype: Any) -> Compiled:
-    """The compiled ADMM stage: (p, rows, points (B, d), alpha) → verdicts and w (B, k)."""
+    """Return the compiled ADMM stage: (p, rows, points (B, d), alpha) → verdicts and w (B, k)."""
     stage = lambda p, rows, points, alpha: admm_stage(p, rows, points, alpha, iterations, dtype)
     return Compiled(jax.jit(stage))
 
 
 @functools.cache
 def compiled_newton(batch: int) -> Compiled:
-    """The compiled Newton stages: (p, rows, points (B, d), usable (B,), verdicts, w (B, k)) →
-    verdicts.
+    """Return the compiled Newton stages: (p, rows, points (B, d), usable (B,), verdicts, w (B, k))
+    → verdicts.
 
-    Usable points that are left open are gathered in batches of `batch`, on the device, until none
-    is open or each has met Newton NEWTON_ROUNDS times; those that met it least often come first.
+    Usable points that are undecided are gathered in batches of `batch`, on the device, until none
+    is undecided or each has had NEWTON_ROUNDS rounds; those with the fewest rounds come first.
     """
 
     @jax.jit

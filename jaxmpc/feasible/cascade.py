@@ -1,4 +1,4 @@
-"""The cascade that labels points, chunk by chunk: ADMM on all, Newton on those left open."""
+"""The cascade that labels points, chunk by chunk: ADMM on all, Newton on those undecided."""
 
 import itertools
 import time
@@ -24,11 +24,11 @@ from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.qp.precision import matmul
 
-# Steps of the longer ADMM run, relative to the first, on points that Newton leaves open.
+# Steps of the longer ADMM run, relative to the first, on points that Newton leaves undecided.
 LONGER = 20
-# Proofs of so many bytes in all may stay on the device until they are asked for.
+# Proofs of up to so many bytes in total stay on the device until they are used.
 ON_DEVICE = 2**31
-# Points from which is taken how large they typically are.
+# Number of points from which their typical size is taken.
 SAMPLE = 4096
 
 
@@ -36,7 +36,7 @@ def label_chunks(
     problem: FeasibilityProblem, points: Any, *, iterations: int = 50, dtype: Any = "float32",
     chunk: int | None = None, penalties: StagePenalties | None = None,
 ) -> Iterator[tuple[slice, Labels]]:  # fmt: skip
-    """Label points chunk by chunk; yields (slice of the points, Labels). See `map_feasible_set`."""
+    """Label points chunk by chunk; yield (slice of the points, Labels). See `map_feasible_set`."""
     d = problem.dimension
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != d:
@@ -63,19 +63,20 @@ def label_chunks(
         exact, rows, quick = jax.device_put((exact, problem.rows, quick))
 
     def started(here: slice) -> tuple[np.ndarray, np.ndarray, tuple[Verdict, Any]]:
-        """A chunk, which of it is usable, and the ADMM stage, which the device still works on."""
+        """Return a chunk, which of it is usable, and the ADMM stage, which the device still works
+        on."""
         ok = padded(usable[here], chunk)
         x = np.where(ok[:, None], padded(points[here], chunk), 0.0)
         return x, ok, _run(short, exact, quick, x, alpha)
 
     def finished(x: np.ndarray, ok: np.ndarray, found: tuple[Verdict, Any]) -> Labels:
-        """The labels of a chunk, by all stages."""
+        """Return the labels of a chunk, by all stages."""
         labels, (verdict, w) = Labels.proved(found[0], ok), found
         if np.any((labels.label == 0) & ok):
             w = w if back is None else matmul(w.astype(np.float64), jnp.asarray(back.T))
             labels = Labels.proved(_run(newton, exact, rows, x, ok, verdict, w), ok)
         left = np.flatnonzero((labels.label == 0) & ok)
-        # What resists gets a longer ADMM run without weights, and Newton once more.
+        # Points still undecided get a longer ADMM run without weights, and Newton once more.
         for i in range(0, len(left), batch):
             where = left[i : i + batch]
             again, all_ = padded(x[where], batch), np.ones(batch, bool)
@@ -101,15 +102,15 @@ def label_chunks(
 
 
 def _run(program: Compiled, *args: Any) -> Any:
-    """The program's result, left on the device."""
+    """Run the program and leave its result on the device."""
     return program.program(*args)(*args)
 
 
 def _penalised(
     rows: ConstraintRows, penalties: StagePenalties | None
 ) -> tuple[ConstraintRows, np.ndarray | None, np.float64]:
-    """The rows of the ADMM stage, the matrix that leads back from their w, None where it is the
-    same, and alpha."""
+    """Return the rows of the ADMM stage, the matrix that leads back from their w (None where it is
+    the same), and alpha."""
     if penalties is None:
         return rows, None, np.float64(ALPHA)
     shape, right = np.shape(penalties.weight), rows.lower.shape

@@ -24,16 +24,16 @@ class CenteredPolytope:
 
     @property
     def size(self) -> float:
-        """Largest distance of a facet from the centre, the scale of tolerances."""
+        """Return the largest distance of a facet from the centre, the scale of tolerances."""
         return float(np.max(self.offsets - self.normals @ self.center))
 
     @cached_property
     def extent(self) -> np.ndarray:
-        """|θ_i| ≤ extent_i on the polytope."""
+        """Return bounds |θ_i| ≤ extent_i on the polytope, (p,)."""
         return coordinate_extent(self.normals, self.offsets)
 
     def support(self, direction: np.ndarray) -> tuple[float, np.ndarray | None]:
-        """Upper bound of max direction'θ, by weak duality, and where it is attained."""
+        """Return an upper bound of max direction'θ, by weak duality, and where it is attained."""
         top = maximise(direction, self.normals, self.offsets)
         if top.y is None:
             return top.value, None
@@ -41,16 +41,17 @@ class CenteredPolytope:
 
     @property
     def polytope(self) -> Polytope:
-        """The same as H x ≤ h."""
+        """Return the same set as H x ≤ h."""
         return Polytope(self.normals, self.offsets)
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """max_j (normal_j'θ − offset_j) (B,) at points (B, p): how far outside they are, negative
-        inside."""
+        """Return max_j (normal_j'θ − offset_j), (B,), at points (B, p): how far outside they are,
+        negative inside."""
         return np.max(points @ self.normals.T - self.offsets, axis=1)
 
     def nearest(self, points: np.ndarray, inset: float = 0.0) -> np.ndarray:
-        """The point nearest to each of `points` (B, p) that keeps all half-spaces by `inset`.
+        """Return the point nearest to each of `points` (B, p) that keeps all half-spaces by
+        `inset`.
 
         Least distance by non-negative least squares (Lawson & Hanson 1974, ch. 23).
         """
@@ -71,7 +72,8 @@ class CenteredPolytope:
 
 
 def coordinate_extent(G: np.ndarray, g: np.ndarray) -> np.ndarray:
-    """|v_i| ≤ extent_i on G v ≤ g: twice what linear programs find, which outweighs their error."""
+    """Return bounds |v_i| ≤ extent_i on G v ≤ g: twice what linear programs find, which outweighs
+    their error."""
     size = G.shape[1]
     ends = [maximise(s * e, G, g).value for e in np.eye(size) for s in (1, -1)]
     return 2 * np.abs(ends).reshape(size, 2).max(axis=1) + 1e-300
@@ -80,8 +82,8 @@ def coordinate_extent(G: np.ndarray, g: np.ndarray) -> np.ndarray:
 def weak_duality_bound(
     d: np.ndarray, y: np.ndarray, G: np.ndarray, g: np.ndarray, extent: np.ndarray
 ) -> float:
-    """An upper bound of d'v over G v ≤ g, |v| ≤ extent, from any multipliers y ≥ 0:
-    d'v = y'G v + (d − G'y)'v ≤ y'g + |d − G'y|'extent."""
+    """Return an upper bound of d'v over G v ≤ g, |v| ≤ extent, from any multipliers y ≥ 0: d'v =
+    y'G v + (d − G'y)'v ≤ y'g + |d − G'y|'extent."""
     left = np.abs(d - G.T @ y)
     off = left > 0
     return float(y @ g + left[off] @ extent[off])

@@ -1,6 +1,6 @@
 """The condensed constraints in an orthonormal basis, in which candidates for proofs are found.
 
-No label rests on these numbers; proofs work on `ExactData`.
+No label depends on these numbers; proofs use `ExactData`.
 """
 
 from dataclasses import dataclass, field, replace
@@ -24,10 +24,10 @@ from jaxmpc.qp.projection import Bounds
 class ConstraintRows:
     """Rows of the condensed constraints: lower ≤ (U w)_i + D_i θ ≤ upper, i = 1..R.
 
-    U (R, k) is an orthonormal basis of what the decision variables (inputs, prestabilised or
-    not, and in a projection the free states) can do to the normalised rows; back (nz, k) leads
-    from w to the variables. A row that nothing moves (k = 0; Euler's q₁ does not feel u₀) has
-    U = 0: a half-space on θ alone. weight (R,) brings multipliers to the units of the problem's
+    U (R, k) is an orthonormal basis of the range of the normalised rows' matrix in the decision
+    variables (inputs, prestabilised or not, and in a projection the free states); back (nz, k) maps
+    w to the variables. A row that no variable moves (such as those at k = 0) has U = 0: a
+    half-space on θ alone. weight (R,) brings multipliers to the units of the problem's
     rows, and index says where the multiplier of each row of `ExactData` (step by step, then
     terminal rows, then those of the terminal ellipsoid) stands among the R (R where there is
     none). The last `balls` rows are those of the ellipsoid: |v − lower| ≤ radius. Psi, Omega, psi:
@@ -49,7 +49,7 @@ class ConstraintRows:
     balls: tuple[int, ...] = field(metadata={"static": True})
 
     def bounds(self, theta: Array) -> Bounds:
-        """What θ leaves for U w."""
+        """Return the bounds that θ leaves for U w."""
         shift = matmul(jnp.asarray(self.D), theta)
         return Bounds(self.lower - shift, self.upper - shift, radius=self.radius, balls=self.balls)
 
@@ -57,7 +57,8 @@ class ConstraintRows:
 def constraint_rows(mpc: MPC, view: View, c: Any, blocks: list[Block]) -> ConstraintRows:
     """Restrict the condensed rows of a problem without soft rows to a view, and normalise them.
 
-    c: the `Condensed` problem, in NumPy; blocks: its `hard_blocks`. Host, float64.
+    c: the `Condensed` problem, in NumPy; blocks: its `hard_blocks`. NumPy in float64; not
+    traceable.
     """
     axes, others = list(view.axes), list(view.others)
     C, D, lower, upper = c.C, c.D[:, axes], c.lower - c.d, c.upper - c.d
@@ -100,8 +101,8 @@ def constraint_rows(mpc: MPC, view: View, c: Any, blocks: list[Block]) -> Constr
 
 
 def weighted(rows: ConstraintRows, weight: np.ndarray) -> tuple[ConstraintRows, np.ndarray]:
-    """The rows multiplied by weights > 0 (R,), alike in a ball, and M (k, k): w = M w', the old
-    coordinates from the new."""
+    """Return the rows multiplied by weights > 0 (R,), alike in a ball, and M (k, k) with w = M w',
+    the old coordinates from the new."""
     U, singular, Vt = np.linalg.svd(weight[:, None] * rows.U, full_matrices=False)
     M = Vt.T / singular
     return replace(
@@ -114,8 +115,8 @@ def weighted(rows: ConstraintRows, weight: np.ndarray) -> tuple[ConstraintRows, 
 def multiplier_index(
     mpc: MPC, blocks: list[Block], layout: tuple[Any, ...], place: np.ndarray, none: int
 ) -> np.ndarray:
-    """`ConstraintRows.index`. place: where each row of the condensed problem stands among the R
-    that are kept."""
+    """Return `ConstraintRows.index`. place: where each row of the condensed problem stands among
+    the R that are kept."""
     N, offset = mpc.horizon, 0
     columns, last, ball = [], [np.zeros(0, int)], np.zeros(0, int)
     for block, (_, steps, size) in zip(blocks, layout, strict=True):

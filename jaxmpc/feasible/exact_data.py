@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxmpc.control.set_bounds import set_bounds
 from jaxmpc.control.sets import Box, Ellipsoid
+from jaxmpc.control.system import host_matrices
 from jaxmpc.feasible.view import View
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Block
@@ -23,11 +24,11 @@ class ExactData:
     lower_k ≤ H x_k + D u_k ≤ upper_k for k < N: H (r, n), D (r, m), lower and upper (N, r), ±inf at
     steps where a row does not hold. lower_N ≤ H_N x_N ≤ upper_N. P, level: terminal ellipsoid
     x'Px ≤ level, None without; back (n, rows) leads from multipliers of its rows L'x to v.
-    u_lower, u_upper (m,): a box round the inputs; move_lower, move_upper (moves, m): what limits on
-    the states leave of it to each free move. left (N, n): 1 where errors of p_k, k = 1..N, are left
-    to the steps before; elsewhere, and there side and reach are 0 too, |x_k| + side∘x_k ≤ reach on
-    every feasible trajectory. side_0, reach_0 (d,): the same of every feasible θ, ∞ where nothing
-    bounds it. moves: number of the free move that each input is.
+    u_lower, u_upper (m,): a box around the inputs; move_lower, move_upper (moves, m): the part of
+    it that limits on the states leave to each free move. left (N, n): 1 where errors of the
+    costates p_k, k = 1..N, are passed to the step before (side and reach are 0 there), else 0, with
+    |x_k| + side∘x_k ≤ reach on every feasible trajectory. side_0, reach_0 (d,): the same for every
+    feasible θ, ∞ where nothing bounds it. moves: index of the free move that each input equals.
     """
 
     A: Any
@@ -57,16 +58,14 @@ class ExactData:
 
     @property
     def horizon(self) -> int:
-        """N."""
+        """Return the horizon N."""
         return len(self.moves)
 
 
 def dynamics(mpc: MPC) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A, B, c of x⁺ = Ax + Bu + c, for (x, u_{−1}) where input rates are limited."""
-    to64 = lambda v: np.asarray(v, np.float64)
+    """Return A, B, c of x⁺ = Ax + Bu + c, for (x, u_{−1}) where input rates are limited."""
     n, m = mpc.system.n, mpc.system.m
-    A, B = to64(mpc.system.A), to64(mpc.system.B)
-    c = np.zeros(n) if mpc.system.c is None else to64(mpc.system.c)
+    A, B, c = host_matrices(mpc.system)
     if mpc.rate_limited:
         A = np.block([[A, np.zeros((n, m))], [np.zeros((m, n + m))]])
         B, c = np.concatenate([B, np.eye(m)]), np.concatenate([c, np.zeros(m)])
@@ -74,7 +73,8 @@ def dynamics(mpc: MPC) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def hard_blocks(mpc: MPC) -> list[Block]:
-    """Hard blocks as float64 host arrays; those of rates written as rows of (x, u_{−1}) and u."""
+    """Return the blocks of hard rows as float64 NumPy arrays, those of rates as rows of (x, u_{−1})
+    and u."""
     with jax.enable_x64(True):
         found = row_blocks(mpc, np.float64)
     to64 = lambda v: np.asarray(v, np.float64)
@@ -95,7 +95,8 @@ def hard_blocks(mpc: MPC) -> list[Block]:
 
 
 def absorbed(mpc: MPC, block: Block) -> bool:
-    """True for input limits that the clip and the support function look after: those of a box."""
+    """Return whether a block is the input limits of a box, which the clip and the support function
+    account for."""
     return block.kind == "input" and isinstance(mpc.inputs, Box)
 
 
@@ -104,9 +105,9 @@ def exact_data(
 ) -> ExactData:
     """Collect the exact data of a problem without soft rows; blocks: its `hard_blocks`.
 
-    extent (2, d): lower and upper bounds of every feasible θ, which no label rests on; (d,): of
-    |θ|. size (d,): how large θ typically is (None: as large as extent says), by which is chosen how
-    rounding errors are bounded, not whether they are.
+    extent (2, d): lower and upper bounds of every feasible θ, on which no label depends; (d,): of
+    |θ|. size (d,): typical size of θ (None: that of extent), which selects how rounding errors are
+    bounded, not whether they are.
     """
     n, m, N, p = mpc.system.n, mpc.system.m, mpc.horizon, mpc.dimension
     A, B, c = dynamics(mpc)
@@ -135,7 +136,7 @@ def exact_data(
     boxes = {id(set_): set_bounds(set_, n) for set_ in (mpc.states, mpc.terminal_set)}
 
     def limits(k: int) -> np.ndarray:
-        """Bounds (2, p) of x_k, without those that the inputs have on it."""
+        """Return the bounds (2, p) of x_k, without those that the inputs have on it."""
         sets = [mpc.states] if k in mpc.state_steps else []
         bound = np.repeat([[-np.inf], [np.inf]], p, axis=1)
         for set_ in [*sets, mpc.terminal_set] if k == N else sets:
@@ -153,7 +154,7 @@ def exact_data(
         start[others] = one_sided(view.lower, view.upper)[1]
     elif others:
         start[others] = np.abs(view.fixed)[others]
-    grown, u_size = np.where(np.isfinite(start), start, 0.0), largest(u_lower, u_upper)
+    grown, u_size = np.where(np.isfinite(start), start, 0.0), largest_magnitude(u_lower, u_upper)
     errors = []
     for k in range(1, N + 1):
         with np.errstate(invalid="ignore"):  # 0·inf below counts as 0
@@ -163,7 +164,7 @@ def exact_data(
         far = (bound > grown) | np.isinf(bound)
         errors.append((1.0 * far, np.where(far, 0.0, side), np.where(far, 0.0, bound)))
         grown = np.minimum(grown, bound)
-    x_size = [largest(*limits(k)[:, :n]) for k in range(N + 1)]
+    x_size = [largest_magnitude(*limits(k)[:, :n]) for k in range(N + 1)]
     implied = input_size(A[:n, :n], B[:n], c[:n], x_size)
     steps = [np.equal(mpc.moves, i) for i in range(max(mpc.moves) + 1)]
     implied = np.array([implied[same].min(axis=0) for same in steps])
@@ -178,7 +179,8 @@ def exact_data(
 
 
 def input_size(A: np.ndarray, B: np.ndarray, c: np.ndarray, size: list[np.ndarray]) -> np.ndarray:
-    """Bounds (N, m) of |u_k| from those of |x_k|, k = 0..N: u_k = B⁺(x_{k+1} − A x_k − c).
+    """Return bounds (N, m) of |u_k| from those of |x_k|, k = 0..N, by u_k = B⁺(x_{k+1} − A x_k −
+    c).
 
     ∞ where there is none, and where B has dependent columns.
     """
@@ -197,12 +199,15 @@ def input_size(A: np.ndarray, B: np.ndarray, c: np.ndarray, size: list[np.ndarra
 
 
 def one_sided(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(s, r) with the least r for which |x| + s x ≤ r on lower ≤ x ≤ upper, s in {0, 1, −1}."""
-    ways = np.array([largest(lower, upper), 2 * np.maximum(upper, 0), 2 * np.maximum(-lower, 0)])
+    """Return (s, r) with the least r for which |x| + s x ≤ r on lower ≤ x ≤ upper, s in {0, 1,
+    −1}."""
+    ways = np.array(
+        [largest_magnitude(lower, upper), 2 * np.maximum(upper, 0), 2 * np.maximum(-lower, 0)]
+    )
     best = np.argmin(ways, axis=0)
     return np.array([0.0, 1.0, -1.0])[best], ways.min(axis=0)
 
 
-def largest(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Bound of |x| on lower ≤ x ≤ upper."""
+def largest_magnitude(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Return the largest |x| on lower ≤ x ≤ upper."""
     return np.maximum(np.abs(lower), np.abs(upper))

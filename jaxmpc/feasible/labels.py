@@ -18,14 +18,14 @@ STATUS = np.array([Status.PRIMAL_INFEASIBLE, Status.ITERATION_LIMIT, Status.SOLV
 
 
 class OnDemand:
-    """An array that is fetched once, when it is first asked for."""
+    """An array that is fetched once, when it is first used."""
 
     def __init__(self, fetch: Callable[[], np.ndarray]) -> None:
         self._fetch: Callable[[], np.ndarray] | None = fetch
         self._value: np.ndarray | None = None
 
     def get(self) -> np.ndarray:
-        """The array."""
+        """Return the array, and fetch it the first time."""
         if self._value is None:
             assert self._fetch is not None
             self._value, self._fetch = self._fetch(), None
@@ -40,12 +40,12 @@ class Labels:
     `Status` (NOT_RUN, NON_FINITE, or SOLVED / PRIMAL_INFEASIBLE / ITERATION_LIMIT for the three
     labels). starts (b, n), plans (b, N, m): x_0 and inputs that prove 1, else NaN.
     cut_normals (b, d), cut_offsets (b,): the half-space a'x ≤ b, valid on the whole feasible set,
-    that proves −1, else NaN. An offset of ∞ says that −1 is proved at the point but that no such
-    half-space is known: on sets that extend both ways without end, or very far, along a facet,
-    the rounding of its normal outweighs what the point is outside. Seconds spent compiling and
-    running.
+    that proves −1, else NaN. An offset of ∞ means that −1 is proved at the point but that no such
+    half-space is known: on sets that are unbounded in both directions, or very long, along a facet,
+    the rounding of its normal outweighs the distance of the point. compile_seconds, run_seconds:
+    time spent compiling and running.
 
-    The proofs may still be on the device: each of the four arrays is copied when first asked for.
+    The proofs may still be on the device: each of the four arrays is copied when first used.
     """
 
     label: np.ndarray
@@ -56,22 +56,23 @@ class Labels:
 
     @property
     def starts(self) -> np.ndarray:
-        """x_0 (b, n) of the points proved feasible, NaN elsewhere."""
+        """Return x_0 (b, n) of the points proved feasible, NaN elsewhere."""
         return self.proofs["starts"].get()
 
     @property
     def plans(self) -> np.ndarray:
-        """Inputs (b, N, m) that prove points feasible, NaN elsewhere."""
+        """Return inputs (b, N, m) that prove points feasible, NaN elsewhere."""
         return self.proofs["plans"].get()
 
     @property
     def cut_normals(self) -> np.ndarray:
-        """Normals (b, d) of the half-spaces that prove points infeasible, NaN elsewhere."""
+        """Return the normals (b, d) of the half-spaces that prove points infeasible, NaN
+        elsewhere."""
         return self.proofs["cut_normals"].get()
 
     @property
     def cut_offsets(self) -> np.ndarray:
-        """Offsets (b,) of these half-spaces."""
+        """Return the offsets (b,) of these half-spaces."""
         return self.proofs["cut_offsets"].get()
 
     @classmethod
@@ -79,7 +80,7 @@ class Labels:
         cls, *, label: Any, status: Any, starts: Any, plans: Any, cut_normals: Any,
         cut_offsets: Any, **seconds: float,
     ) -> "Labels":  # fmt: skip
-        """Labels from their arrays, which may be a device's."""
+        """Return labels from their arrays, of NumPy or on a device."""
         given = dict(starts=starts, plans=plans, cut_normals=cut_normals, cut_offsets=cut_offsets)
         fetch = lambda v: OnDemand(lambda: np.asarray(v))
         proofs = {name: fetch(v) for name, v in given.items()}
@@ -87,7 +88,7 @@ class Labels:
 
     @classmethod
     def proved(cls, verdict: Verdict, usable: np.ndarray) -> "Labels":
-        """Labels from the verdicts on a batch (B,); waits for the device. usable (B,): which
+        """Return labels from the verdicts on a batch (B,); waits for the device. usable (B,): which
         points are finite."""
         label = np.where(usable, np.asarray(verdict.label), np.int8(0))
         status = np.where(usable, STATUS[label + 1], np.int8(Status.NON_FINITE))
@@ -105,7 +106,7 @@ class Labels:
 
     @classmethod
     def empty(cls, count: int, problem: FeasibilityProblem) -> "Labels":
-        """Labels of `count` points that have not been run."""
+        """Return labels of `count` points that have not been run."""
         mpc, d = problem.mpc, problem.dimension
         return cls.of(
             label=np.zeros(count, np.int8), status=np.full(count, Status.NOT_RUN, np.int8),
@@ -116,7 +117,7 @@ class Labels:
 
     @classmethod
     def joined(cls, parts: Sequence["Labels"]) -> "Labels":
-        """The labels of several batches of points, one after the other."""
+        """Return the labels of several batches of points, one after the other."""
         several = lambda name: OnDemand(
             lambda: np.concatenate([part.proofs[name].get() for part in parts])
         )
@@ -129,7 +130,7 @@ class Labels:
         )
 
     def first(self, count: int) -> "Labels":
-        """Labels of the first `count` points."""
+        """Return the labels of the first `count` points."""
         head = lambda proof: OnDemand(lambda: proof.get()[:count])
         proofs = {name: head(proof) for name, proof in self.proofs.items()}
         return replace(self, label=self.label[:count], status=self.status[:count], proofs=proofs)
@@ -137,7 +138,8 @@ class Labels:
     def changed(
         self, where: np.ndarray, label: Any, status: Any, proofs: dict[str, OnDemand]
     ) -> "Labels":
-        """These labels with others at indices `where` (k,), and with these rows of their proofs."""
+        """Return these labels with others at indices `where` (k,), and with these rows of their
+        proofs."""
         merged = lambda name, rows: OnDemand(
             lambda: _put(self.proofs[name].get(), where, rows.get())
         )
@@ -155,7 +157,7 @@ class Labels:
 
 
 def _put(array: np.ndarray, where: np.ndarray, rows: Any) -> np.ndarray:
-    """A copy of the array with `rows` at indices `where`."""
+    """Return a copy of the array with `rows` at indices `where`."""
     copy = array.copy()
     copy[where] = rows
     return copy

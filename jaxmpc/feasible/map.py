@@ -1,4 +1,4 @@
-"""Maps of the feasible set: every point proved feasible, proved infeasible, or said undecided."""
+"""Maps of the feasible set: every point proved feasible, proved infeasible, or undecided."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,14 +20,15 @@ from jaxmpc.feasible.rays import Rays
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
 
-# Rays that `refine` shoots in one round at most.
+# The most rays that `refine` sends in one round.
 MOST_RAYS = 2000
 # Volumes are sums of rounded products; bounds are widened by more than that.
 VOLUME_ROUNDING = 1e-11
 
 
 def grid(lower: Any, upper: Any, shape: Any) -> np.ndarray:
-    """Points of a regular grid, end points included: (Π shape, d), first coordinate slowest."""
+    """Return the points of a regular grid, end points included: (Π shape, d), first coordinate
+    slowest."""
     lower, upper = np.atleast_1d(np.asarray(lower, float)), np.atleast_1d(np.asarray(upper, float))
     shape = tuple(int(k) for k in np.atleast_1d(shape))
     if not lower.shape == upper.shape == (len(shape),):
@@ -57,44 +58,44 @@ class FeasibleSetMap:
 
     @classmethod
     def of(cls, problem: FeasibilityProblem, points: Any, labels: Labels) -> "FeasibleSetMap":
-        """A map from labels that were made elsewhere, by chunks or from a store."""
+        """Return a map from labels that were made elsewhere, by chunks or from a store."""
         d = problem.dimension
         none = np.zeros((0, d)), np.zeros((0, d)), np.zeros(0)
         return cls(problem, np.asarray(points, float), labels, *none)
 
     @property
     def mpc(self) -> MPC:
-        """The MPC problem, without soft rows and weights of input rates."""
+        """Return the MPC problem, without soft rows and weights of input rates."""
         return self.problem.mpc
 
     @property
     def axes(self) -> tuple[int, ...]:
-        """Indices of the d mapped states."""
+        """Return the indices of the d mapped states."""
         return self.problem.view.axes
 
     @property
     def fixed(self) -> np.ndarray | None:
-        """Values (n,) of the other states in a slice, zero at `axes`; None for a projection or
-        where all states are mapped."""
+        """Return the values (n,) of the other states in a slice, zero at `axes`; None for a
+        projection or where all states are mapped."""
         return self.problem.view.fixed
 
     @property
     def label(self) -> np.ndarray:
-        """(B,) int8: 1 proved feasible, −1 proved infeasible, 0 undecided."""
+        """Return the labels (B,) int8: 1 proved feasible, −1 proved infeasible, 0 undecided."""
         return self.labels.label
 
     @property
     def status(self) -> np.ndarray:
-        """(B,) int8, values of `Status`."""
+        """Return the values of `Status` (B,), int8."""
         return self.labels.status
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Labels of the mapped states with their units."""
+        """Return the labels of the mapped states with their units."""
         return self.problem.labels
 
     def counts(self) -> dict[str, int]:
-        """How many points are feasible, infeasible, undecided, not finite, not run."""
+        """Return how many points are feasible, infeasible, undecided, not finite, not run."""
         status, label = self.status, self.label
         return {
             "feasible": int(np.sum(label == 1)),
@@ -105,7 +106,7 @@ class FeasibleSetMap:
         }
 
     def inner(self) -> Polytope:
-        """Convex hull of all points proved feasible: a subset of the feasible set.
+        """Return the convex hull of all points proved feasible: a subset of the feasible set.
 
         Raises ValueError while these points have no interior.
         """
@@ -114,14 +115,14 @@ class FeasibleSetMap:
         )
 
     def cuts(self) -> tuple[np.ndarray, np.ndarray]:
-        """All half-spaces a'x ≤ b proved valid for the feasible set: a (K, d), b (K,)."""
+        """Return all half-spaces a'x ≤ b proved valid for the feasible set: a (K, d), b (K,)."""
         proved = (self.label == -1) & np.isfinite(self.labels.cut_offsets)
         normals = np.concatenate([self.labels.cut_normals[proved], self.extra_normals])
         offsets = np.concatenate([self.labels.cut_offsets[proved], self.extra_offsets])
         return normals, offsets
 
     def outer(self) -> Polytope:
-        """Intersection of all half-spaces proved valid: a superset of the feasible set.
+        """Return the intersection of all half-spaces proved valid: a superset of the feasible set.
 
         Raises ValueError where it is unbounded, empty or flat.
         """
@@ -132,7 +133,8 @@ class FeasibleSetMap:
         return Polytope(normals, offsets).reduce()
 
     def volume_bounds(self) -> tuple[float, float]:
-        """Certified bounds on the volume (area in 2-D) of the feasible set, or of its section.
+        """Return certified bounds on the volume (area in 2-D) of the feasible set, or of its
+        section.
 
         (0, 0) where the half-spaces leave nothing, an upper bound of inf where they leave an
         unbounded set.
@@ -149,7 +151,8 @@ class FeasibleSetMap:
         return low, high
 
     def terminal_section(self) -> Polytope | None:
-        """The terminal set in the mapped states (slice or all states), None where there is none.
+        """Return the terminal set in the mapped states (slice or all states), None where there is
+        none.
 
         An Ellipsoid is given as a polygon of 256 of its boundary points, in two mapped states.
         """
@@ -168,7 +171,7 @@ class FeasibleSetMap:
         return Polytope(H[:, axes], h - H[:, others] @ rest)
 
     def refine(self, tolerance: float = 1e-6, rounds: int = 30) -> "FeasibleSetMap":
-        """Shoot rays at the vertices of the outer polytope until the volume bounds meet.
+        """Send rays through the vertices of the outer polytope until the volume bounds meet.
 
         Each ray adds a proved boundary point and a proved facet (`boundary`); in up to four
         mapped dimensions this ends at the exact polytope. Undecided points that a facet excludes
@@ -183,9 +186,9 @@ class FeasibleSetMap:
         directions = np.concatenate([np.eye(d), -np.eye(d), -np.ones((1, d))])
         points = np.zeros((0, d))
         normals, offsets = rays.box()
-        shot = unit(directions)
+        sent = unit(directions)
         for _ in range(rounds):
-            found = rays.shoot(directions)
+            found = rays.cast(directions)
             proved = np.isfinite(found.inner)
             points = np.concatenate([points, found.points[proved]])
             valid = np.isfinite(found.offsets)
@@ -194,8 +197,8 @@ class FeasibleSetMap:
             try:
                 outer = Polytope(normals, offsets).reduce()
                 low, high = hull_volume(points), outer.volume()
-                directions = fresh(outer.vertices() - rays.center, shot)
-                shot = np.concatenate([shot, unit(directions)])
+                directions = fresh(outer.vertices() - rays.center, sent)
+                sent = np.concatenate([sent, unit(directions)])
             except ValueError:  # unbounded, or too thin for qhull
                 break
             # Sets with a curved boundary have no end of vertices.
@@ -207,7 +210,8 @@ class FeasibleSetMap:
         )
 
     def to_xarray(self) -> Any:
-        """The map as an xarray.Dataset along the dimension `sample`, names and units attached."""
+        """Return the map as an xarray.Dataset along the dimension `sample`, names and units
+        attached."""
         import xarray
 
         data = {
@@ -232,21 +236,23 @@ class FeasibleSetMap:
 
 
 def unit(directions: np.ndarray) -> np.ndarray:
-    """Directions (K, d) scaled to length one."""
+    """Return directions (K, d) scaled to length one."""
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def fresh(directions: np.ndarray, shot: np.ndarray) -> np.ndarray:
-    """The directions, except zeros, along which no ray of `shot` (unit length) has been sent."""
+def fresh(directions: np.ndarray, sent: np.ndarray) -> np.ndarray:
+    """Return the directions, except zeros, along which no ray of `sent` (unit length) has been
+    sent."""
     directions = directions[np.any(directions != 0, axis=1)]
-    distance = KDTree(shot).query(unit(directions))[0]
+    distance = KDTree(sent).query(unit(directions))[0]
     return directions[distance > 1e-9]
 
 
 def ellipse(
     P: np.ndarray, level: float, axes: list[int], others: list[int], rest: np.ndarray
 ) -> Polytope | None:
-    """Polygon in the section {y: (y, rest)'P(y, rest) ≤ level}; None unless y has two entries.
+    """Return a polygon in the section {y: (y, rest)'P(y, rest) ≤ level}; None unless y has two
+    entries.
 
     With S the block of P at y, c = −S⁻¹ P_yo rest and α = level − rest'P_oo rest + c'S c the
     section is (y − c)'S(y − c) ≤ α.
@@ -265,10 +271,10 @@ def ellipse(
 def excluded(
     labels: Labels, rays: Rays, points: np.ndarray, normals: np.ndarray, offsets: np.ndarray
 ) -> Labels:  # fmt: skip
-    """Labels where undecided points that one of the half-spaces excludes are infeasible.
+    """Return labels where undecided points that one of the half-spaces excludes are infeasible.
 
-    Only within the extent of the feasible set that LPs found: there a half-space of
-    `proofs.everywhere` is one of `proofs.cut`, and no label rests on an LP.
+    This is done only within the extent of the feasible set that LPs found: there a half-space of
+    `proofs.everywhere` is one of `proofs.cut`, and no label depends on an LP.
     """
     p = rays.exact
     within = np.all(np.abs(points) + p.side_0 * points <= p.reach_0, axis=1)
@@ -296,12 +302,13 @@ def map_feasible_set(
 
     x0s: points (B, d). axes: indices of the d mapped states (None: all n). fixed: values (n,) of
     all states, for a slice through them; None with d < n: a projection (feasible if some value
-    of the other states is). The cost plays no part. Every label rests on a proof in float64
+    of the other states is). The cost is ignored. Every label rests on a proof in float64
     (`proofs.py`): an input sequence whose roll-out keeps all rows, or a half-space that excludes
     the point, each by more than rounding; what is neither is 0, undecided. iterations and dtype
-    govern the ADMM stage alone and cannot make a label wrong. chunk: points a compiled program
-    takes at once (None: by device). refine: tolerance of `FeasibleSetMap.refine`, None to skip
-    it. penalties: of the ADMM stage, from `tune_sweep_penalties`. progress: show a bar.
+    affect the ADMM stage alone and cannot make a label wrong. chunk: number of points that a
+    compiled program takes at once (None: by device). refine: tolerance of `FeasibleSetMap.refine`,
+    None to skip it. penalties: of the ADMM stage, from `tune_sweep_penalties`. progress: show a
+    bar.
 
     A point with NaN or infinity gets status NON_FINITE and label 0. Raises ValueError for wrong
     shapes and ill-posed problems before anything compiles.

@@ -3,7 +3,7 @@
 A state θ and the decision variables z of the condensed problem are one vector v = (θ, z); the hard
 rows are a polytope G v ≤ g of such pairs, and the state after the first move is θ⁺ = M v + t. The
 feasible set is the projection of this polytope on θ; "every first move" and "some first move" are
-linear programs over it. Host, float64, HiGHS.
+linear programs over it, solved by HiGHS in float64.
 """
 
 import time
@@ -46,7 +46,7 @@ class PlanPolytope:
 
     @classmethod
     def of(cls, c: Any) -> "PlanPolytope":
-        """The polytope of a `Condensed` problem whose arrays are NumPy's.
+        """Return the polytope of a `Condensed` problem whose arrays are NumPy's.
 
         Where input rates are limited, θ = (x, u_{−1}).
         """
@@ -59,17 +59,18 @@ class PlanPolytope:
 
     @property
     def p(self) -> int:
-        """Number of coordinates of θ."""
+        """Return the number of coordinates of θ."""
         return len(self.t)
 
     @cached_property
     def extent(self) -> np.ndarray:
-        """|v_i| ≤ extent_i on the polytope (twice what LPs find, which outweighs their error)."""
+        """Return bounds |v_i| ≤ extent_i on the polytope (twice what LPs find, which outweighs
+        their error)."""
         return coordinate_extent(self.G, self.g)
 
     def followed(self) -> "PlanPolytope":
-        """The polytope of (θ, z, z⁺) with (θ, z) and (θ⁺, z⁺) both in this one: of the decisions
-        after which another one is feasible."""
+        """Return the polytope of (θ, z, z⁺) with (θ, z) and (θ⁺, z⁺) both in this one: the
+        decisions after which another one is feasible."""
         p = self.p
         state, plan = self.G[:, :p], self.G[:, p:]
         G = np.block([[self.G, np.zeros_like(plan)], [state @ self.M, plan]])
@@ -80,9 +81,9 @@ class PlanPolytope:
         return PlanPolytope(G / size[:, None], g / size, M, self.t, self.exact, equal)
 
     def largest_next(self, normal: np.ndarray) -> tuple[float, float, np.ndarray | None]:
-        """max normal'θ⁺ over the polytope: (attained value, upper bound, v).
+        """Return max normal'θ⁺ over the polytope as (attained value, upper bound, v).
 
-        The bound holds whatever the LP's error, by weak duality.
+        The bound holds for any LP error, by weak duality.
         """
         d = normal @ self.M
         top, shift = maximise(d, self.G, self.g), float(normal @ self.t)
@@ -91,7 +92,7 @@ class PlanPolytope:
         return top.value + shift, self._bound(d, top.y) + shift, top.x
 
     def support(self, direction: np.ndarray) -> float:
-        """Upper bound of direction'θ over the polytope, as in `largest_next`."""
+        """Return an upper bound of direction'θ over the polytope, as in `largest_next`."""
         d = np.append(direction, np.zeros(self.G.shape[1] - self.p))
         top = maximise(d, self.G, self.g)
         return top.value if top.y is None else self._bound(d, top.y)
@@ -100,8 +101,8 @@ class PlanPolytope:
         return weak_duality_bound(d, y, self.G, self.g, self.extent)
 
     def centre(self) -> np.ndarray | None:
-        """The θ of the point with the largest margin of all rows but equalities, None without a
-        margin."""
+        """Return the θ of the point with the largest margin of all rows but equalities; None
+        without a margin."""
         size = self.G.shape[1]
         margin = np.where(self.equal, 0.0, 1.0)[:, None]
         wide = np.vstack([np.hstack([self.G, margin]), np.eye(size + 1)[-1:]])
@@ -110,7 +111,8 @@ class PlanPolytope:
         return None if top.x is None or top.value <= TOLERANCE else top.x[: self.p]
 
     def ray(self, centre: np.ndarray, direction: np.ndarray) -> tuple[float, np.ndarray, float]:
-        """max s with centre + s·direction in the projection, and a half-space a'θ ≤ b of it.
+        """Return max s with centre + s·direction in the projection, and a half-space a'θ ≤ b of it,
+        as (s, a, b).
 
         (s, a, b). The LP's multipliers y give a = G_θ'y and b = y'g, plus what their error G_z'y
         can add. Raises ValueError where the ray does not end.
@@ -127,7 +129,8 @@ class PlanPolytope:
 
 
 def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope | str:
-    """The projection of a plan polytope on θ, all facets and vertices, or the reason why not.
+    """Return the projection of a plan polytope on θ, all facets and vertices, or the reason why
+    not.
 
     Rays at the vertices of an outer polytope add half-spaces, the duals of their LPs, until every
     vertex is reached (beneath-beyond). deadline: of `time.monotonic`, in seconds.

@@ -16,18 +16,19 @@ from jaxmpc.mpc.problem import MPC
 
 
 def feasible_polytope(mpc: MPC) -> Polytope:
-    """The feasible set X_N as a polytope, every facet once: {θ : some plan keeps every hard row}.
+    """Return the feasible set X_N as a polytope, every facet once: {θ : some plan keeps every hard
+    row}.
 
     θ is x, or (x, u_{−1}) where input rates are limited. Facets come from the duals of linear
     programs and are valid; each vertex was reached by one, to 1e-9 of the set's size. For a map
     with proofs against rounding, slices, projections or an ellipsoidal terminal set use
     `map_feasible_set(...).refine()`; one step at a time, `predecessor`.
 
-    In more than four dimensions X_N comes from N steps of `predecessor` instead, for limits of
-    states and inputs alone; that works while the limits couple few states.
+    In more than four dimensions X_N is computed by N steps of `predecessor` instead, for limits of
+    states and inputs alone; that works if the limits couple few states.
 
     Raises ValueError where X_N is empty, flat or unbounded, for an ellipsoidal terminal set, and
-    where there are too many facets. Host, float64.
+    where there are too many facets. NumPy in float64; not traceable.
     """
     problem = FeasibilityProblem.of(mpc)
     plans = problem.plan_polytope
@@ -54,7 +55,7 @@ class Growth:
 
 
 def feasible_growth(mpc: MPC, horizons: Sequence[int]) -> Growth:
-    """How X_N grows or shrinks with N: `feasible_polytope` at each of `horizons`.
+    """Compute how X_N grows or shrinks with N: `feasible_polytope` at each of `horizons`.
 
     Raises ValueError as `feasible_polytope` does, and where steps or blocks of `mpc` fit one
     horizon only.
@@ -71,7 +72,7 @@ def feasible_growth(mpc: MPC, horizons: Sequence[int]) -> Growth:
 def backward(
     mpc: MPC, deadline: float = np.inf
 ) -> tuple[CenteredPolytope, CenteredPolytope, CenteredPolytope] | str:
-    """X_{N−1}, X_N and X_{N+1} by X_{k+1} = states ∩ Pre(X_k), or the reason why not.
+    """Return X_{N−1}, X_N and X_{N+1} by X_{k+1} = states ∩ Pre(X_k), or the reason why not.
 
     Half-spaces without vertices, by elimination (`predecessor`): for problems of many states
     whose limits couple few of them. Only for limits on states and inputs at the standard steps.
@@ -109,7 +110,7 @@ def backward(
 
 
 def is_standard_form(mpc: MPC) -> bool:
-    """True for limits on states and inputs alone, at the standard steps, with inputs free at
-    each step."""
+    """Return whether limits are on states and inputs alone, at the standard steps, with inputs free
+    at each step."""
     free = not (mpc.outputs or mpc.rate_limited) and mpc.control_horizon is None
     return free and mpc.constrained_steps is None

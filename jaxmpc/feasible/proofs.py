@@ -1,7 +1,7 @@
 """Proofs that a state is feasible or infeasible, evaluated in float64 and safe against rounding.
 
-Both work on the exact data of the problem (A, B, c and the sets), not on condensed matrices. Where
-input rates are limited x stands for (x, u_{k−1}). Soft rows are no constraints and play no part.
+Both use the exact data of the problem (A, B, c and the sets), not condensed matrices. Where input
+rates are limited x stands for (x, u_{k−1}). Soft rows are not constraints and are left out.
 
 *Feasible*: inputs clipped into their limits are rolled out, x_{k+1} = A x_k + B u_k + c, with a
 running bound on the rounding error, ε_{k+1} = |A| ε_k + γ(|A||x_k| + |B||u_k| + |c|). Every
@@ -21,18 +21,18 @@ No property of y is needed, so any iterate gives a valid half-space; a converged
 tight one. (Neumaier & Shcherbina 2004: the input limits absorb the dual residual.)
 
 *Rounding.* The computed p_k is off by at most e_k = |A|'e_{k+1} + γ(|A|'|p_{k+1}| + |H|'|y_k|).
-Such an error meets x_k, and is settled there where limits on x_k are near, or else is left to the
-steps before, e_k → |A|'e_k, with what it meets of u and c on the way. To settle it, p_k is moved
-by s∘e_k, s_i ∈ {−1, 0, 1}, at the price of e_k'reach_k, where |x_k| + s∘x_k ≤ reach_k: a limit
-on one side of x_k suffices, since |x| + x ≤ 2 max(x, 0). What arrives at k = 0 gives
+Such an error multiplies x_k. It is bounded at once where limits on x_k are tight, or else passed to
+the step before, e_k → |A|'e_k, together with its products with u and c. To bound it, p_k is moved
+by s∘e_k, s_i ∈ {−1, 0, 1}, which adds e_k'reach_k, where |x_k| + s∘x_k ≤ reach_k: a limit on one
+side of x_k suffices, since |x| + x ≤ 2 max(x, 0). The error that is left at k = 0 gives
 
     a'θ ≤ b + w'|θ|   for every feasible θ,
 
-which decides about θ whether the feasible set is bounded or not, and takes no figure from a solver
-(but for the box round a polytope, a part in 10⁶ outwards). In the same way it becomes a half-space
-for the whole set, with (a + s∘w)'θ ≤ b + w'reach_0, as far as limits on x_0, or the extent that
-LPs find (`RowPrograms.bounding_box`), doubled, leave θ_i a finite side for each w_i ≠ 0. (Where a
-set extends both ways without end along a facet there is none: its normal is no vector of floats.)
+which decides about θ whether the feasible set is bounded or not, and uses no number of a solver
+(except the box around a polytope, enlarged by a part in 10⁶). It becomes a half-space valid for the
+whole set, (a + s∘w)'θ ≤ b + w'reach_0, if limits on x_0, or twice the extent that LPs find
+(`RowPrograms.bounding_box`), bound θ_i on one side for each w_i ≠ 0. (Where a set is unbounded in
+both directions along a facet there is none: the facet's normal is no vector of floats.)
 """
 
 import jax
@@ -43,28 +43,28 @@ from jax import Array
 from jaxmpc.feasible.exact_data import ExactData
 
 UNIT_ROUNDOFF = 2.0**-53
-# Covers products that underflow; data smaller than this are not told from zero.
+# Covers products that underflow; data smaller than this count as zero.
 TINY = 1e-290
 
 
 def gamma(terms: int) -> float:
-    """Relative rounding bound of a sum of `terms` products (Higham 2002, §3.1)."""
+    """Return the relative rounding bound of a sum of `terms` products (Higham 2002, §3.1)."""
     return terms * UNIT_ROUNDOFF / (1 - terms * UNIT_ROUNDOFF)
 
 
 def row_gamma(H: Array) -> Array:
-    """Rounding bound of each product Hx: none where the row only picks ±x_i."""
+    """Return the rounding bound of each product Hx: zero where the row only picks ±x_i."""
     exact = (jnp.sum(H != 0, axis=1) <= 1) & jnp.all((H == 0) | (jnp.abs(H) == 1), axis=1)
     return jnp.where(exact, 0.0, gamma(H.shape[1] + 1))
 
 
 def first_of_block(moves: tuple[int, ...]) -> np.ndarray:
-    """For each step the first step that has the same move."""
+    """Return for each step the first step that has the same move."""
     return np.searchsorted(np.array(moves), np.array(moves))
 
 
 def prove_feasible(p: ExactData, theta: Array, free: Array, inputs: Array) -> tuple[Array, Array]:
-    """Roll out inputs (N, m) from the point θ: (proved, inputs clipped into their limits).
+    """Roll out inputs (N, m) from the point θ; return (proved, inputs clipped into their limits).
 
     All arithmetic in float64. Not proved means only that this input sequence is no proof.
     """
@@ -102,7 +102,8 @@ def prove_feasible(p: ExactData, theta: Array, free: Array, inputs: Array) -> tu
 
 
 def cut(p: ExactData, y_states: Array, y_N: Array, y_ball: Array) -> tuple[Array, Array, Array]:
-    """What multipliers say: a'θ ≤ b + w'|θ| for every feasible θ; a (d,), b, w (d,) ≥ 0.
+    """Return what multipliers imply, a'θ ≤ b + w'|θ| for every feasible θ, as a (d,), b, w (d,) ≥
+    0.
 
     y_states (N, r) and y_N (r_N,): y > 0 on the upper bound, y < 0 on the lower. y_ball: of the
     rows L'x of the terminal ellipsoid P = LL', any length without one. w covers rounding;
@@ -170,12 +171,12 @@ def cut(p: ExactData, y_states: Array, y_N: Array, y_ball: Array) -> tuple[Array
         fixed = p.view.fixed[others]
         total, size = total - p_0[others] @ fixed, size + moved[others] @ jnp.abs(fixed)
     a, b, w = p_0[axes], total + unit * size + TINY, unit * moved[axes]
-    # 0'θ ≤ b says nothing, unless b < 0: then no θ at all is feasible.
+    # 0'θ ≤ b excludes nothing, unless b < 0: then no θ at all is feasible.
     return a, jnp.where(jnp.isfinite(b) & (jnp.any(a != 0) | (b < 0)), b, jnp.inf), w
 
 
 def everywhere(p: ExactData, a: Array, b: Array, w: Array) -> tuple[Array, Array]:
-    """The half-space a'θ ≤ b, valid for every feasible θ, that follows from those (a, b, w) of
+    """Return the half-space a'θ ≤ b, valid for every feasible θ, that follows from the (a, b, w) of
     `cut`; b = inf where none does.
     """
     w = w + jnp.where(p.side_0 == 0, 0.0, 2 * UNIT_ROUNDOFF * jnp.abs(a))
@@ -183,7 +184,7 @@ def everywhere(p: ExactData, a: Array, b: Array, w: Array) -> tuple[Array, Array
 
 
 def excludes(a: Array, b: Array, w: Array, theta: Array) -> Array:
-    """True when θ breaks a'θ ≤ b + w'|θ| by more than the rounding of this test."""
+    """Return whether θ violates a'θ ≤ b + w'|θ| by more than the rounding of this test."""
     beyond = jnp.sum(a * theta, axis=-1) - jnp.sum(w * jnp.abs(theta), axis=-1) - b
     size = jnp.sum((jnp.abs(a) + w) * jnp.abs(theta), axis=-1) + jnp.abs(b)
     return beyond > 2 * gamma(2 * theta.shape[-1] + 3) * size

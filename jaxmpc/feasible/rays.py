@@ -1,8 +1,8 @@
 """Exact boundary of the feasible set along rays: one linear program a ray, both ends proved.
 
 For a ray centre + t d the LP max t over (t, w) gives the boundary point; its dual gives a facet
-of the feasible set there. HiGHS solves the LP; what is reported is what `proofs.py` confirms: a
-point proved feasible just inside, and a half-space that holds on the whole set.
+of the feasible set there. HiGHS solves the LP; `proofs.py` then proves a point just inside
+feasible, and a half-space valid on the whole set.
 """
 
 from dataclasses import dataclass
@@ -20,8 +20,8 @@ from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 
-# How far a boundary point is pulled towards the centre before it is proved: the least that works.
-PULLS = 10.0 ** np.arange(-14, -1)
+# How far a boundary point is moved towards the centre before it is proved: the least that works.
+BACKOFFS = 10.0 ** np.arange(-14, -1)
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def boundary(
     mpc: MPC, directions: int | np.ndarray, *, center: np.ndarray | None = None,
     axes: tuple[int, ...] | None = None, fixed: np.ndarray | None = None,
 ) -> Boundary:  # fmt: skip
-    """Exact boundary points and facets of the feasible set of `mpc` along rays.
+    """Compute exact boundary points and facets of the feasible set of `mpc` along rays.
 
     directions: a number of rays (equally spaced in 2-D, random in more dimensions) or an array
     (K, d). center: a feasible point (d,); None: the point with the largest margin. axes, fixed:
@@ -65,11 +65,11 @@ def boundary(
         fail("directions", "holds no ray, or a zero row", "Give at least one direction")
     if center is not None and (np.shape(center) != (d,) or not np.all(np.isfinite(center))):
         fail("center", f"{center}", f"Give one finite point ({d},)")
-    return Rays.of(problem, center).shoot(directions)
+    return Rays.of(problem, center).cast(directions)
 
 
 def ray_directions(count: int, d: int) -> np.ndarray:
-    """`count` directions in R^d: equally spaced in 2-D, random with a fixed seed above."""
+    """Return `count` directions in R^d: equally spaced in 2-D, random with a fixed seed above."""
     if d == 1:
         return np.array([[1.0], [-1.0]])
     if d == 2:
@@ -93,7 +93,7 @@ class Rays:
 
     @classmethod
     def of(cls, problem: FeasibilityProblem, center: np.ndarray | None = None) -> "Rays":
-        """Rays from the given centre, or from the point with the largest margin.
+        """Return rays from the given centre, or from the point with the largest margin.
 
         Raises ValueError where the feasible set is empty or flat, or the centre not inside it.
         """
@@ -101,31 +101,29 @@ class Rays:
         return cls(problem, center, w, problem.exact(np.abs(center)))
 
     def box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Half-spaces (normals, offsets) of the bounding box, as far as there is one."""
+        """Return the half-spaces (normals, offsets) of the bounding box, those that exist."""
         _, sides = self.problem.programs.bounding_box
         with jax.enable_x64(True):
-            normals, offsets = (
-                np.asarray(v) for v in half_spaces(self.exact, self.problem.rows, sides)
-            )
+            normals, offsets = (np.asarray(v) for v in cuts(self.exact, self.problem.rows, sides))
         valid = np.isfinite(offsets)
         return normals[valid], offsets[valid]
 
-    def shoot(self, directions: np.ndarray) -> Boundary:
-        """Solve, pull and prove along every direction (K, d)."""
+    def cast(self, directions: np.ndarray) -> Boundary:
+        """Return the boundary points along every direction (K, d), moved inwards and proved."""
         solved = [self.problem.programs.ray(self.center, d) for d in directions]
         t, w, y = (np.array(part) for part in zip(*solved, strict=True))
         bounded = np.isfinite(t)
         # Shrinking a feasible pair (θ, w) towards the centre's pair gives every row a margin.
-        reach = np.where(bounded, t, 0.0)[:, None] * (1 - PULLS)
+        reach = np.where(bounded, t, 0.0)[:, None] * (1 - BACKOFFS)
         theta = self.center + reach[:, :, None] * directions[:, None, :]
-        w = self.w + (w - self.w)[:, None, :] * (1 - PULLS)[:, None]
+        w = self.w + (w - self.w)[:, None, :] * (1 - BACKOFFS)[:, None]
         # Repeated rays fill up to a power of two, so that few shapes compile.
         count = len(directions)
         fill = np.arange(max(32, 1 << (count - 1).bit_length())) % count
         with jax.enable_x64(True):
             feasible, normals, offsets = (
                 np.asarray(v)[:count]
-                for v in prove(self.exact, self.problem.rows, theta[fill], w[fill], y[fill])
+                for v in prove_rays(self.exact, self.problem.rows, theta[fill], w[fill], y[fill])
             )
         feasible = feasible & bounded[:, None]
         best, each = np.argmax(feasible, axis=1), np.arange(len(directions))
@@ -142,27 +140,27 @@ class Rays:
 
 
 @jax.jit
-def prove(p: ExactData, rows: ConstraintRows, theta: Any, w: Any, y: Any) -> tuple[Array, ...]:
-    """For each ray: which of its pulled points (K, pulls, d) are proved feasible, and the
-    half-space that its multipliers give."""
+def prove_rays(p: ExactData, rows: ConstraintRows, theta: Any, w: Any, y: Any) -> tuple[Array, ...]:
+    """Return which points (K, backoffs, d) of the rays are proved feasible, and the half-spaces of
+    the rays' multipliers."""
 
     def feasible(theta: Array, w: Array) -> Array:
         inputs, free = inputs_of(p, rows, theta, w)
         return proofs.prove_feasible(p, theta, free, inputs)[0]
 
-    return jax.vmap(jax.vmap(feasible))(theta, w), *half_spaces(p, rows, y)
+    return jax.vmap(jax.vmap(feasible))(theta, w), *cuts(p, rows, y)
 
 
-def half_spaces(p: ExactData, rows: ConstraintRows, y: Any) -> tuple[Array, Array]:
-    """Normals (K, d) and offsets (K,) of half-spaces that hold on the whole feasible set, from
-    multipliers (K, R)."""
+def cuts(p: ExactData, rows: ConstraintRows, y: Any) -> tuple[Array, Array]:
+    """Return the normals (K, d) and offsets (K,) of half-spaces that hold on the whole feasible
+    set, from multipliers (K, R)."""
     return jax.vmap(lambda y: proofs.everywhere(p, *cut_of(p, rows, y)))(y)
 
 
 def leaving(
     center: np.ndarray, directions: np.ndarray, normals: np.ndarray, offsets: np.ndarray
 ) -> np.ndarray:
-    """t (K,) at which each ray leaves the intersection of the half-spaces; inf for never."""
+    """Return t (K,) at which each ray leaves the intersection of the half-spaces; inf for never."""
     slope = directions @ normals.T
     with np.errstate(divide="ignore", invalid="ignore"):
         t = (offsets - normals @ center) / slope

@@ -7,27 +7,27 @@ import numpy as np
 from scipy.optimize import linprog
 
 from jaxmpc.checks import fail
+from jaxmpc.control.geometry import HIGHS
 from jaxmpc.feasible.constraint_rows import ConstraintRows
-
-HIGHS = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 
 
 class RowPrograms:
     """Linear programs over the rows of a feasibility problem, which may end in a ball.
 
     The ball |v| ≤ radius is the intersection of its tangent half-spaces n'v ≤ radius, which are
-    added until they suffice. Those found for one program serve the next (Kelley 1960).
+    added until they suffice. They are kept for the next program (Kelley 1960).
     """
 
     def __init__(self, rows: ConstraintRows) -> None:
         self.rows, k = rows, sum(rows.balls)
         self.normals = np.concatenate([np.eye(k), -np.eye(k)])
 
-    def solve(
+    def solve_lp(
         self, cost: np.ndarray, U: np.ndarray, lower: np.ndarray, upper: np.ndarray,
         bounds: list[Any], margin: np.ndarray | None = None,
     ) -> tuple[Any, np.ndarray]:  # fmt: skip
-        """max cost'x over lower ≤ U x ≤ upper and the ball: HiGHS' result, multipliers (R,).
+        """Maximise cost'x over lower ≤ U x ≤ upper and the ball; return HiGHS' result and
+        multipliers (R,).
 
         margin (R,): the last variable times this is kept from every bound.
         """
@@ -66,8 +66,8 @@ class RowPrograms:
         return result, y
 
     def support(self, direction: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        """max direction'θ over the feasible set: the optimum (inf: unbounded, −inf: empty), w, and
-        the multipliers of the rows."""
+        """Return max direction'θ over the feasible set: the optimum (inf: unbounded, −inf: empty),
+        w, and the multipliers of the rows."""
         k = self.rows.U.shape[1]
         U = np.hstack([self.rows.U, self.rows.D])
         return self._maximum(np.append(np.zeros(k), direction), U, np.zeros(len(U)), None)
@@ -75,7 +75,8 @@ class RowPrograms:
     def ray(
         self, center: np.ndarray, direction: np.ndarray
     ) -> tuple[float, np.ndarray, np.ndarray]:
-        """max t ≥ 0 with center + t·direction in the feasible set; results as in `support`."""
+        """Return max t ≥ 0 with center + t·direction in the feasible set; results as in
+        `support`."""
         rows, k = self.rows, self.rows.U.shape[1]
         U = np.hstack([rows.U, (rows.D @ direction)[:, None]])
         return self._maximum(np.append(np.zeros(k), 1.0), U, rows.D @ center, 0)
@@ -85,15 +86,15 @@ class RowPrograms:
     ) -> tuple[float, np.ndarray, np.ndarray]:
         k = self.rows.U.shape[1]
         bounds = [(None, None)] * k + [(low, None)] * (U.shape[1] - k)
-        result, y = self.solve(cost, U, self.rows.lower - shift, self.rows.upper - shift, bounds)
+        result, y = self.solve_lp(cost, U, self.rows.lower - shift, self.rows.upper - shift, bounds)
         if result.x is None:
             return -np.inf if result.status == 2 else np.inf, np.zeros(k), y
         return float(-result.fun), result.x[:k], y
 
     @cached_property
     def bounding_box(self) -> tuple[np.ndarray | None, np.ndarray]:
-        """Bounds (2, d) of every feasible θ, lower and upper, None where the set is found empty;
-        and the multipliers (2d, R) of the upper and then the lower sides.
+        """Return bounds (2, d) of every feasible θ, lower and upper, None where the set is found
+        empty; and the multipliers (2d, R) of the upper and then the lower sides.
 
         Each side is moved out by the larger of the coordinate's two finite ends, which outweighs
         the tolerances of the linear programs.
@@ -108,7 +109,7 @@ class RowPrograms:
         return np.array([-ends[1] - margin, ends[0] + margin]), np.array(y)
 
     def centre(self, given: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """θ (the one given, or the best) and w with the largest common margin of all rows.
+        """Return θ (the one given, or the best) and w with the largest common margin of all rows.
 
         Raises ValueError where the set is empty or flat, or does not hold the given θ inside.
         """
@@ -120,7 +121,7 @@ class RowPrograms:
         largest = max(1.0, np.abs(ends[np.isfinite(ends)]).max(initial=0.0))
         if rows.balls:
             size[-sum(rows.balls) :] = size[-sum(rows.balls) :].max()
-        result, _ = self.solve(
+        result, _ = self.solve_lp(
             np.eye(k + d + 1)[-1], np.hstack([rows.U, rows.D, np.zeros((len(rows.U), 1))]),
             rows.lower, rows.upper, [(None, None)] * k + pinned + [(None, largest)], size,
         )  # fmt: skip

@@ -1,6 +1,6 @@
-"""A batch of results kept chunk by chunk, so that a killed run loses one chunk at most.
+"""A batch of results stored chunk by chunk, so that a killed run loses one chunk at most.
 
-The store is a zarr v3 group, one row a sample, written in whole zarr chunks. That of a sweep:
+The store is a zarr v3 group, one row a sample, written in whole zarr chunks. A sweep's store has
 
     points (sample, coordinate), label (sample), status (sample),
     start (sample, state), plan (sample, time, input): x_0 and inputs that prove feasible,
@@ -12,8 +12,8 @@ The store is a zarr v3 group, one row a sample, written in whole zarr chunks. Th
 The group appears under its name by one rename, complete with its attributes. A chunk counts
 only once its entry of `done` is set, which happens after all its rows are written; zarr
 writes each chunk to a side file and renames it. Fill values (label and status 0, NaN) are
-no answers, so that a row not reached is never taken for one. Power cuts are not covered:
-zarr does not sync to the disk.
+no answers, so that a row not reached is never taken for one. A power cut can lose data: zarr does
+not sync to the disk.
 """
 
 import os
@@ -57,7 +57,7 @@ def open_sweep(
 
 
 class Field(NamedTuple):
-    """What a sample has one of: its shape, type, value while not written, names of its axes."""
+    """A field of each sample: shape, type, value while it is not written, names of its axes."""
 
     shape: tuple[int, ...]
     dtype: str
@@ -75,7 +75,7 @@ def open_store(
 ) -> zarr.Group:
     """Open the store at `path` to write; make it where there is none, with these fields.
 
-    `points` (B, d) are the samples, `config` is JSON data that says what is done with them,
+    `points` (B, d) are the samples, `config` is JSON data that describes the computation,
     `shape` the sizes that fields follow from, `chunk` is the number of rows a commit. Raises
     ValueError where the store was made with another configuration, or where something else lies
     there.
@@ -102,12 +102,12 @@ def open_store(
 
 
 def pending(group: zarr.Group) -> list[int]:
-    """Indices of the chunks that are not committed."""
+    """Return the indices of the chunks that are not committed."""
     return np.flatnonzero(_array(group, "done")[:] == 0).tolist()
 
 
 def chunk_rows(group: zarr.Group, index: int) -> slice:
-    """Rows that belong to one chunk; the last may be short."""
+    """Return the rows that belong to one chunk; the last may be short."""
     chunk = _chunk(group)
     return slice(index * chunk, min((index + 1) * chunk, _array(group, "points").shape[0]))
 
@@ -135,8 +135,9 @@ def save_bounds(
         group.create_array(name, data=value, overwrite=True, dimension_names=dimensions)
 
 
-def read(path: str | Path) -> "xr.Dataset":
-    """The store as an xarray Dataset (lazy); rows of chunks not done hold the fill values."""
+def open_dataset(path: str | Path) -> "xr.Dataset":
+    """Return the store as an xarray Dataset (lazy); rows of chunks not done hold the fill
+    values."""
     import xarray as xr  # takes longer to import than to read
 
     _open(Path(path), "r")
@@ -152,6 +153,7 @@ def remove(path: str | Path) -> None:
 def _create(
     path: Path, points: np.ndarray, fields: Mapping[str, Field], attributes: dict[str, Any]
 ) -> None:
+    """Create the store under a temporary name, then rename it to `path`."""
     rows, chunk = len(points), attributes["chunk"]
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     group = zarr.open_group(partial, mode="w", zarr_format=3, attributes=attributes)
@@ -184,6 +186,7 @@ def _create(
 
 
 def _open(path: Path, mode: Any) -> zarr.Group:
+    """Open a store; raise ValueError where `path` holds something else."""
     try:
         group = zarr.open_group(path, mode=mode)
     except (OSError, ValueError) as error:  # zarr's own errors derive from these

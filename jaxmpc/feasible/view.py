@@ -30,11 +30,12 @@ class View:
 
     @property
     def projects(self) -> bool:
-        """True when the states that are not mapped are free."""
+        """Return whether the states that are not mapped are free."""
         return self.fixed is None and bool(self.others)
 
     def initial_state(self, theta: Array, free: Array) -> Array:
-        """x_0 (n,) of a point θ and values `free` of the other states, clipped into their box."""
+        """Return x_0 (n,) of a point θ and values `free` of the other states, clipped into their
+        box."""
         n = len(self.axes) + len(self.others)
         x = jnp.zeros(n, theta.dtype) if self.fixed is None else jnp.asarray(self.fixed)
         x = x.at[np.array(self.axes)].set(theta)

@@ -5,10 +5,11 @@ Three claims about the feasible set X_N of an MPC problem, each weaker than the 
     strong  every first move of a feasible plan leads to a state in X_N,
     law     the optimal first move does,
     weak    some first move of a feasible plan does (X_N ⊆ X_{N+1}, where longer horizons can only
-            make these sets smaller; else it asks for a little more).
+            make these sets smaller; else the claim is slightly stronger).
 
-A claim is proved by Theorem 1 of the lesson (an invariant terminal set), by linear programs over
-the polytope of all states and plans, or by the critical regions of the law (`claims.py`). It is
+A claim is proved by an invariant terminal set (Theorem 1 of `verify_terminal`; Rawlings, Mayne &
+Diehl 2017, section 2.4), by linear programs over the polytope of all states and plans, or by the
+critical regions of the law (`claims.py`). It is
 refuted by a counterexample: a state with a feasible plan, and a half-space that excludes the next
 state. Counterexamples are looked for among samples and by gradient ascent (`ascent.py`).
 """
@@ -48,25 +49,28 @@ def recursive_feasibility(
     mpc: MPC, x0s: Any = None, *, steps: int = 20, search: bool = True, regions: int = 2000,
     seconds: float = 60.0,
 ) -> RecursionReport:  # fmt: skip
-    """Is `mpc` recursively feasible? Proofs, the worst counterexample, and the states lost.
+    """Examine whether `mpc` is recursively feasible: proofs, the worst counterexample, the states
+    lost.
 
     x0s: sample states (B, n), or (B, n + m) with the previous input where input rates are
     limited; None: a grid over X_N, random states in more than three dimensions. steps: length of
     the closed loops x⁺ = A x + B u_0(x) + c from each sample. search: look for a counterexample to
     the law by gradient ascent too. regions: critical regions to enumerate at most for a proof of
-    the law (0: none). seconds: when these are spent, search and enumeration of facets end, and
-    what they have not settled is open.
+    the law (0: none). seconds: time limit of the search and of the enumeration of facets; what is
+    not settled by then is open.
 
-    Linear programs are believed to 1e-9 of the size of X_N, by bounds from their multipliers. A
-    state counts as outside X_N when it is so by more than 1e-7 of that size. In the closed loops
-    each next state is moved towards the centre by 1e-7 of its distance (plans ride on limits,
-    where residuals decide the side) and then labelled: infeasible by proof means lost.
+    Optima of linear programs are trusted to 1e-9 of the size of X_N, by bounds from their
+    multipliers. A state counts as outside X_N when its distance exceeds 1e-7 of that size. In the
+    closed loops each next state is moved towards the centre by 1e-7 of its distance, since plans
+    lie on limits and residuals decide on which side; then it is labelled, and counts as lost when
+    it is proved infeasible.
 
     Raises ValueError for ill-posed problems and wrong arguments before anything compiles, and
     where x0s is None and X_N is empty, flat or unbounded.
 
-    Sources: the lesson's Theorem 1; Kerrigan & Maciejowski 2001 (CDC) for strong feasibility;
-    Löfberg 2012, Automatica 48, for the law; Bemporad et al. 2002 for critical regions.
+    Sources: Rawlings, Mayne & Diehl 2017, section 2.4, for Theorem 1; Kerrigan & Maciejowski 2001
+    (CDC) for strong feasibility; Löfberg 2012, Automatica 48, for the law; Bemporad et al. 2002 for
+    critical regions.
     """
     begun = time.monotonic()
     problem = FeasibilityProblem.of(mpc)
@@ -106,7 +110,7 @@ def recursive_feasibility(
     enumerable = regions and np.isfinite(claims.volume) and time.monotonic() < deadline
     if enumerable and not claims.law.holds:
         verdict, lost, beyond = settle_by_regions(claims, regions)
-        if verdict.holds is False and worst is None:  # the search has missed it
+        if verdict.holds is False and worst is None:  # the search did not find it
             worst = certified(law, problem, bound, beyond, ["regions"] * len(beyond))
         if verdict.holds is False:
             verdict = Claim(None, f"{verdict.reason}, which is not certified", verdict.state)
@@ -135,7 +139,8 @@ def recursive_feasibility(
 
 
 def _samples(claims: Claims, starts: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """Middles of a grid's cells on the box of X_N up to 3-D; above, random points on rays."""
+    """Return the middles of a grid's cells on the box of X_N up to 3-D; above, random points on
+    rays."""
     p = claims.problem.dimension
     if claims.feasible_set is not None and len(claims.feasible_set.vertices) and p <= 3:
         V, count = claims.feasible_set.vertices, {1: 1000, 2: 64, 3: 16}[p]
@@ -164,11 +169,10 @@ def smallest_horizon(
 ) -> SmallestHorizon:
     """Try horizons 1, 2, … up to `limit` with proofs alone (no samples, no search).
 
-    seconds: when these are spent, larger horizons are left out. The horizon of `mpc` itself plays
-    no part. The answer is the least horizon with a proof; a
-    smaller one that is neither proved nor refuted is in `reasons` with holds None, and one at
-    which the problem is ill-posed (more free moves than steps) is not. Raises ValueError for an
-    ill-posed problem.
+    seconds: time limit, after which larger horizons are left out. The horizon of `mpc` itself has
+    no influence. The answer is the least horizon with a proof; a smaller one that is neither proved
+    nor refuted is in `reasons` with holds None, and one at which the problem is ill-posed (more
+    free moves than steps) is left out of it. Raises ValueError for an ill-posed problem.
     """
     mpc.validate()
     limit, regions = whole("limit", limit, 1), whole("regions", regions, 0)

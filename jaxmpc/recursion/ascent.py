@@ -1,7 +1,7 @@
-"""Ascent over the pieces of the MPC law: to states whose next state leaves a polytope.
+"""Ascent over the regions of the MPC law: to states whose next state leaves a polytope.
 
 The law is piecewise affine in the state. So a convex function of the next state can be raised by
-its gradient, and within a piece be maximised exactly by a linear program.
+its gradient, and on a region be maximised exactly by a linear program.
 """
 
 import time
@@ -14,22 +14,22 @@ from jaxmpc.explicit.law import Law
 from jaxmpc.feasible.centered_polytope import CenteredPolytope
 from jaxmpc.qp.status import Status
 
-# Gradient ascent: how far inside the half-spaces it stays (on the boundary, where a single plan is
-# left, solvers crawl), and step lengths; relative to the size of the set.
+# Gradient ascent: distance kept from the half-spaces (on the boundary only one plan is feasible,
+# and solvers converge slowly), and step lengths; relative to the size of the set.
 INSET = 1e-6
 LENGTHS = 0.3 * 0.5 ** np.arange(16)
-# At the end regions are climbed: how many at once, in how many rounds, from how many neighbours
-# at what distance.
+# Then the search goes from region to region: with how many states at once, in how many rounds, from
+# how many neighbours at what distance.
 KEPT, ROUNDS, NEIGHBOURS, NEAR = 6, 10, 4, 1e-4
 
 
 def ascend(law: Law, bound: CenteredPolytope, starts: np.ndarray, deadline: float) -> np.ndarray:
-    """States (K, p) from which the next state lies farthest outside `bound`, the best first.
+    """Return states (K, p) from which the next state lies farthest outside `bound`, the best first.
 
     starts (S, p) follow the gradient (A + B ∂u_0/∂x)'a_j of v(x) = max_j (a_j'x⁺(x) − b_j) within
-    the half-spaces, in steps of halving length of which those are taken that raise v. Then the
-    best are led from region to region, each to the maximum of a_j'x⁺ on its region. A local
-    method: what it finds is real, what it does not find is not proved absent.
+    the half-spaces, in steps of halving length; a step is taken if it raises v. Then the best go
+    from region to region, each to the maximum of a_j'x⁺ on its region. The method is local: that it
+    finds no counterexample does not prove that there is none.
     """
     inset = INSET * bound.size
     x = bound.nearest(starts, inset)
@@ -47,7 +47,8 @@ def ascend(law: Law, bound: CenteredPolytope, starts: np.ndarray, deadline: floa
 def _value_and_gradient(
     law: Law, bound: CenteredPolytope, x: np.ndarray, than: Any = -np.inf
 ) -> tuple[np.ndarray, np.ndarray]:
-    """v (S,) at x (S, p), −inf where there is no plan; its unit gradient where v > than."""
+    """Return v (S,) at x (S, p), −inf where there is no plan, and its unit gradient where v >
+    than."""
     plans = law.plans(x)
     after = law.following(x, plans.inputs[:, 0])
     beyond = after @ bound.normals.T - bound.offsets
@@ -64,7 +65,8 @@ def _value_and_gradient(
 def _climb_regions(
     law: Law, bound: CenteredPolytope, x: np.ndarray, value: np.ndarray, deadline: float
 ) -> np.ndarray:
-    """From the best of x (S, p): to the best vertex of the region there, and on from beside it."""
+    """Follow the best of x (S, p) to the best vertex of its region, and on from beside it; return
+    states (K, p)."""
     random = np.random.default_rng(0)
     inset = INSET * bound.size
     order = np.argsort(-value)[:KEPT]

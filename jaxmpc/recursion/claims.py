@@ -7,6 +7,7 @@ import numpy as np
 from jaxmpc.checks import fail
 from jaxmpc.control.set_bounds import set_bounds
 from jaxmpc.control.sets import Polytope
+from jaxmpc.control.system import host_matrices
 from jaxmpc.control.terminal import verify_terminal
 from jaxmpc.explicit.regions import critical_regions
 from jaxmpc.feasible.centered_polytope import CenteredPolytope
@@ -84,19 +85,20 @@ def settle_claims(mpc: MPC, problem: FeasibilityProblem, deadline: float = np.in
 
 
 def _every_move(mpc: MPC, plans: PlanPolytope, body: CenteredPolytope) -> tuple[Claim, np.ndarray]:
-    """Strong, by one LP a facet of X_N over the plan polytope; and the states led outside."""
+    """Settle the strong claim by one LP for each facet of X_N; return it and the states led
+    outside."""
     tops = [plans.largest_next(normal) for normal in body.normals]
-    excess = np.array([top[1] for top in tops]) - body.offsets
+    violation = np.array([top[1] for top in tops]) - body.offsets
     beyond = np.array([top[0] for top in tops]) - body.offsets
     i, p = int(np.argmax(beyond)), plans.p
     outside = np.flatnonzero(beyond > CLEAR * body.size)
     points = [v for _, _, v in tops if v is not None]
-    if excess.max() <= TOLERANCE * body.size:
-        count = f"one LP for each of {len(excess)} facets, largest excess {excess.max():.1e}"
+    if violation.max() <= TOLERANCE * body.size:
+        count = f"one LP for each of {len(tops)} facets, largest violation {violation.max():.1e}"
         reason = f"every feasible first move stays ({_set_before(mpc, body)}{count})"
         return Claim(True, reason), np.zeros((0, p))
     if not len(outside) or len(points) < len(tops):
-        reason = f"an LP is within {CLEAR:g} of the size of X_N, {excess.max():.1e}"
+        reason = f"an LP is within {CLEAR:g} of the size of X_N, {violation.max():.1e}"
         return Claim(None, reason), np.zeros((0, p))
     where, after = points[i][:p], plans.M @ points[i] + plans.t
     reason = (
@@ -107,7 +109,7 @@ def _every_move(mpc: MPC, plans: PlanPolytope, body: CenteredPolytope) -> tuple[
 
 
 def _set_before(mpc: MPC, body: CenteredPolytope) -> str:
-    """In words, that one step less gives the same set, where it does."""
+    """Return a text saying that one step less gives the same set, empty where it does not."""
     if mpc.horizon < 2 or not is_standard_form(mpc):
         return ""
     shorter = FeasibilityProblem.of(replace(mpc, horizon=mpc.horizon - 1)).plan_polytope
@@ -119,42 +121,43 @@ def _set_before(mpc: MPC, body: CenteredPolytope) -> str:
 
 
 def _nested(mpc: MPC) -> bool:
-    """True where a longer horizon can only make X_N smaller: the end has state limits at most."""
+    """Return whether a longer horizon can only make X_N smaller: the end has state limits at
+    most."""
     return mpc.constrain_initial and (mpc.terminal_set is None or mpc.terminal_set is mpc.states)
 
 
 def _some_move(
     plans: PlanPolytope, body: CenteredPolytope, deadline: float
 ) -> tuple[Claim, float, np.ndarray]:
-    """Weak: X_N against the states that can go on. The volume lost whatever the move, and the
-    vertices of X_N lost.
+    """Settle the weak claim by comparing X_N with the states that can go on; return it, the volume
+    lost whatever the move, and the vertices of X_N that are lost.
     """
     none = np.zeros((0, plans.p))
     later = projected(plans.followed(), deadline)
     if isinstance(later, str):
         return Claim(None, f"of the states that can go on, {later}"), np.nan, none
-    excess = later.signed_distance(body.vertices)
-    i = int(np.argmax(excess))
+    violation = later.signed_distance(body.vertices)
+    i = int(np.argmax(violation))
     lost = max(body.polytope.volume() - later.polytope.volume(), 0.0)
-    if excess[i] <= TOLERANCE * body.size:
-        what = f"all {len(excess)} vertices of X_N have a first move that stays"
-        return Claim(True, f"{what} (largest excess {max(excess[i], 0.0):.1e})"), 0.0, none
-    if excess[i] <= CLEAR * body.size:
-        reason = f"a vertex is within {CLEAR:g} of the size of X_N, {excess[i]:.1e}"
+    if violation[i] <= TOLERANCE * body.size:
+        what = f"all {len(violation)} vertices of X_N have a first move that stays"
+        return Claim(True, f"{what} (largest violation {max(violation[i], 0.0):.1e})"), 0.0, none
+    if violation[i] <= CLEAR * body.size:
+        reason = f"a vertex is within {CLEAR:g} of the size of X_N, {violation[i]:.1e}"
         return Claim(None, reason), lost, none
-    return every_move_leaves(body.vertices[i]), lost, body.vertices[excess > CLEAR * body.size]
+    return every_move_leaves(body.vertices[i]), lost, body.vertices[violation > CLEAR * body.size]
 
 
 def _longer(
     before: CenteredPolytope, body: CenteredPolytope, after: CenteredPolytope
 ) -> tuple[Claim, np.ndarray]:
-    """Weak by half-spaces alone: X_N ⊆ X_{N+1}, and X_N ⊆ X_{N−1}, so that a first move into X_N
-    is that of a feasible plan. And the states that are not in X_{N+1}.
+    """Settle the weak claim by half-spaces alone: X_N ⊆ X_{N+1}, and X_N ⊆ X_{N−1}, so that a first
+    move into X_N is that of a feasible plan. Return it and the states that are not in X_{N+1}.
     """
     tops = [body.support(normal) for normal in after.normals]
-    excess = np.array([top for top, _ in tops]) - after.offsets
-    i = int(np.argmax(excess))
-    outside = [x for (_, x), e in zip(tops, excess, strict=True) if e > CLEAR * body.size]
+    violation = np.array([top for top, _ in tops]) - after.offsets
+    i = int(np.argmax(violation))
+    outside = [x for (_, x), e in zip(tops, violation, strict=True) if e > CLEAR * body.size]
     seeds = np.array([x for x in outside if x is not None]).reshape(-1, len(body.center))
     if len(seeds):
         x = seeds[0]
@@ -162,19 +165,20 @@ def _longer(
             False, f"from x = {in_words(x)} every feasible first move leaves X_N", x
         ), seeds
     nested = np.array([body.support(normal)[0] for normal in before.normals]) - before.offsets
-    if max(excess[i], nested.max()) <= TOLERANCE * body.size:
-        return Claim(True, f"X_N lies in X_N+1 and in X_N-1 ({len(excess)} facets, by LPs)"), seeds
+    if max(violation[i], nested.max()) <= TOLERANCE * body.size:
+        return Claim(True, f"X_N lies in X_N+1 and in X_N-1 ({len(tops)} facets, by LPs)"), seeds
     return Claim(None, "X_N lies in X_N+1, but not in X_N-1: its plans may lead elsewhere"), seeds
 
 
 def every_move_leaves(state: np.ndarray) -> Claim:
-    """Weak refuted at a state."""
+    """Return the weak claim, refuted at a state."""
     reason = f"from x = {in_words(state)} every feasible first move leaves X_N"
     return Claim(False, reason, state)
 
 
 def no_move_stays(plans: PlanPolytope, state: np.ndarray) -> bool:
-    """True if no feasible first move from `state` stays: it is beyond the states that can go on."""
+    """Return whether no feasible first move from `state` stays: it lies outside the states that can
+    go on."""
     later = plans.followed()
     center = later.centre()
     if center is None or not plans.exact:
@@ -187,9 +191,10 @@ def no_move_stays(plans: PlanPolytope, state: np.ndarray) -> bool:
 
 
 def _by_theorem(mpc: MPC) -> Claim:
-    """Strong by Theorem 1: a plan shifted by one step and ended inside the terminal set is a plan.
+    """Settle the strong claim by Theorem 1: a plan shifted by one step and ended inside the
+    terminal set is a plan.
 
-    That needs limits on states and inputs alone, at the usual steps, and inputs free at each step.
+    It covers limits on states and inputs alone, at the usual steps, and inputs free at each step.
     Without a terminal set, X takes its place at horizon N − 1. Convexity and compactness, which
     the theorem asks for, are used nowhere in this argument.
     """
@@ -214,9 +219,10 @@ def _by_theorem(mpc: MPC) -> Claim:
 
 
 def settle_by_regions(claims: Claims, limit: int) -> tuple[Claim, float, np.ndarray]:
-    """The law by its critical regions; the volume it loses; states (K, n) it loses most.
+    """Settle the law claim by its critical regions; return it, the volume it loses, and states (K,
+    n) it loses most.
 
-    On a region x⁺ is affine, so its excess over a facet is largest at a vertex.
+    On a region x⁺ is affine, so its violation of a facet is largest at a vertex.
     """
     body, mpc = claims.feasible_set, claims.mpc
     assert body is not None
@@ -227,13 +233,12 @@ def settle_by_regions(claims: Claims, limit: int) -> tuple[Claim, float, np.ndar
         found = critical_regions(mpc, limit=limit)
     except ValueError as error:
         return Claim(None, f"no critical regions ({error})"), np.nan, none
-    A, B = np.asarray(mpc.system.A, float), np.asarray(mpc.system.B, float)
-    c = np.zeros(len(A)) if mpc.system.c is None else np.asarray(mpc.system.c, float)
-    excess, parts, lost = [-np.inf], [none], 0.0
+    A, B, c = host_matrices(mpc.system)
+    violation, parts, lost = [-np.inf], [none], 0.0
     for region in found.regions:
         E, e = A + B @ region.K, B @ region.k + c
         beyond = body.signed_distance(region.vertices @ E.T + e)
-        excess.extend(beyond)
+        violation.extend(beyond)
         parts.append(region.vertices)
         if beyond.max() > CLEAR * body.size:
             H, h = np.asarray(region.polytope.H), np.asarray(region.polytope.h)
@@ -241,7 +246,7 @@ def settle_by_regions(claims: Claims, limit: int) -> tuple[Claim, float, np.ndar
                 np.vstack([H, body.normals @ E]), np.append(h, body.offsets - body.normals @ e)
             )
             lost += region.volume - _volume(stays)
-    values, states = np.array(excess[1:]), np.concatenate(parts)
+    values, states = np.array(violation[1:]), np.concatenate(parts)
     top = values.max(initial=-np.inf)
     if top > CLEAR * body.size:
         worst = np.argsort(-values)[:6]
@@ -260,6 +265,7 @@ def settle_by_regions(claims: Claims, limit: int) -> tuple[Claim, float, np.ndar
 
 
 def _volume(body: Polytope) -> float:
+    """Return the volume of a polytope, 0 where it is empty or flat."""
     try:
         return body.volume()
     except ValueError:  # empty or flat

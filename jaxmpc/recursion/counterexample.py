@@ -15,12 +15,13 @@ from jaxmpc.recursion.loops import LawLoops, map_states
 from jaxmpc.recursion.report import Counterexample
 
 STARTS = 96
-# How far a counterexample is pulled towards the centre until its plan is proved.
-PULLS = 10.0 ** np.arange(-8, -3)
+# How far a counterexample is moved towards the centre, tried in turn, until its plan is proved.
+BACKOFFS = 10.0 ** np.arange(-8, -3)
 
 
 def outer_bound(claims: Claims) -> tuple[CenteredPolytope | None, np.ndarray]:
-    """Half-spaces of X_N and starts (S, p) near its boundary; None and no starts without them."""
+    """Return half-spaces of X_N and starts (S, p) near its boundary; None and no starts if there
+    are none."""
     body, p = claims.feasible_set, claims.problem.dimension
     random = np.random.default_rng(0)
     if body is not None and len(body.vertices):
@@ -34,7 +35,7 @@ def outer_bound(claims: Claims) -> tuple[CenteredPolytope | None, np.ndarray]:
         return body, np.concatenate(parts)
     try:
         directions = np.concatenate([ray_directions(STARTS, p), np.eye(p), -np.eye(p)])
-        rays = Rays.of(claims.problem).shoot(directions)
+        rays = Rays.of(claims.problem).cast(directions)
     except ValueError:  # empty or flat
         return None, np.zeros((0, p))
     valid = np.isfinite(rays.offsets) & np.any(rays.normals != 0, axis=1)
@@ -51,12 +52,12 @@ def outer_bound(claims: Claims) -> tuple[CenteredPolytope | None, np.ndarray]:
 
 
 def farthest_first(bound: CenteredPolytope, after: np.ndarray) -> np.ndarray:
-    """Indices of next states, the farthest outside first; NaN last."""
+    """Return the indices of next states, the farthest outside first, NaN last."""
     return np.argsort(-np.nan_to_num(bound.signed_distance(after), nan=-np.inf))
 
 
 def worst_samples(bound: CenteredPolytope, x0s: np.ndarray, loops: LawLoops) -> np.ndarray:
-    """Up to three of the samples (B, p) lost after one step, farthest outside."""
+    """Return up to three of the samples (B, p) lost after one step, farthest outside."""
     lost = np.flatnonzero(loops.lost_at == 1)
     return x0s[lost[farthest_first(bound, loops.next_states[lost])[:3]]]
 
@@ -68,14 +69,15 @@ def certified(
     candidates: np.ndarray,
     found: list[str],
 ) -> Counterexample | None:  # fmt: skip
-    """The candidate (K, p) whose next state is farthest outside, with both ends proved; or None.
+    """Return the candidate (K, p) whose next state is farthest outside, with both ends proved; or
+    None.
 
-    Each candidate is pulled towards the centre by as little as it takes to prove its plan.
+    Each candidate is moved towards the centre by the least amount that lets its plan be proved.
     """
     if bound is None or not len(candidates):
         return None
-    pulled = bound.center + (1 - PULLS)[:, None, None] * (candidates - bound.center)
-    states = pulled.reshape(-1, candidates.shape[1])
+    moved = bound.center + (1 - BACKOFFS)[:, None, None] * (candidates - bound.center)
+    states = moved.reshape(-1, candidates.shape[1])
     plans = law.plans(states)
     inputs = plans.inputs.copy()
     inputs[:, 0] = law.limited(inputs[:, 0])
@@ -99,12 +101,13 @@ def certified(
 def _deepest(
     problem: FeasibilityProblem, bound: CenteredPolytope, fmap: FeasibleSetMap, x: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Of the half-spaces proved by labels, and by rays that end on the side of x, the deepest."""
+    """Return, of the half-spaces proved by labels and by rays that end on the side of x, the one
+    that x violates most."""
     normals, offsets = fmap.cuts()
     facet = int(np.argmax(bound.normals @ x - bound.offsets))
     depth = bound.normals[facet] @ x - bound.offsets[facet]
     towards = np.array([x, bound.nearest(x[None])[0], x - depth * bound.normals[facet]])
-    rays = Rays.of(problem, bound.center).shoot(towards - bound.center)
+    rays = Rays.of(problem, bound.center).cast(towards - bound.center)
     valid = np.isfinite(rays.offsets)
     normals = np.concatenate([normals, rays.normals[valid]])
     offsets = np.concatenate([offsets, rays.offsets[valid]])

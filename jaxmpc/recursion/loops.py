@@ -23,7 +23,7 @@ class LawLoops:
 
 
 def map_states(law: Law, problem: FeasibilityProblem, states: np.ndarray) -> FeasibleSetMap:
-    """Labels of states (B, p or more columns), in programs of the law's shape."""
+    """Return the labels of states (B, p or more columns), in programs of the law's shape."""
     p, count = problem.dimension, len(states)
     fmap = map_points(problem, law.filled(states[:, :p]), chunk=law.chunk)
     return FeasibleSetMap.of(problem, fmap.points[:count], fmap.labels.first(count))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxmpc.control.sets import Polytope
 from jaxmpc.mpc.problem import MPC
 
-# `lost_at` of samples that cannot be lost, and of those that were not decided.
+# `lost_at` of samples that are infeasible from the start, and of those that were not decided.
 NOT_FEASIBLE, UNDECIDED = -1, -2
 
 
@@ -60,7 +60,7 @@ class Counterexample:
 class RecursionReport:
     """What is known about the recursive feasibility of one MPC problem.
 
-    strong, law, weak: `Claim`s. counterexample: the worst to the law that was found, or None.
+    strong, law, weak: `Claim`s. counterexample: the worst one to the law that was found, or None.
     feasible_set: X_N (half-spaces valid and vertices reached, to 1e-9 of its size), None where
     facets were not enumerated. volume: of X_N; lost_by_any: of the part from which every first
     move leaves X_N; lost_by_law: of the part from which the optimal one does, from critical
@@ -93,21 +93,22 @@ class RecursionReport:
 
     @property
     def S(self) -> bool | None:
-        """Whether every feasible first move stays: `strong.holds`."""
+        """Return whether every feasible first move stays: `strong.holds`."""
         return self.strong.holds
 
     @property
     def M(self) -> bool | None:
-        """Whether the MPC law stays, that is recursive feasibility: `law.holds`."""
+        """Return whether the MPC law stays, that is recursive feasibility: `law.holds`."""
         return self.law.holds
 
     @property
     def W(self) -> bool | None:
-        """Whether some feasible first move stays: `weak.holds`."""
+        """Return whether some feasible first move stays: `weak.holds`."""
         return self.weak.holds
 
     def counts(self) -> dict[str, int]:
-        """How many samples are feasible; of these lost at once, later, kept, undecided."""
+        """Return how many samples are feasible, and how many of these are lost at once, lost later,
+        kept, undecided."""
         lost = self.lost_at
         return {
             "feasible": int(np.sum(self.label == 1)),
@@ -118,7 +119,8 @@ class RecursionReport:
         }
 
     def __str__(self) -> str:
-        """The claims with reasons, the worst counterexample, volumes and counts, one a line."""
+        """Return the claims with reasons, the worst counterexample, volumes and counts, one a
+        line."""
         rows = [(name, str(getattr(self, name))) for name in ("strong", "law", "weak")]
         if self.counterexample is not None:
             rows.append(("worst", f"{self.counterexample} (found by {self.counterexample.found})"))
@@ -134,7 +136,7 @@ class RecursionReport:
         return "\n".join(f"  {name:<20} {value}" for name, value in rows)
 
     def to_xarray(self) -> Any:
-        """The samples as an xarray.Dataset along the dimension `sample`, names attached."""
+        """Return the samples as an xarray.Dataset along the dimension `sample`, names attached."""
         import xarray
 
         data = {
@@ -153,4 +155,5 @@ class RecursionReport:
 
 
 def in_words(x: np.ndarray) -> str:
+    """Return a vector as text, such as "(0.5, -1)", rounded to 9 decimals and 6 digits."""
     return "(" + ", ".join(f"{v:.6g}" for v in np.round(x, 9) + 0.0) + ")"

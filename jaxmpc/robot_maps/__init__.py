@@ -1,4 +1,4 @@
-"""Maps of a real robot: what the linear model promises of a state, and what the robot then does.
+"""Maps of a robot: what the linear model promises of a state, and what the robot then does.
 
 map_robot      label each state twice, by proof and by the robot's closed loop -> RobotMap
 RobotLoops     what those closed loops did

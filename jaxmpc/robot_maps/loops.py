@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxmpc.closed_loop.outcome import with_limits
 from jaxmpc.closed_loop.run import Run
-from jaxmpc.control.violation import kept, worst_excess
+from jaxmpc.control.violation import kept, worst_violation
 from jaxmpc.qp.status import Status
 
 
@@ -18,10 +18,10 @@ class RobotLoops:
     worst (b,): the most by which a state (T+1 samples) or an input exceeds a limit of the robot, in
     the units of that limit; NaN where something is not finite. broken_at (b,): first sample 0 … T
     with a limit not `kept` or a number that is not finite, −1 for none. lost_at (b,):
-    first sample 0 … T−1 at which the state is beyond its limits or its plan, SOLVED, breaks soft
+    first sample 0 … T−1 at which the state is beyond its limits or its plan, SOLVED, violates soft
     rows (`Run.fallback`): there the hard problem has no plan whose multipliers stay below the
-    controller's penalty. −1: none. unsolved_at (b,): first
-    sample whose plan is not SOLVED, −1 for none. statuses (b, S): how many plans had each `Status`,
+    controller's penalty. −1: none. unsolved_at (b,): first sample whose plan is not SOLVED, −1 for
+    none. statuses (b, S): how many plans had each `Status`,
     in the order of the enumeration.
     """
 
@@ -33,22 +33,23 @@ class RobotLoops:
 
     @classmethod
     def of(cls, run: Run, robot: Any, dtype: Any) -> "RobotLoops":
-        """From closed loops with the batch in front, run in `dtype`, by the robot's own limits."""
+        """Evaluate closed loops (batch axis in front), run in `dtype`, by the robot's own
+        limits."""
         states, inputs = with_limits(robot, run)
         # An input belongs to the sample that it leaves.
         last = lambda v: np.pad(v, ((0, 0), (0, 1)))
-        excess = np.maximum(worst_excess(*states), last(worst_excess(*inputs)))
+        worst = np.maximum(worst_violation(*states), last(worst_violation(*inputs)))
         within = [kept(*pair, dtype).all(axis=-1) for pair in (states, inputs)]
         beyond = ~within[0] | last(~within[1])
         status = np.asarray(run.status)
         solved = status == Status.SOLVED
         lost = beyond[:, :-1] | (solved & np.asarray(run.fallback))
         return cls(
-            excess.max(axis=1), _first(beyond), _first(lost), _first(~solved),
+            worst.max(axis=1), _first(beyond), _first(lost), _first(~solved),
             np.stack([np.sum(status == s, axis=1) for s in Status], axis=1),
         )  # fmt: skip
 
 
 def _first(flags: np.ndarray) -> np.ndarray:
-    """Index of the first True of each row, −1 for none."""
+    """Return the index of the first True of each row, −1 for none."""
     return np.where(flags.any(axis=1), np.argmax(flags, axis=1), -1)

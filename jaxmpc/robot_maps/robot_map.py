@@ -1,9 +1,9 @@
-"""Maps of a real robot: what the linear model promises of a state, and what the robot then does.
+"""Maps of a robot: what the linear model promises of a state, and what the robot then does.
 
 Each state is labelled twice. The promise is the linear model's: a plan that keeps all limits
 exists, by proof (`map_feasible_set`), or one exists at every sample of the linear closed loop
-(`recursive_feasibility`). The robot's own closed loop, nonlinear, in MJX, keeps the promise or
-breaks it. Nothing here is proved of the robot: its labels are measured, over T samples.
+(`recursive_feasibility`). The robot's own closed loop, nonlinear and simulated in MJX, keeps the
+promise or breaks it. The robot's labels are measured over T samples, not proved.
 """
 
 from dataclasses import dataclass
@@ -49,31 +49,32 @@ class RobotMap:
 
     @property
     def points(self) -> np.ndarray:
-        """(B, d) the mapped coordinates."""
+        """Return the mapped coordinates (B, d)."""
         return self.linear.points
 
     @property
     def seconds(self) -> float:
-        """Length of the closed loops."""
+        """Return the length of the closed loops."""
         return self.steps * self.robot.dt
 
     @property
     def kept(self) -> np.ndarray:
-        """(B,) whether the robot kept all its limits, without margin, at all T+1 samples, and
-        every number was finite."""
+        """Return whether the robot kept all its limits, without margin, at all T+1 samples, and
+        every number was finite, (B,)."""
         return self.loops.broken_at < 0
 
     @property
     def recursive(self) -> np.ndarray:
-        """(B,) int8: 1 a plan without fallback at each of T samples, −1 none at sample
-        `loops.lost_at`, 0 undecided: an earlier plan is not SOLVED."""
+        """Return (B,) int8: 1 a plan without fallback at each of T samples, −1 none at sample
+        `loops.lost_at`, 0 undecided because an earlier plan is not SOLVED."""
         lost, unsolved = self.loops.lost_at, self.loops.unsolved_at
         open_ = (unsolved >= 0) & ((lost < 0) | (unsolved < lost))
         return np.select([open_, lost >= 0], [0, -1], 1).astype(np.int8)
 
     @property
     def promised(self) -> np.ndarray:
-        """(B,) int8, of the linear model: 1 promised, −1 proved that it cannot be, 0 undecided."""
+        """Return the promise of the linear model, (B,) int8: 1 promised, −1 proved that it cannot
+        be, 0 undecided."""
         report = self.recursion
         if report is None:
             return self.linear.label
@@ -82,43 +83,44 @@ class RobotMap:
 
     @property
     def held(self) -> np.ndarray:
-        """(B,) int8, of the robot: 1 it did what the claim says, −1 it did not, 0 undecided."""
+        """Return what the robot did, (B,) int8: 1 what the claim says, −1 not, 0 undecided."""
         if self.claim == "recursion":
             return self.recursive
         return np.where(self.kept, 1, -1).astype(np.int8)
 
     @property
     def broken(self) -> np.ndarray:
-        """(B,) whether the promise was made and the robot broke it."""
+        """Return whether the promise was made and the robot broke it, (B,)."""
         return (self.promised == 1) & (self.held == -1)
 
     @property
     def first_loss(self) -> np.ndarray:
-        """(B,) sample at which the robot failed the claim first, −1 where it did not."""
+        """Return the sample at which the robot failed the claim first, (B,); −1 where it did
+        not."""
         found = self.loops.lost_at if self.claim == "recursion" else self.loops.broken_at
         return np.where(self.held == -1, found, -1)
 
     @property
     def unsure(self) -> np.ndarray:
-        """(B,) whether a broken promise was preceded by a plan that is not SOLVED: the solver may
-        be to blame, not the model."""
+        """Return whether a broken promise was preceded by a plan that is not SOLVED, (B,): the
+        solver may be to blame, not the model."""
         unsolved = self.loops.unsolved_at
         return self.broken & (unsolved >= 0) & (unsolved < self.first_loss)
 
     @property
     def outcome(self) -> np.ndarray:
-        """(B,) int: index into `OUTCOMES`, their number for undecided."""
+        """Return the index into `OUTCOMES`, (B,) int; their number for undecided."""
         same = [(self.promised == p) & (self.held == h) for p, h in OUTCOMES.values()]
         return np.select(same, range(len(same)), len(same))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Labels of the mapped coordinates with their units."""
+        """Return the labels of the mapped coordinates with their units."""
         return self.linear.names
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Table promise × robot: how many states of each kind of promise held, failed, or are
-        undecided."""
+        """Return the table promise × robot: how many states of each kind of promise held, failed,
+        or are undecided."""
         words = {1: "kept", -1: "failed", 0: "undecided"}
         promises = {1: "promised", -1: "not promised", 0: "undecided"}
         return {
@@ -130,14 +132,16 @@ class RobotMap:
         }
 
     def plan_counts(self) -> dict[str, int]:
-        """How many of all B·T plans had which status; statuses that did not occur are left out."""
+        """Return how many of all B·T plans had which status; statuses that did not occur are left
+        out."""
         totals = self.loops.statuses.sum(axis=0)
         return {s.name: int(k) for s, k in zip(Status, totals, strict=True) if k}
 
     @cached_property
     def depth(self) -> np.ndarray:
-        """(B,) how deep in the linear feasible set: 1 at the middle of the points proved feasible,
-        0 on the outer bound, negative beyond; NaN where no half-space is proved.
+        """Return how deep states lie in the linear feasible set, (B,): 1 at the middle of the
+        points proved feasible, 0 on the outer bound, negative outside; NaN where no half-space is
+        proved.
 
         1 − max_i a_i'(x − m) / (b_i − a_i'm) over the proved half-spaces a_i'x ≤ b_i: one minus
         Minkowski's gauge of their intersection about m.
@@ -153,14 +157,15 @@ class RobotMap:
             return 1 - np.max((self.points - middle) @ scaled.T, axis=1)
 
     def worst(self) -> int | None:
-        """Index of the broken promise deepest in the linear feasible set; None without any."""
+        """Return the index of the broken promise deepest in the linear feasible set; None without
+        any."""
         found = np.flatnonzero(self.broken)
         if not len(found):
             return None
         return int(found[np.argmax(np.nan_to_num(self.depth[found], nan=-np.inf))])
 
     def __str__(self) -> str:
-        """Claim, table of counts, statuses and worst broken promise, one a line."""
+        """Return the claim, table of counts, statuses and worst broken promise, one a line."""
         what = {
             "limits": "all limits kept", "recursion": "a plan at each sample"
         }[self.claim]  # fmt: skip

@@ -5,14 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.checks import fail
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope
-from jaxmpc.control.system import LinearSystem
+from jaxmpc.control.sets import Box, translated
+from jaxmpc.control.system import LinearSystem, host_matrices
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
 
 
 def with_initial_limits(mpc: MPC, limits: Box) -> MPC:
-    """`mpc` with `limits` on x_0 as well, where its own state limits do not hold at k = 0."""
+    """Return `mpc` with `limits` on x_0 as well, where its own state limits do not hold at k =
+    0."""
     lower, upper = np.asarray(limits.lower, float), np.asarray(limits.upper, float)
     bounded = np.isfinite(lower) | np.isfinite(upper)
     if not bounded.any() or (mpc.states is not None and 0 in mpc.state_steps):
@@ -26,7 +26,8 @@ def with_initial_limits(mpc: MPC, limits: Box) -> MPC:
 
 
 def deviations(mpc: MPC, x: Any, u: Any) -> MPC:
-    """The same problem in z = ξ − x, v = u − u_ref, so that tracking (x, u_ref) becomes regulation.
+    """Return the same problem in z = ξ − x, v = u − u_ref, so that tracking (x, u_ref) becomes
+    regulation.
 
     z⁺ = A z + B v + (A x + B u_ref + c − x); a set H ξ ≤ h is H z ≤ h − H x. Raises ValueError
     for an Ellipsoid as terminal set away from x = 0.
@@ -36,26 +37,14 @@ def deviations(mpc: MPC, x: Any, u: Any) -> MPC:
         return mpc
 
     system: LinearSystem = mpc.system
-    A, B = np.asarray(system.A, float), np.asarray(system.B, float)
-    c = np.zeros(system.n) if system.c is None else np.asarray(system.c, float)
+    A, B, c = host_matrices(system)
     rows = []
     for each in as_tuple("outputs", mpc.outputs, Outputs):
         D = np.zeros((len(each.lower), system.m)) if each.D is None else np.asarray(each.D)
         by = np.asarray(each.C) @ x + D @ u
         rows.append(replace(each, lower=np.asarray(each.lower) - by, upper=each.upper - by))
     return replace(
-        mpc, system=replace(system, c=A @ x + B @ u + c - x), states=moved(mpc.states, x),
-        inputs=moved(mpc.inputs, u), terminal_set=moved(mpc.terminal_set, x), outputs=tuple(rows),
+        mpc, system=replace(system, c=A @ x + B @ u + c - x), states=translated(mpc.states, -x),
+        inputs=translated(mpc.inputs, -u), terminal_set=translated(mpc.terminal_set, -x),
+        outputs=tuple(rows),
     )  # fmt: skip
-
-
-def moved(set_: Any, by: np.ndarray) -> Any:
-    """The set {x − by : x in set_}; None for None. Raises ValueError for an Ellipsoid, which is
-    about the origin, unless by = 0."""
-    if isinstance(set_, Box):
-        return Box(np.asarray(set_.lower) - by, np.asarray(set_.upper) - by)
-    if isinstance(set_, Polytope):
-        return replace(set_, h=np.asarray(set_.h) - np.asarray(set_.H) @ by)
-    if isinstance(set_, Ellipsoid) and by.any():
-        fail("terminal_set", "is an Ellipsoid about the origin", "Use a Polytope")
-    return set_

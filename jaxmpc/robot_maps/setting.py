@@ -27,7 +27,7 @@ from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
 
 CLAIMS = ("limits", "recursion")
-# Of the default controller: plans in float64 are SOLVED but for about one in a hundred.
+# The default controller's solver: about 99 % of its plans in float64 are SOLVED.
 SOLVER = ADMM(iterations=100, refine=10)
 
 
@@ -47,17 +47,17 @@ def map_robot(
         controller: None for a RobotController at the set-point, in float64. Another one decides
             the precision of the loops, by its dtype.
         claim: "limits": the promise is a plan over the horizon (`map_feasible_set`), which is kept
-            where the robot keeps all its limits for `seconds`. A plan over N steps need not
-            promise as much: on the linear model it does if the problem is recursively feasible,
-            as with an invariant terminal set. "recursion": the promise is a plan at each of T
+            where the robot keeps all its limits for `seconds`. A plan over N steps implies that
+            for the linear model only if the problem is recursively feasible, as with an invariant
+            terminal set. "recursion": the promise is a plan at each of T
             samples of the linear closed loop (`recursive_feasibility`, which spends at most
             about search_seconds on claims about all states), kept where the robot has them.
         chunk: loops that run at once (None: 256 on a CPU, 8192 on a GPU). refine: as in
             `map_feasible_set`.
 
-    Both labels hold x_0 against the robot's limits, which `robot_mpc` leaves out: a state beyond
-    them is neither feasible nor kept. A limit counts as kept up to 1e-6 (float32: 1e-4) in its
-    units. Raises ValueError for wrong arguments before anything compiles.
+    Both labels apply the robot's limits to x_0 too, which `robot_mpc` does not: a state beyond them
+    is neither feasible nor kept. A limit counts as kept up to 1e-6 (float32: 1e-4) in its units.
+    Raises ValueError for wrong arguments before anything compiles.
     """
     setting = RobotSetting.of(
         robot, mpc, x0s, seconds, controller=controller, target=target, axes=axes, fixed=fixed,
@@ -75,7 +75,7 @@ def map_robot(
 
 @dataclass(frozen=True)
 class RobotSetting:
-    """A map that is checked and not yet made, for those who keep it chunk by chunk.
+    """A checked description of a map, for callers who compute and store it chunk by chunk.
 
     mpc: the linear problem with the robot's limits on x_0; problem: its feasibility problem.
     reference (n,), input_reference (m,): the set-point. The rest is that of `map_robot`.
@@ -97,7 +97,7 @@ class RobotSetting:
         cls, robot: Any, mpc: MPC, points: Any, seconds: float, *, controller: Any = None,
         target: Any = None, axes: Any = None, fixed: Any = None, claim: str = "limits",
     ) -> "RobotSetting":  # fmt: skip
-        """Check everything. Raises ValueError, compiles no loop."""
+        """Check all arguments. Raises ValueError; compiles no loop."""
         if not isinstance(robot, Robot | LinearPlant):
             fail("robot", f"is a {type(robot).__name__}", "Give a Robot or a LinearPlant")
         if claim not in CLAIMS:
@@ -141,30 +141,31 @@ class RobotSetting:
 
     @property
     def axes(self) -> tuple[int, ...]:
-        """Indices of the d mapped coordinates."""
+        """Return the indices of the d mapped coordinates."""
         return self.problem.view.axes
 
     @property
     def dtype(self) -> str:
-        """Precision of the loops: that of the controller's numbers."""
+        """Return the precision of the loops: that of the controller's numbers."""
         with jax.enable_x64(True):  # outside it JAX calls float64 numbers float32
             return str(np.dtype(self.controller.dtype))
 
     def states(self, points: np.ndarray) -> np.ndarray:
-        """Coordinates ξ (B, n) of points (B, d)."""
+        """Return the coordinates ξ (B, n) of points (B, d)."""
         whole = np.zeros(self.robot.n) if self.fixed is None else self.fixed
         xi = np.tile(whole, (len(points), 1))
         xi[:, list(self.axes)] = points
         return xi
 
     def none(self) -> Labels:
-        """Labels of all points, none of them run."""
+        """Return labels of all points, none of them run."""
         return Labels.empty(len(self.points), self.problem)
 
     def chunks(
         self, rows: Any = None, *, chunk: int | None = None, **settings: Any
     ) -> Iterator[tuple[slice, Labels, RobotLoops]]:
-        """Promises and loops of points[rows] (all for None) chunk by chunk, one shape throughout.
+        """Yield promises and loops of points[rows] (all for None) chunk by chunk, in one shape
+        throughout.
 
         settings: iterations, dtype of the linear labels, as in `map_feasible_set`. Yields (slice of
         these rows, Labels, RobotLoops).
@@ -176,13 +177,13 @@ class RobotSetting:
             yield here, labels, self.run(points[here], size)
 
     def chunk(self, chunk: int | None) -> int:
-        """How many loops run at once."""
+        """Return how many loops run at once."""
         if chunk is not None and (isinstance(chunk, bool) or chunk < 1):
             fail("chunk", f"{chunk}", "Give a count of at least 1")
         return min(default_chunk() // 32 if chunk is None else int(chunk), len(self.points))
 
     def run(self, points: np.ndarray, size: int) -> RobotLoops:
-        """Closed loops from points (b, d), b ≤ size, filled up to `size` of them."""
+        """Simulate closed loops from points (b, d), b ≤ size, filled up to `size` of them."""
         with jax.enable_x64(self.dtype == "float64"):
             xi = padded(self.states(points).astype(self.dtype), size)
             run = simulate_many(
@@ -197,7 +198,7 @@ class RobotSetting:
         self, labels: Any, loops: list[RobotLoops], *, refine: float | None = None,
         search_seconds: float = 60.0,
     ) -> RobotMap:  # fmt: skip
-        """The map from its chunks; the linear recursion is examined here."""
+        """Make the map from its chunks, and examine the recursion of the linear problem."""
         linear = FeasibleSetMap.of(self.problem, self.points, labels)
         whole = RobotLoops(*(
             np.concatenate([getattr(part, name) for part in loops])
@@ -216,10 +217,10 @@ class RobotSetting:
         )  # fmt: skip
 
     def deviations(self) -> MPC:
-        """The linear problem about its set-point, whose law regulates to the origin."""
+        """Return the linear problem about its set-point, whose law regulates to the origin."""
         return deviations(self.mpc, self.reference, self.input_reference)
 
 
 def _states(robot: Any, xi: np.ndarray) -> np.ndarray:
-    """Plant states of coordinates (b, n)."""
+    """Return the plant states of coordinates (b, n)."""
     return xi if robot.state_size == robot.n else np.asarray(jax.vmap(robot.state)(xi))

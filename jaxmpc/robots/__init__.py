@@ -2,7 +2,7 @@
 
 load_robot            a robot by name, or from an MJCF or URDF file -> Robot
 LinearPlant           a linear system with limits, in the place of a robot
-render, save_video    pictures of a motion, and a video of them
+render, save_video    images of a motion, and a video of them
 """
 
 from jaxmpc.robots.linear import LinearPlant

@@ -16,7 +16,7 @@ from jaxmpc.control.system import LinearSystem
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class LinearPlant:
-    """x⁺ = A x + B u + c with limits: what `Robot` is, for a plant that is linear indeed.
+    """A linear plant x⁺ = A x + B u + c with limits and the interface of `Robot`.
 
     system: LinearSystem with dt. state_limits (n,), input_limits (m,): Boxes, ±inf for no limit.
     home (n,): set-point, zeros if not given.
@@ -44,55 +44,55 @@ class LinearPlant:
 
     @property
     def n(self) -> int:
-        """Number of states."""
+        """Return the number of states."""
         return self.system.n
 
     @property
     def m(self) -> int:
-        """Number of inputs."""
+        """Return the number of inputs."""
         return self.system.m
 
     @property
     def state_size(self) -> int:
-        """Numbers in the state, n."""
+        """Return the length of the state, n."""
         return self.system.n
 
     @property
     def state_names(self) -> tuple[str, ...]:
-        """Names of the states, if the system has any."""
+        """Return the names of the states, if the system has any."""
         return self.system.state_names
 
     @property
     def dt(self) -> float:
-        """Control period (s)."""
+        """Return the control period (s)."""
         assert self.system.dt is not None
         return self.system.dt
 
     def step(self, x: Any, u: Any) -> Array:
-        """The next state (n,)."""
+        """Return the next state (n,)."""
         return self.system.step(x, u)
 
     def linearize(self, x: Any, u: Any, *, exact: bool = True) -> LinearSystem:
-        """The system itself, whatever x and u."""
+        """Return the system itself, for all x and u."""
         return self.system
 
     def coordinates(self, x: Any) -> Any:
-        """x itself."""
+        """Return x itself."""
         return x
 
     def state(self, coordinates: Any) -> Any:
-        """The coordinates themselves."""
+        """Return the coordinates themselves."""
         return coordinates
 
     def equilibrium(self, x: Any = None) -> tuple[np.ndarray, np.ndarray]:
-        """(x, u): the state x (n,), None for home, and the input that holds it; see
+        """Return (x, u): the state x (n,), None for home, and the input that holds it; see
         `jaxmpc.equilibrium`. Raises ValueError where none does, or only beyond the limits."""
         target = self.home if x is None else x
         return equilibrium(self.system, target, states=self.state_limits, inputs=self.input_limits)
 
     def vary(self, **numbers: Any) -> "LinearPlant":
-        """The plant with another A, B or c."""
+        """Return the plant with another A, B or c."""
         strange = set(numbers) - {"A", "B", "c"}
         if strange:
-            fail(sorted(strange)[0], "is no number of a linear plant", "Give A, B or c")
+            fail(sorted(strange)[0], "is no parameter of a linear plant", "Give A, B or c")
         return replace(self, system=replace(self.system, **numbers))

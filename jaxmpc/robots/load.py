@@ -26,28 +26,28 @@ def load_robot(
     torque: Limit = None, home: Any = None, control_period: float | None = None,
     timestep: float | None = None,
 ) -> Robot:  # fmt: skip
-    """A robot from a model of ours, an MJCF or URDF file, or a mujoco.MjModel.
+    """Load a robot: a model of ours, an MJCF or URDF file, or a mujoco.MjModel.
 
     Arguments:
-        model: "joint" (the lesson's), "pendulum", "cartpole", "arm2", "arm6" (UR5e), "arm7" (Franka
+        model: "joint" (one hinge), "pendulum", "cartpole", "arm2", "arm6" (UR5e), "arm7" (Franka
             FER), "quadrotor" (Crazyflie 2), or a path. A URDF gets a motor for each joint
             with its `effort` as limit, its `velocity` limits are read (0: none), and its shapes are
-            left out, so that it needs inertias and touches nothing.
+            left out: it must give inertias, and has no contacts.
         position, velocity, torque: limits in place of the file's, as `joint_limits` takes them:
             (lower, upper), each a number or one a dof (torque: one an actuator), or v for
             |.| ≤ v, inputs in units of ctrl. They bind the controller; the joint stops of the plant
-            stay, motors push as hard as they are told.
+            stay, and its motors apply any input that they are given.
         home: configuration (nq,) in place of the file's.
         control_period: seconds between inputs; a multiple of timestep, the physics step (s).
 
-    What the file does not say by `<numeric name="velocity_limit">`, `<numeric name=
-    "control_period">` and `<key name="home">` is: none, 10 ms (rounded to physics steps), and the
+    Defaults where the file lacks `<numeric name="velocity_limit">`, `<numeric name=
+    "control_period">` and `<key name="home">`: none, 10 ms (rounded to physics steps), and the
     model's qpos0 moved inside the joint ranges. Input limits are the narrowest of `ctrlrange`,
     and for motors `forcerange` and the joint's `actuatorfrcrange`.
 
     Raises ValueError for files that MuJoCo cannot read, models without actuators or joints or with
     activation states, what MJX does not support, and limits that contradict each other.
-    Contacts and other constraints act in the plant and not in the linear models (`Robot`).
+    Contacts and other constraints act in the plant, not in the linear models (see `Robot`).
     """
     import mujoco
 
@@ -55,7 +55,7 @@ def load_robot(
     name = "robot"
     if isinstance(model, str | Path):
         name = Path(model).stem
-        model, velocities = _read(model)
+        model, velocities = _compiled_model(model)
     elif not isinstance(model, mujoco.MjModel):
         fail("model", f"is a {type(model).__name__}", "Give a name, a path or a mujoco.MjModel")
     host = copy.deepcopy(model)
@@ -88,17 +88,18 @@ def load_robot(
     smooth.jnt_actfrclimited[:] = 0
     names, units = _state_names(host)
     states = _state_limits(host, position, velocity, velocities)
-    q = _home(host) if home is None else _configuration(host, home)
+    q = _home_qpos(host) if home is None else _configuration(host, home)
     return Robot(
         state_limits=states, input_limits=inputs, home=np.concatenate([q, np.zeros(host.nv)]),
         plant=Physics(host), predictor=Physics(smooth), anchor=_anchor(host, q),
         substeps=substeps, dt=control_period, name=name, state_names=names, state_units=units,
-        input_names=tuple(_names(host, mujoco.mjtObj.mjOBJ_ACTUATOR, host.nu, "u")),
+        input_names=tuple(_mujoco_names(host, mujoco.mjtObj.mjOBJ_ACTUATOR, host.nu, "u")),
         input_units=tuple(_input_unit(host, i) for i in range(host.nu)),
     )  # fmt: skip
 
 
 def _configuration(host: "mujoco.MjModel", home: Any) -> np.ndarray:
+    """Return the configuration `home` (nq,), checked, with unit quaternions."""
     require_shape("home", home, (host.nq,), "One configuration, as in qpos")
     require_finite("home", home)
     q = np.array(home, float)
@@ -113,7 +114,7 @@ def _configuration(host: "mujoco.MjModel", home: Any) -> np.ndarray:
 
 
 def _anchor(host: "mujoco.MjModel", home: np.ndarray) -> tuple[float, ...]:
-    """Zeros, with the orientations of the configuration `home`."""
+    """Return zeros, with the orientations of the configuration `home`."""
     anchor = np.zeros(host.nq)
     for kind, i in zip(host.jnt_type, host.jnt_qposadr, strict=True):
         if kind in (0, 1):  # free, ball
@@ -122,8 +123,8 @@ def _anchor(host: "mujoco.MjModel", home: np.ndarray) -> tuple[float, ...]:
     return tuple(anchor.tolist())
 
 
-def _read(model: str | Path) -> tuple["mujoco.MjModel", dict[str, float]]:
-    """The compiled model, and the velocity limits of a URDF by joint."""
+def _compiled_model(model: str | Path) -> tuple["mujoco.MjModel", dict[str, float]]:
+    """Return the compiled model, and the velocity limits of a URDF by joint."""
     import mujoco
 
     path = Path(model)
@@ -145,7 +146,7 @@ def _read(model: str | Path) -> tuple["mujoco.MjModel", dict[str, float]]:
 
 
 def _without_meshes(text: str) -> tuple[str, dict[str, float]]:
-    """A URDF without visual and collision geometry, and the velocity limit of each joint."""
+    """Return a URDF without visual and collision geometry, and the velocity limit of each joint."""
     root = ElementTree.fromstring(text)
     for link in root.iter("link"):
         for kind in ("visual", "collision"):
@@ -161,7 +162,7 @@ def _without_meshes(text: str) -> tuple[str, dict[str, float]]:
 
 
 def _add_motors(spec: "mujoco.MjSpec") -> None:
-    """A motor for each hinge and slide joint; a URDF cannot have any."""
+    """Add a motor to each hinge and slide joint; a URDF cannot have any."""
     import mujoco
 
     single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
@@ -173,7 +174,7 @@ def _add_motors(spec: "mujoco.MjSpec") -> None:
 
 
 def _numeric(host: "mujoco.MjModel", name: str, default: Any) -> Any:
-    """The custom numbers of this name in the file."""
+    """Return the custom numbers of this name in the file."""
     import mujoco
 
     i = mujoco.mj_name2id(host, mujoco.mjtObj.mjOBJ_NUMERIC, name)
@@ -184,20 +185,21 @@ def _numeric(host: "mujoco.MjModel", name: str, default: Any) -> Any:
     return value[0] if size == 1 else value
 
 
-def _names(host: "mujoco.MjModel", kind: Any, count: int, letter: str) -> list[str]:
+def _mujoco_names(host: "mujoco.MjModel", kind: Any, count: int, letter: str) -> list[str]:
+    """Return the names of `count` objects of a kind; letter and number where there is none."""
     import mujoco
 
     return [mujoco.mj_id2name(host, kind, i) or f"{letter}{i + 1}" for i in range(count)]
 
 
 def _state_names(host: "mujoco.MjModel") -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names and units of the coordinates, positions first."""
+    """Return the names and units of the coordinates, positions first."""
     import mujoco
 
     free, ball, slide, _ = range(4)
     positions: list[tuple[str, str]] = []
     for name, kind in zip(
-        _names(host, mujoco.mjtObj.mjOBJ_JOINT, host.njnt, "q"), host.jnt_type, strict=True
+        _mujoco_names(host, mujoco.mjtObj.mjOBJ_JOINT, host.njnt, "q"), host.jnt_type, strict=True
     ):
         if kind == free:
             positions += [(f"{name} {axis}", "m") for axis in "xyz"]
@@ -211,14 +213,14 @@ def _state_names(host: "mujoco.MjModel") -> tuple[tuple[str, ...], tuple[str, ..
 
 
 def _input_unit(host: "mujoco.MjModel", i: int) -> str:
-    """Unit of an actuator's input: force or torque of a joint's motor, else unknown."""
+    """Return the unit of an actuator's input: force or torque of a joint's motor, else unknown."""
     if not _is_motor(host, i) or abs(host.actuator_gainprm[i, 0] * host.actuator_gear[i, 0]) != 1:
         return ""
     return "N" if host.jnt_type[host.actuator_trnid[i, 0]] == 2 else "N m"
 
 
 def _is_motor(host: "mujoco.MjModel", i: int) -> bool:
-    """Whether an actuator puts a multiple of its input on one hinge or slide joint."""
+    """Return whether an actuator puts a multiple of its input on one hinge or slide joint."""
     import mujoco
 
     return (
@@ -230,7 +232,7 @@ def _is_motor(host: "mujoco.MjModel", i: int) -> bool:
 
 
 def _input_limits(host: "mujoco.MjModel", override: Limit) -> Box:
-    """The box of inputs; what it takes over of a motor's force limits is dropped in `host`."""
+    """Return the box of inputs, and drop in `host` the motors' force limits that it takes over."""
     import mujoco
 
     lower, upper = np.full(host.nu, -np.inf), np.full(host.nu, np.inf)
@@ -259,12 +261,12 @@ def _input_limits(host: "mujoco.MjModel", override: Limit) -> Box:
 def _state_limits(
     host: "mujoco.MjModel", position: Limit, velocity: Limit, of_file: dict[str, float]
 ) -> Box:
-    """Limits of the coordinates ξ: joint ranges and velocities."""
+    """Return the limits of the coordinates ξ: joint ranges and velocities."""
     import mujoco
 
     nv = host.nv
     lower, upper = np.full(2 * nv, -np.inf), np.full(2 * nv, np.inf)
-    names = _names(host, mujoco.mjtObj.mjOBJ_JOINT, host.njnt, "q")
+    names = _mujoco_names(host, mujoco.mjtObj.mjOBJ_JOINT, host.njnt, "q")
     for j in range(host.njnt):
         dof = host.jnt_dofadr[j]
         if host.jnt_limited[j] and host.jnt_type[j] in (2, 3):
@@ -286,7 +288,7 @@ def _state_limits(
 
 
 def _overridden(argument: str, limits: Box, override: Limit, part: slice) -> Box:
-    """The box with some of its bounds replaced; ValueError where it is empty."""
+    """Return the box with some of its bounds replaced; raise ValueError where it is empty."""
     lower, upper = np.array(limits.lower), np.array(limits.upper)
     if override is not None:
         size = len(lower[part])
@@ -298,8 +300,8 @@ def _overridden(argument: str, limits: Box, override: Limit, part: slice) -> Box
     return Box(lower, upper)
 
 
-def _home(host: "mujoco.MjModel") -> np.ndarray:
-    """qpos of the key "home", else of the first key, else qpos0 moved inside the ranges."""
+def _home_qpos(host: "mujoco.MjModel") -> np.ndarray:
+    """Return qpos of the key "home", else of the first key, else qpos0 moved inside the ranges."""
     import mujoco
 
     i = mujoco.mj_name2id(host, mujoco.mjtObj.mjOBJ_KEY, "home")

@@ -29,14 +29,14 @@ EULER, RK4 = 0, 1
 # mjtDisableBit.
 NO_CONSTRAINTS = 1
 
-# Operations that old jaxlibs may fuse on a CPU.
+# How many operations XLA of old jaxlibs may fuse on a CPU.
 PIECE = 15
 
 
 class Physics:
-    """A mujoco.MjModel and what MJX makes of it; two are equal only if they are the same object.
+    """A mujoco.MjModel and its mjx.Model; two are equal only if they are the same object.
 
-    model: the mujoco.MjModel. mjx: mjx.Model with host arrays, in float64 whatever JAX's mode.
+    model: the mujoco.MjModel. mjx: mjx.Model with NumPy arrays, in float64 in either mode of JAX.
     Raises ValueError for models that MJX does not support.
     """
 
@@ -53,7 +53,8 @@ class Physics:
             fail("model", f"MJX does not support it: {error}", "Take that out of the file")
 
     def step(self, x: Array, u: Array, numbers: Mapping[str, Any] | None = None) -> Array:
-        """x = (qpos, qvel) one physics step later: a function of x, u and nothing carried along.
+        """Return x = (qpos, qvel) one physics step later: a function of x, u and nothing carried
+        along.
 
         numbers: fields of mjx.Model to replace. Differentiable in all three, forward and reverse;
         with constraints by `with_forward_jacobian`.
@@ -69,8 +70,8 @@ class Physics:
         cast = lambda tree: jax.tree.map(
             lambda v: jnp.asarray(v, x.dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v, tree
         )
-        # A copy for each program. JAX remembers by their identity how it read NumPy arrays, also
-        # for programs of the other precision, and MJX hands it arrays of the model.
+        # A copy for each program. JAX caches by identity how it converted NumPy arrays, also for
+        # programs of the other precision, and MJX passes it arrays of the model.
         model = cast(copy.deepcopy(self.mjx).replace(**numbers))
         blank, h = cast(mjx.make_data(self.model)), model.opt.timestep
         x_q, v = jnp.split(x, [self.model.nq])
@@ -80,14 +81,14 @@ class Physics:
             return self._runge_kutta(forward, q, v, h)
         integrate = mjx.euler if self.model.opt.integrator == EULER else mjx.implicit
         v = integrate(model, forward(x_q, v)).qvel
-        # MJX's own move has the derivative 0 for a body that does not turn.
+        # MJX's own integration of positions has the derivative 0 for a body that does not turn.
         return jnp.concatenate([retract(self.joints, q, h * v), v])
 
     def _runge_kutta(self, forward: Callable, q: Array, v: Array, h: Array) -> Array:
-        """(qpos, qvel) after a step of length h by the classical method of fourth order.
+        """Return (qpos, qvel) after a step of length h by the classical method of fourth order.
 
-        MJX's own cannot be used: its tableau is a NumPy array of the module, and what is said
-        about those in `_step` makes it fail in the second of two precisions.
+        MJX's own method cannot be used: its tableau is a NumPy array of the module, which the
+        caching described in `_step` makes fail in the second of two precisions.
         """
         move = lambda rate: retract(self.joints, q, h * rate)
 
@@ -104,14 +105,15 @@ class Physics:
 
 
 def accelerated(model: Any, data: Any) -> Any:
-    """mjx.Data with the accelerations and constraint forces at its state, as by mjx.forward."""
+    """Return mjx.Data with the accelerations and constraint forces at its state, as mjx.forward
+    does."""
     mjx = mjx_module()
     for part in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
         data = part(model, data)
     rows = data._impl
     if rows.efc_J.size == 0:
         return data.replace(qacc=data.qacc_smooth)
-    # Rows of what does not touch push nothing, whatever the derivative of the distance: it does not
+    # Rows of contacts that do not touch exert no force; the derivative of their distance does not
     # always exist.
     idle = jnp.all(rows.efc_J == 0, axis=1) & (rows.efc_aref == 0)
     still = lambda v: jnp.where(idle, jax.lax.stop_gradient(v.T), v.T).T
@@ -119,26 +121,27 @@ def accelerated(model: Any, data: Any) -> Any:
         {f"_impl.{key}": still(getattr(rows, key)) for key in ("efc_J", "efc_D", "efc_aref")}
     )
     a = constrained(model, data)
-    return data.replace(qacc=a, qfrc_constraint=_pushes(model, data, a))
+    return data.replace(qacc=a, qfrc_constraint=_constraint_forces(model, data, a))
 
 
 @jax.custom_jvp
 def constrained(model: Any, data: Any) -> Array:
-    """The accelerations (nv,) by MJX's constraint solver.
+    """Return the accelerations (nv,) by MJX's constraint solver.
 
-    Their derivatives are those of the forces' balance there (implicit function theorem), not of the
-    iterations of the solver. Those have none where elliptic contacts do not touch, and are as far
-    from the solution's as the iterates are.
+    The derivatives are those of the balance of forces (implicit function theorem), not of the
+    solver's iterations: these have none where elliptic contacts do not touch, and err as much as
+    the iterates do.
     """
     return mjx_module().solve(model, data).qacc
 
 
 def _balance(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    """Return the accelerations and their derivative by the implicit function theorem."""
     a = constrained(*primals)
 
     def missing(a: Array, model: Any, data: Any) -> Array:
         carried = mjx_module().mul_m(model, data, a) - data.qfrc_smooth
-        return carried - _pushes(model, data, a)
+        return carried - _constraint_forces(model, data, a)
 
     of, at, directions = moving(lambda *rest: missing(a, *rest), primals, tangents)
     matrix = jax.jacfwd(missing)(a, *primals)
@@ -148,8 +151,8 @@ def _balance(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 constrained.defjvp(_balance, symbolic_zeros=True)
 
 
-def _pushes(model: Any, data: Any, a: Array) -> Array:
-    """Generalised forces (nv,) of the constraints under the accelerations a (nv,)."""
+def _constraint_forces(model: Any, data: Any, a: Array) -> Array:
+    """Return the generalised forces (nv,) of the constraints under the accelerations a (nv,)."""
     from mujoco.mjx._src.solver import Context
 
     return Context.create(model, data.replace(qacc=a), grad=False).qfrc_constraint
@@ -161,30 +164,31 @@ def _root(x: Array) -> Array:
 
 
 @_root.defjvp
-def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+def _root_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     y = _root(*primals)
     inside = y > 0
     return y, jnp.where(inside, tangents[0] / (2 * jnp.where(inside, y, 1)), 0)
 
 
 def root(x: Array, **_: Any) -> Array:
-    """The square root, with the derivative 0 at 0 instead of an infinite one.
+    """Return the square root, with the derivative 0 at 0 instead of an infinite one.
 
-    MJX takes lengths by it that can be 0, such as how far a point inside a cylinder is from it, and
+    MJX computes lengths by it that can be 0, such as the distance of a point inside a cylinder, and
     the chain rule multiplies infinity by 0 there.
     """
     return _root(x)
 
 
 def mjx_module() -> Any:
-    """mujoco.mjx, which says on stdout that Warp is not installed when it is first imported."""
+    """Import mujoco.mjx without its message on stdout that Warp is not installed, and return it."""
     with contextlib.redirect_stdout(io.StringIO()):
         from mujoco import mjx
     return mjx
 
 
 def in_pieces(function: Callable, size: int = PIECE) -> Callable:
-    """The same function of arrays, as pieces of `size` operations that XLA does not fuse.
+    """Return the same function of arrays, split into parts of `size` operations that XLA does not
+    fuse.
 
     XLA's CPU backend of jaxlib 0.7 to 0.11.0 (the newest for Python 3.11) fuses long chains of
     small operations, joint after joint, and then computes the beginning of the chain again for each
@@ -219,10 +223,10 @@ def in_pieces(function: Callable, size: int = PIECE) -> Callable:
 
 
 def with_forward_jacobian(function: Callable) -> Callable:
-    """The same function of pytrees, its derivative a Jacobian made by forward mode.
+    """Return the same function of pytrees, its derivative a Jacobian made by forward mode.
 
-    Reverse mode then transposes one matrix product instead of the function. It remembers a
-    Jacobian a step, and does not multiply infinite derivatives, as those of distances of shapes
+    Reverse mode then transposes one matrix product instead of the function. It stores one Jacobian
+    a step, and does not multiply infinite derivatives, as those of distances of shapes
     that do not touch can be, by zeros.
     """
     wrapped = jax.custom_jvp(function)

@@ -1,4 +1,4 @@
-"""A function with some of JAX's operations replaced by others, wherever they stand in it."""
+"""Replace some of JAX's primitives in a function by other functions, in all nested bodies."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -9,16 +9,16 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun
 
 
 def rewritten(function: Callable, rules: Mapping[Primitive, Callable]) -> Callable:
-    """The same function of pytrees of arrays, with the primitives of `rules` replaced.
+    """Return the same function of pytrees of arrays, with the primitives of `rules` replaced.
 
-    rules: for a primitive the function that stands in for it. It takes the primitive's operands,
+    rules: for each primitive the function that replaces it. It takes the primitive's operands,
     its parameters as keywords, and returns what it returns: one array, or a list of them for a
     primitive with several results, of the same shapes and types. Bodies of jit, scan, while, cond,
     checkpoint and custom_jvp are rewritten too, the last with their rules. Not rewritten are rules
     of custom_vjp and what JAX does not show in a jaxpr (the parts of custom_root since 0.12).
 
-    The result can be differentiated, batched and compiled as the function itself; its derivatives
-    are those of the functions that stand in.
+    The result can be differentiated, batched and compiled like the function itself; its derivatives
+    are those of the replacements.
     """
 
     def run(*args: Any) -> Any:
@@ -30,7 +30,7 @@ def rewritten(function: Callable, rules: Mapping[Primitive, Callable]) -> Callab
 
 
 def _evaluated(closed: ClosedJaxpr, rules: Mapping[Primitive, Callable], args: Sequence) -> list:
-    """What the traced function gives, its equations one by one."""
+    """Evaluate the traced function, equation by equation, and return its outputs."""
     jaxpr = closed.jaxpr
     values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*closed.consts, *args), strict=True))
     read = lambda v: v.val if isinstance(v, Literal) else values[v]
@@ -55,7 +55,7 @@ def _evaluated(closed: ClosedJaxpr, rules: Mapping[Primitive, Callable], args: S
 
 
 def _with_rule(values: Callable, original: Callable, rules: Mapping[Primitive, Callable]) -> Any:
-    """The function `values`, its derivative that of `original`, rewritten."""
+    """Return the function `values`, its derivative that of `original`, rewritten."""
     stand_in = jax.custom_jvp(values)
 
     def rule(primals: tuple, tangents: tuple) -> tuple:
@@ -67,7 +67,7 @@ def _with_rule(values: Callable, original: Callable, rules: Mapping[Primitive, C
 
 
 def _holds(value: Any, rules: Mapping[Primitive, Callable]) -> bool:
-    """Whether a traced function, or one among parameters, has a primitive to replace."""
+    """Return whether a traced function, or one among parameters, has a primitive to replace."""
     if isinstance(value, ClosedJaxpr | Jaxpr):  # one class since JAX 0.12
         return any(eqn.primitive in rules or _holds(eqn.params, rules) for eqn in value.eqns)
     if isinstance(value, dict):
@@ -76,7 +76,7 @@ def _holds(value: Any, rules: Mapping[Primitive, Callable]) -> bool:
 
 
 def _replaced(value: Any, rules: Mapping[Primitive, Callable]) -> Any:
-    """A parameter with the traced functions in it rewritten."""
+    """Return a parameter with the traced functions in it rewritten."""
     if not _holds(value, rules):
         return value
     if isinstance(value, tuple | list):
@@ -92,8 +92,9 @@ def _replaced(value: Any, rules: Mapping[Primitive, Callable]) -> Any:
 
 
 def moving(function: Callable, primals: Sequence, tangents: Sequence) -> tuple:
-    """What a rule of `jax.custom_jvp` with symbolic zeros differentiates: `function` of the leaves
-    of its arguments that move, these leaves of the primals, and their tangents."""
+    """Return what a rule of `jax.custom_jvp` with symbolic zeros differentiates: `function` of the
+    leaves of its arguments whose tangent is not zero, these leaves of the primals, and their
+    tangents."""
     leaves, tree = jax.tree.flatten(tuple(primals))
     is_zero = lambda t: isinstance(t, SymbolicZero)
     directions = jax.tree.leaves(tuple(tangents), is_leaf=is_zero)

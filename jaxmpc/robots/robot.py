@@ -1,11 +1,11 @@
 """A robot of MuJoCo as a plant: one control period forward, and its affine model.
 
-Two models of one file. The plant is the model as written, but for the force limits of motors, which
-become `input_limits`. The predictor is the same without
-constraint rows (joint limits, contacts, friction loss, equalities): a stiff spring at a joint's
-end makes a linear model useless one sample later, so limits belong into the MPC. Both take inputs
-as they are, without MuJoCo's clamp to `ctrlrange`, whose derivative is wrong at the bound, where
-MPC sits: keeping u inside `input_limits` is the controller's work.
+A file gives two models. The plant is the model as written, except that the force limits of motors
+become `input_limits`. The predictor is the same without constraint rows (joint limits, contacts,
+friction loss, equalities): a stiff spring at a joint's end makes a linear model useless one sample
+later, so limits belong into the MPC. Both apply inputs without MuJoCo's clamp to `ctrlrange`, whose
+derivative is wrong at the bound, where MPC often operates: the controller has to keep u inside
+`input_limits`.
 """
 
 from dataclasses import dataclass, field, replace
@@ -41,8 +41,8 @@ class Robot:
 
     state_limits (in ξ), input_limits: Boxes, ±inf for no limit. home (nq + nv,): the set-point of
     the file. anchor (nq,): zeros, with the orientations of home. plant, predictor: `Physics`,
-    constants of compiled programs (twice to ten times as fast as arguments). numbers: what a batch
-    varies of the plant (masses, damping), see `vary`.
+    constants of compiled programs (twice to ten times as fast as arguments). numbers: parameters of
+    the plant that differ in a batch (masses, damping), see `vary`.
     """
 
     state_limits: Box
@@ -62,51 +62,52 @@ class Robot:
 
     @property
     def mujoco(self) -> "mujoco.MjModel":
-        """The plant as MuJoCo's own model, for rendering and the C engine."""
+        """Return the plant as MuJoCo's own model, for rendering and the C engine."""
         return self.plant.model
 
     @property
     def n(self) -> int:
-        """Number of coordinates ξ, 2 nv."""
+        """Return the number of coordinates ξ, 2 nv."""
         return 2 * self.mujoco.nv
 
     @property
     def m(self) -> int:
-        """Number of inputs."""
+        """Return the number of inputs."""
         return self.mujoco.nu
 
     @property
     def joints(self) -> tuple[int, ...]:
-        """mjtJoint of each joint."""
+        """Return the mjtJoint of each joint."""
         return tuple(int(joint) for joint in self.mujoco.jnt_type)
 
     @property
     def state_size(self) -> int:
-        """Numbers in the state x, nq + nv."""
+        """Return the length of the state x, nq + nv."""
         return self.mujoco.nq + self.mujoco.nv
 
     def step(self, x: Any, u: Any) -> Array:
-        """The state x (nq + nv,) one control period later under the input u (m,), held.
+        """Return the state x (nq + nv,) one control period later, with the input u (m,) held.
 
-        Differentiable in x, u and the numbers of `plant`, in forward and reverse mode: each physics
-        step gives its Jacobian by forward mode, and that of constraint forces by their balance, not
-        through MJX's solver. Second derivatives: forward mode over either.
+        Differentiable in x, u and the numbers of `plant`, in forward and reverse mode. Each physics
+        step computes its Jacobian by forward mode, that of constraint forces by the implicit
+        function theorem instead of through MJX's solver. Second derivatives: forward over either.
         """
-        return _stepped(self, *self._read(x, u))
+        return _stepped(self, *self._checked_arrays(x, u))
 
     def _step(self, x: Array, u: Array) -> Array:
         body = lambda x, _: (self.plant.step(x, u, self.numbers), None)
         return jax.lax.scan(body, x, length=self.substeps)[0]
 
     def linearize(self, x: Any, u: Any, *, exact: bool = False) -> LinearSystem:
-        """Affine model ξ⁺ = A ξ + B u + c of a whole control period about x (nq + nv,), u (m,).
+        """Return the affine model ξ⁺ = A ξ + B u + c of a whole control period about x (nq + nv,),
+        u (m,).
 
-        Of the predictor, by automatic differentiation. exact=False: one physics step is linearised
-        and its affine map applied `substeps` times (a tenth of the cost; on a 7-joint arm A is off
-        by 1 %, B by 0.05 %). exact=True: Jacobians along the physics steps, and c such that the
-        model passes through the predictor's own next state.
+        It is of the predictor, by automatic differentiation. exact=False: one physics step is
+        linearised and its affine map applied `substeps` times (a tenth of the cost; on a 7-joint
+        arm A is off by 1 %, B by 0.05 %). exact=True: Jacobians along the physics steps, and c such
+        that the model passes through the predictor's own next state.
         """
-        return _linearized(self, *self._read(x, u), exact=exact)
+        return _linearized(self, *self._checked_arrays(x, u), exact=exact)
 
     def _linearize(self, x: Array, u: Array, exact: bool) -> LinearSystem:
         advance = lambda s, u: self.coordinates(self.predictor.step(self.state(s), u))
@@ -140,9 +141,9 @@ class Robot:
         )  # fmt: skip
 
     def transition(self, x: Any, u: Any) -> tuple[Array, Array]:
-        """A (n, n), B (n, m) of one physics step of the plant about x, u, small motions against
-        small motions: those of mujoco.mjd_transitionFD, by automatic differentiation."""
-        return _differentiated(self, *self._read(x, u))
+        """Return A (n, n), B (n, m) of one physics step of the plant about x, u, in tangent
+        coordinates: those of mujoco.mjd_transitionFD, by automatic differentiation."""
+        return _differentiated(self, *self._checked_arrays(x, u))
 
     def _transition(self, x: Array, u: Array) -> tuple[Array, Array]:
         nq, nv = self.mujoco.nq, self.mujoco.nv
@@ -157,7 +158,7 @@ class Robot:
         return A, B
 
     def coordinates(self, x: Any) -> Array:
-        """ξ (n,) of a state x (nq + nv,)."""
+        """Return ξ (n,) of a state x (nq + nv,)."""
         x = jnp.asarray(x)
         require_shape("x", x, (self.state_size,), "Give (qpos, qvel) of one robot")
         if not quaternions(self.joints):
@@ -167,7 +168,7 @@ class Robot:
         return jnp.concatenate([difference(self.joints, anchor, x[:nq]), x[nq:]])
 
     def state(self, coordinates: Any) -> Array:
-        """x (nq + nv,) with the coordinates ξ (n,)."""
+        """Return x (nq + nv,) with the coordinates ξ (n,)."""
         xi = jnp.asarray(coordinates)
         require_shape("coordinates", xi, (self.n,), "Two numbers a dof; use jax.vmap for many")
         if not quaternions(self.joints):
@@ -177,11 +178,12 @@ class Robot:
         return jnp.concatenate([retract(self.joints, anchor, xi[:nv]), xi[nv:]])
 
     def equilibrium(self, q: Any = None) -> tuple[np.ndarray, np.ndarray]:
-        """(x, u): the robot at rest in the configuration q (nq,), and the input that holds it.
+        """Return (x, u): the robot at rest in the configuration q (nq,), and the input that holds
+        it.
 
         q: None for that of `home`; (..., nq) for many. u solves J'u = bias − passive forces
         (gravity compensation), the least one where there are several. Limits' springs, contacts and
-        dry friction do not help. Host, float64, by MuJoCo's C engine.
+        dry friction do not help. Computed outside JAX in float64 by MuJoCo's C engine.
 
         Raises ValueError where the actuators cannot hold q at all, or only beyond input_limits
         (force limits of actuators other than motors are not looked at).
@@ -200,10 +202,11 @@ class Robot:
         return np.concatenate([q, still], axis=-1), u
 
     def inverse_dynamics(self, q: Any, velocity: Any, acceleration: Any) -> np.ndarray:
-        """Inputs u (..., m) that give `acceleration` (..., nv) at q (..., nq), velocity (..., nv).
+        """Return the inputs u (..., m) that give `acceleration` (..., nv) at q (..., nq), velocity
+        (..., nv).
 
-        Of the predictor, in continuous time. Host, float64, by MuJoCo's C engine (mj_inverse).
-        Raises ValueError where no input does.
+        They are of the predictor, in continuous time. Computed outside JAX in float64 by MuJoCo's C
+        engine (mj_inverse). Raises ValueError where no input does.
         """
         import mujoco
 
@@ -241,11 +244,12 @@ class Robot:
         return np.array(found).reshape(*q.shape[:-1], self.m)
 
     def trajectory(self, positions: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Reference and input reference of a motion given by its positions, for `simulate`.
+        """Return the reference and input reference of a motion given by its positions, for
+        `simulate`.
 
         positions (K, nv): coordinates of the joints once a control period. Returns states (K, n)
-        with velocities by central differences, and inputs (K, m) by inverse dynamics. Host. Raises
-        ValueError for wrong shapes, or orientations that turn.
+        with velocities by central differences, and inputs (K, m) by inverse dynamics. NumPy; not
+        traceable. Raises ValueError for wrong shapes, or orientations that turn.
         """
         nv = self.mujoco.nv
         given = host_array("positions", positions)
@@ -262,7 +266,8 @@ class Robot:
         return np.hstack([given, velocity]), self.inverse_dynamics(q, velocity, acceleration)
 
     def vary(self, **numbers: Any) -> "Robot":
-        """The same robot with other numbers in its plant; models and controllers keep theirs.
+        """Return the same robot with other numbers in its plant; models and controllers keep
+        theirs.
 
         numbers: fields of mjx.Model by name, such as body_mass (nbody,), dof_damping (nv,),
         dof_armature, actuator_gear, dof_frictionloss (where the file has some); or payload (kg): a
@@ -285,8 +290,8 @@ class Robot:
         return replace(self, numbers=varied)
 
     def _loaded(self, payload: Any, varied: dict[str, Any]) -> dict[str, Array]:
-        """Mass, centre and inertia of the body that carries the site "tool", with a point mass
-        there: parallel axes about the new centre (Steiner), then principal axes."""
+        """Return the mass, centre and inertia of the body that carries the site "tool", with a
+        point mass there: parallel axes about the new centre (Steiner), then principal axes."""
         import mujoco
 
         site = mujoco.mj_name2id(self.mujoco, mujoco.mjtObj.mjOBJ_SITE, "tool")
@@ -313,7 +318,8 @@ class Robot:
             "body_iquat": put("body_iquat", _quaternion(axes)),
         }  # fmt: skip
 
-    def _read(self, x: Any, u: Any) -> tuple[Array, Array]:
+    def _checked_arrays(self, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return a state and an input as arrays of one dtype; raise ValueError for wrong shapes."""
         size = self.state_size
         problem = "Give (qpos, qvel) of one robot; use jax.vmap for many"
         if np.shape(x) == (self.n,) != (size,):
@@ -338,8 +344,8 @@ _differentiated = jax.jit(Robot._transition)
 
 
 def _quaternion(R: Array) -> Array:
-    """Unit quaternion (w first) of a rotation matrix: the eigenvector of Bar-Itzhack's K (2000,
-    J. Guidance 23, eq. 6) with the largest eigenvalue, right for every rotation."""
+    """Return the unit quaternion (w first) of a rotation matrix: the eigenvector of Bar-Itzhack's K
+    (2000, J. Guidance 23, eq. 6) with the largest eigenvalue, right for every rotation."""
     x, y, z = R[:, 0], R[:, 1], R[:, 2]
     K = jnp.array([
         [x[0] - y[1] - z[2], y[0] + x[1], z[0] + x[2], y[2] - z[1]],

@@ -17,7 +17,8 @@ SMALL = 1e-8
 
 
 def retract(joints: tuple[int, ...], q: Array, dq: Array) -> Array:
-    """q ⊕ dq (nq,): the configuration q (nq,) moved by dq (nv,). joints: mjtJoint numbers."""
+    """Return q ⊕ dq (nq,): the configuration q (nq,) moved by dq (nv,). joints: mjtJoint
+    numbers."""
     if not quaternions(joints):
         return q + dq
     parts, i, j = [], 0, 0
@@ -35,7 +36,7 @@ def retract(joints: tuple[int, ...], q: Array, dq: Array) -> Array:
 
 
 def difference(joints: tuple[int, ...], start: Array, end: Array) -> Array:
-    """end ⊖ start (nv,): the motion dq with start ⊕ dq = end, rotations of at most π."""
+    """Return end ⊖ start (nv,): the motion dq with start ⊕ dq = end, rotations of at most π."""
     if not quaternions(joints):
         return end - start
     parts, i = [], 0
@@ -54,12 +55,12 @@ def difference(joints: tuple[int, ...], start: Array, end: Array) -> Array:
 
 
 def quaternions(joints: tuple[int, ...]) -> bool:
-    """Whether an orientation is among the joints, so that nq and nv differ."""
+    """Return whether an orientation is among the joints, so that nq and nv differ."""
     return any(joint in (FREE, BALL) for joint in joints)
 
 
 def normalised(joints: tuple[int, ...], q: Array) -> Array:
-    """q (nq,) with quaternions of length 1."""
+    """Return q (nq,) with quaternions of length 1."""
     i = 0
     for joint in joints:
         i += 3 if joint == FREE else 0
@@ -70,13 +71,13 @@ def normalised(joints: tuple[int, ...], q: Array) -> Array:
 
 
 def _product(a: Array, b: Array) -> Array:
-    """Hamilton product."""
+    """Return the Hamilton product a b of two quaternions."""
     vector = a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])
     return jnp.concatenate([(a[0] * b[0] - jnp.dot(a[1:], b[1:]))[None], vector])
 
 
 def _exponential(w: Array) -> Array:
-    """Quaternion of the rotation by |w| about w: (cos |w|/2, w sin(|w|/2)/|w|)."""
+    """Return the quaternion of the rotation by |w| about w: (cos |w|/2, w sin(|w|/2)/|w|)."""
     squared = jnp.dot(w, w)
     small = squared < SMALL
     angle = jnp.sqrt(jnp.where(small, 1.0, squared))  # no sqrt at 0: its derivative is infinite
@@ -86,7 +87,7 @@ def _exponential(w: Array) -> Array:
 
 
 def _logarithm(q: Array) -> Array:
-    """Rotation vector of a unit quaternion, the shorter way: 2 atan2(|v|, w) v/|v|."""
+    """Return the rotation vector of a unit quaternion, the shorter way: 2 atan2(|v|, w) v/|v|."""
     q = jnp.where(q[0] < 0, -q, q)
     v = q[1:]
     squared = jnp.dot(v, v)

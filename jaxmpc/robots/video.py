@@ -1,4 +1,4 @@
-"""Films of robots, by MuJoCo's renderer and without a window."""
+"""Videos of robots, by MuJoCo's renderer and without a window."""
 
 import copy
 import warnings
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.checks import fail, require_finite
+from jaxmpc.checks import fail, require_finite, whole
 from jaxmpc.robots.robot import Robot
 
 
@@ -15,11 +15,11 @@ def render(
     robot: Robot, states: Any, *, every: int = 1, width: int = 320, height: int = 240,
     camera: str | None = "view",
 ) -> np.ndarray:  # fmt: skip
-    """Frames (F, h, w, 3), uint8 RGB, of every `every`-th state.
+    """Return the frames (F, h, w, 3), uint8 RGB, of every `every`-th state.
 
     states: (T+1, nq + nv) of one robot, or (B, T+1, nq + nv) of several, drawn as tiles, row by
-    row, as near a square as there is. width, height: pixels of a tile. camera: one of the model's;
-    None, or "view" where the model has none of that name: MuJoCo's free one, that sees the whole.
+    row, in a nearly square arrangement. width, height: pixels of a tile. camera: the name of one of
+    the model's; None, or "view" where the model has none of that name, for MuJoCo's free camera.
 
     Without a display MuJoCo renders through EGL, on a GPU or not: the environment variable
     MUJOCO_GL=egl must be set before mujoco is imported, hence before the first `load_robot`.
@@ -34,8 +34,7 @@ def render(
         fail("states", f"shape {states.shape}", f"Give ([robots,] samples, {robot.state_size})")
     require_finite("states", states)
     for name, value in (("every", every), ("width", width), ("height", height)):
-        if not isinstance(value, int | np.integer) or value < 1:
-            fail(name, f"{value!r}", "Give a whole number, at least 1")
+        whole(name, value, 1)
     model = copy.deepcopy(robot.mujoco)
     buffer = model.vis.global_
     buffer.offwidth, buffer.offheight = max(buffer.offwidth, width), max(buffer.offheight, height)
@@ -52,7 +51,7 @@ def render(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # GLFW warns of what follows as an error
             renderer = mujoco.Renderer(model, height, width)
-    except Exception as error:  # MuJoCo's, OpenGL's and EGL's: whatever the system lacks
+    except Exception as error:  # of MuJoCo, OpenGL or EGL, whichever is missing
         raise RuntimeError(
             f"no video: MuJoCo finds no renderer ({' '.join(str(error).split())[:120]}). Without "
             "a display set MUJOCO_GL=egl before Python starts; on Debian or Ubuntu install "

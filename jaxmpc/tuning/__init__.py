@@ -1,4 +1,4 @@
-"""Tuning by gradient descent, kept after each step.
+"""Tuning by gradient descent, with a checkpoint after each step.
 
 tune_weights                              fields of an MPC, through its closed loops
 Parameter                                 a quantity that is tuned, and its domain
@@ -6,7 +6,7 @@ ClosedLoopLoss                            tracking, effort, violations and settl
 tune_feasible_set, feasible_fraction      states from which all limits can be kept
 tune_penalties, transfer_penalties        penalties of ADMM, also for another horizon
 tune_sweep_penalties                      penalties of the first stage of a map
-Settings, TuningRun, Descent              what all take and return
+Settings, TuningRun, Descent              arguments and results of all of these
 """
 
 from jaxmpc.tuning.descent import Descent

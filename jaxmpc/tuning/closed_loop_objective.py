@@ -1,4 +1,4 @@
-"""ClosedLoopObjective: the loss of closed loops as a function of what is tuned, with gradients."""
+"""ClosedLoopObjective: the loss of closed loops as a function of the parameters, with gradients."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -51,14 +51,14 @@ class ClosedLoopObjective:
     design_loss: Any
 
     def arguments(self, theta: Any, x0s: Any, varied: Any, weights: Any) -> tuple:
-        """Return the arguments of `total` as arrays of the present precision."""
+        """Return the arguments of `total` as arrays of JAX's current precision."""
         return arrays((theta, self.plant, x0s, varied, weights))
 
     def total(
         self, theta: Any, plant: Any, x0s: Array, varied: dict[str, Array], weights: Array,
         checkpoint: bool = False,
     ) -> tuple[Array, dict[str, Array]]:  # fmt: skip
-        """Return the weighted mean loss, and what is counted of each loop."""
+        """Return the weighted mean loss, and the recorded numbers of each loop."""
         given = values(self.parameters, theta)
         controller = self.build(given)
         aims = (self.reference, self.input_reference)
@@ -85,16 +85,16 @@ class ClosedLoopObjective:
         return total + design, aux
 
     def check(self, theta: Any, data: Data) -> None:
-        """Raise what tracing raises, without compiling."""
+        """Trace the loss without compiling; raise its errors, and ValueError for a wrong shape."""
         x0s, varied = jax.tree.map(lambda v: v[:1], data)
         total, aux = jax.eval_shape(self.total, *self.arguments(theta, x0s, varied, np.ones(1)))
         if aux["losses"].shape != (1,) or total.shape != ():
             fail("loss", f"has shape {aux['losses'].shape[1:]}", "Return one number")
 
     def gradient(self, theta: Any, data: Data, mode: str) -> tuple[str, Callable]:
-        """Return the mode, and (θ, x0s, varied, weights) → value, gradient, what `total` counts.
+        """Return the mode, and (θ, x0s, varied, weights) → value, gradient, numbers of `total`.
 
-        Several modes are compiled and timed on `data` where `mode` leaves the choice.
+        With mode "auto" both modes are compiled and timed on `data`.
         """
         flat, unravel = ravel_pytree(arrays(theta))
 
@@ -135,7 +135,7 @@ class ClosedLoopObjective:
 
 
 def duration(program: Compiled, arguments: tuple) -> float:
-    """Return the seconds that the second of two calls takes: without compiling."""
+    """Return the time of a call in seconds, without compiling."""
     program(*arguments)
     begun = time.perf_counter()
     program(*arguments)
@@ -143,7 +143,7 @@ def duration(program: Compiled, arguments: tuple) -> float:
 
 
 def controller_of(make_mpc: Any, given: Mapping[str, Any], solver: ADMM) -> Any:
-    """Return the controller of these values: make_mpc's own, or a Controller of its problem."""
+    """Return the controller at these values: that of make_mpc, or a Controller of its problem."""
     made = make_mpc(given)
     if isinstance(made, MPC):
         return Controller(made, solver)

@@ -1,8 +1,8 @@
-"""Gradient descent with guards: the loop that every tuner shares.
+"""Gradient descent with safeguards: the loop of all tuners.
 
-The optimiser is one of optax. Around it: the loss on a validation set, by which the best iterate is
-chosen; steps that lead to numbers which are not finite are taken back and halved; and everything is
-on disk after each step.
+The optimiser comes from optax. The best iterate is chosen by the loss on a validation set. Steps
+that lead to numbers which are not finite are undone and halved. A checkpoint is written after each
+step.
 """
 
 import time
@@ -50,13 +50,13 @@ class Descent:
 
     @property
     def steps(self) -> int:
-        """Return T."""
+        """Return the number of steps T."""
         return len(self.loss)
 
 
 @dataclass
 class State:
-    """What the next step depends on, and the record so far.
+    """The state of the descent: all that the next step depends on, and the record so far.
 
     good: the last θ with a finite gradient, its gradient and the optimiser's state before it.
     fraction: of the optimiser's step that is taken, 1 until a step fails.
@@ -75,14 +75,14 @@ def descend(
     theta: Any, gradient: Gradient, validate: Validate, optimizer: optax.GradientTransformation,
     settings: Settings, decides: Any = None,
 ) -> Descent:  # fmt: skip
-    """Minimise from θ = `theta`, a pytree of host arrays, by `settings.updates` optimiser steps.
+    """Minimise from θ = `theta`, a pytree of NumPy arrays, by `settings.updates` optimiser steps.
 
     gradient(θ, t): loss, gradient and further numbers on the batch of step t; a function of its
     arguments alone, so that an interrupted run can go on.
     validate(θ): loss and numbers on the validation set. It is called before the first step too:
     the result is the best of T + 1 iterates, never worse than the start.
     optimizer: used where settings.optimizer is None.
-    decides: JSON data that decide the run; kept in the checkpoint and compared on resuming.
+    decides: JSON data that determine the run, stored in the checkpoint and compared on resuming.
 
     Raises ValueError for a checkpoint of another run, and where θ_0 has no finite validation loss.
     """
@@ -97,7 +97,7 @@ def descend(
     if path is not None:
         remove_partial(path)
     if path is not None and path.exists():
-        state = _load(path, theta, optimizer, mark)
+        state = _load_checkpoint(path, theta, optimizer, mark)
         first, now = state.checks[0]["loss"], _checked(validate, theta)["loss"]
         if not np.isclose(now, first, rtol=1e-4, atol=0):
             problem = f"began with the validation loss {first:.9g}, which is {now:.9g} now"
@@ -108,7 +108,7 @@ def descend(
         if not np.isfinite(state.checks[0]["loss"]):
             fail("parameters", "have no finite validation loss at the start", "Start elsewhere")
         state.seconds += time.perf_counter() - begun
-        _save(path, state, mark, decides)
+        _save_checkpoint(path, state, mark, decides)
     with tqdm(total=updates, unit=" steps", disable=not settings.progress) as bar:
         bar.update(len(state.rows))
         while len(state.rows) < updates:
@@ -117,7 +117,7 @@ def descend(
             state.checks.append(_checked(validate, state.theta))
             state.thetas.append(state.theta)
             state.seconds += time.perf_counter() - begun
-            _save(path, state, mark, decides)
+            _save_checkpoint(path, state, mark, decides)
             losses = [check["loss"] for check in state.checks]
             bar.set_postfix_str(f"validation {losses[-1]:.4g}, best {np.nanmin(losses):.4g}")
             bar.update(1)
@@ -125,7 +125,7 @@ def descend(
 
 
 def _require_first_order(optimizer: optax.GradientTransformation, theta: Any) -> None:
-    """Raise ValueError for an optimiser that asks for more than a gradient."""
+    """Raise ValueError for an optimiser that needs more than a gradient."""
     zeros = jax.tree.map(np.zeros_like, theta)
     try:
         jax.eval_shape(lambda g: optimizer.update(g, optimizer.init(g), g)[0], zeros)
@@ -134,7 +134,7 @@ def _require_first_order(optimizer: optax.GradientTransformation, theta: Any) ->
 
 
 def _step(state: State, gradient: Gradient, optimizer: optax.GradientTransformation) -> None:
-    """Take a step; where its gradient is not finite take back the last one and go half as far."""
+    """Take a step; where the gradient is not finite undo the last step and take half of it."""
     loss, slope, numbers = gradient(state.theta, len(state.rows))
     slope = jax.tree.map(lambda v: np.asarray(v, np.float64), slope)
     norm = float(np.sqrt(sum(np.sum(v**2) for v in jax.tree.leaves(slope))))
@@ -155,10 +155,10 @@ def _step(state: State, gradient: Gradient, optimizer: optax.GradientTransformat
             return
         else:
             state.fraction /= 2
-    state.theta = _moved(state.good, state.fraction, optimizer)
+    state.theta = _after_step(state.good, state.fraction, optimizer)
 
 
-def _moved(good: tuple[Any, Any, Any], fraction: float, optimizer: Any) -> Any:
+def _after_step(good: tuple[Any, Any, Any], fraction: float, optimizer: Any) -> Any:
     """Return θ after this fraction of the optimiser's step."""
     theta, slope, before = good
     with jax.enable_x64(True):
@@ -174,7 +174,7 @@ def _checked(validate: Validate, theta: Any) -> dict[str, float]:
 
 
 def _record(state: State) -> Descent:
-    """Return the record that a user sees."""
+    """Return the public record of the descent."""
     column = lambda rows, name: np.array([row.get(name, np.nan) for row in rows])
     names = lambda rows, known: [n for n in dict.fromkeys(n for r in rows for n in r)
                                  if n not in known]  # fmt: skip
@@ -192,8 +192,8 @@ def _record(state: State) -> Descent:
     )  # fmt: skip
 
 
-def _save(path: Path | None, state: State, mark: str, decides: Any) -> None:
-    """Write the checkpoint, if there is to be one."""
+def _save_checkpoint(path: Path | None, state: State, mark: str, decides: Any) -> None:
+    """Write the checkpoint; nothing where `path` is None."""
     if path is None:
         return
     leaves: dict[str, Any] = {
@@ -209,7 +209,9 @@ def _save(path: Path | None, state: State, mark: str, decides: Any) -> None:
     write_arrays(path, plain, **leaves)
 
 
-def _load(path: Path, theta: Any, optimizer: optax.GradientTransformation, mark: str) -> State:
+def _load_checkpoint(
+    path: Path, theta: Any, optimizer: optax.GradientTransformation, mark: str
+) -> State:
     """Return the state of an interrupted run; raise ValueError for a file of another run."""
     kept = read_arrays(path)
     if kept is None or "fingerprint" not in (kept[0] or {}):
@@ -235,7 +237,7 @@ def _load(path: Path, theta: Any, optimizer: optax.GradientTransformation, mark:
         **{name: plain[name] for name in ("fraction", "seconds", "rows", "checks")},
     )  # fmt: skip
     if good is not None:  # the step that was taken is the one that this optimiser takes
-        again = _moved(good, state.fraction, optimizer)
+        again = _after_step(good, state.fraction, optimizer)
         close = lambda a, b: np.allclose(a, b, rtol=1e-6, atol=1e-9)
         if not all(map(close, *map(jax.tree.leaves, (again, state.theta)))):
             fail(str(path), "holds the state of another optimizer", "Give the one it began with")

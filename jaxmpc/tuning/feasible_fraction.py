@@ -60,8 +60,9 @@ def membership(
     that does not exist, gives NaN.
 
     The smaller the width, the sharper: the sum over a grid tends to the number of its points in
-    the feasible set. It is a number to climb, no proof: that is `map_feasible_set`. In the type
-    of the problem's arrays; float64 is advised. Raises ValueError for wrong shapes.
+    the feasible set. It is an objective for gradient ascent; proofs come from `map_feasible_set`.
+    Computed in the dtype of the problem's arrays; float64 is advised. Raises ValueError for wrong
+    shapes.
     """
     if mpc.soft and mpc.states is None and mpc.terminal_set is None and not mpc.outputs:
         fail(
@@ -108,8 +109,8 @@ def _membership(c: Condensed, x0s: Array, width: Array, scale: Any, steps: int) 
         z, e = nearest(fixed, bounds, z, steps)
         usable = given & jnp.isfinite(jnp.sum(e**2) / width**4) & jnp.all(jnp.isfinite(z))
         x0, z = jnp.where(usable, x0, 0.0), jax.lax.stop_gradient(jnp.where(usable, z, 0.0))
-        excess = at(C, D, tight, x0).excess(matmul(z, C.T), 1.0)
-        return jnp.where(usable, 1 / (1 + jnp.sum(excess**2) / width**2), 0.0)
+        residual = at(C, D, tight, x0).excess(matmul(z, C.T), 1.0)
+        return jnp.where(usable, 1 / (1 + jnp.sum(residual**2) / width**2), 0.0)
 
     data = (c.C, c.D, c.d, c.lower, c.upper, c.radius)
     missing = jnp.any(jnp.array([jnp.any(jnp.isnan(part)) for part in jax.tree.leaves(data)]))

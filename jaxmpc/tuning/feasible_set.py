@@ -1,4 +1,4 @@
-"""tune_feasible_set: the feasible set grown by gradient."""
+"""tune_feasible_set: enlarge the feasible set by gradient descent."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -25,17 +25,17 @@ def tune_feasible_set(
     width: float = 0.02, *, design_loss: Callable[[MPC], Any] | None = None,
     newton_steps: int = STEPS, **settings: Any,
 ) -> TuningRun:  # fmt: skip
-    """Grow the feasible set by gradient: min_θ design_loss(mpc) − feasible_fraction(mpc, x0s).
+    """Enlarge the feasible set by gradient: min_θ design_loss(mpc) − feasible_fraction(mpc, x0s).
 
     make_mpc, parameters: as in `tune_weights`, make_mpc to an MPC. x0s (B, n): states spread
     evenly over the region that matters, such as a `grid` or a uniform sample. width,
-    newton_steps: as in `feasible_fraction`. design_loss: what growth is traded against, a number
-    computed from the problem alone. (To trade it against the cost of closed loops, give
-    `tune_weights` design_loss=lambda mpc: -weight * feasible_fraction(mpc, ...).)
-    settings: of `Settings`, as updates=50; optimizer None: Adam of 0.05.
+    newton_steps: as in `feasible_fraction`. design_loss: a cost that is traded against the
+    size of the set, a number computed from the problem alone. (To trade it against the cost of
+    closed loops, give `tune_weights` design_loss=lambda mpc: -weight * feasible_fraction(mpc,
+    ...).) settings: of `Settings`, as updates=50; optimizer None: Adam of 0.05.
 
     Returns a `TuningRun` whose result is the MPC problem. Computes in float64. The fraction is
-    smoothed and sampled: prove what was gained by `map_feasible_set`, before and after. Numbers of
+    smoothed and sampled: check the result by `map_feasible_set`, before and after. Numbers of
     the history: fraction, and design, the design loss. Raises ValueError for what does not fit
     together, before any compile.
     """

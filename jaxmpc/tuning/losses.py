@@ -1,4 +1,4 @@
-"""ClosedLoopLoss: what a closed loop costs, as one number with a derivative."""
+"""ClosedLoopLoss: the cost of a closed loop, as a differentiable number."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -22,11 +22,11 @@ class ClosedLoopLoss:
         (1/T) Σ_{t<T} [ e_t'Q e_t + v_t'R v_t ] + violation·(1/T) Σ_{t≤T} Σ_i excess_i(x_t)
         + settling·(time to settle),    e_t = x_t − r_t,  v_t = u_t − s_t.
 
-    Its Q (n, n) and R (m, m), or their diagonals, are fixed: those of the controller, which
+    Q (n, n) and R (m, m), or their diagonals, are fixed: the controller's own weights, which
     `Run.stage_cost` uses, would be driven to zero. reference r, input_reference s: (n,) and (m,),
     or with at least T rows; None for zero. limits: Box or Polytope of x; excess_i is by how much
-    row i is exceeded, in its unit, of a Box as a fraction of its half-width (1 where infinite).
-    Its weight acts as an exact penalty: with enough of it limits are kept wherever they can be.
+    row i is violated, in its unit, of a Box as a fraction of its half-width (1 where infinite).
+    The term is an exact penalty: with a large enough weight limits are kept wherever they can be.
 
     Time to settle, in samples: the number of t after which the loop is still once outside the band
     |e_i| ≤ band_i. With d_t = max_i |e_i|/band_i it counts Σ_t (1 − Π_{s≥t} σ((1 − d_s)/softness)),
@@ -82,13 +82,13 @@ class ClosedLoopLoss:
         return total
 
     def excess(self, x: Array) -> Array:
-        """Return by how much the states x (T+1, n) exceed each row of the limits, (T+1, rows)."""
+        """Return by how much the states x (T+1, n) violate each row of the limits, (T+1, rows)."""
         limits = jax.tree.map(lambda v: jnp.asarray(v, x.dtype), self.limits)
         size = self.limits.half_widths() if isinstance(self.limits, Box) else 1.0
-        return violation.excess(limits, x) / jnp.asarray(size, x.dtype)
+        return violation.row_violations(limits, x) / jnp.asarray(size, x.dtype)
 
     def worst(self, run: Run) -> Array:
-        """Return the largest excess of a run."""
+        """Return the largest violation of a run."""
         return jnp.max(self.excess(self._coordinates(run)))
 
     def _coordinates(self, run: Run) -> Array:

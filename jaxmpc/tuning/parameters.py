@@ -1,4 +1,4 @@
-"""Parameters: numbers and matrices that stay in their domain whatever the optimiser does.
+"""Parameters: numbers and matrices that stay in their domain for any step of the optimiser.
 
 An optimiser moves free real numbers θ; `values` maps them to what the problem takes:
 
@@ -9,7 +9,7 @@ An optimiser moves free real numbers θ; `values` maps them to what the problem 
     definite   V = L L', L lower triangular with θ below and exp(θ) on the diagonal: every
                symmetric positive definite V has exactly one such L (Golub & Van Loan 2013, §4.2.3)
 
-so that a step of θ is a relative change of a weight, whatever its units.
+so that a step of θ is a relative change of a weight, independent of its units.
 """
 
 from collections.abc import Mapping
@@ -29,13 +29,13 @@ DOMAINS = ("real", "positive", "interval", "diagonal", "definite")
 
 @dataclass(frozen=True, eq=False)
 class Parameter:
-    """One quantity to tune: where it starts, where it may go, which of its entries move.
+    """One quantity to tune: its initial value, its domain, and which of its entries are trained.
 
     value: a number or an array; for "diagonal" and "definite" a matrix (n, n), for "diagonal" also
     its diagonal (n,). domain: see above. lower, upper: ends of an "interval", numbers or arrays of
     the value's shape. train: True, False, or a mask of the shape of what is free: of value itself,
     of the diagonal (n,) for "diagonal", of L (n, n) for "definite" (its upper triangle does not
-    count). Entries not trained keep their value, but for rounding. Raises ValueError for values
+    count). Entries not trained keep their value, up to rounding. Raises ValueError for values
     outside the domain.
     """
 
@@ -95,7 +95,7 @@ class Parameter:
         return value
 
     def record(self) -> dict[str, Any]:
-        """Return what decides the map from θ, as JSON data."""
+        """Return the map from θ to the value, as JSON data."""
         ends = [
             None if end is None else np.asarray(end).tolist() for end in (self.lower, self.upper)
         ]
@@ -109,7 +109,8 @@ class Parameter:
         return self._free(self.value)[self.train]
 
     def at(self, raw: Any) -> Array:
-        """Return the value where the trained entries have the θ (k,). Traceable."""
+        """Return the value where the trained entries have the θ (k,). Works inside jit, vmap and
+        grad."""
         raw = jnp.asarray(raw)
         theta = jnp.asarray(self._free(self.value), raw.dtype).at[self.train].set(raw)
         if self.domain == "positive":
@@ -146,18 +147,18 @@ def raw(parameters: Parameters) -> dict[str, np.ndarray]:
 
 
 def values(parameters: Parameters, theta: Mapping[str, Any]) -> dict[str, Array]:
-    """Return the values at θ. Traceable."""
+    """Return the values at θ. Works inside jit, vmap and grad."""
     return {name: parameter.at(theta[name]) for name, parameter in parameters.items()}
 
 
 def exact_values(parameters: Parameters, theta: Any) -> dict[str, np.ndarray]:
-    """Return the values at θ in float64, on the host."""
+    """Return the values at θ as float64 NumPy arrays."""
     with jax.enable_x64(True):
         return jax.tree.map(np.asarray, values(parameters, theta))
 
 
 def trajectory(parameters: Parameters, thetas: Any) -> dict[str, np.ndarray]:
-    """Return the values at each of T points θ, leaves (T, …), in float64, on the host."""
+    """Return the values at each of T points θ, leaves (T, …), as float64 NumPy arrays."""
     with jax.enable_x64(True):
         found = jax.vmap(partial(values, parameters))(jax.tree.map(jnp.asarray, thetas))
         return jax.tree.map(np.asarray, found)

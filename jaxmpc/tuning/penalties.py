@@ -29,7 +29,7 @@ from jaxmpc.tuning.penalty_schedule import KNOTS, interpolation
 from jaxmpc.tuning.result import TuningRun, cached
 from jaxmpc.tuning.settings import Settings
 
-# Of the algorithm: results that an older version cached are not used.
+# Version of the algorithm: results that an older version cached are not used.
 VERSION = 2
 # Constant penalties that are tried as a start, with this over-relaxation.
 CONSTANTS, ALPHA = np.logspace(-2, 2, 9), 1.6
@@ -47,10 +47,10 @@ def tune_penalties(
 
     x0s (B, n), or (B, n + m) with the previous inputs where these count: states such as the
         controller will meet; a few hundred to a few thousand. Those proved infeasible are left out.
-    stages: the schedule has so many penalties a row, each for iterations/stages steps.
+    stages: number of penalties of each row in the schedule, each for iterations/stages steps.
     groups: "step": rows of a kind share 5 values along the horizon, linear between them; "row":
         each row has its own.
-    solver: what the result is compared with, and where refine, eps and so on come from; both are
+    solver: the solver that the result is compared with, and the source of refine, eps and so on;
         tuned and compared without Newton steps. None: ADMM(refine=0).
     warm_start: (z (B, nz), y (B, rows)) or plans of all states, to tune for warm starts.
     reference, input_reference: to track, as in `solve`, one for all.
@@ -90,7 +90,7 @@ def tune_penalties(
 
     def tune() -> TuningRun:
         with jax.enable_x64(True):
-            return search(objective, train, test, given, stages, chosen, decides)
+            return tune_schedule(objective, train, test, given, stages, chosen, decides)
 
     run = cached(cache, decides, chosen, partial(_with_values, given), tune)
     if not run.improved:
@@ -101,7 +101,7 @@ def tune_penalties(
     return run
 
 
-def search(
+def tune_schedule(
     objective: PenaltyObjective, train: Samples, test: Samples, given: ADMM, stages: int,
     settings: Settings, decides: dict[str, Any],
 ) -> TuningRun:  # fmt: skip
@@ -114,7 +114,7 @@ def search(
         count = stages if len(rho) == 1 else len(rho)
         return solve_samples(np.broadcast_to(rho, (count, rows)), alpha, objective, samples, chunk)
 
-    # Infeasible states teach nothing. What proves one so, holds whatever rho was.
+    # Infeasible states are left out; a proof of infeasibility holds for any rho.
     tried = [measure(rho, ALPHA, test) for rho in CONSTANTS]
     infeasible = np.any([status == Status.PRIMAL_INFEASIBLE for status, _ in tried], axis=0)
     if infeasible.all():
@@ -122,11 +122,11 @@ def search(
     test = test.take(~infeasible)
     scores = [score(status[~infeasible], worst[~infeasible]) for status, worst in tried]
     constant = CONSTANTS[int(np.argmin([found["loss"] for found in scores]))]
-    no_use = measure(constant, ALPHA, train)[0] == Status.PRIMAL_INFEASIBLE
-    if no_use.all():
+    excluded = measure(constant, ALPHA, train)[0] == Status.PRIMAL_INFEASIBLE
+    if excluded.all():
         fail("x0s", "all states are infeasible", "Give states that can be controlled")
-    train = train.take(~no_use)
-    left_out = {"infeasible": float(infeasible.sum() + no_use.sum())}
+    train = train.take(~excluded)
+    left_out = {"infeasible": float(infeasible.sum() + excluded.sum())}
 
     theta = {
         "log_rho": np.full((stages, parameters), np.log(constant)),
@@ -164,10 +164,12 @@ def _values(theta: Any, W: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _with_values(solver: ADMM, values: Any) -> ADMM:
+    """Return the solver with rho and alpha of `values`."""
     return replace(solver, rho=np.asarray(values["rho"]), alpha=float(values["alpha"]))
 
 
 def _knots(mpc: MPC) -> int:
+    """Return the number of knots along the horizon, at most one a step."""
     return min(KNOTS, mpc.horizon + 1)
 
 

@@ -5,11 +5,11 @@ is minimised is a smooth count of the sampled states that it leaves unsolved,
 
     mean over states of softplus(2 (e + margin)) / 2,    e = log10 |residuals / tolerances|,
 
-the residuals being those that the status is made of. A state that is solved counts for nothing, a
-state far from it for the digits that are missing. (Learning to optimise by unrolling: Gregor,
+with the residuals by which the status is decided. A solved state counts almost nothing, another one
+the number of digits that are missing. (Learning to optimise by unrolling: Gregor,
 LeCun 2010; penalties of ADMM for QPs: Ichnowski et al. 2021, by reinforcement; Stellato et al.
-2020, §5.2, adapt one number while iterating.) Whatever rho is, the fixed points of the
-iteration are the solutions: a bad rho costs steps, it cannot make an answer wrong.
+2020, §5.2, adapt one number while iterating.) For every rho the fixed points of the
+iteration are the solutions: a bad rho costs steps but cannot make a solution wrong.
 """
 
 from dataclasses import dataclass, replace
@@ -51,7 +51,7 @@ class Samples:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PenaltyObjective:
-    """What the penalties are tuned for: a problem, its references, and an iteration.
+    """The problem, references and iteration for which penalties are tuned.
 
     W: from `interpolation`. solver: its iterations, eps and smoothing are used.
     """
@@ -93,7 +93,7 @@ class PenaltyObjective:
 @jax.jit
 @jax.value_and_grad
 def loss_and_gradient(theta: Any, objective: PenaltyObjective, samples: Samples) -> Array:
-    """Return the number that is minimised over θ, see above, and its gradient."""
+    """Return the objective of the module's docstring at θ, and its gradient."""
     e = objective.digits(theta, samples)
     return jnp.mean(jax.nn.softplus(2 * (e + MARGIN)) / 2)
 
@@ -108,7 +108,7 @@ def solve_samples(
     parts = []
     for i in range(0, len(samples), chunk):
         part = samples.take(slice(i, i + chunk))
-        found = _solve(
+        found = _solve_batch(
             jnp.asarray(rho), jnp.asarray(alpha, float), objective,
             jax.tree.map(lambda v: padded(v, chunk), part),
         )  # fmt: skip
@@ -118,9 +118,10 @@ def solve_samples(
 
 
 @jax.jit
-def _solve(
+def _solve_batch(
     rho: Array, alpha: Array, objective: PenaltyObjective, samples: Samples
 ) -> tuple[Array, Array]:  # fmt: skip
+    """Return status and largest residual (B,) of a batch, in JAX."""
     c, solver = objective.condensed, replace(objective.solver, rho=rho, alpha=alpha)
     made = factor(c.P, c.C, solver, c.balls)
 

@@ -24,8 +24,8 @@ def interpolation(
     """Return W (rows, parameters): log rho = W θ.
 
     groups "row": one parameter a row. "step": for each row of a block `knots` values at k/N in
-    [0, 1], linear between them; one value where a block has one step. The rows of a ball share
-    theirs, since it stays a ball only so; the last len(balls) blocks are balls.
+    [0, 1], linear between them; one value where a block has one step. The rows of a ball have the
+    same values, so that it stays a ball; the last len(balls) blocks are balls.
     """
     columns: list[np.ndarray] = []
     for i, (_, steps, size) in enumerate(blocks):
@@ -51,28 +51,28 @@ def transfer_penalties(run: TuningRun, mpc: MPC, iterations: int | None = None) 
 
     run: of groups="step", unless mpc has the very rows of the problem tuned. Its penalties are
     interpolated at k/N. mpc: a problem with the same blocks of rows. iterations: None for those
-    tuned with; the stages divide them evenly. Nothing is promised of the other problem: its
-    status says which states are solved. Where nothing better was found it is the solver that was
-    given. Raises ValueError for a problem with other blocks.
+    tuned with, divided evenly among the stages. How many states of the other problem it solves is
+    not guaranteed; its status tells. Where nothing better was found the given solver is returned.
+    Raises ValueError for a problem with other blocks.
     """
     mpc.validate()
-    solver, said = run.solver, run.settings
+    solver, settings = run.solver, run.settings
     rho = np.asarray(solver.rho)
     if run.improved:
         with jax.enable_x64(True):
             c = condense(in_float64(mpc))
-        blocks = tuple((kind, tuple(steps), size) for kind, steps, size in said["blocks"])
-        if said["groups"] == "row" and c.layout != blocks:
+        blocks = tuple((kind, tuple(steps), size) for kind, steps, size in settings["blocks"])
+        if settings["groups"] == "row" and c.layout != blocks:
             fail("mpc", "has other rows than the problem tuned", 'Use groups="step"')
         kinds = lambda blocks: [(kind, size) for kind, _, size in blocks]
-        if kinds(c.layout) != kinds(blocks) or len(c.balls) != len(said["balls"]):
+        if kinds(c.layout) != kinds(blocks) or len(c.balls) != len(settings["balls"]):
             fail("mpc", f"blocks {kinds(c.layout)}", f"Needed: {kinds(blocks)}")
         if c.layout != blocks:
-            shape = lambda blocks, N: interpolation("step", blocks, N, c.balls, said["knots"])
-            old, new = shape(blocks, said["horizon"]), shape(c.layout, mpc.horizon)
+            shape = lambda blocks, N: interpolation("step", blocks, N, c.balls, settings["knots"])
+            old, new = shape(blocks, settings["horizon"]), shape(c.layout, mpc.horizon)
             if old.shape[1] != new.shape[1]:
                 fail("mpc", "has blocks of one step, or more where one was", "Tune it anew")
-            # A parameter that no row feels takes the mean of the others.
+            # A parameter that no row depends on takes the mean of the others.
             mean = np.mean(np.log(rho), axis=1, keepdims=True)
             theta = np.linalg.lstsq(old, (np.log(rho) - mean).T, rcond=None)[0]
             rho = np.exp(mean + theta.T @ new.T)

@@ -1,4 +1,4 @@
-"""TuningRun: what every tuner returns, and how it is kept in a cache."""
+"""TuningRun: the result of every tuner, and its cache."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -18,15 +18,14 @@ from jaxmpc.tuning.settings import Settings
 
 @dataclass(frozen=True, eq=False)
 class TuningRun:
-    """What a tuner found: the values that do best on the validation set.
+    """The result of a tuner: the values with the least loss on the validation set.
 
-    values, initial: name → array, the best values and those given; the latter too where no step
-        is better.
+    values, initial: name → array, the best values and those given; equal where no step is better.
     before, after: name → number, measured on the validation set with `initial` and `values`:
         "loss", and the numbers that the tuner documents.
     improved: whether a step is better than what was given.
-    settings: what was asked, JSON data.
-    build: values → what was tuned.
+    settings: the settings of the run, JSON data.
+    build: values → the tuned object (controller, MPC, ADMM or penalties).
     history: record of every step (`Descent`); None where the run comes from a cache.
     trace: name → values at every step (T + 1, …); empty where the run comes from a cache.
     """
@@ -61,7 +60,7 @@ class TuningRun:
 
     @property
     def result(self) -> Any:
-        """Return what was tuned, with the values found.
+        """Return the tuned object, with the values found.
 
         From `tune_weights` a controller, from `tune_feasible_set` an MPC, from `tune_penalties`
         an ADMM, from `tune_sweep_penalties` the penalties for `map_feasible_set`.
@@ -87,7 +86,7 @@ class TuningRun:
         return float((first - best) / abs(first)) if first else 0.0
 
     def record(self) -> dict[str, Any]:
-        """Return all of it as JSON data: settings, values, and the numbers of every step."""
+        """Return the run as JSON data: settings, values, and the numbers of every step."""
         listed = lambda tree: {name: np.asarray(v).tolist() for name, v in tree.items()}
         column = lambda v: [float(x) if np.isfinite(x) else None for x in v]
         found = {

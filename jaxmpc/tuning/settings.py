@@ -13,16 +13,16 @@ from jaxmpc.checks import fail, whole
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """How a tuner searches.
+    """Settings of the descent of a tuner.
 
     updates: number of steps of the optimiser.
     optimizer: from optax; None: Adam, with the step size that suits what is tuned.
-    batch: number of samples of each step, drawn anew; None: all.
-    validation: fraction of the samples that are set apart to choose the best step, or samples of
-        their own.
+    batch: number of samples of each step, drawn again each time; None: all.
+    validation: fraction of the samples in the validation set, by which the best step is chosen, or
+        the samples of this set themselves.
     seed: of batches and of the validation set.
-    checkpoint: file (.npz) that is replaced after every step. Where it exists the run goes on from
-        it, and ends where it would have ended; it must be a checkpoint of the same run.
+    checkpoint: file (.npz) that is replaced after every step. Where it exists the run resumes from
+        it, with the same result as without interruption; it must be of the same run.
     progress: show a progress bar.
     """
 

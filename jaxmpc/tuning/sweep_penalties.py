@@ -1,16 +1,15 @@
 """tune_sweep_penalties: penalties with which ADMM decides more states of a feasible-set map.
 
 The first stage of `map_feasible_set` (`feasible/candidates.py`) is an ADMM without cost; its
-penalties are weights of the rows. What is minimised here is how far its answers are from being
-proofs,
+penalties are weights of the rows. The objective is how far its results are from being proofs,
 
     mean over states of log10(1 + shortfall / FLOOR),
 
 where the shortfall of a feasible state is the largest violation (normalised rows) of the plan that
 the stage ends with, and of an infeasible one how far the half-space of its multipliers is from
-excluding the state. The states come labelled by the whole cascade of stages; half of each batch are
-those that the first stage leaves open. Proofs decide labels with any penalties: these only change
-which stage decides.
+excluding the state. The states are labelled by the whole cascade of stages; half of each batch are
+those that the first stage leaves undecided. Labels rest on proofs with any penalties, which only
+change the stage that decides.
 """
 
 from dataclasses import dataclass
@@ -46,7 +45,7 @@ from jaxmpc.tuning.descent import descend
 from jaxmpc.tuning.result import TuningRun, cached
 from jaxmpc.tuning.settings import Settings
 
-# Of the algorithm: results that an older version cached are not used.
+# Version of the algorithm: results that an older version cached are not used.
 VERSION = 2
 # In normalised rows; iterates in float32 end near 1e-5.
 FLOOR = 1e-4
@@ -98,7 +97,7 @@ def tune_sweep_penalties(
     def tune() -> TuningRun:
         labelled = map_points(feasibility, train, iterations=iterations, dtype=dtype, chunk=chunk)
         with jax.enable_x64(True):
-            return search(stage, train, labelled.label, test, chosen, decides)
+            return tune_row_weights(stage, train, labelled.label, test, chosen, decides)
 
     return cached(cache, decides, chosen, _penalties, tune)
 
@@ -130,7 +129,7 @@ class Stage:
         return W[:, : R - balls + 1] if balls else W
 
 
-def search(
+def tune_row_weights(
     stage: Stage, train: np.ndarray, label: np.ndarray, test: np.ndarray, settings: Settings,
     decides: dict[str, Any],
 ) -> TuningRun:  # fmt: skip
@@ -155,7 +154,7 @@ def search(
         rng = np.random.default_rng((settings.seed, step))
         half = batch // 2
         chosen = np.concatenate([rng.choice(hard, half), rng.choice(known, batch - half)])
-        value, slope = loss_and_gradient(
+        value, slope = sweep_loss_and_gradient(
             theta, W, stage.problem, stage.rows, train[chosen], label[chosen], stage.iterations
         )
         return float(value), jax.tree.map(np.asarray, slope), {}
@@ -177,6 +176,7 @@ def search(
 
 
 def _penalties(values: Any) -> StagePenalties:
+    """Return the penalties with weight and alpha of `values`."""
     return StagePenalties(np.asarray(values["weight"]), float(values["alpha"]))
 
 
@@ -184,7 +184,7 @@ def shortfall(
     problem: ExactData, rows: ConstraintRows, theta: Array, label: Array, weight: Array,
     alpha: Array, iterations: int,
 ) -> Array:  # fmt: skip
-    """Return how far the stage's answer at θ is from a proof of its label; ≤ 0: none is missing."""
+    """Return how far the stage's result at θ is from a proof of the label; ≤ 0: it is a proof."""
     U, bounds = jnp.asarray(rows.U), rows.bounds(theta)
     A = weight[:, None] * U
     pseudoinverse = linalg.solve(matmul(A.T, A), A.T)
@@ -216,11 +216,11 @@ def shortfall(
 
 @partial(jax.jit, static_argnums=6)
 @jax.value_and_grad
-def loss_and_gradient(
+def sweep_loss_and_gradient(
     theta: Any, W: Array, problem: ExactData, rows: ConstraintRows, x: Array, label: Array,
     iterations: int,
 ) -> Array:  # fmt: skip
-    """Return the number that is minimised, see above, and its gradient."""
+    """Return the objective of the module's docstring at θ, and its gradient."""
     weight, alpha = jnp.exp(W @ theta["weight"]), 2 * jax.nn.sigmoid(theta["alpha"])
     missing = jax.vmap(
         lambda x, label: shortfall(problem, rows, x, label, weight, alpha, iterations)

@@ -1,4 +1,4 @@
-"""tune_weights: the numbers of an MPC problem by gradient through its closed loops."""
+"""tune_weights: tune parameters of an MPC problem by gradients through its closed loops."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -9,6 +9,7 @@ import numpy as np
 import optax
 
 from jaxmpc.checks import fail, whole
+from jaxmpc.closed_loop.robot_controller import SOLVER
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.closed_loop.simulate_many import as_argument, require_variations
 from jaxmpc.compiled import Compiled
@@ -29,8 +30,6 @@ from jaxmpc.tuning.parameters import Parameters, raw, require_parameters
 from jaxmpc.tuning.result import TuningRun
 from jaxmpc.tuning.settings import Settings
 
-SOLVER = ADMM(iterations=50, rho=1.0, alpha=1.6, refine=20)
-
 
 def tune_weights(
     make_mpc: Callable[[Mapping[str, Any]], Any], parameters: Parameters, plant: Any, x0s: Any,
@@ -44,27 +43,28 @@ def tune_weights(
         min_θ  mean_i loss(run_i(θ)) + design_loss(mpc(θ)),   run_i from x0s[i], T = steps samples
 
     The derivative goes through plant, solver (`ADMM.differentiate`) and all samples. It is finite
-    whatever becomes of single plans: an infeasible QP has the derivative of the closest feasible
-    one, a robot's MPC is soft; both are counted in the history.
+    even where single plans fail: an infeasible QP has the derivative of the closest feasible one,
+    and a robot's MPC is soft; the history counts both.
 
     Arguments:
         make_mpc: name → value of all parameters to an MPC (then driven by `Controller` with
-            `solver`) or to a controller, such as RobotController. It is traced: make what needs
-            the host (`robot_mpc`) outside, and put values in by `dataclasses.replace`. Any field
-            of MPC can depend on them, and `jm.lqr` inside has a derivative.
+            `solver`) or to a controller, such as RobotController. It is traced: compute what is
+            not traceable (`robot_mpc`) outside, and put values in by `dataclasses.replace`. Any
+            field of MPC can depend on them, and `jm.lqr` is differentiable inside.
         parameters: name → `Parameter`.
         plant: as in `simulate`. x0s (B, n): initial states. variations: as in `simulate_many`,
-            each (B, …): numbers of the plant of which the controller knows nothing.
+            each (B, …): parameters of the plant that the controller does not know.
         loss: of one run. None: `ClosedLoopLoss` with Q, R and state limits of the problem at the
-            start. Not `run.stage_cost`: it is weighed by the very Q and R that are tuned.
+            start. Do not use `run.stage_cost`: its weights are the Q and R that are tuned.
         reference, input_reference: as in `simulate`, or functions of the values.
-        solver: None for 50 ADMM steps and 3 Newton steps.
+        solver: None for 50 ADMM steps and at most 20 Newton steps.
         design_loss: of the problem alone, such as the `feasible_fraction` of sample states.
         mode: "forward" (cost grows with the number of parameters, memory does not), "reverse"
-            (the other way round; samples are computed twice where memory asks for it), "auto":
-            both are timed on the first step's data where there are at most 32 parameters.
+            (memory grows with the number of samples; they are computed twice if it does not
+            suffice), "auto": both are timed on the first step's data where there are at most 32
+            parameters.
         settings: of `Settings`, as updates=20, batch=64. optimizer None: Adam of 0.05, which
-            moves a weight by 5 % a step. validation: initial states of its own have no variations
+            moves a weight by 5 % a step. validation: given initial states have no variations
             unless they are a pair of states and variations. A checkpoint must be of the same run:
             parameters and data are compared, and the loss at the start is computed again.
 
@@ -73,7 +73,7 @@ def tune_weights(
 
         unsolved    fraction of plans that are not SOLVED, infeasible ones and others
         infeasible  fraction of plans proved infeasible
-        fallback    fraction of plans that break soft rows
+        fallback    fraction of plans that violate soft rows
         violation   fraction of loops that leave the limits of a ClosedLoopLoss (of another loss:
                     the controller's own) by more than `violation.TOLERANCE`
         excluded    loops left out because their loss was not finite
@@ -117,7 +117,7 @@ def tune_weights(
         rows = chosen.minibatch(len(train[0]), step)
         return jax.tree.map(lambda v: v[rows], train)
 
-    gradients: list[tuple[str, Callable]] = []  # the mode chosen, once a step is asked for
+    gradients: list[tuple[str, Callable]] = []  # filled with the chosen mode at the first step
     evaluate = Compiled(jax.jit(objective.total))
     sound: list[np.ndarray] = []  # of the validation loops, those finite at the start
 

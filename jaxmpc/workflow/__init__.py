@@ -1,8 +1,8 @@
 """From limits to a tested controller.
 
 Design: `design` chooses terminal set, terminal cost and penalties, and returns a `Design`.
-Test: `offline_report` collects in an `OfflineReport` what is proved, what was only tried, and what
-fails; its `NominalLoops` are closed loops that were simulated.
+Test: `offline_report` collects proofs, simulations and failed hypotheses in an `OfflineReport`; its
+`NominalLoops` are the closed loops that were simulated.
 """
 
 from jaxmpc.workflow.controller_design import Design, design

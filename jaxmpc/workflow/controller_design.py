@@ -21,8 +21,8 @@ from jaxmpc.workflow.offline_test import OfflineReport, offline_report
 class Design:
     """The result of `design`.
 
-    mpc: the problem. regulator: the LQR law that its terminal ingredients rest on. penalty: the
-    exact penalty, where one was asked for.
+    mpc: the problem. regulator: the LQR of its terminal cost and set. penalty: the exact penalty
+    where soft="exact", else None.
     """
 
     mpc: MPC

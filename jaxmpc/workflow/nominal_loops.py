@@ -20,13 +20,13 @@ ROUNDING = 1e-7
 
 @dataclass(frozen=True)
 class NominalLoops:
-    """What nominal closed loops from sampled feasible states came to.
+    """The results of nominal closed loops from sampled feasible states.
 
-    starts (B, n). steps: samples of each loop. feasible: how many kept every plan SOLVED; the rest
-    is of these. violation: the worst of the state limits, in their units. slack: the worst
-    violation of soft rows. increase: the largest V(x⁺) − V(x) + x'Qx + u'Ru relative to V(x);
-    worst_start: the start of the loop in which it was met. left: largest |x_T| of a loop, relative
-    to the largest of its start, each state in units of its size among the starts.
+    starts (B, n). steps: samples of each loop. feasible: number of loops whose plans were all
+    SOLVED; the other fields are of these. violation: the worst of the state limits, in their units.
+    slack: the worst violation of soft rows. increase: the largest V(x⁺) − V(x) + x'Qx + u'Ru
+    relative to V(x); worst_start: the start of the loop in which it was met. left: largest |x_T| of
+    a loop, relative to the largest of its start, each state in units of its size among the starts.
     """
 
     starts: np.ndarray

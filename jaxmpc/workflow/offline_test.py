@@ -1,11 +1,11 @@
-"""The test of an MPC problem before it runs: what is proved, what was only tried, what fails."""
+"""The test of an MPC problem before it runs: proofs, simulations, and failed hypotheses."""
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, whole
 from jaxmpc.control.sets import Box
 from jaxmpc.control.terminal import TerminalReport, verify_terminal
 from jaxmpc.explicit.exact_penalty import ExactPenalty, exact_penalty
@@ -23,7 +23,7 @@ from jaxmpc.workflow.nominal_loops import NominalLoops, nominal_loops
 
 @dataclass(frozen=True)
 class OfflineReport:
-    """What is known of an MPC problem before it runs, for `print`.
+    """Everything that is known of an MPC problem before it runs; `print` shows it.
 
     feasible_set: map of initial states with proofs, of the problem with its soft rows hard; volume:
     lower and upper bound of its volume. recursion, penalty, terminal: the reports of
@@ -74,7 +74,7 @@ def offline_report(
     mpc: MPC, x0s: Any = None, *, K: Any = None, steps: int = 50, loops: int = 128,
     seconds: float = 60.0,
 ) -> OfflineReport:  # fmt: skip
-    """Test an MPC problem before its controller runs, and return what is known as one report.
+    """Test an MPC problem before its controller runs, and return one report.
 
     Covers the feasible set and its volume, recursive feasibility, the exact penalty, every
     hypothesis of the terminal theorems, and `loops` nominal closed loops of `steps` samples from
@@ -87,13 +87,12 @@ def offline_report(
         K: terminal law to verify, (m, n); None: that of the LQR.
         seconds: about how long the search for counterexamples may take.
 
-    Raises ValueError for an ill-posed problem, and where x0s is None and the feasible set is
-    empty, flat or unbounded. Host; proofs in float64.
+    Raises ValueError for an ill-posed problem, and where x0s is None and the feasible set is empty,
+    flat or unbounded. NumPy; not traceable. Proofs are in float64.
     """
     mpc.validate()
     for name, value, least in (("steps", steps, 2), ("loops", loops, 1)):
-        if not isinstance(value, int | np.integer) or value < least:
-            fail(name, f"{value!r}", f"Give a whole number, at least {least}")
+        whole(name, value, least)
     if not seconds > 0:
         fail("seconds", f"{seconds!r}", "Give a positive number")
     hard = harden(mpc)
@@ -161,7 +160,7 @@ def samples(mpc: MPC, d: int) -> np.ndarray:
         return grid(lower - margin, upper + margin, ({1: 256, 2: 48, 3: 14}[d],) * d)
     rng = np.random.default_rng(0)
     centre, reach = edges.center, np.nanmax(np.abs(edges.points - edges.center), axis=0)
-    # Uniform in the box would hardly meet the set in many dimensions: half of it shrinks.
+    # Uniform samples of the box hardly meet the set in many dimensions: half of them are shrunk.
     shrink = np.where(np.arange(2048) % 2, 1.0, rng.uniform(0, 1, 2048))[:, None]
     return centre + shrink * rng.uniform(-1, 1, (2048, d)) * reach
 

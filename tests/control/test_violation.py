@@ -1,4 +1,4 @@
-"""By how much limits are exceeded: Box, Polytope and rows, NumPy and JAX, NaN and infinity."""
+"""By how much limits are violated: Box, Polytope and rows, NumPy and JAX, NaN and infinity."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.control.violation import TOLERANCE, excess, kept, worst_excess
+from jaxmpc.control.violation import TOLERANCE, kept, row_violations, worst_violation
 
 INF = np.inf
 BOX = jm.Box(np.array([-1.0, -INF]), np.array([2.0, 3.0]))
@@ -16,31 +16,31 @@ EXPECTED = np.array([[0, 0], [0.5, 0.25], [0, 0], [np.nan, 0], [0, np.nan]])
 
 @pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
 def test_box(array):
-    found = excess(BOX, array(POINTS))
+    found = row_violations(BOX, array(POINTS))
     assert isinstance(found, jax.Array) == (array is jnp.asarray)
     np.testing.assert_array_equal(found, EXPECTED)
-    np.testing.assert_array_equal(worst_excess(BOX, array(POINTS)), [0, 0.5, 0, np.nan, np.nan])
+    np.testing.assert_array_equal(worst_violation(BOX, array(POINTS)), [0, 0.5, 0, np.nan, np.nan])
     np.testing.assert_array_equal(kept(BOX, array(POINTS)), EXPECTED == 0)
 
 
 @pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
 def test_polytope_and_rows(array):
-    """The same limits in three ways: their largest excess is the same."""
+    """The same limits in three ways: their largest violation is the same."""
     body, rows = BOX.to_polytope(), BOX.rows()
     for limits in (body, rows):
         np.testing.assert_array_equal(
-            worst_excess(limits, array(POINTS)), worst_excess(BOX, array(POINTS))
+            worst_violation(limits, array(POINTS)), worst_violation(BOX, array(POINTS))
         )
         np.testing.assert_array_equal(
             kept(limits, array(POINTS)).all(axis=-1), [True, False, True, False, False]
         )
     slanted = jm.Polytope(np.array([[3.0, 4.0]]), np.array([5.0]))
-    assert excess(slanted, array([1.0, 1.0])) == 2.0
+    assert row_violations(slanted, array([1.0, 1.0])) == 2.0
 
 
 def test_no_limits():
-    assert excess(None, POINTS).shape == (5, 0)
-    np.testing.assert_array_equal(worst_excess(None, np.zeros((2, 3))), [0, 0])
+    assert row_violations(None, POINTS).shape == (5, 0)
+    np.testing.assert_array_equal(worst_violation(None, np.zeros((2, 3))), [0, 0])
     assert kept(None, np.zeros((2, 3))).all()
 
 
@@ -54,5 +54,5 @@ def test_tolerance_is_relative_above_one():
 
 def test_traced_limits():
     """Limits may be traced where points are not, and derivatives pass."""
-    slope = jax.jit(jax.grad(lambda end: worst_excess(jm.Box([-1.0], [end]), np.array([3.0]))))(2.0)
-    assert slope == -1.0
+    worst = lambda end: worst_violation(jm.Box([-1.0], [end]), np.array([3.0]))
+    assert jax.jit(jax.grad(worst))(2.0) == -1.0

@@ -40,7 +40,7 @@ def test_chunks_resume_and_open_in_xarray(tmp_path):
     group = open_store(path)
     assert store.pending(group) == [0, 1]
     store.commit(group, 0, **rows(4, 1))
-    data = store.read(path)
+    data = store.open_dataset(path)
     np.testing.assert_array_equal(data["label"], [1] * 4 + [0] * 4 + [-1] * 3)
     np.testing.assert_array_equal(data["points"], POINTS)
     assert data["plan"].dims == ("sample", "time", "input")
@@ -57,7 +57,7 @@ def test_bounds_are_kept_and_replaced(tmp_path):
     group = open_store(path)
     for count in (3, 5):
         store.save_bounds(group, np.ones((count, 2)), np.ones((4, 2)), np.arange(4.0))
-    data = store.read(path)
+    data = store.open_dataset(path)
     assert data["bound_point"].shape == (5, 2)
     assert data["bound_normal"].dims == ("facet", "coordinate")
     np.testing.assert_array_equal(data["bound_offset"], np.arange(4.0))
@@ -78,7 +78,7 @@ def test_what_is_no_store_is_refused_and_kept(tmp_path):
     folder = tmp_path / "photos"
     folder.mkdir()
     (folder / "precious").touch()
-    for call in (store.read, store.remove, open_store):
+    for call in (store.open_dataset, store.remove, open_store):
         with pytest.raises(ValueError, match="is no sweep store"):
             call(folder)
     assert (folder / "precious").exists()
@@ -123,7 +123,7 @@ def test_killed_writer_loses_no_committed_chunk(tmp_path):
             time.sleep(delay)
             writer.send_signal(signal.SIGKILL)
         assert writer.returncode == -signal.SIGKILL
-        data = store.read(path).load()
+        data = store.open_dataset(path).load()
         done = np.repeat(data["done"].values, 1000) == 1
         first = data["points"].values[:, 0]
         assert np.all(data["label"].values[done] == 1)
@@ -132,6 +132,6 @@ def test_killed_writer_loses_no_committed_chunk(tmp_path):
         assert 0 < np.count_nonzero(data["done"] == 0) <= left
         left = np.count_nonzero(data["done"] == 0)
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    data = store.read(path).load()
+    data = store.open_dataset(path).load()
     assert np.all(data["done"] == 1)
     np.testing.assert_array_equal(data["plan"][:, 2, 0], data["points"][:, 0])

@@ -324,7 +324,8 @@ def test_sweep_command_learns_and_its_labels_agree(tmp_path, monkeypatch, capsys
     assert "80.00% -> 90.00% decided" in capsys.readouterr().err
     assert asked[0][0] == tmp_path / "cache/jaxmpc/penalties" and asked[0][1]["iterations"] == 8
     labels = [
-        np.asarray(linear_sweep.store.read(tmp_path / k / "sweep.zarr")["label"]) for k in "ab"
+        np.asarray(linear_sweep.store.open_dataset(tmp_path / k / "sweep.zarr")["label"])
+        for k in "ab"
     ]
     both = (labels[0] != 0) & (labels[1] != 0)
     assert np.array_equal(labels[0][both], labels[1][both]) and both.mean() > 0.99

@@ -151,7 +151,7 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
 
     # Where nothing learned is better the words say so.
     default = replace(made[0], improved=False, build=lambda _: ADMM(refine=0))
-    table = rows(tune_penalties.TunePenalties().table(default, 4, 0, 1.0))
+    table = rows(tune_penalties.TunePenalties().report_text(default, 4, 0, 1.0))
     assert "the default is kept" in table["safeguard"]
 
 

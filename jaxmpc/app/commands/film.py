@@ -1,4 +1,4 @@
-"""The video of some of the robots."""
+"""The video of some of the robots in a simulation."""
 
 import os
 import sys
@@ -18,7 +18,7 @@ FRAME = 0.04
 def film(robot: Robot, run: Run, count: int, path: Path) -> bool:
     """Write a video of the first robots with finite states.
 
-    Returns False, with a line on stderr, where nothing can be drawn.
+    Returns False, and prints a line on stderr, where nothing can be drawn.
     """
     finite = np.flatnonzero(np.isfinite(run.states).all(axis=(1, 2)))[:count]
     every = max(1, round(FRAME / robot.dt))

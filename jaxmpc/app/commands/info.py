@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 from jaxmpc.app import config as configs
-from jaxmpc.app.commands.options import Horizon, Terminal, check_positive, option
+from jaxmpc.app.commands.options import Horizon, Terminal, check_positive, given_options, option
 from jaxmpc.workflow.offline_test import offline_report
 
 
@@ -32,8 +32,8 @@ class Info:
 
     How to read the output
       "proved" rests on linear programs or certificates with the tolerance that is named, "refuted"
-      on a counterexample; closed loops are tried, not proved. Nothing is written to disk.
-      Exit code  0 done, whatever the answers; 2 error (one line on stderr says which).
+      on a counterexample; closed loops are simulated, not proved. Nothing is written to disk.
+      Exit code  0 done, for any answers; 2 error (one line on stderr says which).
 
     What the TOML file holds
       The sections [system], [limits], [cost], [mpc] of jaxmpc sweep --help.
@@ -49,16 +49,14 @@ class Info:
     loops: Annotated[int, option("K", "128")] = 128
     """Number of the closed loops."""
     seconds: Annotated[float, option("S", "60")] = 60.0
-    """Time for the search for counterexamples; what is not settled by then is open."""
+    """Time limit of the search for counterexamples; claims not settled by then are open."""
 
     keeps = ""
 
     def run(self) -> None:
         """Print the report. Raises ValueError for options and files that make no sense."""
         check_positive(self, "steps", "loops", "seconds")
-        given = {"horizon": self.horizon, "terminal": self.terminal}
-        overrides = {key: value for key, value in given.items() if value is not None}
-        config = configs.load(self.config, overrides, "info")
+        config = configs.load(self.config, given_options(self, "horizon", "terminal"), "info")
         report = offline_report(
             config.build_controlled(), steps=self.steps, loops=self.loops, seconds=self.seconds
         )

@@ -1,4 +1,4 @@
-"""A sweep of a linear problem: states labelled chunk by chunk into a store, then map and table."""
+"""A sweep of a linear problem: label states chunk by chunk into a store, then map and table."""
 
 import dataclasses
 import os
@@ -40,7 +40,7 @@ STORED = {
 
 @dataclasses.dataclass(frozen=True)
 class LinearSweep:
-    """A sweep that is checked and open, before anything compiles."""
+    """A sweep whose options are checked and whose store is open; nothing is compiled yet."""
 
     config: Config
     mpc: MPC
@@ -51,7 +51,7 @@ class LinearSweep:
 
     @classmethod
     def open(cls, config: Config, output: Path, resume: bool, overwrite: bool) -> "LinearSweep":
-        """Open a new sweep, or one to go on with. Raises ValueError; compiles nothing."""
+        """Open a new sweep, or one to resume. Raises ValueError; compiles nothing."""
         mpc, region = config.build_mpc(), sweep_points(config)
         path = output / "sweep.zarr"
         check_results(path, resume, overwrite)
@@ -115,9 +115,9 @@ class LinearSweep:
         ], 12)  # fmt: skip
 
     def penalties(self) -> StagePenalties | None:
-        """Return penalties learned for the problem, or kept from an earlier run.
+        """Return penalties learned for the problem, or cached from an earlier run.
 
-        Raises ValueError for too few states, and where there is no folder to keep them in.
+        Raises ValueError for too few states, and where the cache folder cannot be written.
         """
         if not store.pending(self.group):
             return None

@@ -1,4 +1,4 @@
-"""What the commands share: options, their checks, opening of results, and one line for errors."""
+"""Options that several commands share, their checks, and helpers to open results and print."""
 
 import hashlib
 import sys
@@ -15,9 +15,9 @@ from jaxmpc.robots.robot import Robot
 
 
 def option(metavar: str | None, default: str, text: str | None = None) -> Any:
-    """Return how an option and its default appear in the help.
+    """Return the tyro annotation that sets how an option and its default appear in the help.
 
-    text: what it means, where that takes more than a line; else the string below the field.
+    text: its meaning, where that takes more than a line; else the string below the field.
     """
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})", help=text)
 
@@ -41,7 +41,7 @@ Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")]
 
 @dataclass
 class Timing:
-    """How much one process did, of a run that may have been resumed, and how long it took."""
+    """Work done by this process, in a run that may have been resumed, and the time it took (s)."""
 
     count: int = 0
     compile_seconds: float = 0.0
@@ -49,11 +49,25 @@ class Timing:
 
 
 def check_results(path: Path, resume: bool, overwrite: bool) -> None:
-    """Raise ValueError where `path` exists and the options don't say what becomes of it."""
+    """Raise ValueError where `path` exists and neither --resume nor --overwrite is given."""
     if resume and overwrite:
         fail("--overwrite", "given beside --resume", "Choose one")
     if path.exists() and not (resume or overwrite):
         fail(str(path), "exists", "Add --resume to go on with it or --overwrite to start again")
+
+
+def given_options(command: Any, *names: str) -> dict[str, Any]:
+    """Return those of the named options that are not None."""
+    options = {name: getattr(command, name) for name in names}
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def check_counts(command: Any, **least: int) -> None:
+    """Raise ValueError for an option that is given and below its least value."""
+    for name, lowest in least.items():
+        value = getattr(command, name)
+        if value is not None and value < lowest:
+            fail(f"--{name}", f"{value}", f"Give a whole number, at least {lowest}")
 
 
 def check_positive(command: Any, *names: str) -> None:
@@ -73,9 +87,9 @@ def refuse(given: dict[str, Any], robot: str | None, needs: str) -> None:
 
 
 def open_folder(path: Path, *files: str) -> None:
-    """Make the folder of --output, without these files of an earlier run.
+    """Create the folder of --output and remove these files of an earlier run.
 
-    Raises ValueError where nothing can be written there.
+    Raises ValueError where the folder cannot be written.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -99,7 +113,7 @@ def print_table(rows: list[tuple[str, Any]], width: int) -> None:
 
 
 def model_hash(robot: Robot) -> str:
-    """Return a hash of the compiled model, so that --resume notices a file that has changed."""
+    """Return a hash of the compiled model, by which --resume notices a changed file."""
     import mujoco
 
     binary = np.zeros(mujoco.mj_sizeModel(robot.mujoco), np.uint8)

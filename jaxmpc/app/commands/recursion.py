@@ -14,6 +14,7 @@ from jaxmpc.app.commands.options import (
     Switch,
     Terminal,
     check_positive,
+    given_options,
     open_folder,
     option,
     print_table,
@@ -62,14 +63,14 @@ class Recursion:
                       first move), next_state, lost_at (step at which the problem is proved
                       infeasible; 0 never, -1 infeasible at the start, -2 undecided), and
                       facet_normals, facet_offsets of X_N. Opens with numpy.load(path).
-      Exit code       0 done, whatever the answer; 2 error (one line on stderr says which); 130
+      Exit code       0 done, for any answer; 2 error (one line on stderr says which); 130
                       stopped by Ctrl-C (nothing is kept).
 
     With --robot NAME or FILE: the promise and the robot
       Such as jaxmpc recursion --robot pendulum --horizon 40 --steps 100
       As in jaxmpc sweep --help, with another promise: the linear closed loop has a plan at each
-      of --steps samples (of the robot's control period). The robot keeps it where its own loop
-      has: each plan solved without breaking a limit. Files as there; robot_map.png too.
+      of --steps samples (of the robot's control period). The robot keeps the promise where each
+      plan of its own loop is solved without violating a limit. Same files, and robot_map.png.
 
     What the TOML file holds
       The sections [system], [limits], [cost], [mpc] of jaxmpc sweep --help, and
@@ -113,7 +114,7 @@ class Recursion:
     overwrite: Switch = False
     """Replace the results in --output."""
     resume: Switch = False
-    """With --robot: go on with the map in --output."""
+    """With --robot: resume the map in --output."""
 
     @property
     def keeps(self) -> str:
@@ -133,8 +134,7 @@ class Recursion:
         given = {"axes": self.axes, "fixed": self.fixed, "resume": self.resume}
         refuse(given, None, "It is for maps of robots")
         keys = "horizon terminal steps grid lower upper regions seconds".split()
-        overrides = {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
-        config = configs.load(self.config, overrides, "recursion")
+        config = configs.load(self.config, given_options(self, *keys), "recursion")
         mpc, states, settings = config.build_mpc(), recursion_states(config), config.recursion
         there = [self.output / name for name in FILES if (self.output / name).exists()]
         if there and not self.overwrite:
@@ -150,7 +150,7 @@ class Recursion:
             least = smallest_horizon(
                 mpc, self.smallest, regions=settings.regions, seconds=settings.seconds
             )
-            rows.append(("smallest horizon", _sentence(least, self.smallest)))
+            rows.append(("smallest horizon", _horizon_text(least, self.smallest)))
         files = self.save(config, report, least)
         print(report)
         rows.append(("total", f"{time.perf_counter() - begun:.2f} s with set-up and files"))
@@ -208,7 +208,8 @@ class Recursion:
         return list(FILES)
 
 
-def _sentence(least: SmallestHorizon, limit: int) -> str:
+def _horizon_text(least: SmallestHorizon, limit: int) -> str:
+    """Return the smallest horizon with its reason, or that none up to `limit` is proved."""
     if least.horizon is None:
         return f"none up to {limit} is proved"
     strong = f"; strong from {least.strong}" if least.strong is not None else ""

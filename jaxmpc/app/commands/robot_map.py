@@ -1,4 +1,4 @@
-"""`--robot` of the commands sweep and recursion: a robot's map, kept chunk by chunk."""
+"""`--robot` of the commands sweep and recursion: a robot's map, stored chunk by chunk."""
 
 import time
 from collections.abc import Sequence
@@ -17,6 +17,7 @@ from jaxmpc.checks import fail
 from jaxmpc.closed_loop.robot_mpc import robot_mpc
 from jaxmpc.control.named_terminal import named_terminal_set
 from jaxmpc.control.riccati import lqr
+from jaxmpc.control.sets import translated
 from jaxmpc.feasible import store
 from jaxmpc.feasible.labels import ARRAYS, Labels
 from jaxmpc.feasible.map import grid
@@ -24,19 +25,19 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
 from jaxmpc.robot_maps.loops import RobotLoops
 from jaxmpc.robot_maps.robot_map import RobotMap
-from jaxmpc.robot_maps.set_point import deviations, moved
+from jaxmpc.robot_maps.set_point import deviations
 from jaxmpc.robot_maps.setting import RobotSetting
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import Robot
 from jaxmpc.runs import versions, write_arrays, write_json
 
-# Points along each of two axes, and in all along another number of them.
+# Points along each of two axes; total number of points for another number of axes.
 SIDE, POINTS = 32, 1024
 
 
 @dataclass(frozen=True)
 class RobotMapCommand:
-    """What to map, as the command line says it; None where it says nothing.
+    """What to map, from the command line; None for options that are not given.
 
     claim: as in `map_robot`, and so is search_seconds. axes: names or indices of coordinates;
     values: of the other coordinates, in their order. settings: iterations and dtype of the linear
@@ -77,7 +78,7 @@ class RobotMapCommand:
         print(f"  {'files':<16} {' '.join(str(self.output / name) for name in files)}")
 
     def prepare(self) -> tuple[RobotSetting, dict[str, Any], zarr.Group]:
-        """Return the checked map, what says which it is, and the opened store of its chunks."""
+        """Return the checked setting, its configuration (JSON data), and the opened store."""
         path = self.output / "robot_map.zarr"
         check_results(path, self.resume, self.overwrite)
         robot = load_robot(self.robot)
@@ -93,8 +94,8 @@ class RobotMapCommand:
         check_positive(self, "horizon", "steps", "seconds")
         if self.terminal == "ellipsoid":
             fail("--terminal", "ellipsoid: a robot's limits are soft rows", "Give invariant or box")
-        # From here on things compile.
-        fixed = _home(robot)
+        # The steps from here on compile programs.
+        fixed = _home_coordinates(robot)
         fixed[others] = fixed[others] if self.values is None else self.values
         mpc = default_mpc(robot, self.horizon or 20, self.terminal or "none")
         seconds = 2.0 if self.seconds is None else self.seconds
@@ -124,7 +125,7 @@ class RobotMapCommand:
             store.remove(path)
         shape = (robot.n, mpc.horizon, robot.m)
         chunk = setting.chunk(None)
-        group = store.open_store(path, setting.points, _fields(setting), config, chunk, shape)
+        group = store.open_store(path, setting.points, _map_fields(setting), config, chunk, shape)
         return setting, config, group
 
     def _points(self, robot: Robot, axes: tuple[int, ...]) -> np.ndarray:
@@ -157,7 +158,7 @@ class RobotMapCommand:
 
     def map(self, setting: RobotSetting, group: zarr.Group) -> RobotMap:
         """Return the map that the store holds."""
-        data: dict[str, Any] = {name: np.asarray(group[name]) for name in _fields(setting)}
+        data: dict[str, Any] = {name: np.asarray(group[name]) for name in _map_fields(setting)}
         labels = Labels.of(**{name: data[name] for name in ARRAYS})
         loops = RobotLoops(**{f.name: data[f.name] for f in fields(RobotLoops)})
         refine = 1e-6 if self.refine and len(setting.axes) <= 3 else None
@@ -208,8 +209,8 @@ class RobotMapCommand:
         return ["summary.json", "robot_map.npz", "robot_map.png"]
 
 
-def _fields(setting: RobotSetting) -> dict[str, store.Field]:
-    """Return what the store keeps of each state: its labels and its closed loop."""
+def _map_fields(setting: RobotSetting) -> dict[str, store.Field]:
+    """Return the fields that the store has of each state: its labels and its closed loop."""
     labels = {name: getattr(setting.none(), name) for name in ARRAYS}
     found = {
         name: store.Field(
@@ -232,16 +233,16 @@ def default_mpc(robot: Robot, horizon: int, terminal: str = "none") -> MPC:
         return replace(
             mpc, terminal_set=named_terminal_set(terminal, mpc.system, None, mpc.states, None)
         )
-    x, (_, u) = _home(robot), robot.equilibrium()
+    x, (_, u) = _home_coordinates(robot), robot.equilibrium()
     about = deviations(mpc, x, u)
     # At the set-point c is rounding.
     system = replace(about.system, c=None)
     regulator = lqr(system, mpc.Q, mpc.R)
     found = named_terminal_set(terminal, system, regulator, about.states, about.inputs)
-    return replace(mpc, terminal_set=moved(found, -x))
+    return replace(mpc, terminal_set=translated(found, x))
 
 
-def _home(robot: Robot) -> np.ndarray:
+def _home_coordinates(robot: Robot) -> np.ndarray:
     """Return the coordinates of `robot.home`."""
     with jax.enable_x64(True):
         return np.array(robot.coordinates(np.asarray(robot.home)), np.float64)

@@ -1,9 +1,7 @@
 """Closed loops of many robots, simulated chunk by chunk into a store."""
 
-import contextlib
 import dataclasses
 import importlib
-import io
 import os
 import time
 from typing import TYPE_CHECKING, Any
@@ -38,9 +36,9 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class RobotRuns:
-    """Runs that are checked and open, before any loop compiles.
+    """Runs whose options are checked and whose store is open; no loop is compiled yet.
 
-    command: the options, none of them missing. reference (n,), input_reference (m,): the target,
+    command: the options, all with values. reference (n,), input_reference (m,): the target,
     at rest. steps: samples of a run. starts (B, nq + nv). variations: factors of each plant, as
     `draw_robots` returns them. group: the store.
     """
@@ -57,7 +55,7 @@ class RobotRuns:
 
     @classmethod
     def open(cls, command: "Simulate") -> "RobotRuns":
-        """Open new runs, or some to go on with. Raises ValueError; compiles no loop."""
+        """Open new runs, or some to resume. Raises ValueError; compiles no loop."""
         path = command.output / "runs.zarr"
         check_results(path, command.resume, command.overwrite)
         if command.video:
@@ -67,8 +65,7 @@ class RobotRuns:
         except (AttributeError, ImportError, RuntimeError) as error:
             problem = f"mujoco does not start with {os.environ.get('MUJOCO_GL')!r} ({error})"
             fail("MUJOCO_GL", problem, "Unset it, or install the OpenGL library that it names")
-        with contextlib.redirect_stdout(io.StringIO()):  # MJX tells of absent optional parts
-            robot = load_robot(command.robot)
+        robot = load_robot(command.robot)
         sizes = (
             ("--target", command.target, robot.mujoco.nq),
             ("--state-weights", command.state_weights, robot.n),
@@ -113,7 +110,7 @@ class RobotRuns:
         steps = max(1, round(command.seconds / robot.dt))
         chunk = command.chunk or (256 if jax.default_backend() == "cpu" else 4096)
         group = store.open_store(
-            path, starts, _fields(command, robot, steps), _decisive(command, robot, mpc),
+            path, starts, _run_fields(command, robot, steps), _decisive(command, robot, mpc),
             min(chunk, command.count), (steps, robot.state_size, robot.m),
         )  # fmt: skip
         return cls(
@@ -148,8 +145,8 @@ class RobotRuns:
                 bar.update(count)
         return timing
 
-    def read(self) -> Run:
-        """Return the runs in the store, on the host."""
+    def load(self) -> Run:
+        """Return the runs in the store, as NumPy arrays."""
         data: dict[str, Any] = {name: np.asarray(self.group[name]) for name in STORED}
         # x_0 is measured and no limit binds it, so that there is no soft row at k = 0.
         return Run(**data | {"slack": np.zeros((*data["status"].shape, 0))})
@@ -159,8 +156,8 @@ class RobotRuns:
 STORED = tuple(field.name for field in dataclasses.fields(Run) if field.name != "slack")
 
 
-def _fields(command: "Simulate", robot: Robot, steps: int) -> dict[str, store.Field]:
-    """Return what the store keeps of each robot."""
+def _run_fields(command: "Simulate", robot: Robot, steps: int) -> dict[str, store.Field]:
+    """Return the fields that the store has of each robot."""
     number = lambda shape, *axes: store.Field(shape, command.dtype, np.nan, axes)
     found = {
         "states": number((steps + 1, robot.state_size), "sample_time", "state"),
@@ -180,7 +177,7 @@ def _fields(command: "Simulate", robot: Robot, steps: int) -> dict[str, store.Fi
 
 
 def _decisive(command: "Simulate", robot: Robot, mpc: MPC) -> dict[str, Any]:
-    """Return what decides the results, as JSON data."""
+    """Return the options that determine the results, as JSON data."""
     irrelevant = ("output", "video", "tolerance", "resume", "overwrite", "chunk")
     options = {k: v for k, v in dataclasses.asdict(command).items() if k not in irrelevant}
     weights = {
@@ -200,7 +197,7 @@ def _decisive(command: "Simulate", robot: Robot, mpc: MPC) -> dict[str, Any]:
 
 
 def newton_steps(command: "Simulate") -> int:
-    """Return --refine, or what the precision asks for: ADMM alone seldom comes to 1e-6."""
+    """Return --refine, or its default by precision: ADMM alone seldom reaches 1e-6."""
     if command.refine is not None:
         return command.refine
     return 3 if command.dtype == "float64" else 2

@@ -1,4 +1,4 @@
-"""Random starts and plants: where robots begin, and by how much their numbers are off."""
+"""Random initial states, and random deviations of the plants from the model."""
 
 import jax
 import numpy as np
@@ -39,7 +39,7 @@ def draw_robots(
 
 
 def plant_numbers(robot: Robot, variations: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the numbers that `Robot.vary` takes for these factors."""
+    """Return the arguments of `Robot.vary` for these factors."""
     model, found = robot.mujoco, {}
     if "mass" in variations:
         factor = variations["mass"]

@@ -1,4 +1,4 @@
-"""The numbers of many closed loops: as JSON data, and as a table."""
+"""Summary of many closed loops: as JSON data, and as a table."""
 
 import dataclasses
 from typing import Any
@@ -16,12 +16,12 @@ from jaxmpc.runs import versions
 
 
 def summarise(runs: RobotRuns, run: Run, outcome: Outcome, timing: Timing) -> dict[str, Any]:
-    """Return the numbers of the table, and what they rest on."""
+    """Return the numbers of the table, with target, configuration and versions, as JSON data."""
     robot, plans = runs.robot, int(np.size(run.status))
     names = [*robot.state_names, *robot.input_names]
     units = [*robot.state_units, *robot.input_units]
-    excess = [outcome.state_excess, outcome.input_excess]
-    worst = np.concatenate([np.nanmax(e, axis=(0, 1), initial=0.0) for e in excess])
+    violations = [outcome.state_excess, outcome.input_excess]
+    worst = np.concatenate([np.nanmax(v, axis=(0, 1), initial=0.0) for v in violations])
     widths = [b.half_widths() for b in (robot.state_limits, robot.input_limits)]
     i = int(np.argmax(worst / np.concatenate(widths)))
     finite = lambda v: float(v) if np.isfinite(v) else None
@@ -69,7 +69,7 @@ def summarise(runs: RobotRuns, run: Run, outcome: Outcome, timing: Timing) -> di
     }  # fmt: skip
 
 
-def table(s: dict[str, Any]) -> list[tuple[str, str]]:
+def summary_rows(s: dict[str, Any]) -> list[tuple[str, str]]:
     """Return the rows of the table, name and value, from the summary."""
     fraction = lambda key: f"{s[key]:>9,}  {s[key] / s['robots']:8.2%}"
     mpc, worst, this = s["plans"] > 0, s["worst_violation"], s["this_run"]
@@ -92,7 +92,7 @@ def table(s: dict[str, Any]) -> list[tuple[str, str]]:
     if mpc:
         for key, label, what in (
             ("plans_solved", "plans solved", ""),
-            ("fallback_plans", "fallback", "  break soft limits"),
+            ("fallback_plans", "fallback", "  violate soft limits"),
         ):
             part = f"{s[key]:>9,}  {s[key] / s['plans']:8.2%}"
             rows.append((label, f"{part}  of {s['plans']:,}{what}"))

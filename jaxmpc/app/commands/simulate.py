@@ -7,28 +7,34 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from jaxmpc.app.commands.film import film
-from jaxmpc.app.commands.options import Switch, check_positive, option, print_table
+from jaxmpc.app.commands.options import (
+    Switch,
+    check_counts,
+    check_positive,
+    option,
+    print_table,
+)
 from jaxmpc.app.commands.robot_runs import RobotRuns
-from jaxmpc.app.commands.runs_summary import summarise, table
+from jaxmpc.app.commands.runs_summary import summarise, summary_rows
 from jaxmpc.app.config import load_robot_config
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.runs import write_json
 
-# What --config says where an option does not, and what holds without either.
+# Defaults of options that --config can give too.
 USUAL = {"horizon": 20, "margin": 0.02, "linearize": "state", "penalty": 1e4}
 
 
 @dataclasses.dataclass(frozen=True)
 class Simulate:
-    """Drive thousands of robots to a target under constrained MPC, and count what holds.
+    """Drive thousands of robots to a target under constrained MPC, and count kept limits.
 
     What it does
-      Puts many copies of a robot at random states, each with its own masses if asked for, and
+      Puts many copies of a robot at random states, each with its own masses if wanted, and
       drives all of them to a target: physics by MuJoCo MJX, at each sample a linear model and an
       MPC that keeps joint, velocity and torque limits. Then assesses every run by its own
       states and inputs, not by what the MPC planned.
-      Limits that a plan cannot keep are broken as little as --penalty asks (fallback), and counted.
+      Limits that a plan cannot keep are violated at the cost --penalty (fallback), and counted.
 
     How to start
       $ jaxmpc simulate
@@ -43,10 +49,10 @@ class Simulate:
       plans valid    robots all of whose plans were solved without fallback; how many kept limits
       worst          the largest violation relative to half the range, in its own unit
       plans solved   plans whose residuals pass: 1e-6 in float64, 1e-3 in float32
-      fallback       plans that break soft limits somewhere on their horizon
+      fallback       plans that violate soft limits somewhere on their horizon
       settling       time after which a robot stays within the tolerance for the rest of its run
       cost           sum of (x - x_target)'Q(x - x_target) + (u - u_target)'R(u - u_target)
-      run            wall time without compiler, files and pictures
+      run            wall time without compiler, files and plots
       real time      robot-seconds simulated in a second of wall time; the second number is
                      simulated time by wall time for all robots at once: above 1 is real time
 
@@ -59,7 +65,7 @@ class Simulate:
       runs.zarr      points (the start), states, inputs, status, cost, fallback, ... of every
                      robot. Opens with xarray.open_zarr(path, consolidated=False).
       Ctrl-C         Stops; finished chunks are kept, --resume goes on from there.
-      Exit code      0 done, whatever the robots did; 2 error (one line on stderr says which);
+      Exit code      0 done, for any outcome; 2 error (one line on stderr says which);
                      130 stopped by Ctrl-C.
     """
 
@@ -105,7 +111,7 @@ class Simulate:
     margin: Annotated[float | None, option("FRACTION", "from --config, else 0.02")] = None
     """Room that the MPC leaves to state limits, as a fraction of half the range."""
     penalty: Annotated[float | None, option("RHO", "from --config, else 1e4")] = None
-    """L1 weight of state limits; too small a weight breaks limits that could be kept."""
+    """L1 weight of state limits; too small a weight violates limits that could be kept."""
     iterations: Annotated[int, option("K", "50")] = 50
     """ADMM steps of each plan."""
     refine: Annotated[int | None, option("K", "2; with float64 3")] = None
@@ -130,7 +136,7 @@ class Simulate:
     output: Annotated[Path, option("DIR", "jaxmpc-simulate")] = Path("jaxmpc-simulate")
     """Folder for the files; made where absent."""
     resume: Switch = False
-    """Go on with the run in --output."""
+    """Resume the run in --output."""
     overwrite: Switch = False
     """Delete the run in --output and start again."""
 
@@ -147,7 +153,7 @@ class Simulate:
         robot = runs.robot
         print(f"{robot.name}: {self.count:,} robots for {self.seconds:g} s -> {self.output}")
         timing = runs.simulate()
-        run = runs.read()
+        run = runs.load()
         outcome = evaluate_runs(run, robot, runs.reference, tolerance=self.tolerance)
         files = ["runs.zarr", "summary.json", "runs.png"]
         from jaxmpc.app.plots.closed_loops import plot_runs
@@ -160,12 +166,12 @@ class Simulate:
             files.append("robots.gif")
         summary = summarise(runs, run, outcome, timing)
         write_json(self.output / "summary.json", summary)
-        rows = table(summary)
+        rows = summary_rows(summary)
         rows.append(("files", " ".join(str(self.output / name) for name in files)))
         print_table(rows, 13)
 
     def settled(self) -> "Simulate":
-        """Return the command with what --config or `USUAL` says for options not given."""
+        """Return the command with the values of --config or `USUAL` for options not given."""
         found: dict[str, Any] = dict(USUAL)
         if self.config is not None:
             file = load_robot_config(self.config)
@@ -178,13 +184,7 @@ class Simulate:
 
     def check(self) -> None:
         """Raise ValueError for options that make no sense."""
-        for name, least in (
-            ("count", 1), ("horizon", 1), ("iterations", 1), ("refine", 0), ("video", 0),
-            ("seed", 0), ("chunk", 1),
-        ):  # fmt: skip
-            value = getattr(self, name)
-            if value is not None and value < least:
-                fail(f"--{name}", f"{value}", f"Give a whole number, at least {least}")
+        check_counts(self, count=1, horizon=1, iterations=1, refine=0, video=0, seed=0, chunk=1)
         check_positive(self, "seconds", "penalty", "tolerance")
         if not 0 <= self.payload < np.inf:
             fail("--payload", f"{self.payload}", "Give a mass in kg")

@@ -2,13 +2,21 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.linear_sweep import LinearSweep
-from jaxmpc.app.commands.options import End, Horizon, Switch, Terminal, option, refuse
+from jaxmpc.app.commands.options import (
+    End,
+    Horizon,
+    Switch,
+    Terminal,
+    given_options,
+    option,
+    refuse,
+)
 from jaxmpc.app.commands.robot_map import RobotMapCommand
 
 
@@ -56,7 +64,7 @@ class Sweep:
       summary.json   Counts, plans by status, deepest broken promise, configuration.
       robot_map.npz  points, states, promised, held (1 yes, -1 no, 0 undecided), kept, recursive,
                      feasible, depth, worst (most beyond a limit), broken_at, lost_at, unsolved_at.
-      robot_map.zarr What --resume goes on from: a killed run loses one chunk of 256 states.
+      robot_map.zarr The state for --resume: a killed run loses one chunk of 256 states.
 
     What the TOML file holds (n states, m inputs; dt in seconds, other units are yours)
       name = "joint"
@@ -100,7 +108,7 @@ class Sweep:
     ] = False
     """With more states than axes: feasible for some value of the other states."""
     iterations: Annotated[int | None, option("K", "from the file, else 50")] = None
-    """Solver steps of the first pass over all states; what is left open gets more."""
+    """Solver steps of the first pass over all states; states left undecided get more."""
     dtype: Annotated[
         Literal["float32", "float64"] | None,
         option("{float32,float64}", "from the file, else float32"),
@@ -119,7 +127,7 @@ class Sweep:
         ),
     ] = False
     resume: Switch = False
-    """Go on with the sweep in --output."""
+    """Resume the sweep in --output."""
     overwrite: Switch = False
     """Delete the sweep in --output and start again."""
     refine: Annotated[bool, option(None, "on")] = True
@@ -141,8 +149,7 @@ class Sweep:
     def open(self) -> LinearSweep:
         """Read, check and open what a sweep needs. Raises ValueError; compiles nothing."""
         keys = "horizon terminal grid lower upper axes fixed iterations dtype".split()
-        given = {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
-        overrides = {**given, **({"projection": True} if self.projection else {})}
+        overrides = given_options(self, *keys) | ({"projection": True} if self.projection else {})
         config = configs.load(self.config, overrides)
         return LinearSweep.open(config, self.output, self.resume, self.overwrite)
 
@@ -151,11 +158,10 @@ class Sweep:
         given = {"config": self.config, "projection": self.projection}
         refuse(given, robot, "Give a problem or a robot; a robot's map is a slice")
         refuse({"learn-penalties": self.learn_penalties}, robot, "They are for linear maps")
-        settings: dict[str, Any] = {"iterations": self.iterations, "dtype": self.dtype}
         return RobotMapCommand(
             robot, self.output, "limits", seconds=self.seconds, horizon=self.horizon,
             terminal=self.terminal, axes=self.axes, values=self.fixed, grid=self.grid,
             lower=self.lower, upper=self.upper, refine=self.refine, resume=self.resume,
             overwrite=self.overwrite,
-            settings={key: value for key, value in settings.items() if value is not None},
+            settings=given_options(self, "iterations", "dtype"),
         )  # fmt: skip

@@ -10,16 +10,24 @@ from typing import Annotated, Any, Literal
 import jax
 import numpy as np
 import optax
-import tyro
 
-from jaxmpc.app.commands.options import Horizon, Terminal, option, refuse, report_error
+from jaxmpc.app.commands.options import (
+    Horizon,
+    Switch,
+    Terminal,
+    check_counts,
+    check_positive,
+    check_results,
+    option,
+    refuse,
+    report_error,
+)
 from jaxmpc.app.commands.tuning import (
     CHECKPOINT,
     TUNED,
+    check_validation,
     open_run,
     optimizer_of,
-    require_counts,
-    require_positive,
 )
 from jaxmpc.app.commands.tuning_report import save_results
 from jaxmpc.app.commands.tuning_task import TuningTask, linear_task, robot_task
@@ -78,7 +86,7 @@ class TuneWeights:
       tuning.png        The same as curves. Red crosses: steps rejected because not finite.
       before_after.png  Some validation loops with the weights before and after.
       maps.png          The feasible set before and after; for two states, with tightening tuned.
-      checkpoint.npz    The state of the run after every step, from which --resume goes on.
+      checkpoint.npz    The state of the run after every step, for --resume.
       Ctrl-C            Stops. Finished steps are kept, and --resume goes on from there. A finished
                         run goes on with --resume and more --updates.
       Exit code         0 done, whether better or not; 2 error (one line on stderr says which); 130
@@ -111,7 +119,7 @@ class TuneWeights:
     count: Annotated[int, option("B", "64")] = 64
     """Number of initial states, validation included."""
     batch: Annotated[int | None, option("B", "all training loops")] = None
-    """Number of loops of each step, drawn anew."""
+    """Number of loops of each step, drawn again each time."""
     validation: Annotated[float, option("FRACTION", "0.25")] = 0.25
     """Fraction of the initial states in the validation set."""
     steps: Annotated[int | None, option("K", "50; robots: 1 s")] = None
@@ -182,9 +190,9 @@ class TuneWeights:
     """Seed of initial states, batches, masses, damping and payloads."""
     output: Annotated[Path, option("DIR", "jaxmpc-weights")] = Path("jaxmpc-weights")
     """Folder for the files; created if absent."""
-    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
-    """Go on with the run in --output."""
-    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
+    resume: Switch = False
+    """Resume the run in --output."""
+    overwrite: Switch = False
     """Delete the run in --output and start again."""
 
     keeps = "steps"
@@ -221,11 +229,7 @@ class TuneWeights:
 
         Raises ValueError for options that do not fit together."""
         self.check()
-        if (self.output / "tuning.json").exists() and not (self.resume or self.overwrite):
-            there = self.output / "tuning.json"
-            fail(
-                str(there), "exists", "Add --resume to go on with it or --overwrite to start again"
-            )
+        check_results(self.output / "tuning.json", self.resume, self.overwrite)
         task = linear_task(self) if self.robot is None else robot_task(self)
         self.stepper(np.zeros(1))
         files = ("tuning.json", TUNED, "tuning.png", "before_after.png", "maps.png")
@@ -245,8 +249,9 @@ class TuneWeights:
             fail("--tune", f"{' '.join(self.tune) or 'nothing'}", "Name each quantity once")
         if self.steps is not None and self.seconds is not None:
             fail("--seconds", "given beside --steps", "Give one of them")
-        require_counts(self, updates=0, count=2, batch=1, steps=1, iterations=1, refine=0, seed=0)
-        require_positive(self, "seconds", "learning_rate", "tolerance")
+        check_counts(self, updates=0, count=2, batch=1, steps=1, iterations=1, refine=0, seed=0)
+        check_validation(self)
+        check_positive(self, "seconds", "learning_rate", "tolerance")
         for name in ("violation", "settling", "payload"):
             if not 0 <= getattr(self, name) < np.inf:
                 fail(f"--{name}", f"{getattr(self, name)}", "Give a number, at least 0")
@@ -261,7 +266,7 @@ class TuneWeights:
         return optimizer_of(self.optimizer, self.learning_rate, tried)
 
     def options(self, task: TuningTask) -> dict[str, Any]:
-        """Return what decides the result, as JSON data; --updates may grow on resuming."""
+        """Return the options that determine the result, as JSON data, without --updates."""
         ignored = ("config", "output", "resume", "overwrite", "updates")
         found = {k: v for k, v in dataclasses.asdict(self).items() if k not in ignored}
         solver = {"iterations": task.solver.iterations, "refine": task.solver.refine}

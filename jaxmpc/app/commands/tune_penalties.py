@@ -11,24 +11,25 @@ from typing import Annotated, Any, Literal
 import jax
 import numpy as np
 import optax
-import tyro
 
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import (
     Horizon,
+    Switch,
     Terminal,
+    check_counts,
+    check_positive,
     option,
     report_error,
 )
 from jaxmpc.app.commands.tuning import (
     CHECKPOINT,
     TUNED,
+    check_validation,
     feasible_states,
     open_run,
     optimizer_of,
     problem_file,
-    require_counts,
-    require_positive,
     start_range,
 )
 from jaxmpc.app.plots.tuning import plot_penalties
@@ -55,7 +56,7 @@ class TunePenalties:
       digits by which the residuals are too large. Some of the states (--validation) are the
       validation set: the result is the best of all steps on these; where none is better than the
       default (rho = 1, alpha = 1.6) the table says so and the default is kept.
-      ADMM converges to the same plan whatever rho is: a bad rho costs steps, not correctness.
+      ADMM converges to the same plan for every rho: a bad rho costs steps, not correctness.
       Without a file the problem is one robot joint: x = (q, dq), torque u, 20 steps of 0.01 s.
 
     How to start
@@ -79,7 +80,7 @@ class TunePenalties:
       penalties.json  Options, the numbers of the table, loss of every step, versions.
       penalties.png   rho by kind of limit, step of the horizon and stage; distribution of the
                       residuals before and after.
-      checkpoint.npz  The state of the run after every step, from which --resume goes on.
+      checkpoint.npz  The state of the run after every step, for --resume.
       Ctrl-C          Stops. Finished steps are kept, and --resume goes on from there.
       Exit code       0 done, better or not; 2 error (one line on stderr says which); 130 stopped
                       by Ctrl-C.
@@ -103,7 +104,7 @@ class TunePenalties:
     count: Annotated[int, option("B", "1024")] = 1024
     """Number of feasible initial states, validation included."""
     batch: Annotated[int, option("B", "128")] = 128
-    """Number of states of each step, drawn anew."""
+    """Number of states of each step, drawn again each time."""
     validation: Annotated[float, option("FRACTION", "0.25")] = 0.25
     """Fraction of the initial states in the validation set."""
     optimizer: Annotated[str | None, option("NAME", "adam, its rate falling to 3 %")] = None
@@ -122,9 +123,9 @@ class TunePenalties:
     """Seed of initial states and batches."""
     output: Annotated[Path, option("DIR", "jaxmpc-penalties")] = Path("jaxmpc-penalties")
     """Folder for the files; created if absent."""
-    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
-    """Go on with the run in --output."""
-    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")] = False
+    resume: Switch = False
+    """Resume the run in --output."""
+    overwrite: Switch = False
     """Delete the run in --output and start again."""
 
     keeps = "steps"
@@ -156,9 +157,9 @@ class TunePenalties:
             return report_error(error)
         seconds = time.perf_counter() - learning
         given = dataclasses.replace(given, iterations=self.iterations)
-        worst = residuals(mpc, test, (given, found.solver))
+        worst = largest_residuals(mpc, test, (given, found.solver))
         self.save(config, found, worst, dropped, seconds)
-        print(self.table(found, worst.shape[1], dropped, seconds))
+        print(self.report_text(found, worst.shape[1], dropped, seconds))
         print(f"  {'total':<13} {time.perf_counter() - begun:.1f} s with set-up and files")
         return 0
 
@@ -167,8 +168,9 @@ class TunePenalties:
 
         Nothing compiles. Raises ValueError for options that do not fit together.
         """
-        require_counts(self, iterations=1, stages=1, updates=0, count=16, batch=1, seed=0)
-        require_positive(self, "learning_rate")
+        check_counts(self, iterations=1, stages=1, updates=0, count=16, batch=1, seed=0)
+        check_validation(self)
+        check_positive(self, "learning_rate")
         if self.iterations % self.stages:
             fail("--iterations", f"{self.iterations} for {self.stages} stages", "Use a multiple")
         if self.learning_rate is not None and self.optimizer is None:
@@ -229,7 +231,7 @@ class TunePenalties:
         figure = plot_penalties(found, worst[0], worst[1], 1e-6, title)
         figure.savefig(self.output / "penalties.png", dpi=150)
 
-    def table(self, found: TuningRun, count: int, dropped: int, seconds: float) -> str:
+    def report_text(self, found: TuningRun, count: int, dropped: int, seconds: float) -> str:
         """Return the result as a table of text."""
         row = lambda name, a, b, more="": f"  {name:<13} {a:>12} {b:>12}  {more}".rstrip()
         first, last = found.before, found.after
@@ -258,7 +260,7 @@ class TunePenalties:
         ])  # fmt: skip
 
 
-def residuals(mpc: MPC, states: np.ndarray, solvers: tuple[ADMM, ADMM]) -> np.ndarray:
+def largest_residuals(mpc: MPC, states: np.ndarray, solvers: tuple[ADMM, ADMM]) -> np.ndarray:
     """Return the largest residual (2, B) with each solver, of the states that neither proves
     infeasible."""
     shape = np.broadcast_shapes(*(np.shape(solver.rho) for solver in solvers))

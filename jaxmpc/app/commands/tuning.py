@@ -1,4 +1,4 @@
-"""What `jaxmpc tune weights` and `tune penalties` share: optimizer, initial states, folder."""
+"""Helpers of `jaxmpc tune weights` and `tune penalties`: optimizer, initial states, folder."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ import optax
 from scipy.optimize import linprog
 
 from jaxmpc.app import config as configs
-from jaxmpc.app.commands.options import open_folder
+from jaxmpc.app.commands.options import check_results, given_options, open_folder
 from jaxmpc.checks import fail
 from jaxmpc.control.sets import Polytope
 from jaxmpc.feasible.problem import FeasibilityProblem
@@ -20,7 +20,7 @@ from jaxmpc.runs import differences, write_json
 
 CHECKPOINT = "checkpoint.npz"
 TUNED = "tuned.toml"
-# Random states that are tried at most for each that is wanted.
+# The most random states that are drawn for each state wanted.
 TRIES = 10
 
 
@@ -34,34 +34,20 @@ def optimizer_of(name: str, rate: float, tried: Any = None) -> optax.GradientTra
         assert isinstance(made, optax.GradientTransformation)
         if tried is not None:
             jax.eval_shape(lambda v: made.update(v, made.init(v), v)[0], tried)
-    except Exception:  # whatever a function that is no such optimizer does
+    except Exception:  # any error of a function that is no such optimizer
         fail("--optimizer", f"{name!r} is no optimizer of optax that serves here", cure)
     return made
 
 
-def require_counts(command: Any, **least: int) -> None:
-    """Raise ValueError for a count below its least, or a fraction of validation outside (0, 1)."""
-    for name, lowest in least.items():
-        value = getattr(command, name)
-        if value is not None and value < lowest:
-            fail(f"--{name}", f"{value}", f"Give a whole number, at least {lowest}")
+def check_validation(command: Any) -> None:
+    """Raise ValueError unless --validation lies in (0, 1)."""
     if not 0 < command.validation < 1:
         fail("--validation", f"{command.validation}", "Give a fraction above 0 and below 1")
 
 
-def require_positive(command: Any, *names: str) -> None:
-    """Raise ValueError for an option that is given and not a positive number."""
-    for name in names:
-        value = getattr(command, name)
-        if value is not None and not 0 < value < np.inf:
-            fail(f"--{name.replace('_', '-')}", f"{value}", "Give a positive number")
-
-
 def problem_file(command: Any) -> configs.Config:
     """Return the problem of --config, or the built-in joint, with --horizon and --terminal."""
-    given = {key: getattr(command, key) for key in ("horizon", "terminal")}
-    overrides = {key: value for key, value in given.items() if value is not None}
-    return configs.load(command.config, overrides, "tune")
+    return configs.load(command.config, given_options(command, "horizon", "terminal"), "tune")
 
 
 def start_range(
@@ -90,8 +76,8 @@ def feasible_states(
 ) -> tuple[np.ndarray, int]:
     """Return uniform states (count, n) within limits that have a plan, and how many had none.
 
-    Whether a state has a plan is decided by linear programs on the host, without compiling: hard
-    rows are all linear but for an ellipsoidal terminal set, which is left out.
+    Linear programs decide whether a state has a plan, without compiling: all hard rows are linear
+    but those of an ellipsoidal terminal set, which are left out.
     """
     rows = Inequalities.of(FeasibilityProblem.of(mpc).condensed)
     random, dropped = np.random.default_rng(seed), 0
@@ -115,25 +101,21 @@ def feasible_states(
 def open_run(
     folder: Path, files: tuple[str, ...], options: dict[str, Any], resume: bool, overwrite: bool
 ) -> None:
-    """Open the folder of a new run, or of one that goes on with the same options.
+    """Open the folder of a new run, or of one that is resumed with the same options.
 
-    files[0] is the record of the run, a JSON file that holds the options; all files are removed,
-    and the record is begun. Raises ValueError where the folder holds a run with other options, or
+    files[0] is the record of the run, a JSON file that holds the options. All files are removed and
+    a new record is written. Raises ValueError where the folder holds a run with other options, or
     any run without `resume` or `overwrite`.
     """
-    if resume and overwrite:
-        fail("--overwrite", "given beside --resume", "Choose one")
     record = folder / files[0]
-    there = [name for name in (files[0], CHECKPOINT) if (folder / name).exists()]
-    if there and not (resume or overwrite):
-        what = "Add --resume to go on with it or --overwrite to start again"
-        fail(str(folder / there[0]), "exists", what)
+    for path in (record, folder / CHECKPOINT):
+        check_results(path, resume, overwrite)
     if resume and record.exists():
         try:
-            said = json.loads(record.read_text())["options"]
+            stored = json.loads(record.read_text())["options"]
         except (ValueError, KeyError, TypeError):
             fail(str(record), "holds no run", "Add --overwrite to start again")
-        if changes := differences(said, options):
+        if changes := differences(stored, options):
             fail(str(record), "; ".join(changes), "Give the same options, or --overwrite")
     open_folder(folder)
     for name in (*files, *([CHECKPOINT] if overwrite else [])):  # of an earlier run

@@ -1,4 +1,4 @@
-"""What `jaxmpc tune weights` writes and prints: files, figures and the table."""
+"""Output of `jaxmpc tune weights`: files, figures and the table."""
 
 import time
 from collections.abc import Mapping
@@ -21,12 +21,12 @@ SHOWN = 24
 def save_results(
     command: Any, task: TuningTask, run: TuningRun, seconds: dict[str, float], begun: float
 ) -> str:  # fmt: skip
-    """Simulate anew with what tuned.toml says, write the other files, and return the table."""
+    """Simulate again with the written tuned.toml, write the other files, and return the table."""
     h, test = run.history, task.x0s[~task.train]
     before, after = (
         task.simulated(controller)
         for controller in (
-            lambda: run.build(run.initial), lambda: task.read(command.output / TUNED)
+            lambda: run.build(run.initial), lambda: task.load(command.output / TUNED)
         )
     )  # fmt: skip
     counts = [task.counted(loops, command.tolerance) for loops in (before, after)]
@@ -64,7 +64,7 @@ def save_results(
         maps(command, task).savefig(command.output / "maps.png", dpi=150)
         files.insert(4, "maps.png")
     seconds = {**seconds, "total": time.perf_counter() - begun}
-    return table(command, task, run, result, trace, seconds, files)
+    return report_text(command, task, run, result, trace, seconds, files)
 
 
 def maps(command: Any, task: TuningTask) -> Any:
@@ -76,7 +76,7 @@ def maps(command: Any, task: TuningTask) -> Any:
     return plot_maps(*found)
 
 
-def table(
+def report_text(
     command: Any, task: TuningTask, run: TuningRun, result: dict[str, Any],
     trace: dict[str, dict[str, np.ndarray]], seconds: dict[str, float], files: list[str],
 ) -> str:  # fmt: skip

@@ -1,8 +1,6 @@
-"""What `jaxmpc tune weights` tunes: problem, plant, initial states and loss from its options."""
+"""The task of `jaxmpc tune weights`: problem, plant, initial states and loss from its options."""
 
-import contextlib
 import dataclasses
-import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxmpc.app import config as configs
-from jaxmpc.app.commands.options import model_hash
+from jaxmpc.app.commands.options import given_options, model_hash
 from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
 from jaxmpc.app.commands.tuning import feasible_states, problem_file, start_range
 from jaxmpc.checks import fail
@@ -39,12 +37,12 @@ TIGHTEST = 0.5
 
 
 class TuningTask(NamedTuple):
-    """What `jaxmpc tune weights` tunes, made from its options and checked.
+    """The task of `jaxmpc tune weights`, built from its options and checked.
 
     make: values → MPC or controller. x0s (B, n or nq + nv) and variations (B, ...); train (B,):
     which of them are for training, the others for validation. limits: of the states. write: values
-    → text of tuned.toml; read: the controller that such a file stands for. options: what else
-    decides the result. dropped: states drawn that have no plan. mpc: the hard problem before
+    → text of tuned.toml; load: path of such a file → its controller. options: what else determines
+    the result. dropped: number of states drawn that have no plan. mpc: the hard problem before
     tuning. config: None for robots.
     """
 
@@ -63,14 +61,14 @@ class TuningTask(NamedTuple):
     dtype: str
     limits: Box | Polytope | None
     write: Callable[[Mapping[str, np.ndarray]], str]
-    read: Callable[[Path], Any]
+    load: Callable[[Path], Any]
     options: dict[str, Any]
     dropped: int
     mpc: MPC
     config: configs.Config | None
 
     def simulated(self, make: Callable[[], Any]) -> Run:
-        """Return the validation loops with a controller or the Controller of an MPC."""
+        """Simulate the validation loops with a controller, or with the Controller of an MPC."""
         with jax.enable_x64(self.dtype == "float64"):
             made = make()
             controller = Controller(made, self.solver) if isinstance(made, MPC) else made
@@ -81,7 +79,7 @@ class TuningTask(NamedTuple):
             )  # fmt: skip
 
     def counted(self, run: Run, tolerance: float) -> dict[str, Any]:
-        """Return counts of what the loops did, evaluated from their states and inputs."""
+        """Return counts of violations, unsolved plans and so on, from states and inputs."""
         goal = np.zeros(self.plant.n) if self.reference is None else self.reference
         outcome = evaluate_runs(run, self.plant, goal, tolerance=tolerance)
         kept = outcome.kept
@@ -102,7 +100,8 @@ class TuningTask(NamedTuple):
 def linear_family(
     hard: MPC, follow: Any, rho: float | None, parameters: Mapping[str, Parameter], limits: Any
 ) -> Callable[[Mapping[str, Any]], MPC]:
-    """Return the map from values to the problem that the controller solves. Traceable."""
+    """Return the map from values to the problem that the controller solves. Works inside jit, vmap
+    and grad."""
     # The gain that keeps predictions of unstable plants in bounds changes rounding only.
     base = dataclasses.replace(hard, prestabilise=prestabilising_gain(hard))
     follow = follow if isinstance(follow, str) else "none"
@@ -162,7 +161,7 @@ def tightening(start: float, limits: Box, target: np.ndarray) -> Parameter:
 def tuned(config: configs.Config, values: Mapping[str, np.ndarray]) -> configs.Config:
     """Return the problem with tuned values."""
     changes: dict[str, Any] = {
-        name: matrix(values[name]) for name in ("Q", "R", "P") if name in values
+        name: from_matrix(values[name]) for name in ("Q", "R", "P") if name in values
     }
     if "rho" in values:
         changes["rho"] = float(values["rho"])
@@ -173,7 +172,7 @@ def tuned(config: configs.Config, values: Mapping[str, np.ndarray]) -> configs.C
     return dataclasses.replace(config, cost=cost, limits=limits)
 
 
-def matrix(value: Any, flat: bool = True) -> Any:
+def from_matrix(value: Any, flat: bool = True) -> Any:
     """Return a matrix as the file holds it: rows, or the diagonal of a diagonal one if `flat`."""
     value = np.asarray(value, float)
     if flat and np.all(value == np.diag(np.diag(value))):
@@ -237,14 +236,14 @@ def linear_task(command: Any) -> TuningTask:
     def write(values: Mapping[str, np.ndarray]) -> str:
         return tuned(config, values).to_toml()
 
-    def read(path: Path) -> Controller:
+    def load(path: Path) -> Controller:
         return Controller(configs.load(path, None, "tune").build_controlled(), solver)
 
     make = linear_family(hard, config.cost.P, rho, parameters, limits)
     return TuningTask(
         config.name, make, parameters, plant, x0s, {}, training(command, len(x0s)),
         loss_of(command, hard.Q, hard.R, n, m, limits, plant, None, None), None, None, steps,
-        solver, dtype, limits, write, read, {"problem": config.to_dict("tune")}, dropped, hard,
+        solver, dtype, limits, write, load, {"problem": config.to_dict("tune")}, dropped, hard,
         config,
     )  # fmt: skip
 
@@ -266,13 +265,10 @@ def with_numbers(config: configs.Config, hard: MPC, rho: float | None) -> config
 def robot_task(command: Any) -> TuningTask:
     """Return the task of a robot."""
     file = None if command.config is None else configs.load_robot_config(command.config)
-    with contextlib.redirect_stdout(io.StringIO()):  # MJX tells of absent optional parts
-        robot = load_robot(str(command.robot))
-    said = configs.RobotSection(name=robot.name) if file is None else file.robot
-    given: dict[str, Any] = {
-        "horizon": command.horizon, "margin": command.margin, "linearize": command.linearize,
-    }  # fmt: skip
-    said = dataclasses.replace(said, **{k: v for k, v in given.items() if v is not None})
+    robot = load_robot(str(command.robot))
+    section = configs.RobotSection(name=robot.name) if file is None else file.robot
+    given = given_options(command, "horizon", "margin", "linearize")
+    section = dataclasses.replace(section, **given)
     if command.target is not None and len(command.target) != robot.mujoco.nq:
         what = f"has {len(command.target)} numbers"
         fail("--target", what, f"{robot.name} needs {robot.mujoco.nq}")
@@ -282,7 +278,7 @@ def robot_task(command: Any) -> TuningTask:
         command, np.eye(robot.n), np.eye(robot.m), robot.n, robot.m, None, None, None, None
     )
     weights: dict[str, Any] = {} if file is None else file.weights(robot)
-    mpc = robot_mpc(robot, horizon=said.horizon, target=target, margin=said.margin, **weights)
+    mpc = robot_mpc(robot, horizon=section.horizon, target=target, margin=section.margin, **weights)
     Q, R, P = mpc.Q, mpc.R, mpc.terminal_cost
     rho = 1e4 if file is None else file.cost.rho
     follow = "lqr" if file is None else file.cost.P
@@ -298,7 +294,7 @@ def robot_task(command: Any) -> TuningTask:
     with jax.enable_x64(True):
         r = np.asarray(robot.coordinates(x))
     if "tightening" in command.tune:
-        parameters["tightening"] = tightening(said.margin, robot.state_limits, r)
+        parameters["tightening"] = tightening(section.margin, robot.state_limits, r)
     solver = ADMM(
         iterations=20 if command.iterations is None else command.iterations,
         refine=2 if command.refine is None else command.refine,
@@ -324,22 +320,22 @@ def robot_task(command: Any) -> TuningTask:
         if "tightening" in values:
             states = robot.state_limits.tightened(values["tightening"])
             changed = dataclasses.replace(changed, states=states)
-        return controller(changed, values.get("rho", rho), said.linearize)
+        return controller(changed, values.get("rho", rho), section.linearize)
 
     def write(values: Mapping[str, np.ndarray]) -> str:
         end: Any = follow
         if "P" in values or (follow == "none" and P is not None):
-            end = matrix(values.get("P", P), flat=False)
-        margin = float(values.get("tightening", said.margin))
+            end = from_matrix(values.get("P", P), flat=False)
+        margin = float(values.get("tightening", section.margin))
         return configs.RobotConfig(
-            robot=dataclasses.replace(said, margin=margin),
+            robot=dataclasses.replace(section, margin=margin),
             cost=configs.RobotCostSection(
-                Q=matrix(values.get("Q", Q)), R=matrix(values.get("R", R)), P=end,
+                Q=from_matrix(values.get("Q", Q)), R=from_matrix(values.get("R", R)), P=end,
                 rho=float(values.get("rho", rho)),
             ),
         ).to_toml()  # fmt: skip
 
-    def read(path: Path) -> RobotController:
+    def load(path: Path) -> RobotController:
         file = configs.load_robot_config(path)
         mpc = robot_mpc(
             robot, horizon=file.robot.horizon, target=target, margin=file.robot.margin,
@@ -350,7 +346,7 @@ def robot_task(command: Any) -> TuningTask:
     start = {"robot": write({}), "model": model_hash(robot)}
     return TuningTask(
         robot.name, make, parameters, robot, x0s, variations, training(command, len(x0s)), loss, r,
-        np.asarray(s), steps, solver, dtype, robot.state_limits, write, read, start, 0, mpc,
+        np.asarray(s), steps, solver, dtype, robot.state_limits, write, load, start, 0, mpc,
         None,
     )  # fmt: skip
 
@@ -364,7 +360,7 @@ def training(command: Any, count: int) -> np.ndarray:
 def loss_of(
     command: Any, Q: Any, R: Any, n: int, m: int, limits: Any, plant: Any, r: Any, s: Any
 ) -> ClosedLoopLoss:
-    """Return the loss of the options."""
+    """Return the loss that the options describe; m, n: sizes, r, s: references."""
     for name, given, size in (("tracking", command.tracking, n), ("effort", command.effort, m)):
         if given is not None and len(given) != size:
             fail(f"--{name}", f"has {len(given)} numbers", f"The problem needs {size}")

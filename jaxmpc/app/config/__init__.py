@@ -1,4 +1,4 @@
-"""A problem and what to ask of it, as a TOML file: read, checked, turned into an MPC, written.
+"""Configuration files: a problem and the settings of commands, as TOML, to and from an MPC.
 
     name = "joint"
 
@@ -10,9 +10,9 @@
     [sweep]   grid, lower, upper, axes, fixed | projection, iterations, dtype
     [recursion]  steps, grid, lower, upper, regions, seconds
 
-The classes of `sections` say what each key means. Every error is a ValueError that names the
-file and the key (or the option of the command line that set it) and what would be right.
-A robot's weights have a file of their own, with the sections [robot] and [cost].
+The classes of `sections` document each key. Every error is a ValueError that names the file and the
+key (or the option of the command line that set it), and how to correct it. A robot's weights have a
+file of their own, with the sections [robot] and [cost].
 """
 
 from jaxmpc.app.config.problem import Config

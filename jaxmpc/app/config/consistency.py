@@ -1,4 +1,4 @@
-"""Checks of a configuration as a whole: keys, each good alone, must fit one another."""
+"""Checks of a configuration as a whole: keys that are valid alone must fit one another."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from jaxmpc.checks import fail
 
 
 def check(config: Config, command: str = "sweep") -> None:
-    """Raise ValueError where keys, each good alone, do not fit one another."""
+    """Raise ValueError where keys that are valid alone do not fit one another."""
     s, limits = config.system, config.limits
     n, m = len(s.A), len(s.B[0])
     for key, value, count in (
@@ -43,6 +43,7 @@ def check(config: Config, command: str = "sweep") -> None:
 
 
 def _check_sweep(config: Config, n: int) -> None:
+    """Raise ValueError unless [sweep] fits a system of n states."""
     sweep = config.sweep
     d = len(mapped_axes(config))
     for key, count in (("grid", d), ("lower", d), ("upper", d), ("fixed", n - d)):
@@ -59,6 +60,7 @@ def _check_sweep(config: Config, n: int) -> None:
 
 
 def _check_recursion(config: Config, n: int) -> None:
+    """Raise ValueError unless [recursion] fits a system of n states."""
     recursion = config.recursion
     for key in ("grid", "lower", "upper"):
         value = getattr(recursion, key)
@@ -70,6 +72,7 @@ def _check_recursion(config: Config, n: int) -> None:
 
 
 def _check_state_limits(config: Config) -> None:
+    """Raise ValueError unless the state limits are either a box or rows of H_x, and complete."""
     limits = config.limits
     box = limits.x_min is not None or limits.x_max is not None
     polytope = limits.H_x is not None or limits.h_x is not None
@@ -90,6 +93,7 @@ def _check_state_limits(config: Config) -> None:
 
 
 def _check_terminal_set(config: Config, n: int) -> None:
+    """Raise ValueError unless [mpc] gives at most one terminal set, complete and of size n."""
     mpc = config.mpc
     for rows, ends in (("H_f", "h_f"), ("P_f", "level_f")):
         if (getattr(mpc, rows) is None) != (getattr(mpc, ends) is None):
@@ -109,6 +113,7 @@ def _check_terminal_set(config: Config, n: int) -> None:
 def _check_order(
     where: str, low: str, high: str, lower: tuple[float, ...] | None, upper: Any
 ) -> None:
+    """Raise ValueError where a lower end lies above its upper end."""
     for i, (a, b) in enumerate(zip(lower or (), upper or (), strict=False)):
         if a > b or (where in COMMANDS and a == b):
             fail(

@@ -17,7 +17,7 @@ from jaxmpc.app.config.sections import (
     SolverSection,
     SweepSection,
     SystemSection,
-    matrix,
+    to_matrix,
 )
 from jaxmpc.control.named_terminal import named_terminal_set
 from jaxmpc.control.riccati import lqr
@@ -34,7 +34,7 @@ COMMANDS = ("sweep", "recursion")
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Config:
-    """A problem and what is asked of it: the sections of the file."""
+    """A problem and the settings of commands: the sections of the file."""
 
     name: str = "mpc"
     system: SystemSection
@@ -72,7 +72,7 @@ class Config:
         if isinstance(states, Box) and limits.margin:
             states = states.tightened(limits.margin)
         inputs = Box(np.asarray(limits.u_min), np.asarray(limits.u_max))
-        Q, R = matrix(cost.Q), matrix(cost.R)
+        Q, R = to_matrix(cost.Q), to_matrix(cost.R)
         name, regulator = self.mpc.terminal, None
         if cost.P == "lqr" or name in ("invariant", "ellipsoid"):
             regulator = lqr(system, Q, R)
@@ -80,7 +80,7 @@ class Config:
         if cost.P == "lqr":
             terminal_cost = regulator and regulator.P
         elif not isinstance(cost.P, str):
-            terminal_cost = matrix(cost.P)
+            terminal_cost = to_matrix(cost.P)
         terminal_set: Any = named_terminal_set(name, system, regulator, states, inputs)
         if self.mpc.H_f is not None:
             terminal_set = Polytope(np.asarray(self.mpc.H_f), np.asarray(self.mpc.h_f))

@@ -60,7 +60,7 @@ def load(
         config = ADAPTER.validate_python(merged)
         check(config, command)
     except ValidationError as error:
-        raise ValueError(_sentence(error, source, overrides, Config)) from None
+        raise ValueError(_error_message(error, source, overrides, Config)) from None
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
     return config
@@ -74,10 +74,10 @@ def load_robot_config(path: str | Path) -> RobotConfig:
     try:
         return ROBOT_ADAPTER.validate_python(document)
     except ValidationError as error:
-        raise ValueError(_sentence(error, str(path), {}, RobotConfig)) from None
+        raise ValueError(_error_message(error, str(path), {}, RobotConfig)) from None
 
 
-def _sentence(
+def _error_message(
     error: ValidationError, source: str, overrides: Mapping[str, Any], whole: Any
 ) -> str:  # fmt: skip
     """Return the first thing wrong in one line: where, what, and what is allowed there."""
@@ -98,10 +98,6 @@ def _sentence(
     value = repr(first["input"])
     shown = value if len(value) < 60 else value[:57] + "..."
     return f"{source}: {key}: {'; or '.join(problems)}. Got {shown}"
-
-
-def _names(section: Any) -> list[str]:
-    return [field.name for field in dataclasses.fields(section)]
 
 
 def _keys(whole: Any, section: str | None = None) -> list[str]:

@@ -6,7 +6,7 @@ from pydantic import Field, FiniteFloat, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from jaxmpc.app.config.files import to_toml
-from jaxmpc.app.config.sections import STRICT, Matrix, Vector, matrix
+from jaxmpc.app.config.sections import STRICT, Matrix, Vector, to_matrix
 from jaxmpc.checks import fail
 
 
@@ -53,8 +53,8 @@ class RobotConfig:
             if not isinstance(value, str) and len(value) != size:
                 fail(f"cost.{key}", f"has {len(value)} entries", f"{robot.name} needs {size}")
         P: Any = None if cost.P == "none" else cost.P
-        terminal = P if P is None or isinstance(P, str) else matrix(P)
-        return {"Q": matrix(cost.Q), "R": matrix(cost.R), "terminal_cost": terminal}
+        terminal = P if P is None or isinstance(P, str) else to_matrix(P)
+        return {"Q": to_matrix(cost.Q), "R": to_matrix(cost.R), "terminal_cost": terminal}
 
     def to_toml(self) -> str:
         """Return the text of a file that `load_robot_config` reads back."""

@@ -85,7 +85,7 @@ class MPCSection:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class SweepSection:
-    """Which initial states are asked: a grid over the mapped states."""
+    """The initial states of a sweep: a grid over the mapped states."""
 
     grid: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)] | None = None
     lower: Vector | None = None  # (d,), none means the state limits widened by 3 % each side
@@ -120,7 +120,7 @@ class SolverSection:
     refine: Annotated[int, Field(ge=0, strict=True)] = 150  # Newton steps after them at most
 
 
-def matrix(value: Any) -> np.ndarray:
+def to_matrix(value: Any) -> np.ndarray:
     """Return a weight as a matrix (n, n); a flat list is a diagonal."""
     array = np.asarray(value, dtype=np.float64)
     return np.diag(array) if array.ndim == 1 else array

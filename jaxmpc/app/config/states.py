@@ -1,4 +1,4 @@
-"""The initial states that the commands sweep and recursion ask about: grids over state limits."""
+"""Initial states of the commands sweep and recursion: grids over the state limits."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple

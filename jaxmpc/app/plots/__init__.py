@@ -1,4 +1,4 @@
-"""Pictures of what jaxmpc computes. Each draws into the axes given and never shows a window."""
+"""Plots of results. Each function draws into the given axes and never shows a window."""
 
 from jaxmpc.app.plots.closed_loops import plot_runs
 from jaxmpc.app.plots.feasible_set import plot_feasible_set

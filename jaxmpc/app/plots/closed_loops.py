@@ -1,4 +1,4 @@
-"""The picture of closed loops over time: positions, velocities and inputs with their limits."""
+"""The plot of closed loops over time: positions, velocities and inputs with their limits."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -25,7 +25,7 @@ def plot_runs(
     """Draw closed loops over time: a panel for each position, velocity and input.
 
     run: of `simulate` or `simulate_many`, of a Robot or LinearPlant. Limits are lines, what lies
-    outside is grey. Orange: samples whose plan breaks soft limits (fallback). Red: limits exceeded
+    outside is grey. Orange: fallback plans, which violate soft limits. Red: limits violated
     by more than 1e-6 (of the limit, if that is above 1). reference (n,), input_reference (m,):
     set-points to draw. robots: which of the batch to draw, 24 at most by default; the title
     counts all. Raises ValueError for robots that are not there.
@@ -38,33 +38,14 @@ def plot_runs(
         fail("robots", f"{robots}", f"Give indices from 0 to {count - 1}")
     pairs = with_limits(plant, run)
     xi, kept = pairs[0][1], [violation.kept(*pair) for pair in pairs]
-    columns = panel_columns(plant)
-    rows = max(len(panels) for _, panels in columns)
-    size = (2.6 * len(columns) + 0.2, max(1.15 * rows, 2.0) + 1.1)
-    figure = Figure(figsize=size, layout="constrained")
-    grid = figure.subplots(rows, len(columns), sharex=True, squeeze=False)
     time = plant.dt * np.arange(samples + 1)
     fallback = failed[shown]
-    for column, (title, panels) in zip(grid.T, columns, strict=True):
-        for ax in column[len(panels) :]:
-            ax.set_axis_off()
-        column[0].set_title(title, fontsize=9)
-        column[len(panels) - 1].set_xlabel("time [s]", fontsize=8)
-        column[len(panels) - 1].tick_params(labelbottom=True)
-        for ax, (kind, i, label) in zip(column, panels, strict=False):
-            values, limits, target = (
-                (inputs, plant.input_limits, input_reference) if kind
-                else (xi, plant.state_limits, reference)
-            )  # fmt: skip
-            target = None if target is None else float(np.asarray(target)[i])
-            ends = [float(np.asarray(end)[i]) for end in (limits.lower, limits.upper)]
-            broken = ~kept[kind][shown, :, i]
-            _draw_lines(ax, time, values[shown, :, i].T, fallback.T, broken.T)
-            draw_limits(ax, ends, target)
-            ax.set_ylabel(label, fontsize=8)
-            ax.tick_params(labelsize=7)
-            ax.set_xlim(0, time[-1])
-    figure.align_ylabels()
+    figure, panels = panel_grid(plant, time, 2.6, (1.15, 2.0, 1.1))
+    for ax, kind, i in panels:
+        broken = ~kept[kind][shown, :, i]
+        values = (xi, inputs)[kind][shown, :, i]
+        _draw_lines(ax, time, values.T, fallback.T, broken.T)
+        draw_limits(ax, plant, kind, i, (reference, input_reference)[kind])
     whole = kept[0].all(axis=(1, 2)) & kept[1].all(axis=(1, 2))
     figure.suptitle(
         f"{plant.name}: {count:,} closed loop{'s' * (count > 1)} of {time[-1]:g} s, {len(shown):,} "
@@ -87,6 +68,35 @@ def plot_runs(
         handles=handles, loc="outside lower left", ncols=len(handles), fontsize=8, frameon=False
     )
     return figure
+
+
+def panel_grid(
+    plant: Any, time: np.ndarray, width: float, height: tuple[float, float, float]
+) -> tuple[Figure, list[tuple[Axes, int, int]]]:
+    """Return a figure with a panel for each state and input over time, and its panels.
+
+    A panel is (axes, 0 for a state or 1 for an input, its index). width: of a column, in inches;
+    height: of a row, least of all rows, and of the rest.
+    """
+    columns = panel_columns(plant)
+    rows, (each, least, rest) = max(len(panels) for _, panels in columns), height
+    size = (width * len(columns) + 0.2, max(each * rows, least) + rest)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(rows, len(columns), sharex=True, squeeze=False)
+    found = []
+    for column, (title, panels) in zip(grid.T, columns, strict=True):
+        for ax in column[len(panels) :]:
+            ax.set_axis_off()
+        column[0].set_title(title, fontsize=9)
+        column[len(panels) - 1].set_xlabel("time [s]", fontsize=8)
+        column[len(panels) - 1].tick_params(labelbottom=True)
+        for ax, (kind, i, label) in zip(column, panels, strict=False):
+            ax.set_ylabel(label, fontsize=8)
+            ax.tick_params(labelsize=7)
+            ax.set_xlim(0, time[-1])
+            found.append((ax, kind, i))
+    figure.align_ylabels()
+    return figure, found
 
 
 def panel_columns(plant: Any) -> list[tuple[str, list[tuple[int, int, str]]]]:
@@ -133,8 +143,10 @@ def _draw_lines(
     ax.plot(time[k], values[k, robot], ".", color=BROKEN, ms=2, zorder=4)
 
 
-def draw_limits(ax: Axes, ends: list[float], target: float | None) -> None:
-    """Draw limits in full view, grey beyond them, and the set-point."""
+def draw_limits(ax: Axes, plant: Any, kind: int, i: int, reference: Any) -> None:
+    """Draw the limits of state (kind 0) or input (1) i, grey beyond them, and the set-point."""
+    limits = plant.input_limits if kind else plant.state_limits
+    ends = [float(np.asarray(end)[i]) for end in (limits.lower, limits.upper)]
     low, high = ax.get_ylim()
     finite = [end for end in ends if np.isfinite(end)]
     low, high = min([low, *finite]), max([high, *finite])
@@ -144,6 +156,7 @@ def draw_limits(ax: Axes, ends: list[float], target: float | None) -> None:
         if np.isfinite(end):
             ax.axhspan(min(end, far), max(end, far), color=INFEASIBLE, lw=0, zorder=0)
             ax.axhline(end, color=EDGE, lw=0.7, zorder=1)
-    if target is not None:
+    if reference is not None:
+        target = float(np.asarray(reference)[i])
         ax.axhline(target, color=TERMINAL, lw=0.9, ls=(0, (4, 2)), zorder=3)
     ax.set_ylim(low, high)

@@ -1,4 +1,4 @@
-"""The picture of a map of two states: labels, proved bounds and terminal set."""
+"""The plot of a map of two states: labels, proved bounds and terminal set."""
 
 from typing import Any
 
@@ -25,15 +25,14 @@ from jaxmpc.feasible.map import FeasibleSetMap
 def plot_feasible_set(fmap: FeasibleSetMap, ax: Axes | None = None) -> Axes:
     """Draw a map of two states: labels, proved boundaries and terminal set.
 
-    Samples are coloured by label. The dashed line bounds the
-    inner polytope (the convex hull of states with a checked plan), the solid one the outer
-    polytope (the intersection of certified half-spaces): the true boundary lies between, and
-    where they meet one sees a dashed line on a solid one. Without `ax` a new figure is made;
-    save it with `ax.figure.savefig(path)`. Raises ValueError for a map not of two states.
+    Samples are coloured by label. The dashed line bounds the inner polytope (the convex hull of
+    states with a checked plan), the solid one the outer polytope (the intersection of certified
+    half-spaces); the true boundary lies between them. Without `ax` a new figure is made; save it
+    with `ax.figure.savefig(path)`. Raises ValueError for a map not of two states.
     """
     points, label = np.asarray(fmap.points), np.asarray(fmap.label)
     if points.ndim != 2 or points.shape[1] != 2:
-        fail("fmap", f"maps {points.shape[-1]} states", "A picture needs 2: choose `axes`")
+        fail("fmap", f"maps {points.shape[-1]} states", "A plot needs 2: choose `axes`")
     ax = new_axes() if ax is None else ax
     draw_values(ax, points, label, {-1: INFEASIBLE, 1: FEASIBLE, 0: UNDECIDED})
     handles: list[Any] = [
@@ -52,12 +51,12 @@ def plot_feasible_set(fmap: FeasibleSetMap, ax: Axes | None = None) -> Axes:
     ])  # fmt: skip
     ax.set_xlabel(fmap.names[0])
     ax.set_ylabel(fmap.names[1])
-    ax.set_title(_title(fmap), loc="left", fontsize=11)
+    ax.set_title(_map_title(fmap), loc="left", fontsize=11)
     legend(ax, handles)
     return ax
 
 
-def _title(fmap: FeasibleSetMap) -> str:
+def _map_title(fmap: FeasibleSetMap) -> str:
     """Return what is shown, and for more than two states how the others are treated."""
     labels = fmap.mpc.labels if fmap.mpc.rate_limited else fmap.mpc.system.state_labels
     others = [i for i in range(len(labels)) if i not in fmap.axes]

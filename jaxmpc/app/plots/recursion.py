@@ -1,4 +1,4 @@
-"""The picture of recursive feasibility: states that are lost, and the worst counterexample."""
+"""The plot of recursive feasibility: states that are lost, and the worst counterexample."""
 
 from typing import Any
 
@@ -48,7 +48,7 @@ def plot_recursion(
     enlarge without a counterexample.
     """
     if report.states.shape[1] != 2:
-        fail("report", f"is of {report.states.shape[1]} states", "A picture needs 2")
+        fail("report", f"is of {report.states.shape[1]} states", "A plot needs 2")
     worst = report.counterexample
     if enlarge and worst is None:
         fail("enlarge", "without a counterexample there is nothing to enlarge", "Leave it out")
@@ -81,9 +81,9 @@ def plot_recursion(
 
 
 def _draw_losses(ax: Axes, report: RecursionReport) -> list[Any]:
-    """Draw samples by their fate: infeasible, undecided, kept, or lost at some step."""
+    """Draw samples by outcome: infeasible, undecided, kept, or lost at some step."""
     lost = report.lost_at
-    fates = [
+    outcomes = [
         ("infeasible", INFEASIBLE, (lost == -1) & (report.label == -1)),
         ("undecided", UNDECIDED, (lost == -2) | (report.label == 0)),
         (f"kept for {report.steps} steps", FEASIBLE, lost == 0),
@@ -92,14 +92,15 @@ def _draw_losses(ax: Axes, report: RecursionReport) -> list[Any]:
     for first, last, colour in zip((1, 2, 3, 4, 6, 11), ends, LOST, strict=True):
         name = f"{first}" if first == last else f"{first} to {last}"
         name = f"lost at step {name if last < np.inf else f'{first} or later'}"
-        fates.append((name, colour, (lost >= first) & (lost <= last)))
-    fate = np.zeros(len(lost), int)
-    for i, (_, _, where) in enumerate(fates):
-        fate[where] = i
-    draw_values(ax, report.states, fate, {i: colour for i, (_, colour, _) in enumerate(fates)})
+        outcomes.append((name, colour, (lost >= first) & (lost <= last)))
+    outcome = np.zeros(len(lost), int)
+    for i, (_, _, where) in enumerate(outcomes):
+        outcome[where] = i
+    colours = {i: colour for i, (_, colour, _) in enumerate(outcomes)}
+    draw_values(ax, report.states, outcome, colours)
     return [
         patch(name, colour, count)
-        for name, colour, where in fates
+        for name, colour, where in outcomes
         if (count := np.count_nonzero(where))
     ]
 

@@ -1,4 +1,4 @@
-"""The picture of a robot map: what the linear model promises and what the robot does."""
+"""The plot of a robot map: what the linear model promises and what the robot does."""
 
 from typing import Any
 
@@ -36,7 +36,7 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
     """
     points = rmap.points
     if points.shape[1] != 2:
-        fail("rmap", f"maps {points.shape[1]} coordinates", "A picture needs 2: choose `axes`")
+        fail("rmap", f"maps {points.shape[1]} coordinates", "A plot needs 2: choose `axes`")
     ax = new_axes(9.6) if ax is None else ax
     colours = (FEASIBLE, BROKEN, INFEASIBLE, BETTER, UNDECIDED)
     draw_values(ax, points, rmap.outcome, dict(enumerate(colours)))
@@ -68,7 +68,7 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
         handles.append(Line2D([], [], ls="", label=name, **style))
     ax.set_xlabel(rmap.names[0])
     ax.set_ylabel(rmap.names[1])
-    ax.set_title(_title(rmap), loc="left", fontsize=11)
+    ax.set_title(_robot_map_title(rmap), loc="left", fontsize=11)
     legend(ax, handles)
     return ax
 
@@ -90,7 +90,7 @@ def _words(rmap: RobotMap) -> tuple[str, ...]:
     return words
 
 
-def _title(rmap: RobotMap) -> str:
+def _robot_map_title(rmap: RobotMap) -> str:
     """Return which robot, how long, and the values of the coordinates that are not mapped."""
     name = rmap.robot.name
     mpc = rmap.linear.mpc

@@ -1,4 +1,4 @@
-"""Colours and drawing that the pictures share. Nothing here shows a window."""
+"""Colours and drawing functions that the plots share. No function shows a window."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 
 from jaxmpc.control.sets import Polytope
 
-# Okabe and Ito's palette: told apart with any colour vision, and in grey by lightness.
+# Okabe and Ito's palette: distinct with any colour vision, and in grey by lightness.
 INFEASIBLE, FEASIBLE, UNDECIDED = "#dddcd8", "#9fcbe6", "#f0d024"
 OUTER, INNER, TERMINAL = "#d55e00", "#00486b", "#006f52"
 EDGE = "#8a8a8a"

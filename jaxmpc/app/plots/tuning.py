@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
-from jaxmpc.app.plots.closed_loops import draw_limits, panel_columns
+from jaxmpc.app.plots.closed_loops import draw_limits, panel_grid
 from jaxmpc.app.plots.style import INFEASIBLE, TERMINAL, ring
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.outcome import coordinates
@@ -25,7 +25,7 @@ _BEFORE, _AFTER, _REJECTED, _BEST = "#d55e00", "#0072b2", "#a50f15", "#006f52"
 _FRACTIONS = (
     ("unsolved", "plans not solved", "#0072b2", "-"),
     ("infeasible", "plans proved infeasible", "#a50f15", "--"),
-    ("fallback", "plans that break soft limits", "#e69f00", "-"),
+    ("fallback", "plans that violate soft limits", "#e69f00", "-"),
     ("violation", "loops beyond the limits", "#006f52", ":"),
 )
 # Lines of a panel that get a name each; more are named by the groups they belong to.
@@ -48,7 +48,7 @@ def plot_tuning(
     ((top, norm), (ratio, counts)) = figure.subplots(2, 2)
     every, steps, best = np.arange(history.steps + 1), np.arange(history.steps), history.best
     loss, validation = history.loss, history.validation
-    # Training and validation loops differ: what they share is by how much they fall.
+    # Training and validation loops differ, so only relative changes are comparable.
     relative = validation[0] > 0 and len(loss) > 0 and loss[0] > 0
     if relative:
         loss, validation = loss / loss[0], validation / validation[0]
@@ -94,7 +94,7 @@ def plot_tuning(
 
 
 def _scale(ax: Axes, *columns: np.ndarray) -> None:
-    """A logarithmic axis where values are positive and range over more than a factor of 5."""
+    """Use a logarithmic axis where values are positive and range over more than a factor of 5."""
     values = np.concatenate(columns)
     values = values[np.isfinite(values)]
     if len(values) and values.min() > 0 and values.max() > 5 * values.min():
@@ -104,7 +104,8 @@ def _scale(ax: Axes, *columns: np.ndarray) -> None:
 
 
 def _logarithmic(ax: Axes, values: np.ndarray) -> None:
-    """With ticks at 1, 2, 5 in plain numbers where powers of ten would leave too few."""
+    """Use a logarithmic axis, with ticks at 1, 2, 5 in plain numbers where powers of ten would
+    leave too few."""
     ax.set_yscale("log")
     decades = np.log10(values.max() / values.min())
     if decades < 3:
@@ -118,7 +119,7 @@ def _logarithmic(ax: Axes, values: np.ndarray) -> None:
 def _draw_weights(
     ax: Axes, steps: np.ndarray, weights: Mapping[str, Mapping[str, np.ndarray]]
 ) -> None:
-    """Each weight over its start; a colour a line, or a colour a group where there are many."""
+    """Draw each weight over its start: one colour a line, or one a group where there are many."""
     count = sum(len(entries) for entries in weights.values())
     colours = matplotlib.colormaps["tab10"].colors  # type: ignore[attr-defined]
     i, handles, ratios = 0, [], []
@@ -169,34 +170,15 @@ def plot_before_after(
         (coordinates(plant, run.states)[shown], np.asarray(run.inputs, float)[shown])
         for run in (before, after)
     ]
-    columns = panel_columns(plant)
-    rows = max(len(panels) for _, panels in columns)
-    figure = Figure(
-        figsize=(3.4 * len(columns) + 0.2, max(1.35 * rows, 2.4) + 1.0), layout="constrained"
-    )
-    grid = figure.subplots(rows, len(columns), sharex=True, squeeze=False)
-    for column, (name, panels) in zip(grid.T, columns, strict=True):
-        for ax in column[len(panels) :]:
-            ax.set_axis_off()
-        column[0].set_title(name, fontsize=9)
-        column[len(panels) - 1].set_xlabel("time [s]", fontsize=8)
-        column[len(panels) - 1].tick_params(labelbottom=True)
-        for ax, (kind, i, label) in zip(column, panels, strict=False):
-            limits, target = (
-                (plant.input_limits, input_reference) if kind else (plant.state_limits, reference)
-            )
-            # Broad below narrow: where both are the same both are seen.
-            for found, colour, width in zip(values, (_BEFORE, _AFTER), (2.2, 1.0), strict=True):
-                lines = found[kind][..., i].T
-                lines = np.concatenate([lines, lines[-1:]]) if kind else lines
-                style: dict[str, Any] = {"drawstyle": "steps-post"} if kind else {}
-                ax.plot(time, lines, color=colour, lw=width, alpha=0.9, **style)
-            ends = [float(np.asarray(end)[i]) for end in (limits.lower, limits.upper)]
-            draw_limits(ax, ends, None if target is None else float(np.asarray(target)[i]))
-            ax.set_ylabel(label, fontsize=8)
-            ax.tick_params(labelsize=7)
-            ax.set_xlim(0, time[-1])
-    figure.align_ylabels()
+    figure, panels = panel_grid(plant, time, 3.4, (1.35, 2.4, 1.0))
+    for ax, kind, i in panels:
+        # Broad lines below narrow ones, so that both are visible where they coincide.
+        for found, colour, width in zip(values, (_BEFORE, _AFTER), (2.2, 1.0), strict=True):
+            lines = found[kind][..., i].T
+            lines = np.concatenate([lines, lines[-1:]]) if kind else lines
+            style: dict[str, Any] = {"drawstyle": "steps-post"} if kind else {}
+            ax.plot(time, lines, color=colour, lw=width, alpha=0.9, **style)
+        draw_limits(ax, plant, kind, i, (reference, input_reference)[kind])
     handles: list[Any] = [
         Line2D([], [], color=_BEFORE, lw=2.2, label="before"),
         Line2D([], [], color=_AFTER, lw=1.0, label="after"),
