@@ -64,7 +64,7 @@ def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple:
     _, moved = jax.jvp(conditions, (qp,), (tangents[0],))
     weights, normals = bounds.curvature(v + y_w / rho, rho)
     weights = jnp.where(kept, weights, upper + lower)
-    dw, dy = linearised(H, A, weights, normals, rho)(*moved)
+    dw, dy = linearised(H, A, weights, normals, rho, factor.flat)(*moved)
     return (z, y), (matmul(dw, T.T), E * dy)
 
 

@@ -19,10 +19,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxmpc.qp.batches import everywhere, true_places
 from jaxmpc.qp.linalg import definite_solver, solve
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
 
+# Rows of the reduced system of derivatives at most.
+FEW_ROWS = 48
 # Steps of the line search, a scalar Newton method. Penalties put almost vertical pieces into the
 # derivative, which only bisection finds.
 LINE_STEPS, LINE_STEPS_SOFT = 6, 24
@@ -211,7 +214,7 @@ def multipliers_update(q: Array, state: Multipliers, step: Newton, far: float) -
 
 
 def linearised(
-    H: Array, A: Array, weights: Array, normals: list[Array], rho: float
+    H: Array, A: Array, weights: Array, normals: list[Array], rho: float, flat: Array
 ) -> Callable[[Array, Array], tuple[Array, Array]]:
     """Solver of the optimality conditions with the pieces of g held fixed.
 
@@ -220,16 +223,17 @@ def linearised(
 
         H dw + A'dy = −a,        dy/ρ = D (A dw + dy/ρ) + c,        D = diag(weights) + Σ h h'.
 
-    The function returned maps (a, c) to (dw, dy); it is linear. D is singular or not: eliminating
+    The function returned maps (a, c) to (dw, dy); it is linear. flat: whether H is not nearly the
+    identity; where it is and few rows have a weight in all instances of a batch, the system to be
+    factored is of the size of these. D is singular or not: eliminating
     dy by the method of multipliers needs only the definite K = H + ρ A'DA (with a ridge), and
     eight sweeps leave an error (1 + ρ s²)⁻⁸ for active rows with least singular value s. Where
     active rows contradict each other, dw tends to their least-squares solution and dy stays
     bounded by 8ρ times the contradiction.
     """
-    inverse = definite_solver(ridged(H + rho * gram(A, weights, normals), rho))
     D = lambda v: weights * v + sum(h * jnp.sum(h * v) for h in normals)
 
-    def solved(a: Array, c: Array) -> tuple[Array, Array]:
+    def swept(inverse: Callable, a: Array, c: Array) -> tuple[Array, Array]:
         def sweep(carry: tuple[Array, Array], _: None) -> tuple[Any, None]:
             dw, dy = carry
             rows = D(matmul(dw, A.T) + dy / rho) + c - dy / rho
@@ -239,4 +243,20 @@ def linearised(
 
         return jax.lax.scan(sweep, (jnp.zeros_like(a), jnp.zeros_like(c)), length=8)[0]
 
-    return solved
+    dense = lambda a, c: swept(
+        definite_solver(ridged(H + rho * gram(A, weights, normals), rho)), a, c
+    )
+    if normals or min(A.shape) <= FEW_ROWS:
+        return dense
+
+    def reduced(a: Array, c: Array) -> tuple[Array, Array]:
+        # (I + ρ A'DA)⁻¹g = g − A_W'(S_WW + (ρD)⁻¹)⁻¹A_W g for the rows W with D > 0 (Woodbury);
+        # where H is not quite I the next sweep makes up for it.
+        W = true_places(weights > 0, FEW_ROWS)
+        A_W = A.at[W].get(mode="fill", fill_value=0.0)
+        D_W = weights.at[W].get(mode="fill", fill_value=1.0)
+        K = matmul(A_W, A_W.T) + jnp.diag(1 / (rho * D_W))
+        return swept(lambda g: g - matmul(solve(K, matmul(g, A_W.T)), A_W), a, c)
+
+    few = (jnp.sum(weights > 0) <= FEW_ROWS) & ~flat
+    return lambda a, c: jax.lax.cond(everywhere(few), reduced, dense, a, c)
