@@ -13,9 +13,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.qp import gpu
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import matmul
+
+# Numbers along a side that a warp's registers hold; Triton's products need 16 at least.
+SIDES = (16, 32)
 
 # float32 products from six of bfloat16, as exact as float32's own, on tensor cores.
 PRODUCT: Any = jax.lax.DotAlgorithmPreset.BF16_BF16_F32_X6
@@ -69,7 +71,7 @@ def riccati_recursion(Q: Array, R: Array, cross: Any, A: Array, B: Array) -> Gai
 def _or_kernel(scan: Callable, kernel: Callable, *args: Array) -> Any:
     """The kernel where it runs, with the derivative of the scan."""
     side = max(size for v in args for size in v.shape[-1:])
-    if jax.default_backend() != "gpu" or side > gpu.WARP_SIDE:
+    if jax.default_backend() != "gpu" or side > SIDES[-1]:
         return scan(*args)
     fast = jax.custom_jvp(kernel)
     # The value is the kernel's here too: under `vmap` within `jit` JAX takes the place of the batch
@@ -133,21 +135,21 @@ def _recurrence_kernel(
     N, n = w.shape
 
     def kernel(M_ref: Any, w_ref: Any, start_ref: Any, out_ref: Any) -> None:
-        i = jnp.arange(gpu.side_of(n), dtype=jnp.int32)
+        i = jnp.arange(_side(n), dtype=jnp.int32)
         here = i < n
-        shared = gpu.matrix(M_ref, None, n, n) if M.ndim == 2 else None
+        shared = _matrix(M_ref, None, n, n) if M.ndim == 2 else None
 
         def stage(step: Array, y: Array) -> Array:
             k = N - 1 - step if adjoint else step
-            own = gpu.matrix(M_ref, k, n, n) if shared is None else shared
+            own = _matrix(M_ref, k, n, n) if shared is None else shared
             product = own * (y[:, None] if adjoint else y[None, :])
-            y = jnp.sum(product, axis=0 if adjoint else 1) + gpu.load(w_ref.at[k, i], here)
-            gpu.store(out_ref.at[k, i], y, here)
+            y = jnp.sum(product, axis=0 if adjoint else 1) + _load(w_ref.at[k, i], here)
+            _store(out_ref.at[k, i], y, here)
             return y
 
-        jax.lax.fori_loop(jnp.int32(0), jnp.int32(N), stage, gpu.load(start_ref.at[i], here))
+        jax.lax.fori_loop(jnp.int32(0), jnp.int32(N), stage, _load(start_ref.at[i], here))
 
-    return gpu.call(kernel, jax.ShapeDtypeStruct((N, n), w.dtype), interpret)(M, w, start)
+    return _call(kernel, jax.ShapeDtypeStruct((N, n), w.dtype), interpret)(M, w, start)
 
 
 def _tracking_kernel(
@@ -159,10 +161,10 @@ def _tracking_kernel(
 
     def kernel(K_ref: Any, inverse_ref: Any, A_ref: Any, B_ref: Any, gx_ref: Any, gu_ref: Any,
                x_ref: Any, u_ref: Any) -> None:  # fmt: skip
-        side = gpu.side_of(max(n, m))
+        side = _side(max(n, m))
         i = jnp.arange(side, dtype=jnp.int32)
         state, moved = i < n, i < m
-        load = lambda ref, k, rows, columns: gpu.matrix(ref, k, rows, columns, side)
+        load = lambda ref, k, rows, columns: _matrix(ref, k, rows, columns, side)
         once = lambda ref, v, columns: load(ref, None, n, columns) if v.ndim == 2 else None
         A_0, B_0 = once(A_ref, A, n), once(B_ref, B, m)
         own = lambda k: (
@@ -175,34 +177,32 @@ def _tracking_kernel(
         def backward(step: Array, p: Array) -> Array:
             k = N - 1 - step
             A_k, B_k = own(k)
-            q = gpu.load(gu_ref.at[k, i], moved) - turned(B_k, p)
-            gpu.store(u_ref.at[k, i], apply(load(inverse_ref, k, m, m), q), moved)
-            return (
-                turned(A_k, p) - turned(load(K_ref, k, m, n), q) - gpu.load(gx_ref.at[k, i], state)
-            )
+            q = _load(gu_ref.at[k, i], moved) - turned(B_k, p)
+            _store(u_ref.at[k, i], apply(load(inverse_ref, k, m, m), q), moved)
+            return turned(A_k, p) - turned(load(K_ref, k, m, n), q) - _load(gx_ref.at[k, i], state)
 
         def forward(k: Array, x: Array) -> Array:
             A_k, B_k = own(k)
-            gpu.store(x_ref.at[k, i], x, state)
-            u = apply(load(K_ref, k, m, n), x) + gpu.load(u_ref.at[k, i], moved)
-            gpu.store(u_ref.at[k, i], u, moved)
+            _store(x_ref.at[k, i], x, state)
+            u = apply(load(K_ref, k, m, n), x) + _load(u_ref.at[k, i], moved)
+            _store(u_ref.at[k, i], u, moved)
             return apply(A_k, x) + apply(B_k, u)
 
         zero, end = jnp.int32(0), jnp.int32(N)
-        jax.lax.fori_loop(zero, end, backward, -gpu.load(gx_ref.at[N, i], state))
+        jax.lax.fori_loop(zero, end, backward, -_load(gx_ref.at[N, i], state))
         if not interpret:
-            gpu.barrier()
+            _barrier()
         x = jax.lax.fori_loop(zero, end, forward, jnp.zeros(side, gx.dtype))
-        gpu.store(x_ref.at[N, i], x, state)
+        _store(x_ref.at[N, i], x, state)
 
     out = [jax.ShapeDtypeStruct(v.shape, v.dtype) for v in (gx, gu)]
-    x, u = gpu.call(kernel, out, interpret)(K, inverse, A, B, gx, gu)
+    x, u = _call(kernel, out, interpret)(K, inverse, A, B, gx, gu)
     return x, u
 
 
 def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array, *, interpret: bool = False) -> Gains:
     N, n, m, dtype = len(R), Q.shape[-1], R.shape[-1], Q.dtype
-    side = gpu.side_of(max(n, m))
+    side = _side(max(n, m))
     precision = None if dtype == jnp.float64 or interpret else PRODUCT
 
     def dot(a: Array, b: Array) -> Array:
@@ -214,7 +214,7 @@ def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array, *, interpret: bool =
                inverse_ref: Any) -> None:  # fmt: skip
         i = jnp.arange(side, dtype=jnp.int32)
         row, column = i[:, None], i[None, :]
-        load = lambda ref, k, rows, columns: gpu.matrix(ref, k, rows, columns, side)
+        load = lambda ref, k, rows, columns: _matrix(ref, k, rows, columns, side)
 
         def stage(step: Array, S: Array) -> Array:
             k = N - 1 - step
@@ -240,7 +240,7 @@ def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array, *, interpret: bool =
                 (closed_ref, closed, n, n), (K_ref, K, m, n), (inverse_ref, G, m, m)
             ):  # fmt: skip
                 inside = (row < rows) & (column < columns)
-                gpu.store(ref.at[k, row, column], v, inside)
+                _store(ref.at[k, row, column], v, inside)
             S = load(Q_ref, k, n, n) + dot(closed.T, dot(S, closed)) + dot(K.T, dot(R_k, K))
             return (S + S.T) / 2
 
@@ -248,4 +248,48 @@ def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array, *, interpret: bool =
 
     shapes = [(N, n, n), (N, m, n), (N, m, m)]
     out = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
-    return Gains(*gpu.call(kernel, out, interpret)(Q, R, A, B))
+    return Gains(*_call(kernel, out, interpret)(Q, R, A, B))
+
+
+def _call(kernel: Callable, shapes: Any, interpret: bool) -> Callable:
+    """One program, a warp, for each instance: `vmap` makes the grid."""
+    from jax.experimental import pallas
+    from jax.experimental.pallas import triton
+
+    options = triton.CompilerParams(num_warps=1, num_stages=1)
+    return pallas.pallas_call(
+        kernel, out_shape=shapes, compiler_params=options, interpret=interpret
+    )
+
+
+def _side(n: int) -> int:
+    """The least power of two that Triton takes and that holds n."""
+    return next(side for side in SIDES if n <= side)
+
+
+def _matrix(ref: Any, k: Any, rows: int, columns: int, side: int | None = None) -> Array:
+    """The matrix (rows, columns) at stage k (None: the only one), filled up with zeros."""
+    side = _side(max(rows, columns)) if side is None else side
+    i = jnp.arange(side, dtype=jnp.int32)
+    row, column = i[:, None], i[None, :]
+    place = ref.at[row, column] if k is None else ref.at[k, row, column]
+    return _load(place, (row < rows) & (column < columns))
+
+
+def _load(place: Any, mask: Array) -> Array:
+    from jax.experimental.pallas import triton
+
+    return triton.load(place, mask=mask, other=0.0)
+
+
+def _store(place: Any, value: Array, mask: Array) -> None:
+    from jax.experimental.pallas import triton
+
+    triton.store(place, value, mask=mask)
+
+
+def _barrier() -> None:
+    """What the program has stored may be loaded from here on."""
+    from jax.experimental.pallas import triton
+
+    triton.debug_barrier()

@@ -16,8 +16,8 @@ import numpy as np
 from jax import Array, lax
 from jax.custom_batching import custom_vmap
 
-# Instances in a block on a CPU, and bytes of data in one elsewhere: they stay within the cache.
-BLOCK, BLOCK_BYTES = 128, 2**25
+# Instances in a block on a CPU, whose data stay within the cache. (On GPUs blocks gain nothing.)
+BLOCK = 128
 # Instances in a group on a CPU at most, and when fewer are open; small batches are one group.
 PART_CPU, FEW_CPU, SMALL_CPU = 512, 64, 128
 # Instances in a group elsewhere: a quarter of the batch; when fewer are open a sixteenth of that,
@@ -40,7 +40,7 @@ def group_sizes(batch: int) -> list[int]:
 
 
 def in_blocks(function: Callable, constants: Any, data: Any) -> Any:
-    """Return function(constants, data), for a large batch in blocks, one after the other.
+    """Return function(constants, data), for a batch on a CPU in blocks, one after the other.
 
     `function` must close over no arrays. A batch of constants makes no blocks.
     """
@@ -52,23 +52,17 @@ def in_blocks(function: Callable, constants: Any, data: Any) -> Any:
         data = _broadcast(size, in_batched[1], data)
         together = lambda constants, data: jax.vmap(function, in_axes=(axes, 0))(constants, data)
 
-        def blocks(block: int, constants: Any, data: Any) -> Any:
-            if size <= block:
-                return together(constants, data)
-            missing = -size % block
+        def blocks(constants: Any, data: Any) -> Any:
+            missing = -size % BLOCK
             padded = lambda v: jnp.pad(v, ((0, missing), *[(0, 0)] * (v.ndim - 1)), mode="edge")
-            grouped = jax.tree.map(lambda v: padded(v).reshape(-1, block, *v.shape[1:]), data)
+            grouped = jax.tree.map(lambda v: padded(v).reshape(-1, BLOCK, *v.shape[1:]), data)
             out = lax.map(lambda block: together(constants, block), grouped)
             return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:])[:size], out)
 
-        bytes_each = sum(v.nbytes for v in jax.tree.leaves(data)) // max(size, 1)
-        large = max(BLOCK_BYTES // max(bytes_each, 1), BLOCK)
         if size <= BLOCK or any(jax.tree.leaves(in_batched[0])):
             out = together(constants, data)
         else:
-            out = lax.platform_dependent(
-                constants, data, cpu=partial(blocks, BLOCK), default=partial(blocks, large)
-            )
+            out = lax.platform_dependent(constants, data, cpu=blocks, default=together)
         return out, jax.tree.map(lambda _: True, out)
 
     return one(constants, data)

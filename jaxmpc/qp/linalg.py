@@ -12,10 +12,9 @@ batch on a CPU is
 * above, on those jaxlibs, LAPACK calls for some matrices each, a fraction of the work that is
   spread (TOGETHER), and one call for all where that is safe.
 
-On GPUs systems of up to 64 rows with one right-hand side are solved by a kernel (`gpu.py`). On
-other devices, and for all else, JAX's batched routines serve. Nested `vmap`s are one batch. All
-functions here have derivatives of any order, forward and reverse (`eigh` where no eigenvalue is
-repeated). A matrix that is not positive definite gives NaN.
+On other devices JAX's batched routines serve. Nested `vmap`s are one batch. All functions here have
+derivatives of any order, forward and reverse (`eigh`: where no eigenvalue is repeated). A matrix
+that is not positive definite gives NaN.
 """
 
 import re
@@ -29,7 +28,6 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.custom_batching import custom_vmap
 
-from jaxmpc.qp import gpu
 from jaxmpc.qp.precision import matmul
 
 JAXLIB = tuple(int(part) for part in re.findall(r"\d+", version("jaxlib"))[:3])
@@ -46,7 +44,6 @@ def _batched(
     small: int = 0,
     columns: bool = False,
     together: int = TOGETHER,
-    kernel: Callable | None = None,
 ) -> Callable:
     """The function `one` of a matrix (and right-hand sides), whose `vmap` follows the rules above.
 
@@ -54,7 +51,6 @@ def _batched(
     side, all arguments and results with the batch as last axis, used up to `small` rows. columns:
     the second argument is right-hand sides (n, k), the batch of which needs one factorization
     where it shares the matrix. together: multiplications in a call, 0 for one matrix a call.
-    kernel: (K, b (n,)) → K⁻¹b on GPUs, up to gpu.SIDES[-1] rows.
     """
 
     def on_cpu(*args: Array) -> Any:
@@ -68,10 +64,6 @@ def _batched(
 
     @custom_vmap
     def many(*args: Array) -> Any:
-        small_system = args[0].shape[-1] <= gpu.SIDES[-1] and args[-1].shape[-1] == 1
-        if kernel is not None and small_system and jax.default_backend() == "gpu":
-            on_gpu = jax.vmap(lambda K, B: kernel(K, B[:, 0])[:, None])
-            return lax.platform_dependent(*args, cpu=on_cpu, cuda=on_gpu, default=jax.vmap(one))
         return lax.platform_dependent(*args, cpu=on_cpu, default=jax.vmap(one))
 
     @many.def_vmap
@@ -199,7 +191,7 @@ def _triangular_lapack(L: Array, B: Array) -> Array:
     return lax.linalg.triangular_solve(L, B, left_side=True, lower=True)
 
 
-_solve = _batched(_solve_lapack, _solve_plain, small=6, columns=True, kernel=gpu.solve)
+_solve = _batched(_solve_lapack, _solve_plain, small=6, columns=True)
 _cholesky = _batched(_cholesky_lapack, _cholesky_plain, small=12)
 _inverse_root = _batched(_inverse_root_lapack, _inverse_root_plain, small=12)
 _triangular = _batched(_triangular_lapack, _triangular_plain, small=6, columns=True)

@@ -255,8 +255,8 @@ def linearised(
         W = true_places(weights > 0, FEW_ROWS)
         A_W = A.at[W].get(mode="fill", fill_value=0.0)
         D_W = weights.at[W].get(mode="fill", fill_value=1.0)
-        K = matmul(A_W, A_W.T) + jnp.diag(1 / (rho * D_W))
-        return swept(lambda g: g - matmul(solve(K, matmul(g, A_W.T)), A_W), a, c)
+        inverse = definite_solver(matmul(A_W, A_W.T) + jnp.diag(1 / (rho * D_W)))
+        return swept(lambda g: g - matmul(inverse(matmul(g, A_W.T)), A_W), a, c)
 
     few = (jnp.sum(weights > 0) <= FEW_ROWS) & ~flat
     return lambda a, c: jax.lax.cond(everywhere(few), reduced, dense, a, c)

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from jaxmpc.checks import concrete, fail
-from jaxmpc.qp.active_set import DualPoint, dual_point, dual_step
+from jaxmpc.qp.active_set import DualPoint, dual_point, dual_step, sizes_of_W
 from jaxmpc.qp.admm import (
     ADMM,
     DEFAULT,
@@ -244,9 +244,13 @@ def improve(
         # The dual of an infeasible program has no maximum: steps towards it would be wasted.
         _, empty = farkas(qp, factor.E * begin.change, correcting)
         dual = dual_point(factor.A, p.q, p.bounds, begin.y)
-        state = DualSearch(dual, best, jnp.int32(0), ~factor.flat & ~empty)
-        most = min(DUAL_STEPS, refine)
-        state = repeat_while(lambda s: s.open, partial(on_the_dual, most), p, state)
+        state = DualSearch(dual, best, jnp.int32(0), ~factor.flat & ~empty, jnp.asarray(True))
+        *few, most = sizes_of_W(factor.A)
+        step = partial(on_the_dual, min(DUAL_STEPS, refine))
+        for size in few:
+            fitting = lambda s: s.open & s.fits
+            state = repeat_while(fitting, partial(step, size, must_fit=True), p, state)
+        state = repeat_while(lambda s: s.open, partial(step, most), p, state)
         best, go_on, y = state.best, ~state.best.solved, state.dual.y
         # Multipliers that grow without bound are nearly a Farkas vector.
         begin = replace(begin, change=jnp.where(diverged(p, y), y, begin.change))
@@ -266,13 +270,14 @@ def improve(
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class DualSearch:
-    """One instance among the dual steps: where it is, the best pair so far, the steps taken, and
-    whether to go on."""
+    """One instance among the dual steps: where it is, the best pair so far, the steps taken,
+    whether to go on, and whether its active rows fit into the system that is solved."""
 
     dual: DualPoint
     best: Pair
     steps: Array
     open: Array
+    fits: Array
 
 
 def diverged(p: Program, y: Array) -> Array:
@@ -280,17 +285,25 @@ def diverged(p: Program, y: Array) -> Array:
     return largest(y) > DIVERGED * (1 + largest(p.q))
 
 
-def on_the_dual(most: int, p: Program, s: DualSearch) -> DualSearch:
-    """One step of `active_set.py`, and whether it solved the program."""
+def on_the_dual(
+    most: int, rows: int, p: Program, s: DualSearch, must_fit: bool = False
+) -> DualSearch:
+    """One step of `active_set.py` with `rows` rows at most, and whether it solved the program.
+    must_fit: where there are more, the instance stays as it is, marked so."""
     steps = s.steps + 1
-    dual = dual_step(p.factor.A, p.factor.S, p.bounds, s.dual, steps > JOINTLY)
+    f, singly = p.factor, steps > JOINTLY
+    dual, fits = dual_step(f.A, f.S, p.bounds, s.dual, singly, rows)
     pair, gradient = judged(p, dual.w, dual.y)
     best = s.best.or_better(pair)
     # In exact arithmetic the gradient is zero here. Where P is ill-conditioned it is rounding of
     # T'PT, for which w makes up (defect correction).
     dual = replace(dual, w=dual.w - gradient)
     go_on = ~best.solved & ~diverged(p, dual.y) & (steps < most)
-    return DualSearch(dual, best, steps, go_on)
+    new = DualSearch(dual, best, steps, go_on, fits)
+    if not must_fit:
+        return new
+    kept = jax.tree.map(lambda a, b: jnp.where(fits, a, b), new, s)
+    return replace(kept, fits=fits)
 
 
 def proof_steps(refine: int) -> int:
