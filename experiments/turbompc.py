@@ -36,7 +36,7 @@ class Settings:
     umax: float = 1.0
     samples: int = 50
     gradient: bool = False
-    checkpoint: bool = True
+    checkpoint: bool = False
     rounds: int = 3
 
 

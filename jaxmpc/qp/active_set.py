@@ -30,8 +30,8 @@ from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
 
-# Most rows in W. On GPUs, where factorizations take most of the time, instances with few rows are
-# worked off first.
+# Most rows in W. In large batches on GPUs, where factorizations take most of the time, instances
+# with few rows are worked off first.
 MOST_ROWS, FEW_ROWS = 48, 16
 # Step lengths that are tried, beside the largest that stops no row.
 LENGTHS = (1.0, 0.5, 0.25, 0.0625)
@@ -52,12 +52,6 @@ def dual_point(A: Array, q: Array, bounds: Bounds, y: Array) -> DualPoint:
     """Return the point of multipliers y (m,), made admissible."""
     y = bounds.admissible(y)
     return DualPoint(y, -q - matmul(y, A))
-
-
-def sizes_of_W(A: Array) -> list[int]:
-    """Return how many rows W may hold, from few to many, for a program of rows A (m, n)."""
-    most, few = min(*A.shape, MOST_ROWS), FEW_ROWS if jax.default_backend() == "gpu" else 0
-    return [few, most] if 0 < few < most else [most]
 
 
 def dual_step(

@@ -25,6 +25,8 @@ PART_CPU, FEW_CPU, SMALL_CPU = 512, 64, 128
 # TurboMPC's problem, 4,096 at once: 2.6 µs a solve in one group, 1.6 in groups of 512, 1.2 of 1,024
 # and 256.)
 PART, SMALLER, LEAST = 4, 16, 256
+# Instances on a GPU from which on the arithmetic, not the launches, takes the time.
+LARGE = 16_384
 
 
 def group_sizes(batch: int) -> list[int]:
@@ -68,13 +70,17 @@ def in_blocks(function: Callable, constants: Any, data: Any) -> Any:
     return one(constants, data)
 
 
-def repeat_while(is_open: Callable, step: Callable, constants: Any, state: Any) -> Any:
+def repeat_while(
+    is_open: Callable, step: Callable, constants: Any, state: Any, first: tuple | None = None
+) -> Any:
     """Return `state` after state = step(constants, state) while is_open(state), a scalar.
 
-    Both functions must close over no arrays: what they read stands in `constants`. One instance is
+    The functions must close over no arrays: what they read stands in `constants`. One instance is
     one `while_loop`. A batch, also one of nested `vmap`s, is worked off in groups (top of this
-    file). Not differentiable.
+    file). first: another pair (is_open, step), whose loop comes before in large batches on a GPU:
+    a cheaper step for those instances that it serves. Not differentiable.
     """
+    loops = [(is_open, step)] if first is None else [first, (is_open, step)]
     one = lambda constants, state: lax.while_loop(is_open, lambda s: step(constants, s), state)
     single = custom_vmap(one)
 
@@ -83,26 +89,29 @@ def repeat_while(is_open: Callable, step: Callable, constants: Any, state: Any) 
         leaves, tree = jax.tree.flatten(constants)
         batched = tuple(jax.tree.leaves(in_batched[0]))
         state = _broadcast(size, in_batched[1], state)
-        out = _in_groups(is_open, step, tree, batched)(tuple(leaves), state)
+        out = _in_groups(loops, tree, batched)(tuple(leaves), state)
         return out, jax.tree.map(lambda _: True, out)
 
     return single(constants, state)
 
 
-def _in_groups(is_open: Callable, step: Callable, tree: Any, batched: tuple[bool, ...]) -> Callable:
-    """The loop for a batch: (leaves of the constants, states) → states. batched: which leaves have
-    the batch axis."""
-
-    def advance(leaves: tuple, state: Any) -> Any:
-        return step(jax.tree.unflatten(tree, leaves), state)
-
+def _in_groups(loops: list[tuple], tree: Any, batched: tuple[bool, ...]) -> Callable:
+    """Return the loops for a batch, (leaves of the constants, states) → states. loops: (is_open,
+    step) of each, as in `repeat_while`. batched: which leaves have the batch axis."""
     axes = tuple(0 if b else None for b in batched)
-    many = jax.vmap(advance, in_axes=(axes, 0))
 
     def run(leaves: tuple, state: Any) -> Any:
         size = jax.tree.leaves(state)[0].shape[0]
         if not size:
             return state
+        large = size >= LARGE and jax.default_backend() == "gpu"
+        for is_open, step in loops if large else loops[-1:]:
+            state = loop(is_open, step, size, leaves, state)
+        return state
+
+    def loop(is_open: Callable, step: Callable, size: int, leaves: tuple, state: Any) -> Any:
+        advance = lambda leaves, state: step(jax.tree.unflatten(tree, leaves), state)
+        many = jax.vmap(advance, in_axes=(axes, 0))
         open_ones = lambda state: jax.vmap(is_open)(state)
 
         def group(count: int, state: Any) -> Any:

@@ -259,4 +259,5 @@ def linearised(
         return swept(lambda g: g - matmul(inverse(matmul(g, A_W.T)), A_W), a, c)
 
     few = (jnp.sum(weights > 0) <= FEW_ROWS) & ~flat
-    return lambda a, c: jax.lax.cond(everywhere(few), reduced, dense, a, c)
+    # Going backward, the factors are made then: kept, they would be n² numbers an instance.
+    return jax.checkpoint(lambda a, c: jax.lax.cond(everywhere(few), reduced, dense, a, c))

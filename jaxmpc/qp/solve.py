@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from jaxmpc.checks import concrete, fail
-from jaxmpc.qp.active_set import DualPoint, dual_point, dual_step, sizes_of_W
+from jaxmpc.qp.active_set import FEW_ROWS, MOST_ROWS, DualPoint, dual_point, dual_step
 from jaxmpc.qp.admm import (
     ADMM,
     DEFAULT,
@@ -245,12 +245,11 @@ def improve(
         _, empty = farkas(qp, factor.E * begin.change, correcting)
         dual = dual_point(factor.A, p.q, p.bounds, begin.y)
         state = DualSearch(dual, best, jnp.int32(0), ~factor.flat & ~empty, jnp.asarray(True))
-        *few, most = sizes_of_W(factor.A)
-        step = partial(on_the_dual, min(DUAL_STEPS, refine))
-        for size in few:
-            fitting = lambda s: s.open & s.fits
-            state = repeat_while(fitting, partial(step, size, must_fit=True), p, state)
-        state = repeat_while(lambda s: s.open, partial(step, most), p, state)
+        step, most = partial(on_the_dual, min(DUAL_STEPS, refine)), min(*qp.A.shape, MOST_ROWS)
+        few = None
+        if most > FEW_ROWS:
+            few = (lambda s: s.open & s.fits), partial(step, FEW_ROWS, must_fit=True)
+        state = repeat_while(lambda s: s.open, partial(step, most), p, state, few)
         best, go_on, y = state.best, ~state.best.solved, state.dual.y
         # Multipliers that grow without bound are nearly a Farkas vector.
         begin = replace(begin, change=jnp.where(diverged(p, y), y, begin.change))
