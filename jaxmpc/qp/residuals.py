@@ -18,6 +18,8 @@ from jaxmpc.qp.precision import matmul, precisely, rounding
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.status import Status
 
+# Multiple of the rounding floor below which steps on ill-conditioned programs gain nothing.
+STALLED = 10
 # A residual vector and the sizes of its terms.
 Terms = tuple[Array, Array]
 
@@ -97,10 +99,11 @@ class Pair:
 
     @classmethod
     def of(cls, z: Array, y: Array, terms: Terms, eps: Array, floor: float) -> "Pair":
-        """Return the pair judged. near: all residuals are below a thousandth of eps; solved: a
-        millionth."""
+        """Return the pair judged. near: all residuals are below a thousandth of eps, or below a
+        tenth and a small multiple of their rounding; solved: below a millionth."""
         above, relative = worst(terms, floor)
-        return cls(z, y, relative, above <= 1e-3 * eps, above <= 1e-6 * eps)
+        at_rounding = (relative <= STALLED * floor) & (above <= 0.1 * eps)
+        return cls(z, y, relative, (above <= 1e-3 * eps) | at_rounding, above <= 1e-6 * eps)
 
     def or_better(self, other: "Pair") -> "Pair":
         """Return the other pair where that is solved or its residuals are smaller. What was near

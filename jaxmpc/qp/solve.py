@@ -288,7 +288,8 @@ def on_the_dual(
     most: int, rows: int, p: Program, s: DualSearch, must_fit: bool = False
 ) -> DualSearch:
     """One step of `active_set.py` with `rows` rows at most, and whether it solved the program.
-    must_fit: where there are more, the instance stays as it is, marked so."""
+    Where there still are more when rows join singly, the search ends. must_fit: where there are
+    more, the instance stays as it is, marked so."""
     steps = s.steps + 1
     f, singly = p.factor, steps > JOINTLY
     dual, fits = dual_step(f.A, f.S, p.bounds, s.dual, singly, rows)
@@ -297,7 +298,7 @@ def on_the_dual(
     # In exact arithmetic the gradient is zero here. Where P is ill-conditioned it is rounding of
     # T'PT, for which w makes up (defect correction).
     dual = replace(dual, w=dual.w - gradient)
-    go_on = ~best.solved & ~diverged(p, dual.y) & (steps < most)
+    go_on = ~best.solved & ~diverged(p, dual.y) & (steps < most) & (fits | ~singly)
     new = DualSearch(dual, best, steps, go_on, fits)
     if not must_fit:
         return new
