@@ -65,6 +65,21 @@ def as32(qp: jm.QP) -> jm.QP:
     return jax.tree.map(np.float32, qp)
 
 
+def solve_small(qp: jm.QP):
+    """`jm.solve_qp` from plain Python, of a program with up to 3 variables and 4 rows: filled up by
+    variables that no row holds and rows that hold nothing, so that all of them share a program."""
+    (m, n), (rows, variables) = qp.A.shape, (4, 3)
+    P, A = np.eye(variables), np.zeros((rows, variables))
+    P[:n, :n], A[:m, :n] = qp.P, qp.A
+    free = np.full(rows - m, INF)
+    sol = jm.solve_qp(
+        jm.QP(P, np.append(qp.q, np.zeros(variables - n)), A, np.append(qp.l, -free),
+              np.append(qp.u, free))
+    )  # fmt: skip
+    sol = jax.tree.map(np.asarray, sol)
+    return replace(sol, z=sol.z[:n], ray=sol.ray[:n], y=sol.y[:m], certificate=sol.certificate[:m])
+
+
 @pytest.fixture
 def x64():
     with enable_x64(True):
@@ -103,7 +118,7 @@ class TestKnownAnswers:
 
     def test_linear_program_in_a_box(self, x64):
         q = np.array([1.0, -2.0, 0.5])
-        sol = solve(box(3, P=np.zeros((3, 3)), q=q))
+        sol = solve_small(box(3, P=np.zeros((3, 3)), q=q))
         assert sol.status == jm.Status.SOLVED
         np.testing.assert_allclose(sol.z, -np.sign(q), atol=1e-8)
         np.testing.assert_allclose(sol.y, -q, atol=1e-8)
@@ -153,7 +168,7 @@ class TestKnownAnswers:
         """l = u fixes every variable: never called infeasible, zero data included."""
         for value in (0.0, 1.0, -3.0):
             v = np.full(3, value)
-            sol = jm.solve_qp(box(3, l=v, u=v))
+            sol = solve_small(box(3, l=v, u=v))
             assert sol.status == jm.Status.SOLVED
             np.testing.assert_allclose(sol.z, v, atol=1e-8)
 
@@ -315,7 +330,7 @@ class TestHonestStatus:
         """Integer rows z₁ + z₂ ≥ 2, z₁ + z₂ ≤ 1: the certificate is (−t, t)."""
         A = np.array([[1.0, 1.0], [1.0, 1.0]])
         l, u = np.array([2.0, -INF]), np.array([INF, 1.0])
-        sol = jm.solve_qp(jm.QP(np.eye(2), np.ones(2), A, l, u))
+        sol = solve_small(jm.QP(np.eye(2), np.ones(2), A, l, u))
         assert sol.status == jm.Status.PRIMAL_INFEASIBLE
         y = np.asarray(sol.certificate)
         np.testing.assert_allclose(A.T @ y, 0, atol=1e-12)
@@ -324,7 +339,7 @@ class TestHonestStatus:
     def test_infeasible_zero_row(self, x64):
         """0'z ≥ 1 contradicts itself."""
         qp = jm.QP(np.eye(2), np.ones(2), np.zeros((1, 2)), np.ones(1), np.array([INF]))
-        sol = jm.solve_qp(qp)
+        sol = solve_small(qp)
         assert sol.status == jm.Status.PRIMAL_INFEASIBLE
         assert exact.proves_empty(qp.A, qp.l, qp.u, sol.certificate)
 
@@ -357,7 +372,7 @@ class TestHonestStatus:
         """Cost falls along −z₂, which only a bound from above limits."""
         A, l, u = np.eye(2), np.array([-1, -INF]), np.array([1.0, 3.0])
         qp = jm.QP(P, np.array([0.3, 1.0]), A, l, u)
-        sol = jm.solve_qp(qp)
+        sol = solve_small(qp)
         assert sol.status == jm.Status.DUAL_INFEASIBLE
         d = np.asarray(sol.ray)
         np.testing.assert_allclose(np.abs(d).max(), 1)
