@@ -1,7 +1,9 @@
 """Runs before any test module, hence before jax is imported: settings of JAX for tests.
 
-Most of the time of a test goes into compiling programs that run once: LLVM's optimisations are off,
-which halves that. `JAX_DISABLE_MOST_OPTIMIZATIONS=0 pytest` runs the tests on optimised programs.
+Most of the time of a test goes into compiling programs that run once: 20 ms the smallest, seconds a
+QP solver. LLVM's optimisations are off, which halves that, and equal programs compile once a run:
+all workers share a cache in a temporary folder. `JAX_DISABLE_MOST_OPTIMIZATIONS=0 pytest` runs the
+tests on optimised programs; `JAX_COMPILATION_CACHE_DIR=folder pytest` keeps programs for later.
 
 A CPU bug of old jaxlibs: from 0.7.0 until 0.11.1, XLA's fusion emitters recompute long chains of
 small operations again and again (a step of a 7-joint robot is 500 times slower). The flag is
@@ -12,7 +14,9 @@ each other on busy cores. The library itself never touches the environment.
 import gc
 import os
 import re
+import tempfile
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 
@@ -22,13 +26,36 @@ if (0, 7, 0) <= _jaxlib < (0, 11, 1):
     os.environ["XLA_FLAGS"] = f"{_flags} --xla_cpu_use_fusion_emitters=false".strip()
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    # Of the process that starts the workers, which inherit the environment; removed as it ends.
+    _programs = tempfile.TemporaryDirectory(prefix="jaxmpc-programs-", ignore_cleanup_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _programs.name
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+
+# Each kernel of a compiled program keeps some memory maps, of which a process may have 65,530 (one
+# more, and it ends by SIGSEGV). A module adds up to 30,000.
+MAPS = 15_000
+
+
+def pytest_configure(config):
+    # A program that another worker is about to write; this one compiles it then.
+    config.addinivalue_line("filterwarnings", "ignore:Error reading persistent compilation cache")
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _forget_programs():
-    """Compiled programs keep memory maps, of which a process may have 65,530."""
+    """Before the process has too many memory maps. What is needed again comes from the cache."""
     yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") < MAPS:
+        return
     import jax
 
+    from jaxmpc.compiled import Compiled
+
+    for found in gc.get_objects():
+        if type(found) is Compiled:
+            found.programs.clear()
     jax.clear_caches()
     gc.collect()

@@ -4,9 +4,12 @@ Every entry is a function, so that a test can change a field with `dataclasses.r
 areas hold for the decimal data as printed; for the float64 data use `exact.feasible_polygon`.
 """
 
+import jax
 import numpy as np
 
 import jaxmpc as jm
+from jaxmpc.mpc.plan import flat_multipliers
+from jaxmpc.mpc.rows import layout
 
 
 def symmetric(*limits: float) -> jm.Box:
@@ -148,3 +151,9 @@ PLANAR = {
     "unstable": lambda: unstable(10),
     "drifting": drifting,
 }
+
+
+def rows_of(mpc, plans):
+    """Multipliers of one plan (rows,), or of many, in the order of `row_table`."""
+    flat = lambda multipliers: flat_multipliers(layout(mpc), multipliers)
+    return np.asarray((jax.vmap(flat) if plans.cost.ndim else flat)(plans.multipliers))

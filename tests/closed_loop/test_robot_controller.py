@@ -7,7 +7,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from test_robots import c_affine, c_steps
+from c_engine import c_affine, c_steps
 
 import jaxmpc as jm
 from jaxmpc.closed_loop import LinearFeedback

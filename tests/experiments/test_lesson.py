@@ -12,7 +12,7 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.mpc.condense import condense
 
-LESSON = Path(__file__).parents[1] / "experiments" / "lesson"
+LESSON = Path(__file__).parents[2] / "experiments" / "lesson"
 sys.path.append(str(LESSON))
 
 

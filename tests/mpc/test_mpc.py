@@ -13,8 +13,7 @@ from jax import enable_x64
 
 import jaxmpc as jm
 from jaxmpc.mpc.condense import condense
-from jaxmpc.mpc.plan import WarmStart, flat_multipliers
-from jaxmpc.mpc.rows import layout
+from jaxmpc.mpc.plan import WarmStart
 
 FINE = jm.ADMM(iterations=400, refine=30, eps=1e-8)
 
@@ -426,7 +425,7 @@ class TestController:
         plan = fine.plan(x)
         cold, warm = few.plan(x), few.plan(x, warm_start=plan)
         assert warm.status == jm.Status.SOLVED != cold.status
-        y = flat_multipliers(layout(mpc), plan.multipliers)
+        y = problems.rows_of(mpc, plan)
         again = few.plan(x, warm_start=WarmStart(plan.states, plan.inputs, y))
         np.testing.assert_array_equal(again.inputs, warm.inputs)
         for bad in ((plan.inputs, y), WarmStart(plan.states, plan.inputs[1:], y)):

@@ -28,6 +28,14 @@ def rows(A, l, u, **fields) -> jm.QP:
     return jm.QP(np.eye(n), np.ones(n), A, l, u, **fields)
 
 
+def filled(qp) -> jm.QP:
+    """With a variable in no row and rows that hold nothing up to (3, 2): one program for all."""
+    m, n = qp.A.shape
+    A, free = np.zeros((3, 2)), np.full(3 - m, INF)
+    A[:m, :n] = qp.A
+    return rows(A, np.append(qp.l, -free), np.append(qp.u, free))
+
+
 def margin(qp, **settings) -> float:
     t, status = jm.qp.feasibility_margin(qp, **settings)
     assert status == jm.Status.SOLVED
@@ -46,13 +54,13 @@ def margin(qp, **settings) -> float:
     ],
 )
 def test_known_values(qp, t):
-    assert margin(qp) == pytest.approx(t, abs=1e-8)
+    assert margin(filled(qp)) == pytest.approx(t, abs=1e-8)
 
 
 def test_scale_and_limit():
-    qp = rows([[1], [1]], [2, -INF], [INF, 1])
-    assert margin(qp, scale=np.array([3.0, 1.0])) == pytest.approx(-0.25, abs=1e-8)
-    assert margin(rows([[1]], [0], [INF]), limit=7.0) == pytest.approx(7.0)
+    qp = filled(rows([[1], [1]], [2, -INF], [INF, 1]))
+    assert margin(qp, scale=np.array([3.0, 1.0, 1.0])) == pytest.approx(-0.25, abs=1e-8)
+    assert margin(filled(rows([[1]], [0], [INF])), limit=7.0) == pytest.approx(7.0)
 
 
 def test_soft_rows_do_not_count():

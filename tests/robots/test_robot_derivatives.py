@@ -8,15 +8,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from c_engine import by_differences, c_steps, c_transition
 from jax.extend.core.primitives import cholesky_p, triangular_solve_p
 from jax.scipy.linalg import cho_factor, cho_solve
 
 import jaxmpc as jm
 from jaxmpc.qp.linalg import cholesky, solve_general
 from jaxmpc.robots.rewrite import rewritten
-from jaxmpc.robots.tangent import difference, retract
-
-EPS = 1e-6
 
 
 def pair(first, second, cone="elliptic"):
@@ -37,45 +35,6 @@ def swing(integrator, extra=""):
         <worldbody><body><joint name="a" axis="0 1 0" damping=".1" range="-60 60"/>
         <geom type="capsule" size=".02" fromto="0 0 0 .4 0 0" mass="1"/></body></worldbody>
         <actuator><motor joint="a" ctrlrange="-9 9"/></actuator>{extra}</mujoco>""")
-
-
-def c_step(model, x, u):
-    data = mujoco.MjData(model)
-    data.qpos, data.qvel, data.ctrl = x[: model.nq], x[model.nq :], u
-    mujoco.mj_step(model, data)
-    return np.concatenate([data.qpos, data.qvel])
-
-
-def by_differences(robot, step, x, u):
-    """A, B of a step by central differences, small motions against small motions."""
-    nq, nv = robot.mujoco.nq, robot.mujoco.nv
-    after = step(x, u)
-
-    def motion(d, u):
-        moved = np.asarray(retract(robot.joints, x[:nq], d[:nv]))
-        y = np.asarray(step(np.concatenate([moved, x[nq:] + d[nv:]]), u))
-        return np.concatenate([difference(robot.joints, after[:nq], y[:nq]), y[nq:]])
-
-    d, zero = EPS * np.eye(2 * nv), np.zeros(2 * nv)
-    A = [(motion(e, u) - motion(-e, u)) / 2 / EPS for e in d]
-    B = [(motion(zero, u + e) - motion(zero, u - e)) / 2 / EPS for e in EPS * np.eye(robot.m)]
-    return np.array(A).T, np.array(B).T
-
-
-def c_transition(robot, x, u):
-    """A, B of mujoco.mjd_transitionFD, with a solver that has converged; by our own differences of
-    the C engine where that function refuses (RK4)."""
-    model = robot.mujoco
-    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        return by_differences(robot, lambda x, u: c_step(model, x, u), x, u)
-    tolerance, model.opt.tolerance = model.opt.tolerance, 0
-    data, n = mujoco.MjData(model), 2 * model.nv
-    data.qpos, data.qvel, data.ctrl = x[: model.nq], x[model.nq :], u
-    mujoco.mj_forward(model, data)
-    A, B = np.zeros((n, n)), np.zeros((n, model.nu))
-    mujoco.mjd_transitionFD(model, data, EPS, True, A, B, None, None)
-    model.opt.tolerance = tolerance
-    return A, B
 
 
 def assert_close(found, wanted, tolerance=1e-6):
@@ -104,7 +63,7 @@ def test_every_integrator_in_both_precisions(integrator, order):
     """Of one robot, one after the other: JAX remembers how it read MJX's NumPy constants."""
     robot = jm.load_robot(swing(integrator))
     x, u = np.array([0.3, -0.4]), np.array([0.7])
-    wanted = c_step(robot.mujoco, x, u)
+    wanted = c_steps(robot.mujoco, x, u, 1)
     for wide in order * 2:
         with jax.enable_x64(wide):
             after = robot.step(jnp.asarray(x), jnp.asarray(u))
@@ -148,7 +107,7 @@ def test_rk4_moves_orientations():
         step = jax.jit(robot.plant.step)
         ours = theirs = x
         for _ in range(50):
-            ours, theirs = step(ours, u), c_step(robot.mujoco, theirs, u)
+            ours, theirs = step(ours, u), c_steps(robot.mujoco, theirs, u, 1)
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-10)
 
 
@@ -240,7 +199,7 @@ def test_foreign_models_against_the_c_engine(name):
         transition, step = jax.jit(robot.transition), jax.jit(robot.plant.step)
         for (touching, _), (x, u) in states.items():
             found = transition(x, u)
-            same = np.abs(step(x, u) - c_step(robot.mujoco, x, u)).max() < 1e-9
+            same = np.abs(step(x, u) - c_steps(robot.mujoco, x, u, 1)).max() < 1e-9
             assert same or touching
             wanted = c_transition(robot, x, u) if same else by_differences(robot, step, x, u)
             assert_close(found, wanted)

@@ -46,11 +46,17 @@ def test_values(name, n):
         K, B = matrices(linalg.LANES + 6, n)
         truth = np.stack([expected(*pair) for pair in zip(K, B, strict=True)])
         close = lambda found, of: np.testing.assert_allclose(found, of, rtol=1e-9, atol=1e-11)
-        close(function(jnp.asarray(K[0]), jnp.asarray(B[0])), truth[0])
-        close(jax.vmap(function)(K, B), truth)
-        nested = jax.vmap(jax.vmap(function))(K.reshape(10, 7, n, n), B.reshape(10, 7, n, 3))
+
+        @jax.jit
+        def every_way(K, B):
+            nested = jax.vmap(jax.vmap(function))(K.reshape(10, 7, n, n), B.reshape(10, 7, n, 3))
+            shared = jax.vmap(function, in_axes=(None, 0))(K[0], B)
+            return function(K[0], B[0]), jax.vmap(function)(K, B), nested, shared
+
+        one, batch, nested, shared = every_way(K, B)
+        close(one, truth[0])
+        close(batch, truth)
         close(nested.reshape(truth.shape), truth)
-        shared = jax.vmap(function, in_axes=(None, 0))(K[0], B)
         close(shared, np.stack([expected(K[0], b) for b in B]))
 
 
@@ -65,14 +71,19 @@ def test_derivatives(name, n):
             return lambda K, B: jnp.sum(jnp.sin(function((K + K.T) / 2, B)))
 
         ours, theirs = total(FUNCTIONS[name][0]), total(PEERS[name])
-        for derivative in (
+        derivatives = (
             lambda f: jax.grad(f, argnums=(0, 1)),
             lambda f: jax.jacfwd(f, argnums=(0, 1)),
             lambda f: lambda K, B: jax.jvp(lambda K: jax.grad(f)(K, B), (K,), (jnp.cos(K),))[1],
-        ):
-            found, expected = (jax.vmap(derivative(f))(K, B) for f in (ours, theirs))
-            for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-                np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-8 * (1 + np.abs(b).max()))
+        )
+
+        @jax.jit
+        def both(K, B):
+            return [[jax.vmap(d(f))(K, B) for d in derivatives] for f in (ours, theirs)]
+
+        found, expected = both(K, B)
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-8 * (1 + np.abs(b).max()))
 
 
 @pytest.mark.parametrize("n", [3, 13])

@@ -13,6 +13,7 @@ INF = np.inf
 PRECISIONS = pytest.mark.parametrize("x64", [False, True], ids=["float32", "float64"])
 solve = jax.jit(jax.vmap(jm.solve_qp))
 N, M = 6, 12
+COUNT = 150  # programs in a batch
 
 
 def batch(programs, dtype):
@@ -73,7 +74,7 @@ def test_no_false_status_in_any_units(make, decades, x64):
         allowed = (*allowed, jm.Status.SOLVED)
     rng = np.random.default_rng(7)
     with jax.enable_x64(x64):
-        qps = [rescaled(make(rng), rng, decades) for _ in range(150)]
+        qps = [rescaled(make(rng), rng, decades) for _ in range(COUNT)]
         status = np.asarray(solve(batch(qps, float if x64 else np.float32)).status)
     assert set(status) <= {*allowed, jm.Status.ITERATION_LIMIT}
     if x64 and decades < 12:
@@ -99,8 +100,8 @@ def test_a_small_coefficient_still_bounds(x64, least):
 def test_negative_curvature_has_a_status(x64):
     """Indefinite but for rounding; whatever stands on the diagonal, and in whatever units."""
     rng = np.random.default_rng(3)
-    M = rng.normal(size=(3, 6))
-    singular = M.T @ M
+    factor = rng.normal(size=(3, 6))
+    singular = factor.T @ factor
     negative = singular - 1e-3 * np.eye(6)
     units = 10.0 ** np.linspace(-3, 3, 6)
     small = np.eye(6)
@@ -109,17 +110,16 @@ def test_negative_curvature_has_a_status(x64):
     crossed[0, 1] = crossed[1, 0] = 1.0
     P = [singular, singular * units * units[:, None], np.zeros((6, 6)), np.eye(6), negative,
          negative * units * units[:, None], small, crossed]  # fmt: skip
+    box, rows = 1e4 * np.ones(M), np.tile(np.eye(N), (M // N, 1))
+    programs = [(p, np.full(N, value), rows, -box, box) for p in P for value in (0.1, 1.0)]
     with jax.enable_x64(x64):
-        box = 1e4 * np.ones(6)
-        dtype = float if x64 else np.float32
-        status = solve(
-            batch([(p, np.ones(6) * 0.1, np.eye(6), -box, box) for p in P], dtype)
-        ).status
-        sol = solve(batch([(negative, np.ones(6), np.eye(6), -box, box)], dtype))
-    bad = np.asarray(status) == jm.Status.NON_CONVEX
-    np.testing.assert_array_equal(bad, [False] * 4 + [True] * 4)
-    assert np.all(np.isnan(sol.z)) and np.isnan(sol.cost[0])
-    assert "negative eigenvalue" in jm.Status(int(sol.status[0])).sentence
+        # As many as in `test_no_false_status_in_any_units`, whose program this is.
+        many = [programs[i % len(programs)] for i in range(COUNT)]
+        sol = solve(batch(many, float if x64 else np.float32))
+    bad = np.asarray(sol.status[: len(programs)]) == jm.Status.NON_CONVEX
+    np.testing.assert_array_equal(bad, [False] * 8 + [True] * 8)
+    assert np.isnan(sol.z[8:16]).all() and np.isnan(sol.cost[8:16]).all()
+    assert "negative eigenvalue" in jm.Status(int(sol.status[8])).sentence
 
 
 def test_an_overflow_has_a_status():
@@ -146,9 +146,11 @@ def test_a_bad_program_leaves_the_shared_gradient(mode, x64):
 
     with jax.enable_x64(x64):
         total = lambda t, P: jnp.sum(jax.vmap(loss, in_axes=(None, 0))(t, jnp.asarray(P)))
-        everyone, good = (float(mode(total)(1.0, P)) for P in (kinds, kinds[[0, 3]]))
+        gradient = jax.jit(mode(total))
+        # The good ones twice: one shape, one program.
+        everyone, good = (float(gradient(1.0, P)) for P in (kinds, kinds[[0, 3, 0, 3]]))
     assert np.isfinite(good) and good != 0
-    np.testing.assert_allclose(everyone, good, rtol=1e-5)
+    np.testing.assert_allclose(everyone, good / 2, rtol=1e-5)
 
 
 @pytest.mark.parametrize("stagewise", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -168,14 +170,15 @@ def test_a_bad_plan_leaves_the_shared_gradient(stagewise):
         states = jnp.where(solved[:, None, None], plans.states, 0.0)
         return jnp.sum(jnp.where(solved, plans.cost, 0.0)) + jnp.sum(states), plans.status
 
-    weights = jnp.array([1.0, -500.0, 1.0, jnp.nan, 2.0])
-    x = jnp.array([[1.0, 0], [1, 0], [jnp.nan, 0], [1, 0], [2, 0]])
+    weights = np.array([1.0, -500.0, 1.0, np.nan, 2.0, 1.0])
+    x = np.array([[1.0, 0], [1, 0], [np.nan, 0], [1, 0], [2, 0], [0.5, 0]])
     gradient = jax.jit(jax.grad(loss, has_aux=True))
     everyone, status = gradient(1.0, weights, x)
-    np.testing.assert_array_equal(status, [1, 9, 12, 12, 1])
-    good, _ = gradient(1.0, weights[jnp.array([0, 4])], x[jnp.array([0, 4])])
+    np.testing.assert_array_equal(status, [1, 9, 12, 12, 1, 1])
+    twice = np.array([0, 4, 5] * 2)  # one shape, one program
+    good, _ = gradient(1.0, weights[twice], x[twice])
     assert np.isfinite(good) and good != 0
-    np.testing.assert_allclose(everyone, good, rtol=1e-4)
+    np.testing.assert_allclose(everyone, good / 2, rtol=1e-4)
 
 
 def test_the_mpc_of_an_indefinite_weight_is_refused_where_it_can_be_read():

@@ -21,9 +21,8 @@ from jaxmpc.feasible import proofs
 from jaxmpc.feasible.exact_data import exact_data, hard_blocks
 from jaxmpc.feasible.view import make_view
 from jaxmpc.mpc.active_constraints import active_constraints
-from jaxmpc.mpc.plan import flat_multipliers
 from jaxmpc.mpc.problem import Outputs, Soft
-from jaxmpc.mpc.rows import layout, row_table
+from jaxmpc.mpc.rows import row_table
 from jaxmpc.mpc.soften import soften
 
 ONE, EYE = np.ones(2), np.eye(2)
@@ -278,12 +277,6 @@ class Explicit:
         return v
 
 
-def rows_of(mpc, plans):
-    """Multipliers of one plan (rows,), or of many, in the order of `row_table`."""
-    flat = lambda multipliers: flat_multipliers(layout(mpc), multipliers)
-    return np.asarray((jax.vmap(flat) if plans.cost.ndim else flat)(plans.multipliers))
-
-
 def rated() -> jm.MPC:
     """Rate limits and a full rate weight, outputs with D, an oblique terminal set, drift."""
     return jm.MPC(
@@ -404,7 +397,7 @@ class TestAnotherSolver:
         """One entry a row, in the order of the multipliers, with the names of the explicit rows."""
         explicit, *_, plans = batch(name)
         table, keys = row_table(explicit.mpc), explicit.keys()
-        assert rows_of(explicit.mpc, plans).shape == (COUNT, len(table))
+        assert problems.rows_of(explicit.mpc, plans).shape == (COUNT, len(table))
         flat = [key for key in keys if not key[2].startswith("terminal ellipsoid")]
         assert len(set(flat)) == len(flat) and set(flat) == set(explicit.rows)
         order = ["input", "state", "output", "rate", "soft", "terminal"]
@@ -450,7 +443,7 @@ class TestAnotherSolver:
             W, w, _ = explicit.cost(*tracked)
             v = explicit.v_of(x0, previous, plan.inputs)
             gradient = 2 * W @ v + w
-            for key, y in zip(explicit.keys(), rows_of(explicit.mpc, plan), strict=True):
+            for key, y in zip(explicit.keys(), problems.rows_of(explicit.mpc, plan), strict=True):
                 if key not in explicit.rows:
                     continue
                 h, lower, upper, weight = explicit.rows[key]
@@ -498,7 +491,7 @@ class TestAnotherSolver:
                 continue
             seen |= kinds
             blocks = explicit.mpc.control_horizon
-            y = dict(zip(explicit.keys(), rows_of(explicit.mpc, plan), strict=True))
+            y = dict(zip(explicit.keys(), problems.rows_of(explicit.mpc, plan), strict=True))
             for c in found:
                 key = (c.constraint, c.step, c.name)
                 names, push = [key], c.multiplier
@@ -544,7 +537,7 @@ class TestActiveConstraints:
         for name in ("rated", "blocked"):
             explicit, *_, plans = batch(name)
             table, N = row_table(explicit.mpc), explicit.N
-            y = rows_of(explicit.mpc, plans)
+            y = problems.rows_of(explicit.mpc, plans)
             of = lambda kind, table=table, y=y: y[
                 :, [i for i, row in enumerate(table) if row.kind == kind]
             ]

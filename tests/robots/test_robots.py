@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from c_engine import c_affine, c_state, c_steps, c_transition, data_at
 
 import jaxmpc as jm
 from jaxmpc.robots import physics
@@ -91,60 +92,11 @@ def draw(robot, count, seed=0, stretch=1.0, speed=1.0):
     return np.hstack([q, v]), u
 
 
-def data_at(model, x, u):
-    data = mujoco.MjData(model)
-    data.qpos, data.qvel, data.ctrl = x[: model.nq], x[model.nq :], u
-    return data
-
-
-def c_steps(model, x, u, count):
-    """x after `count` steps of the C engine, its solver started cold each time, as MJX's."""
-    data = data_at(model, x, u)
-    for _ in range(count):
-        data.qacc_warmstart = 0
-        mujoco.mj_step(model, data)
-    return np.concatenate([data.qpos, data.qvel])
-
-
-def c_transition(model, x, u):
-    data, n = data_at(model, x, u), 2 * model.nv
-    mujoco.mj_forward(model, data)
-    A, B = np.zeros((n, n)), np.zeros((n, model.nu))
-    mujoco.mjd_transitionFD(model, data, 1e-6, True, A, B, None, None)
-    return A, B
-
-
-def c_state(robot, xi):
-    """x of coordinates by mj_integratePos from the anchor."""
-    q = np.array(robot.anchor)
-    mujoco.mj_integratePos(robot.mujoco, q, np.asarray(xi[: robot.mujoco.nv], float), 1.0)
-    return np.concatenate([q, xi[robot.mujoco.nv :]])
-
-
-def c_coordinates(robot, x):
-    """Coordinates by mj_differentiatePos from the anchor."""
-    m, d = robot.mujoco, np.zeros(robot.mujoco.nv)
-    mujoco.mj_differentiatePos(m, d, 1.0, np.array(robot.anchor), np.asarray(x[: m.nq], float))
-    return np.concatenate([d, x[m.nq :]])
-
-
-def c_affine(robot, x, u, count, eps=1e-6):
-    """A, B, c in the coordinates, by central differences through the C engine's predictor."""
-    xi = c_coordinates(robot, x)
-    f = lambda xi, u: c_coordinates(
-        robot, c_steps(robot.predictor.model, c_state(robot, xi), u, count)
-    )
-    columns = lambda g, size: np.array([(g(d) - g(-d)) / 2 for d in eps * np.eye(size)]).T / eps
-    A = columns(lambda d: f(xi + d, u), robot.n)
-    B = columns(lambda d: f(xi, u + d), robot.m)
-    return A, B, f(xi, u) - A @ xi - B @ u
-
-
 def assert_transition(robot, x, u, tolerance=1e-6):
     transition = jax.jit(jax.vmap(robot.transition))
     found = transition(x, u)
     for A, B, x_i, u_i in zip(*map(np.asarray, found), x, u, strict=True):
-        A_c, B_c = c_transition(robot.mujoco, x_i, u_i)
+        A_c, B_c = c_transition(robot, x_i, u_i)
         np.testing.assert_allclose(A, A_c, rtol=0, atol=tolerance * np.abs(A_c).max())
         np.testing.assert_allclose(B, B_c, rtol=0, atol=tolerance * np.abs(A_c).max())
         assert np.abs(B).max() > 0

@@ -8,12 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import enable_x64
-from problems import symmetric
+from problems import rows_of, symmetric
 
 import jaxmpc as jm
 from jaxmpc.mpc import stagewise
-from jaxmpc.mpc.plan import WarmStart, flat_multipliers
-from jaxmpc.mpc.rows import layout
+from jaxmpc.mpc.plan import WarmStart
 from jaxmpc.mpc.stagewise import factor_stages, plan_stages, solve_stagewise
 from jaxmpc.qp import admm
 from jaxmpc.qp.residuals import residuals
@@ -62,11 +61,6 @@ def varying(drift: bool = True) -> jm.LinearSystem:
     rng, system = np.random.default_rng(2), problem().system
     move = lambda M: np.asarray(M) + 0.05 * rng.normal(size=(N, *np.shape(M)))
     return jm.LinearSystem(*(move(M) for M in (system.A, system.B, system.c)))
-
-
-def rows_of(mpc, plan):
-    """Multipliers (rows,) in the order of the rows of the condensed QP."""
-    return flat_multipliers(layout(mpc), plan.multipliers)
 
 
 def condensed(mpc: jm.MPC, system: jm.LinearSystem, x0: np.ndarray) -> tuple:

@@ -15,7 +15,7 @@ import pytest
 
 from jaxmpc.qp import linalg
 
-FILE = Path(__file__).parents[1] / "experiments" / "stress.py"
+FILE = Path(__file__).parents[2] / "experiments" / "stress.py"
 spec = importlib.util.spec_from_file_location("stress", FILE)
 stress = importlib.util.module_from_spec(spec)
 sys.modules["stress"] = stress  # dataclasses look themselves up there
