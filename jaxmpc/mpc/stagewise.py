@@ -695,7 +695,7 @@ def search(
         u, y = jax.lax.scan(newton, (u, y), length=solver.refine)[0]
         y = s.bounds.admissible(y)
     elif solver.refine:
-        eps = jnp.asarray(tolerance(solver, u.dtype), u.dtype)
+        eps = tolerance(solver, u.dtype)
         best = judged(eps, s, sample, u, y)
         state = Search(u, y, best, jnp.int32(0), ~(best.near | best.solved))
         constants = (factor, sample, bounds, eps)

@@ -49,17 +49,20 @@ class ADMM:
     """Settings of the solver.
 
     iterations: ADMM steps, always all of them. rho: penalty in the scaled coordinates above;
-    None: 1/√(mean eigenvalue of A_w A_w'), √(n/m) for m ≥ n rows; or a number, one value a row
+    None: √(min(1, n/m)), m counting the rows that z moves; or a number, one value a row
     (m,), or a schedule (stages, m) or (stages, 1) whose stages have equally many iterations.
     alpha: over-relaxation in (0, 2).
     refine: Newton steps after the loop at most, 0 for none (`active_set.py`, `newton.py`). An
     instance leaves when its residuals are small enough, also in a batch. fixed: take all `refine`
-    steps of the method of multipliers, for every instance: constant time, for which 20 suffice in
-    most MPC; so do unrolled derivatives. dtype: floating type
-    of the ADMM iterates, None: that of the data; Newton steps are float64 whatever it is.
+    steps of the method of multipliers, for every instance: constant time; so do unrolled
+    derivatives. dtype: floating type of the ADMM iterates, "float32" or "float64"; None: float32
+    before Newton steps, that of the data without any. Newton steps are float64 whatever it is,
+    except unrolled ones.
     eps: tolerance of status SOLVED on primal residual, dual residual and gap, absolute, plus
     a rounding floor, a multiple of machine epsilon·(size of the terms): 100 in float64, 4 in
-    float32. None: 1e-6 in float64, 1e-3 in float32.
+    float32. None: 1e-6 in float64, 1e-3 in float32. eps_rel: tolerance relative to the size of
+    the terms, Σ_j |A_ij z_j| for row i, Σ_j |P_ij z_j| + |q_i| + Σ_j |A_ji y_j| for variable i,
+    and likewise for the gap; a residual may be as large as the sum of all three.
     differentiate: "implicit", derivatives of the solution itself (`derivative.py`), zero with
     respect to rho, alpha and the warm start; or "unrolled", derivatives of the steps as they
     were taken. smoothing: 0, or μ > 0 to round off the kinks of the implicit derivative as an
@@ -71,6 +74,7 @@ class ADMM:
     alpha: Any = 1.9
     refine: int = field(default=150, metadata={"static": True})
     eps: Any = None
+    eps_rel: Any = 0.0
     differentiate: str = field(default="implicit", metadata={"static": True})
     smoothing: Any = 0.0
     fixed: bool = field(default=False, metadata={"static": True})
@@ -89,6 +93,12 @@ class ADMM:
             fail("iterations", f"{self.iterations} for {shape[0]} stages", "Use a multiple")
         if concrete(self.alpha) and not 0 < float(np.asarray(self.alpha)) < 2:
             fail("alpha", f"{self.alpha}", "Over-relaxation lies in (0, 2); 1.6 is usual")
+        for name in ("eps", "eps_rel"):
+            value = getattr(self, name)
+            if value is not None and concrete(value) and not float(np.asarray(value)) >= 0:
+                fail(name, f"{value}", "Tolerances are at least 0")
+        if self.dtype not in (None, "float32", "float64"):
+            fail("dtype", f"{self.dtype!r}", 'Give "float32", "float64" or None')
         if self.differentiate not in ("implicit", "unrolled"):
             fail("differentiate", f"{self.differentiate!r}", 'Give "implicit" or "unrolled"')
         if concrete(self.smoothing) and not float(np.asarray(self.smoothing)) >= 0:

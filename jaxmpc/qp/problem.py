@@ -1,7 +1,7 @@
-"""The quadratic program, its solution, and the residuals that say how good a solution is."""
+"""The quadratic program and its solution."""
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,8 @@ from jaxmpc.qp.projection import Bounds
 class QP:
     """Quadratic program: minimise ½ z'Pz + q'z subject to l ≤ Az ≤ u.
 
-    P (n, n) symmetric positive semidefinite, q (n,), A (m, n), l and u (m,). Entries of l may
+    P (n, n) symmetric positive semidefinite, q (n,), A (m, n), l and u (m,). P and A may be
+    SciPy's sparse matrices, which are made dense. Entries of l may
     be -inf and of u +inf; l = u is an equality. For a batch that shares matrices keep P and
     A unbatched: `jax.vmap(solve_qp, in_axes=(QP(P=None, q=0, A=None, l=0, u=0),))`.
 
@@ -58,18 +59,20 @@ class QP:
     ) -> "QP":  # fmt: skip
         """The same program from qpsolvers' form: Gz ≤ h, Az = b, lb ≤ z ≤ ub (None: absent).
 
-        Rows come in that order: inequalities, equalities, bounds. Sparse matrices are made dense.
+        Rows come in that order: inequalities, equalities, bounds; `QPSolution.duals` splits their
+        multipliers again.
         """
-        dense = lambda M: np.asarray(M.toarray() if hasattr(M, "toarray") else M, dtype=float)
-        P, q = dense(P), np.asarray(q, dtype=float).ravel()
+        P, q = np.asarray(dense(P), float), np.asarray(q, dtype=float).ravel()
         n = q.size
         rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         if G is not None:
             upper = np.asarray(h, dtype=float).ravel()
-            rows.append((dense(G).reshape(-1, n), np.full(upper.size, -np.inf), upper))
+            rows.append(
+                (np.asarray(dense(G), float).reshape(-1, n), np.full(upper.size, -np.inf), upper)
+            )
         if A is not None:
             value = np.asarray(b, dtype=float).ravel()
-            rows.append((dense(A).reshape(-1, n), value, value))
+            rows.append((np.asarray(dense(A), float).reshape(-1, n), value, value))
         if lb is not None or ub is not None:
             lower = np.full(n, -np.inf) if lb is None else np.asarray(lb, dtype=float).ravel()
             upper = np.full(n, np.inf) if ub is None else np.asarray(ub, dtype=float).ravel()
@@ -77,6 +80,10 @@ class QP:
         rows = rows or [(np.zeros((0, n)), np.zeros(0), np.zeros(0))]
         matrix, low, high = (np.concatenate(part) for part in zip(*rows, strict=True))
         return cls(P=P, q=q, A=matrix, l=low, u=high)
+
+    def dense(self) -> "QP":
+        """Return the program with sparse matrices made dense."""
+        return replace(self, P=dense(self.P), A=dense(self.A))
 
     def validate(self) -> None:
         """Raise ValueError for wrong shapes, NaN, asymmetric or indefinite P, or l > u."""
@@ -133,6 +140,20 @@ class QP:
                 fail(name, "softens the rows of a ball", f"Balls are hard: give {hard} there")
 
 
+def dense(M: Any) -> Any:
+    """Return a matrix of SciPy's sparse kinds as a dense array, any other as it is."""
+    return M.toarray() if hasattr(M, "toarray") else M
+
+
+class Duals(NamedTuple):
+    """Multipliers in qpsolvers' form, Px + q + G'z + A'y + z_box = 0: z ≥ 0 of Gx ≤ h, y of
+    Ax = b, z_box (n,) of lb ≤ x ≤ ub, ≥ 0 at the upper bound and ≤ 0 at the lower."""
+
+    z: Any
+    y: Any
+    z_box: Any
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class QPSolution:
@@ -155,3 +176,9 @@ class QPSolution:
     iterations: Array
     certificate: Array
     ray: Array
+
+    def duals(self, inequalities: int, equalities: int) -> Duals:
+        """Return the multipliers of a program of `QP.from_qpsolvers` with so many rows G and A."""
+        parts = jnp.split(self.y, [inequalities, inequalities + equalities])
+        box = parts[2] if parts[2].size else jnp.zeros_like(self.z)
+        return Duals(parts[0], parts[1], box)

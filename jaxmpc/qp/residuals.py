@@ -62,12 +62,13 @@ def largest_of_each(values: Array, rows: int) -> tuple[Array, Array, Array]:
 
 
 def small(terms: Terms, eps: Any, floor: float) -> Array:
-    """Return whether each residual is at most eps + floor·(size of its terms)."""
+    """Return whether each residual is at most its tolerance: eps (2,) holds the absolute one and
+    that relative to the size of the terms, to which floor is added."""
     values, sizes = terms
-    return jnp.all(jnp.abs(values) <= eps + floor * sizes)
+    return jnp.all(jnp.abs(values) <= eps[0] + (eps[1] + floor) * sizes)
 
 
-def worst(terms: Terms, floor: float) -> tuple[Array, Array]:
+def worst(terms: Terms, floor: Any) -> tuple[Array, Array]:
     """Return the largest of the residuals, each less floor·(size of its terms), and the largest
     relative to 1 + that size; inf where one is NaN."""
     values, sizes = terms
@@ -99,11 +100,13 @@ class Pair:
 
     @classmethod
     def of(cls, z: Array, y: Array, terms: Terms, eps: Array, floor: float) -> "Pair":
-        """Return the pair judged. near: all residuals are below a thousandth of eps, or below a
-        tenth and a small multiple of their rounding; solved: below a millionth."""
-        above, relative = worst(terms, floor)
-        at_rounding = (relative <= STALLED * floor) & (above <= 0.1 * eps)
-        return cls(z, y, relative, (above <= 1e-3 * eps) | at_rounding, above <= 1e-6 * eps)
+        """Return the pair judged; eps (2,) and floor as in `small`. near: all residuals are below
+        a thousandth of their tolerance, or below a tenth and a small multiple of their rounding;
+        solved: below a millionth of the absolute one."""
+        above, relative = worst(terms, floor + 1e-3 * eps[1])
+        at_rounding = (relative <= STALLED * floor) & (above <= 0.1 * eps[0])
+        near = (above <= 1e-3 * eps[0]) | at_rounding
+        return cls(z, y, relative, near, above <= 1e-6 * eps[0])
 
     def or_better(self, other: "Pair") -> "Pair":
         """Return the other pair where that is solved or its residuals are smaller. What was near

@@ -62,6 +62,7 @@ def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: Any = None) -> QPSoluti
     data has derivative zero. Raises ValueError for bad shapes and, where values can be read, bad
     values.
     """
+    qp = qp.dense()
     qp.validate()
     solver.validate(np.shape(qp.A)[0])
     arguments = as_arrays(qp), *arrays((solver, warm_start))
@@ -146,13 +147,15 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = 
     (w, y), (w_old, y_old) = cast(
         run(*arguments) if unrolled else in_blocks(run, *arguments), qp.q.dtype
     )
-    eps = jnp.asarray(tolerance(solver, qp.q.dtype), qp.q.dtype)
+    eps = tolerance(solver, qp.q.dtype)
     begin = replace(multipliers_start(q, w, y), change=y - y_old, move=w - w_old)
     if solver.refine and not unrolled:
         p = Program(qp, factor, q, bounds, eps, Constants.of(qp.q.dtype).far)
         polish = partial(improve, solver.refine, solver.fixed, whole)
-        (z, y), proof = precisely(polish, p, begin)
-        return assess(residual_terms, (qp,), z, y, proof, eps)
+        (z, y), proof, ended = precisely(polish, p, begin)
+        found = assess(residual_terms, (qp,), z, y, proof, eps)
+        status = jnp.where(ended, found.status, jnp.int32(Status.ITERATION_LIMIT))
+        return replace(found, status=status)
     pair, end = unscaled(qp, factor, w, y), begin
     if solver.refine:
         advance = lambda s, _: (multipliers_step(factor.H, q, factor.A, bounds, s), None)
@@ -231,8 +234,9 @@ DUAL_STEPS, JOINTLY, DIVERGED = 24, 2, 1e6
 
 def improve(
     refine: int, fixed: bool, whole: bool, p: Program, begin: Multipliers
-) -> tuple[tuple[Array, Array], Proof]:
-    """The pair (z, y) and what is proved, after `refine` Newton steps at most; in float64.
+) -> tuple[tuple[Array, Array], Proof, Array]:
+    """Return the pair (z, y) and what is proved, after `refine` Newton steps at most, in float64,
+    and whether there is nothing left to try.
 
     Steps on the dual in the rows that push solve most programs (`active_set.py`). The method of
     multipliers (`newton.py`) takes the others: P singular, balls, degenerate or infeasible rows.
@@ -255,7 +259,7 @@ def improve(
         begin = replace(begin, change=jnp.where(diverged(p, y), y, begin.change))
         begin = least_violation(begin, empty)
     if not whole:
-        return (best.z, best.y), Proof.none(p.q, p.bounds.l)
+        return (best.z, best.y), Proof.none(p.q, p.bounds.l), best.solved
     constants = (p, matmul(factor.H, factor.H), correcting)
     s = Search(begin, p.q, best, jnp.int32(0), Proof.none(p.q, p.bounds.l), begin.w, go_on)
     if fixed:
@@ -263,7 +267,7 @@ def improve(
         s = lax.scan(partial(still_open, refine, constants), s, length=length)[0]
     else:
         s = repeat_while(lambda s: s.open, partial(by_multipliers, refine), constants, s)
-    return (s.best.z, s.best.y), s.proof
+    return (s.best.z, s.best.y), s.proof, jnp.asarray(True)
 
 
 @jax.tree_util.register_dataclass
@@ -448,6 +452,7 @@ def value(qp: QP, z: Array, y: Array) -> Array:
     return fixed(own + cost) + (lagrangian - fixed(lagrangian))
 
 
-def tolerance(solver: ADMM, dtype: Any) -> Any:
-    """Return the residuals that `solver` asks for."""
-    return (1e-6 if dtype == jnp.float64 else 1e-3) if solver.eps is None else solver.eps
+def tolerance(solver: ADMM, dtype: Any) -> Array:
+    """Return the absolute and the relative tolerance (2,) that `solver` asks for."""
+    eps = (1e-6 if dtype == jnp.float64 else 1e-3) if solver.eps is None else solver.eps
+    return jnp.stack([jnp.asarray(v, dtype) for v in (eps, solver.eps_rel)])

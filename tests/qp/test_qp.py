@@ -224,6 +224,28 @@ class TestFromQpsolvers:
         np.testing.assert_array_equal(qp.l, [-INF, 6, -1, -2])
         np.testing.assert_array_equal(qp.u, [3, 6, INF, INF])
 
+    def test_duals(self, x64):
+        """Px + q + G'z + A'y + z_box = 0 with signs as in qpsolvers, complementary."""
+        rng = np.random.default_rng(3)
+        n, G, A = 6, rng.normal(size=(5, 6)), rng.normal(size=(2, 6))
+        q, h, b, lb, ub = 3 * rng.normal(size=n), rng.uniform(0.05, 0.1, 5), np.zeros(2), -0.3, 0.2
+        lb, ub = np.full(n, lb), np.full(n, ub)
+        sol = jm.solve_qp(jm.QP.from_qpsolvers(np.eye(n), q, G, h, A, b, lb, ub))
+        z, y, z_box = sol.duals(5, 2)
+        x = sol.z
+        np.testing.assert_allclose(x + q + G.T @ z + A.T @ y + z_box, 0, atol=1e-9)
+        assert np.all(z >= 0) and np.any(z > 1e-3) and np.any(np.abs(z_box) > 1e-3)
+        np.testing.assert_allclose(z * (h - G @ x), 0, atol=1e-9)
+        side = np.where(z_box > 0, ub - x, x - lb)
+        np.testing.assert_allclose(z_box * side, 0, atol=1e-9)
+        assert not np.any(jm.solve_qp(jm.QP.from_qpsolvers(np.eye(n), q, G, h)).duals(5, 0).z_box)
+
+    def test_sparse_matrices(self, x64):
+        qp = constructed(6, 5)[0]
+        sparse = scipy.sparse.csc_matrix
+        found = jm.solve_qp(replace(qp, P=sparse(qp.P), A=sparse(qp.A)))
+        np.testing.assert_array_equal(found.z, jm.solve_qp(qp).z)
+
     def test_nothing_but_cost(self, x64):
         qp = jm.QP.from_qpsolvers(2 * np.eye(2), [2, -4])
         assert qp.A.shape == (0, 2)
@@ -711,3 +733,32 @@ class TestOneRowDoesNotExcuseAnother:
         solver = jm.ADMM(iterations=0, refine=0)
         start = f32([10]), f32([1000, 1e-5])
         assert jm.solve_qp(qp, solver, warm_start=start).status != jm.Status.PRIMAL_INFEASIBLE
+
+
+class TestTolerances:
+    def test_relative(self, x64):
+        """One program, two scales of its terms: what is solved relative to them is by eps_rel."""
+        qp = constructed(6, 5)[0]
+        solver = jm.ADMM(iterations=10, refine=0)
+        found = jm.solve_qp(qp, replace(solver, eps=1e-15))
+        worst = max(float(found.primal_residual), float(found.dual_residual), float(found.gap))
+        assert 1e-12 < worst and found.status == jm.Status.ITERATION_LIMIT
+        large = replace(solver, eps=1e-15, eps_rel=1.0)
+        assert jm.solve_qp(qp, large).status == jm.Status.SOLVED
+
+    def test_newton_reaches_a_relative_one(self, x64):
+        found = solve(constructed(6, 5)[0], jm.ADMM(eps=0.0, eps_rel=1e-9))
+        assert found.status == jm.Status.SOLVED and found.dual_residual < 1e-7
+
+    @pytest.mark.parametrize("wrong", [{"eps": -1.0}, {"eps_rel": -1.0}, {"dtype": "int32"}])
+    def test_bad_ones_are_refused(self, wrong):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            jm.solve_qp(constructed(6, 5)[0], jm.ADMM(**wrong))
+
+
+def test_plain_python_and_jit_answer_alike(x64):
+    """A cost so small that z = 0 is within eps of the optimum, z = -1."""
+    qp = jm.QP(np.zeros((1, 1)), np.array([1e-7]), np.eye(1), -np.ones(1), np.ones(1))
+    plain, jitted = jm.solve_qp(qp), jax.jit(jm.solve_qp)(qp)
+    np.testing.assert_allclose(plain.z, -1, atol=1e-9)
+    np.testing.assert_allclose(plain.z, jitted.z)
