@@ -378,7 +378,7 @@ def test_bad_loops_are_named(pendulum, linear_mpc):
         ),
         (
             lambda: many(law, PLANT, x0s, 5, variations={"mass": np.ones(5)}),
-            "mass: is no number of",
+            "mass: is no parameter of",
         ),
         (
             lambda: many(law, DOUBLE, x0s, 5, variations={"B": np.ones((5, 2, 1))}),

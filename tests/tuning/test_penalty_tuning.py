@@ -108,7 +108,7 @@ def test_cache(learned, monkeypatch):
         tune_penalties(mpc(), states(160, 0), cache=folder, **{**SETTINGS, **more}).solver
     )
     calls = []
-    monkeypatch.setattr(penalties, "search", lambda *_: calls.append(1) or found)
+    monkeypatch.setattr(penalties, "tune_schedule", lambda *_: calls.append(1) or found)
     assert np.array_equal(again().rho, found.solver.rho) and not calls
     assert again().alpha == found.solver.alpha
     assert (
@@ -135,11 +135,11 @@ def unimproved(run):
 
 def test_a_cached_failure_warns_again(tmp_path, learned, monkeypatch):
     failed = unimproved(learned[0])
-    monkeypatch.setattr(penalties, "search", lambda *_: failed)
+    monkeypatch.setattr(penalties, "tune_schedule", lambda *_: failed)
     for _ in range(2):
         with pytest.warns(UserWarning, match="nothing found is better"):
             kept = tune_penalties(mpc(), states(160, 0), cache=tmp_path, **SETTINGS)
-        monkeypatch.setattr(penalties, "search", lambda *_: pytest.fail("searched again"))
+        monkeypatch.setattr(penalties, "tune_schedule", lambda *_: pytest.fail("searched again"))
     assert not kept.improved and kept.solver == replace(DEFAULT, iterations=30)
     assert kept.before == failed.before and kept.history is None
 
@@ -256,7 +256,7 @@ def test_the_first_pass_of_a_sweep_decides_more_and_labels_stay(tmp_path):
     both = (fmap.label != 0) & (plain.label != 0)
     assert np.array_equal(fmap.label[both], plain.label[both]) and both.mean() > 0.995
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweep_penalties, "search", lambda *_: pytest.fail("searched again"))
+        patch.setattr(sweep_penalties, "tune_row_weights", lambda *_: pytest.fail("searched again"))
         again = learn()
     assert np.array_equal(again.result.weight, found.result.weight)
     assert again.after == found.after
