@@ -181,7 +181,7 @@ def least_distance_form(mpc: MPC, within: Box | Polytope | None = None) -> Least
     G, D, v, row, side = Inequalities.of(c)
     V = -D
     H, h = unit_half_spaces("within", within, n)
-    if mpc.remembers and mpc.inputs is not None:  # a previous input is one that was applied
+    if mpc.input_in_state and mpc.inputs is not None:  # a previous input is one that was applied
         H_u, h_u = unit_half_spaces("inputs", mpc.inputs, mpc.system.m)
         H, h = np.vstack([H, np.pad(H_u, ((0, 0), (mpc.system.n, 0)))]), np.append(h, h_u)
     G, V, v = np.vstack([G, np.zeros((len(h), G.shape[1]))]), np.vstack([V, -H]), np.append(v, h)

@@ -1,4 +1,4 @@
-"""active_constraints: which limits push on a plan, by name, step and unit."""
+"""active_constraints: which limits of a plan are active, by name, step and unit."""
 
 from dataclasses import dataclass
 
@@ -40,12 +40,13 @@ class ActiveConstraint:
 def active_constraints(
     mpc: MPC, plan: Plan, tolerance: float = 1e-6
 ) -> tuple[ActiveConstraint, ...]:
-    """The limits with a multiplier above `tolerance`, largest first (the lesson's problem 1).
+    """The limits with a multiplier above `tolerance`, largest first.
 
     plan: of `mpc`, one instance. The multiplier of a bound is the sensitivity of the optimal cost:
     dJ*/d(bound) = −multiplier for an upper bound, +multiplier for a lower one. Where rows coincide
     (inputs of one block of a control horizon, states at N beside the terminal set) they share it in
-    an arbitrary way: only their sum is a sensitivity, of relaxing all of them. Host.
+    an arbitrary way: only their sum is a sensitivity, of relaxing all of them. NumPy; not
+    traceable.
     """
     table = row_table(mpc)
     y = np.asarray(flat_multipliers(layout(mpc), plan.multipliers), np.float64)

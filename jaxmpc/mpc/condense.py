@@ -31,7 +31,7 @@ from jaxmpc.qp.problem import QP
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Condensed:
-    """The parametric QP of an MPC problem; `qp(theta)` is its member at one initial state.
+    """The parametric QP of an MPC problem; `qp(theta)` is the QP at θ.
 
     With p = n, or n + m where the previous input counts, and nz variables: Phi (N+1, n, p),
     Gamma (N+1, n, nz), phi (N+1, n): predicted states. Psi (N, m, p), Omega (N, m, nz), psi (N, m):
@@ -40,7 +40,7 @@ class Condensed:
     any. radius: of the terminal ball, whose rows are the last `balls`. Q, R, P_N, W: weights, W of
     input rates, stage (N,) of the stages. K (m, n): prestabilising gain. K_N (m, n): gain of the
     unconstrained input of one more step, u_N = K_N x_N. layout: (kind, steps, rows a step) of each
-    block of rows. begins: the step at which each move begins.
+    block of rows. begins: the first step of each move.
     """
 
     Phi: Array
@@ -101,7 +101,8 @@ class Condensed:
 
 
 def prestabilising_gain(mpc: MPC) -> Any:
-    """The gain K of u = Kx + v that `mpc.prestabilise` asks for; zero for none."""
+    """Return the gain K (m, n) of u = Kx + v that `mpc.prestabilise` asks for, zero for none.
+    Raises ValueError where it is True and there is no LQR, or A and B are traced."""
     wish, none = mpc.prestabilise, np.zeros((mpc.system.m, mpc.system.n))
     if wish is False:
         return none
@@ -185,8 +186,8 @@ def _condense(mpc: MPC) -> Condensed:
     product = lambda M, weight, X: jnp.einsum(
         f"kai,{'kab' if weight.ndim == 3 else 'ab'},kb...->i...", M, weight, X, precision="highest"
     )
-    # 2 Σ_k M_k' W_k X_k with the weights of states, inputs and rates: Hessian, its θ and constant
-    # part.
+    # 2 Σ_k M_k' W_k X_k with the weights of states, inputs and rates: the Hessian for X = Γ, the
+    # part of the linear term in θ for X = Φ, its constant part for X = φ.
     form = lambda X, U, V: (
         2 * (product(Gamma, weights, X) + product(Omega, efforts, U) + product(rates[0], W, V))
     )
@@ -215,13 +216,13 @@ def _condense(mpc: MPC) -> Condensed:
             for b in found
         ])  # fmt: skip
         linear, quadratic = spread("linear", jnp.inf), spread("quadratic", 0.0)
-    round_ones = [b for b in found if b.radius is not None]
-    if round_ones:
-        radius = jnp.stack([b.radius for b in round_ones])
+    ball_blocks = [b for b in found if b.radius is not None]
+    if ball_blocks:
+        radius = jnp.stack([b.radius for b in ball_blocks])
     return Condensed(
         Phi, Gamma, phi, Psi, Omega, psi, (P + P.T) / 2, form(Phi, Psi, rates[1]),
         form(phi, psi, rates[2]), C, D, d, lower, upper, linear, quadratic, radius, Q, R, P_N, W,
         stage, K, K_N, tuple((b.kind, b.steps, b.size) for b in found),
-        tuple(b.size for b in round_ones),
+        tuple(b.size for b in ball_blocks),
         tuple(int(k) for k in np.unique(mpc.moves, return_index=True)[1]),
     )  # fmt: skip

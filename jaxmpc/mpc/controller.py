@@ -37,12 +37,12 @@ class Controller:
     """An MPC law whose matrices are condensed and factored once, at construction.
 
     `controller(x, carry) -> (u, carry, plan)`: u (m,) is the first input of the plan, clipped
-    into its limits if these are a Box; carry is None at the start and the previous plan
-    afterwards, whose `shifted` form is the warm start and whose first input is the previous one
-    (zero at the start). When the plan is not SOLVED, u is still the first input of the best
-    iterate: look at plan.status. `condensed` and `factor` are filled in at construction: for
-    another problem or solver make another Controller, `dataclasses.replace` would keep the old
-    ones.
+    into its limits if these are a Box. carry is None at the start and the previous plan
+    afterwards. Its `shifted` form is the warm start, and its first input is the previous input
+    (zero at the start). The plan is returned twice, as carry and as output of `jax.lax.scan`. When
+    the plan is not SOLVED, u is still the first input of the best iterate: look at plan.status.
+    `condensed` and `factor` are filled in at construction: for another problem or solver make
+    another Controller, `dataclasses.replace` would keep the old ones.
     """
 
     mpc: MPC
@@ -68,18 +68,18 @@ class Controller:
 
     @property
     def dtype(self) -> Any:
-        """In what the controller computes."""
+        """Floating type of the plans."""
         assert self.condensed is not None
         return self.condensed.P.dtype
 
     @property
     def state_size(self) -> int:
-        """Numbers in the state that the controller is given."""
+        """Length n of the state."""
         return self.mpc.system.n
 
     @property
     def limits(self) -> Box | Polytope | None:
-        """Limits of the state that a closed loop is judged by."""
+        """The set by which violations of a closed loop are measured."""
         return self.mpc.states
 
     def coordinates(self, x: Array) -> Array:
@@ -108,9 +108,9 @@ class Controller:
     def shifted(self, plan: Plan) -> WarmStart:
         """The plan seen one sample later, as a warm start (`WarmStart.shifted`).
 
-        The new last input is the unconstrained optimum of that step for the terminal cost, inside
-        its limits. With a control horizon each move becomes what the plan did one step after its
-        beginning.
+        The new last input is the unconstrained optimum of that step for the terminal cost about
+        the origin, clipped into its limits. With a control horizon each move becomes what the plan
+        did one step after its beginning.
         """
         c = self.condensed
         assert c is not None
@@ -217,7 +217,7 @@ def _plan(
 ) -> Plan:  # fmt: skip
     c, mpc = controller.condensed, controller.mpc
     assert c is not None and controller.factor is not None
-    given = (x0, reference, input_reference, previous_input if mpc.remembers else None)
+    given = (x0, reference, input_reference, previous_input if mpc.input_in_state else None)
     given = jax.tree.map(lambda v: jnp.asarray(v, c.P.dtype), given)
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(given)]))
     # Harmless numbers until all is computed: the derivative of a product with NaN is NaN.
@@ -230,7 +230,7 @@ def _plan(
     if input_reference is not None:
         input_reference = jnp.broadcast_to(input_reference, (N, m))
     theta = x0
-    if mpc.remembers:
+    if mpc.input_in_state:
         previous = jnp.zeros(m, x0.dtype) if previous is None else previous
         theta = jnp.concatenate([x0, previous])
     qp = c.qp(theta, reference, input_reference)

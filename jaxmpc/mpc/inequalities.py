@@ -45,6 +45,6 @@ class Inequalities(NamedTuple):
 
 
 def row_lengths(M: np.ndarray) -> np.ndarray:
-    """The norm of each row of M, and 1 for a row of zeros: what to divide rows by."""
+    """Return the norm of each row of M, and 1 for a row of zeros."""
     length = np.linalg.norm(M, axis=1)
     return np.where(length > 0, length, 1.0)

@@ -21,8 +21,8 @@ from jaxmpc.qp.status import Status
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Multipliers:
-    """Lagrange multipliers of a plan, for the cost without ½; y > 0 pushes against the upper
-    bound of the row, y < 0 against the lower.
+    """Lagrange multipliers of a plan, for the cost without ½: y > 0 where the upper bound of the
+    row is active, y < 0 where the lower is.
 
     states (K, r): rows of `states` at the steps where they hold, inputs (N, m or rows), terminal
     (r_f,) (for an Ellipsoid {x'Px ≤ level}: of the rows L'x with P = LL', n of them). outputs and
@@ -88,19 +88,19 @@ class WarmStart(NamedTuple):
 
     @classmethod
     def shifted(
-        cls, layout: Layout, plan: Plan, tail: Array, round_end: bool = False
+        cls, layout: Layout, plan: Plan, tail: Array, terminal_is_ball: bool = False
     ) -> "WarmStart":
         """Return the plan seen one sample later, with `tail` (m,) as its new last input.
 
-        Inputs and multipliers move up by one step. The rows of the last step push with nothing.
-        What bounded x_N through the terminal set bounds it as a state from now on, where both
-        have the same rows; not where it is an ellipsoid (round_end), whose rows are no limits.
+        Inputs and multipliers move up by one step; those of the last step are zero. What bounded
+        x_N through the terminal set bounds it as a state from now on, where both have the same
+        rows; not where it is an ellipsoid (terminal_is_ball), whose rows are no limits.
         """
         y = flat_multipliers(layout, plan.multipliers)
         return cls(
             jnp.concatenate([plan.states[1:], plan.states[-1:]]),
             jnp.concatenate([plan.inputs[1:], tail[None]]),
-            _shifted_multipliers(layout, len(plan.inputs), y, round_end),
+            _shifted_multipliers(layout, len(plan.inputs), y, terminal_is_ball),
         )
 
 
@@ -122,7 +122,7 @@ def answer(
 
 
 def limited(inputs: Any, u: Array) -> Array:
-    """u inside the input limits, if these are a Box: an actuator takes no rounding beyond them."""
+    """Return u clipped into the input limits, if these are a Box: no rounding beyond them."""
     if not isinstance(inputs, Box):
         return u
     lower, upper = arrays((inputs.lower, inputs.upper))
@@ -162,7 +162,7 @@ def slack(mpc: MPC, states: Array, inputs: Array) -> Array:
 
 
 def _violations(mpc: MPC, states: Array, inputs: Array) -> list[tuple[Any, Array]]:
-    """Each soft block with its violations (steps, rows)."""
+    """Return each soft block with its violations (steps, rows)."""
     if not mpc.soft:
         return []
     found = []
@@ -178,7 +178,7 @@ def _violations(mpc: MPC, states: Array, inputs: Array) -> list[tuple[Any, Array
 
 
 def sorted_multipliers(mpc: MPC, layout: Layout, y: Array) -> Multipliers:
-    """The multipliers y (rows,) of all rows sorted by constraint and step."""
+    """Return the multipliers y (rows,) of all rows, sorted by constraint and step."""
     of: dict[str, list[Array]] = {}
     for (kind, _, _), part in zip(layout, split(layout, y), strict=True):
         of.setdefault(kind, []).append(part)
@@ -211,8 +211,10 @@ def flat_multipliers(layout: Layout, multipliers: Multipliers) -> Array:
     return jnp.concatenate(parts) if parts else jnp.zeros(0, jnp.result_type(of.states))
 
 
-def _shifted_multipliers(layout: Layout, horizon: int, y: Array, round_end: bool = False) -> Array:
-    """Multipliers (rows,) of a plan one sample later: see `WarmStart.shifted`."""
+def _shifted_multipliers(
+    layout: Layout, horizon: int, y: Array, terminal_is_ball: bool = False
+) -> Array:
+    """Return the multipliers (rows,) of a plan one sample later: see `WarmStart.shifted`."""
     parts = split(layout, y)
     terminal = next((part[0] for (kind, *_), part in zip(layout, parts, strict=True)
                      if kind == "terminal"), y[:0])  # fmt: skip
@@ -221,7 +223,7 @@ def _shifted_multipliers(layout: Layout, horizon: int, y: Array, round_end: bool
         if kind != "terminal":
             # Step k takes over from k + 1: from the block itself, else from the terminal set.
             place = {k: j for j, k in enumerate(steps)}
-            same = kind == "state" and not round_end and terminal.shape[0] == size
+            same = kind == "state" and not terminal_is_ball and terminal.shape[0] == size
             last = terminal if same else jnp.zeros(size, y.dtype)
             source = jnp.concatenate([part, last[None], jnp.zeros((1, size), y.dtype)])
             end = len(steps)
@@ -232,7 +234,7 @@ def _shifted_multipliers(layout: Layout, horizon: int, y: Array, round_end: bool
 
 
 def split(layout: Layout, y: Array) -> list[Array]:
-    """y (rows,) as one array (steps, rows a step) for each block."""
+    """Return y (rows,) as one array (steps, rows a step) for each block."""
     ends = np.cumsum([len(steps) * size for _, steps, size in layout], dtype=int)
     shapes = [(len(steps), size) for _, steps, size in layout]
     parts = jnp.split(y, ends)[: len(shapes)]

@@ -116,21 +116,21 @@ class MPC:
         return self.input_rate_limit is not None
 
     @property
-    def remembers(self) -> bool:
+    def input_in_state(self) -> bool:
         """True when the plan depends on the previous input."""
         return self.rate_limited or self.input_rate_weight is not None
 
     @property
     def dimension(self) -> int:
         """Number of coordinates of the parameter (x_0, u_{−1}) of the problem: n, or n + m."""
-        return self.system.n + (self.system.m if self.remembers else 0)
+        return self.system.n + (self.system.m if self.input_in_state else 0)
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Labels of these coordinates, with units."""
         system = self.system
         previous = tuple(f"previous {label}" for label in system.input_labels)
-        return system.state_labels + (previous if self.remembers else ())
+        return system.state_labels + (previous if self.input_in_state else ())
 
     @property
     def state_steps(self) -> tuple[int, ...]:

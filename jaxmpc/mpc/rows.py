@@ -26,8 +26,9 @@ Layout = tuple[tuple[str, tuple[int, ...], int], ...]
 class Block:
     """lower ≤ H x_k + D v_k ≤ upper at `steps`: H (r, n) or None, D (r, m) or None.
 
-    rate: v_k is Δu_k. linear, quadratic (r,): weights c e + ½ k e² of a violation e where the rows
-    are soft, None where they are hard. radius: the rows are those of a ball |H x| ≤ radius.
+    rate: v_k is Δu_k. linear, quadratic (r,): weights c and k of the penalty c e + ½ k e² of a
+    violation e where the rows are soft (k is twice `Soft.quadratic`), None where they are hard.
+    radius: the rows are those of a ball |H x| ≤ radius.
     """
 
     kind: str
@@ -54,7 +55,7 @@ class Row:
     """What one row of the condensed QP stands for.
 
     kind: "input", "state", "output", "rate", "soft" or "terminal". step: its k. name, unit: of the
-    quantity that is bounded. index: of the row within its block. soft: whether it may be violated.
+    quantity that is bounded. index: of the row within its step. soft: whether it may be violated.
     """
 
     kind: str
@@ -66,7 +67,7 @@ class Row:
 
 
 def blocks(mpc: MPC, dtype: Any) -> list[Block]:
-    """The blocks of a problem; arrays in `dtype`. Traceable in every array of `mpc`."""
+    """Return the blocks of a problem, arrays in `dtype`. Works inside jit, vmap and grad."""
     system, N, found = mpc.system, mpc.horizon, []
     n, m = system.n, system.m
     cast = lambda v: jnp.asarray(v, dtype)
@@ -144,7 +145,7 @@ def blocks(mpc: MPC, dtype: Any) -> list[Block]:
 
 
 def row_table(mpc: MPC) -> tuple[Row, ...]:
-    """One entry for each row of the condensed QP, in its order."""
+    """Return one entry for each row of the condensed QP, in its order."""
     mpc.validate()
     return tuple(
         Row(b.kind, k, b.names[i], b.units[i], i, b.linear is not None)
@@ -157,7 +158,7 @@ def row_table(mpc: MPC) -> tuple[Row, ...]:
 def stacked(
     block: Block, states: tuple[Array, ...], inputs: tuple[Array, ...]
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """(C, D, d, lower, upper) of a block: its rows are C z + D θ + d.
+    """Return (C, D, d, lower, upper) of a block: its rows are C z + D θ + d.
 
     states (Γ, Φ, φ): x_k = Γ_k z + Φ_k θ + φ_k. inputs: the same for v_k.
     """
@@ -175,7 +176,7 @@ def stacked(
 
 
 def _each(H: Array, M: Array) -> Array:
-    """H M_k, or H v_k for vectors, for every step."""
+    """Return H M_k, or H v_k for vectors, for every step."""
     return matmul(H, M) if M.ndim == 3 else matmul(M, H.T)
 
 

@@ -87,6 +87,8 @@ def _plans(controller: Controller, x0s: Array) -> Plan:
     n = controller.mpc.system.n
 
     def one(x: Array) -> Plan:
-        return controller.plan(x[:n], previous_input=x[n:] if controller.mpc.remembers else None)
+        return controller.plan(
+            x[:n], previous_input=x[n:] if controller.mpc.input_in_state else None
+        )
 
     return jax.vmap(one)(x0s)

@@ -85,7 +85,7 @@ def solve_stagewise(
     one that no input moves: where that is not so, the plan does not become SOLVED.
 
     `jax.vmap` over system, x0, references or the arrays of `mpc`. Raises ValueError for bad data
-    that can be read, and for what only `solve` knows: Ellipsoids, control horizons, input rates.
+    that can be read, and for what only `solve` supports: Ellipsoids, control horizons, input rates.
     """
     factor = factor_stages(mpc, system, solver, scale)
     return plan_stages(
@@ -115,7 +115,7 @@ def checked(mpc: MPC, system: LinearSystem, solver: ADMM) -> MPC:
     for name, found in (
         ("terminal_set is an Ellipsoid", isinstance(mpc.terminal_set, Ellipsoid)),
         ("control_horizon is given", mpc.control_horizon is not None),
-        ("input rates are limited or weighed", mpc.remembers),
+        ("input rates are limited or weighed", mpc.input_in_state),
     ):
         if found:
             fail("mpc", name, "Stage by stage there is no such thing: use jm.solve")
@@ -215,19 +215,19 @@ class Stages:
 
 
 def consecutive(steps: tuple[int, ...]) -> bool:
-    """Whether the steps are k, k + 1, …"""
+    """Return whether the steps are k, k + 1, …"""
     return bool(steps) and steps == tuple(range(steps[0], steps[0] + len(steps)))
 
 
 def at(v: Array, steps: tuple[int, ...]) -> Array:
-    """v_k at the steps."""
+    """Return v_k at the steps."""
     if consecutive(steps):
         return v[steps[0] : steps[0] + len(steps)]
     return v[np.array(steps, int)]
 
 
 def spread(part: Array, steps: tuple[int, ...], length: int) -> Array:
-    """The array of so many steps that is `part` at the steps and zero elsewhere."""
+    """Return the array of so many steps that is `part` at the steps and zero elsewhere."""
     if consecutive(steps):
         ends = (steps[0], length - steps[0] - len(steps))
         return jnp.pad(part, (ends, *[(0, 0)] * (part.ndim - 1)))
@@ -235,17 +235,17 @@ def spread(part: Array, steps: tuple[int, ...], length: int) -> Array:
 
 
 def apply(M: Array, v: Array) -> Array:
-    """M_k v_k, or M v_k, for all steps: M (N, a, b) or (a, b), v (N, b)."""
+    """Return M_k v_k, or M v_k, for all steps: M (N, a, b) or (a, b), v (N, b)."""
     return matmul(v, M.T) if M.ndim == 2 else matmul(M, v[..., None])[..., 0]
 
 
 def apply_transposed(M: Array, v: Array) -> Array:
-    """M_k'v_k, or M'v_k, for all steps."""
+    """Return M_k'v_k, or M'v_k, for all steps."""
     return matmul(v, M) if M.ndim == 2 else matmul(v[..., None, :], M)[..., 0, :]
 
 
 def stages(mpc: MPC) -> Stages:
-    """The data of `mpc`. Traceable in every array."""
+    """Return the data of `mpc`. Works inside jit, vmap and grad."""
     system, n = mpc.system, mpc.system.n
     dtype = floating_dtype(mpc)
     cast = lambda v: jnp.asarray(v, dtype)
@@ -413,7 +413,7 @@ def row_scale(s: Stages) -> Array:
 
 
 class Sample(NamedTuple):
-    """What differs from sample to sample: x0 (n,), references (N+1, n) and (N, m)."""
+    """Initial state and references of one solve: x0 (n,), references (N+1, n) and (N, m)."""
 
     x0: Array
     states: Array
@@ -466,8 +466,8 @@ def read(
     x, u = (
         a + b for a, b in zip(free, minimise(s, gains, *s.pull(rho * E * (2 * p - t))), strict=True)
     )
-    # Soft rows that no input moves push with their penalty, for the gap's sake.
-    y = jnp.where(E == 0, s.bounds.push(s.rows(x, u)), E * rho * (t - p))
+    # A soft row that no input moves gets its penalty's gradient as multiplier: the gap closes.
+    y = jnp.where(E == 0, s.bounds.penalty_gradient(s.rows(x, u)), E * rho * (t - p))
     return u, s.bounds.admissible(y)
 
 
@@ -518,8 +518,8 @@ def residual_terms(s: Stages, sample: Sample, u: Array, y: Array) -> Terms:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Search:
-    """One instance on its way: inputs u (N, m) and multipliers y (rows,) of the last Newton step,
-    the best pair of all so far, the steps taken, and whether to go on."""
+    """Loop state of one instance: inputs u (N, m) and multipliers y (rows,) of the last Newton
+    step, the best pair of all so far, the steps taken, and whether to go on."""
 
     u: Array
     y: Array
@@ -533,10 +533,10 @@ def newton_step(
 ) -> tuple[Array, Array]:
     """Semismooth Newton on the optimality conditions from ADMM's u (N, m) and y (rows,).
 
-    In scaled rows v, multipliers y/E and with the excess of `projection.py` the conditions are
-    gradient = 0 and excess(v + y/ρ) = y/ρ. With the derivative D of the excess a step asks
+    In scaled rows v, multipliers y/E and with the residual e(v) = v − prox(v) of `projection.py`
+    the conditions are gradient = 0 and e(v + y/ρ) = y/ρ. With the derivative D of e a step asks
 
-        gradient + P du + rows'dy = 0,        dy (1 − D)/ρ = D dv + c,    c = excess − y/ρ.
+        gradient + P du + rows'dy = 0,        dy (1 − D)/ρ = D dv + c,    c = e − y/ρ.
 
     Where D = 1 (a row held at its bound) 0·dy becomes dy/κ with a large κ, a proximal step on y:
     dy = ω dv + ω_c c, with ω = ρ D/(1 − D + D ρ/κ) and ω_c = ρ/(1 − D + D ρ/κ). What is left is an
@@ -577,7 +577,7 @@ def errors(
     """v + y/ρ, c and the gradient, see `newton_step`."""
     found, push = conditions(s, sample, u, y), scaled_multipliers(E, y) / rho
     v = E * found.rows + push
-    return v, s.bounds.scaled(E).excess(v, rho) - push, found.gradient
+    return v, s.bounds.scaled(E).prox_residual(v, rho) - push, found.gradient
 
 
 def newton(s: Stages, E: Array, rho: Array, D: Array) -> Callable[[Array, Array], Any]:
@@ -603,7 +603,7 @@ def implicit(
 
     The conditions F(data, u, y) = 0 of `newton_step` hold at a solution, hence J d(u, y) = −dF with
     the matrix J of a Newton step and u, y held fixed in dF: one Riccati recursion, whatever the
-    number of iterations. Rows that touch without pushing count as inactive, as in
+    number of iterations. Rows that touch with a zero multiplier count as inactive, as in
     `qp/derivative.py`.
     """
     return u, y

@@ -1,4 +1,4 @@
-"""Projected Newton steps on the dual, in the few rows that push: exact answers at little cost.
+"""Projected Newton steps on the dual, in the rows with a multiplier or a violation.
 
 In ADMM's coordinates (H = I, rows of length one) the dual of min ½|w|² + q'w + g(A w) is
 
@@ -9,7 +9,7 @@ gradient. Let W hold the rows with y_i ≠ 0 and those that are violated. A Newt
 
     (S_WW + Γ) d = v_W − b_W − Γ (y_W − sign·c),
 
-with b the bound that each row pushes at and Γ = 1/k for soft rows beyond it, needs one small
+with b the bound of each row that is active and Γ = 1/k for soft rows beyond it, needs one small
 symmetric system of static size. y + t d, with rows that would change sign stopped at zero
 (Bertsekas 1982, "Projected Newton methods for optimization problems with simple constraints"), is
 tried for several t, among them the largest that stops no row; the one with the best dual value is
@@ -35,7 +35,7 @@ from jaxmpc.qp.projection import Bounds
 MOST_ROWS, FEW_ROWS = 48, 16
 # Step lengths that are tried, beside the largest that stops no row.
 LENGTHS = (1.0, 0.5, 0.25, 0.0625)
-# Ridge on S_WW, whose diagonal is 1: rows that depend on each other share their multiplier.
+# Ridge on S_WW, whose diagonal is 1, for linearly dependent rows: they share their multiplier.
 RIDGE = 1e-11
 
 
@@ -108,6 +108,6 @@ def dual_step(
     # (An argmin in a float64 program cannot be lowered where 64-bit mode is off.)
     best = (loss <= jnp.min(loss)).astype(y.dtype)
     change = jnp.zeros_like(y).at[W].add(matmul(best / jnp.sum(best), moved), mode="drop")
-    # −q − A'y would lose what w is small beside q; the change of w is as exact as that of y.
+    # −q − A'y would cancel where |w| is far below |q|; the change of w is as exact as that of y.
     moved_to = DualPoint(y + change, point.w - matmul(change, A))
     return moved_to, jnp.sum(in_W) <= most

@@ -37,7 +37,8 @@ from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.status import Status
 
-# Eigenvalue, relative to the mean, below which a direction counts as without curvature.
+# Eigenvalue, relative to the mean, below which a direction counts as without curvature, by the
+# size of a number in bytes.
 SINGULAR = {8: 1e-10, 4: 1e-6}
 # Beside which eigenvalue, relative to the mean, range and null space are told apart.
 SPLIT = 1e-6
@@ -158,8 +159,8 @@ def scale(
     H = matmul(T.T, matmul(P, T))
     rows = matmul(A, T)
     squared = jnp.sum(rows**2, axis=1)
-    # A row is zero when it is rounding noise of its own terms, or beside the others (Euler: q₁
-    # does not feel u₀).
+    # A row is zero when it is rounding noise of its own terms, or beside the others (with explicit
+    # Euler the position at k = 1 does not depend on u_0).
     eps = jnp.finfo(dtype).eps
     own = jnp.sum(matmul(jnp.abs(A), jnp.abs(T)) ** 2, axis=1)
     noise = jnp.maximum((100 * eps) ** 2 * own, eps**2 * jnp.max(squared, initial=0.0))
@@ -177,7 +178,7 @@ def null_curvature(P: Array, A: Array) -> tuple[Array, Array]:
     """The curvature δ that stands in for P where P has none, and whether there is such a part.
 
     Where P is definite, δ is rounding. Where it is singular, the scale of its
-    null space relative to its range is free, and ADMM is slow when rows feel mostly one of them:
+    null space relative to its range is free, and ADMM is slow when rows lie mostly in one of them:
     δ makes both parts of the median row alike, |a_null|²/δ = Σ (a'v)²/λ over P's range; 1 if
     no row has both parts. With x = (P + εI)⁻¹a the null part is ε|x|, and the range part x'Px.
     """
@@ -203,7 +204,7 @@ def null_curvature(P: Array, A: Array) -> tuple[Array, Array]:
 
 
 def factor(P: Array, A: Array, solver: ADMM, balls: tuple[int, ...] = ()) -> Factor:
-    """Scale and invert; depends on nothing that differs between initial states."""
+    """Return the factor of P (n, n) and A (m, n) at the penalties of `solver`."""
     fault = matrix_fault(P, A)
     P, A = harmless_matrices(P, A, fault == Status.NOT_RUN)
     T, E, H, A_w, flat = scale(P, A, balls)
@@ -346,7 +347,7 @@ def repeat(advance: Callable[[Array], Array], t: Array, count: int) -> Array:
 
 
 def read(factor: Factor, t: Array, q: Array, bounds: Bounds) -> tuple[Array, Array]:
-    """Primal w (n,) and multiplier R v (m,), both scaled, that t stands for at the last stage."""
+    """Return primal w (n,) and multiplier R v (m,), both scaled, of t with the last penalty."""
     s = bounds.project(t, factor.rho[-1])
     w = matmul(2 * s - t, factor.F[-1].T) - matmul(q, factor.Minv[-1])
     return w, factor.rho[-1] * (t - s)

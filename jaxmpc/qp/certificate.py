@@ -4,7 +4,7 @@ A vector y proves l ≤ Az ≤ u empty when A'y = 0 and Σ u y⁺ − l y⁻ < 0
 radius·|y_b| to the sum, soft rows never take part. Iterates never satisfy A'y = 0 exactly.
 Where a row bounds a single variable on both sides its multiplier can be chosen to absorb what is
 left of A'y, exactly up to one rounding (Neumaier & Shcherbina 2004, safe bounds; here with the
-box rows in the role of the correction). Convergence of y then buys tightness, not validity.
+box rows in the role of the correction). The bound is valid for any y; convergence makes it tight.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from jaxmpc.qp.precision import matmul, rounding
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
 
-# Rounding of a ray's products beside that of residuals: rays are solutions of linear systems.
+# Tolerance of a ray's products, in multiples of `rounding`: rays are solutions of linear systems.
 RAY = 25
 
 
@@ -80,7 +80,7 @@ def correcting_rows(qp: QP) -> tuple[Array, Array]:
 def farkas(qp: QP, y: Array, correcting: tuple[Array, Array]) -> tuple[Array, Array]:
     """The candidate y made into a certificate: returns (y, proved).
 
-    y is scaled to length one, freed of pushes against infinite bounds, and corrected on rows
+    y is scaled to length one, set to zero against infinite bounds, and corrected on rows
     that bound one variable (`correcting_rows`). `proved` is True when Σ u y⁺ − l y⁻ is below zero
     by more than the rounding of the sum and of A'y (over the box of the bounded variables); a
     variable without such a row must have (A'y)_j at rounding level. A zero y proves nothing.

@@ -1,7 +1,8 @@
 """Derivatives of the solution map (P, q, A, l, u, …) → (z, y), by the implicit function theorem.
 
-At a solution the conditions Pz + q + A'y = 0 and excess(Az + y/ρ) = y/ρ hold for every ρ > 0
-(`projection.py`). With the pieces of the excess held fixed they are smooth, and a change of the
+At a solution the conditions Pz + q + A'y = 0 and e(Az + y/ρ) = y/ρ hold for every ρ > 0, with the
+prox residual e(v) = v − prox(v) (`projection.py`). With the formula of e in each row, the active
+set, held fixed they are smooth, and a change of the
 data moves (z, y) by one linear system, which `newton.linearised` solves in ADMM's coordinates.
 JAX transposes that for reverse mode and differentiates it again for higher orders.
 
@@ -15,11 +16,11 @@ Which element of the generalised derivative is taken, and what it means where no
   Kanzow, Smale): the stiffness of a log barrier. (z, y) stay those of the exact solution;
   equalities, soft rows and balls are not smoothed.
 * Where active rows depend on each other, the least-squares answer (see `linearised`).
-* A row that is violated although its multiplier pushes (the program is infeasible, or not yet
-  solved) counts as the spring with stiffness k = y/violation that holds (z, y) in balance. For
-  an infeasible program the polish of `newton.py` ends at the point that violates the rows
-  least, with stiff springs: the derivative is that of the closest feasible program
-  (Bambade et al. 2024, QPLayer), up to about 1/k.
+* A row that is violated and has a multiplier of the same sign (the program is infeasible, or not
+  yet solved) counts as a soft row with the quadratic weight k = y/violation. For an infeasible
+  program the method of multipliers ends at the point that violates the rows least, with a large
+  k: the derivative is that of the closest feasible program (Bambade et al. 2024, QPLayer), up to
+  about 1/k.
 """
 
 from typing import Any
@@ -58,7 +59,7 @@ def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple:
         _, bounds = scaled(factor, qp)
         v = E * matmul(z, qp.A.T)
         sides = upper * (v - bounds.u) + lower * (v - bounds.l)
-        rows = jnp.where(kept, bounds.excess(v + y_w / rho, rho), sides)
+        rows = jnp.where(kept, bounds.prox_residual(v + y_w / rho, rho), sides)
         return matmul(matmul(z, qp.P) + qp.q + matmul(y, qp.A), T), rows
 
     _, moved = jax.jvp(conditions, (qp,), (tangents[0],))
@@ -73,7 +74,7 @@ def activity(
 ) -> tuple[Array, Array, Array]:
     """How far each hard row counts as active, with the choices made at the top of this file:
     weights in [0, 1] of its upper and its lower bound. And the other rows (soft ones, balls),
-    which keep the excess as it is."""
+    whose prox residual is kept as it is."""
     precision = jnp.finfo(v.dtype).eps
     kept = jnp.arange(v.shape[0]) >= v.shape[0] - sum(bounds.balls)
     if bounds.linear is not None:

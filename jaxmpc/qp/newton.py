@@ -5,9 +5,9 @@ splitting variable minimised out (Rockafellar 1976; Hermans, Themelis, Patrinos 
 
     φ(w) = ½ w'Hw + q'w + min_p g(p) + ½ρ|A w + y/ρ − p|²
 
-with g of `projection.py`. Its gradient, with the excess e of v = A w + y/ρ, is Hw + q + ρ A'e,
-its generalised Hessian H + ρ A'DA with D the derivative of the excess. With H = q = y = 0 and
-ρ = 1 the minimum is the distance to feasibility: there e = 0 (a feasible w), or A'e = 0 with
+with g of `projection.py`. Its gradient, with the prox residual e of v = A w + y/ρ, is
+Hw + q + ρ A'e, its generalised Hessian H + ρ A'DA with D the derivative of e. With H = q = y = 0
+and ρ = 1 the minimum is the distance to feasibility: there e = 0 (a feasible w), or A'e = 0 with
 e ≠ 0, which is a Farkas vector: e'A w is 0 for all w but at least g*(e) fails by |e|².
 """
 
@@ -61,14 +61,15 @@ def gram(A: Array, weights: Array, normals: list[Array]) -> Array:
 
 
 def ridged(K: Array, scale: Any = 0.0) -> Array:
-    """Return K plus a ridge at rounding level, for directions that nothing in K sees."""
+    """Return K plus a ridge at rounding level, for the null space of K."""
     n = K.shape[0]
     ridge = 10 * jnp.finfo(K.dtype).eps * (jnp.trace(K) / n + scale)
     return K + ridge * jnp.eye(n, dtype=K.dtype)
 
 
 class Newton(NamedTuple):
-    """What one step gives: w, its excess, the gradient of φ, and whether φ was minimised."""
+    """Result of one step: w (n,), its prox residual (m,), the gradient of φ (n,), and whether φ was
+    minimised."""
 
     w: Array
     excess: Array
@@ -82,11 +83,11 @@ def newton_step(
     """One step on φ + ½σ d'(I − H)d with exact line search.
 
     The proximal term acts where the cost has no curvature (H = I elsewhere in ADMM's
-    coordinates) and keeps linear programs from running off. φ is quadratic where no row changes
-    its piece, so a full step that leaves all pieces as they were has reached the minimum.
+    coordinates) and keeps the iterates of linear programs bounded. φ is quadratic where no row
+    changes its piece, so a full step that leaves all pieces as they were has reached the minimum.
     """
     v = matmul(w, A.T) + y / rho
-    e = bounds.excess(v, rho)
+    e = bounds.prox_residual(v, rho)
     gradient = matmul(w, H) + q + rho * matmul(e, A)
     weights, normals = bounds.curvature(v, rho)
     smooth = H + sigma * (jnp.eye(w.shape[0], dtype=w.dtype) - H)
@@ -95,13 +96,13 @@ def newton_step(
     # φ along w + t d costs no product with A: two scalars and A d.
     Ad, Hd = matmul(d, A.T), matmul(d, smooth)
     slope, bend = jnp.sum(d * jnp.stack([matmul(w, H) + q, Hd]), axis=1)
-    minimised = jnp.all(bounds.piece(v + Ad, rho) == bounds.piece(v, rho))
+    minimised = jnp.all(bounds.active_set(v + Ad, rho) == bounds.active_set(v, rho))
 
     def search(carry: tuple[Array, Array, Array], _: None) -> tuple[Any, None]:
         """Newton on the derivative of φ, which grows with t, between what it has bracketed."""
         t, low, high = carry
         at = v + t * Ad
-        derivative = slope + t * bend + rho * jnp.sum(bounds.excess(at, rho) * Ad)
+        derivative = slope + t * bend + rho * jnp.sum(bounds.prox_residual(at, rho) * Ad)
         D, hs = bounds.curvature(at, rho)
         second = bend + rho * (jnp.sum(D * Ad**2) + sum(jnp.sum(h * Ad) ** 2 for h in hs))
         low, high = jnp.where(derivative < 0, t, low), jnp.where(derivative < 0, high, t)
@@ -113,12 +114,12 @@ def newton_step(
     one = jnp.ones((), w.dtype)
     count = LINE_STEPS if bounds.linear is None else LINE_STEPS_SOFT
     (t, low, high), _ = jax.lax.scan(search, (one, 0 * one, jnp.inf * one), length=count)
-    # Where no t was found too long, the last try is none to rely on.
+    # Without an upper bracket the lower end is used.
     t = jnp.where(minimised, 1.0, jnp.where(jnp.isinf(high), low, t))
-    w_new, e_new = w + t * d, bounds.excess(v + t * Ad, rho)
+    w_new, e_new = w + t * d, bounds.prox_residual(v + t * Ad, rho)
     if not bounds.balls:
-        # The excess moves linearly within its piece. Adding the move keeps the rounding of a
-        # small e small; ρ will multiply it.
+        # The prox residual is linear where the active set does not change. Adding the change keeps
+        # the rounding of a small e small; ρ will multiply it.
         e_new = jnp.where(minimised, e + weights * Ad, e_new)
     return Newton(w_new, e_new, matmul(w_new, H) + q + rho * matmul(e_new, A), minimised)
 
@@ -218,7 +219,7 @@ def linearised(
 ) -> Callable[[Array, Array], tuple[Array, Array]]:
     """Solver of the optimality conditions with the pieces of g held fixed.
 
-    The conditions Hw + q + A'y = 0 and excess(Aw + y/ρ) = y/ρ, moved by a (n,) and c (m,), move
+    The conditions Hw + q + A'y = 0 and e(Aw + y/ρ) = y/ρ, moved by a (n,) and c (m,), move
     their solution by
 
         H dw + A'dy = −a,        dy/ρ = D (A dw + dy/ρ) + c,        D = diag(weights) + Σ h h'.

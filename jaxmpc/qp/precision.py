@@ -1,4 +1,4 @@
-"""In what precision things are computed, whatever JAX's settings are."""
+"""Float64 evaluation and products at full precision, whatever JAX's settings are."""
 
 from collections.abc import Callable
 from typing import Any

@@ -159,9 +159,9 @@ class Duals(NamedTuple):
 class QPSolution:
     """A primal-dual pair and what is known about it.
 
-    z (n,) primal. y (m,) multipliers: Pz + q + A'y = 0, y > 0 pushes against the upper bound,
-    y < 0 against the lower. cost: ½ z'Pz + q'z plus what soft rows pay; its derivative is that
-    of the optimal value. Residuals are in the problem's own units (see `residuals`).
+    z (n,) primal. y (m,) multipliers: Pz + q + A'y = 0, y > 0 where the upper bound is active,
+    y < 0 where the lower is. cost: ½ z'Pz + q'z plus the penalties of soft rows; its derivative is
+    that of the optimal value. Residuals are in the problem's own units (see `residuals`).
     certificate (m,): for PRIMAL_INFEASIBLE the Farkas vector, else zeros. ray (n,): for
     DUAL_INFEASIBLE a direction of unbounded descent, else zeros. iterations: ADMM steps run.
     """

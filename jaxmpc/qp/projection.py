@@ -7,8 +7,8 @@ The constraints are one convex function g(v), a sum over rows and balls:
     ball       0 if |v_b − centre| ≤ radius, else ∞       (v_b: the rows of the ball)
 
 ADMM and the Newton method need of it only the proximal map p = argmin_p g(p) + ½ρ|p − v|²,
-here through the excess e = v − p, which is closed: zero inside; the whole distance s to the set
-for a hard row or a ball; for a soft row s as long as ρ s ≤ c, and beyond that s − d with
+here through the prox residual e = v − p, which is in closed form: zero inside; the whole distance s
+to the set for a hard row or a ball; for a soft row s as long as ρ s ≤ c, and beyond that s − d with
 d = (ρ s − c)/(ρ + k). ρ e is a subgradient of g at p: the multiplier.
 """
 
@@ -37,36 +37,37 @@ class Bounds:
     balls: tuple[int, ...] = field(default=(), metadata={"static": True})
 
     def blocks(self) -> list[tuple[slice, Array]]:
-        """Rows and radius of each ball."""
+        """Return the rows and the radius of each ball."""
         first = self.l.shape[0] - sum(self.balls)
         ends = [first + sum(self.balls[: i + 1]) for i in range(len(self.balls))]
         sizes = zip(self.balls, ends, strict=True)
         return [(slice(end - k, end), self.radius[i]) for i, (k, end) in enumerate(sizes)]
 
-    def excess(self, v: Array, rho: Any) -> Array:
-        """e = v − prox(v) with penalty rho, a number or (m,)."""
+    def prox_residual(self, v: Array, rho: Any) -> Array:
+        """Return e = v − prox(v) (m,) with penalty rho, a number or (m,)."""
         s = v - jnp.clip(v, self.l, self.u)
         if self.linear is not None:
-            s = s - jnp.sign(s) * self._yield(s, rho)
+            s = s - jnp.sign(s) * self._soft_slack(s, rho)
         for rows, radius in self.blocks():
-            s = s.at[rows].multiply(1 - self._shrink(s[rows], radius))
+            s = s.at[rows].multiply(1 - self._projection_factor(s[rows], radius))
         return s
 
     def project(self, v: Array, rho: Any) -> Array:
-        """prox(v) = v − excess."""
+        """Return prox(v) (m,) of g/rho."""
         plain = self.linear is None and not self.balls
-        return jnp.clip(v, self.l, self.u) if plain else v - self.excess(v, rho)
+        return jnp.clip(v, self.l, self.u) if plain else v - self.prox_residual(v, rho)
 
     def cost(self, p: Array) -> Array:
-        """The penalty that each soft row pays at p; hard rows and balls cost nothing here."""
+        """Return the penalty of each soft row at p; 0 for hard rows and balls (`violation`)."""
         if self.linear is None:
             return jnp.zeros_like(p)
         soft = jnp.isfinite(self.linear)
         d = jnp.where(soft, jnp.abs(p - jnp.clip(p, self.l, self.u)), 0.0)
         return d * (jnp.where(soft, self.linear, 0.0) + 0.5 * self.quadratic * d)
 
-    def push(self, v: Array) -> Array:
-        """The multiplier of soft rows that v leaves outside, as their penalty's slope; else 0."""
+    def penalty_gradient(self, v: Array) -> Array:
+        """Return the gradient of the penalties at v (m,): the multiplier of soft rows that are
+        violated, 0 in all others."""
         if self.linear is None:
             return jnp.zeros_like(v)
         s = v - jnp.clip(v, self.l, self.u)
@@ -75,21 +76,21 @@ class Bounds:
         return jnp.where(soft, jnp.sign(s) * slope, 0.0)
 
     def violation(self, v: Array) -> Array:
-        """v minus its projection where a constraint is hard; 0 in soft rows."""
-        return self.hard().excess(v, 1.0)
+        """Return v minus its projection where a constraint is hard; 0 in soft rows."""
+        return self.hard().prox_residual(v, 1.0)
 
     def curvature(self, v: Array, rho: Any) -> tuple[Array, list[Array]]:
-        """The derivative of the excess at v (one element of it at a kink): diag(weights) plus
-        h h' for each h of the list, both (m,)."""
+        """Return the derivative of the prox residual at v (an element of its generalised Jacobian):
+        diag(weights) plus h h' for each h of the list, both (m,)."""
         s = v - jnp.clip(v, self.l, self.u)
         weights = (s != 0).astype(v.dtype)
         if self.linear is not None:
-            beyond = self._yield(s, rho) > 0
+            beyond = self._soft_slack(s, rho) > 0
             weights = jnp.where(beyond, self.quadratic / (rho + self.quadratic), weights)
         normals = []
         for rows, radius in self.blocks():
-            # In the ball's own directions the excess turns, along its normal it grows.
-            shrink, length = self._shrink(s[rows], radius), self._length(s[rows])
+            # Tangential to the ball the prox residual turns, along its normal it grows.
+            shrink, length = self._projection_factor(s[rows], radius), self._length(s[rows])
             outside = (length > radius).astype(v.dtype)
             weights = weights.at[rows].set(outside * (1 - shrink))
             root = jnp.where(
@@ -99,14 +100,15 @@ class Bounds:
             normals.append(jnp.zeros_like(v).at[rows].set(normal))
         return weights, normals
 
-    def piece(self, v: Array, rho: Any) -> Array:
-        """Which formula of the excess holds in each row: 0 inside, ±1 at a bound, ±2 beyond."""
+    def active_set(self, v: Array, rho: Any) -> Array:
+        """Return which formula of the prox residual holds in each row: 0 inside, ±1 outside, ±2
+        outside and past the L1 weight; for a ball 0 inside and 1 outside."""
         s = v - jnp.clip(v, self.l, self.u)
         if self.linear is None and not self.balls:
             return jnp.sign(s)
         count = jnp.ones_like(s)
         if self.linear is not None:
-            count = count + (self._yield(s, rho) > 0)
+            count = count + (self._soft_slack(s, rho) > 0)
         piece = jnp.sign(s) * count
         for rows, radius in self.blocks():
             piece = piece.at[rows].set((self._length(s[rows]) > radius).astype(v.dtype))
@@ -132,8 +134,8 @@ class Bounds:
         return value
 
     def admissible(self, y: Array) -> Array:
-        """The nearest y of finite conjugate: no push against a bound that is not there, and none
-        beyond the weight of an L1 penalty."""
+        """Return the nearest y of finite conjugate: zero against a bound that is not there, and at
+        most the weight of an L1 penalty."""
         y = jnp.where(jnp.isposinf(self.u), jnp.minimum(y, 0.0), y)
         y = jnp.where(jnp.isneginf(self.l), jnp.maximum(y, 0.0), y)
         if self.linear is not None:
@@ -142,7 +144,7 @@ class Bounds:
         return y
 
     def hard(self) -> "Bounds":
-        """The constraints alone: soft rows become free."""
+        """Return the hard constraints alone: soft rows become free."""
         if self.linear is None:
             return self
         soft = jnp.isfinite(self.linear)
@@ -174,20 +176,20 @@ class Bounds:
             )  # fmt: skip
         return new
 
-    def _yield(self, s: Array, rho: Any) -> Array:
-        """d ≥ 0: how far prox(v) stays outside a soft row, s = signed distance of v."""
+    def _soft_slack(self, s: Array, rho: Any) -> Array:
+        """Return d ≥ 0 (m,): how far prox(v) stays outside a soft row; s: signed distance of v."""
         soft = jnp.isfinite(self.linear)
         over = jnp.abs(s) - jnp.where(soft, self.linear, 0.0) / rho
         beyond = soft & (over > 0)
         return jnp.where(beyond, rho / (rho + self.quadratic) * jnp.where(beyond, over, 0.0), 0.0)
 
     def _length(self, v: Array) -> Array:
-        """|v|, with derivative 0 at v = 0."""
+        """Return |v|, with derivative 0 at v = 0."""
         squared = jnp.sum(v**2)
         return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
 
-    def _shrink(self, s: Array, radius: Array) -> Array:
-        """Factor that projects s onto the ball: radius/|s| outside, 1 inside."""
+    def _projection_factor(self, s: Array, radius: Array) -> Array:
+        """Return the factor that projects s onto the ball: radius/|s| outside, 1 inside."""
         length = self._length(s)
         outside = length > radius
         return jnp.where(outside, radius / jnp.where(outside, length, 1.0), 1.0)

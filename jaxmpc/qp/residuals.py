@@ -1,8 +1,8 @@
 """Residuals of a primal-dual pair, judged against the rounding of their own terms.
 
-A transcription of a problem gives its residuals as one vector, [rows, gradient, gap], with the
-sizes of the terms that each is a difference of: `residual_terms` for a QP, its namesake in
-`mpc/stagewise.py` for a problem stage by stage. All that is said of a pair is computed from these.
+Residuals are one vector, [rows (m), variables (n), gap (1)], and with it, entry by entry, the sum
+of the absolute terms that each is a difference of: `residual_terms` for a QP, its namesake in
+`mpc/stagewise.py` for a problem stage by stage. Status and stopping are computed from these.
 """
 
 from collections.abc import Callable
@@ -93,7 +93,7 @@ class Pair:
 
     @classmethod
     def none(cls, z: Array, y: Array) -> "Pair":
-        """Return the pair that any other is better than, of the shapes of z and y."""
+        """Return a placeholder with infinite error, of the shapes of z and y."""
         false = jnp.asarray(False)
         infinite = jnp.asarray(jnp.inf, z.dtype)
         return cls(jnp.zeros_like(z), jnp.zeros_like(y), infinite, false, false)
@@ -109,8 +109,8 @@ class Pair:
         return cls(z, y, relative, near, above <= 1e-6 * eps[0])
 
     def or_better(self, other: "Pair") -> "Pair":
-        """Return the other pair where that is solved or its residuals are smaller. What was near
-        before counts as solved: one step more is rounding."""
+        """Return the other pair where that is solved or its residuals are smaller. A pair that was
+        near before is solved after one step more."""
         take = ~self.solved & (other.solved | (other.error < self.error))
         best = jax.tree.map(lambda old, new: jnp.where(take, new, old), self, other)
         return replace(best, solved=best.solved | self.near)

@@ -1,4 +1,4 @@
-"""solve_qp: loop, polish, honest status and derivative joined."""
+"""solve_qp: ADMM, Newton steps, status from residuals and certificates, implicit derivative."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -50,7 +50,7 @@ INFINITE = 1e20
 
 
 def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: Any = None) -> QPSolution:
-    """Minimise ½ z'Pz + q'z subject to l ≤ Az ≤ u by a fixed number of ADMM steps and a polish.
+    """Minimise ½ z'Pz + q'z subject to l ≤ Az ≤ u by ADMM and Newton steps.
 
     One instance; `jax.vmap` for many. Where P and A are not batched they are factored once;
     where they are, each instance has its own factor. Soft rows and balls: see `QP`. Bounds of 1e20
@@ -93,7 +93,7 @@ def in_two_parts(
 
 
 def has_dual_steps(balls: tuple[int, ...], A: Any) -> bool:
-    """Whether `active_set.py` can take steps: there are rows, and no balls."""
+    """Return whether `active_set.py` can take steps: there are rows, and no balls."""
     return not balls and np.shape(A)[0] > 0
 
 
@@ -131,7 +131,8 @@ def solve_factored(
 
 
 def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = True) -> QPSolution:
-    """Loop, Newton steps, proofs."""
+    """Return the solution of clean data by ADMM and Newton steps, with its status, without its cost
+    and count of iterations. whole: see `in_two_parts`."""
     q, bounds = scaled(factor, qp)
     t = jnp.zeros_like(qp.l)
     if warm_start is not None:
@@ -179,8 +180,8 @@ def loop(iterations: int, constants: tuple, data: tuple) -> list[tuple[Array, Ar
 @dataclass(frozen=True)
 class Program:
     """A program in its own units and, as `q` (n,) and `bounds`, in ADMM's coordinates; eps: the
-    residuals that are asked for; far: |w| at which the data's precision takes a ray's end for a
-    solution."""
+    tolerances (2,); far: bound on |w|, beyond which steps are rejected (the program looks
+    unbounded)."""
 
     qp: QP
     factor: Factor
@@ -194,18 +195,18 @@ def judged(p: Program, w: Array, y: Array) -> tuple[Pair, Array]:
     """The pair of scaled w and y, and the gradient T'(Pz + q + A'y) (n,) of the Lagrangian."""
     z, y = unscaled(p.qp, p.factor, w, y)
     values, sizes = residual_terms(p.qp, z, y)
-    # The gap of soft rows is of second order in the error of z; this residual is of first.
+    # For soft rows the gap is quadratic in the error of z; the prox residual is linear.
     v, push = scaled_rows(p.factor, p.qp, z, y)
-    prox = p.bounds.excess(v + push, 1.0) - push
+    prox = p.bounds.prox_residual(v + push, 1.0) - push
     terms = jnp.append(values, prox), jnp.append(sizes, jnp.abs(v) + jnp.abs(push))
     floor = rounding(z.dtype)
-    # What is rounding of its own terms says nothing.
+    # Entries at rounding level count as zero.
     gradient = jnp.where(jnp.abs(values) > floor * sizes, values, 0.0)[len(y) : -1]
     return Pair.of(z, y, terms, p.eps, floor), matmul(gradient, p.factor.T)
 
 
 def better(qp: QP, pair: tuple[Array, Array], other: tuple[Array, Array]) -> tuple:
-    """The one of two pairs (z, y) with the smaller residuals."""
+    """Return the one of two pairs (z, y) with the smaller largest relative residual."""
     error = lambda z, y: worst(residual_terms(qp, z, y), 0.0)[1]
     take = lax.stop_gradient(error(*other) < error(*pair))
     return tuple(jnp.where(take, b, a) for a, b in zip(pair, other, strict=True))
@@ -214,7 +215,7 @@ def better(qp: QP, pair: tuple[Array, Array], other: tuple[Array, Array]) -> tup
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Search:
-    """One instance on its way: the point of the method of multipliers; q (n,) corrected by what
+    """Loop state of one instance: the point of the method of multipliers; q (n,) corrected by what
     rounding leaves of the gradient; the best pair so far; Newton steps taken; what is proved;
     w (n,) of the search for a proof, and whether to go on."""
 
@@ -227,8 +228,8 @@ class Search:
     open: Array
 
 
-# Steps on the dual before the method of multipliers takes over, and those after which rows join
-# one at a time. DIVERGED: multipliers, relative to q, that say the dual has no maximum.
+# DUAL_STEPS: most steps on the dual. JOINTLY: of these, steps in which all violated rows join the
+# active set. DIVERGED: multipliers, relative to q, from which on the dual seems unbounded.
 DUAL_STEPS, JOINTLY, DIVERGED = 24, 2, 1e6
 
 
@@ -238,7 +239,7 @@ def improve(
     """Return the pair (z, y) and what is proved, after `refine` Newton steps at most, in float64,
     and whether there is nothing left to try.
 
-    Steps on the dual in the rows that push solve most programs (`active_set.py`). The method of
+    Steps on the dual in the active rows solve most programs (`active_set.py`). The method of
     multipliers (`newton.py`) takes the others: P singular, balls, degenerate or infeasible rows.
     """
     qp, factor = p.qp, p.factor
@@ -273,8 +274,8 @@ def improve(
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class DualSearch:
-    """One instance among the dual steps: where it is, the best pair so far, the steps taken,
-    whether to go on, and whether its active rows fit into the system that is solved."""
+    """Loop state of one instance in the dual steps: its point, the best pair so far, the steps
+    taken, whether to go on, and whether its active rows fit into the system that is solved."""
 
     dual: DualPoint
     best: Pair
@@ -284,7 +285,7 @@ class DualSearch:
 
 
 def diverged(p: Program, y: Array) -> Array:
-    """Whether multipliers are so large that the rows seem to contradict each other."""
+    """Return whether |y| is so large that the dual seems unbounded: rows contradict each other."""
     return largest(y) > DIVERGED * (1 + largest(p.q))
 
 
@@ -316,8 +317,9 @@ def proof_steps(refine: int) -> int:
 
 
 def by_multipliers(refine: int, constants: tuple, s: Search) -> Search:
-    """One Newton step: of the method of multipliers; after `refine` of these of least distance to
-    the rows, whose excess becomes a Farkas vector; then, if P is singular, to those of a ray."""
+    """Take one Newton step, by the count of steps: of the method of multipliers, `refine` times;
+    then of least distance to the rows, whose residual becomes a Farkas vector; then, if P is
+    singular, of `recession`, whose minimiser becomes a ray."""
     p, squared, correcting = constants
     f, few, dtype = p.factor, proof_steps(refine), s.w.dtype
     primal, distance = s.steps < refine, s.steps < refine + few
@@ -372,7 +374,7 @@ def least_violation(point: Multipliers, infeasible: Array) -> Multipliers:
 
 
 def still_open(refine: int, constants: tuple, s: Search, _: None) -> tuple[Search, None]:
-    """`by_multipliers` where the instance is open."""
+    """Body of a scan: `by_multipliers`, no change once the instance is finished."""
     new = by_multipliers(refine, constants, s)
     return jax.tree.map(lambda a, b: jnp.where(s.open, a, b), new, s), None
 
@@ -417,7 +419,8 @@ def cleaned(qp: QP, matrix_fault: Array) -> tuple[QP, Array]:
 
 
 def warm(factor: Factor, qp: QP, bounds: Bounds, warm_start: Any) -> Array:
-    """t of a warm start (z, y), a pair or a solution; what is not finite counts as 0."""
+    """Return t (m,) of a warm start, a pair z (n,), y (m,) or a solution; what is not finite counts
+    as 0. Raises ValueError for other shapes."""
     z, y = (warm_start.z, warm_start.y) if hasattr(warm_start, "z") else warm_start
     for name, value, like in (("z", z, qp.q), ("y", y, qp.l)):
         if jnp.shape(value) != like.shape:
@@ -427,10 +430,10 @@ def warm(factor: Factor, qp: QP, bounds: Bounds, warm_start: Any) -> Array:
 
 
 def unscaled(qp: QP, factor: Factor, w: Array, y: Array) -> tuple[Array, Array]:
-    """z and an admissible y in the units of `qp`. Soft rows that z cannot move (scale 0) push with
-    their penalty, for the gap's sake."""
+    """Return z and an admissible y in the units of `qp`. A soft row that z cannot move (scale 0)
+    gets its penalty's gradient as multiplier, so that the duality gap closes."""
     zero = factor.E == 0
-    y = jnp.where(zero, qp.bounds.push(jnp.zeros_like(y)), factor.E * y)
+    y = jnp.where(zero, qp.bounds.penalty_gradient(jnp.zeros_like(y)), factor.E * y)
     return matmul(w, factor.T.T), qp.bounds.admissible(y)
 
 

@@ -1,10 +1,11 @@
-"""What became of a quadratic program: one number an instance, and a sentence for people."""
+"""Status codes of a solve, with a sentence for each."""
 
 from enum import IntEnum
 
 
 class Status(IntEnum):
-    """Outcome of one QP or one state of a sweep. OSQP's numbers; 0 is never an answer.
+    """Outcome of one QP, or label of one state of a map. 1 to 9 are OSQP's numbers; 0 marks
+    instances that have not been solved yet.
 
     A status is derived from residuals and certificates that are computed in the units of
     the problem as given, never from the fact that a loop came to its end.
@@ -43,5 +44,5 @@ _SENTENCES = {
         "The Hessian of the cost has a negative eigenvalue beyond rounding. "
         "Make the weights positive semidefinite: check their signs."
     ),
-    Status.NON_FINITE: "The data of this instance hold NaN, or l > u, or an infinite cost.",
+    Status.NON_FINITE: "The data of this instance hold NaN, or l > u, or an infinite weight.",
 }

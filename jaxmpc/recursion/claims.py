@@ -228,7 +228,7 @@ def settle_by_regions(claims: Claims, limit: int) -> tuple[Claim, float, np.ndar
     assert body is not None
     none = np.zeros((0, claims.problem.dimension))
     try:
-        if mpc.remembers:
+        if mpc.input_in_state:
             fail("mpc", "its law depends on the previous input", "They are not enumerated then")
         found = critical_regions(mpc, limit=limit)
     except ValueError as error:

@@ -106,7 +106,7 @@ class RobotSetting:
         if (mpc.system.n, mpc.system.m) != (robot.n, robot.m):
             sizes, needed = (mpc.system.n, mpc.system.m), (robot.n, robot.m)
             fail("mpc", f"has {sizes} states and inputs", f"This robot has {needed}: see robot_mpc")
-        if mpc.remembers:
+        if mpc.input_in_state:
             fail("mpc", "limits or weighs input rates", "A state alone decides nothing then")
         number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
         if not number or not 0 < seconds < math.inf:

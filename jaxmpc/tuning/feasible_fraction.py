@@ -109,7 +109,7 @@ def _membership(c: Condensed, x0s: Array, width: Array, scale: Any, steps: int) 
         z, e = nearest(fixed, bounds, z, steps)
         usable = given & jnp.isfinite(jnp.sum(e**2) / width**4) & jnp.all(jnp.isfinite(z))
         x0, z = jnp.where(usable, x0, 0.0), jax.lax.stop_gradient(jnp.where(usable, z, 0.0))
-        residual = at(C, D, tight, x0).excess(matmul(z, C.T), 1.0)
+        residual = at(C, D, tight, x0).prox_residual(matmul(z, C.T), 1.0)
         return jnp.where(usable, 1 / (1 + jnp.sum(residual**2) / width**2), 0.0)
 
     data = (c.C, c.D, c.d, c.lower, c.upper, c.radius)

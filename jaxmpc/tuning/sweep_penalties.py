@@ -203,7 +203,7 @@ def shortfall(
         project, lambda v: matmul(P, v), project(jnp.zeros_like(weight)), alpha, iterations
     )
     e, e_before = t - project(t), before - project(before)
-    beyond = jnp.max(jnp.abs(bounds.excess(matmul(U, onto(t - 2 * e)), 1.0)))
+    beyond = jnp.max(jnp.abs(bounds.prox_residual(matmul(U, onto(t - 2 * e)), 1.0)))
 
     def outside(y: Array) -> Array:
         """Return how far θ is inside the half-space that multipliers give; < 0: it is excluded."""

@@ -632,17 +632,17 @@ def test_solve_many(name):
     """The adaptive driver, previous inputs in the last columns; feasible or not as in truth."""
     mpc = PROBLEMS[name]()
     explicit, x0, previous, *_ = batch(name)
-    x = x0 if not mpc.remembers else np.concatenate([x0, previous], axis=1)
+    x = x0 if not mpc.input_in_state else np.concatenate([x0, previous], axis=1)
     found = jm.solve_many(mpc, x, jm.ADMM(eps=1e-8), chunk=16)
     for i in range(COUNT):
-        cost, _, inputs, *_ = explicit.solve(x0[i], previous[i] if mpc.remembers else None)
+        cost, _, inputs, *_ = explicit.solve(x0[i], previous[i] if mpc.input_in_state else None)
         if cost is None:
             assert found.status[i] == jm.Status.PRIMAL_INFEASIBLE
         else:
             assert found.status[i] == jm.Status.SOLVED
             np.testing.assert_allclose(found.cost[i], cost, rtol=1e-7, atol=1e-7)
             np.testing.assert_allclose(found.inputs[i], inputs, atol=1e-6)
-    if mpc.remembers:
+    if mpc.input_in_state:
         short = jm.solve_many(mpc, x0[:3], jm.ADMM(eps=1e-8), chunk=16)
         for i in range(3):
             cost = explicit.solve(x0[i])[0]
@@ -1101,10 +1101,10 @@ def test_wrong_problems_name_the_argument_and_the_cure(name):
 
 def test_wrong_arguments():
     mpc, system = problems.drifting(4), problems.drifting().system
-    round_end = replace(mpc, terminal_set=Ellipsoid(EYE, 1.0))
+    terminal_is_ball = replace(mpc, terminal_set=Ellipsoid(EYE, 1.0))
     far = dict(C=EYE, inputs=jm.Box(-ONE, ONE))
     for call, words in (
-        (lambda: soften(round_end, 10.0), "^terminal_set: .*Polytope inside"),
+        (lambda: soften(terminal_is_ball, 10.0), "^terminal_set: .*Polytope inside"),
         (lambda: soften(replace(mpc, horizon=0), 10.0), "^horizon: "),
         (lambda: equilibrium(system, [1.0]), "^target: .*each row of C"),
         (lambda: equilibrium(system, [1.0, np.nan]), "^target: .*finite"),

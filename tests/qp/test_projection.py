@@ -439,10 +439,14 @@ class TestBounds:
         def compare(v, rho):
             w, normals = b.curvature(v, rho)
             moved = jax.vmap(
-                lambda d: (b.excess(v + h * d, rho) - b.excess(v - h * d, rho)) / (2 * h)
+                lambda d: (
+                    (b.prox_residual(v + h * d, rho) - b.prox_residual(v - h * d, rho)) / (2 * h)
+                )
             )(jnp.eye(35))
             kept = jax.vmap(
-                lambda d: jnp.all(b.piece(v + 4 * h * d, rho) == b.piece(v - 4 * h * d, rho))
+                lambda d: jnp.all(
+                    b.active_set(v + 4 * h * d, rho) == b.active_set(v - 4 * h * d, rho)
+                )
             )(jnp.eye(35))
             return jnp.diag(w) + sum(jnp.outer(n, n) for n in normals), moved, jnp.all(kept)
 
@@ -488,13 +492,14 @@ class TestBounds:
 
             def everything(value, rho):
                 v = jnp.full_like(b.l, value).at[-2:].set(2 * value)
-                e = b.excess(v, rho)
+                e = b.prox_residual(v, rho)
                 y = b.admissible(rho * e)
                 return (
-                    e, b.project(v, rho), b.curvature(v, rho), b.piece(v, rho), y, b.support(y),
+                    e, b.project(v, rho), b.curvature(v, rho), b.active_set(v, rho), y,
+                    b.support(y),
                     b.support(b.admissible(v)), b.cost(b.project(v, rho)), b.violation(v),
-                    jax.jvp(lambda v: b.excess(v, rho), (v,), (jnp.ones_like(v),)),
-                    jax.grad(lambda v: jnp.sum(b.excess(v, rho) ** 2))(v),
+                    jax.jvp(lambda v: b.prox_residual(v, rho), (v,), (jnp.ones_like(v),)),
+                    jax.grad(lambda v: jnp.sum(b.prox_residual(v, rho) ** 2))(v),
                 )  # fmt: skip
 
             values = jnp.asarray([0.0, 1.0, -1.0, 1e-30, 1e6, -1e6], dtype)
@@ -509,7 +514,7 @@ class TestBounds:
     def test_infinite_radius_is_a_free_ball(self, x64):
         """0·inf counts as 0 there, as it does for rows."""
         b = Bounds(jnp.zeros(2), jnp.zeros(2), radius=jnp.array([INF]), balls=(2,))
-        np.testing.assert_array_equal(b.excess(jnp.array([1e9, 1.0]), 1.0), 0)
+        np.testing.assert_array_equal(b.prox_residual(jnp.array([1e9, 1.0]), 1.0), 0)
         assert b.support(jnp.zeros(2)).sum() == 0
 
 
