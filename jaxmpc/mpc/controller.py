@@ -18,9 +18,7 @@ from jaxmpc.mpc.plan import (
     Plan,
     WarmStart,
     answer,
-    cost,
     limited,
-    slack,
     sorted_multipliers,
 )
 from jaxmpc.mpc.problem import MPC
@@ -157,18 +155,6 @@ class Controller:
                     value = np.asarray(value, self.dtype)
             checked.append(value)
         return checked
-
-    def cost(
-        self, states: Array, inputs: Array, reference: Any = None, input_reference: Any = None,
-        previous_input: Any = None,
-    ) -> Array:  # fmt: skip
-        """J (without ½) of a trajectory, states (N+1, n) and inputs (N, m), with what input rates
-        and soft rows pay. previous_input (m,): None for zero."""
-        return cost(self.mpc, states, inputs, reference, input_reference, previous_input)
-
-    def slack(self, states: Array, inputs: Array) -> Array:
-        """Violation of the soft rows along a trajectory: (N+1, p), zero where none holds."""
-        return slack(self.mpc, states, inputs)
 
     def multipliers(self, y: Array) -> Multipliers:
         """Sort the QP's multipliers y (rows,) by constraint and step."""

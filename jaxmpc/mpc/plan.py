@@ -133,7 +133,8 @@ def cost(
     mpc: MPC, states: Array, inputs: Array, reference: Any = None, input_reference: Any = None,
     previous_input: Any = None,
 ) -> Array:  # fmt: skip
-    """J (without ½) of a trajectory; see `Controller.cost`."""
+    """Return J (without ½) of a trajectory, states (N+1, n) and inputs (N, m), with what input
+    rates and soft rows add. previous_input (m,): None for zero."""
     error = states if reference is None else states - reference
     effort = inputs if input_reference is None else inputs - input_reference
     cast = lambda W: jnp.asarray(W, states.dtype)
@@ -153,7 +154,8 @@ def cost(
 
 
 def slack(mpc: MPC, states: Array, inputs: Array) -> Array:
-    """Violation of the soft rows along a trajectory; see `Controller.slack`."""
+    """Return the violation of the p soft rows along a trajectory: (N+1, p), zero at steps where a
+    row does not hold."""
     columns = [
         jnp.zeros((len(states), block.size), e.dtype).at[np.array(block.steps, int)].set(e)
         for block, e in _violations(mpc, states, inputs)

@@ -14,7 +14,7 @@ from jaxmpc.control.system import LinearSystem, as_array, host_array
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Soft:
-    """Rows that may be violated at a price (the lesson's section 4):
+    """Rows that may be violated at a penalty:
 
         lower − ε_k ≤ C x_k + D u_k ≤ d + ε_k,  ε_k ≥ 0,   cost + ρ Σ ε_k + quadratic Σ ε_k²
         (no ½).
@@ -65,7 +65,7 @@ class Outputs:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MPC:
-    """Constrained linear-quadratic MPC over the horizon N (the lesson's section 2):
+    """Constrained linear-quadratic MPC over the horizon N:
 
         min  Σ_{k<N} (x_k'Q x_k + u_k'R u_k) + x_N'P x_N          (no ½)
         s.t. x_{k+1} = A x_k + B u_k + c,  x_0 given,
