@@ -1,6 +1,6 @@
 """Quadratic programs: minimise ½z'Pz + q'z subject to l ≤ Az ≤ u.
 
-QP, solve_qp         a problem, and its solution -> QPSolution
+QP, solve_qp         a problem, and its solution -> QPSolution (`duals`: -> Duals)
 ADMM                 settings of the solver
 Status               how a solve ended, with a sentence for each
 Bounds               the constraints of a QP on Az: intervals, hard or soft, and balls
@@ -9,9 +9,18 @@ feasibility_margin   by how much all limits can be tightened, or must be widened
 
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.margin import feasibility_margin
-from jaxmpc.qp.problem import QP, QPSolution
+from jaxmpc.qp.problem import QP, Duals, QPSolution
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.solve import solve_qp
 from jaxmpc.qp.status import Status
 
-__all__ = ["ADMM", "QP", "Bounds", "QPSolution", "Status", "feasibility_margin", "solve_qp"]
+__all__ = [
+    "ADMM",
+    "QP",
+    "Bounds",
+    "Duals",
+    "QPSolution",
+    "Status",
+    "feasibility_margin",
+    "solve_qp",
+]
