@@ -333,7 +333,7 @@ class TestBounds:
         b = self.bounds()
         v, rho = self.points()
         p = self.each("project", b, v, rho)
-        np.testing.assert_allclose(v - self.each("excess", b, v, rho), p, atol=1e-12)
+        np.testing.assert_allclose(v - self.each("prox_residual", b, v, rho), p, atol=1e-12)
         for v_b, p_b, r in zip(v[:12], p[:12], rho[:12], strict=True):
             for i in range(30):
                 row = (b.l[i], b.u[i], b.linear[i], b.quadratic[i])
@@ -379,7 +379,7 @@ class TestBounds:
         The objective is convex, so nothing in a neighbourhood of any size may be better."""
         b, rng = self.bounds(), np.random.default_rng(3)
         v, rho = self.points()
-        y = rho[:, None] * self.each("excess", b, v, rho)
+        y = rho[:, None] * self.each("prox_residual", b, v, rho)
         for v_b, y_b, r in zip(v, y, rho, strict=True):
             value = lambda y: self.conjugate(b, y) + ((y - r * v_b) ** 2).sum() / (2 * r)  # noqa: B023
             # Rounding may leave y one ulp beyond an L1 weight, where g* is infinite.
@@ -397,7 +397,7 @@ class TestBounds:
         of numpy, and y = ρe is admissible."""
         b, rng = self.bounds(), np.random.default_rng(4)
         v, rho = self.points()
-        e, p = self.each("excess", b, v, rho), self.each("project", b, v, rho)
+        e, p = self.each("prox_residual", b, v, rho), self.each("project", b, v, rho)
         y = self.each("admissible", b, rho[:, None] * e)
         np.testing.assert_allclose(y, rho[:, None] * e, rtol=1e-12, atol=1e-12)
         cost, support = self.each("cost", b, p), self.each("support", b, y)
@@ -465,11 +465,11 @@ class TestBounds:
         direction, h = rng.standard_normal(v.shape), 1e-5
 
         def envelope(v):
-            e, p = self.each("excess", b, v, rho), self.each("project", b, v, rho)
+            e, p = self.each("prox_residual", b, v, rho), self.each("project", b, v, rho)
             return [self.g(b, p_b) for p_b in p] + rho * np.sum(e**2, axis=1) / 2
 
         numeric = (envelope(v + h * direction) - envelope(v - h * direction)) / (2 * h)
-        exact = rho * np.sum(self.each("excess", b, v, rho) * direction, axis=1)
+        exact = rho * np.sum(self.each("prox_residual", b, v, rho) * direction, axis=1)
         np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-4 * rho.max())
 
     @pytest.mark.parametrize("wide", [True, False])
