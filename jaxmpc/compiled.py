@@ -23,7 +23,10 @@ def default_chunk() -> int:
 def workers() -> int:
     """Return how many chunks to run side by side: one a core of a CPU, whose programs use little
     more than one, for most of their steps are too small to be divided; one on other devices."""
-    return len(os.sched_getaffinity(0)) if jax.default_backend() == "cpu" else 1
+    if jax.default_backend() != "cpu":
+        return 1
+    # Linux knows which cores this process may use.
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def side_by_side(call: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:

@@ -159,7 +159,7 @@ def _in_groups(loops: list[tuple], tree: Any, batched: tuple[bool, ...]) -> Call
     return batch
 
 
-def everywhere(condition: Array) -> Array:
+def all_instances(condition: Array) -> Array:
     """Return whether a condition, a scalar, holds for all instances of all `vmap`s around.
 
     The result is one for all: `jax.lax.cond` on it takes one branch, not both.
@@ -168,7 +168,7 @@ def everywhere(condition: Array) -> Array:
 
     @one.def_vmap
     def _(size: int, in_batched: Any, condition: Array) -> Any:
-        return everywhere(jnp.all(condition)), False
+        return all_instances(jnp.all(condition)), False
 
     return one(condition)
 

@@ -19,13 +19,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.qp.batches import everywhere, true_places
+from jaxmpc.qp.batches import all_instances, true_places
 from jaxmpc.qp.linalg import definite_solver, solve
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
 
 # Rows of the reduced system of derivatives at most.
-FEW_ROWS = 48
+REDUCED_ROWS = 48
 # Steps of the line search, a scalar Newton method. Penalties put almost vertical pieces into the
 # derivative, which only bisection finds.
 LINE_STEPS, LINE_STEPS_SOFT = 6, 24
@@ -247,18 +247,18 @@ def linearised(
     dense = lambda a, c: swept(
         definite_solver(ridged(H + rho * gram(A, weights, normals), rho)), a, c
     )
-    if normals or min(A.shape) <= FEW_ROWS:
+    if normals or min(A.shape) <= REDUCED_ROWS:
         return dense
 
     def reduced(a: Array, c: Array) -> tuple[Array, Array]:
         # (I + ρ A'DA)⁻¹g = g − A_W'(S_WW + (ρD)⁻¹)⁻¹A_W g for the rows W with D > 0 (Woodbury);
         # where H is not quite I the next sweep makes up for it.
-        W = true_places(weights > 0, FEW_ROWS)
+        W = true_places(weights > 0, REDUCED_ROWS)
         A_W = A.at[W].get(mode="fill", fill_value=0.0)
         D_W = weights.at[W].get(mode="fill", fill_value=1.0)
         inverse = definite_solver(matmul(A_W, A_W.T) + jnp.diag(1 / (rho * D_W)))
         return swept(lambda g: g - matmul(inverse(matmul(g, A_W.T)), A_W), a, c)
 
-    few = (jnp.sum(weights > 0) <= FEW_ROWS) & ~flat
+    few = (jnp.sum(weights > 0) <= REDUCED_ROWS) & ~flat
     # Going backward, the factors are made then: kept, they would be n² numbers an instance.
-    return jax.checkpoint(lambda a, c: jax.lax.cond(everywhere(few), reduced, dense, a, c))
+    return jax.checkpoint(lambda a, c: jax.lax.cond(all_instances(few), reduced, dense, a, c))

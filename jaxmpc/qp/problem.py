@@ -62,17 +62,16 @@ class QP:
         Rows come in that order: inequalities, equalities, bounds; `QPSolution.duals` splits their
         multipliers again.
         """
-        P, q = np.asarray(dense(P), float), np.asarray(q, dtype=float).ravel()
+        host = lambda M: np.asarray(dense(M), dtype=float)
+        P, q = host(P), np.asarray(q, dtype=float).ravel()
         n = q.size
         rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         if G is not None:
             upper = np.asarray(h, dtype=float).ravel()
-            rows.append(
-                (np.asarray(dense(G), float).reshape(-1, n), np.full(upper.size, -np.inf), upper)
-            )
+            rows.append((host(G).reshape(-1, n), np.full(upper.size, -np.inf), upper))
         if A is not None:
             value = np.asarray(b, dtype=float).ravel()
-            rows.append((np.asarray(dense(A), float).reshape(-1, n), value, value))
+            rows.append((host(A).reshape(-1, n), value, value))
         if lb is not None or ub is not None:
             lower = np.full(n, -np.inf) if lb is None else np.asarray(lb, dtype=float).ravel()
             upper = np.full(n, np.inf) if ub is None else np.asarray(ub, dtype=float).ravel()

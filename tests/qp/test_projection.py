@@ -533,6 +533,20 @@ def with_slacks(qp):
     return jm.QP(P, np.concatenate([qp.q, cost, cost]), A, l, u)
 
 
+def coarse_and_warm(qp, z, y):
+    """Coarse steps are honest at wide and narrow tolerances; from the answer all are SOLVED."""
+    solved = 0
+    for eps in (1e-6, 1e-2, 1.0, 30.0):
+        sol = solve_coarse(qp, eps)
+        assert_honest(qp, sol, eps)
+        solved += np.sum(sol.status == jm.Status.SOLVED)
+    assert 0 < solved < 4 * COUNT
+    warm = solve_warm(qp, 1e-6, (z, y))
+    assert_honest(qp, warm, 1e-6)
+    np.testing.assert_array_equal(warm.status, jm.Status.SOLVED)
+    return warm
+
+
 class TestSoftRows:
     def test_known_answers(self, x64):
         """z and y as constructed, feasible and infeasible hard version; residuals recomputed;
@@ -670,15 +684,7 @@ class TestSoftRows:
     def test_coarse_steps_are_honest(self, x64):
         """Three steps and no polish, cold and from the answer; wide and narrow tolerances."""
         qp, z, y = soft_batch()
-        solved = 0
-        for eps in (1e-6, 1e-2, 1.0, 30.0):
-            sol = solve_coarse(qp, eps)
-            assert_honest(qp, sol, eps)
-            solved += np.sum(sol.status == jm.Status.SOLVED)
-        assert 0 < solved < 4 * COUNT
-        warm = solve_warm(qp, 1e-6, (z, y))
-        assert_honest(qp, warm, 1e-6)
-        np.testing.assert_array_equal(warm.status, jm.Status.SOLVED)
+        warm = coarse_and_warm(qp, z, y)
         np.testing.assert_allclose(warm.z, z, atol=1e-6)
 
 
@@ -829,15 +835,7 @@ class TestBalls:
     @pytest.mark.slow
     def test_coarse_steps_are_honest(self, x64):
         qp, z, y = ball_batch()
-        solved = 0
-        for eps in (1e-6, 1e-2, 1.0, 30.0):
-            sol = solve_coarse(qp, eps)
-            assert_honest(qp, sol, eps)
-            solved += np.sum(sol.status == jm.Status.SOLVED)
-        assert 0 < solved < 4 * COUNT
-        warm = solve_warm(qp, 1e-6, (z, y))
-        assert_honest(qp, warm, 1e-6)
-        np.testing.assert_array_equal(warm.status, jm.Status.SOLVED)
+        coarse_and_warm(qp, z, y)
         empty = solve_coarse(self.emptied(), 1e-6)
         assert jm.Status.SOLVED not in np.asarray(empty.status)
 
