@@ -47,6 +47,14 @@ def pair_of(c: Condensed, plan: jm.Plan) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(z), np.asarray(y)
 
 
+def rows_that_move(c: Condensed) -> Condensed:
+    """Without the rows that no input moves: limits of the given state, which some solvers
+    refuse."""
+    moved = np.linalg.norm(c.C, axis=1) > 1e-12
+    names = ("C", "D", "d", "lower", "upper")
+    return replace(c, **{name: getattr(c, name)[moved] for name in names})
+
+
 def measure(name: str, s: Settings) -> None:
     """Print the lines of one family."""
     mpc, x = family(name, s.states, s.seed)
@@ -64,10 +72,7 @@ def measure(name: str, s: Settings) -> None:
     )
     if not s.rivals:
         return
-    # Rows that no input moves are limits of the given state, which some solvers refuse.
-    moved = np.linalg.norm(c.C, axis=1) > 1e-12
-    names = ("C", "D", "d", "lower", "upper")
-    c = replace(c, **{name: getattr(c, name)[moved] for name in names})
+    c = rows_that_move(c)
     shift = x @ c.D.T + c.d
     q, l, u = x @ c.F.T + c.f, c.lower - shift, c.upper - shift
     few = slice(s.loop)

@@ -42,6 +42,8 @@ from jaxmpc.qp.status import Status
 SINGULAR = {8: 1e-10, 4: 1e-6}
 # Beside which eigenvalue, relative to the mean, range and null space are told apart.
 SPLIT = 1e-6
+# Rounds of equilibration; half as many decades of an entry's size are left after each.
+EQUILIBRATIONS = 10
 
 
 @jax.tree_util.register_dataclass
@@ -73,7 +75,7 @@ class ADMM:
     iterations: int = field(default=50, metadata={"static": True})
     rho: Any = None
     alpha: Any = 1.9
-    refine: int = field(default=150, metadata={"static": True})
+    refine: int = field(default=1000, metadata={"static": True})
     eps: Any = None
     eps_rel: Any = 0.0
     differentiate: str = field(default="implicit", metadata={"static": True})
@@ -151,8 +153,7 @@ def scale(
     nothing in z. The rows of a ball share one scale, so that it stays one.
     """
     n, dtype = P.shape[0], P.dtype
-    size = jnp.where(jnp.diag(P) > 0, jnp.diag(P), jnp.sum(A**2, axis=0))
-    unit = jax.lax.stop_gradient(1 / jnp.sqrt(jnp.where(size > 0, size, 1.0)))
+    unit = jax.lax.stop_gradient(equilibrated(P, A))
     P_1, A_1 = unit[:, None] * P * unit, A * unit
     delta, flat = null_curvature(*jax.lax.stop_gradient((P_1, A_1)))
     T = unit[:, None] * inverse_root(P_1 + delta * jnp.eye(n, dtype=dtype)).T
@@ -172,6 +173,27 @@ def scale(
     zero = squared <= noise
     E = jnp.where(zero, 0.0, 1 / jnp.sqrt(jnp.where(zero, 1.0, squared)))
     return T, E, (H + H.T) / 2, E[:, None] * rows, flat
+
+
+def equilibrated(P: Array, A: Array) -> Array:
+    """Return units d (n,) of the variables in which columns of [P; A] have entries alike.
+
+    Ruiz's equilibration (2001, RAL-TR-2001-034): rows and columns of the matrix [P A'; A 0] are
+    divided by the roots of their largest entries, again and again.
+    """
+    P, A = jnp.abs(P), jnp.abs(A)
+    root = lambda v: jnp.sqrt(jnp.where(v > 0, v, 1.0))
+
+    def advance(_: Any, units: tuple[Array, Array]) -> tuple[Array, Array]:
+        d, e = units
+        rows = jnp.max(A * d, axis=1, initial=0.0) * e
+        columns = d * jnp.maximum(
+            jnp.max(P * d, axis=1), jnp.max(e[:, None] * A, axis=0, initial=0.0)
+        )
+        return d / root(columns), e / root(rows)
+
+    ones = jnp.ones(A.shape[1], A.dtype), jnp.ones(A.shape[0], A.dtype)
+    return jax.lax.fori_loop(0, EQUILIBRATIONS, advance, ones)[0]
 
 
 def null_curvature(P: Array, A: Array) -> tuple[Array, Array]:

@@ -82,14 +82,16 @@ def in_two_parts(
     """Return program(*arguments, whole=True), whose status is status(result).
 
     One instance from plain Python runs first without the method of multipliers, which most programs
-    do not need and which is half of what there is to compile; what it leaves open is solved again
-    with it. hard: known to need it.
+    do not need and which is half of what there is to compile, and without ADMM steps if it has a
+    warm start, which mostly is as near as these would come; what it leaves open is solved again
+    with both. hard: known to need them.
     """
     every = hard or solver.fixed or not solver.refine or solver.differentiate != "implicit"
     if every or not concrete(arguments):
         return program(*arguments, whole=True)
     found = program(*arguments, whole=False)
-    return program(*arguments, whole=True) if status(found) == Status.ITERATION_LIMIT else found
+    solved = int(status(found)) != Status.ITERATION_LIMIT  # as an int: == would be a program
+    return found if solved else program(*arguments, whole=True)
 
 
 def has_dual_steps(balls: tuple[int, ...], A: Any) -> bool:
@@ -113,12 +115,15 @@ def solve_factored(
 ) -> tuple[QPSolution, Array]:
     """`solve_qp` after its factorization: what a controller repeats at each sample.
 
-    whole: False leaves out the method of multipliers and proofs (`in_two_parts`).
+    whole: False leaves out the method of multipliers and proofs, and ADMM after a warm start
+    (`in_two_parts`).
     Returns the solution and the fault of the data, NOT_RUN for none. Where there is one the
     solution is that of harmless data: `marked` says so, after all that is computed from it, for
     the derivative of a product with NaN is NaN even where nobody looks at it.
     """
     clean, fault = cleaned(qp, factor.fault)
+    if not whole and warm_start is not None:
+        solver = replace(solver, iterations=0)
     if solver.differentiate == "implicit":
         constants = jax.lax.stop_gradient((clean, factor, solver, warm_start))
         found = search(*constants, whole)
@@ -313,7 +318,7 @@ def on_the_dual(
 
 def proof_steps(refine: int) -> int:
     """Return the Newton steps towards a Farkas vector; twice as many towards a ray."""
-    return max(refine // 5, 1)
+    return max(min(refine // 5, 30), 1)
 
 
 def by_multipliers(refine: int, constants: tuple, s: Search) -> Search:

@@ -1,0 +1,88 @@
+"""One robot at a time: microseconds a sample of a closed loop, each sample warm-started by the one
+before, beside the solvers that embedded control uses.
+
+    python experiments/one_robot.py
+
+jaxmpc: `u, carry, plan = controller(x, carry)` from plain Python with 64-bit mode on, all that it
+does: checks, warm start, plan, status. The others solve the same condensed QPs, of the states that
+this loop went through, in the same order; forming q, l and u from the state is not counted. OSQP
+starts from its last solution, DAQP and PIQP start cold. Residuals of all are computed here.
+"""
+
+import time
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+import jax
+import numpy as np
+import tyro
+from benchmark import clocked, condensed, residuals
+from mpc_families import family
+from mpc_solvers import daqp_loop, osqp_loop, piqp_loop
+from plans import pair_of, rows_that_move
+
+import jaxmpc as jm
+
+
+@dataclass(frozen=True)
+class Settings:
+    """loops: closed loops from random feasible states. samples: of each. rounds: the best counts."""
+
+    families: tuple[str, ...] = ("joint", "springs4", "springs8", "turbompc")
+    loops: int = 10
+    samples: int = 50
+    seed: int = 0
+    rounds: int = 3
+
+
+def drive(controller: jm.Controller, x0s: np.ndarray, samples: int) -> tuple:
+    """States (loops·samples, n) and their plans, and the seconds of each call."""
+    system = controller.mpc.system
+    A, B = np.asarray(system.A), np.asarray(system.B)
+    states, plans, seconds = [], [], []
+    for x in x0s:
+        carry = None
+        for _ in range(samples):
+            begun = time.perf_counter()
+            u, carry, plan = controller(x, carry)
+            u = np.asarray(u)
+            seconds.append(time.perf_counter() - begun)
+            states.append(x)
+            plans.append(plan)
+            x = A @ x + B @ u
+    return np.array(states), plans, np.array(seconds)
+
+
+def measure(name: str, s: Settings) -> None:
+    """Print the lines of one family."""
+    mpc, x0s = family(name, s.loops, s.seed)
+    controller = jm.Controller(mpc)
+    drive(controller, x0s, 3)  # compiles
+    runs = [drive(controller, x0s, s.samples) for _ in range(s.rounds)]
+    warm = np.arange(s.loops * s.samples) % s.samples > 0
+    x, plans, _ = runs[0]
+    plan = jax.tree.map(lambda *v: np.stack(v), *plans)
+    solved = np.mean(residuals(condensed(mpc), x, *pair_of(condensed(mpc), plan)) <= 1e-6)
+    spent = min((run[2][warm] for run in runs), key=np.mean) * 1e6
+    print(f"{name:10} jaxmpc {spent.mean():8.0f} µs, median {np.median(spent):6.0f}, "
+          f"solved {solved:.2%}", flush=True)  # fmt: skip
+    c = rows_that_move(condensed(mpc))
+    shift = x @ c.D.T + c.d
+    q, l, u = x @ c.F.T + c.f, c.lower - shift, c.upper - shift
+    for rival, make in (("osqp", osqp_loop), ("daqp", daqp_loop), ("piqp", piqp_loop)):
+        if find_spec(rival):
+            call = make(c, q, l, u)
+            seconds, (z, y, _) = min((clocked(call) for _ in range(s.rounds)), key=lambda f: f[0])
+            met = np.mean(residuals(c, x, z, y) <= 1e-6)
+            print(f"{'':10} {rival:6} {seconds / len(x) * 1e6:8.0f} µs, solved {met:.2%}", flush=True)
+
+
+def main(s: Settings) -> None:
+    """Print all families."""
+    jax.config.update("jax_enable_x64", True)
+    for name in s.families:
+        measure(name, s)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings, description=__doc__))
