@@ -103,8 +103,9 @@ class Rays:
     def box(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the half-spaces (normals, offsets) of the bounding box, those that exist."""
         _, sides = self.problem.programs.bounding_box
-        with jax.enable_x64(True):
-            normals, offsets = (np.asarray(v) for v in cuts(self.exact, self.problem.rows, sides))
+        # No rays go with these multipliers; the program is that of `cast`, so that one compiles.
+        still = np.zeros((len(sides), len(BACKOFFS), 1))
+        _, normals, offsets = self.proved(still + self.center, still + self.w, sides)
         valid = np.isfinite(offsets)
         return normals[valid], offsets[valid]
 
@@ -117,14 +118,7 @@ class Rays:
         reach = np.where(bounded, t, 0.0)[:, None] * (1 - BACKOFFS)
         theta = self.center + reach[:, :, None] * directions[:, None, :]
         w = self.w + (w - self.w)[:, None, :] * (1 - BACKOFFS)[:, None]
-        # Repeated rays fill up to a power of two, so that few shapes compile.
-        count = len(directions)
-        fill = np.arange(max(32, 1 << (count - 1).bit_length())) % count
-        with jax.enable_x64(True):
-            feasible, normals, offsets = (
-                np.asarray(v)[:count]
-                for v in prove_rays(self.exact, self.problem.rows, theta[fill], w[fill], y[fill])
-            )
+        feasible, normals, offsets = self.proved(theta, w, y)
         feasible = feasible & bounded[:, None]
         best, each = np.argmax(feasible, axis=1), np.arange(len(directions))
         found = feasible.any(axis=1)
@@ -138,23 +132,27 @@ class Rays:
             offsets=offsets,
         )
 
+    def proved(self, theta: np.ndarray, w: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
+        """Return `prove_rays` of (K, backoffs, …) points and (K, R) multipliers."""
+        # Repeated rays fill up to a power of two, so that few shapes compile.
+        count = len(y)
+        fill = np.arange(max(32, 1 << (count - 1).bit_length())) % count
+        with jax.enable_x64(True):
+            found = prove_rays(self.exact, self.problem.rows, theta[fill], w[fill], y[fill])
+        return [np.asarray(v)[:count] for v in found]
+
 
 @jax.jit
 def prove_rays(p: ExactData, rows: ConstraintRows, theta: Any, w: Any, y: Any) -> tuple[Array, ...]:
-    """Return which points (K, backoffs, d) of the rays are proved feasible, and the half-spaces of
-    the rays' multipliers."""
+    """Return which points (K, backoffs, d) of the rays are proved feasible, and the normals (K, d)
+    and offsets (K,) of half-spaces that hold on the whole feasible set, from multipliers (K, R)."""
 
     def feasible(theta: Array, w: Array) -> Array:
         inputs, free = inputs_of(p, rows, theta, w)
         return proofs.prove_feasible(p, theta, free, inputs)[0]
 
-    return jax.vmap(jax.vmap(feasible))(theta, w), *cuts(p, rows, y)
-
-
-def cuts(p: ExactData, rows: ConstraintRows, y: Any) -> tuple[Array, Array]:
-    """Return the normals (K, d) and offsets (K,) of half-spaces that hold on the whole feasible
-    set, from multipliers (K, R)."""
-    return jax.vmap(lambda y: proofs.everywhere(p, *cut_of(p, rows, y)))(y)
+    cuts = jax.vmap(lambda y: proofs.everywhere(p, *cut_of(p, rows, y)))(y)
+    return jax.vmap(jax.vmap(feasible))(theta, w), *cuts
 
 
 def leaving(

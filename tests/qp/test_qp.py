@@ -500,6 +500,28 @@ class TestBatches:
             solve(jm.QP(qp.P, qp.q, qp.A, qp.l, qp.u))
 
 
+def badly_scaled(n, rng):
+    """A linear program in z ≥ 0 with n sparse rows and one of its solutions."""
+    rows = rng.standard_normal((n, n)) * (rng.random((n, n)) < 0.2)
+    columns, units = 10 ** rng.uniform(-3, 3, (2, n))
+    A = np.vstack([rows, np.eye(n)])
+    z = np.where(rng.random(n) < 0.5, 0, rng.uniform(0.5, 2, n))
+    equal = rng.random(n) < 0.4
+    pushes = rng.random(n) < 0.4
+    value = rows @ z
+    l = np.where(equal | pushes, value, value - rng.uniform(0.1, 2, n))
+    y = np.where(pushes, -rng.uniform(0.1, 3, n), 0.0)
+    y = np.concatenate(
+        [np.where(equal, rng.standard_normal(n), y), -1.0 * (z == 0) * rng.random(n)]
+    )
+    l, u = np.append(l, np.zeros(n)), np.append(np.where(equal, value, np.inf), np.full(n, np.inf))
+    E = np.concatenate([units, 1 / columns])
+    qp = jm.QP(
+        np.zeros((n, n)), -columns * (y @ A), E[:, None] * A * columns, E * l, E * u
+    )  # fmt: skip
+    return qp, z / columns
+
+
 class TestHardPrograms:
     """Each of these once ended at the iteration limit."""
 
@@ -532,6 +554,18 @@ class TestHardPrograms:
                 found = jm.solve_qp(replace(box(2), P=p * np.eye(2), q=size * q))
                 assert found.status == jm.Status.SOLVED, (p, size)
                 np.testing.assert_allclose(found.z, np.clip(-size * q / p, -1, 1), atol=1e-9)
+
+    def test_badly_scaled_linear_programs(self, x64):
+        """Optimal vertices, drawn first; then variables and rows in units from 1e-3 to 1e3."""
+        programs, answers = [], []
+        for seed in range(30, 40):
+            qp, z = badly_scaled(30, np.random.default_rng(seed))
+            programs.append(qp)
+            answers.append(z)
+        found = jax.jit(jax.vmap(jm.solve_qp))(jax.tree.map(lambda *v: np.stack(v), *programs))
+        assert (found.status == jm.Status.SOLVED).all()
+        cost = [qp.q @ z for qp, z in zip(programs, answers, strict=True)]
+        np.testing.assert_allclose(found.cost, cost, rtol=1e-6)
 
     @pytest.mark.parametrize("condition", [1e3, 1e6])
     def test_ill_conditioned_hessian_with_defaults(self, x64, condition):
