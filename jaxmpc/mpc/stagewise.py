@@ -51,6 +51,7 @@ from jaxmpc.qp.admm import (
 )
 from jaxmpc.qp.batches import repeat_while
 from jaxmpc.qp.certificate import Proof
+from jaxmpc.qp.derivative import Undo, implicit
 from jaxmpc.qp.linalg import cholesky
 from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely, rounding
@@ -595,39 +596,31 @@ def newton(s: Stages, E: Array, rho: Array, D: Array) -> Callable[[Array, Array]
     return step
 
 
-@jax.custom_jvp
-def implicit(
-    s: Stages, sample: Sample, E: Array, rho: Array, u: Array, y: Array
-) -> tuple[Array, Array]:
-    """The solution (u, y), given as constants, with its derivative with respect to the data.
+def stage_conditions(
+    data: tuple[Stages, Sample], constants: tuple[Array, Array], u: Array, y: Array
+) -> tuple[Callable[[Any], Any], Undo]:
+    """The `conditions_of` that `qp.derivative.implicit` takes for (stages, sample) and (E, ρ).
 
     The conditions F(data, u, y) = 0 of `newton_step` hold at a solution, hence J d(u, y) = −dF with
-    the matrix J of a Newton step and u, y held fixed in dF: one Riccati recursion, whatever the
-    number of iterations. Rows that touch with a zero multiplier count as inactive, as in
-    `qp/derivative.py`.
+    the matrix J of a Newton step: one Riccati recursion, whatever the number of iterations. Rows
+    that touch with a zero multiplier count as inactive, as in `qp/derivative.py`.
     """
-    return u, y
-
-
-@implicit.defjvp
-def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple:
-    s, sample, E, rho, u, y = primals
-    # As results of this function u and y carry the derivatives that higher orders need.
-    u, y = implicit(s, sample, E, rho, u, y)
-    at_data = lambda s, sample: errors(s, sample, E, rho, u, y)
-    (v, c, gradient), (_, *moved) = jax.jvp(at_data, (s, sample), tangents[:2])
+    (s, sample), (E, rho) = data, constants
+    v, c, gradient = errors(s, sample, E, rho, u, y)
     step = newton(s, E, rho, s.bounds.scaled(E).curvature(v, rho)[0])
 
     def follow(moved: Any) -> Any:
         # The step is linear; as a derivative of itself it can be transposed, kernels or not.
         return jax.jvp(step, (c, gradient), tuple(moved))[1]
 
-    # What the proximal step on y leaves, of relative size ρ/κ, is taken up by a second step.
-    first = follow(moved)
-    of_pair = lambda u, y: errors(s, sample, E, rho, u, y)[1:]
-    left = jax.jvp(of_pair, (u, y), first)[1]
-    second = follow(jax.tree.map(jnp.add, moved, list(left)))
-    return (u, y), jax.tree.map(jnp.add, first, second)
+    def undo(moved: Any) -> tuple[Array, Array]:
+        # What the proximal step on y leaves, of relative size ρ/κ, is taken up by a second step.
+        first = follow(moved)
+        of_pair = lambda u, y: errors(s, sample, E, rho, u, y)[1:]
+        left = jax.jvp(of_pair, (u, y), first)[1]
+        return jax.tree.map(jnp.add, first, follow(jax.tree.map(jnp.add, moved, left)))
+
+    return lambda data: errors(data[0], data[1], E, rho, u, y)[1:], undo
 
 
 def plan_stages(
@@ -663,9 +656,8 @@ def _plan(factor: StageFactor, mpc: MPC, solver: ADMM, sample: Sample, warm_star
     sample, mpc = jax.tree.map(lambda v: jnp.where(usable, v, 0), (sample, mpc))
     if solver.differentiate == "implicit":
         constants = jax.lax.stop_gradient((factor, sample, solver, warm_start))
-        u, y = implicit(
-            factor.stages, sample, constants[0].E, constants[0].rho[-1], *search(*constants)
-        )
+        fixed = constants[0].E, constants[0].rho[-1]
+        u, y = implicit(stage_conditions, (factor.stages, sample), fixed, *search(*constants))
     else:
         u, y = search(factor, sample, solver, warm_start)
     s, eps = factor.stages, tolerance(solver, u.dtype)

@@ -147,13 +147,12 @@ def scale(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Coordinates z = T w and row scale E with T'PT ≈ I and rows of E A T of length one.
 
-    Variables first get units of their own, by P's diagonal or, where that is zero, by the
-    columns of A; then T is the inverse transposed Cholesky factor of P + δI. T'PT stays exact.
+    Variables first get units of their own (`units`); then T is the inverse transposed Cholesky factor of P + δI. T'PT stays exact.
     Returns T, E, T'PT, E A T and whether P is singular. A zero row keeps scale 0: it constrains
     nothing in z. The rows of a ball share one scale, so that it stays one.
     """
     n, dtype = P.shape[0], P.dtype
-    unit = jax.lax.stop_gradient(equilibrated(P, A))
+    unit = jax.lax.stop_gradient(units(jnp.diag(P), A))
     P_1, A_1 = unit[:, None] * P * unit, A * unit
     delta, flat = null_curvature(*jax.lax.stop_gradient((P_1, A_1)))
     T = unit[:, None] * inverse_root(P_1 + delta * jnp.eye(n, dtype=dtype)).T
@@ -175,25 +174,24 @@ def scale(
     return T, E, (H + H.T) / 2, E[:, None] * rows, flat
 
 
-def equilibrated(P: Array, A: Array) -> Array:
-    """Return units d (n,) of the variables in which columns of [P; A] have entries alike.
+def units(curvature: Array, A: Array) -> Array:
+    """Return the units (n,) of the variables: 1/√curvature, P's diagonal (n,), and where that is
+    zero those in which the columns of A have entries alike.
 
-    Ruiz's equilibration (2001, RAL-TR-2001-034): rows and columns of the matrix [P A'; A 0] are
-    divided by the roots of their largest entries, again and again.
+    These come from Ruiz's equilibration (2001, RAL-TR-2001-034): rows and columns of A are divided
+    by the roots of their largest entries, again and again.
     """
-    P, A = jnp.abs(P), jnp.abs(A)
+    A, curved = jnp.abs(A), curvature > 0
     root = lambda v: jnp.sqrt(jnp.where(v > 0, v, 1.0))
 
-    def advance(_: Any, units: tuple[Array, Array]) -> tuple[Array, Array]:
-        d, e = units
-        rows = jnp.max(A * d, axis=1, initial=0.0) * e
-        columns = d * jnp.maximum(
-            jnp.max(P * d, axis=1), jnp.max(e[:, None] * A, axis=0, initial=0.0)
-        )
-        return d / root(columns), e / root(rows)
+    def advance(_: Any, scales: tuple[Array, Array]) -> tuple[Array, Array]:
+        d, e = scales
+        M = e[:, None] * A * d
+        rows, columns = (jnp.max(M, axis=axis, initial=0.0) for axis in (1, 0))
+        return jnp.where(curved, d, d / root(columns)), e / root(rows)
 
-    ones = jnp.ones(A.shape[1], A.dtype), jnp.ones(A.shape[0], A.dtype)
-    return jax.lax.fori_loop(0, EQUILIBRATIONS, advance, ones)[0]
+    begin = jnp.where(curved, 1 / root(curvature), 1.0), jnp.ones(A.shape[0], A.dtype)
+    return jax.lax.fori_loop(0, EQUILIBRATIONS, advance, begin)[0]
 
 
 def null_curvature(P: Array, A: Array) -> tuple[Array, Array]:

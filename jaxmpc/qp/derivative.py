@@ -23,6 +23,8 @@ Which element of the generalised derivative is taken, and what it means where no
   about 1/k.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -35,18 +37,38 @@ from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
 
+# Maps tangents of the optimality conditions to tangents of (z, y) that undo them; linear.
+Undo = Callable[[Any], tuple[Array, Array]]
+Conditions = Callable[[Any, Any, Array, Array], tuple[Callable[[Any], Any], Undo]]
 
-@jax.custom_jvp
-def implicit(qp: QP, factor: Factor, smoothing: Any, z: Array, y: Array) -> tuple[Array, Array]:
-    """The solution (z, y) of qp, given as constants, with its derivatives with respect to qp."""
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def implicit(
+    conditions_of: Conditions, data: Any, constants: Any, z: Array, y: Array
+) -> tuple[Array, Array]:
+    """Return the solution (z, y), given as constants, with its derivatives with respect to `data`.
+
+    conditions_of(data, constants, z, y) gives the optimality conditions as a function of the data
+    alone, with z, y and the active set held fixed, and the function that maps a change of them to
+    the change of (z, y) that undoes it.
+    """
     return z, y
 
 
 @implicit.defjvp
-def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple:
-    qp, factor, smoothing, z, y = primals
+def _implicit_jvp(conditions_of: Conditions, primals: tuple, tangents: tuple) -> tuple:
+    data, constants, z, y = primals
     # As a result of this function, z and y carry the derivatives that higher orders need.
-    z, y = implicit(qp, factor, smoothing, z, y)
+    z, y = implicit(conditions_of, data, constants, z, y)
+    conditions, undo = conditions_of(data, constants, z, y)
+    return (z, y), undo(jax.jvp(conditions, (data,), tangents[:1])[1])
+
+
+def dense_conditions(
+    qp: QP, constants: tuple[Factor, Any], z: Array, y: Array
+) -> tuple[Callable[[QP], tuple[Array, Array]], Undo]:
+    """The `conditions_of` that `implicit` takes for a program and (factor, smoothing)."""
+    factor, smoothing = constants
     T, E = factor.T, factor.E
     A = E[:, None] * matmul(qp.A, T)
     H = matmul(T.T, matmul(qp.P, T))
@@ -62,11 +84,15 @@ def _implicit_jvp(primals: tuple, tangents: tuple) -> tuple:
         rows = jnp.where(kept, bounds.prox_residual(v + y_w / rho, rho), sides)
         return matmul(matmul(z, qp.P) + qp.q + matmul(y, qp.A), T), rows
 
-    _, moved = jax.jvp(conditions, (qp,), (tangents[0],))
     weights, normals = bounds.curvature(v + y_w / rho, rho)
     weights = jnp.where(kept, weights, upper + lower)
-    dw, dy = linearised(H, A, weights, normals, rho, factor.flat)(*moved)
-    return (z, y), (matmul(dw, T.T), E * dy)
+    inverse = linearised(H, A, weights, normals, rho, factor.flat)
+
+    def undo(moved: tuple[Array, Array]) -> tuple[Array, Array]:
+        dw, dy = inverse(*moved)
+        return matmul(dw, T.T), E * dy
+
+    return conditions, undo
 
 
 def activity(

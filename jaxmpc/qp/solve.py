@@ -27,7 +27,7 @@ from jaxmpc.qp.admm import (
 )
 from jaxmpc.qp.batches import in_blocks, repeat_while
 from jaxmpc.qp.certificate import Proof, correcting_rows, farkas, prove, recession, to_length_one
-from jaxmpc.qp.derivative import implicit
+from jaxmpc.qp.derivative import dense_conditions, implicit
 from jaxmpc.qp.newton import (
     Constants,
     Multipliers,
@@ -127,7 +127,7 @@ def solve_factored(
     if solver.differentiate == "implicit":
         constants = jax.lax.stop_gradient((clean, factor, solver, warm_start))
         found = search(*constants, whole)
-        z, y = implicit(clean, constants[1], solver.smoothing, found.z, found.y)
+        z, y = implicit(dense_conditions, clean, (constants[1], solver.smoothing), found.z, found.y)
     else:
         found = search(clean, factor, solver, warm_start, whole)
         z, y = found.z, found.y
