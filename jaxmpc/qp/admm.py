@@ -147,7 +147,8 @@ def scale(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Coordinates z = T w and row scale E with T'PT ≈ I and rows of E A T of length one.
 
-    Variables first get units of their own (`units`); then T is the inverse transposed Cholesky factor of P + δI. T'PT stays exact.
+    Variables first get units of their own (`units`); then T is the inverse transposed Cholesky
+    factor of P + δI. T'PT stays exact.
     Returns T, E, T'PT, E A T and whether P is singular. A zero row keeps scale 0: it constrains
     nothing in z. The rows of a ball share one scale, so that it stays one.
     """
