@@ -242,14 +242,14 @@ def draw(family: str, seed: int) -> Instance:
 
 @dataclass(frozen=True)
 class Settings:
-    """count: programs a family, from seed on. families: which (none: all). iterations, refine,
-    dtype: of jaxmpc's solver. reference: run Clarabel too."""
+    """count: programs a family, from seed on. families: which (none: all). iterations, refine:
+    of jaxmpc's solver, its defaults; dtype: of the data. reference: run Clarabel too."""
 
     count: int = 1000
     seed: int = 0
     families: tuple[str, ...] = ()
-    iterations: int = 200
-    refine: int = 60
+    iterations: int = jm.ADMM().iterations
+    refine: int = jm.ADMM().refine
     dtype: Literal["float64", "float32"] = "float64"
     reference: bool = False
 

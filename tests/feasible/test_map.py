@@ -174,8 +174,15 @@ class TestIndependenceOf:
         got = jm.map_feasible_set(problems.lecture(), points[order])
         np.testing.assert_array_equal(got.label, fmap.label[order])
 
-    @pytest.mark.parametrize("iterations", [1, 300])
-    @pytest.mark.parametrize("dtype", ["float32", "float64"])
+    @pytest.mark.parametrize(
+        "dtype, iterations",
+        [
+            ("float32", 1),
+            ("float64", 300),
+            pytest.param("float32", 300, marks=pytest.mark.slow),
+            pytest.param("float64", 1, marks=pytest.mark.slow),
+        ],
+    )
     def test_iterates(self, points, fmap, polygon, iterations, dtype):
         got = jm.map_feasible_set(problems.lecture(), points, iterations=iterations, dtype=dtype)
         np.testing.assert_array_equal(got.label, fmap.label)

@@ -284,7 +284,9 @@ class TestPrestabilising:
 
 
 class TestReferences:
-    @pytest.mark.parametrize("name", ["drifting", "hidden product", "unstable"])
+    @pytest.mark.parametrize(
+        "name", [pytest.param("drifting", marks=pytest.mark.slow), "hidden product", "unstable"]
+    )
     def test_tracking(self, name):
         """Cost Σ (x − r)'Q(x − r) + u'Ru + …, with the states kept, by another solver."""
         mpc, x0 = CASES[name](), start(name)

@@ -429,7 +429,7 @@ class TestBatches:
         q[7, 0] = INF
         return clean, jm.QP(good.P, q, good.A, l, u)
 
-    @pytest.mark.parametrize("x32", [False, True])
+    @pytest.mark.parametrize("x32", [False, pytest.param(True, marks=pytest.mark.slow)])
     def test_bad_neighbours_change_nothing(self, x32):
         with enable_x64(not x32):
             clean, spoiled = self.spoiled()
@@ -620,12 +620,14 @@ class TestSettings:
                 assert sol.status == jm.Status.SOLVED, (shape, sol.primal_residual)
                 np.testing.assert_allclose(sol.z, z, atol=1e-5)
 
+    @pytest.mark.slow
     def test_schedule_of_equal_stages_is_no_schedule(self, x64):
         qp, _, _ = constructed(6, 4)
         one = jm.solve_qp(qp, jm.ADMM(iterations=60, rho=2.0, refine=0))
         four = jm.solve_qp(qp, jm.ADMM(iterations=60, rho=np.full((4, 1), 2.0), refine=0))
         np.testing.assert_allclose(one.z, four.z, atol=1e-12)
 
+    @pytest.mark.slow
     def test_refine_never_hurts(self, x64):
         for seed in range(10):
             qp, z, _ = constructed(8, seed)
