@@ -109,9 +109,11 @@ class Pair:
         return cls(z, y, relative, near, above <= 1e-6 * eps[0])
 
     def or_better(self, other: "Pair") -> "Pair":
-        """Return the other pair where that is solved or its residuals are smaller. A pair that was
-        near before is solved after one step more."""
-        take = ~self.solved & (other.solved | (other.error < self.error))
+        """Return the other pair where that is solved or its residuals are smaller; one that is
+        near only for another that is. A pair that was near before is solved after one step
+        more."""
+        smaller = (other.error < self.error) & (other.near | ~self.near)
+        take = ~self.solved & (other.solved | smaller)
         best = jax.tree.map(lambda old, new: jnp.where(take, new, old), self, other)
         return replace(best, solved=best.solved | self.near)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxmpc as jm
+from jaxmpc.qp.residuals import Pair
 
 INF = np.inf
 PRECISIONS = pytest.mark.parametrize("x64", [False, True], ids=["float32", "float64"])
@@ -185,3 +186,19 @@ def test_the_mpc_of_an_indefinite_weight_is_refused_where_it_can_be_read():
     mpc = jm.MPC(jm.LinearSystem(np.eye(1), np.eye(1)), np.eye(1), np.eye(1), 3)
     with pytest.raises(ValueError, match="Q: .*not positive semidefinite"):
         jm.solve(replace(mpc, Q=-np.eye(1)), [0.0])
+
+
+def test_a_pair_near_the_solution_is_not_lost():
+    """Residuals are compared relative to their terms, where a large term can hide an error that is
+    too large in itself (a quadrotor's plan ended so, with a gap of 1.4e-6)."""
+    with jax.enable_x64(True):
+        eps, none = np.array([1e-6, 0.0]), np.zeros(1)
+        judge = lambda values, sizes: Pair.of(
+            none, none, (np.array(values), np.array(sizes)), eps, 1e-14
+        )
+        best, other = (
+            judge([0.0, 0.0, 1e-10], [1.0, 1.0, 1.0]),
+            judge([0.0, 2e-6, 0.0], [1, 1e6, 1]),
+        )
+        assert best.near and not other.near and other.error < best.error
+        assert best.or_better(other).error == best.error
