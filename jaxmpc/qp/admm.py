@@ -51,8 +51,9 @@ EQUILIBRATIONS = 10
 class ADMM:
     """Settings of the solver.
 
-    iterations: ADMM steps, always all of them. rho: penalty in the scaled coordinates above;
-    None: √(min(1, n/m)), m counting the rows that z moves; or a number, one value a row
+    iterations: ADMM steps, always all of them; one instance from plain Python that has a warm start
+    and that Newton steps solve without them takes none. rho: penalty in the scaled coordinates
+    above; None: √(min(1, n/m)), m counting the rows that z moves; or a number, one value a row
     (m,), or a schedule (stages, m) or (stages, 1) whose stages have equally many iterations.
     alpha: over-relaxation in (0, 2).
     refine: Newton steps after the loop at most, 0 for none (`active_set.py`, `newton.py`). An

@@ -481,6 +481,12 @@ class TestController:
         assert np.all(np.asarray(status) == jm.Status.SOLVED)
         assert np.abs(xs[-1]).max() < 0.2
 
+        # From plain Python the shifted plan is good enough to go without ADMM, and the same comes.
+        x = mpc.system.A @ x0 + mpc.system.B @ u
+        _, _, plan = controller(x, carry)
+        assert plan.status == jm.Status.SOLVED and plan.iterations == 0
+        np.testing.assert_allclose(plan.inputs, jm.solve(mpc, x).inputs, atol=1e-6)
+
     def test_is_a_tree(self):
         controller = jm.Controller(problems.lecture())
         leaves, structure = jax.tree.flatten(controller)
