@@ -499,7 +499,7 @@ def conditions(s: Stages, sample: Sample, u: Array, y: Array) -> Conditions:
     )  # fmt: skip
 
 
-def residual_terms(s: Stages, sample: Sample, u: Array, y: Array) -> Terms:
+def stage_residuals(s: Stages, sample: Sample, u: Array, y: Array) -> Terms:
     """As `qp.residuals.residual_terms`, for the condensed QP in the inputs.
 
     With the gradient g of the Lagrangian the gap z'Pz + q'z + g(Az) + g*(y) is
@@ -568,7 +568,7 @@ def search_step(most: int, constants: tuple, state: Search) -> Search:
 def judged(eps: Array, s: Stages, sample: Sample, u: Array, y: Array) -> Pair:
     """The pair of inputs u (N, m) and multipliers y (rows,), judged in float64."""
     y, floor = s.bounds.admissible(y), rounding(u.dtype)
-    judge = lambda s, sample, u, y, eps: Pair.of(u, y, residual_terms(s, sample, u, y), eps, floor)
+    judge = lambda s, sample, u, y, eps: Pair.of(u, y, stage_residuals(s, sample, u, y), eps, floor)
     return precisely(judge, s, sample, u, y, eps)
 
 
@@ -657,17 +657,17 @@ def _plan(factor: StageFactor, mpc: MPC, solver: ADMM, sample: Sample, warm_star
     if solver.differentiate == "implicit":
         constants = jax.lax.stop_gradient((factor, sample, solver, warm_start))
         fixed = constants[0].E, constants[0].rho[-1]
-        u, y = implicit(stage_conditions, (factor.stages, sample), fixed, *search(*constants))
+        u, y = implicit(stage_conditions, (factor.stages, sample), fixed, *solution(*constants))
     else:
-        u, y = search(factor, sample, solver, warm_start)
+        u, y = solution(factor, sample, solver, warm_start)
     s, eps = factor.stages, tolerance(solver, u.dtype)
-    found = assess(residual_terms, (s, sample), u, y, Proof.none(u, y), eps)
+    found = assess(stage_residuals, (s, sample), u, y, Proof.none(u, y), eps)
     found = replace(found, iterations=jnp.asarray(solver.iterations, jnp.int32))
     x = predict(s, sample.x0, u)
     return answer(mpc, s.layout, found, fault, x, u, sample.states, sample.inputs)
 
 
-def search(
+def solution(
     factor: StageFactor, sample: Sample, solver: ADMM, warm_start: WarmStart | None
 ) -> tuple[Array, Array]:
     """Inputs u (N, m) and multipliers y (rows,): ADMM, then Newton steps."""

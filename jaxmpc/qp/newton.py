@@ -98,7 +98,7 @@ def newton_step(
     slope, bend = jnp.sum(d * jnp.stack([matmul(w, H) + q, Hd]), axis=1)
     minimised = jnp.all(bounds.active_set(v + Ad, rho) == bounds.active_set(v, rho))
 
-    def search(carry: tuple[Array, Array, Array], _: None) -> tuple[Any, None]:
+    def bracket(carry: tuple[Array, Array, Array], _: None) -> tuple[Any, None]:
         """Newton on the derivative of φ, which grows with t, between what it has bracketed."""
         t, low, high = carry
         at = v + t * Ad
@@ -113,7 +113,7 @@ def newton_step(
 
     one = jnp.ones((), w.dtype)
     count = LINE_STEPS if bounds.linear is None else LINE_STEPS_SOFT
-    (t, low, high), _ = jax.lax.scan(search, (one, 0 * one, jnp.inf * one), length=count)
+    (t, low, high), _ = jax.lax.scan(bracket, (one, 0 * one, jnp.inf * one), length=count)
     # Without an upper bracket the lower end is used.
     t = jnp.where(minimised, 1.0, jnp.where(jnp.isinf(high), low, t))
     w_new, e_new = w + t * d, bounds.prox_residual(v + t * Ad, rho)

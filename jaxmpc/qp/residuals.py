@@ -1,8 +1,9 @@
 """Residuals of a primal-dual pair, judged against the rounding of their own terms.
 
 Residuals are one vector, [rows (m), variables (n), gap (1)], and with it, entry by entry, the sum
-of the absolute terms that each is a difference of: `residual_terms` for a QP, its namesake in
-`mpc/stagewise.py` for a problem stage by stage. Status and stopping are computed from these.
+of the absolute terms that each is a difference of: `residual_terms` for a QP,
+`mpc.stagewise.stage_residuals` for a problem stage by stage. Status and stopping are computed from
+these.
 """
 
 from collections.abc import Callable
