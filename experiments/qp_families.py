@@ -249,7 +249,7 @@ class Settings:
     seed: int = 0
     families: tuple[str, ...] = ()
     iterations: int = jm.ADMM().iterations
-    refine: int = jm.ADMM().refine
+    refine: int | None = None  # None: the default
     dtype: Literal["float64", "float32"] = "float64"
     reference: bool = False
 
@@ -335,7 +335,10 @@ def run(s: Settings) -> None:
     jax.config.update("jax_enable_x64", s.dtype == "float64")
     solver = jm.ADMM(s.iterations, refine=s.refine, eps=1e-6 if s.dtype == "float64" else None)
     solve = jax.jit(jax.vmap(lambda qp: jm.solve_qp(qp, solver)))
-    print(f"{s.count} a family, jaxmpc in {s.dtype}: {s.iterations} steps, refine {s.refine}")
+    print(
+        f"{s.count} a family, jaxmpc in {s.dtype}: {s.iterations} steps, "
+        f"{solver.newton_steps()} Newton steps at most"
+    )
     for status, columns in (
         (jm.Status.SOLVED, ("right", "absolute", "relative", "median")),
         (jm.Status.PRIMAL_INFEASIBLE, ("right", "exact", "loose", "")),

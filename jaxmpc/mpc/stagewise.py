@@ -63,6 +63,8 @@ from jaxmpc.qp.status import Status
 # Most stages that the passes of an ADMM step write out, without a loop over them. Loops reorder
 # (batch, N, …) to (N, batch, …) at each step, which takes longer than the products.
 UNROLL = 32
+# Newton steps where ADMM.refine is None. A problem without a solution takes them all.
+MOST_STEPS = 150
 
 
 def solve_stagewise(
@@ -77,8 +79,8 @@ def solve_stagewise(
     no infeasibility is proved (a problem without a solution ends as ITERATION_LIMIT: soften the
     rows that may not hold). Derivatives with respect to every array of data are those of
     solver.differentiate. warm_start: an earlier Plan or a WarmStart, whose states are not read.
-    solver.refine: Newton steps, a Riccati recursion each; 5 suffice where ADMM has found the
-    active rows. mpc.prestabilise is not read:
+    solver.refine: Newton steps at most (None: 150), a Riccati recursion each; 5 suffice where ADMM
+    has found the active rows. mpc.prestabilise is not read:
     the inputs are the variables, so a plant that grows more than 1e5-fold over the horizon in open
     loop (1e3-fold in float32) has residuals above eps by rounding alone; `solve` takes those. scale
     (rows,): the row scale of a similar problem (`factor_stages(...).E`), which saves one of two
@@ -682,19 +684,20 @@ def solution(
     schedule, free = splittings(factor, sample, min(s.horizon, UNROLL))
     t, _ = iterate(schedule, bounds, t, solver.iterations, solver.alpha)
     u, y = read(factor, bounds, t, free[-1])
-    if solver.refine and solver.differentiate == "unrolled":
+    refine = solver.newton_steps(MOST_STEPS)
+    if refine and solver.differentiate == "unrolled":
         newton = lambda pair, _: (newton_step(factor, sample, bounds, *pair), None)
-        u, y = jax.lax.scan(newton, (u, y), length=solver.refine)[0]
+        u, y = jax.lax.scan(newton, (u, y), length=refine)[0]
         y = s.bounds.admissible(y)
-    elif solver.refine:
+    elif refine:
         eps = tolerance(solver, u.dtype)
         best = judged(eps, s, sample, u, y)
         state = Search(u, y, best, jnp.int32(0), ~(best.near | best.solved))
         constants = (factor, sample, bounds, eps)
-        step = partial(search_step, solver.refine)
+        step = partial(search_step, refine)
         if solver.fixed:
             again = lambda state, _: (step(constants, state), None)
-            state = jax.lax.scan(again, state, length=solver.refine)[0]
+            state = jax.lax.scan(again, state, length=refine)[0]
         else:
             state = repeat_while(lambda state: state.open, step, constants, state)
         u, y = state.best.z, state.best.y

@@ -56,12 +56,13 @@ class ADMM:
     above; None: √(min(1, n/m)), m counting the rows that z moves; or a number, one value a row
     (m,), or a schedule (stages, m) or (stages, 1) whose stages have equally many iterations.
     alpha: over-relaxation in (0, 2).
-    refine: Newton steps after the loop at most, 0 for none (`active_set.py`, `newton.py`). An
-    instance leaves when its residuals are small enough, also in a batch. fixed: take all `refine`
-    steps of the method of multipliers, for every instance: constant time; so do unrolled
-    derivatives. dtype: floating type of the ADMM iterates, "float32" or "float64"; None: float32
-    before Newton steps, that of the data without any. Newton steps are float64 whatever it is,
-    except unrolled ones.
+    refine: Newton steps after the loop at most, 0 for none (`active_set.py`, `newton.py`). None:
+    1,000, of which badly scaled linear programs need most, and 150 in `solve_stagewise` and where
+    every instance takes them all. An instance leaves when its residuals are small enough, also in
+    a batch. fixed: take all `refine` steps of the method of multipliers, for every instance:
+    constant time; so do unrolled derivatives. dtype: floating type of the ADMM iterates, "float32"
+    or "float64"; None: float32 before Newton steps, that of the data without any. Newton steps are
+    float64 whatever it is, except unrolled ones.
     eps: tolerance of status SOLVED on primal residual, dual residual and gap, absolute, plus
     a rounding floor, a multiple of machine epsilon·(size of the terms): 100 in float64, 4 in
     float32. None: 1e-6 in float64, 1e-3 in float32. eps_rel: tolerance relative to the size of
@@ -76,7 +77,7 @@ class ADMM:
     iterations: int = field(default=50, metadata={"static": True})
     rho: Any = None
     alpha: Any = 1.9
-    refine: int = field(default=1000, metadata={"static": True})
+    refine: int | None = field(default=None, metadata={"static": True})
     eps: Any = None
     eps_rel: Any = 0.0
     differentiate: str = field(default="implicit", metadata={"static": True})
@@ -86,7 +87,7 @@ class ADMM:
 
     def validate(self, rows: int) -> None:
         """Raise ValueError for settings that make no iteration."""
-        if self.iterations < 0 or self.refine < 0:
+        if self.iterations < 0 or (self.refine or 0) < 0:
             fail("iterations, refine", f"{self.iterations}, {self.refine}", "Give counts ≥ 0")
         shape: tuple[int, ...] = () if self.rho is None else np.shape(self.rho)
         if len(shape) > 2 or (shape and shape[-1] not in (1, rows)):
@@ -107,6 +108,13 @@ class ADMM:
             fail("differentiate", f"{self.differentiate!r}", 'Give "implicit" or "unrolled"')
         if concrete(self.smoothing) and not float(np.asarray(self.smoothing)) >= 0:
             fail("smoothing", f"{self.smoothing}", "Give 0 (none) or a positive number")
+
+    def newton_steps(self, most: int = 1000) -> int:
+        """Return how many Newton steps there are at most: `refine`, or where that is None `most`,
+        and 150 at most where every instance takes them all."""
+        if self.refine is not None:
+            return self.refine
+        return min(most, 150) if self.fixed or self.differentiate == "unrolled" else most
 
 
 DEFAULT = ADMM()

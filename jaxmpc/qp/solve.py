@@ -86,7 +86,7 @@ def in_two_parts(
     warm start, which mostly is as near as these would come; what it leaves open is solved again
     with both. hard: known to need them.
     """
-    every = hard or solver.fixed or not solver.refine or solver.differentiate != "implicit"
+    every = hard or solver.fixed or solver.refine == 0 or solver.differentiate != "implicit"
     if every or not concrete(arguments):
         return program(*arguments, whole=True)
     found = program(*arguments, whole=False)
@@ -142,8 +142,8 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = 
     t = jnp.zeros_like(qp.l)
     if warm_start is not None:
         t = warm(factor, qp, bounds, warm_start)
-    unrolled = solver.differentiate == "unrolled"
-    rough = "float32" if solver.refine and not unrolled else qp.q.dtype
+    unrolled, refine = solver.differentiate == "unrolled", solver.newton_steps()
+    rough = "float32" if refine and not unrolled else qp.q.dtype
     dtype = rough if solver.dtype is None else jnp.dtype(solver.dtype)
     cast = lambda tree, dtype=dtype: jax.tree.map(
         lambda v: v.astype(dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v, tree
@@ -155,17 +155,17 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = 
     )
     eps = tolerance(solver, qp.q.dtype)
     begin = replace(multipliers_start(q, w, y), change=y - y_old, move=w - w_old)
-    if solver.refine and not unrolled:
+    if refine and not unrolled:
         p = Program(qp, factor, q, bounds, eps, Constants.of(qp.q.dtype).far)
-        polish = partial(improve, solver.refine, solver.fixed, whole)
+        polish = partial(improve, refine, solver.fixed, whole)
         (z, y), proof, ended = precisely(polish, p, begin)
         found = assess(residual_terms, (qp,), z, y, proof, eps)
         status = jnp.where(ended, found.status, jnp.int32(Status.ITERATION_LIMIT))
         return replace(found, status=status)
     pair, end = unscaled(qp, factor, w, y), begin
-    if solver.refine:
+    if refine:
         advance = lambda s, _: (multipliers_step(factor.H, q, factor.A, bounds, s), None)
-        end = lax.scan(advance, begin, length=solver.refine)[0]
+        end = lax.scan(advance, begin, length=refine)[0]
         pair = better(qp, pair, unscaled(qp, factor, end.w, end.y))
     correcting = correcting_rows(qp)
     proof = prove(qp, factor.T, factor.E, correcting, end.change, end.move)

@@ -1,5 +1,6 @@
 """ADMM stage by stage against the dense solver and a condensed QP built here with numpy."""
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -223,6 +224,19 @@ def test_stage_weights():
         replace(mpc, stage_weights=[1.0, 0.0, 1.0, 1.0]).validate()
     with pytest.raises(ValueError, match=r"stage_weights.*\(4,\)"):
         replace(mpc, stage_weights=s[:3]).validate()
+
+
+def test_fixed_count_of_newton_steps():
+    """150 by default, as also the most that a problem without a solution takes."""
+    early, all_of_them = (
+        solve_stagewise(problem(), varying(), X0, solver=solver)
+        for solver in (SOLVER, replace(SOLVER, fixed=True))
+    )
+    np.testing.assert_array_equal(early.status, all_of_them.status)
+    np.testing.assert_allclose(early.inputs, all_of_them.inputs, atol=1e-9)
+    solve = lambda x0: solve_stagewise(problem(), varying(), x0, solver=jm.ADMM(fixed=True)).inputs
+    lengths = re.findall(r" length=(\d+)", str(jax.make_jaxpr(solve)(X0)))
+    assert max(map(int, lengths)) == 150
 
 
 def test_residuals_are_those_of_the_qp():

@@ -1,5 +1,6 @@
 """The QP solver against programs with known answers, exact certificates and finite differences."""
 
+import re
 from dataclasses import replace
 
 import chex
@@ -723,6 +724,28 @@ class TestGradients:
 def test_bad_data_raise(change, words):
     with pytest.raises(ValueError, match=words):
         jm.solve_qp(replace(box(2), **change))
+
+
+class TestFixedCount:
+    def test_solves_and_proves_as_the_default_does(self, x64):
+        qp = constructed(5, 3)[0]
+        empty = replace(qp, l=np.where(np.arange(13) == 0, 50.0, qp.l), u=np.full(13, 50.0))
+        many = jax.tree.map(lambda *v: np.stack(v), qp, replace(qp, q=-qp.q), empty)
+        for q in ({}, {"q": np.full((3, 5), np.nan)}):
+            batch = replace(many, **q)
+            early, all_of_them = (
+                jax.jit(jax.vmap(lambda qp, s=s: jm.solve_qp(qp, s)))(batch)
+                for s in (jm.ADMM(), jm.ADMM(refine=30, fixed=True))
+            )
+            np.testing.assert_array_equal(early.status, all_of_them.status)
+            np.testing.assert_allclose(early.z[:2], all_of_them.z[:2], atol=1e-8)
+
+    def test_the_default_takes_150_steps(self, x64):
+        """The 1,000 that a badly scaled linear program may need are not for every instance."""
+        for solver in (jm.ADMM(fixed=True), jm.ADMM(differentiate="unrolled")):
+            assert solver.newton_steps() == 150
+            program = str(jax.make_jaxpr(lambda qp, s=solver: jm.solve_qp(qp, s).z)(box(2)))
+            assert 150 <= max(map(int, re.findall(r" length=(\d+)", program))) <= 250
 
 
 @pytest.mark.parametrize(

@@ -117,7 +117,8 @@ class SolverSection:
     # Number, one a row of the QP, or (stages, rows); None: chosen from the problem.
     rho: FiniteFloat | Vector | Matrix | None = None
     alpha: Annotated[FiniteFloat, Field(gt=0, lt=2)] = 1.9
-    refine: Annotated[int, Field(ge=0, strict=True)] = 1000  # Newton steps after them at most
+    # Newton steps after them at most; None: as `ADMM`.
+    refine: Annotated[int, Field(ge=0, strict=True)] | None = None
 
 
 def to_matrix(value: Any) -> np.ndarray:
