@@ -15,7 +15,7 @@ be negative is so by more than that share. "loose": the same with 1e-6 (float32:
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -74,8 +74,10 @@ def _sizes(rng: np.random.Generator) -> tuple[int, int]:
     return n, int(rng.integers(n + 4, 3 * n + 8))
 
 
-def _gram(n: int, rank: int, rng: np.random.Generator) -> np.ndarray:
-    factor = rng.standard_normal((n, rank))
+def _gram(n: int, rank: int, rng: np.random.Generator, left: Any = 1.0) -> np.ndarray:
+    """left·F F'·left' for random F (n, rank). Multiplied in this order P is positive semidefinite
+    to rounding of its own entries."""
+    factor = np.dot(left, rng.standard_normal((n, rank)))
     return factor @ factor.T
 
 
@@ -215,7 +217,7 @@ def unbounded(rng: np.random.Generator) -> Instance:
     d = rng.standard_normal(n)
     d /= np.linalg.norm(d)
     off = np.eye(n) - np.outer(d, d)
-    P = off @ _gram(n, int(rng.integers(0, n)), rng) @ off
+    P = _gram(n, int(rng.integers(0, n)), rng, off)
     A, z = rng.standard_normal((m, n)), rng.standard_normal(n)
     A[: m // 3] = A[: m // 3] @ off  # rows along the ray, bounded on both sides
     value = A @ z
