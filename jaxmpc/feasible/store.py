@@ -1,199 +1,576 @@
-"""A batch of results stored chunk by chunk, so that a killed run loses one chunk at most.
+"""A batch of results stored block by block, so that a killed run loses one block at most.
 
-The store is a zarr v3 group, one row a sample, written in whole zarr chunks. A sweep's store has
+The store is a zarr v3 group that opens as a data set, `xarray.open_zarr(path)`. A grid has one
+dimension an axis, with its coordinates; other samples lie along `sample`. Of each sample a sweep
+holds
 
-    points (sample, coordinate), label (sample), status (sample),
-    start (sample, state), plan (sample, time, input): x_0 and inputs that prove feasible,
-    cut_normal (sample, coordinate), cut_offset (sample): the half-space that proves infeasible
-    (offset inf: none that holds on the whole feasible set is known),
-    done (chunk); after refinement bound_point (ray, coordinate), bound_normal (facet,
-    coordinate), bound_offset (facet): proved boundary points and half-spaces
+    label, status, start (state), plan (time, input): x_0 and inputs that prove feasible,
+    cut_normal (coordinate), cut_offset: the half-space that proves infeasible (offset inf: none
+    that holds on the whole feasible set is known)
 
-The group appears under its name by one rename, complete with its attributes. A chunk counts
-only once its entry of `done` is set, which happens after all its rows are written; zarr
-writes each chunk to a side file and renames it. Fill values (label and status 0, NaN) are
-no answers, so that a row not reached is never taken for one. A power cut can lose data: zarr does
-not sync to the disk.
+and after refinement bound_point (ray, coordinate), bound_normal (facet, coordinate) and
+bound_offset (facet): proved boundary points and half-spaces.
+
+A block is a run of consecutive samples, one zarr chunk of each variable. checksum (block) is a hash
+of its data, written after them, and 0 before: a block whose data are missing, unreadable or others
+than were written counts as not done. Fill values (label and status 0, NaN) are no answers. The
+group appears under its name by one rename, complete with its attributes; zarr writes each chunk to
+a side file and renames it. A power cut can lose data, which the checksums show: zarr does not sync
+to the disk.
 """
 
+import hashlib
+import itertools
+import json
+import math
 import os
+import re
 import shutil
 import uuid
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 import zarr
+from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from jaxmpc.checks import fail
-from jaxmpc.runs import differences, fingerprint, versions
+from jaxmpc.control.sets import Ellipsoid
+from jaxmpc.feasible.exact_data import dynamics
+from jaxmpc.feasible.labels import Labels, OnDemand
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.qp.status import Status
+from jaxmpc.runs import as_json, differences, fingerprint, versions
 
 if TYPE_CHECKING:
     import xarray as xr
 
+# Names in the store, one row a sample, and the fields of `Labels` that they hold.
+LABELS = {
+    "label": "label",
+    "status": "status",
+    "start": "starts",
+    "plan": "plans",
+    "cut_normal": "cut_normals",
+    "cut_offset": "cut_offsets",
+}
+BOUNDS = {
+    "bound_point": ("ray", "coordinate"),
+    "bound_normal": ("facet", "coordinate"),
+    "bound_offset": ("facet",),
+}
 
-def open_sweep(
-    path: str | Path,
-    points: np.ndarray,
-    shape: tuple[int, int, int],
-    config: Mapping[str, Any],
-    chunk: int,
-) -> zarr.Group:
-    """Open the store of a sweep at `path` to write; make it where there is none.
-
-    `points` (B, d) are the samples, `shape` is (n, N, m), the rest as in `open_store`.
-    """
-    d, (n, *plan_shape) = points.shape[1], shape
-    fields: dict[str, Field] = {
-        "label": Field((), "int8", 0, ()),
-        "status": Field((), "int8", 0, ()),
-        "start": Field((n,), "float64", np.nan, ("state",)),
-        "plan": Field(tuple(plan_shape), "float64", np.nan, ("time", "input")),
-        "cut_normal": Field((d,), "float64", np.nan, ("coordinate",)),
-        "cut_offset": Field((), "float64", np.nan, ()),
-    }
-    return open_store(path, points, fields, config, chunk, shape)
+# Of each chunk; the last one adds a checksum of the file itself.
+CODECS = (ZstdCodec(), Crc32cCodec())
 
 
 class Field(NamedTuple):
-    """A field of each sample: shape, type, value while it is not written, names of its axes."""
+    """A variable with a value a sample: its further shape, type, value while it is not written,
+    names of its further dimensions, CF attributes."""
 
     shape: tuple[int, ...]
     dtype: str
     fill: Any
     dimensions: tuple[str, ...]
+    attributes: Mapping[str, Any] = {}
 
 
-def open_store(
-    path: str | Path,
-    points: np.ndarray,
-    fields: Mapping[str, Field],
-    config: Mapping[str, Any],
-    chunk: int,
-    shape: tuple[int, ...],
-) -> zarr.Group:
-    """Open the store at `path` to write; make it where there is none, with these fields.
+class Constant(NamedTuple):
+    """A variable that is known from the start, such as a coordinate: its array, dimensions and CF
+    attributes."""
 
-    `points` (B, d) are the samples, `config` is JSON data that describes the computation,
-    `shape` the sizes that fields follow from, `chunk` is the number of rows a commit. Raises
-    ValueError where the store was made with another configuration, or where something else lies
-    there.
+    data: np.ndarray
+    dimensions: tuple[str, ...]
+    attributes: Mapping[str, Any] = {}
+
+
+def label_fields(n: int, horizon: int, m: int, d: int) -> dict[str, Field]:
+    """Return the variables that hold `Labels` of d mapped states and plans (horizon, m) from states
+    of size n."""
+    flags = lambda values, names: {"flag_values": values, "flag_meanings": " ".join(names)}
+    return {
+        "label": Field((), "int8", 0, (), {
+            "long_name": "proved feasible (1), proved infeasible (-1) or undecided (0)",
+            **flags([-1, 0, 1], ["infeasible", "undecided", "feasible"]),
+        }),
+        "status": Field((), "int8", 0, (), {
+            "long_name": "status of the problem at this state",
+            **flags([int(s) for s in Status], [s.name.lower() for s in Status]),
+        }),
+        "start": Field((n,), "float64", np.nan, ("state",), {
+            "long_name": "initial state of the plan that proves feasible"}),
+        "plan": Field((horizon, m), "float64", np.nan, ("time", "input"), {
+            "long_name": "inputs that prove feasible"}),
+        "cut_normal": Field((d,), "float64", np.nan, ("coordinate",), {
+            "long_name": "normal a of a half-space a'x <= b that no feasible state leaves and this "
+            "one does"}),
+        "cut_offset": Field((), "float64", np.nan, (), {
+            "long_name": "offset b of the half-space a'x <= b; inf: proved at this state alone"}),
+    }  # fmt: skip
+
+
+def open_labels(
+    path: str | Path, problem: FeasibilityProblem, along: Sequence[np.ndarray],
+    config: Mapping[str, Any], chunk: int, fields: Mapping[str, Field] | None = None,
+) -> "Store":  # fmt: skip
+    """Open the store of the labels of a grid; see `Store`.
+
+    along: the coordinates of the grid along each mapped state. fields: variables beside the labels.
     """
-    path = Path(path)
-    attributes = {
-        "config": dict(config),
-        "chunk": chunk,
-        "fingerprint": fingerprint([dict(config), shape, chunk], points),
-        "versions": versions(),
+    mpc, system = problem.mpc, problem.mpc.system
+    all_fields = label_fields(mpc.dimension, mpc.horizon, system.m, problem.dimension)
+    all_fields |= dict(fields or {})
+    names = [_name_and_unit(label) for label in problem.labels]
+    axes = {
+        dimension: Constant(values, (dimension,), {"long_name": name, "units": unit or "1"})
+        for dimension, values, (name, unit) in zip(
+            dimension_names([name for name, _ in names], all_fields), along, names, strict=True
+        )
     }
-    if not path.exists():
-        _create(path, points, fields, attributes)
-    group = _open(path, "r+")
-    if group.attrs["fingerprint"] != attributes["fingerprint"]:
-        stored: Any = group.attrs["config"]
-        changes = differences({**stored, "chunk": group.attrs["chunk"]}, {**config, "chunk": chunk})
+    text = lambda dimension, values: Constant(np.array(list(values), str), (dimension,))
+    period = system.dt or 1.0
+    constants = {
+        "coordinate": text("coordinate", problem.labels),
+        "state": text("state", mpc.labels),
+        "input": text("input", system.input_labels),
+        "time": Constant(period * np.arange(mpc.horizon), ("time",), {
+            "long_name": "time of the input", "units": "s" if system.dt else "1"}),
+    }  # fmt: skip
+    attributes = {"problem": plain_problem(problem)}
+    return Store(path, axes, all_fields, config, chunk, constants=constants, attributes=attributes)
+
+
+def plain_problem(problem: FeasibilityProblem) -> dict[str, Any]:
+    """Return the hard constraints of a problem as JSON data, from which labels can be verified.
+
+    x⁺ = Ax + Bu + c over `horizon` steps; moves: index of the free move that each input equals.
+    rows: lower ≤ Hx + Du ≤ upper at steps (None: no bound); where `radius` is given |Lx| ≤ radius
+    for L = H. ellipsoid: x_N'Px_N ≤ level. axes: the mapped states; others: their index, and their
+    value or bounds.
+    """
+    mpc, view = problem.mpc, problem.view
+    A, B, c = dynamics(mpc)
+    rows = [
+        {"steps": list(b.steps), "H": b.H, "D": b.D, "lower": b.lower, "upper": b.upper}
+        for b in problem.blocks if b.radius is None
+    ]  # fmt: skip
+    set_ = mpc.terminal_set
+    ellipsoid = {"P": set_.P, "level": set_.level} if isinstance(set_, Ellipsoid) else None
+    others: dict[str, Any] = {"index": list(view.others)}
+    if view.projects:
+        others |= {"lower": view.lower, "upper": view.upper}
+    elif view.others:
+        others["value"] = np.asarray(view.fixed)[list(view.others)]
+    return as_json({
+        "A": A, "B": B, "c": c, "horizon": mpc.horizon, "moves": list(mpc.moves), "rows": rows,
+        "ellipsoid": ellipsoid, "axes": list(view.axes), "others": others,
+    })  # fmt: skip
+
+
+def _name_and_unit(label: str) -> tuple[str, str]:
+    """Split a label such as "q [rad]" into its name and its unit."""
+    found = re.fullmatch(r"(.*?) \[(.*)\]", label)
+    return (found[1], found[2]) if found else (label, "")
+
+
+def dimension_names(names: Sequence[str], taken: Mapping[str, Any]) -> list[str]:
+    """Return names of dimensions for mapped states: their own, without characters that a path
+    cannot hold; x0, x1, ... where these are not distinct or are the names of variables."""
+    found = [re.sub(r"[^\w.\- ]", "_", name).strip(". ") for name in names]
+    known = {*taken, *BOUNDS, "checksum", "block", "state", "input", "time", "coordinate", "sample"}
+    if len(set(found)) < len(found) or not all(found) or known & set(found):
+        return [f"x{i}" for i in range(len(found))]
+    return found
+
+
+class Store:
+    """An open store; see the module. One process writes at a time."""
+
+    def __init__(
+        self, path: str | Path, axes: Mapping[str, Constant], fields: Mapping[str, Field],
+        config: Mapping[str, Any], chunk: int, *, constants: Mapping[str, Constant] | None = None,
+        attributes: Mapping[str, Any] | None = None,
+    ) -> None:  # fmt: skip
+        """Open the store at `path` to write; make it where there is none.
+
+        axes: the coordinates of the samples, a grid's axes in their order or one array along
+        `sample`. constants: further known variables. config: JSON data that describes the
+        computation; attributes: JSON data that follow from it. chunk: samples of a block at most.
+        `damaged` becomes the number of blocks that were done and whose data are not as written;
+        they are to be computed again. Raises ValueError where the store was made with another
+        configuration, where another process writes, or where something else lies there.
+        """
+        self.path, self.fields, self.damaged = Path(path), dict(fields), 0
+        self.constants = {**axes, **(constants or {})}
+        self.shape = tuple(len(axis.data) for axis in axes.values())
+        self.dimensions = tuple(axes)
+        self.block_shape = block_shape(self.shape, chunk)
+        self.regions = regions(self.shape, self.block_shape)
+        self._lock = _Lock(self.path.parent)
+        variables = {
+            "axes": list(axes), "constants": list(constants or {}), "fields": list(fields),
+            "block": list(self.block_shape),
+        }  # fmt: skip
+        record = {
+            "config": dict(config), "chunk": chunk, "variables": variables, **(attributes or {}),
+        }  # fmt: skip
+        self.attributes = {
+            "Conventions": "CF-1.11",
+            **record,
+            "fingerprint": _fingerprint(record, {k: v.data for k, v in self.constants.items()}),
+            "versions": versions(),
+        }
+        try:
+            self._open()
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let other processes write."""
+        self._lock.release()
+
+    def rows(self, block: int) -> slice:
+        """Return the samples of a block, counted in C order of the grid."""
+        region = self.regions[block]
+        first = int(np.ravel_multi_index([part.start for part in region], self.shape))
+        return slice(first, first + math.prod(part.stop - part.start for part in region))
+
+    def pending(self) -> list[int]:
+        """Return the indices of the blocks that are not done."""
+        return np.flatnonzero(_array(self.group, "checksum")[:] == 0).tolist()
+
+    def commit(self, block: int, **rows: np.ndarray) -> None:
+        """Write all variables of a block, (samples of the block, ...), then mark it done."""
+        region, written = self.regions[block], []
+        for name, value in rows.items():
+            array = _array(self.group, name)
+            here = tuple(part.stop - part.start for part in region)
+            value = np.asarray(value, array.dtype).reshape(*here, *array.shape[len(here) :])
+            array[region] = value
+            written.append((name, value))
+        _array(self.group, "checksum")[block] = checksum(dict(written))
+
+    def read(self, name: str) -> np.ndarray:
+        """Return a variable (samples, ...)."""
+        found = np.asarray(_array(self.group, name)[:])
+        return found.reshape(-1, *found.shape[len(self.shape) :])
+
+    def labels(self) -> Labels:
+        """Return the labels in the store; proofs are read when they are used."""
+        later = {
+            stored: OnDemand(partial(self.read, name))
+            for name, stored in LABELS.items() if stored not in ("label", "status")
+        }  # fmt: skip
+        return Labels(self.read("label"), self.read("status"), later)
+
+    def save_bounds(self, points: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> None:
+        """Write what refinement proved: points (K, d) and half-spaces normals (F, d), offsets
+        (F,)."""
+        for (name, dimensions), value in zip(
+            BOUNDS.items(), (points, normals, offsets), strict=True
+        ):
+            self.group.create_array(
+                name, data=value, overwrite=True, dimension_names=dimensions, compressors=CODECS,
+                attributes={"checksum": str(checksum({name: value}))},
+            )  # fmt: skip
+        _consolidate(self.path)
+
+    def _open(self) -> None:
+        """Open the group, made, checked and repaired as needed."""
+        for left in self.path.parent.glob(f".{self.path.name}.*"):  # of a run killed at the start
+            shutil.rmtree(left, ignore_errors=True)
+        if not self.path.exists():
+            self._create()
+        self.group = _open(self.path, "r+")
+        self._require_configuration()
+        self._repair()
+
+    def _create(self) -> None:
+        """Create the store under a temporary name, then rename it to `path`."""
+        partial = self.path.with_name(f".{self.path.name}.{uuid.uuid4().hex}")
+        group = zarr.open_group(partial, mode="w", zarr_format=3, attributes=self.attributes)
+        for name in self._names():
+            self._create_array(group, name)
+        _consolidate(partial)
+        os.rename(partial, self.path)
+
+    def _names(self) -> list[str]:
+        return [*self.constants, *self.fields, "checksum"]
+
+    def _create_array(self, group: zarr.Group, name: str) -> None:
+        """Create one variable, without values but for constants."""
+        options: dict[str, Any]
+        if name in self.constants:
+            data, dimensions, attributes = self.constants[name]
+            options = dict(shape=data.shape, dtype=str if data.dtype.kind == "U" else data.dtype)
+        elif name == "checksum":  # one a file: a kill while one is written leaves the others
+            dimensions, attributes = ("block",), {"long_name": "hash of a block; 0: not done"}
+            options = dict(shape=(len(self.regions),), chunks=(1,), dtype="uint64", fill_value=0)
+        else:
+            tail, dtype, fill, further, attributes = self.fields[name]
+            dimensions = (*self.dimensions, *further)
+            chunks = (*self.block_shape, *tail)
+            options = dict(shape=(*self.shape, *tail), chunks=chunks, dtype=dtype, fill_value=fill)
+        made = group.create_array(
+            name, dimension_names=dimensions, attributes=dict(attributes), overwrite=True,
+            compressors=CODECS, **options,
+        )  # fmt: skip
+        if name in self.constants:
+            made[...] = data if data.dtype.kind != "U" else data.astype(object)
+
+    def _require_configuration(self) -> None:
+        """Raise unless the store was made with the same configuration and samples."""
+        there, here = dict(self.group.attrs), self.attributes
+        if there["fingerprint"] == here["fingerprint"]:
+            return
+        stored: Any = there.get("config")
+        changes = differences(
+            {**(stored if isinstance(stored, Mapping) else {}), "chunk": there.get("chunk")},
+            {**here["config"], "chunk": here["chunk"]},
+        )
         fail(
-            str(path),
+            str(self.path),
             f"holds results of another configuration ({'; '.join(changes) or 'other points'})",
             "Resume with that configuration, choose another output, or overwrite",
         )
-    return group
+
+    def _repair(self) -> None:
+        """Make what is missing or damaged new, and mark its blocks as not done."""
+        for left in self.path.rglob("*.partial"):
+            left.unlink(missing_ok=True)
+        renewed = [name for name in self._names() if not self._is_sound(name)]
+        for name in renewed:
+            shutil.rmtree(self.path / name, ignore_errors=True)
+            self._create_array(self.group, name)
+        if renewed:
+            _consolidate(self.path)
+        marks, sums = _array(self.group, "checksum"), self._checksums()
+        lost = "checksum" in renewed
+        self.damaged = len(self.regions) if lost else 0
+        for block in np.flatnonzero(sums):
+            if sums[block] != self._checksum(int(block)):
+                marks[int(block)] = 0
+                self.damaged += 1
+
+    def _checksums(self) -> np.ndarray:
+        """Return the checksums, 0 where one cannot be read."""
+        marks, found = _array(self.group, "checksum"), np.zeros(len(self.regions), np.uint64)
+        for block in range(len(found)):
+            try:
+                found[block] = marks[block]
+            except Exception:  # what a codec raises is its own
+                marks[block] = 0
+                self.damaged += 1
+        return found
+
+    def _is_sound(self, name: str) -> bool:
+        """Return whether a variable exists as it was created, with its values if it is a
+        constant."""
+        try:
+            array = _array(self.group, name)
+            if name in self.constants:
+                return bool(np.array_equal(np.asarray(array[...]), self.constants[name].data))
+            count = len(self.regions)
+            field = self.fields.get(name, Field((), "uint64", 0, ()))
+            grid, chunks = (
+                (self.shape, self.block_shape) if name in self.fields else ((count,), (1,))
+            )
+            return bool(
+                array.shape == (*grid, *field.shape)
+                and array.chunks == (*chunks, *field.shape)
+                and array.dtype == np.dtype(field.dtype)
+                and np.array_equal(array.fill_value, field.fill, equal_nan=field.dtype != "bool")
+            )
+        except Exception:  # unreadable metadata: zarr raises what its parsers raise
+            return False
+
+    def _checksum(self, block: int) -> int:
+        """Return the checksum of the data of a block, 0 where they cannot be read."""
+        region = self.regions[block]
+        try:
+            return checksum({k: np.asarray(_array(self.group, k)[region]) for k in self.fields})
+        except Exception:
+            return 0
 
 
-def pending(group: zarr.Group) -> list[int]:
-    """Return the indices of the chunks that are not committed."""
-    return np.flatnonzero(_array(group, "done")[:] == 0).tolist()
+@dataclass(frozen=True)
+class Stored:
+    """A store as it lies on the disk, read without being changed.
 
-
-def chunk_rows(group: zarr.Group, index: int) -> slice:
-    """Return the rows that belong to one chunk; the last may be short."""
-    chunk = _chunk(group)
-    return slice(index * chunk, min((index + 1) * chunk, _array(group, "points").shape[0]))
-
-
-def commit(group: zarr.Group, index: int, **rows: np.ndarray) -> None:
-    """Write all rows of chunk `index`, then mark it done.
-
-    `rows` has all fields of the store; other processes may commit other chunks at the same time.
+    arrays: its variables (samples, ...), bounds and constants. done: how many of its `blocks` were
+    done. problems: what is wrong, a line each; none in a sound store.
     """
-    where = chunk_rows(group, index)
-    for name, value in rows.items():
-        _array(group, name)[where] = value
-    _array(group, "done")[index] = 1
+
+    attributes: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+    axes: dict[str, np.ndarray]
+    blocks: int
+    done: int
+    problems: list[str] = field(default_factory=list)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Return the samples (B, d)."""
+        if "points" in self.arrays:
+            return self.arrays["points"]
+        mesh = np.meshgrid(*self.axes.values(), indexing="ij")
+        return np.stack([axis.ravel() for axis in mesh], axis=1)
 
 
-def save_bounds(
-    group: zarr.Group, points: np.ndarray, normals: np.ndarray, offsets: np.ndarray
-) -> None:
-    """Write what refinement proved: points (K, d) and half-spaces normals (F, d), offsets (F,)."""
-    for name, value, dimensions in (
-        ("bound_point", points, ("ray", "coordinate")),
-        ("bound_normal", normals, ("facet", "coordinate")),
-        ("bound_offset", offsets, ("facet",)),
-    ):
-        group.create_array(name, data=value, overwrite=True, dimension_names=dimensions)
+def read(path: str | Path) -> Stored:
+    """Read a store and compare it with its checksums; raises ValueError where there is none."""
+    path = Path(path)
+    group = _open(path, "r")
+    found: dict[str, Any] = dict(group.attrs)
+    problems: list[str] = []
+
+    def load(name: str) -> np.ndarray | None:
+        try:
+            return np.asarray(_array(group, name)[...])
+        except Exception as error:
+            problems.append(f"{name}: cannot be read ({type(error).__name__})")
+            return None
+
+    names = found.get("variables", {})
+    axes = {name: load(name) for name in names.get("axes", [])}
+    constants = {name: load(name) for name in names.get("constants", [])}
+    arrays = {name: load(name) for name in [*names.get("fields", []), "checksum"]}
+    record = {k: v for k, v in found.items() if k not in ("Conventions", "fingerprint", "versions")}
+    known = {**axes, **constants}
+    whole = {k: v for k, v in known.items() if v is not None}
+    if found["fingerprint"] != _fingerprint(record, whole):
+        problems.append("configuration, axes or constants are not as they were written")
+    try:
+        root = json.loads((path / "zarr.json").read_text())
+        together = root["consolidated_metadata"]["metadata"]
+        same = all(
+            json.loads((path / name / "zarr.json").read_text()) == one
+            for name, one in together.items()
+        )
+    except (OSError, ValueError, LookupError, TypeError):
+        same = False
+    if not same:
+        problems.append("metadata of variables are not as they were written")
+    shape = tuple(0 if axis is None else len(axis) for axis in axes.values())
+    parts = regions(shape, tuple(names.get("block", shape)))
+    sums = arrays.pop("checksum")
+    sums = np.zeros(len(parts), np.uint64) if sums is None or len(sums) != len(parts) else sums
+    for block, region in enumerate(parts):
+        if not sums[block]:
+            continue
+        there = {
+            k: v for k, v in arrays.items() if v is not None and v.shape[: len(shape)] == shape
+        }
+        if sums[block] != checksum({k: v[region] for k, v in there.items()}):
+            problems.append(f"block {block}: data are not as they were written")
+    for name in BOUNDS:
+        if (path / name).exists() and (value := load(name)) is not None:
+            if _array(group, name).attrs.get("checksum") != str(checksum({name: value})):
+                problems.append(f"{name}: data are not as they were written")
+            constants[name] = value
+    flat = {
+        k: v.reshape(-1, *v.shape[len(shape) :]) for k, v in arrays.items() if v is not None
+    } | {k: v for k, v in constants.items() if v is not None}  # fmt: skip
+    sound = {k: v for k, v in axes.items() if v is not None}
+    return Stored(found, flat, sound, len(parts), int(np.count_nonzero(sums)), problems)
 
 
 def open_dataset(path: str | Path) -> "xr.Dataset":
-    """Return the store as an xarray Dataset (lazy); rows of chunks not done hold the fill
-    values."""
+    """Return the store as an xarray Dataset (lazy); samples of blocks not done hold the fill
+    values. `xarray.open_zarr(path)` does the same."""
     import xarray as xr  # takes longer to import than to read
 
     _open(Path(path), "r")
-    return xr.open_zarr(path, consolidated=False, mask_and_scale=False)
+    return xr.open_zarr(path)
 
 
 def remove(path: str | Path) -> None:
-    """Delete the store at `path`; ValueError, and nothing deleted, where it is no store."""
-    _open(Path(path), "r")
-    shutil.rmtree(path)
-
-
-def _create(
-    path: Path, points: np.ndarray, fields: Mapping[str, Field], attributes: dict[str, Any]
-) -> None:
-    """Create the store under a temporary name, then rename it to `path`."""
-    rows, chunk = len(points), attributes["chunk"]
-    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-    group = zarr.open_group(partial, mode="w", zarr_format=3, attributes=attributes)
-    samples = Field(points.shape[1:], "float64", np.nan, ("coordinate",))
-    for name, (tail, dtype, fill, dimensions) in {"points": samples, **fields}.items():
-        group.create_array(
-            name,
-            shape=(rows, *tail),
-            chunks=(chunk, *tail),
-            dtype=dtype,
-            fill_value=fill,
-            dimension_names=("sample", *dimensions),
-        )
-    # One marker a file: markers that share a zarr chunk are lost when two processes write.
-    group.create_array(
-        "done",
-        shape=(-(-rows // chunk),),
-        chunks=(1,),
-        dtype="uint8",
-        fill_value=0,
-        dimension_names=("chunk",),
-    )
-    _array(group, "points")[:] = points
+    """Delete the store at `path`, damaged or not; ValueError, and nothing deleted, where it is no
+    store."""
+    path = Path(path)
+    metadata = [path / "zarr.json", *path.glob("*/zarr.json")]
+    if not any(file.is_file() for file in metadata):
+        fail(str(path), "is no sweep store", "Choose another output folder")
+    foreign = [v.name for v in path.iterdir() if not v.is_dir() and v.name != "zarr.json"]
+    if foreign:
+        fail(str(path), f"holds {foreign[0]}, which is of no store", "Choose another output folder")
+    lock = _Lock(path.parent)
     try:
-        os.rename(partial, path)
-    except OSError:  # another process was first: use its store
-        shutil.rmtree(partial)
-        if not path.exists():
-            raise
+        shutil.rmtree(path)
+    finally:
+        lock.release()
+
+
+def checksum(arrays: Mapping[str, np.ndarray]) -> int:
+    """Return a hash of arrays in the order of their names, from 1 to 2⁶⁴ − 1."""
+    state = hashlib.blake2b(digest_size=8)
+    for name in sorted(arrays):
+        value = np.ascontiguousarray(arrays[name])
+        text = value.dtype.kind not in "biuf"
+        data = repr(value.tolist()).encode() if text else value.tobytes()
+        state.update(f"{name}{value.shape}{'' if text else value.dtype.str}".encode() + data)
+    return int.from_bytes(state.digest(), "little") or 1
+
+
+def _fingerprint(record: Mapping[str, Any], constants: Mapping[str, np.ndarray]) -> str:
+    """Return a hash of all that determines a store."""
+    return fingerprint([record, checksum(constants)])
+
+
+def block_shape(shape: Sequence[int], most: int) -> tuple[int, ...]:
+    """Return the shape of blocks of at most `most` samples of a grid, of nearly equal size and
+    consecutive in C order."""
+    found, rest, whole = [], 1, True
+    for count in reversed(shape):
+        take = min(count, max(most // rest, 1)) if whole else 1
+        take = -(-count // -(-count // take))
+        whole, rest = whole and take == count, rest * take
+        found.append(take)
+    return tuple(reversed(found))
+
+
+def regions(shape: Sequence[int], block: Sequence[int]) -> list[tuple[slice, ...]]:
+    """Return the parts of a grid that blocks of this shape cover, in C order."""
+    along = [
+        [slice(first, min(first + take, count)) for first in range(0, count, take)]
+        for count, take in zip(shape, block, strict=True)
+    ]
+    return list(itertools.product(*along))
 
 
 def _open(path: Path, mode: Any) -> zarr.Group:
     """Open a store; raise ValueError where `path` holds something else."""
     try:
-        group = zarr.open_group(path, mode=mode)
-    except (OSError, ValueError) as error:  # zarr's own errors derive from these
-        fail(str(path), f"is no sweep store ({error})", "Choose another output folder")
-    if "fingerprint" not in group.attrs:
+        group = zarr.open_group(path, mode=mode, use_consolidated=False)
+        there = "fingerprint" in group.attrs
+    except Exception as error:  # of a file system, or of a parser of garbled metadata
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        known = (path / "zarr.json").is_file()
+        what = (
+            "is damaged: its metadata cannot be read" if known else f"is no sweep store ({reason})"
+        )
+        fail(str(path), what, "Overwrite it" if known else "Choose another output folder")
+    if not there:
         fail(str(path), "is a zarr group but no sweep store", "Choose another output folder")
     return group
+
+
+def _consolidate(path: Path) -> None:
+    """Write the metadata of all variables to the group, so that readers need one file."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # zarr says that its format 3 has no standard for it yet
+        zarr.consolidate_metadata(path)
 
 
 def _array(group: zarr.Group, name: str) -> zarr.Array[Any]:
@@ -202,5 +579,31 @@ def _array(group: zarr.Group, name: str) -> zarr.Array[Any]:
     return array
 
 
-def _chunk(group: zarr.Group) -> int:
-    return int(group.attrs["chunk"])  # type: ignore[arg-type]
+class _Lock:
+    """A lock of a folder against other processes that write; the end of the process releases it
+    too."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raise ValueError where another process holds it. Where the system or the file system has
+        no such locks (Windows has none), nothing is locked."""
+        self._folder: int | None = None
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            import fcntl
+
+            self._folder = os.open(folder, os.O_RDONLY)
+            fcntl.flock(self._folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.release()
+            cure = "Wait for it, or choose another output"
+            fail(str(folder), "another process writes there", cure)
+        except (ImportError, OSError):
+            self.release()
+
+    def release(self, close: Callable[[int], None] = os.close) -> None:
+        """Let others write."""
+        if self._folder is not None:
+            close(self._folder)
+            self._folder = None
+
+    __del__ = release

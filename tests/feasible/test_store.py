@@ -1,19 +1,28 @@
-"""The store keeps every committed chunk, whatever happens to the writer."""
+"""The store keeps every committed block, whatever happens to the writer, and trusts none that is
+not as it was written."""
 
+import shutil
 import signal
 import subprocess
 import sys
 import textwrap
 import time
+import warnings
 
 import numpy as np
 import pytest
 import xarray as xr
+import zarr
 
 from jaxmpc.feasible import store
+from jaxmpc.feasible.store import Constant, Store
 
-POINTS = np.arange(22.0).reshape(11, 2)
+AXES = {
+    "q": Constant(np.linspace(-1, 1, 5), ("q",), {"units": "rad", "long_name": "q"}),
+    "dq": Constant(np.linspace(0, 3, 4), ("dq",), {"units": "rad/s", "long_name": "dq"}),
+}
 CONFIG = {"mpc": {"horizon": 3}, "limits": {"x_min": ["-Infinity", 0.0]}}
+FIELDS = store.label_fields(2, 3, 1, 2)
 
 
 def rows(count, value):
@@ -27,111 +36,257 @@ def rows(count, value):
     }
 
 
-def open_store(path, config=CONFIG, points=POINTS, chunk=4):
-    return store.open_sweep(path, points, (2, 3, 1), config, chunk)
+def open_store(path, config=CONFIG, axes=AXES, chunk=8):
+    names = {"state": Constant(np.array(["q [rad]", "dq [rad/s]"]), ("state",))}
+    return Store(path, axes, FIELDS, config, chunk, constants=names)
 
 
-def test_chunks_resume_and_open_in_xarray(tmp_path):
+@pytest.fixture
+def full(tmp_path):
+    """Return the path of a store with all blocks done."""
     path = tmp_path / "sweep.zarr"
-    group = open_store(path)
-    assert store.pending(group) == [0, 1, 2]
-    assert store.chunk_rows(group, 2) == slice(8, 11)
-    store.commit(group, 2, **rows(3, -1))
-    group = open_store(path)
-    assert store.pending(group) == [0, 1]
-    store.commit(group, 0, **rows(4, 1))
-    data = store.open_dataset(path)
-    np.testing.assert_array_equal(data["label"], [1] * 4 + [0] * 4 + [-1] * 3)
-    np.testing.assert_array_equal(data["points"], POINTS)
-    assert data["plan"].dims == ("sample", "time", "input")
-    assert np.isnan(data["cut_offset"][4:8]).all()
-    plain = xr.open_zarr(path, consolidated=False)
-    assert plain["label"].dtype == np.int8
-    assert plain.attrs["config"] == CONFIG
-    assert {"jax", "zarr"} <= set(plain.attrs["versions"])
-    assert [child.name for child in tmp_path.iterdir()] == ["sweep.zarr"]
+    with open_store(path) as kept:
+        for block in kept.pending():
+            here = kept.rows(block)
+            kept.commit(block, **rows(here.stop - here.start, 1 - 2 * (block % 2)))
+        kept.save_bounds(np.ones((3, 2)), np.ones((4, 2)), np.arange(4.0))
+    return path
 
 
-def test_bounds_are_kept_and_replaced(tmp_path):
-    path = tmp_path / "sweep.zarr"
-    group = open_store(path)
-    for count in (3, 5):
-        store.save_bounds(group, np.ones((count, 2)), np.ones((4, 2)), np.arange(4.0))
-    data = store.open_dataset(path)
-    assert data["bound_point"].shape == (5, 2)
-    assert data["bound_normal"].dims == ("facet", "coordinate")
-    np.testing.assert_array_equal(data["bound_offset"], np.arange(4.0))
+class TestBlocks:
+    @pytest.mark.parametrize(
+        ("shape", "most"),
+        [((5, 4), 8), ((7,), 3), ((3, 5, 7), 14), ((3, 5, 7), 8), ((4, 4), 1), ((2, 3), 100)],
+    )
+    def test_are_consecutive_and_cover_the_grid(self, shape, most):
+        block = store.block_shape(shape, most)
+        whole, found = np.arange(np.prod(shape)).reshape(shape), []
+        for region in store.regions(shape, block):
+            part = whole[region].ravel()
+            assert len(part) <= most
+            np.testing.assert_array_equal(np.diff(part), 1)
+            found.append(part)
+        np.testing.assert_array_equal(np.concatenate(found), whole.ravel())
+
+    def test_resume(self, tmp_path):
+        path = tmp_path / "sweep.zarr"
+        with open_store(path) as kept:
+            assert kept.pending() == [0, 1, 2]
+            assert [kept.rows(k) for k in range(3)] == [slice(0, 8), slice(8, 16), slice(16, 20)]
+            kept.commit(2, **rows(4, -1))
+        with open_store(path) as kept:
+            assert kept.pending() == [0, 1] and kept.damaged == 0
+            kept.commit(0, **rows(8, 1))
+            np.testing.assert_array_equal(kept.read("label"), [1] * 8 + [0] * 8 + [-1] * 4)
+            labels = kept.labels()
+        assert labels.plans.shape == (20, 3, 1) and np.isnan(labels.cut_offsets[8:16]).all()
+
+    def test_a_block_counts_once_its_rows_are_written(self, tmp_path, monkeypatch):
+        """Killed before any of its writes, a block is not done; after the last it is."""
+        path, written = tmp_path / "sweep.zarr", []
+        with open_store(path) as kept:
+            write = zarr.Array.__setitem__
+            for stop in range(len(FIELDS) + 1):
+                count = iter(range(stop))
+
+                def until(array, where, value, count=count):
+                    if next(count, None) is None:
+                        raise KeyboardInterrupt
+                    written.append(array.name)
+                    write(array, where, value)
+
+                monkeypatch.setattr(zarr.Array, "__setitem__", until)
+                with pytest.raises(KeyboardInterrupt):
+                    kept.commit(1, **rows(8, 1))
+                monkeypatch.undo()
+                assert kept.pending() == [0, 1, 2]
+            kept.commit(1, **rows(8, 1))
+            assert kept.pending() == [0, 2]
 
 
-def test_another_configuration_is_refused(tmp_path):
-    path = tmp_path / "sweep.zarr"
-    open_store(path)
-    with pytest.raises(ValueError, match="mpc.horizon: 3 there, 4 here"):
-        open_store(path, config={**CONFIG, "mpc": {"horizon": 4}})
-    with pytest.raises(ValueError, match="chunk: 4 there, 5 here"):
-        open_store(path, chunk=5)
-    with pytest.raises(ValueError, match="other points"):
-        open_store(path, points=POINTS + 1)
+class TestDataSet:
+    def test_opens_without_arguments(self, full):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            data = xr.open_zarr(full)
+        assert data["label"].dims == ("q", "dq") and data["label"].dtype == np.int8
+        assert data["plan"].dims == ("q", "dq", "time", "input")
+        assert data["q"].attrs == {"units": "rad", "long_name": "q"}
+        assert data["label"].attrs["flag_meanings"] == "infeasible undecided feasible"
+        np.testing.assert_array_equal(data["label"].attrs["flag_values"], [-1, 0, 1])
+        np.testing.assert_array_equal(data["q"], AXES["q"].data)
+        assert list(data["state"].values) == ["q [rad]", "dq [rad/s]"]
+        assert data.attrs["config"] == CONFIG and {"jax", "zarr"} <= set(data.attrs["versions"])
+        assert data["bound_point"].dims == ("ray", "coordinate")
+        assert float(data.sel(q=0, method="nearest").label[0]) == -1
+        assert [child.name for child in full.parent.iterdir()] == ["sweep.zarr"]
+
+    def test_draws(self, full):
+        line = xr.open_zarr(full).sel(q=0, method="nearest").label.plot()
+        assert len(line[0].get_xdata()) == 4
+
+    def test_names_of_dimensions(self):
+        assert store.dimension_names(["q", "dq"], FIELDS) == ["q", "dq"]
+        assert store.dimension_names(["a/b", "dq"], FIELDS) == ["a_b", "dq"]
+        for names in (["label", "q"], ["q", "q"], ["", "q"], ["..", "q"], ["time", "q"]):
+            assert store.dimension_names(names, FIELDS) == ["x0", "x1"]
+
+    def test_bounds_are_replaced(self, full):
+        with open_store(full) as kept:
+            kept.save_bounds(np.ones((5, 2)), np.ones((4, 2)), np.arange(4.0))
+        assert xr.open_zarr(full)["bound_point"].shape == (5, 2)
+        assert not store.read(full).problems
 
 
-def test_what_is_no_store_is_refused_and_kept(tmp_path):
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    (folder / "precious").touch()
-    for call in (store.open_dataset, store.remove, open_store):
-        with pytest.raises(ValueError, match="is no sweep store"):
-            call(folder)
-    assert (folder / "precious").exists()
+class TestRefusals:
+    def test_another_configuration(self, tmp_path):
+        path = tmp_path / "sweep.zarr"
+        open_store(path).close()
+        with pytest.raises(ValueError, match="mpc.horizon: 3 there, 4 here"):
+            open_store(path, config={**CONFIG, "mpc": {"horizon": 4}})
+        with pytest.raises(ValueError, match="chunk: 8 there, 5 here"):
+            open_store(path, chunk=5)
+        with pytest.raises(ValueError, match="other points"):
+            open_store(path, axes={**AXES, "q": AXES["q"]._replace(data=AXES["q"].data + 1)})
+
+    def test_what_is_no_store_is_kept(self, tmp_path):
+        folder = tmp_path / "photos"
+        folder.mkdir()
+        (folder / "precious").touch()
+        for call in (store.open_dataset, store.remove, store.read, open_store):
+            with pytest.raises(ValueError, match="is no sweep store"):
+                call(folder)
+        assert (folder / "precious").exists()
+        (folder / "zarr.json").touch()
+        with pytest.raises(ValueError, match="holds precious"):
+            store.remove(folder)
+
+    def test_a_second_process(self, full):
+        with open_store(full):
+            code = "from jaxmpc.feasible import store; import sys; store.remove(sys.argv[1])"
+            command = [sys.executable, "-c", code, str(full)]
+            second = subprocess.run(command, capture_output=True, text=True)
+        assert second.returncode and "another process writes there" in second.stderr
+        store.remove(full)
+        assert not full.exists()
 
 
-def test_remove(tmp_path):
-    path = tmp_path / "sweep.zarr"
-    open_store(path)
-    store.remove(path)
-    assert not path.exists()
+def array_files(path, name):
+    return sorted(file for file in (path / name).rglob("*") if file.is_file())
+
+
+class TestDamage:
+    """Each damage is found when it is read, and repaired when work goes on."""
+
+    def repaired(self, path, blocks):
+        """Assert that the damage is found, and that these blocks are computed again."""
+        assert store.read(path).problems
+        with open_store(path) as kept:
+            assert kept.pending() == blocks
+            assert kept.damaged == len(blocks)
+            for block in blocks:
+                here = kept.rows(block)
+                kept.commit(block, **rows(here.stop - here.start, 1 - 2 * (block % 2)))
+        assert not store.read(path).problems
+        np.testing.assert_array_equal(
+            xr.open_zarr(path)["label"].values.ravel(), [1] * 8 + [-1] * 8 + [1] * 4
+        )
+
+    def test_flipped_labels(self, full):
+        label = zarr.open_group(full, mode="r+", use_consolidated=False)["label"]
+        label[0, 1] = -label[0, 1]
+        self.repaired(full, [0])
+
+    def test_a_missing_chunk(self, full):
+        array_files(full, "plan/c")[1].unlink()
+        self.repaired(full, [1])
+
+    def test_a_truncated_chunk(self, full):
+        file = array_files(full, "start/c")[2]
+        file.write_bytes(file.read_bytes()[:-5])
+        self.repaired(full, [2])
+
+    @pytest.mark.parametrize("name", ["start", "checksum"])
+    def test_a_missing_array(self, full, name):
+        shutil.rmtree(full / name)
+        self.repaired(full, [0, 1, 2])
+
+    def test_garbled_metadata_of_an_array(self, full):
+        (full / "label" / "zarr.json").write_text("{")
+        self.repaired(full, [0, 1, 2])
+
+    def test_an_axis(self, full):
+        zarr.open_group(full, mode="r+", use_consolidated=False)["q"][1] = 0.3
+        self.repaired(full, [])
+
+    def test_garbled_metadata_of_the_group(self, full):
+        (full / "zarr.json").write_text("{")
+        for call in (store.read, open_store):
+            with pytest.raises(ValueError, match="metadata cannot be read"):
+                call(full)
+        store.remove(full)
+        assert not full.exists()
+
+    def test_what_killed_runs_leave(self, full):
+        orphan = full.with_name(".sweep.zarr.123")
+        orphan.mkdir()
+        partial = full / "label" / "c" / "0" / "0.123.partial"
+        partial.touch()
+        open_store(full).close()
+        assert not orphan.exists() and not partial.exists()
+
+    def test_one_bit(self, full):
+        """Of any file of any array, data or metadata."""
+        random = np.random.default_rng(0)
+        files = [v for v in full.rglob("*") if v.is_file() and v.parent != full]
+        for _ in range(60):
+            file = files[random.integers(len(files))]
+            good = file.read_bytes()
+            bad = bytearray(good)
+            bad[random.integers(len(bad))] ^= 1 << random.integers(8)
+            file.write_bytes(bad)
+            assert store.read(full).problems, file
+            file.write_bytes(good)
+        assert not store.read(full).problems
 
 
 WRITER = """
     import sys
     import numpy as np
-    from jaxmpc.feasible import store
-    count, chunk = 64_000, 1000
+    from jaxmpc.feasible.store import Constant, Field, Store
+    count, chunk = 16_000, 1000
     points = np.arange(2.0 * count).reshape(count, 2)
-    group = store.open_sweep(sys.argv[1], points, (2, 3, 1), {}, chunk)
+    fields = {"label": Field((), "int8", 0, ()), "plan": Field((3,), "float64", np.nan, ("time",))}
+    axes = {"sample": Constant(np.arange(count), ("sample",))}
+    constants = {"points": Constant(points, ("sample", "coordinate"))}
+    kept = Store(sys.argv[1], axes, fields, {}, chunk, constants=constants)
     print("open", flush=True)
-    random = np.random.default_rng(0)
-    for index in store.pending(group):
-        rows = store.chunk_rows(group, index)
-        x = points[rows, 0]
-        store.commit(
-            group, index, label=np.ones(chunk, np.int8), status=np.ones(chunk, np.int8),
-            start=points[rows], plan=np.repeat(x, 3).reshape(chunk, 3, 1),
-            cut_normal=points[rows], cut_offset=x,
-        )
+    for block in kept.pending():
+        x = points[kept.rows(block), 0]
+        kept.commit(block, label=np.ones(chunk, np.int8), plan=np.stack([x, x, x], axis=1))
 """
 
 
-@pytest.mark.slow
-def test_killed_writer_loses_no_committed_chunk(tmp_path):
+@pytest.mark.parametrize("kills", [2, pytest.param(50, marks=pytest.mark.slow)])
+def test_killed_writer_loses_no_committed_block(tmp_path, kills):
     path = tmp_path / "sweep.zarr"
     command = [sys.executable, "-c", textwrap.dedent(WRITER), str(path)]
-    left = 64
-    for delay in (0.02, 0.05):
+    random = np.random.default_rng(0)
+    for _ in range(kills):
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writer:
             assert writer.stdout is not None
             assert writer.stdout.readline() == "open\n"
-            time.sleep(delay)
+            time.sleep(random.uniform(0, 0.05))
             writer.send_signal(signal.SIGKILL)
-        assert writer.returncode == -signal.SIGKILL
-        data = store.open_dataset(path).load()
-        done = np.repeat(data["done"].values, 1000) == 1
-        first = data["points"].values[:, 0]
-        assert np.all(data["label"].values[done] == 1)
-        assert np.all(data["plan"].values[done] == first[done, None, None])
-        assert np.all(data["cut_offset"].values[done] == first[done])
-        assert 0 < np.count_nonzero(data["done"] == 0) <= left
-        left = np.count_nonzero(data["done"] == 0)
+        found = store.read(path)
+        assert not found.problems
+        sums = np.asarray(zarr.open_group(path, mode="r")["checksum"])
+        done = np.repeat(sums != 0, 1000)
+        assert np.all(found.arrays["label"][done] == 1)
+        np.testing.assert_array_equal(found.arrays["plan"][done, 2], found.points[done, 0])
+        if found.done == found.blocks:
+            shutil.rmtree(path)
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    data = store.open_dataset(path).load()
-    assert np.all(data["done"] == 1)
-    np.testing.assert_array_equal(data["plan"][:, 2, 0], data["points"][:, 0])
+    found = store.read(path)
+    assert found.done == found.blocks == 16 and not found.problems
+    np.testing.assert_array_equal(found.arrays["plan"][:, 2], found.points[:, 0])

@@ -7,35 +7,29 @@ import time
 from importlib import import_module
 from pathlib import Path
 from threading import Thread
-from typing import Any
 
 import numpy as np
-import zarr
 from tqdm.std import tqdm
 
-from jaxmpc.app.commands.options import Timing, check_results, open_folder, print_table
+from jaxmpc.app.commands.options import (
+    Timing,
+    check_results,
+    open_folder,
+    print_table,
+    report_damage,
+)
 from jaxmpc.app.config import Config, SweepPoints, sweep_points
 from jaxmpc.checks import fail
-from jaxmpc.compiled import CHUNK
+from jaxmpc.compiled import CHUNK, padded
 from jaxmpc.feasible import store
 from jaxmpc.feasible.candidates import StagePenalties
 from jaxmpc.feasible.cascade import label_chunks
-from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.store import LABELS
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.runs import versions, write_json
 from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
-
-# Names in the store, one row a state, and the fields of `Labels` that they hold.
-STORED = {
-    "label": "label",
-    "status": "status",
-    "start": "starts",
-    "plan": "plans",
-    "cut_normal": "cut_normals",
-    "cut_offset": "cut_offsets",
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +41,7 @@ class LinearSweep:
     problem: FeasibilityProblem
     region: SweepPoints
     output: Path
-    group: zarr.Group
+    store: store.Store
 
     @classmethod
     def open(cls, config: Config, output: Path, resume: bool, overwrite: bool) -> "LinearSweep":
@@ -58,13 +52,17 @@ class LinearSweep:
         open_folder(output, "map.png", "summary.json")
         if path.exists() and overwrite:
             store.remove(path)
-        shape = (mpc.system.n, mpc.horizon, mpc.system.m)
-        group = store.open_sweep(path, region.points, shape, config.to_dict(), CHUNK)
         problem = FeasibilityProblem.of(mpc, region.axes, region.fixed)
-        return cls(config, mpc, problem, region, output, group)
+        found = store.open_labels(path, problem, region.along, config.to_dict(), CHUNK)
+        report_damage(found)
+        return cls(config, mpc, problem, region, output, found)
 
     def run(self, *, refine: bool, learn_penalties: bool) -> None:
         """Label all states, write map and summary, print the table."""
+        with self.store:
+            self._run(refine, learn_penalties)
+
+    def _run(self, refine: bool, learn_penalties: bool) -> None:
         start = time.perf_counter()
         print(f"{self.config.name}: {len(self.region.points):,} initial states -> {self.output}")
         # The compiler keeps one core busy; meanwhile another can load matplotlib.
@@ -76,7 +74,7 @@ class LinearSweep:
         if refine and dimension <= 3:
             print("closing the bounds by rays; long horizons take a while", file=sys.stderr)
             fmap = fmap.refine()
-            store.save_bounds(self.group, fmap.extra_points, fmap.extra_normals, fmap.extra_offsets)
+            self.store.save_bounds(fmap.extra_points, fmap.extra_normals, fmap.extra_offsets)
         files = ["sweep.zarr", "summary.json"]
         if dimension == 2:
             from jaxmpc.app.plots.feasible_set import plot_feasible_set
@@ -85,6 +83,9 @@ class LinearSweep:
             save(plot_feasible_set(fmap), self.output / "map.png")
             files.append("map.png")
         low, high = fmap.volume_bounds()
+        if low > high * (1 + 1e-9):
+            what = f"its inner bound {low:.9g} exceeds its outer bound {high:.9g}"
+            fail(str(self.store.path), what, "Look for damage with jaxmpc verify, or overwrite it")
         seconds = time.perf_counter() - start
         summary = {
             "name": self.config.name,
@@ -119,7 +120,7 @@ class LinearSweep:
 
         Raises ValueError for too few states, and where the cache folder cannot be written.
         """
-        if not store.pending(self.group):
+        if not self.store.pending():
             return None
         start, region, settings = time.perf_counter(), self.region, self.config.sweep
         cache = cache_folder()
@@ -139,23 +140,24 @@ class LinearSweep:
 
     def label(self, penalties: StagePenalties | None) -> Timing:
         """Label the chunks that are not done, and commit each."""
-        todo = store.pending(self.group)
+        todo = self.store.pending()
         timing, decided = Timing(), 0
         if not todo:
             return timing
         region, settings = self.region, self.config.sweep
-        slices = [store.chunk_rows(self.group, k) for k in todo]
-        points = np.concatenate([region.points[rows] for rows in slices])
+        slices = [self.store.rows(k) for k in todo]
+        # Blocks of one size, that of the largest: points of its own fill up a smaller one.
+        size = max(rows.stop - rows.start for rows in slices)
+        points = np.concatenate([padded(region.points[rows], size) for rows in slices])
         chunks = label_chunks(
-            self.problem, points, chunk=CHUNK, iterations=settings.iterations,
+            self.problem, points, chunk=size, iterations=settings.iterations,
             dtype=settings.dtype, penalties=penalties,
         )  # fmt: skip
-        with tqdm(total=len(points), unit=" states", unit_scale=True, disable=None) as bar:
-            for index, (_, labels) in zip(todo, chunks, strict=True):
-                rows: dict[str, Any] = {
-                    name: getattr(labels, field) for name, field in STORED.items()
-                }
-                store.commit(self.group, index, **rows)
+        total = sum(rows.stop - rows.start for rows in slices)
+        with tqdm(total=total, unit=" states", unit_scale=True, disable=None) as bar:
+            for block, here, (_, labels) in zip(todo, slices, chunks, strict=True):
+                labels = labels.first(here.stop - here.start)
+                self.store.commit(block, **{k: getattr(labels, v) for k, v in LABELS.items()})
                 timing.count += len(labels.label)
                 timing.compile_seconds += labels.compile_seconds
                 timing.run_seconds += labels.run_seconds
@@ -166,10 +168,7 @@ class LinearSweep:
 
     def map(self) -> FeasibleSetMap:
         """Return the map that the store holds."""
-        data: dict[str, Any] = {
-            field: np.asarray(self.group[name]) for name, field in STORED.items()
-        }
-        return FeasibleSetMap.of(self.problem, self.region.points, Labels.of(**data))
+        return FeasibleSetMap.of(self.problem, self.region.points, self.store.labels())
 
 
 def cache_folder() -> Path:

@@ -11,6 +11,7 @@ import numpy as np
 import tyro
 
 from jaxmpc.checks import fail
+from jaxmpc.feasible.store import Store
 from jaxmpc.robots.robot import Robot
 
 
@@ -119,3 +120,14 @@ def model_hash(robot: Robot) -> str:
     binary = np.zeros(mujoco.mj_sizeModel(robot.mujoco), np.uint8)
     mujoco.mj_saveModel(robot.mujoco, None, binary)
     return hashlib.sha256(binary.tobytes()).hexdigest()
+
+
+def report_damage(kept: Store) -> None:
+    """Say on stderr how many blocks of a store are computed again because their data are damaged or
+    missing."""
+    if kept.damaged:
+        what = "blocks that were done are" if kept.damaged > 1 else "block that was done is"
+        print(
+            f"{kept.path}: {kept.damaged:,} of {len(kept.regions):,} {what} missing or damaged, "
+            "computed again", file=sys.stderr,
+        )  # fmt: skip

@@ -8,18 +8,23 @@ from typing import Any
 
 import jax
 import numpy as np
-import zarr
 from tqdm.std import tqdm
 
-from jaxmpc.app.commands.options import check_positive, check_results, model_hash, open_folder
+from jaxmpc.app.commands.options import (
+    check_positive,
+    check_results,
+    model_hash,
+    open_folder,
+    report_damage,
+)
 from jaxmpc.app.config.states import axis_indices, grid_ends
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.robot_mpc import robot_mpc
+from jaxmpc.compiled import first_rows, padded
 from jaxmpc.control.named_terminal import named_terminal_set
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import translated
 from jaxmpc.feasible import store
-from jaxmpc.feasible.labels import ARRAYS, Labels
 from jaxmpc.feasible.map import grid
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
@@ -33,6 +38,19 @@ from jaxmpc.runs import versions, write_arrays, write_json
 
 # Points along each of two axes; total number of points for another number of axes.
 SIDE, POINTS = 32, 1024
+# What the store has of each closed loop, beside the labels.
+LOOPS = {
+    name: store.Field((), "int64", -1, (), {"long_name": text})
+    for name, text in (
+        ("broken_at", "sample at which the robot leaves its limits; -1: never"),
+        ("lost_at", "sample at which a plan is not within the limits; -1: never"),
+        ("unsolved_at", "sample at which a plan is not solved; -1: never"),
+    )
+} | {
+    "worst": store.Field((), "float64", np.nan, (), {"long_name": "most beyond a limit"}),
+    "statuses": store.Field((len(Status),), "int64", 0, ("kind",), {
+        "long_name": "number of plans by status"}),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -65,11 +83,17 @@ class RobotMapCommand:
     def run(self) -> None:
         """Make the map, write the files, print the table. Raises ValueError before it compiles."""
         begun = time.perf_counter()
-        setting, config, group = self.prepare()
+        setting, config, kept = self.prepare()
+        with kept:
+            self._run(setting, config, kept, begun)
+
+    def _run(
+        self, setting: RobotSetting, config: dict[str, Any], kept: store.Store, begun: float
+    ) -> None:
         count = len(setting.points)
         print(f"{setting.robot.name}: {count:,} states, {setting.steps} samples -> {self.output}")
-        self.label(setting, group)
-        rmap = self.map(setting, group)
+        self.label(setting, kept)
+        rmap = self.map(setting, kept)
         files = self.save(setting, rmap, config)
         print(rmap)
         if rmap.recursion is not None:
@@ -77,7 +101,7 @@ class RobotMapCommand:
         print(f"  {'total':<16} {time.perf_counter() - begun:.2f} s with set-up and files")
         print(f"  {'files':<16} {' '.join(str(self.output / name) for name in files)}")
 
-    def prepare(self) -> tuple[RobotSetting, dict[str, Any], zarr.Group]:
+    def prepare(self) -> tuple[RobotSetting, dict[str, Any], store.Store]:
         """Return the checked setting, its configuration (JSON data), and the opened store."""
         path = self.output / "robot_map.zarr"
         check_results(path, self.resume, self.overwrite)
@@ -86,7 +110,8 @@ class RobotMapCommand:
         # By default the first joint, its position and velocity.
         given = self.axes or (names[0], names[robot.n // 2])
         axes = axis_indices("--axes", "coordinate", given, names, robot.n)
-        points = self._points(robot, axes)
+        along = self._along(robot, axes)
+        points = grid([v[0] for v in along], [v[-1] for v in along], [len(v) for v in along])
         others = [i for i in range(robot.n) if i not in axes]
         if self.values is not None and len(self.values) != len(others):
             what = f"has {len(self.values)} entries where {len(others)} are needed"
@@ -123,13 +148,13 @@ class RobotMapCommand:
         open_folder(self.output, "robot_map.npz", "robot_map.png", "summary.json")
         if path.exists() and self.overwrite:
             store.remove(path)
-        shape = (robot.n, mpc.horizon, robot.m)
-        chunk = setting.chunk(None)
-        group = store.open_store(path, setting.points, _map_fields(setting), config, chunk, shape)
-        return setting, config, group
+        kept = store.open_labels(path, setting.problem, along, config, setting.chunk(None), LOOPS)
+        report_damage(kept)
+        return setting, config, kept
 
-    def _points(self, robot: Robot, axes: tuple[int, ...]) -> np.ndarray:
-        """Return the grid (B, d) over the axes. Raises ValueError for options of other sizes."""
+    def _along(self, robot: Robot, axes: tuple[int, ...]) -> list[np.ndarray]:
+        """Return the coordinates of the grid along each axis. Raises ValueError for options of
+        other sizes."""
         d = len(axes)
         shape = tuple(self.grid or ((SIDE, SIDE) if d == 2 else (int(POINTS ** (1 / d)),) * d))
         for name, value in (("grid", shape), ("lower", self.lower), ("upper", self.upper)):
@@ -138,31 +163,34 @@ class RobotMapCommand:
                 fail(f"--{name}", what, "One for each axis")
         box = robot.state_limits
         limits = lambda: tuple(np.asarray(end)[list(axes)] for end in (box.lower, box.upper))
-        return grid(*grid_ends("--", self.lower, self.upper, limits), shape)
+        ends = grid_ends("--", self.lower, self.upper, limits)
+        return [np.linspace(*line) for line in zip(*ends, shape, strict=True)]
 
-    def label(self, setting: RobotSetting, group: zarr.Group) -> None:
-        """Label the chunks that are not done, and commit each."""
-        todo = store.pending(group)
+    def label(self, setting: RobotSetting, kept: store.Store) -> None:
+        """Label the blocks that are not done, and commit each."""
+        todo = kept.pending()
         if not todo:
             return
-        slices = [store.chunk_rows(group, k) for k in todo]
-        rows = np.concatenate([np.arange(here.start, here.stop) for here in slices])
-        # Whole chunks but for the last of all, so the chunks of the rest are those of the whole.
-        size = store.chunk_rows(group, 0).stop
+        slices = [kept.rows(k) for k in todo]
+        # Blocks of one size, that of the largest: points of its own fill up a smaller one.
+        size = max(here.stop - here.start for here in slices)
+        rows = np.concatenate([padded(np.arange(here.start, here.stop), size) for here in slices])
         chunks = setting.chunks(rows, chunk=size, **self.settings)
-        with tqdm(total=len(rows), unit=" loops", disable=None) as bar:
-            for k, (_, labels, loops) in zip(todo, chunks, strict=True):
-                arrays = {name: getattr(labels, name) for name in ARRAYS}
-                store.commit(group, k, **arrays, **vars(loops))
-                bar.update(len(labels.label))
+        with tqdm(total=sum(v.stop - v.start for v in slices), unit=" loops", disable=None) as bar:
+            for k, here, (_, labels, loops) in zip(todo, slices, chunks, strict=True):
+                count = here.stop - here.start
+                first, looped = labels.first(count), first_rows(vars(loops), count)
+                arrays = {name: getattr(first, field) for name, field in store.LABELS.items()}
+                kept.commit(k, **arrays, **looped)
+                bar.update(count)
 
-    def map(self, setting: RobotSetting, group: zarr.Group) -> RobotMap:
+    def map(self, setting: RobotSetting, kept: store.Store) -> RobotMap:
         """Return the map that the store holds."""
-        data: dict[str, Any] = {name: np.asarray(group[name]) for name in _map_fields(setting)}
-        labels = Labels.of(**{name: data[name] for name in ARRAYS})
-        loops = RobotLoops(**{f.name: data[f.name] for f in fields(RobotLoops)})
+        loops = RobotLoops(**{f.name: kept.read(f.name) for f in fields(RobotLoops)})
         refine = 1e-6 if self.refine and len(setting.axes) <= 3 else None
-        return setting.map(labels, [loops], refine=refine, search_seconds=self.search_seconds)
+        return setting.map(
+            kept.labels(), [loops], refine=refine, search_seconds=self.search_seconds
+        )
 
     def save(self, setting: RobotSetting, rmap: RobotMap, config: dict[str, Any]) -> list[str]:
         """Write the files and return their names."""
@@ -207,23 +235,6 @@ class RobotMapCommand:
 
         save(plot_robot_map(rmap), self.output / "robot_map.png")
         return ["summary.json", "robot_map.npz", "robot_map.png"]
-
-
-def _map_fields(setting: RobotSetting) -> dict[str, store.Field]:
-    """Return the fields that the store has of each state: its labels and its closed loop."""
-    labels = {name: getattr(setting.none(), name) for name in ARRAYS}
-    found = {
-        name: store.Field(
-            value.shape[1:], str(value.dtype), value.flat[0],
-            tuple(f"{name}_{i}" for i in range(1, value.ndim)),
-        )
-        for name, value in labels.items()
-    }  # fmt: skip
-    for name in ("broken_at", "lost_at", "unsolved_at"):
-        found[name] = store.Field((), "int64", -1, ())
-    found["worst"] = store.Field((), "float64", np.nan, ())
-    found["statuses"] = store.Field((len(Status),), "int64", 0, ("kind",))
-    return found
 
 
 def default_mpc(robot: Robot, horizon: int, terminal: str = "none") -> MPC:

@@ -8,11 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
-import zarr
 from tqdm.std import tqdm
 
 from jaxmpc.app.commands.film import choose_renderer
-from jaxmpc.app.commands.options import Timing, check_results, model_hash, open_folder
+from jaxmpc.app.commands.options import (
+    Timing,
+    check_results,
+    model_hash,
+    open_folder,
+    report_damage,
+)
 from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
 from jaxmpc.app.config import load_robot_config
 from jaxmpc.checks import fail
@@ -40,7 +45,7 @@ class RobotRuns:
 
     command: the options, all with values. reference (n,), input_reference (m,): the target,
     at rest. steps: samples of a run. starts (B, nq + nv). variations: factors of each plant, as
-    `draw_robots` returns them. group: the store.
+    `draw_robots` returns them. kept: the store.
     """
 
     command: "Simulate"
@@ -51,7 +56,7 @@ class RobotRuns:
     steps: int
     starts: np.ndarray
     variations: dict[str, np.ndarray]
-    group: zarr.Group
+    kept: store.Store
 
     @classmethod
     def open(cls, command: "Simulate") -> "RobotRuns":
@@ -109,19 +114,22 @@ class RobotRuns:
             store.remove(path)
         steps = max(1, round(command.seconds / robot.dt))
         chunk = command.chunk or (256 if jax.default_backend() == "cpu" else 4096)
-        group = store.open_store(
-            path, starts, _run_fields(command, robot, steps), _decisive(command, robot, mpc),
-            min(chunk, command.count), (steps, robot.state_size, robot.m),
+        sample = store.Constant(np.arange(len(starts)), ("sample",), {"long_name": "robot"})
+        points = store.Constant(starts, ("sample", "state"), {"long_name": "initial state"})
+        kept = store.Store(
+            path, {"sample": sample}, _run_fields(command, robot, steps),
+            _decisive(command, robot, mpc), chunk, constants={"points": points},
         )  # fmt: skip
+        report_damage(kept)
         return cls(
-            command, robot, controller, reference, input_reference, steps, starts, variations, group
+            command, robot, controller, reference, input_reference, steps, starts, variations, kept
         )
 
     def simulate(self) -> Timing:
         """Run the chunks that are not done, and commit each."""
-        todo, timing = store.pending(self.group), Timing()
-        slices = [store.chunk_rows(self.group, k) for k in todo]
-        size = store.chunk_rows(self.group, 0).stop
+        todo, timing = self.kept.pending(), Timing()
+        slices = [self.kept.rows(k) for k in todo]
+        size = self.kept.rows(0).stop
         total = sum(rows.stop - rows.start for rows in slices)
         with tqdm(total=total, unit=" robots", disable=None) as bar:
             for index, rows in zip(todo, slices, strict=True):
@@ -141,13 +149,13 @@ class RobotRuns:
                 timing.count += count
                 run = first_rows(run, count)
                 results = {name: getattr(run, name) for name in STORED}
-                store.commit(self.group, index, **results, **factors)
+                self.kept.commit(index, **results, **factors)
                 bar.update(count)
         return timing
 
     def load(self) -> Run:
         """Return the runs in the store, as NumPy arrays."""
-        data: dict[str, Any] = {name: np.asarray(self.group[name]) for name in STORED}
+        data: dict[str, Any] = {name: self.kept.read(name) for name in STORED}
         # x_0 is measured and no limit binds it, so that there is no soft row at k = 0.
         return Run(**data | {"slack": np.zeros((*data["status"].shape, 0))})
 

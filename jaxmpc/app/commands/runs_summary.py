@@ -63,7 +63,7 @@ def summarise(runs: RobotRuns, run: Run, outcome: Outcome, timing: Timing) -> di
         "target": dict(zip(robot.state_names, runs.reference.tolist(), strict=True)),
         "target_input": dict(zip(robot.input_names, runs.input_reference.tolist(), strict=True)),
         "tolerance": dict(zip(robot.state_names, outcome.band.tolist(), strict=True)),
-        "config": runs.group.attrs["config"],
+        "config": runs.kept.attributes["config"],
         "versions": versions(),
         "device": jax.devices()[0].device_kind,
     }  # fmt: skip

@@ -63,7 +63,7 @@ class Simulate:
                      libegl-mesa0 libgl1-mesa-dri libgl1 (Debian, Ubuntu); without it no video.
       summary.json   The table's numbers, target, worst violation of each coordinate, versions.
       runs.zarr      points (the start), states, inputs, status, cost, fallback, ... of every
-                     robot. Opens with xarray.open_zarr(path, consolidated=False).
+                     robot. Opens with xarray.open_zarr(path).
       Ctrl-C         Stops; finished chunks are kept, --resume goes on from there.
       Exit code      0 done, for any outcome; 2 error (one line on stderr says which);
                      130 stopped by Ctrl-C.
@@ -152,8 +152,9 @@ class Simulate:
         runs = RobotRuns.open(command)
         robot = runs.robot
         print(f"{robot.name}: {self.count:,} robots for {self.seconds:g} s -> {self.output}")
-        timing = runs.simulate()
-        run = runs.load()
+        with runs.kept:
+            timing = runs.simulate()
+            run = runs.load()
         outcome = evaluate_runs(run, robot, runs.reference, tolerance=self.tolerance)
         files = ["runs.zarr", "summary.json", "runs.png"]
         from jaxmpc.app.plots.closed_loops import plot_runs

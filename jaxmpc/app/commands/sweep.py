@@ -44,7 +44,7 @@ class Sweep:
       sweep.zarr    Each state with its label (1 feasible, -1 infeasible, 0 undecided), its plan,
                     and the half-space cut_normal'x <= cut_offset that no feasible state leaves.
                     start holds the x_0 of the plan; bound_* the points and facets of the bounds.
-                    Opens with xarray.open_zarr(path, consolidated=False).
+                    Opens with xarray.open_zarr(path): a dimension a mapped state.
       Ctrl-C        Stops; finished chunks are kept, --resume goes on from there.
       Exit code     0 done, 2 error (one line on stderr says which), 130 stopped by Ctrl-C.
 

@@ -17,6 +17,7 @@ class SweepPoints(NamedTuple):
     points: np.ndarray  # (B, d)
     axes: tuple[int, ...]  # the d states mapped
     fixed: np.ndarray | None  # (n,) for a slice; None: all states mapped, or a projection
+    along: tuple[np.ndarray, ...]  # the coordinates along each of the d axes
 
 
 def sweep_points(config: Config) -> SweepPoints:
@@ -27,11 +28,12 @@ def sweep_points(config: Config) -> SweepPoints:
     # 256 along each of two axes; about as many points in all along more.
     shape = config.sweep.grid or (min(256, int(65_536.5 ** (1 / d))),) * d
     points = grid(lower, upper, shape)
+    along = tuple(np.linspace(*ends) for ends in zip(lower, upper, shape, strict=True))
     if config.sweep.fixed is None:
-        return SweepPoints(points, axes, None)
+        return SweepPoints(points, axes, None, along)
     fixed = np.zeros(len(config.system.A))
     fixed[[i for i in range(len(fixed)) if i not in axes]] = config.sweep.fixed
-    return SweepPoints(points, axes, fixed)
+    return SweepPoints(points, axes, fixed, along)
 
 
 def recursion_states(config: Config) -> np.ndarray | None:
