@@ -18,6 +18,7 @@ COMMANDS = {
     "recursion": ("recursion", "Recursion"),
     "info": ("info", "Info"),
     "simulate": ("simulate", "Simulate"),
+    "verify": ("verify", "Verify"),
 }
 DESCRIPTION = "Constrained MPC in batches, with proofs. Also: jaxmpc --version"
 TUNERS = {"weights": ("tune", "TuneWeights"), "penalties": ("tune_penalties", "TunePenalties")}

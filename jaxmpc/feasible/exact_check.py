@@ -1,0 +1,214 @@
+"""Check plans and half-spaces in exact arithmetic, without the code that made them.
+
+Every float is a whole number times a power of two, and so are sums and products of floats. With all
+data of a problem written as integers over one 2ᵉ, a state after k steps is integers over
+2^((k+1)e): no rounding, no tolerance. What is checked is the problem as it is stored
+(`store.plain_problem`): x⁺ = Ax + Bu + c, rows lower ≤ Hx + Du ≤ upper, and a terminal ellipsoid
+x'Px ≤ level.
+
+*Feasible* (`roll_out_exactly`): the plan, rolled out from the state, keeps every row.
+
+*Infeasible* (`beyond`): for any multipliers y_k of the rows, with the costates p_N = H_N'y_N,
+p_k = A'p_{k+1} + H_k'y_k, every trajectory satisfies
+
+    p_0'x_0 ≤ Σ_k σ(y_k) + Σ_{k<N} [ max over u of (−B'p_{k+1} − D_k'y_k)'u − c'p_{k+1} ],
+
+σ(y) = upper'y⁺ − lower'y⁻: multiply the rows by y and insert the dynamics (weak duality). A
+terminal ellipsoid adds Pv to p_N and √(level·v'Pv) to the right, for any v (Cauchy-Schwarz). A
+state beyond that half-space starts no trajectory, wherever the multipliers came from.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+UNIT_ROUNDOFF = 2.0**-53
+
+
+class Constraints:
+    """The hard constraints as float64 arrays: of each step k = 0..N the rows H[k], D[k], lower[k],
+    upper[k], D[N] being zero. `plain`: see `plain_problem`."""
+
+    def __init__(self, plain: Mapping[str, Any]) -> None:
+        """Stack the rows of each step."""
+        self.A, self.B, self.c = (np.array(plain[k], float) for k in ("A", "B", "c"))
+        self.N, self.moves = plain["horizon"], np.array(plain["moves"])
+        n, m = self.B.shape
+        bound = lambda values, none: np.array([none if v is None else v for v in values], float)
+        rows: list[list[tuple[Any, ...]]] = [[] for _ in range(self.N + 1)]
+        for b in plain["rows"]:
+            H = np.array(b["H"], float).reshape(-1, n)
+            D = np.array(b["D"], float).reshape(-1, m)
+            lower, upper = bound(b["lower"], -np.inf), bound(b["upper"], np.inf)
+            for k in b["steps"]:
+                rows[k].append((H, D if k < self.N else 0 * D, lower, upper))
+        none = np.zeros((0, n)), np.zeros((0, m)), np.zeros(0), np.zeros(0)
+        stacked = [[np.concatenate(v) for v in zip(none, *at, strict=True)] for at in rows]
+        self.H, self.D, self.lower, self.upper = (list(v) for v in zip(*stacked, strict=True))
+        ball = plain["ellipsoid"]
+        self.P = None if ball is None else np.zeros((n, n))
+        if ball is not None:
+            given = np.array(ball["P"], float)
+            self.P[: len(given), : len(given)] = given  # type: ignore[index]
+            self.level = float(np.asarray(ball["level"]))
+        others = plain["others"]
+        self.axes, self.others = np.array(plain["axes"], int), np.array(others["index"], int)
+        if "value" in others:
+            self.low = self.high = np.array(others["value"], float)
+        else:
+            self.low = bound(others.get("lower", []), -np.inf)
+            self.high = bound(others.get("upper", []), np.inf)
+
+    def input_rows(self) -> Iterator[tuple[int, int, float, float]]:
+        """Yield (move, i, lower, upper) for each row that bounds an input u_i alone."""
+        for k in range(self.N):
+            D = self.D[k]
+            alone = (self.H[k] == 0).all(axis=1) & (np.sum(D != 0, axis=1) == 1)
+            for row in np.flatnonzero(alone & (np.abs(D).sum(axis=1) == 1)):
+                i = int(np.flatnonzero(D[row])[0])
+                ends = self.lower[k][row], self.upper[k][row]
+                lower, upper = ends if D[row, i] > 0 else (-ends[1], -ends[0])
+                yield int(self.moves[k]), i, lower, upper
+
+    def exponent(self, *more: np.ndarray) -> int:
+        """Return e such that all data, and these arrays, are integers over 2ᵉ."""
+        parts = [self.A, self.B, self.c, self.low, self.high, *self.H, *self.D, *self.lower,
+                 *self.upper, *more]  # fmt: skip
+        if self.P is not None:
+            parts += [self.P, np.array(self.level)]
+        return max(0, *(_bits(v) for v in parts))
+
+
+def _bits(values: Any) -> int:
+    """Return the least e ≥ 0 for which values·2ᵉ are whole; what is not finite does not count."""
+    values = np.asarray(values, float).ravel()
+    values = values[np.isfinite(values) & (values != 0)]
+    if not len(values):
+        return 0
+    mantissa, power = np.frexp(values)
+    whole = (mantissa * 2.0**53).astype(np.int64)
+    zeros = np.log2((whole & -whole).astype(float)).astype(int)
+    return int(max(0, np.max(53 - power - zeros)))
+
+
+def integers(values: Any, e: int) -> np.ndarray:
+    """Return values·2ᵉ as an array of Python integers; ±∞ become 0."""
+    values = np.asarray(values, float)
+    mantissa, power = np.frexp(np.where(np.isfinite(values), values, 0.0))
+    whole = (mantissa * 2.0**53).astype(np.int64)
+    shift = (power + e - 53).astype(int)
+    found = [
+        int(w) << s if s >= 0 else int(w) >> -s  # what is shifted out is zero
+        for w, s in zip(whole.ravel().tolist(), shift.ravel().tolist(), strict=True)
+    ]
+    return np.array(found, object).reshape(values.shape)
+
+
+def roll_out_exactly(p: Constraints, starts: np.ndarray, plans: np.ndarray) -> np.ndarray:
+    """Return the least margin (b,) of all rows along plans (b, N, m) from states (b, n), computed
+    without rounding: negative where a plan breaks a limit."""
+    e = p.exponent(starts, plans)
+    A, B, c = (integers(v, e) for v in (p.A, p.B, p.c))
+    x, inputs = integers(starts, e), integers(plans, e)  # x_k is x / 2^((k+1)e)
+    least = np.full(len(starts), np.inf)
+    for k in range(p.N + 1):
+        u = inputs[:, k] if k < p.N else 0 * inputs[:, 0]
+        later = 1 << k * e
+        value = x @ integers(p.H[k], e).T + (u @ integers(p.D[k], e).T) * later
+        scale = 1 << (k + 2) * e
+        for bound, sign in ((p.upper[k], 1), (p.lower[k], -1)):
+            there = np.isfinite(bound)
+            room = sign * (integers(bound, e) * (later << e) - value)[:, there]
+            if room.shape[1]:
+                least = np.minimum(least, [min(row) / scale for row in room])
+        if k < p.N:
+            x = x @ A.T + (u @ B.T) * later + c * (later << e)
+    if p.P is not None:
+        square = np.sum((x @ integers(p.P, e)) * x, axis=1)  # over 2^((2N+3)e)
+        power = (2 * p.N + 3) * e
+        room = integers(p.level, e) * (1 << power - e) - square
+        least = np.minimum(least, [v / (1 << power) for v in room])
+    return least
+
+
+def roll_out(p: Constraints, starts: np.ndarray, plans: np.ndarray) -> np.ndarray:
+    """Return the same in float64, less a bound on its rounding: at least so much room is left."""
+    n, m = p.B.shape
+    gamma = 4 * (n + m + 2) * UNIT_ROUNDOFF
+    x, error, least = starts, np.zeros_like(starts), np.full(len(starts), np.inf)
+    for k in range(p.N + 1):
+        u = plans[:, k] if k < p.N else 0 * plans[:, 0]
+        value = x @ p.H[k].T + u @ p.D[k].T
+        size = np.abs(x) @ np.abs(p.H[k]).T + np.abs(u) @ np.abs(p.D[k]).T
+        off = error @ np.abs(p.H[k]).T + gamma * (size + np.abs(value))
+        room = np.minimum(p.upper[k] - value, value - p.lower[k]) - off
+        least = np.minimum(least, room.min(axis=1, initial=np.inf))
+        if k < p.N:
+            size = np.abs(x) @ np.abs(p.A).T + np.abs(u) @ np.abs(p.B).T + np.abs(p.c)
+            error = 1.01 * error @ np.abs(p.A).T + gamma * size
+            x = x @ p.A.T + u @ p.B.T + p.c
+    if p.P is not None:
+        whole = np.abs(x) + error
+        square = np.einsum("bi,ij,bj->b", x, p.P, x)
+        off = np.einsum("bi,ij,bj->b", whole, np.abs(p.P), error * 2 + gamma * n * whole)
+        least = np.minimum(least, p.level - square - off - gamma * p.level)
+    return least
+
+
+def beyond(
+    p: Constraints, y: list[np.ndarray], points: np.ndarray, box: tuple[np.ndarray, ...]
+) -> np.ndarray:
+    """Return by how much points (b, d) violate the half-space that multipliers imply, relative to
+    the largest entry of its normal; −∞ where it implies none. Computed without rounding.
+
+    y: of the rows of each step, y > 0 on the upper bound and y < 0 on the lower; then, of a
+    terminal ellipsoid, the vector v of v'Px ≤ √(level·v'Pv). box: lower and upper bounds (moves, m)
+    of the inputs and of the states that are not mapped, ±∞ where there are none.
+    """
+    n, (low, high, others_low, others_high) = len(p.A), box
+    e = p.exponent(points, *box, *y)
+    A, B, c = (integers(v, e) for v in (p.A, p.B, p.c))
+    # Sums are over 2^top. The costate p_k is over 2^((N−k+2)e): each step multiplies by A.
+    top, total = (p.N + 4) * e, 0
+    costate, slopes = np.zeros(n, object), np.zeros(low.shape, object)
+    for k in range(p.N, -1, -1):
+        weight = np.where(np.isinf(p.upper[k]), np.minimum(y[k], 0.0), y[k])
+        weight = np.where(np.isinf(p.lower[k]), np.maximum(weight, 0.0), weight)
+        w = integers(weight, e)
+        bound = np.where(weight > 0, p.upper[k], np.where(weight < 0, p.lower[k], 0.0))
+        total += int(w @ integers(bound, e)) << top - 2 * e
+        if k < p.N:
+            total -= int(costate @ c) << top - (p.N - k + 2) * e
+            slopes[p.moves[k]] -= (costate @ B) * (1 << top - e - (p.N - k + 2) * e)
+            slopes[p.moves[k]] -= (w @ integers(p.D[k], e)) * (1 << top - 3 * e)
+            costate = costate @ A
+        elif p.P is not None:
+            v, P = integers(y[-1], e), integers(p.P, e)
+            # level·v'Pv is over 2^(4e), its root over 2^(2e), rounded up.
+            square = int(v @ P @ v) * int(integers(p.level, e))
+            root = math.isqrt(max(square, 0))
+            total += root + (root * root < square) << top - 2 * e
+            costate = costate + v @ P
+        costate = costate + (w @ integers(p.H[k], e)) * (1 << (p.N - k) * e)
+    costate = costate * (1 << e)  # now over 2^(top − e), as the slopes are
+    for normal, lower, upper in (
+        *zip(slopes.ravel(), low.ravel(), high.ravel(), strict=True),
+        *zip(-costate[p.others], others_low, others_high, strict=True),
+    ):
+        worth = upper if normal > 0 else lower
+        if normal and not np.isfinite(worth):
+            return np.full(len(points), -np.inf)
+        total += int(normal) * int(integers(worth, e)) if normal else 0
+    normal = costate[p.axes]
+    largest = max(abs(int(v)) for v in normal)
+    if not largest:  # 0'θ ≤ b excludes every θ if b < 0
+        return np.full(len(points), np.inf if total < 0 else -np.inf)
+    left = integers(points, e) @ normal - total
+    return np.array([_ratio(int(v), largest << e) for v in left])
+
+
+def _ratio(over: int, under: int) -> float:
+    """Return over / under, not rounded to zero."""
+    return over / under or math.copysign(5e-324, over) * (over != 0)

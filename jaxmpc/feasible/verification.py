@@ -1,0 +1,316 @@
+"""Prove the labels of a stored map again, from what is stored alone.
+
+Multipliers that prove a state infeasible come from linear programs solved by HiGHS, in the
+direction of the stored half-space or, failing that, of least violation at the state. They need not
+be accurate: `exact_check.beyond` evaluates what they imply exactly. One half-space serves all
+states that it excludes.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.optimize import linprog
+from tqdm.std import tqdm
+
+from jaxmpc.checks import fail
+from jaxmpc.feasible.exact_check import Constraints, beyond, roll_out, roll_out_exactly
+from jaxmpc.feasible.store import read
+from jaxmpc.qp.status import Status
+
+# Tangents to a terminal ellipsoid that a linear program gets at most.
+TANGENTS = 30
+TOLERANCES = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+
+
+@dataclass
+class Verification:
+    """What was verified of a store.
+
+    labels: number of stored labels of each kind. verified: how many of the decided ones are proved.
+    exactly: how many of these in exact arithmetic. margin: the least margin of a limit along a
+    plan, in the units of that limit; excess: the least by which an infeasible state lies beyond its
+    half-space, relative to the largest entry of the normal; ∞ where there are none. failures: index
+    of each state whose label is not proved, with the reason. problems: what is wrong with the
+    store.
+    """
+
+    labels: dict[str, int]
+    verified: int = 0
+    exactly: int = 0
+    margin: float = np.inf
+    excess: float = np.inf
+    failures: dict[int, str] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+
+    @property
+    def passed(self) -> bool:
+        """Return whether the store is sound and each of its labels is proved."""
+        return not self.failures and not self.problems
+
+
+def verify(
+    path: str | Path, *, exact: bool = False, sample: int = 1000, seed: int = 0,
+    progress: bool = False,
+) -> Verification:  # fmt: skip
+    """Prove every label of a stored map again, from its plans, half-spaces and problem.
+
+    path: a store that `jaxmpc sweep` or `jaxmpc recursion --robot` made, or the folder that holds
+    one. exact: all plans in exact arithmetic, else a random sample of them and those with margins
+    near rounding, the others in float64; half-spaces are exact always. Nothing is written. Raises
+    ValueError where there is no store.
+    """
+    path = Path(path)
+    found = read(find_store(path))
+    label, status = found.arrays.get("label"), found.arrays.get("status")
+    result = Verification({}, problems=list(found.problems))
+    if found.done < found.blocks:
+        left = found.blocks - found.done
+        result.problems.append(f"{left} of {found.blocks} blocks are not done: resume the sweep")
+    needed = ("label", "status", "start", "plan", "cut_normal")
+    missing = [name for name in needed if name not in found.arrays]
+    if missing or not found.axes or "problem" not in found.attributes:
+        result.problems.append(f"cannot be verified without {missing or 'its problem'}")
+        return result
+    assert label is not None and status is not None
+    names = {1: "feasible", -1: "infeasible", 0: "undecided"}
+    result.labels = {name: int(np.sum(label == value)) for value, name in names.items()}
+    expected = {1: Status.SOLVED, -1: Status.PRIMAL_INFEASIBLE}
+    points, problem = found.points, found.attributes["problem"]
+    if len(points) != len(label):
+        result.problems.append(f"{len(label)} labels for {len(points)} states")
+        return result
+    for i in np.flatnonzero(~np.isin(label, list(names))):
+        result.failures[int(i)] = f"label {label[i]} means nothing"
+    for value, name in expected.items():
+        for i in np.flatnonzero((label == value) & (status != name)):
+            result.failures[int(i)] = f"label {value} with status {status[i]}"
+    p = Constraints(problem)
+    feasible, infeasible = np.flatnonzero(label == 1), np.flatnonzero(label == -1)
+    hidden = None if progress else True  # None: where stderr is no terminal
+    with tqdm(total=len(feasible) + len(infeasible), unit=" labels", disable=hidden) as bar:
+        _verify_feasible(p, points, found.arrays, feasible, exact, sample, seed, result, bar)
+        _verify_infeasible(p, points, found.arrays, infeasible, result, bar)
+    _compare_half_spaces(points, found.arrays, feasible, infeasible, result)
+    return result
+
+
+def _compare_half_spaces(
+    points: np.ndarray, arrays: Mapping[str, np.ndarray], feasible: np.ndarray,
+    infeasible: np.ndarray, result: Verification,
+) -> None:  # fmt: skip
+    """Look for stored half-spaces that contradict the labels: that do not exclude their own state,
+    or exclude a feasible one or a proved boundary point."""
+    normals, offsets = arrays["cut_normal"][infeasible], arrays["cut_offset"][infeasible]
+    known = np.isfinite(offsets)
+    inside = known & ~(np.sum(normals * points[infeasible], axis=1) > offsets)
+    result.failures |= {int(i): "its half-space does not exclude it" for i in infeasible[inside]}
+    size = np.abs(normals).max(axis=1, initial=0.0, where=np.isfinite(normals))
+    known &= size > 0
+    H, h = normals[known] / size[known, None], offsets[known] / size[known]
+    _, first = np.unique(np.round(np.column_stack([H, h]), 9), axis=0, return_index=True)
+    H, h = H[first], h[first]
+    if "bound_normal" in arrays:
+        H, h = np.concatenate([H, arrays["bound_normal"]]), np.append(h, arrays["bound_offset"])
+    kept = points[feasible]
+    if "bound_point" in arrays:
+        kept = np.concatenate([kept, arrays["bound_point"]])
+    for i in range(0, len(H), 256):
+        off = np.max(kept @ H[i : i + 256].T - h[i : i + 256], axis=0, initial=-np.inf)
+        reach = np.abs(kept).max(axis=0, initial=0.0) @ np.abs(H[i : i + 256]).T
+        for j in np.flatnonzero(off > 1e-12 * (reach + np.abs(h[i : i + 256]))):
+            what = f"half-space {H[i + j].tolist()} x <= {h[i + j]:.9g}"
+            result.problems.append(f"{what} excludes a feasible state by {off[j]:.3g}")
+
+
+def find_store(path: Path) -> Path:
+    """Return the store at `path` or in that folder."""
+    if (path / "zarr.json").exists():
+        return path
+    inside = [path / name for name in ("sweep.zarr", "robot_map.zarr") if (path / name).exists()]
+    if len(inside) != 1:
+        what = "holds two stores" if inside else "holds no store of labels"
+        fail(str(path), what, "Give the folder of a sweep, or a .zarr folder")
+    return inside[0]
+
+
+def _verify_feasible(
+    p: Constraints, points: np.ndarray, arrays: Mapping[str, np.ndarray], where: np.ndarray,
+    exact: bool, sample: int, seed: int, result: Verification, bar: Any,
+) -> None:  # fmt: skip
+    """Verify the plans of states `where`."""
+    same = np.searchsorted(p.moves, p.moves)
+    for i in range(0, len(where), 4096):
+        here = where[i : i + 4096]
+        starts, plans = arrays["start"][here], arrays["plan"][here]
+        known = np.isfinite(starts).all(axis=1) & np.isfinite(plans).all(axis=(1, 2))
+        others = starts[:, p.others]
+        fits = {
+            "the start of its plan is another state": (starts[:, p.axes] == points[here]).all(1)
+            & ((others >= p.low) & (others <= p.high)).all(axis=1),
+            "inputs that a control horizon holds differ": (plans == plans[:, same]).all((1, 2)),
+        }
+        fits = {"it has no plan": known} | {k: v | ~known for k, v in fits.items()}
+        for reason, fine in fits.items():
+            result.failures |= {int(j): reason for j in here[~fine]}
+        margin = np.where(known, 0.0, -np.inf)
+        margin[known] = roll_out(p, starts[known], plans[known])
+        draw = np.random.default_rng([seed, i]).random(len(here)) * len(where) < sample
+        again = known & (exact | draw | ~(margin > 0))
+        margin[again] = roll_out_exactly(p, starts[again], plans[again])
+        result.failures |= {
+            int(j): f"its plan breaks a limit by {-v:.3g}"
+            for j, v in zip(here[again], margin[again], strict=True) if v < 0
+        }  # fmt: skip
+        good = [j for j, at in enumerate(here) if int(at) not in result.failures]
+        result.verified += len(good)
+        result.exactly += int(np.sum(again[good]))
+        result.margin = min(result.margin, margin[good].min(initial=np.inf))
+        bar.update(len(here))
+
+
+def _verify_infeasible(
+    p: Constraints, points: np.ndarray, arrays: Mapping[str, np.ndarray], where: np.ndarray,
+    result: Verification, bar: Any,
+) -> None:  # fmt: skip
+    """Verify that no trajectory starts at states `where`."""
+    where = np.array([i for i in where if int(i) not in result.failures], int)
+    program, left = Programs(p), np.ones(len(where), bool)
+    box = program.boxes() if len(where) else ()
+    while left.any():
+        first = int(np.flatnonzero(left)[0])
+        normal = arrays["cut_normal"][where[first]]
+        excess = np.full(len(where), -np.inf)
+        for y in program.multipliers(points[where[first]], normal):
+            excess[left] = beyond(p, y, points[where[left]], box)
+            if excess[first] > 0:
+                break
+        out = left & (excess > 0)
+        if not out[first]:
+            result.failures[int(where[first])] = "no half-space is found that excludes it"
+            left[first] = False
+            bar.update(1)
+        if out.any():
+            result.verified += int(out.sum())
+            result.exactly += int(out.sum())
+            result.excess = min(result.excess, excess[out].min())
+        left &= ~out
+        bar.update(int(out.sum()))
+
+
+class Programs:
+    """Linear programs over all trajectories, v = (x_0, …, x_N, moves)."""
+
+    def __init__(self, p: Constraints) -> None:
+        """Assemble the equations of motion and the rows."""
+        self.p, (n, m) = p, p.B.shape
+        self.states, self.count = n * (p.N + 1), n * (p.N + 1) + m * (int(p.moves.max()) + 1)
+        motion = sp.lil_matrix((n * p.N, self.count))
+        parts, bounds, self.place = [], [], []
+        for k in range(p.N + 1):
+            x = slice(k * n, (k + 1) * n)
+            block = sp.lil_matrix((len(p.H[k]), self.count))
+            block[:, x] = p.H[k]
+            if k < p.N:
+                u = slice(self.states + p.moves[k] * m, self.states + (p.moves[k] + 1) * m)
+                block[:, u] = p.D[k]
+                motion[k * n : (k + 1) * n, x] = -p.A
+                motion[k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = np.eye(n)
+                motion[k * n : (k + 1) * n, u] = -p.B
+            for bound, sign in ((p.upper[k], 1.0), (p.lower[k], -1.0)):
+                there = np.flatnonzero(np.isfinite(bound))
+                parts.append(sign * block.tocsr()[there])
+                bounds.append(sign * bound[there])
+                self.place += [(k, int(i), sign) for i in there]
+        self.motion, self.drift = motion.tocsr(), np.tile(p.c, p.N)
+        self.rows, self.bounds = sp.vstack(parts).tocsr(), np.concatenate(bounds)
+        self.tangents: list[np.ndarray] = []
+        if p.P is not None:  # its box
+            there = np.flatnonzero(np.diag(p.P))
+            inverse = np.linalg.inv(p.P[np.ix_(there, there)])
+            box = np.zeros((len(there), n))
+            box[:, there] = inverse
+            self.tangents = [*box, *-box]
+
+    def solve(self, cost: np.ndarray, theta: np.ndarray | None = None) -> Any:
+        """Return the least cost'v over all trajectories; with theta (d,) the least violation t of
+        the rows over those from there instead."""
+        p, n = self.p, len(self.p.A)
+        elastic = theta is not None
+        variables = [(None, None)] * self.count
+        for i, lower, upper in zip(p.others, p.low, p.high, strict=True):
+            variables[i] = (max(lower, -1e300), min(upper, 1e300))
+        for i, value in zip(p.axes, [] if theta is None else theta, strict=False):
+            variables[i] = (value, value)
+        for _ in range(TANGENTS):
+            rows, bounds = self.rows, self.bounds
+            if self.tangents:
+                v = np.array(self.tangents) @ p.P
+                extra = sp.lil_matrix((len(v), self.count))
+                extra[:, self.states - n : self.states] = v
+                values = np.sqrt(p.level * np.sum(v * np.array(self.tangents), axis=1))
+                rows, bounds = sp.vstack([rows, extra]), np.append(bounds, values)
+            motion = self.motion
+            if elastic:
+                rows = sp.hstack([rows, -np.ones((rows.shape[0], 1))])
+                motion = sp.hstack([motion, np.zeros((motion.shape[0], 1))])
+            found = linprog(
+                np.append(np.zeros(self.count), 1.0) if elastic else cost, rows, bounds, motion,
+                self.drift, [*variables, (None, None)] if elastic else variables, method="highs-ds",
+                options=TOLERANCES,
+            )  # fmt: skip
+            if found.status != 0 or p.P is None:
+                return found
+            last = found.x[self.states - n : self.states]
+            if last @ p.P @ last <= p.level * (1 + 1e-9):
+                return found
+            self.tangents.append(last)
+        return found
+
+    def multipliers(self, theta: np.ndarray, normal: np.ndarray) -> Iterator[list[np.ndarray]]:
+        """Yield multipliers of the rows: of the largest normal'θ, then of the least violation from
+        theta."""
+        p = self.p
+        for direct in (True, False):
+            if direct and not (np.all(np.isfinite(normal)) and np.any(normal)):
+                continue
+            cost = np.zeros(self.count)
+            cost[p.axes] = -normal / np.abs(normal).max() if direct else 0.0
+            found = self.solve(cost, None if direct else theta)
+            if found.status != 0:
+                continue
+            values = -found.ineqlin.marginals
+            values[np.abs(values) < 1e-13 * np.abs(values).max(initial=0.0)] = 0.0
+            y = [np.zeros(len(rows)) for rows in p.lower]
+            for (k, i, sign), value in zip(self.place, values, strict=False):
+                y[k][i] += sign * value
+            if p.P is not None:
+                weights = values[len(self.place) :]
+                y.append(weights @ np.array(self.tangents[: len(weights)]))
+            yield y
+
+    def boxes(self) -> tuple[np.ndarray, ...]:
+        """Return lower and upper bounds (moves, m) of the inputs and of the states that are not
+        mapped: the limits on each alone, and where there are none those of linear programs over all
+        trajectories, enlarged by a part in 10⁶ of their size; ±∞ where there are none."""
+        p = self.p
+        size = int(p.moves.max()) + 1, p.B.shape[1]
+        low, high = np.full(size, -np.inf), np.full(size, np.inf)
+        for move, i, least, most in p.input_rows():
+            low[move, i], high[move, i] = max(low[move, i], least), min(high[move, i], most)
+        found = low.ravel(), high.ravel(), p.low.copy(), p.high.copy()
+        place = np.arange(self.states, self.count), p.others
+        for (lower, upper), entries in zip((found[:2], found[2:]), place, strict=True):
+            for j in np.flatnonzero(~(np.isfinite(lower) & np.isfinite(upper))):
+                ends = []
+                for sign in (1.0, -1.0):
+                    cost = np.zeros(self.count)
+                    cost[entries[j]] = sign
+                    best = self.solve(cost)
+                    ends.append(sign * best.fun if best.status == 0 else -sign * np.inf)
+                room = 1e-6 * np.max(np.abs(ends), initial=0.0, where=np.isfinite(ends))
+                lower[j], upper[j] = max(lower[j], ends[0] - room), min(upper[j], ends[1] + room)
+        return found[0].reshape(size), found[1].reshape(size), found[2], found[3]
