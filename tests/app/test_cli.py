@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from importlib.metadata import version
 import numpy as np
 import pytest
 import xarray as xr
+import zarr
 
 from jaxmpc.app import cli
 from jaxmpc.app.commands import linear_sweep, recursion
@@ -40,8 +42,9 @@ def test_sweep_writes_files_and_table(tmp_path, capsys):
     out = capsys.readouterr().out
     folder = tmp_path / "jaxmpc-sweep"
     assert {path.name for path in folder.iterdir()} == {"sweep.zarr", "map.png", "summary.json"}
-    data = xr.open_zarr(folder / "sweep.zarr", consolidated=False)
-    assert data["label"].shape == (192,) and data["plan"].shape == (192, 5, 1)
+    data = xr.open_zarr(folder / "sweep.zarr")
+    assert data["label"].shape == (16, 12) and data["plan"].shape == (16, 12, 5, 1)
+    assert data["label"].dims == ("q", "dq") and data["q"].attrs["units"] == "rad"
     summary = json.loads((folder / "summary.json").read_text())
     labels = data["label"].values
     feasible, infeasible = np.count_nonzero(labels == 1), np.count_nonzero(labels == -1)
@@ -57,8 +60,35 @@ def test_sweep_writes_files_and_table(tmp_path, capsys):
     for word in ("feasible", "undecided", "area from", "rad·rad/s", "QPs/s", "map.png"):
         assert word in out
     # States beyond the limits |q| <= 1.5, |dq| <= 2 are never feasible.
-    beyond = np.any(np.abs(data["points"].values) > [1.5, 2.0], axis=1)
-    assert np.all(labels[beyond] == -1)
+    assert np.all(labels[np.abs(data["q"].values) > 1.5] == -1)
+    assert np.all(labels[:, np.abs(data["dq"].values) > 2.0] == -1)
+    assert run("verify jaxmpc-sweep --exact") == 0
+    assert "192 of 192, 192 exactly" in capsys.readouterr().out
+
+
+def test_damage_is_repaired_by_resume_and_found_by_verify(tmp_path, capsys):
+    """Flipped labels are no longer printed as fact, nor a missing chunk as a smaller count."""
+    line = "sweep --grid 16 12 --horizon 5"
+    assert run(line) == 0
+    path = tmp_path / "jaxmpc-sweep" / "sweep.zarr"
+    summary = json.loads((path.parent / "summary.json").read_text())
+    label = zarr.open_group(path, mode="r+", use_consolidated=False)["label"]
+    label[3, 4:9] = -label[3, 4:9]
+    assert run("verify jaxmpc-sweep") == 1
+    out = capsys.readouterr().out
+    assert "NOT VERIFIED" in out and "FAILS: block 0" in out
+    assert "FAILS: state 40" in out and "FAILS: state 44" in out
+    assert run(f"{line} --resume") == 0
+    assert "1 of 1 block that was done is missing or damaged" in capsys.readouterr().err
+    shutil.rmtree(path / "plan" / "c")
+    assert run(f"{line} --resume") == 0
+    again = json.loads((path.parent / "summary.json").read_text())
+    assert again["counts"] == summary["counts"]
+    assert run("verify jaxmpc-sweep") == 0
+    (path / "zarr.json").write_text("{")
+    assert run(f"{line} --resume") == 2
+    assert "metadata cannot be read. Overwrite it" in capsys.readouterr().err
+    assert run(f"{line} --overwrite") == 0
 
 
 @pytest.mark.slow
@@ -122,8 +152,9 @@ def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsy
     monkeypatch.setattr(linear_sweep, "label_chunks", counted)
     resume = "sweep --grid 16 12 --horizon 5 --output 'my maps' --resume"
     assert run(resume) == 0
-    data = xr.open_zarr(tmp_path / "my maps" / "sweep.zarr", consolidated=False)
-    np.testing.assert_array_equal(asked[0], data["points"][50:])
+    data = xr.open_zarr(tmp_path / "my maps" / "sweep.zarr")
+    points = np.stack(np.meshgrid(data["q"], data["dq"], indexing="ij"), axis=-1)
+    np.testing.assert_array_equal(asked[0], points.reshape(-1, 2)[48:])
     assert np.all(data["status"] != 0)
     assert run(resume) == 0 and len(asked) == 1
 

@@ -84,8 +84,8 @@ def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
     out = capsys.readouterr().out
     assert f"jaxmpc simulate {LINE} --output 'my runs' --resume" in out
     folder = tmp_path / "my runs"
-    first = xr.open_zarr(folder / "runs.zarr", consolidated=False).load()
-    assert np.isfinite(first["states"][:4]).all() and np.isnan(first["states"][4:]).all()
+    first = xr.open_zarr(folder / "runs.zarr").load()
+    assert np.isfinite(first["states"][:3]).all() and np.isnan(first["states"][3:]).all()
     assert not (folder / "summary.json").exists()
 
     assert run(f"{LINE} --output 'my runs' --resume --seed 1") == 2
@@ -97,8 +97,8 @@ def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
     assert "no video: MuJoCo finds no renderer" in captured.err and "libegl1" in captured.err
     assert {p.name for p in folder.iterdir()} == {"runs.zarr", "runs.png", "summary.json"}
 
-    data = xr.open_zarr(folder / "runs.zarr", consolidated=False).load()
-    np.testing.assert_array_equal(data["states"][:4], first["states"][:4])
+    data = xr.open_zarr(folder / "runs.zarr").load()
+    np.testing.assert_array_equal(data["states"][:3], first["states"][:3])
     x, u = (data[name].values.astype(float) for name in ("states", "inputs"))
     assert x.shape == (6, 41, 2) and u.shape == (6, 40, 1)
     np.testing.assert_allclose(x[:, 0], data["points"], atol=1e-6)
@@ -126,7 +126,7 @@ def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
     assert summary["plans_valid"] == (solved & ~fallback).all(axis=1).sum()
     cost = np.sum((x[:, :-1] ** 2) @ [1 / 1.5**2, 0.01 / 4] + 0.01 / 4 * u[:, :, 0] ** 2, axis=1)
     assert summary["cost"]["median"] == pytest.approx(np.sort(cost)[3], rel=1e-4)
-    assert summary["this_run"]["count"] == 2 and summary["config"]["horizon"] == 10
+    assert summary["this_run"]["count"] == 3 and summary["config"]["horizon"] == 10
     table = rows(captured.out)
     assert table["success"].startswith(f"{summary['success']}  ")
     assert table["limits kept"].startswith(f"{kept.sum()}  ")
@@ -151,7 +151,7 @@ def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
 def test_other_robots_and_laws(tmp_path, capsys, arguments):
     assert run(f"{arguments} --count 3 --seconds 0.1 --output out --video 0") == 0
     table = rows(capsys.readouterr().out)
-    data = xr.open_zarr(tmp_path / "out" / "runs.zarr", consolidated=False).load()
+    data = xr.open_zarr(tmp_path / "out" / "runs.zarr").load()
     assert np.isfinite(data["states"]).all()
     if "lqr" in arguments:
         assert "plans solved" not in table and "control steps/s" in table["run"]
