@@ -355,9 +355,8 @@ class Store:
             self._create_array(self.group, name)
         if renewed:
             _consolidate(self.path)
+        self.damaged = len(self.regions) if "checksum" in renewed else 0
         marks, sums = _array(self.group, "checksum"), self._checksums()
-        lost = "checksum" in renewed
-        self.damaged = len(self.regions) if lost else 0
         for block in np.flatnonzero(sums):
             if sums[block] != self._checksum(int(block)):
                 marks[int(block)] = 0

@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from importlib.metadata import version
 
 import numpy as np
@@ -393,3 +394,71 @@ def test_version_and_module_entry():
     command = [sys.executable, "-m", "jaxmpc", "--version"]
     out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert out == f"jaxmpc {version('jaxmpc')}\n"
+
+
+FAULTS = """
+import sys, errno, zarr
+from jaxmpc.app import cli
+fail_at = int(sys.argv[1])
+write, count = zarr.Array.__setitem__, 0
+
+def limited(array, where, value):
+    global count
+    count += 1
+    if count > fail_at:
+        raise OSError(errno.ENOSPC, "No space left on device")
+    write(array, where, value)
+
+zarr.Array.__setitem__ = limited
+sys.exit(cli.main(sys.argv[2:]))
+"""
+
+
+def test_a_full_disk_is_one_line_and_resume_goes_on(tmp_path, capsys):
+    """While the store is made, and while a block is written."""
+    line = "sweep --grid 16 12 --horizon 5 --no-refine"
+    for count in (2, 9):
+        command = [sys.executable, "-c", FAULTS, str(count), *shlex.split(line), "--overwrite"]
+        found = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+        assert found.returncode == 2 and found.stderr.count("\n") <= 2
+        assert found.stderr.splitlines()[-1] == (
+            "jaxmpc: error: [Errno 28] No space left on device"
+        )
+    assert run(f"{line} --resume") == 0
+    assert run("verify jaxmpc-sweep") == 0
+    assert [p.name for p in tmp_path.glob("jaxmpc-sweep/.*")] == []
+
+
+def test_two_processes_on_one_folder(tmp_path, capsys):
+    line = "sweep --grid 16 12 --horizon 5 --no-refine"
+    first = linear_sweep.store._Lock(tmp_path / "jaxmpc-sweep")
+    assert run(line) == 2
+    assert "another process writes there" in capsys.readouterr().err
+    first.release()
+    assert run(line) == 0
+
+
+@pytest.mark.slow
+def test_fifty_kills_at_random_moments(tmp_path):
+    """Arrays after resume are those of a run that nobody killed."""
+    line = "sweep --grid 130 257 --horizon 4 --no-refine --output"
+    command = [sys.executable, "-m", "jaxmpc", *line.split()]
+    subprocess.run([*command, "whole"], check=True, cwd=tmp_path, capture_output=True)
+    random = np.random.default_rng(0)
+    for k in range(50):
+        more = ["--resume"] if (tmp_path / "killed" / "sweep.zarr").exists() else []
+        if k % 10 == 0:
+            shutil.rmtree(tmp_path / "killed", ignore_errors=True)
+            more = []
+        with subprocess.Popen(
+            [*command, "killed", *more], cwd=tmp_path, stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        ) as process:  # fmt: skip
+            time.sleep(random.uniform(1, 6))
+            process.kill()
+    more = ["--resume"] if (tmp_path / "killed" / "sweep.zarr").exists() else []
+    subprocess.run([*command, "killed", *more], check=True, cwd=tmp_path, capture_output=True)
+    whole, killed = (
+        xr.open_zarr(tmp_path / name / "sweep.zarr").load() for name in ("whole", "killed")
+    )
+    xr.testing.assert_identical(whole, killed)

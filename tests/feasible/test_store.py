@@ -211,6 +211,10 @@ class TestDamage:
         shutil.rmtree(full / name)
         self.repaired(full, [0, 1, 2])
 
+    def test_a_garbled_checksum(self, full):
+        array_files(full, "checksum/c")[1].write_bytes(b"garbled")
+        self.repaired(full, [1])
+
     def test_garbled_metadata_of_an_array(self, full):
         (full / "label" / "zarr.json").write_text("{")
         self.repaired(full, [0, 1, 2])

@@ -82,10 +82,10 @@ def test_proves_all_labels(tmp_path, name):
         assert found.margin >= 0 and found.excess > 0
 
 
-def test_roll_out_is_that_of_fractions():
+@pytest.mark.parametrize("name", ["terminal polytope", "terminal ellipsoid"])
+def test_roll_out_is_that_of_fractions(name):
     """Each margin to the last digit, and the bound of float64 below it."""
-    problem = FeasibilityProblem.of(mpc(terminal_set=diamond(0.5)))
-    p = Constraints(store.plain_problem(problem))
+    p = Constraints(store.plain_problem(FeasibilityProblem.of(PROBLEMS[name][0])))
     random = np.random.default_rng(0)
     starts, plans = random.normal(size=(4, 2)), random.normal(size=(4, 5, 1))
     exact = lambda v: np.vectorize(Fraction, otypes=[object])(v)
@@ -100,7 +100,31 @@ def test_roll_out_is_that_of_fractions():
                 least += [Fraction(b) - value for b in (upper,) if np.isfinite(b)]
                 least += [value - Fraction(b) for b in (lower,) if np.isfinite(b)]
             x = exact(p.A) @ x + exact(p.B) @ u[k] + exact(p.c) if k < 5 else x
+        if p.P is not None:
+            least.append(Fraction(p.level) - x @ exact(p.P) @ x)
         assert float(min(least)) == margin
+
+
+def test_rows_that_bound_an_input_alone():
+    plain = store.plain_problem(FeasibilityProblem.of(mpc()))
+    plain["rows"][0] = {
+        "steps": [0, 2], "H": [[0.0, 0.0], [0.0, 0.0], [0.0, 1.0]], "D": [[-1.0], [2.0], [1.0]],
+        "lower": [-3.0, -1.0, -1.0], "upper": [None, 1.0, 1.0],
+    }  # fmt: skip
+    found = list(Constraints(plain).input_rows())
+    assert found == [(0, 0, -np.inf, 3.0), (2, 0, -np.inf, 3.0)]
+
+
+def test_an_empty_set(tmp_path):
+    """No state at all has a plan: the half-space 0'x ≤ b, b < 0, says so."""
+    problem = mpc(terminal_set=jm.Box([5.0, 5.0], [6.0, 6.0]))
+    labels = stored(tmp_path / "sweep.zarr", problem, None, None, side=4)
+    assert np.all(labels.label == -1)
+    found = verify(tmp_path)
+    assert found.passed and found.verified == 20
+    p = Constraints(store.plain_problem(FeasibilityProblem.of(problem)))
+    zero, box = [np.zeros(len(rows)) for rows in p.lower], Programs(p).boxes()
+    assert np.all(beyond(p, zero, np.zeros((3, 2)), box) == -np.inf)
 
 
 def test_integers():
