@@ -18,7 +18,6 @@ from tqdm.std import tqdm
 
 from jaxmpc.checks import fail
 from jaxmpc.feasible.exact_check import Constraints, beyond, roll_out, roll_out_exactly
-from jaxmpc.feasible.store import read
 from jaxmpc.qp.status import Status
 
 # Tangents to a terminal ellipsoid that a linear program gets at most.
@@ -63,6 +62,8 @@ def verify(
     near rounding, the others in float64; half-spaces are exact always. Nothing is written. Raises
     ValueError where there is no store.
     """
+    from jaxmpc.feasible.store import read  # zarr takes longer to import than most reads
+
     path = Path(path)
     found = read(find_store(path))
     label, status = found.arrays.get("label"), found.arrays.get("status")
