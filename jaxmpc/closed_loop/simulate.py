@@ -59,6 +59,9 @@ def checked_arguments(
     """Return the traced arguments of `_simulate`; raise ValueError where one is wrong."""
     if isinstance(controller, LinearFeedback):
         controller.validate()
+    if not hasattr(controller, "mpc"):
+        what = f"is a {type(controller).__name__}"
+        fail("controller", what, "Give a Controller, RobotController or LinearFeedback")
     mpc = controller.mpc
     N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
     size = controller.state_size

@@ -36,7 +36,7 @@ def simulate_many(
     Raises ValueError as `simulate` does.
     """
     if np.ndim(x0s) != 2 or not len(x0s):
-        fail("x0s", f"shape {np.shape(x0s)}", f"Give (B, {controller.state_size}), B ≥ 1")
+        fail("x0s", f"shape {np.shape(x0s)}", "Give states (B, n), B ≥ 1")
     x0s, variations = np.asarray(x0s), dict(variations or {})
     require_variations(plant, variations, len(x0s))
     if chunk is not None and chunk < 1:

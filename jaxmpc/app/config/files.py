@@ -12,12 +12,15 @@ from jaxmpc.checks import fail
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """Return what a file holds. Raises ValueError where it cannot be read or is no TOML."""
+    """Return what a file holds, with or without a byte-order mark. Raises ValueError where it
+    cannot be read or is no TOML."""
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         fail(str(path), f"cannot be read ({error.strerror})", "Give the path of a TOML file")
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except RecursionError:
+        fail(str(path), "is nested too deeply", "No key takes more than rows of numbers")
+    except ValueError as error:  # no TOML, no UTF-8, or a number of thousands of digits
         fail(str(path), f"is no TOML ({error})", "See the keys with: jaxmpc sweep --help")
 
 

@@ -2,11 +2,11 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, FiniteFloat, TypeAdapter
+from pydantic import Field, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from jaxmpc.app.config.files import to_toml
-from jaxmpc.app.config.sections import STRICT, Matrix, Vector, to_matrix
+from jaxmpc.app.config.sections import STRICT, Matrix, Number, Vector, Whole, to_matrix
 from jaxmpc.checks import fail
 
 
@@ -15,8 +15,8 @@ class RobotSection:
     """Which robot's MPC this is, with arguments of `robot_mpc` and `RobotController`."""
 
     name: str
-    horizon: Annotated[int, Field(ge=1, strict=True)] = 20
-    margin: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.02
+    horizon: Annotated[Whole, Field(ge=1)] = 20
+    margin: Annotated[Number, Field(ge=0, lt=1)] = 0.02
     linearize: Literal["set-point", "state", "trajectory"] = "state"
 
 
@@ -27,7 +27,7 @@ class RobotCostSection:
     Q: Vector | Matrix
     R: Vector | Matrix
     P: Literal["lqr", "none"] | Matrix = "lqr"
-    rho: Annotated[FiniteFloat, Field(gt=0)] = 1e4
+    rho: Annotated[Number, Field(gt=0)] = 1e4
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
