@@ -115,7 +115,8 @@ def values_of(option: str, words: Sequence[str]) -> str:
             taken = False
         elif taken:
             found.append(word)
-    return " ".join(found) or "no value"
+    text = " ".join(found) or "no value"
+    return text if len(text) < 60 else f"{text[:57]}..."
 
 
 def described_type(kind: Any) -> str:

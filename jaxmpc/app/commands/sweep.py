@@ -157,7 +157,9 @@ class Sweep:
         overrides = given_options(self, *keys) | ({"projection": True} if self.projection else {})
         config = configs.load(self.config, overrides)
         needed = math.prod(configs.grid_shape(config)) * configs.state_bytes(config) / COMPRESSION
-        require_disk("--output", needed, self.output, "Map fewer points, or use another disk")
+        require_disk(
+            f"--output {self.output}", needed, self.output, "Map fewer points, or use another disk"
+        )
         return LinearSweep.open(config, self.output, self.resume, self.overwrite)
 
     def robot_map(self, robot: str) -> RobotMapCommand:

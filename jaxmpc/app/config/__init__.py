@@ -15,7 +15,7 @@ key (or the option of the command line that set it), and how to correct it. A ro
 file of their own, with the sections [robot] and [cost].
 """
 
-from jaxmpc.app.config.consistency import state_bytes
+from jaxmpc.app.config.consistency import require_horizon, state_bytes
 from jaxmpc.app.config.problem import Config
 from jaxmpc.app.config.reading import load, load_robot_config
 from jaxmpc.app.config.robot import RobotConfig, RobotCostSection, RobotSection
@@ -33,6 +33,7 @@ __all__ = [
     "load",
     "load_robot_config",
     "recursion_states",
+    "require_horizon",
     "state_bytes",
     "sweep_points",
 ]

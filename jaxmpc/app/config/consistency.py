@@ -38,13 +38,19 @@ def check(config: Config, command: str = "sweep") -> None:
         _check_order("limits", low, high, getattr(limits, low), getattr(limits, high))
     _check_state_limits(config)
     _check_terminal_set(config, n)
-    rows = limits.h_x or limits.x_min or ()
-    needed = condensed_bytes(config.mpc.horizon, n, m, config.mpc.control_horizon, len(rows) + m)
-    require_memory("mpc.horizon", needed, "Give fewer steps")
+    require_horizon(config, "mpc.horizon", config.mpc.horizon)
     if command == "sweep":
         _check_sweep(config, n)
     elif command == "recursion":
         _check_recursion(config, n)
+
+
+def require_horizon(config: Config, key: str, horizon: int) -> None:
+    """Raise ValueError, naming the key, where a horizon is too long for the memory."""
+    n, m = len(config.system.A), len(config.system.B[0])
+    rows = config.limits.h_x or config.limits.x_min or ()
+    needed = condensed_bytes(horizon, n, m, config.mpc.control_horizon, len(rows) + m)
+    require_memory(key, needed, "Give fewer steps")
 
 
 def _check_sweep(config: Config, n: int) -> None:

@@ -1,14 +1,31 @@
-"""Reading and writing of TOML files."""
+"""Reading and writing of TOML files, and where their keys come from."""
 
 import re
 import tomllib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import tomli_w
 
 from jaxmpc.checks import fail
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where the keys of a configuration come from: a file, and options of the command line (keys
+    such as "mpc.horizon")."""
+
+    file: str = ""
+    options: frozenset[str] = frozenset()
+
+    def error(self, message: str) -> ValueError:
+        """Return the error with the file, or the option, that holds the key it begins with."""
+        key, _, rest = message.partition(": ")
+        if key in self.options:
+            return ValueError(f"command line: --{key.split('.')[-1]}: {rest}")
+        return ValueError(f"{self.file}: {message}" if self.file else message)
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from jaxmpc.app.config.files import to_toml
+from jaxmpc.app.config.files import Origin, to_toml
 from jaxmpc.app.config.sections import (
     STRICT,
     CostSection,
@@ -49,22 +49,6 @@ KEYS = {
     "terminal_set.h": "mpc.h_f", "terminal_set.P": "mpc.P_f", "terminal_set.level": "mpc.level_f",
 }  # fmt: skip
 Result = TypeVar("Result")
-
-
-@dataclasses.dataclass(frozen=True)
-class Origin:
-    """Where the keys of a configuration come from: a file, and options of the command line (keys
-    such as "mpc.horizon")."""
-
-    file: str = ""
-    options: frozenset[str] = frozenset()
-
-    def error(self, message: str) -> ValueError:
-        """Return the error with the file, or the option, that holds the key it begins with."""
-        key, _, rest = message.partition(": ")
-        if key in self.options:
-            return ValueError(f"command line: --{key.split('.')[-1]}: {rest}")
-        return ValueError(f"{self.file}: {message}" if self.file else message)
 
 
 def _in_keys(method: Callable[..., Result]) -> Callable[..., Result]:

@@ -8,8 +8,8 @@ from typing import Any, get_args
 from pydantic import ValidationError
 
 from jaxmpc.app.config.consistency import check
-from jaxmpc.app.config.files import read_toml
-from jaxmpc.app.config.problem import ADAPTER, COMMANDS, Config, Origin
+from jaxmpc.app.config.files import Origin, read_toml
+from jaxmpc.app.config.problem import ADAPTER, COMMANDS, Config
 from jaxmpc.app.config.robot import ROBOT_ADAPTER, RobotConfig
 from jaxmpc.checks import fail, nearest
 
@@ -75,9 +75,11 @@ def load_robot_config(path: str | Path) -> RobotConfig:
     if "robot" not in document:
         fail(str(path), "has no section [robot]", "Give what jaxmpc tune weights --robot wrote")
     try:
-        return ROBOT_ADAPTER.validate_python(document)
+        config = ROBOT_ADAPTER.validate_python(document)
     except ValidationError as error:
         raise ValueError(f"{path}: {_error_message(error, RobotConfig)}") from None
+    object.__setattr__(config, "origin", Origin(str(path)))
+    return config
 
 
 def _error_message(error: ValidationError, whole: Any) -> str:

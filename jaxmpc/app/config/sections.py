@@ -21,7 +21,7 @@ def _not_nan(value: float) -> float:
 
 
 def _rectangular(rows: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
-    if len({len(row) for row in rows}) != 1:
+    if len({len(row) for row in rows}) != 1 or not rows[0]:
         raise ValueError("is no matrix: give at least one row and rows of one length")
     return rows
 
