@@ -92,16 +92,22 @@ def whole(argument: str, value: Any, least: int) -> int:
     return int(value)
 
 
+def shown(value: Any) -> str:
+    """Return a value as text of one line and less than 60 characters."""
+    text = " ".join(repr(value).split())
+    return text if len(text) < 60 else f"{text[:56]}..."
+
+
 def require_real(argument: str, value: Any) -> None:
     """Raise unless a readable `value` is an array, or nested lists, of real numbers."""
     if not concrete(value):
         return
     try:
-        array = value if hasattr(value, "dtype") else np.asarray(value)
+        array = value if hasattr(value, "ndim") else np.asarray(value)
     except (TypeError, ValueError):
-        fail(argument, f"{value!r} is not an array of numbers", "Give rows of equal length")
+        fail(argument, f"{shown(value)} is not an array of numbers", "Give rows of equal length")
     if array.dtype.kind not in "biuf" and array.dtype.name != "bfloat16":
-        found = repr(value) if np.ndim(array) == 0 else f"entries of type {array.dtype}"
+        found = shown(value) if np.ndim(array) == 0 else f"entries of type {array.dtype}"
         fail(argument, f"{found} where real numbers are needed", "Give an array or nested lists")
 
 

@@ -58,7 +58,7 @@ CALLS = [
     ("x0: {'q': 1, 'dq': 2} where real", lambda: jm.solve(M, {"q": 1, "dq": 2})),
     ("x0: entries of type object where real", lambda: jm.solve(M, [None, None])),
     ("x0: {1, 2} where real numbers are", lambda: jm.solve(M, {1, 2})),
-    ("reference: is a ADMM. Give an array, or name", lambda: jm.solve(M, x, jm.ADMM())),
+    ("reference: ADMM(iterations=50", lambda: jm.solve(M, x, jm.ADMM())),
     ("reference: 'r' where real numbers are", lambda: jm.solve(M, x, "r")),
     ("reference: entries of type complex128 where", lambda: jm.solve(M, x, x + 1j)),
     ("reference: shape (3,). Give (2,) or (4, 2);", lambda: jm.solve(M, x, np.zeros(3))),
@@ -160,7 +160,6 @@ CALLS = [
     ("refine: 1.5. Give a whole number of at", lambda: jm.solve(M, x, solver=jm.ADMM(refine=1.5))),
     ("rho: 'x' where real numbers are", lambda: jm.solve(M, x, solver=jm.ADMM(rho="x"))),
     ("rho: holds a value that is not", lambda: jm.solve(M, x, solver=jm.ADMM(rho=0))),
-    ("rho: shape (2,). Give (), (9,) or", lambda: jm.solve(M, x, solver=jm.ADMM(rho=[1, 2]))),
     ("alpha: 2. Over-relaxation lies in (0,", lambda: jm.solve(M, x, solver=jm.ADMM(alpha=2))),
     ("alpha: 'a' where real numbers are", lambda: jm.solve(M, x, solver=jm.ADMM(alpha="a"))),
     (
@@ -626,14 +625,23 @@ def test_wrong_arguments_are_named(message, call):
 
 def test_wrong_arguments_of_a_controller_are_named():
     controller = jm.Controller(M)
+    with pytest.raises(ValueError, match=r"rho: shape \(2,\). Give \(\), \(9,\) or"):
+        jm.Controller(M, jm.ADMM(rho=[1, 2]))
     for given, message in (
-        ("x", "x0: 'x' where real"), (jm.ADMM(), "x0: is a ADMM"), (None, "x0: None"),
+        ("x", "x0: 'x' where real"), (jm.ADMM(), "x0: ADMM(iterations"), (None, "x0: None where"),
         (x + 1j, "x0: entries of type complex"), (jnp.zeros(2, complex), "x0: entries of type c"),
         (0.5, "x0: shape ()"),
     ):  # fmt: skip
         with pytest.raises(ValueError) as caught:
             controller(given)
         assert str(caught.value).startswith(message)
+    for wrong in ("x", x + 1j, np.zeros(3)):
+        with pytest.raises(ValueError, match="^x0: "):
+            jm.simulate(controller, S, wrong, 3)
+        with pytest.raises(ValueError, match="^x0s: "):
+            jm.simulate_many(controller, S, wrong, 3)
+    with pytest.raises(ValueError, match="^reference: "):
+        jm.simulate(controller, S, x, 3, reference=jm.ADMM())
 
 
 def same(one, other):

@@ -54,6 +54,7 @@ class Controller:
         if self.condensed is None and isinstance(self.mpc, MPC):
             self.mpc.validate()
             require_kind("solver", self.solver, ADMM)
+            self.solver.validate()
             mpc, finite = harmless(self.mpc)
             condensed = condense(mpc)
             # The factorization reads from P what is wrong with the data.
@@ -179,8 +180,6 @@ def plan_arguments(
 
 
 def _real_array(name: str, value: Any) -> Any:
-    if isinstance(value, ADMM | MPC | Plan):
-        fail(name, f"is a {type(value).__name__}", "Give an array, or name the arguments")
     value = as_array(value)
     if not isinstance(value, jax.Array):
         return host_array(name, value)

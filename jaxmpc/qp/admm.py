@@ -85,8 +85,9 @@ class ADMM:
     fixed: bool = field(default=False, metadata={"static": True})
     dtype: str | None = field(default=None, metadata={"static": True})
 
-    def validate(self, rows: int) -> None:
-        """Raise ValueError for settings that make no iteration."""
+    def validate(self, rows: int | None = None) -> None:
+        """Raise ValueError for settings that make no iteration of a program with so many rows
+        (None: not known yet)."""
         for name in ("iterations", "refine"):
             count = getattr(self, name)
             if (count is not None or name == "iterations") and whole(name, count, 0) > MOST_COUNT:
@@ -94,7 +95,7 @@ class ADMM:
         if self.rho is not None:
             require_real("rho", self.rho)
         shape: tuple[int, ...] = () if self.rho is None else np.shape(self.rho)
-        if len(shape) > 2 or (shape and shape[-1] not in (1, rows)):
+        if len(shape) > 2 or (shape and rows is not None and shape[-1] not in (1, rows)):
             fail("rho", f"shape {shape}", f"Give (), ({rows},) or (stages, {rows})")
         if self.rho is not None and concrete(self.rho) and not np.all(np.asarray(self.rho) > 0):
             fail("rho", "holds a value that is not positive", "Penalties are positive")

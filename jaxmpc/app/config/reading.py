@@ -11,7 +11,7 @@ from jaxmpc.app.config.consistency import check
 from jaxmpc.app.config.files import Origin, read_toml
 from jaxmpc.app.config.problem import ADAPTER, COMMANDS, Config
 from jaxmpc.app.config.robot import ROBOT_ADAPTER, RobotConfig
-from jaxmpc.checks import fail, nearest
+from jaxmpc.checks import fail, nearest, shown
 
 # Inertia 0.05 kg m², period 0.01 s, x = (q, dq), u = τ.
 _JOINT: dict[str, Any] = {
@@ -98,9 +98,7 @@ def _error_message(error: ValidationError, whole: Any) -> str:
     problems = dict.fromkeys(e["msg"].removeprefix("Value error, ") for e in same)
     # TOML and the help say list, Python tuple.
     text = "; or ".join(problems).replace("tuple", "list").replace("Tuple", "List")
-    value = repr(first["input"])
-    shown = value if len(value) < 60 else value[:57] + "..."
-    return f"{key}: {text}. Got {shown}"
+    return f"{key}: {text}. Got {shown(first['input'])}"
 
 
 def _unknown_key(where: list[str], whole: Any) -> str:
