@@ -26,6 +26,8 @@ COMMANDS = {
     "simulate": ("simulate", "Simulate"),
 }
 DESCRIPTION = "Constrained MPC in batches, with proofs. Also: jaxmpc --version"
+# Options of tyro that write a completion script for a shell, and the words that each needs.
+COMPLETIONS = {"--tyro-print-completion": 2, "--tyro-write-completion": 3}
 TUNERS = {"weights": ("tune", "TuneWeights"), "penalties": ("tune_penalties", "TunePenalties")}
 
 
@@ -37,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     try:
         command = parse(argv)
-    except ValueError as error:
+    except (ValueError, OSError, AssertionError) as error:  # tyro asserts that it knows a shell
         return report_error(error)
     try:
         return command.run() or 0
@@ -65,11 +67,11 @@ def parse(argv: Sequence[str]) -> Any:
     if words and words[0] in table:
         kind = _class(*table[words[0]])
         return parse_options(kind, f"{prog} {words[0]}", words[1:])
-    if not words or words[0] not in ("-h", "--help"):
+    first = words[0] if words else ""
+    if first not in ("-h", "--help") and not 0 < COMPLETIONS.get(first, 0) <= len(words):
         known = [*table, *(["tune"] if table is COMMANDS else [])]
-        given = f"no command {words[0]!r}" if words else "no command given"
-        cure = f"{nearest(words[0], known) if words else ''}There are {', '.join(known)}"
-        fail(prog, given, f"{cure}; see {prog} --help")
+        given = f"no command {first!r}" if words else "no command given"
+        fail(prog, given, f"{nearest(first, known)}There are {', '.join(known)}; see {prog} --help")
     described = [_described(name, _class(*where)) for name, where in table.items()]
     if table is COMMANDS:
         described.append(_described("tune", Tune))
@@ -108,8 +110,8 @@ def values_of(option: str, words: Sequence[str]) -> str:
     """Return the words that follow the last mention of an option, or "no value"."""
     found, taken = list[str](), False
     for word in words:
-        name, equals, value = word.replace("_", "-").partition("=")
-        if name == option:
+        name, equals, value = word.partition("=")
+        if name.replace("_", "-") == option:
             found, taken = [value] if equals else [], True
         elif word.startswith("--"):
             taken = False

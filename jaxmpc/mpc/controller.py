@@ -180,6 +180,8 @@ def plan_arguments(
 
 
 def _real_array(name: str, value: Any) -> Any:
+    if isinstance(value, np.ndarray) and value.dtype.kind in "iuf":  # the usual case, and fast
+        return value
     value = as_array(value)
     if not isinstance(value, jax.Array):
         return host_array(name, value)

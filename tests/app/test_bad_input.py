@@ -295,6 +295,10 @@ LINES = [
     ("tune", "jaxmpc tune: no command given. There are weights, penalties"),
     ("tune wights", "no command 'wights'. Did you mean weights?"),
     ("tune --help-me", "no command '--help-me'"),
+    ("--tyro-print-completion", "no command '--tyro-print-completion'"),
+    ("--tyro-print-completion dash", "Shell should be one"),
+    ("--tyro-write-completion bash absent/file", "No such file"),
+    ("sweep --tyro-print-completion dash", "Shell should be one"),
     # Options that there are not.
     ("sweep --horizont 3", "--horizont: no such option. Did you mean --horizon?"),
     ("sweep --horizont=3", "--horizont=3: no such option. Did you mean --horizon?"),

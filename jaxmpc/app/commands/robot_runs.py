@@ -15,7 +15,7 @@ from jaxmpc.app.commands.film import choose_renderer
 from jaxmpc.app.commands.options import Timing, check_results, model_hash, open_folder
 from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
 from jaxmpc.app.config import load_robot_config
-from jaxmpc.checks import fail, require_memory
+from jaxmpc.checks import fail, require_disk, require_memory
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
 from jaxmpc.closed_loop.robot_controller import RobotController
 from jaxmpc.closed_loop.robot_mpc import robot_mpc
@@ -160,6 +160,9 @@ def require_sizes(command: "Simulate", robot: Robot) -> None:
     each = np.dtype(command.dtype).itemsize * (robot.state_size + m + 3) + 2
     needed = command.count * samples * each
     require_memory("--count, --seconds", needed, "Simulate fewer robots, or for less time")
+    # Trajectories hardly compress; the files are seldom a quarter of the arrays.
+    folder = command.output
+    require_disk(f"--output {folder}", needed / 4, folder, "Simulate less, or use another disk")
     horizon: Any = command.horizon
     require_memory("--horizon", condensed_bytes(horizon, n, m, None, n + m), "Give fewer steps")
 
