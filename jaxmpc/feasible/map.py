@@ -34,10 +34,10 @@ def grid(lower: Any, upper: Any, shape: Any) -> np.ndarray:
 
     Raises ValueError for what is no grid, and for one that does not fit into memory.
     """
-    given = (host_array("lower", lower), host_array("upper", upper), np.asarray(shape))
+    given = (host_array("grid lower", lower), host_array("grid upper", upper), np.asarray(shape))
     d = max(np.size(value) for value in given)
     lower, upper, shape = (v if v.ndim else np.full(d, v) for v in given)
-    shape = tuple(whole("shape", k, 1) for k in shape.ravel().tolist())
+    shape = tuple(whole("grid shape", k, 1) for k in shape.ravel().tolist())
     if not shape or not lower.shape == upper.shape == (len(shape),):
         fail("grid", f"lower {lower.shape}, upper {upper.shape}, shape {shape}", "Same length each")
     if not (np.all(np.isfinite(lower)) and np.all(np.isfinite(upper)) and np.all(lower <= upper)):
