@@ -4,16 +4,80 @@ Inside `jit`, `vmap` or `grad` an array has a shape but no value: shapes are che
 are not (a solver reports bad values of a batch by its status).
 """
 
+import difflib
+import math
+import os
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+# Counts are 32-bit integers in compiled programs.
+MOST_COUNT = 2**31 - 1
+
 
 def fail(argument: str, problem: str, cure: str) -> NoReturn:
     """Raise a ValueError that names the argument, what is wrong, and what to do."""
     raise ValueError(f"{argument}: {problem}. {cure}")
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return "Did you mean ...? " with the known word that is most like `word`, "" if none is."""
+    found = difflib.get_close_matches(word, [str(name) for name in known], 1, 0.7)
+    return f"Did you mean {found[0]}? " if found else ""
+
+
+def require_kind(argument: str, value: Any, *kinds: type) -> None:
+    """Raise unless `value` is of one of these kinds."""
+    if not isinstance(value, kinds):
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        fail(argument, f"is a {type(value).__name__}", f"Give a jm.{wanted}")
+
+
+def require_memory(argument: str, needed: float, cure: str) -> None:
+    """Raise where `needed` bytes exceed the memory that is available."""
+    available = available_memory()
+    if needed > available:
+        fail(argument, f"needs {in_units(needed)} of memory, {in_units(available)} are free", cure)
+
+
+def require_disk(argument: str, needed: float, folder: Path, cure: str) -> None:
+    """Raise where `needed` bytes exceed the free space of the disk that holds `folder`, which need
+    not exist."""
+    there = next((path for path in (folder, *folder.absolute().parents) if path.exists()), None)
+    free = shutil.disk_usage(there).free if there else np.inf
+    if needed > free:
+        fail(
+            argument, f"needs at least {in_units(needed)} on disk, {in_units(free)} are free", cure
+        )
+
+
+def available_memory() -> float:
+    """Return the bytes of memory that this process can still get: what the system says, or the
+    size of the machine where it does not say, and at most the limit of a container."""
+    found = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    try:  # Linux; free pages alone would leave out what caches give back
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        found = next(1024.0 * int(v.split()[1]) for v in lines if v.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        pass
+    for limit in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        try:
+            found = min(found, float(Path(limit).read_text()))
+        except (OSError, ValueError):  # none, or "max"
+            continue
+    return found
+
+
+def in_units(count: float) -> str:
+    """Return a number of bytes as text, such as "14.4 GB"."""
+    units = ("bytes", "kB", "MB", "GB", "TB")
+    k = min(int(math.log10(max(count, 1))) // 3, len(units) - 1)
+    return f"{count / 1000.0**k:.4g} {units[k]}"
 
 
 def concrete(*values: Any) -> bool:
@@ -28,15 +92,43 @@ def whole(argument: str, value: Any, least: int) -> int:
     return int(value)
 
 
+def shown(value: Any) -> str:
+    """Return a value as text of one line and less than 60 characters."""
+    text = " ".join(repr(value).split())
+    return text if len(text) < 60 else f"{text[:56]}..."
+
+
+def require_real(argument: str, value: Any) -> None:
+    """Raise unless a readable `value` is an array, or nested lists, of real numbers."""
+    if not concrete(value):
+        return
+    try:
+        array = value if hasattr(value, "ndim") else np.asarray(value)
+    except (TypeError, ValueError):
+        fail(argument, f"{shown(value)} is not an array of numbers", "Give rows of equal length")
+    if array.dtype.kind not in "biuf" and array.dtype.name != "bfloat16":
+        found = shown(value) if np.ndim(array) == 0 else f"entries of type {array.dtype}"
+        fail(argument, f"{found} where real numbers are needed", "Give an array or nested lists")
+
+
+def number(argument: str, value: Any, least: float, cure: str) -> None:
+    """Raise unless a readable `value` is one number of at least `least`."""
+    require_real(argument, value)
+    if np.ndim(value) or (concrete(value) and not float(np.asarray(value)) >= least):
+        fail(argument, f"{value}", cure)
+
+
 def require_shape(argument: str, value: Any, shape: tuple[int, ...], cure: str) -> None:
-    """Raise unless `value` has exactly this shape."""
+    """Raise unless `value` holds real numbers and has exactly this shape."""
+    require_real(argument, value)
     given = np.shape(value if concrete(value) else jnp.asarray(value))  # lists of traced numbers
     if given != shape:
         fail(argument, f"shape {given} where {shape} is needed", cure)
 
 
 def require_finite(argument: str, value: Any) -> None:
-    """Raise if a readable `value` holds NaN or infinity."""
+    """Raise if a readable `value` holds NaN or infinity, or no real numbers."""
+    require_real(argument, value)
     if concrete(value) and not np.all(np.isfinite(value)):
         fail(argument, "holds NaN or infinity", "Give finite numbers")
 

@@ -1,16 +1,22 @@
 """The command `jaxmpc`: parse the command line, run the subcommand, and report how it ended."""
 
+import contextlib
 import importlib
+import io
+import re
 import shlex
 import sys
+import types
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib.metadata import version
-from typing import Annotated, Any, Union
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import tyro
 
 from jaxmpc.app.commands.options import report_error
+from jaxmpc.checks import fail, nearest
 
 # Module and class of each command: only the one that is called is imported.
 COMMANDS = {
@@ -21,6 +27,8 @@ COMMANDS = {
     "verify": ("verify", "Verify"),
 }
 DESCRIPTION = "Constrained MPC in batches, with proofs. Also: jaxmpc --version"
+# Options of tyro that write a completion script for a shell, and the words that each needs.
+COMPLETIONS = {"--tyro-print-completion": 2, "--tyro-write-completion": 3}
 TUNERS = {"weights": ("tune", "TuneWeights"), "penalties": ("tune_penalties", "TunePenalties")}
 
 
@@ -30,7 +38,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if argv == ["--version"]:
         print(f"jaxmpc {version('jaxmpc')}")
         return 0
-    command = parse(argv)
+    try:
+        command = parse(argv)
+    except (ValueError, OSError, AssertionError) as error:  # tyro asserts that it knows a shell
+        return report_error(error)
     try:
         return command.run() or 0
     except (ValueError, OSError, MemoryError) as error:
@@ -49,19 +60,78 @@ def parse(argv: Sequence[str]) -> Any:
     """Return the command with its options.
 
     `jaxmpc COMMAND --help` prints a page; `jaxmpc --help` and `jaxmpc tune --help` one line each.
+    Raises ValueError for commands, options and values that there are not.
     """
     prog, table, words = "jaxmpc", COMMANDS, list(argv)
     if words[:1] == ["tune"]:
         prog, table, words = "jaxmpc tune", TUNERS, words[1:]
     if words and words[0] in table:
         kind = _class(*table[words[0]])
-        return tyro.cli(kind, prog=f"{prog} {words[0]}", args=words[1:])
+        return parse_options(kind, f"{prog} {words[0]}", words[1:])
+    first = words[0] if words else ""
+    if first not in ("-h", "--help") and not 0 < COMPLETIONS.get(first, 0) <= len(words):
+        known = [*table, *(["tune"] if table is COMMANDS else [])]
+        given = f"no command {first!r}" if words else "no command given"
+        fail(prog, given, f"{nearest(first, known)}There are {', '.join(known)}; see {prog} --help")
     described = [_described(name, _class(*where)) for name, where in table.items()]
     if table is COMMANDS:
         described.append(_described("tune", Tune))
     choice: Any = Union[tuple(described)]  # noqa: UP007
     text = Tune.__doc__ if table is TUNERS else DESCRIPTION
     return tyro.cli(choice, prog=prog, description=text, args=words)
+
+
+def parse_options(kind: Any, prog: str, words: Sequence[str]) -> Any:
+    """Return a command of this class with the options in `words`.
+
+    Raises ValueError, which names the option and what it takes, where tyro would print some lines.
+    """
+    known = {f"--{field.name.replace('_', '-')}": field.name for field in fields(kind)}
+    text = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(text):
+            command, rest = tyro.cli(kind, prog=prog, args=words, return_unknown_args=True)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        found = next((w for w in re.findall(r"--[\w-]+", text.getvalue()) if w in known), None)
+        if found is None:
+            fail(prog, " ".join(re.sub(r"[^ -~]", " ", text.getvalue()).split()), "")
+        wanted = f"Give {described_type(get_type_hints(kind)[known[found]])}"
+        fail(found, values_of(found, words), f"{wanted}; see {prog} --help")
+    if rest:
+        what = "no such option" if rest[0].startswith("-") else "belongs to no option"
+        switches = [f"--no-{field.name}" for field in fields(kind) if field.default is True]
+        meant = nearest(rest[0].partition("=")[0], [*known, *switches, "--help"])
+        fail(rest[0], what, f"{meant}See {prog} --help")
+    return command
+
+
+def values_of(option: str, words: Sequence[str]) -> str:
+    """Return the words that follow the last mention of an option, or "no value"."""
+    found, taken = list[str](), False
+    for word in words:
+        name, equals, value = word.partition("=")
+        if name.replace("_", "-") == option:
+            found, taken = [value] if equals else [], True
+        elif word.startswith("--"):
+            taken = False
+        elif taken:
+            found.append(word)
+    text = " ".join(found) or "no value"
+    return text if len(text) < 60 else f"{text[:57]}..."
+
+
+def described_type(kind: Any) -> str:
+    """Return what an option of this type takes, in words."""
+    if get_origin(kind) in (Union, types.UnionType):
+        kind = next(part for part in get_args(kind) if part is not type(None))
+    if get_origin(kind) is Literal:
+        return f"one of {', '.join(map(str, get_args(kind)))}"
+    if get_origin(kind) is tuple:
+        inner = get_args(kind)[0]
+        return {int: "whole numbers", float: "numbers"}.get(inner) or described_type(inner)
+    return {int: "a whole number", float: "a number", Path: "a path"}.get(kind, "a text")
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, whole
 from jaxmpc.control.riccati import lqr
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.robots.linear import LinearPlant
@@ -37,6 +37,9 @@ def robot_mpc(
     `robot.equilibrium(target)`. Raises ValueError as MPC and `equilibrium` do, or where the
     tightened limits leave out the target.
     """
+    if not callable(getattr(robot, "linearize", None)):
+        fail("robot", f"is a {type(robot).__name__}", "Give a Robot or a LinearPlant")
+    whole("horizon", horizon, 1)
     if not 0 <= margin < 1:
         fail("margin", f"{margin}", "Give a fraction in [0, 1)")
     if Q is None:

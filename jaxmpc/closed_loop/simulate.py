@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
-from jaxmpc.checks import fail, whole
+from jaxmpc.checks import fail, require_real, whole
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.control.system import LinearSystem
@@ -59,10 +59,14 @@ def checked_arguments(
     """Return the traced arguments of `_simulate`; raise ValueError where one is wrong."""
     if isinstance(controller, LinearFeedback):
         controller.validate()
+    if not hasattr(controller, "mpc"):
+        what = f"is a {type(controller).__name__}"
+        fail("controller", what, "Give a Controller, RobotController or LinearFeedback")
     mpc = controller.mpc
     N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
     size = controller.state_size
     whole("steps", steps, 1)
+    require_real("x0", x0)
     if np.shape(x0) != (size,):
         fail("x0", f"shape {np.shape(x0)}", f"Give one state ({size},); use jax.vmap for many")
     for name, value, shapes in (
@@ -71,7 +75,10 @@ def checked_arguments(
         ("disturbance", disturbance, ((steps, size),)),
         ("previous_input", previous_input, ((m,),)),
     ):
-        if value is not None and np.shape(value) not in shapes:
+        if value is None:
+            continue
+        require_real(name, value)
+        if np.shape(value) not in shapes:
             fail(name, f"shape {np.shape(value)}", f"Give {' or '.join(map(str, shapes))}")
     cast = lambda v: None if v is None else jnp.asarray(v, controller.dtype)
     references = (cast(reference), cast(input_reference))

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 from tqdm.std import tqdm
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, require_real
 from jaxmpc.closed_loop.memory import device_bytes, program_bytes
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.closed_loop.simulate import checked_arguments, simulate
@@ -35,8 +35,9 @@ def simulate_many(
 
     Raises ValueError as `simulate` does.
     """
+    require_real("x0s", x0s)
     if np.ndim(x0s) != 2 or not len(x0s):
-        fail("x0s", f"shape {np.shape(x0s)}", f"Give (B, {controller.state_size}), B ≥ 1")
+        fail("x0s", f"shape {np.shape(x0s)}", "Give states (B, n), B ≥ 1")
     x0s, variations = np.asarray(x0s), dict(variations or {})
     require_variations(plant, variations, len(x0s))
     if chunk is not None and chunk < 1:

@@ -16,7 +16,14 @@ import scipy
 from jax.typing import ArrayLike
 from scipy.spatial import KDTree
 
-from jaxmpc.checks import concrete, fail, require_finite, require_shape, require_symmetric_psd
+from jaxmpc.checks import (
+    concrete,
+    fail,
+    require_finite,
+    require_kind,
+    require_shape,
+    require_symmetric_psd,
+)
 from jaxmpc.control import geometry
 from jaxmpc.control.geometry import maximise, unit_rows
 from jaxmpc.control.riccati import lqr
@@ -374,6 +381,7 @@ def invariant_ellipsoid(
     Source: Boyd, El Ghaoui, Feron & Balakrishnan 1994, Linear Matrix Inequalities, section
     5.2; Rawlings, Mayne & Diehl 2017, Model Predictive Control, section 2.5.5.
     """
+    require_kind("system", system, LinearSystem)
     if not concrete(system.A, system.B, system.c, K, P, states, inputs):
         if disturbance is not None:
             fail("disturbance", "given inside a trace", "Compute the ellipsoid outside, or omit it")
@@ -414,6 +422,7 @@ def _traced_ellipsoid(
     inputs: Box | Polytope | None,
 ) -> tuple[Ellipsoid, Any]:  # fmt: skip
     """Compute `invariant_ellipsoid` in JAX, with NaN in place of errors."""
+    require_kind("system", system, LinearSystem)
     system.validate()
     n, m = system.n, system.m
     require_shape("K", K, (m, n), "Give u = Kx one row an input, one column a state")
@@ -533,6 +542,7 @@ def one_step(
 ) -> OneStep:
     """Return the exact data of x⁺ = A x + B u + c + w, with inputs that are fixed (lower = upper)
     taken out."""
+    require_kind("system", system, LinearSystem)
     system.validate()
     m = system.m
     A, B, c = host_matrices(system)
@@ -797,6 +807,7 @@ def _closed_loop(
     optional: tuple[str, ...] = ("inputs",),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return A + BK, and F of the constraints F x <= 1 on the state, inputs included."""
+    require_kind("system", system, LinearSystem)
     system.validate()
     n, m = system.n, system.m
     require_shape("K", K, (m, n), "Give u = Kx one row an input, one column a state")

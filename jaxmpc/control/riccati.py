@@ -10,8 +10,8 @@ import scipy
 from jax import Array
 from jax.typing import ArrayLike
 
-from jaxmpc.checks import concrete, fail, require_shape, require_symmetric_psd
-from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.checks import concrete, fail, require_kind, require_shape, require_symmetric_psd
+from jaxmpc.control.system import LinearSystem, as_weight, host_array
 from jaxmpc.qp.linalg import solve, solve_general
 from jaxmpc.qp.precision import arrays, floating_dtype, in_float64, matmul
 
@@ -47,8 +47,8 @@ def lqr(system: LinearSystem, Q: ArrayLike, R: ArrayLike) -> LQR:
     Arguments:
         system: its c is not used: with an equilibrium x = A x + B u + c, the law holds for
             the deviations from it.
-        Q: (n, n), symmetric positive semidefinite.
-        R: (m, m), symmetric positive definite.
+        Q: (n, n), symmetric positive semidefinite; or its diagonal (n,), or a number for n = 1.
+        R: (m, m), symmetric positive definite; or its diagonal (m,), or a number for m = 1.
 
     NumPy in float64; not traceable. Raises ValueError if Q or R is not as above, or if a mode that
     does not decay by itself cannot be moved by u (not stabilizable) or costs nothing (not
@@ -66,8 +66,10 @@ def lqr(system: LinearSystem, Q: ArrayLike, R: ArrayLike) -> LQR:
     Int. J. Control 77(8), for the doubling algorithm in a trace; Kao & Hennequin 2020,
     arXiv:2011.11430, for the derivative.
     """
+    require_kind("system", system, LinearSystem)
     system.validate()
     n, m = system.n, system.m
+    Q, R = as_weight(Q, n), as_weight(R, m)
     require_shape("Q", Q, (n, n), "Give one weight matrix for the states")
     require_shape("R", R, (m, m), "Give one weight matrix for the inputs")
     if not concrete(system.A, system.B, Q, R):

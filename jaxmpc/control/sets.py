@@ -23,6 +23,7 @@ from jaxmpc.checks import (
     concrete,
     fail,
     require_finite,
+    require_real,
     require_shape,
     require_symmetric_psd,
 )
@@ -44,7 +45,7 @@ from jaxmpc.control.geometry import (
     unit_rows,
 )
 from jaxmpc.control.geometry import irredundant as _irredundant
-from jaxmpc.control.system import as_array, host_array
+from jaxmpc.control.system import as_array, dimensions, host_array
 from jaxmpc.qp.linalg import solve
 
 __all__ = ["Box", "Ellipsoid", "Optimum", "Polytope", "hull_volume", "maximise", "unit_rows"]
@@ -56,19 +57,43 @@ class Box:
     """{x in R^n : lower <= x <= upper}, elementwise.
 
     Arguments:
-        lower, upper: (n,) arrays, in the units of x; -inf and inf for no bound.
+        lower, upper: (n,) arrays, in the units of x; -inf and inf for no bound. A number beside an
+            array stands for all its coordinates; two numbers are an interval, n = 1, and in an
+            `MPC` the bounds of every coordinate.
     """
 
     lower: ArrayLike
     upper: ArrayLike
 
+    def __post_init__(self) -> None:
+        axes = dimensions(self.lower), dimensions(self.upper)
+        if axes in ((0, 1), (1, 0)):
+            one, other = ("lower", "upper") if axes[0] == 0 else ("upper", "lower")
+            self._fill(one, np.shape(as_array(getattr(self, other))))
+
+    def _fill(self, name: str, shape: tuple[int, ...]) -> None:
+        value = getattr(self, name)
+        full = jnp.broadcast_to if isinstance(value, jax.Array) else np.broadcast_to
+        object.__setattr__(self, name, full(value, shape))
+
+    def spread(self, n: int) -> "Box":
+        """Return the box with two numbers as the bounds of each of n coordinates; any other box
+        unchanged."""
+        if (dimensions(self.lower), dimensions(self.upper)) != (0, 0):
+            return self
+        box = Box(self.lower, self.upper)
+        for name in ("lower", "upper"):
+            box._fill(name, (n,))
+        return box
+
     @property
     def dimension(self) -> int:
         """Return n, the number of coordinates."""
-        return np.shape(as_array(self.lower))[-1]
+        return (np.shape(as_array(self.lower)) or (1,))[-1]
 
     def validate(self, argument: str, dimension: int | None = None) -> None:
         """Raise ValueError, naming `argument`, for wrong shapes, NaN or an empty box."""
+        self = self.spread(1)
         _require_shapes(argument, self, ("lower", "upper"), 1, dimension)
         if not concrete((self.lower, self.upper)):
             return
@@ -88,6 +113,7 @@ class Box:
 
     def contains(self, x: ArrayLike, tolerance: float = 0.0) -> jax.Array:
         """Return whether lower - tolerance <= x <= upper + tolerance, x of shape (n,)."""
+        self = self.spread(1)
         _require_shapes("Box", self, ("lower", "upper"), 1)
         require_shape("x", x, (self.dimension,), "Give one point; use jax.vmap for many")
         x, lower, upper = jnp.asarray(x), jnp.asarray(self.lower), jnp.asarray(self.upper)
@@ -95,6 +121,7 @@ class Box:
 
     def support(self, d: ArrayLike) -> jax.Array:
         """Return max d'x over the box, d of shape (n,); inf where the box is unbounded along d."""
+        self = self.spread(1)
         _require_shapes("Box", self, ("lower", "upper"), 1)
         require_shape("d", d, (self.dimension,), "Give one direction; use jax.vmap for many")
         d, lower, upper = jnp.asarray(d), jnp.asarray(self.lower), jnp.asarray(self.upper)
@@ -112,12 +139,14 @@ class Box:
         """Return half the distance between the two ends of each coordinate, (n,); 1 where an end
         is infinite or both coincide. It is the unit of weights and tolerances. NumPy; not
         traceable."""
+        self = self.spread(1)
         width = (host_array("upper", self.upper) - host_array("lower", self.lower)) / 2
         return np.where(np.isfinite(width) & (width > 0), width, 1.0)
 
     def rows(self) -> tuple[ArrayLike, ArrayLike, ArrayLike]:
         """Return (H, lower, upper) of the two-sided rows lower <= H x <= upper; H is the
         identity."""
+        self = self.spread(1)
         lower, upper = _as_floats(self.lower), _as_floats(self.upper)
         return np.eye(self.dimension, dtype=lower.dtype), lower, upper
 
@@ -157,6 +186,7 @@ class Box:
         return float(np.prod(upper - lower))
 
     def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        self = self.spread(1)
         self.validate("Box")
         return host_array("Box.lower", self.lower), host_array("Box.upper", self.upper)
 
@@ -282,6 +312,7 @@ class Polytope:
     def scale(self, factor: float) -> "Polytope":
         """Return {factor x : x in the set}, factor > 0. NumPy; not traceable."""
         self._require_fields("Polytope")
+        require_real("factor", factor)
         if not (np.ndim(factor) == 0 and np.isfinite(factor) and factor > 0):
             fail("factor", f"{factor!r} is not a positive number", "Give a finite factor > 0")
         return Polytope(host_array("H", self.H), host_array("h", self.h) * float(factor))
@@ -597,6 +628,7 @@ def unit_half_spaces(argument: str, set_: Any, n: int) -> tuple[np.ndarray, np.n
         return np.zeros((0, n)), np.zeros(0)
     if not isinstance(set_, Box | Polytope):
         fail(argument, f"{type(set_).__name__} is no convex set", "Give a Box or Polytope")
+    set_ = set_.spread(n) if isinstance(set_, Box) else set_
     set_.validate(argument, n)
     polytope = _as_polytope(argument, set_)
     return unit_rows(polytope.H, polytope.h, argument)

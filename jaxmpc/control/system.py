@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from jax.typing import ArrayLike
 
-from jaxmpc.checks import concrete, fail, require_finite, require_shape
+from jaxmpc.checks import concrete, fail, require_finite, require_real, require_shape
 
 
 def host_array(argument: str, value: Any) -> np.ndarray:
@@ -26,14 +26,40 @@ def host_array(argument: str, value: Any) -> np.ndarray:
             "is traced by JAX, and this computation is not traceable",
             "Call it outside jit, vmap and grad",
         )
+    require_real(argument, value)
+    return np.asarray(value).astype(np.float64)
+
+
+def dimensions(value: Any) -> int | None:
+    """Return the number of axes of an array, number or nested lists; None for anything else, such
+    as the placeholders by which JAX rebuilds an object."""
+    if hasattr(value, "ndim"):
+        return value.ndim
+    if not isinstance(value, Real | list | tuple):
+        return None
     try:
-        array = np.asarray(value)
+        return np.ndim(as_array(value))
     except (TypeError, ValueError):
-        fail(argument, f"{value!r} is not an array of numbers", "Give rows of equal length")
-    if array.dtype.kind not in "biuf" and array.dtype.name != "bfloat16":
-        found = repr(value) if array.ndim == 0 else f"entries of type {array.dtype}"
-        fail(argument, f"{found} where real numbers are needed", "Give an array or nested lists")
-    return array.astype(np.float64)
+        return None
+
+
+def as_weight(value: Any, size: int) -> Any:
+    """Return a weight as a matrix where it has one meaning: a number for size 1, and a vector
+    (size,), which is a diagonal; anything else unchanged."""
+    shape = np.shape(as_array(value)) if dimensions(value) in (0, 1) else None
+    if (shape == () and size == 1) or shape == (size,):
+        value = as_array(value)
+        value = value if isinstance(value, jax.Array) else np.asarray(value)
+        if value.dtype.kind in "iufV":
+            value = value.reshape(size)
+            return jnp.diag(value) if isinstance(value, jax.Array) else np.diag(value)
+    return value
+
+
+def as_column(value: Any) -> Any:
+    """Return a vector (n,) as a matrix (n, 1)."""
+    value = as_array(value)
+    return (value if isinstance(value, jax.Array) else np.asarray(value))[:, None]
 
 
 def as_array(value: Any) -> Any:
@@ -62,7 +88,7 @@ class LinearSystem:
         state_units, input_units: tuples of n and m units ("rad", "N m"); empty means none.
 
     A, B and c are pytree leaves (they may be batched and differentiated); the rest is
-    static. The constructor checks nothing; `validate` does.
+    static. The constructor checks nothing, `validate` does, and takes a vector B (n,) as one input.
     """
 
     A: ArrayLike
@@ -73,6 +99,10 @@ class LinearSystem:
     input_names: tuple[str, ...] = field(default=(), metadata={"static": True})
     state_units: tuple[str, ...] = field(default=(), metadata={"static": True})
     input_units: tuple[str, ...] = field(default=(), metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        if dimensions(self.A) == 2 and dimensions(self.B) == 1:
+            object.__setattr__(self, "B", as_column(self.B))
 
     @property
     def n(self) -> int:
@@ -127,6 +157,9 @@ class LinearSystem:
         for kind, count in (("state", self.n), ("input", self.m)):
             for what in (f"{kind}_names", f"{kind}_units"):
                 _require_strings(what, getattr(self, what), count)
+            names = getattr(self, f"{kind}_names")
+            if len(set(names)) < len(names):
+                fail(f"{kind}_names", f"{names} has a name twice", "Give each a name of its own")
 
     @classmethod
     def from_continuous(
@@ -151,6 +184,9 @@ class LinearSystem:
         Raises ValueError for bad shapes or values, or dt <= 0.
         """
         require_period("dt", dt)
+        for key, value in names.items():
+            if not isinstance(value, list | tuple):
+                fail(key, f"{value!r} is not a tuple of strings", 'Write it as ("q", "dq")')
         tuples: dict[str, Any] = {key: tuple(value) for key, value in names.items()}
         continuous = cls(A, B, c, dt, **tuples)
         continuous.validate()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxmpc.checks import fail, require_finite, require_shape
+from jaxmpc.checks import fail, require_finite, require_kind, require_shape
 from jaxmpc.control import geometry
 from jaxmpc.control.geometry import maximise, unit_rows
 from jaxmpc.control.invariant import (
@@ -151,6 +151,7 @@ def verify_terminal(
     Source: Rawlings, Mayne & Diehl 2017, Model Predictive Control, section 2.4; Bitsoris 1988,
     Int. J. Control 47(6), for the certificate; Hautus 1970, for detectability.
     """
+    require_kind("system", system, LinearSystem)
     system.validate()
     n, m = system.n, system.m
     A, B, c = host_matrices(system)

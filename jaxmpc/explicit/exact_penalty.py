@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import linprog
 
-from jaxmpc.checks import fail, whole
+from jaxmpc.checks import fail, require_kind, whole
 from jaxmpc.control.geometry import HIGHS
 from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.explicit.cells import ActivePiece, active_piece, capped_ball
@@ -119,6 +119,7 @@ def exact_penalty(
     samples = whole("samples", samples, 1)
     if rho is not None and not (np.ndim(rho) == 0 and np.isfinite(rho) and rho >= 0):
         fail("rho", f"{rho!r}", "Give one finite weight of at least 0, or None")
+    require_kind("mpc", mpc, MPC)
     mpc.validate()
     x0s = np.zeros((0, mpc.dimension)) if x0s is None else np.asarray(x0s, np.float64)
     if x0s.ndim != 2 or x0s.shape[1] != mpc.dimension:

@@ -1,5 +1,6 @@
 """Maps of the feasible set: every point proved feasible, proved infeasible, or undecided."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,8 +10,9 @@ import numpy as np
 from scipy.spatial import KDTree
 from tqdm.auto import tqdm
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, number, require_kind, require_memory, whole
 from jaxmpc.control.sets import Ellipsoid, Polytope, hull_volume
+from jaxmpc.control.system import host_array
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.candidates import StagePenalties
 from jaxmpc.feasible.cascade import label_chunks
@@ -28,15 +30,19 @@ VOLUME_ROUNDING = 1e-11
 
 def grid(lower: Any, upper: Any, shape: Any) -> np.ndarray:
     """Return the points of a regular grid, end points included: (Π shape, d), first coordinate
-    slowest."""
-    lower, upper = np.atleast_1d(np.asarray(lower, float)), np.atleast_1d(np.asarray(upper, float))
-    shape = tuple(int(k) for k in np.atleast_1d(shape))
-    if not lower.shape == upper.shape == (len(shape),):
+    slowest. A number among lower, upper (d,) and shape (d,) holds along each axis.
+
+    Raises ValueError for what is no grid, and for one that does not fit into memory.
+    """
+    given = (host_array("grid lower", lower), host_array("grid upper", upper), np.asarray(shape))
+    d = max(np.size(value) for value in given)
+    lower, upper, shape = (v if v.ndim else np.full(d, v) for v in given)
+    shape = tuple(whole("grid shape", k, 1) for k in shape.ravel().tolist())
+    if not shape or not lower.shape == upper.shape == (len(shape),):
         fail("grid", f"lower {lower.shape}, upper {upper.shape}, shape {shape}", "Same length each")
     if not (np.all(np.isfinite(lower)) and np.all(np.isfinite(upper)) and np.all(lower <= upper)):
         fail("grid", f"lower {lower}, upper {upper}", "Give finite lower ≤ upper")
-    if min(shape) < 1:
-        fail("grid", f"shape {shape}", "Give at least one point along each axis")
+    require_memory("grid", 16 * len(shape) * math.prod(shape), "Give fewer points")
     lines = [np.linspace(*ends) for ends in zip(lower, upper, shape, strict=True)]
     return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(shape))
 
@@ -314,6 +320,13 @@ def map_feasible_set(
     shapes and ill-posed problems before anything compiles.
     """
     problem = FeasibilityProblem.of(mpc, axes, fixed)
+    whole("iterations", iterations, 1)
+    if chunk is not None:
+        whole("chunk", chunk, 1)
+    if refine is not None:
+        number("refine", refine, 0, "Give a tolerance of at least 0, or None")
+    if penalties is not None:
+        require_kind("penalties", penalties, StagePenalties)
     result = map_points(
         problem, x0s, iterations=iterations, dtype=dtype, chunk=chunk, penalties=penalties,
         progress=progress,
@@ -325,7 +338,7 @@ def map_points(
     problem: FeasibilityProblem, points: Any, *, progress: bool = False, **settings: Any
 ) -> FeasibleSetMap:
     """Label the points (B, d) of a feasibility problem; settings: those of `label_chunks`."""
-    points = np.asarray(points, np.float64)
+    points = host_array("x0s", points)
     parts = [Labels.empty(0, problem)]
     with tqdm(total=len(points), unit="pt", disable=not progress) as bar:
         for _, part in label_chunks(problem, points, **settings):

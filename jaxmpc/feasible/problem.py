@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxmpc.checks import require_kind
 from jaxmpc.feasible import constraint_rows, exact_data
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
@@ -36,6 +37,7 @@ class FeasibilityProblem:
 
         Raises ValueError for an ill-posed problem and for a wrong view.
         """
+        require_kind("mpc", mpc, MPC)
         mpc.validate()
         hard = replace(mpc, soft=(), input_rate_weight=None)
         return cls(hard, make_view(hard, axes, fixed))

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.checks import concrete, fail
+from jaxmpc.checks import concrete, fail, require_memory
 from jaxmpc.control.riccati import lqr
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Layout, blocks, stacked
@@ -131,8 +131,23 @@ def prestabilising_gain(mpc: MPC) -> Any:
 
 
 def condense(mpc: MPC) -> Condensed:
-    """Build the parametric QP. Differentiable in every array of `mpc`."""
+    """Build the parametric QP. Differentiable in every array of `mpc`. Raises ValueError where it
+    does not fit into memory."""
+    a_step = sum(np.shape(s.rows()[1])[0] for s in (mpc.states, mpc.inputs) if s is not None)
+    sizes = mpc.horizon, mpc.system.n, mpc.system.m, mpc.control_horizon, a_step
+    needed = condensed_bytes(*sizes) * jax.dtypes.canonicalize_dtype(float).itemsize / 8
+    require_memory("horizon", needed, "Give fewer steps, or use jm.mpc.solve_stagewise")
     return _condense(arrays(replace(mpc, prestabilise=prestabilising_gain(mpc))))
+
+
+def condensed_bytes(
+    N: int, n: int, m: int, control_horizon: int | tuple[int, ...] | None, a_step: int
+) -> float:
+    """Return the bytes of the large arrays of a condensed problem in float64: Γ and Ω before moves
+    are blocked, an identity, P and C with `a_step` rows a step."""
+    moves: Any = N if control_horizon is None else control_horizon
+    free = (len(moves) if isinstance(moves, tuple) else moves) * m
+    return 8 * (N * m * (N * n + 2 * N * m) + free * (free + N * a_step))
 
 
 def in_float64(mpc: MPC) -> MPC:

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.checks import concrete, fail
+from jaxmpc.checks import concrete, fail, require_kind
 from jaxmpc.control.sets import Box, Polytope
+from jaxmpc.control.system import as_array, host_array
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.plan import (
     Multipliers,
@@ -52,6 +53,8 @@ class Controller:
         # JAX rebuilds this object with its parts present, or with placeholders: leave those be.
         if self.condensed is None and isinstance(self.mpc, MPC):
             self.mpc.validate()
+            require_kind("solver", self.solver, ADMM)
+            self.solver.validate()
             mpc, finite = harmless(self.mpc)
             condensed = condense(mpc)
             # The factorization reads from P what is wrong with the data.
@@ -137,30 +140,54 @@ class Controller:
     def _checked(
         self, x0: Any, reference: Any, input_reference: Any, previous_input: Any
     ) -> list[Any]:
-        """The arguments in the controller's precision; ValueError for wrong shapes."""
-        N, n, m = self.mpc.horizon, self.mpc.system.n, self.mpc.system.m
-        shapes = {
-            "x0": ((n,), (n,)), "reference": ((n,), (N + 1, n)),
-            "input_reference": ((m,), (N, m)), "previous_input": ((m,), (m,)),
-        }  # fmt: skip
-        checked = []
-        for (name, (one, all_steps)), value in zip(
-            shapes.items(), (x0, reference, input_reference, previous_input), strict=True
-        ):
-            if value is not None or name == "x0":
-                if np.shape(value) not in (one, all_steps):
-                    cure = f"Give {one}" if one == all_steps else f"Give {one} or {all_steps}"
-                    fail(name, f"shape {np.shape(value)}", f"{cure}; use jax.vmap for many")
-                if not isinstance(value, jax.Array):
-                    value = np.asarray(value, self.dtype)
-            checked.append(value)
-        return checked
+        """The arguments in the controller's precision; ValueError for wrong ones."""
+        if self.condensed is None:
+            require_kind("mpc", self.mpc, MPC)
+        given = plan_arguments(self.mpc, x0, reference, input_reference, previous_input)
+        return [v.astype(self.dtype) if isinstance(v, np.ndarray) else v for v in given]
 
     def multipliers(self, y: Array) -> Multipliers:
         """Sort the QP's multipliers y (rows,) by constraint and step."""
         c = self.condensed
         assert c is not None
         return sorted_multipliers(self.mpc, c.layout, y)
+
+
+def plan_arguments(
+    mpc: MPC, x0: Any, reference: Any = None, input_reference: Any = None,
+    previous_input: Any = None,
+) -> list[Any]:  # fmt: skip
+    """Return the arguments of a plan as arrays, None where they are None; ValueError for wrong
+    kinds and shapes. A number will do for one state or input."""
+    N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
+    shapes = {
+        "x0": ((n,), (n,)), "reference": ((n,), (N + 1, n)),
+        "input_reference": ((m,), (N, m)), "previous_input": ((m,), (m,)),
+    }  # fmt: skip
+    checked = []
+    for (name, (one, all_steps)), value in zip(
+        shapes.items(), (x0, reference, input_reference, previous_input), strict=True
+    ):
+        if value is not None or name == "x0":
+            value = _real_array(name, value)
+            if np.shape(value) == () and one == (1,):
+                value = value.reshape(1)
+            if np.shape(value) not in (one, all_steps):
+                cure = f"Give {one}" if one == all_steps else f"Give {one} or {all_steps}"
+                fail(name, f"shape {np.shape(value)}", f"{cure}; use jax.vmap for many")
+        checked.append(value)
+    return checked
+
+
+def _real_array(name: str, value: Any) -> Any:
+    if isinstance(value, np.ndarray) and value.dtype.kind in "iuf":  # the usual case, and fast
+        return value
+    value = as_array(value)
+    if not isinstance(value, jax.Array):
+        return host_array(name, value)
+    if jnp.issubdtype(value.dtype, jnp.complexfloating):
+        fail(name, f"entries of type {value.dtype} where real numbers are needed", "Use .real")
+    return value
 
 
 def harmless(mpc: MPC) -> tuple[MPC, Any]:

@@ -6,9 +6,17 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxmpc.checks import concrete, fail, require_finite, require_shape, require_symmetric_psd
+from jaxmpc.checks import (
+    concrete,
+    fail,
+    require_finite,
+    require_kind,
+    require_real,
+    require_shape,
+    require_symmetric_psd,
+)
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
-from jaxmpc.control.system import LinearSystem, as_array, host_array
+from jaxmpc.control.system import LinearSystem, as_array, as_weight, dimensions, host_array
 
 
 @jax.tree_util.register_dataclass
@@ -73,7 +81,8 @@ class MPC:
              u_k ∈ inputs (k = 0..N−1),  x_N ∈ terminal_set.
 
     system: LinearSystem. Q (n, n) ⪰ 0, R (m, m) ≻ 0, terminal_cost P (n, n) ⪰ 0 or None (no
-    terminal cost). states, inputs: Box, Polytope or None; terminal_set: these or an Ellipsoid.
+    terminal cost); a vector is a diagonal, and a number will do for one state or input. states,
+    inputs: Box, Polytope or None; terminal_set: these or an Ellipsoid.
     constrained_steps: the k in 0..N at which `states` hold, where that is another index set.
     outputs: `Outputs`, or a tuple of them; soft: `Soft`, or a tuple of them. stage_weights s (N,) >
     0: weighs the stages, Σ s_k (x_k'Q x_k + u_k'R u_k); None: all 1.
@@ -109,6 +118,20 @@ class MPC:
     input_rate_weight: Any = None
     input_rate_limit: Any = None
     stage_weights: Any = None
+
+    def __post_init__(self) -> None:
+        # JAX rebuilds this object with placeholders, and `in_axes` are one without arrays.
+        system = self.system
+        if not isinstance(system, LinearSystem):
+            return
+        if dimensions(system.A) != 2 or dimensions(system.B) != 2:
+            return
+        n, m = system.n, system.m
+        for name, size in (("Q", n), ("R", m), ("terminal_cost", n)):
+            object.__setattr__(self, name, as_weight(getattr(self, name), size))
+        for name, size in (("states", n), ("inputs", m), ("terminal_set", n)):
+            if isinstance(getattr(self, name), Box):
+                object.__setattr__(self, name, getattr(self, name).spread(size))
 
     @property
     def rate_limited(self) -> bool:
@@ -151,8 +174,7 @@ class MPC:
 
     def validate(self) -> None:
         """Raise ValueError that names the field, its value and the cure, before any compile."""
-        if not isinstance(self.system, LinearSystem):
-            fail("system", f"is a {type(self.system).__name__}", "Give a jm.LinearSystem")
+        require_kind("system", self.system, LinearSystem)
         self.system.validate()
         n, m = self.system.n, self.system.m
         whole = isinstance(self.horizon, int | np.integer) and not isinstance(self.horizon, bool)
@@ -184,6 +206,8 @@ class MPC:
             value.validate(name, size)
         if self.prestabilise is not None and not isinstance(self.prestabilise, bool):
             require_shape("prestabilise", self.prestabilise, (m, n), "A gain K with u = Kx + v")
+        if not isinstance(self.constrain_initial, bool | np.bool_):
+            fail("constrain_initial", f"{self.constrain_initial!r}", "Give True or False")
         self._validate_steps()
         for i, soft in enumerate(as_tuple("soft", self.soft, Soft)):
             sides = ("d",) if soft.lower is None else ("d", "lower")
@@ -228,6 +252,7 @@ class MPC:
 
     def _validate_rows(self, name: str, rows: Any, bounds: tuple[str, ...]) -> None:
         n, m = self.system.n, self.system.m
+        require_real(f"{name}.C", rows.C)
         shape = np.shape(as_array(rows.C))
         if len(shape) != 2 or shape[1] != n or not shape[0]:
             fail(f"{name}.C", f"shape {shape}", f"Give (p, {n}), one column a state")
@@ -260,6 +285,7 @@ class MPC:
     def _validate_rates(self) -> None:
         m, W, limit = self.system.m, self.input_rate_weight, self.input_rate_limit
         if W is not None:
+            require_real("input_rate_weight", W)
             if np.shape(W) not in ((m,), (m, m)):
                 fail("input_rate_weight", f"shape {np.shape(W)}", f"Give ({m}, {m}) or ({m},)")
             if concrete(W):

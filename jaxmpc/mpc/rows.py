@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.checks import require_kind
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, output_steps
 from jaxmpc.qp.linalg import cholesky
@@ -146,6 +147,7 @@ def blocks(mpc: MPC, dtype: Any) -> list[Block]:
 
 def row_table(mpc: MPC) -> tuple[Row, ...]:
     """Return one entry for each row of the condensed QP, in its order."""
+    require_kind("mpc", mpc, MPC)
     mpc.validate()
     return tuple(
         Row(b.kind, k, b.names[i], b.units[i], i, b.linear is not None)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.checks import concrete, fail
+from jaxmpc.checks import concrete, fail, require_kind
 from jaxmpc.control.limits import output_limits
 from jaxmpc.control.sets import Ellipsoid, Polytope
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple, output_steps
@@ -19,6 +19,7 @@ def soften(mpc: MPC, rho: Any, quadratic: Any = 0.0) -> MPC:
     measured as H x − h in the row as given. Raises ValueError for an Ellipsoid as terminal set,
     which has no rows.
     """
+    require_kind("mpc", mpc, MPC)
     mpc.validate()
     system, N, soft = mpc.system, mpc.horizon, list(as_tuple("soft", mpc.soft, Soft))
     if isinstance(mpc.terminal_set, Ellipsoid):

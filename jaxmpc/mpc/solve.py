@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, require_kind, require_memory, whole
 from jaxmpc.compiled import (
     Compiled,
     default_chunk,
@@ -17,9 +17,10 @@ from jaxmpc.compiled import (
     side_by_side,
     workers,
 )
+from jaxmpc.control.system import LinearSystem, host_array
 from jaxmpc.mpc.condense import in_float64
-from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.plan import Plan
+from jaxmpc.mpc.controller import Controller, plan_arguments
+from jaxmpc.mpc.plan import Plan, WarmStart
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM, DEFAULT
 
@@ -40,6 +41,14 @@ def solve(
     once. Raises ValueError for an ill-posed problem or wrong shapes, before any compile; what
     depends on values inside a batch is answered by `plan.status`.
     """
+    require_kind("mpc", mpc, MPC)
+    require_kind("system", mpc.system, LinearSystem)
+    mpc.system.validate()
+    whole("horizon", mpc.horizon, 1)
+    plan_arguments(mpc, x0, reference, input_reference, previous_input)
+    if warm_start is not None and not isinstance(warm_start, Plan | WarmStart):
+        what = f"is a {type(warm_start).__name__}"
+        fail("warm_start", what, "Give a Plan or a jm.mpc.WarmStart")
     return Controller(mpc, solver).plan(x0, reference, warm_start, input_reference, previous_input)
 
 
@@ -56,16 +65,20 @@ def solve_many(
     takes at once; None: by device. A state with NaN gets status NON_FINITE. Raises ValueError for
     wrong shapes and ill-posed problems.
     """
+    require_kind("mpc", mpc, MPC)
+    require_kind("solver", solver, ADMM)
     mpc.validate()
-    x0s = np.asarray(x0s, np.float64)
+    x0s = host_array("x0s", x0s)
     if x0s.ndim != 2 or x0s.shape[1] not in (mpc.system.n, mpc.dimension):
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.system.n})")
     x0s = np.pad(x0s, ((0, 0), (0, mpc.dimension - x0s.shape[1])))
     require_step_type(dtype)
     if chunk is None:
         chunk = min(default_chunk(), -(-len(x0s) // workers()))
-    elif chunk < 1:
-        fail("chunk", f"{chunk}", "Give a count of at least 1")
+    else:
+        whole("chunk", chunk, 1)
+    each = 8 * (mpc.horizon + 1) * (mpc.system.n + mpc.system.m)
+    require_memory("x0s", len(x0s) * each, "Solve some of them at a time")
     size = max(min(chunk, len(x0s)), 1)
     with jax.enable_x64(True):
         controller = Controller(in_float64(mpc), replace(solver, dtype=np.dtype(dtype).name))

@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.checks import concrete, fail
+from jaxmpc.checks import MOST_COUNT, concrete, fail, number, require_real, whole
 from jaxmpc.qp.linalg import cholesky, inverse_root
 from jaxmpc.qp.precision import matmul, precisely, rounding
 from jaxmpc.qp.problem import QP
@@ -85,29 +85,34 @@ class ADMM:
     fixed: bool = field(default=False, metadata={"static": True})
     dtype: str | None = field(default=None, metadata={"static": True})
 
-    def validate(self, rows: int) -> None:
-        """Raise ValueError for settings that make no iteration."""
-        if self.iterations < 0 or (self.refine or 0) < 0:
-            fail("iterations, refine", f"{self.iterations}, {self.refine}", "Give counts ≥ 0")
+    def validate(self, rows: int | None = None) -> None:
+        """Raise ValueError for settings that make no iteration of a program with so many rows
+        (None: not known yet)."""
+        for name in ("iterations", "refine"):
+            count = getattr(self, name)
+            if (count is not None or name == "iterations") and whole(name, count, 0) > MOST_COUNT:
+                fail(name, f"{count}", f"Give at most {MOST_COUNT}")
+        if self.rho is not None:
+            require_real("rho", self.rho)
         shape: tuple[int, ...] = () if self.rho is None else np.shape(self.rho)
-        if len(shape) > 2 or (shape and shape[-1] not in (1, rows)):
+        if len(shape) > 2 or (shape and rows is not None and shape[-1] not in (1, rows)):
             fail("rho", f"shape {shape}", f"Give (), ({rows},) or (stages, {rows})")
         if self.rho is not None and concrete(self.rho) and not np.all(np.asarray(self.rho) > 0):
             fail("rho", "holds a value that is not positive", "Penalties are positive")
         if len(shape) == 2 and self.iterations % shape[0]:
             fail("iterations", f"{self.iterations} for {shape[0]} stages", "Use a multiple")
+        number("alpha", self.alpha, 0, "Over-relaxation lies in (0, 2); 1.6 is usual")
         if concrete(self.alpha) and not 0 < float(np.asarray(self.alpha)) < 2:
             fail("alpha", f"{self.alpha}", "Over-relaxation lies in (0, 2); 1.6 is usual")
         for name in ("eps", "eps_rel"):
             value = getattr(self, name)
-            if value is not None and concrete(value) and not float(np.asarray(value)) >= 0:
-                fail(name, f"{value}", "Tolerances are at least 0")
+            if value is not None:
+                number(name, value, 0, "Tolerances are at least 0")
         if self.dtype not in (None, "float32", "float64"):
             fail("dtype", f"{self.dtype!r}", 'Give "float32", "float64" or None')
         if self.differentiate not in ("implicit", "unrolled"):
             fail("differentiate", f"{self.differentiate!r}", 'Give "implicit" or "unrolled"')
-        if concrete(self.smoothing) and not float(np.asarray(self.smoothing)) >= 0:
-            fail("smoothing", f"{self.smoothing}", "Give 0 (none) or a positive number")
+        number("smoothing", self.smoothing, 0, "Give 0 (none) or a positive number")
 
     def newton_steps(self, most: int = 1000) -> int:
         """Return how many Newton steps there are at most: `refine`, or where that is None `most`,

@@ -8,7 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.checks import concrete, fail, require_finite, require_shape, require_symmetric_psd
+from jaxmpc.checks import (
+    concrete,
+    fail,
+    require_finite,
+    require_real,
+    require_shape,
+    require_symmetric_psd,
+)
 from jaxmpc.qp.projection import Bounds
 
 
@@ -62,6 +69,8 @@ class QP:
         Rows come in that order: inequalities, equalities, bounds; `QPSolution.duals` splits their
         multipliers again.
         """
+        for name, value in (("P", P), ("q", q), *(() if G is None else (("G", G), ("h", h)))):
+            require_real(name, dense(value))
         host = lambda M: np.asarray(dense(M), dtype=float)
         P, q = host(P), np.asarray(q, dtype=float).ravel()
         n = q.size
@@ -86,6 +95,8 @@ class QP:
 
     def validate(self) -> None:
         """Raise ValueError for wrong shapes, NaN, asymmetric or indefinite P, or l > u."""
+        for name in ("P", "q", "A", "l", "u"):
+            require_real(name, getattr(self, name))
         if np.ndim(self.q) != 1:
             fail("q", f"shape {np.shape(self.q)} is not (n,)", "Give one vector; vmap for many")
         n = np.shape(self.q)[0]
@@ -117,6 +128,8 @@ class QP:
 
     def _validate_balls(self, m: int) -> None:
         sizes = self.balls
+        if not isinstance(sizes, tuple):
+            fail("balls", f"{sizes!r}", "Give a tuple with the number of rows of each")
         if (self.radius is None) != (not sizes):
             fail("balls, radius", f"{sizes}, {self.radius}", "Give both, or neither")
         if not sizes:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jaxmpc.checks import concrete, fail
+from jaxmpc.checks import concrete, fail, require_kind, require_shape
 from jaxmpc.qp.active_set import FEW_ROWS, MOST_ROWS, DualPoint, dual_point, dual_step
 from jaxmpc.qp.admm import (
     ADMM,
@@ -62,9 +62,13 @@ def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: Any = None) -> QPSoluti
     data has derivative zero. Raises ValueError for bad shapes and, where values can be read, bad
     values.
     """
+    require_kind("qp", qp, QP)
+    require_kind("solver", solver, ADMM)
     qp = qp.dense()
     qp.validate()
     solver.validate(np.shape(qp.A)[0])
+    if warm_start is not None:
+        require_warm_start(qp, warm_start)
     arguments = as_arrays(qp), *arrays((solver, warm_start))
     return in_two_parts(_solve, not has_dual_steps(qp.balls, qp.A), solver, *arguments)
 
@@ -426,12 +430,20 @@ def cleaned(qp: QP, matrix_fault: Array) -> tuple[QP, Array]:
 def warm(factor: Factor, qp: QP, bounds: Bounds, warm_start: Any) -> Array:
     """Return t (m,) of a warm start, a pair z (n,), y (m,) or a solution; what is not finite counts
     as 0. Raises ValueError for other shapes."""
-    z, y = (warm_start.z, warm_start.y) if hasattr(warm_start, "z") else warm_start
-    for name, value, like in (("z", z, qp.q), ("y", y, qp.l)):
-        if jnp.shape(value) != like.shape:
-            fail(f"warm_start {name}", f"shape {jnp.shape(value)}", f"Needed: {like.shape}")
+    z, y = require_warm_start(qp, warm_start)
     clean = lambda v: jnp.nan_to_num(jnp.asarray(v, qp.q.dtype), posinf=0.0, neginf=0.0)
     return start(bounds, factor.rho[0], *scaled_rows(factor, qp, clean(z), clean(y)))
+
+
+def require_warm_start(qp: QP, warm_start: Any) -> tuple[Any, Any]:
+    """Return z and y of a warm start; ValueError for other things and other shapes."""
+    pair = (warm_start.z, warm_start.y) if hasattr(warm_start, "z") else warm_start
+    if not isinstance(pair, tuple | list) or len(pair) != 2:
+        what = f"is a {type(warm_start).__name__}"
+        fail("warm_start", what, "Give a pair (z, y) or an earlier QPSolution")
+    for name, value, like in (("z", pair[0], qp.q), ("y", pair[1], qp.l)):
+        require_shape(f"warm_start {name}", value, np.shape(like), f"Needed: {np.shape(like)}")
+    return pair[0], pair[1]
 
 
 def unscaled(qp: QP, factor: Factor, w: Array, y: Array) -> tuple[Array, Array]:

@@ -48,8 +48,8 @@ class Parameter:
     def __post_init__(self) -> None:
         if self.domain not in DOMAINS:
             fail("domain", f"{self.domain!r}", f"Give one of {', '.join(DOMAINS)}")
+        require_finite("value", self.value)
         value = np.asarray(self.value, np.float64)
-        require_finite("value", value)
         if self.domain in ("diagonal", "definite"):
             if self.domain == "diagonal" and value.ndim == 1:
                 value = np.diag(value)

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import optax
 
-from jaxmpc.checks import fail, require_finite, whole
+from jaxmpc.checks import fail, require_finite, require_kind, whole
 from jaxmpc.mpc.condense import condense, in_float64
 from jaxmpc.mpc.plan import Plan, WarmStart
 from jaxmpc.mpc.problem import MPC
@@ -178,6 +178,7 @@ def _prepared(
     reference: Any, input_reference: Any, settings: Settings,
 ) -> tuple[PenaltyObjective, Samples, Samples]:  # fmt: skip
     """Return the objective, and states for training and validation; ValueError for bad input."""
+    require_kind("mpc", mpc, MPC)
     mpc.validate()
     if whole("iterations", iterations, 1) % whole("stages", stages, 1):
         fail("iterations", f"{iterations} for {stages} stages", "Use a multiple")

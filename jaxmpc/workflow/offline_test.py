@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.checks import fail, whole
+from jaxmpc.checks import fail, require_kind, whole
 from jaxmpc.control.sets import Box
 from jaxmpc.control.terminal import TerminalReport, verify_terminal
 from jaxmpc.explicit.exact_penalty import ExactPenalty, exact_penalty
@@ -90,6 +90,7 @@ def offline_report(
     Raises ValueError for an ill-posed problem, and where x0s is None and the feasible set is empty,
     flat or unbounded. NumPy; not traceable. Proofs are in float64.
     """
+    require_kind("mpc", mpc, MPC)
     mpc.validate()
     for name, value, least in (("steps", steps, 2), ("loops", loops, 1)):
         whole(name, value, least)

@@ -5,7 +5,14 @@ from pathlib import Path
 from typing import Annotated
 
 from jaxmpc.app import config as configs
-from jaxmpc.app.commands.options import Horizon, Terminal, check_positive, given_options, option
+from jaxmpc.app.commands.options import (
+    Horizon,
+    Terminal,
+    check_counts,
+    check_positive,
+    given_options,
+    option,
+)
 from jaxmpc.workflow.offline_test import offline_report
 
 
@@ -55,7 +62,8 @@ class Info:
 
     def run(self) -> None:
         """Print the report. Raises ValueError for options and files that make no sense."""
-        check_positive(self, "steps", "loops", "seconds")
+        check_counts(self, steps=2, loops=1)
+        check_positive(self, "seconds")
         config = configs.load(self.config, given_options(self, "horizon", "terminal"), "info")
         report = offline_report(
             config.build_controlled(), steps=self.steps, loops=self.loops, seconds=self.seconds

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import MOST_COUNT, fail
 from jaxmpc.feasible.store import Store
 from jaxmpc.robots.robot import Robot
 
@@ -64,11 +64,14 @@ def given_options(command: Any, *names: str) -> dict[str, Any]:
 
 
 def check_counts(command: Any, **least: int) -> None:
-    """Raise ValueError for an option that is given and below its least value."""
+    """Raise ValueError for an option that is given and below its least value, or too large for a
+    count."""
     for name, lowest in least.items():
         value = getattr(command, name)
         if value is not None and value < lowest:
             fail(f"--{name}", f"{value}", f"Give a whole number, at least {lowest}")
+        if value is not None and value > MOST_COUNT:
+            fail(f"--{name}", f"{value}", f"Give at most {MOST_COUNT}")
 
 
 def check_positive(command: Any, *names: str) -> None:

@@ -13,6 +13,7 @@ from jaxmpc.app.commands.options import (
     Horizon,
     Switch,
     Terminal,
+    check_counts,
     check_positive,
     given_options,
     open_folder,
@@ -127,7 +128,8 @@ class Recursion:
         Raises ValueError for options and files that make no sense.
         """
         begun = time.perf_counter()
-        check_positive(self, "seconds", "smallest")
+        check_positive(self, "seconds")
+        check_counts(self, smallest=1)
         if self.robot is not None:
             self.robot_map(self.robot).run()
             return
@@ -135,6 +137,8 @@ class Recursion:
         refuse(given, None, "It is for maps of robots")
         keys = "horizon terminal steps grid lower upper regions seconds".split()
         config = configs.load(self.config, given_options(self, *keys), "recursion")
+        if self.smallest is not None:
+            configs.require_horizon(config, "--smallest", self.smallest)
         mpc, states, settings = config.build_mpc(), recursion_states(config), config.recursion
         there = [self.output / name for name in FILES if (self.output / name).exists()]
         if there and not self.overwrite:

@@ -20,7 +20,7 @@ from jaxmpc.app.commands.options import (
 )
 from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
 from jaxmpc.app.config import load_robot_config
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, require_disk, require_memory
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
 from jaxmpc.closed_loop.robot_controller import RobotController
 from jaxmpc.closed_loop.robot_mpc import robot_mpc
@@ -29,6 +29,7 @@ from jaxmpc.closed_loop.simulate_many import simulate_many
 from jaxmpc.compiled import Compiled, first_rows, padded
 from jaxmpc.control.riccati import lqr
 from jaxmpc.feasible import store
+from jaxmpc.mpc.condense import condensed_bytes
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
@@ -79,6 +80,7 @@ class RobotRuns:
         for name, given, size in sizes:
             if given is not None and len(given) != size:
                 fail(name, f"has {len(given)} numbers", f"{robot.name} needs {size}")
+        require_sizes(command, robot)
         target = None if command.target is None else np.array(command.target)
         file: dict[str, Any] = {}
         if command.config is not None:
@@ -158,6 +160,19 @@ class RobotRuns:
         data: dict[str, Any] = {name: self.kept.read(name) for name in STORED}
         # x_0 is measured and no limit binds it, so that there is no soft row at k = 0.
         return Run(**data | {"slack": np.zeros((*data["status"].shape, 0))})
+
+
+def require_sizes(command: "Simulate", robot: Robot) -> None:
+    """Raise ValueError where the runs, or the condensed problem, do not fit into memory."""
+    samples, n, m = command.seconds / robot.dt, robot.n, robot.m
+    each = np.dtype(command.dtype).itemsize * (robot.state_size + m + 3) + 2
+    needed = command.count * samples * each
+    require_memory("--count, --seconds", needed, "Simulate fewer robots, or for less time")
+    # Trajectories hardly compress; the files are seldom a quarter of the arrays.
+    folder = command.output
+    require_disk(f"--output {folder}", needed / 4, folder, "Simulate less, or use another disk")
+    horizon: Any = command.horizon
+    require_memory("--horizon", condensed_bytes(horizon, n, m, None, n + m), "Give fewer steps")
 
 
 # The fields of `Run` that the store keeps.

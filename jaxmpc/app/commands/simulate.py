@@ -187,6 +187,14 @@ class Simulate:
         """Raise ValueError for options that make no sense."""
         check_counts(self, count=1, horizon=1, iterations=1, refine=0, video=0, seed=0, chunk=1)
         check_positive(self, "seconds", "penalty", "tolerance")
+        for name, wrong, cure in (
+            ("target", lambda v: False, "Give finite numbers"),
+            ("state_weights", lambda v: v < 0, "Give finite numbers, at least 0"),
+            ("input_weights", lambda v: v <= 0, "Give finite positive numbers"),
+        ):
+            for value in getattr(self, name) or ():
+                if not np.isfinite(value) or wrong(value):
+                    fail(f"--{name.replace('_', '-')}", f"{value}", cure)
         if not 0 <= self.payload < np.inf:
             fail("--payload", f"{self.payload}", "Give a mass in kg")
         if not 0 <= self.spread <= 1:

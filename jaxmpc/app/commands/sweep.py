@@ -1,6 +1,7 @@
 """The command `jaxmpc sweep`."""
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -18,6 +19,10 @@ from jaxmpc.app.commands.options import (
     refuse,
 )
 from jaxmpc.app.commands.robot_map import RobotMapCommand
+from jaxmpc.checks import require_disk
+
+# By how much the files of a sweep are smaller than its arrays, at most: the joint's 13 times.
+COMPRESSION = 20
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,6 +156,10 @@ class Sweep:
         keys = "horizon terminal grid lower upper axes fixed iterations dtype".split()
         overrides = given_options(self, *keys) | ({"projection": True} if self.projection else {})
         config = configs.load(self.config, overrides)
+        needed = math.prod(configs.grid_shape(config)) * configs.state_bytes(config) / COMPRESSION
+        require_disk(
+            f"--output {self.output}", needed, self.output, "Map fewer points, or use another disk"
+        )
         return LinearSweep.open(config, self.output, self.resume, self.overwrite)
 
     def robot_map(self, robot: str) -> RobotMapCommand:

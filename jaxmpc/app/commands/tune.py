@@ -230,8 +230,8 @@ class TuneWeights:
         Raises ValueError for options that do not fit together."""
         self.check()
         check_results(self.output / "tuning.json", self.resume, self.overwrite)
-        task = linear_task(self) if self.robot is None else robot_task(self)
         self.stepper(np.zeros(1))
+        task = linear_task(self) if self.robot is None else robot_task(self)
         files = ("tuning.json", TUNED, "tuning.png", "before_after.png", "maps.png")
         open_run(self.output, files, self.options(task), self.resume, self.overwrite)
         return task

@@ -33,7 +33,7 @@ from jaxmpc.app.commands.tuning import (
     start_range,
 )
 from jaxmpc.app.plots.tuning import plot_penalties
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, require_memory
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import solve
 from jaxmpc.qp.admm import ADMM
@@ -177,6 +177,7 @@ class TunePenalties:
             fail("--learning-rate", "given without --optimizer", "Name one, such as adam")
         self.stepper(np.zeros(1))
         config = problem_file(self)
+        require_memory("--count", 8 * self.count * len(config.system.A), "Tune on fewer states")
         ends = start_range(config, self.lower, self.upper, 1.0)
         mpc = config.build_controlled()
         ignored = ("config", "output", "resume", "overwrite", "updates")

@@ -12,7 +12,7 @@ from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import given_options, model_hash
 from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
 from jaxmpc.app.commands.tuning import feasible_states, problem_file, start_range
-from jaxmpc.checks import fail
+from jaxmpc.checks import MOST_COUNT, fail, require_memory
 from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.closed_loop.robot_controller import RobotController
 from jaxmpc.closed_loop.robot_mpc import robot_mpc
@@ -225,13 +225,15 @@ def linear_task(command: Any) -> TuningTask:
     solver = dataclasses.replace(settings, iterations=count, refine=refine)
     dtype = command.dtype or "float64"
     fraction = 0.9 if command.spread is None else command.spread
+    steps = command.steps or 50
+    if command.seconds is not None:
+        steps = whole_samples(command.seconds, plant.dt)
+    require_loops(command.count, steps, n, m)
+    require_loss(command, n, m)
     x0s, dropped = feasible_states(
         hard if rho is None else soften(hard, rho), config.state_limits(),
         *start_range(config, command.lower, command.upper, fraction), command.count, command.seed,
     )  # fmt: skip
-    steps = command.steps or 50
-    if command.seconds is not None:
-        steps = max(1, round(command.seconds / plant.dt))
 
     def write(values: Mapping[str, np.ndarray]) -> str:
         return tuned(config, values).to_toml()
@@ -242,10 +244,23 @@ def linear_task(command: Any) -> TuningTask:
     make = linear_family(hard, config.cost.P, rho, parameters, limits)
     return TuningTask(
         config.name, make, parameters, plant, x0s, {}, training(command, len(x0s)),
-        loss_of(command, hard.Q, hard.R, n, m, limits, plant, None, None), None, None, steps,
+        loss_of(command, hard.Q, hard.R, limits, plant, None, None), None, None, steps,
         solver, dtype, limits, write, load, {"problem": config.to_dict("tune")}, dropped, hard,
         config,
     )  # fmt: skip
+
+
+def whole_samples(seconds: float, dt: float) -> int:
+    """Return the number of samples in some seconds, at least 1. Raises ValueError for too many."""
+    if seconds / dt > MOST_COUNT:
+        fail("--seconds", f"{seconds:g}", f"Give at most {MOST_COUNT * dt:g}")
+    return max(1, round(seconds / dt))
+
+
+def require_loops(count: int, steps: int, n: int, m: int) -> None:
+    """Raise ValueError where states and inputs of all loops do not fit into memory in float64."""
+    needed = 8 * count * (steps + 1) * (n + m)
+    require_memory("--count, --steps", needed, "Tune on fewer loops, or shorter ones")
 
 
 def with_numbers(config: configs.Config, hard: MPC, rho: float | None) -> configs.Config:
@@ -274,9 +289,9 @@ def robot_task(command: Any) -> TuningTask:
         fail("--target", what, f"{robot.name} needs {robot.mujoco.nq}")
     target = None if command.target is None else np.array(command.target)
     # What does not compile is checked before the linear model is.
-    loss = loss_of(
-        command, np.eye(robot.n), np.eye(robot.m), robot.n, robot.m, None, None, None, None
-    )
+    steps = command.steps or whole_samples(command.seconds or 1.0, robot.dt)
+    require_loops(command.count, steps, robot.n, robot.m)
+    require_loss(command, robot.n, robot.m)
     weights: dict[str, Any] = {} if file is None else file.weights(robot)
     mpc = robot_mpc(robot, horizon=section.horizon, target=target, margin=section.margin, **weights)
     Q, R, P = mpc.Q, mpc.R, mpc.terminal_cost
@@ -308,8 +323,7 @@ def robot_task(command: Any) -> TuningTask:
     if variations:
         robot.vary(**{key: value[0] for key, value in variations.items()})
     dtype = command.dtype or "float32"
-    steps = command.steps or max(1, round((command.seconds or 1.0) / robot.dt))
-    loss = loss_of(command, Q, R, robot.n, robot.m, robot.state_limits, robot, r, s)
+    loss = loss_of(command, Q, R, robot.state_limits, robot, r, s)
 
     def controller(mpc: MPC, penalty: Any, linearize: str) -> RobotController:
         return RobotController(robot, mpc, solver, linearize=linearize, penalty=penalty)
@@ -357,16 +371,20 @@ def training(command: Any, count: int) -> np.ndarray:
     return np.arange(count) < count - kept
 
 
-def loss_of(
-    command: Any, Q: Any, R: Any, n: int, m: int, limits: Any, plant: Any, r: Any, s: Any
-) -> ClosedLoopLoss:
-    """Return the loss that the options describe; m, n: sizes, r, s: references."""
+def require_loss(command: Any, n: int, m: int) -> None:
+    """Raise ValueError where --tracking or --effort does not fit n states and m inputs."""
     for name, given, size in (("tracking", command.tracking, n), ("effort", command.effort, m)):
         if given is not None and len(given) != size:
             fail(f"--{name}", f"has {len(given)} numbers", f"The problem needs {size}")
+
+
+def loss_of(
+    command: Any, Q: Any, R: Any, limits: Any, plant: Any, r: Any, s: Any
+) -> ClosedLoopLoss:
+    """Return the loss that the options describe; Q, R: weights at the start, r, s: references."""
     Q = np.asarray(Q) if command.tracking is None else np.array(command.tracking)
     R = np.asarray(R) if command.effort is None else np.array(command.effort)
-    half = limits.half_widths() if isinstance(limits, Box) else np.ones(n)
+    half = limits.half_widths() if isinstance(limits, Box) else np.ones(len(Q))
     return ClosedLoopLoss(
         Q, R, r, s, limits, command.violation, command.settling, command.tolerance * half,
         plant=None if isinstance(plant, LinearPlant) else plant,

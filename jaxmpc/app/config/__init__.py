@@ -15,11 +15,12 @@ key (or the option of the command line that set it), and how to correct it. A ro
 file of their own, with the sections [robot] and [cost].
 """
 
+from jaxmpc.app.config.consistency import require_horizon, state_bytes
 from jaxmpc.app.config.problem import Config
 from jaxmpc.app.config.reading import load, load_robot_config
 from jaxmpc.app.config.robot import RobotConfig, RobotCostSection, RobotSection
 from jaxmpc.app.config.sections import SolverSection
-from jaxmpc.app.config.states import SweepPoints, recursion_states, sweep_points
+from jaxmpc.app.config.states import SweepPoints, grid_shape, recursion_states, sweep_points
 
 __all__ = [
     "Config",
@@ -28,8 +29,11 @@ __all__ = [
     "RobotSection",
     "SolverSection",
     "SweepPoints",
+    "grid_shape",
     "load",
     "load_robot_config",
     "recursion_states",
+    "require_horizon",
+    "state_bytes",
     "sweep_points",
 ]

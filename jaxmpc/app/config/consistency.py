@@ -1,12 +1,14 @@
 """Checks of a configuration as a whole: keys that are valid alone must fit one another."""
 
+import math
 from typing import Any
 
 import numpy as np
 
 from jaxmpc.app.config.problem import COMMANDS, Config
-from jaxmpc.app.config.states import mapped_axes, recursion_states, section_ends
-from jaxmpc.checks import fail
+from jaxmpc.app.config.states import grid_shape, mapped_axes, recursion_shape, section_ends
+from jaxmpc.checks import fail, require_memory
+from jaxmpc.mpc.condense import condensed_bytes
 
 
 def check(config: Config, command: str = "sweep") -> None:
@@ -36,10 +38,19 @@ def check(config: Config, command: str = "sweep") -> None:
         _check_order("limits", low, high, getattr(limits, low), getattr(limits, high))
     _check_state_limits(config)
     _check_terminal_set(config, n)
+    require_horizon(config, "mpc.horizon", config.mpc.horizon)
     if command == "sweep":
         _check_sweep(config, n)
     elif command == "recursion":
         _check_recursion(config, n)
+
+
+def require_horizon(config: Config, key: str, horizon: int) -> None:
+    """Raise ValueError, naming the key, where a horizon is too long for the memory."""
+    n, m = len(config.system.A), len(config.system.B[0])
+    rows = config.limits.h_x or config.limits.x_min or ()
+    needed = condensed_bytes(horizon, n, m, config.mpc.control_horizon, len(rows) + m)
+    require_memory(key, needed, "Give fewer steps")
 
 
 def _check_sweep(config: Config, n: int) -> None:
@@ -56,7 +67,11 @@ def _check_sweep(config: Config, n: int) -> None:
         cure = f"Give the {n - d} other values in sweep.fixed (a slice) or projection = true"
         both = "fixed and projection exclude each other"
         fail("sweep.fixed", both if sweep.projection else f"{n} states, {d} mapped", cure)
+    if d == n and sweep.projection:
+        fail("sweep.projection", f"true, and all {n} states are mapped", "Name fewer in sweep.axes")
     section_ends(config, mapped_axes(config), sweep)
+    count = math.prod(grid_shape(config))
+    require_memory("sweep.grid", count * (8 * d + state_bytes(config)), "Map fewer points")
 
 
 def _check_recursion(config: Config, n: int) -> None:
@@ -68,7 +83,20 @@ def _check_recursion(config: Config, n: int) -> None:
             what = f"has {len(value)} entries where {n} are needed"
             fail(f"recursion.{key}", what, "One for each state")
     _check_order("recursion", "lower", "upper", recursion.lower, recursion.upper)
-    recursion_states(config)
+    shape = recursion_shape(config)
+    if shape is not None:
+        section_ends(config, range(n), recursion)
+        # The map of the samples, and the states of the loops: x, x⁺, two inputs, lost, undecided.
+        each = state_bytes(config, n) + 8 * (3 * n + 2 * len(config.system.B[0]) + 2)
+        require_memory("recursion.grid", math.prod(shape) * each, "Look at fewer states")
+
+
+def state_bytes(config: Config, d: int | None = None) -> int:
+    """Return the bytes of a state with its label and proofs in a map of d axes (None: those of
+    [sweep]): the point, x_0, the plan, the half-space, label and status."""
+    d = len(mapped_axes(config)) if d is None else d
+    n, m = len(config.system.A), len(config.system.B[0])
+    return 8 * (2 * d + n + config.mpc.horizon * m + 1) + 2
 
 
 def _check_state_limits(config: Config) -> None:

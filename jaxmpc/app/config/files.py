@@ -1,8 +1,9 @@
-"""Reading and writing of TOML files."""
+"""Reading and writing of TOML files, and where their keys come from."""
 
 import re
 import tomllib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,32 @@ import tomli_w
 from jaxmpc.checks import fail
 
 
+@dataclass(frozen=True)
+class Origin:
+    """Where the keys of a configuration come from: a file, and options of the command line (keys
+    such as "mpc.horizon")."""
+
+    file: str = ""
+    options: frozenset[str] = frozenset()
+
+    def error(self, message: str) -> ValueError:
+        """Return the error with the file, or the option, that holds the key it begins with."""
+        key, _, rest = message.partition(": ")
+        if key in self.options:
+            return ValueError(f"command line: --{key.split('.')[-1]}: {rest}")
+        return ValueError(f"{self.file}: {message}" if self.file else message)
+
+
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """Return what a file holds. Raises ValueError where it cannot be read or is no TOML."""
+    """Return what a file holds, with or without a byte-order mark. Raises ValueError where it
+    cannot be read or is no TOML."""
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         fail(str(path), f"cannot be read ({error.strerror})", "Give the path of a TOML file")
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except RecursionError:
+        fail(str(path), "is nested too deeply", "No key takes more than rows of numbers")
+    except ValueError as error:  # no TOML, no UTF-8, or a number of thousands of digits
         fail(str(path), f"is no TOML ({error})", "See the keys with: jaxmpc sweep --help")
 
 

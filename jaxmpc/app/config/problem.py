@@ -1,13 +1,16 @@
 """The problem that a TOML file describes, and the `MPC` made of it."""
 
+import dataclasses
 import json
-from typing import Any
+from collections.abc import Callable
+from functools import wraps
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import TypeAdapter
+from pydantic import Field, TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from jaxmpc.app.config.files import to_toml
+from jaxmpc.app.config.files import Origin, to_toml
 from jaxmpc.app.config.sections import (
     STRICT,
     CostSection,
@@ -30,6 +33,35 @@ from jaxmpc.qp.admm import ADMM
 
 # Commands that have a section of their own.
 COMMANDS = ("sweep", "recursion")
+# Arguments by which errors of the library name what these keys give.
+KEYS = {
+    **{
+        name: f"system.{name}"
+        for name in (
+            "A", "B", "c", "dt", "state_names", "state_units", "input_names", "input_units",
+        )
+    },
+    "Q": "cost.Q", "R": "cost.R", "terminal_cost": "cost.P",
+    "horizon": "mpc.horizon", "control_horizon": "mpc.control_horizon", "terminal": "mpc.terminal",
+    "states": "limits.x_min, x_max", "states.lower": "limits.x_min", "states.upper": "limits.x_max",
+    "inputs": "limits.u_min, u_max", "inputs.lower": "limits.u_min", "inputs.upper": "limits.u_max",
+    "states.H": "limits.H_x", "states.h": "limits.h_x", "terminal_set.H": "mpc.H_f",
+    "terminal_set.h": "mpc.h_f", "terminal_set.P": "mpc.P_f", "terminal_set.level": "mpc.level_f",
+}  # fmt: skip
+Result = TypeVar("Result")
+
+
+def _in_keys(method: Callable[..., Result]) -> Callable[..., Result]:
+    """Let errors of a method of `Config` name file and key, not the library's arguments."""
+
+    @wraps(method)
+    def wrapped(self: "Config", *args: Any) -> Result:
+        try:
+            return method(self, *args)
+        except ValueError as error:
+            raise self.origin.error(self.renamed(str(error))) from None
+
+    return wrapped
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -44,6 +76,20 @@ class Config:
     sweep: SweepSection = SweepSection()
     recursion: RecursionSection = RecursionSection()
     solver: SolverSection | None = None
+    origin: Annotated[Origin, Field(exclude=True)] = dataclasses.field(
+        init=False, compare=False, repr=False, default=Origin()
+    )
+
+    def renamed(self, message: str) -> str:
+        """Return an error of the library with the key of this file for its argument."""
+        argument, colon, rest = message.partition(": ")
+        mpc, limits = self.mpc, self.limits
+        found = {
+            "Polytope": "limits.H_x",
+            "terminal_set": "mpc.H_f" if mpc.H_f else "mpc.P_f" if mpc.P_f else "mpc.terminal",
+            **({"states": "limits.H_x"} if limits.H_x is not None else {}),
+        }
+        return found.get(argument, KEYS.get(argument, argument)) + colon + rest
 
     def to_dict(self, command: str = "sweep") -> dict[str, Any]:
         """Return the sections that a command reads as JSON data; infinity is "Infinity"."""
@@ -54,8 +100,10 @@ class Config:
         """Return the text of a file that `load` reads back as this very configuration."""
         return to_toml(ADAPTER.dump_python(self, exclude_none=True))
 
+    @_in_keys
     def build_mpc(self) -> MPC:
-        """Return the problem with hard limits. Raises ValueError as `MPC.validate` does."""
+        """Return the problem with hard limits. Raises ValueError, naming file and key, as
+        `MPC.validate` does."""
         s, limits, cost = self.system, self.limits, self.cost
         make = LinearSystem.from_continuous if s.continuous else LinearSystem
         system = make(
@@ -104,8 +152,10 @@ class Config:
     def build_controlled(self) -> MPC:
         """Return the problem that the controller solves: `build_mpc` softened by cost.rho."""
         mpc, rho = self.build_mpc(), self.cost.rho
-        if rho is None:
-            return mpc
+        return mpc if rho is None else self._softened(mpc, rho)
+
+    @_in_keys
+    def _softened(self, mpc: MPC, rho: Any) -> MPC:
         return soften(mpc, exact_penalty(mpc).advised if isinstance(rho, str) else rho)
 
     def build_solver(self) -> ADMM | None:
@@ -125,6 +175,7 @@ class Config:
             return Box(np.asarray(limits.x_min), np.asarray(limits.x_max))
         return None
 
+    @_in_keys
     def state_range(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the ends (n,), (n,) of the smallest box round the state limits; ±inf without."""
         states, n = self.state_limits(), len(self.system.A)

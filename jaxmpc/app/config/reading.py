@@ -8,10 +8,10 @@ from typing import Any, get_args
 from pydantic import ValidationError
 
 from jaxmpc.app.config.consistency import check
-from jaxmpc.app.config.files import read_toml
+from jaxmpc.app.config.files import Origin, read_toml
 from jaxmpc.app.config.problem import ADAPTER, COMMANDS, Config
 from jaxmpc.app.config.robot import ROBOT_ADAPTER, RobotConfig
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, nearest, shown
 
 # Inertia 0.05 kg m², period 0.01 s, x = (q, dq), u = τ.
 _JOINT: dict[str, Any] = {
@@ -43,7 +43,7 @@ def load(
     Raises ValueError, naming file and key, where the file is absent or unreadable, is no
     TOML, or holds an unknown key or a value that cannot be.
     """
-    source, overrides = "built-in joint" if path is None else str(path), overrides or {}
+    overrides, options = overrides or {}, set()
     merged = dict(_JOINT if path is None else read_toml(path))
     # A slice and a projection exclude each other: choosing either drops the file's choice.
     # So do the names of a terminal set and the sets themselves.
@@ -53,16 +53,19 @@ def load(
     for name in ("mpc", *({command} & set(COMMANDS))):
         known = _keys(Config, name)
         changes = {key: value for key, value in overrides.items() if key in known}
+        options |= {f"{name}.{key}" for key in changes}
         if changes and isinstance(merged.get(name, {}), dict):
             kept = {k: v for k, v in merged.get(name, {}).items() if k not in dropped}
             merged[name] = {**kept, **changes}
+    origin = Origin("built-in joint" if path is None else str(path), frozenset(options))
     try:
         config = ADAPTER.validate_python(merged)
         check(config, command)
     except ValidationError as error:
-        raise ValueError(_error_message(error, source, overrides, Config)) from None
+        raise origin.error(_error_message(error, Config)) from None
     except ValueError as error:
-        raise ValueError(f"{source}: {error}") from None
+        raise origin.error(str(error)) from None
+    object.__setattr__(config, "origin", origin)  # the way to set a field of a frozen dataclass
     return config
 
 
@@ -72,37 +75,48 @@ def load_robot_config(path: str | Path) -> RobotConfig:
     if "robot" not in document:
         fail(str(path), "has no section [robot]", "Give what jaxmpc tune weights --robot wrote")
     try:
-        return ROBOT_ADAPTER.validate_python(document)
+        config = ROBOT_ADAPTER.validate_python(document)
     except ValidationError as error:
-        raise ValueError(_error_message(error, str(path), {}, RobotConfig)) from None
+        raise ValueError(f"{path}: {_error_message(error, RobotConfig)}") from None
+    object.__setattr__(config, "origin", Origin(str(path)))
+    return config
 
 
-def _error_message(
-    error: ValidationError, source: str, overrides: Mapping[str, Any], whole: Any
-) -> str:  # fmt: skip
+def _error_message(error: ValidationError, whole: Any) -> str:
     """Return the first thing wrong in one line: where, what, and what is allowed there."""
     unknown = "unexpected_keyword_argument"  # first: a misspelt key is also a missing one
     first = min(error.errors(), key=lambda e: e["type"] != unknown)
     where = [str(part) for part in first["loc"][:2]]
     key = ".".join(where)
     if first["type"] == unknown:
-        allowed = ", ".join(_keys(whole, *where[:-1]))
-        place = f"[{where[0]}]" if len(where) == 2 else "the top of the file"
-        return f"{source}: unknown key {where[-1]!r} in {place}. Keys allowed there: {allowed}"
+        return _unknown_key(where, whole)
+    if first["type"] == "missing":
+        return f"{key} is missing. Add it (jaxmpc sweep --help lists all keys)"
+    if first["type"] == "dataclass_type":
+        return f"{key}: is no section. Write [{key}] above its keys"
     same = [e for e in error.errors() if [str(part) for part in e["loc"][:2]] == where]
     problems = dict.fromkeys(e["msg"].removeprefix("Value error, ") for e in same)
-    if first["type"] == "missing":
-        return f"{source}: {key} is missing. Add it (jaxmpc sweep --help lists all keys)"
-    if where[-1] in overrides:
-        source, key = "command line", f"--{where[-1]}"
-    value = repr(first["input"])
-    shown = value if len(value) < 60 else value[:57] + "..."
-    return f"{source}: {key}: {'; or '.join(problems)}. Got {shown}"
+    # TOML and the help say list, Python tuple.
+    text = "; or ".join(problems).replace("tuple", "list").replace("Tuple", "List")
+    return f"{key}: {text}. Got {shown(first['input'])}"
+
+
+def _unknown_key(where: list[str], whole: Any) -> str:
+    """Return which key is unknown, the key or section that was probably meant, and all keys."""
+    key, allowed = where[-1], _keys(whole, *where[:-1])
+    place = f"[{where[0]}]" if len(where) == 2 else "the top of the file"
+    others = [name for name in _keys(whole) if key in _keys(whole, name)]
+    meant = f"It belongs to [{others[0]}]. " if others else nearest(key, allowed)
+    return f"unknown key {key!r} in {place}. {meant}Keys allowed there: {', '.join(allowed)}"
 
 
 def _keys(whole: Any, section: str | None = None) -> list[str]:
     """Return the keys of a section, or those at the top of the file."""
-    found: dict[str, Any] = {field.name: field.type for field in dataclasses.fields(whole)}
+    found: dict[str, Any] = {
+        field.name: field.type for field in dataclasses.fields(whole) if field.init
+    }
+    if section is None:
+        return list(found)
     # [solver] may be absent: its type is a union with None.
-    kind = whole if section is None else next(iter(get_args(found[section])), found[section])
-    return [field.name for field in dataclasses.fields(kind)]
+    kind = next(iter(get_args(found[section])), found[section])
+    return [field.name for field in dataclasses.fields(kind)] if kind is not str else []

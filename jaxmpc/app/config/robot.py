@@ -1,13 +1,13 @@
 """The TOML file with the weights of a robot's MPC: what jaxmpc tune weights --robot writes."""
 
+from dataclasses import field
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, FiniteFloat, TypeAdapter
+from pydantic import Field, TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from jaxmpc.app.config.files import to_toml
-from jaxmpc.app.config.sections import STRICT, Matrix, Vector, to_matrix
-from jaxmpc.checks import fail
+from jaxmpc.app.config.files import Origin, to_toml
+from jaxmpc.app.config.sections import STRICT, Matrix, Number, Vector, Whole, to_matrix
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -15,8 +15,8 @@ class RobotSection:
     """Which robot's MPC this is, with arguments of `robot_mpc` and `RobotController`."""
 
     name: str
-    horizon: Annotated[int, Field(ge=1, strict=True)] = 20
-    margin: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.02
+    horizon: Annotated[Whole, Field(ge=1)] = 20
+    margin: Annotated[Number, Field(ge=0, lt=1)] = 0.02
     linearize: Literal["set-point", "state", "trajectory"] = "state"
 
 
@@ -27,7 +27,7 @@ class RobotCostSection:
     Q: Vector | Matrix
     R: Vector | Matrix
     P: Literal["lqr", "none"] | Matrix = "lqr"
-    rho: Annotated[FiniteFloat, Field(gt=0)] = 1e4
+    rho: Annotated[Number, Field(gt=0)] = 1e4
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -36,6 +36,9 @@ class RobotConfig:
 
     robot: RobotSection
     cost: RobotCostSection
+    origin: Annotated[Origin, Field(exclude=True)] = field(
+        init=False, compare=False, repr=False, default=Origin()
+    )
 
     def weights(self, robot: Any) -> dict[str, Any]:
         """Return Q, R and terminal_cost as `robot_mpc` takes them.
@@ -43,7 +46,8 @@ class RobotConfig:
         Raises ValueError where the file is of another robot, or of other sizes.
         """
         if self.robot.name != robot.name:
-            fail("robot.name", f"{self.robot.name!r}, asked is {robot.name!r}", "Give that --robot")
+            what = f"robot.name: {self.robot.name!r}, asked is {robot.name!r}. Give that --robot"
+            raise self.origin.error(what)
         cost = self.cost
         for key, value, size in (
             ("Q", cost.Q, robot.n),
@@ -51,7 +55,8 @@ class RobotConfig:
             ("P", cost.P, robot.n),
         ):
             if not isinstance(value, str) and len(value) != size:
-                fail(f"cost.{key}", f"has {len(value)} entries", f"{robot.name} needs {size}")
+                what = f"cost.{key}: has {len(value)} entries. {robot.name} needs {size}"
+                raise self.origin.error(what)
         P: Any = None if cost.P == "none" else cost.P
         terminal = P if P is None or isinstance(P, str) else to_matrix(P)
         return {"Q": to_matrix(cost.Q), "R": to_matrix(cost.R), "terminal_cost": terminal}

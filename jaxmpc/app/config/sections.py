@@ -3,8 +3,15 @@
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat
+from pydantic import AfterValidator, AllowInfNan, BeforeValidator, ConfigDict, Field, Strict
 from pydantic.dataclasses import dataclass
+
+from jaxmpc.checks import MOST_COUNT
+
+
+def _infinity(value: Any) -> Any:
+    """Return the number for the texts that `Config.to_dict` writes, JSON having none."""
+    return float(value) if value in ("Infinity", "-Infinity") else value
 
 
 def _not_nan(value: float) -> float:
@@ -14,16 +21,20 @@ def _not_nan(value: float) -> float:
 
 
 def _rectangular(rows: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
-    if len({len(row) for row in rows}) != 1:
+    if len({len(row) for row in rows}) != 1 or not rows[0]:
         raise ValueError("is no matrix: give at least one row and rows of one length")
     return rows
 
 
 STRICT = ConfigDict(extra="forbid", ser_json_inf_nan="strings")
 
-Limit = Annotated[float, AfterValidator(_not_nan)]
+# Strict: true and "1.0" are no numbers, 1 and "yes" no booleans.
+Number = Annotated[float, Strict(), AllowInfNan(False)]
+Whole = Annotated[int, Strict(), Field(le=MOST_COUNT)]
+Switch = Annotated[bool, Strict()]
+Limit = Annotated[float, Strict(), AfterValidator(_not_nan), BeforeValidator(_infinity)]
 Limits = tuple[Limit, ...]
-Vector = tuple[FiniteFloat, ...]
+Vector = tuple[Number, ...]
 Matrix = Annotated[tuple[Vector, ...], AfterValidator(_rectangular)]
 
 
@@ -34,8 +45,8 @@ class SystemSection:
     A: Matrix  # (n, n)
     B: Matrix  # (n, m)
     c: Vector | None = None  # (n,), none means zero
-    dt: Annotated[FiniteFloat, Field(gt=0)]  # seconds
-    continuous: bool = False  # True: convert by zero-order hold
+    dt: Annotated[Number, Field(gt=0)]  # seconds
+    continuous: Switch = False  # True: convert by zero-order hold
     state_names: tuple[str, ...] | None = None
     state_units: tuple[str, ...] | None = None
     input_names: tuple[str, ...] | None = None
@@ -49,7 +60,7 @@ class LimitsSection:
     x_min: Limits | None = None  # (n,), -inf where free
     x_max: Limits | None = None  # (n,), inf where free
     # Fraction of the half-width of x_min, x_max that the MPC keeps away from them, on each side.
-    margin: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.0
+    margin: Annotated[Number, Field(ge=0, lt=1)] = 0.0
     H_x: Matrix | None = None  # (r, n)
     h_x: Vector | None = None  # (r,)
     u_min: Vector  # (m,)
@@ -65,7 +76,7 @@ class CostSection:
     P: Literal["lqr", "Q", "none"] | Vector | Matrix = "lqr"  # "lqr": the Riccati solution
     # L1 weight that makes state and terminal limits soft in the controller; "exact": the least one
     # that changes nothing where they can be kept, and a margin. Sets are those of the hard limits.
-    rho: Annotated[FiniteFloat, Field(ge=0)] | Literal["exact"] | None = None
+    rho: Annotated[Number, Field(ge=0)] | Literal["exact"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -73,27 +84,27 @@ class MPCSection:
     """Horizon and terminal set: "invariant" = O_inf of the LQR, "ellipsoid" = largest level set of
     its cost inside the limits, "box" = the state limits; or the set itself."""
 
-    horizon: Annotated[int, Field(ge=1, strict=True)]
+    horizon: Annotated[Whole, Field(ge=1)]
     terminal: Literal["none", "invariant", "ellipsoid", "box"] = "none"
     H_f: Matrix | None = None  # (r, n): H_f x_N <= h_f
     h_f: Vector | None = None  # (r,)
     P_f: Matrix | None = None  # (n, n): x_N'P_f x_N <= level_f
-    level_f: Annotated[FiniteFloat, Field(gt=0)] | None = None
-    control_horizon: Annotated[int, Field(ge=1, strict=True)] | None = None  # free moves
-    constrain_initial: bool = True  # False: no state limits at k = 0
+    level_f: Annotated[Number, Field(gt=0)] | None = None
+    control_horizon: Annotated[Whole, Field(ge=1)] | None = None  # free moves
+    constrain_initial: Switch = True  # False: no state limits at k = 0
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class SweepSection:
     """The initial states of a sweep: a grid over the mapped states."""
 
-    grid: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)] | None = None
+    grid: Annotated[tuple[Annotated[Whole, Field(ge=2)], ...], Field(min_length=1)] | None = None
     lower: Vector | None = None  # (d,), none means the state limits widened by 3 % each side
     upper: Vector | None = None  # (d,)
-    axes: tuple[int | str, ...] | None = None  # names or indices, none means the first two
+    axes: tuple[Whole | str, ...] | None = None  # names or indices, none means the first two
     fixed: Vector | None = None  # (n - d,) values of the other states: a slice
-    projection: bool = False  # True: some value of the other states
-    iterations: Annotated[int, Field(ge=1)] = 50  # ADMM steps in the first pass over all states
+    projection: Switch = False  # True: some value of the other states
+    iterations: Annotated[Whole, Field(ge=1)] = 50  # ADMM steps in the first pass over all states
     dtype: Literal["float32", "float64"] = "float32"  # of the iterates; proofs are float64
 
 
@@ -101,24 +112,24 @@ class SweepSection:
 class RecursionSection:
     """How recursive feasibility is examined: sample states, closed loops, effort."""
 
-    steps: Annotated[int, Field(ge=1, strict=True)] = 20  # length of the closed loops
-    grid: Annotated[tuple[Annotated[int, Field(ge=2)], ...], Field(min_length=1)] | None = None
+    steps: Annotated[Whole, Field(ge=1)] = 20  # length of the closed loops
+    grid: Annotated[tuple[Annotated[Whole, Field(ge=2)], ...], Field(min_length=1)] | None = None
     lower: Vector | None = None  # (n,), none means the state limits widened by 3 % each side
     upper: Vector | None = None  # (n,)
-    regions: Annotated[int, Field(ge=0, strict=True)] = 2000  # critical regions at most, 0: none
-    seconds: Annotated[FiniteFloat, Field(gt=0)] = 60.0  # for search and proofs
+    regions: Annotated[Whole, Field(ge=0)] = 2000  # critical regions at most, 0: none
+    seconds: Annotated[Number, Field(gt=0)] = 60.0  # for search and proofs
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class SolverSection:
     """ADMM as the controller runs it; see `ADMM`. What jaxmpc tune penalties learns."""
 
-    iterations: Annotated[int, Field(ge=0, strict=True)] = 50
+    iterations: Annotated[Whole, Field(ge=0)] = 50
     # Number, one a row of the QP, or (stages, rows); None: chosen from the problem.
-    rho: FiniteFloat | Vector | Matrix | None = None
-    alpha: Annotated[FiniteFloat, Field(gt=0, lt=2)] = 1.9
+    rho: Number | Vector | Matrix | None = None
+    alpha: Annotated[Number, Field(gt=0, lt=2)] = 1.9
     # Newton steps after them at most; None: as `ADMM`.
-    refine: Annotated[int, Field(ge=0, strict=True)] | None = None
+    refine: Annotated[Whole, Field(ge=0)] | None = None
 
 
 def to_matrix(value: Any) -> np.ndarray:

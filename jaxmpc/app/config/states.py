@@ -24,9 +24,7 @@ def sweep_points(config: Config) -> SweepPoints:
     """Return the grid of initial states that [sweep] describes."""
     axes = mapped_axes(config)
     lower, upper = section_ends(config, axes, config.sweep)
-    d = len(axes)
-    # 256 along each of two axes; about as many points in all along more.
-    shape = config.sweep.grid or (min(256, int(65_536.5 ** (1 / d))),) * d
+    shape = grid_shape(config)
     points = grid(lower, upper, shape)
     along = tuple(np.linspace(*ends) for ends in zip(lower, upper, shape, strict=True))
     if config.sweep.fixed is None:
@@ -36,13 +34,24 @@ def sweep_points(config: Config) -> SweepPoints:
     return SweepPoints(points, axes, fixed, along)
 
 
+def grid_shape(config: Config) -> tuple[int, ...]:
+    """Return the number of points of a sweep along each mapped axis."""
+    d = len(mapped_axes(config))
+    # 256 along each of two axes; about as many points in all along more.
+    return config.sweep.grid or (min(256, int(65_536.5 ** (1 / d))),) * d
+
+
 def recursion_states(config: Config) -> np.ndarray | None:
     """Return states (B, n) for `recursive_feasibility`; None for its own choice (n > 3)."""
-    n, recursion = len(config.system.A), config.recursion
-    if recursion.grid is None and n > 3:
-        return None
-    shape = recursion.grid or {1: (1001,), 2: (128, 128), 3: (24, 24, 24)}[n]
-    return grid(*section_ends(config, range(n), recursion), shape)
+    shape, axes = recursion_shape(config), range(len(config.system.A))
+    return None if shape is None else grid(*section_ends(config, axes, config.recursion), shape)
+
+
+def recursion_shape(config: Config) -> tuple[int, ...] | None:
+    """Return the number of sample states along each axis; None for those that
+    `recursive_feasibility` chooses itself (n > 3)."""
+    usual = {1: (1001,), 2: (128, 128), 3: (24, 24, 24)}
+    return config.recursion.grid or usual.get(len(config.system.A))
 
 
 def mapped_axes(config: Config) -> tuple[int, ...]:

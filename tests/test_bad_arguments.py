@@ -1,0 +1,706 @@
+"""Wrong arguments in Python: ValueError in one line that names the argument, before any compile.
+What has one meaning is accepted: numbers and vectors where a matrix is needed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmpc as jm
+
+A, B = np.array([[1, 0.01], [0, 1]]), np.array([[0], [0.2]])
+S = jm.LinearSystem(A, B, dt=0.01)
+x = np.zeros(2)
+
+
+def mpc(**changes):
+    given = {
+        "system": S, "Q": np.eye(2), "R": np.eye(1), "horizon": 3,
+        "states": jm.Box(np.array([-1, -1]), np.array([1, 1])),
+        "inputs": jm.Box(np.array([-1]), np.array([1])),
+    }  # fmt: skip
+    return jm.MPC(**{**given, **changes})
+
+
+def qp(**changes):
+    given = {"P": np.eye(2), "q": np.zeros(2), "A": np.eye(2), "l": -np.ones(2), "u": np.ones(2)}
+    return jm.QP(**{**given, **changes})
+
+
+M = mpc()
+COMPILED: list[str] = []
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _listen():
+    def note(event, seconds, **about):
+        if event == "/jax/core/compile/backend_compile_duration":
+            COMPILED.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    yield
+    jax.monitoring.unregister_event_duration_listener(note)
+
+
+# How the answer begins, and the call.
+CALLS = [
+    ("mpc: is a str. Give a jm.MPC", lambda: jm.solve("x", x)),
+    ("mpc: is a NoneType. Give a jm.MPC", lambda: jm.solve(None, x)),
+    ("mpc: is a LinearSystem. Give a jm.MPC", lambda: jm.solve(S, x)),
+    ("mpc: is a QP. Give a jm.MPC", lambda: jm.solve(qp(), x)),
+    ("x0: None where real numbers are", lambda: jm.solve(M, None)),
+    ("x0: 'abc' where real numbers are", lambda: jm.solve(M, "abc")),
+    ("x0: entries of type <U1 where real", lambda: jm.solve(M, ["a", "b"])),
+    ("x0: entries of type complex128 where", lambda: jm.solve(M, x + 1j)),
+    ("x0: [1, [2, 3]] is not an array of", lambda: jm.solve(M, [1, [2, 3]])),
+    ("x0: shape (3,). Give (2,); use", lambda: jm.solve(M, np.zeros(3))),
+    ("x0: shape (5, 2). Give (2,); use", lambda: jm.solve(M, np.zeros((5, 2)))),
+    ("x0: {'q': 1, 'dq': 2} where real", lambda: jm.solve(M, {"q": 1, "dq": 2})),
+    ("x0: entries of type object where real", lambda: jm.solve(M, [None, None])),
+    ("x0: {1, 2} where real numbers are", lambda: jm.solve(M, {1, 2})),
+    ("reference: ADMM(iterations=50", lambda: jm.solve(M, x, jm.ADMM())),
+    ("reference: 'r' where real numbers are", lambda: jm.solve(M, x, "r")),
+    ("reference: entries of type complex128 where", lambda: jm.solve(M, x, x + 1j)),
+    ("reference: shape (3,). Give (2,) or (4, 2);", lambda: jm.solve(M, x, np.zeros(3))),
+    ("solver: is a ndarray. Give a jm.ADMM", lambda: jm.solve(M, x, None, x)),
+    ("solver: is a str. Give a jm.ADMM", lambda: jm.solve(M, x, solver="osqp")),
+    ("solver: is a type. Give a jm.ADMM", lambda: jm.solve(M, x, solver=jm.ADMM)),
+    ("warm_start: is a str. Give a Plan or a", lambda: jm.solve(M, x, warm_start="x")),
+    ("warm_start: is a ndarray. Give a Plan or a", lambda: jm.solve(M, x, warm_start=x)),
+    (
+        "input_reference: shape (2,). Give (1,) or (3, 1);",
+        lambda: jm.solve(M, x, input_reference=np.zeros(2)),
+    ),
+    (
+        "previous_input: shape (2,). Give (1,); use",
+        lambda: jm.solve(M, x, previous_input=np.zeros(2)),
+    ),
+    ("previous_input: 'u' where real numbers are", lambda: jm.solve(M, x, previous_input="u")),
+    ("x0s: 'x' where real numbers are", lambda: jm.solve_many(M, "x")),
+    ("x0s: shape (2,). Give states (B, 2)", lambda: jm.solve_many(M, x)),
+    ("x0s: entries of type complex128 where", lambda: jm.solve_many(M, np.zeros((3, 2)) + 1j)),
+    ("mpc: is a str. Give a jm.MPC", lambda: jm.solve_many("M", np.zeros((3, 2)))),
+    ("solver: is a str. Give a jm.ADMM", lambda: jm.solve_many(M, np.zeros((3, 2)), "s")),
+    ("chunk: 0. Give a whole number of at", lambda: jm.solve_many(M, np.zeros((3, 2)), chunk=0)),
+    (
+        "chunk: 1.5. Give a whole number of at",
+        lambda: jm.solve_many(M, np.zeros((3, 2)), chunk=1.5),
+    ),
+    (
+        "dtype: 'int8'. Iterate in 'float32' or",
+        lambda: jm.solve_many(M, np.zeros((3, 2)), dtype="int8"),
+    ),
+    ("mpc: is a str. Give a jm.MPC", lambda: jm.Controller("x")(x)),
+    ("mpc: is a int. Give a jm.MPC", lambda: jm.Controller(3).plan(x)),
+    ("solver: is a str. Give a jm.ADMM", lambda: jm.Controller(M, "s")),
+    ("qp: is a int. Give a jm.QP", lambda: jm.solve_qp(3)),
+    ("qp: is a str. Give a jm.QP", lambda: jm.solve_qp("qp")),
+    ("qp: is a NoneType. Give a jm.QP", lambda: jm.solve_qp(None)),
+    ("qp: is a MPC. Give a jm.QP", lambda: jm.solve_qp(M)),
+    ("qp: is a tuple. Give a jm.QP", lambda: jm.solve_qp((1, 2))),
+    ("solver: is a int. Give a jm.ADMM", lambda: jm.solve_qp(qp(), 3)),
+    ("P: 'P' where real numbers are", lambda: jm.solve_qp(qp(P="P"))),
+    ("P: None where real numbers are", lambda: jm.solve_qp(qp(P=None))),
+    ("P: entries of type complex128 where", lambda: jm.solve_qp(qp(P=np.eye(2) * 1j))),
+    ("P: shape (3, 3) where (2, 2) is", lambda: jm.solve_qp(qp(P=np.eye(3)))),
+    ("P: is not positive semidefinite", lambda: jm.solve_qp(qp(P=-np.eye(2)))),
+    ("P: is not symmetric. Use (P + P.T) /", lambda: jm.solve_qp(qp(P=[[1, 2], [0, 1.0]]))),
+    ("q: None where real numbers are", lambda: jm.solve_qp(qp(q=None))),
+    ("q: 'q' where real numbers are", lambda: jm.solve_qp(qp(q="q"))),
+    ("q: entries of type <U1 where real", lambda: jm.solve_qp(qp(q=["a", "b"]))),
+    ("q: entries of type complex128 where", lambda: jm.solve_qp(qp(q=x + 1j))),
+    ("q: shape (2, 2) is not (n,). Give", lambda: jm.solve_qp(qp(q=np.zeros((2, 2))))),
+    ("q: holds NaN or infinity. Give", lambda: jm.solve_qp(qp(q=x * np.nan))),
+    ("A: 'A' where real numbers are", lambda: jm.solve_qp(qp(A="A"))),
+    ("A: shape (2,) is not (m, 2). One", lambda: jm.solve_qp(qp(A=x))),
+    ("A: entries of type <U1 where real", lambda: jm.solve_qp(qp(A=[["a", "b"], ["c", "d"]]))),
+    ("A: holds NaN or infinity. Give", lambda: jm.solve_qp(qp(A=np.full((2, 2), np.inf)))),
+    ("l, u: row 0 has l = 2.0 and u = 1.0.", lambda: jm.solve_qp(qp(l=[2.0, 2.0]))),
+    ("l, u: row 0 has l = nan and u = 1.0.", lambda: jm.solve_qp(qp(l=[np.nan, 2.0]))),
+    ("l: 'l' where real numbers are", lambda: jm.solve_qp(qp(l="l"))),
+    ("l: entries of type <U1 where real", lambda: jm.solve_qp(qp(l=["a", "b"]))),
+    ("l: None where real numbers are", lambda: jm.solve_qp(qp(l=None))),
+    ("u: entries of type complex128 where", lambda: jm.solve_qp(qp(u=x + 1j))),
+    ("A: [[1, 2], [3]] is not an array of", lambda: jm.solve_qp(qp(A=[[1, 2], [3]]))),
+    ("warm_start: is a str. Give a pair (z, y) or", lambda: jm.solve_qp(qp(), jm.ADMM(), "w")),
+    ("warm_start: is a tuple. Give a pair (z, y) or", lambda: jm.solve_qp(qp(), jm.ADMM(), (x,))),
+    (
+        "warm_start z: shape (3,) where (2,) is needed.",
+        lambda: jm.solve_qp(qp(), jm.ADMM(), (np.zeros(3), x)),
+    ),
+    (
+        "soft_linear: holds a negative weight or NaN.",
+        lambda: jm.solve_qp(qp(soft_linear=[-1.0, 1])),
+    ),
+    ("soft_linear: 's' where real numbers are", lambda: jm.solve_qp(qp(soft_linear="s"))),
+    (
+        "soft_quadratic: entries of type <U1 where real",
+        lambda: jm.solve_qp(qp(soft_quadratic=["a", "b"])),
+    ),
+    ("balls, radius: (2,), None. Give both, or neither", lambda: jm.solve_qp(qp(balls=(2,)))),
+    ("balls: 3. Give a tuple with the number", lambda: jm.solve_qp(qp(balls=3, radius=[1.0]))),
+    ("radius: 'r' where real numbers are", lambda: jm.solve_qp(qp(balls=(2,), radius="r"))),
+    ("P: None where real numbers are", lambda: jm.QP.from_qpsolvers(None, None)),
+    (
+        "iterations: 1.5. Give a whole number of at",
+        lambda: jm.solve(M, x, solver=jm.ADMM(iterations=1.5)),
+    ),
+    (
+        "iterations: 'x'. Give a whole number of at",
+        lambda: jm.solve(M, x, solver=jm.ADMM(iterations="x")),
+    ),
+    (
+        "iterations: 1000000000000. Give at most",
+        lambda: jm.solve(M, x, solver=jm.ADMM(iterations=10**12)),
+    ),
+    (
+        "iterations: True. Give a whole number of at",
+        lambda: jm.solve(M, x, solver=jm.ADMM(iterations=True)),
+    ),
+    ("refine: 1.5. Give a whole number of at", lambda: jm.solve(M, x, solver=jm.ADMM(refine=1.5))),
+    ("rho: 'x' where real numbers are", lambda: jm.solve(M, x, solver=jm.ADMM(rho="x"))),
+    ("rho: holds a value that is not", lambda: jm.solve(M, x, solver=jm.ADMM(rho=0))),
+    ("alpha: 2. Over-relaxation lies in (0,", lambda: jm.solve(M, x, solver=jm.ADMM(alpha=2))),
+    ("alpha: 'a' where real numbers are", lambda: jm.solve(M, x, solver=jm.ADMM(alpha="a"))),
+    (
+        "alpha: [1.0, 1.0]. Over-relaxation lies",
+        lambda: jm.solve(M, x, solver=jm.ADMM(alpha=[1.0, 1.0])),
+    ),
+    ("alpha: None where real numbers are", lambda: jm.solve(M, x, solver=jm.ADMM(alpha=None))),
+    ("eps: -1. Tolerances are at least 0", lambda: jm.solve(M, x, solver=jm.ADMM(eps=-1))),
+    ("eps: 'e' where real numbers are", lambda: jm.solve(M, x, solver=jm.ADMM(eps="e"))),
+    (
+        "differentiate: 'x'. Give \"implicit\" or",
+        lambda: jm.solve(M, x, solver=jm.ADMM(differentiate="x")),
+    ),
+    (
+        'dtype: \'int\'. Give "float32", "float64"',
+        lambda: jm.solve(M, x, solver=jm.ADMM(dtype="int")),
+    ),
+    (
+        "smoothing: -1. Give 0 (none) or a positive",
+        lambda: jm.solve(M, x, solver=jm.ADMM(smoothing=-1)),
+    ),
+    (
+        "smoothing: 's' where real numbers are",
+        lambda: jm.solve(M, x, solver=jm.ADMM(smoothing="s")),
+    ),
+    ("system: is a int. Give a jm.LinearSystem", lambda: mpc(system=3).validate()),
+    ("system: is a ndarray. Give a", lambda: mpc(system=A).validate()),
+    ("Q: 'Q' where real numbers are", lambda: mpc(Q="Q").validate()),
+    ("Q: entries of type <U1 where real", lambda: mpc(Q=[["a", "b"], ["c", "d"]]).validate()),
+    ("Q: None where real numbers are", lambda: mpc(Q=None).validate()),
+    ("Q: shape () where (2, 2) is needed.", lambda: mpc(Q=1.0).validate()),
+    ("Q: shape (3,) where (2, 2) is", lambda: mpc(Q=[1, 2, 3]).validate()),
+    ("Q: is not positive semidefinite", lambda: mpc(Q=[-1, 2]).validate()),
+    ("Q: entries of type complex128 where", lambda: mpc(Q=np.eye(2) * 1j).validate()),
+    ("Q: holds NaN or infinity. Give", lambda: mpc(Q=np.eye(2) * np.nan).validate()),
+    ("Q: [[1, 2], [3]] is not an array of", lambda: mpc(Q=[[1, 2], [3]]).validate()),
+    ("R: is not positive definite (least", lambda: mpc(R=0.0).validate()),
+    ("R: is not positive definite (least", lambda: mpc(R=-1.0).validate()),
+    ("R: '1' where real numbers are", lambda: mpc(R="1").validate()),
+    ("R: shape () where (1, 1) is needed.", lambda: mpc(R=True).validate()),
+    ("R: None where real numbers are", lambda: mpc(R=None).validate()),
+    ("R: shape (2,) where (1, 1) is", lambda: mpc(R=[1, 2]).validate()),
+    ("horizon: 0. Give a whole number of steps,", lambda: mpc(horizon=0).validate()),
+    ("horizon: 2.5. Give a whole number of", lambda: mpc(horizon=2.5).validate()),
+    ("horizon: True. Give a whole number of", lambda: mpc(horizon=True).validate()),
+    ("horizon: '3'. Give a whole number of", lambda: mpc(horizon="3").validate()),
+    ("horizon: None. Give a whole number of", lambda: mpc(horizon=None).validate()),
+    ("horizon: [3]. Give a whole number of", lambda: mpc(horizon=[3]).validate()),
+    ("horizon: needs ", lambda: jm.solve(mpc(horizon=10**6), x)),
+    ("horizon: needs ", lambda: jm.solve(mpc(horizon=10**30), x)),
+    ("horizon: needs ", lambda: jm.map_feasible_set(mpc(horizon=10**6), np.zeros((1, 2)))),
+    ("states: is a int. Give a Box or Polytope,", lambda: mpc(states=3).validate()),
+    ("states: is a tuple. Give a Box or", lambda: mpc(states=(-1, 1)).validate()),
+    (
+        "states: is a Ellipsoid. Give a Box or",
+        lambda: mpc(states=jm.Ellipsoid(np.eye(2), 1.0)).validate(),
+    ),
+    ("states: has dimension 1 where 2 is", lambda: mpc(states=jm.Box([-1], [1])).validate()),
+    ("states: is empty: lower[0] = 1, upper[0]", lambda: mpc(states=jm.Box(1, -1)).validate()),
+    (
+        "states.lower: holds NaN. Use -inf or inf for no",
+        lambda: mpc(states=jm.Box([np.nan, 0], 1)).validate(),
+    ),
+    ("states.lower: 'a' where real numbers are", lambda: mpc(states=jm.Box("a", "b")).validate()),
+    (
+        "states.lower: entries of type <U1 where real",
+        lambda: mpc(states=jm.Box(["a", "b"], ["c", "d"])).validate(),
+    ),
+    (
+        "states.lower: entries of type complex128 where",
+        lambda: mpc(states=jm.Box([-1j, -1], [1, 1])).validate(),
+    ),
+    (
+        "states.lower: None where real numbers are",
+        lambda: mpc(states=jm.Box(None, [1, 1])).validate(),
+    ),
+    ("inputs: has dimension 2 where 1 is", lambda: mpc(inputs=jm.Box([-1, -1], [1, 1])).validate()),
+    ("inputs: is a str. Give a Box or Polytope,", lambda: mpc(inputs="box").validate()),
+    (
+        "states.h: shape (2,) where (1,) is needed.",
+        lambda: mpc(states=jm.Polytope([[1, 0]], [1, 2])).validate(),
+    ),
+    (
+        "states.H: shape (2,) is not (rows, n). Give",
+        lambda: mpc(states=jm.Polytope([1, 0], [1, 2])).validate(),
+    ),
+    (
+        "states: is empty: no point satisfies all",
+        lambda: mpc(states=jm.Polytope([[1, 0], [-1, 0]], [-1, -1])).validate(),
+    ),
+    (
+        "terminal_set: is a str. Give a Box or Polytope",
+        lambda: mpc(terminal_set="invariant").validate(),
+    ),
+    (
+        "terminal_set.level: -1 is not a positive number. Give",
+        lambda: mpc(terminal_set=jm.Ellipsoid(np.eye(2), -1.0)).validate(),
+    ),
+    (
+        "terminal_set.level: '1' where real numbers are",
+        lambda: mpc(terminal_set=jm.Ellipsoid(np.eye(2), "1")).validate(),
+    ),
+    (
+        "terminal_set.P: shape () is not (n, n). Give a",
+        lambda: mpc(terminal_set=jm.Ellipsoid(1.0, 1.0)).validate(),
+    ),
+    ("terminal_cost: 'lqr' where real numbers are", lambda: mpc(terminal_cost="lqr").validate()),
+    (
+        "terminal_cost: shape (3, 3) where (2, 2) is",
+        lambda: mpc(terminal_cost=np.eye(3)).validate(),
+    ),
+    (
+        "terminal_cost: is not positive semidefinite",
+        lambda: mpc(terminal_cost=-np.eye(2)).validate(),
+    ),
+    ("constrain_initial: 'no'. Give True or False", lambda: mpc(constrain_initial="no").validate()),
+    (
+        "constrained_steps: [1, 2]. Give a tuple of different",
+        lambda: mpc(constrained_steps=[1, 2]).validate(),
+    ),
+    (
+        "constrained_steps: (1, 9). Give a tuple of different",
+        lambda: mpc(constrained_steps=(1, 9)).validate(),
+    ),
+    (
+        "constrained_steps: (1.5,). Give a tuple of different",
+        lambda: mpc(constrained_steps=(1.5,)).validate(),
+    ),
+    (
+        "constrained_steps: 1. Give a tuple of different",
+        lambda: mpc(constrained_steps=1).validate(),
+    ),
+    (
+        "control_horizon: 9 moves in 3 steps. Give at most",
+        lambda: mpc(control_horizon=9).validate(),
+    ),
+    ("control_horizon: 0. Give a number of moves, or", lambda: mpc(control_horizon=0).validate()),
+    (
+        "control_horizon: 1.5. Give a number of moves, or",
+        lambda: mpc(control_horizon=1.5).validate(),
+    ),
+    (
+        "control_horizon: '1'. Give a number of moves, or",
+        lambda: mpc(control_horizon="1").validate(),
+    ),
+    (
+        "control_horizon: (1, 1) adds up to 2. Make it 3",
+        lambda: mpc(control_horizon=(1, 1)).validate(),
+    ),
+    (
+        "control_horizon: [1, 2]. Give a number of moves,",
+        lambda: mpc(control_horizon=[1, 2]).validate(),
+    ),
+    (
+        "input_rate_weight: 'w' where real numbers are",
+        lambda: mpc(input_rate_weight="w").validate(),
+    ),
+    (
+        "input_rate_weight: shape (2,). Give (1, 1) or (1,)",
+        lambda: mpc(input_rate_weight=[1, 2.0]).validate(),
+    ),
+    (
+        "input_rate_weight: is not positive semidefinite",
+        lambda: mpc(input_rate_weight=[-1.0]).validate(),
+    ),
+    (
+        "input_rate_limit: -1.0. |Δu| ≤ limit needs limit ≥",
+        lambda: mpc(input_rate_limit=-1.0).validate(),
+    ),
+    ("input_rate_limit: 'x' where real numbers are", lambda: mpc(input_rate_limit="x").validate()),
+    (
+        "input_rate_limit: shape (2,). Give (1,) or a Box",
+        lambda: mpc(input_rate_limit=[1, 2]).validate(),
+    ),
+    (
+        "stage_weights: shape (2,) where (3,) is needed.",
+        lambda: mpc(stage_weights=[1, 2]).validate(),
+    ),
+    (
+        "stage_weights: [0, 1, 1]. Give positive numbers",
+        lambda: mpc(stage_weights=[0, 1, 1]).validate(),
+    ),
+    ("stage_weights: 'www' where real numbers are", lambda: mpc(stage_weights="www").validate()),
+    ("prestabilise: 'yes' where real numbers are", lambda: mpc(prestabilise="yes").validate()),
+    ("prestabilise: shape (2,) where (1, 2) is", lambda: mpc(prestabilise=np.zeros(2)).validate()),
+    ("soft: int. Give a jm.Soft, or a tuple", lambda: mpc(soft=3).validate()),
+    (
+        "soft[0].C: shape (3, 3). Give (p, 2), one",
+        lambda: mpc(soft=jm.Soft(np.eye(3), [1, 1, 1])).validate(),
+    ),
+    (
+        "soft[0].rho: -1. Penalties are at least 0",
+        lambda: mpc(soft=jm.Soft(np.eye(2), [1, 1], rho=-1)).validate(),
+    ),
+    (
+        "soft[0].rho: 'x' where real numbers are",
+        lambda: mpc(soft=jm.Soft(np.eye(2), [1, 1], rho="x")).validate(),
+    ),
+    ("soft[0].C: 'C' where real numbers are", lambda: mpc(soft=jm.Soft("C", [1, 1])).validate()),
+    (
+        "soft[0].C: entries of type <U1 where real",
+        lambda: mpc(soft=jm.Soft([["a", "b"]], [1])).validate(),
+    ),
+    (
+        "soft[0].d: 'dd' where real numbers are",
+        lambda: mpc(soft=jm.Soft(np.eye(2), "dd")).validate(),
+    ),
+    (
+        "soft[0].d: None where real numbers are",
+        lambda: mpc(soft=jm.Soft(np.eye(2), None)).validate(),
+    ),
+    ("outputs: str. Give a jm.Outputs, or a", lambda: mpc(outputs="y").validate()),
+    (
+        "outputs[0].C: shape (3, 3). Give (p, 2), one",
+        lambda: mpc(outputs=jm.Outputs(np.eye(3), [0], [1])).validate(),
+    ),
+    (
+        "outputs[0]: is empty: lower[0] = 2, upper[0]",
+        lambda: mpc(outputs=jm.Outputs(np.eye(2), [2, 2], [1, 1])).validate(),
+    ),
+    (
+        "outputs[0].lower: entries of type <U1 where real",
+        lambda: mpc(outputs=jm.Outputs(np.eye(2), ["a", "b"], [1, 1])).validate(),
+    ),
+    (
+        "outputs[0].steps: (9,). Give a tuple of different",
+        lambda: mpc(outputs=jm.Outputs(np.eye(2), [0, 0], [1, 1], steps=(9,))).validate(),
+    ),
+    (
+        "outputs[0].names: ['a', 'b']. Give a tuple of",
+        lambda: mpc(outputs=jm.Outputs(np.eye(2), [0, 0], [1, 1], names=["a", "b"])).validate(),
+    ),
+    ("A: 'A' where real numbers are", lambda: jm.LinearSystem("A", B).validate()),
+    ("A: None where real numbers are", lambda: jm.LinearSystem(None, B).validate()),
+    ("A: shape (2,) is not (n, n). Give a", lambda: jm.LinearSystem([1, 2], B).validate()),
+    ("A: shape () is not (n, n). Give a", lambda: jm.LinearSystem(1.0, 1.0).validate()),
+    ("A: shape (2, 3) where (3, 3) is", lambda: jm.LinearSystem(np.zeros((2, 3)), B).validate()),
+    ("A: entries of type complex128 where", lambda: jm.LinearSystem(A * 1j, B).validate()),
+    ("A: holds NaN or infinity. Give", lambda: jm.LinearSystem(A * np.nan, B).validate()),
+    ("A: [[1, 2], [3]] is not an array of", lambda: jm.LinearSystem([[1, 2], [3]], B).validate()),
+    (
+        "A: shape (0, 0) is not (n, n). Give",
+        lambda: jm.LinearSystem(np.zeros((0, 0)), np.zeros((0, 1))).validate(),
+    ),
+    ("A: {'a': 1} where real numbers are", lambda: jm.LinearSystem({"a": 1}, B).validate()),
+    ("B: shape (3, 1) where (2, 1) is", lambda: jm.LinearSystem(A, [1, 2, 3]).validate()),
+    ("B: 'B' where real numbers are", lambda: jm.LinearSystem(A, "B").validate()),
+    ("B: entries of type <U1 where real", lambda: jm.LinearSystem(A, ["a", "b"]).validate()),
+    ("B: shape () is not (n, m). Give a", lambda: jm.LinearSystem(A, 1.0).validate()),
+    (
+        "B: shape (2, 1, 1) is not (n, m).",
+        lambda: jm.LinearSystem(A, np.zeros((2, 1, 1))).validate(),
+    ),
+    ("c: shape (3,) where (2,) is needed.", lambda: jm.LinearSystem(A, B, [1, 2, 3]).validate()),
+    ("c: 'c' where real numbers are", lambda: jm.LinearSystem(A, B, "c").validate()),
+    ("dt: -1 is not a positive number. Give", lambda: jm.LinearSystem(A, B, dt=-1).validate()),
+    ("dt: '1' is not a positive number.", lambda: jm.LinearSystem(A, B, dt="1").validate()),
+    ("dt: True is not a positive number.", lambda: jm.LinearSystem(A, B, dt=True).validate()),
+    (
+        "state_names: 1 entries where 2 are needed.",
+        lambda: jm.LinearSystem(A, B, state_names=("a",)).validate(),
+    ),
+    (
+        "state_names: ['a', 'b'] is not a tuple of",
+        lambda: jm.LinearSystem(A, B, state_names=["a", "b"]).validate(),
+    ),
+    (
+        "state_names: ('a', 'a') has a name twice. Give",
+        lambda: jm.LinearSystem(A, B, state_names=("a", "a")).validate(),
+    ),
+    (
+        "state_units: 'rad' is not a tuple of strings.",
+        lambda: jm.LinearSystem(A, B, state_units="rad").validate(),
+    ),
+    ("dt: 0 is not a positive number. Give", lambda: jm.LinearSystem.from_continuous(A, B, 0)),
+    ("dt: 'x' is not a positive number.", lambda: jm.LinearSystem.from_continuous(A, B, "x")),
+    (
+        "state_names: 3 is not a tuple of strings.",
+        lambda: jm.LinearSystem.from_continuous(A, B, 0.1, state_names=3),
+    ),
+    ("obj: has no .A. Give a state-space", lambda: jm.LinearSystem.from_object(3)),
+    ("grid shape: 50.5. Give a whole number of at", lambda: jm.grid(-1, 1, 50.5)),
+    ("grid shape: 5.0. Give a whole number of at", lambda: jm.grid([-1, -1], [1, 1], (5, 2.5))),
+    ("grid lower: 'a' where real numbers are", lambda: jm.grid("a", "b", 3)),
+    ("grid shape: '5'. Give a whole number of at", lambda: jm.grid(-1, 1, "5")),
+    ("grid shape: None. Give a whole number of at", lambda: jm.grid(-1, 1, None)),
+    ("grid shape: 0. Give a whole number of at", lambda: jm.grid(-1, 1, 0)),
+    ("grid shape: -3. Give a whole number of at", lambda: jm.grid(-1, 1, -3)),
+    ("grid: lower [-inf], upper [1.]. Give", lambda: jm.grid(-np.inf, 1, 3)),
+    ("grid: lower [nan], upper [1.]. Give", lambda: jm.grid(np.nan, 1, 3)),
+    ("grid: lower [1.], upper [-1.]. Give", lambda: jm.grid(1, -1, 3)),
+    ("grid: lower (2,), upper (2,), shape (3,", lambda: jm.grid([0, 0], [1, 1], (3, 3, 3))),
+    ("grid: lower (2,), upper (3,), shape (3,", lambda: jm.grid([0, 0], [1, 1, 1], 3)),
+    (
+        "grid: lower (2, 2), upper (2, 2), shape",
+        lambda: jm.grid(np.zeros((2, 2)), np.ones((2, 2)), 3),
+    ),
+    ("grid: needs ", lambda: jm.grid([0, 0], [1, 1], (10**6, 10**6))),
+    ("grid: needs ", lambda: jm.grid(0, 1, 10**30)),
+    ("grid upper: 1j where real numbers are needed.", lambda: jm.grid(0, 1j, 5)),
+    ("grid shape: True. Give a whole number of at", lambda: jm.grid(0, 1, True)),
+    ("grid: lower (0,), upper (0,), shape ().", lambda: jm.grid([], [], ())),
+    ("mpc: is a str. Give a jm.MPC", lambda: jm.map_feasible_set("M", np.zeros((3, 2)))),
+    ("mpc: is a LinearSystem. Give a jm.MPC", lambda: jm.map_feasible_set(S, np.zeros((3, 2)))),
+    ("x0s: 'x' where real numbers are", lambda: jm.map_feasible_set(M, "x")),
+    (
+        "x0s: entries of type complex128 where",
+        lambda: jm.map_feasible_set(M, np.zeros((3, 2)) + 1j),
+    ),
+    ("x0s: shape (2,). Give points (B, 2),", lambda: jm.map_feasible_set(M, x)),
+    ("x0s: shape (3, 3). Give points (B, 2),", lambda: jm.map_feasible_set(M, np.zeros((3, 3)))),
+    (
+        "axes: (5,). Give different state",
+        lambda: jm.map_feasible_set(M, np.zeros((3, 1)), axes=(5,)),
+    ),
+    (
+        "axes: ('q',). Give state indices or",
+        lambda: jm.map_feasible_set(M, np.zeros((3, 1)), axes="q"),
+    ),
+    (
+        "axes: (0, 0). Give different state",
+        lambda: jm.map_feasible_set(M, np.zeros((3, 2)), axes=(0, 0)),
+    ),
+    (
+        "axes: (0.5,). Give state indices or",
+        lambda: jm.map_feasible_set(M, np.zeros((3, 1)), axes=(0.5,)),
+    ),
+    (
+        "fixed: shape (1,) where (2,) is needed.",
+        lambda: jm.map_feasible_set(M, np.zeros((3, 1)), axes=(0,), fixed=[1]),
+    ),
+    (
+        "fixed: 'ab' where real numbers are",
+        lambda: jm.map_feasible_set(M, np.zeros((3, 1)), axes=(0,), fixed="ab"),
+    ),
+    (
+        "iterations: 0. Give a whole number of at",
+        lambda: jm.map_feasible_set(M, np.zeros((3, 2)), iterations=0),
+    ),
+    (
+        "iterations: 1.5. Give a whole number of at",
+        lambda: jm.map_feasible_set(M, np.zeros((3, 2)), iterations=1.5),
+    ),
+    (
+        "dtype: 'int'. Iterate in 'float32' or",
+        lambda: jm.map_feasible_set(M, np.zeros((3, 2)), dtype="int"),
+    ),
+    (
+        "chunk: 0. Give a whole number of at",
+        lambda: jm.map_feasible_set(M, np.zeros((3, 2)), chunk=0),
+    ),
+    (
+        "chunk: 1.5. Give a whole number of at",
+        lambda: jm.map_feasible_set(M, np.zeros((3, 2)), chunk=1.5),
+    ),
+    ("penalties: is a int. Give a", lambda: jm.map_feasible_set(M, np.zeros((3, 2)), penalties=3)),
+    (
+        "refine: 'x' where real numbers are",
+        lambda: jm.map_feasible_set(M, np.zeros((3, 2)), refine="x"),
+    ),
+    ("mpc: is a str. Give a jm.MPC", lambda: jm.boundary("M", 3)),
+    ("mpc: is a str. Give a jm.MPC", lambda: jm.recursive_feasibility("M")),
+    ("steps: 0. Give a whole number of at", lambda: jm.recursive_feasibility(M, steps=0)),
+    ("steps: 1.5. Give a whole number of at", lambda: jm.recursive_feasibility(M, steps=1.5)),
+    ("regions: -1. Give a whole number of at", lambda: jm.recursive_feasibility(M, regions=-1)),
+    ("seconds: 0. Give a positive number", lambda: jm.recursive_feasibility(M, seconds=0)),
+    ("seconds: '1'. Give a positive number", lambda: jm.recursive_feasibility(M, seconds="1")),
+    ("system: is a str. Give a jm.LinearSystem", lambda: jm.lqr("S", np.eye(2), np.eye(1))),
+    ("Q: 'Q' where real numbers are", lambda: jm.lqr(S, "Q", np.eye(1))),
+    ("Q: shape (3, 3) where (2, 2) is", lambda: jm.lqr(S, np.eye(3), np.eye(1))),
+    ("R: is not positive definite (least", lambda: jm.lqr(S, np.eye(2), 0.0)),
+    (
+        "B: not stabilizable: does not move",
+        lambda: jm.lqr(jm.LinearSystem(A * 2, B * 0), np.eye(2), 1.0),
+    ),
+    (
+        "system: is a str. Give a jm.LinearSystem",
+        lambda: jm.maximal_invariant_set("S", np.zeros((1, 2)), jm.Box(-1, 1), None),
+    ),
+    (
+        "K: 'K' where real numbers are",
+        lambda: jm.maximal_invariant_set(S, "K", jm.Box(-1, 1), None),
+    ),
+    (
+        "states: int is no Box or Polytope. Give",
+        lambda: jm.maximal_invariant_set(S, np.array([[-1.0, -1.0]]), 3, None),
+    ),
+    (
+        "system: is a str. Give a jm.LinearSystem",
+        lambda: jm.maximal_control_invariant_set("S", jm.Box(-1, 1), jm.Box(-1, 1)),
+    ),
+    (
+        "states: str is no Box or Polytope. Give",
+        lambda: jm.maximal_control_invariant_set(S, "x", jm.Box(-1, 1)),
+    ),
+    (
+        "system: is a str. Give a jm.LinearSystem",
+        lambda: jm.invariant_ellipsoid("S", np.zeros((1, 2)), np.eye(2), jm.Box(-1, 1), None),
+    ),
+    ("mpc: is a str. Give a jm.MPC", lambda: jm.exact_penalty("M")),
+    ("mpc: is a str. Give a jm.MPC", lambda: jm.soften("M", 1.0)),
+    ("soft[0].rho: 'x' where real numbers are", lambda: jm.soften(M, "x")),
+    ("soft[0].rho: -1.0. Penalties are at least 0", lambda: jm.soften(M, -1.0)),
+    ("mpc: is a str. Give a jm.MPC", lambda: jm.offline_report("M")),
+    ("steps: 0. Give a whole number of at", lambda: jm.offline_report(M, steps=0)),
+    (
+        "system: is a str. Give a jm.LinearSystem",
+        lambda: jm.verify_terminal("S", None, np.eye(2), np.eye(1), np.eye(2), None, None, None),
+    ),
+    ("system: is a str. Give a jm.LinearSystem", lambda: jm.design("S", np.eye(2), np.eye(1), 3)),
+    ("model: 'nothing' is no file. Give a", lambda: jm.load_robot("nothing")),
+    ("model: is a int. Give a name, a path or", lambda: jm.load_robot(3)),
+    ("model: is a NoneType. Give a name, a", lambda: jm.load_robot(None)),
+    (
+        "control_period: -1 is not a positive number. Give",
+        lambda: jm.load_robot("joint", control_period=-1),
+    ),
+    ("controller: is a str. Give a Controller,", lambda: jm.simulate("c", S, x, 3)),
+    (
+        "controller: is a str. Give a Controller,",
+        lambda: jm.simulate_many("c", S, np.zeros((2, 2)), 3),
+    ),
+    ('parameters: is a dict. Give {"Q":', lambda: jm.tune_weights("m", {}, S, x, 3, 4)),
+    ("mpc: is a str. Give a jm.MPC", lambda: jm.tune_penalties("m", np.zeros((3, 2)), 5)),
+    (
+        "iterations: 0. Give a whole number of at",
+        lambda: jm.tune_penalties(M, np.zeros((30, 2)), 0),
+    ),
+    ("position: 'x' where real numbers are", lambda: jm.joint_limits("x")),
+    ("robot: is a str. Give a Robot or a", lambda: jm.robot_mpc("joint")),
+    ("robot: is a str. Give a Robot or a", lambda: jm.RobotController("joint", "m")),
+    ("value: 'x' where real numbers are", lambda: jm.Parameter("x")),
+    ("x: shape (3,) where (2,) is needed.", lambda: jm.Box([-1, -1], [1, 1]).contains([1, 2, 3])),
+    ("x: 'x' where real numbers are", lambda: jm.Box(-1, 1).contains("x")),
+    ("Box: is unbounded. Give finite bounds", lambda: jm.Box(-np.inf, 1).volume()),
+    ("x: shape (1,) where (2,) is needed.", lambda: jm.Polytope([[1, 0]], [1]).contains([1])),
+    ("Polytope: is unbounded. Check the rows:", lambda: jm.Polytope([[1, 0]], [1]).vertices()),
+    (
+        "axes: [5] are not distinct numbers in",
+        lambda: jm.Box([-1, -1], [1, 1]).to_polytope().project([5]),
+    ),
+    (
+        "factor: -1 is not a positive number. Give",
+        lambda: jm.Box([-1, -1], [1, 1]).to_polytope().scale(-1),
+    ),
+    (
+        "factor: '2' where real numbers are",
+        lambda: jm.Box([-1, -1], [1, 1]).to_polytope().scale("2"),
+    ),
+    ("Ellipsoid.P: shape () is not (n, n). Give a", lambda: jm.Ellipsoid("P", 1).volume()),
+]
+
+
+@pytest.mark.parametrize(("message", "call"), CALLS, ids=range(len(CALLS)))
+def test_wrong_arguments_are_named(message, call):
+    COMPILED.clear()
+    with pytest.raises(ValueError) as caught:
+        call()
+    text = str(caught.value)
+    assert text.startswith(message), text
+    assert "\n" not in text and len(text) < 300 and not COMPILED
+
+
+def test_wrong_arguments_of_a_controller_are_named():
+    controller = jm.Controller(M)
+    with pytest.raises(ValueError, match=r"rho: shape \(2,\). Give \(\), \(9,\) or"):
+        jm.Controller(M, jm.ADMM(rho=[1, 2]))
+    for given, message in (
+        ("x", "x0: 'x' where real"), (jm.ADMM(), "x0: ADMM(iterations"), (None, "x0: None where"),
+        (x + 1j, "x0: entries of type complex"), (jnp.zeros(2, complex), "x0: entries of type c"),
+        (0.5, "x0: shape ()"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError) as caught:
+            controller(given)
+        assert str(caught.value).startswith(message)
+    for wrong in ("x", x + 1j, np.zeros(3)):
+        with pytest.raises(ValueError, match="^x0: "):
+            jm.simulate(controller, S, wrong, 3)
+        with pytest.raises(ValueError, match="^x0s: "):
+            jm.simulate_many(controller, S, wrong, 3)
+    with pytest.raises(ValueError, match="^reference: "):
+        jm.simulate(controller, S, x, 3, reference=jm.ADMM())
+
+
+def same(one, other):
+    leaves, others = (jax.tree.flatten(value) for value in (one, other))
+    assert leaves[1] == others[1]
+    for a, b in zip(leaves[0], others[0], strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_numbers_and_vectors_stand_for_the_matrices_they_mean():
+    same(jm.LinearSystem(A, [0, 0.2], dt=0.01).B, B)
+    wanted = mpc(Q=np.diag([50.0, 1.0]), R=np.array([[0.1]]), terminal_cost=np.diag([2.0, 3.0]))
+    given = mpc(
+        system=jm.LinearSystem(A, np.array([0, 0.2]), dt=0.01), Q=[50.0, 1.0], R=0.1,
+        terminal_cost=(2.0, 3.0), states=jm.Box(-1, 1), inputs=jm.Box(-1, 1),
+    )  # fmt: skip
+    given.validate()
+    same(given, wanted)
+    same(mpc(states=jm.Box(-1, [1, 2])).states, jm.Box(np.array([-1, -1]), [1, 2]))
+    same(mpc(R=[0.1]).R, np.array([[0.1]]))
+    law, other = jm.lqr(S, [50.0, 1.0], 0.1), jm.lqr(S, np.diag([50.0, 1.0]), [[0.1]])
+    np.testing.assert_array_equal(law.K, other.K)
+    # A number for several states or inputs has more than one meaning.
+    with pytest.raises(ValueError, match="Q: shape"):
+        mpc(Q=1.0).validate()
+
+
+def test_two_numbers_are_an_interval():
+    box = jm.Box(-1, 3)
+    box.validate("box", 1)
+    assert (box.dimension, box.volume(), box.vertices().tolist()) == (1, 4.0, [[-1.0], [3.0]])
+    assert box.contains([2.0]) and not box.contains([4.0]) and box.support([-2.0]) == 2.0
+    assert box.half_widths() == [2.0] and box.tightened(0.5).upper == 2.0
+    same(box.to_polytope(), jm.Box([-1], [3]).to_polytope())
+    same(jm.Box([-1, -2], np.inf), jm.Box([-1, -2], np.array([np.inf, np.inf])))
+
+
+def test_grids_take_numbers_for_all_axes():
+    np.testing.assert_array_equal(jm.grid(-1, 1, 3), [[-1], [0], [1]])
+    np.testing.assert_array_equal(jm.grid([-1, -2], [1, 2], 3), jm.grid([-1, -2], [1, 2], (3, 3)))
+    np.testing.assert_array_equal(jm.grid(-1, [1, 2], (2, 3)), jm.grid([-1, -1], [1, 2], [2, 3]))
+
+
+def test_numbers_are_states_where_there_is_one():
+    one = jm.MPC(jm.LinearSystem([[0.9]], [1.0]), 1.0, 1.0, horizon=2, inputs=jm.Box(-1, 1))
+    np.testing.assert_array_equal(jm.solve(one, 0.5).states, jm.solve(one, [0.5]).states)
+
+
+def test_rebuilt_objects_stay_what_they_are():
+    specification = jax.tree.map(lambda _: None, M)
+    assert jax.tree.leaves(specification) == []
+    axes = jm.MPC(None, Q=0, R=None, horizon=3)
+    assert (axes.Q, axes.R) == (0, None)
+    weights = np.stack([np.eye(2), 2 * np.eye(2)])
+    total = jax.vmap(lambda Q: mpc(Q=Q).Q.sum())(jnp.asarray(weights))
+    np.testing.assert_array_equal(total, [2, 4])
+    # Vectors and numbers may be traced.
+    np.testing.assert_array_equal(jax.jit(lambda q, r: mpc(Q=q, R=r).Q)(x + 2, 1.0), 2 * np.eye(2))
+    system = jax.jit(lambda b: jm.LinearSystem(A, b).B)(jnp.ones(2))
+    np.testing.assert_array_equal(system, [[1], [1]])
+    box = jax.jit(lambda u: mpc(states=jm.Box(-1.0, u)).states.upper)(2.0)
+    np.testing.assert_array_equal(box, [2, 2])
