@@ -5,14 +5,16 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
 
 from jaxmpc.checks import MOST_COUNT, fail
-from jaxmpc.feasible.store import Store
 from jaxmpc.robots.robot import Robot
+
+if TYPE_CHECKING:
+    from jaxmpc.feasible.store import Store
 
 
 def option(metavar: str | None, default: str, text: str | None = None) -> Any:
@@ -125,7 +127,7 @@ def model_hash(robot: Robot) -> str:
     return hashlib.sha256(binary.tobytes()).hexdigest()
 
 
-def report_damage(kept: Store) -> None:
+def report_damage(kept: "Store") -> None:
     """Say on stderr how many blocks of a store are computed again because their data are damaged or
     missing."""
     if kept.damaged:
