@@ -79,6 +79,8 @@ def _climb_regions(
         plans = law.plans(around)
         found = []
         for i in np.flatnonzero(plans.status == Status.SOLVED):
+            if time.monotonic() > deadline:
+                break
             state, piece = around[i], law.piece(around[i], plans.inputs[i])
             if piece is None:
                 continue
