@@ -2,6 +2,7 @@
 
 import importlib
 import shlex
+import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,6 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"jaxmpc {version('jaxmpc')}")
         return 0
     command = parse(argv)
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in the background
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         return command.run() or 0
     except (ValueError, OSError, MemoryError) as error:

@@ -46,6 +46,11 @@ class Budget:
         """Return whether so many seconds are left."""
         return self.deadline - time.monotonic() >= seconds
 
+    @property
+    def bar(self) -> bool:
+        """Return whether to show a bar: a terminal is there to draw it."""
+        return self.progress and sys.stderr.isatty()
+
     def say(self, stage: str) -> None:
         """Print the stage that begins, after the seconds spent so far."""
         if self.progress:

@@ -47,8 +47,7 @@ def closed_loops(
     center = x0s[label == 1].mean(axis=0) if np.any(label == 1) else np.zeros(p)
     # The previous input travels along where the plan depends on it.
     states = np.pad(x0s, ((0, 0), (0, law.mpc.dimension - p)))
-    quiet = None if budget.progress else True  # None: quiet unless stderr is a terminal
-    for k in tqdm(range(1, steps + 1), unit=" steps", leave=False, disable=quiet):
+    for k in tqdm(range(1, steps + 1), unit=" steps", leave=False, disable=not budget.bar):
         alive = np.flatnonzero(lost_at == 0)
         if not len(alive):
             break

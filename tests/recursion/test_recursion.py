@@ -277,9 +277,9 @@ class TestReport:
         report = recursive_feasibility(mpc, states, steps=4)
         assert holds(report) == (False, False, False)
         c = report.counterexample
-        assert c.found == "search"
-        assert c.distance == pytest.approx(0.0474341649, abs=1e-6)
-        np.testing.assert_allclose(np.abs(c.state), [0.95, 1.0], atol=1e-6)
+        assert c.found == "regions"
+        assert c.distance == pytest.approx(0.0474341649, abs=1e-9)
+        np.testing.assert_allclose(np.abs(c.state), [0.95, 1.0], atol=1e-9)
         assert c.state[0] * c.state[1] < 0
         check_counterexample(mpc, c)
         assert report.lost_by_law == pytest.approx(0.02, abs=1e-9)
