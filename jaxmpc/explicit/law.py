@@ -166,7 +166,8 @@ class RegionPlans(NamedTuple):
 
 
 class RegionLaw(Law):
-    """The same from complete critical regions, which compiles nothing for its plans."""
+    """The same from critical regions, which compiles nothing for its plans; a state that lies in
+    none of them has no plan."""
 
     def __init__(self, regions: CriticalRegions, easy: np.ndarray, chunk: int) -> None:
         super().__init__(regions.mpc, easy, chunk)

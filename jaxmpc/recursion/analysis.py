@@ -112,11 +112,9 @@ def examine(
         lost = verdict.lost
         if claims.law.holds is None:
             claims = replace(claims, law=verdict.claim)
-    if x0s is None and claims.law.holds:
-        none = np.zeros((0, problem.dimension))
-        return _report(claims, None, lost, none, _unfollowed(mpc, none), steps, budget)
-
     none = np.zeros((0, problem.dimension))
+    if x0s is None and claims.law.holds:
+        return _report(claims, None, lost, none, _unfollowed(mpc, none), steps, budget)
     if not budget.affords(PROOFS):
         budget.say("the time is over before a counterexample is proved")
         x0s = none if x0s is None else x0s
@@ -134,10 +132,11 @@ def examine(
     found = None if verdict is None else verdict.regions
     complete = found is not None and found.complete
     law = RegionLaw(found, easy, chunk) if found is not None and complete else Law(mpc, easy, chunk)
-    worst, beyond = None, none if verdict is None else verdict.worst
-    if complete and len(beyond):
+    worst = None
+    if verdict is not None and found is not None and len(verdict.worst):
         budget.say(f"proof of the counterexample; compiles for some {PROOFS:.0f} s")
-        worst = certified(law, problem, bound, beyond, ["regions"] * len(beyond))
+        by = ["regions"] * len(verdict.worst)
+        worst = certified(RegionLaw(found, easy, chunk), problem, bound, verdict.worst, by)
     compiles, ascents = LABELS + (0.0 if complete else PLANS), 0
     followed = _unfollowed(mpc, x0s if asked else none)
     if not budget.affords(compiles):
@@ -152,9 +151,8 @@ def examine(
         loops = closed_loops(law, problem, x0s, label, steps, budget)
         followed = label, loops
         if bound is not None and not complete and not claims.law.holds:
-            samples = worst_samples(bound, x0s, loops)
-            candidates = np.concatenate([beyond, samples])
-            by = ["regions"] * len(beyond) + ["sample"] * len(samples)
+            candidates = worst_samples(bound, x0s, loops)
+            by = ["sample"] * len(candidates)
             if search:
                 far = farthest_first(bound, loops.next_states[label == 1])[: STARTS // 4]
                 starts = np.concatenate([claims.seeds, starts[:STARTS], x0s[label == 1][far]])
@@ -163,7 +161,9 @@ def examine(
                 tops = ascend(law, bound, starts, budget.share(0.8))
                 candidates, by = np.concatenate([candidates, tops]), by + ["search"] * len(tops)
             budget.say(f"proof of the counterexample; compiles for some {PROOFS:.0f} s")
-            worst = certified(law, problem, bound, candidates, by)
+            other = certified(law, problem, bound, candidates, by)
+            if worst is None or (other is not None and other.distance > worst.distance):
+                worst = other
     if worst is not None:
         refuted = Claim(False, str(worst), worst.state)
         strong = claims.strong if claims.strong.holds is False else refuted

@@ -365,6 +365,14 @@ class TestReport:
         ]
         assert c.distance - 0.1 * c.distance < max(beyond) < c.distance + 1e-6
 
+    def test_some_regions_already_refute(self, monkeypatch):
+        """What is lost is not known then, nor how far outside the worst state leads."""
+        monkeypatch.setattr(analysis, "LABELS", np.inf)  # no time for samples, nor for a search
+        report = recursive_feasibility(problems.lecture(0.25, 3), regions=5)
+        assert report.law.holds is False and np.isnan(report.lost_by_law)
+        assert 0.01 < report.counterexample.distance <= 0.0474341650
+        check_counterexample(report.mpc, report.counterexample)
+
     def test_time_bounds_the_whole_call(self, capsys):
         """What compiles is left out, the rest stops; what is open and what is undecided is said."""
         mpc, states = problems.joint(20), np.array([[0.0, 0.0], [1.0, 1.0]])
