@@ -91,11 +91,12 @@ def offline_report(
             over the feasible set, in more than three dimensions random points of its bounding box;
             those of `recursive_feasibility` for its test.
         K: terminal law to verify, (m, n); None: that of the LQR.
-        seconds: time limit of the whole call. Recursive feasibility and the exact penalty may take
-            a third of what is left each, and what they do not settle is open. Linear programs take
-            seconds, thousands of facets or critical regions minutes; compiling takes some 15 s
-            for the map and 20 s for the closed loops, whatever the problem. What compiles cannot
-            be interrupted, and is left out, with a note, where it does not fit.
+        seconds: time limit of the whole call. Linear programs take seconds, thousands of facets or
+            critical regions minutes; compiling takes some 15 s for the map and 20 s for the closed
+            loops, whatever the problem, which are kept for that where seconds allow. What
+            compiles cannot be interrupted, and is left out, with a note, where it does not fit.
+            Recursive feasibility may take two thirds of the rest, the exact penalty what is left
+            of it; what they do not settle is open.
         progress: print each stage on stderr.
 
     Raises ValueError for an ill-posed problem, and where x0s is None and the feasible set is empty,
@@ -118,15 +119,19 @@ def offline_report(
 
     budget.say("terminal ingredients")
     terminal = attempt("terminal", lambda: theorems(hard, K))
-    third = replace(budget, deadline=budget.share(1 / 3))
+    # Where map and closed loops can fit, time is kept for their compiles.
+    compiles = PROOFS + LABELS + LOOPS
+    kept = compiles if budget.affords(1.5 * compiles) else 0.0
+    proofs = replace(budget, deadline=budget.deadline - kept)
+    part = replace(proofs, deadline=proofs.share(2 / 3))
     follow = x0s if problem.dimension > 3 else None
     recursion = attempt(
         "recursion",
-        lambda: examine(hard, follow, steps, True, 2000, third, third.share(0.5)),
+        lambda: examine(hard, follow, steps, True, 2000, part, part.share(0.75)),
     )
     budget.say("exact penalty, by critical regions")
-    share = budget.share(1 / 3) - time.monotonic()
-    penalty = attempt("penalty", lambda: exact_penalty(mpc, seconds=share))
+    left = proofs.deadline - time.monotonic()
+    penalty = attempt("penalty", lambda: exact_penalty(mpc, seconds=left))
     fmap = mapped(problem, x0s, budget)
     inside = np.zeros((0, problem.dimension)) if fmap is None else fmap.points[fmap.label == 1]
     closed = None
