@@ -9,53 +9,58 @@ Sets and laws  lqr, maximal_invariant_set, maximal_control_invariant_set, invari
 Tuning         tune_weights, tune_penalties with Parameter and ClosedLoopLoss
 
 The rest, and the types of all results, are in `qp`, `control`, `sets`, `mpc`, `feasible`,
-`recursion`, `explicit`, `robots`, `robot_maps`, `closed_loop`, `tuning` and `workflow`.
+`recursion`, `explicit`, `robots`, `robot_maps`, `closed_loop`, `tuning` and `workflow`. Each name
+is imported when it is first used, so that the command can answer Ctrl-C before JAX is loaded.
 """
 
-from jaxmpc import (
-    closed_loop,
-    control,
-    explicit,
-    feasible,
-    mpc,
-    qp,
-    recursion,
-    robot_maps,
-    robots,
-    sets,
-    tuning,
-    workflow,
-)
-from jaxmpc.closed_loop import RobotController, robot_mpc, simulate, simulate_many
-from jaxmpc.control.invariant import (
-    invariant_ellipsoid,
-    maximal_control_invariant_set,
-    maximal_invariant_set,
-)
-from jaxmpc.control.limits import joint_limits
-from jaxmpc.control.riccati import lqr
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope
-from jaxmpc.control.system import LinearSystem
-from jaxmpc.control.terminal import verify_terminal
-from jaxmpc.explicit import exact_penalty
-from jaxmpc.feasible import boundary, feasible_polytope, grid, map_feasible_set
-from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.plan import Plan
-from jaxmpc.mpc.problem import MPC, Outputs, Soft
-from jaxmpc.mpc.soften import soften
-from jaxmpc.mpc.solve import solve, solve_many
-from jaxmpc.qp.admm import ADMM
-from jaxmpc.qp.problem import QP
-from jaxmpc.qp.solve import solve_qp
-from jaxmpc.qp.status import Status
-from jaxmpc.recursion import recursive_feasibility
-from jaxmpc.robots.linear import LinearPlant
-from jaxmpc.robots.load import load_robot
-from jaxmpc.tuning.losses import ClosedLoopLoss
-from jaxmpc.tuning.parameters import Parameter
-from jaxmpc.tuning.penalties import tune_penalties
-from jaxmpc.tuning.weights import tune_weights
-from jaxmpc.workflow import design, offline_report
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jaxmpc import (
+        closed_loop,
+        control,
+        explicit,
+        feasible,
+        mpc,
+        qp,
+        recursion,
+        robot_maps,
+        robots,
+        sets,
+        tuning,
+        workflow,
+    )
+    from jaxmpc.closed_loop import RobotController, robot_mpc, simulate, simulate_many
+    from jaxmpc.control.invariant import (
+        invariant_ellipsoid,
+        maximal_control_invariant_set,
+        maximal_invariant_set,
+    )
+    from jaxmpc.control.limits import joint_limits
+    from jaxmpc.control.riccati import lqr
+    from jaxmpc.control.sets import Box, Ellipsoid, Polytope
+    from jaxmpc.control.system import LinearSystem
+    from jaxmpc.control.terminal import verify_terminal
+    from jaxmpc.explicit import exact_penalty
+    from jaxmpc.feasible import boundary, feasible_polytope, grid, map_feasible_set
+    from jaxmpc.mpc.controller import Controller
+    from jaxmpc.mpc.plan import Plan
+    from jaxmpc.mpc.problem import MPC, Outputs, Soft
+    from jaxmpc.mpc.soften import soften
+    from jaxmpc.mpc.solve import solve, solve_many
+    from jaxmpc.qp.admm import ADMM
+    from jaxmpc.qp.problem import QP
+    from jaxmpc.qp.solve import solve_qp
+    from jaxmpc.qp.status import Status
+    from jaxmpc.recursion import recursive_feasibility
+    from jaxmpc.robots.linear import LinearPlant
+    from jaxmpc.robots.load import load_robot
+    from jaxmpc.tuning.losses import ClosedLoopLoss
+    from jaxmpc.tuning.parameters import Parameter
+    from jaxmpc.tuning.penalties import tune_penalties
+    from jaxmpc.tuning.weights import tune_weights
+    from jaxmpc.workflow import design, offline_report
 
 __all__ = [
     "ADMM",
@@ -111,3 +116,48 @@ __all__ = [
     "verify_terminal",
     "workflow",
 ]
+
+# The module of each name that is no module itself.
+HOMES = {
+    "closed_loop": "RobotController robot_mpc simulate simulate_many",
+    "control.invariant": "invariant_ellipsoid maximal_control_invariant_set maximal_invariant_set",
+    "control.limits": "joint_limits",
+    "control.riccati": "lqr",
+    "control.sets": "Box Ellipsoid Polytope",
+    "control.system": "LinearSystem",
+    "control.terminal": "verify_terminal",
+    "explicit": "exact_penalty",
+    "feasible": "boundary feasible_polytope grid map_feasible_set",
+    "mpc.controller": "Controller",
+    "mpc.plan": "Plan",
+    "mpc.problem": "MPC Outputs Soft",
+    "mpc.soften": "soften",
+    "mpc.solve": "solve solve_many",
+    "qp.admm": "ADMM",
+    "qp.problem": "QP",
+    "qp.solve": "solve_qp",
+    "qp.status": "Status",
+    "recursion": "recursive_feasibility",
+    "robots.linear": "LinearPlant",
+    "robots.load": "load_robot",
+    "tuning.losses": "ClosedLoopLoss",
+    "tuning.parameters": "Parameter",
+    "tuning.penalties": "tune_penalties",
+    "tuning.weights": "tune_weights",
+    "workflow": "design offline_report",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name when it is first used."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    home = next((home for home, names in HOMES.items() if name in names.split()), None)
+    if home is None:
+        return import_module(f"{__name__}.{name}")
+    globals()[name] = found = getattr(import_module(f"{__name__}.{home}"), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

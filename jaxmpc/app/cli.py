@@ -5,6 +5,7 @@ import importlib
 import io
 import re
 import shlex
+import signal
 import sys
 import types
 from collections.abc import Sequence
@@ -42,6 +43,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         command = parse(argv)
     except (ValueError, OSError, AssertionError) as error:  # tyro asserts that it knows a shell
         return report_error(error)
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in the background
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         return command.run() or 0
     except (ValueError, OSError, MemoryError) as error:

@@ -1,5 +1,6 @@
 """Exact penalties: from which weight on slacks the soft problem keeps limits that can be kept."""
 
+import time
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -88,6 +89,7 @@ class ExactPenalty:
 def exact_penalty(
     mpc: MPC, x0s: Any = None, *, method: str = "auto", rho: float | None = None,
     limit: int = 2000, within: Box | Polytope | None = None, samples: int = 200, seed: int = 0,
+    seconds: float = np.inf,
 ) -> ExactPenalty:  # fmt: skip
     """Return the exact-penalty threshold of an MPC problem with an L1 penalty on slacks.
 
@@ -106,7 +108,8 @@ def exact_penalty(
     it can miss the greatest. "auto": regions up to four states, and samples as well where there are
     more than `limit` regions. Where active rows are dependent the multipliers are not unique, and
     an LP finds those with the least maximum. rho: a weight to check; None: those of `mpc.soft`, if
-    any. within: the set of initial states, needed where X_N is unbounded.
+    any. within: the set of initial states, needed where X_N is unbounded. seconds: after which the
+    search stops, and rho_bar is a lower bound.
 
     Raises ValueError for ill-posed problems, wrong arguments, an ellipsoidal terminal set, no soft
     row, and where X_N is empty, flat or unbounded. NumPy in float64; not traceable.
@@ -114,6 +117,7 @@ def exact_penalty(
     Sources: Fletcher 1987, Practical Methods of Optimization, section 14.3; Kerrigan &
     Maciejowski 2000, Proc. UKACC Control; Hovd & Stoican 2014, Comput. Chem. Eng. 70.
     """
+    deadline = time.monotonic() + seconds
     if method not in ("auto", "regions", "samples"):
         fail("method", f"{method!r}", 'Give "auto", "regions" or "samples"')
     samples = whole("samples", samples, 1)
@@ -131,13 +135,13 @@ def exact_penalty(
     regions: CriticalRegions | None = None
     few = len(p.center) <= ENUMERATED
     if method == "regions" or (method == "auto" and few):
-        search = explore(p, limit)
+        search = explore(p, limit, deadline)
         regions = CriticalRegions.of(mpc, search)
         for c in search.found:
             found[c.law.active] = weigh.over(c.law, c.vertices)
     exact = regions is not None and regions.complete
     if method == "samples" or (method == "auto" and not exact):
-        climb_regions(p, weigh, found, samples, np.random.default_rng(seed))
+        climb_regions(p, weigh, found, samples, np.random.default_rng(seed), deadline)
     worsts = [worst for worst in found.values() if worst is not None]
     worst = max(worsts, key=lambda w: w.value, default=Worst(0.0, p.interior, -1))
 
@@ -289,12 +293,12 @@ class Thresholds:
 
 def climb_regions(
     p: LeastDistanceForm, weigh: Thresholds, found: dict[tuple[int, ...], Worst | None],
-    samples: int, random: np.random.Generator,
+    samples: int, random: np.random.Generator, deadline: float,
 ) -> None:  # fmt: skip
     """Add to `found` the regions that samples, and a search from the best of them, meet.
 
     The search goes on from the best region not yet left, across its facets, until PATIENCE
-    regions in turn have led to nothing better.
+    regions in turn have led to nothing better, or until the deadline of `time.monotonic`.
     """
     seen: dict[tuple[int, ...], float] = {}
     n, half = len(p.center), samples // 2
@@ -304,6 +308,8 @@ def climb_regions(
     weights = random.dirichlet(np.full(max(len(corners), 1), 1 / max(len(corners), 1)), half)
     between = weights @ corners - p.interior if len(corners) else np.zeros((0, n))
     for direction in [*random.standard_normal((samples - half, n)), *between]:
+        if time.monotonic() > deadline:
+            break
         end = p.leave(direction)
         for fraction in FRACTIONS if end is not None else ():
             solution = p.solution(p.interior + fraction * (end - p.interior))
@@ -325,7 +331,7 @@ def climb_regions(
     best, stale = -1.0, 0
     while stale < PATIENCE:
         waiting = {a: w for a, w in found.items() if w is not None and a not in left}
-        if not waiting:
+        if not waiting or time.monotonic() > deadline:
             return
         here, worst = max(waiting.items(), key=lambda item: item[1].value)
         stale = 0 if worst.value > best * (1 + ROUNDING) else stale + 1

@@ -6,7 +6,7 @@ region.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -14,10 +14,12 @@ from scipy.optimize import lsq_linear, nnls
 
 from jaxmpc.control.sets import Box, unit_rows
 from jaxmpc.control.system import host_matrices
+from jaxmpc.explicit.regions import CriticalRegions
 from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import solve_many
 from jaxmpc.qp.admm import ADMM
+from jaxmpc.qp.status import Status
 
 # Residuals to which plans are solved.
 EPS = 1e-8
@@ -152,3 +154,42 @@ class Law:
         last = slice(len(c.C) - sum(c.balls), None)
         centred = c.C[last] @ z + c.D[last] @ theta + c.d[last] - c.lower[last]
         return bool(np.linalg.norm(centred) > (1 - TOUCHING) * float(np.ravel(c.radius)[0]))
+
+
+class RegionPlans(NamedTuple):
+    """Plans from critical regions: inputs (B, N, m), status and residuals (B,), as in `Plan`."""
+
+    inputs: np.ndarray
+    status: np.ndarray
+    primal_residual: np.ndarray
+    dual_residual: np.ndarray
+
+
+class RegionLaw(Law):
+    """The same from critical regions, which compiles nothing for its plans; a state that lies in
+    none of them has no plan."""
+
+    def __init__(self, regions: CriticalRegions, easy: np.ndarray, chunk: int) -> None:
+        super().__init__(regions.mpc, easy, chunk)
+        self.regions = regions
+
+    def plans(self, states: np.ndarray) -> RegionPlans:
+        """Return the plans from states (B, p), with the largest row violated and the largest entry
+        of P z + F x + f + C'y; NaN, ITERATION_LIMIT and inf where no region holds a state."""
+        c, where = self.condensed, self.regions.find(states)
+        z, y = np.full((len(states), len(c.P)), np.nan), np.zeros((len(states), len(c.C)))
+        for i in np.unique(where[where >= 0]):
+            region, here = self.regions[i], np.flatnonzero(where == i)
+            z[here] = states[here] @ region.Z.T + region.z0
+            y[np.ix_(here, region.rows)] = states[here] @ region.L.T + region.l0
+        known = where >= 0
+        inputs = np.einsum("kmz,bz->bkm", c.Omega, z) + np.einsum("kmp,bp->bkm", c.Psi, states)
+        rows = z @ c.C.T + states @ c.D.T + c.d
+        violated = np.maximum(rows - c.upper, c.lower - rows).max(axis=1, initial=0.0)
+        gradient = z @ c.P.T + states @ c.F.T + c.f + y @ c.C
+        return RegionPlans(
+            inputs + c.psi,
+            np.where(known, Status.SOLVED, Status.ITERATION_LIMIT).astype(np.int8),
+            np.where(known, violated, np.inf),
+            np.where(known, np.abs(gradient).max(axis=1, initial=0.0), np.inf),
+        )

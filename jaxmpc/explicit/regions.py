@@ -125,16 +125,18 @@ class CriticalRegions:
 
 
 def critical_regions(
-    mpc: MPC, *, limit: int = 5000, within: Box | Polytope | None = None
+    mpc: MPC, *, limit: int = 5000, within: Box | Polytope | None = None, seconds: float = np.inf
 ) -> CriticalRegions:
     """Return all critical regions of positive volume of the MPC problem (multiparametric QP).
 
     limit: the most regions to look for. within: the set of initial states, needed where the
-    feasible set X_N is unbounded. The search crosses every facet of every region: a row that
-    becomes active joins the active set, a multiplier that vanishes leaves it, and where the new row
-    depends on the others each of those that the dual ratio test may drop is tried; what this leaves
-    open is found by solving the QP just behind the facet. `complete` does not rest on the search
-    having ended but on the volumes (see `CriticalRegions`). NumPy in float64; not traceable.
+    feasible set X_N is unbounded. seconds: after which the search stops (some linear programs and
+    the hull of all vertices are finished; in five and six dimensions that may take long). The
+    search crosses every facet of every region: a row that becomes active joins the active set, a
+    multiplier that vanishes leaves it, and where the new row depends on the others each of those
+    that the dual ratio test may drop is tried; what this leaves open is found by solving the QP
+    just behind the facet. `complete` does not rest on the search having ended but on the volumes
+    (see `CriticalRegions`). NumPy in float64; not traceable.
 
     Raises ValueError for ill-posed problems, soft rows or an ellipsoidal terminal set (their
     laws are not piecewise affine in this form), and where X_N is empty, flat or unbounded.
@@ -143,10 +145,11 @@ def critical_regions(
     Bemporad 2003, Automatica 39 (crossing facets by active sets); Lawson & Hanson 1974, ch. 23
     (least distance by NNLS).
     """
+    deadline = time.monotonic() + seconds
     mpc.validate()
     if mpc.soft:
         fail("mpc.soft", "has rows, and slacks make another QP", "Make the rows hard first")
-    return CriticalRegions.of(mpc, explore(least_distance_form(mpc, within), limit))
+    return CriticalRegions.of(mpc, explore(least_distance_form(mpc, within), limit, deadline))
 
 
 def region(p: LeastDistanceForm, c: Cell) -> Region:

@@ -23,16 +23,22 @@ DIMENSIONS = 6
 class RegionSearch:
     """Breadth-first search across facets. cells: active set → region, None for no volume."""
 
-    def __init__(self, p: LeastDistanceForm, limit: int) -> None:
-        self.p, self.limit, self.begun = p, limit, time.perf_counter()
+    def __init__(self, p: LeastDistanceForm, limit: int, deadline: float = np.inf) -> None:
+        self.p, self.limit, self.deadline = p, limit, deadline
+        self.begun = time.perf_counter()
         self.cells: dict[tuple[int, ...], Cell | None] = {}
         self.found: list[Cell] = []
         self.queue: deque[Cell] = deque()
 
     @property
     def full(self) -> bool:
-        """Return True once the limit is reached."""
-        return len(self.found) >= self.limit
+        """Return True once the limit is reached, or the deadline."""
+        return len(self.found) >= self.limit or self.late
+
+    @property
+    def late(self) -> bool:
+        """Return True once the deadline, of `time.monotonic`, is over."""
+        return time.monotonic() > self.deadline
 
     def visit(self, active: tuple[int, ...] | None) -> Cell | None:
         """Return the region of an active set, and queue it when it is new."""
@@ -80,12 +86,16 @@ class RegionSearch:
         random = np.random.default_rng(0)
         why = ""
         for _ in range(REPAIRS):
+            if self.late:
+                return False, f"stopped by the time limit, after {len(self.found)} regions"
             if self.full:
                 return False, f"stopped at the limit of {self.limit} regions"
             points = np.concatenate([c.vertices for c in self.found])
             volumes, whole = sum(volume(c.vertices) for c in self.found), volume(points)
             hull = Polytope.from_points(points)
-            tops = [self.p.support(a) for a in np.asarray(hull.H)]
+            tops = [self.p.support(a) for a in np.asarray(hull.H) if not self.late]
+            if self.late:
+                continue
             beyond = np.array([value for value, _ in tops]) - np.asarray(hull.h)
             gap = 1 - volumes / whole
             why = (
@@ -101,6 +111,8 @@ class RegionSearch:
                     inside = self.p.interior + (corner - self.p.interior) * (1 - 1e-6)
                     self.visit(self.p.active(inside))
             for c in list(self.found):
+                if self.full:
+                    break
                 for middle, normal in zip(c.middles, c.H, strict=True):
                     corner = c.vertices[random.integers(len(c.vertices))]
                     # Anywhere on the facet, which is convex, and a little behind it.
@@ -113,15 +125,16 @@ class RegionSearch:
         return False, why.replace("the volumes of", "a part was not found: the volumes of")
 
 
-def explore(p: LeastDistanceForm, limit: Any) -> RegionSearch:
-    """Run the search from an interior point across all facets, and return it."""
+def explore(p: LeastDistanceForm, limit: Any, deadline: float = np.inf) -> RegionSearch:
+    """Run the search from an interior point across all facets, until the deadline of
+    `time.monotonic`, and return it."""
     limit = whole("limit", limit, 1)
     if len(p.center) > DIMENSIONS:
         fail(
             "mpc", f"its states have {len(p.center)} coordinates, too many for vertices",
             f"Regions serve up to {DIMENSIONS}; exact_penalty(method='samples') serves more",
         )  # fmt: skip
-    search = RegionSearch(p, limit)
+    search = RegionSearch(p, limit, deadline)
     search.visit(p.active(p.interior))
     search.cross_all()
     if not search.found:

@@ -1,6 +1,7 @@
 """Maps of the feasible set: every point proved feasible, proved infeasible, or undecided."""
 
 import math
+import time
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -176,12 +177,15 @@ class FeasibleSetMap:
         H, h = np.asarray(body.H, float), np.asarray(body.h, float)
         return Polytope(H[:, axes], h - H[:, others] @ rest)
 
-    def refine(self, tolerance: float = 1e-6, rounds: int = 30) -> "FeasibleSetMap":
+    def refine(
+        self, tolerance: float = 1e-6, rounds: int = 30, *, deadline: float = np.inf
+    ) -> "FeasibleSetMap":
         """Send rays through the vertices of the outer polytope until the volume bounds meet.
 
         Each ray adds a proved boundary point and a proved facet (`boundary`); in up to four
         mapped dimensions this ends at the exact polytope. Undecided points that a facet excludes
         are labelled infeasible. tolerance: relative gap of the volume bounds at which to stop.
+        deadline: of `time.monotonic`, after which no round of rays begins.
         A set without interior, or unbounded, is returned as it is.
         """
         d = self.problem.dimension
@@ -194,6 +198,8 @@ class FeasibleSetMap:
         normals, offsets = rays.box()
         sent = unit(directions)
         for _ in range(rounds):
+            if time.monotonic() > deadline:
+                break
             found = rays.cast(directions)
             proved = np.isfinite(found.inner)
             points = np.concatenate([points, found.points[proved]])
@@ -335,13 +341,21 @@ def map_feasible_set(
 
 
 def map_points(
-    problem: FeasibilityProblem, points: Any, *, progress: bool = False, **settings: Any
-) -> FeasibleSetMap:
-    """Label the points (B, d) of a feasibility problem; settings: those of `label_chunks`."""
+    problem: FeasibilityProblem, points: Any, *, progress: bool = False,
+    deadline: float = np.inf, **settings: Any,
+) -> FeasibleSetMap:  # fmt: skip
+    """Label the points (B, d) of a feasibility problem; settings: those of `label_chunks`.
+
+    deadline: of `time.monotonic`; chunks of points that are left then get status NOT_RUN.
+    """
     points = host_array("x0s", points)
-    parts = [Labels.empty(0, problem)]
+    parts, done = [Labels.empty(0, problem)], 0
     with tqdm(total=len(points), unit="pt", disable=not progress) as bar:
         for _, part in label_chunks(problem, points, **settings):
             parts.append(part)
+            done += len(part.label)
             bar.update(len(part.label))
+            if time.monotonic() > deadline:
+                break
+    parts.append(Labels.empty(len(points) - done, problem))
     return FeasibleSetMap.of(problem, points, Labels.joined(parts))

@@ -145,9 +145,12 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
     offsets, reached = np.array([plans.support(d) for d in normals]), np.zeros((0, p))
     if not np.all(np.isfinite(offsets)):
         return "the feasible set is unbounded"
-    while time.monotonic() < deadline and len(offsets) < FACETS:
+    many = "its facets are too many to enumerate in the time given"
+    while len(offsets) < FACETS:
         missed = []
         for direction in directions:
+            if time.monotonic() > deadline:
+                return many
             s, normal, offset = plans.ray(center, direction)
             missed.append(s < 1 - TOLERANCE)
             normals, offsets = np.vstack([normals, normal]), np.append(offsets, offset)
@@ -163,4 +166,4 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
         directions = vertices[~near.any(axis=1)] - center
         if not len(directions):
             return CenteredPolytope(center, normals, offsets, vertices)
-    return "its facets are too many to enumerate in the time given"
+    return many

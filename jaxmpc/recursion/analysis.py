@@ -11,10 +11,10 @@ A claim is proved by an invariant terminal set (Theorem 1 of `verify_terminal`; 
 Diehl 2017, section 2.4), by linear programs over the polytope of all states and plans, or by the
 critical regions of the law (`claims.py`). It is
 refuted by a counterexample: a state with a feasible plan, and a half-space that excludes the next
-state. Counterexamples are looked for among samples and by gradient ascent (`ascent.py`).
+state. The worst is at a vertex of a critical region; without all regions counterexamples are looked
+for among samples and by gradient ascent (`ascent.py`).
 """
 
-import time
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -22,13 +22,15 @@ import numpy as np
 
 from jaxmpc.checks import fail, whole
 from jaxmpc.compiled import default_chunk
-from jaxmpc.explicit.law import Law
+from jaxmpc.explicit.law import Law, RegionLaw
 from jaxmpc.feasible.map import grid
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.recursion.ascent import ascend
+from jaxmpc.recursion.budget import LABELS, PLANS, PROOFS, Budget
 from jaxmpc.recursion.claims import (
     Claims,
+    RegionVerdict,
     every_move_leaves,
     no_move_stays,
     settle_by_regions,
@@ -41,23 +43,37 @@ from jaxmpc.recursion.counterexample import (
     outer_bound,
     worst_samples,
 )
-from jaxmpc.recursion.loops import closed_loops, map_states
-from jaxmpc.recursion.report import Claim, RecursionReport
+from jaxmpc.recursion.loops import LawLoops, closed_loops, map_states
+from jaxmpc.recursion.report import NOT_FEASIBLE, Claim, Counterexample, RecursionReport
 
 
 def recursive_feasibility(
     mpc: MPC, x0s: Any = None, *, steps: int = 20, search: bool = True, regions: int = 2000,
-    seconds: float = 60.0,
+    seconds: float = 60.0, progress: bool = False,
 ) -> RecursionReport:  # fmt: skip
     """Examine whether `mpc` is recursively feasible: proofs, the worst counterexample, the states
     lost.
 
+    What is exact and cheap comes first; what it settles is not sampled:
+
+        1. theorem and linear programs over plans: seconds for up to three states, minutes for
+           hundreds of facets,
+        2. critical regions of the law, up to four states: seconds for hundreds of regions, minutes
+           for thousands. The next state's distance from X_N is convex on each, so that the worst
+           of their vertices is the worst state of X_N,
+        3. proof of the worst counterexample: some 4 s of compiling,
+        4. samples and closed loops from them: another 12 s of compiling,
+        5. without complete regions, plans by a solver for 4. (20 s of compiling), and a search.
+
     x0s: sample states (B, n), or (B, n + m) with the previous input where input rates are
-    limited; None: a grid over X_N, random states in more than three dimensions. steps: length of
-    the closed loops x⁺ = A x + B u_0(x) + c from each sample. search: look for a counterexample to
-    the law by gradient ascent too. regions: critical regions to enumerate at most for a proof of
-    the law (0: none). seconds: time limit of the search and of the enumeration of facets; what is
-    not settled by then is open.
+    limited; None: none where the law is proved, else a grid over X_N, random states in more than
+    three dimensions. steps: length of the closed loops x⁺ = A x + B u_0(x) + c from each sample.
+    search: where regions are incomplete look for a counterexample by gradient ascent too.
+    regions: critical regions to enumerate at most (0: none). seconds: time limit of the whole call;
+    1. may take half of it, 2. half of what is left. What is not settled by then is open, and
+    samples that are not labelled or followed to the end are undecided. Compiling, one step of
+    all closed loops, and a linear program cannot be interrupted: a stage that has to compile is
+    left out where less than the seconds above are left. progress: print each stage on stderr.
 
     Optima of linear programs are trusted to 1e-9 of the size of X_N, by bounds from their
     multipliers. A state counts as outside X_N when its distance exceeds 1e-7 of that size. In the
@@ -72,50 +88,82 @@ def recursive_feasibility(
     (CDC) for strong feasibility; Löfberg 2012, Automatica 48, for the law; Bemporad et al. 2002 for
     critical regions.
     """
-    begun = time.monotonic()
+    budget = Budget.of(seconds, progress)
+    return examine(mpc, x0s, steps, search, regions, budget, budget.share(0.5))
+
+
+def examine(
+    mpc: MPC, x0s: Any, steps: int, search: bool, regions: int, budget: Budget, settled: float
+) -> RecursionReport:
+    """Return the report of `recursive_feasibility`; settled: when its stage 1 has to end."""
     problem = FeasibilityProblem.of(mpc)
     steps, regions = whole("steps", steps, 1), whole("regions", regions, 0)
-    if not isinstance(seconds, int | float) or not seconds > 0:
-        fail("seconds", f"{seconds!r}", "Give a positive number")
-    deadline = begun + seconds
     if x0s is not None:
         x0s, p = np.asarray(x0s, np.float64), problem.dimension
         if x0s.ndim != 2 or x0s.shape[1] != p or not len(x0s):
             fail("x0s", f"shape {x0s.shape}", f"Give at least one state, (B, {p})")
-    claims = settle_claims(mpc, problem, deadline)
+    budget.say("theorem and linear programs")
+    claims = settle_claims(mpc, problem, settled)
+    lost = 0.0 if claims.law.holds and np.isfinite(claims.volume) else np.nan
+    verdict: RegionVerdict | None = None
+    if regions and not claims.law.holds and np.isfinite(claims.volume):
+        budget.say("critical regions of the law")
+        verdict = settle_by_regions(claims, regions, budget.share(0.5))
+        lost = verdict.lost
+        if claims.law.holds is None:
+            claims = replace(claims, law=verdict.claim)
+    none = np.zeros((0, problem.dimension))
+    if x0s is None and claims.law.holds:
+        return _report(claims, None, lost, none, _unfollowed(mpc, none), steps, budget)
+    if not budget.affords(PROOFS):
+        budget.say("the time is over before a counterexample is proved")
+        x0s = none if x0s is None else x0s
+        return _report(
+            _open(claims, verdict), None, lost, x0s, _unfollowed(mpc, x0s), steps, budget
+        )
     bound, starts = outer_bound(claims)
+    asked = x0s is not None
     if x0s is None:
         if bound is None:
             fail("x0s", f"None, and {claims.why}", "Give the states to look at, (B, n)")
         x0s = _samples(claims, starts, bound.center)
     easy = x0s[0] if bound is None else bound.center
-    law = Law(mpc, easy, 1024 if len(x0s) <= 16_384 else default_chunk())
-    fmap = map_states(law, problem, x0s)
-    loops = closed_loops(law, problem, x0s, fmap.label, steps)
-
+    chunk = 1024 if len(x0s) <= 16_384 else default_chunk()
+    found = None if verdict is None else verdict.regions
+    complete = found is not None and found.complete
+    law = RegionLaw(found, easy, chunk) if found is not None and complete else Law(mpc, easy, chunk)
     worst = None
-    if bound is not None and claims.law.holds is not True:
-        candidates = worst_samples(bound, x0s, loops)
-        found = ["sample"] * len(candidates)
-        if search:
-            feasible = x0s[fmap.label == 1]
-            near = feasible[
-                farthest_first(bound, loops.next_states[fmap.label == 1])[: STARTS // 4]
-            ]
-            starts = np.concatenate([claims.seeds, starts[:STARTS], near])
-            tops = ascend(law, bound, starts, deadline)
-            candidates, found = np.concatenate([candidates, tops]), found + ["search"] * len(tops)
-        worst = certified(law, problem, bound, candidates, found)
-    lost = 0.0 if claims.law.holds and np.isfinite(claims.volume) else np.nan
-    enumerable = regions and np.isfinite(claims.volume) and time.monotonic() < deadline
-    if enumerable and not claims.law.holds:
-        verdict, lost, beyond = settle_by_regions(claims, regions)
-        if verdict.holds is False and worst is None:  # the search did not find it
-            worst = certified(law, problem, bound, beyond, ["regions"] * len(beyond))
-        if verdict.holds is False:
-            verdict = Claim(None, f"{verdict.reason}, which is not certified", verdict.state)
-        if claims.law.holds is None:
-            claims = replace(claims, law=verdict)
+    if verdict is not None and found is not None and len(verdict.worst):
+        budget.say(f"proof of the counterexample; compiles for some {PROOFS:.0f} s")
+        by = ["regions"] * len(verdict.worst)
+        worst = certified(RegionLaw(found, easy, chunk), problem, bound, verdict.worst, by)
+    compiles, ascents = LABELS + (0.0 if complete else PLANS), 0
+    followed = _unfollowed(mpc, x0s if asked else none)
+    if not budget.affords(compiles):
+        budget.say(f"no samples: they compile for some {compiles:.0f} s, which are not left")
+        x0s = x0s if asked else none
+    else:
+        budget.say(
+            f"closed loops of {steps} steps from {len(x0s):,} samples; compile for some "
+            f"{compiles:.0f} s"
+        )
+        label = map_states(law, problem, x0s).label
+        loops = closed_loops(law, problem, x0s, label, steps, budget)
+        followed = label, loops
+        if bound is not None and not complete and not claims.law.holds:
+            candidates = worst_samples(bound, x0s, loops)
+            by = ["sample"] * len(candidates)
+            if search:
+                far = farthest_first(bound, loops.next_states[label == 1])[: STARTS // 4]
+                starts = np.concatenate([claims.seeds, starts[:STARTS], x0s[label == 1][far]])
+                ascents = len(starts)
+                budget.say(f"gradient ascent from {ascents} states")
+                tops = ascend(law, bound, starts, budget.share(0.8))
+                candidates, by = np.concatenate([candidates, tops]), by + ["search"] * len(tops)
+            budget.say(f"proof of the counterexample; compiles for some {PROOFS:.0f} s")
+            other = certified(law, problem, bound, candidates, by)
+            if worst is None or (other is not None and other.distance > worst.distance):
+                worst = other
     if worst is not None:
         refuted = Claim(False, str(worst), worst.state)
         strong = claims.strong if claims.strong.holds is False else refuted
@@ -123,18 +171,59 @@ def recursive_feasibility(
         if weak.holds is None and no_move_stays(problem.plan_polytope, worst.state):
             weak = every_move_leaves(worst.state)
         claims = replace(claims, law=refuted, strong=strong, weak=weak)
-    elif claims.law.holds is None:
-        tried = f"{np.sum(fmap.label == 1):,} samples" + search * f" and {len(starts)} ascents"
-        lost_now = np.sum(loops.lost_at == 1)
-        what = f"{lost_now:,} lost after one step, but no" if lost_now else "no"
-        reason = f"{what} counterexample among {tried}; no proof: {claims.law.reason}"
-        claims = replace(claims, law=Claim(None, reason))
-    body = claims.feasible_set
+    else:
+        claims = _open(claims, verdict, followed, ascents)
+    return _report(claims, worst, lost, x0s, followed, steps, budget)
+
+
+def _open(
+    claims: Claims, verdict: RegionVerdict | None, followed: Any = None, ascents: int = 0
+) -> Claims:
+    """Return the claims without a certified counterexample: that about the law stays open unless
+    some other proof or counterexample settles it, and says what was tried.
+
+    followed: labels and closed loops of the samples, None where the time was over before.
+    """
+    if claims.law.holds or claims.weak.holds is False:
+        return claims
+    reason = claims.law.reason
+    if verdict is not None and verdict.claim.holds is False:
+        why = "no time was left for that" if followed is None else "its proof failed"
+        reason = f"{verdict.claim.reason}, which is not certified: {why}"
+        return replace(claims, law=Claim(None, reason, verdict.claim.state))
+    if followed is None or not len(followed[0]):
+        return replace(claims, law=Claim(None, f"no time was left for samples; no proof: {reason}"))
+    label, loops = followed
+    tried = f"{np.sum(label == 1):,} samples" + (f" and {ascents} ascents" if ascents else "")
+    lost = np.sum(loops.lost_at == 1)
+    what = f"{lost:,} lost after one step, but no" if lost else "no"
+    return replace(
+        claims, law=Claim(None, f"{what} counterexample among {tried}; no proof: {reason}")
+    )
+
+
+def _unfollowed(mpc: MPC, x0s: np.ndarray) -> tuple[np.ndarray, LawLoops]:
+    """Return labels and closed loops of samples (B, p) that there was no time for: undecided."""
+    count = len(x0s)
+    nowhere = np.full_like(x0s, np.nan)
+    loops = LawLoops(
+        np.full((count, mpc.system.m), np.nan), nowhere, np.full(count, NOT_FEASIBLE),
+        np.zeros(count, int),
+    )  # fmt: skip
+    return np.zeros(count, np.int8), loops
+
+
+def _report(
+    claims: Claims, worst: Counterexample | None, lost: float, x0s: np.ndarray,
+    followed: tuple[np.ndarray, LawLoops], steps: int, budget: Budget,
+) -> RecursionReport:  # fmt: skip
+    """Return the report of all that was found. followed: labels and closed loops of x0s."""
+    body, (label, loops) = claims.feasible_set, followed
     return RecursionReport(
-        mpc, claims.strong, claims.law, claims.weak, worst,
+        claims.mpc, claims.strong, claims.law, claims.weak, worst,
         None if body is None else body.polytope, claims.volume, claims.lost, lost,
-        x0s, fmap.label, loops.inputs, loops.next_states, loops.lost_at, loops.undecided_at,
-        steps, time.monotonic() - begun,
+        x0s, label, loops.inputs, loops.next_states, loops.lost_at, loops.undecided_at,
+        steps, budget.spent,
     )  # fmt: skip
 
 
@@ -165,11 +254,18 @@ class SmallestHorizon:
 
 
 def smallest_horizon(
-    mpc: MPC, limit: int = 20, *, regions: int = 2000, seconds: float = 60.0
+    mpc: MPC,
+    limit: int = 20,
+    *,
+    regions: int = 2000,
+    seconds: float = 60.0,
+    progress: bool = False,
 ) -> SmallestHorizon:
     """Try horizons 1, 2, … up to `limit` with proofs alone (no samples, no search).
 
-    seconds: time limit, after which larger horizons are left out. The horizon of `mpc` itself has
+    seconds: time limit, after which larger horizons are left out (some linear programs are
+    finished); a horizon takes a second or so with two states, minutes with hundreds of facets or
+    thousands of regions. progress: print each horizon on stderr. The horizon of `mpc` itself has
     no influence. The answer is the least horizon with a proof; a smaller one that is neither proved
     nor refuted is in `reasons` with holds None, and one at which the problem is ill-posed (more
     free moves than steps) is left out of it. Raises ValueError for an ill-posed problem.
@@ -177,19 +273,20 @@ def smallest_horizon(
     mpc.validate()
     limit, regions = whole("limit", limit, 1), whole("regions", regions, 0)
     least, reasons = None, {}
-    deadline = time.monotonic() + seconds
+    budget = Budget.of(seconds, progress)
     for N in range(1, limit + 1):
-        if time.monotonic() > deadline:
+        if not budget.affords(0):
             break
+        budget.say(f"horizon {N}")
         changed = replace(mpc, horizon=N)
         try:
             problem = FeasibilityProblem.of(changed)
         except ValueError:  # such as more free moves than steps
             continue
-        claims = settle_claims(changed, problem, deadline)
+        claims = settle_claims(changed, problem, budget.deadline)
         law = claims.law
         if law.holds is None and least is None and regions and np.isfinite(claims.volume):
-            law = settle_by_regions(claims, regions)[0]
+            law = settle_by_regions(claims, regions, budget.deadline).claim
         reasons[N] = law
         least = N if law.holds and least is None else least
         if claims.strong.holds:

@@ -33,28 +33,30 @@ def ascend(law: Law, bound: CenteredPolytope, starts: np.ndarray, deadline: floa
     """
     inset = INSET * bound.size
     x = bound.nearest(starts, inset)
-    value, gradient = _value_and_gradient(law, bound, x)
+    value, gradient = _value_and_gradient(law, bound, x, deadline)
     for length in LENGTHS:
         if time.monotonic() > deadline:
             break
         trial = bound.nearest(x + length * bound.size * gradient, inset)
-        better, slope = _value_and_gradient(law, bound, trial, than=value)
+        better, slope = _value_and_gradient(law, bound, trial, deadline, than=value)
         grown = better > value
         x[grown], value[grown], gradient[grown] = trial[grown], better[grown], slope[grown]
     return _climb_regions(law, bound, x, value, deadline)
 
 
 def _value_and_gradient(
-    law: Law, bound: CenteredPolytope, x: np.ndarray, than: Any = -np.inf
+    law: Law, bound: CenteredPolytope, x: np.ndarray, deadline: float, than: Any = -np.inf
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return v (S,) at x (S, p), −inf where there is no plan, and its unit gradient where v >
-    than."""
+    than, and before the deadline."""
     plans = law.plans(x)
     after = law.following(x, plans.inputs[:, 0])
     beyond = after @ bound.normals.T - bound.offsets
     value = np.where(plans.status == Status.SOLVED, beyond.max(axis=1), -np.inf)
     gradient = np.zeros_like(x)
     for i in np.flatnonzero((value > than) & np.isfinite(value)):
+        if time.monotonic() > deadline:
+            break
         piece = law.piece(x[i], plans.inputs[i])
         if piece is not None:
             slope = piece.E.T @ bound.normals[np.argmax(beyond[i])]
@@ -79,6 +81,8 @@ def _climb_regions(
         plans = law.plans(around)
         found = []
         for i in np.flatnonzero(plans.status == Status.SOLVED):
+            if time.monotonic() > deadline:
+                break
             state, piece = around[i], law.piece(around[i], plans.inputs[i])
             if piece is None:
                 continue

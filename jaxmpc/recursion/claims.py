@@ -1,5 +1,6 @@
 """The three claims of recursive feasibility, proved or refuted by theorems and linear programs."""
 
+import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from jaxmpc.control.set_bounds import set_bounds
 from jaxmpc.control.sets import Polytope
 from jaxmpc.control.system import host_matrices
 from jaxmpc.control.terminal import verify_terminal
-from jaxmpc.explicit.regions import critical_regions
+from jaxmpc.explicit.regions import CriticalRegions, critical_regions
 from jaxmpc.feasible.centered_polytope import CenteredPolytope
 from jaxmpc.feasible.plan_polytope import DIMENSIONS, TOLERANCE, PlanPolytope, projected
 from jaxmpc.feasible.polytope import backward, is_standard_form
@@ -20,6 +21,7 @@ from jaxmpc.recursion.report import Claim, in_words
 # Distance from X_N, relative to its size, from which a state counts as outside: well above the
 # residuals of plans. Next states are moved towards the centre by as much before they are labelled.
 CLEAR = 1e-7
+LATE = "the time was over before its linear programs were solved"
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,9 @@ class Claims:
 def settle_claims(mpc: MPC, problem: FeasibilityProblem, deadline: float = np.inf) -> Claims:
     """Prove or refute the claims about `mpc` by Theorem 1 and linear programs.
 
-    problem: the feasibility problem of `mpc`. deadline: of `time.monotonic`, in seconds.
+    problem: the feasibility problem of `mpc`. deadline: of `time.monotonic`; a claim that is not
+    settled by then is open. Theorem 1 and the extent of the polytope of plans, some dozens of
+    linear programs, are finished.
     """
     plans = problem.plan_polytope
     none = np.zeros((0, plans.p))
@@ -66,7 +70,7 @@ def settle_claims(mpc: MPC, problem: FeasibilityProblem, deadline: float = np.in
     else:
         strong, leaving = _by_theorem(mpc), none
     if strong.holds is None and found is not None:
-        strong, leaving = _every_move(mpc, plans, found)
+        strong, leaving = _every_move(mpc, plans, found, deadline)
     elif strong.holds is None:
         strong = Claim(None, f"{strong.reason}; {why}")
     if strong.holds:
@@ -74,7 +78,7 @@ def settle_claims(mpc: MPC, problem: FeasibilityProblem, deadline: float = np.in
         return Claims(mpc, problem, found, why, strong, follows, follows, volume, lost, none)
     weak, lost, stuck = Claim(None, why), np.nan, none
     if found is not None and before is not None and after is not None:
-        weak, stuck = _longer(before, found, after)
+        weak, stuck = _longer(before, found, after, deadline)
     elif found is not None:
         weak, lost, stuck = _some_move(plans, found, deadline)
     law = Claim(None, why or "the critical regions were not looked at")
@@ -84,10 +88,14 @@ def settle_claims(mpc: MPC, problem: FeasibilityProblem, deadline: float = np.in
     return Claims(mpc, problem, found, why, strong, law, weak, volume, lost, seeds)
 
 
-def _every_move(mpc: MPC, plans: PlanPolytope, body: CenteredPolytope) -> tuple[Claim, np.ndarray]:
+def _every_move(
+    mpc: MPC, plans: PlanPolytope, body: CenteredPolytope, deadline: float
+) -> tuple[Claim, np.ndarray]:
     """Settle the strong claim by one LP for each facet of X_N; return it and the states led
     outside."""
-    tops = [plans.largest_next(normal) for normal in body.normals]
+    tops = [plans.largest_next(normal) for normal in body.normals if time.monotonic() < deadline]
+    if len(tops) < len(body.normals):
+        return Claim(None, LATE), np.zeros((0, plans.p))
     violation = np.array([top[1] for top in tops]) - body.offsets
     beyond = np.array([top[0] for top in tops]) - body.offsets
     i, p = int(np.argmax(beyond)), plans.p
@@ -149,12 +157,14 @@ def _some_move(
 
 
 def _longer(
-    before: CenteredPolytope, body: CenteredPolytope, after: CenteredPolytope
+    before: CenteredPolytope, body: CenteredPolytope, after: CenteredPolytope, deadline: float
 ) -> tuple[Claim, np.ndarray]:
     """Settle the weak claim by half-spaces alone: X_N ⊆ X_{N+1}, and X_N ⊆ X_{N−1}, so that a first
     move into X_N is that of a feasible plan. Return it and the states that are not in X_{N+1}.
     """
-    tops = [body.support(normal) for normal in after.normals]
+    tops = [body.support(normal) for normal in after.normals if time.monotonic() < deadline]
+    if len(tops) < len(after.normals):
+        return Claim(None, LATE), np.zeros((0, len(body.center)))
     violation = np.array([top for top, _ in tops]) - after.offsets
     i = int(np.argmax(violation))
     outside = [x for (_, x), e in zip(tops, violation, strict=True) if e > CLEAR * body.size]
@@ -218,11 +228,22 @@ def _by_theorem(mpc: MPC) -> Claim:
     return Claim(None, f"Theorem 1 does not apply: {missing.name}")
 
 
-def settle_by_regions(claims: Claims, limit: int) -> tuple[Claim, float, np.ndarray]:
-    """Settle the law claim by its critical regions; return it, the volume it loses, and states (K,
-    n) it loses most.
+@dataclass(frozen=True)
+class RegionVerdict:
+    """What critical regions say of the law: the claim, the volume that it loses (NaN unless they
+    are complete), states (K, n) from which it leads farthest outside X_N, and the regions."""
 
-    On a region x⁺ is affine, so its violation of a facet is largest at a vertex.
+    claim: Claim
+    lost: float
+    worst: np.ndarray
+    regions: CriticalRegions | None
+
+
+def settle_by_regions(claims: Claims, limit: int, deadline: float = np.inf) -> RegionVerdict:
+    """Settle the law claim by at most `limit` critical regions, found before the deadline.
+
+    On a region x⁺ is affine and its distance from X_N convex, hence largest at a vertex: where the
+    regions are complete, the worst vertex is the worst state of X_N.
     """
     body, mpc = claims.feasible_set, claims.mpc
     assert body is not None
@@ -230,9 +251,9 @@ def settle_by_regions(claims: Claims, limit: int) -> tuple[Claim, float, np.ndar
     try:
         if mpc.input_in_state:
             fail("mpc", "its law depends on the previous input", "They are not enumerated then")
-        found = critical_regions(mpc, limit=limit)
+        found = critical_regions(mpc, limit=limit, seconds=deadline - time.monotonic())
     except ValueError as error:
-        return Claim(None, f"no critical regions ({error})"), np.nan, none
+        return RegionVerdict(Claim(None, f"no critical regions ({error})"), np.nan, none, None)
     A, B, c = host_matrices(mpc.system)
     violation, parts, lost = [-np.inf], [none], 0.0
     for region in found.regions:
@@ -240,28 +261,27 @@ def settle_by_regions(claims: Claims, limit: int) -> tuple[Claim, float, np.ndar
         beyond = body.signed_distance(region.vertices @ E.T + e)
         violation.extend(beyond)
         parts.append(region.vertices)
-        if beyond.max() > CLEAR * body.size:
+        if found.complete and beyond.max() > CLEAR * body.size:
             H, h = np.asarray(region.polytope.H), np.asarray(region.polytope.h)
             stays = Polytope(
                 np.vstack([H, body.normals @ E]), np.append(h, body.offsets - body.normals @ e)
             )
             lost += region.volume - _volume(stays)
     values, states = np.array(violation[1:]), np.concatenate(parts)
-    top = values.max(initial=-np.inf)
+    top, lost = values.max(initial=-np.inf), lost if found.complete else np.nan
     if top > CLEAR * body.size:
-        worst = np.argsort(-values)[:6]
-        claim = Claim(False, f"a critical region leads {top:.6g} beyond a facet of X_N")
-        return claim, lost if found.complete else np.nan, states[worst]
+        worst = states[np.argsort(-values)[:6]]
+        claim = Claim(False, f"a critical region leads {top:.6g} beyond a facet of X_N", worst[0])
+        return RegionVerdict(claim, lost, worst, found)
     if not found.complete:
-        return Claim(None, f"critical regions are incomplete: {found.reason}"), np.nan, none
-    if top > TOLERANCE * body.size:
-        return (
-            Claim(None, f"a region is within {CLEAR:g} of the size of X_N: {top:.1e}"),
-            lost,
-            none,
-        )
-    count = f"{len(found)} critical regions fill X_N"
-    return Claim(True, f"{count}, and the images of their vertices are in it"), 0.0, none
+        claim = Claim(None, f"critical regions are incomplete: {found.reason}")
+    elif top > TOLERANCE * body.size:
+        claim = Claim(None, f"a region is within {CLEAR:g} of the size of X_N: {top:.1e}")
+    else:
+        count = f"{len(found)} critical regions fill X_N"
+        claim = Claim(True, f"{count}, and the images of their vertices are in it")
+        lost = 0.0
+    return RegionVerdict(claim, lost, none, found)
 
 
 def _volume(body: Polytope) -> float:

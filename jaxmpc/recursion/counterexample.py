@@ -6,17 +6,15 @@ import numpy as np
 
 from jaxmpc.explicit.law import Law
 from jaxmpc.feasible.centered_polytope import CenteredPolytope
-from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.rays import Rays, ray_directions
+from jaxmpc.feasible.proofs import first_of_block
+from jaxmpc.feasible.rays import BACKOFFS, Rays, ray_directions
 from jaxmpc.qp.status import Status
 from jaxmpc.recursion.claims import CLEAR, Claims
-from jaxmpc.recursion.loops import LawLoops, map_states
+from jaxmpc.recursion.loops import LawLoops
 from jaxmpc.recursion.report import Counterexample
 
 STARTS = 96
-# How far a counterexample is moved towards the centre, tried in turn, until its plan is proved.
-BACKOFFS = 10.0 ** np.arange(-8, -3)
 
 
 def outer_bound(claims: Claims) -> tuple[CenteredPolytope | None, np.ndarray]:
@@ -72,45 +70,69 @@ def certified(
     """Return the candidate (K, p) whose next state is farthest outside, with both ends proved; or
     None.
 
-    Each candidate is moved towards the centre by the least amount that lets its plan be proved.
+    Each candidate is moved towards the centre by the least amount that lets a plan be proved.
     """
     if bound is None or not len(candidates):
         return None
-    moved = bound.center + (1 - BACKOFFS)[:, None, None] * (candidates - bound.center)
-    states = moved.reshape(-1, candidates.shape[1])
+    rays = Rays.of(problem, bound.center)
+    states, feasible, proved = _proved_plans(rays, candidates)
     plans = law.plans(states)
     inputs = plans.inputs.copy()
     inputs[:, 0] = law.limited(inputs[:, 0])
     after = law.following(states, inputs[:, 0])
-    fmap = map_states(law, problem, np.concatenate([states, after]))
-    here, there = np.split(fmap.label, 2)
-    good = (here == 1) & (there == -1) & (plans.status == Status.SOLVED)
+    good = proved & (plans.status == Status.SOLVED)
     outside = np.where(good, bound.signed_distance(after), -np.inf)
-    if not np.any(outside > CLEAR * bound.size):
-        return None
-    best = int(np.argmax(outside))
-    normal, offset = _deepest(problem, bound, fmap, after[best])
-    distance = float((normal @ after[best] - offset) / np.linalg.norm(normal))
-    return Counterexample(
-        states[best], inputs[best], after[best], normal, offset, distance,
-        fmap.labels.plans[best], float(plans.primal_residual[best]),
-        float(plans.dual_residual[best]), found[best % len(candidates)],
-    )  # fmt: skip
+    for best in np.argsort(-outside)[: len(candidates)]:
+        if not outside[best] > CLEAR * bound.size:
+            break
+        normal, offset = _deepest(rays, bound, after[best])
+        distance = float((normal @ after[best] - offset) / np.linalg.norm(normal))
+        if distance > CLEAR * bound.size:
+            return Counterexample(
+                states[best], inputs[best], after[best], normal, offset, distance,
+                feasible[best], float(plans.primal_residual[best]),
+                float(plans.dual_residual[best]), found[best // len(BACKOFFS)],
+            )  # fmt: skip
+    return None
 
 
-def _deepest(
-    problem: FeasibilityProblem, bound: CenteredPolytope, fmap: FeasibleSetMap, x: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """Return, of the half-spaces proved by labels and by rays that end on the side of x, the one
-    that x violates most."""
-    normals, offsets = fmap.cuts()
+def _proved_plans(rays: Rays, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return states (K·S, p) that lead from each candidate (K, p) towards the centre by S small
+    steps, inputs (K·S, N, m), and whether they are proved to keep all rows from there.
+
+    State and plan lie between those of the centre and those of where the ray through the candidate
+    leaves X_N, or the candidate's own where it never does.
+    """
+    states, plans, multipliers = [], [], []
+    for direction in candidates - rays.center:
+        t, w, y = rays.problem.programs.ray(rays.center, direction)
+        if not np.isfinite(t):
+            try:
+                t, w = 1.0, rays.problem.programs.centre(rays.center + direction)[1]
+            except ValueError:  # no margin there
+                t, w = 0.0, rays.w
+        reach = (min(t, 1.0) * (1 - BACKOFFS))[:, None]
+        states.append(rays.center + reach * direction)
+        plans.append(rays.w + reach / max(t, 1e-300) * (w - rays.w))
+        multipliers.append(y)
+    theta, w = np.array(states), np.array(plans)
+    proved = rays.proved(theta, w, np.array(multipliers))[0].ravel()
+    theta, rows, exact = np.concatenate(states), rays.problem.rows, rays.exact
+    inputs = np.einsum("kmz,bz->bkm", rows.Omega, np.concatenate(plans) @ rows.back.T)
+    inputs += np.einsum("kmp,bp->bkm", rows.Psi, theta) + rows.psi
+    # As the proof takes them.
+    inputs = np.clip(inputs, exact.u_lower, exact.u_upper)[:, first_of_block(exact.moves)]
+    return theta, inputs, proved
+
+
+def _deepest(rays: Rays, bound: CenteredPolytope, x: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return, of the half-spaces proved by rays that end on the side of x, the one that x violates
+    most."""
     facet = int(np.argmax(bound.normals @ x - bound.offsets))
     depth = bound.normals[facet] @ x - bound.offsets[facet]
     towards = np.array([x, bound.nearest(x[None])[0], x - depth * bound.normals[facet]])
-    rays = Rays.of(problem, bound.center).cast(towards - bound.center)
-    valid = np.isfinite(rays.offsets)
-    normals = np.concatenate([normals, rays.normals[valid]])
-    offsets = np.concatenate([offsets, rays.offsets[valid]])
-    depth = (normals @ x - offsets) / np.linalg.norm(normals, axis=1)
-    best = int(np.nanargmax(depth))
-    return normals[best], float(offsets[best])
+    cast = rays.cast(towards - rays.center)
+    with np.errstate(invalid="ignore"):
+        depths = (cast.normals @ x - cast.offsets) / np.linalg.norm(cast.normals, axis=1)
+    best = int(np.argmax(np.nan_to_num(depths, nan=-np.inf)))
+    return cast.normals[best], float(cast.offsets[best])

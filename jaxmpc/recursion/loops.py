@@ -3,11 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
+from tqdm.std import tqdm
 
 from jaxmpc.explicit.law import Law
 from jaxmpc.feasible.map import FeasibleSetMap, map_points
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.qp.status import Status
+from jaxmpc.recursion.budget import Budget
 from jaxmpc.recursion.claims import CLEAR
 from jaxmpc.recursion.report import NOT_FEASIBLE, UNDECIDED
 
@@ -30,9 +32,13 @@ def map_states(law: Law, problem: FeasibilityProblem, states: np.ndarray) -> Fea
 
 
 def closed_loops(
-    law: Law, problem: FeasibilityProblem, x0s: np.ndarray, label: np.ndarray, steps: int
-) -> LawLoops:
-    """Run the closed loop from every feasible sample until it is lost, undecided or over."""
+    law: Law, problem: FeasibilityProblem, x0s: np.ndarray, label: np.ndarray, steps: int,
+    budget: Budget,
+) -> LawLoops:  # fmt: skip
+    """Run the closed loop from every feasible sample until it is lost, undecided or over.
+
+    The samples that are left when the time is over are undecided.
+    """
     count, p = x0s.shape
     lost_at = np.where(label == 1, 0, NOT_FEASIBLE)
     undecided_at = np.zeros(count, int)
@@ -41,9 +47,12 @@ def closed_loops(
     center = x0s[label == 1].mean(axis=0) if np.any(label == 1) else np.zeros(p)
     # The previous input travels along where the plan depends on it.
     states = np.pad(x0s, ((0, 0), (0, law.mpc.dimension - p)))
-    for k in range(1, steps + 1):
+    for k in tqdm(range(1, steps + 1), unit=" steps", leave=False, disable=not budget.bar):
         alive = np.flatnonzero(lost_at == 0)
         if not len(alive):
+            break
+        if not budget.affords(0):
+            lost_at[alive], undecided_at[alive] = UNDECIDED, k
             break
         plans = law.plans(states[alive])
         u = law.limited(plans.inputs[:, 0])

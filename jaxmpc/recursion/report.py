@@ -66,7 +66,8 @@ class RecursionReport:
     move leaves X_N; lost_by_law: of the part from which the optimal one does, from critical
     regions. NaN where not computed.
 
-    states (B, p): the samples. label (B,): 1 proved feasible, −1 proved infeasible, 0 undecided.
+    states (B, p): the samples, none where the law is proved and none were given, or without time.
+    label (B,): 1 proved feasible, −1 proved infeasible, 0 undecided.
     inputs (B, m), next_states (B, p): the optimal first move and where it leads (NaN where
     label ≠ 1). lost_at (B,): first step k ≥ 1 of the closed loop at which the problem is proved
     infeasible; 0: feasible at all `steps`; −1: not proved feasible at the start; −2: undecided,
@@ -129,11 +130,14 @@ class RecursionReport:
             if np.isfinite(value):
                 fraction = "" if name == "volume" else f"  {value / self.volume:.4%}"
                 rows.append((name, f"{value:.9g}{fraction}"))
+        if not len(self.states):
+            why = "its law is proved" if self.law.holds else "no time was left for them"
+            return lines([*rows, ("samples", f"none: {why}")])
         counts = self.counts()
         for name, count in counts.items():
             fraction = "" if name == "feasible" else f"  {count / max(counts['feasible'], 1):8.3%}"
             rows.append((name, f"{count:>10,}{fraction}"))
-        return "\n".join(f"  {name:<20} {value}" for name, value in rows)
+        return lines(rows)
 
     def to_xarray(self) -> Any:
         """Return the samples as an xarray.Dataset along the dimension `sample`, names attached."""
@@ -152,6 +156,11 @@ class RecursionReport:
             "move": list(self.mpc.system.input_labels),
         }
         return xarray.Dataset(data, coords=names, attrs={"steps": self.steps})
+
+
+def lines(rows: list[tuple[str, str]]) -> str:
+    """Return names and values as text, one pair a line."""
+    return "\n".join(f"  {name:<20} {value}" for name, value in rows)
 
 
 def in_words(x: np.ndarray) -> str:

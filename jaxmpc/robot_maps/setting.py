@@ -1,6 +1,7 @@
 """Make a robot map: the linear labels and the robot's closed loops, chunk by chunk."""
 
 import math
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +20,8 @@ from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.recursion.analysis import recursive_feasibility
+from jaxmpc.recursion.analysis import examine
+from jaxmpc.recursion.budget import Budget
 from jaxmpc.robot_maps.loops import RobotLoops
 from jaxmpc.robot_maps.robot_map import RobotMap
 from jaxmpc.robot_maps.set_point import deviations, with_initial_limits
@@ -207,9 +209,10 @@ class RobotSetting:
         report = None
         if self.claim == "recursion":
             # Plans at T samples: that at the first, and T − 1 after it.
-            report = recursive_feasibility(
+            budget = Budget.of(np.inf)  # of the loops, which are what the map shows
+            report = examine(
                 self.deviations(), self.states(self.points) - self.reference,
-                steps=max(self.steps - 1, 1), search=False, regions=0, seconds=search_seconds,
+                max(self.steps - 1, 1), False, 0, budget, time.monotonic() + search_seconds,
             )  # fmt: skip
         linear = linear if refine is None else linear.refine(refine)
         return RobotMap(

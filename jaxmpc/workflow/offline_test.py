@@ -1,6 +1,7 @@
 """The test of an MPC problem before it runs: proofs, simulations, and failed hypotheses."""
 
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from jaxmpc.checks import fail, require_kind, whole
 from jaxmpc.control.sets import Box
 from jaxmpc.control.terminal import TerminalReport, verify_terminal
 from jaxmpc.explicit.exact_penalty import ExactPenalty, exact_penalty
-from jaxmpc.feasible.map import FeasibleSetMap, grid, map_feasible_set
+from jaxmpc.feasible.map import FeasibleSetMap, grid, map_points
 from jaxmpc.feasible.polytope import is_standard_form
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import boundary
@@ -17,7 +18,9 @@ from jaxmpc.mpc.inequalities import condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import row_table
 from jaxmpc.mpc.soften import harden
-from jaxmpc.recursion import RecursionReport, recursive_feasibility
+from jaxmpc.recursion import RecursionReport
+from jaxmpc.recursion.analysis import examine
+from jaxmpc.recursion.budget import LABELS, LOOPS, PROOFS, Budget
 from jaxmpc.workflow.nominal_loops import NominalLoops, nominal_loops
 
 
@@ -27,13 +30,14 @@ class OfflineReport:
 
     feasible_set: map of initial states with proofs, of the problem with its soft rows hard; volume:
     lower and upper bound of its volume. recursion, penalty, terminal: the reports of
-    `recursive_feasibility`, `exact_penalty` and `verify_terminal`; None, with the reason in
-    `notes`, where they do not apply. loops: closed loops that were simulated, not proved.
+    `recursive_feasibility`, `exact_penalty` and `verify_terminal`. loops: closed loops that were
+    simulated, not proved. None, with the reason in `notes`, where they do not apply or the time was
+    over.
     variables, rows, condition: sizes of the condensed QP and condition number of its Hessian.
     """
 
     mpc: MPC
-    feasible_set: FeasibleSetMap
+    feasible_set: FeasibleSetMap | None
     volume: tuple[float, float]
     recursion: RecursionReport | None
     penalty: ExactPenalty | None
@@ -50,7 +54,7 @@ class OfflineReport:
             return [title, *("  " + line.strip("\n") for line in text.splitlines()), ""]
 
         mpc, system = self.mpc, self.mpc.system
-        found = self.feasible_set.counts()
+        found = {} if self.feasible_set is None else self.feasible_set.counts()
         known = ", ".join(f"{count:,} {name}" for name, count in found.items() if count)
         low, high = self.volume
         size = f"volume from {low:.9g} to {high:.9g}, " if np.isfinite(high) and high > 0 else ""
@@ -61,7 +65,8 @@ class OfflineReport:
             f"{self.condition:.3g}\n" + limits_text(mpc)
         )
         lines = section("Problem", problem, "")
-        lines += section("Feasible set (limits hard)", f"{size}samples: {known}", "")
+        text = None if self.feasible_set is None else f"{size}samples: {known}"
+        lines += section("Feasible set (limits hard)", text, "feasible_set")
         lines += section("Recursive feasibility (limits hard)", self.recursion, "recursion")
         penalty = None if self.penalty is None else self.penalty.sentence
         lines += section("Exact penalty", penalty, "penalty")
@@ -72,38 +77,39 @@ class OfflineReport:
 
 def offline_report(
     mpc: MPC, x0s: Any = None, *, K: Any = None, steps: int = 50, loops: int = 128,
-    seconds: float = 60.0,
+    seconds: float = 120.0, progress: bool = False,
 ) -> OfflineReport:  # fmt: skip
     """Test an MPC problem before its controller runs, and return one report.
 
-    Covers the feasible set and its volume, recursive feasibility, the exact penalty, every
-    hypothesis of the terminal theorems, and `loops` nominal closed loops of `steps` samples from
-    feasible states. Soft rows count as hard but for the closed loops.
+    Covers every hypothesis of the terminal theorems, recursive feasibility, the exact penalty, the
+    feasible set and its volume, and `loops` nominal closed loops of `steps` samples from feasible
+    states, in this order. Soft rows count as hard but for the closed loops.
 
     Arguments:
         x0s: states (B, n), or (B, n + m) with the previous input where input rates are limited, to
             map, and in more than three dimensions to follow in the recursion test. None: a grid
-            over the feasible set, in more than three dimensions random points of its bounding box.
+            over the feasible set, in more than three dimensions random points of its bounding box;
+            those of `recursive_feasibility` for its test.
         K: terminal law to verify, (m, n); None: that of the LQR.
-        seconds: about how long the search for counterexamples may take.
+        seconds: time limit of the whole call. Linear programs take seconds, thousands of facets or
+            critical regions minutes; compiling takes some 15 s for the map and 20 s for the closed
+            loops, whatever the problem, which are kept for that where seconds allow. What
+            compiles cannot be interrupted, and is left out, with a note, where it does not fit.
+            Recursive feasibility may take two thirds of the rest, the exact penalty what is left
+            of it; what they do not settle is open.
+        progress: print each stage on stderr.
 
     Raises ValueError for an ill-posed problem, and where x0s is None and the feasible set is empty,
     flat or unbounded. NumPy; not traceable. Proofs are in float64.
     """
     require_kind("mpc", mpc, MPC)
+    budget = Budget.of(seconds, progress)
     mpc.validate()
     for name, value, least in (("steps", steps, 2), ("loops", loops, 1)):
         whole(name, value, least)
-    if not seconds > 0:
-        fail("seconds", f"{seconds!r}", "Give a positive number")
     hard = harden(mpc)
+    problem = FeasibilityProblem.of(hard)
     notes: dict[str, str] = {}
-    d = FeasibilityProblem.of(hard).dimension
-    if x0s is None:
-        x0s = samples(hard, d)
-    fmap = map_feasible_set(hard, x0s)
-    fmap = fmap.refine() if d <= 3 else fmap
-    inside = fmap.points[fmap.label == 1]
 
     def attempt(name: str, action: Any) -> Any:
         try:
@@ -112,23 +118,54 @@ def offline_report(
             notes[name] = str(error)
             return None
 
+    budget.say("terminal ingredients")
+    terminal = attempt("terminal", lambda: theorems(hard, K))
+    # Where map and closed loops can fit, time is kept for their compiles.
+    compiles = PROOFS + LABELS + LOOPS
+    kept = compiles if budget.affords(1.5 * compiles) else 0.0
+    proofs = replace(budget, deadline=budget.deadline - kept)
+    part = replace(proofs, deadline=proofs.share(2 / 3))
+    follow = x0s if problem.dimension > 3 else None
     recursion = attempt(
         "recursion",
-        lambda: recursive_feasibility(hard, x0s if d > 3 else None, steps=steps, seconds=seconds),
+        lambda: examine(hard, follow, steps, True, 2000, part, part.share(0.75)),
     )
-    penalty = attempt("penalty", lambda: exact_penalty(mpc))
-    terminal = attempt("terminal", lambda: theorems(hard, K))
-    notes["loops"] = "none of the samples is feasible"
+    budget.say("exact penalty, by critical regions")
+    left = proofs.deadline - time.monotonic()
+    penalty = attempt("penalty", lambda: exact_penalty(mpc, seconds=left))
+    fmap = mapped(problem, x0s, budget)
+    inside = np.zeros((0, problem.dimension)) if fmap is None else fmap.points[fmap.label == 1]
     closed = None
-    if len(inside):
+    late = "no time was left: {} takes some {:.0f} s of compiling"
+    notes["feasible_set"] = late.format("the map", PROOFS + LABELS)
+    if not len(inside):
+        notes["loops"] = "none of the samples is feasible" if fmap else "no samples are mapped"
+    elif not budget.affords(LOOPS):
+        notes["loops"] = late.format("the simulation", LOOPS)
+    else:
+        budget.say(f"closed loops; compile for some {LOOPS:.0f} s")
         pick = np.unique(np.linspace(0, len(inside) - 1, min(loops, len(inside))).astype(int))
         closed = nominal_loops(mpc, inside[pick], steps)
     condensed = condensed_in_float64(mpc)
+    volume = (0.0, np.inf)
+    if fmap is not None and problem.dimension <= 3:
+        volume = fmap.volume_bounds()
     return OfflineReport(
-        mpc, fmap, fmap.volume_bounds() if d <= 3 else (0.0, np.inf), recursion, penalty, terminal,
+        mpc, fmap, volume, recursion, penalty, terminal,
         closed, condensed.P.shape[0], condensed.C.shape[0],
         float(np.linalg.cond(np.asarray(condensed.P))), notes,
     )  # fmt: skip
+
+
+def mapped(problem: FeasibilityProblem, x0s: Any, budget: Budget) -> FeasibleSetMap | None:
+    """Return the map of the states x0s, or of `samples`; None where there is no time for it."""
+    if not budget.affords(PROOFS + LABELS):
+        return None
+    budget.say(f"map of the feasible set; compiles for some {PROOFS + LABELS:.0f} s")
+    d = problem.dimension
+    points = samples(problem.mpc, d) if x0s is None else x0s
+    fmap = map_points(problem, points, progress=budget.bar, deadline=budget.deadline)
+    return fmap.refine(deadline=budget.deadline) if d <= 3 else fmap
 
 
 def theorems(mpc: MPC, K: Any = None) -> TerminalReport:

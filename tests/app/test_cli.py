@@ -263,7 +263,9 @@ def test_recursion_writes_files_and_table(tmp_path, capsys, examined):
     assert run(f"{line} --smallest 8") == 0
     mpc, x0s, settings = examined[0]
     assert (mpc.horizon, x0s.shape) == (4, (30, 2))
-    assert settings == {"steps": 3, "search": False, "regions": 0, "seconds": 9.0}
+    # Half of the time is for --smallest.
+    expected = {"steps": 3, "search": False, "regions": 0, "seconds": 4.5, "progress": True}
+    assert settings == expected
     np.testing.assert_allclose(x0s[0], [-1.59, -2.12])  # limits and 3 %
     out = capsys.readouterr().out
     for word in ("strong", "refuted: an example", "open: no facets", "0.25", "lost by law",
@@ -386,7 +388,37 @@ def test_recursion_of_the_joint_for_real(tmp_path, capsys):
     assert [summary["claims"][name]["holds"] for name in ("strong", "law", "weak")] == [False] * 3
     assert abs(summary["counterexample"]["distance"] - 0.0039968) < 1e-6
     assert abs(summary["lost_by_law"] - 0.0016) < 1e-9
-    assert "found by search" in capsys.readouterr().out
+    assert "found by regions" in capsys.readouterr().out
+
+
+def test_recursion_of_a_proved_law_draws_no_samples(tmp_path, capsys):
+    assert run("recursion --horizon 6 --terminal box --smallest 1") == 0
+    text = capsys.readouterr()
+    assert "none: its law is proved" in text.out and "none up to 1" in text.out
+    for stage in ("0.0 s  theorem and linear programs", "s  horizon 1"):
+        assert stage in text.err
+    assert (tmp_path / "jaxmpc-recursion" / "recursion.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("options", "sign", "answer"),
+    [
+        (["-X", "importtime"], "numpy", "\nstopped before it began\n"),
+        ([], "theorem and linear programs", "\nstopped; nothing is kept\n"),
+    ],
+)
+def test_ctrl_c_is_one_line_from_the_first_import_on(options, sign, answer):
+    command = [sys.executable, *options, "-m", "jaxmpc", "info"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        for line in process.stderr:
+            if sign in line:
+                process.send_signal(signal.SIGINT)
+                break
+        out, err = process.communicate()
+    assert (process.returncode, out) == (130, answer)
+    assert "Traceback" not in err
 
 
 def test_version_and_module_entry():

@@ -184,6 +184,12 @@ class TestRegions:
         assert len(found) == 4 and not found.complete and "limit of 4" in found.reason
         assert found.volume < 1043 / 400
 
+    def test_time_limit(self):
+        found = critical_regions(problems.joint(20), seconds=1e-9)
+        assert not found.complete and "stopped by the time limit" in found.reason
+        bound = exact_penalty(problems.joint(20), seconds=1e-9)
+        assert not bound.exact and bound.rho_bar >= 0
+
     def test_missing_part_is_seen(self, monkeypatch):
         """Completeness rests on volumes: a search that loses its way does not say so."""
         monkeypatch.setattr("jaxmpc.explicit.search.RegionSearch.cross", lambda *_: None)

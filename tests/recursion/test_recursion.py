@@ -10,14 +10,17 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.explicit.law import Law
+from jaxmpc.explicit.law import Law, RegionLaw
+from jaxmpc.explicit.regions import critical_regions
 from jaxmpc.feasible.centered_polytope import CenteredPolytope
 from jaxmpc.feasible.plan_polytope import projected
 from jaxmpc.feasible.polytope import backward
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import Soft
 from jaxmpc.recursion import analysis, ascent, recursive_feasibility, smallest_horizon
+from jaxmpc.recursion.budget import Budget
 from jaxmpc.recursion.claims import _by_theorem, settle_claims
+from jaxmpc.recursion.loops import closed_loops
 
 
 def settled(mpc):
@@ -66,7 +69,8 @@ def least_distance(mpc, x):
         Phi.append(A @ Phi[-1])
         Gamma.append(step)
         phi.append(A @ phi[-1] + drift)
-    weights = [mpc.Q] * N + [mpc.terminal_cost]
+    end = np.zeros((n, n)) if mpc.terminal_cost is None else mpc.terminal_cost
+    weights = [mpc.Q] * N + [end]
     P = sum(G.T @ W @ G for G, W in zip(Gamma, weights, strict=True))
     P = P + np.kron(np.eye(N), mpc.R)
     free = [M @ x + d for M, d in zip(Phi, phi, strict=True)]
@@ -259,6 +263,19 @@ class TestLaw:
                 compared += 1
         assert compared > 60
 
+    def test_plans_from_regions(self):
+        """They are those of another solver, optimal to rounding; outside of X_N there is none."""
+        mpc = problems.drifting()
+        law = RegionLaw(critical_regions(mpc), np.zeros(2), 64)
+        corners = np.concatenate([region.vertices for region in law.regions.regions])
+        states = np.random.default_rng(0).dirichlet(np.ones(len(corners)), 40) @ corners
+        plans = law.plans(np.vstack([states, [[9.0, 9.0]]]))
+        expected = [least_distance(mpc, x) for x in states]
+        np.testing.assert_allclose(plans.inputs[:-1], expected, atol=1e-8)
+        assert np.all(plans.status[:-1] == jm.Status.SOLVED)
+        assert max(plans.primal_residual[:-1].max(), plans.dual_residual[:-1].max()) < 1e-9
+        assert plans.status[-1] != jm.Status.SOLVED and np.isnan(plans.inputs[-1]).all()
+
     def test_nearest_point_of_a_polytope(self):
         square = CenteredPolytope(
             np.zeros(2), np.vstack([np.eye(2), -np.eye(2)]), np.ones(4), np.zeros((0, 2))
@@ -277,9 +294,9 @@ class TestReport:
         report = recursive_feasibility(mpc, states, steps=4)
         assert holds(report) == (False, False, False)
         c = report.counterexample
-        assert c.found == "search"
-        assert c.distance == pytest.approx(0.0474341649, abs=1e-6)
-        np.testing.assert_allclose(np.abs(c.state), [0.95, 1.0], atol=1e-6)
+        assert c.found == "regions"
+        assert c.distance == pytest.approx(0.0474341649, abs=1e-9)
+        np.testing.assert_allclose(np.abs(c.state), [0.95, 1.0], atol=1e-9)
         assert c.state[0] * c.state[1] < 0
         check_counterexample(mpc, c)
         assert report.lost_by_law == pytest.approx(0.02, abs=1e-9)
@@ -294,19 +311,88 @@ class TestReport:
         data = report.to_xarray()
         assert data["lost_at"].shape == (5,) and data.attrs["steps"] == 4
 
-    @pytest.mark.slow
     def test_lecture_with_more_input_is_proved_by_regions(self):
-        report = recursive_feasibility(problems.lecture(0.3, 3), steps=3)
+        """And nothing is sampled."""
+        report = recursive_feasibility(problems.lecture(0.3, 3))
         assert holds(report) == (False, True, True)
         assert "13 critical regions fill X_N" in report.law.reason
         assert report.counterexample is None and report.lost_by_law == 0.0
+        assert report.states.shape == (0, 2) and report.counts()["feasible"] == 0
+        assert "none: its law is proved" in str(report)
+
+    @pytest.mark.slow
+    def test_samples_that_are_asked_for_are_kept_where_the_law_is_proved(self):
+        cells = jm.grid([-63 / 64] * 2, [63 / 64] * 2, (64, 64))
+        report = recursive_feasibility(problems.lecture(0.3, 3), cells, steps=3)
         counts = report.counts()
         assert counts["kept"] == counts["feasible"] > 2000
         # The middles of the grid's cells measure the area.
-        cell = np.prod(np.ptp(report.states, axis=0) * 64 / 63) / 4096
-        assert counts["feasible"] * cell == pytest.approx(2.8108, rel=0.02)
+        assert counts["feasible"] * (2 / 64) ** 2 == pytest.approx(2.8108, rel=0.02)
         without = recursive_feasibility(problems.lecture(0.3, 3), steps=1, regions=0, search=False)
         assert without.law.holds is None and "no counterexample" in without.law.reason
+
+    @pytest.mark.parametrize("search", [True, False])
+    @pytest.mark.parametrize(
+        ("problem", "distance", "lost"),
+        [
+            (lambda: problems.lecture(0.25, 1), 0.546401, 0.785245),
+            (lambda: problems.double_integrator(3), 0.737865, 4.083333),
+        ],
+    )
+    def test_worst_is_a_vertex_of_a_region(self, monkeypatch, problem, distance, lost, search):
+        """A search can end elsewhere (in 12 s at 0.527 on the first). Nor are samples needed."""
+        monkeypatch.setattr(analysis, "LABELS", np.inf)  # no time for samples
+        mpc = problem()
+        report = recursive_feasibility(mpc, search=search)
+        assert holds(report) == (False, False, False) and len(report.states) == 0
+        assert "no time was left" in str(report)
+        c = report.counterexample
+        check_counterexample(mpc, c)
+        assert c.found == "regions" and c.distance == pytest.approx(distance, abs=1e-6)
+        assert report.lost_by_law == pytest.approx(lost, abs=1e-6)
+        if not search:
+            return
+        # No vertex of X_N and no state between leads farther, by another solver.
+        body = exact.feasible_polygon(mpc)
+        H = np.array([[float(v) for v in a] for a, _ in body.facets])
+        size = np.linalg.norm(H, axis=1)
+        h = np.array([float(b) for _, b in body.facets]) / size
+        corners = np.asarray(report.feasible_set.vertices())
+        weights = np.random.default_rng(0).dirichlet(np.full(len(corners), 0.3), 150)
+        beyond = [
+            (H @ (mpc.system.A @ x + mpc.system.B @ least_distance(mpc, x)[0]) / size - h).max()
+            for x in [*corners * (1 - 1e-9), *weights @ corners * (1 - 1e-9)]
+        ]
+        assert c.distance - 0.1 * c.distance < max(beyond) < c.distance + 1e-6
+
+    def test_some_regions_already_refute(self, monkeypatch):
+        """What is lost is not known then, nor how far outside the worst state leads."""
+        monkeypatch.setattr(analysis, "LABELS", np.inf)  # no time for samples, nor for a search
+        report = recursive_feasibility(problems.lecture(0.25, 3), regions=5)
+        assert report.law.holds is False and np.isnan(report.lost_by_law)
+        assert 0.01 < report.counterexample.distance <= 0.0474341650
+        check_counterexample(report.mpc, report.counterexample)
+
+    def test_time_bounds_the_whole_call(self, capsys):
+        """What compiles is left out, the rest stops; what is open and what is undecided is said."""
+        mpc, states = problems.joint(20), np.array([[0.0, 0.0], [1.0, 1.0]])
+        report = recursive_feasibility(mpc, states, seconds=0.01, progress=True)
+        assert holds(report) == (None, None, None) and report.counterexample is None
+        np.testing.assert_array_equal(report.label, [0, 0])
+        np.testing.assert_array_equal(report.lost_at, [-1, -1])
+        assert "time" in report.law.reason and report.seconds < 20
+        assert "theorem and linear programs" in capsys.readouterr().err
+        found = smallest_horizon(mpc, 50, seconds=0.01, progress=True)
+        assert len(found.reasons) <= 1
+        assert "horizon 1\n" in capsys.readouterr().err
+
+    def test_closed_loops_stop_in_time(self):
+        mpc, over = problems.lecture(), Budget(0.0, -np.inf, False)
+        law = RegionLaw(critical_regions(mpc), np.zeros(2), 64)
+        states, label = np.zeros((3, 2)), np.array([1, 1, -1])
+        loops = closed_loops(law, FeasibilityProblem.of(mpc), states, label, 5, over)
+        np.testing.assert_array_equal(loops.lost_at, [-2, -2, -1])
+        np.testing.assert_array_equal(loops.undecided_at, [1, 1, 0])
 
     @pytest.mark.parametrize(
         ("arguments", "message"),
@@ -390,9 +476,8 @@ class TestSlow:
         report = recursive_feasibility(mpc)
         assert holds(report) == (False, False, False)
         check_counterexample(mpc, report.counterexample)
-        # The regions know the worst vertex: the search has found it.
-        from jaxmpc.explicit.regions import critical_regions
-
+        # The regions know the worst vertex, which search alone finds too.
+        report = recursive_feasibility(mpc, regions=0)
         worst = -np.inf
         for region in critical_regions(mpc).regions:
             E = mpc.system.A + mpc.system.B @ region.K

@@ -6,6 +6,8 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.app.cli import main
+from jaxmpc.feasible.map import map_points
+from jaxmpc.feasible.problem import FeasibilityProblem
 
 
 def test_design_builds_what_its_parts_say():
@@ -79,6 +81,27 @@ def test_info_explains_what_it_cannot_read(capsys, tmp_path):
     assert "cannot be read" in capsys.readouterr().err
     assert main(["info", "--loops", "0"]) == 2
     assert "--loops" in capsys.readouterr().err
+
+
+def test_report_keeps_to_its_time(capsys):
+    """Stages are announced, and what is left out is said."""
+    report = jm.offline_report(problems.joint(20), seconds=0.01, progress=True)
+    assert report.feasible_set is None and report.loops is None
+    assert report.terminal is not None and report.recursion.M is None
+    text = str(report)
+    assert text.count("no time was left") >= 2 and "no samples are mapped" in text
+    lines = capsys.readouterr().err.splitlines()
+    assert all(" s  " in line for line in lines)
+    for stage in ("terminal ingredients", "theorem and linear programs", "exact penalty"):
+        assert any(stage in line for line in lines)
+
+
+def test_a_map_that_runs_out_of_time_says_so():
+    fmap = map_points(
+        FeasibilityProblem.of(problems.lecture()), np.zeros((5, 2)), chunk=2, deadline=-np.inf
+    )
+    assert fmap.counts()["feasible"] == 2 and fmap.counts()["not run"] == 3
+    assert len(fmap.labels.plans) == 5
 
 
 @pytest.mark.slow

@@ -46,13 +46,26 @@ class Recursion:
         law     the optimal first move does (what one wants of the controller)
         weak    some first move does
       Each is proved, refuted by a counterexample, or open, with the reason; strong implies law,
-      law implies weak. Closed loops from a grid of states show which states are lost, and when.
+      law implies weak. Where the law is not proved, closed loops from a grid of states show which
+      states are lost, and when.
       Without a file the problem is one robot joint: x = (q, dq), torque u, 20 steps of 0.01 s.
       An option given here wins over the file.
 
     How to start
       $ jaxmpc recursion --horizon 4
       $ jaxmpc recursion --config pendulum.toml --terminal invariant --output checks/a
+
+    How long it takes
+      Each stage is announced on stderr as it begins, with the seconds spent so far.
+        theorem, linear programs   seconds for up to three states; minutes for hundreds of facets
+        critical regions           seconds for hundreds (two states); minutes for thousands (four).
+                                   The worst counterexample and the states lost are then exact
+        its proof                  some 4 s, most of it compiling
+        closed loops               some 12 s of compiling, then seconds
+        search                     only without all regions: 20 s of compiling, then a minute
+      --seconds bounds all of these together. Compiling, one step of all closed loops and a
+      linear program cannot be interrupted: what compiles is left out where it does not fit.
+      Start-up and the picture take some 5 s more.
 
     How to read the output, all in the folder of --output
       recursion.png   Blue: kept for all steps. Dark red to light orange: lost at step 1, 2, ...
@@ -91,9 +104,13 @@ class Recursion:
     """Length of the closed loops."""
     grid: Annotated[
         tuple[int, ...] | None,
-        option("K [K ...]", "128 128; above 3 states: random states; robots 32 32"),
+        option(
+            "K [K ...]",
+            "none where the law is proved, else 64 64 over X_N; above 3 states: random states; "
+            "robots 32 32",
+        ),
     ] = None
-    """Points along each state, ends included."""
+    """Points along each state, ends included, even where the law is proved."""
     lower: End = None
     """Lower end of the grid along each state, in its units."""
     upper: End = None
@@ -105,11 +122,11 @@ class Recursion:
     fixed: Annotated[tuple[float, ...] | None, option("X [X ...]", "home")] = None
     """With --robot: values of the other coordinates, in their order."""
     regions: Annotated[int | None, option("K", "from the file, else 2000")] = None
-    """Critical regions of the law to enumerate at most for a proof; 0: none."""
+    """Critical regions of the law to enumerate at most; 0: none."""
     seconds: Annotated[float | None, option("S", "from the file, else 60")] = None
-    """Time for search and proofs; what is not settled by then is open."""
+    """Time for all of it; what is not settled by then is open. With --smallest half is for that."""
     search: Annotated[bool, option(None, "on")] = True
-    """Look for a counterexample by gradient ascent, beside the samples."""
+    """Without all regions, look for a counterexample by gradient ascent, beside the samples."""
     smallest: Annotated[int | None, option("N", "off")] = None
     """Look also for the smallest horizon, up to N, that is proved recursively feasible."""
     overwrite: Switch = False
@@ -139,20 +156,23 @@ class Recursion:
         config = configs.load(self.config, given_options(self, *keys), "recursion")
         if self.smallest is not None:
             configs.require_horizon(config, "--smallest", self.smallest)
-        mpc, states, settings = config.build_mpc(), recursion_states(config), config.recursion
+        mpc, settings = config.build_mpc(), config.recursion
+        asked = any(v is not None for v in (settings.grid, settings.lower, settings.upper))
+        states = recursion_states(config) if asked else None
         there = [self.output / name for name in FILES if (self.output / name).exists()]
         if there and not self.overwrite:
             fail(str(there[0]), "exists", "Add --overwrite to replace it")
         open_folder(self.output, *FILES)
         print(f"{config.name}: horizon {mpc.horizon} -> {self.output}")
+        seconds = settings.seconds / (1 if self.smallest is None else 2)
         report = recursive_feasibility(
             mpc, states, steps=settings.steps, search=self.search, regions=settings.regions,
-            seconds=settings.seconds,
+            seconds=seconds, progress=True,
         )  # fmt: skip
         rows, least = [], None
         if self.smallest is not None:
             least = smallest_horizon(
-                mpc, self.smallest, regions=settings.regions, seconds=settings.seconds
+                mpc, self.smallest, regions=settings.regions, seconds=seconds, progress=True
             )
             rows.append(("smallest horizon", _horizon_text(least, self.smallest)))
         files = self.save(config, report, least)

@@ -44,6 +44,7 @@ def plot_recursion(
     The line round them is the feasible set X_N. The arrow leads from the counterexample to its
     next state; the dashed line is the half-space that holds on all of X_N and excludes it.
     enlarge: show the neighbourhood of the counterexample, with X_N filled and without samples.
+    X_N is filled also where there are no samples.
     Without `ax` a new figure is made. Raises ValueError for other than two states, and for
     enlarge without a counterexample.
     """
@@ -55,7 +56,7 @@ def plot_recursion(
     ax = new_axes() if ax is None else ax
     handles: list[Any] = []
     corners = ring(lambda: report.feasible_set)
-    if enlarge:
+    if enlarge or not len(report.states):
         ax.fill(*corners.T, color=FEASIBLE, zorder=0)
     else:
         handles += _draw_losses(ax, report)
@@ -73,6 +74,9 @@ def plot_recursion(
     ax.set_xlabel(names[0])
     ax.set_ylabel(names[1])
     title = f"Closed loops of {report.steps} steps, horizon N = {report.mpc.horizon}"
+    if not len(report.states):
+        verdict = {True: "kept for ever", False: "not all kept", None: "not followed"}
+        title = f"Feasible states, {verdict[report.law.holds]}, horizon N = {report.mpc.horizon}"
     if enlarge and worst is not None:
         title = f"Worst counterexample: next state {worst.distance:.4g} outside"
     ax.set_title(title, loc="left", fontsize=11)
