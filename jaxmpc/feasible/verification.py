@@ -6,6 +6,7 @@ be accurate: `exact_check.beyond` evaluates what they imply exactly. One half-sp
 states that it excludes.
 """
 
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,7 @@ from tqdm.std import tqdm
 from jaxmpc.checks import fail
 from jaxmpc.feasible.exact_check import Constraints, beyond, roll_out, roll_out_exactly
 from jaxmpc.qp.status import Status
+from jaxmpc.runs import read_arrays
 
 # Tangents to a terminal ellipsoid that a linear program gets at most.
 TANGENTS = 30
@@ -58,14 +60,16 @@ def verify(
     """Prove every label of a stored map again, from its plans, half-spaces and problem.
 
     path: a store that `jaxmpc sweep` or `jaxmpc recursion --robot` made, or the folder that holds
-    one. exact: all plans in exact arithmetic, else a random sample of them and those with margins
-    near rounding, the others in float64; half-spaces are exact always. Nothing is written. Raises
-    ValueError where there is no store.
+    one; or the folder of a report of `jaxmpc recursion`, whose counterexample, and next states that
+    count as lost after one step, are proved again too. exact: all plans in exact arithmetic, else a
+    random sample of them and those with margins near rounding, the others in float64; half-spaces
+    are exact always. Nothing is written. Raises ValueError where there is no store.
     """
     from jaxmpc.feasible.store import read  # zarr takes longer to import than most reads
 
-    path = Path(path)
-    found = read(find_store(path))
+    path = find_store(Path(path))
+    report = path.suffix == ".npz"
+    found = read_report(path) if report else read(path)
     label, status = found.arrays.get("label"), found.arrays.get("status")
     result = Verification({}, problems=list(found.problems))
     if found.done < found.blocks:
@@ -96,6 +100,8 @@ def verify(
         _verify_feasible(p, points, found.arrays, feasible, exact, sample, seed, result, bar)
         _verify_infeasible(p, points, found.arrays, infeasible, result, bar)
     _compare_half_spaces(points, found.arrays, feasible, infeasible, result)
+    if report:
+        _verify_next_states(p, points, found.arrays, found.attributes, result)
     return result
 
 
@@ -128,14 +134,66 @@ def _compare_half_spaces(
 
 
 def find_store(path: Path) -> Path:
-    """Return the store at `path` or in that folder."""
-    if (path / "zarr.json").exists():
+    """Return the store at `path` or in that folder, or the arrays of a recursion report there."""
+    if (path / "zarr.json").exists() or path.suffix == ".npz":
         return path
-    inside = [path / name for name in ("sweep.zarr", "robot_map.zarr") if (path / name).exists()]
+    names = ("sweep.zarr", "robot_map.zarr", "recursion.npz")
+    inside = [path / name for name in names if (path / name).exists()]
     if len(inside) != 1:
-        what = "holds two stores" if inside else "holds no store of labels"
-        fail(str(path), what, "Give the folder of a sweep, or a .zarr folder")
+        what = f"holds {' and '.join(v.name for v in inside)}" if inside else "holds no labels"
+        fail(str(path), what, "Give the folder of a sweep or a recursion report, or what it holds")
     return inside[0]
+
+
+def read_report(path: Path) -> Any:
+    """Return the samples of a recursion report as `store.read` returns those of a map."""
+    from jaxmpc.feasible.store import Stored
+
+    found, summary = read_arrays(path), None
+    if found is None or not isinstance(found[0], dict) or "state" not in found[1]:
+        return Stored({}, {}, {}, 0, 0, [f"{path.name}: cannot be read"])
+    record, arrays = found
+    try:
+        summary = json.loads((path.parent / "summary.json").read_text())
+    except (OSError, ValueError):
+        return Stored({}, {}, {}, 0, 0, ["summary.json: cannot be read"])
+    arrays["points"] = arrays["state"]
+    return Stored({**record, "summary": summary}, arrays, {"sample": arrays["state"]}, 1, 1)
+
+
+def _verify_next_states(
+    p: Constraints, states: np.ndarray, arrays: Mapping[str, np.ndarray],
+    attributes: Mapping[str, Any], result: Verification,
+) -> None:  # fmt: skip
+    """Verify that next states follow, and that those are infeasible that count as lost after one
+    step; and the same of the counterexample, and that it has a plan."""
+    inputs, after, lost = arrays["input"], arrays["next_state"], arrays["lost_at"] == 1
+    worst = attributes["summary"].get("counterexample")
+    if worst is not None:
+        at = {k: np.array(worst[k], float) for k in ("state", "feasible_inputs", "next_state")}
+        margin = roll_out_exactly(p, at["state"][None], at["feasible_inputs"][None])[0]
+        if margin < 0:
+            result.problems.append(f"counterexample: its plan breaks a limit by {-margin:.3g}")
+        states = np.concatenate([states, at["state"][None]])
+        inputs = np.concatenate([inputs, np.array(worst["inputs"], float)[:1]])
+        after = np.concatenate([after, at["next_state"][None]])
+        lost = np.append(lost, True)
+    where = np.flatnonzero(lost)
+    expected = states[where] @ p.A.T + inputs[where] @ p.B.T + p.c
+    size = np.abs(states[where]) @ np.abs(p.A).T + np.abs(inputs[where]) @ np.abs(p.B).T
+    wrong = np.any(np.abs(after[where] - expected) > 1e-12 * (1 + size), axis=1)
+    normals = arrays.get("facet_normals", np.zeros((0, len(p.A))))
+    if len(normals):
+        normals = normals[np.argmax(after[where] @ normals.T - arrays["facet_offsets"], axis=1)]
+    else:
+        normals = np.full((len(where), len(p.A)), np.nan)
+    excess = exclude(p, after[where], normals)
+    for i, follows, beyond_by in zip(where, ~wrong, excess, strict=True):
+        name = f"next state of state {i}" if i < len(arrays["state"]) else "counterexample"
+        if not follows:
+            result.problems.append(f"{name}: it is not A x + B u + c")
+        if not beyond_by > 0:
+            result.problems.append(f"{name}: no half-space is found that excludes it")
 
 
 def _verify_feasible(
@@ -179,27 +237,36 @@ def _verify_infeasible(
 ) -> None:  # fmt: skip
     """Verify that no trajectory starts at states `where`."""
     where = np.array([i for i in where if int(i) not in result.failures], int)
-    program, left = Programs(p), np.ones(len(where), bool)
-    box = program.boxes() if len(where) else ()
+    excess = exclude(p, points[where], arrays["cut_normal"][where], bar)
+    result.failures |= {
+        int(i): "no half-space is found that excludes it" for i in where[~(excess > 0)]
+    }
+    proved = excess[excess > 0]
+    result.verified += len(proved)
+    result.exactly += len(proved)
+    result.excess = min(result.excess, float(proved.min(initial=np.inf)))
+
+
+def exclude(p: Constraints, points: np.ndarray, normals: np.ndarray, bar: Any = None) -> np.ndarray:
+    """Return by how much points (b, d) lie beyond half-spaces that no feasible state leaves, found
+    anew in the directions normals (b, d) or else by least violation; see `exact_check.beyond`."""
+    best, left = np.full(len(points), -np.inf), np.ones(len(points), bool)
+    if not len(points):
+        return best
+    programs = Programs(p)
+    box = programs.boxes()
     while left.any():
         first = int(np.flatnonzero(left)[0])
-        normal = arrays["cut_normal"][where[first]]
-        excess = np.full(len(where), -np.inf)
-        for y in program.multipliers(points[where[first]], normal):
-            excess[left] = beyond(p, y, points[where[left]], box)
-            if excess[first] > 0:
+        for y in programs.multipliers(points[first], normals[first]):
+            best[left] = np.maximum(best[left], beyond(p, y, points[left], box))
+            if best[first] > 0:
                 break
-        out = left & (excess > 0)
-        if not out[first]:
-            result.failures[int(where[first])] = "no half-space is found that excludes it"
-            left[first] = False
-            bar.update(1)
-        if out.any():
-            result.verified += int(out.sum())
-            result.exactly += int(out.sum())
-            result.excess = min(result.excess, excess[out].min())
-        left &= ~out
-        bar.update(int(out.sum()))
+        done = left & (best > 0)
+        done[first] = True  # nothing more to try
+        left &= ~done
+        if bar is not None:
+            bar.update(int(done.sum()))
+    return best
 
 
 class Programs:

@@ -23,6 +23,7 @@ import numpy as np
 from jaxmpc.checks import fail, whole
 from jaxmpc.compiled import default_chunk
 from jaxmpc.explicit.law import Law, RegionLaw
+from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import grid
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
@@ -114,12 +115,12 @@ def examine(
             claims = replace(claims, law=verdict.claim)
     none = np.zeros((0, problem.dimension))
     if x0s is None and claims.law.holds:
-        return _report(claims, None, lost, none, _unfollowed(mpc, none), steps, budget)
+        return _report(claims, None, lost, none, _unfollowed(problem, none), steps, budget)
     if not budget.affords(PROOFS):
         budget.say("the time is over before a counterexample is proved")
         x0s = none if x0s is None else x0s
         return _report(
-            _open(claims, verdict), None, lost, x0s, _unfollowed(mpc, x0s), steps, budget
+            _open(claims, verdict), None, lost, x0s, _unfollowed(problem, x0s), steps, budget
         )
     bound, starts = outer_bound(claims)
     asked = x0s is not None
@@ -138,7 +139,7 @@ def examine(
         by = ["regions"] * len(verdict.worst)
         worst = certified(RegionLaw(found, easy, chunk), problem, bound, verdict.worst, by)
     compiles, ascents = LABELS + (0.0 if complete else PLANS), 0
-    followed = _unfollowed(mpc, x0s if asked else none)
+    followed = _unfollowed(problem, x0s if asked else none)
     if not budget.affords(compiles):
         budget.say(f"no samples: they compile for some {compiles:.0f} s, which are not left")
         x0s = x0s if asked else none
@@ -147,9 +148,10 @@ def examine(
             f"closed loops of {steps} steps from {len(x0s):,} samples; compile for some "
             f"{compiles:.0f} s"
         )
-        label = map_states(law, problem, x0s).label
+        labels = map_states(law, problem, x0s).labels
+        label = labels.label
         loops = closed_loops(law, problem, x0s, label, steps, budget)
-        followed = label, loops
+        followed = labels, loops
         if bound is not None and not complete and not claims.law.holds:
             candidates = worst_samples(bound, x0s, loops)
             by = ["sample"] * len(candidates)
@@ -191,9 +193,9 @@ def _open(
         why = "no time was left for that" if followed is None else "its proof failed"
         reason = f"{verdict.claim.reason}, which is not certified: {why}"
         return replace(claims, law=Claim(None, reason, verdict.claim.state))
-    if followed is None or not len(followed[0]):
+    if followed is None or not len(followed[0].label):
         return replace(claims, law=Claim(None, f"no time was left for samples; no proof: {reason}"))
-    label, loops = followed
+    label, loops = followed[0].label, followed[1]
     tried = f"{np.sum(label == 1):,} samples" + (f" and {ascents} ascents" if ascents else "")
     lost = np.sum(loops.lost_at == 1)
     what = f"{lost:,} lost after one step, but no" if lost else "no"
@@ -202,28 +204,28 @@ def _open(
     )
 
 
-def _unfollowed(mpc: MPC, x0s: np.ndarray) -> tuple[np.ndarray, LawLoops]:
+def _unfollowed(problem: FeasibilityProblem, x0s: np.ndarray) -> tuple[Labels, LawLoops]:
     """Return labels and closed loops of samples (B, p) that there was no time for: undecided."""
     count = len(x0s)
     nowhere = np.full_like(x0s, np.nan)
     loops = LawLoops(
-        np.full((count, mpc.system.m), np.nan), nowhere, np.full(count, NOT_FEASIBLE),
+        np.full((count, problem.mpc.system.m), np.nan), nowhere, np.full(count, NOT_FEASIBLE),
         np.zeros(count, int),
     )  # fmt: skip
-    return np.zeros(count, np.int8), loops
+    return Labels.empty(count, problem), loops
 
 
 def _report(
     claims: Claims, worst: Counterexample | None, lost: float, x0s: np.ndarray,
-    followed: tuple[np.ndarray, LawLoops], steps: int, budget: Budget,
+    followed: tuple[Labels, LawLoops], steps: int, budget: Budget,
 ) -> RecursionReport:  # fmt: skip
     """Return the report of all that was found. followed: labels and closed loops of x0s."""
-    body, (label, loops) = claims.feasible_set, followed
+    body, (labels, loops) = claims.feasible_set, followed
     return RecursionReport(
         claims.mpc, claims.strong, claims.law, claims.weak, worst,
         None if body is None else body.polytope, claims.volume, claims.lost, lost,
-        x0s, label, loops.inputs, loops.next_states, loops.lost_at, loops.undecided_at,
-        steps, budget.spent,
+        x0s, labels.label, loops.inputs, loops.next_states, loops.lost_at, loops.undecided_at,
+        steps, budget.spent, labels,
     )  # fmt: skip
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.control.sets import Polytope
+from jaxmpc.feasible.labels import Labels
 from jaxmpc.mpc.problem import MPC
 
 # `lost_at` of samples that are infeasible from the start, and of those that were not decided.
@@ -71,7 +72,7 @@ class RecursionReport:
     inputs (B, m), next_states (B, p): the optimal first move and where it leads (NaN where
     label ≠ 1). lost_at (B,): first step k ≥ 1 of the closed loop at which the problem is proved
     infeasible; 0: feasible at all `steps`; −1: not proved feasible at the start; −2: undecided,
-    from step undecided_at (B,) on (0 elsewhere).
+    from step undecided_at (B,) on (0 elsewhere). labels: the labels with their proofs.
     """
 
     mpc: MPC
@@ -91,6 +92,7 @@ class RecursionReport:
     undecided_at: np.ndarray
     steps: int
     seconds: float
+    labels: Labels | None = None
 
     @property
     def S(self) -> bool | None:

@@ -18,6 +18,7 @@ from jaxmpc.app import cli
 from jaxmpc.app.commands import linear_sweep, recursion
 from jaxmpc.control.sets import Box
 from jaxmpc.recursion import Claim, Counterexample, RecursionReport, SmallestHorizon
+from jaxmpc.runs import read_arrays, write_arrays
 
 
 @pytest.fixture(autouse=True)
@@ -493,3 +494,27 @@ def test_fifty_kills_at_random_moments(tmp_path):
         xr.open_zarr(tmp_path / name / "sweep.zarr").load() for name in ("whole", "killed")
     )
     xr.testing.assert_identical(whole, killed)
+
+
+@pytest.mark.slow
+def test_verify_a_recursion_report(tmp_path, capsys):
+    assert run("recursion --horizon 4 --grid 9 9 --lower -1.5 -2 --upper 1.5 2 --output rec") == 0
+    assert run("verify rec") == 0
+    out = capsys.readouterr().out
+    assert "rec/recursion.npz: verified" in out and "of 79," in out
+    summary = json.loads((tmp_path / "rec/summary.json").read_text())
+    for key, word in (("next_state", "not A x + B u + c"), ("feasible_inputs", "breaks a limit")):
+        wrong = json.loads(json.dumps(summary))
+        wrong["counterexample"][key] = (np.array(wrong["counterexample"][key]) * 0.5 + 1.2).tolist()
+        (tmp_path / "rec/summary.json").write_text(json.dumps(wrong))
+        assert run("verify rec") == 1
+        assert word in capsys.readouterr().out
+    (tmp_path / "rec/summary.json").write_text(json.dumps(summary))
+    record, arrays = read_arrays(tmp_path / "rec/recursion.npz")
+    arrays["label"][40] *= -1
+    write_arrays(tmp_path / "rec/recursion.npz", record, **arrays)
+    assert run("verify rec") == 1
+    assert "FAILS: state 40" in capsys.readouterr().out
+    (tmp_path / "rec/recursion.npz").write_bytes(b"garbled")
+    assert run("verify rec") == 1
+    assert "cannot be read" in capsys.readouterr().out

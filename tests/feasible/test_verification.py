@@ -243,5 +243,5 @@ class TestFindsWhatIsWrong:
 
 
 def test_what_holds_no_map(tmp_path):
-    with pytest.raises(ValueError, match="holds no store of labels"):
+    with pytest.raises(ValueError, match="holds no labels"):
         verify(tmp_path)

@@ -24,6 +24,8 @@ from jaxmpc.app.commands.options import (
 from jaxmpc.app.commands.robot_map import RobotMapCommand
 from jaxmpc.app.config.states import recursion_states
 from jaxmpc.checks import fail
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.store import LABELS, plain_problem
 from jaxmpc.recursion import (
     RecursionReport,
     SmallestHorizon,
@@ -73,6 +75,7 @@ class Recursion:
                       to the next state, with the half-space (line) that proves it infeasible;
                       the right panel enlarges it. Two states only.
       summary.json    The claims with reasons, the counterexample, areas, counts, configuration.
+                      jaxmpc verify DIR proves labels and counterexample again.
       recursion.npz   state, label (1 feasible, -1 infeasible, 0 undecided), input (the optimal
                       first move), next_state, lost_at (step at which the problem is proved
                       infeasible; 0 never, -1 infeasible at the start, -2 undecided), and
@@ -200,8 +203,13 @@ class Recursion:
         facets: dict[str, Any] = {}
         if body is not None:
             facets = {"facet_normals": np.asarray(body.H), "facet_offsets": np.asarray(body.h)}
+        labels = {} if report.labels is None else {
+            name: getattr(report.labels, stored) for name, stored in LABELS.items()
+        }  # fmt: skip
+        facets |= {name: value for name, value in labels.items() if name != "label"}
+        plain = {"problem": plain_problem(FeasibilityProblem.of(report.mpc))}
         write_arrays(
-            self.output / "recursion.npz", state=report.states, label=report.label,
+            self.output / "recursion.npz", plain, state=report.states, label=report.label,
             input=report.inputs, next_state=report.next_states, lost_at=report.lost_at,
             undecided_at=report.undecided_at, **facets,
         )  # fmt: skip

@@ -19,13 +19,15 @@ class Verify:
     """Prove every label of a stored map again, from what is stored alone.
 
     What it does
-      Reads the map that jaxmpc sweep left in DIR, or jaxmpc sweep --robot, or jaxmpc recursion
-      --robot, and compares the data with their checksums. Then proves each label:
+      Reads the map that jaxmpc sweep left in DIR, or the report of jaxmpc recursion, either with
+      --robot or without, and compares the data with their checksums. Then proves each label:
         feasible    the stored plan is rolled out from the state and keeps every limit
         infeasible  a half-space that no feasible state leaves, made anew, excludes the state
       by a roll-out and by weak duality of their own (jaxmpc/feasible/exact_check.py, to be read by
       a sceptic). Half-spaces are evaluated in exact arithmetic, plans in float64 with a bound on
-      its rounding, and exactly where that leaves a doubt and on a sample. Nothing is written.
+      its rounding, and exactly where that leaves a doubt and on a sample. Of a recursion report
+      the counterexample is proved too, and each state that counts as lost after one step.
+      Nothing is written.
 
     How to start
       $ jaxmpc sweep && jaxmpc verify jaxmpc-sweep
@@ -39,7 +41,7 @@ class Verify:
     """
 
     directory: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """Folder that holds sweep.zarr or robot_map.zarr, or one of these."""
+    """Folder that holds sweep.zarr, robot_map.zarr or recursion.npz, or one of these."""
     exact: Switch = False
     """Roll out all plans in exact arithmetic."""
     sample: Annotated[int, option("K", "1000")] = 1000
