@@ -1,4 +1,5 @@
-"""The cascade that labels points, chunk by chunk: ADMM on all, Newton on those undecided."""
+"""The cascade that labels points, chunk by chunk: ADMM on all, Newton on those undecided, and a
+linear program for each of the last, up to `MOST_PROGRAMS` in a call."""
 
 import itertools
 import time
@@ -17,6 +18,7 @@ from jaxmpc.feasible.candidates import (
     StagePenalties,
     Verdict,
     compiled_admm,
+    compiled_check,
     compiled_newton,
 )
 from jaxmpc.feasible.constraint_rows import ConstraintRows, weighted
@@ -26,6 +28,9 @@ from jaxmpc.qp.precision import matmul
 
 # Steps of the longer ADMM run, relative to the first, on points that Newton leaves undecided.
 LONGER = 20
+# Points that get a linear program in one call of `label_chunks`; the first in order. One takes some
+# milliseconds, at N = 60 some tens.
+MOST_PROGRAMS = 2000
 # Proofs of up to so many bytes in total stay on the device until they are used.
 ON_DEVICE = 2**31
 # Number of points from which their typical size is taken.
@@ -52,13 +57,14 @@ def label_chunks(
     sample = np.abs(sample[np.all(np.isfinite(sample), axis=1)])
     size = np.median(sample, axis=0) if len(sample) else np.zeros(d)
     exact = problem.exact(np.abs(points[usable]).max(axis=0, initial=0.0), size)
+    margins, budget = problem.row_margins(exact, size), MOST_PROGRAMS
     chunk = min(chunk, max(len(points), 1))
     batch = gather_size(chunk)
     short, long = (
         compiled_admm(iterations, np.dtype(dtype)),
         compiled_admm(LONGER * iterations, np.dtype(np.float64)),
     )
-    newton = compiled_newton(batch)
+    newton, check = compiled_newton(batch), compiled_check()
     with jax.enable_x64(True):
         exact, rows, quick = jax.device_put((exact, problem.rows, quick))
 
@@ -71,6 +77,7 @@ def label_chunks(
 
     def finished(x: np.ndarray, ok: np.ndarray, found: tuple[Verdict, Any]) -> Labels:
         """Return the labels of a chunk, by all stages."""
+        nonlocal budget
         labels, (verdict, w) = Labels.proved(found[0], ok), found
         if np.any((labels.label == 0) & ok):
             w = w if back is None else matmul(w.astype(np.float64), jnp.asarray(back.T))
@@ -83,6 +90,15 @@ def label_chunks(
             found = _run(long, exact, rows, again, np.float64(ALPHA))
             more = Labels.proved(_run(newton, exact, rows, again, all_, *found), all_)
             more = more.first(len(where))
+            labels = labels.changed(where, more.label, more.status, more.proofs)
+        left = np.flatnonzero((labels.label == 0) & ok)[:budget]
+        budget -= len(left)
+        for i in range(0, len(left), batch):
+            where = left[i : i + batch]
+            solved = [problem.programs.margin(theta, margins) for theta in x[where]]
+            candidates = [padded(np.array(v), batch) for v in zip(*solved, strict=True)]
+            verdict = _run(check, exact, rows, padded(x[where], batch), *candidates)
+            more = Labels.proved(verdict, np.ones(batch, bool)).first(len(where))
             labels = labels.changed(where, more.label, more.status, more.proofs)
         return labels
 

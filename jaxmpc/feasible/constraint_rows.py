@@ -31,7 +31,8 @@ class ConstraintRows:
     rows, and index says where the multiplier of each row of `ExactData` (step by step, then
     terminal rows, then those of the terminal ellipsoid) stands among the R (R where there is
     none). The last `balls` rows are those of the ellipsoid: |v − lower| ≤ radius. Psi, Omega, psi:
-    inputs from θ and the variables. still: the rows that nothing moves, but for those of a ball.
+    inputs from θ and the variables. still: the rows that nothing moves, but for those of a ball. size: of the
+    bounds (`typical_bound`).
     """
 
     U: Any
@@ -45,6 +46,7 @@ class ConstraintRows:
     Omega: Any
     psi: Any
     still: Any
+    size: Any
     radius: Any
     balls: tuple[int, ...] = field(metadata={"static": True})
 
@@ -92,12 +94,22 @@ def constraint_rows(mpc: MPC, view: View, c: Any, blocks: list[Block]) -> Constr
 
     place = np.full(len(lower), len(keep))
     place[keep] = np.arange(len(keep))
+    index = multiplier_index(mpc, blocks, c.layout, place[extra:], len(keep))
+    lower, upper = weight * lower[keep], weight * upper[keep]
     return ConstraintRows(
-        U, back, weight[:, None] * D[keep], weight * lower[keep], weight * upper[keep], weight,
-        multiplier_index(mpc, blocks, c.layout, place[extra:], len(keep)), Psi, Omega, psi,
-        np.flatnonzero(still[: len(keep) - sum(c.balls)]),
+        U, back, weight[:, None] * D[keep], lower, upper, weight,
+        index, Psi, Omega, psi,
+        np.flatnonzero(still[: len(keep) - sum(c.balls)]), typical_bound(lower, upper),
         weight[-1:] * c.radius if c.balls else None, c.balls,
     )  # fmt: skip
+
+
+def typical_bound(lower: np.ndarray, upper: np.ndarray) -> float:
+    """Return the size of bounds to which tolerances are relative: the lower quartile of those that
+    are finite and not zero, as some may be huge and stand for none; 1 without any."""
+    ends = np.abs(np.concatenate([lower, upper]))
+    ends = ends[np.isfinite(ends) & (ends > 0)]
+    return float(np.quantile(ends, 0.25)) if len(ends) else 1.0
 
 
 def weighted(rows: ConstraintRows, weight: np.ndarray) -> tuple[ConstraintRows, np.ndarray]:

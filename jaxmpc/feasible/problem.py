@@ -86,3 +86,18 @@ class FeasibilityProblem:
         extent, _ = self.programs.bounding_box
         extent = np.array([-region, region]) if extent is None else extent
         return exact_data.exact_data(self.mpc, self.view, self.blocks, extent, size)
+
+    def row_margins(self, exact: ExactData, size: np.ndarray) -> np.ndarray:
+        """Return what margins (R,) of the rows a proof needs relative to each other: as rounding
+        can move them at points of this size (d,), within a factor of 1e6."""
+        view, start = self.view, np.zeros(self.mpc.dimension)
+        start[list(view.axes)] = size
+        if view.projects:
+            free = exact_data.one_sided(view.lower, view.upper)[1]
+            start[list(view.others)] = np.where(np.isfinite(free), free, 0.0)
+        elif view.others:
+            start[list(view.others)] = np.abs(view.fixed)[list(view.others)]
+        rounding = exact_data.rounding_of_rows(exact, start)
+        found = np.zeros(len(self.rows.lower) + 1)
+        found[self.rows.index] = np.concatenate([np.ravel(part) for part in rounding])
+        return np.clip(found[:-1] * self.rows.weight, self.rows.size, 1e6 * self.rows.size)
