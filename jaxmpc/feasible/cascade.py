@@ -3,7 +3,7 @@ linear program for each of the last, up to `MOST_PROGRAMS` in a call."""
 
 import itertools
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -24,6 +24,7 @@ from jaxmpc.feasible.candidates import (
 from jaxmpc.feasible.constraint_rows import ConstraintRows, weighted
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.row_programs import RowPrograms
 from jaxmpc.qp.precision import matmul
 
 # Steps of the longer ADMM run, relative to the first, on points that Newton leaves undecided.
@@ -91,15 +92,17 @@ def label_chunks(
             more = Labels.proved(_run(newton, exact, rows, again, all_, *found), all_)
             more = more.first(len(where))
             labels = labels.changed(where, more.label, more.status, more.proofs)
-        left = np.flatnonzero((labels.label == 0) & ok)[:budget]
-        budget -= len(left)
-        for i in range(0, len(left), batch):
-            where = left[i : i + batch]
-            solved = [problem.programs.margin(theta, margins) for theta in x[where]]
-            candidates = [padded(np.array(v), batch) for v in zip(*solved, strict=True)]
-            verdict = _run(check, exact, rows, padded(x[where], batch), *candidates)
-            more = Labels.proved(verdict, np.ones(batch, bool)).first(len(where))
-            labels = labels.changed(where, more.label, more.status, more.proofs)
+        last = np.flatnonzero((labels.label == 0) & ok)[:budget]
+        budget -= len(last)
+        for some_rows, program in last_programs(problem, margins) if len(last) else ():
+            last = last[labels.label[last] == 0]
+            for i in range(0, len(last), batch):
+                where = last[i : i + batch]
+                solved = [program(theta) for theta in x[where]]
+                candidates = [padded(np.array(v), batch) for v in zip(*solved, strict=True)]
+                verdict = _run(check, exact, some_rows, padded(x[where], batch), *candidates)
+                more = Labels.proved(verdict, np.ones(batch, bool)).first(len(where))
+                labels = labels.changed(where, more.label, more.status, more.proofs)
         return labels
 
     slices = [slice(i, min(i + chunk, len(points))) for i in range(0, len(points), chunk)]
@@ -115,6 +118,33 @@ def label_chunks(
         run_seconds = time.perf_counter() - begun - compile_seconds
         yield here, replace(labels, compile_seconds=compile_seconds, run_seconds=run_seconds)
         begun, compiled = time.perf_counter(), Compiled.seconds
+
+
+def last_programs(
+    problem: FeasibilityProblem, margins: np.ndarray
+) -> Iterator[tuple[ConstraintRows, Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]]]:
+    """Yield linear programs for the last undecided points θ, as the rows and θ → (w, multipliers).
+
+    First the ray from the centre through θ: inside, θ lies between the centre and the ray's end,
+    and so do their plans; outside, the end's multipliers are few. Then the largest margin at θ, and
+    where the plant is unstable the ray again, for multipliers in the units of its growth.
+    """
+    try:
+        center, w_center = problem.programs.centre()
+    except ValueError:  # flat or empty: no rays
+        center = None
+
+    if center is not None:
+
+        def between(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            t, w, y = problem.programs.ray(center, theta - center)
+            return (w_center + (w - w_center) / t if 1 <= t < np.inf else w), y
+
+        yield problem.rows, between
+    yield problem.rows, lambda theta: problem.programs.margin(theta, margins)
+    if center is not None and problem.weighted_rows is not None:
+        programs = RowPrograms(problem.weighted_rows)
+        yield problem.weighted_rows, lambda theta: programs.ray(center, theta - center)[1:]
 
 
 def _run(program: Compiled, *args: Any) -> Any:

@@ -71,6 +71,21 @@ class FeasibilityProblem:
         return RowPrograms(self.rows)
 
     @cached_property
+    def weighted_rows(self) -> ConstraintRows | None:
+        """Return the rows without prestabilisation, in units that grow as the plant does; None
+        where it does not grow. Multipliers of late rows are tiny beside those of early ones, and
+        precise in these units alone."""
+        A = self.mpc.system.A
+        radius = np.abs(np.linalg.eigvals(np.asarray(A, float))).max()
+        if radius <= 1 + 1e-9:
+            return None
+        free = replace(self.mpc, prestabilise=False)
+        growth = min(radius, 1e200 ** (1 / self.mpc.horizon))
+        return constraint_rows.constraint_rows(
+            self.mpc, self.view, condensed_in_float64(free), self.blocks, growth
+        )
+
+    @cached_property
     def plan_polytope(self) -> PlanPolytope:
         """Return the polytope of all states and the decisions that keep all rows, for any
         view."""

@@ -37,6 +37,10 @@ class RowPrograms:
         self.rows, k = rows, sum(rows.balls)
         self.normals = np.concatenate([np.eye(k), -np.eye(k)])
         self.size = float(rows.size)
+        equal = (rows.lower == rows.upper) & (np.linalg.norm(rows.U, axis=1) > 0)
+        independent = np.linalg.matrix_rank(rows.U[equal], rtol=1e-6) == equal.sum()
+        # Equalities that the variables can keep, whatever θ is: they leave no margin.
+        self.kept = equal & independent
 
     def solve_lp(
         self, cost: np.ndarray, U: np.ndarray, lower: np.ndarray, upper: np.ndarray,
@@ -122,14 +126,13 @@ class RowPrograms:
         """Return w and the multipliers of the largest s with which all rows at the point θ (d,)
         keep s·size, size (R,) ≥ 0, from their bounds: s < 0 where θ is not feasible.
 
-        Equalities (lower = upper) keep no margin, unless nothing feasible is found.
+        Equalities keep no margin, unless nothing feasible is found.
         """
         rows, k = self.rows, self.rows.U.shape[1]
         shift = rows.D @ theta
         U, cost = np.hstack([rows.U, np.zeros((len(rows.U), 1))]), np.append(np.zeros(k), 1.0)
         bounds = [(None, None)] * k + [(None, float(self.size / size.max()))]
-        equal = rows.lower == rows.upper
-        for kept in [np.where(equal, 0.0, size), size][: 1 + np.any(equal)]:
+        for kept in [np.where(self.kept, 0.0, size), size][: 1 + np.any(self.kept)]:
             found = self.solve_lp(cost, U, rows.lower - shift, rows.upper - shift, bounds, kept)
             if found.x is not None:
                 return found.x[:k], found.y
@@ -153,13 +156,14 @@ class RowPrograms:
         return np.array([-ends[1] - margin, ends[0] + margin]), np.array(y)
 
     def centre(self, given: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return θ (the one given, or the best) and w with the largest common margin of all rows.
+        """Return θ (the one given, or the best) and w with the largest common margin of all rows, but
+        for equalities that the variables can keep.
 
         Raises ValueError where the set is empty or flat, or does not hold the given θ inside.
         """
         rows = self.rows
         k, d = rows.U.shape[1], rows.D.shape[1]
-        size = np.linalg.norm(np.hstack([rows.U, rows.D]), axis=1)
+        size = np.where(self.kept, 0.0, np.linalg.norm(np.hstack([rows.U, rows.D]), axis=1))
         pinned = [(None, None)] * d if given is None else [(v, v) for v in np.asarray(given)]
         ends = np.concatenate([rows.upper, rows.lower])
         largest = max(self.size, np.abs(ends[np.isfinite(ends)]).max(initial=0.0))
