@@ -3,20 +3,19 @@
     python experiments/hard_sets.py                    # 2,000 points of each system
     python experiments/hard_sets.py --points 240 --only "x_N = 0" "N = 60"
 
-Points lie on random rays from a point inside, at t (1 ± δ) where t is the end of the ray. Which side
-they are on is known from rational arithmetic that shares nothing with the library: polygons by
-exact elimination in the plane (`tests/exact.py`); in more dimensions a bracket of t, from below by
-a plan whose roll-out keeps all rows in rationals, from above by multipliers whose bound is evaluated
-in rationals (the plan and the multipliers come from HiGHS on the sparse problem); the quadratic
-program of a terminal ellipsoid by all its active sets. The table has a row a system: points, wrong
-labels, how many are undecided at each δ, and seconds (with compiling).
+Points lie on random rays from a point inside, at t (1 ± δ) where t is the end of the ray. On which
+side they are is known from rational arithmetic that shares nothing with the library: polygons by
+exact elimination in the plane (`tests/exact.py`); in more dimensions a bracket of t, from below
+by a plan whose roll-out keeps all rows in rationals, from above by multipliers whose bound is
+evaluated in rationals (the plan and the multipliers come from HiGHS on the sparse problem); the
+quadratic program of a terminal ellipsoid by all its active sets. The table has a row a system:
+points, wrong labels, how many are undecided at each δ, and seconds (with compiling).
 """
 
 import itertools
 import json
 import sys
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction as Q
@@ -131,8 +130,8 @@ def without_rates(mpc: jm.MPC) -> jm.MPC:
         return mpc
     A, B = np.asarray(mpc.system.A), np.asarray(mpc.system.B)
     n, m = B.shape
-    wide = lambda set_: set_ if set_ is None else jm.Box(
-        np.append(set_.lower, np.full(m, -np.inf)), np.append(set_.upper, np.full(m, np.inf)))  # fmt: skip
+    free = np.full(m, np.inf)
+    wide = lambda set_: set_ and jm.Box(np.append(set_.lower, -free), np.append(set_.upper, free))
     limit = np.broadcast_to(np.asarray(mpc.input_rate_limit, float), (m,))
     rates = jm.Outputs(np.hstack([np.zeros((m, n)), -np.eye(m)]), -limit, limit, np.eye(m),
                        steps=tuple(range(mpc.horizon)))  # fmt: skip
@@ -150,7 +149,10 @@ def bracketed(mpc: jm.MPC, center: np.ndarray) -> Case:
     A, B = np.asarray(plain.system.A), np.asarray(plain.system.B)
     (n, m), N = B.shape, plain.horizon
     unit = np.eye(1 + (N + 1) * n + N * m)
-    x, u = unit[1 : 1 + (N + 1) * n].reshape(N + 1, n, -1), unit[1 + (N + 1) * n :].reshape(N, m, -1)
+    x, u = (
+        unit[1 : 1 + (N + 1) * n].reshape(N + 1, n, -1),
+        unit[1 + (N + 1) * n :].reshape(N, m, -1),
+    )
     rows, bounds, owner = [], [], []
     every = [exact.stage_rows(plain, k) for k in range(N + 1)]
     for k, stage in enumerate(every):
@@ -190,7 +192,9 @@ def bracketed(mpc: jm.MPC, center: np.ndarray) -> Case:
                 if k < N:
                     slope = [a + value * h for a, h in zip(slope, hu, strict=True)]
             if k < N:  # whatever is left is absorbed by the input box
-                total += sum(max(-s * lo, -s * hi) for s, lo, hi in zip(slope, lows, highs, strict=True))
+                total += sum(
+                    max(-s * lo, -s * hi) for s, lo, hi in zip(slope, lows, highs, strict=True)
+                )
         return p, total
 
     zero = np.zeros(len(dynamics))
@@ -204,7 +208,10 @@ def bracketed(mpc: jm.MPC, center: np.ndarray) -> Case:
             result = solve(unit[0], np.vstack([dynamics, start]), np.append(zero, center))
             t, plan = result.x[0], result.x[-N * m :].reshape(N, m)
             s = BRACKET / 2
-            low, kept = t * (1 - s), np.clip((1 - s) * plan + s * inside, plain.inputs.lower, plain.inputs.upper)
+            low, kept = (
+                t * (1 - s),
+                np.clip((1 - s) * plan + s * inside, plain.inputs.lower, plain.inputs.upper),
+            )
             if not exact.keeps_all_rows(plain, center + low * d, kept):
                 found.append(np.inf)
                 continue
@@ -319,10 +326,10 @@ def non_minimum_phase() -> Case:
     mpc = problem([[1.1, 0.4], [0.0, 0.8]], [[0.0], [0.5]], 12, box(3, 3), box(1.0),
                   input_rate_limit=np.array([0.25]))  # fmt: skip
     plain = replace(mpc, outputs=outputs)
-    case = bracketed(replace(without_rates(mpc), outputs=(
-        *without_rates(mpc).outputs,
-        jm.Outputs(np.array([[-1.0, 1.5, 0.0]]), [-0.5], [1.0]))), np.array([0.1, 0.2, 0.0]))  # fmt: skip
-    return replace(case, mpc=plain)
+    wide = jm.Outputs(np.array([[-1.0, 1.5, 0.0]]), [-0.5], [1.0])
+    same = without_rates(mpc)
+    same = replace(same, outputs=(*same.outputs, wide))
+    return replace(bracketed(same, np.array([0.1, 0.2, 0.0])), mpc=plain)
 
 
 def terminal_ellipsoid() -> Case:
@@ -350,12 +357,16 @@ def polytope_inputs() -> Case:
     angle = np.arange(5) * 2 * np.pi / 5
     H = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     inputs = jm.Polytope(H, np.array([0.5, 0.4, 0.6, 0.5, 0.7]))
-    return elimination(problem([[1.2, 0.3], [-0.4, 1.1]], [[0.5, 0.2], [0.0, 0.9]], 4, box(2, 2), inputs))
+    return elimination(
+        problem([[1.2, 0.3], [-0.4, 1.1]], [[0.5, 0.2], [0.0, 0.9]], 4, box(2, 2), inputs)
+    )
 
 
 def away_from_zero() -> Case:
     states = jm.Box([2.0, -1.0], [5.0, 1.0])
-    return elimination(problem(*INTEGRATOR, 8, states, jm.Box([0.3], [1.0]), c=np.array([-0.2, -0.6])))
+    return elimination(
+        problem(*INTEGRATOR, 8, states, jm.Box([0.3], [1.0]), c=np.array([-0.2, -0.6]))
+    )
 
 
 def decades() -> Case:

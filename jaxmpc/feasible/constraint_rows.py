@@ -31,8 +31,8 @@ class ConstraintRows:
     rows, and index says where the multiplier of each row of `ExactData` (step by step, then
     terminal rows, then those of the terminal ellipsoid) stands among the R (R where there is
     none). The last `balls` rows are those of the ellipsoid: |v − lower| ≤ radius. Psi, Omega, psi:
-    inputs from θ and the variables. still: the rows that nothing moves, but for those of a ball. size: of the
-    bounds (`typical_bound`).
+    inputs from θ and the variables. still: the rows that nothing moves, but for those of a ball.
+    size: of the bounds (`typical_bound`).
     """
 
     U: Any

@@ -96,7 +96,7 @@ class Equalities:
         free = np.tile(p.u_lower < p.u_upper, moves.shape[1])
         gain, off = np.zeros((n, free.size)), np.zeros((n, free.size))
         unit = 2.0**-52 * (n + m + 4)
-        E, e, at, at_N = [], [], p.lower == p.upper, p.lower_N == p.upper_N
+        values, errors, at, at_N = [], [], p.lower == p.upper, p.lower_N == p.upper_N
         for k in range(N + 1):
             H, D, found = (p.H, p.D, at[k]) if k < N else (p.H_N, np.zeros((len(at_N), m)), at_N)
             u = move(k) if k < N else np.zeros((m, free.size))
@@ -104,18 +104,19 @@ class Equalities:
             size = np.abs(H) @ (off + unit * np.abs(gain)) + unit * np.abs(D) @ u
             # A row that no input moves is kept by itself, or not at all.
             found &= np.any(value != 0, axis=1)
-            E, e = [*E, value[found]], [*e, size[found] * free]
+            values.append(value[found])
+            errors.append(size[found] * free)
             if k < N:
                 off = np.abs(p.A) @ (off + unit * np.abs(gain)) + unit * np.abs(p.B) @ u
                 gain = p.A @ gain + p.B @ u
-        E, e = np.concatenate(E), np.concatenate(e)
+        E, e = np.concatenate(values), np.concatenate(errors)
         if not len(E):
             return None
         rows = np.linalg.norm(E, axis=1)
         E, e = E / rows[:, None], e / rows[:, None]
         X = np.linalg.pinv(E, rcond=1e-10)
-        left = np.abs(np.eye(len(E)) - E @ X) + (e + (len(X) + 2) * 2.0**-52 * np.abs(E)) @ np.abs(X)
-        eta = left.sum(axis=1).max()
+        e = e + (len(X) + 2) * 2.0**-52 * np.abs(E)
+        eta = (np.abs(np.eye(len(E)) - E @ X) + e @ np.abs(X)).sum(axis=1).max()
         if not eta < 1e-6:
             return None
         most = (1 + 1e-5) * np.abs(X).sum(axis=1).reshape(-1, m)[list(p.moves)]

@@ -95,7 +95,8 @@ def prove_feasible(p: ExactData, theta: Array, free: Array, inputs: Array) -> tu
 def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array, Array, Array]:
     """Roll out inputs (N, m) from x (n,), each of which may be off by moved (N, m).
 
-    Returns whether all rows hold but for `Equalities`; how far those q are off, and a bound of that.
+    Returns whether all rows hold but for the q of `Equalities`; how far those are off, and a bound
+    of that.
     """
     n, m = p.B.shape
     A, B, c = jnp.asarray(p.A), jnp.asarray(p.B), jnp.asarray(p.c)
@@ -113,9 +114,9 @@ def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array
         return inside, value - upper, size
 
     def advance(carry, step):
-        (x, error), (u, u_error, *limits) = carry, step
+        (x, error), (u, u_error, lower, upper, solved) = carry, step
         here = jnp.concatenate([x, u]), jnp.concatenate([error, u_error])
-        found = holds(rows, *limits, *here)
+        found = holds(rows, lower, upper, solved, *here)
         bound = jnp.abs(A) @ jnp.abs(x) + jnp.abs(B) @ jnp.abs(u) + jnp.abs(c)
         error = jnp.abs(A) @ error + jnp.abs(B) @ u_error
         error = error * (1 + 1e-9) + growth * bound + TINY

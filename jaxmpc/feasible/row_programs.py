@@ -53,8 +53,8 @@ class RowPrograms:
         """
         balls, R = sum(self.rows.balls), len(lower)
         flat, reduced = slice(0, R - balls), np.zeros(R) if margin is None else margin
-        top = np.abs(U).max(axis=0, initial=0.0)
-        top[-1] = max(top[-1], reduced.max(initial=0.0))
+        top = np.max(np.abs(U), axis=0, initial=0.0)
+        top[-1] = max(top[-1], np.max(reduced, initial=0.0))
         unit = self.size / np.where(top > 0, top, 1.0)
         U, reduced = U * (unit / self.size), reduced * (unit[-1] / self.size)
         lower, upper = lower / self.size, upper / self.size
@@ -156,8 +156,8 @@ class RowPrograms:
         return np.array([-ends[1] - margin, ends[0] + margin]), np.array(y)
 
     def centre(self, given: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return θ (the one given, or the best) and w with the largest common margin of all rows, but
-        for equalities that the variables can keep.
+        """Return θ (the one given, or the best) and w with the largest common margin of all rows,
+        but for equalities that the variables can keep.
 
         Raises ValueError where the set is empty or flat, or does not hold the given θ inside.
         """
