@@ -1,5 +1,5 @@
 """The cascade that labels points, chunk by chunk: ADMM on all, Newton on those undecided, and a
-linear program for each of the last, up to `MOST_PROGRAMS` in a call."""
+linear program or three for each of the last, up to `MOST_PROGRAMS` points in a call."""
 
 import itertools
 import time
@@ -29,9 +29,9 @@ from jaxmpc.qp.precision import matmul
 
 # Steps of the longer ADMM run, relative to the first, on points that Newton leaves undecided.
 LONGER = 20
-# Points that get a linear program in one call of `label_chunks`; the first in order. One takes some
-# milliseconds, at N = 60 some tens.
-MOST_PROGRAMS = 2000
+# Points that get linear programs in one call of `label_chunks`, the first in order: so many, and no
+# more than these entries of their matrices in total. 10,000 entries take some tens of milliseconds.
+MOST_PROGRAMS, MOST_ENTRIES = 2000, 2 * 10**7
 # Proofs of up to so many bytes in total stay on the device until they are used.
 ON_DEVICE = 2**31
 # Number of points from which their typical size is taken.
@@ -58,7 +58,8 @@ def label_chunks(
     sample = np.abs(sample[np.all(np.isfinite(sample), axis=1)])
     size = np.median(sample, axis=0) if len(sample) else np.zeros(d)
     exact = problem.exact(np.abs(points[usable]).max(axis=0, initial=0.0), size)
-    margins, budget = problem.row_margins(exact, size), MOST_PROGRAMS
+    margins = problem.row_margins(exact, size)
+    budget = min(MOST_PROGRAMS, MOST_ENTRIES // max(problem.rows.U.size, 1))
     chunk = min(chunk, max(len(points), 1))
     batch = gather_size(chunk)
     short, long = (

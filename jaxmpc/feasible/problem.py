@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.feasible import constraint_rows, exact_data
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
@@ -23,8 +24,9 @@ class FeasibilityProblem:
     """The hard constraints of an MPC problem, and which initial states points θ (d,) stand for.
 
     mpc: the problem without soft rows and weights of input rates, which do not influence
-    feasibility. view: all states, a slice or a projection. Everything else follows from these two,
-    in NumPy in float64, and is computed once, when it is first used.
+    feasibility, and with polytopes that are boxes as those. view: all states, a slice or a
+    projection. Everything else follows from these two, in NumPy in float64, and is computed once,
+    when it is first used.
     """
 
     mpc: MPC
@@ -37,7 +39,10 @@ class FeasibilityProblem:
         Raises ValueError for an ill-posed problem and for a wrong view.
         """
         mpc.validate()
-        hard = replace(mpc, soft=(), input_rate_weight=None)
+        hard = replace(
+            mpc, soft=(), input_rate_weight=None, states=as_box(mpc.states),
+            inputs=as_box(mpc.inputs), terminal_set=as_box(mpc.terminal_set),
+        )  # fmt: skip
         return cls(hard, make_view(hard, axes, fixed))
 
     @property
@@ -116,3 +121,20 @@ class FeasibilityProblem:
         found = np.zeros(len(self.rows.lower) + 1)
         found[self.rows.index] = np.concatenate([np.ravel(part) for part in rounding])
         return np.clip(found[:-1] * self.rows.weight, self.rows.size, 1e6 * self.rows.size)
+
+
+def as_box(set_: Any) -> Any:
+    """Return a Polytope whose rows are limits of single coordinates as the same Box, other sets as
+    they are. Two opposite rows become one equality then, and limits of inputs part of the proofs'
+    support functions. Rows must be powers of two long, so that nothing is rounded."""
+    if not isinstance(set_, Polytope):
+        return set_
+    H, h = np.asarray(set_.H, np.float64), np.asarray(set_.h, np.float64)
+    entry = H.sum(axis=1)
+    if not (np.all(np.sum(H != 0, axis=1) == 1) and np.all(np.abs(np.frexp(entry)[0]) == 0.5)):
+        return set_
+    with np.errstate(over="ignore"):
+        limit = np.where(H != 0, (h / entry)[:, None], np.nan)
+    upper = np.nanmin(np.where(H > 0, limit, np.inf), axis=0, initial=np.inf)
+    lower = np.nanmax(np.where(H < 0, limit, -np.inf), axis=0, initial=-np.inf)
+    return Box(lower, upper) if np.all(lower <= upper) else set_

@@ -120,12 +120,12 @@ def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array
         bound = jnp.abs(A) @ jnp.abs(x) + jnp.abs(B) @ jnp.abs(u) + jnp.abs(c)
         error = jnp.abs(A) @ error + jnp.abs(B) @ u_error
         error = error * (1 + 1e-9) + growth * bound + TINY
-        return (A @ x + B @ u + c, error), found
+        return (A @ x + B @ u + c, error), found[0] if e is None else found
 
     steps = (inputs, moved, *map(jnp.asarray, (p.lower, p.upper, solved)))
-    (x, error), (inside, off, size) = jax.lax.scan(advance, (x, jnp.zeros_like(x)), steps)
+    (x, error), found = jax.lax.scan(advance, (x, jnp.zeros_like(x)), steps)
     last, off_N, size_N = holds(rows_N, p.lower_N, p.upper_N, solved_N, x, error)
-    proved = jnp.all(inside) & last
+    proved = jnp.all(found if e is None else found[0]) & last
     if p.P is not None:
         # (x + e)'P(x + e) ≤ x'Px + 2|x|'|P|ε + ε'|P|ε for |e| ≤ ε.
         scale = jnp.abs(p.P)
@@ -135,6 +135,7 @@ def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array
     proved = proved & jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(inputs))
     if e is None:
         return proved, jnp.zeros(0), jnp.zeros(0)
+    _, off, size = found
     count = np.shape(e.rows)[0]
     where = jnp.flatnonzero(jnp.append(jnp.ravel(solved), solved_N), size=count)
     off, size = (jnp.append(jnp.ravel(v), v_N)[where] for v, v_N in ((off, off_N), (size, size_N)))

@@ -167,7 +167,7 @@ class TestLastPrograms:
         assert (some.label[10:] == 0).all()
 
     def test_multipliers_in_units_of_the_growth(self):
-        """Predictions grow by 2^30 and late multipliers are as small; the ends of rays are precise."""
+        """Predictions grow by 2^30, late multipliers fall as much; ends of rays are precise."""
         problem = FeasibilityProblem.of(problems.unstable(30))
         assert FeasibilityProblem.of(problems.lecture()).weighted_rows is None
         programs = RowPrograms(problem.weighted_rows)
