@@ -48,7 +48,7 @@ class Settings:
 @dataclass(frozen=True)
 class Case:
     """A problem and its answer: truth(points) → which are inside; ends(center, directions) → where
-    rays end. still: the coordinates that no ray moves."""
+    rays end; truth None: shorter rays end inside. scale (d,): of the rays."""
 
     mpc: jm.MPC
     center: np.ndarray
@@ -323,13 +323,13 @@ def oscillator() -> Case:
 
 def non_minimum_phase() -> Case:
     outputs = jm.Outputs(np.array([[-1.0, 1.5]]), [-0.5], [1.0])
-    mpc = problem([[1.1, 0.4], [0.0, 0.8]], [[0.0], [0.5]], 12, box(3, 3), box(1.0),
-                  input_rate_limit=np.array([0.25]))  # fmt: skip
+    mpc = problem([[1.1, 0.4], [0.0, 0.8]], [[0.0], [0.5]], 30, box(3, 3), box(1.0),
+                  input_rate_limit=np.array([0.05]))  # fmt: skip
     plain = replace(mpc, outputs=outputs)
     wide = jm.Outputs(np.array([[-1.0, 1.5, 0.0]]), [-0.5], [1.0])
     same = without_rates(mpc)
     same = replace(same, outputs=(*same.outputs, wide))
-    return replace(bracketed(same, np.array([0.1, 0.2, 0.0])), mpc=plain)
+    return replace(bracketed(same, np.array([0.05, 0.05, 0.0])), mpc=plain)
 
 
 def terminal_ellipsoid() -> Case:
@@ -425,6 +425,14 @@ def chain_6() -> Case:
     return bracketed(chain(6), np.zeros(6))
 
 
+def empty() -> Case:
+    """Only x_0 is limited; from (1, 1) full input leads to x_N = 25 and no farther."""
+    mpc = problem(*INTEGRATOR, 6, box(1, 1), box(1.0), constrained_steps=(0,),
+                  terminal_set=jm.Box([25 + 1e-9, -np.inf], [np.inf, np.inf]))  # fmt: skip
+    corner, none = np.ones(2), lambda points: np.zeros(len(points), bool)
+    return Case(mpc, corner, lambda c, rays: np.full(len(rays), 1e-3), none)
+
+
 SYSTEMS = {
     "unstable spiral": spiral,
     "oscillator with D": oscillator,
@@ -447,6 +455,7 @@ SYSTEMS = {
     "one-sided outputs": one_sided_outputs,
     "unbounded inputs": unbounded_inputs,
     "uncontrollable mode": uncontrollable,
+    "empty by 1e-9 of 25": empty,
 }
 
 

@@ -127,8 +127,8 @@ def last_programs(
     """Yield linear programs for the last undecided points θ, as the rows and θ → (w, multipliers).
 
     First the ray from the centre through θ: inside, θ lies between the centre and the ray's end,
-    and so do their plans; outside, the end's multipliers are few. Then the largest margin at θ, and
-    where the plant is unstable the ray again, for multipliers in the units of its growth.
+    and so do their plans; outside, the end's multipliers are few. Where the plant is unstable the
+    ray again, for multipliers in the units of its growth. Then the largest margin at θ.
     """
     try:
         center, w_center = problem.programs.centre()
@@ -142,10 +142,10 @@ def last_programs(
             return (w_center + (w - w_center) / t if 1 <= t < np.inf else w), y
 
         yield problem.rows, between
+        if problem.weighted_rows is not None:
+            programs = RowPrograms(problem.weighted_rows)
+            yield problem.weighted_rows, lambda theta: programs.ray(center, theta - center)[1:]
     yield problem.rows, lambda theta: problem.programs.margin(theta, margins)
-    if center is not None and problem.weighted_rows is not None:
-        programs = RowPrograms(problem.weighted_rows)
-        yield problem.weighted_rows, lambda theta: programs.ray(center, theta - center)[1:]
 
 
 def _run(program: Compiled, *args: Any) -> Any:
