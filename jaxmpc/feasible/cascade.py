@@ -1,6 +1,7 @@
 """The cascade that labels points, chunk by chunk: ADMM on all, Newton on those undecided, and a
 linear program or three for each of the last, up to `MOST_PROGRAMS` points in a call."""
 
+import functools
 import itertools
 import time
 from collections.abc import Callable, Iterator
@@ -137,14 +138,16 @@ def last_programs(
 
     if center is not None:
 
+        def end(programs: RowPrograms, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return programs.ray(center, theta - center)[1:]
+
         def between(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             t, w, y = problem.programs.ray(center, theta - center)
             return (w_center + (w - w_center) / t if 1 <= t < np.inf else w), y
 
         yield problem.rows, between
-        if problem.weighted_rows is not None:
-            programs = RowPrograms(problem.weighted_rows)
-            yield problem.weighted_rows, lambda theta: programs.ray(center, theta - center)[1:]
+        for rows in problem.weighted_rows:
+            yield rows, functools.partial(end, RowPrograms(rows))
     yield problem.rows, lambda theta: problem.programs.margin(theta, margins)
 
 

@@ -76,18 +76,19 @@ class FeasibilityProblem:
         return RowPrograms(self.rows)
 
     @cached_property
-    def weighted_rows(self) -> ConstraintRows | None:
-        """Return the rows without prestabilisation, in units that grow as the plant does; None
-        where it does not grow. Multipliers of late rows are tiny beside those of early ones, and
-        precise in these units alone."""
-        A = self.mpc.system.A
-        radius = np.abs(np.linalg.eigvals(np.asarray(A, float))).max()
-        if radius <= 1 + 1e-9:
-            return None
-        free = replace(self.mpc, prestabilise=False)
-        growth = min(radius, 1e200 ** (1 / self.mpc.horizon))
-        return constraint_rows.constraint_rows(
-            self.mpc, self.view, condensed_in_float64(free), self.blocks, growth
+    def weighted_rows(self) -> tuple[ConstraintRows, ...]:
+        """Return the rows without prestabilisation, in units that grow as the slowest and as the
+        fastest unstable mode do; none where no mode is unstable. Multipliers of late rows are tiny
+        beside those of early ones, and precise in such units alone."""
+        moduli = np.abs(np.linalg.eigvals(np.asarray(self.mpc.system.A, float)))
+        moduli = moduli[moduli > 1 + 1e-9]
+        if not len(moduli):
+            return ()
+        slow, fast = np.minimum([moduli.min(), moduli.max()], 1e200 ** (1 / self.mpc.horizon))
+        c = condensed_in_float64(replace(self.mpc, prestabilise=False))
+        return tuple(
+            constraint_rows.constraint_rows(self.mpc, self.view, c, self.blocks, growth)
+            for growth in ([slow, fast] if fast > (1 + 1e-6) * slow else [fast])
         )
 
     @cached_property
@@ -109,7 +110,7 @@ class FeasibilityProblem:
 
     def row_margins(self, exact: ExactData, size: np.ndarray) -> np.ndarray:
         """Return what margins (R,) of the rows a proof needs relative to each other: as rounding
-        can move them at points of this size (d,), within a factor of 1e6."""
+        can move them at points of this size (d,), within a factor of 1e8."""
         view, start = self.view, np.zeros(self.mpc.dimension)
         start[list(view.axes)] = size
         if view.projects:
@@ -120,7 +121,7 @@ class FeasibilityProblem:
         rounding = exact_data.rounding_of_rows(exact, start)
         found = np.zeros(len(self.rows.lower) + 1)
         found[self.rows.index] = np.concatenate([np.ravel(part) for part in rounding])
-        return np.clip(found[:-1] * self.rows.weight, self.rows.size, 1e6 * self.rows.size)
+        return np.clip(found[:-1] * self.rows.weight, self.rows.size, 1e8 * self.rows.size)
 
 
 def as_box(set_: Any) -> Any:

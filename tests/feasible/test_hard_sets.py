@@ -169,8 +169,9 @@ class TestLastPrograms:
     def test_multipliers_in_units_of_the_growth(self):
         """Predictions grow by 2^30, late multipliers fall as much; ends of rays are precise."""
         problem = FeasibilityProblem.of(problems.unstable(30))
-        assert FeasibilityProblem.of(problems.lecture()).weighted_rows is None
-        programs = RowPrograms(problem.weighted_rows)
+        assert FeasibilityProblem.of(problems.lecture()).weighted_rows == ()
+        (rows,) = problem.weighted_rows
+        programs = RowPrograms(rows)
         polygon = exact.feasible_polygon(problems.unstable(30))
         for direction in TestUnits.D:
             t, _, _ = programs.ray(np.zeros(2), direction)
