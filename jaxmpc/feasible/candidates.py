@@ -1,4 +1,5 @@
-"""Stages that find candidates for proofs, plans or multipliers: ADMM, least-distance Newton.
+"""Stages that find candidates for proofs, plans or multipliers: ADMM, least-distance Newton; and
+the check of those that linear programs find.
 
 For the question "feasible or not" the cost is dropped. In an orthonormal basis U of the range
 of the (row-normalised) constraint matrix a zero-cost ADMM step is t⁺ = t + α(U U'r − clip(t)):
@@ -172,7 +173,8 @@ def newton_stage(
         l, u = bounds.l, bounds.u
         # The nearest feasible w lies on a face, where a roll-out has no margin for its rounding:
         # aim a little inside. Half-spaces are checked on the true bounds all the same.
-        inset = jnp.minimum(INSET * (1 + jnp.fmin(jnp.abs(l), jnp.abs(u))), (u - l) / 4)
+        size = rows.size + jnp.fmin(jnp.abs(l), jnp.abs(u))
+        inset = jnp.minimum(INSET * size, (u - l) / 4)
         inner = replace(bounds, l=l + inset, u=u - inset)
         if rows.balls:
             inner = replace(inner, radius=bounds.radius * (1 - INSET))
@@ -187,6 +189,19 @@ def compiled_admm(iterations: int, dtype: Any) -> Compiled:
     """Return the compiled ADMM stage: (p, rows, points (B, d), alpha) → verdicts and w (B, k)."""
     stage = lambda p, rows, points, alpha: admm_stage(p, rows, points, alpha, iterations, dtype)
     return Compiled(jax.jit(stage))
+
+
+@functools.cache
+def compiled_check() -> Compiled:
+    """Return the compiled proofs: (p, rows, points (B, d), w (B, k), multipliers (B, R)) →
+    verdicts."""
+
+    @jax.jit
+    def run(p: ExactData, rows: ConstraintRows, points: Array, w: Array, y: Array) -> Verdict:
+        check = lambda theta, w, y: check_candidates(p, rows, theta, w, [y])
+        return jax.vmap(check)(points, w, y)
+
+    return Compiled(run)
 
 
 @functools.cache

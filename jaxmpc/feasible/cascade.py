@@ -1,8 +1,10 @@
-"""The cascade that labels points, chunk by chunk: ADMM on all, Newton on those undecided."""
+"""The cascade that labels points, chunk by chunk: ADMM on all, Newton on those undecided, and a
+linear program or three for each of the last, up to `MOST_PROGRAMS` points in a call."""
 
+import functools
 import itertools
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -17,15 +19,20 @@ from jaxmpc.feasible.candidates import (
     StagePenalties,
     Verdict,
     compiled_admm,
+    compiled_check,
     compiled_newton,
 )
 from jaxmpc.feasible.constraint_rows import ConstraintRows, weighted
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.row_programs import RowPrograms
 from jaxmpc.qp.precision import matmul
 
 # Steps of the longer ADMM run, relative to the first, on points that Newton leaves undecided.
 LONGER = 20
+# Points that get linear programs in one call of `label_chunks`, the first in order: so many, and no
+# more than these entries of their matrices in total. 10,000 entries take some tens of milliseconds.
+MOST_PROGRAMS, MOST_ENTRIES = 2000, 2 * 10**7
 # Proofs of up to so many bytes in total stay on the device until they are used.
 ON_DEVICE = 2**31
 # Number of points from which their typical size is taken.
@@ -52,13 +59,15 @@ def label_chunks(
     sample = np.abs(sample[np.all(np.isfinite(sample), axis=1)])
     size = np.median(sample, axis=0) if len(sample) else np.zeros(d)
     exact = problem.exact(np.abs(points[usable]).max(axis=0, initial=0.0), size)
+    margins = problem.row_margins(exact, size)
+    budget = min(MOST_PROGRAMS, MOST_ENTRIES // max(problem.rows.U.size, 1))
     chunk = min(chunk, max(len(points), 1))
     batch = gather_size(chunk)
     short, long = (
         compiled_admm(iterations, np.dtype(dtype)),
         compiled_admm(LONGER * iterations, np.dtype(np.float64)),
     )
-    newton = compiled_newton(batch)
+    newton, check = compiled_newton(batch), compiled_check()
     with jax.enable_x64(True):
         exact, rows, quick = jax.device_put((exact, problem.rows, quick))
 
@@ -71,6 +80,7 @@ def label_chunks(
 
     def finished(x: np.ndarray, ok: np.ndarray, found: tuple[Verdict, Any]) -> Labels:
         """Return the labels of a chunk, by all stages."""
+        nonlocal budget
         labels, (verdict, w) = Labels.proved(found[0], ok), found
         if np.any((labels.label == 0) & ok):
             w = w if back is None else matmul(w.astype(np.float64), jnp.asarray(back.T))
@@ -84,6 +94,17 @@ def label_chunks(
             more = Labels.proved(_run(newton, exact, rows, again, all_, *found), all_)
             more = more.first(len(where))
             labels = labels.changed(where, more.label, more.status, more.proofs)
+        last = np.flatnonzero((labels.label == 0) & ok)[:budget]
+        budget -= len(last)
+        for some_rows, program in last_programs(problem, margins) if len(last) else ():
+            last = last[labels.label[last] == 0]
+            for i in range(0, len(last), batch):
+                where = last[i : i + batch]
+                solved = [program(theta) for theta in x[where]]
+                candidates = [padded(np.array(v), batch) for v in zip(*solved, strict=True)]
+                verdict = _run(check, exact, some_rows, padded(x[where], batch), *candidates)
+                more = Labels.proved(verdict, np.ones(batch, bool)).first(len(where))
+                labels = labels.changed(where, more.label, more.status, more.proofs)
         return labels
 
     slices = [slice(i, min(i + chunk, len(points))) for i in range(0, len(points), chunk)]
@@ -99,6 +120,35 @@ def label_chunks(
         run_seconds = time.perf_counter() - begun - compile_seconds
         yield here, replace(labels, compile_seconds=compile_seconds, run_seconds=run_seconds)
         begun, compiled = time.perf_counter(), Compiled.seconds
+
+
+def last_programs(
+    problem: FeasibilityProblem, margins: np.ndarray
+) -> Iterator[tuple[ConstraintRows, Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]]]:
+    """Yield linear programs for the last undecided points θ, as the rows and θ → (w, multipliers).
+
+    First the ray from the centre through θ: inside, θ lies between the centre and the ray's end,
+    and so do their plans; outside, the end's multipliers are few. Where the plant is unstable the
+    ray again, for multipliers in the units of its growth. Then the largest margin at θ.
+    """
+    try:
+        center, w_center = problem.programs.centre()
+    except ValueError:  # flat or empty: no rays
+        center = None
+
+    if center is not None:
+
+        def end(programs: RowPrograms, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return programs.ray(center, theta - center)[1:]
+
+        def between(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            t, w, y = problem.programs.ray(center, theta - center)
+            return (w_center + (w - w_center) / t if 1 <= t < np.inf else w), y
+
+        yield problem.rows, between
+        for rows in problem.weighted_rows:
+            yield rows, functools.partial(end, RowPrograms(rows))
+    yield problem.rows, lambda theta: problem.programs.margin(theta, margins)
 
 
 def _run(program: Compiled, *args: Any) -> Any:

@@ -87,3 +87,10 @@ def weak_duality_bound(
     left = np.abs(d - G.T @ y)
     off = left > 0
     return float(y @ g + left[off] @ extent[off])
+
+
+def power_of_two(sizes: np.ndarray) -> np.ndarray:
+    """Return the powers of two next below sizes, 1 for those that are zero or infinite: units that
+    change no digit."""
+    usable = np.isfinite(sizes) & (sizes > 1e-200) & (sizes < 1e200)
+    return 2.0 ** np.floor(np.log2(np.where(usable, sizes, 1.0)))

@@ -32,6 +32,7 @@ class ConstraintRows:
     terminal rows, then those of the terminal ellipsoid) stands among the R (R where there is
     none). The last `balls` rows are those of the ellipsoid: |v − lower| ≤ radius. Psi, Omega, psi:
     inputs from θ and the variables. still: the rows that nothing moves, but for those of a ball.
+    size: of the bounds (`typical_bound`).
     """
 
     U: Any
@@ -45,6 +46,7 @@ class ConstraintRows:
     Omega: Any
     psi: Any
     still: Any
+    size: Any
     radius: Any
     balls: tuple[int, ...] = field(metadata={"static": True})
 
@@ -54,11 +56,15 @@ class ConstraintRows:
         return Bounds(self.lower - shift, self.upper - shift, radius=self.radius, balls=self.balls)
 
 
-def constraint_rows(mpc: MPC, view: View, c: Any, blocks: list[Block]) -> ConstraintRows:
+def constraint_rows(
+    mpc: MPC, view: View, c: Any, blocks: list[Block], growth: float | None = None
+) -> ConstraintRows:
     """Restrict the condensed rows of a problem without soft rows to a view, and normalise them.
 
-    c: the `Condensed` problem, in NumPy; blocks: its `hard_blocks`. NumPy in float64; not
-    traceable.
+    c: the `Condensed` problem, in NumPy; blocks: its `hard_blocks`. growth: leave the basis out (U
+    is the matrix itself) and measure rows and inputs of step k in units of growth^k: predictions of
+    an unstable plant that is not prestabilised, and their multipliers, are all about 1 in these.
+    NumPy in float64; not traceable.
     """
     axes, others = list(view.axes), list(view.others)
     C, D, lower, upper = c.C, c.D[:, axes], c.lower - c.d, c.upper - c.d
@@ -75,29 +81,51 @@ def constraint_rows(mpc: MPC, view: View, c: Any, blocks: list[Block]) -> Constr
         lower, upper = lower - c.D[:, others] @ rest, upper - c.D[:, others] @ rest
         psi = psi + c.Psi[:, :, others] @ rest
 
+    row_unit, unit = np.ones(len(C)), np.ones(C.shape[1])
+    if growth is not None:
+        by_block = [np.repeat(steps, size) for _, steps, size in c.layout]
+        row_unit[extra:] = growth ** np.concatenate(by_block)
+        firsts = np.unique(mpc.moves, return_index=True)[1]
+        unit[: len(unit) - extra] = np.repeat(growth**firsts, mpc.system.m)
+        C = C / row_unit[:, None] * unit
+
     norm = np.linalg.norm(C, axis=1)
     still = norm <= 1e-13 * norm.max(initial=0.0)
     keep = np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
-    size = np.where(still, np.linalg.norm(D, axis=1), norm)
+    size = np.where(still, np.linalg.norm(D, axis=1), norm * row_unit)
     first = len(size) - sum(c.balls)
     if c.balls:  # one scale for all rows of the ball
         moved = norm[first:].max() > 0
-        size[first:] = norm[first:].max() if moved else np.linalg.norm(D[first:], axis=1).max()
+        own = norm * row_unit if moved else np.linalg.norm(D, axis=1)
+        size[first:] = own[first:].max()
     size, still = size[keep], still[keep]
     weight = 1 / np.where(size > 0, size, 1.0)
-    scaled = np.where(still[:, None], 0.0, weight[:, None] * C[keep])
+    scaled = np.where(still[:, None], 0.0, (weight * row_unit[keep])[:, None] * C[keep])
     U, singular, Vt = np.linalg.svd(scaled, full_matrices=False)
     rank = int(np.sum(singular > 1e-12 * singular.max(initial=0.0)))
     U, back = np.where(still[:, None], 0.0, U[:, :rank]), Vt[:rank].T / singular[:rank]
+    if growth is not None:
+        U, back = scaled, np.diag(unit)
 
     place = np.full(len(lower), len(keep))
     place[keep] = np.arange(len(keep))
+    index = multiplier_index(mpc, blocks, c.layout, place[extra:], len(keep))
+    lower, upper = weight * lower[keep], weight * upper[keep]
+    size = typical_bound(lower * row_unit[keep], upper * row_unit[keep])
     return ConstraintRows(
-        U, back, weight[:, None] * D[keep], weight * lower[keep], weight * upper[keep], weight,
-        multiplier_index(mpc, blocks, c.layout, place[extra:], len(keep)), Psi, Omega, psi,
-        np.flatnonzero(still[: len(keep) - sum(c.balls)]),
+        U, back, weight[:, None] * D[keep], lower, upper, weight,
+        index, Psi, Omega, psi,
+        np.flatnonzero(still[: len(keep) - sum(c.balls)]), size,
         weight[-1:] * c.radius if c.balls else None, c.balls,
     )  # fmt: skip
+
+
+def typical_bound(lower: np.ndarray, upper: np.ndarray) -> float:
+    """Return the size of bounds to which tolerances are relative: the lower quartile of those that
+    are finite and not zero, as some may be huge and stand for none; 1 without any."""
+    ends = np.abs(np.concatenate([lower, upper]))
+    ends = ends[np.isfinite(ends) & (ends > 0)]
+    return float(np.quantile(ends, 0.25)) if len(ends) else 1.0
 
 
 def weighted(rows: ConstraintRows, weight: np.ndarray) -> tuple[ConstraintRows, np.ndarray]:

@@ -28,7 +28,8 @@ class ExactData:
     it that limits on the states leave to each free move. left (N, n): 1 where errors of the
     costates p_k, k = 1..N, are passed to the step before (side and reach are 0 there), else 0, with
     |x_k| + side∘x_k ≤ reach on every feasible trajectory. side_0, reach_0 (d,): the same for every
-    feasible θ, ∞ where nothing bounds it. moves: index of the free move that each input equals.
+    feasible θ, ∞ where nothing bounds it. equalities: how inputs keep equalities, None where there
+    are none, or none that inputs can keep. moves: index of the free move that each input equals.
     """
 
     A: Any
@@ -53,6 +54,7 @@ class ExactData:
     reach: Any
     side_0: Any
     reach_0: Any
+    equalities: "Equalities | None"
     view: View
     moves: tuple[int, ...] = field(metadata={"static": True})
 
@@ -60,6 +62,84 @@ class ExactData:
     def horizon(self) -> int:
         """Return the horizon N."""
         return len(self.moves)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Equalities:
+    """Rows with lower = upper which inputs can keep all at once, and how.
+
+    at (N, r), at_N (r_N,): which of the rows of `ExactData`. inverse (N, m, q): changes of the
+    inputs that change the values of these q rows, stage by stage, by given amounts, but for
+    rounding. rows (q,): units of the rows. most (N, m): there is an exact change, of no more than
+    most·max_i |r_i| / rows_i, for any amounts r.
+    """
+
+    at: Any
+    at_N: Any
+    inverse: Any
+    rows: Any
+    most: Any
+
+    @classmethod
+    def of(cls, p: "ExactData") -> "Equalities | None":
+        """Return the equalities of a problem; None without any, and where they are not independent
+        of each other to 1e-6, so that no bound is known.
+
+        E is the matrix by which the moves v act on the rows, in floats, and |E − exactly| ≤ e. With
+        X = E⁺ and η = ‖ |I − E X| + e|X| ‖ < 1 in the maximum norm, exactly E X is invertible, and
+        X (E X)⁻¹ r is an exact change, no larger than |X| ‖r‖ / (1 − η).
+        """
+        (n, m), N = np.shape(p.B), p.horizon
+        moves = np.equal.outer(np.array(p.moves), np.arange(max(p.moves) + 1)).astype(float)
+        move = lambda k: np.kron(moves[k], np.eye(m))  # u_k from all moves
+        free = np.tile(p.u_lower < p.u_upper, moves.shape[1])
+        gain, off = np.zeros((n, free.size)), np.zeros((n, free.size))
+        unit = 2.0**-52 * (n + m + 4)
+        values, errors, at, at_N = [], [], p.lower == p.upper, p.lower_N == p.upper_N
+        for k in range(N + 1):
+            H, D, found = (p.H, p.D, at[k]) if k < N else (p.H_N, np.zeros((len(at_N), m)), at_N)
+            u = move(k) if k < N else np.zeros((m, free.size))
+            value = (H @ gain + D @ u) * free
+            size = np.abs(H) @ (off + unit * np.abs(gain)) + unit * np.abs(D) @ u
+            # A row that no input moves is kept by itself, or not at all.
+            found &= np.any(value != 0, axis=1)
+            values.append(value[found])
+            errors.append(size[found] * free)
+            if k < N:
+                off = np.abs(p.A) @ (off + unit * np.abs(gain)) + unit * np.abs(p.B) @ u
+                gain = p.A @ gain + p.B @ u
+        E, e = np.concatenate(values), np.concatenate(errors)
+        if not len(E):
+            return None
+        rows = np.linalg.norm(E, axis=1)
+        E, e = E / rows[:, None], e / rows[:, None]
+        X = np.linalg.pinv(E, rcond=1e-10)
+        e = e + (len(X) + 2) * 2.0**-52 * np.abs(E)
+        eta = (np.abs(np.eye(len(E)) - E @ X) + e @ np.abs(X)).sum(axis=1).max()
+        if not eta < 1e-6:
+            return None
+        most = (1 + 1e-5) * np.abs(X).sum(axis=1).reshape(-1, m)[list(p.moves)]
+        inverse = (X / rows).reshape(-1, m, len(E))[list(p.moves)]
+        return cls(at, at_N, inverse, rows, most)
+
+
+def rounding_of_rows(p: ExactData, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what rounding can do, to first order and in units of it, to the rows of a roll-out
+    from |x_0| ≤ start (n,): rows of the stages (N, r), of the last state (r_N,), and of L'x_N."""
+    most = np.maximum(largest_magnitude(p.u_lower, p.u_upper), 0.0)
+    implied = largest_magnitude(p.move_lower, p.move_upper)[list(p.moves)]
+    u = np.minimum(most, implied)
+    u = np.where(np.isfinite(u), u, 0.0)
+    A, B, H, D = (np.abs(v) for v in (p.A, p.B, p.H, p.D))
+    x, error, stages = start, np.zeros_like(start), []
+    for k in range(p.horizon):
+        stages.append(H @ (error + x) + D @ u[k])
+        bound = A @ x + B @ u[k] + np.abs(p.c)
+        error = A @ error + bound
+        x = np.where(p.left[k] == 0, np.minimum(bound, p.reach[k]), bound)
+    ball = np.zeros(0) if p.P is None else np.linalg.norm(np.linalg.pinv(p.back), axis=1)
+    return np.array(stages), np.abs(p.H_N) @ (error + x), ball * np.linalg.norm(error + x)
 
 
 def dynamics(mpc: MPC) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -170,12 +250,13 @@ def exact_data(
     implied = np.array([implied[same].min(axis=0) for same in steps])
     every_step = lambda parts: np.concatenate([np.zeros((N, 0)), *parts], axis=1)
     left, sides, reach = np.array(errors).transpose(1, 0, 2)
-    return ExactData(
+    data = ExactData(
         A, B, c, np.concatenate(H), np.concatenate(D), every_step(lower), every_step(upper),
         np.concatenate(H_N), np.concatenate(lower_N), np.concatenate(upper_N), P, level, back,
         u_lower, u_upper, np.maximum(u_lower, -implied), np.minimum(u_upper, implied),
-        left, sides, reach, side_0, reach_0, view, mpc.moves,
+        left, sides, reach, side_0, reach_0, None, view, mpc.moves,
     )  # fmt: skip
+    return replace(data, equalities=Equalities.of(data))
 
 
 def input_size(A: np.ndarray, B: np.ndarray, c: np.ndarray, size: list[np.ndarray]) -> np.ndarray:

@@ -38,7 +38,8 @@ class Labels:
 
     label (b,) int8: 1 proved feasible, −1 proved infeasible, 0 undecided. status (b,) int8:
     `Status` (NOT_RUN, NON_FINITE, or SOLVED / PRIMAL_INFEASIBLE / ITERATION_LIMIT for the three
-    labels). starts (b, n), plans (b, N, m): x_0 and inputs that prove 1, else NaN.
+    labels). starts (b, n), plans (b, N, m): x_0 and inputs that prove 1, else NaN. Where equalities
+    tie inputs to states the inputs that prove 1 are real numbers within rounding of these.
     cut_normals (b, d), cut_offsets (b,): the half-space a'x ≤ b, valid on the whole feasible set,
     that proves −1, else NaN. An offset of ∞ means that −1 is proved at the point but that no such
     half-space is known: on sets that are unbounded in both directions, or very long, along a facet,

@@ -2,6 +2,7 @@
 
 import math
 import time
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,6 +18,7 @@ from jaxmpc.control.system import host_array
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.candidates import StagePenalties
 from jaxmpc.feasible.cascade import label_chunks
+from jaxmpc.feasible.centered_polytope import power_of_two
 from jaxmpc.feasible.labels import Labels, OnDemand
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays
@@ -117,9 +119,8 @@ class FeasibleSetMap:
 
         Raises ValueError while these points have no interior.
         """
-        return Polytope.from_points(
-            np.concatenate([self.points[self.label == 1], self.extra_points])
-        )
+        points = np.concatenate([self.points[self.label == 1], self.extra_points])
+        return scaled_back(Polytope.from_points(points / self._unit), self._unit)
 
     def cuts(self) -> tuple[np.ndarray, np.ndarray]:
         """Return all half-spaces a'x ≤ b proved valid for the feasible set: a (K, d), b (K,)."""
@@ -137,7 +138,14 @@ class FeasibleSetMap:
         if not len(offsets):
             what = "no half-space is proved that holds on the whole set"
             fail("outer", what, "Map points outside the set, or refine(), if it is bounded")
-        return Polytope(normals, offsets).reduce()
+        return scaled_back(Polytope(normals * self._unit, offsets).reduce(), self._unit)
+
+    @property
+    def _unit(self) -> np.ndarray:
+        """Return units (d,) in which the points proved feasible are about 1 apart: qhull and LPs
+        need coordinates of like size."""
+        points = np.concatenate([self.points[self.label == 1], self.extra_points])
+        return power_of_two(np.ptp(points, axis=0) if len(points) else np.zeros(points.shape[1]))
 
     def volume_bounds(self) -> tuple[float, float]:
         """Return certified bounds on the volume (area in 2-D) of the feasible set, or of its
@@ -149,10 +157,11 @@ class FeasibleSetMap:
         points = np.concatenate([self.points[self.label == 1], self.extra_points])
         low = hull_volume(points) * (1 - VOLUME_ROUNDING)
         normals, offsets = self.cuts()
-        if len(offsets) and Polytope(normals, offsets).is_empty():
+        outer = Polytope(normals * self._unit, offsets)
+        if len(offsets) and outer.is_empty():
             return low, 0.0
         try:
-            high = self.outer().volume() * (1 + VOLUME_ROUNDING)
+            high = float(outer.reduce().volume() * np.prod(self._unit)) * (1 + VOLUME_ROUNDING)
         except ValueError:
             high = np.inf
         return low, high
@@ -184,38 +193,47 @@ class FeasibleSetMap:
 
         Each ray adds a proved boundary point and a proved facet (`boundary`); in up to four
         mapped dimensions this ends at the exact polytope. Undecided points that a facet excludes
-        are labelled infeasible. tolerance: relative gap of the volume bounds at which to stop.
-        deadline: of `time.monotonic`, after which no round of rays begins.
-        A set without interior, or unbounded, is returned as it is.
+        are labelled infeasible. tolerance: relative gap of the volume bounds at which to stop;
+        a warning tells the gap where the rays, or rounds of them, end before. deadline: of
+        `time.monotonic`, after which no round of rays begins. A set without interior, or unbounded,
+        is returned as it is.
         """
         d = self.problem.dimension
         try:
             rays = Rays.of(self.problem)
         except ValueError:
             return self
+        box, _ = self.problem.programs.bounding_box
+        unit = power_of_two(np.zeros(d) if box is None else np.ptp(box, axis=0))
         directions = np.concatenate([np.eye(d), -np.eye(d), -np.ones((1, d))])
         points = np.zeros((0, d))
         normals, offsets = rays.box()
-        sent = unit(directions)
+        sent, gap = of_length_one(directions), np.inf
         for _ in range(rounds):
             if time.monotonic() > deadline:
                 break
-            found = rays.cast(directions)
+            found = rays.cast(directions * unit)
             proved = np.isfinite(found.inner)
             points = np.concatenate([points, found.points[proved]])
             valid = np.isfinite(found.offsets)
             normals = np.concatenate([normals, found.normals[valid]])
             offsets = np.concatenate([offsets, found.offsets[valid]])
             try:
-                outer = Polytope(normals, offsets).reduce()
-                low, high = hull_volume(points), outer.volume()
-                directions = fresh(outer.vertices() - rays.center, sent)
-                sent = np.concatenate([sent, unit(directions)])
+                outer = Polytope(normals * unit, offsets).reduce()
+                low, high = hull_volume(points / unit), outer.volume()
+                directions = fresh(outer.vertices() - rays.center / unit, sent)
+                sent = np.concatenate([sent, of_length_one(directions)])
             except ValueError:  # unbounded, or too thin for qhull
                 break
+            gap = (high - low) / high
             # Sets with a curved boundary have no end of vertices.
-            if high - low <= tolerance * high or not 0 < len(directions) <= MOST_RAYS:
+            if gap <= tolerance or not 0 < len(directions) <= MOST_RAYS:
                 break
+        if gap > tolerance and box is not None and np.all(np.isfinite(box)):
+            warnings.warn(
+                f"refine: the bounds of the volume differ by {gap:.2g} of it, more than the "
+                f"tolerance {tolerance:.2g}", stacklevel=2,
+            )  # fmt: skip
         labels = excluded(self.labels, rays, self.points, normals, offsets)
         return replace(
             self, labels=labels, extra_points=points, extra_normals=normals, extra_offsets=offsets
@@ -247,7 +265,12 @@ class FeasibleSetMap:
         return xarray.Dataset(data, coords=names)
 
 
-def unit(directions: np.ndarray) -> np.ndarray:
+def scaled_back(body: Polytope, unit: np.ndarray) -> Polytope:
+    """Return {x: x / unit ∈ body}."""
+    return Polytope(np.asarray(body.H) / unit, np.asarray(body.h))
+
+
+def of_length_one(directions: np.ndarray) -> np.ndarray:
     """Return directions (K, d) scaled to length one."""
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
@@ -256,7 +279,7 @@ def fresh(directions: np.ndarray, sent: np.ndarray) -> np.ndarray:
     """Return the directions, except zeros, along which no ray of `sent` (unit length) has been
     sent."""
     directions = directions[np.any(directions != 0, axis=1)]
-    distance = KDTree(sent).query(unit(directions))[0]
+    distance = KDTree(sent).query(of_length_one(directions))[0]
     return directions[distance > 1e-9]
 
 
@@ -316,11 +339,13 @@ def map_feasible_set(
     all states, for a slice through them; None with d < n: a projection (feasible if some value
     of the other states is). The cost is ignored. Every label rests on a proof in float64
     (`proofs.py`): an input sequence whose roll-out keeps all rows, or a half-space that excludes
-    the point, each by more than rounding; what is neither is 0, undecided. iterations and dtype
-    affect the ADMM stage alone and cannot make a label wrong. chunk: number of points that a
-    compiled program takes at once (None: by device). refine: tolerance of `FeasibleSetMap.refine`,
-    None to skip it. penalties: of the ADMM stage, from `tune_sweep_penalties`. progress: show a
-    bar.
+    the point, each by more than rounding; what is neither is 0, undecided. Where equalities tie
+    the inputs to the states (a terminal point) the proof is that inputs within rounding of the
+    plan keep them exactly. iterations and dtype affect the ADMM stage alone and cannot make a
+    label wrong. The last undecided points, up to 2,000 in a call, get linear programs of some
+    milliseconds each. chunk: number of points that a compiled program takes at once (None: by
+    device). refine: tolerance of `FeasibleSetMap.refine`, None to skip it. penalties: of the ADMM
+    stage, from `tune_sweep_penalties`. progress: show a bar.
 
     A point with NaN or infinity gets status NON_FINITE and label 0. Raises ValueError for wrong
     shapes and ill-posed problems before anything compiles.

@@ -18,6 +18,7 @@ from jaxmpc.control.sets import Polytope, maximise
 from jaxmpc.feasible.centered_polytope import (
     CenteredPolytope,
     coordinate_extent,
+    power_of_two,
     weak_duality_bound,
 )
 from jaxmpc.mpc.inequalities import Inequalities, row_lengths
@@ -56,6 +57,13 @@ class PlanPolytope:
         t = np.concatenate([c.phi[1], c.psi[0]])
         equal = (c.lower == c.upper)[rows.row]
         return cls(np.hstack([rows.D, rows.C]), rows.b, M[:p], t[:p], not c.balls, equal)
+
+    def in_units(self, unit: np.ndarray) -> "PlanPolytope":
+        """Return the polytope of v / unit, unit (p + nz,) > 0."""
+        G, state = self.G * unit, unit[: self.p]
+        size = row_lengths(G)
+        M, t = self.M * unit / state[:, None], self.t / state
+        return PlanPolytope(G / size[:, None], self.g / size, M, t, self.exact, self.equal)
 
     @property
     def p(self) -> int:
@@ -133,10 +141,13 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
     not.
 
     Rays at the vertices of an outer polytope add half-spaces, the duals of their LPs, until every
-    vertex is reached (beneath-beyond). deadline: of `time.monotonic`, in seconds.
+    vertex is reached (beneath-beyond), in coordinates in which the polytope is about 1 wide.
+    deadline: of `time.monotonic`, in seconds.
     """
     if plans.p > DIMENSIONS:
         return f"vertices are not enumerated in {plans.p} dimensions (up to {DIMENSIONS} they are)"
+    unit = power_of_two(plans.extent)
+    plans, state = plans.in_units(unit), unit[: plans.p]
     center = plans.centre()
     if center is None:
         return "the feasible set is empty or flat"
@@ -146,15 +157,16 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
     if not np.all(np.isfinite(offsets)):
         return "the feasible set is unbounded"
     many = "its facets are too many to enumerate in the time given"
+    missed = np.zeros((0, p))
     while len(offsets) < FACETS:
-        missed = []
+        last, short = missed, []
         for direction in directions:
             if time.monotonic() > deadline:
                 return many
             s, normal, offset = plans.ray(center, direction)
-            missed.append(s < 1 - TOLERANCE)
+            short.append(s < 1 - TOLERANCE)
             normals, offsets = np.vstack([normals, normal]), np.append(offsets, offset)
-        reached = np.vstack([reached, (center + directions)[~np.array(missed)]])
+        reached = np.vstack([reached, (center + directions)[~np.array(short)]])
         try:
             outer = Polytope(normals, offsets).reduce()
             vertices = outer.vertices()
@@ -162,8 +174,15 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
             return f"its facets are too ill-conditioned ({error})"
         normals, offsets = np.asarray(outer.H), np.asarray(outer.h)
         scale = TOLERANCE * np.abs(vertices - center).max()
-        near = np.abs(vertices[:, None] - reached).max(axis=2, initial=0.0) <= scale
-        directions = vertices[~near.any(axis=1)] - center
-        if not len(directions):
-            return CenteredPolytope(center, normals, offsets, vertices)
+        near = lambda points, scale=scale, of=vertices: (
+            np.abs(of[:, None] - points).max(axis=2, initial=0.0) <= scale
+        ).any(axis=1)
+        missed = vertices[~near(reached)]
+        if not len(missed):
+            size = np.linalg.norm(normals / state, axis=1)
+            normals, offsets = normals / state / size[:, None], offsets / size
+            return CenteredPolytope(center * state, normals, offsets, vertices * state)
+        if near(last)[~near(reached)].all():  # rays at these vertices gave no half-space between
+            return f"its vertices are not reached to {TOLERANCE:g} of its size"
+        directions = missed - center
     return many

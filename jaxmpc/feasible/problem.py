@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import require_kind
+from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.feasible import constraint_rows, exact_data
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
@@ -24,8 +25,9 @@ class FeasibilityProblem:
     """The hard constraints of an MPC problem, and which initial states points θ (d,) stand for.
 
     mpc: the problem without soft rows and weights of input rates, which do not influence
-    feasibility. view: all states, a slice or a projection. Everything else follows from these two,
-    in NumPy in float64, and is computed once, when it is first used.
+    feasibility, and with polytopes that are boxes as those. view: all states, a slice or a
+    projection. Everything else follows from these two, in NumPy in float64, and is computed once,
+    when it is first used.
     """
 
     mpc: MPC
@@ -39,7 +41,10 @@ class FeasibilityProblem:
         """
         require_kind("mpc", mpc, MPC)
         mpc.validate()
-        hard = replace(mpc, soft=(), input_rate_weight=None)
+        hard = replace(
+            mpc, soft=(), input_rate_weight=None, states=as_box(mpc.states),
+            inputs=as_box(mpc.inputs), terminal_set=as_box(mpc.terminal_set),
+        )  # fmt: skip
         return cls(hard, make_view(hard, axes, fixed))
 
     @property
@@ -73,6 +78,22 @@ class FeasibilityProblem:
         return RowPrograms(self.rows)
 
     @cached_property
+    def weighted_rows(self) -> tuple[ConstraintRows, ...]:
+        """Return the rows without prestabilisation, in units that grow as the slowest and as the
+        fastest unstable mode do; none where no mode is unstable. Multipliers of late rows are tiny
+        beside those of early ones, and precise in such units alone."""
+        moduli = np.abs(np.linalg.eigvals(np.asarray(self.mpc.system.A, float)))
+        moduli = moduli[moduli > 1 + 1e-9]
+        if not len(moduli):
+            return ()
+        slow, fast = np.minimum([moduli.min(), moduli.max()], 1e200 ** (1 / self.mpc.horizon))
+        c = condensed_in_float64(replace(self.mpc, prestabilise=False))
+        return tuple(
+            constraint_rows.constraint_rows(self.mpc, self.view, c, self.blocks, growth)
+            for growth in ([slow, fast] if fast > (1 + 1e-6) * slow else [fast])
+        )
+
+    @cached_property
     def plan_polytope(self) -> PlanPolytope:
         """Return the polytope of all states and the decisions that keep all rows, for any
         view."""
@@ -88,3 +109,35 @@ class FeasibilityProblem:
         extent, _ = self.programs.bounding_box
         extent = np.array([-region, region]) if extent is None else extent
         return exact_data.exact_data(self.mpc, self.view, self.blocks, extent, size)
+
+    def row_margins(self, exact: ExactData, size: np.ndarray) -> np.ndarray:
+        """Return what margins (R,) of the rows a proof needs relative to each other: as rounding
+        can move them at points of this size (d,), within a factor of 1e8."""
+        view, start = self.view, np.zeros(self.mpc.dimension)
+        start[list(view.axes)] = size
+        if view.projects:
+            free = exact_data.one_sided(view.lower, view.upper)[1]
+            start[list(view.others)] = np.where(np.isfinite(free), free, 0.0)
+        elif view.others:
+            start[list(view.others)] = np.abs(view.fixed)[list(view.others)]
+        rounding = exact_data.rounding_of_rows(exact, start)
+        found = np.zeros(len(self.rows.lower) + 1)
+        found[self.rows.index] = np.concatenate([np.ravel(part) for part in rounding])
+        return np.clip(found[:-1] * self.rows.weight, self.rows.size, 1e8 * self.rows.size)
+
+
+def as_box(set_: Any) -> Any:
+    """Return a Polytope whose rows are limits of single coordinates as the same Box, other sets as
+    they are. Two opposite rows become one equality then, and limits of inputs part of the proofs'
+    support functions. Rows must be powers of two long, so that nothing is rounded."""
+    if not isinstance(set_, Polytope):
+        return set_
+    H, h = np.asarray(set_.H, np.float64), np.asarray(set_.h, np.float64)
+    entry = H.sum(axis=1)
+    if not (np.all(np.sum(H != 0, axis=1) == 1) and np.all(np.abs(np.frexp(entry)[0]) == 0.5)):
+        return set_
+    with np.errstate(over="ignore"):
+        limit = np.where(H != 0, (h / entry)[:, None], np.nan)
+    upper = np.nanmin(np.where(H > 0, limit, np.inf), axis=0, initial=np.inf)
+    lower = np.nanmax(np.where(H < 0, limit, -np.inf), axis=0, initial=-np.inf)
+    return Box(lower, upper) if np.all(lower <= upper) else set_

@@ -7,6 +7,13 @@ rates are limited x stands for (x, u_{k−1}). Soft rows are not constraints and
 running bound on the rounding error, ε_{k+1} = |A| ε_k + γ(|A||x_k| + |B||u_k| + |c|). Every
 row must hold with a margin no less than |H| ε_k plus the rounding of the row's own product.
 
+*Equalities* (a terminal point, say) leave no margin, and inputs in floats hardly ever keep them
+exactly. There the proof is that real inputs exist within rounding of the floats: the floats miss
+the rows by r, |r| at most r̄ by the roll-out; real changes of no more than `Equalities.most`·r̄ take
+r away exactly; and with inputs off by that much every other row still holds. The floats themselves
+keep the equalities to r̄ only. Not proved are rows that no input moves or that depend on each
+other, as where a mode that inputs cannot reach has to be zero at last.
+
 *Infeasible*: for any multipliers y_k of the rows H x_k + D u_k the costates p_N = H_N'y_N,
 p_k = A'p_{k+1} + H'y_k satisfy Σ y_k'(H x_k + D u_k) = p_0'x_0 + Σ (B'p_{k+1} + D'y_k)'u_k +
 c'p_{k+1} along every trajectory; with σ the support function of each set this bounds every
@@ -66,39 +73,73 @@ def first_of_block(moves: tuple[int, ...]) -> np.ndarray:
 def prove_feasible(p: ExactData, theta: Array, free: Array, inputs: Array) -> tuple[Array, Array]:
     """Roll out inputs (N, m) from the point θ; return (proved, inputs clipped into their limits).
 
-    All arithmetic in float64. Not proved means only that this input sequence is no proof.
+    All arithmetic in float64. Not proved means only that this input sequence is no proof. Where
+    equalities tie the inputs to the states, inputs within rounding of these are proved to exist.
+    """
+    limit = lambda u: jnp.clip(u, p.u_lower, p.u_upper)[first_of_block(p.moves)]
+    inputs = limit(inputs)
+    x = p.view.initial_state(theta, free)
+    if p.equalities is None:
+        proved, _, _ = roll_out(p, x, inputs, jnp.zeros_like(inputs))
+        return proved, inputs
+    e = p.equalities
+    _, residual, _ = roll_out(p, x, inputs, jnp.zeros_like(inputs))
+    inputs = limit(inputs - jnp.asarray(e.inverse) @ residual)
+    _, _, off = roll_out(p, x, inputs, jnp.zeros_like(inputs))
+    moved = jnp.asarray(e.most) * jnp.max(off / e.rows)
+    within = (p.u_upper - inputs >= moved) & (inputs - p.u_lower >= moved)
+    proved, _, _ = roll_out(p, x, inputs, moved)
+    return proved & jnp.all(within), inputs
+
+
+def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array, Array, Array]:
+    """Roll out inputs (N, m) from x (n,), each of which may be off by moved (N, m).
+
+    Returns whether all rows hold but for the q of `Equalities`; how far those are off, and a bound
+    of that.
     """
     n, m = p.B.shape
-    inputs = jnp.clip(inputs, p.u_lower, p.u_upper)[first_of_block(p.moves)]
-    x = p.view.initial_state(theta, free)
     A, B, c = jnp.asarray(p.A), jnp.asarray(p.B), jnp.asarray(p.c)
     rows, rows_N = jnp.concatenate([p.H, p.D], axis=1), jnp.asarray(p.H_N)
     # Twice the first-order bound covers the rounding of the bound itself.
     growth = 2 * gamma(n + m + 2)
+    e = p.equalities
+    solved = np.zeros(np.shape(p.lower), bool) if e is None else e.at
+    solved_N = np.zeros(np.shape(p.lower_N), bool) if e is None else e.at_N
 
-    def holds(H, lower, upper, x, error):
+    def holds(H, lower, upper, solved, x, error):
         value = H @ x
         size = jnp.abs(H) @ error * (1 + 1e-9) + 2 * row_gamma(H) * (jnp.abs(H) @ jnp.abs(x))
-        return jnp.all((value + size <= upper) & (value - size >= lower))
+        inside = jnp.all(((value + size <= upper) & (value - size >= lower)) | solved)
+        return inside, value - upper, size
 
     def advance(carry, step):
-        (x, error), (u, lower, upper) = carry, step
-        here = jnp.concatenate([x, u]), jnp.concatenate([error, jnp.zeros_like(u)])
-        inside = holds(rows, lower, upper, *here)
+        (x, error), (u, u_error, lower, upper, solved) = carry, step
+        here = jnp.concatenate([x, u]), jnp.concatenate([error, u_error])
+        found = holds(rows, lower, upper, solved, *here)
         bound = jnp.abs(A) @ jnp.abs(x) + jnp.abs(B) @ jnp.abs(u) + jnp.abs(c)
-        error = jnp.abs(A) @ error * (1 + 1e-9) + growth * bound + TINY
-        return (A @ x + B @ u + c, error), inside
+        error = jnp.abs(A) @ error + jnp.abs(B) @ u_error
+        error = error * (1 + 1e-9) + growth * bound + TINY
+        return (A @ x + B @ u + c, error), found[0] if e is None else found
 
-    steps = (inputs, jnp.asarray(p.lower), jnp.asarray(p.upper))
-    (x, error), inside = jax.lax.scan(advance, (x, jnp.zeros_like(x)), steps)
-    proved = jnp.all(inside) & holds(rows_N, p.lower_N, p.upper_N, x, error)
+    steps = (inputs, moved, *map(jnp.asarray, (p.lower, p.upper, solved)))
+    (x, error), found = jax.lax.scan(advance, (x, jnp.zeros_like(x)), steps)
+    last, off_N, size_N = holds(rows_N, p.lower_N, p.upper_N, solved_N, x, error)
+    proved = jnp.all(found if e is None else found[0]) & last
     if p.P is not None:
         # (x + e)'P(x + e) ≤ x'Px + 2|x|'|P|ε + ε'|P|ε for |e| ≤ ε.
-        size = jnp.abs(p.P)
-        rounding = (2 * jnp.abs(x) + error) @ (size @ error) * (1 + 1e-9)
-        rounding = rounding + 2 * gamma(2 * n + 2) * (jnp.abs(x) @ (size @ jnp.abs(x)))
+        scale = jnp.abs(p.P)
+        rounding = (2 * jnp.abs(x) + error) @ (scale @ error) * (1 + 1e-9)
+        rounding = rounding + 2 * gamma(2 * n + 2) * (jnp.abs(x) @ (scale @ jnp.abs(x)))
         proved = proved & (x @ (p.P @ x) + rounding <= p.level)
-    return proved & jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(inputs)), inputs
+    proved = proved & jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(inputs))
+    if e is None:
+        return proved, jnp.zeros(0), jnp.zeros(0)
+    _, off, size = found
+    count = np.shape(e.rows)[0]
+    where = jnp.flatnonzero(jnp.append(jnp.ravel(solved), solved_N), size=count)
+    off, size = (jnp.append(jnp.ravel(v), v_N)[where] for v, v_N in ((off, off_N), (size, size_N)))
+    return proved, off, jnp.abs(off) * (1 + 1e-9) + size
 
 
 def cut(p: ExactData, y_states: Array, y_N: Array, y_ball: Array) -> tuple[Array, Array, Array]:

@@ -54,3 +54,14 @@ def test_inequalities_are_the_rows():
         room = np.minimum(c.upper[:linear] - value, value - c.lower[:linear]).min()
         slack = ((rows.b - rows.C @ z - rows.D @ x) * length).min()
         assert slack == pytest.approx(room, abs=1e-12)
+
+
+def test_polytopes_that_are_boxes():
+    """Limits of single coordinates in rows of powers of two, each once or more often."""
+    H = np.array([[1.0, 0], [-2, 0], [0, -0.5], [0.25, 0]])
+    box = problem.as_box(jm.Polytope(H, np.array([1.0, 3.0, 0.1, 0.1])))
+    np.testing.assert_array_equal(box.lower, [-1.5, -0.2])
+    np.testing.assert_array_equal(box.upper, [0.4, np.inf])
+    for rows, h in ((3 * H, np.ones(4)), (H + 0.1, np.ones(4)), (H, np.array([-1.0, 1, 1, 1]))):
+        body = jm.Polytope(rows, h)
+        assert problem.as_box(body) is body
