@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import warnings
 from typing import Any
 
 
@@ -10,6 +11,7 @@ def main() -> int:
     """Run the command and return its exit code."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _stop)  # until the command begins, see `cli.main`
+    warnings.formatwarning = lambda message, *_, **__: f"jaxmpc: {message}\n"
     from jaxmpc.app import cli
 
     return cli.main()
