@@ -6,7 +6,8 @@ data of a problem written as integers over one 2ᵉ, a state after k steps is in
 (`store.plain_problem`): x⁺ = Ax + Bu + c, rows lower ≤ Hx + Du ≤ upper, and a terminal ellipsoid
 x'Px ≤ level.
 
-*Feasible* (`roll_out_exactly`): the plan, rolled out from the state, keeps every row.
+*Feasible* (`roll_out_exactly`): the plan, rolled out from the state, keeps every row. Equalities
+are missed by rounding; there the plan counts that keeps them and differs by as little.
 
 *Infeasible* (`beyond`): for any multipliers y_k of the rows, with the costates p_N = H_N'y_N,
 p_k = A'p_{k+1} + H_k'y_k, every trajectory satisfies
@@ -20,11 +21,15 @@ state beyond that half-space starts no trajectory, wherever the multipliers came
 
 import math
 from collections.abc import Iterator, Mapping
+from fractions import Fraction
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 UNIT_ROUNDOFF = 2.0**-53
+# Change of the inputs, relative to the largest, up to which it counts as rounding.
+TINY = 1e-9
 
 
 class Constraints:
@@ -60,6 +65,27 @@ class Constraints:
         else:
             self.low = bound(others.get("lower", []), -np.inf)
             self.high = bound(others.get("upper", []), np.inf)
+
+    @cached_property
+    def equalities(self) -> tuple[list[tuple[int, int]], np.ndarray]:
+        """The rows (k, i) with lower = upper that inputs move, and changes (q, N, m) of the inputs
+        that change the values of one of these q rows each by about one: the pseudoinverse of the
+        matrix by which the moves act on them."""
+        n, m = self.B.shape
+        moves = int(self.moves.max()) + 1
+        states, rows, where = np.zeros((moves * m, n)), [], []
+        for k in range(self.N + 1):
+            u = np.zeros((moves * m, m))
+            if k < self.N:
+                at = int(self.moves[k]) * m
+                u[at : at + m] = np.eye(m)
+            values = states @ self.H[k].T + u @ self.D[k].T
+            for i in np.flatnonzero((self.lower[k] == self.upper[k]) & np.any(values, axis=0)):
+                where.append((k, int(i)))
+                rows.append(values[:, i])
+            states = states @ self.A.T + u @ self.B.T
+        X = np.linalg.pinv(np.reshape(rows, (-1, moves * m)))
+        return where, X.T.reshape(-1, moves, m)[:, self.moves]
 
     def input_rows(self) -> Iterator[tuple[int, int, float, float]]:
         """Yield (move, i, lower, upper) for each row that bounds an input u_i alone."""
@@ -108,29 +134,90 @@ def integers(values: Any, e: int) -> np.ndarray:
 
 def roll_out_exactly(p: Constraints, starts: np.ndarray, plans: np.ndarray) -> np.ndarray:
     """Return the least margin (b,) of all rows along plans (b, N, m) from states (b, n), computed
-    without rounding: negative where a plan breaks a limit."""
-    e = p.exponent(starts, plans)
-    A, B, c = (integers(v, e) for v in (p.A, p.B, p.c))
-    x, inputs = integers(starts, e), integers(plans, e)  # x_k is x / 2^((k+1)e)
+    without rounding: negative where a plan breaks a limit.
+
+    Where rows are equalities, which no plan of floats keeps exactly, the margin is that of the
+    plan with the rational change of its inputs that makes up for what it misses of them, less than
+    TINY of the largest input; a larger change counts as a broken limit.
+    """
+    rows, X = p.equalities
+    e = p.exponent(starts, plans, X)
+    x, u, one = integers(starts, e), integers(plans, e), 1
     least = np.full(len(starts), np.inf)
-    for k in range(p.N + 1):
-        u = inputs[:, k] if k < p.N else 0 * inputs[:, 0]
-        later = 1 << k * e
-        value = x @ integers(p.H[k], e).T + (u @ integers(p.D[k], e).T) * later
-        scale = 1 << (k + 2) * e
+    if rows:
+        change = integers(X, e)
+        missed = _at(p, e, rows, x, u, one, p.upper)
+        G = -_at(p, e, rows, np.zeros((len(X), len(p.A)), object), change, 0, None).T
+        inverse = _inverse(G)
+        if inverse is not None:
+            K, one = inverse  # the inverse of G is K / one
+            moved = np.tensordot(missed @ K.T, change, axes=1)
+            u, x = u * one + moved, x * one
+            size = np.array([max(map(abs, v.ravel())) / (one << e) for v in moved])
+            much = size > TINY * (1 + np.abs(plans).max(axis=(1, 2)))
+            least = np.where(much, -size, least)
+    for k, value, x_k in _values(p, e, x, u, one):
+        end = x_k
+        scale = one << (k + 2) * e
         for bound, sign in ((p.upper[k], 1), (p.lower[k], -1)):
             there = np.isfinite(bound)
-            room = sign * (integers(bound, e) * (later << e) - value)[:, there]
+            room = sign * (integers(bound, e) * (one << (k + 1) * e) - value)[:, there]
             if room.shape[1]:
                 least = np.minimum(least, [min(row) / scale for row in room])
-        if k < p.N:
-            x = x @ A.T + (u @ B.T) * later + c * (later << e)
     if p.P is not None:
-        square = np.sum((x @ integers(p.P, e)) * x, axis=1)  # over 2^((2N+3)e)
+        square = np.sum((end @ integers(p.P, e)) * end, axis=1)  # over 2^((2N+3)e)
         power = (2 * p.N + 3) * e
-        room = integers(p.level, e) * (1 << power - e) - square
-        least = np.minimum(least, [v / (1 << power) for v in room])
+        room = integers(p.level, e) * (one**2 << power - e) - square
+        least = np.minimum(least, [v / (one**2 << power) for v in room])
     return least
+
+
+def _values(
+    p: Constraints, e: int, x: np.ndarray, u: np.ndarray, one: int
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Yield k, the values (b, rows) of its rows, over 2^((k+2)e), and x_k, over 2^((k+1)e), along
+    inputs u (b, N, m) over 2ᵉ from x (b, n). All are multiplied by the integer `one`."""
+    A, B, c = (integers(v, e) for v in (p.A, p.B, p.c))
+    for k in range(p.N + 1):
+        later = 1 << k * e
+        value = x @ integers(p.H[k], e).T
+        if k < p.N:
+            value = value + (u[:, k] @ integers(p.D[k], e).T) * later
+        yield k, value, x
+        if k < p.N:
+            x = x @ A.T + (u[:, k] @ B.T) * later + c * (one * (later << e))
+
+
+def _at(
+    p: Constraints, e: int, rows: list[tuple[int, int]], x: np.ndarray, u: np.ndarray, one: int,
+    bounds: list[np.ndarray] | None,
+) -> np.ndarray:  # fmt: skip
+    """Return bounds (None: 0) less the values (b, q) of rows (k, i), over 2^((N+2)e)."""
+    found = []
+    for k, value, _ in _values(p, e, x, u, one):
+        for i in (i for at, i in rows if at == k):
+            bound = 0 if bounds is None else int(integers(bounds[k][i], e)) * (one << (k + 1) * e)
+            found.append((bound - value[:, i]) * (1 << (p.N - k) * e))
+    return np.stack(found, axis=1)
+
+
+def _inverse(G: np.ndarray) -> tuple[np.ndarray, int] | None:
+    """Return integers K (q, q) and d with G K = d I; None for a singular matrix G of integers."""
+    q = len(G)
+    rows = [[Fraction(int(v)) for v in row] + [Fraction(i == j) for j in range(q)]
+            for i, row in enumerate(G)]  # fmt: skip
+    for i in range(q):
+        pivot = next((j for j in range(i, q) if rows[j][i]), None)
+        if pivot is None:
+            return None
+        rows[i], rows[pivot] = rows[pivot], rows[i]
+        rows[i] = [v / rows[i][i] for v in rows[i]]
+        for j in range(q):
+            if j != i and rows[j][i]:
+                rows[j] = [v - rows[j][i] * w for v, w in zip(rows[j], rows[i], strict=True)]
+    inverse = [row[q:] for row in rows]
+    d = math.lcm(*(v.denominator for row in inverse for v in row))
+    return np.array([[int(v * d) for v in row] for row in inverse], object).reshape(q, q), d
 
 
 def roll_out(p: Constraints, starts: np.ndarray, plans: np.ndarray) -> np.ndarray:
