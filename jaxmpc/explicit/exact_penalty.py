@@ -10,6 +10,7 @@ from scipy.optimize import linprog
 from jaxmpc.checks import fail, require_kind, whole
 from jaxmpc.control.geometry import HIGHS
 from jaxmpc.control.sets import Box, Polytope
+from jaxmpc.control.system import host_array
 from jaxmpc.explicit.cells import ActivePiece, active_piece, capped_ball
 from jaxmpc.explicit.least_distance import (
     SMALLEST,
@@ -125,7 +126,7 @@ def exact_penalty(
         fail("rho", f"{rho!r}", "Give one finite weight of at least 0, or None")
     require_kind("mpc", mpc, MPC)
     mpc.validate()
-    x0s = np.zeros((0, mpc.dimension)) if x0s is None else np.asarray(x0s, np.float64)
+    x0s = np.zeros((0, mpc.dimension)) if x0s is None else host_array("x0s", x0s)
     if x0s.ndim != 2 or x0s.shape[1] != mpc.dimension:
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.dimension})")
 

@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
+from jaxmpc.control.system import host_array
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.candidates import cut_of, inputs_of
 from jaxmpc.feasible.constraint_rows import ConstraintRows
@@ -58,7 +59,7 @@ def boundary(
     d = problem.dimension
     if isinstance(directions, int | np.integer):
         directions = ray_directions(max(int(directions), 0), d)
-    directions = np.asarray(directions, np.float64)
+    directions = host_array("directions", directions)
     if directions.ndim != 2 or directions.shape[1] != d or not np.all(np.isfinite(directions)):
         fail("directions", f"shape {directions.shape}", f"Give finite rays (K, {d}) or a number")
     if not len(directions) or not np.all(np.any(directions != 0, axis=1)):

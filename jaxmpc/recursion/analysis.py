@@ -22,6 +22,7 @@ import numpy as np
 
 from jaxmpc.checks import fail, whole
 from jaxmpc.compiled import default_chunk
+from jaxmpc.control.system import host_array
 from jaxmpc.explicit.law import Law, RegionLaw
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import grid
@@ -100,7 +101,7 @@ def examine(
     problem = FeasibilityProblem.of(mpc)
     steps, regions = whole("steps", steps, 1), whole("regions", regions, 0)
     if x0s is not None:
-        x0s, p = np.asarray(x0s, np.float64), problem.dimension
+        x0s, p = host_array("x0s", x0s), problem.dimension
         if x0s.ndim != 2 or x0s.shape[1] != p or not len(x0s):
             fail("x0s", f"shape {x0s.shape}", f"Give at least one state, (B, {p})")
     budget.say("theorem and linear programs")

@@ -14,6 +14,7 @@ from jaxmpc.checks import fail, require_shape
 from jaxmpc.closed_loop.robot_controller import RobotController
 from jaxmpc.closed_loop.simulate_many import simulate_many
 from jaxmpc.compiled import default_chunk, padded
+from jaxmpc.control.system import host_array
 from jaxmpc.feasible.cascade import label_chunks
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import FeasibleSetMap
@@ -125,7 +126,7 @@ class RobotSetting:
             fixed = np.asarray(fixed, np.float64)
         problem = FeasibilityProblem.of(limited, axes, fixed)
         d = problem.dimension
-        points = np.asarray(points, np.float64)
+        points = host_array("x0s", points)
         if points.ndim != 2 or points.shape[1] != d or not len(points):
             cure = f"Give points (B, {d}), B ≥ 1, one column a mapped coordinate"
             fail("x0s", f"shape {points.shape}", cure)

@@ -68,23 +68,25 @@ def test_plans_that_are_proved_keep_limits_to_the_last_bit(terminal):
             ulps = 1 + RANDOM.integers(-50, 400) * 2.0**-53
             wide = lambda v: np.full_like(v, 1e6)
             upper, upper_N, level = wide(p.upper), wide(p.upper_N), 1e6
+            lower, lower_N, below = -upper, -upper_N, j % 3 == 0
             if i == -1:
                 level = (state @ p.P @ state) * ulps
             elif k < N:
-                upper[k, i] = (p.H[i] @ state) * ulps
+                ends, value = (lower, 2 - ulps) if below else (upper, ulps)
+                ends[k, i] = (p.H[i] @ state) * value
             else:
-                upper_N[i] = (p.H_N[i] @ state) * ulps
+                ends, value = (lower_N, 2 - ulps) if below else (upper_N, ulps)
+                ends[i] = (p.H_N[i] @ state) * value
             here = replace(
-                p,
-                upper=upper,
-                upper_N=upper_N,
-                level=np.float64(level) if p.P is not None else None,
-            )
+                p, lower=lower, upper=upper, lower_N=lower_N, upper_N=upper_N,
+                level=None if p.P is None else np.float64(level),
+            )  # fmt: skip
             proved.append(bool(run(here, x[j], u[j])))
             same = Constraints(plain_problem(view))
-            same.upper = [np.append(b[:m], row) for b, row in zip(q.upper, upper, strict=False)] + [
-                upper_N if len(upper_N) else q.upper[N]
-            ]
+            for name, rows, last in (("upper", upper, upper_N), ("lower", lower, lower_N)):
+                box = getattr(q, name)
+                parts = [np.append(b[:m], row) for b, row in zip(box, rows, strict=False)]
+                setattr(same, name, [*parts, last if len(last) else box[N]])
             if p.P is not None:
                 same.level = level
             margins.append(roll_out_exactly(same, x[j : j + 1], u[j : j + 1])[0])
