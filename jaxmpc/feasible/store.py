@@ -94,7 +94,7 @@ def label_fields(n: int, horizon: int, m: int, d: int) -> dict[str, Field]:
     flags = lambda values, names: {"flag_values": values, "flag_meanings": " ".join(names)}
     return {
         "label": Field((), "int8", 0, (), {
-            "long_name": "proved feasible (1), proved infeasible (-1) or undecided (0)",
+            "long_name": "label",
             **flags([-1, 0, 1], ["infeasible", "undecided", "feasible"]),
         }),
         "status": Field((), "int8", 0, (), {
