@@ -3,8 +3,8 @@
 Every float is a whole number times a power of two, and so are sums and products of floats. With all
 data of a problem written as integers over one 2ᵉ, a state after k steps is integers over
 2^((k+1)e): no rounding, no tolerance. What is checked is the problem as it is stored
-(`store.plain_problem`): x⁺ = Ax + Bu + c, rows lower ≤ Hx + Du ≤ upper, and a terminal ellipsoid
-x'Px ≤ level.
+(`FeasibilityProblem.plain`): x⁺ = Ax + Bu + c, rows lower ≤ Hx + Du ≤ upper, and a terminal
+ellipsoid x'Px ≤ level.
 
 *Feasible* (`roll_out_exactly`): the plan, rolled out from the state, keeps every row. Equalities
 are missed by rounding; there the plan counts that keeps them and differs by as little.
@@ -34,7 +34,7 @@ TINY = 1e-9
 
 class Constraints:
     """The hard constraints as float64 arrays: of each step k = 0..N the rows H[k], D[k], lower[k],
-    upper[k], D[N] being zero. `plain`: see `plain_problem`."""
+    upper[k], D[N] being zero. `plain`: see `FeasibilityProblem.plain`."""
 
     def __init__(self, plain: Mapping[str, Any]) -> None:
         """Stack the rows of each step."""

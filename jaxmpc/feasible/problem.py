@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import require_kind
-from jaxmpc.control.sets import Box, Polytope
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.feasible import constraint_rows, exact_data
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
@@ -18,6 +18,7 @@ from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.inequalities import condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Block
+from jaxmpc.runs import as_json
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +110,31 @@ class FeasibilityProblem:
         extent, _ = self.programs.bounding_box
         extent = np.array([-region, region]) if extent is None else extent
         return exact_data.exact_data(self.mpc, self.view, self.blocks, extent, size)
+
+    def plain(self) -> dict[str, Any]:
+        """Return the hard constraints as JSON data, from which stored labels can be verified.
+
+        A, B, c of x⁺ = Ax + Bu + c over `horizon` steps; moves: index of the free move that each
+        input equals. rows: lower ≤ Hx + Du ≤ upper at steps (None: no bound). ellipsoid: P and
+        level of x_N'Px_N ≤ level, or None. axes: the mapped states; others: the index of those
+        that are not, and their value or bounds.
+        """
+        mpc, view, set_ = self.mpc, self.view, self.mpc.terminal_set
+        A, B, c = exact_data.dynamics(mpc)
+        rows = [
+            {"steps": list(b.steps), "H": b.H, "D": b.D, "lower": b.lower, "upper": b.upper}
+            for b in self.blocks if b.radius is None
+        ]  # fmt: skip
+        ellipsoid = {"P": set_.P, "level": set_.level} if isinstance(set_, Ellipsoid) else None
+        others: dict[str, Any] = {"index": list(view.others)}
+        if view.projects:
+            others |= {"lower": view.lower, "upper": view.upper}
+        elif view.others:
+            others["value"] = np.asarray(view.fixed)[list(view.others)]
+        return as_json({
+            "A": A, "B": B, "c": c, "horizon": mpc.horizon, "moves": list(mpc.moves), "rows": rows,
+            "ellipsoid": ellipsoid, "axes": list(view.axes), "others": others,
+        })  # fmt: skip
 
     def row_margins(self, exact: ExactData, size: np.ndarray) -> np.ndarray:
         """Return what margins (R,) of the rows a proof needs relative to each other: as rounding

@@ -39,12 +39,10 @@ import zarr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from jaxmpc.checks import fail
-from jaxmpc.control.sets import Ellipsoid
-from jaxmpc.feasible.exact_data import dynamics
 from jaxmpc.feasible.labels import Labels, OnDemand
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.qp.status import Status
-from jaxmpc.runs import as_json, differences, fingerprint, versions
+from jaxmpc.runs import differences, fingerprint, versions
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -140,35 +138,8 @@ def open_labels(
         "time": Constant(period * np.arange(mpc.horizon), ("time",), {
             "long_name": "time of the input", "units": "s" if system.dt else "1"}),
     }  # fmt: skip
-    attributes = {"problem": plain_problem(problem)}
+    attributes = {"problem": problem.plain()}
     return Store(path, axes, all_fields, config, chunk, constants=constants, attributes=attributes)
-
-
-def plain_problem(problem: FeasibilityProblem) -> dict[str, Any]:
-    """Return the hard constraints of a problem as JSON data, from which labels can be verified.
-
-    x⁺ = Ax + Bu + c over `horizon` steps; moves: index of the free move that each input equals.
-    rows: lower ≤ Hx + Du ≤ upper at steps (None: no bound); where `radius` is given |Lx| ≤ radius
-    for L = H. ellipsoid: x_N'Px_N ≤ level. axes: the mapped states; others: their index, and their
-    value or bounds.
-    """
-    mpc, view = problem.mpc, problem.view
-    A, B, c = dynamics(mpc)
-    rows = [
-        {"steps": list(b.steps), "H": b.H, "D": b.D, "lower": b.lower, "upper": b.upper}
-        for b in problem.blocks if b.radius is None
-    ]  # fmt: skip
-    set_ = mpc.terminal_set
-    ellipsoid = {"P": set_.P, "level": set_.level} if isinstance(set_, Ellipsoid) else None
-    others: dict[str, Any] = {"index": list(view.others)}
-    if view.projects:
-        others |= {"lower": view.lower, "upper": view.upper}
-    elif view.others:
-        others["value"] = np.asarray(view.fixed)[list(view.others)]
-    return as_json({
-        "A": A, "B": B, "c": c, "horizon": mpc.horizon, "moves": list(mpc.moves), "rows": rows,
-        "ellipsoid": ellipsoid, "axes": list(view.axes), "others": others,
-    })  # fmt: skip
 
 
 def _name_and_unit(label: str) -> tuple[str, str]:

@@ -12,7 +12,6 @@ import jaxmpc as jm
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.exact_check import Constraints, beyond, roll_out, roll_out_exactly
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.store import plain_problem
 
 RANDOM = np.random.default_rng(3)
 N, n, m = 4, 3, 2
@@ -43,7 +42,7 @@ def exact(problem: FeasibilityProblem) -> tuple:
         p, move_lower=np.tile(p.u_lower, (N, 1)), move_upper=np.tile(p.u_upper, (N, 1)),
         left=np.ones((N, n)), side=np.zeros((N, n)), reach=np.zeros((N, n)),
     )  # fmt: skip
-    return p, Constraints(plain_problem(problem))
+    return p, Constraints(problem.plain())
 
 
 @pytest.mark.parametrize("terminal", TERMINAL)
@@ -82,7 +81,7 @@ def test_plans_that_are_proved_keep_limits_to_the_last_bit(terminal):
                 level=None if p.P is None else np.float64(level),
             )  # fmt: skip
             proved.append(bool(run(here, x[j], u[j])))
-            same = Constraints(plain_problem(view))
+            same = Constraints(view.plain())
             for name, rows, last in (("upper", upper, upper_N), ("lower", lower, lower_N)):
                 box = getattr(q, name)
                 parts = [np.append(b[:m], row) for b, row in zip(box, rows, strict=False)]

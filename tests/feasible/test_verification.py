@@ -90,7 +90,7 @@ def test_proves_all_labels(tmp_path, name):
 @pytest.mark.parametrize("name", ["terminal polytope", "terminal ellipsoid"])
 def test_roll_out_is_that_of_fractions(name):
     """Each margin to the last digit, and the bound of float64 below it."""
-    p = Constraints(store.plain_problem(FeasibilityProblem.of(PROBLEMS[name][0])))
+    p = Constraints(FeasibilityProblem.of(PROBLEMS[name][0]).plain())
     random = np.random.default_rng(0)
     starts, plans = random.normal(size=(4, 2)), random.normal(size=(4, 5, 1))
     exact = lambda v: np.vectorize(Fraction, otypes=[object])(v)
@@ -111,7 +111,7 @@ def test_roll_out_is_that_of_fractions(name):
 
 
 def test_rows_that_bound_an_input_alone():
-    plain = store.plain_problem(FeasibilityProblem.of(mpc()))
+    plain = FeasibilityProblem.of(mpc()).plain()
     plain["rows"][0] = {
         "steps": [0, 2], "H": [[0.0, 0.0], [0.0, 0.0], [0.0, 1.0]], "D": [[-1.0], [2.0], [1.0]],
         "lower": [-3.0, -1.0, -1.0], "upper": [None, 1.0, 1.0],
@@ -127,7 +127,7 @@ def test_an_empty_set(tmp_path):
     assert np.all(labels.label == -1)
     found = verify(tmp_path)
     assert found.passed and found.verified == 20
-    p = Constraints(store.plain_problem(FeasibilityProblem.of(problem)))
+    p = Constraints(FeasibilityProblem.of(problem).plain())
     zero, box = [np.zeros(len(rows)) for rows in p.lower], Programs(p).boxes()
     assert np.all(beyond(p, zero, np.zeros((3, 2)), box) == -np.inf)
 
@@ -144,7 +144,7 @@ def test_half_spaces_are_valid_for_any_multipliers():
     for name in ("box", "terminal ellipsoid", "control horizon", "projection"):
         problem, axes, fixed = PROBLEMS[name]
         view = FeasibilityProblem.of(problem, axes, fixed)
-        p = Constraints(store.plain_problem(view))
+        p = Constraints(view.plain())
         grid = jm.grid([-1.0, -1.2], [1.0, 1.0], (9, 9))
         inside = grid[jm.map_feasible_set(problem, grid, axes=axes, fixed=fixed).label == 1]
         random, box = np.random.default_rng(1), Programs(p).boxes()

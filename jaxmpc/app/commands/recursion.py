@@ -25,7 +25,7 @@ from jaxmpc.app.commands.robot_map import RobotMapCommand
 from jaxmpc.app.config.states import recursion_states
 from jaxmpc.checks import fail
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.store import LABELS, plain_problem
+from jaxmpc.feasible.store import LABELS
 from jaxmpc.recursion import (
     RecursionReport,
     SmallestHorizon,
@@ -207,7 +207,7 @@ class Recursion:
             name: getattr(report.labels, stored) for name, stored in LABELS.items()
         }  # fmt: skip
         facets |= {name: value for name, value in labels.items() if name != "label"}
-        plain = {"problem": plain_problem(FeasibilityProblem.of(report.mpc))}
+        plain = {"problem": FeasibilityProblem.of(report.mpc).plain()}
         write_arrays(
             self.output / "recursion.npz", plain, state=report.states, label=report.label,
             input=report.inputs, next_state=report.next_states, lost_at=report.lost_at,
