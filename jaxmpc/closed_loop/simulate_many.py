@@ -37,7 +37,8 @@ def simulate_many(
     """
     require_real("x0s", x0s)
     if np.ndim(x0s) != 2 or not len(x0s):
-        fail("x0s", f"shape {np.shape(x0s)}", "Give states (B, n), B ≥ 1")
+        size = getattr(controller, "state_size", "n")
+        fail("x0s", f"shape {np.shape(x0s)}", f"Give (B, {size}), B ≥ 1")
     x0s, variations = np.asarray(x0s), dict(variations or {})
     require_variations(plant, variations, len(x0s))
     if chunk is not None and chunk < 1:

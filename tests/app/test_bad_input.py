@@ -285,7 +285,7 @@ def test_a_byte_order_mark_is_accepted(refused, tmp_path):
 
 LINES = [
     # Commands.
-    ("", "no command given. There are sweep, recursion, info, simulate, tune"),
+    ("", "no command given. There are sweep, recursion, info, simulate, verify, tune"),
     ("swep", "no command 'swep'. Did you mean sweep?"),
     ("Sweep", "no command 'Sweep'"),
     ("--horizon 3", "no command '--horizon'"),
@@ -400,6 +400,12 @@ LINES = [
     ("recursion --seconds nan", "--seconds: nan. Give a positive number"),
     ("recursion --seconds inf", "--seconds: inf. Give a positive number"),
     ("recursion --smallest 0", "--smallest: 0"),
+    ("verify", "DIR"),
+    ("verify nowhere", "nowhere: holds no labels"),
+    ("verify file --sample -1", "--sample: -1"),
+    ("verify file --sample 1.5", "--sample: 1.5"),
+    ("verify file --exct", "--exct: no such option. Did you mean --exact?"),
+    ("verify a b", "b"),
     ("recursion --smallest 1000000", "--smallest: needs "),
     ("recursion --axes q", "--axes: given without --robot"),
     ("recursion --fixed 1", "--fixed: given without --robot"),

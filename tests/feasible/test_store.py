@@ -243,7 +243,7 @@ class TestDamage:
         """Of any file of any array, data or metadata."""
         random = np.random.default_rng(0)
         files = [v for v in full.rglob("*") if v.is_file() and v.parent != full]
-        for _ in range(60):
+        for _ in range(25):
             file = files[random.integers(len(files))]
             good = file.read_bytes()
             bad = bytearray(good)
