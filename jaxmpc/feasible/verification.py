@@ -227,7 +227,7 @@ def _verify_feasible(
         good = [j for j, at in enumerate(here) if int(at) not in result.failures]
         result.verified += len(good)
         result.exactly += int(np.sum(again[good]))
-        result.margin = min(result.margin, margin[good].min(initial=np.inf))
+        result.margin = min(result.margin, float(margin[good].min(initial=np.inf)))
         bar.update(len(here))
 
 

@@ -50,7 +50,9 @@ class Sweep:
                     and the half-space cut_normal'x <= cut_offset that no feasible state leaves.
                     start holds the x_0 of the plan; bound_* the points and facets of the bounds.
                     Opens with xarray.open_zarr(path): a dimension a mapped state.
-      Ctrl-C        Stops; finished chunks are kept, --resume goes on from there.
+      Ctrl-C        Stops; finished chunks are kept. --resume goes on from there, and computes
+                    again what is missing or damaged.
+      jaxmpc verify DIR proves every label again, from these files alone.
       Exit code     0 done, 2 error (one line on stderr says which), 130 stopped by Ctrl-C.
 
     With --robot NAME or FILE: the promise and the robot
