@@ -35,8 +35,8 @@ class Verification:
     exactly: how many of these in exact arithmetic. margin: the least margin of a limit along a
     plan, in the units of that limit; excess: the least by which an infeasible state lies beyond its
     half-space, relative to the largest entry of the normal; ∞ where there are none. failures: index
-    of each state whose label is not proved, with the reason. problems: what is wrong with the
-    store.
+    of each state whose label is not proved, with where it lies and the reason. problems: what is
+    wrong with the store.
     """
 
     labels: dict[str, int]
@@ -102,6 +102,9 @@ def verify(
     _compare_half_spaces(points, found.arrays, feasible, infeasible, result)
     if report:
         _verify_next_states(p, points, found.arrays, found.attributes, result)
+    result.failures = {
+        i: f"at {points[i].tolist()}: {reason}" for i, reason in result.failures.items()
+    }
     return result
 
 

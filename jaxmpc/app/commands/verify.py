@@ -69,7 +69,7 @@ class Verify:
         for problem in found.problems[:SHOWN]:
             print(f"  FAILS: {problem}")
         for index, reason in list(found.failures.items())[:SHOWN]:
-            print(f"  FAILS: state {index}: {reason}")
+            print(f"  FAILS: state {index} {reason}")
         more = len(found.problems[SHOWN:]) + len(list(found.failures)[SHOWN:])
         if more:
             print(f"  and {more:,} more")
