@@ -10,9 +10,8 @@ from jaxmpc.feasible.candidates import Verdict
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.qp.status import Status
 
-# The arrays of `Labels`.
-ARRAYS = ("label", "status", "starts", "plans", "cut_normals", "cut_offsets")
-PROOFS = ARRAYS[2:]
+# The arrays of `Labels` that may still be on the device.
+PROOFS = ("starts", "plans", "cut_normals", "cut_offsets")
 # The status of labels −1, 0 and 1.
 STATUS = np.array([Status.PRIMAL_INFEASIBLE, Status.ITERATION_LIMIT, Status.SOLVED], np.int8)
 

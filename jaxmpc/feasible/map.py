@@ -3,6 +3,7 @@
 import math
 import time
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -47,7 +48,12 @@ def grid(lower: Any, upper: Any, shape: Any) -> np.ndarray:
         fail("grid", f"lower {lower}, upper {upper}", "Give finite lower ≤ upper")
     require_memory("grid", 16 * len(shape) * math.prod(shape), "Give fewer points")
     lines = [np.linspace(*ends) for ends in zip(lower, upper, shape, strict=True)]
-    return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(shape))
+    return mesh(lines)
+
+
+def mesh(lines: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the points (B, d) of a grid with these d coordinates, the first one slowest."""
+    return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(lines))
 
 
 @dataclass(frozen=True)

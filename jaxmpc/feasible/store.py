@@ -39,7 +39,9 @@ import zarr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from jaxmpc.checks import fail
-from jaxmpc.feasible.labels import Labels, OnDemand
+from jaxmpc.compiled import padded
+from jaxmpc.feasible.labels import PROOFS, Labels, OnDemand
+from jaxmpc.feasible.map import mesh
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.qp.status import Status
 from jaxmpc.runs import differences, fingerprint, versions
@@ -109,6 +111,11 @@ def label_fields(n: int, horizon: int, m: int, d: int) -> dict[str, Field]:
         "cut_offset": Field((), "float64", np.nan, (), {
             "long_name": "offset b of the half-space a'x <= b; inf: proved at this state alone"}),
     }  # fmt: skip
+
+
+def label_rows(labels: Labels) -> dict[str, np.ndarray]:
+    """Return labels as the variables of `label_fields`."""
+    return {name: getattr(labels, stored) for name, stored in LABELS.items()}
 
 
 def open_labels(
@@ -221,6 +228,15 @@ class Store:
         """Return the indices of the blocks that are not done."""
         return np.flatnonzero(_array(self.group, "checksum")[:] == 0).tolist()
 
+    def batches(self) -> tuple[list[tuple[int, slice]], np.ndarray]:
+        """Return the blocks that are not done with their samples, and the indices (K, size) of
+        these samples: the first one of a smaller block fills it up to the size of the largest, so
+        that one compiled program takes them all."""
+        todo = [(block, self.rows(block)) for block in self.pending()]
+        size = max((rows.stop - rows.start for _, rows in todo), default=0)
+        index = [padded(np.arange(rows.start, rows.stop), size) for _, rows in todo]
+        return todo, np.array(index, int).reshape(len(todo), size)
+
     def commit(self, block: int, **rows: np.ndarray) -> None:
         """Write all variables of a block, (samples of the block, ...), then mark it done."""
         region, written = self.regions[block], []
@@ -241,7 +257,7 @@ class Store:
         """Return the labels in the store; proofs are read when they are used."""
         later = {
             stored: OnDemand(partial(self.read, name))
-            for name, stored in LABELS.items() if stored not in ("label", "status")
+            for name, stored in LABELS.items() if stored in PROOFS
         }  # fmt: skip
         return Labels(self.read("label"), self.read("status"), later)
 
@@ -394,8 +410,7 @@ class Stored:
         """Return the samples (B, d)."""
         if "points" in self.arrays:
             return self.arrays["points"]
-        mesh = np.meshgrid(*self.axes.values(), indexing="ij")
-        return np.stack([axis.ravel() for axis in mesh], axis=1)
+        return mesh(list(self.axes.values()))
 
 
 def read(path: str | Path) -> Stored:

@@ -152,7 +152,7 @@ def read_report(path: Path) -> Any:
     """Return the samples of a recursion report as `store.read` returns those of a map."""
     from jaxmpc.feasible.store import Stored
 
-    found, summary = read_arrays(path), None
+    found = read_arrays(path)
     if found is None or not isinstance(found[0], dict) or "state" not in found[1]:
         return Stored({}, {}, {}, 0, 0, [f"{path.name}: cannot be read"])
     record, arrays = found

@@ -69,7 +69,7 @@ def stored(path, mpc, axes, fixed, side=15):
     with store.open_labels(path, problem, along, {}, 128) as kept:
         for block in kept.pending():
             rows = kept.rows(block)
-            kept.commit(block, **{k: getattr(labels, v)[rows] for k, v in store.LABELS.items()})
+            kept.commit(block, **{k: v[rows] for k, v in store.label_rows(labels).items()})
     return labels
 
 

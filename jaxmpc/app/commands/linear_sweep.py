@@ -20,13 +20,12 @@ from jaxmpc.app.commands.options import (
 )
 from jaxmpc.app.config import Config, SweepPoints, sweep_points
 from jaxmpc.checks import fail
-from jaxmpc.compiled import CHUNK, padded
+from jaxmpc.compiled import CHUNK
 from jaxmpc.feasible import store
 from jaxmpc.feasible.candidates import StagePenalties
 from jaxmpc.feasible.cascade import label_chunks
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.store import LABELS
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.runs import versions, write_json
 from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
@@ -140,24 +139,20 @@ class LinearSweep:
 
     def label(self, penalties: StagePenalties | None) -> Timing:
         """Label the chunks that are not done, and commit each."""
-        todo = self.store.pending()
+        todo, index = self.store.batches()
         timing, decided = Timing(), 0
         if not todo:
             return timing
         region, settings = self.region, self.config.sweep
-        slices = [self.store.rows(k) for k in todo]
-        # Blocks of one size, that of the largest: points of its own fill up a smaller one.
-        size = max(rows.stop - rows.start for rows in slices)
-        points = np.concatenate([padded(region.points[rows], size) for rows in slices])
         chunks = label_chunks(
-            self.problem, points, chunk=size, iterations=settings.iterations,
-            dtype=settings.dtype, penalties=penalties,
+            self.problem, region.points[index.ravel()], chunk=index.shape[1],
+            iterations=settings.iterations, dtype=settings.dtype, penalties=penalties,
         )  # fmt: skip
-        total = sum(rows.stop - rows.start for rows in slices)
+        total = sum(rows.stop - rows.start for _, rows in todo)
         with tqdm(total=total, unit=" states", unit_scale=True, disable=None) as bar:
-            for block, here, (_, labels) in zip(todo, slices, chunks, strict=True):
+            for (block, here), (_, labels) in zip(todo, chunks, strict=True):
                 labels = labels.first(here.stop - here.start)
-                self.store.commit(block, **{k: getattr(labels, v) for k, v in LABELS.items()})
+                self.store.commit(block, **store.label_rows(labels))
                 timing.count += len(labels.label)
                 timing.compile_seconds += labels.compile_seconds
                 timing.run_seconds += labels.run_seconds

@@ -25,7 +25,7 @@ from jaxmpc.app.commands.robot_map import RobotMapCommand
 from jaxmpc.app.config.states import recursion_states
 from jaxmpc.checks import fail
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.store import LABELS
+from jaxmpc.feasible.store import label_rows
 from jaxmpc.recursion import (
     RecursionReport,
     SmallestHorizon,
@@ -203,9 +203,7 @@ class Recursion:
         facets: dict[str, Any] = {}
         if body is not None:
             facets = {"facet_normals": np.asarray(body.H), "facet_offsets": np.asarray(body.h)}
-        labels = {} if report.labels is None else {
-            name: getattr(report.labels, stored) for name, stored in LABELS.items()
-        }  # fmt: skip
+        labels = {} if report.labels is None else label_rows(report.labels)
         facets |= {name: value for name, value in labels.items() if name != "label"}
         plain = {"problem": FeasibilityProblem.of(report.mpc).plain()}
         write_arrays(

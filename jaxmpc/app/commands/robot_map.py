@@ -20,7 +20,7 @@ from jaxmpc.app.commands.options import (
 from jaxmpc.app.config.states import axis_indices, grid_ends
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.robot_mpc import robot_mpc
-from jaxmpc.compiled import first_rows, padded
+from jaxmpc.compiled import first_rows
 from jaxmpc.control.named_terminal import named_terminal_set
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import translated
@@ -168,20 +168,16 @@ class RobotMapCommand:
 
     def label(self, setting: RobotSetting, kept: store.Store) -> None:
         """Label the blocks that are not done, and commit each."""
-        todo = kept.pending()
+        todo, index = kept.batches()
         if not todo:
             return
-        slices = [kept.rows(k) for k in todo]
-        # Blocks of one size, that of the largest: points of its own fill up a smaller one.
-        size = max(here.stop - here.start for here in slices)
-        rows = np.concatenate([padded(np.arange(here.start, here.stop), size) for here in slices])
-        chunks = setting.chunks(rows, chunk=size, **self.settings)
-        with tqdm(total=sum(v.stop - v.start for v in slices), unit=" loops", disable=None) as bar:
-            for k, here, (_, labels, loops) in zip(todo, slices, chunks, strict=True):
+        total = sum(here.stop - here.start for _, here in todo)
+        chunks = setting.chunks(index.ravel(), chunk=index.shape[1], **self.settings)
+        with tqdm(total=total, unit=" loops", disable=None) as bar:
+            for (block, here), (_, labels, loops) in zip(todo, chunks, strict=True):
                 count = here.stop - here.start
-                first, looped = labels.first(count), first_rows(vars(loops), count)
-                arrays = {name: getattr(first, field) for name, field in store.LABELS.items()}
-                kept.commit(k, **arrays, **looped)
+                looped = first_rows(vars(loops), count)
+                kept.commit(block, **store.label_rows(labels.first(count)), **looped)
                 bar.update(count)
 
     def map(self, setting: RobotSetting, kept: store.Store) -> RobotMap:
