@@ -59,3 +59,19 @@ def _forget_programs():
             found.programs.clear()
     jax.clear_caches()
     gc.collect()
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    """Return a list to which each program that is compiled is added; clear it at will."""
+    import jax
+
+    found: list[str] = []
+
+    def note(event, seconds, **about):
+        if event == "/jax/core/compile/backend_compile_duration":
+            found.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    yield found
+    jax.monitoring.unregister_event_duration_listener(note)

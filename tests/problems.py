@@ -157,3 +157,25 @@ def rows_of(mpc, plans):
     """Multipliers of one plan (rows,), or of many, in the order of `row_table`."""
     flat = lambda multipliers: flat_multipliers(layout(mpc), multipliers)
     return np.asarray((jax.vmap(flat) if plans.cost.ndim else flat)(plans.multipliers))
+
+
+# The least that a file for the commands holds.
+MINIMAL_FILE = """
+[system]
+A = [[1.0, 1.0], [0.0, 1.0]]
+B = [[1.0], [0.5]]
+dt = 1.0
+state_names = ["p", "v"]
+[limits]
+x_min = [-5.0, -5.0]
+x_max = [5.0, 5.0]
+u_min = [-1.0]
+u_max = [1.0]
+[cost]
+Q = [1.0, 2.0]
+R = [1.0]
+[mpc]
+horizon = 3
+[sweep]
+grid = [3, 4]
+"""

@@ -28,18 +28,6 @@ def qp(**changes):
 
 
 M = mpc()
-COMPILED: list[str] = []
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _listen():
-    def note(event, seconds, **about):
-        if event == "/jax/core/compile/backend_compile_duration":
-            COMPILED.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(note)
-    yield
-    jax.monitoring.unregister_event_duration_listener(note)
 
 
 # How the answer begins, and the call.
@@ -618,13 +606,13 @@ CALLS = [
 
 
 @pytest.mark.parametrize(("message", "call"), CALLS, ids=range(len(CALLS)))
-def test_wrong_arguments_are_named(message, call):
-    COMPILED.clear()
+def test_wrong_arguments_are_named(message, call, compiled):
+    compiled.clear()
     with pytest.raises(ValueError) as caught:
         call()
     text = str(caught.value)
     assert text.startswith(message), text
-    assert "\n" not in text and len(text) < 300 and not COMPILED
+    assert "\n" not in text and len(text) < 300 and not compiled
 
 
 def test_wrong_arguments_of_a_controller_are_named():

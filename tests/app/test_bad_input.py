@@ -5,34 +5,15 @@ import shlex
 import subprocess
 import sys
 
-import jax
 import pytest
+from problems import MINIMAL_FILE
 
 from jaxmpc import checks
 from jaxmpc.app import cli
 from jaxmpc.app.commands import linear_sweep, recursion
 from jaxmpc.robots.load import load_robot
 
-FILE = """
-name = "case"
-[system]
-A = [[1.0, 1.0], [0.0, 1.0]]
-B = [[1.0], [0.5]]
-dt = 1.0
-state_names = ["p", "v"]
-[limits]
-x_min = [-5.0, -5.0]
-x_max = [5.0, 5.0]
-u_min = [-1.0]
-u_max = [1.0]
-[cost]
-Q = [1.0, 2.0]
-R = [1.0]
-[mpc]
-horizon = 3
-[sweep]
-grid = [3, 4]
-"""
+FILE = f'\nname = "case"{MINIMAL_FILE}'
 
 ROBOT = """
 [robot]
@@ -42,24 +23,14 @@ Q = [1.0, 1.0]
 R = [1.0]
 """
 
-COMPILED: list[str] = []
-
 
 @pytest.fixture(scope="module", autouse=True)
-def _listen():
-    load_robot("joint")  # reading a model compiles conversions
-
-    def note(event, seconds, **about):
-        if event == "/jax/core/compile/backend_compile_duration":
-            COMPILED.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(note)
-    yield
-    jax.monitoring.unregister_event_duration_listener(note)
+def _conversions():
+    load_robot("joint")  # reading a model compiles some
 
 
 @pytest.fixture
-def refused(tmp_path, monkeypatch, capsys):
+def refused(tmp_path, monkeypatch, capsys, compiled):
     """Run a command line that must be refused in one line before anything compiles; return it."""
     monkeypatch.chdir(tmp_path)
     forbidden = lambda *a, **k: pytest.fail("the work started")
@@ -67,11 +38,11 @@ def refused(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(recursion, "recursive_feasibility", forbidden)
 
     def run(line):
-        COMPILED.clear()
+        compiled.clear()
         assert cli.main(shlex.split(line)) == 2
         out, err = capsys.readouterr()
         assert err.startswith("jaxmpc: error: ") and err.count("\n") == 1 and err.endswith("\n")
-        assert not COMPILED and "Traceback" not in err and len(err) < 500 and not out
+        assert not compiled and "Traceback" not in err and len(err) < 500 and not out
         return err
 
     return run

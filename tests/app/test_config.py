@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from problems import MINIMAL_FILE
 from pydantic import TypeAdapter
 
 from jaxmpc.app.config import Config, load, load_robot_config, sweep_points
@@ -15,35 +16,15 @@ from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
-MINIMAL = """
-[system]
-A = [[1.0, 1.0], [0.0, 1.0]]
-B = [[1.0], [0.5]]
-dt = 1.0
-state_names = ["p", "v"]
-[limits]
-x_min = [-5.0, -5.0]
-x_max = [5.0, 5.0]
-u_min = [-1.0]
-u_max = [1.0]
-[cost]
-Q = [1.0, 2.0]
-R = [1.0]
-[mpc]
-horizon = 3
-[sweep]
-grid = [3, 4]
-"""
-
 
 @pytest.fixture
 def write(tmp_path):
-    """Write MINIMAL with one piece of text replaced (and more appended); give the path."""
+    """Write MINIMAL_FILE with one piece of text replaced (and more appended); give the path."""
 
     def write_file(old="", new="", more=""):
-        assert old in MINIMAL
+        assert old in MINIMAL_FILE
         path = tmp_path / "case.toml"
-        path.write_text(MINIMAL.replace(old, new, 1) + more)
+        path.write_text(MINIMAL_FILE.replace(old, new, 1) + more)
         return path
 
     return write_file
