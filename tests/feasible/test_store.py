@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
+from damage import turned_bits
 
 from jaxmpc.feasible import store
 from jaxmpc.feasible.store import Constant, Store
@@ -241,16 +242,8 @@ class TestDamage:
 
     def test_one_bit(self, full):
         """Of any file of any array, data or metadata."""
-        random = np.random.default_rng(0)
-        files = [v for v in full.rglob("*") if v.is_file() and v.parent != full]
-        for _ in range(25):
-            file = files[random.integers(len(files))]
-            good = file.read_bytes()
-            bad = bytearray(good)
-            bad[random.integers(len(bad))] ^= 1 << random.integers(8)
-            file.write_bytes(bad)
+        for file in turned_bits(full, 25):
             assert store.read(full).problems, file
-            file.write_bytes(good)
         assert not store.read(full).problems
 
 
