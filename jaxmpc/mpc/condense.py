@@ -95,8 +95,10 @@ class Condensed:
 
     def trajectory(self, theta: Array, z: Array) -> tuple[Array, Array]:
         """States (N+1, n) and inputs (N, m) that z predicts from θ."""
-        states = matmul(self.Phi, theta) + matmul(self.Gamma, z) + self.phi
-        inputs = matmul(self.Psi, theta) + matmul(self.Omega, z) + self.psi
+        # One product of the batch each, (B, nz)·(nz, rows), not one a step.
+        one = lambda M, v: matmul(v, M.reshape(-1, M.shape[-1]).T).reshape(M.shape[:-1])
+        states = one(self.Phi, theta) + one(self.Gamma, z) + self.phi
+        inputs = one(self.Psi, theta) + one(self.Omega, z) + self.psi
         return states, inputs
 
 

@@ -8,16 +8,9 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail, require_kind, require_memory, whole
-from jaxmpc.compiled import (
-    Compiled,
-    default_chunk,
-    first_rows,
-    padded,
-    require_step_type,
-    side_by_side,
-    workers,
-)
+from jaxmpc.compiled import require_step_type
 from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.mpc.batch import Batch
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller, plan_arguments
 from jaxmpc.mpc.plan import Plan, WarmStart
@@ -53,55 +46,47 @@ def solve(
 
 
 def solve_many(
-    mpc: MPC, x0s: Any, solver: ADMM = DEFAULT, *, dtype: Any = "float32", chunk: int | None = None
-) -> Plan:
+    mpc: MPC | Controller, x0s: Any, solver: ADMM = DEFAULT, *, dtype: Any = "float32",
+    chunk: int | None = None, transfer: bool = True, to_host: bool = True,
+) -> Plan:  # fmt: skip
     """Solve the MPC problem from each state x0s (B, n); the Plan holds host arrays, B in front.
 
     Where input rates are limited or weighted x0s may be (B, n + m), with the previous inputs in the
     last columns; (B, n) takes them as zero. The plans track the origin.
 
-    dtype: type of the ADMM iterates; Newton steps, residuals, status and the answer are float64
-    whatever it is, and whether or not 64-bit mode is on. chunk: states that a compiled program
-    takes at once; None: by device. A state with NaN gets status NON_FINITE. Raises ValueError for
-    wrong shapes and ill-posed problems.
+    mpc: the problem, or a Controller of it in float64, already condensed and factored, whose own
+    solver counts. dtype: type of the ADMM iterates; Newton steps, residuals, status and the answer
+    are float64 whatever it is, and whether or not 64-bit mode is on. chunk: states that a compiled
+    program takes at once; None: by device. transfer: of very many states with few coordinates solve
+    some, and let the others follow these (`transfer.py`). Each plan is judged by its own residuals
+    all the same: this changes the time, and which of several plans within the tolerances is found.
+    to_host: False leaves the plans on the device. A state with NaN gets status NON_FINITE. Raises
+    ValueError for wrong shapes and ill-posed problems.
     """
-    require_kind("mpc", mpc, MPC)
-    require_kind("solver", solver, ADMM)
-    mpc.validate()
-    x0s = host_array("x0s", x0s)
-    if x0s.ndim != 2 or x0s.shape[1] not in (mpc.system.n, mpc.dimension):
-        fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.system.n})")
-    x0s = np.pad(x0s, ((0, 0), (0, mpc.dimension - x0s.shape[1])))
-    require_step_type(dtype)
-    if chunk is None:
-        chunk = min(default_chunk(), -(-len(x0s) // workers()))
+    if isinstance(mpc, Controller):
+        controller, problem = mpc, mpc.mpc
+        if controller.dtype != np.float64:
+            fail("mpc", f"a controller in {controller.dtype}", "Make it with jax.enable_x64(True)")
     else:
+        require_kind("mpc", mpc, MPC)
+        mpc.validate()
+        controller, problem = None, mpc
+    require_kind("solver", solver, ADMM)
+    require_step_type(dtype)
+    if chunk is not None:
         whole("chunk", chunk, 1)
-    each = 8 * (mpc.horizon + 1) * (mpc.system.n + mpc.system.m)
+    n, p = problem.system.n, problem.dimension
+    if not (isinstance(x0s, Array) and x0s.dtype == np.float64):
+        x0s = host_array("x0s", x0s)
+    if x0s.ndim != 2 or x0s.shape[1] not in (n, p):
+        fail("x0s", f"shape {x0s.shape}", f"Give states (B, {n})")
+    each = 8 * (problem.horizon + 1) * (n + problem.system.m)
     require_memory("x0s", len(x0s) * each, "Solve some of them at a time")
-    size = max(min(chunk, len(x0s)), 1)
     with jax.enable_x64(True):
-        controller = Controller(in_float64(mpc), replace(solver, dtype=np.dtype(dtype).name))
-        program = _plans.program(controller, x0s[:size])
-
-    def part(start: int) -> Plan:
-        here = x0s[start : start + size]
-        with jax.enable_x64(True):
-            plans = program(controller, padded(here, size) if len(here) else here)
-        return first_rows(jax.tree.map(np.asarray, plans), len(here))
-
-    parts = side_by_side(part, range(0, max(len(x0s), 1), size))
-    return jax.tree.map(lambda *v: np.concatenate(v), *parts)
-
-
-@Compiled
-@jax.jit
-def _plans(controller: Controller, x0s: Array) -> Plan:
-    n = controller.mpc.system.n
-
-    def one(x: Array) -> Plan:
-        return controller.plan(
-            x[:n], previous_input=x[n:] if controller.mpc.input_in_state else None
-        )
-
-    return jax.vmap(one)(x0s)
+        if controller is None:
+            controller = Controller(
+                in_float64(problem), replace(solver, dtype=np.dtype(dtype).name)
+            )
+        if x0s.shape[1] < p:
+            x0s = np.pad(np.asarray(x0s), ((0, 0), (0, p - n)))
+        return Batch(controller, x0s, chunk, to_host).solve(transfer)

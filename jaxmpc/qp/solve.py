@@ -139,6 +139,28 @@ def solve_factored(
     return replace(found, z=z, y=y, cost=value(clean, z, y), iterations=steps), fault
 
 
+def solve_from(
+    qp: QP, factor: Factor, solver: ADMM, y: Array, steps: int
+) -> tuple[QPSolution, Array]:
+    """`solve_factored` by `steps` steps on the dual from multipliers y (m,) in ADMM's coordinates:
+    SOLVED, or ITERATION_LIMIT, at once where y is not finite. Multipliers of the solution need no
+    step. For hard rows, without balls, in float64; not differentiable."""
+    clean, fault = cleaned(qp, factor.fault)
+    q, bounds = scaled(factor, clean)
+    eps, proof = tolerance(solver, qp.q.dtype), Proof.none(q, bounds.l)
+    usable = jnp.all(jnp.isfinite(y))
+    dual = dual_point(factor.A, q, bounds, jnp.where(usable, y, 0.0))
+    if not steps:
+        z, y = unscaled(clean, factor, dual.w, dual.y)
+        return assess(residual_terms, (clean,), z, y, proof, eps), fault
+    p = Program(clean, factor, q, bounds, eps, Constants.of(qp.q.dtype).far)
+    pair, gradient = judged(p, dual.w, dual.y)
+    dual = replace(dual, w=dual.w - gradient)
+    open_ = usable & ~(pair.solved | pair.near | factor.flat)
+    pair = dual_steps(p, DualSearch(dual, pair, jnp.int32(0), open_, open_), steps).best
+    return assess(residual_terms, (clean,), pair.z, pair.y, proof, eps), fault
+
+
 def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = True) -> QPSolution:
     """Return the solution of clean data by ADMM and Newton steps, with its status, without its cost
     and count of iterations. whole: see `in_two_parts`."""
@@ -259,11 +281,7 @@ def improve(
         _, empty = farkas(qp, factor.E * begin.change, correcting)
         dual = dual_point(factor.A, p.q, p.bounds, begin.y)
         state = DualSearch(dual, best, jnp.int32(0), ~factor.flat & ~empty, jnp.asarray(True))
-        step, most = partial(on_the_dual, min(DUAL_STEPS, refine)), min(*qp.A.shape, MOST_ROWS)
-        few = None
-        if most > FEW_ROWS:
-            few = (lambda s: s.open & s.fits), partial(step, FEW_ROWS, must_fit=True)
-        state = repeat_while(lambda s: s.open, partial(step, most), p, state, few)
+        state = dual_steps(p, state, min(DUAL_STEPS, refine))
         best, go_on, y = state.best, ~state.best.solved, state.dual.y
         # Multipliers that grow without bound are nearly a Farkas vector.
         begin = replace(begin, change=jnp.where(diverged(p, y), y, begin.change))
@@ -291,6 +309,15 @@ class DualSearch:
     steps: Array
     open: Array
     fits: Array
+
+
+def dual_steps(p: Program, state: DualSearch, most: int) -> DualSearch:
+    """Return the search after steps on the dual, `most` of them at most."""
+    step, rows = partial(on_the_dual, most), min(*p.qp.A.shape, MOST_ROWS)
+    few = None
+    if rows > FEW_ROWS:
+        few = (lambda s: s.open & s.fits), partial(step, FEW_ROWS, must_fit=True)
+    return repeat_while(lambda s: s.open, partial(step, rows), p, state, few)
 
 
 def diverged(p: Program, y: Array) -> Array:

@@ -1,0 +1,134 @@
+"""Plans from many states: in chunks of one shape, on all cores, with transfer between states."""
+
+import functools
+import threading
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.compiled import Compiled, default_chunk, padded, side_by_side, workers
+from jaxmpc.mpc import transfer
+from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.plan import Plan
+from jaxmpc.qp.status import Status
+
+# States from which on transfer is tried: below, compiling its programs costs more than it saves.
+MANY = 32_768
+# States that a program takes at once on a CPU where there are fewer than a chunk.
+BLOCK = 1024
+# Of chunks so many or more, one is tried before all others; where fewer than this fraction of it is
+# solved by following, solving takes less time.
+TRIAL, LEAST = 16, 0.3
+# Steps on the dual from the law of a neighbour.
+STEPS = 24
+
+
+class Batch:
+    """Plans from the states x (B, p), which lie in NumPy or on the device.
+
+    chunk, block: states that a program takes at once, of many and of few. answer: the plans so far,
+    B in front.
+    """
+
+    def __init__(self, controller: Controller, x: Any, chunk: int | None, to_host: bool) -> None:
+        self.controller, self.x, self.to_host = controller, x, to_host
+        most = max(min(default_chunk(), -(-len(x) // workers())), 1)
+        self.chunk = max(min(chunk or most, len(x)), 1)
+        self.block = min(self.chunk, BLOCK if jax.default_backend() == "cpu" else 8 * BLOCK)
+        self.answer: Plan | None = None
+        self._lock = threading.Lock()
+
+    def solve(self, follow: bool) -> Plan:
+        """Return the plans from all states. follow: whether states may follow solved ones."""
+        B = len(self.x)
+        left = np.arange(B)
+        if follow and B >= MANY and transfer.transferable(self.controller):
+            left = self._transfer()
+        self._run(_plans, (self.controller,), left)
+        assert self.answer is not None
+        return self.answer
+
+    def _transfer(self) -> np.ndarray:
+        """Solve from some states, and from those that follow them; return the indices of those that
+        are left."""
+        index, cells = transfer.choose(self.x)
+        self._run(_plans, (self.controller,), index)
+        solved = jax.tree.map(lambda v: v[padded(index, len(cells.states))], self.answer)
+        laws = _laws(self.controller, solved.multipliers, solved.status)
+        arguments = (self.controller, laws, cells)
+        left = np.delete(np.arange(len(self.x)), index)
+        if len(left) >= TRIAL * self.chunk:
+            few = left[:: len(left) // self.chunk][: self.chunk]
+            self._run(_follow(0), arguments, few)
+            if np.mean(self._unsolved(few)) > 1 - LEAST:
+                return left
+        for steps in (0, STEPS):
+            self._run(_follow(steps), arguments, left)
+            left = left[self._unsolved(left)]
+        return left
+
+    def _unsolved(self, index: np.ndarray) -> np.ndarray:
+        """Return which of these states (k,) have no plan yet."""
+        assert self.answer is not None
+        return np.asarray(self.answer.status)[index] != Status.SOLVED
+
+    def _run(self, program: Compiled, arguments: tuple, index: np.ndarray) -> None:
+        """Put the plans of program(*arguments, states) from the states at `index` (k,) into
+        `answer`."""
+        size = self.chunk if len(index) >= self.chunk else self.block
+
+        def part(where: np.ndarray) -> None:
+            where = padded(where, size)
+            with jax.enable_x64(True):
+                x = self.x[where] if isinstance(self.x, np.ndarray) else _rows(self.x, where)
+                self._put(where, program.program(*arguments, x)(*arguments, x))
+
+        side_by_side(part, [index[i : i + size] for i in range(0, len(index), size)])
+
+    def _put(self, where: np.ndarray, plans: Plan) -> None:
+        B = len(self.x)
+        with self._lock:
+            if self.answer is None:
+                zeros = np.zeros if self.to_host else jnp.zeros
+                self.answer = jax.tree.map(lambda v: zeros((B, *v.shape[1:]), v.dtype), plans)
+            if not self.to_host:
+                self.answer = _put(self.answer, where, plans)
+                return
+        for all_, rows in zip(*map(jax.tree.leaves, (self.answer, plans)), strict=True):
+            all_[where] = np.asarray(rows)
+
+
+@jax.jit
+def _rows(x: Array, where: Array) -> Array:
+    return x[where]
+
+
+@partial(jax.jit, donate_argnums=0)
+def _put(answer: Plan, where: Array, plans: Plan) -> Plan:
+    return jax.tree.map(lambda v, rows: v.at[where].set(rows), answer, plans)
+
+
+@Compiled
+@jax.jit
+def _plans(controller: Controller, x: Array) -> Plan:
+    n = controller.mpc.system.n
+    previous = lambda x: x[n:] if controller.mpc.input_in_state else None
+    return jax.vmap(lambda x: controller.plan(x[:n], previous_input=previous(x)))(x)
+
+
+_laws = jax.jit(transfer.laws_of)
+
+
+@functools.cache
+def _follow(steps: int) -> Compiled:
+    """Return the program (controller, laws, cells, x (B, p)) → plans of `transfer.follow`."""
+
+    @jax.jit
+    def run(controller: Controller, laws: transfer.Laws, cells: transfer.Cells, x: Array) -> Plan:
+        return jax.vmap(partial(transfer.follow, controller, laws, cells, steps))(x)
+
+    return Compiled(run)
