@@ -1,7 +1,6 @@
 """The cascade: every point once and in order, the last programs, its limits and its errors.
 
-The problem is x⁺ = x + u with |x| ≤ 1 at k ≥ 1, |u| ≤ 0.3 and |x_N| ≤ 0.5: feasible for
-|x_0| ≤ 1.3, and a wider terminal limit plays no part.
+The problem is x⁺ = x + u with |x| ≤ 1 from k = 1 on and |u| ≤ 0.3: feasible for |x_0| ≤ 1.3.
 """
 
 import functools
@@ -75,6 +74,22 @@ class TestChunks:
         )
         require_proofs(self.POINTS, parts)
 
+    def test_one_at_a_time(self):
+        _, parts, label, _ = labelled(self.POINTS[:4], chunk=1)
+        np.testing.assert_array_equal(label, expected(self.POINTS[:4]))
+        assert [len(part.label) for part in parts] == [1, 1, 1, 1]
+
+    def test_points_that_are_decided_go_no_further(self, monkeypatch):
+        """The first stage runs once a chunk; others only where it leaves points."""
+        run, calls = cascade._run, []
+        monkeypatch.setattr(cascade, "_run", lambda *args: calls.append(args[0]) or run(*args))
+        easy, hard = np.array([0.0, 2.0, -0.1, -3.0]), np.array([0.0, 2.0, 1.3 - 1e-9, 1.3 + 1e-9])
+        label = labelled(np.append(easy, np.nan), iterations=100)[2]
+        np.testing.assert_array_equal(label[:4], expected(easy))
+        assert len(calls) == 1
+        np.testing.assert_array_equal(labelled(hard, iterations=1)[2], expected(hard))
+        assert len(calls) > 2 and len(set(calls)) > 2
+
     def test_points_that_are_not_finite(self):
         points = self.POINTS[:130].copy()
         bad = np.isin(np.arange(130), [0, 64, 77, 129])
@@ -106,34 +121,38 @@ class TestChunks:
 
 
 @pytest.fixture
-def only_programs(monkeypatch):
-    """The other stages decide nothing. Returns a function that counts points of the last check."""
-    run, given = cascade._run, []
+def hide(monkeypatch):
+    """hide(of): only linear programs decide the points x (B, 1) with of(x) (B,)."""
+    run = cascade._run
 
-    def without_verdict(program, *args):
-        found = run(program, *args)
-        if program is compiled_check():
-            given.append(np.unique(args[2]))
-            return found
-        verdict, *rest = found if isinstance(found, tuple) else (found,)
-        verdict = replace(verdict, label=0 * verdict.label)
-        return (verdict, *rest) if rest else verdict
+    def hide(of):
+        def without_verdict(program, *args):
+            found = run(program, *args)
+            if program is compiled_check():
+                return found
+            verdict, *rest = found if isinstance(found, tuple) else (found,)
+            label = np.where(of(np.asarray(args[2])), 0, verdict.label).astype(np.int8)
+            verdict = replace(verdict, label=label)
+            return (verdict, *rest) if rest else verdict
 
-    monkeypatch.setattr(cascade, "_run", without_verdict)
-    return given
+        monkeypatch.setattr(cascade, "_run", without_verdict)
+
+    return hide
 
 
 class TestLastPrograms:
     POINTS = np.array([-2.0, -1.31, -1.29, -0.5, 0.0, 0.7, 1.2999, 1.3001, 1.5])
 
-    def test_they_decide_what_is_left(self, only_programs):
+    def test_they_decide_what_is_left(self, hide):
+        hide(lambda x: x[:, 0] < 9)
         _, parts, label, _ = labelled(self.POINTS, chunk=4)
         np.testing.assert_array_equal(label, expected(self.POINTS))
         require_proofs(self.POINTS, parts)
 
     @pytest.mark.parametrize("chunk", [9, 4])
-    def test_no_more_than_may_run(self, only_programs, monkeypatch, chunk):
+    def test_no_more_than_may_run(self, hide, monkeypatch, chunk):
         """The first points in order, over all chunks."""
+        hide(lambda x: x[:, 0] < 9)
         monkeypatch.setattr(cascade, "MOST_PROGRAMS", 6)
         _, _, label, status = labelled(self.POINTS, chunk=chunk)
         np.testing.assert_array_equal(label[:6], expected(self.POINTS)[:6])
@@ -141,6 +160,22 @@ class TestLastPrograms:
         monkeypatch.setattr(cascade, "MOST_ENTRIES", 3 * scalar().rows.U.size - 1)
         label = labelled(self.POINTS, chunk=chunk)[2]
         assert np.count_nonzero(label) == 2 and np.all(label[:2] != 0)
+
+    def test_only_what_is_left_counts(self, hide, monkeypatch):
+        """Decided points before and after two others are no reason not to run their programs."""
+        hide(lambda x: np.isin(x[:, 0], self.POINTS[4:6]))
+        monkeypatch.setattr(cascade, "MOST_PROGRAMS", 2)
+        label = labelled(self.POINTS)[2]
+        np.testing.assert_array_equal(label, expected(self.POINTS))
+
+    def test_a_longer_run_before(self, hide, monkeypatch):
+        """Of what a chunk leaves, in as many batches as it takes, without any program."""
+        points = np.random.default_rng(6).uniform(-2, 2, 100)
+        hide(lambda x: len(x) == 100)
+        monkeypatch.setattr(cascade, "MOST_PROGRAMS", 0)
+        _, parts, label, _ = labelled(points, chunk=100)
+        np.testing.assert_array_equal(label, expected(points))
+        require_proofs(points, parts)
 
     def test_ray_from_the_centre(self):
         """Inside: a plan between those of the centre and of the ray's end, so that it keeps all
@@ -171,13 +206,12 @@ class TestLastPrograms:
             # Outside the plan is that of the end.
             np.testing.assert_allclose(w, w_end, atol=1e-6)
 
-    def test_unbounded_rays_and_flat_sets(self):
-        """Without an end of the ray the plan is that of the program; without a centre the margin
-        alone is left."""
-        flat = FeasibilityProblem.of(problems.scalar(u_max=0.3, terminal=0.0, x_max=0.0))
+    def test_flat_sets(self):
+        """Without a centre the margin alone is left."""
+        flat = FeasibilityProblem.of(problems.scalar(x_max=0.0, terminal=0.0))
         assert len(list(last_programs(flat, np.ones(len(flat.rows.U))))) == 1
-        label = [p.label for _, p in label_chunks(flat, np.array([[0.0], [0.1]]))][0]
-        assert label[1] == -1
+        ((_, labels),) = label_chunks(flat, np.array([[0.0], [0.1]]))
+        assert labels.label[0] >= 0 and labels.label[1] == -1
 
     def test_growth(self):
         """Rays once more in the units of an unstable mode, with the same ends."""
