@@ -35,7 +35,7 @@ MADE = {
     "lecture": (problems.lecture(), None, None),
     "ball": (ROUND, None, None),
     "drifting": (replace(problems.drifting(), prestabilise=GAIN), None, None),
-    "projection": (problems.drifting(), (1,), None),
+    "projection": (problems.lecture(), (1,), None),
     "slice": (replace(problems.drifting(), prestabilise=GAIN), (1,), np.array([0.2, 0.0])),
 }
 NAMES = pytest.mark.parametrize("name", MADE)
@@ -260,7 +260,7 @@ def test_feasibility_steps():
     for _ in range(5):
         s = box(ts[-1])
         ts.append(ts[-1] + 1.3 * (onto(2 * s - ts[-1]) - s))
-    for iterations in (1, 5):
+    for iterations in (1, 2, 5):
         last, before = feasibility_steps(
             lambda v: jax.numpy.clip(v, -1, 1), onto, jax.numpy.asarray(ts[0]), 1.3, iterations
         )
