@@ -48,8 +48,7 @@ def program(A=None, l=(), u=(), P=None, q=(), y=(), d=()):
 
 def _certify(qp, y, d):
     qp = jm.QP(*qp)
-    correcting = correcting_rows(qp)
-    return farkas(qp, y, correcting), descent_ray(qp, d), correcting
+    return farkas(qp, y, correcting_rows(qp)), descent_ray(qp, d)
 
 
 COMPILED = jax.jit(jax.vmap(_certify))
@@ -64,7 +63,7 @@ def certify(programs):
     for i in range(0, len(programs), size):
         some = [*programs[i : i + size], *[programs[0]] * size][:size]
         found = COMPILED(*jax.tree.map(lambda *v: np.stack(v), *some))
-        parts.append(jax.tree.leaves(found[:2]))
+        parts.append(jax.tree.leaves(found))
     return [np.concatenate(v)[: len(programs)] for v in zip(*parts, strict=True)]
 
 
