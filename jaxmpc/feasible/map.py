@@ -53,13 +53,24 @@ def grid(lower: Any, upper: Any, shape: Any) -> np.ndarray:
     return mesh(lines)
 
 
-def mesh(lines: Sequence[np.ndarray], rows: slice | None = None) -> np.ndarray:
-    """Return the points (B, d) of a grid with these d coordinates, the first one slowest; rows:
-    only these of them, which need no memory for the others."""
-    if rows is None:
+def mesh(lines: Sequence[np.ndarray], index: np.ndarray | None = None) -> np.ndarray:
+    """Return the points (B, d) of a grid with these d coordinates, the first one slowest; index
+    (k,): only these of them, which needs no memory for the others."""
+    if index is None:
         return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(lines))
-    index = np.unravel_index(np.arange(rows.start, rows.stop), [len(line) for line in lines])
-    return np.stack([line[i] for line, i in zip(lines, index, strict=True)], axis=-1)
+    place = np.unravel_index(index, [len(line) for line in lines])
+    return np.stack([line[i] for line, i in zip(lines, place, strict=True)], axis=-1)
+
+
+def count_labels(label: np.ndarray, status: np.ndarray) -> dict[str, int]:
+    """Return how many points are feasible, infeasible, undecided, not finite, not run."""
+    return {
+        "feasible": int(np.sum(label == 1)),
+        "infeasible": int(np.sum(label == -1)),
+        "undecided": int(np.sum(status == Status.ITERATION_LIMIT)),
+        "not finite": int(np.sum(status == Status.NON_FINITE)),
+        "not run": int(np.sum(status == Status.NOT_RUN)),
+    }
 
 
 @dataclass(frozen=True)
@@ -117,14 +128,7 @@ class FeasibleSetMap:
 
     def counts(self) -> dict[str, int]:
         """Return how many points are feasible, infeasible, undecided, not finite, not run."""
-        status, label = self.status, self.label
-        return {
-            "feasible": int(np.sum(label == 1)),
-            "infeasible": int(np.sum(label == -1)),
-            "undecided": int(np.sum(status == Status.ITERATION_LIMIT)),
-            "not finite": int(np.sum(status == Status.NON_FINITE)),
-            "not run": int(np.sum(status == Status.NOT_RUN)),
-        }
+        return count_labels(self.label, self.status)
 
     def inner(self) -> Polytope:
         """Return the convex hull of all points proved feasible: a subset of the feasible set.

@@ -265,6 +265,10 @@ class Store:
         blocks, give each the same bits in every run."""
         return math.prod(self.block_shape)
 
+    def samples(self, block: int) -> np.ndarray:
+        """Return the indices of the samples of a block."""
+        return np.r_[self.rows(block)]
+
     def pending(self) -> list[int]:
         """Return the indices of the blocks, of this shard, that are not done."""
         done = self._done()
@@ -293,7 +297,7 @@ class Store:
         these samples: the first one of a smaller block fills it up to the size of the largest, so
         that one compiled program takes them all."""
         todo = [(block, self.rows(block)) for block in self.pending()]
-        index = [padded(np.arange(rows.start, rows.stop), self.size) for _, rows in todo]
+        index = [padded(self.samples(block), self.size) for block, _ in todo]
         return todo, np.array(index, int).reshape(len(todo), self.size)
 
     def unfinished(self) -> str:
@@ -392,7 +396,7 @@ class Store:
                 self._create_array(group, name, overwrite=False)
         for name in self.constants:  # once more: whoever made the array may have been killed
             self._write_constant(_array(group, name), name)
-        group.update_attributes(self.attributes)
+        group.attrs.put(self.attributes)
         _consolidate(group)
 
     def _remove_leftovers(self) -> None:
