@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from jaxmpc.control.sets import Polytope
+from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.feasible.centered_polytope import power_of_two
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import FeasibleSetMap, count_labels, excluded, mesh
@@ -24,6 +24,8 @@ from jaxmpc.qp.status import Status
 # Points, or half-spaces, from which on they are reduced to those that matter, and the most mapped
 # states with which they are.
 MANY, REDUCED = 10_000, 4
+# Half-spaces that cut nothing off within so many sizes of the grid around it do not matter.
+FAR = 100.0
 # Lines of a picture along each axis, at most.
 LINES = 1024
 
@@ -64,7 +66,7 @@ class StoredMap:
             problem, np.zeros((0, problem.dimension)), Labels.empty(0, problem)
         )
         points = nothing.extra_points
-        cuts = HalfSpaces.none(np.array([np.ptp(line) for line in along]))
+        cuts = HalfSpaces.none(np.array([[line[0], line[-1]] for line in along]).T)
         lines = [len(line[:: step(line)]) for line in along]
         image = np.zeros(lines, np.int8) if len(along) == 2 else None
         found = cls(problem, kept, along, nothing, {}, [], image)
@@ -160,19 +162,21 @@ def extreme(points: np.ndarray) -> np.ndarray:
 class HalfSpaces:
     """Half-spaces normals (K, d) x ≤ offsets (K,) of which those that do not matter are dropped.
 
-    vertices: of their intersection when it was computed last; a half-space that holds at all of
-    them cuts nothing off. None while it is unbounded, or was not computed. size (d,): of the grid.
+    around (2, d): ends of a box, far around the grid, within which they matter. vertices: of their
+    intersection with it when it was computed last; a half-space that holds at all of them cuts
+    nothing off. None where it was not computed, or is empty or flat.
     """
 
     normals: np.ndarray
     offsets: np.ndarray
-    vertices: np.ndarray | None
-    size: np.ndarray
+    around: np.ndarray
+    vertices: np.ndarray | None = None
 
     @classmethod
-    def none(cls, size: np.ndarray) -> "HalfSpaces":
-        """Return no half-spaces."""
-        return cls(np.zeros((0, len(size))), np.zeros(0), None, power_of_two(size))
+    def none(cls, ends: np.ndarray) -> "HalfSpaces":
+        """Return no half-spaces. ends (2, d): of the grid."""
+        far = FAR * np.ptp(ends, axis=0)
+        return cls(np.zeros((0, len(far))), np.zeros(0), ends + np.array([-far, far]))
 
     def add(self, normals: np.ndarray, offsets: np.ndarray) -> "HalfSpaces":
         """Return these half-spaces and others (those with finite offsets), without those that do
@@ -196,14 +200,15 @@ class HalfSpaces:
         return found.reduced() if len(found.offsets) > MANY else found
 
     def reduced(self) -> "HalfSpaces":
-        """Return those that bound the intersection; the first ones where it is unbounded, empty or
-        flat."""
+        """Return those that bound the intersection; the first ones where it is empty or flat."""
         if self.normals.shape[1] > REDUCED:
             return self
+        unit = power_of_two(np.ptp(self.around, axis=0))
         names = tuple(map(str, range(len(self.offsets))))
+        box = Box(*(self.around / unit)).to_polytope()
         try:
-            body = Polytope(self.normals * self.size, self.offsets, names).reduce()
-            index, vertices = [int(name) for name in body.labels], body.vertices() * self.size
+            body = Polytope(self.normals * unit, self.offsets, names).intersect(box).reduce()
+            index, vertices = [int(name) for name in body.labels if name], body.vertices() * unit
         except ValueError:
             index, vertices = list(range(min(len(names), MANY))), None
         return replace(
