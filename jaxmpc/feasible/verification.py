@@ -59,11 +59,10 @@ def verify(
 ) -> Verification:  # fmt: skip
     """Prove every label of a stored map again, from its plans, half-spaces and problem.
 
-    path: a store that `jaxmpc sweep` or `jaxmpc recursion --robot` made, its URL, or the folder that
-    holds one; or the folder of a report of `jaxmpc recursion`, whose counterexample, and next
-    states that count as lost after one step, are proved again too. exact: all plans in exact
-    arithmetic, else a random sample of them and those with margins near rounding, the others in
-    float64; half-spaces
+    path: a store that `jaxmpc sweep` or `jaxmpc recursion --robot` made, its URL, or its folder; or
+    the folder of a report of `jaxmpc recursion`, whose counterexample, and next states that count
+    as lost after one step, are proved again too. exact: all plans in exact arithmetic, else a
+    random sample of them and those with margins near rounding, the others in float64; half-spaces
     are exact always. Nothing is written. Raises ValueError where there is no store.
     """
     from jaxmpc.feasible.store import read  # zarr takes longer to import than most reads
