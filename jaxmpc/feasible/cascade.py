@@ -60,11 +60,13 @@ class Scope:
     @classmethod
     def of(cls, points: np.ndarray, parts: int) -> "Scope":
         """Return the scope of points (B, d), of which some may not be finite."""
-        usable = np.all(np.isfinite(points), axis=1)
+        # Column by column: reductions along rows of few entries are slow.
+        usable = functools.reduce(np.logical_and, map(np.isfinite, points.T))
+        extent = np.array([np.max(np.abs(v), where=usable, initial=0.0) for v in points.T])
         sample = points[:: max(1, len(points) // SAMPLE)]
         sample = np.abs(sample[np.all(np.isfinite(sample), axis=1)])
         size = np.median(sample, axis=0) if len(sample) else np.zeros(points.shape[1])
-        return cls(np.abs(points[usable]).max(axis=0, initial=0.0), size, parts)
+        return cls(extent, size, parts)
 
     @classmethod
     def of_grid(cls, lines: Sequence[np.ndarray], parts: int) -> "Scope":
