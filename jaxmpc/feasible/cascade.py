@@ -1,11 +1,16 @@
-"""The cascade that labels points, chunk by chunk: ADMM on all, Newton on those undecided, and a
-linear program or three for each of the last, up to `MOST_PROGRAMS` points in a call."""
+"""The cascade that labels points, part by part: ADMM on all, Newton on those undecided, and a
+linear program or three for each of the last, up to `MOST_PROGRAMS` points of all parts together.
+
+The labels and proofs of a part depend on its own points, on the shape of a part and on the `Scope`
+of all points, not on which other parts a process has labelled: any split among processes gives the
+same bits.
+"""
 
 import functools
 import itertools
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -30,8 +35,9 @@ from jaxmpc.qp.precision import matmul
 
 # Steps of the longer ADMM run, relative to the first, on points that Newton leaves undecided.
 LONGER = 20
-# Points that get linear programs in one call of `label_chunks`, the first in order: so many, and no
-# more than these entries of their matrices in total. 10,000 entries take some tens of milliseconds.
+# Points that get linear programs, the first of each part in order: so many in all parts, each with
+# an equal share, and no more than these entries of their matrices in total. 10,000 entries take
+# some tens of milliseconds.
 MOST_PROGRAMS, MOST_ENTRIES = 2000, 2 * 10**7
 # Proofs of up to so many bytes in total stay on the device until they are used.
 ON_DEVICE = 2**31
@@ -39,29 +45,76 @@ ON_DEVICE = 2**31
 SAMPLE = 4096
 
 
+@dataclass(frozen=True)
+class Scope:
+    """What the labels of a part take from all points together.
+
+    largest, typical (d,): the largest and the median |θ|. parts: their number, which share the
+    linear programs.
+    """
+
+    largest: np.ndarray
+    typical: np.ndarray
+    parts: int
+
+    @classmethod
+    def of(cls, points: np.ndarray, parts: int) -> "Scope":
+        """Return the scope of points (B, d), of which some may not be finite."""
+        # Column by column: reductions along rows of few entries are slow.
+        usable = functools.reduce(np.logical_and, map(np.isfinite, points.T))
+        extent = np.array([np.max(np.abs(v), where=usable, initial=0.0) for v in points.T])
+        sample = points[:: max(1, len(points) // SAMPLE)]
+        sample = np.abs(sample[np.all(np.isfinite(sample), axis=1)])
+        size = np.median(sample, axis=0) if len(sample) else np.zeros(points.shape[1])
+        return cls(extent, size, parts)
+
+    @classmethod
+    def of_grid(cls, lines: Sequence[np.ndarray], parts: int) -> "Scope":
+        """Return the scope of the grid with these d coordinates."""
+        sizes = [np.abs(line) for line in lines]
+        largest, typical = (np.array([f(v) for v in sizes]) for f in (np.max, np.median))
+        return cls(largest, typical, parts)
+
+
 def label_chunks(
-    problem: FeasibilityProblem, points: Any, *, iterations: int = 50, dtype: Any = "float32",
-    chunk: int | None = None, penalties: StagePenalties | None = None,
+    problem: FeasibilityProblem, points: Any, *, chunk: int | None = None,
+    scope: Scope | None = None, label: Callable[..., Iterator[Labels]] | None = None,
+    **settings: Any,
 ) -> Iterator[tuple[slice, Labels]]:  # fmt: skip
-    """Label points chunk by chunk; yield (slice of the points, Labels). See `map_feasible_set`."""
+    """Label points chunk by chunk; yield (slice of the points, Labels). See `map_feasible_set`.
+
+    scope: None for that of these points. label: what labels the chunks, None for `label_parts`;
+    settings: further ones of it.
+    """
     d = problem.dimension
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != d:
         fail("x0s", f"shape {points.shape}", f"Give points (B, {d}), one column a mapped state")
     chunk = default_chunk() if chunk is None else chunk
-    if iterations < 1 or chunk < 1:
-        fail("iterations, chunk", f"{iterations}, {chunk}", "Give counts of at least 1")
+    if chunk < 1:
+        fail("chunk", f"{chunk}", "Give a count of at least 1")
+    chunk = min(chunk, max(len(points), 1))
+    slices = [slice(i, min(i + chunk, len(points))) for i in range(0, len(points), chunk)]
+    scope = Scope.of(points, len(slices)) if scope is None else scope
+    parts = (points[here] for here in slices)
+    found = (label or label_parts)(problem, parts, scope, chunk, **settings)
+    yield from zip(slices, found, strict=True)
+
+
+def label_parts(
+    problem: FeasibilityProblem, parts: Iterable[np.ndarray], scope: Scope, chunk: int, *,
+    iterations: int = 50, dtype: Any = "float32", penalties: StagePenalties | None = None,
+) -> Iterator[Labels]:  # fmt: skip
+    """Label parts, each an array of up to `chunk` points (b, d), in compiled programs for `chunk`;
+    yield their Labels in order. The next part is taken before the labels of one are yielded."""
+    if iterations < 1:
+        fail("iterations", f"{iterations}", "Give a count of at least 1")
     require_step_type(dtype)
     quick, back, alpha = _penalised(problem.rows, penalties)
-
-    usable = np.all(np.isfinite(points), axis=1)
-    sample = points[:: max(1, len(points) // SAMPLE)]
-    sample = np.abs(sample[np.all(np.isfinite(sample), axis=1)])
-    size = np.median(sample, axis=0) if len(sample) else np.zeros(d)
-    exact = problem.exact(np.abs(points[usable]).max(axis=0, initial=0.0), size)
-    margins = problem.row_margins(exact, size)
-    budget = min(MOST_PROGRAMS, MOST_ENTRIES // max(problem.rows.U.size, 1))
-    chunk = min(chunk, max(len(points), 1))
+    exact = problem.exact(scope.largest, scope.typical)
+    margins = problem.row_margins(exact, scope.typical)
+    programs = min(MOST_PROGRAMS, MOST_ENTRIES // max(problem.rows.U.size, 1))
+    share = -(-programs // max(scope.parts, 1))
     batch = gather_size(chunk)
     short, long = (
         compiled_admm(iterations, np.dtype(dtype)),
@@ -71,16 +124,16 @@ def label_chunks(
     with jax.enable_x64(True):
         exact, rows, quick = jax.device_put((exact, problem.rows, quick))
 
-    def started(here: slice) -> tuple[np.ndarray, np.ndarray, tuple[Verdict, Any]]:
-        """Return a chunk, which of it is usable, and the ADMM stage, which the device still works
+    def started(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[Verdict, Any]]:
+        """Return a part, which of it is usable, and the ADMM stage, which the device still works
         on."""
-        ok = padded(usable[here], chunk)
-        x = np.where(ok[:, None], padded(points[here], chunk), 0.0)
+        x = padded(points, chunk)
+        ok = np.all(np.isfinite(x), axis=1)
+        x = np.where(ok[:, None], x, 0.0)
         return x, ok, _run(short, exact, quick, x, alpha)
 
     def finished(x: np.ndarray, ok: np.ndarray, found: tuple[Verdict, Any]) -> Labels:
-        """Return the labels of a chunk, by all stages."""
-        nonlocal budget
+        """Return the labels of a part, by all stages."""
         labels, (verdict, w) = Labels.proved(found[0], ok), found
         if np.any((labels.label == 0) & ok):
             w = w if back is None else matmul(w.astype(np.float64), jnp.asarray(back.T))
@@ -94,8 +147,7 @@ def label_chunks(
             more = Labels.proved(_run(newton, exact, rows, again, all_, *found), all_)
             more = more.first(len(where))
             labels = labels.changed(where, more.label, more.status, more.proofs)
-        last = np.flatnonzero((labels.label == 0) & ok)[:budget]
-        budget -= len(last)
+        last = np.flatnonzero((labels.label == 0) & ok)[:share]
         for some_rows, program in last_programs(problem, margins) if len(last) else ():
             last = last[labels.label[last] == 0]
             for i in range(0, len(last), batch):
@@ -107,19 +159,21 @@ def label_chunks(
                 labels = labels.changed(where, more.label, more.status, more.proofs)
         return labels
 
-    slices = [slice(i, min(i + chunk, len(points))) for i in range(0, len(points), chunk)]
-    begun, compiled, ahead = time.perf_counter(), Compiled.seconds, None
-    for here, following in itertools.zip_longest(slices, slices[1:]):
+    begun, compiled, waiting = time.perf_counter(), Compiled.seconds, None
+    for points in itertools.chain(parts, [None]):
         with jax.enable_x64(True):
-            now = started(here) if ahead is None else ahead
-            ahead = None if following is None else started(following)
-            labels = finished(*now).first(here.stop - here.start)
-            if len(slices) * sum(v.nbytes for v in jax.tree.leaves(now[2])) > ON_DEVICE:
+            ahead = None if points is None else (len(points), started(points))
+            if waiting is None:
+                waiting = ahead
+                continue
+            count, now = waiting
+            labels = finished(*now).first(count)
+            if scope.parts * sum(v.nbytes for v in jax.tree.leaves(now[2])) > ON_DEVICE:
                 labels.fetch()
         compile_seconds = Compiled.seconds - compiled
         run_seconds = time.perf_counter() - begun - compile_seconds
-        yield here, replace(labels, compile_seconds=compile_seconds, run_seconds=run_seconds)
-        begun, compiled = time.perf_counter(), Compiled.seconds
+        yield replace(labels, compile_seconds=compile_seconds, run_seconds=run_seconds)
+        begun, compiled, waiting = time.perf_counter(), Compiled.seconds, ahead
 
 
 def last_programs(
@@ -129,10 +183,12 @@ def last_programs(
 
     First the ray from the centre through θ: inside, θ lies between the centre and the ray's end,
     and so do their plans; outside, the end's multipliers are few. Where the plant is unstable the
-    ray again, for multipliers in the units of its growth. Then the largest margin at θ.
+    ray again, for multipliers in the units of its growth. Then the largest margin at θ. Tangents to
+    a ball that the programs keep are those of this part's points.
     """
+    found = RowPrograms(problem.rows)
     try:
-        center, w_center = problem.programs.centre()
+        center, w_center = found.centre()
     except ValueError:  # flat or empty: no rays
         center = None
 
@@ -142,13 +198,13 @@ def last_programs(
             return programs.ray(center, theta - center)[1:]
 
         def between(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            t, w, y = problem.programs.ray(center, theta - center)
+            t, w, y = found.ray(center, theta - center)
             return (w_center + (w - w_center) / t if 1 <= t < np.inf else w), y
 
         yield problem.rows, between
         for rows in problem.weighted_rows:
             yield rows, functools.partial(end, RowPrograms(rows))
-    yield problem.rows, lambda theta: problem.programs.margin(theta, margins)
+    yield problem.rows, lambda theta: found.margin(theta, margins)
 
 
 def _run(program: Compiled, *args: Any) -> Any:

@@ -5,6 +5,7 @@ import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -20,6 +21,7 @@ from jaxmpc.feasible import proofs
 from jaxmpc.feasible.candidates import StagePenalties
 from jaxmpc.feasible.cascade import label_chunks
 from jaxmpc.feasible.centered_polytope import power_of_two
+from jaxmpc.feasible.executors import label_elsewhere
 from jaxmpc.feasible.labels import Labels, OnDemand
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays
@@ -51,9 +53,24 @@ def grid(lower: Any, upper: Any, shape: Any) -> np.ndarray:
     return mesh(lines)
 
 
-def mesh(lines: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the points (B, d) of a grid with these d coordinates, the first one slowest."""
-    return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(lines))
+def mesh(lines: Sequence[np.ndarray], index: np.ndarray | None = None) -> np.ndarray:
+    """Return the points (B, d) of a grid with these d coordinates, the first one slowest; index
+    (k,): only these of them, which needs no memory for the others."""
+    if index is None:
+        return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(lines))
+    place = np.unravel_index(index, [len(line) for line in lines])
+    return np.stack([line[i] for line, i in zip(lines, place, strict=True)], axis=-1)
+
+
+def count_labels(label: np.ndarray, status: np.ndarray) -> dict[str, int]:
+    """Return how many points are feasible, infeasible, undecided, not finite, not run."""
+    return {
+        "feasible": int(np.sum(label == 1)),
+        "infeasible": int(np.sum(label == -1)),
+        "undecided": int(np.sum(status == Status.ITERATION_LIMIT)),
+        "not finite": int(np.sum(status == Status.NON_FINITE)),
+        "not run": int(np.sum(status == Status.NOT_RUN)),
+    }
 
 
 @dataclass(frozen=True)
@@ -111,14 +128,7 @@ class FeasibleSetMap:
 
     def counts(self) -> dict[str, int]:
         """Return how many points are feasible, infeasible, undecided, not finite, not run."""
-        status, label = self.status, self.label
-        return {
-            "feasible": int(np.sum(label == 1)),
-            "infeasible": int(np.sum(label == -1)),
-            "undecided": int(np.sum(status == Status.ITERATION_LIMIT)),
-            "not finite": int(np.sum(status == Status.NON_FINITE)),
-            "not run": int(np.sum(status == Status.NOT_RUN)),
-        }
+        return count_labels(self.label, self.status)
 
     def inner(self) -> Polytope:
         """Return the convex hull of all points proved feasible: a subset of the feasible set.
@@ -337,7 +347,7 @@ def excluded(
 def map_feasible_set(
     mpc: MPC, x0s: Any, *, axes: Any = None, fixed: Any = None, iterations: int = 50,
     dtype: Any = "float32", chunk: int | None = None, refine: float | None = None,
-    penalties: StagePenalties | None = None, progress: bool = False,
+    penalties: StagePenalties | None = None, progress: bool = False, executor: Any = None,
 ) -> FeasibleSetMap:  # fmt: skip
     """Label each point: is there an input sequence that keeps every hard constraint of `mpc`?
 
@@ -349,9 +359,13 @@ def map_feasible_set(
     the inputs to the states (a terminal point) the proof is that inputs within rounding of the
     plan keep them exactly. iterations and dtype affect the ADMM stage alone and cannot make a
     label wrong. The last undecided points, up to 2,000 in a call, get linear programs of some
-    milliseconds each. chunk: number of points that a compiled program takes at once (None: by
-    device). refine: tolerance of `FeasibleSetMap.refine`, None to skip it. penalties: of the ADMM
-    stage, from `tune_sweep_penalties`. progress: show a bar.
+    milliseconds each, an equal share of each chunk. chunk: number of points that a compiled program
+    takes at once (None: by device). refine: tolerance of `FeasibleSetMap.refine`, None to skip it.
+    penalties: of the ADMM stage, from `tune_sweep_penalties`. progress: show a bar. executor: what
+    labels the chunks, such as a `concurrent.futures.ProcessPoolExecutor` with the start method
+    spawn, or the executor of a cluster: `submit(function, *arguments)` returns a future with
+    `result()`. Labels and proofs are those without it, bit for bit on processors of one kind. A
+    chunk whose worker died is submitted again up to 3 times, with a warning.
 
     A point with NaN or infinity gets status NON_FINITE and label 0. Raises ValueError for wrong
     shapes and ill-posed problems before anything compiles.
@@ -366,19 +380,22 @@ def map_feasible_set(
         require_kind("penalties", penalties, StagePenalties)
     result = map_points(
         problem, x0s, iterations=iterations, dtype=dtype, chunk=chunk, penalties=penalties,
-        progress=progress,
+        progress=progress, executor=executor,
     )  # fmt: skip
     return result if refine is None else result.refine(refine)
 
 
 def map_points(
     problem: FeasibilityProblem, points: Any, *, progress: bool = False,
-    deadline: float = np.inf, **settings: Any,
+    deadline: float = np.inf, executor: Any = None, **settings: Any,
 ) -> FeasibleSetMap:  # fmt: skip
     """Label the points (B, d) of a feasibility problem; settings: those of `label_chunks`.
 
-    deadline: of `time.monotonic`; chunks of points that are left then get status NOT_RUN.
+    deadline: of `time.monotonic`; chunks of points that are left then get status NOT_RUN. executor:
+    as in `map_feasible_set`.
     """
+    if executor is not None:
+        settings["label"] = partial(label_elsewhere, executor)
     points = host_array("x0s", points)
     parts, done = [Labels.empty(0, problem)], 0
     with tqdm(total=len(points), unit="pt", disable=not progress) as bar:

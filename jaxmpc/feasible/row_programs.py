@@ -146,9 +146,10 @@ class RowPrograms:
         Each side is moved out by the larger of the coordinate's two finite ends, which outweighs
         the tolerances of the linear programs.
         """
-        d = self.rows.D.shape[1]
+        d, programs = self.rows.D.shape[1], RowPrograms(self.rows)
         directions = np.concatenate([np.eye(d), -np.eye(d)])
-        ends, _, y = zip(*(self.support(row) for row in directions), strict=True)
+        # Programs of their own, so that no tangent comes from an earlier question.
+        ends, _, y = zip(*(programs.support(row) for row in directions), strict=True)
         if -np.inf in ends:
             return None, np.array(y)
         ends = np.reshape(ends, (2, d))

@@ -17,8 +17,21 @@ than were written counts as not done. Fill values (label and status 0, NaN) are 
 group appears under its name by one rename, complete with its attributes; zarr writes each chunk to
 a side file and renames it. A power cut can lose data, which the checksums show: zarr does not sync
 to the disk.
+
+Several processes write one store as its shards: block k belongs to shard k mod n. A shared lock of
+the folder keeps out whoever would write it alone; each shard has a lock file beside the store. The
+first process makes the store, those that lose the race for its name open it. What is not theirs
+(leftovers of killed processes, blocks of others) shards leave alone; the one that concludes removes
+leftovers.
+
+A URL of fsspec, such as s3://bucket/a.zarr, stands for a store of objects. A chunk is put there
+whole or not at all and its block's checksum after it, so that all said of blocks holds; but there
+are no locks and no rename. The attributes that make a group a store are written last, and
+processes that make the same store at once write the same. That no two processes compute the same
+shard is up to the caller there; two that do write the same data.
 """
 
+import contextlib
 import hashlib
 import itertools
 import json
@@ -28,7 +41,7 @@ import re
 import shutil
 import uuid
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -121,6 +134,7 @@ def label_rows(labels: Labels) -> dict[str, np.ndarray]:
 def open_labels(
     path: str | Path, problem: FeasibilityProblem, along: Sequence[np.ndarray],
     config: Mapping[str, Any], chunk: int, fields: Mapping[str, Field] | None = None,
+    shard: tuple[int, int] | None = None,
 ) -> "Store":  # fmt: skip
     """Open the store of the labels of a grid; see `Store`.
 
@@ -146,7 +160,10 @@ def open_labels(
             "long_name": "time of the input", "units": "s" if system.dt else "1"}),
     }  # fmt: skip
     attributes = {"problem": problem.plain()}
-    return Store(path, axes, all_fields, config, chunk, constants=constants, attributes=attributes)
+    return Store(
+        path, axes, all_fields, config, chunk, constants=constants, attributes=attributes,
+        shard=shard,
+    )  # fmt: skip
 
 
 def _name_and_unit(label: str) -> tuple[str, str]:
@@ -166,29 +183,35 @@ def dimension_names(names: Sequence[str], taken: Mapping[str, Any]) -> list[str]
 
 
 class Store:
-    """An open store; see the module. One process writes at a time."""
+    """An open store; see the module. One process writes at a time, or one each shard."""
 
     def __init__(
         self, path: str | Path, axes: Mapping[str, Constant], fields: Mapping[str, Field],
         config: Mapping[str, Any], chunk: int, *, constants: Mapping[str, Constant] | None = None,
-        attributes: Mapping[str, Any] | None = None,
+        attributes: Mapping[str, Any] | None = None, shard: tuple[int, int] | None = None,
     ) -> None:  # fmt: skip
-        """Open the store at `path` to write; make it where there is none.
+        """Open the store at `path`, a folder or a URL, to write; make it where there is none.
 
         axes: the coordinates of the samples, a grid's axes in their order or one array along
         `sample`. constants: further known variables. config: JSON data that describes the
         computation; attributes: JSON data that follow from it. chunk: samples of a block at most.
-        `damaged` becomes the number of blocks that were done and whose data are not as written;
-        they are to be computed again. Raises ValueError where the store was made with another
-        configuration, where another process writes, or where something else lies there.
+        shard: (i, n), 0 ≤ i < n, to write the blocks k with k mod n = i only, beside other
+        processes; None for all. `damaged` becomes the number of these blocks that were done and
+        whose data are not as written; they are to be computed again. Raises ValueError where the
+        store was made with another configuration, where another process writes (the same shard, or
+        all), or where something else lies there.
         """
-        self.path, self.fields, self.damaged = Path(path), dict(fields), 0
+        self.path, self.fields, self.damaged = location(path), dict(fields), 0
+        self.shard = shard
         self.constants = {**axes, **(constants or {})}
         self.shape = tuple(len(axis.data) for axis in axes.values())
         self.dimensions = tuple(axes)
         self.block_shape = block_shape(self.shape, chunk)
         self.regions = regions(self.shape, self.block_shape)
-        self._lock = _Lock(self.path.parent)
+        self.own = range(len(self.regions))[
+            slice(None) if shard is None else slice(*shard_of(shard))
+        ]
+        self._locks = list[_Lock]()
         variables = {
             "axes": list(axes), "constants": list(constants or {}), "fields": list(fields),
             "block": list(self.block_shape),
@@ -203,6 +226,10 @@ class Store:
             "versions": versions(),
         }
         try:
+            if isinstance(self.path, Path):
+                self._locks.append(_Lock(self.path.parent, shared=shard is not None))
+            if shard is not None:
+                self._lock_file("{}-of-{}".format(*shard), f"computes shard {shard[0]}/{shard[1]}")
             self._open()
         except BaseException:
             self.close()
@@ -216,7 +243,15 @@ class Store:
 
     def close(self) -> None:
         """Let other processes write."""
-        self._lock.release()
+        while self._locks:
+            self._locks.pop().release()
+
+    def _lock_file(self, name: str, work: str) -> None:
+        """Hold the lock of a part of the work; ValueError where another process does it. A store of
+        objects has no locks."""
+        if isinstance(self.path, Path):
+            file = f".{self.path.name}.{name}.lock"
+            self._locks.append(_Lock(self.path.parent, file=file, work=work))
 
     def rows(self, block: int) -> slice:
         """Return the samples of a block, counted in C order of the grid."""
@@ -224,18 +259,65 @@ class Store:
         first = int(np.ravel_multi_index([part.start for part in region], self.shape))
         return slice(first, first + math.prod(part.stop - part.start for part in region))
 
+    @property
+    def size(self) -> int:
+        """Return the number of samples of the largest block: programs of this size, which take all
+        blocks, give each the same bits in every run."""
+        return math.prod(self.block_shape)
+
+    def samples(self, block: int) -> np.ndarray:
+        """Return the indices of the samples of a block."""
+        return np.r_[self.rows(block)]
+
     def pending(self) -> list[int]:
-        """Return the indices of the blocks that are not done."""
-        return np.flatnonzero(_array(self.group, "checksum")[:] == 0).tolist()
+        """Return the indices of the blocks, of this shard, that are not done."""
+        done = self._done()
+        return [block for block in self.own if not done[block]]
+
+    def _done(self) -> np.ndarray:
+        """Return which blocks are marked as done; those whose marks cannot be read are not."""
+        marks = _array(self.group, "checksum")
+        try:
+            return np.asarray(marks[:]) != 0
+        except Exception:  # what a codec raises is its own
+            return np.array(
+                [self._mark(block) not in (0, None) for block in range(len(self.regions))]
+            )
+
+    def _mark(self, block: int) -> int | None:
+        """Return the stored checksum of a block, 0 where it is not done, None where it cannot be
+        read."""
+        try:
+            return int(np.asarray(_array(self.group, "checksum")[block]))
+        except Exception:
+            return None
 
     def batches(self) -> tuple[list[tuple[int, slice]], np.ndarray]:
         """Return the blocks that are not done with their samples, and the indices (K, size) of
         these samples: the first one of a smaller block fills it up to the size of the largest, so
         that one compiled program takes them all."""
         todo = [(block, self.rows(block)) for block in self.pending()]
-        size = max((rows.stop - rows.start for _, rows in todo), default=0)
-        index = [padded(np.arange(rows.start, rows.stop), size) for _, rows in todo]
-        return todo, np.array(index, int).reshape(len(todo), size)
+        index = [padded(self.samples(block), self.size) for block, _ in todo]
+        return todo, np.array(index, int).reshape(len(todo), self.size)
+
+    def unfinished(self) -> str:
+        """Return why a shard does not conclude the work of all: what is missing, in words; "" where
+        nothing is. Then this process alone concludes, until it closes the store, and leftovers of
+        killed processes are removed."""
+        if self.shard is None:
+            return ""
+        left = int(np.sum(~self._done()))
+        if not left:
+            try:
+                self._lock_file("end", "concludes")
+            except ValueError:
+                return "all blocks are done, and another process concludes"
+            others = [k for k in range(len(self.regions)) if k not in self.own]
+            left = self._check(others)
+        if left:
+            return f"{left:,} of {len(self.regions):,} blocks are missing, of other shards"
+        self._remove_leftovers()
+        return ""
 
     def commit(self, block: int, **rows: np.ndarray) -> None:
         """Write all variables of a block, (samples of the block, ...), then mark it done."""
@@ -248,9 +330,10 @@ class Store:
             written.append((name, value))
         _array(self.group, "checksum")[block] = checksum(dict(written))
 
-    def read(self, name: str) -> np.ndarray:
-        """Return a variable (samples, ...)."""
-        found = np.asarray(_array(self.group, name)[:])
+    def read(self, name: str, block: int | None = None) -> np.ndarray:
+        """Return a variable (samples, ...), of one block or of all."""
+        region = slice(None) if block is None else self.regions[block]
+        found = np.asarray(_array(self.group, name)[region])
         return found.reshape(-1, *found.shape[len(self.shape) :])
 
     def labels(self) -> Labels:
@@ -271,31 +354,69 @@ class Store:
                 name, data=value, overwrite=True, dimension_names=dimensions, compressors=CODECS,
                 attributes={"checksum": str(checksum({name: value}))},
             )  # fmt: skip
-        _consolidate(self.path)
+        _consolidate(self.group)
 
     def _open(self) -> None:
         """Open the group, made, checked and repaired as needed."""
-        for left in self.path.parent.glob(f".{self.path.name}.*"):  # of a run killed at the start
-            shutil.rmtree(left, ignore_errors=True)
-        if not self.path.exists():
-            self._create()
+        if self.shard is None:
+            self._remove_leftovers()
+        if not exists(self.path):
+            if isinstance(self.path, Path):
+                self._create(self.path)
+            else:
+                self._create_objects(self.path)
         self.group = _open(self.path, "r+")
         self._require_configuration()
         self._repair()
 
-    def _create(self) -> None:
-        """Create the store under a temporary name, then rename it to `path`."""
-        partial = self.path.with_name(f".{self.path.name}.{uuid.uuid4().hex}")
+    def _create(self, path: Path) -> None:
+        """Create the store under a temporary name, then rename it to `path`, unless another process
+        was first."""
+        partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
         group = zarr.open_group(partial, mode="w", zarr_format=3, attributes=self.attributes)
         for name in self._names():
             self._create_array(group, name)
-        _consolidate(partial)
-        os.rename(partial, self.path)
+        _consolidate(group)
+        try:
+            os.rename(partial, path)
+        except OSError:
+            shutil.rmtree(partial, ignore_errors=True)
+            if self.shard is None or not path.exists():
+                raise
+
+    def _create_objects(self, url: str) -> None:
+        """Create the store in place, attributes last; what another process has made of it stays."""
+        group = zarr.open_group(_place(url), mode="a", zarr_format=3)
+        maker = {"maker": self.attributes["fingerprint"]}
+        if dict(group.attrs) not in ({}, maker) or (not dict(group.attrs) and list(group.keys())):
+            fail(url, "is a zarr group but no sweep store", "Choose another output folder")
+        group.update_attributes(maker)
+        for name in self._names():
+            with contextlib.suppress(zarr.errors.ContainsArrayError):
+                self._create_array(group, name, overwrite=False)
+        for name in self.constants:  # once more: whoever made the array may have been killed
+            self._write_constant(_array(group, name), name)
+        group.attrs.put(self.attributes)
+        _consolidate(group)
+
+    def _remove_leftovers(self) -> None:
+        """Remove what killed processes have left: stores half made, lock files, chunks half
+        written."""
+        if not isinstance(self.path, Path):
+            return
+        for left in self.path.parent.glob(f".{self.path.name}.*"):
+            if left.is_dir():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                with contextlib.suppress(ValueError):  # it is held
+                    _Lock(left.parent, file=left.name).release()
+        for left in self.path.rglob("*.partial"):
+            left.unlink(missing_ok=True)
 
     def _names(self) -> list[str]:
         return [*self.constants, *self.fields, "checksum"]
 
-    def _create_array(self, group: zarr.Group, name: str) -> None:
+    def _create_array(self, group: zarr.Group, name: str, overwrite: bool = True) -> None:
         """Create one variable, without values but for constants."""
         options: dict[str, Any]
         if name in self.constants:
@@ -310,11 +431,15 @@ class Store:
             chunks = (*self.block_shape, *tail)
             options = dict(shape=(*self.shape, *tail), chunks=chunks, dtype=dtype, fill_value=fill)
         made = group.create_array(
-            name, dimension_names=dimensions, attributes=dict(attributes), overwrite=True,
+            name, dimension_names=dimensions, attributes=dict(attributes), overwrite=overwrite,
             compressors=CODECS, **options,
         )  # fmt: skip
         if name in self.constants:
-            made[...] = data if data.dtype.kind != "U" else data.astype(object)
+            self._write_constant(made, name)
+
+    def _write_constant(self, array: zarr.Array[Any], name: str) -> None:
+        data = self.constants[name].data
+        array[...] = data if data.dtype.kind != "U" else data.astype(object)
 
     def _require_configuration(self) -> None:
         """Raise unless the store was made with the same configuration and samples."""
@@ -333,32 +458,32 @@ class Store:
         )
 
     def _repair(self) -> None:
-        """Make what is missing or damaged new, and mark its blocks as not done."""
-        for left in self.path.rglob("*.partial"):
-            left.unlink(missing_ok=True)
+        """Make what is missing or damaged new, and mark its blocks as not done.
+
+        Of blocks, a shard looks at its own. It does not make variables new, which are of all.
+        """
         renewed = [name for name in self._names() if not self._is_sound(name)]
+        if renewed and self.shard is not None:
+            what = f"{', '.join(renewed)}: missing or damaged"
+            fail(str(self.path), what, "Stop all shards, and resume once without --shard")
         for name in renewed:
-            shutil.rmtree(self.path / name, ignore_errors=True)
+            del self.group[name]
             self._create_array(self.group, name)
         if renewed:
-            _consolidate(self.path)
-        self.damaged = len(self.regions) if "checksum" in renewed else 0
-        marks, sums = _array(self.group, "checksum"), self._checksums()
-        for block in np.flatnonzero(sums):
-            if sums[block] != self._checksum(int(block)):
-                marks[int(block)] = 0
-                self.damaged += 1
+            _consolidate(self.group)
+        lost = len(self.regions) if "checksum" in renewed else 0
+        self.damaged = self._check(self.own) or lost
 
-    def _checksums(self) -> np.ndarray:
-        """Return the checksums, 0 where one cannot be read."""
-        marks, found = _array(self.group, "checksum"), np.zeros(len(self.regions), np.uint64)
-        for block in range(len(found)):
-            try:
-                found[block] = marks[block]
-            except Exception:  # what a codec raises is its own
+    def _check(self, blocks: Iterable[int]) -> int:
+        """Mark those of the blocks as not done whose data are not as written; return their
+        number."""
+        marks, damaged = _array(self.group, "checksum"), 0
+        for block in blocks:
+            mark = self._mark(block)
+            if mark != 0 and mark != self._checksum(block):
                 marks[block] = 0
-                self.damaged += 1
-        return found
+                damaged += 1
+        return damaged
 
     def _is_sound(self, name: str) -> bool:
         """Return whether a variable exists as it was created, with its values if it is a
@@ -382,12 +507,12 @@ class Store:
             return False
 
     def _checksum(self, block: int) -> int:
-        """Return the checksum of the data of a block, 0 where they cannot be read."""
+        """Return the checksum of the data of a block, −1 where they cannot be read."""
         region = self.regions[block]
         try:
             return checksum({k: np.asarray(_array(self.group, k)[region]) for k in self.fields})
         except Exception:
-            return 0
+            return -1
 
 
 @dataclass(frozen=True)
@@ -415,7 +540,7 @@ class Stored:
 
 def read(path: str | Path) -> Stored:
     """Read a store and compare it with its checksums; raises ValueError where there is none."""
-    path = Path(path)
+    path = location(path)
     group = _open(path, "r")
     found: dict[str, Any] = dict(group.attrs)
     problems: list[str] = []
@@ -432,16 +557,14 @@ def read(path: str | Path) -> Stored:
     constants = {name: load(name) for name in names.get("constants", [])}
     arrays = {name: load(name) for name in [*names.get("fields", []), "checksum"]}
     record = {k: v for k, v in found.items() if k not in ("Conventions", "fingerprint", "versions")}
-    known = {**axes, **constants}
-    whole = {k: v for k, v in known.items() if v is not None}
+    whole = {k: v for k, v in {**axes, **constants}.items() if v is not None}
     if found["fingerprint"] != _fingerprint(record, whole):
         problems.append("configuration, axes or constants are not as they were written")
     try:
-        root = json.loads((path / "zarr.json").read_text())
+        root = json.loads(text_of(path, "zarr.json"))
         together = root["consolidated_metadata"]["metadata"]
         same = all(
-            json.loads((path / name / "zarr.json").read_text()) == one
-            for name, one in together.items()
+            json.loads(text_of(path, f"{name}/zarr.json")) == one for name, one in together.items()
         )
     except (OSError, ValueError, LookupError, TypeError):
         same = False
@@ -460,7 +583,11 @@ def read(path: str | Path) -> Stored:
         if sums[block] != checksum({k: v[region] for k, v in there.items()}):
             problems.append(f"block {block}: data are not as they were written")
     for name in BOUNDS:
-        if (path / name).exists() and (value := load(name)) is not None:
+        try:
+            known = name in group
+        except Exception:  # garbled: `load` says so
+            known = True
+        if known and (value := load(name)) is not None:
             if _array(group, name).attrs.get("checksum") != str(checksum({name: value})):
                 problems.append(f"{name}: data are not as they were written")
             constants[name] = value
@@ -476,14 +603,16 @@ def open_dataset(path: str | Path) -> "xr.Dataset":
     values. `xarray.open_zarr(path)` does the same."""
     import xarray as xr  # takes longer to import than to read
 
-    _open(Path(path), "r")
+    _open(location(path), "r")
     return xr.open_zarr(path)
 
 
 def remove(path: str | Path) -> None:
     """Delete the store at `path`, damaged or not; ValueError, and nothing deleted, where it is no
     store."""
-    path = Path(path)
+    path = location(path)
+    if not isinstance(path, Path):
+        fail(path, "is a store of objects", "Delete it with the tools of that store")
     metadata = [path / "zarr.json", *path.glob("*/zarr.json")]
     if not any(file.is_file() for file in metadata):
         fail(str(path), "is no sweep store", "Choose another output folder")
@@ -534,14 +663,63 @@ def regions(shape: Sequence[int], block: Sequence[int]) -> list[tuple[slice, ...
     return list(itertools.product(*along))
 
 
-def _open(path: Path, mode: Any) -> zarr.Group:
+def shard_of(shard: tuple[int, int]) -> tuple[int, None, int]:
+    """Return the first block of shard (i, n) and the step to the next, as arguments of a slice.
+
+    Raises ValueError unless 0 ≤ i < n."""
+    i, n = shard
+    if not 0 <= i < n:
+        fail("shard", f"{i}/{n}", "Give i/n with i from 0 to n - 1")
+    return i, None, n
+
+
+def location(path: str | Path) -> Path | str:
+    """Return the path of a store, or its URL where it is one of objects."""
+    text = str(path)
+    if text.startswith("file://"):
+        return Path(text.removeprefix("file://"))
+    return text if "://" in text else Path(path)
+
+
+def text_of(path: Path | str, name: str) -> str:
+    """Return the text of a file below a path or URL."""
+    if isinstance(path, Path):
+        return (path / name).read_text()
+    import fsspec
+
+    with fsspec.open(f"{path}/{name}", "r") as file:
+        return str(file.read())
+
+
+def exists(path: Path | str) -> bool:
+    """Return whether something lies at a path, or a complete store of objects at a URL."""
+    if isinstance(path, Path):
+        return path.exists()
+    try:
+        group = zarr.open_group(_place(path), mode="r", use_consolidated=False)
+    except FileNotFoundError:
+        return False
+    return "fingerprint" in group.attrs
+
+
+def _place(path: Path | str) -> Any:
+    """Return what zarr opens at a path or URL. Raises ValueError where fsspec cannot open it."""
+    if isinstance(path, Path):
+        return path
+    try:
+        return zarr.storage.FsspecStore.from_url(path)
+    except (ImportError, ValueError) as error:
+        fail(path, f"{error}", "Install fsspec and what it needs for this kind of URL")
+
+
+def _open(path: Path | str, mode: Any) -> zarr.Group:
     """Open a store; raise ValueError where `path` holds something else."""
     try:
-        group = zarr.open_group(path, mode=mode, use_consolidated=False)
+        group = zarr.open_group(_place(path), mode=mode, use_consolidated=False)
         there = "fingerprint" in group.attrs
     except Exception as error:  # of a file system, or of a parser of garbled metadata
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        known = (path / "zarr.json").is_file()
+        known = isinstance(path, Path) and (path / "zarr.json").is_file()
         what = (
             "is damaged: its metadata cannot be read" if known else f"is no sweep store ({reason})"
         )
@@ -551,11 +729,11 @@ def _open(path: Path, mode: Any) -> zarr.Group:
     return group
 
 
-def _consolidate(path: Path) -> None:
+def _consolidate(group: zarr.Group) -> None:
     """Write the metadata of all variables to the group, so that readers need one file."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # zarr says that its format 3 has no standard for it yet
-        zarr.consolidate_metadata(path)
+        zarr.consolidate_metadata(group.store)
 
 
 def _array(group: zarr.Group, name: str) -> zarr.Array[Any]:
@@ -565,30 +743,50 @@ def _array(group: zarr.Group, name: str) -> zarr.Array[Any]:
 
 
 class _Lock:
-    """A lock of a folder against other processes that write; the end of the process releases it
-    too."""
+    """A lock against other processes that write; the end of the process releases it too.
 
-    def __init__(self, folder: Path) -> None:
-        """Raise ValueError where another process holds it. Where the system or the file system has
-        no such locks (Windows has none), nothing is locked."""
-        self._folder: int | None = None
+    Of a folder, or of a file in it that is made for the lock and removed with it: file systems of a
+    network have locks of files, not of folders.
+    """
+
+    def __init__(
+        self, folder: Path, *, shared: bool = False, file: str = "", work: str = "writes there"
+    ) -> None:
+        """Raise ValueError where another process holds it, unless both share it. Where the system
+        or the file system has no such locks (Windows has none), nothing is locked."""
+        self._held: int | None = None
+        self.file = folder / file if file else None
         folder.mkdir(parents=True, exist_ok=True)
         try:
             import fcntl
 
-            self._folder = os.open(folder, os.O_RDONLY)
-            fcntl.flock(self._folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+            while self._held is None:
+                place, flags = (self.file, os.O_RDWR | os.O_CREAT) if self.file else (folder, 0)
+                self._held = os.open(place, flags)
+                fcntl.flock(self._held, kind | fcntl.LOCK_NB)
+                try:
+                    there = os.path.samestat(os.fstat(self._held), os.stat(place))
+                except FileNotFoundError:
+                    there = False
+                if not there:  # its last holder removed the file after it was opened here
+                    self._close()
         except BlockingIOError:
-            self.release()
+            self._close()
             cure = "Wait for it, or choose another output"
-            fail(str(folder), "another process writes there", cure)
+            fail(str(folder), f"another process {work}", cure)
         except (ImportError, OSError):
-            self.release()
+            self._close()
 
-    def release(self, close: Callable[[int], None] = os.close) -> None:
+    def release(self) -> None:
         """Let others write."""
-        if self._folder is not None:
-            close(self._folder)
-            self._folder = None
+        if self._held is not None and self.file is not None:
+            self.file.unlink(missing_ok=True)
+        self._close()
 
-    __del__ = release
+    def _close(self, close: Callable[[int], None] = os.close) -> None:
+        if self._held is not None:
+            close(self._held)
+            self._held = None
+
+    __del__ = _close

@@ -59,17 +59,17 @@ def verify(
 ) -> Verification:  # fmt: skip
     """Prove every label of a stored map again, from its plans, half-spaces and problem.
 
-    path: a store that `jaxmpc sweep` or `jaxmpc recursion --robot` made, or the folder that holds
-    one; or the folder of a report of `jaxmpc recursion`, whose counterexample, and next states that
-    count as lost after one step, are proved again too. exact: all plans in exact arithmetic, else a
+    path: a store that `jaxmpc sweep` or `jaxmpc recursion --robot` made, its URL, or its folder; or
+    the folder of a report of `jaxmpc recursion`, whose counterexample, and next states that count
+    as lost after one step, are proved again too. exact: all plans in exact arithmetic, else a
     random sample of them and those with margins near rounding, the others in float64; half-spaces
     are exact always. Nothing is written. Raises ValueError where there is no store.
     """
     from jaxmpc.feasible.store import read  # zarr takes longer to import than most reads
 
-    path = find_store(Path(path))
-    report = path.suffix == ".npz"
-    found = read_report(path) if report else read(path)
+    path = find_store(path)
+    report = isinstance(path, Path) and path.suffix == ".npz"
+    found = read_report(Path(path)) if report else read(path)
     label, status = found.arrays.get("label"), found.arrays.get("status")
     result = Verification({}, problems=list(found.problems))
     if found.done < found.blocks:
@@ -136,8 +136,12 @@ def _compare_half_spaces(
             result.problems.append(f"{what} excludes a feasible state by {off[j]:.3g}")
 
 
-def find_store(path: Path) -> Path:
-    """Return the store at `path` or in that folder, or the arrays of a recursion report there."""
+def find_store(path: str | Path) -> str | Path:
+    """Return the store at `path` or in that folder, or the arrays of a recursion report there; a
+    URL as it is."""
+    if "://" in str(path):
+        return str(path)
+    path = Path(path)
     if (path / "zarr.json").exists() or path.suffix == ".npz":
         return path
     names = ("sweep.zarr", "robot_map.zarr", "recursion.npz")

@@ -15,7 +15,7 @@ from jaxmpc.closed_loop.robot_controller import RobotController
 from jaxmpc.closed_loop.simulate_many import simulate_many
 from jaxmpc.compiled import default_chunk, padded
 from jaxmpc.control.system import host_array
-from jaxmpc.feasible.cascade import label_chunks
+from jaxmpc.feasible.cascade import Scope, label_chunks
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.problem import FeasibilityProblem
@@ -175,7 +175,8 @@ class RobotSetting:
         """
         points = self.points if rows is None else self.points[rows]
         size = self.chunk(chunk)
-        labelled = label_chunks(self.problem, points, chunk=size, **settings)
+        scope = Scope.of(self.points, -(-len(self.points) // size))
+        labelled = label_chunks(self.problem, points, chunk=size, scope=scope, **settings)
         for here, labels in labelled:
             yield here, labels, self.run(points[here], size)
 

@@ -34,7 +34,7 @@ def refused(tmp_path, monkeypatch, capsys, compiled):
     """Run a command line that must be refused in one line before anything compiles; return it."""
     monkeypatch.chdir(tmp_path)
     forbidden = lambda *a, **k: pytest.fail("the work started")
-    monkeypatch.setattr(linear_sweep, "label_chunks", forbidden)
+    monkeypatch.setattr(linear_sweep, "label_parts", forbidden)
     monkeypatch.setattr(recursion, "recursive_feasibility", forbidden)
 
     def run(line):
@@ -162,7 +162,7 @@ KEYS = [
     ("grid = [3, 4]", "grid = [3, true]", "sweep.grid"),
     ("grid = [3, 4]", 'grid = ["3", "4"]', "sweep.grid"),
     ("grid = [3, 4]", "grid = 3", "sweep.grid"),
-    ("grid = [3, 4]", "grid = [30000, 30000]", "sweep.grid: needs 88.2 GB of memory, 8 GB are"),
+    ("grid = [3, 4]", "grid = [1000000, 1000000]", "sweep.grid: needs 12.21 GB of memory, 8 GB"),
     ("grid = [3, 4]", "grid = [3, 1" + "0" * 30 + "]", "sweep.grid"),
     ("grid = [3, 4]", "lower = [1.0, 1.0]\nupper = [0.0, 2.0]", "sweep.lower: entry 0 is 1"),
     ("grid = [3, 4]", "lower = [9.0, 9.0]", "sweep.lower.*not below upper"),
@@ -312,7 +312,7 @@ LINES = [
     ("sweep --grid 5 5 5", "command line: --grid: has 3 entries"),
     ("sweep --grid 1 5", "command line: --grid: "),
     ("sweep --grid -5 5", "command line: --grid: "),
-    ("sweep --grid 30000 30000", "command line: --grid: needs 210.6 GB of memory, 8 GB are free"),
+    ("sweep --grid 1000000 1000000", "command line: --grid: needs 12.22 GB of memory, 8 GB are"),
     ("sweep --grid 1000000000 1000000000", "command line: --grid: needs "),
     ("sweep --lower x y", "--lower: x y. Give numbers"),
     ("sweep --lower 1 0 --upper -1 0", "command line: --lower: entry 0 is 1"),

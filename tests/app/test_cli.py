@@ -31,7 +31,7 @@ def _in_empty_folder(tmp_path, monkeypatch):
 def no_compile(monkeypatch):
     """Fail if the sweep starts: errors must be found before."""
     monkeypatch.setattr(
-        linear_sweep, "label_chunks", lambda *a, **k: pytest.fail("the sweep started")
+        linear_sweep, "label_parts", lambda *a, **k: pytest.fail("the sweep started")
     )
 
 
@@ -132,7 +132,7 @@ def test_file_slice_and_overwrite(tmp_path, capsys):
 
 def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(linear_sweep, "CHUNK", 50)
-    real = linear_sweep.label_chunks
+    real = linear_sweep.label_parts
 
     def interrupted(*args, **kwargs):
         for k, chunk in enumerate(real(*args, **kwargs)):
@@ -140,23 +140,23 @@ def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsy
                 signal.raise_signal(signal.SIGINT)
             yield chunk
 
-    monkeypatch.setattr(linear_sweep, "label_chunks", interrupted)
+    monkeypatch.setattr(linear_sweep, "label_parts", interrupted)
     assert run("sweep --grid 16 12 --horizon 5 --output 'my maps'") == 130
     out = capsys.readouterr().out
     assert "jaxmpc sweep --grid 16 12 --horizon 5 --output 'my maps' --resume" in out
     assert "chunks that were done are kept" in out
     asked = []
 
-    def counted(mpc, points, **kwargs):
-        asked.append(points)
-        return real(mpc, points, **kwargs)
+    def counted(mpc, parts, *args, **kwargs):
+        asked.append(list(parts))
+        return real(mpc, asked[-1], *args, **kwargs)
 
-    monkeypatch.setattr(linear_sweep, "label_chunks", counted)
+    monkeypatch.setattr(linear_sweep, "label_parts", counted)
     resume = "sweep --grid 16 12 --horizon 5 --output 'my maps' --resume"
     assert run(resume) == 0
     data = xr.open_zarr(tmp_path / "my maps" / "sweep.zarr")
     points = np.stack(np.meshgrid(data["q"], data["dq"], indexing="ij"), axis=-1)
-    np.testing.assert_array_equal(asked[0], points.reshape(-1, 2)[48:])
+    np.testing.assert_array_equal(np.concatenate(asked[0]), points.reshape(-1, 2)[48:])
     assert np.all(data["status"] != 0)
     assert run(resume) == 0 and len(asked) == 1
 
@@ -212,7 +212,7 @@ def test_help_is_a_page_a_stranger_can_use(capsys):
     assert caught.value.code == 0
     text = capsys.readouterr().out
     options = """config output horizon terminal grid lower upper axes fixed projection iterations
-        dtype resume overwrite no-refine"""
+        dtype shard store resume overwrite no-refine"""
     for word in options.split():
         assert f"--{word}" in text
     assert text.count("(default:") >= 14

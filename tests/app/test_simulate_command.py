@@ -17,8 +17,10 @@ from PIL import Image
 import jaxmpc as jm
 from jaxmpc.app import cli
 from jaxmpc.app.commands import robot_runs
+from jaxmpc.app.commands.robot_samples import draw_robots
 from jaxmpc.app.plots import plot_runs
 from jaxmpc.closed_loop.outcome import evaluate_runs
+from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.video import render, save_video
 
 # Models at the set-point compile in half the time.
@@ -282,6 +284,7 @@ from jaxmpc.app.commands.film import choose_renderer
 choose_renderer()
 import jaxmpc as jm
 from jaxmpc.closed_loop.outcome import evaluate_runs
+from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.video import render, save_video
 q = np.linspace(0, 1.2, 9)
 states = np.zeros((3, 9, 2))
@@ -350,3 +353,13 @@ def test_film_refuses_what_it_cannot_draw(tmp_path, monkeypatch, joint):
     monkeypatch.setitem(sys.modules, "imageio.v3", None)
     with pytest.raises(ValueError, match=r"imageio\[ffmpeg\]"):
         save_video(tmp_path / "a.mp4", frames, 25)
+
+
+def test_numbers_of_a_robot_do_not_depend_on_how_many_there_are():
+    """Nor, then, on how they are split into blocks, or resumed."""
+    robot, settings = load_robot("joint"), dict(spread=0.5, mass=0.1, damping=0.2, payload=1.0)
+    few, many = (draw_robots(robot, count, 3, **settings) for count in (5, 40))
+    np.testing.assert_array_equal(few[0], many[0][:5])
+    assert few[1].keys() == many[1].keys() == {"mass", "damping", "payload"}
+    for name, value in few[1].items():
+        np.testing.assert_array_equal(value, many[1][name][:5])

@@ -4,9 +4,11 @@ import dataclasses
 import os
 import sys
 import time
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 import numpy as np
 from tqdm.std import tqdm
@@ -23,12 +25,17 @@ from jaxmpc.checks import fail
 from jaxmpc.compiled import CHUNK
 from jaxmpc.feasible import store
 from jaxmpc.feasible.candidates import StagePenalties
-from jaxmpc.feasible.cascade import label_chunks
-from jaxmpc.feasible.map import FeasibleSetMap
+from jaxmpc.feasible.cascade import Scope, label_parts
+from jaxmpc.feasible.executors import label_elsewhere
+from jaxmpc.feasible.map import mesh
 from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.stored_map import StoredMap
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.runs import versions, write_json
 from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
+
+# States from which penalties are learned, at most.
+LEARN = 65_536
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,52 +50,86 @@ class LinearSweep:
     store: store.Store
 
     @classmethod
-    def open(cls, config: Config, output: Path, resume: bool, overwrite: bool) -> "LinearSweep":
-        """Open a new sweep, or one to resume. Raises ValueError; compiles nothing."""
+    def open(
+        cls, config: Config, output: Path, resume: bool = False, overwrite: bool = False,
+        shard: tuple[int, int] | None = None, url: str | None = None,
+    ) -> "LinearSweep":  # fmt: skip
+        """Open a new sweep, or one to resume.
+
+        shard: (i, n) to compute the blocks k with k mod n = i, beside other processes. url: of the
+        store, None for sweep.zarr in the folder output. Raises ValueError; compiles nothing.
+        """
         mpc, region = config.build_mpc(), sweep_points(config)
-        path = output / "sweep.zarr"
-        check_results(path, resume, overwrite)
-        open_folder(output, "map.png", "summary.json")
-        if path.exists() and overwrite:
-            store.remove(path)
+        path = store.location(url or output / "sweep.zarr")
+        there = store.exists(path)
+        if shard is None:
+            check_results(path, resume, overwrite, there)
+            open_folder(output, "map.png", "summary.json")
+            if there and overwrite:
+                store.remove(path)
+        else:  # other shards may have made the store, and one may be writing the results
+            if overwrite:
+                fail("--overwrite", "given beside --shard", "Delete the store before shards start")
+            open_folder(output)
         problem = FeasibilityProblem.of(mpc, region.axes, region.fixed)
-        found = store.open_labels(path, problem, region.along, config.to_dict(), CHUNK)
+        found = store.open_labels(path, problem, region.along, config.to_dict(), CHUNK, shard=shard)
+        done = len(found.own) - len(found.pending())
+        if shard is not None and (done or found.damaged) and not resume:
+            found.close()
+            what = f"holds {done:,} blocks of shard {shard[0]}/{shard[1]}"
+            fail(str(path), what, "Add --resume to go on with it")
         report_damage(found)
         return cls(config, mpc, problem, region, output, found)
 
-    def run(self, *, refine: bool, learn_penalties: bool) -> None:
-        """Label all states, write map and summary, print the table."""
-        with self.store:
-            self._run(refine, learn_penalties)
+    def run(
+        self, *, refine: bool = True, learn_penalties: bool = False, executor: Any = None
+    ) -> None:
+        """Label all states, write map and summary, print the table; close the store.
 
-    def _run(self, refine: bool, learn_penalties: bool) -> None:
-        start = time.perf_counter()
-        print(f"{self.config.name}: {len(self.region.points):,} initial states -> {self.output}")
+        executor: what labels the blocks, as in `map_feasible_set`; this process stores them. A
+        shard labels its own, and is done unless it is the last.
+        """
+        with self.store:
+            self._run(refine, learn_penalties, executor)
+
+    def _run(self, refine: bool, learn_penalties: bool, executor: Any) -> None:
+        start, kept = time.perf_counter(), self.store
+        part = ""
+        if kept.shard is not None:
+            part = f", shard {kept.shard[0]}/{kept.shard[1]}"
+            part += f" with {len(kept.own):,} of {len(kept.regions):,} blocks"
+        print(f"{self.config.name}: {self.region.total:,} initial states -> {self.output}{part}")
         # The compiler keeps one core busy; meanwhile another can load matplotlib.
         plots = Thread(target=import_module, args=("jaxmpc.app.plots.feasible_set",), daemon=True)
         plots.start()
-        timing = self.label(self.penalties() if learn_penalties else None)
-        fmap = self.map()
+        timing = self.label(self.penalties() if learn_penalties else None, executor)
+        speed = f", {timing.count / timing.run_seconds:,.0f} QPs/s" if timing.count else ""
+        run = ("run", f"{timing.run_seconds:.2f} s for {timing.count:,} QPs{speed}")
+        if why := kept.unfinished():
+            print_table([run, ("left", why)], 12)
+            return
+        found = StoredMap.read(self.problem, kept, self.region.along)
         dimension = len(self.region.axes)
         if refine and dimension <= 3:
             print("closing the bounds by rays; long horizons take a while", file=sys.stderr)
-            fmap = fmap.refine()
-            self.store.save_bounds(fmap.extra_points, fmap.extra_normals, fmap.extra_offsets)
-        files = ["sweep.zarr", "summary.json"]
+            found, rays = found.refine()
+            kept.save_bounds(rays.extra_points, rays.extra_normals, rays.extra_offsets)
+        files = [str(kept.path), str(self.output / "summary.json")]
         if dimension == 2:
             from jaxmpc.app.plots.feasible_set import plot_feasible_set
             from jaxmpc.app.plots.style import save
 
-            save(plot_feasible_set(fmap), self.output / "map.png")
-            files.append("map.png")
-        low, high = fmap.volume_bounds()
+            picture = found.picture()
+            save(plot_feasible_set(found.bounds, picture=picture), self.output / "map.png")
+            files.append(str(self.output / "map.png"))
+        low, high = found.bounds.volume_bounds()
         if low > high * (1 + 1e-9):
             what = f"its inner bound {low:.9g} exceeds its outer bound {high:.9g}"
             fail(str(self.store.path), what, "Look for damage with jaxmpc verify, or overwrite it")
         seconds = time.perf_counter() - start
         summary = {
             "name": self.config.name,
-            "counts": fmap.counts(),
+            "counts": found.counts,
             "volume": {"inner": low, "outer": high},
             "this_run": {**dataclasses.asdict(timing), "total_seconds": seconds},
             "config": self.config.to_dict(),
@@ -99,19 +140,18 @@ class LinearSweep:
         units = self.config.system.state_units
         unit = " " + "·".join(units[i] for i in self.region.axes) if units else ""
         rows = [
-            (name, f"{count:>12,}  {count / len(fmap.points):7.2%}")
-            for name, count in fmap.counts().items()
+            (name, f"{count:>12,}  {count / self.region.total:7.2%}")
+            for name, count in found.counts.items()
             if count or name in ("feasible", "infeasible", "undecided")
         ]
-        speed = f", {timing.count / timing.run_seconds:,.0f} QPs/s" if timing.count else ""
         print_table([
             *rows,
             ("compile", f"{timing.compile_seconds:.2f} s"),
-            ("run", f"{timing.run_seconds:.2f} s for {timing.count:,} QPs{speed}"),
+            run,
             (f"{what} from", f"{low:.9g}{unit} (inner bound)"),
             (f"{what} to", f"{high:.9g}{unit} (outer bound, gap {high - low:.2g})"),
             ("total", f"{seconds:.2f} s with bounds and files"),
-            ("files", " ".join(str(self.output / name) for name in files)),
+            ("files", " ".join(files)),
         ], 12)  # fmt: skip
 
     def penalties(self) -> StagePenalties | None:
@@ -122,10 +162,13 @@ class LinearSweep:
         if not self.store.pending():
             return None
         start, region, settings = time.perf_counter(), self.region, self.config.sweep
-        cache = cache_folder()
+        cache, points = cache_folder(), region.points if region.total <= LEARN else None
+        if points is None:
+            random = np.random.default_rng(0).choice(region.total, LEARN, replace=False)
+            points = mesh(region.along, random)
         try:
             found = tune_sweep_penalties(
-                self.mpc, region.points, axes=region.axes, fixed=region.fixed, chunk=CHUNK,
+                self.mpc, points, axes=region.axes, fixed=region.fixed, chunk=CHUNK,
                 iterations=settings.iterations, dtype=settings.dtype, cache=cache,
             )  # fmt: skip
         except OSError as error:
@@ -137,21 +180,21 @@ class LinearSweep:
         print(f"penalties: {verdict}, {time.perf_counter() - start:.1f} s", file=sys.stderr)
         return found.result if found.improved else None
 
-    def label(self, penalties: StagePenalties | None) -> Timing:
-        """Label the chunks that are not done, and commit each."""
-        todo, index = self.store.batches()
+    def label(self, penalties: StagePenalties | None = None, executor: Any = None) -> Timing:
+        """Label the blocks that are not done, and commit each."""
+        todo, along, settings = self.store.pending(), self.region.along, self.config.sweep
         timing, decided = Timing(), 0
         if not todo:
             return timing
-        region, settings = self.region, self.config.sweep
-        chunks = label_chunks(
-            self.problem, region.points[index.ravel()], chunk=index.shape[1],
+        label = label_parts if executor is None else partial(label_elsewhere, executor)
+        found = label(
+            self.problem, (mesh(along, self.store.samples(block)) for block in todo),
+            Scope.of_grid(along, len(self.store.regions)), self.store.size,
             iterations=settings.iterations, dtype=settings.dtype, penalties=penalties,
         )  # fmt: skip
-        total = sum(rows.stop - rows.start for _, rows in todo)
+        total = sum(len(self.store.samples(block)) for block in todo)
         with tqdm(total=total, unit=" states", unit_scale=True, disable=None) as bar:
-            for (block, here), (_, labels) in zip(todo, chunks, strict=True):
-                labels = labels.first(here.stop - here.start)
+            for block, labels in zip(todo, found, strict=True):
                 self.store.commit(block, **store.label_rows(labels))
                 timing.count += len(labels.label)
                 timing.compile_seconds += labels.compile_seconds
@@ -160,10 +203,6 @@ class LinearSweep:
                 bar.set_postfix_str(f"{decided / timing.count:.2%} decided", refresh=False)
                 bar.update(len(labels.label))
         return timing
-
-    def map(self) -> FeasibleSetMap:
-        """Return the map that the store holds."""
-        return FeasibleSetMap.of(self.problem, self.region.points, self.store.labels())
 
 
 def cache_folder() -> Path:

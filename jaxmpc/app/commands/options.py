@@ -3,6 +3,7 @@
 import hashlib
 import sys
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -51,12 +52,45 @@ class Timing:
     run_seconds: float = 0.0
 
 
-def check_results(path: Path, resume: bool, overwrite: bool) -> None:
-    """Raise ValueError where `path` exists and neither --resume nor --overwrite is given."""
+def check_results(
+    path: Path | str, resume: bool, overwrite: bool, exists: bool | None = None
+) -> None:
+    """Raise ValueError where `path` exists (None: look) and neither --resume nor --overwrite is
+    given."""
     if resume and overwrite:
         fail("--overwrite", "given beside --resume", "Choose one")
-    if path.exists() and not (resume or overwrite):
+    exists = Path(path).exists() if exists is None else exists
+    if exists and not (resume or overwrite):
         fail(str(path), "exists", "Add --resume to go on with it or --overwrite to start again")
+
+
+def chosen_shard(text: str, environment: Mapping[str, str]) -> tuple[int, int]:
+    """Return (i, n) of --shard "i/n", "auto" or "auto/n".
+
+    auto: of a SLURM job array, the i-th of its n evenly spaced tasks. auto/n: i is the number of
+    the task in the array, or in an indexed Kubernetes job. Raises ValueError unless 0 ≤ i < n.
+    """
+    where, (first, _, second) = f"--shard {text}", text.partition("/")
+    slurm = {key: environment.get(f"SLURM_ARRAY_TASK_{key}", "") for key in "ID MIN COUNT".split()}
+    step = environment.get("SLURM_ARRAY_TASK_STEP", "1")
+    if first == "auto" and second:
+        first = slurm["ID"] or environment.get("JOB_COMPLETION_INDEX", "")
+        if not first:
+            what = "neither SLURM_ARRAY_TASK_ID nor JOB_COMPLETION_INDEX is set"
+            fail(where, what, "Give i/n, or start it in a job array or an indexed job")
+    elif first == "auto":
+        if not all(v.isdecimal() for v in (*slurm.values(), step)):
+            what = "SLURM_ARRAY_TASK_ID, _MIN and _COUNT are not set"
+            fail(where, what, "Start it in a SLURM job array, or give i/n or auto/n")
+        first, second, apart = slurm["ID"], slurm["COUNT"], max(int(step), 1)
+        last = int(slurm["MIN"]) + (int(second) - 1) * apart
+        if environment.get("SLURM_ARRAY_TASK_MAX", str(last)) != str(last):
+            what = "the tasks of the SLURM job array are not evenly spaced"
+            fail(where, what, "Give auto/n, with tasks from 0 to n - 1")
+        first = str((int(first) - int(slurm["MIN"])) // apart)
+    if not (first.isdecimal() and second.isdecimal() and int(first) < int(second)):
+        fail(where, f"shard {first or '?'} of {second or '?'}", "Give i/n with i from 0 to n - 1")
+    return int(first), int(second)
 
 
 def given_options(command: Any, *names: str) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,12 +15,13 @@ from jaxmpc.app.commands.options import (
     Horizon,
     Switch,
     Terminal,
+    chosen_shard,
     given_options,
     option,
     refuse,
 )
 from jaxmpc.app.commands.robot_map import RobotMapCommand
-from jaxmpc.checks import require_disk
+from jaxmpc.checks import fail, require_disk
 
 # By how much the files of a sweep are smaller than its arrays, at most: the joint's 13 times.
 COMPRESSION = 20
@@ -52,6 +54,7 @@ class Sweep:
                     Opens with xarray.open_zarr(path): a dimension a mapped state.
       Ctrl-C        Stops; finished chunks are kept. --resume goes on from there, and computes
                     again what is missing or damaged.
+      --shard       Several processes write one sweep.zarr, the same bits as one would.
       jaxmpc verify DIR proves every label again, from these files alone.
       Exit code     0 done, 2 error (one line on stderr says which), 130 stopped by Ctrl-C.
 
@@ -133,8 +136,22 @@ class Sweep:
             "swept again and again.",
         ),
     ] = False
+    shard: Annotated[
+        str | None,
+        option(
+            "I/N|auto|auto/N",
+            "one process",
+            "Compute blocks I, I+N, I+2N, ... (I from 0) beside N-1 other processes, here or on "
+            "machines that share --output. auto: I and N of a SLURM job array; auto/N: I is "
+            "SLURM_ARRAY_TASK_ID, or JOB_COMPLETION_INDEX of a Kubernetes job. The process that "
+            "finishes last writes map.png and summary.json; the others say what is missing.",
+        ),
+    ] = None
+    store: Annotated[str | None, option("URL", "sweep.zarr in --output")] = None
+    """Where the data go instead, such as s3://bucket/sweep.zarr (fsspec). There are no locks
+    there: compute no shard twice at a time."""
     resume: Switch = False
-    """Resume the sweep in --output."""
+    """Resume the sweep in --output; of a shard, its blocks."""
     overwrite: Switch = False
     """Delete the sweep in --output and start again."""
     refine: Annotated[bool, option(None, "on")] = True
@@ -155,20 +172,25 @@ class Sweep:
 
     def open(self) -> LinearSweep:
         """Read, check and open what a sweep needs. Raises ValueError; compiles nothing."""
+        if self.shard is not None and self.learn_penalties:
+            what = "Each shard would learn its own, and results depend on the split"
+            fail("--learn-penalties", "given beside --shard", what)
         keys = "horizon terminal grid lower upper axes fixed iterations dtype".split()
         overrides = given_options(self, *keys) | ({"projection": True} if self.projection else {})
         config = configs.load(self.config, overrides)
         needed = math.prod(configs.grid_shape(config)) * configs.state_bytes(config) / COMPRESSION
-        require_disk(
-            f"--output {self.output}", needed, self.output, "Map fewer points, or use another disk"
-        )
-        return LinearSweep.open(config, self.output, self.resume, self.overwrite)
+        if self.store is None:
+            where, cure = f"--output {self.output}", "Map fewer points, or use another disk"
+            require_disk(where, needed, self.output, cure)
+        shard = None if self.shard is None else chosen_shard(self.shard, os.environ)
+        return LinearSweep.open(config, self.output, self.resume, self.overwrite, shard, self.store)
 
     def robot_map(self, robot: str) -> RobotMapCommand:
         """Return the map of --robot. Raises ValueError for options that do not go with it."""
         given = {"config": self.config, "projection": self.projection}
         refuse(given, robot, "Give a problem or a robot; a robot's map is a slice")
         refuse({"learn-penalties": self.learn_penalties}, robot, "They are for linear maps")
+        refuse({"shard": self.shard, "store": self.store}, robot, "They are for linear maps")
         return RobotMapCommand(
             robot, self.output, "limits", seconds=self.seconds, horizon=self.horizon,
             terminal=self.terminal, axes=self.axes, values=self.fixed, grid=self.grid,

@@ -2,7 +2,6 @@
 
 import dataclasses
 import time
-from pathlib import Path
 from typing import Annotated
 
 import tyro
@@ -40,8 +39,9 @@ class Verify:
       Exit code     0 all labels are proved; 1 something fails, with the states where; 2 error.
     """
 
-    directory: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """Folder that holds sweep.zarr, robot_map.zarr or recursion.npz, or one of these."""
+    directory: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
+    """Folder that holds sweep.zarr, robot_map.zarr or recursion.npz, one of these, or the URL of a
+    store."""
     exact: Switch = False
     """Roll out all plans in exact arithmetic."""
     sample: Annotated[int, option("K", "1000")] = 1000

@@ -8,6 +8,7 @@ import numpy as np
 from jaxmpc.app.config.problem import COMMANDS, Config
 from jaxmpc.app.config.states import grid_shape, mapped_axes, recursion_shape, section_ends
 from jaxmpc.checks import fail, require_memory
+from jaxmpc.compiled import CHUNK
 from jaxmpc.mpc.condense import condensed_bytes
 
 
@@ -70,8 +71,10 @@ def _check_sweep(config: Config, n: int) -> None:
     if d == n and sweep.projection:
         fail("sweep.projection", f"true, and all {n} states are mapped", "Name fewer in sweep.axes")
     section_ends(config, mapped_axes(config), sweep)
+    # Blocks in work, and a hundred bytes of each other block.
     count = math.prod(grid_shape(config))
-    require_memory("sweep.grid", count * (8 * d + state_bytes(config)), "Map fewer points")
+    needed = 8 * min(count, CHUNK) * state_bytes(config) + 100 * count / CHUNK
+    require_memory("sweep.grid", needed, "Map fewer points")
 
 
 def _check_recursion(config: Config, n: int) -> None:

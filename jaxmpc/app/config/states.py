@@ -1,5 +1,6 @@
 """Initial states of the commands sweep and recursion: grids over the state limits."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -8,16 +9,25 @@ import numpy as np
 from jaxmpc.app.config.problem import Config
 from jaxmpc.app.config.sections import RecursionSection, SweepSection
 from jaxmpc.checks import fail
-from jaxmpc.feasible.map import grid
+from jaxmpc.feasible.map import grid, mesh
 
 
 class SweepPoints(NamedTuple):
-    """Initial states of a sweep, as `map_feasible_set` takes them."""
+    """Initial states of a sweep: a grid of mapped states, as `map_feasible_set` takes it."""
 
-    points: np.ndarray  # (B, d)
+    along: tuple[np.ndarray, ...]  # the coordinates along each of the d axes
     axes: tuple[int, ...]  # the d states mapped
     fixed: np.ndarray | None  # (n,) for a slice; None: all states mapped, or a projection
-    along: tuple[np.ndarray, ...]  # the coordinates along each of the d axes
+
+    @property
+    def total(self) -> int:
+        """Return the number of points B."""
+        return math.prod(len(line) for line in self.along)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Return all points (B, d)."""
+        return mesh(self.along)
 
 
 def sweep_points(config: Config) -> SweepPoints:
@@ -25,13 +35,12 @@ def sweep_points(config: Config) -> SweepPoints:
     axes = mapped_axes(config)
     lower, upper = section_ends(config, axes, config.sweep)
     shape = grid_shape(config)
-    points = grid(lower, upper, shape)
     along = tuple(np.linspace(*ends) for ends in zip(lower, upper, shape, strict=True))
     if config.sweep.fixed is None:
-        return SweepPoints(points, axes, None, along)
+        return SweepPoints(along, axes, None)
     fixed = np.zeros(len(config.system.A))
     fixed[[i for i in range(len(fixed)) if i not in axes]] = config.sweep.fixed
-    return SweepPoints(points, axes, fixed, along)
+    return SweepPoints(along, axes, fixed)
 
 
 def grid_shape(config: Config) -> tuple[int, ...]:

@@ -20,17 +20,23 @@ from jaxmpc.app.plots.style import (
 )
 from jaxmpc.checks import fail
 from jaxmpc.feasible.map import FeasibleSetMap
+from jaxmpc.feasible.stored_map import Picture
 
 
-def plot_feasible_set(fmap: FeasibleSetMap, ax: Axes | None = None) -> Axes:
+def plot_feasible_set(
+    fmap: FeasibleSetMap, ax: Axes | None = None, picture: Picture | None = None
+) -> Axes:
     """Draw a map of two states: labels, proved boundaries and terminal set.
 
     Samples are coloured by label. The dashed line bounds the inner polytope (the convex hull of
     states with a checked plan), the solid one the outer polytope (the intersection of certified
     half-spaces); the true boundary lies between them. Without `ax` a new figure is made; save it
-    with `ax.figure.savefig(path)`. Raises ValueError for a map not of two states.
+    with `ax.figure.savefig(path)`. picture: of a stored map, instead of the map's points. Raises
+    ValueError for a map not of two states.
     """
-    points, label = np.asarray(fmap.points), np.asarray(fmap.label)
+    points, label, counts = np.asarray(fmap.points), np.asarray(fmap.label), None
+    if picture is not None:
+        points, label, counts = picture
     if points.ndim != 2 or points.shape[1] != 2:
         fail("fmap", f"maps {points.shape[-1]} states", "A plot needs 2: choose `axes`")
     ax = new_axes() if ax is None else ax
@@ -42,7 +48,7 @@ def plot_feasible_set(fmap: FeasibleSetMap, ax: Axes | None = None) -> Axes:
             (-1, "infeasible", INFEASIBLE),
             (0, "undecided", UNDECIDED),
         )
-        if (count := np.count_nonzero(label == value))
+        if (count := counts[name] if counts else np.count_nonzero(label == value))
     ]
     handles += draw_polygons(ax, [
         (fmap.terminal_section, "terminal set", {"color": TERMINAL, "lw": 1.8}),
