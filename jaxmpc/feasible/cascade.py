@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxmpc.checks import fail
 from jaxmpc.compiled import Compiled, default_chunk, gather_size, padded, require_step_type
+from jaxmpc.devices import chosen_devices, count, divisible, placement
 from jaxmpc.feasible.candidates import (
     ALPHA,
     StagePenalties,
@@ -41,14 +42,15 @@ SAMPLE = 4096
 
 def label_chunks(
     problem: FeasibilityProblem, points: Any, *, iterations: int = 50, dtype: Any = "float32",
-    chunk: int | None = None, penalties: StagePenalties | None = None,
+    chunk: int | None = None, penalties: StagePenalties | None = None, devices: Any = None,
 ) -> Iterator[tuple[slice, Labels]]:  # fmt: skip
     """Label points chunk by chunk; yield (slice of the points, Labels). See `map_feasible_set`."""
     d = problem.dimension
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != d:
         fail("x0s", f"shape {points.shape}", f"Give points (B, {d}), one column a mapped state")
-    chunk = default_chunk() if chunk is None else chunk
+    devices = chosen_devices(devices)
+    chunk = count(devices) * default_chunk() if chunk is None else chunk
     if iterations < 1 or chunk < 1:
         fail("iterations, chunk", f"{iterations}, {chunk}", "Give counts of at least 1")
     require_step_type(dtype)
@@ -62,20 +64,21 @@ def label_chunks(
     margins = problem.row_margins(exact, size)
     budget = min(MOST_PROGRAMS, MOST_ENTRIES // max(problem.rows.U.size, 1))
     chunk = min(chunk, max(len(points), 1))
-    batch = gather_size(chunk)
+    whole = divisible(chunk, devices)  # the chunk as the devices share it
+    batch = count(devices) * (each := gather_size(whole // count(devices)))
     short, long = (
-        compiled_admm(iterations, np.dtype(dtype)),
-        compiled_admm(LONGER * iterations, np.dtype(np.float64)),
+        compiled_admm(iterations, np.dtype(dtype), devices),
+        compiled_admm(LONGER * iterations, np.dtype(np.float64), devices),
     )
-    newton, check = compiled_newton(batch), compiled_check()
+    newton, check = compiled_newton(each, devices), compiled_check(devices)
     with jax.enable_x64(True):
-        exact, rows, quick = jax.device_put((exact, problem.rows, quick))
+        exact, rows, quick = jax.device_put((exact, problem.rows, quick), placement(devices))
 
     def started(here: slice) -> tuple[np.ndarray, np.ndarray, tuple[Verdict, Any]]:
         """Return a chunk, which of it is usable, and the ADMM stage, which the device still works
         on."""
-        ok = padded(usable[here], chunk)
-        x = np.where(ok[:, None], padded(points[here], chunk), 0.0)
+        ok = padded(usable[here], whole)
+        x = np.where(ok[:, None], padded(points[here], whole), 0.0)
         return x, ok, _run(short, exact, quick, x, alpha)
 
     def finished(x: np.ndarray, ok: np.ndarray, found: tuple[Verdict, Any]) -> Labels:

@@ -337,7 +337,7 @@ def excluded(
 def map_feasible_set(
     mpc: MPC, x0s: Any, *, axes: Any = None, fixed: Any = None, iterations: int = 50,
     dtype: Any = "float32", chunk: int | None = None, refine: float | None = None,
-    penalties: StagePenalties | None = None, progress: bool = False,
+    penalties: StagePenalties | None = None, progress: bool = False, devices: Any = None,
 ) -> FeasibleSetMap:  # fmt: skip
     """Label each point: is there an input sequence that keeps every hard constraint of `mpc`?
 
@@ -349,9 +349,10 @@ def map_feasible_set(
     the inputs to the states (a terminal point) the proof is that inputs within rounding of the
     plan keep them exactly. iterations and dtype affect the ADMM stage alone and cannot make a
     label wrong. The last undecided points, up to 2,000 in a call, get linear programs of some
-    milliseconds each. chunk: number of points that a compiled program takes at once (None: by
-    device). refine: tolerance of `FeasibleSetMap.refine`, None to skip it. penalties: of the ADMM
-    stage, from `tune_sweep_penalties`. progress: show a bar.
+    milliseconds each. devices: a number of them, or a sequence of JAX devices, which share the
+    points of a chunk; None: the default device. chunk: number of points that a compiled program
+    takes at once (None: by device). refine: tolerance of `FeasibleSetMap.refine`, None to skip it.
+    penalties: of the ADMM stage, from `tune_sweep_penalties`. progress: show a bar.
 
     A point with NaN or infinity gets status NON_FINITE and label 0. Raises ValueError for wrong
     shapes and ill-posed problems before anything compiles.
@@ -366,7 +367,7 @@ def map_feasible_set(
         require_kind("penalties", penalties, StagePenalties)
     result = map_points(
         problem, x0s, iterations=iterations, dtype=dtype, chunk=chunk, penalties=penalties,
-        progress=progress,
+        progress=progress, devices=devices,
     )  # fmt: skip
     return result if refine is None else result.refine(refine)
 

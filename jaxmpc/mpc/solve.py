@@ -1,5 +1,6 @@
 """solve: one plan from one state; solve_many: from many, in chunks that fit into memory."""
 
+import functools
 from dataclasses import replace
 from typing import Any
 
@@ -12,12 +13,14 @@ from jaxmpc.compiled import (
     Compiled,
     default_chunk,
     first_rows,
+    joined,
     padded,
     require_step_type,
     side_by_side,
     workers,
 )
 from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.devices import Devices, chosen_devices, count, divisible, over_devices, placement
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller, plan_arguments
 from jaxmpc.mpc.plan import Plan, WarmStart
@@ -53,8 +56,9 @@ def solve(
 
 
 def solve_many(
-    mpc: MPC, x0s: Any, solver: ADMM = DEFAULT, *, dtype: Any = "float32", chunk: int | None = None
-) -> Plan:
+    mpc: MPC, x0s: Any, solver: ADMM = DEFAULT, *, dtype: Any = "float32",
+    chunk: int | None = None, devices: Any = None,
+) -> Plan:  # fmt: skip
     """Solve the MPC problem from each state x0s (B, n); the Plan holds host arrays, B in front.
 
     Where input rates are limited or weighted x0s may be (B, n + m), with the previous inputs in the
@@ -62,8 +66,9 @@ def solve_many(
 
     dtype: type of the ADMM iterates; Newton steps, residuals, status and the answer are float64
     whatever it is, and whether or not 64-bit mode is on. chunk: states that a compiled program
-    takes at once; None: by device. A state with NaN gets status NON_FINITE. Raises ValueError for
-    wrong shapes and ill-posed problems.
+    takes at once; None: by device. devices: a number of them, or a sequence of JAX devices, which
+    share the states of a chunk; None: the default device. A state with NaN gets status NON_FINITE.
+    Raises ValueError for wrong shapes and ill-posed problems.
     """
     require_kind("mpc", mpc, MPC)
     require_kind("solver", solver, ADMM)
@@ -73,30 +78,37 @@ def solve_many(
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.system.n})")
     x0s = np.pad(x0s, ((0, 0), (0, mpc.dimension - x0s.shape[1])))
     require_step_type(dtype)
+    devices = chosen_devices(devices)
+    # Of several devices two chunks at once: one is computed while the other goes to the host.
+    together, shares = (workers(), workers()) if devices is None else (2, 1)
     if chunk is None:
-        chunk = min(default_chunk(), -(-len(x0s) // workers()))
+        chunk = min(count(devices) * default_chunk(), -(-len(x0s) // shares))
     else:
         whole("chunk", chunk, 1)
     each = 8 * (mpc.horizon + 1) * (mpc.system.n + mpc.system.m)
     require_memory("x0s", len(x0s) * each, "Solve some of them at a time")
-    size = max(min(chunk, len(x0s)), 1)
+    size = divisible(max(min(chunk, len(x0s)), 1), devices)
     with jax.enable_x64(True):
         controller = Controller(in_float64(mpc), replace(solver, dtype=np.dtype(dtype).name))
-        program = _plans.program(controller, x0s[:size])
+        controller = jax.device_put(controller, placement(devices))
+        first = padded(x0s[:size], size) if len(x0s) else x0s
+        program = _plans(devices).program(controller, first)
 
     def part(start: int) -> Plan:
         here = x0s[start : start + size]
         with jax.enable_x64(True):
             plans = program(controller, padded(here, size) if len(here) else here)
-        return first_rows(jax.tree.map(np.asarray, plans), len(here))
+        return first_rows(jax.device_get(plans), len(here))
 
-    parts = side_by_side(part, range(0, max(len(x0s), 1), size))
-    return jax.tree.map(lambda *v: np.concatenate(v), *parts)
+    return joined(side_by_side(part, range(0, max(len(x0s), 1), size), together))
 
 
-@Compiled
-@jax.jit
-def _plans(controller: Controller, x0s: Array) -> Plan:
+@functools.cache
+def _plans(devices: Devices) -> Compiled:
+    return over_devices(_plans_from, devices, (False, True))
+
+
+def _plans_from(controller: Controller, x0s: Array) -> Plan:
     n = controller.mpc.system.n
 
     def one(x: Array) -> Plan:
