@@ -24,8 +24,8 @@ from jaxmpc.compiled import Compiled
 Devices = tuple[jax.Device, ...] | None
 
 
-def chosen_devices(devices: Any) -> Devices:
-    """Return the devices that an argument `devices` names.
+def chosen_devices(devices: Any, name: str = "devices") -> Devices:
+    """Return the devices that an argument `devices`, or another name, stands for.
 
     devices: None, the default device; a number, so many of `jax.local_devices()`; or a sequence of
     them. Raises ValueError for no device, for the same one twice, and for those of another process
@@ -35,23 +35,23 @@ def chosen_devices(devices: Any) -> Devices:
         return None
     there = jax.local_devices()
     if not isinstance(devices, Sequence | np.ndarray) or isinstance(devices, str):
-        count = whole("devices", devices, 1)
+        count = whole(name, devices, 1)
         if count > len(there):
-            fail("devices", f"{count} where this process has {len(there)}", "Give fewer")
+            fail(name, f"{count} where this process has {len(there)}", "Give fewer")
         return tuple(there[:count])
     chosen = tuple(devices)
     if not chosen:
-        fail("devices", "an empty sequence", "Give at least one device, or None for the default")
+        fail(name, "an empty sequence", "Give at least one device, or None for the default")
     for device in chosen:
         if not isinstance(device, jax.Device):
-            fail("devices", f"holds {shown(device)}", "Give a number, or some of jax.devices()")
+            fail(name, f"holds {shown(device)}", "Give a number, or some of jax.devices()")
         if device.process_index != jax.process_index():
-            fail("devices", f"{device} is of another process", "Give some of jax.local_devices()")
+            fail(name, f"{device} is of another process", "Give some of jax.local_devices()")
         if device not in there:
             what = f"{device} is not of JAX's default backend, {there[0].platform}"
-            fail("devices", what, f"Set JAX_PLATFORMS={device.platform} for programs made for it")
+            fail(name, what, f"Set JAX_PLATFORMS={device.platform} for programs made for it")
     if len(set(chosen)) < len(chosen):
-        fail("devices", "the same one twice", "Give each once")
+        fail(name, "the same one twice", "Give each once")
     return chosen
 
 

@@ -56,18 +56,18 @@ class LinearSweep:
         report_damage(found)
         return cls(config, mpc, problem, region, output, found)
 
-    def run(self, *, refine: bool, learn_penalties: bool) -> None:
+    def run(self, *, refine: bool, learn_penalties: bool, devices: int | None = None) -> None:
         """Label all states, write map and summary, print the table."""
         with self.store:
-            self._run(refine, learn_penalties)
+            self._run(refine, learn_penalties, devices)
 
-    def _run(self, refine: bool, learn_penalties: bool) -> None:
+    def _run(self, refine: bool, learn_penalties: bool, devices: int | None) -> None:
         start = time.perf_counter()
         print(f"{self.config.name}: {len(self.region.points):,} initial states -> {self.output}")
         # The compiler keeps one core busy; meanwhile another can load matplotlib.
         plots = Thread(target=import_module, args=("jaxmpc.app.plots.feasible_set",), daemon=True)
         plots.start()
-        timing = self.label(self.penalties() if learn_penalties else None)
+        timing = self.label(self.penalties(devices) if learn_penalties else None, devices)
         fmap = self.map()
         dimension = len(self.region.axes)
         if refine and dimension <= 3:
@@ -114,7 +114,7 @@ class LinearSweep:
             ("files", " ".join(str(self.output / name) for name in files)),
         ], 12)  # fmt: skip
 
-    def penalties(self) -> StagePenalties | None:
+    def penalties(self, devices: int | None = None) -> StagePenalties | None:
         """Return penalties learned for the problem, or cached from an earlier run.
 
         Raises ValueError for too few states, and where the cache folder cannot be written.
@@ -127,6 +127,7 @@ class LinearSweep:
             found = tune_sweep_penalties(
                 self.mpc, region.points, axes=region.axes, fixed=region.fixed, chunk=CHUNK,
                 iterations=settings.iterations, dtype=settings.dtype, cache=cache,
+                devices=devices,
             )  # fmt: skip
         except OSError as error:
             fail(str(cache), f"{error.strerror}", "Set XDG_CACHE_HOME to a folder of yours")
@@ -137,7 +138,7 @@ class LinearSweep:
         print(f"penalties: {verdict}, {time.perf_counter() - start:.1f} s", file=sys.stderr)
         return found.result if found.improved else None
 
-    def label(self, penalties: StagePenalties | None) -> Timing:
+    def label(self, penalties: StagePenalties | None, devices: int | None = None) -> Timing:
         """Label the chunks that are not done, and commit each."""
         todo, index = self.store.batches()
         timing, decided = Timing(), 0
@@ -147,6 +148,7 @@ class LinearSweep:
         chunks = label_chunks(
             self.problem, region.points[index.ravel()], chunk=index.shape[1],
             iterations=settings.iterations, dtype=settings.dtype, penalties=penalties,
+            devices=devices,
         )  # fmt: skip
         total = sum(rows.stop - rows.start for _, rows in todo)
         with tqdm(total=total, unit=" states", unit_scale=True, disable=None) as bar:
