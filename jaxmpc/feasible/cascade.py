@@ -56,11 +56,13 @@ def label_chunks(
     require_step_type(dtype)
     quick, back, alpha = _penalised(problem.rows, penalties)
 
-    usable = np.all(np.isfinite(points), axis=1)
+    # Column by column: reductions along rows of few entries are slow.
+    usable = np.logical_and.reduce([np.isfinite(column) for column in points.T])
+    extent = np.array([np.max(np.abs(v), where=usable, initial=0.0) for v in points.T])
     sample = points[:: max(1, len(points) // SAMPLE)]
     sample = np.abs(sample[np.all(np.isfinite(sample), axis=1)])
     size = np.median(sample, axis=0) if len(sample) else np.zeros(d)
-    exact = problem.exact(np.abs(points[usable]).max(axis=0, initial=0.0), size)
+    exact = problem.exact(extent, size)
     margins = problem.row_margins(exact, size)
     budget = min(MOST_PROGRAMS, MOST_ENTRIES // max(problem.rows.U.size, 1))
     chunk = min(chunk, max(len(points), 1))
