@@ -57,7 +57,7 @@ def label_chunks(
     quick, back, alpha = _penalised(problem.rows, penalties)
 
     # Column by column: reductions along rows of few entries are slow.
-    usable = np.logical_and.reduce([np.isfinite(column) for column in points.T])
+    usable = functools.reduce(np.logical_and, map(np.isfinite, points.T))
     extent = np.array([np.max(np.abs(v), where=usable, initial=0.0) for v in points.T])
     sample = points[:: max(1, len(points) // SAMPLE)]
     sample = np.abs(sample[np.all(np.isfinite(sample), axis=1)])
