@@ -1,6 +1,8 @@
 """solve: one plan from one state; solve_many: from many, in chunks that fit into memory."""
 
 import functools
+import threading
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -81,6 +83,8 @@ def solve_many(
     devices = chosen_devices(devices)
     # Of several devices two chunks at once: one is computed while the other goes to the host.
     together, shares = (workers(), workers()) if devices is None else (2, 1)
+    # One begins after the other, in the same order on all of them.
+    beginning = nullcontext() if devices is None else threading.Lock()
     if chunk is None:
         chunk = min(count(devices) * default_chunk(), -(-len(x0s) // shares))
     else:
@@ -96,7 +100,7 @@ def solve_many(
 
     def part(start: int) -> Plan:
         here = x0s[start : start + size]
-        with jax.enable_x64(True):
+        with jax.enable_x64(True), beginning:
             plans = program(controller, padded(here, size) if len(here) else here)
         return first_rows(jax.device_get(plans), len(here))
 
