@@ -51,10 +51,11 @@ def near(one, other, to=1e-9):
 
 
 def map_of(x, **options):
-    """The labels of states and their proofs."""
+    """The labels of states and their proofs. The ADMM stage decides all in its usual 50 steps."""
     import jaxmpc as jm
 
-    found = jm.map_feasible_set(problem(), x, **options).labels
+    mpc = replace(problem(), horizon=20)
+    found = jm.map_feasible_set(mpc, x, **options).labels
     return {
         name: getattr(found, name)
         for name in ("label", "status", "starts", "plans", "cut_normals", "cut_offsets")
@@ -69,10 +70,14 @@ def check_map():
     one = map_of(x, chunk=64)
     for devices in (1, 2, 4, jax.devices()[1:3], np.array(jax.devices()[::-1])):
         same(map_of(x, chunk=64, devices=devices), one)
+    # The Newton stage gathers other states side by side on each device.
+    left, whole = map_of(x, iterations=2, chunk=64, devices=4), map_of(x, iterations=2, chunk=64)
+    same((left["label"], one["label"]), (whole["label"], whole["label"]))
+    near(left, whole, 1e-7)
     # By hand: plans keep the limits, half-spaces exclude their states.
     yes, no = one["label"] == 1, one["label"] == -1
     assert 100 < yes.sum() and 10 < no.sum() and yes.sum() + no.sum() == COUNT - 1
-    rolled, mpc = x[yes].T, problem()
+    rolled, mpc = x[yes].T, replace(problem(), horizon=20)
     assert np.abs(one["plans"][yes]).max() <= 2
     for k in range(mpc.horizon - 1):
         rolled = mpc.system.A @ rolled + mpc.system.B @ one["plans"][yes, k].T
@@ -218,12 +223,11 @@ def check_programs():
     taken = program.program(*args)(*args)
     assert taken.sharding.device_set == set(devices)
     same(np.asarray(taken), np.repeat([8.0, 6.0, 4.0, 2.0], 2).astype(np.float32))
-    map_of(states(), chunk=64, devices=4)
-    stages = compiled_admm(50, np.dtype(np.float32), devices), compiled_newton(64, devices)
-    made = [
-        p for v in (*stages, compiled_check(devices), _plans(devices)) for p in v.programs.values()
-    ]
-    assert len(made) >= 2
+    map_of(states(), iterations=2, chunk=64, devices=4)
+    stages = compiled_admm(2, np.dtype(np.float32), devices), compiled_newton(64, devices)
+    used = (program, *stages, compiled_check(devices), _plans(devices))
+    made = [found for compiled in used for found in getattr(compiled, "programs", {}).values()]
+    assert len(made) >= 3 and stages[1].programs
     for text in (found.as_text() for found in made):
         for word in ("all-reduce", "all-gather", "all-to-all", "collective-permute"):
             assert word not in text
