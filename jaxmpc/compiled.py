@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -20,21 +20,26 @@ def default_chunk() -> int:
     return CHUNK if jax.default_backend() == "cpu" else 32 * CHUNK
 
 
-def workers() -> int:
-    """Return how many chunks to run side by side: one a core of a CPU, whose programs use little
-    more than one, for most of their steps are too small to be divided; one on other devices."""
-    if jax.default_backend() != "cpu":
-        return 1
-    # Linux knows which cores this process may use.
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    # Linux knows which.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def side_by_side(call: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
-    """Return [call(item) for item in items], as many at once as there are `workers`.
+def workers() -> int:
+    """Return how many chunks to run side by side: one a core of a CPU, whose programs use little
+    more than one, for most of their steps are too small to be divided; one on other devices."""
+    return cores() if jax.default_backend() == "cpu" else 1
+
+
+def side_by_side(
+    call: Callable[[Any], Any], items: Iterable[Any], count: int | None = None
+) -> list[Any]:
+    """Return [call(item) for item in items], `count` at once, by default as many as `workers`.
 
     `call` runs in threads of its own, which see none of the caller's JAX contexts.
     """
-    items, count = list(items), workers()
+    items, count = list(items), workers() if count is None else count
     if min(count, len(items)) < 2:
         return [call(item) for item in items]
     with ThreadPoolExecutor(count) as pool:
@@ -58,7 +63,7 @@ class Compiled:
         self.programs: dict[Any, Any] = {}
 
     def __call__(self, *args: Any) -> Any:
-        return jax.tree.map(np.asarray, self.program(*args)(*args))
+        return jax.device_get(self.program(*args)(*args))
 
     def program(self, *args: Any) -> Any:
         """The program for arguments of these shapes."""
@@ -79,6 +84,20 @@ def padded(x: np.ndarray, size: int) -> np.ndarray:
 def first_rows(tree: Any, count: int) -> Any:
     """The leaves without what `padded` added."""
     return jax.tree.map(lambda v: v[:count], tree)
+
+
+def joined(parts: Sequence[Any]) -> Any:
+    """The host arrays of pytrees one after the other, copied by as many threads as there are cores:
+    a single one is slower than a fast device."""
+    ends = np.cumsum([len(jax.tree.leaves(part)[0]) for part in parts])
+    whole = jax.tree.map(lambda v: np.empty((ends[-1], *v.shape[1:]), v.dtype), parts[0])
+
+    def put(end: int, part: Any) -> None:
+        for out, v in zip(jax.tree.leaves(whole), jax.tree.leaves(part), strict=True):
+            out[end - len(v) : end] = v
+
+    side_by_side(lambda pair: put(*pair), zip(ends, parts, strict=True), cores())
+    return whole
 
 
 def require_step_type(dtype: Any) -> None:

@@ -14,14 +14,15 @@ from jaxmpc.checks import fail, require_real
 from jaxmpc.closed_loop.memory import device_bytes, program_bytes
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.closed_loop.simulate import checked_arguments, simulate
-from jaxmpc.compiled import Compiled, first_rows, padded
+from jaxmpc.compiled import Compiled, first_rows, joined, padded
+from jaxmpc.devices import Devices, chosen_devices, count, divisible, over_devices, placement
 from jaxmpc.qp.precision import arrays
 
 
 def simulate_many(
     controller: Any, plant: Any, x0s: Any, steps: int, *, reference: Any = None,
     input_reference: Any = None, variations: Mapping[str, Any] | None = None,
-    chunk: int | None = None, progress: bool = False,
+    chunk: int | None = None, progress: bool = False, devices: Any = None,
 ) -> Run:  # fmt: skip
     """Simulate closed loops from many initial states x0s (B, n); return NumPy arrays (B, ...).
 
@@ -32,6 +33,8 @@ def simulate_many(
     chunk: number of loops that the compiled program runs at once; None: all of them, halved until
         the program fits into the memory of the device.
     progress: show a progress bar.
+    devices: a number of them, or a sequence of JAX devices, which share the loops of a chunk; None:
+        the default device.
 
     Raises ValueError as `simulate` does.
     """
@@ -43,26 +46,30 @@ def simulate_many(
     require_variations(plant, variations, len(x0s))
     if chunk is not None and chunk < 1:
         fail("chunk", f"{chunk}", "Give a count of at least 1")
+    devices = chosen_devices(devices)
     checked_arguments(controller, plant, x0s[0], steps, reference, input_reference, None, None)
     shared = arrays((
         controller, as_argument(plant),
         *(None if v is None else np.asarray(v) for v in (reference, input_reference)),
     ))  # fmt: skip
-    part = lambda start, size: arrays(
-        jax.tree.map(lambda v: padded(np.asarray(v)[start : start + size], size), (x0s, variations))
+    shared = jax.device_put(shared, placement(devices))
+    rows = lambda start, size: jax.tree.map(
+        lambda v: padded(np.asarray(v)[start : start + size], size), (x0s, variations)
     )
-    loops, size = _compiled_loops(int(steps)), min(chunk or len(x0s), len(x0s))
-    while chunk is None and size > 1:
+    part = lambda start, size: jax.device_put(rows(start, size), placement(devices, True))
+    loops = _compiled_loops(int(steps), devices)
+    size = divisible(min(chunk or len(x0s), len(x0s)), devices)
+    while chunk is None and size > count(devices):
         if program_bytes(loops.program(*shared, *part(0, size))) <= 0.8 * device_bytes():
             break
-        size = -(-size // 2)
+        size = divisible(-(-size // 2), devices)
     runs = []
     with tqdm(total=len(x0s), unit=" loops", disable=not progress) as bar:
         for start in range(0, len(x0s), size):
-            count = min(size, len(x0s) - start)
-            runs.append(first_rows(loops(*shared, *part(start, size)), count))
-            bar.update(count)
-    return jax.tree.map(lambda *v: np.concatenate(v), *runs)
+            here = min(size, len(x0s) - start)
+            runs.append(first_rows(loops(*shared, *part(start, size)), here))
+            bar.update(here)
+    return joined(runs)
 
 
 def require_variations(plant: Any, variations: Mapping[str, Any], count: int) -> None:
@@ -116,5 +123,6 @@ def simulate_batch(
 
 
 @functools.cache
-def _compiled_loops(steps: int) -> Compiled:
-    return Compiled(jax.jit(functools.partial(simulate_batch, steps=steps)))
+def _compiled_loops(steps: int, devices: Devices) -> Compiled:
+    loops = functools.partial(simulate_batch, steps=steps)
+    return over_devices(loops, devices, (False, False, False, False, True, True))

@@ -20,6 +20,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.compiled import Compiled
+from jaxmpc.devices import Devices, over_devices
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
@@ -185,35 +186,33 @@ def newton_stage(
 
 
 @functools.cache
-def compiled_admm(iterations: int, dtype: Any) -> Compiled:
+def compiled_admm(iterations: int, dtype: Any, devices: Devices = None) -> Compiled:
     """Return the compiled ADMM stage: (p, rows, points (B, d), alpha) → verdicts and w (B, k)."""
     stage = lambda p, rows, points, alpha: admm_stage(p, rows, points, alpha, iterations, dtype)
-    return Compiled(jax.jit(stage))
+    return over_devices(stage, devices, (False, False, True, False))
 
 
 @functools.cache
-def compiled_check() -> Compiled:
+def compiled_check(devices: Devices = None) -> Compiled:
     """Return the compiled proofs: (p, rows, points (B, d), w (B, k), multipliers (B, R)) →
     verdicts."""
 
-    @jax.jit
     def run(p: ExactData, rows: ConstraintRows, points: Array, w: Array, y: Array) -> Verdict:
         check = lambda theta, w, y: check_candidates(p, rows, theta, w, [y])
         return jax.vmap(check)(points, w, y)
 
-    return Compiled(run)
+    return over_devices(run, devices, (False, False, True, True, True))
 
 
 @functools.cache
-def compiled_newton(batch: int) -> Compiled:
+def compiled_newton(batch: int, devices: Devices = None) -> Compiled:
     """Return the compiled Newton stages: (p, rows, points (B, d), usable (B,), verdicts, w (B, k))
     → verdicts.
 
-    Usable points that are undecided are gathered in batches of `batch`, on the device, until none
+    Usable points that are undecided are gathered in batches of `batch`, on each device, until none
     is undecided or each has had NEWTON_ROUNDS rounds; those with the fewest rounds come first.
     """
 
-    @jax.jit
     def run(
         p: ExactData, rows: ConstraintRows, points: Array, usable: Array, verdict: Verdict,
         w: Array,
@@ -236,4 +235,4 @@ def compiled_newton(batch: int) -> Compiled:
         start = verdict, w.astype(jnp.float64), jnp.zeros(len(points), int)
         return jax.lax.while_loop(go_on, newton, start)[0]
 
-    return Compiled(run)
+    return over_devices(run, devices, (False, False, True, True, True, True))

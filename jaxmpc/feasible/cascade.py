@@ -19,6 +19,7 @@ import numpy as np
 
 from jaxmpc.checks import fail
 from jaxmpc.compiled import Compiled, default_chunk, gather_size, padded, require_step_type
+from jaxmpc.devices import chosen_devices, count, divisible, placement
 from jaxmpc.feasible.candidates import (
     ALPHA,
     StagePenalties,
@@ -90,7 +91,8 @@ def label_chunks(
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != d:
         fail("x0s", f"shape {points.shape}", f"Give points (B, {d}), one column a mapped state")
-    chunk = default_chunk() if chunk is None else chunk
+    if chunk is None:
+        chunk = count(chosen_devices(settings.get("devices"))) * default_chunk()
     if chunk < 1:
         fail("chunk", f"{chunk}", "Give a count of at least 1")
     chunk = min(chunk, max(len(points), 1))
@@ -104,30 +106,33 @@ def label_chunks(
 def label_parts(
     problem: FeasibilityProblem, parts: Iterable[np.ndarray], scope: Scope, chunk: int, *,
     iterations: int = 50, dtype: Any = "float32", penalties: StagePenalties | None = None,
+    devices: Any = None,
 ) -> Iterator[Labels]:  # fmt: skip
     """Label parts, each an array of up to `chunk` points (b, d), in compiled programs for `chunk`;
     yield their Labels in order. The next part is taken before the labels of one are yielded."""
     if iterations < 1:
         fail("iterations", f"{iterations}", "Give a count of at least 1")
     require_step_type(dtype)
+    devices = chosen_devices(devices)
     quick, back, alpha = _penalised(problem.rows, penalties)
     exact = problem.exact(scope.largest, scope.typical)
     margins = problem.row_margins(exact, scope.typical)
     programs = min(MOST_PROGRAMS, MOST_ENTRIES // max(problem.rows.U.size, 1))
     share = -(-programs // max(scope.parts, 1))
-    batch = gather_size(chunk)
+    whole = divisible(chunk, devices)  # the chunk as the devices share it
+    batch = count(devices) * (each := gather_size(whole // count(devices)))
     short, long = (
-        compiled_admm(iterations, np.dtype(dtype)),
-        compiled_admm(LONGER * iterations, np.dtype(np.float64)),
+        compiled_admm(iterations, np.dtype(dtype), devices),
+        compiled_admm(LONGER * iterations, np.dtype(np.float64), devices),
     )
-    newton, check = compiled_newton(batch), compiled_check()
+    newton, check = compiled_newton(each, devices), compiled_check(devices)
     with jax.enable_x64(True):
-        exact, rows, quick = jax.device_put((exact, problem.rows, quick))
+        exact, rows, quick = jax.device_put((exact, problem.rows, quick), placement(devices))
 
     def started(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[Verdict, Any]]:
         """Return a part, which of it is usable, and the ADMM stage, which the device still works
         on."""
-        x = padded(points, chunk)
+        x = padded(points, whole)
         ok = np.all(np.isfinite(x), axis=1)
         x = np.where(ok[:, None], x, 0.0)
         return x, ok, _run(short, exact, quick, x, alpha)
@@ -166,8 +171,8 @@ def label_parts(
             if waiting is None:
                 waiting = ahead
                 continue
-            count, now = waiting
-            labels = finished(*now).first(count)
+            size, now = waiting
+            labels = finished(*now).first(size)
             if scope.parts * sum(v.nbytes for v in jax.tree.leaves(now[2])) > ON_DEVICE:
                 labels.fetch()
         compile_seconds = Compiled.seconds - compiled

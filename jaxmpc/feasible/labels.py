@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxmpc.compiled import cores, joined, side_by_side
 from jaxmpc.feasible.candidates import Verdict
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.qp.status import Status
@@ -118,9 +119,8 @@ class Labels:
     @classmethod
     def joined(cls, parts: Sequence["Labels"]) -> "Labels":
         """Return the labels of several batches of points, one after the other."""
-        several = lambda name: OnDemand(
-            lambda: np.concatenate([part.proofs[name].get() for part in parts])
-        )
+        fetched = lambda name: side_by_side(lambda part: part.proofs[name].get(), parts, cores())
+        several = lambda name: OnDemand(lambda: joined(fetched(name)))
         return cls(
             np.concatenate([part.label for part in parts]),
             np.concatenate([part.status for part in parts]),

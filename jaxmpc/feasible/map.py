@@ -348,6 +348,7 @@ def map_feasible_set(
     mpc: MPC, x0s: Any, *, axes: Any = None, fixed: Any = None, iterations: int = 50,
     dtype: Any = "float32", chunk: int | None = None, refine: float | None = None,
     penalties: StagePenalties | None = None, progress: bool = False, executor: Any = None,
+    devices: Any = None,
 ) -> FeasibleSetMap:  # fmt: skip
     """Label each point: is there an input sequence that keeps every hard constraint of `mpc`?
 
@@ -365,7 +366,8 @@ def map_feasible_set(
     labels the chunks, such as a `concurrent.futures.ProcessPoolExecutor` with the start method
     spawn, or the executor of a cluster: `submit(function, *arguments)` returns a future with
     `result()`. Labels and proofs are those without it, bit for bit on processors of one kind. A
-    chunk whose worker died is submitted again up to 3 times, with a warning.
+    chunk whose worker died is submitted again up to 3 times, with a warning. devices: a number of
+    them, or a sequence of JAX devices, which share the points of a chunk; None: the default device.
 
     A point with NaN or infinity gets status NON_FINITE and label 0. Raises ValueError for wrong
     shapes and ill-posed problems before anything compiles.
@@ -380,7 +382,7 @@ def map_feasible_set(
         require_kind("penalties", penalties, StagePenalties)
     result = map_points(
         problem, x0s, iterations=iterations, dtype=dtype, chunk=chunk, penalties=penalties,
-        progress=progress, executor=executor,
+        progress=progress, executor=executor, devices=devices,
     )  # fmt: skip
     return result if refine is None else result.refine(refine)
 

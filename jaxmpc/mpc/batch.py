@@ -2,6 +2,7 @@
 
 import functools
 import threading
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.compiled import Compiled, default_chunk, padded, side_by_side, workers
+from jaxmpc.devices import Devices, count, divisible, over_devices, placement
 from jaxmpc.mpc import transfer
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Plan
@@ -30,17 +32,26 @@ STEPS = 24
 class Batch:
     """Plans from the states x (B, p), which lie in NumPy or on the device.
 
-    chunk, block: states that a program takes at once, of many and of few. answer: the plans so far,
-    B in front.
+    chunk, block: states that a program takes at once, of many and of few; devices share them.
+    answer: the plans so far, B in front, in NumPy (to_host) or on the device.
     """
 
-    def __init__(self, controller: Controller, x: Any, chunk: int | None, to_host: bool) -> None:
-        self.controller, self.x, self.to_host = controller, x, to_host
-        most = max(min(default_chunk(), -(-len(x) // workers())), 1)
-        self.chunk = max(min(chunk or most, len(x)), 1)
-        self.block = min(self.chunk, BLOCK if jax.default_backend() == "cpu" else 8 * BLOCK)
+    def __init__(
+        self, controller: Controller, x: Any, chunk: int | None, to_host: bool, devices: Devices
+    ) -> None:
+        self.x, self.to_host, self.devices = x, to_host, devices
+        self.controller = jax.device_put(controller, placement(devices))
+        # Of several devices two chunks at once: one is computed while the other goes to the host.
+        self.together = workers() if devices is None else 2
+        shares = workers() if devices is None else 1
+        most = min(count(devices) * default_chunk(), -(-len(x) // shares))
+        few = BLOCK if jax.default_backend() == "cpu" else 8 * BLOCK
+        self.chunk = divisible(max(min(chunk or most, len(x)), 1), devices)
+        self.block = divisible(min(self.chunk, count(devices) * few), devices)
+        # On several devices one program begins after the other, in the same order on all of them.
+        self._begins: Any = nullcontext() if devices is None else threading.Lock()
+        self._stores = threading.Lock()
         self.answer: Plan | None = None
-        self._lock = threading.Lock()
 
     def solve(self, follow: bool) -> Plan:
         """Return the plans from all states. follow: whether states may follow solved ones."""
@@ -48,7 +59,7 @@ class Batch:
         left = np.arange(B)
         if follow and B >= MANY and transfer.transferable(self.controller):
             left = self._transfer()
-        self._run(_plans, (self.controller,), left)
+        self._run(_plans(self.devices), (self.controller,), left)
         assert self.answer is not None
         return self.answer
 
@@ -56,18 +67,18 @@ class Batch:
         """Solve from some states, and from those that follow them; return the indices of those that
         are left."""
         index, cells = transfer.choose(self.x)
-        self._run(_plans, (self.controller,), index)
+        self._run(_plans(self.devices), (self.controller,), index)
         solved = jax.tree.map(lambda v: v[padded(index, len(cells.states))], self.answer)
         laws = _laws(self.controller, solved.multipliers, solved.status)
         arguments = (self.controller, laws, cells)
         left = np.delete(np.arange(len(self.x)), index)
         if len(left) >= TRIAL * self.chunk:
             few = left[:: len(left) // self.chunk][: self.chunk]
-            self._run(_follow(0), arguments, few)
+            self._run(_follow(self.devices, 0), arguments, few)
             if np.mean(self._unsolved(few)) > 1 - LEAST:
                 return left
         for steps in (0, STEPS):
-            self._run(_follow(steps), arguments, left)
+            self._run(_follow(self.devices, steps), arguments, left)
             left = left[self._unsolved(left)]
         return left
 
@@ -85,13 +96,16 @@ class Batch:
             where = padded(where, size)
             with jax.enable_x64(True):
                 x = self.x[where] if isinstance(self.x, np.ndarray) else _rows(self.x, where)
-                self._put(where, program.program(*arguments, x)(*arguments, x))
+                with self._begins:
+                    plans = program.program(*arguments, x)(*arguments, x)
+                self._put(where, plans)
 
-        side_by_side(part, [index[i : i + size] for i in range(0, len(index), size)])
+        pieces = [index[i : i + size] for i in range(0, len(index), size)]
+        side_by_side(part, pieces, self.together)
 
     def _put(self, where: np.ndarray, plans: Plan) -> None:
-        B = len(self.x)
-        with self._lock:
+        B, plans = len(self.x), jax.device_get(plans) if self.to_host else plans
+        with self._stores:
             if self.answer is None:
                 zeros = np.zeros if self.to_host else jnp.zeros
                 self.answer = jax.tree.map(lambda v: zeros((B, *v.shape[1:]), v.dtype), plans)
@@ -99,7 +113,7 @@ class Batch:
                 self.answer = _put(self.answer, where, plans)
                 return
         for all_, rows in zip(*map(jax.tree.leaves, (self.answer, plans)), strict=True):
-            all_[where] = np.asarray(rows)
+            all_[where] = rows
 
 
 @jax.jit
@@ -112,23 +126,26 @@ def _put(answer: Plan, where: Array, plans: Plan) -> Plan:
     return jax.tree.map(lambda v, rows: v.at[where].set(rows), answer, plans)
 
 
-@Compiled
-@jax.jit
-def _plans(controller: Controller, x: Array) -> Plan:
-    n = controller.mpc.system.n
-    previous = lambda x: x[n:] if controller.mpc.input_in_state else None
-    return jax.vmap(lambda x: controller.plan(x[:n], previous_input=previous(x)))(x)
+@functools.cache
+def _plans(devices: Devices) -> Compiled:
+    """Return the program (controller, x (B, p)) → plans."""
 
+    def run(controller: Controller, x: Array) -> Plan:
+        n = controller.mpc.system.n
+        previous = lambda x: x[n:] if controller.mpc.input_in_state else None
+        return jax.vmap(lambda x: controller.plan(x[:n], previous_input=previous(x)))(x)
 
-_laws = jax.jit(transfer.laws_of)
+    return over_devices(run, devices, (False, True))
 
 
 @functools.cache
-def _follow(steps: int) -> Compiled:
+def _follow(devices: Devices, steps: int) -> Compiled:
     """Return the program (controller, laws, cells, x (B, p)) → plans of `transfer.follow`."""
 
-    @jax.jit
     def run(controller: Controller, laws: transfer.Laws, cells: transfer.Cells, x: Array) -> Plan:
         return jax.vmap(partial(transfer.follow, controller, laws, cells, steps))(x)
 
-    return Compiled(run)
+    return over_devices(run, devices, (False, False, False, True))
+
+
+_laws = jax.jit(transfer.laws_of)

@@ -8,8 +8,9 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail, require_kind, require_memory, whole
-from jaxmpc.compiled import require_step_type
+from jaxmpc.compiled import first_rows, require_step_type
 from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.devices import chosen_devices
 from jaxmpc.mpc.batch import Batch
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller, plan_arguments
@@ -48,6 +49,7 @@ def solve(
 def solve_many(
     mpc: MPC | Controller, x0s: Any, solver: ADMM = DEFAULT, *, dtype: Any = "float32",
     chunk: int | None = None, transfer: bool = True, to_host: bool = True,
+    devices: Any = None,
 ) -> Plan:  # fmt: skip
     """Solve the MPC problem from each state x0s (B, n); the Plan holds host arrays, B in front.
 
@@ -60,8 +62,9 @@ def solve_many(
     program takes at once; None: by device. transfer: of very many states with few coordinates solve
     some, and let the others follow these (`transfer.py`). Each plan is judged by its own residuals
     all the same: this changes the time, and which of several plans within the tolerances is found.
-    to_host: False leaves the plans on the device. A state with NaN gets status NON_FINITE. Raises
-    ValueError for wrong shapes and ill-posed problems.
+    to_host: False leaves the plans on the device. devices: a number of them, or a sequence of JAX
+    devices, which share the states of a chunk; None: the default device. A state with NaN gets
+    status NON_FINITE. Raises ValueError for wrong shapes and ill-posed problems.
     """
     if isinstance(mpc, Controller):
         controller, problem = mpc, mpc.mpc
@@ -73,6 +76,7 @@ def solve_many(
         controller, problem = None, mpc
     require_kind("solver", solver, ADMM)
     require_step_type(dtype)
+    chosen = chosen_devices(devices)
     if chunk is not None:
         whole("chunk", chunk, 1)
     n, p = problem.system.n, problem.dimension
@@ -89,4 +93,6 @@ def solve_many(
             )
         if x0s.shape[1] < p:
             x0s = np.pad(np.asarray(x0s), ((0, 0), (0, p - n)))
-        return Batch(controller, x0s, chunk, to_host).solve(transfer)
+        some = x0s if len(x0s) else np.zeros((1, p))  # and none of the plans from these
+        plans = Batch(controller, some, chunk, to_host, chosen).solve(transfer)
+    return plans if len(x0s) else first_rows(plans, 0)

@@ -165,20 +165,22 @@ class RobotSetting:
         return Labels.empty(len(self.points), self.problem)
 
     def chunks(
-        self, rows: Any = None, *, chunk: int | None = None, **settings: Any
+        self, rows: Any = None, *, chunk: int | None = None, devices: Any = None, **settings: Any
     ) -> Iterator[tuple[slice, Labels, RobotLoops]]:
         """Yield promises and loops of points[rows] (all for None) chunk by chunk, in one shape
         throughout.
 
-        settings: iterations, dtype of the linear labels, as in `map_feasible_set`. Yields (slice of
-        these rows, Labels, RobotLoops).
+        devices: as in `map_feasible_set`. settings: iterations, dtype of the linear labels, as
+        there. Yields (slice of these rows, Labels, RobotLoops).
         """
         points = self.points if rows is None else self.points[rows]
         size = self.chunk(chunk)
         scope = Scope.of(self.points, -(-len(self.points) // size))
-        labelled = label_chunks(self.problem, points, chunk=size, scope=scope, **settings)
+        labelled = label_chunks(
+            self.problem, points, chunk=size, scope=scope, devices=devices, **settings
+        )
         for here, labels in labelled:
-            yield here, labels, self.run(points[here], size)
+            yield here, labels, self.run(points[here], size, devices)
 
     def chunk(self, chunk: int | None) -> int:
         """Return how many loops run at once."""
@@ -186,14 +188,14 @@ class RobotSetting:
             fail("chunk", f"{chunk}", "Give a count of at least 1")
         return min(default_chunk() // 32 if chunk is None else int(chunk), len(self.points))
 
-    def run(self, points: np.ndarray, size: int) -> RobotLoops:
+    def run(self, points: np.ndarray, size: int, devices: Any = None) -> RobotLoops:
         """Simulate closed loops from points (b, d), b ≤ size, filled up to `size` of them."""
         with jax.enable_x64(self.dtype == "float64"):
             xi = padded(self.states(points).astype(self.dtype), size)
             run = simulate_many(
                 self.controller, self.robot, _states(self.robot, xi), self.steps,
                 reference=self.reference.astype(self.dtype),
-                input_reference=self.input_reference.astype(self.dtype),
+                input_reference=self.input_reference.astype(self.dtype), devices=devices,
             )  # fmt: skip
             run = jax.tree.map(lambda v: v[: len(points)], run)
             return RobotLoops.of(run, self.robot, self.dtype)

@@ -15,13 +15,14 @@ from jax.flatten_util import ravel_pytree
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.memory import device_bytes, program_bytes
 from jaxmpc.closed_loop.simulate_many import simulate_batch
-from jaxmpc.compiled import Compiled
 from jaxmpc.control.violation import TOLERANCE
+from jaxmpc.devices import Devices
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.precision import arrays
 from jaxmpc.qp.status import Status
+from jaxmpc.tuning.batch_mean import BatchMean
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameters, values
 
@@ -91,8 +92,30 @@ class ClosedLoopObjective:
         if aux["losses"].shape != (1,) or total.shape != ():
             fail("loss", f"has shape {aux['losses'].shape[1:]}", "Return one number")
 
-    def gradient(self, theta: Any, data: Data, mode: str) -> tuple[str, Callable]:
-        """Return the mode, and (θ, x0s, varied, weights) → value, gradient, numbers of `total`.
+    def over(self, function: Callable, devices: Devices) -> BatchMean:
+        """Return the program of a function with the arguments of `total` and the results of it, or
+        value, gradient, and its numbers."""
+
+        def parted(*args: Any) -> tuple[Any, dict[str, Array]]:
+            *means, each = function(*args)
+            return (*means, each.pop("design")), each
+
+        return BatchMean(parted, devices, (False, False, True, True))
+
+    def evaluation(self, devices: Devices) -> Callable:
+        """Return (θ, x0s, varied, weights) → the design loss, and the numbers of each loop."""
+        program = self.over(self.total, devices)
+
+        def evaluate(*args: Any) -> tuple[float, dict[str, np.ndarray]]:
+            (_, design), each = program(*self.arguments(*args))
+            return design, each
+
+        return evaluate
+
+    def gradient(
+        self, theta: Any, data: Data, mode: str, devices: Devices = None
+    ) -> tuple[str, Callable]:
+        """Return the mode, and (θ, x0s, varied, weights) → value, gradient, numbers of each loop.
 
         With mode "auto" both modes are compiled and timed on `data`.
         """
@@ -114,15 +137,15 @@ class ClosedLoopObjective:
 
         x0s, varied = data
         arguments = self.arguments(theta, x0s, varied, np.ones(len(x0s)))
-        tried: dict[str, Compiled] = {}
+        tried: dict[str, BatchMean] = {}
         if mode != "reverse" and (mode == "forward" or flat.size <= FORWARD):
-            tried["forward"] = Compiled(jax.jit(forward))
+            tried["forward"] = self.over(forward, devices)
         if mode != "forward":
-            name, plain = "reverse", Compiled(jax.jit(reverse))
+            name, plain = "reverse", self.over(reverse, devices)
             try:
                 if program_bytes(plain.program(*arguments)) > 0.5 * device_bytes():
                     name = "reverse, checkpointed"
-                    plain = Compiled(jax.jit(partial(reverse, checkpoint=True)))
+                    plain = self.over(partial(reverse, checkpoint=True), devices)
                 tried[name] = plain
             except ValueError:  # a plant with a loop that JAX cannot transpose
                 if not tried:
@@ -131,10 +154,15 @@ class ClosedLoopObjective:
         if len(tried) > 1:
             name = min(tried, key=lambda name: duration(tried[name], arguments))
         program = tried[name]
-        return name, lambda theta, *rest: program(*self.arguments(theta, *rest))
+
+        def slope(*args: Any) -> tuple[Any, Any, dict[str, np.ndarray]]:
+            (value, slopes, _), each = program(*self.arguments(*args))
+            return value, slopes, each
+
+        return name, slope
 
 
-def duration(program: Compiled, arguments: tuple) -> float:
+def duration(program: BatchMean, arguments: tuple) -> float:
     """Return the time of a call in seconds, without compiling."""
     program(*arguments)
     begun = time.perf_counter()

@@ -10,11 +10,13 @@ import optax
 from jax import Array
 
 from jaxmpc.checks import fail
+from jaxmpc.devices import chosen_devices
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.precision import arrays
 from jaxmpc.runs import fingerprint
+from jaxmpc.tuning.batch_mean import BatchMean
 from jaxmpc.tuning.descent import descend
-from jaxmpc.tuning.feasible_fraction import STEPS, feasible_fraction
+from jaxmpc.tuning.feasible_fraction import STEPS, membership
 from jaxmpc.tuning.parameters import Parameters, raw, require_parameters, values
 from jaxmpc.tuning.result import TuningRun
 from jaxmpc.tuning.settings import Settings
@@ -47,25 +49,32 @@ def tune_feasible_set(
         fail("x0s", f"shape {x0s.shape}", "Give states (B, n), one a row")
     train, test = chosen.split(x0s, shuffle=True)
 
-    def total(theta: Any, x0s: Array) -> tuple[Array, dict[str, Array]]:
+    def total(theta: Any, x0s: Array, weights: Array) -> tuple[Array, dict[str, Array]]:
         mpc = make_mpc(values(parameters, theta))
         if not isinstance(mpc, MPC):
             fail("make_mpc", f"returns a {type(mpc).__name__}", "Return a jm.MPC")
-        fraction = feasible_fraction(mpc, x0s, width, newton_steps=newton_steps)
+        inside = membership(mpc, x0s, width, newton_steps=newton_steps)
+        fraction = jnp.sum(weights * inside) / jnp.sum(weights)
         design = jnp.zeros(()) if design_loss is None else jnp.asarray(design_loss(mpc))
         return design - fraction, {"fraction": fraction, "design": design}
 
-    slope, value = jax.jit(jax.value_and_grad(total, has_aux=True)), jax.jit(total)
+    slope, value = (
+        BatchMean(
+            lambda *args, f=f: (f(*args), {}), chosen_devices(chosen.devices), (False, True)
+        )
+        for f in (jax.value_and_grad(total, has_aux=True), total)
+    )  # fmt: skip
 
     def gradient(theta: Any, step: int) -> tuple[float, Any, dict[str, float]]:
         rows = chosen.minibatch(len(train), step)
         with jax.enable_x64(True):
-            (loss, numbers), slopes = slope(arrays(theta), arrays(train[rows]))
+            x = train[rows]
+            ((loss, numbers), slopes), _ = slope(*arrays((theta, x, np.ones(len(x)))))
         return float(loss), slopes, numbers
 
     def validate(theta: Any) -> tuple[float, dict[str, float]]:
         with jax.enable_x64(True):
-            loss, numbers = value(arrays(theta), arrays(test))
+            (loss, numbers), _ = value(*arrays((theta, test, np.ones(len(test)))))
         return float(loss), numbers
 
     decides = {

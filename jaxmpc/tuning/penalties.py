@@ -11,6 +11,7 @@ import numpy as np
 import optax
 
 from jaxmpc.checks import fail, require_finite, require_kind, whole
+from jaxmpc.devices import chosen_devices
 from jaxmpc.mpc.condense import condense, in_float64
 from jaxmpc.mpc.plan import Plan, WarmStart
 from jaxmpc.mpc.problem import MPC
@@ -107,12 +108,13 @@ def tune_schedule(
 ) -> TuningRun:  # fmt: skip
     """Start at the best constant penalty, descend, and compare with `given`."""
     rows, parameters = objective.W.shape
-    chunk = len(test)
+    chunk, devices = len(test), chosen_devices(settings.devices)
 
     def measure(rho: Any, alpha: Any, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
         rho = np.atleast_2d(rho)  # one stage counts as many equal ones
         count = stages if len(rho) == 1 else len(rho)
-        return solve_samples(np.broadcast_to(rho, (count, rows)), alpha, objective, samples, chunk)
+        rho = np.broadcast_to(rho, (count, rows))
+        return solve_samples(rho, alpha, objective, samples, chunk, devices)
 
     # Infeasible states are left out; a proof of infeasibility holds for any rho.
     tried = [measure(rho, ALPHA, test) for rho in CONSTANTS]
@@ -133,10 +135,12 @@ def tune_schedule(
         "alpha": np.asarray(np.log(ALPHA / (2 - ALPHA))),  # 2 sigmoid(θ) = ALPHA
     }
 
+    program = loss_and_gradient(devices)
+
     def gradient(theta: Any, step: int) -> tuple[float, Any, dict[str, float]]:
         batch = train.take(settings.minibatch(len(train), step))
-        value, slope = loss_and_gradient(theta, objective, batch)
-        return float(value), jax.tree.map(np.asarray, slope), {}
+        (value, slope), _ = program(theta, objective, batch, np.ones(len(batch)))
+        return float(value), slope, {}
 
     def validate(theta: Any) -> tuple[float, dict[str, float]]:
         found = score(*measure(**_values(theta, objective.W), samples=test))

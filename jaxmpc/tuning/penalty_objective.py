@@ -12,6 +12,7 @@ LeCun 2010; penalties of ADMM for QPs: Ichnowski et al. 2021, by reinforcement; 
 iteration are the solutions: a bad rho costs steps but cannot make a solution wrong.
 """
 
+import functools
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,13 +21,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.compiled import padded
+from jaxmpc.compiled import Compiled, first_rows, padded
+from jaxmpc.devices import Devices, divisible, over_devices
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.qp.admm import ADMM, factor, iterate, read, scaled, splittings
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.residuals import marked, residual_terms
 from jaxmpc.qp.solve import solve_factored, unscaled, warm
 from jaxmpc.qp.status import Status
+from jaxmpc.tuning.batch_mean import BatchMean
 
 # Digits by which the loss wants residuals below their tolerance.
 MARGIN = 0.3
@@ -90,34 +93,45 @@ class PenaltyObjective:
         return jax.vmap(one)(samples)
 
 
-@jax.jit
-@jax.value_and_grad
-def loss_and_gradient(theta: Any, objective: PenaltyObjective, samples: Samples) -> Array:
-    """Return the objective of the module's docstring at θ, and its gradient."""
-    e = objective.digits(theta, samples)
-    return jnp.mean(jax.nn.softplus(2 * (e + MARGIN)) / 2)
+@functools.cache
+def loss_and_gradient(devices: Devices = None) -> BatchMean:
+    """Return the program (θ, objective, samples, weights (B,)) → ((loss, gradient), {}): the
+    weighted mean of the module's docstring."""
+
+    def loss(theta: Any, objective: PenaltyObjective, samples: Samples, weights: Array) -> Array:
+        e = objective.digits(theta, samples)
+        return jnp.sum(weights * jax.nn.softplus(2 * (e + MARGIN)) / 2) / jnp.sum(weights)
+
+    value_and_slope = jax.value_and_grad(loss)
+    return BatchMean(lambda *args: (value_and_slope(*args), {}), devices, (False, False, True))
 
 
 def solve_samples(
-    rho: np.ndarray, alpha: Any, objective: PenaltyObjective, samples: Samples, chunk: int
-) -> tuple[np.ndarray, np.ndarray]:
+    rho: np.ndarray, alpha: Any, objective: PenaltyObjective, samples: Samples, chunk: int,
+    devices: Devices = None,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return status and largest residual (B,) of the samples by the solver itself.
 
     rho (stages, rows). chunk: samples at once; one size, so that it compiles once.
     """
-    parts = []
+    parts, program = [], _solve_batches(devices)
+    chunk = divisible(chunk, devices)
     for i in range(0, len(samples), chunk):
         part = samples.take(slice(i, i + chunk))
-        found = _solve_batch(
+        found = program(
             jnp.asarray(rho), jnp.asarray(alpha, float), objective,
             jax.tree.map(lambda v: padded(v, chunk), part),
         )  # fmt: skip
-        parts.append([np.asarray(v)[: len(part)] for v in found])
+        parts.append(first_rows(found, len(part)))
     status, worst = (np.concatenate(part) for part in zip(*parts, strict=True))
     return status, worst
 
 
-@jax.jit
+@functools.cache
+def _solve_batches(devices: Devices) -> Compiled:
+    return over_devices(_solve_batch, devices, (False, False, False, True))
+
+
 def _solve_batch(
     rho: Array, alpha: Array, objective: PenaltyObjective, samples: Samples
 ) -> tuple[Array, Array]:  # fmt: skip

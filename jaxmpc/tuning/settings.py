@@ -9,6 +9,7 @@ import numpy as np
 import optax
 
 from jaxmpc.checks import fail, whole
+from jaxmpc.devices import chosen_devices
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +25,8 @@ class Settings:
     checkpoint: file (.npz) that is replaced after every step. Where it exists the run resumes from
         it, with the same result as without interruption; it must be of the same run.
     progress: show a progress bar.
+    devices: a number of them, or a sequence of JAX devices, which share the samples of a step;
+        None: the default device. A design loss is computed on each of them.
     """
 
     updates: int = 100
@@ -33,9 +36,11 @@ class Settings:
     seed: int = 0
     checkpoint: str | Path | None = None
     progress: bool = False
+    devices: Any = None
 
     def validate(self) -> None:
-        """Raise ValueError for a count or fraction that makes no sense."""
+        """Raise ValueError for a count or fraction that makes no sense, and for wrong devices."""
+        chosen_devices(self.devices)
         whole("updates", self.updates, 0)
         whole("seed", self.seed, 0)
         if self.batch is not None:

@@ -13,7 +13,7 @@ change the stage that decides.
 """
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from jax import Array
 
 from jaxmpc.checks import fail, whole
 from jaxmpc.compiled import default_chunk, padded, require_step_type
+from jaxmpc.devices import Devices, chosen_devices, divisible
 from jaxmpc.feasible.candidates import (
     ALPHA,
     StagePenalties,
@@ -41,6 +42,7 @@ from jaxmpc.qp import linalg
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.runs import fingerprint
+from jaxmpc.tuning.batch_mean import BatchMean
 from jaxmpc.tuning.descent import descend
 from jaxmpc.tuning.result import TuningRun, cached
 from jaxmpc.tuning.settings import Settings
@@ -87,7 +89,7 @@ def tune_sweep_penalties(
     train = train[:chunk]
 
     rows, exact = feasibility.rows, feasibility.exact(np.abs(points).max(axis=0))
-    stage = Stage(exact, rows, iterations, dtype)
+    stage = Stage(exact, rows, iterations, dtype, chosen_devices(chosen.devices))
     decides = {
         "version": VERSION, "iterations": iterations, "dtype": str(np.dtype(dtype)),
         "batch": chosen.batch, "seed": chosen.seed, "updates": chosen.updates,
@@ -95,7 +97,10 @@ def tune_sweep_penalties(
     decides["fingerprint"] = fingerprint(decides, exact, rows, train, test)
 
     def tune() -> TuningRun:
-        labelled = map_points(feasibility, train, iterations=iterations, dtype=dtype, chunk=chunk)
+        labelled = map_points(
+            feasibility, train, iterations=iterations, dtype=dtype, chunk=chunk,
+            devices=chosen.devices,
+        )  # fmt: skip
         with jax.enable_x64(True):
             return tune_row_weights(stage, train, labelled.label, test, chosen, decides)
 
@@ -104,16 +109,18 @@ def tune_sweep_penalties(
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """The ADMM stage of a map: its rows, proofs, iterations and precision."""
+    """The ADMM stage of a map: its rows, proofs, iterations, precision and devices."""
 
     problem: ExactData
     rows: ConstraintRows
     iterations: int
     dtype: Any
+    devices: Devices
 
     def undecided(self, x: np.ndarray, penalties: StagePenalties, chunk: int) -> np.ndarray:
         """Return which states (B,) the stage leaves undecided; chunk: states at once."""
-        run = compiled_admm(self.iterations, np.dtype(self.dtype))
+        run = compiled_admm(self.iterations, np.dtype(self.dtype), self.devices)
+        chunk = divisible(chunk, self.devices)
         made = weighted(self.rows, penalties.weight)[0]
         parts = [
             run(self.problem, made, padded(part, chunk), np.float64(penalties.alpha))[0].label
@@ -150,14 +157,16 @@ def tune_row_weights(
     hard = np.flatnonzero(stage.undecided(train, _penalties(initial), size) & (label != 0))
     known = np.flatnonzero(label)
 
+    program = sweep_loss_and_gradient(stage.iterations, stage.devices)
+
     def gradient(theta: Any, step: int) -> tuple[float, Any, dict[str, float]]:
         rng = np.random.default_rng((settings.seed, step))
         half = batch // 2
         chosen = np.concatenate([rng.choice(hard, half), rng.choice(known, batch - half)])
-        value, slope = sweep_loss_and_gradient(
-            theta, W, stage.problem, stage.rows, train[chosen], label[chosen], stage.iterations
+        (value, slope), _ = program(
+            theta, W, stage.problem, stage.rows, train[chosen], label[chosen], np.ones(batch)
         )
-        return float(value), jax.tree.map(np.asarray, slope), {}
+        return float(value), slope, {}
 
     loss, numbers = validate(theta)
     before = {"loss": loss, **numbers}
@@ -214,15 +223,22 @@ def shortfall(
     return jnp.where(label > 0, beyond, jnp.minimum(outside(e), outside(e - e_before)))
 
 
-@partial(jax.jit, static_argnums=6)
-@jax.value_and_grad
-def sweep_loss_and_gradient(
-    theta: Any, W: Array, problem: ExactData, rows: ConstraintRows, x: Array, label: Array,
-    iterations: int,
-) -> Array:  # fmt: skip
-    """Return the objective of the module's docstring at θ, and its gradient."""
-    weight, alpha = jnp.exp(W @ theta["weight"]), 2 * jax.nn.sigmoid(theta["alpha"])
-    missing = jax.vmap(
-        lambda x, label: shortfall(problem, rows, x, label, weight, alpha, iterations)
-    )(x, label)
-    return jnp.mean(jnp.log10(1 + jnp.maximum(missing, 0.0) / FLOOR))
+@cache
+def sweep_loss_and_gradient(iterations: int, devices: Devices) -> BatchMean:
+    """Return the program (θ, W, problem, rows, x (B, d), label (B,), weights (B,)) → ((loss,
+    gradient), {}): the weighted mean of the module's docstring."""
+
+    def loss(
+        theta: Any, W: Array, problem: ExactData, rows: ConstraintRows, x: Array, label: Array,
+        weights: Array,
+    ) -> Array:  # fmt: skip
+        weight, alpha = jnp.exp(W @ theta["weight"]), 2 * jax.nn.sigmoid(theta["alpha"])
+        missing = jax.vmap(
+            lambda x, label: shortfall(problem, rows, x, label, weight, alpha, iterations)
+        )(x, label)
+        losses = jnp.log10(1 + jnp.maximum(missing, 0.0) / FLOOR)
+        return jnp.sum(weights * losses) / jnp.sum(weights)
+
+    value_and_slope = jax.value_and_grad(loss)
+    batched = (False, False, False, False, True, True)
+    return BatchMean(lambda *args: (value_and_slope(*args), {}), devices, batched)

@@ -12,7 +12,7 @@ from jaxmpc.checks import fail, whole
 from jaxmpc.closed_loop.robot_controller import SOLVER
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.closed_loop.simulate_many import as_argument, require_variations
-from jaxmpc.compiled import Compiled
+from jaxmpc.devices import chosen_devices
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.soften import harden
 from jaxmpc.qp.admm import ADMM
@@ -118,13 +118,14 @@ def tune_weights(
         return jax.tree.map(lambda v: v[rows], train)
 
     gradients: list[tuple[str, Callable]] = []  # filled with the chosen mode at the first step
-    evaluate = Compiled(jax.jit(objective.total))
+    devices = chosen_devices(chosen.devices)
+    evaluate = objective.evaluation(devices)
     sound: list[np.ndarray] = []  # of the validation loops, those finite at the start
 
     def gradient(theta: Any, step: int) -> tuple[float, Any, dict[str, float]]:
         x, varied = data(step)
         if not gradients:
-            gradients.append(objective.gradient(start, data(0), mode))
+            gradients.append(objective.gradient(start, data(0), mode, devices))
         slope, weights = gradients[0][1], np.ones(len(x))
         value, slopes, aux = slope(theta, x, varied, weights)
         finite = np.isfinite(value) and all(np.all(np.isfinite(v)) for v in jax.tree.leaves(slopes))
@@ -137,12 +138,12 @@ def tune_weights(
         return value, slopes, means(aux, weights)
 
     def validate(theta: Any) -> tuple[float, dict[str, float]]:
-        _, aux = evaluate(*objective.arguments(theta, test[0], test[1], np.ones(len(test[0]))))
+        design, aux = evaluate(theta, test[0], test[1], np.ones(len(test[0])))
         if not sound:
             sound.append(np.isfinite(aux["losses"]))
         # Loops that are not finite at the start are left out for good; another makes the loss NaN.
         used = aux["losses"][sound[0]]
-        value = np.mean(used) + aux["design"] if len(used) else np.nan
+        value = np.mean(used) + design if len(used) else np.nan
         return float(value), means(aux, sound[0])
 
     history = descend(start, gradient, validate, optax.adam(0.05), chosen, decides)

@@ -194,7 +194,7 @@ def test_help_is_a_page_a_stranger_can_use(capsys):
     text = capsys.readouterr().out
     options = """robot count seconds target spread seed linearize horizon state-weights
         input-weights margin penalty iterations refine mass damping payload tolerance dtype chunk
-        video output resume overwrite"""
+        devices video output resume overwrite"""
     for word in options.split():
         assert f"--{word}" in text
     assert text.count("(default:") >= 24 and text.count("$ jaxmpc simulate") == 2

@@ -79,8 +79,9 @@ def test_gradient_against_differences():
     parameters = objective.W.shape[1]
     theta = {"log_rho": 0.3 * rng.normal(size=(2, parameters)), "alpha": np.array(1.2)}
     with jax.enable_x64(True):
-        value = lambda theta: float(loss_and_gradient(theta, objective, samples)[0])
-        slope = jax.tree.map(np.asarray, loss_and_gradient(theta, objective, samples)[1])
+        program = loss_and_gradient()
+        both = lambda theta: program(theta, objective, samples, np.ones(len(samples)))[0]
+        value, slope = lambda theta: float(both(theta)[0]), both(theta)[1]
         for _ in range(10):
             d = jax.tree.map(lambda v: rng.normal(size=v.shape), theta)
             move = lambda h, d=d: jax.tree.map(lambda v, w: v + h * w, theta, d)

@@ -82,7 +82,12 @@ class LinearSweep:
         return cls(config, mpc, problem, region, output, found)
 
     def run(
-        self, *, refine: bool = True, learn_penalties: bool = False, executor: Any = None
+        self,
+        *,
+        refine: bool = True,
+        learn_penalties: bool = False,
+        executor: Any = None,
+        devices: int | None = None,
     ) -> None:
         """Label all states, write map and summary, print the table; close the store.
 
@@ -90,9 +95,9 @@ class LinearSweep:
         shard labels its own, and is done unless it is the last.
         """
         with self.store:
-            self._run(refine, learn_penalties, executor)
+            self._run(refine, learn_penalties, executor, devices)
 
-    def _run(self, refine: bool, learn_penalties: bool, executor: Any) -> None:
+    def _run(self, refine: bool, learn_penalties: bool, executor: Any, devices: int | None) -> None:
         start, kept = time.perf_counter(), self.store
         part = ""
         if kept.shard is not None:
@@ -102,7 +107,7 @@ class LinearSweep:
         # The compiler keeps one core busy; meanwhile another can load matplotlib.
         plots = Thread(target=import_module, args=("jaxmpc.app.plots.feasible_set",), daemon=True)
         plots.start()
-        timing = self.label(self.penalties() if learn_penalties else None, executor)
+        timing = self.label(self.penalties(devices) if learn_penalties else None, executor, devices)
         speed = f", {timing.count / timing.run_seconds:,.0f} QPs/s" if timing.count else ""
         run = ("run", f"{timing.run_seconds:.2f} s for {timing.count:,} QPs{speed}")
         if why := kept.unfinished():
@@ -154,7 +159,7 @@ class LinearSweep:
             ("files", " ".join(files)),
         ], 12)  # fmt: skip
 
-    def penalties(self) -> StagePenalties | None:
+    def penalties(self, devices: int | None = None) -> StagePenalties | None:
         """Return penalties learned for the problem, or cached from an earlier run.
 
         Raises ValueError for too few states, and where the cache folder cannot be written.
@@ -170,6 +175,7 @@ class LinearSweep:
             found = tune_sweep_penalties(
                 self.mpc, points, axes=region.axes, fixed=region.fixed, chunk=CHUNK,
                 iterations=settings.iterations, dtype=settings.dtype, cache=cache,
+                devices=devices,
             )  # fmt: skip
         except OSError as error:
             fail(str(cache), f"{error.strerror}", "Set XDG_CACHE_HOME to a folder of yours")
@@ -180,7 +186,10 @@ class LinearSweep:
         print(f"penalties: {verdict}, {time.perf_counter() - start:.1f} s", file=sys.stderr)
         return found.result if found.improved else None
 
-    def label(self, penalties: StagePenalties | None = None, executor: Any = None) -> Timing:
+    def label(
+        self, penalties: StagePenalties | None = None, executor: Any = None,
+        devices: int | None = None,
+    ) -> Timing:  # fmt: skip
         """Label the blocks that are not done, and commit each."""
         todo, along, settings = self.store.pending(), self.region.along, self.config.sweep
         timing, decided = Timing(), 0
@@ -191,6 +200,7 @@ class LinearSweep:
             self.problem, (mesh(along, self.store.samples(block)) for block in todo),
             Scope.of_grid(along, len(self.store.regions)), self.store.size,
             iterations=settings.iterations, dtype=settings.dtype, penalties=penalties,
+            devices=devices,
         )  # fmt: skip
         total = sum(len(self.store.samples(block)) for block in todo)
         with tqdm(total=total, unit=" states", unit_scale=True, disable=None) as bar:

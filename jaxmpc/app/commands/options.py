@@ -40,6 +40,12 @@ Terminal = Annotated[
 End = Annotated[
     tuple[float, ...] | None, option("X [X ...]", "state limits, 3 % wider on each side")
 ]
+Devices = Annotated[
+    int | None,
+    option(
+        "K", "JAX's default device", "Share the work among the first K devices of this machine."
+    ),
+]
 Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")]
 
 

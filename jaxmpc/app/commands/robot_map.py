@@ -78,6 +78,7 @@ class RobotMapCommand:
     search_seconds: float = 60.0
     resume: bool = False
     overwrite: bool = False
+    devices: int | None = None
     settings: dict[str, Any] = field(default_factory=dict)
 
     def run(self) -> None:
@@ -172,7 +173,9 @@ class RobotMapCommand:
         if not todo:
             return
         total = sum(here.stop - here.start for _, here in todo)
-        chunks = setting.chunks(index.ravel(), chunk=index.shape[1], **self.settings)
+        chunks = setting.chunks(
+            index.ravel(), chunk=index.shape[1], devices=self.devices, **self.settings
+        )
         with tqdm(total=total, unit=" loops", disable=None) as bar:
             for (block, here), (_, labels, loops) in zip(todo, chunks, strict=True):
                 count = here.stop - here.start

@@ -115,7 +115,8 @@ class RobotRuns:
         if path.exists() and command.overwrite:
             store.remove(path)
         steps = max(1, round(command.seconds / robot.dt))
-        chunk = command.chunk or (256 if jax.default_backend() == "cpu" else 4096)
+        each = 256 if jax.default_backend() == "cpu" else 4096
+        chunk = command.chunk or (command.devices or 1) * each
         sample = store.Constant(np.arange(len(starts)), ("sample",), {"long_name": "robot"})
         points = store.Constant(starts, ("sample", "state"), {"long_name": "initial state"})
         kept = store.Store(
@@ -143,6 +144,7 @@ class RobotRuns:
                         self.controller, self.robot, padded(self.starts[rows], size), self.steps,
                         reference=self.reference, input_reference=self.input_reference,
                         variations={key: padded(value, size) for key, value in numbers.items()},
+                        devices=self.command.devices,
                     )  # fmt: skip
                 compiling = Compiled.seconds - compiled
                 count = rows.stop - rows.start
@@ -201,7 +203,7 @@ def _run_fields(command: "Simulate", robot: Robot, steps: int) -> dict[str, stor
 
 def _decisive(command: "Simulate", robot: Robot, mpc: MPC) -> dict[str, Any]:
     """Return the options that determine the results, as JSON data."""
-    irrelevant = ("output", "video", "tolerance", "resume", "overwrite", "chunk")
+    irrelevant = ("output", "video", "tolerance", "resume", "overwrite", "chunk", "devices")
     options = {k: v for k, v in dataclasses.asdict(command).items() if k not in irrelevant}
     weights = {
         "state_weights": np.diag(mpc.Q).tolist(),

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxmpc.app.commands.film import film
 from jaxmpc.app.commands.options import (
+    Devices,
     Switch,
     check_counts,
     check_positive,
@@ -19,6 +20,7 @@ from jaxmpc.app.commands.runs_summary import summarise, summary_rows
 from jaxmpc.app.config import load_robot_config
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.outcome import evaluate_runs
+from jaxmpc.devices import chosen_devices
 from jaxmpc.runs import write_json
 
 # Defaults of options that --config can give too.
@@ -129,8 +131,9 @@ class Simulate:
         "float32"
     )
     """Precision of physics and MPC."""
-    chunk: Annotated[int | None, option("B", "256 on a CPU, 4096 on others")] = None
+    chunk: Annotated[int | None, option("B", "256 on a CPU, 4096 on others, of each device")] = None
     """Robots at a time: what is written at once, and lost at most."""
+    devices: Devices = None
     video: Annotated[int, option("K", "4")] = 4
     """Number of robots in the video; 0: none."""
     output: Annotated[Path, option("DIR", "jaxmpc-simulate")] = Path("jaxmpc-simulate")
@@ -185,6 +188,7 @@ class Simulate:
 
     def check(self) -> None:
         """Raise ValueError for options that make no sense."""
+        chosen_devices(self.devices, "--devices")
         check_counts(self, count=1, horizon=1, iterations=1, refine=0, video=0, seed=0, chunk=1)
         check_positive(self, "seconds", "penalty", "tolerance")
         for name, wrong, cure in (

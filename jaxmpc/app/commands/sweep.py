@@ -11,6 +11,7 @@ import tyro
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.linear_sweep import LinearSweep
 from jaxmpc.app.commands.options import (
+    Devices,
     End,
     Horizon,
     Switch,
@@ -22,6 +23,7 @@ from jaxmpc.app.commands.options import (
 )
 from jaxmpc.app.commands.robot_map import RobotMapCommand
 from jaxmpc.checks import fail, require_disk
+from jaxmpc.devices import chosen_devices
 
 # By how much the files of a sweep are smaller than its arrays, at most: the joint's 13 times.
 COMPRESSION = 20
@@ -150,6 +152,7 @@ class Sweep:
     store: Annotated[str | None, option("URL", "sweep.zarr in --output")] = None
     """Where the data go instead, such as s3://bucket/sweep.zarr (fsspec). There are no locks
     there: compute no shard twice at a time."""
+    devices: Devices = None
     resume: Switch = False
     """Resume the sweep in --output; of a shard, its blocks."""
     overwrite: Switch = False
@@ -168,7 +171,10 @@ class Sweep:
             self.robot_map(self.robot).run()
             return
         refuse({"seconds": self.seconds}, None, "It is how long a robot's loops last")
-        self.open().run(refine=self.refine, learn_penalties=self.learn_penalties)
+        chosen_devices(self.devices, "--devices")
+        self.open().run(
+            refine=self.refine, learn_penalties=self.learn_penalties, devices=self.devices
+        )
 
     def open(self) -> LinearSweep:
         """Read, check and open what a sweep needs. Raises ValueError; compiles nothing."""
@@ -191,10 +197,11 @@ class Sweep:
         refuse(given, robot, "Give a problem or a robot; a robot's map is a slice")
         refuse({"learn-penalties": self.learn_penalties}, robot, "They are for linear maps")
         refuse({"shard": self.shard, "store": self.store}, robot, "They are for linear maps")
+        chosen_devices(self.devices, "--devices")
         return RobotMapCommand(
             robot, self.output, "limits", seconds=self.seconds, horizon=self.horizon,
             terminal=self.terminal, axes=self.axes, values=self.fixed, grid=self.grid,
             lower=self.lower, upper=self.upper, refine=self.refine, resume=self.resume,
-            overwrite=self.overwrite,
+            overwrite=self.overwrite, devices=self.devices,
             settings=given_options(self, "iterations", "dtype"),
         )  # fmt: skip
