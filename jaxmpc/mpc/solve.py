@@ -96,12 +96,14 @@ def solve_many(
         controller = Controller(in_float64(mpc), replace(solver, dtype=np.dtype(dtype).name))
         controller = jax.device_put(controller, placement(devices))
         first = padded(x0s[:size], size) if len(x0s) else x0s
-        program = _plans(devices).program(controller, first)
+        compiled = _plans(devices)
+        program = compiled.program(controller, first)
 
     def part(start: int) -> Plan:
         here = x0s[start : start + size]
         with jax.enable_x64(True), beginning:
-            plans = program(controller, padded(here, size) if len(here) else here)
+            x = padded(here, size) if len(here) else here
+            plans = program(*compiled.placed((controller, x)))
         return first_rows(jax.device_get(plans), len(here))
 
     return joined(side_by_side(part, range(0, max(len(x0s), 1), size), together))
