@@ -73,7 +73,7 @@ def check_map():
     # The Newton stage gathers other states side by side on each device.
     left, whole = (map_of(x, 20, iterations=2, chunk=64, devices=d) for d in (4, None))
     same(left["label"], whole["label"])
-    near(left["plans"], whole["plans"])
+    near(left["plans"], whole["plans"], 1e-5)  # of float32 iterates
     # By hand: plans keep the limits, half-spaces exclude their states.
     yes, no = one["label"] == 1, one["label"] == -1
     assert 100 < yes.sum() and 10 < no.sum() and yes.sum() + no.sum() == COUNT - 1

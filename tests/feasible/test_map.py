@@ -209,7 +209,10 @@ class TestIndependenceOf:
 
 def test_compiles_once_for_all_chunks():
     """One program of each stage, whatever the number of chunks."""
-    stages = candidates.compiled_admm(7, np.dtype(np.float32)), candidates.compiled_newton(64)
+    stages = (
+        candidates.compiled_admm(7, np.dtype(np.float32), None),
+        candidates.compiled_newton(64, None),
+    )
     before = [len(stage.programs) for stage in stages]
     points = np.random.default_rng(0).uniform(-1.2, 1.2, (333, 2))
     got = jm.map_feasible_set(problems.lecture(), points, chunk=50, iterations=7)
