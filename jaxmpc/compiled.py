@@ -58,15 +58,23 @@ class Compiled:
 
     seconds = 0.0
 
-    def __init__(self, function: Any) -> None:
+    def __init__(self, function: Any, places: Any = None) -> None:
         self.function = function
+        self.places = places
         self.programs: dict[Any, Any] = {}
 
     def __call__(self, *args: Any) -> Any:
+        args = self.placed(args)
         return jax.device_get(self.program(*args)(*args))
+
+    def placed(self, args: tuple) -> tuple:
+        """The arguments where `places`, one sharding of each, says; None leaves it to JAX, which
+        refuses to divide host arrays among devices under `jax.distributed`."""
+        return args if self.places is None else jax.device_put(args, self.places)
 
     def program(self, *args: Any) -> Any:
         """The program for arguments of these shapes."""
+        args = self.placed(args)
         leaves, tree = jax.tree.flatten(args)
         key = tree, tuple(jax.typeof(leaf) for leaf in leaves)
         if key not in self.programs:

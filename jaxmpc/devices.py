@@ -91,4 +91,4 @@ def over_devices(function: Callable, devices: Devices, batched: Sequence[bool]) 
         function, mesh=out.mesh, in_specs=tuple(place.spec for place in places),
         out_specs=out.spec, check_vma=False,
     )  # fmt: skip
-    return Compiled(jax.jit(parts, in_shardings=places, out_shardings=out))
+    return Compiled(jax.jit(parts, in_shardings=places, out_shardings=out), places)

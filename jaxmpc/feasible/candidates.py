@@ -186,14 +186,14 @@ def newton_stage(
 
 
 @functools.cache
-def compiled_admm(iterations: int, dtype: Any, devices: Devices = None) -> Compiled:
+def compiled_admm(iterations: int, dtype: Any, devices: Devices) -> Compiled:
     """Return the compiled ADMM stage: (p, rows, points (B, d), alpha) → verdicts and w (B, k)."""
     stage = lambda p, rows, points, alpha: admm_stage(p, rows, points, alpha, iterations, dtype)
     return over_devices(stage, devices, (False, False, True, False))
 
 
 @functools.cache
-def compiled_check(devices: Devices = None) -> Compiled:
+def compiled_check(devices: Devices) -> Compiled:
     """Return the compiled proofs: (p, rows, points (B, d), w (B, k), multipliers (B, R)) →
     verdicts."""
 
@@ -205,7 +205,7 @@ def compiled_check(devices: Devices = None) -> Compiled:
 
 
 @functools.cache
-def compiled_newton(batch: int, devices: Devices = None) -> Compiled:
+def compiled_newton(batch: int, devices: Devices) -> Compiled:
     """Return the compiled Newton stages: (p, rows, points (B, d), usable (B,), verdicts, w (B, k))
     → verdicts.
 

@@ -357,7 +357,7 @@ class TestNewtonRounds:
         mark = lambda *shape: np.full((count, *shape), 7.0)
         start = Verdict(label, mark(2), mark(p.horizon, 1), mark(2), mark())
         args = (p, rows, points, usable, start, np.zeros((count, k), np.float32))
-        return jax.tree.map(np.asarray, compiled_newton(batch)(*args))
+        return jax.tree.map(np.asarray, compiled_newton(batch, None)(*args))
 
     @pytest.mark.parametrize("batch", [4, 64])
     def test_all_that_are_open_are_decided(self, batch):

@@ -273,7 +273,7 @@ def test_sweep_shortfalls_against_the_stages_own_verdicts():
     rows, p = problem.rows, problem.exact(np.abs(POINTS).max(axis=0))
     truth = jm.map_feasible_set(mpc(4), x, **SWEEP).label
     with jax.enable_x64(True):
-        decided = compiled_admm(8, np.dtype(np.float32))(p, rows, x, np.float64(1.6))[0].label
+        decided = compiled_admm(8, np.dtype(np.float32), None)(p, rows, x, np.float64(1.6))[0].label
         one = lambda x, label: sweep_penalties.shortfall(
             p, rows, x, label, np.ones(len(rows.lower)), 1.6, 8
         )
