@@ -4,7 +4,7 @@ FAMILIES, family     MPC problems by name, with feasible initial states
 problem, box_states  a family's problem alone; random states of its box
 RIVALS, Rival        other solvers, each where it is installed
 Batch, residuals     QPs that share P and A; primal residual, dual residual and gap of answers
-condensed, pair_of   the QPs of an MPC problem on the host; z and y of plans
+condensed, pair_of   the QPs of an MPC problem on the host, a Condensed; z and y of plans
 Case, Row, measure   one comparison, and what it found of each solver
 Ceilings, Work       what the machine can do, and what a program asks of it
 Growth, Point        time and memory against batch, horizon and number of states
@@ -15,6 +15,7 @@ from jaxmpc.bench.families import FAMILIES, box_states, family, problem
 from jaxmpc.bench.growth import Growth, Point
 from jaxmpc.bench.rivals import RIVALS, Batch, Rival, residuals
 from jaxmpc.bench.roofline import Ceilings, Work
+from jaxmpc.mpc.condense import Condensed
 
 __all__ = [
     "FAMILIES",
@@ -22,6 +23,7 @@ __all__ = [
     "Batch",
     "Case",
     "Ceilings",
+    "Condensed",
     "Growth",
     "Point",
     "Rival",

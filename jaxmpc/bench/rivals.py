@@ -122,14 +122,14 @@ def piqp(qps: Batch, tolerance: float) -> Call:
 
 
 def osqp(qps: Batch, tolerance: float) -> Call:
-    """OSQP's ADMM, from a cold start."""
+    """OSQP's ADMM; each starts from the answer before it, as is its default."""
     import osqp
 
     solver = osqp.OSQP()
     P, A = sparse.csc_matrix(np.triu(qps.P)), sparse.csc_matrix(qps.A)
     solver.setup(
         P, qps.q[0], A, qps.l[0], qps.u[0], eps_abs=tolerance, eps_rel=0.0, max_iter=20_000,
-        warm_starting=False, verbose=False,
+        verbose=False,
     )  # fmt: skip
     known = {1: SOLVED, 3: EMPTY}
 

@@ -102,8 +102,8 @@ class Bench:
     families: Annotated[
         tuple[str, ...] | None, option("NAME [NAME ...]", "joint springs4 springs8 turbompc")
     ] = None
-    """Problems: joint, springs4, springs8, springs16 (springs8_30 and springs16_30: N = 30),
-    quadrotor, cartpole, turbompc, turbompc_10."""
+    """Problems: joint, springs4, springs8, springs16, springs8_30 and springs16_30 (N = 30),
+    quadrotor, cartpole, turbompc and turbompc_10."""
     batches: Annotated[tuple[int, ...] | None, option("B [B ...]", "1 1024 16384")] = None
     """Numbers of states, up to 1048576."""
     horizons: Annotated[tuple[int, ...] | None, option("N [N ...]", "the family's own")] = None
