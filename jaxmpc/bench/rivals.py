@@ -21,6 +21,8 @@ from scipy import sparse
 from jaxmpc.qp.status import Status
 
 SOLVED, EMPTY, OPEN = Status.SOLVED, Status.PRIMAL_INFEASIBLE, Status.ITERATION_LIMIT
+# QPs whose residuals are computed at a time.
+AT_ONCE = 65_536
 Answers = tuple[np.ndarray, np.ndarray, np.ndarray]
 Call = Callable[[], Answers]
 
@@ -44,9 +46,9 @@ class Batch:
     def __len__(self) -> int:
         return len(self.q)
 
-    def first(self, count: int) -> "Batch":
-        """Return the first QPs."""
-        return replace(self, q=self.q[:count], l=self.l[:count], u=self.u[:count])
+    def part(self, which: slice) -> "Batch":
+        """Return some of the QPs."""
+        return replace(self, q=self.q[which], l=self.l[which], u=self.u[which])
 
     def closest(self) -> "Batch":
         """Return the programs of the point of least norm that keeps the limits: the question
@@ -62,6 +64,9 @@ def residuals(qps: Batch, z: Any, y: Any) -> np.ndarray:
     counts as zero, and the dual residual shows what it was worth.
     """
     z, y = np.asarray(z, float), np.asarray(y, float)
+    if len(z) > AT_ONCE:  # the arrays below are of the size of y, some at a time
+        parts = [slice(i, i + AT_ONCE) for i in range(0, len(z), AT_ONCE)]
+        return np.hstack([residuals(qps.part(part), z[part], y[part]) for part in parts])
     y = np.where(((y > 0) & np.isposinf(qps.u)) | ((y < 0) & np.isneginf(qps.l)), 0.0, y)
     with np.errstate(invalid="ignore", over="ignore"):
         Az, gradient = z @ qps.A.T, z @ qps.P + qps.q
