@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.bench.families import LIMITS, box_states, family
+from jaxmpc.bench.families import LIMITS, box_states, family, problem
 from jaxmpc.bench.rivals import EMPTY, RIVALS, SOLVED, Batch, Rival, moreau, residuals
 from jaxmpc.bench.roofline import Ceilings, Work, best_seconds, free_memory, memory_of
 from jaxmpc.checks import in_units
@@ -64,9 +64,10 @@ class Case:
     @cached_property
     def states(self) -> tuple[MPC, np.ndarray]:
         """Return the problem and its states (batch, n)."""
-        draw = 1 if self.what == "labels" else self.batch
-        mpc, x = family(self.family, draw, self.seed, self.horizon)
-        return mpc, box_states(mpc, self.batch, self.seed) if self.what == "labels" else x
+        if self.what == "labels":  # not drawn by labels, which would compile before the clock runs
+            mpc = problem(self.family, self.horizon)
+            return mpc, box_states(mpc, self.batch, self.seed)
+        return family(self.family, self.batch, self.seed, self.horizon)
 
     @cached_property
     def condensed(self) -> Condensed:

@@ -18,7 +18,8 @@ import numpy as np
 
 from jaxmpc.checks import available_memory
 
-# Order of the matrices (on a CPU; four times that on other devices), length of the vectors and number of their sums that measure the ceilings.
+# What measures the ceilings: order of the matrices (on a CPU; four times that on other devices),
+# length of the vectors and number of their sums.
 ORDER, LENGTH, SUMS = 2048, 2**25, 10
 
 

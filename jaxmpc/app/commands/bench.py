@@ -82,7 +82,7 @@ class Bench:
       solved       Share of the answers whose three residuals are within the tolerance.
       false        Answers whose status says otherwise than these residuals, or than a proof.
       cold         Seconds until the first answer, set-up and compiling included.
-      compile      XLA's part of these.
+      compile      XLA's part of these; 0 where an earlier table has compiled the same program.
       ceiling      Time that the matrix products, or their bytes, take at the speed that this
                    machine reached in this run, over the time taken. A lower bound: loops whose
                    length is not known count once, and what is no matrix product not at all.
