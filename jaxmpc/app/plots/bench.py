@@ -32,7 +32,7 @@ def plot_bench(rows: list[Row]) -> Figure:
     problems = list(dict.fromkeys((row.family, row.horizon) for row in rows))
     size = (3.2 * len(problems) + 1.9, 2.7 * len(kinds) + 0.4)
     figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(len(kinds), len(problems), squeeze=False, sharex=True)
+    panels = figure.subplots(len(kinds), len(problems), squeeze=False, sharex=True, sharey="row")
     for (i, (what, tolerance)), (j, (family, horizon)) in (
         (a, b) for a in enumerate(kinds) for b in enumerate(problems)
     ):
@@ -62,7 +62,7 @@ def plot_bench(rows: list[Row]) -> Figure:
         ax.set_yscale("log")
         ax.grid(True, which="major", color="0.9", lw=0.6)
         ax.set_axisbelow(True)
-        ax.tick_params(labelsize=8, labelbottom=True)
+        ax.tick_params(which="both", labelsize=8, labelbottom=True)
     for ax in panels[:, 0]:
         ax.set_ylabel("µs a state", fontsize=9)
     for ax in panels[-1]:
@@ -92,7 +92,7 @@ def plot_growth(points: list[Point]) -> Figure:
             ax.set_xscale("log", base=2)
             ax.set_yscale("log")
             ax.grid(True, which="major", color="0.9", lw=0.6)
-            ax.tick_params(labelsize=8)
+            ax.tick_params(which="both", labelsize=8)
             if len(known):
                 ax.plot(*known.T, color="#0072b2", marker="o", ms=5)
             power = found.get(axis, {}).get(quantity)
