@@ -8,7 +8,7 @@ that the count, and the share of the ceilings that follows from it, is a lower b
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -96,6 +96,11 @@ class Ceilings:
         add = jax.jit(lambda a, b: jax.lax.fori_loop(0, SUMS, lambda _, s: 0.5 * s + b, a))
         found.append(3.0 * SUMS * a.nbytes / best_seconds(partial(add, a, b), rounds))
         return cls(*(value / 1e9 for value in found))
+
+    def or_better(self, other: "Ceilings") -> "Ceilings":
+        """Return the larger of each: other work on the machine only lowers them."""
+        pairs = zip(astuple(self), astuple(other), strict=True)
+        return Ceilings(*(max(pair) for pair in pairs))
 
     def share(self, work: Work, seconds: float) -> tuple[float, str]:
         """Return the time that the work takes at the ceilings over `seconds`, and what bounds it,

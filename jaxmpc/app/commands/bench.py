@@ -84,8 +84,9 @@ class Bench:
       cold         Seconds until the first answer, set-up and compiling included.
       compile      XLA's part of these; 0 where an earlier table has compiled the same program.
       ceiling      Time that the matrix products, or their bytes, take at the speed that this
-                   machine reached in this run, over the time taken. A lower bound: loops whose
-                   length is not known count once, and what is no matrix product not at all.
+                   machine has reached so far (measured before each table, on a busy machine too
+                   low), over the time taken. The operations are a lower bound: loops whose length
+                   is not known count once, and what is no matrix product not at all.
       bench.json   All rows with versions, machine, date and command; written after each call.
       bench.png    Microseconds a state against the batch; growth.png beside it with --growth.
       Ctrl-C       Stops; what was measured is kept and drawn.
@@ -240,7 +241,7 @@ class Record:
 
     def compare(self) -> None:
         """Measure the cases, print a table of each."""
-        from jaxmpc.bench import measure, problem
+        from jaxmpc.bench import Ceilings, measure, problem
 
         for case in self.command.cases():
             if case.what == "labels" and problem(case.family).states is None:
@@ -249,6 +250,8 @@ class Record:
             before = self.rows
             found: list[Row] = []
             print(f"... {case.what} of {case.family}, {case.batch:,} states", file=sys.stderr)
+            if self.ceilings:
+                self.ceilings = self.ceilings.or_better(Ceilings.measure(1))
             try:
                 for found in measure(case, self.ceilings, self.note):
                     self.rows = [*before, *found]
