@@ -11,17 +11,15 @@ starts from its last solution, DAQP and PIQP start cold. Residuals of all are co
 
 import time
 from dataclasses import dataclass
-from importlib.util import find_spec
 
 import jax
 import numpy as np
 import tyro
-from benchmark import clocked, condensed, residuals
-from mpc_families import family
-from mpc_solvers import daqp_loop, osqp_loop, piqp_loop
-from plans import pair_of, rows_that_move
 
 import jaxmpc as jm
+from jaxmpc.bench import RIVALS, Batch, condensed, family, pair_of, residuals
+from jaxmpc.bench.cases import moving_rows
+from jaxmpc.bench.roofline import best_seconds
 
 
 @dataclass(frozen=True)
@@ -63,19 +61,18 @@ def measure(name: str, s: Settings) -> None:
     warm = np.arange(s.loops * s.samples) % s.samples > 0
     x, plans, _ = runs[0]
     plan = jax.tree.map(lambda *v: np.stack(v), *plans)
-    solved = np.mean(residuals(condensed(mpc), x, *pair_of(condensed(mpc), plan)) <= 1e-6)
+    c = condensed(mpc)
+    worst = residuals(Batch.of(c, x), *pair_of(c, plan)).max(axis=0)
     ours = min((run[2][warm] for run in runs), key=np.mean) * 1e6
     print(f"{name:10} jaxmpc {ours.mean():8.0f} µs, median {np.median(ours):6.0f}, "
-          f"solved {solved:.2%}", flush=True)  # fmt: skip
-    c = rows_that_move(condensed(mpc))
-    shift = x @ c.D.T + c.d
-    q, l, u = x @ c.F.T + c.f, c.lower - shift, c.upper - shift
-    for rival, make in (("osqp", osqp_loop), ("daqp", daqp_loop), ("piqp", piqp_loop)):
-        if find_spec(rival):
-            call = make(c, q, l, u)
-            seconds, (z, y, _) = min((clocked(call) for _ in range(s.rounds)), key=lambda f: f[0])
-            met = np.mean(residuals(c, x, z, y) <= 1e-6)
-            spent = seconds / len(x) * 1e6
+          f"solved {np.mean(worst <= 1e-6):.2%}", flush=True)  # fmt: skip
+    qps = Batch.of(moving_rows(c), x)
+    for rival in ("osqp", "daqp", "piqp"):
+        if RIVALS[rival].installed:
+            call = RIVALS[rival].make(qps, 1e-6)
+            z, y, _ = call()
+            met = np.mean(residuals(qps, z, y).max(axis=0) <= 1e-6)
+            spent = best_seconds(call, s.rounds) / len(x) * 1e6
             print(f"{'':10} {rival:6} {spent:8.0f} µs, solved {met:.2%}", flush=True)
 
 

@@ -9,8 +9,9 @@ Sets and laws  lqr, maximal_invariant_set, maximal_control_invariant_set, invari
 Tuning         tune_weights, tune_penalties with Parameter and ClosedLoopLoss
 
 The rest, and the types of all results, are in `qp`, `control`, `sets`, `mpc`, `feasible`,
-`recursion`, `explicit`, `robots`, `robot_maps`, `closed_loop`, `tuning` and `workflow`. Each name
-is imported when it is first used, so that the command can answer Ctrl-C before JAX is loaded.
+`recursion`, `explicit`, `robots`, `robot_maps`, `closed_loop`, `tuning`, `workflow` and `bench`.
+Each name is imported when it is first used, so that the command can answer Ctrl-C before JAX is
+loaded.
 """
 
 from importlib import import_module
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxmpc import (
+        bench,
         closed_loop,
         control,
         explicit,
@@ -79,6 +81,7 @@ __all__ = [
     "RobotController",
     "Soft",
     "Status",
+    "bench",
     "boundary",
     "closed_loop",
     "control",

@@ -26,6 +26,7 @@ COMMANDS = {
     "info": ("info", "Info"),
     "simulate": ("simulate", "Simulate"),
     "verify": ("verify", "Verify"),
+    "bench": ("bench", "Bench"),
 }
 DESCRIPTION = "Constrained MPC in batches, with proofs. Also: jaxmpc --version"
 # Options of tyro that write a completion script for a shell, and the words that each needs.

@@ -1,4 +1,4 @@
-"""MPC problems that the field measures solvers on, each with feasible initial states.
+"""MPC problems that the field measures solvers on, with initial states for each.
 
 joint: the lesson's robot joint, N = 20. springs4, 8, 16: masses on springs between walls with that
 many states, forces on every other mass, N = 20 or, with _30, 30. quadrotor: planar, about hover.
@@ -7,42 +7,52 @@ cartpole: about the upright pole, unstable. turbompc: the random systems of Turb
 """
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-import jaxmpc as jm
+from jaxmpc.checks import fail, nearest
+from jaxmpc.control.sets import Box
+from jaxmpc.control.system import LinearSystem
+from jaxmpc.feasible.map import map_feasible_set
+from jaxmpc.mpc.problem import MPC
+
+# States of a family that differ from each other; more are these again.
+DISTINCT = 65_536
+# States that `family` labels at a time: one shape, hence one compiled program.
+BLOCK = 8192
 
 
 def regulator(
     A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray, horizon: int, x: np.ndarray,
     u: np.ndarray,
-) -> jm.MPC:  # fmt: skip
+) -> MPC:  # fmt: skip
     """The problem |x_k| ≤ x, |u_k| ≤ u with the LQR's terminal cost."""
-    return jm.MPC(
-        jm.LinearSystem(A, B), Q, R, horizon, states=jm.Box(-x, x), inputs=jm.Box(-u, u),
+    return MPC(
+        LinearSystem(A, B), Q, R, horizon, states=Box(-x, x), inputs=Box(-u, u),
         terminal_cost=solve_discrete_are(A, B, Q, R),
     )  # fmt: skip
 
 
 def sampled(Ac: np.ndarray, Bc: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
     """A, B of the system sampled with zero-order hold."""
-    system = jm.LinearSystem.from_continuous(Ac, Bc, dt)
+    system = LinearSystem.from_continuous(Ac, Bc, dt)
     return np.asarray(system.A), np.asarray(system.B)
 
 
-def joint() -> jm.MPC:
+def joint() -> MPC:
     """The lesson's joint: angle and rate, torque."""
     Q = np.diag([50.0, 1.0])
-    return jm.MPC(
-        jm.LinearSystem(np.array([[1, 0.01], [0, 1]]), np.array([[0], [0.2]])), Q,
-        np.array([[0.1]]), 20, states=jm.Box([-1.5, -2], [1.5, 2]), inputs=jm.Box([-2.0], [2.0]),
-        terminal_cost=Q,
+    return MPC(
+        LinearSystem(np.array([[1, 0.01], [0, 1]]), np.array([[0], [0.2]])), Q,
+        np.array([[0.1]]), 20, states=Box(np.array([-1.5, -2]), np.array([1.5, 2])),
+        inputs=Box(np.array([-2.0]), np.array([2.0])), terminal_cost=Q,
     )  # fmt: skip
 
 
-def springs(masses: int, horizon: int) -> jm.MPC:
+def springs(masses: int, horizon: int) -> MPC:
     """Masses in a row between walls, unit mass and stiffness, a force on every other one."""
     n, forces = 2 * masses, max(1, masses // 2)
     K = 2 * np.eye(masses) - np.eye(masses, k=1) - np.eye(masses, k=-1)
@@ -55,7 +65,7 @@ def springs(masses: int, horizon: int) -> jm.MPC:
     )
 
 
-def quadrotor() -> jm.MPC:
+def quadrotor() -> MPC:
     """A planar quadrotor about hover: x, z, tilt and their rates; thrusts beside those of hover."""
     g, mass, inertia, arm = 9.81, 0.5, 0.005, 0.17
     Ac, Bc = np.zeros((6, 6)), np.zeros((6, 2))
@@ -66,7 +76,7 @@ def quadrotor() -> jm.MPC:
     return regulator(A, B, Q, 0.1 * np.eye(2), 20, limits, np.full(2, 1.5))
 
 
-def cartpole() -> jm.MPC:
+def cartpole() -> MPC:
     """A cart with an upright pole: positions, rates; force on the cart."""
     M, m, length, g = 1.0, 0.2, 0.5, 9.81
     Ac, Bc = np.zeros((4, 4)), np.zeros((4, 1))
@@ -81,7 +91,7 @@ def cartpole() -> jm.MPC:
 
 def turbompc(
     umax: float = 1.0, n: int = 8, m: int = 4, horizon: int = 39, batch: int = 1, seed: int = 0
-) -> tuple[jm.MPC, np.ndarray]:
+) -> tuple[MPC, np.ndarray]:
     """A system of TurboMPC's benchmark and initial states (batch, n), from its own generator."""
     random = np.random.RandomState(seed)
     A = np.eye(n) + 0.1 * random.randn(n, n)
@@ -91,14 +101,14 @@ def turbompc(
     A = (V @ np.diag(values) @ np.linalg.inv(V)).real
     B, c, x0 = random.randn(n, m), 0.01 * random.randn(n), 5 * random.randn(batch, n)
     limit = np.full(m, umax)
-    mpc = jm.MPC(
-        jm.LinearSystem(A, B, c), np.eye(n), np.eye(m), horizon, inputs=jm.Box(-limit, limit),
+    mpc = MPC(
+        LinearSystem(A, B, c), np.eye(n), np.eye(m), horizon, inputs=Box(-limit, limit),
         terminal_cost=np.eye(n),
     )  # fmt: skip
     return mpc, x0
 
 
-PROBLEMS: dict[str, Callable[[], jm.MPC]] = {
+PROBLEMS: dict[str, Callable[[], MPC]] = {
     "joint": joint,
     "springs4": partial(springs, 2, 20),
     "springs8": partial(springs, 4, 20),
@@ -112,15 +122,55 @@ LIMITS = {"turbompc": 1.0, "turbompc_10": 10.0}
 FAMILIES = (*PROBLEMS, *LIMITS)
 
 
-def family(name: str, count: int, seed: int = 0) -> tuple[jm.MPC, np.ndarray]:
-    """A problem and initial states (count, n) that are proved feasible, dense near the origin."""
+def problem(name: str, horizon: int | None = None) -> MPC:
+    """Return the problem of a family, with another horizon where one is given.
+
+    Raises ValueError for a name that is not in FAMILIES.
+    """
+    if name not in FAMILIES:
+        fail("family", f"no problem {name!r}", f"{nearest(name, FAMILIES)}{', '.join(FAMILIES)}")
+    mpc = turbompc(LIMITS[name])[0] if name in LIMITS else PROBLEMS[name]()
+    return mpc if horizon is None else replace(mpc, horizon=horizon)
+
+
+def family(
+    name: str, count: int, seed: int = 0, horizon: int | None = None
+) -> tuple[MPC, np.ndarray]:
+    """Return the problem of a family and feasible states (count, n).
+
+    They are proved feasible by `map_feasible_set`, dense near the origin; the systems of TurboMPC
+    have states without limits, and their own generator. Above 65,536 states they repeat.
+    """
+    mpc, few = problem(name, horizon), min(count, DISTINCT)
+    x = _feasible(name, few, seed, mpc.horizon)
+    return mpc, np.resize(x, (count, x.shape[1]))
+
+
+@cache
+def _feasible(name: str, count: int, seed: int, horizon: int) -> np.ndarray:
+    """Return states of a family (count, n), all different."""
     if name in LIMITS:
-        return turbompc(LIMITS[name], batch=count, seed=seed)
-    mpc, random = PROBLEMS[name](), np.random.default_rng(seed)
-    h = np.asarray(mpc.states.upper, float)
+        return turbompc(LIMITS[name], batch=count, seed=seed)[1]
+    mpc, random = problem(name, horizon), np.random.default_rng(seed)
+    h = half_widths(mpc)
     x = np.zeros((0, len(h)))
     while len(x) < count:
-        size = random.uniform(0, 1, (4 * count, 1)) ** (1 / 4)
-        drawn = random.uniform(-h, h, (4 * count, len(h))) * size
-        x = np.concatenate([x, drawn[jm.map_feasible_set(mpc, drawn).label == 1]])
-    return mpc, x[:count]
+        size = random.uniform(0, 1, (BLOCK, 1)) ** (1 / 4)
+        drawn = random.uniform(-h, h, (BLOCK, len(h))) * size
+        x = np.concatenate([x, drawn[map_feasible_set(mpc, drawn).label == 1]])
+    return x[:count]
+
+
+def half_widths(mpc: MPC) -> np.ndarray:
+    """Return the limits (n,) of |x|. Raises ValueError where the states have none."""
+    if not isinstance(mpc.states, Box):
+        fail("family", "the states have no limits", "Take another problem")
+    return np.asarray(mpc.states.half_widths(), float)
+
+
+def box_states(mpc: MPC, count: int, seed: int = 0) -> np.ndarray:
+    """Return random states (count, n) of the box of the state limits, widened by 6 % so that some
+    of them are infeasible."""
+    high = 1.06 * half_widths(mpc)
+    few = np.random.default_rng(seed).uniform(-high, high, (min(count, DISTINCT), len(high)))
+    return np.resize(few, (count, len(high)))
