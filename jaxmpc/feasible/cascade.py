@@ -28,6 +28,7 @@ from jaxmpc.feasible.candidates import (
     compiled_check,
     compiled_newton,
 )
+from jaxmpc.feasible.cones import compiled_cones, cones_for
 from jaxmpc.feasible.constraint_rows import ConstraintRows, weighted
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.problem import FeasibilityProblem
@@ -129,29 +130,49 @@ def label_parts(
     with jax.enable_x64(True):
         exact, rows, quick = jax.device_put((exact, problem.rows, quick), placement(devices))
 
+    cones = cones_for(problem, scope.parts * chunk)
+    if cones is not None:
+        with jax.enable_x64(True):
+            cones = jax.device_put(cones, placement(devices))
+
     def started(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[Verdict, Any]]:
-        """Return a part, which of it is usable, and the ADMM stage, which the device still works
-        on."""
+        """Return a part, which of it is usable, and the first stage, which the device still works
+        on, with its last w where that is ADMM."""
         x = padded(points, whole)
         ok = np.all(np.isfinite(x), axis=1)
         x = np.where(ok[:, None], x, 0.0)
+        if cones is not None:
+            return x, ok, (_run(compiled_cones(devices), exact, cones, x), None)
         return x, ok, _run(short, exact, quick, x, alpha)
 
-    def finished(x: np.ndarray, ok: np.ndarray, found: tuple[Verdict, Any]) -> Labels:
-        """Return the labels of a part, by all stages."""
-        labels, (verdict, w) = Labels.proved(found[0], ok), found
+    def by_newton(
+        x: np.ndarray, ok: np.ndarray, found: tuple[Verdict, Any], back: np.ndarray | None
+    ) -> Labels:
+        """Return the labels after Newton from the w of an ADMM stage, if it left a point open."""
+        verdict, w = found
+        labels = Labels.proved(verdict, ok)
         if np.any((labels.label == 0) & ok):
             w = w if back is None else matmul(w.astype(np.float64), jnp.asarray(back.T))
             labels = Labels.proved(_run(newton, exact, rows, x, ok, verdict, w), ok)
-        left = np.flatnonzero((labels.label == 0) & ok)
+        return labels
+
+    def finished(x: np.ndarray, ok: np.ndarray, found: tuple[Verdict, Any]) -> Labels:
+        """Return the labels of a part, by all stages."""
+        all_ = np.ones(batch, bool)
+        if cones is None:
+            labels, again = by_newton(x, ok, found, back), []
+        else:
+            labels, again = Labels.proved(found[0], ok), [(short, quick, alpha, back)]
         # Points still undecided get a longer ADMM run without weights, and Newton once more.
-        for i in range(0, len(left), batch):
-            where = left[i : i + batch]
-            again, all_ = padded(x[where], batch), np.ones(batch, bool)
-            found = _run(long, exact, rows, again, np.float64(ALPHA))
-            more = Labels.proved(_run(newton, exact, rows, again, all_, *found), all_)
-            more = more.first(len(where))
-            labels = labels.changed(where, more.label, more.status, more.proofs)
+        again = [*again, (long, rows, np.float64(ALPHA), None)]
+        for admm, basis, relaxation, to_rows in again:
+            left = np.flatnonzero((labels.label == 0) & ok)
+            for i in range(0, len(left), batch):
+                where = left[i : i + batch]
+                here = padded(x[where], batch)
+                steps = _run(admm, exact, basis, here, relaxation)
+                more = by_newton(here, all_, steps, to_rows).first(len(where))
+                labels = labels.changed(where, more.label, more.status, more.proofs)
         last = np.flatnonzero((labels.label == 0) & ok)[:share]
         for some_rows, program in last_programs(problem, margins) if len(last) else ():
             last = last[labels.label[last] == 0]

@@ -11,7 +11,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import KDTree
 from tqdm.auto import tqdm
 
 from jaxmpc.checks import fail, number, require_kind, require_memory, whole
@@ -25,11 +24,10 @@ from jaxmpc.feasible.executors import label_elsewhere
 from jaxmpc.feasible.labels import Labels, OnDemand
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays
+from jaxmpc.feasible.refinement import refined
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
 
-# The most rays that `refine` sends in one round.
-MOST_RAYS = 2000
 # Volumes are sums of rounded products; bounds are widened by more than that.
 VOLUME_ROUNDING = 1e-11
 
@@ -214,46 +212,21 @@ class FeasibleSetMap:
         `time.monotonic`, after which no round of rays begins. A set without interior, or unbounded,
         is returned as it is.
         """
-        d = self.problem.dimension
         try:
-            rays = Rays.of(self.problem)
+            found = refined(Rays.of(self.problem), tolerance, rounds, deadline=deadline)
         except ValueError:
             return self
-        box, _ = self.problem.programs.bounding_box
-        unit = power_of_two(np.zeros(d) if box is None else np.ptp(box, axis=0))
-        directions = np.concatenate([np.eye(d), -np.eye(d), -np.ones((1, d))])
-        points = np.zeros((0, d))
-        normals, offsets = rays.box()
-        sent, gap = of_length_one(directions), np.inf
-        for _ in range(rounds):
-            if time.monotonic() > deadline:
-                break
-            found = rays.cast(directions * unit)
-            proved = np.isfinite(found.inner)
-            points = np.concatenate([points, found.points[proved]])
-            valid = np.isfinite(found.offsets)
-            normals = np.concatenate([normals, found.normals[valid]])
-            offsets = np.concatenate([offsets, found.offsets[valid]])
-            try:
-                outer = Polytope(normals * unit, offsets).reduce()
-                low, high = hull_volume(points / unit), outer.volume()
-                directions = fresh(outer.vertices() - rays.center / unit, sent)
-                sent = np.concatenate([sent, of_length_one(directions)])
-            except ValueError:  # unbounded, or too thin for qhull
-                break
-            gap = (high - low) / high
-            # Sets with a curved boundary have no end of vertices.
-            if gap <= tolerance or not 0 < len(directions) <= MOST_RAYS:
-                break
+        gap, box = found.gap, self.problem.programs.bounding_box[0]
         if gap > tolerance and box is not None and np.all(np.isfinite(box)):
             warnings.warn(
                 f"refine: the bounds of the volume differ by {gap:.2g} of it, more than the "
                 f"tolerance {tolerance:.2g}", stacklevel=2,
             )  # fmt: skip
-        labels = excluded(self.labels, rays, self.points, normals, offsets)
+        labels = excluded(self.labels, found.rays, self.points, found.normals, found.offsets)
         return replace(
-            self, labels=labels, extra_points=points, extra_normals=normals, extra_offsets=offsets
-        )
+            self, labels=labels, extra_points=found.points, extra_normals=found.normals,
+            extra_offsets=found.offsets,
+        )  # fmt: skip
 
     def to_xarray(self) -> Any:
         """Return the map as an xarray.Dataset along the dimension `sample`, names and units
@@ -284,19 +257,6 @@ class FeasibleSetMap:
 def scaled_back(body: Polytope, unit: np.ndarray) -> Polytope:
     """Return {x: x / unit ∈ body}."""
     return Polytope(np.asarray(body.H) / unit, np.asarray(body.h))
-
-
-def of_length_one(directions: np.ndarray) -> np.ndarray:
-    """Return directions (K, d) scaled to length one."""
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-
-def fresh(directions: np.ndarray, sent: np.ndarray) -> np.ndarray:
-    """Return the directions, except zeros, along which no ray of `sent` (unit length) has been
-    sent."""
-    directions = directions[np.any(directions != 0, axis=1)]
-    distance = KDTree(sent).query(of_length_one(directions))[0]
-    return directions[distance > 1e-9]
 
 
 def ellipse(
@@ -345,8 +305,9 @@ def excluded(
 
 
 def map_feasible_set(
-    mpc: MPC, x0s: Any, *, axes: Any = None, fixed: Any = None, iterations: int = 50,
-    dtype: Any = "float32", chunk: int | None = None, refine: float | None = None,
+    mpc: MPC | FeasibilityProblem, x0s: Any, *, axes: Any = None, fixed: Any = None,
+    iterations: int = 50, dtype: Any = "float32", chunk: int | None = None,
+    refine: float | None = None,
     penalties: StagePenalties | None = None, progress: bool = False, executor: Any = None,
     devices: Any = None,
 ) -> FeasibleSetMap:  # fmt: skip
@@ -372,7 +333,12 @@ def map_feasible_set(
     A point with NaN or infinity gets status NON_FINITE and label 0. Raises ValueError for wrong
     shapes and ill-posed problems before anything compiles.
     """
-    problem = FeasibilityProblem.of(mpc, axes, fixed)
+    if isinstance(mpc, FeasibilityProblem):
+        problem = mpc
+        if axes is not None or fixed is not None:
+            fail("axes, fixed", "given with a FeasibilityProblem", "It has its own view")
+    else:
+        problem = FeasibilityProblem.of(mpc, axes, fixed)
     whole("iterations", iterations, 1)
     if chunk is not None:
         whole("chunk", chunk, 1)

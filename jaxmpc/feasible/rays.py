@@ -25,14 +25,20 @@ from jaxmpc.mpc.problem import MPC
 BACKOFFS = 10.0 ** np.arange(-14, -1)
 
 
+# a (K, d), b (K,), w (K, d): a'θ ≤ b + w'|θ| for every feasible θ.
+Cuts = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
 @dataclass(frozen=True)
 class Boundary:
     """Rays from `center` (d,) along `directions` (K, d), and what was proved on each.
 
     inner (K,): largest t for which centre + t d was proved feasible (NaN: none). outer (K,):
-    where the ray leaves all the half-spaces (inf: never). points (K, d): the points at `inner`.
+    where the ray leaves all the half-spaces (inf: never). points (K, d): the points at `inner`,
+    w (K, k): with which the constraint rows hold there.
     normals (K, d), offsets (K,): half-spaces a'x ≤ b that hold on the whole feasible set
-    (b = inf where the LP gave none).
+    (b = inf where the LP gave none), and cuts, the bounds (a, b, w) of `proofs.cut` they follow
+    from.
     """
 
     center: np.ndarray
@@ -40,8 +46,10 @@ class Boundary:
     inner: np.ndarray
     outer: np.ndarray
     points: np.ndarray
+    w: np.ndarray
     normals: np.ndarray
     offsets: np.ndarray
+    cuts: Cuts
 
 
 def boundary(
@@ -101,14 +109,16 @@ class Rays:
         center, w = problem.programs.centre(center)
         return cls(problem, center, w, problem.exact(np.abs(center)))
 
-    def box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the half-spaces (normals, offsets) of the bounding box, those that exist."""
+    def box(self) -> tuple[np.ndarray, np.ndarray, Cuts]:
+        """Return the half-spaces (normals, offsets) of the bounding box, those that exist, and
+        their cuts."""
         _, sides = self.problem.programs.bounding_box
         # No rays go with these multipliers; the program is that of `cast`, so that one compiles.
         still = np.zeros((len(sides), len(BACKOFFS), 1))
-        _, normals, offsets = self.proved(still + self.center, still + self.w, sides)
+        _, normals, offsets, *cuts = self.proved(still + self.center, still + self.w, sides)
         valid = np.isfinite(offsets)
-        return normals[valid], offsets[valid]
+        a, b, w = (v[valid] for v in cuts)
+        return normals[valid], offsets[valid], (a, b, w)
 
     def cast(self, directions: np.ndarray) -> Boundary:
         """Return the boundary points along every direction (K, d), moved inwards and proved."""
@@ -119,7 +129,7 @@ class Rays:
         reach = np.where(bounded, t, 0.0)[:, None] * (1 - BACKOFFS)
         theta = self.center + reach[:, :, None] * directions[:, None, :]
         w = self.w + (w - self.w)[:, None, :] * (1 - BACKOFFS)[:, None]
-        feasible, normals, offsets = self.proved(theta, w, y)
+        feasible, normals, offsets, *cuts = self.proved(theta, w, y)
         feasible = feasible & bounded[:, None]
         best, each = np.argmax(feasible, axis=1), np.arange(len(directions))
         found = feasible.any(axis=1)
@@ -129,8 +139,10 @@ class Rays:
             inner=np.where(found, reach[each, best], np.nan),
             outer=leaving(self.center, directions, normals, offsets),
             points=np.where(found[:, None], theta[each, best], np.nan),
+            w=np.where(found[:, None], w[each, best], np.nan),
             normals=normals,
             offsets=offsets,
+            cuts=(cuts[0], cuts[1], cuts[2]),
         )
 
     def proved(self, theta: np.ndarray, w: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
@@ -146,14 +158,16 @@ class Rays:
 @jax.jit
 def prove_rays(p: ExactData, rows: ConstraintRows, theta: Any, w: Any, y: Any) -> tuple[Array, ...]:
     """Return which points (K, backoffs, d) of the rays are proved feasible, and the normals (K, d)
-    and offsets (K,) of half-spaces that hold on the whole feasible set, from multipliers (K, R)."""
+    and offsets (K,) of half-spaces that hold on the whole feasible set, from multipliers (K, R),
+    with the bounds of `proofs.cut` they follow from."""
 
     def feasible(theta: Array, w: Array) -> Array:
         inputs, free = inputs_of(p, rows, theta, w)
         return proofs.prove_feasible(p, theta, free, inputs)[0]
 
-    cuts = jax.vmap(lambda y: proofs.everywhere(p, *cut_of(p, rows, y)))(y)
-    return jax.vmap(jax.vmap(feasible))(theta, w), *cuts
+    cuts = jax.vmap(lambda y: cut_of(p, rows, y))(y)
+    half_spaces = jax.vmap(lambda *cut: proofs.everywhere(p, *cut))(*cuts)
+    return jax.vmap(jax.vmap(feasible))(theta, w), *half_spaces, *cuts
 
 
 def leaving(
