@@ -55,6 +55,16 @@ def chosen_devices(devices: Any, name: str = "devices") -> Devices:
     return chosen
 
 
+def require_partitioner(devices: Devices) -> None:
+    """Raise ValueError where programs of labels cannot be compiled for these devices: on several
+    GPUs XLA's Shardy partitioner crashes in the roll-out of `proofs.py` (JAX 0.11.2, H100)."""
+    if devices is None or len(devices) < 2 or devices[0].platform != "gpu":
+        return
+    if getattr(jax.config, "jax_use_shardy_partitioner", False):
+        what = "maps on several GPUs crash the partitioner that this process uses"
+        fail("devices", what, "Set JAX_USE_SHARDY_PARTITIONER=false in the environment")
+
+
 def count(devices: Devices) -> int:
     """Return the number of devices."""
     return 1 if devices is None else len(devices)

@@ -373,3 +373,27 @@ def main(arguments):
 
 if __name__ == "__main__":
     main(sys.argv[1:])
+
+
+def test_maps_on_several_gpus_name_the_partitioner():
+    """The compiler would crash, and take the process with it."""
+    import jax
+    import pytest
+
+    from jaxmpc.devices import require_partitioner
+
+    class Device:
+        platform = "gpu"
+
+    before = jax.config.jax_use_shardy_partitioner
+    try:
+        jax.config.update("jax_use_shardy_partitioner", True)
+        with pytest.raises(ValueError, match="devices: maps on several GPUs.*=false"):
+            require_partitioner((Device(), Device()))
+        require_partitioner((Device(),))
+        require_partitioner(None)
+        require_partitioner(tuple(jax.devices()) * 2)
+        jax.config.update("jax_use_shardy_partitioner", False)
+        require_partitioner((Device(), Device()))
+    finally:
+        jax.config.update("jax_use_shardy_partitioner", before)

@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxmpc.checks import fail
 from jaxmpc.compiled import Compiled, default_chunk, gather_size, padded, require_step_type
-from jaxmpc.devices import chosen_devices, count, divisible, placement
+from jaxmpc.devices import chosen_devices, count, divisible, placement, require_partitioner
 from jaxmpc.feasible.candidates import (
     ALPHA,
     StagePenalties,
@@ -115,6 +115,7 @@ def label_parts(
         fail("iterations", f"{iterations}", "Give a count of at least 1")
     require_step_type(dtype)
     devices = chosen_devices(devices)
+    require_partitioner(devices)
     quick, back, alpha = _penalised(problem.rows, penalties)
     exact = problem.exact(scope.largest, scope.typical)
     margins = problem.row_margins(exact, scope.typical)
