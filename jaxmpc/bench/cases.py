@@ -341,7 +341,7 @@ def _breaks_at_once(case: Case, x: np.ndarray) -> np.ndarray:
     c = condensed(case.states[0])
     fixed = ~moves(c)
     value = x @ c.D[fixed].T + c.d[fixed]
-    return ((value < c.lower[fixed]) | (value > c.upper[fixed])).any(axis=1)
+    return np.any((value < c.lower[fixed]) | (value > c.upper[fixed]), axis=1)
 
 
 def _rival_labels(case: Case, name: str, rival: Rival) -> Iterator[Contestant]:
