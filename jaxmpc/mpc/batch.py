@@ -20,10 +20,10 @@ from jaxmpc.qp.status import Status
 
 # States from which on transfer is tried: below, compiling its programs costs more than it saves.
 MANY = 32_768
-# States that a program takes at once on a CPU where there are fewer than a chunk.
-BLOCK = 1024
-# Of chunks so many or more, one is tried before all others; where fewer than this fraction of it is
-# solved by following, solving takes less time.
+# States that a program takes at once on a CPU where they are few, or follow others.
+BLOCK = 2048
+# Of chunks so many or more, one is tried before all others; where fewer than this fraction of those
+# that can be solved are by following, solving takes less time.
 TRIAL, LEAST = 16, 0.3
 # Steps on the dual from the law of a neighbour.
 STEPS = 24
@@ -45,7 +45,7 @@ class Batch:
         self.together = workers() if devices is None else 2
         shares = workers() if devices is None else 1
         most = min(count(devices) * default_chunk(), -(-len(x) // shares))
-        few = BLOCK if jax.default_backend() == "cpu" else 8 * BLOCK
+        few = BLOCK if jax.default_backend() == "cpu" else 4 * BLOCK
         self.chunk = divisible(max(min(chunk or most, len(x)), 1), devices)
         self.block = divisible(min(self.chunk, count(devices) * few), devices)
         # On several devices one program begins after the other, in the same order on all of them.
@@ -58,6 +58,8 @@ class Batch:
         B = len(self.x)
         left = np.arange(B)
         if follow and B >= MANY and transfer.transferable(self.controller):
+            if jax.default_backend() == "cpu":  # whose allocator gives larger arrays back each time
+                self.chunk = self.block
             left = self._transfer()
         self._run(_plans(self.devices), (self.controller,), left)
         assert self.answer is not None
@@ -73,9 +75,10 @@ class Batch:
         arguments = (self.controller, laws, cells)
         left = np.delete(np.arange(len(self.x)), index)
         if len(left) >= TRIAL * self.chunk:
-            few = left[:: len(left) // self.chunk][: self.chunk]
+            few = np.random.default_rng(0).choice(left, self.chunk, replace=False)
             self._run(_follow(self.devices, 0), arguments, few)
-            if np.mean(self._unsolved(few)) > 1 - LEAST:
+            solvable = 1 - np.mean(self._unsolved(index))
+            if 1 - np.mean(self._unsolved(few)) < LEAST * solvable:
                 return left
         for steps in (0, STEPS):
             self._run(_follow(self.devices, steps), arguments, left)

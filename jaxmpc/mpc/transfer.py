@@ -111,13 +111,15 @@ def choose(x: Any) -> tuple[np.ndarray, Cells]:
     B, p = x.shape
     count = 2 ** int(np.log2(max(B // STATES_A_CELL, 1)))
     g = int(count ** (1 / p) + 1e-9)
-    index = np.arange(0, B, max(B // (CHOICE * count), 1))
-    some = np.asarray(x[:: max(B // (CHOICE * count), 1)])
+    # At random: equal distances would be in step with the lines of a grid.
+    index = np.sort(np.random.default_rng(0).integers(0, B, CHOICE * count))
+    some = np.asarray(x[index])
     finite = np.all(np.isfinite(some), axis=1)
     index, some = index[finite], some[finite]
     if not len(some):
         index, some = np.zeros(1, int), np.zeros((1, p))
-    sample = np.sort(some[:: max(len(some) // SAMPLE, 1)], axis=0)
+    few = np.random.default_rng(1).integers(0, len(some), SAMPLE)
+    sample = np.sort(some[few], axis=0)
     ends = sample[np.linspace(0, len(sample) - 1, g + 1).astype(int)]
     edges, width = ends[1:-1], np.diff(ends, axis=0)
     k = [np.searchsorted(edges[:, j], some[:, j]) for j in range(p)]

@@ -136,8 +136,8 @@ def test_all_states_alike(mpc, few):
 def test_it_is_given_up_where_few_follow(mpc, states, solved, few, monkeypatch):
     monkeypatch.setattr(batch, "TRIAL", 1)
     monkeypatch.setattr(batch, "LEAST", 1.1)
-    same_plans(jm.solve_many(mpc, states, chunk=256), solved)
-    assert [arguments for arguments, _ in few] == [1, 3, 1] and few[1][1] == 256
+    same_plans(jm.solve_many(mpc, states), solved)
+    assert [arguments for arguments, _ in few] == [1, 3, 1] and few[1][1] == 64
 
 
 def test_on_the_device_and_from_a_controller(mpc, states, solved, few):
@@ -182,3 +182,14 @@ def test_cells():
     distance = np.linalg.norm(x - x[index][near[:, 0]], axis=1)
     assert np.all(near < len(index)) and np.median(distance) < 0.5
     assert np.all(near[index, 0] == np.arange(len(index)))
+
+
+@pytest.mark.parametrize("order", ["grid", "repeated"])
+def test_cells_of_states_in_order(order):
+    """Equal distances between the states that are looked at would miss most of these cells."""
+    x = jm.grid([-1, -1], [1, 1], (256, 256))
+    if order == "repeated":
+        x = np.tile(np.random.default_rng(0).permutation(x)[:4096], (16, 1))
+    with jax.enable_x64(True):
+        index, cells = transfer.choose(x)
+    assert len(index) >= 0.9 * len(cells.law)

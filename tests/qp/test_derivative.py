@@ -639,7 +639,7 @@ class TestInfeasible:
         """`everything` with row 4 against row 0: both fail by the same distance at z in the scaled
         rows a_i'T/|a_i'T|, where |a_i'T|² = a_i'P⁻¹a_i. Moved are q, bounds, soft weights and
         radius; P and A would also change what "closest" means."""
-        h, names = 1e-4, ("q", "l", "u", "bounds", "soft_linear", "soft_quadratic", "radius")
+        h, names = 5e-4, ("q", "l", "u", "bounds", "soft_linear", "soft_quadratic", "radius")
         qps, ds, answers, cases = [], [], [], []
         for seed in range(8):
             qp, z, y = everything(seed)
