@@ -131,6 +131,7 @@ def label_parts(
     with jax.enable_x64(True):
         exact, rows, quick = jax.device_put((exact, problem.rows, quick), placement(devices))
 
+    begun, compiled = time.perf_counter(), Compiled.seconds
     cones = cones_for(problem, scope.parts * chunk)
     if cones is not None:
         with jax.enable_x64(True):
@@ -186,7 +187,7 @@ def label_parts(
                 labels = labels.changed(where, more.label, more.status, more.proofs)
         return labels
 
-    begun, compiled, waiting = time.perf_counter(), Compiled.seconds, None
+    waiting = None
     for points in itertools.chain(parts, [None]):
         with jax.enable_x64(True):
             ahead = None if points is None else (len(points), started(points))
