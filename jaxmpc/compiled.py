@@ -1,6 +1,7 @@
 """What the drivers of batches share: compile once a shape, timed apart; pad to few shapes."""
 
 import os
+import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -62,10 +63,15 @@ class Compiled:
         self.function = function
         self.places = places
         self.programs: dict[Any, Any] = {}
+        self._compiles = threading.Lock()
 
     def __call__(self, *args: Any) -> Any:
+        return jax.device_get(self.run(*args))
+
+    def run(self, *args: Any) -> Any:
+        """The result, left on the device."""
         args = self.placed(args)
-        return jax.device_get(self.program(*args)(*args))
+        return self.program(*args)(*args)
 
     def placed(self, args: tuple) -> tuple:
         """The arguments where `places`, one sharding of each, says; None leaves it to JAX, which
@@ -77,10 +83,11 @@ class Compiled:
         args = self.placed(args)
         leaves, tree = jax.tree.flatten(args)
         key = tree, tuple(jax.typeof(leaf) for leaf in leaves)
-        if key not in self.programs:
-            start = time.perf_counter()
-            self.programs[key] = self.function.lower(*args).compile()
-            Compiled.seconds += time.perf_counter() - start
+        with self._compiles:  # threads that need the same program wait for one of them
+            if key not in self.programs:
+                start = time.perf_counter()
+                self.programs[key] = self.function.lower(*args).compile()
+                Compiled.seconds += time.perf_counter() - start
         return self.programs[key]
 
 

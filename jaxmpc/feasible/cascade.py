@@ -237,8 +237,7 @@ def last_programs(
 
 def _run(program: Compiled, *args: Any) -> Any:
     """Run the program and leave its result on the device."""
-    args = program.placed(args)
-    return program.program(*args)(*args)
+    return program.run(*args)
 
 
 def _penalised(

@@ -100,8 +100,7 @@ class Batch:
             with jax.enable_x64(True):
                 x = self.x[where] if isinstance(self.x, np.ndarray) else _rows(self.x, where)
                 with self._begins:
-                    given = program.placed((*arguments, x))
-                    plans = program.program(*given)(*given)
+                    plans = program.run(*arguments, x)
                 self._put(where, plans)
 
         pieces = [index[i : i + size] for i in range(0, len(index), size)]
