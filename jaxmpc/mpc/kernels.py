@@ -15,9 +15,10 @@ from jax import Array
 
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.triton import barrier, call, indices, load, on_gpu, padded_side, store
 
-# Numbers along a side that a warp's registers hold; Triton's products need 16 at least.
-SIDES = (16, 32)
+# Numbers along a side that a warp's registers hold.
+MOST = 32
 
 # float32 products from six of bfloat16, as exact as float32's own, on tensor cores.
 PRODUCT: Any = jax.lax.DotAlgorithmPreset.BF16_BF16_F32_X6
@@ -70,8 +71,8 @@ def riccati_recursion(Q: Array, R: Array, cross: Any, A: Array, B: Array) -> Gai
 
 def _or_kernel(scan: Callable, kernel: Callable, *args: Array) -> Any:
     """The kernel where it runs, with the derivative of the scan."""
-    side = max(size for v in args for size in v.shape[-1:])
-    if jax.default_backend() != "gpu" or side > SIDES[-1]:
+    longest = max(size for v in args for size in v.shape[-1:])
+    if not on_gpu() or longest > MOST:
         return scan(*args)
     fast = jax.custom_jvp(kernel)
     # The value is the kernel's here too: under `vmap` within `jit` JAX takes the place of the batch
@@ -129,13 +130,11 @@ def _riccati_scan(Q: Array, R: Array, A: Array, B: Array, cross: Any = None) -> 
     return jax.lax.scan(stage, Q[-1], (Q[:-1], R, cross, *own), reverse=True)[1]
 
 
-def _recurrence_kernel(
-    M: Array, w: Array, start: Array, *, adjoint: bool, interpret: bool = False
-) -> Array:
+def _recurrence_kernel(M: Array, w: Array, start: Array, *, adjoint: bool) -> Array:
     N, n = w.shape
 
     def kernel(M_ref: Any, w_ref: Any, start_ref: Any, out_ref: Any) -> None:
-        i = jnp.arange(_side(n), dtype=jnp.int32)
+        i = indices(padded_side(n))
         here = i < n
         shared = _matrix(M_ref, None, n, n) if M.ndim == 2 else None
 
@@ -143,33 +142,32 @@ def _recurrence_kernel(
             k = N - 1 - step if adjoint else step
             own = _matrix(M_ref, k, n, n) if shared is None else shared
             product = own * (y[:, None] if adjoint else y[None, :])
-            y = jnp.sum(product, axis=0 if adjoint else 1) + _load(w_ref.at[k, i], here)
-            _store(out_ref.at[k, i], y, here)
+            y = jnp.sum(product, axis=0 if adjoint else 1) + load(w_ref.at[k, i], here)
+            store(out_ref.at[k, i], y, here)
             return y
 
-        jax.lax.fori_loop(jnp.int32(0), jnp.int32(N), stage, _load(start_ref.at[i], here))
+        jax.lax.fori_loop(jnp.int32(0), jnp.int32(N), stage, load(start_ref.at[i], here))
 
-    return _call(kernel, jax.ShapeDtypeStruct((N, n), w.dtype), interpret)(M, w, start)
+    return call(kernel, jax.ShapeDtypeStruct((N, n), w.dtype))(M, w, start)
 
 
 def _tracking_kernel(
-    closed: Array, K: Array, inverse: Array, A: Array, B: Array, gx: Array, gu: Array, *,
-    interpret: bool = False,
+    closed: Array, K: Array, inverse: Array, A: Array, B: Array, gx: Array, gu: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
     # K and G⁻¹ are half of what `closed` is to read, and reading is what takes the time.
     (N, m), n = gu.shape, gx.shape[-1]
 
     def kernel(K_ref: Any, inverse_ref: Any, A_ref: Any, B_ref: Any, gx_ref: Any, gu_ref: Any,
                x_ref: Any, u_ref: Any) -> None:  # fmt: skip
-        side = _side(max(n, m))
-        i = jnp.arange(side, dtype=jnp.int32)
+        side = padded_side(max(n, m))
+        i = indices(side)
         state, moved = i < n, i < m
-        load = lambda ref, k, rows, columns: _matrix(ref, k, rows, columns, side)
-        once = lambda ref, v, columns: load(ref, None, n, columns) if v.ndim == 2 else None
+        matrix = lambda ref, k, rows, columns: _matrix(ref, k, rows, columns, side)
+        once = lambda ref, v, columns: matrix(ref, None, n, columns) if v.ndim == 2 else None
         A_0, B_0 = once(A_ref, A, n), once(B_ref, B, m)
         own = lambda k: (
-            load(A_ref, k, n, n) if A_0 is None else A_0,
-            load(B_ref, k, n, m) if B_0 is None else B_0,
+            matrix(A_ref, k, n, n) if A_0 is None else A_0,
+            matrix(B_ref, k, n, m) if B_0 is None else B_0,
         )
         apply = lambda M, v: jnp.sum(M * v[None, :], axis=1)
         turned = lambda M, v: jnp.sum(M * v[:, None], axis=0)
@@ -177,33 +175,32 @@ def _tracking_kernel(
         def backward(step: Array, p: Array) -> Array:
             k = N - 1 - step
             A_k, B_k = own(k)
-            q = _load(gu_ref.at[k, i], moved) - turned(B_k, p)
-            _store(u_ref.at[k, i], apply(load(inverse_ref, k, m, m), q), moved)
-            return turned(A_k, p) - turned(load(K_ref, k, m, n), q) - _load(gx_ref.at[k, i], state)
+            q = load(gu_ref.at[k, i], moved) - turned(B_k, p)
+            store(u_ref.at[k, i], apply(matrix(inverse_ref, k, m, m), q), moved)
+            return turned(A_k, p) - turned(matrix(K_ref, k, m, n), q) - load(gx_ref.at[k, i], state)
 
         def forward(k: Array, x: Array) -> Array:
             A_k, B_k = own(k)
-            _store(x_ref.at[k, i], x, state)
-            u = apply(load(K_ref, k, m, n), x) + _load(u_ref.at[k, i], moved)
-            _store(u_ref.at[k, i], u, moved)
+            store(x_ref.at[k, i], x, state)
+            u = apply(matrix(K_ref, k, m, n), x) + load(u_ref.at[k, i], moved)
+            store(u_ref.at[k, i], u, moved)
             return apply(A_k, x) + apply(B_k, u)
 
         zero, end = jnp.int32(0), jnp.int32(N)
-        jax.lax.fori_loop(zero, end, backward, -_load(gx_ref.at[N, i], state))
-        if not interpret:
-            _barrier()
+        jax.lax.fori_loop(zero, end, backward, -load(gx_ref.at[N, i], state))
+        barrier()
         x = jax.lax.fori_loop(zero, end, forward, jnp.zeros(side, gx.dtype))
-        _store(x_ref.at[N, i], x, state)
+        store(x_ref.at[N, i], x, state)
 
     out = [jax.ShapeDtypeStruct(v.shape, v.dtype) for v in (gx, gu)]
-    x, u = _call(kernel, out, interpret)(K, inverse, A, B, gx, gu)
+    x, u = call(kernel, out)(K, inverse, A, B, gx, gu)
     return x, u
 
 
-def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array, *, interpret: bool = False) -> Gains:
+def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array) -> Gains:
     N, n, m, dtype = len(R), Q.shape[-1], R.shape[-1], Q.dtype
-    side = _side(max(n, m))
-    precision = None if dtype == jnp.float64 or interpret else PRODUCT
+    side = padded_side(max(n, m))
+    precision = None if dtype == jnp.float64 or not on_gpu() else PRODUCT
 
     def dot(a: Array, b: Array) -> Array:
         return jax.lax.dot_general(
@@ -212,15 +209,15 @@ def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array, *, interpret: bool =
 
     def kernel(Q_ref: Any, R_ref: Any, A_ref: Any, B_ref: Any, closed_ref: Any, K_ref: Any,
                inverse_ref: Any) -> None:  # fmt: skip
-        i = jnp.arange(side, dtype=jnp.int32)
+        i = indices(side)
         row, column = i[:, None], i[None, :]
-        load = lambda ref, k, rows, columns: _matrix(ref, k, rows, columns, side)
+        matrix = lambda ref, k, rows, columns: _matrix(ref, k, rows, columns, side)
 
         def stage(step: Array, S: Array) -> Array:
             k = N - 1 - step
             at = lambda ref, given: k if given.ndim == 3 else None
-            A_k, B_k = load(A_ref, at(A_ref, A), n, n), load(B_ref, at(B_ref, B), n, m)
-            R_k = load(R_ref, k, m, m)
+            A_k, B_k = matrix(A_ref, at(A_ref, A), n, n), matrix(B_ref, at(B_ref, B), n, m)
+            R_k = matrix(R_ref, k, m, m)
             BtS = dot(B_k.T, S)
             # Gauss-Jordan in place: R + B'SB is definite, no pivoting.
             G = R_k + dot(BtS, B_k)
@@ -240,56 +237,21 @@ def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array, *, interpret: bool =
                 (closed_ref, closed, n, n), (K_ref, K, m, n), (inverse_ref, G, m, m)
             ):  # fmt: skip
                 inside = (row < rows) & (column < columns)
-                _store(ref.at[k, row, column], v, inside)
-            S = load(Q_ref, k, n, n) + dot(closed.T, dot(S, closed)) + dot(K.T, dot(R_k, K))
+                store(ref.at[k, row, column], v, inside)
+            S = matrix(Q_ref, k, n, n) + dot(closed.T, dot(S, closed)) + dot(K.T, dot(R_k, K))
             return (S + S.T) / 2
 
-        jax.lax.fori_loop(jnp.int32(0), jnp.int32(N), stage, load(Q_ref, N, n, n))
+        jax.lax.fori_loop(jnp.int32(0), jnp.int32(N), stage, matrix(Q_ref, N, n, n))
 
     shapes = [(N, n, n), (N, m, n), (N, m, m)]
     out = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
-    return Gains(*_call(kernel, out, interpret)(Q, R, A, B))
-
-
-def _call(kernel: Callable, shapes: Any, interpret: bool) -> Callable:
-    """One program, a warp, for each instance: `vmap` makes the grid."""
-    from jax.experimental import pallas
-    from jax.experimental.pallas import triton
-
-    options = triton.CompilerParams(num_warps=1, num_stages=1)
-    return pallas.pallas_call(
-        kernel, out_shape=shapes, compiler_params=options, interpret=interpret
-    )
-
-
-def _side(n: int) -> int:
-    """The least power of two that Triton takes and that holds n."""
-    return next(side for side in SIDES if n <= side)
+    return Gains(*call(kernel, out)(Q, R, A, B))
 
 
 def _matrix(ref: Any, k: Any, rows: int, columns: int, side: int | None = None) -> Array:
     """The matrix (rows, columns) at stage k (None: the only one), filled up with zeros."""
-    side = _side(max(rows, columns)) if side is None else side
-    i = jnp.arange(side, dtype=jnp.int32)
+    side = padded_side(max(rows, columns)) if side is None else side
+    i = indices(side)
     row, column = i[:, None], i[None, :]
     place = ref.at[row, column] if k is None else ref.at[k, row, column]
-    return _load(place, (row < rows) & (column < columns))
-
-
-def _load(place: Any, mask: Array) -> Array:
-    from jax.experimental.pallas import triton
-
-    return triton.load(place, mask=mask, other=0.0)
-
-
-def _store(place: Any, value: Array, mask: Array) -> None:
-    from jax.experimental.pallas import triton
-
-    triton.store(place, value, mask=mask)
-
-
-def _barrier() -> None:
-    """What the program has stored may be loaded from here on."""
-    from jax.experimental.pallas import triton
-
-    triton.debug_barrier()
+    return load(place, (row < rows) & (column < columns))

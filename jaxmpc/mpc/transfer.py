@@ -25,7 +25,7 @@ from jaxmpc.compiled import padded
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Multipliers, Plan, answer, flat_multipliers
-from jaxmpc.qp.active_set import MOST_ROWS, RIDGE
+from jaxmpc.qp.active_set import RIDGE, most_rows
 from jaxmpc.qp.admm import Factor, scaled, scaled_multipliers
 from jaxmpc.qp.batches import repeat_while, true_places
 from jaxmpc.qp.linalg import solve
@@ -139,7 +139,7 @@ def laws_of(controller: Controller, multipliers: Multipliers, status: Array) -> 
     """Return the laws of plans with these multipliers and this status, S in front."""
     c, f = controller.condensed, controller.factor
     assert c is not None and f is not None
-    m, most = len(f.E), min(*c.C.shape, MOST_ROWS)
+    m, most = len(f.E), most_rows(c.C)
     finite = lambda bound: jnp.where(jnp.isfinite(bound), bound, 0.0)
     # v − b of the upper and of the lower bound, in (θ, 1).
     linear = f.E[:, None] * c.D - matmul(f.A, matmul(f.T.T, c.F))

@@ -17,41 +17,132 @@ taken. So the dual value rises at each step; where the guess of W was right one 
 violated rows join W at first; where that does not end soon, one at a time, as in the dual method
 of Goldfarb and Idnani (1983).
 Where H is not the identity (P singular) or there are balls, nothing is done here.
+
+The steps see nothing but S, the bounds, y and v: `DualSearch`. On NVIDIA GPUs they are one kernel
+(`dual_kernel.py`), made of the same functions.
 """
 
 from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.qp.batches import true_places
+from jaxmpc.qp.batches import repeat_while, true_places
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.triton import on_gpu
 
-# Most rows in W. In large batches on GPUs, where factorizations take most of the time, instances
-# with few rows are worked off first.
-MOST_ROWS, FEW_ROWS = 48, 16
+# Most rows in W.
+MOST_ROWS = 48
+# Most steps, and of these the steps in which all violated rows join W.
+MOST_STEPS, JOINTLY = 24, 2
 # Step lengths that are tried, beside the largest that stops no row.
 LENGTHS = (1.0, 0.5, 0.25, 0.0625)
 # Ridge on S_WW, whose diagonal is 1, for linearly dependent rows: they share their multiplier.
 RIDGE = 1e-11
+# Violations relative to the largest row that count as rounding.
+NOISE = 1e-13
+# Multipliers, relative to v₀, from which on the dual seems unbounded.
+DIVERGED = 1e6
+# Distance from the optimum, relative to the largest row, at which the steps end.
+CONVERGED = 1e-11
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class DualPoint:
-    """Multipliers y (m,) with w = −q − A'y (n,)."""
+    """Multipliers y (m,) with w = −q − A'y (n,) and the rows v = A w (m,)."""
 
     y: Array
     w: Array
+    v: Array
+
+    @classmethod
+    def of(cls, A: Array, q: Array, bounds: Bounds, y: Array) -> "DualPoint":
+        """Return the point of multipliers y (m,), made admissible."""
+        y = bounds.admissible(y)
+        w = -q - matmul(y, A)
+        return cls(y, w, matmul(w, A.T))
+
+    def moved(self, A: Array, change: Array) -> "DualPoint":
+        """Return the point y + change. (−q − A'y would cancel where |w| is far below |q|; the
+        change of w is as exact as that of y.)"""
+        return self.shifted(A, -matmul(change, A), self.y + change)
+
+    def shifted(self, A: Array, change: Array, y: Array | None = None) -> "DualPoint":
+        """Return the point with w + change, and with other multipliers where given."""
+        w = self.w + change
+        return DualPoint(self.y if y is None else y, w, matmul(w, A.T))
 
 
-def dual_point(A: Array, q: Array, bounds: Bounds, y: Array) -> DualPoint:
-    """Return the point of multipliers y (m,), made admissible."""
-    y = bounds.admissible(y)
-    return DualPoint(y, -q - matmul(y, A))
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class DualSearch:
+    """Loop state of one instance: its point, the steps taken, and whether to go on."""
+
+    point: DualPoint
+    steps: Array
+    open: Array
+
+
+def dual_search(
+    A: Array, S: Array, bounds: Bounds, limit: Array, point: DualPoint, go_on: Array, most: int
+) -> DualPoint:
+    """Return the point after steps on the dual, `most` of them at most: until its multipliers are
+    optimal, or beyond `limit`, or rows join singly and still are too many. A (m, n), S = A A'."""
+    rows, none = most_rows(A), jnp.int32(0)
+    if on_gpu():
+        from jaxmpc.qp.dual_kernel import dual_search_on_gpu  # which is made of what stands here
+
+        y = dual_search_on_gpu(S, bounds, limit, point.y, point.v, none, go_on, rows, most)
+        return point.moved(A, y - point.y)
+    start = DualSearch(point, none, go_on)
+    step = partial(_search_step, rows, most)
+    return repeat_while(lambda s: s.open, step, (A, S, bounds, limit), start).point
+
+
+def single_step(
+    A: Array, S: Array, bounds: Bounds, limit: Array, point: DualPoint
+) -> DualPoint:  # fmt: skip
+    """Return the point after one step, in which rows join singly."""
+    rows, before, true = most_rows(A), jnp.int32(JOINTLY), jnp.asarray(True)
+    if on_gpu():
+        from jaxmpc.qp.dual_kernel import dual_search_on_gpu
+
+        state = point.y, point.v, before, true
+        y = dual_search_on_gpu(S, bounds, limit, *state, rows, JOINTLY + 1)
+        return point.moved(A, y - point.y)
+    return dual_step(A, S, bounds, point, true, rows)[0]
+
+
+def _search_step(rows: int, most: int, constants: tuple, s: DualSearch) -> DualSearch:
+    (A, S, bounds, limit), steps = constants, s.steps + 1
+    point, fits = dual_step(A, S, bounds, s.point, steps > JOINTLY, rows)
+    largest = [jnp.max(v, initial=0.0) for v in sizes(bounds, point.y, point.v)]
+    return DualSearch(point, steps, continues(*largest, limit, steps, most, fits))
+
+
+def sizes(bounds: Bounds, y: Array, v: Array) -> tuple[Array, Array, Array]:
+    """Return by how much v misses prox(v + y), at which it is optimal, |v| and |y|, row by row."""
+    return jnp.abs(bounds.prox_residual(v + y, 1.0) - y), jnp.abs(v), jnp.abs(y)
+
+
+def continues(
+    error: Array, largest_v: Array, largest_y: Array, limit: Any, steps: Any, most: int, fits: Any
+) -> Array:
+    """Return whether a search goes on after a step, of whose result these are the largest `sizes`;
+    fits: whether all its rows were in W."""
+    more = error > CONVERGED * (1 + largest_v)
+    return more & (largest_y <= limit) & (steps < most) & (fits | (steps <= JOINTLY))
+
+
+def most_rows(A: Array) -> int:
+    """Return the number of rows that W may hold: no more than n are independent."""
+    return min(*A.shape, MOST_ROWS)
 
 
 def dual_step(
@@ -63,51 +154,118 @@ def dual_step(
 
     Returns the new point, and whether W held all its rows.
     """
-    y, v, soft = point.y, matmul(point.w, A.T), bounds.linear is not None
-    noise = 1e-13 * (1 + jnp.max(jnp.abs(v), initial=0.0))
-    outside = v - jnp.clip(v, bounds.l, bounds.u)
-    outside = jnp.where(jnp.abs(outside) > noise, outside, 0.0)
-    new = jnp.where(y == 0, jnp.abs(outside), 0.0)
-    joins = (new > 0) & (new >= jnp.where(singly, jnp.max(new, initial=0.0), 0.0))
-    sign = jnp.where(y != 0, jnp.sign(y), jnp.sign(outside))
-    in_W = (y != 0) | joins
-    columns = [y, sign, v - jnp.where(sign > 0, bounds.u, bounds.l), bounds.l == bounds.u]
-    if soft:
-        beyond = jnp.abs(y) >= bounds.linear
-        # An L1 penalty that is paid in full stays so while its row is outside.
-        in_W = in_W & ~(beyond & (bounds.quadratic == 0) & (sign * outside > 0))
-        columns += [bounds.linear, bounds.quadratic, beyond]
+    y, v = point.y, point.v
+    in_W = working_set(bounds, y, v, singly)
     W = true_places(in_W, most)
     inside = W < len(y)
-    table = jnp.stack([column.astype(y.dtype) for column in columns])
-    y_W, sign_W, value, equal, *weights = table.at[:, W].get(mode="fill", fill_value=0.0)
+    columns = [y, v, bounds.l, bounds.u]
+    if bounds.linear is not None:
+        columns += [bounds.linear, bounds.quadratic]
+    y_W, v_W, *rest = jnp.stack(columns).at[:, W].get(mode="fill", fill_value=0.0)
+    rows = WorkingRows(Bounds(*rest), y_W, v_W)
     S_W = S.at[W[:, None], W[None, :]].get(mode="fill", fill_value=0.0)
-
-    gradient, slack, added = value, jnp.zeros_like(y_W), lambda y: jnp.zeros_like(y)
-    if soft:
-        cap, stiff, beyond = weights
-        capped, elastic = jnp.isfinite(cap), stiff > 0
-        give = jnp.where(elastic, 1 / jnp.where(elastic, stiff, 1.0), 0.0)
-        over = lambda y: jnp.maximum(jnp.abs(y) - jnp.where(capped, cap, jnp.inf), 0.0)
-        slack = jnp.where(beyond > 0, give, 0.0)
-        gradient = value - slack * sign_W * over(y_W)
-        added = lambda y: 0.5 * give * over(y) ** 2
-    d = solve(S_W + jnp.diag(jnp.where(inside, slack + RIDGE, 1.0)), gradient)
-
-    stops = (equal == 0) & (sign_W * d < 0) & (sign_W * y_W > 0)
-    first = jnp.min(jnp.where(stops, -y_W / jnp.where(stops, d, 1.0), 1.0), initial=1.0)
-    t = jnp.append(jnp.asarray(LENGTHS, y.dtype), first)[:, None]
-    moved = t * d
-    moved = jnp.where((equal > 0) | (sign_W * (y_W + moved) > 0), moved, -y_W)
-    if soft:
-        top = jnp.where(elastic, jnp.inf, cap)
-        moved = jnp.where(y_W + moved > top, top - y_W, jnp.maximum(moved, -top - y_W))
-    # The loss of dual value: ½ δ'S δ − δ'(v − b) and the change of what soft rows add to g*.
-    loss = moved * (0.5 * matmul(moved, S_W) - value) + added(y_W + moved) - added(y_W)
-    loss = jnp.sum(loss, axis=1)
+    d = solve(S_W + jnp.diag(jnp.where(inside, rows.slack + RIDGE, 1.0)), rows.gradient)
+    t = jnp.append(jnp.asarray(LENGTHS, y.dtype), jnp.min(rows.stops(d), initial=1.0))
+    moved = jax.vmap(lambda t: rows.moved(t * d))(t)
+    loss = jnp.sum(jax.vmap(rows.loss)(moved, matmul(moved, S_W)), axis=1)
     # (An argmin in a float64 program cannot be lowered where 64-bit mode is off.)
     best = (loss <= jnp.min(loss)).astype(y.dtype)
     change = jnp.zeros_like(y).at[W].add(matmul(best / jnp.sum(best), moved), mode="drop")
-    # −q − A'y would cancel where |w| is far below |q|; the change of w is as exact as that of y.
-    moved_to = DualPoint(y + change, point.w - matmul(change, A))
-    return moved_to, jnp.sum(in_W) <= most
+    return point.moved(A, change), jnp.sum(in_W) <= most
+
+
+def working_set(bounds: Bounds, y: Array, v: Array, singly: Any) -> Array:
+    """Return which rows are in W (m,)."""
+    new = jnp.where(y == 0, jnp.abs(violation(bounds, v)), 0.0)
+    least = jnp.where(singly, jnp.max(new, initial=0.0), 0.0)
+    return joins(bounds, y, v, NOISE * (1 + jnp.max(jnp.abs(v), initial=0.0)), least)
+
+
+def violation(bounds: Bounds, v: Array) -> Array:
+    """Return by how much each row is outside its interval, with its sign."""
+    return v - jnp.clip(v, bounds.l, bounds.u)
+
+
+def joins(bounds: Bounds, y: Array, v: Array, noise: Array, least: Array) -> Array:
+    """Return which rows have a multiplier or are violated, by more than `noise` and `least` at
+    least."""
+    outside = violation(bounds, v)
+    in_W = (y != 0) | ((jnp.abs(outside) > noise) & (jnp.abs(outside) >= least))
+    if bounds.linear is not None:
+        # An L1 penalty that is paid in full stays so while its row is outside.
+        paid = (jnp.abs(y) >= bounds.linear) & (bounds.quadratic == 0)
+        in_W = jnp.where(paid & (jnp.abs(outside) > noise) & (y * outside > 0), False, in_W)
+    return in_W
+
+
+class WorkingRows(NamedTuple):
+    """The rows of W: their bounds, multipliers y and values v, (k,) each."""
+
+    bounds: Bounds
+    y: Array
+    v: Array
+
+    @property
+    def sign(self) -> Array:
+        """That of the multiplier, or of the violation where there is none yet."""
+        outside = self.v - jnp.clip(self.v, self.bounds.l, self.bounds.u)
+        return jnp.where(self.y != 0, jnp.sign(self.y), jnp.sign(outside))
+
+    @property
+    def beyond(self) -> Array:
+        """By how much |y| exceeds the weight of an L1 penalty."""
+        return self._beyond(self.y)
+
+    def _beyond(self, y: Array) -> Array:
+        return jnp.maximum(jnp.abs(y) - self.bounds.linear, 0.0)
+
+    @property
+    def give(self) -> Array:
+        """1/k of soft rows, 0 of others."""
+        stiff = self.bounds.quadratic
+        return jnp.where(stiff > 0, 1 / jnp.where(stiff > 0, stiff, 1.0), 0.0)
+
+    @property
+    def slack(self) -> Array:
+        """Γ: what soft rows that pay more than their L1 weight add to the diagonal of S."""
+        if self.bounds.linear is None:
+            return jnp.zeros_like(self.y)
+        return jnp.where(jnp.abs(self.y) >= self.bounds.linear, self.give, 0.0)
+
+    @property
+    def excess(self) -> Array:
+        """v less the bound that is active."""
+        return self.v - jnp.where(self.sign > 0, self.bounds.u, self.bounds.l)
+
+    @property
+    def gradient(self) -> Array:
+        """Right-hand side of the Newton step."""
+        if self.bounds.linear is None:
+            return self.excess
+        return self.excess - self.slack * self.sign * self.beyond
+
+    def stops(self, d: Array) -> Array:
+        """Return the largest step lengths up to 1 along d that take no multiplier past zero."""
+        sign, unequal = self.sign, self.bounds.l != self.bounds.u
+        stops = unequal & (sign * d < 0) & (sign * self.y > 0)
+        return jnp.where(stops, -self.y / jnp.where(stops, d, 1.0), 1.0)
+
+    def moved(self, change: Array) -> Array:
+        """Return the change of y (k,) that is admissible: rows that would turn stop at zero, those
+        of an L1 penalty at its weight."""
+        equal = self.bounds.l == self.bounds.u
+        change = jnp.where(equal | (self.sign * (self.y + change) > 0), change, -self.y)
+        if self.bounds.linear is not None:
+            top = jnp.where(self.bounds.quadratic > 0, jnp.inf, self.bounds.linear)
+            low = jnp.maximum(change, -top - self.y)
+            change = jnp.where(self.y + change > top, top - self.y, low)
+        return change
+
+    def loss(self, change: Array, image: Array) -> Array:
+        """Return the loss of dual value, ½ δ'S δ − δ'(v − b) and the change of what soft rows add
+        to g*, as terms (k,) of a sum, for a change δ of y and its image S_WW δ."""
+        loss = change * (0.5 * image - self.excess)
+        if self.bounds.linear is not None:
+            added = lambda y: 0.5 * self.give * self._beyond(y) ** 2
+            loss = loss + added(self.y + change) - added(self.y)
+        return loss

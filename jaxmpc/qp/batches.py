@@ -41,17 +41,18 @@ def group_sizes(batch: int) -> list[int]:
     return sizes
 
 
-def in_blocks(function: Callable, constants: Any, data: Any) -> Any:
+def in_blocks(function: Callable, constants: Any, data: Any, on_gpu: Callable | None = None) -> Any:
     """Return function(constants, data), for a batch on a CPU in blocks, one after the other.
 
-    `function` must close over no arrays. A batch of constants makes no blocks.
+    on_gpu: the same of a batch, (constants, data with the batch in front), as a kernel for NVIDIA
+    GPUs. `function` must close over no arrays. A batch of constants makes no blocks.
     """
     one = custom_vmap(lambda constants, data: function(constants, data))
 
     @one.def_vmap
     def _(size: int, in_batched: Any, constants: Any, data: Any) -> Any:
         axes = jax.tree.map(lambda b: 0 if b else None, in_batched[0])
-        data = _broadcast(size, in_batched[1], data)
+        data = broadcast(size, in_batched[1], data)
         together = lambda constants, data: jax.vmap(function, in_axes=(axes, 0))(constants, data)
 
         def blocks(constants: Any, data: Any) -> Any:
@@ -61,26 +62,23 @@ def in_blocks(function: Callable, constants: Any, data: Any) -> Any:
             out = lax.map(lambda block: together(constants, block), grouped)
             return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:])[:size], out)
 
-        if size <= BLOCK or any(jax.tree.leaves(in_batched[0])):
+        if any(jax.tree.leaves(in_batched[0])) or (size <= BLOCK and on_gpu is None):
             out = together(constants, data)
         else:
-            out = lax.platform_dependent(constants, data, cpu=blocks, default=together)
+            others = {} if on_gpu is None else {"cuda": on_gpu}
+            out = lax.platform_dependent(constants, data, cpu=blocks, default=together, **others)
         return out, jax.tree.map(lambda _: True, out)
 
     return one(constants, data)
 
 
-def repeat_while(
-    is_open: Callable, step: Callable, constants: Any, state: Any, first: tuple | None = None
-) -> Any:
+def repeat_while(is_open: Callable, step: Callable, constants: Any, state: Any) -> Any:
     """Return `state` after state = step(constants, state) while is_open(state), a scalar.
 
     The functions must close over no arrays: what they read stands in `constants`. One instance is
     one `while_loop`. A batch, also one of nested `vmap`s, is worked off in groups (top of this
-    file). first: another pair (is_open, step), whose loop comes before in large batches on a GPU:
-    a cheaper step for those instances that it serves. Not differentiable.
+    file). Not differentiable.
     """
-    loops = [(is_open, step)] if first is None else [first, (is_open, step)]
     one = lambda constants, state: lax.while_loop(is_open, lambda s: step(constants, s), state)
     single = custom_vmap(one)
 
@@ -88,28 +86,22 @@ def repeat_while(
     def _(size: int, in_batched: Any, constants: Any, state: Any) -> Any:
         leaves, tree = jax.tree.flatten(constants)
         batched = tuple(jax.tree.leaves(in_batched[0]))
-        state = _broadcast(size, in_batched[1], state)
-        out = _in_groups(loops, tree, batched)(tuple(leaves), state)
+        state = broadcast(size, in_batched[1], state)
+        out = _in_groups(is_open, step, tree, batched)(tuple(leaves), state)
         return out, jax.tree.map(lambda _: True, out)
 
     return single(constants, state)
 
 
-def _in_groups(loops: list[tuple], tree: Any, batched: tuple[bool, ...]) -> Callable:
-    """Return the loops for a batch, (leaves of the constants, states) → states. loops: (is_open,
-    step) of each, as in `repeat_while`. batched: which leaves have the batch axis."""
+def _in_groups(is_open: Callable, step: Callable, tree: Any, batched: tuple[bool, ...]) -> Callable:
+    """Return the loop for a batch, (leaves of the constants, states) → states. batched: which
+    leaves have the batch axis."""
     axes = tuple(0 if b else None for b in batched)
 
     def run(leaves: tuple, state: Any) -> Any:
         size = jax.tree.leaves(state)[0].shape[0]
         if not size:
             return state
-        large = size >= LARGE and jax.default_backend() == "gpu"
-        for is_open, step in loops if large else loops[-1:]:
-            state = loop(is_open, step, size, leaves, state)
-        return state
-
-    def loop(is_open: Callable, step: Callable, size: int, leaves: tuple, state: Any) -> Any:
         advance = lambda leaves, state: step(jax.tree.unflatten(tree, leaves), state)
         many = jax.vmap(advance, in_axes=(axes, 0))
         open_ones = lambda state: jax.vmap(is_open)(state)
@@ -140,7 +132,7 @@ def _in_groups(loops: list[tuple], tree: Any, batched: tuple[bool, ...]) -> Call
     @batch.def_vmap
     def _(size: int, in_batched: Any, leaves: tuple, state: Any) -> Any:
         outer = in_batched[0]
-        state = _broadcast(size, in_batched[1], state)
+        state = broadcast(size, in_batched[1], state)
         mixed = any(o and not b for o, b in zip(outer, batched, strict=True))
         if mixed:
             # Each outer instance has constants that its inner batch shares: copies would not fit.
@@ -184,6 +176,7 @@ def true_places(mask: Array, size: int) -> Array:
     return jnp.full(size, m, jnp.int32).at[place].set(np.arange(m, dtype=np.int32), mode="drop")
 
 
-def _broadcast(size: int, batched: Any, tree: Any) -> Any:
+def broadcast(size: int, batched: Any, tree: Any) -> Any:
+    """Return the tree with `size` copies, in front, of each leaf that is not `batched`."""
     give = lambda v, b: v if b else jnp.broadcast_to(v, (size, *jnp.shape(v)))
     return jax.tree.map(give, tree, batched)

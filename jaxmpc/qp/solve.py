@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from jaxmpc.checks import concrete, fail, require_kind, require_shape
-from jaxmpc.qp.active_set import FEW_ROWS, MOST_ROWS, DualPoint, dual_point, dual_step
+from jaxmpc.qp.active_set import DIVERGED, MOST_STEPS, DualPoint, dual_search, single_step
 from jaxmpc.qp.admm import (
     ADMM,
     DEFAULT,
@@ -25,6 +25,7 @@ from jaxmpc.qp.admm import (
     splittings,
     start,
 )
+from jaxmpc.qp.admm_kernel import iterate_batch, suits
 from jaxmpc.qp.batches import in_blocks, repeat_while
 from jaxmpc.qp.certificate import Proof, correcting_rows, farkas, prove, recession, to_length_one
 from jaxmpc.qp.derivative import dense_conditions, implicit
@@ -42,6 +43,7 @@ from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.residuals import Pair, assess, marked, residual_terms, worst
 from jaxmpc.qp.status import Status
+from jaxmpc.qp.triton import on_gpu
 
 T = TypeVar("T", bound=Any)
 
@@ -149,15 +151,12 @@ def solve_from(
     q, bounds = scaled(factor, clean)
     eps, proof = tolerance(solver, qp.q.dtype), Proof.none(q, bounds.l)
     usable = jnp.all(jnp.isfinite(y))
-    dual = dual_point(factor.A, q, bounds, jnp.where(usable, y, 0.0))
+    y = bounds.admissible(jnp.where(usable, y, 0.0))
     if not steps:
-        z, y = unscaled(clean, factor, dual.w, dual.y)
+        z, y = unscaled(clean, factor, -q - matmul(y, factor.A), y)
         return assess(residual_terms, (clean,), z, y, proof, eps), fault
     p = Program(clean, factor, q, bounds, eps, Constants.of(qp.q.dtype).far)
-    pair, gradient = judged(p, dual.w, dual.y)
-    dual = replace(dual, w=dual.w - gradient)
-    open_ = usable & ~(pair.solved | pair.near | factor.flat)
-    pair = dual_steps(p, DualSearch(dual, pair, jnp.int32(0), open_, open_), steps).best
+    pair, _ = by_the_dual(p, y, usable & ~factor.flat, steps)
     return assess(residual_terms, (clean,), pair.z, pair.y, proof, eps), fault
 
 
@@ -175,9 +174,10 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = 
         lambda v: v.astype(dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v, tree
     )
     run = partial(loop, solver.iterations)
+    kernel = partial(loop_kernel, solver.iterations) if on_gpu() and suits(factor) else None
     arguments = cast(((factor, jnp.asarray(solver.alpha)), (q, bounds, t)))
     (w, y), (w_old, y_old) = cast(
-        run(*arguments) if unrolled else in_blocks(run, *arguments), qp.q.dtype
+        run(*arguments) if unrolled else in_blocks(run, *arguments, on_gpu=kernel), qp.q.dtype
     )
     eps = tolerance(solver, qp.q.dtype)
     begin = replace(multipliers_start(q, w, y), change=y - y_old, move=w - w_old)
@@ -205,6 +205,13 @@ def loop(iterations: int, constants: tuple, data: tuple) -> list[tuple[Array, Ar
     (factor, alpha), (q, bounds, t) = constants, data
     ends = iterate(splittings(factor, q), bounds, t, iterations, alpha)
     return [read(factor, t, q, bounds) for t in ends]
+
+
+def loop_kernel(iterations: int, constants: tuple, data: tuple) -> list[tuple[Array, Array]]:
+    """`loop` of a batch, as a kernel for NVIDIA GPUs; B in front of all leaves of `data`."""
+    (factor, alpha), (q, bounds, t) = constants, data
+    ends = iterate_batch(factor, alpha, q, bounds, t, iterations)
+    return [jax.vmap(partial(read, factor))(t, q, bounds) for t in ends]
 
 
 @jax.tree_util.register_dataclass
@@ -259,11 +266,6 @@ class Search:
     open: Array
 
 
-# DUAL_STEPS: most steps on the dual. JOINTLY: of these, steps in which all violated rows join the
-# active set. DIVERGED: multipliers, relative to q, from which on the dual seems unbounded.
-DUAL_STEPS, JOINTLY, DIVERGED = 24, 2, 1e6
-
-
 def improve(
     refine: int, fixed: bool, whole: bool, p: Program, begin: Multipliers
 ) -> tuple[tuple[Array, Array], Proof, Array]:
@@ -279,12 +281,10 @@ def improve(
     if has_dual_steps(qp.balls, qp.A) and not fixed:
         # The dual of an infeasible program has no maximum: steps towards it would be wasted.
         _, empty = farkas(qp, factor.E * begin.change, correcting)
-        dual = dual_point(factor.A, p.q, p.bounds, begin.y)
-        state = DualSearch(dual, best, jnp.int32(0), ~factor.flat & ~empty, jnp.asarray(True))
-        state = dual_steps(p, state, min(DUAL_STEPS, refine))
-        best, go_on, y = state.best, ~state.best.solved, state.dual.y
+        best, y = by_the_dual(p, begin.y, ~factor.flat & ~empty, min(MOST_STEPS, refine))
+        go_on = ~best.solved
         # Multipliers that grow without bound are nearly a Farkas vector.
-        begin = replace(begin, change=jnp.where(diverged(p, y), y, begin.change))
+        begin = replace(begin, change=jnp.where(largest(y) > most_multiplier(p), y, begin.change))
         begin = least_violation(begin, empty)
     if not whole:
         return (best.z, best.y), Proof.none(p.q, p.bounds.l), best.solved
@@ -300,51 +300,48 @@ def improve(
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class DualSearch:
-    """Loop state of one instance in the dual steps: its point, the best pair so far, the steps
-    taken, whether to go on, and whether its active rows fit into the system that is solved."""
+class Correction:
+    """Loop state of one instance whose dual steps leave residuals: its point, the gradient of its
+    Lagrangian in w (n,), the best pair so far, the corrections made, and whether to go on."""
 
-    dual: DualPoint
+    point: DualPoint
+    gradient: Array
     best: Pair
     steps: Array
     open: Array
-    fits: Array
 
 
-def dual_steps(p: Program, state: DualSearch, most: int) -> DualSearch:
-    """Return the search after steps on the dual, `most` of them at most."""
-    step, rows = partial(on_the_dual, most), min(*p.qp.A.shape, MOST_ROWS)
-    few = None
-    if rows > FEW_ROWS:
-        few = (lambda s: s.open & s.fits), partial(step, FEW_ROWS, must_fit=True)
-    return repeat_while(lambda s: s.open, partial(step, rows), p, state, few)
+def by_the_dual(p: Program, y: Array, go_on: Array, most: int) -> tuple[Pair, Array]:
+    """Return the best pair of a search on the dual from y (m,) in ADMM's coordinates, `most` steps
+    and as many corrections at most, and the last multipliers. The pair is `solved` where its
+    residuals are small enough to end with it."""
+    f = p.factor
+    point = DualPoint.of(f.A, p.q, p.bounds, y)
+    point = dual_search(f.A, f.S, p.bounds, most_multiplier(p), point, go_on, most)
+    best, gradient = judged(p, point.w, point.y)
+    best = replace(best, solved=best.solved | best.near)
+    start = Correction(point, gradient, best, jnp.int32(0), go_on & ~best.solved)
+    end = repeat_while(lambda s: s.open, partial(correction, most), p, start)
+    return end.best, end.point.y
 
 
-def diverged(p: Program, y: Array) -> Array:
-    """Return whether |y| is so large that the dual seems unbounded: rows contradict each other."""
-    return largest(y) > DIVERGED * (1 + largest(p.q))
+def most_multiplier(p: Program) -> Array:
+    """Return the size of scaled multipliers from which on the dual seems unbounded: rows contradict
+    each other."""
+    return DIVERGED * (1 + largest(p.q))
 
 
-def on_the_dual(
-    most: int, rows: int, p: Program, s: DualSearch, must_fit: bool = False
-) -> DualSearch:
-    """One step of `active_set.py` with `rows` rows at most, and whether it solved the program.
-    Where there still are more when rows join singly, the search ends. must_fit: where there are
-    more, the instance stays as it is, marked so."""
-    steps = s.steps + 1
-    f, singly = p.factor, steps > JOINTLY
-    dual, fits = dual_step(f.A, f.S, p.bounds, s.dual, singly, rows)
-    pair, gradient = judged(p, dual.w, dual.y)
+def correction(most: int, p: Program, s: Correction) -> Correction:
+    """One more step on the dual, from a point that makes up for the gradient of the Lagrangian: it
+    is zero there in exact arithmetic; where P is ill-conditioned it is rounding of T'PT (defect
+    correction)."""
+    f, steps, limit = p.factor, s.steps + 1, most_multiplier(p)
+    point = s.point.shifted(f.A, -s.gradient)
+    point = single_step(f.A, f.S, p.bounds, limit, point)
+    pair, gradient = judged(p, point.w, point.y)
     best = s.best.or_better(pair)
-    # In exact arithmetic the gradient is zero here. Where P is ill-conditioned it is rounding of
-    # T'PT, for which w makes up (defect correction).
-    dual = replace(dual, w=dual.w - gradient)
-    go_on = ~best.solved & ~diverged(p, dual.y) & (steps < most) & (fits | ~singly)
-    new = DualSearch(dual, best, steps, go_on, fits)
-    if not must_fit:
-        return new
-    kept = jax.tree.map(lambda a, b: jnp.where(fits, a, b), new, s)
-    return replace(kept, fits=fits)
+    go_on = ~best.solved & (largest(point.y) <= limit) & (steps < most)
+    return Correction(point, gradient, best, steps, go_on)
 
 
 def proof_steps(refine: int) -> int:

@@ -32,7 +32,7 @@ def test_kernels_equal_the_scans(staged):
     rng = np.random.default_rng(3)
     Q, R, A, B, gx, gu = batch(rng, 3, 5, 2, staged)
     both = lambda scan, kernel, *args, **options: (
-        jax.vmap(lambda *a: kernel(*a, interpret=True, **options))(*args),
+        jax.vmap(lambda *a: kernel(*a, **options))(*args),
         jax.vmap(lambda *a: scan(*a, **options))(*args),
     )
     found, gains = both(kernels._riccati_scan, kernels._riccati_kernel, Q, R, A, B)
@@ -77,7 +77,7 @@ def test_a_kernel_is_chosen_on_gpus_only(monkeypatch):
 
     scan = lambda v: v**2
     assert kernels._or_kernel(scan, kernel, jnp.ones(3)).shape == (3,) and not calls
-    monkeypatch.setattr(kernels.jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(kernels, "on_gpu", lambda: True)
     kernels._or_kernel(scan, kernel, jnp.ones(33))
     assert not calls
     one = jnp.array([3.0])
@@ -101,8 +101,6 @@ def test_derivatives_under_vmap_and_jit(monkeypatch):
     total = lambda A, gx: jnp.sum(jax.vmap(loop)(A, gx))
     by = lambda mode: jax.jit(mode(lambda A, gx: total(A, gx)))(A, gx)
     scans = by(jax.grad)
-    real = kernels._call
-    monkeypatch.setattr(kernels, "_call", lambda kernel, shapes, _: real(kernel, shapes, True))
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(kernels, "on_gpu", lambda: True)
     close(by(jax.grad), scans)
     close(by(jax.jacfwd), scans)

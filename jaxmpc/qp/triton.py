@@ -1,0 +1,76 @@
+"""What the kernels for NVIDIA GPUs share (Pallas, Triton): calls, masked loads and stores, sizes.
+
+Triton's arrays have powers of two as sizes: `padded_side` and masks stand for others. Without a GPU
+Pallas' interpreter runs the kernels, slowly: for tests. Pallas is imported where a kernel is made,
+so that machines without GPUs never load it.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+# Least side of a matrix in Triton's products.
+LEAST = 16
+
+
+def on_gpu() -> bool:
+    """Return whether programs run on an NVIDIA GPU by default."""
+    return jax.default_backend() == "gpu"
+
+
+def call(
+    kernel: Callable, shapes: Any, warps: int = 1, grid: tuple[int, ...] = (),
+    aliases: dict[int, int] | None = None,
+) -> Callable:  # fmt: skip
+    """Return the kernel as a function of arrays, with one program for each place of the grid;
+    `vmap` puts another axis in front of it. aliases: which results begin as which arguments."""
+    from jax.experimental import pallas
+    from jax.experimental.pallas import triton
+
+    options = triton.CompilerParams(num_warps=warps, num_stages=1)
+    return pallas.pallas_call(
+        kernel, out_shape=shapes, grid=grid, compiler_params=options, interpret=not on_gpu(),
+        input_output_aliases=aliases or {},
+    )  # fmt: skip
+
+
+def padded_side(n: int, least: int = LEAST) -> int:
+    """Return the least power of two that holds n, at least `least`."""
+    return max(1 << (n - 1).bit_length(), least)
+
+
+def indices(count: int) -> Array:
+    """Return 0, 1, …, count − 1 as int32, whatever JAX's settings are."""
+    return jnp.arange(count, dtype=jnp.int32)
+
+
+def program(axis: int = 0) -> Array:
+    """Return the place of this program in the grid."""
+    from jax.experimental import pallas
+
+    return pallas.program_id(axis)
+
+
+def load(place: Any, mask: Any, other: Any = 0.0) -> Array:
+    """Return what stands at `place`, and `other` where the mask is false."""
+    from jax.experimental.pallas import triton
+
+    return triton.load(place, mask=mask, other=other)
+
+
+def store(place: Any, value: Array, mask: Any) -> None:
+    """Store where the mask is true."""
+    from jax.experimental.pallas import triton
+
+    triton.store(place, value, mask=mask)
+
+
+def barrier() -> None:
+    """What the program has stored may be loaded from here on."""
+    from jax.experimental.pallas import triton
+
+    if on_gpu():
+        triton.debug_barrier()
