@@ -38,7 +38,7 @@ import jaxmpc as jm
 from jaxmpc.app import config
 from jaxmpc.mpc.condense import Condensed, condense, in_float64
 from jaxmpc.qp.admm import factor, iterate, read, scaled, splittings
-from jaxmpc.qp.residuals import residual_terms
+from jaxmpc.qp.residuals import joined, residual_terms
 from jaxmpc.qp.solve import unscaled
 from jaxmpc.tuning.penalties import tune_penalties
 from jaxmpc.tuning.penalty_schedule import transfer_penalties
@@ -146,7 +146,7 @@ def run(condensed: Condensed, tracked: Any, x: jax.Array, rho: Any, alpha: Any) 
 
 def excess(qp: jm.QP, z: jax.Array, y: jax.Array) -> jax.Array:
     """Largest residual over its tolerance; SOLVED is ≤ 1."""
-    values, sizes = residual_terms(qp, z, y)
+    values, sizes = joined(residual_terms(qp, z, y))
     return jnp.max(jnp.abs(values) / (1e-6 + 100 * jnp.finfo(z.dtype).eps * sizes))
 
 

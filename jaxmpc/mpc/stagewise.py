@@ -512,10 +512,11 @@ def stage_residuals(s: Stages, sample: Sample, u: Array, y: Array) -> Terms:
     gap = jnp.sum(u * found.gradient) + jnp.sum(penalty + support - product)
     size = jnp.sum(jnp.abs(u) * found.gradient_size)
     size = size + jnp.sum(penalty + jnp.abs(support) + jnp.abs(product))
-    return (
-        jnp.concatenate([bounds.violation(found.rows), found.gradient.ravel(), gap[None]]),
-        jnp.concatenate([found.row_size, found.gradient_size.ravel(), size[None]]),
-    )
+    return [
+        (bounds.violation(found.rows), found.row_size),
+        (found.gradient.ravel(), found.gradient_size.ravel()),
+        (gap[None], size[None]),
+    ]
 
 
 @jax.tree_util.register_dataclass
@@ -664,7 +665,7 @@ def _plan(factor: StageFactor, mpc: MPC, solver: ADMM, sample: Sample, warm_star
         u, y = solution(factor, sample, solver, warm_start)
     s, eps = factor.stages, tolerance(solver, u.dtype)
     found = assess(stage_residuals, (s, sample), u, y, Proof.none(u, y), eps)
-    found = replace(found, iterations=jnp.asarray(solver.iterations, jnp.int32))
+    found = replace(found, iterations=jnp.int32(solver.admm_steps()))
     x = predict(s, sample.x0, u)
     return answer(mpc, s.layout, found, fault, x, u, sample.states, sample.inputs)
 
@@ -682,7 +683,7 @@ def solution(
     rows = E * s.rows(predict(s, sample.x0, u), u)
     t = start(bounds, rho, rows, scaled_multipliers(E, y)) if warm_start is not None else rows
     schedule, free = splittings(factor, sample, min(s.horizon, UNROLL))
-    t, _ = iterate(schedule, bounds, t, solver.iterations, solver.alpha)
+    t, _ = iterate(schedule, bounds, t, solver.admm_steps(), solver.alpha)
     u, y = read(factor, bounds, t, free[-1])
     refine = solver.newton_steps(MOST_STEPS)
     if refine and solver.differentiate == "unrolled":

@@ -38,8 +38,10 @@ from jaxmpc.qp.triton import on_gpu
 
 # Most rows in W.
 MOST_ROWS = 48
-# Most steps, and of these the steps in which all violated rows join W.
-MOST_STEPS, JOINTLY = 24, 2
+# Rows that the kernel for GPUs takes.
+MOST_KERNEL_ROWS = 512
+# Most steps, of these those in which all violated rows join W, and most steps of a second search.
+MOST_STEPS, JOINTLY, MORE_STEPS = 24, 2, 100
 # Step lengths that are tried, beside the largest that stops no row.
 LENGTHS = (1.0, 0.5, 0.25, 0.0625)
 # Ridge on S_WW, whose diagonal is 1, for linearly dependent rows: they share their multiplier.
@@ -48,8 +50,9 @@ RIDGE = 1e-11
 NOISE = 1e-13
 # Multipliers, relative to v₀, from which on the dual seems unbounded.
 DIVERGED = 1e6
-# Distance from the optimum, relative to the largest row, at which the steps end.
-CONVERGED = 1e-11
+# Distance from the optimum at which the steps end: relative to the largest row, and, for rounding,
+# to the largest multiplier.
+CONVERGED, ROUNDING = 1e-11, 1e-15
 
 
 @jax.tree_util.register_dataclass
@@ -82,48 +85,53 @@ class DualPoint:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class DualSearch:
-    """Loop state of one instance: its point, the steps taken, and whether to go on."""
+    """Loop state of one instance: its point, the steps taken, whether to go on, and whether its
+    multipliers are optimal."""
 
     point: DualPoint
     steps: Array
     open: Array
+    optimal: Array
 
 
 def dual_search(
-    A: Array, S: Array, bounds: Bounds, limit: Array, point: DualPoint, go_on: Array, most: int
-) -> DualPoint:
-    """Return the point after steps on the dual, `most` of them at most: until its multipliers are
-    optimal, or beyond `limit`, or rows join singly and still are too many. A (m, n), S = A A'."""
-    rows, none = most_rows(A), jnp.int32(0)
-    if on_gpu():
-        from jaxmpc.qp.dual_kernel import dual_search_on_gpu  # which is made of what stands here
+    A: Array, S: Array, bounds: Bounds, limit: Array, cold: DualPoint, point: DualPoint,
+    go_on: Array, most: int, more: int,
+) -> tuple[DualPoint, Array]:  # fmt: skip
+    """Return the point after steps on the dual, and whether it is optimal. A (m, n), S = A A'.
 
-        y = dual_search_on_gpu(S, bounds, limit, point.y, point.v, none, go_on, rows, most)
-        return point.moved(A, y - point.y)
-    start = DualSearch(point, none, go_on)
-    step = partial(_search_step, rows, most)
-    return repeat_while(lambda s: s.open, step, (A, S, bounds, limit), start).point
+    Where `most` steps do not get there, multipliers exceed `limit`, or rows that join singly are
+    too many for W, it begins once more from `cold`, the point without multipliers, with rows that
+    join singly and `more` steps at most."""
+    state, rows = DualSearch(point, jnp.int32(0), go_on, jnp.asarray(False)), most_rows(A)
+    if on_gpu() and len(S) <= MOST_KERNEL_ROWS:
+        from jaxmpc.qp.dual_kernel import dual_search_kernel  # which is made of what stands here
+
+        return dual_search_kernel(A, S, bounds, limit, cold, state, rows, most, more)
+    step = partial(_search_step, rows, most, more)
+    end = repeat_while(lambda s: s.open, step, (A, S, bounds, limit, cold), state)
+    return end.point, end.optimal
 
 
-def single_step(
-    A: Array, S: Array, bounds: Bounds, limit: Array, point: DualPoint
-) -> DualPoint:  # fmt: skip
+def single_step(A: Array, S: Array, bounds: Bounds, limit: Array, point: DualPoint) -> DualPoint:
     """Return the point after one step, in which rows join singly."""
-    rows, before, true = most_rows(A), jnp.int32(JOINTLY), jnp.asarray(True)
-    if on_gpu():
-        from jaxmpc.qp.dual_kernel import dual_search_on_gpu
+    rows, true = most_rows(A), jnp.asarray(True)
+    if on_gpu() and len(S) <= MOST_KERNEL_ROWS:
+        from jaxmpc.qp.dual_kernel import dual_search_kernel
 
-        state = point.y, point.v, before, true
-        y = dual_search_on_gpu(S, bounds, limit, *state, rows, JOINTLY + 1)
-        return point.moved(A, y - point.y)
+        state = DualSearch(point, jnp.int32(JOINTLY), true, ~true)
+        return dual_search_kernel(A, S, bounds, limit, point, state, rows, JOINTLY + 1, 0)[0]
     return dual_step(A, S, bounds, point, true, rows)[0]
 
 
-def _search_step(rows: int, most: int, constants: tuple, s: DualSearch) -> DualSearch:
-    (A, S, bounds, limit), steps = constants, s.steps + 1
-    point, fits = dual_step(A, S, bounds, s.point, steps > JOINTLY, rows)
+def _search_step(rows: int, most: int, more: int, constants: tuple, s: DualSearch) -> DualSearch:
+    A, S, bounds, limit, cold = constants
+    again = s.steps == most
+    point = jax.tree.map(lambda old, new: jnp.where(again, new, old), s.point, cold)
+    singly = again | (s.steps >= JOINTLY)
+    point, fits = dual_step(A, S, bounds, point, singly, rows)
     largest = [jnp.max(v, initial=0.0) for v in sizes(bounds, point.y, point.v)]
-    return DualSearch(point, steps, continues(*largest, limit, steps, most, fits))
+    return DualSearch(point, *after_step(*largest, limit, s.steps + 1, fits, most, more))
 
 
 def sizes(bounds: Bounds, y: Array, v: Array) -> tuple[Array, Array, Array]:
@@ -131,13 +139,20 @@ def sizes(bounds: Bounds, y: Array, v: Array) -> tuple[Array, Array, Array]:
     return jnp.abs(bounds.prox_residual(v + y, 1.0) - y), jnp.abs(v), jnp.abs(y)
 
 
-def continues(
-    error: Array, largest_v: Array, largest_y: Array, limit: Any, steps: Any, most: int, fits: Any
-) -> Array:
-    """Return whether a search goes on after a step, of whose result these are the largest `sizes`;
-    fits: whether all its rows were in W."""
-    more = error > CONVERGED * (1 + largest_v)
-    return more & (largest_y <= limit) & (steps < most) & (fits | (steps <= JOINTLY))
+def after_step(
+    error: Array, largest_v: Array, largest_y: Array, limit: Any, steps: Array, fits: Any,
+    most: int, more: int,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Return the count of steps, whether to go on, and whether the point is optimal, after a step
+    to a point whose largest `sizes` are given. fits: whether all its rows were in W. The count is
+    `most` where the search begins once more."""
+    optimal = error <= CONVERGED * (1 + largest_v) + ROUNDING * largest_y
+    lost = (largest_y > limit) | (jnp.where(fits, False, steps > JOINTLY))
+    first = steps <= most
+    steps = jnp.where(first & lost, most, steps)
+    go_on = jnp.where(first, steps < most + more, (steps < most + more) & (largest_y <= limit))
+    stuck = jnp.where(first, False, lost)
+    return steps, jnp.where(optimal | stuck, False, go_on), optimal
 
 
 def most_rows(A: Array) -> int:

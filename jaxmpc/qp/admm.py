@@ -42,6 +42,8 @@ from jaxmpc.qp.status import Status
 SINGULAR = {8: 1e-10, 4: 1e-6}
 # Beside which eigenvalue, relative to the mean, range and null space are told apart.
 SPLIT = 1e-6
+# ADMM steps, and those from a warm start, from which Newton steps mostly could begin at once.
+STEPS, STEPS_WARM = 50, 10
 # Rounds of equilibration; half as many decades of an entry's size are left after each.
 EQUILIBRATIONS = 10
 
@@ -51,8 +53,9 @@ EQUILIBRATIONS = 10
 class ADMM:
     """Settings of the solver.
 
-    iterations: ADMM steps, always all of them; one instance from plain Python that has a warm start
-    and that Newton steps solve without them takes none. rho: penalty in the scaled coordinates
+    iterations: ADMM steps, always all of them; None: 50, and 10 from a warm start where Newton
+    steps follow. One instance from plain Python that has a warm start and that Newton steps solve
+    without them takes none. rho: penalty in the scaled coordinates
     above; None: √(min(1, n/m)), m counting the rows that z moves; or a number, one value a row
     (m,), or a schedule (stages, m) or (stages, 1) whose stages have equally many iterations.
     alpha: over-relaxation in (0, 2).
@@ -74,7 +77,7 @@ class ADMM:
     interior-point method stopped at slack·multiplier = μ (scaled coordinates) would.
     """
 
-    iterations: int = field(default=50, metadata={"static": True})
+    iterations: int | None = field(default=None, metadata={"static": True})
     rho: Any = None
     alpha: Any = 1.9
     refine: int | None = field(default=None, metadata={"static": True})
@@ -90,7 +93,7 @@ class ADMM:
         (None: not known yet)."""
         for name in ("iterations", "refine"):
             count = getattr(self, name)
-            if (count is not None or name == "iterations") and whole(name, count, 0) > MOST_COUNT:
+            if count is not None and whole(name, count, 0) > MOST_COUNT:
                 fail(name, f"{count}", f"Give at most {MOST_COUNT}")
         if self.rho is not None:
             require_real("rho", self.rho)
@@ -99,8 +102,8 @@ class ADMM:
             fail("rho", f"shape {shape}", f"Give (), ({rows},) or (stages, {rows})")
         if self.rho is not None and concrete(self.rho) and not np.all(np.asarray(self.rho) > 0):
             fail("rho", "holds a value that is not positive", "Penalties are positive")
-        if len(shape) == 2 and self.iterations % shape[0]:
-            fail("iterations", f"{self.iterations} for {shape[0]} stages", "Use a multiple")
+        if len(shape) == 2 and self.admm_steps() % shape[0]:
+            fail("iterations", f"{self.admm_steps()} for {shape[0]} stages", "Use a multiple")
         number("alpha", self.alpha, 0, "Over-relaxation lies in (0, 2); 1.6 is usual")
         if concrete(self.alpha) and not 0 < float(np.asarray(self.alpha)) < 2:
             fail("alpha", f"{self.alpha}", "Over-relaxation lies in (0, 2); 1.6 is usual")
@@ -113,6 +116,13 @@ class ADMM:
         if self.differentiate not in ("implicit", "unrolled"):
             fail("differentiate", f"{self.differentiate!r}", 'Give "implicit" or "unrolled"')
         number("smoothing", self.smoothing, 0, "Give 0 (none) or a positive number")
+
+    def admm_steps(self, warm: bool = False) -> int:
+        """Return how many ADMM steps there are. warm: there is a warm start."""
+        if self.iterations is not None:
+            return self.iterations
+        few = warm and self.newton_steps() > 0 and self.differentiate != "unrolled"
+        return STEPS_WARM if few and np.ndim(self.rho) < 2 else STEPS
 
     def newton_steps(self, most: int = 1000) -> int:
         """Return how many Newton steps there are at most: `refine`, or where that is None `most`,

@@ -1,14 +1,14 @@
 """Residuals of a primal-dual pair, judged against the rounding of their own terms.
 
-Residuals are one vector, [rows (m), variables (n), gap (1)], and with it, entry by entry, the sum
-of the absolute terms that each is a difference of: `residual_terms` for a QP,
+Residuals come in parts, those of rows (m,), of variables (n,) and the gap (1,), and with each,
+entry by entry, the sum of the absolute terms that it is a difference of: `residual_terms` for a QP,
 `mpc.stagewise.stage_residuals` for a problem stage by stage. Status and stopping are computed from
 these.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,31 +17,49 @@ from jax import Array
 from jaxmpc.qp.certificate import Proof
 from jaxmpc.qp.precision import matmul, precisely, rounding
 from jaxmpc.qp.problem import QP, QPSolution
+from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.status import Status
 
 # Multiple of the rounding floor below which steps on ill-conditioned programs gain nothing.
 STALLED = 10
-# A residual vector and the sizes of its terms.
-Terms = tuple[Array, Array]
+# Parts of the residuals, each with the sizes of its terms.
+Terms = Sequence[tuple[Array, Array]]
+
+
+class Products(NamedTuple):
+    """Az, Pz and A'y, and the same of absolute values, |A||z|, |P||z| and |A|'|y|."""
+
+    Az: Array
+    Pz: Array
+    Aty: Array
+    size_Az: Array
+    size_Pz: Array
+    size_Aty: Array
+
+    @classmethod
+    def of(cls, qp: QP, z: Array, y: Array) -> "Products":
+        """Return the products of a pair z (n,), y (m,)."""
+        multiply = lambda z, y, P, A: (matmul(z, A.T), matmul(z, P), matmul(y, A))
+        return cls(*multiply(z, y, qp.P, qp.A), *multiply(*map(jnp.abs, (z, y, qp.P, qp.A))))
 
 
 def residual_terms(qp: QP, z: Array, y: Array) -> Terms:
-    """Return the residuals of rows (m,), variables (n,) and the gap as one vector (m + n + 1,), and
-    the sizes, entry by entry, of the terms that they are differences of: rounding is a share of
-    these.
-    """
-    Az, Pz, Aty = matmul(z, qp.A.T), matmul(z, qp.P), matmul(y, qp.A)
-    bounds, size_z, size_y = qp.bounds, jnp.abs(z), jnp.abs(y)
+    """Return the residuals of rows (m,), variables (n,) and the gap (1,), each with the sizes,
+    entry by entry, of the terms that they are differences of: rounding is a share of these."""
+    return terms_of(qp.q, qp.bounds, z, y, Products.of(qp, z, y))
+
+
+def terms_of(q: Array, bounds: Bounds, z: Array, y: Array, products: Products) -> Terms:
+    """Return `residual_terms` from the products with the matrices."""
+    Az, Pz, Aty, *sizes = products
     penalty, support = bounds.cost(Az), bounds.support(y)
-    # Summed together: each sum is a kernel of its own.
-    gap, size = jnp.sum(jnp.stack([
-        jnp.concatenate([z * (Pz + qp.q), penalty + support]),
-        jnp.concatenate([size_z * (jnp.abs(Pz) + jnp.abs(qp.q)), penalty + jnp.abs(support)]),
-    ]), axis=1)  # fmt: skip
-    dual_size = matmul(size_z, jnp.abs(qp.P)) + jnp.abs(qp.q) + matmul(size_y, jnp.abs(qp.A))
-    values = [bounds.violation(Az), Pz + qp.q + Aty, gap[None]]
-    sizes = [matmul(size_z, jnp.abs(qp.A).T), dual_size, size[None]]
-    return jnp.concatenate(values), jnp.concatenate(sizes)
+    gap = jnp.sum(z * (Pz + q)) + jnp.sum(penalty + support)
+    size = jnp.sum(jnp.abs(z) * (jnp.abs(Pz) + jnp.abs(q))) + jnp.sum(penalty + jnp.abs(support))
+    return [
+        (bounds.violation(Az), sizes[0]),
+        (Pz + q + Aty, sizes[1] + jnp.abs(q) + sizes[2]),
+        (gap[None], size[None]),
+    ]
 
 
 def residuals(qp: QP, z: Array, y: Array) -> tuple[Array, Array, Array]:
@@ -52,42 +70,70 @@ def residuals(qp: QP, z: Array, y: Array) -> tuple[Array, Array, Array]:
     g*(y) = Σ u y⁺ − l y⁻ + … (`Bounds.support`). A multiplier that is not admissible (a push
     against an absent bound) must be made so before.
     """
-    return largest_of_each(residual_terms(qp, z, y)[0], len(y))
+    primal, dual, gap = (_largest(jnp.abs(values)) for values, _ in residual_terms(qp, z, y))
+    return primal, dual, gap
 
 
-def largest_of_each(values: Array, rows: int) -> tuple[Array, Array, Array]:
-    """Return the infinity norms of primal and dual residual and the gap, of `residual_terms`."""
-    size = jnp.abs(values)
-    norm = lambda v: jnp.max(v, initial=0.0)
-    return norm(size[:rows]), norm(size[rows:-1]), size[-1]
-
-
-def small(terms: Terms, eps: Any, floor: float) -> Array:
-    """Return whether each residual is at most its tolerance: eps (2,) holds the absolute one and
-    that relative to the size of the terms, to which floor is added."""
-    values, sizes = terms
-    return jnp.all(jnp.abs(values) <= eps[0] + (eps[1] + floor) * sizes)
+def joined(terms: Terms) -> tuple[Array, Array]:
+    """Return all residuals as one vector (m + n + 1,), and their sizes as another."""
+    values, sizes = zip(*terms, strict=True)
+    return jnp.concatenate(values), jnp.concatenate(sizes)
 
 
 def worst(terms: Terms, floor: Any) -> tuple[Array, Array]:
     """Return the largest of the residuals, each less floor·(size of its terms), and the largest
     relative to 1 + that size; inf where one is NaN."""
-    values, sizes = terms
-    # A maximum need not propagate NaN (XLA on CPUs).
-    error = jnp.where(jnp.isfinite(values), jnp.abs(values), jnp.inf)
-    sizes = jnp.where(jnp.isfinite(sizes), sizes, 0.0)
-    absolute, relative = jnp.max(jnp.stack([error - floor * sizes, error / (1 + sizes)]), axis=1)
-    return absolute, relative
+    absolute, relative = [], []
+    for values, sizes in terms:
+        # A maximum need not propagate NaN (XLA on CPUs).
+        error = jnp.where(jnp.isfinite(values), jnp.abs(values), jnp.inf)
+        sizes = jnp.where(jnp.isfinite(sizes), sizes, 0.0)
+        absolute.append(_largest(error - floor * sizes))
+        relative.append(_largest(error / (1 + sizes)))
+    return _largest_of(absolute), _largest_of(relative)
+
+
+def _largest(v: Array) -> Array:
+    return jnp.max(v, initial=0.0)
+
+
+def _largest_of(numbers: list[Array]) -> Array:
+    found = numbers[0]
+    for number in numbers[1:]:
+        found = jnp.maximum(found, number)
+    return found
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Measured:
+    """Primal residual, dual residual and gap of a pair, and whether each entry is at most its
+    tolerance: eps (2,) holds the absolute one and that relative to the size of the terms, to which
+    `floor` is added."""
+
+    primal: Array
+    dual: Array
+    gap: Array
+    small: Array
+
+    @classmethod
+    def of(cls, terms: Terms, eps: Any, floor: float) -> "Measured":
+        """Return the residuals with these terms, measured."""
+        primal, dual, gap = (_largest(jnp.abs(values)) for values, _ in terms)
+        above, _ = worst(terms, eps[1] + floor)
+        return cls(primal, dual, gap, above <= eps[0])
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Pair:
-    """Primal z and dual y in the units of the problem, the largest of its residuals, each relative
-    to the size of its terms, whether all are small, and whether there is no more to gain."""
+    """Primal z and dual y in the units of the problem, what was measured of them, the largest of
+    their residuals, each relative to the size of its terms, whether all are small, and whether
+    there is no more to gain."""
 
     z: Array
     y: Array
+    measured: Measured
     error: Array
     near: Array
     solved: Array
@@ -97,17 +143,18 @@ class Pair:
         """Return a placeholder with infinite error, of the shapes of z and y."""
         false = jnp.asarray(False)
         infinite = jnp.asarray(jnp.inf, z.dtype)
-        return cls(jnp.zeros_like(z), jnp.zeros_like(y), infinite, false, false)
+        measured = Measured(infinite, infinite, infinite, false)
+        return cls(jnp.zeros_like(z), jnp.zeros_like(y), measured, infinite, false, false)
 
     @classmethod
-    def of(cls, z: Array, y: Array, terms: Terms, eps: Array, floor: float) -> "Pair":
-        """Return the pair judged; eps (2,) and floor as in `small`. near: all residuals are below
-        a thousandth of their tolerance, or below a tenth and a small multiple of their rounding;
-        solved: below a millionth of the absolute one."""
-        above, relative = worst(terms, floor + 1e-3 * eps[1])
-        at_rounding = (relative <= STALLED * floor) & (above <= 0.1 * eps[0])
-        near = (above <= 1e-3 * eps[0]) | at_rounding
-        return cls(z, y, relative, near, above <= 1e-6 * eps[0])
+    def of(
+        cls, z: Array, y: Array, terms: Terms, eps: Array, floor: float, others: Terms = ()
+    ) -> "Pair":
+        """Return the pair judged; eps (2,) and floor as in `Measured`. near: all residuals are
+        below a thousandth of their tolerance, or below a tenth and a small multiple of their
+        rounding; solved: below a millionth of the absolute one. others: terms that count for these
+        alone."""
+        return cls(z, y, *judgment(terms, eps, floor, others))
 
     def or_better(self, other: "Pair") -> "Pair":
         """Return the other pair where that is solved or its residuals are smaller; one that is
@@ -119,18 +166,30 @@ class Pair:
         return replace(best, solved=best.solved | self.near)
 
 
+def judgment(
+    terms: Terms, eps: Any, floor: float, others: Terms = ()
+) -> tuple[Measured, Array, Array, Array]:
+    """Return what `Pair.of` says of the terms: the last four fields of the pair."""
+    above, relative = worst([*terms, *others], floor + 1e-3 * eps[1])
+    at_rounding = (relative <= STALLED * floor) & (above <= 0.1 * eps[0])
+    near = (above <= 1e-3 * eps[0]) | at_rounding
+    return Measured.of(terms, eps, floor), relative, near, above <= 1e-6 * eps[0]
+
+
 def assess(
     terms: Callable[..., Terms], data: tuple, z: Array, y: Array, proof: Proof, eps: Any
 ) -> QPSolution:
     """Return the solution (z, y) with the status that its residuals, terms(*data, z, y) in float64,
     and the proofs give it; without its cost and count of iterations."""
     dtype, floor = z.dtype, rounding(z.dtype)
+    measure = lambda data, z, y, eps: Measured.of(terms(*data, z, y), eps, floor)
+    return concluded(precisely(measure, data, z, y, jnp.asarray(eps, dtype)), z, y, proof)
 
-    def measure(data: tuple, z: Array, y: Array, eps: Array) -> tuple[Array, ...]:
-        found = terms(*data, z, y)
-        return (small(found, eps, floor), *largest_of_each(found[0], len(y)))
 
-    solved, primal, dual, gap = precisely(measure, data, z, y, jnp.asarray(eps, dtype))
+def concluded(measured: Measured, z: Array, y: Array, proof: Proof) -> QPSolution:
+    """Return the solution (z, y) with the status that its residuals and the proofs give it; without
+    its cost and count of iterations."""
+    solved, dtype = measured.small, z.dtype
     # Rows that contradict each other by less than eps are both solved and proved empty: say solved.
     infeasible = proof.infeasible & ~solved
     unbounded = proof.unbounded & ~solved & ~infeasible
@@ -141,8 +200,8 @@ def assess(
     )
     return QPSolution(
         z=z, y=y, cost=jnp.zeros((), dtype), status=status.astype(jnp.int32),
-        primal_residual=primal, dual_residual=dual, gap=gap, iterations=jnp.int32(0),
-        certificate=jnp.where(infeasible, proof.certificate, 0.0),
+        primal_residual=measured.primal, dual_residual=measured.dual, gap=measured.gap,
+        iterations=jnp.int32(0), certificate=jnp.where(infeasible, proof.certificate, 0.0),
         ray=jnp.where(unbounded, proof.ray, 0.0),
     )  # fmt: skip
 

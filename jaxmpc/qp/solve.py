@@ -11,7 +11,14 @@ import numpy as np
 from jax import Array, lax
 
 from jaxmpc.checks import concrete, fail, require_kind, require_shape
-from jaxmpc.qp.active_set import DIVERGED, MOST_STEPS, DualPoint, dual_search, single_step
+from jaxmpc.qp.active_set import (
+    DIVERGED,
+    MORE_STEPS,
+    MOST_STEPS,
+    DualPoint,
+    dual_search,
+    single_step,
+)
 from jaxmpc.qp.admm import (
     ADMM,
     DEFAULT,
@@ -21,6 +28,7 @@ from jaxmpc.qp.admm import (
     iterate,
     read,
     scaled,
+    scaled_multipliers,
     scaled_rows,
     splittings,
     start,
@@ -41,9 +49,20 @@ from jaxmpc.qp.newton import (
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely, rounding
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.residuals import Pair, assess, marked, residual_terms, worst
+from jaxmpc.qp.residuals import (
+    Measured,
+    Pair,
+    Products,
+    assess,
+    concluded,
+    judgment,
+    marked,
+    residual_terms,
+    terms_of,
+    worst,
+)
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.triton import on_gpu
+from jaxmpc.qp.triton import in_one_program, indices, on_gpu
 
 T = TypeVar("T", bound=Any)
 
@@ -137,7 +156,7 @@ def solve_factored(
     else:
         found = search(clean, factor, solver, warm_start, whole)
         z, y = found.z, found.y
-    steps = jnp.asarray(solver.iterations, jnp.int32)
+    steps = jnp.int32(solver.admm_steps(warm_start is not None))
     return replace(found, z=z, y=y, cost=value(clean, z, y), iterations=steps), fault
 
 
@@ -157,7 +176,7 @@ def solve_from(
         return assess(residual_terms, (clean,), z, y, proof, eps), fault
     p = Program(clean, factor, q, bounds, eps, Constants.of(qp.q.dtype).far)
     pair, _ = by_the_dual(p, y, usable & ~factor.flat, steps)
-    return assess(residual_terms, (clean,), pair.z, pair.y, proof, eps), fault
+    return concluded(pair.measured, pair.z, pair.y, proof), fault
 
 
 def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = True) -> QPSolution:
@@ -173,9 +192,12 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = 
     cast = lambda tree, dtype=dtype: jax.tree.map(
         lambda v: v.astype(dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v, tree
     )
-    run = partial(loop, solver.iterations)
-    kernel = partial(loop_kernel, solver.iterations) if on_gpu() and suits(factor) else None
-    arguments = cast(((factor, jnp.asarray(solver.alpha)), (q, bounds, t)))
+    steps = solver.admm_steps(warm_start is not None)
+    kernel = partial(loop_kernel, steps) if on_gpu() and suits(factor) else None
+    run, arguments = (
+        partial(loop, steps),
+        cast(((factor, jnp.asarray(solver.alpha)), (q, bounds, t))),
+    )
     (w, y), (w_old, y_old) = cast(
         run(*arguments) if unrolled else in_blocks(run, *arguments, on_gpu=kernel), qp.q.dtype
     )
@@ -184,8 +206,11 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = 
     if refine and not unrolled:
         p = Program(qp, factor, q, bounds, eps, Constants.of(qp.q.dtype).far)
         polish = partial(improve, refine, solver.fixed, whole)
-        (z, y), proof, ended = precisely(polish, p, begin)
-        found = assess(residual_terms, (qp,), z, y, proof, eps)
+        best, proof, ended = precisely(polish, p, begin)
+        # What was measured of float64 numbers need not hold for these in float32.
+        found = concluded(best.measured, best.z, best.y, proof)
+        if qp.q.dtype != jnp.float64:
+            found = assess(residual_terms, (qp,), best.z, best.y, proof, eps)
         status = jnp.where(ended, found.status, jnp.int32(Status.ITERATION_LIMIT))
         return replace(found, status=status)
     pair, end = unscaled(qp, factor, w, y), begin
@@ -231,16 +256,50 @@ class Program:
 
 def judged(p: Program, w: Array, y: Array) -> tuple[Pair, Array]:
     """The pair of scaled w and y, and the gradient T'(Pz + q + A'y) (n,) of the Lagrangian."""
-    z, y = unscaled(p.qp, p.factor, w, y)
-    values, sizes = residual_terms(p.qp, z, y)
+    qp, f = p.qp, p.factor
+    z, y = unscaled(qp, f, w, y)
+    products = Products.of(qp, z, y)
+    judge = judge_in_one_program if on_gpu() and not qp.balls and len(y) else judge_pair
+    judgment, gradient = judge(p.eps, qp.q, qp.bounds, z, y, products, f.E, p.bounds)
+    return Pair(z, y, *judgment), matmul(gradient, f.T)
+
+
+def judge_pair(
+    eps: Array, q: Array, bounds: Bounds, z: Array, y: Array, products: Products, E: Array,
+    scaled: Bounds,
+) -> tuple[tuple[Measured, Array, Array, Array], Array]:  # fmt: skip
+    """Return the last four fields of the pair (z, y), and the gradient of its Lagrangian."""
+    terms, floor = terms_of(q, bounds, z, y, products), rounding(z.dtype)
     # For soft rows the gap is quadratic in the error of z; the prox residual is linear.
-    v, push = scaled_rows(p.factor, p.qp, z, y)
-    prox = p.bounds.prox_residual(v + push, 1.0) - push
-    terms = jnp.append(values, prox), jnp.append(sizes, jnp.abs(v) + jnp.abs(push))
-    floor = rounding(z.dtype)
+    v, push = E * products.Az, scaled_multipliers(E, y)
+    prox = scaled.prox_residual(v + push, 1.0) - push, jnp.abs(v) + jnp.abs(push)
+    values, sizes = terms[1]
     # Entries at rounding level count as zero.
-    gradient = jnp.where(jnp.abs(values) > floor * sizes, values, 0.0)[len(y) : -1]
-    return Pair.of(z, y, terms, p.eps, floor), matmul(gradient, p.factor.T)
+    gradient = jnp.where(jnp.abs(values) > floor * sizes, values, 0.0)
+    return judgment(terms, eps, floor, [prox]), gradient
+
+
+def judge_in_one_program(
+    eps: Array, q: Array, bounds: Bounds, z: Array, y: Array, products: Products, E: Array,
+    scaled: Bounds,
+) -> tuple[tuple[Measured, Array, Array, Array], Array]:  # fmt: skip
+    """`judge_pair` as a kernel for NVIDIA GPUs. Rows and variables that fill up the vectors are
+    free, and zero."""
+    vectors, tree = jax.tree.flatten((q, bounds, z, y, products, E, scaled))
+    soft = bounds.linear is not None
+    free = (-jnp.inf, jnp.inf, jnp.inf, 0.0) if soft else (-jnp.inf, jnp.inf)
+    fills = jax.tree.leaves((0.0, free, 0.0, 0.0, (0.0,) * len(products), 0.0, free))
+
+    def judge(eps: Array, *vectors: Array) -> tuple[list[Array], list[Array]]:
+        i = indices(len(eps))
+        two = [jnp.sum(jnp.where(i == n, eps, 0.0)) for n in range(2)]
+        found, gradient = judge_pair(two, *jax.tree.unflatten(tree, vectors))
+        return [gradient], jax.tree.leaves(found)
+
+    data = [(eps, 0.0), *zip(vectors, fills, strict=True)]
+    [gradient], numbers = in_one_program(judge, data, [len(z)], 7)
+    primal, dual, gap, small, error, near, solved = numbers
+    return (Measured(primal, dual, gap, small > 0), error, near > 0, solved > 0), gradient
 
 
 def better(qp: QP, pair: tuple[Array, Array], other: tuple[Array, Array]) -> tuple:
@@ -268,9 +327,9 @@ class Search:
 
 def improve(
     refine: int, fixed: bool, whole: bool, p: Program, begin: Multipliers
-) -> tuple[tuple[Array, Array], Proof, Array]:
-    """Return the pair (z, y) and what is proved, after `refine` Newton steps at most, in float64,
-    and whether there is nothing left to try.
+) -> tuple[Pair, Proof, Array]:
+    """Return the best pair (z, y) and what is proved, after `refine` Newton steps at most, in
+    float64, and whether there is nothing left to try.
 
     Steps on the dual in the active rows solve most programs (`active_set.py`). The method of
     multipliers (`newton.py`) takes the others: P singular, balls, degenerate or infeasible rows.
@@ -281,13 +340,13 @@ def improve(
     if has_dual_steps(qp.balls, qp.A) and not fixed:
         # The dual of an infeasible program has no maximum: steps towards it would be wasted.
         _, empty = farkas(qp, factor.E * begin.change, correcting)
-        best, y = by_the_dual(p, begin.y, ~factor.flat & ~empty, min(MOST_STEPS, refine))
+        best, y = by_the_dual(p, begin.y, ~factor.flat & ~empty, refine)
         go_on = ~best.solved
         # Multipliers that grow without bound are nearly a Farkas vector.
         begin = replace(begin, change=jnp.where(largest(y) > most_multiplier(p), y, begin.change))
         begin = least_violation(begin, empty)
     if not whole:
-        return (best.z, best.y), Proof.none(p.q, p.bounds.l), best.solved
+        return best, Proof.none(p.q, p.bounds.l), best.solved
     constants = (p, matmul(factor.H, factor.H), correcting)
     s = Search(begin, p.q, best, jnp.int32(0), Proof.none(p.q, p.bounds.l), begin.w, go_on)
     if fixed:
@@ -295,7 +354,7 @@ def improve(
         s = lax.scan(partial(still_open, refine, constants), s, length=length)[0]
     else:
         s = repeat_while(lambda s: s.open, partial(by_multipliers, refine), constants, s)
-    return (s.best.z, s.best.y), s.proof, jnp.asarray(True)
+    return s.best, s.proof, jnp.asarray(True)
 
 
 @jax.tree_util.register_dataclass
@@ -313,15 +372,16 @@ class Correction:
 
 def by_the_dual(p: Program, y: Array, go_on: Array, most: int) -> tuple[Pair, Array]:
     """Return the best pair of a search on the dual from y (m,) in ADMM's coordinates, `most` steps
-    and as many corrections at most, and the last multipliers. The pair is `solved` where its
-    residuals are small enough to end with it."""
-    f = p.factor
-    point = DualPoint.of(f.A, p.q, p.bounds, y)
-    point = dual_search(f.A, f.S, p.bounds, most_multiplier(p), point, go_on, most)
+    and corrections at most, and the last multipliers. The pair is `solved` where its residuals are
+    small enough to end with it."""
+    f, first, limit = p.factor, min(most, MOST_STEPS), most_multiplier(p)
+    cold, point = (DualPoint.of(f.A, p.q, p.bounds, y) for y in (jnp.zeros_like(y), y))
+    more = min(most - first, MORE_STEPS)
+    point, optimal = dual_search(f.A, f.S, p.bounds, limit, cold, point, go_on, first, more)
     best, gradient = judged(p, point.w, point.y)
     best = replace(best, solved=best.solved | best.near)
-    start = Correction(point, gradient, best, jnp.int32(0), go_on & ~best.solved)
-    end = repeat_while(lambda s: s.open, partial(correction, most), p, start)
+    start = Correction(point, gradient, best, jnp.int32(0), optimal & ~best.solved)
+    end = repeat_while(lambda s: s.open, partial(correction, first), p, start)
     return end.best, end.point.y
 
 

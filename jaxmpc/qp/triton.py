@@ -74,3 +74,37 @@ def barrier() -> None:
 
     if on_gpu():
         triton.debug_barrier()
+
+
+def in_one_program(
+    function: Callable, data: list[tuple[Array, float]], lengths: list[int], numbers: int
+) -> tuple[list[Array], list[Array]]:
+    """Return function(*vectors), a list of vectors and a list of so many numbers, all of one type,
+    computed by one program: one launch for a batch, and no intermediate result in memory.
+
+    data: vectors and what they are filled up with, to a power of two; lengths: those of the vectors
+    returned. The function consists of operations entry by entry and reductions.
+    """
+    dtype = data[0][0].dtype
+
+    def kernel(*refs: Any) -> None:
+        *in_refs, numbers_ref = refs
+        in_refs, out_refs = in_refs[: len(data)], in_refs[len(data) :]
+
+        def read(ref: Any, count: int, fill: float) -> Array:
+            i = indices(padded_side(count))
+            return load(ref.at[i], i < count, fill)
+
+        given = [read(ref, len(v), fill) for ref, (v, fill) in zip(in_refs, data, strict=True)]
+        vectors, found = function(*given)
+        for ref, vector, count in zip(out_refs, vectors, lengths, strict=True):
+            i = indices(len(vector))
+            store(ref.at[i], vector, i < count)
+        k, together = indices(padded_side(numbers)), jnp.zeros(padded_side(numbers), dtype)
+        for n, number in enumerate(found):
+            together = jnp.where(k == n, number.astype(dtype), together)
+        store(numbers_ref.at[k], together, k < numbers)
+
+    shapes = [jax.ShapeDtypeStruct((count,), dtype) for count in [*lengths, numbers]]
+    *vectors, found = call(kernel, shapes)(*(vector for vector, _ in data))
+    return vectors, list(found)

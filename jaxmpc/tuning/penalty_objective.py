@@ -26,7 +26,7 @@ from jaxmpc.devices import Devices, divisible, over_devices
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.qp.admm import ADMM, factor, iterate, read, scaled, splittings
 from jaxmpc.qp.problem import QP
-from jaxmpc.qp.residuals import marked, residual_terms
+from jaxmpc.qp.residuals import joined, marked, residual_terms
 from jaxmpc.qp.solve import solve_factored, unscaled, warm
 from jaxmpc.qp.status import Status
 from jaxmpc.tuning.batch_mean import BatchMean
@@ -82,11 +82,11 @@ class PenaltyObjective:
             t = jnp.zeros_like(qp.l)
             if sample.start is not None:
                 t = warm(made, qp, bounds, sample.start)
-            t, _ = iterate(splittings(made, q), bounds, t, solver.iterations, solver.alpha)
+            t, _ = iterate(splittings(made, q), bounds, t, solver.admm_steps(), solver.alpha)
             z, y = unscaled(qp, made, *read(made, t, q, bounds))
             floor = 100 * jnp.finfo(z.dtype).eps
             # A quarter of the rounding stays, for the sake of the logarithm's slope at 0.
-            values, sizes = residual_terms(qp, z, y)
+            values, sizes = joined(residual_terms(qp, z, y))
             squares = jnp.sum((values / (eps + floor * sizes)) ** 2)
             return 0.5 * jnp.log10((floor / 4) ** 2 + squares)
 

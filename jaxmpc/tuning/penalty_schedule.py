@@ -76,7 +76,7 @@ def transfer_penalties(run: TuningRun, mpc: MPC, iterations: int | None = None) 
             mean = np.mean(np.log(rho), axis=1, keepdims=True)
             theta = np.linalg.lstsq(old, (np.log(rho) - mean).T, rcond=None)[0]
             rho = np.exp(mean + theta.T @ new.T)
-    count = solver.iterations if iterations is None else iterations
+    count = solver.admm_steps() if iterations is None else iterations
     solver = replace(solver, iterations=count, rho=rho)
     solver.validate(rho.shape[-1] if rho.ndim else 1)
     return solver

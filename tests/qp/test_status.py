@@ -193,8 +193,9 @@ def test_a_pair_near_the_solution_is_not_lost():
     too large in itself (a quadrotor's plan ended so, with a gap of 1.4e-6)."""
     with jax.enable_x64(True):
         eps, none = np.array([1e-6, 0.0]), np.zeros(1)
+        part = lambda value, size: (np.array([value]), np.array([size]))
         judge = lambda values, sizes: Pair.of(
-            none, none, (np.array(values), np.array(sizes)), eps, 1e-14
+            none, none, list(map(part, values, sizes)), eps, 1e-14
         )
         best, other = (
             judge([0.0, 0.0, 1e-10], [1.0, 1.0, 1.0]),
