@@ -16,17 +16,18 @@ from jaxmpc.devices import Devices, count, divisible, over_devices, placement
 from jaxmpc.mpc import transfer
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Plan
+from jaxmpc.qp.active_set import MORE_STEPS, MOST_STEPS
 from jaxmpc.qp.status import Status
 
 # States from which on transfer is tried: below, compiling its programs costs more than it saves.
 MANY = 32_768
-# States that a program takes at once on a CPU where they are few, or follow others.
+# States that a program takes at once where they are few, or follow others.
 BLOCK = 2048
 # Of chunks so many or more, one is tried before all others; where fewer than this fraction of those
 # that can be solved are by following, solving takes less time.
 TRIAL, LEAST = 16, 0.3
 # Steps on the dual from the law of a neighbour.
-STEPS = 24
+STEPS = MOST_STEPS + MORE_STEPS
 
 
 class Batch:
@@ -45,9 +46,8 @@ class Batch:
         self.together = workers() if devices is None else 2
         shares = workers() if devices is None else 1
         most = min(count(devices) * default_chunk(), -(-len(x) // shares))
-        few = BLOCK if jax.default_backend() == "cpu" else 4 * BLOCK
         self.chunk = divisible(max(min(chunk or most, len(x)), 1), devices)
-        self.block = divisible(min(self.chunk, count(devices) * few), devices)
+        self.block = divisible(min(self.chunk, count(devices) * BLOCK), devices)
         # On several devices one program begins after the other, in the same order on all of them.
         self._begins: Any = nullcontext() if devices is None else threading.Lock()
         self._stores = threading.Lock()
@@ -57,9 +57,10 @@ class Batch:
         """Return the plans from all states. follow: whether states may follow solved ones."""
         B = len(self.x)
         left = np.arange(B)
-        if follow and B >= MANY and transfer.transferable(self.controller):
-            if jax.default_backend() == "cpu":  # whose allocator gives larger arrays back each time
-                self.chunk = self.block
+        # (On GPUs the solver's kernels take less time than the laws and the host's indices would.)
+        on_cpu = jax.default_backend() == "cpu"
+        if follow and on_cpu and B >= MANY and transfer.transferable(self.controller):
+            self.chunk = self.block  # larger arrays a CPU's allocator would give back each time
             left = self._transfer()
         self._run(_plans(self.devices), (self.controller,), left)
         assert self.answer is not None

@@ -20,6 +20,8 @@ from jax.custom_batching import custom_vmap
 BLOCK = 128
 # Instances in a group on a CPU at most, and when fewer are open; small batches are one group.
 PART_CPU, FEW_CPU, SMALL_CPU = 512, 64, 128
+# The same of loops that few instances of a batch enter, but with long steps.
+RARE_PART_CPU, RARE_FEW_CPU = 64, 8
 # Instances in a group elsewhere: a quarter of the batch; when fewer are open a sixteenth of that,
 # and so on, but not below LEAST, where a step costs little more than its launches. (H100,
 # TurboMPC's problem, 4,096 at once: 2.6 µs a solve in one group, 1.6 in groups of 512, 1.2 of 1,024
@@ -29,10 +31,11 @@ PART, SMALLER, LEAST = 4, 16, 256
 LARGE = 16_384
 
 
-def group_sizes(batch: int) -> list[int]:
+def group_sizes(batch: int, rare: bool = False) -> list[int]:
     """Return the sizes of the groups of a batch, from the largest."""
     if jax.default_backend() == "cpu":
-        return [batch] if batch <= SMALL_CPU else [min(batch, PART_CPU), FEW_CPU]
+        part, few = (RARE_PART_CPU, RARE_FEW_CPU) if rare else (PART_CPU, FEW_CPU)
+        return [batch] if batch <= SMALL_CPU else [min(batch, part), few]
     if batch <= PART * LEAST:
         return [batch]
     sizes = [-(-batch // PART)]
@@ -72,12 +75,14 @@ def in_blocks(function: Callable, constants: Any, data: Any, on_gpu: Callable | 
     return one(constants, data)
 
 
-def repeat_while(is_open: Callable, step: Callable, constants: Any, state: Any) -> Any:
+def repeat_while(
+    is_open: Callable, step: Callable, constants: Any, state: Any, rare: bool = False
+) -> Any:
     """Return `state` after state = step(constants, state) while is_open(state), a scalar.
 
     The functions must close over no arrays: what they read stands in `constants`. One instance is
     one `while_loop`. A batch, also one of nested `vmap`s, is worked off in groups (top of this
-    file). Not differentiable.
+    file). rare: few instances are open at first. Not differentiable.
     """
     one = lambda constants, state: lax.while_loop(is_open, lambda s: step(constants, s), state)
     single = custom_vmap(one)
@@ -87,13 +92,15 @@ def repeat_while(is_open: Callable, step: Callable, constants: Any, state: Any) 
         leaves, tree = jax.tree.flatten(constants)
         batched = tuple(jax.tree.leaves(in_batched[0]))
         state = broadcast(size, in_batched[1], state)
-        out = _in_groups(is_open, step, tree, batched)(tuple(leaves), state)
+        out = _in_groups(is_open, step, tree, batched, rare)(tuple(leaves), state)
         return out, jax.tree.map(lambda _: True, out)
 
     return single(constants, state)
 
 
-def _in_groups(is_open: Callable, step: Callable, tree: Any, batched: tuple[bool, ...]) -> Callable:
+def _in_groups(
+    is_open: Callable, step: Callable, tree: Any, batched: tuple[bool, ...], rare: bool
+) -> Callable:
     """Return the loop for a batch, (leaves of the constants, states) → states. batched: which
     leaves have the batch axis."""
     axes = tuple(0 if b else None for b in batched)
@@ -121,7 +128,7 @@ def _in_groups(is_open: Callable, step: Callable, tree: Any, batched: tuple[bool
             put = lambda old, new: old.at[where].set(new, mode="drop")
             return jax.tree.map(put, state, found)
 
-        counts = group_sizes(size)
+        counts = group_sizes(size, rare)
         for count, least in zip(counts, [*counts[1:], 0], strict=True):
             more = partial(lambda least, state: jnp.sum(open_ones(state)) > least, least)
             state = lax.while_loop(more, partial(group, count), state)

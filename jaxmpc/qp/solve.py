@@ -353,7 +353,8 @@ def improve(
         length = refine + 3 * proof_steps(refine)
         s = lax.scan(partial(still_open, refine, constants), s, length=length)[0]
     else:
-        s = repeat_while(lambda s: s.open, partial(by_multipliers, refine), constants, s)
+        step = partial(by_multipliers, refine)
+        s = repeat_while(lambda s: s.open, step, constants, s, rare=True)
     return s.best, s.proof, jnp.asarray(True)
 
 
@@ -381,7 +382,7 @@ def by_the_dual(p: Program, y: Array, go_on: Array, most: int) -> tuple[Pair, Ar
     best, gradient = judged(p, point.w, point.y)
     best = replace(best, solved=best.solved | best.near)
     start = Correction(point, gradient, best, jnp.int32(0), optimal & ~best.solved)
-    end = repeat_while(lambda s: s.open, partial(correction, first), p, start)
+    end = repeat_while(lambda s: s.open, partial(correction, first), p, start, rare=True)
     return end.best, end.point.y
 
 
