@@ -5,6 +5,8 @@ Pallas' interpreter runs the kernels, slowly: for tests. Pallas is imported wher
 so that machines without GPUs never load it.
 """
 
+import functools
+import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -17,8 +19,18 @@ LEAST = 16
 
 
 def on_gpu() -> bool:
-    """Return whether programs run on an NVIDIA GPU by default."""
-    return jax.default_backend() == "gpu"
+    """Return whether programs run by default on a GPU for which there are kernels."""
+    return jax.default_backend() == "gpu" and has_triton()
+
+
+@functools.cache
+def has_triton() -> bool:
+    """Return whether this JAX has the Triton backend of Pallas, which a later one may lack."""
+    try:
+        importlib.import_module("jax.experimental.pallas.triton")
+    except ImportError:
+        return False
+    return True
 
 
 def call(

@@ -1,0 +1,178 @@
+"""The kernels for GPUs, run by Pallas' interpreter, against the loops of XLA that they replace."""
+
+import sys
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmpc as jm
+from jaxmpc.bench.families import joint
+from jaxmpc.qp import active_set, admm_kernel, dual_kernel, solve, triton
+from jaxmpc.qp.active_set import DualPoint, DualSearch, dual_search, most_rows
+from jaxmpc.qp.admm import ADMM, factor, iterate, scaled, splittings
+from jaxmpc.qp.admm_kernel import iterate_batch, pieces
+
+STEPS = 12
+
+
+@pytest.fixture
+def x64():
+    with jax.enable_x64(True):
+        yield
+
+
+def scaled_batch(n, m, B, *, soft=False, balls=(), stages=1, dtype=jnp.float32, seed=0):
+    """Random programs that share P and A, in ADMM's coordinates: factor, q (B, n), bounds, t."""
+    rng = np.random.default_rng(seed)
+    A = jnp.asarray(0.3 * rng.standard_normal((m, n)))
+    l, u = -rng.uniform(0.1, 1, (B, m)), rng.uniform(0.1, 1, (B, m))
+    l[:, ::5], q, in_balls = -np.inf, rng.standard_normal((B, n)), m - sum(balls)
+    l[:, in_balls:] = u[:, in_balls:] = 0.0
+    fields = {}
+    if soft:
+        odd = (np.arange(m) % 2 == 1) & (np.arange(m) < in_balls)
+        fields |= {"soft_linear": np.where(odd, 1.0, np.inf), "soft_quadratic": 2.0 * odd}
+    if balls:
+        fields |= {"balls": balls, "radius": rng.uniform(0.5, 1, len(balls))}
+    rho = np.linspace(0.5, 2, stages)[:, None] * np.ones(m)
+    made = factor(jnp.eye(n), A, ADMM(iterations=STEPS, rho=rho), balls)
+
+    def one(q, l, u):
+        return scaled(made, solve.as_arrays(jm.QP(jnp.eye(n), q, A, l, u, **fields)))
+
+    data = made, *jax.vmap(one)(q, l, u), rng.standard_normal((B, m))
+    return jax.tree.map(lambda v: jnp.asarray(v, dtype) if v.dtype.kind == "f" else v, data)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        dict(n=7, m=11, B=5),  # padded rows and a tile that is not full
+        dict(n=20, m=60, B=17, stages=3),
+        dict(n=10, m=150, B=3, dtype=jnp.float64),  # low rank, two pieces
+        dict(n=20, m=21, B=20, soft=True),
+        dict(n=10, m=30, B=4, soft=True, balls=(2, 3)),
+    ],
+)
+def test_admm_in_one_kernel_is_the_loop(case, x64):
+    made, q, bounds, t = scaled_batch(**case)
+    alpha = jnp.asarray(1.7, t.dtype)
+    loop = lambda q, b, t: iterate(splittings(made, q), b, t, STEPS, alpha)
+    found = iterate_batch(made, alpha, q, bounds, t, STEPS)
+    rounding = 1e3 * jnp.finfo(t.dtype).eps
+    for ours, wanted in zip(found, jax.vmap(loop)(q, bounds, t), strict=True):
+        np.testing.assert_allclose(ours, wanted, atol=rounding)
+    assert iterate_batch(made, alpha, q, bounds, t, 0)[0] is t
+
+
+@pytest.mark.parametrize("count", [1, 16, 17, 60, 100, 156, 200, 300, 512])
+def test_pieces_cover_all_rows(count):
+    found = pieces(count)
+    assert len(found) <= 2 and sum(size for _, size in found) >= count
+    assert all(size >= 16 and size & (size - 1) == 0 for _, size in found)
+    assert [first for first, _ in found] == [0, found[0][1]][: len(found)]
+
+
+def searches(case, first, more):
+    """The end of the search by XLA's loop and by the kernel, and which instances are optimal."""
+    made, q, bounds, t = scaled_batch(**case, dtype=jnp.float64)
+    start = 0.02 * t * (jnp.abs(t) > 1)
+    limit, A, S = jnp.asarray(1e7), made.A, made.S
+    points = jax.vmap(lambda q, b, y: DualPoint.of(A, q, b, y))
+    cold, point = points(q, bounds, 0 * start), points(q, bounds, start)
+
+    def loop(bounds, cold, point):
+        return dual_search(A, S, bounds, limit, cold, point, jnp.asarray(True), first, more)
+
+    def kernel(bounds, cold, point):
+        state = DualSearch(point, jnp.int32(0), jnp.asarray(True), jnp.asarray(False))
+        return dual_kernel.dual_search_kernel(
+            A, S, bounds, limit, cold, state, most_rows(A), first, more
+        )
+
+    return [jax.jit(jax.vmap(search))(bounds, cold, point) for search in (loop, kernel)]
+
+
+@pytest.mark.parametrize(
+    ("case", "first"),
+    [
+        (dict(n=7, m=11, B=9), 24),
+        (dict(n=20, m=30, B=6, soft=True), 24),
+        (dict(n=20, m=40, B=6), 24),
+        (dict(n=20, m=40, B=6), 2),  # which is too few: all begin once more
+        pytest.param(dict(n=40, m=100, B=3), 24, marks=pytest.mark.slow),  # three kernels
+    ],
+)
+def test_the_search_on_the_dual_in_a_kernel_is_the_loop(case, first, x64):
+    (wanted, there), (found, found_there) = searches(case, first, 60)
+    np.testing.assert_array_equal(found_there, there)
+    assert np.all(there)
+    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-10)
+
+
+def test_a_search_that_is_lost_begins_once_more(x64):
+    """Programs whose first search, of three steps, does not end; by a second one all are solved."""
+    case = dict(n=20, m=60, B=30)
+    (_, lost), _ = searches(case, 3, 0)
+    (_, found), _ = searches(case, 3, 60)
+    assert not np.all(lost) and np.all(found)
+
+
+STATES = np.linspace(-1, 1, 6)[:, None] * np.array([1.1, 1.4])
+# Settings of no other test: programs that are traced for a GPU must not be taken for others.
+SOLVER = jm.ADMM(refine=1001)
+
+
+@pytest.mark.parametrize("soft", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_plans_by_kernels_are_those_without(soft, x64, monkeypatch):
+    """Statuses of infeasible states too."""
+    far = np.array([[1.49, 1.99]])  # beyond the limit after one step
+    states, mpc = np.concatenate([STATES, far]), replace(joint(), horizon=8)
+    if soft:
+        mpc = replace(mpc, soft=jm.Soft(np.array([[0.0, 1.0]]), np.array([0.5]), 5.0, 20.0))
+    plans = lambda solver: jax.jit(jax.vmap(jm.Controller(mpc, solver).plan))(states)
+    wanted = plans(jm.ADMM())
+    for module in (active_set, solve):
+        monkeypatch.setattr(module, "on_gpu", lambda: True)
+    found = plans(SOLVER)
+    np.testing.assert_array_equal(found.status, wanted.status)
+    solved = np.asarray(wanted.status) == jm.Status.SOLVED
+    assert solved[:-1].all() and not solved[-1]
+    np.testing.assert_allclose(found.inputs[solved], wanted.inputs[solved], atol=1e-8)
+    np.testing.assert_allclose(found.gap[solved], wanted.gap[solved], atol=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend:DeprecationWarning")
+def test_kernels_can_be_lowered_for_a_gpu(x64, monkeypatch):
+    """All operations of the kernels exist in Triton's dialect; no GPU is needed to see that."""
+    mesh_module = pytest.importorskip("jax._src.mesh")
+    if not hasattr(mesh_module, "AbstractDevice"):
+        pytest.skip("this JAX lowers kernels on machines with a GPU alone")
+    for module in (active_set, solve, triton, admm_kernel):
+        monkeypatch.setattr(module, "on_gpu", lambda: True)
+    device = mesh_module.AbstractDevice("NVIDIA H100 80GB HBM3", 132, "gpu")
+    axes = dict(axis_types=(jax.sharding.AxisType.Auto,), abstract_device=device)
+    plan = jax.jit(jax.vmap(jm.Controller(joint(), SOLVER).plan))
+    try:
+        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((1,), ("x",), **axes)):
+            lowered = plan.trace(jnp.asarray(STATES)).lower(lowering_platforms=("cuda",))
+    except (TypeError, RuntimeError) as error:
+        pytest.skip(f"this JAX lowers kernels on machines with a GPU alone: {error}")
+    # ADMM; the search on the dual and its corrections (two sizes each), and three loops' judges.
+    assert lowered.as_text().count("xla.gpu.triton") == 8
+
+
+def test_without_triton_there_are_no_kernels(monkeypatch):
+    """Newer versions of JAX may leave it out."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert triton.on_gpu()
+    monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
+    triton.has_triton.cache_clear()
+    try:
+        assert not triton.on_gpu()
+    finally:
+        triton.has_triton.cache_clear()
