@@ -22,6 +22,7 @@ The steps see nothing but S, the bounds, y and v: `DualSearch`. On NVIDIA GPUs t
 (`dual_kernel.py`), made of the same functions.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -131,7 +132,7 @@ def _search_step(rows: int, most: int, more: int, constants: tuple, s: DualSearc
     singly = again | (s.steps >= JOINTLY)
     point, fits = dual_step(A, S, bounds, point, singly, rows)
     largest = [jnp.max(v, initial=0.0) for v in sizes(bounds, point.y, point.v)]
-    return DualSearch(point, *after_step(*largest, limit, s.steps + 1, fits, most, more))
+    return DualSearch(point, *after_step(largest, limit, s.steps + 1, fits, most, more))
 
 
 def sizes(bounds: Bounds, y: Array, v: Array) -> tuple[Array, Array, Array]:
@@ -140,12 +141,12 @@ def sizes(bounds: Bounds, y: Array, v: Array) -> tuple[Array, Array, Array]:
 
 
 def after_step(
-    error: Array, largest_v: Array, largest_y: Array, limit: Any, steps: Array, fits: Any,
-    most: int, more: int,
-) -> tuple[Array, Array, Array]:  # fmt: skip
+    largest: Sequence[Array], limit: Any, steps: Array, fits: Any, most: int, more: int
+) -> tuple[Array, Array, Array]:
     """Return the count of steps, whether to go on, and whether the point is optimal, after a step
-    to a point whose largest `sizes` are given. fits: whether all its rows were in W. The count is
-    `most` where the search begins once more."""
+    to a point with these largest `sizes`. fits: whether all its rows were in W. The count is `most`
+    where the search begins once more."""
+    error, largest_v, largest_y = largest
     optimal = error <= CONVERGED * (1 + largest_v) + ROUNDING * largest_y
     lost = (largest_y > limit) | (jnp.where(fits, False, steps > JOINTLY))
     first = steps <= most
@@ -173,11 +174,8 @@ def dual_step(
     in_W = working_set(bounds, y, v, singly)
     W = true_places(in_W, most)
     inside = W < len(y)
-    columns = [y, v, bounds.l, bounds.u]
-    if bounds.linear is not None:
-        columns += [bounds.linear, bounds.quadratic]
-    y_W, v_W, *rest = jnp.stack(columns).at[:, W].get(mode="fill", fill_value=0.0)
-    rows = WorkingRows(Bounds(*rest), y_W, v_W)
+    y_W, v_W, *rest = jnp.stack([y, v, *bounds.columns]).at[:, W].get(mode="fill", fill_value=0.0)
+    rows = WorkingRows(Bounds.of_rows(rest), y_W, v_W)
     S_W = S.at[W[:, None], W[None, :]].get(mode="fill", fill_value=0.0)
     d = solve(S_W + jnp.diag(jnp.where(inside, rows.slack + RIDGE, 1.0)), rows.gradient)
     t = jnp.append(jnp.asarray(LENGTHS, y.dtype), jnp.min(rows.stops(d), initial=1.0))

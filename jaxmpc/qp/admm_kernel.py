@@ -19,7 +19,7 @@ from jax import Array
 
 from jaxmpc.qp.admm import Factor
 from jaxmpc.qp.precision import matmul
-from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.projection import FREE, Bounds
 from jaxmpc.qp.triton import LEAST, call, indices, load, on_gpu, padded_side, program, store
 
 PRODUCT: Any = jax.lax.DotAlgorithmPreset.BF16_BF16_F32_X3
@@ -67,9 +67,7 @@ def iterate_batch(
         matrices = [turned(factor.F), factor.A.T]
     else:
         matrices = [turned(matmul(factor.A, factor.F) if factor.G is None else factor.G)]
-    vectors = [jnp.stack(offsets, axis=1), t, bounds.l, bounds.u]
-    if bounds.linear is not None:
-        vectors += [bounds.linear, bounds.quadratic]
+    vectors = [jnp.stack(offsets, axis=1), t, *bounds.columns]
     if balls:
         free = m - sum(balls)
         member = np.repeat(np.arange(len(balls) + 1), [free, *balls])
@@ -112,13 +110,14 @@ def iterate_batch(
             return [[matrix(ref, i, j, stage) for i in rows] for j in cols]
 
         b_ref, t_ref, *bound_refs = vector_refs
-        others = [-jnp.inf, jnp.inf, jnp.inf, 0.0]
         if balls:
             *bound_refs, radius_ref = bound_refs
             radius = vector(radius_ref, places[0], other=jnp.inf)
             same = matrix(matrix_refs[-1], places[0], places[0], None)
         tiles = [
-            Bounds(*(vector(ref, i, other=o) for ref, o in zip(bound_refs, others, strict=False)))
+            Bounds.of_rows(
+                vector(ref, i, other=free) for ref, free in zip(bound_refs, FREE, strict=False)
+            )
             for i in places
         ]
 

@@ -44,10 +44,12 @@ def group_sizes(batch: int, rare: bool = False) -> list[int]:
     return sizes
 
 
-def in_blocks(function: Callable, constants: Any, data: Any, on_gpu: Callable | None = None) -> Any:
+def in_blocks(
+    function: Callable, constants: Any, data: Any, *, kernel: Callable | None = None
+) -> Any:
     """Return function(constants, data), for a batch on a CPU in blocks, one after the other.
 
-    on_gpu: the same of a batch, (constants, data with the batch in front), as a kernel for NVIDIA
+    kernel: the same of a batch, (constants, data with the batch in front), as a kernel for NVIDIA
     GPUs. `function` must close over no arrays. A batch of constants makes no blocks.
     """
     one = custom_vmap(lambda constants, data: function(constants, data))
@@ -65,10 +67,10 @@ def in_blocks(function: Callable, constants: Any, data: Any, on_gpu: Callable | 
             out = lax.map(lambda block: together(constants, block), grouped)
             return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:])[:size], out)
 
-        if any(jax.tree.leaves(in_batched[0])) or (size <= BLOCK and on_gpu is None):
+        if any(jax.tree.leaves(in_batched[0])) or (size <= BLOCK and kernel is None):
             out = together(constants, data)
         else:
-            others = {} if on_gpu is None else {"cuda": on_gpu}
+            others = {} if kernel is None else {"cuda": kernel}
             out = lax.platform_dependent(constants, data, cpu=blocks, default=together, **others)
         return out, jax.tree.map(lambda _: True, out)
 

@@ -23,7 +23,7 @@ from jaxmpc.qp.active_set import (
     sizes,
     working_set,
 )
-from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.projection import FREE, Bounds
 from jaxmpc.qp.triton import LEAST, barrier, call, indices, load, padded_side, store
 
 # Rows of W, one kernel after the other: each takes the instances that did not fit into the last.
@@ -57,17 +57,14 @@ def _kernel(
     kernel. flags: count of steps, whether to go on, whether the point is optimal."""
     m, dtype = S.shape[-1], S.dtype
     width = padded_side(m)
-    bound_leaves = [bounds.l, bounds.u]
-    if bounds.linear is not None:
-        bound_leaves += [bounds.linear, bounds.quadratic]
-    others = [-jnp.inf, jnp.inf, jnp.inf, 0.0]
 
     def kernel(*refs: Any) -> None:
-        limit_ref, cold_ref, flags_in, S_ref, y_in, v_in, *refs = refs
-        *bound_refs, y_ref, v_ref, flags_ref, order_ref, change_ref, moved_ref = refs
+        limit_ref, cold_ref, flags_in, S_ref, y_in, v_in, *others = refs
+        *bound_refs, y_ref, v_ref, flags_ref, order_ref, change_ref, moved_ref = others
         i, k, few = indices(width), indices(side), indices(ROWS)
         here, limit = i < m, limit_ref[0]
-        own = Bounds(*(load(r.at[i], here, o) for r, o in zip(bound_refs, others, strict=False)))
+        rows_of = zip(bound_refs, FREE, strict=False)
+        own = Bounds.of_rows(load(ref.at[i], here, free) for ref, free in rows_of)
 
         def step(carry: tuple) -> tuple:
             y, v, taken, _, _, _ = carry
@@ -88,7 +85,7 @@ def _kernel(
             inside = k < count
             W = load(order_ref.at[k], inside, 0)
             take = lambda ref: load(ref.at[W], inside)
-            W_rows = WorkingRows(Bounds(*map(take, bound_refs)), take(y_ref), take(v_ref))
+            W_rows = WorkingRows(Bounds.of_rows(map(take, bound_refs)), take(y_ref), take(v_ref))
             diagonal = jnp.where(inside, W_rows.slack + RIDGE, 1.0)
             S_W = lambda: load(S_ref.at[W[:, None], W[None, :]], inside[:, None] & inside[None, :])
             M = S_W() + jnp.where(k[:, None] == k[None, :], diagonal[:, None], 0.0)
@@ -96,13 +93,12 @@ def _kernel(
 
             def searched(_: Any) -> Array:
                 """Return the change with the best dual value."""
-                S, best, least = S_W(), None, None
+                S, best, least = S_W(), jnp.zeros_like(d), jnp.asarray(jnp.inf, dtype)
                 for t in (*LENGTHS, jnp.min(W_rows.stops(d))):
                     change = W_rows.moved(t * d)
                     image = jnp.sum(S * change[None, :], axis=1)
                     loss = jnp.sum(W_rows.loss(change, image))
-                    best = change if best is None else jnp.where(loss < least, change, best)
-                    least = loss if least is None else jnp.minimum(loss, least)
+                    best, least = jnp.where(loss < least, change, best), jnp.minimum(loss, least)
                 return best
 
             whole = W_rows.moved(d)
@@ -125,7 +121,7 @@ def _kernel(
             barrier()
             largest = [jnp.max(part) for part in sizes(own, new_y, new_v)]
             after, go_on, optimal = after_step(
-                *largest, limit, taken + 1, wanted <= rows, most, more
+                largest, limit, taken + 1, wanted <= rows, most, more
             )
             stays = wanted > (m if last else rows)
             y, v = jnp.where(stays, y, new_y), jnp.where(stays, v, new_v)
@@ -152,7 +148,7 @@ def _kernel(
     program = call(kernel, shapes, warps)
 
     def run(limit: Array, cold: Array, flags: Array, y: Array, v: Array) -> tuple:
-        return tuple(program(limit[None], cold, flags, S, y, v, *bound_leaves)[:3])
+        return tuple(program(limit[None], cold, flags, S, y, v, *bounds.columns)[:3])
 
     return run
 

@@ -12,12 +12,17 @@ to the set for a hard row or a ball; for a soft row s as long as ρ s ≤ c, and
 d = (ρ s − c)/(ρ + k). ρ e is a subgradient of g at p: the multiplier.
 """
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+
+# What leaves a row free: l, u, linear and quadratic.
+FREE = (-math.inf, math.inf, math.inf, 0.0)
 
 
 @jax.tree_util.register_dataclass
@@ -35,6 +40,18 @@ class Bounds:
     quadratic: Any = None
     radius: Any = None
     balls: tuple[int, ...] = field(default=(), metadata={"static": True})
+
+    @classmethod
+    def of_rows(cls, columns: Iterable[Any]) -> "Bounds":
+        """Return the bounds of rows from l, u and, where there are soft ones, linear and quadratic:
+        without balls."""
+        return cls(**dict(zip(("l", "u", "linear", "quadratic"), columns, strict=False)))
+
+    @property
+    def columns(self) -> list[Any]:
+        """l, u and, where there are soft rows, linear and quadratic."""
+        soft = [] if self.linear is None else [self.linear, self.quadratic]
+        return [self.l, self.u, *soft]
 
     def blocks(self) -> list[tuple[slice, Array]]:
         """Return the rows and the radius of each ball."""

@@ -48,7 +48,7 @@ from jaxmpc.qp.newton import (
 )
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely, rounding
 from jaxmpc.qp.problem import QP, QPSolution
-from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.projection import FREE, Bounds
 from jaxmpc.qp.residuals import (
     Measured,
     Pair,
@@ -199,7 +199,7 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = 
         cast(((factor, jnp.asarray(solver.alpha)), (q, bounds, t))),
     )
     (w, y), (w_old, y_old) = cast(
-        run(*arguments) if unrolled else in_blocks(run, *arguments, on_gpu=kernel), qp.q.dtype
+        run(*arguments) if unrolled else in_blocks(run, *arguments, kernel=kernel), qp.q.dtype
     )
     eps = tolerance(solver, qp.q.dtype)
     begin = replace(multipliers_start(q, w, y), change=y - y_old, move=w - w_old)
@@ -265,7 +265,7 @@ def judged(p: Program, w: Array, y: Array) -> tuple[Pair, Array]:
 
 
 def judge_pair(
-    eps: Array, q: Array, bounds: Bounds, z: Array, y: Array, products: Products, E: Array,
+    eps: Any, q: Array, bounds: Bounds, z: Array, y: Array, products: Products, E: Array,
     scaled: Bounds,
 ) -> tuple[tuple[Measured, Array, Array, Array], Array]:  # fmt: skip
     """Return the last four fields of the pair (z, y), and the gradient of its Lagrangian."""
@@ -286,8 +286,7 @@ def judge_in_one_program(
     """`judge_pair` as a kernel for NVIDIA GPUs. Rows and variables that fill up the vectors are
     free, and zero."""
     vectors, tree = jax.tree.flatten((q, bounds, z, y, products, E, scaled))
-    soft = bounds.linear is not None
-    free = (-jnp.inf, jnp.inf, jnp.inf, 0.0) if soft else (-jnp.inf, jnp.inf)
+    free = FREE[: len(bounds.columns)]
     fills = jax.tree.leaves((0.0, free, 0.0, 0.0, (0.0,) * len(products), 0.0, free))
 
     def judge(eps: Array, *vectors: Array) -> tuple[list[Array], list[Array]]:

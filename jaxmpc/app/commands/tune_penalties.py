@@ -201,7 +201,7 @@ class TunePenalties:
         """Write the files."""
         rho = np.asarray(found.solver.rho, float)
         solver = configs.SolverSection(
-            iterations=found.solver.iterations, refine=0,
+            iterations=found.solver.admm_steps(), refine=0,
             alpha=float(np.asarray(found.solver.alpha)),
             rho=float(rho) if rho.ndim == 0 else tuple(map(tuple, np.atleast_2d(rho).tolist())),
         )  # fmt: skip

@@ -1,0 +1,137 @@
+"""What the kernels bring on a GPU: ADMM's speed, plans of very many states, TurboMPC's protocol.
+
+    python experiments/kernels.py [--small]
+
+All on the device, float64 but for ADMM's iterates, after compiling; the least of four runs. All
+programs compile at once. --small: 64 states each, to try the script.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxmpc as jm
+from jaxmpc.bench.families import family, turbompc
+from jaxmpc.qp.admm import scaled
+from jaxmpc.qp.admm_kernel import iterate_batch
+
+PLANS = [("joint", 2**20), ("springs4", 2**20), ("springs8", 2**16)]
+LOOPS, TOLERANCES, SAMPLES, STEPS = (64, 1024, 65_536), (1e-3, 1e-5, 1e-7), 50, 50
+REPEATS = 4
+
+
+@dataclass
+class Task:
+    """A program to time: its arguments, solves in a call, and what to say of the result."""
+
+    name: str
+    program: Callable
+    arguments: tuple
+    count: int
+    say: Callable[[Any], str]
+
+
+def single(tree: Any) -> Any:
+    """The tree in float32."""
+    cast = lambda v: v.astype(jnp.float32) if jnp.issubdtype(v.dtype, jnp.floating) else v
+    return jax.tree.map(cast, tree)
+
+
+def admm_task(name: str, count: int) -> Task:
+    """ADMM's steps for a batch, from zero, in one kernel."""
+    mpc, x = family(name, count)
+    c = jm.Controller(mpc)
+    given = jax.jit(jax.vmap(lambda x: scaled(c.factor, c.condensed.qp(x))))(x)
+    q, bounds = single(given)
+    made, m = single(c.factor), bounds.l.shape[1]
+    run = jax.jit(
+        lambda q, b, t: iterate_batch(made, jnp.float32(1.9), q, b, t, STEPS)[0]
+    )  # fmt: skip
+    flops = 2 * m * m * STEPS
+    task = Task(f"admm {name} {count}", run, (q, bounds, jnp.zeros_like(bounds.l)), count, str)
+    task.say = lambda seconds: f"{flops * count / seconds / 1e12:.1f} TFLOP/s (2 m² a step)"
+    return task
+
+
+def plan_task(name: str, count: int) -> Task:
+    """Plans of feasible states."""
+    mpc, x = family(name, count)
+    say = lambda plans: f"{np.mean(plans.status == jm.Status.SOLVED):.4%} solved"
+    plans = jax.jit(jax.vmap(jm.Controller(mpc).plan))
+    return Task(f"plans {name} {count}", plans, (jnp.asarray(x),), count, say)
+
+
+def loop_tasks(count: int, gradient: bool) -> list[Task]:
+    """TurboMPC's protocol: closed loops of 50 samples from `count` states; with the gradient of
+    their cost with respect to the diagonals of Q and R."""
+    mpc, x = turbompc(batch=count)
+
+    def loops(weights: tuple, x: Any, eps: Any) -> tuple:
+        Q, R = map(jnp.diag, weights)
+        moved = replace(mpc, Q=Q, R=R, terminal_cost=Q)
+        controller = jm.Controller(moved, jm.ADMM(eps=eps))
+        run = jax.vmap(lambda x: jm.simulate(controller, mpc.system, x, SAMPLES))(x)
+        cost = jnp.sum(run.states[:, 1:] ** 2) + jnp.sum(run.inputs**2)
+        return cost, jnp.mean(run.status == jm.Status.SOLVED)
+
+    program = jax.jit(jax.value_and_grad(loops, has_aux=True) if gradient else loops)
+    weights, what = (jnp.ones(8), jnp.ones(4)), "loops, gradient," if gradient else "loops"
+
+    def say(answer: Any) -> str:
+        cost, solved = answer[0] if gradient else answer
+        return f"{float(solved):.4%} solved, cost {float(cost):.9g}"
+
+    return [
+        Task(f"{what} {count} to {eps:g}", program, (weights, jnp.asarray(x), jnp.asarray(eps)),
+             count * SAMPLES, say)
+        for eps in TOLERANCES
+    ]  # fmt: skip
+
+
+def run_all(small: bool) -> None:
+    """Print a line for each task."""
+    size = lambda count: min(count, 64) if small else count
+    tasks = [admm_task(name, size(count // 4)) for name, count in PLANS] if on_gpu() else []
+    tasks += [plan_task(name, size(count)) for name, count in PLANS]
+    tasks += [t for grad in (False, True) for count in LOOPS for t in loop_tasks(size(count), grad)]
+    compiled: dict[Any, Any] = {}
+    with ThreadPoolExecutor() as pool:
+        for task in tasks:
+            if task.program not in compiled:
+                start = lambda task=task: task.program.lower(*task.arguments).compile()
+                compiled[task.program] = pool.submit(start)
+        for task in tasks:
+            try:
+                print(timed(task, compiled[task.program].result()), flush=True)
+            except jax.errors.JaxRuntimeError as error:  # too large for the device's memory
+                print(f"{task.name}: {str(error).splitlines()[0][:90]}", flush=True)
+
+
+def timed(task: Task, program: Callable) -> str:
+    """Return a line about the program's least time."""
+    seconds = []
+    for _ in range(REPEATS + 1):
+        begin = time.perf_counter()
+        answer = jax.block_until_ready(program(*task.arguments))
+        seconds.append(time.perf_counter() - begin)
+    best = min(seconds[1:])
+    what = task.say(best if task.name.startswith("admm") else answer)
+    return f"{task.name}: {1e3 * best:.2f} ms, {1e6 * best / task.count:.4f} µs each, {what}"
+
+
+def on_gpu() -> bool:
+    """Whether there is a GPU: elsewhere Pallas' interpreter would run the kernel."""
+    return jax.default_backend() == "gpu"
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    print(jax.__version__, jax.devices())
+    run_all("--small" in sys.argv[1:])
