@@ -37,9 +37,8 @@ from scipy import sparse
 import jaxmpc as jm
 from jaxmpc.app import config
 from jaxmpc.mpc.condense import Condensed, condense, in_float64
-from jaxmpc.qp.admm import factor, iterate, read, scaled, splittings
+from jaxmpc.qp.admm import factor, iterate, read, scaled, splittings, unscaled
 from jaxmpc.qp.residuals import joined, residual_terms
-from jaxmpc.qp.solve import unscaled
 from jaxmpc.tuning.penalties import tune_penalties
 from jaxmpc.tuning.penalty_schedule import transfer_penalties
 from jaxmpc.tuning.result import TuningRun

@@ -18,10 +18,10 @@ from jax import Array
 
 import jaxmpc as jm
 from jaxmpc.mpc.plan import WarmStart
-from jaxmpc.qp.admm import iterate, read, scaled, splittings
+from jaxmpc.qp.admm import iterate, read, scaled, splittings, unscaled
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.residuals import residuals
-from jaxmpc.qp.solve import unscaled, warm
+from jaxmpc.qp.solve import warm
 
 
 @dataclass(frozen=True)

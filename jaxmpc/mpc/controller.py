@@ -23,10 +23,11 @@ from jaxmpc.mpc.plan import (
     sorted_multipliers,
 )
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.active_set import has_dual_steps
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor
 from jaxmpc.qp.admm import factor as factorise
 from jaxmpc.qp.precision import arrays, matmul
-from jaxmpc.qp.solve import has_dual_steps, in_two_parts, solve_factored
+from jaxmpc.qp.solve import in_two_parts, solve_factored
 from jaxmpc.qp.status import Status
 
 

@@ -59,9 +59,10 @@ def solve_many(
     mpc: the problem, or a Controller of it in float64, already condensed and factored, whose own
     solver counts. dtype: type of the ADMM iterates; Newton steps, residuals, status and the answer
     are float64 whatever it is, and whether or not 64-bit mode is on. chunk: states that a compiled
-    program takes at once; None: by device. transfer: of very many states with few coordinates solve
-    some, and let the others follow these (`transfer.py`). Each plan is judged by its own residuals
-    all the same: this changes the time, and which of several plans within the tolerances is found.
+    program takes at once; None: by device. transfer: on a CPU, of very many states with few
+    coordinates solve some, and let the others follow these (`transfer.py`). Each plan is judged by
+    its own residuals all the same: this changes the time, and which of several plans within the
+    tolerances is found.
     to_host: False leaves the plans on the device. devices: a number of them, or a sequence of JAX
     devices, which share the states of a chunk; None: the default device. A state with NaN gets
     status NON_FINITE. Raises ValueError for wrong shapes and ill-posed problems.

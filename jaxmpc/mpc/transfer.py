@@ -25,12 +25,12 @@ from jaxmpc.compiled import padded
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Multipliers, Plan, answer, flat_multipliers
-from jaxmpc.qp.active_set import RIDGE, most_rows
+from jaxmpc.qp.active_set import RIDGE, has_dual_steps, most_rows
 from jaxmpc.qp.admm import Factor, scaled, scaled_multipliers
 from jaxmpc.qp.batches import repeat_while, true_places
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import matmul
-from jaxmpc.qp.solve import has_dual_steps, solve_from
+from jaxmpc.qp.solve import solve_from
 from jaxmpc.qp.status import Status
 
 # Coordinates of a state up to which its neighbours are near enough.

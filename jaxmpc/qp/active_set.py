@@ -156,6 +156,11 @@ def after_step(
     return steps, jnp.where(optimal | stuck, False, go_on), optimal
 
 
+def has_dual_steps(balls: tuple[int, ...], A: Any) -> bool:
+    """Return whether `active_set.py` can take steps: there are rows, and no balls."""
+    return not balls and len(A) > 0
+
+
 def most_rows(A: Array) -> int:
     """Return the number of rows that W may hold: no more than n are independent."""
     return min(*A.shape, MOST_ROWS)

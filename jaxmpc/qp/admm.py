@@ -338,6 +338,14 @@ def scaled_multipliers(E: Array, y: Array) -> Array:
     return jnp.where(E > 0, y / jnp.where(E > 0, E, 1.0), 0.0)
 
 
+def unscaled(qp: QP, factor: Factor, w: Array, y: Array) -> tuple[Array, Array]:
+    """Return z and an admissible y in the units of `qp`. A soft row that z cannot move (scale 0)
+    gets its penalty's gradient as multiplier, so that the duality gap closes."""
+    zero = factor.E == 0
+    y = jnp.where(zero, qp.bounds.penalty_gradient(jnp.zeros_like(y)), factor.E * y)
+    return matmul(w, factor.T.T), qp.bounds.admissible(y)
+
+
 class Splitting(NamedTuple):
     """What a step of ADMM needs at one penalty rho (m,), in scaled rows: image, r → A M⁻¹A'R r, and
     offset b (m,), the rows of the minimiser for r = 0."""

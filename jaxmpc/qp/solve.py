@@ -1,7 +1,8 @@
-"""solve_qp: ADMM, Newton steps, status from residuals and certificates, implicit derivative."""
+"""solve_qp: ADMM, then Newton steps (`refine.py`), status from residuals and certificates,
+implicit derivative."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -11,14 +12,7 @@ import numpy as np
 from jax import Array, lax
 
 from jaxmpc.checks import concrete, fail, require_kind, require_shape
-from jaxmpc.qp.active_set import (
-    DIVERGED,
-    MORE_STEPS,
-    MOST_STEPS,
-    DualPoint,
-    dual_search,
-    single_step,
-)
+from jaxmpc.qp.active_set import has_dual_steps
 from jaxmpc.qp.admm import (
     ADMM,
     DEFAULT,
@@ -28,41 +22,33 @@ from jaxmpc.qp.admm import (
     iterate,
     read,
     scaled,
-    scaled_multipliers,
     scaled_rows,
     splittings,
     start,
+    unscaled,
 )
 from jaxmpc.qp.admm_kernel import iterate_batch, suits
-from jaxmpc.qp.batches import in_blocks, repeat_while
-from jaxmpc.qp.certificate import Proof, correcting_rows, farkas, prove, recession, to_length_one
+from jaxmpc.qp.batches import in_blocks
+from jaxmpc.qp.certificate import Proof, correcting_rows, prove
 from jaxmpc.qp.derivative import dense_conditions, implicit
 from jaxmpc.qp.newton import (
     Constants,
-    Multipliers,
-    largest,
     multipliers_start,
     multipliers_step,
-    multipliers_update,
-    newton_step,
 )
-from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely, rounding
+from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely
 from jaxmpc.qp.problem import QP, QPSolution
-from jaxmpc.qp.projection import FREE, Bounds
+from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.refine import Program, by_the_dual, improve
 from jaxmpc.qp.residuals import (
-    Measured,
-    Pair,
-    Products,
     assess,
     concluded,
-    judgment,
     marked,
     residual_terms,
-    terms_of,
     worst,
 )
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.triton import in_one_program, indices, on_gpu
+from jaxmpc.qp.triton import on_gpu
 
 T = TypeVar("T", bound=Any)
 
@@ -117,11 +103,6 @@ def in_two_parts(
     found = program(*arguments, whole=False)
     solved = int(status(found)) != Status.ITERATION_LIMIT  # as an int: == would be a program
     return found if solved else program(*arguments, whole=True)
-
-
-def has_dual_steps(balls: tuple[int, ...], A: Any) -> bool:
-    """Return whether `active_set.py` can take steps: there are rows, and no balls."""
-    return not balls and np.shape(A)[0] > 0
 
 
 def as_arrays(qp: QP) -> QP:
@@ -239,237 +220,11 @@ def loop_kernel(iterations: int, constants: tuple, data: tuple) -> list[tuple[Ar
     return [jax.vmap(partial(read, factor))(t, q, bounds) for t in ends]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Program:
-    """A program in its own units and, as `q` (n,) and `bounds`, in ADMM's coordinates; eps: the
-    tolerances (2,); far: bound on |w|, beyond which steps are rejected (the program looks
-    unbounded)."""
-
-    qp: QP
-    factor: Factor
-    q: Array
-    bounds: Bounds
-    eps: Array
-    far: float = field(metadata={"static": True})
-
-
-def judged(p: Program, w: Array, y: Array) -> tuple[Pair, Array]:
-    """The pair of scaled w and y, and the gradient T'(Pz + q + A'y) (n,) of the Lagrangian."""
-    qp, f = p.qp, p.factor
-    z, y = unscaled(qp, f, w, y)
-    products = Products.of(qp, z, y)
-    judge = judge_in_one_program if on_gpu() and not qp.balls and len(y) else judge_pair
-    judgment, gradient = judge(p.eps, qp.q, qp.bounds, z, y, products, f.E, p.bounds)
-    return Pair(z, y, *judgment), matmul(gradient, f.T)
-
-
-def judge_pair(
-    eps: Any, q: Array, bounds: Bounds, z: Array, y: Array, products: Products, E: Array,
-    scaled: Bounds,
-) -> tuple[tuple[Measured, Array, Array, Array], Array]:  # fmt: skip
-    """Return the last four fields of the pair (z, y), and the gradient of its Lagrangian."""
-    terms, floor = terms_of(q, bounds, z, y, products), rounding(z.dtype)
-    # For soft rows the gap is quadratic in the error of z; the prox residual is linear.
-    v, push = E * products.Az, scaled_multipliers(E, y)
-    prox = scaled.prox_residual(v + push, 1.0) - push, jnp.abs(v) + jnp.abs(push)
-    values, sizes = terms[1]
-    # Entries at rounding level count as zero.
-    gradient = jnp.where(jnp.abs(values) > floor * sizes, values, 0.0)
-    return judgment(terms, eps, floor, [prox]), gradient
-
-
-def judge_in_one_program(
-    eps: Array, q: Array, bounds: Bounds, z: Array, y: Array, products: Products, E: Array,
-    scaled: Bounds,
-) -> tuple[tuple[Measured, Array, Array, Array], Array]:  # fmt: skip
-    """`judge_pair` as a kernel for NVIDIA GPUs. Rows and variables that fill up the vectors are
-    free, and zero."""
-    vectors, tree = jax.tree.flatten((q, bounds, z, y, products, E, scaled))
-    free = FREE[: len(bounds.columns)]
-    fills = jax.tree.leaves((0.0, free, 0.0, 0.0, (0.0,) * len(products), 0.0, free))
-
-    def judge(eps: Array, *vectors: Array) -> tuple[list[Array], list[Array]]:
-        i = indices(len(eps))
-        two = [jnp.sum(jnp.where(i == n, eps, 0.0)) for n in range(2)]
-        found, gradient = judge_pair(two, *jax.tree.unflatten(tree, vectors))
-        return [gradient], jax.tree.leaves(found)
-
-    data = [(eps, 0.0), *zip(vectors, fills, strict=True)]
-    [gradient], numbers = in_one_program(judge, data, [len(z)], 7)
-    primal, dual, gap, small, error, near, solved = numbers
-    return (Measured(primal, dual, gap, small > 0), error, near > 0, solved > 0), gradient
-
-
 def better(qp: QP, pair: tuple[Array, Array], other: tuple[Array, Array]) -> tuple:
     """Return the one of two pairs (z, y) with the smaller largest relative residual."""
     error = lambda z, y: worst(residual_terms(qp, z, y), 0.0)[1]
     take = lax.stop_gradient(error(*other) < error(*pair))
     return tuple(jnp.where(take, b, a) for a, b in zip(pair, other, strict=True))
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Search:
-    """Loop state of one instance: the point of the method of multipliers; q (n,) corrected by what
-    rounding leaves of the gradient; the best pair so far; Newton steps taken; what is proved;
-    w (n,) of the search for a proof, and whether to go on."""
-
-    point: Multipliers
-    q: Array
-    best: Pair
-    steps: Array
-    proof: Proof
-    w: Array
-    open: Array
-
-
-def improve(
-    refine: int, fixed: bool, whole: bool, p: Program, begin: Multipliers
-) -> tuple[Pair, Proof, Array]:
-    """Return the best pair (z, y) and what is proved, after `refine` Newton steps at most, in
-    float64, and whether there is nothing left to try.
-
-    Steps on the dual in the active rows solve most programs (`active_set.py`). The method of
-    multipliers (`newton.py`) takes the others: P singular, balls, degenerate or infeasible rows.
-    """
-    qp, factor = p.qp, p.factor
-    best, go_on = Pair.none(p.q, p.bounds.l), jnp.asarray(True)
-    correcting = correcting_rows(qp)
-    if has_dual_steps(qp.balls, qp.A) and not fixed:
-        # The dual of an infeasible program has no maximum: steps towards it would be wasted.
-        _, empty = farkas(qp, factor.E * begin.change, correcting)
-        best, y = by_the_dual(p, begin.y, ~factor.flat & ~empty, refine)
-        go_on = ~best.solved
-        # Multipliers that grow without bound are nearly a Farkas vector.
-        begin = replace(begin, change=jnp.where(largest(y) > most_multiplier(p), y, begin.change))
-        begin = least_violation(begin, empty)
-    if not whole:
-        return best, Proof.none(p.q, p.bounds.l), best.solved
-    constants = (p, matmul(factor.H, factor.H), correcting)
-    s = Search(begin, p.q, best, jnp.int32(0), Proof.none(p.q, p.bounds.l), begin.w, go_on)
-    if fixed:
-        length = refine + 3 * proof_steps(refine)
-        s = lax.scan(partial(still_open, refine, constants), s, length=length)[0]
-    else:
-        step = partial(by_multipliers, refine)
-        s = repeat_while(lambda s: s.open, step, constants, s, rare=True)
-    return s.best, s.proof, jnp.asarray(True)
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Correction:
-    """Loop state of one instance whose dual steps leave residuals: its point, the gradient of its
-    Lagrangian in w (n,), the best pair so far, the corrections made, and whether to go on."""
-
-    point: DualPoint
-    gradient: Array
-    best: Pair
-    steps: Array
-    open: Array
-
-
-def by_the_dual(p: Program, y: Array, go_on: Array, most: int) -> tuple[Pair, Array]:
-    """Return the best pair of a search on the dual from y (m,) in ADMM's coordinates, `most` steps
-    and corrections at most, and the last multipliers. The pair is `solved` where its residuals are
-    small enough to end with it."""
-    f, first, limit = p.factor, min(most, MOST_STEPS), most_multiplier(p)
-    cold, point = (DualPoint.of(f.A, p.q, p.bounds, y) for y in (jnp.zeros_like(y), y))
-    more = min(most - first, MORE_STEPS)
-    point, optimal = dual_search(f.A, f.S, p.bounds, limit, cold, point, go_on, first, more)
-    best, gradient = judged(p, point.w, point.y)
-    best = replace(best, solved=best.solved | best.near)
-    start = Correction(point, gradient, best, jnp.int32(0), optimal & ~best.solved)
-    end = repeat_while(lambda s: s.open, partial(correction, first), p, start, rare=True)
-    return end.best, end.point.y
-
-
-def most_multiplier(p: Program) -> Array:
-    """Return the size of scaled multipliers from which on the dual seems unbounded: rows contradict
-    each other."""
-    return DIVERGED * (1 + largest(p.q))
-
-
-def correction(most: int, p: Program, s: Correction) -> Correction:
-    """One more step on the dual, from a point that makes up for the gradient of the Lagrangian: it
-    is zero there in exact arithmetic; where P is ill-conditioned it is rounding of T'PT (defect
-    correction)."""
-    f, steps, limit = p.factor, s.steps + 1, most_multiplier(p)
-    point = s.point.shifted(f.A, -s.gradient)
-    point = single_step(f.A, f.S, p.bounds, limit, point)
-    pair, gradient = judged(p, point.w, point.y)
-    best = s.best.or_better(pair)
-    go_on = ~best.solved & (largest(point.y) <= limit) & (steps < most)
-    return Correction(point, gradient, best, steps, go_on)
-
-
-def proof_steps(refine: int) -> int:
-    """Return the Newton steps towards a Farkas vector; twice as many towards a ray."""
-    return max(min(refine // 5, 30), 1)
-
-
-def by_multipliers(refine: int, constants: tuple, s: Search) -> Search:
-    """Take one Newton step, by the count of steps: of the method of multipliers, `refine` times;
-    then of least distance to the rows, whose residual becomes a Farkas vector; then, if P is
-    singular, of `recession`, whose minimiser becomes a ray."""
-    p, squared, correcting = constants
-    f, few, dtype = p.factor, proof_steps(refine), s.w.dtype
-    primal, distance = s.steps < refine, s.steps < refine + few
-    pick = lambda first, second, third: jax.tree.map(
-        lambda a, b, c: jnp.where(primal, a, jnp.where(distance, b, c)), first, second, third
-    )
-    w = jnp.where(s.steps == refine, s.point.w, s.w)
-    w = jnp.where(s.steps == refine + few, to_length_one(s.point.move), w)
-    hard, (H_ray, q_ray, cone) = p.bounds.hard(), recession(squared, p.q, p.bounds)
-    if p.bounds.linear is not None:
-        rigid: dict[str, Any] = {
-            "linear": jnp.full_like(p.bounds.linear, jnp.inf),
-            "quadratic": jnp.zeros_like(p.bounds.quadratic),
-        }
-        hard, cone = replace(hard, **rigid), replace(cone, **rigid)
-    damping, none = Constants.of(dtype).damping, jnp.zeros_like(s.point.y)
-    at, y, H, q, bounds, rho, sigma = pick(
-        (s.point.w, s.point.y, f.H, s.q, p.bounds, s.point.rho, s.point.sigma),
-        (w, none, 0 * f.H, 0 * s.q, hard, 1.0, damping),
-        (w, none, H_ray, q_ray, cone, 1.0, damping),
-    )
-    step = newton_step(at, y, H, q, bounds, rho, sigma, f.A)
-    keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(primal, a, b), new, old)
-    stiff = s.point.rho >= Constants.of(dtype).rho[1]
-    point = keep(multipliers_update(s.q, s.point, step, p.far), s.point)
-    pair, gradient = judged(p, point.w, point.y)
-    # What rounding of T'PT hides of the gradient counts as a part of q (defect correction).
-    q = s.q + gradient - (matmul(point.w, f.H) + s.q + matmul(point.y, f.A))
-    ray = jnp.where(distance, point.move, step.w)
-    push = jnp.where(primal, point.change, step.excess)
-    proof = s.proof.joined(prove(p.qp, f.T, f.E, correcting, push, ray))
-    # Where there is no answer, the best is the point of least violation, at which this ends.
-    best = keep(s.best.or_better(pair), s.best)
-    take = proof.infeasible & ~best.solved
-    best = jax.tree.map(lambda a, b: jnp.where(take, a, b), pair, best)
-
-    steps = s.steps + 1
-    there = (stiff & step.minimised) | ~primal
-    ended = best.solved | proof.unbounded | (proof.infeasible & there)
-    point = least_violation(point, proof.infeasible & ~stiff)
-    ended = ended | (steps >= refine + jnp.where(f.flat, 3 * few, few))
-    return Search(point, q, best, steps, proof, step.w, ~ended)
-
-
-def least_violation(point: Multipliers, infeasible: Array) -> Multipliers:
-    """`point`, or where the program is infeasible the start of a search for the least violation of
-    the rows: the last penalty at once, and no multipliers."""
-    top = Constants.of(point.w.dtype).rho[1]
-    return replace(
-        point, rho=jnp.where(infeasible, top, point.rho), y=jnp.where(infeasible, 0.0, point.y)
-    )
-
-
-def still_open(refine: int, constants: tuple, s: Search, _: None) -> tuple[Search, None]:
-    """Body of a scan: `by_multipliers`, no change once the instance is finished."""
-    new = by_multipliers(refine, constants, s)
-    return jax.tree.map(lambda a, b: jnp.where(s.open, a, b), new, s), None
 
 
 def cleaned(qp: QP, matrix_fault: Array) -> tuple[QP, Array]:
@@ -528,14 +283,6 @@ def require_warm_start(qp: QP, warm_start: Any) -> tuple[Any, Any]:
     for name, value, like in (("z", pair[0], qp.q), ("y", pair[1], qp.l)):
         require_shape(f"warm_start {name}", value, np.shape(like), f"Needed: {np.shape(like)}")
     return pair[0], pair[1]
-
-
-def unscaled(qp: QP, factor: Factor, w: Array, y: Array) -> tuple[Array, Array]:
-    """Return z and an admissible y in the units of `qp`. A soft row that z cannot move (scale 0)
-    gets its penalty's gradient as multiplier, so that the duality gap closes."""
-    zero = factor.E == 0
-    y = jnp.where(zero, qp.bounds.penalty_gradient(jnp.zeros_like(y)), factor.E * y)
-    return matmul(w, factor.T.T), qp.bounds.admissible(y)
 
 
 def value(qp: QP, z: Array, y: Array) -> Array:

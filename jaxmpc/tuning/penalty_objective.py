@@ -24,10 +24,10 @@ from jax import Array
 from jaxmpc.compiled import Compiled, first_rows, padded
 from jaxmpc.devices import Devices, divisible, over_devices
 from jaxmpc.mpc.condense import Condensed
-from jaxmpc.qp.admm import ADMM, factor, iterate, read, scaled, splittings
+from jaxmpc.qp.admm import ADMM, factor, iterate, read, scaled, splittings, unscaled
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.residuals import joined, marked, residual_terms
-from jaxmpc.qp.solve import solve_factored, unscaled, warm
+from jaxmpc.qp.solve import solve_factored, warm
 from jaxmpc.qp.status import Status
 from jaxmpc.tuning.batch_mean import BatchMean
 

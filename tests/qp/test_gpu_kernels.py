@@ -10,7 +10,7 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.bench.families import joint
-from jaxmpc.qp import active_set, admm_kernel, dual_kernel, solve, triton
+from jaxmpc.qp import active_set, admm_kernel, dual_kernel, refine, solve, triton
 from jaxmpc.qp.active_set import DualPoint, DualSearch, dual_search, most_rows
 from jaxmpc.qp.admm import ADMM, factor, iterate, scaled, splittings
 from jaxmpc.qp.admm_kernel import iterate_batch, pieces
@@ -136,7 +136,7 @@ def test_plans_by_kernels_are_those_without(soft, x64, monkeypatch):
         mpc = replace(mpc, soft=jm.Soft(np.array([[0.0, 1.0]]), np.array([0.5]), 5.0, 20.0))
     plans = lambda solver: jax.jit(jax.vmap(jm.Controller(mpc, solver).plan))(states)
     wanted = plans(jm.ADMM())
-    for module in (active_set, solve):
+    for module in (active_set, refine):
         monkeypatch.setattr(module, "on_gpu", lambda: True)
     found = plans(SOLVER)
     np.testing.assert_array_equal(found.status, wanted.status)
@@ -152,7 +152,7 @@ def test_kernels_can_be_lowered_for_a_gpu(x64, monkeypatch):
     mesh_module = pytest.importorskip("jax._src.mesh")
     if not hasattr(mesh_module, "AbstractDevice"):
         pytest.skip("this JAX lowers kernels on machines with a GPU alone")
-    for module in (active_set, solve, triton, admm_kernel):
+    for module in (active_set, refine, solve, triton, admm_kernel):
         monkeypatch.setattr(module, "on_gpu", lambda: True)
     device = mesh_module.AbstractDevice("NVIDIA H100 80GB HBM3", 132, "gpu")
     axes = dict(axis_types=(jax.sharding.AxisType.Auto,), abstract_device=device)
