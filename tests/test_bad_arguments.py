@@ -46,7 +46,7 @@ CALLS = [
     ("x0: {'q': 1, 'dq': 2} where real", lambda: jm.solve(M, {"q": 1, "dq": 2})),
     ("x0: entries of type object where real", lambda: jm.solve(M, [None, None])),
     ("x0: {1, 2} where real numbers are", lambda: jm.solve(M, {1, 2})),
-    ("reference: ADMM(iterations=50", lambda: jm.solve(M, x, jm.ADMM())),
+    ("reference: ADMM(iterations=None", lambda: jm.solve(M, x, jm.ADMM())),
     ("reference: 'r' where real numbers are", lambda: jm.solve(M, x, "r")),
     ("reference: entries of type complex128 where", lambda: jm.solve(M, x, x + 1j)),
     ("reference: shape (3,). Give (2,) or (4, 2);", lambda: jm.solve(M, x, np.zeros(3))),
