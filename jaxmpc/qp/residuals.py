@@ -37,16 +37,21 @@ class Products(NamedTuple):
     size_Aty: Array
 
     @classmethod
-    def of(cls, qp: QP, z: Array, y: Array) -> "Products":
-        """Return the products of a pair z (n,), y (m,)."""
+    def of(cls, qp: QP, z: Array, y: Array, sizes: bool = True) -> "Products":
+        """Return the products of a pair z (n,), y (m,); sizes: False counts those of the absolute
+        values as 0."""
         multiply = lambda z, y, P, A: (matmul(z, A.T), matmul(z, P), matmul(y, A))
-        return cls(*multiply(z, y, qp.P, qp.A), *multiply(*map(jnp.abs, (z, y, qp.P, qp.A))))
+        products = multiply(z, y, qp.P, qp.A)
+        if not sizes:
+            return cls(*products, *map(jnp.zeros_like, products))
+        return cls(*products, *multiply(*map(jnp.abs, (z, y, qp.P, qp.A))))
 
 
-def residual_terms(qp: QP, z: Array, y: Array) -> Terms:
+def residual_terms(qp: QP, z: Array, y: Array, sizes: bool = True) -> Terms:
     """Return the residuals of rows (m,), variables (n,) and the gap (1,), each with the sizes,
-    entry by entry, of the terms that they are differences of: rounding is a share of these."""
-    return terms_of(qp.q, qp.bounds, z, y, Products.of(qp, z, y))
+    entry by entry, of the terms that they are differences of: rounding is a share of these. sizes:
+    False underestimates them, at half the cost."""
+    return terms_of(qp.q, qp.bounds, z, y, Products.of(qp, z, y, sizes))
 
 
 def terms_of(q: Array, bounds: Bounds, z: Array, y: Array, products: Products) -> Terms:
