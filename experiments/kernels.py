@@ -7,7 +7,6 @@ programs compile at once. --small: 64 states each, to try the script.
 """
 
 import sys
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -19,8 +18,10 @@ import numpy as np
 
 import jaxmpc as jm
 from jaxmpc.bench.families import family, turbompc
+from jaxmpc.bench.roofline import best_seconds
 from jaxmpc.qp.admm import scaled
 from jaxmpc.qp.admm_kernel import iterate_batch
+from jaxmpc.qp.triton import ROUGH, on_gpu
 
 PLANS = [("joint", 2**20), ("springs4", 2**20), ("springs8", 2**16)]
 LOOPS, TOLERANCES, SAMPLES, STEPS = (64, 1024, 65_536), (1e-3, 1e-5, 1e-7), 50, 50
@@ -29,13 +30,13 @@ REPEATS = 4
 
 @dataclass
 class Task:
-    """A program to time: its arguments, solves in a call, and what to say of the result."""
+    """A program to time: its arguments, solves in a call, what to say of the result and seconds."""
 
     name: str
     program: Callable
     arguments: tuple
     count: int
-    say: Callable[[Any], str]
+    say: Callable[[Any, float], str]
 
 
 def single(tree: Any) -> Any:
@@ -51,19 +52,17 @@ def admm_task(name: str, count: int) -> Task:
     given = jax.jit(jax.vmap(lambda x: scaled(c.factor, c.condensed.qp(x))))(x)
     q, bounds = single(given)
     made, m = single(c.factor), bounds.l.shape[1]
-    run = jax.jit(
-        lambda q, b, t: iterate_batch(made, jnp.float32(1.9), q, b, t, STEPS)[0]
-    )  # fmt: skip
+    alpha = jnp.float32(1.9)
+    run = jax.jit(lambda q, b, t: iterate_batch(made, alpha, q, b, t, STEPS, ROUGH)[0])
     flops = 2 * m * m * STEPS
-    task = Task(f"admm {name} {count}", run, (q, bounds, jnp.zeros_like(bounds.l)), count, str)
-    task.say = lambda seconds: f"{flops * count / seconds / 1e12:.1f} TFLOP/s (2 m² a step)"
-    return task
+    say = lambda _, seconds: f"{flops * count / seconds / 1e12:.1f} TFLOP/s (2 m² a step)"
+    return Task(f"admm {name} {count}", run, (q, bounds, jnp.zeros_like(bounds.l)), count, say)
 
 
 def plan_task(name: str, count: int) -> Task:
     """Plans of feasible states."""
     mpc, x = family(name, count)
-    say = lambda plans: f"{np.mean(plans.status == jm.Status.SOLVED):.4%} solved"
+    say = lambda plans, _: f"{np.mean(plans.status == jm.Status.SOLVED):.4%} solved"
     plans = jax.jit(jax.vmap(jm.Controller(mpc).plan))
     return Task(f"plans {name} {count}", plans, (jnp.asarray(x),), count, say)
 
@@ -84,7 +83,7 @@ def loop_tasks(count: int, gradient: bool) -> list[Task]:
     program = jax.jit(jax.value_and_grad(loops, has_aux=True) if gradient else loops)
     weights, what = (jnp.ones(8), jnp.ones(4)), "loops, gradient," if gradient else "loops"
 
-    def say(answer: Any) -> str:
+    def say(answer: Any, _: float) -> str:
         cost, solved = answer[0] if gradient else answer
         return f"{float(solved):.4%} solved, cost {float(cost):.9g}"
 
@@ -116,19 +115,9 @@ def run_all(small: bool) -> None:
 
 def timed(task: Task, program: Callable) -> str:
     """Return a line about the program's least time."""
-    seconds = []
-    for _ in range(REPEATS + 1):
-        begin = time.perf_counter()
-        answer = jax.block_until_ready(program(*task.arguments))
-        seconds.append(time.perf_counter() - begin)
-    best = min(seconds[1:])
-    what = task.say(best if task.name.startswith("admm") else answer)
+    best = best_seconds(lambda: program(*task.arguments), REPEATS)
+    what = task.say(program(*task.arguments), best)
     return f"{task.name}: {1e3 * best:.2f} ms, {1e6 * best / task.count:.4f} µs each, {what}"
-
-
-def on_gpu() -> bool:
-    """Whether there is a GPU: elsewhere Pallas' interpreter would run the kernel."""
-    return jax.default_backend() == "gpu"
 
 
 if __name__ == "__main__":

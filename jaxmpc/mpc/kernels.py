@@ -13,15 +13,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxmpc.qp import triton
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.triton import barrier, call, indices, load, on_gpu, padded_side, store
 
 # Numbers along a side that a warp's registers hold.
 MOST = 32
-
-# float32 products from six of bfloat16, as exact as float32's own, on tensor cores.
-PRODUCT: Any = jax.lax.DotAlgorithmPreset.BF16_BF16_F32_X6
 
 
 class Gains(NamedTuple):
@@ -200,12 +198,7 @@ def _tracking_kernel(
 def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array) -> Gains:
     N, n, m, dtype = len(R), Q.shape[-1], R.shape[-1], Q.dtype
     side = padded_side(max(n, m))
-    precision = None if dtype == jnp.float64 or not on_gpu() else PRODUCT
-
-    def dot(a: Array, b: Array) -> Array:
-        return jax.lax.dot_general(
-            a, b, (((1,), (0,)), ((), ())), precision=precision, preferred_element_type=dtype
-        )
+    dot = partial(triton.dot, product=triton.EXACT)
 
     def kernel(Q_ref: Any, R_ref: Any, A_ref: Any, B_ref: Any, closed_ref: Any, K_ref: Any,
                inverse_ref: Any) -> None:  # fmt: skip

@@ -35,12 +35,10 @@ from jaxmpc.qp.batches import repeat_while, true_places
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.triton import on_gpu
+from jaxmpc.qp.triton import has_kernels
 
 # Most rows in W.
 MOST_ROWS = 48
-# Rows that the kernel for GPUs takes.
-MOST_KERNEL_ROWS = 512
 # Most steps, of these those in which all violated rows join W, and most steps of a second search.
 MOST_STEPS, JOINTLY, MORE_STEPS = 24, 2, 100
 # Step lengths that are tried, beside the largest that stops no row.
@@ -71,6 +69,11 @@ class DualPoint:
         y = bounds.admissible(y)
         w = -q - matmul(y, A)
         return cls(y, w, matmul(w, A.T))
+
+    @classmethod
+    def cold(cls, A: Array, q: Array) -> "DualPoint":
+        """Return the point without multipliers."""
+        return cls(jnp.zeros(len(A), q.dtype), -q, -matmul(q, A.T))
 
     def moved(self, A: Array, change: Array) -> "DualPoint":
         """Return the point y + change. (−q − A'y would cancel where |w| is far below |q|; the
@@ -105,7 +108,7 @@ def dual_search(
     too many for W, it begins once more from `cold`, the point without multipliers, with rows that
     join singly and `more` steps at most."""
     state, rows = DualSearch(point, jnp.int32(0), go_on, jnp.asarray(False)), most_rows(A)
-    if on_gpu() and len(S) <= MOST_KERNEL_ROWS:
+    if has_kernels(len(S)):
         from jaxmpc.qp.dual_kernel import dual_search_kernel  # which is made of what stands here
 
         return dual_search_kernel(A, S, bounds, limit, cold, state, rows, most, more)
@@ -117,7 +120,7 @@ def dual_search(
 def single_step(A: Array, S: Array, bounds: Bounds, limit: Array, point: DualPoint) -> DualPoint:
     """Return the point after one step, in which rows join singly."""
     rows, true = most_rows(A), jnp.asarray(True)
-    if on_gpu() and len(S) <= MOST_KERNEL_ROWS:
+    if has_kernels(len(S)):
         from jaxmpc.qp.dual_kernel import dual_search_kernel
 
         state = DualSearch(point, jnp.int32(JOINTLY), true, ~true)
@@ -148,12 +151,12 @@ def after_step(
     where the search begins once more."""
     error, largest_v, largest_y = largest
     optimal = error <= CONVERGED * (1 + largest_v) + ROUNDING * largest_y
-    lost = (largest_y > limit) | (jnp.where(fits, False, steps > JOINTLY))
+    # (Without "not": Triton's dialect lacks it for booleans.)
+    lost = jnp.where(largest_y <= limit, jnp.where(fits, False, steps > JOINTLY), True)
     first = steps <= most
+    ended = optimal | jnp.where(first, False, lost)
     steps = jnp.where(first & lost, most, steps)
-    go_on = jnp.where(first, steps < most + more, (steps < most + more) & (largest_y <= limit))
-    stuck = jnp.where(first, False, lost)
-    return steps, jnp.where(optimal | stuck, False, go_on), optimal
+    return steps, jnp.where(ended, False, steps < most + more), optimal
 
 
 def has_dual_steps(balls: tuple[int, ...], A: Any) -> bool:

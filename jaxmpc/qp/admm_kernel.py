@@ -2,9 +2,7 @@
 
 As a loop of XLA every step reads and writes t, l, u and b of all instances in memory, in several
 launches. Here a program takes a tile of instances through all steps: their vectors stay in
-registers, the matrices in shared memory as long as they fit, else in the cache. Products of float32
-are sums of three products of bfloat16 on tensor cores, with errors of 2⁻¹⁶: ADMM's float32 iterates
-are where Newton steps begin.
+registers, the matrices in shared memory.
 
 The rows are divided into pieces of powers of two, the sizes that Triton takes.
 """
@@ -17,14 +15,29 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.qp import triton
 from jaxmpc.qp.admm import Factor
+from jaxmpc.qp.batches import LARGE
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import FREE, Bounds
-from jaxmpc.qp.triton import LEAST, call, indices, load, on_gpu, padded_side, program, store
+from jaxmpc.qp.triton import (
+    EXACT,
+    LEAST,
+    ROUGH,
+    call,
+    has_kernels,
+    indices,
+    load,
+    padded_side,
+    program,
+    store,
+)
 
-PRODUCT: Any = jax.lax.DotAlgorithmPreset.BF16_BF16_F32_X3
-# Most rows, of which a tile of LEAST instances fits into the registers of a program.
-MOST_ROWS = 512
+# Warps of a program.
+WARPS = 4
+# Bytes of a number of the matrices, as its parts in bfloat16 (`triton.dot`), and most of all these
+# in shared memory: the largest that was tried on an H100, which has 227 KB.
+BYTES, MOST_BYTES = {ROUGH: 4, EXACT: 6}, 153_600
 
 
 def pieces(count: int) -> list[tuple[int, int]]:
@@ -37,29 +50,42 @@ def pieces(count: int) -> list[tuple[int, int]]:
     return [(0, whole // 2), (whole // 2, small)]
 
 
-def suits(factor: Factor) -> bool:
-    """Return whether the kernel takes programs of this size."""
-    return 0 < factor.A.shape[-2] <= MOST_ROWS
+def total(parts: list[tuple[int, int]]) -> int:
+    """Return the sum of the sizes of pieces."""
+    return sum(size for _, size in parts)
+
+
+def row_pieces(rows: int, balls: tuple[int, ...]) -> list[tuple[int, int]]:
+    """Return the pieces of the rows: one where there are balls, whose rows belong together."""
+    return [(0, padded_side(rows))] if balls else pieces(rows)
+
+
+def suits(factor: Factor, balls: tuple[int, ...], dtype: Any, product: Any) -> bool:
+    """Return whether there is a kernel for iterates of this type and matrices of this size."""
+    m, n = factor.A.shape[-2:]
+    if not has_kernels(m) or dtype != jnp.float32:
+        return False
+    rows, inner = total(row_pieces(m, balls)), total(pieces(n))
+    numbers = rows * (min(rows, 2 * inner) + (rows if balls else 0))
+    return numbers * BYTES[product] <= MOST_BYTES
 
 
 def iterate_batch(
     factor: Factor, alpha: Array, q: Array, bounds: Bounds, t: Array, iterations: int,
-    tile: int | None = None, warps: int = 4,
+    product: Any = EXACT,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Return `iterate` of a batch: q (B, n), t (B, m) and bounds with B in front of all leaves."""
+    """Return `iterate` of a batch: q (B, n), t (B, m) and bounds with B in front of all leaves.
+    product: how float32 is multiplied, EXACT, or ROUGH where Newton steps follow."""
     (B, m), dtype, stages = t.shape, t.dtype, len(factor.rho)
     if not iterations:
         return t, t
     balls = bounds.balls
-    columns = [(0, padded_side(m))] if balls else pieces(m)
+    columns = row_pieces(m, balls)
     inner = pieces(factor.A.shape[1])
-    total = lambda parts: sum(size for _, size in parts)
     low_rank = 2 * total(inner) < total(columns)
-    if tile is None:
-        # More instances a program where there are programs enough for all of the GPU's processors.
-        tile = 64 if total(columns) <= 64 and B >= 16_384 else LEAST
-    T = tile
-    product = None if not on_gpu() or dtype == jnp.float64 else PRODUCT
+    # More instances a program where there are programs enough for all of the GPU's processors.
+    T = 64 if total(columns) <= 64 and B >= LARGE else LEAST
+    dot = functools.partial(triton.dot, product=product)
 
     offsets = [-matmul(matmul(q, Minv), factor.A.T) for Minv in factor.Minv]
     turned = lambda M: jnp.swapaxes(M, -1, -2)
@@ -93,11 +119,6 @@ def iterate_batch(
         def vector(ref: Any, i: Array, *stage: int, other: float = 0.0) -> Array:
             at = (row[:, None], *stage, i[None, :])
             return load(ref.at[at], (row[:, None] < B) & (i[None, :] < m), other)
-
-        def dot(a: Array, b: Array) -> Array:
-            return jax.lax.dot_general(
-                a, b, (((1,), (0,)), ((), ())), precision=product, preferred_element_type=dtype
-            )
 
         def times(parts: list[Array], blocks: list[list[Array]]) -> list[Array]:
             return [
@@ -164,5 +185,5 @@ def iterate_batch(
                 store(ref.at[row[:, None], i[None, :]], v, inside)
 
     shapes = [jax.ShapeDtypeStruct((B, m), dtype)] * 2
-    run = call(kernel, shapes, warps, (-(-B // T),))
+    run = call(kernel, shapes, WARPS, (-(-B // T),))
     return tuple(run(jnp.reshape(alpha, 1).astype(dtype), factor.rho, *matrices, *vectors))

@@ -57,7 +57,7 @@ def in_blocks(
     @one.def_vmap
     def _(size: int, in_batched: Any, constants: Any, data: Any) -> Any:
         axes = jax.tree.map(lambda b: 0 if b else None, in_batched[0])
-        data = broadcast(size, in_batched[1], data)
+        data = _broadcast(size, in_batched[1], data)
         together = lambda constants, data: jax.vmap(function, in_axes=(axes, 0))(constants, data)
 
         def blocks(constants: Any, data: Any) -> Any:
@@ -93,7 +93,7 @@ def repeat_while(
     def _(size: int, in_batched: Any, constants: Any, state: Any) -> Any:
         leaves, tree = jax.tree.flatten(constants)
         batched = tuple(jax.tree.leaves(in_batched[0]))
-        state = broadcast(size, in_batched[1], state)
+        state = _broadcast(size, in_batched[1], state)
         out = _in_groups(is_open, step, tree, batched, rare)(tuple(leaves), state)
         return out, jax.tree.map(lambda _: True, out)
 
@@ -141,7 +141,7 @@ def _in_groups(
     @batch.def_vmap
     def _(size: int, in_batched: Any, leaves: tuple, state: Any) -> Any:
         outer = in_batched[0]
-        state = broadcast(size, in_batched[1], state)
+        state = _broadcast(size, in_batched[1], state)
         mixed = any(o and not b for o, b in zip(outer, batched, strict=True))
         if mixed:
             # Each outer instance has constants that its inner batch shares: copies would not fit.
@@ -185,7 +185,7 @@ def true_places(mask: Array, size: int) -> Array:
     return jnp.full(size, m, jnp.int32).at[place].set(np.arange(m, dtype=np.int32), mode="drop")
 
 
-def broadcast(size: int, batched: Any, tree: Any) -> Any:
+def _broadcast(size: int, batched: Any, tree: Any) -> Any:
     """Return the tree with `size` copies, in front, of each leaf that is not `batched`."""
     give = lambda v, b: v if b else jnp.broadcast_to(v, (size, *jnp.shape(v)))
     return jax.tree.map(give, tree, batched)

@@ -36,7 +36,7 @@ from jaxmpc.qp.precision import matmul, rounding
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import FREE, Bounds
 from jaxmpc.qp.residuals import Measured, Pair, Products, judgment, terms_of
-from jaxmpc.qp.triton import in_one_program, indices, on_gpu
+from jaxmpc.qp.triton import has_kernels, in_one_program, indices
 
 
 @jax.tree_util.register_dataclass
@@ -59,7 +59,7 @@ def judged(p: Program, w: Array, y: Array) -> tuple[Pair, Array]:
     qp, f = p.qp, p.factor
     z, y = unscaled(qp, f, w, y)
     products = Products.of(qp, z, y)
-    judge = judge_in_one_program if on_gpu() and not qp.balls and len(y) else judge_pair
+    judge = judge_in_one_program if has_kernels(len(y)) and not qp.balls else judge_pair
     judgment, gradient = judge(p.eps, qp.q, qp.bounds, z, y, products, f.E, p.bounds)
     return Pair(z, y, *judgment), matmul(gradient, f.T)
 
@@ -168,7 +168,7 @@ def by_the_dual(p: Program, y: Array, go_on: Array, most: int) -> tuple[Pair, Ar
     and corrections at most, and the last multipliers. The pair is `solved` where its residuals are
     small enough to end with it."""
     f, first, limit = p.factor, min(most, MOST_STEPS), most_multiplier(p)
-    cold, point = (DualPoint.of(f.A, p.q, p.bounds, y) for y in (jnp.zeros_like(y), y))
+    cold, point = DualPoint.cold(f.A, p.q), DualPoint.of(f.A, p.q, p.bounds, y)
     more = min(most - first, MORE_STEPS)
     point, optimal = dual_search(f.A, f.S, p.bounds, limit, cold, point, go_on, first, more)
     best, gradient = judged(p, point.w, point.y)

@@ -48,7 +48,7 @@ from jaxmpc.qp.residuals import (
     worst,
 )
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.triton import on_gpu
+from jaxmpc.qp.triton import EXACT, ROUGH
 
 T = TypeVar("T", bound=Any)
 
@@ -171,16 +171,18 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = 
         t = warm(factor, qp, bounds, warm_start)
     unrolled, refine = solver.differentiate == "unrolled", solver.newton_steps()
     rough = "float32" if refine and not unrolled else qp.q.dtype
-    dtype = rough if solver.dtype is None else jnp.dtype(solver.dtype)
+    dtype = jnp.dtype(rough if solver.dtype is None else solver.dtype)
     cast = lambda tree, dtype=dtype: jax.tree.map(
         lambda v: v.astype(dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v, tree
     )
     steps = solver.admm_steps(warm_start is not None)
-    kernel = partial(loop_kernel, steps) if on_gpu() and suits(factor) else None
-    run, arguments = (
-        partial(loop, steps),
-        cast(((factor, jnp.asarray(solver.alpha)), (q, bounds, t))),
+    # Newton steps make up for rough products.
+    product = ROUGH if refine and not unrolled else EXACT
+    kernel = (
+        partial(loop_kernel, steps, product) if suits(factor, qp.balls, dtype, product) else None
     )
+    run = partial(loop, steps)
+    arguments = cast(((factor, jnp.asarray(solver.alpha)), (q, bounds, t)))
     (w, y), (w_old, y_old) = cast(
         run(*arguments) if unrolled else in_blocks(run, *arguments, kernel=kernel), qp.q.dtype
     )
@@ -215,10 +217,12 @@ def loop(iterations: int, constants: tuple, data: tuple) -> list[tuple[Array, Ar
     return [read(factor, t, q, bounds) for t in ends]
 
 
-def loop_kernel(iterations: int, constants: tuple, data: tuple) -> list[tuple[Array, Array]]:
+def loop_kernel(
+    iterations: int, product: Any, constants: tuple, data: tuple
+) -> list[tuple[Array, Array]]:
     """`loop` of a batch, as a kernel for NVIDIA GPUs; B in front of all leaves of `data`."""
     (factor, alpha), (q, bounds, t) = constants, data
-    ends = iterate_batch(factor, alpha, q, bounds, t, iterations)
+    ends = iterate_batch(factor, alpha, q, bounds, t, iterations, product)
     return [jax.vmap(partial(read, factor))(t, q, bounds) for t in ends]
 
 

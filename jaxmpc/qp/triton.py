@@ -14,13 +14,22 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-# Least side of a matrix in Triton's products.
-LEAST = 16
+# Least side of a matrix in Triton's products, and most rows that a program's registers hold.
+LEAST, MOST = 16, 512
+# float32 products as sums of six products of bfloat16, as exact as float32's own, or of three, with
+# errors of 2⁻¹⁶.
+EXACT: Any = jax.lax.DotAlgorithmPreset.BF16_BF16_F32_X6
+ROUGH: Any = jax.lax.DotAlgorithmPreset.BF16_BF16_F32_X3
 
 
 def on_gpu() -> bool:
     """Return whether programs run by default on a GPU for which there are kernels."""
     return jax.default_backend() == "gpu" and has_triton()
+
+
+def has_kernels(rows: int) -> bool:
+    """Return whether programs run on such a GPU and kernels take so many rows."""
+    return on_gpu() and 0 < rows <= MOST
 
 
 @functools.cache
@@ -33,25 +42,21 @@ def has_triton() -> bool:
     return True
 
 
-def call(
-    kernel: Callable, shapes: Any, warps: int = 1, grid: tuple[int, ...] = (),
-    aliases: dict[int, int] | None = None,
-) -> Callable:  # fmt: skip
+def call(kernel: Callable, shapes: Any, warps: int = 1, grid: tuple[int, ...] = ()) -> Callable:
     """Return the kernel as a function of arrays, with one program for each place of the grid;
-    `vmap` puts another axis in front of it. aliases: which results begin as which arguments."""
+    `vmap` puts another axis in front of it."""
     from jax.experimental import pallas
     from jax.experimental.pallas import triton
 
     options = triton.CompilerParams(num_warps=warps, num_stages=1)
     return pallas.pallas_call(
-        kernel, out_shape=shapes, grid=grid, compiler_params=options, interpret=not on_gpu(),
-        input_output_aliases=aliases or {},
-    )  # fmt: skip
+        kernel, out_shape=shapes, grid=grid, compiler_params=options, interpret=not on_gpu()
+    )
 
 
-def padded_side(n: int, least: int = LEAST) -> int:
-    """Return the least power of two that holds n, at least `least`."""
-    return max(1 << (n - 1).bit_length(), least)
+def padded_side(n: int) -> int:
+    """Return the least power of two that holds n, at least LEAST."""
+    return max(1 << (n - 1).bit_length(), LEAST)
 
 
 def indices(count: int) -> Array:
@@ -59,11 +64,19 @@ def indices(count: int) -> Array:
     return jnp.arange(count, dtype=jnp.int32)
 
 
-def program(axis: int = 0) -> Array:
+def program() -> Array:
     """Return the place of this program in the grid."""
     from jax.experimental import pallas
 
-    return pallas.program_id(axis)
+    return pallas.program_id(0)
+
+
+def dot(a: Array, b: Array, product: Any) -> Array:
+    """Return the product of two matrices; product: EXACT or ROUGH, for float32 on tensor cores."""
+    precision = product if on_gpu() and a.dtype == jnp.float32 else None
+    return jax.lax.dot_general(
+        a, b, (((1,), (0,)), ((), ())), precision=precision, preferred_element_type=a.dtype
+    )
 
 
 def load(place: Any, mask: Any, other: Any = 0.0) -> Array:

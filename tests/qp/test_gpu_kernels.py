@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +11,11 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.bench.families import joint
-from jaxmpc.qp import active_set, admm_kernel, dual_kernel, refine, solve, triton
+from jaxmpc.qp import active_set, dual_kernel, refine, solve, triton
 from jaxmpc.qp.active_set import DualPoint, DualSearch, dual_search, most_rows
 from jaxmpc.qp.admm import ADMM, factor, iterate, scaled, splittings
 from jaxmpc.qp.admm_kernel import iterate_batch, pieces
+from jaxmpc.qp.admm_kernel import suits as suits_kernel
 
 STEPS = 12
 
@@ -137,7 +139,7 @@ def test_plans_by_kernels_are_those_without(soft, x64, monkeypatch):
     plans = lambda solver: jax.jit(jax.vmap(jm.Controller(mpc, solver).plan))(states)
     wanted = plans(jm.ADMM())
     for module in (active_set, refine):
-        monkeypatch.setattr(module, "on_gpu", lambda: True)
+        monkeypatch.setattr(module, "has_kernels", lambda rows: rows > 0)
     found = plans(SOLVER)
     np.testing.assert_array_equal(found.status, wanted.status)
     solved = np.asarray(wanted.status) == jm.Status.SOLVED
@@ -152,8 +154,7 @@ def test_kernels_can_be_lowered_for_a_gpu(x64, monkeypatch):
     mesh_module = pytest.importorskip("jax._src.mesh")
     if not hasattr(mesh_module, "AbstractDevice"):
         pytest.skip("this JAX lowers kernels on machines with a GPU alone")
-    for module in (active_set, refine, solve, triton, admm_kernel):
-        monkeypatch.setattr(module, "on_gpu", lambda: True)
+    monkeypatch.setattr(triton, "on_gpu", lambda: True)
     device = mesh_module.AbstractDevice("NVIDIA H100 80GB HBM3", 132, "gpu")
     axes = dict(axis_types=(jax.sharding.AxisType.Auto,), abstract_device=device)
     plan = jax.jit(jax.vmap(jm.Controller(joint(), SOLVER).plan))
@@ -176,3 +177,16 @@ def test_without_triton_there_are_no_kernels(monkeypatch):
         assert not triton.on_gpu()
     finally:
         triton.has_triton.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("n", "m", "taken"),
+    [(20, 60, True), (156, 156, True), (40, 200, True), (140, 420, False), (20, 600, False)],
+)
+def test_matrices_beyond_shared_memory_are_left_to_xla(n, m, taken, monkeypatch):
+    """As are iterates in float64, and rows that no program's registers hold."""
+    monkeypatch.setattr(triton, "on_gpu", lambda: True)
+    made = SimpleNamespace(A=np.zeros((m, n)))
+    suits = lambda dtype, product: suits_kernel(made, (), np.dtype(dtype), product)
+    assert suits("float32", triton.ROUGH) == taken == suits("float32", triton.EXACT)
+    assert not suits("float64", triton.EXACT)
