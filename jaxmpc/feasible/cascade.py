@@ -28,9 +28,9 @@ from jaxmpc.feasible.candidates import (
     compiled_check,
     compiled_newton,
 )
-from jaxmpc.feasible.cones import compiled_cones, cones_for
+from jaxmpc.feasible.cones import compiled_labels, compiled_plans, cones_for
 from jaxmpc.feasible.constraint_rows import ConstraintRows, weighted
-from jaxmpc.feasible.labels import Labels
+from jaxmpc.feasible.labels import Labels, OnDemand
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.row_programs import RowPrograms
 from jaxmpc.qp.precision import matmul
@@ -137,43 +137,57 @@ def label_parts(
         with jax.enable_x64(True):
             cones = jax.device_put(cones, placement(devices))
 
-    def started(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[Verdict, Any]]:
+    def started(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
         """Return a part, which of it is usable, and the first stage, which the device still works
-        on, with its last w where that is ADMM."""
+        on: labels from cones, or verdicts and the last w from ADMM."""
         x = padded(points, whole)
         ok = np.all(np.isfinite(x), axis=1)
         x = np.where(ok[:, None], x, 0.0)
         if cones is not None:
-            return x, ok, (_run(compiled_cones(devices), exact, cones, x), None)
+            return x, ok, _run(compiled_labels(devices), cones, x)
         return x, ok, _run(short, exact, quick, x, alpha)
+
+    def planned(x: np.ndarray) -> Verdict:
+        """Return the verdicts of the cones on points, with their proofs."""
+        with jax.enable_x64(True):
+            return _run(compiled_plans(devices), exact, cones, x)
 
     def by_newton(
         x: np.ndarray, ok: np.ndarray, found: tuple[Verdict, Any], back: np.ndarray | None
     ) -> Labels:
         """Return the labels after Newton from the w of an ADMM stage, if it left a point open."""
         verdict, w = found
-        labels = Labels.proved(verdict, ok)
+        labels = Labels.proved(verdict.label, lambda: verdict, ok)
         if np.any((labels.label == 0) & ok):
             w = w if back is None else matmul(w.astype(np.float64), jnp.asarray(back.T))
-            labels = Labels.proved(_run(newton, exact, rows, x, ok, verdict, w), ok)
+            after = _run(newton, exact, rows, x, ok, verdict, w)
+            labels = Labels.proved(after.label, lambda: after, ok)
         return labels
 
-    def finished(x: np.ndarray, ok: np.ndarray, found: tuple[Verdict, Any]) -> Labels:
-        """Return the labels of a part, by all stages."""
+    def by_admm(
+        stage: Compiled, basis: Any, relaxation: Any, to_rows: np.ndarray | None
+    ) -> Callable[[np.ndarray], Labels]:
+        """Return the stage of ADMM and Newton, a function of points."""
         all_ = np.ones(batch, bool)
+        return lambda x: by_newton(x, all_, _run(stage, exact, basis, x, relaxation), to_rows)
+
+    def everywhere(verdict: Verdict) -> Labels:
+        """Return the labels of a verdict on points that are all finite."""
+        return Labels.proved(verdict.label, lambda: verdict, np.ones(batch, bool))
+
+    def finished(x: np.ndarray, ok: np.ndarray, found: Any) -> Labels:
+        """Return the labels of a part, by all stages."""
         if cones is None:
             labels, again = by_newton(x, ok, found, back), []
         else:
-            labels, again = Labels.proved(found[0], ok), [(short, quick, alpha, back)]
+            labels = Labels.proved(found, OnDemand(lambda: planned(x)).get, ok)
+            again = [lambda x: everywhere(planned(x)), by_admm(short, quick, alpha, back)]
         # Points still undecided get a longer ADMM run without weights, and Newton once more.
-        again = [*again, (long, rows, np.float64(ALPHA), None)]
-        for admm, basis, relaxation, to_rows in again:
+        for stage in (*again, by_admm(long, rows, np.float64(ALPHA), None)):
             left = np.flatnonzero((labels.label == 0) & ok)
             for i in range(0, len(left), batch):
                 where = left[i : i + batch]
-                here = padded(x[where], batch)
-                steps = _run(admm, exact, basis, here, relaxation)
-                more = by_newton(here, all_, steps, to_rows).first(len(where))
+                more = stage(padded(x[where], batch)).first(len(where))
                 labels = labels.changed(where, more.label, more.status, more.proofs)
         last = np.flatnonzero((labels.label == 0) & ok)[:share]
         for some_rows, program in last_programs(problem, margins) if len(last) else ():
@@ -183,7 +197,7 @@ def label_parts(
                 solved = [program(theta) for theta in x[where]]
                 candidates = [padded(np.array(v), batch) for v in zip(*solved, strict=True)]
                 verdict = _run(check, exact, some_rows, padded(x[where], batch), *candidates)
-                more = Labels.proved(verdict, np.ones(batch, bool)).first(len(where))
+                more = everywhere(verdict).first(len(where))
                 labels = labels.changed(where, more.label, more.status, more.proofs)
         return labels
 

@@ -4,9 +4,20 @@ The hull of proved points v is divided into cones from the centre c of the rays,
 facets. In a cone a point θ and its inputs are the same combination of the centre's and of those of
 the facet's vertices: with λ = M (θ − c), M = [v_1 − c, …, v_d − c]⁻¹, the inputs are
 u_c + Σ λ_i (u_i − u_c), affine in θ. The gauge Σ λ_i tells the cone of a point, in which it is
-largest, and whether the point lies in the hull, where it is at most 1. These inputs are rolled out,
-and half-spaces are compared, like all candidates (`proofs.py`): what is not proved so, within
-rounding of the boundary or between the polytopes, is left to the other stages.
+largest, and whether the point lies in the hull, where it is at most 1.
+
+*Labels.* A point of the hull is feasible, for the plans of the vertices keep all limits and so does
+their combination: λ ≥ 0 and Σ λ_i ≤ 1 prove it, each by more than the rounding of λ. A point that a
+half-space excludes is infeasible (`proofs.excludes`). Nothing is rolled out (`label`).
+
+*Plans* are made when they are asked for (`verdict`). They are these inputs in floats, rolled out
+like all candidates. That roll-out succeeds where a point has been labelled so: rows are linear and
+the bounds of their rounding are sublinear, so the slack of a row net of rounding, s, is concave in
+θ, at least (1 − Σ λ_i) s_c + Σ λ_i s_i. Where the vertices' own s_i, evaluated for inputs that may
+be off by the rounding of this combination, are not below −δ s_c, Σ λ_i ≤ 1 − δ suffices.
+
+What is not labelled so, within rounding of the boundary or between the polytopes, gets its plan
+rolled out at once, and is else left to the other stages.
 """
 
 import functools
@@ -29,7 +40,6 @@ from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays
 from jaxmpc.feasible.refinement import refined
-from jaxmpc.qp.precision import matmul
 
 # Coordinates up to which the polytopes have few facets.
 MOST_COORDINATES = 4
@@ -44,12 +54,16 @@ MANY = 2**18
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Cones:
-    """Cones about center (d,): gauge (F, d) of each; inputs and, in a projection, free states
-    value + slope_i (θ − center), value (v,), slope (F, v, d). Half-spaces normals (K, d) θ ≤
-    offsets (K,) that hold on the whole feasible set, and the cuts that they follow from."""
+    """Cones about center (d,): M (F, d, d) and gauge (F, d) of each, the least λ_i and the largest
+    gauge (F,) of points that are labelled; inputs and, in a projection, free states value + slope_i
+    (θ − center), value (v,), slope (F, v, d). Half-spaces normals (K, d) θ ≤ offsets (K,) that hold
+    on the whole feasible set, and the cuts that they follow from."""
 
     center: Any
+    M: Any
     gauge: Any
+    least: Any
+    most: Any
     value: Any
     slope: Any
     normals: Any
@@ -82,8 +96,64 @@ class Cones:
         free = len(problem.view.others) if problem.view.projects else 0
         value = values(rows, center, found.rays.w, free)
         each = np.array([values(rows, *pair, free) for pair in zip(points, found.w, strict=True)])
-        slope = (each - value)[facets].transpose(0, 2, 1) @ M
-        return cls(center, M.sum(axis=1), value, slope, found.normals, found.offsets, found.cuts)
+        moves = (each - value)[facets].transpose(0, 2, 1)  # (F, v, d)
+        ends = labelled(found.rays, points, np.vstack([each, value]), facets, edges, M, moves)
+        return cls(
+            center, M, M.sum(axis=1), *ends, value, moves @ M, found.normals, found.offsets,
+            found.cuts,
+        )  # fmt: skip
+
+
+def labelled(
+    rays: Rays, points: np.ndarray, values: np.ndarray, facets: np.ndarray, edges: np.ndarray,
+    M: np.ndarray, moves: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the least λ_i and the largest gauge (F,) with which points of each cone are labelled
+    (top of this file); a gauge of −∞ for none: with free states, equalities or a terminal
+    ellipsoid, whose plans are rolled out.
+
+    values (K + 1, v): inputs at the points, and at the centre. With E the edges and γ of
+    `proofs.gamma`, λ is off by no more than ‖I − M E‖ + O(γ) ‖|M||E|‖ in the hull, four times which
+    is allowed for; and inputs by d max|u_i − u_c| times that, in `roll_out` as `moved`.
+    """
+    p, d = rays.exact, points.shape[1]
+    N, (_, m) = p.horizon, p.B.shape
+    norm = lambda v: np.abs(v).sum(axis=2).max(axis=1)
+    few = proofs.gamma(d + 3)
+    off = 4 * (norm(np.eye(d) - M @ edges) + 4 * few * norm(np.abs(M) @ np.abs(edges)))
+    none = np.full(len(off), -np.inf)
+    if values.shape[1] != N * m or p.equalities is not None or p.P is not None:
+        return off, none
+    rounding = 4 * proofs.UNIT_ROUNDOFF * np.abs(values).max()
+    moved = 2 * d * np.abs(moves).max(axis=(1, 2)) * off + rounding
+    # One bound for all cones but those so thin that it would be the others' loss.
+    usable = (off < 1e-3) & (moved <= 1e4 * (np.median(moved) + rounding))
+    most = np.max(moved, where=usable, initial=0.0)
+
+    with jax.enable_x64(True):
+        slack = np.asarray(_slack(p, np.vstack([points, rays.center]), values, most))
+    unmoved, slack = slack
+    at_center = slack[-1]
+    proved = usable & np.all(unmoved[facets] >= 0, axis=1) & (at_center > 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        lost = np.max(np.maximum(-slack[facets], 0.0), axis=1) / at_center
+    return off, np.where(proved, 1 - 2 * lost - d * off, none)
+
+
+@jax.jit
+def _slack(p: ExactData, points: Any, values: Any, moved: Any) -> Array:
+    """Return the slack of `roll_out` (2, K) from the points with these inputs: as they are, and
+    where each may be off by `moved`."""
+    N, (_, m) = p.horizon, p.B.shape
+    none = jnp.zeros(0)
+
+    def one(theta: Array, inputs: Array, moved: Any) -> Array:
+        inputs = proofs.within_limits(p, inputs.reshape(N, m))
+        x = p.view.initial_state(theta, none)
+        return proofs.roll_out(p, x, inputs, jnp.broadcast_to(moved, inputs.shape))[0]
+
+    each = jax.vmap(one, in_axes=(0, 0, None))
+    return jnp.stack([each(points, values, 0.0), each(points, values, moved)])
 
 
 def hull_facets(points: np.ndarray) -> np.ndarray:
@@ -115,30 +185,66 @@ def cones_for(problem: FeasibilityProblem, points: int) -> Cones | None:
 
 
 @functools.cache
-def compiled_cones(devices: Devices) -> Compiled:
-    """Return the compiled stage: (p, cones, points (B, d)) → verdicts."""
-    return over_devices(cone_stage, devices, (False, False, True))
+def compiled_labels(devices: Devices) -> Compiled:
+    """Return the compiled labels: (cones, points (B, d)) → labels (B,)."""
+    each = lambda cones, points: jax.vmap(lambda theta: label(cones, theta))(points)
+    return over_devices(each, devices, (False, True))
 
 
-def cone_stage(p: ExactData, cones: Cones, points: Array) -> Verdict:
-    """Return verdicts on points (B, d)."""
+@functools.cache
+def compiled_plans(devices: Devices) -> Compiled:
+    """Return the compiled plans: (p, cones, points (B, d)) → verdicts."""
+    each = lambda p, cones, points: jax.vmap(lambda theta: verdict(p, cones, theta))(points)
+    return over_devices(each, devices, (False, False, True))
+
+
+def label(cones: Cones, theta: Array) -> Array:
+    """Return the label of θ (d,), 0 where it is left to others: nothing is rolled out."""
+    cone, facet = nearest(cones, theta)
+    share = jnp.sum(cones.M[cone] * (theta - cones.center), axis=1)
+    inside = jnp.all(share >= cones.least[cone]) & (jnp.sum(share) <= cones.most[cone])
+    a, b, w = (v[facet] for v in cones.cuts)
+    outside = proofs.excludes(a, b, w, theta)
+    return jnp.where(inside, 1, jnp.where(outside, -1, 0)).astype(jnp.int8)
+
+
+def verdict(p: ExactData, cones: Cones, theta: Array) -> Verdict:
+    """Return the verdict on θ (d,), with its proof."""
     N, (_, m) = p.horizon, p.B.shape
+    cone, facet = nearest(cones, theta)
+    value = cones.value + jnp.sum(cones.slope[cone] * (theta - cones.center), axis=1)
+    inputs, free = value[: N * m].reshape(N, m), value[N * m :]
+    feasible, inputs = proofs.prove_feasible(p, theta, free, inputs)
+    # The cut at the point rests on no linear program; a half-space may (`proofs.everywhere`).
+    a, b, w = (v[facet] for v in cones.cuts)
+    infeasible = proofs.excludes(a, b, w, theta)
+    normal, offset = cones.normals[facet], cones.offsets[facet]
+    everywhere = proofs.excludes(normal, offset, jnp.zeros_like(normal), theta)
+    offset = jnp.where(everywhere, offset, jnp.inf)
+    label = jnp.where(feasible, 1, jnp.where(infeasible, -1, 0)).astype(jnp.int8)
+    return Verdict(label, p.view.initial_state(theta, free), inputs, normal, offset)
+
+
+def nearest(cones: Cones, theta: Array) -> tuple[Array, Array]:
+    """Return the indices of the cone of θ (d,), and of the half-space that it exceeds most."""
     length = jnp.linalg.norm(cones.normals, axis=1)
+    cone = largest(cones.gauge, jnp.zeros(len(cones.gauge)), theta - cones.center)
+    return cone, largest(cones.normals / length[:, None], cones.offsets / length, theta)
 
-    def one(theta: Array) -> Verdict:
-        r = theta - cones.center
-        cone = jnp.argmax(matmul(r, cones.gauge.T))
-        value = cones.value + jnp.sum(cones.slope[cone] * r, axis=1)
-        inputs, free = value[: N * m].reshape(N, m), value[N * m :]
-        feasible, inputs = proofs.prove_feasible(p, theta, free, inputs)
-        facet = jnp.argmax((matmul(theta, cones.normals.T) - cones.offsets) / length)
-        # The cut at the point rests on no linear program; a half-space may (`proofs.everywhere`).
-        a, b, w = (v[facet] for v in cones.cuts)
-        infeasible = proofs.excludes(a, b, w, theta)
-        normal, offset = cones.normals[facet], cones.offsets[facet]
-        everywhere = proofs.excludes(normal, offset, jnp.zeros_like(normal), theta)
-        offset = jnp.where(everywhere, offset, jnp.inf)
-        label = jnp.where(feasible, 1, jnp.where(infeasible, -1, 0)).astype(jnp.int8)
-        return Verdict(label, p.view.initial_state(theta, free), inputs, normal, offset)
 
-    return jax.vmap(one)(points)
+def largest(rows: Array, offsets: Array, x: Array) -> Array:
+    """Return the index of the largest rows·x − offsets, rows (K, d), x (d,).
+
+    Row by row: so a batch is one loop over its points in each, which CPUs take in vectors. (A
+    product and an argmax take twice as long.)
+    """
+
+    def better(best: tuple[Array, Array], row: tuple) -> tuple[Any, None]:
+        value, index = best
+        normal, offset, i = row
+        here = sum(normal[j] * x[j] for j in range(x.shape[0])) - offset
+        return (jnp.maximum(value, here), jnp.where(here > value, i, index)), None
+
+    count = jnp.arange(len(rows), dtype=jnp.int32)
+    begin = jnp.asarray(-jnp.inf, x.dtype), jnp.int32(0)
+    return jax.lax.scan(better, begin, (rows, offsets, count))[0][1]

@@ -18,14 +18,14 @@ STATUS = np.array([Status.PRIMAL_INFEASIBLE, Status.ITERATION_LIMIT, Status.SOLV
 
 
 class OnDemand:
-    """An array that is fetched once, when it is first used."""
+    """Something, mostly an array, that is fetched once, when it is first used."""
 
-    def __init__(self, fetch: Callable[[], np.ndarray]) -> None:
-        self._fetch: Callable[[], np.ndarray] | None = fetch
-        self._value: np.ndarray | None = None
+    def __init__(self, fetch: Callable[[], Any]) -> None:
+        self._fetch: Callable[[], Any] | None = fetch
+        self._value: Any = None
 
-    def get(self) -> np.ndarray:
-        """Return the array, and fetch it the first time."""
+    def get(self) -> Any:
+        """Return it, and fetch it the first time."""
         if self._value is None:
             assert self._fetch is not None
             self._value, self._fetch = self._fetch(), None
@@ -46,7 +46,8 @@ class Labels:
     the rounding of its normal outweighs the distance of the point. compile_seconds, run_seconds:
     time spent compiling and running.
 
-    The proofs may still be on the device: each of the four arrays is copied when first used.
+    The proofs may still be on the device, or not be made yet: each of the four arrays is fetched
+    when first used.
     """
 
     label: np.ndarray
@@ -88,20 +89,20 @@ class Labels:
         return cls(np.asarray(label), np.asarray(status), proofs, **seconds)
 
     @classmethod
-    def proved(cls, verdict: Verdict, usable: np.ndarray) -> "Labels":
-        """Return labels from the verdicts on a batch (B,); waits for the device. usable (B,): which
-        points are finite."""
-        label = np.where(usable, np.asarray(verdict.label), np.int8(0))
+    def proved(cls, label: Any, verdict: Callable[[], Verdict], usable: np.ndarray) -> "Labels":
+        """Return labels (B,) of a batch, on the device, with the proofs in its verdict, which is
+        asked for when one is used; waits for the device. usable (B,): which points are finite."""
+        label = np.where(usable, np.asarray(label), np.int8(0))
         status = np.where(usable, STATUS[label + 1], np.int8(Status.NON_FINITE))
 
-        def proof(rows: Any, of: int) -> OnDemand:  # NaN where it proves nothing
-            return OnDemand(lambda: _put(np.asarray(rows), label != of, np.nan))
+        def proof(name: str, of: int) -> OnDemand:  # NaN where it proves nothing
+            return OnDemand(lambda: _put(np.asarray(getattr(verdict(), name)), label != of, np.nan))
 
         proofs = {
-            "starts": proof(verdict.start, 1),
-            "plans": proof(verdict.inputs, 1),
-            "cut_normals": proof(verdict.normal, -1),
-            "cut_offsets": proof(verdict.offset, -1),
+            "starts": proof("start", 1),
+            "plans": proof("inputs", 1),
+            "cut_normals": proof("normal", -1),
+            "cut_offsets": proof("offset", -1),
         }
         return cls(label, status, proofs)
 

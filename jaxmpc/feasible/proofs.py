@@ -76,27 +76,32 @@ def prove_feasible(p: ExactData, theta: Array, free: Array, inputs: Array) -> tu
     All arithmetic in float64. Not proved means only that this input sequence is no proof. Where
     equalities tie the inputs to the states, inputs within rounding of these are proved to exist.
     """
-    limit = lambda u: jnp.clip(u, p.u_lower, p.u_upper)[first_of_block(p.moves)]
-    inputs = limit(inputs)
+    inputs = within_limits(p, inputs)
     x = p.view.initial_state(theta, free)
     if p.equalities is None:
-        proved, _, _ = roll_out(p, x, inputs, jnp.zeros_like(inputs))
-        return proved, inputs
+        slack, _, _ = roll_out(p, x, inputs, jnp.zeros_like(inputs))
+        return slack >= 0, inputs
     e = p.equalities
     _, residual, _ = roll_out(p, x, inputs, jnp.zeros_like(inputs))
-    inputs = limit(inputs - jnp.asarray(e.inverse) @ residual)
+    inputs = within_limits(p, inputs - jnp.asarray(e.inverse) @ residual)
     _, _, off = roll_out(p, x, inputs, jnp.zeros_like(inputs))
     moved = jnp.asarray(e.most) * jnp.max(off / e.rows)
     within = (p.u_upper - inputs >= moved) & (inputs - p.u_lower >= moved)
-    proved, _, _ = roll_out(p, x, inputs, moved)
-    return proved & jnp.all(within), inputs
+    slack, _, _ = roll_out(p, x, inputs, moved)
+    return (slack >= 0) & jnp.all(within), inputs
+
+
+def within_limits(p: ExactData, inputs: Array) -> Array:
+    """Return inputs (N, m) clipped into their limits, those of one move equal to its first."""
+    return jnp.clip(inputs, p.u_lower, p.u_upper)[first_of_block(p.moves)]
 
 
 def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array, Array, Array]:
     """Roll out inputs (N, m) from x (n,), each of which may be off by moved (N, m).
 
-    Returns whether all rows hold but for the q of `Equalities`; how far those are off, and a bound
-    of that.
+    Returns the least slack of all rows but the q of `Equalities`, less what rounding and `moved`
+    may do to it: all hold where it is ≥ 0, and it is −∞ or NaN where the numbers overflow. Then how
+    far the q are off, and a bound of that.
     """
     n, m = p.B.shape
     A, B, c = jnp.asarray(p.A), jnp.asarray(p.B), jnp.asarray(p.c)
@@ -110,8 +115,8 @@ def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array
     def holds(H, lower, upper, solved, x, error):
         value = H @ x
         size = jnp.abs(H) @ error * (1 + 1e-9) + 2 * row_gamma(H) * (jnp.abs(H) @ jnp.abs(x))
-        inside = jnp.all(((value + size <= upper) & (value - size >= lower)) | solved)
-        return inside, value - upper, size
+        slack = jnp.minimum(upper - (value + size), (value - size) - lower)
+        return jnp.min(jnp.where(solved, jnp.inf, slack), initial=jnp.inf), value - upper, size
 
     def advance(carry, step):
         (x, error), (u, u_error, lower, upper, solved) = carry, step
@@ -125,21 +130,22 @@ def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array
     steps = (inputs, moved, *map(jnp.asarray, (p.lower, p.upper, solved)))
     (x, error), found = jax.lax.scan(advance, (x, jnp.zeros_like(x)), steps)
     last, off_N, size_N = holds(rows_N, p.lower_N, p.upper_N, solved_N, x, error)
-    proved = jnp.all(found if e is None else found[0]) & last
+    slack = jnp.minimum(jnp.min(found if e is None else found[0]), last)
     if p.P is not None:
         # (x + e)'P(x + e) ≤ x'Px + 2|x|'|P|ε + ε'|P|ε for |e| ≤ ε.
         scale = jnp.abs(p.P)
         rounding = (2 * jnp.abs(x) + error) @ (scale @ error) * (1 + 1e-9)
         rounding = rounding + 2 * gamma(2 * n + 2) * (jnp.abs(x) @ (scale @ jnp.abs(x)))
-        proved = proved & (x @ (p.P @ x) + rounding <= p.level)
-    proved = proved & jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(inputs))
+        slack = jnp.minimum(slack, p.level - (x @ (p.P @ x) + rounding))
+    finite = jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(inputs))
+    slack = jnp.where(finite, slack, -jnp.inf)
     if e is None:
-        return proved, jnp.zeros(0), jnp.zeros(0)
+        return slack, jnp.zeros(0), jnp.zeros(0)
     _, off, size = found
     count = np.shape(e.rows)[0]
     where = jnp.flatnonzero(jnp.append(jnp.ravel(solved), solved_N), size=count)
     off, size = (jnp.append(jnp.ravel(v), v_N)[where] for v, v_N in ((off, off_N), (size, size_N)))
-    return proved, off, jnp.abs(off) * (1 + 1e-9) + size
+    return slack, off, jnp.abs(off) * (1 + 1e-9) + size
 
 
 def cut(p: ExactData, y_states: Array, y_N: Array, y_ball: Array) -> tuple[Array, Array, Array]:

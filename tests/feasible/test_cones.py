@@ -1,5 +1,6 @@
 """Labels by the polytopes of rays: those of the other stages, with proofs of their own."""
 
+import jax
 import numpy as np
 import problems
 import pytest
@@ -66,7 +67,37 @@ def test_they_decide_nearly_all(always, monkeypatch):
     monkeypatch.setattr(cascade, "_run", lambda *a: programs.append(a[0]) or run(*a))
     label = jm.map_feasible_set(mpc, points[np.abs(distance) > 1e-6], chunk=1000).label
     np.testing.assert_array_equal(label, np.where(distance < 0, 1, -1)[np.abs(distance) > 1e-6])
-    assert set(programs) == {cones.compiled_cones(None)}
+    assert set(programs) <= {cones.compiled_labels(None), cones.compiled_plans(None)}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_points_labelled_without_a_roll_out_have_plans(name):
+    """At all distances from the boundary, on both sides, and beside the planes between cones:
+    whatever is said to be feasible has a plan that keeps all limits, in exact arithmetic."""
+    mpc, _, view = CASES[name]
+    problem = FeasibilityProblem.of(mpc, **view)
+    made = Cones.of(problem)
+    random, d = np.random.default_rng(1), problem.dimension
+    share = random.dirichlet(np.ones(d), (len(made.M), 40))
+    share[:, :10] *= random.choice([0.0, 1e-16, 1e-12, 1.0], (len(made.M), 10, d))
+    side = random.choice([-1, -1, 1], (len(made.M), 40, 1))
+    share *= 1 + side * 10.0 ** random.uniform(-16, 0, (len(made.M), 40, 1))
+    edges = np.linalg.inv(made.M)
+    points = (made.center + np.einsum("fij,fkj->fki", edges, share)).reshape(-1, d)
+    with jax.enable_x64(True):
+        label = np.asarray(cones.compiled_labels(None).run(made, points))
+        exact = problem.exact(np.abs(points).max(axis=0))
+        found = jax.device_get(cones.compiled_plans(None).run(exact, made, points))
+    assert set(label) <= {-1, 0, 1} and np.all((found.label == label)[label != 0])
+    inside = found.label == 1
+    assert np.all(
+        roll_out_exactly(Constraints(problem.plain()), found.start[inside], found.inputs[inside])
+        >= 0
+    )
+    if problem.view.projects:
+        assert not np.any(label == 1)  # with free states plans are rolled out
+    else:
+        assert np.mean(label == 1) > 0.25
 
 
 @pytest.mark.parametrize("gap", [1e-9, -1e-9])
