@@ -13,7 +13,7 @@ state of each cell is solved, and each state follows the nearest of its own cell
 it. That needs few coordinates.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -22,12 +22,11 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.compiled import padded
-from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Multipliers, Plan, answer, flat_multipliers
 from jaxmpc.qp.active_set import RIDGE, has_dual_steps, most_rows
-from jaxmpc.qp.admm import Factor, scaled, scaled_multipliers
-from jaxmpc.qp.batches import repeat_while, true_places
+from jaxmpc.qp.admm import scaled_multipliers
+from jaxmpc.qp.batches import true_places
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.solve import solve_from
@@ -39,8 +38,6 @@ MOST_COORDINATES = 4
 STATES_A_CELL = 128
 # States among which those are chosen, for each of them, and states that the quantiles are of.
 CHOICE, SAMPLE = 4, 4096
-# Laws that a state tries.
-TRIES = 3
 # Multipliers relative to the largest that count as zero.
 INACTIVE = 1e-9
 
@@ -55,14 +52,11 @@ class Laws:
     sign: Array
     slope: Array
 
-    def evaluate(self, i: Array, theta: Array, count: int) -> tuple[Array, Array]:
-        """Return the multipliers (count,) that law i gives θ (p,), those of the wrong sign as 0,
-        and whether there are none of these but for rounding."""
+    def evaluate(self, i: Array, theta: Array, count: int) -> Array:
+        """Return the multipliers (count,) that law i gives θ (p,), those of the wrong sign as 0."""
         y = jnp.sum(self.slope[i] * jnp.append(theta, 1.0), axis=1)
-        wrong = self.sign[i] * y < 0
-        right = jnp.all(~wrong | (jnp.abs(y) <= INACTIVE * jnp.max(jnp.abs(y), initial=0.0)))
-        y = jnp.where(wrong, 0.0, y)
-        return jnp.zeros(count, y.dtype).at[self.rows[i]].add(y, mode="drop"), right
+        y = jnp.where(self.sign[i] * y < 0, 0.0, y)
+        return jnp.zeros(count, y.dtype).at[self.rows[i]].add(y, mode="drop")
 
 
 @jax.tree_util.register_dataclass
@@ -79,8 +73,8 @@ class Cells:
     states: Array
 
     def nearest(self, x: Array) -> Array:
-        """Return the indices (TRIES,) of the solved states nearest to x (p,), of those in its cell
-        and the cells beside it; −1 where there is none."""
+        """Return the index of the solved state nearest to x (p,), of those in its cell and the
+        cells beside it; −1 where there is none."""
         g, p = self.lower.shape
         axis = np.arange(p)
         k = jnp.sum(x > self.edges, axis=0)
@@ -90,7 +84,7 @@ class Cells:
         beside = jnp.clip(k + moves * side, 0, g - 1)
         law = self.law[jnp.sum(beside * g ** axis[::-1], axis=1)]
         distance = jnp.sum(((self.states[law] - x) / width) ** 2, axis=1)
-        return law[jnp.argsort(jnp.where(law < 0, jnp.inf, distance))[:TRIES]]
+        return law[jnp.argmin(jnp.where(law < 0, jnp.inf, distance))]
 
 
 def transferable(controller: Controller) -> bool:
@@ -169,38 +163,9 @@ def follow(controller: Controller, laws: Laws, cells: Cells, steps: int, theta: 
     dual: SOLVED, or ITERATION_LIMIT where that leads to none."""
     c, f = controller.condensed, controller.factor
     assert c is not None and f is not None
-    near = cells.nearest(theta)
-    start = Trial(theta, near, jnp.int32(0), near[0], near[0] >= 0)
-    i = repeat_while(lambda t: t.open, try_law, (c, f, laws), start).law
-    y = jnp.where(i < 0, jnp.nan, laws.evaluate(i, theta, len(f.E))[0])
+    i = cells.nearest(theta)
+    y = jnp.where(i < 0, jnp.nan, laws.evaluate(i, theta, len(f.E)))
     found, fault = solve_from(c.qp(theta), f, controller.solver, y, steps)
     states, inputs = c.trajectory(theta, found.z)
     previous = theta[controller.mpc.system.n :] if controller.mpc.input_in_state else None
     return answer(controller.mpc, c.layout, found, fault, states, inputs, None, None, previous)
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Trial:
-    """Loop state of one θ: the laws to try, how many have been, the law that holds at θ or else the
-    first, and whether to go on."""
-
-    theta: Array
-    near: Array
-    tried: Array
-    law: Array
-    open: Array
-
-
-def try_law(constants: tuple[Condensed, Factor, Laws], t: Trial) -> Trial:
-    """Try the next law: it holds where its multipliers have their signs and its plan keeps all
-    rows."""
-    (c, f, laws), i = constants, t.near[t.tried]
-    y, right = laws.evaluate(i, t.theta, len(f.E))
-    q, bounds = scaled(f, c.qp(t.theta))
-    v = matmul(-q - matmul(y, f.A), f.A.T)
-    outside = jnp.max(jnp.maximum(v - bounds.u, bounds.l - v), initial=-jnp.inf)
-    holds = right & (outside <= INACTIVE * (1 + jnp.max(jnp.abs(v), initial=0.0)))
-    tried = t.tried + 1
-    more = ~holds & (tried < len(t.near)) & (t.near[jnp.minimum(tried, len(t.near) - 1)] >= 0)
-    return replace(t, tried=tried, law=jnp.where(holds, i, t.law), open=more)
