@@ -45,12 +45,14 @@ def group_sizes(batch: int, rare: bool = False) -> list[int]:
 
 
 def in_blocks(
-    function: Callable, constants: Any, data: Any, *, kernel: Callable | None = None
-) -> Any:
+    function: Callable, constants: Any, data: Any, *, kernel: Callable | None = None,
+    large: int | None = None,
+) -> Any:  # fmt: skip
     """Return function(constants, data), for a batch on a CPU in blocks, one after the other.
 
     kernel: the same of a batch, (constants, data with the batch in front), as a kernel for NVIDIA
-    GPUs. `function` must close over no arrays. A batch of constants makes no blocks.
+    GPUs. large: size of blocks elsewhere than on a CPU, None for no blocks. `function` must close
+    over no arrays. A batch of constants makes no blocks.
     """
     one = custom_vmap(lambda constants, data: function(constants, data))
 
@@ -60,10 +62,12 @@ def in_blocks(
         data = _broadcast(size, in_batched[1], data)
         together = lambda constants, data: jax.vmap(function, in_axes=(axes, 0))(constants, data)
 
-        def blocks(constants: Any, data: Any) -> Any:
-            missing = -size % BLOCK
+        def blocks(block: int, constants: Any, data: Any) -> Any:
+            if size <= block:
+                return together(constants, data)
+            missing = -size % block
             padded = lambda v: jnp.pad(v, ((0, missing), *[(0, 0)] * (v.ndim - 1)), mode="edge")
-            grouped = jax.tree.map(lambda v: padded(v).reshape(-1, BLOCK, *v.shape[1:]), data)
+            grouped = jax.tree.map(lambda v: padded(v).reshape(-1, block, *v.shape[1:]), data)
             out = lax.map(lambda block: together(constants, block), grouped)
             return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:])[:size], out)
 
@@ -71,7 +75,8 @@ def in_blocks(
             out = together(constants, data)
         else:
             others = {} if kernel is None else {"cuda": kernel}
-            out = lax.platform_dependent(constants, data, cpu=blocks, default=together, **others)
+            cpu, default = partial(blocks, BLOCK), partial(blocks, large or size)
+            out = lax.platform_dependent(constants, data, cpu=cpu, default=default, **others)
         return out, jax.tree.map(lambda _: True, out)
 
     return one(constants, data)

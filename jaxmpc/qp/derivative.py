@@ -60,8 +60,14 @@ def _implicit_jvp(conditions_of: Conditions, primals: tuple, tangents: tuple) ->
     data, constants, z, y = primals
     # As a result of this function, z and y carry the derivatives that higher orders need.
     z, y = implicit(conditions_of, data, constants, z, y)
-    conditions, undo = conditions_of(data, constants, z, y)
-    return (z, y), undo(jax.jvp(conditions, (data,), tangents[:1])[1])
+
+    def moved(data: Any, constants: Any, z: Array, y: Array, change: Any) -> tuple[Array, Array]:
+        conditions, undo = conditions_of(data, constants, z, y)
+        return undo(jax.jvp(conditions, (data,), (change,))[1])
+
+    # Going backward, all but these arguments is computed then: kept, it would be several times as
+    # much for each solve of a closed loop.
+    return (z, y), jax.checkpoint(moved)(data, constants, z, y, tangents[0])
 
 
 def dense_conditions(

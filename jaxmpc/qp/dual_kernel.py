@@ -1,4 +1,5 @@
-"""The search on the dual of `active_set.py` as kernels for NVIDIA GPUs: a program an instance.
+"""Systems in the active rows W as kernels for NVIDIA GPUs, a program an instance: the search on the
+dual of `active_set.py`, and the derivatives of `newton.linearised`.
 
 As a loop of XLA each step is some twenty launches, and all instances of a group wait for the
 largest system. Here an instance takes all its steps within one program and leaves when it is done.
@@ -6,6 +7,7 @@ A program holds y, v and the system of W in registers, and gathers through memor
 system is solved in as many pivots as W has rows.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -62,7 +64,9 @@ def _kernel(
         limit_ref, cold_ref, flags_in, S_ref, y_in, v_in, *others = refs
         *bound_refs, y_ref, v_ref, flags_ref, order_ref, change_ref, moved_ref = others
         i, k, few = indices(width), indices(side), indices(ROWS)
-        here, limit = i < m, limit_ref[0]
+        # An instance that is done leaves what it shares with the results as it is, unread.
+        busy = flags_in[1] > 0
+        here, limit = (i < m) & busy, limit_ref[0]
         rows_of = zip(bound_refs, FREE, strict=False)
         own = Bounds.of_rows(load(ref.at[i], here, free) for ref, free in rows_of)
 
@@ -137,7 +141,7 @@ def _kernel(
         four = indices(4)
         taken, go_on, optimal = flags
         all_flags = jnp.where(four == 0, taken, jnp.where(four == 1, go_on, optimal))
-        store(flags_ref.at[four], all_flags, four < 3)
+        store(flags_ref.at[four], all_flags, (four < 3) & busy)
 
     number = lambda count, kind=dtype: jax.ShapeDtypeStruct((count,), kind)
     shapes = [
@@ -145,7 +149,7 @@ def _kernel(
         number(m + side),
     ]  # fmt: skip
     warps = 1 if width <= 64 and side <= LEAST else 2 if side <= 32 and width <= 128 else 4
-    program = call(kernel, shapes, warps)
+    program = call(kernel, shapes, warps, aliases={2: 2, 4: 0, 5: 1})
 
     def run(limit: Array, cold: Array, flags: Array, y: Array, v: Array) -> tuple:
         return tuple(program(limit[None], cold, flags, S, y, v, *bounds.columns)[:3])
@@ -173,3 +177,65 @@ def solved(M: Array, b: Array, k: Array, count: Array) -> Array:
         return M - c[:, None] * (c * inverse)[None, :], b - c * (at_j(b) * inverse)
 
     return jax.lax.fori_loop(jnp.int32(0), count, sweep, (M, b))[1]
+
+
+def damped_kernel(S: Array, W: Array, slack: Array, b: Array, damping: float, steps: int) -> Array:
+    """Return `newton.damped` (k,) of one instance. W (k,): rows of S, which is shared, filled up
+    with their number; slack, b (k,). `vmap` for many."""
+    m, rows, last = len(S), len(W), padded_side(len(W))
+    count = jnp.sum(W < m, dtype=jnp.int32)
+    y, done = jnp.zeros_like(b), 0
+    for side in [*(side for side in SIDES if side < last), last]:
+        here = jnp.where((count > done) & (count <= side), count, 0)
+        solution = _damped(m, min(rows, side), side, damping, steps, b.dtype)
+        part = solution(here[None], S, W, slack, b)
+        y, done = jnp.where(here > 0, part, y), side
+    return y
+
+
+def _damped(m: int, rows: int, side: int, damping: float, steps: int, dtype: Any) -> Callable:
+    """Return the kernel (count (1,), S, W, slack, b) → y (k,) with systems of `rows` rows at most,
+    in arrays of `side`; y is zero where the count is."""
+
+    def kernel(count_ref: Any, S_ref: Any, W_ref: Any, slack_ref: Any, b_ref: Any, y_ref: Any):
+        k, count = indices(side), count_ref[0]
+        inside = k < count
+        W = load(W_ref.at[k], inside, 0)
+        slack, b = load(slack_ref.at[k], inside), load(b_ref.at[k], inside)
+        same, square = k[:, None] == k[None, :], inside[:, None] & inside[None, :]
+
+        def M(added: float) -> Array:
+            diagonal = jnp.where(inside, slack + added, 1.0)
+            whole = load(S_ref.at[W[:, None], W[None, :]], square)
+            return whole + jnp.where(same, diagonal[:, None], 0.0)
+
+        inverse = inverted(M(damping), k, count)
+        y = jnp.zeros_like(b)
+        for _ in range(steps):
+            left = b - jnp.sum(M(0.0) * y[None, :], axis=1)
+            y = y + jnp.sum(inverse * left[None, :], axis=1)
+        store(y_ref.at[k], jnp.where(inside, y, 0.0), k < rows)
+
+    warps = 1 if side <= LEAST else 4 if side <= 32 else 8
+    program = call(kernel, jax.ShapeDtypeStruct((rows,), dtype), warps)
+
+    def run(count: Array, S: Array, W: Array, slack: Array, b: Array) -> Array:
+        y = program(count, S, W[:rows], slack[:rows], b[:rows])
+        return jnp.pad(y, (0, len(b) - rows))
+
+    return run
+
+
+def inverted(M: Array, k: Array, count: Array) -> Array:
+    """Return M⁻¹ for M (k, k) symmetric positive definite, the identity beyond the first `count`
+    rows, by the sweeps of `solved`, which leave −M⁻¹ where the pivot itself becomes −1/p."""
+    row = k[:, None]
+
+    def sweep(j: Array, M: Array) -> Array:
+        c = jnp.sum(jnp.where(row == j, M, 0.0), axis=0)
+        pivot = jnp.sum(jnp.where(k == j, c, 0.0))
+        c, inverse = jnp.where(k == j, pivot - 1, c), 1 / pivot
+        swept = M - c[:, None] * (c * inverse)[None, :]
+        return jnp.where((row == j) & (k[None, :] == j), -inverse, swept)
+
+    return -jax.lax.fori_loop(jnp.int32(0), count, sweep, M)

@@ -13,19 +13,23 @@ e ≠ 0, which is a Farkas vector: e'A w is 0 for all w but at least g*(e) fails
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.qp.batches import all_instances, true_places
+from jaxmpc.qp.batches import all_instances, in_blocks, true_places
+from jaxmpc.qp.dual_kernel import damped_kernel
 from jaxmpc.qp.linalg import definite_solver, solve
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.triton import on_gpu
 
-# Rows of the reduced system of derivatives at most.
-REDUCED_ROWS = 48
+# For derivatives: rows of the reduced system at most, steps of the method of multipliers, and
+# instances whose matrices of the size of H are held at once.
+REDUCED_ROWS, STEPS, DENSE_BLOCK = 48, 8, 512
 # Steps of the line search, a scalar Newton method. Penalties put almost vertical pieces into the
 # derivative, which only bisection finds.
 LINE_STEPS, LINE_STEPS_SOFT = 6, 24
@@ -224,41 +228,120 @@ def linearised(
 
         H dw + A'dy = −a,        dy/ρ = D (A dw + dy/ρ) + c,        D = diag(weights) + Σ h h'.
 
-    The function returned maps (a, c) to (dw, dy); it is linear. flat: whether H is not nearly the
-    identity; where it is and few rows have a weight in all instances of a batch, the system to be
-    factored is of the size of these. D is singular or not: eliminating
+    The function returned maps (a, c) to (dw, dy); it is linear. D is singular or not: eliminating
     dy by the method of multipliers needs only the definite K = H + ρ A'DA (with a ridge), and
-    eight sweeps leave an error (1 + ρ s²)⁻⁸ for active rows with least singular value s. Where
+    eight steps leave an error (1 + ρ s²)⁻⁸ for active rows with least singular value s. Where
     active rows contradict each other, dw tends to their least-squares solution and dy stays
     bounded by 8ρ times the contradiction.
+
+    flat: whether H is not nearly the identity. Without normals the rows R with D = 0 have dy = ρc,
+    and the others, W, make the system symmetric, Λ = (1/D − 1)/ρ:
+
+        H dw + A_W'dy_W = −a − A_R'dy_R,        A_W dw − Λ dy_W = −c_W/D.
     """
     D = lambda v: weights * v + sum(h * jnp.sum(h * v) for h in normals)
+    if normals:
+        return partial(
+            swept, H, A, D, rho, definite_solver(dense_system(H, A, weights, normals, rho))
+        )
+    n, active = A.shape[1], weights > jnp.finfo(A.dtype).eps ** 2
+    slack = (1 / jnp.where(active, weights, 1.0) - 1) / rho
+    only = lambda y: jnp.where(active, y, 0.0)
 
-    def swept(inverse: Callable, a: Array, c: Array) -> tuple[Array, Array]:
-        def sweep(carry: tuple[Array, Array], _: None) -> tuple[Any, None]:
-            dw, dy = carry
-            rows = D(matmul(dw, A.T) + dy / rho) + c - dy / rho
-            gradient = a + matmul(dw, H) + matmul(dy, A)
-            step = -inverse(gradient + rho * matmul(rows, A))
-            return (dw + step, dy + rho * (D(matmul(step, A.T)) + rows)), None
+    def product(wy: Array) -> Array:
+        w, y = wy[:n], wy[n:]
+        rows = jnp.where(active, matmul(w, A.T) - slack * y, y)
+        return jnp.concatenate([matmul(w, H) + matmul(only(y), A), rows])
 
-        return jax.lax.scan(sweep, (jnp.zeros_like(a), jnp.zeros_like(c)), length=8)[0]
+    constants, own = jax.lax.stop_gradient(((H, A, flat), (weights, active, slack)))
 
-    dense = lambda a, c: swept(
-        definite_solver(ridged(H + rho * gram(A, weights, normals), rho)), a, c
-    )
-    if normals or min(A.shape) <= REDUCED_ROWS:
-        return dense
+    def approach(_: Any, b: Array) -> Array:
+        return jnp.concatenate(approximate(rho, constants, own, (b[:n], b[n:])))
 
-    def reduced(a: Array, c: Array) -> tuple[Array, Array]:
-        # (I + ρ A'DA)⁻¹g = g − A_W'(S_WW + (ρD)⁻¹)⁻¹A_W g for the rows W with D > 0 (Woodbury);
-        # where H is not quite I the next sweep makes up for it.
-        W = true_places(weights > 0, REDUCED_ROWS)
-        A_W = A.at[W].get(mode="fill", fill_value=0.0)
-        D_W = weights.at[W].get(mode="fill", fill_value=1.0)
-        inverse = definite_solver(matmul(A_W, A_W.T) + jnp.diag(1 / (rho * D_W)))
-        return swept(lambda g: g - matmul(inverse(matmul(g, A_W.T)), A_W), a, c)
+    def solver(a: Array, c: Array) -> tuple[Array, Array]:
+        rest = jnp.where(active, 0.0, rho * c)
+        b = [-a - matmul(rest, A), only(-c / jnp.where(active, weights, 1.0))]
+        # In one vector: a part without tangents could not be transposed.
+        moved = jax.lax.custom_linear_solve(product, jnp.concatenate(b), approach, symmetric=True)
+        return moved[:n], moved[n:] + rest
 
-    few = (jnp.sum(weights > 0) <= REDUCED_ROWS) & ~flat
-    # Going backward, the factors are made then: kept, they would be n² numbers an instance.
-    return jax.checkpoint(lambda a, c: jax.lax.cond(all_instances(few), reduced, dense, a, c))
+    return solver
+
+
+def dense_system(H: Array, A: Array, weights: Array, normals: list[Array], rho: float) -> Array:
+    """Return K = H + ρ A'DA (n, n) of `linearised`, with a ridge."""
+    return ridged(H + rho * gram(A, weights, normals), rho)
+
+
+def swept(
+    H: Array, A: Array, D: Callable, rho: float, inverse: Callable, a: Array, c: Array
+) -> tuple[Array, Array]:
+    """Return (dw, dy) of `linearised` by eight steps of the method of multipliers; inverse: K⁻¹."""
+
+    def sweep(carry: tuple[Array, Array], _: None) -> tuple[Any, None]:
+        dw, dy = carry
+        rows = D(matmul(dw, A.T) + dy / rho) + c - dy / rho
+        gradient = a + matmul(dw, H) + matmul(dy, A)
+        step = -inverse(gradient + rho * matmul(rows, A))
+        return (dw + step, dy + rho * (D(matmul(step, A.T)) + rows)), None
+
+    return jax.lax.scan(sweep, (jnp.zeros_like(a), jnp.zeros_like(c)), length=STEPS)[0]
+
+
+def approximate(
+    rho: float, constants: tuple, own: tuple, b: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """Return (dw, dy) of the symmetric system in `linearised` with right-hand sides b; not
+    differentiable. constants: H, A, flat; own: weights, active, Λ.
+
+    Where H is nearly the identity and few rows are active in all instances of a batch, the eight
+    steps are taken in these rows (`damped`), four of them on what the first four leave of the
+    system, in which H is what it is.
+    """
+    (H, A, flat), (weights, active, slack) = constants, own
+
+    def dense(b: tuple[Array, Array]) -> tuple[Array, Array]:
+        return in_blocks(partial(dense_steps, rho), (H, A), (weights, b), large=DENSE_BLOCK)
+
+    if min(A.shape) <= REDUCED_ROWS and not on_gpu():
+        return dense(b)
+    W = true_places(active, REDUCED_ROWS)
+    take = lambda v, fill=0.0: v.at[W].get(mode="fill", fill_value=fill)
+
+    def half(b: tuple[Array, Array]) -> tuple[Array, Array]:
+        right = take(matmul(b[0], A.T) - b[1])
+        y = damped(matmul(A, A.T), W, take(slack), right, 1 / rho, STEPS // 2)
+        dy = jnp.zeros_like(b[1]).at[W].add(y, mode="drop")
+        return b[0] - matmul(dy, A), dy
+
+    def reduced(b: tuple[Array, Array]) -> tuple[Array, Array]:
+        dw, dy = half(b)
+        rows = jnp.where(active, matmul(dw, A.T) - slack * dy, b[1])
+        more_w, more_y = half((b[0] - matmul(dw, H) - matmul(dy, A), b[1] - rows))
+        return dw + more_w, jnp.where(active, dy + more_y, b[1])
+
+    few = (jnp.sum(active) <= REDUCED_ROWS) & ~flat
+    return jax.lax.cond(all_instances(few), reduced, dense, b)
+
+
+def dense_steps(rho: float, constants: tuple, data: tuple) -> tuple[Array, Array]:
+    """Return `approximate` of one instance with any number of active rows, by systems of the size
+    of H. constants: H, A; data: weights, and b, which has no entries in inactive rows."""
+    (H, A), (weights, (a, c)) = constants, data
+    inverse = definite_solver(dense_system(H, A, weights, [], rho))
+    return swept(H, A, lambda v: weights * v, rho, inverse, -a, -weights * c)
+
+
+def damped(S: Array, W: Array, slack: Array, b: Array, damping: float, steps: int) -> Array:
+    """Return y (k,) after so many steps y += (M + damping·I)⁻¹(b − M y) from 0, M = S_WW +
+    diag(slack) positive semidefinite: b's solution, or where M is singular and b contradicts it,
+    least-squares with a bounded part in the null space. W (k,): rows of S, filled up with their
+    number; slack, b (k,)."""
+    if on_gpu():
+        return damped_kernel(S, W, slack, b, damping, steps)
+    M = S.at[W[:, None], W[None, :]].get(mode="fill", fill_value=0.0) + jnp.diag(slack)
+    inverse = definite_solver(M + damping * jnp.eye(len(W), dtype=b.dtype))
+    y = jnp.zeros_like(b)
+    for _ in range(steps):
+        y = y + inverse(b - matmul(y, M))
+    return y

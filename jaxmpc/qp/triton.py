@@ -42,16 +42,20 @@ def has_triton() -> bool:
     return True
 
 
-def call(kernel: Callable, shapes: Any, warps: int = 1, grid: tuple[int, ...] = ()) -> Callable:
+def call(
+    kernel: Callable, shapes: Any, warps: int = 1, grid: tuple[int, ...] = (),
+    aliases: dict[int, int] | None = None,
+) -> Callable:  # fmt: skip
     """Return the kernel as a function of arrays, with one program for each place of the grid;
-    `vmap` puts another axis in front of it."""
+    `vmap` puts another axis in front of it. aliases: arguments whose memory a result takes over."""
     from jax.experimental import pallas
     from jax.experimental.pallas import triton
 
     options = triton.CompilerParams(num_warps=warps, num_stages=1)
     return pallas.pallas_call(
-        kernel, out_shape=shapes, grid=grid, compiler_params=options, interpret=not on_gpu()
-    )
+        kernel, out_shape=shapes, grid=grid, compiler_params=options, interpret=not on_gpu(),
+        input_output_aliases=aliases or {},
+    )  # fmt: skip
 
 
 def padded_side(n: int) -> int:

@@ -11,11 +11,12 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.bench.families import joint
-from jaxmpc.qp import active_set, dual_kernel, refine, solve, triton
+from jaxmpc.qp import active_set, dual_kernel, newton, refine, solve, triton
 from jaxmpc.qp.active_set import DualPoint, DualSearch, dual_search, most_rows
 from jaxmpc.qp.admm import ADMM, factor, iterate, scaled, splittings
 from jaxmpc.qp.admm_kernel import iterate_batch, pieces
 from jaxmpc.qp.admm_kernel import suits as suits_kernel
+from jaxmpc.qp.batches import true_places
 
 STEPS = 12
 
@@ -125,6 +126,29 @@ def test_a_search_that_is_lost_begins_once_more(x64):
 
 
 STATES = np.linspace(-1, 1, 6)[:, None] * np.array([1.1, 1.4])
+
+
+def test_damped_systems_in_a_kernel_are_those_of_xla(x64):
+    """Of every size, in float64, with rows that depend on each other and soft ones."""
+    rng = np.random.default_rng(0)
+    A = rng.standard_normal((120, 60))
+    A[7] = A[3]
+    A /= np.linalg.norm(A, axis=1)[:, None]
+    on = np.zeros((6, 120), bool)
+    for row, count in zip(on, (0, 1, 5, 16, 20, 48), strict=True):
+        row[rng.choice(120, count, replace=False)] = True
+    on[2, [3, 7]] = True
+    W = jax.vmap(lambda on: true_places(on, 48))(on)
+    slack = jnp.asarray(rng.uniform(0, 1e-3, (6, 48)) * (rng.random((6, 48)) < 0.5))
+    b = jnp.where(W < 120, rng.standard_normal((6, 48)), 0.0)
+    S = jnp.asarray(A @ A.T)
+    each = lambda function: jax.vmap(lambda *v: function(S, *v, 1e-6, 4))(W, slack, b)
+    found, wanted = each(dual_kernel.damped_kernel), each(newton.damped)
+    np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
+    whole = np.asarray(S)[np.ix_(W[5], W[5])] + np.diag(slack[5])
+    np.testing.assert_allclose(whole @ found[5], b[5], atol=1e-9)
+
+
 # Settings of no other test: programs that are traced for a GPU must not be taken for others.
 SOLVER = jm.ADMM(refine=1001)
 
@@ -149,22 +173,28 @@ def test_plans_by_kernels_are_those_without(soft, x64, monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend:DeprecationWarning")
-def test_kernels_can_be_lowered_for_a_gpu(x64, monkeypatch):
+@pytest.mark.parametrize("gradient", [False, True])
+def test_kernels_can_be_lowered_for_a_gpu(gradient, x64, monkeypatch):
     """All operations of the kernels exist in Triton's dialect; no GPU is needed to see that."""
     mesh_module = pytest.importorskip("jax._src.mesh")
     if not hasattr(mesh_module, "AbstractDevice"):
         pytest.skip("this JAX lowers kernels on machines with a GPU alone")
     monkeypatch.setattr(triton, "on_gpu", lambda: True)
+    monkeypatch.setattr(newton, "on_gpu", lambda: True)
     device = mesh_module.AbstractDevice("NVIDIA H100 80GB HBM3", 132, "gpu")
     axes = dict(axis_types=(jax.sharding.AxisType.Auto,), abstract_device=device)
-    plan = jax.jit(jax.vmap(jm.Controller(joint(), SOLVER).plan))
+    plan = jax.vmap(jm.Controller(joint(), SOLVER).plan)
+    if gradient:
+        plan = jax.grad(lambda x, plan=plan: jnp.sum(plan(x).cost))
+    plan = jax.jit(plan)
     try:
         with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((1,), ("x",), **axes)):
             lowered = plan.trace(jnp.asarray(STATES)).lower(lowering_platforms=("cuda",))
     except (TypeError, RuntimeError) as error:
         pytest.skip(f"this JAX lowers kernels on machines with a GPU alone: {error}")
-    # ADMM; the search on the dual and its corrections (two sizes each), and three loops' judges.
-    assert lowered.as_text().count("xla.gpu.triton") == 8
+    # ADMM; the search on the dual and its corrections (two sizes each), and three loops' judges;
+    # derivatives: two halves of three sizes.
+    assert lowered.as_text().count("xla.gpu.triton") == (14 if gradient else 8)
 
 
 def test_without_triton_there_are_no_kernels(monkeypatch):
