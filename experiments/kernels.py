@@ -9,7 +9,7 @@ programs compile at once. --small: 64 states each, to try the script.
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -17,14 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxmpc as jm
-from jaxmpc.bench.families import family, turbompc
+from jaxmpc.bench.cases import SAMPLES, closed_loops, weights_of
+from jaxmpc.bench.families import family
 from jaxmpc.bench.roofline import best_seconds
 from jaxmpc.qp.admm import scaled
 from jaxmpc.qp.admm_kernel import iterate_batch
 from jaxmpc.qp.triton import ROUGH, on_gpu
 
 PLANS = [("joint", 2**20), ("springs4", 2**20), ("springs8", 2**16)]
-LOOPS, TOLERANCES, SAMPLES, STEPS = (64, 1024, 65_536), (1e-3, 1e-5, 1e-7), 50, 50
+LOOPS, TOLERANCES, STEPS = (64, 1024, 65_536), (1e-3, 1e-5, 1e-7), 50
 REPEATS = 4
 
 
@@ -70,18 +71,14 @@ def plan_task(name: str, count: int) -> Task:
 def loop_tasks(count: int, gradient: bool) -> list[Task]:
     """TurboMPC's protocol: closed loops of 50 samples from `count` states; with the gradient of
     their cost with respect to the diagonals of Q and R."""
-    mpc, x = turbompc(batch=count)
+    mpc, x = family("turbompc", count)
 
-    def loops(weights: tuple, x: Any, eps: Any) -> tuple:
-        Q, R = map(jnp.diag, weights)
-        moved = replace(mpc, Q=Q, R=R, terminal_cost=Q)
-        controller = jm.Controller(moved, jm.ADMM(eps=eps))
-        run = jax.vmap(lambda x: jm.simulate(controller, mpc.system, x, SAMPLES))(x)
-        cost = jnp.sum(run.states[:, 1:] ** 2) + jnp.sum(run.inputs**2)
+    def loops(weights: dict[str, Any], x: Any, eps: Any) -> tuple:
+        cost, run = closed_loops("turbompc", mpc, weights, x, eps)
         return cost, jnp.mean(run.status == jm.Status.SOLVED)
 
     program = jax.jit(jax.value_and_grad(loops, has_aux=True) if gradient else loops)
-    weights, what = (jnp.ones(8), jnp.ones(4)), "loops, gradient," if gradient else "loops"
+    weights, what = weights_of(mpc), "loops, gradient," if gradient else "loops"
 
     def say(answer: Any, _: float) -> str:
         cost, solved = answer[0] if gradient else answer
@@ -106,11 +103,12 @@ def run_all(small: bool) -> None:
             if task.program not in compiled:
                 start = lambda task=task: task.program.lower(*task.arguments).compile()
                 compiled[task.program] = pool.submit(start)
-        for task in tasks:
-            try:
-                print(timed(task, compiled[task.program].result()), flush=True)
-            except jax.errors.JaxRuntimeError as error:  # too large for the device's memory
-                print(f"{task.name}: {str(error).splitlines()[0][:90]}", flush=True)
+    # (Not before all are compiled: the compiler tries kernels on the device.)
+    for task in tasks:
+        try:
+            print(timed(task, compiled[task.program].result()), flush=True)
+        except jax.errors.JaxRuntimeError as error:  # too large for the device's memory
+            print(f"{task.name}: {str(error).splitlines()[0][:90]}", flush=True)
 
 
 def timed(task: Task, program: Callable) -> str:

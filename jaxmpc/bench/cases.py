@@ -569,17 +569,25 @@ def _moreau_gradients(case: Case, rival: Rival) -> Contestant:
 # Closed loops: TurboMPC's protocol
 
 
+def closed_loops(
+    name: str, mpc: MPC, weights: dict[str, Any], x: Any, tolerance: Any
+) -> tuple[Any, Any]:
+    """Return the cost of `SAMPLES` samples of closed loop from each of the states x (B, n), and the
+    runs, of a family under weights, the diagonals of Q and R."""
+    moved = weighted(in_float64(mpc), weights)
+    if name in LIMITS:  # there the terminal cost is Q
+        moved = replace(moved, terminal_cost=moved.Q)
+    controller = Controller(moved, ADMM(eps=tolerance))
+    run = jax.vmap(lambda x: simulate(controller, mpc.system, x, SAMPLES))(x)
+    return jnp.sum(run.states[:, 1:] ** 2) + jnp.sum(run.inputs**2), run
+
+
 def _own_loops(case: Case) -> Iterator[Contestant]:
     mpc, x = case.states
     weights, there = weights_of(mpc), jnp.asarray(x)
 
     def loops(weights: dict[str, Any], x: Any) -> tuple[Any, Any]:
-        moved = weighted(in_float64(mpc), weights)
-        if case.family in LIMITS:  # there the terminal cost is Q
-            moved = replace(moved, terminal_cost=moved.Q)
-        controller = Controller(moved, ADMM(eps=case.tolerance))
-        run = jax.vmap(lambda x: simulate(controller, mpc.system, x, SAMPLES))(x)
-        cost = jnp.sum(run.states[:, 1:] ** 2) + jnp.sum(run.inputs**2)
+        cost, run = closed_loops(case.family, mpc, weights, x, case.tolerance)
         return cost, (run.states[:, :-1], run.inputs, run.status)
 
     both = jax.value_and_grad(loops, has_aux=True)

@@ -107,25 +107,25 @@ def dual_search(
     Where `most` steps do not get there, multipliers exceed `limit`, or rows that join singly are
     too many for W, it begins once more from `cold`, the point without multipliers, with rows that
     join singly and `more` steps at most."""
-    state, rows = DualSearch(point, jnp.int32(0), go_on, jnp.asarray(False)), most_rows(A)
+    state = DualSearch(point, jnp.int32(0), go_on, jnp.asarray(False))
     if has_kernels(len(S)):
         from jaxmpc.qp.dual_kernel import dual_search_kernel  # which is made of what stands here
 
-        return dual_search_kernel(A, S, bounds, limit, cold, state, rows, most, more)
-    step = partial(_search_step, rows, most, more)
+        return dual_search_kernel(A, S, bounds, limit, cold, state, most, more)
+    step = partial(_search_step, most_rows(A), most, more)
     end = repeat_while(lambda s: s.open, step, (A, S, bounds, limit, cold), state)
     return end.point, end.optimal
 
 
 def single_step(A: Array, S: Array, bounds: Bounds, limit: Array, point: DualPoint) -> DualPoint:
     """Return the point after one step, in which rows join singly."""
-    rows, true = most_rows(A), jnp.asarray(True)
+    true = jnp.asarray(True)
     if has_kernels(len(S)):
         from jaxmpc.qp.dual_kernel import dual_search_kernel
 
         state = DualSearch(point, jnp.int32(JOINTLY), true, ~true)
-        return dual_search_kernel(A, S, bounds, limit, point, state, rows, JOINTLY + 1, 0)[0]
-    return dual_step(A, S, bounds, point, true, rows)[0]
+        return dual_search_kernel(A, S, bounds, limit, point, state, JOINTLY + 1, 0)[0]
+    return dual_step(A, S, bounds, point, true, most_rows(A))[0]
 
 
 def _search_step(rows: int, most: int, more: int, constants: tuple, s: DualSearch) -> DualSearch:
@@ -135,7 +135,8 @@ def _search_step(rows: int, most: int, more: int, constants: tuple, s: DualSearc
     singly = again | (s.steps >= JOINTLY)
     point, fits = dual_step(A, S, bounds, point, singly, rows)
     largest = [jnp.max(v, initial=0.0) for v in sizes(bounds, point.y, point.v)]
-    return DualSearch(point, *after_step(largest, limit, s.steps + 1, fits, most, more))
+    after = after_step(largest, CONVERGED, limit, s.steps + 1, fits, most, more)
+    return DualSearch(point, *after)
 
 
 def sizes(bounds: Bounds, y: Array, v: Array) -> tuple[Array, Array, Array]:
@@ -144,13 +145,15 @@ def sizes(bounds: Bounds, y: Array, v: Array) -> tuple[Array, Array, Array]:
 
 
 def after_step(
-    largest: Sequence[Array], limit: Any, steps: Array, fits: Any, most: int, more: int
-) -> tuple[Array, Array, Array]:
+    largest: Sequence[Array], converged: float, limit: Any, steps: Array, fits: Any, most: int,
+    more: int,
+) -> tuple[Array, Array, Array]:  # fmt: skip
     """Return the count of steps, whether to go on, and whether the point is optimal, after a step
-    to a point with these largest `sizes`. fits: whether all its rows were in W. The count is `most`
+    to a point with these largest `sizes`. converged: distance from the optimum, relative to the
+    largest row, at which the steps end. fits: whether all its rows were in W. The count is `most`
     where the search begins once more."""
     error, largest_v, largest_y = largest
-    optimal = error <= CONVERGED * (1 + largest_v) + ROUNDING * largest_y
+    optimal = error <= converged * (1 + largest_v) + ROUNDING * largest_y
     # (Without "not": Triton's dialect lacks it for booleans.)
     lost = jnp.where(largest_y <= limit, jnp.where(fits, False, steps > JOINTLY), True)
     first = steps <= most

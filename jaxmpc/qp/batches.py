@@ -29,6 +29,8 @@ RARE_PART_CPU, RARE_FEW_CPU = 64, 8
 PART, SMALLER, LEAST = 4, 16, 256
 # Instances on a GPU from which on the arithmetic, not the launches, takes the time.
 LARGE = 16_384
+# Length of masks from which on their true places are looked up.
+LONG = 65_536
 
 
 def group_sizes(batch: int, rare: bool = False) -> list[int]:
@@ -186,6 +188,9 @@ def true_places(mask: Array, size: int) -> Array:
     off.)"""
     m = mask.shape[0]
     rank = jnp.cumsum(mask, dtype=jnp.int32) - 1
+    if m >= LONG:  # to look `size` of them up takes less than to put all m in their place
+        wanted = jnp.arange(1, size + 1, dtype=jnp.int32)
+        return jnp.searchsorted(rank + 1, wanted, method="scan_unrolled").astype(jnp.int32)
     place = jnp.where(mask, jnp.minimum(rank, size), size)
     return jnp.full(size, m, jnp.int32).at[place].set(np.arange(m, dtype=np.int32), mode="drop")
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxmpc as jm
+from jaxmpc.qp import batches
 from jaxmpc.qp.batches import BLOCK, group_sizes, in_blocks, repeat_while, true_places
 
 
@@ -55,7 +56,10 @@ def test_groups_cover_and_shrink():
         assert sizes[0] <= batch and sizes == sorted(sizes, reverse=True)
 
 
-def test_true_places():
+@pytest.mark.parametrize("long", [10, 5])
+def test_true_places(long, monkeypatch):
+    """Put in their places, and looked up."""
+    monkeypatch.setattr(batches, "LONG", long)
     mask = np.array([0, 1, 1, 0, 1], bool)
     np.testing.assert_array_equal(true_places(mask, 2), [1, 2])
     np.testing.assert_array_equal(true_places(mask, 4), [1, 2, 4, 5])

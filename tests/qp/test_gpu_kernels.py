@@ -12,7 +12,7 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.bench.families import joint
 from jaxmpc.qp import active_set, dual_kernel, newton, refine, solve, triton
-from jaxmpc.qp.active_set import DualPoint, DualSearch, dual_search, most_rows
+from jaxmpc.qp.active_set import DualPoint, DualSearch, dual_search
 from jaxmpc.qp.admm import ADMM, factor, iterate, scaled, splittings
 from jaxmpc.qp.admm_kernel import iterate_batch, pieces
 from jaxmpc.qp.admm_kernel import suits as suits_kernel
@@ -92,9 +92,7 @@ def searches(case, first, more):
 
     def kernel(bounds, cold, point):
         state = DualSearch(point, jnp.int32(0), jnp.asarray(True), jnp.asarray(False))
-        return dual_kernel.dual_search_kernel(
-            A, S, bounds, limit, cold, state, most_rows(A), first, more
-        )
+        return dual_kernel.dual_search_kernel(A, S, bounds, limit, cold, state, first, more)
 
     return [jax.jit(jax.vmap(search))(bounds, cold, point) for search in (loop, kernel)]
 
