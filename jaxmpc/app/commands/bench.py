@@ -398,6 +398,8 @@ def print_case(rows: list["Row"]) -> None:
             more += f"  forward {r.forward_microseconds:.2f} µs"
         if r.gradient_error is not None:
             more += f", error {r.gradient_error:.1e}"
+        if r.proofs_microseconds is not None:
+            more += f"  with all proofs {r.proofs_microseconds:.2f} µs"
         each = f"{mark}{r.microseconds:.2f}"
         print(f"  {r.solver:13}{each:>12} {speedup:>10}{solved:>9}{false:>7}"
               f"{r.cold_seconds:>9.2f}{r.compile_seconds:>11.2f}  {more.strip(', ')}")  # fmt: skip
