@@ -94,8 +94,10 @@ class Cones:
         facets, edges = facets[regular], edges[regular]
         M = np.linalg.inv(edges)
         free = len(problem.view.others) if problem.view.projects else 0
-        value = values(rows, center, found.rays.w, free)
-        each = np.array([values(rows, *pair, free) for pair in zip(points, found.w, strict=True)])
+        exact = found.rays.exact
+        value = values(exact, rows, center, found.rays.w, free)
+        pairs = zip(points, found.w, strict=True)
+        each = np.array([values(exact, rows, *pair, free) for pair in pairs])
         moves = (each - value)[facets].transpose(0, 2, 1)  # (F, v, d)
         ends = labelled(found.rays, points, np.vstack([each, value]), facets, edges, M, moves)
         return cls(
@@ -148,8 +150,7 @@ def _slack(p: ExactData, points: Any, values: Any, moved: Any) -> Array:
     none = jnp.zeros(0)
 
     def one(theta: Array, inputs: Array, moved: Any) -> Array:
-        inputs = proofs.within_limits(p, inputs.reshape(N, m))
-        x = p.view.initial_state(theta, none)
+        x, inputs = p.view.initial_state(theta, none), inputs.reshape(N, m)
         return proofs.roll_out(p, x, inputs, jnp.broadcast_to(moved, inputs.shape))[0]
 
     each = jax.vmap(one, in_axes=(0, 0, None))
@@ -163,12 +164,16 @@ def hull_facets(points: np.ndarray) -> np.ndarray:
     return ConvexHull(points).simplices
 
 
-def values(rows: ConstraintRows, theta: np.ndarray, w: np.ndarray, free: int) -> np.ndarray:
-    """Return the inputs (N·m,) and the `free` states that w (k,) stands for at θ (d,), one after
-    the other."""
+def values(
+    p: ExactData, rows: ConstraintRows, theta: np.ndarray, w: np.ndarray, free: int
+) -> np.ndarray:
+    """Return the inputs (N·m,), within their limits, and the `free` states that w (k,) stands for
+    at θ (d,), one after the other."""
     variables = rows.back @ w
     inputs = rows.Psi @ theta + rows.Omega @ variables + rows.psi
-    return np.append(inputs.ravel(), variables[len(variables) - free :])
+    with jax.enable_x64(True):
+        limited = np.asarray(proofs.within_limits(p, jnp.asarray(inputs)))
+    return np.append(limited.ravel(), variables[len(variables) - free :])
 
 
 # The cones of problems that have been asked for, for as long as the problems live.

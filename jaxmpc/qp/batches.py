@@ -167,20 +167,6 @@ def _in_groups(
     return batch
 
 
-def all_instances(condition: Array) -> Array:
-    """Return whether a condition, a scalar, holds for all instances of all `vmap`s around.
-
-    The result is one for all: `jax.lax.cond` on it takes one branch, not both.
-    """
-    one = custom_vmap(lambda condition: condition)
-
-    @one.def_vmap
-    def _(size: int, in_batched: Any, condition: Array) -> Any:
-        return all_instances(jnp.all(condition)), False
-
-    return one(condition)
-
-
 def true_places(mask: Array, size: int) -> Array:
     """Return the first `size` places where mask (m,) is true as int32, filled up with m.
 

@@ -20,15 +20,15 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.qp.batches import all_instances, in_blocks, true_places
-from jaxmpc.qp.dual_kernel import damped_kernel
+from jaxmpc.qp.batches import in_blocks, repeat_while, true_places
+from jaxmpc.qp.dual_kernel import MOST_ROWS, damped_kernel
 from jaxmpc.qp.linalg import definite_solver, solve
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.triton import on_gpu
 
-# For derivatives: rows of the reduced system at most, steps of the method of multipliers, and
-# instances whose matrices of the size of H are held at once.
+# For derivatives: rows of the reduced system at most, where there is no kernel, steps of the method
+# of multipliers, and instances whose matrices of the size of H are held at once.
 REDUCED_ROWS, STEPS, DENSE_BLOCK = 48, 8, 512
 # Steps of the line search, a scalar Newton method. Penalties put almost vertical pieces into the
 # derivative, which only bisection finds.
@@ -241,9 +241,8 @@ def linearised(
     """
     D = lambda v: weights * v + sum(h * jnp.sum(h * v) for h in normals)
     if normals:
-        return partial(
-            swept, H, A, D, rho, definite_solver(dense_system(H, A, weights, normals, rho))
-        )
+        inverse = definite_solver(dense_system(H, A, weights, normals, rho))
+        return partial(swept, H, A, D, rho, inverse)
     n, active = A.shape[1], weights > jnp.finfo(A.dtype).eps ** 2
     slack = (1 / jnp.where(active, weights, 1.0) - 1) / rho
     only = lambda y: jnp.where(active, y, 0.0)
@@ -294,19 +293,16 @@ def approximate(
     """Return (dw, dy) of the symmetric system in `linearised` with right-hand sides b; not
     differentiable. constants: H, A, flat; own: weights, active, Λ.
 
-    Where H is nearly the identity and few rows are active in all instances of a batch, the eight
-    steps are taken in these rows (`damped`), four of them on what the first four leave of the
-    system, in which H is what it is.
+    Where H is nearly the identity and few rows are active, the eight steps are taken in these rows
+    (`damped`), four of them on what the first four leave of the system, in which H is what it is.
+    The other instances of a batch take them with systems of the size of H.
     """
     (H, A, flat), (weights, active, slack) = constants, own
-
-    def dense(b: tuple[Array, Array]) -> tuple[Array, Array]:
-        return in_blocks(partial(dense_steps, rho), (H, A), (weights, b), large=DENSE_BLOCK)
-
     if min(A.shape) <= REDUCED_ROWS and not on_gpu():
-        return dense(b)
-    W = true_places(active, REDUCED_ROWS)
-    take = lambda v, fill=0.0: v.at[W].get(mode="fill", fill_value=fill)
+        return in_blocks(partial(dense_steps, rho), (H, A), (weights, b))
+    most = MOST_ROWS if on_gpu() else REDUCED_ROWS
+    W = true_places(active, most)
+    take = lambda v: v.at[W].get(mode="fill", fill_value=0.0)
 
     def half(b: tuple[Array, Array]) -> tuple[Array, Array]:
         right = take(matmul(b[0], A.T) - b[1])
@@ -314,14 +310,21 @@ def approximate(
         dy = jnp.zeros_like(b[1]).at[W].add(y, mode="drop")
         return b[0] - matmul(dy, A), dy
 
-    def reduced(b: tuple[Array, Array]) -> tuple[Array, Array]:
-        dw, dy = half(b)
-        rows = jnp.where(active, matmul(dw, A.T) - slack * dy, b[1])
-        more_w, more_y = half((b[0] - matmul(dw, H) - matmul(dy, A), b[1] - rows))
-        return dw + more_w, jnp.where(active, dy + more_y, b[1])
+    dw, dy = half(b)
+    rows = jnp.where(active, matmul(dw, A.T) - slack * dy, b[1])
+    more_w, more_y = half((b[0] - matmul(dw, H) - matmul(dy, A), b[1] - rows))
+    reduced = dw + more_w, jnp.where(active, dy + more_y, b[1])
 
-    few = (jnp.sum(active) <= REDUCED_ROWS) & ~flat
-    return jax.lax.cond(all_instances(few), reduced, dense, b)
+    def by_blocks(constants: tuple, state: tuple) -> tuple:
+        weights, b, _, is_open = state
+        found = in_blocks(partial(dense_steps, rho), constants, (weights, b), large=DENSE_BLOCK)
+        # What stayed the same XLA would take for constant, and factor before the loop, for nothing.
+        none = jax.tree.map(jnp.zeros_like, (weights, b))
+        return *none, found, ~is_open
+
+    many = (jnp.sum(active) > most) | flat
+    state = weights, b, reduced, many
+    return repeat_while(lambda s: s[3], by_blocks, (H, A), state, rare=True)[2]
 
 
 def dense_steps(rho: float, constants: tuple, data: tuple) -> tuple[Array, Array]:

@@ -16,6 +16,7 @@ import pytest
 from jax import enable_x64
 
 import jaxmpc as jm
+from jaxmpc.qp.newton import linearised
 
 INF = np.inf
 # Without the polish a program compiles several times faster; ADMM alone converges on easy ones.
@@ -807,3 +808,34 @@ class TestUnrolled:
             )
 
         assert temporary(1600) < 5 * temporary(100)
+
+
+def test_few_and_many_active_rows_in_a_batch():
+    """Against the linear system itself; rows that depend on each other where few are active."""
+    rng = np.random.default_rng(0)
+    n, m, rho = 60, 70, 1e6
+    A = rng.standard_normal((m, n))
+    A[7] = A[3]
+    A /= np.linalg.norm(A, axis=1)[:, None]
+    H = np.eye(n) + 1e-9 * np.diag(rng.standard_normal(n))
+    counts = (0, 5, 47, 48, 49, 55)
+    weights = np.zeros((len(counts), m))
+    for row, count in zip(weights, counts, strict=True):
+        row[rng.choice(np.arange(8, m), count, replace=False)] = 1.0
+    weights[1, :3] = rng.uniform(0.1, 0.9, 3)
+    a, c = rng.standard_normal((len(counts), n)), rng.standard_normal((len(counts), m))
+    with jax.enable_x64(True):
+        move = lambda D, a, c: linearised(H, A, D, [], rho, jnp.asarray(False))(a, c)
+        dw, dy = jax.vmap(move)(*map(jnp.asarray, (weights, a, c)))
+        for i, D in enumerate(weights):
+            whole = np.block([[H, A.T], [D[:, None] * A, np.diag((D - 1) / rho)]])
+            wanted = np.linalg.solve(whole, -np.concatenate([a[i], c[i]]))
+            found = np.concatenate([dw[i], dy[i]])
+            np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-8 * np.abs(wanted).max())
+        # The normal of row 3 twice: the same change, and its multiplier in two parts.
+        twice = weights[1] + (np.arange(m) == 3) + (np.arange(m) == 7)
+        once = weights[1] + (np.arange(m) == 3)
+        c = np.where(np.isin(np.arange(m), (3, 7)), 0.0, c[1])
+        (w_2, y_2), (w_1, y_1) = (move(jnp.asarray(D), a[1], c) for D in (twice, once))
+        np.testing.assert_allclose(w_2, w_1, atol=1e-6)
+        np.testing.assert_allclose(y_2[3] + y_2[7], y_1[3], rtol=1e-6, atol=1e-6)
