@@ -81,6 +81,8 @@ def load_robot(
         )  # fmt: skip
 
     host.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
+    # MuJoCo's account of the energy changes no motion, and MJX refuses it.
+    host.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     inputs = _input_limits(host, torque)
     smooth = copy.deepcopy(host)
     smooth.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)

@@ -154,13 +154,11 @@ SUITE = ("finger", "cartpole", "acrobot", "pendulum", "reacher", "point_mass", "
 
 
 def foreign(name):
-    """A robot of dm_control's suite, without the switch for its energy, which MJX does not know."""
+    """A robot of dm_control's suite."""
     found = importlib.util.find_spec("dm_control")
     if found is None:
         pytest.skip("dm_control is not installed")
-    model = mujoco.MjModel.from_xml_path(str(Path(found.origin).parent / "suite" / f"{name}.xml"))
-    model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
-    return jm.load_robot(model)
+    return jm.load_robot(str(Path(found.origin).parent / "suite" / f"{name}.xml"))
 
 
 def met(robot, count=400):

@@ -597,6 +597,21 @@ BAD_FILES = {
 }  # fmt: skip
 
 
+def test_the_switch_for_energy_is_turned_off():
+    """It changes no motion, and MJX does not know it: the model steps as MuJoCo's own."""
+    xml = """<mujoco><option timestep="0.01"><flag energy="enable"/></option><worldbody><body>
+    <joint name="hinge" axis="0 1 0"/><geom size="0.1" mass="1" pos="0 0 0.5"/></body></worldbody>
+    <actuator><motor joint="hinge"/></actuator></mujoco>"""
+    given = mujoco.MjModel.from_xml_string(xml)
+    robot = jm.load_robot(given)
+    assert given.opt.enableflags  # the caller's own model stays as it is
+    data = mujoco.MjData(given)
+    data.qpos[0], data.ctrl[0] = 0.3, 0.7
+    mujoco.mj_step(given, data)
+    x = robot.step(np.array([0.3, 0.0]), np.array([0.7]))
+    np.testing.assert_allclose(x, [data.qpos[0], data.qvel[0]], atol=1e-6)
+
+
 @pytest.mark.parametrize("case", BAD_FILES)
 def test_bad_files_are_named(case, tmp_path):
     text, options, message = BAD_FILES[case]
