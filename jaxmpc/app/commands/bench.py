@@ -54,8 +54,9 @@ class Bench:
       'jaxmpc[bench]'), all in this run, in turns, and judges every answer itself: primal residual,
       dual residual and duality gap are recomputed in float64 from each (z, y). No solver's own
       word counts. What is measured, by --what:
-        labels     each state of a box proved feasible or infeasible (map_feasible_set); rivals
-                   look for the point of least norm that keeps the limits
+        labels     each state of a box proved feasible or infeasible (map_feasible_set); "with all
+                   proofs" counts every plan and half-space, which else are made when used;
+                   rivals look for the point of least norm that keeps the limits
         plans      the optimal plan from each of many feasible states: solve_many ("jaxmpc") and,
                    from device memory to device memory, jax.vmap(controller.plan) ("jaxmpc vmap";
                    on other devices than CPUs this alone)
