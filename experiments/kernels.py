@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxmpc as jm
-from jaxmpc.bench.cases import SAMPLES, closed_loops, weights_of
+from jaxmpc.bench.cases import SAMPLES, weighted_loops, weights_of
 from jaxmpc.bench.families import family
 from jaxmpc.bench.roofline import best_seconds
 from jaxmpc.qp.admm import scaled
@@ -74,7 +74,7 @@ def loop_tasks(count: int, gradient: bool) -> list[Task]:
     mpc, x = family("turbompc", count)
 
     def loops(weights: dict[str, Any], x: Any, eps: Any) -> tuple:
-        cost, run = closed_loops("turbompc", mpc, weights, x, eps)
+        cost, run = weighted_loops("turbompc", mpc, weights, x, eps)
         return cost, jnp.mean(run.status == jm.Status.SOLVED)
 
     program = jax.jit(jax.value_and_grad(loops, has_aux=True) if gradient else loops)

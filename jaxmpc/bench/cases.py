@@ -576,7 +576,7 @@ def _moreau_gradients(case: Case, rival: Rival) -> Contestant:
 # Closed loops: TurboMPC's protocol
 
 
-def closed_loops(
+def weighted_loops(
     name: str, mpc: MPC, weights: dict[str, Any], x: Any, tolerance: Any
 ) -> tuple[Any, Any]:
     """Return the cost of `SAMPLES` samples of closed loop from each of the states x (B, n), and the
@@ -594,7 +594,7 @@ def _own_loops(case: Case) -> Iterator[Contestant]:
     weights, there = weights_of(mpc), jnp.asarray(x)
 
     def loops(weights: dict[str, Any], x: Any) -> tuple[Any, Any]:
-        cost, run = closed_loops(case.family, mpc, weights, x, case.tolerance)
+        cost, run = weighted_loops(case.family, mpc, weights, x, case.tolerance)
         return cost, (run.states[:, :-1], run.inputs, run.status)
 
     both = jax.value_and_grad(loops, has_aux=True)

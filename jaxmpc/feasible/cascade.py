@@ -123,6 +123,7 @@ def label_parts(
     share = -(-programs // max(scope.parts, 1))
     whole = divisible(chunk, devices)  # the chunk as the devices share it
     batch = count(devices) * (each := gather_size(whole // count(devices)))
+    all_ = np.ones(batch, bool)
     short, long = (
         compiled_admm(iterations, np.dtype(dtype), devices),
         compiled_admm(LONGER * iterations, np.dtype(np.float64), devices),
@@ -152,28 +153,26 @@ def label_parts(
         with jax.enable_x64(True):
             return _run(compiled_plans(devices), exact, cones, x)
 
+    def decided(verdict: Verdict, ok: np.ndarray) -> Labels:
+        """Return the labels of a verdict; ok: which points are usable."""
+        return Labels.proved(verdict.label, lambda: verdict, ok)
+
     def by_newton(
         x: np.ndarray, ok: np.ndarray, found: tuple[Verdict, Any], back: np.ndarray | None
     ) -> Labels:
         """Return the labels after Newton from the w of an ADMM stage, if it left a point open."""
         verdict, w = found
-        labels = Labels.proved(verdict.label, lambda: verdict, ok)
+        labels = decided(verdict, ok)
         if np.any((labels.label == 0) & ok):
             w = w if back is None else matmul(w.astype(np.float64), jnp.asarray(back.T))
-            after = _run(newton, exact, rows, x, ok, verdict, w)
-            labels = Labels.proved(after.label, lambda: after, ok)
+            labels = decided(_run(newton, exact, rows, x, ok, verdict, w), ok)
         return labels
 
     def by_admm(
         stage: Compiled, basis: Any, relaxation: Any, to_rows: np.ndarray | None
     ) -> Callable[[np.ndarray], Labels]:
         """Return the stage of ADMM and Newton, a function of points."""
-        all_ = np.ones(batch, bool)
         return lambda x: by_newton(x, all_, _run(stage, exact, basis, x, relaxation), to_rows)
-
-    def everywhere(verdict: Verdict) -> Labels:
-        """Return the labels of a verdict on points that are all finite."""
-        return Labels.proved(verdict.label, lambda: verdict, np.ones(batch, bool))
 
     def finished(x: np.ndarray, ok: np.ndarray, found: Any) -> Labels:
         """Return the labels of a part, by all stages."""
@@ -181,7 +180,7 @@ def label_parts(
             labels, again = by_newton(x, ok, found, back), []
         else:
             labels = Labels.proved(found, OnDemand(lambda: planned(x)).get, ok)
-            again = [lambda x: everywhere(planned(x)), by_admm(short, quick, alpha, back)]
+            again = [lambda x: decided(planned(x), all_), by_admm(short, quick, alpha, back)]
         # Points still undecided get a longer ADMM run without weights, and Newton once more.
         for stage in (*again, by_admm(long, rows, np.float64(ALPHA), None)):
             left = np.flatnonzero((labels.label == 0) & ok)
@@ -197,7 +196,7 @@ def label_parts(
                 solved = [program(theta) for theta in x[where]]
                 candidates = [padded(np.array(v), batch) for v in zip(*solved, strict=True)]
                 verdict = _run(check, exact, some_rows, padded(x[where], batch), *candidates)
-                more = everywhere(verdict).first(len(where))
+                more = decided(verdict, all_).first(len(where))
                 labels = labels.changed(where, more.label, more.status, more.proofs)
         return labels
 

@@ -38,7 +38,7 @@ from jaxmpc.feasible.candidates import Verdict
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.rays import Rays
+from jaxmpc.feasible.rays import Rays, filled
 from jaxmpc.feasible.refinement import refined
 
 # Coordinates up to which the polytopes have few facets.
@@ -94,32 +94,30 @@ class Cones:
         facets, edges = facets[regular], edges[regular]
         M = np.linalg.inv(edges)
         free = len(problem.view.others) if problem.view.projects else 0
-        exact = found.rays.exact
-        value = values(exact, rows, center, found.rays.w, free)
-        pairs = zip(points, found.w, strict=True)
-        each = np.array([values(exact, rows, *pair, free) for pair in pairs])
+        theta, w = np.vstack([points, center]), np.vstack([found.w, found.rays.w])
+        every = values(found.rays.exact, rows, theta, w, free)
+        each, value = every[:-1], every[-1]
         moves = (each - value)[facets].transpose(0, 2, 1)  # (F, v, d)
-        ends = labelled(found.rays, points, np.vstack([each, value]), facets, edges, M, moves)
+        ends = label_limits(found.rays.exact, theta, every, facets, edges, M, moves)
         return cls(
             center, M, M.sum(axis=1), *ends, value, moves @ M, found.normals, found.offsets,
             found.cuts,
         )  # fmt: skip
 
 
-def labelled(
-    rays: Rays, points: np.ndarray, values: np.ndarray, facets: np.ndarray, edges: np.ndarray,
+def label_limits(
+    p: ExactData, points: np.ndarray, values: np.ndarray, facets: np.ndarray, edges: np.ndarray,
     M: np.ndarray, moves: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return the least λ_i and the largest gauge (F,) with which points of each cone are labelled
     (top of this file); a gauge of −∞ for none: with free states, equalities or a terminal
     ellipsoid, whose plans are rolled out.
 
-    values (K + 1, v): inputs at the points, and at the centre. With E the edges and γ of
+    points (K + 1, d), the centre last, with inputs values (K + 1, v). With E the edges and γ of
     `proofs.gamma`, λ is off by no more than ‖I − M E‖ + O(γ) ‖|M||E|‖ in the hull, four times which
     is allowed for; and inputs by d max|u_i − u_c| times that, in `roll_out` as `moved`.
     """
-    p, d = rays.exact, points.shape[1]
-    N, (_, m) = p.horizon, p.B.shape
+    d, N, (_, m) = points.shape[1], p.horizon, p.B.shape
     norm = lambda v: np.abs(v).sum(axis=2).max(axis=1)
     few = proofs.gamma(d + 3)
     off = 4 * (norm(np.eye(d) - M @ edges) + 4 * few * norm(np.abs(M) @ np.abs(edges)))
@@ -132,9 +130,10 @@ def labelled(
     usable = (off < 1e-3) & (moved <= 1e4 * (np.median(moved) + rounding))
     most = np.max(moved, where=usable, initial=0.0)
 
+    some = filled(len(points))
     with jax.enable_x64(True):
-        slack = np.asarray(_slack(p, np.vstack([points, rays.center]), values, most))
-    unmoved, slack = slack
+        found = np.asarray(_slack(p, points[some], values[some], most))
+    unmoved, slack = found[:, : len(points)]
     at_center = slack[-1]
     proved = usable & np.all(unmoved[facets] >= 0, axis=1) & (at_center > 0)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -167,13 +166,14 @@ def hull_facets(points: np.ndarray) -> np.ndarray:
 def values(
     p: ExactData, rows: ConstraintRows, theta: np.ndarray, w: np.ndarray, free: int
 ) -> np.ndarray:
-    """Return the inputs (N·m,), within their limits, and the `free` states that w (k,) stands for
-    at θ (d,), one after the other."""
-    variables = rows.back @ w
-    inputs = rows.Psi @ theta + rows.Omega @ variables + rows.psi
+    """Return the inputs (K, N·m), within their limits, and the `free` states that w (K, k) stand
+    for at θ (K, d), side by side."""
+    variables = w @ rows.back.T
+    by = lambda M, v: np.tensordot(v, M, (1, 2))
+    inputs = by(rows.Psi, theta) + by(rows.Omega, variables) + rows.psi
     with jax.enable_x64(True):
-        limited = np.asarray(proofs.within_limits(p, jnp.asarray(inputs)))
-    return np.append(limited.ravel(), variables[len(variables) - free :])
+        inputs = np.asarray(jax.vmap(functools.partial(proofs.within_limits, p))(inputs))
+    return np.hstack([inputs.reshape(len(w), -1), variables[:, variables.shape[1] - free :]])
 
 
 # The cones of problems that have been asked for, for as long as the problems live.

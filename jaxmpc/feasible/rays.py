@@ -147,12 +147,15 @@ class Rays:
 
     def proved(self, theta: np.ndarray, w: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
         """Return `prove_rays` of (K, backoffs, …) points and (K, R) multipliers."""
-        # Repeated rays fill up to a power of two, so that few shapes compile.
-        count = len(y)
-        fill = np.arange(max(32, 1 << (count - 1).bit_length())) % count
+        count, fill = len(y), filled(len(y))
         with jax.enable_x64(True):
             found = prove_rays(self.exact, self.problem.rows, theta[fill], w[fill], y[fill])
         return [np.asarray(v)[:count] for v in found]
+
+
+def filled(count: int) -> np.ndarray:
+    """Return 0, …, count − 1, and these again up to a power of two: few shapes compile."""
+    return np.arange(max(32, 1 << (count - 1).bit_length())) % count
 
 
 @jax.jit

@@ -37,6 +37,12 @@ MOST_ROWS, ROWS = 64, 8
 CONVERGED = 2e-13
 
 
+def sides(rows: int) -> list[int]:
+    """Return the sides of the arrays of kernels that together take W of up to so many rows."""
+    last = padded_side(rows)
+    return [*(side for side in SIDES if side < last), last]
+
+
 def dual_search_kernel(
     A: Array, S: Array, bounds: Bounds, limit: Array, cold: DualPoint, state: DualSearch,
     most: int, more: int,
@@ -45,9 +51,10 @@ def dual_search_kernel(
     whether it is optimal. `vmap` for many."""
     rows = min(*A.shape, MOST_ROWS)
     flags = jnp.stack([state.steps, *(v.astype(jnp.int32) for v in (state.open, state.optimal))])
-    y, v, last = state.point.y, state.point.v, padded_side(rows)
-    for side in [*(side for side in SIDES if side < last), last]:
-        search = _kernel(S, bounds, min(side, rows), side, most, more, side == last)
+    y, v = state.point.y, state.point.v
+    for side in sides(rows):
+        last = side >= rows
+        search = _kernel(S, bounds, min(side, rows), side, most, more, last)
         y, v, flags = search(limit, cold.v, flags, y, v)
     # A search that began again has other multipliers, all of which count from the cold point.
     again = flags[0] > most
@@ -186,10 +193,10 @@ def solved(M: Array, b: Array, k: Array, count: Array) -> Array:
 def damped_kernel(S: Array, W: Array, slack: Array, b: Array, damping: float, steps: int) -> Array:
     """Return `newton.damped` (k,) of one instance. W (k,): rows of S, which is shared, filled up
     with their number; slack, b (k,). `vmap` for many."""
-    m, rows, last = len(S), len(W), padded_side(len(W))
+    m, rows = len(S), len(W)
     count = jnp.sum(W < m, dtype=jnp.int32)
     y, done = jnp.zeros_like(b), 0
-    for side in [*(side for side in SIDES if side < last), last]:
+    for side in sides(rows):
         here = jnp.where((count > done) & (count <= side), count, 0)
         solution = _damped(m, min(rows, side), side, damping, steps, b.dtype)
         part = solution(here[None], S, W, slack, b)

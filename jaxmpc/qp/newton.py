@@ -301,12 +301,12 @@ def approximate(
     if min(A.shape) <= REDUCED_ROWS and not on_gpu():
         return in_blocks(partial(dense_steps, rho), (H, A), (weights, b))
     most = MOST_ROWS if on_gpu() else REDUCED_ROWS
-    W = true_places(active, most)
+    W, S = true_places(active, most), matmul(A, A.T)
     take = lambda v: v.at[W].get(mode="fill", fill_value=0.0)
 
     def half(b: tuple[Array, Array]) -> tuple[Array, Array]:
         right = take(matmul(b[0], A.T) - b[1])
-        y = damped(matmul(A, A.T), W, take(slack), right, 1 / rho, STEPS // 2)
+        y = damped(S, W, take(slack), right, 1 / rho, STEPS // 2)
         dy = jnp.zeros_like(b[1]).at[W].add(y, mode="drop")
         return b[0] - matmul(dy, A), dy
 
