@@ -129,6 +129,25 @@ def test_cache(learned, monkeypatch):
         assert again().alpha == found.solver.alpha and not calls
 
 
+def test_an_interrupt_gives_the_best_so_far_and_no_cache(learned, tmp_path, monkeypatch):
+    """Ctrl-C in the fourth gradient: the run of three steps, on hand in the exception."""
+    program, calls = loss_and_gradient(), []
+
+    def trap(*arguments):
+        calls.append(1)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return program(*arguments)
+
+    monkeypatch.setattr(penalties, "loss_and_gradient", lambda devices: trap)
+    tune = lambda: tune_penalties(mpc(), states(160, 0), cache=tmp_path, **SETTINGS)
+    with pytest.raises(jm.tuning.Interrupted, match="after 3 steps") as stop:
+        tune()
+    run = stop.value.run
+    assert run.history.steps == 3 and run.history.interrupted and run.solver.iterations == 30
+    assert run.after["loss"] <= run.before["loss"] and not list(tmp_path.iterdir())
+
+
 def unimproved(run):
     """The run as it would be had no step been better than the solver given."""
     return replace(run, improved=False, values=run.initial, after=run.before)
