@@ -38,7 +38,7 @@ def save_results(
         "before": counts[0], "after": counts[1],
     }  # fmt: skip
     document = {
-        "name": task.name, "options": command.options(task), "finished": True,
+        "name": task.name, "options": command.options(task), "finished": not h.interrupted,
         "result": result, "this_run": seconds, "states_without_plan": task.dropped,
         **run.record(), "versions": versions(),
     }  # fmt: skip
