@@ -6,9 +6,13 @@ evaluate_runs              limits kept, target reached, settling time and cost -
 RobotController            an MPC with the linear models of a robot
 robot_mpc                  the MPC of a robot, from the limits of its model
 LinearFeedback             LQR or PD with clipping, to compare with
+Noise                      random disturbances of the plant and of what is measured
+KalmanFilter               estimates of the state from noisy outputs -> Belief
 """
 
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
+from jaxmpc.closed_loop.noise import Noise
+from jaxmpc.closed_loop.observer import Belief, KalmanFilter
 from jaxmpc.closed_loop.outcome import Outcome, evaluate_runs
 from jaxmpc.closed_loop.robot_controller import RobotController
 from jaxmpc.closed_loop.robot_mpc import robot_mpc
@@ -17,7 +21,10 @@ from jaxmpc.closed_loop.simulate import simulate
 from jaxmpc.closed_loop.simulate_many import simulate_many
 
 __all__ = [
+    "Belief",
+    "KalmanFilter",
     "LinearFeedback",
+    "Noise",
     "Outcome",
     "RobotController",
     "Run",
