@@ -8,6 +8,7 @@ robot_mpc                  the MPC of a robot, from the limits of its model
 LinearFeedback             LQR or PD with clipping, to compare with
 Noise                      random disturbances of the plant and of what is measured
 KalmanFilter               estimates of the state from noisy outputs -> Belief
+randomised                 random masses, damping, payloads of robots, for `variations`
 """
 
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
@@ -19,6 +20,7 @@ from jaxmpc.closed_loop.robot_mpc import robot_mpc
 from jaxmpc.closed_loop.run import Run, lyapunov_decrease
 from jaxmpc.closed_loop.simulate import simulate
 from jaxmpc.closed_loop.simulate_many import simulate_many
+from jaxmpc.closed_loop.variations import randomised
 
 __all__ = [
     "Belief",
@@ -30,6 +32,7 @@ __all__ = [
     "Run",
     "evaluate_runs",
     "lyapunov_decrease",
+    "randomised",
     "robot_mpc",
     "simulate",
     "simulate_many",
