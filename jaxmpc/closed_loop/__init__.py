@@ -8,9 +8,13 @@ robot_mpc                  the MPC of a robot, from the limits of its model
 LinearFeedback             LQR or PD with clipping, to compare with
 Noise                      random disturbances of the plant and of what is measured
 KalmanFilter               estimates of the state from noisy outputs -> Belief
+Environment                a robot with a task, reset and step as pure functions
+                           -> EnvironmentState; robot_env.RobotEnv is Gymnasium's form
+MPCPolicy                  a controller as a policy of observations
 randomised                 random masses, damping, payloads of robots, for `variations`
 """
 
+from jaxmpc.closed_loop.environment import Environment, EnvironmentState, MPCPolicy
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
 from jaxmpc.closed_loop.noise import Noise
 from jaxmpc.closed_loop.observer import Belief, KalmanFilter
@@ -24,8 +28,11 @@ from jaxmpc.closed_loop.variations import randomised
 
 __all__ = [
     "Belief",
+    "Environment",
+    "EnvironmentState",
     "KalmanFilter",
     "LinearFeedback",
+    "MPCPolicy",
     "Noise",
     "Outcome",
     "RobotController",

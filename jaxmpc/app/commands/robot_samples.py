@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 
+from jaxmpc.closed_loop.environment import start_room
 from jaxmpc.closed_loop.variations import draw_factors, plant_numbers
 from jaxmpc.robots.robot import Robot
 
@@ -20,15 +21,10 @@ def draw_robots(
     are not zero: "mass" (count, bodies), "damping" (count, nv), "payload" (count,).
     """
     starts = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
+    home, below, above = start_room(robot)
+    aside = spread * starts.uniform(-1, 1, (count, robot.n))
     with jax.enable_x64(True):
-        home = np.asarray(robot.coordinates(np.asarray(robot.home)))
-        lower, upper = (
-            np.where(np.isfinite(end), np.abs(end - home), 1.0)
-            for end in (np.asarray(robot.state_limits.lower), robot.state_limits.upper)
-        )
-        aside = spread * starts.uniform(-1, 1, (count, robot.n))
-        xi = home + np.where(aside > 0, upper, lower) * aside
-        x0s = np.asarray(jax.vmap(robot.state)(xi))
+        x0s = np.asarray(jax.vmap(robot.state)(home + np.where(aside > 0, above, below) * aside))
     ranges = {"mass": (1 - mass, 1 + mass), "damping": (1 - damping, 1 + damping)}
     ranges = {name: range_ for name, range_ in ranges.items() if range_[1] > 1}
     if payload:
