@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.checks import fail, require_kind, require_real, whole
+from jaxmpc.checks import fail, require_real, whole
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
 from jaxmpc.closed_loop.noise import Noise
 from jaxmpc.closed_loop.observer import KalmanFilter, model_of, model_step
@@ -98,13 +98,15 @@ def checked_arguments(
         fail("delay", f"{delay}", "Give 0 or 1 samples; put longer delays into the model")
     plant = _checked_plant(plant, size, m)
     if observer is not None:
-        require_kind("observer", observer, KalmanFilter)
+        if not isinstance(observer, KalmanFilter):
+            fail("observer", f"is a {type(observer).__name__}", "Give a closed_loop.KalmanFilter")
         observer = arrays(observer.prepared())
         if observer.model.n != n:
             what = f"has {observer.model.n} states, the controller's model {n}"
             fail("observer.model", what, "Give the model of the same plant")
     if noise is not None:
-        require_kind("noise", noise, Noise)
+        if not isinstance(noise, Noise):
+            fail("noise", f"is a {type(noise).__name__}", "Give a closed_loop.Noise")
         noise = noise.prepared(n, n if observer is None else observer.p)
     if size != n and (noise is not None or observer is not None) and not hasattr(plant, "state"):
         what = f"a {type(plant).__name__} does not say which state has the coordinates ξ"

@@ -169,6 +169,21 @@ def test_delayed_mpc_with_filter_and_moving_references():
     np.testing.assert_allclose(late.cost, want.cost, atol=1e-7)
 
 
+def test_a_robots_own_model_predicts_its_delay():
+    """Inside its limits the predictor is the plant: the delayed loop of a robot far from where its
+    law was made is the one without delay, a sample later. Without prediction it is another."""
+    robot = jm.load_robot("pendulum")
+    mpc = jm.MPC(SYSTEM, Q, R, 2, inputs=robot.input_limits)
+    law = LinearFeedback(mpc, [[-40.0, -10.0]], robot)
+    late = jm.simulate(law, robot, np.array([0.6, -2.0]), 8, delay=1, previous_input=np.ones(1))
+    want = jm.simulate(law, robot, late.states[1], 8)
+    np.testing.assert_allclose(late.states[1:], want.states[:-1], atol=1e-9)
+    naive = jm.simulate(
+        law, robot, np.array([0.6, -2.0]), 8, delay=1, previous_input=np.ones(1), compensate=False
+    )
+    assert np.abs(naive.states - late.states).max() > 1e-3
+
+
 def test_references_of_each_loop():
     """What each gives alone, in both shapes; also where B = T + N, so that shapes coincide."""
     steps = 4
@@ -270,8 +285,8 @@ def test_bad_noise_and_observers_are_named():
         (lambda: run(noise=Noise(np.nan)), "noise.process: holds NaN"),
         (lambda: run(noise=Noise(1.0, seed=0.5)), "noise.seed: 0.5. Give a whole number"),
         (lambda: run(noise=Noise(1.0, [1.0, 1.0]), observer=FILTER), "noise.measurement: shape"),
-        (lambda: run(noise=0.1), "noise: is a float. Give a jm.Noise"),
-        (lambda: run(observer=SYSTEM), "observer: is a LinearSystem. Give a jm.Kalman"),
+        (lambda: run(noise=0.1), "noise: is a float. Give a closed_loop.Noise"),
+        (lambda: run(observer=SYSTEM), "observer: is a LinearSystem. Give a closed_loop.Kal"),
         (lambda: run(observer=KalmanFilter(odd, 1.0, 1.0)), "observer.C: is None with 3 states"),
         (
             lambda: run(observer=KalmanFilter(odd, 1.0, 1.0, C=np.eye(3))),
