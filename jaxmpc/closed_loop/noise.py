@@ -39,8 +39,8 @@ class Noise:
         and p outputs."""
         require_spread("noise.process", self.process, n)
         require_spread("noise.measurement", self.measurement, p)
-        process, measurement = arrays((self.process, self.measurement))
-        return Noise(process, measurement, self.key())
+        spreads = arrays([whole_array(spread) for spread in (self.process, self.measurement)])
+        return Noise(spreads[0], spreads[1], self.key())
 
     def key(self) -> Array:
         """Return the seed as the numbers (2,) of a JAX key."""
@@ -87,6 +87,13 @@ def require_spread(name: str, value: Any, size: int) -> None:
         require_symmetric_psd(name, value)
     elif concrete(value) and np.any(np.asarray(value) < 0):
         fail(name, "has a negative standard deviation", "Give numbers of at least 0")
+
+
+def whole_array(value: Any) -> Any:
+    """Return lists as one array, so that a pytree has one leaf for them; None as it is."""
+    if value is None:
+        return None
+    return np.asarray(value) if concrete(value) else jnp.asarray(value)
 
 
 def covariance(spread: Any, size: int) -> Any:

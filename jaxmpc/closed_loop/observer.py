@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import concrete, fail, require_finite, require_kind, require_shape
-from jaxmpc.closed_loop.noise import covariance, require_spread
+from jaxmpc.closed_loop.noise import covariance, require_spread, whole_array
 from jaxmpc.control.riccati import least_reached, lqr
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.qp.linalg import solve
@@ -80,12 +80,14 @@ class KalmanFilter:
         require_spread("observer.initial", self.initial, n)
         if self.start is not None:
             require_shape("observer.start", self.start, (n,), "Coordinates of the first estimate")
+        names = ("process", "measurement", "C", "initial", "start")
+        given = {name: whole_array(getattr(self, name)) for name in names}
         if self.initial is not None or self.gain is not None:
-            return self
+            return replace(self, **given)
         if isinstance(self.model, Robot):
             cure = "Give standard deviations, or use the LinearSystem of the set-point as the model"
             fail("observer.initial", "is None for a Robot", cure)
-        return replace(self, gain=self._steady_gain())
+        return replace(self, **given, gain=self._steady_gain())
 
     @property
     def p(self) -> int:

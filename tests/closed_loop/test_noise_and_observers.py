@@ -21,8 +21,8 @@ LAW = LinearFeedback(MPC, K)
 PLANT = jm.LinearPlant(SYSTEM, jm.Box([-9.0, -9.0], [9.0, 9.0]), jm.Box([-9.0], [9.0]))
 # Correlated process noise.
 W, V = np.array([[4e-4, 3e-4], [3e-4, 1e-3]]), np.array([[9e-4]])
-NOISE = Noise(W, V, seed=3)
-FILTER = KalmanFilter(SYSTEM, W, V)
+NOISE = Noise(W.tolist(), V.tolist(), seed=3)
+FILTER = KalmanFilter(SYSTEM, W.tolist(), [0.03], C=[[1.0, 0.0]])
 STEPS, LOOPS = 60, 4000
 
 
