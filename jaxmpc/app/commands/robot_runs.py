@@ -177,8 +177,10 @@ def require_sizes(command: "Simulate", robot: Robot) -> None:
     require_memory("--horizon", condensed_bytes(horizon, n, m, None, n + m), "Give fewer steps")
 
 
-# The fields of `Run` that the store keeps.
-STORED = tuple(field.name for field in dataclasses.fields(Run) if field.name != "slack")
+# The fields of `Run` that the store keeps: no robot here has an observer.
+STORED = tuple(
+    field.name for field in dataclasses.fields(Run) if field.name not in ("slack", "estimates")
+)
 
 
 def _run_fields(command: "Simulate", robot: Robot, steps: int) -> dict[str, store.Field]:
