@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxmpc.robots.physics import NO_CONSTRAINTS, mjx_module
+from jaxmpc.robots.physics import mjx_module
 
 if TYPE_CHECKING:
     from jaxmpc.robots.robot import Robot
@@ -101,7 +101,7 @@ def _ignored(robot: "Robot") -> tuple[str, ...]:
     counts: dict[str, int] = {}
 
     def acts(flag: "mujoco.mjtDisableBit") -> bool:
-        return not model.opt.disableflags & (int(flag) | NO_CONSTRAINTS)
+        return not model.opt.disableflags & (int(flag) | int(bit.mjDSBL_CONSTRAINT))
 
     if acts(bit.mjDSBL_CONTACT):
         counts["pairs of shapes in contact"] = sum(1 for _ in collision_driver.geom_pairs(model))
