@@ -53,8 +53,8 @@ class Physics:
             fail("model", f"MJX does not support it: {error}", "Take that out of the file")
 
     def step(self, x: Array, u: Array, numbers: Mapping[str, Any] | None = None) -> Array:
-        """Return x = (qpos, qvel) one physics step later: a function of x, u and nothing carried
-        along.
+        """Return x = (qpos, qvel, act) one physics step later: a function of x, u and nothing
+        carried along.
 
         numbers: fields of mjx.Model to replace. Differentiable in all three, forward and reverse;
         with constraints by `with_forward_jacobian`.
@@ -74,15 +74,16 @@ class Physics:
         # programs of the other precision, and MJX passes it arrays of the model.
         model = cast(copy.deepcopy(self.mjx).replace(**numbers))
         blank, h = cast(mjx.make_data(self.model)), model.opt.timestep
-        x_q, v = jnp.split(x, [self.model.nq])
+        x_q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
         q = normalised(self.joints, x_q)
-        forward = lambda q, v: accelerated(model, blank.replace(qpos=q, qvel=v, ctrl=u))
+        forward = lambda q, v: accelerated(model, blank.replace(qpos=q, qvel=v, act=act, ctrl=u))
         if self.model.opt.integrator == RK4:
             return self._runge_kutta(forward, q, v, h)
         integrate = mjx.euler if self.model.opt.integrator == EULER else mjx.implicit
-        v = integrate(model, forward(x_q, v)).qvel
+        after = integrate(model, forward(x_q, v))
+        v = after.qvel
         # MJX's own integration of positions has the derivative 0 for a body that does not turn.
-        return jnp.concatenate([retract(self.joints, q, h * v), v])
+        return jnp.concatenate([retract(self.joints, q, h * v), v, after.act])
 
     def _runge_kutta(self, forward: Callable, q: Array, v: Array, h: Array) -> Array:
         """Return (qpos, qvel) after a step of length h by the classical method of fourth order.
