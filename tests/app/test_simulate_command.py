@@ -20,6 +20,7 @@ from jaxmpc.app.commands import robot_runs
 from jaxmpc.app.commands.robot_samples import draw_robots
 from jaxmpc.app.plots import plot_runs
 from jaxmpc.closed_loop.outcome import evaluate_runs
+from jaxmpc.robots.captions import exceeded_limits
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.video import render, save_video
 
@@ -289,13 +290,19 @@ from jaxmpc.robots.video import render, save_video
 q = np.linspace(0, 1.2, 9)
 states = np.zeros((3, 9, 2))
 states[0, :, 0], states[1, :, 0] = q, -q
+robot, size = jm.load_robot("joint"), dict(every=2, width=160, height=120)
 try:
-    frames = render(jm.load_robot("joint"), states, every=2, width=160, height=120)
+    frames = render(robot, states, labels=False, **size)
 except RuntimeError as error:
     print(error, file=sys.stderr)
     sys.exit(3)
-save_video("film.gif", frames, 25)
-np.save("frames.npy", frames)
+states[1, 3, 1] = -2.1  # beyond 2 rad/s
+inputs = np.zeros((3, 8, 1))
+inputs[2, 5] = 2.1  # beyond 2 N m
+words = render(robot, states, inputs=inputs, target=[1.2], numbers=[4, 7, 9], **size)
+still = render(robot, states[0], target=[[0.0]] * 8 + [[1.2]], labels=False, **size)
+save_video("film.gif", words, 25)
+np.savez("frames.npz", frames=frames, words=words, still=still)
 """
 
 
@@ -308,7 +315,8 @@ def test_film_shows_the_motion(tmp_path):
     if done.returncode == 3:
         pytest.skip(done.stderr.splitlines()[-1])
     assert done.returncode == 0, done.stderr
-    frames = np.load(tmp_path / "frames.npy")
+    data = np.load(tmp_path / "frames.npz")
+    frames, words = data["frames"], data["words"].astype(int)
     assert frames.shape == (5, 240, 320, 3) and frames.dtype == np.uint8
     assert (frames[:, 125:, 165:] == 255).all(), "no fourth robot"
 
@@ -326,8 +334,43 @@ def test_film_shows_the_motion(tmp_path):
         (x0, y0), (x1, y1) = tool(tiles[0]), tool(tiles[-1])
         assert x0 > 20, "at q = 0 the tool is to the right"
         assert np.sign(round((y1 - y0) / 10)) == sign and (x0 - x1 > 10) == bool(sign)
+
+    # With words: a line above, the legend below, between them the same robots and the target's.
+    line, foot = 20, 40
+    assert words.shape == (5, 240 + line + foot, 320, 3)
+    inner = words[:, line:-foot]
+    green = lambda film: ((film[..., 1] > film[..., 0] + 30) & (film[..., 1] > film[..., 2])).sum()
+    assert green(frames.astype(int)) == 0, "no target asked for"
+    for top, left in ((0, 0), (0, 160), (120, 0)):
+        assert green(inner[0, top : top + 120, left : left + 160]) > 50
+    moving = data["still"].astype(int)
+    assert green(moving[0]) == 0 and green(moving[2]) > 50, "the target moves away at the end"
+    red = (inner[..., 0] > 180) & (inner[..., 1:] < 60).all(axis=-1)
+    edge = {(top, left): red[:, top + 1, left + 30 : left + 130].all(axis=1)
+            for top, left in ((0, 0), (0, 160), (120, 0))}  # fmt: skip
+    np.testing.assert_array_equal(edge[0, 0], [0, 0, 0, 0, 0])
+    np.testing.assert_array_equal(edge[0, 160], [0, 1, 0, 0, 0])  # sample 3, between two frames
+    np.testing.assert_array_equal(edge[120, 0], [0, 0, 1, 0, 0])  # sample 5
+    dark = (words < 90).all(axis=-1)
+    assert dark[:, :line, :60].any(axis=(1, 2)).all(), "the robot's name"
+    clock = words[:, :line, 260:]
+    assert dark[:, :line, 260:].any(axis=(1, 2)).all() and np.any(clock[0] != clock[1])
+    assert np.array_equal(words[0, :line, :200], words[1, :line, :200])
+    assert dark[:, -foot:].any(axis=(1, 2)).all(), "the legend"
     with Image.open(tmp_path / "film.gif") as film:
-        assert film.n_frames == 5 and film.size == (320, 240) and film.info["duration"] == 40
+        assert film.n_frames == 5 and film.size == (320, 300) and film.info["duration"] == 40
+        film.seek(1)
+        assert np.asarray(film.convert("RGB"))[line + 1, 200] == pytest.approx([200, 20, 20], abs=9)
+
+
+def test_film_names_the_limit_exceeded_most(joint):
+    """From a frame to the next, relative to half the range: 1.5 rad, 2 rad/s, 2 N m."""
+    states, inputs = np.zeros((2, 7, 2)), np.zeros((2, 6, 1))
+    states[0, 3] = [1.6, 2.2]  # 7 % and 10 %
+    states[1, 6, 0], inputs[1, 0] = -1.5 - 1e-7, 2.5
+    found = exceeded_limits(joint, states, inputs, 2)
+    assert found.tolist() == [["", "q velocity [rad/s]", "", ""], ["tau [N m]", "", "", ""]]
+    assert exceeded_limits(joint, states[1:], None, 2).tolist() == [[""] * 4]
 
 
 def test_film_refuses_what_it_cannot_draw(tmp_path, monkeypatch, joint):
@@ -336,6 +379,10 @@ def test_film_refuses_what_it_cannot_draw(tmp_path, monkeypatch, joint):
         (np.full((3, 2), np.nan), {}, "states: holds NaN"),
         (np.zeros((3, 2)), {"every": 0}, "every: 0"),
         (np.zeros((3, 2)), {"camera": "left"}, "none named 'left'"),
+        (np.zeros((3, 2)), {"inputs": np.zeros((3, 1))}, r"inputs: shape \(3, 1\)"),
+        (np.zeros((3, 2)), {"target": [0.0, 1.0]}, r"target: shape \(2,\)"),
+        (np.zeros((3, 2)), {"target": [np.nan]}, "target: holds NaN"),
+        (np.zeros((3, 2)), {"numbers": [1, 2]}, "numbers: 2 of 1 robots"),
     ):
         with pytest.raises(ValueError, match=message):
             render(joint, states, **options)

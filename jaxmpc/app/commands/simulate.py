@@ -166,7 +166,8 @@ class Simulate:
             run, robot, reference=runs.reference, input_reference=runs.input_reference
         )
         figure.savefig(self.output / "runs.png", dpi=150)
-        if self.video and film(robot, run, self.video, self.output / "robots.gif"):
+        video = self.output / "robots.gif"
+        if self.video and film(robot, run, runs.reference, self.video, video):
             files.append("robots.gif")
         summary = summarise(runs, run, outcome, timing)
         write_json(self.output / "summary.json", summary)
