@@ -1,8 +1,11 @@
 """Videos of robots, by MuJoCo's renderer and without a window."""
 
+import base64
 import copy
+import io
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +131,28 @@ def _add_ghost(scene: Any, model: Any, data: Any) -> None:
         geom.pos[:] += 0.01 * (geom.pos - eye)
 
 
+@dataclass(frozen=True)
+class Film:
+    """Frames (F, h, w, 3), uint8, of `render`, at `fps` of them a second: notebooks play it.
+
+    It is an image in the page (a GIF), so that a saved notebook needs no file beside it.
+    Raises ValueError for other frames.
+    """
+
+    frames: np.ndarray
+    fps: float
+
+    def __post_init__(self) -> None:
+        check_frames(self.frames, self.fps)
+
+    def _repr_html_(self) -> str:
+        """Return the film as HTML, which Jupyter shows."""
+        data = io.BytesIO()
+        write_gif(data, self.frames, self.fps)
+        text = base64.b64encode(data.getvalue()).decode()
+        return f'<img src="data:image/gif;base64,{text}" alt="{len(self.frames)} frames">'
+
+
 def save_video(path: str | Path, frames: Any, fps: float) -> None:
     """Write frames (F, h, w, 3), uint8, as path.gif, or as path.mp4 if imageio has ffmpeg.
 
@@ -135,24 +160,10 @@ def save_video(path: str | Path, frames: Any, fps: float) -> None:
     Raises ValueError for other endings and frames, and where .mp4 cannot be written.
     """
     path, frames = Path(path), np.asarray(frames)
-    if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or not frames.size:
-        problem = f"shape {frames.shape}, {frames.dtype}"
-        fail("frames", problem, "Give (frames, height, width, 3), uint8")
-    if not 0 < fps < np.inf:
-        fail("fps", f"{fps}", "Give a positive number")
+    check_frames(frames, fps)
     kind = path.suffix.lower()
     if kind == ".gif":
-        from PIL import Image
-
-        # One palette for all frames: with one each, colours flicker.
-        sheet = Image.fromarray(frames[:: max(1, len(frames) // 8)].reshape(-1, *frames.shape[2:]))
-        palette = sheet.quantize(256)
-        first, *rest = (
-            Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
-            for frame in frames
-        )
-        milliseconds = max(10, 10 * round(100 / fps))
-        first.save(path, save_all=True, append_images=rest, duration=milliseconds, loop=0)
+        write_gif(path, frames, fps)
     elif kind == ".mp4":
         try:
             import imageio.v3 as imageio
@@ -164,3 +175,28 @@ def save_video(path: str | Path, frames: Any, fps: float) -> None:
         imageio.imwrite(path, frames, fps=fps)
     else:
         fail(str(path), f"the ending {kind!r} is no video", "Give .gif or .mp4")
+
+
+def check_frames(frames: Any, fps: float) -> None:
+    """Raise ValueError unless these are frames, and a number of them a second."""
+    frames = np.asarray(frames)
+    if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or not frames.size:
+        problem = f"shape {frames.shape}, {frames.dtype}"
+        fail("frames", problem, "Give (frames, height, width, 3), uint8")
+    if not 0 < fps < np.inf:
+        fail("fps", f"{fps}", "Give a positive number")
+
+
+def write_gif(file: Any, frames: np.ndarray, fps: float) -> None:
+    """Write frames to a path or an open file, as a GIF that starts again at its end."""
+    from PIL import Image
+
+    # One palette for all frames: with one each, colours flicker.
+    sheet = Image.fromarray(frames[:: max(1, len(frames) // 8)].reshape(-1, *frames.shape[2:]))
+    palette = sheet.quantize(256)
+    first, *rest = (
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in frames
+    )
+    milliseconds = max(10, 10 * round(100 / fps))
+    first.save(file, format="GIF", save_all=True, append_images=rest, duration=milliseconds, loop=0)

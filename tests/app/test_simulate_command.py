@@ -1,7 +1,10 @@
 """jaxmpc simulate: files, table and picture say what the states in the store say."""
 
+import base64
+import io
 import json
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -19,10 +22,12 @@ from jaxmpc.app import cli
 from jaxmpc.app.commands import robot_runs
 from jaxmpc.app.commands.robot_samples import draw_robots
 from jaxmpc.app.plots import plot_runs
+from jaxmpc.app.plots.closed_loops import PLANS
 from jaxmpc.closed_loop.outcome import evaluate_runs
+from jaxmpc.qp.status import Status
 from jaxmpc.robots.captions import exceeded_limits
 from jaxmpc.robots.load import load_robot
-from jaxmpc.robots.video import render, save_video
+from jaxmpc.robots.video import Film, render, save_video
 
 # Models at the set-point compile in half the time.
 LINE = (
@@ -125,7 +130,9 @@ def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
     median, last = (None if np.isinf(v) else pytest.approx(v) for v in settled[[3, 5]])
     assert summary["settling"] == {"median": median, "95 %": last}
     solved, fallback = (data["status"] == 1).values, data["fallback"].values
-    assert summary["plans_solved"] == solved.sum() and summary["fallback_plans"] == fallback.sum()
+    assert summary["plans_solved"] == solved.sum()
+    assert summary["fallback_plans"] == (fallback & solved).sum()
+    assert summary["unsolved_plans"] == (~solved).sum()
     assert summary["plans_valid"] == (solved & ~fallback).all(axis=1).sum()
     cost = np.sum((x[:, :-1] ** 2) @ [1 / 1.5**2, 0.01 / 4] + 0.01 / 4 * u[:, :, 0] ** 2, axis=1)
     assert summary["cost"]["median"] == pytest.approx(np.sort(cost)[3], rel=1e-4)
@@ -134,6 +141,8 @@ def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
     assert table["success"].startswith(f"{summary['success']}  ")
     assert table["limits kept"].startswith(f"{kept.sum()}  ")
     assert f"of {solved.size}" in table["plans solved"]
+    assert table["fallback"].startswith(f"{(fallback & solved).sum()}  ")
+    assert table["unsolved"].startswith(f"{(~solved).sum()}  ")
     assert "real time" in table and "MPC solves/s" in table["run"]
 
     again = run(f"{LINE} --output 'my runs' --resume --video 0")  # nothing is left to do
@@ -222,14 +231,15 @@ def test_outcome_and_picture_of_runs_made_by_hand(joint):
     x = np.stack([np.stack([q, dq], axis=1)] * 4)
     x[1, 3, 1], x[2, -1, 0], x[3, 5, 0] = -2.00001, 0.5, np.nan
     u = np.zeros((4, 10, 1))
-    fallback = np.zeros((4, 10), bool)
-    fallback[1, 2] = True
-    run = by_hand(x, u, fallback=fallback)
+    fallback, status = np.zeros((4, 10), bool), np.ones((4, 10), int)
+    fallback[1, 2], status[2, 6:8] = True, Status.ITERATION_LIMIT
+    fallback[2, 6] = True  # of a plan that is not solved: says nothing
+    run = by_hand(x, u, fallback=fallback, status=status)
     outcome = evaluate_runs(run, joint, np.array([1.0, 0.0]))
     assert list(outcome.kept) == [True, False, True, False]
     assert list(outcome.reached) == [True, True, False, True]
     assert list(outcome.success) == [True, False, False, False]
-    assert list(outcome.plans_valid) == [True, False, True, True]
+    assert list(outcome.plans_valid) == [True, False, False, True]
     # q = 0.8 at sample 4, 1 from sample 5 on: 0.05 s.
     np.testing.assert_allclose(outcome.settling, [0.05, 0.05, np.inf, 0.06])
     np.testing.assert_allclose(outcome.cost, 10.0)
@@ -241,16 +251,28 @@ def test_outcome_and_picture_of_runs_made_by_hand(joint):
     figure = plot_runs(run, joint, reference=np.array([1.0, 0.0]), robots=[0, 1, 2])
     labels = [(ax.get_title(), ax.get_ylabel()) for ax in figure.axes if ax.axison]
     assert labels == [("position", "q [rad]"), ("velocity", "q [rad/s]"), ("input", "tau [N m]")]
-    assert "4 closed loops of 0.1 s, 3 shown\nlimits kept by 2; fallback plans: 1 of 40" in (
-        figure.get_suptitle()
+    assert figure.get_suptitle() == (
+        "joint: 4 closed loops of 0.1 s, 3 shown. Limits kept by 2 of 4\n"
+        "40 plans: 37 within all limits, 1 need slack (fallback), 2 not solved"
     )
+    colours = {name: colour for name, (colour, _) in PLANS.items()}
+    (slack,), (open_,) = (
+        [line for line in figure.axes[0].lines if line.get_color() == colours[name]
+         and np.isfinite(line.get_ydata()).any()] for name in ("fallback", "unsolved")
+    )  # fmt: skip
+    for line, first, last in ((slack, 2, 3), (open_, 6, 8)):
+        np.testing.assert_array_equal(np.flatnonzero(np.isfinite(line.get_ydata()))[[0, -1]],
+                                      [first, last])  # fmt: skip
     (red,) = (line for line in figure.axes[1].lines if len(line.get_xdata()) == 1)
     np.testing.assert_allclose(red.get_xydata(), [[0.03, -2.00001]])
     low, high = figure.axes[1].get_ylim()
     assert low < -2 < 2 < high
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [
-        "one robot", "outside limits", "set-point", "fallback plan", "limit exceeded",
+        "one robot", "beyond the limits", "set-point", "its plan needs slack (fallback)",
+        "its plan was not solved", "limit exceeded",
     ]  # fmt: skip
+    feedback = by_hand(x[:1], u[:1], status=np.zeros((1, 10), int))  # a law without plans
+    assert "a law without plans" in plot_runs(feedback, joint).get_suptitle()
     with pytest.raises(ValueError, match="robots: .*from 0 to 3"):
         plot_runs(run, joint, robots=[4])
 
@@ -363,6 +385,18 @@ def test_film_shows_the_motion(tmp_path):
         assert np.asarray(film.convert("RGB"))[line + 1, 200] == pytest.approx([200, 20, 20], abs=9)
 
 
+def test_notebooks_play_a_film():
+    """The HTML holds a GIF of these frames, whatever else lies in the folder."""
+    frames = np.zeros((3, 6, 8, 3), np.uint8)
+    frames[1, :, 4:] = [0, 158, 115]
+    html = Film(frames, 20)._repr_html_()
+    (data,) = re.findall(r'^<img src="data:image/gif;base64,([^"]+)" alt="3 frames">$', html)
+    with Image.open(io.BytesIO(base64.b64decode(data))) as film:
+        assert film.n_frames == 3 and film.info["duration"] == 50
+        film.seek(1)
+        np.testing.assert_array_equal(np.asarray(film.convert("RGB")), frames[1])
+
+
 def test_film_names_the_limit_exceeded_most(joint):
     """From a frame to the next, relative to half the range: 1.5 rad, 2 rad/s, 2 N m."""
     states, inputs = np.zeros((2, 7, 2)), np.zeros((2, 6, 1))
@@ -396,6 +430,8 @@ def test_film_refuses_what_it_cannot_draw(tmp_path, monkeypatch, joint):
     ):
         with pytest.raises(ValueError, match=message):
             save_video(tmp_path / name, given, 25)
+    with pytest.raises(ValueError, match="fps: 0"):
+        Film(frames, 0)
     monkeypatch.setitem(sys.modules, "imageio", None)
     monkeypatch.setitem(sys.modules, "imageio.v3", None)
     with pytest.raises(ValueError, match=r"imageio\[ffmpeg\]"):
