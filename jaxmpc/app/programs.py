@@ -78,6 +78,7 @@ def kept_programs(words: Sequence[str]) -> Iterator[None]:
         with contextlib.suppress(OSError):
             _end(own, given)
         shutil.rmtree(own, ignore_errors=True)
+        del os.environ["JAX_COMPILATION_CACHE_DIR"]
 
 
 def times_file() -> Path | None:

@@ -17,9 +17,9 @@ from jaxmpc.compiled import Compiled
 from jaxmpc.robots.robot import Robot
 from jaxmpc.runs import fingerprint, versions, write_json
 
-# Seconds of the first compile by degrees of freedom, (at none, for each): XLA and tracing for CPUs.
+# Seconds of the first compile on free cores: with no degree of freedom, and for each of them.
 GUESSES = {
-    "loops": (30.0, 8.0),
+    "loops": (20.0, 6.0),
     "map of limits": (60.0, 10.0),
     "map of recursion": (60.0, 10.0),
     "gradients": (100.0, 40.0),
@@ -59,7 +59,7 @@ class Compiling:
             case _:
                 base, each = GUESSES[kind]
                 guess = base + each * robot.mujoco.nv
-                text = f"about {guess:.0f} s (a guess by the number of joints)"
+                text = f"about {guess:.0f} s on free cores (a guess by the number of joints)"
         print(f"compiling, {text}", file=sys.stderr, flush=True)
         now = time.perf_counter()
         return cls(times, key, now, now, now)
