@@ -39,7 +39,7 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
     points = rmap.points
     if points.shape[1] != 2:
         fail("rmap", f"maps {points.shape[1]} coordinates", "A plot needs 2: choose `axes`")
-    ax = new_axes(10.4) if ax is None else ax
+    ax = new_axes(9.6) if ax is None else ax
     handles: list[Any] = []
     shown, colours = np.zeros(len(points), int), {}
     for i, (name, colour, where) in enumerate(_outcomes(rmap)):
@@ -61,7 +61,9 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
     )]  # fmt: skip
     worst = rmap.worst()
     if worst is not None:
-        name = f"deepest broken promise, fails after {rmap.first_loss[worst] * rmap.robot.dt:.3g} s"
+        name = (
+            f"deepest broken promise,\nfails after {rmap.first_loss[worst] * rmap.robot.dt:.3g} s"
+        )
         marks.append(
             (points[worst], name, {"marker": "o", "ms": 6, "mfc": "white", "mec": "black"})
         )
@@ -89,8 +91,8 @@ def _outcomes(rmap: RobotMap) -> list[tuple[str, str, np.ndarray]]:
         words = (
             "promise kept: the robot has\na plan at each sample",
             "promise broken: the robot's\nplans run out",
-            "lost on the linear model,\nand on the robot",
-            "lost on the linear model,\nnot on the robot",
+            "plans run out on the linear\nmodel, and on the robot",
+            "plans run out on the linear\nmodel, not on the robot",
             "linear closed loop undecided",
         )  # fmt: skip
     promised, held = rmap.promised, rmap.held
@@ -113,10 +115,12 @@ def _robot_map_title(rmap: RobotMap) -> str:
     name = rmap.robot.name
     mpc = rmap.linear.mpc
     what = {
-        "limits": "is a feasible state safe on the robot?",
-        "recursion": "does the robot keep having plans?",
+        "limits": "is a feasible state safe on the robot",
+        "recursion": "does the robot keep having plans",
     }[rmap.claim]
-    first = f"{name}: {what} {rmap.seconds:g} s, horizon N = {mpc.horizon} of {rmap.robot.dt:g} s"
+    first = (
+        f"{name}: {what} for {rmap.seconds:g} s?\nN = {mpc.horizon} steps of {rmap.robot.dt:g} s"
+    )
     labels = mpc.system.state_labels
     others = [i for i in range(len(labels)) if i not in rmap.linear.axes]
     fixed = rmap.linear.fixed
@@ -124,4 +128,4 @@ def _robot_map_title(rmap: RobotMap) -> str:
         return first
     values = [f"{labels[i]} = {fixed[i]:.4g}" for i in others]
     shown = ", ".join(values) if len(values) <= 4 else f"{len(values)} other coordinates as fixed"
-    return f"{first}\nslice at {shown}"
+    return f"{first}, slice at {shown}"
