@@ -15,7 +15,7 @@ from jaxmpc.checks import fail, require_finite, require_shape, whole
 from jaxmpc.robots.captions import TARGET, captioned, exceeded_limits
 from jaxmpc.robots.robot import Robot
 
-OPACITY = 0.4  # of the target
+OPACITY = 0.3  # of the target
 
 
 def render(

@@ -130,7 +130,12 @@ def test_recursion_shows_fates_set_and_counterexample(tmp_path):
     names = ("infeasible", -1), ("undecided", -2), ("kept for 9 steps", 0), ("lost at step 1", 1)
     counts = [(f"{name} ({np.sum(report.lost_at == fate):,})") for name, fate in names]
     assert shown[:4] == counts and shown[4].startswith("lost at step 4 to 5 (")
-    assert shown[-4:] == ["X_7", "counterexample x", "next state", "half-space it leaves"]
+    assert shown[-4:] == [
+        "X_7: states with a plan",
+        "counterexample x",
+        "next state",
+        "half-space it leaves",
+    ]
     cut = next(line for line in ax.lines if np.allclose(line.get_xdata(), 1.0))
     assert np.ptp(cut.get_ydata()) > 4  # across the picture
     assert ax.get_title(loc="left") == "Closed loops of 9 steps, horizon N = 7"
