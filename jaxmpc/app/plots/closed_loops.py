@@ -71,12 +71,10 @@ def plot_runs(
             handles.append(line(words, color=colour, lw=1.6))
     if not all(part[shown].all() for part in kept):
         handles.append(line("limit exceeded", color=BROKEN, marker="o", ms=3, ls=""))
-    # Two panels, of a linear plant, have room for two columns of words.
-    width = figure.get_figwidth()
+    columns = max(1, min(len(handles), int(figure.get_figwidth() / 2.5)))
     figure.legend(
-        handles=handles, loc="outside lower left", ncols=max(1, min(len(handles), int(width / 2.5))),
-        fontsize=8, frameon=False,
-    )  # fmt: skip
+        handles=handles, loc="outside lower left", ncols=columns, fontsize=8, frameon=False
+    )
     return figure
 
 
