@@ -20,9 +20,9 @@ from jaxmpc.runs import fingerprint, versions, write_json
 # Seconds of the first compile on free cores: with no degree of freedom, and for each of them.
 GUESSES = {
     "loops": (20.0, 6.0),
-    "map of limits": (60.0, 10.0),
-    "map of recursion": (60.0, 10.0),
-    "gradients": (100.0, 40.0),
+    "map of limits": (45.0, 8.0),
+    "map of recursion": (45.0, 8.0),
+    "gradients": (30.0, 30.0),
 }
 
 
