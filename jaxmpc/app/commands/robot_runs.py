@@ -86,10 +86,6 @@ class RobotRuns:
         steps = max(1, round(command.seconds / robot.dt))
         each = 256 if jax.default_backend() == "cpu" else 4096
         chunk = command.chunk or (command.devices or 1) * each
-        # The steps from here on compile programs.
-        programs = {name: getattr(command, name) for name in PROGRAM}
-        programs |= {"steps": steps, "chunk": min(chunk, command.count)}
-        compiling = Compiling.announce(robot, "loops", programs)
         target = None if command.target is None else np.array(command.target)
         file: dict[str, Any] = {}
         if command.config is not None:
@@ -98,6 +94,11 @@ class RobotRuns:
         file |= {key: np.array(value) for key, value in options.items() if value is not None}
         more = {"terminal_cost": file["terminal_cost"]} if "terminal_cost" in file else {}
         horizon: Any = command.horizon
+        x, input_reference = robot.equilibrium(target)
+        # The steps from here on compile programs.
+        programs = {name: getattr(command, name) for name in PROGRAM}
+        programs |= {"steps": steps, "chunk": min(chunk, command.count)}
+        compiling = Compiling.announce(robot, "loops", programs)
         mpc = robot_mpc(
             robot, file.get("Q"), file.get("R"), horizon, target=target,
             margin=command.margin or 0.0, **more,
@@ -111,7 +112,6 @@ class RobotRuns:
                 controller = RobotController(
                     robot, mpc, solver, linearize=str(command.linearize), penalty=command.penalty
                 )
-        x, input_reference = robot.equilibrium(target)
         with jax.enable_x64(True):
             reference = np.asarray(robot.coordinates(x))
         starts, variations = draw_robots(
