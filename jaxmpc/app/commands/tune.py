@@ -1,9 +1,11 @@
 """The command `jaxmpc tune weights`: its options and help."""
 
+import contextlib
 import dataclasses
 import json
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,6 +13,7 @@ import jax
 import numpy as np
 import optax
 
+from jaxmpc.app.commands.compiling import Compiling
 from jaxmpc.app.commands.options import (
     Horizon,
     Switch,
@@ -58,6 +61,7 @@ class TuneWeights:
       $ jaxmpc tune weights --config pendulum.toml --tune Q R P --updates 50 --output tuned/a
       $ jaxmpc tune weights --robot arm2 --mass 0.2 --payload 0.5 --tune Q R rho tightening
       Before the first step the program compiles: half a minute for one joint, minutes for an arm.
+      What is compiled is kept for the next time, see jaxmpc simulate --help.
 
     What can be tuned (--tune)
       Q, R        weights of states and inputs; diagonal, or --weights full: L L', any positive
@@ -74,8 +78,8 @@ class TuneWeights:
       violated    validation loops that violate a limit of states or inputs by more than 1e-6 (of
                   the limit, where that is above 1), not counting the tightening
       unsolved    plans whose residuals exceed 1e-6 (float64) or 1e-3 (float32)
-      infeasible  plans proved infeasible
-      fallback    plans that violate soft limits somewhere on their horizon
+      infeasible  those of them that are proved infeasible
+      fallback    plans that are solved with slack: soft limits are violated on their horizon
       at target   loops that end within --tolerance of half the range of each state
       then        the weights
       All but the loss is counted in new simulations, those after tuning with tuned.toml as written.
@@ -223,7 +227,7 @@ class TuneWeights:
 
     def tuned(self, task: TuningTask) -> TuningRun:
         """Return the run of `tune_weights`."""
-        with jax.enable_x64(task.dtype == "float64"):
+        with jax.enable_x64(task.dtype == "float64"), self.waiting(task):
             return tune_weights(
                 task.make, task.parameters, task.plant, task.x0s, task.loss, task.steps,
                 reference=task.reference, input_reference=task.input_reference,
@@ -232,6 +236,20 @@ class TuneWeights:
                 batch=self.batch, mode=self.mode, seed=self.seed,
                 checkpoint=self.output / CHECKPOINT, progress=sys.stderr.isatty(),
             )  # fmt: skip
+
+    @contextlib.contextmanager
+    def waiting(self, task: TuningTask) -> Iterator[None]:
+        """Say with --robot how long it compiles; only in the end is it known which was the last."""
+        if self.robot is None:
+            yield
+            return
+        options = self.options(task)
+        irrelevant = "seed spread mass damping payload violation settling tolerance".split()
+        programs = {k: v for k, v in options.items() if k not in irrelevant}
+        compiling = Compiling.announce(task.plant, "gradients", programs)
+        with compiling.followed():
+            yield
+        compiling.over()
 
     def prepare(self) -> TuningTask:
         """Check the options, build the task and open the folder. No closed loop compiles.
