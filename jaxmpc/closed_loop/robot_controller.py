@@ -17,7 +17,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import layout
 from jaxmpc.mpc.soften import soften
 from jaxmpc.mpc.stagewise import factor_stages, solve_stagewise
-from jaxmpc.qp.admm import ADMM
+from jaxmpc.qp.admm import ADMM, DEFAULT
 from jaxmpc.qp.precision import arrays, floating_dtype
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
@@ -34,7 +34,7 @@ class RobotController:
     robot: Robot (its predictor is the model) or LinearPlant.
     mpc: the problem, from `robot_mpc`; its `system` is used by linearize="set-point" only.
     solver: None for Newton steps from the last plan and, where they do not end at the solution, an
-      interior point method, without ADMM steps before them.
+      interior point method, without ADMM steps before them; with "set-point" the one of `solve`.
     linearize: where the linear models are taken,
       "set-point"   once, as mpc.system says; matrices are factored once for all robots;
       "state"       about the measured state and the last input, at each sample;
@@ -68,7 +68,8 @@ class RobotController:
         self, robot: Any, mpc: MPC, solver: ADMM | None = None, linearize: str = "state",
         exact: bool = False, penalty: Any = 1e4,
     ) -> None:  # fmt: skip
-        solver = SOLVER if solver is None else solver
+        if solver is None:
+            solver = DEFAULT if linearize == "set-point" else SOLVER
         parts = prepared(robot, mpc, solver, linearize, penalty)
         self.__dict__.update(
             robot=robot, mpc=mpc, solver=arrays(solver), linearize=linearize, exact=exact,

@@ -20,7 +20,6 @@ from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.qp.admm import ADMM
 from jaxmpc.recursion.analysis import examine
 from jaxmpc.recursion.budget import Budget
 from jaxmpc.robot_maps.loops import RobotLoops
@@ -30,8 +29,6 @@ from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
 
 CLAIMS = ("limits", "recursion")
-# The default controller's solver: about 99 % of its plans in float64 are SOLVED.
-SOLVER = ADMM(iterations=100, refine=10)
 
 
 def map_robot(
@@ -132,7 +129,7 @@ class RobotSetting:
             fail("x0s", f"shape {points.shape}", cure)
         if controller is None:
             with jax.enable_x64(True):
-                controller = RobotController(robot, mpc, SOLVER, linearize="set-point")
+                controller = RobotController(robot, mpc, linearize="set-point")
         steps = max(1, round(seconds / robot.dt))
         setting = cls(
             robot, limited, problem, controller, points, fixed, reference, np.asarray(u), steps,

@@ -82,7 +82,7 @@ class ClosedLoopObjective:
             "losses": losses, "design": design,
             "unsolved": fraction(run.status != Status.SOLVED),
             "infeasible": fraction(run.status == Status.PRIMAL_INFEASIBLE),
-            "fallback": fraction(run.fallback),
+            "fallback": fraction(run.fallback & (run.status == Status.SOLVED)),
             "violation": worst > TOLERANCE[run.states.dtype.name],
         }  # fmt: skip
         return total + design, aux

@@ -9,7 +9,6 @@ import numpy as np
 import optax
 
 from jaxmpc.checks import fail, whole
-from jaxmpc.closed_loop.robot_controller import SOLVER
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.closed_loop.simulate_many import as_argument, require_variations
 from jaxmpc.devices import chosen_devices
@@ -29,6 +28,9 @@ from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameters, raw, require_parameters
 from jaxmpc.tuning.result import TuningRun, finished
 from jaxmpc.tuning.settings import Settings
+
+# Where make_mpc returns a problem and no solver is given.
+SOLVER = ADMM(iterations=50, rho=1.0, alpha=1.6, refine=20)
 
 
 def tune_weights(
@@ -73,7 +75,7 @@ def tune_weights(
 
         unsolved    fraction of plans that are not SOLVED, infeasible ones and others
         infeasible  fraction of plans proved infeasible
-        fallback    fraction of plans that violate soft rows
+        fallback    fraction of plans that were solved and violate soft rows
         violation   fraction of loops that leave the limits of a ClosedLoopLoss (of another loss:
                     the controller's own) by more than `violation.TOLERANCE`
         excluded    loops left out because their loss was not finite

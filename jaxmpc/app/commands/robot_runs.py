@@ -108,7 +108,9 @@ class RobotRuns:
             if command.linearize == "lqr":
                 controller = LinearFeedback(mpc, lqr(mpc.system, mpc.Q, mpc.R).K, robot)
             else:
-                solver = ADMM(iterations=command.iterations, refine=newton_steps(command))
+                solver = None
+                if (command.iterations, command.refine) != (None, None):
+                    solver = ADMM(iterations=command.iterations or 0, refine=command.refine)
                 controller = RobotController(
                     robot, mpc, solver, linearize=str(command.linearize), penalty=command.penalty
                 )
@@ -230,12 +232,5 @@ def _decisive(command: "Simulate", robot: Robot, mpc: MPC) -> dict[str, Any]:
             for name, value in (("Q", mpc.Q), ("R", mpc.R), ("P", mpc.terminal_cost))
         }
         options["config"] = "tuned"
-    options |= {**weights, "refine": newton_steps(command), "model": model_hash(robot)}
+    options |= {**weights, "model": model_hash(robot)}
     return options
-
-
-def newton_steps(command: "Simulate") -> int:
-    """Return --refine, or its default by precision: ADMM alone seldom reaches 1e-6."""
-    if command.refine is not None:
-        return command.refine
-    return 3 if command.dtype == "float64" else 2

@@ -54,7 +54,7 @@ class Simulate:
       worst          the largest violation relative to half the range, in its own unit
       plans solved   plans whose residuals pass: 1e-6 in float64, 1e-3 in float32
       fallback       solved plans that need slack: soft limits are violated on their horizon
-      unsolved       the other plans: raise --iterations or --refine; of limits they say nothing
+      unsolved       the other plans; of limits they say nothing
       settling       time after which a robot stays within the tolerance for the rest of its run
       cost           sum of (x - x_target)'Q(x - x_target) + (u - u_target)'R(u - u_target)
       run            wall time without compiler, files and plots
@@ -120,10 +120,11 @@ class Simulate:
     """Room that the MPC leaves to state limits, as a fraction of half the range."""
     penalty: Annotated[float | None, option("RHO", "from --config, else 1e4")] = None
     """L1 weight of state limits; too small a weight violates limits that could be kept."""
-    iterations: Annotated[int, option("K", "50")] = 50
+    iterations: Annotated[int | None, option("K", "0; with set-point 50")] = None
     """ADMM steps of each plan."""
-    refine: Annotated[int | None, option("K", "2; with float64 3")] = None
-    """Newton steps after them; 3 solve nearly all plans, in two to four times the time."""
+    refine: Annotated[int | None, option("K", "as many as are needed")] = None
+    """Newton steps after them at most. A number bounds the time of a plan and gives up the
+    interior point method, which solves what Newton steps do not."""
     mass: Annotated[float, option("FRACTION", "0")] = 0.0
     """Each body's mass and inertia times a number from 1 - FRACTION to 1 + FRACTION.
     The MPC does not know: it has the model of the file."""
@@ -196,7 +197,7 @@ class Simulate:
     def check(self) -> None:
         """Raise ValueError for options that make no sense."""
         chosen_devices(self.devices, "--devices")
-        check_counts(self, count=1, horizon=1, iterations=1, refine=0, video=0, seed=0, chunk=1)
+        check_counts(self, count=1, horizon=1, iterations=0, refine=0, video=0, seed=0, chunk=1)
         check_positive(self, "seconds", "penalty", "tolerance")
         for name, wrong, cure in (
             ("target", lambda v: False, "Give finite numbers"),

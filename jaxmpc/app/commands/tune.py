@@ -182,9 +182,9 @@ class TuneWeights:
     """With --robot: the same for the damping of each joint."""
     payload: Annotated[float, option("KG", "0")] = 0.0
     """With --robot: mass from 0 to KG at the site "tool"; the MPC keeps the nominal model."""
-    iterations: Annotated[int | None, option("K", "[solver], else 50; robots 20")] = None
+    iterations: Annotated[int | None, option("K", "[solver], else 50; robots 0")] = None
     """ADMM steps of each plan."""
-    refine: Annotated[int | None, option("K", "[solver], else 3; robots 2")] = None
+    refine: Annotated[int | None, option("K", "[solver], else 20; robots as needed")] = None
     """Newton steps after them."""
     dtype: Annotated[
         Literal["float32", "float64"] | None,

@@ -310,10 +310,7 @@ def robot_task(command: Any) -> TuningTask:
         r = np.asarray(robot.coordinates(x))
     if "tightening" in command.tune:
         parameters["tightening"] = tightening(section.margin, robot.state_limits, r)
-    solver = ADMM(
-        iterations=20 if command.iterations is None else command.iterations,
-        refine=2 if command.refine is None else command.refine,
-    )
+    solver = ADMM(iterations=command.iterations or 0, refine=command.refine)
     x0s, variations = draw_robots(
         robot, command.count, command.seed,
         spread=0.5 if command.spread is None else command.spread,
