@@ -31,7 +31,7 @@ def test_first_snippet(capsys):
 @pytest.mark.slow
 def test_workflow_snippet(capsys):
     """Theorem 1 holds of the design, and the weight it advises is exact."""
-    _, names = run(0, 3)
+    _, names = run(0, 4)
     text = capsys.readouterr().out
     assert "Theorem 1 (recursive feasibility) applies" in text and "weight given is exact" in text
     assert names["controller"].mpc.soft
@@ -47,8 +47,16 @@ def test_robot_snippet():
 
 
 @pytest.mark.slow
+def test_noise_snippet():
+    _, names = run(1, 2, instead=("arm7", "joint"))
+    found = names["run"]
+    assert found.estimates.shape == (64, 100, 2) and (found.status == 1).mean() > 0.99
+    assert abs(found.states[:, -1]).max() < 0.05
+
+
+@pytest.mark.slow
 def test_tuning_snippet():
     """The loss on states set apart falls, and the penalties learned solve them."""
-    _, names = run(0, 2)
+    _, names = run(0, 3)
     assert names["run"].improvement > 0.01
     assert names["solver"].rho.shape[0] == 4

@@ -83,13 +83,15 @@ def solve_stagewise(
     no infeasibility is proved (a problem without a solution ends as ITERATION_LIMIT: soften the
     rows that may not hold). Derivatives with respect to every array of data are those of
     solver.differentiate. warm_start: an earlier Plan or a WarmStart, whose states are not read.
-    solver.refine: Newton steps at most (None: 150), a Riccati recursion each; 5 suffice where ADMM
-    has found the active rows. mpc.prestabilise is not read:
-    the inputs are the variables, so a plant that grows more than 1e5-fold over the horizon in open
-    loop (1e3-fold in float32) has residuals above eps by rounding alone; `solve` takes those. scale
-    (rows,): the row scale of a similar problem (`factor_stages(...).E`), which saves one of two
-    Riccati recursions; it changes the path of ADMM, not the answer. A row of scale 0 counts as
-    one that no input moves: where that is not so, the plan does not become SOLVED.
+    solver.refine: Newton steps at most, a Riccati recursion each; 5 suffice where ADMM, or the warm
+    start, has found the active rows. None: 6, after them an interior point method where they have
+    not ended at the solution (its steps need rows with l < u), and 6 again; all in float64.
+    mpc.prestabilise is not read: the inputs are the variables, so a plant that grows more than
+    1e5-fold over the horizon in open loop (1e3-fold in float32) has residuals above eps by rounding
+    alone; `solve` takes those. scale (rows,): the row scale of a similar problem
+    (`factor_stages(...).E`), which saves a Riccati recursion; it changes the path, not the answer.
+    A row of scale 0 counts as one that no input moves: where that is not so, the plan does not
+    become SOLVED.
 
     `jax.vmap` over system, x0, references or the arrays of `mpc`. Raises ValueError for bad data
     that can be read, and for what only `solve` supports: Ellipsoids, control horizons, input rates.

@@ -60,12 +60,12 @@ class ADMM:
     (m,), or a schedule (stages, m) or (stages, 1) whose stages have equally many iterations.
     alpha: over-relaxation in (0, 2).
     refine: Newton steps after the loop at most, 0 for none (`active_set.py`, `newton.py`). None:
-    1,000, of which badly scaled linear programs need most, and 150 in `solve_stagewise` and where
-    every instance takes them all. An instance leaves when its residuals are small enough, also in
-    a batch. fixed: take all `refine` steps of the method of multipliers, for every instance:
-    constant time; so do unrolled derivatives. dtype: floating type of the ADMM iterates, "float32"
-    or "float64"; None: float32 before Newton steps, that of the data without any. Newton steps are
-    float64 whatever it is, except unrolled ones.
+    1,000, of which badly scaled linear programs need most, 150 where every instance takes them all,
+    and in `solve_stagewise` as many as are needed. An instance leaves when its residuals are small
+    enough, also in a batch. fixed: take all `refine` steps of the method of multipliers, for every
+    instance: constant time; so do unrolled derivatives. dtype: floating type of ADMM's iterates,
+    "float32" or "float64"; None: float32 before Newton steps, that of the data without any. Newton
+    steps are float64 whatever it is, except unrolled ones.
     eps: tolerance of status SOLVED on primal residual, dual residual and gap, absolute, plus
     a rounding floor, a multiple of machine epsilon·(size of the terms): 100 in float64, 4 in
     float32. None: 1e-6 in float64, 1e-3 in float32. eps_rel: tolerance relative to the size of

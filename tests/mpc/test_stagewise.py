@@ -12,7 +12,7 @@ from jax import enable_x64
 from problems import rows_of, symmetric
 
 import jaxmpc as jm
-from jaxmpc.mpc import stagewise
+from jaxmpc.mpc import interior_point, stagewise
 from jaxmpc.mpc.plan import WarmStart
 from jaxmpc.mpc.stagewise import factor_stages, plan_stages, solve_stagewise
 from jaxmpc.qp import admm
@@ -227,7 +227,7 @@ def test_stage_weights():
 
 
 def test_fixed_count_of_newton_steps():
-    """150 by default, as also the most that a problem without a solution takes."""
+    """By default those of the interior point method are the most."""
     early, all_of_them = (
         solve_stagewise(problem(), varying(), X0, solver=solver)
         for solver in (SOLVER, replace(SOLVER, fixed=True))
@@ -236,7 +236,7 @@ def test_fixed_count_of_newton_steps():
     np.testing.assert_allclose(early.inputs, all_of_them.inputs, atol=1e-9)
     solve = lambda x0: solve_stagewise(problem(), varying(), x0, solver=jm.ADMM(fixed=True)).inputs
     lengths = re.findall(r" length=(\d+)", str(jax.make_jaxpr(solve)(X0)))
-    assert max(map(int, lengths)) == 150
+    assert max(map(int, lengths)) == interior_point.STEPS
 
 
 def test_residuals_are_those_of_the_qp():
