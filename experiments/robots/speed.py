@@ -4,10 +4,12 @@
     python experiments/robots/speed.py --count 4096        # for a GPU
 
 Each piece of a control step is timed apart, as a loop of its own inside one program: physics (the
-control period of the plant with its joint limits), the linear models, the Riccati factorisation,
-the ADMM steps, the Newton steps with the judgement of the plan; then the closed loop whole. The
-bare loop is mjx.step on the same model without jaxmpc. Set OPENBLAS_NUM_THREADS=1 on CPUs: the
-threads of OpenBLAS make the small triangular solves of MJX 70 times slower on busy cores.
+control period of the plant with its joint limits), the linear models, the data of the plans (with
+ADMM steps their Riccati factorisation), the judgement of a plan, ADMM steps if any, the Newton and
+interior point steps from a cold start; then the closed loop whole, whose plans start from those of
+the sample before. The bare loop is mjx.step on the same model without jaxmpc. Set
+OPENBLAS_NUM_THREADS=1 on CPUs: the threads of OpenBLAS make the small triangular solves of MJX 70
+times slower on busy cores.
 """
 
 import dataclasses
@@ -30,8 +32,8 @@ class Settings:
     count: int = 64
     seconds: float = 1.0
     horizon: int = 20
-    iterations: int = 20
-    refine: int = 2
+    iterations: int = 0  # ADMM steps
+    refine: int | None = None  # Newton steps at most; None: as many as are needed
     repeats: int = 3
     pieces: bool = True
     loop: bool = True  # also the closed loop, whose compilation takes longest
@@ -88,7 +90,7 @@ def run(settings: Settings) -> dict[str, Any]:
     factor = jax.jit(jax.vmap(lambda model: factor_stages(soft, model, solver, controller.scale)))
     factors = factor(models)
 
-    def planned(iterations: int, refine: int) -> Any:
+    def planned(iterations: int, refine: int | None) -> Any:
         chosen = replace(solver, iterations=iterations, refine=refine)
         plan = jax.vmap(
             lambda f, x: plan_stages(f, soft, x, reference, chosen, input_reference=inputs)
@@ -110,10 +112,12 @@ def run(settings: Settings) -> dict[str, Any]:
                 factor(replace(m, c=m.c + 1e-9 * x))
             )), few), x0s, models,
         ),
-        "plan, 0 steps": (repeated(planned(0, 0), few), x0s, factors),
+        "plan, judged": (repeated(planned(0, 0), few), x0s, factors),
         "plan, ADMM": (repeated(planned(s.iterations, 0), few), x0s, factors),
-        "plan, ADMM + Newton": (repeated(planned(s.iterations, s.refine), few), x0s, factors),
+        "plan, cold": (repeated(planned(s.iterations, s.refine), few), x0s, factors),
     }  # fmt: skip
+    if not s.iterations:
+        del pieces["plan, ADMM"]
     print(
         f"{jax.devices()[0]}, JAX {jax.__version__}: {s.count} x {robot.name}, {steps} samples of "
         f"{robot.dt * 1e3:g} ms, {robot.substeps} physics steps each, N = {s.horizon}"

@@ -95,7 +95,7 @@ class Environment:
         Q, R = as_weight(Q, robot.n), as_weight(R, robot.m)
         require_shape("Q", Q, (robot.n, robot.n), "Give a matrix, or its diagonal")
         require_shape("R", R, (robot.m, robot.m), "Give a matrix, or its diagonal")
-        x, u = robot.equilibrium(target)
+        x, u = robot.set_point(target)
         home, below, above = start_room(robot)
         with jax.enable_x64(True):
             reference = np.asarray(robot.coordinates(x))

@@ -90,6 +90,10 @@ class LinearPlant:
         target = self.home if x is None else x
         return equilibrium(self.system, target, states=self.state_limits, inputs=self.input_limits)
 
+    def set_point(self, target: Any = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return `equilibrium(target)`, as a Robot does that rests at its home."""
+        return self.equilibrium(target)
+
     def vary(self, **numbers: Any) -> "LinearPlant":
         """Return the plant with another A, B or c."""
         strange = set(numbers) - {"A", "B", "c"}

@@ -231,16 +231,18 @@ class Robot:
         x = join([rest.x for rest in rests], self.state_size)
         return x, join([rest.u for rest in rests], self.m)
 
-    def set_point(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return (x, u), the state and the input about which `robot_mpc` takes its model where no
-        target is given.
+    def set_point(self, target: Any = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return (x, u), the state and the input about which `robot_mpc` takes its model.
 
-        They are `equilibrium()` at home, home moved inside the position limits if it is not; where
-        that cannot be held `equilibrium(near=home)`; and where nothing nearby can, home at rest
-        under the input within the limits that leaves the least unbalanced force. The affine model
-        has that force in its c: it predicts a fall, and inputs still move what they can. Each step
-        down this list gives a UserWarning that names the coordinates.
+        target (nq,): `equilibrium(target)`. None: `equilibrium()` at home, home moved inside the
+        position limits if it is not; where that cannot be held `equilibrium(near=home)`; and where
+        nothing nearby can, home at rest under the input within the limits that leaves the least
+        unbalanced force. The affine model has that force in its c: it predicts a fall, and inputs
+        still move what they can. Each step down this list gives a UserWarning that names the
+        coordinates.
         """
+        if target is not None:
+            return self.equilibrium(target)
         rest, texts = settled(self)
         for text in texts:
             warnings.warn(text, stacklevel=2)

@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import os
 import time
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -94,7 +95,9 @@ class RobotRuns:
         file |= {key: np.array(value) for key, value in options.items() if value is not None}
         more = {"terminal_cost": file["terminal_cost"]} if "terminal_cost" in file else {}
         horizon: Any = command.horizon
-        x, input_reference = robot.equilibrium(target)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # robot_mpc says the same
+            x, input_reference = robot.set_point(target)
         # The steps from here on compile programs.
         programs = {name: getattr(command, name) for name in PROGRAM}
         programs |= {"steps": steps, "chunk": min(chunk, command.count)}

@@ -1,6 +1,7 @@
 """The task of `jaxmpc tune weights`: problem, plant, initial states and loss from its options."""
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -305,7 +306,9 @@ def robot_task(command: Any) -> TuningTask:
     }
     if "rho" in command.tune:
         parameters["rho"] = Parameter(rho, "positive")
-    x, s = robot.equilibrium(target)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # robot_mpc has said the same
+        x, s = robot.set_point(target)
     with jax.enable_x64(True):
         r = np.asarray(robot.coordinates(x))
     if "tightening" in command.tune:
