@@ -5,19 +5,23 @@ import copy
 import io
 import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jax.extend.core.primitives import sqrt_p
 
 from jaxmpc.checks import fail
 from jaxmpc.qp.linalg import JAXLIB, solve, stand_ins
+from jaxmpc.qp.precision import matmul
 from jaxmpc.robots.rewrite import moving, rewritten
-from jaxmpc.robots.tangent import normalised, retract
+from jaxmpc.robots.rigid import FIELDS, Tree, dynamics, inverse_dynamics, side_by_side, slopes
+from jaxmpc.robots.tangent import normalised, rates, retract
 
 if TYPE_CHECKING:
     import mujoco
@@ -26,8 +30,9 @@ if TYPE_CHECKING:
 # mjtIntegrator.
 EULER, RK4 = 0, 1
 
-# mjtDisableBit.
-NO_CONSTRAINTS = 1
+# mjtDisableBit, mjtEq.
+NO_GRAVITY, NO_EULER_DAMPING = 128, 32768
+EQUALITY_OF_JOINTS = 2
 
 # How many operations XLA of old jaxlibs may fuse on a CPU.
 PIECE = 15
@@ -38,19 +43,31 @@ class Physics:
 
     model: the mujoco.MjModel. mjx: mjx.Model with NumPy arrays, in float64 in either mode of JAX.
     Raises ValueError for models that MJX does not support.
+
+    Inertia, velocities and their forces are those of `rigid.py`; MJX gives the forces of springs,
+    tendons and actuators, the rows of constraints and their solver. Accelerations are differentiated
+    by the implicit function theorem on the balance of forces, M a + bias = forces.
     """
 
     def __init__(self, model: "mujoco.MjModel") -> None:
         self.model = model
         self.joints = tuple(int(joint) for joint in model.jnt_type)
+        self.tree = Tree.of(model)
         try:
             with warnings.catch_warnings(), jax.enable_x64(True):
                 warnings.simplefilter("ignore")
                 mjx = mjx_module()
                 self.mjx: Any = jax.tree.map(np.asarray, mjx.put_model(model))
-                mjx.make_data(model)
+                blank = mjx.make_data(model)
         except NotImplementedError as error:
             fail("model", f"MJX does not support it: {error}", "Take that out of the file")
+        self.rows = blank._impl.efc_J.size > 0
+        # Where no force depends on where the bodies are, other than through the joints.
+        self.posed = bool(
+            model.ntendon or np.any(model.body_gravcomp) or blank._impl.contact.dim.size
+            or model.opt.density or model.opt.viscosity or np.any(model.actuator_trntype > 1)
+            or np.any(model.eq_type != EQUALITY_OF_JOINTS)
+        )  # fmt: skip
 
     def step(self, x: Array, u: Array, numbers: Mapping[str, Any] | None = None) -> Array:
         """Return x = (qpos, qvel) one physics step later: a function of x, u and nothing carried
@@ -60,29 +77,153 @@ class Physics:
         with constraints by `with_forward_jacobian`.
         """
         numbers = jax.tree.map(jnp.asarray, dict(numbers or {}))
-        if self.model.opt.disableflags & NO_CONSTRAINTS:
+        if not self.rows:
             return in_pieces(rewritten(self._step, stand_ins()))(x, u, numbers)
         step = in_pieces(rewritten(self._step, {**stand_ins(), sqrt_p: root}))
         return with_forward_jacobian(step)(x, u, numbers)
 
     def _step(self, x: Array, u: Array, numbers: dict[str, Array]) -> Array:
+        x_q, v = jnp.split(x, [self.model.nq])
+        q, h = normalised(self.joints, x_q), jnp.asarray(self.mjx.opt.timestep, x.dtype)
+        if self.model.opt.integrator == RK4:
+            forward = lambda q, v: self._accelerations(numbers, q, v, u)
+            return self._runge_kutta(forward, q, v, h)
+        v = v + h * self._accelerations(numbers, q, v, u, damped=True)
+        # MJX's own integration of positions has the derivative 0 for a body that does not turn.
+        return jnp.concatenate([retract(self.joints, q, h * v), v])
+
+    def _accelerations(
+        self, numbers: dict[str, Array], q: Array, v: Array, u: Array, damped: bool = False
+    ) -> Array:
+        """Return the accelerations (nv,); damped: with the integrator's implicit part."""
+        still = jnp.zeros_like(v)
+        smooth = lambda damped: balanced(
+            partial(self._smooth, damped=damped), partial(self._missing, damped=damped)
+        )
+        if not self.rows:
+            return smooth(damped)(numbers, q, v, u, still)
+        a = balanced(self._constrained, self._missing)(numbers, q, v, u)
+        if not damped:
+            return a
+        model, data = self._forced(numbers, q, v, u)
+        return smooth(True)(numbers, q, v, u, _constraint_forces(model, data, a))
+
+    def _smooth(
+        self, numbers: dict[str, Array], q: Array, v: Array, u: Array, pushed: Array, damped: bool
+    ) -> Array:
+        """Return the accelerations under the forces `pushed` (nv,) of the constraints."""
+        model, data = self._forced(numbers, q, v, u)
+        M, bias, _ = self._dynamics(numbers, q, v)
+        return solve(M + self._added(model, data, damped), data.qfrc_smooth - bias + pushed)
+
+    def _constrained(self, numbers: dict[str, Array], q: Array, v: Array, u: Array) -> Array:
+        """Return the accelerations by MJX's constraint solver."""
+        mjx = mjx_module()
+        model, data = self._forced(numbers, q, v, u)
+        M, bias, _ = self._dynamics(numbers, q, v)
+        force, M = data.qfrc_smooth - bias, M + self._added(model, data, False)
+        data = data.replace(qfrc_smooth=force, qacc_smooth=solve(M, force))
+        if mjx.is_sparse(model):
+            M = M[np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind]
+        data = mjx.factor_m(model, data.tree_replace({"_impl.M": M}))
+        return mjx.solve(model, data).qacc
+
+    def _missing(
+        self, a: Array, numbers: dict[str, Array], q: Array, v: Array, u: Array,
+        pushed: Array | None = None, damped: bool = False,
+    ) -> Array:  # fmt: skip
+        """Return the generalised forces (nv,) that the accelerations a lack."""
+        model, data = self._forced(numbers, q, v, u)
+        needed = self._inverse_dynamics(numbers, q, v, a)
+        if pushed is None:
+            pushed = _constraint_forces(model, data, a) if self.rows else jnp.zeros_like(a)
+        needed = needed + matmul(self._added(model, data, damped), a)
+        return needed - data.qfrc_smooth - pushed
+
+    def _added(self, model: Any, data: Any, damped: bool) -> Array:
+        """Return what tendons with inertia add to M (nv, nv), and damped: what the integrator does,
+        as in mjx.euler and mjx.implicit."""
+        J, h = data._impl.ten_J, model.opt.timestep
+        added = matmul(J.T * model.tendon_armature, J)
+        if damped and self.model.opt.integrator == EULER:
+            if not self.model.opt.disableflags & NO_EULER_DAMPING:
+                added = added + jnp.diag(h * model.dof_damping)
+        elif damped:
+            slope = mjx_module().deriv_smooth_vel(model, data)
+            added = added if slope is None else added - h * slope
+        return added
+
+    def _forced(
+        self, numbers: dict[str, Array], q: Array, v: Array, u: Array
+    ) -> tuple[Any, Any]:
+        """Return mjx.Model and mjx.Data with the forces of springs, dampers and actuators in
+        qfrc_smooth, and with the rows of constraints."""
         mjx = mjx_module()
         cast = lambda tree: jax.tree.map(
-            lambda v: jnp.asarray(v, x.dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v, tree
+            lambda v: jnp.asarray(v, q.dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v, tree
         )
         # A copy for each program. JAX caches by identity how it converted NumPy arrays, also for
         # programs of the other precision, and MJX passes it arrays of the model.
         model = cast(copy.deepcopy(self.mjx).replace(**numbers))
-        blank, h = cast(mjx.make_data(self.model)), model.opt.timestep
-        x_q, v = jnp.split(x, [self.model.nq])
-        q = normalised(self.joints, x_q)
-        forward = lambda q, v: accelerated(model, blank.replace(qpos=q, qvel=v, ctrl=u))
-        if self.model.opt.integrator == RK4:
-            return self._runge_kutta(forward, q, v, h)
-        integrate = mjx.euler if self.model.opt.integrator == EULER else mjx.implicit
-        v = integrate(model, forward(x_q, v)).qvel
-        # MJX's own integration of positions has the derivative 0 for a body that does not turn.
-        return jnp.concatenate([retract(self.joints, q, h * v), v])
+        data = cast(mjx.make_data(self.model)).replace(qpos=q, qvel=v, ctrl=u)
+        if self.posed:
+            data = data.replace(**self._dynamics(numbers, q, v)[2])
+            data = mjx.collision(model, mjx.tendon(model, data))
+        data = mjx.transmission(model, mjx.make_constraint(model, data))
+        data = data.tree_replace({
+            "_impl.actuator_velocity": matmul(data._impl.actuator_moment, v),
+            "_impl.ten_velocity": matmul(data._impl.ten_J, v),
+        })  # fmt: skip
+        data = mjx.fwd_actuation(model, mjx.passive(model, data))
+        force = data.qfrc_passive + data.qfrc_actuator
+        if self.model.ntendon:
+            force = force - mjx.tendon_bias(model, data).qfrc_bias
+        data = data.replace(qfrc_smooth=force)
+        # Rows of contacts that do not touch exert no force; the derivative of their distance does
+        # not always exist.
+        rows = data._impl
+        if self.rows:
+            idle = jnp.all(rows.efc_J == 0, axis=1) & (rows.efc_aref == 0)
+            still = lambda v: jnp.where(idle, jax.lax.stop_gradient(v.T), v.T).T
+            names = ("efc_J", "efc_D", "efc_aref")
+            data = data.tree_replace({f"_impl.{n}": still(getattr(rows, n)) for n in names})
+        return model, data
+
+    def _rigid(self, function: Callable, numbers: dict[str, Array], q: Array, *rest: Array) -> Any:
+        """Return what a function of `rigid.py` does."""
+        fixed = {key: np.array(getattr(self.mjx, key), q.dtype)[..., None] for key in FIELDS}
+        off = bool(self.model.opt.disableflags & NO_GRAVITY)
+        fixed["gravity"] = (0.0 if off else 1.0) * np.array(self.mjx.opt.gravity, q.dtype)[:, None]
+        own = {key: value for key, value in numbers.items() if key in FIELDS}
+        call = lambda own, *rest: function(self.tree, {**fixed, **own}, *rest)
+        return side_by_side(call)(jax.tree.map(lambda v: jnp.asarray(v, q.dtype), own), q, *rest)
+
+    def _dynamics(self, numbers: dict[str, Array], q: Array, v: Array) -> tuple[Array, Array, dict]:
+        """Return M (nv, nv), bias (nv,) and fields of mjx.Data."""
+        return self._rigid(dynamics, numbers, q, v)
+
+    def _inverse_dynamics(
+        self, numbers: dict[str, Array], q: Array, v: Array, a: Array
+    ) -> Array:
+        """Return M a + bias (nv,), with derivatives in closed form."""
+        inverse = jax.custom_jvp(partial(self._rigid, inverse_dynamics))
+
+        def rule(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+            numbers, q, v, a = primals
+            moved, dq, dv, da = tangents
+            still = lambda t: isinstance(t, SymbolicZero)
+            found = jnp.zeros_like(a)
+            if not all(map(still, jax.tree.leaves(moved, is_leaf=still))):
+                inner = lambda numbers: self._rigid(inverse_dynamics, numbers, q, v, a)
+                of, at, directions = moving(inner, (numbers,), (moved,))
+                found = found + jax.jvp(of, at, directions)[1]
+            dq = dq if still(dq) else rates(self.joints, q, dq)
+            for K, d in zip(self._rigid(slopes, numbers, q, v, a), (dq, dv, da), strict=True):
+                found = found if still(d) else found + matmul(K, d)
+            return inverse(*primals), found
+
+        inverse.defjvp(rule, symbolic_zeros=True)
+        return inverse(numbers, q, v, a)
 
     def _runge_kutta(self, forward: Callable, q: Array, v: Array, h: Array) -> Array:
         """Return (qpos, qvel) after a step of length h by the classical method of fourth order.
@@ -96,7 +237,7 @@ class Physics:
             rate, acceleration, rates, accelerations = carry
             a, b = weights
             moved, rate = move(a * rate), v + a * h * acceleration
-            acceleration = forward(moved, rate).qacc
+            acceleration = forward(moved, rate)
             return (rate, acceleration, rates + b * rate, accelerations + b * acceleration), None
 
         table = jnp.array([[0, 1 / 6], [1 / 2, 1 / 3], [1 / 2, 1 / 3], [1, 1 / 6]], v.dtype)
@@ -104,51 +245,23 @@ class Physics:
         return jnp.concatenate([move(end[2]), v + h * end[3]])
 
 
-def accelerated(model: Any, data: Any) -> Any:
-    """Return mjx.Data with the accelerations and constraint forces at its state, as mjx.forward
-    does."""
-    mjx = mjx_module()
-    for part in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
-        data = part(model, data)
-    rows = data._impl
-    if rows.efc_J.size == 0:
-        return data.replace(qacc=data.qacc_smooth)
-    # Rows of contacts that do not touch exert no force; the derivative of their distance does not
-    # always exist.
-    idle = jnp.all(rows.efc_J == 0, axis=1) & (rows.efc_aref == 0)
-    still = lambda v: jnp.where(idle, jax.lax.stop_gradient(v.T), v.T).T
-    data = data.tree_replace(
-        {f"_impl.{key}": still(getattr(rows, key)) for key in ("efc_J", "efc_D", "efc_aref")}
-    )
-    a = constrained(model, data)
-    return data.replace(qacc=a, qfrc_constraint=_constraint_forces(model, data, a))
+def balanced(value: Callable, missing: Callable) -> Callable:
+    """Return the function args → a of `value`, differentiated as the solution of missing(a, *args)
+    = 0 (implicit function theorem): not by the iterations that found it, which err in their
+    derivatives as much as in a, and have none where elliptic contacts do not touch.
 
-
-@jax.custom_jvp
-def constrained(model: Any, data: Any) -> Array:
-    """Return the accelerations (nv,) by MJX's constraint solver.
-
-    The derivatives are those of the balance of forces (implicit function theorem), not of the
-    solver's iterations: these have none where elliptic contacts do not touch, and err as much as
-    the iterates do.
+    missing's Jacobian in a is symmetric positive definite.
     """
-    return mjx_module().solve(model, data).qacc
+    solved = jax.custom_jvp(value)
 
+    def rule(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+        a = solved(*primals)
+        of, at, directions = moving(lambda *args: missing(a, *args), primals, tangents)
+        matrix = jax.jacfwd(missing)(a, *primals)
+        return a, -solve((matrix + matrix.T) / 2, jax.jvp(of, at, directions)[1])
 
-def _balance(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    """Return the accelerations and their derivative by the implicit function theorem."""
-    a = constrained(*primals)
-
-    def missing(a: Array, model: Any, data: Any) -> Array:
-        carried = mjx_module().mul_m(model, data, a) - data.qfrc_smooth
-        return carried - _constraint_forces(model, data, a)
-
-    of, at, directions = moving(lambda *rest: missing(a, *rest), primals, tangents)
-    matrix = jax.jacfwd(missing)(a, *primals)
-    return a, -solve((matrix + matrix.T) / 2, jax.jvp(of, at, directions)[1])
-
-
-constrained.defjvp(_balance, symbolic_zeros=True)
+    solved.defjvp(rule, symbolic_zeros=True)
+    return solved
 
 
 def _constraint_forces(model: Any, data: Any, a: Array) -> Array:
