@@ -45,8 +45,7 @@ class Physics:
     Raises ValueError for models that MJX does not support.
 
     Inertia, velocities and their forces are those of `rigid.py`; MJX gives the forces of springs,
-    tendons and actuators, the rows of constraints and their solver. Accelerations are differentiated
-    by the implicit function theorem on the balance of forces, M a + bias = forces.
+    tendons and actuators, the rows of constraints and their solver.
     """
 
     def __init__(self, model: "mujoco.MjModel") -> None:
@@ -95,50 +94,72 @@ class Physics:
     def _accelerations(
         self, numbers: dict[str, Array], q: Array, v: Array, u: Array, damped: bool = False
     ) -> Array:
-        """Return the accelerations (nv,); damped: with the integrator's implicit part."""
-        still = jnp.zeros_like(v)
-        smooth = lambda damped: balanced(
-            partial(self._smooth, damped=damped), partial(self._missing, damped=damped)
-        )
-        if not self.rows:
-            return smooth(damped)(numbers, q, v, u, still)
-        a = balanced(self._constrained, self._missing)(numbers, q, v, u)
-        if not damped:
-            return a
-        model, data = self._forced(numbers, q, v, u)
-        return smooth(True)(numbers, q, v, u, _constraint_forces(model, data, a))
+        """Return the accelerations (nv,); damped: with the integrator's implicit part.
 
-    def _smooth(
-        self, numbers: dict[str, Array], q: Array, v: Array, u: Array, pushed: Array, damped: bool
-    ) -> Array:
-        """Return the accelerations under the forces `pushed` (nv,) of the constraints."""
+        Differentiated as the solution of the balance of forces (implicit function theorem), not by
+        the iterations of MJX's solver, which err in their derivatives as much as in the
+        accelerations, and have none where elliptic contacts do not touch.
+        """
+        solved = jax.custom_jvp(partial(self._solved, damped))
+
+        def rule(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+            found = solved(*primals)
+            of, at, directions = moving(partial(self._missing, damped, found), primals, tangents)
+            _, missing, (first, second, C) = jax.jvp(of, at, directions, has_aux=True)
+            M = self._dynamics(*primals[:3])[0]
+            moved = da = jnp.zeros_like(found[0])
+            if self.rows:
+                K = M + first - C
+                moved = da = -solve((K + K.T) / 2, missing[0])
+            if damped or not self.rows:
+                da = -solve(M + second, missing[1] - matmul(C, moved))
+            return found, (da, moved)
+
+        solved.defjvp(rule, symbolic_zeros=True)
+        return solved(numbers, q, v, u)[0]
+
+    def _solved(
+        self, damped: bool, numbers: dict[str, Array], q: Array, v: Array, u: Array
+    ) -> tuple[Array, Array]:
+        """Return the accelerations (nv,) with and without the integrator's implicit part."""
         model, data = self._forced(numbers, q, v, u)
         M, bias, _ = self._dynamics(numbers, q, v)
-        return solve(M + self._added(model, data, damped), data.qfrc_smooth - bias + pushed)
+        force = data.qfrc_smooth - bias
+        pushed = first = jnp.zeros_like(v)
+        if self.rows:
+            first = self._constrained(model, data, M + self._added(model, data, False), force)
+            if not damped:
+                return first, first
+            pushed = _constraint_forces(model, data, first)
+        return solve(M + self._added(model, data, damped), force + pushed), first
 
-    def _constrained(self, numbers: dict[str, Array], q: Array, v: Array, u: Array) -> Array:
+    def _missing(
+        self, damped: bool, found: tuple[Array, Array], numbers: dict[str, Array], q: Array,
+        v: Array, u: Array,
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:  # fmt: skip
+        """Return the generalised forces that the accelerations `found` without and with the
+        implicit part lack, then what is added to M for each, and the derivative of the constraint
+        forces in the accelerations."""
+        model, data = self._forced(numbers, q, v, u)
+        a, first = found
+        forces, still = data.qfrc_smooth, jnp.zeros_like(a)
+        added = [self._added(model, data, kind) for kind in (False, damped)]
+        lack = lambda a, added: self._inverse_dynamics(numbers, q, v, a) + matmul(added, a) - forces
+        if not self.rows:
+            return (still, lack(a, added[1])), (*added, jnp.zeros_like(added[0]))
+        pushed = partial(_constraint_forces, model, data)
+        forces = forces + pushed(first)
+        second = lack(a, added[1]) if damped else still
+        return (lack(first, added[0]), second), (*added, jax.jacfwd(pushed)(first))
+
+    def _constrained(self, model: Any, data: Any, M: Array, force: Array) -> Array:
         """Return the accelerations by MJX's constraint solver."""
         mjx = mjx_module()
-        model, data = self._forced(numbers, q, v, u)
-        M, bias, _ = self._dynamics(numbers, q, v)
-        force, M = data.qfrc_smooth - bias, M + self._added(model, data, False)
         data = data.replace(qfrc_smooth=force, qacc_smooth=solve(M, force))
         if mjx.is_sparse(model):
             M = M[np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind]
         data = mjx.factor_m(model, data.tree_replace({"_impl.M": M}))
         return mjx.solve(model, data).qacc
-
-    def _missing(
-        self, a: Array, numbers: dict[str, Array], q: Array, v: Array, u: Array,
-        pushed: Array | None = None, damped: bool = False,
-    ) -> Array:  # fmt: skip
-        """Return the generalised forces (nv,) that the accelerations a lack."""
-        model, data = self._forced(numbers, q, v, u)
-        needed = self._inverse_dynamics(numbers, q, v, a)
-        if pushed is None:
-            pushed = _constraint_forces(model, data, a) if self.rows else jnp.zeros_like(a)
-        needed = needed + matmul(self._added(model, data, damped), a)
-        return needed - data.qfrc_smooth - pushed
 
     def _added(self, model: Any, data: Any, damped: bool) -> Array:
         """Return what tendons with inertia add to M (nv, nv), and damped: what the integrator does,
@@ -153,9 +174,7 @@ class Physics:
             added = added if slope is None else added - h * slope
         return added
 
-    def _forced(
-        self, numbers: dict[str, Array], q: Array, v: Array, u: Array
-    ) -> tuple[Any, Any]:
+    def _forced(self, numbers: dict[str, Array], q: Array, v: Array, u: Array) -> tuple[Any, Any]:
         """Return mjx.Model and mjx.Data with the forces of springs, dampers and actuators in
         qfrc_smooth, and with the rows of constraints."""
         mjx = mjx_module()
@@ -202,9 +221,7 @@ class Physics:
         """Return M (nv, nv), bias (nv,) and fields of mjx.Data."""
         return self._rigid(dynamics, numbers, q, v)
 
-    def _inverse_dynamics(
-        self, numbers: dict[str, Array], q: Array, v: Array, a: Array
-    ) -> Array:
+    def _inverse_dynamics(self, numbers: dict[str, Array], q: Array, v: Array, a: Array) -> Array:
         """Return M a + bias (nv,), with derivatives in closed form."""
         inverse = jax.custom_jvp(partial(self._rigid, inverse_dynamics))
 
@@ -243,25 +260,6 @@ class Physics:
         table = jnp.array([[0, 1 / 6], [1 / 2, 1 / 3], [1 / 2, 1 / 3], [1, 1 / 6]], v.dtype)
         end, _ = jax.lax.scan(in_pieces(stage), (jnp.zeros_like(v),) * 4, table)
         return jnp.concatenate([move(end[2]), v + h * end[3]])
-
-
-def balanced(value: Callable, missing: Callable) -> Callable:
-    """Return the function args → a of `value`, differentiated as the solution of missing(a, *args)
-    = 0 (implicit function theorem): not by the iterations that found it, which err in their
-    derivatives as much as in a, and have none where elliptic contacts do not touch.
-
-    missing's Jacobian in a is symmetric positive definite.
-    """
-    solved = jax.custom_jvp(value)
-
-    def rule(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-        a = solved(*primals)
-        of, at, directions = moving(lambda *args: missing(a, *args), primals, tangents)
-        matrix = jax.jacfwd(missing)(a, *primals)
-        return a, -solve((matrix + matrix.T) / 2, jax.jvp(of, at, directions)[1])
-
-    solved.defjvp(rule, symbolic_zeros=True)
-    return solved
 
 
 def _constraint_forces(model: Any, data: Any, a: Array) -> Array:

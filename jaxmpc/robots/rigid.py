@@ -23,7 +23,6 @@ r = m u − h × w the linear momentum, h = m·centre, Σ = ½ tr(J) 1 − J, J 
 The torque S_i·F_i, F_i the sum of f over the bodies after i, does not change by motions of all.
 """
 
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import wraps
@@ -214,7 +213,9 @@ def _unit(q: Array) -> Array:
 def link_poses(tree: Tree, model: Mapping[str, Any], q: Array) -> tuple[Array, Array]:
     """Return positions (links, 3, lanes) and quaternions (links, 4, lanes) in the world."""
     lanes, kinds = q.shape[-1], np.where(tree.joint < 0, -1, tree.kinds[tree.joint])
-    places, moved, turned = [], [], []
+    places: list[Any] = []
+    moved: list[Any] = []
+    turned: list[Any] = []
     for kind in np.unique(kinds):
         at = np.flatnonzero(kinds == kind)
         j = tree.joint[at]
