@@ -143,7 +143,7 @@ class Physics:
         model, data = self._forced(numbers, q, v, u)
         a, first = found
         forces, still = data.qfrc_smooth, jnp.zeros_like(a)
-        added = [self._added(model, data, kind) for kind in (False, damped)]
+        added = self._added(model, data, False), self._added(model, data, damped)
         lack = lambda a, added: self._inverse_dynamics(numbers, q, v, a) + matmul(added, a) - forces
         if not self.rows:
             return (still, lack(a, added[1])), (*added, jnp.zeros_like(added[0]))
