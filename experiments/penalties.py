@@ -8,8 +8,8 @@ float64) after the steps, no Newton. "steps to 99 %": the fewest, on a grid, aft
 of the held-out states are solved.
 
 States: uniform in the state limits (arm2: a box about home; product: each joint's limits, hidden
-as the product is), those that `map_feasible_set` proves feasible. Learning and the choice of the
-constant see the first part only; both judge on the rest.
+as the product is; springs8_30: denser near the origin), those that `map_feasible_set` proves
+feasible. Learning and the choice of the constant see the first part only; both judge on the rest.
 
 default: rho = 1, alpha = 1.6. constant: best of a grid of rho and alpha on states of the first part
 (for "steps to 99 %" the best for that). OSQP: OSQP itself with its scaling and its adaptive
@@ -36,6 +36,7 @@ from scipy import sparse
 
 import jaxmpc as jm
 from jaxmpc.app import config
+from jaxmpc.bench import families
 from jaxmpc.mpc.condense import Condensed, condense, in_float64
 from jaxmpc.qp.admm import factor, iterate, read, scaled, splittings, unscaled
 from jaxmpc.qp.residuals import joined, residual_terms
@@ -58,12 +59,14 @@ class Settings:
     states that the constant is chosen on. osqp: states that OSQP is given, one by one. longer: also
     carry groups to twice the horizon. to_99: also count steps of learned penalties to 99 %."""
 
-    problem: Literal["joint", "double_integrator", "inverted_pendulum", "arm2", "product"] = "joint"
+    problem: Literal[
+        "joint", "double_integrator", "inverted_pendulum", "arm2", "product", "springs8_30"
+    ] = "joint"
     learn: int = 3000
     test: int = 2000
     steps: int = 100
-    updates: int = 400
-    batch: int = 128
+    updates: int = 200
+    batch: int = 32
     constants: int = 300
     osqp: int = 500
     longer: bool = True
@@ -111,6 +114,13 @@ def case(name: str) -> Case:
         tracked = {"reference": home, "input_reference": np.asarray(u)}
         wide = np.array([1.0, 1.0, 3.5, 5.5])
         return Case(mpc, lambda rng, k: home + rng.uniform(-wide, wide, (k, 4)), tracked)
+    if name == "springs8_30":
+        mpc = families.problem(name)
+        wide = families.half_widths(mpc)
+        near = lambda rng, k: rng.uniform(0, 1, (k, 1)) ** (1 / 4)  # as `families.family`
+        return Case(
+            mpc, lambda rng, k: rng.uniform(-wide, wide, (k, len(wide))) * near(rng, k), tracked
+        )
     mpc = joint() if name == "joint" else config.load(HERE / f"{name}.toml").build_mpc()
     lower, upper = np.asarray(mpc.states.lower), np.asarray(mpc.states.upper)
     return Case(mpc, lambda rng, k: rng.uniform(lower, upper, (k, len(lower))), tracked)

@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
@@ -54,10 +54,11 @@ def gather_size(chunk: int) -> int:
 
 class Compiled:
     """A jitted function, compiled ahead once for each shape. `Compiled.seconds`: spent on that
-    in this process so far.
+    in this process so far. `Compiled.listeners`: called after each program.
     """
 
     seconds = 0.0
+    listeners: ClassVar[list[Callable[[], None]]] = []
 
     def __init__(self, function: Any, places: Any = None) -> None:
         self.function = function
@@ -88,6 +89,8 @@ class Compiled:
                 start = time.perf_counter()
                 self.programs[key] = self.function.lower(*args).compile()
                 Compiled.seconds += time.perf_counter() - start
+                for listener in Compiled.listeners:
+                    listener()
         return self.programs[key]
 
 

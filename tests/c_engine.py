@@ -8,7 +8,10 @@ EPS = 1e-6
 
 def data_at(model, x, u):
     data = mujoco.MjData(model)
-    data.qpos, data.qvel, data.ctrl = x[: model.nq], x[model.nq :], u
+    rates = model.nq + model.nv
+    data.qpos, data.qvel, data.ctrl = x[: model.nq], x[model.nq : rates], u
+    if model.na:
+        data.act = x[rates:]
     return data
 
 
@@ -18,7 +21,7 @@ def c_steps(model, x, u, count):
     for _ in range(count):
         data.qacc_warmstart = 0
         mujoco.mj_step(model, data)
-    return np.concatenate([data.qpos, data.qvel])
+    return np.concatenate([data.qpos, data.qvel, data.act])
 
 
 def moved(model, q, motion):
@@ -57,7 +60,7 @@ def c_transition(robot, x, u):
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         return by_differences(robot, lambda x, u: c_steps(model, x, u, 1), x, u)
     tolerance, model.opt.tolerance = model.opt.tolerance, 0
-    data, n = data_at(model, x, u), 2 * model.nv
+    data, n = data_at(model, x, u), 2 * model.nv + model.na
     mujoco.mj_forward(model, data)
     A, B = np.zeros((n, n)), np.zeros((n, model.nu))
     mujoco.mjd_transitionFD(model, data, EPS, True, A, B, None, None)

@@ -6,23 +6,40 @@ evaluate_runs              limits kept, target reached, settling time and cost -
 RobotController            an MPC with the linear models of a robot
 robot_mpc                  the MPC of a robot, from the limits of its model
 LinearFeedback             LQR or PD with clipping, to compare with
+Noise                      random disturbances of the plant and of what is measured
+KalmanFilter               estimates of the state from noisy outputs -> Belief
+Environment                a robot with a task, reset and step as pure functions
+                           -> EnvironmentState; robot_env.RobotEnv is Gymnasium's form
+MPCPolicy                  a controller as a policy of observations
+randomised                 random masses, damping, payloads of robots, for `variations`
 """
 
+from jaxmpc.closed_loop.environment import Environment, EnvironmentState, MPCPolicy
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
+from jaxmpc.closed_loop.noise import Noise
+from jaxmpc.closed_loop.observer import Belief, KalmanFilter
 from jaxmpc.closed_loop.outcome import Outcome, evaluate_runs
 from jaxmpc.closed_loop.robot_controller import RobotController
 from jaxmpc.closed_loop.robot_mpc import robot_mpc
 from jaxmpc.closed_loop.run import Run, lyapunov_decrease
 from jaxmpc.closed_loop.simulate import simulate
 from jaxmpc.closed_loop.simulate_many import simulate_many
+from jaxmpc.closed_loop.variations import randomised
 
 __all__ = [
+    "Belief",
+    "Environment",
+    "EnvironmentState",
+    "KalmanFilter",
     "LinearFeedback",
+    "MPCPolicy",
+    "Noise",
     "Outcome",
     "RobotController",
     "Run",
     "evaluate_runs",
     "lyapunov_decrease",
+    "randomised",
     "robot_mpc",
     "simulate",
     "simulate_many",

@@ -23,7 +23,8 @@ from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
 
 LINEARIZATIONS = ("set-point", "state", "trajectory")
-SOLVER = ADMM(iterations=50, rho=1.0, alpha=1.6, refine=20)
+# Newton steps from the last plan, and the interior point method, need no ADMM steps before them.
+SOLVER = ADMM(iterations=0)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -32,7 +33,8 @@ class RobotController:
 
     robot: Robot (its predictor is the model) or LinearPlant.
     mpc: the problem, from `robot_mpc`; its `system` is used by linearize="set-point" only.
-    solver: None for 50 ADMM steps and at most 20 Newton steps.
+    solver: None for Newton steps from the last plan and, where they do not end at the solution, an
+      interior point method, without ADMM steps before them.
     linearize: where the linear models are taken,
       "set-point"   once, as mpc.system says; matrices are factored once for all robots;
       "state"       about the measured state and the last input, at each sample;

@@ -1,6 +1,7 @@
 """Run: the record of a closed loop at each sample."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,8 @@ from jaxmpc.qp.status import Status
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Run:
-    """A closed loop of T samples: x_{t+1} = plant(x_t, u_t) + w_t, u_t the first input of a plan.
+    """A closed loop of T samples: x_{t+1} = plant(x_t, u_t) + w_t, u_t the first input of a plan
+    (with a delay, of the plan one sample earlier).
 
     states (T+1, n), inputs (T, m). Of each plan: cost (T,), the optimal value V_N(x_t) (without
     ½), and status (T,). stage_cost (T,): (x_t − r_t)'Q(x_t − r_t) + (u_t − s_t)'R(u_t − s_t) with
@@ -21,8 +23,10 @@ class Run:
     the state limits, in the units of the row; 0 where it keeps them all. slack (T, p): violations
     of the soft rows at k = 0 of each plan, hence of what happens. fallback (T,): whether the plan
     violates soft rows anywhere on its horizon by more than 1e-6 (1e-3 in float32), as happens
-    where the limits cannot all be kept. Batches have their axes in front. For robots states are
-    the plant's, (qpos, qvel), and x in costs and limits means their coordinates.
+    where the limits cannot all be kept. estimates (T, n): the states as an observer estimates them
+    from the outputs up to each sample; None without an observer. Batches have their axes in front.
+    For robots states are the plant's, (qpos, qvel), and x in costs and limits means their
+    coordinates.
     """
 
     states: Array
@@ -33,6 +37,7 @@ class Run:
     violation: Array
     slack: Array
     fallback: Array
+    estimates: Any = None
 
     @property
     def feasible_steps(self) -> Array:

@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -12,8 +11,15 @@ from tqdm.std import tqdm
 
 from jaxmpc.checks import fail, require_real
 from jaxmpc.closed_loop.memory import device_bytes, program_bytes
+from jaxmpc.closed_loop.noise import Noise
+from jaxmpc.closed_loop.observer import KalmanFilter
 from jaxmpc.closed_loop.run import Run
-from jaxmpc.closed_loop.simulate import checked_arguments, simulate
+from jaxmpc.closed_loop.simulate import (
+    ConstantPlant,
+    as_argument,
+    checked_arguments,
+    simulate,
+)
 from jaxmpc.compiled import Compiled, first_rows, joined, padded
 from jaxmpc.devices import Devices, chosen_devices, count, divisible, over_devices, placement
 from jaxmpc.qp.precision import arrays
@@ -21,12 +27,18 @@ from jaxmpc.qp.precision import arrays
 
 def simulate_many(
     controller: Any, plant: Any, x0s: Any, steps: int, *, reference: Any = None,
-    input_reference: Any = None, variations: Mapping[str, Any] | None = None,
+    input_reference: Any = None, references: Any = None, input_references: Any = None,
+    previous_input: Any = None, noise: Noise | None = None, observer: KalmanFilter | None = None,
+    delay: int = 0, compensate: bool = True, variations: Mapping[str, Any] | None = None,
     chunk: int | None = None, progress: bool = False, devices: Any = None,
 ) -> Run:  # fmt: skip
     """Simulate closed loops from many initial states x0s (B, n); return NumPy arrays (B, ...).
 
-    controller, plant, steps, reference, input_reference: as in `simulate`.
+    controller, plant, steps, previous_input, observer, delay, compensate: as in `simulate`.
+    reference, input_reference: as in `simulate`, the same for all loops.
+    references, input_references: one for each loop, (B, n) and (B, m), or over time (B, T + N, n)
+        and (B, T + N − 1, m); in place of those for all.
+    noise: as in `simulate`, each loop with its own (see `Noise.seed`).
     variations: parameters of the plant that differ between the B loops, as `plant.vary` takes
         them, each with B in front: dict(body_mass=(B, nbody), payload=(B,)) randomises masses
         (domain randomisation). The controller keeps the nominal model.
@@ -47,29 +59,60 @@ def simulate_many(
     if chunk is not None and chunk < 1:
         fail("chunk", f"{chunk}", "Give a count of at least 1")
     devices = chosen_devices(devices)
-    checked_arguments(controller, plant, x0s[0], steps, reference, input_reference, None, None)
-    shared = arrays((
-        controller, as_argument(plant),
-        *(None if v is None else np.asarray(v) for v in (reference, input_reference)),
-    ))  # fmt: skip
-    shared = jax.device_put(shared, placement(devices))
+    shared = {
+        "reference": reference, "input_reference": input_reference,
+        "previous_input": previous_input, "noise": noise, "observer": observer,
+    }  # fmt: skip
+    shared = {name: value for name, value in shared.items() if value is not None}
+    own = {"reference": references, "input_reference": input_references}
+    own = {name: np.asarray(v) for name, v in own.items() if v is not None}
+    checked = checked_arguments(controller, plant, x0s[0], steps, **shared, delay=delay)
+    require_own(own, shared, controller, steps, len(x0s))
+    if noise is not None:
+        shared["noise"], own["index"] = checked[-2], np.arange(len(x0s))
+    if observer is not None:
+        shared["observer"] = checked[-1]
+    host = ("reference", "input_reference", "previous_input")
+    shared |= {name: np.asarray(shared[name]) for name in host if name in shared}
+    whole = jax.device_put(arrays((controller, as_argument(plant), shared)), placement(devices))
     rows = lambda start, size: jax.tree.map(
-        lambda v: padded(np.asarray(v)[start : start + size], size), (x0s, variations)
+        lambda v: padded(np.asarray(v)[start : start + size], size), (x0s, variations, own)
     )
     part = lambda start, size: jax.device_put(rows(start, size), placement(devices, True))
-    loops = _compiled_loops(int(steps), devices)
+    loops = _compiled_loops(int(steps), int(delay), bool(compensate), devices)
     size = divisible(min(chunk or len(x0s), len(x0s)), devices)
     while chunk is None and size > count(devices):
-        if program_bytes(loops.program(*shared, *part(0, size))) <= 0.8 * device_bytes():
+        if program_bytes(loops.program(*whole, *part(0, size))) <= 0.8 * device_bytes():
             break
         size = divisible(-(-size // 2), devices)
     runs = []
     with tqdm(total=len(x0s), unit=" loops", disable=not progress) as bar:
         for start in range(0, len(x0s), size):
             here = min(size, len(x0s) - start)
-            runs.append(first_rows(loops(*shared, *part(start, size)), here))
+            runs.append(first_rows(loops(*whole, *part(start, size)), here))
             bar.update(here)
     return joined(runs)
+
+
+def require_own(
+    own: Mapping[str, np.ndarray], shared: Mapping[str, Any], controller: Any, steps: int,
+    count: int,
+) -> None:  # fmt: skip
+    """Raise ValueError unless the references of each loop have these shapes."""
+    mpc = controller.mpc
+    sizes = {
+        "reference": (mpc.system.n, steps + mpc.horizon),
+        "input_reference": (mpc.system.m, steps + mpc.horizon - 1),
+    }
+    for name, value in own.items():
+        size, length = sizes[name]
+        if name in shared:
+            fail(f"{name}s", f"given beside {name}", "Give one for all loops, or one for each")
+        require_real(f"{name}s", value)
+        shapes = (count, size), (count, length, size)
+        if value.shape not in shapes:
+            cure = f"Give {shapes[0]} or {shapes[1]}, one for each loop; {name} is for all of them"
+            fail(f"{name}s", f"shape {value.shape}", cure)
 
 
 def require_variations(plant: Any, variations: Mapping[str, Any], count: int) -> None:
@@ -83,25 +126,6 @@ def require_variations(plant: Any, variations: Mapping[str, Any], count: int) ->
         plant.vary(**{key: np.asarray(value)[0] for key, value in variations.items()})
 
 
-@jax.tree_util.register_static
-@dataclass(frozen=True, eq=False)
-class ConstantPlant:
-    """A plant that is no pytree: a constant of the compiled program, compared by identity."""
-
-    plant: Any
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, ConstantPlant) and self.plant is other.plant
-
-    def __hash__(self) -> int:
-        return id(self.plant)
-
-
-def as_argument(plant: Any) -> Any:
-    """Return the plant as an argument of `simulate_batch`: itself where it is a pytree."""
-    return ConstantPlant(plant) if jax.tree_util.all_leaves([plant]) else plant
-
-
 def simulate_batch(
     controller: Any, plant: Any, reference: Any, input_reference: Any, x0s: Array,
     variations: dict[str, Array], steps: int, checkpoint: bool = False,
@@ -111,18 +135,29 @@ def simulate_batch(
 
     plant: from `as_argument`. The rest is as in `simulate` and `simulate_many`.
     """
+    shared = {"reference": reference, "input_reference": input_reference}
+    options = {"steps": steps, "checkpoint": checkpoint}
+    return _loops(controller, plant, shared, x0s, variations, {}, **options)
+
+
+def _loops(
+    controller: Any, plant: Any, shared: dict[str, Any], x0s: Array, variations: dict[str, Array],
+    own: dict[str, Array], **options: Any,
+) -> Run:  # fmt: skip
+    """Return the runs from x0s (B, n), with arguments of `simulate` that all loops share and others
+    that each has of its own; "index" is the number of the loop for its noise."""
     plant = plant.plant if isinstance(plant, ConstantPlant) else plant
 
-    def loop(x0: Array, varied: dict[str, Array]) -> Run:
-        return simulate(
-            controller, plant.vary(**varied) if varied else plant, x0, steps, reference=reference,
-            input_reference=input_reference, checkpoint=checkpoint,
-        )  # fmt: skip
+    def loop(x0: Array, varied: dict[str, Array], own: dict[str, Array]) -> Run:
+        given = shared | own | options
+        if "index" in own:
+            given["noise"] = shared["noise"].of_loop(given.pop("index"))
+        return simulate(controller, plant.vary(**varied) if varied else plant, x0, **given)
 
-    return jax.vmap(loop)(x0s, variations)
+    return jax.vmap(loop)(x0s, variations, own)
 
 
 @functools.cache
-def _compiled_loops(steps: int, devices: Devices) -> Compiled:
-    loops = functools.partial(simulate_batch, steps=steps)
-    return over_devices(loops, devices, (False, False, False, False, True, True))
+def _compiled_loops(steps: int, delay: int, compensate: bool, devices: Devices) -> Compiled:
+    loops = functools.partial(_loops, steps=steps, delay=delay, compensate=compensate)
+    return over_devices(loops, devices, (False,) * 3 + (True,) * 3)

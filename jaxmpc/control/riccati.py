@@ -1,5 +1,6 @@
 """The infinite-horizon linear-quadratic regulator in discrete time."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,7 +53,7 @@ def lqr(system: LinearSystem, Q: ArrayLike, R: ArrayLike) -> LQR:
 
     NumPy in float64; not traceable. Raises ValueError if Q or R is not as above, or if a mode that
     does not decay by itself cannot be moved by u (not stabilizable) or costs nothing (not
-    detectable). The message names its eigenvalue.
+    detectable). The message names its coordinates and its eigenvalue.
 
     Under `jit`, `vmap` and `grad`, where any of A, B, Q, R is traced, K and P are JAX arrays in
     the dtype of the data (computed in float64 nevertheless), differentiable in both modes and
@@ -85,8 +86,9 @@ def lqr(system: LinearSystem, Q: ArrayLike, R: ArrayLike) -> LQR:
     output = np.sqrt(np.maximum(weights, 0.0))[:, None] * axes.T  # Q = output'output
     control, control_mode = least_reached(A, B)
     cost, cost_mode = least_reached(A.T, output.T)
-    unmoved = ("B", f"does not move the mode with eigenvalue {control_mode}", "Actuate it")
-    unseen = ("Q", f"puts no weight on the mode with eigenvalue {cost_mode}", "Give it some")
+    name = lambda A, B, mode: f"{_coordinates(A, B, system.state_names)} (eigenvalue {mode})"
+    unmoved = ("B", f"does not move {name(A, B, control_mode)}", "Actuate that")
+    unseen = ("Q", f"puts no weight on {name(A.T, output.T, cost_mode)}", "Give it some")
     if control <= _UNREACHED:
         fail(unmoved[0], f"not stabilizable: {unmoved[1]}", unmoved[2])
     if cost <= _UNREACHED:
@@ -270,17 +272,44 @@ def least_reached(A: np.ndarray, B: np.ndarray) -> tuple[float, str]:
     Popov-Belevitch-Hautus: all are reached if [A - s I, B] has full row rank at every
     eigenvalue |s| >= 1. The distance is its least singular value, B scaled to norm 1.
     """
+    worst, mode = np.inf, "none"
+    for s, _, sizes in _rank_tests(A, B):
+        if sizes[-1] < worst:
+            worst = float(sizes[-1])
+            mode = f"{s.real:.6g}" if s.imag == 0 else f"{s.real:.6g}{s.imag:+.6g}j"
+    return worst, mode
+
+
+def _rank_tests(
+    A: np.ndarray, B: np.ndarray
+) -> Iterator[tuple[complex, np.ndarray, np.ndarray]]:  # fmt: skip
+    """Yield each eigenvalue s, |s| >= 1, and the left singular vectors and values of
+    [A - s I, B], B scaled to norm 1 and the values by max(1, |A|)."""
     B = B / max(np.linalg.norm(B, 2), np.finfo(np.float64).tiny)
     # A k-fold eigenvalue is computed as a ring of radius eps^(1/k); its mean is accurate.
     computed = np.linalg.eigvals(A)
     means = [computed[np.abs(computed - s) < 1e-4].mean() for s in computed]
-    worst, mode = np.inf, "none"
-    for s in np.concatenate([computed, means]):
-        if abs(s) < 1 - 1e-12:
-            continue
-        test = np.hstack([A - s * np.eye(len(A)), B])
-        least = np.linalg.svd(test, compute_uv=False)[-1] / max(1.0, np.linalg.norm(A, 2))
-        if least < worst:
-            worst = float(least)
-            mode = f"{s.real:.6g}" if s.imag == 0 else f"{s.real:.6g}{s.imag:+.6g}j"
-    return worst, mode
+    size = max(1.0, np.linalg.norm(A, 2))
+    for s in np.unique(np.concatenate([computed, means])):
+        if abs(s) >= 1 - 1e-12:
+            vectors, values, _ = np.linalg.svd(np.hstack([A - s * np.eye(len(A)), B]))
+            yield s, vectors, values / size
+
+
+def _coordinates(A: np.ndarray, B: np.ndarray, names: Sequence[str], most: int = 6) -> str:
+    """Return the coordinates of the unreached modes in words: those in which a left null vector of
+    a rank test, or of the test that comes nearest to one, has more than a tenth of its largest
+    entry."""
+    tests = list(_rank_tests(A, B))
+    if not tests:
+        return "a mode"
+    bound = max(_UNREACHED, min(values[-1] for _, _, values in tests))
+    weight = np.zeros(len(A))
+    for _, vectors, values in tests:
+        entries = np.abs(vectors[:, values <= bound])
+        largest = entries.max(axis=0, initial=0.0)
+        weight = np.maximum(weight, (entries > 0.1 * largest).max(axis=1, initial=0.0))
+    of = np.flatnonzero(weight).tolist()
+    found = [names[i] for i in of] if names else [f"coordinate {i}" for i in of]
+    rest = len(found) - most
+    return ", ".join(found[:most]) + (f" and {rest} more" if rest > 0 else "")

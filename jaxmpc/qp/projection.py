@@ -82,6 +82,11 @@ class Bounds:
         d = jnp.where(soft, jnp.abs(p - jnp.clip(p, self.l, self.u)), 0.0)
         return d * (jnp.where(soft, self.linear, 0.0) + 0.5 * self.quadratic * d)
 
+    def slope(self, v: Array) -> Array:
+        """Return by how much the penalty of each row at v (m,) grows with its violation: c + k d
+        of soft rows that are violated, 0 of all others."""
+        return jnp.abs(self.penalty_gradient(v))
+
     def penalty_gradient(self, v: Array) -> Array:
         """Return the gradient of the penalties at v (m,): the multiplier of soft rows that are
         violated, 0 in all others."""

@@ -59,7 +59,9 @@ def terms_of(q: Array, bounds: Bounds, z: Array, y: Array, products: Products) -
     Az, Pz, Aty, *sizes = products
     penalty, support = bounds.cost(Az), bounds.support(y)
     gap = jnp.sum(z * (Pz + q)) + jnp.sum(penalty + support)
-    size = jnp.sum(jnp.abs(z) * (jnp.abs(Pz) + jnp.abs(q))) + jnp.sum(penalty + jnp.abs(support))
+    # A penalty is a multiple of a violation, which is a difference of the terms of its row.
+    size = jnp.sum(jnp.abs(z) * (jnp.abs(Pz) + jnp.abs(q)))
+    size = size + jnp.sum(bounds.slope(Az) * sizes[0] + penalty + jnp.abs(support))
     return [
         (bounds.violation(Az), sizes[0]),
         (Pz + q + Aty, sizes[1] + jnp.abs(q) + sizes[2]),

@@ -119,9 +119,9 @@ class RobotMap:
         return self.linear.names
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Return the table promise × robot: how many states of each kind of promise held, failed,
-        or are undecided."""
-        words = {1: "kept", -1: "failed", 0: "undecided"}
+        """Return the table promise × robot: of how many states each kind of promise held, failed,
+        or is open since a plan of the robot was not solved."""
+        words = {1: "kept", -1: "failed", 0: "unsolved"}
         promises = {1: "promised", -1: "not promised", 0: "undecided"}
         return {
             name: {

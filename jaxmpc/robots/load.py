@@ -1,6 +1,7 @@
 """load_robot: from a model file to a Robot, its limits read and checked."""
 
 import copy
+import warnings
 import xml.etree.ElementTree as ElementTree
 from importlib import resources
 from pathlib import Path
@@ -12,8 +13,10 @@ from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.control.limits import Limit, limit_pair
 from jaxmpc.control.sets import Box
 from jaxmpc.control.system import require_period
-from jaxmpc.robots.physics import Physics
+from jaxmpc.robots.physics import RK4, Physics
 from jaxmpc.robots.robot import Robot
+from jaxmpc.robots.supported import make_supported
+from jaxmpc.robots.urdf import compiled_urdf
 
 if TYPE_CHECKING:
     import mujoco
@@ -24,7 +27,7 @@ MODELS = ("joint", "pendulum", "cartpole", "arm2", "arm6", "arm7", "quadrotor")
 def load_robot(
     model: "str | Path | mujoco.MjModel", *, position: Limit = None, velocity: Limit = None,
     torque: Limit = None, home: Any = None, control_period: float | None = None,
-    timestep: float | None = None,
+    timestep: float | None = None, floating_base: bool = False, mend_inertias: bool = False,
 ) -> Robot:  # fmt: skip
     """Load a robot: a model of ours, an MJCF or URDF file, or a mujoco.MjModel.
 
@@ -32,30 +35,43 @@ def load_robot(
         model: "joint" (one hinge), "pendulum", "cartpole", "arm2", "arm6" (UR5e), "arm7" (Franka
             FER), "quadrotor" (Crazyflie 2), or a path. A URDF gets a motor for each joint
             with its `effort` as limit, its `velocity` limits are read (0: none), and its shapes are
-            left out: it must give inertias, and has no contacts.
+            left out: it must give inertias, has no contacts, and needs none of its mesh files.
         position, velocity, torque: limits in place of the file's, as `joint_limits` takes them:
             (lower, upper), each a number or one a dof (torque: one an actuator), or v for
             |.| ≤ v, inputs in units of ctrl. They bind the controller; the joint stops of the plant
             stay, and its motors apply any input that they are given.
         home: configuration (nq,) in place of the file's.
         control_period: seconds between inputs; a multiple of timestep, the physics step (s).
+        floating_base: of a URDF, whether its root link moves freely; else it is welded to the
+            world.
+        mend_inertias: of a URDF, whether inertias that no body can have (principal moments that are
+            not positive or violate a + b ≥ c, moving links without mass) are replaced by near ones,
+            which `report` lists. Without it they are refused.
 
     Defaults where the file lacks `<numeric name="velocity_limit">`, `<numeric name=
     "control_period">` and `<key name="home">`: none, 10 ms (rounded to physics steps), and the
     model's qpos0 moved inside the joint ranges. Input limits are the narrowest of `ctrlrange`,
     and for motors `forcerange` and the joint's `actuatorfrcrange`.
 
-    Raises ValueError for files that MuJoCo cannot read, models without actuators or joints or with
-    activation states, what MJX does not support, and limits that contradict each other.
-    Contacts and other constraints act in the plant, not in the linear models (see `Robot`).
+    What MJX lacks is taken out: where that changes no motion in silence (switches of diagnostics,
+    sensors), else with a UserWarning (contacts between shapes for which it has no function, noslip
+    iterations). `robot.report()` lists both, and what acts in the plant but not in linear models.
+
+    Raises ValueError for files that MuJoCo cannot read, models without actuators or joints, what
+    else MJX does not support, and limits that contradict each other.
     """
     import mujoco
 
     velocities: dict[str, float] = {}
+    mended: tuple[str, ...] = ()
     name = "robot"
+    for argument, given in (("floating_base", floating_base), ("mend_inertias", mend_inertias)):
+        if given and not (isinstance(model, str | Path) and _is_urdf(model)):
+            fail(argument, "is for URDF files", "Write it into the MJCF file or the MjModel")
+    welded = isinstance(model, str | Path) and _is_urdf(model) and not floating_base
     if isinstance(model, str | Path):
         name = Path(model).stem
-        model, velocities = _compiled_model(model)
+        model, velocities, mended = _compiled_model(model, floating_base, mend_inertias)
     elif not isinstance(model, mujoco.MjModel):
         fail("model", f"is a {type(model).__name__}", "Give a name, a path or a mujoco.MjModel")
     host = copy.deepcopy(model)
@@ -63,8 +79,9 @@ def load_robot(
         fail("model", f"{name} has no joints", "A robot has something to move")
     if host.nu == 0:
         fail("model", f"{name} has no actuators", "Add <actuator><motor joint=.../></actuator>")
-    if host.na:
-        fail("model", f"{name} has {host.na} activation states", "Use actuators with dyntype none")
+    if host.na and host.opt.integrator == RK4:
+        fail("model", f"{name} has {host.na} activation states and the integrator RK4",
+             "Use another integrator, or actuators with dyntype none")  # fmt: skip
     if timestep is not None:
         require_period("timestep", timestep)
         host.opt.timestep = timestep
@@ -81,23 +98,40 @@ def load_robot(
         )  # fmt: skip
 
     host.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
-    # MuJoCo's account of the energy changes no motion, and MJX refuses it.
-    host.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
-    inputs = _input_limits(host, torque)
+    cleared, left_out = make_supported(host)
+    if left_out:
+        warnings.warn(
+            f"robot {name} moves without {'; '.join(left_out)} of its file, which MJX lacks",
+            stacklevel=2,
+        )
+    inputs, of_inputs = _input_limits(host, torque)
     smooth = copy.deepcopy(host)
     smooth.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     smooth.actuator_forcelimited[:] = 0
     smooth.jnt_actfrclimited[:] = 0
     names, units = _state_names(host)
-    states = _state_limits(host, position, velocity, velocities)
-    q = _home_qpos(host) if home is None else _configuration(host, home)
+    states, of_states = _state_limits(host, position, velocity, velocities)
+    q, act, source = _home(host)
+    if home is not None:
+        q, source = _configuration(host, home), "argument"
+    notes = [
+        *(("cleared", text) for text in cleared), *(("left out", text) for text in left_out),
+        *(("mended", text) for text in mended), ("home", source),
+        *(("limit", text) for text in (*of_states, *of_inputs)),
+    ]  # fmt: skip
+    if welded:
+        notes.append(("welded", "the root link is welded to the world (see floating_base)"))
     return Robot(
-        state_limits=states, input_limits=inputs, home=np.concatenate([q, np.zeros(host.nv)]),
+        state_limits=states, input_limits=inputs, home=np.concatenate([q, np.zeros(host.nv), act]),
         plant=Physics(host), predictor=Physics(smooth), anchor=_anchor(host, q),
         substeps=substeps, dt=control_period, name=name, state_names=names, state_units=units,
         input_names=tuple(_mujoco_names(host, mujoco.mjtObj.mjOBJ_ACTUATOR, host.nu, "u")),
-        input_units=tuple(_input_unit(host, i) for i in range(host.nu)),
+        input_units=tuple(_input_unit(host, i) for i in range(host.nu)), notes=tuple(notes),
     )  # fmt: skip
+
+
+def _is_urdf(model: str | Path) -> bool:
+    return Path(model).suffix.lower() == ".urdf"
 
 
 def _configuration(host: "mujoco.MjModel", home: Any) -> np.ndarray:
@@ -125,8 +159,10 @@ def _anchor(host: "mujoco.MjModel", home: np.ndarray) -> tuple[float, ...]:
     return tuple(anchor.tolist())
 
 
-def _compiled_model(model: str | Path) -> tuple["mujoco.MjModel", dict[str, float]]:
-    """Return the compiled model, and the velocity limits of a URDF by joint."""
+def _compiled_model(
+    model: str | Path, floating_base: bool, mend_inertias: bool
+) -> tuple["mujoco.MjModel", dict[str, float], tuple[str, ...]]:
+    """Return the compiled model, and of a URDF its velocity limits by joint and what was mended."""
     import mujoco
 
     path = Path(model)
@@ -134,45 +170,15 @@ def _compiled_model(model: str | Path) -> tuple["mujoco.MjModel", dict[str, floa
         path = Path(str(resources.files("jaxmpc.robots"))) / "models" / f"{model}.xml"
     elif not path.is_file():
         fail("model", f"{str(model)!r} is no file", f"Give a path, or one of {', '.join(MODELS)}")
-    velocities: dict[str, float] = {}
     try:
-        if path.suffix.lower() == ".urdf":
-            text, velocities = _without_meshes(path.read_text())
-            spec = mujoco.MjSpec.from_string(text)
-            _add_motors(spec)
-            return spec.compile(), velocities
-        return mujoco.MjModel.from_xml_path(str(path)), velocities
+        if _is_urdf(path):
+            return compiled_urdf(
+                path.read_text(), floating_base=floating_base, mend_inertias=mend_inertias
+            )
+        return mujoco.MjModel.from_xml_path(str(path)), {}, ()
     except (ValueError, ElementTree.ParseError) as error:
         text = " ".join(str(error).split())
         fail("model", f"{path} cannot be read: {text}", "Mend the file")
-
-
-def _without_meshes(text: str) -> tuple[str, dict[str, float]]:
-    """Return a URDF without visual and collision geometry, and the velocity limit of each joint."""
-    root = ElementTree.fromstring(text)
-    for link in root.iter("link"):
-        for kind in ("visual", "collision"):
-            for element in link.findall(kind):
-                link.remove(element)
-    limits = ((joint.get("name"), joint.find("limit")) for joint in root.iter("joint"))
-    velocities = {
-        str(name): float(limit.get("velocity", "inf")) or np.inf
-        for name, limit in limits
-        if limit is not None
-    }
-    return ElementTree.tostring(root, encoding="unicode"), velocities
-
-
-def _add_motors(spec: "mujoco.MjSpec") -> None:
-    """Add a motor to each hinge and slide joint; a URDF cannot have any."""
-    import mujoco
-
-    single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-    for joint in spec.joints:
-        if joint.type in single:
-            motor = spec.add_actuator(name=f"{joint.name} torque", target=joint.name)
-            motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
-            motor.set_to_motor()
 
 
 def _numeric(host: "mujoco.MjModel", name: str, default: Any) -> Any:
@@ -211,7 +217,10 @@ def _state_names(host: "mujoco.MjModel") -> tuple[tuple[str, ...], tuple[str, ..
             positions.append((name, "m" if kind == slide else "rad"))
     names = [name for name, _ in positions] + [f"{name} velocity" for name, _ in positions]
     units = [unit for _, unit in positions] + [f"{unit}/s" for _, unit in positions]
-    return tuple(names), tuple(units)
+    active = np.flatnonzero(host.actuator_actadr >= 0)
+    inputs = _mujoco_names(host, mujoco.mjtObj.mjOBJ_ACTUATOR, host.nu, "u")
+    names += [f"{inputs[i]} activation" for i in active]
+    return tuple(names), (*units, *[""] * len(active))
 
 
 def _input_unit(host: "mujoco.MjModel", i: int) -> str:
@@ -233,13 +242,15 @@ def _is_motor(host: "mujoco.MjModel", i: int) -> bool:
     )
 
 
-def _input_limits(host: "mujoco.MjModel", override: Limit) -> Box:
-    """Return the box of inputs, and drop in `host` the motors' force limits that it takes over."""
+def _input_limits(host: "mujoco.MjModel", override: Limit) -> tuple[Box, list[str]]:
+    """Return the box of inputs and the source of each, and drop in `host` the motors' force limits
+    that it takes over."""
     import mujoco
 
     lower, upper = np.full(host.nu, -np.inf), np.full(host.nu, np.inf)
     limited = host.actuator_ctrllimited.astype(bool)
     lower[limited], upper[limited] = host.actuator_ctrlrange[limited].T
+    sources = ["ctrlrange" if yes else "" for yes in limited]
     on_joint = host.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
     joints = np.where(on_joint, host.actuator_trnid[:, 0], -1)
     for i in range(host.nu):
@@ -247,46 +258,64 @@ def _input_limits(host: "mujoco.MjModel", override: Limit) -> Box:
         if not _is_motor(host, i) or gain * gear == 0:
             continue
         alone = np.sum(joints == joints[i]) == 1
-        ends = []
+        ends = {}
         if host.actuator_forcelimited[i]:
-            ends.append(host.actuator_forcerange[i] / gain)
+            ends["forcerange"] = host.actuator_forcerange[i] / gain
             host.actuator_forcelimited[i] = 0
         if host.jnt_actfrclimited[joints[i]] and alone:
-            ends.append(host.jnt_actfrcrange[joints[i]] / (gain * gear))
+            ends["actuatorfrcrange"] = host.jnt_actfrcrange[joints[i]] / (gain * gear)
             host.jnt_actfrclimited[joints[i]] = 0
-        for end in ends:
+        for source, end in ends.items():
+            if end.min() > lower[i] or end.max() < upper[i]:
+                sources[i] = source
             lower[i], upper[i] = max(lower[i], end.min()), min(upper[i], end.max())
-    limits = Box(lower, upper)
-    return _overridden("torque", limits, override, slice(None))
+    sources = ["none" if not source else f"file, {source}" for source in sources]
+    limits = _overridden("torque", Box(lower, upper), override, slice(None))
+    return limits, sources if override is None else ["argument"] * host.nu
 
 
 def _state_limits(
     host: "mujoco.MjModel", position: Limit, velocity: Limit, of_file: dict[str, float]
-) -> Box:
-    """Return the limits of the coordinates ξ: joint ranges and velocities."""
+) -> tuple[Box, list[str]]:
+    """Return the limits of the coordinates ξ (joint ranges, velocities and ranges of activations),
+    and the source of each."""
     import mujoco
 
-    nv = host.nv
-    lower, upper = np.full(2 * nv, -np.inf), np.full(2 * nv, np.inf)
+    nv, size = host.nv, 2 * host.nv + host.na
+    lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
+    sources = ["none"] * size
     names = _mujoco_names(host, mujoco.mjtObj.mjOBJ_JOINT, host.njnt, "q")
     for j in range(host.njnt):
         dof = host.jnt_dofadr[j]
         if host.jnt_limited[j] and host.jnt_type[j] in (2, 3):
             lower[dof], upper[dof] = host.jnt_range[j]
-        lower[nv + dof], upper[nv + dof] = np.array([-1, 1]) * of_file.get(names[j], np.inf)
+            sources[dof] = "file, range"
+        speed = of_file.get(names[j], np.inf)
+        lower[nv + dof], upper[nv + dof] = -speed, speed
+        if np.isfinite(speed):
+            sources[nv + dof] = "file, velocity"
     speeds = np.atleast_1d(_numeric(host, "velocity_limit", np.inf))
     if speeds.size not in (1, nv):
         fail("velocity_limit", f"{speeds.size} numbers in the file, {nv} dofs", "Give one a dof")
     speeds = np.broadcast_to(speeds, nv)
-    lower[nv:], upper[nv:] = np.maximum(lower[nv:], -speeds), np.minimum(upper[nv:], speeds)
+    rates = slice(nv, 2 * nv)
+    for dof in np.flatnonzero(speeds < upper[rates]):
+        sources[nv + dof] = "file, velocity_limit"
+    lower[rates], upper[rates] = np.maximum(lower[rates], -speeds), np.minimum(upper[rates], speeds)
+    for k in np.flatnonzero(host.actuator_actlimited & (host.actuator_actadr >= 0)):
+        at = 2 * nv + host.actuator_actadr[k]
+        lower[at], upper[at] = host.actuator_actrange[k]
+        sources[at] = "file, actrange"
     limits = _overridden("position", Box(lower, upper), position, slice(0, nv))
-    limits = _overridden("velocity", limits, velocity, slice(nv, None))
-    slow, fast = np.asarray(limits.lower)[nv:], np.asarray(limits.upper)[nv:]
+    limits = _overridden("velocity", limits, velocity, rates)
+    for given, part in ((position, slice(0, nv)), (velocity, rates)):
+        sources[part] = sources[part] if given is None else ["argument"] * nv
+    slow, fast = np.asarray(limits.lower)[rates], np.asarray(limits.upper)[rates]
     if np.any((slow > 0) | (fast < 0)):
         i = int(np.argmax((slow > 0) | (fast < 0)))
         cure = "Give (lower, upper) with 0 inside, or one number v for |.| ≤ v"
         fail("velocity", f"[{slow[i]:g}, {fast[i]:g}] of dof {i} leaves out rest", cure)
-    return limits
+    return limits, sources
 
 
 def _overridden(argument: str, limits: Box, override: Limit, part: slice) -> Box:
@@ -302,16 +331,19 @@ def _overridden(argument: str, limits: Box, override: Limit, part: slice) -> Box
     return Box(lower, upper)
 
 
-def _home_qpos(host: "mujoco.MjModel") -> np.ndarray:
-    """Return qpos of the key "home", else of the first key, else qpos0 moved inside the ranges."""
+def _home(host: "mujoco.MjModel") -> tuple[np.ndarray, np.ndarray, str]:
+    """Return qpos, act and the source: the key "home", else the first key, else qpos0 moved inside
+    the ranges and zeros."""
     import mujoco
 
-    i = mujoco.mj_name2id(host, mujoco.mjtObj.mjOBJ_KEY, "home")
     if host.nkey:
-        return host.key_qpos[max(i, 0)].copy()
+        key = max(mujoco.mj_name2id(host, mujoco.mjtObj.mjOBJ_KEY, "home"), 0)
+        name = mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_KEY, key)
+        return host.key_qpos[key].copy(), host.key_act[key].copy(), f"file, key {name or key}"
     q = host.qpos0.copy()
     for j in range(host.njnt):
         if host.jnt_limited[j] and host.jnt_type[j] in (2, 3):
-            i = host.jnt_qposadr[j]
-            q[i] = np.clip(q[i], *host.jnt_range[j])
-    return q
+            at = host.jnt_qposadr[j]
+            q[at] = np.clip(q[at], *host.jnt_range[j])
+    moved = "" if np.array_equal(q, host.qpos0) else ", moved inside the joint ranges"
+    return q, np.zeros(host.na), f"file, qpos0{moved}"

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 # mjtIntegrator.
 EULER, RK4 = 0, 1
 
-# mjtDisableBit, mjtEq.
+# mjtDisableBit, mjtEq, the last mjtTrn of a joint.
 NO_GRAVITY, NO_EULER_DAMPING = 128, 32768
-EQUALITY_OF_JOINTS = 2
+EQUALITY_OF_JOINTS, TRANSMISSION_BY_JOINT = 2, 1
 
 # How many operations XLA of old jaxlibs may fuse on a CPU.
 PIECE = 15
@@ -61,16 +61,18 @@ class Physics:
         except NotImplementedError as error:
             fail("model", f"MJX does not support it: {error}", "Take that out of the file")
         self.rows = blank._impl.efc_J.size > 0
-        # Where no force depends on where the bodies are, other than through the joints.
+        placed = blank._impl.contact.dim.size or np.any(model.eq_type != EQUALITY_OF_JOINTS)
+        light = getattr(model, "flg_gravcomp", False) or np.any(model.body_gravcomp)
+        in_fluid = model.opt.density or model.opt.viscosity or np.any(model.opt.wind)
+        # Whether a force depends on where the bodies are, other than through the joints.
         self.posed = bool(
-            model.ntendon or np.any(model.body_gravcomp) or blank._impl.contact.dim.size
-            or model.opt.density or model.opt.viscosity or np.any(model.actuator_trntype > 1)
-            or np.any(model.eq_type != EQUALITY_OF_JOINTS)
+            model.ntendon or light or in_fluid or (self.rows and placed)
+            or np.any(model.actuator_trntype > TRANSMISSION_BY_JOINT)
         )  # fmt: skip
 
     def step(self, x: Array, u: Array, numbers: Mapping[str, Any] | None = None) -> Array:
-        """Return x = (qpos, qvel) one physics step later: a function of x, u and nothing carried
-        along.
+        """Return x = (qpos, qvel, act) one physics step later: a function of x, u and nothing
+        carried along.
 
         numbers: fields of mjx.Model to replace. Differentiable in all three, forward and reverse;
         with constraints by `with_forward_jacobian`.
@@ -82,18 +84,23 @@ class Physics:
         return with_forward_jacobian(step)(x, u, numbers)
 
     def _step(self, x: Array, u: Array, numbers: dict[str, Array]) -> Array:
-        x_q, v = jnp.split(x, [self.model.nq])
+        x_q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
         q, h = normalised(self.joints, x_q), jnp.asarray(self.mjx.opt.timestep, x.dtype)
         if self.model.opt.integrator == RK4:
-            forward = lambda q, v: self._accelerations(numbers, q, v, u)
+            forward = lambda q, v: self._accelerations(numbers, q, v, act, u)
             return self._runge_kutta(forward, q, v, h)
-        v = v + h * self._accelerations(numbers, q, v, u, damped=True)
+        if self.model.na:
+            act_next = _next_activations(*self._forced(numbers, q, v, act, u))
+        else:
+            act_next = act
+        v = v + h * self._accelerations(numbers, q, v, act, u, damped=True)
         # MJX's own integration of positions has the derivative 0 for a body that does not turn.
-        return jnp.concatenate([retract(self.joints, q, h * v), v])
+        return jnp.concatenate([retract(self.joints, q, h * v), v, act_next])
 
     def _accelerations(
-        self, numbers: dict[str, Array], q: Array, v: Array, u: Array, damped: bool = False
-    ) -> Array:
+        self, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array,
+        damped: bool = False,
+    ) -> Array:  # fmt: skip
         """Return the accelerations (nv,); damped: with the integrator's implicit part.
 
         Differentiated as the solution of the balance of forces (implicit function theorem), not by
@@ -116,13 +123,13 @@ class Physics:
             return found, (da, moved)
 
         solved.defjvp(rule, symbolic_zeros=True)
-        return solved(numbers, q, v, u)[0]
+        return solved(numbers, q, v, act, u)[0]
 
     def _solved(
-        self, damped: bool, numbers: dict[str, Array], q: Array, v: Array, u: Array
+        self, damped: bool, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array
     ) -> tuple[Array, Array]:
         """Return the accelerations (nv,) with and without the integrator's implicit part."""
-        model, data = self._forced(numbers, q, v, u)
+        model, data = self._forced(numbers, q, v, act, u)
         M, bias, _ = self._dynamics(numbers, q, v)
         force = data.qfrc_smooth - bias
         pushed = first = jnp.zeros_like(v)
@@ -135,12 +142,12 @@ class Physics:
 
     def _missing(
         self, damped: bool, found: tuple[Array, Array], numbers: dict[str, Array], q: Array,
-        v: Array, u: Array,
+        v: Array, act: Array, u: Array,
     ) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:  # fmt: skip
         """Return the generalised forces that the accelerations `found` without and with the
         implicit part lack, then what is added to M for each, and the derivative of the constraint
         forces in the accelerations."""
-        model, data = self._forced(numbers, q, v, u)
+        model, data = self._forced(numbers, q, v, act, u)
         a, first = found
         forces, still = data.qfrc_smooth, jnp.zeros_like(a)
         added = self._added(model, data, False), self._added(model, data, damped)
@@ -174,7 +181,9 @@ class Physics:
             added = added if slope is None else added - h * slope
         return added
 
-    def _forced(self, numbers: dict[str, Array], q: Array, v: Array, u: Array) -> tuple[Any, Any]:
+    def _forced(
+        self, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array
+    ) -> tuple[Any, Any]:
         """Return mjx.Model and mjx.Data with the forces of springs, dampers and actuators in
         qfrc_smooth, and with the rows of constraints."""
         mjx = mjx_module()
@@ -184,10 +193,11 @@ class Physics:
         # A copy for each program. JAX caches by identity how it converted NumPy arrays, also for
         # programs of the other precision, and MJX passes it arrays of the model.
         model = cast(copy.deepcopy(self.mjx).replace(**numbers))
-        data = cast(mjx.make_data(self.model)).replace(qpos=q, qvel=v, ctrl=u)
+        data = cast(mjx.make_data(self.model)).replace(qpos=q, qvel=v, act=act, ctrl=u)
         if self.posed:
             data = data.replace(**self._dynamics(numbers, q, v)[2])
-            data = mjx.collision(model, mjx.tendon(model, data))
+            data = mjx.tendon(model, data)
+            data = mjx.collision(model, data) if self.rows else data
         data = mjx.transmission(model, mjx.make_constraint(model, data))
         data = data.tree_replace({
             "_impl.actuator_velocity": matmul(data._impl.actuator_moment, v),
@@ -213,7 +223,12 @@ class Physics:
         fixed = {key: np.array(getattr(self.mjx, key), q.dtype)[..., None] for key in FIELDS}
         off = bool(self.model.opt.disableflags & NO_GRAVITY)
         fixed["gravity"] = (0.0 if off else 1.0) * np.array(self.mjx.opt.gravity, q.dtype)[:, None]
-        own = {key: value for key, value in numbers.items() if key in FIELDS}
+        unit = lambda v: v / jnp.linalg.norm(v, axis=-1, keepdims=True)
+        own = {
+            key: unit(value) if key.endswith("quat") else value
+            for key, value in numbers.items()
+            if key in FIELDS
+        }
         call = lambda own, *rest: function(self.tree, {**fixed, **own}, *rest)
         return side_by_side(call)(jax.tree.map(lambda v: jnp.asarray(v, q.dtype), own), q, *rest)
 
@@ -260,6 +275,13 @@ class Physics:
         table = jnp.array([[0, 1 / 6], [1 / 2, 1 / 3], [1 / 2, 1 / 3], [1, 1 / 6]], v.dtype)
         end, _ = jax.lax.scan(in_pieces(stage), (jnp.zeros_like(v),) * 4, table)
         return jnp.concatenate([move(end[2]), v + h * end[3]])
+
+
+def _next_activations(model: Any, data: Any) -> Array:
+    """Return the activations (na,) one physics step later, as mjx.euler does."""
+    from mujoco.mjx._src.forward import _next_activation
+
+    return _next_activation(model, data, data.act_dot)
 
 
 def _constraint_forces(model: Any, data: Any, a: Array) -> Array:

@@ -8,6 +8,7 @@ derivative is wrong at the bound, where MPC often operates: the controller has t
 `input_limits`.
 """
 
+import warnings
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,9 @@ from jaxmpc.control.sets import Box
 from jaxmpc.control.system import LinearSystem, host_array
 from jaxmpc.qp.linalg import eigh
 from jaxmpc.qp.precision import floating_dtype, matmul
+from jaxmpc.robots.balance import lacking, nearest_rest, rest_at, settled
 from jaxmpc.robots.physics import Physics
+from jaxmpc.robots.report import RobotReport, report_of
 from jaxmpc.robots.tangent import difference, quaternions, retract
 
 if TYPE_CHECKING:
@@ -36,13 +39,15 @@ class Robot:
     State of the plant: x = (qpos, qvel), size nq + nv. State of models and controllers: coordinates
     ξ = (q ⊖ anchor, qvel), size n = 2 nv: hinge and slide joints as they are, free positions as
     they are, orientations as the rotation vector (rad) from that of `home`. Without quaternions
-    both are the same numbers. The input u (m,) is MuJoCo's ctrl, held for a control period dt (s)
-    of `substeps` physics steps. Units are MuJoCo's: m, rad, s, kg, N, N m.
+    both are the same numbers. Activation states of actuators, act (na,), stand behind qvel in both.
+    The input u (m,) is MuJoCo's ctrl, held for a control period dt (s) of `substeps` physics steps.
+    Units are MuJoCo's: m, rad, s, kg, N, N m.
 
-    state_limits (in ξ), input_limits: Boxes, ±inf for no limit. home (nq + nv,): the set-point of
-    the file. anchor (nq,): zeros, with the orientations of home. plant, predictor: `Physics`,
+    state_limits (in ξ), input_limits: Boxes, ±inf for no limit. home (nq + nv + na,): the set-point
+    of the file. anchor (nq,): zeros, with the orientations of home. plant, predictor: `Physics`,
     constants of compiled programs (twice to ten times as fast as arguments). numbers: parameters of
-    the plant that differ in a batch (masses, damping), see `vary`.
+    the plant that differ in a batch (masses, damping), see `vary`. notes: (kind, text) of what
+    `load_robot` found, see `report`.
     """
 
     state_limits: Box
@@ -59,6 +64,7 @@ class Robot:
     input_names: tuple[str, ...] = field(default=(), metadata={"static": True})
     input_units: tuple[str, ...] = field(default=(), metadata={"static": True})
     numbers: dict[str, Any] = field(default_factory=dict)
+    notes: tuple[tuple[str, str], ...] = field(default=(), metadata={"static": True})
 
     @property
     def mujoco(self) -> "mujoco.MjModel":
@@ -67,8 +73,8 @@ class Robot:
 
     @property
     def n(self) -> int:
-        """Return the number of coordinates ξ, 2 nv."""
-        return 2 * self.mujoco.nv
+        """Return the number of coordinates ξ, 2 nv + na."""
+        return 2 * self.mujoco.nv + self.mujoco.na
 
     @property
     def m(self) -> int:
@@ -82,11 +88,11 @@ class Robot:
 
     @property
     def state_size(self) -> int:
-        """Return the length of the state x, nq + nv."""
-        return self.mujoco.nq + self.mujoco.nv
+        """Return the length of the state x, nq + nv + na."""
+        return self.mujoco.nq + self.mujoco.nv + self.mujoco.na
 
     def step(self, x: Any, u: Any) -> Array:
-        """Return the state x (nq + nv,) one control period later, with the input u (m,) held.
+        """Return the state x one control period later, with the input u (m,) held.
 
         Differentiable in x, u and the numbers of `plant`, in forward and reverse mode. Each physics
         step computes its Jacobian by forward mode, that of constraint forces by the implicit
@@ -158,9 +164,9 @@ class Robot:
         return A, B
 
     def coordinates(self, x: Any) -> Array:
-        """Return ξ (n,) of a state x (nq + nv,)."""
+        """Return ξ (n,) of a state x (nq + nv + na,)."""
         x = jnp.asarray(x)
-        require_shape("x", x, (self.state_size,), "Give (qpos, qvel) of one robot")
+        require_shape("x", x, (self.state_size,), "Give (qpos, qvel, act) of one robot")
         if not quaternions(self.joints):
             return x
         nq = self.mujoco.nq
@@ -168,7 +174,7 @@ class Robot:
         return jnp.concatenate([difference(self.joints, anchor, x[:nq]), x[nq:]])
 
     def state(self, coordinates: Any) -> Array:
-        """Return x (nq + nv,) with the coordinates ξ (n,)."""
+        """Return x (nq + nv + na,) with the coordinates ξ (n,)."""
         xi = jnp.asarray(coordinates)
         require_shape("coordinates", xi, (self.n,), "Two numbers a dof; use jax.vmap for many")
         if not quaternions(self.joints):
@@ -177,40 +183,87 @@ class Robot:
         anchor = jnp.asarray(self.anchor, xi.dtype)
         return jnp.concatenate([retract(self.joints, anchor, xi[:nv]), xi[nv:]])
 
-    def equilibrium(self, q: Any = None) -> tuple[np.ndarray, np.ndarray]:
+    def equilibrium(self, q: Any = None, *, near: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Return (x, u): the robot at rest in the configuration q (nq,), and the input that holds
         it.
 
-        q: None for that of `home`; (..., nq) for many. u solves J'u = bias − passive forces
-        (gravity compensation), the least one where there are several. Limits' springs, contacts and
-        dry friction do not help. Computed outside JAX in float64 by MuJoCo's C engine.
+        q: None for that of `home`; (..., nq) for many. The input (or the activation, where an
+        actuator has one) balances gravity and passive forces, the least one where there are
+        several. near (nq,), in place of q: the configuration nearest to it that inputs within the
+        limits hold, inside the position limits: a local search, least squares of the forces and
+        of the motion. Limits' springs, contacts, equalities and dry friction do not help. Computed
+        outside JAX in float64 by MuJoCo's C engine.
 
         Raises ValueError where the actuators cannot hold q at all, or only beyond input_limits
-        (force limits of actuators other than motors are not looked at).
+        (force limits of actuators other than motors are not looked at), and where the search from
+        `near` ends at unbalanced forces: nothing but contact holds a body that stands on the
+        ground. It names the coordinates that lack a force.
         """
+        if near is not None:
+            if q is not None:
+                fail("near", "is given beside q", "Give one of them")
+            require_shape("near", near, (self.mujoco.nq,), "One configuration, as in qpos")
+            rest = nearest_rest(self, self._configurations("near", near))
+            if not rest.held:
+                fail(
+                    "near", f"no configuration that can be held was found from there: "
+                    f"{lacking(self, rest)}", "Start elsewhere, or give the robot what holds it",
+                )  # fmt: skip
+            return rest.x, rest.u
         q = self._configurations("q", self.home[: self.mujoco.nq] if q is None else q)
-        still = np.zeros((*q.shape[:-1], self.mujoco.nv))
-        u = self.inverse_dynamics(q, still, still)
-        lower, upper = np.asarray(self.input_limits.lower), np.asarray(self.input_limits.upper)
-        over = np.maximum(lower - u, u - upper)
+        rests = [rest_at(self, row) for row in q.reshape(-1, q.shape[-1])]
+        for rest in rests:
+            if not rest.balanced:
+                fail(
+                    "q", f"{rest.q}: no input balances the forces; {lacking(self, rest)}",
+                    "Choose a configuration that the actuators hold, or search with near=",
+                )  # fmt: skip
+        over = np.array([rest.over for rest in rests])
         if np.any(over > 1e-9):
-            i = int(np.argmax(over.reshape(-1, self.m).max(axis=0)))
+            i = int(np.argmax(over.max(axis=0)))
+            needed = np.array([rest.drive[i] for rest in rests])
             fail(
-                "q", f"needs {self.input_names[i]} = {u.reshape(-1, self.m)[:, i]}, the limits are "
-                f"[{lower[i]:g}, {upper[i]:g}]", "Choose a configuration that the actuators hold",
+                "q", f"needs {self.input_names[i]} = {needed}, "
+                f"the limits are [{rests[0].lower[i]:g}, {rests[0].upper[i]:g}]",
+                "Choose a configuration that the actuators hold, or search with near=",
             )  # fmt: skip
-        return np.concatenate([q, still], axis=-1), u
+        join = lambda rows, size: np.array(rows).reshape(*q.shape[:-1], size)
+        x = join([rest.x for rest in rests], self.state_size)
+        return x, join([rest.u for rest in rests], self.m)
+
+    def set_point(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (x, u), the state and the input about which `robot_mpc` takes its model where no
+        target is given.
+
+        They are `equilibrium()` at home, home moved inside the position limits if it is not; where
+        that cannot be held `equilibrium(near=home)`; and where nothing nearby can, home at rest
+        under the input within the limits that leaves the least unbalanced force. The affine model
+        has that force in its c: it predicts a fall, and inputs still move what they can. Each step
+        down this list gives a UserWarning that names the coordinates.
+        """
+        rest, texts = settled(self)
+        for text in texts:
+            warnings.warn(text, stacklevel=2)
+        return rest.x, rest.u
+
+    def report(self) -> RobotReport:
+        """Return an account of what was read, what is ignored, and where limits come from."""
+        return report_of(self)
 
     def inverse_dynamics(self, q: Any, velocity: Any, acceleration: Any) -> np.ndarray:
         """Return the inputs u (..., m) that give `acceleration` (..., nv) at q (..., nq), velocity
         (..., nv).
 
         They are of the predictor, in continuous time. Computed outside JAX in float64 by MuJoCo's C
-        engine (mj_inverse). Raises ValueError where no input does.
+        engine (mj_inverse). Raises ValueError where no input does, as for a model whose actuators
+        have activation states.
         """
         import mujoco
 
         nv = self.mujoco.nv
+        if self.mujoco.na:
+            fail("robot", "has activation states between inputs and forces",
+                 "Inverse dynamics need actuators with dyntype none")  # fmt: skip
         q = self._configurations("q", q)
         rates = []
         for argument, value in (("velocity", velocity), ("acceleration", acceleration)):
@@ -321,7 +374,7 @@ class Robot:
     def _checked_arrays(self, x: Any, u: Any) -> tuple[Array, Array]:
         """Return a state and an input as arrays of one dtype; raise ValueError for wrong shapes."""
         size = self.state_size
-        problem = "Give (qpos, qvel) of one robot; use jax.vmap for many"
+        problem = "Give (qpos, qvel, act) of one robot; use jax.vmap for many"
         if np.shape(x) == (self.n,) != (size,):
             problem = "That is the size of the coordinates: robot.state(ξ) makes a state of them"
         require_shape("x", x, (size,), problem)

@@ -7,6 +7,7 @@ tune_feasible_set, feasible_fraction      states from which all limits can be ke
 tune_penalties, transfer_penalties        penalties of ADMM, also for another horizon
 tune_sweep_penalties                      penalties of the first stage of a map
 Settings, TuningRun, Descent              arguments and results of all of these
+Interrupted                               what they raise on Ctrl-C, with the best so far
 """
 
 from jaxmpc.tuning.descent import Descent
@@ -16,7 +17,7 @@ from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
 from jaxmpc.tuning.penalties import tune_penalties
 from jaxmpc.tuning.penalty_schedule import transfer_penalties
-from jaxmpc.tuning.result import TuningRun
+from jaxmpc.tuning.result import Interrupted, TuningRun
 from jaxmpc.tuning.settings import Settings
 from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
 from jaxmpc.tuning.weights import tune_weights
@@ -24,6 +25,7 @@ from jaxmpc.tuning.weights import tune_weights
 __all__ = [
     "ClosedLoopLoss",
     "Descent",
+    "Interrupted",
     "Parameter",
     "Settings",
     "TuningRun",

@@ -43,6 +43,11 @@ class BatchMean:
         """Return the program for arguments of these shapes."""
         return self.compiled.program(*self.divided(args))
 
+    def traced(self, *args: Any) -> Any:
+        """Return the jaxpr for arguments of these shapes; nothing compiles, and `program` needs not
+        trace again."""
+        return self.compiled.function.trace(*self.compiled.placed(self.divided(args))).jaxpr
+
     def divided(self, args: tuple) -> tuple:
         """Return the arguments with a batch that the devices can share equally: the first instance
         fills it up, with weight zero."""

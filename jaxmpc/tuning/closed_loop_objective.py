@@ -1,6 +1,6 @@
 """ClosedLoopObjective: the loss of closed loops as a function of the parameters, with gradients."""
 
-import time
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -29,6 +29,8 @@ from jaxmpc.tuning.parameters import Parameters, values
 MODES = ("auto", "forward", "reverse")
 # Parameters up to which "auto" tries forward mode, whose cost grows with their number.
 FORWARD = 32
+# Primitives of linear algebra, of cubic cost.
+FACTORING = ("cholesky", "triangular_solve", "lu", "eigh", "qr", "householder_product", "svd")
 
 # Initial states (B, n), and the variations of the plant with B in front.
 Data = tuple[np.ndarray, dict[str, np.ndarray]]
@@ -117,7 +119,7 @@ class ClosedLoopObjective:
     ) -> tuple[str, Callable]:
         """Return the mode, and (θ, x0s, varied, weights) → value, gradient, numbers of each loop.
 
-        With mode "auto" both modes are compiled and timed on `data`.
+        With mode "auto" both are traced, and the one with fewer `operations` is compiled.
         """
         flat, unravel = ravel_pytree(arrays(theta))
 
@@ -141,18 +143,13 @@ class ClosedLoopObjective:
         if mode != "reverse" and (mode == "forward" or flat.size <= FORWARD):
             tried["forward"] = self.over(forward, devices)
         if mode != "forward":
-            name, plain = "reverse", self.over(reverse, devices)
-            try:
-                if program_bytes(plain.program(*arguments)) > 0.5 * device_bytes():
-                    name = "reverse, checkpointed"
-                    plain = self.over(partial(reverse, checkpoint=True), devices)
-                tried[name] = plain
-            except ValueError:  # a plant with a loop that JAX cannot transpose
-                if not tried:
-                    raise
-        name = next(iter(tried))
-        if len(tried) > 1:
-            name = min(tried, key=lambda name: duration(tried[name], arguments))
+            tried["reverse"] = self.over(reverse, devices)
+        name = cheapest(tried, arguments)
+        short = 0.5 * device_bytes()
+        if name == "reverse" and program_bytes(tried[name].program(*arguments)) > short:
+            del tried[name]
+            tried["reverse, checkpointed"] = self.over(partial(reverse, checkpoint=True), devices)
+            name = cheapest(tried, arguments)
         program = tried[name]
 
         def slope(*args: Any) -> tuple[Any, Any, dict[str, np.ndarray]]:
@@ -162,12 +159,45 @@ class ClosedLoopObjective:
         return name, slope
 
 
-def duration(program: BatchMean, arguments: tuple) -> float:
-    """Return the time of a call in seconds, without compiling."""
-    program(*arguments)
-    begun = time.perf_counter()
-    program(*arguments)
-    return time.perf_counter() - begun
+def cheapest(programs: dict[str, BatchMean], arguments: tuple) -> str:
+    """Return the name of the program with the fewest operations, without compiling; one that JAX
+    cannot transpose, a plant with a loop, counts as the last choice."""
+    if len(programs) == 1:
+        return next(iter(programs))
+    counts = {}
+    for name, program in programs.items():
+        try:
+            counts[name] = operations(program.traced(*arguments))
+        except ValueError:
+            counts[name] = np.inf
+    return min(counts, key=lambda name: counts[name])
+
+
+def operations(jaxpr: Any) -> float:
+    """Return about how many operations a jaxpr takes: those of products and factorizations, and
+    one an entry of every other result. A loop of unknown length counts as one pass."""
+    jaxpr, total = getattr(jaxpr, "jaxpr", jaxpr), 0.0
+    for equation in jaxpr.eqns:
+        name, given = equation.primitive.name, equation.params
+        inner = [
+            operations(part)
+            for value in given.values()
+            for part in (value if isinstance(value, tuple | list) else (value,))
+            if hasattr(part, "eqns") or hasattr(part, "jaxpr")
+        ]
+        entries = sum(math.prod(v.aval.shape) for v in equation.outvars)
+        if inner:
+            passes = given["length"] if name == "scan" else 1
+            total += passes * (max(inner) if name == "cond" else sum(inner))
+        elif name == "dot_general":
+            (contracted, _), _ = given["dimension_numbers"]
+            shape = equation.invars[0].aval.shape
+            total += 2 * entries * math.prod(shape[axis] for axis in contracted)
+        elif name in FACTORING:  # n operations an entry, up to a factor
+            total += entries * equation.invars[0].aval.shape[-1]
+        else:
+            total += entries
+    return total
 
 
 def controller_of(make_mpc: Any, given: Mapping[str, Any], solver: ADMM) -> Any:

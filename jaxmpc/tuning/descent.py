@@ -2,12 +2,12 @@
 
 The optimiser comes from optax. The best iterate is chosen by the loss on a validation set. Steps
 that lead to numbers which are not finite are undone and halved. A checkpoint is written after each
-step.
+step. An interrupt (Ctrl-C) ends the descent early, with all that it has found.
 """
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +32,10 @@ class Descent:
     theta: the θ of least validation loss; best: its number. thetas: all of them, leaves (T+1, …).
     loss, gradient_norm (T,): at θ_t on the batch of the step. accepted (T,): False where loss or
     gradient was not finite; θ_{t+1} is then the last good θ moved by half the step. validation
-    (T+1,): loss of each θ on the validation set, NaN where not finite. numbers {name: (T,)},
-    validation_numbers {name: (T+1,)}: what else was measured. seconds: time taken, the interrupted
-    runs that a checkpoint joins included.
+    (T+1,): loss of each θ on the validation set, NaN where not finite or not measured. numbers
+    {name: (T,)}, validation_numbers {name: (T+1,)}: what else was measured. seconds: time taken,
+    the interrupted runs that a checkpoint joins included. interrupted: whether an interrupt ended
+    it before the last step.
     """
 
     theta: Any
@@ -47,6 +48,7 @@ class Descent:
     numbers: dict[str, np.ndarray]
     validation_numbers: dict[str, np.ndarray]
     seconds: float
+    interrupted: bool = False
 
     @property
     def steps(self) -> int:
@@ -73,7 +75,7 @@ class State:
 
 def descend(
     theta: Any, gradient: Gradient, validate: Validate, optimizer: optax.GradientTransformation,
-    settings: Settings, decides: Any = None,
+    settings: Settings, decides: Any = None, every: int = 1, shown: str | None = None,
 ) -> Descent:  # fmt: skip
     """Minimise from θ = `theta`, a pytree of NumPy arrays, by `settings.updates` optimiser steps.
 
@@ -83,7 +85,11 @@ def descend(
     the result is the best of T + 1 iterates, never worse than the start.
     optimizer: used where settings.optimizer is None.
     decides: JSON data that determine the run, stored in the checkpoint and compared on resuming.
+    every: steps from one validation to the next; the last step is validated as well.
+    shown: name of a number of the best validation for the progress bar.
 
+    A KeyboardInterrupt after the first step ends it: the result is that of the steps that are
+    done. Before, there is nothing to keep, and it passes.
     Raises ValueError for a checkpoint of another run, and where θ_0 has no finite validation loss.
     """
     settings.validate()
@@ -102,26 +108,48 @@ def descend(
         if not np.isclose(now, first, rtol=1e-4, atol=0):
             problem = f"began with the validation loss {first:.9g}, which is {now:.9g} now"
             fail(str(path), problem, "Give it the same data, loss, plant and solver, or remove it")
-    if not state.checks:
-        begun = time.perf_counter()
-        state.checks.append(_checked(validate, theta))
-        if not np.isfinite(state.checks[0]["loss"]):
-            fail("parameters", "have no finite validation loss at the start", "Start elsewhere")
-        state.seconds += time.perf_counter() - begun
-        _save_checkpoint(path, state, mark, decides)
+    begun = time.perf_counter()
     with tqdm(total=updates, unit=" steps", disable=not settings.progress) as bar:
-        bar.update(len(state.rows))
-        while len(state.rows) < updates:
-            begun = time.perf_counter()
-            _step(state, gradient, optimizer)
-            state.checks.append(_checked(validate, state.theta))
-            state.thetas.append(state.theta)
+        bar.set_postfix_str("compiling")
+        if not state.checks:
+            state.checks.append(_checked(validate, theta))
+            if not np.isfinite(state.checks[0]["loss"]):
+                fail("parameters", "have no finite validation loss at the start", "Start elsewhere")
             state.seconds += time.perf_counter() - begun
             _save_checkpoint(path, state, mark, decides)
-            losses = [check["loss"] for check in state.checks]
-            bar.set_postfix_str(f"validation {losses[-1]:.4g}, best {np.nanmin(losses):.4g}")
-            bar.update(1)
+        try:
+            bar.update(len(state.rows))
+            while len(state.rows) < updates:
+                begun = time.perf_counter()
+                _step(state, gradient, optimizer)
+                done = len(state.rows)
+                measured = done == updates or done % every == 0
+                state.checks.append(_checked(validate, state.theta) if measured else {})
+                state.thetas.append(state.theta)
+                state.seconds += time.perf_counter() - begun
+                _save_checkpoint(path, state, mark, decides)
+                bar.set_postfix_str(_progress(state, shown))
+                bar.update(1)
+        except KeyboardInterrupt:
+            if len(state.thetas) < 2:
+                raise
+            _drop_unfinished(state)
+            state.checks[-1] = state.checks[-1] or _checked(validate, state.thetas[-1])
+            return replace(_record(state), interrupted=True)
     return _record(state)
+
+
+def _drop_unfinished(state: State) -> None:
+    """Leave the steps of which all is recorded."""
+    done = min(len(state.rows), len(state.checks) - 1, len(state.thetas) - 1)
+    del state.rows[done:], state.checks[done + 1 :], state.thetas[done + 1 :]
+
+
+def _progress(state: State, shown: str | None) -> str:
+    """Return the loss of the last step, and of the best validation the loss and what is shown."""
+    best = min((c for c in state.checks if c), key=lambda c: np.nan_to_num(c["loss"], nan=np.inf))
+    more = "" if shown is None else f", {shown} {best[shown]:.4g}"
+    return f"loss {state.rows[-1]['loss']:.4g}, best on validation {best['loss']:.4g}{more}"
 
 
 def _require_first_order(optimizer: optax.GradientTransformation, theta: Any) -> None:

@@ -18,7 +18,7 @@ from jaxmpc.tuning.batch_mean import BatchMean
 from jaxmpc.tuning.descent import descend
 from jaxmpc.tuning.feasible_fraction import STEPS, membership
 from jaxmpc.tuning.parameters import Parameters, raw, require_parameters, values
-from jaxmpc.tuning.result import TuningRun
+from jaxmpc.tuning.result import TuningRun, finished
 from jaxmpc.tuning.settings import Settings
 
 
@@ -84,4 +84,4 @@ def tune_feasible_set(
         "seed": chosen.seed, "dtype": "float64", "data": fingerprint(None, train, test),
     }  # fmt: skip
     history = descend(raw(parameters), gradient, validate, optax.adam(0.05), chosen, decides)
-    return TuningRun.of_parameters(parameters, history, decides, make_mpc)
+    return finished(TuningRun.of_parameters(parameters, history, decides, make_mpc))

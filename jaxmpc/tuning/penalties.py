@@ -31,11 +31,14 @@ from jaxmpc.tuning.result import TuningRun, cached
 from jaxmpc.tuning.settings import Settings
 
 # Version of the algorithm: results that an older version cached are not used.
-VERSION = 2
+VERSION = 3
 # Constant penalties that are tried as a start, with this over-relaxation.
 CONSTANTS, ALPHA = np.logspace(-2, 2, 9), 1.6
 # Fewest states to learn from, validation included, and for validation.
 FEWEST, FEWEST_VALIDATION = 8, 2
+# Learning rate of log rho at the start: rho may be wrong by decades there. How often the validation
+# set is solved, which costs as much as many steps.
+RATE, VALIDATIONS = 0.2, 15
 SOLVER = ADMM(refine=0)
 
 
@@ -56,8 +59,9 @@ def tune_penalties(
     warm_start: (z (B, nz), y (B, rows)) or plans of all states, to tune for warm starts.
     reference, input_reference: to track, as in `solve`, one for all.
     cache: folder that keeps results by a fingerprint of all of this; not with an optimizer.
-    settings: of `Settings`, as updates=100; here updates is 300 and batch 128 unless given.
-        optimizer None: Adam with a cosine schedule. validation: a fraction of x0s, or states
+    settings: of `Settings`, as updates=100; here updates is 200 and batch 32 unless given.
+        optimizer None: Adam with a cosine schedule. The validation set is solved some 15 times, not
+        after each step. validation: a fraction of x0s, or states
         (B', n), which are cold-started: only without warm_start. Computes in float64.
 
     Returns a `TuningRun` whose result, also `run.solver`, is `solver` with rho (stages, rows),
@@ -66,9 +70,10 @@ def tune_penalties(
     by the median residual; where none is better than `solver`, that is the result and a
     UserWarning says so. Numbers in before, after and the history: solved, residual, and
     infeasible, the states left out. `transfer_penalties` takes the result to another horizon.
-    Raises ValueError for bad input, before any compile, and for states all proved infeasible.
+    Raises ValueError for bad input, before any compile, and for states all proved infeasible;
+    on Ctrl-C `Interrupted`, as `tune_weights`.
     """
-    chosen = Settings(**{"updates": 300, "batch": 128, **settings})
+    chosen = Settings(**{"updates": 200, "batch": 32, **settings})
     chosen.validate()
     solver = SOLVER if solver is None else solver
     objective, train, test = _prepared(
@@ -146,8 +151,12 @@ def tune_schedule(
         found = score(*measure(**_values(theta, objective.W), samples=test))
         return found.pop("loss"), found
 
-    schedule = optax.cosine_decay_schedule(0.1, max(settings.updates, 1), 0.03)
-    history = descend(theta, gradient, validate, optax.adam(schedule, b2=0.99), settings, decides)
+    schedule = optax.cosine_decay_schedule(RATE, max(settings.updates, 1), 0.03)
+    every = max(settings.updates // VALIDATIONS, 1)
+    history = descend(
+        theta, gradient, validate, optax.adam(schedule, b2=0.99), settings, decides, every,
+        "solved",
+    )  # fmt: skip
     after = {"loss": history.validation[history.best]} | {
         name: float(v[history.best]) for name, v in history.validation_numbers.items()
     }

@@ -1,4 +1,4 @@
-"""TuningRun: the result of every tuner, and its cache."""
+"""TuningRun: the result of every tuner, its cache, and what an interrupt leaves of it."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -106,6 +106,25 @@ class TuningRun:
         }  # fmt: skip
 
 
+class Interrupted(KeyboardInterrupt):
+    """Raised by a tuner that an interrupt (Ctrl-C) ends after its first step.
+
+    run: the `TuningRun` of the steps that were done, with the best of them as its result. As a
+    KeyboardInterrupt it ends a program that does not catch it.
+    """
+
+    def __init__(self, run: TuningRun) -> None:
+        super().__init__(f"stopped after {run.history.steps} steps; the best of them: .run")
+        self.run = run
+
+
+def finished(run: TuningRun) -> TuningRun:
+    """Return the run; raise Interrupted with it where an interrupt ended it."""
+    if run.history is not None and run.history.interrupted:
+        raise Interrupted(run)
+    return run
+
+
 def cached(
     cache: str | Path | None, decides: Mapping[str, Any], settings: Settings,
     build: Callable[[Mapping[str, Any]], Any], tune: Callable[[], TuningRun],
@@ -113,10 +132,10 @@ def cached(
     """Return the run kept in the folder `cache`, else the run of `tune`, which is kept there.
 
     decides["fingerprint"]: names the file; a damaged one counts as absent. build: of the run.
-    cache None: nothing is kept.
+    cache None: nothing is kept. Raises Interrupted, and keeps nothing, where an interrupt ends it.
     """
     if cache is None:
-        return tune()
+        return finished(tune())
     if settings.optimizer is not None:
         fail("cache", "given beside an optimizer, which has no fingerprint", "Leave one out")
     path = Path(cache) / f"{decides['fingerprint']}.npz"
@@ -126,7 +145,7 @@ def cached(
             name.removeprefix(key): v for name, v in kept[1].items() if name.startswith(key)
         }
         return TuningRun(part("values_"), part("initial_"), **kept[0], build=build)
-    run = tune()
+    run = finished(tune())
     trees = (("values", run.values), ("initial", run.initial))
     arrays = {f"{key}_{name}": v for key, tree in trees for name, v in tree.items()}
     plain = {name: getattr(run, name) for name in ("before", "after", "improved", "settings")}

@@ -24,7 +24,7 @@ class Settings:
     seed: of batches and of the validation set.
     checkpoint: file (.npz) that is replaced after every step. Where it exists the run resumes from
         it, with the same result as without interruption; it must be of the same run.
-    progress: show a progress bar.
+    progress: show a progress bar with the loss of the step and the best on the validation set.
     devices: a number of them, or a sequence of JAX devices, which share the samples of a step;
         None: the default device. A design loss is computed on each of them.
     """

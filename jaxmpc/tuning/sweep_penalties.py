@@ -174,7 +174,7 @@ def tune_row_weights(
         return TuningRun(initial, initial, before, before, False, decides, _penalties)
     schedule = optax.cosine_decay_schedule(0.05, max(settings.updates, 1), 0.03)
     optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule, b2=0.99))
-    history = descend(theta, gradient, validate, optimizer, settings, decides)
+    history = descend(theta, gradient, validate, optimizer, settings, decides, shown="decided")
     least = float(history.validation[history.best])
     improved = least < loss
     after = {"loss": least, "decided": 1 - least} if improved else before

@@ -27,7 +27,7 @@ from jaxmpc.tuning.closed_loop_objective import (
 from jaxmpc.tuning.descent import descend
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameters, raw, require_parameters
-from jaxmpc.tuning.result import TuningRun
+from jaxmpc.tuning.result import TuningRun, finished
 from jaxmpc.tuning.settings import Settings
 
 
@@ -61,8 +61,8 @@ def tune_weights(
         design_loss: of the problem alone, such as the `feasible_fraction` of sample states.
         mode: "forward" (cost grows with the number of parameters, memory does not), "reverse"
             (memory grows with the number of samples; they are computed twice if it does not
-            suffice), "auto": both are timed on the first step's data where there are at most 32
-            parameters.
+            suffice), "auto": the one with fewer operations, counted without compiling, where there
+            are at most 32 parameters.
         settings: of `Settings`, as updates=20, batch=64. optimizer None: Adam of 0.05, which
             moves a weight by 5 % a step. validation: given initial states have no variations
             unless they are a pair of states and variations. A checkpoint must be of the same run:
@@ -78,7 +78,8 @@ def tune_weights(
                     the controller's own) by more than `violation.TOLERANCE`
         excluded    loops left out because their loss was not finite
 
-    Raises ValueError for what does not fit together, before any compile.
+    Raises ValueError for what does not fit together, before any compile, and on Ctrl-C
+    `Interrupted`, a KeyboardInterrupt that holds the `TuningRun` of the finished steps.
     """
     require_parameters(parameters)
     chosen = Settings(**settings)
@@ -148,7 +149,7 @@ def tune_weights(
 
     history = descend(start, gradient, validate, optax.adam(0.05), chosen, decides)
     decides["mode"] = gradients[0][0] if gradients else mode
-    return TuningRun.of_parameters(parameters, history, decides, build)
+    return finished(TuningRun.of_parameters(parameters, history, decides, build))
 
 
 def _default_loss(controller: Any, plant: Any, r: Any, s: Any) -> ClosedLoopLoss:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from jaxmpc.app.plots import plot_feasible_set, plot_recursion
+from jaxmpc.app.plots import plot_feasible_set, plot_recursion, plot_robot_map
 from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.recursion import Claim, Counterexample, RecursionReport
@@ -130,7 +130,12 @@ def test_recursion_shows_fates_set_and_counterexample(tmp_path):
     names = ("infeasible", -1), ("undecided", -2), ("kept for 9 steps", 0), ("lost at step 1", 1)
     counts = [(f"{name} ({np.sum(report.lost_at == fate):,})") for name, fate in names]
     assert shown[:4] == counts and shown[4].startswith("lost at step 4 to 5 (")
-    assert shown[-4:] == ["X_7", "counterexample x", "next state", "half-space it leaves"]
+    assert shown[-4:] == [
+        "X_7: states with a plan",
+        "counterexample x",
+        "next state",
+        "half-space it leaves",
+    ]
     cut = next(line for line in ax.lines if np.allclose(line.get_xdata(), 1.0))
     assert np.ptp(cut.get_ydata()) > 4  # across the picture
     assert ax.get_title(loc="left") == "Closed loops of 9 steps, horizon N = 7"
@@ -149,3 +154,43 @@ def test_recursion_refuses_what_it_cannot_draw():
         plot_recursion(report, enlarge=True)
     with pytest.raises(ValueError, match="report: is of 3 states"):
         plot_recursion(dataclasses.replace(report, states=np.zeros((5, 3))))
+
+
+@pytest.mark.parametrize("claim", ["limits", "recursion"])
+def test_robot_map_says_in_words_what_became_of_each_state(claim):
+    """Outside the feasible set an unsolved plan of the robot is that, and not an undecided
+    label."""
+    points = square(21)
+    fmap, size = Map(points), np.abs(points).max(axis=1)
+    fmap = SimpleNamespace(**{
+        name: getattr(fmap, name)
+        for name in ("points", "fixed", "axes", "mpc", "inner", "outer", "terminal_section")
+    })  # fmt: skip
+    promised = np.select([size > 1.5, size > 1.3], [-1, 0], 1)
+    held = np.where(points[:, 0] > 0.9, -1, 1)
+    if claim == "recursion":
+        held[points[:, 1] > 0.9] = 0
+    unsure = (promised == 1) & (held == -1) & (points[:, 1] > 0)
+    rmap = SimpleNamespace(
+        points=points, linear=fmap, claim=claim, promised=promised, held=held, unsure=unsure,
+        names=("q [rad]", "dq [rad/s]"), set_point=np.zeros(2), worst=lambda: None, seconds=2.0,
+        robot=SimpleNamespace(name="pendulum", dt=0.02),
+    )  # fmt: skip
+    ax = plot_robot_map(rmap)
+    counts = {
+        text.rsplit(" (", 1)[0].replace("\n", " "): int(text.rsplit(" (", 1)[1][:-1])
+        for text in texts(ax) if text.endswith(")")
+    }  # fmt: skip
+    assert sum(counts.values()) == len(points)
+    undecided = [name for name in counts if "undecided" in name]
+    assert [counts.pop(name) for name in undecided] == [np.sum(promised == 0)]
+    assert counts.pop("the same, but after a plan that was not solved") == unsure.sum() > 0
+    open_ = counts.pop("a plan of the robot was not solved", 0)
+    assert open_ == np.sum((promised != 0) & (held == 0)) and bool(open_) == (claim == "recursion")
+    both = [(1, 1), (1, -1), (-1, -1), (-1, 1)]
+    wanted = [np.sum((promised == p) & (held == h) & ~unsure) for p, h in both]
+    assert list(counts.values()) == wanted and min(wanted) > 0
+    image = ax.images[0].get_array().T.ravel()
+    assert len(np.unique(image)) == len(counts) + 2 + bool(open_)
+    assert ax.get_title(loc="left").startswith("pendulum: ") and "2 s" in ax.get_title(loc="left")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == rmap.names

@@ -1,7 +1,10 @@
 """jaxmpc simulate: files, table and picture say what the states in the store say."""
 
+import base64
+import io
 import json
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -19,9 +22,12 @@ from jaxmpc.app import cli
 from jaxmpc.app.commands import robot_runs
 from jaxmpc.app.commands.robot_samples import draw_robots
 from jaxmpc.app.plots import plot_runs
+from jaxmpc.app.plots.closed_loops import PLANS
 from jaxmpc.closed_loop.outcome import evaluate_runs
+from jaxmpc.qp.status import Status
+from jaxmpc.robots.captions import exceeded_limits
 from jaxmpc.robots.load import load_robot
-from jaxmpc.robots.video import render, save_video
+from jaxmpc.robots.video import Film, render, save_video
 
 # Models at the set-point compile in half the time.
 LINE = (
@@ -124,7 +130,9 @@ def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
     median, last = (None if np.isinf(v) else pytest.approx(v) for v in settled[[3, 5]])
     assert summary["settling"] == {"median": median, "95 %": last}
     solved, fallback = (data["status"] == 1).values, data["fallback"].values
-    assert summary["plans_solved"] == solved.sum() and summary["fallback_plans"] == fallback.sum()
+    assert summary["plans_solved"] == solved.sum()
+    assert summary["fallback_plans"] == (fallback & solved).sum()
+    assert summary["unsolved_plans"] == (~solved).sum()
     assert summary["plans_valid"] == (solved & ~fallback).all(axis=1).sum()
     cost = np.sum((x[:, :-1] ** 2) @ [1 / 1.5**2, 0.01 / 4] + 0.01 / 4 * u[:, :, 0] ** 2, axis=1)
     assert summary["cost"]["median"] == pytest.approx(np.sort(cost)[3], rel=1e-4)
@@ -133,6 +141,8 @@ def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
     assert table["success"].startswith(f"{summary['success']}  ")
     assert table["limits kept"].startswith(f"{kept.sum()}  ")
     assert f"of {solved.size}" in table["plans solved"]
+    assert table["fallback"].startswith(f"{(fallback & solved).sum()}  ")
+    assert table["unsolved"].startswith(f"{(~solved).sum()}  ")
     assert "real time" in table and "MPC solves/s" in table["run"]
 
     again = run(f"{LINE} --output 'my runs' --resume --video 0")  # nothing is left to do
@@ -221,14 +231,15 @@ def test_outcome_and_picture_of_runs_made_by_hand(joint):
     x = np.stack([np.stack([q, dq], axis=1)] * 4)
     x[1, 3, 1], x[2, -1, 0], x[3, 5, 0] = -2.00001, 0.5, np.nan
     u = np.zeros((4, 10, 1))
-    fallback = np.zeros((4, 10), bool)
-    fallback[1, 2] = True
-    run = by_hand(x, u, fallback=fallback)
+    fallback, status = np.zeros((4, 10), bool), np.ones((4, 10), int)
+    fallback[1, 2], status[2, 6:8] = True, Status.ITERATION_LIMIT
+    fallback[2, 6] = True  # of a plan that is not solved: says nothing
+    run = by_hand(x, u, fallback=fallback, status=status)
     outcome = evaluate_runs(run, joint, np.array([1.0, 0.0]))
     assert list(outcome.kept) == [True, False, True, False]
     assert list(outcome.reached) == [True, True, False, True]
     assert list(outcome.success) == [True, False, False, False]
-    assert list(outcome.plans_valid) == [True, False, True, True]
+    assert list(outcome.plans_valid) == [True, False, False, True]
     # q = 0.8 at sample 4, 1 from sample 5 on: 0.05 s.
     np.testing.assert_allclose(outcome.settling, [0.05, 0.05, np.inf, 0.06])
     np.testing.assert_allclose(outcome.cost, 10.0)
@@ -240,16 +251,28 @@ def test_outcome_and_picture_of_runs_made_by_hand(joint):
     figure = plot_runs(run, joint, reference=np.array([1.0, 0.0]), robots=[0, 1, 2])
     labels = [(ax.get_title(), ax.get_ylabel()) for ax in figure.axes if ax.axison]
     assert labels == [("position", "q [rad]"), ("velocity", "q [rad/s]"), ("input", "tau [N m]")]
-    assert "4 closed loops of 0.1 s, 3 shown\nlimits kept by 2; fallback plans: 1 of 40" in (
-        figure.get_suptitle()
+    assert figure.get_suptitle() == (
+        "joint: 4 closed loops of 0.1 s, 3 shown. Limits kept by 2 of 4\n"
+        "40 plans: 37 within all limits, 1 need slack (fallback), 2 not solved"
     )
+    colours = {name: colour for name, (colour, _) in PLANS.items()}
+    (slack,), (open_,) = (
+        [line for line in figure.axes[0].lines if line.get_color() == colours[name]
+         and np.isfinite(line.get_ydata()).any()] for name in ("fallback", "unsolved")
+    )  # fmt: skip
+    for line, first, last in ((slack, 2, 3), (open_, 6, 8)):
+        np.testing.assert_array_equal(np.flatnonzero(np.isfinite(line.get_ydata()))[[0, -1]],
+                                      [first, last])  # fmt: skip
     (red,) = (line for line in figure.axes[1].lines if len(line.get_xdata()) == 1)
     np.testing.assert_allclose(red.get_xydata(), [[0.03, -2.00001]])
     low, high = figure.axes[1].get_ylim()
     assert low < -2 < 2 < high
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [
-        "one robot", "outside limits", "set-point", "fallback plan", "limit exceeded",
+        "one robot", "beyond the limits", "set-point", "its plan needs slack (fallback)",
+        "its plan was not solved", "limit exceeded",
     ]  # fmt: skip
+    feedback = by_hand(x[:1], u[:1], status=np.zeros((1, 10), int))  # a law without plans
+    assert "a law without plans" in plot_runs(feedback, joint).get_suptitle()
     with pytest.raises(ValueError, match="robots: .*from 0 to 3"):
         plot_runs(run, joint, robots=[4])
 
@@ -289,13 +312,19 @@ from jaxmpc.robots.video import render, save_video
 q = np.linspace(0, 1.2, 9)
 states = np.zeros((3, 9, 2))
 states[0, :, 0], states[1, :, 0] = q, -q
+robot, size = jm.load_robot("joint"), dict(every=2, width=160, height=120)
 try:
-    frames = render(jm.load_robot("joint"), states, every=2, width=160, height=120)
+    frames = render(robot, states, labels=False, **size)
 except RuntimeError as error:
     print(error, file=sys.stderr)
     sys.exit(3)
-save_video("film.gif", frames, 25)
-np.save("frames.npy", frames)
+states[1, 3, 1] = -2.1  # beyond 2 rad/s
+inputs = np.zeros((3, 8, 1))
+inputs[2, 5] = 2.1  # beyond 2 N m
+words = render(robot, states, inputs=inputs, target=[1.2], numbers=[4, 7, 9], **size)
+still = render(robot, states[0], target=[[0.0]] * 8 + [[1.2]], labels=False, **size)
+save_video("film.gif", words, 25)
+np.savez("frames.npz", frames=frames, words=words, still=still)
 """
 
 
@@ -308,7 +337,8 @@ def test_film_shows_the_motion(tmp_path):
     if done.returncode == 3:
         pytest.skip(done.stderr.splitlines()[-1])
     assert done.returncode == 0, done.stderr
-    frames = np.load(tmp_path / "frames.npy")
+    data = np.load(tmp_path / "frames.npz")
+    frames, words = data["frames"], data["words"].astype(int)
     assert frames.shape == (5, 240, 320, 3) and frames.dtype == np.uint8
     assert (frames[:, 125:, 165:] == 255).all(), "no fourth robot"
 
@@ -326,8 +356,55 @@ def test_film_shows_the_motion(tmp_path):
         (x0, y0), (x1, y1) = tool(tiles[0]), tool(tiles[-1])
         assert x0 > 20, "at q = 0 the tool is to the right"
         assert np.sign(round((y1 - y0) / 10)) == sign and (x0 - x1 > 10) == bool(sign)
+
+    # With words: a line above, the legend below, between them the same robots and the target's.
+    line, foot = 20, 40
+    assert words.shape == (5, 240 + line + foot, 320, 3)
+    inner = words[:, line:-foot]
+    green = lambda film: ((film[..., 1] > film[..., 0] + 30) & (film[..., 1] > film[..., 2])).sum()
+    assert green(frames.astype(int)) == 0, "no target asked for"
+    for top, left in ((0, 0), (0, 160), (120, 0)):
+        assert green(inner[0, top : top + 120, left : left + 160]) > 50
+    moving = data["still"].astype(int)
+    assert green(moving[0]) == 0 and green(moving[2]) > 50, "the target moves away at the end"
+    red = (inner[..., 0] > 180) & (inner[..., 1:] < 60).all(axis=-1)
+    edge = {(top, left): red[:, top + 1, left + 30 : left + 130].all(axis=1)
+            for top, left in ((0, 0), (0, 160), (120, 0))}  # fmt: skip
+    np.testing.assert_array_equal(edge[0, 0], [0, 0, 0, 0, 0])
+    np.testing.assert_array_equal(edge[0, 160], [0, 1, 0, 0, 0])  # sample 3, between two frames
+    np.testing.assert_array_equal(edge[120, 0], [0, 0, 1, 0, 0])  # sample 5
+    dark = (words < 90).all(axis=-1)
+    assert dark[:, :line, :60].any(axis=(1, 2)).all(), "the robot's name"
+    clock = words[:, :line, 260:]
+    assert dark[:, :line, 260:].any(axis=(1, 2)).all() and np.any(clock[0] != clock[1])
+    assert np.array_equal(words[0, :line, :200], words[1, :line, :200])
+    assert dark[:, -foot:].any(axis=(1, 2)).all(), "the legend"
     with Image.open(tmp_path / "film.gif") as film:
-        assert film.n_frames == 5 and film.size == (320, 240) and film.info["duration"] == 40
+        assert film.n_frames == 5 and film.size == (320, 300) and film.info["duration"] == 40
+        film.seek(1)
+        assert np.asarray(film.convert("RGB"))[line + 1, 200] == pytest.approx([200, 20, 20], abs=9)
+
+
+def test_notebooks_play_a_film():
+    """The HTML holds a GIF of these frames, whatever else lies in the folder."""
+    frames = np.zeros((3, 6, 8, 3), np.uint8)
+    frames[1, :, 4:] = [0, 158, 115]
+    html = Film(frames, 20)._repr_html_()
+    (data,) = re.findall(r'^<img src="data:image/gif;base64,([^"]+)" alt="3 frames">$', html)
+    with Image.open(io.BytesIO(base64.b64decode(data))) as film:
+        assert film.n_frames == 3 and film.info["duration"] == 50
+        film.seek(1)
+        np.testing.assert_array_equal(np.asarray(film.convert("RGB")), frames[1])
+
+
+def test_film_names_the_limit_exceeded_most(joint):
+    """From a frame to the next, relative to half the range: 1.5 rad, 2 rad/s, 2 N m."""
+    states, inputs = np.zeros((2, 7, 2)), np.zeros((2, 6, 1))
+    states[0, 3] = [1.6, 2.2]  # 7 % and 10 %
+    states[1, 6, 0], inputs[1, 0] = -1.5 - 1e-7, 2.5
+    found = exceeded_limits(joint, states, inputs, 2)
+    assert found.tolist() == [["", "q velocity [rad/s]", "", ""], ["tau [N m]", "", "", ""]]
+    assert exceeded_limits(joint, states[1:], None, 2).tolist() == [[""] * 4]
 
 
 def test_film_refuses_what_it_cannot_draw(tmp_path, monkeypatch, joint):
@@ -336,6 +413,10 @@ def test_film_refuses_what_it_cannot_draw(tmp_path, monkeypatch, joint):
         (np.full((3, 2), np.nan), {}, "states: holds NaN"),
         (np.zeros((3, 2)), {"every": 0}, "every: 0"),
         (np.zeros((3, 2)), {"camera": "left"}, "none named 'left'"),
+        (np.zeros((3, 2)), {"inputs": np.zeros((3, 1))}, r"inputs: shape \(3, 1\)"),
+        (np.zeros((3, 2)), {"target": [0.0, 1.0]}, r"target: shape \(2,\)"),
+        (np.zeros((3, 2)), {"target": [np.nan]}, "target: holds NaN"),
+        (np.zeros((3, 2)), {"numbers": [1, 2]}, "numbers: 2 of 1 robots"),
     ):
         with pytest.raises(ValueError, match=message):
             render(joint, states, **options)
@@ -349,6 +430,8 @@ def test_film_refuses_what_it_cannot_draw(tmp_path, monkeypatch, joint):
     ):
         with pytest.raises(ValueError, match=message):
             save_video(tmp_path / name, given, 25)
+    with pytest.raises(ValueError, match="fps: 0"):
+        Film(frames, 0)
     monkeypatch.setitem(sys.modules, "imageio", None)
     monkeypatch.setitem(sys.modules, "imageio.v3", None)
     with pytest.raises(ValueError, match=r"imageio\[ffmpeg\]"):

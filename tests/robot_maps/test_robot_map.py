@@ -101,7 +101,8 @@ def test_picture(hanging):
     rmap = hanging[-1]
     ax = plot_robot_map(rmap)
     texts = [text.get_text() for text in ax.get_legend().get_texts()]
-    broken = f"promise broken: beyond a limit ({rmap.broken.sum()})"
+    count = np.sum(rmap.broken & ~rmap.unsure)
+    broken = f"promise broken: a plan exists,\nthe robot leaves its limits ({count})"
     assert broken in texts and "set-point" in texts
     assert ax.get_xlabel() == "theta [rad]" and "0.8 s" in ax.get_title(loc="left")
     assert "broken promises" in str(rmap)

@@ -566,13 +566,12 @@ BAD_FILES = {
         '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>', {}, "model: .* has no joints",
     ),
     "activation": (
-        single(actuator='<general joint="a" dyntype="integrator"/>'), {},
-        "model: .* 1 activation states. Use actuators with dyntype none",
+        single('integrator="RK4"', actuator='<general joint="a" dyntype="integrator"/>'), {},
+        "model: .* 1 activation states and the integrator RK4. Use another integrator",
     ),
     "integrator": (
         single('integrator="implicit"'), {}, "model: MJX does not support it: .*IMPLICIT.*Take",
     ),
-    "solver": (single('solver="PGS"'), {}, "model: MJX does not support it: .*PGS"),
     "forces": (
         single(actuator='<motor joint="a" ctrlrange="1 2" forcerange="-.5 .5"/>'), {},
         "torque: is empty: .*Give lower <= upper",

@@ -1,6 +1,7 @@
 """Gradient descent with guards: answer, steps back, checkpoints. Domains of parameters."""
 
 import importlib
+import os
 import signal
 import subprocess
 import sys
@@ -135,6 +136,44 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path, monkeypatch, target, late):
                 bowl(12, checkpoint=path, decides=DECIDES)
     assert_same(bowl(12, checkpoint=path, decides=DECIDES), whole)
     assert [p.name for p in tmp_path.iterdir()] == ["run.npz"]  # no side files left
+
+
+@pytest.mark.parametrize("where", ["gradient", "validation", "checkpoint"])
+def test_an_interrupt_keeps_the_steps_that_are_done(tmp_path, monkeypatch, capsys, where):
+    """Ctrl-C in the seventh step, of which validation takes place every fourth time."""
+    names = {"gradient": "slope", "validation": "check", "checkpoint": "replace"}
+    module = os if where == "checkpoint" else sys.modules[__name__]
+    real, left = getattr(module, names[where]), [1 if where == "validation" else 7]
+
+    def trap(*arguments):
+        left[0] -= 1
+        if left[0] == 0:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    path = tmp_path / "run.npz"
+    settings = Settings(12, optax.adam(0.3), checkpoint=path, progress=True)
+    go = lambda: descend(
+        START, lambda *v: slope(*v), lambda *v: check(*v), optax.sgd(0.0), settings, DECIDES, 4,
+        "first",
+    )  # fmt: skip
+    monkeypatch.setattr(module, names[where], trap)
+    if where == "validation":  # before the first step there is nothing to keep
+        with pytest.raises(KeyboardInterrupt):
+            go()
+        left[0] = 3  # once before the first step, once after four, then after eight
+    cut = go()
+    monkeypatch.undo()
+    done = {"gradient": 6, "validation": 7, "checkpoint": 6}[where]
+    assert cut.interrupted and cut.steps == done and cut.validation.shape == (done + 1,)
+    measured = np.flatnonzero(np.isfinite(cut.validation))
+    assert measured.tolist() == sorted({0, 4, done})
+    assert cut.validation[cut.best] == np.nanmin(cut.validation) == distance(cut.theta)
+    assert "best on validation" in capsys.readouterr().err
+    whole = go()
+    assert not whole.interrupted and whole.steps == 12
+    np.testing.assert_array_equal(whole.thetas["a"], bowl(12).thetas["a"])
+    assert np.flatnonzero(np.isfinite(whole.validation)).tolist() == [0, 4, 8, 12]
 
 
 def test_checkpoints_that_do_not_fit(tmp_path):

@@ -15,7 +15,8 @@ from jaxmpc.app.commands.sweep import Sweep
 from jaxmpc.app.commands.tuning import feasible_states
 from jaxmpc.app.config import load, load_robot_config
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.tuning.result import TuningRun
+from jaxmpc.tuning.descent import Descent
+from jaxmpc.tuning.result import Interrupted, TuningRun
 
 # The built-in joint with a horizon that is too short for its terminal weight.
 LINE = (
@@ -53,12 +54,12 @@ def rows(out):
 
 @pytest.mark.slow
 def test_weights_cut_off_resumed_and_read_back(tmp_path, monkeypatch, capsys, given_starts):
-    """Ctrl-C keeps the checkpoint; tuned.toml is the problem that was tuned."""
+    """Ctrl-C writes what there is; tuned.toml is the problem that was tuned."""
     real = tune.tune_weights
 
     def interrupted(*args, **more):
-        real(*args, **{**more, "updates": 0})
-        raise KeyboardInterrupt
+        found = real(*args, **{**more, "updates": 0})
+        raise Interrupted(replace(found, history=replace(found.history, interrupted=True)))
 
     monkeypatch.setattr(tune, "tune_weights", interrupted)
     assert run(f"weights {LINE} --updates 2 --output 'my runs'") == 130
@@ -66,7 +67,8 @@ def test_weights_cut_off_resumed_and_read_back(tmp_path, monkeypatch, capsys, gi
     assert "steps that were done are kept. Go on with:" in out
     assert f"jaxmpc tune weights {LINE} --updates 2 --output 'my runs' --resume" in out
     folder = tmp_path / "my runs"
-    assert {path.name for path in folder.iterdir()} == {"tuning.json", "checkpoint.npz"}
+    files = {"tuning.json", "checkpoint.npz", "tuned.toml", "tuning.png", "before_after.png"}
+    assert {path.name for path in folder.iterdir()} == files
     assert json.loads((folder / "tuning.json").read_text())["finished"] is False
     assert run(f"weights {LINE} --output 'my runs'") == 2
     assert "Add --resume" in capsys.readouterr().err
@@ -148,6 +150,21 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
     record = json.loads((tmp_path / "out" / "penalties.json").read_text())
     assert record["finished"] and record["result"]["after"]["solved"] == 0.5
     assert (tmp_path / "out" / "penalties.png").read_bytes()[:4] == b"\x89PNG"
+
+    # Ctrl-C: the same files, from the steps that were done.
+    ones = np.ones(1)
+    numbers = {"solved": np.array([0.25, 0.5]), "residual": np.array([1e-2, 1e-6])}
+    history = Descent({}, 1, {}, ones, ones, ones > 0, np.ones(2), {}, numbers, 1.0, True)
+
+    def stopped(*_, **__):
+        raise Interrupted(replace(made[0], history=history))
+
+    monkeypatch.setattr(tune_penalties, "tune_penalties", stopped)
+    assert run(f"{line} --output cut") == 130
+    assert "--output cut --resume" in capsys.readouterr().out
+    np.testing.assert_array_equal(load(tmp_path / "cut" / "tuned.toml").build_solver().rho, rho)
+    record = json.loads((tmp_path / "cut" / "penalties.json").read_text())
+    assert not record["finished"] and record["solved"] == [0.25, 0.5]
 
     # Where nothing learned is better the words say so.
     default = replace(made[0], improved=False, build=lambda _: ADMM(refine=0))

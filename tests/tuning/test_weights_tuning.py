@@ -11,6 +11,8 @@ from problems import symmetric
 
 import jaxmpc as jm
 from jaxmpc.closed_loop.run import Run
+from jaxmpc.tuning import weights
+from jaxmpc.tuning.closed_loop_objective import operations
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
 from jaxmpc.tuning.weights import tune_weights
@@ -79,6 +81,26 @@ def test_reverse_mode_checkpoint_and_forward_mode_agree(tuned, tmp_path):
         tune(updates=5, checkpoint=path, **{**same, "batch": 4})
 
 
+def test_an_interrupt_gives_the_best_so_far(tuned, monkeypatch):
+    """Ctrl-C in the sixth of twelve steps: what these gave, for the plan of `tuned`."""
+    real = weights.descend
+
+    def descend(theta, gradient, *more):
+        def trap(theta, step):
+            if step == 5:
+                raise KeyboardInterrupt
+            return gradient(theta, step)
+
+        return real(theta, trap, *more)
+
+    monkeypatch.setattr(weights, "descend", descend)
+    with pytest.raises(KeyboardInterrupt) as stop:
+        tune(loss=LOSS, updates=12, batch=8, optimizer=optax.adam(0.2))
+    run = stop.value.run
+    np.testing.assert_array_equal(run.history.validation, tuned.history.validation[:6])
+    assert run.improved and run.result.mpc.Q.shape == (2, 2)
+
+
 def test_bad_states_are_left_out_and_infeasible_ones_count(x64):
     """NaN in one start, and starts that no plan keeps within the limits."""
     x0s = starts(8)  # as many as in a batch of `tuned`, whose program this is
@@ -117,6 +139,27 @@ def test_design_loss_references_and_other_fields(x64):
     assert np.all(np.diff(goal) > 0)  # towards 0.3
     assert found.values["tight"] > 0.05  # narrower limits lower the design loss
     assert found.values["goal"][1] == 0.0
+
+
+def test_operations_are_counted_without_compiling():
+    """Products, factorizations, scans and branches by their formulas; a gradient by one parameter
+    takes about as many forward as in reverse, by many far more."""
+    count = lambda f, *v: operations(jax.make_jaxpr(f)(*v))
+    A, B = jnp.ones((3, 5)), jnp.ones((5, 7))
+    assert count(jnp.dot, A, B) == 2 * 3 * 5 * 7
+    assert count(jax.vmap(lambda a: jnp.dot(a, B)), jnp.ones((4, 3, 5))) == 4 * 2 * 3 * 5 * 7
+    loop = lambda v: jax.lax.scan(lambda v, _: (jnp.sin(v), None), v, length=10)[0]
+    assert count(loop, jnp.ones(6)) == 60
+    branch = lambda v: jax.lax.cond(True, lambda v: v, lambda v: jnp.sin(jnp.sin(v)), v)
+    assert 12 <= count(branch, jnp.ones(6)) <= 13  # and the choice
+    assert count(jax.lax.linalg.cholesky, jnp.eye(8)) >= 8**3
+    W, chain = jnp.ones((6, 6)), lambda W, v: jnp.sum(jnp.tanh(W @ jnp.tanh(W @ v)))
+    for parameters, least, most in ((1, 0.5, 1.5), (36, 5, 36)):
+        at = lambda p: chain(W.at[0, 0].add(p[0]) if len(p) == 1 else p.reshape(6, 6), W[0])
+        one = lambda p, d, at=at: jax.jvp(at, (p,), (d,))[1]
+        p = jnp.ones(parameters)
+        forward = count(lambda p, one=one: jax.vmap(lambda d: one(p, d))(jnp.eye(len(p))), p)
+        assert least < forward / count(jax.grad(at), p) < most
 
 
 class Looping:

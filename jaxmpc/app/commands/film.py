@@ -5,6 +5,7 @@ import sys
 from ctypes.util import find_library
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from jaxmpc.closed_loop.run import Run
@@ -15,8 +16,8 @@ from jaxmpc.robots.video import render, save_video
 FRAME = 0.04
 
 
-def film(robot: Robot, run: Run, count: int, path: Path) -> bool:
-    """Write a video of the first robots with finite states.
+def film(robot: Robot, run: Run, reference: np.ndarray, count: int, path: Path) -> bool:
+    """Write a video of the first robots with finite states, and of the target, `reference` (n,).
 
     Returns False, and prints a line on stderr, where nothing can be drawn.
     """
@@ -25,7 +26,12 @@ def film(robot: Robot, run: Run, count: int, path: Path) -> bool:
     try:
         if not len(finite):
             raise RuntimeError("no video: no robot has finite states")
-        frames = render(robot, run.states[finite], every=every)
+        with jax.enable_x64(True):
+            target = np.asarray(robot.state(reference))[: robot.mujoco.nq]
+        frames = render(
+            robot, run.states[finite], inputs=run.inputs[finite], target=target, every=every,
+            numbers=finite.tolist(),
+        )  # fmt: skip
     except RuntimeError as error:
         print(f"jaxmpc: {error}", file=sys.stderr)
         return False

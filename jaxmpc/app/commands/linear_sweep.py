@@ -1,7 +1,6 @@
 """A sweep of a linear problem: label states chunk by chunk into a store, then map and table."""
 
 import dataclasses
-import os
 import sys
 import time
 from functools import partial
@@ -21,6 +20,7 @@ from jaxmpc.app.commands.options import (
     report_damage,
 )
 from jaxmpc.app.config import Config, SweepPoints, sweep_points
+from jaxmpc.app.programs import user_cache
 from jaxmpc.checks import fail
 from jaxmpc.compiled import CHUNK
 from jaxmpc.feasible import store
@@ -167,7 +167,7 @@ class LinearSweep:
         if not self.store.pending():
             return None
         start, region, settings = time.perf_counter(), self.region, self.config.sweep
-        cache, points = cache_folder(), region.points if region.total <= LEARN else None
+        cache, points = user_cache() / "penalties", region.points if region.total <= LEARN else None
         if points is None:
             random = np.random.default_rng(0).choice(region.total, LEARN, replace=False)
             points = mesh(region.along, random)
@@ -214,9 +214,3 @@ class LinearSweep:
         # By the clock: blocks are computed while others are stored.
         timing.run_seconds = time.perf_counter() - begun - timing.compile_seconds
         return timing
-
-
-def cache_folder() -> Path:
-    """Return the folder of learned penalties, in the user's cache (XDG base directories)."""
-    home = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(home) if Path(home).is_absolute() else Path.home() / ".cache") / "jaxmpc/penalties"

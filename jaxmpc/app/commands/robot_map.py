@@ -1,5 +1,6 @@
 """`--robot` of the commands sweep and recursion: a robot's map, stored chunk by chunk."""
 
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -10,6 +11,7 @@ import jax
 import numpy as np
 from tqdm.std import tqdm
 
+from jaxmpc.app.commands.compiling import Compiling
 from jaxmpc.app.commands.options import (
     check_positive,
     check_results,
@@ -84,16 +86,24 @@ class RobotMapCommand:
     def run(self) -> None:
         """Make the map, write the files, print the table. Raises ValueError before it compiles."""
         begun = time.perf_counter()
-        setting, config, kept = self.prepare()
+        setting, config, kept, compiling = self.prepare()
         with kept:
-            self._run(setting, config, kept, begun)
+            self._run(setting, config, kept, compiling, begun)
 
     def _run(
-        self, setting: RobotSetting, config: dict[str, Any], kept: store.Store, begun: float
-    ) -> None:
+        self, setting: RobotSetting, config: dict[str, Any], kept: store.Store,
+        compiling: Compiling, begun: float,
+    ) -> None:  # fmt: skip
         count = len(setting.points)
-        print(f"{setting.robot.name}: {count:,} states, {setting.steps} samples -> {self.output}")
-        self.label(setting, kept)
+        print(
+            f"{setting.robot.name}: {count:,} states, {setting.steps} samples -> {self.output}",
+            flush=True,
+        )
+        self.label(setting, kept, compiling)
+        if self.claim == "recursion":
+            what = "linear model: closed loops and a search for counterexamples"
+            most = f"up to {self.search_seconds:g} s and compiling"
+            print(f"{what}, {most}", file=sys.stderr, flush=True)
         rmap = self.map(setting, kept)
         files = self.save(setting, rmap, config)
         print(rmap)
@@ -102,8 +112,9 @@ class RobotMapCommand:
         print(f"  {'total':<16} {time.perf_counter() - begun:.2f} s with set-up and files")
         print(f"  {'files':<16} {' '.join(str(self.output / name) for name in files)}")
 
-    def prepare(self) -> tuple[RobotSetting, dict[str, Any], store.Store]:
-        """Return the checked setting, its configuration (JSON data), and the opened store."""
+    def prepare(self) -> tuple[RobotSetting, dict[str, Any], store.Store, Compiling]:
+        """Return the checked setting, its configuration (JSON data), the opened store, and the
+        wait for the compiler, announced."""
         path = self.output / "robot_map.zarr"
         check_results(path, self.resume, self.overwrite)
         robot = load_robot(self.robot)
@@ -120,15 +131,21 @@ class RobotMapCommand:
         check_positive(self, "horizon", "steps", "seconds")
         if self.terminal == "ellipsoid":
             fail("--terminal", "ellipsoid: a robot's limits are soft rows", "Give invariant or box")
+        seconds = 2.0 if self.seconds is None else self.seconds
+        if self.steps is not None:
+            seconds = self.steps * robot.dt
         # The steps from here on compile programs.
+        programs = {
+            "seconds": seconds, "horizon": self.horizon, "terminal": self.terminal, "axes": axes,
+            "grid": [len(line) for line in along], "devices": self.devices, **self.settings,
+        }  # fmt: skip
+        compiling = Compiling.announce(robot, f"map of {self.claim}", programs)
         fixed = _home_coordinates(robot)
         fixed[others] = fixed[others] if self.values is None else self.values
         mpc = default_mpc(robot, self.horizon or 20, self.terminal or "none")
-        seconds = 2.0 if self.seconds is None else self.seconds
         setting = RobotSetting.of(
-            robot, mpc, points, seconds if self.steps is None else self.steps * robot.dt,
-            axes=axes, fixed=fixed, claim=self.claim,
-        )  # fmt: skip
+            robot, mpc, points, seconds, axes=axes, fixed=fixed, claim=self.claim
+        )
         config = {
             "robot": self.robot,
             "claim": self.claim,
@@ -151,7 +168,7 @@ class RobotMapCommand:
             store.remove(path)
         kept = store.open_labels(path, setting.problem, along, config, setting.chunk(None), LOOPS)
         report_damage(kept)
-        return setting, config, kept
+        return setting, config, kept, compiling
 
     def _along(self, robot: Robot, axes: tuple[int, ...]) -> list[np.ndarray]:
         """Return the coordinates of the grid along each axis. Raises ValueError for options of
@@ -167,8 +184,8 @@ class RobotMapCommand:
         ends = grid_ends("--", self.lower, self.upper, limits)
         return [np.linspace(*line) for line in zip(*ends, shape, strict=True)]
 
-    def label(self, setting: RobotSetting, kept: store.Store) -> None:
-        """Label the blocks that are not done, and commit each."""
+    def label(self, setting: RobotSetting, kept: store.Store, compiling: Compiling) -> None:
+        """Label the blocks that are not done, and commit each; the first one compiles."""
         todo, index = kept.batches()
         if not todo:
             return
@@ -176,8 +193,9 @@ class RobotMapCommand:
         chunks = setting.chunks(
             index.ravel(), chunk=index.shape[1], devices=self.devices, **self.settings
         )
-        with tqdm(total=total, unit=" loops", disable=None) as bar:
+        with tqdm(total=total, unit=" loops", disable=None) as bar, compiling.followed():
             for (block, here), (_, labels, loops) in zip(todo, chunks, strict=True):
+                compiling.over()
                 count = here.stop - here.start
                 looped = first_rows(vars(loops), count)
                 kept.commit(block, **store.label_rows(labels.first(count)), **looped)

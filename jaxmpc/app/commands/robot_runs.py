@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from tqdm.std import tqdm
 
+from jaxmpc.app.commands.compiling import Compiling
 from jaxmpc.app.commands.film import choose_renderer
 from jaxmpc.app.commands.options import (
     Timing,
@@ -46,7 +47,7 @@ class RobotRuns:
 
     command: the options, all with values. reference (n,), input_reference (m,): the target,
     at rest. steps: samples of a run. starts (B, nq + nv). variations: factors of each plant, as
-    `draw_robots` returns them. kept: the store.
+    `draw_robots` returns them. kept: the store. compiling: the wait for the compiler.
     """
 
     command: "Simulate"
@@ -58,6 +59,7 @@ class RobotRuns:
     starts: np.ndarray
     variations: dict[str, np.ndarray]
     kept: store.Store
+    compiling: Compiling
 
     @classmethod
     def open(cls, command: "Simulate") -> "RobotRuns":
@@ -81,6 +83,9 @@ class RobotRuns:
             if given is not None and len(given) != size:
                 fail(name, f"has {len(given)} numbers", f"{robot.name} needs {size}")
         require_sizes(command, robot)
+        steps = max(1, round(command.seconds / robot.dt))
+        each = 256 if jax.default_backend() == "cpu" else 4096
+        chunk = command.chunk or (command.devices or 1) * each
         target = None if command.target is None else np.array(command.target)
         file: dict[str, Any] = {}
         if command.config is not None:
@@ -89,6 +94,11 @@ class RobotRuns:
         file |= {key: np.array(value) for key, value in options.items() if value is not None}
         more = {"terminal_cost": file["terminal_cost"]} if "terminal_cost" in file else {}
         horizon: Any = command.horizon
+        x, input_reference = robot.equilibrium(target)
+        # The steps from here on compile programs.
+        programs = {name: getattr(command, name) for name in PROGRAM}
+        programs |= {"steps": steps, "chunk": min(chunk, command.count)}
+        compiling = Compiling.announce(robot, "loops", programs)
         mpc = robot_mpc(
             robot, file.get("Q"), file.get("R"), horizon, target=target,
             margin=command.margin or 0.0, **more,
@@ -102,7 +112,6 @@ class RobotRuns:
                 controller = RobotController(
                     robot, mpc, solver, linearize=str(command.linearize), penalty=command.penalty
                 )
-        x, input_reference = robot.equilibrium(target)
         with jax.enable_x64(True):
             reference = np.asarray(robot.coordinates(x))
         starts, variations = draw_robots(
@@ -114,9 +123,6 @@ class RobotRuns:
         open_folder(command.output, "summary.json", "runs.png", "robots.gif")
         if path.exists() and command.overwrite:
             store.remove(path)
-        steps = max(1, round(command.seconds / robot.dt))
-        each = 256 if jax.default_backend() == "cpu" else 4096
-        chunk = command.chunk or (command.devices or 1) * each
         sample = store.Constant(np.arange(len(starts)), ("sample",), {"long_name": "robot"})
         points = store.Constant(starts, ("sample", "state"), {"long_name": "initial state"})
         kept = store.Store(
@@ -125,8 +131,9 @@ class RobotRuns:
         )  # fmt: skip
         report_damage(kept)
         return cls(
-            command, robot, controller, reference, input_reference, steps, starts, variations, kept
-        )
+            command, robot, controller, reference, input_reference, steps, starts, variations, kept,
+            compiling,
+        )  # fmt: skip
 
     def simulate(self) -> Timing:
         """Run the chunks that are not done, and commit each."""
@@ -139,13 +146,15 @@ class RobotRuns:
                 factors = {key: value[rows] for key, value in self.variations.items()}
                 numbers = plant_numbers(self.robot, factors)
                 begun, compiled = time.perf_counter(), Compiled.seconds
-                with jax.enable_x64(self.command.dtype == "float64"):
+                precision = jax.enable_x64(self.command.dtype == "float64")
+                with precision, self.compiling.followed(programs=1):
                     run = simulate_many(
                         self.controller, self.robot, padded(self.starts[rows], size), self.steps,
                         reference=self.reference, input_reference=self.input_reference,
                         variations={key: padded(value, size) for key, value in numbers.items()},
                         devices=self.command.devices,
                     )  # fmt: skip
+                self.compiling.over()
                 compiling = Compiled.seconds - compiled
                 count = rows.stop - rows.start
                 timing.compile_seconds += compiling
@@ -177,8 +186,12 @@ def require_sizes(command: "Simulate", robot: Robot) -> None:
     require_memory("--horizon", condensed_bytes(horizon, n, m, None, n + m), "Give fewer steps")
 
 
-# The fields of `Run` that the store keeps.
-STORED = tuple(field.name for field in dataclasses.fields(Run) if field.name != "slack")
+# Options that change the compiled programs.
+PROGRAM = ("horizon", "linearize", "iterations", "refine", "dtype", "devices")
+# The fields of `Run` that the store keeps: no robot here has an observer.
+STORED = tuple(
+    field.name for field in dataclasses.fields(Run) if field.name not in ("slack", "estimates")
+)
 
 
 def _run_fields(command: "Simulate", robot: Robot, steps: int) -> dict[str, store.Field]:

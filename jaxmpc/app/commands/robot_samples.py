@@ -3,7 +3,11 @@
 import jax
 import numpy as np
 
+from jaxmpc.closed_loop.environment import start_room
+from jaxmpc.closed_loop.variations import draw_factors, plant_numbers
 from jaxmpc.robots.robot import Robot
+
+__all__ = ["draw_robots", "plant_numbers"]
 
 
 def draw_robots(
@@ -16,39 +20,13 @@ def draw_robots(
     1 − this to 1 + this; payload: masses in kg are from 0 to this. The dictionary has those that
     are not zero: "mass" (count, bodies), "damping" (count, nv), "payload" (count,).
     """
-    starts, masses, dampings, loads = np.random.default_rng(seed).spawn(4)
+    starts = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
+    home, below, above = start_room(robot)
+    aside = spread * starts.uniform(-1, 1, (count, robot.n))
     with jax.enable_x64(True):
-        home = np.asarray(robot.coordinates(np.asarray(robot.home)))
-        lower, upper = (
-            np.where(np.isfinite(end), np.abs(end - home), 1.0)
-            for end in (np.asarray(robot.state_limits.lower), robot.state_limits.upper)
-        )
-        aside = spread * starts.uniform(-1, 1, (count, robot.n))
-        xi = home + np.where(aside > 0, upper, lower) * aside
-        x0s = np.asarray(jax.vmap(robot.state)(xi))
-    found = {}
-    for name, most, random, size in (
-        ("mass", mass, masses, robot.mujoco.nbody),
-        ("damping", damping, dampings, robot.mujoco.nv),
-    ):
-        if most:
-            found[name] = random.uniform(1 - most, 1 + most, (count, size))
+        x0s = np.asarray(jax.vmap(robot.state)(home + np.where(aside > 0, above, below) * aside))
+    ranges = {"mass": (1 - mass, 1 + mass), "damping": (1 - damping, 1 + damping)}
+    ranges = {name: range_ for name, range_ in ranges.items() if range_[1] > 1}
     if payload:
-        found["payload"] = loads.uniform(0, payload, count)
-    return x0s, found
-
-
-def plant_numbers(robot: Robot, variations: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the arguments of `Robot.vary` for these factors."""
-    model, found = robot.mujoco, {}
-    if "mass" in variations:
-        factor = variations["mass"]
-        found = {
-            "body_mass": factor * model.body_mass,
-            "body_inertia": factor[..., None] * model.body_inertia,
-        }
-    if "damping" in variations:
-        found["dof_damping"] = variations["damping"] * model.dof_damping
-    if "payload" in variations:
-        found["payload"] = variations["payload"]
-    return found
+        ranges["payload"] = (0, payload)
+    return x0s, draw_factors(robot, count, seed, ranges)

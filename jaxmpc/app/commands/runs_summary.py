@@ -56,7 +56,8 @@ def summarise(runs: RobotRuns, run: Run, outcome: Outcome, timing: Timing) -> di
         },
         "plans": plans if mpc else 0,
         "plans_solved": count(run.status == Status.SOLVED),
-        "fallback_plans": count(run.fallback),
+        "fallback_plans": count((run.status == Status.SOLVED) & run.fallback),
+        "unsolved_plans": count(run.status != Status.SOLVED) if mpc else 0,
         "settling": levels(outcome.settling),
         "cost": levels(outcome.cost),
         "this_run": {**dataclasses.asdict(timing), **simulated},
@@ -92,7 +93,8 @@ def summary_rows(s: dict[str, Any]) -> list[tuple[str, str]]:
     if mpc:
         for key, label, what in (
             ("plans_solved", "plans solved", ""),
-            ("fallback_plans", "fallback", "  violate soft limits"),
+            ("fallback_plans", "fallback", "  solved, but with slack in soft limits"),
+            ("unsolved_plans", "unsolved", "  say nothing about limits"),
         ):
             part = f"{s[key]:>9,}  {s[key] / s['plans']:8.2%}"
             rows.append((label, f"{part}  of {s['plans']:,}{what}"))

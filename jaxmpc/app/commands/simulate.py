@@ -41,7 +41,9 @@ class Simulate:
     How to start
       $ jaxmpc simulate
       $ jaxmpc simulate --robot arm7 --count 256 --seconds 1 --mass 0.1 --output runs/a
-      Compiling takes 20 s for one joint and a minute for seven, before the first samples.
+      It compiles before the first samples, and says for about how long. What is compiled is kept
+      for the next time in ~/.cache/jaxmpc/programs (with JAXMPC_CACHE=off nothing is; with
+      JAX_COMPILATION_CACHE_DIR it is there).
 
     How to read the table
       success        robots that kept all limits and ended at the target: each coordinate within
@@ -51,7 +53,8 @@ class Simulate:
       plans valid    robots all of whose plans were solved without fallback; how many kept limits
       worst          the largest violation relative to half the range, in its own unit
       plans solved   plans whose residuals pass: 1e-6 in float64, 1e-3 in float32
-      fallback       plans that violate soft limits somewhere on their horizon
+      fallback       solved plans that need slack: soft limits are violated on their horizon
+      unsolved       the other plans: raise --iterations or --refine; of limits they say nothing
       settling       time after which a robot stays within the tolerance for the rest of its run
       cost           sum of (x - x_target)'Q(x - x_target) + (u - u_target)'R(u - u_target)
       run            wall time without compiler, files and plots
@@ -60,9 +63,12 @@ class Simulate:
 
     Files, all in the folder of --output
       runs.png       Positions, velocities and inputs of some robots over time, limits in grey.
-                     Orange: fallback plans. Red: limits exceeded.
-      robots.gif     Some of the robots, in real time. Needs OpenGL: without a display libegl1
-                     libegl-mesa0 libgl1-mesa-dri libgl1 (Debian, Ubuntu); without it no video.
+                     Orange: its plan needs slack (fallback). Purple: its plan was not
+                     solved. Red: limits exceeded.
+      robots.gif     Some of the robots, in real time, with their numbers in runs.zarr. Green and
+                     see-through: the target. Red frame: beyond the limit that it names.
+                     Needs OpenGL: without a display libegl1 libegl-mesa0 libgl1-mesa-dri libgl1
+                     (Debian, Ubuntu); without it no video.
       summary.json   The table's numbers, target, worst violation of each coordinate, versions.
       runs.zarr      points (the start), states, inputs, status, cost, fallback, ... of every
                      robot. Opens with xarray.open_zarr(path).
@@ -166,7 +172,8 @@ class Simulate:
             run, robot, reference=runs.reference, input_reference=runs.input_reference
         )
         figure.savefig(self.output / "runs.png", dpi=150)
-        if self.video and film(robot, run, self.video, self.output / "robots.gif"):
+        video = self.output / "robots.gif"
+        if self.video and film(robot, run, runs.reference, self.video, video):
             files.append("robots.gif")
         summary = summarise(runs, run, outcome, timing)
         write_json(self.output / "summary.json", summary)

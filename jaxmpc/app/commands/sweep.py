@@ -67,11 +67,14 @@ class Sweep:
       joint's position and velocity unless --axes says otherwise, the rest at home unless --fixed.
       Each state is labelled as above, by the linear model, and by the closed loop of the
       nonlinear robot in MJX: are all its limits kept for --seconds? Costs about 0.3 ms a state
-      and sample on one CPU core.
+      and sample on one CPU core, after compiling, which is announced. What is compiled is kept
+      for the next time, see jaxmpc simulate --help.
       robot_map.png  Blue: promise kept. Red: promise broken (feasible by the linear model, the
-                     robot leaves its limits). Grey: infeasible, and the robot fails. Green:
-                     infeasible, yet the robot keeps its limits. Circle: the broken promise
-                     deepest in the linear feasible set.
+                     robot leaves its limits); orange: the same, but a plan before that was not
+                     solved, so that the solver may be to blame. Grey: infeasible, and the robot
+                     fails. Green: infeasible, yet the robot keeps its limits. Yellow: the linear
+                     model's label is undecided. Circle: the broken promise deepest in the linear
+                     feasible set.
                      Without an invariant terminal set a plan promises its horizon only.
       summary.json   Counts, plans by status, deepest broken promise, configuration.
       robot_map.npz  points, states, promised, held (1 yes, -1 no, 0 undecided), kept, recursive,

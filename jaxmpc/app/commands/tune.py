@@ -1,9 +1,11 @@
 """The command `jaxmpc tune weights`: its options and help."""
 
+import contextlib
 import dataclasses
 import json
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,6 +13,7 @@ import jax
 import numpy as np
 import optax
 
+from jaxmpc.app.commands.compiling import Compiling
 from jaxmpc.app.commands.options import (
     Horizon,
     Switch,
@@ -33,6 +36,7 @@ from jaxmpc.app.commands.tuning_report import save_results
 from jaxmpc.app.commands.tuning_task import TuningTask, linear_task, robot_task
 from jaxmpc.checks import fail
 from jaxmpc.compiled import Compiled
+from jaxmpc.tuning.result import Interrupted, TuningRun
 from jaxmpc.tuning.weights import tune_weights
 
 
@@ -57,6 +61,7 @@ class TuneWeights:
       $ jaxmpc tune weights --config pendulum.toml --tune Q R P --updates 50 --output tuned/a
       $ jaxmpc tune weights --robot arm2 --mass 0.2 --payload 0.5 --tune Q R rho tightening
       Before the first step the program compiles: half a minute for one joint, minutes for an arm.
+      What is compiled is kept for the next time, see jaxmpc simulate --help.
 
     What can be tuned (--tune)
       Q, R        weights of states and inputs; diagonal, or --weights full: L L', any positive
@@ -73,8 +78,8 @@ class TuneWeights:
       violated    validation loops that violate a limit of states or inputs by more than 1e-6 (of
                   the limit, where that is above 1), not counting the tightening
       unsolved    plans whose residuals exceed 1e-6 (float64) or 1e-3 (float32)
-      infeasible  plans proved infeasible
-      fallback    plans that violate soft limits somewhere on their horizon
+      infeasible  those of them that are proved infeasible
+      fallback    plans that are solved with slack: soft limits are violated on their horizon
       at target   loops that end within --tolerance of half the range of each state
       then        the weights
       All but the loss is counted in new simulations, those after tuning with tuned.toml as written.
@@ -87,8 +92,8 @@ class TuneWeights:
       before_after.png  Some validation loops with the weights before and after.
       maps.png          The feasible set before and after; for two states, with tightening tuned.
       checkpoint.npz    The state of the run after every step, for --resume.
-      Ctrl-C            Stops. Finished steps are kept, and --resume goes on from there. A finished
-                        run goes on with --resume and more --updates.
+      Ctrl-C            Stops, and writes all files from the best of the finished steps; --resume
+                        goes on from there. A finished run goes on with --resume and more --updates.
       Exit code         0 done, whether better or not; 2 error (one line on stderr says which); 130
                         stopped by Ctrl-C.
 
@@ -134,7 +139,7 @@ class TuneWeights:
         Literal["auto", "forward", "reverse"], option("{auto,forward,reverse}", "auto")
     ] = "auto"
     """Differentiation: the time of forward grows with the number of weights, the memory of
-    reverse with the length of the loops. auto: both are compiled, and the faster one runs."""
+    reverse with the length of the loops. auto: the one with fewer operations."""
     tracking: Annotated[tuple[float, ...] | None, option("Q [Q ...]", "Q at the start")] = None
     """Diagonal of the loss's own Q."""
     effort: Annotated[tuple[float, ...] | None, option("R [R ...]", "R at the start")] = None
@@ -206,23 +211,45 @@ class TuneWeights:
                 f"{task.name}: {', '.join(self.tune)} from {len(task.x0s)} closed loops of "
                 f"{task.steps} samples -> {self.output}", flush=True,
             )  # fmt: skip
-            with jax.enable_x64(task.dtype == "float64"):
-                run = tune_weights(
-                    task.make, task.parameters, task.plant, task.x0s, task.loss,
-                    task.steps, reference=task.reference,
-                    input_reference=task.input_reference, variations=task.variations,
-                    validation=float(np.mean(~task.train)), solver=task.solver,
-                    optimizer=self.stepper(), updates=self.updates, batch=self.batch,
-                    mode=self.mode, seed=self.seed, checkpoint=self.output / CHECKPOINT,
-                    progress=sys.stderr.isatty(),
-                )  # fmt: skip
+            run, stopped = self.tuned(task), False
         except ValueError as error:
             return report_error(error)
+        except Interrupted as stop:
+            print("\nstopped; writing the best of the steps that were done")
+            run, stopped = stop.run, True
         compiling = Compiled.seconds - compiled
         seconds = {"compile": compiling, "run": time.perf_counter() - begun - compiling}
         (self.output / TUNED).write_text(task.write(run.values))
         print(save_results(self, task, run, seconds, begun))
+        if stopped:
+            raise KeyboardInterrupt
         return 0
+
+    def tuned(self, task: TuningTask) -> TuningRun:
+        """Return the run of `tune_weights`."""
+        with jax.enable_x64(task.dtype == "float64"), self.waiting(task):
+            return tune_weights(
+                task.make, task.parameters, task.plant, task.x0s, task.loss, task.steps,
+                reference=task.reference, input_reference=task.input_reference,
+                variations=task.variations, validation=float(np.mean(~task.train)),
+                solver=task.solver, optimizer=self.stepper(), updates=self.updates,
+                batch=self.batch, mode=self.mode, seed=self.seed,
+                checkpoint=self.output / CHECKPOINT, progress=sys.stderr.isatty(),
+            )  # fmt: skip
+
+    @contextlib.contextmanager
+    def waiting(self, task: TuningTask) -> Iterator[None]:
+        """Say with --robot how long it compiles; only in the end is it known which was the last."""
+        if self.robot is None:
+            yield
+            return
+        options = self.options(task)
+        irrelevant = "seed spread mass damping payload violation settling tolerance".split()
+        programs = {k: v for k, v in options.items() if k not in irrelevant}
+        compiling = Compiling.announce(task.plant, "gradients", programs)
+        with compiling.followed():
+            yield
+        compiling.over()
 
     def prepare(self) -> TuningTask:
         """Check the options, build the task and open the folder. No closed loop compiles.

@@ -40,7 +40,7 @@ from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.runs import versions, write_json
 from jaxmpc.tuning.penalties import tune_penalties
-from jaxmpc.tuning.result import TuningRun
+from jaxmpc.tuning.result import Interrupted, TuningRun
 
 FILES = ("penalties.json", TUNED, "penalties.png")
 
@@ -62,7 +62,7 @@ class TunePenalties:
     How to start
       $ jaxmpc tune penalties
       $ jaxmpc tune penalties --config pendulum.toml --iterations 60 --count 1024 --output tuned/p
-      The joint takes some minutes on two CPU cores.
+      The joint takes less than a minute on two idle CPU cores.
 
     How to read the table
       solved      validation states whose residuals (primal, dual, gap) are all within 1e-6 after
@@ -81,7 +81,8 @@ class TunePenalties:
       penalties.png   rho by kind of limit, step of the horizon and stage; distribution of the
                       residuals before and after.
       checkpoint.npz  The state of the run after every step, for --resume.
-      Ctrl-C          Stops. Finished steps are kept, and --resume goes on from there.
+      Ctrl-C          Stops, and writes all files from the best of the finished steps; --resume
+                      goes on from there.
       Exit code       0 done, better or not; 2 error (one line on stderr says which); 130 stopped
                       by Ctrl-C.
 
@@ -99,11 +100,11 @@ class TunePenalties:
     groups: Annotated[Literal["step", "row"], option("{step,row}", "step")] = "step"
     """step: five penalties along the horizon for each limit, linear between them.
     row: one for each limit and step of the horizon."""
-    updates: Annotated[int, option("K", "300")] = 300
+    updates: Annotated[int, option("K", "200")] = 200
     """Steps of the optimizer."""
     count: Annotated[int, option("B", "1024")] = 1024
     """Number of feasible initial states, validation included."""
-    batch: Annotated[int, option("B", "128")] = 128
+    batch: Annotated[int, option("B", "32")] = 32
     """Number of states of each step, drawn again each time."""
     validation: Annotated[float, option("FRACTION", "0.25")] = 0.25
     """Fraction of the initial states in the validation set."""
@@ -144,24 +145,35 @@ class TunePenalties:
                 f"{config.name}: penalties of {self.iterations} ADMM steps from {len(states):,} "
                 f"states -> {self.output}", flush=True,
             )  # fmt: skip
-            given, learning = ADMM(refine=0), time.perf_counter()
-            with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", "tune_penalties", UserWarning)
-                found = tune_penalties(
-                    mpc, train, self.iterations, stages=self.stages, groups=self.groups,
-                    solver=given, updates=self.updates, optimizer=self.stepper(),
-                    batch=self.batch, validation=test, seed=self.seed,
-                    checkpoint=self.output / CHECKPOINT, progress=sys.stderr.isatty(),
-                )  # fmt: skip
+            given, learning, stopped = ADMM(refine=0), time.perf_counter(), False
+            found = self.learned(mpc, train, test, given)
         except ValueError as error:
             return report_error(error)
+        except Interrupted as stop:
+            print("\nstopped; writing the best of the steps that were done")
+            found, stopped = stop.run, True
         seconds = time.perf_counter() - learning
         given = dataclasses.replace(given, iterations=self.iterations)
         worst = largest_residuals(mpc, test, (given, found.solver))
         self.save(config, found, worst, dropped, seconds)
         print(self.report_text(found, worst.shape[1], dropped, seconds))
         print(f"  {'total':<13} {time.perf_counter() - begun:.1f} s with set-up and files")
+        if stopped:
+            raise KeyboardInterrupt
         return 0
+
+    def learned(
+        self, mpc: MPC, train: np.ndarray, test: np.ndarray, given: ADMM
+    ) -> TuningRun:  # fmt: skip
+        """Return the run of `tune_penalties`."""
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "tune_penalties", UserWarning)
+            return tune_penalties(
+                mpc, train, self.iterations, stages=self.stages, groups=self.groups,
+                solver=given, updates=self.updates, optimizer=self.stepper(), batch=self.batch,
+                validation=test, seed=self.seed, checkpoint=self.output / CHECKPOINT,
+                progress=sys.stderr.isatty(),
+            )  # fmt: skip
 
     def prepare(self) -> tuple[configs.Config, MPC, tuple[np.ndarray, np.ndarray]]:
         """Return the problem and the ends of the initial states; open the folder.
@@ -216,7 +228,8 @@ class TunePenalties:
         document = {
             "name": config.name,
             "options": json.loads((self.output / FILES[0]).read_text())["options"],
-            "finished": True, "result": numbers, "validation_states": worst.shape[1],
+            "finished": not (h and h.interrupted), "result": numbers,
+            "validation_states": worst.shape[1],
             "states_without_plan": dropped + round(found.after["infeasible"]),
             "learning_seconds": seconds,
             "loss": finite(h.loss) if h else [],

@@ -38,7 +38,7 @@ def save_results(
         "before": counts[0], "after": counts[1],
     }  # fmt: skip
     document = {
-        "name": task.name, "options": command.options(task), "finished": True,
+        "name": task.name, "options": command.options(task), "finished": not h.interrupted,
         "result": result, "this_run": seconds, "states_without_plan": task.dropped,
         **run.record(), "versions": versions(),
     }  # fmt: skip
@@ -97,8 +97,8 @@ def report_text(
     for key, name, more in (
         ("violated", "violated", f"of {loops} loops violate a limit"),
         ("unsolved", "unsolved", f"of {before['plans']:,} plans each"),
-        ("infeasible", "infeasible", "of them proved infeasible"),
-        ("fallback", "fallback", "of them violate soft limits"),
+        ("infeasible", "infeasible", "of all plans: unsolved, and proved infeasible"),
+        ("fallback", "fallback", "of all plans: solved, with slack in soft limits"),
         ("at_target", "at target", f"of {loops} loops at the end"),
     ):
         lines.append(row(name, percent(before[key]), percent(after[key]), more))

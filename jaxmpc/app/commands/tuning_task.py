@@ -92,7 +92,7 @@ class TuningTask(NamedTuple):
             "kept_to": violation.TOLERANCE["float64"],
             "unsolved": float(np.mean(status != Status.SOLVED)),
             "infeasible": float(np.mean(status == Status.PRIMAL_INFEASIBLE)),
-            "fallback": float(np.mean(run.fallback)),
+            "fallback": float(np.mean((status == Status.SOLVED) & np.asarray(run.fallback))),
             "at_target": float(np.mean(outcome.reached)),
         }  # fmt: skip
 

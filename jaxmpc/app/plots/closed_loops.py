@@ -8,14 +8,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxmpc.app.plots.style import EDGE, INFEASIBLE, OUTER, TERMINAL, patch
+from jaxmpc.app.plots.style import EDGE, INFEASIBLE, NOT_SOLVED, OUTER, TERMINAL, patch
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.outcome import with_limits
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.control import violation
+from jaxmpc.qp.status import Status
 from jaxmpc.robots.robot import Robot
 
 RUN, BROKEN = "#0072b2", "#a50f15"
+# Plans that stand out, by `plan_outcomes`: colour and words.
+PLANS = {
+    "fallback": (OUTER, "its plan needs slack (fallback)"),
+    "unsolved": (NOT_SOLVED, "its plan was not solved"),
+}
 
 
 def plot_runs(
@@ -25,13 +31,14 @@ def plot_runs(
     """Draw closed loops over time: a panel for each position, velocity and input.
 
     run: of `simulate` or `simulate_many`, of a Robot or LinearPlant. Limits are lines, what lies
-    outside is grey. Orange: fallback plans, which violate soft limits. Red: limits violated
-    by more than 1e-6 (of the limit, if that is above 1). reference (n,), input_reference (m,):
+    outside is grey. Orange: the plan was solved and needs slack, hence exceeds soft limits
+    somewhere on its horizon (fallback). Purple: the plan was not solved. Red: limits exceeded by
+    more than 1e-6 (of the limit, if that is above 1). reference (n,), input_reference (m,):
     set-points to draw. robots: which of the batch to draw, 24 at most by default; the title
     counts all. Raises ValueError for robots that are not there.
     """
     run = run.on_host()
-    inputs, failed = np.asarray(run.inputs), np.asarray(run.fallback)
+    inputs, plans = np.asarray(run.inputs), plan_outcomes(run)
     count, samples = inputs.shape[:2]
     shown = np.arange(min(count, 24)) if robots is None else np.asarray(robots, int)
     if not len(shown) or np.any((shown < 0) | (shown >= count)):
@@ -39,35 +46,60 @@ def plot_runs(
     pairs = with_limits(plant, run)
     xi, kept = pairs[0][1], [violation.kept(*pair) for pair in pairs]
     time = plant.dt * np.arange(samples + 1)
-    fallback = failed[shown]
     figure, panels = panel_grid(plant, time, 2.6, (1.15, 2.0, 1.1))
     for ax, kind, i in panels:
         broken = ~kept[kind][shown, :, i]
         values = (xi, inputs)[kind][shown, :, i]
-        _draw_lines(ax, time, values.T, fallback.T, broken.T)
+        parts = [(colour, plans[name][shown].T) for name, (colour, _) in PLANS.items()]
+        _draw_lines(ax, time, values.T, parts, broken.T)
         draw_limits(ax, plant, kind, i, (reference, input_reference)[kind])
     whole = kept[0].all(axis=(1, 2)) & kept[1].all(axis=(1, 2))
     figure.suptitle(
         f"{plant.name}: {count:,} closed loop{'s' * (count > 1)} of {time[-1]:g} s, {len(shown):,} "
-        f"shown\nlimits kept by {np.count_nonzero(whole):,}; fallback plans: "
-        f"{np.count_nonzero(failed):,} of {failed.size:,}",
+        f"shown. Limits kept by {np.count_nonzero(whole):,} of {count:,}\n{_plans_text(plans)}",
         fontsize=9, x=0.01, ha="left",
     )  # fmt: skip
     line = lambda label, **style: Line2D([], [], label=label, **style)
     handles: list[Any] = [
-        line("one robot", color=RUN, lw=0.8),
-        patch("outside limits", INFEASIBLE),
+        line("one robot" if isinstance(plant, Robot) else "one loop", color=RUN, lw=0.8),
+        patch("beyond the limits", INFEASIBLE),
     ]
     if reference is not None or input_reference is not None:
         handles.append(line("set-point", color=TERMINAL, lw=1.0, ls=(0, (4, 2))))
-    if fallback.any():
-        handles.append(line("fallback plan", color=OUTER, lw=1.2))
+    for name, (colour, words) in PLANS.items():
+        if plans[name][shown].any():
+            handles.append(line(words, color=colour, lw=1.6))
     if not all(part[shown].all() for part in kept):
         handles.append(line("limit exceeded", color=BROKEN, marker="o", ms=3, ls=""))
+    columns = max(1, min(len(handles), int(figure.get_figwidth() / 2.5)))
     figure.legend(
-        handles=handles, loc="outside lower left", ncols=len(handles), fontsize=8, frameon=False
+        handles=handles, loc="outside lower left", ncols=columns, fontsize=8, frameon=False
     )
     return figure
+
+
+def plan_outcomes(run: Run) -> dict[str, np.ndarray]:
+    """Return which plans (B, T) were solved within all limits ("kept"), solved with slack in soft
+    limits ("fallback"), and not solved ("unsolved"). Laws that do not plan have none of them."""
+    status, fallback = np.asarray(run.status), np.asarray(run.fallback, bool)
+    solved = status == Status.SOLVED
+    return {
+        "kept": solved & ~fallback,
+        "fallback": solved & fallback,
+        "unsolved": ~solved & (status != Status.NOT_RUN),
+    }
+
+
+def _plans_text(plans: dict[str, np.ndarray]) -> str:
+    """Return the numbers of plans by outcome, in words."""
+    kept, fallback, unsolved = (np.count_nonzero(plans[name]) for name in plans)
+    total = kept + fallback + unsolved
+    if not total:
+        return "a law without plans"
+    return (
+        f"{total:,} plans: {kept:,} within all limits, {fallback:,} need slack (fallback), "
+        f"{unsolved:,} not solved"
+    )
 
 
 def panel_grid(
@@ -124,21 +156,23 @@ def panel_columns(plant: Any) -> list[tuple[str, list[tuple[int, int, str]]]]:
 
 
 def _draw_lines(
-    ax: Axes, time: np.ndarray, values: np.ndarray, fallback: np.ndarray, broken: np.ndarray
-) -> None:
-    """Draw thin lines (samples, robots), on top those in fallback and points beyond limits."""
+    ax: Axes, time: np.ndarray, values: np.ndarray, parts: list[tuple[str, np.ndarray]],
+    broken: np.ndarray,
+) -> None:  # fmt: skip
+    """Draw thin lines (samples, robots), on top parts (colour, plans) and points beyond limits."""
     held = len(values) < len(time)  # inputs, each held for a period
     if held:
         values, broken = (np.concatenate([v, v[-1:]]) for v in (values, broken))
     style: dict[str, Any] = {"drawstyle": "steps-post"} if held else {}
     alpha = float(np.clip(6 / values.shape[1], 0.35, 0.9))
     ax.plot(time, values, color=RUN, lw=0.7, alpha=alpha, **style)
-    # A sample's part of the line reaches to the next sample.
-    part = np.zeros(values.shape, bool)
-    part[:-1] |= fallback
-    part[1:] |= fallback
-    if part.any():
-        ax.plot(time, np.where(part, values, np.nan), color=OUTER, lw=0.8, **style)
+    for colour, plans in parts:
+        # A sample's part of the line reaches to the next sample.
+        part = np.zeros(values.shape, bool)
+        part[:-1] |= plans
+        part[1:] |= plans
+        if part.any():
+            ax.plot(time, np.where(part, values, np.nan), color=colour, lw=0.9, **style)
     k, robot = np.nonzero(broken)
     ax.plot(time[k], values[k, robot], ".", color=BROKEN, ms=2, zorder=4)
 

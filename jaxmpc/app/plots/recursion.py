@@ -62,7 +62,9 @@ def plot_recursion(
         handles += _draw_losses(ax, report)
     if len(corners):
         ax.plot(*corners.T, color=INNER, lw=1.4)
-        handles.append(Line2D([], [], color=INNER, lw=1.4, label=f"X_{report.mpc.horizon}"))
+        handles.append(
+            Line2D([], [], color=INNER, lw=1.4, label=f"X_{report.mpc.horizon}: states with a plan")
+        )
     if worst is not None:
         if enlarge:
             ends = np.array([worst.state, worst.next_state])

@@ -10,6 +10,7 @@ from jaxmpc.app.plots.style import (
     FEASIBLE,
     INFEASIBLE,
     INNER,
+    NOT_SOLVED,
     OUTER,
     TERMINAL,
     UNDECIDED,
@@ -20,31 +21,32 @@ from jaxmpc.app.plots.style import (
     patch,
 )
 from jaxmpc.checks import fail
-from jaxmpc.robot_maps.robot_map import OUTCOMES, RobotMap
+from jaxmpc.robot_maps.robot_map import RobotMap
 
-BROKEN, BETTER = "#cc4b1c", "#8ccfae"
+BROKEN, UNSURE, BETTER = "#cc4b1c", "#f0a868", "#8ccfae"
 
 
 def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
     """Draw a map of two coordinates: what the linear model promises and what the robot did.
 
-    Blue: promise kept. Red: promise broken. Grey: no promise, and the robot fails. Green: no
-    promise, yet the robot does it. Yellow: undecided. Lines as in `plot_feasible_set`: inner and
-    outer bound of the linear feasible set, and the terminal set. The circle is the broken promise
-    deepest in that set, the cross the set-point. Without `ax` a new figure is made. Raises
-    ValueError for a map not of two coordinates.
+    Blue: promise kept. Red: promise broken; orange: after a plan that was not solved. Grey: no
+    promise, and the robot fails. Green: no promise, yet the robot does it. Purple: a plan of the
+    robot was not solved, so that its claim is open. Yellow: the linear promise is undecided. Lines
+    as in `plot_feasible_set`: inner and outer bound of the linear feasible set, and the terminal
+    set. The circle is the broken promise deepest in that set, the cross the set-point. Without
+    `ax` a new figure is made. Raises ValueError for a map not of two coordinates.
     """
     points = rmap.points
     if points.shape[1] != 2:
         fail("rmap", f"maps {points.shape[1]} coordinates", "A plot needs 2: choose `axes`")
     ax = new_axes(9.6) if ax is None else ax
-    colours = (FEASIBLE, BROKEN, INFEASIBLE, BETTER, UNDECIDED)
-    draw_values(ax, points, rmap.outcome, dict(enumerate(colours)))
     handles: list[Any] = []
-    for i, (name, colour) in enumerate(zip(_words(rmap), colours, strict=True)):
-        count = np.count_nonzero(rmap.outcome == i)
-        if count:
+    shown, colours = np.zeros(len(points), int), {}
+    for i, (name, colour, where) in enumerate(_outcomes(rmap)):
+        shown[where], colours[i] = i, colour
+        if count := np.count_nonzero(where):
             handles.append(patch(name, colour, count))
+    draw_values(ax, points, shown, colours)
     linear = rmap.linear
     ax.autoscale(False)
     handles += draw_polygons(ax, [
@@ -59,7 +61,9 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
     )]  # fmt: skip
     worst = rmap.worst()
     if worst is not None:
-        name = f"deepest broken promise, fails after {rmap.first_loss[worst] * rmap.robot.dt:.3g} s"
+        name = (
+            f"deepest broken promise,\nfails after {rmap.first_loss[worst] * rmap.robot.dt:.3g} s"
+        )
         marks.append(
             (points[worst], name, {"marker": "o", "ms": 6, "mfc": "white", "mec": "black"})
         )
@@ -73,21 +77,37 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def _words(rmap: RobotMap) -> tuple[str, ...]:
-    """Return the names of the outcomes in the words of the claim."""
+def _outcomes(rmap: RobotMap) -> list[tuple[str, str, np.ndarray]]:
+    """Return what can become of a state: words, colour, and which states it is, (B,)."""
     if rmap.claim == "limits":
         words = (
-            "promise kept: limits kept", "promise broken: beyond a limit",
-            "infeasible, robot beyond a limit", "infeasible, robot keeps limits", "undecided",
+            "promise kept: a plan exists,\nthe robot keeps its limits",
+            "promise broken: a plan exists,\nthe robot leaves its limits",
+            "infeasible, and the robot\nleaves its limits",
+            "infeasible, yet the robot\nkeeps its limits",
+            "linear model undecided:\nno plan and no proof found",
         )  # fmt: skip
     else:
         words = (
-            "promise kept: a plan at each sample", "promise broken: plans run out",
-            "lost on the linear model, and the robot",
-            "lost on the linear model, not the robot", "undecided",
+            "promise kept: the robot has\na plan at each sample",
+            "promise broken: the robot's\nplans run out",
+            "plans run out on the linear\nmodel, and on the robot",
+            "plans run out on the linear\nmodel, not on the robot",
+            "linear closed loop undecided",
         )  # fmt: skip
-    assert len(words) == len(OUTCOMES) + 1
-    return words
+    promised, held = rmap.promised, rmap.held
+    unsure = rmap.unsure & (promised == 1)
+    found = [
+        (words[0], FEASIBLE, (promised == 1) & (held == 1)),
+        (words[1], BROKEN, (promised == 1) & (held == -1) & ~unsure),
+        ("the same, but after a plan\nthat was not solved", UNSURE, unsure),
+        (words[2], INFEASIBLE, (promised == -1) & (held == -1)),
+        (words[3], BETTER, (promised == -1) & (held == 1)),
+        ("a plan of the robot\nwas not solved", NOT_SOLVED, (promised != 0) & (held == 0)),
+        (words[4], UNDECIDED, promised == 0),
+    ]
+    assert np.all(sum(where.astype(int) for _, _, where in found) == 1)
+    return found
 
 
 def _robot_map_title(rmap: RobotMap) -> str:
@@ -95,10 +115,12 @@ def _robot_map_title(rmap: RobotMap) -> str:
     name = rmap.robot.name
     mpc = rmap.linear.mpc
     what = {
-        "limits": "is a feasible state safe on the robot?",
-        "recursion": "does the robot keep having plans?",
+        "limits": "is a feasible state safe on the robot",
+        "recursion": "does the robot keep having plans",
     }[rmap.claim]
-    first = f"{name}: {what} {rmap.seconds:g} s, horizon N = {mpc.horizon} of {rmap.robot.dt:g} s"
+    first = (
+        f"{name}: {what} for {rmap.seconds:g} s?\nN = {mpc.horizon} steps of {rmap.robot.dt:g} s"
+    )
     labels = mpc.system.state_labels
     others = [i for i in range(len(labels)) if i not in rmap.linear.axes]
     fixed = rmap.linear.fixed
@@ -106,4 +128,4 @@ def _robot_map_title(rmap: RobotMap) -> str:
         return first
     values = [f"{labels[i]} = {fixed[i]:.4g}" for i in others]
     shown = ", ".join(values) if len(values) <= 4 else f"{len(values)} other coordinates as fixed"
-    return f"{first}\nslice at {shown}"
+    return f"{first}, slice at {shown}"

@@ -16,6 +16,8 @@ from jaxmpc.control.sets import Polytope
 # Okabe and Ito's palette: distinct with any colour vision, and in grey by lightness.
 INFEASIBLE, FEASIBLE, UNDECIDED = "#dddcd8", "#9fcbe6", "#f0d024"
 OUTER, INNER, TERMINAL = "#d55e00", "#00486b", "#006f52"
+# Plans that the solver did not solve: they say nothing about limits.
+NOT_SOLVED = "#a05fa8"
 EDGE = "#8a8a8a"
 
 

@@ -25,7 +25,7 @@ _BEFORE, _AFTER, _REJECTED, _BEST = "#d55e00", "#0072b2", "#a50f15", "#006f52"
 _FRACTIONS = (
     ("unsolved", "plans not solved", "#0072b2", "-"),
     ("infeasible", "plans proved infeasible", "#a50f15", "--"),
-    ("fallback", "plans that violate soft limits", "#e69f00", "-"),
+    ("fallback", "plans with slack in soft limits (fallback)", "#e69f00", "-"),
     ("violation", "loops beyond the limits", "#006f52", ":"),
 )
 # Lines of a panel that get a name each; more are named by the groups they belong to.

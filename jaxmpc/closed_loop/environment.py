@@ -1,0 +1,184 @@
+"""Environment: a robot with a task as functions for reinforcement learning; MPCPolicy: an MPC in
+the place of the agent."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import number, require_kind, require_shape, whole
+from jaxmpc.closed_loop.observer import model_of
+from jaxmpc.closed_loop.robot_mpc import robot_mpc
+from jaxmpc.control.system import as_weight
+from jaxmpc.control.violation import TOLERANCE, worst_violation
+from jaxmpc.mpc.plan import limited
+from jaxmpc.qp.precision import matmul
+from jaxmpc.robots.linear import LinearPlant
+from jaxmpc.robots.robot import Robot
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class EnvironmentState:
+    """The state of an episode: a pytree, with batch axes in front under `jax.vmap`.
+
+    x (nq + nv,): the robot's state. observation (n,): its coordinates ξ. reward: of the step that
+    led here, 0 at the start. terminated: a limit was exceeded, or the state is not finite.
+    truncated: the episode has its full length. samples: steps so far. violation: the most by which
+    ξ exceeds a state limit, in its unit.
+    """
+
+    x: Array
+    observation: Array
+    reward: Array
+    terminated: Array
+    truncated: Array
+    samples: Array
+    violation: Array
+
+    @property
+    def done(self) -> Array:
+        """Return whether the episode has ended."""
+        return self.terminated | self.truncated
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Environment:
+    """A robot that has to reach a target from random starts; made by `Environment.of`.
+
+        state = environment.reset(key);  state = environment.step(state, action)
+
+    are pure functions for `jax.jit`, `jax.vmap`, `jax.lax.scan` and derivatives, as in Brax. The
+    action (m,) is the input, clipped into its limits and held for a control period. The reward of a
+    step is −(ξ − r)'Q(ξ − r) − (u − s)'R(u − s) of the state before it, so that the return is
+    minus the sum of `Run.stage_cost`.
+
+    robot: a Robot or LinearPlant; `replace(environment, robot=robot.vary(...))` has another plant,
+    a batch of them under `jax.vmap`. reference r (n,), input_reference s (m,): the target, at rest.
+    Q (n, n), R (m, m). home (n,), below (n,), above (n,): coordinates of starts are uniform in
+    [home − below, home + above]. length: steps of an episode. stop_at_limits: whether it ends where
+    a state limit is exceeded. A pytree.
+    """
+
+    robot: Any
+    reference: Any
+    input_reference: Any
+    Q: Any
+    R: Any
+    home: Any
+    below: Any
+    above: Any
+    length: int = field(metadata={"static": True})
+    stop_at_limits: bool = field(default=False, metadata={"static": True})
+
+    @classmethod
+    def of(
+        cls, robot: Robot | LinearPlant, target: Any = None, *, Q: Any = None, R: Any = None,
+        spread: float = 0.5, length: int = 200, stop_at_limits: bool = False,
+    ) -> "Environment":  # fmt: skip
+        """Return the environment of a robot and a target (nq,), None for its home.
+
+        Q, R: weights, matrices or diagonals; None for those of `robot_mpc`. spread: starts are
+        uniform up to this fraction of the way from home to each limit (of 1 where there is none).
+        Raises ValueError as `robot_mpc` and `Robot.equilibrium` do.
+        """
+        require_kind("robot", robot, Robot, LinearPlant)
+        whole("length", length, 1)
+        number("spread", spread, 0.0, "Give a fraction of at least 0")
+        if Q is None or R is None:
+            usual = robot_mpc(robot, Q, R, 1, target=target, terminal_cost=None, exact=False)
+            Q, R = usual.Q, usual.R
+        Q, R = as_weight(Q, robot.n), as_weight(R, robot.m)
+        require_shape("Q", Q, (robot.n, robot.n), "Give a matrix, or its diagonal")
+        require_shape("R", R, (robot.m, robot.m), "Give a matrix, or its diagonal")
+        x, u = robot.equilibrium(target)
+        home, below, above = start_room(robot)
+        with jax.enable_x64(True):
+            reference = np.asarray(robot.coordinates(x))
+        return cls(
+            robot, reference, u, Q, R, home, spread * below, spread * above, length, stop_at_limits
+        )
+
+    def reset(self, key: Array) -> EnvironmentState:
+        """Return a random start."""
+        aside = jax.random.uniform(key, (self.robot.n,), minval=-1.0, maxval=1.0)
+        room = jnp.where(aside > 0, jnp.asarray(self.above), jnp.asarray(self.below))
+        return self.at(
+            self.robot.state((jnp.asarray(self.home) + room * aside).astype(aside.dtype))
+        )
+
+    def at(self, x: Any) -> EnvironmentState:
+        """Return the start of an episode at the state x (nq + nv,)."""
+        return self._state(jnp.asarray(x), jnp.zeros(()), jnp.asarray(0))
+
+    def step(self, state: EnvironmentState, action: Any) -> EnvironmentState:
+        """Return the state one control period later, under the action (m,)."""
+        robot, dtype = self.robot, state.x.dtype
+        require_shape("action", action, (robot.m,), "One number an input; use jax.vmap for many")
+        u = limited(robot.input_limits, jnp.asarray(action, dtype))
+        error = robot.coordinates(state.x) - jnp.asarray(self.reference, dtype)
+        effort = u - jnp.asarray(self.input_reference, dtype)
+        square = lambda v, W: jnp.sum(v * matmul(jnp.asarray(W, dtype), v))
+        reward = -square(error, self.Q) - square(effort, self.R)
+        return self._state(robot.step(state.x, u), reward, state.samples + 1)
+
+    def policy(self, controller: Any) -> "MPCPolicy":
+        """Return a controller of this robot as a policy for the target."""
+        return MPCPolicy(controller, self.reference, self.input_reference)
+
+    def _state(self, x: Array, reward: Array, samples: Array) -> EnvironmentState:
+        xi = self.robot.coordinates(x)
+        limits = jax.tree.map(lambda v: jnp.asarray(v, xi.dtype), self.robot.state_limits)
+        violation = worst_violation(limits, xi)
+        ended = jnp.isnan(violation)
+        if self.stop_at_limits:
+            ended = ended | (violation > TOLERANCE[xi.dtype.name])
+        return EnvironmentState(
+            x=x, observation=xi, reward=reward.astype(xi.dtype), terminated=ended,
+            truncated=samples >= self.length, samples=samples, violation=violation,
+        )  # fmt: skip
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class MPCPolicy:
+    """A controller as a policy: `policy(observation) -> action`, a pure function.
+
+    controller: a Controller, RobotController or LinearFeedback. reference, input_reference: the
+    target, as in `simulate`. The observation (n,) is the coordinates ξ. Each call solves its plan
+    from a cold start; `controller(x, carry)` is warm-started. Under `jax.jit`, `jax.vmap`, and
+    differentiable in the observation, the references and all that the controller is made of. A
+    pytree: `replace(policy, reference=...)` under `jax.vmap` gives each robot its own target.
+    """
+
+    controller: Any
+    reference: Any = None
+    input_reference: Any = None
+
+    def __call__(self, observation: Any) -> Array:
+        """Return the action (m,) for an observation (n,)."""
+        n = self.controller.mpc.system.n
+        require_shape("observation", observation, (n,), "The coordinates; use jax.vmap for many")
+        xi = jnp.asarray(observation, self.controller.dtype)
+        model = model_of(self.controller)
+        x = model.state(xi) if hasattr(model, "state") else xi
+        u, *_ = self.controller(
+            x, None, self.reference, input_reference=self.input_reference
+        )  # fmt: skip
+        return u
+
+
+def start_room(robot: Robot | LinearPlant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the coordinates (n,) of home, and how far the limits are below and above it, 1 where
+    there are none."""
+    with jax.enable_x64(True):
+        home = np.asarray(robot.coordinates(np.asarray(robot.home)))
+    below, above = (
+        np.where(np.isfinite(end), np.abs(end - home), 1.0)
+        for end in (np.asarray(robot.state_limits.lower), np.asarray(robot.state_limits.upper))
+    )
+    return home, below, above

@@ -1,0 +1,213 @@
+"""Compiled programs are kept between commands, whole or not at all, and waits are announced."""
+
+import os
+import subprocess
+import sys
+import time
+import zlib
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+import jaxmpc as jm
+from jaxmpc.app import programs
+from jaxmpc.app.commands import compiling
+from jaxmpc.app.commands.compiling import Compiling
+from jaxmpc.app.programs import kept_programs, times_file
+from jaxmpc.compiled import Compiled
+
+VARIABLE = "JAX_COMPILATION_CACHE_DIR"
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES", "none")
+    monkeypatch.delenv("JAXMPC_CACHE", raising=False)
+    monkeypatch.delenv(VARIABLE, raising=False)
+
+
+def entries():
+    """What is kept: {name without the checksum: content}."""
+    folder = programs.programs_folder()
+    return {path.stem: path.read_bytes() for path in folder.glob("*-cache.*")}
+
+
+def write(name, content):
+    """What JAX does."""
+    Path(os.environ[VARIABLE], name).write_bytes(content)
+
+
+def test_entries_are_kept_whole_or_not_at_all():
+    with kept_programs(["simulate"]):
+        own = Path(os.environ[VARIABLE])
+        write("a-cache", b"first")
+        write("b-cache", b"second")
+        write("notes", b"no entry")
+        assert entries() == {}, "nothing half written is seen"
+        assert times_file() == own.parent / "jaxmpc-seconds.json"
+    assert entries() == {"a-cache": b"first", "b-cache": b"second"}
+    assert VARIABLE not in os.environ and not own.exists()
+    (damaged,) = own.parent.glob("b-cache.*")
+    damaged.write_bytes(b"secons")
+    with kept_programs(["tune"]):
+        assert {path.name for path in Path(os.environ[VARIABLE]).iterdir()} == {"a-cache"}
+        write("b-cache", b"second")
+    assert entries() == {"a-cache": b"first", "b-cache": b"second"}
+
+
+def test_processes_do_not_disturb_each_other(monkeypatch):
+    with kept_programs(["sweep"]):
+        write("a-cache", b"of both")
+        one = os.environ.pop(VARIABLE)
+        with kept_programs(["sweep"]):
+            assert os.environ[VARIABLE] != one and not os.listdir(os.environ[VARIABLE])
+            write("a-cache", b"of both")
+            write("b-cache", b"of the second")
+        monkeypatch.setenv(VARIABLE, one)
+        write("c-cache", b"of the first")
+    assert entries().keys() == {"a-cache", "b-cache", "c-cache"}
+    # A process that was killed leaves its folder, which goes when it is old.
+    left = programs.programs_folder() / f"{programs.RUN}killed"
+    left.mkdir()
+    with kept_programs(["sweep"]):
+        assert left.exists()
+    os.utime(left, (0, time.time() - 1.1 * programs.LEFT))
+    with kept_programs(["sweep"]):
+        assert not left.exists()
+
+
+def test_the_oldest_go_when_there_are_too_many(monkeypatch):
+    monkeypatch.setattr(programs, "LIMIT", 25)
+    for k in range(3):
+        with kept_programs(["sweep"]):
+            write(f"{k}-cache", b"ten bytes.")
+        (path,) = programs.programs_folder().glob(f"{k}-cache.*")
+        os.utime(path, (0, 1000.0 + k))
+    with kept_programs(["sweep"]):
+        pass
+    assert entries().keys() == {"1-cache", "2-cache"}
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_file_systems_without_links(monkeypatch, links):
+    if not links:
+        monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(PermissionError()))
+    for _ in range(2):
+        with kept_programs(["info"]):
+            write("a-cache", b"one")
+    assert entries() == {"a-cache": b"one"}
+    assert len(os.listdir(programs.programs_folder())) == 1
+
+
+def test_switches(tmp_path, monkeypatch):
+    """JAXMPC_CACHE=off, the user's own folder, a command that measures, no folder at all."""
+    with kept_programs(["bench"]):
+        assert VARIABLE not in os.environ
+    monkeypatch.setenv("JAXMPC_CACHE", "off")
+    with kept_programs(["simulate"]):
+        assert VARIABLE not in os.environ and times_file() is None
+    monkeypatch.delenv("JAXMPC_CACHE")
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with kept_programs(["simulate"]):
+        assert VARIABLE not in os.environ
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "mine"))
+    with kept_programs(["simulate"]):
+        assert os.environ[VARIABLE] == str(tmp_path / "mine")
+        assert times_file() == tmp_path / "mine" / "jaxmpc-seconds.json"
+    assert os.environ[VARIABLE] == str(tmp_path / "mine") and not (tmp_path / "mine").exists()
+
+
+def test_a_wait_is_announced_by_the_last_one(tmp_path, monkeypatch, capsys):
+    """By a guess, then by the first time, then by the last; other options are another program."""
+    robot, clock = jm.load_robot("joint"), [0.0]
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    monkeypatch.setattr(compiling, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+
+    def waited(seconds, options):
+        program = Compiled(jax.jit(lambda x: x + 1.0))
+        wait = Compiling.announce(robot, "loops", options)
+        with wait.followed(programs=1):
+            clock[0] += seconds
+            program(np.zeros(3))
+            clock[0] += 1000.0  # it runs
+        wait.over()
+        return capsys.readouterr().err
+
+    first = waited(40.0, {"horizon": 5})
+    assert first.startswith("compiling, about ") and "guess by the number of joints" in first
+    assert first.count("\n") == 2 and first.endswith("\ncompiled in 40 s\n")
+    assert "less than the 40 s of the first time" in waited(7.0, {"horizon": 5})
+    assert "about 7 s, as last time" in waited(6.0, {"horizon": 5})
+    assert "about 6 s, as last time" in waited(6.0, {"horizon": 5})
+    assert "guess" in waited(6.0, {"horizon": 6})
+    (tmp_path / "jaxmpc-seconds.json").write_text('{"a": [')
+    assert "guess" in waited(6.0, {"horizon": 5})
+    wait = Compiling.announce(robot, "gradients", {})
+    with wait.followed():  # nobody knows how many
+        for k, seconds in enumerate((7.0, 3.0, 20.0)):
+            clock[0] += seconds
+            Compiled(jax.jit(lambda x: x + 1.0))(np.zeros(k))
+    wait.over()
+    assert capsys.readouterr().err.splitlines()[1:] == [
+        "compiling, 1 program ready after 7 s", "compiling, 3 programs ready after 30 s",
+        "compiled in 30 s",
+    ]  # fmt: skip
+    assert not Compiled.listeners
+    Compiling.announce(robot, "loops", {}).over()  # nothing had to be compiled
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+PROGRAM = """
+import numpy as np
+from jaxmpc.app.programs import kept_programs
+with kept_programs(["simulate"]):
+    import jax
+    import jax.numpy as jnp
+    hits = []
+    jax.monitoring.register_event_listener(
+        lambda event, **_: hits.append(event) if event.endswith("/cache_hits") else None
+    )
+    A = jnp.sin(jnp.arange(900.0)).reshape(30, 30)
+    step = lambda x, _: (jnp.tanh(A @ x) + 0.1 * x, jnp.exp(x).sum())
+    run = jax.jit(lambda x: jax.lax.scan(step, x, length=50))
+    x, sums = run(jnp.cos(jnp.arange(30.0)))
+    print(len(hits) > 0, np.asarray(x).tobytes().hex(), sums.tolist())
+"""
+
+
+def test_results_are_the_same_with_and_without():
+    """Cold, kept, two at once, damaged and without: the same bits, and nothing on stderr."""
+    paths = {**os.environ, "PYTHONPATH": str(Path(jm.__file__).parents[1])}
+
+    def start(**more):
+        command = [sys.executable, "-c", PROGRAM]
+        pipes = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        return subprocess.Popen(command, env=paths | more, **pipes)
+
+    def finish(process):
+        out, err = process.communicate(timeout=250)
+        assert process.returncode == 0 and not err, err
+        hit, values = out.split(" ", 1)
+        return hit == "True", values
+
+    hit, values = finish(start(JAXMPC_CACHE="off"))
+    assert not hit and not programs.user_cache().exists()
+    assert finish(start()) == (False, values)
+    kept = entries()
+    assert any(name.startswith("jit__lambda") for name in kept)
+    assert [finish(process) for process in [start(), start()]] == [(True, values)] * 2
+    assert entries() == kept, "there was nothing to add"
+    for path in programs.programs_folder().glob("*-cache.*"):
+        path.write_bytes(path.read_bytes()[:-100] + bytes(100))
+    assert finish(start()) == (False, values)
+    assert entries().keys() == kept.keys()
+    folder = programs.programs_folder()
+    for path in list(folder.glob("*-cache.*")):  # with the right checksum, but no program
+        (folder / f"{path.stem}.{zlib.crc32(b'nothing'):08x}").write_bytes(b"nothing")
+        path.unlink()
+    assert finish(start()) == (False, values)

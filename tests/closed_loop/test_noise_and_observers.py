@@ -1,0 +1,325 @@
+"""Noise, Kalman filters, delays and references of each loop, against linear theory."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy
+from c_engine import c_steps
+
+import jaxmpc as jm
+from jaxmpc.closed_loop import KalmanFilter, LinearFeedback, Noise
+
+T, J = 0.1, 0.5
+SYSTEM = jm.LinearSystem(
+    np.array([[1, T], [0, 1]]), np.array([[T * T / J], [T / J]]), np.array([0.01, -0.02]), dt=T
+)
+Q, R = np.diag([5.0, 0.2]), np.array([[0.1]])
+MPC = jm.MPC(SYSTEM, Q, R, 3)
+K = np.asarray(jm.lqr(SYSTEM, Q, R).K)
+LAW = LinearFeedback(MPC, K)
+PLANT = jm.LinearPlant(SYSTEM, jm.Box([-9.0, -9.0], [9.0, 9.0]), jm.Box([-9.0], [9.0]))
+# Correlated process noise.
+W, V = np.array([[4e-4, 3e-4], [3e-4, 1e-3]]), np.array([[9e-4]])
+NOISE = Noise(W.tolist(), V.tolist(), seed=3)
+FILTER = KalmanFilter(SYSTEM, W.tolist(), [0.03], C=[[1.0, 0.0]])
+STEPS, LOOPS = 60, 4000
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _float64():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def gaussian():
+    """Runs of the linear plant under LQR and Kalman filter, from the origin."""
+    return jm.simulate_many(LAW, SYSTEM, np.zeros((LOOPS, 2)), STEPS, noise=NOISE, observer=FILTER)
+
+
+def test_covariances_of_lqg_solve_the_lyapunov_equations(gaussian):
+    """State and estimation error, jointly: z = (x, x − x̂_t|t−1) is a linear system under white
+    noise, whose stationary covariance solves a Lyapunov equation. P of the filter by scipy."""
+    A, B, C = SYSTEM.A, SYSTEM.B, np.array([[1.0, 0.0]])
+    P = scipy.linalg.solve_discrete_are(A.T, C.T, W, V)
+    L = P @ C.T @ np.linalg.inv(C @ P @ C.T + V)
+    np.testing.assert_allclose(FILTER.prepared().gain, L, rtol=1e-9)
+    # u = K x̂_t|t = K (x − e_t|t), e_t|t = (I − LC) e − L v, e⁺ = A e_t|t + w.
+    kept, zero, I = np.eye(2) - L @ C, np.zeros((2, 2)), np.eye(2)
+    loop = np.block([[A + B @ K, -B @ K @ kept], [zero, A @ kept]])
+    noise = np.block([[I, B @ K @ L], [I, -A @ L]])
+    Z = scipy.linalg.solve_discrete_lyapunov(loop, noise @ scipy.linalg.block_diag(W, V) @ noise.T)
+    np.testing.assert_allclose(Z[2:, 2:], P, rtol=1e-9)  # what the filter says of itself
+    x, filtered = gaussian.states[:, :-1], gaussian.estimates
+    # Stationary from some 30 samples on (0.01 of the start is left); offsets c apart, by means.
+    states, errors = x[:, 40:], (x - filtered)[:, 40:]
+    samples = np.concatenate([states - states.mean((0, 1)), errors - errors.mean((0, 1))], axis=2)
+    found = np.einsum("bti,btj->ij", samples, samples) / np.prod(samples.shape[:2])
+    tt = kept @ P  # covariance of the filtered error
+    size = np.sqrt(np.outer(np.diag(Z)[:2], np.diag(Z)[:2]))
+    # 4000 independent loops: the error of a variance is √(2/4000) = 2 % of it or less.
+    np.testing.assert_allclose(found[:2, :2], Z[:2, :2], atol=0.07 * size.max(), rtol=0.07)
+    np.testing.assert_allclose(found[2:, 2:], tt, atol=0.05 * np.abs(tt).max())
+    # The estimate is orthogonal to its error: E x̂ e' = 0, so E x e' = E e e'.
+    np.testing.assert_allclose(found[:2, 2:], tt, atol=0.07 * np.abs(tt).max())
+    # Offsets: the mean of the error is 0, for the filter knows c.
+    np.testing.assert_allclose(errors.mean((0, 1)), 0, atol=4e-4)
+    np.testing.assert_allclose(gaussian.inputs, filtered @ K.T, atol=1e-12)
+
+
+def test_noise_has_its_covariances_and_seeds(gaussian):
+    """What drives the plant is white with covariance W; loops keep theirs whatever the chunks."""
+    x, u = gaussian.states, gaussian.inputs
+    w = x[:, 1:] - x[:, :-1] @ SYSTEM.A.T - u @ SYSTEM.B.T - SYSTEM.c
+    flat = w.reshape(-1, 2)
+    np.testing.assert_allclose(np.cov(flat.T), W, atol=0.02 * W.max())
+    np.testing.assert_allclose(
+        np.einsum("bti,btj->ij", w[:, 1:], w[:, :-1]) / len(flat), 0, atol=2e-5
+    )
+    few = dict(noise=NOISE, observer=FILTER)
+    part = jm.simulate_many(LAW, SYSTEM, np.zeros((5, 2)), STEPS, chunk=2, **few)
+    np.testing.assert_allclose(part.states, x[:5], atol=1e-12)
+    key = jax.random.fold_in(jax.random.key(3), 4)
+    alone = jm.simulate(
+        LAW, SYSTEM, np.zeros(2), STEPS, observer=FILTER, noise=Noise(W, V, key)
+    )  # fmt: skip
+    np.testing.assert_allclose(alone.states, x[4], atol=1e-12)
+    other = jm.simulate_many(
+        LAW, SYSTEM, np.zeros((5, 2)), STEPS, chunk=2, observer=FILTER, noise=Noise(W, V, 4)
+    )
+    assert np.abs(other.states[:, 1:] - part.states[:, 1:]).max() > 0.01
+
+
+def test_estimates_converge_without_noise():
+    """From a wrong first estimate as A(I − LC) says; then nothing is left."""
+    off = np.array([0.4, -0.7])
+    observer = KalmanFilter(SYSTEM, W, V, start=off)
+    run = jm.simulate(LAW, SYSTEM, np.array([1.0, 0.0]), STEPS, observer=observer)
+    L, C = observer.prepared().gain, np.array([[1.0, 0.0]])
+    error = np.array([1.0, 0.0]) - off
+    for t in range(STEPS):
+        error = error - L @ (C @ error)
+        np.testing.assert_allclose(run.states[t] - run.estimates[t], error, atol=1e-10)
+        error = SYSTEM.A @ error
+    assert np.abs(error).max() < 1e-4
+    # Separation: a known start is estimated exactly, and the loop is that of the full state.
+    known = jm.simulate(LAW, SYSTEM, np.array([1.0, 0.0]), STEPS, observer=FILTER)
+    plain = jm.simulate(LAW, SYSTEM, np.array([1.0, 0.0]), STEPS)
+    np.testing.assert_allclose(known.states, plain.states, atol=1e-12)
+    assert plain.estimates is None and known.estimates.shape == (STEPS, 2)
+
+
+def test_time_varying_filter_is_the_textbook_recursion():
+    """Covariances and estimates of the extended filter, on a linear plant, by NumPy."""
+    P = np.diag([0.2, 0.5])
+    observer = KalmanFilter(PLANT, W, V, initial=np.sqrt(np.diag(P)), start=[0.1, 0.0])
+    feedback = LinearFeedback(MPC, K, PLANT)
+    run = jm.simulate(feedback, PLANT, np.array([0.5, 0.0]), 30, noise=NOISE, observer=observer)
+    xi, C, y = np.array([0.1, 0.0]), np.array([[1.0, 0.0]]), None
+    v = np.asarray(NOISE.prepared(2, 1).draw(30, 2, 1, jnp.float64)[1])
+    for t in range(30):
+        y = C @ run.states[t] + v[t]
+        L = P @ C.T / (C @ P @ C.T + V)
+        xi, P = xi + L @ (y - C @ xi), P - L @ C @ P
+        np.testing.assert_allclose(run.estimates[t], xi, atol=1e-10)
+        xi = SYSTEM.A @ xi + SYSTEM.B @ run.inputs[t] + SYSTEM.c
+        P = SYSTEM.A @ P @ SYSTEM.A.T + W
+
+
+@pytest.mark.parametrize("compensate", [True, False])
+def test_delay_is_the_augmented_state(compensate):
+    """z = (x, u of the sample before): z⁺ known in closed form with prediction and without."""
+    x0, u0 = np.array([0.4, -0.1]), np.array([0.3])
+    run = jm.simulate(
+        LAW, SYSTEM, x0, 40, delay=1, compensate=compensate, previous_input=u0
+    )  # fmt: skip
+    A, B, c = SYSTEM.A, SYSTEM.B, SYSTEM.c
+    x, u = x0, u0
+    for t in range(40):
+        np.testing.assert_allclose(run.states[t], x, atol=1e-12)
+        np.testing.assert_allclose(run.inputs[t], u, atol=1e-12)
+        after = A @ x + B @ u + c
+        x, u = after, K @ (after if compensate else x)
+    loop = np.block([[A, B], [K @ A, K @ B]] if compensate else [[A, B], [K, np.zeros((1, 1))]])
+    assert np.abs(np.linalg.eigvals(loop)).max() < 1
+    if compensate:  # of the loop without delay, and a pole at 0
+        poles = np.sort_complex(np.append(np.linalg.eigvals(A + B @ K), 0))
+        np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(loop)), poles, atol=1e-9)
+
+
+def test_delayed_mpc_with_filter_and_moving_references():
+    """Under perfect prediction the delayed loop is the one without delay, a sample later, also for
+    references over time and through an observer."""
+    controller = jm.Controller(MPC, jm.ADMM(iterations=200, refine=0))
+    x0, u0 = np.array([0.4, -0.1]), np.array([0.3])
+    r = np.stack([np.sin(np.arange(20 + 3) / 5), np.zeros(23)], axis=1)
+    s = 0.1 * np.cos(np.arange(20 + 2))[:, None]
+    late = jm.simulate(
+        controller, SYSTEM, x0, 20, reference=r, input_reference=s, delay=1, previous_input=u0,
+        observer=FILTER,
+    )  # fmt: skip
+    r, s = (np.concatenate([v[1:], v[-1:]]) for v in (r, s))
+    want = jm.simulate(
+        controller, SYSTEM, late.states[1], 20, reference=r, input_reference=s, observer=FILTER
+    )
+    np.testing.assert_allclose(late.states[1:], want.states[:-1], atol=1e-8)
+    np.testing.assert_allclose(late.inputs[1:], want.inputs[:-1], atol=1e-7)
+    np.testing.assert_allclose(late.stage_cost[1:], want.stage_cost[:-1], atol=1e-7)
+    np.testing.assert_allclose(late.cost, want.cost, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_a_robots_own_model_predicts_its_delay():
+    """Inside its limits the predictor is the plant: the delayed loop of a robot far from where its
+    law was made is the one without delay, a sample later. Without prediction it is another."""
+    robot = jm.load_robot("pendulum")
+    mpc = jm.MPC(SYSTEM, Q, R, 2, inputs=robot.input_limits)
+    law = LinearFeedback(mpc, [[-40.0, -10.0]], robot)
+    late = jm.simulate(law, robot, np.array([0.6, -2.0]), 8, delay=1, previous_input=np.ones(1))
+    want = jm.simulate(law, robot, late.states[1], 8)
+    np.testing.assert_allclose(late.states[1:], want.states[:-1], atol=1e-9)
+    naive = jm.simulate(
+        law, robot, np.array([0.6, -2.0]), 8, delay=1, previous_input=np.ones(1), compensate=False
+    )
+    assert np.abs(naive.states - late.states).max() > 1e-3
+
+
+def test_references_of_each_loop():
+    """What each gives alone, in both shapes; also where B = T + N, so that shapes coincide."""
+    steps = 4
+    B = steps + MPC.horizon
+    rng = np.random.default_rng(0)
+    x0s, still = rng.normal(size=(B, 2)), rng.normal(size=(B, 2))
+    moving, inputs = rng.normal(size=(B, steps + 3, 2)), rng.normal(size=(B, steps + 2, 1))
+    many = lambda **given: jm.simulate_many(LAW, SYSTEM, x0s, steps, chunk=3, **given)
+    each, shared, over_time = (
+        many(references=still), many(reference=still),
+        many(references=moving, input_references=inputs),
+    )  # fmt: skip
+    for i in range(B):
+        for run, given in (
+            (each, dict(reference=still[i])), (shared, dict(reference=still)),
+            (over_time, dict(reference=moving[i], input_reference=inputs[i])),
+        ):  # fmt: skip
+            want = jm.simulate(LAW, SYSTEM, x0s[i], steps, **given)
+            np.testing.assert_allclose(run.states[i], want.states, atol=1e-12)
+
+
+def test_derivatives_through_noise_filter_and_delay():
+    """Of the cost in the gain of the law and the standard deviations: finite differences."""
+    keys = jax.random.split(jax.random.key(0), 3)
+
+    def cost(theta):
+        law = LinearFeedback(MPC, theta[:2][None])
+
+        def one(key):
+            noise = Noise(theta[2], theta[3], key)
+            observer = KalmanFilter(SYSTEM, theta[2], theta[3])
+            return jm.simulate(
+                law, SYSTEM, jnp.array([0.5, 0.0]), 15, noise=noise, observer=observer, delay=1
+            ).stage_cost.sum()
+
+        return jax.vmap(one)(keys).sum()
+
+    theta = jnp.array([*K[0], 0.02, 0.05])
+    slope = jax.jit(jax.grad(cost))(theta)
+    value = jax.jit(cost)
+    step = 1e-6 * np.eye(4)
+    want = [(value(theta + h) - value(theta - h)) / 2e-6 for h in step]
+    np.testing.assert_allclose(slope, want, rtol=1e-5)
+
+
+def test_not_finite_stays_in_its_row(gaussian):
+    """Also in the derivative with respect to the starts."""
+    x0s = np.zeros((3, 2))
+    x0s[1] = np.nan
+    run = jm.simulate_many(LAW, SYSTEM, x0s, STEPS, noise=NOISE, observer=FILTER)
+    assert np.isnan(run.states[1]).all() and np.isnan(run.estimates[1]).all()
+    np.testing.assert_allclose(run.states[[0, 2]], gaussian.states[[0, 2]], atol=1e-12)
+
+    @jax.jit
+    @jax.grad
+    def slope(x0s):
+        one = lambda x: jm.simulate(LAW, SYSTEM, x, 5, noise=NOISE, observer=FILTER).stage_cost
+        return jax.vmap(one)(x0s)[jnp.array([0, 2])].sum()
+
+    found, clean = slope(jnp.asarray(x0s)), slope(jnp.zeros((3, 2)))
+    np.testing.assert_allclose(found[jnp.array([0, 2])], clean[jnp.array([0, 2])])
+
+
+@pytest.mark.slow
+def test_orientations_stay_rotations():
+    """Noise on a quadrotor lives in the coordinates: quaternions of length 1, the noise in ξ."""
+    robot = jm.load_robot("quadrotor")
+    x, u = robot.equilibrium()
+    mpc = jm.robot_mpc(robot, horizon=5)
+    law = LinearFeedback(mpc, np.asarray(jm.lqr(mpc.system, mpc.Q, mpc.R).K), robot)
+    goal = dict(reference=np.asarray(robot.coordinates(x)), input_reference=u)
+    sizes = np.repeat([1e-4, 1e-4, 1e-3, 5e-3], 3)
+    noise = Noise(sizes, np.repeat([1e-4, 2e-4], 3), seed=1)
+    start = np.asarray(robot.coordinates(x)) + 0.2
+    observer = KalmanFilter(robot, sizes, np.repeat([1e-4, 2e-4], 3), initial=0.2, start=start)
+    run = jm.simulate(law, robot, x, 10, noise=noise, observer=observer, **goal)
+    for states in (run.states, run.estimates):
+        np.testing.assert_allclose(np.linalg.norm(states[:, 3:7], axis=1), 1, atol=1e-12)
+    w, _ = noise.prepared(12, 6).draw(10, 12, 6, jnp.float64)
+    xi = jax.jit(jax.vmap(robot.coordinates))
+    before = zip(np.asarray(run.states[:-1]), np.asarray(run.inputs), strict=True)
+    after = xi(np.array([c_steps(robot.mujoco, x, u, robot.substeps) for x, u in before]))
+    np.testing.assert_allclose(xi(run.states[1:]) - after, w, atol=1e-10)
+    # First estimates 0.2 off, of which nothing was measured but positions.
+    off = np.abs(xi(run.states[:-1]) - xi(run.estimates))
+    assert off[0, 6:].min() > 0.1 and off[-1].max() < 0.05
+
+
+def test_bad_noise_and_observers_are_named():
+    odd = jm.LinearSystem(np.eye(3) / 2, np.ones((3, 1)))
+    unstable = jm.LinearSystem(np.diag([1.2, 1.1]), np.ones((2, 1)))
+    run = lambda **given: jm.simulate(LAW, SYSTEM, np.zeros(2), 4, **given)
+    many = lambda **given: jm.simulate_many(LAW, SYSTEM, np.zeros((5, 2)), 4, **given)
+    robot = jm.load_robot("pendulum")
+    for call, message in (
+        (lambda: run(noise=Noise([1.0, 1.0, 1.0])), r"noise.process: shape \(3,\). Give standard"),
+        (lambda: run(noise=Noise(measurement=-1.0)), "noise.measurement: has a negative"),
+        (lambda: run(noise=Noise(np.array([[1.0, 2.0], [2.0, 1.0]]))), "noise.process: is not pos"),
+        (lambda: run(noise=Noise(np.nan)), "noise.process: holds NaN"),
+        (lambda: run(noise=Noise(1.0, seed=0.5)), "noise.seed: 0.5. Give a whole number"),
+        (lambda: run(noise=Noise(1.0, [1.0, 1.0]), observer=FILTER), "noise.measurement: shape"),
+        (lambda: run(noise=0.1), "noise: is a float. Give a closed_loop.Noise"),
+        (lambda: run(observer=SYSTEM), "observer: is a LinearSystem. Give a closed_loop.Kal"),
+        (lambda: run(observer=KalmanFilter(odd, 1.0, 1.0)), "observer.C: is None with 3 states"),
+        (
+            lambda: run(observer=KalmanFilter(odd, 1.0, 1.0, C=np.eye(3))),
+            "observer.model: has 3 states, the controller's model 2",
+        ),
+        (lambda: run(observer=KalmanFilter(SYSTEM, 1.0, 0.0)), "observer.measurement: has a comb"),
+        (lambda: run(observer=KalmanFilter(SYSTEM, None, 1.0)), "observer.process: is None"),
+        (lambda: run(observer=KalmanFilter(SYSTEM, 1.0, 1.0, C=np.eye(3))), "observer.C: shape"),
+        (lambda: run(observer=KalmanFilter(SYSTEM, 1.0, 1.0, start=[0.0])), "observer.start: sha"),
+        (
+            lambda: run(observer=KalmanFilter(SYSTEM, 1.0, 1.0, C=[[0.0, 1.0]])),
+            "observer.C: no output shows the mode with eigenvalue 1",
+        ),
+        (
+            lambda: run(observer=KalmanFilter(unstable, [1.0, 0.0], 1.0, C=np.eye(2))),
+            "observer.process: no noise moves the mode with eigenvalue 1.1. Give it some, or init",
+        ),
+        (
+            lambda: run(observer=KalmanFilter(robot, 1.0, 1.0)),
+            "observer.initial: is None for a Robot",
+        ),
+        (lambda: run(delay=2), "delay: 2. Give 0 or 1"),
+        (lambda: run(delay=0.5), "delay: 0.5. Give a whole"),
+        (
+            lambda: many(references=np.zeros((4, 2))),
+            r"references: shape \(4, 2\). Give \(5, 2\) or \(5, 7, 2\), one for each loop; ref",
+        ),
+        (lambda: many(input_references=np.zeros((5, 7, 1))), r"input_references: shape \(5, 7, 1"),
+        (
+            lambda: many(references=np.zeros((5, 2)), reference=np.zeros(2)),
+            "references: given beside reference. Give one for all loops, or one for each",
+        ),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            call()
