@@ -448,8 +448,9 @@ def side_by_side(function: Callable) -> Callable:
 
     @custom_vmap
     def many(*args: Any) -> Any:  # the batch first, of size 1 where it is shared
-        out = function(*jax.tree.map(lambda v: jnp.moveaxis(v, 0, -1), args))
         count = max(len(v) for v in jax.tree.leaves(args))
+        whole = lambda v: jnp.broadcast_to(v, (count, *v.shape[1:]))
+        out = function(*jax.tree.map(lambda v: jnp.moveaxis(whole(v), 0, -1), args))
         first = lambda v: jnp.moveaxis(jnp.broadcast_to(v, (*v.shape[:-1], count)), -1, 0)
         return jax.tree.map(first, out)
 
