@@ -5,19 +5,23 @@ import copy
 import io
 import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jax.extend.core.primitives import sqrt_p
 
 from jaxmpc.checks import fail
 from jaxmpc.qp.linalg import JAXLIB, solve, stand_ins
+from jaxmpc.qp.precision import matmul
 from jaxmpc.robots.rewrite import moving, rewritten
-from jaxmpc.robots.tangent import normalised, retract
+from jaxmpc.robots.rigid import FIELDS, Tree, dynamics, inverse_dynamics, side_by_side, slopes
+from jaxmpc.robots.tangent import normalised, rates, retract
 
 if TYPE_CHECKING:
     import mujoco
@@ -26,8 +30,9 @@ if TYPE_CHECKING:
 # mjtIntegrator.
 EULER, RK4 = 0, 1
 
-# mjtDisableBit.
-NO_CONSTRAINTS = 1
+# mjtDisableBit, mjtEq, the last mjtTrn of a joint.
+NO_GRAVITY, NO_EULER_DAMPING = 128, 32768
+EQUALITY_OF_JOINTS, TRANSMISSION_BY_JOINT = 2, 1
 
 # How many operations XLA of old jaxlibs may fuse on a CPU.
 PIECE = 15
@@ -38,19 +43,32 @@ class Physics:
 
     model: the mujoco.MjModel. mjx: mjx.Model with NumPy arrays, in float64 in either mode of JAX.
     Raises ValueError for models that MJX does not support.
+
+    Inertia, velocities and their forces are those of `rigid.py`; MJX gives the forces of springs,
+    tendons and actuators, the rows of constraints and their solver.
     """
 
     def __init__(self, model: "mujoco.MjModel") -> None:
         self.model = model
         self.joints = tuple(int(joint) for joint in model.jnt_type)
+        self.tree = Tree.of(model)
         try:
             with warnings.catch_warnings(), jax.enable_x64(True):
                 warnings.simplefilter("ignore")
                 mjx = mjx_module()
                 self.mjx: Any = jax.tree.map(np.asarray, mjx.put_model(model))
-                mjx.make_data(model)
+                blank = mjx.make_data(model)
         except NotImplementedError as error:
             fail("model", f"MJX does not support it: {error}", "Take that out of the file")
+        self.rows = blank._impl.efc_J.size > 0
+        placed = blank._impl.contact.dim.size or np.any(model.eq_type != EQUALITY_OF_JOINTS)
+        light = getattr(model, "flg_gravcomp", False) or np.any(model.body_gravcomp)
+        in_fluid = model.opt.density or model.opt.viscosity or np.any(model.opt.wind)
+        # Whether a force depends on where the bodies are, other than through the joints.
+        self.posed = bool(
+            model.ntendon or light or in_fluid or (self.rows and placed)
+            or np.any(model.actuator_trntype > TRANSMISSION_BY_JOINT)
+        )  # fmt: skip
 
     def step(self, x: Array, u: Array, numbers: Mapping[str, Any] | None = None) -> Array:
         """Return x = (qpos, qvel, act) one physics step later: a function of x, u and nothing
@@ -60,30 +78,184 @@ class Physics:
         with constraints by `with_forward_jacobian`.
         """
         numbers = jax.tree.map(jnp.asarray, dict(numbers or {}))
-        if self.model.opt.disableflags & NO_CONSTRAINTS:
+        if not self.rows:
             return in_pieces(rewritten(self._step, stand_ins()))(x, u, numbers)
         step = in_pieces(rewritten(self._step, {**stand_ins(), sqrt_p: root}))
         return with_forward_jacobian(step)(x, u, numbers)
 
     def _step(self, x: Array, u: Array, numbers: dict[str, Array]) -> Array:
+        x_q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
+        q, h = normalised(self.joints, x_q), jnp.asarray(self.mjx.opt.timestep, x.dtype)
+        if self.model.opt.integrator == RK4:
+            forward = lambda q, v: self._accelerations(numbers, q, v, act, u)
+            return self._runge_kutta(forward, q, v, h)
+        if self.model.na:
+            act_next = _next_activations(*self._forced(numbers, q, v, act, u))
+        else:
+            act_next = act
+        v = v + h * self._accelerations(numbers, q, v, act, u, damped=True)
+        # MJX's own integration of positions has the derivative 0 for a body that does not turn.
+        return jnp.concatenate([retract(self.joints, q, h * v), v, act_next])
+
+    def _accelerations(
+        self, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array,
+        damped: bool = False,
+    ) -> Array:  # fmt: skip
+        """Return the accelerations (nv,); damped: with the integrator's implicit part.
+
+        Differentiated as the solution of the balance of forces (implicit function theorem), not by
+        the iterations of MJX's solver, which err in their derivatives as much as in the
+        accelerations, and have none where elliptic contacts do not touch.
+        """
+        solved = jax.custom_jvp(partial(self._solved, damped))
+
+        def rule(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+            found = solved(*primals)
+            of, at, directions = moving(partial(self._missing, damped, found), primals, tangents)
+            _, missing, (first, second, C) = jax.jvp(of, at, directions, has_aux=True)
+            M = self._dynamics(*primals[:3])[0]
+            moved = da = jnp.zeros_like(found[0])
+            if self.rows:
+                K = M + first - C
+                moved = da = -solve((K + K.T) / 2, missing[0])
+            if damped or not self.rows:
+                da = -solve(M + second, missing[1] - matmul(C, moved))
+            return found, (da, moved)
+
+        solved.defjvp(rule, symbolic_zeros=True)
+        return solved(numbers, q, v, act, u)[0]
+
+    def _solved(
+        self, damped: bool, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array
+    ) -> tuple[Array, Array]:
+        """Return the accelerations (nv,) with and without the integrator's implicit part."""
+        model, data = self._forced(numbers, q, v, act, u)
+        M, bias, _ = self._dynamics(numbers, q, v)
+        force = data.qfrc_smooth - bias
+        pushed = first = jnp.zeros_like(v)
+        if self.rows:
+            first = self._constrained(model, data, M + self._added(model, data, False), force)
+            if not damped:
+                return first, first
+            pushed = _constraint_forces(model, data, first)
+        return solve(M + self._added(model, data, damped), force + pushed), first
+
+    def _missing(
+        self, damped: bool, found: tuple[Array, Array], numbers: dict[str, Array], q: Array,
+        v: Array, act: Array, u: Array,
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:  # fmt: skip
+        """Return the generalised forces that the accelerations `found` without and with the
+        implicit part lack, then what is added to M for each, and the derivative of the constraint
+        forces in the accelerations."""
+        model, data = self._forced(numbers, q, v, act, u)
+        a, first = found
+        forces, still = data.qfrc_smooth, jnp.zeros_like(a)
+        added = self._added(model, data, False), self._added(model, data, damped)
+        lack = lambda a, added: self._inverse_dynamics(numbers, q, v, a) + matmul(added, a) - forces
+        if not self.rows:
+            return (still, lack(a, added[1])), (*added, jnp.zeros_like(added[0]))
+        pushed = partial(_constraint_forces, model, data)
+        forces = forces + pushed(first)
+        second = lack(a, added[1]) if damped else still
+        return (lack(first, added[0]), second), (*added, jax.jacfwd(pushed)(first))
+
+    def _constrained(self, model: Any, data: Any, M: Array, force: Array) -> Array:
+        """Return the accelerations by MJX's constraint solver."""
+        mjx = mjx_module()
+        data = data.replace(qfrc_smooth=force, qacc_smooth=solve(M, force))
+        if mjx.is_sparse(model):
+            M = M[np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind]
+        data = mjx.factor_m(model, data.tree_replace({"_impl.M": M}))
+        return mjx.solve(model, data).qacc
+
+    def _added(self, model: Any, data: Any, damped: bool) -> Array:
+        """Return what tendons with inertia add to M (nv, nv), and damped: what the integrator does,
+        as in mjx.euler and mjx.implicit."""
+        J, h = data._impl.ten_J, model.opt.timestep
+        added = matmul(J.T * model.tendon_armature, J)
+        if damped and self.model.opt.integrator == EULER:
+            if not self.model.opt.disableflags & NO_EULER_DAMPING:
+                added = added + jnp.diag(h * model.dof_damping)
+        elif damped:
+            slope = mjx_module().deriv_smooth_vel(model, data)
+            added = added if slope is None else added - h * slope
+        return added
+
+    def _forced(
+        self, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array
+    ) -> tuple[Any, Any]:
+        """Return mjx.Model and mjx.Data with the forces of springs, dampers and actuators in
+        qfrc_smooth, and with the rows of constraints."""
         mjx = mjx_module()
         cast = lambda tree: jax.tree.map(
-            lambda v: jnp.asarray(v, x.dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v, tree
+            lambda v: jnp.asarray(v, q.dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v, tree
         )
         # A copy for each program. JAX caches by identity how it converted NumPy arrays, also for
         # programs of the other precision, and MJX passes it arrays of the model.
         model = cast(copy.deepcopy(self.mjx).replace(**numbers))
-        blank, h = cast(mjx.make_data(self.model)), model.opt.timestep
-        x_q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
-        q = normalised(self.joints, x_q)
-        forward = lambda q, v: accelerated(model, blank.replace(qpos=q, qvel=v, act=act, ctrl=u))
-        if self.model.opt.integrator == RK4:
-            return self._runge_kutta(forward, q, v, h)
-        integrate = mjx.euler if self.model.opt.integrator == EULER else mjx.implicit
-        after = integrate(model, forward(x_q, v))
-        v = after.qvel
-        # MJX's own integration of positions has the derivative 0 for a body that does not turn.
-        return jnp.concatenate([retract(self.joints, q, h * v), v, after.act])
+        data = cast(mjx.make_data(self.model)).replace(qpos=q, qvel=v, act=act, ctrl=u)
+        if self.posed:
+            data = data.replace(**self._dynamics(numbers, q, v)[2])
+            data = mjx.tendon(model, data)
+            data = mjx.collision(model, data) if self.rows else data
+        data = mjx.transmission(model, mjx.make_constraint(model, data))
+        data = data.tree_replace({
+            "_impl.actuator_velocity": matmul(data._impl.actuator_moment, v),
+            "_impl.ten_velocity": matmul(data._impl.ten_J, v),
+        })  # fmt: skip
+        data = mjx.fwd_actuation(model, mjx.passive(model, data))
+        force = data.qfrc_passive + data.qfrc_actuator
+        if self.model.ntendon:
+            force = force - mjx.tendon_bias(model, data).qfrc_bias
+        data = data.replace(qfrc_smooth=force)
+        # Rows of contacts that do not touch exert no force; the derivative of their distance does
+        # not always exist.
+        rows = data._impl
+        if self.rows:
+            idle = jnp.all(rows.efc_J == 0, axis=1) & (rows.efc_aref == 0)
+            still = lambda v: jnp.where(idle, jax.lax.stop_gradient(v.T), v.T).T
+            names = ("efc_J", "efc_D", "efc_aref")
+            data = data.tree_replace({f"_impl.{n}": still(getattr(rows, n)) for n in names})
+        return model, data
+
+    def _rigid(self, function: Callable, numbers: dict[str, Array], q: Array, *rest: Array) -> Any:
+        """Return what a function of `rigid.py` does."""
+        fixed = {key: np.array(getattr(self.mjx, key), q.dtype)[..., None] for key in FIELDS}
+        off = bool(self.model.opt.disableflags & NO_GRAVITY)
+        fixed["gravity"] = (0.0 if off else 1.0) * np.array(self.mjx.opt.gravity, q.dtype)[:, None]
+        unit = lambda v: v / jnp.linalg.norm(v, axis=-1, keepdims=True)
+        own = {
+            key: unit(value) if key.endswith("quat") else value
+            for key, value in numbers.items()
+            if key in FIELDS
+        }
+        call = lambda own, *rest: function(self.tree, {**fixed, **own}, *rest)
+        return side_by_side(call)(jax.tree.map(lambda v: jnp.asarray(v, q.dtype), own), q, *rest)
+
+    def _dynamics(self, numbers: dict[str, Array], q: Array, v: Array) -> tuple[Array, Array, dict]:
+        """Return M (nv, nv), bias (nv,) and fields of mjx.Data."""
+        return self._rigid(dynamics, numbers, q, v)
+
+    def _inverse_dynamics(self, numbers: dict[str, Array], q: Array, v: Array, a: Array) -> Array:
+        """Return M a + bias (nv,), with derivatives in closed form."""
+        inverse = jax.custom_jvp(partial(self._rigid, inverse_dynamics))
+
+        def rule(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+            numbers, q, v, a = primals
+            moved, dq, dv, da = tangents
+            still = lambda t: isinstance(t, SymbolicZero)
+            found = jnp.zeros_like(a)
+            if not all(map(still, jax.tree.leaves(moved, is_leaf=still))):
+                inner = lambda numbers: self._rigid(inverse_dynamics, numbers, q, v, a)
+                of, at, directions = moving(inner, (numbers,), (moved,))
+                found = found + jax.jvp(of, at, directions)[1]
+            dq = dq if still(dq) else rates(self.joints, q, dq)
+            for K, d in zip(self._rigid(slopes, numbers, q, v, a), (dq, dv, da), strict=True):
+                found = found if still(d) else found + matmul(K, d)
+            return inverse(*primals), found
+
+        inverse.defjvp(rule, symbolic_zeros=True)
+        return inverse(numbers, q, v, a)
 
     def _runge_kutta(self, forward: Callable, q: Array, v: Array, h: Array) -> Array:
         """Return (qpos, qvel) after a step of length h by the classical method of fourth order.
@@ -97,7 +269,7 @@ class Physics:
             rate, acceleration, rates, accelerations = carry
             a, b = weights
             moved, rate = move(a * rate), v + a * h * acceleration
-            acceleration = forward(moved, rate).qacc
+            acceleration = forward(moved, rate)
             return (rate, acceleration, rates + b * rate, accelerations + b * acceleration), None
 
         table = jnp.array([[0, 1 / 6], [1 / 2, 1 / 3], [1 / 2, 1 / 3], [1, 1 / 6]], v.dtype)
@@ -105,51 +277,11 @@ class Physics:
         return jnp.concatenate([move(end[2]), v + h * end[3]])
 
 
-def accelerated(model: Any, data: Any) -> Any:
-    """Return mjx.Data with the accelerations and constraint forces at its state, as mjx.forward
-    does."""
-    mjx = mjx_module()
-    for part in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
-        data = part(model, data)
-    rows = data._impl
-    if rows.efc_J.size == 0:
-        return data.replace(qacc=data.qacc_smooth)
-    # Rows of contacts that do not touch exert no force; the derivative of their distance does not
-    # always exist.
-    idle = jnp.all(rows.efc_J == 0, axis=1) & (rows.efc_aref == 0)
-    still = lambda v: jnp.where(idle, jax.lax.stop_gradient(v.T), v.T).T
-    data = data.tree_replace(
-        {f"_impl.{key}": still(getattr(rows, key)) for key in ("efc_J", "efc_D", "efc_aref")}
-    )
-    a = constrained(model, data)
-    return data.replace(qacc=a, qfrc_constraint=_constraint_forces(model, data, a))
+def _next_activations(model: Any, data: Any) -> Array:
+    """Return the activations (na,) one physics step later, as mjx.euler does."""
+    from mujoco.mjx._src.forward import _next_activation
 
-
-@jax.custom_jvp
-def constrained(model: Any, data: Any) -> Array:
-    """Return the accelerations (nv,) by MJX's constraint solver.
-
-    The derivatives are those of the balance of forces (implicit function theorem), not of the
-    solver's iterations: these have none where elliptic contacts do not touch, and err as much as
-    the iterates do.
-    """
-    return mjx_module().solve(model, data).qacc
-
-
-def _balance(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    """Return the accelerations and their derivative by the implicit function theorem."""
-    a = constrained(*primals)
-
-    def missing(a: Array, model: Any, data: Any) -> Array:
-        carried = mjx_module().mul_m(model, data, a) - data.qfrc_smooth
-        return carried - _constraint_forces(model, data, a)
-
-    of, at, directions = moving(lambda *rest: missing(a, *rest), primals, tangents)
-    matrix = jax.jacfwd(missing)(a, *primals)
-    return a, -solve((matrix + matrix.T) / 2, jax.jvp(of, at, directions)[1])
-
-
-constrained.defjvp(_balance, symbolic_zeros=True)
+    return _next_activation(model, data, data.act_dot)
 
 
 def _constraint_forces(model: Any, data: Any, a: Array) -> Array:

@@ -54,6 +54,23 @@ def difference(joints: tuple[int, ...], start: Array, end: Array) -> Array:
     return jnp.concatenate(parts)
 
 
+def rates(joints: tuple[int, ...], q: Array, dq: Array) -> Array:
+    """Return the motion (nv,) in the tangent space at q (nq,), with quaternions of length 1, that
+    changes the numbers of q by dq (nq,). Linear in dq."""
+    if not quaternions(joints):
+        return dq
+    parts, i = [], 0
+    for joint in joints:
+        size = 1 if joint not in (FREE, BALL) else 3 if joint == FREE else 0
+        parts.append(dq[i : i + size])
+        i += size
+        if joint in (FREE, BALL):
+            inverse = q[i : i + 4] * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype)
+            parts.append(2 * _product(inverse, dq[i : i + 4])[1:])
+            i += 4
+    return jnp.concatenate(parts)
+
+
 def quaternions(joints: tuple[int, ...]) -> bool:
     """Return whether an orientation is among the joints, so that nq and nv differ."""
     return any(joint in (FREE, BALL) for joint in joints)
