@@ -185,7 +185,12 @@ def test_poses_inertia_and_forces_are_the_c_engines(name):
         np.testing.assert_allclose(needed[:, i], full @ a[:, i] + data.qfrc_bias, atol=1e-9)
 
 
-@pytest.mark.parametrize("case", CASES)
+QUICK = ("plain", "implicit", "tendons", "weightless", "in a fluid", "contact")
+
+
+@pytest.mark.parametrize(
+    "case", [c if c in QUICK else pytest.param(c, marks=pytest.mark.slow) for c in CASES]
+)
 def test_a_step_is_the_c_engines(case):
     model, rng = model_of(case), np.random.default_rng(1)
     x, u = state_of(model, rng, CASES[case].get("low", False), CASES[case].get("still", False))
