@@ -10,7 +10,8 @@ the centre of mass of the kinematic tree at the time, as in MuJoCo. S_i is the m
 velocity and acceleration (gravity as an acceleration of the world upward), I the inertia, all
 (items, components, lanes): the last axis holds the robots of a batch, side by side.
 
-Derivatives (Singh, Russo, Wensing 2022, IEEE RA-L 7(2), derived here for these coordinates): a
+Derivatives (after Singh, Russell, Wensing 2022, "Efficient analytical derivatives of rigid-body
+dynamics using spatial vector algebra", arXiv 2105.05102; derived here for these coordinates): a
 motion of dof j moves what is after it, v → v + S_j×v + ψ_j and a → a + S_j×a + χ_j + ψ_j×v with
 
     ψ_j = v_B × S_j,   χ_j = a_B × S_j + v_B × ψ_j,   B: before the joint of j,
