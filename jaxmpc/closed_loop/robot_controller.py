@@ -23,8 +23,6 @@ from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
 
 LINEARIZATIONS = ("set-point", "state", "trajectory")
-# Newton steps from the last plan, and the interior point method, need no ADMM steps before them.
-SOLVER = ADMM(iterations=0)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -33,8 +31,9 @@ class RobotController:
 
     robot: Robot (its predictor is the model) or LinearPlant.
     mpc: the problem, from `robot_mpc`; its `system` is used by linearize="set-point" only.
-    solver: None for Newton steps from the last plan and, where they do not end at the solution, an
-      interior point method, without ADMM steps before them; with "set-point" the one of `solve`.
+    solver: with iterations=None, as by default, there are no ADMM steps but Newton steps from the
+      last plan and, where they do not end at the solution, an interior point method
+      (`solve_stagewise`); with "set-point" the steps are those of `solve`.
     linearize: where the linear models are taken,
       "set-point"   once, as mpc.system says; matrices are factored once for all robots;
       "state"       about the measured state and the last input, at each sample;
@@ -68,8 +67,9 @@ class RobotController:
         self, robot: Any, mpc: MPC, solver: ADMM | None = None, linearize: str = "state",
         exact: bool = False, penalty: Any = 1e4,
     ) -> None:  # fmt: skip
-        if solver is None:
-            solver = DEFAULT if linearize == "set-point" else SOLVER
+        solver = DEFAULT if solver is None else solver
+        if solver.iterations is None and linearize != "set-point":
+            solver = replace(solver, iterations=0)
         parts = prepared(robot, mpc, solver, linearize, penalty)
         self.__dict__.update(
             robot=robot, mpc=mpc, solver=arrays(solver), linearize=linearize, exact=exact,

@@ -335,10 +335,6 @@ def test_bad_problems_and_controllers_are_named(pendulum, linear_mpc):
         (lambda: make(PLANT, Q, R, target=[1.6, 0.0]), "target: "),
         (lambda: make(pendulum, Q, R, target=[1.0]), "q: needs torque"),
         (
-            lambda: make(PLANT, Q, R, target=[1.495, 0.0]),
-            "target: has .* = 1.495, limits with margin are .*less margin",
-        ),
-        (
             lambda: jm.RobotController(pendulum, mpc, solver, linearize="once"),
             "linearize: 'once'. Give one of set-point, state, trajectory",
         ),
@@ -354,6 +350,12 @@ def test_bad_problems_and_controllers_are_named(pendulum, linear_mpc):
     ):
         with pytest.raises(ValueError, match=message):
             call()
+
+
+def test_margin_gives_way_to_the_target():
+    with pytest.warns(UserWarning, match="margin: coordinate 0: the target lies at the limit"):
+        mpc = jm.robot_mpc(PLANT, [50.0, 1.0], [0.1], target=[1.495, 0.0])
+    assert mpc.states.upper[0] == 1.495 and mpc.states.lower[0] > -1.5
 
 
 def test_bad_loops_are_named(pendulum, linear_mpc):

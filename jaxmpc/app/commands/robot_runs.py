@@ -111,9 +111,7 @@ class RobotRuns:
             if command.linearize == "lqr":
                 controller = LinearFeedback(mpc, lqr(mpc.system, mpc.Q, mpc.R).K, robot)
             else:
-                solver = None
-                if (command.iterations, command.refine) != (None, None):
-                    solver = ADMM(iterations=command.iterations or 0, refine=command.refine)
+                solver = ADMM(iterations=command.iterations, refine=command.refine)
                 controller = RobotController(
                     robot, mpc, solver, linearize=str(command.linearize), penalty=command.penalty
                 )

@@ -313,7 +313,7 @@ def robot_task(command: Any) -> TuningTask:
         r = np.asarray(robot.coordinates(x))
     if "tightening" in command.tune:
         parameters["tightening"] = tightening(section.margin, robot.state_limits, r)
-    solver = ADMM(iterations=command.iterations or 0, refine=command.refine)
+    solver = ADMM(iterations=command.iterations, refine=command.refine)
     x0s, variations = draw_robots(
         robot, command.count, command.seed,
         spread=0.5 if command.spread is None else command.spread,
