@@ -421,7 +421,7 @@ LINES = [
     ("simulate --horizon 1000000000000", "--horizon: 1000000000000. Give at most"),
     ("simulate --margin 1", "--margin: 1.0"),
     ("simulate --penalty 0", "--penalty: 0.0"),
-    ("simulate --iterations 0", "--iterations: 0"),
+    ("simulate --iterations -1", "--iterations: -1"),
     ("simulate --iterations 1000000000000", "--iterations: 1000000000000. Give at most"),
     ("simulate --refine -1", "--refine: -1"),
     ("simulate --mass 1", "--mass: 1.0"),
