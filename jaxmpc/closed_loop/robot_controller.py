@@ -8,18 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, whole
 from jaxmpc.control.sets import Box
-from jaxmpc.control.system import LinearSystem
 from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.nonlinear import NonlinearMPC, Task, task_layout
 from jaxmpc.mpc.plan import Plan, WarmStart, limited
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import layout
 from jaxmpc.mpc.soften import soften
+from jaxmpc.mpc.sqp import solve_nonlinear
 from jaxmpc.mpc.stagewise import factor_stages, solve_stagewise
 from jaxmpc.qp.admm import ADMM, DEFAULT
 from jaxmpc.qp.precision import arrays, floating_dtype
 from jaxmpc.robots.linear import LinearPlant
+from jaxmpc.robots.model import RobotModel
 from jaxmpc.robots.robot import Robot
 
 LINEARIZATIONS = ("set-point", "state", "trajectory")
@@ -37,8 +39,14 @@ class RobotController:
     linearize: where the linear models are taken,
       "set-point"   once, as mpc.system says; matrices are factored once for all robots;
       "state"       about the measured state and the last input, at each sample;
-      "trajectory"  about the last plan shifted by one sample, a model for each step.
-    exact: see `Robot.linearize`.
+      "trajectory"  about the last plan shifted by one sample, a model for each step: the real-time
+                    iteration of sequential quadratic programming.
+    exact: see `Robot.linearize`; always with sqp_steps > 1.
+    tasks: `jaxmpc.mpc.Task`s, costs and limits on functions of mjx.Data, such as the position of
+      the gripper; with "trajectory" only. Their targets are the columns of `reference` after the
+      first n, or those of the tasks where the reference has just n.
+    sqp_steps: quadratic programs a sample at most. With "trajectory" more than one solve the
+      nonlinear problem (`solve_nonlinear`), and the status is that of the nonlinear problem.
     penalty: L1 weight (cost per unit) with which state limits and terminal rows are soft. Where it
       exceeds the multipliers of the hard problem, plans keep the limits whenever the model can
       (exact penalty), and elsewhere trade violations against the cost by that weight. Each such
@@ -59,21 +67,24 @@ class RobotController:
     linearize: str
     exact: bool
     penalty: Any
+    tasks: tuple[Task, ...]
+    sqp_steps: int
     soft: Any = field(init=False)
     fixed: Controller | None = field(init=False)
     scale: Any = field(init=False)
 
     def __init__(
         self, robot: Any, mpc: MPC, solver: ADMM | None = None, linearize: str = "state",
-        exact: bool = False, penalty: Any = 1e4,
+        exact: bool = False, penalty: Any = 1e4, tasks: tuple[Task, ...] = (), sqp_steps: int = 1,
     ) -> None:  # fmt: skip
         solver = DEFAULT if solver is None else solver
         if solver.iterations is None and linearize != "set-point":
             solver = replace(solver, iterations=0)
-        parts = prepared(robot, mpc, solver, linearize, penalty)
+        exact = exact or sqp_steps > 1
+        parts = prepared(robot, mpc, solver, linearize, penalty, tasks, sqp_steps)
         self.__dict__.update(
             robot=robot, mpc=mpc, solver=arrays(solver), linearize=linearize, exact=exact,
-            penalty=penalty, **parts,
+            penalty=penalty, tasks=tuple(tasks), sqp_steps=int(sqp_steps), **parts,
         )  # fmt: skip
 
     @property
@@ -122,31 +133,56 @@ class RobotController:
                 self.coordinates(x), carry, reference, input_reference=input_reference,
                 previous_input=previous_input,
             )  # fmt: skip
-        if carry is None:
-            states, inputs = self._resting(x, input_reference)
-            start = None
+        problem = self.problem
+        rows = layout(self.soft) + task_layout(problem)
+        start = None
+        if carry is not None:
+            start = WarmStart.shifted(rows, carry, carry.inputs[-1])
+        given = {"input_reference": input_reference, "scale": self.scale}
+        xi = self.coordinates(x)
+        if self.linearize == "trajectory":
+            if start is None:
+                blank = jnp.zeros(sum(len(steps) * size for _, steps, size in rows), xi.dtype)
+                start = WarmStart(*self._resting(x, input_reference), blank)
+            reference, targets = self._targets(problem, reference)
+            plan = solve_nonlinear(
+                problem, xi, reference, self.solver, start, targets=targets, **given,
+                steps=self.sqp_steps,
+            )  # fmt: skip
         else:
-            start = WarmStart.shifted(layout(self.soft), carry, carry.inputs[-1])
-            states, inputs = start.states, start.inputs
-        system = self._model(x, states, inputs, carry)
-        plan = solve_stagewise(
-            self.soft, system, self.coordinates(x), reference, self.solver, start,
-            input_reference=input_reference, scale=self.scale,
-        )  # fmt: skip
+            u = self._resting(x, input_reference)[1][0] if carry is None else carry.inputs[0]
+            system = self.robot.linearize(x, limited(self.soft.inputs, u), exact=self.exact)
+            plan = solve_stagewise(self.soft, system, xi, reference, self.solver, start, **given)
         return limited(self.soft.inputs, plan.inputs[0]), plan, plan
 
-    def _model(self, x: Array, states: Array, inputs: Array, carry: Plan | None) -> LinearSystem:
-        """Return the linear model about x, or one about each step of a plan."""
-        if self.linearize == "state":
-            u = inputs[0] if carry is None else carry.inputs[0]
-            return self.robot.linearize(x, limited(self.soft.inputs, u), exact=self.exact)
-        states = states.at[0].set(self.coordinates(x))
-        at = lambda xi, u: self.robot.linearize(self.robot.state(xi), u, exact=self.exact)
-        return jax.vmap(at)(states[:-1], inputs)
+    @property
+    def problem(self) -> NonlinearMPC:
+        """Return the nonlinear problem of "trajectory"."""
+        return NonlinearMPC(self.soft, as_model(self.robot, self.exact), self.tasks)
+
+    @property
+    def reference_sizes(self) -> tuple[int, ...]:
+        """Return how many columns `reference` may have: n, or those and the tasks' targets."""
+        n = self.mpc.system.n
+        return (n, n + self.problem.targets) if self.tasks else (n,)
+
+    def _targets(self, problem: NonlinearMPC, reference: Any) -> tuple[Any, Any]:
+        """Return the reference of the coordinates and those of the tasks, None for their own."""
+        n = self.mpc.system.n
+        if reference is None or np.shape(reference)[-1] == n:
+            return reference, None
+        ends = n + np.cumsum(problem.sizes())[:-1]
+        reference, *targets = jnp.split(reference, [n, *ends], axis=-1)
+        return reference, targets
+
+
+def as_model(robot: Any, exact: bool = True) -> Any:
+    """Return a Robot or LinearPlant as the model of a `NonlinearMPC`."""
+    return RobotModel(robot, exact=exact) if isinstance(robot, Robot) else robot
 
 
 def prepared(
-    robot: Any, mpc: MPC, solver: ADMM, linearize: str, penalty: Any
+    robot: Any, mpc: MPC, solver: ADMM, linearize: str, penalty: Any, tasks: Any, sqp_steps: Any
 ) -> dict[str, Any]:  # fmt: skip
     """Check the arguments of a RobotController and compute what all its samples share.
 
@@ -162,15 +198,21 @@ def prepared(
     if sizes != (robot.n, robot.m):
         needed = f"{(robot.n, robot.m)}: robot_mpc makes such a problem"
         fail("mpc", f"has {sizes} states and inputs", f"This robot has {needed}")
+    whole("sqp_steps", sqp_steps, 1)
+    for name, given in (("tasks", len(tasks) > 0), ("sqp_steps", sqp_steps > 1)):
+        if given and linearize != "trajectory":
+            fail(name, f"given with linearize={linearize!r}", 'Give linearize="trajectory"')
     soft = soften(mpc, penalty)
     if linearize == "set-point":
         return {"soft": arrays(soft), "fixed": Controller(soft, solver), "scale": None}
-    scale = factor_stages(soft, soft.system, solver).E
+    NonlinearMPC(soft, as_model(robot), tuple(tasks)).validate()
+    # Rows of tasks differ from state to state.
+    scale = None if tasks else factor_stages(soft, soft.system, solver).E
     return {"soft": arrays(soft), "fixed": None, "scale": scale}
 
 
-STATIC = ("linearize", "exact")
-LEAVES = ("robot", "mpc", "solver", "penalty", "soft", "fixed", "scale")
+STATIC = ("linearize", "exact", "sqp_steps")
+LEAVES = ("robot", "mpc", "solver", "penalty", "tasks", "soft", "fixed", "scale")
 
 
 def _flatten(controller: RobotController) -> tuple[tuple, tuple]:

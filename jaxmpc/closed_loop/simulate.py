@@ -84,7 +84,11 @@ def checked_arguments(
     if np.shape(x0) != (size,):
         fail("x0", f"shape {np.shape(x0)}", f"Give one state ({size},); use jax.vmap for many")
     for name, value, shapes in (
-        ("reference", reference, ((n,), (steps + N, n))),
+        (
+            "reference",
+            reference,
+            tuple(shape for k in reference_sizes(controller) for shape in ((k,), (steps + N, k))),
+        ),
         ("input_reference", input_reference, ((m,), (steps + N - 1, m))),
         ("disturbance", disturbance, ((steps, size),)),
         ("previous_input", previous_input, ((m,),)),
@@ -115,6 +119,11 @@ def checked_arguments(
     references = (cast(reference), cast(input_reference))
     given = (cast(x0), references, cast(disturbance), cast(previous_input))
     return controller, as_argument(plant), *given, noise, observer
+
+
+def reference_sizes(controller: Any) -> tuple[int, ...]:
+    """Return how many columns the reference of a controller may have."""
+    return getattr(controller, "reference_sizes", (controller.mpc.system.n,))
 
 
 def _checked_plant(plant: Any, n: int, m: int) -> Any:
@@ -201,7 +210,9 @@ def _simulate(
         )
         u = previous if delay else found
         error, effort = (
-            value if target is None else value - (target if target.ndim == 1 else target[0])
+            value
+            if target is None
+            else value - (target if target.ndim == 1 else target[0])[: len(value)]
             for value, target in zip(
                 (controller.coordinates(x), u), rows(t) if ahead_by else (r, s), strict=True
             )

@@ -18,6 +18,7 @@ from jaxmpc.closed_loop.simulate import (
     ConstantPlant,
     as_argument,
     checked_arguments,
+    reference_sizes,
     simulate,
 )
 from jaxmpc.compiled import Compiled, first_rows, joined, padded
@@ -101,17 +102,18 @@ def require_own(
     """Raise ValueError unless the references of each loop have these shapes."""
     mpc = controller.mpc
     sizes = {
-        "reference": (mpc.system.n, steps + mpc.horizon),
-        "input_reference": (mpc.system.m, steps + mpc.horizon - 1),
+        "reference": (reference_sizes(controller), steps + mpc.horizon),
+        "input_reference": ((mpc.system.m,), steps + mpc.horizon - 1),
     }
     for name, value in own.items():
-        size, length = sizes[name]
+        widths, length = sizes[name]
         if name in shared:
             fail(f"{name}s", f"given beside {name}", "Give one for all loops, or one for each")
         require_real(f"{name}s", value)
-        shapes = (count, size), (count, length, size)
+        shapes = [shape for k in widths for shape in ((count, k), (count, length, k))]
         if value.shape not in shapes:
-            cure = f"Give {shapes[0]} or {shapes[1]}, one for each loop; {name} is for all of them"
+            listed = " or ".join(map(str, shapes))
+            cure = f"Give {listed}, one for each loop; {name} is for all of them"
             fail(f"{name}s", f"shape {value.shape}", cure)
 
 

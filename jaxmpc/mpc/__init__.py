@@ -3,6 +3,8 @@
 MPC, Outputs, Soft    a problem, with rows of outputs and soft rows
 solve, Controller     one plan, or a factored law u = controller(x) -> Plan with Multipliers
 solve_stagewise       one plan, factored along the horizon
+NonlinearMPC, Task    a problem with a nonlinear model, costs and limits on functions
+solve_nonlinear       its plan by sequential quadratic programming
 solve_many            one plan for each of many states -> Plan with a batch axis
 WarmStart             where a solver begins: states, inputs, multipliers
 active_constraints    which rows of a plan are active -> ActiveConstraint
@@ -12,11 +14,13 @@ soften, harden        make rows soft or hard
 
 from jaxmpc.mpc.active_constraints import ActiveConstraint, active_constraints
 from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.nonlinear import NonlinearMPC, Point, Task
 from jaxmpc.mpc.plan import Multipliers, Plan, WarmStart
 from jaxmpc.mpc.problem import MPC, Outputs, Soft
 from jaxmpc.mpc.rows import Row, row_table
 from jaxmpc.mpc.soften import harden, soften
 from jaxmpc.mpc.solve import solve, solve_many
+from jaxmpc.mpc.sqp import solve_nonlinear
 from jaxmpc.mpc.stagewise import solve_stagewise
 
 __all__ = [
@@ -24,10 +28,13 @@ __all__ = [
     "ActiveConstraint",
     "Controller",
     "Multipliers",
+    "NonlinearMPC",
     "Outputs",
     "Plan",
+    "Point",
     "Row",
     "Soft",
+    "Task",
     "WarmStart",
     "active_constraints",
     "harden",
@@ -35,5 +42,6 @@ __all__ = [
     "soften",
     "solve",
     "solve_many",
+    "solve_nonlinear",
     "solve_stagewise",
 ]

@@ -26,7 +26,7 @@ class Multipliers:
 
     states (K, r): rows of `states` at the steps where they hold, inputs (N, m or rows), terminal
     (r_f,) (for an Ellipsoid {x'Px ≤ level}: of the rows L'x with P = LL', n of them). outputs and
-    soft: one array (steps, rows) for each of the problem's; rates (N, m).
+    soft and tasks with limits: one array (steps, rows) for each of the problem's; rates (N, m).
     dJ*/d(upper bound) = −y where y > 0, dJ*/d(lower bound) = −y where y < 0.
     `active_constraints` lists them by name, step and unit.
     """
@@ -37,6 +37,7 @@ class Multipliers:
     outputs: tuple[Array, ...] = ()
     rates: Any = None
     soft: tuple[Array, ...] = ()
+    tasks: tuple[Array, ...] = ()
 
 
 @jax.tree_util.register_dataclass
@@ -190,7 +191,7 @@ def sorted_multipliers(mpc: MPC, layout: Layout, y: Array) -> Multipliers:
         inputs=of.get("input", empty(mpc.horizon, 0))[0],
         terminal=of.get("terminal", empty(1, 0))[0][0],
         outputs=tuple(of.get("output", ())), soft=tuple(of.get("soft", ())),
-        rates=of.get("rate", [None])[0],
+        rates=of.get("rate", [None])[0], tasks=tuple(of.get("task", ())),
     )  # fmt: skip
 
 
@@ -201,6 +202,7 @@ def flat_multipliers(layout: Layout, multipliers: Multipliers) -> Array:
     kinds = {
         "state": [of.states], "input": [of.inputs], "rate": [of.rates],
         "terminal": [of.terminal], "output": list(of.outputs), "soft": list(of.soft),
+        "task": list(of.tasks),
     }  # fmt: skip
     parts = []
     for kind, steps, size in layout:

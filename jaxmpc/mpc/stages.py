@@ -42,11 +42,12 @@ class Stages:
     """The data of a problem in one floating type.
 
     A (n, n), B (n, m), c (n,), or with a leading axis N. Q, R, P: weights, without ½; P of x_N; Q
-    may have a leading axis N; stage (N,): weights of the stages.
+    and R may have a leading axis N; cross M (N, m, n): of the term 2 u'M x, None for zero; stage
+    (N,): weights of the stages, of all three.
     H (r, n) and D (r, m) of each block of rows (`rows.blocks`), or one a step of the block, None
-    for zero. lower, upper,
-    linear, quadratic (rows,): as in `Bounds`. layout: (kind, steps, rows a step) of each block;
-    boxes: whether its matrix is the identity.
+    for zero; D does not count at step N, which has no input. lower, upper, linear, quadratic
+    (rows,): as in `Bounds`. layout: (kind, steps, rows a step) of each block; boxes: whether its
+    matrix is the identity.
     """
 
     A: Array
@@ -65,6 +66,7 @@ class Stages:
     layout: Layout = field(metadata={"static": True})
     boxes: tuple[bool, ...] = field(metadata={"static": True})
     horizon: int = field(metadata={"static": True})
+    cross: Any = None
 
     @property
     def bounds(self) -> Bounds:
@@ -119,14 +121,19 @@ def consecutive(steps: tuple[int, ...]) -> bool:
 
 
 def at(v: Array, steps: tuple[int, ...]) -> Array:
-    """Return v_k at the steps."""
+    """Return v_k at the steps, zero at the one after the last of v."""
+    if max(steps, default=0) == len(v):
+        v = jnp.pad(v, ((0, 1), *[(0, 0)] * (v.ndim - 1)))
     if consecutive(steps):
         return v[steps[0] : steps[0] + len(steps)]
     return v[np.array(steps, int)]
 
 
 def spread(part: Array, steps: tuple[int, ...], length: int) -> Array:
-    """Return the array of so many steps that is `part` at the steps and zero elsewhere."""
+    """Return the array of so many steps that is `part` at the steps and zero elsewhere; a part at
+    the step after the last is left out."""
+    if max(steps, default=0) == length:
+        return spread(part, steps, length + 1)[:-1]
     if consecutive(steps):
         ends = (steps[0], length - steps[0] - len(steps))
         return jnp.pad(part, (ends, *[(0, 0)] * (part.ndim - 1)))
@@ -213,7 +220,7 @@ def riccati(s: Stages, weights: Any = None) -> Gains:
     N, stage = s.horizon, s.stage[:, None, None]
     Q = 2 * jnp.concatenate([stage * s.Q, s.P[None]])
     R = 2 * stage * s.R
-    cross = None
+    cross = None if s.cross is None else 2 * stage * s.cross
     for rows, steps, size, H, D, box in s.blocks() if weights is not None else ():
         w = weights[rows].reshape(len(steps), size)
         diagonal = lambda w: w[:, :, None] * jnp.eye(w.shape[1], dtype=w.dtype)
@@ -247,20 +254,22 @@ def predict(s: Stages, x0: Array, u: Array) -> Array:
 
 
 class Sample(NamedTuple):
-    """Initial state and references of one solve: x0 (n,), references (N+1, n) and (N, m). slope
-    (N+1, n): a linear term Σ slope_k·x_k of the cost, None for none."""
+    """Initial state and references of one solve: x0 (n,), references (N+1, n) and (N, m). slopes
+    (N+1, n) and (N, m): linear terms Σ slope_k·x_k + Σ slope_k·u_k of the cost, None for none."""
 
     x0: Array
     states: Array
     inputs: Array
-    slope: Any = None
+    slopes: Any = None
 
     def gradient(self, s: Stages, x: Array, u: Array) -> tuple[Array, Array]:
         """Of J at x, u: (N+1, n) and (N, m)."""
-        e, stage = 2 * (x - self.states), s.stage[:, None]
-        gx = jnp.concatenate([stage * apply(s.Q, e[:-1]), matmul(e[-1:], s.P.T)])
-        gx = gx if self.slope is None else gx + self.slope
-        return gx, 2 * stage * matmul(u - self.inputs, s.R.T)
+        e, d, stage = 2 * (x - self.states), 2 * (u - self.inputs), s.stage[:, None]
+        gx, gu = apply(s.Q, e[:-1]), apply(s.R, d)
+        if s.cross is not None:
+            gx, gu = gx + apply_transposed(s.cross, d), gu + apply(s.cross, e[:-1])
+        gradient = jnp.concatenate([stage * gx, apply(s.P, e[-1:])]), stage * gu
+        return gradient if self.slopes is None else jax.tree.map(jnp.add, gradient, self.slopes)
 
 
 def unconstrained(s: Stages, gains: Gains, weights: Array, sample: Sample) -> tuple[Array, Array]:

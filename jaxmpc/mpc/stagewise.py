@@ -186,7 +186,7 @@ def row_scale(s: Stages) -> Array:
         spread = matmul(B, matmul(inverse, B.T))
         return matmul(closed, matmul(Sigma, closed.T)) + spread, Sigma
 
-    start = jnp.zeros_like(s.Q)
+    start = jnp.zeros_like(s.P)
     last, Sigma = jax.lax.scan(forward, start, (gains, *s.varying("B")))
     Sigma = jnp.concatenate([Sigma, last[None]])
     variance, own = [jnp.zeros(0, s.Q.dtype)], [jnp.zeros(0, s.Q.dtype)]

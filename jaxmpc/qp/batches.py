@@ -20,7 +20,7 @@ from jax.custom_batching import custom_vmap
 BLOCK = 128
 # Instances in a group on a CPU at most, and when fewer are open; small batches are one group.
 PART_CPU, FEW_CPU, SMALL_CPU = 512, 64, 128
-# The same of loops that few instances of a batch enter, but with long steps.
+# The same of loops with long steps, or that few instances of a batch enter.
 RARE_PART_CPU, RARE_FEW_CPU = 64, 8
 # Instances in a group elsewhere: a quarter of the batch; when fewer are open a sixteenth of that,
 # and so on, but not below LEAST, where a step costs little more than its launches. (H100,
@@ -37,7 +37,8 @@ def group_sizes(batch: int, rare: bool = False) -> list[int]:
     """Return the sizes of the groups of a batch, from the largest."""
     if jax.default_backend() == "cpu":
         part, few = (RARE_PART_CPU, RARE_FEW_CPU) if rare else (PART_CPU, FEW_CPU)
-        return [batch] if batch <= SMALL_CPU else [min(batch, part), few]
+        small = RARE_PART_CPU if rare else SMALL_CPU
+        return [batch] if batch <= small else [min(batch, part), few]
     if batch <= PART * LEAST:
         return [batch]
     sizes = [-(-batch // PART)]
@@ -91,7 +92,7 @@ def repeat_while(
 
     The functions must close over no arrays: what they read stands in `constants`. One instance is
     one `while_loop`. A batch, also one of nested `vmap`s, is worked off in groups (top of this
-    file). rare: few instances are open at first. Not differentiable.
+    file). rare: few instances are open at first, or a step takes long. Not differentiable.
     """
     one = lambda constants, state: lax.while_loop(is_open, lambda s: step(constants, s), state)
     single = custom_vmap(one)

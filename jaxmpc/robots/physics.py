@@ -97,6 +97,16 @@ class Physics:
         # MJX's own integration of positions has the derivative 0 for a body that does not turn.
         return jnp.concatenate([retract(self.joints, q, h * v), v, act_next])
 
+    def data(self, x: Array, u: Array, numbers: Mapping[str, Any] | None = None) -> Any:
+        """Return mjx.Data at x = (qpos, qvel, act) under u: poses and velocities of bodies, geoms
+        and sites, forces of actuators and springs (qfrc_actuator, qfrc_passive), qfrc_bias.
+        Differentiable."""
+        own = jax.tree.map(jnp.asarray, dict(numbers or {}))
+        x_q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
+        q = normalised(self.joints, x_q)
+        _, bias, poses = self._dynamics(own, q, v)
+        return self._forced(own, q, v, act, u)[1].replace(qfrc_bias=bias, **poses)
+
     def _accelerations(
         self, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array,
         damped: bool = False,

@@ -104,19 +104,24 @@ class Robot:
         body = lambda x, _: (self.plant.step(x, u, self.numbers), None)
         return jax.lax.scan(body, x, length=self.substeps)[0]
 
-    def linearize(self, x: Any, u: Any, *, exact: bool = False) -> LinearSystem:
+    def linearize(
+        self, x: Any, u: Any, *, exact: bool = False, numbers: Any = None
+    ) -> LinearSystem:  # fmt: skip
         """Return the affine model ξ⁺ = A ξ + B u + c of a whole control period about x (nq + nv,),
         u (m,).
 
         It is of the predictor, by automatic differentiation. exact=False: one physics step is
         linearised and its affine map applied `substeps` times (a tenth of the cost; on a 7-joint
         arm A is off by 1 %, B by 0.05 %). exact=True: Jacobians along the physics steps, and c such
-        that the model passes through the predictor's own next state.
+        that the model passes through the predictor's own next state. numbers: fields of mjx.Model
+        in place of the predictor's own, see `vary`.
         """
-        return _linearized(self, *self._checked_arrays(x, u), exact=exact)
+        return _linearized(self, *self._checked_arrays(x, u), numbers or {}, exact=exact)
 
-    def _linearize(self, x: Array, u: Array, exact: bool) -> LinearSystem:
-        advance = lambda s, u: self.coordinates(self.predictor.step(self.state(s), u))
+    def _linearize(
+        self, x: Array, u: Array, numbers: dict[str, Any], exact: bool
+    ) -> LinearSystem:  # fmt: skip
+        advance = lambda s, u: self.coordinates(self.predictor.step(self.state(s), u, numbers))
 
         def affine(s: Array) -> tuple[Array, Array, Array]:
             moved = lambda s, u: (advance(s, u),) * 2

@@ -1,0 +1,336 @@
+"""Nonlinear MPC by sequential quadratic programming, against other solvers and finite
+differences."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import jaxmpc as jm
+from jaxmpc.mpc import NonlinearMPC, Task, solve_nonlinear, solve_stagewise
+
+SOLVED = jm.Status.SOLVED
+CART, POLE, LENGTH, GRAVITY = 1.0, 0.1, 0.8, 9.81
+
+
+@pytest.fixture
+def x64():
+    with jax.enable_x64(True):
+        yield
+
+
+class Pendulum:
+    """A pendulum on a cart, one step of 0.05 s by the classical Runge-Kutta method."""
+
+    def __init__(self, length):
+        self.length = length
+
+    def step(self, x, u):
+        h = 0.05
+        k1 = self.rate(x, u)
+        k2 = self.rate(x + h / 2 * k1, u)
+        k3 = self.rate(x + h / 2 * k2, u)
+        return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + self.rate(x + h * k3, u))
+
+    def rate(self, x, u):
+        s, c = jnp.sin(x[1]), jnp.cos(x[1])
+        common = CART + POLE - POLE * c**2
+        push = -POLE * self.length * s * x[3] ** 2
+        return jnp.stack([
+            x[2], x[3], (push + POLE * GRAVITY * c * s + u[0]) / common,
+            (push * c + u[0] * c + (CART + POLE) * GRAVITY * s) / (self.length * common),
+        ])  # fmt: skip
+
+
+jax.tree_util.register_pytree_node(
+    Pendulum, lambda p: ((p.length,), None), lambda _, leaves: Pendulum(*leaves)
+)
+
+
+def swing_up(length=LENGTH, horizon=20):
+    """The swing-up of acados' getting-started example."""
+    system = jm.LinearSystem(np.eye(4), np.zeros((4, 1)))
+    W = np.diag([1e3, 1e3, 1e-2, 1e-2])
+    mpc = jm.MPC(system, 0.05 * W, 0.05 * np.eye(1) * 1e-2, horizon, inputs=jm.Box([-80.0], [80.0]),
+                 terminal_cost=W)  # fmt: skip
+    return NonlinearMPC(mpc, Pendulum(length))
+
+
+def around(steps=8, **fields):
+    """A point that walks in the plane past a disc of radius 1, to (2, 0.3) from (−2, 0)."""
+    system = jm.LinearSystem(np.eye(2), np.eye(2))
+    mpc = jm.MPC(system, 0.1 * np.eye(2), np.eye(2), steps, inputs=jm.Box([-2.0, -2.0], [2.0, 2.0]),
+                 terminal_cost=50 * np.eye(2))  # fmt: skip
+    far = Task(squared, lower=1.0, penalty=None, name="disc")
+    return NonlinearMPC(mpc, bent, (replace(far, **fields),))
+
+
+# Programs are compiled once for each function.
+def squared(at):
+    return at.x @ at.x
+
+
+def bent(x, u):
+    return x + u + 0.05 * jnp.sin(x[::-1])
+
+
+def mixed(at):
+    return jnp.stack([jnp.sin(at.x[0]), at.x[1] * at.u[0]])
+
+
+def product(at):
+    return jnp.stack([at.x[0] * at.x[1], jnp.sin(at.x[1])])
+
+
+GOAL, START = np.array([2.0, 0.3]), np.array([-2.0, 0.1])
+
+
+class TestSolution:
+    """Plans are those of independent solvers."""
+
+    def test_a_linear_model_needs_one_qp(self, x64):
+        rng = np.random.default_rng(0)
+        A, B = np.eye(3) + 0.1 * rng.normal(size=(3, 3)), rng.normal(size=(3, 2))
+        system = jm.LinearSystem(A, B, 0.1 * rng.normal(size=3))
+        states = jm.Box(-np.ones(3), np.ones(3))
+        mpc = jm.MPC(system, np.eye(3), np.eye(2), 10, states=states, terminal_cost=np.eye(3),
+                     inputs=jm.Box([-0.3, -0.3], [0.3, 0.3]), constrain_initial=False)  # fmt: skip
+        soft = jm.soften(mpc, 20.0)
+        x0, r = np.array([0.9, -0.5, 0.4]), np.array([0.2, 0.0, 0.1])
+        expected = solve_stagewise(soft, system, x0, r)
+        for steps in (1, 20):
+            plan = solve_nonlinear(NonlinearMPC(soft, system), x0, r, steps=steps)
+            assert plan.status == SOLVED and plan.iterations <= 2
+            np.testing.assert_allclose(plan.inputs, expected.inputs, atol=1e-7)
+            np.testing.assert_allclose(plan.cost, expected.cost, rtol=1e-9)
+            np.testing.assert_allclose(plan.slack, expected.slack, atol=1e-8)
+
+    @pytest.mark.parametrize("hessian", ["exact", "gauss-newton"])
+    def test_swing_up_is_ipopts(self, hessian, x64):
+        """IPOPT 3.14 (CasADi 3.8, bounds relaxed by 1e-8) ends at 2242.82813 in 31 iterations."""
+        plan = solve_nonlinear(swing_up(), np.array([0, np.pi, 0, 0]), hessian=hessian)
+        assert plan.status == SOLVED and plan.iterations < 25
+        np.testing.assert_allclose(plan.cost, 2242.82814, rtol=1e-7)
+        assert np.abs(plan.inputs).max() == pytest.approx(80.0, abs=1e-9)
+        # The plan follows the model.
+        x = np.array([0, np.pi, 0, 0])
+        for k in range(20):
+            x = np.asarray(Pendulum(LENGTH).step(x, plan.inputs[k]))
+            np.testing.assert_allclose(plan.states[k + 1], x, atol=1e-6)
+
+    def test_past_an_obstacle_as_slsqp(self, x64):
+        problem = around()
+        plan = solve_nonlinear(problem, START, GOAL)
+        assert plan.status == SOLVED
+        model = lambda x, u: x + u + 0.05 * np.sin(x[::-1])
+
+        def states(z):
+            x = [START]
+            for u in z.reshape(-1, 2):
+                x.append(model(x[-1], u))
+            return np.array(x)
+
+        def cost(z):
+            e = states(z) - GOAL
+            return 0.1 * np.sum(e[:-1] ** 2) + np.sum(z**2) + 50 * np.sum(e[-1] ** 2)
+
+        rows = {"type": "ineq", "fun": lambda z: np.sum(states(z)[1:] ** 2, 1) - 1}
+        found = minimize(
+            cost, np.ravel(plan.inputs) + 1e-3, bounds=[(-2, 2)] * 16, constraints=rows,
+            method="SLSQP", options={"ftol": 1e-14, "maxiter": 500},
+        )  # fmt: skip
+        np.testing.assert_allclose(plan.cost, found.fun, rtol=1e-7)
+        np.testing.assert_allclose(np.ravel(plan.inputs), found.x, atol=1e-4)
+        distance = np.sum(np.asarray(plan.states) ** 2, 1)[1:]
+        assert distance.min() > 1 - 1e-6 and np.sum(distance < 1 + 1e-6) >= 2
+
+    def test_weights_as_matrix_vector_and_number_agree(self, x64):
+        costs = []
+        for weight in (3.0, [3.0, 3.0], 3.0 * np.eye(2)):
+            task = Task(mixed, weight, target=[0.3, 0.1])
+            problem = replace(around(), tasks=(task,))
+            plan = solve_nonlinear(problem, START, GOAL)
+            assert plan.status == SOLVED
+            x, u = np.asarray(plan.states), np.vstack([plan.inputs, np.zeros(2)])
+            g = np.stack([np.sin(x[:, 0]) - 0.3, x[:, 1] * u[:, 0] - 0.1], 1)[1:]
+            e = x - GOAL
+            cost = 0.1 * np.sum(e[:-1] ** 2) + np.sum(u**2) + 50 * np.sum(e[-1] ** 2)
+            np.testing.assert_allclose(plan.cost, cost + 3 * np.sum(g**2), rtol=1e-9)
+            costs.append(plan.cost)
+        np.testing.assert_allclose(costs, costs[0], rtol=1e-9)
+
+    def test_a_soft_limit_gives_way_and_says_so(self, x64):
+        inside = solve_nonlinear(around(penalty=0.5), START, GOAL)
+        exact = solve_nonlinear(around(penalty=1e3), START, GOAL)
+        hard = solve_nonlinear(around(), START, GOAL)
+        for plan in (inside, exact, hard):
+            assert plan.status == SOLVED
+        assert inside.slack.shape == (9, 1) and inside.slack.max() > 0.1
+        np.testing.assert_allclose(
+            inside.slack[1:, 0], np.maximum(1 - np.sum(inside.states**2, 1)[1:], 0), atol=1e-9
+        )
+        assert exact.slack.max() < 1e-6 and hard.slack.size == 0
+        np.testing.assert_allclose(exact.inputs, hard.inputs, atol=1e-5)
+        # Multipliers are those of an exact penalty: below its weight.
+        assert np.abs(hard.multipliers.tasks[0]).max() < 1e3
+        np.testing.assert_allclose(
+            exact.multipliers.tasks[0], hard.multipliers.tasks[0], rtol=1e-4, atol=1e-4
+        )
+
+    def test_a_plan_is_its_own_warm_start(self, x64):
+        problem = around()
+        plan = solve_nonlinear(problem, START, GOAL)
+        again = solve_nonlinear(problem, START, GOAL, warm_start=plan)
+        assert again.status == SOLVED and again.iterations <= 1
+        np.testing.assert_allclose(again.inputs, plan.inputs, atol=1e-6)
+
+    def test_real_time_iterations_come_to_the_solution(self, x64):
+        """One QP a call from the last plan, for the same state: Gauss and Newton's method."""
+        problem = around()
+        plan = None
+        for _ in range(60):
+            plan = solve_nonlinear(problem, START, GOAL, warm_start=plan, steps=1)
+        assert plan.status == SOLVED
+        expected = solve_nonlinear(problem, START, GOAL)
+        np.testing.assert_allclose(plan.inputs, expected.inputs, atol=1e-5)
+
+
+class TestDerivatives:
+    """Derivatives of solutions are those of finite differences, with rows active."""
+
+    def test_of_weights_targets_limits_and_the_state(self, x64):
+        task = Task(product, name="product")
+
+        def inputs(theta):
+            problem = around(lower=theta[3])
+            problem = replace(
+                problem, tasks=(*problem.tasks, replace(task, weight=theta[0], target=theta[1:3])),
+                mpc=replace(problem.mpc, Q=0.1 * jnp.eye(2) * theta[4]),
+            )  # fmt: skip
+            plan = solve_nonlinear(problem, START + theta[5:], GOAL)
+            return plan.inputs.ravel(), (plan.status, plan.multipliers)
+
+        theta = jnp.array([0.7, 0.2, -0.1, 1.0, 1.0, 0.0, 0.0])
+        J, (status, multipliers) = jax.jacrev(inputs, has_aux=True)(theta)
+        assert status == SOLVED
+        assert np.sum(np.abs(multipliers.tasks[0]) > 1e-3) >= 1  # the disc is touched
+        np.testing.assert_allclose(J, jax.jacfwd(inputs, has_aux=True)(theta)[0], atol=1e-9)
+        h = 1e-5
+        for i in range(len(theta)):
+            step = h * np.eye(len(theta))[i]
+            difference = (inputs(theta + step)[0] - inputs(theta - step)[0]) / (2 * h)
+            np.testing.assert_allclose(J[:, i], difference, atol=2e-4 * (1 + np.abs(J).max()))
+
+    def test_of_a_number_of_the_model(self, x64):
+        x0 = jnp.array([0, 2.8, 0, 0])
+
+        def solution(length):
+            plan = solve_nonlinear(swing_up(length), x0)
+            return jnp.append(plan.inputs.ravel(), plan.cost), plan.status
+
+        J, status = jax.jacfwd(solution, has_aux=True)(LENGTH)
+        assert status == SOLVED
+        h = 1e-5
+        difference = (solution(LENGTH + h)[0] - solution(LENGTH - h)[0]) / (2 * h)
+        np.testing.assert_allclose(J, difference, rtol=2e-3, atol=2e-3 * np.abs(J[:-1]).max())
+        # Envelope theorem: the cost's own derivative is far more accurate.
+        np.testing.assert_allclose(J[-1], difference[-1], rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def batch():
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(1)
+        starts = rng.uniform([-2, -1], [-1.5, 1], (12, 2))
+        starts[3, 0], starts[7, 1] = np.nan, np.inf
+        loss = lambda x, r: jnp.sum(solve_nonlinear(around(), x, r).inputs ** 2)
+        many = jax.jit(jax.vmap(lambda x, r: solve_nonlinear(around(), x, r), (0, None)))
+        gradient = jax.jit(jax.vmap(jax.grad(loss), (0, None)))
+        return starts, many(starts, GOAL), gradient(starts, GOAL)
+
+
+class TestBatches:
+    """Each instance of a batch stands alone."""
+
+    def test_a_bad_state_stays_in_its_row(self, batch, x64):
+        starts, plans, gradient = batch
+        good = np.isfinite(starts).all(axis=1)
+        np.testing.assert_array_equal(plans.status[~good], jm.Status.NON_FINITE)
+        np.testing.assert_array_equal(plans.status[good], SOLVED)
+        assert np.isnan(plans.inputs[~good]).all() and np.isfinite(plans.inputs[good]).all()
+        assert np.isfinite(gradient[good]).all()
+        np.testing.assert_array_equal(gradient[~good], 0)
+
+    def test_plans_are_those_alone(self, batch, x64):
+        starts, plans, _ = batch
+        for i in (0, 5, 11):
+            alone = solve_nonlinear(around(), starts[i], GOAL)
+            np.testing.assert_allclose(plans.inputs[i], alone.inputs, atol=1e-6)
+
+    def test_float32(self):
+        plan = solve_nonlinear(around(), START.astype(np.float32), GOAL.astype(np.float32))
+        with jax.enable_x64(True):
+            expected = solve_nonlinear(around(), START, GOAL)
+        assert plan.status == SOLVED and plan.inputs.dtype == jnp.float32
+        np.testing.assert_allclose(plan.cost, expected.cost, rtol=1e-4)
+
+
+def test_an_impossible_limit_is_not_solved(x64):
+    """Hard: the start is inside the disc, and the first step cannot leave it."""
+    problem = around()
+    slow = replace(problem, mpc=replace(problem.mpc, inputs=jm.Box([-0.1, -0.1], [0.1, 0.1])))
+    plan = solve_nonlinear(slow, np.array([0.1, 0.0]), GOAL)
+    assert plan.status == jm.Status.ITERATION_LIMIT
+    soft = replace(slow, tasks=(replace(slow.tasks[0], penalty=1e3),))
+    plan = solve_nonlinear(soft, np.array([0.1, 0.0]), GOAL)
+    assert plan.slack.max() > 0.5
+
+
+BAD = {
+    "x0": (lambda p: solve_nonlinear(p, np.zeros(3)), r"x0: shape \(3,\)"),
+    "reference": (lambda p: solve_nonlinear(p, START, np.zeros(3)), r"reference: shape \(3,\)"),
+    "targets": (lambda p: solve_nonlinear(p, START, targets=[]), "targets: 0 for 1 tasks"),
+    "steps": (lambda p: solve_nonlinear(p, START, steps=0), "steps: 0"),
+    "hessian": (lambda p: solve_nonlinear(p, START, hessian="bfgs"), "hessian: 'bfgs'"),
+    "weight": (
+        lambda p: solve_nonlinear(replace(p, tasks=(replace(p.tasks[0], weight=-1.0),)), START),
+        "disc.weight: is not positive semidefinite",
+    ),
+    "target": (
+        lambda p: solve_nonlinear(
+            replace(p, tasks=(replace(p.tasks[0], target=[1, 2, 3]),)), START
+        ),
+        r"disc.target: shape \(3,\)",
+    ),
+    "lower": (
+        lambda p: solve_nonlinear(replace(p, tasks=(replace(p.tasks[0], upper=0.5),)), START),
+        "disc.lower: exceeds upper",
+    ),
+    "task steps": (
+        lambda p: solve_nonlinear(replace(p, tasks=(replace(p.tasks[0], steps=(0, 9)),)), START),
+        r"disc.steps: \(0, 9\)",
+    ),
+    "function": (
+        lambda p: solve_nonlinear(
+            replace(p, tasks=(replace(p.tasks[0], function=lambda at: jnp.eye(2)),)), START
+        ),
+        r"disc.function: gives shape \(2, 2\)",
+    ),
+    "model": (lambda p: solve_nonlinear(replace(p, model=3.0), START), "model: is a float"),
+    "next state": (
+        lambda p: solve_nonlinear(replace(p, model=lambda x, u: jnp.zeros(3)), START),
+        r"model.step\(x, u\): shape \(3,\)",
+    ),
+    "tasks": (lambda p: solve_nonlinear(replace(p, tasks=(3,)), START), "tasks: is a tuple"),
+    "problem": (lambda p: solve_nonlinear(p.mpc, START), "problem: is a MPC"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_arguments(name, x64):
+    call, text = BAD[name]
+    with pytest.raises(ValueError, match=text):
+        call(around())
