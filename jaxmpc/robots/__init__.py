@@ -2,15 +2,29 @@
 
 load_robot            a robot by name, or from an MJCF or URDF file -> Robot
 RobotReport           what was read and ignored of a file: robot.report()
+RobotModel            what a controller predicts of a robot, for jaxmpc.mpc.NonlinearMPC
+tasks                 positions, orientations, distances and energy, for jaxmpc.mpc.Task
 LinearPlant           a linear system with limits, in the place of a robot
 render, save_video    images of a motion, and a video of them
 Film                  the same for a notebook, which plays it
 """
 
+from jaxmpc.robots import tasks
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.load import load_robot
+from jaxmpc.robots.model import RobotModel
 from jaxmpc.robots.report import RobotReport
 from jaxmpc.robots.robot import Robot
 from jaxmpc.robots.video import Film, render, save_video
 
-__all__ = ["Film", "LinearPlant", "Robot", "RobotReport", "load_robot", "render", "save_video"]
+__all__ = [
+    "Film",
+    "LinearPlant",
+    "Robot",
+    "RobotModel",
+    "RobotReport",
+    "load_robot",
+    "render",
+    "save_video",
+    "tasks",
+]

@@ -1,0 +1,156 @@
+"""Functions of mjx.Data for the tasks of a robot: positions, orientations, distances, energy.
+
+Each maker returns a function of mjx.Data for `jaxmpc.mpc.Task`; any other function of mjx.Data
+written in JAX will do as well, `lambda data: data.qfrc_actuator` for the torques.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import fail, require_finite, require_shape
+from jaxmpc.qp.precision import matmul
+from jaxmpc.robots.robot import Robot
+
+# mjtGeom.
+SPHERE, CAPSULE = 2, 3
+KINDS = ("site", "body", "geom")
+
+
+def position(robot: Robot, name: str, kind: str = "site") -> Callable[[Any], Array]:
+    """Return the function that gives the position (3,) in m, in the world, of a site, a body or
+    the centre of a geom. Raises ValueError for a name that the model does not have."""
+    i, field = _number(robot, kind, name), "xpos" if kind == "body" else f"{kind}_xpos"
+    return lambda data: getattr(data, field)[i]
+
+
+def orientation(
+    robot: Robot, name: str, target: Any = (1, 0, 0, 0), kind: str = "site"
+) -> Callable[[Any], Array]:  # fmt: skip
+    """Return the function that gives the rotation vector (3,) in rad, in the world, that turns the
+    target orientation, a quaternion (w first), into that of a site, body or geom.
+
+    Its length is the angle between both, at most π, where it has no derivative.
+    """
+    i, field = _number(robot, kind, name), "xmat" if kind == "body" else f"{kind}_xmat"
+    require_shape("target", target, (4,), "Give a quaternion (w, x, y, z)")
+    require_finite("target", target)
+    w, x, y, z = np.asarray(target, float) / np.linalg.norm(target)
+    wanted = np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+
+    def turned(data: Any) -> Array:
+        R = getattr(data, field)[i].reshape(3, 3)
+        R = matmul(R, jnp.asarray(wanted.T, R.dtype))
+        axis = jnp.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
+        # |axis| = sin φ, trace = 1 + 2 cos φ. φ/sin φ → 1 + sin²φ/6 for small angles.
+        square, cosine = jnp.sum(axis**2), (jnp.trace(R) - 1) / 2
+        small = square < 1e-8
+        sine = jnp.sqrt(jnp.where(small, 1.0, square))
+        ratio = jnp.where(small, 1 + square / 6, jnp.arctan2(sine, cosine) / sine)
+        return ratio * axis
+
+    return turned
+
+
+def distance(robot: Robot, first: str, second: Any) -> Callable[[Any], Array]:
+    """Return the function that gives the distance (m) between the surfaces of two geoms, negative
+    where they overlap.
+
+    first: name of a geom; second: another, or (centre (3,), radius) of a ball that stands still in
+    the world. Geoms are spheres or capsules: enclose others in one. Raises ValueError for others.
+    """
+    segments = [_segment(robot, first)]
+    if isinstance(second, str):
+        segments.append(_segment(robot, second))
+        radius = 0.0
+    else:
+        centre, radius = np.asarray(second[0], float), float(second[1])
+        require_shape("second[0]", centre, (3,), "Give the centre of the ball")
+        segments.append(lambda data: (jnp.asarray(centre, data.qpos.dtype),) * 2 + (0.0,))
+
+    def between(data: Any) -> Array:
+        (a, b, r), (c, d, s) = (segment(data) for segment in segments)
+        gap = _between_segments(a, b, c, d)
+        length = jnp.sqrt(jnp.maximum(jnp.sum(gap**2), 1e-12))
+        return length - r - s - radius
+
+    return between
+
+
+def energy(robot: Robot) -> Callable[[Any], Array]:
+    """Return the function that gives the kinetic energy and that of the weight (J), zero at rest at
+    the height of the world's origin; without springs."""
+    model = robot.predictor.mjx
+    mass, inertia = np.asarray(model.body_mass), np.asarray(model.body_inertia)
+    gravity, root = np.asarray(model.opt.gravity), np.asarray(model.body_rootid)
+    armature = np.asarray(model.dof_armature)
+
+    def total(data: Any) -> Array:
+        cast = lambda v: jnp.asarray(v, data.qpos.dtype)
+        turn, shift = data.cvel[:, :3], data.cvel[:, 3:]
+        # cvel is that of the point of the body at the centre of its tree.
+        speed = shift + jnp.cross(turn, data.xipos - data.subtree_com[root])
+        own = jnp.einsum("bji,bj->bi", data.ximat.reshape(-1, 3, 3), turn, precision="highest")
+        kinetic = jnp.sum(cast(mass) * jnp.sum(speed**2, 1)) + jnp.sum(cast(inertia) * own**2)
+        kinetic = kinetic + jnp.sum(cast(armature) * data.qvel**2)
+        return kinetic / 2 - jnp.sum(cast(mass) * matmul(data.xipos, cast(gravity)))
+
+    return total
+
+
+def _number(robot: Robot, kind: str, name: str) -> int:
+    """Return the number of a site, body or geom."""
+    import mujoco
+
+    if kind not in KINDS:
+        fail("kind", f"{kind!r}", f"Give one of {', '.join(KINDS)}")
+    objects = {"site": mujoco.mjtObj.mjOBJ_SITE, "body": mujoco.mjtObj.mjOBJ_BODY,
+               "geom": mujoco.mjtObj.mjOBJ_GEOM}  # fmt: skip
+    model = robot.predictor.model
+    i = mujoco.mj_name2id(model, objects[kind], name)
+    if i < 0:
+        count = {"site": model.nsite, "body": model.nbody, "geom": model.ngeom}[kind]
+        names = [mujoco.mj_id2name(model, objects[kind], j) for j in range(count)]
+        listed = ", ".join(name for name in names if name) or "none with a name"
+        fail("name", f"no {kind} {name!r} in {robot.name}", f"It has: {listed}")
+    return i
+
+
+def _segment(robot: Robot, name: str) -> Callable[[Any], tuple[Array, Array, float]]:
+    """Return the ends of a geom's middle line and its radius, as a function of mjx.Data."""
+    model, i = robot.predictor.model, _number(robot, "geom", name)
+    kind, (radius, half, _) = int(model.geom_type[i]), model.geom_size[i]
+    if kind not in (SPHERE, CAPSULE):
+        fail("name", f"geom {name!r} is neither a sphere nor a capsule", "Enclose it in one")
+    half = half if kind == CAPSULE else 0.0
+
+    def ends(data: Any) -> tuple[Array, Array, float]:
+        along = half * data.geom_xmat[i].reshape(3, 3)[:, 2]
+        return data.geom_xpos[i] - along, data.geom_xpos[i] + along, float(radius)
+
+    return ends
+
+
+def _between_segments(a: Array, b: Array, c: Array, d: Array) -> Array:
+    """Return the vector (3,) between the nearest points of the segments ab and cd (Ericson 2005,
+    Real-Time Collision Detection, §5.1.9)."""
+    u, v, w = b - a, d - c, a - c
+    dot = lambda p, q: jnp.sum(p * q)
+    uu, vv, uv, uw, vw = dot(u, u), dot(v, v), dot(u, v), dot(u, w), dot(v, w)
+    tiny = 1e-12
+    uu, vv = jnp.maximum(uu, tiny), jnp.maximum(vv, tiny)
+    # Where both are nearly parallel the middle of ab serves; the clamps below do the rest.
+    denominator = uu * vv - uv**2
+    parallel = denominator < 1e-9 * uu * vv
+    s = jnp.where(parallel, 0.5, (uv * vw - vv * uw) / jnp.where(parallel, 1.0, denominator))
+    s = jnp.clip(s, 0.0, 1.0)
+    t = jnp.clip((uv * s + vw) / vv, 0.0, 1.0)
+    s = jnp.clip((uv * t - uw) / uu, 0.0, 1.0)
+    return w + s * u - t * v
