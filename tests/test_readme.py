@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 README = Path(__file__).resolve().parents[1] / "README.md"
@@ -60,3 +61,11 @@ def test_tuning_snippet():
     _, names = run(0, 3)
     assert names["run"].improvement > 0.01
     assert names["solver"].rho.shape[0] == 4
+
+
+def test_nonlinear_snippet(capsys):
+    _, names = run(5)
+    assert names["plan"].status == names["jm"].Status.SOLVED
+    distance = np.hypot(names["plan"].states[1:, 0] - 1.5, names["plan"].states[1:, 1])
+    assert abs(distance.min() - 0.5) < 1e-4
+    assert "quadratic programs" in capsys.readouterr().out

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import matplotlib.image
 import mujoco
 import numpy as np
 import tyro
@@ -142,21 +143,12 @@ def run(s: Settings) -> None:
     s.out.mkdir(parents=True, exist_ok=True)
     frames = render(robot, r.states[0], inputs=r.inputs[0], every=8, width=480, height=400)
     save_video(s.out / "reach.gif", frames, fps=12.5)
-    picture(s, robot, r.states[0], s.out / "reach.png")
+    matplotlib.image.imsave(s.out / "reach.png", np.hstack(frames[:: len(frames) // 4][:4]))
 
 
 def measured(robot: Robot, s: Settings) -> list:
     """Return the distances of the capsules to the ball."""
     return [tasks.distance(robot, name, (BALL, s.radius)) for name in CAPSULES]
-
-
-def picture(s: Settings, robot: Robot, states: np.ndarray, path: Path) -> None:
-    """Write four frames side by side."""
-    import matplotlib.image
-
-    frames = [render(robot, states[i : i + 1], width=480, height=400)[0]
-              for i in np.linspace(0, len(states) - 1, 6).astype(int)[1:5]]  # fmt: skip
-    matplotlib.image.imsave(path, np.hstack(frames))
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ class Settings:
     speed: float = 0.9
     velocity: float = 0.5
     margin: float = 0.02
-    sqp: int = 3
+    sqp: int = 10
     masses: float = 0.0
     noise: float = 0.0
     seed: int = 0

@@ -46,7 +46,8 @@ class RobotController:
       the gripper; with "trajectory" only. Their targets are the columns of `reference` after the
       first n, or those of the tasks where the reference has just n.
     sqp_steps: quadratic programs a sample at most. With "trajectory" more than one solve the
-      nonlinear problem (`solve_nonlinear`), and the status is that of the nonlinear problem.
+      nonlinear problem (`solve_nonlinear`, Gauss and Newton's Hessian), and the status is that of
+      the nonlinear problem.
     penalty: L1 weight (cost per unit) with which state limits and terminal rows are soft. Where it
       exceeds the multipliers of the hard problem, plans keep the limits whenever the model can
       (exact penalty), and elsewhere trade violations against the cost by that weight. Each such
@@ -147,7 +148,7 @@ class RobotController:
             reference, targets = self._targets(problem, reference)
             plan = solve_nonlinear(
                 problem, xi, reference, self.solver, start, targets=targets, **given,
-                steps=self.sqp_steps,
+                steps=self.sqp_steps, hessian="gauss-newton",
             )  # fmt: skip
         else:
             u = self._resting(x, input_reference)[1][0] if carry is None else carry.inputs[0]

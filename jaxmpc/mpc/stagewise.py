@@ -432,14 +432,18 @@ def refined(
             return jax.lax.scan(again, state, length=most)[0].best
         return repeat_while(lambda state: state.open, step, constants, state, rare).best
 
-    def polished(best: Pair, rare: bool) -> Pair:
+    def round_(best: Pair, first: Array) -> tuple[Pair, None]:
         state = Search(best.z, best.y, best, jnp.int32(0), ~(best.near | best.solved))
-        return repeated(search_step, newton, (s, sample, E, rho, eps), state, rare)
+        best = repeated(search_step, newton, (s, sample, E, rho, eps), state, False)
+        if interior:
+            begun = Interior.begin(best)
+            begun = replace(begun, open=begun.open & first)
+            best = repeated(interior_step, interior, (s, sample, E, fixed, eps), begun, True)
+        return best, None
 
-    best = polished(judged(eps, s, sample, u, y), False)
-    if interior:
-        state = Interior.begin(best)
-        best = repeated(interior_step, interior, (s, sample, E, fixed, eps), state, True)
-        # Weights of rows that are held grow until rounding stops the search; Newton's are bounded.
-        best = polished(best, True)
+    best = judged(eps, s, sample, u, y)
+    # Weights of rows that are held grow until rounding stops the interior point method; Newton's
+    # are bounded. As a loop, so that both are compiled once.
+    rounds = jnp.arange(2 if interior else 1) == 0
+    best, _ = jax.lax.scan(round_, best, rounds)
     return best.z, best.y

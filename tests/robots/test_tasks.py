@@ -231,20 +231,22 @@ class TestClosedLoops:
             jm.simulate(law, robot, x0, 3, reference=np.zeros(5))
 
 
+@pytest.mark.slow
 def test_a_plan_has_derivatives_with_respect_to_masses(arm, x64):
-    robot, mpc, x0, u0, aim = arm
-    hard = replace(aim, target=TestClosedLoops().goals(arm)[0])
+    robot, mpc, x0, u0, _ = arm
+    mpc = replace(mpc, Q=np.diag([10.0, 10.0, 0.1, 0.1]), terminal_cost=np.eye(4))
+    masses = jnp.asarray(robot.mujoco.body_mass)
 
     def solution(factor):
-        model = RobotModel(robot, {"body_mass": factor * jnp.asarray(robot.mujoco.body_mass)})
+        problem = NonlinearMPC(mpc, RobotModel(robot, {"body_mass": factor * masses}))
         plan = solve_nonlinear(
-            NonlinearMPC(mpc, model, (hard,)), x0 + 0.1, x0, input_reference=u0,
-            hessian="gauss-newton",
+            problem, x0 + 0.1, x0, input_reference=u0, hessian="gauss-newton",
+            solver=jm.ADMM(eps=1e-8),
         )  # fmt: skip
         return plan.inputs.ravel(), plan.status
 
     J, status = jax.jacfwd(solution, has_aux=True)(1.0)
     assert status == jm.Status.SOLVED
-    h = 1e-4
+    h = 1e-3
     difference = (solution(1 + h)[0] - solution(1 - h)[0]) / (2 * h)
-    np.testing.assert_allclose(J, difference, atol=2e-3 * np.abs(J).max())
+    np.testing.assert_allclose(J, difference, atol=1e-3 * np.abs(J).max())
