@@ -128,8 +128,9 @@ def run(s: Settings) -> None:
     shift = s.spread * rng.uniform(-1, 1, (s.loops, len(home)))
     shift[:, nv:] *= 4
     low, high = np.asarray(robot.state_limits.lower), np.asarray(robot.state_limits.upper)
-    middle, half = np.where(np.isfinite(high - low), (low + high) / 2, home), (high - low) / 2
-    half = 0.9 * np.where(np.isfinite(half), half, 10.0)
+    bounded = np.isfinite(low) & np.isfinite(high)
+    low, high = np.where(bounded, low, home - 10.0), np.where(bounded, high, home + 10.0)
+    middle, half = (low + high) / 2, 0.9 * (high - low) / 2
     starts = np.clip(home + shift, middle - half, middle + half)
     starts = np.array([robot.state(xi) for xi in starts])
     every = laws(s, robot)

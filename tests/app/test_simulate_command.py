@@ -72,6 +72,7 @@ def rows(out):
     return {line[2:16].strip(): line[16:].strip() for line in lines}
 
 
+@pytest.mark.slow
 def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
     """Ctrl-C in the second chunk loses that chunk only; the table is that of the states."""
     real, asked = robot_runs.simulate_many, []

@@ -235,6 +235,7 @@ def test_exponents_of_the_upper_half():
     assert found["n"]["seconds"] == pytest.approx(2)
 
 
+@pytest.mark.slow
 def test_growth_ends_where_memory_does(monkeypatch, tmp_path):
     from jaxmpc.app.plots.bench import plot_growth
     from jaxmpc.bench import growth

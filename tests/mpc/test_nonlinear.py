@@ -147,6 +147,7 @@ class TestSolution:
         distance = np.sum(np.asarray(plan.states) ** 2, 1)[1:]
         assert distance.min() > 1 - 1e-6 and np.sum(distance < 1 + 1e-6) >= 2
 
+    @pytest.mark.slow
     def test_weights_as_matrix_vector_and_number_agree(self, x64):
         costs = []
         for weight in (3.0, [3.0, 3.0], 3.0 * np.eye(2)):
@@ -224,6 +225,7 @@ class TestDerivatives:
             difference = (inputs(theta + step)[0] - inputs(theta - step)[0]) / (2 * h)
             np.testing.assert_allclose(J[:, i], difference, atol=2e-4 * (1 + np.abs(J).max()))
 
+    @pytest.mark.slow
     def test_of_a_number_of_the_model(self, x64):
         x0 = jnp.array([0, 2.8, 0, 0])
 

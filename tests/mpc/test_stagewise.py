@@ -226,6 +226,7 @@ def test_stage_weights():
         replace(mpc, stage_weights=s[:3]).validate()
 
 
+@pytest.mark.slow
 def test_fixed_count_of_newton_steps():
     """By default those of the interior point method are the most."""
     early, all_of_them = (

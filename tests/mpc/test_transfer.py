@@ -161,6 +161,7 @@ def test_problems_that_do_not_qualify(mpc):
             assert not transfer.transferable(Controller(in_float64(other)))
 
 
+@pytest.mark.slow
 def test_rates_in_the_state(few):
     """The previous input is a coordinate, and counts in the cost."""
     base = problems.joint(6)

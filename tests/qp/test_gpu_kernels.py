@@ -151,6 +151,7 @@ def test_damped_systems_in_a_kernel_are_those_of_xla(x64):
 SOLVER = jm.ADMM(refine=1001)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("soft", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_plans_by_kernels_are_those_without(soft, x64, monkeypatch):
     """Statuses of infeasible states too."""

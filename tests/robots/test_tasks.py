@@ -127,13 +127,13 @@ class TestFunctions:
 
     def test_of_no_turn_has_a_derivative(self, two, x64):
         model, xi = RobotModel(two), np.zeros(two.n)
-        data = model.view(xi, np.zeros(two.m))
+        data = jax.jit(model.view)(xi, np.zeros(two.m))
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, np.ravel(data.site_xmat[0]))
         function = tasks.orientation(two, "tip", quaternion)
         turn = lambda xi: function(model.view(xi, jnp.zeros(two.m)))
-        np.testing.assert_allclose(turn(xi), 0, atol=1e-12)
-        J = jax.jacfwd(turn)(jnp.asarray(xi))
+        np.testing.assert_allclose(jax.jit(turn)(xi), 0, atol=1e-12)
+        J = jax.jit(jax.jacfwd(turn))(jnp.asarray(xi))
         np.testing.assert_allclose(J[:, 0], np.array([0, 0.2, 1]) / np.hypot(0.2, 1), atol=1e-9)
 
     def test_torques_are_of_the_inputs(self, two, x64):
@@ -180,6 +180,7 @@ class TestClosedLoops:
             found.append(data.site_xpos[0][[0, 2]].copy())
         return np.array(found)
 
+    @pytest.mark.slow
     def test_each_robot_reaches_a_target_of_its_own(self, arm, x64):
         robot, mpc, x0, u0, aim = arm
         law = jm.RobotController(robot, mpc, linearize="trajectory", tasks=(aim,))
