@@ -49,7 +49,8 @@ class Plan:
     in the order of `mpc.soft`, zero at steps where a row does not hold.
     Unless the status is SOLVED, cost and trajectory are those of the best iterate and mean little.
     The status is that of the QP (`jaxmpc.Status`); residuals are those of the condensed QP in
-    the units of states and inputs. iterations: ADMM steps. A plan serves as warm start.
+    the units of states and inputs. iterations: ADMM steps, of `solve_nonlinear` quadratic programs.
+    A plan serves as warm start.
     """
 
     states: Array

@@ -79,6 +79,8 @@ STEPS = 100
 DECREASE, SHORTEST = 1e-4, 1e-4
 # A multiplier above which a row counts as held.
 HELD = 1e-6
+# The fields of `Stages` that a Hessian fills.
+QUADRATIC = ("Q", "R", "P", "cross")
 
 
 def solve_nonlinear(
@@ -103,8 +105,8 @@ def solve_nonlinear(
     with the number of QPs as `iterations`. `jax.vmap` over x0, references, targets, warm starts and
     the arrays of the problem; an instance leaves the batch when it is solved. Derivatives are those
     of the solution (implicit function theorem, exact second derivatives), with respect to all
-    arrays of the problem and x0, where the plan is SOLVED. Raises ValueError for wrong shapes, and
-    for what `solve_stagewise` does not support.
+    arrays of the problem and x0, where the plan is SOLVED and a strict minimum, and finite numbers
+    elsewhere. Raises ValueError for wrong shapes, and for what `solve_stagewise` does not support.
     """
     require_kind("problem", problem, NonlinearMPC)
     problem.validate()
@@ -323,8 +325,12 @@ def nonlinear_conditions(
     s, sample = data
     lam = costates(s, sample, u, s.bounds.admissible(y))
     exact = curved(s, base, problem, aims, sample.states, u, lam, y)
-    bent = {name: getattr(exact, name) for name in ("Q", "R", "P", "cross")}
-    bent = jax.lax.stop_gradient(bent)
+    # Elsewhere than at a strict minimum, as where the search has not ended, the exact one has no
+    # solution: NaN would spoil the sums of a batch.
+    strict = convex_with(exact, held(s, E, y))
+    pairs = ((getattr(exact, name), getattr(with_cross(s), name)) for name in QUADRATIC)
+    chosen = (jnp.where(strict, *pair) for pair in pairs)
+    bent: dict[str, Any] = jax.lax.stop_gradient(dict(zip(QUADRATIC, chosen, strict=True)))
     conditions, undo = stage_conditions((replace(s, **bent), sample), (E, rho), u, y)
     return lambda data: conditions((replace(data[0], **bent), data[1])), undo
 
@@ -349,9 +355,7 @@ def sqp_step(most: int, hessian: str, constants: tuple, state: Iterate) -> Itera
     exact = jnp.asarray(False)
     if hessian == "exact":
         curved_s = curved(s, base, problem, aims, x, u, costates(s, sample, u, y), y)
-        # A row held has a multiplier; soft ones past their limits have no curvature.
-        held = E**2 * (jnp.abs(y) > HELD) * (jnp.abs(y) < weights_of(s))
-        exact = state.exact & convex_with(curved_s, Constants.of(x.dtype).linear * held)
+        exact = state.exact & convex_with(curved_s, held(s, E, y))
         s = jax.tree.map(lambda a, b: jnp.where(exact, a, b), curved_s, with_cross(s))
     fixed = jnp.where(E == 0, s.bounds.penalty_gradient(s.rows(x, u)), 0.0)
     u_qp, y_qp, usable = precisely(solved_qp, s, sample, E, rho, fixed, eps, u, y, exact)
@@ -404,9 +408,13 @@ def with_cross(s: Stages) -> Stages:
     return replace(s, cross=cross if s.cross is None else s.cross)
 
 
-def weights_of(s: Stages) -> Array:
-    """Return the multipliers (rows,) at which soft rows give way, inf for hard rows."""
-    return jnp.full_like(s.lower, jnp.inf) if s.linear is None else s.linear * (1 - 1e-6)
+def held(s: Stages, E: Array, y: Array) -> Array:
+    """Return large weights (rows,) for the rows that multipliers y hold at their limits, 0 for
+    others: soft rows beyond their limits give way."""
+    active = jnp.abs(y) > HELD
+    if s.linear is not None:
+        active = active & (jnp.abs(y) < (1 - 1e-6) * s.linear)
+    return Constants.of(y.dtype).linear * E**2 * active
 
 
 def convex_with(s: Stages, weights: Array) -> Array:

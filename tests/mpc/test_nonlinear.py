@@ -272,6 +272,22 @@ class TestBatches:
             alone = solve_nonlinear(around(), starts[i], GOAL)
             np.testing.assert_allclose(plans.inputs[i], alone.inputs, atol=1e-6)
 
+    def test_unsolved_ones_leave_the_shared_gradient_finite(self, x64):
+        """One start cannot leave the disc, one is not finite."""
+        starts = jnp.array([[-2.0, 0.1], [0.05, 0.0], [jnp.nan, 0.0]])
+        slow = jm.Box([-0.6, -0.6], [0.6, 0.6])
+
+        def loss(weight, starts):
+            problem = around()
+            mpc = replace(problem.mpc, R=weight * jnp.eye(2), inputs=slow)
+            plans = jax.vmap(lambda x: solve_nonlinear(replace(problem, mpc=mpc), x, GOAL))(starts)
+            return jnp.sum(jnp.where(jnp.isnan(plans.inputs), 0.0, plans.inputs) ** 2), plans.status
+
+        gradient, status = jax.grad(loss, has_aux=True)(1.0, starts)
+        expected = [SOLVED, jm.Status.ITERATION_LIMIT, jm.Status.NON_FINITE]
+        np.testing.assert_array_equal(status, expected)
+        assert np.isfinite(gradient)
+
     def test_float32(self):
         plan = solve_nonlinear(around(), START.astype(np.float32), GOAL.astype(np.float32))
         with jax.enable_x64(True):
