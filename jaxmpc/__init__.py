@@ -2,6 +2,7 @@
 
 Problems       LinearSystem, MPC, Box, Polytope, Ellipsoid, Outputs, Soft, joint_limits, design
 Plans          solve, solve_many, Controller -> Plan, Status; solve_qp of a QP by ADMM
+Nonlinear      mpc.NonlinearMPC, mpc.Task, mpc.solve_nonlinear
 Closed loops   load_robot, LinearPlant, robot_mpc, RobotController, simulate, simulate_many
 Proofs         map_feasible_set, boundary, feasible_polytope, recursive_feasibility,
                verify_terminal, exact_penalty, offline_report

@@ -5,8 +5,8 @@ functions affine, the cost of weighed functions |g − target|²_W by Gauss and 
 2 G'W(g − target), Hessian 2 G'WG with G the Jacobian of g. All quadratic terms stand about the
 trajectory itself, so the gradient there is that of the true cost.
 
-For derivatives of a solution the Hessian of the Lagrangian takes the place of Gauss and Newton's,
-stage by stage: with the costates λ and the multipliers y of the functions' rows
+Near a solution, and for its derivatives, the Hessian of the Lagrangian takes the place of Gauss and
+Newton's, stage by stage: with the costates λ and the multipliers y of the functions' rows
 
     ½ ∇²[ℓ_k(x, u) + λ_{k+1}'f(x, u) + y_k'g(x, u)].
 """
