@@ -3,7 +3,7 @@
 MPC, Outputs, Soft    a problem, with rows of outputs and soft rows
 solve, Controller     one plan, or a factored law u = controller(x) -> Plan with Multipliers
 solve_stagewise       one plan, factored along the horizon
-NonlinearMPC, Task    a problem with a nonlinear model, costs and limits on functions
+NonlinearMPC, Task    a problem with a nonlinear model, costs and limits on functions of a Point
 solve_nonlinear       its plan by sequential quadratic programming
 solve_many            one plan for each of many states -> Plan with a batch axis
 WarmStart             where a solver begins: states, inputs, multipliers
