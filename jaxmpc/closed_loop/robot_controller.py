@@ -206,7 +206,8 @@ def prepared(
     soft = soften(mpc, penalty)
     if linearize == "set-point":
         return {"soft": arrays(soft), "fixed": Controller(soft, solver), "scale": None}
-    NonlinearMPC(soft, as_model(robot), tuple(tasks)).validate()
+    if linearize == "trajectory":
+        NonlinearMPC(soft, as_model(robot), tuple(tasks)).validate()
     # Rows of tasks differ from state to state.
     scale = None if tasks else factor_stages(soft, soft.system, solver).E
     return {"soft": arrays(soft), "fixed": None, "scale": scale}

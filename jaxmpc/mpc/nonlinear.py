@@ -155,7 +155,7 @@ class NonlinearMPC:
 
     def sizes(self) -> list[int]:
         """Return how many numbers the function of each task gives."""
-        return [shape[0] for shape in self._shapes()[1]]
+        return [shape[0] for shape in self._shapes()[1]] if self.tasks else []
 
     def _shapes(self) -> tuple[tuple[int, ...], list[tuple[int, ...]]]:
         leaves, tree = jax.tree.flatten(self)

@@ -179,11 +179,11 @@ def _solve(
         if solver.admm_steps():
             gains = jax.tree.map(lambda v: v[None], riccati(s, rho * E**2))
         factor = StageFactor(s, E, rho[None], gains, fault)
-        fixed = jax.lax.stop_gradient((factor, sample, solver, WarmStart(x, u, y)))
-        u, y = solution(*fixed)
+        given = factor, sample, solver, WarmStart(x, u, y)
         if solver.differentiate == "unrolled":
-            u, y = solution(factor, sample, solver, WarmStart(x, u, y))
+            u, y = solution(*given)
         else:
+            u, y = solution(*jax.lax.stop_gradient(given))
             u, y = implicit(stage_conditions, (s, sample), (E, rho), u, y)
     else:
         terms = nonlinear_residuals
