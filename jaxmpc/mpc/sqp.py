@@ -169,7 +169,8 @@ def _solve(
         constants = jax.lax.stop_gradient((base, problem, aims, scale, eps))
         start = Iterate.begin(*jax.lax.stop_gradient((x, u, y)))
         is_open = lambda state: state.open
-        last = repeat_while(is_open, partial(sqp_step, steps, hessian), constants, start, rare=True)
+        step = partial(sqp_step, steps, hessian)
+        last = repeat_while(is_open, step, constants, start, steps="stages")
         x, u, y, count = last.x, last.u, last.y, last.steps
     s, sample = expanded(base, problem, aims, x, u)
     E, rho = scales(jax.lax.stop_gradient(s), scale)

@@ -425,20 +425,20 @@ def refined(
     good enough `interior` interior point steps and Newton steps again, at most; constant: always
     as many."""
 
-    def repeated(step: Callable, most: int, constants: tuple, state: Any, rare: bool) -> Pair:
+    def repeated(step: Callable, most: int, constants: tuple, state: Any) -> Pair:
         step = partial(step, most)
         if constant:
             again = lambda state, _: (step(constants, state), None)
             return jax.lax.scan(again, state, length=most)[0].best
-        return repeat_while(lambda state: state.open, step, constants, state, rare).best
+        return repeat_while(lambda state: state.open, step, constants, state, "stages").best
 
     def round_(best: Pair, first: Array) -> tuple[Pair, None]:
         state = Search(best.z, best.y, best, jnp.int32(0), ~(best.near | best.solved))
-        best = repeated(search_step, newton, (s, sample, E, rho, eps), state, False)
+        best = repeated(search_step, newton, (s, sample, E, rho, eps), state)
         if interior:
             begun = Interior.begin(best)
             begun = replace(begun, open=begun.open & first)
-            best = repeated(interior_step, interior, (s, sample, E, fixed, eps), begun, True)
+            best = repeated(interior_step, interior, (s, sample, E, fixed, eps), begun)
         return best, None
 
     best = judged(eps, s, sample, u, y)

@@ -8,7 +8,7 @@ number of steps, not of the largest. Nothing returns to the host in between.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +16,15 @@ import numpy as np
 from jax import Array, lax
 from jax.custom_batching import custom_vmap
 
+# Of a loop: see `repeat_while`.
+Steps = Literal["short", "long", "stages"]
 # Instances in a block on a CPU, whose data stay within the cache. (On GPUs blocks gain nothing.)
 BLOCK = 128
 # Instances in a group on a CPU at most, and when fewer are open; small batches are one group.
 PART_CPU, FEW_CPU, SMALL_CPU = 512, 64, 128
-# The same of loops with long steps, or that few instances of a batch enter.
-RARE_PART_CPU, RARE_FEW_CPU = 64, 8
+# The same of loops with long steps, or that few instances of a batch enter. (One core, 64 arms of 7
+# joints: 8.8 s in one group of 64, 6.4 in groups of 16, 4.9 of 8, 4.6 of 4, 7.0 one by one.)
+RARE_CPU = 8
 # Instances in a group elsewhere: a quarter of the batch; when fewer are open a sixteenth of that,
 # and so on, but not below LEAST, where a step costs little more than its launches. (H100,
 # TurboMPC's problem, 4,096 at once: 2.6 µs a solve in one group, 1.6 in groups of 512, 1.2 of 1,024
@@ -33,15 +36,15 @@ LARGE = 16_384
 LONG = 65_536
 
 
-def group_sizes(batch: int, rare: bool = False) -> list[int]:
-    """Return the sizes of the groups of a batch, from the largest."""
+def group_sizes(batch: int, steps: Steps = "short") -> list[int]:
+    """Return the sizes of the groups of a batch, from the largest; `steps` as in `repeat_while`."""
     if jax.default_backend() == "cpu":
-        part, few = (RARE_PART_CPU, RARE_FEW_CPU) if rare else (PART_CPU, FEW_CPU)
-        small = RARE_PART_CPU if rare else SMALL_CPU
-        return [batch] if batch <= small else [min(batch, part), few]
+        if steps != "short":
+            return [min(batch, RARE_CPU)]
+        return [batch] if batch <= SMALL_CPU else [min(batch, PART_CPU), FEW_CPU]
     if batch <= PART * LEAST:
         return [batch]
-    sizes = [-(-batch // PART)]
+    sizes = [batch if steps == "stages" else -(-batch // PART)]
     while sizes[-1] > LEAST:
         sizes.append(max(-(-sizes[-1] // SMALLER), LEAST))
     return sizes
@@ -86,13 +89,15 @@ def in_blocks(
 
 
 def repeat_while(
-    is_open: Callable, step: Callable, constants: Any, state: Any, rare: bool = False
+    is_open: Callable, step: Callable, constants: Any, state: Any, steps: Steps = "short"
 ) -> Any:
     """Return `state` after state = step(constants, state) while is_open(state), a scalar.
 
     The functions must close over no arrays: what they read stands in `constants`. One instance is
     one `while_loop`. A batch, also one of nested `vmap`s, is worked off in groups (top of this
-    file). rare: few instances are open at first, or a step takes long. Not differentiable.
+    file). steps: "long" where a step takes long or few instances are open at first; "stages" where
+    it is a recursion over stages, which on a GPU takes as long for 4,096 instances as for 1,024.
+    Not differentiable.
     """
     one = lambda constants, state: lax.while_loop(is_open, lambda s: step(constants, s), state)
     single = custom_vmap(one)
@@ -102,14 +107,14 @@ def repeat_while(
         leaves, tree = jax.tree.flatten(constants)
         batched = tuple(jax.tree.leaves(in_batched[0]))
         state = _broadcast(size, in_batched[1], state)
-        out = _in_groups(is_open, step, tree, batched, rare)(tuple(leaves), state)
+        out = _in_groups(is_open, step, tree, batched, steps)(tuple(leaves), state)
         return out, jax.tree.map(lambda _: True, out)
 
     return single(constants, state)
 
 
 def _in_groups(
-    is_open: Callable, step: Callable, tree: Any, batched: tuple[bool, ...], rare: bool
+    is_open: Callable, step: Callable, tree: Any, batched: tuple[bool, ...], steps: Steps
 ) -> Callable:
     """Return the loop for a batch, (leaves of the constants, states) → states. batched: which
     leaves have the batch axis."""
@@ -138,7 +143,7 @@ def _in_groups(
             put = lambda old, new: old.at[where].set(new, mode="drop")
             return jax.tree.map(put, state, found)
 
-        counts = group_sizes(size, rare)
+        counts = group_sizes(size, steps)
         for count, least in zip(counts, [*counts[1:], 0], strict=True):
             more = partial(lambda least, state: jnp.sum(open_ones(state)) > least, least)
             state = lax.while_loop(more, partial(group, count), state)

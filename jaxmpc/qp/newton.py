@@ -324,7 +324,7 @@ def approximate(
 
     many = (jnp.sum(active) > most) | flat
     state = weights, b, reduced, many
-    return repeat_while(lambda s: s[3], by_blocks, (H, A), state, rare=True)[2]
+    return repeat_while(lambda s: s[3], by_blocks, (H, A), state, steps="long")[2]
 
 
 def dense_steps(rho: float, constants: tuple, data: tuple) -> tuple[Array, Array]:

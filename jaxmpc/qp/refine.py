@@ -146,7 +146,7 @@ def improve(
         s = lax.scan(partial(still_open, refine, constants), s, length=length)[0]
     else:
         step = partial(by_multipliers, refine)
-        s = repeat_while(lambda s: s.open, step, constants, s, rare=True)
+        s = repeat_while(lambda s: s.open, step, constants, s, steps="long")
     return s.best, s.proof, jnp.asarray(True)
 
 
@@ -174,7 +174,7 @@ def by_the_dual(p: Program, y: Array, go_on: Array, most: int) -> tuple[Pair, Ar
     best, gradient = judged(p, point.w, point.y)
     best = replace(best, solved=best.solved | best.near)
     start = Correction(point, gradient, best, jnp.int32(0), optimal & ~best.solved)
-    end = repeat_while(lambda s: s.open, partial(correction, first), p, start, rare=True)
+    end = repeat_while(lambda s: s.open, partial(correction, first), p, start, steps="long")
     return end.best, end.point.y
 
 
