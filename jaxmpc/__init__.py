@@ -154,6 +154,10 @@ HOMES = {
 
 def __getattr__(name: str) -> Any:
     """Import a name when it is first used."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version(__name__)
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     home = next((home for home, names in HOMES.items() if name in names.split()), None)

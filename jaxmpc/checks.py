@@ -1,7 +1,8 @@
 """Input checks of public functions, made before anything compiles.
 
 Inside `jit`, `vmap` or `grad` an array has a shape but no value: shapes are checked there, values
-are not (a solver reports bad values of a batch by its status).
+are not (a solver reports bad values of a batch by its status). JAX is imported where it is needed:
+the command's help does without it.
 """
 
 import difflib
@@ -12,8 +13,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 # Counts are 32-bit integers in compiled programs.
@@ -82,6 +81,8 @@ def in_units(count: float) -> str:
 
 def concrete(*values: Any) -> bool:
     """Return True when no value is being traced, so that all can be read."""
+    import jax
+
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
@@ -120,6 +121,8 @@ def number(argument: str, value: Any, least: float, cure: str) -> None:
 
 def require_shape(argument: str, value: Any, shape: tuple[int, ...], cure: str) -> None:
     """Raise unless `value` holds real numbers and has exactly this shape."""
+    import jax.numpy as jnp
+
     require_real(argument, value)
     given = np.shape(value if concrete(value) else jnp.asarray(value))  # lists of traced numbers
     if given != shape:

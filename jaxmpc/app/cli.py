@@ -1,5 +1,6 @@
 """The command `jaxmpc`: parse the command line, run the subcommand, and report how it ended."""
 
+import ast
 import contextlib
 import importlib
 import io
@@ -9,14 +10,14 @@ import signal
 import sys
 import types
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields, make_dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import tyro
 
-from jaxmpc.app.commands.options import report_error
+from jaxmpc.app.report import report_error
 from jaxmpc.checks import fail, nearest
 
 # Module and class of each command: only the one that is called is imported.
@@ -31,6 +32,7 @@ COMMANDS = {
 DESCRIPTION = "Constrained MPC in batches, with proofs. Also: jaxmpc --version"
 # Options of tyro that write a completion script for a shell, and the words that each needs.
 COMPLETIONS = {"--tyro-print-completion": 2, "--tyro-write-completion": 3}
+TUNE = "Learn what is usually guessed: an MPC's weights, or the penalties of its solver."
 TUNERS = {"weights": ("tune", "TuneWeights"), "penalties": ("tune_penalties", "TunePenalties")}
 
 
@@ -77,11 +79,16 @@ def parse(argv: Sequence[str]) -> Any:
         known = [*table, *(["tune"] if table is COMMANDS else [])]
         given = f"no command {first!r}" if words else "no command given"
         fail(prog, given, f"{nearest(first, known)}There are {', '.join(known)}; see {prog} --help")
-    described = [_described(name, _class(*where)) for name, where in table.items()]
+    # A list of the commands needs none of their options, hence neither JAX nor their modules.
+    listed = lambda module, kind: make_dataclass(kind, ())
+    options = listed if first in ("-h", "--help") else _class
+    described = [
+        _described(name, options(*where), first_line(*where)) for name, where in table.items()
+    ]
     if table is COMMANDS:
-        described.append(_described("tune", Tune))
+        described.append(_described("tune", make_dataclass("Tune", ()), TUNE))
     choice: Any = Union[tuple(described)]  # noqa: UP007
-    text = Tune.__doc__ if table is TUNERS else DESCRIPTION
+    text = TUNE if table is TUNERS else DESCRIPTION
     return tyro.cli(choice, prog=prog, description=text, args=words)
 
 
@@ -138,16 +145,20 @@ def described_type(kind: Any) -> str:
     return {int: "a whole number", float: "a number", Path: "a path"}.get(kind, "a text")
 
 
-@dataclass(frozen=True)
-class Tune:
-    """Learn what is usually guessed: an MPC's weights, or the penalties of its solver."""
-
-
 def _class(module: str, name: str) -> Any:
     """Import a command's module and return its class."""
     return getattr(importlib.import_module(f"jaxmpc.app.commands.{module}"), name)
 
 
-def _described(name: str, kind: Any) -> Any:
-    """Return the class as a subcommand that the first line of its docstring describes."""
-    return Annotated[kind, tyro.conf.subcommand(name, description=kind.__doc__.splitlines()[0])]
+def first_line(module: str, name: str) -> str:
+    """Return the first line of the docstring of a command's class, read from its source: to import
+    the module would take seconds."""
+    source = (Path(__file__).parent / "commands" / f"{module}.py").read_text(encoding="utf-8")
+    classes = (node for node in ast.parse(source).body if isinstance(node, ast.ClassDef))
+    found = next(node for node in classes if node.name == name)
+    return (ast.get_docstring(found) or "").partition("\n")[0]
+
+
+def _described(name: str, kind: Any, text: str) -> Any:
+    """Return the class as a subcommand with this description."""
+    return Annotated[kind, tyro.conf.subcommand(name, description=text)]

@@ -422,6 +422,17 @@ def test_ctrl_c_is_one_line_from_the_first_import_on(options, sign, answer):
     assert "Traceback" not in err
 
 
+@pytest.mark.parametrize("words", [["--help"], ["--version"], ["tune", "--help"], ["swep"]])
+def test_help_and_version_do_without_jax(words):
+    code = (
+        "import sys; from jaxmpc.app import cli\n"
+        f"try: cli.main({words})\nexcept SystemExit: pass\n"
+        "print(sorted({'jax', 'mujoco', 'zarr', 'xarray', 'matplotlib'} & set(sys.modules)))"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said.stdout.splitlines()[-1] == "[]"
+
+
 def test_version_and_module_entry():
     command = [sys.executable, "-m", "jaxmpc", "--version"]
     out = subprocess.run(command, capture_output=True, text=True, check=True).stdout

@@ -12,10 +12,10 @@ import numpy as np
 import tyro
 
 from jaxmpc.checks import MOST_COUNT, fail
-from jaxmpc.robots.robot import Robot
 
 if TYPE_CHECKING:
     from jaxmpc.feasible.store import Store
+    from jaxmpc.robots.robot import Robot
 
 
 def option(metavar: str | None, default: str, text: str | None = None) -> Any:
@@ -147,18 +147,12 @@ def open_folder(path: Path, *files: str) -> None:
         fail(f"--output {path}", f"{error.strerror}", "Give a folder you can write to")
 
 
-def report_error(error: Exception) -> int:
-    """Print one line on stderr and return the exit code, 2."""
-    print(f"jaxmpc: error: {' '.join(str(error).split())}", file=sys.stderr)
-    return 2
-
-
 def print_table(rows: list[tuple[str, Any]], width: int) -> None:
     """Print names and values, one pair a line."""
     print("\n".join(f"  {name:<{width}} {value}" for name, value in rows))
 
 
-def model_hash(robot: Robot) -> str:
+def model_hash(robot: "Robot") -> str:
     """Return a hash of the compiled model, by which --resume notices a changed file."""
     import mujoco
 

@@ -23,7 +23,6 @@ from jaxmpc.app.commands.options import (
     check_results,
     option,
     refuse,
-    report_error,
 )
 from jaxmpc.app.commands.tuning import (
     CHECKPOINT,
@@ -34,6 +33,7 @@ from jaxmpc.app.commands.tuning import (
 )
 from jaxmpc.app.commands.tuning_report import save_results
 from jaxmpc.app.commands.tuning_task import TuningTask, linear_task, robot_task
+from jaxmpc.app.report import report_error
 from jaxmpc.checks import fail
 from jaxmpc.compiled import Compiled
 from jaxmpc.tuning.result import Interrupted, TuningRun

@@ -20,7 +20,6 @@ from jaxmpc.app.commands.options import (
     check_counts,
     check_positive,
     option,
-    report_error,
 )
 from jaxmpc.app.commands.tuning import (
     CHECKPOINT,
@@ -33,6 +32,7 @@ from jaxmpc.app.commands.tuning import (
     start_range,
 )
 from jaxmpc.app.plots.tuning import plot_penalties
+from jaxmpc.app.report import report_error
 from jaxmpc.checks import fail, require_memory
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import solve
