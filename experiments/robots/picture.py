@@ -1,7 +1,7 @@
 """One picture of robots in motion, from a run of `jaxmpc simulate`.
 
     jaxmpc simulate --robot arm7 --count 4 --seconds 1 --output runs/a
-    python experiments/robots/picture.py runs/a --time 0.2 --output arms.png
+    python experiments/robots/picture.py runs/a --time 0.2 --output docs/assets/arms.png
 
 The robots are those with the lowest numbers whose states are finite. Without a display set
 MUJOCO_GL=egl.

@@ -1,0 +1,259 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: py:percent,ipynb
+#   kernelspec:
+#     display_name: Python 3
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Feasible sets
+#
+# From which initial states can an MPC controller keep all its limits? You will map this set for
+# the robot joint, enclose its area between two bounds that meet at 1489/125, and check two of the
+# proofs behind the map yourself, in exact arithmetic.
+
+# %%
+import subprocess
+import sys
+import tempfile
+from fractions import Fraction
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+
+import jaxmpc as jm
+
+# %% [markdown]
+# ## The map
+#
+# The joint of notebook 00, with 20 steps of 0.01 s. The feasible set $\mathcal X_N$ holds the
+# states $x_0$ for which there are inputs $u_0, \dots, u_{N-1}$ that keep all limits. The cost plays
+# no role. We label a grid that extends somewhat beyond the limits.
+
+# %%
+T, J = 0.01, 0.05
+A, B = np.array([[1.0, T], [0.0, 1.0]]), np.array([[0.0], [T / J]])
+system = jm.LinearSystem(
+    A,
+    B,
+    dt=T,
+    state_names=("q", "dq"),
+    state_units=("rad", "rad/s"),
+    input_names=("torque",),
+    input_units=("N m",),
+)
+limits, torque = jm.Box([-1.5, -2.0], [1.5, 2.0]), jm.Box([-2.0], [2.0])
+Q, R = np.diag([50.0, 1.0]), np.array([[0.1]])
+mpc = jm.MPC(system, Q, R, horizon=20, states=limits, inputs=torque, terminal_cost=Q)
+
+shape = (64, 64)
+x0s = jm.grid([-1.6, -2.1], [1.6, 2.1], shape)
+fmap = jm.map_feasible_set(mpc, x0s)
+print(fmap.counts())
+assert fmap.counts()["undecided"] == 0
+
+# %% [markdown]
+# Every state has one of three labels: 1, proved feasible; −1, proved infeasible; 0, undecided.
+#
+# The labels give more than a picture. The feasible set is convex, so the convex hull of all states
+# proved feasible lies inside it: an inner bound. Each infeasible state comes with a half-space
+# $a'x \le b$ that holds on the whole feasible set; the intersection of all these is an outer bound.
+
+# %%
+low, high = fmap.volume_bounds()
+print(f"area between {low:.3f} and {high:.3f} rad·rad/s")
+assert low < 1489 / 125 < high
+
+# %% [markdown]
+# `refine()` closes the gap. It sends rays through the vertices of the outer polygon; each ray ends
+# at a boundary point and adds the half-space that stops it.
+
+# %%
+fmap = fmap.refine()
+low, high = fmap.volume_bounds()
+print(f"area between {low:.9f} and {high:.9f} rad·rad/s; 1489/125 = {1489 / 125}")
+assert low <= 1489 / 125 <= high and (high - low) / high < 1e-6
+
+
+# %%
+def draw(label, title, outline=True):
+    """Draw labels on the grid, and the outline of the feasible set."""
+    figure, axis = plt.subplots(figsize=(6, 3.8), layout="constrained")
+    for value, color, name in ((-1, "#dddcd8", "infeasible"), (1, "#9fcbe6", "feasible")):
+        axis.plot(*x0s[label == value].T, "s", ms=4, color=color, label=name)
+    if outline:
+        corners = fmap.outer().vertices()
+        corners = np.vstack([corners, corners[:1]])
+        axis.plot(*corners.T, color="#d55e00", lw=1.5, label="boundary")
+    axis.set(xlabel="q [rad]", ylabel="dq [rad/s]", title=title)
+    figure.legend(loc="outside right upper", fontsize=9)
+    return axis
+
+
+draw(fmap.label, "Initial states from which all limits can be kept")
+plt.show()
+
+# %% [markdown]
+# Almost all of the box of limits is feasible, but for two slivers: fast towards the upper stop,
+# and fast towards the lower one. Notebook 00 explained them by the braking distance. With full
+# torque the velocity falls by 0.4 rad/s in each step, so $\dot q = v$ needs
+#
+# $$q \le 1.5 - 0.01 \sum_{j \ge 0} \max(v - 0.4 j,\ 0).$$
+#
+# The area that this cuts off the box is an integral over $v$ from 0 to 2, twice. In fractions:
+
+# %%
+removed = Fraction(0)
+for j in range(5):  # the integral of max(v - 0.4 j, 0) from 0 to 2 is (2 - 0.4 j)^2 / 2
+    removed += Fraction(1, 100) * (2 - Fraction(2, 5) * j) ** 2 / 2
+area = 3 * 4 - 2 * removed
+print(f"exact area: {area}")
+assert area == Fraction(1489, 125)
+
+# %% [markdown]
+# ## What a proof is
+#
+# **Feasible.** The proof is a plan. Anybody can roll it out and compare with the limits. Every
+# floating-point number is a fraction, so that this can be done without rounding at all:
+
+# %%
+feasible = np.flatnonzero(fmap.label == 1)
+chosen = feasible[np.argmax(x0s[feasible] @ np.array([1.0, 0.5]))]  # fast, and close to the stop
+exact = np.vectorize(Fraction)
+A_exact, B_exact = exact(A), exact(B)
+x = exact(x0s[chosen])
+margin = Fraction(2)
+for u in exact(fmap.labels.plans[chosen]):
+    margin = min(margin, 2 - abs(u[0]), Fraction(1.5) - abs(x[0]), 2 - abs(x[1]))
+    x = A_exact @ x + B_exact @ u
+print(f"state {x0s[chosen].round(4)}: least distance to a limit {float(margin):.2e}")
+assert margin >= 0
+
+# %% [markdown]
+# **Infeasible.** The proof is a half-space. It comes from a Farkas vector (notebook 01): multiply
+# the constraints by it, and the inputs cancel. What is left is an inequality on $x_0$ that every
+# feasible state satisfies. Here is the half-space of a state that is within all limits:
+
+# %%
+infeasible = np.flatnonzero((fmap.label == -1) & np.all(np.abs(x0s) <= [1.5, 2.0], axis=1))
+worst = infeasible[np.argmax(x0s[infeasible] @ np.array([1.0, 0.5]))]
+a, b = fmap.labels.cut_normals[worst], fmap.labels.cut_offsets[worst]
+a, b = a / np.abs(a).max(), b / np.abs(a).max()
+print(f"state {x0s[worst].round(4)} violates {a[0]:.4f} q + {a[1]:.4f} dq <= {b:.4f}")
+assert a @ x0s[worst] > b
+assert np.all(x0s[feasible] @ a <= b + 1e-9)  # it holds for every feasible state of the map
+
+# %%
+axis = draw(fmap.label, "One half-space excludes many states", outline=False)
+velocity = np.linspace(0.5, 2.1, 2)
+axis.plot((b - a[1] * velocity) / a[0], velocity, color="#d55e00", lw=1.5)
+axis.plot(*x0s[worst], "o", color="#d55e00")
+axis.plot(*x0s[chosen], "o", color="#00486b")
+axis.annotate("plan", x0s[chosen], (-34, -16), textcoords="offset points", color="#00486b")
+axis.set(xlim=(1.2, 1.62), ylim=(0.5, 2.15))
+plt.show()
+
+# %% [markdown]
+# ## A failure: labels from a solver that stopped
+#
+# A tempting shortcut: run a solver for a fixed number of iterations, and call a state feasible if
+# the constraints are then violated by less than $10^{-3}$. We do that with 30 ADMM iterations and
+# no refinement.
+
+# %%
+short = jm.ADMM(iterations=30, refine=0)
+residual = jax.vmap(lambda x0: jm.solve(mpc, x0, solver=short).primal_residual)(x0s)
+guess = np.where(np.asarray(residual) <= 1e-3, 1, -1)
+missed = int(np.sum((guess == -1) & (fmap.label == 1)))
+wrongly = int(np.sum((guess == 1) & (fmap.label == -1)))
+print(f"feasible states called infeasible: {missed}; infeasible states called feasible: {wrongly}")
+assert missed > 0
+draw(guess, "Guessed from the residual after 30 iterations")
+plt.show()
+
+# %% [markdown]
+# Many feasible states are called infeasible. The reason is not a mistake of the solver: an iterate
+# converges towards the optimum from outside the constraints, and after 30 iterations it is not yet
+# there. A residual says something about an iterate; a label says something about a state. More
+# iterations make the picture better, but no number of them makes it a proof. The map avoids the
+# question: it labels a state only when it holds a plan or a half-space, and otherwise says
+# "undecided".
+
+# %% [markdown]
+# ## Checking a stored map
+#
+# `jaxmpc sweep` computes such a map from the command line and stores it with all proofs. `verify`
+# reads the stored file and proves every label again, by separate code and here in exact
+# arithmetic. Without a configuration file the command maps this joint.
+
+# %%
+with tempfile.TemporaryDirectory() as folder:
+    command = [sys.executable, "-m", "jaxmpc", "sweep", "--grid", "24", "24", "--output", folder]
+    done = subprocess.run([*command, "--overwrite"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    found = jm.feasible.verify(folder, exact=True)
+print(found.labels, "verified:", found.verified, "exactly:", found.exactly)
+assert found.passed and found.verified == sum(found.labels.values()) == 24 * 24
+
+# %% [markdown]
+# ## Exercises
+#
+# 1. A scalar system $x_{k+1} = x_k + u_k$ has $|u_k| \le u_{\max}$ and $|x_k| \le x_{\max}$ for all
+#    $k = 0, \dots, N$. A common answer is that $\mathcal X_N$ is
+#    $|x_0| \le x_{\max} + N u_{\max}$. Test it with $x_{\max} = 1$, $u_{\max} = 0.25$, $N = 4$.
+# 2. For which index set of the state limit is that answer right? (`constrained_steps`)
+# 3. What happens to the area of the joint's feasible set if the torque is halved? Predict it with
+#    the integral above, then compute it.
+
+# %% [markdown]
+# ### Answers
+#
+# **1.** The answer is wrong. The limit at $k = 0$ is a limit on $x_0$ itself, which no input can
+# change, so $|x_0| \le x_{\max}$ is necessary. It is sufficient too, with $u = 0$.
+
+
+# %%
+def scalar(steps):
+    """Return x+ = x + u with |x| <= 1 at these steps and |u| <= 0.25, for N = 4."""
+    return jm.MPC(
+        jm.LinearSystem(1.0, 1.0),
+        1.0,
+        1.0,
+        horizon=4,
+        states=jm.Box([-1.0], [1.0]),
+        inputs=jm.Box([-0.25], [0.25]),
+        constrained_steps=steps,
+    )
+
+
+def interval(steps):
+    """Return the largest x0 of the feasible set."""
+    return float(jm.feasible.feasible_polytope(scalar(steps)).vertices().max())
+
+
+print("limit at k = 0..4: x0 up to", round(interval((0, 1, 2, 3, 4)), 9))
+assert np.isclose(interval((0, 1, 2, 3, 4)), 1.0)
+
+# %% [markdown]
+# **2.** It is right if the limit holds at $k = N$ alone. With $k = 1, \dots, N$ there is one step
+# to come back, and the answer is $x_{\max} + u_{\max}$.
+
+# %%
+print("limit at k = 4 alone:", round(interval((4,)), 9))
+print("limit at k = 1..4:   ", round(interval((1, 2, 3, 4)), 9))
+assert np.isclose(interval((4,)), 1 + 4 * 0.25) and np.isclose(interval((1, 2, 3, 4)), 1.25)
+
+# %% [markdown]
+# **3.** The velocity falls by 0.2 rad/s in each step, so there are ten terms
+# $(2 - 0.2 j)^2 / 2$ in place of five. The slivers become larger.
+
+# %%
+removed = sum(Fraction(1, 100) * (2 - Fraction(1, 5) * j) ** 2 / 2 for j in range(10))
+predicted = 12 - 2 * removed
+weak = jm.MPC(system, Q, R, horizon=20, states=limits, inputs=jm.Box([-1.0], [1.0]))
+computed = jm.feasible.feasible_polytope(weak).volume()
+print(f"predicted {predicted} = {float(predicted)}, computed {computed:.9f}")
+assert np.isclose(computed, float(predicted), rtol=1e-8) and predicted < area

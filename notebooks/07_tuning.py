@@ -1,0 +1,212 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # 7. Tuning by gradient
+#
+# You will tune the weights $Q$ and $R$ of an MPC by the gradient of a closed-loop loss, through the
+# constraints, the solver and all samples, and see how a badly chosen loss deceives. You will also
+# keep apart two numbers that are both called $\rho$: the weight of soft limits, which is part
+# of the *problem*, and the step size of ADMM, which is part of the *solver*.
+
+# %%
+from dataclasses import replace
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+import optax
+
+import jaxmpc as jm
+
+jax.config.update("jax_enable_x64", True)
+
+# %% [markdown]
+# ## The problem and the first guess
+#
+# A robot joint has the state (angle, velocity) and a torque as its input; its sampling time is
+# 50 ms. The first weights are all one, in rad, rad/s and N m. That is nobody's wish, it is a guess.
+
+# %%
+dt = 0.05
+system = jm.LinearSystem(A=np.array([[1, dt], [0, 1]]), B=np.array([[0.0], [dt / 0.05]]), dt=dt)
+limits, torque = jm.Box([-1.5, -2.0], [1.5, 2.0]), jm.Box(-1.0, 1.0)
+guess = jm.MPC(system, np.eye(2), np.eye(1), horizon=10, states=limits, inputs=torque)
+x0s = np.random.default_rng(0).uniform([-1.0, -1.0], [1.0, 1.0], (64, 2))
+
+# %% [markdown]
+# What we do want stands in the loss, with weights of its own that stay fixed: the angle matters, the
+# effort little, and leaving the limits is charged. The average is over the closed loops.
+
+# %%
+steps = 30
+loss = jm.ClosedLoopLoss(Q=np.diag([50.0, 0.1]), R=np.array([[0.01]]), limits=limits)
+weights = {"Q": jm.Parameter(np.eye(2), "diagonal"), "R": jm.Parameter(np.eye(1), "definite")}
+make = lambda values: replace(guess, Q=values["Q"], R=values["R"])
+settings = dict(updates=25, optimizer=optax.adam(0.3))
+run = jm.tune_weights(make, weights, system, x0s, loss, steps, **settings)
+print("loss before and after:", run.before["loss"], run.after["loss"])
+print("Q:", np.diag(run.values["Q"]), " R:", run.values["R"].item())
+assert run.improved and run.improvement > 0.05
+
+# %% [markdown]
+# The gradient is taken with respect to the logarithms of the weights, so that a step is a relative
+# change and a weight cannot become negative. A quarter of the initial states is set apart; the
+# result is the step with the least loss on these.
+
+# %%
+before = jm.simulate_many(jm.Controller(guess), system, x0s, steps)
+after = jm.simulate_many(run.result, system, x0s, steps)
+time = dt * np.arange(steps + 1)
+fig, (left, right) = plt.subplots(1, 2, figsize=(8, 3.2))
+left.plot(run.history.validation, "o-", markersize=3)
+left.set(xlabel="step of the optimiser", ylabel="loss on states set apart (1)")
+angle = lambda r: np.median(np.abs(r.states[:, :, 0]), axis=0)
+right.plot(time, angle(before), label="first guess")
+right.plot(time, angle(after), label="tuned")
+right.set(xlabel="time (s)", ylabel="median |angle| (rad)")
+right.legend()
+fig.tight_layout()
+assert angle(after)[10] < angle(before)[10]
+
+# %% [markdown]
+# ## A failure on purpose: the controller's own cost as the loss
+#
+# It seems natural to minimise the cost that the controller minimises anyway, `run.stage_cost`.
+
+# %%
+own_cost = lambda run: run.stage_cost.mean()
+fooled = jm.tune_weights(make, weights, system, x0s, own_cost, steps, **settings)
+print("its loss before and after:", fooled.before["loss"], fooled.after["loss"])
+print("Q:", np.diag(fooled.values["Q"]), " R:", fooled.values["R"].item())
+worse = jm.simulate_many(fooled.result, system, x0s, steps)
+true_loss = lambda r: float(np.mean(jax.vmap(loss)(r)))
+table = {"first guess": true_loss(before), "tuned": true_loss(after), "fooled": true_loss(worse)}
+print("the loss that we meant:", table)
+assert fooled.after["loss"] < 0.1 * fooled.before["loss"]
+assert np.diag(fooled.values["Q"]).max() < 0.1 and fooled.values["R"].item() < 0.1
+assert table["fooled"] > table["tuned"]
+
+# %% [markdown]
+# The loss fell to less than a tenth, and the controller is worse than the one tuned with our own
+# loss. The optimiser has found the easy way: $\sum x'Qx + u'Ru$ becomes small when $Q$ and $R$
+# themselves become small. The optimal plan does not change if both are multiplied by one number, so
+# this descent says nothing about the motion. Weights that are tuned must not measure the result.
+
+# %% [markdown]
+# ## $\rho$ number one: the penalty of soft limits
+#
+# `soften(mpc, rho)` lets the state limits be exceeded and charges $\rho \cdot$ (violation). This
+# $\rho$ changes the *answer*. Above a threshold $\bar\rho$, the largest multiplier of the hard
+# problem, the slacks are zero wherever the limits can be kept (exact penalty, Theorem 2).
+
+# %%
+unit = jm.Box(-np.ones(2), np.ones(2))
+cart = jm.MPC(
+    jm.LinearSystem(np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.4], [1.0]]), dt=1.0),
+    *(np.eye(2), 10 * np.eye(1), 3),
+    states=unit,
+    inputs=jm.Box(-0.25, 0.25),
+    terminal_cost=np.eye(2),
+    terminal_set=unit,
+)
+exact = jm.exact_penalty(cart)
+factors = np.array([0.1, 0.5, 0.9, 0.99, 1.01, 2.0])
+worst = np.array([0.999999 * exact.at])  # a hair inside the feasible set
+slack = [jm.solve_many(jm.soften(cart, rho=f * exact.rho_bar), worst).slack.max() for f in factors]
+print("threshold:", exact.rho_bar, " slack:", dict(zip(factors, np.round(slack, 6), strict=True)))
+assert np.isclose(exact.rho_bar, 11.25)
+assert min(slack[:3]) > 1e-4 and max(slack[4:]) < 1e-5
+
+# %% [markdown]
+# ## $\rho$ number two: the step size of ADMM
+#
+# ADMM's $\rho$ weighs the distance between its two copies of the variables. It changes nothing about
+# the problem: with enough iterations every $\rho > 0$ ends at the same plan. It decides how fast.
+# Here 50 ADMM steps alone, without Newton steps, on states with a plan:
+
+# %%
+states = np.random.default_rng(1).uniform([-1.5, -2.0], [1.5, 2.0], (320, 2))
+states = states[jm.map_feasible_set(guess, states).label == 1]
+rhos = np.logspace(-2, 2, 9)
+accuracy, solved = [], []
+for rho in rhos:
+    admm = jm.ADMM(iterations=50, rho=rho, refine=0)
+    plans = jax.vmap(jm.Controller(run.mpc, admm).plan)(states)
+    accuracy.append(np.maximum(plans.primal_residual, plans.dual_residual))
+    solved.append(np.mean(plans.status == jm.Status.SOLVED))
+print("solved to 1e-6, by rho:", dict(zip(np.round(rhos, 3), np.round(solved, 3), strict=True)))
+
+# %%
+fig, (left, right) = plt.subplots(1, 2, figsize=(8, 3.2))
+left.semilogy(factors, np.maximum(slack, 1e-9), "o-")
+left.axvline(1.0, color="k", linestyle="--")
+left.set(xlabel=r"soft penalty $\rho / \bar\rho$ (1)", ylabel="largest slack (m or m/s)")
+right.loglog(rhos, np.median(accuracy, axis=1), "o-", label="median")
+right.loglog(rhos, np.quantile(accuracy, 0.9, axis=1), "s-", label="90 %")
+right.set(xlabel=r"ADMM's $\rho$ (1)", ylabel="residual after 50 steps")
+right.legend()
+fig.tight_layout()
+
+# %% [markdown]
+# `tune_penalties` learns this step size by gradient through the ADMM steps: one value for each group
+# of rows and each quarter of the iterations. Its start is the best constant, and what it returns is
+# never worse on the validation states than the solver that it is compared with.
+
+# %%
+penalties = jm.tune_penalties(run.mpc, states, iterations=50, updates=60)
+print("solved to 1e-6:", penalties.before["solved"], "->", penalties.after["solved"])
+print("median residual:", penalties.before["residual"], "->", penalties.after["residual"])
+assert penalties.after["solved"] >= penalties.before["solved"]
+
+# %% [markdown]
+# ## Exercises
+#
+# 1. *(Lesson, Problem 3.)* Let the optimum without the limits keep the limits. Show on an example
+#    that then the slack is zero for *any* soft penalty $\rho > 0$, however small.
+# 2. Multiply $Q$, $R$ and the terminal cost by ten. What happens to the plan, and to $\bar\rho$?
+# 3. Does the tuned ADMM change the plan? Compare with the default solver.
+
+# %% [markdown]
+# **Answer 1.** Near the origin no limit is active, so its multiplier is zero, and the threshold at
+# that state is zero too: any $\rho > 0$ is large enough.
+
+# %%
+near = np.array([[0.05, -0.02]])
+plain = jm.solve_many(replace(cart, states=None, terminal_set=None), near)
+assert np.all(np.abs(plain.states) < 1)
+tiny = jm.solve_many(jm.soften(cart, rho=1e-3), near)
+print(
+    "slack:", tiny.slack.max(), " difference of the inputs:", abs(tiny.inputs - plain.inputs).max()
+)
+assert tiny.slack.max() < 1e-6 and np.allclose(tiny.inputs, plain.inputs, atol=1e-5)
+
+# %% [markdown]
+# **Answer 2.** The plan stays; the multipliers, and with them $\bar\rho$, grow tenfold. Exact
+# penalties have the unit of the cost.
+
+# %%
+tenfold = replace(cart, Q=10 * cart.Q, R=10 * cart.R, terminal_cost=10 * cart.terminal_cost)
+same = jm.solve_many(cart, worst).inputs - jm.solve_many(tenfold, worst).inputs
+print("difference:", abs(same).max(), " threshold:", jm.exact_penalty(tenfold).rho_bar)
+assert abs(same).max() < 1e-5 and np.isclose(jm.exact_penalty(tenfold).rho_bar, 112.5)
+
+# %% [markdown]
+# **Answer 3.** No, within the tolerance of the residuals: it changes the path of the iterates only.
+
+# %%
+tuned = jax.vmap(jm.Controller(run.mpc, penalties.solver).plan)(states)
+default = jm.solve_many(run.mpc, states)
+both = (tuned.status == jm.Status.SOLVED) & (default.status == jm.Status.SOLVED)
+gap = np.abs(np.asarray(tuned.inputs) - default.inputs)[both].max()
+print(f"{both.sum()} of {len(states)} states compared; largest difference {gap:.1e} N m")
+assert gap < 1e-2
