@@ -106,8 +106,8 @@ draw(plan.states, plan.inputs, "One plan of 20 steps from q = −1.2 rad")
 
 # %% [markdown]
 # The plan accelerates with full torque until the velocity reaches its limit of 2 rad/s, and then
-# coasts at that limit. Two constraints shape the plan, one after the other. We check this
-# statement instead of trusting the picture:
+# coasts at that limit; towards the end it brakes. Two constraints shape the plan, one after the
+# other. We check this statement instead of trusting the picture:
 
 # %%
 velocity, applied = np.asarray(plan.states)[:, 1], np.asarray(plan.inputs)[:, 0]

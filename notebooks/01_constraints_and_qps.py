@@ -40,9 +40,9 @@ jax.config.update("jax_enable_x64", True)
 T, J, N = 0.01, 0.05, 2
 A = np.array([[1.0, T], [0.0, 1.0]])
 B = np.array([[0.0], [T / J]])
-Q, R, P = np.diag([50.0, 1.0]), np.array([[0.1]]), np.diag([5000.0, 1.0])
+Q, R, P = np.diag([50.0, 1.0]), np.array([[0.1]]), np.diag([1500.0, 0.1])
 x_max, u_max = np.array([1.5, 2.0]), 2.0
-x0 = np.array([-0.5, 1.5])
+x0 = np.array([-0.5, 1.8])
 
 # %% [markdown]
 # Insert the model: $x_1 = A x_0 + B u_0$ and $x_2 = A^2 x_0 + A B u_0 + B u_1$. With
@@ -97,7 +97,7 @@ print(f"cost {float(plan.cost):.6f} = {float(solution.cost):.6f} + {constant:.6f
 
 # %%
 unconstrained = np.linalg.solve(P_z, -q)
-span = np.linspace(-4, 11, 400)
+span = np.linspace(-6, 11, 400)
 U0, U1 = np.meshgrid(span, span)
 points = np.stack([U0.ravel(), U1.ravel()])
 cost = (0.5 * np.sum(points * (P_z @ points), axis=0) + q @ points).reshape(U0.shape)
@@ -110,7 +110,7 @@ levels = best + (float(solution.cost) - best) * np.array([0.05, 0.25, 0.6, 1.0, 
 axis.contour(U0, U1, cost, levels=levels, colors="0.5", linewidths=0.8, linestyles="-")
 axis.plot(*unconstrained, "o", color="#d55e00", label="optimum without constraints")
 axis.plot(*z, "o", color="#00486b", label="optimum with constraints")
-axis.set(xlabel="torque $u_0$ [N m]", ylabel="torque $u_1$ [N m]", xlim=(-4, 11), ylim=(-4, 8))
+axis.set(xlabel="torque $u_0$ [N m]", ylabel="torque $u_1$ [N m]", xlim=(-3, 9), ylim=(-5, 5))
 axis.legend(loc="upper right", fontsize=9)
 plt.show()
 
@@ -160,10 +160,10 @@ assert max(ours) < 1e-6 and max(theirs) < 1e-6
 active = jm.mpc.active_constraints(mpc, plan)
 for constraint in active:
     print(constraint)
-assert len(active) == 1 and active[0].name.startswith("dq") and active[0].step == 2
+assert len(active) == 1 and active[0].name.startswith("dq") and active[0].step == 1
 
 # %%
-row = 5  # the velocity in x_2: rows 0, 1 are torques, 2, 3 are x_1, 4, 5 are x_2
+row = 3  # the velocity in x_1: rows 0, 1 are torques, 2, 3 are x_1, 4, 5 are x_2
 delta = 1e-4
 relaxed = jm.QP(qp.P, qp.q, qp.A, qp.l, qp.u + delta * np.eye(6)[row])
 cheaper = float(solution.cost) - float(jm.solve_qp(relaxed).cost)

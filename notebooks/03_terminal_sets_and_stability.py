@@ -97,8 +97,8 @@ assert np.allclose(fallen_inputs[0], K_N @ start, atol=1e-6)  # the MPC law is t
 # %% [markdown]
 # **Cause 2: the feasible set holds states that are lost.** Let $w'$ be the left eigenvector of the
 # unstable eigenvalue $\lambda$, and $s = w' x$. Then $s_{k+1} = \lambda s_k + w' B u_k$, and once
-# $|s| > |w' B|\, u_{\max} / (\lambda - 1)$, no torque makes $|s|$ smaller ever again. A horizon of 5
-# steps does not notice. Of the feasible set, this share is lost:
+# $|s| > |w' B|\, u_{\max} / (\lambda - 1)$, no torque makes $|s|$ smaller ever again. A horizon of
+# 5 steps does not notice. Of the feasible set, this share is lost:
 
 # %%
 eigenvalues, vectors = np.linalg.eig(A.T)

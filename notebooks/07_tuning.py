@@ -44,8 +44,8 @@ guess = jm.MPC(system, np.eye(2), np.eye(1), horizon=10, states=limits, inputs=t
 x0s = np.random.default_rng(0).uniform([-1.0, -1.0], [1.0, 1.0], (64, 2))
 
 # %% [markdown]
-# What we do want stands in the loss, with weights of its own that stay fixed: the angle matters, the
-# effort little, and leaving the limits is charged. The average is over the closed loops.
+# What we do want stands in the loss, with weights of its own that stay fixed: the angle matters,
+# the effort little, and leaving the limits is charged. The average is over the closed loops.
 
 # %%
 steps = 30
@@ -130,8 +130,9 @@ assert min(slack[:3]) > 1e-4 and max(slack[4:]) < 1e-5
 # %% [markdown]
 # ## $\rho$ number two: the step size of ADMM
 #
-# ADMM's $\rho$ weighs the distance between its two copies of the variables. It changes nothing about
-# the problem: with enough iterations every $\rho > 0$ ends at the same plan. It decides how fast.
+# ADMM's $\rho$ weighs the distance between its two copies of the variables. It changes nothing
+# about the problem: with enough iterations every $\rho > 0$ ends at the same plan. It
+# decides how fast.
 # Here 50 ADMM steps alone, without Newton steps, on states with a plan:
 
 # %%
@@ -158,9 +159,9 @@ right.legend()
 fig.tight_layout()
 
 # %% [markdown]
-# `tune_penalties` learns this step size by gradient through the ADMM steps: one value for each group
-# of rows and each quarter of the iterations. Its start is the best constant, and what it returns is
-# never worse on the validation states than the solver that it is compared with.
+# `tune_penalties` learns this step size by gradient through the ADMM steps: one value for each
+# group of rows and each quarter of the iterations. Its start is the best constant, and
+# what it returns is never worse on the validation states than the solver that it is compared with.
 
 # %%
 penalties = jm.tune_penalties(run.mpc, states, iterations=50, updates=60)

@@ -15,7 +15,8 @@
 #
 # You will solve the same MPC problem for one state, for a batch by `jax.vmap`, and for many states
 # by `solve_many`, and label a million states as feasible or not, with proofs. You will count what
-# became of each state, measure the throughput on your own machine, and compare float32 with float64.
+# became of each state, measure the throughput on your own machine, and compare
+# float32 with float64.
 
 # %%
 from time import perf_counter
@@ -100,7 +101,8 @@ fig.tight_layout()
 # ## A million labels
 #
 # Where only the question "is there a plan?" counts, `map_feasible_set` drops the cost. Each label
-# rests on a proof: a plan whose roll-out keeps every limit, or a half-space that excludes the state.
+# rests on a proof: a plan whose roll-out keeps every limit, or a half-space that excludes
+# the state.
 
 # %%
 points = jm.grid([-1.6, -2.1], [1.6, 2.1], (1024, 1024))

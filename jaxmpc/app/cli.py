@@ -22,6 +22,7 @@ from jaxmpc.checks import fail, nearest
 
 # Module and class of each command: only the one that is called is imported.
 COMMANDS = {
+    "init": ("init", "Init"),
     "sweep": ("sweep", "Sweep"),
     "recursion": ("recursion", "Recursion"),
     "info": ("info", "Info"),

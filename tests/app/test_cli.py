@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from importlib.metadata import version
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ import xarray as xr
 import zarr
 
 from jaxmpc.app import cli
+from jaxmpc.app import config as configs
 from jaxmpc.app.commands import linear_sweep, recursion
 from jaxmpc.control.sets import Box
 from jaxmpc.recursion import Claim, Counterexample, RecursionReport, SmallestHorizon
@@ -195,7 +197,7 @@ def test_wrong_usage(arguments, capsys):
 
 @pytest.mark.parametrize(
     ("line", "names"),
-    [("--help", "sweep recursion info simulate tune"), ("tune --help", "weights penalties")],
+    [("--help", "init sweep recursion info simulate tune"), ("tune --help", "weights penalties")],
 )
 def test_help_has_a_line_for_each_command(line, names, capsys):
     with pytest.raises(SystemExit) as caught:
@@ -420,6 +422,22 @@ def test_ctrl_c_is_one_line_from_the_first_import_on(options, sign, answer):
         out, err = process.communicate()
     assert (process.returncode, out) == (130, answer)
     assert "Traceback" not in err
+
+
+def test_init_writes_a_problem_that_every_command_reads(capsys):
+    assert run("init") == 0 and "jaxmpc sweep --config problem.toml" in capsys.readouterr().out
+    text = Path("problem.toml").read_text()
+    assert "jaxmpc sweep --config problem.toml" in text
+    assert configs.load(Path("problem.toml")).name == "mass"
+    assert run("sweep --config problem.toml --grid 8 8") == 0
+    assert "undecided               0 " in capsys.readouterr().out
+    assert run("init") == 2 and "exists. Add --overwrite" in capsys.readouterr().err
+    assert run("init --overwrite") == 0 and run("init --output no/where.toml") == 2
+    # Every option that is a comment can be set, but for those that need other data.
+    for word in ("c = ", "rho = ", "control_horizon = ", "lower = ", "upper = "):
+        text = text.replace(f"# {word}", word)
+    Path("all.toml").write_text(text)
+    assert configs.load(Path("all.toml")).mpc.control_horizon == 5
 
 
 @pytest.mark.parametrize("words", [["--help"], ["--version"], ["tune", "--help"], ["swep"]])
