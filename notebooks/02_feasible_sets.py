@@ -219,7 +219,7 @@ assert found.passed and found.verified == sum(found.labels.values()) == 24 * 24
 def scalar(steps):
     """Return x+ = x + u with |x| <= 1 at these steps and |u| <= 0.25, for N = 4."""
     return jm.MPC(
-        jm.LinearSystem(1.0, 1.0),
+        jm.LinearSystem(np.eye(1), np.eye(1)),
         1.0,
         1.0,
         horizon=4,
