@@ -81,9 +81,9 @@ assert low <= 1489 / 125 <= high and (high - low) / high < 1e-6
 # %%
 def draw(label, title, outline=True):
     """Draw labels on the grid, and the outline of the feasible set."""
-    figure, axis = plt.subplots(figsize=(6, 3.8), layout="constrained")
+    figure, axis = plt.subplots(figsize=(7, 3.6), layout="constrained")
     for value, color, name in ((-1, "#dddcd8", "infeasible"), (1, "#9fcbe6", "feasible")):
-        axis.plot(*x0s[label == value].T, "s", ms=4, color=color, label=name)
+        axis.plot(*x0s[label == value].T, "s", ms=3, color=color, label=name)
     if outline:
         corners = fmap.outer().vertices()
         corners = np.vstack([corners, corners[:1]])
@@ -175,8 +175,8 @@ draw(guess, "Guessed from the residual after 30 iterations")
 plt.show()
 
 # %% [markdown]
-# Many feasible states are called infeasible. The reason is not a mistake of the solver: an iterate
-# converges towards the optimum from outside the constraints, and after 30 iterations it is not yet
+# Many feasible states are called infeasible. The reason is not a mistake of the solver: the
+# iterates of ADMM keep the constraints only in the limit, and after 30 iterations they are not yet
 # there. A residual says something about an iterate; a label says something about a state. More
 # iterations make the picture better, but no number of them makes it a proof. The map avoids the
 # question: it labels a state only when it holds a plan or a half-space, and otherwise says

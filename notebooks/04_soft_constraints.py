@@ -94,7 +94,7 @@ assert peaks[0] <= 2 + 1e-6 < 2.05 < peaks[1]
 
 # %%
 figure, axis = plt.subplots(figsize=(6, 3.2), layout="constrained")
-axis.axhspan(2.0, 3.0, color="#d55e00", alpha=0.25, lw=0)
+axis.axhspan(2.0, 5.0, color="#d55e00", alpha=0.25, lw=0)
 for p, color, label in ((reference_plan, "#00486b", "hard"), (cheap, "#d55e00", "soft, ρ = 10")):
     axis.plot(time, np.asarray(p.states)[:, 1], ".-", color=color, label=label)
 axis.set(xlabel="time [s]", ylabel="dq [rad/s]", ylim=(0, 1.08 * peaks[1]))
@@ -128,7 +128,7 @@ axis.plot(line[:, 0], result.thresholds[1:], color="#00486b", label="at dq = 0.1
 axis.axhline(result.rho_bar, color="#d55e00", ls="--", label="supremum over the feasible set")
 axis.plot(x0[0], threshold, "o", color="#00486b")
 axis.set(xlabel="q [rad]", ylabel="threshold of ρ [cost per unit]", ylim=(-1, None))
-axis.legend(loc="center right", fontsize=9)
+axis.legend(loc=(0.26, 0.55), fontsize=9)
 plt.show()
 
 # %% [markdown]

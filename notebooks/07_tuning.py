@@ -48,12 +48,13 @@ x0s = np.random.default_rng(0).uniform([-1.0, -1.0], [1.0, 1.0], (64, 2))
 # the effort little, and leaving the limits is charged. The average is over the closed loops.
 
 # %%
-steps = 30
+steps = 20
 loss = jm.ClosedLoopLoss(Q=np.diag([50.0, 0.1]), R=np.array([[0.01]]), limits=limits)
 weights = {"Q": jm.Parameter(np.eye(2), "diagonal"), "R": jm.Parameter(np.eye(1), "definite")}
 make = lambda values: replace(guess, Q=values["Q"], R=values["R"])
-settings = dict(updates=25, optimizer=optax.adam(0.3))
-run = jm.tune_weights(make, weights, system, x0s, loss, steps, **settings)
+run = jm.tune_weights(
+    make, weights, system, x0s, loss, steps, updates=20, optimizer=optax.adam(0.3)
+)
 print("loss before and after:", run.before["loss"], run.after["loss"])
 print("Q:", np.diag(run.values["Q"]), " R:", run.values["R"].item())
 assert run.improved and run.improvement > 0.05
@@ -81,26 +82,26 @@ assert angle(after)[10] < angle(before)[10]
 # %% [markdown]
 # ## A failure on purpose: the controller's own cost as the loss
 #
-# It seems natural to minimise the cost that the controller minimises anyway, `run.stage_cost`.
+# It seems natural to minimise the cost that the controller minimises anyway, `run.stage_cost`. A
+# hundredth of the first guess, $Q/100$ and $R/100$, seems to be a far better controller then:
 
 # %%
-own_cost = lambda run: run.stage_cost.mean()
-fooled = jm.tune_weights(make, weights, system, x0s, own_cost, steps, **settings)
-print("its loss before and after:", fooled.before["loss"], fooled.after["loss"])
-print("Q:", np.diag(fooled.values["Q"]), " R:", fooled.values["R"].item())
-worse = jm.simulate_many(fooled.result, system, x0s, steps)
+hundredth = replace(guess, Q=guess.Q / 100, R=guess.R / 100)
+fooled = jm.simulate_many(jm.Controller(hundredth), system, x0s, steps)
+own = {"first guess": before.stage_cost.mean(), "a hundredth of it": fooled.stage_cost.mean()}
+print("the controller's own cost:", own)
 true_loss = lambda r: float(np.mean(jax.vmap(loss)(r)))
-table = {"first guess": true_loss(before), "tuned": true_loss(after), "fooled": true_loss(worse)}
-print("the loss that we meant:", table)
-assert fooled.after["loss"] < 0.1 * fooled.before["loss"]
-assert np.diag(fooled.values["Q"]).max() < 0.1 and fooled.values["R"].item() < 0.1
-assert table["fooled"] > table["tuned"]
+ours = {"first guess": before, "a hundredth of it": fooled, "tuned": after}
+print("the loss that we meant:   ", {name: true_loss(r) for name, r in ours.items()})
+assert fooled.stage_cost.mean() < 0.011 * before.stage_cost.mean()
+assert np.allclose(fooled.states, before.states, atol=1e-3)
+assert true_loss(after) < true_loss(before)
 
 # %% [markdown]
-# The loss fell to less than a tenth, and the controller is worse than the one tuned with our own
-# loss. The optimiser has found the easy way: $\sum x'Qx + u'Ru$ becomes small when $Q$ and $R$
-# themselves become small. The optimal plan does not change if both are multiplied by one number, so
-# this descent says nothing about the motion. Weights that are tuned must not measure the result.
+# Its cost is a hundred times smaller, and the motion is the same. The sum of $x'Qx + u'Ru$ becomes
+# small when $Q$ and $R$ themselves become small; the optimal plan does not change if both are
+# multiplied by one number. A descent on this cost would drive the weights towards zero and say
+# nothing about the motion. Weights that are tuned must not measure the result.
 
 # %% [markdown]
 # ## $\rho$ number one: the penalty of soft limits
@@ -164,7 +165,7 @@ fig.tight_layout()
 # what it returns is never worse on the validation states than the solver that it is compared with.
 
 # %%
-penalties = jm.tune_penalties(run.mpc, states, iterations=50, updates=60)
+penalties = jm.tune_penalties(run.mpc, states, iterations=50, updates=30, batch=16)
 print("solved to 1e-6:", penalties.before["solved"], "->", penalties.after["solved"])
 print("median residual:", penalties.before["residual"], "->", penalties.after["residual"])
 assert penalties.after["solved"] >= penalties.before["solved"]

@@ -64,7 +64,7 @@ controller = jm.Controller(mpc)
 one, seconds = timed(controller.plan, np.array([0.5, -1.0]))
 print(jm.Status(int(one.status)).sentence, f"{1e6 * seconds:,.0f} µs")
 
-batch = jax.jit(jax.vmap(controller.plan))
+batch = jax.vmap(controller.plan)
 x0s = states(1024)
 many, seconds_many = timed(batch, x0s.astype(np.float32))
 print(count_status(many.status), f"{1e6 * seconds_many / len(x0s):,.1f} µs a state")
@@ -137,7 +137,7 @@ fig.tight_layout()
 # %%
 with jax.enable_x64(True):
     admm = jm.Controller(mpc, jm.ADMM(iterations=50, refine=0))
-    short = jax.jit(jax.vmap(admm.plan))(x0s)
+    short = jax.vmap(admm.plan)(x0s)
 reference = jm.solve_many(mpc, x0s)
 print("50 ADMM steps:   ", count_status(short.status))
 print("with Newton steps:", count_status(reference.status))

@@ -545,6 +545,7 @@ def one_step(
     require_kind("system", system, LinearSystem)
     system.validate()
     m = system.m
+    inputs = inputs.spread(m) if isinstance(inputs, Box) else inputs
     A, B, c = host_matrices(system)
     V, moving, fixed, ends = None, np.eye(m), np.zeros(m), None
     if inputs is not None:
@@ -844,6 +845,7 @@ def _polytope(argument: str, value: Box | Polytope | None, n: int) -> Polytope:
     """Return a set in R^n as a Polytope; raise ValueError, naming `argument`, for anything else."""
     if not isinstance(value, Box | Polytope):
         fail(argument, f"{type(value).__name__} is no Box or Polytope", "Give one")
+    value = value.spread(n) if isinstance(value, Box) else value
     value.validate(argument, n)
     return value.to_polytope() if isinstance(value, Box) else value
 

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm.auto import tqdm
+from tqdm.std import tqdm
 
 from jaxmpc.checks import fail, number, require_kind, require_memory, whole
 from jaxmpc.control.sets import Ellipsoid, Polytope, hull_volume

@@ -37,6 +37,14 @@ def interval(polytope):
 # --- One step back ---------------------------------------------------------------------
 
 
+def test_numbers_are_the_limits_of_every_coordinate():
+    system = LinearSystem([[1, 0.1], [0, 1]], [0, 0.1])
+    given = maximal_control_invariant_set(system, Box(-1, 1), Box(-0.5, 0.5))
+    full = maximal_control_invariant_set(system, Box([-1, -1], [1, 1]), Box([-0.5], [0.5]))
+    np.testing.assert_array_equal(given.H, full.H)
+    np.testing.assert_array_equal(given.h, full.h)
+
+
 def test_predecessor_on_the_line():
     w = Box([-0.5], [0.25])
     # 2x + u + w in [-3, 3]: 2x <= 3 - 0.25 + 1 and 2x >= -3 + 0.5 - 1
