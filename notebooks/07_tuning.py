@@ -134,7 +134,7 @@ assert min(slack[:3]) > 1e-4 and max(slack[4:]) < 1e-5
 # ADMM's $\rho$ weighs the distance between its two copies of the variables. It changes nothing
 # about the problem: with enough iterations every $\rho > 0$ ends at the same plan. It
 # decides how fast.
-# Here 50 ADMM steps alone, without Newton steps, on states with a plan:
+# Here 48 ADMM steps alone, without Newton steps, on states with a plan:
 
 # %%
 states = np.random.default_rng(1).uniform([-1.5, -2.0], [1.5, 2.0], (320, 2))
@@ -142,7 +142,7 @@ states = states[jm.map_feasible_set(guess, states).label == 1]
 rhos = np.logspace(-2, 2, 9)
 accuracy, solved = [], []
 for rho in rhos:
-    admm = jm.ADMM(iterations=50, rho=rho, refine=0)
+    admm = jm.ADMM(iterations=48, rho=rho, refine=0)
     plans = jax.vmap(jm.Controller(run.mpc, admm).plan)(states)
     accuracy.append(np.maximum(plans.primal_residual, plans.dual_residual))
     solved.append(np.mean(plans.status == jm.Status.SOLVED))
@@ -155,7 +155,7 @@ left.axvline(1.0, color="k", linestyle="--")
 left.set(xlabel=r"soft penalty $\rho / \bar\rho$ (1)", ylabel="largest slack (m or m/s)")
 right.loglog(rhos, np.median(accuracy, axis=1), "o-", label="median")
 right.loglog(rhos, np.quantile(accuracy, 0.9, axis=1), "s-", label="90 %")
-right.set(xlabel=r"ADMM's $\rho$ (1)", ylabel="residual after 50 steps")
+right.set(xlabel=r"ADMM's $\rho$ (1)", ylabel="residual after 48 steps")
 right.legend()
 fig.tight_layout()
 
@@ -165,7 +165,7 @@ fig.tight_layout()
 # what it returns is never worse on the validation states than the solver that it is compared with.
 
 # %%
-penalties = jm.tune_penalties(run.mpc, states, iterations=50, updates=30, batch=16)
+penalties = jm.tune_penalties(run.mpc, states, iterations=48, updates=30, batch=16)
 print("solved to 1e-6:", penalties.before["solved"], "->", penalties.after["solved"])
 print("median residual:", penalties.before["residual"], "->", penalties.after["residual"])
 assert penalties.after["solved"] >= penalties.before["solved"]
