@@ -146,7 +146,7 @@ for rho in rhos:
     plans = jax.vmap(jm.Controller(run.mpc, admm).plan)(states)
     accuracy.append(np.maximum(plans.primal_residual, plans.dual_residual))
     solved.append(np.mean(plans.status == jm.Status.SOLVED))
-print("solved to 1e-6, by rho:", dict(zip(np.round(rhos, 3), np.round(solved, 3), strict=True)))
+print("solved, by rho:", dict(zip(np.round(rhos, 3), np.round(solved, 3), strict=True)))
 
 # %%
 fig, (left, right) = plt.subplots(1, 2, figsize=(8, 3.2))
