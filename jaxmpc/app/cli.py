@@ -11,12 +11,12 @@ import sys
 import types
 from collections.abc import Sequence
 from dataclasses import fields, make_dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import tyro
 
+import jaxmpc
 from jaxmpc.app.report import report_error
 from jaxmpc.checks import fail, nearest
 
@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code: 0 done, 2 error, 130 interrupted."""
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv == ["--version"]:
-        print(f"jaxmpc {version('jaxmpc')}")
+        print(f"jaxmpc {jaxmpc.__version__}")
         return 0
     try:
         command = parse(argv)

@@ -256,7 +256,7 @@ def test_a_byte_order_mark_is_accepted(refused, tmp_path):
 
 LINES = [
     # Commands.
-    ("", "no command given. There are sweep, recursion, info, simulate, verify, bench, tune"),
+    ("", "no command given. There are init, sweep, recursion, info, simulate, verify, bench, tune"),
     ("swep", "no command 'swep'. Did you mean sweep?"),
     ("Sweep", "no command 'Sweep'"),
     ("--horizon 3", "no command '--horizon'"),
