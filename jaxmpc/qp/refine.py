@@ -22,7 +22,7 @@ from jaxmpc.qp.active_set import (
     has_dual_steps,
     single_step,
 )
-from jaxmpc.qp.admm import Factor, scaled_multipliers, unscaled
+from jaxmpc.qp.admm import Factor, scaled, scaled_multipliers, unscaled
 from jaxmpc.qp.batches import repeat_while
 from jaxmpc.qp.certificate import Proof, correcting_rows, farkas, prove, recession, to_length_one
 from jaxmpc.qp.newton import (
@@ -52,6 +52,16 @@ class Program:
     bounds: Bounds
     eps: Array
     far: float = field(metadata={"static": True})
+
+
+def unrounded(p: Program) -> Program:
+    """The program whose ADMM coordinates are made anew, in float64, from that in its own units:
+    what rounding to float32 leaves between the two is more than the last Newton steps gain."""
+    qp, f = p.qp, p.factor
+    A = f.E[:, None] * matmul(qp.A, f.T)
+    f = replace(f, H=matmul(f.T.T, matmul(qp.P, f.T)), A=A, S=matmul(A, A.T))
+    q, bounds = scaled(f, qp)
+    return replace(p, factor=f, q=q, bounds=bounds)
 
 
 def judged(p: Program, w: Array, y: Array) -> tuple[Pair, Array]:

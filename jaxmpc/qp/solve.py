@@ -39,7 +39,7 @@ from jaxmpc.qp.newton import (
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.refine import Program, by_the_dual, improve
+from jaxmpc.qp.refine import Program, by_the_dual, improve, unrounded
 from jaxmpc.qp.residuals import (
     assess,
     concluded,
@@ -190,11 +190,11 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = 
     begin = replace(multipliers_start(q, w, y), change=y - y_old, move=w - w_old)
     if refine and not unrolled:
         p = Program(qp, factor, q, bounds, eps, Constants.of(qp.q.dtype).far)
-        polish = partial(improve, refine, solver.fixed, whole)
+        single, method = qp.q.dtype != jnp.float64, partial(improve, refine, solver.fixed, whole)
+        polish = lambda p, begin: method(unrounded(p) if single else p, begin)
         best, proof, ended = precisely(polish, p, begin)
-        # What was measured of float64 numbers need not hold for these in float32.
         found = concluded(best.measured, best.z, best.y, proof)
-        if qp.q.dtype != jnp.float64:
+        if single:  # What was measured of float64 numbers need not hold for these in float32.
             found = assess(residual_terms, (qp,), best.z, best.y, proof, eps)
         status = jnp.where(ended, found.status, jnp.int32(Status.ITERATION_LIMIT))
         return replace(found, status=status)

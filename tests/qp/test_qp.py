@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from functools import partial
 
 import chex
 import exact
@@ -13,8 +14,11 @@ import scipy
 from jax import enable_x64
 
 import jaxmpc as jm
+from jaxmpc.mpc.condense import condense
+from jaxmpc.qp.admm import factor
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.residuals import residuals
+from jaxmpc.qp.solve import solve_factored
 
 INF = np.inf
 FINE = jm.ADMM(iterations=400, refine=30, eps=1e-9)
@@ -499,6 +503,24 @@ class TestBatches:
         for seed in range(3):
             qp, _, _ = constructed(5, seed)
             solve(jm.QP(qp.P, qp.q, qp.A, qp.l, qp.u))
+
+
+class TestFloat32:
+    def test_dual_steps_solve_what_they_solve_in_float64(self):
+        """Without a Newton step of the method of multipliers: rounding of the factor to float32
+        left residuals above those at which a search on the dual ends."""
+        system = jm.LinearSystem(np.array([[1, 0.01], [0, 1]]), np.array([[0.0], [0.2]]))
+        limits = jm.Box([-1.5, -2.0], [1.5, 2.0]), jm.Box([-2.0], [2.0])
+        c = condense(jm.MPC(system, np.diag([50.0, 1.0]), np.array([[0.1]]), 20, *limits))
+        x = jnp.asarray(np.random.default_rng(0).uniform([-1.4, -1.2], [1.4, 1.2], (100, 2)))
+        made, solver = factor(c.P, c.C, jm.ADMM()), jm.ADMM()
+        assert x.dtype == c.P.dtype == jnp.float32
+        dual = partial(solve_factored, factor=made, solver=solver, whole=False)
+        found, _ = jax.jit(jax.vmap(lambda x: dual(c.qp(x))))(x)
+        known = jax.jit(jax.vmap(lambda x: jm.solve_qp(c.qp(x))))(x)
+        feasible = known.status == jm.Status.SOLVED
+        assert feasible.sum() > 80
+        assert (found.status == known.status)[feasible].all()
 
 
 def badly_scaled(n, rng):
