@@ -10,9 +10,9 @@ Sets and laws  lqr, maximal_invariant_set, maximal_control_invariant_set, invari
 Tuning         tune_weights, tune_penalties with Parameter and ClosedLoopLoss
 
 The rest, and the types of all results, are in `qp`, `control`, `sets`, `mpc`, `feasible`,
-`recursion`, `explicit`, `robots`, `robot_maps`, `closed_loop`, `tuning`, `workflow` and `bench`.
-Each name is imported when it is first used, so that the command can answer Ctrl-C before JAX is
-loaded.
+`recursion`, `explicit`, `export`, `robots`, `robot_maps`, `closed_loop`, `tuning`, `workflow` and
+`bench`. Each name is imported when it is first used, so that the command can answer Ctrl-C before
+JAX is loaded.
 """
 
 from importlib import import_module
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         closed_loop,
         control,
         explicit,
+        export,
         feasible,
         mpc,
         qp,
@@ -89,6 +90,7 @@ __all__ = [
     "design",
     "exact_penalty",
     "explicit",
+    "export",
     "feasible",
     "feasible_polytope",
     "grid",

@@ -10,6 +10,7 @@ import math
 import os
 import shutil
 from collections.abc import Iterable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -35,6 +36,13 @@ def require_kind(argument: str, value: Any, *kinds: type) -> None:
     if not isinstance(value, kinds):
         wanted = " or ".join(kind.__name__ for kind in kinds)
         fail(argument, f"is a {type(value).__name__}", f"Give a jm.{wanted}")
+
+
+def require_package(package: str, extra: str) -> None:
+    """Raise ImportError, which names the extra to install, where a package is not there."""
+    if find_spec(package) is None:
+        cure = f"pip install 'jaxmpc[{extra}]', or '.[{extra}]' in a checkout"
+        raise ImportError(f"{package} is not installed. Install it: {cure}", name=package)
 
 
 def require_memory(argument: str, needed: float, cure: str) -> None:

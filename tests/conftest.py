@@ -43,6 +43,20 @@ def pytest_configure(config):
     config.addinivalue_line("filterwarnings", "ignore:Error reading persistent compilation cache")
 
 
+@pytest.hookimpl(tryfirst=True)  # before -m chooses
+def pytest_collection_modifyitems(items):
+    """Mark the cases of a parametrised test after the first k as slow: `@pytest.mark.first(k)`."""
+    seen: dict[str, int] = {}
+    for item in items:
+        mark = item.get_closest_marker("first")
+        if mark is None or item.get_closest_marker("slow"):
+            continue
+        name = item.nodeid.partition("[")[0]
+        seen[name] = seen.get(name, 0) + 1
+        if seen[name] > mark.args[0]:
+            item.add_marker("slow")
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _forget_programs():
     """Before the process has too many memory maps. What is needed again comes from the cache."""

@@ -329,6 +329,7 @@ def passed(names):
     assert list(outcomes) == list(names) and not failures, "\n".join(failures)
 
 
+@pytest.mark.slow
 def test_on_four_devices():
     passed(QUICK)
 

@@ -54,6 +54,7 @@ def test_links():
         assert (ROOT / target).exists(), target
 
 
+@pytest.mark.slow
 def test_nonlinear(capsys):
     names = run("docs/how-to/nonlinear.md")[0]
     assert names["plan"].status == jm.Status.SOLVED

@@ -52,6 +52,23 @@ sys.exit(', '.join({late} & set(sys.modules)))"""
     assert done.stderr.strip() == ""
 
 
+def test_without_mujoco(monkeypatch, tmp_path):
+    """The rest works, and a robot names what to install, in the command too."""
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(ImportError, match=r"mujoco is not installed.*jaxmpc\[robots\]"):
+        jm.load_robot("joint")
+    program = """import sys
+sys.modules["mujoco"] = None
+import jaxmpc as jm
+all(getattr(jm, name) for name in jm.__all__)
+from jaxmpc.app.cli import main
+sys.exit(main(["simulate", "--robot", "joint"]))"""
+    run = functools.partial(subprocess.run, capture_output=True, text=True, cwd=tmp_path)
+    done = run([sys.executable, "-c", program])
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
+    assert "jaxmpc[robots]" in done.stderr
+
+
 def test_every_public_object_says_what_it_is():
     for name, found in public().items():
         if not isinstance(found, types.ModuleType):

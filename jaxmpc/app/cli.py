@@ -28,6 +28,8 @@ COMMANDS = {
     "info": ("info", "Info"),
     "simulate": ("simulate", "Simulate"),
     "verify": ("verify", "Verify"),
+    "export": ("export", "Export"),
+    "report": ("report", "Report"),
     "bench": ("bench", "Bench"),
 }
 DESCRIPTION = "Constrained MPC in batches, with proofs. Also: jaxmpc --version"
@@ -51,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         return command.run() or 0
-    except (ValueError, OSError, MemoryError) as error:
+    except (ValueError, OSError, MemoryError, ImportError) as error:
         return report_error(error)
     except KeyboardInterrupt:
         if not command.keeps:

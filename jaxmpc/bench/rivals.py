@@ -19,6 +19,7 @@ from jax import Array
 from scipy import sparse
 
 from jaxmpc.qp.status import Status
+from jaxmpc.reals import Reals
 
 SOLVED, EMPTY, OPEN = Status.SOLVED, Status.PRIMAL_INFEASIBLE, Status.ITERATION_LIMIT
 # QPs whose residuals are computed at a time.
@@ -56,7 +57,7 @@ class Batch:
         return replace(self, P=np.eye(len(self.P)), q=np.zeros_like(self.q))
 
 
-def residuals(qps: Batch, z: Any, y: Any) -> np.ndarray:
+def residuals(qps: Batch, z: Reals, y: Reals) -> np.ndarray:
     """Return primal residual, dual residual and gap of each pair as (3, B): infinity norms,
     absolute, infinity where a number is not finite.
 

@@ -12,6 +12,7 @@ from jaxmpc.control.sets import Box
 from jaxmpc.control.system import host_array
 from jaxmpc.control.violation import kept, row_violations
 from jaxmpc.qp.status import Status
+from jaxmpc.reals import Reals
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Outcome:
         return self.kept & self.reached
 
 
-def evaluate_runs(run: Run, plant: Any, reference: Any, *, tolerance: float = 0.02) -> Outcome:
+def evaluate_runs(run: Run, plant: Any, reference: Reals, *, tolerance: float = 0.02) -> Outcome:
     """Evaluate closed loops whose target is rest at `reference`.
 
     run: from `simulate` or `simulate_many`, with or without a batch axis. plant: the Robot or

@@ -12,15 +12,16 @@ from jaxmpc.control.riccati import least_reached, lqr
 from jaxmpc.control.sets import Box
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.reals import Reals
 from jaxmpc.robots.balance import settled
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
 
 
 def robot_mpc(
-    robot: Robot | LinearPlant, Q: Any = None, R: Any = None, horizon: int = 20, *,
-    target: Any = None, margin: float = 0.02, terminal_cost: Any = "lqr", exact: bool = True,
-    **fields: Any,
+    robot: Robot | LinearPlant, Q: Reals | None = None, R: Reals | None = None, horizon: int = 20,
+    *, target: Any = None, margin: float = 0.02, terminal_cost: Reals | str | None = "lqr",
+    exact: bool = True, **fields: Any,
 ) -> MPC:  # fmt: skip
     """Return the MPC of a robot about a set-point, with the limits of its model.
 

@@ -17,14 +17,16 @@ from jaxmpc.closed_loop.run import Run
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.control.violation import worst_violation
 from jaxmpc.qp.precision import arrays, matmul
+from jaxmpc.reals import Reals
 
 # Slack of a plan that counts as rounding, by precision: the accuracy of solved plans.
 SLACK = {"float64": 1e-6, "float32": 1e-3}
 
 
 def simulate(
-    controller: Any, plant: Any, x0: Any, steps: int, *, reference: Any = None,
-    input_reference: Any = None, disturbance: Any = None, previous_input: Any = None,
+    controller: Any, plant: Any, x0: Reals, steps: int, *, reference: Reals | None = None,
+    input_reference: Reals | None = None, disturbance: Reals | None = None,
+    previous_input: Reals | None = None,
     noise: Noise | None = None, observer: KalmanFilter | None = None, delay: int = 0,
     compensate: bool = True, checkpoint: bool = False,
 ) -> Run:  # fmt: skip

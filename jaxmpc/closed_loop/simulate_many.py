@@ -24,12 +24,14 @@ from jaxmpc.closed_loop.simulate import (
 from jaxmpc.compiled import Compiled, first_rows, joined, padded
 from jaxmpc.devices import Devices, chosen_devices, count, divisible, over_devices, placement
 from jaxmpc.qp.precision import arrays
+from jaxmpc.reals import Reals
 
 
 def simulate_many(
-    controller: Any, plant: Any, x0s: Any, steps: int, *, reference: Any = None,
-    input_reference: Any = None, references: Any = None, input_references: Any = None,
-    previous_input: Any = None, noise: Noise | None = None, observer: KalmanFilter | None = None,
+    controller: Any, plant: Any, x0s: Reals, steps: int, *, reference: Reals | None = None,
+    input_reference: Reals | None = None, references: Reals | None = None,
+    input_references: Reals | None = None, previous_input: Reals | None = None,
+    noise: Noise | None = None, observer: KalmanFilter | None = None,
     delay: int = 0, compensate: bool = True, variations: Mapping[str, Any] | None = None,
     chunk: int | None = None, progress: bool = False, devices: Any = None,
 ) -> Run:  # fmt: skip
@@ -52,10 +54,10 @@ def simulate_many(
     Raises ValueError as `simulate` does.
     """
     require_real("x0s", x0s)
-    if np.ndim(x0s) != 2 or not len(x0s):
-        size = getattr(controller, "state_size", "n")
-        fail("x0s", f"shape {np.shape(x0s)}", f"Give (B, {size}), B ≥ 1")
     x0s, variations = np.asarray(x0s), dict(variations or {})
+    if x0s.ndim != 2 or not len(x0s):
+        size = getattr(controller, "state_size", "n")
+        fail("x0s", f"shape {x0s.shape}", f"Give (B, {size}), B ≥ 1")
     require_variations(plant, variations, len(x0s))
     if chunk is not None and chunk < 1:
         fail("chunk", f"{chunk}", "Give a count of at least 1")
@@ -65,8 +67,8 @@ def simulate_many(
         "previous_input": previous_input, "noise": noise, "observer": observer,
     }  # fmt: skip
     shared = {name: value for name, value in shared.items() if value is not None}
-    own = {"reference": references, "input_reference": input_references}
-    own = {name: np.asarray(v) for name, v in own.items() if v is not None}
+    given = {"reference": references, "input_reference": input_references}
+    own = {name: np.asarray(v) for name, v in given.items() if v is not None}
     checked = checked_arguments(controller, plant, x0s[0], steps, **shared, delay=delay)
     require_own(own, shared, controller, steps, len(x0s))
     if noise is not None:

@@ -1,17 +1,16 @@
 """Equilibria of a linear system: the steady state and input that a reference requires."""
 
-from typing import Any
-
 import numpy as np
 from scipy.optimize import lsq_linear
 
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.control.sets import Box
 from jaxmpc.control.system import LinearSystem, host_array, host_matrices
+from jaxmpc.reals import Reals
 
 
 def equilibrium(
-    system: LinearSystem, target: Any, *, C: Any = None, states: Box | None = None,
+    system: LinearSystem, target: Reals, *, C: Reals | None = None, states: Box | None = None,
     inputs: Box | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return (x, u) with x = A x + B u + c and C x = target: what to track and the input that holds

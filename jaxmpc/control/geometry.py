@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
-from jax.typing import ArrayLike
 from scipy.optimize import linprog
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 
 from jaxmpc.checks import fail, require_finite
 from jaxmpc.control.system import host_array
+from jaxmpc.reals import Reals
 
 # Tolerances of HiGHS' linear programs.
 HIGHS = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
@@ -143,7 +143,7 @@ def unit_rows(H: Any, h: Any, argument: str = "Polytope") -> tuple[np.ndarray, n
     return H / length[:, None], h / length
 
 
-def hull_volume(points: ArrayLike) -> float:
+def hull_volume(points: Reals) -> float:
     """Return the volume of the convex hull of points (k, n): 0 where they lie in a hyperplane.
     NumPy; not traceable."""
     points = host_array("points", points)

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jax.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from jaxmpc.checks import (
@@ -31,6 +30,7 @@ from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem, host_array, host_matrices
 from jaxmpc.qp.linalg import cholesky, eigh, solve_triangular
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul
+from jaxmpc.reals import Reals
 
 # A row counts as redundant if it is exceeded by no more than this, relative to its bound.
 # Rounding alone makes rows that just touch the set exceed their bound by about 1e-16.
@@ -46,7 +46,7 @@ _VERTICES = 500  # up to this many vertices, an input is found for each
 @overload
 def maximal_invariant_set(
     system: LinearSystem,
-    K: ArrayLike,
+    K: Reals,
     states: Box | Polytope,
     inputs: Box | Polytope | None,
     *,
@@ -57,7 +57,7 @@ def maximal_invariant_set(
 @overload
 def maximal_invariant_set(
     system: LinearSystem,
-    K: ArrayLike,
+    K: Reals,
     states: Box | Polytope,
     inputs: Box | Polytope | None,
     *,
@@ -67,7 +67,7 @@ def maximal_invariant_set(
 ) -> tuple[Polytope, int]: ...
 def maximal_invariant_set(
     system: LinearSystem,
-    K: ArrayLike,
+    K: Reals,
     states: Box | Polytope,
     inputs: Box | Polytope | None,
     *,
@@ -343,8 +343,8 @@ def maximal_control_invariant_set(
 
 def invariant_ellipsoid(
     system: LinearSystem,
-    K: ArrayLike,
-    P: ArrayLike,
+    K: Reals,
+    P: Reals,
     states: Box | Polytope | None,
     inputs: Box | Polytope | None,
     disturbance: Box | Polytope | None = None,
@@ -802,7 +802,7 @@ def _vertex_proof(step: OneStep, C: Polytope) -> tuple[str, float]:
 
 def _closed_loop(
     system: LinearSystem,
-    K: ArrayLike,
+    K: Reals,
     states: Box | Polytope | None,
     inputs: Box | Polytope | None,
     optional: tuple[str, ...] = ("inputs",),
@@ -850,14 +850,14 @@ def _polytope(argument: str, value: Box | Polytope | None, n: int) -> Polytope:
     return value.to_polytope() if isinstance(value, Box) else value
 
 
-def _extent(rows: np.ndarray, limits: ArrayLike = 1.0) -> np.ndarray:
+def _extent(rows: np.ndarray, limits: Reals = 1.0) -> np.ndarray:
     """Return bounds on |x_i| over rows x <= limits, with a margin for the LP's error; inf where
     unbounded."""
     return geometry.extent(*unit_rows(rows, np.broadcast_to(limits, len(rows)))) * (1 + 1e-6)
 
 
 def _bound(
-    row: np.ndarray, rows: np.ndarray, extent: np.ndarray, limits: ArrayLike = 1.0
+    row: np.ndarray, rows: np.ndarray, extent: np.ndarray, limits: Reals = 1.0
 ) -> tuple[float, float]:
     """Return (maximum, upper bound of it) of row x over rows x <= limits.
 

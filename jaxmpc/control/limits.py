@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jax.typing import ArrayLike
 
 from jaxmpc.checks import fail, require_finite
 from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.control.system import host_array
+from jaxmpc.reals import Reals
 
-Limit = float | ArrayLike | tuple[ArrayLike, ArrayLike] | None
+Limit = float | Reals | tuple[Reals, Reals] | None
 
 
 @dataclass(frozen=True)
@@ -97,9 +97,9 @@ def joint_limits(
 
 
 def output_limits(
-    C: ArrayLike,
-    lower: ArrayLike | None,
-    upper: ArrayLike | None,
+    C: Reals,
+    lower: Reals | None,
+    upper: Reals | None,
     names: Sequence[str] = (),
     units: Sequence[str] = (),
     argument: str = "limits",

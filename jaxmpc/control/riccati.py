@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 from jax import Array
-from jax.typing import ArrayLike
 
 from jaxmpc.checks import concrete, fail, require_kind, require_shape, require_symmetric_psd
 from jaxmpc.control.system import LinearSystem, as_weight, host_array
 from jaxmpc.qp.linalg import solve, solve_general
 from jaxmpc.qp.precision import arrays, floating_dtype, in_float64, matmul
+from jaxmpc.reals import Reals
 
 # Modes closer than this to unreachable (least singular value, relative) count as such.
 _UNREACHED = 1e-10
@@ -33,11 +33,11 @@ class LQR:
     P: (n, n), symmetric: the least cost from x is x'P x (no 1/2).
     """
 
-    K: ArrayLike
-    P: ArrayLike
+    K: Reals
+    P: Reals
 
 
-def lqr(system: LinearSystem, Q: ArrayLike, R: ArrayLike) -> LQR:
+def lqr(system: LinearSystem, Q: Reals, R: Reals) -> LQR:
     """Minimise sum over k >= 0 of x_k'Q x_k + u_k'R u_k subject to x+ = A x + B u.
 
     P solves the discrete algebraic Riccati equation
@@ -105,7 +105,7 @@ def lqr(system: LinearSystem, Q: ArrayLike, R: ArrayLike) -> LQR:
     return LQR(K=K, P=P)
 
 
-def cost_of_law(system: LinearSystem, K: ArrayLike, Q: ArrayLike, R: ArrayLike) -> Any:
+def cost_of_law(system: LinearSystem, K: Reals, Q: Reals, R: Reals) -> Any:
     """Return P with x'P x = sum over k >= 0 of x_k'Q x_k + u_k'R u_k under u = K x.
 
     P = (A+BK)'P(A+BK) + Q + K'RK: as terminal cost it falls by the stage cost along u = K x, which

@@ -47,6 +47,7 @@ from jaxmpc.control.geometry import (
 from jaxmpc.control.geometry import irredundant as _irredundant
 from jaxmpc.control.system import as_array, dimensions, host_array
 from jaxmpc.qp.linalg import solve
+from jaxmpc.reals import Reals
 
 __all__ = ["Box", "Ellipsoid", "Optimum", "Polytope", "hull_volume", "maximise", "unit_rows"]
 
@@ -62,8 +63,8 @@ class Box:
             `MPC` the bounds of every coordinate.
     """
 
-    lower: ArrayLike
-    upper: ArrayLike
+    lower: Reals
+    upper: Reals
 
     def __post_init__(self) -> None:
         axes = dimensions(self.lower), dimensions(self.upper)
@@ -111,7 +112,7 @@ class Box:
                 "Give lower <= upper, with -inf below or inf above for no bound",
             )
 
-    def contains(self, x: ArrayLike, tolerance: float = 0.0) -> jax.Array:
+    def contains(self, x: Reals, tolerance: float = 0.0) -> jax.Array:
         """Return whether lower - tolerance <= x <= upper + tolerance, x of shape (n,)."""
         self = self.spread(1)
         _require_shapes("Box", self, ("lower", "upper"), 1)
@@ -119,7 +120,7 @@ class Box:
         x, lower, upper = jnp.asarray(x), jnp.asarray(self.lower), jnp.asarray(self.upper)
         return jnp.all((lower - tolerance <= x) & (x <= upper + tolerance))
 
-    def support(self, d: ArrayLike) -> jax.Array:
+    def support(self, d: Reals) -> jax.Array:
         """Return max d'x over the box, d of shape (n,); inf where the box is unbounded along d."""
         self = self.spread(1)
         _require_shapes("Box", self, ("lower", "upper"), 1)
@@ -209,12 +210,12 @@ class Polytope:
             out of `intersect`, `reduce` or `preimage` keeps the label it went in with.
     """
 
-    H: ArrayLike
-    h: ArrayLike
+    H: Reals
+    h: Reals
     labels: tuple[str, ...] = field(default=(), metadata={"static": True})
 
     @classmethod
-    def from_points(cls, points: ArrayLike) -> "Polytope":
+    def from_points(cls, points: Reals) -> "Polytope":
         """Return the convex hull of `points` (k, n), one unit outward normal per facet. NumPy; not
         traceable.
 
@@ -260,14 +261,14 @@ class Polytope:
             return True
         return maximise(np.zeros(self.dimension), *unit_rows(H, h)).value == -np.inf
 
-    def contains(self, x: ArrayLike, tolerance: float = 0.0) -> jax.Array:
+    def contains(self, x: Reals, tolerance: float = 0.0) -> jax.Array:
         """Return whether H x <= h + tolerance (in the scale of each row), x of shape (n,)."""
         _require_shapes("Polytope", self, ("H", "h"), 2)
         require_shape("x", x, (self.dimension,), "Give one point; use jax.vmap for many")
         H, h, x = jnp.asarray(self.H), jnp.asarray(self.h), jnp.asarray(x)
         return jnp.all(jnp.matmul(H, x, precision="highest") <= h + tolerance)
 
-    def support(self, d: ArrayLike) -> float:
+    def support(self, d: Reals) -> float:
         """Return max d'x over the set, by one LP; inf if unbounded along d. NumPy; not traceable.
         Raises ValueError if the set is empty."""
         G, g = self._rows()
@@ -317,7 +318,7 @@ class Polytope:
             fail("factor", f"{factor!r} is not a positive number", "Give a finite factor > 0")
         return Polytope(host_array("H", self.H), host_array("h", self.h) * float(factor))
 
-    def preimage(self, M: ArrayLike, t: ArrayLike | None = None) -> "Polytope":
+    def preimage(self, M: Reals, t: Reals | None = None) -> "Polytope":
         """Return {x : M x + t in the set} = {x : H M x <= h - H t}, row by row, not reduced. NumPy;
         not traceable.
 
@@ -330,7 +331,7 @@ class Polytope:
         M, t = _affine(M, t, (self.dimension, None))
         return Polytope(H @ M, h - H @ t, self.labels)
 
-    def image(self, M: ArrayLike, t: ArrayLike | None = None) -> "Polytope":
+    def image(self, M: Reals, t: Reals | None = None) -> "Polytope":
         """Return {M x + t : x in the set}, reduced unless M is square. NumPy; not traceable.
 
         Arguments:
@@ -356,7 +357,7 @@ class Polytope:
         T = np.vstack([M, np.eye(n)[order[k:]]])
         lifted = self.preimage(np.linalg.inv(T))
         image = lifted if k == n else lifted.project(range(k))
-        return Polytope(image.H, image.h + image.H @ t, image.labels)
+        return Polytope(image.H, np.asarray(image.h) + image.H @ t, image.labels)
 
     def project(self, axes: Sequence[int]) -> "Polytope":
         """Return the set of (x_i for i in axes) over all x in the set, with irredundant unit rows.
@@ -378,7 +379,7 @@ class Polytope:
         Y = eliminate(Y, sorted(set(range(n)) - set(axes)))[:, np.argsort(np.argsort(axes))]
         return Polytope(*unit_rows(Y, 1 + Y @ centre[axes]))
 
-    def minkowski_sum(self, other: "Box | Polytope | ArrayLike") -> "Polytope":
+    def minkowski_sum(self, other: "Box | Polytope | Reals") -> "Polytope":
         """Return {x + w : x in the set, w in other}, with irredundant unit rows. NumPy; not
         traceable.
 
@@ -413,7 +414,7 @@ class Polytope:
             lifted = lifted.intersect(weights.preimage(np.eye(k, n + k, n)))
         return lifted.project(range(n))
 
-    def pontryagin_difference(self, other: "Box | Polytope | Ellipsoid | ArrayLike") -> "Polytope":
+    def pontryagin_difference(self, other: "Box | Polytope | Ellipsoid | Reals") -> "Polytope":
         """Return {x : x + w in the set for all w in other}: H x <= h - max {H w : w in other}.
         NumPy; not traceable.
 
@@ -535,8 +536,8 @@ class Ellipsoid:
         level: a number > 0.
     """
 
-    P: ArrayLike
-    level: ArrayLike
+    P: Reals
+    level: Reals
 
     @property
     def dimension(self) -> int:
@@ -554,7 +555,7 @@ class Ellipsoid:
         if not (np.isfinite(level) and level > 0):
             fail(f"{argument}.level", f"{level:g} is not a positive number", "Give x'Px's maximum")
 
-    def contains(self, x: ArrayLike, tolerance: float = 0.0) -> jax.Array:
+    def contains(self, x: Reals, tolerance: float = 0.0) -> jax.Array:
         """Return whether x'P x <= level + tolerance, x of shape (n,)."""
         self._require_fields("Ellipsoid")
         require_shape("x", x, (self.dimension,), "Give one point; use jax.vmap for many")
@@ -562,7 +563,7 @@ class Ellipsoid:
         value = jnp.vdot(x, jnp.matmul(P, x, precision="highest"), precision="highest")
         return value <= jnp.asarray(self.level) + tolerance
 
-    def support(self, d: ArrayLike) -> jax.Array:
+    def support(self, d: Reals) -> jax.Array:
         """Return max d'x over the ellipsoid = sqrt(level d'P^-1 d), d of shape (n,)."""
         self._require_fields("Ellipsoid")
         require_shape("d", d, (self.dimension,), "Give one direction; use jax.vmap for many")
@@ -650,7 +651,7 @@ def _as_polytope(argument: str, value: Any) -> Polytope:
 
 
 def _affine(
-    M: ArrayLike, t: ArrayLike | None, shape: tuple[int | None, int | None]
+    M: Reals, t: Reals | None, shape: tuple[int | None, int | None]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return M and t of x -> M x + t, checked: M has this shape (None: any), t one entry a row of
     M."""
@@ -667,7 +668,7 @@ def _affine(
 
 
 def _generated(
-    other: "Box | Polytope | ArrayLike", points: np.ndarray | None
+    other: "Box | Polytope | Reals", points: np.ndarray | None
 ) -> tuple[Polytope | None, np.ndarray, np.ndarray]:
     """Return (W, D, shift) with {D w + shift : w in W} = other, W with volume; None: other =
     {shift}."""

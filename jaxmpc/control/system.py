@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jax.typing import ArrayLike
 
 from jaxmpc.checks import concrete, fail, require_finite, require_real, require_shape
+from jaxmpc.reals import Reals
 
 
 def host_array(argument: str, value: Any) -> np.ndarray:
@@ -91,9 +91,9 @@ class LinearSystem:
     static. The constructor checks nothing, `validate` does, and takes a vector B (n,) as one input.
     """
 
-    A: ArrayLike
-    B: ArrayLike
-    c: ArrayLike | None = None
+    A: Reals
+    B: Reals
+    c: Reals | None = None
     dt: float | None = field(default=None, metadata={"static": True})
     state_names: tuple[str, ...] = field(default=(), metadata={"static": True})
     input_names: tuple[str, ...] = field(default=(), metadata={"static": True})
@@ -129,7 +129,7 @@ class LinearSystem:
         """Return m labels for axes and tables, such as "torque [N m]"."""
         return _labels(self.input_names or _numbered("u", self.m), self.input_units)
 
-    def step(self, x: ArrayLike, u: ArrayLike) -> jax.Array:
+    def step(self, x: Reals, u: Reals) -> jax.Array:
         """Return A x + B u + c for x (n,) and u (m,), computed in the dtype of x."""
         x = jnp.asarray(x)
         A, B = jnp.asarray(self.A, x.dtype), jnp.asarray(self.B, x.dtype)
@@ -164,10 +164,10 @@ class LinearSystem:
     @classmethod
     def from_continuous(
         cls,
-        A: ArrayLike,
-        B: ArrayLike,
+        A: Reals,
+        B: Reals,
         dt: float,
-        c: ArrayLike | None = None,
+        c: Reals | None = None,
         **names: tuple[str, ...],
     ) -> "LinearSystem":
         """Sample dx/dt = A x + B u + c exactly, the input held constant over each period.

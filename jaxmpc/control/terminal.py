@@ -6,7 +6,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jax.typing import ArrayLike
 
 from jaxmpc.checks import fail, require_finite, require_kind, require_shape
 from jaxmpc.control import geometry
@@ -22,6 +21,7 @@ from jaxmpc.control.invariant import (
 from jaxmpc.control.riccati import least_reached, lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope, translated, unit_half_spaces
 from jaxmpc.control.system import LinearSystem, host_array, host_matrices
+from jaxmpc.reals import Reals
 
 # A limit counts as kept if it is exceeded by no more than this, relative to the set's extent
 # along the row (to |P| for matrix inequalities). Sets that touch a limit exceed it by rounding.
@@ -106,13 +106,13 @@ class TerminalReport:
 
 def verify_terminal(
     system: LinearSystem,
-    Q: ArrayLike,
-    R: ArrayLike,
-    terminal_cost: ArrayLike | None,
+    Q: Reals,
+    R: Reals,
+    terminal_cost: Reals | None,
     terminal_set: Box | Polytope | Ellipsoid | None,
     states: Box | Polytope | None,
     inputs: Box | Polytope | None,
-    K: ArrayLike | None = None,
+    K: Reals | None = None,
     disturbance: Box | Polytope | None = None,
 ) -> TerminalReport:
     """Check each hypothesis of the theorems on recursive feasibility (1) and stability (3).
@@ -552,7 +552,7 @@ def _origin_inside(X_f: _Set) -> Check:
     return Check(name, depth > 0, depth, unit, sentence, (3,))
 
 
-def _symmetric(argument: str, value: ArrayLike, n: int) -> np.ndarray:
+def _symmetric(argument: str, value: Reals, n: int) -> np.ndarray:
     """Return a symmetric matrix (n, n) in float64; raise ValueError unless it is one."""
     require_shape(argument, value, (n, n), "Give one square matrix")
     matrix = host_array(argument, value)

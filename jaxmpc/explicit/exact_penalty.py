@@ -2,7 +2,7 @@
 
 import time
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linprog
@@ -24,6 +24,7 @@ from jaxmpc.explicit.search import exchange, explore
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Row, row_table
 from jaxmpc.qp.status import Status
+from jaxmpc.reals import Reals
 
 # "auto" enumerates regions up to this dimension of the state.
 ENUMERATED = 4
@@ -88,7 +89,7 @@ class ExactPenalty:
 
 
 def exact_penalty(
-    mpc: MPC, x0s: Any = None, *, method: str = "auto", rho: float | None = None,
+    mpc: MPC, x0s: Reals | None = None, *, method: str = "auto", rho: float | None = None,
     limit: int = 2000, within: Box | Polytope | None = None, samples: int = 200, seed: int = 0,
     seconds: float = np.inf,
 ) -> ExactPenalty:  # fmt: skip

@@ -27,12 +27,13 @@ from jaxmpc.feasible.rays import Rays
 from jaxmpc.feasible.refinement import refined
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
+from jaxmpc.reals import Reals
 
 # Volumes are sums of rounded products; bounds are widened by more than that.
 VOLUME_ROUNDING = 1e-11
 
 
-def grid(lower: Any, upper: Any, shape: Any) -> np.ndarray:
+def grid(lower: Reals, upper: Reals, shape: Any) -> np.ndarray:
     """Return the points of a regular grid, end points included: (Π shape, d), first coordinate
     slowest. A number among lower, upper (d,) and shape (d,) holds along each axis.
 
@@ -305,7 +306,8 @@ def excluded(
 
 
 def map_feasible_set(
-    mpc: MPC | FeasibilityProblem, x0s: Any, *, axes: Any = None, fixed: Any = None,
+    mpc: MPC | FeasibilityProblem, x0s: Reals, *, axes: Any = None,
+    fixed: Reals | None = None,
     iterations: int = 50, dtype: Any = "float32", chunk: int | None = None,
     refine: float | None = None,
     penalties: StagePenalties | None = None, progress: bool = False, executor: Any = None,

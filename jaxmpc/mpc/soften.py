@@ -10,9 +10,10 @@ from jaxmpc.checks import concrete, fail, require_kind
 from jaxmpc.control.limits import output_limits
 from jaxmpc.control.sets import Ellipsoid, Polytope
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple, output_steps
+from jaxmpc.reals import Reals
 
 
-def soften(mpc: MPC, rho: Any, quadratic: Any = 0.0) -> MPC:
+def soften(mpc: MPC, rho: Reals, quadratic: Reals = 0.0) -> MPC:
     """The same problem with all state, output and terminal rows soft; inputs and rates stay hard.
 
     rho, quadratic: weights of every row, as in `Soft`. Rows keep their units: a violation is

@@ -17,11 +17,13 @@ from jaxmpc.mpc.controller import Controller, plan_arguments
 from jaxmpc.mpc.plan import Plan, WarmStart
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM, DEFAULT
+from jaxmpc.reals import Reals
 
 
 def solve(
-    mpc: MPC, x0: Any, reference: Any = None, solver: ADMM = DEFAULT, warm_start: Any = None, *,
-    input_reference: Any = None, previous_input: Any = None,
+    mpc: MPC, x0: Reals, reference: Reals | None = None, solver: ADMM = DEFAULT,
+    warm_start: Any = None, *, input_reference: Reals | None = None,
+    previous_input: Reals | None = None,
 ) -> Plan:  # fmt: skip
     """Solve one MPC problem from the state x0 (n,).
 
@@ -47,7 +49,7 @@ def solve(
 
 
 def solve_many(
-    mpc: MPC | Controller, x0s: Any, solver: ADMM = DEFAULT, *, dtype: Any = "float32",
+    mpc: MPC | Controller, x0s: Reals, solver: ADMM = DEFAULT, *, dtype: Any = "float32",
     chunk: int | None = None, transfer: bool = True, to_host: bool = True,
     devices: Any = None,
 ) -> Plan:  # fmt: skip

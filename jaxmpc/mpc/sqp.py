@@ -72,6 +72,7 @@ from jaxmpc.qp.precision import arrays, precisely, rounding
 from jaxmpc.qp.residuals import Measured, Terms, assess
 from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
+from jaxmpc.reals import Reals
 
 # QPs at most, of `solve_nonlinear`.
 STEPS = 100
@@ -84,8 +85,8 @@ QUADRATIC = ("Q", "R", "P", "cross")
 
 
 def solve_nonlinear(
-    problem: NonlinearMPC, x0: Any, reference: Any = None, solver: ADMM = DEFAULT,
-    warm_start: Any = None, *, input_reference: Any = None, targets: Any = None,
+    problem: NonlinearMPC, x0: Reals, reference: Reals | None = None, solver: ADMM = DEFAULT,
+    warm_start: Any = None, *, input_reference: Reals | None = None, targets: Any = None,
     steps: int = STEPS, hessian: str = "exact", scale: Any = None,
 ) -> Plan:  # fmt: skip
     """Solve a nonlinear MPC from the state x0 (n,) by sequential quadratic programming.

@@ -63,6 +63,7 @@ from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.residuals import Pair, assess
 from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
+from jaxmpc.reals import Reals
 
 # Most stages that the passes of an ADMM step write out, without a loop over them. Loops reorder
 # (batch, N, …) to (N, batch, …) at each step, which takes longer than the products.
@@ -72,8 +73,9 @@ NEWTON_STEPS = 6
 
 
 def solve_stagewise(
-    mpc: MPC, system: LinearSystem, x0: Any, reference: Any = None, solver: ADMM = DEFAULT,
-    warm_start: Any = None, *, input_reference: Any = None, scale: Any = None,
+    mpc: MPC, system: LinearSystem, x0: Reals, reference: Reals | None = None,
+    solver: ADMM = DEFAULT, warm_start: Any = None, *, input_reference: Reals | None = None,
+    scale: Any = None,
 ) -> Plan:  # fmt: skip
     """Solve `mpc` with `system` in place of its own, whose A (n, n), B (n, m) and c (n,) may have
     a leading axis N: x_{k+1} = A_k x_k + B_k u_k + c_k.

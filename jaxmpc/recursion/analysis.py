@@ -28,6 +28,7 @@ from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import grid
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.reals import Reals
 from jaxmpc.recursion.ascent import ascend
 from jaxmpc.recursion.budget import LABELS, PLANS, PROOFS, Budget
 from jaxmpc.recursion.claims import (
@@ -50,8 +51,8 @@ from jaxmpc.recursion.report import NOT_FEASIBLE, Claim, Counterexample, Recursi
 
 
 def recursive_feasibility(
-    mpc: MPC, x0s: Any = None, *, steps: int = 20, search: bool = True, regions: int = 2000,
-    seconds: float = 60.0, progress: bool = False,
+    mpc: MPC, x0s: Reals | None = None, *, steps: int = 20, search: bool = True,
+    regions: int = 2000, seconds: float = 60.0, progress: bool = False,
 ) -> RecursionReport:  # fmt: skip
     """Examine whether `mpc` is recursively feasible: proofs, the worst counterexample, the states
     lost.

@@ -20,6 +20,7 @@ from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.reals import Reals
 from jaxmpc.recursion.analysis import examine
 from jaxmpc.recursion.budget import Budget
 from jaxmpc.robot_maps.loops import RobotLoops
@@ -32,8 +33,8 @@ CLAIMS = ("limits", "recursion")
 
 
 def map_robot(
-    robot: Robot | LinearPlant, mpc: MPC, x0s: Any, seconds: float = 2.0, *,
-    controller: Any = None, target: Any = None, axes: Any = None, fixed: Any = None,
+    robot: Robot | LinearPlant, mpc: MPC, x0s: Reals, seconds: float = 2.0, *,
+    controller: Any = None, target: Any = None, axes: Any = None, fixed: Reals | None = None,
     claim: str = "limits", chunk: int | None = None, refine: float | None = None,
     search_seconds: float = 60.0, progress: bool = False,
 ) -> RobotMap:  # fmt: skip

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxmpc.checks import fail, require_finite, require_shape
+from jaxmpc.checks import fail, require_finite, require_package, require_shape
 from jaxmpc.control.limits import Limit, limit_pair
 from jaxmpc.control.sets import Box
 from jaxmpc.control.system import require_period
+from jaxmpc.reals import Reals
 from jaxmpc.robots.physics import RK4, Physics
 from jaxmpc.robots.robot import Robot
 from jaxmpc.robots.supported import make_supported
@@ -26,7 +27,7 @@ MODELS = ("joint", "pendulum", "cartpole", "arm2", "arm6", "arm7", "quadrotor")
 
 def load_robot(
     model: "str | Path | mujoco.MjModel", *, position: Limit = None, velocity: Limit = None,
-    torque: Limit = None, home: Any = None, control_period: float | None = None,
+    torque: Limit = None, home: Reals | None = None, control_period: float | None = None,
     timestep: float | None = None, floating_base: bool = False, mend_inertias: bool = False,
 ) -> Robot:  # fmt: skip
     """Load a robot: a model of ours, an MJCF or URDF file, or a mujoco.MjModel.
@@ -58,8 +59,9 @@ def load_robot(
     iterations). `robot.report()` lists both, and what acts in the plant but not in linear models.
 
     Raises ValueError for files that MuJoCo cannot read, models without actuators or joints, what
-    else MJX does not support, and limits that contradict each other.
+    else MJX does not support, and limits that contradict each other; ImportError without MuJoCo.
     """
+    require_package("mujoco", "robots")
     import mujoco
 
     velocities: dict[str, float] = {}

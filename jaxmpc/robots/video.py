@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail, require_finite, require_shape, whole
+from jaxmpc.reals import Reals
 from jaxmpc.robots.captions import TARGET, captioned, exceeded_limits
 from jaxmpc.robots.robot import Robot
 
@@ -19,7 +20,7 @@ OPACITY = 0.3  # of the target
 
 
 def render(
-    robot: Robot, states: Any, *, inputs: Any = None, target: Any = None, every: int = 1,
+    robot: Robot, states: Reals, *, inputs: Reals | None = None, target: Any = None, every: int = 1,
     width: int = 320, height: int = 240, camera: str | None = "view", labels: bool = True,
     numbers: Sequence[int] | None = None,
 ) -> np.ndarray:  # fmt: skip

@@ -27,13 +27,14 @@ from jaxmpc.qp import linalg
 from jaxmpc.qp.newton import Constants, newton_step, ridged
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.projection import Bounds
+from jaxmpc.reals import Reals
 
 # Newton steps at most: most states need 3 to 20.
 STEPS = 60
 
 
 def feasible_fraction(
-    mpc: MPC, x0s: Any, width: float = 0.02, *, scale: Any = None, newton_steps: int = STEPS
+    mpc: MPC, x0s: Reals, width: float = 0.02, *, scale: Any = None, newton_steps: int = STEPS
 ) -> Array:
     """Return the smoothed fraction of states x0s (B, n) from which hard constraints can be kept.
 

@@ -13,6 +13,7 @@ from jaxmpc.checks import fail
 from jaxmpc.devices import chosen_devices
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.precision import arrays
+from jaxmpc.reals import Reals
 from jaxmpc.runs import fingerprint
 from jaxmpc.tuning.batch_mean import BatchMean
 from jaxmpc.tuning.descent import descend
@@ -23,7 +24,7 @@ from jaxmpc.tuning.settings import Settings
 
 
 def tune_feasible_set(
-    make_mpc: Callable[[Mapping[str, Any]], MPC], parameters: Parameters, x0s: Any,
+    make_mpc: Callable[[Mapping[str, Any]], MPC], parameters: Parameters, x0s: Reals,
     width: float = 0.02, *, design_loss: Callable[[MPC], Any] | None = None,
     newton_steps: int = STEPS, **settings: Any,
 ) -> TuningRun:  # fmt: skip

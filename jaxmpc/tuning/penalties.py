@@ -17,6 +17,7 @@ from jaxmpc.mpc.plan import Plan, WarmStart
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM, factor
 from jaxmpc.qp.status import Status
+from jaxmpc.reals import Reals
 from jaxmpc.runs import fingerprint
 from jaxmpc.tuning.descent import descend
 from jaxmpc.tuning.penalty_objective import (
@@ -43,9 +44,9 @@ SOLVER = ADMM(refine=0)
 
 
 def tune_penalties(
-    mpc: MPC, x0s: Any, iterations: int = 100, *, stages: int = 4, groups: str = "step",
-    solver: ADMM | None = None, warm_start: Any = None, reference: Any = None,
-    input_reference: Any = None, cache: str | Path | None = None, **settings: Any,
+    mpc: MPC, x0s: Reals, iterations: int = 100, *, stages: int = 4, groups: str = "step",
+    solver: ADMM | None = None, warm_start: Any = None, reference: Reals | None = None,
+    input_reference: Reals | None = None, cache: str | Path | None = None, **settings: Any,
 ) -> TuningRun:  # fmt: skip
     """Tune ADMM's rho and alpha for an MPC problem, so that `iterations` steps solve more states.
 

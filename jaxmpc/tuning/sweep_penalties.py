@@ -41,6 +41,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp import linalg
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
+from jaxmpc.reals import Reals
 from jaxmpc.runs import fingerprint
 from jaxmpc.tuning.batch_mean import BatchMean
 from jaxmpc.tuning.descent import descend
@@ -56,7 +57,7 @@ VALIDATION, FEWEST = 2048, 64
 
 
 def tune_sweep_penalties(
-    mpc: MPC, points: Any, *, axes: Any = None, fixed: Any = None, iterations: int = 50,
+    mpc: MPC, points: Reals, *, axes: Any = None, fixed: Reals | None = None, iterations: int = 50,
     dtype: Any = "float32", chunk: int | None = None, cache: str | Path | None = None,
     **settings: Any,
 ) -> TuningRun:  # fmt: skip

@@ -15,6 +15,7 @@ from jaxmpc.devices import chosen_devices
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.soften import harden
 from jaxmpc.qp.admm import ADMM
+from jaxmpc.reals import Reals
 from jaxmpc.runs import fingerprint
 from jaxmpc.tuning.closed_loop_objective import (
     MODES,
@@ -34,9 +35,9 @@ SOLVER = ADMM(iterations=50, rho=1.0, alpha=1.6, refine=20)
 
 
 def tune_weights(
-    make_mpc: Callable[[Mapping[str, Any]], Any], parameters: Parameters, plant: Any, x0s: Any,
-    loss: Callable[[Run], Any] | None = None, steps: int = 50, *, reference: Any = None,
-    input_reference: Any = None, variations: Mapping[str, Any] | None = None,
+    make_mpc: Callable[[Mapping[str, Any]], Any], parameters: Parameters, plant: Any, x0s: Reals,
+    loss: Callable[[Run], Any] | None = None, steps: int = 50, *, reference: Reals | None = None,
+    input_reference: Reals | None = None, variations: Mapping[str, Any] | None = None,
     solver: ADMM | None = None, design_loss: Callable[[MPC], Any] | None = None,
     mode: str = "auto", **settings: Any,
 ) -> TuningRun:  # fmt: skip

@@ -14,6 +14,7 @@ from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.soften import soften
 from jaxmpc.qp.admm import ADMM
+from jaxmpc.reals import Reals
 from jaxmpc.workflow.offline_test import OfflineReport, offline_report
 
 
@@ -39,7 +40,7 @@ class Design:
 
 
 def design(
-    system: LinearSystem, Q: Any, R: Any, horizon: int, *, limits: JointLimits | None = None,
+    system: LinearSystem, Q: Reals, R: Reals, horizon: int, *, limits: JointLimits | None = None,
     states: Box | Polytope | None = None, inputs: Box | Polytope | None = None,
     terminal: str | Box | Polytope | Ellipsoid = "invariant", soft: float | str | None = None,
     **settings: Any,
@@ -74,11 +75,11 @@ def design(
         terminal_set=terminal_set, **{"terminal_cost": regulator.P, **settings},
     )  # fmt: skip
     mpc.validate()
-    penalty = None
-    if isinstance(soft, str):
-        if soft != "exact":
-            fail("soft", f"{soft!r}", 'Give a weight, "exact" or None')
-        penalty = exact_penalty(mpc)
-    if soft is not None:
-        mpc = soften(mpc, soft if penalty is None else penalty.advised)
-    return Design(mpc, regulator, penalty)
+    if soft is None:
+        return Design(mpc, regulator, None)
+    if not isinstance(soft, str):
+        return Design(soften(mpc, soft), regulator, None)
+    if soft != "exact":
+        fail("soft", f"{soft!r}", 'Give a weight, "exact" or None')
+    penalty = exact_penalty(mpc)
+    return Design(soften(mpc, penalty.advised), regulator, penalty)

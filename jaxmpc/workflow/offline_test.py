@@ -18,6 +18,7 @@ from jaxmpc.mpc.inequalities import condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import row_table
 from jaxmpc.mpc.soften import harden
+from jaxmpc.reals import Reals
 from jaxmpc.recursion import RecursionReport
 from jaxmpc.recursion.analysis import examine
 from jaxmpc.recursion.budget import LABELS, LOOPS, PROOFS, Budget
@@ -76,8 +77,8 @@ class OfflineReport:
 
 
 def offline_report(
-    mpc: MPC, x0s: Any = None, *, K: Any = None, steps: int = 50, loops: int = 128,
-    seconds: float = 120.0, progress: bool = False,
+    mpc: MPC, x0s: Reals | None = None, *, K: Reals | None = None, steps: int = 50,
+    loops: int = 128, seconds: float = 120.0, progress: bool = False,
 ) -> OfflineReport:  # fmt: skip
     """Test an MPC problem before its controller runs, and return one report.
 

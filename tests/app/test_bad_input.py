@@ -256,7 +256,10 @@ def test_a_byte_order_mark_is_accepted(refused, tmp_path):
 
 LINES = [
     # Commands.
-    ("", "no command given. There are init, sweep, recursion, info, simulate, verify, bench, tune"),
+    (
+        "",
+        "no command given. There are init, sweep, recursion, info, simulate, verify, export, ",
+    ),
     ("swep", "no command 'swep'. Did you mean sweep?"),
     ("Sweep", "no command 'Sweep'"),
     ("--horizon 3", "no command '--horizon'"),
@@ -371,6 +374,13 @@ LINES = [
     ("recursion --seconds nan", "--seconds: nan. Give a positive number"),
     ("recursion --seconds inf", "--seconds: inf. Give a positive number"),
     ("recursion --smallest 0", "--smallest: 0"),
+    ("export --iterations 0", "--iterations: 0"),
+    ("export --samples -1", "--samples: -1"),
+    ("export --tolerance 0", "--tolerance: 0.0"),
+    ("export --name 1st", "name: '1st'"),
+    ("export --horizon 0", "--horizon: "),
+    ("export --config nowhere", "nowhere"),
+    ("export --output file", "file"),
     ("verify", "DIR"),
     ("verify nowhere", "nowhere: holds no labels"),
     ("verify file --sample -1", "--sample: -1"),

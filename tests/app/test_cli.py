@@ -132,6 +132,15 @@ def test_file_slice_and_overwrite(tmp_path, capsys):
     assert "length from" in capsys.readouterr().out
 
 
+@pytest.fixture
+def interruptible():
+    """Shells start what runs in the background with SIGINT ignored, which children inherit."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(linear_sweep, "CHUNK", 50)
     real = linear_sweep.label_parts
@@ -403,6 +412,7 @@ def test_recursion_of_a_proved_law_draws_no_samples(tmp_path, capsys):
     assert (tmp_path / "jaxmpc-recursion" / "recursion.png").stat().st_size > 10_000
 
 
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize(
     ("options", "sign", "answer"),
     [
@@ -475,6 +485,7 @@ sys.exit(cli.main(sys.argv[2:]))
 """
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line_and_resume_goes_on(tmp_path, capsys):
     """While the store is made, and while a block is written."""
     line = "sweep --grid 16 12 --horizon 5 --no-refine"

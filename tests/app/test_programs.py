@@ -180,6 +180,7 @@ with kept_programs(["simulate"]):
 """
 
 
+@pytest.mark.slow
 def test_results_are_the_same_with_and_without():
     """Cold, kept, two at once, damaged and without: the same bits, and nothing on stderr."""
     paths = {**os.environ, "PYTHONPATH": str(Path(jm.__file__).parents[1])}

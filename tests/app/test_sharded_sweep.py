@@ -90,6 +90,7 @@ def test_refusals_and_resume(tmp_path, monkeypatch, capsys):
     assert "for 660 QPs" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_job_array_and_an_indexed_job(whole, tmp_path, monkeypatch):
     monkeypatch.setenv("SLURM_ARRAY_TASK_MIN", "1")
     monkeypatch.setenv("SLURM_ARRAY_TASK_COUNT", "2")
@@ -149,6 +150,7 @@ SHARD = """
 
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("kills", [3, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_kills_at_random_moments(tmp_path, kills):
     """Two shards side by side, one of them killed at a time: no array differs, and no block is
     computed twice but those in hand."""

@@ -329,6 +329,7 @@ np.savez("frames.npz", frames=frames, words=words, still=still)
 """
 
 
+@pytest.mark.slow
 def test_film_shows_the_motion(tmp_path):
     """Three joints turn left, right and not at all: so do the red tools in their tiles. In a
     process of its own, since MuJoCo chooses its renderer when it is imported."""

@@ -92,6 +92,7 @@ def test_rivals_find_known_answers(name):
     assert name == "proxqp" or np.all(status == Status.PRIMAL_INFEASIBLE)
 
 
+@pytest.mark.slow
 def test_a_solver_that_lies_is_found_out(monkeypatch):
     """It says solved with answers that are 1e-5 off: counted as not solved, each status as false,
     and never as the best rival."""
@@ -117,6 +118,7 @@ def test_a_solver_that_lies_is_found_out(monkeypatch):
     assert rows["jaxmpc"].speedup == rows["clarabel"].microseconds / rows["jaxmpc"].microseconds
 
 
+@pytest.mark.slow
 def test_command_writes_table_json_and_plot(tmp_path, capsys, without):
     without("daqp")
     assert run(f"{PLANS} --rivals osqp clarabel daqp --loop 4") == 0

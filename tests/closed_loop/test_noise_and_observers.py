@@ -206,6 +206,7 @@ def test_references_of_each_loop():
             np.testing.assert_allclose(run.states[i], want.states, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_through_noise_filter_and_delay():
     """Of the cost in the gain of the law and the standard deviations: finite differences."""
     keys = jax.random.split(jax.random.key(0), 3)

@@ -121,6 +121,7 @@ def assert_records(robot, run):
     np.testing.assert_allclose(run.violation[:9], over, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_limits_are_kept_or_the_plan_says_so(pendulum, loops):
     assert_loops(pendulum, loops)
     assert_records(pendulum, loops)
@@ -132,6 +133,7 @@ def test_limits_are_kept_in_the_other_modes(pendulum, mode):
     assert_loops(pendulum, loops_of(pendulum, mode))
 
 
+@pytest.mark.slow
 def test_plans_are_those_of_another_solver(pendulum, loops):
     """The first input and cost of plans about the measured state and the last input, and whether
     soft rows break, by the C engine's linear model and clarabel."""

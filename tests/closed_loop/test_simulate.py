@@ -161,6 +161,7 @@ def test_previous_input_starts_the_loop():
     np.testing.assert_allclose(run.inputs[:, 0], np.array([31, 28, 25]) / 30, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_soft_violation_is_reported():
     """A soft limit at 1: from x0 = 2 the violation is 1 at once, and 2 − 0.5 − 1 a step later."""
     rows = Soft(np.array([[1.0]]), np.array([1.0]), rho=100.0)

@@ -37,6 +37,7 @@ def interval(polytope):
 # --- One step back ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_numbers_are_the_limits_of_every_coordinate():
     system = LinearSystem([[1, 0.1], [0, 1]], [0, 0.1])
     given = maximal_control_invariant_set(system, Box(-1, 1), Box(-0.5, 0.5))
@@ -113,6 +114,7 @@ def test_predecessor_by_ridges_and_by_elimination(monkeypatch):
         (LECTURE, symmetric(1, 1), 0.3, Fraction(7027, 2500), 10, 3),
     ],
 )
+@pytest.mark.first(1)
 def test_known_control_invariant_sets(system, states, inputs, area, vertices, index):
     found = maximal_control_invariant_set(system, states, symmetric(inputs))
     assert found.exact and found.iterations == index and found.gap == 0
@@ -140,6 +142,7 @@ def test_affine_dynamics_and_two_inputs_against_rationals():
     assert 0.5 * float(later.area) < found.volume() <= float(later.area)
 
 
+@pytest.mark.slow
 def test_recursion_without_end_gives_a_pair():
     found = maximal_control_invariant_set(UNSTABLE, symmetric(5), symmetric(1))
     assert not found.exact and found.gap < 1e-9 and "without end" in found.reason
@@ -247,6 +250,7 @@ def hidden(blocks):
 @pytest.mark.parametrize(
     "blocks", [pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow), 6]
 )
+@pytest.mark.slow
 def test_hidden_products(blocks):
     system, states, inputs, T = hidden(blocks)
     assert abs(np.linalg.det(T)) == pytest.approx(1)

@@ -56,6 +56,7 @@ def spread_calls(text: str) -> list[str]:
         if name not in HOST
     ],
 )
+@pytest.mark.first(1)
 def test_no_spread_lapack_call(name, monkeypatch):
     """Where such calls wait for each other, no program of the package may hold one."""
     monkeypatch.setattr(linalg, "WAITS", True)

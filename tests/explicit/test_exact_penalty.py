@@ -141,6 +141,7 @@ class TestRegions:
         ids=["lecture", "joint", "joint O_inf", "drifting", "double", "scalar", "duplicated",
              "apex", "pair", "rates"],
     )  # fmt: skip
+    @pytest.mark.first(1)
     def test_complete(self, mpc, count, area):
         """The regions tile X_N, their number and volume are known, and their plans are optimal."""
         found = critical_regions(mpc)
@@ -156,6 +157,7 @@ class TestRegions:
         degenerate = [region for region in found.regions if len(region.also_active)]
         assert degenerate and all(len(region.rows) <= 3 for region in found.regions)
 
+    @pytest.mark.slow
     def test_law(self):
         """The first input is that of the solver, at random states in and out of X_N."""
         mpc = problems.lecture()
@@ -253,6 +255,7 @@ class TestExactPenalty:
         "mpc", [problems.drifting(), problems.joint_o_inf(5), pair(), duplicated(), apex()],
         ids=["drifting", "joint O_inf", "pair", "duplicated", "apex"],
     )  # fmt: skip
+    @pytest.mark.first(1)
     def test_samples_reach_regions(self, mpc):
         exact = exact_penalty(mpc, method="regions")
         corners = np.concatenate([region.vertices for region in exact.regions.regions[:20]])

@@ -270,6 +270,7 @@ def test_feasibility_steps():
 
 @pytest.mark.parametrize("name", ["lecture", "ball"])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.first(2)
 def test_admm(name, dtype):
     """w as a loop finds it, and the labels that w, the last residual and its change prove."""
     _, p, rows, lower, upper = made(name)

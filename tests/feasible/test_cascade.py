@@ -143,6 +143,7 @@ def hide(monkeypatch):
 class TestLastPrograms:
     POINTS = np.array([-2.0, -1.31, -1.29, -0.5, 0.0, 0.7, 1.2999, 1.3001, 1.5])
 
+    @pytest.mark.slow
     def test_they_decide_what_is_left(self, hide):
         hide(lambda x: x[:, 0] < 9)
         _, parts, label, _ = labelled(self.POINTS, chunk=4)
@@ -150,6 +151,7 @@ class TestLastPrograms:
         require_proofs(self.POINTS, parts)
 
     @pytest.mark.parametrize(("chunk", "most", "entries"), [(9, 6, 2), (4, 2, 1)])
+    @pytest.mark.slow
     def test_no_more_than_may_run(self, hide, monkeypatch, chunk, most, entries):
         """The first points of each chunk, which have equal shares."""
         hide(lambda x: x[:, 0] < 9)

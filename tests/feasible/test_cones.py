@@ -35,6 +35,7 @@ def points_of(name, count):
 
 
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.first(1)
 def test_labels_and_proofs(name, monkeypatch):
     """Against the labels of the other stages, and the plans in exact arithmetic."""
     mpc, _, view = CASES[name]
@@ -71,6 +72,7 @@ def test_they_decide_nearly_all(always, monkeypatch):
 
 
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.first(1)
 def test_points_labelled_without_a_roll_out_have_plans(name):
     """At all distances from the boundary, on both sides, and beside the planes between cones:
     whatever is said to be feasible has a plan that keeps all limits, in exact arithmetic."""

@@ -125,6 +125,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
+@pytest.mark.slow
 def test_labels_of_a_part_do_not_depend_on_the_others(case, monkeypatch):
     """Linear programs, whose tangents to a ball are kept, and whose number is bounded, included:
     no stage before them decides a point here."""

@@ -30,6 +30,7 @@ FAST = ("x_N = 0",)
     "name",
     [v if v in FAST else pytest.param(v, marks=pytest.mark.slow) for v in hard_sets.SYSTEMS],
 )
+@pytest.mark.slow
 def test_nothing_wrong_and_nothing_open(name):
     """At relative distances 1e-3 … 1e-8 of the boundary, on both sides."""
     row = hard_sets.run(name, 120)
@@ -71,6 +72,7 @@ class TestTerminalPoint:
             assert all(abs(u) <= 1 for u in inputs)
             assert max(abs(float(v)) for v in end) < 1e-13
 
+    @pytest.mark.slow
     def test_rays_and_bounds(self):
         polygon = exact.feasible_polygon(self.mpc)
         low, high = jm.map_feasible_set(self.mpc, np.zeros((1, 2))).refine().volume_bounds()
@@ -98,6 +100,7 @@ def roll(A, B, x, inputs):
 SLOW = pytest.mark.slow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "gap", [pytest.param(1e-3, marks=SLOW), pytest.param(1e-6, marks=SLOW), 1e-9]
 )

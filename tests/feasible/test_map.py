@@ -183,6 +183,7 @@ class TestIndependenceOf:
             pytest.param("float64", 1, marks=pytest.mark.slow),
         ],
     )
+    @pytest.mark.first(1)
     def test_iterates(self, points, fmap, polygon, iterations, dtype):
         got = jm.map_feasible_set(problems.lecture(), points, iterations=iterations, dtype=dtype)
         np.testing.assert_array_equal(got.label, fmap.label)
@@ -194,6 +195,7 @@ class TestIndependenceOf:
         np.testing.assert_array_equal(got.label, fmap.label)
         assert not jax.config.jax_enable_x64
 
+    @pytest.mark.slow
     def test_prestabilising(self):
         mpc = problems.unstable(8)
         polygon = exact.feasible_polygon(mpc)
@@ -221,6 +223,7 @@ def test_compiles_once_for_all_chunks():
     assert more[0] == 1 and more[1] <= 1
 
 
+@pytest.mark.slow
 def test_proofs_are_copied_when_asked_for(points, fmap):
     """And are the same rows whichever part of the cascade found them."""
     labels = jm.map_feasible_set(problems.lecture(), points, iterations=1, chunk=64).labels
@@ -257,6 +260,7 @@ class TestMapObject:
         assert data["plan"].dims == ("sample", "time", "input")
         assert list(data["state"].values) == list(fmap.names)
 
+    @pytest.mark.slow
     def test_terminal_section(self, fmap):
         section = fmap.terminal_section()
         assert section.volume() == pytest.approx(4.0)
@@ -287,6 +291,7 @@ def test_slice_through_a_broken_limit_is_infeasible_everywhere():
     assert fmap.volume_bounds()[0] == 0
 
 
+@pytest.mark.slow
 def test_projection_keeps_the_state_it_starts_from():
     mpc = problems.hidden_product(3)
     fmap = jm.map_feasible_set(mpc, jm.grid([-1, -1], [1, 1], (5, 5)), axes=(0, 3))

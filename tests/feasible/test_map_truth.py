@@ -38,6 +38,7 @@ SCALAR = {
 
 
 @pytest.mark.parametrize("name", SCALAR)
+@pytest.mark.first(2)
 def test_scalar_closed_forms(name):
     settings, radius = SCALAR[name]
     steps = 10.0 ** -np.arange(1, 9)
@@ -172,6 +173,7 @@ def near_boundary(polygon, count):
     "count", [1000, pytest.param(12000, marks=pytest.mark.slow)], ids=["1,000", "12,000"]
 )
 @pytest.mark.parametrize("name", ["joint", "joint, terminal O_inf"])
+@pytest.mark.first(1)
 def test_nothing_wrong_and_nothing_open_near_the_boundary(name, count):
     mpc = problems.PLANAR[name]()
     polygon = exact.feasible_polygon(mpc)
@@ -279,6 +281,7 @@ class TestHiddenProduct:
         np.testing.assert_array_less(found.outer - found.inner, 1e-9)
 
     @pytest.mark.parametrize("axes", [(0, 1), (3, 2), (0, 1, 2)])
+    @pytest.mark.first(1)
     def test_slice(self, blocks, axes):
         fixed = np.array([0.2, -0.1, 0.15, 0.4])
         rng = np.random.default_rng(2)
@@ -314,6 +317,7 @@ def test_terminal_section_of_a_slice():
     assert fmap.status[0] == Status.SOLVED
 
 
+@pytest.mark.slow
 def test_unstable_long_horizon():
     """Predictions grow by 2^30 and rounding with them: labels stay right, and none is open."""
     mpc = problems.unstable(30)

@@ -44,6 +44,7 @@ INSIDE = np.array([1.0, 1 - 1e-9, 0.0, -50.0, -1e6])
 
 @pytest.mark.parametrize("none", NONE)
 @pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.first(1)
 def test_scalar(none, sign):
     """x ≤ 1, or −x ≤ 1 as a mirror: labels, and half-spaces that hold and exclude, exactly."""
     mpc = ceiling(none)
@@ -73,6 +74,7 @@ def test_scalar(none, sign):
     ],
     ids=["k = 1..N", "k = 3", "x_N ≤ −7", "−2 x_N ≤ 1", "empty"],
 )
+@pytest.mark.first(1)
 def test_scalar_steps_and_terminal_sets(settings, edge):
     """Where the limit is not on x_0, or at the other end; by hand. x_N ≥ −1/2 needs x_0 ≥ −5.5."""
     x = np.array([-9.0, 0.5, 1.7, 3.0, 100.0])
@@ -150,6 +152,7 @@ def check(mpc, allow=0, whole=True) -> FeasibleSetMap:
 @pytest.mark.parametrize("none", [np.inf, *slow(*NONE[1:])])
 @pytest.mark.parametrize("missing", ["-0", "-0 -1", *slow("-0 +1", "-0 +0", "-0 +0 -1")])
 @pytest.mark.parametrize("kind", ["unstable", *slow("marginal", "rotating", "coupled")])
+@pytest.mark.first(1)
 def test_boxes(kind, missing, none):
     check(planar(kind, none, missing.split()), whole=missing != "-0 +0 -1")
 
@@ -170,6 +173,7 @@ def test_dynamics_and_inputs(settings, none):
 
 
 @pytest.mark.parametrize("none", [1e20, *slow(*NONE[:3])])
+@pytest.mark.slow
 def test_terminal_set(none):
     check(planar("coupled", none, ("-0", "-1"), terminal_set=jm.Box([-0.5, -none], [none, none])))
 
@@ -186,6 +190,7 @@ def test_one_row(kind):
 
 
 @pytest.mark.parametrize("inputs", [None, *slow(jm.Box([-1.0], [np.inf]), jm.Box([-1.0], [1e20]))])
+@pytest.mark.slow
 def test_inputs_are_bounded_by_the_states_they_lead_to(inputs):
     """u_k = B⁺(x_{k+1} − A x_k − c): limits of the states on both sides do for those of u."""
     check(planar("coupled", 1.0, (), inputs=inputs))
@@ -217,6 +222,7 @@ class TestRowsThatNoInputMoves:
         np.testing.assert_array_equal(fmap.label, np.where(inside, 1, -1))
 
 
+@pytest.mark.slow
 def test_multipliers_say_what_holds_on_an_unbounded_set():
     """a'θ ≤ b + w'|θ| for random multipliers at far feasible points, in rationals, whatever the
     extent that is given."""
@@ -256,6 +262,7 @@ class TestOtherQuestions:
         for a, b in zip(found.normals, found.offsets, strict=True):
             assert b == np.inf or polygon.support(a) <= Fraction(float(b))
 
+    @pytest.mark.slow
     def test_refine(self):
         """x ≥ −1e9 bounds a length, x ≥ −∞ none."""
         low, high = jm.map_feasible_set(ceiling(1e9), [[0.0]]).refine().volume_bounds()
@@ -345,6 +352,7 @@ def margin(mpc, pinned) -> float:
     ],
     ids=lambda v: v if isinstance(v, str) else " ".join(v),
 )
+@pytest.mark.slow
 def test_views_rates_and_blocks(view, settings, none):
     """Three states, five of their six limits, against one LP a point."""
     if "terminal_set" in settings:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import problems
+import pytest
 from jax import enable_x64
 
 import jaxmpc as jm
@@ -53,6 +54,7 @@ class TestProofs:
                 _, b, *_ = proofs.cut(self.problem, y, y_N, np.zeros(0))
                 assert b == np.inf
 
+    @pytest.mark.slow
     def test_inputs_that_are_proved_keep_all_rows(self):
         """Random inputs, beyond their limits too, from random states."""
         rng = np.random.default_rng(1)

@@ -46,6 +46,7 @@ def exact(problem: FeasibilityProblem) -> tuple:
 
 
 @pytest.mark.parametrize("terminal", TERMINAL)
+@pytest.mark.first(1)
 def test_plans_that_are_proved_keep_limits_to_the_last_bit(terminal):
     """Limits are put where the plan's rows lie, up to ± some roundings: what is proved is true, and
     what holds by the bound on rounding, with what rounding it leaves, is proved."""
@@ -100,6 +101,7 @@ def test_plans_that_are_proved_keep_limits_to_the_last_bit(terminal):
 
 
 @pytest.mark.parametrize("terminal", TERMINAL)
+@pytest.mark.first(1)
 def test_half_spaces_exclude_only_what_is_infeasible_to_the_last_bit(terminal):
     """States on the half-space that multipliers imply, up to ± some roundings."""
     p, q = exact(FeasibilityProblem.of(problem(terminal)))

@@ -265,6 +265,7 @@ WRITER = """
 
 
 @pytest.mark.parametrize("kills", [2, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_killed_writer_loses_no_committed_block(tmp_path, kills):
     path = tmp_path / "sweep.zarr"
     command = [sys.executable, "-c", textwrap.dedent(WRITER), str(path)]

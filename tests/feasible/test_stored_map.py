@@ -43,6 +43,7 @@ def labelled(path, problem, lines, chunk, **changes):
 @pytest.mark.parametrize(
     ("name", "many"), [("joint", 30), ("lecture", 30), ("lecture", 10_000), ("scalar", 1)]
 )
+@pytest.mark.first(1)
 def test_says_what_a_map_of_all_points_says(tmp_path, monkeypatch, name, many):
     """Also where points and half-spaces are reduced again and again."""
     monkeypatch.setattr(stored_map, "MANY", many)

@@ -78,13 +78,15 @@ PROBLEMS = {
 }
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", [pytest.param("float64", marks=pytest.mark.slow), "float32"])
+@pytest.mark.slow
 def test_every_plan_is_solved_however_far_outside(dtype):
     plan = planned(dtype=dtype)
     assert (plan.status == jm.Status.SOLVED).all()
     assert plan.slack.max() > 0.5 and plan.slack.min() == 0
 
 
+@pytest.mark.slow
 def test_newton_steps_alone_do_not_solve_them():
     plan = planned(refine=20)
     assert (plan.status == jm.Status.SOLVED).mean() < 0.99
@@ -97,10 +99,12 @@ def test_costs_are_those_of_another_solver():
         assert plan.cost[i] == pytest.approx(least_cost(MPC, int(i)), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_penalties_may_be_quadratic_alone():
     assert (planned("quadratic").status == jm.Status.SOLVED).all()
 
 
+@pytest.mark.slow
 def test_states_that_are_not_finite_stay_by_themselves():
     A, B, c, x0 = instances()
     bad = x0.copy()

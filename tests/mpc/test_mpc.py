@@ -170,6 +170,7 @@ class TestCondensing:
 
 class TestAnotherSolver:
     @pytest.mark.parametrize("name", CASES)
+    @pytest.mark.first(1)
     def test_states_kept(self, name):
         mpc, x0 = CASES[name](), start(name)
         cost, v = Stacked(mpc).solve(x0)
@@ -180,6 +181,7 @@ class TestAnotherSolver:
         np.testing.assert_allclose(plan.cost, cost, rtol=1e-6)
 
     @pytest.mark.parametrize("name", CASES)
+    @pytest.mark.first(2)
     def test_optimality(self, name):
         """KKT of the stacked problem: costates recovered by the adjoint leave no gradient in u."""
         mpc, x0 = CASES[name](), start(name)
@@ -197,6 +199,7 @@ class TestAnotherSolver:
         slack = np.where(y > 0, stacked.upper - value, value - stacked.lower)
         np.testing.assert_allclose(np.where(np.abs(y) > 1e-6, slack, 0), 0, atol=1e-6)
 
+    @pytest.mark.slow
     def test_limits_bind(self):
         """The cases above are no unconstrained problems in disguise."""
         for name in ("drifting", "joint", "hidden product", "unstable"):
@@ -206,6 +209,7 @@ class TestAnotherSolver:
 
 class TestRiccati:
     @pytest.mark.parametrize("horizon", [1, 2, 5, 20])
+    @pytest.mark.first(1)
     def test_unconstrained_is_lqr_at_every_horizon(self, horizon):
         mpc = free(horizon)
         lqr = jm.lqr(mpc.system, mpc.Q, mpc.R)
@@ -287,6 +291,7 @@ class TestReferences:
     @pytest.mark.parametrize(
         "name", [pytest.param("drifting", marks=pytest.mark.slow), "hidden product", "unstable"]
     )
+    @pytest.mark.first(1)
     def test_tracking(self, name):
         """Cost Σ (x − r)'Q(x − r) + u'Ru + …, with the states kept, by another solver."""
         mpc, x0 = CASES[name](), start(name)
@@ -369,6 +374,7 @@ class TestIndexSet:
         assert plan.status == jm.Status.SOLVED
         assert np.all(np.abs(plan.states[1:]) <= 1 + 1e-6)
 
+    @pytest.mark.slow
     def test_infeasible_far_away(self):
         plan = jm.solve(replace(problems.scalar(terminal=1.0), constrain_initial=False), [3.0])
         assert plan.status == jm.Status.PRIMAL_INFEASIBLE

@@ -393,6 +393,7 @@ def each(name):
 
 @pytest.mark.parametrize("name", NAMES)
 class TestAnotherSolver:
+    @pytest.mark.slow
     def test_row_table(self, name):
         """One entry a row, in the order of the multipliers, with the names of the explicit rows."""
         explicit, *_, plans = batch(name)
@@ -411,6 +412,7 @@ class TestAnotherSolver:
             if key in explicit.rows and row.kind == "state":
                 assert row.unit == (explicit.mpc.system.state_units or ("",) * 9)[row.index]
 
+    @pytest.mark.slow
     def test_plans(self, name):
         """Status, cost, trajectory and violations."""
         explicit, x0, previous, reference, effort, plans = batch(name)
@@ -436,6 +438,7 @@ class TestAnotherSolver:
             np.testing.assert_allclose(plans.slack[i], expected, atol=1e-6)
         assert 5 <= solved
 
+    @pytest.mark.slow
     def test_optimality_row_by_row(self, name):
         """Labelled multipliers: signs, complementarity and no gradient left in the free moves."""
         active = set()

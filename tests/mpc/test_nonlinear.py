@@ -91,6 +91,7 @@ GOAL, START = np.array([2.0, 0.3]), np.array([-2.0, 0.1])
 class TestSolution:
     """Plans are those of independent solvers."""
 
+    @pytest.mark.slow
     def test_a_linear_model_needs_one_qp(self, x64):
         rng = np.random.default_rng(0)
         A, B = np.eye(3) + 0.1 * rng.normal(size=(3, 3)), rng.normal(size=(3, 2))
@@ -109,6 +110,7 @@ class TestSolution:
             np.testing.assert_allclose(plan.slack, expected.slack, atol=1e-8)
 
     @pytest.mark.parametrize("hessian", ["exact", "gauss-newton"])
+    @pytest.mark.first(1)
     def test_swing_up_is_ipopts(self, hessian, x64):
         """IPOPT 3.14 (CasADi 3.8, bounds relaxed by 1e-8) ends at 2242.82813 in 31 iterations."""
         plan = solve_nonlinear(swing_up(), np.array([0, np.pi, 0, 0]), hessian=hessian)
@@ -121,6 +123,7 @@ class TestSolution:
             x = np.asarray(Pendulum(LENGTH).step(x, plan.inputs[k]))
             np.testing.assert_allclose(plan.states[k + 1], x, atol=1e-6)
 
+    @pytest.mark.slow
     def test_past_an_obstacle_as_slsqp(self, x64):
         problem = around()
         plan = solve_nonlinear(problem, START, GOAL)
@@ -163,6 +166,7 @@ class TestSolution:
             costs.append(plan.cost)
         np.testing.assert_allclose(costs, costs[0], rtol=1e-9)
 
+    @pytest.mark.slow
     def test_a_soft_limit_gives_way_and_says_so(self, x64):
         inside = solve_nonlinear(around(penalty=0.5), START, GOAL)
         exact = solve_nonlinear(around(penalty=1e3), START, GOAL)
@@ -181,6 +185,7 @@ class TestSolution:
             exact.multipliers.tasks[0], hard.multipliers.tasks[0], rtol=1e-4, atol=1e-4
         )
 
+    @pytest.mark.slow
     def test_a_plan_is_its_own_warm_start(self, x64):
         problem = around()
         plan = solve_nonlinear(problem, START, GOAL)
@@ -188,6 +193,7 @@ class TestSolution:
         assert again.status == SOLVED and again.iterations <= 1
         np.testing.assert_allclose(again.inputs, plan.inputs, atol=1e-6)
 
+    @pytest.mark.slow
     def test_real_time_iterations_come_to_the_solution(self, x64):
         """One QP a call from the last plan, for the same state: Gauss and Newton's method."""
         problem = around()
@@ -202,6 +208,7 @@ class TestSolution:
 class TestDerivatives:
     """Derivatives of solutions are those of finite differences, with rows active."""
 
+    @pytest.mark.slow
     def test_of_weights_targets_limits_and_the_state(self, x64):
         task = Task(product, name="product")
 
@@ -257,6 +264,7 @@ def batch():
 class TestBatches:
     """Each instance of a batch stands alone."""
 
+    @pytest.mark.slow
     def test_a_bad_state_stays_in_its_row(self, batch, x64):
         starts, plans, gradient = batch
         good = np.isfinite(starts).all(axis=1)
@@ -266,12 +274,14 @@ class TestBatches:
         assert np.isfinite(gradient[good]).all()
         np.testing.assert_array_equal(gradient[~good], 0)
 
+    @pytest.mark.slow
     def test_plans_are_those_alone(self, batch, x64):
         starts, plans, _ = batch
         for i in (0, 5, 11):
             alone = solve_nonlinear(around(), starts[i], GOAL)
             np.testing.assert_allclose(plans.inputs[i], alone.inputs, atol=1e-6)
 
+    @pytest.mark.slow
     def test_unsolved_ones_leave_the_shared_gradient_finite(self, x64):
         """One start cannot leave the disc, one is not finite."""
         starts = jnp.array([[-2.0, 0.1], [0.05, 0.0], [jnp.nan, 0.0]])
@@ -288,6 +298,7 @@ class TestBatches:
         np.testing.assert_array_equal(status, expected)
         assert np.isfinite(gradient)
 
+    @pytest.mark.slow
     def test_float32(self):
         plan = solve_nonlinear(around(), START.astype(np.float32), GOAL.astype(np.float32))
         with jax.enable_x64(True):
@@ -296,6 +307,7 @@ class TestBatches:
         np.testing.assert_allclose(plan.cost, expected.cost, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_an_impossible_limit_is_not_solved(x64):
     """Hard: the start is inside the disc, and the first step cannot leave it."""
     problem = around()

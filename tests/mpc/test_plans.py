@@ -18,6 +18,7 @@ def plans(request, states):
     return jm.solve_many(problems.joint_o_inf(10), states, dtype=request.param, chunk=200)
 
 
+@pytest.mark.slow
 def test_status_agrees_with_the_proved_labels(plans, states):
     label = jm.map_feasible_set(problems.joint_o_inf(10), states).label
     np.testing.assert_array_equal(plans.status == jm.Status.SOLVED, label == 1)

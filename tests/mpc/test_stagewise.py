@@ -240,6 +240,7 @@ def test_fixed_count_of_newton_steps():
     assert max(map(int, lengths)) == interior_point.STEPS
 
 
+@pytest.mark.slow
 def test_residuals_are_those_of_the_qp():
     """Far from the optimum: the residuals of `residuals(qp, z, y)`, from adjoints."""
     mpc, system = problem(), varying()
@@ -287,6 +288,7 @@ def test_warm_start_and_parts():
         solve_stagewise(mpc, system, X0, warm_start=WarmStart(plan.states, plan.inputs, y[1:]))
 
 
+@pytest.mark.slow
 def test_float32_and_bad_elements():
     """Penalties, and with them factors, differ in the batch; NaN stays in its element."""
     mpc, system = problem(), varying()

@@ -96,7 +96,8 @@ def test_most_follow(mpc, states, solved, few):
     assert few[-1][0] == 1 and few[-1][1] <= COUNT // 10
 
 
-@pytest.mark.parametrize("tolerance", [1e-3, 1e-9])
+@pytest.mark.parametrize("tolerance", [1e-3, pytest.param(1e-9, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_own_residuals_decide(mpc, states, few, tolerance):
     found = jm.solve_many(mpc, states, jm.ADMM(eps=tolerance))
     good = found.status == jm.Status.SOLVED
@@ -104,6 +105,7 @@ def test_own_residuals_decide(mpc, states, few, tolerance):
         assert residual[good].max() <= tolerance + 1e-11
 
 
+@pytest.mark.slow
 def test_a_wrong_law_is_no_plan(mpc, states, solved, few, monkeypatch):
     """Laws of other states: whatever they give, all plans are those of the solver."""
     monkeypatch.setattr(transfer.Cells, "nearest", lambda self, x: self.law[0])
@@ -140,6 +142,7 @@ def test_it_is_given_up_where_few_follow(mpc, states, solved, few, monkeypatch):
     assert [arguments for arguments, _ in few] == [1, 3, 1] and few[1][1] == 64
 
 
+@pytest.mark.slow
 def test_on_the_device_and_from_a_controller(mpc, states, solved, few):
     with jax.enable_x64(True):
         controller = Controller(in_float64(mpc))

@@ -72,6 +72,7 @@ def test_blocks_are_the_batch():
     np.testing.assert_allclose(found, 2 * x.astype(np.float32) ** 2, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_answer_is_its_own_in_any_batch():
     """Feasible and infeasible programs side by side: those of a batch of one."""
     with jax.enable_x64(True):

@@ -156,10 +156,10 @@ class TestEveryField:
     """z, y and cost against central differences; jvp and vjp are each other's adjoint."""
 
     @pytest.mark.parametrize(
-        "first", [0, *(pytest.param(32 * i, marks=pytest.mark.slow) for i in range(1, 9))]
+        "first", [0, *(pytest.param(8 * i, marks=pytest.mark.slow) for i in range(1, 36))]
     )
     def test_central_differences(self, x64, first):
-        h, cases = 1e-4, [(first + seed, name) for seed in range(32) for name in DIRECTIONS]
+        h, cases = 1e-4, [(first + seed, name) for seed in range(8) for name in DIRECTIONS]
         programs = [everything(seed) for seed, _ in cases]
         qps = [qp for qp, _, _ in programs]
         ds = [direction(qp, name, seed) for qp, (seed, name) in zip(qps, cases, strict=True)]
@@ -193,6 +193,7 @@ class TestEveryField:
 
 class TestClosedForms:
     @pytest.mark.parametrize("solver", [PLAIN, UNROLLED], ids=["implicit", "unrolled"])
+    @pytest.mark.first(1)
     def test_equalities(self, x64, solver):
         """K (z, y) = (−q, b), K the KKT matrix: d(z, y) = K⁻¹(−dq − dP z − dA'y, db − dA z)."""
         rng = np.random.default_rng(3)
@@ -235,6 +236,7 @@ class TestClosedForms:
             np.testing.assert_allclose(got, np.diag(np.asarray(mask, float)), atol=1e-14)
 
     @pytest.mark.parametrize("size", [1, 3])
+    @pytest.mark.first(1)
     def test_ball(self, x64, size):
         """z = centre + r d/|d|, d = −q − centre: dz/dq = −r/|d| (I − nn'), dz/dr = n, y = d − rn.
 
@@ -435,6 +437,7 @@ def loss(qp: jm.QP, solver: jm.ADMM = PLAIN):
 
 
 class TestTransformations:
+    @pytest.mark.slow
     def test_gradient_of_shared_matrices_is_the_sum(self, x64):
         """vmap(grad) gives each instance's own; grad of a batch's sum adds up those of P and A."""
         qp, axes = joint_batch(64)
@@ -451,6 +454,7 @@ class TestTransformations:
         for name in "qlu":
             near(getattr(shared, name), getattr(each, name))
 
+    @pytest.mark.slow
     def test_float32_is_near_float64(self):
         qp, axes = joint_batch(64)
         gradient = jax.jit(jax.vmap(jax.grad(loss), in_axes=(axes,)))
@@ -810,6 +814,7 @@ class TestUnrolled:
         assert temporary(1600) < 5 * temporary(100)
 
 
+@pytest.mark.slow
 def test_few_and_many_active_rows_in_a_batch():
     """Against the linear system itself; rows that depend on each other where few are active."""
     rng = np.random.default_rng(0)

@@ -54,12 +54,13 @@ def scaled_batch(n, m, B, *, soft=False, balls=(), stages=1, dtype=jnp.float32, 
     "case",
     [
         dict(n=7, m=11, B=5),  # padded rows and a tile that is not full
-        dict(n=20, m=60, B=17, stages=3),
+        pytest.param(dict(n=20, m=60, B=17, stages=3), marks=pytest.mark.slow),
         dict(n=10, m=150, B=3, dtype=jnp.float64),  # low rank, two pieces
-        dict(n=20, m=21, B=20, soft=True),
+        pytest.param(dict(n=20, m=21, B=20, soft=True), marks=pytest.mark.slow),
         dict(n=10, m=30, B=4, soft=True, balls=(2, 3)),
     ],
 )
+@pytest.mark.first(1)
 def test_admm_in_one_kernel_is_the_loop(case, x64):
     made, q, bounds, t = scaled_batch(**case)
     alpha = jnp.asarray(1.7, t.dtype)
@@ -102,11 +103,12 @@ def searches(case, first, more):
     [
         (dict(n=7, m=11, B=9), 24),
         (dict(n=20, m=30, B=6, soft=True), 24),
-        (dict(n=20, m=40, B=6), 24),
+        pytest.param(dict(n=20, m=40, B=6), 24, marks=pytest.mark.slow),
         (dict(n=20, m=40, B=6), 2),  # which is too few: all begin once more
         pytest.param(dict(n=40, m=100, B=3), 24, marks=pytest.mark.slow),  # three kernels
     ],
 )
+@pytest.mark.first(1)
 def test_the_search_on_the_dual_in_a_kernel_is_the_loop(case, first, x64):
     (wanted, there), (found, found_there) = searches(case, first, 60)
     np.testing.assert_array_equal(found_there, there)
@@ -115,6 +117,7 @@ def test_the_search_on_the_dual_in_a_kernel_is_the_loop(case, first, x64):
         np.testing.assert_allclose(ours, theirs, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_search_that_is_lost_begins_once_more(x64):
     """Programs whose first search, of three steps, does not end; by a second one all are solved."""
     case = dict(n=20, m=60, B=30)
@@ -173,6 +176,7 @@ def test_plans_by_kernels_are_those_without(soft, x64, monkeypatch):
 
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend:DeprecationWarning")
 @pytest.mark.parametrize("gradient", [False, True])
+@pytest.mark.first(1)
 def test_kernels_can_be_lowered_for_a_gpu(gradient, x64, monkeypatch):
     """All operations of the kernels exist in Triton's dialect; no GPU is needed to see that."""
     mesh_module = pytest.importorskip("jax._src.mesh")

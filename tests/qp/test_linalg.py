@@ -39,6 +39,7 @@ def matrices(count, n, seed=0, k=3):
 
 @pytest.mark.parametrize("n", [1, 3, 6, 12, 13])
 @pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.first(4)
 def test_values(name, n):
     """One, a batch that is no multiple of the group, nested batches, and a shared matrix."""
     function, expected = FUNCTIONS[name]
@@ -62,6 +63,7 @@ def test_values(name, n):
 
 @pytest.mark.parametrize("n", [3, pytest.param(13, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.first(3)
 def test_derivatives(name, n):
     """Reverse, forward, and forward over reverse, under vmap: those of JAX's own routines."""
     with jax.enable_x64(True):

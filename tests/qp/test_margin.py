@@ -63,6 +63,7 @@ def test_scale_and_limit():
     assert margin(filled(rows([[1]], [0], [INF])), limit=7.0) == pytest.approx(7.0)
 
 
+@pytest.mark.slow
 def test_soft_rows_do_not_count():
     qp = rows([[1], [1]], [-1, 5], [1, INF], soft_linear=np.array([INF, 3.0]))
     assert margin(qp) == pytest.approx(1.0, abs=1e-8)

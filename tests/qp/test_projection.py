@@ -844,6 +844,7 @@ class TestOwnMatrices:
     """Each element of a batch with its own P and A (the shapes above: soft rows and balls)."""
 
     @pytest.mark.parametrize("make", [soft_batch, ball_batch], ids=["soft", "balls"])
+    @pytest.mark.slow
     def test_batch_agrees_with_single(self, x64, make):
         """A program's answer does not depend on its neighbours (to rounding: other kernels)."""
         qp = make()[0]
@@ -991,6 +992,7 @@ class TestBadInput:
         ]  # fmt: skip
         self.spoilt(soft_batch, changes)
 
+    @pytest.mark.slow
     def test_bad_balls_in_a_batch(self, x64):
         changes = [
             (2, "radius", 0, -0.1), (4, "radius", 1, np.nan), (6, "u", 8, 1e3), (8, "l", 10, -1e3),
@@ -998,6 +1000,7 @@ class TestBadInput:
         ]  # fmt: skip
         self.spoilt(ball_batch, changes)
 
+    @pytest.mark.slow
     def test_soft_balls_in_a_batch(self, x64):
         """A finite L1 weight in the rows of a ball means nothing: that instance has bad data."""
 

@@ -93,6 +93,7 @@ def x64():
 
 class TestKnownAnswers:
     @pytest.mark.parametrize("n", [1, 5, 20, pytest.param(60, marks=pytest.mark.slow)])
+    @pytest.mark.first(1)
     def test_float64(self, x64, n):
         for seed in range(3):
             qp, z, y = constructed(n, seed)
@@ -103,6 +104,7 @@ class TestKnownAnswers:
             np.testing.assert_allclose(sol.y, y, atol=1e-6)
 
     @pytest.mark.parametrize("n", [1, 5, 20])
+    @pytest.mark.first(1)
     def test_singular_hessian(self, x64, n):
         """Half of the directions have no curvature: only the active rows fix them."""
         for seed in range(3):
@@ -121,6 +123,7 @@ class TestKnownAnswers:
             if sol.status == jm.Status.SOLVED:
                 np.testing.assert_allclose(sol.z, z, atol=1e-5)
 
+    @pytest.mark.slow
     def test_linear_program_in_a_box(self, x64):
         q = np.array([1.0, -2.0, 0.5])
         sol = solve_small(box(3, P=np.zeros((3, 3)), q=q))
@@ -129,6 +132,7 @@ class TestKnownAnswers:
         np.testing.assert_allclose(sol.y, -q, atol=1e-8)
 
     @pytest.mark.parametrize("n", [pytest.param(2, marks=pytest.mark.slow), 20])
+    @pytest.mark.slow
     def test_float32(self, n):
         for seed in range(3):
             qp, z, y = constructed(n, seed)
@@ -229,6 +233,7 @@ class TestFromQpsolvers:
         np.testing.assert_array_equal(qp.l, [-INF, 6, -1, -2])
         np.testing.assert_array_equal(qp.u, [3, 6, INF, INF])
 
+    @pytest.mark.slow
     def test_duals(self, x64):
         """Px + q + G'z + A'y + z_box = 0 with signs as in qpsolvers, complementary."""
         rng = np.random.default_rng(3)
@@ -245,6 +250,7 @@ class TestFromQpsolvers:
         np.testing.assert_allclose(z_box * side, 0, atol=1e-9)
         assert not np.any(jm.solve_qp(jm.QP.from_qpsolvers(np.eye(n), q, G, h)).duals(5, 0).z_box)
 
+    @pytest.mark.slow
     def test_sparse_matrices(self, x64):
         qp = constructed(6, 5)[0]
         sparse = scipy.sparse.csc_matrix
@@ -306,6 +312,7 @@ class TestHonestStatus:
         ],
     )
     @pytest.mark.parametrize("eps", [1e-2, 1e-6])
+    @pytest.mark.first(1)
     def test_solved_means_small_residuals(self, x64, iterations, refine, eps):
         """SOLVED exactly where residuals recomputed by numpy are within eps and rounding."""
         batch = [constructed(8, seed) for seed in range(8)]
@@ -506,6 +513,7 @@ class TestBatches:
 
 
 class TestFloat32:
+    @pytest.mark.slow
     def test_dual_steps_solve_what_they_solve_in_float64(self):
         """Without a Newton step of the method of multipliers: rounding of the factor to float32
         left residuals above those at which a search on the dual ends."""
@@ -549,6 +557,7 @@ class TestHardPrograms:
     """Each of these once ended at the iteration limit."""
 
     @pytest.mark.parametrize("bound", [1e5, 1e12, 1e20, 1e30])
+    @pytest.mark.slow
     def test_linear_program_with_far_bounds(self, x64, bound):
         """max x + 2y, x + y ≤ 1, x and y from 0 to far away: (0, 1)."""
         qp = jm.QP(
@@ -578,6 +587,7 @@ class TestHardPrograms:
                 assert found.status == jm.Status.SOLVED, (p, size)
                 np.testing.assert_allclose(found.z, np.clip(-size * q / p, -1, 1), atol=1e-9)
 
+    @pytest.mark.slow
     def test_badly_scaled_linear_programs(self, x64):
         """Optimal vertices, drawn first; then variables and rows in units from 1e-3 to 1e3. Whether
         the last of them is solved depends on how the compiler rounds."""
@@ -593,6 +603,7 @@ class TestHardPrograms:
         np.testing.assert_allclose(found.cost[solved], cost[solved], rtol=1e-6)
 
     @pytest.mark.parametrize("condition", [1e3, 1e6])
+    @pytest.mark.slow
     def test_ill_conditioned_hessian_with_defaults(self, x64, condition):
         for seed in range(5):
             qp, *_ = constructed(8, seed)
@@ -751,6 +762,7 @@ def test_bad_data_raise(change, words):
 
 
 class TestFixedCount:
+    @pytest.mark.slow
     def test_solves_and_proves_as_the_default_does(self, x64):
         qp = constructed(5, 3)[0]
         empty = replace(qp, l=np.where(np.arange(13) == 0, 50.0, qp.l), u=np.full(13, 50.0))
@@ -839,6 +851,7 @@ class TestTolerances:
             jm.solve_qp(constructed(6, 5)[0], jm.ADMM(**wrong))
 
 
+@pytest.mark.slow
 def test_plain_python_and_jit_answer_alike(x64):
     """A cost so small that z = 0 is within eps of the optimum, z = -1."""
     qp = jm.QP(np.zeros((1, 1)), np.array([1e-7]), np.eye(1), -np.ones(1), np.ones(1))

@@ -62,8 +62,11 @@ def rescaled(program, rng, decades):
 
 
 @PRECISIONS
-@pytest.mark.parametrize("decades", [0, pytest.param(4, marks=pytest.mark.slow), 12])
+@pytest.mark.parametrize(
+    "decades", [12, *(pytest.param(d, marks=pytest.mark.slow) for d in (0, 4))]
+)
 @pytest.mark.parametrize("make", [bounded, unbounded, empty])
+@pytest.mark.first(1)
 def test_no_false_status_in_any_units(make, decades, x64):
     """What is not decided may stay so; what is said must be true."""
     allowed = {
@@ -85,6 +88,7 @@ def test_no_false_status_in_any_units(make, decades, x64):
 @pytest.mark.parametrize(
     ("x64", "least"), [(False, 1e-5), (False, 1e-6), (False, 1e-9), (True, 1e-10), (True, 1e-13)]
 )
+@pytest.mark.first(1)
 def test_a_small_coefficient_still_bounds(x64, least):
     """min ½ z₂² − z₁ with least·z₁ ≤ 1: the optimum lies at 1/least, it is not at infinity."""
     with jax.enable_x64(x64):
@@ -98,6 +102,7 @@ def test_a_small_coefficient_still_bounds(x64, least):
 
 
 @PRECISIONS
+@pytest.mark.first(1)
 def test_negative_curvature_has_a_status(x64):
     """Indefinite but for rounding; whatever stands on the diagonal, and in whatever units."""
     rng = np.random.default_rng(3)
@@ -123,6 +128,7 @@ def test_negative_curvature_has_a_status(x64):
     assert "negative eigenvalue" in jm.Status(int(sol.status[8])).sentence
 
 
+@pytest.mark.slow
 def test_an_overflow_has_a_status():
     """Finite numbers whose squares are not: their neighbours are solved."""
     A = np.stack([np.eye(2), 1e30 * np.eye(2)]).astype(np.float32)
@@ -134,6 +140,7 @@ def test_an_overflow_has_a_status():
 
 @PRECISIONS
 @pytest.mark.parametrize("mode", [jax.grad, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_a_bad_program_leaves_the_shared_gradient(mode, x64):
     """Of a parameter that an indefinite and a NaN program share with two good ones."""
     kinds = np.stack([np.eye(2), np.diag([1.0, -1.0]), np.full((2, 2), np.nan), 2 * np.eye(2)])

@@ -247,6 +247,7 @@ class TestLaw:
     @pytest.mark.parametrize(
         "soft", [(), pytest.param((Soft([[0.0, 1.0]], [0.2], 2.0, 0.5),), marks=pytest.mark.slow)]
     )
+    @pytest.mark.slow
     def test_piece_predicts_the_plan_beside(self, soft):
         mpc = replace(problems.lecture(0.25, 3), soft=soft)
         random = np.random.default_rng(0)
@@ -288,6 +289,7 @@ class TestLaw:
 
 
 class TestReport:
+    @pytest.mark.slow
     def test_lecture_loses_and_keeps(self):
         mpc = problems.lecture(0.25, 3)
         states = np.array([[-1.0, 1.0], [-0.999, 0.999], [0.0, 0.0], [1.0, 1.0], [np.nan, 0.0]])
@@ -339,6 +341,7 @@ class TestReport:
             (lambda: problems.double_integrator(3), 0.737865, 4.083333),
         ],
     )
+    @pytest.mark.slow
     def test_worst_is_a_vertex_of_a_region(self, monkeypatch, problem, distance, lost, search):
         """A search can end elsewhere (in 12 s at 0.527 on the first). Nor are samples needed."""
         monkeypatch.setattr(analysis, "LABELS", np.inf)  # no time for samples

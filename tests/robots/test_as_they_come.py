@@ -184,6 +184,7 @@ ACTIVE = """
  actrange="-2 2"/></actuator></mujoco>"""
 
 
+@pytest.mark.slow
 def test_activation_states_are_mujocos():
     """A filter and an integrator behind the velocities: a step and its derivatives by the C engine,
     rest that stays, names and limits."""
@@ -300,6 +301,7 @@ def test_report_names_what_the_predictor_ignores():
 # --- rows of a batch -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_bad_rows_and_heavy_loads_stay_alone():
     """NaN and infinity spoil no other row of a step; 200 kg in the hand of a 3 kg arm, at its
     stops, stay finite."""

@@ -147,6 +147,7 @@ def state_of(model, rng, low=False, still=False):
 
 
 @pytest.mark.parametrize("name", ["arm2", "tree"])
+@pytest.mark.slow
 def test_poses_inertia_and_forces_are_the_c_engines(name):
     model = model_of("plain") if name == "tree" else jm.load_robot(name).mujoco
     tree, rng, data = rigid.Tree.of(model), np.random.default_rng(0), mujoco.MjData(model)
@@ -185,12 +186,13 @@ def test_poses_inertia_and_forces_are_the_c_engines(name):
         np.testing.assert_allclose(needed[:, i], full @ a[:, i] + data.qfrc_bias, atol=1e-9)
 
 
-QUICK = ("plain", "implicit", "tendons", "weightless", "in a fluid", "contact")
+QUICK = ("implicit", "tendons", "contact")
 
 
 @pytest.mark.parametrize(
     "case", [c if c in QUICK else pytest.param(c, marks=pytest.mark.slow) for c in CASES]
 )
+@pytest.mark.first(1)
 def test_a_step_is_the_c_engines(case):
     model, rng = model_of(case), np.random.default_rng(1)
     x, u = state_of(model, rng, CASES[case].get("low", False), CASES[case].get("still", False))
@@ -203,6 +205,7 @@ def test_a_step_is_the_c_engines(case):
     np.testing.assert_allclose(found, after, rtol=0, atol=1e-8 * (1 + np.abs(after).max()))
 
 
+@pytest.mark.slow
 def test_every_number_that_varies_counts():
     """Fields of mjx.Model as arguments, one other in each row, against a file with that number."""
     model, rng = model_of("site"), np.random.default_rng(2)

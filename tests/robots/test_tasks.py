@@ -111,6 +111,7 @@ class TestFunctions:
             np.testing.assert_allclose(ours, theirs, atol=1e-6, err_msg=name)
         assert min(float(ours) for ours, _ in found["arms"]) < 0.15
 
+    @pytest.mark.slow
     def test_have_derivatives(self, two, x64):
         model, (points, inputs) = RobotModel(two), states(two, 3)
         every = [function for function, _ in self.functions(two).values()]
@@ -125,6 +126,7 @@ class TestFunctions:
                 difference = (values(xi + step, u) - values(xi - step, u)) / (2 * h)
                 np.testing.assert_allclose(J[:, i], difference, atol=2e-6)
 
+    @pytest.mark.slow
     def test_of_no_turn_has_a_derivative(self, two, x64):
         model, xi = RobotModel(two), np.zeros(two.n)
         data = jax.jit(model.view)(xi, np.zeros(two.m))
@@ -136,6 +138,7 @@ class TestFunctions:
         J = jax.jit(jax.jacfwd(turn))(jnp.asarray(xi))
         np.testing.assert_allclose(J[:, 0], np.array([0, 0.2, 1]) / np.hypot(0.2, 1), atol=1e-9)
 
+    @pytest.mark.slow
     def test_torques_are_of_the_inputs(self, two, x64):
         data = RobotModel(two).view(np.zeros(two.n), np.array([1.0, 2.0, 3.0, 4.0]))
         np.testing.assert_allclose(data.qfrc_actuator, [1, 2, 3, 4])
@@ -197,6 +200,7 @@ class TestClosedLoops:
             mujoco.mj_forward(robot.mujoco, data)
             assert np.linalg.norm(data.site_xpos[0][[0, 2]] - goals[i]) < 0.01
 
+    @pytest.mark.slow
     def test_a_limit_of_a_task_is_kept_or_counted(self, arm, x64):
         robot, mpc, x0, u0, aim = arm
         height = lambda data: data.site_xpos[0, 2]

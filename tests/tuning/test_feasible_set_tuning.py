@@ -77,6 +77,7 @@ def test_larger_terminal_sets_never_lose_a_state(fraction):
     assert np.all(np.diff(np.mean(members, axis=1)) > 0.01)
 
 
+@pytest.mark.slow
 def test_fraction_of_a_fine_grid_is_the_exact_area():
     """As the width goes to 0; the polygons are exact, their areas known in closed form."""
     cells = lambda k: (np.arange(k) + 0.5) / k * 2 - 1

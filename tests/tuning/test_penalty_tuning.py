@@ -323,6 +323,7 @@ terminal = "box"
 """
 
 
+@pytest.mark.slow
 def test_sweep_command_learns_and_its_labels_agree(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(linear_sweep, "CHUNK", 800)

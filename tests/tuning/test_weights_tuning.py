@@ -101,6 +101,7 @@ def test_an_interrupt_gives_the_best_so_far(tuned, monkeypatch):
     assert run.improved and run.result.mpc.Q.shape == (2, 2)
 
 
+@pytest.mark.slow
 def test_bad_states_are_left_out_and_infeasible_ones_count(x64):
     """NaN in one start, and starts that no plan keeps within the limits."""
     x0s = starts(8)  # as many as in a batch of `tuned`, whose program this is

@@ -320,6 +320,7 @@ class Record:
     def draw(self) -> list[str]:
         """Write the plots of what there is and return their names."""
         from jaxmpc.app.plots.bench import plot_bench, plot_growth
+        from jaxmpc.app.plots.style import save
 
         figures = {}
         if self.rows:
@@ -327,7 +328,7 @@ class Record:
         if self.points:
             figures["growth.png"] = plot_growth(self.points)
         for name, figure in figures.items():
-            figure.savefig(self.command.output / name, dpi=150)
+            save(figure, self.command.output / name)
         return list(figures)
 
     def print_head(self) -> None:

@@ -1,10 +1,12 @@
 """The command `jaxmpc info`."""
 
 import dataclasses
+import io
 from pathlib import Path
 from typing import Annotated
 
 from jaxmpc.app import config as configs
+from jaxmpc.app import page
 from jaxmpc.app.commands.options import (
     Horizon,
     Terminal,
@@ -13,7 +15,8 @@ from jaxmpc.app.commands.options import (
     given_options,
     option,
 )
-from jaxmpc.workflow.offline_test import offline_report
+from jaxmpc.checks import fail
+from jaxmpc.workflow.offline_test import OfflineReport, offline_report
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +38,7 @@ class Info:
 
     How to start
       $ jaxmpc info
-      $ jaxmpc info --config pendulum.toml --terminal invariant
+      $ jaxmpc info --config pendulum.toml --terminal invariant --html pendulum.html
 
     How long it takes
       Each stage is announced on stderr as it begins, with the seconds spent so far.
@@ -48,7 +51,8 @@ class Info:
 
     How to read the output
       "proved" rests on linear programs or certificates with the tolerance that is named, "refuted"
-      on a counterexample; closed loops are simulated, not proved. Nothing is written to disk.
+      on a counterexample; closed loops are simulated, not proved. Nothing is written to disk
+      but the page of --html.
       Exit code  0 done, for any answers; 2 error (one line on stderr says which); 130 stopped by
                  Ctrl-C.
 
@@ -67,6 +71,8 @@ class Info:
     """Number of the closed loops."""
     seconds: Annotated[float, option("S", "120")] = 120.0
     """Time for all of it; claims not settled by then are open."""
+    html: Annotated[Path | None, option("FILE", "none")] = None
+    """Write the report as a page too, with a picture of a feasible set of two states."""
 
     keeps = ""
 
@@ -74,9 +80,28 @@ class Info:
         """Print the report. Raises ValueError for options and files that make no sense."""
         check_counts(self, steps=2, loops=1)
         check_positive(self, "seconds")
+        if self.html is not None and not self.html.parent.is_dir():
+            fail(f"--html {self.html}", "its folder does not exist", "Make it, or give another")
         config = configs.load(self.config, given_options(self, "horizon", "terminal"), "info")
         report = offline_report(
             config.build_controlled(), steps=self.steps, loops=self.loops, seconds=self.seconds,
             progress=True,
         )  # fmt: skip
         print(f"{config.name}\n\n{report}")
+        if self.html is not None:
+            parts = [*_pictures(report), page.text("Offline report", str(report))]
+            parts.append(page.table("Configuration", config.to_dict("info")))
+            self.html.write_text(page.html_page(config.name, parts), encoding="utf-8")
+
+
+def _pictures(report: OfflineReport) -> list[str]:
+    """The feasible set, where there is one of two states."""
+    fmap = report.feasible_set
+    if fmap is None or fmap.points.shape[1] != 2:
+        return []
+    from jaxmpc.app.plots.feasible_set import plot_feasible_set
+    from jaxmpc.app.plots.style import save
+
+    file = io.BytesIO()
+    save(plot_feasible_set(fmap).figure, file)
+    return [page.picture("feasible set", file.getvalue())]

@@ -125,7 +125,8 @@ class LinearSweep:
             from jaxmpc.app.plots.style import save
 
             picture = found.picture()
-            save(plot_feasible_set(found.bounds, picture=picture), self.output / "map.png")
+            figure = plot_feasible_set(found.bounds, picture=picture).figure
+            save(figure, self.output / "map.png", self.config.name)
             files.append(str(self.output / "map.png"))
         low, high = found.bounds.volume_bounds()
         if low > high * (1 + 1e-9):

@@ -233,8 +233,9 @@ class Recursion:
         if report.states.shape[1] != 2:
             return ["summary.json", "recursion.npz"]
         from jaxmpc.app.plots.recursion import draw_recursion
+        from jaxmpc.app.plots.style import save
 
-        draw_recursion(report).savefig(self.output / "recursion.png", dpi=150)
+        save(draw_recursion(report), self.output / "recursion.png", config.name)
         return list(FILES)
 
 

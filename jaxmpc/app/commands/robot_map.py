@@ -250,7 +250,7 @@ class RobotMapCommand:
         from jaxmpc.app.plots.robot_map import plot_robot_map
         from jaxmpc.app.plots.style import save
 
-        save(plot_robot_map(rmap), self.output / "robot_map.png")
+        save(plot_robot_map(rmap).figure, self.output / "robot_map.png")
         return ["summary.json", "robot_map.npz", "robot_map.png"]
 
 

@@ -22,7 +22,7 @@ from jaxmpc.app.commands.options import (
 )
 from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
 from jaxmpc.app.config import load_robot_config
-from jaxmpc.checks import fail, require_disk, require_memory
+from jaxmpc.checks import fail, require_disk, require_memory, require_package
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
 from jaxmpc.closed_loop.robot_controller import RobotController
 from jaxmpc.closed_loop.robot_mpc import robot_mpc
@@ -69,6 +69,7 @@ class RobotRuns:
         check_results(path, command.resume, command.overwrite)
         if command.video:
             choose_renderer()
+        require_package("mujoco", "robots")
         try:
             importlib.import_module("mujoco")
         except (AttributeError, ImportError, RuntimeError) as error:

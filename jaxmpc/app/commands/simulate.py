@@ -168,11 +168,12 @@ class Simulate:
         outcome = evaluate_runs(run, robot, runs.reference, tolerance=self.tolerance)
         files = ["runs.zarr", "summary.json", "runs.png"]
         from jaxmpc.app.plots.closed_loops import plot_runs
+        from jaxmpc.app.plots.style import save
 
         figure = plot_runs(
             run, robot, reference=runs.reference, input_reference=runs.input_reference
         )
-        figure.savefig(self.output / "runs.png", dpi=150)
+        save(figure, self.output / "runs.png")
         video = self.output / "robots.gif"
         if self.video and film(robot, run, runs.reference, self.video, video):
             files.append("robots.gif")

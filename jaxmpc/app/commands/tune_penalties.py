@@ -31,6 +31,7 @@ from jaxmpc.app.commands.tuning import (
     problem_file,
     start_range,
 )
+from jaxmpc.app.plots.style import save
 from jaxmpc.app.plots.tuning import plot_penalties
 from jaxmpc.app.report import report_error
 from jaxmpc.checks import fail, require_memory
@@ -243,7 +244,7 @@ class TunePenalties:
         words = "tuned" if found.improved else "default kept, no step is better"
         title = f"{config.name}: {self.iterations} ADMM steps, {words}"
         figure = plot_penalties(found, worst[0], worst[1], 1e-6, title)
-        figure.savefig(self.output / "penalties.png", dpi=150)
+        save(figure, self.output / "penalties.png")
 
     def report_text(self, found: TuningRun, count: int, dropped: int, seconds: float) -> str:
         """Return the result as a table of text."""

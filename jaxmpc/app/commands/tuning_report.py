@@ -9,6 +9,7 @@ import numpy as np
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.tuning import CHECKPOINT, TUNED
 from jaxmpc.app.commands.tuning_task import TuningTask
+from jaxmpc.app.plots.style import save
 from jaxmpc.app.plots.tuning import plot_before_after, plot_maps, plot_tuning
 from jaxmpc.feasible.map import grid, map_feasible_set
 from jaxmpc.runs import versions, write_json
@@ -51,17 +52,17 @@ def save_results(
     )
     title = f"{task.name}: {', '.join(command.tune)} tuned, {change}"
     figure = plot_tuning(h, trace, title)
-    figure.savefig(command.output / "tuning.png", dpi=150)
+    save(figure, command.output / "tuning.png")
     shown = min(6, len(test))
     title = f"{change}\n{shown} of {len(test)} validation loops, the same starts before and after"
     figure = plot_before_after(
         before, after, task.plant, reference=task.reference,
         input_reference=task.input_reference, title=f"{task.name}: {title}",
     )  # fmt: skip
-    figure.savefig(command.output / "before_after.png", dpi=150)
+    save(figure, command.output / "before_after.png")
     files = [TUNED, "tuning.json", "tuning.png", "before_after.png", CHECKPOINT]
     if task.config is not None and "tightening" in command.tune and task.plant.n == 2:
-        maps(command, task).savefig(command.output / "maps.png", dpi=150)
+        save(maps(command, task), command.output / "maps.png", task.name)
         files.insert(4, "maps.png")
     seconds = {**seconds, "total": time.perf_counter() - begun}
     return report_text(command, task, run, result, trace, seconds, files)

@@ -2,14 +2,16 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
+from matplotlib import font_manager, rcParams
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.text import Text
 
 from jaxmpc.control.sets import Polytope
 
@@ -26,11 +28,36 @@ def new_axes(width: float = 8.4) -> Axes:
     return Figure(figsize=(width, 4.8), layout="constrained").add_subplot()
 
 
-def save(ax: Axes, path: Path) -> None:
-    """Write the figure of these axes, cut to its content."""
-    figure = ax.get_figure(root=True)
-    assert figure is not None
+def save(figure: Any, path: Path | BinaryIO, name: str = "") -> None:
+    """Write a figure, cut to its content. name: of the system, put before the first title.
+
+    Letters that the usual font lacks are drawn with fonts that are installed and have them.
+    """
+    if name and (title := figure.axes[0].get_title(loc="left")):
+        text = f"{name}: {title[0].lower()}{title[1:]}"
+        figure.axes[0].set_title(text, loc="left", fontsize=11)
+    texts = [t for t in figure.findobj(Text) if not t.get_text().isascii()]
+    families = [*rcParams["font.sans-serif"][:1], *_fonts_for("".join(t.get_text() for t in texts))]
+    for found in texts:
+        found.set_fontfamily(families)
     figure.savefig(path, dpi=150, bbox_inches="tight", pad_inches=0.15)
+
+
+def _fonts_for(text: str) -> list[str]:
+    """Return installed fonts that together have the letters that Matplotlib's own lacks."""
+    own = font_manager.get_font(font_manager.findfont(rcParams["font.sans-serif"][0]))
+    missing = {ord(letter) for letter in text if letter.isprintable()} - set(own.get_charmap())
+    found = []
+    for entry in font_manager.fontManager.ttflist if missing else ():
+        if entry.weight != 400 or entry.style != "normal":
+            continue
+        has = missing & set(font_manager.get_font(entry.fname).get_charmap())
+        if has:
+            missing -= has
+            found.append(entry.name)
+        if not missing:
+            break
+    return found
 
 
 def patch(name: str, colour: str, count: Any = None) -> Patch:

@@ -1,0 +1,206 @@
+"""A controller in C99: the condensed problem as tables, ADMM with a fixed number of steps as code.
+
+The code is `mpc.c`, the same for all problems. What the matrices decide is computed here in float64
+and written as data. With M = P + C'E R E C, R = diag(rho), a stage of the schedule needs
+ZF = M⁻¹C'E R and ZQ = −M⁻¹ in the units of the problem; `Factor` has them in coordinates z = T w.
+"""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmpc.checks import fail, number, require_kind
+from jaxmpc.control.sets import Box
+from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.plan import WarmStart, sorted_multipliers
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.admm import ADMM
+from jaxmpc.qp.status import Status
+
+TEMPLATES = Path(__file__).parent
+REAL = {"float64": "double", "float32": "float"}
+# Relative residuals below which the code says "solved".
+TOLERANCE = {"float64": 1e-6, "float32": 1e-3}
+
+
+def export_c(
+    mpc: MPC, folder: str | Path, solver: ADMM | None = None, *, name: str = "mpc",
+    dtype: Literal["float64", "float32"] = "float64", tolerance: float | None = None,
+    overwrite: bool = False,
+) -> list[Path]:  # fmt: skip
+    """Write a controller as C99 code: what `Controller(mpc, solver)` does in a closed loop.
+
+    Each call of `NAME_step` warm-starts from the plan before, takes `solver.iterations` steps of
+    ADMM (50 where that is None) and none of Newton's: `solver` is taken with refine=0. Nothing is
+    allocated and no loop depends on data but for the branches of a projection, so the time of a
+    call hardly varies. What it returns as status comes from residuals that it computes itself.
+    Choose iterations and rho with `tune_penalties`, or watch the status along closed loops.
+
+    References are constant over the horizon. Inputs in a Box are clipped into it.
+
+    folder: where NAME.c, NAME.h, NAME_sizes.h, NAME_tables.h and NAME_example.c are written. dtype:
+    type of all numbers there; the tables are computed in float64. tolerance: of the residuals
+    relative to 1 and their largest term, None: 1e-6, and 1e-3 in float32.
+
+    Returns the paths. Raises ValueError for a problem that cannot be solved, a name that C does not
+    take, and files that exist, unless overwrite.
+    """
+    solver = ADMM() if solver is None else solver
+    require_kind("mpc", mpc, MPC)
+    require_kind("solver", solver, ADMM)
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        fail("name", f"{name!r}", "Give letters, digits and _, a letter first")
+    if dtype not in REAL:
+        fail("dtype", f"{dtype!r}", 'Give "float64" or "float32"')
+    if tolerance is None:
+        tolerance = TOLERANCE[dtype]
+    number("tolerance", tolerance, 0, "Give a positive number")
+    folder = Path(folder)
+    kinds = (".h", ".c", "_sizes.h", "_tables.h", "_example.c")
+    paths = [folder / f"{name}{kind}" for kind in kinds]
+    for path in paths:
+        if path.exists() and not overwrite:
+            fail(
+                str(path),
+                "exists",
+                "Overwrite it (overwrite=True, --overwrite) or give another folder or name",
+            )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        fail(str(folder), f"{error.strerror}", "Give a folder that you can write")
+    with jax.enable_x64(True):
+        controller = Controller(mpc, replace(solver, refine=0))
+        assert controller.factor is not None
+        fault = Status(int(controller.factor.fault))
+        if fault != Status.NOT_RUN:
+            fail("mpc", f"cannot be factored: {fault.name}", "See the status in jm.Status")
+        sizes, tables = _sizes(controller), _tables(controller)
+    real = REAL[dtype]
+    own = {"TOLERANCE": _literal(tolerance, real), "real": real}
+    made = {
+        "_sizes.h": _header("sizes and types", {**sizes, **own}, name),
+        "_tables.h": _c_tables(tables, controller, real),
+    }
+    for kind, source in ((".h", "mpc.h"), (".c", "mpc.c"), ("_example.c", "example.c")):
+        made[kind] = (TEMPLATES / source).read_text(encoding="utf-8")
+    zeros = " ".join(["0"] * mpc.system.n)
+    for kind, path in zip(kinds, paths, strict=True):
+        text = made[kind].replace("NAME", name).replace("VERSION", _version()).replace("X0", zeros)
+        path.write_text(text, encoding="utf-8")
+    return paths
+
+
+def _version() -> str:
+    import jaxmpc
+
+    return str(jaxmpc.__version__)
+
+
+def _sizes(controller: Controller) -> dict[str, int]:
+    """What the code needs to know before it is compiled."""
+    mpc, c, factor, solver = (
+        controller.mpc,
+        controller.condensed,
+        controller.factor,
+        controller.solver,
+    )
+    assert c is not None and factor is not None
+    return {
+        "STATES": mpc.system.n, "INPUTS": mpc.system.m, "PARAMETERS": mpc.dimension,
+        "VARIABLES": c.P.shape[0], "ROWS": c.C.shape[0], "STAGES": factor.rho.shape[0],
+        "ITERATIONS": solver.admm_steps(), "THIN": int(factor.G is None),
+        "SOFT": int(c.soft_linear is not None), "BALLS": len(c.balls), "BALL_ROWS": sum(c.balls),
+    }  # fmt: skip
+
+
+def _tables(controller: Controller) -> dict[str, Any]:
+    """Every table of `mpc.c` by its name, in float64 and int."""
+    mpc, c, factor = controller.mpc, controller.condensed, controller.factor
+    assert c is not None and factor is not None
+    N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
+    origin = jnp.zeros(mpc.dimension)
+    state = lambda r: c.qp(origin, reference=jnp.broadcast_to(r, (N + 1, n))).q
+    inputs = lambda r: c.qp(origin, input_reference=jnp.broadcast_to(r, (N, m))).q
+    bounds = c.qp(origin).bounds.scaled(factor.E)
+    # From coordinates w to z = T w, and from q to q_w = T'q.
+    T = factor.T
+    tables = {
+        "P": c.P, "C": c.C, "E": factor.E, "rho": factor.rho.ravel(),
+        "ZF": T @ factor.F, "ZQ": -(T @ factor.Minv @ T.T),
+        "q_theta": c.F, "q_constant": c.f,
+        "q_state": jax.jacfwd(state)(jnp.zeros(n)), "q_input": jax.jacfwd(inputs)(jnp.zeros(m)),
+        "shift_theta": c.D, "shift_constant": c.d, "lower": c.lower, "upper": c.upper,
+        "first_theta": c.Psi[0], "first_z": c.Omega[0], "first_constant": c.psi[0],
+        "end_theta": c.Phi[N], "end_z": c.Gamma[N], "end_constant": c.phi[N],
+        "tail_gain": c.K_N, "prestabilising_gain": c.K,
+    }  # fmt: skip
+    if factor.G is not None:
+        tables["G"] = factor.G
+    if bounds.linear is not None:
+        tables |= {"soft_linear": bounds.linear, "soft_quadratic": bounds.quadratic}
+    if c.balls:
+        tables |= {"radius": bounds.radius, "ball_rows": np.array(c.balls)}
+    box = mpc.inputs if isinstance(mpc.inputs, Box) else None
+    tables["input_lower"] = np.full(m, -np.inf) if box is None else box.lower
+    tables["input_upper"] = np.full(m, np.inf) if box is None else box.upper
+    tables["later_move"] = np.array([mpc.moves[b + 1] if b + 1 < N else -1 for b in c.begins], int)
+    tables["later_row"] = _later_rows(controller)
+    return {key: np.asarray(value) for key, value in tables.items()}
+
+
+def _later_rows(controller: Controller) -> np.ndarray:
+    """Row of the last plan whose multiplier each row begins with, -1 for none: what
+    `Controller.shifted` does to multipliers that are the numbers of their rows."""
+    c, mpc = controller.condensed, controller.mpc
+    assert c is not None
+    N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
+    plan = jax.eval_shape(lambda x: controller(x)[1], jnp.zeros(n))
+    numbers = sorted_multipliers(mpc, c.layout, jnp.arange(1.0, c.C.shape[0] + 1))
+    plan = replace(
+        plan, multipliers=numbers, states=jnp.zeros((N + 1, n)), inputs=jnp.zeros((N, m))
+    )
+    shifted = WarmStart.shifted(c.layout, plan, jnp.zeros(m), bool(c.balls))
+    return np.asarray(shifted.multipliers).astype(int) - 1
+
+
+def _header(what: str, macros: dict[str, Any], name: str) -> str:
+    lines = [f"/* NAME: {what}; written by jaxmpc VERSION. */"]
+    real = macros["real"]
+    lines += [f"#define NAME_{key} {value}" for key, value in macros.items() if key != "real"]
+    return "\n".join([*lines, f"typedef {real} NAME_real;", ""])
+
+
+def _c_tables(tables: dict[str, np.ndarray], controller: Controller, real: str) -> str:
+    """The tables as constant arrays, column by column, and the functions of math.h for the type."""
+    suffix = "f" if real == "float" else ""
+    lines = ["/* NAME: tables, column by column; written by jaxmpc VERSION. */"]
+    functions = {"FABS": "fabs", "FMAX": "fmax", "SQRT": "sqrt"}
+    lines += [f"#define {key} {value}{suffix}" for key, value in functions.items()]
+    lines.append(f"#define ALPHA {_literal(float(np.asarray(controller.solver.alpha)), real)}")
+    for key, table in tables.items():
+        whole = table.dtype.kind == "i"
+        columns = table if table.ndim < 2 else np.swapaxes(table, -1, -2)
+        values = [str(v) if whole else _literal(v, real) for v in columns.ravel()] or ["0"]
+        shape = " x ".join(map(str, table.shape))
+        lines.append(
+            f"static const {'int' if whole else 'real'} {key}[{len(values)}] = {{ /* {shape} */"
+        )
+        lines += [f"  {', '.join(values[i : i + 6])}," for i in range(0, len(values), 6)]
+        lines.append("};")
+    return "\n".join([*lines, ""])
+
+
+def _literal(value: Any, real: str) -> str:
+    """A number in C: the shortest text that is read as the same number."""
+    value = np.float32(value) if real == "float" else np.float64(value)
+    if np.isinf(value):
+        return f"(real){'-' if value < 0 else ''}INFINITY"
+    text = str(value)
+    text += "" if any(s in text for s in ".en") else ".0"
+    return f"{text}f" if real == "float" else text

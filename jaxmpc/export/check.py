@@ -1,0 +1,87 @@
+"""Closed loops under the law that is written as C code, beside plans that are solved to the end."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmpc.checks import number, require_finite, require_kind, require_shape, whole
+from jaxmpc.control.system import host_array
+from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.admm import ADMM
+from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.status import Status
+from jaxmpc.reals import Reals
+
+LOOPS = 20
+
+
+@dataclass(frozen=True)
+class ClosedLoopCheck:
+    """What `check_fixed_steps` found along closed loops.
+
+    samples: how many. solvable: how many of the plans are solved by ADMM and Newton steps. reached:
+    how many of these the fixed number of steps solves to the tolerance. input_error: the largest
+    difference between the inputs of the two where both are solved; input_error_any: where the
+    precise plan is. Both are 0 where there is no such sample.
+    """
+
+    samples: int
+    solvable: int
+    reached: int
+    input_error: float
+    input_error_any: float
+
+
+def check_fixed_steps(
+    mpc: MPC, solver: ADMM, lower: Reals, upper: Reals, samples: int = 1000,
+    tolerance: float = 1e-6, seed: int = 0,
+) -> ClosedLoopCheck:  # fmt: skip
+    """Run `Controller(mpc, solver)` with refine=0 from random states of the box [lower, upper]
+    (n,), and at each state solve the plan precisely too.
+
+    20 closed loops begin at states that have a plan; `samples` are rounded up to a multiple of 20.
+
+    Raises ValueError for an invalid problem, bounds of another shape than (n,) and bad counts.
+    """
+    require_kind("mpc", mpc, MPC)
+    require_kind("solver", solver, ADMM)
+    whole("samples", samples, 1)
+    number("tolerance", tolerance, 0, "Give a positive number")
+    for argument, bound in (("lower", lower), ("upper", upper)):
+        require_shape(argument, bound, (mpc.system.n,), "Give a number for each state")
+        require_finite(argument, bound)
+    with jax.enable_x64(True):
+        lower, upper = host_array("lower", lower), host_array("upper", upper)
+        fixed = Controller(mpc, replace(solver, refine=0, eps=tolerance, eps_rel=tolerance))
+        precise = Controller(mpc, ADMM())
+        starts = np.random.default_rng(seed).uniform(lower, upper, (50 * LOOPS, len(lower)))
+        plans = jax.jit(jax.vmap(lambda x: precise(x)[2].status))(starts)
+        starts = starts[np.argsort(np.asarray(plans) != Status.SOLVED, kind="stable")[:LOOPS]]
+        A, B = (jnp.asarray(host_array("system", v)) for v in (mpc.system.A, mpc.system.B))
+        drift = 0.0 if mpc.system.c is None else jnp.asarray(host_array("system.c", mpc.system.c))
+
+        def sample(state: Any, _: Any) -> Any:
+            x, carry, before = state
+            u, carry, plan = fixed(x, carry)
+            exact, kept, best = precise(x, before)
+            # The previous input of the next sample is what was applied.
+            kept = replace(kept, inputs=kept.inputs.at[0].set(u))
+            after = matmul(A, x) + matmul(B, u) + drift
+            error = jnp.max(jnp.abs(u - exact))
+            return (after, carry, kept), (plan.status, best.status, error)
+
+        def loop(x: Any) -> Any:
+            start = x, fixed.start(x), precise.start(x)
+            return jax.lax.scan(sample, start, length=-(-samples // LOOPS))[1]
+
+        status, best, error = (np.asarray(v) for v in jax.jit(jax.vmap(loop))(starts))
+    solvable = best == Status.SOLVED
+    both = solvable & (status == Status.SOLVED)
+    most = lambda where: float(error[where].max(initial=0.0))
+    return ClosedLoopCheck(
+        best.size, int(solvable.sum()), int(both.sum()), most(both), most(solvable)
+    )

@@ -1,0 +1,201 @@
+/* NAME: written by jaxmpc VERSION. See NAME.h.
+ *
+ * minimize 1/2 z'Pz + q'z + g(Cz), q and the bounds of g affine in the parameters, by ADMM in rows
+ * scaled by E. A step on t = s + v, the sum of splitting variable and scaled multiplier:
+ *     s = prox(t),  t <- t + ALPHA (E C (ZF r + ZQ q) - s),  r = 2s - t,
+ * with ZF = M^-1 C'E RHO and ZQ = -M^-1, M = P + C'E RHO E C (Boyd et al. 2011, section 3.4.3).
+ */
+#include <math.h>
+#include <string.h>
+
+#include "NAME.h"
+
+typedef NAME_real real;
+
+#define N NAME_STATES
+#define MU NAME_INPUTS
+#define NP NAME_PARAMETERS
+#define NZ NAME_VARIABLES
+#define M NAME_ROWS
+#define STAGES NAME_STAGES
+
+#include "NAME_tables.h"
+
+/* out (rows) = A (rows, columns) v, plus out where add is 1. Columns of A lie one after another, so
+ * that compilers vectorise the inner loop without reordering a sum. */
+static void product(int rows, int columns, const real *restrict A, const real *restrict v, int add,
+                    real *restrict out) {
+  for (int i = 0; i < rows && !add; i++) out[i] = 0;
+  for (int j = 0; j < columns; j++)
+    for (int i = 0; i < rows; i++) out[i] += A[j * rows + i] * v[j];
+}
+
+static real largest(int count, const real *v, real most) {
+  for (int i = 0; i < count; i++) most = FMAX(most, FABS(v[i]));
+  return most;
+}
+
+/* s = prox(t) for bounds l, u in scaled rows and penalties rho */
+static void project(const real *t, const real *l, const real *u, const real *rho, real *s) {
+  for (int i = 0; i < M; i++) {
+    real v = t[i], p = v < l[i] ? l[i] : v > u[i] ? u[i] : v;
+#if NAME_SOFT
+    if (isfinite(soft_linear[i])) {
+      real distance = FABS(v - p), over = distance - soft_linear[i] / rho[i];
+      if (over > 0) {
+        real slack = rho[i] / (rho[i] + soft_quadratic[i]) * over;
+        p += v > p ? slack : -slack;
+      }
+    }
+#else
+    (void)rho;
+#endif
+    s[i] = p;
+  }
+#if NAME_BALLS
+  for (int k = 0, first = M - NAME_BALL_ROWS; k < NAME_BALLS; first += ball_rows[k++]) {
+    real squared = 0;
+    for (int i = first; i < first + ball_rows[k]; i++) squared += (t[i] - l[i]) * (t[i] - l[i]);
+    real length = SQRT(squared), shrink = length > radius[k] ? radius[k] / length : 1;
+    for (int i = first; i < first + ball_rows[k]; i++) s[i] = l[i] + shrink * (t[i] - l[i]);
+  }
+#endif
+}
+
+static real clipped(int i, real u) {
+  return u < input_lower[i] ? input_lower[i] : u > input_upper[i] ? input_upper[i] : u;
+}
+
+void NAME_reset(NAME_memory *memory) { memset(memory, 0, sizeof *memory); }
+
+/* Scaled t = s + v of the last plan, one step later. */
+static void warm_start(const NAME_memory *memory, const real *l, const real *u, real *t) {
+  real z[NZ], x[N], y[M + 1], s[M + 1];
+  memcpy(x, end_constant, sizeof x);
+  product(N, NP, end_theta, memory->theta, 1, x);
+  product(N, NZ, end_z, memory->z, 1, x);
+  for (int k = 0; k < NZ / MU; k++)
+    for (int i = 0; i < MU; i++) {
+      real value = 0;
+      if (later_move[k] >= 0) {
+        value = memory->z[later_move[k] * MU + i];
+      } else { /* one step more: the unconstrained optimum, clipped */
+        real own = 0;
+        for (int j = 0; j < N; j++) value += tail_gain[j * MU + i] * x[j];
+        for (int j = 0; j < N; j++) own += prestabilising_gain[j * MU + i] * x[j];
+        value = clipped(i, value) - own;
+      }
+      z[k * MU + i] = value;
+    }
+  product(M, NZ, C, z, 0, t);
+  for (int i = 0; i < M; i++) {
+    real later = later_row[i] < 0 ? 0 : memory->y[later_row[i]];
+    y[i] = E[i] > 0 ? later / E[i] / rho[i] : 0;
+    t[i] = E[i] * t[i] + y[i];
+  }
+  project(t, l, u, rho, s);
+  for (int i = 0; i < M; i++) t[i] = s[i] + y[i];
+}
+
+int NAME_step(NAME_memory *memory, const real x[N], const real *state_reference,
+              const real *input_reference, real input[MU], NAME_info *info) {
+  real theta[NP], q[NZ], move[NZ], z[NZ], spare[NZ];
+  /* One more than M, since an array needs a length. */
+  real shift[M + 1], l[M + 1], u[M + 1], t[M + 1], s[M + 1], r[M + 1], b[M + 1], image[M + 1];
+  real sum = 0;
+
+  for (int i = 0; i < N; i++) sum += FABS(theta[i] = x[i]);
+  for (int i = N; i < NP; i++) theta[i] = memory->u[i - N]; /* input rates */
+  for (int i = 0; i < N && state_reference; i++) sum += FABS(state_reference[i]);
+  for (int i = 0; i < MU && input_reference; i++) sum += FABS(input_reference[i]);
+  if (!isfinite(sum)) {
+    NAME_reset(memory);
+    for (int i = 0; i < MU; i++) input[i] = memory->u[i] = clipped(i, 0);
+    if (info) *info = (NAME_info){NAME_NON_FINITE, (real)INFINITY, (real)INFINITY};
+    return NAME_NON_FINITE;
+  }
+
+  memcpy(q, q_constant, sizeof q);
+  product(NZ, NP, q_theta, theta, 1, q);
+  if (state_reference) product(NZ, N, q_state, state_reference, 1, q);
+  if (input_reference) product(NZ, MU, q_input, input_reference, 1, q);
+  memcpy(shift, shift_constant, M * sizeof(real));
+  product(M, NP, shift_theta, theta, 1, shift);
+  for (int i = 0; i < M; i++) {
+    l[i] = E[i] > 0 ? E[i] * (lower[i] - shift[i]) : (real)-INFINITY;
+    u[i] = E[i] > 0 ? E[i] * (upper[i] - shift[i]) : (real)INFINITY;
+    t[i] = 0;
+  }
+  if (memory->warm) warm_start(memory, l, u, t);
+
+  for (int stage = 0; stage < STAGES; stage++) {
+    const real *now = rho + stage * M;
+    if (stage) { /* the multiplier carries over: v changes with the penalty */
+      project(t, l, u, now - M, s);
+      for (int i = 0; i < M; i++) t[i] = s[i] + now[i - M] / now[i] * (t[i] - s[i]);
+    }
+    product(NZ, NZ, ZQ + stage * NZ * NZ, q, 0, move);
+    product(M, NZ, C, move, 0, b);
+    for (int i = 0; i < M; i++) b[i] *= E[i];
+    for (int k = 0; k < NAME_ITERATIONS / STAGES; k++) {
+      project(t, l, u, now, s);
+      for (int i = 0; i < M; i++) r[i] = 2 * s[i] - t[i];
+#if NAME_THIN
+      product(NZ, M, ZF + stage * NZ * M, r, 0, spare);
+      product(M, NZ, C, spare, 0, image);
+      for (int i = 0; i < M; i++) image[i] *= E[i];
+#else
+      product(M, M, G + stage * M * M, r, 0, image);
+#endif
+      for (int i = 0; i < M; i++) t[i] += ALPHA * (image[i] + b[i] - s[i]);
+    }
+  }
+
+  /* Read: z, and multipliers in the units of the problem. */
+  const real *last = rho + (STAGES - 1) * M;
+  project(t, l, u, last, s);
+  for (int i = 0; i < M; i++) r[i] = 2 * s[i] - t[i];
+  memcpy(z, move, sizeof z);
+  product(NZ, M, ZF + (STAGES - 1) * NZ * M, r, 1, z);
+  product(M, NZ, C, z, 0, image);
+
+  real primal = 0, most_primal = 1, dual = 0, most_dual = largest(NZ, q, 1);
+  for (int i = 0; i < M; i++) {
+    /* A row that no move changes keeps its limit or does not; its penalty has a slope. */
+    real least = lower[i] - shift[i], top = upper[i] - shift[i];
+    real near = 0 < least ? least : 0 > top ? top : 0, y = 0;
+    if (E[i] > 0) {
+      near = s[i] / E[i];
+      y = E[i] * last[i] * (t[i] - s[i]);
+#if NAME_SOFT
+    } else if (isfinite(soft_linear[i])) {
+      y = near == 0 ? 0 : (near < 0 ? 1 : -1) * (soft_linear[i] + soft_quadratic[i] * FABS(near));
+      near = image[i];
+#endif
+    }
+    memory->y[i] = y;
+    primal = FMAX(primal, FABS(image[i] - near));
+    most_primal = FMAX(most_primal, FMAX(FABS(image[i]), FABS(near)));
+  }
+  product(NZ, NZ, P, z, 0, spare);
+  most_dual = largest(NZ, spare, most_dual);
+  for (int i = 0; i < NZ; i++) {
+    real force = 0;
+    for (int j = 0; j < M; j++) force += C[i * M + j] * memory->y[j];
+    most_dual = FMAX(most_dual, FABS(force));
+    dual = FMAX(dual, FABS(spare[i] + q[i] + force));
+  }
+  primal /= most_primal, dual /= most_dual;
+  int solved = primal <= NAME_TOLERANCE && dual <= NAME_TOLERANCE; /* false for NaN */
+  int status = solved ? NAME_SOLVED : NAME_NOT_SOLVED;
+  if (info) *info = (NAME_info){status, primal, dual};
+
+  memcpy(input, first_constant, MU * sizeof(real));
+  product(MU, NP, first_theta, theta, 1, input);
+  product(MU, NZ, first_z, z, 1, input);
+  memcpy(memory->z, z, sizeof z);
+  memcpy(memory->theta, theta, sizeof theta);
+  for (int i = 0; i < MU; i++) memory->u[i] = input[i] = clipped(i, input[i]);
+  memory->warm = 1;
+  return status;
+}

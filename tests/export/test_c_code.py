@@ -1,0 +1,180 @@
+"""The C code, compiled and called, beside the controller whose code it is."""
+
+import ctypes
+import shutil
+import subprocess
+from dataclasses import replace
+
+import jax
+import numpy as np
+import problems
+import pytest
+
+import jaxmpc as jm
+from jaxmpc.export import check_fixed_steps, export_c
+
+CC = shutil.which("cc")
+compiled = pytest.mark.skipif(CC is None, reason="there is no C compiler")
+STEPS = jm.ADMM(iterations=12, refine=0)
+
+
+def pendulum(**changes):
+    """An unstable system with two inputs, small."""
+    A, B = [[1.0, 0.2], [0.3, 1.05]], [[0.05, 0.1], [0.2, -0.1]]
+    return replace(
+        jm.MPC(
+            system=jm.LinearSystem(A, B, c=[0.01, -0.02]), Q=np.eye(2), R=0.1 * np.eye(2),
+            horizon=5, states=jm.Box([-1.0, -1.0], [1.0, 1.5]),
+            inputs=jm.Box([-1.0, -2.0], [1.5, 1.0]), terminal_cost=3 * np.eye(2),
+        ),
+        **changes,
+    )  # fmt: skip
+
+
+CASES = {
+    "hard": (lambda: problems.joint_o_inf(6), STEPS),
+    "all": (
+        lambda: replace(
+            jm.mpc.soften(
+                pendulum(input_rate_limit=0.4, input_rate_weight=0.3 * np.eye(2)), 5.0
+            ),
+            terminal_set=jm.Ellipsoid(np.array([[2.0, 0.3], [0.3, 1.0]]), 0.2),
+        ),
+        jm.ADMM(iterations=12, refine=0, rho=[[0.3], [2.0]]),
+    ),
+    "prestabilised, drift": (pendulum, STEPS),
+    "soft": (lambda: jm.mpc.soften(pendulum(), 5.0), STEPS),
+    "ellipsoid": (
+        lambda: pendulum(terminal_set=jm.Ellipsoid(np.array([[2.0, 0.3], [0.3, 1.0]]), 0.2)), STEPS,
+    ),
+    "rates": (
+        lambda: pendulum(input_rate_limit=0.4, input_rate_weight=0.3 * np.eye(2)), STEPS,
+    ),
+    "moves": (lambda: pendulum(control_horizon=(1, 2, 2)), STEPS),
+    "schedule": (pendulum, jm.ADMM(iterations=12, refine=0, rho=[[0.3], [2.0]])),
+    "no rows": (lambda: pendulum(states=None, inputs=None), STEPS),
+}  # fmt: skip
+
+
+class Compiled:
+    """The exported law as a shared library. `step` like a Controller's call."""
+
+    def __init__(self, mpc, solver, folder, dtype="float64", name="law"):
+        export_c(mpc, folder, solver, name=name, dtype=dtype)
+        sizes = dict(
+            line.split()[1:3] for line in (folder / f"{name}_sizes.h").read_text().splitlines()
+            if line.startswith("#define")
+        )  # fmt: skip
+        self.m, self.dtype = int(sizes[f"{name}_INPUTS"]), np.dtype(dtype)
+        strict = "-std=c99 -O2 -Wall -Wextra -Wpedantic -Werror -shared -fPIC".split()
+        library = folder / f"{name}.so"
+        subprocess.run([CC, *strict, folder / f"{name}.c", "-lm", "-o", library], check=True)
+        self.call = getattr(ctypes.CDLL(str(library)), f"{name}_step")
+        self.memory = np.zeros(10_000)  # as NAME_reset leaves it
+
+    def step(self, x, reference=None, input_reference=None):
+        given = [
+            None if v is None else np.ascontiguousarray(v, self.dtype)
+            for v in (x, reference, input_reference)
+        ]
+        u = np.zeros(self.m, self.dtype)
+        at = lambda v: None if v is None else v.ctypes.data_as(ctypes.c_void_p)
+        status = self.call(at(self.memory), *map(at, given), at(u), None)
+        return u, status
+
+
+@compiled
+@pytest.mark.parametrize(
+    "case",
+    [c if c == "all" else pytest.param(c, marks=pytest.mark.slow) for c in CASES],
+)
+def test_closed_loop_is_the_controllers(case, tmp_path):
+    """Two loops, with references and without, beyond the limits at the start of the second."""
+    mpc, solver = CASES[case][0](), CASES[case][1]
+    with jax.enable_x64(True):
+        code, law = Compiled(mpc, solver, tmp_path), jm.Controller(mpc, solver)
+        system = law.mpc.system
+        for start, reference, effort in ((0.5, None, None), (1.2, 0.3, 0.1)):
+            x, carry = np.full(system.n, start), None
+            code.memory[:] = 0
+            target = None if reference is None else np.full(system.n, reference)
+            input_target = None if effort is None else np.full(system.m, effort)
+            for _ in range(8):
+                u, carry, _ = law(x, carry, target, input_reference=input_target)
+                mine, _ = code.step(x, target, input_target)
+                np.testing.assert_allclose(mine, u, rtol=0, atol=1e-8)
+                x = np.asarray(system.A) @ x + np.asarray(system.B) @ mine
+                x = x if system.c is None else x + np.asarray(system.c)
+
+
+@compiled
+def test_status_is_true_and_bad_states_are_answered(tmp_path):
+    mpc = problems.joint_o_inf(6)
+    code = Compiled(mpc, jm.ADMM(iterations=300, refine=0), tmp_path)
+    with jax.enable_x64(True):
+        best = jm.solve(mpc, [0.2, -0.1])
+    u, status = code.step([0.2, -0.1])
+    np.testing.assert_allclose(u, best.inputs[0], atol=1e-5)
+    assert status == 1
+    assert code.step([1.5, 2.0])[1] == 2  # beyond the limits of x_0
+    for bad in (np.nan, np.inf):
+        u, status = code.step([bad, 0.0])
+        assert status == 3 and u == 0
+    assert code.step([0.2, -0.1])[1] == 1  # from a cold start again
+
+
+@compiled
+def test_float(tmp_path):
+    mpc, solver = problems.joint_o_inf(6), jm.ADMM(iterations=100, refine=0)
+    code = Compiled(mpc, solver, tmp_path, dtype="float32")
+    with jax.enable_x64(True):
+        u, *_ = jm.Controller(mpc, solver)(np.array([0.2, -0.1]))
+    np.testing.assert_allclose(code.step([0.2, -0.1])[0], u, atol=1e-3)
+
+
+def test_bad_arguments(tmp_path):
+    mpc = pendulum()
+    for changes, message in (
+        (dict(name="1st"), "name: '1st'"),
+        (dict(dtype="float16"), "dtype: 'float16'"),
+        (dict(tolerance=-1.0), "tolerance: "),
+        (dict(solver="fast"), "solver: "),
+    ):
+        with pytest.raises(ValueError, match=message):
+            export_c(mpc, tmp_path, **changes)
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "mpc.c").touch()
+    with pytest.raises(ValueError, match="mpc.c: exists"):
+        export_c(mpc, tmp_path)
+
+
+CHECKED = jm.MPC(
+    system=jm.LinearSystem([[1, 0.1], [0, 1]], [[0.005], [0.1]]), Q=np.eye(2), R=[[0.1]],
+    horizon=3, states=jm.Box([-1, -2], [1, 2]), inputs=jm.Box([-2], [2]),
+)  # fmt: skip
+
+
+@pytest.mark.slow
+def test_closed_loop_check():
+    """Lists as numbers; enough steps solve every plan, one step few."""
+    check = lambda steps: check_fixed_steps(
+        CHECKED, jm.ADMM(iterations=steps), [-0.5, -0.5], [0.5, 0.5], samples=40, tolerance=1e-4
+    )
+    many, one = check(200), check(1)
+    assert many.samples == many.solvable == many.reached == 40 and many.input_error < 1e-3
+    assert one.reached < 40
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        (dict(lower=[0.0]), "lower: "),
+        (dict(upper=[np.inf, 1.0]), "upper: "),
+        (dict(samples=0), "samples: "),
+        (dict(mpc=3), "mpc: "),
+    ],
+)
+def test_closed_loop_check_names_bad_arguments(changes, message):
+    given = dict(mpc=CHECKED, solver=jm.ADMM(), lower=[-1.0, -1.0], upper=[1.0, 1.0]) | changes
+    with pytest.raises(ValueError, match=message):
+        check_fixed_steps(**given)
