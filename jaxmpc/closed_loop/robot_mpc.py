@@ -97,8 +97,9 @@ def _around(limits: Box, margin: float, point: np.ndarray, names: tuple[str, ...
             "Choose another target",
         )  # fmt: skip
     tight = limits.tightened(margin)
-    low, high = np.minimum(tight.lower, point), np.maximum(tight.upper, point)
-    less = np.flatnonzero((low < np.asarray(tight.lower)) | (high > np.asarray(tight.upper)))
+    lower, upper = np.asarray(tight.lower), np.asarray(tight.upper)
+    low, high = np.minimum(lower, point), np.maximum(upper, point)
+    less = np.flatnonzero((low < lower) | (high > upper))
     if len(less):
         warnings.warn(
             f"margin: {_listed(less, names)}: the target lies at the limit or less than the margin "

@@ -520,7 +520,8 @@ class OneStep:
                 T = Polytope(G, g + 4 * _FLAT * size)  # an elimination needs a set with volume
         # y in T - B u, where the inputs are u = moving v + fixed
         T = T.preimage(np.eye(n), self.B @ self.fixed)
-        if k and self.ends is not None and n in (3, 4) and np.size(T.h) > _MANY and _bounded(T):
+        many = n in (3, 4) and np.asarray(T.h).size > _MANY
+        if k and self.ends is not None and many and _bounded(T):
             for b, (lower, upper) in zip((self.B @ self.moving).T, self.ends, strict=True):
                 T = _plus_segment(T, -b, lower, upper)
         elif k:
@@ -853,7 +854,8 @@ def _polytope(argument: str, value: Box | Polytope | None, n: int) -> Polytope:
 def _extent(rows: np.ndarray, limits: Reals = 1.0) -> np.ndarray:
     """Return bounds on |x_i| over rows x <= limits, with a margin for the LP's error; inf where
     unbounded."""
-    return geometry.extent(*unit_rows(rows, np.broadcast_to(limits, len(rows)))) * (1 + 1e-6)
+    limits = np.broadcast_to(np.asarray(limits), len(rows))
+    return geometry.extent(*unit_rows(rows, limits)) * (1 + 1e-6)
 
 
 def _bound(
@@ -864,7 +866,7 @@ def _bound(
     For any y >= 0,
         row x = y'(rows x) + (row - rows'y)'x <= y'limits + |row - rows'y|'extent.
     """
-    limits = np.broadcast_to(limits, len(rows))
+    limits = np.broadcast_to(np.asarray(limits), len(rows))
     top = maximise(row, *unit_rows(rows, limits))
     if top.y is None:
         return top.value, top.value

@@ -306,7 +306,7 @@ class Polytope:
             part._require_fields(argument, self.dimension)
         H = [host_array("H", part.H) for part in parts]
         h = [host_array("h", part.h) for part in parts]
-        labels = [part.labels or ("",) * np.size(part.h) for part in parts]
+        labels = [part.labels or ("",) * len(b) for part, b in zip(parts, h, strict=True)]
         named = any(part.labels for part in parts)
         return Polytope(np.vstack(H), np.concatenate(h), labels[0] + labels[1] if named else ())
 

@@ -69,7 +69,9 @@ class Law:
         """Return inputs (B, m) clipped into a box of limits: an actuator takes no rounding beyond
         them."""
         box = self.mpc.inputs
-        return np.clip(u, box.lower, box.upper) if isinstance(box, Box) else u
+        if not isinstance(box, Box):
+            return u
+        return np.clip(u, np.asarray(box.lower), np.asarray(box.upper))
 
     def following(self, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
         """Return the states (B, p) after inputs (B, m): A x + B u + c, and u where the state holds

@@ -95,7 +95,7 @@ def backward(
             body = predecessor(mpc.system, body, mpc.states, mpc.inputs).reduce()
         except ValueError as error:
             return f"its facets are not found ({error})"
-        if time.monotonic() > deadline or np.size(body.h) > FACETS // 4:
+        if time.monotonic() > deadline or np.asarray(body.h).size > FACETS // 4:
             return "its facets are too many to enumerate in the time given"
         if k >= count - 3:
             found.append(body)

@@ -23,7 +23,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail, require_kind, whole
@@ -124,8 +123,9 @@ def solve_nonlinear(
     # The model's own system is not read; the one of the set-point may differ from step to step.
     s = jax.eval_shape(stages, mpc)
     dtype = s.P.dtype
-    if np.shape(x0) != (n,):
-        fail("x0", f"shape {np.shape(x0)}", f"Give one state ({n},); use jax.vmap for many")
+    x0 = jnp.asarray(x0, dtype)
+    if x0.shape != (n,):
+        fail("x0", f"shape {x0.shape}", f"Give one state ({n},); use jax.vmap for many")
     sizes = problem.sizes()
     aims = [("reference", reference, n, N + 1), ("input_reference", input_reference, m, N)]
     given = [task.target for task in problem.tasks] if targets is None else list(targets)
@@ -134,17 +134,17 @@ def solve_nonlinear(
     aims += [(f"targets[{i}]", v, sizes[i], N + 1) for i, v in enumerate(given)]
     found = []
     for name, value, size, length in aims:
-        value = jnp.zeros(size, dtype) if value is None else value
-        if np.shape(value) not in ((), (size,), (length, size)):
-            fail(name, f"shape {np.shape(value)}", f"Give ({size},) or ({length}, {size})")
-        found.append(jnp.broadcast_to(jnp.asarray(value, dtype), (length, size)))
+        aim = jnp.zeros(size, dtype) if value is None else jnp.asarray(value, dtype)
+        if aim.shape not in ((), (size,), (length, size)):
+            fail(name, f"shape {aim.shape}", f"Give ({size},) or ({length}, {size})")
+        found.append(jnp.broadcast_to(aim, (length, size)))
     rows = (*s.layout, *task_layout(problem))
     if warm_start is None:
         count = sum(len(steps) * size for _, steps, size in rows)
-        x, u = jnp.broadcast_to(jnp.asarray(x0, dtype), (N + 1, n)), jnp.zeros((N, m), dtype)
+        x, u = jnp.broadcast_to(x0, (N + 1, n)), jnp.zeros((N, m), dtype)
         warm_start = WarmStart(x, u + found[1][:1], jnp.zeros(count, dtype))
     warm_start = WarmStart.of(warm_start, rows, N, n, m)
-    sample = Aims(jnp.asarray(x0, dtype), found[0], found[1], tuple(found[2:]))
+    sample = Aims(x0, found[0], found[1], tuple(found[2:]))
     return _solve(
         *arrays((problem, solver, sample, warm_start, scale)), steps=int(steps), hessian=hessian
     )

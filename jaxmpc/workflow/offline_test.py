@@ -190,10 +190,9 @@ def samples(mpc: MPC, d: int) -> np.ndarray:
     corners = edges.points[np.isfinite(edges.points).all(axis=1)]
     lower, upper = corners.min(axis=0), corners.max(axis=0)
     if isinstance(mpc.states, Box) and d == mpc.system.n:
-        ends = mpc.states
-        wide = np.isfinite(np.asarray(ends.lower)) & np.isfinite(np.asarray(ends.upper))
-        lower = np.where(wide, ends.lower, lower)
-        upper = np.where(wide, ends.upper, upper)
+        low, high = np.asarray(mpc.states.lower), np.asarray(mpc.states.upper)
+        wide = np.isfinite(low) & np.isfinite(high)
+        lower, upper = np.where(wide, low, lower), np.where(wide, high, upper)
     margin = 0.03 * (upper - lower)
     if d <= 3:
         return grid(lower - margin, upper + margin, ({1: 256, 2: 48, 3: 14}[d],) * d)

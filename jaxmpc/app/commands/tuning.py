@@ -84,7 +84,7 @@ def feasible_states(
     found: list[np.ndarray] = []
     for _ in range(TRIES * count):
         x = random.uniform(lower, upper)
-        if isinstance(limits, Polytope) and np.any(np.asarray(limits.H) @ x > limits.h):
+        if isinstance(limits, Polytope) and np.any(np.asarray(limits.H) @ x > np.asarray(limits.h)):
             continue
         b = rows.b - rows.D @ np.pad(x, (0, rows.D.shape[1] - len(x)))
         zero = np.zeros(rows.C.shape[1])
