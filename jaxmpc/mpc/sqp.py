@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.checks import fail, require_kind, whole
+from jaxmpc.checks import fail, require_kind, require_real, require_shape, whole
 from jaxmpc.mpc.interior_point import STEPS as INTERIOR_STEPS
 from jaxmpc.mpc.interior_point import Interior, interior_step
 from jaxmpc.mpc.kernels import recurrence
@@ -123,9 +123,8 @@ def solve_nonlinear(
     # The model's own system is not read; the one of the set-point may differ from step to step.
     s = jax.eval_shape(stages, mpc)
     dtype = s.P.dtype
+    require_shape("x0", x0, (n,), f"Give one state ({n},); use jax.vmap for many")
     x0 = jnp.asarray(x0, dtype)
-    if x0.shape != (n,):
-        fail("x0", f"shape {x0.shape}", f"Give one state ({n},); use jax.vmap for many")
     sizes = problem.sizes()
     aims = [("reference", reference, n, N + 1), ("input_reference", input_reference, m, N)]
     given = [task.target for task in problem.tasks] if targets is None else list(targets)
@@ -134,6 +133,7 @@ def solve_nonlinear(
     aims += [(f"targets[{i}]", v, sizes[i], N + 1) for i, v in enumerate(given)]
     found = []
     for name, value, size, length in aims:
+        require_real(name, 0.0 if value is None else value)
         aim = jnp.zeros(size, dtype) if value is None else jnp.asarray(value, dtype)
         if aim.shape not in ((), (size,), (length, size)):
             fail(name, f"shape {aim.shape}", f"Give ({size},) or ({length}, {size})")
