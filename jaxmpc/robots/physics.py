@@ -75,13 +75,15 @@ class Physics:
         carried along.
 
         numbers: fields of mjx.Model to replace. Differentiable in all three, forward and reverse;
-        with constraints by `with_forward_jacobian`.
+        with constraints by `with_forward_jacobian`. Computed in float64 where 64-bit mode is on, as
+        MJX's own numbers are then, and returned in the type of x.
         """
-        numbers = jax.tree.map(jnp.asarray, dict(numbers or {}))
+        dtype = x.dtype
+        x, u, numbers = _widest((x, u, dict(numbers or {})))
         if not self.rows:
-            return in_pieces(rewritten(self._step, stand_ins()))(x, u, numbers)
+            return in_pieces(rewritten(self._step, stand_ins()))(x, u, numbers).astype(dtype)
         step = in_pieces(rewritten(self._step, {**stand_ins(), sqrt_p: root}))
-        return with_forward_jacobian(step)(x, u, numbers)
+        return with_forward_jacobian(step)(x, u, numbers).astype(dtype)
 
     def _step(self, x: Array, u: Array, numbers: dict[str, Array]) -> Array:
         x_q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
@@ -101,7 +103,7 @@ class Physics:
         """Return mjx.Data at x = (qpos, qvel, act) under u: poses and velocities of bodies, geoms
         and sites, forces of actuators and springs (qfrc_actuator, qfrc_passive), qfrc_bias.
         Differentiable."""
-        own = jax.tree.map(jnp.asarray, dict(numbers or {}))
+        x, u, own = _widest((x, u, dict(numbers or {})))
         x_q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
         q = normalised(self.joints, x_q)
         _, bias, poses = self._dynamics(own, q, v)
@@ -285,6 +287,13 @@ class Physics:
         table = jnp.array([[0, 1 / 6], [1 / 2, 1 / 3], [1 / 2, 1 / 3], [1, 1 / 6]], v.dtype)
         end, _ = jax.lax.scan(in_pieces(stage), (jnp.zeros_like(v),) * 4, table)
         return jnp.concatenate([move(end[2]), v + h * end[3]])
+
+
+def _widest(tree: Any) -> Any:
+    """Return the pytree with its floats in float64 where 64-bit mode is on, else in float32."""
+    wide = jnp.result_type(float)
+    number = lambda v: v.astype(wide) if jnp.issubdtype(v.dtype, jnp.floating) else v
+    return jax.tree.map(lambda v: number(jnp.asarray(v)), tree)
 
 
 def _next_activations(model: Any, data: Any) -> Array:

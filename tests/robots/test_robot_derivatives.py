@@ -72,6 +72,21 @@ def test_every_integrator_in_both_precisions(integrator, order):
             np.testing.assert_allclose(after, wanted, rtol=0, atol=1e-12 if wide else 1e-6)
 
 
+def test_float32_states_while_64_bit_mode_is_on():
+    """Numbers of MJX are in float64 then; states and models keep the type of what was given."""
+    robot = jm.load_robot(swing("Euler"))
+    x, u = np.array([0.3, -0.4], np.float32), np.array([0.7], np.float32)
+    with jax.enable_x64(True):
+        after, found = robot.step(x, u), robot.linearize(x, u)
+        wanted = robot.linearize(x.astype(float), u.astype(float))
+        assert (after.dtype, found.A.dtype, found.c.dtype) == (np.float32,) * 3
+        np.testing.assert_allclose(after, c_steps(robot.mujoco, x, u, 1), rtol=0, atol=1e-6)
+        np.testing.assert_allclose(found.A, wanted.A, rtol=0, atol=1e-5)
+        # A predictor without rows, whose accelerations have a rule of their own.
+        A, B = jm.load_robot("arm2").transition(np.ones(4, np.float32), np.ones(2, np.float32))
+        assert (A.dtype, B.dtype) == (np.float32,) * 2
+
+
 @pytest.mark.slow
 def test_rk4_in_a_loop_in_float32():
     """The problem is made in float64, the loop runs in float32: the rod goes to its target."""
