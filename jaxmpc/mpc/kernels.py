@@ -2,7 +2,9 @@
 
 As a scan every stage is a launch of its own, or several: 5 to 200 µs each whatever the batch. Here
 one warp runs all stages of one problem with the running vector or matrix in its registers (Pallas,
-Triton). Everywhere else, and for derivatives, the scans serve.
+Triton). On CPUs the matrices of a batch stand side by side (the batch in the last axis, which XLA
+vectorises: 40 µs for 14 states, 7 inputs and 20 stages, 67 as a batched scan). Everywhere else, and
+for derivatives, the scans serve.
 """
 
 from collections.abc import Callable
@@ -14,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.qp import triton
-from jaxmpc.qp.linalg import solve
+from jaxmpc.qp.linalg import WAITS, batched, inverse_root_side_by_side, solve
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.triton import barrier, call, indices, load, on_gpu, padded_side, store
 
@@ -64,14 +66,19 @@ def riccati_recursion(Q: Array, R: Array, cross: Any, A: Array, B: Array) -> Gai
     """
     if cross is not None:
         return _riccati_scan(Q, R, A, B, cross)
-    return _or_kernel(_riccati_scan, _riccati_kernel, Q, R, A, B)
+    return _or_kernel(_riccati_scan, _riccati_kernel, Q, R, A, B, lanes=_riccati_lanes)
 
 
-def _or_kernel(scan: Callable, kernel: Callable, *args: Array) -> Any:
-    """The kernel where it runs, with the derivative of the scan."""
+def _or_kernel(scan: Callable, kernel: Callable, *args: Array, lanes: Any = None) -> Any:
+    """The kernel where it runs, or on CPUs `lanes`, the scan of a batch in the last axis; both with
+    the derivative of the scan."""
     longest = max(size for v in args for size in v.shape[-1:])
-    if not on_gpu() or longest > MOST:
+    if longest > MOST:
         return scan(*args)
+    if not on_gpu():
+        if lanes is None or WAITS:  # the fusions of those versions of XLA compute products again
+            return scan(*args)
+        kernel = batched(lambda *args: scan(*args), lanes, MOST)
     fast = jax.custom_jvp(kernel)
     # The value is the kernel's here too: under `vmap` within `jit` JAX takes the place of the batch
     # axis from the function as it stands, and a scan would put it elsewhere.
@@ -126,6 +133,29 @@ def _riccati_scan(Q: Array, R: Array, A: Array, B: Array, cross: Any = None) -> 
 
     own = (v if f is None else None for v, f in zip((A, B), fixed, strict=True))
     return jax.lax.scan(stage, Q[-1], (Q[:-1], R, cross, *own), reverse=True)[1]
+
+
+def _riccati_lanes(Q: Array, R: Array, A: Array, B: Array) -> Gains:
+    """The recursion for problems side by side: all arrays with the batch as last axis."""
+    fixed = (A if A.ndim == 3 else None, B if B.ndim == 3 else None)
+    # Each product is an array of its own: XLA would compute it again for each of its uses.
+    keep = jax.lax.optimization_barrier
+    times = lambda X, Y: keep(sum(X[:, k, None] * Y[k] for k in range(len(Y))))
+    turned = lambda X, Y: keep(sum(X[k][:, None] * Y[k] for k in range(len(Y))))
+
+    def stage(S: Array, stage: tuple) -> tuple[Array, Gains]:
+        Q, R, *own = stage
+        A, B = (v if f is None else f for v, f in zip(own, fixed, strict=True))
+        BtS = turned(B, S)
+        W = inverse_root_side_by_side(R + times(BtS, B))
+        inverse = turned(W, W)
+        K = -times(inverse, times(BtS, A))
+        closed = A + times(B, K)
+        S = Q + turned(closed, times(S, closed)) + turned(K, times(R, K))
+        return keep((S + S.swapaxes(0, 1)) / 2), Gains(closed, K, inverse)
+
+    own = (v if f is None else None for v, f in zip((A, B), fixed, strict=True))
+    return jax.lax.scan(stage, Q[-1], (Q[:-1], R, *own), reverse=True)[1]
 
 
 def _recurrence_kernel(M: Array, w: Array, start: Array, *, adjoint: bool) -> Array:

@@ -23,9 +23,9 @@ BLOCK = 128
 # Instances in a group on a CPU at most, and when fewer are open; small batches are one group.
 PART_CPU, FEW_CPU, SMALL_CPU = 512, 64, 128
 # The same of loops with long steps, or that few instances of a batch enter; then of those over
-# stages, always so many. (One core, 64 arms of 7 joints: 8.8 s in one group of 64, 6.4 in groups of
-# 16, 4.9 of 8, 4.6 of 4, 7.0 one by one.)
-LONG_PART_CPU, LONG_FEW_CPU, STAGES_CPU = 64, 8, 8
+# stages, always so many. (64 arms of 7 joints for 1 s: 1.23 s in groups of 32, 1.11 of 16, 1.17
+# of 8.)
+LONG_PART_CPU, LONG_FEW_CPU, STAGES_CPU = 64, 8, 16
 # Instances in a group elsewhere: a quarter of the batch; when fewer are open a sixteenth of that,
 # and so on, but not below LEAST, where a step costs little more than its launches. (H100,
 # TurboMPC's problem, 4,096 at once: 2.6 µs a solve in one group, 1.6 in groups of 512, 1.2 of 1,024

@@ -38,23 +38,25 @@ LANES = 64
 TOGETHER = 100_000
 
 
-def _batched(
+def batched(
     one: Callable,
     plain: Callable | None = None,
     small: int = 0,
     columns: bool = False,
     together: int = TOGETHER,
 ) -> Callable:
-    """The function `one` of a matrix (and right-hand sides), whose `vmap` follows the rules above.
+    """Return the function `one` of square matrices (…, n, n) and other arrays, whose `vmap` follows
+    the rules above.
 
-    one: LAPACK's answer for one matrix. plain: the same in plain operations for matrices side by
-    side, all arguments and results with the batch as last axis, used up to `small` rows. columns:
-    the second argument is right-hand sides (n, k), the batch of which needs one factorization
-    where it shares the matrix. together: multiplications in a call, 0 for one matrix a call.
+    one: the answer for one instance, by LAPACK. plain: the same in plain operations for instances
+    side by side, all arguments and results with the batch as last axis, used up to `small` rows.
+    columns: the second argument is right-hand sides (n, k), the batch of which needs one
+    factorization where it shares the matrix. together: multiplications in a call, 0 for one matrix
+    a call.
     """
 
     def on_cpu(*args: Array) -> Any:
-        batch, n = args[0].shape[:2]
+        batch, n = len(args[0]), args[0].shape[-1]
         if plain is not None and n <= small:
             return _side_by_side(plain, args)
         if not WAITS:
@@ -147,7 +149,7 @@ def _substituted(U: Array, D: Array, B: Array) -> Array:
 
 def _solve_plain(K: Array, B: Array) -> Array:
     """By the inverse root W, K⁻¹ = W'W, and a step of iterative refinement."""
-    W = _inverse_root_plain(K)
+    W = inverse_root_side_by_side(K)
     product = lambda M, X: jnp.sum(M[:, :, None] * X[None], axis=1)
     rough = lambda X: product(W.swapaxes(0, 1), product(W, X))
     X = rough(B)
@@ -169,7 +171,8 @@ def _cholesky_plain(K: Array) -> Array:
     return jnp.where(upper[..., None], M / jnp.sqrt(D)[:, None], 0.0).swapaxes(0, 1)
 
 
-def _inverse_root_plain(K: Array) -> Array:
+def inverse_root_side_by_side(K: Array) -> Array:
+    """Return the `inverse_root` of each matrix of K (n, n, lanes); NaN where there is none."""
     n = K.shape[0]
     identity = jnp.broadcast_to(jnp.eye(n, dtype=K.dtype)[..., None], K.shape)
     M, D = _eliminated(jnp.concatenate([K, identity], axis=1))
@@ -191,12 +194,12 @@ def _triangular_lapack(L: Array, B: Array) -> Array:
     return lax.linalg.triangular_solve(L, B, left_side=True, lower=True)
 
 
-_solve = _batched(_solve_lapack, _solve_plain, small=6, columns=True)
-_cholesky = _batched(_cholesky_lapack, _cholesky_plain, small=12)
-_inverse_root = _batched(_inverse_root_lapack, _inverse_root_plain, small=12)
-_triangular = _batched(_triangular_lapack, _triangular_plain, small=6, columns=True)
-_general = _batched(jnp.linalg.solve, columns=True)
-_eigh = _batched(lambda K: tuple(jnp.linalg.eigh(K)), together=0)
+_solve = batched(_solve_lapack, _solve_plain, small=6, columns=True)
+_cholesky = batched(_cholesky_lapack, _cholesky_plain, small=12)
+_inverse_root = batched(_inverse_root_lapack, inverse_root_side_by_side, small=12)
+_triangular = batched(_triangular_lapack, _triangular_plain, small=6, columns=True)
+_general = batched(jnp.linalg.solve, columns=True)
+_eigh = batched(lambda K: tuple(jnp.linalg.eigh(K)), together=0)
 
 
 def solve(K: Array, B: Array) -> Array:

@@ -1,4 +1,5 @@
-"""The GPU kernels of the stage recursions, run by Pallas' interpreter, against the scans."""
+"""The GPU kernels of the stage recursions, run by Pallas' interpreter, and batches side by side on
+CPUs, against the scans."""
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +42,28 @@ def test_kernels_equal_the_scans(staged):
     for adjoint in (False, True):
         scan = lambda *a, adjoint: kernels._scan(*a, adjoint=adjoint, unroll=1)
         close(*both(scan, kernels._recurrence_kernel, A, gx[:, 1:], gx[:, 0], adjoint=adjoint))
+
+
+@pytest.mark.parametrize("staged", [False, True])
+def test_a_batch_side_by_side_is_the_scan(staged):
+    """On CPUs: values, and the derivative of the scans, of nested batches too."""
+    with jax.enable_x64(True):
+        problems = batch(np.random.default_rng(2), 3, 5, 2, staged)[:4]
+        Q, R, A, B = (jnp.asarray(v, jnp.float64) for v in problems)
+        last = lambda v: jnp.moveaxis(v, 0, -1)
+        first = lambda v: jnp.moveaxis(v, -1, 0)
+        scan = jax.vmap(lambda *v: kernels._riccati_scan(*v))
+        own = lambda *v: jax.tree.map(first, kernels._riccati_lanes(*map(last, v)))
+        chosen = lambda Q, R, A, B: kernels.riccati_recursion(Q, R, None, A, B)
+        nested = jax.vmap(jax.vmap(chosen, (0, 0, None, 0)), (None, None, 0, None))
+        expected = jax.vmap(lambda A: scan(Q, R, jnp.stack([A, A]), B))(A)
+        for found, wanted in (
+            (own(Q, R, A, B), scan(Q, R, A, B)), (nested(Q, R, A, B), expected)
+        ):  # fmt: skip
+            for a, b in zip(found, wanted, strict=True):
+                np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+        slope = lambda of: jax.grad(lambda A: jnp.sum(of(Q, R, A, B).K ** 3))(A)
+        np.testing.assert_allclose(slope(jax.vmap(chosen)), slope(scan), rtol=1e-10)
 
 
 @pytest.mark.slow
