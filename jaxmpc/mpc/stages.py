@@ -188,30 +188,41 @@ def stages(mpc: MPC) -> Stages:
 
 
 def cleaned(s: Stages) -> tuple[Stages, Array]:
-    """The data with harmless ones in their place where they are not usable, and the fault in
-    them (see `qp.solve.cleaned`): NOT_RUN for none, NON_CONVEX where Q, R or P is indefinite or R
-    singular."""
-    ok = jnp.all(s.lower <= s.upper) & ~jnp.any(jnp.isposinf(s.lower) | jnp.isneginf(s.upper))
-    for value in jax.tree.leaves((s.A, s.B, s.c, s.Q, s.R, s.P, s.stage, s.H, s.D)):
-        ok = ok & jnp.all(jnp.isfinite(value))
-    if s.linear is not None:
-        ok = ok & jnp.all(s.linear >= 0)
-        ok = ok & jnp.all((s.quadratic >= 0) & jnp.isfinite(s.quadratic))
-    weights = [jnp.where(ok, (W + W.T) / 2, 0.0) for W in (s.Q, s.R, s.P)]
-    definite = jnp.all(jnp.isfinite(cholesky(jax.lax.stop_gradient(weights[1]))))
-    for W in weights:
-        definite = definite & convex(W)
-    definite = definite & jnp.all(s.stage > 0)
-    fault = jnp.where(definite, Status.NOT_RUN, Status.NON_CONVEX)
-    fault = jnp.where(ok, fault, Status.NON_FINITE).astype(jnp.int32)
-    ok = ok & definite
-    clean = lambda tree, harmless=0.0: jax.tree.map(lambda v: jnp.where(ok, v, harmless), tree)
+    """The data with harmless numbers in place of those that are not usable, and the fault in them
+    (see `qp.solve.cleaned`): NOT_RUN for none, NON_CONVEX where Q, R or P is indefinite or R
+    singular.
+
+    Each array by itself: what a batch shares is read and cleaned once, whatever its instances hold.
+    """
+    everywhere = lambda *tests: jnp.all(jnp.stack([jnp.all(test) for test in tests]))
+    numbers = jax.tree.leaves((s.A, s.B, s.c, s.Q, s.R, s.P, s.stage, s.H, s.D))
+    ordered = (s.lower <= s.upper) & ~jnp.isposinf(s.lower) & ~jnp.isneginf(s.upper)
+    tests = [*map(jnp.isfinite, numbers), ordered]
+    finite = lambda tree: jax.tree.map(lambda v: jnp.where(jnp.isfinite(v), v, 0.0), tree)
+    linear, quadratic = s.linear, s.quadratic
+    if linear is not None:
+        tests += [linear >= 0, (quadratic >= 0) & jnp.isfinite(quadratic)]
+        linear, quadratic = (
+            jnp.where(test, v, harmless)
+            for test, v, harmless in zip(tests[-2:], (linear, quadratic), (jnp.inf, 0), strict=True)
+        )
+    Q, R, P = ((W + W.T) / 2 for W in finite((s.Q, s.R, s.P)))
+    has_root = everywhere(jnp.isfinite(cholesky(jax.lax.stop_gradient(R))))
+    convexity = [convex(Q), convex(R) & has_root, convex(P)]
+    positive = jnp.isfinite(s.stage) & (s.stage > 0)
+    fault = jnp.where(everywhere(*convexity, positive), Status.NOT_RUN, Status.NON_CONVEX)
+    fault = jnp.where(everywhere(*tests), fault, Status.NON_FINITE).astype(jnp.int32)
+    Q, R, P = (
+        jnp.where(test, W, harmless)
+        for test, W, harmless in zip(
+            convexity, (Q, R, P), (0, jnp.eye(len(R), dtype=R.dtype), 0), strict=True
+        )
+    )
     return replace(
-        s, A=clean(s.A), B=clean(s.B), c=clean(s.c), Q=clean(s.Q), P=clean(s.P),
-        stage=clean(s.stage, 1.0),
-        R=clean(s.R, jnp.eye(s.R.shape[0], dtype=s.R.dtype)), H=clean(s.H), D=clean(s.D),
-        lower=clean(s.lower, -jnp.inf), upper=clean(s.upper, jnp.inf),
-        linear=clean(s.linear, jnp.inf), quadratic=clean(s.quadratic),
+        s, A=finite(s.A), B=finite(s.B), c=finite(s.c), Q=Q, R=R, P=P,
+        stage=jnp.where(positive, s.stage, 1.0), H=finite(s.H), D=finite(s.D),
+        lower=jnp.where(ordered, s.lower, -jnp.inf), upper=jnp.where(ordered, s.upper, jnp.inf),
+        linear=linear, quadratic=quadratic,
     ), fault  # fmt: skip
 
 

@@ -373,8 +373,9 @@ def _plan(factor: StageFactor, mpc: MPC, solver: ADMM, sample: Sample, warm_star
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(sample)]))
     fault = jnp.where(finite, factor.fault, jnp.int32(Status.NON_FINITE))
     usable = fault == Status.NOT_RUN
+    sample = jax.tree.map(lambda v: jnp.where(jnp.isfinite(v), v, 0), sample)
     # Only cost and slack are read from the problem as given.
-    sample, mpc = jax.tree.map(lambda v: jnp.where(usable, v, 0), (sample, mpc))
+    mpc = jax.tree.map(lambda v: jnp.where(usable, v, 0), mpc)
     if solver.differentiate == "implicit":
         constants = jax.lax.stop_gradient((factor, sample, solver, warm_start))
         fixed = constants[0].E, constants[0].rho[-1]
