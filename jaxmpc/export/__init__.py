@@ -1,10 +1,17 @@
-"""Controllers for machines without Python: the solver with a fixed number of steps as C99 code.
+"""Controllers for machines without Python, or without this library.
 
-export_c              write the code of a controller
-check_fixed_steps     closed loops under the same law beside precise plans -> ClosedLoopCheck
+export_c              the solver with a fixed number of steps as C99 code
+export_explicit_c     the explicit law of `critical_regions` as C99 code, with a search tree
+export_jax            plans of a batch of any size as a program that needs jax alone
+check_fixed_steps     closed loops under the law of `export_c` beside precise plans
+                      -> ClosedLoopCheck
 """
 
 from jaxmpc.export.c_code import export_c
 from jaxmpc.export.check import ClosedLoopCheck, check_fixed_steps
+from jaxmpc.export.explicit_law import export_explicit_c
+from jaxmpc.export.jax_program import export_jax
 
-__all__ = ["ClosedLoopCheck", "check_fixed_steps", "export_c"]
+__all__ = [
+    "ClosedLoopCheck", "check_fixed_steps", "export_c", "export_explicit_c", "export_jax",
+]  # fmt: skip

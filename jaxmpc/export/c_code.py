@@ -5,7 +5,6 @@ and written as data. With M = P + C'E R E C, R = diag(rho), a stage of the sched
 ZF = M⁻¹C'E R and ZQ = −M⁻¹ in the units of the problem; `Factor` has them in coordinates z = T w.
 """
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,14 +15,22 @@ import numpy as np
 
 from jaxmpc.checks import fail, number, require_kind
 from jaxmpc.control.sets import Box
+from jaxmpc.export.c_text import (
+    REAL,
+    literal,
+    prepared_paths,
+    require_c_names,
+    sizes_header,
+    tables_header,
+    template,
+    write,
+)
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import WarmStart, sorted_multipliers
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 
-TEMPLATES = Path(__file__).parent
-REAL = {"float64": "double", "float32": "float"}
 # Relative residuals below which the code says "solved".
 TOLERANCE = {"float64": 1e-6, "float32": 1e-3}
 
@@ -53,27 +60,12 @@ def export_c(
     solver = ADMM() if solver is None else solver
     require_kind("mpc", mpc, MPC)
     require_kind("solver", solver, ADMM)
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-        fail("name", f"{name!r}", "Give letters, digits and _, a letter first")
-    if dtype not in REAL:
-        fail("dtype", f"{dtype!r}", 'Give "float64" or "float32"')
+    require_c_names(name, dtype)
     if tolerance is None:
         tolerance = TOLERANCE[dtype]
     number("tolerance", tolerance, 0, "Give a positive number")
-    folder = Path(folder)
     kinds = (".h", ".c", "_sizes.h", "_tables.h", "_example.c")
-    paths = [folder / f"{name}{kind}" for kind in kinds]
-    for path in paths:
-        if path.exists() and not overwrite:
-            fail(
-                str(path),
-                "exists",
-                "Overwrite it (overwrite=True, --overwrite) or give another folder or name",
-            )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        fail(str(folder), f"{error.strerror}", "Give a folder that you can write")
+    paths = prepared_paths(Path(folder), [f"{name}{kind}" for kind in kinds], overwrite)
     with jax.enable_x64(True):
         controller = Controller(mpc, replace(solver, refine=0))
         assert controller.factor is not None
@@ -82,27 +74,18 @@ def export_c(
             fail("mpc", f"cannot be factored: {fault.name}", "See the status in jm.Status")
         sizes, tables = _sizes(controller), _tables(controller)
     real = REAL[dtype]
-    own = {"TOLERANCE": _literal(tolerance, real), "real": real}
-    made = {
-        "_sizes.h": _header("sizes and types", {**sizes, **own}, name),
-        "_tables.h": _c_tables(tables, controller, real),
-    }
-    for kind, source in ((".h", "mpc.h"), (".c", "mpc.c"), ("_example.c", "example.c")):
-        made[kind] = (TEMPLATES / source).read_text(encoding="utf-8")
-    zeros = " ".join(["0"] * mpc.system.n)
-    for kind, path in zip(kinds, paths, strict=True):
-        text = made[kind].replace("NAME", name).replace("VERSION", _version()).replace("X0", zeros)
-        path.write_text(text, encoding="utf-8")
-    return paths
+    sizes["TOLERANCE"] = literal(tolerance, real)
+    suffix = "f" if real == "float" else ""
+    macros = {key: f"{key.lower()}{suffix}" for key in ("FABS", "FMAX", "SQRT")}
+    macros["ALPHA"] = literal(float(np.asarray(controller.solver.alpha)), real)
+    texts = [
+        template("mpc.h"), template("mpc.c"), sizes_header(sizes, real),
+        tables_header(tables, macros, real), template("example.c"),
+    ]  # fmt: skip
+    return write(paths, texts, name, mpc.system.n)
 
 
-def _version() -> str:
-    import jaxmpc
-
-    return str(jaxmpc.__version__)
-
-
-def _sizes(controller: Controller) -> dict[str, int]:
+def _sizes(controller: Controller) -> dict[str, Any]:
     """What the code needs to know before it is compiled."""
     mpc, c, factor, solver = (
         controller.mpc,
@@ -167,40 +150,3 @@ def _later_rows(controller: Controller) -> np.ndarray:
     )
     shifted = WarmStart.shifted(c.layout, plan, jnp.zeros(m), bool(c.balls))
     return np.asarray(shifted.multipliers).astype(int) - 1
-
-
-def _header(what: str, macros: dict[str, Any], name: str) -> str:
-    lines = [f"/* NAME: {what}; written by jaxmpc VERSION. */"]
-    real = macros["real"]
-    lines += [f"#define NAME_{key} {value}" for key, value in macros.items() if key != "real"]
-    return "\n".join([*lines, f"typedef {real} NAME_real;", ""])
-
-
-def _c_tables(tables: dict[str, np.ndarray], controller: Controller, real: str) -> str:
-    """The tables as constant arrays, column by column, and the functions of math.h for the type."""
-    suffix = "f" if real == "float" else ""
-    lines = ["/* NAME: tables, column by column; written by jaxmpc VERSION. */"]
-    functions = {"FABS": "fabs", "FMAX": "fmax", "SQRT": "sqrt"}
-    lines += [f"#define {key} {value}{suffix}" for key, value in functions.items()]
-    lines.append(f"#define ALPHA {_literal(float(np.asarray(controller.solver.alpha)), real)}")
-    for key, table in tables.items():
-        whole = table.dtype.kind == "i"
-        columns = table if table.ndim < 2 else np.swapaxes(table, -1, -2)
-        values = [str(v) if whole else _literal(v, real) for v in columns.ravel()] or ["0"]
-        shape = " x ".join(map(str, table.shape))
-        lines.append(
-            f"static const {'int' if whole else 'real'} {key}[{len(values)}] = {{ /* {shape} */"
-        )
-        lines += [f"  {', '.join(values[i : i + 6])}," for i in range(0, len(values), 6)]
-        lines.append("};")
-    return "\n".join([*lines, ""])
-
-
-def _literal(value: Any, real: str) -> str:
-    """A number in C: the shortest text that is read as the same number."""
-    value = np.float32(value) if real == "float" else np.float64(value)
-    if np.isinf(value):
-        return f"(real){'-' if value < 0 else ''}INFINITY"
-    text = str(value)
-    text += "" if any(s in text for s in ".en") else ".0"
-    return f"{text}f" if real == "float" else text

@@ -212,12 +212,8 @@ def cleaned(s: Stages) -> tuple[Stages, Array]:
     positive = jnp.isfinite(s.stage) & (s.stage > 0)
     fault = jnp.where(everywhere(*convexity, positive), Status.NOT_RUN, Status.NON_CONVEX)
     fault = jnp.where(everywhere(*tests), fault, Status.NON_FINITE).astype(jnp.int32)
-    Q, R, P = (
-        jnp.where(test, W, harmless)
-        for test, W, harmless in zip(
-            convexity, (Q, R, P), (0, jnp.eye(len(R), dtype=R.dtype), 0), strict=True
-        )
-    )
+    others = (jnp.zeros_like(Q), jnp.eye(len(R), dtype=R.dtype), jnp.zeros_like(P))
+    Q, R, P = map(jnp.where, convexity, (Q, R, P), others)
     return replace(
         s, A=finite(s.A), B=finite(s.B), c=finite(s.c), Q=Q, R=R, P=P,
         stage=jnp.where(positive, s.stage, 1.0), H=finite(s.H), D=finite(s.D),

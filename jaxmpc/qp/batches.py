@@ -38,7 +38,11 @@ LONG = 65_536
 
 
 def group_sizes(batch: int, steps: Steps = "short") -> list[int]:
-    """Return the sizes of the groups of a batch, from the largest; `steps` as in `repeat_while`."""
+    """Return the sizes of the groups of a batch, from the largest; `steps` as in `repeat_while`.
+
+    A batch of symbolic size (`jax.export`) is one group."""
+    if not isinstance(batch, int):
+        return [batch]
     if jax.default_backend() == "cpu":
         if steps == "stages":
             return [min(batch, STAGES_CPU)]
@@ -80,7 +84,8 @@ def in_blocks(
             out = lax.map(lambda block: together(constants, block), grouped)
             return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:])[:size], out)
 
-        if any(jax.tree.leaves(in_batched[0])) or (size <= BLOCK and kernel is None):
+        small = not isinstance(size, int) or (size <= BLOCK and kernel is None)
+        if any(jax.tree.leaves(in_batched[0])) or small:
             out = together(constants, data)
         else:
             others = {} if kernel is None else {"cuda": kernel}

@@ -56,11 +56,13 @@ def batched(
     """
 
     def on_cpu(*args: Array) -> Any:
-        batch, n = len(args[0]), args[0].shape[-1]
+        batch, n = args[0].shape[0], args[0].shape[-1]
         if plain is not None and n <= small:
             return _side_by_side(plain, args)
         if not WAITS:
             return jax.vmap(one)(*args)
+        if not isinstance(batch, int):  # a symbolic size, of `jax.export`
+            return lax.map(lambda each: one(*each), args)
         size = together // (n * n * max(n, args[-1].shape[-1]))
         return lax.map(lambda each: one(*each), args, batch_size=min(max(size, 1), batch))
 
@@ -97,6 +99,9 @@ def _all_batched(size: int, in_batched: Any, args: tuple[Array, ...]) -> tuple[A
 def _side_by_side(plain: Callable, args: tuple[Array, ...]) -> Any:
     """`plain` on groups of LANES, whose data stay within the cache."""
     count = args[0].shape[0]
+    if not isinstance(count, int):  # a symbolic size, of `jax.export`
+        out = plain(*(jnp.moveaxis(v, 0, -1) for v in args))
+        return jax.tree.map(lambda v: jnp.moveaxis(v, -1, 0), out)
     lanes = min(LANES, max(count, 1))
     missing = -count % lanes
 

@@ -1,0 +1,88 @@
+"""Tables and files of C code."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.checks import fail
+
+TEMPLATES = Path(__file__).parent
+REAL = {"float64": "double", "float32": "float"}
+
+
+def require_c_names(name: str, dtype: str) -> None:
+    """Raise ValueError for names that C does not take and types that are not offered."""
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        fail("name", f"{name!r}", "Give letters, digits and _, a letter first")
+    if dtype not in REAL:
+        fail("dtype", f"{dtype!r}", 'Give "float64" or "float32"')
+
+
+def prepared_paths(folder: Path, names: list[str], overwrite: bool) -> list[Path]:
+    """Return the paths of the files in the folder, which is made; raise ValueError where one exists
+    and may not be overwritten."""
+    paths = [folder / name for name in names]
+    for path in paths:
+        if path.exists() and not overwrite:
+            cure = "Overwrite it (overwrite=True, --overwrite) or give another folder or name"
+            fail(str(path), "exists", cure)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        fail(str(folder), f"{error.strerror}", "Give a folder that you can write")
+    return paths
+
+
+def write(paths: list[Path], texts: list[str], name: str, states: int) -> list[Path]:
+    """Write the texts, NAME, VERSION and X0 (a state of zeros) in them replaced; return the
+    paths."""
+    import jaxmpc
+
+    own = {"NAME": name, "VERSION": str(jaxmpc.__version__), "X0": " ".join(["0"] * states)}
+    for path, text in zip(paths, texts, strict=True):
+        for key, value in own.items():
+            text = text.replace(key, value)
+        path.write_text(text, encoding="utf-8")
+    return paths
+
+
+def template(source: str) -> str:
+    """Return the text of a file beside this one."""
+    return (TEMPLATES / source).read_text(encoding="utf-8")
+
+
+def sizes_header(macros: Mapping[str, Any], real: str) -> str:
+    """Return the header with sizes as macros NAME_KEY and the type of numbers."""
+    lines = ["/* NAME: sizes and types; written by jaxmpc VERSION. */"]
+    lines += [f"#define NAME_{key} {value}" for key, value in macros.items()]
+    return "\n".join([*lines, f"typedef {real} NAME_real;", ""])
+
+
+def tables_header(tables: Mapping[str, np.ndarray], macros: Mapping[str, str], real: str) -> str:
+    """Return the header with constant arrays, column by column, and macros for `real`."""
+    lines = ["/* NAME: tables, column by column; written by jaxmpc VERSION. */"]
+    lines += [f"#define {key} {value}" for key, value in macros.items()]
+    for key, table in tables.items():
+        whole = table.dtype.kind == "i"
+        columns = table if table.ndim < 2 else np.swapaxes(table, -1, -2)
+        values = [str(v) if whole else literal(v, real) for v in columns.ravel()] or ["0"]
+        shape = " x ".join(map(str, table.shape))
+        lines.append(
+            f"static const {'int' if whole else 'real'} {key}[{len(values)}] = {{ /* {shape} */"
+        )
+        lines += [f"  {', '.join(values[i : i + 6])}," for i in range(0, len(values), 6)]
+        lines.append("};")
+    return "\n".join([*lines, ""])
+
+
+def literal(value: Any, real: str) -> str:
+    """Return a number in C: the shortest text that is read as the same number."""
+    value = np.float32(value) if real == "float" else np.float64(value)
+    if np.isinf(value):
+        return f"(real){'-' if value < 0 else ''}INFINITY"
+    text = str(value)
+    text += "" if any(s in text for s in ".en") else ".0"
+    return f"{text}f" if real == "float" else text

@@ -1,0 +1,167 @@
+"""The explicit law as C99 code: tables of its regions and a binary search tree over their facets.
+
+A node asks on which side of a half-space the state lies. The regions that reach into either side,
+seen from their vertices, go on to its children; the facet that leaves the fewer regions in the
+larger child is taken (Tøndel, Johansen, Bemporad 2003, "Evaluation of piecewise affine control via
+binary search tree", Automatica 39(5)). A leaf holds the regions that no facet tells apart, one
+mostly, and the code checks their facets: so its answer "inside" does not rest on the tree.
+"""
+
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from jaxmpc.checks import fail, number, require_kind
+from jaxmpc.control.sets import Box
+from jaxmpc.explicit.regions import CriticalRegions
+from jaxmpc.export.c_text import (
+    REAL,
+    literal,
+    prepared_paths,
+    require_c_names,
+    sizes_header,
+    tables_header,
+    template,
+    write,
+)
+
+# How far beyond a facet counts as inside, relative to the size of X_N.
+TOLERANCE = {"float64": 1e-9, "float32": 1e-5}
+# Decimals, relative to the size of X_N, to which facets of two regions are the same.
+DECIMALS = 9
+
+
+class Facets(NamedTuple):
+    """Half-spaces a'x ≤ b, each stored once: normal (planes, p), offset (planes,); of the facets of
+    all regions, region after region, its plane, the side (1, or −1 for a'x ≥ b), and where each
+    region begins (regions + 1,)."""
+
+    normal: np.ndarray
+    offset: np.ndarray
+    plane: np.ndarray
+    side: np.ndarray
+    begin: np.ndarray
+
+    @classmethod
+    def of(cls, regions: CriticalRegions, size: float) -> "Facets":
+        """Return the facets of regions in X_N of this size."""
+        H = [np.asarray(region.polytope.H) for region in regions.regions]
+        h = np.concatenate([np.asarray(region.polytope.h) for region in regions.regions])
+        begin = np.cumsum([0, *(len(part) for part in H)])
+        whole = np.hstack([np.vstack(H), h[:, None]])
+        rounded = np.round(np.hstack([whole[:, :-1], whole[:, -1:] / size]), DECIMALS)
+        # The first entry that is not zero is positive, so that both sides are one plane.
+        lead = rounded[np.arange(len(rounded)), np.argmax(rounded[:, :-1] != 0, axis=1)]
+        side = np.where(lead < 0, -1, 1)
+        _, first, plane = np.unique(
+            rounded * side[:, None] + 0.0, axis=0, return_index=True, return_inverse=True
+        )
+        planes = whole[first] * side[first, None]
+        return cls(planes[:, :-1], planes[:, -1], plane.ravel(), side, begin)
+
+
+class SearchTree(NamedTuple):
+    """Nodes in arrays: plane, −1 at a leaf; the next node inside and outside of it, at a leaf where
+    its regions begin in `regions` and how many there are. depth: half-spaces on the longest way."""
+
+    plane: np.ndarray
+    inside: np.ndarray
+    outside: np.ndarray
+    regions: np.ndarray
+    depth: int
+
+    @classmethod
+    def of(cls, facets: Facets, vertices: list[np.ndarray], margin: float) -> "SearchTree":
+        """Return the tree over regions with these vertices (k, p). A region reaches into a side
+        where a vertex lies more than `margin` inside it."""
+        far = [points @ facets.normal.T - facets.offset for points in vertices]
+        below = np.array([values.min(axis=0) < -margin for values in far])
+        above = np.array([values.max(axis=0) > margin for values in far])
+        plane: list[int] = []
+        children: list[list[int]] = []
+        leaves: list[int] = []
+        depth = 0
+        waiting = [(np.arange(len(vertices)), -1, 0, 0)]  # regions, parent, which child, depth
+        while waiting:
+            here, parent, child, deep = waiting.pop()
+            node, depth = len(plane), max(depth, deep)
+            if parent >= 0:
+                children[parent][child] = node
+            own = np.unique(
+                np.concatenate([facets.plane[facets.begin[i] : facets.begin[i + 1]] for i in here])
+            )
+            larger = np.maximum(below[here][:, own].sum(axis=0), above[here][:, own].sum(axis=0))
+            best = int(np.argmin(larger))
+            if len(here) == 1 or larger[best] == len(here):
+                plane.append(-1)
+                children.append([len(leaves), len(here)])
+                leaves.extend(int(i) for i in here)
+                continue
+            plane.append(int(own[best]))
+            children.append([0, 0])
+            for k, reach in enumerate((below, above)):
+                waiting.append((here[reach[here, own[best]]], node, k, deep + 1))
+        inside, outside = np.array(children).T
+        return cls(np.array(plane), inside, outside, np.array(leaves), depth)
+
+
+def export_explicit_c(
+    regions: CriticalRegions, folder: str | Path, *, name: str = "law",
+    dtype: Literal["float64", "float32"] = "float64", tolerance: float | None = None,
+    overwrite: bool = False,
+) -> list[Path]:  # fmt: skip
+    """Write the explicit law of `jm.explicit.critical_regions` as C99 code, for references of zero.
+
+    Nothing is allocated, and nothing is solved: a call takes as many products of p numbers as the
+    tree is deep, and those of one region's facets. What it costs is memory, which grows as the
+    number of regions. The status says whether the state has a plan at all.
+
+    folder: where NAME.c, NAME.h, NAME_sizes.h, NAME_tables.h and NAME_example.c are written. dtype:
+    type of all numbers there. tolerance: distance beyond a facet that counts as inside, relative to
+    the size of the feasible set, None: 1e-9, and 1e-5 in float32.
+
+    Returns the paths. Raises ValueError where not all regions were found, for a name that C does
+    not take, and for files that exist, unless overwrite.
+    """
+    require_kind("regions", regions, CriticalRegions)
+    require_c_names(name, dtype)
+    if tolerance is None:
+        tolerance = TOLERANCE[dtype]
+    number("tolerance", tolerance, 0, "Give a positive number")
+    if not regions.complete:
+        fail("regions", f"are not all of the law ({regions.reason})", "Raise limit or seconds")
+    vertices = [region.vertices for region in regions.regions]
+    size = float(np.ptp(np.concatenate(vertices), axis=0).max())
+    facets = Facets.of(regions, size)
+    tree = SearchTree.of(facets, vertices, 1e-9 * size)
+    mpc, real = regions.mpc, REAL[dtype]
+    box = mpc.inputs if isinstance(mpc.inputs, Box) else None
+    none = np.full(mpc.system.m, np.inf)
+    tables: dict[str, Any] = {
+        "plane_normal": facets.normal.ravel(), "plane_offset": facets.offset,
+        "node_plane": tree.plane, "node_inside": tree.inside, "node_outside": tree.outside,
+        "leaf_region": tree.regions, "facet_begin": facets.begin, "facet_plane": facets.plane,
+        "facet_side": facets.side, "law_gain": np.array([r.K.T.ravel() for r in regions.regions]).T,
+        "law_offset": np.array([r.k for r in regions.regions]).T,
+        "input_lower": -none if box is None else np.broadcast_to(np.asarray(box.lower), none.shape),
+        "input_upper": none if box is None else np.broadcast_to(np.asarray(box.upper), none.shape),
+    }  # fmt: skip
+    sizes = {
+        "PARAMETERS": mpc.dimension, "INPUTS": mpc.system.m, "REGIONS": len(regions),
+        "NODES": len(tree.plane), "DEPTH": tree.depth, "MOST": _most(tree),
+        "TOLERANCE": literal(tolerance * size, real).replace("(real)", ""),
+    }  # fmt: skip
+    kinds = (".h", ".c", "_sizes.h", "_tables.h", "_example.c")
+    paths = prepared_paths(Path(folder), [f"{name}{kind}" for kind in kinds], overwrite)
+    arrays = {key: np.asarray(value) for key, value in tables.items()}
+    texts = [
+        template("law.h"), template("law.c"), sizes_header(sizes, real),
+        tables_header(arrays, {}, real), template("law_example.c"),
+    ]  # fmt: skip
+    return write(paths, texts, name, mpc.dimension)
+
+
+def _most(tree: SearchTree) -> int:
+    """Return the most regions of a leaf."""
+    return int(tree.outside[tree.plane < 0].max())

@@ -1,0 +1,55 @@
+/* NAME: the search tree; see NAME.h. Written by jaxmpc VERSION. */
+#include "NAME.h"
+
+#include <math.h>
+
+typedef NAME_real real;
+
+#include "NAME_tables.h"
+
+enum { P = NAME_PARAMETERS, M = NAME_INPUTS };
+
+/* a'x - b of half-space i. */
+static real beyond(int i, const real *x) {
+  real sum = -plane_offset[i];
+  for (int k = 0; k < P; k++) sum += plane_normal[i * P + k] * x[k];
+  return sum;
+}
+
+static void clip(real *u) {
+  for (int i = 0; i < M; i++) {
+    if (u[i] < input_lower[i]) u[i] = input_lower[i];
+    if (u[i] > input_upper[i]) u[i] = input_upper[i];
+  }
+}
+
+int NAME_evaluate(const real x[NAME_PARAMETERS], real u[NAME_INPUTS]) {
+  for (int i = 0; i < M; i++) u[i] = 0;
+  for (int k = 0; k < P; k++) {
+    if (!isfinite(x[k])) {
+      clip(u);
+      return NAME_NON_FINITE;
+    }
+  }
+  int node = 0;
+  while (node_plane[node] >= 0)
+    node = beyond(node_plane[node], x) <= 0 ? node_inside[node] : node_outside[node];
+  /* A leaf: node_inside is its first region in leaf_region, node_outside how many. */
+  int best = leaf_region[node_inside[node]];
+  real least = (real)INFINITY;
+  for (int j = 0; j < node_outside[node]; j++) {
+    int region = leaf_region[node_inside[node] + j];
+    real worst = (real)-INFINITY;
+    for (int f = facet_begin[region]; f < facet_begin[region + 1]; f++) {
+      real over = facet_side[f] * beyond(facet_plane[f], x);
+      if (over > worst) worst = over;
+    }
+    if (worst < least) least = worst, best = region;
+  }
+  for (int i = 0; i < M; i++) {
+    u[i] = law_offset[best * M + i];
+    for (int k = 0; k < P; k++) u[i] += law_gain[(best * P + k) * M + i] * x[k];
+  }
+  clip(u);
+  return least <= NAME_TOLERANCE ? NAME_INSIDE : NAME_OUTSIDE;
+}

@@ -1,0 +1,92 @@
+"""The explicit law as C code, compiled and called, beside the regions and the solver."""
+
+import ctypes
+import shutil
+import subprocess
+from dataclasses import replace
+
+import jax
+import numpy as np
+import problems
+import pytest
+
+import jaxmpc as jm
+from jaxmpc.export import export_explicit_c
+
+CC = shutil.which("cc")
+compiled = pytest.mark.skipif(CC is None, reason="there is no C compiler")
+
+
+def built(regions, folder, dtype="float64", **options):
+    """Return x → (u, status) of the compiled law."""
+    export_explicit_c(regions, folder, dtype=dtype, **options)
+    strict = "-std=c99 -O2 -Wall -Wextra -Wpedantic -Werror -shared -fPIC".split()
+    library = folder / f"{dtype}.so"
+    subprocess.run([CC, *strict, folder / "law.c", "-lm", "-o", library], check=True)
+    call, m = ctypes.CDLL(str(library)).law_evaluate, regions.mpc.system.m
+
+    def law(x):
+        x, u = np.ascontiguousarray(x, dtype), np.zeros(m, dtype)
+        status = call(*(v.ctypes.data_as(ctypes.c_void_p) for v in (x, u)))
+        return u, status
+
+    return law
+
+
+@pytest.fixture(scope="module")
+def regions():
+    return jm.explicit.critical_regions(problems.joint_o_inf(6))
+
+
+@compiled
+@pytest.mark.parametrize("dtype, error", [("float64", 1e-9), ("float32", 2e-4)])
+def test_every_state_has_the_input_of_its_region(regions, tmp_path, dtype, error):
+    """Random states in and around the feasible set, and the vertices of all regions."""
+    law = built(regions, tmp_path, dtype)
+    points = np.concatenate([r.vertices for r in regions.regions])
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    x = np.random.default_rng(0).uniform(1.2 * lower, 1.2 * upper, (4000, 2))
+    wanted = regions.law(x)
+    for state, u in zip(x, wanted, strict=True):
+        found, status = law(state)
+        near = np.min(np.abs(np.concatenate([
+            np.asarray(r.polytope.H) @ state - np.asarray(r.polytope.h) for r in regions.regions
+        ])))  # fmt: skip
+        if near > 1e-5:  # elsewhere rounding may choose the other region
+            assert status == (2 if np.isnan(u[0]) else 1)
+        if status == 1 and not np.isnan(u[0]):
+            np.testing.assert_allclose(found, u, rtol=0, atol=error)
+        assert abs(found[0]) <= 2
+    for vertex in points:
+        assert law(vertex)[1] == 1
+    assert law([np.nan, 0.0]) == (0, 3)
+
+
+@compiled
+def test_closed_loop_is_the_solvers(tmp_path):
+    """With previous inputs in the state: as many numbers as the problem has parameters."""
+    system = jm.LinearSystem([[1.0, 0.2], [0.0, 1.0]], [[0.0], [0.2]])
+    mpc = jm.MPC(
+        system, np.eye(2), [[0.1]], 4, jm.Box([-1.0, -1.0], [1.0, 1.0]), jm.Box([-1.0], [1.0]),
+        input_rate_limit=0.5,
+    )  # fmt: skip
+    law = built(jm.explicit.critical_regions(mpc), tmp_path)
+    x, u = np.array([0.8, 0.3]), np.zeros(1)
+    with jax.enable_x64(True):
+        for _ in range(6):
+            plan = jm.solve(mpc, x, previous_input=u)
+            found, status = law(np.concatenate([x, u]))
+            assert status == 1
+            np.testing.assert_allclose(found, plan.inputs[0], rtol=0, atol=1e-7)
+            x, u = np.asarray(system.A) @ x + np.asarray(system.B) @ found, found
+
+
+def test_bad_input(regions, tmp_path):
+    with pytest.raises(ValueError, match="regions: are not all of the law"):
+        export_explicit_c(replace(regions, complete=False, reason="stopped"), tmp_path)
+    with pytest.raises(ValueError, match="name: '2x'"):
+        export_explicit_c(regions, tmp_path, name="2x")
+    export_explicit_c(regions, tmp_path)
+    with pytest.raises(ValueError, match=r"law\.h: exists"):
+        export_explicit_c(regions, tmp_path)
+    export_explicit_c(regions, tmp_path, overwrite=True)
