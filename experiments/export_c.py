@@ -53,6 +53,28 @@ def compiled(mpc: jm.MPC, solver: jm.ADMM, dtype: str, folder: Path):
     return step, size
 
 
+def explicit(mpc: jm.MPC, folder: Path):
+    """The same for the explicit law: regions and a search tree, nothing solved."""
+    regions = jm.explicit.critical_regions(mpc)
+    jm.export.export_explicit_c(regions, folder, name="law", overwrite=True)
+    text = (folder / "law_sizes.h").read_text().split()
+    depth = text[text.index("law_DEPTH") + 1]
+    print(f"{'':15}explicit law: {len(regions)} regions, tree of depth {depth}")
+    library = folder / "law.so"
+    subprocess.run(["cc", *FLAGS, str(folder / "law.c"), "-lm", "-o", str(library)], check=True)
+    call, u = ctypes.CDLL(str(library)).law_evaluate, np.zeros(mpc.system.m)
+
+    def step(x: np.ndarray | None):
+        if x is None:
+            return None
+        at = [ctypes.c_void_p(v.ctypes.data) for v in (np.ascontiguousarray(x), u)]
+        begin = time.perf_counter()
+        status = call(*at)
+        return u.copy(), status, time.perf_counter() - begin
+
+    return step, sizes([library])
+
+
 def sizes(files: list[Path]) -> tuple[int, int]:
     """Bytes of code, and of constant and changing data, by `size -A`."""
     code = data = 0
@@ -180,6 +202,9 @@ def main() -> None:
                 codes["OSQP"] = osqp_code(mpc, given.iterations, Path(base, "osqp"))
             except (ImportError, subprocess.CalledProcessError) as error:
                 print(f"{name}: no code of OSQP: {error}", getattr(error, "stderr", b"")[-500:])
+            if mpc.dimension == 2:  # few regions; springs and arm have too many
+                (folder := Path(base, "explicit")).mkdir()
+                codes["explicit law"] = explicit(mpc, folder)
             for label, (step, (code, data)) in codes.items():
                 best_times = np.full(len(states), np.inf)
                 for _ in range(5):  # the least of five: other processes interrupt
@@ -192,7 +217,7 @@ def main() -> None:
                         best_times[k] = min(best_times[k], seconds)
                 error = np.abs(np.array(inputs) - np.array(laws)).max()
                 off = np.abs(np.array(inputs) - np.array(plans))[good].max()
-                law_error = f"{error:9.1e}" if label != "OSQP" else "        -"
+                law_error = f"{error:9.1e}" if label.startswith("jaxmpc") else "        -"
                 print(
                     f"{name:<15}{label:<15} {law_error} {off:10.1e} {1e6 * best_times.mean():9.1f}"
                     f" {1e6 * best_times.max():8.1f} {code:8d} {data:9d}", flush=True,

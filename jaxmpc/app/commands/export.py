@@ -19,8 +19,11 @@ from jaxmpc.app.commands.options import (
     print_table,
 )
 from jaxmpc.checks import fail
+from jaxmpc.explicit.regions import critical_regions
 from jaxmpc.export.c_code import TOLERANCE, export_c
 from jaxmpc.export.check import check_fixed_steps
+from jaxmpc.export.explicit_law import export_explicit_c
+from jaxmpc.export.jax_program import export_jax
 from jaxmpc.qp.admm import ADMM
 
 
@@ -29,18 +32,23 @@ class Export:
     """Write the controller as C code for machines without Python.
 
     What it does
-      Writes C99 code without dependencies, allocation or branches on data but for the projections:
+      --law steps writes C99 code without dependencies, allocation or branches on data but for the
+      projections:
         NAME.h, NAME.c            NAME_reset, NAME_step: state in, input and status out
         NAME_sizes.h, _tables.h   the problem as data
         NAME_example.c            states from stdin, inputs to stdout, time of a call
       Each call takes the same number of ADMM steps, from the plan before. Then it runs closed loops
       under the same law in Python and says how many plans those steps solve.
+      --law explicit writes the optimal law as C99 code: its regions and a search tree, nothing to
+      solve. For problems without soft rows, with few states and a short horizon.
+      --law jax writes NAME.jax, plans of a batch of any size, which needs jax alone to run.
 
     How to start
       $ jaxmpc export
       $ cd controller && cc -std=c99 -O2 mpc.c mpc_example.c -lm -o example
       $ echo "0.5 0" | ./example
       $ jaxmpc export --config pendulum.toml --iterations 100 --single
+      $ jaxmpc export --horizon 6 --law explicit
 
     How to read the output
       "solved by the C code's steps" is the share of the plans with a solution whose residuals the
@@ -59,6 +67,8 @@ class Export:
     horizon: Horizon = None
     """Prediction horizon, in steps of dt."""
     terminal: Terminal = None
+    law: Literal["steps", "explicit", "jax"] = "steps"
+    """What to write: ADMM steps in C, the explicit law in C, or a stored program of JAX."""
     iterations: Annotated[int | None, option("K", "from the file, else 50")] = None
     """ADMM steps a call, all of them always."""
     single: Switch = False
@@ -79,20 +89,35 @@ class Export:
         check_positive(self, "tolerance")
         config = configs.load(self.config, given_options(self, "horizon", "terminal"), "info")
         lower, upper = config.state_range()
-        if self.samples and not np.isfinite([*lower, *upper]).all():
+        if self.law == "steps" and self.samples and not np.isfinite([*lower, *upper]).all():
             fail("limits.x_min", "bounds not every state", "Give --samples 0 for no check")
         mpc, solver = config.build_controlled(), config.build_solver() or ADMM()
         if self.iterations is not None:
             solver = dataclasses.replace(solver, iterations=self.iterations)
         dtype: Literal["float32", "float64"] = "float32" if self.single else "float64"
         tolerance = TOLERANCE[dtype] if self.tolerance is None else self.tolerance
-        paths = export_c(
-            mpc, self.output, solver, name=self.name, dtype=dtype, tolerance=tolerance,
-            overwrite=self.overwrite,
-        )  # fmt: skip
+        rows: list[tuple[str, str]] = []
+        if self.law == "explicit":
+            print("searching regions", file=sys.stderr)
+            regions = critical_regions(mpc)
+            paths = export_explicit_c(
+                regions, self.output, name=self.name, dtype=dtype, tolerance=self.tolerance,
+                overwrite=self.overwrite,
+            )  # fmt: skip
+            rows += [("regions", f"{len(regions)}, which fill the feasible set")]
+        elif self.law == "jax":
+            path = self.output / f"{self.name}.jax"
+            paths = [export_jax(mpc, path, solver, dtype=dtype, overwrite=self.overwrite)]
+        else:
+            paths = export_c(
+                mpc, self.output, solver, name=self.name, dtype=dtype, tolerance=tolerance,
+                overwrite=self.overwrite,
+            )  # fmt: skip
         print(f"{config.name}\n")
-        rows = [(str(path), f"{path.stat().st_size / 1024:.1f} KiB of text") for path in paths]
-        if self.samples:
+        kind = "" if self.law == "jax" else " of text"
+        size = lambda path: f"{path.stat().st_size / 1024:.1f} KiB{kind}"
+        rows = [(str(path), size(path)) for path in paths] + rows
+        if self.law == "steps" and self.samples:
             print("checking closed loops; compiling, some 20 s", file=sys.stderr)
             found = check_fixed_steps(mpc, solver, lower, upper, self.samples, tolerance)
             share = 100 * found.reached / max(found.solvable, 1)
@@ -103,5 +128,9 @@ class Export:
                 ("largest error of u at all of these", f"{found.input_error_any:.2g}"),
             ]
         print_table(rows, max(len(name) for name, _ in rows))
-        call = f"cc -std=c99 -O2 {self.name}.c {self.name}_example.c -lm -o example"
-        print(f"\nNext: cd {self.output} && {call}")
+        if self.law == "jax":
+            read = f'jax.export.deserialize(open("{paths[0]}", "rb").read())'
+            print(f"\nNext, in Python: {read}.call")
+        else:
+            call = f"cc -std=c99 -O2 {self.name}.c {self.name}_example.c -lm -o example"
+            print(f"\nNext: cd {self.output} && {call}")
