@@ -17,7 +17,6 @@ python experiments/robots/foreign.py --models suite/cartpole urdf/panda
 
 import dataclasses
 import json
-import os
 import subprocess
 import sys
 import time
@@ -49,8 +48,6 @@ ROBOTICS = (
     "hand/manipulate_pen_touch_sensors", "hand/reach",
     "kitchen_franka/kitchen_assets/kitchen_env_model", "point/point",
 )  # fmt: skip
-# Compiling takes most of the time.
-FAST = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 MEND = {"mend_inertias": True}
 FREE = {"floating_base": True}
 # name: (path, arguments of load_robot)
@@ -230,7 +227,7 @@ def run(s: Settings) -> None:
         try:
             done = subprocess.run(
                 [sys.executable, __file__, f"--one={name}", *sizes], capture_output=True,
-                text=True, timeout=s.seconds, check=False, env={"XLA_FLAGS": FAST, **os.environ},
+                text=True, timeout=s.seconds, check=False,
             )  # fmt: skip
             failed = (done.stderr.strip().splitlines() or ["no output"])[-1]
             lines = [line for line in done.stdout.splitlines() if line.startswith("{")]
