@@ -327,7 +327,7 @@ CALLS = [
         lambda: mpc(stage_weights=[1, 2]).validate(),
     ),
     (
-        "stage_weights: [0, 1, 1]. Give positive numbers",
+        "stage_weights: [0.0, 1.0, 1.0]. Give positive numbers",
         lambda: mpc(stage_weights=[0, 1, 1]).validate(),
     ),
     ("stage_weights: 'www' where real numbers are", lambda: mpc(stage_weights="www").validate()),

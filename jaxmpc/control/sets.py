@@ -45,7 +45,7 @@ from jaxmpc.control.geometry import (
     unit_rows,
 )
 from jaxmpc.control.geometry import irredundant as _irredundant
-from jaxmpc.control.system import as_array, dimensions, host_array
+from jaxmpc.control.system import as_array, dimensions, host_array, store_floats
 from jaxmpc.qp.linalg import solve
 from jaxmpc.reals import Reals
 
@@ -67,6 +67,7 @@ class Box:
     upper: Reals
 
     def __post_init__(self) -> None:
+        store_floats(self, "lower", "upper")
         axes = dimensions(self.lower), dimensions(self.upper)
         if axes in ((0, 1), (1, 0)):
             one, other = ("lower", "upper") if axes[0] == 0 else ("upper", "lower")
@@ -76,6 +77,7 @@ class Box:
         value = getattr(self, name)
         full = jnp.broadcast_to if isinstance(value, jax.Array) else np.broadcast_to
         object.__setattr__(self, name, full(value, shape))
+        store_floats(self, name)
 
     def spread(self, n: int) -> "Box":
         """Return the box with two numbers as the bounds of each of n coordinates; any other box
@@ -213,6 +215,9 @@ class Polytope:
     H: Reals
     h: Reals
     labels: tuple[str, ...] = field(default=(), metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        store_floats(self, "H", "h")
 
     @classmethod
     def from_points(cls, points: Reals) -> "Polytope":
@@ -538,6 +543,9 @@ class Ellipsoid:
 
     P: Reals
     level: Reals
+
+    def __post_init__(self) -> None:
+        store_floats(self, "P", "level")
 
     @property
     def dimension(self) -> int:

@@ -43,6 +43,25 @@ def dimensions(value: Any) -> int | None:
         return None
 
 
+def store_floats(instance: Any, *names: str) -> None:
+    """Make arrays of floats of the named fields of a frozen dataclass where they are lists, or
+    NumPy arrays of whole numbers: one leaf each, which can be differentiated and stacked.
+
+    All else stays as it is: numbers, JAX's arrays, the placeholders by which JAX rebuilds an
+    object, and what is no array of numbers, which `validate` refuses."""
+    for name in names:
+        value = getattr(instance, name)
+        if isinstance(value, list | tuple) and dimensions(value) is not None:
+            value = as_array(value)
+            value = value if isinstance(value, jax.Array) else np.asarray(value)
+        if isinstance(value, np.ndarray) and value.dtype.kind in "iu":
+            value = value.astype(float)
+        if isinstance(value, jax.Array) or (
+            isinstance(value, np.ndarray) and value.dtype.kind == "f"
+        ):
+            object.__setattr__(instance, name, value)
+
+
 def as_weight(value: Any, size: int) -> Any:
     """Return a weight as a matrix where it has one meaning: a number for size 1, and a vector
     (size,), which is a diagonal; anything else unchanged."""
@@ -51,6 +70,7 @@ def as_weight(value: Any, size: int) -> Any:
         value = as_array(value)
         value = value if isinstance(value, jax.Array) else np.asarray(value)
         if value.dtype.kind in "iufV":
+            value = value.astype(float) if value.dtype.kind in "iu" else value
             value = value.reshape(size)
             return jnp.diag(value) if isinstance(value, jax.Array) else np.diag(value)
     return value
@@ -101,6 +121,7 @@ class LinearSystem:
     input_units: tuple[str, ...] = field(default=(), metadata={"static": True})
 
     def __post_init__(self) -> None:
+        store_floats(self, "A", "B", "c")
         if dimensions(self.A) == 2 and dimensions(self.B) == 1:
             object.__setattr__(self, "B", as_column(self.B))
 

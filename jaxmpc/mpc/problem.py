@@ -16,7 +16,14 @@ from jaxmpc.checks import (
     require_symmetric_psd,
 )
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
-from jaxmpc.control.system import LinearSystem, as_array, as_weight, dimensions, host_array
+from jaxmpc.control.system import (
+    LinearSystem,
+    as_array,
+    as_weight,
+    dimensions,
+    host_array,
+    store_floats,
+)
 
 
 @jax.tree_util.register_dataclass
@@ -44,6 +51,9 @@ class Soft:
     units: tuple[str, ...] = field(default=(), metadata={"static": True})
     lower: Any = None
 
+    def __post_init__(self) -> None:
+        store_floats(self, "C", "d", "rho", "quadratic", "D", "lower")
+
     @property
     def sides(self) -> tuple[Any, Any]:
         """(lower, d), −inf for no lower side."""
@@ -68,6 +78,9 @@ class Outputs:
     steps: tuple[int, ...] | None = field(default=None, metadata={"static": True})
     names: tuple[str, ...] = field(default=(), metadata={"static": True})
     units: tuple[str, ...] = field(default=(), metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        store_floats(self, "C", "lower", "upper", "D")
 
 
 @jax.tree_util.register_dataclass
@@ -120,6 +133,8 @@ class MPC:
     stage_weights: Any = None
 
     def __post_init__(self) -> None:
+        weights = ("Q", "R", "terminal_cost", "input_rate_weight", "stage_weights")
+        store_floats(self, *weights, "prestabilise", "input_rate_limit")
         # JAX rebuilds this object with placeholders, and `in_axes` are one without arrays.
         system = self.system
         if not isinstance(system, LinearSystem):

@@ -586,3 +586,24 @@ def test_gradients_are_finite_with_half_open_rows():
 def test_applied_input_stays_within_its_limits():
     u, _, plan = jm.Controller(problems.joint(5))(np.array([1.4, 1.0]))
     assert plan.status == jm.Status.SOLVED and -2 <= u[0] <= 2
+
+
+def test_problems_from_lists_and_whole_numbers_are_pytrees_of_float_arrays():
+    """They can be differentiated and stacked like those from arrays."""
+    lists = jm.MPC(
+        jm.LinearSystem(A=[[1, 0.01], [0, 1]], B=[0, 0.2], dt=0.01), Q=[50, 1], R=1, horizon=3,
+        states=jm.Box([-1, -2], [1, 2]), inputs=jm.Box(-2, 2),
+        soft=jm.Soft([[1, 0]], [1], lower=[-1]), stage_weights=[1, 1, 2],
+        terminal_set=jm.Polytope([[1, 0], [-1, 0]], [1, 1]),
+    )  # fmt: skip
+    leaves = jax.tree.leaves(lists)
+    assert all(isinstance(v, float) or v.dtype == float for v in leaves)
+    stacked = jax.tree.map(lambda *v: np.stack(v), lists, lists)
+    assert stacked.system.A.shape == (2, 2, 2) and stacked.soft.C.shape == (2, 1, 2)
+    with jax.enable_x64(True):
+        slope = jax.grad(lambda mpc: jm.solve(mpc, np.array([0.5, -1.0])).cost)(lists)
+        lower, upper = (
+            float(jm.solve(replace(lists, R=np.array([[1 + d]])), np.array([0.5, -1.0])).cost)
+            for d in (-1e-4, 1e-4)
+        )
+    np.testing.assert_allclose(slope.R[0, 0], (upper - lower) / 2e-4, rtol=1e-5)
