@@ -12,7 +12,9 @@ import numpy as np
 
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.environment import Environment, EnvironmentState
+from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.load import load_robot
+from jaxmpc.robots.robot import Robot
 
 _reset, _step = jax.jit(Environment.reset), jax.jit(Environment.step)
 
@@ -31,7 +33,7 @@ class RobotEnv(gymnasium.Env):
     metadata = {"render_modes": []}
 
     def __init__(self, robot: Any = "pendulum", target: Any = None, **options: Any) -> None:
-        robot = load_robot(robot) if isinstance(robot, str) else robot
+        robot = robot if isinstance(robot, Robot | LinearPlant) else load_robot(robot)
         self.environment = Environment.of(robot, target, **options)
         bounds = (np.asarray(end, np.float32) for end in (
             robot.input_limits.lower, robot.input_limits.upper

@@ -36,8 +36,10 @@ def simulate(
     plant: a LinearSystem, LinearPlant or Robot, or any object with `step(x, u) -> x` written in
         JAX; the controller's own `mpc.system` gives the nominal loop. A plant that is a pytree is
         an argument of the compiled program, any other object a constant of it.
-    reference: state to track, (n,), or (T + N, n): the plan at sample t sees the rows t … t+N.
-    input_reference: input to track, (m,), or (T + N − 1, m).
+    reference: state to track in the coordinates of the controller, (n,), or (T + N, n): the plan at
+        sample t sees the rows t … t+N. None: their origin, also where a robot's problem was made
+        about another target.
+    input_reference: input to track, (m,), or (T + N − 1, m); None: zero.
     disturbance (T, n): added to the next states.
     previous_input (m,): u_{−1} where the problem limits or weighs input rates, or where inputs are
         delayed; None for zero.

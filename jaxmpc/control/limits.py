@@ -149,6 +149,10 @@ def limit_pair(argument: str, limit: Any) -> tuple[np.ndarray, np.ndarray]:
         bound = host_array(argument, limit)
         return -bound, bound
     if len(limit) != 2:
-        fail(argument, f"{limit!r} is not a pair", "Give (lower, upper), or one number")
+        fail(
+            argument,
+            f"{limit!r} is not a pair",
+            "Give (lower, upper), each a number or one a joint, or one number v for |.| ≤ v",
+        )
     lower, upper = (host_array(argument, end) for end in limit)
     return lower, upper

@@ -172,7 +172,12 @@ class LinearSystem:
         require_shape("A", as_array(self.A), (n, n), "A must be square")
         require_shape("B", as_array(self.B), (n, m), "Give B as many rows as A")
         if self.c is not None:
-            require_shape("c", as_array(self.c), (n,), "Give one number a state, or None")
+            require_shape(
+                "c",
+                as_array(self.c),
+                (n,),
+                "Give one number a state, or None; outputs are no part of a system: see jm.Outputs",
+            )
         if self.dt is not None:
             require_period("dt", self.dt)
         for kind, count in (("state", self.n), ("input", self.m)):

@@ -144,6 +144,9 @@ class Controller:
         """The arguments in the controller's precision; ValueError for wrong ones."""
         if self.condensed is None:
             require_kind("mpc", self.mpc, MPC)
+        elif self.dtype == jnp.float64 and jnp.result_type(float) != jnp.float64:
+            cure = "Call it under jax.enable_x64(True), or make it outside"
+            fail("controller", "was made in float64, and 64-bit mode is off", cure)
         given = plan_arguments(self.mpc, x0, reference, input_reference, previous_input)
         return [v.astype(self.dtype) if isinstance(v, np.ndarray) else v for v in given]
 

@@ -55,9 +55,10 @@ class ADMM:
 
     iterations: ADMM steps, always all of them; None: 50, and 10 from a warm start where Newton
     steps follow. One instance from plain Python that has a warm start and that Newton steps solve
-    without them takes none. rho: penalty in the scaled coordinates
-    above; None: √(min(1, n/m)), m counting the rows that z moves; or a number, one value a row
-    (m,), or a schedule (stages, m) or (stages, 1) whose stages have equally many iterations.
+    without them takes none.
+    rho: penalty of the scaled rows (each of length 1 in the metric of the Hessian); None:
+    √(min(1, n/m)), m counting the rows that z moves; or a number, one value a row (m,), or a
+    schedule (stages, m) or (stages, 1) whose stages have equally many iterations.
     alpha: over-relaxation in (0, 2).
     refine: Newton steps after the loop at most, 0 for none (`active_set.py`, `newton.py`). None:
     1,000, of which badly scaled linear programs need most, 150 where every instance takes them all,

@@ -85,8 +85,9 @@ class LinearPlant:
         return coordinates
 
     def equilibrium(self, x: Any = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return (x, u): the state x (n,), None for home, and the input that holds it; see
-        `jaxmpc.equilibrium`. Raises ValueError where none does, or only beyond the limits."""
+        """Return (x, u): the state x (n,), None for home, and the input that holds it
+        (`jaxmpc.control.equilibrium`). Raises ValueError where none does, or only beyond the
+        limits."""
         target = self.home if x is None else x
         return equilibrium(self.system, target, states=self.state_limits, inputs=self.input_limits)
 

@@ -17,6 +17,7 @@ from jaxmpc.reals import Reals
 from jaxmpc.robots.physics import RK4, Physics
 from jaxmpc.robots.robot import Robot
 from jaxmpc.robots.supported import make_supported
+from jaxmpc.robots.tangent import unit_orientations
 from jaxmpc.robots.urdf import compiled_urdf
 
 if TYPE_CHECKING:
@@ -35,8 +36,8 @@ def load_robot(
     Arguments:
         model: "joint" (one hinge), "pendulum", "cartpole", "arm2", "arm6" (UR5e), "arm7" (Franka
             FER), "quadrotor" (Crazyflie 2), or a path. A URDF gets a motor for each joint
-            with its `effort` as limit, its `velocity` limits are read (0: none), and its shapes are
-            left out: it must give inertias, has no contacts, and needs none of its mesh files.
+            with its `effort` as limit, its `velocity` limits are read (0 of either: none), and its
+            shapes are left out: it must give inertias, has no contacts, needs no mesh files.
         position, velocity, torque: limits in place of the file's, as `joint_limits` takes them:
             (lower, upper), each a number or one a dof (torque: one an actuator), or v for
             |.| ≤ v, inputs in units of ctrl. They bind the controller; the joint stops of the plant
@@ -80,7 +81,11 @@ def load_robot(
     if host.nv == 0:
         fail("model", f"{name} has no joints", "A robot has something to move")
     if host.nu == 0:
-        fail("model", f"{name} has no actuators", "Add <actuator><motor joint=.../></actuator>")
+        fail(
+            "model",
+            f"{name} has no actuators",
+            "Add <actuator><motor joint=.../></actuator>; a URDF file gets motors",
+        )
     if host.na and host.opt.integrator == RK4:
         fail("model", f"{name} has {host.na} activation states and the integrator RK4",
              "Use another integrator, or actuators with dyntype none")  # fmt: skip
@@ -90,7 +95,7 @@ def load_robot(
     h = host.opt.timestep
     if control_period is None:
         found = np.atleast_1d(_numeric(host, "control_period", max(1, round(0.01 / h)) * h))
-        control_period = float(found[0])
+        control_period = float(f"{found[0]:.12g}")
     require_period("control_period", control_period)
     substeps = round(control_period / h)
     if substeps < 1 or abs(substeps * h - control_period) > 1e-9 * control_period:
@@ -133,22 +138,22 @@ def load_robot(
 
 
 def _is_urdf(model: str | Path) -> bool:
-    return Path(model).suffix.lower() == ".urdf"
+    """Return whether a path ends in .urdf, or leads to an XML file whose root is <robot>."""
+    path = Path(model)
+    if path.suffix.lower() == ".urdf" or not path.is_file():
+        return path.suffix.lower() == ".urdf"
+    try:
+        _, root = next(ElementTree.iterparse(path, events=("start",)))
+    except (ElementTree.ParseError, StopIteration):
+        return False  # which MuJoCo will say better
+    return root.tag == "robot"
 
 
 def _configuration(host: "mujoco.MjModel", home: Any) -> np.ndarray:
     """Return the configuration `home` (nq,), checked, with unit quaternions."""
     require_shape("home", home, (host.nq,), "One configuration, as in qpos")
     require_finite("home", home)
-    q = np.array(home, float)
-    for kind, i in zip(host.jnt_type, host.jnt_qposadr, strict=True):
-        if kind in (0, 1):  # free, ball
-            i = i + (3 if kind == 0 else 0)
-            size = np.linalg.norm(q[i : i + 4])
-            if not 0.5 < size < 2:
-                fail("home", f"quaternion {q[i : i + 4]} of length {size:g}", "Give unit length")
-            q[i : i + 4] /= size
-    return q
+    return unit_orientations("home", host.jnt_type, np.array(home, float))
 
 
 def _anchor(host: "mujoco.MjModel", home: np.ndarray) -> tuple[float, ...]:
@@ -180,7 +185,7 @@ def _compiled_model(
         return mujoco.MjModel.from_xml_path(str(path)), {}, ()
     except (ValueError, ElementTree.ParseError) as error:
         text = " ".join(str(error).split())
-        fail("model", f"{path} cannot be read: {text}", "Mend the file")
+        fail("model", f"{path} cannot be read: {text.rstrip('.')}", "Mend the file")
 
 
 def _numeric(host: "mujoco.MjModel", name: str, default: Any) -> Any:

@@ -25,7 +25,7 @@ from jaxmpc.qp.precision import floating_dtype, matmul
 from jaxmpc.robots.balance import lacking, nearest_rest, rest_at, settled
 from jaxmpc.robots.physics import Physics
 from jaxmpc.robots.report import RobotReport, report_of
-from jaxmpc.robots.tangent import difference, quaternions, retract
+from jaxmpc.robots.tangent import difference, quaternions, retract, unit_orientations
 
 if TYPE_CHECKING:
     import mujoco
@@ -394,7 +394,7 @@ class Robot:
         if q.shape[-1:] != (self.mujoco.nq,):
             fail(argument, f"shape {q.shape}", f"Give (..., {self.mujoco.nq}), as in qpos")
         require_finite(argument, q)
-        return q
+        return unit_orientations(argument, self.joints, q)
 
 
 # Compiled once a robot, also where the user calls them outside `jit`.

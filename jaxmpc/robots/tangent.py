@@ -6,14 +6,36 @@ both are the same number. `retract` is mj_integratePos over unit time, `differen
 mj_differentiatePos; both are smooth where the rotation is zero, and differentiable there.
 """
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+
+from jaxmpc.checks import fail
 
 # mjtJoint: free (3 + 4 numbers), ball (4), slide (1), hinge (1).
 FREE, BALL = 0, 1
 
 # Below this angle² the series of sin and cos are exact in float64.
 SMALL = 1e-8
+
+
+def unit_orientations(argument: str, joints: Sequence[int], q: np.ndarray) -> np.ndarray:
+    """Return the configurations q (..., nq) with quaternions of length 1; raise ValueError, naming
+    the argument, where one is far from that. joints: mjtJoint numbers."""
+    i, q = 0, np.array(q, float)
+    for joint in joints:
+        i += 3 if joint == FREE else 0
+        if joint in (FREE, BALL):
+            size = np.linalg.norm(q[..., i : i + 4], axis=-1, keepdims=True)
+            if not np.all((size > 0.5) & (size < 2)):
+                worst = q.reshape(-1, q.shape[-1])[np.argmax(np.abs(size - 1)), i : i + 4]
+                problem = f"quaternion {worst} of length {np.linalg.norm(worst):g}"
+                fail(argument, problem, "Give unit length, w first")
+            q[..., i : i + 4] /= size
+        i += 4 if joint in (FREE, BALL) else 1
+    return q
 
 
 def retract(joints: tuple[int, ...], q: Array, dq: Array) -> Array:

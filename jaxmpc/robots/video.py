@@ -18,6 +18,9 @@ from jaxmpc.robots.robot import Robot
 
 OPACITY = 0.3  # of the target
 
+# Grey of what a model without a skybox leaves black.
+BACKGROUND = np.array([0.5, 0.5, 0.5, 1], np.float32)
+
 
 def render(
     robot: Robot, states: Reals, *, inputs: Reals | None = None, target: Any = None, every: int = 1,
@@ -30,7 +33,8 @@ def render(
     row, in a nearly square arrangement. inputs: (T, m) or (B, T, m), for their limits alone.
     target: a configuration (nq,), or one for each state (T+1, nq), of a green, see-through robot in
     each tile; None for none. width, height: pixels of a tile. camera: the name of one of the
-    model's; None, or "view" where the model has none of that name, for MuJoCo's free camera.
+    model's; None, or "view" where the model has none of that name, for a camera that sees all that
+    moves, at all times. What a model without a skybox leaves black is grey.
 
     labels: write the robot's name and the time in s above, a legend below, and `numbers` (by
     default from 0) on the tiles. A tile has a red frame, with the name of the limit, where the
@@ -85,6 +89,17 @@ def render(
             "a display set MUJOCO_GL=egl before Python starts; on Debian or Ubuntu install "
             "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1"
         ) from None
+    view: Any = camera
+    if camera is None:
+        poses = states[:, :: max(1, samples // 20), : model.nq].reshape(-1, model.nq)
+        poses = poses if target is None else np.concatenate([poses, target])
+        view = _camera(model, poses, width / height)
+    sky = np.any(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+    if not model.nlight:
+        light = model.vis.headlight
+        light.ambient[:], light.diffuse[:] = (
+            np.maximum(v, 0.6) for v in (light.ambient, light.diffuse)
+        )
     columns = int(np.ceil(np.sqrt(count)))
     rows = -(-count // columns)
     tiles = [(height * (i // columns), width * (i % columns)) for i in range(count)]
@@ -96,11 +111,13 @@ def render(
             for k, (frame, q) in enumerate(zip(film, motion, strict=True)):
                 data.qpos[:] = q
                 mujoco.mj_forward(model, data)
-                renderer.update_scene(data, -1 if camera is None else camera)
+                renderer.update_scene(data, view)
                 if target is not None:
                     ghost.qpos[:] = target[k]
                     mujoco.mj_forward(model, ghost)
                     _add_ghost(renderer.scene, model, ghost)
+                if not sky:
+                    _add_backdrop(renderer.scene)
                 frame[top : top + height, left : left + width] = renderer.render()
     for row in range(1, rows):
         film[:, row * height - 1 : row * height + 1] = 255
@@ -113,6 +130,48 @@ def render(
         film, tiles, (height, width), robot, times, range(count) if numbers is None else numbers,
         exceeded_limits(robot, states, inputs, every), target is not None,
     )  # fmt: skip
+
+
+def _add_backdrop(scene: Any) -> None:
+    """Add a grey wall far behind a scene whose model has no skybox, which would be black there."""
+    import mujoco
+
+    eye = (scene.camera[0].pos + scene.camera[1].pos) / 2
+    ahead, up = scene.camera[0].forward, scene.camera[0].up
+    far = 0.9 * scene.camera[0].frustum_far
+    wall = scene.geoms[scene.ngeom]
+    frame = np.stack([np.cross(up, -ahead), up, -ahead], axis=1)
+    mujoco.mjv_initGeom(
+        wall, mujoco.mjtGeom.mjGEOM_BOX, far * np.array([3, 3, 1e-3]), eye + far * ahead,
+        frame.ravel(), BACKGROUND,
+    )  # fmt: skip
+    wall.emission, wall.specular, wall.category = 1, 0, mujoco.mjtCatBit.mjCAT_DECOR
+    scene.ngeom += 1
+
+
+def _camera(model: Any, poses: np.ndarray, aspect: float) -> Any:
+    """Return MuJoCo's free camera, moved so that it sees what moves at all poses (k, nq).
+
+    aspect: width by height of a picture."""
+    import mujoco
+
+    camera, data = mujoco.MjvCamera(), mujoco.MjData(model)
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    moving = (model.body_weldid[model.geom_bodyid] != 0) & (model.geom_rbound > 0)
+    if not np.any(moving):
+        return camera
+    size, ends = model.geom_rbound[moving, None], []
+    for pose in poses:
+        data.qpos[:] = pose
+        mujoco.mj_kinematics(model, data)
+        at = data.geom_xpos[moving]
+        ends += [(at - size).min(axis=0), (at + size).max(axis=0)]
+    lower, upper = np.min(ends, axis=0), np.max(ends, axis=0)
+    half = np.deg2rad(model.vis.global_.fovy) / 2
+    narrow = min(half, np.arctan(np.tan(half) * aspect))
+    camera.lookat[:] = (lower + upper) / 2
+    camera.distance = 0.5 * np.linalg.norm(upper - lower) / np.sin(narrow)
+    return camera
 
 
 def _add_ghost(scene: Any, model: Any, data: Any) -> None:

@@ -607,3 +607,12 @@ def test_problems_from_lists_and_whole_numbers_are_pytrees_of_float_arrays():
             for d in (-1e-4, 1e-4)
         )
     np.testing.assert_allclose(slope.R[0, 0], (upper - lower) / 2e-4, rtol=1e-5)
+
+
+def test_a_float64_controller_outside_64_bit_mode_is_refused():
+    with jax.enable_x64(True):
+        controller = jm.Controller(problems.joint_o_inf(3))
+    with jax.enable_x64(False), pytest.raises(ValueError, match="controller: was made in float64"):
+        controller(np.zeros(2))
+    with jax.enable_x64(True):
+        assert controller(np.zeros(2))[0].dtype == np.float64

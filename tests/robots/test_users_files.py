@@ -1,0 +1,57 @@
+"""What users give: URDFs under other names, quaternions, a slide that leaves the usual view."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+import jaxmpc as jm
+from jaxmpc.robots.video import _camera
+
+URDF = """<?xml version="1.0"?>
+<!-- <mujoco> in a comment -->
+<robot name="swing"><link name="base"/>
+<link name="rod"><inertial><origin xyz="0 0 .5"/><mass value="1"/>
+<inertia ixx=".1" iyy=".1" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="hinge" type="revolute"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" effort="5" velocity="2"/></joint></robot>"""
+
+
+def test_a_urdf_of_any_name(tmp_path):
+    path = Path(tmp_path / "swing_urdf.xml")
+    path.write_text(URDF)
+    robot = jm.load_robot(path)
+    np.testing.assert_array_equal(robot.input_limits.upper, [5])
+    assert jm.load_robot(path, floating_base=True, mend_inertias=True).n == 14
+
+
+@pytest.mark.parametrize("size", [0, 0.1, 3])
+def test_quaternions_have_unit_length(size):
+    robot = jm.load_robot("quadrotor")
+    q = np.array([0, 0, 1, size, 0, 0, 0.0])
+    with pytest.raises(ValueError, match="q: quaternion .* Give unit length, w first"):
+        robot.equilibrium(q)
+    with pytest.raises(ValueError, match="quaternion"):
+        jm.robot_mpc(robot, target=q)
+
+
+def test_the_camera_sees_all_poses():
+    """Every moving shape lies in the cone of view about the camera's axis."""
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody>
+        <body><joint type="slide" axis="1 0 0"/><geom size=".1" mass="1"/>
+        <body pos="0 0 .5"><joint axis="0 1 0"/><geom type="capsule" size=".02"
+        fromto="0 0 0 .6 0 .3" mass="1"/></body></body></worldbody></mujoco>""")
+    poses = np.array([[-5.0, 0], [0, 1], [9, -2]])
+    camera, data = _camera(model, poses, 0.5), mujoco.MjData(model)
+    a, e = np.deg2rad([camera.azimuth, camera.elevation])
+    ahead = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    eye = camera.lookat - camera.distance * ahead
+    narrow = np.arctan(0.5 * np.tan(np.deg2rad(model.vis.global_.fovy) / 2))
+    for pose in poses:
+        data.qpos[:] = pose
+        mujoco.mj_kinematics(model, data)
+        way = data.geom_xpos - eye
+        angle = np.arccos(way @ ahead / np.linalg.norm(way, axis=1))
+        size = np.arcsin(model.geom_rbound / np.linalg.norm(way, axis=1))
+        assert np.all(angle + size <= narrow + 1e-9)
