@@ -38,9 +38,9 @@ def compiled_urdf(
         # A frame: MuJoCo refuses it, and it weighs nothing.
         if inertial is not None and _mass(link) == 0 and not np.any(_inertia(inertial)):
             link.remove(inertial)
-    changes = _mended(root) if mend_inertias else ()
     if floating_base:
         _free(root)
+    changes = _mended(root) if mend_inertias else ()  # the freed root link counts as moving
     limits = ((joint.get("name"), joint.find("limit")) for joint in root.iter("joint"))
     velocities = {
         str(name): float(limit.get("velocity", "inf")) or np.inf
