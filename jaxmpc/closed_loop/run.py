@@ -39,6 +39,11 @@ class Run:
     fallback: Array
     estimates: Any = None
 
+    def __repr__(self) -> str:
+        """Return the shapes, in one line: the arrays may be long."""
+        fields = (f"{name} {np.shape(v)}" for name, v in vars(self).items() if v is not None)
+        return f"Run({', '.join(fields)})"
+
     @property
     def feasible_steps(self) -> Array:
         """Return the number of samples before the first plan that is not SOLVED: T if all are."""

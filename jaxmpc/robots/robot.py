@@ -71,6 +71,10 @@ class Robot:
         """Return the plant as MuJoCo's own model, for rendering and the C engine."""
         return self.plant.model
 
+    def __repr__(self) -> str:
+        """Return the name and the sizes, in one line; `report` has the rest."""
+        return f"Robot({self.name!r}, n={self.n}, m={self.m}, dt={self.dt:g} s)"
+
     @property
     def n(self) -> int:
         """Return the number of coordinates ξ, 2 nv + na."""

@@ -169,3 +169,10 @@ def test_soft_violation_is_reported():
     run = simulate(jm.Controller(mpc, CHEAP), mpc.system, np.array([2.0]), 3)
     np.testing.assert_allclose(run.slack[:, 0], [1.0, 0.5, 0.0], atol=1e-4)
     assert run.feasible_steps == 3
+
+
+def test_a_run_is_printed_in_one_line():
+    zeros = np.zeros(3)
+    run = jm.closed_loop.Run(np.zeros((4, 2)), np.zeros((3, 1)), *[zeros] * 6)
+    assert repr(run).startswith("Run(states (4, 2), inputs (3, 1), cost (3,)")
+    assert "\n" not in repr(run) and "estimates" not in repr(run)
