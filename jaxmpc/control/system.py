@@ -218,8 +218,8 @@ class LinearSystem:
         continuous.validate()
         n, m = continuous.n, continuous.m
         M = np.zeros((n + m + 1, n + m + 1))
-        M[:n, :n] = host_array("A", A)
-        M[:n, n:-1] = host_array("B", B)
+        M[:n, :n] = host_array("A", continuous.A)
+        M[:n, n:-1] = host_array("B", continuous.B)
         if c is not None:
             M[:n, -1] = host_array("c", c)
         top = scipy.linalg.expm(M * dt)[:n]

@@ -20,7 +20,7 @@ from jaxmpc.control.invariant import (
 )
 from jaxmpc.control.riccati import least_reached, lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope, translated, unit_half_spaces
-from jaxmpc.control.system import LinearSystem, host_array, host_matrices
+from jaxmpc.control.system import LinearSystem, as_weight, host_array, host_matrices
 from jaxmpc.reals import Reals
 
 # A limit counts as kept if it is exceeded by no more than this, relative to the set's extent
@@ -554,6 +554,7 @@ def _origin_inside(X_f: _Set) -> Check:
 
 def _symmetric(argument: str, value: Reals, n: int) -> np.ndarray:
     """Return a symmetric matrix (n, n) in float64; raise ValueError unless it is one."""
+    value = as_weight(value, n)
     require_shape(argument, value, (n, n), "Give one square matrix")
     matrix = host_array(argument, value)
     require_finite(argument, matrix)

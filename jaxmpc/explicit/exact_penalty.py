@@ -68,6 +68,10 @@ class ExactPenalty:
     regions: CriticalRegions | None
     evaluated: int
 
+    def __str__(self) -> str:
+        """Return `sentence`."""
+        return self.sentence
+
     @property
     def sentence(self) -> str:
         """Return the result and its basis as sentences."""
@@ -76,6 +80,8 @@ class ExactPenalty:
             found = f"rho_bar = {value} over the feasible set, by {self.evaluated} critical regions"
         else:
             found = f"rho_bar >= {value}: a lower bound, from {self.evaluated} active sets"
+            if self.regions is not None and not self.regions.complete:
+                found += f" ({self.regions.reason})"
         where = f", reached at x0 = {at} by {self.label}" if self.row else ""
         answer = {
             True: "The weight given is exact.",

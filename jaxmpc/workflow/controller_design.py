@@ -61,6 +61,9 @@ def design(
     if limits is not None:
         if states is not None or inputs is not None:
             fail("limits", "given beside states or inputs", "Choose one way to give the limits")
+        if not isinstance(limits, JointLimits):
+            cure = "Give what jm.joint_limits returns, or states= and inputs="
+            fail("limits", f"is a {type(limits).__name__}", cure)
         states, inputs = limits.states, limits.inputs
         if not system.state_names:
             named: dict[str, Any] = limits.names
