@@ -59,8 +59,9 @@ class Verify:
         found = verify(
             path, exact=self.exact, sample=self.sample, seed=self.seed, progress=True
         )  # fmt: skip
-        print(f"{path}: {'verified' if found.passed else 'NOT VERIFIED'}")
         decided = found.labels.get("feasible", 0) + found.labels.get("infeasible", 0)
+        word = "verified" if decided else "nothing to verify, no state is labelled"
+        print(f"{path}: {word if found.passed else 'NOT VERIFIED'}")
         rows = [(name, f"{count:>12,}") for name, count in found.labels.items()]
         rows += [("verified", f"{found.verified:>12,} of {decided:,}, {found.exactly:,} exactly")]
         print_table(
