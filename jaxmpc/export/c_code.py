@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.checks import fail, number, require_kind
-from jaxmpc.control.sets import Box
 from jaxmpc.export.c_text import (
+    KINDS,
     REAL,
+    input_limits,
     literal,
     prepared_paths,
     require_c_names,
@@ -64,8 +65,7 @@ def export_c(
     if tolerance is None:
         tolerance = TOLERANCE[dtype]
     number("tolerance", tolerance, 0, "Give a positive number")
-    kinds = (".h", ".c", "_sizes.h", "_tables.h", "_example.c")
-    paths = prepared_paths(Path(folder), [f"{name}{kind}" for kind in kinds], overwrite)
+    paths = prepared_paths(Path(folder), [f"{name}{kind}" for kind in KINDS], overwrite)
     with jax.enable_x64(True):
         controller = Controller(mpc, replace(solver, refine=0))
         assert controller.factor is not None
@@ -129,9 +129,7 @@ def _tables(controller: Controller) -> dict[str, Any]:
         tables |= {"soft_linear": bounds.linear, "soft_quadratic": bounds.quadratic}
     if c.balls:
         tables |= {"radius": bounds.radius, "ball_rows": np.array(c.balls)}
-    box = mpc.inputs if isinstance(mpc.inputs, Box) else None
-    tables["input_lower"] = np.full(m, -np.inf) if box is None else box.lower
-    tables["input_upper"] = np.full(m, np.inf) if box is None else box.upper
+    tables |= input_limits(mpc)
     tables["later_move"] = np.array([mpc.moves[b + 1] if b + 1 < N else -1 for b in c.begins], int)
     tables["later_row"] = _later_rows(controller)
     return {key: np.asarray(value) for key, value in tables.items()}

@@ -8,9 +8,13 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail
+from jaxmpc.control.sets import Box
+from jaxmpc.mpc.problem import MPC
 
 TEMPLATES = Path(__file__).parent
 REAL = {"float64": "double", "float32": "float"}
+# Endings of the files of a controller, in the order of their texts.
+KINDS = (".h", ".c", "_sizes.h", "_tables.h", "_example.c")
 
 
 def require_c_names(name: str, dtype: str) -> None:
@@ -34,6 +38,15 @@ def prepared_paths(folder: Path, names: list[str], overwrite: bool) -> list[Path
     except OSError as error:
         fail(str(folder), f"{error.strerror}", "Give a folder that you can write")
     return paths
+
+
+def input_limits(mpc: MPC) -> dict[str, np.ndarray]:
+    """Return the tables of the limits (m,) into which the code clips inputs, ±inf for none."""
+    free = np.full(mpc.system.m, np.inf)
+    lower, upper = (
+        (mpc.inputs.lower, mpc.inputs.upper) if isinstance(mpc.inputs, Box) else (-free, free)
+    )
+    return {"input_lower": np.asarray(lower), "input_upper": np.asarray(upper)}
 
 
 def write(paths: list[Path], texts: list[str], name: str, states: int) -> list[Path]:

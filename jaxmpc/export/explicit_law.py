@@ -13,10 +13,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from jaxmpc.checks import fail, number, require_kind
-from jaxmpc.control.sets import Box
 from jaxmpc.explicit.regions import CriticalRegions
 from jaxmpc.export.c_text import (
+    KINDS,
     REAL,
+    input_limits,
     literal,
     prepared_paths,
     require_c_names,
@@ -136,24 +137,20 @@ def export_explicit_c(
     facets = Facets.of(regions, size)
     tree = SearchTree.of(facets, vertices, 1e-9 * size)
     mpc, real = regions.mpc, REAL[dtype]
-    box = mpc.inputs if isinstance(mpc.inputs, Box) else None
-    none = np.full(mpc.system.m, np.inf)
     tables: dict[str, Any] = {
         "plane_normal": facets.normal.ravel(), "plane_offset": facets.offset,
         "node_plane": tree.plane, "node_inside": tree.inside, "node_outside": tree.outside,
         "leaf_region": tree.regions, "facet_begin": facets.begin, "facet_plane": facets.plane,
         "facet_side": facets.side, "law_gain": np.array([r.K.T.ravel() for r in regions.regions]).T,
         "law_offset": np.array([r.k for r in regions.regions]).T,
-        "input_lower": -none if box is None else np.broadcast_to(np.asarray(box.lower), none.shape),
-        "input_upper": none if box is None else np.broadcast_to(np.asarray(box.upper), none.shape),
+        **input_limits(mpc),
     }  # fmt: skip
     sizes = {
         "PARAMETERS": mpc.dimension, "INPUTS": mpc.system.m, "REGIONS": len(regions),
         "NODES": len(tree.plane), "DEPTH": tree.depth, "MOST": _most(tree),
         "TOLERANCE": literal(tolerance * size, real).replace("(real)", ""),
     }  # fmt: skip
-    kinds = (".h", ".c", "_sizes.h", "_tables.h", "_example.c")
-    paths = prepared_paths(Path(folder), [f"{name}{kind}" for kind in kinds], overwrite)
+    paths = prepared_paths(Path(folder), [f"{name}{kind}" for kind in KINDS], overwrite)
     arrays = {key: np.asarray(value) for key, value in tables.items()}
     texts = [
         template("law.h"), template("law.c"), sizes_header(sizes, real),

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxmpc.checks import fail, require_kind, require_package
+from jaxmpc.export.c_text import prepared_paths
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
@@ -40,8 +41,7 @@ def export_jax(
     require_kind("solver", solver, ADMM)
     if dtype not in ("float64", "float32"):
         fail("dtype", f"{dtype!r}", 'Give "float64" or "float32"')
-    if path.exists() and not overwrite:
-        fail(str(path), "exists", "Overwrite it (overwrite=True) or give another name")
+    (path,) = prepared_paths(path.parent, [path.name], overwrite)
     n, m = mpc.system.n, mpc.system.m
 
     def plan(x0: Any, reference: Any, input_reference: Any, *previous: Any) -> dict[str, Any]:
@@ -56,6 +56,5 @@ def export_jax(
         sizes = (n, n, m, m) if mpc.input_in_state else (n, n, m)
         given = [jax.ShapeDtypeStruct((b, size), dtype) for size in sizes]
         program = jax.export.export(jax.jit(jax.vmap(plan)), platforms=platforms)(*given)
-    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(program.serialize())
     return path
