@@ -39,7 +39,7 @@ from jaxmpc.app import config
 from jaxmpc.bench import families
 from jaxmpc.mpc.condense import Condensed, condense, in_float64
 from jaxmpc.qp.admm import factor, iterate, read, scaled, splittings, unscaled
-from jaxmpc.qp.residuals import joined, residual_terms
+from jaxmpc.qp.residuals import residual_terms, worst
 from jaxmpc.tuning.penalties import tune_penalties
 from jaxmpc.tuning.penalty_schedule import transfer_penalties
 from jaxmpc.tuning.result import TuningRun
@@ -142,11 +142,12 @@ def run(condensed: Condensed, tracked: Any, x: jax.Array, rho: Any, alpha: Any) 
 
     def one(x: jax.Array) -> jax.Array:
         qp = condensed.qp(x, *tracked)
-        q, bounds = scaled(made, qp)
+        q, bounds, unit = scaled(made, qp)
 
         def chunk(t: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
             t, _ = iterate(splittings(made, q), bounds, t, EVERY, alpha)
-            return t, excess(qp, *unscaled(qp, made, *read(made, t, q, bounds)))
+            w, y = read(made, t, q, bounds)
+            return t, excess(qp, *unscaled(qp, made, unit, w, y))
 
         return jax.lax.scan(chunk, jnp.zeros_like(qp.l), length=LONG // EVERY)[1]
 
@@ -155,8 +156,7 @@ def run(condensed: Condensed, tracked: Any, x: jax.Array, rho: Any, alpha: Any) 
 
 def excess(qp: jm.QP, z: jax.Array, y: jax.Array) -> jax.Array:
     """Largest residual over its tolerance; SOLVED is ≤ 1."""
-    values, sizes = joined(residual_terms(qp, z, y))
-    return jnp.max(jnp.abs(values) / (1e-6 + 100 * jnp.finfo(z.dtype).eps * sizes))
+    return worst(residual_terms(qp, z, y), 100 * jnp.finfo(z.dtype).eps)[0] / 1e-6
 
 
 @jax.jit

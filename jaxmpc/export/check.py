@@ -56,7 +56,7 @@ def check_fixed_steps(
         require_finite(argument, bound)
     with jax.enable_x64(True):
         lower, upper = host_array("lower", lower), host_array("upper", upper)
-        fixed = Controller(mpc, replace(solver, refine=0, eps=tolerance, eps_rel=tolerance))
+        fixed = Controller(mpc, replace(solver, refine=0, eps=tolerance))
         precise = Controller(mpc, ADMM())
         starts = np.random.default_rng(seed).uniform(lower, upper, (50 * LOOPS, len(lower)))
         plans = jax.jit(jax.vmap(lambda x: precise(x)[2].status))(starts)

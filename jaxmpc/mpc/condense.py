@@ -22,10 +22,11 @@ from jax import Array
 from jaxmpc.checks import concrete, fail, require_memory
 from jaxmpc.control.riccati import lqr
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.rows import Layout, blocks, stacked
+from jaxmpc.mpc.rows import Layout, blocks, split, stacked
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 from jaxmpc.qp.problem import QP
+from jaxmpc.qp.projection import Bounds
 
 
 @jax.tree_util.register_dataclass
@@ -85,8 +86,24 @@ class Condensed:
         return QP(
             P=self.P, q=q, A=self.C, l=self.lower - shift, u=self.upper - shift,
             soft_linear=self.soft_linear, soft_quadratic=self.soft_quadratic, radius=self.radius,
-            balls=self.balls,
+            row_sizes=self.limits.sizes(), balls=self.balls,
         )  # fmt: skip
+
+    @property
+    def limits(self) -> Bounds:
+        """What is asked of the rows as stated, without what follows from θ."""
+        return Bounds(
+            self.lower, self.upper, self.soft_linear, self.soft_quadratic, self.radius, self.balls
+        )
+
+    def reach(self, reach: Array) -> Array:
+        """Return how far rows move along a unit of length (rows,), where that is known of those
+        that z moves and 0 of the others: for these, what is the most of the same row at other
+        steps, which has its unit."""
+        parts = split(self.layout, reach)
+        most = [jnp.max(part, axis=0, keepdims=True, initial=0.0) for part in parts]
+        filled = [jnp.where(p > 0, p, q).ravel() for p, q in zip(parts, most, strict=True)]
+        return jnp.concatenate([*filled, reach[:0]])
 
     def variables(self, states: Array, inputs: Array) -> Array:
         """z (nz,) of a trajectory, states (N+1, n) and inputs (N, m): the inverse of

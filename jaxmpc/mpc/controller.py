@@ -14,6 +14,7 @@ from jaxmpc.checks import concrete, fail, require_kind
 from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.control.system import as_array, host_array
 from jaxmpc.mpc.condense import Condensed, condense
+from jaxmpc.mpc.judge import judged
 from jaxmpc.mpc.plan import (
     Multipliers,
     Plan,
@@ -210,7 +211,8 @@ def harmless(mpc: MPC) -> tuple[MPC, Any]:
 
 @jax.jit
 def _factor(condensed: Condensed, solver: ADMM) -> Factor:
-    return factorise(condensed.P, condensed.C, solver, condensed.balls)
+    made = factorise(condensed.P, condensed.C, solver, condensed.balls)
+    return replace(made, reach=condensed.reach(made.reach))
 
 
 @partial(jax.jit, static_argnames="whole")
@@ -255,4 +257,8 @@ def _plan(
     found, fault = solve_factored(qp, controller.factor, controller.solver, pair, whole=whole)
     fault = jnp.where(finite, fault, Status.NON_FINITE)
     states, inputs = c.trajectory(theta, found.z)
+    found = judged(
+        mpc, c, controller.factor, controller.solver, found, states, inputs, reference,
+        input_reference, previous,
+    )  # fmt: skip
     return answer(mpc, c.layout, found, fault, states, inputs, reference, input_reference, previous)

@@ -11,7 +11,7 @@ from jax import Array
 from jaxmpc.checks import fail
 from jaxmpc.control.sets import Box
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.rows import Layout, blocks
+from jaxmpc.mpc.rows import Layout, blocks, split
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.residuals import marked
@@ -236,11 +236,3 @@ def _shifted_multipliers(
             part = source[np.array(later, int)]
         moved.append(part.ravel())
     return jnp.concatenate([*moved, y[:0]])
-
-
-def split(layout: Layout, y: Array) -> list[Array]:
-    """Return y (rows,) as one array (steps, rows a step) for each block."""
-    ends = np.cumsum([len(steps) * size for _, steps, size in layout], dtype=int)
-    shapes = [(len(steps), size) for _, steps, size in layout]
-    parts = jnp.split(y, ends)[: len(shapes)]
-    return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]

@@ -9,6 +9,7 @@ this one list.
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -18,6 +19,7 @@ from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, output_steps
 from jaxmpc.qp.linalg import cholesky
 from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.projection import Bounds
 
 # (kind, steps, rows a step) of each block of rows.
 Layout = tuple[tuple[str, tuple[int, ...], int], ...]
@@ -25,7 +27,8 @@ Layout = tuple[tuple[str, tuple[int, ...], int], ...]
 
 @dataclass(frozen=True)
 class Block:
-    """lower ≤ H x_k + D v_k ≤ upper at `steps`: H (r, n) or None, D (r, m) or None.
+    """lower ≤ H x_k + D v_k ≤ upper at `steps`: H (r, n) or None, D (r, m) or None. box: the one of
+    them that is there is the identity.
 
     rate: v_k is Δu_k. linear, quadratic (r,): weights c and k of the penalty c e + ½ k e² of a
     violation e where the rows are soft (k is twice `Soft.quadratic`), None where they are hard.
@@ -44,11 +47,20 @@ class Block:
     linear: Any = None
     quadratic: Any = None
     radius: Any = None
+    box: bool = False
 
     @property
     def size(self) -> int:
         """Rows at each step."""
         return len(self.names)
+
+    def bounds(self) -> Bounds:
+        """What is asked of the rows of all steps (steps·r,), without what follows from x_0."""
+        tiled = lambda v: None if v is None else jnp.tile(v, len(self.steps))
+        ends = map(tiled, (self.lower, self.upper, self.linear, self.quadratic))
+        if self.radius is None:
+            return Bounds(*ends)
+        return Bounds(*ends, self.radius[None], (self.size,))
 
 
 @dataclass(frozen=True)
@@ -91,11 +103,13 @@ def blocks(mpc: MPC, dtype: Any) -> list[Block]:
     if mpc.inputs is not None:
         D, lower, upper = mpc.inputs.rows()
         texts = described(mpc.inputs, input_names, system.input_units)
-        add("input", None, D, lower, upper, range(N), *texts)
+        box = isinstance(mpc.inputs, Box)
+        add("input", None, D, lower, upper, range(N), *texts, box=box)
     if mpc.states is not None:
         H, lower, upper = mpc.states.rows()
         texts = described(mpc.states, state_names, system.state_units)
-        add("state", H, None, lower, upper, mpc.state_steps, *texts)
+        box = isinstance(mpc.states, Box)
+        add("state", H, None, lower, upper, mpc.state_steps, *texts, box=box)
     for rows in (mpc.outputs,) if isinstance(mpc.outputs, Outputs) else mpc.outputs:
         steps = output_steps(mpc, rows)
         add("output", rows.C, rows.D, rows.lower, rows.upper, steps, rows.names, rows.units)
@@ -115,6 +129,7 @@ def blocks(mpc: MPC, dtype: Any) -> list[Block]:
             names,
             units,
             rate=True,
+            box=True,
         )
     for soft in (mpc.soft,) if isinstance(mpc.soft, Soft) else mpc.soft:
         every = range(N + 1) if soft.D is None else range(N)
@@ -141,6 +156,7 @@ def blocks(mpc: MPC, dtype: Any) -> list[Block]:
             upper,
             (N,),
             *described(last, state_names, system.state_units),
+            box=isinstance(last, Box),
         )
     return found
 
@@ -162,17 +178,27 @@ def stacked(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return (C, D, d, lower, upper) of a block: its rows are C z + D θ + d.
 
-    states (Γ, Φ, φ): x_k = Γ_k z + Φ_k θ + φ_k. inputs: the same for v_k.
+    states (Γ, Φ, φ): x_k = Γ_k z + Φ_k θ + φ_k. inputs: the same for v_k. What an input adds to a
+    row counts as zero where it is rounding beside what it adds to the same row at other times: a
+    row that no input moves (with explicit Euler the position at k = 1) is one of zeros.
     """
-    steps, r = np.array(block.steps, int), block.size
-    parts = []
-    for x, v in zip(states, inputs, strict=True):
+    steps, r, m = np.array(block.steps, int), block.size, inputs[0].shape[1]
+
+    def added(x: Array, v: Array, H: Any, D: Any) -> Array:
         part: Any = 0.0
-        if block.H is not None:
-            part = part + _each(block.H, x[steps])
-        if block.D is not None:
-            part = part + _each(block.D, v[steps])
-        parts.append(part.reshape((len(steps) * r, *x.shape[2:])))
+        if H is not None:
+            part = part + _each(H, x[steps])
+        if D is not None:
+            part = part + _each(D, v[steps])
+        return part.reshape((len(steps), r, *x.shape[2:]))
+
+    parts = [added(x, v, block.H, block.D) for x, v in zip(states, inputs, strict=True)]
+    size = lambda M: None if M is None else jax.lax.stop_gradient(jnp.abs(M))
+    terms = added(*map(size, (states[0], inputs[0], block.H, block.D)))
+    most = jnp.max(terms.reshape(len(steps), r, -1, m), axis=(0, 2), initial=0.0)
+    noise = 8 * jnp.finfo(terms.dtype).eps * jnp.tile(most, terms.shape[-1] // m)
+    none = jax.lax.stop_gradient(jnp.where(jnp.abs(parts[0]) <= noise, parts[0], 0.0))
+    parts = [part.reshape(-1, *part.shape[2:]) for part in (parts[0] - none, *parts[1:])]
     repeat = lambda v: jnp.tile(v, len(steps))
     return (*parts, repeat(block.lower), repeat(block.upper))
 
@@ -185,3 +211,11 @@ def _each(H: Array, M: Array) -> Array:
 def layout(mpc: MPC) -> Layout:
     """Return (kind, steps, rows a step) of each block of rows."""
     return tuple((b.kind, b.steps, b.size) for b in blocks(mpc, float))
+
+
+def split(layout: Layout, y: Array) -> list[Array]:
+    """Return y (rows,) as one array (steps, rows a step) for each block."""
+    ends = np.cumsum([len(steps) * size for _, steps, size in layout], dtype=int)
+    shapes = [(len(steps), size) for _, steps, size in layout]
+    parts = jnp.split(y, ends)[: len(shapes)]
+    return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]

@@ -60,8 +60,9 @@ from jaxmpc.mpc.stagewise import (
     search_step,
     solution,
     stage_conditions,
+    stated,
 )
-from jaxmpc.qp.admm import ADMM, DEFAULT, default_rho
+from jaxmpc.qp.admm import ADMM, DEFAULT, default_rho, scaled_multipliers
 from jaxmpc.qp.batches import repeat_while
 from jaxmpc.qp.certificate import Proof
 from jaxmpc.qp.derivative import Undo, implicit
@@ -77,8 +78,10 @@ from jaxmpc.reals import Reals
 STEPS = 100
 # Part of the predicted decrease that a step has to make, and the shortest step.
 DECREASE, SHORTEST = 1e-4, 1e-4
-# A multiplier above which a row counts as held.
+# A multiplier, relative to the largest, above which a row counts as held.
 HELD = 1e-6
+# Least tolerance in float32, in which the model itself is evaluated.
+SINGLE = 1e-3
 # The fields of `Stages` that a Hessian fills.
 QUADRATIC = ("Q", "R", "P", "cross")
 
@@ -162,6 +165,8 @@ def _solve(
     usable = fault == Status.NOT_RUN
     aims = jax.tree.map(lambda v: jnp.where(usable, v, 0), aims)
     eps = tolerance(solver, base.P.dtype)
+    if eps.dtype != jnp.float64:
+        eps = jnp.maximum(eps, SINGLE)
     # What is not finite in a warm start counts as 0.
     x, u, y = (jnp.nan_to_num(v.astype(base.P.dtype), posinf=0, neginf=0) for v in warm_start)
     x = x.at[0].set(aims.x0)
@@ -175,7 +180,6 @@ def _solve(
         x, u, y, count = last.x, last.u, last.y, last.steps
     s, sample = expanded(base, problem, aims, x, u)
     E, rho = scales(jax.lax.stop_gradient(s), scale)
-    terms: Any = stage_residuals
     if steps == 1:
         gains = None
         if solver.admm_steps():
@@ -183,15 +187,15 @@ def _solve(
         factor = StageFactor(s, E, rho[None], gains, fault)
         given = factor, sample, solver, WarmStart(x, u, y)
         if solver.differentiate == "unrolled":
-            u, y = solution(*given)
+            u, y, measured = solution(*given)
         else:
-            u, y = solution(*jax.lax.stop_gradient(given))
+            u, y, measured = solution(*jax.lax.stop_gradient(given))
             u, y = implicit(stage_conditions, (s, sample), (E, rho), u, y)
+        found = stated(solver, s, sample, u, y, measured)
     else:
-        terms = nonlinear_residuals
         at_solution = jax.lax.stop_gradient((E, rho, base, problem, aims))
         u, y = implicit(nonlinear_conditions, (s, sample), at_solution, u, y)
-    found = assess(terms, (s, sample), u, y, Proof.none(u, y), eps)
+        found = assess(nonlinear_residuals, (s, sample), u, y, Proof.none(u, y), eps)
     found = replace(found, iterations=jnp.asarray(count, jnp.int32))
     x = predict(s, sample.x0, u)
     plan = answer(problem.mpc, s.layout, found, fault, x, u, aims.states, aims.inputs)
@@ -307,10 +311,13 @@ def defects(s: Stages, x: Array, u: Array) -> tuple[Array, Array]:
 def nonlinear_residuals(s: Stages, sample: Sample, u: Array, y: Array) -> Terms:
     """Return the residuals of the nonlinear problem at the point of expansion: those of the
     expansion, with the defects among the rows."""
-    (rows, row_sizes), *rest = stage_residuals(s, sample, u, y)
-    open_, sizes = defects(s, sample.states, u)
-    join = lambda a, b: jnp.concatenate([a, b.ravel()])
-    return [(join(rows, open_), join(row_sizes, sizes)), *rest]
+    of_rows, *rest = stage_residuals(s, sample, u, y)
+    of_defects = defects(s, sample.states, u)
+    joined = [
+        jnp.concatenate([a, b.ravel()])
+        for a, b in zip(of_rows, (*of_defects, of_defects[1]), strict=True)
+    ]
+    return [(joined[0], joined[1], joined[2]), *rest]
 
 
 def nonlinear_conditions(
@@ -413,7 +420,8 @@ def with_cross(s: Stages) -> Stages:
 def held(s: Stages, E: Array, y: Array) -> Array:
     """Return large weights (rows,) for the rows that multipliers y hold at their limits, 0 for
     others: soft rows beyond their limits give way."""
-    active = jnp.abs(y) > HELD
+    push = jnp.abs(scaled_multipliers(E, y))
+    active = push > HELD * jnp.max(push, initial=0.0)
     if s.linear is not None:
         active = active & (jnp.abs(y) < (1 - 1e-6) * s.linear)
     return Constants.of(y.dtype).linear * E**2 * active

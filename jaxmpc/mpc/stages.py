@@ -24,7 +24,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.control.sets import Box
 from jaxmpc.mpc.kernels import Gains, recurrence, riccati_recursion, tracking
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Layout, blocks
@@ -32,7 +31,7 @@ from jaxmpc.qp.admm import convex
 from jaxmpc.qp.linalg import cholesky
 from jaxmpc.qp.precision import floating_dtype, matmul, precisely, rounding
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.residuals import Pair, Terms
+from jaxmpc.qp.residuals import SHARE, Pair, Terms
 from jaxmpc.qp.status import Status
 
 
@@ -156,12 +155,6 @@ def stages(mpc: MPC) -> Stages:
     dtype = floating_dtype(mpc)
     cast = lambda v: jnp.asarray(v, dtype)
     found = blocks(mpc, dtype)
-    box = {
-        kind: isinstance(set_, Box)
-        for kind, set_ in (
-            ("input", mpc.inputs), ("state", mpc.states), ("terminal", mpc.terminal_set)
-        )
-    }  # fmt: skip
     none = [jnp.zeros(0, dtype)]
     tiled = lambda values: jnp.concatenate(none + [
         jnp.tile(v, len(b.steps)) for v, b in zip(values, found, strict=True)
@@ -183,7 +176,7 @@ def stages(mpc: MPC) -> Stages:
         lower=tiled([b.lower for b in found]), upper=tiled([b.upper for b in found]),
         linear=linear, quadratic=quadratic,
         layout=tuple((b.kind, b.steps, b.size) for b in found),
-        boxes=tuple(box.get(b.kind, False) for b in found), horizon=mpc.horizon,
+        boxes=tuple(b.box for b in found), horizon=mpc.horizon,
     )  # fmt: skip
 
 
@@ -290,12 +283,13 @@ def unconstrained(s: Stages, gains: Gains, weights: Array, sample: Sample) -> tu
 
 
 class Conditions(NamedTuple):
-    """Rows (rows,) and gradient (N, m) of the Lagrangian with respect to the inputs, and the
-    sizes of the terms of both."""
+    """Rows (rows,) and gradient (N, m) of the Lagrangian with respect to the inputs, the terms of
+    both, and the sums that the gradient is a difference of."""
 
     rows: Array
     gradient: Array
-    row_size: Array
+    row_terms: Array
+    gradient_terms: Array
     gradient_size: Array
 
 
@@ -316,6 +310,8 @@ def conditions(s: Stages, sample: Sample, u: Array, y: Array) -> Conditions:
         absolute.rows(terms, jnp.abs(u)),
         jnp.abs(own) + absolute.pull(jnp.abs(y))[1]
         + apply_transposed(absolute.B, jnp.abs(of_cost) + jnp.abs(of_rows)),
+        jnp.abs(own + apply_transposed(s.B, of_cost))
+        + jnp.abs(pushed + apply_transposed(s.B, of_rows)),
     )  # fmt: skip
 
 
@@ -323,19 +319,36 @@ def stage_residuals(s: Stages, sample: Sample, u: Array, y: Array) -> Terms:
     """As `qp.residuals.residual_terms`, for the condensed QP in the inputs.
 
     With the gradient g of the Lagrangian the gap z'Pz + q'z + g(Az) + g*(y) is
-    u'g + g(rows) + g*(y) − y'rows: at the optimum both parts are zero.
+    u'g + g(rows) + g*(y) − y'rows: at the optimum both parts are zero. What is natural for a row
+    and for an input is what is the most of the same one over the horizon.
     """
     found, bounds = conditions(s, sample, u, y), s.bounds
     penalty, support, product = bounds.cost(found.rows), bounds.support(y), y * found.rows
     gap = jnp.sum(u * found.gradient) + jnp.sum(penalty + support - product)
-    size = jnp.sum(jnp.abs(u) * found.gradient_size)
-    terms = bounds.slope(found.rows) + jnp.abs(y)
-    size = size + jnp.sum(terms * found.row_size + jnp.abs(support))
+    terms = jnp.sum(jnp.abs(u) * found.gradient_terms)
+    slopes = bounds.slope(found.rows) + jnp.abs(y)
+    terms = terms + jnp.sum(slopes * found.row_terms + jnp.abs(support))
+    size = jnp.sum(penalty + jnp.abs(support) + jnp.abs(product))
+    size = size + jnp.sum(jnp.abs(u) * found.gradient_size)
+
+    def most(v: Array) -> Array:
+        parts = [v[rows].reshape(len(steps), size) for rows, steps, size, *_ in s.blocks()]
+        largest = [jnp.max(part, axis=0, initial=0.0) for part in parts]
+        pairs = zip(parts, largest, strict=True)
+        return jnp.concatenate([*(jnp.broadcast_to(m, p.shape).ravel() for p, m in pairs), v[:0]])
+
+    row_size = jnp.maximum(bounds.sizes(), jnp.abs(found.rows))
+    row_terms = found.row_terms + row_size
+    gradient_size = found.gradient_size + SHARE * jnp.max(found.gradient_size, axis=0)
+    gradient_terms = found.gradient_terms + jnp.max(found.gradient_terms, axis=0)
     return [
-        (bounds.violation(found.rows), found.row_size),
-        (found.gradient.ravel(), found.gradient_size.ravel()),
-        (gap[None], size[None]),
-    ]
+        (
+            bounds.violation(found.rows), row_size + SHARE * most(row_size),
+            row_terms + most(row_terms),
+        ),
+        (found.gradient.ravel(), gradient_size.ravel(), gradient_terms.ravel()),
+        (gap[None], size[None], terms[None]),
+    ]  # fmt: skip
 
 
 def judged(eps: Array, s: Stages, sample: Sample, u: Array, y: Array) -> Pair:

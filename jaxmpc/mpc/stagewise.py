@@ -59,8 +59,9 @@ from jaxmpc.qp.certificate import Proof
 from jaxmpc.qp.derivative import Undo, implicit
 from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.precision import arrays, matmul, precisely
+from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.residuals import Pair, assess
+from jaxmpc.qp.residuals import Measured, Pair, assess, concluded
 from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
 from jaxmpc.reals import Reals
@@ -89,8 +90,8 @@ def solve_stagewise(
     start, has found the active rows. None: 6, after them an interior point method where they have
     not ended at the solution (its steps need rows with l < u), and 6 again; all in float64.
     mpc.prestabilise is not read: the inputs are the variables, so a plant that grows more than
-    1e5-fold over the horizon in open loop (1e3-fold in float32) has residuals above eps by rounding
-    alone; `solve` takes those. scale (rows,): the row scale of a similar problem
+    1e5-fold over the horizon in open loop has residuals above eps by rounding alone; `solve` takes
+    those. scale (rows,): the row scale of a similar problem
     (`factor_stages(...).E`), which saves a Riccati recursion; it changes the path, not the answer.
     A row of scale 0 counts as one that no input moves: where that is not so, the plan does not
     become SOLVED.
@@ -379,20 +380,33 @@ def _plan(factor: StageFactor, mpc: MPC, solver: ADMM, sample: Sample, warm_star
     if solver.differentiate == "implicit":
         constants = jax.lax.stop_gradient((factor, sample, solver, warm_start))
         fixed = constants[0].E, constants[0].rho[-1]
-        u, y = implicit(stage_conditions, (factor.stages, sample), fixed, *solution(*constants))
+        u, y, measured = solution(*constants)
+        u, y = implicit(stage_conditions, (factor.stages, sample), fixed, u, y)
     else:
-        u, y = solution(factor, sample, solver, warm_start)
-    s, eps = factor.stages, tolerance(solver, u.dtype)
-    found = assess(stage_residuals, (s, sample), u, y, Proof.none(u, y), eps)
+        u, y, measured = solution(factor, sample, solver, warm_start)
+    s = factor.stages
+    found = stated(solver, s, sample, u, y, measured)
     found = replace(found, iterations=jnp.int32(solver.admm_steps()))
     x = predict(s, sample.x0, u)
     return answer(mpc, s.layout, found, fault, x, u, sample.states, sample.inputs)
 
 
+def stated(
+    solver: ADMM, s: Stages, sample: Sample, u: Array, y: Array, measured: Measured | None
+) -> QPSolution:
+    """Return the solution with its status: what was measured of the float64 pair that Newton steps
+    end at, before it was rounded, or where there were none what is measured of this pair."""
+    none = Proof.none(u, y)
+    if measured is not None:
+        return concluded(measured, u, y, none)
+    return assess(stage_residuals, (s, sample), u, y, none, tolerance(solver, u.dtype))
+
+
 def solution(
     factor: StageFactor, sample: Sample, solver: ADMM, warm_start: WarmStart | None
-) -> tuple[Array, Array]:
-    """Inputs u (N, m) and multipliers y (rows,): ADMM, Newton steps, interior point method."""
+) -> tuple[Array, Array, Measured | None]:
+    """Inputs u (N, m) and multipliers y (rows,): ADMM, Newton steps, interior point method; and
+    what was measured of them where Newton steps end at them."""
     s, E, rho = factor.stages, factor.E, factor.rho
     u, y = jnp.zeros((s.horizon, s.B.shape[-1]), E.dtype), jnp.zeros_like(E)
     if warm_start is not None:  # what is not finite counts as 0
@@ -407,7 +421,7 @@ def solution(
         t, _ = iterate(schedule, bounds, t, solver.admm_steps(), solver.alpha)
         u, y = read(factor, bounds, t, free[-1])
     y = jnp.where(E == 0, fixed, y)
-    newton = solver.newton_steps(NEWTON_STEPS)
+    newton, measured = solver.newton_steps(NEWTON_STEPS), None
     if newton and solver.differentiate == "unrolled":
         step = lambda pair, _: (newton_step(s, sample, E, rho[-1], *pair), None)
         u, y = jax.lax.scan(step, (u, y), length=newton)[0]
@@ -416,15 +430,15 @@ def solution(
         eps = tolerance(solver, u.dtype)
         last = STEPS if solver.refine is None else 0
         search = partial(refined, newton, last, solver.fixed)
-        u, y = precisely(search, s, sample, E, rho[-1], fixed, eps, u, y)
-    return u, y
+        u, y, measured = precisely(search, s, sample, E, rho[-1], fixed, eps, u, y)
+    return u, y, measured
 
 
 def refined(
     newton: int, interior: int, constant: bool, s: Stages, sample: Sample, E: Array, rho: Array,
     fixed: Array, eps: Array, u: Array, y: Array,
-) -> tuple[Array, Array]:  # fmt: skip
-    """The best pair after `newton` Newton steps from u (N, m), y (rows,), and where that is not
+) -> tuple[Array, Array, Measured]:  # fmt: skip
+    """The best pair, and what was measured of it, after `newton` Newton steps from u (N, m), y (rows,), and where that is not
     good enough `interior` interior point steps and Newton steps again, at most; constant: always
     as many."""
 
@@ -449,4 +463,4 @@ def refined(
     # are bounded. As a loop, so that both are compiled once.
     rounds = jnp.arange(2 if interior else 1) == 0
     best, _ = jax.lax.scan(round_, best, rounds)
-    return best.z, best.y
+    return best.z, best.y, best.measured

@@ -23,6 +23,7 @@ from jax import Array
 
 from jaxmpc.compiled import padded
 from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.judge import judged
 from jaxmpc.mpc.plan import Multipliers, Plan, answer, flat_multipliers
 from jaxmpc.qp.active_set import RIDGE, has_dual_steps, most_rows
 from jaxmpc.qp.admm import scaled_multipliers
@@ -167,5 +168,7 @@ def follow(controller: Controller, laws: Laws, cells: Cells, steps: int, theta: 
     y = jnp.where(i < 0, jnp.nan, laws.evaluate(i, theta, len(f.E)))
     found, fault = solve_from(c.qp(theta), f, controller.solver, y, steps)
     states, inputs = c.trajectory(theta, found.z)
-    previous = theta[controller.mpc.system.n :] if controller.mpc.input_in_state else None
-    return answer(controller.mpc, c.layout, found, fault, states, inputs, None, None, previous)
+    mpc = controller.mpc
+    previous = theta[mpc.system.n :] if mpc.input_in_state else None
+    found = judged(mpc, c, f, controller.solver, found, states, inputs, None, None, previous)
+    return answer(mpc, c.layout, found, fault, states, inputs, None, None, previous)

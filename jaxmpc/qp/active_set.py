@@ -47,8 +47,8 @@ LENGTHS = (1.0, 0.5, 0.25, 0.0625)
 RIDGE = 1e-11
 # Violations relative to the largest row that count as rounding.
 NOISE = 1e-13
-# Multipliers, relative to v₀, from which on the dual seems unbounded.
-DIVERGED = 1e6
+# Multipliers from which on the dual seems unbounded: see `refine.most_multiplier`.
+DIVERGED = 1 / RIDGE
 # Distance from the optimum at which the steps end: relative to the largest row, and, for rounding,
 # to the largest multiplier.
 CONVERGED, ROUNDING = 1e-11, 1e-15

@@ -35,6 +35,7 @@ from jaxmpc.qp.linalg import cholesky, inverse_root
 from jaxmpc.qp.precision import matmul, precisely, rounding
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.residuals import Natural
 from jaxmpc.qp.status import Status
 
 # Eigenvalue, relative to the mean, below which a direction counts as without curvature, by the
@@ -67,11 +68,12 @@ class ADMM:
     instance: constant time; so do unrolled derivatives. dtype: floating type of ADMM's iterates,
     "float32" or "float64"; None: float32 before Newton steps, that of the data without any. Newton
     steps are float64 whatever it is, except unrolled ones.
-    eps: tolerance of status SOLVED on primal residual, dual residual and gap, absolute, plus
-    a rounding floor, a multiple of machine epsilon·(size of the terms): 100 in float64, 4 in
-    float32. None: 1e-6 in float64, 1e-3 in float32. eps_rel: tolerance relative to the size of
-    the terms, Σ_j |A_ij z_j| for row i, Σ_j |P_ij z_j| + |q_i| + Σ_j |A_ji y_j| for variable i,
-    and likewise for the gap; a residual may be as large as the sum of all three.
+    eps: tolerance of status SOLVED, relative: each entry of the primal and of the dual residual,
+    and the gap, is at most eps times the size of its terms, Σ_j |A_ij z_j| for row i and
+    Σ_j |P_ij z_j| + |q_i| + Σ_j |A_ji y_j| for variable i, or a thousandth of eps times what is
+    natural for the whole program (`residuals.Natural`). So neither the units of rows and variables
+    nor that of the cost play a part. A few machine epsilons of the type in which the pair is
+    computed are added: 100 in float64, 4 in float32.
     differentiate: "implicit", derivatives of the solution itself (`derivative.py`), zero with
     respect to rho, alpha and the warm start; or "unrolled", derivatives of the steps as they
     were taken. smoothing: 0, or μ > 0 to round off the kinks of the implicit derivative as an
@@ -82,8 +84,7 @@ class ADMM:
     rho: Any = None
     alpha: Any = 1.9
     refine: int | None = field(default=None, metadata={"static": True})
-    eps: Any = None
-    eps_rel: Any = 0.0
+    eps: Any = 1e-6
     differentiate: str = field(default="implicit", metadata={"static": True})
     smoothing: Any = 0.0
     fixed: bool = field(default=False, metadata={"static": True})
@@ -108,10 +109,7 @@ class ADMM:
         number("alpha", self.alpha, 0, "Over-relaxation lies in (0, 2); 1.6 is usual")
         if concrete(self.alpha) and not 0 < float(np.asarray(self.alpha)) < 2:
             fail("alpha", f"{self.alpha}", "Over-relaxation lies in (0, 2); 1.6 is usual")
-        for name in ("eps", "eps_rel"):
-            value = getattr(self, name)
-            if value is not None:
-                number(name, value, 0, "Tolerances are at least 0")
+        number("eps", self.eps, 0, "Tolerances are at least 0")
         if self.dtype not in (None, "float32", "float64"):
             fail("dtype", f"{self.dtype!r}", 'Give "float32", "float64" or None')
         if self.differentiate not in ("implicit", "unrolled"):
@@ -141,7 +139,8 @@ DEFAULT = ADMM()
 class Factor:
     """What P, A and rho alone decide; shared by every instance of a batch.
 
-    T (n, n): z = T w. E (m,): row scale, 0 for a zero row. H (n, n), A (m, n): Hessian and
+    T (n, n): z = T w. E (m,): row scale, 0 for a zero row. reach (m,): by how much a row moves along
+    a unit of w, 1/E, and 0 or what is known of it for a zero row. H (n, n), A (m, n): Hessian and
     rows in w. flat: whether P is singular. rho (S, m), and a stage each of F = M⁻¹A'R (S, n, m)
     and Minv (S, n, n); G = A F (S, m, m), or None where two thin products cost less. S = A A'
     (m, m). fault: NOT_RUN where P and A are
@@ -150,6 +149,7 @@ class Factor:
 
     T: Array
     E: Array
+    reach: Array
     H: Array
     A: Array
     flat: Array
@@ -185,11 +185,9 @@ def scale(
     H = matmul(T.T, matmul(P, T))
     rows = matmul(A, T)
     squared = jnp.sum(rows**2, axis=1)
-    # A row is zero when it is rounding noise of its own terms, or beside the others (with explicit
-    # Euler the position at k = 1 does not depend on u_0).
-    eps = jnp.finfo(dtype).eps
+    # A row is zero when it is rounding noise of its own terms. Other rows have other units.
     own = jnp.sum(matmul(jnp.abs(A), jnp.abs(T)) ** 2, axis=1)
-    noise = jnp.maximum((100 * eps) ** 2 * own, eps**2 * jnp.max(squared, initial=0.0))
+    noise = (100 * jnp.finfo(dtype).eps) ** 2 * own
     last = A.shape[0]
     for count in reversed(balls):
         block, last = slice(last - count, last), last - count
@@ -226,7 +224,8 @@ def null_curvature(P: Array, A: Array) -> tuple[Array, Array]:
     Where P is definite, δ is rounding. Where it is singular, the scale of its
     null space relative to its range is free, and ADMM is slow when rows lie mostly in one of them:
     δ makes both parts of the median row alike, |a_null|²/δ = Σ (a'v)²/λ over P's range; 1 if
-    no row has both parts. With x = (P + εI)⁻¹a the null part is ε|x|, and the range part x'Px.
+    no row has both parts. With x = (P + εI)⁻¹a the null part is εx, and the part in the range is
+    r = Px, of which what is rounding of its terms counts as none; Σ (a'v)²/λ = r'(P + εI)⁻¹r.
     """
     n, identity = P.shape[0], jnp.eye(P.shape[0], dtype=P.dtype)
     mean = jnp.trace(P) / n
@@ -241,7 +240,10 @@ def null_curvature(P: Array, A: Array) -> tuple[Array, Array]:
     delta = jnp.ones((), P.dtype)
     if A.shape[0]:
         x = matmul(matmul(A, root.T), root)
-        in_null, in_range = epsilon**2 * jnp.sum(x**2, axis=1), jnp.sum(x * matmul(x, P), axis=1)
+        r, noise = matmul(x, P), rounding(P.dtype) * matmul(jnp.abs(x), jnp.abs(P))
+        r = jnp.where(jnp.abs(r) > noise, r, 0.0)
+        in_null = epsilon**2 * jnp.sum(x**2, axis=1)
+        in_range = jnp.sum(matmul(r, root.T) ** 2, axis=1)
         both = (in_null > 1e-8 * jnp.sum(A**2, axis=1)) & (in_range > 0)
         ratio = jnp.where(both, in_null / jnp.where(both, in_range, 1.0), jnp.nan)
         delta = jnp.where(jnp.any(both), jnp.nanmedian(ratio), delta)
@@ -270,7 +272,8 @@ def factor(P: Array, A: Array, solver: ADMM, balls: tuple[int, ...] = ()) -> Fac
     F = jnp.stack([F for F, _ in stages])
     Minv = jnp.stack([Minv for _, Minv in stages])
     G = None if 2 * n < m else matmul(A_w, F)
-    made = Factor(T, E, H, A_w, flat, rho, F, G, Minv, matmul(A_w, A_w.T), fault)
+    reach = jnp.where(E > 0, 1 / jnp.where(E > 0, E, 1.0), 0.0)
+    made = Factor(T, E, reach, H, A_w, flat, rho, F, G, Minv, matmul(A_w, A_w.T), fault)
     # Finite data can still overflow, or be too near singular for their precision.
     parts = jax.tree.leaves((T, E, H, A_w, F, G, Minv))
     sound = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in parts]))
@@ -323,15 +326,47 @@ def convex(P: Array) -> Array:
     return precisely(factored, jax.lax.stop_gradient(P))
 
 
-def scaled(factor: Factor, qp: QP) -> tuple[Array, Bounds]:
-    """q and bounds in ADMM's coordinates. A zero row (scale 0) is free there; `prove` and
-    `residual_terms` look after it."""
-    return matmul(qp.q, factor.T), qp.bounds.scaled(factor.E)
+def scaled(factor: Factor, qp: QP, unit: Any = None) -> tuple[Array, Bounds, Array]:
+    """q and bounds in ADMM's coordinates, and their unit, where it is not given. A zero row (scale 0) is free there;
+    `prove` and `residual_terms` look after it.
+
+    The coordinates are measured in a unit of each instance, the power of two next to the largest of
+    |q| and of the distances of 0 from the bounds: the solution, which is homogeneous in these, is
+    of size 1 or so, however large the cost and the limits of a problem are."""
+    q, bounds = matmul(qp.q, factor.T), qp.bounds.scaled(factor.E)
+    if unit is not None:
+        return q / unit, bounds.divided(unit), unit
+    far = jnp.clip(jnp.zeros_like(bounds.l), bounds.l, bounds.u)
+    size = jnp.maximum(*(jnp.max(jnp.abs(v), initial=0.0) for v in jax.lax.stop_gradient((q, far))))
+    exponent = jnp.where((size > 0) & jnp.isfinite(size), jnp.frexp(size)[1], 0)
+    unit = jnp.ldexp(jnp.ones((), q.dtype), exponent)
+    return q / unit, bounds.divided(unit), unit
 
 
-def scaled_rows(factor: Factor, qp: QP, z: Array, y: Array) -> tuple[Array, Array]:
+def natural(factor: Factor, unit: Array, q: Array, bounds: Bounds, w: Array, y: Array) -> Natural:
+    """Return what is natural for the program with q and bounds in ADMM's coordinates, at w, y
+    there.
+
+    Where P is singular q and y are no lengths: gradients are compared with them, and the length of
+    w with the nearest of the bounds that are not 0."""
+    length, linear, push = (jnp.max(jnp.abs(v), initial=0.0) for v in (w, q, y))
+    force = jnp.maximum(linear, push)
+    ends = jnp.stack([jnp.abs(bounds.l), jnp.abs(bounds.u)])
+    nearest = jnp.min(jnp.where(ends > 0, ends, jnp.inf), initial=jnp.inf)
+    nearest = jnp.where(jnp.isfinite(nearest), nearest, 1.0)
+    along = unit * jnp.where(factor.flat, length + nearest, length)
+    push = unit * jnp.where(factor.flat, force, length)
+    rounds = unit * jnp.where(factor.flat, length, length + force)
+    per_variable = 1 / jnp.sum(jnp.abs(factor.T), axis=1)
+    return Natural(
+        along * factor.reach, push * per_variable, along * push,
+        rounds * factor.reach, unit * force * per_variable,
+    )  # fmt: skip
+
+
+def scaled_rows(factor: Factor, qp: QP, unit: Array, z: Array, y: Array) -> tuple[Array, Array]:
     """Az and y in ADMM's coordinates; 0 in a zero row."""
-    return factor.E * matmul(z, qp.A.T), scaled_multipliers(factor.E, y)
+    return factor.E * matmul(z, qp.A.T) / unit, scaled_multipliers(factor.E, y) / unit
 
 
 def scaled_multipliers(E: Array, y: Array) -> Array:
@@ -339,12 +374,12 @@ def scaled_multipliers(E: Array, y: Array) -> Array:
     return jnp.where(E > 0, y / jnp.where(E > 0, E, 1.0), 0.0)
 
 
-def unscaled(qp: QP, factor: Factor, w: Array, y: Array) -> tuple[Array, Array]:
+def unscaled(qp: QP, factor: Factor, unit: Array, w: Array, y: Array) -> tuple[Array, Array]:
     """Return z and an admissible y in the units of `qp`. A soft row that z cannot move (scale 0)
     gets its penalty's gradient as multiplier, so that the duality gap closes."""
     zero = factor.E == 0
-    y = jnp.where(zero, qp.bounds.penalty_gradient(jnp.zeros_like(y)), factor.E * y)
-    return matmul(w, factor.T.T), qp.bounds.admissible(y)
+    y = jnp.where(zero, qp.bounds.penalty_gradient(jnp.zeros_like(y)), unit * factor.E * y)
+    return unit * matmul(w, factor.T.T), qp.bounds.admissible(y)
 
 
 class Splitting(NamedTuple):

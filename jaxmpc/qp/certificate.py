@@ -8,6 +8,7 @@ box rows in the role of the correction). The bound is valid for any y; convergen
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,10 +26,12 @@ RAY = 25
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Proof:
-    """A Farkas vector and a descent ray, and whether they are proved to be."""
+    """A Farkas vector and a descent ray, and whether they are proved to be. beyond: the rows
+    contradict each other also where each is widened by its tolerance."""
 
     certificate: Array
     infeasible: Array
+    beyond: Array
     ray: Array
     unbounded: Array
 
@@ -36,28 +39,33 @@ class Proof:
     def none(cls, z: Array, y: Array) -> "Proof":
         """Nothing proved of a program with variables like z and rows like y."""
         false = jnp.asarray(False)
-        return cls(jnp.zeros_like(y), false, jnp.zeros_like(z), false)
+        return cls(jnp.zeros_like(y), false, false, jnp.zeros_like(z), false)
 
     def joined(self, other: "Proof") -> "Proof":
-        """What either proves."""
+        """What either proves; of Farkas vectors the first one beyond the tolerance."""
         old, new = self, other
+        first = old.beyond | (old.infeasible & ~new.beyond)
         return Proof(
-            jnp.where(old.infeasible, old.certificate, new.certificate),
-            old.infeasible | new.infeasible,
+            jnp.where(first, old.certificate, new.certificate), old.infeasible | new.infeasible,
+            old.beyond | new.beyond,
             jnp.where(old.unbounded, old.ray, new.ray), old.unbounded | new.unbounded,
         )  # fmt: skip
 
 
-def prove(qp: QP, T: Array, E: Array, correcting: tuple[Array, Array], y: Array, d: Array) -> Proof:
+def prove(
+    qp: QP, T: Array, E: Array, correcting: tuple[Array, Array], tolerances: Array, y: Array,
+    d: Array,
+) -> Proof:  # fmt: skip
     """What is proved of the program by candidates for a Farkas vector y and for a ray d, both in
-    ADMM's coordinates (`admm.scale`). correcting: `correcting_rows(qp)`."""
+    ADMM's coordinates (`admm.scale`). correcting: `correcting_rows(qp)`. tolerances (m,): by how
+    much rows may be violated."""
     ray, unbounded = descent_ray(qp, matmul(d, T.T))
     if not y.shape[0]:
-        return Proof(y, jnp.asarray(False), ray, unbounded)
+        return replace(Proof.none(ray, y), ray=ray, unbounded=unbounded)
     # Rows that z cannot move prove emptiness by themselves.
     fixed = jnp.where(E == 0, qp.bounds.violation(jnp.zeros_like(E)), 0.0)
     candidate = jnp.where(jnp.any(fixed != 0), fixed, E * y)
-    return Proof(*farkas(qp, candidate, correcting), ray, unbounded)
+    return Proof(*farkas(qp, candidate, correcting, tolerances), ray, unbounded)
 
 
 def correcting_rows(qp: QP) -> tuple[Array, Array]:
@@ -77,13 +85,17 @@ def correcting_rows(qp: QP) -> tuple[Array, Array]:
     return row, jnp.where(entries[row, column] > 0, qp.A[row, column], 0.0)
 
 
-def farkas(qp: QP, y: Array, correcting: tuple[Array, Array]) -> tuple[Array, Array]:
-    """The candidate y made into a certificate: returns (y, proved).
+def farkas(
+    qp: QP, y: Array, correcting: tuple[Array, Array], tolerances: Any = 0.0
+) -> tuple[Array, Array, Array]:
+    """The candidate y made into a certificate: returns (y, proved, beyond).
 
     y is scaled to length one, set to zero against infinite bounds, and corrected on rows
     that bound one variable (`correcting_rows`). `proved` is True when Σ u y⁺ − l y⁻ is below zero
     by more than the rounding of the sum and of A'y (over the box of the bounded variables); a
     variable without such a row must have (A'y)_j at rounding level. A zero y proves nothing.
+    `beyond`: proved also of the program whose rows are widened by `tolerances` (m,), which adds
+    Σ tolerance·|y| to the sum.
     """
     eps = jnp.finfo(y.dtype).eps
     m, n = qp.A.shape
@@ -101,8 +113,9 @@ def farkas(qp: QP, y: Array, correcting: tuple[Array, Array]) -> tuple[Array, Ar
     # What the correction leaves of A'y meets at most |z| ≤ bound / |pivot|.
     reach = jnp.where(has_row, bound / jnp.abs(pivot), jnp.where(left <= noise, 0.0, jnp.inf))
     leak = jnp.where(reach > 0, (2 * left + noise) * reach, 0.0)
-    proved = jnp.sum(jnp.concatenate([support + gamma * jnp.abs(support), leak])) < 0
-    return jnp.where(proved, y, 0.0), proved
+    bound = jnp.sum(jnp.concatenate([support + gamma * jnp.abs(support), leak]))
+    proved, beyond = bound < 0, bound + jnp.sum(tolerances * jnp.abs(y)) < 0
+    return jnp.where(proved, y, 0.0), proved, beyond
 
 
 def to_length_one(v: Array) -> Array:

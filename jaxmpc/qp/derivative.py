@@ -79,16 +79,17 @@ def dense_conditions(
     A = E[:, None] * matmul(qp.A, T)
     H = matmul(T.T, matmul(qp.P, T))
     rho = Constants.of(z.dtype).linear
-    v, y_w = scaled_rows(factor, qp, z, y)
-    _, bounds = scaled(factor, qp)
-    upper, lower, kept = activity(bounds, v, y_w, smoothing, rho)
+    _, bounds, unit = scaled(factor, qp)
+    v, y_w = scaled_rows(factor, qp, unit, z, y)
+    # μ is a product of a slack and a multiplier, each of which is measured in the unit.
+    upper, lower, kept = activity(bounds, v, y_w, smoothing / unit**2, rho)
 
     def conditions(qp: QP) -> tuple[Array, Array]:
-        _, bounds = scaled(factor, qp)
-        v = E * matmul(z, qp.A.T)
+        bounds = qp.bounds.scaled(E).divided(unit)
+        v = E * matmul(z, qp.A.T) / unit
         sides = upper * (v - bounds.u) + lower * (v - bounds.l)
         rows = jnp.where(kept, bounds.prox_residual(v + y_w / rho, rho), sides)
-        return matmul(matmul(z, qp.P) + qp.q + matmul(y, qp.A), T), rows
+        return matmul(matmul(z, qp.P) + qp.q + matmul(y, qp.A), T) / unit, rows
 
     weights, normals = bounds.curvature(v + y_w / rho, rho)
     weights = jnp.where(kept, weights, upper + lower)
@@ -96,7 +97,7 @@ def dense_conditions(
 
     def undo(moved: tuple[Array, Array]) -> tuple[Array, Array]:
         dw, dy = inverse(*moved)
-        return matmul(dw, T.T), E * dy
+        return unit * matmul(dw, T.T), unit * E * dy
 
     return conditions, undo
 

@@ -38,21 +38,17 @@ LINE_STEPS, LINE_STEPS_SOFT = 6, 24
 class Constants(NamedTuple):
     """What the precision decides. rho: first and last penalty of the method of multipliers.
     sigma: last proximal weight. damping: proximal weight of least distance, little but far above
-    rounding. far: |w| beyond which w has run off along a ray. linear: penalty of the linearised
-    optimality conditions."""
+    rounding. linear: penalty of the linearised optimality conditions."""
 
     rho: tuple[float, float]
     sigma: float
     damping: float
-    far: float
     linear: float
 
     @classmethod
     def of(cls, dtype: Any) -> "Constants":
         double = jnp.finfo(dtype).eps < 1e-10
-        return cls((1e3, 1e8), 1e-8, 1e-10, 1e10, 1e6) if double else (
-            cls((1e3, 1e4), 1e-4, 1e-5, 1e4, 1e3)
-        )  # fmt: skip
+        return cls((1e3, 1e8), 1e-8, 1e-10, 1e6) if double else cls((1e3, 1e4), 1e-4, 1e-5, 1e3)
 
 
 def gram(A: Array, weights: Array, normals: list[Array]) -> Array:
@@ -191,11 +187,11 @@ def multipliers_step(
     """One Newton step of the proximal method of multipliers."""
     s = state
     step = newton_step(s.w, s.y, H, q, bounds, s.rho, s.sigma, A)
-    return multipliers_update(q, s, step, Constants.of(s.w.dtype).far)
+    return multipliers_update(q, s, step)
 
 
-def multipliers_update(q: Array, state: Multipliers, step: Newton, far: float) -> Multipliers:
-    """The state after a Newton step on φ; w stays where it would go beyond `far`.
+def multipliers_update(q: Array, state: Multipliers, step: Newton) -> Multipliers:
+    """The state after a Newton step on φ.
 
     Whenever φ is minimised the multipliers become ρ e; ρ grows tenfold if the violation has not
     fallen tenfold, and σ falls a hundredfold. "Minimised" is exact (`newton_step`), or the
@@ -209,9 +205,8 @@ def multipliers_update(q: Array, state: Multipliers, step: Newton, far: float) -
     new = jnp.where(done, s.rho * step.excess, s.y)
     violation = largest(new - s.y) / s.rho
     grow = done & (violation > 0.1 * s.before)
-    off = w > far
     return Multipliers(
-        jnp.where(off, s.w, step.w), new, jnp.where(done, new - s.y, s.change), step.w - s.w,
+        step.w, new, jnp.where(done, new - s.y, s.change), step.w - s.w,
         jnp.where(grow, jnp.minimum(10 * s.rho, constants.rho[1]), s.rho),
         jnp.where(done, jnp.maximum(s.sigma / 100, constants.sigma), s.sigma),
         jnp.where(done, violation, s.before), jnp.where(done, s.tolerance / 10, s.tolerance),

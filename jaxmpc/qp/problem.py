@@ -37,6 +37,10 @@ class QP:
     Balls: the last sum(balls) rows form blocks of balls[i] rows each, and block i asks
     |A_b z − l_b| ≤ radius_i, with l_b = u_b its centre. An ellipsoid {x: (x − c)'M(x − c) ≤ r²}
     is a ball in the rows L'x, M = LL'.
+
+    row_sizes (m,) ≥ 0: what tolerances of rows are relative to, beside the terms A_ij z_j; None: to
+    these alone. Where l and u are differences, such as limits less what the present state
+    contributes, the sizes of the limits belong here.
     """
 
     P: Any
@@ -47,6 +51,7 @@ class QP:
     soft_linear: Any = None
     soft_quadratic: Any = None
     radius: Any = None
+    row_sizes: Any = None
     balls: tuple[int, ...] = field(default=(), metadata={"static": True})
 
     @property
@@ -124,6 +129,11 @@ class QP:
                 fail(name, "holds a negative weight or NaN", "Penalties are ≥ 0; inf is a hard row")
         if self.soft_quadratic is not None:
             require_finite("soft_quadratic", self.soft_quadratic)
+        if self.row_sizes is not None:
+            require_shape("row_sizes", self.row_sizes, (m,), "One size for each row of A")
+            require_finite("row_sizes", self.row_sizes)
+            if concrete(self.row_sizes) and np.any(np.asarray(self.row_sizes) < 0):
+                fail("row_sizes", "holds a negative size", "Sizes are ≥ 0")
         self._validate_balls(m)
 
     def _validate_balls(self, m: int) -> None:

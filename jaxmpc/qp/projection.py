@@ -82,6 +82,15 @@ class Bounds:
         d = jnp.where(soft, jnp.abs(p - jnp.clip(p, self.l, self.u)), 0.0)
         return d * (jnp.where(soft, self.linear, 0.0) + 0.5 * self.quadratic * d)
 
+    def sizes(self) -> Array:
+        """Return what a violation of each row is compared with (m,): the larger of its finite ends,
+        in a ball the radius."""
+        sizes = [jnp.where(jnp.isfinite(v), jnp.abs(v), 0.0) for v in (self.l, self.u)]
+        found = jnp.maximum(*sizes)
+        for rows, radius in self.blocks():
+            found = found.at[rows].set(radius)
+        return found
+
     def slope(self, v: Array) -> Array:
         """Return by how much the penalty of each row at v (m,) grows with its violation: c + k d
         of soft rows that are violated, 0 of all others."""
@@ -197,6 +206,22 @@ class Bounds:
                 radius=new.radius.at[i].set(radius),
             )  # fmt: skip
         return new
+
+    def divided(self, unit: Array) -> "Bounds":
+        """Return what is asked of v/unit when this is asked of v, where the whole program is
+        measured in `unit`: multipliers, and with them L1 weights, are divided as v is."""
+        parts = {name: getattr(self, name) for name in ("l", "u", "linear", "radius")}
+        return replace(self, **{k: v if v is None else v / unit for k, v in parts.items()})
+
+    def widened(self, e: Array) -> "Bounds":
+        """Return the bounds that a v with the prox residual e (m,) of hard rows meets."""
+        blocks = self.blocks()
+        radius = self.radius
+        for i, (rows, _) in enumerate(blocks):
+            radius = radius.at[i].add(self._length(e[rows]))
+            e = e.at[rows].set(0.0)
+        l, u = self.l + jnp.minimum(e, 0.0), self.u + jnp.maximum(e, 0.0)
+        return replace(self, l=l, u=u, radius=radius)
 
     def _soft_slack(self, s: Array, rho: Any) -> Array:
         """Return d ≥ 0 (m,): how far prox(v) stays outside a soft row; s: signed distance of v."""

@@ -1,9 +1,16 @@
-"""Residuals of a primal-dual pair, judged against the rounding of their own terms.
+"""Residuals of a primal-dual pair, each judged relative to the size of its own entry.
 
-Residuals come in parts, those of rows (m,), of variables (n,) and the gap (1,), and with each,
-entry by entry, the sum of the absolute terms that it is a difference of: `residual_terms` for a QP,
-`mpc.stagewise.stage_residuals` for a problem stage by stage. Status and stopping are computed from
-these.
+Residuals come in parts, those of rows (m,), of variables (n,) and the gap (1,): `residual_terms`
+for a QP, `mpc.judge` for the plan of an MPC problem, `mpc.stages.stage_residuals` for a problem
+stage by stage. With each entry come two numbers in its own unit, so that neither the units of rows
+and variables nor that of the cost change what is said of a pair:
+
+    size    what the entry is compared with: the sums that it is a difference of;
+    terms   the absolute terms of these sums, which can be far larger: rounding is a share of them.
+
+A pair is solved where every entry is at most ε·size + floor·terms, with the floor at a few machine
+epsilons. Sums can all vanish: of a row z_j ≥ 0 at z_j = 0, nothing is left but rounding. So a small
+share of what is natural for the whole program is added to both (`Natural`).
 """
 
 from collections.abc import Callable, Sequence
@@ -22,8 +29,12 @@ from jaxmpc.qp.status import Status
 
 # Multiple of the rounding floor below which steps on ill-conditioned programs gain nothing.
 STALLED = 10
-# Parts of the residuals, each with the sizes of its terms.
-Terms = Sequence[tuple[Array, Array]]
+# Part of the tolerance below which one more step ends a search.
+NEAR = 1e-5
+# Share of what is natural for the whole program in the size of an entry.
+SHARE = 1e-3
+# Parts of the residuals: values, sizes and terms, as above.
+Terms = Sequence[tuple[Array, Array, Array]]
 
 
 class Products(NamedTuple):
@@ -37,36 +48,72 @@ class Products(NamedTuple):
     size_Aty: Array
 
     @classmethod
-    def of(cls, qp: QP, z: Array, y: Array, sizes: bool = True) -> "Products":
-        """Return the products of a pair z (n,), y (m,); sizes: False counts those of the absolute
-        values as 0."""
+    def of(cls, qp: QP, z: Array, y: Array) -> "Products":
+        """Return the products of a pair z (n,), y (m,)."""
         multiply = lambda z, y, P, A: (matmul(z, A.T), matmul(z, P), matmul(y, A))
-        products = multiply(z, y, qp.P, qp.A)
-        if not sizes:
-            return cls(*products, *map(jnp.zeros_like, products))
-        return cls(*products, *multiply(*map(jnp.abs, (z, y, qp.P, qp.A))))
+        sizes = multiply(*map(jnp.abs, (z, y, qp.P, qp.A)))
+        return cls(*multiply(z, y, qp.P, qp.A), *sizes)
 
 
-def residual_terms(qp: QP, z: Array, y: Array, sizes: bool = True) -> Terms:
-    """Return the residuals of rows (m,), variables (n,) and the gap (1,), each with the sizes,
-    entry by entry, of the terms that they are differences of: rounding is a share of these. sizes:
-    False underestimates them, at half the cost."""
-    return terms_of(qp.q, qp.bounds, z, y, Products.of(qp, z, y, sizes))
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Natural:
+    """What is natural for the whole program, for rows (m,), variables (n,) and the gap: sizes, and
+    the terms of rows and variables.
+
+    In ADMM's coordinates z = T w, in which the Hessian is the identity, the solution is
+    w = −q_w − A_w'y: its length is a size, that of q_w one of terms. A row a of scale E = 1/|T'a|
+    grows by 1/E along a unit of length, and a gradient of size 1/Σ_k |T_jk| in every z_j is at most
+    one of w.
+    """
+
+    rows: Any = 0.0
+    variables: Any = 0.0
+    gap: Any = 0.0
+    row_terms: Any = 0.0
+    variable_terms: Any = 0.0
 
 
-def terms_of(q: Array, bounds: Bounds, z: Array, y: Array, products: Products) -> Terms:
-    """Return `residual_terms` from the products with the matrices."""
+def residual_terms(qp: QP, z: Array, y: Array, natural: Natural | None = None) -> Terms:
+    """Return the residuals of rows (m,), variables (n,) and the gap (1,) of a pair."""
+    products = Products.of(qp, z, y)
+    return terms_of(qp.q, qp.bounds, qp.row_sizes, z, y, products, natural or Natural())
+
+
+def row_sizes(Az: Any, known: Any, natural: Natural) -> Array:
+    """Return what violations of rows are compared with (m,). known: `QP.row_sizes`."""
+    sizes = jnp.abs(Az) + SHARE * natural.rows
+    return sizes if known is None else sizes + known
+
+
+def terms_of(
+    q: Array, bounds: Bounds, known: Any, z: Array, y: Array, products: Products, natural: Natural
+) -> Terms:
+    """Return `residual_terms` from the products with the matrices. known: `QP.row_sizes`."""
     Az, Pz, Aty, *sizes = products
+    size = jnp.abs
     penalty, support = bounds.cost(Az), bounds.support(y)
-    gap = jnp.sum(z * (Pz + q)) + jnp.sum(penalty + support)
+    curved, along = jnp.sum(z * Pz), jnp.sum(z * q)
+    paid, conjugate = jnp.sum(penalty), jnp.sum(support)
     # A penalty is a multiple of a violation, which is a difference of the terms of its row.
-    size = jnp.sum(jnp.abs(z) * (jnp.abs(Pz) + jnp.abs(q)))
-    size = size + jnp.sum(bounds.slope(Az) * sizes[0] + penalty + jnp.abs(support))
+    terms = jnp.sum(jnp.abs(z) * (jnp.abs(Pz) + jnp.abs(q)))
+    terms = terms + jnp.sum(bounds.slope(Az) * sizes[0] + penalty + jnp.abs(support))
     return [
-        (bounds.violation(Az), sizes[0]),
-        (Pz + q + Aty, sizes[1] + jnp.abs(q) + sizes[2]),
-        (gap[None], size[None]),
-    ]
+        (
+            bounds.violation(Az), row_sizes(Az, known, natural),
+            sizes[0] + natural.row_terms,
+        ),
+        (
+            Pz + q + Aty, size(Pz) + size(q) + size(Aty) + SHARE * natural.variables,
+            sizes[1] + size(q) + sizes[2] + natural.variable_terms,
+        ),
+        tuple(
+            v[None] for v in (
+                curved + along + paid + conjugate,
+                size(curved) + size(along) + paid + size(conjugate) + SHARE * natural.gap, terms,
+            )
+        ),
+    ]  # fmt: skip
 
 
 def residuals(qp: QP, z: Array, y: Array) -> tuple[Array, Array, Array]:
@@ -77,27 +124,32 @@ def residuals(qp: QP, z: Array, y: Array) -> tuple[Array, Array, Array]:
     g*(y) = Σ u y⁺ − l y⁻ + … (`Bounds.support`). A multiplier that is not admissible (a push
     against an absent bound) must be made so before.
     """
-    primal, dual, gap = (_largest(jnp.abs(values)) for values, _ in residual_terms(qp, z, y))
+    primal, dual, gap = (_largest(jnp.abs(values)) for values, *_ in residual_terms(qp, z, y))
     return primal, dual, gap
 
 
-def joined(terms: Terms) -> tuple[Array, Array]:
-    """Return all residuals as one vector (m + n + 1,), and their sizes as another."""
-    values, sizes = zip(*terms, strict=True)
-    return jnp.concatenate(values), jnp.concatenate(sizes)
+def joined(terms: Terms) -> tuple[Array, Array, Array]:
+    """Return all residuals as one vector (m + n + 1,), their sizes as another, and the terms."""
+    values, sizes, terms = zip(*terms, strict=True)
+    return jnp.concatenate(values), jnp.concatenate(sizes), jnp.concatenate(terms)
 
 
 def worst(terms: Terms, floor: Any) -> tuple[Array, Array]:
-    """Return the largest of the residuals, each less floor·(size of its terms), and the largest
-    relative to 1 + that size; inf where one is NaN."""
-    absolute, relative = [], []
-    for values, sizes in terms:
+    """Return the largest of the residuals, each less floor·terms, relative to its size, and the
+    largest relative to size and terms; 0/0 is 0, and inf where one is NaN."""
+
+    def ratio(error: Array, size: Array) -> Array:
+        known = jnp.isfinite(size) & (size > 0)
+        none = jnp.where(error > 0, jnp.inf, 0.0)
+        return _largest(jnp.where(known, error / jnp.where(known, size, 1.0), none))
+
+    above, relative = [], []
+    for values, sizes, own in terms:
         # A maximum need not propagate NaN (XLA on CPUs).
         error = jnp.where(jnp.isfinite(values), jnp.abs(values), jnp.inf)
-        sizes = jnp.where(jnp.isfinite(sizes), sizes, 0.0)
-        absolute.append(_largest(error - floor * sizes))
-        relative.append(_largest(error / (1 + sizes)))
-    return _largest_of(absolute), _largest_of(relative)
+        above.append(ratio(error - floor * (sizes + own), sizes))
+        relative.append(ratio(error, sizes + own))
+    return _largest_of(above), _largest_of(relative)
 
 
 def _largest(v: Array) -> Array:
@@ -114,9 +166,8 @@ def _largest_of(numbers: list[Array]) -> Array:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Measured:
-    """Primal residual, dual residual and gap of a pair, and whether each entry is at most its
-    tolerance: eps (2,) holds the absolute one and that relative to the size of the terms, to which
-    `floor` is added."""
+    """Primal residual, dual residual and gap of a pair, in the units of the problem, and whether
+    each entry is at most eps·size + floor·terms."""
 
     primal: Array
     dual: Array
@@ -126,17 +177,16 @@ class Measured:
     @classmethod
     def of(cls, terms: Terms, eps: Any, floor: float) -> "Measured":
         """Return the residuals with these terms, measured."""
-        primal, dual, gap = (_largest(jnp.abs(values)) for values, _ in terms)
-        above, _ = worst(terms, eps[1] + floor)
-        return cls(primal, dual, gap, above <= eps[0])
+        primal, dual, gap = (_largest(jnp.abs(values)) for values, *_ in terms)
+        return cls(primal, dual, gap, worst(terms, floor)[0] <= eps)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Pair:
     """Primal z and dual y in the units of the problem, what was measured of them, the largest of
-    their residuals, each relative to the size of its terms, whether all are small, and whether
-    there is no more to gain."""
+    their residuals, each less its rounding and relative to its size, whether all are small, and
+    whether there is no more to gain."""
 
     z: Array
     y: Array
@@ -157,10 +207,9 @@ class Pair:
     def of(
         cls, z: Array, y: Array, terms: Terms, eps: Array, floor: float, others: Terms = ()
     ) -> "Pair":
-        """Return the pair judged; eps (2,) and floor as in `Measured`. near: all residuals are
-        below a thousandth of their tolerance, or below a tenth and a small multiple of their
-        rounding; solved: below a millionth of the absolute one. others: terms that count for these
-        alone."""
+        """Return the pair judged; eps and floor as in `Measured`. near: all residuals are below a
+        small part of their tolerance (NEAR), or below a tenth and a small multiple of their
+        rounding; solved: below a tenth of that part. others: terms that count for these alone."""
         return cls(z, y, *judgment(terms, eps, floor, others))
 
     def or_better(self, other: "Pair") -> "Pair":
@@ -177,20 +226,21 @@ def judgment(
     terms: Terms, eps: Any, floor: float, others: Terms = ()
 ) -> tuple[Measured, Array, Array, Array]:
     """Return what `Pair.of` says of the terms: the last four fields of the pair."""
-    above, relative = worst([*terms, *others], floor + 1e-3 * eps[1])
-    at_rounding = (relative <= STALLED * floor) & (above <= 0.1 * eps[0])
-    near = (above <= 1e-3 * eps[0]) | at_rounding
-    return Measured.of(terms, eps, floor), relative, near, above <= 1e-6 * eps[0]
+    above, relative = worst([*terms, *others], floor)
+    at_rounding = (relative <= STALLED * floor) & (above <= 0.1 * eps)
+    near = (above <= NEAR * eps) | at_rounding
+    return Measured.of(terms, eps, floor), above, near, above <= 0.1 * NEAR * eps
 
 
 def assess(
-    terms: Callable[..., Terms], data: tuple, z: Array, y: Array, proof: Proof, eps: Any
-) -> QPSolution:
-    """Return the solution (z, y) with the status that its residuals, terms(*data, z, y) in float64,
-    and the proofs give it; without its cost and count of iterations."""
+    terms: Callable[..., Terms], data: tuple, z: Array, y: Array, proof: Proof, eps: Any,
+    **more: Any,
+) -> QPSolution:  # fmt: skip
+    """Return the solution (z, y) with the status that its residuals, terms(*data, z, y, **more) in
+    float64, and the proofs give it; without its cost and count of iterations."""
     dtype, floor = z.dtype, rounding(z.dtype)
-    measure = lambda data, z, y, eps: Measured.of(terms(*data, z, y), eps, floor)
-    return concluded(precisely(measure, data, z, y, jnp.asarray(eps, dtype)), z, y, proof)
+    measure = lambda data, z, y, eps, more: Measured.of(terms(*data, z, y, **more), eps, floor)
+    return concluded(precisely(measure, data, z, y, jnp.asarray(eps, dtype), more), z, y, proof)
 
 
 def concluded(measured: Measured, z: Array, y: Array, proof: Proof) -> QPSolution:

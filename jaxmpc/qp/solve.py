@@ -21,7 +21,6 @@ from jaxmpc.qp.admm import (
     harmless_matrices,
     iterate,
     read,
-    scaled,
     scaled_rows,
     splittings,
     start,
@@ -31,20 +30,18 @@ from jaxmpc.qp.admm_kernel import iterate_batch, suits
 from jaxmpc.qp.batches import in_blocks
 from jaxmpc.qp.certificate import Proof, correcting_rows, prove
 from jaxmpc.qp.derivative import dense_conditions, implicit
-from jaxmpc.qp.newton import (
-    Constants,
-    multipliers_start,
-    multipliers_step,
-)
+from jaxmpc.qp.newton import multipliers_start, multipliers_step
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.refine import Program, by_the_dual, improve, unrounded
 from jaxmpc.qp.residuals import (
+    Pair,
     assess,
     concluded,
     marked,
     residual_terms,
+    row_sizes,
     worst,
 )
 from jaxmpc.qp.status import Status
@@ -64,7 +61,8 @@ def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: Any = None) -> QPSoluti
     and above are infinite.
     warm_start: a (z, y) pair or an earlier QPSolution. The status comes from residuals in the
     units of `qp` (see `ADMM.eps`), computed in float64 even for float32 data, or from a
-    certificate (`certificate.py`). z, y and cost are differentiable with respect to every array
+    certificate (`certificate.py`); of float32 data it speaks of the float64 pair that was found,
+    which is then rounded. z, y and cost are differentiable with respect to every array
     of `qp`, forward and reverse, for every status (`derivative.py`); an instance with NON_FINITE
     data has derivative zero. Raises ValueError for bad shapes and, where values can be read, bad
     values.
@@ -145,19 +143,16 @@ def solve_from(
     qp: QP, factor: Factor, solver: ADMM, y: Array, steps: int
 ) -> tuple[QPSolution, Array]:
     """`solve_factored` by `steps` steps on the dual from multipliers y (m,) in ADMM's coordinates:
-    SOLVED, or ITERATION_LIMIT, at once where y is not finite. Multipliers of the solution need no
-    step. For hard rows, without balls, in float64; not differentiable."""
+    SOLVED, or ITERATION_LIMIT, at once where y is not finite. Without a step, for multipliers of
+    the solution, the status is yet to be judged: ITERATION_LIMIT. For hard rows, without balls, in
+    float64; not differentiable."""
     clean, fault = cleaned(qp, factor.fault)
-    q, bounds = scaled(factor, clean)
-    eps, proof = tolerance(solver, qp.q.dtype), Proof.none(q, bounds.l)
-    usable = jnp.all(jnp.isfinite(y))
-    y = bounds.admissible(jnp.where(usable, y, 0.0))
+    p = Program.of(clean, factor, tolerance(solver, qp.q.dtype))
+    proof, usable = Proof.none(p.q, p.bounds.l), jnp.all(jnp.isfinite(y))
+    y = p.bounds.admissible(jnp.where(usable, y / p.unit, 0.0))
     if not steps:
-        z, y = unscaled(clean, factor, -q - matmul(y, factor.A), y)
-        # Most pairs need no allowance for rounding; those that do are judged again by the others.
-        strictly = partial(residual_terms, sizes=False)
-        return assess(strictly, (clean,), z, y, proof, eps), fault
-    p = Program(clean, factor, q, bounds, eps, Constants.of(qp.q.dtype).far)
+        pair = unscaled(clean, factor, p.unit, -p.q - matmul(y, factor.A), y)
+        return concluded(Pair.none(*pair).measured, *pair, proof), fault
     pair, _ = by_the_dual(p, y, usable & ~factor.flat, steps)
     return concluded(pair.measured, pair.z, pair.y, proof), fault
 
@@ -165,10 +160,11 @@ def solve_from(
 def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = True) -> QPSolution:
     """Return the solution of clean data by ADMM and Newton steps, with its status, without its cost
     and count of iterations. whole: see `in_two_parts`."""
-    q, bounds = scaled(factor, qp)
+    p = Program.of(qp, factor, tolerance(solver, qp.q.dtype))
+    q, bounds, unit, eps = p.q, p.bounds, p.unit, p.eps
     t = jnp.zeros_like(qp.l)
     if warm_start is not None:
-        t = warm(factor, qp, bounds, warm_start)
+        t = warm(factor, qp, unit, bounds, warm_start)
     unrolled, refine = solver.differentiate == "unrolled", solver.newton_steps()
     rough = "float32" if refine and not unrolled else qp.q.dtype
     dtype = jnp.dtype(rough if solver.dtype is None else solver.dtype)
@@ -186,27 +182,25 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = 
     (w, y), (w_old, y_old) = cast(
         run(*arguments) if unrolled else in_blocks(run, *arguments, kernel=kernel), qp.q.dtype
     )
-    eps = tolerance(solver, qp.q.dtype)
     begin = replace(multipliers_start(q, w, y), change=y - y_old, move=w - w_old)
     if refine and not unrolled:
-        p = Program(qp, factor, q, bounds, eps, Constants.of(qp.q.dtype).far)
         single, method = qp.q.dtype != jnp.float64, partial(improve, refine, solver.fixed, whole)
         polish = lambda p, begin: method(unrounded(p) if single else p, begin)
-        best, proof, ended = precisely(polish, p, begin)
+        best, proof, ended, idle = precisely(polish, p, begin)
         found = concluded(best.measured, best.z, best.y, proof)
-        if single:  # What was measured of float64 numbers need not hold for these in float32.
-            found = assess(residual_terms, (qp,), best.z, best.y, proof, eps)
-        status = jnp.where(ended, found.status, jnp.int32(Status.ITERATION_LIMIT))
-        return replace(found, status=status)
-    pair, end = unscaled(qp, factor, w, y), begin
+        open_ = found.status == Status.ITERATION_LIMIT
+        status = jnp.where(open_ & idle, jnp.int32(Status.INACCURATE), found.status)
+        return replace(found, status=jnp.where(ended, status, jnp.int32(Status.ITERATION_LIMIT)))
+    pair, end = unscaled(qp, factor, unit, w, y), begin
     if refine:
         advance = lambda s, _: (multipliers_step(factor.H, q, factor.A, bounds, s), None)
         end = lax.scan(advance, begin, length=refine)[0]
-        pair = better(qp, pair, unscaled(qp, factor, end.w, end.y))
-    correcting = correcting_rows(qp)
-    proof = prove(qp, factor.T, factor.E, correcting, end.change, end.move)
-    proof = proof.joined(prove(qp, factor.T, factor.E, correcting, end.y, end.w))
-    return assess(residual_terms, (qp,), *pair, proof, eps)
+        pair = better(qp, pair, unscaled(qp, factor, unit, end.w, end.y))
+    sizes = p.natural(end.w, end.y)
+    allowed = eps * row_sizes(0.0, qp.row_sizes, sizes)
+    certified = partial(prove, qp, factor.T, factor.E, correcting_rows(qp), allowed)
+    proof = certified(end.change, end.move).joined(certified(end.y, end.w))
+    return assess(residual_terms, (qp,), *pair, proof, eps, natural=sizes)
 
 
 def loop(iterations: int, constants: tuple, data: tuple) -> list[tuple[Array, Array]]:
@@ -272,12 +266,12 @@ def cleaned(qp: QP, matrix_fault: Array) -> tuple[QP, Array]:
     return replace(qp, P=P, A=A, **fields), fault
 
 
-def warm(factor: Factor, qp: QP, bounds: Bounds, warm_start: Any) -> Array:
+def warm(factor: Factor, qp: QP, unit: Array, bounds: Bounds, warm_start: Any) -> Array:
     """Return t (m,) of a warm start, a pair z (n,), y (m,) or a solution; what is not finite counts
-    as 0. Raises ValueError for other shapes."""
+    as 0. bounds: in ADMM's coordinates, which are measured in `unit`. Raises ValueError for other shapes."""
     z, y = require_warm_start(qp, warm_start)
     clean = lambda v: jnp.nan_to_num(jnp.asarray(v, qp.q.dtype), posinf=0.0, neginf=0.0)
-    return start(bounds, factor.rho[0], *scaled_rows(factor, qp, clean(z), clean(y)))
+    return start(bounds, factor.rho[0], *scaled_rows(factor, qp, unit, clean(z), clean(y)))
 
 
 def require_warm_start(qp: QP, warm_start: Any) -> tuple[Any, Any]:
@@ -310,6 +304,5 @@ def value(qp: QP, z: Array, y: Array) -> Array:
 
 
 def tolerance(solver: ADMM, dtype: Any) -> Array:
-    """Return the absolute and the relative tolerance (2,) that `solver` asks for."""
-    eps = (1e-6 if dtype == jnp.float64 else 1e-3) if solver.eps is None else solver.eps
-    return jnp.stack([jnp.asarray(v, dtype) for v in (eps, solver.eps_rel)])
+    """Return the relative tolerance that `solver` asks for."""
+    return jnp.asarray(solver.eps, dtype)

@@ -5,7 +5,9 @@ from enum import IntEnum
 
 class Status(IntEnum):
     """Outcome of one QP, or label of one state of a map. 1 to 9 are OSQP's numbers; 0 marks
-    instances that have not been solved yet.
+    instances that have not been solved yet. ITERATION_LIMIT: all steps were taken, and the last
+    ones still gained; INACCURATE: steps were left or gained nothing more, and the tolerance is not
+    met.
 
     A status is derived from residuals and certificates that are computed in the units of
     the problem as given, never from the fact that a loop came to its end.
@@ -13,6 +15,7 @@ class Status(IntEnum):
 
     NOT_RUN = 0
     SOLVED = 1
+    INACCURATE = 2
     PRIMAL_INFEASIBLE = 3
     DUAL_INFEASIBLE = 5
     ITERATION_LIMIT = 7
@@ -28,6 +31,10 @@ class Status(IntEnum):
 _SENTENCES = {
     Status.NOT_RUN: "Not run yet.",
     Status.SOLVED: "Solved: primal residual, dual residual and gap are within tolerance.",
+    Status.INACCURATE: (
+        "Not solved to the tolerance, and further steps gain nothing: rounding stops them. Compute "
+        "in float64; let a long unstable prediction have prestabilise=True; or allow a larger eps."
+    ),
     Status.PRIMAL_INFEASIBLE: (
         "No point satisfies the constraints; a Farkas vector proves it. "
         "Relax a limit, lengthen the horizon or soften rows."
@@ -37,8 +44,8 @@ _SENTENCES = {
         "Add a cost or a bound on that ray."
     ),
     Status.ITERATION_LIMIT: (
-        "Neither solved nor proved infeasible within the fixed iterations. "
-        "Raise iterations or refine, or compute in float64."
+        "Neither solved nor proved infeasible within all steps, the last of which still gained. "
+        "Raise refine, or iterations where refine is 0."
     ),
     Status.NON_CONVEX: (
         "The Hessian of the cost has a negative eigenvalue beyond rounding. "

@@ -24,7 +24,7 @@ from jax import Array
 from jaxmpc.compiled import Compiled, first_rows, padded
 from jaxmpc.devices import Devices, divisible, over_devices
 from jaxmpc.mpc.condense import Condensed
-from jaxmpc.qp.admm import ADMM, factor, iterate, read, scaled, splittings, unscaled
+from jaxmpc.qp.admm import ADMM, factor, iterate, natural, read, scaled, splittings, unscaled
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.residuals import joined, marked, residual_terms
 from jaxmpc.qp.solve import solve_factored, warm
@@ -74,20 +74,23 @@ class PenaltyObjective:
         rho, alpha = jnp.exp(theta["log_rho"] @ self.W.T), 2 * jax.nn.sigmoid(theta["alpha"])
         solver, c = replace(self.solver, rho=rho, alpha=alpha), self.condensed
         made = factor(c.P, c.C, solver, c.balls)
-        eps = 1e-6 if solver.eps is None else solver.eps
+        eps = solver.eps
 
         def one(sample: Samples) -> Array:
             qp = self.qp(sample.x)
-            q, bounds = scaled(made, qp)
+            q, bounds, unit = scaled(made, qp)
             t = jnp.zeros_like(qp.l)
             if sample.start is not None:
-                t = warm(made, qp, bounds, sample.start)
+                t = warm(made, qp, unit, bounds, sample.start)
             t, _ = iterate(splittings(made, q), bounds, t, solver.admm_steps(), solver.alpha)
-            z, y = unscaled(qp, made, *read(made, t, q, bounds))
+            w, y = read(made, t, q, bounds)
+            sizes = natural(made, unit, q, bounds, w, y)
+            z, y = unscaled(qp, made, unit, w, y)
             floor = 100 * jnp.finfo(z.dtype).eps
             # A quarter of the rounding stays, for the sake of the logarithm's slope at 0.
-            values, sizes = joined(residual_terms(qp, z, y))
-            squares = jnp.sum((values / (eps + floor * sizes)) ** 2)
+            values, sizes, terms = joined(residual_terms(qp, z, y, natural=sizes))
+            allowed = eps * sizes + floor * (sizes + terms)
+            squares = jnp.sum((values / jnp.where(allowed > 0, allowed, 1.0)) ** 2)
             return 0.5 * jnp.log10((floor / 4) ** 2 + squares)
 
         return jax.vmap(one)(samples)
