@@ -23,7 +23,7 @@ RAY = 25
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Proof:
     """A Farkas vector and a descent ray, and whether they are proved to be."""
 

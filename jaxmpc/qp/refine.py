@@ -40,7 +40,7 @@ from jaxmpc.qp.triton import has_kernels, in_one_program, indices
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Program:
     """A program in its own units and, as `q` (n,) and `bounds`, in ADMM's coordinates; eps: the
     tolerances (2,); far: bound on |w|, beyond which steps are rejected (the program looks
@@ -112,7 +112,7 @@ def judge_in_one_program(
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Search:
     """Loop state of one instance: the point of the method of multipliers; q (n,) corrected by what
     rounding leaves of the gradient; the best pair so far; Newton steps taken; what is proved;
@@ -161,7 +161,7 @@ def improve(
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Correction:
     """Loop state of one instance whose dual steps leave residuals: its point, the gradient of its
     Lagrangian in w (n,), the best pair so far, the corrections made, and whether to go on."""

@@ -112,7 +112,7 @@ def _largest_of(numbers: list[Array]) -> Array:
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Measured:
     """Primal residual, dual residual and gap of a pair, and whether each entry is at most its
     tolerance: eps (2,) holds the absolute one and that relative to the size of the terms, to which
@@ -132,7 +132,7 @@ class Measured:
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pair:
     """Primal z and dual y in the units of the problem, what was measured of them, the largest of
     their residuals, each relative to the size of its terms, whether all are small, and whether
