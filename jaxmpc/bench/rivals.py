@@ -28,7 +28,7 @@ Answers = tuple[np.ndarray, np.ndarray, np.ndarray]
 Call = Callable[[], Answers]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Batch:
     """QPs that share P (nz, nz) and A (rows, nz): q (B, nz), l and u (B, rows)."""
 

@@ -15,13 +15,14 @@ from jaxmpc.closed_loop.robot_mpc import robot_mpc
 from jaxmpc.control.system import as_weight
 from jaxmpc.control.violation import TOLERANCE, worst_violation
 from jaxmpc.mpc.plan import limited
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.precision import matmul
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
+@dataclass(frozen=True, eq=False)
 class EnvironmentState:
     """The state of an episode: a pytree, with batch axes in front under `jax.vmap`.
 
@@ -45,7 +46,7 @@ class EnvironmentState:
         return self.terminated | self.truncated
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True, eq=False)
 class Environment:
     """A robot that has to reach a target from random starts; made by `Environment.of`.
@@ -143,7 +144,7 @@ class Environment:
         )  # fmt: skip
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True, eq=False)
 class MPCPolicy:
     """A controller as a policy: `policy(observation) -> action`, a pure function.

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -11,10 +10,12 @@ from jax import Array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.mpc.plan import limited
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.precision import floating_dtype, matmul
 from jaxmpc.qp.status import Status
 
 
+@named_pytree
 class NoPlan(NamedTuple):
     """The plan of a law without plans: cost NaN, status NOT_RUN, no slack."""
 
@@ -23,7 +24,7 @@ class NoPlan(NamedTuple):
     slack: Array
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True, eq=False)
 class LinearFeedback:
     """The law u = clip(s + K (ξ − r)): linear state feedback inside the input limits of `mpc`.

@@ -9,11 +9,12 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import concrete, fail, require_finite, require_real, require_symmetric_psd
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import eigh
-from jaxmpc.qp.precision import arrays, matmul
+from jaxmpc.qp.precision import arrays, matmul, symmetric
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True, eq=False)
 class Noise:
     """White Gaussian noise of a closed loop: ξ_{t+1} = f(ξ_t, u_t) + w_t, y_t = C ξ_t + v_t.
@@ -101,7 +102,7 @@ def covariance(spread: Any, size: int) -> Any:
     xp = np if concrete(spread) else jnp
     spread = xp.asarray(spread)
     if spread.ndim == 2:
-        return spread
+        return symmetric(spread)
     return xp.diag(xp.broadcast_to(spread, (size,)) ** 2)
 
 
@@ -109,5 +110,5 @@ def _scaled(draws: Array, spread: Array) -> Array:
     """Return standard normal draws (T, k) with this spread."""
     if spread.ndim < 2:
         return draws * spread
-    variances, axes = eigh(spread)  # no Cholesky factor: covariances may be singular
+    variances, axes = eigh(symmetric(spread))  # no Cholesky factor: covariances may be singular
     return matmul(draws * jnp.sqrt(jnp.maximum(variances, 0)), axes.T)

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -12,12 +11,14 @@ from jaxmpc.checks import concrete, fail, require_finite, require_kind, require_
 from jaxmpc.closed_loop.noise import covariance, require_spread, whole_array
 from jaxmpc.control.riccati import least_reached, lqr
 from jaxmpc.control.system import LinearSystem
+from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import matmul
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
 
 
+@named_pytree
 class Belief(NamedTuple):
     """An estimate ξ̂ (n,), and the covariance (n, n) of its error; None with a constant gain."""
 
@@ -25,7 +26,7 @@ class Belief(NamedTuple):
     covariance: Array | None
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True, eq=False)
 class KalmanFilter:
     """Kalman filter of a model ξ⁺ = f(ξ, u) + w with outputs y = C ξ + v, w and v white.

@@ -15,7 +15,7 @@ from jaxmpc.qp.status import Status
 from jaxmpc.reals import Reals
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Outcome:
     """What B closed loops of T samples achieved, from their states and inputs, in float64.
 

@@ -18,6 +18,7 @@ from jaxmpc.mpc.rows import layout
 from jaxmpc.mpc.soften import soften
 from jaxmpc.mpc.sqp import solve_nonlinear
 from jaxmpc.mpc.stagewise import factor_stages, solve_stagewise
+from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT
 from jaxmpc.qp.precision import arrays, floating_dtype
 from jaxmpc.robots.linear import LinearPlant
@@ -65,11 +66,11 @@ class RobotController:
     robot: Any
     mpc: MPC
     solver: ADMM
-    linearize: str
-    exact: bool
+    linearize: str = field(metadata={"static": True})
+    exact: bool = field(metadata={"static": True})
     penalty: Any
     tasks: tuple[Task, ...]
-    sqp_steps: int
+    sqp_steps: int = field(metadata={"static": True})
     soft: Any = field(init=False)
     fixed: Controller | None = field(init=False)
     scale: Any = field(init=False)
@@ -213,19 +214,4 @@ def prepared(
     return {"soft": arrays(soft), "fixed": None, "scale": scale}
 
 
-STATIC = ("linearize", "exact", "sqp_steps")
-LEAVES = ("robot", "mpc", "solver", "penalty", "tasks", "soft", "fixed", "scale")
-
-
-def _flatten(controller: RobotController) -> tuple[tuple, tuple]:
-    values = controller.__dict__
-    return tuple(values[name] for name in LEAVES), tuple(values[name] for name in STATIC)
-
-
-def _unflatten(static: tuple, leaves: tuple) -> RobotController:
-    controller = object.__new__(RobotController)
-    controller.__dict__.update(zip((*LEAVES, *STATIC), (*leaves, *static), strict=True))
-    return controller
-
-
-jax.tree_util.register_pytree_node(RobotController, _flatten, _unflatten)
+prepared_pytree(RobotController)

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.status import Status
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
+@dataclass(frozen=True, eq=False)
 class Run:
     """A closed loop of T samples: x_{t+1} = plant(x_t, u_t) + w_t, u_t the first input of a plan
     (with a delay, of the plan one sample earlier).

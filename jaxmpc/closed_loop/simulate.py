@@ -172,7 +172,7 @@ def _simulate(
 ) -> Run:  # fmt: skip
     plant = plant.plant if isinstance(plant, ConstantPlant) else plant
     mpc = controller.mpc
-    N, Q, R = mpc.horizon, jnp.asarray(mpc.Q, x0.dtype), jnp.asarray(mpc.R, x0.dtype)
+    N, (Q, R, *_) = mpc.horizon, mpc.weights(x0.dtype)
     tolerance = SLACK[x0.dtype.name]
     square = lambda v, W: jnp.sum(v * matmul(W, v))
     ahead_by = delay if compensate else 0

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Literal, overload
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
@@ -28,6 +27,7 @@ from jaxmpc.control.geometry import maximise, unit_rows
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem, host_array, host_matrices
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import cholesky, eigh, solve_triangular
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 from jaxmpc.reals import Reals
@@ -189,7 +189,7 @@ def predecessor(
     return step.back(_polytope("target", target, step.n), *X)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ControlInvariantSet(Polytope):
     """{H x <= h}, a set that some admissible input never lets the state leave.
@@ -484,7 +484,7 @@ def supports(W: Box | Polytope | None, rows: np.ndarray) -> np.ndarray:
     return -host_array("disturbance", limits)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OneStep:
     """x+ = A x + B u + c + w with u in U, w in W.
 

@@ -14,7 +14,7 @@ from jaxmpc.reals import Reals
 Limit = float | Reals | tuple[Reals, Reals] | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class JointLimits:
     """Limits of n joints with the state x = (q, dq) in R^2n and the torques u in R^n.
 

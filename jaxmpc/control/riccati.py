@@ -12,6 +12,7 @@ from jax import Array
 
 from jaxmpc.checks import concrete, fail, require_kind, require_shape, require_symmetric_psd
 from jaxmpc.control.system import LinearSystem, as_weight, host_array
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import solve, solve_general
 from jaxmpc.qp.precision import arrays, floating_dtype, in_float64, matmul
 from jaxmpc.reals import Reals
@@ -24,7 +25,7 @@ _DOUBLINGS = 40
 _RESIDUAL = 1e-6
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True, eq=False)
 class LQR:
     """The optimal law u = K x and its cost x'P x.

@@ -46,13 +46,14 @@ from jaxmpc.control.geometry import (
 )
 from jaxmpc.control.geometry import irredundant as _irredundant
 from jaxmpc.control.system import as_array, dimensions, host_array, store_floats
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import solve
 from jaxmpc.reals import Reals
 
 __all__ = ["Box", "Ellipsoid", "Optimum", "Polytope", "hull_volume", "maximise", "unit_rows"]
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True, eq=False)
 class Box:
     """{x in R^n : lower <= x <= upper}, elementwise.
@@ -200,7 +201,7 @@ class Box:
         return lower, upper
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True, eq=False)
 class Polytope:
     """{x in R^n : H x <= h}.
@@ -531,7 +532,7 @@ class Polytope:
         return Y, centre, 1 / np.abs(Y).max(axis=0)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True, eq=False)
 class Ellipsoid:
     """{x in R^n : x'P x <= level}, centred at the origin.

@@ -11,6 +11,7 @@ import numpy as np
 import scipy
 
 from jaxmpc.checks import concrete, fail, require_finite, require_real, require_shape
+from jaxmpc.pytrees import pytree
 from jaxmpc.reals import Reals
 
 
@@ -94,7 +95,7 @@ def require_period(argument: str, dt: Any) -> None:
         fail(argument, f"{dt!r} is not a positive number", "Give the sampling period in seconds")
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True, eq=False)
 class LinearSystem:
     """x+ = A x + B u + c, with x in R^n and u in R^m.

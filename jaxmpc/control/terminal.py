@@ -228,7 +228,7 @@ def verify_terminal(
     return TerminalReport(tuple(checks), gain, certificate, factor, exact)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Rows:
     """{G x <= g}, rows of norm 1; no rows for all of R^n."""
 
@@ -269,7 +269,7 @@ class _Rows:
         return np.where(width > _TOUCH * width.max(initial=0.0), width, 1.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Ellipse:
     """{x'P x <= level}."""
 

@@ -35,7 +35,7 @@ NEWTON_STEPS = 8
 NEWTON_ROUNDS = 8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StagePenalties:
     """Penalties of the ADMM stage: weight (R,) of the constraint rows, the root of ADMM's rho, and
     the over-relaxation alpha. No proof depends on them: they influence which points this stage
@@ -46,7 +46,7 @@ class StagePenalties:
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Verdict:
     """What was proved of one point, and the proof.
 

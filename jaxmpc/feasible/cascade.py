@@ -47,7 +47,7 @@ ON_DEVICE = 2**31
 SAMPLE = 4096
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scope:
     """What the labels of a part take from all points together.
 

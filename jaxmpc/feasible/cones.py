@@ -52,7 +52,7 @@ MANY = 2**18
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cones:
     """Cones about center (d,): M (F, d, d) and gauge (F, d) of each, the least λ_i and the largest
     gauge (F,) of points that are labelled; inputs and, in a projection, free states value + slope_i

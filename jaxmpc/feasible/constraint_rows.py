@@ -20,7 +20,7 @@ from jaxmpc.qp.projection import Bounds
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ConstraintRows:
     """Rows of the condensed constraints: lower ≤ (U w)_i + D_i θ ≤ upper, i = 1..R.
 

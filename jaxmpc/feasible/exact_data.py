@@ -17,7 +17,7 @@ from jaxmpc.mpc.rows import blocks as row_blocks
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ExactData:
     """The hard constraints of an MPC problem as float64 arrays: exact data for proofs.
 
@@ -65,7 +65,7 @@ class ExactData:
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Equalities:
     """Rows with lower = upper which inputs can keep all at once, and how.
 

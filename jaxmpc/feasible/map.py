@@ -72,7 +72,7 @@ def count_labels(label: np.ndarray, status: np.ndarray) -> dict[str, int]:
     }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FeasibleSetMap:
     """Points of a state space, each with its label and the proof of it (see `Labels`).
 

@@ -44,7 +44,7 @@ def feasible_polytope(mpc: MPC) -> Polytope:
     return body.polytope
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Growth:
     """Feasible sets at several horizons: horizons (H,), volume (H,), facets (H,), and the sets."""
 

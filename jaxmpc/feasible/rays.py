@@ -29,7 +29,7 @@ BACKOFFS = 10.0 ** np.arange(-14, -1)
 Cuts = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Boundary:
     """Rays from `center` (d,) along `directions` (K, d), and what was proved on each.
 

@@ -515,7 +515,7 @@ class Store:
             return -1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stored:
     """A store as it lies on the disk, read without being changed.
 

@@ -38,7 +38,7 @@ class Picture(NamedTuple):
     counts: dict[str, int]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StoredMap:
     """A stored map of a grid.
 
@@ -158,7 +158,7 @@ def extreme(points: np.ndarray) -> np.ndarray:
         return points
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HalfSpaces:
     """Half-spaces normals (K, d) x ≤ offsets (K,) of which those that do not matter are dropped.
 

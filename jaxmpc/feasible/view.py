@@ -14,7 +14,7 @@ from jaxmpc.mpc.problem import MPC
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class View:
     """Which initial states a point θ (d,) of the map stands for.
 

@@ -19,18 +19,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.checks import concrete, fail, require_memory
+from jaxmpc.checks import concrete, require_memory
 from jaxmpc.control.riccati import lqr
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.control.system import host_array, host_matrices
+from jaxmpc.mpc.problem import MPC, Switch
 from jaxmpc.mpc.rows import Layout, blocks, split, stacked
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
+@dataclass(frozen=True, eq=False)
 class Condensed:
     """The parametric QP of an MPC problem; `qp(theta)` is the QP at θ.
 
@@ -121,32 +123,33 @@ class Condensed:
 
 def prestabilising_gain(mpc: MPC) -> Any:
     """Return the gain K (m, n) of u = Kx + v that `mpc.prestabilise` asks for, zero for none.
-    Raises ValueError where it is True and there is no LQR, or A and B are traced."""
+    Raises ValueError where it is True and there is no LQR; none if A and B are traced then."""
     wish, none = mpc.prestabilise, np.zeros((mpc.system.m, mpc.system.n))
-    if wish is False:
-        return none
-    if wish is not None and wish is not True:
+    if not isinstance(wish, Switch | None):
         return wish
-    if mpc.control_horizon is not None:
-        return none
-    if not concrete(mpc.system.A, mpc.system.B):
-        if wish is True:
-            fail("prestabilise", "is True where A, B are traced", "Give the gain K (m, n) itself")
-        return none
-    spectral_radius = np.abs(np.linalg.eigvals(np.asarray(mpc.system.A, float))).max()
-    if wish is None and spectral_radius <= 1 + 1e-9:
+    if mpc.control_horizon is not None or (wish is not None and not wish.on):
         return none
     # Any stabilising gain serves; a little weight on every state makes the DARE solvable.
     Q, R = np.eye(mpc.system.n), np.eye(mpc.system.m)
-    if concrete(mpc.Q, mpc.R):
-        Q, R = np.asarray(mpc.Q, float), np.asarray(mpc.R, float)
-    weight = 1e-3 * max(np.trace(Q) / len(Q), 1e-9)
-    try:
-        return lqr(mpc.system, Q + weight * np.eye(len(Q)), R).K
-    except ValueError:
-        if wish is True:
-            raise
+    if not concrete(mpc.system.A, mpc.system.B):
+        if wish is None:
+            return none
+        K = jax.lax.stop_gradient(jnp.asarray(lqr(mpc.system, Q, R).K))
+        return jnp.where(jnp.all(jnp.isfinite(K)), K, 0.0)
+    A, B, _ = host_matrices(mpc.system)
+    if wish is None and np.abs(np.linalg.eigvals(A)).max() <= 1 + 1e-9:
         return none
+    if concrete(mpc.Q, mpc.R):
+        Q, R = host_array("Q", mpc.Q), host_array("R", mpc.R)
+    Q = Q + 1e-3 * max(np.trace(Q) / len(Q), 1e-9) * np.eye(len(Q))
+    if np.linalg.eigvalsh((R + R.T) / 2)[0] <= 0:
+        R = R + 1e-3 * np.diag(np.diag(B.T @ Q @ B))
+    try:
+        return lqr(mpc.system, Q, R).K
+    except ValueError:
+        if wish is None:
+            return none
+        raise
 
 
 def condense(mpc: MPC) -> Condensed:
@@ -180,6 +183,7 @@ def _condense(mpc: MPC) -> Condensed:
     n, m, p = system.n, system.m, mpc.dimension
     dtype = floating_dtype(replace(mpc, prestabilise=None))
     cast = lambda v: jnp.asarray(v, dtype)
+    Q, R, P_N, W, stage = mpc.weights(dtype)
     A, B = cast(system.A), cast(system.B)
     c = jnp.zeros(n, dtype) if system.c is None else cast(system.c)
     K = cast(mpc.prestabilise)
@@ -210,11 +214,6 @@ def _condense(mpc: MPC) -> Condensed:
         for M, M_0 in zip((Omega, Psi, psi), before, strict=True)
     )
 
-    Q, R = cast(mpc.Q), cast(mpc.R)
-    P_N = jnp.zeros((n, n), dtype) if mpc.terminal_cost is None else cast(mpc.terminal_cost)
-    W = jnp.zeros((m, m), dtype) if mpc.input_rate_weight is None else cast(mpc.input_rate_weight)
-    W = jnp.diag(W) if W.ndim == 1 else W
-    stage = jnp.ones(N, dtype) if mpc.stage_weights is None else cast(mpc.stage_weights)
     weights = jnp.concatenate([stage[:, None, None] * Q, P_N[None]])
     efforts = R if mpc.stage_weights is None else stage[:, None, None] * R
     product = lambda M, weight, X: jnp.einsum(
@@ -229,9 +228,12 @@ def _condense(mpc: MPC) -> Condensed:
         form = lambda X, U, V: 2 * (product(Gamma, weights, X) + product(Omega, efforts, U))
     P = form(Gamma, Omega, rates[0])
 
-    # argmin over u of u'Ru + (Ax + Bu)'P(Ax + Bu).
+    # argmin over u of u'Ru + (Ax + Bu)'P(Ax + Bu), the least of them where there are several.
     BtP = matmul(B.T, P_N)
-    K_N = -solve(R + matmul(BtP, B), matmul(BtP, A))
+    G = R + matmul(BtP, B)
+    ridge = 10 * jnp.finfo(dtype).eps * jnp.trace(G) / m
+    ridge = jnp.where(ridge > 0, ridge, 1.0)
+    K_N = -solve(G + ridge * jnp.eye(m, dtype=dtype), matmul(BtP, A))
 
     found = blocks(mpc, dtype)
     states, inputs = (Gamma, Phi, phi), (Omega, Psi, psi)

@@ -1,7 +1,7 @@
 """Controller: an MPC law whose matrices are condensed and factored once."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -24,6 +24,7 @@ from jaxmpc.mpc.plan import (
     sorted_multipliers,
 )
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.active_set import has_dual_steps
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor
 from jaxmpc.qp.admm import factor as factorise
@@ -32,8 +33,7 @@ from jaxmpc.qp.solve import in_two_parts, solve_factored
 from jaxmpc.qp.status import Status
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Controller:
     """An MPC law whose matrices are condensed and factored once, at construction.
 
@@ -42,37 +42,43 @@ class Controller:
     afterwards. Its `shifted` form is the warm start, and its first input is the previous input
     (zero at the start). The plan is returned twice, as carry and as output of `jax.lax.scan`. When
     the plan is not SOLVED, u is still the first input of the best iterate: look at plan.status.
-    `condensed` and `factor` are filled in at construction: for another problem or solver make
-    another Controller, `dataclasses.replace` would keep the old ones.
+
+    `condensed` and `factor` are filled in at construction, which `dataclasses.replace` repeats and
+    JAX, which rebuilds pytrees, does not. Each array has a buffer of its own: a controller may be
+    donated.
     """
 
     mpc: MPC
     solver: ADMM = DEFAULT
-    condensed: Condensed | None = None
-    factor: Factor | None = None
+    condensed: Condensed = field(init=False)
+    factor: Factor = field(init=False)
 
     def __post_init__(self) -> None:
-        # JAX rebuilds this object with its parts present, or with placeholders: leave those be.
-        if self.condensed is None and isinstance(self.mpc, MPC):
-            self.mpc.validate()
-            require_kind("solver", self.solver, ADMM)
-            self.solver.validate()
-            mpc, finite = harmless(self.mpc)
-            condensed = condense(mpc)
-            # The factorization reads from P what is wrong with the data.
-            condensed = replace(condensed, P=jnp.where(finite, condensed.P, jnp.nan))
-            self.solver.validate(condensed.C.shape[0])
-            # Arrays from here on, so that a sample need not convert the whole object again.
-            mpc = replace(mpc, prestabilise=condensed.K)
-            object.__setattr__(self, "mpc", arrays(mpc))
-            object.__setattr__(self, "solver", arrays(self.solver))
-            object.__setattr__(self, "condensed", condensed)
-            object.__setattr__(self, "factor", _factor(condensed, self.solver))
+        require_kind("mpc", self.mpc, MPC)
+        self.mpc.validate()
+        require_kind("solver", self.solver, ADMM)
+        self.solver.validate()
+        mpc, finite = harmless(self.mpc)
+        condensed = condense(mpc)
+        # The factorization reads from P what is wrong with the data.
+        condensed = replace(condensed, P=jnp.where(finite, condensed.P, jnp.nan))
+        self.solver.validate(condensed.C.shape[0])
+        # Arrays from here on, so that a sample need not convert the whole object again.
+        given = arrays((replace(mpc, prestabilise=condensed.K), self.solver))
+        made = condensed, _factor(condensed, self.solver)
+        parts = unshared((*given, *made))
+        vars(self).update(zip(("mpc", "solver", "condensed", "factor"), parts, strict=True))
+
+    def __repr__(self) -> str:
+        """Return the size of the problem, in one line: the arrays may be long."""
+        P = self.condensed.P
+        rows = sum(len(steps) * size for _, steps, size in self.condensed.layout)
+        sizes = f"horizon {self.mpc.horizon}, {rows} rows, Hessian {np.shape(P)}"
+        return f"Controller({sizes}, {getattr(P, 'dtype', type(P).__name__)})"
 
     @property
     def dtype(self) -> Any:
         """Floating type of the plans."""
-        assert self.condensed is not None
         return self.condensed.P.dtype
 
     @property
@@ -116,7 +122,6 @@ class Controller:
         did one step after its beginning.
         """
         c = self.condensed
-        assert c is not None
         tail = limited(self.mpc.inputs, matmul(c.K_N, plan.states[-1]))
         return WarmStart.shifted(c.layout, plan, tail, bool(c.balls))
 
@@ -128,14 +133,12 @@ class Controller:
         given = self._checked(x0, reference, input_reference, previous_input)
         if warm_start is not None:
             c, mpc = self.condensed, self.mpc
-            assert c is not None
             start = WarmStart.of(warm_start, c.layout, mpc.horizon, mpc.system.n, mpc.system.m)
             warm_start = arrays(start)
         return self._in_two_parts(_plan, *given, warm_start)
 
     def _in_two_parts(self, program: Callable[..., Any], *given: Any, **kwargs: Any) -> Any:
         c = self.condensed
-        assert c is not None
         hard = not has_dual_steps(c.balls, c.C)
         return in_two_parts(program, hard, self.solver, self, *given, **kwargs)
 
@@ -143,9 +146,7 @@ class Controller:
         self, x0: Any, reference: Any, input_reference: Any, previous_input: Any
     ) -> list[Any]:
         """The arguments in the controller's precision; ValueError for wrong ones."""
-        if self.condensed is None:
-            require_kind("mpc", self.mpc, MPC)
-        elif self.dtype == jnp.float64 and jnp.result_type(float) != jnp.float64:
+        if self.dtype == jnp.float64 and jnp.result_type(float) != jnp.float64:
             cure = "Call it under jax.enable_x64(True), or make it outside"
             fail("controller", "was made in float64, and 64-bit mode is off", cure)
         given = plan_arguments(self.mpc, x0, reference, input_reference, previous_input)
@@ -154,8 +155,24 @@ class Controller:
     def multipliers(self, y: Array) -> Multipliers:
         """Sort the QP's multipliers y (rows,) by constraint and step."""
         c = self.condensed
-        assert c is not None
         return sorted_multipliers(self.mpc, c.layout, y)
+
+
+prepared_pytree(Controller)
+
+
+def unshared(parts: tuple) -> tuple:
+    """Return the problem, the solver and what is made of them with a buffer for each array, which
+    neither another one nor an array of the user has."""
+    seen: set[int] = set()
+
+    def own(v: Array) -> Array:
+        again = id(v) in seen
+        seen.add(id(v))
+        return jnp.array(v) if again and concrete(v) else v
+
+    given = jax.tree.map(lambda v: jnp.array(v) if concrete(v) else v, parts[:2])
+    return jax.tree.map(own, (*given, *parts[2:]))
 
 
 def plan_arguments(
@@ -235,7 +252,6 @@ def _plan(
     start: WarmStart | None, *, whole: bool,
 ) -> Plan:  # fmt: skip
     c, mpc = controller.condensed, controller.mpc
-    assert c is not None and controller.factor is not None
     given = (x0, reference, input_reference, previous_input if mpc.input_in_state else None)
     given = jax.tree.map(lambda v: jnp.asarray(v, c.P.dtype), given)
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(given)]))

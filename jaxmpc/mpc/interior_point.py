@@ -121,7 +121,7 @@ class Limits(NamedTuple):
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Interior:
     """Loop state of one instance: inputs u (N, m), the sides' numbers, the best pair of all so far,
     the steps taken, and whether to go on."""

@@ -21,13 +21,21 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.checks import concrete, fail, require_finite, require_kind, require_real
+from jaxmpc.checks import (
+    concrete,
+    fail,
+    require_finite,
+    require_kind,
+    require_real,
+    require_symmetric_psd,
+)
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.stages import Sample, Stages, apply, apply_transposed, at, spread
-from jaxmpc.qp.precision import matmul
+from jaxmpc.pytrees import named_pytree, pytree
+from jaxmpc.qp.precision import matmul, symmetric
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True, eq=False)
 class Task:
     """A cost or a limit on a smooth function g of the state and the input:
@@ -86,8 +94,7 @@ class Task:
         if self.weight is not None and concrete(self.weight):
             values = np.asarray(self.weight, float)
             values = np.diag(values) if values.ndim == 1 else np.atleast_2d(values)
-            if np.linalg.eigvalsh((values + values.T) / 2).min() < 0:
-                fail(f"{name}.weight", "is not positive semidefinite", "Give weights of at least 0")
+            require_symmetric_psd(f"{name}.weight", values)
         if self.penalty is not None and concrete(self.penalty) and not self.penalty >= 0:
             fail(f"{name}.penalty", f"{self.penalty}", "Give at least 0, or None for hard limits")
         if self.limited and concrete(self.lower, self.upper):
@@ -101,6 +108,7 @@ class Task:
                 fail(f"{name}.steps", f"{self.steps}", f"Give different steps from 0 to {horizon}")
 
 
+@named_pytree
 class Point(NamedTuple):
     """State x (n,) and input u (m,) of one step."""
 
@@ -120,7 +128,7 @@ class Plain:
         return getattr(self.given, "step", self.given)(x, u)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True, eq=False)
 class NonlinearMPC:
     """The problem of `MPC` with a nonlinear model, and with costs and limits on functions:
@@ -223,7 +231,7 @@ class Aims(NamedTuple):
 def weighed(weight: Any, v: Array) -> Array:
     """Return W v for v (..., p) with a weight that is a number, a diagonal or a matrix."""
     weight = jnp.asarray(weight, v.dtype)
-    return matmul(v, weight.T) if weight.ndim == 2 else v * weight
+    return matmul(v, symmetric(weight)) if weight.ndim == 2 else v * weight
 
 
 def task_cost(task: Task, value: Array, target: Array) -> Array:

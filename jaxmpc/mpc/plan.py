@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -12,14 +11,15 @@ from jaxmpc.checks import fail
 from jaxmpc.control.sets import Box
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Layout, blocks, split
+from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.residuals import marked
 from jaxmpc.qp.status import Status
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
+@dataclass(frozen=True, eq=False)
 class Multipliers:
     """Lagrange multipliers of a plan, for the cost without ½: y > 0 where the upper bound of the
     row is active, y < 0 where the lower is.
@@ -40,8 +40,8 @@ class Multipliers:
     tasks: tuple[Array, ...] = ()
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
+@dataclass(frozen=True, eq=False)
 class Plan:
     """Answer of `solve`: states (N+1, n), inputs (N, m), cost J (without ½), multipliers, status.
 
@@ -65,6 +65,7 @@ class Plan:
     iterations: Array
 
 
+@named_pytree
 class WarmStart(NamedTuple):
     """Where a solver begins: states (N+1, n), inputs (N, m), multipliers (rows,) in the order of
     `row_table`."""
@@ -139,17 +140,15 @@ def cost(
     rates and soft rows add. previous_input (m,): None for zero."""
     error = states if reference is None else states - reference
     effort = inputs if input_reference is None else inputs - input_reference
-    cast = lambda W: jnp.asarray(W, states.dtype)
-    square = lambda v, W, s=1.0: jnp.sum(s * v * matmul(v, cast(W)))
-    stage = 1.0 if mpc.stage_weights is None else cast(mpc.stage_weights)[:, None]
-    J = square(error[:-1], mpc.Q, stage) + square(effort, mpc.R, stage)
+    square = lambda v, W, s=1.0: jnp.sum(s * v * matmul(v, W))
+    weights = mpc.weights(states.dtype)
+    stage = 1.0 if mpc.stage_weights is None else weights.stage[:, None]
+    J = square(error[:-1], weights.Q, stage) + square(effort, weights.R, stage)
     if mpc.terminal_cost is not None:
-        J = J + square(error[-1:], mpc.terminal_cost)
+        J = J + square(error[-1:], weights.P)
     if mpc.input_rate_weight is not None:
-        W = cast(mpc.input_rate_weight)
         first = jnp.zeros_like(inputs[0]) if previous_input is None else previous_input
-        rates = jnp.diff(inputs, axis=0, prepend=first[None])
-        J = J + square(rates, jnp.diag(W) if W.ndim == 1 else W)
+        J = J + square(jnp.diff(inputs, axis=0, prepend=first[None]), weights.W)
     for block, e in _violations(mpc, states, inputs):
         J = J + jnp.sum(e * (block.linear + 0.5 * block.quadratic * e))
     return J

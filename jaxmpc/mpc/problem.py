@@ -1,10 +1,11 @@
 """The constrained MPC problem as a user states it."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
-import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jaxmpc.checks import (
     concrete,
@@ -22,12 +23,18 @@ from jaxmpc.control.system import (
     as_weight,
     dimensions,
     host_array,
+    host_matrices,
     store_floats,
 )
+from jaxmpc.pytrees import pytree, static_pytree
+from jaxmpc.qp.precision import symmetric
+
+# Curvature of the cost, relative to its terms, below which a direction of the inputs costs nothing.
+FLAT = 1e-12
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
+@dataclass(frozen=True, eq=False)
 class Soft:
     """Rows that may be violated at a penalty:
 
@@ -61,8 +68,8 @@ class Soft:
         return (free if self.lower is None else self.lower), self.d
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
+@dataclass(frozen=True, eq=False)
 class Outputs:
     """Hard limits of outputs, lower ≤ C x_k + D u_k ≤ upper (±inf for none).
 
@@ -83,8 +90,31 @@ class Outputs:
         store_floats(self, "C", "lower", "upper", "D")
 
 
-@jax.tree_util.register_dataclass
+class Weights(NamedTuple):
+    """The weights of a cost as symmetric matrices of one floating type: Q (n, n), R (m, m),
+    P (n, n) of x_N and W (m, m) of input rates, zero for None, and stage (N,)."""
+
+    Q: Array
+    R: Array
+    P: Array
+    W: Array
+    stage: Array
+
+
+@static_pytree
 @dataclass(frozen=True)
+class Switch:
+    """True or False as a part of a pytree's structure: nothing to trace or to differentiate."""
+
+    on: bool
+
+    def __repr__(self) -> str:
+        """Return True or False."""
+        return repr(self.on)
+
+
+@pytree
+@dataclass(frozen=True, eq=False)
 class MPC:
     """Constrained linear-quadratic MPC over the horizon N:
 
@@ -93,9 +123,11 @@ class MPC:
              x_k ∈ states (k = 0..N−1; from 1 if constrain_initial is False),
              u_k ∈ inputs (k = 0..N−1),  x_N ∈ terminal_set.
 
-    system: LinearSystem. Q (n, n) ⪰ 0, R (m, m) ≻ 0, terminal_cost P (n, n) ⪰ 0 or None (no
-    terminal cost); a vector is a diagonal, and a number will do for one state or input. states,
-    inputs: Box, Polytope or None; terminal_set: these or an Ellipsoid.
+    system: LinearSystem. Q (n, n) ⪰ 0, R (m, m) ⪰ 0, terminal_cost P (n, n) ⪰ 0 or None (no
+    terminal cost); a vector is a diagonal, and a number will do for one state or input. Weights are
+    symmetric; of one that is traced by JAX the symmetric part counts, in derivatives too. R need
+    not be definite where Q, P or input_rate_weight give every input a cost. states, inputs: Box,
+    Polytope or None; terminal_set: these or an Ellipsoid.
     constrained_steps: the k in 0..N at which `states` hold, where that is another index set.
     outputs: `Outputs`, or a tuple of them; soft: `Soft`, or a tuple of them. stage_weights s (N,) >
     0: weighs the stages, Σ s_k (x_k'Q x_k + u_k'R u_k); None: all 1.
@@ -136,6 +168,8 @@ class MPC:
         weights = ("Q", "R", "terminal_cost", "input_rate_weight", "stage_weights")
         store_floats(self, *weights, "prestabilise", "input_rate_limit")
         # JAX rebuilds this object with placeholders, and `in_axes` are one without arrays.
+        if isinstance(self.prestabilise, bool | np.bool_):
+            object.__setattr__(self, "prestabilise", Switch(bool(self.prestabilise)))
         system = self.system
         if not isinstance(system, LinearSystem):
             return
@@ -187,6 +221,24 @@ class MPC:
             return tuple(min(k, int(blocks) - 1) for k in range(N))
         return tuple(int(i) for i in np.repeat(np.arange(len(blocks)), blocks))
 
+    def weights(self, dtype: Any) -> Weights:
+        """Return the weights as all solvers and costs take them. Works inside jit, vmap and grad.
+
+        x'Qx depends on the symmetric part of Q alone. Of a Q that is not symmetric a minimiser
+        would take it for curvature, but Q itself for linear terms.
+        """
+
+        def matrix(value: Any, size: int) -> Array:
+            value = jnp.asarray(np.zeros(size) if value is None else value, dtype)
+            return symmetric(jnp.diag(value) if value.ndim == 1 else value)
+
+        n, m, stage = self.system.n, self.system.m, self.stage_weights
+        return Weights(
+            matrix(self.Q, n), matrix(self.R, m), matrix(self.terminal_cost, n),
+            matrix(self.input_rate_weight, m),
+            jnp.asarray(np.ones(self.horizon) if stage is None else stage, dtype),
+        )  # fmt: skip
+
     def validate(self) -> None:
         """Raise ValueError that names the field, its value and the cure, before any compile."""
         require_kind("system", self.system, LinearSystem)
@@ -198,7 +250,7 @@ class MPC:
         require_shape("Q", self.Q, (n, n), "Q weighs the states: one row for each")
         require_shape("R", self.R, (m, m), "R weighs the inputs: one row for each")
         require_symmetric_psd("Q", self.Q)
-        require_symmetric_psd("R", self.R, definite=True)
+        require_symmetric_psd("R", self.R)
         if self.terminal_cost is not None:
             require_shape("terminal_cost", self.terminal_cost, (n, n), "P weighs the last state")
             require_symmetric_psd("terminal_cost", self.terminal_cost)
@@ -219,7 +271,7 @@ class MPC:
                 wanted = " or ".join(kind.__name__ for kind in kinds)
                 fail(name, f"is a {type(value).__name__}", f"Give a {wanted}, or None")
             value.validate(name, size)
-        if self.prestabilise is not None and not isinstance(self.prestabilise, bool):
+        if not isinstance(self.prestabilise, Switch | None):
             require_shape("prestabilise", self.prestabilise, (m, n), "A gain K with u = Kx + v")
         if not isinstance(self.constrain_initial, bool | np.bool_):
             fail("constrain_initial", f"{self.constrain_initial!r}", "Give True or False")
@@ -245,6 +297,7 @@ class MPC:
             if concrete(outputs.lower, outputs.upper):
                 Box(outputs.lower, outputs.upper).validate(f"outputs[{i}]")
         self._validate_rates()
+        self._require_unique_inputs()
 
     def _validate_steps(self) -> None:
         N = self.horizon
@@ -253,7 +306,10 @@ class MPC:
         if blocks is None:
             return
         gain = self.prestabilise
-        given = gain is True or (gain is not None and concrete(gain) and np.any(gain))
+        if isinstance(gain, Switch):
+            given = gain.on
+        else:
+            given = gain is not None and concrete(gain) and bool(np.any(gain))
         if given:
             fail("prestabilise", "given beside control_horizon", "Blocked inputs are u, not u − Kx")
         lengths = blocks if isinstance(blocks, tuple) else (blocks,)
@@ -315,6 +371,63 @@ class MPC:
                 fail("input_rate_limit", f"shape {np.shape(limit)}", f"Give ({m},) or a Box")
             if concrete(limit) and not np.all(np.asarray(limit, float) >= 0):
                 fail("input_rate_limit", f"{limit}", "|Δu| ≤ limit needs limit ≥ 0 (inf: none)")
+
+    def _require_unique_inputs(self) -> None:
+        """Raise where R is not definite and the other weights do not make up for it.
+
+        By a Riccati recursion for the state (x_k, u_{k−1}), which holds a blocked input too: the
+        Hessian of the condensed cost is definite where G = s R + W + B'SB is, at each free move.
+        """
+        data = (self.system, self.Q, self.R, self.terminal_cost, self.stage_weights)
+        if not concrete(data, self.input_rate_weight):
+            return
+        R = host_array("R", self.R)
+        if np.linalg.eigvalsh((R + R.T) / 2)[0] > 0:
+            return
+        n, m, N = self.system.n, self.system.m, self.horizon
+        A, B, _ = host_matrices(self.system)
+        zero = lambda size: np.zeros((size, size))
+        as_matrix = lambda W, size: zero(size) if W is None else np.asarray(as_weight(W, size))
+        Q, P = np.asarray(self.Q, float), as_matrix(self.terminal_cost, n)
+        W = as_matrix(self.input_rate_weight, m).astype(float)
+        stage = np.ones(N) if self.stage_weights is None else np.asarray(self.stage_weights, float)
+        block = lambda a, b, c, d: np.block([[a, b], [c, d]])
+        held = block(A, B, np.zeros((m, n)), np.eye(m))  # u_k = u_{k−1}
+        free, move = block(A, 0 * B, 0 * B.T, zero(m)), np.vstack([B, np.eye(m)])
+        S = size = block(P, 0 * B, 0 * B.T, zero(m))
+        moves = self.moves
+        for k in reversed(range(N)):
+            cost, effort = block(stage[k] * Q, 0 * B, 0 * B.T, zero(m)), stage[k] * R
+            if k and moves[k] == moves[k - 1]:
+                own = block(zero(n), 0 * B, 0 * B.T, effort)
+                S, size = cost + own + held.T @ S @ held, abs(cost + own) + _form(held, size)
+                continue
+            G = effort + W + move.T @ S @ move
+            # In units of its own terms, of which rounding leaves eps.
+            terms = np.diag(abs(effort) + abs(W) + _form(move, size))
+            unit = 1 / np.sqrt(np.where(terms > 0, terms, 1.0))
+            values, axes = np.linalg.eigh(unit[:, None] * G * unit)
+            if values[0] <= FLAT:
+                self._refuse_flat(k, unit[:, None] * axes[:, values <= FLAT])
+            Y = move.T @ S @ free - np.hstack([np.zeros((m, n)), W])
+            K = -np.linalg.solve(G, Y)
+            closed, rate = free + move @ K, K - np.hstack([np.zeros((m, n)), np.eye(m)])
+            size = abs(cost) + _form(free, size) + _form(np.eye(n + m)[n:], abs(W))
+            S = cost + closed.T @ S @ closed + K.T @ effort @ K + rate.T @ W @ rate
+
+    def _refuse_flat(self, k: int, directions: np.ndarray) -> None:
+        labels = self.system.input_names or tuple(f"u{i + 1}" for i in range(self.system.m))
+        large = (abs(directions) > 0.1 * abs(directions).max(axis=0)).any(axis=1)
+        names = ", ".join(name for name, one in zip(labels, large, strict=True) if one)
+        what = f"is not positive definite, and at k = {k} no other weight gives {names} a cost"
+        cure = "Put a positive weight on every input, in R or in input_rate_weight"
+        last = self.terminal_cost is None and k == self.horizon - 1
+        fail("R", what, f"{cure}{', or give a terminal_cost' if last else ''}")
+
+
+def _form(M: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return the size of the terms of M'SM where those of S have this size."""
+    return abs(M).T @ size @ abs(M)
 
 
 def output_steps(mpc: MPC, rows: Outputs) -> tuple[int, ...]:

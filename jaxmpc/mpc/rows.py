@@ -25,7 +25,7 @@ from jaxmpc.qp.projection import Bounds
 Layout = tuple[tuple[str, tuple[int, ...], int], ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Block:
     """lower ≤ H x_k + D v_k ≤ upper at `steps`: H (r, n) or None, D (r, m) or None. box: the one of
     them that is there is the identity.

@@ -240,7 +240,7 @@ def scales(s: Stages, scale: Any) -> tuple[Array, Array]:
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Merit:
     """The merit function φ: its weights of defects (N, n) and of hard rows (rows,)."""
 
@@ -274,7 +274,7 @@ class Merit:
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Iterate:
     """Loop state of one instance: x (N+1, n), u (N, m), multipliers y (rows,), the merit function,
     the QPs solved, whether the next may have the exact Hessian, and whether to go on."""

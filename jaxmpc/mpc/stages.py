@@ -28,7 +28,6 @@ from jaxmpc.mpc.kernels import Gains, recurrence, riccati_recursion, tracking
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Layout, blocks
 from jaxmpc.qp.admm import convex
-from jaxmpc.qp.linalg import cholesky
 from jaxmpc.qp.precision import floating_dtype, matmul, precisely, rounding
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.residuals import SHARE, Pair, Terms
@@ -36,7 +35,7 @@ from jaxmpc.qp.status import Status
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stages:
     """The data of a problem in one floating type.
 
@@ -153,6 +152,7 @@ def stages(mpc: MPC) -> Stages:
     """Return the data of `mpc`. Works inside jit, vmap and grad."""
     system, n = mpc.system, mpc.system.n
     dtype = floating_dtype(mpc)
+    weights = mpc.weights(dtype)
     cast = lambda v: jnp.asarray(v, dtype)
     found = blocks(mpc, dtype)
     none = [jnp.zeros(0, dtype)]
@@ -169,9 +169,7 @@ def stages(mpc: MPC) -> Stages:
     return Stages(
         A=cast(system.A), B=cast(system.B),
         c=jnp.zeros(n, dtype) if system.c is None else cast(system.c),
-        Q=cast(mpc.Q), R=cast(mpc.R),
-        P=jnp.zeros((n, n), dtype) if mpc.terminal_cost is None else cast(mpc.terminal_cost),
-        stage=cast(np.ones(mpc.horizon) if mpc.stage_weights is None else mpc.stage_weights),
+        Q=weights.Q, R=weights.R, P=weights.P, stage=weights.stage,
         H=tuple(b.H for b in found), D=tuple(b.D for b in found),
         lower=tiled([b.lower for b in found]), upper=tiled([b.upper for b in found]),
         linear=linear, quadratic=quadratic,
@@ -182,8 +180,7 @@ def stages(mpc: MPC) -> Stages:
 
 def cleaned(s: Stages) -> tuple[Stages, Array]:
     """The data with harmless numbers in place of those that are not usable, and the fault in them
-    (see `qp.solve.cleaned`): NOT_RUN for none, NON_CONVEX where Q, R or P is indefinite or R
-    singular.
+    (see `qp.solve.cleaned`): NOT_RUN for none, NON_CONVEX where Q, R or P is indefinite.
 
     Each array by itself: what a batch shares is read and cleaned once, whatever its instances hold.
     """
@@ -199,9 +196,8 @@ def cleaned(s: Stages) -> tuple[Stages, Array]:
             jnp.where(test, v, harmless)
             for test, v, harmless in zip(tests[-2:], (linear, quadratic), (jnp.inf, 0), strict=True)
         )
-    Q, R, P = ((W + W.T) / 2 for W in finite((s.Q, s.R, s.P)))
-    has_root = everywhere(jnp.isfinite(cholesky(jax.lax.stop_gradient(R))))
-    convexity = [convex(Q), convex(R) & has_root, convex(P)]
+    Q, R, P = finite((s.Q, s.R, s.P))
+    convexity = [convex(Q), convex(R), convex(P)]
     positive = jnp.isfinite(s.stage) & (s.stage > 0)
     fault = jnp.where(everywhere(*convexity, positive), Status.NOT_RUN, Status.NON_CONVEX)
     fault = jnp.where(everywhere(*tests), fault, Status.NON_FINITE).astype(jnp.int32)

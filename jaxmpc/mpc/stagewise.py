@@ -151,7 +151,7 @@ def checked(mpc: MPC, system: LinearSystem, solver: ADMM) -> MPC:
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StageFactor:
     """What data and penalties decide: row scale E (rows,), 0 for a row that no input moves; rho
     (S, rows) with the gains of each of the S penalties of a schedule, None where there are no ADMM
@@ -251,7 +251,7 @@ def read(
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Search:
     """Loop state of one instance: inputs u (N, m) and multipliers y (rows,) of the last Newton
     step, the best pair of all so far, the steps taken, and whether to go on."""

@@ -44,7 +44,7 @@ INACTIVE = 1e-9
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Laws:
     """The laws of S solved states: y[rows] = slope (θ, 1), rows (S, K), filled up with the number
     of rows, slope (S, K, p + 1); NaN where a state has none. sign (S, K): of these multipliers."""
@@ -61,7 +61,7 @@ class Laws:
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cells:
     """Cells of R^p: edges (g − 1, p) divide each coordinate in g. lower, width (g, p): of the
     intervals, in which distances are measured. law (g^p,): index of the state of each cell that is

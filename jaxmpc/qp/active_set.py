@@ -55,7 +55,7 @@ CONVERGED, ROUNDING = 1e-11, 1e-15
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DualPoint:
     """Multipliers y (m,) with w = −q − A'y (n,) and the rows v = A w (m,)."""
 
@@ -87,7 +87,7 @@ class DualPoint:
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DualSearch:
     """Loop state of one instance: its point, the steps taken, whether to go on, and whether its
     multipliers are optimal."""

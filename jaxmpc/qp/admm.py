@@ -31,6 +31,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import MOST_COUNT, concrete, fail, number, require_real, whole
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import cholesky, inverse_root
 from jaxmpc.qp.precision import matmul, precisely, rounding
 from jaxmpc.qp.problem import QP
@@ -49,8 +50,8 @@ STEPS, STEPS_WARM = 50, 10
 EQUILIBRATIONS = 10
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
+@dataclass(frozen=True, eq=False)
 class ADMM:
     """Settings of the solver.
 
@@ -89,6 +90,17 @@ class ADMM:
     smoothing: Any = 0.0
     fixed: bool = field(default=False, metadata={"static": True})
     dtype: str | None = field(default=None, metadata={"static": True})
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether all settings are the same numbers; traced ones only where identical."""
+        if not isinstance(other, ADMM):
+            return NotImplemented
+        pairs = ((v, getattr(other, name)) for name, v in vars(self).items())
+        return all(a is b or (concrete(a, b) and np.array_equal(a, b)) for a, b in pairs)
+
+    def __hash__(self) -> int:
+        """Return a number that equal settings share."""
+        return hash((self.iterations, self.refine, self.differentiate, self.fixed, self.dtype))
 
     def validate(self, rows: int | None = None) -> None:
         """Raise ValueError for settings that make no iteration of a program with so many rows
@@ -134,8 +146,8 @@ class ADMM:
 DEFAULT = ADMM()
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
+@dataclass(frozen=True, eq=False)
 class Factor:
     """What P, A and rho alone decide; shared by every instance of a batch.
 

@@ -24,7 +24,7 @@ RAY = 25
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Proof:
     """A Farkas vector and a descent ray, and whether they are proved to be. beyond: the rows
     contradict each other also where each is widened by its tolerance."""

@@ -146,7 +146,7 @@ def least_distance(
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Multipliers:
     """State of the proximal method of multipliers: w (n,), y (m,); `change`: the last change of y,
     on an infeasible program nearly a Farkas vector; `move`: the last change of w, on an unbounded

@@ -31,10 +31,18 @@ def arrays(tree: Any) -> Any:
 
 
 def floating_dtype(tree: Any) -> Any:
-    """The widest floating type among the leaves; JAX's default float where there is none."""
+    """The widest floating type among the leaves, at least float32: no factorization exists in half
+    precision. JAX's default float where there is none."""
     types = [leaf.dtype for leaf in jax.tree.leaves(arrays(tree))]
     floats = [dtype for dtype in types if jnp.issubdtype(dtype, jnp.floating)]
-    return jnp.result_type(*floats) if floats else jnp.result_type(float)
+    if not floats:
+        return jnp.result_type(float)
+    return jnp.dtype(jnp.float64 if jnp.dtype(jnp.float64) in floats else jnp.float32)
+
+
+def symmetric(M: Any) -> Any:
+    """Return the symmetric part of a matrix, which is all that a quadratic form knows of it."""
+    return (M + M.swapaxes(-1, -2)) / 2
 
 
 def in_float64(function: Callable) -> Callable:

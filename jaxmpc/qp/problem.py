@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -16,11 +15,12 @@ from jaxmpc.checks import (
     require_shape,
     require_symmetric_psd,
 )
+from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.projection import Bounds
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
+@dataclass(frozen=True, eq=False)
 class QP:
     """Quadratic program: minimise ½ z'Pz + q'z subject to l ≤ Az ≤ u.
 
@@ -167,6 +167,7 @@ def dense(M: Any) -> Any:
     return M.toarray() if hasattr(M, "toarray") else M
 
 
+@named_pytree
 class Duals(NamedTuple):
     """Multipliers in qpsolvers' form, Px + q + G'z + A'y + z_box = 0: z ≥ 0 of Gx ≤ h, y of
     Ax = b, z_box (n,) of lb ≤ x ≤ ub, ≥ 0 at the upper bound and ≤ 0 at the lower."""
@@ -176,8 +177,8 @@ class Duals(NamedTuple):
     z_box: Any
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
+@dataclass(frozen=True, eq=False)
 class QPSolution:
     """A primal-dual pair and what is known about it.
 

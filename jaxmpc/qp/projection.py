@@ -26,7 +26,7 @@ FREE = (-math.inf, math.inf, math.inf, 0.0)
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Bounds:
     """The function g above. l, u (m,): intervals; in the rows of a ball l = u is its centre.
 

@@ -50,7 +50,7 @@ from jaxmpc.qp.triton import has_kernels, in_one_program, indices
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Program:
     """A program in its own units and, as `q` (n,) and `bounds`, in ADMM's coordinates, which are
     measured in `unit`; eps: the tolerance."""
@@ -138,7 +138,7 @@ def judge_in_one_program(
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Search:
     """Loop state of one instance: the point of the method of multipliers; its program, whose bounds
     may have been widened; q (n,) corrected by what rounding leaves of the gradient; the best pair
@@ -204,7 +204,7 @@ def improve(
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Correction:
     """Loop state of one instance whose dual steps leave residuals: its point, the gradient of its
     Lagrangian in w (n,), the best pair so far, the corrections made, and whether to go on."""

@@ -164,7 +164,7 @@ def _largest_of(numbers: list[Array]) -> Array:
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Measured:
     """Primal residual, dual residual and gap of a pair, in the units of the problem, and whether
     each entry is at most eps·size + floor·terms."""
@@ -182,7 +182,7 @@ class Measured:
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pair:
     """Primal z and dual y in the units of the problem, what was measured of them, the largest of
     their residuals, each less its rounding and relative to its size, whether all are small, and

@@ -244,7 +244,7 @@ def _samples(claims: Claims, starts: np.ndarray, center: np.ndarray) -> np.ndarr
     return center + random.uniform(0, 1, (len(ends), 1)) ** (1 / p) * ends
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SmallestHorizon:
     """The least horizon at which the law is proved recursively feasible, None if none up to limit.
 

@@ -24,7 +24,7 @@ CLEAR = 1e-7
 LATE = "the time was over before its linear programs were solved"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Claims:
     """The three claims about a problem, as far as they are settled without the law, and X_N.
 
@@ -228,7 +228,7 @@ def _by_theorem(mpc: MPC) -> Claim:
     return Claim(None, f"Theorem 1 does not apply: {missing.name}")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RegionVerdict:
     """What critical regions say of the law: the claim, the volume that it loses (NaN unless they
     are complete), states (K, n) from which it leads farthest outside X_N, and the regions."""

@@ -14,7 +14,7 @@ from jaxmpc.recursion.claims import CLEAR
 from jaxmpc.recursion.report import NOT_FEASIBLE, UNDECIDED
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LawLoops:
     """Closed loops from B samples; fields as in `RecursionReport`."""
 

@@ -13,7 +13,7 @@ from jaxmpc.mpc.problem import MPC
 NOT_FEASIBLE, UNDECIDED = -1, -2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Claim:
     """A claim: holds True (proved), False (refuted) or None (open); and why.
 
@@ -28,7 +28,7 @@ class Claim:
         return f"{ {True: 'proved', False: 'refuted', None: 'open'}[self.holds] }: {self.reason}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Counterexample:
     """A feasible state whose optimal first move leads to an infeasible one.
 
@@ -57,7 +57,7 @@ class Counterexample:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RecursionReport:
     """What is known about the recursive feasibility of one MPC problem.
 

@@ -11,7 +11,7 @@ from jaxmpc.control.violation import kept, worst_violation
 from jaxmpc.qp.status import Status
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RobotLoops:
     """What b closed loops of T samples did.
 

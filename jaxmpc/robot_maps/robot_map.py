@@ -27,7 +27,7 @@ OUTCOMES = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RobotMap:
     """States of a robot with the linear promise and what became of it.
 

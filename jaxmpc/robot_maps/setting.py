@@ -74,7 +74,7 @@ def map_robot(
     return setting.map(Labels.joined(labels), loops, refine=refine, search_seconds=search_seconds)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RobotSetting:
     """A checked description of a map, for callers who compute and store it chunk by chunk.
 

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import jax
 import numpy as np
 from jax import Array
 
@@ -11,9 +10,10 @@ from jaxmpc.checks import fail
 from jaxmpc.control.equilibrium import equilibrium
 from jaxmpc.control.sets import Box
 from jaxmpc.control.system import LinearSystem
+from jaxmpc.pytrees import pytree
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True, eq=False)
 class LinearPlant:
     """A linear plant x⁺ = A x + B u + c with limits and the interface of `Robot`.

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.control.system import LinearSystem
+from jaxmpc.pytrees import pytree
 from jaxmpc.robots.robot import Robot
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True, eq=False)
 class RobotModel:
     """The predictor of a robot (no contacts, no joint limits) in the coordinates ξ.

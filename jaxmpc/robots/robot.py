@@ -20,6 +20,7 @@ from jax import Array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.control.sets import Box
 from jaxmpc.control.system import LinearSystem, host_array
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import eigh
 from jaxmpc.qp.precision import floating_dtype, matmul
 from jaxmpc.robots.balance import lacking, nearest_rest, rest_at, settled
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     import mujoco
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True, eq=False)
 class Robot:
     """A MuJoCo model as a plant with sampled inputs; made by `load_robot`.

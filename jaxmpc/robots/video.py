@@ -191,7 +191,7 @@ def _add_ghost(scene: Any, model: Any, data: Any) -> None:
         geom.pos[:] += 0.01 * (geom.pos - eye)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Film:
     """Frames (F, h, w, 3), uint8, of `render`, at `fps` of them a second: notebooks play it.
 

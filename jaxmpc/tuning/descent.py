@@ -25,7 +25,7 @@ Validate = Callable[[Any], tuple[float, Mapping[str, float]]]
 Gradient = Callable[[Any, int], tuple[float, Any, Mapping[str, float]]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Descent:
     """The record of T steps from θ_0 to θ_T.
 
@@ -56,7 +56,7 @@ class Descent:
         return len(self.loss)
 
 
-@dataclass
+@dataclass(eq=False)
 class State:
     """The state of the descent: all that the next step depends on, and the record so far.
 

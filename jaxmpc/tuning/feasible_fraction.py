@@ -69,8 +69,8 @@ def membership(
         fail(
             "mpc", "has only soft limits of its states", "Give the hard problem, or jm.harden(mpc)"
         )
-    mpc = replace(mpc, soft=(), input_rate_weight=None)  # no part in what is feasible
     mpc.validate()
+    mpc = replace(mpc, soft=(), input_rate_weight=None)  # no part in what is feasible
     x0s, width = arrays((x0s, width))
     if x0s.ndim != 2 or x0s.shape[1] != mpc.dimension:
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.dimension}), one a row")

@@ -36,7 +36,7 @@ MARGIN = 0.3
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Samples:
     """States to solve from: x (B, p), and warm starts (z (B, nz), y (B, rows)) or None."""
 
@@ -52,7 +52,7 @@ class Samples:
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PenaltyObjective:
     """The problem, references and iteration for which penalties are tuned.
 

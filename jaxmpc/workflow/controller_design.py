@@ -18,7 +18,7 @@ from jaxmpc.reals import Reals
 from jaxmpc.workflow.offline_test import OfflineReport, offline_report
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Design:
     """The result of `design`.
 

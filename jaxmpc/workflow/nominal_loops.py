@@ -18,7 +18,7 @@ from jaxmpc.qp.status import Status
 ROUNDING = 1e-7
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class NominalLoops:
     """The results of nominal closed loops from sampled feasible states.
 

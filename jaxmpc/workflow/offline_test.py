@@ -25,7 +25,7 @@ from jaxmpc.recursion.budget import LABELS, LOOPS, PROOFS, Budget
 from jaxmpc.workflow.nominal_loops import NominalLoops, nominal_loops
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OfflineReport:
     """Everything that is known of an MPC problem before it runs; `print` shows it.
 
