@@ -512,6 +512,7 @@ class Statement:
         A, B = np.asarray(system.A), np.asarray(system.B)
         (n, m), self.mpc = B.shape, mpc
         size = (N + 1) * n + N * m
+        self.sizes = np.zeros(size)
         state = lambda k: slice(k * n, (k + 1) * n)
         control = lambda k: slice((N + 1) * n + k * m, (N + 1) * n + (k + 1) * m)
         P = np.zeros((n, n)) if mpc.terminal_cost is None else np.asarray(mpc.terminal_cost)
@@ -578,11 +579,19 @@ class Statement:
 
     def violations(self, w: np.ndarray, x0: np.ndarray) -> tuple[float, float]:
         """The largest violation of a limit, in units of its row; and the largest of a limit or an
-        equation, relative to the sum of the absolute terms of its row."""
+        equation, relative to the sum of the absolute terms of its row, each variable counted with
+        its largest value along this and earlier plans (at rest a term alone says nothing)."""
+        n, m = np.shape(self.mpc.system.B)
+        split = (self.mpc.horizon + 1) * n
+        largest = lambda part, size: np.tile(
+            np.abs(part).reshape(-1, size).max(axis=0), len(part) // size
+        )
+        sizes = np.append(largest(w[:split], n), largest(w[split:], m))
+        self.sizes = sizes = np.maximum(self.sizes, sizes)
         e, value = self.right_side(x0), self.G @ w
         met = np.clip(value, self.lower, self.upper)
-        beyond, size = np.abs(value - met), abs(self.G) @ np.abs(w) + np.abs(met)
-        off, terms = np.abs(self.E @ w - e), abs(self.E) @ np.abs(w) + np.abs(e)
+        beyond, size = np.abs(value - met), abs(self.G) @ sizes + np.abs(met)
+        off, terms = np.abs(self.E @ w - e), abs(self.E) @ sizes + np.abs(e)
         share = lambda v, size: np.max(v / np.where(v > 0, size, 1.0), initial=0.0)
         return beyond.max(initial=0.0), max(share(beyond, size), share(off, terms))
 
@@ -629,14 +638,15 @@ class Record:
     def cost(self) -> float:
         """The largest relative difference of costs."""
         here, there = np.array(self.costs).reshape(-1, 2).T
-        least = 1e-6 * np.max(there, initial=0.0)
-        return np.max(np.abs(here - there) / np.maximum(there, least + 1e-300), initial=0.0)
+        least = 1e-6 * np.max(there, initial=0.0) + 1e-12  # both may be 0
+        return np.max(np.abs(here - there) / np.maximum(there, least), initial=0.0)
 
     @property
     def passed(self) -> bool:
-        """Whether all is as it should be."""
+        """Whether all is as it should be; a loop whose first state has no plan ends there."""
         fine = self.cost <= TOLERANCE and self.row <= TOLERANCE
-        return not self.refused and self.solved == self.found > 0 and fine
+        told = self.found > 0 or self.others == (jm.Status.PRIMAL_INFEASIBLE.name,)
+        return not self.refused and self.solved == self.found and told and fine
 
 
 def follow(one: Loop, samples: int) -> Record:

@@ -48,12 +48,9 @@ def test_aircraft_without_weights_of_inputs(loops):
     assert record.passed
 
 
-def test_small_loop_and_its_judge(loops):
-    """The loop passes; the judge sees a limit missed by 1e-3 and an input off by 1e-2."""
+def test_judge(loops):
+    """It sees a limit missed by 1e-3 and an input off by 1e-2, and what has no solution."""
     one = loops["FiOrdOs 2"]
-    record = follow(one, 5)
-    assert (record.found, record.others) == (5, ())
-    assert record.passed
     statement = public.Statement(one.mpc)
     r = statement.target(np.zeros(2), np.zeros(1))
     w = statement.solve(one.x0, r)
