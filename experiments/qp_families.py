@@ -40,17 +40,17 @@ class Instance:
 
 def from_solution(
     P: np.ndarray, A: np.ndarray, active: int, equal: int, rng: np.random.Generator,
-    weak: int = 0, size: float = 1.0,
+    weak: int = 0, size: float = 1.0, z: np.ndarray | None = None, order: np.ndarray | None = None,
 ) -> Instance:  # fmt: skip
     """`active` rows with a push, `equal` equalities, `weak` rows that touch without a push; the
-    others are inactive, one-sided, or free."""
+    others are inactive, one-sided, or free. They are drawn, or taken in this order; so is z."""
     m, n = A.shape
-    z = size * rng.standard_normal(n)
+    z = size * rng.standard_normal(n) if z is None else z
     value = A @ z
     reach = np.linalg.norm(A, axis=1) * size + 1e-300
     l, u = value - rng.uniform(0.2, 2, m) * reach, value + rng.uniform(0.2, 2, m) * reach
     y = np.zeros(m)
-    order = rng.permutation(m)
+    order = rng.permutation(m) if order is None else order
     pushed, equals, touching, rest = np.split(order, np.cumsum([active, equal, weak]))
     y[pushed] = rng.uniform(0.1, 3, active) * rng.choice([-1, 1], active)
     y[equals] = rng.uniform(0.1, 3, equal) * rng.choice([-1, 1], equal)
@@ -182,6 +182,148 @@ def large_units(rng: np.random.Generator) -> Instance:
     return from_solution(P, rng.standard_normal((m, n)), n // 2, 0, rng, size=1e2)
 
 
+def _flat_directions(n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A random P (n, n) of about half rank, and a basis (n, flat) of its null space."""
+    rank = int(rng.integers(1, n // 2 + 1))
+    V = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    factor = V[:, :rank] @ rng.standard_normal((rank, rank))
+    return factor @ factor.T, V[:, rank:]
+
+
+def rows_without_cost(rng: np.random.Generator) -> Instance:
+    """Every row lies in the null space of P, some are equalities; where they do not span it, there
+    are many solutions."""
+    n, _ = _sizes(rng)
+    P, basis = _flat_directions(n, rng)
+    flat = basis.shape[1]
+    m = int(rng.integers(1, 2 * n + 1))
+    met = min(m, flat)
+    equal = int(rng.integers(0, met + 1))
+    A = rng.standard_normal((m, flat)) @ basis.T
+    return from_solution(P, A, met - equal, equal, rng)
+
+
+def some_rows_without_cost(rng: np.random.Generator) -> Instance:
+    """Every second row lies in the null space of P; up to half of the rows are equalities. There
+    may be many solutions."""
+    n, _ = _sizes(rng)
+    P, basis = _flat_directions(n, rng)
+    m = int(rng.integers(1, 2 * n + 1))
+    A = rng.standard_normal((m, n))
+    A[::2] = A[::2] @ basis @ basis.T
+    equal = int(rng.integers(0, min(m, n) // 2 + 1))
+    return from_solution(P, A, int(rng.integers(0, min(m, n) - equal + 1)), equal, rng)
+
+
+def equalities_without_cost(rng: np.random.Generator) -> Instance:
+    """Equalities in the null space of P, as many as it has dimensions or fewer; few other rows."""
+    n, _ = _sizes(rng)
+    P, basis = _flat_directions(n, rng)
+    flat = basis.shape[1]
+    equal = int(rng.integers(1, flat + 1))
+    A = np.vstack([rng.standard_normal((equal, flat)) @ basis.T, rng.standard_normal((4, n))])
+    order = np.append(equal + np.arange(4), np.arange(equal))  # the other rows push
+    return from_solution(P, A, 4, equal, rng, order=order)
+
+
+def zero_weights(rng: np.random.Generator) -> Instance:
+    """Diagonal P with zeros; rows that couple only the variables of weight zero, a third of them
+    equalities, and bounds of some variables. There may be many solutions."""
+    n, _ = _sizes(rng)
+    flat = int(rng.integers(1, n))
+    weights = rng.permutation(np.append(np.zeros(flat), rng.uniform(0.01, 10, n - flat)))
+    rows = rng.standard_normal((int(rng.integers(1, flat + 3)), n)) * (weights == 0)
+    A = np.vstack([rows, np.eye(n)[rng.uniform(size=n) < rng.uniform()]])
+    equal = min(len(rows), flat) // 3
+    active = min(len(rows), flat) - equal
+    return from_solution(np.diag(weights), A, active, equal, rng, order=np.arange(len(A)))
+
+
+def heavy_slacks(rng: np.random.Generator) -> Instance:
+    """Soft rows Cx − s with slack variables s of weight 1e5, all of them paid; half of x without
+    weight, some of it bounded. There may be many solutions."""
+    n, slacks = int(rng.integers(4, 21)), int(rng.integers(2, 11))
+    weights = np.where(rng.uniform(size=n) < 0.5, 0.0, rng.uniform(0.01, 1, n))
+    P = np.diag(np.append(weights, np.full(slacks, 1e5)))
+    C = np.hstack([rng.standard_normal((slacks, n)), -np.eye(slacks)])
+    bounded = np.eye(n, n + slacks)[rng.uniform(size=n) < rng.uniform()]
+    z = np.append(rng.standard_normal(n), 1e-5 * rng.standard_normal(slacks))
+    pushed = slacks + int(rng.integers(0, len(bounded) + 1))  # the soft rows first
+    order = np.arange(slacks + len(bounded))
+    return from_solution(P, np.vstack([C, bounded]), pushed, 0, rng, z=z, order=order)
+
+
+def jerk_chain(rng: np.random.Generator) -> Instance:
+    """Speeds are sums of sums of jerks, which have no weight and half of them are at their small
+    limits; a goal for the distance with a slack of weight 2e5, whose multiplier is up to 2e3. Only
+    speeds have a linear cost."""
+    speeds, limit = int(rng.integers(4, 13)), 3.5e-4
+    jerks = speeds + 2  # the last two end at rest
+    n = speeds + jerks + 1
+    chain = np.zeros((jerks + 1, n))
+    chain[:jerks, speeds:-1] = np.eye(jerks)
+    for lag, factor in ((0, -1), (1, 2), (2, -1)):
+        k = np.arange(speeds)
+        chain[k + lag, k] += factor
+    chain[-1, :speeds], chain[-1, -1] = 10 ** rng.uniform(-4, -2), 1
+    pushed, sign = rng.uniform(size=jerks) < 0.5, rng.choice([-1, 1], jerks)
+    jerk = limit * np.where(pushed, sign, rng.uniform(-0.9, 0.9, jerks))
+    v = list(rng.uniform(-0.04, 0.04, 2))
+    for k in range(2, speeds):
+        v.append(jerk[k] + 2 * v[-1] - v[-2])
+    slack = rng.choice([-1, 1]) * 10 ** rng.uniform(-5, -2)
+    z = np.concatenate([v, jerk, [slack]])
+    weights = np.concatenate([np.linspace(0.1, 1, speeds), np.zeros(jerks), [2e5]])
+    push = np.where(pushed, sign * 10 ** rng.uniform(-1, 3, jerks), 0.0)
+    y = np.concatenate([np.zeros(speeds), push, [0.0], -push, [-2e5 * slack]])
+    A = np.vstack([np.eye(n), chain])
+    box = np.concatenate([np.full(speeds, 2 * np.max(np.abs(v))), np.full(jerks, limit), [1e4]])
+    l, u = np.append(-box, chain @ z), np.append(box, chain @ z)
+    q = -weights * z - A.T @ y
+    q[speeds:] = 0.0  # but for rounding
+    return Instance(jm.QP(np.diag(weights), q, A, l, u), jm.Status.SOLVED, z, y)
+
+
+def low_rank(rng: np.random.Generator) -> Instance:
+    """P = B'B for B of few rows and whole numbers, rows that span its null space, some of them
+    equalities, and a box."""
+    n, _ = _sizes(rng)
+    rank = int(rng.integers(1, max(n // 3, 1) + 1))
+    B = rng.integers(-2, 3, (rank, n)).astype(float)
+    basis = np.linalg.svd(B)[2][np.linalg.matrix_rank(B) :]
+    A = np.vstack([basis, rng.standard_normal((3, n)), np.eye(n)])
+    order = np.append(rng.permutation(len(basis)), len(basis) + rng.permutation(n + 3))
+    equal = int(rng.integers(0, len(basis) + 1))
+    return from_solution(B.T @ B, A, len(basis) - equal, equal, rng, order=order)
+
+
+def nearly_parallel(rng: np.random.Generator) -> Instance:
+    """Two active rows ±a − εb at an angle 2ε from 2e-3 to 2e-6, whose multipliers of up to 1e10
+    cancel but for a push t/ε along b, of up to 1e5."""
+    n, m = _sizes(rng)
+    a, b = np.linalg.qr(rng.standard_normal((n, 2)))[0].T
+    angle = 10 ** rng.uniform(-6, -3)
+    far = min(1.0, 2e10 * angle**2) / angle
+    across = np.eye(n) - np.outer(b, b)
+    P = np.outer(b, b) + across @ (_gram(n, n, rng) + 0.1 * np.eye(n)) @ across
+    pair = np.array([a - angle * b, -a - angle * b])
+    z = far * b + rng.standard_normal(n)
+    A = np.vstack([pair, rng.standard_normal((m - 2, n))])
+    value, reach = A @ z, np.linalg.norm(A, axis=1) * (1 + far)
+    l, u = value - rng.uniform(0.2, 2, m) * reach, value + rng.uniform(0.2, 2, m) * reach
+    l[:2], u[:2], y = -INF, value[:2], np.zeros(m)
+    y[:2] = far / (2 * angle) * rng.uniform(0.9, 1.0)
+    P = (P + P.T) / 2
+    return Instance(jm.QP(P, -P @ z - A.T @ y, A, l, u), jm.Status.SOLVED, z, y)
+
+
+def far_linear(rng: np.random.Generator) -> Instance:
+    """P = 0, one vertex, at a distance of 1e3 to 1e8."""
+    n, m = _sizes(rng)
+    A = rng.standard_normal((m, n))
+    return from_solution(np.zeros((n, n)), A, n, 0, rng, size=10 ** rng.uniform(3, 8))
+
+
 def empty(rng: np.random.Generator) -> Instance:
     """No feasible point: rows combined by a positive y give 0'z ≤ −gap; no box needed."""
     n, m = _sizes(rng)
@@ -232,7 +374,9 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Instance]] = {
     f.__name__: f
     for f in (
         dense, sparse, degenerate, curved_badly, scaled_badly, parallel_rows, equalities, linear,
-        linear_degenerate, flat, large_units, empty, empty_in_a_box, unbounded,
+        linear_degenerate, flat, large_units, rows_without_cost, some_rows_without_cost,
+        equalities_without_cost, zero_weights, heavy_slacks, jerk_chain, low_rank,
+        nearly_parallel, far_linear, empty, empty_in_a_box, unbounded,
     )
 }  # fmt: skip
 

@@ -1,0 +1,294 @@
+"""A plan, its status and a label do not depend on units: of a row, of a state, of an input.
+
+Rows of limits times s > 0 are the same limits; x' = S x, u' = T u with A' = S A S⁻¹, B' = S B T⁻¹,
+Q' = S⁻¹ Q S⁻¹, … is the same problem. All factors are powers of two near 10^±4 and 10^±8, so that
+nothing is rounded on the way. What a plan says is judged in NumPy from the problem as stated, in
+states and inputs: each equation and limit relative to the absolute terms of its own row, the cost
+against Clarabel's. So is what prestabilising changes, which is rounding and no problem.
+"""
+
+from dataclasses import replace
+
+import clarabel
+import jax
+import numpy as np
+import pytest
+from scipy import linalg, sparse
+
+import jaxmpc as jm
+
+FOUR, EIGHT = 2.0**13, 2.0**27  # near 1e4 and 1e8
+HORIZON = 6
+INF = np.inf
+STATES = np.array([  # inside, at limits, and three beyond what can be steered
+    [0.5, 0.2], [-3.0, 0.5], [4.0, -1.9], [1.0, 1.99], [5.0, 0.0], [-4.9, -0.6], [4.5, 1.8],
+    [5.1, 0.0], [-2.0, 2.5],
+])  # fmt: skip
+
+
+def limits(H, h, rows):
+    """Polytope with rows times `rows`."""
+    return jm.Polytope(rows[:, None] * H, rows * h)
+
+
+def problem(rows=None, S=None, T=None):
+    """The double integrator with limits of states (4 rows), inputs (2), an output with the input in
+    it (2) and of x_N (4), each row times its number of rows (12,), in the units S (2,), T (1,)."""
+    rows = np.ones(12) if rows is None else rows
+    S, T = (np.ones(k) if v is None else v for k, v in ((2, S), (1, T)))
+    box, pair = np.vstack([np.eye(2), -np.eye(2)]) / S, np.array([[1.0], [-1.0]]) / T
+    A, B = np.array([[1.0, 1], [0, 1]]), np.array([[0.5], [1]])
+    C, D, side = rows[6:8, None] * np.eye(2) / S, rows[6:8, None] * [[0.0], [0.5]] / T, rows[6:8]
+    return jm.MPC(
+        jm.LinearSystem(S[:, None] * A / S, S[:, None] * B / T),
+        np.diag(1 / S**2), np.diag(0.5 / T**2), HORIZON,
+        states=limits(box, np.array([5.0, 2, 5, 2]), rows[:4]),
+        inputs=limits(pair, np.ones(2), rows[4:6]),
+        outputs=jm.Outputs(C, side * [-INF, -2.2], side * [5.5, 2.2], D),
+        terminal_set=limits(box, np.array([1.0, 1, 1, 1]), rows[8:]),
+        terminal_cost=np.array([[2.0, 0.5], [0.5, 2.0]]) / S / S[:, None], prestabilise=False,
+    )  # fmt: skip
+
+
+def units(rng, count):
+    """(rows, S, T): one row, then all rows, one state, the input, and all of them."""
+    yield np.ones(12), np.ones(2), np.ones(1)
+    for _ in range(count):
+        up = EIGHT ** rng.choice([-1.0, 1.0])
+        yield up ** (np.arange(12) == rng.integers(12)), np.ones(2), np.ones(1)
+        yield EIGHT ** rng.choice([-1.0, 0.0, 1.0], 12), np.ones(2), np.ones(1)
+        yield np.ones(12), up ** np.eye(2)[rng.integers(2)], np.ones(1)
+        yield np.ones(12), np.ones(2), np.array([up])
+        yield (FOUR ** rng.choice([-1.0, 1.0], k) for k in (12, 2, 1))
+
+
+class Statement:
+    """min Σ x'Qx + u'Ru + x_N'Px_N over w = (x_0, …, x_N, u_0, …): E w = e, lower ≤ G w ≤ upper."""
+
+    def __init__(self, mpc, x0):
+        A, B, N = np.asarray(mpc.system.A), np.asarray(mpc.system.B), mpc.horizon
+        self.n, m = B.shape
+        split = (N + 1) * self.n
+        whole = np.eye(split + N * m)
+        X, U = whole[:split].reshape(N + 1, self.n, -1), whole[split:].reshape(N, m, -1)
+        P = np.zeros_like(A) if mpc.terminal_cost is None else mpc.terminal_cost
+        self.H = linalg.block_diag(*[mpc.Q] * N, P, *[mpc.R] * N)
+        self.E = np.vstack([X[0], *(X[k + 1] - A @ X[k] - B @ U[k] for k in range(N))])
+        self.e = np.append(x0, np.zeros(N * self.n))
+        outputs = (mpc.outputs,) if isinstance(mpc.outputs, jm.Outputs) else mpc.outputs
+        parts = [(o.C @ X[k] + o.D @ U[k], o.lower, o.upper) for o in outputs for k in range(N)]
+        for limit, of in (
+            (mpc.states, X[:N]), (mpc.inputs, U), (mpc.terminal_set, X[N:]),
+        ):  # fmt: skip
+            if limit is not None:
+                M, low, high = (np.asarray(v) for v in limit.rows())
+                parts.extend((M @ v, low, high) for v in of)
+        self.G, self.lower, self.upper = (np.concatenate(v) for v in zip(*parts, strict=True))
+
+    def cost(self, w):
+        return w @ self.H @ w
+
+    def violation(self, w):
+        """The largest violation of a limit or an equation of the dynamics, relative to the absolute
+        terms of its row; of an equation to the largest of its kind along the horizon."""
+        value, finite = self.G @ w, lambda v: np.where(np.isfinite(v), np.abs(v), 0.0)
+        beyond = np.maximum(np.maximum(self.lower - value, value - self.upper), 0.0)
+        terms = np.abs(self.G) @ np.abs(w) + np.maximum(finite(self.lower), finite(self.upper))
+        by_state = lambda v: v.reshape(-1, self.n).max(axis=0)
+        off = by_state(np.abs(self.E @ w - self.e))
+        size = by_state(np.abs(self.E) @ np.abs(w) + np.abs(self.e))
+        return max(np.max(beyond / terms), np.max(off / size))
+
+    def best(self):
+        """The optimal w: Clarabel's, then the solution of its equations and of the limits that push
+        as equations. None where there is none."""
+        high, low = np.isfinite(self.upper), np.isfinite(self.lower)
+        rows = np.vstack([self.E, self.G[high], -self.G[low]])
+        right = np.concatenate([self.e, self.upper[high], -self.lower[low]])
+        equal = len(self.e)
+        cones = [clarabel.ZeroConeT(equal), clarabel.NonnegativeConeT(len(right) - equal)]
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        settings.tol_gap_abs, settings.tol_gap_rel, settings.tol_feas = 1e-14, 1e-10, 1e-10
+        P, q = sparse.csc_matrix(np.triu(2 * self.H)), np.zeros(len(self.H))
+        solver = clarabel.DefaultSolver(P, q, sparse.csc_matrix(rows), right, cones, settings)
+        answer = solver.solve()
+        if str(answer.status) == "PrimalInfeasible":
+            return None
+        assert str(answer.status) == "Solved"
+        push = (np.arange(len(rows)) < equal) | (np.array(answer.z) > np.array(answer.s))
+        met, known = rows[push], right[push]
+        system = np.block([[2 * self.H, met.T], [met, np.zeros((len(met), len(met)))]])
+        answer_w = np.linalg.lstsq(system, np.append(q, known), rcond=1e-14)[0][: len(q)]
+        np.testing.assert_allclose(answer_w, answer.x, atol=1e-3 * np.max(np.abs(answer.x)))
+        return answer_w
+
+
+@pytest.fixture(scope="module")
+def optima():
+    """(statement, optimal w or None) of each of STATES, in the units of the problem as drawn."""
+    statements = [Statement(problem(), x0) for x0 in STATES]
+    found = [(statement, statement.best()) for statement in statements]
+    assert [w is not None for _, w in found] == [True] * 6 + [False] * 3
+    return found
+
+
+def faults_of(plan, mpc, x0, S, T, statement, best, near):
+    """What is wrong with a plan for x0, both in the units S, T: sentences."""
+    status = jm.Status(int(plan.status))
+    if best is None:
+        return [] if status == jm.Status.PRIMAL_INFEASIBLE else [status.name]
+    if status != jm.Status.SOLVED:
+        return [status.name]
+    wrong = []
+    states, inputs = np.asarray(plan.states, float), np.asarray(plan.inputs, float)
+    there = Statement(mpc, x0).violation(np.append(states, inputs))
+    w = np.append(states / S, inputs / T)
+    off = np.max(np.abs(w - best)) / np.max(np.abs(best))
+    optimal = statement.cost(best)
+    gaps = [abs(J / optimal - 1) for J in (statement.cost(w), float(plan.cost))]
+    for name, value in (("row", there), ("plan", off), ("cost", gaps[0]), ("stated", gaps[1])):
+        if not value <= near:
+            wrong.append(f"{name} off by {value:.1e}")
+    return wrong
+
+
+def faults(route, count, x64, optima, seed=0):
+    """What is wrong in `count` choices of units: a list of (unit, state, sentences)."""
+    rng, wrong = np.random.default_rng(seed), []
+    near = 1e-6 if x64 else 2e-5
+    with jax.enable_x64(x64):
+        for k, (rows, S, T) in enumerate(units(rng, count)):
+            mpc = problem(rows, S, T)
+            plans = route(mpc, STATES * S)
+            for i, (plan, pair) in enumerate(zip(plans, optima, strict=True)):
+                found = faults_of(plan, mpc, STATES[i] * S, S, T, *pair, near)
+                if found:
+                    wrong.append((k, i, found))
+    return wrong
+
+
+def solve(mpc, x0s):
+    return [jm.solve(mpc, x0) for x0 in x0s]
+
+
+def solve_many(mpc, x0s):
+    plans = jm.solve_many(mpc, x0s)
+    return [jax.tree.map(lambda v, i=i: v[i], plans) for i in range(len(x0s))]
+
+
+def call_controller(mpc, x0s):
+    controller = jm.Controller(mpc)
+    carry, plans = controller.start(x0s[0]), []
+    for x0 in x0s:  # each with the last one's plan as a start
+        _, carry, plan = controller(x0, carry)
+        plans.append(plan)
+    return plans
+
+
+PRECISIONS = pytest.mark.parametrize("x64", [True, False], ids=["float64", "float32"])
+
+
+@PRECISIONS
+def test_plan_in_any_units(x64, optima):
+    assert faults(solve, 1, x64, optima) == []
+
+
+@pytest.mark.slow
+@PRECISIONS
+@pytest.mark.parametrize("route", [solve, solve_many, call_controller])
+def test_many_plans_in_any_units(route, x64, optima):
+    assert faults(route, 20, x64, optima, seed=1) == []
+
+
+def wrong_labels(count, points, seed=0):
+    """Labels that differ from the truth, in `count` choices of units: (unit, point, label)."""
+    rng = np.random.default_rng(seed)
+    x0s = np.vstack([STATES, rng.uniform([-5.5, -2.5], [5.5, 2.5], (points, 2))])
+    truth = [1 if Statement(problem(), x0).best() is not None else -1 for x0 in x0s]
+    wrong = []
+    for k, (rows, S, T) in enumerate(units(rng, count)):
+        labels = np.asarray(jm.map_feasible_set(problem(rows, S, T), x0s * S).label)
+        wrong += [(k, i, int(labels[i])) for i in np.flatnonzero(labels != truth)]
+    return wrong
+
+
+@pytest.mark.parametrize(
+    ("count", "points"), [(1, 20), pytest.param(10, 100, marks=pytest.mark.slow)]
+)
+def test_label_in_any_units(count, points):
+    assert wrong_labels(count, points) == []
+
+
+def unstable(seed, n=4):
+    """A plant with 0.9 to 1.5 as its largest |eigenvalue|, its inputs within ±1, and states."""
+    rng = np.random.default_rng(seed)
+    A = np.eye(n) + 0.2 * rng.normal(size=(n, n))
+    A *= rng.uniform(0.9, 1.5) / np.max(np.abs(np.linalg.eigvals(A)))
+    system = jm.LinearSystem(A, rng.normal(size=(n, 2)))
+    mpc = jm.MPC(
+        system, np.eye(n), np.eye(2), horizon=30, inputs=jm.Box(-np.ones(2), np.ones(2)),
+        terminal_cost=np.eye(n),
+    )  # fmt: skip
+    return mpc, 5 * rng.normal(size=(2, n))
+
+
+def excess(mpc, x0, inputs):
+    """An upper bound of J(u)/J* − 1 for inputs within ±1 and no other limits; J; and the states of
+    the roll-out.
+
+    The gradient g of J by the adjoint equations gives the multipliers μ = −g of the inputs that are
+    at a limit. The bound is that of the dual, J* ≥ D(μ) = min over all u of J + Σ μ'u − |μ|, an LQ
+    problem with linear terms, which the Riccati recursion solves: its values are
+    x'Sx + 2 s'x + d.
+    """
+    A, B, Q, R = mpc.system.A, mpc.system.B, mpc.Q, mpc.R
+    states = [x0]
+    for u in inputs:
+        states.append(A @ states[-1] + B @ u)
+    J = sum(x @ Q @ x + u @ R @ u for x, u in zip(states, inputs, strict=False))
+    J += states[-1] @ mpc.terminal_cost @ states[-1]
+    adjoint = 2 * mpc.terminal_cost @ states[-1]
+    S, s, d = mpc.terminal_cost, np.zeros(len(A)), 0.0
+    for x, u in zip(states[-2::-1], inputs[::-1], strict=True):
+        push = -(2 * R @ u + B.T @ adjoint)
+        mu = np.where((np.abs(u) > 1 - 1e-6) & (push * u > 0), push, 0.0)
+        adjoint = 2 * Q @ x + A.T @ adjoint
+        linear, G = B.T @ s + mu / 2, R + B.T @ S @ B
+        K = -np.linalg.solve(G, B.T @ S @ A)
+        d -= linear @ np.linalg.solve(G, linear) + np.sum(np.abs(mu))
+        s = A.T @ s + K.T @ linear
+        S = Q + K.T @ R @ K + (A + B @ K).T @ S @ (A + B @ K)
+    return J / (x0 @ S @ x0 + 2 * s @ x0 + d) - 1, J, np.array(states)
+
+
+def unstable_faults(seeds, n=4):
+    """What is wrong with plans of unstable plants, prestabilised and not."""
+    wrong = []
+    with jax.enable_x64(True):
+        for seed in seeds:
+            mpc, x0s = unstable(seed, n)
+            for gain in (None, True, False):
+                controller = jm.Controller(replace(mpc, prestabilise=gain))
+                for plan, x0 in ((controller.plan(x0), x0) for x0 in x0s):
+                    status, u = jm.Status(int(plan.status)), np.asarray(plan.inputs)
+                    gap, J, states = excess(mpc, x0, np.clip(u, -1, 1))
+                    found = {
+                        "beyond": np.max(np.abs(u)) - 1, "gap": abs(gap),
+                        "states": np.max(np.abs(plan.states - states)) / np.max(np.abs(states)),
+                        "cost": abs(float(plan.cost) / J - 1),
+                    }  # fmt: skip
+                    found = {name: f"{v:.0e}" for name, v in found.items() if not v <= 1e-6}
+                    if found or status != jm.Status.SOLVED:
+                        wrong.append((seed, gain, status.name, found))
+    return wrong
+
+
+def test_unstable_plans_prestabilised_or_not():
+    assert unstable_faults(range(4)) == []
+
+
+@pytest.mark.slow
+def test_many_unstable_plans_prestabilised_or_not():
+    assert unstable_faults(range(30)) == []
+    assert unstable_faults(range(10), n=8) == []
