@@ -41,7 +41,7 @@ class Settings:
     """samples: of the longest loop (its segments are shortened alike). names: loops whose name
     begins with one of these (none: all)."""
 
-    samples: int = 50
+    samples: int = 80
     names: tuple[str, ...] = ()
 
 
