@@ -89,20 +89,20 @@ def judged(p: Program, w: Array, y: Array) -> tuple[Pair, Array, Array]:
     products = Products.of(qp, z, y)
     judge = judge_in_one_program if has_kernels(len(y)) and not qp.balls else judge_pair
     vectors = qp.q, qp.bounds, qp.row_sizes, z, y, products
-    judgment, gradient = judge(p.eps, vectors, sizes, f.E / p.unit, p.bounds)
+    judgment, gradient = judge(p.eps, vectors, sizes, f.E, p.unit, p.bounds)
     tolerances = p.eps * row_sizes(products.Az, qp.row_sizes, sizes)
     return Pair(z, y, *judgment), matmul(gradient, f.T) / p.unit, tolerances
 
 
 def judge_pair(
-    eps: Any, vectors: tuple, sizes: Natural, E: Array, scaled: Bounds
+    eps: Any, vectors: tuple, sizes: Natural, E: Array, unit: Array, scaled: Bounds
 ) -> tuple[tuple[Measured, Array, Array, Array], Array]:
     """Return the last four fields of a pair, and the gradient of its Lagrangian. vectors: those of
-    `terms_of`. E: row scale in the unit of the program; scaled: its bounds."""
+    `terms_of`. scaled: the bounds in ADMM's coordinates, of row scale E and measured in `unit`."""
     terms, y, products = terms_of(*vectors, sizes), *vectors[-2:]
     floor = rounding(y.dtype)
     # For soft rows the gap is quadratic in the error of z; the prox residual is linear.
-    v, push = E * products.Az, scaled_multipliers(E, y)
+    v, push = E * products.Az / unit, scaled_multipliers(E, y) / unit
     size = jnp.abs(v) + jnp.abs(push)
     prox = scaled.prox_residual(v + push, 1.0) - push, SHARE + size, size
     values, _, own = terms[1]
@@ -112,7 +112,7 @@ def judge_pair(
 
 
 def judge_in_one_program(
-    eps: Array, vectors: tuple, sizes: Natural, E: Array, scaled: Bounds
+    eps: Array, vectors: tuple, sizes: Natural, E: Array, unit: Array, scaled: Bounds
 ) -> tuple[tuple[Measured, Array, Array, Array], Array]:
     """`judge_pair` as a kernel for NVIDIA GPUs. Rows and variables that fill up the vectors are
     free, and zero."""
@@ -124,14 +124,14 @@ def judge_in_one_program(
         (0.0,) * 4, 0.0, free,
     ))  # fmt: skip
 
-    def judge(two: Array, *given: Array) -> tuple[list[Array], list[Array]]:
-        i = indices(len(two))
-        eps, gap = (jnp.sum(jnp.where(i == n, two, 0.0)) for n in range(2))
+    def judge(three: Array, *given: Array) -> tuple[list[Array], list[Array]]:
+        i = indices(len(three))
+        eps, gap, unit = (jnp.sum(jnp.where(i == n, three, 0.0)) for n in range(3))
         vectors, natural, E, scaled = jax.tree.unflatten(tree, given)
-        found, gradient = judge_pair(eps, vectors, replace(natural, gap=gap), E, scaled)
+        found, gradient = judge_pair(eps, vectors, replace(natural, gap=gap), E, unit, scaled)
         return [gradient], jax.tree.leaves(found)
 
-    data = [(jnp.stack([eps, sizes.gap]), 0.0), *zip(given, fills, strict=True)]
+    data = [(jnp.stack([eps, sizes.gap, unit]), 0.0), *zip(given, fills, strict=True)]
     [gradient], numbers = in_one_program(judge, data, [len(z)], 7)
     primal, dual, gap, small, error, near, solved = numbers
     return (Measured(primal, dual, gap, small > 0), error, near > 0, solved > 0), gradient

@@ -123,7 +123,7 @@ def test_iterates_are_those_of_the_dense_solver(kind):
     moved = E > 0
     rho = np.where(moved, settings.rho * (E / np.where(moved, E_dense, 1)) ** 2, 1)
     dense = admm.factor(qp.P, qp.A, replace(settings, rho=rho))
-    q, bounds = admm.scaled(dense, qp)
+    q, bounds, _ = admm.scaled(dense, qp, 1.0)
     schedule = admm.splittings(dense, q)
     t, _ = admm.iterate(schedule, bounds, jnp.zeros(count), 50, settings.alpha)
     sample = stagewise.Sample(jnp.asarray(X0), jnp.zeros((N + 1, n)), jnp.zeros((N, m)))
@@ -135,7 +135,7 @@ def test_iterates_are_those_of_the_dense_solver(kind):
     u, _ = stagewise.read(factor, bounds, t_stages, free[-1])
     expected = np.asarray(t)[moved] / E_dense[moved] + shift[moved]
     np.testing.assert_allclose(np.asarray(t_stages)[moved] / E[moved], expected, atol=1e-9)
-    w, y = admm.read(dense, t, q, admm.scaled(dense, qp)[1])
+    w, y = admm.read(dense, t, q, admm.scaled(dense, qp, 1.0)[1])
     np.testing.assert_allclose(u.ravel(), dense.T @ w, atol=1e-9)
     s = bounds.project(t_stages, factor.rho[-1])
     y_stages = E * factor.rho[-1] * (t_stages - s)

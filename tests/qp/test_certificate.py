@@ -48,12 +48,12 @@ def program(A=None, l=(), u=(), P=None, q=(), y=(), d=()):
 
 def _certify(qp, y, d):
     qp = jm.QP(*qp)
-    return farkas(qp, y, correcting_rows(qp)), descent_ray(qp, d)
+    return farkas(qp, y, correcting_rows(qp))[:2], descent_ray(qp, d)
 
 
 COMPILED = jax.jit(jax.vmap(_certify))
 PROVE = jax.jit(prove)
-ONE = jax.jit(lambda qp, y: farkas(qp, y, correcting_rows(qp)))
+ONE = jax.jit(lambda qp, y, *more: farkas(qp, y, correcting_rows(qp), *more))
 
 
 def certify(programs):
@@ -167,8 +167,17 @@ class TestFarkas:
             jnp.eye(1), jnp.zeros(1), jnp.ones((2, 1)), jnp.array([2.0, -INF]),
             jnp.array([INF, 1.0]), soft_linear=jnp.array([INF, weight]),
         )  # fmt: skip
-        y, proved = ONE(qp, jnp.array([-1.0, 1.0]))
+        y, proved, _ = ONE(qp, jnp.array([-1.0, 1.0]))
         assert proved == empty and np.abs(y).max() == empty
+
+    def test_beyond_the_tolerance(self):
+        """z₁ ≥ 1 + d and z₁ ≤ 1 still contradict each other when each is widened by t < d/2."""
+        qp = lambda d: jm.QP(
+            jnp.eye(1), jnp.zeros(1), jnp.ones((2, 1)), jnp.array([1 + d, -INF]),
+            jnp.array([INF, 1.0]),
+        )  # fmt: skip
+        for d, t, beyond in ((1e-3, 4e-4, True), (1e-3, 6e-4, False), (1e-10, 1e-6, False)):
+            assert ONE(qp(d), jnp.array([-1.0, 1.0]), jnp.full(2, t))[1:] == (True, beyond)
 
     @pytest.mark.parametrize(("low", "empty"), [(0.9, False), (2.0, True)])
     def test_ball(self, low, empty):
@@ -211,7 +220,7 @@ class TestProve:
         qp = jm.QP(np.zeros((2, 2)), np.array([1.0, 0.0]), A, np.array(l), np.array(u))
         qp = jax.tree.map(jnp.asarray, qp)
         arrays = map(jnp.asarray, (self.T, self.E))
-        return PROVE(qp, *arrays, correcting_rows(qp), jnp.array(y), jnp.array(d))
+        return PROVE(qp, *arrays, correcting_rows(qp), jnp.zeros(3), jnp.array(y), jnp.array(d))
 
     def test_rows_that_nothing_moves(self):
         """0'z ≥ 1 and 0'z ≤ −1, whatever the candidate is."""
@@ -233,21 +242,23 @@ class TestProve:
     def test_no_rows(self):
         empty = jnp.zeros((0, 2))
         qp = jm.QP(jnp.zeros((2, 2)), jnp.ones(2), empty, jnp.zeros(0), jnp.zeros(0))
-        found = PROVE(qp, jnp.eye(2), jnp.zeros(0), correcting_rows(qp), jnp.zeros(0), -jnp.ones(2))
+        none, rows = jnp.zeros(0), correcting_rows(qp)
+        found = PROVE(qp, jnp.eye(2), none, rows, none, none, -jnp.ones(2))
         assert found.unbounded and not found.infeasible and found.certificate.shape == (0,)
 
     def test_joined(self):
-        """What either proves, and the first where both do."""
-        for bits in np.ndindex(2, 2, 2, 2):
+        """What either proves, and the first where both do, but for one beyond the tolerance."""
+        for *bits, beyond in np.ndindex(2, 2, 2, 2, 2):
             parts = [
-                Proof(jnp.full(2, 1.0 + i), jnp.asarray(bool(a)), jnp.full(3, 5.0 + i),
-                      jnp.asarray(bool(b)))
-                for i, (a, b) in enumerate((bits[:2], bits[2:]))
+                Proof(jnp.full(2, 1.0 + i), jnp.asarray(bool(a)), jnp.asarray(bool(a and beyond)),
+                      jnp.full(3, 5.0 + i), jnp.asarray(bool(b)))
+                for i, (a, b, beyond) in enumerate(((*bits[:2], False), (*bits[2:], beyond)))
             ]  # fmt: skip
             got = parts[0].joined(parts[1])
             assert got.infeasible == (bits[0] or bits[2])
             assert got.unbounded == (bits[1] or bits[3])
-            assert got.certificate[0] == (1 if bits[0] else 2)
+            assert got.beyond == (bits[2] and beyond)
+            assert got.certificate[0] == (1 if bits[0] and not got.beyond else 2)
             assert got.ray[0] == (5 if bits[1] else 6)
         none = Proof.none(jnp.ones(3), jnp.ones(2))
         assert not none.infeasible and not none.unbounded

@@ -44,7 +44,7 @@ def scaled_batch(n, m, B, *, soft=False, balls=(), stages=1, dtype=jnp.float32, 
     made = factor(jnp.eye(n), A, ADMM(iterations=STEPS, rho=rho), balls)
 
     def one(q, l, u):
-        return scaled(made, solve.as_arrays(jm.QP(jnp.eye(n), q, A, l, u, **fields)))
+        return scaled(made, solve.as_arrays(jm.QP(jnp.eye(n), q, A, l, u, **fields)))[:2]
 
     data = made, *jax.vmap(one)(q, l, u), rng.standard_normal((B, m))
     return jax.tree.map(lambda v: jnp.asarray(v, dtype) if v.dtype.kind == "f" else v, data)
