@@ -25,6 +25,7 @@ from jaxmpc.qp.active_set import (
 from jaxmpc.qp.admm import Factor, scaled, scaled_multipliers, unscaled
 from jaxmpc.qp.batches import repeat_while
 from jaxmpc.qp.certificate import Proof, correcting_rows, farkas, prove, recession, to_length_one
+from jaxmpc.qp.modes import varying
 from jaxmpc.qp.newton import (
     Constants,
     Multipliers,
@@ -153,6 +154,7 @@ def improve(
     s = Search(begin, p.q, best, jnp.int32(0), Proof.none(p.q, p.bounds.l), begin.w, go_on)
     if fixed:
         length = refine + 3 * proof_steps(refine)
+        s = varying(s, (s, constants))
         s = lax.scan(partial(still_open, refine, constants), s, length=length)[0]
     else:
         step = partial(by_multipliers, refine)

@@ -31,6 +31,7 @@ from jaxmpc.qp.admm_kernel import iterate_batch, suits
 from jaxmpc.qp.batches import in_blocks
 from jaxmpc.qp.certificate import Proof, correcting_rows, prove
 from jaxmpc.qp.derivative import dense_conditions, implicit
+from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.newton import (
     Constants,
     multipliers_start,
@@ -81,6 +82,7 @@ def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: Any = None) -> QPSoluti
 
 
 @partial(jax.jit, static_argnames="whole")
+@own_modes
 def _solve(qp: QP, solver: ADMM, warm_start: Any, *, whole: bool) -> QPSolution:
     made = factor(qp.P, qp.A, solver, qp.balls)
     return marked(*solve_factored(qp, made, solver, warm_start, whole=whole))
@@ -201,7 +203,7 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = 
     pair, end = unscaled(qp, factor, w, y), begin
     if refine:
         advance = lambda s, _: (multipliers_step(factor.H, q, factor.A, bounds, s), None)
-        end = lax.scan(advance, begin, length=refine)[0]
+        end = lax.scan(advance, varying(begin, begin), length=refine)[0]
         pair = better(qp, pair, unscaled(qp, factor, end.w, end.y))
     correcting = correcting_rows(qp)
     proof = prove(qp, factor.T, factor.E, correcting, end.change, end.move)
