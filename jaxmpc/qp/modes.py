@@ -25,12 +25,22 @@ def own_modes(function: F) -> F:
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
         with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
-            call = functools.partial(function, **kwargs)
             if AxisType.Explicit in get_abstract_mesh().axis_types:
-                call = auto_axes(call, out_sharding=PartitionSpec())
-            return varying(call(*varying(args, args)), args)
+                return _without_explicit_axes(functools.partial(function, **kwargs), args)
+            return varying(function(*varying(args, args), **kwargs), args)
 
     return run  # type: ignore[return-value]
+
+
+def _without_explicit_axes(function: Callable[..., Any], args: tuple) -> Any:
+    leaves, tree = jax.tree.flatten(args)
+    places = [i for i, v in enumerate(leaves) if isinstance(v, jax.Array)]  # not what is static
+
+    def call(*arrays: Any) -> Any:
+        given = dict(zip(places, arrays, strict=True))
+        return function(*tree.unflatten([given.get(i, v) for i, v in enumerate(leaves)]))
+
+    return auto_axes(call, out_sharding=PartitionSpec())(*(leaves[i] for i in places))
 
 
 def varying(tree: Any, like: Any) -> Any:
