@@ -19,6 +19,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxmpc.checks import fail, shown, whole
 from jaxmpc.compiled import Compiled
+from jaxmpc.qp.modes import own_modes
 
 # Devices to work on, None for JAX's default device alone.
 Devices = tuple[jax.Device, ...] | None
@@ -92,6 +93,7 @@ def over_devices(function: Callable, devices: Devices, batched: Sequence[bool]) 
     device gets an equal part, in order, of arguments on the host directly from there. devices None:
     the program for the default device.
     """
+    function = own_modes(function)
     if devices is None:
         return Compiled(jax.jit(function))
     places: Any = tuple(placement(devices, each) for each in batched)

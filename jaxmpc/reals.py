@@ -6,4 +6,5 @@ from typing import TypeAlias
 from jax.typing import ArrayLike
 
 # A number, an array of JAX or NumPy, or lists of these: not a text.
-Reals: TypeAlias = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]]
+# (One Sequence: with two a type checker finds none for rows like [[1, 0.1], [0, 1]].)
+Reals: TypeAlias = ArrayLike | Sequence[ArrayLike | Sequence[ArrayLike]]

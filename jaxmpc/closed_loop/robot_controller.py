@@ -20,6 +20,7 @@ from jaxmpc.mpc.sqp import solve_nonlinear
 from jaxmpc.mpc.stagewise import factor_stages, solve_stagewise
 from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT
+from jaxmpc.qp.modes import varying
 from jaxmpc.qp.precision import arrays, floating_dtype
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.model import RobotModel
@@ -111,7 +112,7 @@ class RobotController:
     def start(self, x: Array, input_reference: Any = None) -> Plan:
         """Return a plan at rest at x under the first input of input_reference, zero for none."""
         shapes = jax.eval_shape(lambda x: self(x, None, input_reference=input_reference)[2], x)
-        zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+        zeros = varying(jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), (x, self))
         states, inputs = self._resting(x, input_reference)
         return replace(zeros, states=states, inputs=inputs)
 

@@ -16,6 +16,7 @@ from jaxmpc.closed_loop.observer import KalmanFilter, model_of, model_step
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.control.violation import worst_violation
+from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.reals import Reals
 
@@ -165,6 +166,7 @@ def as_argument(plant: Any) -> Any:
 
 
 @partial(jax.jit, static_argnames=("steps", "delay", "compensate", "checkpoint"))
+@own_modes
 def _simulate(
     controller: Any, plant: Any, x0: Array, references: tuple[Array | None, Array | None],
     disturbance: Array | None, previous_input: Array | None, noise: Noise | None,
@@ -243,7 +245,7 @@ def _simulate(
     if checkpoint:
         sample = jax.checkpoint(sample, prevent_cse=False)
     samples, first = (jnp.arange(steps), disturbance, w, v), (x0, before, previous, belief)
-    (last, *_), run = jax.lax.scan(sample, first, samples, length=steps)
+    (last, *_), run = jax.lax.scan(sample, varying(first, first), samples, length=steps)
     return replace(
         run, states=jnp.concatenate([run.states, last[None]]),
         violation=jnp.append(run.violation, _violation(controller, last)),

@@ -14,6 +14,7 @@ from jaxmpc.checks import concrete, fail, require_kind, require_shape, require_s
 from jaxmpc.control.system import LinearSystem, as_weight, host_array
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import solve, solve_general
+from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, floating_dtype, in_float64, matmul
 from jaxmpc.reals import Reals
 
@@ -166,6 +167,7 @@ def _refine(
     return P
 
 
+@own_modes
 def _traced(*data: Any) -> LQR:
     """Return K and P for traced A, B, Q, R."""
     data = tuple(jnp.asarray(v) for v in data)  # lists of traced numbers
@@ -190,6 +192,7 @@ def _solution(A: Array, B: Array, Q: Array, R: Array) -> Array:
 
 
 @_solution.defjvp
+@own_modes
 def _solution_jvp(data: tuple[Array, ...], moves: tuple[Array, ...]) -> tuple[Array, Array]:
     A, B, Q, R = data
     dA, dB, dQ, dR = moves
@@ -223,7 +226,7 @@ def _doubling(A: Array, B: Array, Q: Array, R: Array) -> Array:
 
     G = matmul(B, solve(R, B.T))
     start: tuple[Array, ...] = (jnp.asarray(0), A, G, Q, jnp.full_like(Q, jnp.inf))
-    P = jax.lax.while_loop(moving, double, start)[3]
+    P = jax.lax.while_loop(moving, double, varying(start, start))[3]
 
     def recursion(P: Array) -> tuple[Array, Array]:  # as in `_refine`
         K = _traced_gain(A, B, R, P)
@@ -255,7 +258,7 @@ def _power_sum(M: Array, S: Array) -> tuple[Array, Array]:
         return (carry[0] < _DOUBLINGS) & (_size(carry[1]) > jnp.finfo(M.dtype).eps)
 
     start: tuple[Array, ...] = (jnp.asarray(0), M, S)
-    _, M, X = jax.lax.while_loop(moving, double, start)
+    _, M, X = jax.lax.while_loop(moving, double, varying(start, start))
     return X, _size(M)
 
 

@@ -10,13 +10,12 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jax.typing import ArrayLike
 from scipy.spatial import ConvexHull
 
 from jaxmpc.checks import (
@@ -49,6 +48,9 @@ from jaxmpc.control.system import as_array, dimensions, host_array, store_floats
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import solve
 from jaxmpc.reals import Reals
+
+# An array of JAX or NumPy.
+Rows: TypeAlias = jax.Array | np.ndarray
 
 __all__ = ["Box", "Ellipsoid", "Optimum", "Polytope", "hull_volume", "maximise", "unit_rows"]
 
@@ -147,7 +149,7 @@ class Box:
         width = (host_array("upper", self.upper) - host_array("lower", self.lower)) / 2
         return np.where(np.isfinite(width) & (width > 0), width, 1.0)
 
-    def rows(self) -> tuple[ArrayLike, ArrayLike, ArrayLike]:
+    def rows(self) -> tuple[Rows, Rows, Rows]:
         """Return (H, lower, upper) of the two-sided rows lower <= H x <= upper; H is the
         identity."""
         self = self.spread(1)
@@ -286,7 +288,7 @@ class Polytope:
             fail("Polytope", "is empty: no point satisfies all its rows", "Loosen its rows")
         return value
 
-    def rows(self) -> tuple[ArrayLike, ArrayLike, ArrayLike]:
+    def rows(self) -> tuple[Rows, Rows, Rows]:
         """Return (H, lower, upper) of the two-sided rows lower <= H x <= upper; lower is -inf."""
         H, h = _as_floats(self.H), _as_floats(self.h)
         return H, np.full(np.shape(h), -np.inf, dtype=h.dtype), h

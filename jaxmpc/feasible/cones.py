@@ -40,6 +40,7 @@ from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays, filled
 from jaxmpc.feasible.refinement import refined
+from jaxmpc.qp.modes import own_modes
 
 # Coordinates up to which the polytopes have few facets.
 MOST_COORDINATES = 4
@@ -142,6 +143,7 @@ def label_limits(
 
 
 @jax.jit
+@own_modes
 def _slack(p: ExactData, points: Any, values: Any, moved: Any) -> Array:
     """Return the slack of `roll_out` (2, K) from the points with these inputs: as they are, and
     where each may be off by `moved`."""

@@ -20,6 +20,7 @@ from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.modes import own_modes
 
 # How far a boundary point is moved towards the centre before it is proved: the least that works.
 BACKOFFS = 10.0 ** np.arange(-14, -1)
@@ -159,6 +160,7 @@ def filled(count: int) -> np.ndarray:
 
 
 @jax.jit
+@own_modes
 def prove_rays(p: ExactData, rows: ConstraintRows, theta: Any, w: Any, y: Any) -> tuple[Array, ...]:
     """Return which points (K, backoffs, d) of the rays are proved feasible, and the normals (K, d)
     and offsets (K,) of half-spaces that hold on the whole feasible set, from multipliers (K, R),

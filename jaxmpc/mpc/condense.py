@@ -26,6 +26,7 @@ from jaxmpc.mpc.problem import MPC, Switch
 from jaxmpc.mpc.rows import Layout, blocks, split, stacked
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import solve
+from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
@@ -178,6 +179,7 @@ def in_float64(mpc: MPC) -> MPC:
 
 
 @jax.jit
+@own_modes
 def _condense(mpc: MPC) -> Condensed:
     system, N = mpc.system, mpc.horizon
     n, m, p = system.n, system.m, mpc.dimension
@@ -190,7 +192,7 @@ def _condense(mpc: MPC) -> Condensed:
 
     A_K = A + matmul(B, K)
     _, powers = jax.lax.scan(
-        lambda M, _: (matmul(A_K, M), M), jnp.eye(n, dtype=dtype), length=N + 1
+        lambda M, _: (matmul(A_K, M), M), varying(jnp.eye(n, dtype=dtype), A_K), length=N + 1
     )
     response = matmul(powers[:N], B)  # A_K^j B
     lag = np.arange(N + 1)[:, None] - 1 - np.arange(N)[None, :]

@@ -28,6 +28,7 @@ from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.active_set import has_dual_steps
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor
 from jaxmpc.qp.admm import factor as factorise
+from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.solve import in_two_parts, solve_factored
 from jaxmpc.qp.status import Status
@@ -100,7 +101,7 @@ class Controller:
 
         (So that a scan compiles one solve, not two: without a warm start and with.)"""
         shapes = jax.eval_shape(lambda x: self(x)[1], x)
-        return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+        return varying(jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), (x, self))
 
     def __call__(
         self, x: Any, carry: Plan | None = None, reference: Any = None, *,
@@ -227,12 +228,14 @@ def harmless(mpc: MPC) -> tuple[MPC, Any]:
 
 
 @jax.jit
+@own_modes
 def _factor(condensed: Condensed, solver: ADMM) -> Factor:
     made = factorise(condensed.P, condensed.C, solver, condensed.balls)
     return replace(made, reach=condensed.reach(made.reach))
 
 
 @partial(jax.jit, static_argnames="whole")
+@own_modes
 def _sample(
     controller: Controller, x: Array, reference: Any, input_reference: Any, previous_input: Any,
     carry: Plan | None, *, whole: bool,
@@ -247,6 +250,7 @@ def _sample(
 
 
 @partial(jax.jit, static_argnames="whole")
+@own_modes
 def _plan(
     controller: Controller, x0: Array, reference: Any, input_reference: Any, previous_input: Any,
     start: WarmStart | None, *, whole: bool,

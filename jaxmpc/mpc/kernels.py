@@ -17,6 +17,7 @@ from jax import Array
 
 from jaxmpc.qp import triton
 from jaxmpc.qp.linalg import WAITS, batched, inverse_root_side_by_side, solve
+from jaxmpc.qp.modes import own_modes
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.triton import barrier, call, indices, load, on_gpu, padded_side, store
 
@@ -82,7 +83,9 @@ def _or_kernel(scan: Callable, kernel: Callable, *args: Array, lanes: Any = None
     fast = jax.custom_jvp(kernel)
     # The value is the kernel's here too: under `vmap` within `jit` JAX takes the place of the batch
     # axis from the function as it stands, and a scan would put it elsewhere.
-    fast.defjvp(lambda primals, tangents: (fast(*primals), jax.jvp(scan, primals, tangents)[1]))
+    fast.defjvp(own_modes(
+        lambda primals, tangents: (fast(*primals), jax.jvp(scan, primals, tangents)[1])
+    ))  # fmt: skip
     return fast(*args)
 
 

@@ -31,7 +31,7 @@ from jaxmpc.checks import (
 )
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.stages import Sample, Stages, apply, apply_transposed, at, spread
-from jaxmpc.pytrees import named_pytree, pytree
+from jaxmpc.pytrees import named_pytree, pytree, static_pytree
 from jaxmpc.qp.precision import matmul, symmetric
 
 
@@ -116,7 +116,7 @@ class Point(NamedTuple):
     u: Array
 
 
-@jax.tree_util.register_static
+@static_pytree
 @dataclass(frozen=True)
 class Plain:
     """A model x⁺ = f(x, u) given as a function or as an object that is no pytree."""

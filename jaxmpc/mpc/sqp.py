@@ -67,6 +67,7 @@ from jaxmpc.qp.batches import repeat_while
 from jaxmpc.qp.certificate import Proof
 from jaxmpc.qp.derivative import Undo, implicit
 from jaxmpc.qp.linalg import cholesky
+from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.precision import arrays, precisely, rounding
 from jaxmpc.qp.residuals import Measured, Terms, assess
@@ -154,6 +155,7 @@ def solve_nonlinear(
 
 
 @partial(jax.jit, static_argnames=("steps", "hessian"))
+@own_modes
 def _solve(
     problem: NonlinearMPC, solver: ADMM, aims: Aims, warm_start: WarmStart, scale: Any, steps: int,
     hessian: str,
@@ -382,7 +384,7 @@ def sqp_step(most: int, hessian: str, constants: tuple, state: Iterate) -> Itera
     shorten = lambda search: (search[0] / 2, enough(search[0] / 2))
     go_on = lambda search: ~search[1] & (search[0] > SHORTEST)
     one = jnp.ones((), x.dtype)
-    length, found = jax.lax.while_loop(go_on, shorten, (one, enough(one)))
+    length, found = jax.lax.while_loop(go_on, shorten, varying((one, enough(one)), x))
     moves = ~solved & found & jnp.all(jnp.isfinite(du))
     moves = moves & (~exact | (usable & (predicted > -slack)))
     step = lambda v, d: v + jnp.where(moves, length * d, 0.0)
@@ -400,7 +402,7 @@ def solved_qp(
     """Return the solution of a QP from u (N, m), y (rows,), and whether it is one: Newton steps,
     and after them, unless `exact`, interior point steps."""
     loop = lambda step, constants, state: jax.lax.while_loop(
-        lambda state: state.open, partial(step, constants), state
+        lambda state: state.open, partial(step, constants), varying(state, (state, constants))
     )
     best = judged(eps, s, sample, u, y)
     first = Search(best.z, best.y, best, jnp.int32(0), ~(best.near | best.solved))

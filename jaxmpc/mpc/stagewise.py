@@ -57,6 +57,7 @@ from jaxmpc.qp.admm import (
 from jaxmpc.qp.batches import repeat_while
 from jaxmpc.qp.certificate import Proof
 from jaxmpc.qp.derivative import Undo, implicit
+from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.precision import arrays, matmul, precisely
 from jaxmpc.qp.problem import QPSolution
@@ -165,6 +166,7 @@ class StageFactor:
 
 
 @partial(jax.jit, static_argnames="steps")
+@own_modes
 def _factor(mpc: MPC, rho: Any, scale: Any, steps: bool) -> StageFactor:
     s, fault = cleaned(stages(mpc))
     E = row_scale(s) if scale is None else jnp.asarray(scale, s.Q.dtype)
@@ -370,6 +372,7 @@ def plan_stages(
 
 
 @jax.jit
+@own_modes
 def _plan(factor: StageFactor, mpc: MPC, solver: ADMM, sample: Sample, warm_start: Any) -> Plan:
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(sample)]))
     fault = jnp.where(finite, factor.fault, jnp.int32(Status.NON_FINITE))
@@ -462,5 +465,5 @@ def refined(
     # Weights of rows that are held grow until rounding stops the interior point method; Newton's
     # are bounded. As a loop, so that both are compiled once.
     rounds = jnp.arange(2 if interior else 1) == 0
-    best, _ = jax.lax.scan(round_, best, rounds)
+    best, _ = jax.lax.scan(round_, varying(best, (best, s, sample, fixed)), rounds)
     return best.z, best.y, best.measured

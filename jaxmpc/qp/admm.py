@@ -33,6 +33,7 @@ from jax import Array
 from jaxmpc.checks import MOST_COUNT, concrete, fail, number, require_real, whole
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import cholesky, inverse_root
+from jaxmpc.qp.modes import varying
 from jaxmpc.qp.precision import matmul, precisely, rounding
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
@@ -227,6 +228,7 @@ def units(curvature: Array, A: Array) -> Array:
         return jnp.where(curved, d, d / root(columns)), e / root(rows)
 
     begin = jnp.where(curved, 1 / root(curvature), 1.0), jnp.ones(A.shape[0], A.dtype)
+    begin = varying(begin, (curvature, A))
     return jax.lax.fori_loop(0, EQUILIBRATIONS, advance, begin)[0]
 
 
@@ -441,10 +443,12 @@ def repeat(advance: Callable[[Array], Array], t: Array, count: int) -> Array:
     """`count` steps. Backward through them, only the starts of √count blocks are kept in memory;
     the steps of a block are computed again."""
     inner = max(math.isqrt(count), 1)
+    if not count:
+        return t
     block = lambda t, length: jax.lax.scan(lambda t, _: (advance(t), None), t, length=length)[0]
     outer = jax.checkpoint(lambda t: block(t, inner), prevent_cse=False)
     t, _ = jax.lax.scan(lambda t, _: (outer(t), None), t, length=count // inner)
-    return block(t, count % inner)
+    return block(t, count % inner) if count % inner else t
 
 
 def read(factor: Factor, t: Array, q: Array, bounds: Bounds) -> tuple[Array, Array]:

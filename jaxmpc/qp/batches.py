@@ -16,6 +16,8 @@ import numpy as np
 from jax import Array, lax
 from jax.custom_batching import custom_vmap
 
+from jaxmpc.qp.modes import own_modes, varying
+
 # Of a loop: see `repeat_while`.
 Steps = Literal["short", "long", "stages"]
 # Instances in a block on a CPU, whose data stay within the cache. (On GPUs blocks gain nothing.)
@@ -70,6 +72,7 @@ def in_blocks(
     one = custom_vmap(lambda constants, data: function(constants, data))
 
     @one.def_vmap
+    @own_modes
     def _(size: int, in_batched: Any, constants: Any, data: Any) -> Any:
         axes = jax.tree.map(lambda b: 0 if b else None, in_batched[0])
         data = _broadcast(size, in_batched[1], data)
@@ -108,9 +111,10 @@ def repeat_while(
     Not differentiable.
     """
     one = lambda constants, state: lax.while_loop(is_open, lambda s: step(constants, s), state)
-    single = custom_vmap(one)
+    single, state = custom_vmap(one), varying(state, (constants, state))
 
     @single.def_vmap
+    @own_modes
     def _(size: int, in_batched: Any, constants: Any, state: Any) -> Any:
         leaves, tree = jax.tree.flatten(constants)
         batched = tuple(jax.tree.leaves(in_batched[0]))
@@ -160,6 +164,7 @@ def _in_groups(
     batch = custom_vmap(run)
 
     @batch.def_vmap
+    @own_modes
     def _(size: int, in_batched: Any, leaves: tuple, state: Any) -> Any:
         outer = in_batched[0]
         state = _broadcast(size, in_batched[1], state)

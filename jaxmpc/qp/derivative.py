@@ -32,6 +32,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.qp.admm import Factor, scaled, scaled_rows
+from jaxmpc.qp.modes import own_modes
 from jaxmpc.qp.newton import Constants, linearised
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.problem import QP
@@ -56,6 +57,7 @@ def implicit(
 
 
 @implicit.defjvp
+@own_modes
 def _implicit_jvp(conditions_of: Conditions, primals: tuple, tangents: tuple) -> tuple:
     data, constants, z, y = primals
     # As a result of this function, z and y carry the derivatives that higher orders need.

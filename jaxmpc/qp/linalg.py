@@ -28,6 +28,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.custom_batching import custom_vmap
 
+from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import matmul
 
 JAXLIB = tuple(int(part) for part in re.findall(r"\d+", version("jaxlib"))[:3])
@@ -71,6 +72,7 @@ def batched(
         return lax.platform_dependent(*args, cpu=on_cpu, default=jax.vmap(one))
 
     @many.def_vmap
+    @own_modes
     def _(size: int, in_batched: Any, *args: Array) -> Any:
         args = _all_batched(size, in_batched, args)
         out = many(*(v.reshape(-1, *v.shape[2:]) for v in args))
@@ -80,6 +82,7 @@ def batched(
     single = custom_vmap(one)
 
     @single.def_vmap
+    @own_modes
     def _(size: int, in_batched: Any, *args: Array) -> Any:
         if columns and not in_batched[0]:
             M, B = args
@@ -149,7 +152,7 @@ def _substituted(U: Array, D: Array, B: Array) -> Array:
         u, x = lax.optimization_barrier((u, x))
         return jnp.where(row < j, X - u * x, jnp.where(row == j, x, X))
 
-    return lax.fori_loop(0, n, column, B)
+    return lax.fori_loop(0, n, column, varying(B, (U, B)))
 
 
 def _solve_plain(K: Array, B: Array) -> Array:
@@ -245,6 +248,7 @@ def cholesky(K: Array) -> Array:
 
 
 @cholesky.defjvp
+@own_modes
 def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     # L⁻¹ dK L⁻' = S + S' with S = L⁻¹ dL lower triangular (Murray 2016, arXiv:1602.07527, eq. 8).
     L = cholesky(*primals)
@@ -262,6 +266,7 @@ def inverse_root(K: Array) -> Array:
 
 
 @inverse_root.defjvp
+@own_modes
 def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     W = inverse_root(*primals)
     return W, -matmul(_lower_half(matmul(W, matmul(tangents[0], W.T))), W)
@@ -295,6 +300,7 @@ def eigh(K: Array) -> tuple[Array, Array]:
 
 
 @eigh.defjvp
+@own_modes
 def _(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
     w, V = eigh(*primals)
     moved = matmul(V.T, matmul(tangents[0], V))

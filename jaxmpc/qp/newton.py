@@ -23,6 +23,7 @@ from jax import Array
 from jaxmpc.qp.batches import in_blocks, repeat_while, true_places
 from jaxmpc.qp.dual_kernel import MOST_ROWS, damped_kernel
 from jaxmpc.qp.linalg import definite_solver, solve
+from jaxmpc.qp.modes import varying
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.triton import on_gpu
@@ -113,7 +114,8 @@ def newton_step(
 
     one = jnp.ones((), w.dtype)
     count = LINE_STEPS if bounds.linear is None else LINE_STEPS_SOFT
-    (t, low, high), _ = jax.lax.scan(bracket, (one, 0 * one, jnp.inf * one), length=count)
+    begin = varying((one, 0 * one, jnp.inf * one), (slope, v))
+    (t, low, high), _ = jax.lax.scan(bracket, begin, length=count)
     # Without an upper bracket the lower end is used.
     t = jnp.where(minimised, 1.0, jnp.where(jnp.isinf(high), low, t))
     w_new, e_new = w + t * d, bounds.prox_residual(v + t * Ad, rho)
@@ -141,7 +143,7 @@ def least_distance(
         step = newton_step(carry[0], y, H, q, bounds, one, sigma, A)
         return (step.w, step.excess), None
 
-    (w, e), _ = jax.lax.scan(body, (w, y), length=steps)
+    (w, e), _ = jax.lax.scan(body, varying((w, y), (w, A, bounds)), length=steps)
     return w, e
 
 

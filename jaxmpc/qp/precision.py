@@ -8,6 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 from jax.custom_batching import custom_vmap
 
+from jaxmpc.qp.modes import own_modes
+
 # float32 products on NVIDIA cards drop to 10 bits (TF32) unless told otherwise.
 PRECISION = jax.lax.Precision.HIGHEST
 
@@ -86,6 +88,7 @@ def _with_x64(function: Callable) -> Callable:
             return function(*arguments)
 
     @wrapped.def_vmap
+    @own_modes
     def batched(axis_size: int, in_batched: Any, *arguments: Any) -> Any:
         axes = jax.tree.map(lambda b: 0 if b else None, tuple(in_batched))
         out = _with_x64(jax.vmap(function, in_axes=axes))(*arguments)

@@ -25,6 +25,7 @@ from jaxmpc.qp.active_set import (
 from jaxmpc.qp.admm import Factor, natural, scaled, scaled_multipliers, unscaled
 from jaxmpc.qp.batches import repeat_while
 from jaxmpc.qp.certificate import Proof, correcting_rows, farkas, prove, recession, to_length_one
+from jaxmpc.qp.modes import varying
 from jaxmpc.qp.newton import (
     Constants,
     Multipliers,
@@ -196,6 +197,7 @@ def improve(
     )  # fmt: skip
     if fixed:
         length = refine + 4 * proof_steps(refine)
+        s = varying(s, (s, constants))
         s = lax.scan(partial(still_open, refine, constants), s, length=length)[0]
     else:
         step = partial(by_multipliers, refine)

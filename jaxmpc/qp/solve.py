@@ -30,6 +30,7 @@ from jaxmpc.qp.admm_kernel import iterate_batch, suits
 from jaxmpc.qp.batches import in_blocks
 from jaxmpc.qp.certificate import Proof, correcting_rows, prove
 from jaxmpc.qp.derivative import dense_conditions, implicit
+from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.newton import multipliers_start, multipliers_step
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely
 from jaxmpc.qp.problem import QP, QPSolution
@@ -79,6 +80,7 @@ def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: Any = None) -> QPSoluti
 
 
 @partial(jax.jit, static_argnames="whole")
+@own_modes
 def _solve(qp: QP, solver: ADMM, warm_start: Any, *, whole: bool) -> QPSolution:
     made = factor(qp.P, qp.A, solver, qp.balls)
     return marked(*solve_factored(qp, made, solver, warm_start, whole=whole))
@@ -194,7 +196,7 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = 
     pair, end = unscaled(qp, factor, unit, w, y), begin
     if refine:
         advance = lambda s, _: (multipliers_step(factor.H, q, factor.A, bounds, s), None)
-        end = lax.scan(advance, begin, length=refine)[0]
+        end = lax.scan(advance, varying(begin, begin), length=refine)[0]
         pair = better(qp, pair, unscaled(qp, factor, unit, end.w, end.y))
     sizes = p.natural(end.w, end.y)
     allowed = eps * row_sizes(0.0, qp.row_sizes, sizes)

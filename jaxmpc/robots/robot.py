@@ -22,6 +22,7 @@ from jaxmpc.control.sets import Box
 from jaxmpc.control.system import LinearSystem, host_array
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import eigh
+from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import floating_dtype, matmul
 from jaxmpc.robots.balance import lacking, nearest_rest, rest_at, settled
 from jaxmpc.robots.physics import Physics
@@ -143,7 +144,7 @@ class Robot:
                 return (after, matmul(A_1, A), matmul(A_1, B) + B_1), None
 
             first = (start, jnp.eye(self.n, dtype=x.dtype), zero)
-            (after, A, B), _ = jax.lax.scan(chain, first, length=self.substeps)
+            (after, A, B), _ = jax.lax.scan(chain, varying(first, first), length=self.substeps)
             c = after - matmul(A, start) - matmul(B, u)
         else:
             A_1, B_1, after = affine(start)
@@ -403,9 +404,9 @@ class Robot:
 
 
 # Compiled once a robot, also where the user calls them outside `jit`.
-_stepped = jax.jit(Robot._step)
-_linearized = jax.jit(Robot._linearize, static_argnames="exact")
-_differentiated = jax.jit(Robot._transition)
+_stepped = jax.jit(own_modes(Robot._step))
+_linearized = jax.jit(own_modes(Robot._linearize), static_argnames="exact")
+_differentiated = jax.jit(own_modes(Robot._transition))
 
 
 def _quaternion(R: Array) -> Array:

@@ -24,6 +24,7 @@ from jaxmpc.checks import concrete, fail, require_shape
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp import linalg
+from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.newton import Constants, newton_step, ridged
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.projection import Bounds
@@ -86,6 +87,7 @@ def membership(
 
 
 @functools.partial(jax.jit, static_argnames="steps")
+@own_modes
 def _membership(c: Condensed, x0s: Array, width: Array, scale: Any, steps: int) -> Array:
     dtype = c.C.dtype
     width = width.astype(dtype)
@@ -136,6 +138,7 @@ def nearest(A: Array, bounds: Bounds, w: Array, steps: int) -> tuple[Array, Arra
         return k + 1, step.w, step.excess, size(step.gradient) <= enough
 
     start: tuple[Array, ...] = (jnp.asarray(0), w, y, jnp.asarray(False))
+    start = varying(start, (start, A, bounds))
     _, w, e, _ = jax.lax.while_loop(lambda carry: (carry[0] < steps) & ~carry[3], body, start)
     return w, e
 

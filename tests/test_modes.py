@@ -1,0 +1,204 @@
+"""JAX's modes × public functions: results are those of the mode that the library uses itself.
+
+A CPU counts as several devices only where a flag says so before JAX is imported: `shard_map` and
+meshes are tried in a process of their own.
+"""
+
+import os
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmpc as jm
+from jaxmpc.mpc import NonlinearMPC, Task, solve_nonlinear, solve_stagewise
+
+A, B = np.array([[1, 0.1], [0, 1]]), np.array([[0.005], [0.1]])
+XS = np.random.default_rng(0).uniform(-2.2, 2.2, (8, 2)).astype(np.float32)
+
+
+def system():
+    return jm.LinearSystem(A, B, dt=0.1)
+
+
+def problem(**more):
+    return jm.MPC(**{
+        "system": system(), "Q": [1.0, 0.5], "R": 0.1, "horizon": 3, "states": jm.Box(-2, 2),
+        "inputs": jm.Box(-1, 1), "terminal_cost": [2.0, 1.0], **more,
+    })  # fmt: skip
+
+
+def soft_problem(**more):
+    return problem(soft=jm.Soft([[1.0, 0.0]], [0.5], rho=3.0, quadratic=1.0), **more)
+
+
+def rich_problem():
+    """Every kind of row and cost that a condensed problem has."""
+    return soft_problem(
+        outputs=jm.Outputs([[1.0, 1.0]], [-3.0], [3.0], D=[[0.1]]), input_rate_weight=[0.1],
+        input_rate_limit=0.8, terminal_set=jm.Ellipsoid(np.eye(2), 9.0),
+        stage_weights=np.array([1.0, 2.0, 1.0]),
+    )  # fmt: skip
+
+
+@cache
+def controller():
+    return jm.Controller(problem())
+
+
+def program(x):
+    """A quadratic program whose linear term is x."""
+    rows = jnp.array([[1.0, 1.0], [1.0, -1.0]], x.dtype)
+    return jm.QP(P=jnp.eye(2, dtype=x.dtype), q=x, A=rows, l=-jnp.ones_like(x), u=jnp.ones_like(x))
+
+
+def bent(x, u):
+    return jnp.asarray(A, x.dtype) @ x + jnp.asarray(B, x.dtype) @ u + 0.01 * jnp.sin(x)
+
+
+def nonlinear(x):
+    task = Task(lambda point: point.x[:1] ** 2, weight=np.eye(1), upper=3.0)
+    return solve_nonlinear(NonlinearMPC(problem(), bent, (task,)), x)
+
+
+def looped(x):
+    """A loop that the user writes, which carries the plan."""
+
+    def sample(carry, _):
+        u, carry, _ = controller()(x, carry)
+        return carry, u
+
+    return jax.lax.scan(sample, controller().start(x), None, length=2)[1]
+
+
+def robot(x):
+    plant = jm.LinearPlant(system(), jm.Box([-2, -2], [2, 2]), jm.Box([-1.0], [1.0]))
+    return jm.simulate(jm.RobotController(plant, problem()), plant, x, 2).states
+
+
+# Functions of a state (2,), each a pytree of arrays.
+FUNCTIONS = {
+    "plan": lambda x: controller().plan(x),
+    "derivative": lambda x: jax.grad(lambda x: jm.solve(rich_problem(), x).cost)(x),
+    "stagewise": lambda x: solve_stagewise(soft_problem(), system(), x).inputs,
+    "data": lambda x: jm.solve(problem(Q=jnp.diag(1 + x**2)), x).inputs,
+    "qp": lambda x: jm.solve_qp(program(x)).z,
+    "lqr": lambda x: jm.lqr(system(), jnp.diag(1 + x**2), 0.1).K,
+    "loop": looped,
+    "simulate": lambda x: jm.simulate(controller(), system(), x, 2).states,
+    "unrolled": lambda x: (
+        jm.solve(problem(), x, solver=jm.ADMM(20, refine=2, differentiate="unrolled")).inputs
+    ),
+    "fixed": lambda x: jm.solve(rich_problem(), x, solver=jm.ADMM(20, refine=5, fixed=True)).inputs,
+    "jacobian": lambda x: jax.jacfwd(lambda x: jm.solve(problem(), x).inputs)(x),
+    "nonlinear": nonlinear,
+    "robot": robot,
+}
+FEW = ("plan", "derivative")
+HELD_BACK = {"explicit": ("loop",)}  # JAX's own: a carry that starts without a sharding
+
+
+def many(name):
+    """The function of a batch. The controller is made here, not while the function is traced."""
+    controller()
+    return jax.vmap(FUNCTIONS[name])
+
+
+def near(one, other):
+    jax.tree.map(lambda v, w: np.testing.assert_allclose(v, w, rtol=2e-3, atol=2e-3), one, other)
+
+
+@pytest.mark.first(3)
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_no_implicit_promotion(name):
+    """Neither of ranks nor of types, by a user who has forbidden both."""
+    with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
+        found = jax.jit(many(name))(XS)
+    near(found, jax.jit(many(name))(XS))
+
+
+def test_labels_without_implicit_promotion():
+    with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
+        found = jm.map_feasible_set(problem(), XS).label
+    np.testing.assert_array_equal(found, jm.map_feasible_set(problem(), XS).label)
+
+
+def test_without_jit():
+    mpc = jm.MPC(jm.LinearSystem([[1.0]], [1.0]), 1.0, 1.0, 2, inputs=jm.Box(-1, 1))
+    with jax.disable_jit():
+        plan = jm.solve(mpc, 3.0)
+    np.testing.assert_allclose(plan.inputs, [[-1.0], [0.0]], atol=1e-5)
+
+
+def test_debugging_modes():
+    """Feasible or not, no NaN is made on the way, and no tracer stays behind."""
+    with jax.debug_nans(True), jax.checking_leaks():
+        for x, status in ((XS[2], jm.Status.SOLVED), (np.array([3.0, 3.0]), 3)):
+            assert jm.solve(problem(), x).status == status
+
+
+@pytest.mark.parametrize("kind", ["bfloat16", "float16"])
+def test_half_precision(kind):
+    """Computed in float32, as there are no factorizations in half precision."""
+    cast = lambda tree: jax.tree.map(lambda v: jnp.asarray(v, kind), tree)
+    plan = jm.solve(cast(problem()), cast(XS[2]))
+    assert plan.inputs.dtype == np.float32 and plan.status == jm.Status.SOLVED
+    want = jm.solve(jax.tree.map(lambda v: v.astype(np.float32), cast(problem())), cast(XS[2]))
+    np.testing.assert_array_equal(plan.inputs, want.inputs)
+    found = jm.solve_qp(cast(program(jnp.array([2.0, 0.5]))))
+    assert found.z.dtype == np.float32 and found.status == jm.Status.SOLVED
+
+
+def check_shard_map(names):
+    """One batch shared by four devices, with JAX's default check of what varies over them."""
+    from jax.sharding import AxisType
+    from jax.sharding import PartitionSpec as P
+
+    mesh = jax.make_mesh((4,), ("b",), axis_types=(AxisType.Auto,))
+    for name in names:
+        parts = jax.shard_map(many(name), mesh=mesh, in_specs=P("b"), out_specs=P("b"))
+        near(jax.jit(parts)(XS), jax.jit(many(name))(XS))
+        print(name, flush=True)
+
+
+def check_explicit(names):
+    """A mesh with explicit axes, the default of jax.make_mesh: shardings are types."""
+    from jax.sharding import NamedSharding
+    from jax.sharding import PartitionSpec as P
+
+    mesh = jax.make_mesh((4,), ("b",))
+    for name in names:
+        if name in HELD_BACK["explicit"]:
+            continue
+        batch, function = jax.device_put(XS, NamedSharding(mesh, P("b"))), many(name)
+        with jax.set_mesh(mesh):
+            found = jax.jit(function)(batch)
+        near(found, jax.jit(many(name))(XS))
+        print(name, flush=True)
+
+
+def in_a_process(check, names):
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4".strip()
+    code = f"import test_modes; test_modes.check_{check}({list(names)})"
+    paths = [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True,
+        env={**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": os.pathsep.join(filter(None, paths))},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-500:] + done.stderr[-2000:]
+
+
+@pytest.mark.parametrize("check", ["shard_map", "explicit"])
+def test_several_devices(check):
+    in_a_process(check, FEW)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("check", ["shard_map", "explicit"])
+def test_several_devices_all(check):
+    in_a_process(check, [name for name in FUNCTIONS if name not in FEW])
