@@ -328,10 +328,10 @@ def implied_equalities(G: np.ndarray, g: np.ndarray, tolerance: float = FLAT) ->
 
 
 class AffineHull(NamedTuple):
-    """The points shift + basis w of an affine space, and the rows of a set that are left in it.
+    """The points x = shift + basis w of an affine space, and a set {G w <= g} in it, with volume.
 
-    equal: which rows hold all over the set. rows: the others that can bind. G w <= g: these. dual
-    (equal rows,) > 0: multipliers with Σ dual_i G_i = 0 that show that they do.
+    equal (all rows,): which rows of the set hold all over it. rows: the others that move with w, of
+    which G and g are.
     """
 
     shift: np.ndarray
@@ -343,41 +343,49 @@ class AffineHull(NamedTuple):
 
 
 def affine_hull(
-    G: np.ndarray, g: np.ndarray, tolerance: float = FLAT, equal: np.ndarray | None = None
-) -> AffineHull:
+    G: np.ndarray, g: np.ndarray, *, keep: int = 0, tolerance: float = FLAT
+) -> AffineHull | None:
     """Return the affine hull of G x <= g (not empty), and the set in its coordinates, with volume.
 
-    In scaled columns the basis is orthonormal and the shift the point nearest to 0. A row that no w
-    moves, but for rounding of its own terms, is left out.
+    keep: so many first coordinates of x are the first of w; None where the equalities tie these to
+    each other. The others are affine in them and in the rest of w, which are some of them. Where no
+    equality is implied, w = x.
     """
     n = G.shape[1]
-    if equal is None:
-        equal = implied_equalities(G, g, tolerance)
+    equal = implied_equalities(G, g, tolerance)
     if not equal.any():
         return AffineHull(np.zeros(n), np.eye(n), equal, np.arange(len(g)), G, g)
     row, column = scaling(G, g)
     E, e = (row[:, None] * G * column)[equal], (row * g)[equal]
-    U, size, Vt = np.linalg.svd(E)
-    rank = int((size > 1e-10 * size[0]).sum())
-    shift = column * (Vt[:rank].T @ ((U[:, :rank].T @ e) / size[:rank]))
-    # A reduced basis leaves coordinates that the equalities do not tie as they are.
-    basis = column[:, None] * plain_null_space(Vt[:rank])
+    U, size, Vt = np.linalg.svd(E[:, keep:], full_matrices=False)
+    rank = int((size > 1e-10 * max(size.max(initial=0.0), 1e-300)).sum())
+    U, S, V = U[:, :rank], size[:rank], Vt[:rank].T
+    if np.any(np.abs(E[:, :keep] - U @ (U.T @ E[:, :keep])) > FLAT):
+        return None
+    shift = np.append(np.zeros(keep), V @ ((U.T @ e) / S))
+    follow = np.where(np.abs(tied := -V @ ((U.T @ E[:, :keep]) / S[:, None])) > 1e-14, tied, 0.0)
+    null, free = plain_null_space(V.T)
+    basis = np.block([[np.eye(keep), np.zeros((keep, n - keep - rank))], [follow, null]])
+    # Each w is a coordinate of x, in its own units.
+    free = np.append(np.arange(keep), keep + free)
+    basis, shift = column[:, None] * basis / column[free], column * shift
     rest = np.flatnonzero(~equal)
-    H, h = G[rest] @ basis, g[rest] - G[rest] @ shift
-    size = np.abs(G[rest]) @ np.abs(basis)
-    H = np.where(np.abs(H) <= ROUNDING * size, 0.0, H)
+    H = cleaned(G[rest] @ basis, np.abs(G[rest]) @ np.abs(basis) * 1e3)
+    h = cleaned(g[rest] - G[rest] @ shift, np.abs(g[rest]) + np.abs(G[rest]) @ np.abs(shift))
     moved = H.any(axis=1)
     return AffineHull(shift, basis, equal, rest[moved], H[moved], h[moved])
 
 
-def plain_null_space(rows: np.ndarray) -> np.ndarray:
-    """Return a basis (n, n - rank) of {x : rows x = 0} in which n - rank coordinates are the
-    parameters: x = (parameters, -S parameters) in an order that pivoting finds."""
+def plain_null_space(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a basis (n, n - r) of {x : rows x = 0}, rows (r, n) independent, whose parameters are
+    the entries `free` (n - r,) of x, and these: the r others are found by pivoting."""
     r, n = rows.shape
+    if r == 0:
+        return np.eye(n), np.arange(n)
     _, R, order = scipy.linalg.qr(rows, mode="economic", pivoting=True)
-    tied, free = order[:r], order[r:]
+    tied, free = order[:r], np.sort(order[r:])
     basis = np.zeros((n, n - r))
     basis[free] = np.eye(n - r)
-    S = np.linalg.solve(R[:, :r], R[:, r:])
+    S = np.linalg.solve(rows[:, tied], rows[:, free])
     basis[tied] = np.where(np.abs(S) <= 1e-14, 0.0, -S)
-    return basis
+    return basis, free

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
-from jaxmpc.control.geometry import HIGHS, distinct
+from jaxmpc.control.geometry import distinct
+from jaxmpc.control.lp import maximise
 from jaxmpc.explicit.least_distance import SMALLEST, LeastDistanceForm
 
 # Relative rounding of a law: below it a coefficient is zero.
@@ -128,11 +128,11 @@ def capped_ball(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the centre and radius of the largest ball in H ξ ≤ h (unit rows), at most 1; −1 for
     none."""
     n = H.shape[1]
-    ball = linprog(
-        -np.eye(n + 1)[n], A_ub=np.column_stack([H, np.ones(len(h))]), b_ub=h,
-        bounds=[(None, None)] * n + [(None, 1.0)], method="highs-ds", options=HIGHS,
-    )  # fmt: skip
-    return (np.zeros(n), -1.0) if ball.x is None else (ball.x[:n], float(ball.x[-1]))
+    radius = np.eye(n + 1)[n]
+    rows = np.vstack([np.column_stack([H, np.ones(len(h))]), radius])
+    ball = maximise(radius, rows, np.append(h, 1.0)).x
+    assert ball is not None  # a ball of negative radius fits
+    return ball[:n], float(ball[-1])
 
 
 def volume(points: np.ndarray) -> float:
