@@ -33,7 +33,7 @@ FLAT = 1e-9
 ROUNDING = 1e-11
 # What is left of G'y in a Farkas vector is charged for points so many times as far as typical ones.
 FAR = 1e3
-_SWEEPS = 40  # of the scaling; it stops where nothing changes by a factor of 2
+_SWEEPS = 40  # of the least squares of `scaling`; fewer where they end before
 
 
 class Optimum(NamedTuple):
@@ -229,41 +229,45 @@ def solve(
 def scaling(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return powers of two (row, column) with row_i G_ij column_j and row_i g_i of about 1.
 
-    The logarithms of the entries of [G column, g] have mean 0 in each row and column, by turns
-    (Curtis & Reid 1972, J. Inst. Maths Applics 10, least squares): a change of units of rows and
-    columns changes the answer by the same factors, to a power of two. Entries of G that are then
-    below 1e-9 of their row are as good as zero, and distances g_i that are 1e12 times smaller or
-    larger than most are rounding or no limits: a second pass leaves them out. The largest entry of
-    each row of G is at last about 1.
+    column_j is how far along x_j the rows that it dominates let a point go, |g_i| / |G_ij|, in the
+    median. A row is dominated by the entries within a factor of 16 of its largest in scaled columns.
+    So entries of G that are rounding have no influence, nor have distances 1e12 times smaller or
+    larger than most, which are rounding or no limits. This starts from the least squares fit of the
+    logarithms of [G, g] (Curtis & Reid 1972, J. Inst. Maths Applics 10). Rows follow: their largest
+    entry is about 1. A change of units of rows and columns changes the answer by the same factors.
     """
-    M = np.abs(np.column_stack([G, g]))
-    with np.errstate(divide="ignore"):
-        L = np.log2(M)
-    there = np.isfinite(L)
-    row, column = np.zeros(len(M)), np.zeros(M.shape[1])
-    for _ in range(2):
-        count_row, count_column = there.sum(axis=1), there.sum(axis=0)
-        L0 = np.where(there, L, 0.0)
-        for _ in range(_SWEEPS):
-            before = column
-            row = -(L0.sum(axis=1) + there @ column) / np.maximum(count_row, 1)
-            column = -(L0.sum(axis=0) + row @ there) / np.maximum(count_column, 1)
-            column = np.where(count_column > 0, column - column[-1], 0.0)
-            if np.abs(column - before).max() < 0.1:
-                break
-        with np.errstate(invalid="ignore"):
-            scaled = np.where(np.isfinite(L), L + row[:, None] + column, -np.inf)
-        top = scaled[:, :-1].max(axis=1, initial=-1e3)[:, None]
-        there = np.isfinite(L) & (scaled >= top - 30)
-        # Distances that are rounding beside the others, or so large that they stand for none.
-        distance = (scaled - top)[:, -1]
-        known = np.isfinite(distance)
-        if known.any():
-            there[:, -1] = known & (np.abs(distance - np.median(distance[known])) <= 40)
-    column = np.round(column[:-1])
-    with np.errstate(invalid="ignore"):
-        top = np.where(np.isfinite(L[:, :-1]), L[:, :-1] + column, -np.inf).max(axis=1, initial=-np.inf)
-    top = np.where(np.isfinite(top), top, np.where(np.isfinite(L[:, -1]), L[:, -1], 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        L, distance = np.log2(np.abs(G)), np.log2(np.abs(g))
+        reach = np.where(np.isfinite(L), distance[:, None] - L, np.inf)
+    reach[~np.isfinite(distance)] = np.inf
+    both = np.column_stack([L, distance])
+    there = np.isfinite(both)
+    both = np.where(there, both, 0.0)
+    each_row, each_column = np.maximum(there.sum(axis=1), 1), np.maximum(there.sum(axis=0), 1)
+    fit = np.zeros(both.shape[1])
+    for _ in range(_SWEEPS):
+        before, row = fit, -(both.sum(axis=1) + there @ fit) / each_row
+        fit = -(both.sum(axis=0) + row @ there) / each_column
+        fit = fit - fit[-1]
+        if np.abs(fit - before).max() < 0.1:
+            break
+    column = fit[:-1]
+    for _ in range(3):
+        T = L + column
+        top = T.max(axis=1, initial=-np.inf)
+        usable = np.isfinite(distance) & np.isfinite(top)
+        if not usable.any():
+            break
+        off = np.where(usable, distance - np.where(usable, top, 0.0), np.inf)
+        usable &= np.abs(off - np.median(off[usable])) <= 40
+        ruled = usable[:, None] & (T >= np.where(usable, top, np.inf)[:, None] - 4)
+        count = ruled.sum(axis=0)
+        middle = np.sort(np.where(ruled, reach, np.inf), axis=0)[np.maximum(count - 1, 0) // 2]
+        column = np.where(count > 0, np.diagonal(middle), column)
+    column = np.round(column)
+    T = L + column
+    top = T.max(axis=1, initial=-np.inf)
+    top = np.where(np.isfinite(top), top, np.where(np.isfinite(distance), distance, 0.0))
     return np.exp2(-np.round(top)), np.exp2(column)
 
 

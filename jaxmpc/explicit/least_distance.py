@@ -40,8 +40,8 @@ class LeastDistanceForm:
 
     length (r,): multipliers of the rows as given are those of M divided by it. row (r,): index
     into `condensed`. side (r,): 1 upper, −1 lower. still (r,): M_i = 0, a half-space on ξ alone.
-    epsilon (r,): direction of the perturbation. factor: ℓ, of the cost of w in a unit in which y is
-    about 1 long. U: orthonormal columns that span those of M.
+    typical (r,): size of v + V ξ, for tolerances. epsilon (r,): direction of the perturbation.
+    factor: ℓ. U: orthonormal columns that span those of M.
     shift (N·m, n + 1): ℓ⁻¹(F, f). interior (n,): ξ with a margin.
     given: the program as it is stated, before any row is scaled or left out. hull: the affine hull
     of its points (x, z).
@@ -56,6 +56,7 @@ class LeastDistanceForm:
     U: np.ndarray
     V: np.ndarray
     v: np.ndarray
+    typical: np.ndarray
     length: np.ndarray
     row: np.ndarray
     side: np.ndarray
@@ -82,9 +83,8 @@ class LeastDistanceForm:
         return None if found is None else self.interior + found[-1] * direction
 
     def margin(self, xi: np.ndarray) -> float:
-        """Return an upper bound of the greatest t ≤ 1 with M y + t ≤ v + V ξ: ξ is outside X_N if t
-        < 0."""
-        rows = np.column_stack([self.U, np.ones(len(self.v))])
+        """Return the greatest t ≤ 1 with M y + t·typical ≤ v + V ξ: ξ is outside X_N if t < 0."""
+        rows = np.column_stack([self.U, self.typical])
         rows = np.vstack([rows, np.eye(rows.shape[1])[-1]])
         d = np.eye(rows.shape[1])[-1]
         return maximise(d, rows, np.append(self.v + self.V @ xi, 1.0)).value
@@ -120,7 +120,7 @@ class LeastDistanceForm:
         if np.any(b[self.still] < -1e-9):
             return None
         moving = np.flatnonzero(~self.still)
-        for allowance in (0.0, 1e-9):  # points on the boundary of X_N may need one
+        for allowance in (0.0, 1e-9 * self.typical[moving]):  # points on the boundary of X_N may need one
             active: tuple[int, ...] = ()
             worst = -b[moving].min(initial=0.0)
             if worst > 0:
@@ -135,7 +135,7 @@ class LeastDistanceForm:
             if solved is None:
                 continue
             multipliers, y = (part[:, :-1] @ np.append(xi, 1.0) for part in solved)
-            terms = 1 + np.abs(b) + np.abs(self.M) @ np.abs(y)
+            terms = self.typical + np.abs(b) + np.abs(self.M) @ np.abs(y)
             slack = b - self.M @ y
             least = -1e-8 * np.abs(multipliers).max(initial=0.0)
             if np.all(slack[moving] >= -1e-8 * terms[moving]) and np.all(multipliers >= least):
@@ -255,20 +255,19 @@ def least_distance_form(mpc: MPC, within: Box | Polytope | None = None) -> Least
     if np.any(size <= ROUNDING * np.abs(center)):
         fail("mpc", flat, "Relax a limit or lengthen the horizon")
     V, v = V * size, v + V @ center
-    # y in a unit in which it is about 1 long, rows on ξ alone of length 1.
-    reach = (np.linalg.norm(V, axis=1) + np.abs(v))[~still]
-    tau = 2.0 ** np.round(np.log2(np.median(reach))) if len(reach) and reach.any() else 1.0
-    unit = np.where(still, np.maximum(np.linalg.norm(V, axis=1), 1e-300), tau)
-    V, v = V / unit[:, None], v / unit
-    length, factor, shift = np.where(still, unit, length / tau), factor / tau, shift / tau
+    # Rows on ξ alone get length 1; the others are as long as y, in units of cost, is.
+    reach = np.linalg.norm(V, axis=1)
+    unit = np.where(still, np.maximum(reach, 1e-300), 1.0)
+    V, v, length = V / unit[:, None], v / unit, length * unit
+    typical = np.where(still, 1.0, np.median((reach + np.abs(v))[~still]) if any(~still) else 1.0)
     # An orthonormal basis of the columns of M keeps tiny coefficients out of the LPs.
     U = np.linalg.svd(M, full_matrices=False)[0]
     ball = framed("mpc: its feasible set", np.hstack([U, -V]), v).centre
     # Multiples of the golden ratio spread evenly and have no small integer relations.
     epsilon = 1 + np.modf(np.arange(1, len(v) + 1) * (np.sqrt(5) - 1) / 2)[0]
     return LeastDistanceForm(
-        given, hull, c, factor, shift, M, U, V, v, length, row, side, still, epsilon, center, size,
-        ball[-n:],
+        given, hull, c, factor, shift, M, U, V, v, typical, length, row, side, still, epsilon,
+        center, size, ball[-n:],
     )  # fmt: skip
 
 
