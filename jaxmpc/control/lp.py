@@ -73,8 +73,7 @@ class Program:
         for method in ("highs-ds", "highs-ipm", "dual"):
             found = self._by_dual(cost) if method == "dual" else self._highs(cost, method)
             if found is not None:
-                x, y = found
-                y = self._exact(cost, y)
+                x, y = self._exact(cost, *found)
                 left = np.abs(self.M.T @ y - cost).max(initial=0.0)
                 exact = left <= 1e-13 * (1 + np.abs(y).sum())
                 value = self.b @ y if exact else cost @ x
@@ -102,17 +101,22 @@ class Program:
         y, x = found
         return -x[: len(cost)], np.where(self.equal, y, np.maximum(y, 0.0))
 
-    def _exact(self, cost: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the multipliers with M'y = cost to rounding, where those that are not 0 tell
-        them."""
+    def _exact(
+        self, cost: np.ndarray, x: np.ndarray, y: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the optimum without HiGHS' tolerances: x on the rows with multipliers, and the
+        multipliers with M'y = cost, each by least squares, where that is no worse."""
         on = np.abs(y) > 1e-10 * np.abs(y).max(initial=0.0)
         if not on.any():
-            return np.zeros_like(y)
+            return x, np.zeros_like(y)
         better = np.zeros_like(y)
         better[on] = np.linalg.lstsq(self.M[on].T, cost, rcond=None)[0]
         off = lambda v: np.abs(self.M.T @ v - cost).max()
-        fits = np.all((better >= 0) | self.equal) and off(better) <= off(y)
-        return better if fits else y
+        if np.all((better >= 0) | self.equal) and off(better) <= off(y):
+            y = better
+        nearer = x + np.linalg.lstsq(self.M[on], self.b[on] - self.M[on] @ x, rcond=None)[0]
+        worst = lambda v: (self.M @ v - self.b).max(initial=0.0)
+        return (nearer if worst(nearer) <= max(worst(x), 1e-14) else x), y
 
     @cached_property
     def violation(self) -> tuple[np.ndarray, np.ndarray, float]:

@@ -84,12 +84,15 @@ def constraint_rows(
         lower, upper = lower - c.D[:, others] @ rest, upper - c.D[:, others] @ rest
         psi = psi + c.Psi[:, :, others] @ rest
 
-    # Inputs and free states in units of their limits, so that no row is long or short by units.
+    # Inputs and free states in units of their limits, relative to the first input's: the variables
+    # count alike.
     firsts = np.unique(mpc.moves, return_index=True)[1]
     sides = np.abs(set_bounds(mpc.inputs, mpc.system.m)).max(axis=0)
-    unit = np.append(np.tile(power_of_two(sides), len(firsts)), np.ones(extra))
+    unit = np.tile(power_of_two(sides), len(firsts))
     if extra:
-        unit[-extra:] = power_of_two(np.maximum(np.abs(view.lower), np.abs(view.upper)))
+        free = power_of_two(np.maximum(np.abs(view.lower), np.abs(view.upper)))
+        unit = np.append(unit, free)
+    unit = unit / unit[0]
     row_unit = np.ones(len(C))
     if growth is not None:
         by_block = [np.repeat(steps, size) for _, steps, size in c.layout]

@@ -111,8 +111,9 @@ class RowPrograms:
         """Return max t ≥ 0 with center + t·direction in the feasible set; results as in
         `support`."""
         rows, k = self.rows, self.rows.U.shape[1]
-        U = np.hstack([rows.U, (rows.D @ direction)[:, None]])
-        return self._maximum(np.append(np.zeros(k), 1.0), U, rows.D @ center, 0)
+        length = np.abs(direction).max(initial=0.0) or 1.0  # must not choose among equal ends
+        U = np.hstack([rows.U, (rows.D @ (direction / length))[:, None]])
+        return self._maximum(np.append(np.zeros(k), 1 / length), U, rows.D @ center, 0)
 
     def _maximum(
         self, cost: np.ndarray, U: np.ndarray, shift: np.ndarray, low: float | None
