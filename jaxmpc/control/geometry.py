@@ -1,4 +1,4 @@
-"""Geometry of H x <= h in NumPy, in float64: LPs, hulls, redundant rows, elimination.
+"""Geometry of H x <= h in NumPy, in float64: hulls, redundant rows, elimination.
 
 About a point c with G c < g the set {G x <= g} reads {Y (x - c) <= 1}, Y = G / (g - G c). The rows
 of Y are points of the polar set: a row is irredundant exactly if it is a vertex of the convex
@@ -7,119 +7,45 @@ hull of all of them and 0 (Ziegler 1995, section 2.3), and the polar of a projec
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy
-from scipy.optimize import linprog
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 
 from jaxmpc.checks import fail, require_finite
+from jaxmpc.control.lp import Program, extent, framed, maximise
 from jaxmpc.control.system import host_array
 from jaxmpc.reals import Reals
 
-# Tolerances of HiGHS' linear programs.
-HIGHS = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
-# A set is called empty or flat if no ball of this radius fits, relative to the median
-# distance of its hyperplanes from the origin; well above HiGHS' own tolerance of 1e-10.
-FLAT = 1e-9
 _ZERO = 1e-12  # a coefficient that moves a row by less, relative to its distance, counts as 0
 _MERGE = "C-1e-12"  # qhull's option: merge facets of the dual that are flat to 1e-12
 _HULL_DIMENSIONS = 6  # above, hulls have too many facets and one LP a row is faster
 _MOST_ROWS = 100_000  # an elimination step with more candidate rows raises ValueError
 
 
-class Optimum(NamedTuple):
-    """An LP's maximum, where it is attained (n,), and the multipliers (rows,)."""
+def largest_ball(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return (centre, radius) of the largest ball in {G x <= g}; ValueError if empty.
 
-    value: float
-    x: np.ndarray | None = None
-    y: np.ndarray | None = None
-
-
-def maximise(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> Optimum:
-    """Maximise d'x over G x <= g: the value is inf (x and y None) if unbounded, -inf if empty.
-
-    The multipliers y >= 0 obey G'y = d and g'y = value up to rounding. Rows of G should
-    have norms of about 1. Solved by the dual simplex of HiGHS, which returns a vertex.
+    The LP max r subject to G_i x + |G_i| r <= g_i (Boyd & Vandenberghe 2004, section 4.3.1), with r
+    of either sign so that it is always feasible: 0, or negative by rounding, where the set is flat.
+    inf, and a point of the set, if there are balls of every radius.
     """
-    # HiGHS' tolerances are absolute, hence the scaling of g and d.
-    size, length = _typical(g), np.linalg.norm(d) or 1.0
-    # Its presolve calls some unbounded LPs infeasible (HiGHS of scipy 1.18, six variables).
-    for presolve in (True, False):
-        result = linprog(
-            -d / length,
-            A_ub=G,
-            b_ub=g / size,
-            bounds=(None, None),
-            method="highs-ds",
-            options={"presolve": presolve, **HIGHS},
-        )
-        if result.status in (0, 3):
-            break
-    if result.status == 0:
-        x = result.x * size
-        return Optimum(float(d @ x), x, np.maximum(-result.ineqlin.marginals, 0.0) * length)
-    if result.status not in (2, 3):
-        fail("LP", f"HiGHS stopped: {result.message}", "Scale the rows to like size")
-    return Optimum(-np.inf if result.status == 2 else np.inf)
-
-
-def extent(G: np.ndarray, g: np.ndarray, axes: Sequence[int] | None = None) -> np.ndarray:
-    """Return max |x_i| over G x <= g for each i of `axes` (None: all), by two LPs each; inf where
-    the set is unbounded."""
-    directions = np.eye(G.shape[1])[slice(None) if axes is None else list(axes)]
-    return np.array(
-        [max(maximise(e, G, g).value, maximise(-e, G, g).value) for e in directions], dtype=float
-    )
-
-
-def _typical(g: np.ndarray) -> float:
-    """Return the median distance of the hyperplanes from the origin, 1 if all pass through it."""
-    distances = np.abs(g)
-    # Below that they are zeros with rounding.
-    distances = distances[distances > 1e-13 * distances.max(initial=0.0)]
-    return float(np.median(distances)) if distances.size else 1.0
-
-
-def largest_ball(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Return (centre, radius, typical size) of {G x <= g} with unit rows; ValueError if empty.
-
-    The LP max r subject to G x + r <= g (Boyd & Vandenberghe 2004, section 4.3.1), with r
-    of either sign so that it is always feasible. Radius inf if it is unbounded: the centre is
-    then that of a ball as large as the typical size.
-    """
-    size, n = _typical(g), G.shape[1]
-    G_ball, e = np.column_stack([G, np.ones(len(g))]), np.eye(n + 1)[n]
-    top = maximise(e, G_ball, g)
-    unbounded = top.x is None
-    if unbounded:
-        top = maximise(e, np.vstack([G_ball, e]), np.append(g, size))
-    assert top.x is not None
-    centre = top.x[:n]
-    radius = float((g - G @ centre).min(initial=np.inf))
-    if radius < -FLAT * size:
+    n, length = G.shape[1], np.linalg.norm(G, axis=1)
+    if Program(G, g).empty:
         fail(argument, "is empty: no point satisfies all its rows", "Loosen its rows")
-    return centre, np.inf if unbounded else radius, size
+    top = maximise(np.eye(n + 1)[n], np.column_stack([G, length]), g)
+    if top.x is None:
+        return Program(G, g).margin()[0], np.inf
+    return top.x[:n], float(((g - G @ top.x[:n]) / length).min(initial=np.inf))
 
 
-def about_centre(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (Y, c) with {G x <= g} = {Y (x - c) <= 1}, for unit rows; ValueError if empty or
-    flat."""
-    centre, radius, size = largest_ball(argument, G, g)
-    if radius <= FLAT * size:
-        cure = "Check the rows: this needs a set with volume"
-        fail(argument, f"is flat (largest ball of radius {radius:.1e})", cure)
-    return G / (g - G @ centre)[:, None], centre
-
-
-def positively_spanning(G: np.ndarray) -> bool:
-    """Return True if {G x <= g} is bounded: G'y = 0 for some y > 0 and rank G = n (Stiemke)."""
-    if len(G) <= G.shape[1] or np.linalg.matrix_rank(G) < G.shape[1]:
-        return False
-    zero = np.zeros(G.shape[1])
-    return linprog(np.zeros(len(G)), A_eq=G.T, b_eq=zero, bounds=(1, None)).status == 0
+def irredundant_rows(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows of a set with volume, which may be unbounded, that the others do not imply;
+    ValueError if it is empty or flat."""
+    keep = irredundant(framed(argument, G, g).Z)
+    return G[keep], g[keep]
 
 
 def binding_rows(H: np.ndarray, h: np.ndarray, argument: str = "Polytope") -> np.ndarray:
@@ -323,7 +249,8 @@ def eliminate(Y: np.ndarray, axes: Sequence[int]) -> np.ndarray:
     """
     scale = np.abs(Y).max(axis=0, initial=0.0)
     scale[scale == 0] = 1.0
-    Y = Y[irredundant(Y)] / scale
+    Y = Y / scale
+    Y = Y[irredundant(Y)]
     reach = np.full(Y.shape[1], np.inf)
     reach[list(axes)] = extent(*unit_rows(Y, np.ones(len(Y))), axes)
     left = list(axes)

@@ -23,7 +23,20 @@ from jaxmpc.checks import (
     require_symmetric_psd,
 )
 from jaxmpc.control import geometry
-from jaxmpc.control.geometry import maximise, unit_rows
+from jaxmpc.control.geometry import irredundant_rows, unit_rows
+from jaxmpc.control.lp import (
+    FLAT,
+    ROUNDING,
+    Flat,
+    Program,
+    affine_hull,
+    bound,
+    extent,
+    framed,
+    maximise,
+    safe_extent,
+    scaling,
+)
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.control.system import LinearSystem, host_array, host_matrices
@@ -38,7 +51,6 @@ _REDUNDANT = 1e-12
 # The same for a predecessor's rows, where rounding in 12 dimensions reaches 1e-12.
 _ROUNDING = 1e-11
 _CUT = 1e-7  # the last step of a recursion that ends cuts off more than this
-_FLAT = 1e-9  # a set whose largest ball is smaller than this, relative to its limits, is flat
 _MANY = 60  # rows of a target from which ridges are looked for, instead of pairs of rows
 _VERTICES = 500  # up to this many vertices, an input is found for each
 
@@ -117,10 +129,10 @@ def maximal_invariant_set(
             "Use a stabilizing K with u = Kx (python-control's K has the other sign)",
         )
     rows, newest, b = F, F, np.ones(len(F))
-    extent = np.full(n, np.inf)
+    reach = np.full(n, np.inf)
     for t in range(max_iterations + 1):
-        if not np.isfinite(extent).all():
-            extent = _extent(rows)
+        if not np.isfinite(reach).all():
+            reach = safe_extent(rows, np.ones(len(rows)))
         # A row once redundant stays so: if F_i Acl^(t+1) x <= b_(t+1) on O_t, and Acl x + w is
         # in O_t for x in O_(t+1) and w in W, then F_i Acl^(t+2) x <= b_(t+2) on O_(t+1).
         # Only the others are propagated.
@@ -133,13 +145,14 @@ def maximal_invariant_set(
                 "Shrink it, widen the limits, or use a K that rejects it better",
             )
         scaled = candidates / b[:, None]
-        values, bounds = np.array([_bound(row, rows, extent) for row in scaled]).T
+        program = Program(rows, np.ones(len(rows)))
+        values, bounds = np.array([_bound(row, program, reach) for row in scaled]).T
         follow = bounds > 1 + _REDUNDANT
         newest, b = candidates[follow], b[follow]
-        if len(newest) == 0 and np.isfinite(extent).all():
+        if len(newest) == 0 and np.isfinite(reach).all():
             invariant = Polytope(rows, np.ones(len(rows))).reduce()
             return (invariant, t) if return_index else invariant
-        if not np.isfinite(extent).all() and values.max() <= 1 + _REDUNDANT:
+        if not np.isfinite(reach).all() and values.max() <= 1 + _REDUNDANT:
             fail(
                 "states",
                 "the invariant set is unbounded: some motion is never constrained",
@@ -169,7 +182,8 @@ def predecessor(
         system: n states, m inputs; A may be singular, c may be anything.
         target: set in R^n with volume.
         states: set in R^n, or None for all of R^n.
-        inputs: set in R^m, or None for all of R^m. A Box may be flat, a Polytope may not.
+        inputs: set in R^m, or None for all of R^m. It may be flat (an input that is off, two that
+            are equal).
         disturbance: bounded set in R^n that holds the origin, or None for w = 0. If it leaves
             of the target a flat set only, that is enlarged by 4e-9 of its size.
 
@@ -180,7 +194,8 @@ def predecessor(
     Minkowski sum T + (-B inputs) under x -> A x + c. The sum is the projection to y of {(y, u) : y
     + B u in T, u in inputs}, so that A need not be inverted. NumPy in float64; not traceable.
 
-    Raises ValueError for wrong shapes, empty or flat arguments, or as `Polytope.project` does.
+    Raises ValueError for wrong shapes, empty arguments, a target from which no input leads to a set
+    with volume, or as `Polytope.project` does.
 
     Source: Kerrigan 2000, thesis, Cambridge, section 2.3.
     """
@@ -262,11 +277,9 @@ def maximal_control_invariant_set(
         fail("tolerance", f"{tolerance!r} is not between 0 and 1", "Give a relative gap")
     step = one_step(system, inputs, disturbance)
     X = _polytope("states", states, step.n)
-    if not np.isfinite(geometry.extent(*unit_rows(X.H, X.h))).all():
+    if not framed("states", *unit_rows(X.H, X.h)).bounded:
         fail("states", "is unbounded", "Bound every coordinate")
-    size = X.chebyshev()[1]
-    if size <= _FLAT * np.abs(unit_rows(X.H, X.h)[1]).max():
-        fail("states", f"is flat (largest ball of radius {size:.1e})", "Give a set with volume")
+    whole = safe_extent(*unit_rows(X.H, X.h))
     empty = Polytope(np.zeros((1, step.n)), np.array([-1.0]))
 
     def result(inner, outer, k, reason, gap=0.0, exact=True):
@@ -276,7 +289,7 @@ def maximal_control_invariant_set(
         )  # fmt: skip
 
     centre, margin = _equilibrium(step, X)
-    if margin < -_FLAT:
+    if margin < -FLAT:
         short = (
             "" if margin == -np.inf else f" (the best misses them by {-margin:.3g} of their size)"
         )
@@ -300,7 +313,7 @@ def maximal_control_invariant_set(
             # Convergence without end makes each cut a fraction of the last; an end makes it 0.
             if cut <= _ROUNDING and last > _CUT:
                 text, worst = _vertex_proof(step, C)
-                if worst > _FLAT * size:
+                if worst > FLAT:
                     stop = f"C_k = C_k+1 at k = {k}, but for rounding{text}"
                     break
                 return result(
@@ -312,10 +325,10 @@ def maximal_control_invariant_set(
                 stop = f"C_k converges without end: step {k} cuts off {cut:.0e} of its extent"
                 break
             if k < max_iterations:
-                radius = following.chebyshev()[1]
-                if radius <= _FLAT * size:
+                width = _width(following, whole)
+                if width <= FLAT:
                     outer = following
-                    stop = f"C_k converges to a set without volume (radius {radius:.0e})"
+                    stop = f"C_k converges to a set without volume (margin {width:.0e})"
                     break
                 C, last = following.reduce(), cut
         except ValueError as error:
@@ -469,7 +482,7 @@ def disturbance_set(disturbance: Box | Polytope | None, n: int) -> Box | Polytop
         return None
     W = _polytope("disturbance", disturbance, n)
     G, g = unit_rows(W.H, W.h, "disturbance")
-    if not np.isfinite(geometry.extent(G, g)).all():
+    if not np.isfinite(extent(G, g)).all():
         fail("disturbance", "is unbounded", "Bound every coordinate")
     if g.min() < 0:
         fail("disturbance", "does not hold the origin", "Add its centre to the system's c")
@@ -515,9 +528,12 @@ class OneStep:
             if T.is_empty():
                 return _tidy(T)
             G, g = unit_rows(T.H, T.h)
-            size = np.abs(unit_rows(target.H, target.h)[1]).max()
-            if geometry.largest_ball("target", G, g)[1] <= _FLAT * size:
-                T = Polytope(G, g + 4 * _FLAT * size)  # an elimination needs a set with volume
+            try:
+                framed("target", G, g)
+            except Flat:  # an elimination needs a set with volume
+                reach = safe_extent(*unit_rows(target.H, target.h))
+                reach = np.where(np.isfinite(reach), reach, 0.0)
+                T = Polytope(G, g + 4 * FLAT * (np.abs(g) + np.abs(G) @ reach))
         # y in T - B u, where the inputs are u = moving v + fixed
         T = T.preimage(np.eye(n), self.B @ self.fixed)
         many = n in (3, 4) and np.asarray(T.h).size > _MANY
@@ -532,8 +548,9 @@ class OneStep:
         before = T.preimage(self.A, self.c)
         H, h = host_array("H", before.H), host_array("h", before.h)
         # Of a singular A, rows of T whose product with it is 0 but for rounding.
-        H[np.linalg.norm(H, axis=1) <= 1e-13 * np.linalg.norm(self.A, 2)] = 0.0
-        h[~H.any(axis=1) & (np.abs(h) <= 1e-12 * np.abs(h).max(initial=0.0))] = 0.0
+        T_H, T_h = np.abs(host_array("H", T.H)), np.abs(host_array("h", T.h))
+        H[np.all(np.abs(H) <= 1e-13 * T_H @ np.abs(self.A), axis=1)] = 0.0
+        h[~H.any(axis=1) & (np.abs(h) <= ROUNDING * (T_h + T_H @ np.abs(self.c)))] = 0.0
         before = Polytope(H, h)
         return _tidy(before if states is None else states.intersect(before))
 
@@ -541,16 +558,23 @@ class OneStep:
 def one_step(
     system: LinearSystem, inputs: Box | Polytope | None, disturbance: Box | Polytope | None
 ) -> OneStep:
-    """Return the exact data of x⁺ = A x + B u + c + w, with inputs that are fixed (lower = upper)
-    taken out."""
+    """Return the exact data of x⁺ = A x + B u + c + w, with what equalities fix of the inputs
+    (lower = upper, or two opposite rows) taken out."""
     require_kind("system", system, LinearSystem)
     system.validate()
     m = system.m
     inputs = inputs.spread(m) if isinstance(inputs, Box) else inputs
     A, B, c = host_matrices(system)
     V, moving, fixed, ends = None, np.eye(m), np.zeros(m), None
-    if inputs is not None:
+    if isinstance(inputs, Polytope):
         V = _polytope("inputs", inputs, m)
+        hull = affine_hull(*unit_rows(V.H, V.h))
+        assert hull is not None
+        if hull.equal.any():
+            moving, fixed = hull.basis, hull.shift
+            V = Polytope(hull.G, hull.g) if len(hull.g) else None
+    elif inputs is not None:
+        _polytope("inputs", inputs, m)
     if isinstance(inputs, Box):
         lower, upper = host_array("inputs", inputs.lower), host_array("inputs", inputs.upper)
         free = upper > lower
@@ -563,7 +587,7 @@ def one_step(
 
 def _bounded(polytope: Polytope) -> bool:
     """Return whether a polytope is bounded."""
-    return geometry.positively_spanning(unit_rows(polytope.H, polytope.h)[0])
+    return framed("Polytope", *unit_rows(polytope.H, polytope.h)).bounded
 
 
 def _plus_segment(T: Polytope, b: np.ndarray, lower: float, upper: float) -> Polytope:
@@ -575,16 +599,16 @@ def _plus_segment(T: Polytope, b: np.ndarray, lower: float, upper: float) -> Pol
     """
     G, g = unit_rows(T.H, T.h)
     slope, n = G @ b, G.shape[1]
-    slope[np.abs(slope) <= 1e-13 * np.linalg.norm(b)] = 0.0
+    slope[np.abs(slope) <= 1e-13 * np.abs(G) @ np.abs(b)] = 0.0
     V = T.vertices()
-    touches = (np.abs(V @ G.T - g) <= 1e-7 * np.ptp(V, axis=0).max()).T.astype(float)
+    touches = (np.abs(V @ G.T - g) <= 1e-7 * np.ptp(V @ G.T, axis=0)).T.astype(float)
     up, down = np.flatnonzero(slope > 0), np.flatnonzero(slope < 0)
     p, q = np.nonzero(touches[up] @ touches[down].T >= n - 1)
     p, q = up[p], down[q]
     weight = -slope[q] / (slope[p] - slope[q])
     H = weight[:, None] * G[p] + (1 - weight)[:, None] * G[q]
     h = weight * g[p] + (1 - weight) * g[q]
-    new = np.linalg.norm(H, axis=1) > 1e-12
+    new = np.any(np.abs(H) > 1e-12 * (weight[:, None] * np.abs(G[p]) + np.abs(G[q])), axis=1)
     shifted = g + np.maximum(slope * lower, slope * upper)
     return Polytope(np.vstack([G, H[new]]), np.r_[shifted, h[new]]).reduce()
 
@@ -598,37 +622,36 @@ def _tidy(polytope: Polytope) -> Polytope:
     G, g = unit_rows(polytope.H, polytope.h)
     if not len(G):
         return Polytope(zero, np.array([1.0]))
-    _, radius, size = geometry.largest_ball("Polytope", G, g)
-    if radius <= _FLAT * size:
+    try:
+        return Polytope(*irredundant_rows("Polytope", G, g))
+    except Flat:
         return Polytope(G, g)
-    if geometry.positively_spanning(G):
-        return polytope.reduce()
-    keep = geometry.irredundant(geometry.about_centre("Polytope", G, g)[0])
-    return Polytope(G[keep], g[keep])
 
 
 def _equilibrium(step: OneStep, X: Polytope) -> tuple[np.ndarray, float]:
     """Return ((x_e, v_e), margin) of the equilibrium farthest inside the limits, u_e = moving v_e +
     fixed.
 
-    The margin is the least distance to a limit over the radius of the largest ball within
-    `states` (inputs: theirs), negative if a limit is exceeded, -inf if there is none at all.
+    The margin is the least distance to a limit over that of the middle of `states` (inputs:
+    theirs), negative if a limit is exceeded, -inf if there is none at all.
     """
     n = step.n
     M = np.hstack([step.A - np.eye(n), step.B @ step.moving])
     drift = step.c + step.B @ step.fixed
+    # In units in which all entries are about 1.
+    row, column = scaling(M, np.zeros(n))
+    M, drift = row[:, None] * M * column, row * drift
     z0 = -np.linalg.lstsq(M, drift, rcond=None)[0]
-    if np.abs(M @ z0 + drift).max() > 1e-9 * max(np.abs(drift).max(), np.abs(M @ z0).max()):
-        return z0, -np.inf
-    free = scipy.linalg.null_space(M)
+    if np.any(np.abs(M @ z0 + drift) > 1e-9 * (np.abs(drift) + np.abs(M) @ np.abs(z0))):
+        return column * z0, -np.inf
+    z0, free = column * z0, column[:, None] * scipy.linalg.null_space(M)
     rows, limits = [], []
     for part, polytope in ((slice(0, n), X), (slice(n, None), step.V)):
         if polytope is None:
             continue
         G, g = unit_rows(polytope.H, polytope.h)
-        _, radius, size = geometry.largest_ball("limits", G, g)
-        weight = radius if _FLAT * size < radius < np.inf else 1.0
-        rows.append(np.column_stack([G @ free[part], np.full(len(g), weight)]))
+        depth = g - G @ framed("limits", G, g).centre
+        rows.append(np.column_stack([G @ free[part], depth]))
         limits.append(g - G @ z0[part])
     top = maximise(np.eye(free.shape[1] + 1)[-1], *unit_rows(np.vstack(rows), np.hstack(limits)))
     assert top.x is not None  # feasible with a margin low enough, bounded as X is
@@ -684,12 +707,13 @@ def _contractive(
 ) -> Iterator[tuple[Polytope, Polytope]]:
     """Yield for each margin the end of C <- Pre(x_e + (1 - margin) (C - x_e)) & C, with its
     predecessor."""
+    whole = safe_extent(*unit_rows(C.H, C.h))
     for margin in margins:
         inner = C
         for _ in range(30):
             before = step.back(_about(inner, centre[: step.n], 1 - margin))
             inner = _tidy(inner.intersect(before))
-            if inner.is_empty() or inner.chebyshev()[1] <= _FLAT * C.chebyshev()[1]:
+            if inner.is_empty() or _width(inner, whole) <= FLAT:
                 break
             found = list(_kept(step, inner))
             if found:
@@ -709,7 +733,11 @@ def _of_regulator(
     if step.V is not None:
         H, h = unit_rows(step.V.H, step.V.h)
         V = Polytope(H, h - H @ v_e)
-    law = lqr(system, np.diag(1 / _extent(G, g) ** 2), np.eye(k))
+    input_size = np.ones(k)
+    if step.V is not None:
+        size = safe_extent(*unit_rows(step.V.H, step.V.h))
+        input_size = np.where(np.isfinite(size), size, 1.0)
+    law = lqr(system, np.diag(1 / safe_extent(G, g) ** 2), np.diag(1 / input_size**2))
     invariant = maximal_invariant_set(
         system, law.K, Polytope(G, g - G @ x_e), V, disturbance=step.W
     )
@@ -737,7 +765,7 @@ def largest_cut(before: Polytope, C: Polytope, enough: float = np.inf) -> float:
     The number is an upper bound; the search ends at the first fraction above `enough`.
     """
     H, h = unit_rows(before.H, before.h)
-    level, worst = H @ C.chebyshev()[0], -np.inf
+    level, worst = H @ framed("Polytope", *unit_rows(C.H, C.h)).centre, -np.inf
     for i, top in _tops(H, C, h):
         worst = max(worst, (top - h[i]) / max(top - level[i], np.finfo(float).tiny))
         if worst > enough:
@@ -748,7 +776,7 @@ def largest_cut(before: Polytope, C: Polytope, enough: float = np.inf) -> float:
 def _gap(outer: Polytope, inner: Polytope) -> float:
     """Return the least s with outer within the inner set enlarged by 1 + s about its centre."""
     H, h = unit_rows(inner.H, inner.h)
-    slack = h - H @ inner.chebyshev()[0]
+    slack = h - H @ framed("Polytope", H, h).centre
     return max(0.0, *((top - h[i]) / slack[i] for i, top in _tops(H, outer)))
 
 
@@ -759,33 +787,41 @@ def _tops(H: np.ndarray, C: Polytope, h: np.ndarray | None = None) -> Iterator[t
     With h, where a row of C next to H_i x <= h_i implies it, that row's bound.
     """
     G, g = unit_rows(C.H, C.h)
+    # In coordinates of like size, rows of length 1: x = scale ξ.
+    scale = framed("Polytope", G, g).scale
+    length = np.linalg.norm(np.vstack([G, H]) * scale, axis=1)
+    G, g = G * scale / length[: len(G), None], g / length[: len(G)]
+    length = length[len(G) :]
+    H, h = H * scale / length[:, None], None if h is None else h / length
     for rows, Z in geometry.factors(np.vstack([G, H]))[0]:
         own = rows < len(G)
-        limits, reach = g[rows[own]], None
+        limits, reach, program = g[rows[own]], None, Program(Z[own], g[rows[own]])
         near = KDTree(Z[own]).query(Z[~own])[1][::-1] if own.any() and not own.all() else []
         # What an elimination made comes last, and cuts most.
         for i, row, j in zip(rows[~own][::-1] - len(G), Z[~own][::-1], near, strict=True):
-            reach = _extent(Z[own], limits) if reach is None else reach
+            reach = safe_extent(Z[own], limits) if reach is None else reach
             top = limits[j] + np.abs(row - Z[own][j]) @ reach
             if h is None or top > h[i]:
-                top = _bound(row, Z[own], reach, limits)[1]
-            yield int(i), float(top)
+                top = _bound(row, program, reach)[1]
+            yield int(i), float(top * length[i])
 
 
 def _vertex_proof(step: OneStep, C: Polytope) -> tuple[str, float]:
     """Return by how much the worst vertex of C leaves it under the best input for each, as a text
-    and as a number in units of x."""
+    and as a number, relative to the set's extent along the row (inputs: theirs)."""
     vertices = C.vertices() if step.n <= 4 else np.zeros((0, step.n))
     if not 0 < len(vertices) <= _VERTICES:
         return "", 0.0
     G, g = unit_rows(C.H, C.h)
+    depth = g - G @ framed("Polytope", G, g).centre
     g = g - supports(step.W, G)
     BU = step.B @ step.moving
     k = BU.shape[1]
-    rows, worst = np.column_stack([G @ BU, np.ones(len(G))]), 0.0
-    H, h = np.zeros((0, k)), np.zeros(0)
+    rows, worst = np.column_stack([G @ BU, depth]), 0.0
+    H, h, room = np.zeros((0, k)), np.zeros(0), np.zeros(0)
     if step.V is not None:
         H, h = unit_rows(step.V.H, step.V.h)
+        room = h - H @ framed("inputs", H, h).centre
     for v in vertices:
         drift = step.A @ v + step.c + step.B @ step.fixed
         limits = np.r_[g - G @ drift, h]
@@ -795,8 +831,8 @@ def _vertex_proof(step: OneStep, C: Polytope) -> tuple[str, float]:
         )
         assert top.x is not None  # any u within its limits is feasible, with a slack low enough
         u = top.x[:-1]
-        worst = max(worst, float((G @ (drift + BU @ u) - g).max()))
-        worst = max(worst, float((H @ u - h).max(initial=0.0)))
+        worst = max(worst, float(((G @ (drift + BU @ u) - g) / depth).max()))
+        worst = max(worst, float(((H @ u - h) / room).max(initial=0.0)))
     text = f"; each of its {len(vertices)} vertices has an input that keeps it in, to {worst:.0e}"
     return text, worst
 
@@ -828,13 +864,19 @@ def _closed_loop(
             continue
         polytope = _polytope(argument, constraint, dimension)
         H, h = host_array(argument, polytope.H), host_array(argument, polytope.h)
+        F = H @ output
+        # Rows that u = K x keeps identically, as that of two inputs which K makes equal: their
+        # terms cancel.
+        F[np.all(np.abs(F) <= ROUNDING * np.abs(H) @ np.abs(output), axis=1)] = 0.0
+        vacuous = ~F.any(axis=1) & (h >= 0)
+        F, h = F[~vacuous], h[~vacuous]
         if not np.all(h > 0):
             fail(
                 argument,
                 "the origin is not in its interior",
                 "Shift the coordinates, or widen the bounds around 0",
             )
-        parts.append(H @ output / h[:, None])
+        parts.append(F / h[:, None])
     F = np.vstack(parts) if parts else np.zeros((0, n))
     F = F[np.abs(F).max(axis=1, initial=0.0) > 0]
     if len(F) == 0:
@@ -851,26 +893,18 @@ def _polytope(argument: str, value: Box | Polytope | None, n: int) -> Polytope:
     return value.to_polytope() if isinstance(value, Box) else value
 
 
-def _extent(rows: np.ndarray, limits: Reals = 1.0) -> np.ndarray:
-    """Return bounds on |x_i| over rows x <= limits, with a margin for the LP's error; inf where
-    unbounded."""
-    limits = np.broadcast_to(np.asarray(limits), len(rows))
-    return geometry.extent(*unit_rows(rows, limits)) * (1 + 1e-6)
+def _width(body: Polytope, whole: np.ndarray) -> float:
+    """Return the largest margin of the rows of a set, relative to the extents `whole` (n,) of one
+    that holds it: 0 for a flat set."""
+    G, g = unit_rows(body.H, body.h)
+    length = np.abs(G) @ whole
+    top = maximise(np.eye(len(whole) + 1)[-1], np.column_stack([G, length]), g)
+    return max(top.value, 0.0)
 
 
-def _bound(
-    row: np.ndarray, rows: np.ndarray, extent: np.ndarray, limits: Reals = 1.0
-) -> tuple[float, float]:
-    """Return (maximum, upper bound of it) of row x over rows x <= limits.
-
-    For any y >= 0,
-        row x = y'(rows x) + (row - rows'y)'x <= y'limits + |row - rows'y|'extent.
-    """
-    limits = np.broadcast_to(np.asarray(limits), len(rows))
-    top = maximise(row, *unit_rows(rows, limits))
+def _bound(row: np.ndarray, program: Program, reach: np.ndarray) -> tuple[float, float]:
+    """Return (maximum, upper bound of it) of row x over a set within |x| <= reach."""
+    top = program.maximise(row)
     if top.y is None:
         return top.value, top.value
-    y = top.y / np.linalg.norm(rows, axis=1)
-    error = np.abs(row - rows.T @ y)
-    off = error > 0
-    return top.value, float(y @ limits + error[off] @ extent[off])
+    return top.value, bound(row, top.y, program.G, program.g, reach)

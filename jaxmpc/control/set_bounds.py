@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope
+from jaxmpc.control.lp import Program
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope, unit_rows
 
 
 def set_bounds(set_: Box | Polytope | Ellipsoid | None, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -16,12 +17,15 @@ def set_bounds(set_: Box | Polytope | Ellipsoid | None, n: int) -> tuple[np.ndar
     if isinstance(set_, Box):
         return np.asarray(set_.lower, np.float64), np.asarray(set_.upper, np.float64)
     if isinstance(set_, Ellipsoid):
+        least = np.zeros(n)
         inverse = np.linalg.inv(np.asarray(set_.P, np.float64))
         upper = np.sqrt(np.asarray(set_.level, np.float64) * np.diag(inverse))
         lower = -upper
     else:
-        upper = np.array([set_.support(row) for row in np.eye(n)])
-        lower = -np.array([set_.support(row) for row in -np.eye(n)])
+        program = Program(*unit_rows(set_.H, set_.h))
+        lower, upper = program.bounds()
+        least = 1e-6 * program.column
     size = [np.where(np.isfinite(v), np.abs(v), 0.0) for v in (lower, upper)]
-    margin = 1e-6 * (1e-6 + np.maximum(*size))
+    # Where the bounds are about 0, of the size that the rows' data are for.
+    margin = 1e-6 * (least + np.maximum(*size))
     return lower - margin, upper + margin

@@ -1,7 +1,8 @@
 """Convex sets: boxes, polytopes and ellipsoids.
 
 `contains`, `Box.support` and `Ellipsoid.support` are JAX functions of one point (map them with
-`jax.vmap`). Everything that needs an LP (HiGHS) or a convex hull (qhull) runs in NumPy, in float64
+`jax.vmap`); outside of JAX's transformations they answer in float64, whatever JAX's own precision.
+Everything that needs an LP (HiGHS) or a convex hull (qhull) runs in NumPy, in float64
 and outside JAX's transformations, and raises ValueError for sets that are empty, flat or unbounded
 where those make no sense.
 """
@@ -26,24 +27,34 @@ from jaxmpc.checks import (
     require_shape,
     require_symmetric_psd,
 )
-from jaxmpc.control.geometry import FLAT as _FLAT
 from jaxmpc.control.geometry import (
-    Optimum,
-    about_centre,
     binding_rows,
     distinct,
     dual_hull,
     eliminate,
     explained,
-    extent,
     factors,
     hull_volume,
+    irredundant_rows,
     largest_ball,
-    maximise,
-    positively_spanning,
     unit_rows,
 )
 from jaxmpc.control.geometry import irredundant as _irredundant
+from jaxmpc.control.lp import (
+    FLAT,
+    ROUNDING,
+    Flat,
+    Frame,
+    Optimum,
+    Program,
+    affine_hull,
+    bound,
+    cleaned,
+    framed,
+    maximise,
+    safe_extent,
+    scaling,
+)
 from jaxmpc.control.system import as_array, dimensions, host_array, store_floats
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import solve
@@ -117,22 +128,22 @@ class Box:
                 "Give lower <= upper, with -inf below or inf above for no bound",
             )
 
-    def contains(self, x: Reals, tolerance: float = 0.0) -> jax.Array:
+    def contains(self, x: Reals, tolerance: float = 0.0) -> Any:
         """Return whether lower - tolerance <= x <= upper + tolerance, x of shape (n,)."""
         self = self.spread(1)
         _require_shapes("Box", self, ("lower", "upper"), 1)
         require_shape("x", x, (self.dimension,), "Give one point; use jax.vmap for many")
-        x, lower, upper = jnp.asarray(x), jnp.asarray(self.lower), jnp.asarray(self.upper)
-        return jnp.all((lower - tolerance <= x) & (x <= upper + tolerance))
+        xp, (x, lower, upper, tolerance) = _numbers(x, self.lower, self.upper, tolerance)
+        return xp.all((lower - tolerance <= x) & (x <= upper + tolerance))
 
-    def support(self, d: Reals) -> jax.Array:
+    def support(self, d: Reals) -> Any:
         """Return max d'x over the box, d of shape (n,); inf where the box is unbounded along d."""
         self = self.spread(1)
         _require_shapes("Box", self, ("lower", "upper"), 1)
         require_shape("d", d, (self.dimension,), "Give one direction; use jax.vmap for many")
-        d, lower, upper = jnp.asarray(d), jnp.asarray(self.lower), jnp.asarray(self.upper)
+        xp, (along, lower, upper) = _numbers(d, self.lower, self.upper)
         # The maximiser, with 0 where d is 0: there 0 * inf would be NaN.
-        return d @ jnp.where(d > 0, upper, jnp.where(d < 0, lower, 0))
+        return along @ xp.where(along > 0, upper, xp.where(along < 0, lower, 0))
 
     def tightened(self, fraction: Any) -> "Box":
         """Return the box with its two-sided coordinates narrowed on each side by a fraction of
@@ -236,7 +247,7 @@ class Polytope:
         centre = points.mean(axis=0)
         scale = np.abs(points - centre).max(axis=0)
         scaled = (points - centre) / np.where(scale > 0, scale, 1.0)
-        if np.linalg.matrix_rank(scaled, rtol=_FLAT) < points.shape[1]:
+        if np.linalg.matrix_rank(scaled, rtol=FLAT) < points.shape[1]:
             fail("points", "lie in a hyperplane", "Give points that span a set with volume")
         if points.shape[1] == 1:
             return cls(np.array([[1.0], [-1.0]]), np.array([points.max(), -points.min()]))
@@ -245,7 +256,8 @@ class Polytope:
             facets = ConvexHull(scaled).equations
         facets = facets[distinct(facets, 1e-10)]
         normals, offsets = facets[:, :-1] / scale, -facets[:, -1]
-        return cls(*unit_rows(normals, offsets + normals @ centre))
+        size = np.abs(offsets) + np.abs(normals) @ np.abs(centre)
+        return cls(*unit_rows(normals, cleaned(offsets + normals @ centre, size)))
 
     @property
     def dimension(self) -> int:
@@ -255,26 +267,26 @@ class Polytope:
     def validate(self, argument: str, dimension: int | None = None) -> None:
         """Raise ValueError, naming `argument`, for wrong shapes, NaN or an empty set.
 
-        Emptiness is decided by one LP, with a relative tolerance of 1e-9.
+        The set is empty if a checked Farkas vector says so (`is_empty`).
         """
         self._require_fields(argument, dimension)
-        if concrete((self.H, self.h)):
-            largest_ball(argument, *unit_rows(self.H, self.h, argument))
+        if concrete((self.H, self.h)) and Program(*unit_rows(self.H, self.h, argument)).empty:
+            fail(argument, "is empty: no point satisfies all its rows", "Loosen its rows")
 
     def is_empty(self) -> bool:
-        """Return whether no point satisfies all rows, by one LP (relative tolerance 1e-10). NumPy;
-        not traceable."""
+        """Return whether no point satisfies all rows: whether an LP finds multipliers y >= 0 with
+        G'y = 0 and g'y < 0, by more than rounding (1e-11 of the terms). NumPy; not traceable."""
         H, h = host_array("H", self.H), host_array("h", self.h)
         if np.any((h == -np.inf) | (~H.any(axis=1) & (h < 0))):
             return True
-        return maximise(np.zeros(self.dimension), *unit_rows(H, h)).value == -np.inf
+        return Program(*unit_rows(H, h)).empty
 
-    def contains(self, x: Reals, tolerance: float = 0.0) -> jax.Array:
+    def contains(self, x: Reals, tolerance: float = 0.0) -> Any:
         """Return whether H x <= h + tolerance (in the scale of each row), x of shape (n,)."""
         _require_shapes("Polytope", self, ("H", "h"), 2)
         require_shape("x", x, (self.dimension,), "Give one point; use jax.vmap for many")
-        H, h, x = jnp.asarray(self.H), jnp.asarray(self.h), jnp.asarray(x)
-        return jnp.all(jnp.matmul(H, x, precision="highest") <= h + tolerance)
+        xp, (H, h, x, tolerance) = _numbers(self.H, self.h, x, tolerance)
+        return xp.all(_product(xp, H, x) <= h + tolerance)
 
     def support(self, d: Reals) -> float:
         """Return max d'x over the set, by one LP; inf if unbounded along d. NumPy; not traceable.
@@ -299,7 +311,7 @@ class Polytope:
         The radius of a flat set is 0. Raises ValueError if the set is empty, or holds balls
         of every radius.
         """
-        centre, radius, _ = largest_ball("Polytope", *self._rows())
+        centre, radius = largest_ball("Polytope", *self._rows())
         if radius == np.inf:
             fail("Polytope", "is unbounded: it holds arbitrarily large balls", "Add rows")
         return centre, max(radius, 0.0)
@@ -337,7 +349,10 @@ class Polytope:
         self._require_fields("Polytope")
         H, h = host_array("Polytope.H", self.H), host_array("Polytope.h", self.h)
         M, t = _affine(M, t, (self.dimension, None))
-        return Polytope(H @ M, h - H @ t, self.labels)
+        return Polytope(
+            cleaned(H @ M, np.abs(H) @ np.abs(M)),
+            cleaned(h - H @ t, np.abs(h) + np.abs(H) @ np.abs(t)), self.labels,
+        )  # fmt: skip
 
     def image(self, M: Reals, t: Reals | None = None) -> "Polytope":
         """Return {M x + t : x in the set}, reduced unless M is square. NumPy; not traceable.
@@ -354,18 +369,16 @@ class Polytope:
         M, t = _affine(M, t, (None, self.dimension))
         k, n = M.shape
         # Units of x and y must not decide the rank.
-        scale = np.abs(M).max(axis=1, initial=0.0)[:, None]
-        scaled = M / np.where(scale > 0, scale, 1.0)
-        column = np.abs(scaled).max(axis=0)
-        scaled = scaled / np.where(column > 0, column, 1.0)
-        if np.linalg.matrix_rank(scaled, rtol=_FLAT) < k:
+        row, column = scaling(M, np.zeros(k))
+        scaled = row[:, None] * M * column
+        if np.linalg.matrix_rank(scaled, rtol=FLAT) < k:
             fail("M", f"has rank below {k}, so the image is flat", "Map to fewer coordinates")
         order = scipy.linalg.qr(scaled, mode="r", pivoting=True)[1]
         # z = (y - t, x[order[k:]]) = T x
         T = np.vstack([M, np.eye(n)[order[k:]]])
         lifted = self.preimage(np.linalg.inv(T))
         image = lifted if k == n else lifted.project(range(k))
-        return Polytope(image.H, np.asarray(image.h) + image.H @ t, image.labels)
+        return image.preimage(np.eye(k), -t)
 
     def project(self, axes: Sequence[int]) -> "Polytope":
         """Return the set of (x_i for i in axes) over all x in the set, with irredundant unit rows.
@@ -375,30 +388,52 @@ class Polytope:
             axes: the coordinates to keep, in the order wanted.
 
         Exact up to rounding: Fourier-Motzkin elimination of the other coordinates, redundant
-        rows removed after each (Ziegler 1995, section 1.2). The set may be unbounded.
+        rows removed after each (Ziegler 1995, section 1.2). The set may be unbounded, and flat if
+        its projection is not: then coordinates are eliminated by its equalities first.
 
-        Raises ValueError if the set is empty or flat, or has too many rows to eliminate.
+        Raises ValueError if the projection is empty or flat, or there are too many rows to
+        eliminate.
         """
         axes, n = list(axes), self.dimension
         wrong = not axes or len(set(axes)) < len(axes) or not set(axes) <= set(range(n))
         if wrong:
             fail("axes", f"{axes} are not distinct numbers in 0..{n - 1}", "Name those to keep")
-        Y, centre = about_centre("Polytope", *self._rows())
-        Y = eliminate(Y, sorted(set(range(n)) - set(axes)))[:, np.argsort(np.argsort(axes))]
-        return Polytope(*unit_rows(Y, 1 + Y @ centre[axes]))
+        G, g = self._rows()
+        try:
+            Z, centre, scale = framed("Polytope", G, g)
+        except Flat:
+            return self._project_flat(G, g, axes)
+        Z = eliminate(Z, sorted(set(range(n)) - set(axes)))[:, np.argsort(np.argsort(axes))]
+        Y, about = Z / scale[axes], centre[axes]
+        return Polytope(*unit_rows(Y, cleaned(1 + Y @ about, 1 + np.abs(Y) @ np.abs(about))))
+
+    @staticmethod
+    def _project_flat(G: np.ndarray, g: np.ndarray, axes: list[int]) -> "Polytope":
+        """Return the projection of a flat set, in coordinates of its affine hull."""
+        hull = affine_hull(G, g)
+        assert hull is not None
+        onto = hull.basis[axes]
+        row, column = scaling(onto, np.zeros(len(axes)))
+        if not hull.equal.any() or not (
+            onto.shape[1] >= len(axes)
+            and np.linalg.matrix_rank(row[:, None] * onto * column, rtol=FLAT) == len(axes)
+        ):
+            cure = "Check the rows: this needs a result with volume"
+            fail("Polytope", "is flat, and so is its projection", cure)
+        image = Polytope(hull.G, hull.g).image(onto, hull.shift[axes])
+        return Polytope(*irredundant_rows("Polytope", *image._rows()))
 
     def minkowski_sum(self, other: "Box | Polytope | Reals") -> "Polytope":
         """Return {x + w : x in the set, w in other}, with irredundant unit rows. NumPy; not
         traceable.
 
         Arguments:
-            other: Box, Polytope with volume, or points (k, n), which stand for their convex hull;
-                boxes and hulls of points may be flat (a segment, say).
+            other: Box, Polytope, or points (k, n), which stand for their convex hull.
 
         Bounded sets in up to three dimensions: the hull of all sums of vertices. Else the
         projection to x of {(x, w) : x - w in the set, w in other}.
 
-        Raises ValueError if this set, or a Polytope `other`, is empty or flat.
+        Raises ValueError if a set is empty, or the sum flat.
         """
         n = self.dimension
         points: np.ndarray | None
@@ -409,10 +444,9 @@ class Polytope:
             require_finite("other", points)
         else:
             other.validate("other", n)
-            bounded = positively_spanning(_as_polytope("other", other)._rows()[0])
-            points = other.vertices() if bounded and n <= 3 else None
-        if n <= 3 and points is not None and positively_spanning(self._rows()[0]):
-            vertices = self.vertices()
+            points = _vertices_of(other) if n <= 3 else None
+        vertices = _vertices_of(self) if n <= 3 and points is not None else None
+        if points is not None and vertices is not None:
             return Polytope.from_points((vertices[:, None] + points).reshape(-1, n))
         # x = s + shift + D w with s in the set and w in `weights`, a set with volume.
         weights, D, shift = _generated(other, points)
@@ -437,18 +471,17 @@ class Polytope:
         binding = binding_rows(H, h)
         reach = np.zeros(len(h))
         reach[binding] = _supports(other, H[binding])
-        return Polytope(H, h - reach)
+        return Polytope(H, cleaned(h - reach, np.abs(h) + np.abs(reach)))
 
     def is_subset(self, other: "Box | Polytope", tolerance: float = 1e-9) -> bool:
-        """Return whether no point of the set violates a row of `other` by more than `tolerance`.
-        NumPy; not traceable.
+        """Return whether no point of the set violates a row of `other` by more than `tolerance`,
+        relative to the row's own terms. NumPy; not traceable.
 
-        The violation is the distance from the row's hyperplane, in the units of x. Each row is
-        judged by an upper bound of its maximum made from an LP's multipliers y >= 0,
-            row x = y'(G x) + (row - G'y)'x <= y'g + |row - G'y|'|x|,
-        valid for any LP error (Neumaier & Shcherbina 2004, Math. Programming 99); along
-        coordinates in which the set is unbounded the second term is left out. An empty set is
-        a subset of every set.
+        A row a'x <= b may be exceeded by tolerance (|b| + sum_i |a_i| max |x_i|), whatever its
+        units and those of x; the maxima are over the set, infinite ones left out. It is judged by
+        an upper bound of its maximum made from an LP's multipliers (`lp.bound`), valid for any LP
+        error but along coordinates in which the set is unbounded. An empty set is a subset of
+        every set.
         """
         if self.is_empty():
             return True
@@ -456,11 +489,13 @@ class Polytope:
         other._require_fields("other", self.dimension)
         rows, offsets = unit_rows(other.H, other.h, "other")
         G, g = self._rows()
-        reach = extent(G, g) * (1 + 1e-6)
+        reach = safe_extent(G, g)
         reach[np.isinf(reach)] = 0.0
-        for row, offset in zip(rows, offsets, strict=True):
-            y = maximise(row, G, g).y
-            if y is None or y @ g + np.abs(row - G.T @ y) @ reach > offset + tolerance:
+        allowed = max(tolerance, ROUNDING) * (np.abs(offsets) + np.abs(rows) @ reach)
+        program = Program(G, g)
+        for row, most in zip(rows, offsets + allowed, strict=True):
+            y = program.maximise(row).y
+            if y is None or bound(row, y, G, g, reach) > most:
                 return False
         return True
 
@@ -477,8 +512,7 @@ class Polytope:
         factor; factors of more than six dimensions by one LP per row.
         """
         G, g = self._rows()
-        Y, _, scale = self._dual(G, g)
-        keep = _irredundant(Y * scale)
+        keep = _irredundant(self._dual(G, g).Z)
         labels: tuple[str, ...] = ()
         if self.labels:
             binding = binding_rows(host_array("H", self.H), host_array("h", self.h))
@@ -492,10 +526,10 @@ class Polytope:
         The vertex dual to the facet {y : v'y = 1} of the hull described in `reduce` is
         c + v. Raises ValueError if the set is empty, flat or unbounded.
         """
-        Y, centre, scale = self._dual(*self.reduce()._rows())
+        Z, centre, scale = self._dual(*self.reduce()._rows())
         if self.dimension == 1:
-            return np.sort(centre + 1 / Y, axis=0)
-        V = dual_hull(Y * scale).intersections
+            return np.sort(centre + scale / Z, axis=0)
+        V = dual_hull(Z).intersections
         V = V[distinct(V / np.abs(V).max(axis=0), 1e-10)]
         if self.dimension == 2:
             V = V[np.argsort(np.arctan2(V[:, 1], V[:, 0]))]
@@ -507,11 +541,11 @@ class Polytope:
 
         Raises ValueError if the set is empty, flat or unbounded.
         """
-        Y, _, scale = self._dual(*self.reduce()._rows())
-        parts, S = factors(Y * scale)
+        Z, _, scale = self._dual(*self.reduce()._rows())
+        parts, S = factors(Z)
         if len(parts) == 1:
             return hull_volume(self.vertices())
-        volumes = [Polytope(Z, np.ones(len(Z))).volume() for _, Z in parts]
+        volumes = [Polytope(part, np.ones(len(part))).volume() for _, part in parts]
         return float(np.prod(volumes) * np.prod(scale) / abs(np.linalg.det(S)))
 
     def _require_fields(self, argument: str, dimension: int | None = None) -> None:
@@ -524,14 +558,12 @@ class Polytope:
         return unit_rows(self.H, self.h)
 
     @staticmethod
-    def _dual(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return (Y, centre, scale): G x <= g is Y (x - centre) <= 1, and Y * scale has entries <=
-        1."""
-        largest_ball("Polytope", G, g)
-        if not positively_spanning(G):
+    def _dual(G: np.ndarray, g: np.ndarray) -> Frame:
+        """Return the frame of a bounded set with volume; raise ValueError for any other."""
+        frame = framed("Polytope", G, g)
+        if not frame.bounded:
             fail("Polytope", "is unbounded", "Check the rows: this needs a bounded set")
-        Y, centre = about_centre("Polytope", G, g)
-        return Y, centre, 1 / np.abs(Y).max(axis=0)
+        return frame
 
 
 @pytree
@@ -566,20 +598,20 @@ class Ellipsoid:
         if not (np.isfinite(level) and level > 0):
             fail(f"{argument}.level", f"{level:g} is not a positive number", "Give x'Px's maximum")
 
-    def contains(self, x: Reals, tolerance: float = 0.0) -> jax.Array:
+    def contains(self, x: Reals, tolerance: float = 0.0) -> Any:
         """Return whether x'P x <= level + tolerance, x of shape (n,)."""
         self._require_fields("Ellipsoid")
         require_shape("x", x, (self.dimension,), "Give one point; use jax.vmap for many")
-        P, x = jnp.asarray(self.P), jnp.asarray(x)
-        value = jnp.vdot(x, jnp.matmul(P, x, precision="highest"), precision="highest")
-        return value <= jnp.asarray(self.level) + tolerance
+        xp, (P, level, x, tolerance) = _numbers(self.P, self.level, x, tolerance)
+        return _product(xp, x, _product(xp, P, x)) <= level + tolerance
 
-    def support(self, d: Reals) -> jax.Array:
+    def support(self, d: Reals) -> Any:
         """Return max d'x over the ellipsoid = sqrt(level d'P^-1 d), d of shape (n,)."""
         self._require_fields("Ellipsoid")
         require_shape("d", d, (self.dimension,), "Give one direction; use jax.vmap for many")
-        d = jnp.asarray(d)
-        return jnp.sqrt(jnp.asarray(self.level) * (d @ solve(jnp.asarray(self.P), d)))
+        xp, (along, P, level) = _numbers(d, self.P, self.level)
+        solved = np.linalg.solve(P, along) if xp is np else solve(P, along)
+        return xp.sqrt(level * (along @ solved))
 
     def volume(self) -> float:
         """Return the length, area or volume: pi^(n/2) / Gamma(n/2 + 1) level^(n/2) / sqrt(det P).
@@ -661,6 +693,14 @@ def _as_polytope(argument: str, value: Any) -> Polytope:
     return value.to_polytope() if isinstance(value, Box) else value
 
 
+def _vertices_of(set_: Box | Polytope) -> np.ndarray | None:
+    """Return the vertices of a set; None where it is unbounded or flat."""
+    try:
+        return set_.vertices()
+    except ValueError:
+        return None
+
+
 def _affine(
     M: Reals, t: Reals | None, shape: tuple[int | None, int | None]
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -717,6 +757,18 @@ def _supports(other: Any, H: np.ndarray) -> np.ndarray:
         fail("other", f"shape {points.shape} is not (k, {n})", "Give a set, or points")
     require_finite("other", points)
     return (H @ points.T).max(axis=1)
+
+
+def _numbers(*values: Any) -> tuple[Any, list[Any]]:
+    """Return NumPy and the values in float64, or jax.numpy and its arrays where one is traced."""
+    if concrete(*values):
+        return np, [host_array("argument", value) for value in values]
+    return jnp, [jnp.asarray(value) for value in values]
+
+
+def _product(xp: Any, M: Any, v: Any) -> Any:
+    """Return M v, by JAX in the precision of the arrays."""
+    return M @ v if xp is np else jnp.matmul(M, v, precision="highest")
 
 
 def _as_floats(value: Any) -> Any:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from jaxmpc.checks import concrete, fail, require_finite, require_real, require_shape
+from jaxmpc.checks import concrete, fail, nearest, require_finite, require_real, require_shape
 from jaxmpc.pytrees import pytree
 from jaxmpc.reals import Reals
 
@@ -211,7 +211,17 @@ class LinearSystem:
         Raises ValueError for bad shapes or values, or dt <= 0.
         """
         require_period("dt", dt)
+        known = ("state_names", "input_names", "state_units", "input_units")
         for key, value in names.items():
+            if key not in known:
+                delayed = "delay" in key.lower() or "latency" in key.lower()
+                fail(
+                    key, f"is no argument (A, B, dt, c, {', '.join(known)} are)",
+                    "Put the previous input into the state: for a delay below dt, "
+                    "LinearSystem([[A, B − B0], [0, 0]], [[B0], [I]], dt=dt) has the state "
+                    "(x, u₋₁), with A, B sampled at dt and B0 = from_continuous(A, B, dt − delay).B"
+                    if delayed else f"{nearest(key, known)}Leave it out",
+                )  # fmt: skip
             if not isinstance(value, list | tuple):
                 fail(key, f"{value!r} is not a tuple of strings", 'Write it as ("q", "dq")')
         tuples: dict[str, Any] = {key: tuple(value) for key, value in names.items()}

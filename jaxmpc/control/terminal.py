@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail, require_finite, require_kind, require_shape
-from jaxmpc.control import geometry
-from jaxmpc.control.geometry import maximise, unit_rows
+from jaxmpc.control.geometry import unit_rows
 from jaxmpc.control.invariant import (
     contraction,
     disturbance_set,
@@ -18,6 +17,7 @@ from jaxmpc.control.invariant import (
     one_step,
     supports,
 )
+from jaxmpc.control.lp import Flat, Program, affine_hull, bound, framed, maximise, safe_extent
 from jaxmpc.control.riccati import least_reached, lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope, translated, unit_half_spaces
 from jaxmpc.control.system import LinearSystem, as_weight, host_array, host_matrices
@@ -239,17 +239,16 @@ class _Rows:
         """Return (upper bounds of max row x, M with M G = rows but for rounding); inf if
         unbounded."""
         bounds, M = np.zeros(len(rows)), np.zeros((len(rows), len(self.g)))
+        program = Program(self.G, self.g)
         for i, row in enumerate(rows):
             if not row.any():
                 continue
-            best = maximise(row, self.G, self.g) if len(self.g) else None
+            best = program.maximise(row) if len(self.g) else None
             if best is None or best.y is None:
                 bounds[i] = np.inf
                 continue
             M[i] = best.y
-            error = np.abs(row - best.y @ self.G)
-            off = error > 0
-            bounds[i] = best.y @ self.g + error[off] @ self.reach[off]
+            bounds[i] = bound(row, best.y, self.G, self.g, self.reach)
         return bounds, M
 
     @cached_property
@@ -258,15 +257,16 @@ class _Rows:
         is none."""
         if not len(self.g):
             return np.full(self.G.shape[1], np.inf)
-        return geometry.extent(self.G, self.g) * (1 + 1e-6)
+        return safe_extent(self.G, self.g)
 
     def width(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """Return how far the set reaches along each row (None: its own) from its largest ball's
-        centre."""
-        centre = geometry.largest_ball("terminal_set", self.G, self.g)[0]
-        tops = self.g if rows is None else self.top(rows)[0]
-        width = np.maximum(tops - (self.G if rows is None else rows) @ centre, 0.0)
-        return np.where(width > _TOUCH * width.max(initial=0.0), width, 1.0)
+        """Return how far the set reaches along each row (None: its own) from a point inside; where
+        that is rounding, as in a flat set, the size of the row's terms."""
+        centre = Program(self.G, self.g).margin()[0]
+        tops, rows = (self.g, self.G) if rows is None else (self.top(rows)[0], rows)
+        width = np.maximum(tops - rows @ centre, 0.0)
+        size = np.abs(tops) + np.abs(rows) @ np.where(np.isfinite(self.reach), self.reach, 0.0)
+        return np.where(width > _TOUCH * size, width, np.where(size > 1e-280, size, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -463,7 +463,11 @@ def _control_invariance(
     if not len(X_f.g):
         return Check(name, True, np.inf, unit, f"All of R^n is invariant{role}.", (1,))
     body = Polytope(X_f.G, X_f.g)
-    if not np.isfinite(X_f.reach).all() or body.chebyshev()[1] <= _TOUCH * X_f.reach.max():
+    try:
+        usable = bool(np.isfinite(X_f.reach).all()) and framed("X_f", X_f.G, X_f.g).bounded
+    except Flat:
+        usable = False
+    if not usable:
         sentence = f"K does not show it, and the set is unbounded or flat{role}: not decided."
         return Check(name, None, None, unit, sentence, (1,))
     before = one_step(system, inputs, disturbance).back(body)
@@ -495,10 +499,15 @@ def _check_lyapunov(
     name, unit = "Lyapunov inequality", "cost per |x|^2"
     if closed is None or P is None:
         return Check(name, None, None, unit, no_law, (3,))
-    top = float(np.linalg.eigvalsh(closed.T @ P @ closed - P + Q + K.T @ R @ K)[-1])
-    size, spread = np.linalg.norm(P, 2), np.linalg.norm(closed, 2)
-    scale = size + size * spread**2 + np.linalg.norm(Q, 2) + np.linalg.norm(K.T @ R @ K, 2)
-    holds = top <= _TOUCH * scale
+    parts = closed.T @ P @ closed, P, Q, K.T @ R @ K
+    change = parts[0] - P + Q + parts[3]
+    top, size = float(np.linalg.eigvalsh(change)[-1]), np.linalg.norm(P, 2)
+    # Signs of eigenvalues do not depend on units; rounding is judged in those in which each state
+    # costs about 1.
+    scale_x = _units_of(P)
+    scale = sum(np.linalg.norm(scale_x[:, None] * part * scale_x, 2) for part in parts)
+    scale += np.linalg.norm(np.abs(closed * scale_x / scale_x[:, None]), 2) ** 2
+    holds = np.linalg.eigvalsh(scale_x[:, None] * change * scale_x)[-1] <= _TOUCH * scale
     sentence = (
         f"The largest eigenvalue of (A+BK)'P(A+BK) - P + Q + K'RK is {top:.3g}, "
         f"for |P| = {size:.3g}."
@@ -519,14 +528,16 @@ def _weights(
         if matrix is None:  # of the three, P alone, and then lqr has failed
             checks.append(Check(name, None, None, "least eigenvalue", trouble, (3,)))
             continue
-        least = float(np.linalg.eigvalsh(matrix)[0])
-        size = float(np.linalg.norm(matrix, 2))
-        holds = least > 0 if definite else least >= -_TOUCH * size
+        least, unit = float(np.linalg.eigvalsh(matrix)[0]), _units_of(matrix)
+        alike = unit[:, None] * matrix * unit
+        bottom = float(np.linalg.eigvalsh(alike)[0])
+        holds = bottom > 0 if definite else bottom >= -_TOUCH * np.linalg.norm(alike, 2)
         sentence = f"The least eigenvalue is {least:.6g}."
         checks.append(Check(name, bool(holds), least, "least eigenvalue", sentence, (3,)))
-    weights, axes = np.linalg.eigh(Q)
+    unit = _units_of(Q if P is None else P)
+    weights, axes = np.linalg.eigh(unit[:, None] * Q * unit)
     output = np.sqrt(np.maximum(weights, 0.0))[:, None] * axes.T  # Q = output'output
-    seen, mode = least_reached(A.T, output.T)
+    seen, mode = least_reached((A * unit / unit[:, None]).T, output.T)
     if seen == np.inf:
         sentence = "Every mode decays by itself."
     elif seen <= _DETECTABLE:
@@ -540,13 +551,38 @@ def _weights(
     return checks
 
 
+def _units_of(P: np.ndarray) -> np.ndarray:
+    """Return units of the coordinates in which a weight's diagonal is 1; 1 where it is not
+    positive, in units of the largest."""
+    diagonal = np.diag(P)
+    top = diagonal.max(initial=0.0)
+    return 1 / np.sqrt(np.where(diagonal > 0, diagonal, top if top > 0 else 1.0))
+
+
 def _origin_inside(X_f: _Set) -> Check:
-    """Check that the origin lies in the interior of X_f."""
+    """Check that the origin lies in the interior of X_f, relative to its affine hull.
+
+    The theorem needs a bound of the optimal cost near the origin. The cost is convex and piecewise
+    quadratic, hence continuous, on the polytope X_N, whether X_f is {0}, another flat set or has an
+    interior (Rawlings, Mayne & Diehl 2017, sections 2.4.2 and 7.3).
+    """
     name, unit = "origin inside terminal set", "distance in x"
     if isinstance(X_f, _Ellipse):
         depth = float(np.sqrt(X_f.level / np.linalg.eigvalsh(X_f.P)[-1]))
     else:
         depth = float(X_f.g.min(initial=np.inf))
+        hull = affine_hull(X_f.G, X_f.g)
+        assert hull is not None
+        if hull.equal.any() and not np.any(X_f.g[hull.equal]):
+            depth = float((hull.g / np.linalg.norm(hull.G, axis=1)).min(initial=np.inf))
+            if depth > 0:
+                point = not hull.basis.size
+                what = "the origin alone" if point else "flat, with the origin in its middle"
+                sentence = (
+                    f"The terminal set is {what}, and the optimal cost is continuous on the "
+                    "polytope X_N all the same."
+                )
+                return Check(name, True, 0.0 if point else depth, unit, sentence, (3,))
     where = "within" if depth > 0 else "on the boundary of" if depth == 0 else "outside"
     sentence = f"The origin lies {where} the terminal set, {abs(depth):.6g} from its boundary."
     return Check(name, depth > 0, depth, unit, sentence, (3,))

@@ -68,18 +68,20 @@ def recursive_feasibility(
         4. samples and closed loops from them: another 12 s of compiling,
         5. without complete regions, plans by a solver for 4. (20 s of compiling), and a search.
 
-    x0s: sample states (B, n), or (B, n + m) with the previous input where input rates are
-    limited; None: none where the law is proved, else a grid over X_N, random states in more than
-    three dimensions. steps: length of the closed loops x⁺ = A x + B u_0(x) + c from each sample.
-    search: where regions are incomplete look for a counterexample by gradient ascent too.
-    regions: critical regions to enumerate at most (0: none). seconds: time limit of the whole call;
-    1. may take half of it, 2. half of what is left. What is not settled by then is open, and
-    samples that are not labelled or followed to the end are undecided. Compiling, one step of
-    all closed loops, and a linear program cannot be interrupted: a stage that has to compile is
-    left out where less than the seconds above are left. progress: print each stage on stderr.
+    x0s: sample states (B, n), or (B, n + m) with the previous input, one within the input limits,
+    where input rates are limited; None: none where the law is proved, else a grid over X_N, random
+    states in more than three dimensions. steps: length of the closed loops x⁺ = A x + B u_0(x) + c
+    from each sample. search: where regions are incomplete look for a counterexample by gradient
+    ascent too. regions: critical regions to enumerate at most (0: none). seconds: time limit of the
+    whole call; 1. may take half of it, 2. half of what is left. What is not settled by then is
+    open, and samples that are not labelled or followed to the end are undecided. Compiling, one
+    step of all closed loops, and a linear program cannot be interrupted: a stage that has to
+    compile is left out where less than the seconds above are left. progress: print each stage on
+    stderr.
 
-    Optima of linear programs are trusted to 1e-9 of the size of X_N, by bounds from their
-    multipliers. A state counts as outside X_N when its distance exceeds 1e-7 of that size. In the
+    Optima of linear programs are trusted to 1e-9, by bounds from their multipliers: relative to the
+    distance of a facet of X_N from the centre. A state counts as outside X_N when it lies beyond a
+    facet by more than 1e-7 of that. In the
     closed loops each next state is moved towards the centre by 1e-7 of its distance, since plans
     lie on limits and residuals decide on which side; then it is labelled, and counts as lost when
     it is proved infeasible.
@@ -287,10 +289,14 @@ def smallest_horizon(
             problem = FeasibilityProblem.of(changed)
         except ValueError:  # such as more free moves than steps
             continue
-        claims = settle_claims(changed, problem, budget.deadline)
-        law = claims.law
-        if law.holds is None and least is None and regions and np.isfinite(claims.volume):
-            law = settle_by_regions(claims, regions, budget.deadline).claim
+        try:
+            claims = settle_claims(changed, problem, budget.deadline)
+            law = claims.law
+            if law.holds is None and least is None and regions and np.isfinite(claims.volume):
+                law = settle_by_regions(claims, regions, budget.deadline).claim
+        except ValueError as error:  # too ill-conditioned: the other horizons stay settled
+            reasons[N] = Claim(None, f"not settled ({error})")
+            continue
         reasons[N] = law
         least = N if law.holds and least is None else least
         if claims.strong.holds:

@@ -12,8 +12,7 @@ import pytest
 import scipy
 
 from jaxmpc import Box, LinearSystem, Polytope, lqr, maximal_invariant_set
-from jaxmpc.control import LQR
-from jaxmpc.control.invariant import _bound
+from jaxmpc.control import LQR, lp
 from jaxmpc.control.sets import _irredundant
 
 INF = np.inf
@@ -616,8 +615,14 @@ def test_invariant_sets_of_product_and_closed_forms():
 
 def test_bound_is_valid_for_inexact_multipliers():
     rows = np.vstack([np.eye(2), -np.eye(2)])
-    value, bound = _bound(np.array([1.0, 2.0]), rows, np.ones(2))
-    assert value == pytest.approx(3, abs=1e-12) and 3 <= bound <= 3 + 1e-12
+    d, g = np.array([1.0, 2.0]), np.ones(4)
+    top = lp.maximise(d, rows, g)
+    assert top.value == pytest.approx(3, abs=1e-12)
+    random = np.random.default_rng(0)
+    for size in (0.0, 1e-12, 1e-3, 1.0):
+        y = np.abs(top.y + size * random.standard_normal(4))
+        above = lp.bound(d, y, rows, g, np.ones(2))
+        assert 3 - 1e-15 <= above <= 3 + 10 * size + 1e-12
 
 
 @pytest.mark.parametrize(
@@ -655,3 +660,21 @@ def test_unbounded_invariant_set():
     decay = LinearSystem(0.5 * np.eye(2), [[1], [0]])
     with pytest.raises(ValueError, match="states: the invariant set is unbounded"):
         maximal_invariant_set(decay, np.zeros((1, 2)), Box([-1, -INF], [1, INF]), None)
+
+
+def test_a_delay_of_the_input_is_no_keyword_and_its_cure_is_exact():
+    A, B, dt, delay = np.array([[0, 1], [-2, -0.3]]), np.array([[0.0], [1]]), 0.1, 0.03
+    with pytest.raises(ValueError, match=r"delay: is no argument .*B − B0"):
+        LinearSystem.from_continuous(A, B, dt, delay=delay)
+    with pytest.raises(ValueError, match="state_name: is no argument .* Did you mean state_names"):
+        LinearSystem.from_continuous(A, B, dt, state_name=("q", "dq"))
+    whole = LinearSystem.from_continuous(A, B, dt)
+    rest = LinearSystem.from_continuous(A, B, dt - delay)
+    first = LinearSystem.from_continuous(A, B, delay)
+    system = LinearSystem(
+        np.block([[whole.A, whole.B - rest.B], [np.zeros((1, 3))]]), np.vstack([rest.B, np.eye(1)])
+    )
+    x, before, u = np.array([0.3, -1.0]), np.array([0.7]), np.array([-0.4])
+    between = first.A @ x + first.B @ before  # the old input for the delay, then the new one
+    after = system.A @ np.append(x, before) + system.B @ u
+    assert after == pytest.approx(np.append(rest.A @ between + rest.B @ u, u), abs=1e-15)
