@@ -41,8 +41,8 @@ def judged(
     """Return the solution of the condensed QP with the status and the residuals of the plan,
     states (N+1, n) and inputs (N, m).
 
-    In float32 the status is that of the QP, which speaks of the plan before it was rounded; rows and
-    dynamics are checked to the precision that is left.
+    In float32 the status is that of the QP, which speaks of the plan before it was rounded; rows
+    and dynamics are checked to the precision that is left.
     """
     given = mpc, c, factor, found.y, states, inputs, reference, input_reference, previous_input
     terms = stated_terms(*jax.lax.stop_gradient(given))
@@ -87,7 +87,8 @@ def stated_terms(
         gu = gu + push - jnp.concatenate([push[1:], jnp.zeros_like(push[:1])])
     gx, gu = 2 * gx, 2 * gu
 
-    violations, sizes, gap, products = [], [], jnp.zeros((), x.dtype), jnp.zeros((), x.dtype)
+    violations, sizes = [], []
+    gap = products = jnp.zeros((), x.dtype)
     for block, y_block in zip(blocks(mpc, x.dtype), split(c.layout, y), strict=True):
         v: Any = 0.0
         for M, along, length in (
@@ -115,8 +116,8 @@ def stated_terms(
 
     g = matmul(gx.ravel(), c.Gamma.reshape(-1, c.Gamma.shape[-1]))
     g = g + matmul(gu.ravel(), c.Omega.reshape(-1, c.Omega.shape[-1]))
-    push = jnp.max(jnp.abs(y) * factor.reach, initial=0.0)
-    length, rounds = jnp.sqrt(2 * J), jnp.sqrt(2 * cancels) + push
+    length, rounds = (jnp.sqrt(2 * jnp.maximum(v, 0.0)) for v in (J, cancels))
+    rounds = rounds + jnp.max(jnp.abs(y) * factor.reach, initial=0.0)
 
     A, B = cast(mpc.system.A), cast(mpc.system.B)
     drift = jnp.zeros_like(x[0]) if mpc.system.c is None else cast(mpc.system.c)

@@ -57,10 +57,10 @@ class Block:
     def bounds(self) -> Bounds:
         """What is asked of the rows of all steps (steps·r,), without what follows from x_0."""
         tiled = lambda v: None if v is None else jnp.tile(v, len(self.steps))
-        ends = map(tiled, (self.lower, self.upper, self.linear, self.quadratic))
+        l, u, linear, quadratic = map(tiled, (self.lower, self.upper, self.linear, self.quadratic))
         if self.radius is None:
-            return Bounds(*ends)
-        return Bounds(*ends, self.radius[None], (self.size,))
+            return Bounds(l, u, linear, quadratic)
+        return Bounds(l, u, linear, quadratic, self.radius[None], (self.size,))
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def stacked(
     """
     steps, r, m = np.array(block.steps, int), block.size, inputs[0].shape[1]
 
-    def added(x: Array, v: Array, H: Any, D: Any) -> Array:
+    def added(x: Any, v: Any, H: Any, D: Any) -> Array:
         part: Any = 0.0
         if H is not None:
             part = part + _each(H, x[steps])
@@ -193,14 +193,14 @@ def stacked(
         return part.reshape((len(steps), r, *x.shape[2:]))
 
     parts = [added(x, v, block.H, block.D) for x, v in zip(states, inputs, strict=True)]
-    size = lambda M: None if M is None else jax.lax.stop_gradient(jnp.abs(M))
-    terms = added(*map(size, (states[0], inputs[0], block.H, block.D)))
+    given = jax.lax.stop_gradient((states[0], inputs[0], block.H, block.D))
+    terms = added(*jax.tree.map(jnp.abs, given))
     most = jnp.max(terms.reshape(len(steps), r, -1, m), axis=(0, 2), initial=0.0)
     noise = 8 * jnp.finfo(terms.dtype).eps * jnp.tile(most, terms.shape[-1] // m)
     none = jax.lax.stop_gradient(jnp.where(jnp.abs(parts[0]) <= noise, parts[0], 0.0))
-    parts = [part.reshape(-1, *part.shape[2:]) for part in (parts[0] - none, *parts[1:])]
+    C, D, d = (v.reshape(-1, *v.shape[2:]) for v in (parts[0] - none, *parts[1:]))
     repeat = lambda v: jnp.tile(v, len(steps))
-    return (*parts, repeat(block.lower), repeat(block.upper))
+    return C, D, d, repeat(block.lower), repeat(block.upper)
 
 
 def _each(H: Array, M: Array) -> Array:

@@ -441,9 +441,9 @@ def refined(
     newton: int, interior: int, constant: bool, s: Stages, sample: Sample, E: Array, rho: Array,
     fixed: Array, eps: Array, u: Array, y: Array,
 ) -> tuple[Array, Array, Measured]:  # fmt: skip
-    """The best pair, and what was measured of it, after `newton` Newton steps from u (N, m), y (rows,), and where that is not
-    good enough `interior` interior point steps and Newton steps again, at most; constant: always
-    as many."""
+    """The best pair, and what was measured of it, after `newton` Newton steps from u (N, m), y
+    (rows,), and where that is not good enough `interior` interior point steps and Newton steps
+    again, at most; constant: always as many."""
 
     def repeated(step: Callable, most: int, constants: tuple, state: Any) -> Pair:
         step = partial(step, most)

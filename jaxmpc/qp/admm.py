@@ -152,8 +152,8 @@ DEFAULT = ADMM()
 class Factor:
     """What P, A and rho alone decide; shared by every instance of a batch.
 
-    T (n, n): z = T w. E (m,): row scale, 0 for a zero row. reach (m,): by how much a row moves along
-    a unit of w, 1/E, and 0 or what is known of it for a zero row. H (n, n), A (m, n): Hessian and
+    T (n, n): z = T w. E (m,): row scale, 0 for a zero row. reach (m,): by how much a row moves
+    along a unit of w, 1/E, and 0 or what is known of it for a zero row. H (n, n), A (m, n): Hessian and
     rows in w. flat: whether P is singular. rho (S, m), and a stage each of F = M⁻¹A'R (S, n, m)
     and Minv (S, n, n); G = A F (S, m, m), or None where two thin products cost less. S = A A'
     (m, m). fault: NOT_RUN where P and A are
@@ -341,8 +341,8 @@ def convex(P: Array) -> Array:
 
 
 def scaled(factor: Factor, qp: QP, unit: Any = None) -> tuple[Array, Bounds, Array]:
-    """q and bounds in ADMM's coordinates, and their unit, where it is not given. A zero row (scale 0) is free there;
-    `prove` and `residual_terms` look after it.
+    """q and bounds in ADMM's coordinates, and their unit, where it is not given. A zero row (scale
+    0) is free there; `prove` and `residual_terms` look after it.
 
     The coordinates are measured in a unit of each instance, the power of two next to the largest of
     |q| and of the distances of 0 from the bounds: the solution, which is homogeneous in these, is

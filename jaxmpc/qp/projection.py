@@ -210,8 +210,11 @@ class Bounds:
     def divided(self, unit: Array) -> "Bounds":
         """Return what is asked of v/unit when this is asked of v, where the whole program is
         measured in `unit`: multipliers, and with them L1 weights, are divided as v is."""
-        parts = {name: getattr(self, name) for name in ("l", "u", "linear", "radius")}
-        return replace(self, **{k: v if v is None else v / unit for k, v in parts.items()})
+        over = lambda v: None if v is None else v / unit
+        return replace(
+            self, l=over(self.l), u=over(self.u), linear=over(self.linear),
+            radius=over(self.radius),
+        )  # fmt: skip
 
     def widened(self, e: Array) -> "Bounds":
         """Return the bounds that a v with the prox residual e (m,) of hard rows meets."""

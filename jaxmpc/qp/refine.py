@@ -100,7 +100,8 @@ def judge_pair(
 ) -> tuple[tuple[Measured, Array, Array, Array], Array]:
     """Return the last four fields of a pair, and the gradient of its Lagrangian. vectors: those of
     `terms_of`. scaled: the bounds in ADMM's coordinates, of row scale E and measured in `unit`."""
-    terms, y, products = terms_of(*vectors, sizes), *vectors[-2:]
+    q, bounds, known, z, y, products = vectors
+    terms = terms_of(q, bounds, known, z, y, products, sizes)
     floor = rounding(y.dtype)
     # For soft rows the gap is quadratic in the error of z; the prox residual is linear.
     v, push = E * products.Az / unit, scaled_multipliers(E, y) / unit
@@ -263,9 +264,9 @@ def by_multipliers(refine: int, constants: tuple, s: Search) -> Search:
     distance to the rows, whose residual becomes a Farkas vector; then, if P is singular, of
     `recession`, whose minimiser becomes a ray.
 
-    Rows that contradict each other by less than their tolerances have a solution all the same: where
-    that is found, steps of least distance come at once, the bounds are widened by what is left of
-    the violation, which is the least, and the method of multipliers begins once more.
+    Rows that contradict each other by less than their tolerances have a solution all the same:
+    where that is found, steps of least distance come at once, the bounds are widened by what is
+    left of the violation, which is the least, and the method of multipliers begins once more.
     """
     p, squared, correcting = constants
     f, few, dtype = p.factor, proof_steps(refine), s.w.dtype

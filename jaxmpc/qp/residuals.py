@@ -100,20 +100,21 @@ def terms_of(
     terms = terms + jnp.sum(bounds.slope(Az) * sizes[0] + penalty + jnp.abs(support))
     return [
         (
-            bounds.violation(Az), row_sizes(Az, known, natural),
+            bounds.violation(Az),
+            row_sizes(Az, known, natural),
             sizes[0] + natural.row_terms,
         ),
         (
-            Pz + q + Aty, size(Pz) + size(q) + size(Aty) + SHARE * natural.variables,
+            Pz + q + Aty,
+            size(Pz) + size(q) + size(Aty) + SHARE * natural.variables,
             sizes[1] + size(q) + sizes[2] + natural.variable_terms,
         ),
-        tuple(
-            v[None] for v in (
-                curved + along + paid + conjugate,
-                size(curved) + size(along) + paid + size(conjugate) + SHARE * natural.gap, terms,
-            )
+        (
+            (curved + along + paid + conjugate)[None],
+            (size(curved) + size(along) + paid + size(conjugate) + SHARE * natural.gap)[None],
+            terms[None],
         ),
-    ]  # fmt: skip
+    ]
 
 
 def residuals(qp: QP, z: Array, y: Array) -> tuple[Array, Array, Array]:

@@ -153,8 +153,8 @@ def solve_from(
     proof, usable = Proof.none(p.q, p.bounds.l), jnp.all(jnp.isfinite(y))
     y = p.bounds.admissible(jnp.where(usable, y / p.unit, 0.0))
     if not steps:
-        pair = unscaled(clean, factor, p.unit, -p.q - matmul(y, factor.A), y)
-        return concluded(Pair.none(*pair).measured, *pair, proof), fault
+        z, y = unscaled(clean, factor, p.unit, -p.q - matmul(y, factor.A), y)
+        return concluded(Pair.none(z, y).measured, z, y, proof), fault
     pair, _ = by_the_dual(p, y, usable & ~factor.flat, steps)
     return concluded(pair.measured, pair.z, pair.y, proof), fault
 
@@ -270,7 +270,8 @@ def cleaned(qp: QP, matrix_fault: Array) -> tuple[QP, Array]:
 
 def warm(factor: Factor, qp: QP, unit: Array, bounds: Bounds, warm_start: Any) -> Array:
     """Return t (m,) of a warm start, a pair z (n,), y (m,) or a solution; what is not finite counts
-    as 0. bounds: in ADMM's coordinates, which are measured in `unit`. Raises ValueError for other shapes."""
+    as 0. bounds: in ADMM's coordinates, which are measured in `unit`. Raises ValueError for other
+    shapes."""
     z, y = require_warm_start(qp, warm_start)
     clean = lambda v: jnp.nan_to_num(jnp.asarray(v, qp.q.dtype), posinf=0.0, neginf=0.0)
     return start(bounds, factor.rho[0], *scaled_rows(factor, qp, unit, clean(z), clean(y)))

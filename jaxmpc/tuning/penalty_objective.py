@@ -84,11 +84,11 @@ class PenaltyObjective:
                 t = warm(made, qp, unit, bounds, sample.start)
             t, _ = iterate(splittings(made, q), bounds, t, solver.admm_steps(), solver.alpha)
             w, y = read(made, t, q, bounds)
-            sizes = natural(made, unit, q, bounds, w, y)
+            of_all = natural(made, unit, q, bounds, w, y)
             z, y = unscaled(qp, made, unit, w, y)
             floor = 100 * jnp.finfo(z.dtype).eps
             # A quarter of the rounding stays, for the sake of the logarithm's slope at 0.
-            values, sizes, terms = joined(residual_terms(qp, z, y, natural=sizes))
+            values, sizes, terms = joined(residual_terms(qp, z, y, natural=of_all))
             allowed = eps * sizes + floor * (sizes + terms)
             squares = jnp.sum((values / jnp.where(allowed > 0, allowed, 1.0)) ** 2)
             return 0.5 * jnp.log10((floor / 4) ** 2 + squares)
