@@ -91,14 +91,14 @@ def stated_terms(
     gap = products = jnp.zeros((), x.dtype)
     for block, y_block in zip(blocks(mpc, x.dtype), split(c.layout, y), strict=True):
         v: Any = 0.0
-        for M, along, length in (
+        for M, along, count in (
             (block.H, x, N + 1), (block.D, rates if block.rate else u, N)
         ):  # fmt: skip
             if M is None:
                 continue
             v = v + (at(along, block.steps) if block.box else apply(M, at(along, block.steps)))
             pulled = spread(
-                y_block if block.box else apply_transposed(M, y_block), block.steps, length
+                y_block if block.box else apply_transposed(M, y_block), block.steps, count
             )
             if M is block.H:
                 gx = gx + pulled

@@ -49,6 +49,8 @@ SPLIT = 1e-6
 STEPS, STEPS_WARM = 50, 10
 # Rounds of equilibration; half as many decades of an entry's size are left after each.
 EQUILIBRATIONS = 10
+# Rounds that take the units of rows and columns out of a matrix before.
+CENTRINGS = 30
 
 
 @pytree
@@ -153,8 +155,8 @@ class Factor:
     """What P, A and rho alone decide; shared by every instance of a batch.
 
     T (n, n): z = T w. E (m,): row scale, 0 for a zero row. reach (m,): by how much a row moves
-    along a unit of w, 1/E, and 0 or what is known of it for a zero row. H (n, n), A (m, n): Hessian and
-    rows in w. flat: whether P is singular. rho (S, m), and a stage each of F = M⁻¹A'R (S, n, m)
+    along a unit of w, 1/E, and 0 or what is known of it for a zero row. H (n, n), A (m, n): Hessian
+    and rows in w. flat: whether P is singular. rho (S, m), and a stage each of F = M⁻¹A'R (S, n, m)
     and Minv (S, n, n); G = A F (S, m, m), or None where two thin products cost less. S = A A'
     (m, m). fault: NOT_RUN where P and A are
     usable, else the status that says why not; the rest is then that of min ½|z|² without rows.
@@ -216,7 +218,9 @@ def units(curvature: Array, A: Array) -> Array:
     zero those in which the columns of A have entries alike.
 
     These come from Ruiz's equilibration (2001, RAL-TR-2001-034): rows and columns of A are divided
-    by the roots of their largest entries, again and again.
+    by the roots of their largest entries, again and again. Where that ends depends on where it
+    begins: with rows and columns in which the logarithms of all entries have the mean 0 (Curtis and
+    Reid 1972, J. Inst. Maths Applics 10), so that the units of A play no part.
     """
     A, curved = jnp.abs(A), curvature > 0
     root = lambda v: jnp.sqrt(jnp.where(v > 0, v, 1.0))
@@ -227,8 +231,20 @@ def units(curvature: Array, A: Array) -> Array:
         rows, columns = (jnp.max(M, axis=axis, initial=0.0) for axis in (1, 0))
         return jnp.where(curved, d, d / root(columns)), e / root(rows)
 
-    begin = jnp.where(curved, 1 / root(curvature), 1.0), jnp.ones(A.shape[0], A.dtype)
+    there = A > 0
+    logarithms = jnp.log(jnp.where(there, A, 1.0))
+
+    def centre(scales: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
+        d, e = scales
+        mean = lambda M, axis: (
+            jnp.sum(jnp.where(there, M, 0.0), axis) / jnp.maximum(jnp.sum(there, axis), 1)
+        )
+        e = -mean(logarithms + d, 1)
+        return (jnp.where(curved, d, -mean(logarithms + e[:, None], 0)), e), None
+
+    begin = -0.5 * jnp.log(jnp.where(curved, curvature, 1.0)), jnp.zeros(A.shape[0], A.dtype)
     begin = varying(begin, (curvature, A))
+    begin = jax.tree.map(jnp.exp, jax.lax.scan(centre, begin, length=CENTRINGS)[0])
     return jax.lax.fori_loop(0, EQUILIBRATIONS, advance, begin)[0]
 
 
