@@ -16,6 +16,7 @@ from jaxmpc.closed_loop.observer import KalmanFilter, model_of, model_step
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.control.system import LinearSystem
 from jaxmpc.control.violation import worst_violation
+from jaxmpc.mpc.problem import weights_of
 from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.reals import Reals
@@ -174,7 +175,7 @@ def _simulate(
 ) -> Run:  # fmt: skip
     plant = plant.plant if isinstance(plant, ConstantPlant) else plant
     mpc = controller.mpc
-    N, (Q, R, *_) = mpc.horizon, mpc.weights(x0.dtype)
+    N, (Q, R, *_) = mpc.horizon, weights_of(mpc, x0.dtype)
     tolerance = SLACK[x0.dtype.name]
     square = lambda v, W: jnp.sum(v * matmul(W, v))
     ahead_by = delay if compensate else 0

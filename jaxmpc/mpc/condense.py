@@ -22,7 +22,7 @@ from jax import Array
 from jaxmpc.checks import concrete, require_memory
 from jaxmpc.control.riccati import lqr
 from jaxmpc.control.system import host_array, host_matrices
-from jaxmpc.mpc.problem import MPC, Switch
+from jaxmpc.mpc.problem import MPC, Switch, weights_of
 from jaxmpc.mpc.rows import Layout, blocks, split, stacked
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import solve
@@ -185,7 +185,7 @@ def _condense(mpc: MPC) -> Condensed:
     n, m, p = system.n, system.m, mpc.dimension
     dtype = floating_dtype(replace(mpc, prestabilise=None))
     cast = lambda v: jnp.asarray(v, dtype)
-    Q, R, P_N, W, stage = mpc.weights(dtype)
+    Q, R, P_N, W, stage = weights_of(mpc, dtype)
     A, B = cast(system.A), cast(system.B)
     c = jnp.zeros(n, dtype) if system.c is None else cast(system.c)
     K = cast(mpc.prestabilise)

@@ -220,11 +220,16 @@ def harmless(mpc: MPC) -> tuple[MPC, Any]:
     data = {name: getattr(mpc, name) for name in fields}
     if concrete(data):
         return mpc, True
-    leaves = jax.tree.leaves(data)
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(jnp.asarray(v))) for v in leaves]))
-    clean = jax.tree.map(lambda v: jnp.where(finite, jnp.asarray(v), 0), data)
-    clean["R"] = jnp.where(finite, jnp.asarray(mpc.R), np.eye(mpc.system.m))
+    clean, finite = _harmless(data, np.eye(mpc.system.m))
     return replace(mpc, **clean), finite
+
+
+@own_modes
+def _harmless(data: dict[str, Any], R: np.ndarray) -> tuple[dict[str, Any], Array]:
+    leaves = [jnp.asarray(v) for v in jax.tree.leaves(data)]
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in leaves]))
+    clean = jax.tree.map(lambda v: jnp.where(finite, jnp.asarray(v), 0), data)
+    return {**clean, "R": jnp.where(finite, jnp.asarray(data["R"]), R)}, finite
 
 
 @jax.jit

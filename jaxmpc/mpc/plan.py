@@ -9,7 +9,7 @@ from jax import Array
 
 from jaxmpc.checks import fail
 from jaxmpc.control.sets import Box
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import MPC, weights_of
 from jaxmpc.mpc.rows import Layout, blocks, split
 from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.precision import arrays, matmul
@@ -47,7 +47,9 @@ class Plan:
 
     cost includes what soft rows and input rates pay. slack (N+1, p): violation of the p soft rows,
     in the order of `mpc.soft`, zero at steps where a row does not hold.
-    Unless the status is SOLVED, cost and trajectory are those of the best iterate and mean little.
+    Unless the status is SOLVED, cost and trajectory are those of the best iterate and mean little:
+    from a state without a feasible plan the inputs too may lie outside their limits. The first one
+    clipped into them is what `Controller(mpc)(x)` gives.
     The status is that of the QP (`jaxmpc.Status`); residuals are those of the condensed QP in
     the units of states and inputs. iterations: ADMM steps, of `solve_nonlinear` quadratic programs.
     A plan serves as warm start.
@@ -141,7 +143,7 @@ def cost(
     error = states if reference is None else states - reference
     effort = inputs if input_reference is None else inputs - input_reference
     square = lambda v, W, s=1.0: jnp.sum(s * v * matmul(v, W))
-    weights = mpc.weights(states.dtype)
+    weights = weights_of(mpc, states.dtype)
     stage = 1.0 if mpc.stage_weights is None else weights.stage[:, None]
     J = square(error[:-1], weights.Q, stage) + square(effort, weights.R, stage)
     if mpc.terminal_cost is not None:

@@ -221,24 +221,6 @@ class MPC:
             return tuple(min(k, int(blocks) - 1) for k in range(N))
         return tuple(int(i) for i in np.repeat(np.arange(len(blocks)), blocks))
 
-    def weights(self, dtype: Any) -> Weights:
-        """Return the weights as all solvers and costs take them. Works inside jit, vmap and grad.
-
-        x'Qx depends on the symmetric part of Q alone. Of a Q that is not symmetric a minimiser
-        would take it for curvature, but Q itself for linear terms.
-        """
-
-        def matrix(value: Any, size: int) -> Array:
-            value = jnp.asarray(np.zeros(size) if value is None else value, dtype)
-            return symmetric(jnp.diag(value) if value.ndim == 1 else value)
-
-        n, m, stage = self.system.n, self.system.m, self.stage_weights
-        return Weights(
-            matrix(self.Q, n), matrix(self.R, m), matrix(self.terminal_cost, n),
-            matrix(self.input_rate_weight, m),
-            jnp.asarray(np.ones(self.horizon) if stage is None else stage, dtype),
-        )  # fmt: skip
-
     def validate(self) -> None:
         """Raise ValueError that names the field, its value and the cure, before any compile."""
         require_kind("system", self.system, LinearSystem)
@@ -423,6 +405,25 @@ class MPC:
         cure = "Put a positive weight on every input, in R or in input_rate_weight"
         last = self.terminal_cost is None and k == self.horizon - 1
         fail("R", what, f"{cure}{', or give a terminal_cost' if last else ''}")
+
+
+def weights_of(mpc: MPC, dtype: Any) -> Weights:
+    """Return the weights as all solvers and costs take them. Works inside jit, vmap and grad.
+
+    x'Qx depends on the symmetric part of Q alone. Of a Q that is not symmetric a minimiser
+    would take it for curvature, but Q itself for linear terms.
+    """
+
+    def matrix(value: Any, size: int) -> Array:
+        value = jnp.asarray(np.zeros(size) if value is None else value, dtype)
+        return symmetric(jnp.diag(value) if value.ndim == 1 else value)
+
+    n, m, stage = mpc.system.n, mpc.system.m, mpc.stage_weights
+    return Weights(
+        matrix(mpc.Q, n), matrix(mpc.R, m), matrix(mpc.terminal_cost, n),
+        matrix(mpc.input_rate_weight, m),
+        jnp.asarray(np.ones(mpc.horizon) if stage is None else stage, dtype),
+    )  # fmt: skip
 
 
 def _form(M: np.ndarray, size: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.mpc.kernels import Gains, recurrence, riccati_recursion, tracking
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import MPC, weights_of
 from jaxmpc.mpc.rows import Layout, blocks
 from jaxmpc.qp.admm import convex
 from jaxmpc.qp.precision import floating_dtype, matmul, precisely, rounding
@@ -152,7 +152,7 @@ def stages(mpc: MPC) -> Stages:
     """Return the data of `mpc`. Works inside jit, vmap and grad."""
     system, n = mpc.system, mpc.system.n
     dtype = floating_dtype(mpc)
-    weights = mpc.weights(dtype)
+    weights = weights_of(mpc, dtype)
     cast = lambda v: jnp.asarray(v, dtype)
     found = blocks(mpc, dtype)
     none = [jnp.zeros(0, dtype)]

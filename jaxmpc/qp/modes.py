@@ -38,8 +38,8 @@ def _without_explicit_axes(function: Callable[..., Any], args: tuple) -> Any:
 
     def call(*arrays: Any) -> Any:
         given = dict(zip(places, arrays, strict=True))
-        filled = [given.get(i, v) for i, v in enumerate(leaves)]
-        return function(*jax.tree.unflatten(tree, filled))
+        full = [given.get(i, v) for i, v in enumerate(leaves)]
+        return function(*jax.tree.unflatten(tree, full))
 
     return auto_axes(call, out_sharding=PartitionSpec())(*(leaves[i] for i in places))
 
