@@ -49,6 +49,8 @@ SPLIT = 1e-6
 STEPS, STEPS_WARM = 50, 10
 # Rounds of equilibration; half as many decades of an entry's size are left after each.
 EQUILIBRATIONS = 10
+# Ridge of ADMM's system, relative, where P is singular.
+FLAT_RIDGE = 1e-8
 # Rounds that take the units of rows and columns out of a matrix before.
 CENTRINGS = 30
 
@@ -289,7 +291,10 @@ def factor(P: Array, A: Array, solver: ADMM, balls: tuple[int, ...] = ()) -> Fac
     n, m = A_w.shape[1], A_w.shape[0]
     rho = default_rho(E, n) if solver.rho is None else jnp.asarray(solver.rho, P.dtype)
     rho = jnp.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, m))
-    ridge = 10 * jnp.finfo(P.dtype).eps
+    # Where P is singular there may be directions that no row stops either: M has none but the ridge,
+    # by which the rounding of float32 iterates is divided there.
+    least = 40 * n * float(jnp.finfo(P.dtype).eps)
+    ridge = jnp.where(flat, max(FLAT_RIDGE, least), least).astype(P.dtype)
 
     def stage(R: Array) -> tuple[Array, Array]:
         M = H + matmul(A_w.T, R[:, None] * A_w)
