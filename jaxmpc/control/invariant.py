@@ -567,6 +567,7 @@ def one_step(
     if isinstance(inputs, Polytope):
         V = _polytope("inputs", inputs, m)
         hull = affine_hull(*unit_rows(V.H, V.h))
+        assert hull is not None
         if hull.equal.any():
             moving, fixed = hull.basis, hull.shift
             V = Polytope(hull.G, hull.g) if len(hull.g) else None

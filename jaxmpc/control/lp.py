@@ -33,7 +33,7 @@ FLAT = 1e-9
 ROUNDING = 1e-11
 # What is left of G'y in a Farkas vector is charged for points so many times as far as typical ones.
 FAR = 1e3
-_SWEEPS = 40  # of the scaling; it stops where nothing changes by a factor of 2
+_SWEEPS = 40  # of the least squares of `scaling`; fewer where they end before
 
 
 class Optimum(NamedTuple):
@@ -73,8 +73,7 @@ class Program:
         for method in ("highs-ds", "highs-ipm", "dual"):
             found = self._by_dual(cost) if method == "dual" else self._highs(cost, method)
             if found is not None:
-                x, y = found
-                y = self._exact(cost, y)
+                x, y = self._exact(cost, *found)
                 left = np.abs(self.M.T @ y - cost).max(initial=0.0)
                 exact = left <= 1e-13 * (1 + np.abs(y).sum())
                 value = self.b @ y if exact else cost @ x
@@ -102,17 +101,22 @@ class Program:
         y, x = found
         return -x[: len(cost)], np.where(self.equal, y, np.maximum(y, 0.0))
 
-    def _exact(self, cost: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the multipliers with M'y = cost to rounding, where those that are not 0 tell
-        them."""
+    def _exact(
+        self, cost: np.ndarray, x: np.ndarray, y: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the optimum without HiGHS' tolerances: x on the rows with multipliers, and the
+        multipliers with M'y = cost, each by least squares, where that is no worse."""
         on = np.abs(y) > 1e-10 * np.abs(y).max(initial=0.0)
         if not on.any():
-            return np.zeros_like(y)
+            return x, np.zeros_like(y)
         better = np.zeros_like(y)
         better[on] = np.linalg.lstsq(self.M[on].T, cost, rcond=None)[0]
         off = lambda v: np.abs(self.M.T @ v - cost).max()
-        fits = np.all((better >= 0) | self.equal) and off(better) <= off(y)
-        return better if fits else y
+        if np.all((better >= 0) | self.equal) and off(better) <= off(y):
+            y = better
+        nearer = x + np.linalg.lstsq(self.M[on], self.b[on] - self.M[on] @ x, rcond=None)[0]
+        worst = lambda v: (self.M @ v - self.b).max(initial=0.0)
+        return (nearer if worst(nearer) <= max(worst(x), 1e-14) else x), y
 
     @cached_property
     def violation(self) -> tuple[np.ndarray, np.ndarray, float]:
@@ -229,41 +233,45 @@ def solve(
 def scaling(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return powers of two (row, column) with row_i G_ij column_j and row_i g_i of about 1.
 
-    The logarithms of the entries of [G column, g] have mean 0 in each row and column, by turns
-    (Curtis & Reid 1972, J. Inst. Maths Applics 10, least squares): a change of units of rows and
-    columns changes the answer by the same factors, to a power of two. Entries of G that are then
-    below 1e-9 of their row are as good as zero, and distances g_i that are 1e12 times smaller or
-    larger than most are rounding or no limits: a second pass leaves them out. The largest entry of
-    each row of G is at last about 1.
+    column_j is how far along x_j the rows that it dominates let a point go, |g_i| / |G_ij|, in the
+    median. A row is dominated by the entries within a factor of 16 of its largest in scaled columns.
+    So entries of G that are rounding have no influence, nor have distances 1e12 times smaller or
+    larger than most, which are rounding or no limits. This starts from the least squares fit of the
+    logarithms of [G, g] (Curtis & Reid 1972, J. Inst. Maths Applics 10). Rows follow: their largest
+    entry is about 1. A change of units of rows and columns changes the answer by the same factors.
     """
-    M = np.abs(np.column_stack([G, g]))
-    with np.errstate(divide="ignore"):
-        L = np.log2(M)
-    there = np.isfinite(L)
-    row, column = np.zeros(len(M)), np.zeros(M.shape[1])
-    for _ in range(2):
-        count_row, count_column = there.sum(axis=1), there.sum(axis=0)
-        L0 = np.where(there, L, 0.0)
-        for _ in range(_SWEEPS):
-            before = column
-            row = -(L0.sum(axis=1) + there @ column) / np.maximum(count_row, 1)
-            column = -(L0.sum(axis=0) + row @ there) / np.maximum(count_column, 1)
-            column = np.where(count_column > 0, column - column[-1], 0.0)
-            if np.abs(column - before).max() < 0.1:
-                break
-        with np.errstate(invalid="ignore"):
-            scaled = np.where(np.isfinite(L), L + row[:, None] + column, -np.inf)
-        top = scaled[:, :-1].max(axis=1, initial=-1e3)[:, None]
-        there = np.isfinite(L) & (scaled >= top - 30)
-        # Distances that are rounding beside the others, or so large that they stand for none.
-        distance = (scaled - top)[:, -1]
-        known = np.isfinite(distance)
-        if known.any():
-            there[:, -1] = known & (np.abs(distance - np.median(distance[known])) <= 40)
-    column = np.round(column[:-1])
-    with np.errstate(invalid="ignore"):
-        top = np.where(np.isfinite(L[:, :-1]), L[:, :-1] + column, -np.inf).max(axis=1, initial=-np.inf)
-    top = np.where(np.isfinite(top), top, np.where(np.isfinite(L[:, -1]), L[:, -1], 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        L, distance = np.log2(np.abs(G)), np.log2(np.abs(g))
+        reach = np.where(np.isfinite(L), distance[:, None] - L, np.inf)
+    reach[~np.isfinite(distance)] = np.inf
+    both = np.column_stack([L, distance])
+    there = np.isfinite(both)
+    both = np.where(there, both, 0.0)
+    each_row, each_column = np.maximum(there.sum(axis=1), 1), np.maximum(there.sum(axis=0), 1)
+    fit = np.zeros(both.shape[1])
+    for _ in range(_SWEEPS):
+        before, row = fit, -(both.sum(axis=1) + there @ fit) / each_row
+        fit = -(both.sum(axis=0) + row @ there) / each_column
+        fit = fit - fit[-1]
+        if np.abs(fit - before).max() < 0.1:
+            break
+    column = fit[:-1]
+    for _ in range(3):
+        T = L + column
+        top = T.max(axis=1, initial=-np.inf)
+        usable = np.isfinite(distance) & np.isfinite(top)
+        if not usable.any():
+            break
+        off = np.where(usable, distance - np.where(usable, top, 0.0), np.inf)
+        usable &= np.abs(off - np.median(off[usable])) <= 40
+        ruled = usable[:, None] & (T >= np.where(usable, top, np.inf)[:, None] - 4)
+        count = ruled.sum(axis=0)
+        middle = np.sort(np.where(ruled, reach, np.inf), axis=0)[np.maximum(count - 1, 0) // 2]
+        column = np.where(count > 0, np.diagonal(middle), column)
+    column = np.round(column)
+    T = L + column
+    top = T.max(axis=1, initial=-np.inf)
+    top = np.where(np.isfinite(top), top, np.where(np.isfinite(distance), distance, 0.0))
     return np.exp2(-np.round(top)), np.exp2(column)
 
 
@@ -328,10 +336,10 @@ def implied_equalities(G: np.ndarray, g: np.ndarray, tolerance: float = FLAT) ->
 
 
 class AffineHull(NamedTuple):
-    """The points shift + basis w of an affine space, and the rows of a set that are left in it.
+    """The points x = shift + basis w of an affine space, and a set {G w <= g} in it, with volume.
 
-    equal: which rows hold all over the set. rows: the others that can bind. G w <= g: these. dual
-    (equal rows,) > 0: multipliers with Σ dual_i G_i = 0 that show that they do.
+    equal (all rows,): which rows of the set hold all over it. rows: the others that move with w, of
+    which G and g are.
     """
 
     shift: np.ndarray
@@ -343,41 +351,49 @@ class AffineHull(NamedTuple):
 
 
 def affine_hull(
-    G: np.ndarray, g: np.ndarray, tolerance: float = FLAT, equal: np.ndarray | None = None
-) -> AffineHull:
+    G: np.ndarray, g: np.ndarray, *, keep: int = 0, tolerance: float = FLAT
+) -> AffineHull | None:
     """Return the affine hull of G x <= g (not empty), and the set in its coordinates, with volume.
 
-    In scaled columns the basis is orthonormal and the shift the point nearest to 0. A row that no w
-    moves, but for rounding of its own terms, is left out.
+    keep: so many first coordinates of x are the first of w; None where the equalities tie these to
+    each other. The others are affine in them and in the rest of w, which are some of them. Where no
+    equality is implied, w = x.
     """
     n = G.shape[1]
-    if equal is None:
-        equal = implied_equalities(G, g, tolerance)
+    equal = implied_equalities(G, g, tolerance)
     if not equal.any():
         return AffineHull(np.zeros(n), np.eye(n), equal, np.arange(len(g)), G, g)
     row, column = scaling(G, g)
     E, e = (row[:, None] * G * column)[equal], (row * g)[equal]
-    U, size, Vt = np.linalg.svd(E)
-    rank = int((size > 1e-10 * size[0]).sum())
-    shift = column * (Vt[:rank].T @ ((U[:, :rank].T @ e) / size[:rank]))
-    # A reduced basis leaves coordinates that the equalities do not tie as they are.
-    basis = column[:, None] * plain_null_space(Vt[:rank])
+    U, size, Vt = np.linalg.svd(E[:, keep:], full_matrices=False)
+    rank = int((size > 1e-10 * max(size.max(initial=0.0), 1e-300)).sum())
+    U, S, V = U[:, :rank], size[:rank], Vt[:rank].T
+    if np.any(np.abs(E[:, :keep] - U @ (U.T @ E[:, :keep])) > FLAT):
+        return None
+    shift = np.append(np.zeros(keep), V @ ((U.T @ e) / S))
+    follow = np.where(np.abs(tied := -V @ ((U.T @ E[:, :keep]) / S[:, None])) > 1e-14, tied, 0.0)
+    null, free = plain_null_space(V.T)
+    basis = np.block([[np.eye(keep), np.zeros((keep, n - keep - rank))], [follow, null]])
+    # Each w is a coordinate of x, in its own units.
+    free = np.append(np.arange(keep), keep + free)
+    basis, shift = column[:, None] * basis / column[free], column * shift
     rest = np.flatnonzero(~equal)
-    H, h = G[rest] @ basis, g[rest] - G[rest] @ shift
-    size = np.abs(G[rest]) @ np.abs(basis)
-    H = np.where(np.abs(H) <= ROUNDING * size, 0.0, H)
+    H = cleaned(G[rest] @ basis, np.abs(G[rest]) @ np.abs(basis) * 1e3)
+    h = cleaned(g[rest] - G[rest] @ shift, np.abs(g[rest]) + np.abs(G[rest]) @ np.abs(shift))
     moved = H.any(axis=1)
     return AffineHull(shift, basis, equal, rest[moved], H[moved], h[moved])
 
 
-def plain_null_space(rows: np.ndarray) -> np.ndarray:
-    """Return a basis (n, n - rank) of {x : rows x = 0} in which n - rank coordinates are the
-    parameters: x = (parameters, -S parameters) in an order that pivoting finds."""
+def plain_null_space(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a basis (n, n - r) of {x : rows x = 0}, rows (r, n) independent, whose parameters are
+    the entries `free` (n - r,) of x, and these: the r others are found by pivoting."""
     r, n = rows.shape
+    if r == 0:
+        return np.eye(n), np.arange(n)
     _, R, order = scipy.linalg.qr(rows, mode="economic", pivoting=True)
-    tied, free = order[:r], order[r:]
+    tied, free = order[:r], np.sort(order[r:])
     basis = np.zeros((n, n - r))
     basis[free] = np.eye(n - r)
-    S = np.linalg.solve(R[:, :r], R[:, r:])
+    S = np.linalg.solve(rows[:, tied], rows[:, free])
     basis[tied] = np.where(np.abs(S) <= 1e-14, 0.0, -S)
-    return basis
+    return basis, free

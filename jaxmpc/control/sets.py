@@ -408,6 +408,7 @@ class Polytope:
     def _project_flat(G: np.ndarray, g: np.ndarray, axes: list[int]) -> "Polytope":
         """Return the projection of a flat set, in coordinates of its affine hull."""
         hull = affine_hull(G, g)
+        assert hull is not None
         onto = hull.basis[axes]
         row, column = scaling(onto, np.zeros(len(axes)))
         if not hull.equal.any() or not (

@@ -557,6 +557,7 @@ def _origin_inside(X_f: _Set) -> Check:
     else:
         depth = float(X_f.g.min(initial=np.inf))
         hull = affine_hull(X_f.G, X_f.g)
+        assert hull is not None
         if hull.equal.any() and not np.any(X_f.g[hull.equal]):
             depth = float((hull.g / np.linalg.norm(hull.G, axis=1)).min(initial=np.inf))
             if depth > 0:

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
-from jaxmpc.control.geometry import HIGHS, distinct
+from jaxmpc.control.geometry import distinct
+from jaxmpc.control.lp import maximise
 from jaxmpc.explicit.least_distance import SMALLEST, LeastDistanceForm
 
 # Relative rounding of a law: below it a coefficient is zero.
@@ -42,6 +42,8 @@ def active_piece(p: LeastDistanceForm, active: tuple[int, ...]) -> ActivePiece |
     slack[rows] = multipliers
     terms[rows] = np.abs(multipliers[:, :-1]).sum(axis=1).max(initial=0.0)
     a, b, c = slack[:, :n], slack[:, n], slack[:, n + 1]
+    # What is rounding beside the terms of its row is zero.
+    a = np.where(np.abs(a) <= 1e-3 * ZERO * terms[:, None], 0.0, a)
     size = np.linalg.norm(a, axis=1)
     constant = size <= ZERO * terms
     zero = constant & (np.abs(b) <= 10 * ZERO * terms)
@@ -50,6 +52,7 @@ def active_piece(p: LeastDistanceForm, active: tuple[int, ...]) -> ActivePiece |
     # Rows at a distance that [−1, 1]^n does not reach cannot cut.
     which = np.flatnonzero(~constant & (b <= 2 * np.sqrt(n) * size))
     H, h = -a[which] / size[which, None], b[which] / size[which]
+    h = np.where(np.abs(b[which]) <= 1e-3 * ZERO * terms[which], 0.0, h)
     zero[rows] = False
     also_active = tuple(np.flatnonzero(zero & ~p.still).tolist())
     return ActivePiece(active, also_active, multipliers[:, :-1], y[:, :-1], H, h, which)
@@ -128,11 +131,11 @@ def capped_ball(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the centre and radius of the largest ball in H ξ ≤ h (unit rows), at most 1; −1 for
     none."""
     n = H.shape[1]
-    ball = linprog(
-        -np.eye(n + 1)[n], A_ub=np.column_stack([H, np.ones(len(h))]), b_ub=h,
-        bounds=[(None, None)] * n + [(None, 1.0)], method="highs-ds", options=HIGHS,
-    )  # fmt: skip
-    return (np.zeros(n), -1.0) if ball.x is None else (ball.x[:n], float(ball.x[-1]))
+    radius = np.eye(n + 1)[n]
+    rows = np.vstack([np.column_stack([H, np.ones(len(h))]), radius])
+    ball = maximise(radius, rows, np.append(h, 1.0)).x
+    assert ball is not None  # a ball of negative radius fits
+    return ball[:n], min(float((h - H @ ball[:n]).min()), 1.0)
 
 
 def volume(points: np.ndarray) -> float:

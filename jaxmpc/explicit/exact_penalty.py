@@ -5,20 +5,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linprog
 
 from jaxmpc.checks import fail, require_kind, whole
-from jaxmpc.control.geometry import HIGHS
+from jaxmpc.control.lp import Program, maximise
 from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.control.system import host_array
 from jaxmpc.explicit.cells import ActivePiece, active_piece, capped_ball
-from jaxmpc.explicit.least_distance import (
-    SMALLEST,
-    STOPPED,
-    LeastDistanceForm,
-    least_distance_form,
-    maximum,
-)
+from jaxmpc.explicit.least_distance import SMALLEST, LeastDistanceForm, least_distance_form
 from jaxmpc.explicit.regions import CriticalRegions
 from jaxmpc.explicit.search import exchange, explore
 from jaxmpc.mpc.problem import MPC
@@ -177,6 +170,10 @@ def softened(p: LeastDistanceForm, table: tuple[Row, ...]) -> np.ndarray:
     """Return which rows (r,) of the program are soft rows that inputs can move."""
     any_soft = any(row.soft for row in table)
     soft = np.array([row.soft if any_soft else row.kind in SOFTENED for row in table], bool)
+    tied = p.given.row[p.hull.equal]
+    if len(soft) and np.any((tied >= 0) & soft[tied]):
+        what = "has soft rows that imply an equality, which any weight lets plans violate"
+        fail("mpc", what, "Keep those rows hard, or give them some width")
     mine = (p.row >= 0) & soft[np.maximum(p.row, 0)] if len(soft) else np.zeros(len(p.row), bool)
     if not mine.any():
         fail("mpc", "has no limit on states or outputs to soften", "Give states, or soft rows")
@@ -223,7 +220,7 @@ class Thresholds:
         self, rows: np.ndarray, active: tuple[int, ...], multipliers: np.ndarray
     ) -> tuple[float, int]:
         """Return min t over λ ≥ 0 on `rows` with the same Σ λ_i M_i as those on `active` and λ_i ≤
-        t over soft rows (NaN: HiGHS stops), and a soft row that attains it.
+        t over soft rows (NaN: there are none), and a soft row that attains it.
         """
         total = self.p.M[list(active)].T @ np.maximum(multipliers, 0.0)
         mine, size = self.soft[rows], np.abs(total).max(initial=0.0)
@@ -234,16 +231,14 @@ class Thresholds:
         unit = per_row[mine].max()
         count = len(rows)
         A, b = self.p.balance(rows, total / size)
-        result = linprog(
-            np.eye(count + 1)[count],
-            A_eq=np.column_stack([A, np.zeros(len(b))]), b_eq=b,
-            A_ub=np.column_stack([np.diag(per_row / unit)[mine], -np.ones(mine.sum())]),
-            b_ub=np.zeros(mine.sum()), bounds=(0, None), method="highs-ds", options=HIGHS,
-        )  # fmt: skip
-        if result.x is None:
+        least = np.column_stack([np.diag(per_row / unit)[mine], -np.ones(mine.sum())])
+        G = np.vstack([np.column_stack([A, np.zeros(len(b))]), least, -np.eye(count + 1)])
+        g = np.append(b, np.zeros(len(G) - len(b)))
+        top = Program(G, g, np.arange(len(G)) < len(b)).maximise(-np.eye(count + 1)[count])
+        if top.x is None:
             return np.nan, -1
-        each = np.where(mine, result.x[:count] * per_row, 0.0)
-        return float(result.fun * unit * size), int(rows[np.argmax(each)])
+        each = np.where(mine, top.x[:count] * per_row, 0.0)
+        return float(-top.value * unit * size), int(rows[np.argmax(each)])
 
     def over(self, found: ActivePiece, points: np.ndarray) -> Worst:
         """Return the largest threshold at points ξ (k, p) of a region, as limits from its inside.
@@ -256,7 +251,7 @@ class Thresholds:
         if found.also_active and self.soft[rows].any():
             each = [self.least(rows, found.active, found.multipliers @ at) for at in affine]
             if np.isnan([value for value, _ in each]).any():
-                fail("mpc", *STOPPED)
+                fail("mpc", "no multipliers are found at a vertex", "Scale states and inputs")
             best = int(np.argmax([value for value, _ in each]))
             return Worst(each[best][0], points[best], each[best][1])
         mine = [i for i, row in enumerate(found.active) if self.soft[row]]
@@ -280,7 +275,7 @@ class Thresholds:
         for i, row in enumerate(found.active):
             gain = found.multipliers[i, :-1]
             if self.soft[row] and gain.any():
-                corner = maximum(gain, found.H, found.h)[1]
+                corner = maximise(gain, found.H, found.h).x
                 points += [] if corner is None else [corner]
         return self.over(found, np.array(points))
 

@@ -7,7 +7,9 @@ from the unconstrained plan, and the QP at x is a least-distance problem:
 
 Where the rows A hold with equality, y = −M_A'λ and M_A M_A'λ = −(v_A + V_A x): plan and
 multipliers are affine in x on the polytope where λ ≥ 0 and all other rows hold, the critical
-region of A. Seen as a problem with v + δε for a fixed ε > 0 and δ → 0+, every active set has
+region of A. Equalities that rows imply (two opposite rows, a terminal point) are taken out
+first: z is affine in x and in coordinates w that they leave free, and w takes the place of z above.
+Seen as a problem with v + δε for a fixed ε > 0 and δ → 0+, every active set has
 independent rows; so regions where rows are dependent (duplicates, apexes of a limit) are divided
 without overlap, and rows that vanish identically are decided by their first order in δ.
 """
@@ -16,11 +18,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linprog, nnls
+from scipy.optimize import nnls
 
 from jaxmpc.checks import fail
-from jaxmpc.control.geometry import HIGHS
-from jaxmpc.control.sets import Box, Polytope, unit_half_spaces, unit_rows
+from jaxmpc.control.geometry import framed
+from jaxmpc.control.lp import ROUNDING, AffineHull, Program, affine_hull, maximise, scaling
+from jaxmpc.control.sets import Box, Polytope, unit_half_spaces
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
 from jaxmpc.mpc.problem import MPC
@@ -29,7 +32,6 @@ from jaxmpc.mpc.problem import MPC
 SMALLEST = 1e-9
 # Rows of length 1 closer to the span of others than this count as dependent on them.
 DEPENDENT = 1e-7
-STOPPED = "HiGHS stopped early on its linear programs", "Scale states and inputs to like size"
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +40,15 @@ class LeastDistanceForm:
 
     length (r,): multipliers of the rows as given are those of M divided by it. row (r,): index
     into `condensed`. side (r,): 1 upper, −1 lower. still (r,): M_i = 0, a half-space on ξ alone.
-    epsilon (r,): direction of the perturbation. factor: ℓ.
-    U: orthonormal columns that span those of M.
+    typical (r,): size of v + V ξ, for tolerances. epsilon (r,): direction of the perturbation.
+    factor: ℓ. U: orthonormal columns that span those of M.
     shift (N·m, n + 1): ℓ⁻¹(F, f). interior (n,): ξ with a margin.
+    given: the program as it is stated, before any row is scaled or left out. hull: the affine hull
+    of its points (x, z).
     """
 
+    given: "GivenProgram"
+    hull: AffineHull
     condensed: Condensed
     factor: np.ndarray
     shift: np.ndarray
@@ -50,6 +56,7 @@ class LeastDistanceForm:
     U: np.ndarray
     V: np.ndarray
     v: np.ndarray
+    typical: np.ndarray
     length: np.ndarray
     row: np.ndarray
     side: np.ndarray
@@ -60,24 +67,27 @@ class LeastDistanceForm:
     interior: np.ndarray
 
     def support(self, d: np.ndarray) -> tuple[float, np.ndarray | None]:
-        """Return max d'ξ over X_N, and where it is attained; NaN and None where HiGHS stops."""
-        return maximum(d, np.hstack([self.U, -self.V]), self.v)
+        """Return max d'ξ over X_N by the program as given, and where it is attained."""
+        value, x = self.given.support(d / self.size)
+        return value - d / self.size @ self.center, None if x is None else self.scaled(x)
+
+    def scaled(self, x: np.ndarray) -> np.ndarray:
+        """Return the ξ of a state x."""
+        return (x - self.center) / self.size
 
     def leave(self, direction: np.ndarray) -> np.ndarray | None:
         """Return where the ray from the interior point along `direction` leaves X_N; None if not
         found."""
-        t = maximum(
-            np.ones(1), np.column_stack([self.U, -self.V @ direction]),
-            self.v + self.V @ self.interior,
-        )[1]  # fmt: skip
-        return None if t is None else self.interior + t * direction
+        rows = np.column_stack([self.U, -self.V @ direction])
+        found = maximise(np.eye(rows.shape[1])[-1], rows, self.v + self.V @ self.interior).x
+        return None if found is None else self.interior + found[-1] * direction
 
     def margin(self, xi: np.ndarray) -> float:
-        """Return an upper bound of the greatest t ≤ 1 with M y + t ≤ v + V ξ: ξ is outside X_N if t
-        < 0."""
-        rows = np.column_stack([self.U, np.ones(len(self.v))])
+        """Return the greatest t ≤ 1 with M y + t·typical ≤ v + V ξ: ξ is outside X_N if t < 0."""
+        rows = np.column_stack([self.U, self.typical])
         rows = np.vstack([rows, np.eye(rows.shape[1])[-1]])
-        return maximum(np.ones(1), rows, np.append(self.v + self.V @ xi, 1.0))[0]
+        d = np.eye(rows.shape[1])[-1]
+        return maximise(d, rows, np.append(self.v + self.V @ xi, 1.0)).value
 
     def solve_active(self, active: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray] | None:
         """Return λ (a, n + 2) and y (nz, n + 2), affine in ξ, constant and δ; None for dependent
@@ -110,7 +120,7 @@ class LeastDistanceForm:
         if np.any(b[self.still] < -1e-9):
             return None
         moving = np.flatnonzero(~self.still)
-        for allowance in (0.0, 1e-9):  # points on the boundary of X_N may need one
+        for allowance in (0.0, 1e-9 * self.typical[moving]):  # points on the boundary of X_N may need one
             active: tuple[int, ...] = ()
             worst = -b[moving].min(initial=0.0)
             if worst > 0:
@@ -125,7 +135,7 @@ class LeastDistanceForm:
             if solved is None:
                 continue
             multipliers, y = (part[:, :-1] @ np.append(xi, 1.0) for part in solved)
-            terms = 1 + np.abs(b) + np.abs(self.M) @ np.abs(y)
+            terms = self.typical + np.abs(b) + np.abs(self.M) @ np.abs(y)
             slack = b - self.M @ y
             least = -1e-8 * np.abs(multipliers).max(initial=0.0)
             if np.all(slack[moving] >= -1e-8 * terms[moving]) and np.all(multipliers >= least):
@@ -142,10 +152,10 @@ class LeastDistanceForm:
         # The limit of the perturbed multipliers minimises ε'λ.
         on = found.touching
         A, b = self.balance(on, -found.y)
-        best = linprog(self.epsilon[on], A_eq=A, b_eq=b, method="highs-ds")
-        if best.x is None:
+        best = positive_maximum(-self.epsilon[on], A, b)
+        if best is None:
             return found.active
-        return tuple(on[best.x > 1e-12 * best.x.max(initial=0.0)].tolist())
+        return tuple(on[best > 1e-12 * best.max(initial=0.0)].tolist())
 
     def balance(self, rows: np.ndarray, total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Σ λ_i M_i = total over `rows`, which hold `total` in their span, as independent
@@ -168,92 +178,100 @@ class PointSolution(NamedTuple):
     y: np.ndarray
 
 
+class GivenProgram(NamedTuple):
+    """The rows C z + D x ≤ b as they are given, with those of the set of initial states: row (r,) and
+    side (r,) as in `Inequalities`, row −1 for these. condensed: the QP they belong to."""
+
+    condensed: Condensed
+    C: np.ndarray
+    D: np.ndarray
+    b: np.ndarray
+    row: np.ndarray
+    side: np.ndarray
+    program: Program
+
+    @classmethod
+    def of(cls, mpc: MPC, within: Box | Polytope | None) -> "GivenProgram":
+        """Return the program of `mpc`, all rows hard, on X_N or on X_N ∩ within."""
+        c = condensed_in_float64(mpc)
+        if c.balls:
+            fail("terminal_set", "is an ellipsoid: its law is not affine", "Give a Polytope")
+        C, D, b, row, side = Inequalities.of(c)
+        H, h = unit_half_spaces("within", within, mpc.dimension)
+        if mpc.input_in_state and mpc.inputs is not None:  # one that was applied
+            H_u, h_u = unit_half_spaces("inputs", mpc.inputs, mpc.system.m)
+            H, h = np.vstack([H, np.pad(H_u, ((0, 0), (mpc.system.n, 0)))]), np.append(h, h_u)
+        C, D = np.vstack([C, np.zeros((len(h), C.shape[1]))]), np.vstack([D, H])
+        b, side = np.append(b, h), np.append(side, np.ones(len(h)))
+        row = np.append(row, np.full(len(h), -1))
+        return cls(c, C, D, b, row, side, Program(np.hstack([D, C]), b))
+
+    def support(self, d: np.ndarray) -> tuple[float, np.ndarray | None]:
+        """Return max d'x over X_N, and where it is attained (None: nowhere)."""
+        found = self.program.maximise(np.append(d, np.zeros(self.C.shape[1])))
+        return found.value, None if found.x is None else found.x[: len(d)]
+
+
 def least_distance_form(mpc: MPC, within: Box | Polytope | None = None) -> LeastDistanceForm:
     """Return the least-distance form with all rows of `mpc` hard, on X_N or on X_N ∩ within."""
-    c = condensed_in_float64(mpc)
-    if c.balls:
-        fail("terminal_set", "is an ellipsoid: its law is not affine", "Give a Polytope")
-    n = mpc.dimension
+    given, n = GivenProgram.of(mpc, within), mpc.dimension
+    c = given.condensed
+    if given.program.empty:
+        fail("mpc", "its feasible set is empty", "Relax a limit or lengthen the horizon")
+    flat = "its feasible set is flat: no initial state keeps a margin"
+    hull = affine_hull(given.program.G, given.b, keep=n)
+    if hull is None:
+        fail("mpc", f"{flat}, as equalities tie the states to each other", "Relax one of them")
+    # z = shift + S x + N w
+    N, S, shift_z = hull.basis[n:, n:], hull.basis[n:, :n], hull.shift[n:]
     try:
-        factor = np.linalg.cholesky(c.P)
+        factor = np.linalg.cholesky(N.T @ c.P @ N)
     except np.linalg.LinAlgError:
         fail("R", "leaves the condensed cost singular in float64", "Put a larger weight on inputs")
-    G, D, v, row, side = Inequalities.of(c)
-    V = -D
-    H, h = unit_half_spaces("within", within, n)
-    if mpc.input_in_state and mpc.inputs is not None:  # a previous input is one that was applied
-        H_u, h_u = unit_half_spaces("inputs", mpc.inputs, mpc.system.m)
-        H, h = np.vstack([H, np.pad(H_u, ((0, 0), (mpc.system.n, 0)))]), np.append(h, h_u)
-    G, V, v = np.vstack([G, np.zeros((len(h), G.shape[1]))]), np.vstack([V, -H]), np.append(v, h)
-    row, side = np.append(row, np.full(len(h), -1)), np.append(side, np.ones(len(h)))
+    G, V, v = hull.G[:, n:], -hull.G[:, :n], hull.g
+    row, side = given.row[hull.rows], given.side[hull.rows]
 
-    # Rows ℓ⁻ᵀ of length 1; those that are zero (k = 0, forward Euler) bound x alone.
+    # Rows ℓ⁻ᵀ of length 1; those that are zero (k = 0, forward Euler) bound x alone. A row is zero
+    # if its entries are rounding beside its other terms, in columns of like size.
+    unit = scaling(hull.G, hull.g)[1]
+    others = np.linalg.norm(V * unit[:n], axis=1) + np.abs(v)
+    still = np.linalg.norm(G * unit[n:], axis=1) <= ROUNDING / 100 * others
     M = np.linalg.solve(factor, G.T).T
-    length = np.linalg.norm(M, axis=1)
-    still = length <= 1e-13 * np.max(length, initial=0.0)
-    M[still], length[still] = 0.0, np.linalg.norm(V[still], axis=1)
-    empty = still & (length == 0)
-    if np.any(v[empty] < 0):
-        fail("mpc", "a limit that no state or input can move is violated", "Relax that limit")
-    M, V, v, length, row, side, still = (
-        part[~empty] for part in (M, V, v, length, row, side, still)
-    )
+    M[still] = 0.0
+    length = np.where(still, 1.0, np.linalg.norm(M, axis=1))
     M, V, v = M / length[:, None], V / length[:, None], v / length
-    shift = np.linalg.solve(factor, np.column_stack([c.F, c.f]))
+    shift = np.linalg.solve(
+        factor, N.T @ (np.column_stack([c.F, c.f]) + c.P @ np.column_stack([S, shift_z]))
+    )
     V, v = V + M @ shift[:, :n], v + M @ shift[:, n]
 
-    # An orthonormal basis of the columns of M keeps tiny coefficients out of the LPs.
-    U = np.linalg.svd(M, full_matrices=False)[0]
-    unit = 1 / np.maximum(np.abs(V).max(axis=0), 1e-300)
-    ends = [maximum(d, np.hstack([U, -V * unit]), v)[0] for d in (*np.eye(n), *-np.eye(n))]
-    high, low = np.array(ends[:n]) * unit, -np.array(ends[n:]) * unit
-    if np.isnan(ends).any():
-        fail("mpc", *STOPPED)
-    if -np.inf in ends:
-        fail("mpc", "its feasible set is empty", "Relax a limit or lengthen the horizon")
+    program = Program(np.hstack([-V, M]), v)
+    low, high = program.bounds(range(n))
     free = ~np.isfinite(high - low)
     if free.any():
         i = int(np.argmax(free))
         fail("mpc", f"its feasible set is unbounded along coordinate {i}", "Give within=jm.Box(…)")
     center, size = (high + low) / 2, (high - low) / 2
-    flat = "its feasible set is flat: no initial state keeps a margin"
-    if np.any(size <= SMALLEST * (unit + np.abs(center))):
+    if np.any(size <= ROUNDING * np.abs(center)):
         fail("mpc", flat, "Relax a limit or lengthen the horizon")
     V, v = V * size, v + V @ center
-    rows = np.hstack([U, -V])
-    gaps = np.linalg.norm(rows, axis=1)
-    margin = np.column_stack([np.vstack([rows, np.zeros(rows.shape[1])]), np.append(gaps, 1.0)])
-    radius, ball = maximum(np.eye(n + 1)[n], margin, np.append(v, 1.0))
-    if ball is None or radius <= SMALLEST:
-        fail("mpc", flat, "Relax a limit or lengthen the horizon")
+    # Rows on ξ alone get length 1; the others are as long as y, in units of cost, is.
+    reach = np.linalg.norm(V, axis=1)
+    unit = np.where(still, np.maximum(reach, 1e-300), 1.0)
+    V, v, length = V / unit[:, None], v / unit, length * unit
+    typical = np.where(still, 1.0, np.median((reach + np.abs(v))[~still]) if any(~still) else 1.0)
+    # An orthonormal basis of the columns of M keeps tiny coefficients out of the LPs.
+    U = np.linalg.svd(M, full_matrices=False)[0]
+    ball = framed("mpc: its feasible set", np.hstack([U, -V]), v).centre
     # Multiples of the golden ratio spread evenly and have no small integer relations.
     epsilon = 1 + np.modf(np.arange(1, len(v) + 1) * (np.sqrt(5) - 1) / 2)[0]
     return LeastDistanceForm(
-        c, factor, shift, M, U, V, v, length, row, side, still, epsilon, center, size, ball[:n],
+        given, hull, c, factor, shift, M, U, V, v, typical, length, row, side, still, epsilon,
+        center, size, ball[-n:],
     )  # fmt: skip
 
 
-def maximum(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> tuple[float, np.ndarray | None]:
-    """Return max d'(last coordinates of w) over G w ≤ g, and those coordinates.
-
-    ±inf and None where there is none, NaN and None where HiGHS stops for another reason.
-
-    Where the active rows carry d to rounding, the value is that of their multipliers: an upper
-    bound by weak duality, and free of HiGHS' tolerances.
-    """
-    G, g = unit_rows(G, g)
-    size = np.median(np.abs(g)) or 1.0  # those tolerances are absolute
-    cost = np.append(np.zeros(G.shape[1] - len(d)), d)
-    for method in ("highs-ds", "highs-ipm"):
-        result = linprog(
-            -cost, A_ub=G, b_ub=g / size, bounds=(None, None), method=method, options=HIGHS
-        )
-        if result.status in (2, 3):
-            return (-np.inf if result.status == 2 else np.inf), None
-        if result.status == 0:
-            active = result.ineqlin.marginals < -1e-9
-            y = np.linalg.lstsq(G[active].T, cost, rcond=None)[0]
-            exact = np.all(y >= 0) and np.abs(G[active].T @ y - cost).max() <= 1e-13 * (1 + y.sum())
-            value = g[active] @ y if exact else -result.fun * size
-            return float(value), result.x[-len(d) :] * size
-    return np.nan, None
+def positive_maximum(d: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray | None:
+    """Return λ of max d'λ over A λ = b, λ ≥ 0; None where there is none."""
+    rows, limits = np.vstack([A, -np.eye(len(d))]), np.append(b, np.zeros(len(d)))
+    return Program(rows, limits, np.arange(len(rows)) < len(b)).maximise(d).x

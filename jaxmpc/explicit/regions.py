@@ -10,10 +10,19 @@ import numpy as np
 from jaxmpc.checks import fail
 from jaxmpc.control.sets import Box, Polytope, unit_rows
 from jaxmpc.explicit.cells import Cell, volume
-from jaxmpc.explicit.least_distance import LeastDistanceForm, least_distance_form
+from jaxmpc.control.lp import scaling
+from jaxmpc.explicit.least_distance import (
+    GivenProgram,
+    LeastDistanceForm,
+    least_distance_form,
+    positive_maximum,
+)
 from jaxmpc.explicit.search import RegionSearch, explore
 from jaxmpc.mpc.problem import MPC
 
+# Residual of the optimality conditions at a vertex, relative to the size of the terms, up to which a
+# region counts as one of the program as given.
+OPTIMAL = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Region:
@@ -21,7 +30,8 @@ class Region:
 
     rows (a,): active rows of `Condensed.C`. On the region the optimal decision is z = Z x + z0
     (nz,), its multipliers y = L x + l0 (a,) for the cost without ½ (y ≥ 0 at an upper bound,
-    y ≤ 0 at a lower one), the first input u_0 = K x + k (m,), a prestabilising gain included.
+    y ≤ 0 at a lower one, any sign where both are equal; the last rows are those of equalities that
+    the rows imply, if there are any), the first input u_0 = K x + k (m,), a prestabilising gain included.
     also_active: rows that are active all over the region and depend on `rows`.
     polytope: irredundant unit rows in the p = mpc.dimension coordinates of the state;
     vertices (k, p); volume.
@@ -45,7 +55,10 @@ class CriticalRegions:
     """Critical regions of an MPC problem: the polytopes on which its plan is affine in x0.
 
     complete: the regions fill X_N, i.e. the volumes sum to that of the hull of all vertices, and
-    no support LP finds a point of X_N beyond a facet of that hull (both to 1e-9 of its size).
+    no support LP over the rows as given finds a point of X_N beyond a facet of that hull (both to
+    1e-9 of its size); and at the vertices of each, hence all over it, the law meets the optimality
+    conditions of the program as given, to 1e-6 of their terms. Where input rates matter the state
+    is (x, u_{−1}), and X_N holds those with u_{−1} in the input limits.
     volume: their sum. reason: what was checked, or what stopped the search.
     """
 
@@ -61,6 +74,11 @@ class CriticalRegions:
         """Return what a search has found, in the coordinates of x, and whether it fills X_N."""
         complete, reason = search.fill()
         regions = tuple(region(search.p, c) for c in search.found)
+        worst = max((residual(search.p.given, r) for r in regions), default=0.0)
+        reason += f"; optimality conditions of the program as given hold to {worst:.0e}"
+        if not worst <= OPTIMAL:
+            complete = False
+            reason += ", which is no law: the program is too ill-conditioned"
         total = float(sum(r.volume for r in regions))
         seconds = time.perf_counter() - search.begun
         return cls(mpc, regions, complete, total, reason, seconds)
@@ -163,17 +181,82 @@ def region(p: LeastDistanceForm, c: Cell) -> Region:
         )
     )
     (L, l0), (Y, y0), n = on_x(c.law.multipliers), on_x(c.law.y), len(p.center)
-    Z = np.linalg.solve(p.factor.T, Y - p.shift[:, :n])
-    z0 = np.linalg.solve(p.factor.T, y0 - p.shift[:, n])
+    W = np.linalg.solve(p.factor.T, Y - p.shift[:, :n])
+    w0 = np.linalg.solve(p.factor.T, y0 - p.shift[:, n])
+    S, N = p.hull.basis[n:, :n], p.hull.basis[n:, n:]
+    Z, z0 = S + N @ W, p.hull.shift[n:] + N @ w0
     sign = p.side[rows] / p.length[rows]
+    L, l0 = sign[:, None] * L, sign * l0
     H, h = c.H / p.size, c.h + c.H / p.size @ p.center
     vertices = p.center + c.vertices * p.size
-    condensed = p.condensed
+    condensed, active = p.condensed, p.row[rows]
+    if p.hull.equal.any():
+        tied, both = of_equalities(p, active, np.column_stack([L, l0]), Z, z0, vertices)
+        active = np.append(active, tied)
+        L, l0 = np.vstack([L, both[:, :-1]]), np.append(l0, both[:, -1])
     return Region(
-        rows=p.row[rows], also_active=p.row[list(c.law.also_active)],
-        Z=Z, z0=z0, L=sign[:, None] * L, l0=sign * l0,
+        rows=active, also_active=p.row[list(c.law.also_active)],
+        Z=Z, z0=z0, L=L, l0=l0,
         K=np.asarray(condensed.Psi[0] + condensed.Omega[0] @ Z),
         k=np.asarray(condensed.Omega[0] @ z0 + condensed.psi[0]),
         polytope=Polytope(*unit_rows(H, h)), vertices=vertices,
         volume=volume(c.vertices) * float(np.prod(p.size)),
     )  # fmt: skip
+
+
+def of_equalities(
+    p: LeastDistanceForm, active: np.ndarray, L: np.ndarray, Z: np.ndarray, z0: np.ndarray,
+    vertices: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the condensed rows of the implied equalities and their multipliers, affine in (x, 1).
+
+    They balance what is left of the gradient, E'y = −(P z + F x + f + C_a'y_a). One-sided rows that
+    imply equalities have E'ν = 0 for some ν > 0: so much of ν is added that y ≥ 0 on the region.
+    """
+    c, given = p.condensed, p.given
+    usable = np.flatnonzero(p.hull.equal & (given.row >= 0))
+    left = -(c.P @ np.column_stack([Z, z0]) + np.column_stack([c.F, c.f]) + c.C[active].T @ L)
+    row, column = scaling(given.C[usable], np.zeros(len(usable)))
+    E = row[:, None] * given.C[usable] * column
+    y = np.linalg.lstsq(E.T, column[:, None] * left, rcond=1e-10)[0]
+    # ν = 1 + μ with μ ≥ 0 as small as possible
+    more = positive_maximum(-np.ones(len(E)), E.T, -E.sum(axis=0))
+    if more is not None:
+        lowest = (y @ np.column_stack([vertices, np.ones(len(vertices))]).T).min(axis=1)
+        y[:, -1] += max(np.max(-lowest / (1 + more)), 0.0) * (1 + more)
+    y *= row[:, None] * given.side[usable][:, None]
+    rows = np.unique(given.row[usable])
+    return rows, np.array([y[given.row[usable] == i].sum(axis=0) for i in rows])
+
+
+def residual(given: GivenProgram, r: Region) -> float:
+    """Return the largest residual of the optimality conditions of the program as given at the
+    vertices of a region, each relative to the size of its terms.
+
+    All four conditions are affine in x under the region's law, so that its vertices stand for it.
+    """
+    c, x = given.condensed, r.vertices
+    z, y = x @ r.Z.T + r.z0, x @ r.L.T + r.l0
+    # In columns of like size, with entries that are rounding beside those of their row left out.
+    size_z = np.abs(z).max(axis=0)
+    terms = np.abs(given.C) @ size_z + np.abs(given.D) @ np.abs(x).max(axis=0) + np.abs(given.b)
+    terms = np.where(terms > 0, terms, 1.0)
+    gap = (z @ given.C.T + x @ given.D.T - given.b) / terms
+    primal = gap.max(initial=0.0)
+    total = np.zeros((len(x), len(c.C)))
+    np.add.at(total, (slice(None), r.rows), y)
+    gradient = z @ c.P.T + x @ c.F.T + c.f + total @ c.C
+    parts = np.abs(z) @ np.abs(c.P) + np.abs(x) @ np.abs(c.F).T + np.abs(c.f)
+    parts = (parts + np.abs(total) @ np.abs(c.C)).max(axis=0)
+    dual = (np.abs(gradient) / np.where(parts > 0, parts, 1.0)).max(initial=0.0)
+    # y > 0 only on an upper bound that is met, y < 0 only on a lower one.
+    load = np.abs(total).max(axis=0)
+    load = np.where(load > 0, load, 1.0)
+    wrong = 0.0
+    for side in (1.0, -1.0):
+        mine = (given.side == side) & (given.row >= 0)
+        met = np.zeros(len(c.C), bool)
+        met[given.row[mine]] = np.abs(gap[:, mine]).max(axis=0) <= OPTIMAL
+        pushed = np.maximum(side * total, 0.0) / load
+        wrong = max(wrong, pushed[:, ~met].max(initial=0.0))
+    return float(max(primal, dual, wrong))

@@ -16,16 +16,19 @@ from jaxmpc.explicit.least_distance import DEPENDENT, LeastDistanceForm
 FILL = 1e-9
 # How far beyond a facet the region behind it is looked for, relative to the facet's region.
 STEPS = (1e-2, 1e-4, 1e-6)
-REPAIRS = 20
+# Rounds of the search from what is missing, and random points of X_N from which each starts again.
+REPAIRS, RESTARTS = 20, 50
 DIMENSIONS = 6
 
 
 class RegionSearch:
-    """Breadth-first search across facets. cells: active set → region, None for no volume."""
+    """Breadth-first search across facets, from random points again until X_N is full. cells: active
+    set → region, None for no volume."""
 
     def __init__(self, p: LeastDistanceForm, limit: int, deadline: float = np.inf) -> None:
         self.p, self.limit, self.deadline = p, limit, deadline
         self.begun = time.perf_counter()
+        self.random = np.random.default_rng(0)
         self.cells: dict[tuple[int, ...], Cell | None] = {}
         self.found: list[Cell] = []
         self.queue: deque[Cell] = deque()
@@ -80,10 +83,26 @@ class RegionSearch:
             if touches(behind):
                 return
 
+    def restart(self) -> None:
+        """Search on from random points of X_N, those in no region yet: on chords between points
+        where rays from the interior point leave it."""
+        n = len(self.p.center)
+        for _ in range(RESTARTS):
+            if self.full:
+                return
+            ends = [self.p.leave(d) for d in self.random.standard_normal((2, n))]
+            if ends[0] is None or ends[1] is None:
+                continue
+            chord = ends[0] + self.random.random() * (ends[1] - ends[0])
+            point = self.p.interior + self.random.random() * (chord - self.p.interior)
+            if not any(np.all(c.H @ point <= c.h) for c in self.found):
+                self.visit(self.p.active(point))
+                self.cross_all()
+
     def fill(self) -> tuple[bool, str]:
         """Check that the regions fill X_N, and search on from what is missing; return (complete,
         reason)."""
-        random = np.random.default_rng(0)
+        random, stale = self.random, 0
         why = ""
         for _ in range(REPAIRS):
             if self.late:
@@ -101,7 +120,7 @@ class RegionSearch:
             why = (
                 f"the volumes of the regions sum to that of their hull (relative gap {gap:.0e}); "
                 f"X_N reaches beyond its {len(beyond)} facets by {max(beyond.max(), 0):.0e}, "
-                "relative to its size, by one linear program each"
+                "relative to its size, by one linear program each over all rows as given"
             )
             if beyond.max() <= FILL and abs(gap) <= FILL:
                 return True, why
@@ -120,7 +139,9 @@ class RegionSearch:
                     point = middle + 0.9 * random.random() * (to - middle)
                     self.visit(self.p.active(point + 1e-6 * c.radius * normal))
             self.cross_all()
-            if len(self.found) == before:
+            self.restart()
+            stale = 0 if len(self.found) > before else stale + 1
+            if stale == 2:
                 break
         return False, why.replace("the volumes of", "a part was not found: the volumes of")
 
@@ -137,6 +158,10 @@ def explore(p: LeastDistanceForm, limit: Any, deadline: float = np.inf) -> Regio
     search = RegionSearch(p, limit, deadline)
     search.visit(p.active(p.interior))
     search.cross_all()
+    for _ in range(REPAIRS):
+        if search.found or search.late:
+            break
+        search.restart()
     if not search.found:
         fail("mpc", "no critical region was found: too ill-conditioned", "Scale states and inputs")
     return search

@@ -81,19 +81,20 @@ def cut_of(p: ExactData, rows: ConstraintRows, y: Array) -> tuple[Array, Array, 
 
 
 def with_violated_limit(rows: ConstraintRows, theta: Array, y: Array) -> Array:
-    """Return the multipliers y (R,), or that of a single row: the one that θ violates most among
-    the rows that nothing moves. It is a proof for any inputs, limited or not.
+    """Return the multipliers y (R,), or that of a single row: the one that θ violates most,
+    relative to its terms, among the rows that nothing moves. It is a proof for any inputs, limited or not.
     """
     if not len(rows.still):
         return y
     still, D = jnp.asarray(rows.still), jnp.asarray(rows.D)[rows.still]
     value = D @ theta
     violation = value - jnp.clip(value, rows.lower[still], rows.upper[still])
-    worst = jnp.argmax(jnp.abs(violation))
     # A violation within rounding is none: then the other rows may prove more.
-    rounding = 1e-13 * jnp.sum(jnp.abs(D[worst] * theta))
+    size = jnp.sum(jnp.abs(D * theta), axis=1) + jnp.abs(violation)
+    relative = jnp.where(violation == 0, 0.0, jnp.abs(violation) / jnp.where(size > 0, size, 1.0))
+    worst = jnp.argmax(relative)
     alone = jnp.where(np.arange(len(y)) == still[worst], jnp.sign(violation[worst]), 0.0)
-    return jnp.where(jnp.abs(violation[worst]) > rounding, alone, y)
+    return jnp.where(relative[worst] > 1e-13, alone, y)
 
 
 def check_candidates(

@@ -11,6 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.control.lp import scaling
+from jaxmpc.control.set_bounds import set_bounds
+from jaxmpc.feasible.centered_polytope import power_of_two
 from jaxmpc.feasible.exact_data import absorbed
 from jaxmpc.feasible.view import View
 from jaxmpc.mpc.problem import MPC
@@ -81,16 +84,28 @@ def constraint_rows(
         lower, upper = lower - c.D[:, others] @ rest, upper - c.D[:, others] @ rest
         psi = psi + c.Psi[:, :, others] @ rest
 
-    row_unit, unit = np.ones(len(C)), np.ones(C.shape[1])
+    # Inputs and free states in units of their limits, relative to the first input's: the variables
+    # count alike.
+    firsts = np.unique(mpc.moves, return_index=True)[1]
+    sides = np.abs(set_bounds(mpc.inputs, mpc.system.m)).max(axis=0)
+    unit = np.tile(power_of_two(sides), len(firsts))
+    if extra:
+        free = power_of_two(np.maximum(np.abs(view.lower), np.abs(view.upper)))
+        unit = np.append(unit, free)
+    unit = unit / unit[0]
+    row_unit = np.ones(len(C))
     if growth is not None:
         by_block = [np.repeat(steps, size) for _, steps, size in c.layout]
         row_unit[extra:] = growth ** np.concatenate(by_block)
-        firsts = np.unique(mpc.moves, return_index=True)[1]
-        unit[: len(unit) - extra] = np.repeat(growth**firsts, mpc.system.m)
-        C = C / row_unit[:, None] * unit
+        unit[: len(unit) - extra] *= np.repeat(growth**firsts, mpc.system.m)
+    C = C / row_unit[:, None] * unit
 
     norm = np.linalg.norm(C, axis=1)
-    still = norm <= 1e-13 * norm.max(initial=0.0)
+    ends = np.abs([lower, upper])
+    ends = np.where(np.isfinite(ends), ends, 0.0).max(axis=0)
+    # Nothing moves a row whose entries are rounding beside its other terms.
+    others_of_row = np.linalg.norm(D * scaling(D, ends)[1], axis=1) + ends
+    still = norm * row_unit <= 1e-13 * others_of_row
     keep = np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
     size = np.where(still, np.linalg.norm(D, axis=1), norm * row_unit)
     first = len(size) - sum(c.balls)
@@ -104,6 +119,7 @@ def constraint_rows(
     U, singular, Vt = np.linalg.svd(scaled, full_matrices=False)
     rank = int(np.sum(singular > 1e-12 * singular.max(initial=0.0)))
     U, back = np.where(still[:, None], 0.0, U[:, :rank]), Vt[:rank].T / singular[:rank]
+    back = unit[:, None] * back
     if growth is not None:
         U, back = scaled, np.diag(unit)
 

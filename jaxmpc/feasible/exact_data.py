@@ -10,6 +10,7 @@ import numpy as np
 from jaxmpc.control.set_bounds import set_bounds
 from jaxmpc.control.sets import Box, Ellipsoid
 from jaxmpc.control.system import host_matrices
+from jaxmpc.feasible.centered_polytope import power_of_two
 from jaxmpc.feasible.view import View
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Block
@@ -112,9 +113,11 @@ class Equalities:
         E, e = np.concatenate(values), np.concatenate(errors)
         if not len(E):
             return None
-        rows = np.linalg.norm(E, axis=1)
+        # In units of the inputs' limits, which must not decide what is independent.
+        unit_u = np.tile(power_of_two(largest_magnitude(p.u_lower, p.u_upper)), moves.shape[1])
+        rows = np.linalg.norm(E * unit_u, axis=1)
         E, e = E / rows[:, None], e / rows[:, None]
-        X = np.linalg.pinv(E, rcond=1e-10)
+        X = unit_u[:, None] * np.linalg.pinv(E * unit_u, rcond=1e-10)
         e = e + (len(X) + 2) * 2.0**-52 * np.abs(E)
         eta = (np.abs(np.eye(len(E)) - E @ X) + e @ np.abs(X)).sum(axis=1).max()
         if not eta < 1e-6:
@@ -159,7 +162,7 @@ def hard_blocks(mpc: MPC) -> list[Block]:
         found = row_blocks(mpc, np.float64)
     to64 = lambda v: np.asarray(v, np.float64)
     n, m, p = mpc.system.n, mpc.system.m, mpc.dimension
-    hard = []
+    hard = previous_inputs(mpc)
     for b in found:
         r = b.size
         H = np.zeros((r, p))
@@ -172,6 +175,21 @@ def hard_blocks(mpc: MPC) -> list[Block]:
             lower, upper = to64(b.lower), to64(b.upper)
             hard.append(replace(b, H=H, D=D, lower=lower, upper=upper))
     return hard
+
+
+def previous_inputs(mpc: MPC) -> list[Block]:
+    """Return the block that asks u_{−1} in the limits of the inputs, where the state holds it: no
+    other input can have been applied. None without limits."""
+    if not mpc.rate_limited or mpc.inputs is None:
+        return []
+    n, m = mpc.system.n, mpc.system.m
+    H, lower, upper = (np.asarray(v, np.float64) for v in mpc.inputs.rows())
+    names = tuple(f"previous input row {i + 1}" for i in range(len(lower)))
+    if isinstance(mpc.inputs, Box):
+        names = tuple(f"previous {label}" for label in mpc.system.input_labels)
+    H = np.hstack([np.zeros((len(H), n)), H])
+    D = np.zeros((len(H), m))
+    return [Block("previous input", H, D, lower, upper, (0,), names, ("",) * len(H))]
 
 
 def absorbed(mpc: MPC, block: Block) -> bool:
@@ -222,6 +240,8 @@ def exact_data(
         for set_ in [*sets, mpc.terminal_set] if k == N else sets:
             lower, upper = boxes[id(set_)]
             bound[:, :n] = np.maximum(bound[0, :n], lower), np.minimum(bound[1, :n], upper)
+        if k == 0 and p > n:
+            bound[:, n:] = u_lower, u_upper
         return bound
 
     axes, others = list(view.axes), list(view.others)

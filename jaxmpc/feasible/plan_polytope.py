@@ -7,20 +7,17 @@ linear programs over it, solved by HiGHS in float64.
 """
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.control.sets import Polytope, maximise
-from jaxmpc.feasible.centered_polytope import (
-    CenteredPolytope,
-    coordinate_extent,
-    power_of_two,
-    weak_duality_bound,
-)
+from jaxmpc.control.geometry import framed
+from jaxmpc.control.lp import Program, affine_hull, bound, maximise, safe_extent
+from jaxmpc.control.sets import Polytope
+from jaxmpc.feasible.centered_polytope import CenteredPolytope, power_of_two
 from jaxmpc.mpc.inequalities import Inequalities, row_lengths
 
 # Bounds of linear programs are trusted to this, relative to the size of the set.
@@ -35,7 +32,11 @@ class PlanPolytope:
 
     G (rows, p + nz) has rows of length 1. M (p, p + nz), t (p,): the state after the first move is
     M v + t. exact: False where a constraint is no row (the terminal ellipsoid) and the polytope is
-    too large for that. equal (rows,): the rows of equalities, which leave no margin.
+    too large for that. flat: whether equalities tie the coordinates of θ to each other, so that the
+    feasible set has no volume.
+
+    Equalities that rows imply, as two opposite rows do, are taken out: z stands for the coordinates
+    in which the polytope has volume.
     """
 
     G: np.ndarray
@@ -43,7 +44,7 @@ class PlanPolytope:
     M: np.ndarray
     t: np.ndarray
     exact: bool
-    equal: np.ndarray
+    flat: bool = False
 
     @classmethod
     def of(cls, c: Any) -> "PlanPolytope":
@@ -55,15 +56,28 @@ class PlanPolytope:
         p = c.D.shape[1]
         M = np.vstack([np.hstack([c.Phi[1], c.Gamma[1]]), np.hstack([c.Psi[0], c.Omega[0]])])
         t = np.concatenate([c.phi[1], c.psi[0]])
-        equal = (c.lower == c.upper)[rows.row]
-        return cls(np.hstack([rows.D, rows.C]), rows.b, M[:p], t[:p], not c.balls, equal)
+        return cls(np.hstack([rows.D, rows.C]), rows.b, M[:p], t[:p], not c.balls).reduced()
+
+    def reduced(self) -> "PlanPolytope":
+        """Return the polytope in coordinates (θ, w) in which it has volume, v = shift + basis (θ,
+        w)."""
+        if Program(self.G, self.g).empty:
+            return self
+        hull = affine_hull(self.G, self.g, keep=self.p)
+        if hull is None:
+            return replace(self, flat=True)
+        if not hull.equal.any():
+            return self
+        size = row_lengths(hull.G)
+        M, t = self.M @ hull.basis, self.t + self.M @ hull.shift
+        return PlanPolytope(hull.G / size[:, None], hull.g / size, M, t, self.exact)
 
     def in_units(self, unit: np.ndarray) -> "PlanPolytope":
         """Return the polytope of v / unit, unit (p + nz,) > 0."""
         G, state = self.G * unit, unit[: self.p]
         size = row_lengths(G)
         M, t = self.M * unit / state[:, None], self.t / state
-        return PlanPolytope(G / size[:, None], self.g / size, M, t, self.exact, self.equal)
+        return replace(self, G=G / size[:, None], g=self.g / size, M=M, t=t)
 
     @property
     def p(self) -> int:
@@ -72,9 +86,8 @@ class PlanPolytope:
 
     @cached_property
     def extent(self) -> np.ndarray:
-        """Return bounds |v_i| ≤ extent_i on the polytope (twice what LPs find, which outweighs
-        their error)."""
-        return coordinate_extent(self.G, self.g)
+        """Return bounds |v_i| ≤ extent_i on the polytope."""
+        return safe_extent(self.G, self.g)
 
     def followed(self) -> "PlanPolytope":
         """Return the polytope of (θ, z, z⁺) with (θ, z) and (θ⁺, z⁺) both in this one: the
@@ -85,8 +98,7 @@ class PlanPolytope:
         g = np.concatenate([self.g, self.g - state @ self.t])
         size = row_lengths(G)
         M = np.hstack([self.M, np.zeros((p, plan.shape[1]))])
-        equal = np.tile(self.equal, 2)
-        return PlanPolytope(G / size[:, None], g / size, M, self.t, self.exact, equal)
+        return PlanPolytope(G / size[:, None], g / size, M, self.t, self.exact).reduced()
 
     def largest_next(self, normal: np.ndarray) -> tuple[float, float, np.ndarray | None]:
         """Return max normal'θ⁺ over the polytope as (attained value, upper bound, v).
@@ -106,17 +118,14 @@ class PlanPolytope:
         return top.value if top.y is None else self._bound(d, top.y)
 
     def _bound(self, d: np.ndarray, y: np.ndarray) -> float:
-        return weak_duality_bound(d, y, self.G, self.g, self.extent)
+        return bound(d, y, self.G, self.g, self.extent)
 
-    def centre(self) -> np.ndarray | None:
-        """Return the θ of the point with the largest margin of all rows but equalities; None
-        without a margin."""
-        size = self.G.shape[1]
-        margin = np.where(self.equal, 0.0, 1.0)[:, None]
-        wide = np.vstack([np.hstack([self.G, margin]), np.eye(size + 1)[-1:]])
-        room = max(1.0, float(np.abs(self.g).max(initial=0.0)))
-        top = maximise(np.eye(size + 1)[-1], wide, np.append(self.g, room))
-        return None if top.x is None or top.value <= TOLERANCE else top.x[: self.p]
+    def centre(self) -> np.ndarray:
+        """Return the θ of a point well inside. Raises ValueError where there is none, because the
+        feasible set is empty or flat."""
+        if self.flat:
+            fail("mpc", "its feasible set is flat: equalities tie the states", "Relax one of them")
+        return framed("mpc: its feasible set", self.G, self.g).centre[: self.p]
 
     def ray(self, centre: np.ndarray, direction: np.ndarray) -> tuple[float, np.ndarray, float]:
         """Return max s with centre + s·direction in the projection, and a half-space a'θ ≤ b of it,
@@ -146,16 +155,20 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
     """
     if plans.p > DIMENSIONS:
         return f"vertices are not enumerated in {plans.p} dimensions (up to {DIMENSIONS} they are)"
-    unit = power_of_two(plans.extent)
+    try:
+        center = plans.centre()
+    except ValueError as error:
+        empty = "empty" in str(error)
+        return "the feasible set is " + ("empty" if empty else "flat: it has no volume")
+    extent = plans.extent
+    if not np.all(np.isfinite(extent[: plans.p])):
+        return "the feasible set is unbounded"
+    unit = power_of_two(extent)
     plans, state = plans.in_units(unit), unit[: plans.p]
-    center = plans.centre()
-    if center is None:
-        return "the feasible set is empty or flat"
+    center = center / state
     p = plans.p
     directions = normals = np.concatenate([np.eye(p), -np.eye(p)])
     offsets, reached = np.array([plans.support(d) for d in normals]), np.zeros((0, p))
-    if not np.all(np.isfinite(offsets)):
-        return "the feasible set is unbounded"
     many = "its facets are too many to enumerate in the time given"
     missed = np.zeros((0, p))
     while len(offsets) < FACETS:

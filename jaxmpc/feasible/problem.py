@@ -5,9 +5,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.linalg import qr
 
 from jaxmpc.checks import require_kind
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope
+from jaxmpc.control.geometry import binding_rows
+from jaxmpc.control.lp import FLAT, ROUNDING, implied_equalities, scaling
+from jaxmpc.control.set_bounds import set_bounds
+from jaxmpc.control.sets import Box, Ellipsoid, Polytope, unit_rows
 from jaxmpc.feasible import constraint_rows, exact_data
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
@@ -16,7 +20,7 @@ from jaxmpc.feasible.row_programs import RowPrograms
 from jaxmpc.feasible.view import View, make_view
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.inequalities import condensed_in_float64
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
 from jaxmpc.mpc.rows import Block
 from jaxmpc.runs import as_json
 
@@ -26,7 +30,9 @@ class FeasibilityProblem:
     """The hard constraints of an MPC problem, and which initial states points θ (d,) stand for.
 
     mpc: the problem without soft rows and weights of input rates, which do not influence
-    feasibility, and with polytopes that are boxes as those. view: all states, a slice or a
+    feasibility, with polytopes that are boxes as those, and with the rows of polytopes that imply
+    equalities as outputs. Where input rates are limited, u_{−1} is one of the inputs that could be
+    applied: the feasible set holds no (x, u_{−1}) with u_{−1} outside `inputs`. view: all states, a slice or a
     projection. Everything else follows from these two, in NumPy in float64, and is computed once,
     when it is first used.
     """
@@ -42,9 +48,11 @@ class FeasibilityProblem:
         """
         require_kind("mpc", mpc, MPC)
         mpc.validate()
-        hard = replace(
-            mpc, soft=(), input_rate_weight=None, states=as_box(mpc.states),
-            inputs=as_box(mpc.inputs), terminal_set=as_box(mpc.terminal_set),
+        hard = with_equalities(
+            replace(
+                mpc, soft=(), input_rate_weight=None, states=as_box(mpc.states),
+                inputs=as_box(mpc.inputs), terminal_set=as_box(mpc.terminal_set),
+            )
         )  # fmt: skip
         return cls(hard, make_view(hard, axes, fixed))
 
@@ -61,7 +69,7 @@ class FeasibilityProblem:
     @cached_property
     def condensed(self) -> Condensed:
         """Return the condensed problem, of all states."""
-        return condensed_in_float64(self.mpc)
+        return with_previous_inputs(self.mpc, condensed_in_float64(self.mpc))
 
     @cached_property
     def blocks(self) -> list[Block]:
@@ -88,7 +96,8 @@ class FeasibilityProblem:
         if not len(moduli):
             return ()
         slow, fast = np.minimum([moduli.min(), moduli.max()], 1e200 ** (1 / self.mpc.horizon))
-        c = condensed_in_float64(replace(self.mpc, prestabilise=False))
+        free = replace(self.mpc, prestabilise=False)
+        c = with_previous_inputs(free, condensed_in_float64(free))
         return tuple(
             constraint_rows.constraint_rows(self.mpc, self.view, c, self.blocks, growth)
             for growth in ([slow, fast] if fast > (1 + 1e-6) * slow else [fast])
@@ -150,6 +159,59 @@ class FeasibilityProblem:
         found = np.zeros(len(self.rows.lower) + 1)
         found[self.rows.index] = np.concatenate([np.ravel(part) for part in rounding])
         return np.clip(found[:-1] * self.rows.weight, self.rows.size, 1e8 * self.rows.size)
+
+
+def with_previous_inputs(mpc: MPC, c: Condensed) -> Condensed:
+    """Return the condensed problem with the rows of `exact_data.previous_inputs` before all
+    others."""
+    for b in exact_data.previous_inputs(mpc):
+        above = lambda top, old: np.concatenate([top, old])
+        c = replace(
+            c, C=above(np.zeros((b.size, c.C.shape[1])), c.C), D=above(b.H, c.D),
+            d=above(np.zeros(b.size), c.d), lower=above(b.lower, c.lower),
+            upper=above(b.upper, c.upper), layout=((b.kind, b.steps, b.size), *c.layout),
+        )  # fmt: skip
+    return c
+
+
+def with_equalities(mpc: MPC) -> MPC:
+    """Return the problem with the rows of polytopes that imply equalities, as two opposite ones do,
+    as outputs with lower = upper, and a box around each of these sets in its place.
+
+    The equalities are `lp.implied_equalities` to rounding: two rows that are opposite but for that
+    are one equality. Of those that depend on each other as many are kept as are independent.
+    """
+    n, m, N = mpc.system.n, mpc.system.m, mpc.horizon
+    outputs = list(as_tuple("outputs", mpc.outputs, Outputs))
+    changes: dict[str, Any] = {}
+    for name, size, steps in (
+        ("inputs", m, tuple(range(N))), ("states", n, mpc.state_steps), ("terminal_set", n, (N,)),
+    ):  # fmt: skip
+        set_ = getattr(mpc, name)
+        if not isinstance(set_, Polytope):
+            continue
+        H, h = np.asarray(set_.H, np.float64), np.asarray(set_.h, np.float64)
+        part = binding_rows(H, h, name)
+        H, h = H[part], h[part]
+        equal = implied_equalities(*unit_rows(H, h), ROUNDING / 100)
+        if not equal.any():
+            continue
+        one = independent(*unit_rows(H[equal], h[equal]))
+        rows = np.append(np.flatnonzero(equal)[one], np.flatnonzero(~equal))
+        lower = np.where(np.arange(len(rows)) < len(one), h[rows], -np.inf)
+        C, D = (H[rows], None) if name != "inputs" else (np.zeros((len(rows), n)), H[rows])
+        labels = tuple(set_.labels[i] for i in part[rows]) if set_.labels else ()
+        outputs.append(Outputs(C, lower, h[rows], D, steps, labels))
+        changes[name] = Box(*set_bounds(set_, size))
+    return replace(mpc, outputs=tuple(outputs), **changes) if changes else mpc
+
+
+def independent(H: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """Return the indices of as many rows of H as are independent, in scaled columns."""
+    row, column = scaling(H, h)
+    _, R, order = qr((row[:, None] * H * column).T, mode="economic", pivoting=True)
+    size = np.abs(np.diag(R))
+    return np.sort(order[: int((size > FLAT * size[0]).sum())])
 
 
 def as_box(set_: Any) -> Any:

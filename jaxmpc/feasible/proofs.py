@@ -106,8 +106,11 @@ def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array
     n, m = p.B.shape
     A, B, c = jnp.asarray(p.A), jnp.asarray(p.B), jnp.asarray(p.c)
     rows, rows_N = jnp.concatenate([p.H, p.D], axis=1), jnp.asarray(p.H_N)
-    # Twice the first-order bound covers the rounding of the bound itself.
-    growth = 2 * gamma(n + m + 2)
+    # Twice the first-order bound covers the rounding of the bound itself. A state that stays as it
+    # is, or takes the value of another one or of an input, is not rounded.
+    copied = row_gamma(jnp.concatenate([A, B, c[:, None]], axis=1)) == 0
+    copied = copied & (c == 0)
+    growth, tiny = jnp.where(copied, 0.0, 2 * gamma(n + m + 2)), jnp.where(copied, 0.0, TINY)
     e = p.equalities
     solved = np.zeros(np.shape(p.lower), bool) if e is None else e.at
     solved_N = np.zeros(np.shape(p.lower_N), bool) if e is None else e.at_N
@@ -124,7 +127,7 @@ def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array
         found = holds(rows, lower, upper, solved, *here)
         bound = jnp.abs(A) @ jnp.abs(x) + jnp.abs(B) @ jnp.abs(u) + jnp.abs(c)
         error = jnp.abs(A) @ error + jnp.abs(B) @ u_error
-        error = error * (1 + 1e-9) + growth * bound + TINY
+        error = error * (1 + 1e-9) + growth * bound + tiny
         return (A @ x + B @ u + c, error), found[0] if e is None else found
 
     steps = (inputs, moved, *map(jnp.asarray, (p.lower, p.upper, solved)))

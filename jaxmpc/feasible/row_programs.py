@@ -5,16 +5,14 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import linprog
-
 from jaxmpc.checks import fail
-from jaxmpc.control.geometry import HIGHS
+from jaxmpc.control.lp import FLAT, Program, scaling
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 
 # Tangents of a ball are added to a program up to so often.
 TANGENTS = 200
-# The least margin of a centre, relative to the size of the bounds.
-LEAST_MARGIN = 1e-9
+# A ball counts as kept where it is exceeded by no more than this, relative to its radius.
+KEPT = 1e-9
 
 
 class Solved(NamedTuple):
@@ -38,63 +36,67 @@ class RowPrograms:
         self.normals = np.concatenate([np.eye(k), -np.eye(k)])
         self.size = float(rows.size)
         equal = (rows.lower == rows.upper) & (np.linalg.norm(rows.U, axis=1) > 0)
-        independent = np.linalg.matrix_rank(rows.U[equal], rtol=1e-6) == equal.sum()
         # Equalities that the variables can keep, whatever θ is: they leave no margin.
-        self.kept = equal & independent
+        both = np.hstack([rows.U, rows.D])
+        both = both * scaling(both[equal], np.zeros(equal.sum()))[1]
+        both = both / np.maximum(np.linalg.norm(both, axis=1), 1e-300)[:, None]
+        rank = lambda M: np.linalg.matrix_rank(M, rtol=FLAT) if len(M) else 0
+        free = rank(both[equal, : rows.U.shape[1]]) == rank(both[equal])
+        self.kept = equal & free
 
     def solve_lp(
         self, cost: np.ndarray, U: np.ndarray, lower: np.ndarray, upper: np.ndarray,
-        bounds: list[Any], margin: np.ndarray | None = None,
+        more: tuple[np.ndarray, np.ndarray] | None = None, margin: np.ndarray | None = None,
+        pinned: np.ndarray | None = None,
     ) -> Solved:  # fmt: skip
         """Maximise cost'x over lower ≤ U x ≤ upper and the ball.
 
-        margin (R,): the last variable times this is kept from every bound. HiGHS' tolerances are
-        absolute: it solves for x in units in which columns and bounds are about 1.
+        margin (R,): the last variable times this is kept from every bound. more: further rows A x ≤
+        b. pinned: values of the variables before the last, the last of those.
         """
         balls, R = sum(self.rows.balls), len(lower)
         flat, reduced = slice(0, R - balls), np.zeros(R) if margin is None else margin
-        top = np.max(np.abs(U), axis=0, initial=0.0)
-        top[-1] = max(top[-1], np.max(reduced, initial=0.0))
-        unit = self.size / np.where(top > 0, top, 1.0)
-        U, reduced = U * (unit / self.size), reduced * (unit[-1] / self.size)
-        lower, upper = lower / self.size, upper / self.size
-        bounds = [
-            tuple(None if v is None else v / one for v in pair)
-            for pair, one in zip(bounds, unit, strict=True)
-        ]
-        cost, length = cost * unit, np.linalg.norm(cost * unit) or 1.0
-
+        same = (lower == upper)[flat] & (reduced[flat] == 0)
         up, low = U[flat].copy(), -U[flat]
         up[:, -1] += reduced[flat]
         low[:, -1] += reduced[flat]
-        high, has_low = np.isfinite(upper[flat]), np.isfinite(lower[flat])
+        high, has_low = np.isfinite(upper[flat]), np.isfinite(lower[flat]) & ~same
         A = np.concatenate([up[high], low[has_low]])
         b = np.concatenate([upper[flat][high], -lower[flat][has_low]])
-        radius = float(self.rows.radius[0]) / self.size if balls else 0.0
+        equal = np.append(same[high], np.zeros(has_low.sum(), bool))
+        extra, limits = (np.zeros((0, len(cost))), np.zeros(0)) if more is None else more
+        radius = float(self.rows.radius[0]) if balls else 0.0
+        shift = np.zeros(len(cost))
+        part = np.ones(len(cost), bool)
+        if pinned is not None and len(pinned):
+            shift[-1 - len(pinned) : -1] = pinned
+            part[-1 - len(pinned) : -1] = False
         for _ in range(TANGENTS):
             planes = self.normals @ U[R - balls :]
             planes[:, -1] += reduced[-1] if balls else 0.0
             reach = radius + self.normals @ lower[R - balls :]
-            result = linprog(
-                -cost / length, A_ub=np.concatenate([A, planes]), b_ub=np.append(b, reach),
-                bounds=bounds, options=HIGHS,
-            )  # fmt: skip
-            if result.x is None or not balls:
+            G, g = np.vstack([A, planes, extra]), np.concatenate([b, reach, limits])
+            mask = np.append(equal, np.zeros(len(g) - len(b), bool))
+            top = Program(G[:, part], g - G @ shift, mask).maximise(cost[part])
+            if top.x is None:
+                return Solved(top.value, None, np.zeros(R))
+            x = shift.copy()
+            x[part] = top.x
+            if not balls:
                 break
-            v = U[R - balls :] @ result.x - lower[R - balls :]
-            kept = radius - reduced[-1] * result.x[-1]
+            v = U[R - balls :] @ x - lower[R - balls :]
+            kept = radius - reduced[-1] * x[-1]
             norm = np.linalg.norm(v)
-            if norm <= kept + 10 * HIGHS["primal_feasibility_tolerance"] * radius:
+            if norm <= kept + KEPT * radius:
                 break
             self.normals = np.concatenate([self.normals, v[None] / norm])
         y = np.zeros(R)
-        if result.x is None:
-            return Solved(-np.inf if result.status == 2 else np.inf, None, y)
-        found, first, second = -result.ineqlin.marginals, high.sum(), len(A)
-        y[flat][high] += found[:first]
-        y[flat][has_low] -= found[first:second]
-        y[R - balls :] = found[second : second + len(planes)] @ self.normals[: len(planes)]
-        return Solved(float(cost @ result.x), result.x * unit, y * (length / self.size))
+        assert top.y is not None
+        first, second = high.sum(), len(A)
+        y[flat][high] += top.y[:first]
+        y[flat][has_low] -= top.y[first:second]
+        y[R - balls :] = top.y[second : second + len(planes)] @ self.normals[: len(planes)]
+        return Solved(float(cost @ x), x, y)
 
     def support(self, direction: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """Return max direction'θ over the feasible set: the optimum (inf: unbounded, −inf: empty),
@@ -109,17 +111,16 @@ class RowPrograms:
         """Return max t ≥ 0 with center + t·direction in the feasible set; results as in
         `support`."""
         rows, k = self.rows, self.rows.U.shape[1]
-        U = np.hstack([rows.U, (rows.D @ direction)[:, None]])
-        return self._maximum(np.append(np.zeros(k), 1.0), U, rows.D @ center, 0)
+        length = np.abs(direction).max(initial=0.0) or 1.0  # must not choose among equal ends
+        U = np.hstack([rows.U, (rows.D @ (direction / length))[:, None]])
+        return self._maximum(np.append(np.zeros(k), 1 / length), U, rows.D @ center, 0)
 
     def _maximum(
         self, cost: np.ndarray, U: np.ndarray, shift: np.ndarray, low: float | None
     ) -> tuple[float, np.ndarray, np.ndarray]:
         k = self.rows.U.shape[1]
-        bounds = [(None, None)] * k + [(low, None)] * (U.shape[1] - k)
-        value, x, y = self.solve_lp(
-            cost, U, self.rows.lower - shift, self.rows.upper - shift, bounds
-        )
+        more = None if low is None else (-np.eye(U.shape[1])[-1:], np.array([-low]))
+        value, x, y = self.solve_lp(cost, U, self.rows.lower - shift, self.rows.upper - shift, more)
         return value, np.zeros(k) if x is None else x[:k], y
 
     def margin(self, theta: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -131,9 +132,9 @@ class RowPrograms:
         rows, k = self.rows, self.rows.U.shape[1]
         shift = rows.D @ theta
         U, cost = np.hstack([rows.U, np.zeros((len(rows.U), 1))]), np.append(np.zeros(k), 1.0)
-        bounds = [(None, None)] * k + [(None, float(self.size / size.max()))]
+        most = np.eye(k + 1)[-1:], np.array([self.size / size.max()])
         for kept in [np.where(self.kept, 0.0, size), size][: 1 + np.any(self.kept)]:
-            found = self.solve_lp(cost, U, rows.lower - shift, rows.upper - shift, bounds, kept)
+            found = self.solve_lp(cost, U, rows.lower - shift, rows.upper - shift, most, kept)
             if found.x is not None:
                 return found.x[:k], found.y
         return np.zeros(k), np.zeros(len(rows.U))
@@ -158,27 +159,32 @@ class RowPrograms:
 
     def centre(self, given: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return θ (the one given, or the best) and w with the largest common margin of all rows,
-        but for equalities that the variables can keep.
+        but for equalities that the variables can keep; margins count in scaled rows.
 
         Raises ValueError where the set is empty or flat, or does not hold the given θ inside.
         """
         rows = self.rows
         k, d = rows.U.shape[1], rows.D.shape[1]
-        size = np.where(self.kept, 0.0, np.linalg.norm(np.hstack([rows.U, rows.D]), axis=1))
-        pinned = [(None, None)] * d if given is None else [(v, v) for v in np.asarray(given)]
-        ends = np.concatenate([rows.upper, rows.lower])
-        largest = max(self.size, np.abs(ends[np.isfinite(ends)]).max(initial=0.0))
+        both = np.hstack([rows.U, rows.D])
+        ends = np.abs([rows.lower, rows.upper])
+        ends = np.where(np.isfinite(ends), ends, 0.0).max(axis=0)
+        # Margins in units in which rows and coordinates are about 1.
+        size = np.where(self.kept, 0.0, 1 / scaling(both, ends)[0])
         if rows.balls:
             size[-sum(rows.balls) :] = size[-sum(rows.balls) :].max()
-        found = self.solve_lp(
-            np.eye(k + d + 1)[-1], np.hstack([rows.U, rows.D, np.zeros((len(rows.U), 1))]),
-            rows.lower, rows.upper, [(None, None)] * k + pinned + [(None, largest)], size,
-        )  # fmt: skip
-        if found.x is None or found.x[-1] <= LEAST_MARGIN * self.size:
+        wide = np.hstack([both, np.zeros((len(both), 1))])
+        most = np.eye(k + d + 1)[-1:], np.array([4.0])
+        cost = np.eye(k + d + 1)[-1]
+        found = self.solve_lp(cost, wide, rows.lower, rows.upper, most, size, given)
+        if found.x is None or found.x[-1] <= FLAT:
             if given is not None:
                 fail("center", f"{given} is not inside the feasible set", "Give None or another")
+            if found.x is None or found.x[-1] < -FLAT:
+                what = "is empty: no initial state has a plan"
+            else:
+                what = "is flat: no initial state keeps a margin"
             fail(
-                "mpc", "its feasible set is empty or flat: no initial state keeps a margin",
+                "mpc", f"its feasible set {what}",
                 "Relax a limit, lengthen the horizon or enlarge the terminal set",
             )  # fmt: skip
         return found.x[k : k + d], found.x[:k]

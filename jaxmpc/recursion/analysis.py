@@ -287,10 +287,14 @@ def smallest_horizon(
             problem = FeasibilityProblem.of(changed)
         except ValueError:  # such as more free moves than steps
             continue
-        claims = settle_claims(changed, problem, budget.deadline)
-        law = claims.law
-        if law.holds is None and least is None and regions and np.isfinite(claims.volume):
-            law = settle_by_regions(claims, regions, budget.deadline).claim
+        try:
+            claims = settle_claims(changed, problem, budget.deadline)
+            law = claims.law
+            if law.holds is None and least is None and regions and np.isfinite(claims.volume):
+                law = settle_by_regions(claims, regions, budget.deadline).claim
+        except ValueError as error:  # too ill-conditioned: the other horizons stay settled
+            reasons[N] = Claim(None, f"not settled ({error})")
+            continue
         reasons[N] = law
         least = N if law.holds and least is None else least
         if claims.strong.holds:

@@ -27,17 +27,18 @@ def ascend(law: Law, bound: CenteredPolytope, starts: np.ndarray, deadline: floa
     """Return states (K, p) from which the next state lies farthest outside `bound`, the best first.
 
     starts (S, p) follow the gradient (A + B ∂u_0/∂x)'a_j of v(x) = max_j (a_j'x⁺(x) − b_j) within
-    the half-spaces, in steps of halving length; a step is taken if it raises v. Then the best go
+    the half-spaces, in steps of halving length, in coordinates in which the set is about 1 wide; b_j
+    and a_j count relative to the facet's distance from the centre. A step is taken if it raises v.
+    Then the best go
     from region to region, each to the maximum of a_j'x⁺ on its region. The method is local: that it
     finds no counterexample does not prove that there is none.
     """
-    inset = INSET * bound.size
-    x = bound.nearest(starts, inset)
+    x = bound.nearest(starts, INSET)
     value, gradient = _value_and_gradient(law, bound, x, deadline)
     for length in LENGTHS:
         if time.monotonic() > deadline:
             break
-        trial = bound.nearest(x + length * bound.size * gradient, inset)
+        trial = bound.nearest(x + length * bound.unit * gradient, INSET)
         better, slope = _value_and_gradient(law, bound, trial, deadline, than=value)
         grown = better > value
         x[grown], value[grown], gradient[grown] = trial[grown], better[grown], slope[grown]
@@ -47,11 +48,11 @@ def ascend(law: Law, bound: CenteredPolytope, starts: np.ndarray, deadline: floa
 def _value_and_gradient(
     law: Law, bound: CenteredPolytope, x: np.ndarray, deadline: float, than: Any = -np.inf
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return v (S,) at x (S, p), −inf where there is no plan, and its unit gradient where v >
-    than, and before the deadline."""
+    """Return v (S,) at x (S, p), −inf where there is no plan, and its unit gradient in coordinates
+    x / bound.unit where v > than, and before the deadline."""
     plans = law.plans(x)
     after = law.following(x, plans.inputs[:, 0])
-    beyond = after @ bound.normals.T - bound.offsets
+    beyond = (after @ bound.normals.T - bound.offsets) / bound.depths
     value = np.where(plans.status == Status.SOLVED, beyond.max(axis=1), -np.inf)
     gradient = np.zeros_like(x)
     for i in np.flatnonzero((value > than) & np.isfinite(value)):
@@ -59,8 +60,8 @@ def _value_and_gradient(
             break
         piece = law.piece(x[i], plans.inputs[i])
         if piece is not None:
-            slope = piece.E.T @ bound.normals[np.argmax(beyond[i])]
-            gradient[i] = slope / max(np.linalg.norm(slope), 1e-12)
+            slope = bound.unit * (piece.E.T @ bound.normals[np.argmax(beyond[i])])
+            gradient[i] = slope / (np.linalg.norm(slope) or 1.0)
     return value, gradient
 
 
@@ -70,14 +71,13 @@ def _climb_regions(
     """Follow the best of x (S, p) to the best vertex of its region, and on from beside it; return
     states (K, p)."""
     random = np.random.default_rng(0)
-    inset = INSET * bound.size
     order = np.argsort(-value)[:KEPT]
     best, top = x[order], value[order]
     for tried in range(ROUNDS):
         if time.monotonic() > deadline:
             break
-        beside = random.standard_normal((NEIGHBOURS, *best.shape)) * NEAR * bound.size
-        around = bound.nearest(np.concatenate([best, *(best + beside)]), inset)
+        beside = random.standard_normal((NEIGHBOURS, *best.shape)) * NEAR * bound.unit
+        around = bound.nearest(np.concatenate([best, *(best + beside)]), INSET)
         plans = law.plans(around)
         found = []
         for i in np.flatnonzero(plans.status == Status.SOLVED):
@@ -86,22 +86,21 @@ def _climb_regions(
             state, piece = around[i], law.piece(around[i], plans.inputs[i])
             if piece is None:
                 continue
-            facet = int(np.argmax(bound.normals @ (piece.E @ state + piece.e) - bound.offsets))
+            off = bound.normals @ (piece.E @ state + piece.e) - bound.offsets
+            facet = int(np.argmax(off / bound.depths))
             up = piece.E.T @ bound.normals[facet]
             R = np.vstack([piece.R, bound.normals])
             peak = maximise(up, R, np.append(piece.r, bound.offsets)).x
             if peak is not None:
-                found.append(
-                    (float(bound.signed_distance((piece.E @ peak + piece.e)[None])[0]), peak)
-                )
+                found.append((float(bound.beyond((piece.E @ peak + piece.e)[None])[0]), peak))
         values = np.append(top, [v for v, _ in found])
         states = np.concatenate([best, *(peak[None] for _, peak in found)])
         kept: list[int] = []
         for i in np.argsort(-values):
-            if all(np.abs(states[i] - states[j]).max() > 1e-6 * bound.size for j in kept):
+            if all(np.any(np.abs(states[i] - states[j]) > 1e-6 * bound.unit) for j in kept):
                 kept.append(int(i))
         before, kept = top.max(initial=-np.inf), kept[:KEPT]
         best, top = states[kept], values[kept]
-        if tried > 1 and top.max(initial=-np.inf) <= before + 1e-12 * bound.size:
+        if tried > 1 and top.max(initial=-np.inf) <= before + 1e-12:
             break
     return best

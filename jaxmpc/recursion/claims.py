@@ -18,8 +18,8 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.recursion.report import Claim, in_words
 
-# Distance from X_N, relative to its size, from which a state counts as outside: well above the
-# residuals of plans. Next states are moved towards the centre by as much before they are labelled.
+# Distance from a facet of X_N, relative to the facet's from the centre, from which a state counts as
+# outside: well above the residuals of plans. Next states are moved towards the centre by as much before they are labelled.
 CLEAR = 1e-7
 LATE = "the time was over before its linear programs were solved"
 
@@ -59,7 +59,7 @@ def settle_claims(mpc: MPC, problem: FeasibilityProblem, deadline: float = np.in
     if plans.exact and plans.p <= DIMENSIONS:
         body = projected(plans, deadline)
     elif plans.exact:
-        sets = backward(problem.mpc, deadline)
+        sets = backward(replace(mpc, soft=(), input_rate_weight=None), deadline)
         before, body, after = (None, sets, None) if isinstance(sets, str) else sets
     found, why = (None, body) if isinstance(body, str) else (body, "")
     volume = np.nan
@@ -96,12 +96,12 @@ def _every_move(
     tops = [plans.largest_next(normal) for normal in body.normals if time.monotonic() < deadline]
     if len(tops) < len(body.normals):
         return Claim(None, LATE), np.zeros((0, plans.p))
-    violation = np.array([top[1] for top in tops]) - body.offsets
-    beyond = np.array([top[0] for top in tops]) - body.offsets
+    violation = (np.array([top[1] for top in tops]) - body.offsets) / body.depths
+    beyond = (np.array([top[0] for top in tops]) - body.offsets) / body.depths
     i, p = int(np.argmax(beyond)), plans.p
-    outside = np.flatnonzero(beyond > CLEAR * body.size)
+    outside = np.flatnonzero(beyond > CLEAR)
     points = [v for _, _, v in tops if v is not None]
-    if violation.max() <= TOLERANCE * body.size:
+    if violation.max() <= TOLERANCE:
         count = f"one LP for each of {len(tops)} facets, largest violation {violation.max():.1e}"
         reason = f"every feasible first move stays ({_set_before(mpc, body)}{count})"
         return Claim(True, reason), np.zeros((0, p))
@@ -111,7 +111,7 @@ def _every_move(
     where, after = points[i][:p], plans.M @ points[i] + plans.t
     reason = (
         f"from x = {in_words(where)} a feasible first move leads to {in_words(after)}, "
-        f"{beyond[i]:.6g} beyond a facet of X_N"
+        f"{beyond[i] * body.depths[i]:.6g} beyond a facet of X_N"
     )
     return Claim(False, reason, where), np.array(points)[outside, :p]
 
@@ -122,7 +122,7 @@ def _set_before(mpc: MPC, body: CenteredPolytope) -> str:
         return ""
     shorter = FeasibilityProblem.of(replace(mpc, horizon=mpc.horizon - 1)).plan_polytope
     ends = [shorter.support(normal) for normal in body.normals]
-    if np.any(np.array(ends) > body.offsets + TOLERANCE * body.size):
+    if np.any(np.array(ends) > body.offsets + TOLERANCE * body.depths):
         return ""
     N = mpc.horizon
     return f"X_{N - 1} = X_{N}; " if _nested(mpc) else f"X_{N - 1} lies in X_{N}; "
@@ -144,16 +144,16 @@ def _some_move(
     later = projected(plans.followed(), deadline)
     if isinstance(later, str):
         return Claim(None, f"of the states that can go on, {later}"), np.nan, none
-    violation = later.signed_distance(body.vertices)
+    violation = later.beyond(body.vertices)
     i = int(np.argmax(violation))
     lost = max(body.polytope.volume() - later.polytope.volume(), 0.0)
-    if violation[i] <= TOLERANCE * body.size:
+    if violation[i] <= TOLERANCE:
         what = f"all {len(violation)} vertices of X_N have a first move that stays"
         return Claim(True, f"{what} (largest violation {max(violation[i], 0.0):.1e})"), 0.0, none
-    if violation[i] <= CLEAR * body.size:
+    if violation[i] <= CLEAR:
         reason = f"a vertex is within {CLEAR:g} of the size of X_N, {violation[i]:.1e}"
         return Claim(None, reason), lost, none
-    return every_move_leaves(body.vertices[i]), lost, body.vertices[violation > CLEAR * body.size]
+    return every_move_leaves(body.vertices[i]), lost, body.vertices[violation > CLEAR]
 
 
 def _longer(
@@ -165,9 +165,9 @@ def _longer(
     tops = [body.support(normal) for normal in after.normals if time.monotonic() < deadline]
     if len(tops) < len(after.normals):
         return Claim(None, LATE), np.zeros((0, len(body.center)))
-    violation = np.array([top for top, _ in tops]) - after.offsets
+    violation = (np.array([top for top, _ in tops]) - after.offsets) / after.depths
     i = int(np.argmax(violation))
-    outside = [x for (_, x), e in zip(tops, violation, strict=True) if e > CLEAR * body.size]
+    outside = [x for (_, x), e in zip(tops, violation, strict=True) if e > CLEAR]
     seeds = np.array([x for x in outside if x is not None]).reshape(-1, len(body.center))
     if len(seeds):
         x = seeds[0]
@@ -175,7 +175,7 @@ def _longer(
             False, f"from x = {in_words(x)} every feasible first move leaves X_N", x
         ), seeds
     nested = np.array([body.support(normal)[0] for normal in before.normals]) - before.offsets
-    if max(violation[i], nested.max()) <= TOLERANCE * body.size:
+    if max(violation[i], (nested / before.depths).max()) <= TOLERANCE:
         return Claim(True, f"X_N lies in X_N+1 and in X_N-1 ({len(tops)} facets, by LPs)"), seeds
     return Claim(None, "X_N lies in X_N+1, but not in X_N-1: its plans may lead elsewhere"), seeds
 
@@ -190,14 +190,14 @@ def no_move_stays(plans: PlanPolytope, state: np.ndarray) -> bool:
     """Return whether no feasible first move from `state` stays: it lies outside the states that can
     go on."""
     later = plans.followed()
-    center = later.centre()
-    if center is None or not plans.exact:
+    if not plans.exact:
         return False
     try:
+        center = later.centre()
         _, normal, offset = later.ray(center, state - center)
-    except ValueError:  # the ray does not end
+    except ValueError:  # flat, or the ray does not end
         return False
-    return bool(normal @ state - offset > CLEAR * np.linalg.norm(state - center))
+    return bool(normal @ state - offset > CLEAR * (offset - normal @ center))
 
 
 def _by_theorem(mpc: MPC) -> Claim:
@@ -258,10 +258,10 @@ def settle_by_regions(claims: Claims, limit: int, deadline: float = np.inf) -> R
     violation, parts, lost = [-np.inf], [none], 0.0
     for region in found.regions:
         E, e = A + B @ region.K, B @ region.k + c
-        beyond = body.signed_distance(region.vertices @ E.T + e)
+        beyond = body.beyond(region.vertices @ E.T + e)
         violation.extend(beyond)
         parts.append(region.vertices)
-        if found.complete and beyond.max() > CLEAR * body.size:
+        if found.complete and beyond.max() > CLEAR:
             H, h = np.asarray(region.polytope.H), np.asarray(region.polytope.h)
             stays = Polytope(
                 np.vstack([H, body.normals @ E]), np.append(h, body.offsets - body.normals @ e)
@@ -269,13 +269,14 @@ def settle_by_regions(claims: Claims, limit: int, deadline: float = np.inf) -> R
             lost += region.volume - _volume(stays)
     values, states = np.array(violation[1:]), np.concatenate(parts)
     top, lost = values.max(initial=-np.inf), lost if found.complete else np.nan
-    if top > CLEAR * body.size:
+    if top > CLEAR:
         worst = states[np.argsort(-values)[:6]]
-        claim = Claim(False, f"a critical region leads {top:.6g} beyond a facet of X_N", worst[0])
+        words = f"a critical region leads out of X_N, by {top:.6g} of a facet's depth"
+        claim = Claim(False, words, worst[0])
         return RegionVerdict(claim, lost, worst, found)
     if not found.complete:
         claim = Claim(None, f"critical regions are incomplete: {found.reason}")
-    elif top > TOLERANCE * body.size:
+    elif top > TOLERANCE:
         claim = Claim(None, f"a region is within {CLEAR:g} of the size of X_N: {top:.1e}")
     else:
         count = f"{len(found)} critical regions fill X_N"

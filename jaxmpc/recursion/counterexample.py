@@ -25,7 +25,7 @@ def outer_bound(claims: Claims) -> tuple[CenteredPolytope | None, np.ndarray]:
     if body is not None and len(body.vertices):
         # Vertices, middles of facets, and random points of facets: convex combinations.
         parts = [body.vertices]
-        tight = body.offsets - body.vertices @ body.normals.T <= 1e-7 * body.size
+        tight = body.offsets - body.vertices @ body.normals.T <= 1e-7 * body.depths
         corners = [body.vertices[column] for column in tight.T]
         parts += [part.mean(axis=0, keepdims=True) for part in corners]
         while sum(map(len, parts)) < STARTS:
@@ -44,14 +44,17 @@ def outer_bound(claims: Claims) -> tuple[CenteredPolytope | None, np.ndarray]:
         return None, np.zeros((0, p))
     length = np.linalg.norm(rays.normals[valid], axis=1)
     half = np.column_stack([rays.normals[valid] / length[:, None], rays.offsets[valid] / length])
-    half = half[np.unique(np.round(half, 9), axis=0, return_index=True)[1]]
+    # The same where they agree to 9 digits, in units of like size.
+    like = half / (half[:, p:] - half[:, :p] @ rays.center[:, None])
+    like = like / np.abs(like).max(axis=0)
+    half = half[np.unique(np.round(like, 9), axis=0, return_index=True)[1]]
     none = np.zeros((0, p))
     return CenteredPolytope(rays.center, half[:, :p], half[:, p], none), rays.points[found]
 
 
 def farthest_first(bound: CenteredPolytope, after: np.ndarray) -> np.ndarray:
     """Return the indices of next states, the farthest outside first, NaN last."""
-    return np.argsort(-np.nan_to_num(bound.signed_distance(after), nan=-np.inf))
+    return np.argsort(-np.nan_to_num(bound.beyond(after), nan=-np.inf))
 
 
 def worst_samples(bound: CenteredPolytope, x0s: np.ndarray, loops: LawLoops) -> np.ndarray:
@@ -81,13 +84,13 @@ def certified(
     inputs[:, 0] = law.limited(inputs[:, 0])
     after = law.following(states, inputs[:, 0])
     good = proved & (plans.status == Status.SOLVED)
-    outside = np.where(good, bound.signed_distance(after), -np.inf)
+    outside = np.where(good, bound.beyond(after), -np.inf)
     for best in np.argsort(-outside)[: len(candidates)]:
-        if not outside[best] > CLEAR * bound.size:
+        if not outside[best] > CLEAR:
             break
         normal, offset = _deepest(rays, bound, after[best])
         distance = float((normal @ after[best] - offset) / np.linalg.norm(normal))
-        if distance > CLEAR * bound.size:
+        if normal @ after[best] - offset > CLEAR * (offset - normal @ bound.center):
             return Counterexample(
                 states[best], inputs[best], after[best], normal, offset, distance,
                 feasible[best], float(plans.primal_residual[best]),
@@ -128,11 +131,12 @@ def _proved_plans(rays: Rays, candidates: np.ndarray) -> tuple[np.ndarray, np.nd
 def _deepest(rays: Rays, bound: CenteredPolytope, x: np.ndarray) -> tuple[np.ndarray, float]:
     """Return, of the half-spaces proved by rays that end on the side of x, the one that x violates
     most."""
-    facet = int(np.argmax(bound.normals @ x - bound.offsets))
+    facet = int(np.argmax((bound.normals @ x - bound.offsets) / bound.depths))
     depth = bound.normals[facet] @ x - bound.offsets[facet]
-    towards = np.array([x, bound.nearest(x[None])[0], x - depth * bound.normals[facet]])
-    cast = rays.cast(towards - rays.center)
-    with np.errstate(invalid="ignore"):
-        depths = (cast.normals @ x - cast.offsets) / np.linalg.norm(cast.normals, axis=1)
+    across = bound.normals[facet] * bound.unit**2  # perpendicular in units of like size
+    towards = x - depth / (bound.normals[facet] @ across) * across
+    cast = rays.cast(np.array([x, bound.nearest(x[None])[0], towards]) - rays.center)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        depths = (cast.normals @ x - cast.offsets) / (cast.offsets - cast.normals @ rays.center)
     best = int(np.argmax(np.nan_to_num(depths, nan=-np.inf)))
     return cast.normals[best], float(cast.offsets[best])

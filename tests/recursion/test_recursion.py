@@ -284,8 +284,15 @@ class TestLaw:
         points = np.array([[3.0, 0.5], [2.0, -5.0], [0.2, 0.3]])
         near = [[1.0, 0.5], [1.0, -1.0], [0.2, 0.3]]
         np.testing.assert_allclose(square.nearest(points), near, atol=1e-12)
-        np.testing.assert_allclose(square.signed_distance(points), [2.0, 4.0, -0.7], atol=1e-12)
-        assert square.size == 1.0
+        np.testing.assert_allclose(square.beyond(points), [2.0, 4.0, -0.7], atol=1e-12)
+        np.testing.assert_array_equal(square.depths, np.ones(4))
+        # In other units of one coordinate the same facets are as far away.
+        unit = np.array([1.0, 1e-7])
+        thin = CenteredPolytope(
+            np.zeros(2), square.normals, np.tile(unit, 2), np.zeros((0, 2))
+        )
+        np.testing.assert_allclose(thin.beyond(points * unit), [2.0, 4.0, -0.7], atol=1e-12)
+        np.testing.assert_allclose(thin.nearest(points * unit) / unit, near, atol=1e-12)
 
 
 class TestReport:
@@ -417,7 +424,7 @@ class TestReport:
 
     def test_empty_and_unbounded_sets_ask_for_states(self):
         empty = replace(problems.lecture(), terminal_set=jm.Box([5.0, 5.0], [6.0, 6.0]))
-        with pytest.raises(ValueError, match="x0s: None, and the feasible set is empty or flat"):
+        with pytest.raises(ValueError, match="x0s: None, and the feasible set is empty"):
             recursive_feasibility(empty)
         with pytest.raises(ValueError, match="Q: "):
             recursive_feasibility(replace(problems.lecture(), Q=-np.eye(2)))

@@ -7,11 +7,11 @@ from typing import Any
 import jax
 import numpy as np
 import optax
-from scipy.optimize import linprog
 
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import check_results, given_options, open_folder
 from jaxmpc.checks import fail
+from jaxmpc.control.lp import Program
 from jaxmpc.control.sets import Polytope
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.inequalities import Inequalities
@@ -87,8 +87,7 @@ def feasible_states(
         if isinstance(limits, Polytope) and np.any(np.asarray(limits.H) @ x > np.asarray(limits.h)):
             continue
         b = rows.b - rows.D @ np.pad(x, (0, rows.D.shape[1] - len(x)))
-        zero = np.zeros(rows.C.shape[1])
-        if len(b) and linprog(zero, rows.C, b, bounds=(None, None)).status == 2:
+        if len(b) and Program(rows.C, b).empty:
             dropped += 1
             continue
         found.append(x)
