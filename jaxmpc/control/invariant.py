@@ -785,6 +785,12 @@ def _tops(H: np.ndarray, C: Polytope, h: np.ndarray | None = None) -> Iterator[t
     With h, where a row of C next to H_i x <= h_i implies it, that row's bound.
     """
     G, g = unit_rows(C.H, C.h)
+    # In coordinates of like size, rows of length 1: x = scale ξ.
+    scale = framed("Polytope", G, g).scale
+    length = np.linalg.norm(np.vstack([G, H]) * scale, axis=1)
+    G, g = G * scale / length[: len(G), None], g / length[: len(G)]
+    length = length[len(G) :]
+    H, h = H * scale / length[:, None], None if h is None else h / length
     for rows, Z in geometry.factors(np.vstack([G, H]))[0]:
         own = rows < len(G)
         limits, reach, program = g[rows[own]], None, Program(Z[own], g[rows[own]])
@@ -795,7 +801,7 @@ def _tops(H: np.ndarray, C: Polytope, h: np.ndarray | None = None) -> Iterator[t
             top = limits[j] + np.abs(row - Z[own][j]) @ reach
             if h is None or top > h[i]:
                 top = _bound(row, program, reach)[1]
-            yield int(i), float(top)
+            yield int(i), float(top * length[i])
 
 
 def _vertex_proof(step: OneStep, C: Polytope) -> tuple[str, float]:
