@@ -119,9 +119,7 @@ def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
     return Frame(Y * scale, centre, scale)
 
 
-def irredundant_rows(
-    argument: str, G: np.ndarray, g: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def irredundant_rows(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows of a set with volume, which may be unbounded, that the others do not imply;
     ValueError if it is empty or flat."""
     keep = irredundant(framed(argument, G, g).Z)

@@ -285,9 +285,7 @@ def cleaned(value: np.ndarray, size: Any) -> np.ndarray:
     return np.where(np.abs(value) < 16 * np.finfo(float).eps * size, 0.0, value)
 
 
-def bound(
-    d: np.ndarray, y: np.ndarray, G: np.ndarray, g: np.ndarray, extent: np.ndarray
-) -> float:
+def bound(d: np.ndarray, y: np.ndarray, G: np.ndarray, g: np.ndarray, extent: np.ndarray) -> float:
     """Return an upper bound of d'x over G x <= g, |x| <= extent, from any multipliers y >= 0:
 
         d'x = y'G x + (d - G'y)'x <= y'g + |d - G'y|'extent,

@@ -120,7 +120,10 @@ class LeastDistanceForm:
         if np.any(b[self.still] < -1e-9):
             return None
         moving = np.flatnonzero(~self.still)
-        for allowance in (0.0, 1e-9 * self.typical[moving]):  # points on the boundary of X_N may need one
+        for allowance in (
+            0.0,
+            1e-9 * self.typical[moving],
+        ):  # points on the boundary of X_N may need one
             active: tuple[int, ...] = ()
             worst = -b[moving].min(initial=0.0)
             if worst > 0:

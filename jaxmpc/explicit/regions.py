@@ -24,6 +24,7 @@ from jaxmpc.mpc.problem import MPC
 # region counts as one of the program as given.
 OPTIMAL = 1e-6
 
+
 @dataclass(frozen=True, eq=False)
 class Region:
     """One critical region and its affine law.

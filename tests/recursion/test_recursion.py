@@ -288,9 +288,7 @@ class TestLaw:
         np.testing.assert_array_equal(square.depths, np.ones(4))
         # In other units of one coordinate the same facets are as far away.
         unit = np.array([1.0, 1e-7])
-        thin = CenteredPolytope(
-            np.zeros(2), square.normals, np.tile(unit, 2), np.zeros((0, 2))
-        )
+        thin = CenteredPolytope(np.zeros(2), square.normals, np.tile(unit, 2), np.zeros((0, 2)))
         np.testing.assert_allclose(thin.beyond(points * unit), [2.0, 4.0, -0.7], atol=1e-12)
         np.testing.assert_allclose(thin.nearest(points * unit) / unit, near, atol=1e-12)
 
