@@ -7,7 +7,7 @@ hull of all of them and 0 (Ziegler 1995, section 2.3), and the polar of a projec
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple, NoReturn
+from typing import Any
 
 import numpy as np
 import scipy
@@ -15,11 +15,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 
 from jaxmpc.checks import fail, require_finite
-from jaxmpc.control.lp import FLAT, ROUNDING, Program, extent, maximise
+from jaxmpc.control.lp import Program, extent, framed, maximise
 from jaxmpc.control.system import host_array
 from jaxmpc.reals import Reals
 
-_DOUBTFUL = 1e-5  # a smaller margin is looked at again, in other units
 _ZERO = 1e-12  # a coefficient that moves a row by less, relative to its distance, counts as 0
 _MERGE = "C-1e-12"  # qhull's option: merge facets of the dual that are flat to 1e-12
 _HULL_DIMENSIONS = 6  # above, hulls have too many facets and one LP a row is faster
@@ -40,83 +39,6 @@ def largest_ball(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarra
     if top.x is None:
         return Program(G, g).margin()[0], np.inf
     return top.x[:n], float(((g - G @ top.x[:n]) / length).min(initial=np.inf))
-
-
-class Flat(ValueError):
-    """A set without volume, where one with volume is needed."""
-
-
-class Frame(NamedTuple):
-    """{G x <= g} about a point inside, in coordinates of like size: Z ((x - centre) / scale) <= 1.
-
-    The entries of Z (rows, n) are at most 1 in size.
-    """
-
-    Z: np.ndarray
-    centre: np.ndarray
-    scale: np.ndarray
-
-    @property
-    def bounded(self) -> bool:
-        """Return whether the set is bounded: no ray r with Z r <= 0, by one LP, its answer
-        checked."""
-        n = self.Z.shape[1]
-        if len(self.Z) <= n or np.linalg.matrix_rank(self.Z) < n:
-            return False
-        # If there is one then one that reaches -1 in -1 <= Z r <= 0.
-        both = np.vstack([self.Z, -self.Z])
-        r = maximise(-self.Z.sum(axis=0), both, np.repeat([0.0, 1.0], len(self.Z))).x
-        assert r is not None  # 0 is feasible, and Z has rank n
-        off, size = self.Z @ r, np.abs(self.Z) @ np.abs(r)
-        return not (np.any(off < -0.5) and np.all(off <= ROUNDING * size))
-
-
-def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
-    """Return the frame of {G x <= g} about a point inside; ValueError if it is empty or flat.
-
-    The point has the largest common margin of all rows, first in the data's own scale, then in that
-    of the slacks found. Where that leaves a doubt, in units in which the bounding box has size 1:
-    the set is flat if the margin is below 1e-9 of it, or if a slack is rounding.
-    """
-    program = Program(G, g)
-    centre, margin, _ = program.margin()
-    if margin <= ROUNDING and program.empty:
-        fail(argument, "is empty: no point satisfies all its rows", "Loosen its rows")
-
-    def slack_at(x: np.ndarray) -> np.ndarray:
-        slack, size = g - G @ x, np.abs(g) + np.abs(G) @ np.abs(x)
-        if np.any(slack <= 4 * np.finfo(float).eps * size):
-            flat(0.0)
-        return slack
-
-    def flat(margin: float) -> NoReturn:
-        raise Flat(
-            f"{argument}: is flat (its rows keep a margin of {max(margin, 0.0):.1e} of its size). "
-            "Check the rows: this needs a set with volume"
-        )
-
-    slack = slack_at(centre)
-    step, margin, _ = Program(G, slack).margin()
-    centre = centre + step
-    slack = slack_at(centre)
-    if margin <= _DOUBTFUL:
-        low, high = Program(G, slack).bounds()
-        half = (high - low) / 2
-        if np.any(half <= 0):
-            flat(0.0)
-        unit = np.where(np.isfinite(half), half, Program(G, slack).column)
-        length = np.linalg.norm(G * unit, axis=1)
-        step, margin, _ = Program(G * unit / length[:, None], slack / length).margin()
-        inside = slack - G @ (unit * step)
-        margin = float((inside / length).min())
-        if margin <= FLAT:
-            flat(margin)
-        centre = centre + unit * step
-        slack = slack_at(centre)
-    Y = G / slack[:, None]
-    top = np.abs(Y).max(axis=0, initial=0.0)
-    scale = 1 / np.where(top > 0, top, 1.0)
-    return Frame(Y * scale, centre, scale)
 
 
 def irredundant_rows(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

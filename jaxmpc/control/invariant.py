@@ -24,14 +24,16 @@ from jaxmpc.checks import (
     require_symmetric_psd,
 )
 from jaxmpc.control import geometry
-from jaxmpc.control.geometry import Flat, framed, irredundant_rows, unit_rows
+from jaxmpc.control.geometry import irredundant_rows, unit_rows
 from jaxmpc.control.lp import (
     FLAT,
     ROUNDING,
+    Flat,
     Program,
     affine_hull,
     bound,
     extent,
+    framed,
     maximise,
     safe_extent,
     scaling,
@@ -556,8 +558,8 @@ class OneStep:
 def one_step(
     system: LinearSystem, inputs: Box | Polytope | None, disturbance: Box | Polytope | None
 ) -> OneStep:
-    """Return the exact data of x⁺ = A x + B u + c + w, with what equalities fix of the inputs (lower
-    = upper, or two opposite rows) taken out."""
+    """Return the exact data of x⁺ = A x + B u + c + w, with what equalities fix of the inputs
+    (lower = upper, or two opposite rows) taken out."""
     require_kind("system", system, LinearSystem)
     system.validate()
     m = system.m

@@ -11,7 +11,7 @@ A number counts as zero if it is within the rounding of the terms that it is the
 """
 
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 import scipy
@@ -33,12 +33,13 @@ FLAT = 1e-9
 ROUNDING = 1e-11
 # What is left of G'y in a Farkas vector is charged for points so many times as far as typical ones.
 FAR = 1e3
+_DOUBTFUL = 1e-5  # a smaller margin is looked at again, in other units
 _SWEEPS = 40  # of the least squares of `scaling`; fewer where they end before
 
 
 class Optimum(NamedTuple):
-    """A program's maximum (inf: unbounded, -inf: empty, each shown by a checked vector), where it is
-    attained (n,), and the multipliers (rows,); None where there is no optimum."""
+    """A program's maximum (inf: unbounded, -inf: empty, each shown by a checked vector), where it
+    is attained (n,), and the multipliers (rows,); None where there is no optimum."""
 
     value: float
     x: np.ndarray | None = None
@@ -137,7 +138,7 @@ class Program:
 
     @cached_property
     def farkas(self) -> np.ndarray | None:
-        """Return multipliers (rows,) that show that the set is empty, None where it is not shown."""
+        """Return multipliers (rows,) that show that the set is empty; None where none do."""
         x, y, t = self.violation
         if t <= ROUNDING:
             return None
@@ -234,11 +235,12 @@ def scaling(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return powers of two (row, column) with row_i G_ij column_j and row_i g_i of about 1.
 
     column_j is how far along x_j the rows that it dominates let a point go, |g_i| / |G_ij|, in the
-    median. A row is dominated by the entries within a factor of 16 of its largest in scaled columns.
-    So entries of G that are rounding have no influence, nor have distances 1e12 times smaller or
-    larger than most, which are rounding or no limits. This starts from the least squares fit of the
-    logarithms of [G, g] (Curtis & Reid 1972, J. Inst. Maths Applics 10). Rows follow: their largest
-    entry is about 1. A change of units of rows and columns changes the answer by the same factors.
+    median. A row is dominated by the entries within a factor of 16 of its largest in scaled
+    columns. So entries of G that are rounding have no influence, nor have distances 1e12 times
+    smaller or larger than most, which are rounding or no limits. This starts from the least squares
+    fit of the logarithms of [G, g] (Curtis & Reid 1972, J. Inst. Maths Applics 10). Rows follow:
+    their largest entry is about 1. A change of units of rows and columns changes the answer by the
+    same factors.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         L, distance = np.log2(np.abs(G)), np.log2(np.abs(g))
@@ -308,22 +310,102 @@ def safe_extent(G: np.ndarray, g: np.ndarray) -> np.ndarray:
     return extent(G, g) * (1 + 1e-6)
 
 
+class Flat(ValueError):
+    """A set without volume, where one with volume is needed."""
+
+
+class Frame(NamedTuple):
+    """{G x <= g} about a point inside, in coordinates of like size: Z ((x - centre) / scale) <= 1.
+
+    The entries of Z (rows, n) are at most 1 in size.
+    """
+
+    Z: np.ndarray
+    centre: np.ndarray
+    scale: np.ndarray
+
+    @property
+    def bounded(self) -> bool:
+        """Return whether the set is bounded: no ray r with Z r <= 0, by one LP, its answer
+        checked."""
+        n = self.Z.shape[1]
+        if len(self.Z) <= n or np.linalg.matrix_rank(self.Z) < n:
+            return False
+        # If there is one then one that reaches -1 in -1 <= Z r <= 0.
+        both = np.vstack([self.Z, -self.Z])
+        r = maximise(-self.Z.sum(axis=0), both, np.repeat([0.0, 1.0], len(self.Z))).x
+        assert r is not None  # 0 is feasible, and Z has rank n
+        off, size = self.Z @ r, np.abs(self.Z) @ np.abs(r)
+        return not (np.any(off < -0.5) and np.all(off <= ROUNDING * size))
+
+
+def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
+    """Return the frame of {G x <= g} about a point inside; ValueError if it is empty or flat.
+
+    The point has the largest common margin of all rows, first in the data's own scale, then in that
+    of the slacks found. Where that leaves a doubt, in units in which the bounding box has size 1:
+    the set is flat if the margin is below 1e-9 of it, or if a slack is rounding.
+    """
+    program = Program(G, g)
+    centre, margin, _ = program.margin()
+    if margin <= ROUNDING and program.empty:
+        fail(argument, "is empty: no point satisfies all its rows", "Loosen its rows")
+
+    def slack_at(x: np.ndarray) -> np.ndarray:
+        slack, size = g - G @ x, np.abs(g) + np.abs(G) @ np.abs(x)
+        if np.any(slack <= 4 * np.finfo(float).eps * size):
+            flat(0.0)
+        return slack
+
+    def flat(margin: float) -> NoReturn:
+        raise Flat(
+            f"{argument}: is flat (its rows keep a margin of {max(margin, 0.0):.1e} of its size). "
+            "Check the rows: this needs a set with volume"
+        )
+
+    slack = slack_at(centre)
+    step, margin, _ = Program(G, slack).margin()
+    centre = centre + step
+    slack = slack_at(centre)
+    if margin <= _DOUBTFUL:
+        low, high = Program(G, slack).bounds()
+        half = (high - low) / 2
+        if np.any(half <= 0):
+            flat(0.0)
+        unit = np.where(np.isfinite(half), half, Program(G, slack).column)
+        length = np.linalg.norm(G * unit, axis=1)
+        step, margin, _ = Program(G * unit / length[:, None], slack / length).margin()
+        inside = slack - G @ (unit * step)
+        margin = float((inside / length).min())
+        if margin <= FLAT:
+            flat(margin)
+        centre = centre + unit * step
+        slack = slack_at(centre)
+    Y = G / slack[:, None]
+    top = np.abs(Y).max(axis=0, initial=0.0)
+    scale = 1 / np.where(top > 0, top, 1.0)
+    return Frame(Y * scale, centre, scale)
+
+
 def implied_equalities(G: np.ndarray, g: np.ndarray, tolerance: float = FLAT) -> np.ndarray:
     """Return which rows of G x <= g (not empty) hold with equality all over the set.
 
-    The rows with a multiplier in max t, G x + t <= g, do if t = 0: y'(g - G x) = 0 for every x. They
-    are made equalities, and so on until the rest keeps a margin (facial reduction; Freund, Roundy &
-    Todd 1985). A margin counts as 0 below `tolerance`, in rows and columns scaled by their own data,
-    about a point of the set.
+    The rows with a multiplier in max t, G x + t <= g, do if t = 0: y'(g - G x) = 0 for every x.
+    They are made equalities, and so on until the rest keeps a margin (facial reduction; Freund,
+    Roundy & Todd 1985). A margin counts as 0 below `tolerance`, in scaled rows and columns, if
+    `framed` calls the set flat too.
     """
     equal = np.zeros(len(g), bool)
-    # About a point of the set a slack is the row's own, not a difference of large numbers.
-    about = np.zeros(np.shape(G)[1])
     for _ in range(len(g)):
-        program = Program(G, g - G @ about if about.any() else g, equal)
-        x, t, y = program.margin()
+        _, t, y = Program(G, g, equal).margin()
         if t > tolerance or equal.all():
             return equal
+        if not equal.any():
+            try:  # a narrow set far from the origin has volume
+                framed("", G, g)
+                return equal
+            except ValueError:
+                pass
         if t == -np.inf:
             break
         on = (y > 1e-6 * y.max(initial=0.0)) & ~equal

@@ -29,15 +29,12 @@ from jaxmpc.checks import (
     require_symmetric_psd,
 )
 from jaxmpc.control.geometry import (
-    Flat,
-    Frame,
     binding_rows,
     distinct,
     dual_hull,
     eliminate,
     explained,
     factors,
-    framed,
     hull_volume,
     irredundant_rows,
     largest_ball,
@@ -47,11 +44,14 @@ from jaxmpc.control.geometry import irredundant as _irredundant
 from jaxmpc.control.lp import (
     FLAT,
     ROUNDING,
+    Flat,
+    Frame,
     Optimum,
     Program,
     affine_hull,
     bound,
     cleaned,
+    framed,
     maximise,
     safe_extent,
     scaling,
@@ -138,9 +138,9 @@ class Box:
         self = self.spread(1)
         _require_shapes("Box", self, ("lower", "upper"), 1)
         require_shape("d", d, (self.dimension,), "Give one direction; use jax.vmap for many")
-        xp, (d, lower, upper) = _numbers(d, self.lower, self.upper)
+        xp, (along, lower, upper) = _numbers(d, self.lower, self.upper)
         # The maximiser, with 0 where d is 0: there 0 * inf would be NaN.
-        return d @ xp.where(d > 0, upper, xp.where(d < 0, lower, 0))
+        return along @ xp.where(along > 0, upper, xp.where(along < 0, lower, 0))
 
     def tightened(self, fraction: Any) -> "Box":
         """Return the box with its two-sided coordinates narrowed on each side by a fraction of
@@ -475,9 +475,10 @@ class Polytope:
         relative to the row's own terms. NumPy; not traceable.
 
         A row a'x <= b may be exceeded by tolerance (|b| + sum_i |a_i| max |x_i|), whatever its
-        units and those of x; the maxima are over the set, infinite ones left out. It is judged by an
-        upper bound of its maximum made from an LP's multipliers (`lp.bound`), valid for any LP error
-        but along coordinates in which the set is unbounded. An empty set is a subset of every set.
+        units and those of x; the maxima are over the set, infinite ones left out. It is judged by
+        an upper bound of its maximum made from an LP's multipliers (`lp.bound`), valid for any LP
+        error but along coordinates in which the set is unbounded. An empty set is a subset of
+        every set.
         """
         if self.is_empty():
             return True
@@ -605,9 +606,9 @@ class Ellipsoid:
         """Return max d'x over the ellipsoid = sqrt(level d'P^-1 d), d of shape (n,)."""
         self._require_fields("Ellipsoid")
         require_shape("d", d, (self.dimension,), "Give one direction; use jax.vmap for many")
-        xp, (d, P, level) = _numbers(d, self.P, self.level)
-        solved = np.linalg.solve(P, d) if xp is np else solve(P, d)
-        return xp.sqrt(level * (d @ solved))
+        xp, (along, P, level) = _numbers(d, self.P, self.level)
+        solved = np.linalg.solve(P, along) if xp is np else solve(P, along)
+        return xp.sqrt(level * (along @ solved))
 
     def volume(self) -> float:
         """Return the length, area or volume: pi^(n/2) / Gamma(n/2 + 1) level^(n/2) / sqrt(det P).

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail, require_finite, require_kind, require_shape
-from jaxmpc.control.geometry import Flat, framed, unit_rows
+from jaxmpc.control.geometry import unit_rows
 from jaxmpc.control.invariant import (
     contraction,
     disturbance_set,
@@ -17,7 +17,7 @@ from jaxmpc.control.invariant import (
     one_step,
     supports,
 )
-from jaxmpc.control.lp import Program, affine_hull, bound, maximise, safe_extent
+from jaxmpc.control.lp import Flat, Program, affine_hull, bound, framed, maximise, safe_extent
 from jaxmpc.control.riccati import least_reached, lqr
 from jaxmpc.control.sets import Box, Ellipsoid, Polytope, translated, unit_half_spaces
 from jaxmpc.control.system import LinearSystem, as_weight, host_array, host_matrices

@@ -21,8 +21,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from jaxmpc.checks import fail
-from jaxmpc.control.geometry import framed
-from jaxmpc.control.lp import ROUNDING, AffineHull, Program, affine_hull, maximise, scaling
+from jaxmpc.control.lp import ROUNDING, AffineHull, Program, affine_hull, framed, maximise, scaling
 from jaxmpc.control.sets import Box, Polytope, unit_half_spaces
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
@@ -182,8 +181,8 @@ class PointSolution(NamedTuple):
 
 
 class GivenProgram(NamedTuple):
-    """The rows C z + D x ≤ b as they are given, with those of the set of initial states: row (r,) and
-    side (r,) as in `Inequalities`, row −1 for these. condensed: the QP they belong to."""
+    """The rows C z + D x ≤ b as they are given, with those of the set of initial states: row (r,)
+    and side (r,) as in `Inequalities`, row −1 for these. condensed: the QP they belong to."""
 
     condensed: Condensed
     C: np.ndarray

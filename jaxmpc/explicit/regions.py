@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail
+from jaxmpc.control.lp import scaling
 from jaxmpc.control.sets import Box, Polytope, unit_rows
 from jaxmpc.explicit.cells import Cell, volume
-from jaxmpc.control.lp import scaling
 from jaxmpc.explicit.least_distance import (
     GivenProgram,
     LeastDistanceForm,
@@ -20,8 +20,8 @@ from jaxmpc.explicit.least_distance import (
 from jaxmpc.explicit.search import RegionSearch, explore
 from jaxmpc.mpc.problem import MPC
 
-# Residual of the optimality conditions at a vertex, relative to the size of the terms, up to which a
-# region counts as one of the program as given.
+# Residual of the optimality conditions at a vertex, relative to the size of the terms, up to which
+# a region counts as one of the program as given.
 OPTIMAL = 1e-6
 
 
@@ -32,7 +32,8 @@ class Region:
     rows (a,): active rows of `Condensed.C`. On the region the optimal decision is z = Z x + z0
     (nz,), its multipliers y = L x + l0 (a,) for the cost without ½ (y ≥ 0 at an upper bound,
     y ≤ 0 at a lower one, any sign where both are equal; the last rows are those of equalities that
-    the rows imply, if there are any), the first input u_0 = K x + k (m,), a prestabilising gain included.
+    the rows imply, if there are any), the first input u_0 = K x + k (m,), a prestabilising gain
+    included.
     also_active: rows that are active all over the region and depend on `rows`.
     polytope: irredundant unit rows in the p = mpc.dimension coordinates of the state;
     vertices (k, p); volume.

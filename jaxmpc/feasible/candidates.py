@@ -82,7 +82,8 @@ def cut_of(p: ExactData, rows: ConstraintRows, y: Array) -> tuple[Array, Array, 
 
 def with_violated_limit(rows: ConstraintRows, theta: Array, y: Array) -> Array:
     """Return the multipliers y (R,), or that of a single row: the one that θ violates most,
-    relative to its terms, among the rows that nothing moves. It is a proof for any inputs, limited or not.
+    relative to its terms, among the rows that nothing moves. It is a proof for any inputs, limited
+    or not.
     """
     if not len(rows.still):
         return y

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.control.geometry import framed
-from jaxmpc.control.lp import Program, affine_hull, bound, maximise, safe_extent
+from jaxmpc.control.lp import Program, affine_hull, bound, framed, maximise, safe_extent
 from jaxmpc.control.sets import Polytope
 from jaxmpc.feasible.centered_polytope import CenteredPolytope, power_of_two
 from jaxmpc.mpc.inequalities import Inequalities, row_lengths

@@ -32,9 +32,9 @@ class FeasibilityProblem:
     mpc: the problem without soft rows and weights of input rates, which do not influence
     feasibility, with polytopes that are boxes as those, and with the rows of polytopes that imply
     equalities as outputs. Where input rates are limited, u_{−1} is one of the inputs that could be
-    applied: the feasible set holds no (x, u_{−1}) with u_{−1} outside `inputs`. view: all states, a slice or a
-    projection. Everything else follows from these two, in NumPy in float64, and is computed once,
-    when it is first used.
+    applied: the feasible set holds no (x, u_{−1}) with u_{−1} outside `inputs`. view: all states, a
+    slice or a projection. Everything else follows from these two, in NumPy in float64, and is
+    computed once, when it is first used.
     """
 
     mpc: MPC
@@ -166,11 +166,12 @@ def with_previous_inputs(mpc: MPC, c: Condensed) -> Condensed:
     others."""
     for b in exact_data.previous_inputs(mpc):
         above = lambda top, old: np.concatenate([top, old])
-        c = replace(
-            c, C=above(np.zeros((b.size, c.C.shape[1])), c.C), D=above(b.H, c.D),
+        more: dict[str, Any] = dict(
+            C=above(np.zeros((b.size, c.C.shape[1])), c.C), D=above(b.H, c.D),
             d=above(np.zeros(b.size), c.d), lower=above(b.lower, c.lower),
             upper=above(b.upper, c.upper), layout=((b.kind, b.steps, b.size), *c.layout),
         )  # fmt: skip
+        c = replace(c, **more)
     return c
 
 

@@ -2,9 +2,10 @@
 (HiGHS)."""
 
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+
 from jaxmpc.checks import fail
 from jaxmpc.control.lp import FLAT, Program, scaling
 from jaxmpc.feasible.constraint_rows import ConstraintRows

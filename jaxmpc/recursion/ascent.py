@@ -27,11 +27,10 @@ def ascend(law: Law, bound: CenteredPolytope, starts: np.ndarray, deadline: floa
     """Return states (K, p) from which the next state lies farthest outside `bound`, the best first.
 
     starts (S, p) follow the gradient (A + B ∂u_0/∂x)'a_j of v(x) = max_j (a_j'x⁺(x) − b_j) within
-    the half-spaces, in steps of halving length, in coordinates in which the set is about 1 wide; b_j
-    and a_j count relative to the facet's distance from the centre. A step is taken if it raises v.
-    Then the best go
-    from region to region, each to the maximum of a_j'x⁺ on its region. The method is local: that it
-    finds no counterexample does not prove that there is none.
+    the half-spaces, in steps of halving length, in coordinates in which the set is about 1 wide;
+    a_j and b_j count relative to the facet's distance from the centre. A step is taken if it raises
+    v. Then the best go from region to region, each to the maximum of a_j'x⁺ on its region. The
+    method is local: that it finds no counterexample does not prove that there is none.
     """
     x = bound.nearest(starts, INSET)
     value, gradient = _value_and_gradient(law, bound, x, deadline)

@@ -18,8 +18,9 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.recursion.report import Claim, in_words
 
-# Distance from a facet of X_N, relative to the facet's from the centre, from which a state counts as
-# outside: well above the residuals of plans. Next states are moved towards the centre by as much before they are labelled.
+# Distance from a facet of X_N, relative to the facet's from the centre, from which a state counts
+# as outside: well above the residuals of plans. Next states are moved towards the centre by as much
+# before they are labelled.
 CLEAR = 1e-7
 LATE = "the time was over before its linear programs were solved"
 

@@ -1,5 +1,5 @@
-"""Laws, feasible sets and labels of the same problem written in other units, x = S x', u = V u', with
-rows times any number, with equalities as two rows, and with previous inputs."""
+"""Laws, feasible sets and labels of the same problem written in other units, x = S x', u = V u',
+with rows times any number, with equalities as two rows, and with previous inputs."""
 
 from dataclasses import replace
 from itertools import combinations
