@@ -499,10 +499,15 @@ def _check_lyapunov(
     name, unit = "Lyapunov inequality", "cost per |x|^2"
     if closed is None or P is None:
         return Check(name, None, None, unit, no_law, (3,))
-    top = float(np.linalg.eigvalsh(closed.T @ P @ closed - P + Q + K.T @ R @ K)[-1])
-    size, spread = np.linalg.norm(P, 2), np.linalg.norm(closed, 2)
-    scale = size + size * spread**2 + np.linalg.norm(Q, 2) + np.linalg.norm(K.T @ R @ K, 2)
-    holds = top <= _TOUCH * scale
+    parts = closed.T @ P @ closed, P, Q, K.T @ R @ K
+    change = parts[0] - P + Q + parts[3]
+    top, size = float(np.linalg.eigvalsh(change)[-1]), np.linalg.norm(P, 2)
+    # Signs of eigenvalues do not depend on units; rounding is judged in those in which each state
+    # costs about 1.
+    scale_x = _units_of(P)
+    scale = sum(np.linalg.norm(scale_x[:, None] * part * scale_x, 2) for part in parts)
+    scale += np.linalg.norm(np.abs(closed * scale_x / scale_x[:, None]), 2) ** 2
+    holds = np.linalg.eigvalsh(scale_x[:, None] * change * scale_x)[-1] <= _TOUCH * scale
     sentence = (
         f"The largest eigenvalue of (A+BK)'P(A+BK) - P + Q + K'RK is {top:.3g}, "
         f"for |P| = {size:.3g}."
@@ -523,14 +528,16 @@ def _weights(
         if matrix is None:  # of the three, P alone, and then lqr has failed
             checks.append(Check(name, None, None, "least eigenvalue", trouble, (3,)))
             continue
-        least = float(np.linalg.eigvalsh(matrix)[0])
-        size = float(np.linalg.norm(matrix, 2))
-        holds = least > 0 if definite else least >= -_TOUCH * size
+        least, unit = float(np.linalg.eigvalsh(matrix)[0]), _units_of(matrix)
+        alike = unit[:, None] * matrix * unit
+        bottom = float(np.linalg.eigvalsh(alike)[0])
+        holds = bottom > 0 if definite else bottom >= -_TOUCH * np.linalg.norm(alike, 2)
         sentence = f"The least eigenvalue is {least:.6g}."
         checks.append(Check(name, bool(holds), least, "least eigenvalue", sentence, (3,)))
-    weights, axes = np.linalg.eigh(Q)
+    unit = _units_of(Q if P is None else P)
+    weights, axes = np.linalg.eigh(unit[:, None] * Q * unit)
     output = np.sqrt(np.maximum(weights, 0.0))[:, None] * axes.T  # Q = output'output
-    seen, mode = least_reached(A.T, output.T)
+    seen, mode = least_reached((A * unit / unit[:, None]).T, output.T)
     if seen == np.inf:
         sentence = "Every mode decays by itself."
     elif seen <= _DETECTABLE:
@@ -542,6 +549,14 @@ def _weights(
               (3,))
     )  # fmt: skip
     return checks
+
+
+def _units_of(P: np.ndarray) -> np.ndarray:
+    """Return units of the coordinates in which a weight's diagonal is 1; 1 where it is not
+    positive, in units of the largest."""
+    diagonal = np.diag(P)
+    top = diagonal.max(initial=0.0)
+    return 1 / np.sqrt(np.where(diagonal > 0, diagonal, top if top > 0 else 1.0))
 
 
 def _origin_inside(X_f: _Set) -> Check:

@@ -95,7 +95,8 @@ class Law:
         if c.balls and self._touches_ball(theta, z):
             return None
         gap = self.C @ z + self.D @ theta - self.b
-        near = TOUCHING * (1 + np.abs(self.b))
+        near = np.abs(self.C) @ np.abs(z) + np.abs(self.D) @ np.abs(theta) + np.abs(self.b)
+        near = TOUCHING * near
         over, touching = gap > near, np.flatnonzero(np.abs(gap) <= near)
         if np.any(np.isinf(self.rho[over])):  # no plan
             return None
@@ -108,7 +109,7 @@ class Law:
         one = np.append(theta, 1.0)
         force = -(P @ z + Q @ one)
         y = self._multipliers(self.C[touching].T, force, self.rho[touching])
-        scale = 1 + np.abs(force).max(initial=0.0)
+        scale = np.abs(force).max(initial=0.0)
         most = y >= self.rho[touching] * (1 - 1e-9)
         active, full = touching[(y > 1e-9 * scale) & ~most], touching[most]
         Q[:, -1] += self.C[full].T @ self.rho[full]
@@ -120,7 +121,8 @@ class Law:
         except np.linalg.LinAlgError:
             return None
         Z, Y = law[: len(z)], law[len(z) :]
-        if np.abs(Z @ one - z).max() > MATCHING * (1 + np.abs(z).max()):
+        size = np.abs(z) + np.abs(Z) @ np.abs(one)
+        if np.any(np.abs(Z @ one - z) > MATCHING * np.maximum(size, 1e-3 * size.max())):
             return None
         # Region: inactive rows hold, violated ones stay so, multipliers stay in [0, ρ].
         slack = np.column_stack([self.D, -self.b]) + self.C @ Z

@@ -98,16 +98,17 @@ class CriticalRegions:
     def find(self, x: Any, tolerance: float = 1e-9) -> np.ndarray:
         """Return the index (B,) of the region that holds each state x (B, p), −1 where none does.
 
-        tolerance: how far outside all regions a state may lie, relative to the size of X_N.
+        tolerance: how far outside all regions a state may lie, relative to the width of X_N across
+        the facet that it exceeds.
         """
         x = self._states(x)
-        H, h, starts, size = self._stacked
+        H, h, starts, width = self._stacked
         answer = np.full(len(x), -1)
         finite = np.flatnonzero(np.all(np.isfinite(x), axis=1))
         for i in range(0, len(finite), 256):
             chunk = finite[i : i + 256]
-            beyond = np.maximum.reduceat(x[chunk] @ H.T - h, starts, axis=1)
-            near = beyond.min(axis=1) <= tolerance * size
+            beyond = np.maximum.reduceat((x[chunk] @ H.T - h) / width, starts, axis=1)
+            near = beyond.min(axis=1) <= tolerance
             answer[chunk] = np.where(near, beyond.argmin(axis=1), -1)
         return answer
 
@@ -136,18 +137,22 @@ class CriticalRegions:
         return x
 
     @cached_property
-    def _stacked(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    def _stacked(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         H = [np.asarray(region.polytope.H) for region in self.regions]
         h = np.concatenate([np.asarray(region.polytope.h) for region in self.regions])
         starts = np.cumsum([0] + [len(part) for part in H[:-1]])
         points = np.concatenate([region.vertices for region in self.regions])
-        return np.vstack(H), h, starts, float(np.ptp(points, axis=0).max())
+        rows = np.vstack(H)
+        return rows, h, starts, np.abs(rows) @ np.ptp(points, axis=0)
 
 
 def critical_regions(
     mpc: MPC, *, limit: int = 5000, within: Box | Polytope | None = None, seconds: float = np.inf
 ) -> CriticalRegions:
     """Return all critical regions of positive volume of the MPC problem (multiparametric QP).
+
+    The state is x, or (x, u_{−1}) with u_{−1} within `mpc.inputs` where input rates matter, as for
+    `feasible_polytope`. Equalities that rows imply, as two opposite ones do, are taken out first.
 
     limit: the most regions to look for. within: the set of initial states, needed where the
     feasible set X_N is unbounded. seconds: after which the search stops (some linear programs and

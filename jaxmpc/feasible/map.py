@@ -321,8 +321,10 @@ def map_feasible_set(
     (`proofs.py`): an input sequence whose roll-out keeps all rows, or a half-space that excludes
     the point, each by more than rounding; what is neither is 0, undecided. Where equalities tie
     the inputs to the states (a terminal point) the proof is that inputs within rounding of the
-    plan keep them exactly. iterations and dtype affect the ADMM stage alone and cannot make a
-    label wrong. The last undecided points, up to 2,000 in a call, get linear programs of some
+    plan keep them exactly; two rows of a polytope that are opposite but for rounding are one
+    equality. Where input rates are limited the states are (x, u_{−1}), and one whose previous input
+    the input limits exclude, which cannot have been applied, is labelled −1. iterations and dtype
+    affect the ADMM stage alone and cannot make a label wrong. The last undecided points, up to 2,000 in a call, get linear programs of some
     milliseconds each, an equal share of each chunk. chunk: number of points that a compiled program
     takes at once (None: by device). refine: tolerance of `FeasibleSetMap.refine`, None to skip it.
     penalties: of the ADMM stage, from `tune_sweep_penalties`. progress: show a bar. executor: what

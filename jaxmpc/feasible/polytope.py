@@ -19,7 +19,9 @@ def feasible_polytope(mpc: MPC) -> Polytope:
     """Return the feasible set X_N as a polytope, every facet once: {θ : some plan keeps every hard
     row}.
 
-    θ is x, or (x, u_{−1}) where input rates are limited. Facets come from the duals of linear
+    θ is x, or (x, u_{−1}) where input rates are limited; a previous input u_{−1} is one that could
+    be applied, within `mpc.inputs`. Equalities (a terminal point, two equal inputs) may be written
+    as opposite rows. Facets come from the duals of linear
     programs and are valid; each vertex was reached by one, to 1e-9 of the set's size. For a map
     with proofs against rounding, slices, projections or an ellipsoidal terminal set use
     `map_feasible_set(...).refine()`; one step at a time, `predecessor`.

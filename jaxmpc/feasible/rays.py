@@ -59,9 +59,9 @@ def boundary(
     """Compute exact boundary points and facets of the feasible set of `mpc` along rays.
 
     directions: a number of rays (equally spaced in 2-D, random in more dimensions) or an array
-    (K, d). center: a feasible point (d,); None: the point with the largest margin. axes, fixed:
-    a slice or projection as in `map_feasible_set`. Raises ValueError where the feasible set is
-    empty or flat, or the centre is not inside it.
+    (K, d). center: a feasible point (d,); None: the point with the largest margin. axes, fixed: a
+    slice or projection as in `map_feasible_set`, whose feasible set this is. Raises ValueError
+    where it is empty or flat, or the centre is not inside it.
     """
     problem = FeasibilityProblem.of(mpc, axes, fixed)
     d = problem.dimension

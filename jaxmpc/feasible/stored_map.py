@@ -186,7 +186,8 @@ class HalfSpaces:
         normals, offsets, scale = normals[known], offsets[known], scale[known]
         if self.vertices is not None:
             values = np.max(self.vertices @ (normals / scale[:, None]).T, axis=0)
-            cut = values > offsets / scale + 1e-12 * np.max(np.abs(self.vertices))
+            reach = np.abs(normals / scale[:, None]) @ np.abs(self.vertices).max(axis=0)
+            cut = values > offsets / scale + 1e-12 * reach
             normals, offsets, scale = normals[cut], offsets[cut], scale[cut]
         # Of those that are equal but for rounding the tightest.
         order = np.argsort(offsets / scale, kind="stable")

@@ -188,7 +188,7 @@ def _verify_next_states(
     where = np.flatnonzero(lost)
     expected = states[where] @ p.A.T + inputs[where] @ p.B.T + p.c
     size = np.abs(states[where]) @ np.abs(p.A).T + np.abs(inputs[where]) @ np.abs(p.B).T
-    wrong = np.any(np.abs(after[where] - expected) > 1e-12 * (1 + size), axis=1)
+    wrong = np.any(np.abs(after[where] - expected) > 1e-12 * (size + np.abs(p.c)), axis=1)
     normals = arrays.get("facet_normals", np.zeros((0, len(p.A))))
     if len(normals):
         normals = normals[np.argmax(after[where] @ normals.T - arrays["facet_offsets"], axis=1)]

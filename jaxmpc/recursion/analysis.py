@@ -68,9 +68,9 @@ def recursive_feasibility(
         4. samples and closed loops from them: another 12 s of compiling,
         5. without complete regions, plans by a solver for 4. (20 s of compiling), and a search.
 
-    x0s: sample states (B, n), or (B, n + m) with the previous input where input rates are
-    limited; None: none where the law is proved, else a grid over X_N, random states in more than
-    three dimensions. steps: length of the closed loops x⁺ = A x + B u_0(x) + c from each sample.
+    x0s: sample states (B, n), or (B, n + m) with the previous input, one within the input limits,
+    where input rates are limited; None: none where the law is proved, else a grid over X_N, random
+    states in more than three dimensions. steps: length of the closed loops x⁺ = A x + B u_0(x) + c from each sample.
     search: where regions are incomplete look for a counterexample by gradient ascent too.
     regions: critical regions to enumerate at most (0: none). seconds: time limit of the whole call;
     1. may take half of it, 2. half of what is left. What is not settled by then is open, and
@@ -78,8 +78,9 @@ def recursive_feasibility(
     all closed loops, and a linear program cannot be interrupted: a stage that has to compile is
     left out where less than the seconds above are left. progress: print each stage on stderr.
 
-    Optima of linear programs are trusted to 1e-9 of the size of X_N, by bounds from their
-    multipliers. A state counts as outside X_N when its distance exceeds 1e-7 of that size. In the
+    Optima of linear programs are trusted to 1e-9, by bounds from their multipliers: relative to the
+    distance of a facet of X_N from the centre. A state counts as outside X_N when it lies beyond a
+    facet by more than 1e-7 of that. In the
     closed loops each next state is moved towards the centre by 1e-7 of its distance, since plans
     lie on limits and residuals decide on which side; then it is labelled, and counts as lost when
     it is proved infeasible.
