@@ -316,23 +316,24 @@ def map_feasible_set(
     """Label each point: is there an input sequence that keeps every hard constraint of `mpc`?
 
     x0s: points (B, d). axes: indices of the d mapped states (None: all n). fixed: values (n,) of
-    all states, for a slice through them; None with d < n: a projection (feasible if some value
-    of the other states is). The cost is ignored. Every label rests on a proof in float64
+    all states, for a slice through them; None with d < n: a projection (feasible if some value of
+    the other states is). The cost is ignored. Every label rests on a proof in float64
     (`proofs.py`): an input sequence whose roll-out keeps all rows, or a half-space that excludes
-    the point, each by more than rounding; what is neither is 0, undecided. Where equalities tie
-    the inputs to the states (a terminal point) the proof is that inputs within rounding of the
-    plan keep them exactly; two rows of a polytope that are opposite but for rounding are one
-    equality. Where input rates are limited the states are (x, u_{−1}), and one whose previous input
-    the input limits exclude, which cannot have been applied, is labelled −1. iterations and dtype
-    affect the ADMM stage alone and cannot make a label wrong. The last undecided points, up to 2,000 in a call, get linear programs of some
-    milliseconds each, an equal share of each chunk. chunk: number of points that a compiled program
-    takes at once (None: by device). refine: tolerance of `FeasibleSetMap.refine`, None to skip it.
-    penalties: of the ADMM stage, from `tune_sweep_penalties`. progress: show a bar. executor: what
-    labels the chunks, such as a `concurrent.futures.ProcessPoolExecutor` with the start method
-    spawn, or the executor of a cluster: `submit(function, *arguments)` returns a future with
-    `result()`. Labels and proofs are those without it, bit for bit on processors of one kind. A
-    chunk whose worker died is submitted again up to 3 times, with a warning. devices: a number of
-    them, or a sequence of JAX devices, which share the points of a chunk; None: the default device.
+    the point, each by more than rounding; what is neither is 0, undecided. Where equalities tie the
+    inputs to the states (a terminal point) the proof is that inputs within rounding of the plan
+    keep them exactly; two rows of a polytope that are opposite but for rounding are one equality.
+    Where input rates are limited the states are (x, u_{−1}), and one whose previous input the input
+    limits exclude, which cannot have been applied, is labelled −1. iterations and dtype affect the
+    ADMM stage alone and cannot make a label wrong. The last undecided points, up to 2,000 in a
+    call, get linear programs of some milliseconds each, an equal share of each chunk. chunk: number
+    of points that a compiled program takes at once (None: by device). refine: tolerance of
+    `FeasibleSetMap.refine`, None to skip it. penalties: of the ADMM stage, from
+    `tune_sweep_penalties`. progress: show a bar. executor: what labels the chunks, such as a
+    `concurrent.futures.ProcessPoolExecutor` with the start method spawn, or the executor of a
+    cluster: `submit(function, *arguments)` returns a future with `result()`. Labels and proofs are
+    those without it, bit for bit on processors of one kind. A chunk whose worker died is submitted
+    again up to 3 times, with a warning. devices: a number of them, or a sequence of JAX devices,
+    which share the points of a chunk; None: the default device.
 
     A point with NaN or infinity gets status NON_FINITE and label 0. Raises ValueError for wrong
     shapes and ill-posed problems before anything compiles.

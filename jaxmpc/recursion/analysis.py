@@ -70,13 +70,14 @@ def recursive_feasibility(
 
     x0s: sample states (B, n), or (B, n + m) with the previous input, one within the input limits,
     where input rates are limited; None: none where the law is proved, else a grid over X_N, random
-    states in more than three dimensions. steps: length of the closed loops x⁺ = A x + B u_0(x) + c from each sample.
-    search: where regions are incomplete look for a counterexample by gradient ascent too.
-    regions: critical regions to enumerate at most (0: none). seconds: time limit of the whole call;
-    1. may take half of it, 2. half of what is left. What is not settled by then is open, and
-    samples that are not labelled or followed to the end are undecided. Compiling, one step of
-    all closed loops, and a linear program cannot be interrupted: a stage that has to compile is
-    left out where less than the seconds above are left. progress: print each stage on stderr.
+    states in more than three dimensions. steps: length of the closed loops x⁺ = A x + B u_0(x) + c
+    from each sample. search: where regions are incomplete look for a counterexample by gradient
+    ascent too. regions: critical regions to enumerate at most (0: none). seconds: time limit of the
+    whole call; 1. may take half of it, 2. half of what is left. What is not settled by then is
+    open, and samples that are not labelled or followed to the end are undecided. Compiling, one
+    step of all closed loops, and a linear program cannot be interrupted: a stage that has to
+    compile is left out where less than the seconds above are left. progress: print each stage on
+    stderr.
 
     Optima of linear programs are trusted to 1e-9, by bounds from their multipliers: relative to the
     distance of a facet of X_N from the centre. A state counts as outside X_N when it lies beyond a
