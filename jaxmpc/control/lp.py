@@ -70,9 +70,13 @@ class Program:
         cost = d * self.column
         length = np.abs(cost).max(initial=0.0) or 1.0
         cost = cost / length
-        refused = False
-        for method in ("highs-ds", "highs-ipm", "dual"):
-            found = self._by_dual(cost) if method == "dual" else self._highs(cost, method)
+        checked = False
+        for method in ("highs-ds", "highs-ipm", "dual", "none"):
+            found, claim = None, True
+            if method == "dual":
+                found = self._by_dual(cost)
+            elif method != "none":
+                found, claim = solve(cost, self.M, self.b, self.equal, method)
             if found is not None:
                 x, y = self._exact(cost, *found)
                 left = np.abs(self.M.T @ y - cost).max(initial=0.0)
@@ -80,23 +84,21 @@ class Program:
                 value = self.b @ y if exact else cost @ x
                 y_given = y * self.row * length
                 return Optimum(float(value * length), x * self.column, y_given)
-            if not refused:
-                refused = True
+            # Where HiGHS claims that there is no optimum, and at last.
+            if claim and not checked:
+                checked = True
                 if self.farkas is not None:
                     return Optimum(-np.inf)
                 if self._ray(cost) is not None:
                     return Optimum(np.inf)
         fail("LP", "HiGHS finds no answer that can be checked", "Scale the rows to like size")
 
-    def _highs(self, cost: np.ndarray, method: str) -> tuple[np.ndarray, np.ndarray] | None:
-        return solve(cost, self.M, self.b, self.equal, method)
-
     def _by_dual(self, cost: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Solve min b'y with M'y = cost, y >= 0 but for equalities: its multipliers are x."""
         free = np.eye(len(self.b))[~self.equal]
         rows = np.vstack([self.M.T, -free])
         limits = np.append(cost, np.zeros(len(free)))
-        found = solve(-self.b, rows, limits, np.arange(len(rows)) < len(cost), "highs-ds")
+        found, _ = solve(-self.b, rows, limits, np.arange(len(rows)) < len(cost), "highs-ds")
         if found is None:
             return None
         y, x = found
@@ -127,7 +129,7 @@ class Program:
         b = np.concatenate([self.b, -self.b[self.equal], [1.0]])
         M = np.column_stack([M, -np.ones(len(M))])
         for method in ("highs-ds", "highs-ipm"):
-            found = solve(-np.eye(M.shape[1])[-1], M, b, np.zeros(len(b), bool), method)
+            found, _ = solve(-np.eye(M.shape[1])[-1], M, b, np.zeros(len(b), bool), method)
             if found is not None:
                 x, y, count = found[0][:-1], found[1].copy(), len(self.b)
                 y[:count][self.equal] -= y[count:-1]
@@ -164,7 +166,7 @@ class Program:
         limits = np.append(np.zeros(len(self.b)), np.ones(2 * n))
         equal = np.append(self.equal, np.zeros(2 * n, bool))
         for method in ("highs-ds", "highs-ipm"):
-            found = solve(cost, box, limits, equal, method)
+            found, _ = solve(cost, box, limits, equal, method)
             if found is None:
                 continue
             r = np.where(np.abs(found[0]) < 1e-12, 0.0, found[0])
@@ -198,7 +200,7 @@ class Program:
         b, equal = np.append(self.b, 1.0), np.append(self.equal, False)
         free = np.arange(len(b)) < len(self.b)
         for method, part in (("highs-ds", free), ("highs-ds", free | True), ("highs-ipm", free)):
-            found = solve(np.eye(M.shape[1])[-1], M[part], b[part], equal[part], method)
+            found, _ = solve(np.eye(M.shape[1])[-1], M[part], b[part], equal[part], method)
             if found is not None:
                 x, y = found[0][:-1], found[1][: len(self.b)]
                 slack = np.append((self.b - self.M @ x)[~self.equal], found[0][-1])
@@ -208,9 +210,10 @@ class Program:
 
 def solve(
     cost: np.ndarray, M: np.ndarray, b: np.ndarray, equal: np.ndarray, method: str
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return (x, y) of max cost'x over M x <= b, with equality where `equal`; None where HiGHS does
-    not call it optimal. The data must be scaled."""
+) -> tuple[tuple[np.ndarray, np.ndarray] | None, bool]:
+    """Return (x, y) of max cost'x over M x <= b, with equality where `equal`, or None where HiGHS
+    does not call it optimal; and whether it claims that there is no optimum. The data must be
+    scaled. On ill-conditioned data HiGHS may cycle: its steps are limited."""
     some = equal.any()
     result = linprog(
         -cost,
@@ -220,15 +223,15 @@ def solve(
         b_eq=b[equal] if some else None,
         bounds=(None, None),
         method=method,
-        options=HIGHS,
+        options={**HIGHS, "maxiter": 1000 + 20 * sum(M.shape)},
     )
     if result.status != 0:
-        return None
+        return None, result.status in (2, 3)
     y = np.zeros(len(b))
     y[~equal] = np.maximum(-result.ineqlin.marginals, 0.0)
     if some:
         y[equal] = -result.eqlin.marginals
-    return result.x, y
+    return (result.x, y), False
 
 
 def scaling(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -70,6 +70,7 @@ def test_sets_in_other_units(seed):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_sets_in_other_units_many():
     for seed in range(6, 106):
         check_set(seed)
@@ -150,6 +151,7 @@ def test_invariant_sets_in_other_units(seed):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_invariant_sets_in_other_units_many():
     for seed in range(2, 32):
         check_invariant(seed)
@@ -186,6 +188,7 @@ def test_programs_in_other_units(seed):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_programs_in_other_units_many():
     for seed in range(9, 609):
         check_program(seed)

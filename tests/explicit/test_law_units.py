@@ -341,3 +341,12 @@ def test_settled_horizons_survive_one_that_fails(monkeypatch):
     found = smallest_horizon(weak, limit=3, regions=0)
     assert list(found.reasons) == [1, 2, 3] and found.reasons[2].holds is None
     assert "LP: no answer" in found.reasons[2].reason
+
+
+@pytest.mark.slow
+def test_programs_of_a_long_unstable_prediction_end():
+    """2^18 between the first and last rows: HiGHS stops on some of the programs, or cycles."""
+    system = jm.LinearSystem([[2.0, 1], [0, 0.5]], [1, 0.0])
+    mpc = integrator(system=system, R=10.0, terminal_set=None)
+    found = smallest_horizon(mpc, limit=19, regions=0, seconds=250)
+    assert found.horizon is None and list(found.reasons) == list(range(1, 20))
