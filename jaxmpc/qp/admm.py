@@ -291,8 +291,8 @@ def factor(P: Array, A: Array, solver: ADMM, balls: tuple[int, ...] = ()) -> Fac
     n, m = A_w.shape[1], A_w.shape[0]
     rho = default_rho(E, n) if solver.rho is None else jnp.asarray(solver.rho, P.dtype)
     rho = jnp.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, m))
-    # Where P is singular there may be directions that no row stops either: M has none but the ridge,
-    # by which the rounding of float32 iterates is divided there.
+    # Where P is singular there may be directions that no row stops either. There M is the ridge, by
+    # which the rounding of float32 iterates is divided.
     least = 40 * n * float(jnp.finfo(P.dtype).eps)
     ridge = jnp.where(flat, max(FLAT_RIDGE, least), least).astype(P.dtype)
 
