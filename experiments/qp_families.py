@@ -479,7 +479,7 @@ def line(family: str, name: str, instances: list[Instance], answers: list[Answer
 def run(s: Settings) -> None:
     """Draw, solve, judge; a row a family and solver."""
     jax.config.update("jax_enable_x64", s.dtype == "float64")
-    solver = jm.ADMM(s.iterations, refine=s.refine, eps=1e-6 if s.dtype == "float64" else None)
+    solver = jm.ADMM(s.iterations, refine=s.refine)
     solve = jax.jit(jax.vmap(lambda qp: jm.solve_qp(qp, solver)))
     print(
         f"{s.count} a family, jaxmpc in {s.dtype}: {s.iterations} steps, "

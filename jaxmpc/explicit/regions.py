@@ -251,7 +251,7 @@ def residual(given: GivenProgram, r: Region) -> float:
     gap = (z @ given.C.T + x @ given.D.T - given.b) / terms
     primal = gap.max(initial=0.0)
     total = np.zeros((len(x), len(c.C)))
-    np.add.at(total, (slice(None), r.rows), y)
+    np.add.at(total.T, r.rows, y.T)
     gradient = z @ c.P.T + x @ c.F.T + c.f + total @ c.C
     parts = np.abs(z) @ np.abs(c.P) + np.abs(x) @ np.abs(c.F).T + np.abs(c.f)
     parts = (parts + np.abs(total) @ np.abs(c.C)).max(axis=0)

@@ -56,7 +56,7 @@ class Products(NamedTuple):
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Natural:
     """What is natural for the whole program, for rows (m,), variables (n,) and the gap: sizes, and
     the terms of rows and variables.

@@ -43,7 +43,7 @@ def test_solutions_are_right(family):
 
 def solved(names, count, dtype):
     """Names of the statuses that are not SOLVED, by family and seed."""
-    solver = jm.ADMM(eps=1e-6 if dtype == "float64" else None)
+    solver = jm.ADMM()
     with jax.enable_x64(dtype == "float64"):
         solve = jax.jit(jax.vmap(lambda qp: jm.solve_qp(qp, solver)))
         draws = [(name, seed) for name in names for seed in range(count)]
@@ -55,7 +55,10 @@ def solved(names, count, dtype):
         if answer.status != instance.status:
             wrong[draw] = answer.status.name
         else:
-            assert families.quality(instance, answer, dtype)[1:] != (False, False), draw
+            # Float32 answers are rounded, and multipliers of the jerk chain are large.
+            share = 1e-6 if dtype == "float64" else 1e-4
+            for value, sizes in judge.residual_terms(instance.qp, answer.z, answer.y):
+                assert np.all(np.abs(value) <= share * sizes + 1e-12), draw
     return wrong
 
 

@@ -124,10 +124,12 @@ def judged(qp, z, y):
 
 
 def assert_honest(batch, sol, eps):
-    """SOLVED only with residuals within eps and rounding; the reported ones are those of (z, y).
+    """SOLVED only with residuals within eps, relative to their terms, and rounding; the reported
+    ones are those of (z, y).
 
     The rounding floor is what `ADMM.eps` promises: 100 (float32: 4) machine epsilons of the size
-    of the terms. A ball of violation r has entries up to r, so its largest may be √3 smaller.
+    of the terms; float32 pairs are rounded after they have been judged. A ball of violation r has
+    entries up to r, so its largest may be √3 smaller.
     """
     single = np.asarray(sol.z).dtype == np.float32
     floor = (4 if single else 100) * np.finfo(np.float32 if single else np.float64).eps
@@ -138,7 +140,7 @@ def assert_honest(batch, sol, eps):
         assert (own <= value + rounding).all()
         assert (value <= np.array([np.sqrt(3), 1, 1]) * own + rounding).all()
         if sol.status[i] == jm.Status.SOLVED:
-            allowed = eps * (1 + 1e-6) + floor * size
+            allowed = eps * (1 + 1e-6) * (1 + size) + (2 if single else 1) * floor * size
             assert (value <= np.array([np.sqrt(3), 1, 1]) * allowed).all(), (i, value, allowed)
 
 
