@@ -5,7 +5,8 @@ to: predictions of an unstable plant, limits less what the present state contrib
 for the status of a plan is computed from A, B, c, the weights and the rows themselves:
 
     rows       v = H x_k + D u_k beyond its bounds, relative to the larger of |bounds| and |v|;
-    dynamics   x_{k+1} − (A x_k + B u_k + c), relative to the sum of its absolute terms;
+    dynamics   x_{k+1} − (A x_k + B u_k + c), relative to the largest value of the same state over
+               the horizon;
     inputs     the gradient of the Lagrangian g = Γ'(∂J/∂x + H'y) + Ω'(∂J/∂u + D'y), with the
                sensitivities Γ, Ω of the plan to its variables. In the metric of the Hessian, in
                which the cost is ½|w|² + const, it is how far the plan is from the best one for the
