@@ -115,15 +115,16 @@ def stated_terms(
         violations.append(bounds.violation(v))
         sizes.append(jnp.maximum(bounds.sizes(), jnp.abs(v)))
 
-    g = matmul(gx.ravel(), c.Gamma.reshape(-1, c.Gamma.shape[-1]))
-    g = g + matmul(gu.ravel(), c.Omega.reshape(-1, c.Omega.shape[-1]))
+    moved = [M.reshape(-1, M.shape[-1]) for M in (c.Gamma, c.Omega)]
+    g = matmul(jnp.concatenate([gx.ravel(), gu.ravel()]), jnp.concatenate(moved))
     length, rounds = (jnp.sqrt(2 * jnp.maximum(v, 0.0)) for v in (J, cancels))
     rounds = rounds + jnp.max(jnp.abs(y) * factor.reach, initial=0.0)
 
     A, B = cast(mpc.system.A), cast(mpc.system.B)
     drift = jnp.zeros_like(x[0]) if mpc.system.c is None else cast(mpc.system.c)
-    defects = x[1:] - (apply(A, x[:-1]) + apply(B, u) + drift)
-    terms = apply(jnp.abs(A), jnp.abs(x[:-1])) + apply(jnp.abs(B), jnp.abs(u)) + jnp.abs(drift)
+    free, forced = apply(A, x[:-1]), apply(B, u)
+    defects = x[1:] - (free + forced + drift)
+    terms = jnp.abs(free) + jnp.abs(forced) + jnp.abs(drift)
     most = jnp.broadcast_to(jnp.max(jnp.abs(x), axis=0), terms.shape)
     row_size = jnp.concatenate([*sizes, y[:0]])
     per_variable = 1 / jnp.sum(jnp.abs(factor.T), axis=1)

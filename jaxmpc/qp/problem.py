@@ -38,8 +38,8 @@ class QP:
     |A_b z − l_b| ≤ radius_i, with l_b = u_b its centre. An ellipsoid {x: (x − c)'M(x − c) ≤ r²}
     is a ball in the rows L'x, M = LL'.
 
-    row_sizes (m,) ≥ 0: what tolerances of rows are relative to, beside the terms A_ij z_j; None: to
-    these alone. Where l and u are differences, such as limits less what the present state
+    row_sizes (m,) ≥ 0: what tolerances of rows are relative to, in place of their terms A_ij z_j; 0
+    or None: to these. Where l and u are differences, such as limits less what the present state
     contributes, the sizes of the limits belong here.
     """
 

@@ -30,7 +30,7 @@ from jaxmpc.qp.status import Status
 # Multiple of the rounding floor below which steps on ill-conditioned programs gain nothing.
 STALLED = 10
 # Part of the tolerance below which one more step ends a search.
-NEAR = 1e-5
+NEAR = 1e-4
 # Share of what is natural for the whole program in the size of an entry.
 SHARE = 1e-3
 # Parts of the residuals: values, sizes and terms, as above.
@@ -81,9 +81,10 @@ def residual_terms(qp: QP, z: Array, y: Array, natural: Natural | None = None) -
 
 
 def row_sizes(Az: Any, known: Any, natural: Natural) -> Array:
-    """Return what violations of rows are compared with (m,). known: `QP.row_sizes`."""
+    """Return what violations of rows are compared with (m,): what is known of a row
+    (`QP.row_sizes`), and where that is nothing its value and what is natural."""
     sizes = jnp.abs(Az) + SHARE * natural.rows
-    return sizes if known is None else sizes + known
+    return sizes if known is None else jnp.where(known > 0, known, sizes)
 
 
 def terms_of(
