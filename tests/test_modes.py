@@ -113,7 +113,7 @@ def near(one, other):
     jax.tree.map(lambda v, w: np.testing.assert_allclose(v, w, rtol=2e-3, atol=2e-3), one, other)
 
 
-@pytest.mark.first(3)
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_no_implicit_promotion(name):
     """Neither of ranks nor of types, by a user who has forbidden both."""
@@ -193,6 +193,7 @@ def in_a_process(check, names):
     assert done.returncode == 0, done.stdout[-500:] + done.stderr[-2000:]
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("check", ["shard_map", "explicit"])
 def test_several_devices(check):
     in_a_process(check, FEW)

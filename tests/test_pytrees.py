@@ -60,7 +60,8 @@ def test_equality_and_hash():
     assert hash(settings) == hash(replace(settings)) and settings != "settings"
 
 
-@pytest.mark.parametrize("choice", [True, False])
+@pytest.mark.first(1)
+@pytest.mark.parametrize("choice", [False, True])
 def test_prestabilise_is_no_leaf(choice):
     """jit, vmap and grad take a problem as argument, whatever it says of prestabilisation."""
     mpc, plain = problem(prestabilise=choice), jm.solve(problem(), X0)
@@ -98,6 +99,7 @@ def test_donated_controller():
     np.testing.assert_allclose(step(again, X0)[1], want, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_stored_programs():
     """jax.export stores problems and controllers as arguments, plans as results."""
     names = dict(constrain_initial=False, constrained_steps=(np.int64(1), 2))

@@ -199,6 +199,7 @@ ALIKE = {
 }
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", ALIKE)
 def test_equalities_as_rows(name):
     written, plain = ALIKE[name]

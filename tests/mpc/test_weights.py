@@ -94,7 +94,7 @@ ROUTES = {
 symmetrised = partial(jax.tree.map, lambda M: (M + M.T) / 2)
 
 
-@pytest.mark.first(5)
+@pytest.mark.first(3)
 @pytest.mark.parametrize("name", ROUTES)
 def test_raw_and_symmetrised_weights_mean_the_same(name):
     """A quadratic form knows the symmetric part alone: plans, costs and derivatives too."""

@@ -181,6 +181,7 @@ def faults(count, each, x64, kinds=KINDS, seed=0):
     return wrong
 
 
+@pytest.mark.first(1)
 @PRECISIONS
 def test_answer_in_any_units(x64):
     assert faults(2, 2, x64) == []
