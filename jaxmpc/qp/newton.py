@@ -202,15 +202,19 @@ def multipliers_update(q: Array, state: Multipliers, step: Newton) -> Multiplier
     """
     constants, s = Constants.of(state.w.dtype), state
     gradient, linear, w = norms(step.gradient, q, step.w)
-    noise = 10 * jnp.finfo(s.w.dtype).eps * (linear + w + s.rho * largest(step.excess))
+    # The rounding of rows A w, which are as large as w, is multiplied by ρ.
+    eps = jnp.finfo(s.w.dtype).eps
+    noise = 10 * eps * (linear + w + s.rho * largest(step.excess)) + eps * s.rho * w
     done = step.minimised | (gradient <= jnp.maximum(s.tolerance, noise))
     new = jnp.where(done, s.rho * step.excess, s.y)
     violation = largest(new - s.y) / s.rho
     grow = done & (violation > 0.1 * s.before)
+    rho = jnp.where(grow, jnp.minimum(10 * s.rho, constants.rho[1]), s.rho)
+    # A Newton step has a ridge of 10 ε ρ, which must be little beside σ.
+    least = jnp.maximum(constants.sigma, 40 * eps * rho)
     return Multipliers(
         step.w, new, jnp.where(done, new - s.y, s.change), step.w - s.w,
-        jnp.where(grow, jnp.minimum(10 * s.rho, constants.rho[1]), s.rho),
-        jnp.where(done, jnp.maximum(s.sigma / 100, constants.sigma), s.sigma),
+        rho, jnp.maximum(jnp.where(done, s.sigma / 100, s.sigma), least),
         jnp.where(done, violation, s.before), jnp.where(done, s.tolerance / 10, s.tolerance),
     )  # fmt: skip
 

@@ -203,6 +203,8 @@ def improve(
     else:
         step = partial(by_multipliers, refine)
         s = repeat_while(lambda s: s.open, step, constants, s, steps="long")
+        if has_dual_steps(qp.balls, qp.A):
+            s = replace(s, best=from_multipliers(p, s))
     return s.best, s.proof, ~false, s.idle > max(refine // 2, 50)
 
 
@@ -239,6 +241,23 @@ def most_multiplier(p: Program) -> Array:
     each other. Systems in the active rows have a ridge, beside which rows that are more nearly
     dependent, and hold multipliers of more than this, cannot be told apart."""
     return DIVERGED * (1 + largest(p.q))
+
+
+def from_multipliers(p: Program, s: Search) -> Pair:
+    """Return the best pair after corrections from where the method of multipliers ends.
+
+    Its penalty multiplies the rounding of rows, so that it stops short of rounding. Where the
+    Hessian H in ADMM's coordinates is singular a correction is a step of the proximal point method:
+    with I − H as the proximal term the Hessian is I, and the minimiser without rows is
+    w − (Hw + q + A'y)."""
+    f, point = p.factor, s.point
+    gradient = matmul(point.w, f.H) + s.q + matmul(point.y, f.A)
+    begin = DualPoint(point.y, point.w, matmul(point.w, f.A.T))
+    go_on = ~s.best.solved & ~s.proof.beyond & ~s.proof.unbounded & jnp.isfinite(s.best.error)
+    start = Correction(begin, gradient, s.best, jnp.int32(0), go_on)
+    step = partial(correction, MOST_STEPS)
+    program = replace(p, bounds=s.bounds)
+    return repeat_while(lambda s: s.open, step, program, start, steps="long").best
 
 
 def correction(most: int, p: Program, s: Correction) -> Correction:
