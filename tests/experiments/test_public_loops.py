@@ -49,7 +49,7 @@ def test_aircraft_without_weights_of_inputs(loops):
 
 
 def test_judge(loops):
-    """It sees a limit missed by 1e-3 and an input off by 1e-2, and what has no solution."""
+    """It sees a limit missed by 1e-3 and an input off by 1e-2."""
     one = loops["FiOrdOs 2"]
     statement = public.Statement(one.mpc)
     r = statement.target(np.zeros(2), np.zeros(1))
@@ -63,4 +63,10 @@ def test_judge(loops):
     off = w.copy()
     off[-1] += 1e-2
     assert statement.violations(off, one.x0)[1] > 1e-3
+
+
+def test_judge_of_an_infeasible_state(loops):
+    pytest.importorskip("piqp")  # asked where Clarabel finds nothing
+    statement = public.Statement(loops["FiOrdOs 2"].mpc)
+    r = statement.target(np.zeros(2), np.zeros(1))
     assert statement.solve(np.array([3.4, 3.0]), r) is None
