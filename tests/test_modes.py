@@ -113,7 +113,7 @@ def near(one, other):
     jax.tree.map(lambda v, w: np.testing.assert_allclose(v, w, rtol=2e-3, atol=2e-3), one, other)
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_no_implicit_promotion(name):
     """Neither of ranks nor of types, by a user who has forbidden both."""
@@ -135,6 +135,7 @@ def test_without_jit():
     np.testing.assert_allclose(plan.inputs, [[-1.0], [0.0]], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_debugging_modes():
     """Feasible or not, no NaN is made on the way, and no tracer stays behind."""
     with jax.debug_nans(True), jax.checking_leaks():
@@ -142,6 +143,7 @@ def test_debugging_modes():
             assert jm.solve(problem(), x).status == status
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("kind", ["bfloat16", "float16"])
 def test_half_precision(kind):
     """Computed in float32, as there are no factorizations in half precision."""

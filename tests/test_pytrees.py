@@ -60,7 +60,7 @@ def test_equality_and_hash():
     assert hash(settings) == hash(replace(settings)) and settings != "settings"
 
 
-@pytest.mark.first(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("choice", [False, True])
 def test_prestabilise_is_no_leaf(choice):
     """jit, vmap and grad take a problem as argument, whatever it says of prestabilisation."""

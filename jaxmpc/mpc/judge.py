@@ -56,7 +56,7 @@ def judged(
         solved = measured.small
     else:
         allowed = eps + ROUNDED * jnp.finfo(dtype).eps
-        solved = (found.status == Status.SOLVED) & (worst(terms[:1], allowed)[1] <= allowed)
+        solved = (found.status == Status.SOLVED) & (worst(terms[:1], allowed)[1][0] <= allowed)
     lost = jnp.where(found.status == Status.SOLVED, Status.INACCURATE, found.status)
     return replace(found, status=jnp.where(solved, Status.SOLVED, lost).astype(jnp.int32))
 

@@ -136,29 +136,28 @@ def joined(terms: Terms) -> tuple[Array, Array, Array]:
     return jnp.concatenate(values), jnp.concatenate(sizes), jnp.concatenate(terms)
 
 
-def worst(terms: Terms, floor: Any) -> tuple[Array, Array]:
-    """Return the largest of the residuals, each less floor·terms, relative to its size, and the
-    largest relative to size and terms; 0/0 is 0, and inf where one is NaN."""
-
-    def ratio(error: Array, size: Array) -> Array:
-        known = jnp.isfinite(size) & (size > 0)
-        none = jnp.where(error > 0, jnp.inf, 0.0)
-        return _largest(jnp.where(known, error / jnp.where(known, size, 1.0), none))
-
+def worst(terms: Terms, floor: Any) -> tuple[list[Array], list[Array]]:
+    """Return of each part the largest residual, each less floor·terms, relative to its size, and
+    the largest relative to size and terms; 0/0 is 0, and inf where one is not finite."""
     above, relative = [], []
     for values, sizes, own in terms:
         # A maximum need not propagate NaN (XLA on CPUs).
-        error = jnp.where(jnp.isfinite(values), jnp.abs(values), jnp.inf)
-        above.append(ratio(error - floor * (sizes + own), sizes))
-        relative.append(ratio(error, sizes + own))
-    return _largest_of(above), _largest_of(relative)
+        finite = jnp.isfinite(values) & jnp.isfinite(sizes) & jnp.isfinite(own)
+        error = jnp.where(finite, jnp.abs(values), jnp.inf)
+        least = jnp.finfo(error.dtype).tiny
+        size = jnp.where(finite, jnp.maximum(sizes, least), 1.0)
+        total = jnp.where(finite, size + own, 1.0)
+        above.append(_largest((error - floor * total) / size))
+        relative.append(_largest(error / total))
+    return above, relative
 
 
 def _largest(v: Array) -> Array:
     return jnp.max(v, initial=0.0)
 
 
-def _largest_of(numbers: list[Array]) -> Array:
+def largest_of(numbers: list[Array]) -> Array:
+    """Return the largest of some scalars."""
     found = numbers[0]
     for number in numbers[1:]:
         found = jnp.maximum(found, number)
@@ -179,8 +178,13 @@ class Measured:
     @classmethod
     def of(cls, terms: Terms, eps: Any, floor: float) -> "Measured":
         """Return the residuals with these terms, measured."""
+        return cls.from_ratios(terms, eps, worst(terms, floor)[0])
+
+    @classmethod
+    def from_ratios(cls, terms: Terms, eps: Any, above: list[Array]) -> "Measured":
+        """Return them where the first three of `worst` are known."""
         primal, dual, gap = (_largest(jnp.abs(values)) for values, *_ in terms)
-        return cls(primal, dual, gap, worst(terms, floor)[0] <= eps)
+        return cls(primal, dual, gap, largest_of(above[:3]) <= eps)
 
 
 @jax.tree_util.register_dataclass
@@ -228,10 +232,11 @@ def judgment(
     terms: Terms, eps: Any, floor: float, others: Terms = ()
 ) -> tuple[Measured, Array, Array, Array]:
     """Return what `Pair.of` says of the terms: the last four fields of the pair."""
-    above, relative = worst([*terms, *others], floor)
+    ratios, relatives = worst([*terms, *others], floor)
+    above, relative = largest_of(ratios), largest_of(relatives)
     at_rounding = (relative <= STALLED * floor) & (above <= 0.1 * eps)
     near = (above <= NEAR * eps) | at_rounding
-    return Measured.of(terms, eps, floor), above, near, above <= 0.1 * NEAR * eps
+    return Measured.from_ratios(terms, eps, ratios), above, near, above <= 0.1 * NEAR * eps
 
 
 def assess(

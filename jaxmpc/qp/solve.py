@@ -40,6 +40,7 @@ from jaxmpc.qp.residuals import (
     Pair,
     assess,
     concluded,
+    largest_of,
     marked,
     residual_terms,
     row_sizes,
@@ -224,7 +225,7 @@ def loop_kernel(
 
 def better(qp: QP, pair: tuple[Array, Array], other: tuple[Array, Array]) -> tuple:
     """Return the one of two pairs (z, y) with the smaller largest relative residual."""
-    error = lambda z, y: worst(residual_terms(qp, z, y), 0.0)[1]
+    error = lambda z, y: largest_of(worst(residual_terms(qp, z, y), 0.0)[1])
     take = lax.stop_gradient(error(*other) < error(*pair))
     return tuple(jnp.where(take, b, a) for a, b in zip(pair, other, strict=True))
 

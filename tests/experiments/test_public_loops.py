@@ -40,6 +40,7 @@ def test_aircraft_rides_on_the_limit_of_a_state(loops):
     assert record.passed
 
 
+@pytest.mark.slow
 def test_aircraft_without_weights_of_inputs(loops):
     """R = 0, where the outputs make the cost of the moves definite."""
     record = follow(replace(loops["aircraft 1"], references=((5, np.array([0, 0, 0, 10.0])),)), 5)

@@ -14,6 +14,7 @@ from jaxmpc.export import export_jax
 pytest.importorskip("flatbuffers")
 
 
+@pytest.mark.slow
 def test_a_batch_of_any_size_in_a_process_without_the_library(tmp_path):
     mpc = problems.joint_o_inf(6)
     export_jax(mpc, tmp_path / "joint.bin")

@@ -588,6 +588,7 @@ def test_applied_input_stays_within_its_limits():
     assert plan.status == jm.Status.SOLVED and -2 <= u[0] <= 2
 
 
+@pytest.mark.slow
 def test_problems_from_lists_and_whole_numbers_are_pytrees_of_float_arrays():
     """They can be differentiated and stacked like those from arrays."""
     lists = jm.MPC(

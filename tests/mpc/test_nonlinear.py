@@ -109,8 +109,8 @@ class TestSolution:
             np.testing.assert_allclose(plan.cost, expected.cost, rtol=1e-9)
             np.testing.assert_allclose(plan.slack, expected.slack, atol=1e-8)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("hessian", ["exact", "gauss-newton"])
-    @pytest.mark.first(1)
     def test_swing_up_is_ipopts(self, hessian, x64):
         """IPOPT 3.14 (CasADi 3.8, bounds relaxed by 1e-8) ends at 2242.82813 in 31 iterations."""
         plan = solve_nonlinear(swing_up(), np.array([0, np.pi, 0, 0]), hessian=hessian)

@@ -189,6 +189,7 @@ def call_controller(mpc, x0s):
 PRECISIONS = pytest.mark.parametrize("x64", [True, False], ids=["float64", "float32"])
 
 
+@pytest.mark.first(1)
 @PRECISIONS
 def test_plan_in_any_units(x64, optima):
     assert faults(solve, 1, x64, optima) == []
@@ -286,6 +287,7 @@ def unstable_faults(seeds, n=4):
     return wrong
 
 
+@pytest.mark.slow
 def test_unstable_plans_prestabilised_or_not():
     """|eigenvalue| of 1.42."""
     assert unstable_faults((0,)) == []

@@ -25,6 +25,7 @@ def test_status_agrees_with_the_proved_labels(plans, states):
     np.testing.assert_array_equal(plans.status == jm.Status.PRIMAL_INFEASIBLE, label == -1)
 
 
+@pytest.mark.slow
 def test_residuals_and_limits(plans):
     solved = plans.status == jm.Status.SOLVED
     for residual in (plans.primal_residual, plans.dual_residual, plans.gap):

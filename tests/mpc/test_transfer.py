@@ -76,6 +76,7 @@ def kkt_residual(mpc, x, plan):
     return max(worst, limits.max(), np.abs(plan.inputs).max() - float(mpc.inputs.upper[0]))
 
 
+@pytest.mark.slow
 def test_plans_are_those_of_the_solver(mpc, states, solved, few):
     found = jm.solve_many(mpc, states)
     same_plans(found, solved)

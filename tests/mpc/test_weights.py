@@ -94,7 +94,7 @@ ROUTES = {
 symmetrised = partial(jax.tree.map, lambda M: (M + M.T) / 2)
 
 
-@pytest.mark.first(3)
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", ROUTES)
 def test_raw_and_symmetrised_weights_mean_the_same(name):
     """A quadratic form knows the symmetric part alone: plans, costs and derivatives too."""
@@ -192,6 +192,7 @@ def test_singular_R_is_judged_by_the_whole_cost(name, unit):
         mpc.validate()
 
 
+@pytest.mark.slow
 def test_the_cure_for_a_singular_R_helps():
     mpc = without_effort()
     with pytest.raises(

@@ -80,7 +80,7 @@ def test_no_false_status_in_any_units(make, decades, x64):
     with jax.enable_x64(x64):
         qps = [rescaled(make(rng), rng, decades) for _ in range(COUNT)]
         status = np.asarray(solve(batch(qps, float if x64 else np.float32)).status)
-    assert set(status) <= {*allowed, jm.Status.ITERATION_LIMIT}
+    assert set(status) <= {*allowed, jm.Status.ITERATION_LIMIT, jm.Status.INACCURATE}
     if x64 and decades < 12:
         assert np.mean(np.isin(status, allowed)) >= 0.95
 

@@ -72,6 +72,7 @@ def test_every_integrator_in_both_precisions(integrator, order):
             np.testing.assert_allclose(after, wanted, rtol=0, atol=1e-12 if wide else 1e-6)
 
 
+@pytest.mark.slow
 def test_float32_states_while_64_bit_mode_is_on():
     """Numbers of MJX are in float64 then; states and models keep the type of what was given."""
     robot = jm.load_robot(swing("Euler"))

@@ -53,6 +53,7 @@ def learned(tmp_path_factory):
     return tune_penalties(mpc(), states(160, 0), cache=folder, **SETTINGS), folder
 
 
+@pytest.mark.slow
 def test_more_states_are_solved_on_others(learned):
     found, x = learned[0], states(300, 1)
     rows = len(jm.mpc.row_table(mpc()))
