@@ -6,7 +6,8 @@ for the status of a plan is computed from A, B, c, the weights and the rows them
 
     rows       v = H x_k + D u_k beyond its bounds, relative to the larger of |bounds| and |v|;
     dynamics   x_{k+1} − (A x_k + B u_k + c), relative to the largest value of the same state over
-               the horizon;
+               the horizon, and a small share of what it is made of, |A||x_k| + |B||u_k| + |c|: a
+               state that rests at 0 has no other size than that;
     inputs     the gradient of the Lagrangian g = Γ'(∂J/∂x + H'y) + Ω'(∂J/∂u + D'y), with the
                sensitivities Γ, Ω of the plan to its variables. In the metric of the Hessian, in
                which the cost is ½|w|² + const, it is how far the plan is from the best one for the
@@ -24,7 +25,7 @@ from jax import Array
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import blocks, split
-from jaxmpc.mpc.stages import apply, apply_transposed, at, spread
+from jaxmpc.mpc.stages import apply, apply_transposed, at, dynamics_terms, spread
 from jaxmpc.qp.admm import ADMM, Factor
 from jaxmpc.qp.precision import matmul, rounding
 from jaxmpc.qp.problem import QPSolution
@@ -122,10 +123,10 @@ def stated_terms(
 
     A, B = cast(mpc.system.A), cast(mpc.system.B)
     drift = jnp.zeros_like(x[0]) if mpc.system.c is None else cast(mpc.system.c)
-    free, forced = apply(A, x[:-1]), apply(B, u)
-    defects = x[1:] - (free + forced + drift)
-    terms = jnp.abs(free) + jnp.abs(forced) + jnp.abs(drift)
-    most = jnp.broadcast_to(jnp.max(jnp.abs(x), axis=0), terms.shape)
+    defects = x[1:] - (apply(A, x[:-1]) + apply(B, u) + drift)
+    terms = dynamics_terms(A, B, drift, x, u)
+    most = jnp.max(jnp.abs(x), axis=0) + SHARE * jnp.max(terms, axis=0)
+    most = jnp.broadcast_to(most, terms.shape)
     row_size = jnp.concatenate([*sizes, y[:0]])
     per_variable = 1 / jnp.sum(jnp.abs(factor.T), axis=1)
     return [

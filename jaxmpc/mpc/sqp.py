@@ -44,6 +44,7 @@ from jaxmpc.mpc.stages import (
     Stages,
     apply,
     cleaned,
+    dynamics_terms,
     judged,
     predict,
     riccati,
@@ -70,7 +71,7 @@ from jaxmpc.qp.linalg import cholesky
 from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.precision import arrays, precisely, rounding
-from jaxmpc.qp.residuals import Measured, Terms, assess
+from jaxmpc.qp.residuals import SHARE, Measured, Terms, assess
 from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
 from jaxmpc.reals import Reals
@@ -303,11 +304,13 @@ def costates(s: Stages, sample: Sample, u: Array, y: Array) -> Array:
     return jnp.concatenate([recurrence(s.A, g[:-1], g[-1], adjoint=True), g[-1:]])
 
 
-def defects(s: Stages, x: Array, u: Array) -> tuple[Array, Array]:
-    """Return f(x_k, u_k) − x_{k+1} (N, n) at the point of expansion, and the sizes of its terms."""
+def defects(s: Stages, x: Array, u: Array) -> tuple[Array, Array, Array]:
+    """Return f(x_k, u_k) − x_{k+1} (N, n) at the point of expansion, what it is compared with, and
+    its terms. A state that rests at 0 has no size but a small share of the latter."""
     parts = apply(s.A, x[:-1]), apply(s.B, u), s.c
-    sizes = sum(map(jnp.abs, parts), jnp.abs(x[1:]))
-    return parts[0] + parts[1] + parts[2] - x[1:], sizes
+    terms = dynamics_terms(s.A, s.B, s.c, x, u)
+    sizes = sum(map(jnp.abs, parts), jnp.abs(x[1:])) + SHARE * jnp.max(terms, axis=0)
+    return parts[0] + parts[1] + parts[2] - x[1:], sizes, terms
 
 
 def nonlinear_residuals(s: Stages, sample: Sample, u: Array, y: Array) -> Terms:
@@ -317,7 +320,7 @@ def nonlinear_residuals(s: Stages, sample: Sample, u: Array, y: Array) -> Terms:
     of_defects = defects(s, sample.states, u)
     joined = [
         jnp.concatenate([a, b.ravel()])
-        for a, b in zip(of_rows, (*of_defects, of_defects[1]), strict=True)
+        for a, b in zip(of_rows, of_defects, strict=True)
     ]
     return [(joined[0], joined[1], joined[2]), *rest]
 

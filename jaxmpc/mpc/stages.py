@@ -148,6 +148,11 @@ def apply_transposed(M: Array, v: Array) -> Array:
     return matmul(v, M) if M.ndim == 2 else matmul(v[..., None, :], M)[..., 0, :]
 
 
+def dynamics_terms(A: Array, B: Array, c: Array, x: Array, u: Array) -> Array:
+    """Return |A||x_k| + |B||u_k| + |c| (N, n), what x_{k+1} is made of."""
+    return apply(jnp.abs(A), jnp.abs(x[:-1])) + apply(jnp.abs(B), jnp.abs(u)) + jnp.abs(c)
+
+
 def stages(mpc: MPC) -> Stages:
     """Return the data of `mpc`. Works inside jit, vmap and grad."""
     system, n = mpc.system, mpc.system.n

@@ -287,6 +287,25 @@ def unstable_faults(seeds, n=4):
     return wrong
 
 
+def test_states_that_rest_at_zero():
+    """With orthogonal B and equal weights of inputs each state has a move of its own, so that two
+    of three states rest, but for rounding, while the first follows its reference."""
+    seeds = range(8)
+    with jax.enable_x64(True):
+        for seed in seeds:
+            rng = np.random.default_rng(seed)
+            B = np.linalg.qr(rng.standard_normal((3, 3)))[0] * 10.0 ** rng.uniform(-3, 3)
+            mpc = jm.MPC(
+                jm.LinearSystem(np.diag([1.0, 1.1, 0.9]), B), np.eye(3), np.eye(3), 8,
+                states=jm.Box([-2.0] * 3, [2.0] * 3),
+            )  # fmt: skip
+            aim = np.zeros((9, 3))
+            aim[:, 0] = 1.0
+            plan = jm.solve(mpc, np.zeros(3), aim)
+            assert plan.status == jm.Status.SOLVED, seed
+            assert np.abs(plan.states[:, 1:]).max() < 1e-12
+
+
 @pytest.mark.slow
 def test_unstable_plans_prestabilised_or_not():
     """|eigenvalue| of 1.42."""
