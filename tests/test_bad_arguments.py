@@ -184,7 +184,7 @@ CALLS = [
     ("Q: entries of type complex128 where", lambda: mpc(Q=np.eye(2) * 1j).validate()),
     ("Q: holds NaN or infinity. Give", lambda: mpc(Q=np.eye(2) * np.nan).validate()),
     ("Q: [[1, 2], [3]] is not an array of", lambda: mpc(Q=[[1, 2], [3]]).validate()),
-    ("R: is not positive definite, and at k = 2", lambda: mpc(R=0.0, Q=[0, 0]).validate()),
+    ("R: is not positive definite, and at k = 0", lambda: mpc(R=0.0, Q=[0, 0]).validate()),
     ("R: is not positive semidefinite", lambda: mpc(R=-1.0).validate()),
     ("R: '1' where real numbers are", lambda: mpc(R="1").validate()),
     ("R: shape () where (1, 1) is needed.", lambda: mpc(R=True).validate()),

@@ -174,6 +174,7 @@ class NonlinearMPC:
         """Raise ValueError for a bad problem, before any compile."""
         require_kind("mpc", self.mpc, MPC)
         self.mpc.validate()
+        self.mpc.require_unique_inputs()
         if not callable(getattr(self.model, "step", None)):
             fail("model", f"is a {type(self.model).__name__}", "Give f(x, u) -> x⁺, or its object")
         if not isinstance(self.tasks, tuple) or not all(isinstance(t, Task) for t in self.tasks):

@@ -126,8 +126,10 @@ class MPC:
     system: LinearSystem. Q (n, n) ⪰ 0, R (m, m) ⪰ 0, terminal_cost P (n, n) ⪰ 0 or None (no
     terminal cost); a vector is a diagonal, and a number will do for one state or input. Weights are
     symmetric; of one that is traced by JAX the symmetric part counts, in derivatives too. R need
-    not be definite where Q, P or input_rate_weight give every input a cost. states, inputs: Box,
-    Polytope or None; terminal_set: these or an Ellipsoid.
+    not be definite where Q, P or input_rate_weight give u_0, the input that is applied, a cost: it
+    is unique then. Later ones may have none, as the last has without an end cost; solvers stage by
+    stage and explicit laws need a cost of each. states, inputs: Box, Polytope or None;
+    terminal_set: these or an Ellipsoid.
     constrained_steps: the k in 0..N at which `states` hold, where that is another index set.
     outputs: `Outputs`, or a tuple of them; soft: `Soft`, or a tuple of them. stage_weights s (N,) >
     0: weighs the stages, Σ s_k (x_k'Q x_k + u_k'R u_k); None: all 1.
@@ -279,7 +281,7 @@ class MPC:
             if concrete(outputs.lower, outputs.upper):
                 Box(outputs.lower, outputs.upper).validate(f"outputs[{i}]")
         self._validate_rates()
-        self._require_unique_inputs()
+        self.require_unique_inputs(first=1)
 
     def _validate_steps(self) -> None:
         N = self.horizon
@@ -354,11 +356,15 @@ class MPC:
             if concrete(limit) and not np.all(np.asarray(limit, float) >= 0):
                 fail("input_rate_limit", f"{limit}", "|Δu| ≤ limit needs limit ≥ 0 (inf: none)")
 
-    def _require_unique_inputs(self) -> None:
-        """Raise where R is not definite and the other weights do not make up for it.
+    def require_unique_inputs(self, first: int = 0) -> None:
+        """Raise ValueError where R is not definite and the other weights do not make up for it.
+
+        first: the move from which on inputs may have no cost: 0, none of them; 1, all but the one
+        that is applied, as in tracking without an end cost.
 
         By a Riccati recursion for the state (x_k, u_{k−1}), which holds a blocked input too: the
-        Hessian of the condensed cost is definite where G = s R + W + B'SB is, at each free move.
+        Hessian of the condensed cost is definite where G = s R + W + B'SB is, at each free move;
+        where G is at k = 0, whatever the others are, all minimisers have the same u_0.
         """
         data = (self.system, self.Q, self.R, self.terminal_cost, self.stage_weights)
         if not concrete(data, self.input_rate_weight):
@@ -389,10 +395,12 @@ class MPC:
             terms = np.diag(abs(effort) + abs(W) + _form(move, size))
             unit = 1 / np.sqrt(np.where(terms > 0, terms, 1.0))
             values, axes = np.linalg.eigh(unit[:, None] * G * unit)
-            if values[0] <= FLAT:
-                self._refuse_flat(k, unit[:, None] * axes[:, values <= FLAT])
+            curved = values > FLAT
+            if not (curved.all() or 0 < first <= moves[k]):
+                self._refuse_flat(k, unit[:, None] * axes[:, ~curved])
             Y = move.T @ S @ free - np.hstack([np.zeros((m, n)), W])
-            K = -np.linalg.solve(G, Y)
+            axes = unit[:, None] * axes[:, curved]
+            K = -(axes / values[curved]) @ axes.T @ Y
             closed, rate = free + move @ K, K - np.hstack([np.zeros((m, n)), np.eye(m)])
             size = abs(cost) + _form(free, size) + _form(np.eye(n + m)[n:], abs(W))
             S = cost + closed.T @ S @ closed + K.T @ effort @ K + rate.T @ W @ rate

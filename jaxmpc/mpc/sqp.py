@@ -318,10 +318,7 @@ def nonlinear_residuals(s: Stages, sample: Sample, u: Array, y: Array) -> Terms:
     expansion, with the defects among the rows."""
     of_rows, *rest = stage_residuals(s, sample, u, y)
     of_defects = defects(s, sample.states, u)
-    joined = [
-        jnp.concatenate([a, b.ravel()])
-        for a, b in zip(of_rows, of_defects, strict=True)
-    ]
+    joined = [jnp.concatenate([a, b.ravel()]) for a, b in zip(of_rows, of_defects, strict=True)]
     return [(joined[0], joined[1], joined[2]), *rest]
 
 

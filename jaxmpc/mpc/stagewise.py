@@ -145,7 +145,9 @@ def checked(mpc: MPC, system: LinearSystem, solver: ADMM) -> MPC:
         if staged and shape[0] != mpc.horizon:
             fail(name, f"shape {shape}", f"A leading axis counts the {mpc.horizon} steps")
         first[name] = value[0] if staged and shape[0] else value
-    replace(mpc, system=replace(system, **first), prestabilise=None).validate()
+    at_first = replace(mpc, system=replace(system, **first), prestabilise=None)
+    at_first.validate()
+    at_first.require_unique_inputs()  # the recursion divides by R + B'SB
     mpc = replace(mpc, system=system, prestabilise=None)
     solver.validate(sum(len(steps) * size for _, steps, size in layout(mpc)))
     return mpc

@@ -176,20 +176,37 @@ def without_effort(same=False, units=(1.0, 1.0), **fields):
     if "input_rate_weight" in fields:
         fields["input_rate_weight"] = np.array(fields["input_rate_weight"]) * units[0]
     fields["R"] = fields["R"] * units[0]
-    return jm.MPC(system, horizon=N, states=jm.Box(-2, 2), inputs=jm.Box(-0.8, 0.8), **fields)
+    return jm.MPC(system, horizon=N, states=jm.Box(-2, 2), **{"inputs": jm.Box(-0.8, 0.8)} | fields)
 
 
 @pytest.mark.parametrize("name, unit", list(itertools.product(R_ZERO, (1.0, 1e-9, 1e9))))
 def test_singular_R_is_judged_by_the_whole_cost(name, unit):
-    """Definite or not, by an eigenvalue computation that shares nothing with the check; the unit
-    of the cost plays no part."""
+    """Whether all inputs, or the first alone, are unique, by an eigenvalue computation that shares
+    nothing with the check; the unit of the cost plays no part."""
     mpc = without_effort(units=(unit, unit), **R_ZERO[name])
-    H = hessian(mpc)
-    if np.linalg.eigvalsh(H)[0] > 1e-9 * np.linalg.eigvalsh(H)[-1]:
-        mpc.validate()
-        return
-    with pytest.raises(ValueError, match="R: is not positive definite, and at k = .*R or in"):
-        mpc.validate()
+    values, axes = np.linalg.eigh(hessian(mpc))
+    free = axes[:, values <= 1e-9 * values[-1]]
+    message = "R: is not positive definite, and at k = .*R or in"
+    for check, unique in (
+        (mpc.require_unique_inputs, not free.size),
+        (mpc.validate, np.abs(free[: mpc.system.m]).max(initial=0) < 1e-6),
+    ):
+        if unique:
+            check()
+        else:
+            with pytest.raises(ValueError, match=message):
+                check()
+
+
+def test_tracking_without_an_end_cost():
+    """No cost sees the last inputs; the first is unique, the limit of those with some effort."""
+    mpc = without_effort(inputs=jm.Box([-0.3, -0.2], [0.3, 0.2]))
+    with jax.enable_x64(True):
+        plan = jm.solve(mpc, X0)
+        near = jm.solve(replace(mpc, R=1e-6 * np.eye(2)), X0)
+    assert plan.status == near.status == jm.Status.SOLVED
+    np.testing.assert_allclose(plan.inputs[0], near.inputs[0], atol=1e-4)
+    assert plan.cost <= near.cost
 
 
 @pytest.mark.slow
@@ -198,7 +215,7 @@ def test_the_cure_for_a_singular_R_helps():
     with pytest.raises(
         ValueError, match=r"k = 3 no other weight gives u1, u2 a cost.* or give a t"
     ):
-        jm.solve(mpc, X0)
+        solve_stagewise(mpc, mpc.system, X0)
     for cure in (
         {"R": 1e-3 * np.eye(2)},
         {"input_rate_weight": [0.1, 0.1]},
