@@ -51,7 +51,7 @@ def admm_task(name: str, count: int) -> Task:
     mpc, x = family(name, count)
     c = jm.Controller(mpc)
     given = jax.jit(jax.vmap(lambda x: scaled(c.factor, c.condensed.qp(x))))(x)
-    q, bounds = single(given)
+    q, bounds, _ = single(given)
     made, m = single(c.factor), bounds.l.shape[1]
     alpha = jnp.float32(1.9)
     run = jax.jit(lambda q, b, t: iterate_batch(made, alpha, q, b, t, STEPS, ROUGH)[0])

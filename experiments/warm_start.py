@@ -55,18 +55,18 @@ def run(s: Settings) -> None:
     condensed, factor = controller.condensed, controller.factor
 
     def steps_to_solve(qp: QP, warm_start: tuple[Array, Array]) -> Array:
-        q, bounds = scaled(factor, qp)
+        q, bounds, unit = scaled(factor, qp)
 
         def look(carry: tuple[Array, Array, Array], _: None) -> tuple:
             t, count, needed = carry
             schedule = splittings(factor, q)
             t, _ = iterate(schedule, bounds, t, s.every, controller.solver.alpha)
-            pair = unscaled(qp, factor, *read(factor, t, q, bounds))
+            pair = unscaled(qp, factor, unit, *read(factor, t, q, bounds))
             done = jnp.max(jnp.stack(residuals(qp, *pair))) <= 1e-6
             count = count + s.every
             return (t, count, jnp.where(done & jnp.isinf(needed), count, needed)), None
 
-        carry = (warm(factor, qp, bounds, warm_start), 0.0, jnp.inf)
+        carry = (warm(factor, qp, unit, bounds, warm_start), 0.0, jnp.inf)
         return jax.lax.scan(look, carry, length=s.most // s.every)[0][2]
 
     def sample(carry: tuple[Array, jm.Plan], _: None) -> tuple:

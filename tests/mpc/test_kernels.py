@@ -99,6 +99,7 @@ def test_a_kernel_is_chosen_on_gpus_only(monkeypatch):
         return v**2
 
     scan = lambda v: v**2
+    monkeypatch.setattr(kernels, "on_gpu", lambda: False)
     assert kernels._or_kernel(scan, kernel, jnp.ones(3)).shape == (3,) and not calls
     monkeypatch.setattr(kernels, "on_gpu", lambda: True)
     kernels._or_kernel(scan, kernel, jnp.ones(33))

@@ -525,7 +525,7 @@ class TestTypes:
         (dict(Q=np.array([[1.0, 0.5], [0.0, 1.0]])), "Q.*symmetric"),
         (dict(Q=np.eye(3)), "Q"),
         (dict(Q=np.full((2, 2), np.nan)), "Q"),
-        (dict(R=np.zeros((1, 1)), terminal_cost=None), "R.*definite"),
+        (dict(Q=np.zeros((2, 2)), R=np.zeros((1, 1)), terminal_cost=None), "R.*definite"),
         (dict(R=-np.eye(1)), "R.*definite"),
         (dict(R=np.eye(2)), "R"),
         (dict(terminal_cost=-np.eye(2)), "terminal_cost"),
