@@ -76,7 +76,7 @@ def export_c(
     real = REAL[dtype]
     sizes["TOLERANCE"] = literal(tolerance, real)
     suffix = "f" if real == "float" else ""
-    macros = {key: f"{key.lower()}{suffix}" for key in ("FABS", "FMAX", "SQRT")}
+    macros = {key: f"{key.lower()}{suffix}" for key in ("FABS", "SQRT")}
     macros["ALPHA"] = literal(float(np.asarray(controller.solver.alpha)), real)
     texts = [
         template("mpc.h"), template("mpc.c"), sizes_header(sizes, real),

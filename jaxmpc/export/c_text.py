@@ -13,6 +13,11 @@ from jaxmpc.mpc.problem import MPC
 
 TEMPLATES = Path(__file__).parent
 REAL = {"float64": "double", "float32": "float"}
+# Headers of C99, which files of the same name would hide.
+HEADERS = (
+    "assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg "
+    "stdbool stddef stdint stdio stdlib string tgmath time wchar wctype"
+).split()
 # Endings of the files of a controller, in the order of their texts.
 KINDS = (".h", ".c", "_sizes.h", "_tables.h", "_example.c")
 
@@ -21,6 +26,8 @@ def require_c_names(name: str, dtype: str) -> None:
     """Raise ValueError for names that C does not take and types that are not offered."""
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         fail("name", f"{name!r}", "Give letters, digits and _, a letter first")
+    if name in HEADERS:
+        fail("name", f"{name!r}", f"{name}.h is a header of C: give another name")
     if dtype not in REAL:
         fail("dtype", f"{dtype!r}", 'Give "float64" or "float32"')
 
@@ -55,9 +62,8 @@ def write(paths: list[Path], texts: list[str], name: str, states: int) -> list[P
     import jaxmpc
 
     own = {"NAME": name, "VERSION": str(jaxmpc.__version__), "X0": " ".join(["0"] * states)}
-    for path, text in zip(paths, texts, strict=True):
-        for key, value in own.items():
-            text = text.replace(key, value)
+    for path, text in zip(paths, texts, strict=True):  # in one pass: the name may hold such a word
+        text = re.sub("|".join(own), lambda found: own[found[0]], text)
         path.write_text(text, encoding="utf-8")
     return paths
 

@@ -1,4 +1,9 @@
 /* NAME: the search tree; see NAME.h. Written by jaxmpc VERSION. */
+#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__) || \
+    defined(_M_FP_FAST)
+#error "Compile without -ffast-math: it takes the tests for NaN and infinity out"
+#endif
+
 #include "NAME.h"
 
 #include <math.h>
@@ -18,6 +23,7 @@ static real beyond(int i, const real *x) {
 
 static void clip(real *u) {
   for (int i = 0; i < M; i++) {
+    if (!isfinite(u[i])) u[i] = 0;
     if (u[i] < input_lower[i]) u[i] = input_lower[i];
     if (u[i] > input_upper[i]) u[i] = input_upper[i];
   }
@@ -41,8 +47,8 @@ int NAME_evaluate(const real x[NAME_PARAMETERS], real u[NAME_INPUTS]) {
     int region = leaf_region[node_inside[node] + j];
     real worst = (real)-INFINITY;
     for (int f = facet_begin[region]; f < facet_begin[region + 1]; f++) {
-      real over = facet_side[f] * beyond(facet_plane[f], x);
-      if (over > worst) worst = over;
+      real over = (real)facet_side[f] * beyond(facet_plane[f], x);
+      if (!(over <= worst)) worst = isfinite(over) ? over : (real)INFINITY;
     }
     if (worst < least) least = worst, best = region;
   }
@@ -50,6 +56,8 @@ int NAME_evaluate(const real x[NAME_PARAMETERS], real u[NAME_INPUTS]) {
     u[i] = law_offset[best * M + i];
     for (int k = 0; k < P; k++) u[i] += law_gain[(best * P + k) * M + i] * x[k];
   }
+  int finite = 1;
+  for (int i = 0; i < M; i++) finite = finite && isfinite(u[i]);
   clip(u);
-  return least <= NAME_TOLERANCE ? NAME_INSIDE : NAME_OUTSIDE;
+  return finite && least <= NAME_TOLERANCE ? NAME_INSIDE : NAME_OUTSIDE;
 }

@@ -5,6 +5,11 @@
  *     s = prox(t),  t <- t + ALPHA (E C (ZF r + ZQ q) - s),  r = 2s - t,
  * with ZF = M^-1 C'E RHO and ZQ = -M^-1, M = P + C'E RHO E C (Boyd et al. 2011, section 3.4.3).
  */
+#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__) || \
+    defined(_M_FP_FAST)
+#error "Compile without -ffast-math: it takes the tests for NaN and infinity out"
+#endif
+
 #include <math.h>
 #include <string.h>
 
@@ -30,25 +35,34 @@ static void product(int rows, int columns, const real *restrict A, const real *r
     for (int i = 0; i < rows; i++) out[i] += A[j * rows + i] * v[j];
 }
 
+/* The larger one; NaN where either is, which fmax drops. */
+static real larger(real a, real b) { return a >= b || a != a ? a : b; }
+
 static real largest(int count, const real *v, real most) {
-  for (int i = 0; i < count; i++) most = FMAX(most, FABS(v[i]));
+  for (int i = 0; i < count; i++) most = larger(most, FABS(v[i]));
   return most;
 }
 
-/* s = prox(t) for bounds l, u in scaled rows and penalties rho */
-static void project(const real *t, const real *l, const real *u, const real *rho, real *s) {
+static int all_finite(int count, const real *v) {
+  int finite = 1;
+  for (int i = 0; i < count; i++) finite = finite && isfinite(v[i]);
+  return finite;
+}
+
+/* s = prox(t) for bounds l, u in scaled rows and these penalties */
+static void project(const real *t, const real *l, const real *u, const real *penalty, real *s) {
   for (int i = 0; i < M; i++) {
     real v = t[i], p = v < l[i] ? l[i] : v > u[i] ? u[i] : v;
 #if NAME_SOFT
     if (isfinite(soft_linear[i])) {
-      real distance = FABS(v - p), over = distance - soft_linear[i] / rho[i];
+      real distance = FABS(v - p), over = distance - soft_linear[i] / penalty[i];
       if (over > 0) {
-        real slack = rho[i] / (rho[i] + soft_quadratic[i]) * over;
+        real slack = penalty[i] / (penalty[i] + soft_quadratic[i]) * over;
         p += v > p ? slack : -slack;
       }
     }
 #else
-    (void)rho;
+    (void)penalty;
 #endif
     s[i] = p;
   }
@@ -63,10 +77,44 @@ static void project(const real *t, const real *l, const real *u, const real *rho
 }
 
 static real clipped(int i, real u) {
+  if (!isfinite(u)) u = 0;
   return u < input_lower[i] ? input_lower[i] : u > input_upper[i] ? input_upper[i] : u;
 }
 
 void NAME_reset(NAME_memory *memory) { memset(memory, 0, sizeof *memory); }
+
+/* Where there is no plan: the last input if its rate counts, else zero, within the limits; the next
+ * call begins cold. */
+static int failed(int status, NAME_memory *memory, real *input, NAME_info *info) {
+  for (int i = 0; i < MU; i++) input[i] = clipped(i, NP > N ? memory->u[i] : 0);
+  NAME_reset(memory);
+  memcpy(memory->u, input, sizeof memory->u);
+  if (info) *info = (NAME_info){status, (real)INFINITY, (real)INFINITY};
+  return status;
+}
+
+/* b = E C ZQ q, and ZQ q in move, for the penalties of a stage. */
+static void offset(int stage, const real *q, real *move, real *b) {
+  product(NZ, NZ, ZQ + stage * NZ * NZ, q, 0, move);
+  product(M, NZ, C, move, 0, b);
+  for (int i = 0; i < M; i++) b[i] *= E[i];
+}
+
+/* What a step of ADMM adds to t, over ALPHA. */
+static void direction(int stage, const real *t, const real *l, const real *u, const real *b, real *d) {
+  real s[M + 1], r[M + 1];
+  project(t, l, u, rho + stage * M, s);
+  for (int i = 0; i < M; i++) r[i] = 2 * s[i] - t[i];
+#if NAME_THIN
+  real spare[NZ];
+  product(NZ, M, ZF + stage * NZ * M, r, 0, spare);
+  product(M, NZ, C, spare, 0, d);
+  for (int i = 0; i < M; i++) d[i] *= E[i];
+#else
+  product(M, M, G + stage * M * M, r, 0, d);
+#endif
+  for (int i = 0; i < M; i++) d[i] += b[i] - s[i];
+}
 
 /* Scaled t = s + v of the last plan, one step later. */
 static void warm_start(const NAME_memory *memory, const real *l, const real *u, real *t) {
@@ -101,19 +149,15 @@ int NAME_step(NAME_memory *memory, const real x[N], const real *state_reference,
               const real *input_reference, real input[MU], NAME_info *info) {
   real theta[NP], q[NZ], move[NZ], z[NZ], spare[NZ];
   /* One more than M, since an array needs a length. */
-  real shift[M + 1], l[M + 1], u[M + 1], t[M + 1], s[M + 1], r[M + 1], b[M + 1], image[M + 1];
+  real shift[M + 1], l[M + 1], u[M + 1], t[M + 1], s[M + 1], r[M + 1], b[M + 1], d[M + 1];
+  real image[M + 1], y[M + 1];
   real sum = 0;
 
   for (int i = 0; i < N; i++) sum += FABS(theta[i] = x[i]);
-  for (int i = N; i < NP; i++) theta[i] = memory->u[i - N]; /* input rates */
+  for (int i = N; i < NP; i++) theta[i] = clipped(i - N, memory->u[i - N]); /* input rates */
   for (int i = 0; i < N && state_reference; i++) sum += FABS(state_reference[i]);
   for (int i = 0; i < MU && input_reference; i++) sum += FABS(input_reference[i]);
-  if (!isfinite(sum)) {
-    NAME_reset(memory);
-    for (int i = 0; i < MU; i++) input[i] = memory->u[i] = clipped(i, 0);
-    if (info) *info = (NAME_info){NAME_NON_FINITE, (real)INFINITY, (real)INFINITY};
-    return NAME_NON_FINITE;
-  }
+  if (!isfinite(sum)) return failed(NAME_NON_FINITE, memory, input, info);
 
   memcpy(q, q_constant, sizeof q);
   product(NZ, NP, q_theta, theta, 1, q);
@@ -126,28 +170,28 @@ int NAME_step(NAME_memory *memory, const real x[N], const real *state_reference,
     u[i] = E[i] > 0 ? E[i] * (upper[i] - shift[i]) : (real)INFINITY;
     t[i] = 0;
   }
-  if (memory->warm) warm_start(memory, l, u, t);
+  offset(0, q, move, b);
+  if (memory->warm) {
+    /* From the last plan only where it is nearer than nothing: where the first step is shorter. */
+    real warm[M + 1], near = 0, cold = 0;
+    direction(0, t, l, u, b, d);
+    for (int i = 0; i < M; i++) cold += d[i] * d[i];
+    warm_start(memory, l, u, warm);
+    direction(0, warm, l, u, b, d);
+    for (int i = 0; i < M; i++) near += d[i] * d[i];
+    for (int i = 0; i < M && near < cold; i++) t[i] = warm[i]; /* NaN is not less */
+  }
 
   for (int stage = 0; stage < STAGES; stage++) {
     const real *now = rho + stage * M;
     if (stage) { /* the multiplier carries over: v changes with the penalty */
       project(t, l, u, now - M, s);
       for (int i = 0; i < M; i++) t[i] = s[i] + now[i - M] / now[i] * (t[i] - s[i]);
+      offset(stage, q, move, b);
     }
-    product(NZ, NZ, ZQ + stage * NZ * NZ, q, 0, move);
-    product(M, NZ, C, move, 0, b);
-    for (int i = 0; i < M; i++) b[i] *= E[i];
     for (int k = 0; k < NAME_ITERATIONS / STAGES; k++) {
-      project(t, l, u, now, s);
-      for (int i = 0; i < M; i++) r[i] = 2 * s[i] - t[i];
-#if NAME_THIN
-      product(NZ, M, ZF + stage * NZ * M, r, 0, spare);
-      product(M, NZ, C, spare, 0, image);
-      for (int i = 0; i < M; i++) image[i] *= E[i];
-#else
-      product(M, M, G + stage * M * M, r, 0, image);
-#endif
-      for (int i = 0; i < M; i++) t[i] += ALPHA * (image[i] + b[i] - s[i]);
+      direction(stage, t, l, u, b, d);
+      for (int i = 0; i < M; i++) t[i] += ALPHA * d[i];
     }
   }
 
@@ -163,36 +207,40 @@ int NAME_step(NAME_memory *memory, const real x[N], const real *state_reference,
   for (int i = 0; i < M; i++) {
     /* A row that no move changes keeps its limit or does not; its penalty has a slope. */
     real least = lower[i] - shift[i], top = upper[i] - shift[i];
-    real near = 0 < least ? least : 0 > top ? top : 0, y = 0;
+    real near = 0 < least ? least : 0 > top ? top : 0;
+    y[i] = 0;
     if (E[i] > 0) {
       near = s[i] / E[i];
-      y = E[i] * last[i] * (t[i] - s[i]);
+      y[i] = E[i] * last[i] * (t[i] - s[i]);
 #if NAME_SOFT
     } else if (isfinite(soft_linear[i])) {
-      y = near == 0 ? 0 : (near < 0 ? 1 : -1) * (soft_linear[i] + soft_quadratic[i] * FABS(near));
+      y[i] = near == 0 ? 0 : (near < 0 ? 1 : -1) * (soft_linear[i] + soft_quadratic[i] * FABS(near));
       near = image[i];
 #endif
     }
-    memory->y[i] = y;
-    primal = FMAX(primal, FABS(image[i] - near));
-    most_primal = FMAX(most_primal, FMAX(FABS(image[i]), FABS(near)));
+    primal = larger(primal, FABS(image[i] - near));
+    most_primal = larger(most_primal, larger(FABS(image[i]), FABS(near)));
   }
   product(NZ, NZ, P, z, 0, spare);
   most_dual = largest(NZ, spare, most_dual);
   for (int i = 0; i < NZ; i++) {
     real force = 0;
-    for (int j = 0; j < M; j++) force += C[i * M + j] * memory->y[j];
-    most_dual = FMAX(most_dual, FABS(force));
-    dual = FMAX(dual, FABS(spare[i] + q[i] + force));
+    for (int j = 0; j < M; j++) force += C[i * M + j] * y[j];
+    most_dual = larger(most_dual, FABS(force));
+    dual = larger(dual, FABS(spare[i] + q[i] + force));
   }
   primal /= most_primal, dual /= most_dual;
   int solved = primal <= NAME_TOLERANCE && dual <= NAME_TOLERANCE; /* false for NaN */
   int status = solved ? NAME_SOLVED : NAME_NOT_SOLVED;
-  if (info) *info = (NAME_info){status, primal, dual};
 
   memcpy(input, first_constant, MU * sizeof(real));
   product(MU, NP, first_theta, theta, 1, input);
   product(MU, NZ, first_z, z, 1, input);
+  if (!(all_finite(NZ, z) && all_finite(M, y) && all_finite(MU, input) && isfinite(primal) &&
+        isfinite(dual)))
+    return failed(NAME_OVERFLOW, memory, input, info);
+  if (info) *info = (NAME_info){status, primal, dual};
+  memcpy(memory->y, y, M * sizeof(real));
   memcpy(memory->z, z, sizeof z);
   memcpy(memory->theta, theta, sizeof theta);
   for (int i = 0; i < MU; i++) memory->u[i] = input[i] = clipped(i, input[i]);

@@ -2,6 +2,10 @@
  *
  * Each call runs a fixed number of ADMM steps: no memory is allocated, no loop depends on data.
  * One NAME_memory per controlled system, NAME_reset before the first call.
+ *
+ * u is finite and within its limits (if these are a box) for whatever x and memory hold. After
+ * NON_FINITE and OVERFLOW u is the last input where its rate is limited or weighed, else zero,
+ * within the limits, and the next call begins cold: one bad reading is forgotten after one sample.
  */
 #ifndef NAME_H
 #define NAME_H
@@ -15,7 +19,8 @@ extern "C" {
 enum {
   NAME_SOLVED = 1,      /* both residuals are below NAME_TOLERANCE */
   NAME_NOT_SOLVED = 2,  /* they are not: infeasible, or too few ADMM steps */
-  NAME_NON_FINITE = 3   /* x or the references hold NaN or infinity; u is clipped zero */
+  NAME_NON_FINITE = 3,  /* x or the references hold NaN or infinity */
+  NAME_OVERFLOW = 4     /* the numbers became too large on the way */
 };
 
 typedef struct {

@@ -20,6 +20,8 @@ from jaxmpc.mpc.plan import (
     Plan,
     WarmStart,
     answer,
+    applied,
+    carried,
     limited,
     sorted_multipliers,
 )
@@ -43,6 +45,10 @@ class Controller:
     afterwards. Its `shifted` form is the warm start, and its first input is the previous input
     (zero at the start). The plan is returned twice, as carry and as output of `jax.lax.scan`. When
     the plan is not SOLVED, u is still the first input of the best iterate: look at plan.status.
+    Of a state that is not finite the plan is NaN, u is finite: the last input where its rate is
+    limited or weighed, else zero, within the limits; and the carry is the last finite plan. A plan
+    is a warm start only where that is nearer to the solution than none: one bad reading, finite or
+    not, is forgotten with the next sample.
 
     `condensed` and `factor` are filled in at construction, which `dataclasses.replace` repeats and
     JAX, which rebuilds pytrees, does not. Each array has a buffer of its own: a controller may be
@@ -112,8 +118,7 @@ class Controller:
         References and previous_input as in `solve`; previous_input None: what the carry says.
         """
         given = self._checked(x, reference, input_reference, previous_input)
-        plan, u = self._in_two_parts(_sample, *given, carry, status=lambda found: found[0].status)
-        return u, plan, plan
+        return self._in_two_parts(_sample, *given, carry, status=lambda found: found[2].status)
 
     def shifted(self, plan: Plan) -> WarmStart:
         """The plan seen one sample later, as a warm start (`WarmStart.shifted`).
@@ -244,14 +249,15 @@ def _factor(condensed: Condensed, solver: ADMM) -> Factor:
 def _sample(
     controller: Controller, x: Array, reference: Any, input_reference: Any, previous_input: Any,
     carry: Plan | None, *, whole: bool,
-) -> tuple[Plan, Array]:  # fmt: skip
+) -> tuple[Array, Plan, Plan]:  # fmt: skip
     start, inputs = None, controller.mpc.inputs
     if carry is not None:
         start = controller.shifted(carry)
         if previous_input is None:  # read where the problem limits or weighs input rates
-            previous_input = limited(inputs, carry.inputs[0])
+            before = carry.inputs[0]
+            previous_input = limited(inputs, jnp.where(jnp.isfinite(before), before, 0.0))
     plan = _plan(controller, x, reference, input_reference, previous_input, start, whole=whole)
-    return plan, limited(inputs, plan.inputs[0])
+    return applied(controller.mpc, plan, previous_input), carried(plan, carry), plan
 
 
 @partial(jax.jit, static_argnames="whole")

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -132,6 +133,25 @@ def limited(inputs: Any, u: Array) -> Array:
         return u
     lower, upper = arrays((inputs.lower, inputs.upper))
     return jnp.clip(u, jnp.asarray(lower, u.dtype), jnp.asarray(upper, u.dtype))
+
+
+def applied(mpc: MPC, plan: Plan, last: Any) -> Array:
+    """Return the first input (m,) of a plan within the limits; where it is not finite `last`, the
+    input before (None: zero), if its rate is limited or weighed, and zero if not."""
+    u = plan.inputs[0]
+    hold = jnp.zeros_like(u)
+    if mpc.input_in_state and last is not None:
+        hold = jnp.where(jnp.isfinite(last), last, 0.0)
+    return limited(mpc.inputs, jnp.where(jnp.all(jnp.isfinite(u)), u, hold))
+
+
+def carried(plan: Plan, before: Plan | None) -> Plan:
+    """Return what a controller carries to the next sample: the plan, and where that is not finite
+    the one before (None: zeros). So a bad reading is forgotten with the next sample."""
+    read = plan.states, plan.inputs, plan.multipliers
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(read)]))
+    old = jax.tree.map(jnp.zeros_like, plan) if before is None else before
+    return jax.tree.map(lambda new, old: jnp.where(finite, new, old), plan, old)
 
 
 def cost(

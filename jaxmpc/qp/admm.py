@@ -454,6 +454,16 @@ def iterate(
     return t, previous
 
 
+def nearer(splitting: Splitting, bounds: Bounds, t: Array) -> Array:
+    """Return t (m,), or 0 where the first step from there is not longer than that from t.
+
+    A step is nonexpansive, so that what it moves t by never grows on the way. A warm start from the
+    plan of another state, far off, or with numbers that are no plan at all, is dropped this way."""
+    moved = lambda t: jnp.sum((splitting.step(t, bounds, 1.0) - t) ** 2)
+    none = jnp.zeros_like(t)
+    return jnp.where(jax.lax.stop_gradient(moved(t) < moved(none)), t, none)
+
+
 def start(bounds: Bounds, rho: Array, rows: Array, y: Array) -> Array:
     """t = s + v of a warm start: rows A w (m,) and multipliers y (m,), both scaled."""
     # Soft rows may stay outside their interval: s is what prox leaves of s + v.

@@ -20,6 +20,7 @@ from jaxmpc.qp.admm import (
     factor,
     harmless_matrices,
     iterate,
+    nearer,
     read,
     scaled_rows,
     splittings,
@@ -168,6 +169,7 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = 
     t = jnp.zeros_like(qp.l)
     if warm_start is not None:
         t = warm(factor, qp, unit, bounds, warm_start)
+        t = nearer(splittings(factor, q)[0], bounds, t)
     unrolled, refine = solver.differentiate == "unrolled", solver.newton_steps()
     rough = "float32" if refine and not unrolled else qp.q.dtype
     dtype = jnp.dtype(rough if solver.dtype is None else solver.dtype)
