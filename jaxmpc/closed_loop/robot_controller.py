@@ -12,7 +12,7 @@ from jaxmpc.checks import fail, whole
 from jaxmpc.control.sets import Box
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.nonlinear import NonlinearMPC, Task, task_layout
-from jaxmpc.mpc.plan import Plan, WarmStart, applied, carried, limited
+from jaxmpc.mpc.plan import Plan, WarmStart, anchored, applied, carried, limited
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import layout
 from jaxmpc.mpc.soften import soften
@@ -147,6 +147,7 @@ class RobotController:
             if start is None:
                 blank = jnp.zeros(sum(len(steps) * size for _, steps, size in rows), xi.dtype)
                 start = WarmStart(*self._resting(x, input_reference), blank)
+            start = anchored(start, xi)
             reference, targets = self._targets(problem, reference)
             plan = solve_nonlinear(
                 problem, xi, reference, self.solver, start, targets=targets, **given,

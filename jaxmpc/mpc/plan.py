@@ -110,6 +110,18 @@ class WarmStart(NamedTuple):
         )
 
 
+def anchored(start: WarmStart, x0: Array) -> WarmStart:
+    """Return the warm start moved to x0 (n,): its states keep their distances from the first.
+
+    So a plan from a bad reading, far off, is no worse a point of expansion than others. Distances
+    that are rounding, beside states that are large, count as none."""
+    d = start.states - start.states[0]
+    most = jnp.max(jnp.abs(start.states), axis=0)
+    noise = 1000 * jnp.finfo(d.dtype).eps * most
+    d = jnp.where(jnp.max(jnp.abs(d), axis=0) > noise, d, 0.0)
+    return start._replace(states=x0 + d)
+
+
 def answer(
     mpc: MPC, layout: Layout, found: QPSolution, fault: Array, states: Array, inputs: Array,
     reference: Any, input_reference: Any, previous_input: Any = None,
@@ -148,7 +160,7 @@ def applied(mpc: MPC, plan: Plan, last: Any) -> Array:
 def carried(plan: Plan, before: Plan | None) -> Plan:
     """Return what a controller carries to the next sample: the plan, and where that is not finite
     the one before (None: zeros). So a bad reading is forgotten with the next sample."""
-    read = plan.states, plan.inputs, plan.multipliers
+    read = plan.states, plan.inputs, plan.multipliers, plan.cost
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(read)]))
     old = jax.tree.map(jnp.zeros_like, plan) if before is None else before
     return jax.tree.map(lambda new, old: jnp.where(finite, new, old), plan, old)
