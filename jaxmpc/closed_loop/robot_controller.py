@@ -12,7 +12,7 @@ from jaxmpc.checks import fail, whole
 from jaxmpc.control.sets import Box
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.nonlinear import NonlinearMPC, Task, task_layout
-from jaxmpc.mpc.plan import Plan, WarmStart, anchored, applied, carried, limited
+from jaxmpc.mpc.plan import Plan, WarmStart, anchored, applied, limited
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import layout
 from jaxmpc.mpc.soften import soften
@@ -157,8 +157,7 @@ class RobotController:
             u = self._resting(x, input_reference)[1][0] if carry is None else carry.inputs[0]
             system = self.robot.linearize(x, limited(self.soft.inputs, u), exact=self.exact)
             plan = solve_stagewise(self.soft, system, xi, reference, self.solver, start, **given)
-        last = None if carry is None else carry.inputs[0]
-        return applied(self.soft, plan, last), carried(plan, carry), plan
+        return applied(self.soft, plan, carry, None if carry is None else carry.inputs[0])
 
     @property
     def problem(self) -> NonlinearMPC:

@@ -21,7 +21,6 @@ from jaxmpc.mpc.plan import (
     WarmStart,
     answer,
     applied,
-    carried,
     limited,
     sorted_multipliers,
 )
@@ -257,7 +256,7 @@ def _sample(
             before = carry.inputs[0]
             previous_input = limited(inputs, jnp.where(jnp.isfinite(before), before, 0.0))
     plan = _plan(controller, x, reference, input_reference, previous_input, start, whole=whole)
-    return applied(controller.mpc, plan, previous_input), carried(plan, carry), plan
+    return applied(controller.mpc, plan, carry, previous_input)
 
 
 @partial(jax.jit, static_argnames="whole")

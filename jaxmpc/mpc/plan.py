@@ -147,23 +147,22 @@ def limited(inputs: Any, u: Array) -> Array:
     return jnp.clip(u, jnp.asarray(lower, u.dtype), jnp.asarray(upper, u.dtype))
 
 
-def applied(mpc: MPC, plan: Plan, last: Any) -> Array:
-    """Return the first input (m,) of a plan within the limits; where it is not finite `last`, the
-    input before (None: zero), if its rate is limited or weighed, and zero if not."""
+def applied(mpc: MPC, plan: Plan, before: Plan | None, last: Any) -> tuple[Array, Plan, Plan]:
+    """Return what a controller gives for a plan: the first input (m,) within the limits, the plan
+    as what it carries to the next sample, and the plan.
+
+    Where the plan is not finite the input is `last`, the one before (None: zero), if its rate is
+    limited or weighed, else zero, and what is carried is the plan before (None: zeros). So a bad
+    reading is forgotten with the next sample."""
+    read = plan.states, plan.inputs, plan.multipliers, plan.cost
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(read)]))
     u = plan.inputs[0]
     hold = jnp.zeros_like(u)
     if mpc.input_in_state and last is not None:
         hold = jnp.where(jnp.isfinite(last), last, 0.0)
-    return limited(mpc.inputs, jnp.where(jnp.all(jnp.isfinite(u)), u, hold))
-
-
-def carried(plan: Plan, before: Plan | None) -> Plan:
-    """Return what a controller carries to the next sample: the plan, and where that is not finite
-    the one before (None: zeros). So a bad reading is forgotten with the next sample."""
-    read = plan.states, plan.inputs, plan.multipliers, plan.cost
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(read)]))
     old = jax.tree.map(jnp.zeros_like, plan) if before is None else before
-    return jax.tree.map(lambda new, old: jnp.where(finite, new, old), plan, old)
+    carry = jax.tree.map(lambda new, old: jnp.where(finite, new, old), plan, old)
+    return limited(mpc.inputs, jnp.where(finite, u, hold)), carry, plan
 
 
 def cost(

@@ -1,0 +1,103 @@
+"""One bad reading, NaN or far off: a finite input within the limits; the next sample forgets it."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+
+import jaxmpc as jm
+
+BASE = jm.MPC(
+    jm.LinearSystem([[1, 0.1], [0, 1]], [[0.005], [0.1]], dt=0.1), np.diag([10.0, 1]), [[0.1]], 8,
+    states=jm.Box([-1.0, -2], [1, 2]), inputs=jm.Box([-2.0], [2]),
+)  # fmt: skip
+BALL = {"terminal_set": jm.Ellipsoid(np.diag([4.0, 4]), 1.0)}
+RATES = {"input_rate_limit": 0.5}
+KINDS = {
+    "all": lambda: replace(jm.mpc.soften(BASE, 50.0), **BALL, **RATES),
+    "ball": lambda: replace(BASE, **BALL), "rates": lambda: replace(BASE, **RATES),
+    "box": lambda: BASE, "soft": lambda: jm.mpc.soften(BASE, 50.0),
+}  # fmt: skip
+READINGS = [np.nan, np.inf, -np.inf, 1e4, -1e8, 1e15, 1e200, -1.7e308]
+SAMPLES, AT = 8, 4
+GOOD = np.array([0.2, 0.0])
+
+
+def loop(controller, x):
+    """Inputs and plans along readings x (SAMPLES, n); beside each plan that of a controller which
+    has seen nothing but the last input."""
+
+    def sample(memory, x):
+        carry, last = memory
+        u, carry, plan = controller(x, carry)
+        cold = controller(x, replace(controller.start(x), inputs=jnp.broadcast_to(
+            last, plan.inputs.shape)))[2]  # fmt: skip
+        return (carry, u), (u, plan.status, plan.inputs[0], cold.status, cold.inputs[0])
+
+    memory = controller.start(x[0]), jnp.zeros(controller.mpc.system.m)
+    return jax.lax.scan(sample, memory, x)[1]
+
+
+def readings(good):
+    x = np.broadcast_to(good, (len(READINGS), SAMPLES, len(good))).copy()
+    x[:, AT, 0] = READINGS
+    return x
+
+
+@pytest.mark.first(1)
+@pytest.mark.parametrize("steps", [{}, {"refine": 0, "iterations": 200}], ids=["exact", "ADMM"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_controller(kind, steps):
+    with jax.enable_x64(True):
+        controller = jm.Controller(KINDS[kind](), jm.ADMM(**steps))
+        found = jax.jit(jax.vmap(partial(loop, controller)))(readings(GOOD))
+        u, status, planned, cold_status, cold = jax.tree.map(np.asarray, found)
+    assert np.isfinite(u).all() and np.abs(u).max() <= 2
+    if kind in ("rates", "all"):
+        assert np.abs(np.diff(u[:3, :, 0], axis=1)).max() <= 0.5 + 1e-9  # where there is no plan
+    assert (status[:3, AT] == jm.Status.NON_FINITE).all()
+    after = np.s_[:, AT + 1 :]
+    solved = status[after] == jm.Status.SOLVED
+    assert solved[cold_status[after] == jm.Status.SOLVED].all()
+    assert steps or solved.all()
+    np.testing.assert_allclose(planned[after][solved], cold[after][solved], atol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("linearize", ["set-point", "state", "trajectory"])
+def test_robot_controller(linearize):
+    pytest.importorskip("mujoco")
+    with jax.enable_x64(True):
+        robot = jm.load_robot("pendulum")
+        mpc = jm.robot_mpc(robot, horizon=8)
+        controller = jm.RobotController(robot, mpc, linearize=linearize)
+        good = np.zeros(robot.state_size) + 0.1
+        found = jax.jit(jax.vmap(partial(loop, controller)))(readings(good))
+        u, status, planned, cold_status, cold = jax.tree.map(np.asarray, found)
+    limits = robot.input_limits
+    assert np.isfinite(u).all() and (u >= limits.lower).all() and (u <= limits.upper).all()
+    after = np.s_[:, AT + 1 :]
+    np.testing.assert_array_equal(status[after], jm.Status.SOLVED)
+    size = np.abs(cold[after]).max()
+    np.testing.assert_allclose(planned[after], cold[after], atol=0.02 * size)
+
+
+def test_a_carry_that_is_not_finite():
+    """It counts as none, whoever made it."""
+    with jax.enable_x64(True):
+        controller = jm.Controller(KINDS["rates"]())
+        x = np.array(GOOD)
+        broken = jax.tree.map(lambda v: jnp.full_like(v, jnp.nan) if v.dtype == float else v,
+                              controller.start(jnp.asarray(x)))  # fmt: skip
+        u, carry, plan = controller(x, broken)
+        assert plan.status == jm.Status.SOLVED and np.isfinite(u).all()
+        np.testing.assert_allclose(u, controller(x)[0], atol=1e-8)
+
+
+def test_joint_without_rates_gives_zero():
+    u, _, plan = jm.Controller(problems.joint(5))(np.array([np.nan, 0.0]))
+    assert plan.status == jm.Status.NON_FINITE and u == 0
