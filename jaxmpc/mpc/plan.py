@@ -154,14 +154,15 @@ def applied(mpc: MPC, plan: Plan, before: Plan | None, last: Any) -> tuple[Array
     Where the plan is not finite the input is `last`, the one before (None: zero), if its rate is
     limited or weighed, else zero, and what is carried is the plan before (None: zeros). So a bad
     reading is forgotten with the next sample."""
-    read = plan.states, plan.inputs, plan.multipliers, plan.cost
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(read)]))
+    finite = jnp.isfinite(plan.cost)  # no state or input is NaN or infinite without it
     u = plan.inputs[0]
     hold = jnp.zeros_like(u)
     if mpc.input_in_state and last is not None:
         hold = jnp.where(jnp.isfinite(last), last, 0.0)
-    old = jax.tree.map(jnp.zeros_like, plan) if before is None else before
-    carry = jax.tree.map(lambda new, old: jnp.where(finite, new, old), plan, old)
+    start = lambda plan: (plan.states, plan.inputs, plan.multipliers)
+    old = jax.tree.map(jnp.zeros_like, start(plan)) if before is None else start(before)
+    kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), start(plan), old)
+    carry = replace(plan, states=kept[0], inputs=kept[1], multipliers=kept[2])
     return limited(mpc.inputs, jnp.where(finite, u, hold)), carry, plan
 
 

@@ -461,7 +461,8 @@ def nearer(splitting: Splitting, bounds: Bounds, t: Array) -> Array:
     plan of another state, far off, or with numbers that are no plan at all, is dropped this way."""
     moved = lambda t: jnp.sum((splitting.step(t, bounds, 1.0) - t) ** 2)
     none = jnp.zeros_like(t)
-    return jnp.where(jax.lax.stop_gradient(moved(t) < moved(none)), t, none)
+    here, there = jax.vmap(moved)(jax.lax.stop_gradient(jnp.stack([t, none])))
+    return jnp.where(here < there, t, none)
 
 
 def start(bounds: Bounds, rho: Array, rows: Array, y: Array) -> Array:
