@@ -31,7 +31,7 @@ from jaxmpc.feasible.map import mesh
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.stored_map import StoredMap
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.runs import versions, write_json
+from jaxmpc.runs import versions, write_results
 from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
 
 # States from which penalties are learned, at most.
@@ -141,7 +141,7 @@ class LinearSweep:
             "config": self.config.to_dict(),
             "versions": versions(),
         }
-        write_json(self.output / "summary.json", summary)
+        write_results(self.output / "summary.json", summary)
         what = {1: "length", 2: "area"}.get(dimension, "volume")
         units = self.config.system.state_units
         unit = " " + "·".join(units[i] for i in self.region.axes) if units else ""

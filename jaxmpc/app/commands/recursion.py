@@ -32,7 +32,7 @@ from jaxmpc.recursion import (
     recursive_feasibility,
     smallest_horizon,
 )
-from jaxmpc.runs import versions, write_arrays, write_json
+from jaxmpc.runs import sha256, versions, write_arrays, write_results
 
 FILES = ("summary.json", "recursion.npz", "recursion.png")
 
@@ -225,11 +225,12 @@ class Recursion:
             "steps": report.steps,
             "seconds": report.seconds,
             "config": config.to_dict("recursion"),
+            "sha256": sha256(self.output / "recursion.npz"),
             "versions": versions(),
         }
         if least is not None:
             summary["smallest_horizon"] = dataclasses.asdict(least)
-        write_json(self.output / "summary.json", summary)
+        write_results(self.output / "summary.json", summary)
         if report.states.shape[1] != 2:
             return ["summary.json", "recursion.npz"]
         from jaxmpc.app.plots.recursion import draw_recursion

@@ -36,7 +36,7 @@ from jaxmpc.robot_maps.set_point import deviations
 from jaxmpc.robot_maps.setting import RobotSetting
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import Robot
-from jaxmpc.runs import versions, write_arrays, write_json
+from jaxmpc.runs import versions, write_arrays, write_results
 
 # Points along each of two axes; total number of points for another number of axes.
 SIDE, POINTS = 32, 1024
@@ -244,7 +244,7 @@ class RobotMapCommand:
             summary["linear"]["recursion"] = {
                 name: str(getattr(report, name)) for name in ("strong", "law", "weak")
             } | {"counts": report.counts()}
-        write_json(self.output / "summary.json", summary)
+        write_results(self.output / "summary.json", summary)
         if rmap.points.shape[1] != 2:
             return ["summary.json", "robot_map.npz"]
         from jaxmpc.app.plots.robot_map import plot_robot_map
