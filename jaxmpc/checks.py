@@ -30,17 +30,19 @@ def fail(argument: str, problem: str, cure: str) -> NoReturn:
 STEERING = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
-def printable(text: str) -> str:
-    """Return a text for a terminal: what would steer it is written as an escape, but for ends of
-    lines."""
-    steers = lambda c: c != "\n" and unicodedata.category(c) in STEERING
+def printable(text: str, keep: str = "\n") -> str:
+    """Return a text for a terminal: what would steer it is written as an escape, but for the
+    characters to keep."""
+    if text.isascii() and text.isprintable():
+        return text
+    steers = lambda c: c not in keep and unicodedata.category(c) in STEERING
     return "".join(ascii(c)[1:-1] if steers(c) else c for c in text)
 
 
 def require_printable(argument: str, *names: str) -> None:
     """Raise where a name holds characters that steer a terminal."""
     for name in names:
-        if "\n" in name or printable(name) != name:
+        if printable(name, keep="") != name:
             cure = "Give a name without control characters"
             fail(argument, f"{ascii(name)} holds control characters", cure)
 

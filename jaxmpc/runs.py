@@ -19,10 +19,11 @@ from typing import Any, BinaryIO
 import jax
 import numpy as np
 
+from jaxmpc import __version__
 from jaxmpc.checks import fail, require_memory
 
-# Packages whose versions a result depends on.
-PACKAGES = ("jaxmpc", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "scipy", "zarr")
+# Packages, beside this one, whose versions a result depends on.
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "scipy", "zarr")
 
 
 # Bytes of a text file that is read, at most; that of a large problem has a tenth of it.
@@ -54,8 +55,8 @@ def differences(there: Any, here: Any, key: str = "") -> list[str]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of those of `PACKAGES` that are installed."""
-    found = {}
+    """Return the versions of this package and of those of `PACKAGES` that are installed."""
+    found = {"jaxmpc": __version__}
     for name in PACKAGES:
         with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
@@ -98,9 +99,9 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def text_within(path: Path, most: int = MOST_TEXT) -> str:
-    """Return the text of a file. Raises ValueError where it is longer than that many bytes, is no
-    text, or cannot be read."""
+def text_within(path: Path | str, most: int = MOST_TEXT, kind: str = "text") -> str:
+    """Return the text of a file of some kind. Raises ValueError where it is longer than that many
+    bytes, is no text, or cannot be read."""
     try:
         with open(path, "rb") as file:
             content = file.read(most + 1)
@@ -110,7 +111,8 @@ def text_within(path: Path, most: int = MOST_TEXT) -> str:
         fail(str(path), f"cannot be read ({error.strerror})", "Give a file that you can read")
     except UnicodeDecodeError:
         if size <= most:
-            fail(str(path), "is no text in UTF-8", "Give another file, or write it again")
+            what = f"is no {kind} (its bytes are not UTF-8)"
+            fail(str(path), what, "Give another file, or write it again")
     if size > most:
         what = f"{size:,} bytes are more than the {most:,} that are read"
         fail(str(path), what, "Give a smaller file")

@@ -566,7 +566,8 @@ def read(path: str | Path, check: Check = lambda attributes, axes: []) -> Stored
     try:
         return _read(path, group, check)
     except Exception as error:  # of zarr, its codecs, JSON: what damaged bytes may raise
-        return Stored.damaged(f"cannot be read: {reason(error)}")
+        text = reason(error)
+        return Stored.damaged(text if isinstance(error, ValueError) else f"cannot be read ({text})")
 
 
 def reason(error: Exception) -> str:

@@ -81,7 +81,7 @@ def verify(
         if not report and isinstance(path, Path) and (path.parent / "summary.json").exists():
             _compare_summary(path.parent / "summary.json", found, result)
     except Exception as error:  # what numbers that fit no problem may raise
-        result.problems.append(f"its labels cannot be proved again: {reason(error)}")
+        result.problems.append(f"its labels cannot be proved again ({reason(error)})")
     return result
 
 

@@ -51,9 +51,9 @@ class Bench:
 
     What it does
       Solves the same problems with jaxmpc and with each rival that can be imported (pip install
-      'jaxmpc[bench]'), all in this run, in turns, and judges every answer itself: primal residual,
-      dual residual and duality gap are recomputed in float64 from each (z, y). No solver's own
-      word counts. What is measured, by --what:
+      -e '.[bench]' in the folder of the source), all in this run, in turns, and judges every
+      answer itself: primal residual, dual residual and duality gap are recomputed in float64 from
+      each (z, y). No solver's own word counts. What is measured, by --what:
         labels     each state of a box proved feasible or infeasible (map_feasible_set); "with all
                    proofs" counts every plan and half-space, which else are made when used;
                    rivals look for the point of least norm that keeps the limits

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from jaxmpc.checks import MOST_COUNT, fail, printable
+from jaxmpc.checks import MOST_COUNT, fail
 
 if TYPE_CHECKING:
     from jaxmpc.feasible.store import Store
@@ -149,7 +149,7 @@ def open_folder(path: Path, *files: str) -> None:
 
 def print_table(rows: list[tuple[str, Any]], width: int) -> None:
     """Print names and values, one pair a line."""
-    print(printable("\n".join(f"  {name:<{width}} {value}" for name, value in rows)))
+    print("\n".join(f"  {name:<{width}} {value}" for name, value in rows))
 
 
 def model_hash(robot: "Robot") -> str:

@@ -11,7 +11,7 @@ import tyro
 
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import Switch, check_counts, option, print_table
-from jaxmpc.checks import printable, shown
+from jaxmpc.checks import shown
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.verification import Verification, find_store, verify
 
@@ -74,18 +74,18 @@ class Verify:
             found.problems.append("summary.json: is missing. Resume the sweep, which writes it")
         if not found.labels:
             rest = f" (and {len(found.problems) - 1} more)" if len(found.problems) > 1 else ""
-            print(printable(f"{path}: NOT VERIFIED: {found.problems[0]}{rest}"))
+            print(f"{path}: NOT VERIFIED: {found.problems[0]}{rest}")
             return 1
         decided = found.labels.get("feasible", 0) + found.labels.get("infeasible", 0)
         word = "verified" if decided else "nothing to verify, no state is labelled"
-        print(printable(f"{path}: {word if found.passed else 'NOT VERIFIED'}"))
+        print(f"{path}: {word if found.passed else 'NOT VERIFIED'}")
         rows = [(name, f"{count:>12,}") for name, count in found.labels.items()]
         rows += [("verified", f"{found.verified:>12,} of {decided:,}, {found.exactly:,} exactly")]
         print_table(
             [*rows, *_extremes(found), ("total", f"{time.perf_counter() - begun:.2f} s")], 12
         )
         for problem in found.problems[:SHOWN]:
-            print(printable(f"  FAILS: {problem}"))
+            print(f"  FAILS: {problem}")
         for index, reason in list(found.failures.items())[:SHOWN]:
             print(f"  FAILS: state {index} {reason}")
         more = len(found.problems[SHOWN:]) + len(list(found.failures)[SHOWN:])
