@@ -79,6 +79,9 @@ BOUNDS = {
 # Of each chunk; the last one adds a checksum of the file itself.
 CODECS = (ZstdCodec(), Crc32cCodec())
 
+# Bytes of the name of a dimension, at most; file systems have 255 for a name.
+MOST_NAME = 100
+
 # Most blocks of a store that is read. Its data are no larger than SMALL bytes, or so many times its
 # files: a sweep's are some 13 times as large, one number throughout is far more.
 MOST_BLOCKS, SMALL, MOST_COMPRESSED = 2**17, 2**28, 1000
@@ -137,9 +140,9 @@ def label_rows(labels: Labels) -> dict[str, np.ndarray]:
 def open_labels(
     path: str | Path, problem: FeasibilityProblem, along: Sequence[np.ndarray],
     config: Mapping[str, Any], chunk: int, fields: Mapping[str, Field] | None = None,
-    shard: tuple[int, int] | None = None,
+    **how: Any,
 ) -> "Store":  # fmt: skip
-    """Open the store of the labels of a grid; see `Store`.
+    """Open the store of the labels of a grid; how: to open it, see `Store`.
 
     along: the coordinates of the grid along each mapped state. fields: variables beside the labels.
     """
@@ -164,8 +167,7 @@ def open_labels(
     }  # fmt: skip
     attributes = {"problem": problem.plain()}
     return Store(
-        path, axes, all_fields, config, chunk, constants=constants, attributes=attributes,
-        shard=shard,
+        path, axes, all_fields, config, chunk, constants=constants, attributes=attributes, **how
     )  # fmt: skip
 
 
@@ -177,10 +179,18 @@ def _name_and_unit(label: str) -> tuple[str, str]:
 
 def dimension_names(names: Sequence[str], taken: Mapping[str, Any]) -> list[str]:
     """Return names of dimensions for mapped states: their own, without characters that a path
-    cannot hold; x0, x1, ... where these are not distinct or are the names of variables."""
+    cannot hold; x0, x1, ... where these are not distinct, or too long for a path, or have a meaning
+    in a store. Some file systems do not tell capital letters from others."""
     found = [re.sub(r"[^\w.\- ]", "_", name).strip(". ") for name in names]
-    known = {*taken, *BOUNDS, "checksum", "block", "state", "input", "time", "coordinate", "sample"}
-    if len(set(found)) < len(found) or not all(found) or known & set(found):
+    own = {"checksum", "block", "state", "input", "time", "coordinate", "sample", "zarr.json"}
+    known, bare = {*taken, *BOUNDS, *own}, [name.casefold() for name in found]
+    if (
+        len(set(bare)) < len(found)
+        or not all(found)
+        or known & {*found, *bare}
+        or any(len(name.encode()) > MOST_NAME for name in found)
+        or any(name.startswith("__") or name.endswith(".partial") for name in found)
+    ):
         return [f"x{i}" for i in range(len(found))]
     return found
 
@@ -192,6 +202,7 @@ class Store:
         self, path: str | Path, axes: Mapping[str, Constant], fields: Mapping[str, Field],
         config: Mapping[str, Any], chunk: int, *, constants: Mapping[str, Constant] | None = None,
         attributes: Mapping[str, Any] | None = None, shard: tuple[int, int] | None = None,
+        overwrite: bool = False, begun: Callable[[], None] = lambda: None,
     ) -> None:  # fmt: skip
         """Open the store at `path`, a folder or a URL, to write; make it where there is none.
 
@@ -199,13 +210,16 @@ class Store:
         `sample`. constants: further known variables. config: JSON data that describes the
         computation; attributes: JSON data that follow from it. chunk: samples of a block at most.
         shard: (i, n), 0 ≤ i < n, to write the blocks k with k mod n = i only, beside other
-        processes; None for all. `damaged` becomes the number of these blocks that were done and
-        whose data are not as written; they are to be computed again. Raises ValueError where the
-        store was made with another configuration, where another process writes (the same shard, or
-        all), or where something else lies there.
+        processes; None for all. overwrite: put a new store in the place of the one at `path`, once
+        it has its first block: until then, and if that never comes, the old one stays as it is.
+        begun: is called when the store lies at `path`. `damaged` becomes the number of these blocks
+        that were done and whose data are not as written; they are to be computed again. Raises
+        ValueError where the store was made with another configuration, where another process writes
+        (the same shard, or all), or where something else lies there.
         """
         self.path, self.fields, self.damaged = location(path), dict(fields), 0
-        self.shard = shard
+        self.shard, self._begun = shard, begun
+        self._aside: Path | None = None
         self.constants = {**axes, **(constants or {})}
         self.shape = tuple(len(axis.data) for axis in axes.values())
         self.dimensions = tuple(axes)
@@ -234,7 +248,11 @@ class Store:
                 self._locks.append(_Lock(self.path.parent, shared=shard is not None))
             if shard is not None:
                 self._lock_file("{}-of-{}".format(*shard), f"computes shard {shard[0]}/{shard[1]}")
-            self._open()
+            if overwrite and exists(self.path):
+                self._open_aside(require_removable(self.path))
+            else:
+                self._open()
+                begun()
         except BaseException:
             self.close()
             raise
@@ -246,7 +264,10 @@ class Store:
         self.close()
 
     def close(self) -> None:
-        """Let other processes write."""
+        """Let other processes write. A new store without a block, that was to replace another, is
+        no more."""
+        if self._aside is not None:
+            shutil.rmtree(self._aside, ignore_errors=True)
         while self._locks:
             self._locks.pop().release()
 
@@ -333,6 +354,8 @@ class Store:
             array[region] = value
             written.append((name, value))
         _array(self.group, "checksum")[block] = checksum(dict(written))
+        if self._aside is not None:
+            self._replace(self._aside)
 
     def read(self, name: str, block: int | None = None) -> np.ndarray:
         """Return a variable (samples, ...), of one block or of all."""
@@ -373,14 +396,35 @@ class Store:
         self._require_configuration()
         self._repair()
 
-    def _create(self, path: Path) -> None:
-        """Create the store under a temporary name, then rename it to `path`, unless another process
-        was first."""
-        partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-        group = zarr.open_group(partial, mode="w", zarr_format=3, attributes=self.attributes)
+    def _open_aside(self, path: Path) -> None:
+        """Make a new store beside the one at `path`, and open it."""
+        self._remove_leftovers()
+        self._aside = aside = _side(path)
+        self._make(aside)
+        self.group = _open(aside, "r+")
+
+    def _replace(self, aside: Path) -> None:
+        """Put the new store in the place of the old one, and delete that."""
+        path = require_removable(self.path)
+        old = _side(path)
+        os.rename(path, old)
+        os.rename(aside, path)
+        self._aside, self.group = None, _open(path, "r+")
+        shutil.rmtree(old, ignore_errors=True)
+        self._begun()
+
+    def _make(self, path: Path) -> None:
+        """Make the store in a folder of its own."""
+        group = zarr.open_group(path, mode="w", zarr_format=3, attributes=self.attributes)
         for name in self._names():
             self._create_array(group, name)
         _consolidate(group)
+
+    def _create(self, path: Path) -> None:
+        """Create the store under a temporary name, then rename it to `path`, unless another process
+        was first."""
+        partial = _side(path)
+        self._make(partial)
         try:
             os.rename(partial, path)
         except OSError:
@@ -784,23 +828,38 @@ def open_dataset(path: str | Path) -> "xr.Dataset":
     return xr.open_zarr(path)
 
 
-def remove(path: str | Path) -> None:
-    """Delete the store at `path`, damaged or not; ValueError, and nothing deleted, where it is no
-    store."""
+def require_removable(path: str | Path) -> Path:
+    """Return the path of a store, damaged or not, that may be deleted; ValueError where it is none,
+    or a link to one: what others have put elsewhere is not deleted."""
     path = location(path)
     if not isinstance(path, Path):
         fail(path, "is a store of objects", "Delete it with the tools of that store")
+    if path.is_symlink():
+        what = f"is a link to {path.readlink()}, which is not deleted"
+        fail(str(path), what, "Remove the link, or choose another output")
     metadata = [path / "zarr.json", *path.glob("*/zarr.json")]
     if not any(file.is_file() for file in metadata):
         fail(str(path), "is no sweep store", "Choose another output folder")
     foreign = [v.name for v in path.iterdir() if not v.is_dir() and v.name != "zarr.json"]
     if foreign:
         fail(str(path), f"holds {foreign[0]}, which is of no store", "Choose another output folder")
+    return path
+
+
+def remove(path: str | Path) -> None:
+    """Delete the store at `path`, damaged or not; ValueError, and nothing deleted, where it is no
+    store."""
+    path = require_removable(path)
     lock = _Lock(path.parent)
     try:
         shutil.rmtree(path)
     finally:
         lock.release()
+
+
+def _side(path: Path) -> Path:
+    """Return a new name beside a path; what lies there is a leftover once its process has ended."""
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex}")
 
 
 def checksum(arrays: Mapping[str, np.ndarray]) -> int:

@@ -18,6 +18,7 @@ from jaxmpc.app.commands.options import (
     option,
     print_table,
     refuse,
+    remove_files,
 )
 from jaxmpc.checks import available_memory, fail, in_units, nearest
 from jaxmpc.runs import versions, write_json
@@ -136,7 +137,7 @@ class Bench:
         """
         command = self.settled()
         command.check()
-        open_folder(self.output, *FILES)
+        open_folder(self.output)
         return Record(command).run()
 
     def settled(self) -> "Bench":
@@ -235,6 +236,7 @@ class Record:
             self.complete = True
         except KeyboardInterrupt:
             print("\nstopped; what was measured is kept")
+        remove_files(self.command.output, *FILES)
         self.write()
         files = ["bench.json", *self.draw()]
         print_table([("files", " ".join(str(self.command.output / name) for name in files))], 6)

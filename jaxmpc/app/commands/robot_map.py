@@ -17,6 +17,7 @@ from jaxmpc.app.commands.options import (
     check_results,
     model_hash,
     open_folder,
+    remove_files,
     report_damage,
 )
 from jaxmpc.app.config.states import axis_indices, grid_ends
@@ -163,10 +164,12 @@ class RobotMapCommand:
             "period": robot.dt,
             **self.settings,
         }
-        open_folder(self.output, "robot_map.npz", "robot_map.png", "summary.json")
-        if path.exists() and self.overwrite:
-            store.remove(path)
-        kept = store.open_labels(path, setting.problem, along, config, setting.chunk(None), LOOPS)
+        open_folder(self.output)
+        old = "robot_map.npz", "robot_map.png", "summary.json"
+        kept = store.open_labels(
+            path, setting.problem, along, config, setting.chunk(None), LOOPS,
+            overwrite=self.overwrite, begun=lambda: remove_files(self.output, *old),
+        )  # fmt: skip
         report_damage(kept)
         return setting, config, kept, compiling
 
