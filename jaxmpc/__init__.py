@@ -66,6 +66,9 @@ if TYPE_CHECKING:
     from jaxmpc.tuning.weights import tune_weights
     from jaxmpc.workflow import design, offline_report
 
+# Here and not in the metadata of an installation, which a source tree on the path has none of.
+__version__ = "0.1.0"
+
 __all__ = [
     "ADMM",
     "MPC",
@@ -156,10 +159,6 @@ HOMES = {
 
 def __getattr__(name: str) -> Any:
     """Import a name when it is first used."""
-    if name == "__version__":
-        from importlib.metadata import version
-
-        return version(__name__)
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     home = next((home for home, names in HOMES.items() if name in names.split()), None)

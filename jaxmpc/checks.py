@@ -9,6 +9,7 @@ import difflib
 import math
 import os
 import shutil
+import unicodedata
 from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,7 +23,33 @@ MOST_COUNT = 2**31 - 1
 
 def fail(argument: str, problem: str, cure: str) -> NoReturn:
     """Raise a ValueError that names the argument, what is wrong, and what to do."""
-    raise ValueError(f"{argument}: {problem}. {cure}")
+    raise ValueError(printable(f"{argument}: {problem}. {cure}"))
+
+
+# Kinds of characters (Unicode) that steer a terminal or a text and show nothing themselves.
+STEERING = ("Cc", "Cf", "Cs", "Zl", "Zp")
+
+
+def printable(text: str, keep: str = "\n") -> str:
+    """Return a text for a terminal: what would steer it is written as an escape, but for the
+    characters to keep."""
+    if text.isascii() and text.isprintable():
+        return text
+    steers = lambda c: c not in keep and unicodedata.category(c) in STEERING
+    return "".join(ascii(c)[1:-1] if steers(c) else c for c in text)
+
+
+def require_printable(argument: str, *names: str) -> None:
+    """Raise where a name holds characters that steer a terminal."""
+    for name in names:
+        if printable(name, keep="") != name:
+            cure = "Give a name without control characters"
+            fail(argument, f"{ascii(name)} holds control characters", cure)
+
+
+def installing(extra: str) -> str:
+    """Return how to install an extra: from the source, as this package is on no index."""
+    return f"pip install -e '.[{extra}]' in the folder of jaxmpc's source"
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
@@ -41,8 +68,8 @@ def require_kind(argument: str, value: Any, *kinds: type) -> None:
 def require_package(package: str, extra: str) -> None:
     """Raise ImportError, which names the extra to install, where a package is not there."""
     if find_spec(package) is None:
-        cure = f"pip install 'jaxmpc[{extra}]', or '.[{extra}]' in a checkout"
-        raise ImportError(f"{package} is not installed. Install it: {cure}", name=package)
+        what = f"{package} is not installed. Install it: {installing(extra)}"
+        raise ImportError(what, name=package)
 
 
 def require_memory(argument: str, needed: float, cure: str) -> None:
@@ -103,8 +130,12 @@ def whole(argument: str, value: Any, least: int) -> int:
 
 def shown(value: Any) -> str:
     """Return a value as text of one line and less than 60 characters."""
-    text = " ".join(repr(value).split())
-    return text if len(text) < 60 else f"{text[:56]}..."
+    return shortened(" ".join(repr(value).split()), 60)
+
+
+def shortened(text: str, most: int = 300) -> str:
+    """Return a text, cut where it is not shorter than `most` characters."""
+    return text if len(text) < most else f"{text[: most - 4]}..."
 
 
 def require_real(argument: str, value: Any) -> None:

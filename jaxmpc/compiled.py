@@ -3,6 +3,7 @@
 import os
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ClassVar
@@ -59,12 +60,14 @@ class Compiled:
 
     seconds = 0.0
     listeners: ClassVar[list[Callable[[], None]]] = []
+    everyone: ClassVar["weakref.WeakSet[Compiled]"] = weakref.WeakSet()
 
     def __init__(self, function: Any, places: Any = None) -> None:
         self.function = function
         self.places = places
         self.programs: dict[Any, Any] = {}
         self._compiles = threading.Lock()
+        self.everyone.add(self)
 
     def __call__(self, *args: Any) -> Any:
         return jax.device_get(self.run(*args))
@@ -92,6 +95,15 @@ class Compiled:
                 for listener in Compiled.listeners:
                     listener()
         return self.programs[key]
+
+
+def clear_programs() -> None:
+    """Free all programs of this process, those of JAX's own caches too. What is called again
+    compiles again."""
+    for each in list(Compiled.everyone):
+        with each._compiles:
+            each.programs.clear()
+    jax.clear_caches()
 
 
 def padded(x: np.ndarray, size: int) -> np.ndarray:

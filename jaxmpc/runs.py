@@ -7,6 +7,7 @@ new one. A fingerprint of all that determines a result tells whether a file belo
 import contextlib
 import hashlib
 import json
+import math
 import os
 import uuid
 import zipfile
@@ -18,8 +19,15 @@ from typing import Any, BinaryIO
 import jax
 import numpy as np
 
-# Packages whose versions a result depends on.
-PACKAGES = ("jaxmpc", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "scipy", "zarr")
+from jaxmpc import __version__
+from jaxmpc.checks import fail, require_memory
+
+# Packages, beside this one, whose versions a result depends on.
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "scipy", "zarr")
+
+
+# Bytes of a text file that is read, at most; that of a large problem has a tenth of it.
+MOST_TEXT = 2**24
 
 
 def fingerprint(plain: Any, *data: Any) -> str:
@@ -47,8 +55,8 @@ def differences(there: Any, here: Any, key: str = "") -> list[str]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of those of `PACKAGES` that are installed."""
-    found = {}
+    """Return the versions of this package and of those of `PACKAGES` that are installed."""
+    found = {"jaxmpc": __version__}
     for name in PACKAGES:
         with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
@@ -64,6 +72,65 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, document: Any) -> None:
     """Write a JSON file atomically; see `as_json`."""
     write_text(path, json.dumps(as_json(document), indent=2, allow_nan=False) + "\n")
+
+
+def write_results(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a JSON file with a hash of its own, by which damage to it is found."""
+    plain = as_json(document)
+    write_json(path, {**plain, "digest": fingerprint(plain)})
+
+
+def read_results(path: Path) -> tuple[dict[str, Any], str]:
+    """Return what `write_results` wrote, and what is wrong with it, "" where nothing is.
+
+    Raises ValueError where it cannot be read.
+    """
+    found = faithful(path.name, text_within(path))
+    if not isinstance(found, dict):
+        fail(path.name, "holds no results", "Run the command again")
+    digest = found.pop("digest", None)
+    same = digest == fingerprint(found)
+    return found, "" if same else f"{path.name}: is not as it was written"
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 hash of a file, in hexadecimal digits."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def text_within(path: Path | str, most: int = MOST_TEXT, kind: str = "text") -> str:
+    """Return the text of a file of some kind. Raises ValueError where it is longer than that many
+    bytes, is no text, or cannot be read."""
+    try:
+        with open(path, "rb") as file:
+            content = file.read(most + 1)
+            size = max(os.fstat(file.fileno()).st_size, len(content))
+        text = content.decode("utf-8-sig")
+    except OSError as error:
+        fail(str(path), f"cannot be read ({error.strerror})", "Give a file that you can read")
+    except UnicodeDecodeError:
+        if size <= most:
+            what = f"is no {kind} (its bytes are not UTF-8)"
+            fail(str(path), what, "Give another file, or write it again")
+    if size > most:
+        what = f"{size:,} bytes are more than the {most:,} that are read"
+        fail(str(path), what, "Give a smaller file")
+    return text
+
+
+def faithful(name: str, text: str) -> Any:
+    """Return JSON data from text that is, but for white space, as Python writes them: a damaged
+    digit that rounding hides is damage too. Raises ValueError for other text."""
+    try:
+        found = json.loads(text)
+        bare = lambda v: "".join(v.split())
+        same = bare(json.dumps(found)) == bare(text)
+    except (ValueError, RecursionError, MemoryError):
+        same = False
+    if not same:
+        fail(name, "is no JSON, or not as it was written", "Write it again")
+    return found
 
 
 def as_json(value: Any) -> Any:
@@ -85,13 +152,28 @@ def write_arrays(path: Path, plain: Any = None, **arrays: Any) -> None:
 
 
 def read_arrays(path: Path) -> tuple[Any, dict[str, np.ndarray]] | None:
-    """Return the data and arrays that `write_arrays` wrote, or None without a valid file."""
+    """Return the data and arrays that `write_arrays` wrote, or None without a valid file, or where
+    they do not fit into memory."""
     try:
+        with zipfile.ZipFile(path) as parts:
+            for part in parts.infolist():
+                with parts.open(part) as member:
+                    _require_size(part, member)
+            require_memory(str(path), sum(part.file_size for part in parts.infolist()), "")
         with open(path, "rb") as file, np.load(file) as data:
             arrays = {name: data[name] for name in data.files}
         return json.loads(str(arrays.pop("record", "null"))), arrays
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+    except Exception:  # what damaged bytes may raise: of zip files, zlib, NumPy, JSON
         return None
+
+
+def _require_size(part: zipfile.ZipInfo, member: Any) -> None:
+    """Raise ValueError where an array claims more bytes than its part of a zip file has: NumPy
+    makes room for them before it reads."""
+    np.lib.format.read_magic(member)
+    shape, _, dtype = np.lib.format.read_array_header_1_0(member)  # type: ignore[no-untyped-call]
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize > part.file_size:
+        raise ValueError(f"{part.filename}: shape {shape}")
 
 
 def remove_partial(path: Path) -> None:

@@ -55,7 +55,7 @@ sys.exit(', '.join({late} & set(sys.modules)))"""
 def test_without_mujoco(monkeypatch, tmp_path):
     """The rest works, and a robot names what to install, in the command too."""
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(ImportError, match=r"mujoco is not installed.*jaxmpc\[robots\]"):
+    with pytest.raises(ImportError, match=r"mujoco is not installed.*-e '.\[robots\]\'"):
         jm.load_robot("joint")
     program = """import sys
 sys.modules["mujoco"] = None
@@ -66,7 +66,7 @@ sys.exit(main(["simulate", "--robot", "joint"]))"""
     run = functools.partial(subprocess.run, capture_output=True, text=True, cwd=tmp_path)
     done = run([sys.executable, "-c", program])
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
-    assert "jaxmpc[robots]" in done.stderr
+    assert "pip install -e '.[robots]'" in done.stderr
 
 
 def test_every_public_object_says_what_it_is():

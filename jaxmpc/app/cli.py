@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import tyro
 
 import jaxmpc
-from jaxmpc.app.report import report_error
+from jaxmpc.app.report import plain_output, report_error
 from jaxmpc.checks import fail, nearest
 
 # Module and class of each command: only the one that is called is imported.
@@ -49,6 +49,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         command = parse(argv)
     except (ValueError, OSError, AssertionError) as error:  # tyro asserts that it knows a shell
         return report_error(error)
+    with plain_output():
+        return run(command, argv)
+
+
+def run(command: Any, argv: Sequence[str]) -> int:
+    """Run a parsed command and return its exit code."""
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in the background
         signal.signal(signal.SIGINT, signal.default_int_handler)
     try:

@@ -7,6 +7,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from jaxmpc.checks import fail
+from jaxmpc.runs import text_within
+
 # What the commands write their results to.
 RESULTS = ("summary.json", "tuning.json", "penalties.json")
 STYLE = (
@@ -55,10 +58,13 @@ def table(title: str, values: dict[str, Any], level: int = 2) -> str:
 def folder_page(folder: Path) -> str:
     """Return the page of a folder that a command wrote: its results and its pictures.
 
-    Raises OSError where there are none, json.JSONDecodeError where they are damaged.
+    Raises ValueError where there are none, and where they are damaged.
     """
     found = next((folder / name for name in RESULTS if (folder / name).exists()), None)
-    document = json.loads((found or folder / RESULTS[0]).read_text(encoding="utf-8"))
+    document = json.loads(text_within(found or folder / RESULTS[0]))
+    if not isinstance(document, dict) or not isinstance(document.get("config", {}), dict):
+        fail(str(folder), "holds other results than commands write", "Run the command again")
+    document.pop("digest", None)
     config = document.pop("config", {})
     name = document.pop("name", None) or config.get("name") or folder.name
     pictures = [picture(path.stem, path.read_bytes()) for path in sorted(folder.glob("*.png"))]

@@ -10,13 +10,13 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from importlib.metadata import version
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmpc import __version__
 from jaxmpc.bench.families import LIMITS, box_states, family, problem
 from jaxmpc.bench.rivals import EMPTY, RIVALS, SOLVED, Batch, Rival, moreau, residuals
 from jaxmpc.bench.roofline import Ceilings, Work, best_seconds, free_memory, memory_of
@@ -327,7 +327,7 @@ def _own_labels(case: Case) -> Iterator[Contestant]:
 
         return {"proofs_microseconds": _best_each(fetched, len(x))}
 
-    yield Contestant("jaxmpc", version("jaxmpc"), len(x), prepare, judge, extra=extra)
+    yield Contestant("jaxmpc", __version__, len(x), prepare, judge, extra=extra)
 
 
 def rolled_out(mpc: MPC, x: Any, inputs: Any) -> Any:
@@ -399,7 +399,7 @@ def _own_plans(case: Case) -> Iterator[Contestant]:
             on_device()
         return counted[0]
 
-    release = version("jaxmpc")
+    release = __version__
     yield Contestant("jaxmpc vmap", release, len(x), on_device, judge, work=work)
     if jax.default_backend() == "cpu":
         make = lambda: lambda: solve_many(mpc, x, solver)
@@ -503,7 +503,7 @@ def _own_gradients(case: Case) -> Iterator[Contestant]:
         z, y = pair_of(c, plan)
         return judged(qps, case.tolerance, (z, y[:, moved], np.asarray(plan.status)))
 
-    yield _differentiated(case, OURS[0], version("jaxmpc"), len(x), loss, judge)
+    yield _differentiated(case, OURS[0], __version__, len(x), loss, judge)
 
 
 def _rival_gradients(case: Case, name: str, rival: Rival) -> Iterator[Contestant]:
@@ -621,6 +621,6 @@ def _own_loops(case: Case) -> Iterator[Contestant]:
         return {"forward_microseconds": spent}
 
     yield Contestant(
-        OURS[0], version("jaxmpc"), len(x), prepare, judge, per=SAMPLES, extra=extra,
+        OURS[0], __version__, len(x), prepare, judge, per=SAMPLES, extra=extra,
         work=lambda: Work.of(both, weights, there),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""RobotEnv: a robot as an environment of Gymnasium (`pip install 'jaxmpc[gymnasium]'`).
+"""RobotEnv: a robot as an environment of Gymnasium (`pip install -e '.[gymnasium]'`).
 
 import gymnasium
 env = gymnasium.make("jaxmpc.closed_loop.robot_env:jaxmpc/Robot-v0", robot="pendulum")

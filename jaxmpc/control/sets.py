@@ -23,6 +23,7 @@ from jaxmpc.checks import (
     concrete,
     fail,
     require_finite,
+    require_printable,
     require_real,
     require_shape,
     require_symmetric_psd,
@@ -684,6 +685,7 @@ def require_labels(argument: str, labels: Any, rows: int) -> None:
         fail(argument, f"{labels!r} is not a tuple of strings", 'Write it as ("q <= 1", "q >= -1")')
     if len(labels) not in (0, rows):
         fail(argument, f"{len(labels)} entries for {rows} rows", "Label all rows or none")
+    require_printable(argument, *labels)
 
 
 def _as_polytope(argument: str, value: Any) -> Polytope:

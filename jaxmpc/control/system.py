@@ -10,7 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from jaxmpc.checks import concrete, fail, nearest, require_finite, require_real, require_shape
+from jaxmpc.checks import (
+    concrete,
+    fail,
+    nearest,
+    require_finite,
+    require_printable,
+    require_real,
+    require_shape,
+)
 from jaxmpc.pytrees import pytree
 from jaxmpc.reals import Reals
 
@@ -318,3 +326,4 @@ def _require_strings(argument: str, value: Any, count: int) -> None:
         fail(argument, f"{value!r} is not a tuple of strings", 'Write it as ("q", "dq")')
     if len(value) not in (0, count):
         fail(argument, f"{len(value)} entries where {count} are needed", "Give all or none")
+    require_printable(argument, *value)

@@ -34,7 +34,6 @@ shard is up to the caller there; two that do write the same data.
 import contextlib
 import hashlib
 import itertools
-import json
 import math
 import os
 import re
@@ -45,19 +44,19 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias
 
 import numpy as np
 import zarr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, in_units, require_memory, shortened, shown
 from jaxmpc.compiled import padded
 from jaxmpc.feasible.labels import PROOFS, Labels, OnDemand
 from jaxmpc.feasible.map import mesh
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.qp.status import Status
-from jaxmpc.runs import differences, fingerprint, versions
+from jaxmpc.runs import differences, faithful, fingerprint, text_within, versions
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -79,6 +78,13 @@ BOUNDS = {
 
 # Of each chunk; the last one adds a checksum of the file itself.
 CODECS = (ZstdCodec(), Crc32cCodec())
+
+# Bytes of the name of a dimension, at most; file systems have 255 for a name.
+MOST_NAME = 100
+
+# Most blocks of a store that is read. Its data are no larger than SMALL bytes, or so many times its
+# files: a sweep's are some 13 times as large, one number throughout is far more.
+MOST_BLOCKS, SMALL, MOST_COMPRESSED = 2**17, 2**28, 1000
 
 
 class Field(NamedTuple):
@@ -134,9 +140,9 @@ def label_rows(labels: Labels) -> dict[str, np.ndarray]:
 def open_labels(
     path: str | Path, problem: FeasibilityProblem, along: Sequence[np.ndarray],
     config: Mapping[str, Any], chunk: int, fields: Mapping[str, Field] | None = None,
-    shard: tuple[int, int] | None = None,
+    **how: Any,
 ) -> "Store":  # fmt: skip
-    """Open the store of the labels of a grid; see `Store`.
+    """Open the store of the labels of a grid; how: to open it, see `Store`.
 
     along: the coordinates of the grid along each mapped state. fields: variables beside the labels.
     """
@@ -161,8 +167,7 @@ def open_labels(
     }  # fmt: skip
     attributes = {"problem": problem.plain()}
     return Store(
-        path, axes, all_fields, config, chunk, constants=constants, attributes=attributes,
-        shard=shard,
+        path, axes, all_fields, config, chunk, constants=constants, attributes=attributes, **how
     )  # fmt: skip
 
 
@@ -174,10 +179,18 @@ def _name_and_unit(label: str) -> tuple[str, str]:
 
 def dimension_names(names: Sequence[str], taken: Mapping[str, Any]) -> list[str]:
     """Return names of dimensions for mapped states: their own, without characters that a path
-    cannot hold; x0, x1, ... where these are not distinct or are the names of variables."""
+    cannot hold; x0, x1, ... where these are not distinct, or too long for a path, or have a meaning
+    in a store. Some file systems do not tell capital letters from others."""
     found = [re.sub(r"[^\w.\- ]", "_", name).strip(". ") for name in names]
-    known = {*taken, *BOUNDS, "checksum", "block", "state", "input", "time", "coordinate", "sample"}
-    if len(set(found)) < len(found) or not all(found) or known & set(found):
+    own = {"checksum", "block", "state", "input", "time", "coordinate", "sample", "zarr.json"}
+    known, bare = {*taken, *BOUNDS, *own}, [name.casefold() for name in found]
+    if (
+        len(set(bare)) < len(found)
+        or not all(found)
+        or known & {*found, *bare}
+        or any(len(name.encode()) > MOST_NAME for name in found)
+        or any(name.startswith("__") or name.endswith(".partial") for name in found)
+    ):
         return [f"x{i}" for i in range(len(found))]
     return found
 
@@ -189,6 +202,7 @@ class Store:
         self, path: str | Path, axes: Mapping[str, Constant], fields: Mapping[str, Field],
         config: Mapping[str, Any], chunk: int, *, constants: Mapping[str, Constant] | None = None,
         attributes: Mapping[str, Any] | None = None, shard: tuple[int, int] | None = None,
+        overwrite: bool = False, begun: Callable[[], None] = lambda: None,
     ) -> None:  # fmt: skip
         """Open the store at `path`, a folder or a URL, to write; make it where there is none.
 
@@ -196,13 +210,16 @@ class Store:
         `sample`. constants: further known variables. config: JSON data that describes the
         computation; attributes: JSON data that follow from it. chunk: samples of a block at most.
         shard: (i, n), 0 ≤ i < n, to write the blocks k with k mod n = i only, beside other
-        processes; None for all. `damaged` becomes the number of these blocks that were done and
-        whose data are not as written; they are to be computed again. Raises ValueError where the
-        store was made with another configuration, where another process writes (the same shard, or
-        all), or where something else lies there.
+        processes; None for all. overwrite: put a new store in the place of the one at `path`, once
+        it has its first block: until then, and if that never comes, the old one stays as it is.
+        begun: is called when the store lies at `path`. `damaged` becomes the number of these blocks
+        that were done and whose data are not as written; they are to be computed again. Raises
+        ValueError where the store was made with another configuration, where another process writes
+        (the same shard, or all), or where something else lies there.
         """
         self.path, self.fields, self.damaged = location(path), dict(fields), 0
-        self.shard = shard
+        self.shard, self._begun = shard, begun
+        self._aside: Path | None = None
         self.constants = {**axes, **(constants or {})}
         self.shape = tuple(len(axis.data) for axis in axes.values())
         self.dimensions = tuple(axes)
@@ -225,12 +242,17 @@ class Store:
             "fingerprint": _fingerprint(record, {k: v.data for k, v in self.constants.items()}),
             "versions": versions(),
         }
+        self.attributes["digest"] = _digest(self.attributes)
         try:
             if isinstance(self.path, Path):
                 self._locks.append(_Lock(self.path.parent, shared=shard is not None))
             if shard is not None:
                 self._lock_file("{}-of-{}".format(*shard), f"computes shard {shard[0]}/{shard[1]}")
-            self._open()
+            if overwrite and exists(self.path):
+                self._open_aside(require_removable(self.path))
+            else:
+                self._open()
+                begun()
         except BaseException:
             self.close()
             raise
@@ -242,7 +264,10 @@ class Store:
         self.close()
 
     def close(self) -> None:
-        """Let other processes write."""
+        """Let other processes write. A new store without a block, that was to replace another, is
+        no more."""
+        if self._aside is not None:
+            shutil.rmtree(self._aside, ignore_errors=True)
         while self._locks:
             self._locks.pop().release()
 
@@ -329,6 +354,8 @@ class Store:
             array[region] = value
             written.append((name, value))
         _array(self.group, "checksum")[block] = checksum(dict(written))
+        if self._aside is not None:
+            self._replace(self._aside)
 
     def read(self, name: str, block: int | None = None) -> np.ndarray:
         """Return a variable (samples, ...), of one block or of all."""
@@ -369,14 +396,35 @@ class Store:
         self._require_configuration()
         self._repair()
 
-    def _create(self, path: Path) -> None:
-        """Create the store under a temporary name, then rename it to `path`, unless another process
-        was first."""
-        partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-        group = zarr.open_group(partial, mode="w", zarr_format=3, attributes=self.attributes)
+    def _open_aside(self, path: Path) -> None:
+        """Make a new store beside the one at `path`, and open it."""
+        self._remove_leftovers()
+        self._aside = aside = _side(path)
+        self._make(aside)
+        self.group = _open(aside, "r+")
+
+    def _replace(self, aside: Path) -> None:
+        """Put the new store in the place of the old one, and delete that."""
+        path = require_removable(self.path)
+        old = _side(path)
+        os.rename(path, old)
+        os.rename(aside, path)
+        self._aside, self.group = None, _open(path, "r+")
+        shutil.rmtree(old, ignore_errors=True)
+        self._begun()
+
+    def _make(self, path: Path) -> None:
+        """Make the store in a folder of its own."""
+        group = zarr.open_group(path, mode="w", zarr_format=3, attributes=self.attributes)
         for name in self._names():
             self._create_array(group, name)
         _consolidate(group)
+
+    def _create(self, path: Path) -> None:
+        """Create the store under a temporary name, then rename it to `path`, unless another process
+        was first."""
+        partial = _side(path)
+        self._make(partial)
         try:
             os.rename(partial, path)
         except OSError:
@@ -520,7 +568,8 @@ class Stored:
     """A store as it lies on the disk, read without being changed.
 
     arrays: its variables (samples, ...), bounds and constants. done: how many of its `blocks` were
-    done. problems: what is wrong, a line each; none in a sound store.
+    done. problems: what is wrong, a line each; none in a sound store. whole: whether all of it was
+    read; where it is False the last problem is the reason, and arrays may be missing.
     """
 
     attributes: dict[str, Any]
@@ -529,6 +578,12 @@ class Stored:
     blocks: int
     done: int
     problems: list[str] = field(default_factory=list)
+    whole: bool = True
+
+    @classmethod
+    def damaged(cls, reason: str) -> "Stored":
+        """Return a store of which nothing can be used, for a reason."""
+        return cls({}, {}, {}, 0, 0, [reason], False)
 
     @property
     def points(self) -> np.ndarray:
@@ -538,64 +593,230 @@ class Stored:
         return mesh(list(self.axes.values()))
 
 
-def read(path: str | Path) -> Stored:
-    """Read a store and compare it with its checksums; raises ValueError where there is none."""
-    path = location(path)
-    group = _open(path, "r")
-    found: dict[str, Any] = dict(group.attrs)
-    problems: list[str] = []
+# What looks at attributes and axes before data are read, and returns what is wrong with them.
+Check: TypeAlias = Callable[[Mapping[str, Any], Mapping[str, np.ndarray]], list[str]]
 
-    def load(name: str) -> np.ndarray | None:
+
+def read(path: str | Path, check: Check = lambda attributes, axes: []) -> Stored:
+    """Read a store and compare it with its checksums; raises ValueError where there is none.
+
+    Metadata come first: nothing is read that is larger than they and the files allow, and nothing
+    but axes and constants before the fingerprint is found to be theirs. check: looks at these.
+    """
+    path = location(path)
+    if isinstance(path, Path) and (path / "zarr.json").is_file():
+        text_of(path, "zarr.json")  # raises for what is too large to be metadata
+    group = _open(path, "r")
+    try:
+        return _read(path, group, check)
+    except Exception as error:  # of zarr, its codecs, JSON: what damaged bytes may raise
+        text = reason(error)
+        return Stored.damaged(text if isinstance(error, ValueError) else f"cannot be read ({text})")
+
+
+def reason(error: Exception) -> str:
+    """Return an error as one line, with its kind unless it is one of values with a text."""
+    text = " ".join(str(error).split())
+    known = isinstance(error, ValueError) and text
+    return shortened(text if known else f"{type(error).__name__}: {text}")
+
+
+def _read(path: Path | str, group: zarr.Group, check: Check) -> Stored:
+    """Read an open store; raises where nothing can be said of its data."""
+    found, described = _described(path)
+    names, block = found["variables"], found["variables"]["block"]
+
+    def load(name: str) -> np.ndarray:
         try:
             return np.asarray(_array(group, name)[...])
         except Exception as error:
-            problems.append(f"{name}: cannot be read ({type(error).__name__})")
-            return None
+            fail(name, f"cannot be read ({type(error).__name__})", "Its file is damaged")
 
-    names = found.get("variables", {})
-    axes = {name: load(name) for name in names.get("axes", [])}
-    constants = {name: load(name) for name in names.get("constants", [])}
-    arrays = {name: load(name) for name in [*names.get("fields", []), "checksum"]}
-    record = {k: v for k, v in found.items() if k not in ("Conventions", "fingerprint", "versions")}
-    whole = {k: v for k, v in {**axes, **constants}.items() if v is not None}
-    if found["fingerprint"] != _fingerprint(record, whole):
-        problems.append("configuration, axes or constants are not as they were written")
-    try:
-        root = json.loads(text_of(path, "zarr.json"))
-        together = root["consolidated_metadata"]["metadata"]
-        same = all(
-            json.loads(text_of(path, f"{name}/zarr.json")) == one for name, one in together.items()
-        )
-    except (OSError, ValueError, LookupError, TypeError):
-        same = False
-    if not same:
-        problems.append("metadata of variables are not as they were written")
-    shape = tuple(0 if axis is None else len(axis) for axis in axes.values())
-    parts = regions(shape, tuple(names.get("block", shape)))
-    sums = arrays.pop("checksum")
-    sums = np.zeros(len(parts), np.uint64) if sums is None or len(sums) != len(parts) else sums
-    for block, region in enumerate(parts):
-        if not sums[block]:
-            continue
-        there = {
-            k: v for k, v in arrays.items() if v is not None and v.shape[: len(shape)] == shape
-        }
-        if sums[block] != checksum({k: v[region] for k, v in there.items()}):
-            problems.append(f"block {block}: data are not as they were written")
+    axes = {name: load(name) for name in names["axes"]}
+    constants = {name: load(name) for name in names["constants"]}
+    if found["fingerprint"] != _fingerprint(_record(found), {**axes, **constants}):
+        fail("zarr.json", "configuration, axes or constants are not as they were written",
+             "Overwrite it")  # fmt: skip
+    if problems := check(found, axes):
+        return Stored(found, {}, axes, 0, 0, problems, False)
+    shape = tuple(len(axis) for axis in axes.values())
+    parts = regions(shape, block)
+    marks = _marks(path, group, len(parts))
+    arrays = {name: load(name) for name in names["fields"]}
+    problems = []
+    for k in np.flatnonzero(marks):
+        if marks[k] != checksum({name: v[parts[k]] for name, v in arrays.items()}):
+            _require_files(path, arrays, parts[k], block, f"block {k}")
+            problems.append(f"block {k}: data are not as they were written")
     for name in BOUNDS:
-        try:
-            known = name in group
-        except Exception:  # garbled: `load` says so
-            known = True
-        if known and (value := load(name)) is not None:
-            if _array(group, name).attrs.get("checksum") != str(checksum({name: value})):
+        if name in described:
+            constants[name] = load(name)
+            stored = described[name]["attributes"].get("checksum")
+            if stored != str(checksum({name: constants[name]})):
                 problems.append(f"{name}: data are not as they were written")
-            constants[name] = value
-    flat = {
-        k: v.reshape(-1, *v.shape[len(shape) :]) for k, v in arrays.items() if v is not None
-    } | {k: v for k, v in constants.items() if v is not None}  # fmt: skip
-    sound = {k: v for k, v in axes.items() if v is not None}
-    return Stored(found, flat, sound, len(parts), int(np.count_nonzero(sums)), problems)
+    flat = {k: v.reshape(-1, *v.shape[len(shape) :]) for k, v in arrays.items()} | constants
+    return Stored(found, flat, axes, len(parts), int(np.count_nonzero(marks)), problems)
+
+
+def _record(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those attributes that the fingerprint covers beside axes and constants."""
+    others = ("Conventions", "fingerprint", "versions", "digest")
+    return {name: value for name, value in attributes.items() if name not in others}
+
+
+def _described(path: Path | str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the attributes of a store and the metadata of each variable. Raises ValueError where
+    they do not fit each other, or describe more than the files can hold; no data are read."""
+    root = faithful("zarr.json", text_of(path, "zarr.json"))
+    try:
+        found, together = root["attributes"], root["consolidated_metadata"]["metadata"]
+        names, block = found["variables"], found["variables"]["block"]
+        axes, fields = names["axes"], [*names["fields"]]
+        own = [*axes, *names["constants"], *fields, "checksum"]
+        digest = found.get("digest")
+        fine = (
+            digest in (None, _digest(found))
+            and all(
+                isinstance(name, str) and name and "/" not in name for name in [*own, *together]
+            )
+            and len(block) == len(axes) > 0
+            and all(type(size) is int and size > 0 for size in block)
+        )
+    except (LookupError, TypeError, AttributeError):
+        fine = False
+    if not fine:
+        fail("zarr.json", "attributes are not as they were written", "Overwrite it")
+    for name in dict.fromkeys([*own, *together]):
+        try:
+            same = faithful(name, text_of(path, f"{name}/zarr.json")) == together.get(name)
+        except (OSError, ValueError):
+            same = False
+        if not same:
+            fail(name, "metadata are missing or not as they were written", "Resume or overwrite it")
+    sizes = {name: _layout(name, one) for name, one in together.items()}
+    grid = tuple(math.prod(sizes[name].shape) for name in axes)
+    count = math.prod(-(-n // size) for n, size in zip(grid, block, strict=True))
+    if count > MOST_BLOCKS:
+        fail("zarr.json", f"describes {count:,} blocks", f"At most {MOST_BLOCKS:,} can be read")
+    last = {name: sizes[name].shape[len(grid) :] for name in fields}
+    if isinstance(found.get("problem"), dict):
+        last |= {k: v for k, v in tails(found["problem"]).items() if k in fields}
+    expected = {
+        name: Layout((*grid, *tail), (*block, *tail)) for name, tail in last.items()
+    } | {"checksum": Layout((count,), (1,))}  # fmt: skip
+    for name, layout in expected.items():
+        if sizes[name][:2] != layout[:2]:
+            what = f"shape {sizes[name].shape} where axes and problem say {layout.shape}"
+            fail(name, what, "Overwrite the store")
+    needed = sum(math.prod(v.shape) * v.itemsize for v in sizes.values())
+    there = needed if isinstance(path, str) else _stored_bytes(path)
+    if needed > max(SMALL, MOST_COMPRESSED * there):
+        what = f"describes {in_units(needed)} of data, its files hold {in_units(there)}"
+        fail("zarr.json", what, "Overwrite it")
+    require_memory("zarr.json", needed, "Read it on a larger machine")
+    return found, together
+
+
+class Layout(NamedTuple):
+    """Shape and chunks of a variable, and the bytes of one number."""
+
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+    itemsize: int = 8
+
+
+def _layout(name: str, one: Any) -> Layout:
+    """Return the layout that the metadata of a variable describe. Raises ValueError unless they are
+    such as `Store` writes."""
+    try:
+        shape, chunks = one["shape"], one["chunk_grid"]["configuration"]["chunk_shape"]
+        kind, codecs = one["data_type"], [codec["name"] for codec in one["codecs"]]
+        fine = (
+            all(type(size) is int and size >= 0 for size in [*shape, *chunks])
+            and codecs == ["vlen-utf8" if kind == "string" else "bytes", "zstd", "crc32c"]
+            and not one["storage_transformers"]
+            and len(shape) == len(chunks)
+            and isinstance(one["attributes"], dict)
+        )
+        size = 64 if kind == "string" else np.dtype(kind).itemsize
+    except (LookupError, TypeError):
+        fine = False
+    if not fine:
+        fail(name, "metadata are not such as are written here", "Overwrite the store")
+    return Layout(tuple(shape), tuple(chunks), size)
+
+
+def tails(problem: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+    """Return the shapes, a sample, of the variables that hold labels of a stored problem. Raises
+    ValueError unless its parts fit one another."""
+    try:
+        (n, m), N, d = np.shape(problem["B"]), problem["horizon"], len(problem["axes"])
+        moves, others, ball = problem["moves"], problem["others"]["index"], problem["ellipsoid"]
+        fine = (
+            np.shape(problem["A"]) == (n, n)
+            and np.shape(problem["c"]) == (n,)
+            and type(N) is int
+            and len(moves) == N > 0
+            and all(type(move) is int and 0 <= move < N for move in moves)
+            and sorted([*problem["axes"], *others]) == list(range(n))
+            and all(
+                np.shape(b["H"]) in ((len(b["lower"]), n), (0,))
+                and np.shape(b["D"]) in ((len(b["lower"]), m), (0,))
+                and len(b["lower"]) == len(b["upper"])
+                and all(type(k) is int and 0 <= k <= N for k in b["steps"])
+                and len(set(b["steps"])) == len(b["steps"])
+                for b in problem["rows"]
+            )
+            and (ball is None or len(np.shape(ball["P"])) == 2)
+        )  # fmt: skip
+    except (LookupError, TypeError, ValueError):
+        fine = False
+    if not fine:
+        fail("problem", "its matrices, horizon, rows and axes do not fit each other",
+             "Overwrite the store")  # fmt: skip
+    return {"plan": (N, m), "start": (n,), "cut_normal": (d,), "label": (), "status": (),
+            "cut_offset": ()}  # fmt: skip
+
+
+def _marks(path: Path | str, group: zarr.Group, count: int) -> np.ndarray:
+    """Return the checksums of all blocks, 0 of those that are not done."""
+    array, marks = _array(group, "checksum"), np.zeros(count, np.uint64)
+    if isinstance(path, str):
+        return np.asarray(array[:])
+    for file in (path / "checksum" / "c").glob("*"):
+        if not (file.name.isdecimal() and int(file.name) < count):
+            fail("checksum", f"holds {shown(file.name)}, which is of no block", "Overwrite it")
+        marks[int(file.name)] = array[int(file.name)]
+    return marks
+
+
+def _require_files(
+    path: Path | str, arrays: Mapping[str, np.ndarray], part: tuple[slice, ...],
+    block: Sequence[int], where: str,
+) -> None:  # fmt: skip
+    """Raise ValueError where a variable has no file of a block whose data are not as written. One
+    whose numbers are all the fill value has none either, which alone is no damage."""
+    place = [str(along.start // size) for along, size in zip(part, block, strict=True)]
+    for name, value in arrays.items():
+        tail = ["0"] * (value.ndim - len(part))
+        if isinstance(path, Path) and not path.joinpath(name, "c", *place, *tail).exists():
+            fail(where, f"data are not as they were written, {name} has no file", "Resume")
+
+
+def _stored_bytes(path: Path) -> int:
+    """Return the bytes of all files of a store. Raises ValueError where one is no ordinary file,
+    such as a pipe, which would be waited for."""
+    total = 0
+    for file in path.rglob("*"):
+        if not file.is_file() and not file.is_dir():
+            fail(str(file.relative_to(path)), "is no file", "Overwrite the store")
+        total += file.stat().st_size if file.is_file() else 0
+    return total
+
+
+def _digest(attributes: Mapping[str, Any]) -> str:
+    """Return a hash of all attributes: the fingerprint is of those that results depend on."""
+    return fingerprint({k: v for k, v in attributes.items() if k != "digest"})
 
 
 def open_dataset(path: str | Path) -> "xr.Dataset":
@@ -607,23 +828,38 @@ def open_dataset(path: str | Path) -> "xr.Dataset":
     return xr.open_zarr(path)
 
 
-def remove(path: str | Path) -> None:
-    """Delete the store at `path`, damaged or not; ValueError, and nothing deleted, where it is no
-    store."""
+def require_removable(path: str | Path) -> Path:
+    """Return the path of a store, damaged or not, that may be deleted; ValueError where it is none,
+    or a link to one: what others have put elsewhere is not deleted."""
     path = location(path)
     if not isinstance(path, Path):
         fail(path, "is a store of objects", "Delete it with the tools of that store")
+    if path.is_symlink():
+        what = f"is a link to {path.readlink()}, which is not deleted"
+        fail(str(path), what, "Remove the link, or choose another output")
     metadata = [path / "zarr.json", *path.glob("*/zarr.json")]
     if not any(file.is_file() for file in metadata):
         fail(str(path), "is no sweep store", "Choose another output folder")
     foreign = [v.name for v in path.iterdir() if not v.is_dir() and v.name != "zarr.json"]
     if foreign:
         fail(str(path), f"holds {foreign[0]}, which is of no store", "Choose another output folder")
+    return path
+
+
+def remove(path: str | Path) -> None:
+    """Delete the store at `path`, damaged or not; ValueError, and nothing deleted, where it is no
+    store."""
+    path = require_removable(path)
     lock = _Lock(path.parent)
     try:
         shutil.rmtree(path)
     finally:
         lock.release()
+
+
+def _side(path: Path) -> Path:
+    """Return a new name beside a path; what lies there is a leftover once its process has ended."""
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex}")
 
 
 def checksum(arrays: Mapping[str, np.ndarray]) -> int:
@@ -682,9 +918,9 @@ def location(path: str | Path) -> Path | str:
 
 
 def text_of(path: Path | str, name: str) -> str:
-    """Return the text of a file below a path or URL."""
+    """Return the text of a file of metadata below a path or URL; see `text_within`."""
     if isinstance(path, Path):
-        return (path / name).read_text()
+        return text_within(path / name)
     import fsspec
 
     with fsspec.open(f"{path}/{name}", "r") as file:

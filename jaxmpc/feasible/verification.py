@@ -6,7 +6,6 @@ be accurate: `exact_check.beyond` evaluates what they imply exactly. One half-sp
 states that it excludes.
 """
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +19,7 @@ from tqdm.std import tqdm
 from jaxmpc.checks import fail
 from jaxmpc.feasible.exact_check import Constraints, beyond, roll_out, roll_out_exactly
 from jaxmpc.qp.status import Status
-from jaxmpc.runs import read_arrays
+from jaxmpc.runs import read_arrays, read_results, sha256
 
 # Tangents to a terminal ellipsoid that a linear program gets at most.
 TANGENTS = 30
@@ -55,7 +54,7 @@ class Verification:
 
 def verify(
     path: str | Path, *, exact: bool = False, sample: int = 1000, seed: int = 0,
-    progress: bool = False,
+    progress: bool = False, check: Any = lambda attributes, axes: [],
 ) -> Verification:  # fmt: skip
     """Prove every label of a stored map again, from its plans, half-spaces and problem.
 
@@ -63,31 +62,50 @@ def verify(
     the folder of a report of `jaxmpc recursion`, whose counterexample, and next states that count
     as lost after one step, are proved again too. exact: all plans in exact arithmetic, else a
     random sample of them and those with margins near rounding, the others in float64; half-spaces
-    are exact always. Nothing is written. Raises ValueError where there is no store.
+    are exact always. What summary.json beside it counts is compared. check: takes the attributes
+    and axes of the store before its labels are read, and returns what is wrong with them. Nothing
+    is written. Where the store is damaged, `problems` says where, and no label is looked at unless
+    its data can be read. Raises ValueError where there is no store.
     """
-    from jaxmpc.feasible.store import read  # zarr takes longer to import than most reads
+    from jaxmpc.feasible.store import read, reason  # zarr takes longer to import than most reads
 
     path = find_store(path)
     report = isinstance(path, Path) and path.suffix == ".npz"
-    found = read_report(Path(path)) if report else read(path)
-    label, status = found.arrays.get("label"), found.arrays.get("status")
+    found = read_report(Path(path), check) if report else read(path, check)
     result = Verification({}, problems=list(found.problems))
+    if not found.whole:
+        return result
+    try:
+        with np.errstate(all="ignore"):  # of numbers that are no plans: they fail
+            _verify(found, report, exact, sample, seed, progress, result)
+        if not report and isinstance(path, Path) and (path.parent / "summary.json").exists():
+            _compare_summary(path.parent / "summary.json", found, result)
+    except Exception as error:  # what numbers that fit no problem may raise
+        result.problems.append(f"its labels cannot be proved again ({reason(error)})")
+    return result
+
+
+def _verify(
+    found: Any, report: bool, exact: bool, sample: int, seed: int, progress: bool,
+    result: Verification,
+) -> None:  # fmt: skip
+    """Verify what was read."""
+    label, status = found.arrays.get("label"), found.arrays.get("status")
     if found.done < found.blocks:
         left = found.blocks - found.done
         result.problems.append(f"{left} of {found.blocks} blocks are not done: resume the sweep")
-    needed = ("label", "status", "start", "plan", "cut_normal")
+    needed = ("label", "status", "start", "plan", "cut_normal", "cut_offset")
     missing = [name for name in needed if name not in found.arrays]
     if missing or not found.axes or "problem" not in found.attributes:
         result.problems.append(f"cannot be verified without {missing or 'its problem'}")
-        return result
-    assert label is not None and status is not None
+        return
     names = {1: "feasible", -1: "infeasible", 0: "undecided"}
     result.labels = {name: int(np.sum(label == value)) for value, name in names.items()}
     expected = {1: Status.SOLVED, -1: Status.PRIMAL_INFEASIBLE}
     points, problem = found.points, found.attributes["problem"]
     if len(points) != len(label):
         result.problems.append(f"{len(label)} labels for {len(points)} states")
-        return result
+        return
     for i in np.flatnonzero(~np.isin(label, list(names))):
         result.failures[int(i)] = f"label {label[i]} means nothing"
     for value, name in expected.items():
@@ -105,7 +123,36 @@ def verify(
     result.failures = {
         i: f"at {points[i].tolist()}: {reason}" for i, reason in result.failures.items()
     }
-    return result
+
+
+def _compare_summary(path: Path, found: Any, result: Verification) -> None:
+    """Compare what a summary says with the store beside it. Half-spaces of refinement exclude some
+    of the undecided states: those count as infeasible there."""
+    try:
+        summary, wrong = read_results(path)
+        counts = summary.get("linear", summary)["counts"]
+        feasible, infeasible, undecided = (
+            int(counts[k]) for k in ("feasible", "infeasible", "undecided")
+        )
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError):
+        result.problems.append(f"{path.name}: cannot be read, or holds no counts")
+        return
+    arrays, there = found.arrays, result.labels
+    open_, more = arrays["status"] == Status.ITERATION_LIMIT, infeasible - there["infeasible"]
+    beyond_bounds = np.zeros(len(open_), bool)
+    for a, b in zip(arrays.get("bound_normal", ()), arrays.get("bound_offset", ()), strict=True):
+        beyond_bounds |= found.points @ a > b
+    fine = (
+        feasible == there["feasible"]
+        and undecided == int(np.sum(open_)) - more
+        and 0 <= more <= int(np.sum(open_ & beyond_bounds))
+    )
+    if not fine and found.done == found.blocks:
+        what = f"{feasible} feasible, {infeasible} infeasible, {undecided} undecided"
+        wrong = f"{path.name}: counts {what}, the store {' '.join(map(str, there.values()))}"
+    elif summary.get("config") != found.attributes["config"]:
+        wrong = f"{path.name}: its configuration is not that of the store"
+    result.problems += [wrong] if wrong else []
 
 
 def _compare_half_spaces(
@@ -124,7 +171,11 @@ def _compare_half_spaces(
     _, first = np.unique(np.round(np.column_stack([H, h]), 9), axis=0, return_index=True)
     H, h = H[first], h[first]
     if "bound_normal" in arrays:
-        H, h = np.concatenate([H, arrays["bound_normal"]]), np.append(h, arrays["bound_offset"])
+        more = np.column_stack([arrays["bound_normal"], arrays["bound_offset"]])
+        more = np.unique(more, axis=0)
+        if not np.all(np.isfinite(more)):
+            result.problems.append("bound_normal, bound_offset: hold NaN or infinity")
+        H, h = np.concatenate([H, more[:, :-1]]), np.append(h, more[:, -1])
     kept = points[feasible]
     if "bound_point" in arrays:
         kept = np.concatenate([kept, arrays["bound_point"]])
@@ -152,20 +203,41 @@ def find_store(path: str | Path) -> str | Path:
     return inside[0]
 
 
-def read_report(path: Path) -> Any:
+def read_report(path: Path, check: Any = lambda attributes, axes: []) -> Any:
     """Return the samples of a recursion report as `store.read` returns those of a map."""
-    from jaxmpc.feasible.store import Stored
+    from jaxmpc.feasible.store import Stored, tails
 
     found = read_arrays(path)
     if found is None or not isinstance(found[0], dict) or "state" not in found[1]:
-        return Stored({}, {}, {}, 0, 0, [f"{path.name}: cannot be read"])
+        return Stored.damaged(f"{path.name}: cannot be read")
     record, arrays = found
     try:
-        summary = json.loads((path.parent / "summary.json").read_text())
-    except (OSError, ValueError):
-        return Stored({}, {}, {}, 0, 0, ["summary.json: cannot be read"])
+        summary, wrong = read_results(path.parent / "summary.json")
+        shapes = {name: (1, *tail) for name, tail in tails(record["problem"]).items()}
+        n, m = np.shape(record["problem"]["B"])
+    except (ValueError, LookupError, TypeError) as error:
+        return Stored.damaged(f"{path.name}, summary.json: {error}")
+    count = len(arrays["label"]) if "label" in arrays and arrays["label"].ndim == 1 else -1
+    shapes |= {"state": (1, n), "input": (1, m), "next_state": (1, n), "lost_at": (1,)}
+    for name, shape in shapes.items():
+        if name in arrays and arrays[name].shape != (count, *shape[1:]):
+            what = f"shape {arrays[name].shape} where {(count, *shape[1:])} is needed"
+            return Stored.damaged(f"{path.name}: {name}: {what}")
+    problems = [wrong] if wrong else []
+    if summary.get("sha256") != sha256(path):
+        problems.append(f"{path.name}: is not as it was written")
+    label, lost = arrays["label"], arrays["lost_at"]
+    counts = {"feasible": label == 1, "lost after one step": lost == 1, "kept": lost == 0}
+    counts |= {"lost later": lost > 1}
+    stated = summary.get("counts")
+    for name, flags in counts.items():
+        if not isinstance(stated, dict) or stated.get(name) != int(np.sum(flags)):
+            problems.append(f"summary.json: its count {name!r} is not {int(np.sum(flags)):,}")
+    attributes = {**record, "summary": summary, "config": summary.get("config")}
+    if differing := check(attributes, {}):
+        return Stored(attributes, {}, {}, 0, 0, [*problems, *differing], False)
     arrays["points"] = arrays["state"]
-    return Stored({**record, "summary": summary}, arrays, {"sample": arrays["state"]}, 1, 1)
+    return Stored(attributes, arrays, {"sample": arrays["state"]}, 1, 1, problems)
 
 
 def _verify_next_states(

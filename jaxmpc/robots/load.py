@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxmpc.checks import fail, require_finite, require_package, require_shape
+from jaxmpc.checks import (
+    fail,
+    require_finite,
+    require_package,
+    require_printable,
+    require_shape,
+)
 from jaxmpc.control.limits import Limit, limit_pair
 from jaxmpc.control.sets import Box
 from jaxmpc.control.system import require_period
@@ -117,6 +123,7 @@ def load_robot(
     smooth.actuator_forcelimited[:] = 0
     smooth.jnt_actfrclimited[:] = 0
     names, units = _state_names(host)
+    require_printable("model", name, *names)
     states, of_states = _state_limits(host, position, velocity, velocities)
     q, act, source = _home(host)
     if home is not None:

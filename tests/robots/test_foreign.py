@@ -1,4 +1,4 @@
-"""Models that nobody here wrote against MuJoCo's C engine; `pip install "jaxmpc[models]"` brings
+"""Models that nobody here wrote against MuJoCo's C engine; `pip install -e '.[models]'` brings
 them, `experiments/robots/foreign.py` lists them."""
 
 import sys
@@ -33,7 +33,7 @@ def loaded(name):
     try:
         model, options = foreign.catalogue()[name]()
     except ImportError as error:
-        pytest.skip(f"{error}: pip install 'jaxmpc[models]'")
+        pytest.skip(f"{error}: pip install -e '.[models]'")
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         robot = jm.load_robot(model, **options)

@@ -18,6 +18,7 @@ from jaxmpc.app.commands.options import (
     option,
     print_table,
     refuse,
+    remove_files,
 )
 from jaxmpc.checks import available_memory, fail, in_units, nearest
 from jaxmpc.runs import versions, write_json
@@ -51,9 +52,9 @@ class Bench:
 
     What it does
       Solves the same problems with jaxmpc and with each rival that can be imported (pip install
-      'jaxmpc[bench]'), all in this run, in turns, and judges every answer itself: primal residual,
-      dual residual and duality gap are recomputed in float64 from each (z, y). No solver's own
-      word counts. What is measured, by --what:
+      -e '.[bench]' in the folder of the source), all in this run, in turns, and judges every
+      answer itself: primal residual, dual residual and duality gap are recomputed in float64 from
+      each (z, y). No solver's own word counts. What is measured, by --what:
         labels     each state of a box proved feasible or infeasible (map_feasible_set); "with all
                    proofs" counts every plan and half-space, which else are made when used;
                    rivals look for the point of least norm that keeps the limits
@@ -136,7 +137,7 @@ class Bench:
         """
         command = self.settled()
         command.check()
-        open_folder(self.output, *FILES)
+        open_folder(self.output)
         return Record(command).run()
 
     def settled(self) -> "Bench":
@@ -235,6 +236,7 @@ class Record:
             self.complete = True
         except KeyboardInterrupt:
             print("\nstopped; what was measured is kept")
+        remove_files(self.command.output, *FILES)
         self.write()
         files = ["bench.json", *self.draw()]
         print_table([("files", " ".join(str(self.command.output / name) for name in files))], 6)

@@ -15,7 +15,7 @@ from jaxmpc.app.commands.options import model_hash
 from jaxmpc.app.programs import times_file
 from jaxmpc.compiled import Compiled
 from jaxmpc.robots.robot import Robot
-from jaxmpc.runs import fingerprint, versions, write_json
+from jaxmpc.runs import fingerprint, text_within, versions, write_json
 
 # Seconds of the first compile on free cores: with no degree of freedom, and for each of them.
 GUESSES = {
@@ -105,7 +105,7 @@ class Compiling:
 def _read(path: Path | None) -> dict[str, list[float]]:
     """Return the seconds of earlier runs by key; none where the file is no such file."""
     try:
-        found = json.loads(path.read_text()) if path is not None else {}
-    except (OSError, ValueError):
+        found = json.loads(text_within(path)) if path is not None else {}
+    except (ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}

@@ -17,6 +17,7 @@ from jaxmpc.app.commands.options import (
     check_results,
     open_folder,
     print_table,
+    remove_files,
     report_damage,
 )
 from jaxmpc.app.config import Config, SweepPoints, sweep_points
@@ -31,7 +32,7 @@ from jaxmpc.feasible.map import mesh
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.stored_map import StoredMap
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.runs import versions, write_json
+from jaxmpc.runs import versions, write_results
 from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
 
 # States from which penalties are learned, at most.
@@ -61,18 +62,18 @@ class LinearSweep:
         """
         mpc, region = config.build_mpc(), sweep_points(config)
         path = store.location(url or output / "sweep.zarr")
-        there = store.exists(path)
         if shard is None:
-            check_results(path, resume, overwrite, there)
-            open_folder(output, "map.png", "summary.json")
-            if there and overwrite:
-                store.remove(path)
-        else:  # other shards may have made the store, and one may be writing the results
-            if overwrite:
-                fail("--overwrite", "given beside --shard", "Delete the store before shards start")
-            open_folder(output)
+            check_results(path, resume, overwrite, store.exists(path))
+        elif overwrite:
+            fail("--overwrite", "given beside --shard", "Delete the store before shards start")
         problem = FeasibilityProblem.of(mpc, region.axes, region.fixed)
-        found = store.open_labels(path, problem, region.along, config.to_dict(), CHUNK, shard=shard)
+        open_folder(output)
+        # Other shards may have made the store, and one may be writing the results.
+        old = () if shard else ("map.png", "summary.json")
+        found = store.open_labels(
+            path, problem, region.along, config.to_dict(), CHUNK, shard=shard, overwrite=overwrite,
+            begun=lambda: remove_files(output, *old),
+        )  # fmt: skip
         done = len(found.own) - len(found.pending())
         if shard is not None and (done or found.damaged) and not resume:
             found.close()
@@ -141,7 +142,7 @@ class LinearSweep:
             "config": self.config.to_dict(),
             "versions": versions(),
         }
-        write_json(self.output / "summary.json", summary)
+        write_results(self.output / "summary.json", summary)
         what = {1: "length", 2: "area"}.get(dimension, "volume")
         units = self.config.system.state_units
         unit = " " + "·".join(units[i] for i in self.region.axes) if units else ""

@@ -132,19 +132,20 @@ def refuse(given: dict[str, Any], robot: str | None, needs: str) -> None:
             fail(f"--{name}", problem, needs)
 
 
-def open_folder(path: Path, *files: str) -> None:
-    """Create the folder of --output and remove these files of an earlier run.
-
-    Raises ValueError where the folder cannot be written.
-    """
+def open_folder(path: Path) -> None:
+    """Create the folder of --output. Raises ValueError where it cannot be written."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
             pass
-        for name in files:
-            (path / name).unlink(missing_ok=True)
     except OSError as error:
         fail(f"--output {path}", f"{error.strerror}", "Give a folder you can write to")
+
+
+def remove_files(path: Path, *files: str) -> None:
+    """Remove files of an earlier run from a folder, once a new one has results."""
+    for name in files:
+        (path / name).unlink(missing_ok=True)
 
 
 def print_table(rows: list[tuple[str, Any]], width: int) -> None:

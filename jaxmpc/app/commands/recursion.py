@@ -20,6 +20,7 @@ from jaxmpc.app.commands.options import (
     option,
     print_table,
     refuse,
+    remove_files,
 )
 from jaxmpc.app.commands.robot_map import RobotMapCommand
 from jaxmpc.app.config.states import recursion_states
@@ -32,7 +33,7 @@ from jaxmpc.recursion import (
     recursive_feasibility,
     smallest_horizon,
 )
-from jaxmpc.runs import versions, write_arrays, write_json
+from jaxmpc.runs import sha256, versions, write_arrays, write_results
 
 FILES = ("summary.json", "recursion.npz", "recursion.png")
 
@@ -165,7 +166,7 @@ class Recursion:
         there = [self.output / name for name in FILES if (self.output / name).exists()]
         if there and not self.overwrite:
             fail(str(there[0]), "exists", "Add --overwrite to replace it")
-        open_folder(self.output, *FILES)
+        open_folder(self.output)
         print(f"{config.name}: horizon {mpc.horizon} -> {self.output}")
         seconds = settings.seconds / (1 if self.smallest is None else 2)
         report = recursive_feasibility(
@@ -206,6 +207,7 @@ class Recursion:
         labels = {} if report.labels is None else label_rows(report.labels)
         facets |= {name: value for name, value in labels.items() if name != "label"}
         plain = {"problem": FeasibilityProblem.of(report.mpc).plain()}
+        remove_files(self.output, *FILES)
         write_arrays(
             self.output / "recursion.npz", plain, state=report.states, label=report.label,
             input=report.inputs, next_state=report.next_states, lost_at=report.lost_at,
@@ -225,11 +227,12 @@ class Recursion:
             "steps": report.steps,
             "seconds": report.seconds,
             "config": config.to_dict("recursion"),
+            "sha256": sha256(self.output / "recursion.npz"),
             "versions": versions(),
         }
         if least is not None:
             summary["smallest_horizon"] = dataclasses.asdict(least)
-        write_json(self.output / "summary.json", summary)
+        write_results(self.output / "summary.json", summary)
         if report.states.shape[1] != 2:
             return ["summary.json", "recursion.npz"]
         from jaxmpc.app.plots.recursion import draw_recursion

@@ -1,7 +1,6 @@
 """The command `jaxmpc report`."""
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -35,7 +34,7 @@ class Report:
         path = self.folder / "report.html"
         try:
             path.write_text(folder_page(self.folder), encoding="utf-8")
-        except (OSError, json.JSONDecodeError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             what = getattr(error, "strerror", None) or f"{error}"
             fail(
                 str(self.folder), f"no page of it: {what}", "Give the folder of a finished command"

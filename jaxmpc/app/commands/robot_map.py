@@ -17,6 +17,7 @@ from jaxmpc.app.commands.options import (
     check_results,
     model_hash,
     open_folder,
+    remove_files,
     report_damage,
 )
 from jaxmpc.app.config.states import axis_indices, grid_ends
@@ -36,7 +37,7 @@ from jaxmpc.robot_maps.set_point import deviations
 from jaxmpc.robot_maps.setting import RobotSetting
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import Robot
-from jaxmpc.runs import versions, write_arrays, write_json
+from jaxmpc.runs import versions, write_arrays, write_results
 
 # Points along each of two axes; total number of points for another number of axes.
 SIDE, POINTS = 32, 1024
@@ -163,10 +164,12 @@ class RobotMapCommand:
             "period": robot.dt,
             **self.settings,
         }
-        open_folder(self.output, "robot_map.npz", "robot_map.png", "summary.json")
-        if path.exists() and self.overwrite:
-            store.remove(path)
-        kept = store.open_labels(path, setting.problem, along, config, setting.chunk(None), LOOPS)
+        open_folder(self.output)
+        old = "robot_map.npz", "robot_map.png", "summary.json"
+        kept = store.open_labels(
+            path, setting.problem, along, config, setting.chunk(None), LOOPS,
+            overwrite=self.overwrite, begun=lambda: remove_files(self.output, *old),
+        )  # fmt: skip
         report_damage(kept)
         return setting, config, kept, compiling
 
@@ -244,7 +247,7 @@ class RobotMapCommand:
             summary["linear"]["recursion"] = {
                 name: str(getattr(report, name)) for name in ("strong", "law", "weak")
             } | {"counts": report.counts()}
-        write_json(self.output / "summary.json", summary)
+        write_results(self.output / "summary.json", summary)
         if rmap.points.shape[1] != 2:
             return ["summary.json", "robot_map.npz"]
         from jaxmpc.app.plots.robot_map import plot_robot_map

@@ -18,6 +18,7 @@ from jaxmpc.app.commands.options import (
     check_results,
     model_hash,
     open_folder,
+    remove_files,
     report_damage,
 )
 from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
@@ -124,14 +125,14 @@ class RobotRuns:
         )  # fmt: skip
         if variations:
             robot.vary(**{key: value[0] for key, value in plant_numbers(robot, variations).items()})
-        open_folder(command.output, "summary.json", "runs.png", "robots.gif")
-        if path.exists() and command.overwrite:
-            store.remove(path)
+        open_folder(command.output)
+        old = "summary.json", "runs.png", "robots.gif"
         sample = store.Constant(np.arange(len(starts)), ("sample",), {"long_name": "robot"})
         points = store.Constant(starts, ("sample", "state"), {"long_name": "initial state"})
         kept = store.Store(
             path, {"sample": sample}, _run_fields(command, robot, steps),
             _decisive(command, robot, mpc), chunk, constants={"points": points},
+            overwrite=command.overwrite, begun=lambda: remove_files(command.output, *old),
         )  # fmt: skip
         report_damage(kept)
         return cls(

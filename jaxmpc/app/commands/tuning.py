@@ -16,7 +16,7 @@ from jaxmpc.control.sets import Polytope
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.inequalities import Inequalities
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.runs import differences, write_json
+from jaxmpc.runs import differences, text_within, write_json
 
 CHECKPOINT = "checkpoint.npz"
 TUNED = "tuned.toml"
@@ -111,8 +111,8 @@ def open_run(
         check_results(path, resume, overwrite)
     if resume and record.exists():
         try:
-            stored = json.loads(record.read_text())["options"]
-        except (ValueError, KeyError, TypeError):
+            stored = json.loads(text_within(record))["options"]
+        except (ValueError, KeyError, TypeError, RecursionError):
             fail(str(record), "holds no run", "Add --overwrite to start again")
         if changes := differences(stored, options):
             fail(str(record), "; ".join(changes), "Give the same options, or --overwrite")

@@ -2,11 +2,17 @@
 
 import dataclasses
 import time
-from typing import Annotated
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
 
+import numpy as np
 import tyro
 
+from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import Switch, check_counts, option, print_table
+from jaxmpc.checks import shown
+from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.verification import Verification, find_store, verify
 
 # Failures that are printed.
@@ -19,7 +25,10 @@ class Verify:
 
     What it does
       Reads the map that jaxmpc sweep left in DIR, or the report of jaxmpc recursion, either with
-      --robot or without, and compares the data with their checksums. Then proves each label:
+      --robot or without. Metadata, configuration, data and summary.json are compared with their
+      checksums and with each other, and the problem with the one that the configuration gives
+      (that of a robot is not built again). What is damaged is named in one line, and nothing is
+      proved where data cannot be read. Else proves each label:
         feasible    the stored plan is rolled out from the state and keeps every limit
         infeasible  a half-space that no feasible state leaves, made anew, excludes the state
       by a roll-out and by weak duality of their own (jaxmpc/feasible/exact_check.py, to be read by
@@ -52,13 +61,21 @@ class Verify:
     keeps = ""
 
     def run(self) -> int:
-        """Verify, print the table, return the exit code. Raises ValueError where there is no
-        map."""
+        """Verify, print the table or what is damaged, return the exit code. Raises ValueError where
+        there is no map."""
         check_counts(self, sample=0, seed=0)
         path, begun = find_store(self.directory), time.perf_counter()
         found = verify(
-            path, exact=self.exact, sample=self.sample, seed=self.seed, progress=True
+            path, exact=self.exact, sample=self.sample, seed=self.seed, progress=True,
+            check=contradictions,
         )  # fmt: skip
+        folder = Path(self.directory)
+        if folder.is_dir() and folder != path and not (folder / "summary.json").exists():
+            found.problems.append("summary.json: is missing. Resume the sweep, which writes it")
+        if not found.labels:
+            rest = f" (and {len(found.problems) - 1} more)" if len(found.problems) > 1 else ""
+            print(f"{path}: NOT VERIFIED: {found.problems[0]}{rest}")
+            return 1
         decided = found.labels.get("feasible", 0) + found.labels.get("infeasible", 0)
         word = "verified" if decided else "nothing to verify, no state is labelled"
         print(f"{path}: {word if found.passed else 'NOT VERIFIED'}")
@@ -75,6 +92,59 @@ class Verify:
         if more:
             print(f"  and {more:,} more")
         return 0 if found.passed else 1
+
+
+def contradictions(attributes: Mapping[str, Any], axes: Mapping[str, np.ndarray]) -> list[str]:
+    """Build the problem of a sweep or a recursion report from its configuration, and return where
+    what is stored is another one."""
+    config, problem = attributes.get("config"), attributes.get("problem")
+    if not isinstance(config, Mapping) or not isinstance(problem, Mapping):
+        return ["zarr.json: holds no configuration or no problem"]
+    if "system" not in config:
+        return _robot_contradictions(config, problem, axes)
+    try:
+        made = configs.from_results(config, "sweep" if axes else "recursion")
+        region = configs.sweep_points(made) if axes else None
+        view = (None, None) if region is None else (region.axes, region.fixed)
+        built = FeasibilityProblem.of(made.build_mpc(), *view).plain()
+    except (ValueError, ArithmeticError, TypeError, np.linalg.LinAlgError) as error:
+        return [f"configuration: makes no problem ({error})"]
+    found = [f"problem.{key}: {shown(problem.get(key))}, the configuration says {shown(value)}"
+             for key, value in built.items() if not alike(problem.get(key), value)]  # fmt: skip
+    for (name, line), end in zip(axes.items(), region.along if region else (), strict=True):
+        if not alike(line.tolist(), end.tolist()):
+            found.append(f"{name}: not the points of the grid in the configuration")
+    return found
+
+
+def _robot_contradictions(
+    config: Mapping[str, Any], problem: Mapping[str, Any], axes: Mapping[str, np.ndarray]
+) -> list[str]:
+    """Return where a robot's map differs from its configuration, without the robot."""
+    ends = {"lower": [v.min() for v in axes.values()], "upper": [v.max() for v in axes.values()]}
+    stored = {"horizon": problem.get("horizon"), **ends}
+    return [
+        f"{key}: {shown(value)}, the configuration says {shown(config[key])}"
+        for key, value in stored.items()
+        if key in config and not alike(config[key], value)
+    ]  # fmt: skip
+
+
+def alike(a: Any, b: Any) -> bool:
+    """Return whether two pieces of JSON data are equal but for rounding of their numbers, which
+    differs between processors."""
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return a.keys() == b.keys() and all(alike(a[key], b[key]) for key in a)
+    if isinstance(a, list) and any(isinstance(v, Mapping) for v in a):
+        return isinstance(b, list) and len(a) == len(b) and all(map(alike, a, b))
+    try:
+        first, second = np.array(a, float), np.array(b, float)
+    except (TypeError, ValueError):
+        return bool(a == b)
+    size = np.abs(second).max(initial=0.0, where=np.isfinite(second))
+    return first.shape == second.shape and np.allclose(
+        first, second, rtol=1e-9, atol=1e-12 * size, equal_nan=True
+    )
 
 
 def _extremes(found: Verification) -> list[tuple[str, str]]:

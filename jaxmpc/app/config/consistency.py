@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxmpc.app.config.problem import COMMANDS, Config
 from jaxmpc.app.config.states import grid_shape, mapped_axes, recursion_shape, section_ends
-from jaxmpc.checks import fail, require_memory
+from jaxmpc.checks import fail, require_memory, require_printable
 from jaxmpc.compiled import CHUNK
 from jaxmpc.mpc.condense import condensed_bytes
 
@@ -16,6 +16,7 @@ def check(config: Config, command: str = "sweep") -> None:
     """Raise ValueError where keys that are valid alone do not fit one another."""
     s, limits = config.system, config.limits
     n, m = len(s.A), len(s.B[0])
+    require_printable("name", config.name)
     for key, value, count in (
         ("system.A", s.A[0], n),
         ("system.B", s.B, n),

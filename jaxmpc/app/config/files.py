@@ -10,6 +10,15 @@ from typing import Any
 import tomli_w
 
 from jaxmpc.checks import fail
+from jaxmpc.runs import text_within
+
+# A problem of a hundred states takes a tenth of that; what tomllib makes of a byte, up to 10 kB.
+MOST_BYTES = 10**6
+# Time and memory of tomllib grow as the square of the parts of a dotted key: one of 60 kB took
+# 4 GB. Keys, dots and blanks stand between the characters that DOTTED splits at.
+MOST_DOTS = 32
+QUOTED = re.compile(r'"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'')
+DOTTED = re.compile(r"[^\w\-. \t]+")
 
 
 @dataclass(frozen=True)
@@ -30,14 +39,16 @@ class Origin:
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """Return what a file holds, with or without a byte-order mark. Raises ValueError where it
-    cannot be read or is no TOML."""
+    cannot be read, is too large or is no TOML."""
+    text = text_within(path, MOST_BYTES, "TOML")
+    if any(run.count(".") > MOST_DOTS for run in DOTTED.split(QUOTED.sub("q", text))):
+        what = f"holds a key of more than {MOST_DOTS} dots"
+        fail(str(path), what, "No key takes more than rows of numbers")
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        fail(str(path), f"cannot be read ({error.strerror})", "Give the path of a TOML file")
+        return tomllib.loads(text)
     except RecursionError:
         fail(str(path), "is nested too deeply", "No key takes more than rows of numbers")
-    except ValueError as error:  # no TOML, no UTF-8, or a number of thousands of digits
+    except ValueError as error:  # no TOML, or a number of thousands of digits
         fail(str(path), f"is no TOML ({error})", "See the keys with: jaxmpc sweep --help")
 
 

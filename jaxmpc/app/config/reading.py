@@ -69,6 +69,16 @@ def load(
     return config
 
 
+def from_results(document: Mapping[str, Any], command: str = "sweep") -> Config:
+    """Return the configuration that results hold (`Config.to_dict`), checked as `load` does."""
+    try:
+        config = ADAPTER.validate_python(dict(document))
+    except ValidationError as error:
+        raise ValueError(_error_message(error, Config)) from None
+    check(config, command)
+    return config
+
+
 def load_robot_config(path: str | Path) -> RobotConfig:
     """Read the TOML file of a robot's weights. Raises ValueError as `load` does."""
     document = read_toml(path)
