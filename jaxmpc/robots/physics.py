@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
-from jax.extend.core.primitives import sqrt_p
+from jax.extend.core.primitives import acos_p, sqrt_p
 
 from jaxmpc.checks import fail
 from jaxmpc.qp.linalg import JAXLIB, solve, stand_ins
@@ -56,8 +56,8 @@ class Physics:
             with warnings.catch_warnings(), jax.enable_x64(True):
                 warnings.simplefilter("ignore")
                 mjx = mjx_module()
-                self.mjx: Any = jax.tree.map(np.asarray, mjx.put_model(model))
-                blank = mjx.make_data(model)
+                self.mjx: Any = jax.tree.map(np.asarray, mjx.put_model(model, impl="jax"))
+                blank = mjx.make_data(model, impl="jax")
         except NotImplementedError as error:
             fail("model", f"MJX does not support it: {error}", "Take that out of the file")
         self.rows = blank._impl.efc_J.size > 0
@@ -80,10 +80,15 @@ class Physics:
         """
         dtype = x.dtype
         x, u, numbers = _widest((x, u, dict(numbers or {})))
+        rules = {**stand_ins(), **TAMED} if self.rows or self.model.ntendon else stand_ins()
+        step = in_pieces(rewritten(self._step, rules))
         if not self.rows:
-            return in_pieces(rewritten(self._step, stand_ins()))(x, u, numbers).astype(dtype)
-        step = in_pieces(rewritten(self._step, {**stand_ins(), sqrt_p: root}))
+            return step(x, u, numbers).astype(dtype)
         return with_forward_jacobian(step)(x, u, numbers).astype(dtype)
+
+    def bare_step(self, x: Array, u: Array) -> Array:
+        """Return `step`, not prepared for derivatives, batches and long programs."""
+        return self._step(x, u, {})
 
     def _step(self, x: Array, u: Array, numbers: dict[str, Array]) -> Array:
         x_q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
@@ -205,7 +210,7 @@ class Physics:
         # A copy for each program. JAX caches by identity how it converted NumPy arrays, also for
         # programs of the other precision, and MJX passes it arrays of the model.
         model = cast(copy.deepcopy(self.mjx).replace(**numbers))
-        data = cast(mjx.make_data(self.model)).replace(qpos=q, qvel=v, act=act, ctrl=u)
+        data = cast(mjx.make_data(self.model, impl="jax")).replace(qpos=q, qvel=v, act=act, ctrl=u)
         if self.posed:
             data = data.replace(**self._dynamics(numbers, q, v)[2])
             data = mjx.tendon(model, data)
@@ -310,25 +315,28 @@ def _constraint_forces(model: Any, data: Any, a: Array) -> Array:
     return Context.create(model, data.replace(qacc=a), grad=False).qfrc_constraint
 
 
-@jax.custom_jvp
-def _root(x: Array) -> Array:
-    return jax.lax.sqrt(x)
+def _tamed(function: Callable, slope: Callable, smooth: Callable) -> Callable:
+    """Return a function of arrays with the derivative `slope` where `smooth` says so, else 0.
 
-
-@_root.defjvp
-def _root_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    y = _root(*primals)
-    inside = y > 0
-    return y, jnp.where(inside, tangents[0] / (2 * jnp.where(inside, y, 1)), 0)
-
-
-def root(x: Array, **_: Any) -> Array:
-    """Return the square root, with the derivative 0 at 0 instead of an infinite one.
-
-    MJX computes lengths by it that can be 0, such as the distance of a point inside a cylinder, and
-    the chain rule multiplies infinity by 0 there.
+    MJX computes lengths and angles by it at the ends of their ranges, where the derivative is
+    infinite: the distance of a point inside a cylinder, the arc of a tendon that only touches. The
+    chain rule multiplies infinity by 0 there.
     """
-    return _root(x)
+    tame = jax.custom_jvp(function)
+
+    def rule(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+        inside = smooth(*primals)
+        at = jnp.where(inside, primals[0], 0.5)
+        return tame(*primals), jnp.where(inside, slope(at) * tangents[0], 0)
+
+    tame.defjvp(rule)
+    return lambda x, **_: tame(x)
+
+
+TAMED = {
+    sqrt_p: _tamed(jax.lax.sqrt, lambda x: 0.5 / jax.lax.sqrt(x), lambda x: x > 0),
+    acos_p: _tamed(jax.lax.acos, lambda x: -jax.lax.rsqrt(1 - x * x), lambda x: jnp.abs(x) < 1),
+}
 
 
 def mjx_module() -> Any:
