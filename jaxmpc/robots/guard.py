@@ -75,7 +75,8 @@ def differences(
         exact.opt.solver = plant.model.opt.solver
         exact.opt.iterations = max(exact.opt.iterations, 100)
         exact.opt.tolerance = min(exact.opt.tolerance, 1e-10)
-        _known[key.digest()] = _differences(exact, plant, motion(exact, inputs, home))
+        seen = motion(exact, inputs, home)
+        _known[key.digest()] = _differences(exact, plant, seen) if len(seen.before) else ()
     return _known[key.digest()]
 
 
@@ -144,6 +145,12 @@ def _sources(model: "mujoco.MjModel", plant: Physics, seen: Motion, k: int) -> l
             f"contacts of {name_of(model, 'geom', a)} with {name_of(model, 'geom', b)}, of which "
             "MJX finds other points or directions" for a, b in unlike[:3]
         ]  # fmt: skip
+    if not texts and not model.opt.disableflags & 2:  # mjDSBL_EQUALITY
+        placed = np.flatnonzero(model.eq_active0 & (model.eq_type < 2))  # connect, weld
+        texts += [
+            f"{name_of(model, 'equality', i)} pushes otherwise (MJX has no force for the turning "
+            "of connect and weld)" for i in placed[:3]
+        ]  # fmt: skip
     return texts
 
 
@@ -207,7 +214,7 @@ def motion(model: "mujoco.MjModel", inputs: Box, home: np.ndarray) -> Motion:
             if bad or not np.all(np.isfinite(rows[-1][2])):
                 rows.pop()
                 break
-    return Motion(*(np.array(part) for part in zip(*rows, strict=True)))
+    return Motion(*(np.array([row[part] for row in rows]) for part in range(4)))
 
 
 def _blown() -> tuple:

@@ -21,7 +21,7 @@ from jaxmpc.qp.linalg import JAXLIB, solve, stand_ins
 from jaxmpc.qp.precision import matmul
 from jaxmpc.robots.rewrite import moving, rewritten
 from jaxmpc.robots.rigid import FIELDS, Tree, dynamics, inverse_dynamics, side_by_side, slopes
-from jaxmpc.robots.tangent import normalised, rates, retract
+from jaxmpc.robots.tangent import BALL, normalised, rates, retract
 
 if TYPE_CHECKING:
     import mujoco
@@ -57,10 +57,12 @@ class Physics:
                 warnings.simplefilter("ignore")
                 mjx = mjx_module()
                 self.mjx: Any = jax.tree.map(np.asarray, mjx.put_model(model, impl="jax"))
+                self.mjx = self.mjx.replace(**_without_margins(self.mjx))
                 blank = mjx.make_data(model, impl="jax")
         except NotImplementedError as error:
             fail("model", f"MJX does not support it: {error}", "Take that out of the file")
         self.rows = blank._impl.efc_J.size > 0
+        self.tamed = TAMED if self.rows or model.ntendon else {}
         placed = blank._impl.contact.dim.size or np.any(model.eq_type != EQUALITY_OF_JOINTS)
         light = getattr(model, "flg_gravcomp", False) or np.any(model.body_gravcomp)
         in_fluid = model.opt.density or model.opt.viscosity or np.any(model.opt.wind)
@@ -80,8 +82,7 @@ class Physics:
         """
         dtype = x.dtype
         x, u, numbers = _widest((x, u, dict(numbers or {})))
-        rules = {**stand_ins(), **TAMED} if self.rows or self.model.ntendon else stand_ins()
-        step = in_pieces(rewritten(self._step, rules))
+        step = in_pieces(rewritten(self._step, {**stand_ins(), **self.tamed}))
         if not self.rows:
             return step(x, u, numbers).astype(dtype)
         return with_forward_jacobian(step)(x, u, numbers).astype(dtype)
@@ -129,6 +130,7 @@ class Physics:
         def rule(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
             found = solved(*primals)
             of, at, directions = moving(partial(self._missing, damped, found), primals, tangents)
+            of = rewritten(of, self.tamed) if self.tamed else of  # before it is differentiated
             _, missing, (first, second, C) = jax.jvp(of, at, directions, has_aux=True)
             M = self._dynamics(*primals[:3])[0]
             moved = da = jnp.zeros_like(found[0])
@@ -292,6 +294,17 @@ class Physics:
         table = jnp.array([[0, 1 / 6], [1 / 2, 1 / 3], [1 / 2, 1 / 3], [1, 1 / 6]], v.dtype)
         end, _ = jax.lax.scan(in_pieces(stage), (jnp.zeros_like(v),) * 4, table)
         return jnp.concatenate([move(end[2]), v + h * end[3]])
+
+
+def _without_margins(model: Any) -> dict[str, np.ndarray]:
+    """Return the ranges of joints and tendons, narrowed by their margins, and no margins: MJX
+    subtracts the margin of a stop twice. A ball joint has an upper end only."""
+    fields = {}
+    for kind, two in (("jnt", model.jnt_type != BALL), ("tendon", np.ones(model.ntendon))):
+        margin, ends = getattr(model, f"{kind}_margin"), getattr(model, f"{kind}_range")
+        fields[f"{kind}_range"] = ends + np.stack([margin * two, -margin], axis=1)
+        fields[f"{kind}_margin"] = np.zeros_like(margin)
+    return fields
 
 
 def _widest(tree: Any) -> Any:

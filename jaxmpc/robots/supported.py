@@ -46,7 +46,8 @@ _DROPPED = (
     ("pair_adhesion", "adhesion", "pair", True),
     ("geom_surfacevel", "surfacevel", "geom", True),
 )
-# Fields that count plugins, -1 for none; those of actuators and bodies exert forces.
+# Fields that count plugins, -1 for none, which exert forces. MuJoCo does not run without them, but
+# MJX does.
 _PLUGINS = (("actuator_plugin", "actuator"), ("body_plugin", "body"))
 
 
@@ -84,17 +85,18 @@ def translate(model: "mujoco.MjModel") -> list[str]:
         options.solver = mujoco.mjtSolver.mjSOL_NEWTON
         cleared.append("solver PGS, Newton in its place (same problem)")
     bit = mujoco.mjtDisableBit
-    springs, dampers = int(bit.mjDSBL_SPRING), int(bit.mjDSBL_DAMPER)
+    both = int(bit.mjDSBL_SPRING) | int(bit.mjDSBL_DAMPER)
+    off = options.disableflags & both
     for flag, words, fields in (
-        (springs, "springs", ("jnt_stiffness", "tendon_stiffness")),
-        (dampers, "dampers", ("dof_damping", "tendon_damping")),
+        (bit.mjDSBL_SPRING, "springs", ("jnt_stiffness", "tendon_stiffness")),
+        (bit.mjDSBL_DAMPER, "dampers", ("dof_damping", "tendon_damping")),
     ):
-        if options.disableflags & (springs | dampers) == flag:
-            options.disableflags &= ~flag
+        if off & flag:
             for field in fields:
                 getattr(model, field)[:] = 0
             cleared.append(f"{words}, switched off in the file")
-            break
+    if off != both:
+        options.disableflags &= ~both
     groups = np.clip(model.actuator_group, 0, 31)
     idle = (options.disableactuator >> groups & 1).astype(bool) & (model.actuator_group >= 0)
     if np.any(idle):
@@ -147,17 +149,13 @@ def lacks(model: "mujoco.MjModel") -> list[Lack]:
         rows = np.flatnonzero(getattr(model, field, np.full(0, -1)) >= 0)
         if len(rows):
             text = f"the plugin of {_listed(model, kind, field, rows)}"
-            found.append(Lack(text, partial(_zero, field=field, value=-1)))
+            found.append(Lack(text, lambda model: None, True))
     return found
 
 
-def _zero(model: Any, field: str, value: float = 0) -> None:
-    """Set a field of the model, or all of an array, to a value."""
-    present = getattr(model, field)
-    if np.ndim(present):
-        present[:] = value
-    else:
-        setattr(model, field, value)
+def _zero(model: Any, field: str) -> None:
+    """Set a number of the model, or all of an array, to zero."""
+    setattr(model, field, 0 * getattr(model, field))
 
 
 def _touches(model: "mujoco.MjModel", geom: Any) -> bool:
