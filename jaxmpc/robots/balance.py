@@ -133,7 +133,9 @@ def rest_at(robot: "Robot", q: np.ndarray, *, within: bool = False) -> Rest:
     return forces.rest(q, drive, f)
 
 
-def require_rest(argument: str, robot: "Robot", rest: Rest, *, touching: bool = False) -> str:
+def require_rest(
+    argument: str, robot: "Robot", rests: list[Rest], *, touching: bool = False
+) -> str:
     """Raise ValueError where the file moves in MuJoCo at what the predictor takes for a rest.
 
     Names the joint, its acceleration, and what takes the rest away: what the predictor ignores.
@@ -148,35 +150,40 @@ def require_rest(argument: str, robot: "Robot", rest: Rest, *, touching: bool = 
     file.jnt_actfrclimited[:] = plant.jnt_actfrclimited
     if hasattr(file, "actuator_delay"):
         file.actuator_delay[:] = 0  # inputs at rest are old enough
-    # A position beyond its limit is for the controller to refuse, not for the stop.
-    low, high = (np.asarray(v) for v in (robot.state_limits.lower, robot.state_limits.upper))
-    for j in np.flatnonzero(np.isin(file.jnt_type, (2, 3))):
-        i = file.jnt_dofadr[j]
-        if not low[i] <= rest.q[file.jnt_qposadr[j]] <= high[i]:
-            file.jnt_limited[j] = 0
-    expected = _accelerations(robot.predictor.model, rest)
-    found = _accelerations(file, rest)
-    moves = lambda a: not np.all(np.abs(a - expected) <= STILL)
-    if not moves(found):
-        return ""
-    i = int(np.argmax(np.nan_to_num(np.abs(found - expected), nan=np.inf)))
-    joint = name_of(file, "joint", file.dof_jntid[i])
-    problem = f"{rest.q} is no rest: in MuJoCo {joint} accelerates by {found[i]:.3g} a second²"
-    for take_out, cause, cure in _CAUSES:
-        without = copy.deepcopy(file)
-        take_out(without)
-        if not moves(_accelerations(without, rest)):
-            text = f"{problem}, by {cause}"
-            if touching and take_out in (_no_contacts, _no_stops):
-                return f"{text}; the model is taken there"
-            fail(argument, text, cure)
-    fail(argument, problem, "See what robot.report() says is left out or ignored")
+    smooth = robot.predictor.model
+    data, expected = mujoco.MjData(file), mujoco.MjData(smooth)
+    limited = file.jnt_limited.copy()
+    straight = np.flatnonzero(np.isin(file.jnt_type, (2, 3)))
+    at, dof = file.jnt_qposadr[straight], file.jnt_dofadr[straight]
+    low, high = (np.asarray(v)[dof] for v in (robot.state_limits.lower, robot.state_limits.upper))
+    for rest in rests:
+        # A position beyond its limit is for the controller to refuse, not for the stop.
+        inside = (low <= rest.q[at]) & (rest.q[at] <= high)
+        file.jnt_limited[straight] = limited[straight] & inside
+        wanted = _accelerations(smooth, expected, rest)
+        moves = lambda a, wanted=wanted: not np.all(np.abs(a - wanted) <= STILL)
+        found = _accelerations(file, data, rest)
+        if not moves(found):
+            continue
+        i = int(np.argmax(np.nan_to_num(np.abs(found - wanted), nan=np.inf)))
+        joint = name_of(file, "joint", file.dof_jntid[i])
+        problem = f"{rest.q} is no rest: in MuJoCo {joint} accelerates by {found[i]:.3g} a second²"
+        for take_out, cause, cure in _CAUSES:
+            without = copy.deepcopy(file)
+            take_out(without)
+            if not moves(_accelerations(without, mujoco.MjData(without), rest)):
+                text = f"{problem}, by {cause}"
+                if touching and take_out in (_no_contacts, _no_stops):
+                    return f"{text}; the model is taken there"
+                fail(argument, text, cure)
+        fail(argument, problem, "See what robot.report() says is left out or ignored")
+    return ""
 
 
-def _accelerations(model: "mujoco.MjModel", rest: Rest) -> np.ndarray:
+def _accelerations(model: "mujoco.MjModel", data: "mujoco.MjData", rest: Rest) -> np.ndarray:
     import mujoco
 
-    data = mujoco.MjData(model)
+    mujoco.mj_resetData(model, data)
     data.qpos[:], data.ctrl[:], data.act[:] = rest.q, rest.u, rest.act
     mujoco.mj_forward(model, data)
     return data.qacc.copy()
@@ -235,11 +242,11 @@ def settled(robot: "Robot") -> tuple[Rest, list[str]]:
         q[at] = inside
     rest = rest_at(robot, q)
     if rest.held:
-        moved = require_rest("home", robot, rest, touching=True)
+        moved = require_rest("home", robot, [rest], touching=True)
         return rest, [*texts, *([moved] if moved else [])]
     near = nearest_rest(robot, q)
     if near.held:
-        moved = require_rest("home", robot, near, touching=True)
+        moved = require_rest("home", robot, [near], touching=True)
         texts += [moved] if moved else []
         say("no input within the limits holds home; the nearest configuration that one holds is "
             f"taken, up to {np.abs(near.q - q).max():.2g} rad or m away")  # fmt: skip

@@ -6,8 +6,10 @@ half a second of falling leads. Each step starts from the engine's own state: di
 pile up, and forces with a memory (delays, filters) show.
 """
 
+import contextlib
 import copy
 import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -186,6 +188,20 @@ def _steps(plant: Physics, seen: Motion) -> np.ndarray:
         return np.asarray(compiled(seen.before, seen.inputs))
 
 
+@contextlib.contextmanager
+def _unlogged() -> Iterator[None]:
+    """Let MuJoCo write no file and no line where a motion blows up, which ends it here."""
+    import mujoco
+
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda text: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+@_unlogged()
 def motion(model: "mujoco.MjModel", inputs: Box, home: np.ndarray) -> Motion:
     """Return steps of the C engine: the same states and inputs for models of the same sizes."""
     import mujoco

@@ -221,7 +221,7 @@ class Robot:
                     "near", f"no configuration that can be held was found from there: "
                     f"{lacking(self, rest)}", "Start elsewhere, or give the robot what holds it",
                 )  # fmt: skip
-            require_rest("near", self, rest)
+            require_rest("near", self, [rest])
             return rest.x, rest.u
         q = self._configurations("q", self.home[: self.mujoco.nq] if q is None else q)
         rests = [rest_at(self, row) for row in q.reshape(-1, q.shape[-1])]
@@ -240,8 +240,7 @@ class Robot:
                 f"the limits are [{rests[0].lower[i]:g}, {rests[0].upper[i]:g}]",
                 "Choose a configuration that the actuators hold, or search with near=",
             )  # fmt: skip
-        for rest in rests:
-            require_rest("q", self, rest)
+        require_rest("q", self, rests)
         join = lambda rows, size: np.array(rows).reshape(*q.shape[:-1], size)
         x = join([rest.x for rest in rests], self.state_size)
         return x, join([rest.u for rest in rests], self.m)
