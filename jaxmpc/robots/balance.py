@@ -1,20 +1,28 @@
 """Robots at rest: which inputs hold a configuration, and which configuration nearby can be held.
 
 Computed outside JAX in float64 by MuJoCo's C engine, on the predictor: the springs of limits,
-contacts, equalities and dry friction do not help.
+contacts, equalities and dry friction do not help. What was found is tried on the file.
 """
 
+import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.optimize import least_squares, lsq_linear
 
+from jaxmpc.checks import fail
+from jaxmpc.robots.supported import name_of
+
 if TYPE_CHECKING:
+    import mujoco
+
     from jaxmpc.robots.robot import Robot
 
 # Forces that count as balanced, relative to 1 + the largest one.
 BALANCED = 1e-6
+# Accelerations (rad/s², m/s²) that count as rest.
+STILL = 1e-3
 # Weights of the distance in the search, one after the other; the last leaves balanced forces.
 _WEIGHTS = (1e-2, 1e-4, 1e-6, 1e-9, 1e-12)
 _STEP = 1e-6
@@ -125,6 +133,94 @@ def rest_at(robot: "Robot", q: np.ndarray, *, within: bool = False) -> Rest:
     return forces.rest(q, drive, f)
 
 
+def require_rest(
+    argument: str, robot: "Robot", rests: list[Rest], *, touching: bool = False
+) -> str:
+    """Raise ValueError where the file moves in MuJoCo at what the predictor takes for a rest.
+
+    Names the joint, its acceleration, and what takes the rest away: what the predictor ignores.
+    touching: where contacts or stops do, return the sentence instead.
+    """
+    import mujoco
+
+    plant, file = robot.mujoco, copy.deepcopy(robot.file or robot.mujoco)
+    # Inputs are not clamped, and of a motor's force limits the box of inputs is in charge.
+    file.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
+    file.actuator_forcelimited[:] = plant.actuator_forcelimited
+    file.jnt_actfrclimited[:] = plant.jnt_actfrclimited
+    if hasattr(file, "actuator_delay"):
+        file.actuator_delay[:] = 0  # inputs at rest are old enough
+    smooth = robot.predictor.model
+    data, expected = mujoco.MjData(file), mujoco.MjData(smooth)
+    limited = file.jnt_limited.copy()
+    straight = np.flatnonzero(np.isin(file.jnt_type, (2, 3)))
+    at, dof = file.jnt_qposadr[straight], file.jnt_dofadr[straight]
+    low, high = (np.asarray(v)[dof] for v in (robot.state_limits.lower, robot.state_limits.upper))
+    for rest in rests:
+        # A position beyond its limit is for the controller to refuse, not for the stop.
+        inside = (low <= rest.q[at]) & (rest.q[at] <= high)
+        file.jnt_limited[straight] = limited[straight] & inside
+        wanted = _accelerations(smooth, expected, rest)
+        moves = lambda a, wanted=wanted: not np.all(np.abs(a - wanted) <= STILL)
+        found = _accelerations(file, data, rest)
+        if not moves(found):
+            continue
+        i = int(np.argmax(np.nan_to_num(np.abs(found - wanted), nan=np.inf)))
+        joint = name_of(file, "joint", file.dof_jntid[i])
+        problem = f"{rest.q} is no rest: in MuJoCo {joint} accelerates by {found[i]:.3g} a second²"
+        for take_out, cause, cure in _CAUSES:
+            without = copy.deepcopy(file)
+            take_out(without)
+            if not moves(_accelerations(without, mujoco.MjData(without), rest)):
+                text = f"{problem}, by {cause}"
+                if touching and take_out in (_no_contacts, _no_stops):
+                    return f"{text}; the model is taken there"
+                fail(argument, text, cure)
+        fail(argument, problem, "See what robot.report() says is left out or ignored")
+    return ""
+
+
+def _accelerations(model: "mujoco.MjModel", data: "mujoco.MjData", rest: Rest) -> np.ndarray:
+    import mujoco
+
+    mujoco.mj_resetData(model, data)
+    data.qpos[:], data.ctrl[:], data.act[:] = rest.q, rest.u, rest.act
+    mujoco.mj_forward(model, data)
+    return data.qacc.copy()
+
+
+def _no_force_limits(model: "mujoco.MjModel") -> None:
+    for limited in (
+        model.actuator_forcelimited,
+        model.jnt_actfrclimited,
+        model.tendon_actfrclimited,
+    ):
+        limited[:] = 0
+
+
+def _no_contacts(model: "mujoco.MjModel") -> None:
+    model.opt.disableflags |= 16  # mjDSBL_CONTACT
+
+
+def _no_stops(model: "mujoco.MjModel") -> None:
+    model.opt.disableflags |= 8  # mjDSBL_LIMIT
+
+
+def _no_couplings(model: "mujoco.MjModel") -> None:
+    model.opt.disableflags |= 2  # mjDSBL_EQUALITY
+
+
+# What takes a rest away: how it is taken out, what it is, and what helps.
+_CAUSES = (
+    (_no_force_limits, "limits of actuators' forces (forcerange, actuatorfrcrange)",
+     "Choose a configuration that needs less force, or widen them in the file"),
+    (_no_couplings, "couplings (equalities), which linear models lack",
+     "Choose a configuration that meets them without their force, or take them out of the file"),
+    (_no_contacts, "contacts", "Choose a configuration in which nothing touches"),
+    (_no_stops, "stops of joints or tendons", "Choose a configuration inside their ranges"),
+)  # fmt: skip
+
+
 def settled(robot: "Robot") -> tuple[Rest, list[str]]:
     """Return the rest of `Robot.set_point`, and in words each way in which it is not home at
     rest."""
@@ -146,9 +242,12 @@ def settled(robot: "Robot") -> tuple[Rest, list[str]]:
         q[at] = inside
     rest = rest_at(robot, q)
     if rest.held:
-        return rest, texts
+        moved = require_rest("home", robot, [rest], touching=True)
+        return rest, [*texts, *([moved] if moved else [])]
     near = nearest_rest(robot, q)
     if near.held:
+        moved = require_rest("home", robot, [near], touching=True)
+        texts += [moved] if moved else []
         say("no input within the limits holds home; the nearest configuration that one holds is "
             f"taken, up to {np.abs(near.q - q).max():.2g} rad or m away")  # fmt: skip
         return near, texts

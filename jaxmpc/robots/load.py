@@ -3,7 +3,9 @@
 import copy
 import warnings
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from importlib import resources
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,9 +22,10 @@ from jaxmpc.control.limits import Limit, limit_pair
 from jaxmpc.control.sets import Box
 from jaxmpc.control.system import require_period
 from jaxmpc.reals import Reals
+from jaxmpc.robots.guard import acting, differences
 from jaxmpc.robots.physics import RK4, Physics
 from jaxmpc.robots.robot import Robot
-from jaxmpc.robots.supported import make_supported
+from jaxmpc.robots.supported import lacks, translate
 from jaxmpc.robots.tangent import unit_orientations
 from jaxmpc.robots.urdf import compiled_urdf
 
@@ -63,7 +66,10 @@ def load_robot(
 
     What MJX lacks is taken out: where that changes no motion in silence (switches of diagnostics,
     sensors), else with a UserWarning (contacts between shapes for which it has no function, noslip
-    iterations). `robot.report()` lists both, and what acts in the plant but not in linear models.
+    iterations, powers of damping, armature and delay of actuators, adhesion). Short motions of the
+    plant are then compared with those of the file in MuJoCo's C engine, and a UserWarning names the
+    joints, actuators and tendons that move otherwise, and couplings, which linear models lack.
+    `robot.report()` lists all of it, and what acts in the plant but not in linear models.
 
     Raises ValueError for files that MuJoCo cannot read, models without actuators or joints, what
     else MJX does not support, and limits that contradict each other; ImportError without MuJoCo.
@@ -71,6 +77,7 @@ def load_robot(
     require_package("mujoco", "robots")
     import mujoco
 
+    _compare_versions()
     velocities: dict[str, float] = {}
     mended: tuple[str, ...] = ()
     name = "robot"
@@ -110,14 +117,14 @@ def load_robot(
             "Give whole multiples, or another timestep",
         )  # fmt: skip
 
+    given = copy.deepcopy(host)
     host.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
-    cleared, left_out = make_supported(host)
-    if left_out:
-        warnings.warn(
-            f"robot {name} moves without {'; '.join(left_out)} of its file, which MJX lacks",
-            stacklevel=2,
-        )
-    inputs, of_inputs = _input_limits(host, torque)
+    cleared = translate(host)
+    missing = lacks(host)
+    for lack in missing:
+        lack.take_out(host)
+    inputs, of_inputs = _input_limits(host)
+    limits = _overridden("torque", inputs, torque, slice(None))
     smooth = copy.deepcopy(host)
     smooth.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     smooth.actuator_forcelimited[:] = 0
@@ -128,6 +135,23 @@ def load_robot(
     q, act, source = _home(host)
     if home is not None:
         q, source = _configuration(host, home), "argument"
+    start, plant = np.concatenate([q, np.zeros(host.nv), act]), Physics(host)
+    acts = acting(given, missing, inputs, start)
+    cleared += [f"{lack.text}, without effect" for lack in missing if lack not in acts]
+    reference = copy.deepcopy(given)
+    for lack in missing:
+        lack.take_out(reference)
+    without = [lack.text for lack in acts]
+    unlike = differences(reference, plant, inputs, start)
+    texts = [f"moves without {'; '.join(without)} of its file, which MJX lacks"] * bool(without)
+    texts += [f"moves otherwise than its file says: {'; '.join(unlike)}"] * bool(unlike)
+    coupled = _couplings(host)
+    if coupled:
+        texts.append(f"has couplings that its linear models lack ({coupled})")
+    if texts:
+        warnings.warn(f"robot {name} {', and '.join(texts)}", stacklevel=2)
+    left_out = [*without, *unlike]
+    of_inputs = of_inputs if torque is None else ["argument"] * host.nu
     notes = [
         *(("cleared", text) for text in cleared), *(("left out", text) for text in left_out),
         *(("mended", text) for text in mended), ("home", source),
@@ -136,12 +160,24 @@ def load_robot(
     if welded:
         notes.append(("welded", "the root link is welded to the world (see floating_base)"))
     return Robot(
-        state_limits=states, input_limits=inputs, home=np.concatenate([q, np.zeros(host.nv), act]),
-        plant=Physics(host), predictor=Physics(smooth), anchor=_anchor(host, q),
+        state_limits=states, input_limits=limits, home=start, file=given,
+        plant=plant, predictor=Physics(smooth), anchor=_anchor(host, q),
         substeps=substeps, dt=control_period, name=name, state_names=names, state_units=units,
         input_names=tuple(_mujoco_names(host, mujoco.mjtObj.mjOBJ_ACTUATOR, host.nu, "u")),
         input_units=tuple(_input_unit(host, i) for i in range(host.nu)), notes=tuple(notes),
     )  # fmt: skip
+
+
+def _compare_versions() -> None:
+    """Warn where MuJoCo and MJX are of different releases: MJX reads what that MuJoCo writes."""
+    engine, mjx = version("mujoco"), version("mujoco-mjx")
+    if engine.split(".")[:2] != mjx.split(".")[:2]:
+        release = ".".join(mjx.split(".")[:2])
+        warnings.warn(
+            f"mujoco {engine} beside mujoco-mjx {mjx}: nobody tests this pair. "
+            f"pip install 'mujoco=={release}.*' 'mujoco-mjx=={release}.*'",
+            stacklevel=3,
+        )
 
 
 def _is_urdf(model: str | Path) -> bool:
@@ -256,7 +292,20 @@ def _is_motor(host: "mujoco.MjModel", i: int) -> bool:
     )
 
 
-def _input_limits(host: "mujoco.MjModel", override: Limit) -> tuple[Box, list[str]]:
+def _couplings(host: "mujoco.MjModel") -> str:
+    """Return the equalities that act, such as "2 of type joint", or nothing."""
+    import mujoco
+
+    bit = mujoco.mjtDisableBit
+    if host.opt.disableflags & (int(bit.mjDSBL_EQUALITY) | int(bit.mjDSBL_CONSTRAINT)):
+        return ""
+    kinds = Counter(int(kind) for kind in host.eq_type[host.eq_active0.astype(bool)])
+    return ", ".join(
+        f"{count} of type {mujoco.mjtEq(kind).name[5:].lower()}" for kind, count in kinds.items()
+    )
+
+
+def _input_limits(host: "mujoco.MjModel") -> tuple[Box, list[str]]:
     """Return the box of inputs and the source of each, and drop in `host` the motors' force limits
     that it takes over."""
     import mujoco
@@ -276,6 +325,8 @@ def _input_limits(host: "mujoco.MjModel", override: Limit) -> tuple[Box, list[st
         if host.actuator_forcelimited[i]:
             ends["forcerange"] = host.actuator_forcerange[i] / gain
             host.actuator_forcelimited[i] = 0
+        # The limit of a joint bounds what compensates gravity there, too.
+        alone = alone and not host.jnt_actgravcomp[joints[i]]
         if host.jnt_actfrclimited[joints[i]] and alone:
             ends["actuatorfrcrange"] = host.jnt_actfrcrange[joints[i]] / (gain * gear)
             host.jnt_actfrclimited[joints[i]] = 0
@@ -284,8 +335,7 @@ def _input_limits(host: "mujoco.MjModel", override: Limit) -> tuple[Box, list[st
                 sources[i] = source
             lower[i], upper[i] = max(lower[i], end.min()), min(upper[i], end.max())
     sources = ["none" if not source else f"file, {source}" for source in sources]
-    limits = _overridden("torque", Box(lower, upper), override, slice(None))
-    return limits, sources if override is None else ["argument"] * host.nu
+    return Box(lower, upper), sources
 
 
 def _state_limits(

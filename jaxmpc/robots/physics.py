@@ -14,14 +14,14 @@ import numpy as np
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
-from jax.extend.core.primitives import sqrt_p
+from jax.extend.core.primitives import acos_p, sqrt_p
 
 from jaxmpc.checks import fail
 from jaxmpc.qp.linalg import JAXLIB, solve, stand_ins
 from jaxmpc.qp.precision import matmul
 from jaxmpc.robots.rewrite import moving, rewritten
 from jaxmpc.robots.rigid import FIELDS, Tree, dynamics, inverse_dynamics, side_by_side, slopes
-from jaxmpc.robots.tangent import normalised, rates, retract
+from jaxmpc.robots.tangent import BALL, normalised, rates, retract
 
 if TYPE_CHECKING:
     import mujoco
@@ -56,11 +56,13 @@ class Physics:
             with warnings.catch_warnings(), jax.enable_x64(True):
                 warnings.simplefilter("ignore")
                 mjx = mjx_module()
-                self.mjx: Any = jax.tree.map(np.asarray, mjx.put_model(model))
-                blank = mjx.make_data(model)
+                self.mjx: Any = jax.tree.map(np.asarray, mjx.put_model(model, impl="jax"))
+                self.mjx = self.mjx.replace(**_without_margins(self.mjx))
+                blank = mjx.make_data(model, impl="jax")
         except NotImplementedError as error:
             fail("model", f"MJX does not support it: {error}", "Take that out of the file")
         self.rows = blank._impl.efc_J.size > 0
+        self.tamed = TAMED if self.rows or model.ntendon else {}
         placed = blank._impl.contact.dim.size or np.any(model.eq_type != EQUALITY_OF_JOINTS)
         light = getattr(model, "flg_gravcomp", False) or np.any(model.body_gravcomp)
         in_fluid = model.opt.density or model.opt.viscosity or np.any(model.opt.wind)
@@ -80,10 +82,14 @@ class Physics:
         """
         dtype = x.dtype
         x, u, numbers = _widest((x, u, dict(numbers or {})))
+        step = in_pieces(rewritten(self._step, {**stand_ins(), **self.tamed}))
         if not self.rows:
-            return in_pieces(rewritten(self._step, stand_ins()))(x, u, numbers).astype(dtype)
-        step = in_pieces(rewritten(self._step, {**stand_ins(), sqrt_p: root}))
+            return step(x, u, numbers).astype(dtype)
         return with_forward_jacobian(step)(x, u, numbers).astype(dtype)
+
+    def bare_step(self, x: Array, u: Array) -> Array:
+        """Return `step`, not prepared for derivatives, batches and long programs."""
+        return self._step(x, u, {})
 
     def _step(self, x: Array, u: Array, numbers: dict[str, Array]) -> Array:
         x_q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
@@ -124,6 +130,7 @@ class Physics:
         def rule(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
             found = solved(*primals)
             of, at, directions = moving(partial(self._missing, damped, found), primals, tangents)
+            of = rewritten(of, self.tamed) if self.tamed else of  # before it is differentiated
             _, missing, (first, second, C) = jax.jvp(of, at, directions, has_aux=True)
             M = self._dynamics(*primals[:3])[0]
             moved = da = jnp.zeros_like(found[0])
@@ -205,7 +212,7 @@ class Physics:
         # A copy for each program. JAX caches by identity how it converted NumPy arrays, also for
         # programs of the other precision, and MJX passes it arrays of the model.
         model = cast(copy.deepcopy(self.mjx).replace(**numbers))
-        data = cast(mjx.make_data(self.model)).replace(qpos=q, qvel=v, act=act, ctrl=u)
+        data = cast(mjx.make_data(self.model, impl="jax")).replace(qpos=q, qvel=v, act=act, ctrl=u)
         if self.posed:
             data = data.replace(**self._dynamics(numbers, q, v)[2])
             data = mjx.tendon(model, data)
@@ -289,6 +296,17 @@ class Physics:
         return jnp.concatenate([move(end[2]), v + h * end[3]])
 
 
+def _without_margins(model: Any) -> dict[str, np.ndarray]:
+    """Return the ranges of joints and tendons, narrowed by their margins, and no margins: MJX
+    subtracts the margin of a stop twice. A ball joint has an upper end only."""
+    fields = {}
+    for kind, two in (("jnt", model.jnt_type != BALL), ("tendon", np.ones(model.ntendon))):
+        margin, ends = getattr(model, f"{kind}_margin"), getattr(model, f"{kind}_range")
+        fields[f"{kind}_range"] = ends + np.stack([margin * two, -margin], axis=1)
+        fields[f"{kind}_margin"] = np.zeros_like(margin)
+    return fields
+
+
 def _widest(tree: Any) -> Any:
     """Return the pytree with its floats in float64 where 64-bit mode is on, else in float32."""
     wide = jnp.result_type(float)
@@ -310,25 +328,28 @@ def _constraint_forces(model: Any, data: Any, a: Array) -> Array:
     return Context.create(model, data.replace(qacc=a), grad=False).qfrc_constraint
 
 
-@jax.custom_jvp
-def _root(x: Array) -> Array:
-    return jax.lax.sqrt(x)
+def _tamed(function: Callable, slope: Callable, smooth: Callable) -> Callable:
+    """Return a function of arrays with the derivative `slope` where `smooth` says so, else 0.
 
-
-@_root.defjvp
-def _root_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    y = _root(*primals)
-    inside = y > 0
-    return y, jnp.where(inside, tangents[0] / (2 * jnp.where(inside, y, 1)), 0)
-
-
-def root(x: Array, **_: Any) -> Array:
-    """Return the square root, with the derivative 0 at 0 instead of an infinite one.
-
-    MJX computes lengths by it that can be 0, such as the distance of a point inside a cylinder, and
-    the chain rule multiplies infinity by 0 there.
+    MJX computes lengths and angles by it at the ends of their ranges, where the derivative is
+    infinite: the distance of a point inside a cylinder, the arc of a tendon that only touches. The
+    chain rule multiplies infinity by 0 there.
     """
-    return _root(x)
+    tame = jax.custom_jvp(function)
+
+    def rule(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+        inside = smooth(*primals)
+        at = jnp.where(inside, primals[0], 0.5)
+        return tame(*primals), jnp.where(inside, slope(at) * tangents[0], 0)
+
+    tame.defjvp(rule)
+    return lambda x, **_: tame(x)
+
+
+TAMED = {
+    sqrt_p: _tamed(jax.lax.sqrt, lambda x: 0.5 / jax.lax.sqrt(x), lambda x: x > 0),
+    acos_p: _tamed(jax.lax.acos, lambda x: -jax.lax.rsqrt(1 - x * x), lambda x: jnp.abs(x) < 1),
+}
 
 
 def mjx_module() -> Any:

@@ -24,7 +24,7 @@ from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import eigh
 from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import floating_dtype, matmul
-from jaxmpc.robots.balance import lacking, nearest_rest, rest_at, settled
+from jaxmpc.robots.balance import lacking, nearest_rest, require_rest, rest_at, settled
 from jaxmpc.robots.physics import Physics
 from jaxmpc.robots.report import RobotReport, report_of
 from jaxmpc.robots.tangent import difference, quaternions, retract, unit_orientations
@@ -49,7 +49,7 @@ class Robot:
     of the file. anchor (nq,): zeros, with the orientations of home. plant, predictor: `Physics`,
     constants of compiled programs (twice to ten times as fast as arguments). numbers: parameters of
     the plant that differ in a batch (masses, damping), see `vary`. notes: (kind, text) of what
-    `load_robot` found, see `report`.
+    `load_robot` found, see `report`. file: the mujoco.MjModel as it was given.
     """
 
     state_limits: Box
@@ -67,6 +67,7 @@ class Robot:
     input_units: tuple[str, ...] = field(default=(), metadata={"static": True})
     numbers: dict[str, Any] = field(default_factory=dict)
     notes: tuple[tuple[str, str], ...] = field(default=(), metadata={"static": True})
+    file: Any = field(default=None, metadata={"static": True})
 
     @property
     def mujoco(self) -> "mujoco.MjModel":
@@ -205,10 +206,10 @@ class Robot:
         of the motion. Limits' springs, contacts, equalities and dry friction do not help. Computed
         outside JAX in float64 by MuJoCo's C engine.
 
-        Raises ValueError where the actuators cannot hold q at all, or only beyond input_limits
-        (force limits of actuators other than motors are not looked at), and where the search from
-        `near` ends at unbalanced forces: nothing but contact holds a body that stands on the
-        ground. It names the coordinates that lack a force.
+        Raises ValueError where the actuators cannot hold q at all, or only beyond input_limits,
+        and where the search from `near` ends at unbalanced forces: nothing but contact holds a
+        body that stands on the ground. It names the coordinates that lack a force. Also where the
+        file moves there in MuJoCo: force limits, couplings, contacts or stops take the rest away.
         """
         if near is not None:
             if q is not None:
@@ -220,6 +221,7 @@ class Robot:
                     "near", f"no configuration that can be held was found from there: "
                     f"{lacking(self, rest)}", "Start elsewhere, or give the robot what holds it",
                 )  # fmt: skip
+            require_rest("near", self, [rest])
             return rest.x, rest.u
         q = self._configurations("q", self.home[: self.mujoco.nq] if q is None else q)
         rests = [rest_at(self, row) for row in q.reshape(-1, q.shape[-1])]
@@ -238,6 +240,7 @@ class Robot:
                 f"the limits are [{rests[0].lower[i]:g}, {rests[0].upper[i]:g}]",
                 "Choose a configuration that the actuators hold, or search with near=",
             )  # fmt: skip
+        require_rest("q", self, rests)
         join = lambda rows, size: np.array(rows).reshape(*q.shape[:-1], size)
         x = join([rest.x for rest in rests], self.state_size)
         return x, join([rest.u for rest in rests], self.m)

@@ -1,6 +1,10 @@
 """What MJX lacks, taken out of a model: by itself where no motion changes, named where one does."""
 
+import copy
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,14 +19,103 @@ if TYPE_CHECKING:
 _BITS = 31
 
 
-def make_supported(model: "mujoco.MjModel") -> tuple[list[str], list[str]]:
-    """Take out of `model`, in place, what MJX lacks; return what changed no motion, and what did.
+@dataclass(frozen=True)
+class Lack:
+    """What a model has and MJX has not. text: in words. take_out: removes it from a model, in
+    place. acts: whether it is known to change motions, without trying."""
 
-    No motion changes: the account of the energy and the comparison of forward and inverse dynamics
-    (switches), sensors of types that MJX does not know, which become clocks (a sensor is read by
-    nobody here), and the PGS solver, whose problem of contact forces Newton's method solves, too.
-    Motions change: contacts between shapes for which MJX has no function, and friction without
-    slip (noslip), which MJX passes over.
+    text: str
+    take_out: "Callable[[mujoco.MjModel], Any]"
+    acts: bool = False
+
+
+# Numbers of mjModel that MJX passes over in silence: the field, what it is in MJCF, whose it is,
+# and whether it shows only in contact, where a trial of motions proves little.
+_DROPPED = (
+    ("dof_dampingpoly", "damping (higher powers)", "joint", False),
+    ("jnt_stiffnesspoly", "stiffness (higher powers)", "joint", False),
+    ("tendon_dampingpoly", "damping (higher powers)", "tendon", False),
+    ("tendon_stiffnesspoly", "stiffness (higher powers)", "tendon", False),
+    ("actuator_armature", "armature", "actuator", False),
+    ("actuator_damping", "damping", "actuator", False),
+    ("actuator_dampingpoly", "damping (higher powers)", "actuator", False),
+    ("actuator_delay", "delay", "actuator", False),
+    ("actuator_actearly", "actearly", "actuator", False),
+    ("geom_fluid", "fluidshape", "geom", False),
+    ("geom_adhesion", "adhesion", "geom", True),
+    ("pair_adhesion", "adhesion", "pair", True),
+    ("geom_surfacevel", "surfacevel", "geom", True),
+)
+# Fields that count plugins, -1 for none, which exert forces. MuJoCo does not run without them, but
+# MJX does.
+_PLUGINS = (("actuator_plugin", "actuator"), ("body_plugin", "body"))
+
+
+def translate(model: "mujoco.MjModel") -> list[str]:
+    """Write in MJX's words, in place, what it would refuse or misread, without a change of motion;
+    return what was changed.
+
+    Switched off: the account of the energy and the comparison of forward and inverse dynamics;
+    sensors of types that MJX does not know become clocks (a sensor is read by nobody here).
+    Newton's method solves the problem of contact forces of the PGS solver, too. MJX takes a switch
+    of springs or of dampers as one of all passive forces, and knows no groups of actuators.
+
+    Raises ValueError for actuators with several inputs.
+    """
+    import mujoco
+
+    mjx_module()
+    from mujoco.mjx._src import types
+
+    several = np.flatnonzero(getattr(model, "actuator_ctrlnum", np.ones(0)) != 1)
+    if len(several):
+        names = ", ".join(name_of(model, "actuator", i) for i in several)
+        fail("model", f"has actuators with several inputs ({names}), which MJX lacks",
+             "Put motors or position actuators, one input each, in their place")  # fmt: skip
+    cleared, options = [], model.opt
+    for flag in (mujoco.mjtEnableBit.mjENBL_ENERGY, mujoco.mjtEnableBit.mjENBL_FWDINV):
+        if options.enableflags & flag:
+            options.enableflags &= ~int(flag)
+            cleared.append(f"switch {_name(flag)}")
+    strange = ~np.isin(model.sensor_type, [int(kind) for kind in types.SensorType])
+    if np.any(strange):
+        cleared.append(f"{np.sum(strange)} sensors of types unknown to MJX")
+        model.sensor_type[strange] = int(mujoco.mjtSensor.mjSENS_CLOCK)
+    if options.solver == mujoco.mjtSolver.mjSOL_PGS:
+        options.solver = mujoco.mjtSolver.mjSOL_NEWTON
+        cleared.append("solver PGS, Newton in its place (same problem)")
+    bit = mujoco.mjtDisableBit
+    both = int(bit.mjDSBL_SPRING) | int(bit.mjDSBL_DAMPER)
+    off = options.disableflags & both
+    for flag, words, fields in (
+        (bit.mjDSBL_SPRING, "springs", ("jnt_stiffness", "tendon_stiffness")),
+        (bit.mjDSBL_DAMPER, "dampers", ("dof_damping", "tendon_damping")),
+    ):
+        if off & flag:
+            for field in fields:
+                getattr(model, field)[:] = 0
+            cleared.append(f"{words}, switched off in the file")
+    if off != both:
+        options.disableflags &= ~both
+    groups = np.clip(model.actuator_group, 0, 31)
+    idle = (options.disableactuator >> groups & 1).astype(bool) & (model.actuator_group >= 0)
+    if np.any(idle):
+        model.actuator_gaintype[idle] = int(mujoco.mjtGain.mjGAIN_FIXED)
+        model.actuator_biastype[idle] = int(mujoco.mjtBias.mjBIAS_NONE)
+        model.actuator_gainprm[idle] = model.actuator_biasprm[idle] = 0
+        names = ", ".join(name_of(model, "actuator", i) for i in np.flatnonzero(idle))
+        cleared.append(f"forces of {names}, whose groups are switched off in the file")
+    without = options.disableflags & _NO_CONTACTS and _leave_out_contacts(model)
+    if without:
+        cleared.append(f"contacts of {without}, switched off in the file")
+    return cleared
+
+
+def lacks(model: "mujoco.MjModel") -> list[Lack]:
+    """Return what of a model MJX cannot simulate although it changes motions.
+
+    Contacts between shapes for which MJX has no function, friction without slip (noslip), and
+    numbers that MJX passes over in silence.
 
     Raises ValueError where such shapes are in an explicit <pair>, or where the contacts that stay
     cannot be written as bits of contype and conaffinity.
@@ -30,30 +123,61 @@ def make_supported(model: "mujoco.MjModel") -> tuple[list[str], list[str]]:
     import mujoco
 
     mjx_module()
-    from mujoco.mjx._src import types
-
-    cleared, changed = [], []
-    diagnostics = (mujoco.mjtEnableBit.mjENBL_ENERGY, mujoco.mjtEnableBit.mjENBL_FWDINV)
-    for flag in diagnostics:
-        if model.opt.enableflags & flag:
-            model.opt.enableflags &= ~int(flag)
-            cleared.append(f"switch {_name(flag)}")
-    strange = ~np.isin(model.sensor_type, [int(kind) for kind in types.SensorType])
-    if np.any(strange):
-        cleared.append(f"{np.sum(strange)} sensors of types unknown to MJX")
-        model.sensor_type[strange] = int(mujoco.mjtSensor.mjSENS_CLOCK)
-    if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
-        model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
-        cleared.append("solver PGS, Newton in its place (same problem)")
+    found, contacts = [], not model.opt.disableflags & _NO_CONTACTS
     if model.opt.noslip_iterations:
-        changed.append(f"{model.opt.noslip_iterations} noslip iterations of dry contacts")
-        model.opt.noslip_iterations = 0
-    left_out = _leave_out_contacts(model)
-    if left_out and not model.opt.disableflags & _NO_CONTACTS:
-        changed.append(f"contacts of {left_out}")
-    elif left_out:
-        cleared.append(f"contacts of {left_out}, switched off in the file")
-    return cleared, changed
+        text = f"{model.opt.noslip_iterations} noslip iterations of dry contacts"
+        found.append(Lack(text, lambda model: _zero(model.opt, "noslip_iterations"), True))
+    without = contacts and _leave_out_contacts(copy.deepcopy(model))
+    if without:
+        found.append(Lack(f"contacts of {without}", _leave_out_contacts, True))
+    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        awake = lambda model: setattr(
+            model.opt, "enableflags", model.opt.enableflags & ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        )
+        found.append(Lack("sleep of bodies at rest", awake, True))
+    for field, words, kind, in_contact in _DROPPED:
+        values = getattr(model, field, np.zeros(0))
+        rows = np.flatnonzero([np.any(row != 0) for row in values])
+        if in_contact and not contacts:
+            continue
+        if in_contact and kind == "geom":
+            rows = rows[[_touches(model, i) for i in rows]]
+        if len(rows):
+            text = f"{words} of {_listed(model, kind, field, rows)}"
+            found.append(Lack(text, partial(_zero, field=field), in_contact))
+    for field, kind in _PLUGINS:
+        rows = np.flatnonzero(getattr(model, field, np.full(0, -1)) >= 0)
+        if len(rows):
+            text = f"the plugin of {_listed(model, kind, field, rows)}"
+            found.append(Lack(text, lambda model: None, True))
+    return found
+
+
+def _zero(model: Any, field: str) -> None:
+    """Set a number of the model, or all of an array, to zero."""
+    setattr(model, field, 0 * getattr(model, field))
+
+
+def _touches(model: "mujoco.MjModel", geom: Any) -> bool:
+    """Return whether a shape can come into contact, by its own bits or in a pair."""
+    bits = model.geom_contype[geom] | model.geom_conaffinity[geom]
+    return bool(bits) or geom in model.pair_geom1 or geom in model.pair_geom2
+
+
+def _listed(model: "mujoco.MjModel", kind: str, field: str, rows: np.ndarray) -> str:
+    """Return the names of rows of a field, such as "joint hip, joint knee"; the first five."""
+    if field.startswith("dof_"):
+        rows = np.unique(model.dof_jntid[rows])
+    more = f" and {len(rows) - 5} more" if len(rows) > 5 else ""
+    return ", ".join(name_of(model, kind, i) for i in rows[:5]) + more
+
+
+def name_of(model: "mujoco.MjModel", kind: str, i: Any) -> str:
+    """Return "joint hip", or "joint 3" (counted from 1) where it has no name."""
+    import mujoco
+
+    of = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
+    return f"{kind} {mujoco.mj_id2name(model, of, int(i)) or int(i) + 1}"
 
 
 # mjtDisableBit: all constraints, contacts.

@@ -1,0 +1,277 @@
+"""Whether the plant moves as its file says: steps of both beside each other.
+
+MJX passes over in silence what it does not know. So the steps of the plant are compared with those
+of MuJoCo's C engine, along short motions of the file from home, from random states, and from where
+half a second of falling leads. Each step starts from the engine's own state: differences do not
+pile up, and forces with a memory (delays, filters) show.
+"""
+
+import contextlib
+import copy
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from jaxmpc.control.sets import Box
+from jaxmpc.qp.linalg import JAXLIB
+from jaxmpc.robots.physics import Physics
+from jaxmpc.robots.supported import Lack, name_of
+
+if TYPE_CHECKING:
+    import mujoco
+
+# What counts as a difference, relative to the largest acceleration of the same dof: without and
+# with rows of constraints, whose two solvers stop where further steps gain little.
+SMOOTH, IN_CONTACT = 1e-6, 1e-3
+# Rounding, relative to the largest acceleration of all dofs.
+_ROUNDING = 1e-11
+_STEPS, _STARTS = 10, 4
+# Half a second, but no more steps than this.
+_MOST_STEPS = 250
+
+_known: dict[bytes, tuple[str, ...]] = {}
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Steps of the C engine: states before and after (K, nq + nv + na), inputs (K, nu), and whether
+    rows of constraints acted (K,)."""
+
+    before: np.ndarray
+    inputs: np.ndarray
+    after: np.ndarray
+    touched: np.ndarray
+
+
+def acting(given: "mujoco.MjModel", found: list[Lack], inputs: Box, home: np.ndarray) -> list[Lack]:
+    """Return those of the lacks without which some motion of the file changes."""
+    trials = [lack for lack in found if not lack.acts]
+    if not trials:
+        return found
+    whole = motion(given, inputs, home).after
+    idle = []
+    for lack in trials:
+        model = copy.deepcopy(given)
+        lack.take_out(model)
+        after = motion(model, inputs, home).after
+        if after.shape == whole.shape and np.allclose(after, whole, rtol=0, atol=1e-12):
+            idle.append(lack)
+    return [lack for lack in found if lack not in idle]
+
+
+def differences(
+    reference: "mujoco.MjModel", plant: Physics, inputs: Box, home: np.ndarray
+) -> tuple[str, ...]:
+    """Return in words where steps of the plant are not those of `reference`, the file without what
+    is known to be left out; inputs: limits of the file. Computed once a process for equal models.
+    """
+    key = hashlib.sha256()
+    for part in (_bytes(reference), _bytes(plant.model), home, *map(np.asarray, _box(inputs))):
+        key.update(np.ascontiguousarray(part).tobytes())
+    if key.digest() not in _known:
+        exact = copy.deepcopy(reference)
+        exact.opt.solver = plant.model.opt.solver
+        exact.opt.iterations = max(exact.opt.iterations, 100)
+        exact.opt.tolerance = min(exact.opt.tolerance, 1e-10)
+        seen = motion(exact, inputs, home)
+        _known[key.digest()] = _differences(exact, plant, seen) if len(seen.before) else ()
+    return _known[key.digest()]
+
+
+def _differences(model: "mujoco.MjModel", plant: Physics, seen: Motion) -> tuple[str, ...]:
+    nq, h = model.nq, model.opt.timestep
+    a, wanted = ((after - seen.before)[:, nq:] / h for after in (_steps(plant, seen), seen.after))
+    off = np.abs(np.where(np.isfinite(a), a, np.inf) - wanted)
+    worst: dict[str, tuple[float, str, int]] = {}
+    for rows, tolerance in ((~seen.touched, SMOOTH), (seen.touched, IN_CONTACT)):
+        if not np.any(rows):
+            continue
+        size = np.abs(wanted[rows]).max(axis=0)
+        allowed = tolerance * size + _ROUNDING * (1 + size.max())
+        for i in np.flatnonzero(np.any(off[rows] > allowed, axis=0)):
+            k = int(np.flatnonzero(rows)[np.argmax(off[rows, i])])
+            share, who = off[k, i] / allowed[i] * tolerance, _moved_by(model, i)
+            if share > worst.get(who, (0,))[0]:
+                text = f"{who} by {a[k, i]:.4g}, in MuJoCo by {wanted[k, i]:.4g} {_unit(model, i)}"
+                worst[who] = share, text, k
+    ranked = sorted(worst.values(), key=lambda entry: -entry[0])
+    if not ranked:
+        return ()
+    texts = [*_sources(model, plant, seen, ranked[0][2]), *(text for _, text, _ in ranked[:3])]
+    return (*texts, f"{len(ranked) - 3} more") if len(ranked) > 3 else tuple(texts)
+
+
+def _moved_by(model: "mujoco.MjModel", i: Any) -> str:
+    """Return what entry i of (accelerations, rates of activations) belongs to."""
+    if i < model.nv:
+        return f"{name_of(model, 'joint', model.dof_jntid[i])} accelerates"
+    k = int(np.flatnonzero(model.actuator_actadr <= i - model.nv)[-1])
+    return f"{name_of(model, 'actuator', k)} activates"
+
+
+def _unit(model: "mujoco.MjModel", i: Any) -> str:
+    if i >= model.nv:
+        return "a second"
+    j = model.dof_jntid[i]
+    straight = model.jnt_type[j] == 2 or (model.jnt_type[j] == 0 and i - model.jnt_dofadr[j] < 3)
+    return "m/s²" if straight else "rad/s²"
+
+
+def _sources(model: "mujoco.MjModel", plant: Physics, seen: Motion, k: int) -> list[str]:
+    """Return the actuators, tendons and contacts that differ before step k."""
+    import mujoco
+
+    data = mujoco.MjData(model)
+    _set(model, data, seen.before[k], seen.inputs[k])
+    mujoco.mj_forward(model, data)
+    with jax.enable_x64(True):
+        ours = jax.jit(plant.data)(seen.before[k], seen.inputs[k])
+    texts = []
+    for kind, quantity, mine, theirs in (
+        ("actuator", "force", ours.actuator_force, data.actuator_force),
+        ("tendon", "length", ours.ten_length, data.ten_length),
+    ):
+        wrong = np.flatnonzero(np.abs(np.asarray(mine) - theirs) > 1e-6 * np.abs(theirs) + 1e-12)
+        texts += [
+            f"{name_of(model, kind, i)} has the {quantity} {mine[i]:.4g}, in MuJoCo {theirs[i]:.4g}"
+            for i in wrong[:3]
+        ]
+    if plant.rows and not texts:
+        mine, theirs = _contacts(ours._impl.contact), _contacts(data.contact)
+        unlike = [pair for pair in mine | theirs if not _alike(mine.get(pair), theirs.get(pair))]
+        texts += [
+            f"contacts of {name_of(model, 'geom', a)} with {name_of(model, 'geom', b)}, of which "
+            "MJX finds other points or directions" for a, b in unlike[:3]
+        ]  # fmt: skip
+    if not texts and not model.opt.disableflags & 2:  # mjDSBL_EQUALITY
+        placed = np.flatnonzero(model.eq_active0 & (model.eq_type < 2))  # connect, weld
+        texts += [
+            f"{name_of(model, 'equality', i)} pushes otherwise (MJX has no force for the turning "
+            "of connect and weld)" for i in placed[:3]
+        ]  # fmt: skip
+    return texts
+
+
+def _contacts(found: Any) -> dict[tuple[int, int], np.ndarray]:
+    """Return distances and frames of the contacts (count, 10) that exert forces, by geoms."""
+    distance, geoms = np.asarray(found.dist), np.asarray(found.geom).reshape(-1, 2)
+    near = distance < np.asarray(found.includemargin)
+    rows = np.hstack([distance[:, None], np.asarray(found.frame).reshape(-1, 9)])
+    pairs = [tuple(sorted(pair)) for pair in geoms.tolist()]
+    return {
+        pair: np.array(sorted(r.tolist() for r, p, n in zip(rows, pairs, near, strict=True)
+                              if p == pair and n))
+        for pair, n in zip(pairs, near, strict=True) if n
+    }  # fmt: skip
+
+
+def _alike(a: np.ndarray | None, b: np.ndarray | None) -> bool:
+    return a is not None and b is not None and a.shape == b.shape and np.allclose(a, b, atol=1e-6)
+
+
+def _steps(plant: Physics, seen: Motion) -> np.ndarray:
+    """Return the states after the steps of the plant. Compiled in haste: it runs once."""
+    options: dict[str, Any] = {
+        "xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True,
+    }  # fmt: skip
+    if jax.default_backend() != "cpu":
+        options = {}
+    elif (0, 7, 0) <= JAXLIB < (0, 11, 1):
+        options["xla_cpu_use_fusion_emitters"] = False
+    run = jax.jit(lambda x, u: jax.lax.map(lambda pair: plant.bare_step(*pair), (x, u)))
+    with jax.enable_x64(True):
+        compiled = run.lower(seen.before, seen.inputs).compile(compiler_options=options)
+        return np.asarray(compiled(seen.before, seen.inputs))
+
+
+@contextlib.contextmanager
+def _unlogged() -> Iterator[None]:
+    """Let MuJoCo write no file and no line where a motion blows up, which ends it here."""
+    import mujoco
+
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda text: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+@_unlogged()
+def motion(model: "mujoco.MjModel", inputs: Box, home: np.ndarray) -> Motion:
+    """Return steps of the C engine: the same states and inputs for models of the same sizes."""
+    import mujoco
+
+    rng, data = np.random.default_rng(0), mujoco.MjData(model)
+    lower, upper = _box(inputs)
+    low, high = (
+        np.maximum(lower, np.minimum(-1, upper - 2)),
+        np.minimum(upper, np.maximum(1, lower + 2)),
+    )
+    rows = []
+    for start in range(_STARTS + 1):
+        mujoco.mj_resetData(model, data)
+        x = home if start in (0, _STARTS) else _moved(model, home, rng)
+        u = rng.uniform(low, high)
+        _set(model, data, x, u)
+        if start == _STARTS:
+            for _ in range(min(round(0.5 / model.opt.timestep), _MOST_STEPS)):
+                mujoco.mj_step(model, data)
+        for _ in range(_STEPS):
+            data.ctrl[:] = u = rng.uniform(low, high)
+            x = _state(data)
+            mujoco.mj_step(model, data)
+            rows.append((x, u, _state(data), data.nefc > 0))
+            bad = any(data.warning[int(w)].number for w in _blown())
+            if bad or not np.all(np.isfinite(rows[-1][2])):
+                rows.pop()
+                break
+    return Motion(*(np.array([row[part] for row in rows]) for part in range(4)))
+
+
+def _blown() -> tuple:
+    import mujoco
+
+    kind = mujoco.mjtWarning
+    return kind.mjWARN_BADQPOS, kind.mjWARN_BADQVEL, kind.mjWARN_BADQACC
+
+
+def _moved(model: "mujoco.MjModel", home: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return a random state near home, inside the ranges of joints and activations."""
+    import mujoco
+
+    q = home[: model.nq].copy()
+    mujoco.mj_integratePos(model, q, rng.normal(scale=0.3, size=model.nv), 1.0)
+    for j in np.flatnonzero(model.jnt_limited & np.isin(model.jnt_type, (2, 3))):
+        low, high = model.jnt_range[j]
+        q[model.jnt_qposadr[j]] = rng.uniform(0.95 * low + 0.05 * high, 0.05 * low + 0.95 * high)
+    act = rng.uniform(0.1, 0.9, size=model.na)
+    for k in np.flatnonzero(model.actuator_actlimited & (model.actuator_actadr >= 0)):
+        act[model.actuator_actadr[k]] = rng.uniform(*model.actuator_actrange[k])
+    return np.concatenate([q, rng.normal(size=model.nv), act])
+
+
+def _set(model: "mujoco.MjModel", data: "mujoco.MjData", x: np.ndarray, u: np.ndarray) -> None:
+    data.qpos[:], data.qvel[:], data.act[:] = np.split(x, [model.nq, model.nq + model.nv])
+    data.ctrl[:] = u
+
+
+def _state(data: "mujoco.MjData") -> np.ndarray:
+    return np.concatenate([data.qpos, data.qvel, data.act])
+
+
+def _box(inputs: Box) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(inputs.lower, float), np.asarray(inputs.upper, float)
+
+
+def _bytes(model: "mujoco.MjModel") -> np.ndarray:
+    """Return the model as MuJoCo stores it."""
+    import mujoco
+
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer
