@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _BITS = 31
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Lack:
     """What a model has and MJX has not. text: in words. take_out: removes it from a model, in
     place. acts: whether it is known to change motions, without trying."""
