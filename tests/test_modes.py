@@ -100,7 +100,7 @@ FUNCTIONS = {
     "nonlinear": nonlinear,
     "robot": robot,
 }
-FEW = ("plan", "derivative")
+FEW = ("plan",)
 HELD_BACK = {"explicit": ("loop",)}  # JAX's own: a carry that starts without a sharding
 
 
@@ -144,7 +144,7 @@ def test_debugging_modes():
             assert jm.solve(problem(), x).status == status
 
 
-@pytest.mark.first(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["bfloat16", "float16"])
 def test_half_precision(kind):
     """Computed in float32, as there are no factorizations in half precision."""

@@ -47,28 +47,48 @@ class Motion:
     touched: np.ndarray
 
 
-def acting(given: "mujoco.MjModel", found: list[Lack], inputs: Box, home: np.ndarray) -> list[Lack]:
-    """Return those of the lacks without which some motion of the file changes."""
+def compared(
+    given: "mujoco.MjModel", plant: Physics, missing: list[Lack], inputs: Box, home: np.ndarray
+) -> tuple[list[str], list[str], tuple[str, ...]]:
+    """Compare the plant with its file.
+
+    Arguments:
+        given: the file, untouched.
+        plant: what simulates it, without what MJX lacks.
+        missing: what was taken out.
+        inputs: the file's limits of inputs.
+        home: the state (nq + nv + na,) from which motions start.
+
+    Return in words which of `missing` change no motion of the file, which do, and where the plant
+    moves otherwise than the file without them.
+    """
+    idle = _idle(given, missing, inputs, home)
+    without = [lack.text for lack in missing if lack.text not in idle]
+    reference = copy.deepcopy(given)
+    for lack in missing:
+        lack.take_out(reference)
+    return idle, without, _differences(reference, plant, inputs, home)
+
+
+def _idle(given: "mujoco.MjModel", found: list[Lack], inputs: Box, home: np.ndarray) -> list[str]:
+    """Return the texts of the lacks without which motions of the file are the same."""
     trials = [lack for lack in found if not lack.acts]
-    if not trials:
-        return found
-    whole = motion(given, inputs, home).after
+    whole = motion(given, inputs, home).after if trials else None
     idle = []
     for lack in trials:
         model = copy.deepcopy(given)
         lack.take_out(model)
         after = motion(model, inputs, home).after
         if after.shape == whole.shape and np.allclose(after, whole, rtol=0, atol=1e-12):
-            idle.append(lack)
-    return [lack for lack in found if lack not in idle]
+            idle.append(lack.text)
+    return idle
 
 
-def differences(
+def _differences(
     reference: "mujoco.MjModel", plant: Physics, inputs: Box, home: np.ndarray
 ) -> tuple[str, ...]:
-    """Return in words where steps of the plant are not those of `reference`, the file without what
-    is known to be left out; inputs: limits of the file. Computed once a process for equal models.
-    """
+    """Return in words where steps of the plant are not those of `reference`. Computed once a
+    process for equal models."""
     key = hashlib.sha256()
     for part in (_bytes(reference), _bytes(plant.model), home, *map(np.asarray, _box(inputs))):
         key.update(np.ascontiguousarray(part).tobytes())
@@ -78,11 +98,11 @@ def differences(
         exact.opt.iterations = max(exact.opt.iterations, 100)
         exact.opt.tolerance = min(exact.opt.tolerance, 1e-10)
         seen = motion(exact, inputs, home)
-        _known[key.digest()] = _differences(exact, plant, seen) if len(seen.before) else ()
+        _known[key.digest()] = _unlike(exact, plant, seen) if len(seen.before) else ()
     return _known[key.digest()]
 
 
-def _differences(model: "mujoco.MjModel", plant: Physics, seen: Motion) -> tuple[str, ...]:
+def _unlike(model: "mujoco.MjModel", plant: Physics, seen: Motion) -> tuple[str, ...]:
     nq, h = model.nq, model.opt.timestep
     a, wanted = ((after - seen.before)[:, nq:] / h for after in (_steps(plant, seen), seen.after))
     off = np.abs(np.where(np.isfinite(a), a, np.inf) - wanted)
@@ -174,16 +194,23 @@ def _alike(a: np.ndarray | None, b: np.ndarray | None) -> bool:
 
 
 def _steps(plant: Physics, seen: Motion) -> np.ndarray:
-    """Return the states after the steps of the plant. Compiled in haste: it runs once."""
+    """Return the states after the steps of the plant.
+
+    Computed on a CPU where JAX has one, compiled in haste: it runs once.
+    """
     options: dict[str, Any] = {
         "xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True,
     }  # fmt: skip
-    if jax.default_backend() != "cpu":
-        options = {}
-    elif (0, 7, 0) <= JAXLIB < (0, 11, 1):
+    if (0, 7, 0) <= JAXLIB < (0, 11, 1):
         options["xla_cpu_use_fusion_emitters"] = False
+    device = None
+    if jax.default_backend() != "cpu":
+        try:
+            device = jax.local_devices(backend="cpu")[0]
+        except RuntimeError:  # JAX_PLATFORMS leaves it out
+            options = {}
     run = jax.jit(lambda x, u: jax.lax.map(lambda pair: plant.bare_step(*pair), (x, u)))
-    with jax.enable_x64(True):
+    with jax.enable_x64(True), jax.default_device(device):
         compiled = run.lower(seen.before, seen.inputs).compile(compiler_options=options)
         return np.asarray(compiled(seen.before, seen.inputs))
 

@@ -22,7 +22,7 @@ from jaxmpc.control.limits import Limit, limit_pair
 from jaxmpc.control.sets import Box
 from jaxmpc.control.system import require_period
 from jaxmpc.reals import Reals
-from jaxmpc.robots.guard import acting, differences
+from jaxmpc.robots.guard import compared
 from jaxmpc.robots.physics import RK4, Physics
 from jaxmpc.robots.robot import Robot
 from jaxmpc.robots.supported import lacks, translate
@@ -136,13 +136,8 @@ def load_robot(
     if home is not None:
         q, source = _configuration(host, home), "argument"
     start, plant = np.concatenate([q, np.zeros(host.nv), act]), Physics(host)
-    acts = acting(given, missing, inputs, start)
-    cleared += [f"{lack.text}, without effect" for lack in missing if lack not in acts]
-    reference = copy.deepcopy(given)
-    for lack in missing:
-        lack.take_out(reference)
-    without = [lack.text for lack in acts]
-    unlike = differences(reference, plant, inputs, start)
+    idle, without, unlike = compared(given, plant, missing, inputs, start)
+    cleared += [f"{text}, without effect" for text in idle]
     texts = [f"moves without {'; '.join(without)} of its file, which MJX lacks"] * bool(without)
     texts += [f"moves otherwise than its file says: {'; '.join(unlike)}"] * bool(unlike)
     coupled = _couplings(host)

@@ -403,6 +403,7 @@ def test_recursion_of_the_joint_for_real(tmp_path, capsys):
     assert "found by regions" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_recursion_of_a_proved_law_draws_no_samples(tmp_path, capsys):
     assert run("recursion --horizon 6 --terminal box --smallest 1") == 0
     text = capsys.readouterr()

@@ -62,6 +62,7 @@ def solved(names, count, dtype):
     return wrong
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_rows_in_the_null_space(dtype):
     assert solved(FLAT, 3, dtype) == {}

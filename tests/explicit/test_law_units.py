@@ -272,6 +272,7 @@ def test_recursion_with_coupled_inputs():
 # --- Previous inputs ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_previous_inputs_are_within_their_limits():
     """One feasible set of (x, u_−1) for all: regions, polytope, labels, rays, fraction."""
     mpc = integrator(input_rate_limit=0.5, horizon=2)

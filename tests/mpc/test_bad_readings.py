@@ -86,6 +86,7 @@ def test_robot_controller(linearize):
     np.testing.assert_allclose(planned[after], cold[after], atol=0.02 * size)
 
 
+@pytest.mark.slow
 def test_a_carry_that_is_not_finite():
     """It counts as none, whoever made it."""
     with jax.enable_x64(True):

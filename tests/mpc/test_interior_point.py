@@ -92,6 +92,7 @@ def test_newton_steps_alone_do_not_solve_them():
     assert (plan.status == jm.Status.SOLVED).mean() < 0.99
 
 
+@pytest.mark.slow
 def test_costs_are_those_of_another_solver():
     plan = planned()
     worst = np.argsort(-plan.slack.max(axis=(1, 2)))[[0, 1, COUNT // 2]]

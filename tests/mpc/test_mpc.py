@@ -222,6 +222,7 @@ class TestRiccati:
             np.testing.assert_allclose(plan.inputs[k], lqr.K @ x, atol=1e-8)
             x = mpc.system.A @ x + mpc.system.B @ (lqr.K @ x)
 
+    @pytest.mark.slow
     def test_loose_limits_are_lqr_too(self):
         mpc = free(6)
         lqr = jm.lqr(mpc.system, mpc.Q, mpc.R)
@@ -320,6 +321,7 @@ class TestReferences:
 class TestMultipliers:
     """dJ*/d(bound) = −y, by central differences."""
 
+    @pytest.mark.first(1)
     @pytest.mark.parametrize("side", ["upper", "lower"])
     @pytest.mark.parametrize("which", ["inputs", "states", "terminal_set"])
     def test_sensitivity(self, which, side):
@@ -425,6 +427,7 @@ class TestManyStates:
 
 
 class TestController:
+    @pytest.mark.slow
     def test_warm_start_saves_steps(self):
         mpc = problems.joint_o_inf(horizon=10)
         x = np.array([0.35, -0.5])
@@ -454,6 +457,7 @@ class TestController:
         inputs = condensed.trajectory(x, z)[1]
         np.testing.assert_allclose(inputs, jm.solve(mpc, x, solver=FINE).inputs, atol=1e-7)
 
+    @pytest.mark.slow
     def test_shifted_multipliers_move_up(self):
         mpc = problems.joint(horizon=6)
         controller = jm.Controller(mpc, FINE)

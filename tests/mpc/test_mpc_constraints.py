@@ -391,9 +391,9 @@ def each(name):
         yield explicit, arguments, jax.tree.map(lambda v, i=i: v[i], plans)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 class TestAnotherSolver:
-    @pytest.mark.slow
     def test_row_table(self, name):
         """One entry a row, in the order of the multipliers, with the names of the explicit rows."""
         explicit, *_, plans = batch(name)
@@ -535,6 +535,7 @@ class TestActiveConstraints:
         with pytest.raises(ValueError, match="plan"):
             active_constraints(blocked(), jax.tree.map(lambda v: v[0], plans))
 
+    @pytest.mark.slow
     def test_multipliers_by_kind(self):
         """The fields of Multipliers are the rows of the table, sorted."""
         for name in ("rated", "blocked"):

@@ -189,7 +189,7 @@ def call_controller(mpc, x0s):
 PRECISIONS = pytest.mark.parametrize("x64", [True, False], ids=["float64", "float32"])
 
 
-@pytest.mark.first(1)
+@pytest.mark.slow
 @PRECISIONS
 def test_plan_in_any_units(x64, optima):
     assert faults(solve, 1, x64, optima) == []

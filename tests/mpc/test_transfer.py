@@ -89,6 +89,7 @@ def test_plans_are_those_of_the_solver(mpc, states, solved, few):
         assert kkt_residual(mpc, states[i], plan) <= 1e-6
 
 
+@pytest.mark.slow
 def test_most_follow(mpc, states, solved, few):
     """Of the feasible states few are solved that are not the first of their cell."""
     good = states[solved.status == jm.Status.SOLVED]

@@ -198,6 +198,7 @@ def test_singular_R_is_judged_by_the_whole_cost(name, unit):
                 check()
 
 
+@pytest.mark.slow
 def test_tracking_without_an_end_cost():
     """No cost sees the last inputs; the first is unique, the limit of those with some effort."""
     mpc = without_effort(inputs=jm.Box([-0.3, -0.2], [0.3, 0.2]))

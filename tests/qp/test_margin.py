@@ -42,6 +42,7 @@ def margin(qp, **settings) -> float:
     return float(t)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("qp", "t"),
     [

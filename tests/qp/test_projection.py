@@ -691,6 +691,7 @@ class TestSoftRows:
 
 
 class TestBalls:
+    @pytest.mark.slow
     def test_known_answers(self, x64):
         """No ball, one or both active: z and the multipliers, along the normals, as constructed."""
         qp, z, y = ball_batch()
@@ -986,6 +987,7 @@ class TestBadInput:
         for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(got), strict=True):
             np.testing.assert_array_equal(a[~bad], b[~bad])
 
+    @pytest.mark.slow
     def test_bad_weights_in_a_batch(self, x64):
         changes = [
             (2, "soft_linear", 5, -1.0), (4, "soft_linear", 7, np.nan),

@@ -113,6 +113,7 @@ class TestKnownAnswers:
             assert sol.status == jm.Status.SOLVED
             np.testing.assert_allclose(sol.z, z, atol=1e-5)
 
+    @pytest.mark.first(1)
     @pytest.mark.parametrize("n", [1, 5, 20])
     def test_linear_programs(self, x64, n):
         """P = 0: ADMM is slow there; solved and right, or said to be unfinished."""
@@ -364,6 +365,7 @@ class TestHonestStatus:
             assert exact.proves_empty(A, l, u, sol.certificate)
             np.testing.assert_array_equal(sol.ray, 0)
 
+    @pytest.mark.slow
     def test_infeasible_without_box(self, x64):
         """Integer rows z₁ + z₂ ≥ 2, z₁ + z₂ ≤ 1: the certificate is (−t, t)."""
         A = np.array([[1.0, 1.0], [1.0, 1.0]])
@@ -388,6 +390,7 @@ class TestHonestStatus:
         assert sol.status == jm.Status.PRIMAL_INFEASIBLE
         assert exact.proves_empty(A, l, u, np.asarray(sol.certificate))
 
+    @pytest.mark.first(3)
     @pytest.mark.parametrize("gap", [1e-1, 1e-2, 1e-3, -1e-3, -1e-2])
     def test_never_infeasible_when_feasible(self, x64, gap):
         """A corner of the box misses (gap > 0) or meets (gap < 0) an oblique row by |gap|."""
@@ -423,6 +426,7 @@ class TestHonestStatus:
         )
         assert sol.status == jm.Status.DUAL_INFEASIBLE
 
+    @pytest.mark.slow
     def test_slow_descent_is_not_called_unbounded(self, x64):
         """A flat but bounded direction: curvature 1e-6 is not none."""
         qp = jm.QP(np.diag([1.0, 1e-6]), np.array([0.0, 1e-3]), np.eye(2), -INF * np.ones(2),
@@ -627,6 +631,7 @@ class TestSettings:
                 assert sol.status == jm.Status.SOLVED
                 np.testing.assert_allclose(sol.z, z, atol=1e-6)
 
+    @pytest.mark.slow
     def test_warm_start_helps(self, x64):
         qp, _, _ = constructed(8, 0)
         near = replace(qp, q=qp.q * 1.01)
@@ -675,12 +680,14 @@ class TestSettings:
             better = solve(qp, jm.ADMM(iterations=30, refine=30))
             assert np.abs(better.z - z).max() <= np.abs(plain.z - z).max() * (1 + 1e-6) + 1e-9
 
+    @pytest.mark.slow
     def test_vmap_over_rho(self, x64):
         qp, z, _ = constructed(6, 4)
         solve = lambda rho: jm.solve_qp(qp, jm.ADMM(iterations=1000, rho=rho, refine=0)).z
         answers = jax.vmap(solve)(jnp.array([0.3, 1.0, 3.0]))
         np.testing.assert_allclose(answers, np.tile(z, (3, 1)), atol=1e-5)
 
+    @pytest.mark.slow
     def test_integers_are_numbers(self):
         sol = jm.solve_qp(jm.QP([[2, 0], [0, 2]], [-2, -6], [[1, 0], [0, 1]], [0, 0], [2, 2]))
         np.testing.assert_allclose(sol.z, [1, 2], atol=1e-4)
@@ -713,6 +720,7 @@ class TestGradients:
             for found in (reverse(0.0, way), forward(way)):
                 np.testing.assert_allclose(found, numeric, rtol=1e-5, atol=1e-7, err_msg=field)
 
+    @pytest.mark.slow
     def test_rho(self, x64):
         """With few steps the answer depends on rho, and its gradient is that of the program."""
         qp, _, _ = constructed(4, 3)
@@ -845,6 +853,7 @@ class TestTolerances:
         large = replace(solver, eps=1.0)
         assert jm.solve_qp(qp, large).status == jm.Status.SOLVED
 
+    @pytest.mark.slow
     def test_newton_reaches_rounding(self, x64):
         found = solve(constructed(6, 5)[0], jm.ADMM(eps=0.0))
         assert found.status == jm.Status.SOLVED and found.dual_residual < 1e-12

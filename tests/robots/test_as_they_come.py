@@ -83,6 +83,7 @@ WALKER = """
 </worldbody><actuator><motor joint="leg" ctrlrange="-5 5"/></actuator></mujoco>"""
 
 
+@pytest.mark.slow
 def test_what_only_the_ground_can_hold_is_named():
     robot = load(WALKER)
     weight = "34.3 are missing at root z"
@@ -137,6 +138,7 @@ def touching(model):
     }
 
 
+@pytest.mark.slow
 def test_contacts_that_mjx_lacks_are_left_out_alone():
     given = mujoco.MjModel.from_xml_string(DROPPED)
     with pytest.warns(UserWarning, match="without 3 noslip .*box with cylinder .1 pairs"):

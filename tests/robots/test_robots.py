@@ -294,6 +294,7 @@ def test_coordinates_and_state_are_inverse(quadrotor, arm2):
     assert quadrotor.state_names[3] == "free rotation x" and quadrotor.state_units[3] == "rad"
 
 
+@pytest.mark.slow
 def test_equilibrium_stays_put(mixed):
     """Of every model: forces balance by mj_forward, and 1 s of the C engine moves nothing."""
     for name in ("joint", "pendulum", "cartpole", "arm2", "arm6", "arm7", "quadrotor"):

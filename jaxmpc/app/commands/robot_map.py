@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from jaxmpc.control.riccati import lqr
 from jaxmpc.control.sets import translated
 from jaxmpc.feasible import store
 from jaxmpc.feasible.map import grid
+from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
 from jaxmpc.robot_maps.loops import RobotLoops
@@ -255,6 +256,21 @@ class RobotMapCommand:
 
         save(plot_robot_map(rmap).figure, self.output / "robot_map.png")
         return ["summary.json", "robot_map.npz", "robot_map.png"]
+
+
+def problem_again(config: Mapping[str, Any], points: np.ndarray) -> FeasibilityProblem:
+    """Build the problem of a map of points (B, d) from its stored configuration alone. Raises
+    ValueError, KeyError or TypeError for one that makes none."""
+    robot = load_robot(config["robot"])
+    names, fixed = robot.state_names, _home_coordinates(robot)
+    for name, value in config["fixed"].items():
+        fixed[names.index(name)] = value
+    axes = tuple(names.index(name) for name in config["axes"])
+    mpc = default_mpc(robot, config["horizon"], config["terminal"])
+    seconds = config["samples"] * robot.dt
+    return RobotSetting.of(
+        robot, mpc, points, seconds, axes=axes, fixed=fixed, claim=config["claim"]
+    ).problem
 
 
 def default_mpc(robot: Robot, horizon: int, terminal: str = "none") -> MPC:

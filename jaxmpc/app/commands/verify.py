@@ -1,8 +1,10 @@
 """The command `jaxmpc verify`."""
 
 import dataclasses
+import sys
 import time
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,9 +13,11 @@ import tyro
 
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import Switch, check_counts, option, print_table
+from jaxmpc.app.commands.robot_map import problem_again
 from jaxmpc.checks import shown
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.verification import Verification, find_store, verify
+from jaxmpc.robots.load import MODELS
 
 # Failures that are printed.
 SHOWN = 10
@@ -27,7 +31,7 @@ class Verify:
       Reads the map that jaxmpc sweep left in DIR, or the report of jaxmpc recursion, either with
       --robot or without. Metadata, configuration, data and summary.json are compared with their
       checksums and with each other, and the problem with the one that the configuration gives
-      (that of a robot is not built again). What is damaged is named in one line, and nothing is
+      (that of a robot where its file is here). What is damaged is named in one line, and nothing is
       proved where data cannot be read. Else proves each label:
         feasible    the stored plan is rolled out from the state and keeps every limit
         infeasible  a half-space that no feasible state leaves, made anew, excludes the state
@@ -95,39 +99,44 @@ class Verify:
 
 
 def contradictions(attributes: Mapping[str, Any], axes: Mapping[str, np.ndarray]) -> list[str]:
-    """Build the problem of a sweep or a recursion report from its configuration, and return where
+    """Build the problem of a map or a recursion report from its configuration, and return where
     what is stored is another one."""
     config, problem = attributes.get("config"), attributes.get("problem")
     if not isinstance(config, Mapping) or not isinstance(problem, Mapping):
         return ["zarr.json: holds no configuration or no problem"]
-    if "system" not in config:
-        return _robot_contradictions(config, problem, axes)
+    lines: list[np.ndarray] = []
     try:
-        made = configs.from_results(config, "sweep" if axes else "recursion")
-        region = configs.sweep_points(made) if axes else None
-        view = (None, None) if region is None else (region.axes, region.fixed)
-        built = FeasibilityProblem.of(made.build_mpc(), *view).plain()
-    except (ValueError, ArithmeticError, TypeError, np.linalg.LinAlgError) as error:
+        if "system" in config:
+            made = configs.from_results(config, "sweep" if axes else "recursion")
+            region = configs.sweep_points(made) if axes else None
+            lines = [] if region is None else region.along
+            view = (None, None) if region is None else (region.axes, region.fixed)
+            built = FeasibilityProblem.of(made.build_mpc(), *view).plain()
+        elif not _is_here(config["robot"]):
+            print(f"{config['robot']}: is not here; the map's problem is not built from it again",
+                  file=sys.stderr)  # fmt: skip
+            return []
+        else:
+            if config["horizon"] != problem.get("horizon"):
+                raise ValueError(f"horizon {shown(config['horizon'])}, the problem says "
+                                 f"{shown(problem.get('horizon'))}")  # fmt: skip
+            lower, upper = config["lower"], config["upper"]
+            lines = [np.linspace(low, high, len(axis)) for low, high, axis in
+                     zip(lower, upper, axes.values(), strict=True)]  # fmt: skip
+            built = problem_again(config, np.array([lower, upper])).plain()
+    except (ArithmeticError, KeyError, LookupError, TypeError, ValueError) as error:
         return [f"configuration: makes no problem ({error})"]
     found = [f"problem.{key}: {shown(problem.get(key))}, the configuration says {shown(value)}"
              for key, value in built.items() if not alike(problem.get(key), value)]  # fmt: skip
-    for (name, line), end in zip(axes.items(), region.along if region else (), strict=True):
-        if not alike(line.tolist(), end.tolist()):
+    for (name, line), stated in zip(axes.items(), lines, strict=bool(lines)):
+        if not alike(line.tolist(), stated.tolist()):
             found.append(f"{name}: not the points of the grid in the configuration")
     return found
 
 
-def _robot_contradictions(
-    config: Mapping[str, Any], problem: Mapping[str, Any], axes: Mapping[str, np.ndarray]
-) -> list[str]:
-    """Return where a robot's map differs from its configuration, without the robot."""
-    ends = {"lower": [v.min() for v in axes.values()], "upper": [v.max() for v in axes.values()]}
-    stored = {"horizon": problem.get("horizon"), **ends}
-    return [
-        f"{key}: {shown(value)}, the configuration says {shown(config[key])}"
-        for key, value in stored.items()
-        if key in config and not alike(config[key], value)
-    ]  # fmt: skip
+def _is_here(robot: Any) -> bool:
+    """Return whether a robot, a name or a path, can be loaded."""
+    return bool(find_spec("mujoco")) and (robot in MODELS or Path(robot).is_file())
 
 
 def alike(a: Any, b: Any) -> bool:
