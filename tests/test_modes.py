@@ -129,6 +129,7 @@ def test_labels_without_implicit_promotion():
     np.testing.assert_array_equal(found, jm.map_feasible_set(problem(), XS).label)
 
 
+@pytest.mark.slow
 def test_without_jit():
     mpc = jm.MPC(jm.LinearSystem([[1.0]], [1.0]), 1.0, 1.0, 2, inputs=jm.Box(-1, 1))
     with jax.disable_jit():

@@ -99,6 +99,7 @@ def test_a_carry_that_is_not_finite():
         np.testing.assert_allclose(u, controller(x)[0], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_joint_without_rates_gives_zero():
     u, _, plan = jm.Controller(problems.joint(5))(np.array([np.nan, 0.0]))
     assert plan.status == jm.Status.NON_FINITE and u == 0

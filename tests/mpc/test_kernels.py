@@ -44,6 +44,7 @@ def test_kernels_equal_the_scans(staged):
         close(*both(scan, kernels._recurrence_kernel, A, gx[:, 1:], gx[:, 0], adjoint=adjoint))
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("staged", [False, True])
 def test_a_batch_side_by_side_is_the_scan(staged):
     """On CPUs: values, and the derivative of the scans, of nested batches too."""

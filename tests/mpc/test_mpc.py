@@ -321,7 +321,7 @@ class TestReferences:
 class TestMultipliers:
     """dJ*/d(bound) = −y, by central differences."""
 
-    @pytest.mark.first(1)
+    @pytest.mark.slow
     @pytest.mark.parametrize("side", ["upper", "lower"])
     @pytest.mark.parametrize("which", ["inputs", "states", "terminal_set"])
     def test_sensitivity(self, which, side):
@@ -507,6 +507,7 @@ class TestController:
 
 
 class TestTypes:
+    @pytest.mark.slow
     def test_dtype_follows_data(self):
         mpc = problems.lecture()
         assert jm.solve(mpc, np.zeros(2)).inputs.dtype == jnp.float64

@@ -412,7 +412,6 @@ class TestAnotherSolver:
             if key in explicit.rows and row.kind == "state":
                 assert row.unit == (explicit.mpc.system.state_units or ("",) * 9)[row.index]
 
-    @pytest.mark.slow
     def test_plans(self, name):
         """Status, cost, trajectory and violations."""
         explicit, x0, previous, reference, effort, plans = batch(name)
@@ -438,7 +437,6 @@ class TestAnotherSolver:
             np.testing.assert_allclose(plans.slack[i], expected, atol=1e-6)
         assert 5 <= solved
 
-    @pytest.mark.slow
     def test_optimality_row_by_row(self, name):
         """Labelled multipliers: signs, complementarity and no gradient left in the free moves."""
         active = set()
@@ -528,6 +526,7 @@ class TestAnotherSolver:
 class TestActiveConstraints:
     """What needs no plan of its own."""
 
+    @pytest.mark.slow
     def test_a_plan_of_another_problem(self):
         _, *_, plans = batch("rated")
         with pytest.raises(ValueError, match="plan.*Give one plan of mpc"):

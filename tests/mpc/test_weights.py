@@ -94,7 +94,7 @@ ROUTES = {
 symmetrised = partial(jax.tree.map, lambda M: (M + M.T) / 2)
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", ROUTES)
 def test_raw_and_symmetrised_weights_mean_the_same(name):
     """A quadratic form knows the symmetric part alone: plans, costs and derivatives too."""
@@ -116,6 +116,7 @@ def test_raw_and_symmetrised_weights_mean_the_same(name):
     assert np.abs(d_raw["Q"]).max() > 1e-3 and np.abs(d_raw["R"]).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_concrete_weights_within_rounding_of_symmetry():
     """What is refused is a visible asymmetry; what is left of it has no effect."""
     tilt = np.array([[0.0, 3e-7], [0.0, 0.0]])

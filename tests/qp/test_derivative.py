@@ -787,6 +787,7 @@ class TestUnrolled:
         for a, b in zip(*map(jax.tree.leaves, pair), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
 
+    @pytest.mark.slow
     def test_float32_without_64_bit_mode(self):
         """Residuals are computed in float64 behind the scenes, and take no part in it."""
         qp, _ = joint_batch(1)

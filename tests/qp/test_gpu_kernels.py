@@ -129,6 +129,7 @@ def test_a_search_that_is_lost_begins_once_more(x64):
 STATES = np.linspace(-1, 1, 6)[:, None] * np.array([1.1, 1.4])
 
 
+@pytest.mark.slow
 def test_damped_systems_in_a_kernel_are_those_of_xla(x64):
     """Of every size, in float64, with rows that depend on each other and soft ones."""
     rng = np.random.default_rng(0)

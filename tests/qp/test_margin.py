@@ -127,6 +127,7 @@ def test_climbing_the_margin_leads_into_the_feasible_set(mpc, count):
     assert np.all(jm.map_feasible_set(mpc, x).label == 1)
 
 
+@pytest.mark.slow
 def test_bad_input():
     qp = rows([[1]], [-1], [1])
     with pytest.raises(ValueError, match="scale"):

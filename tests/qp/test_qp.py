@@ -93,7 +93,7 @@ def x64():
 
 class TestKnownAnswers:
     @pytest.mark.parametrize("n", [1, 5, 20, pytest.param(60, marks=pytest.mark.slow)])
-    @pytest.mark.first(1)
+    @pytest.mark.slow
     def test_float64(self, x64, n):
         for seed in range(3):
             qp, z, y = constructed(n, seed)
@@ -147,6 +147,7 @@ class TestKnownAnswers:
         status = [solve(constructed(10, seed)[0]).status for seed in range(20)]
         assert np.mean(np.array(status) == jm.Status.SOLVED) >= 0.9
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("scale", [1e-6, 1e6])
     def test_units_do_not_matter(self, x64, scale):
         """Rows, cost and variables in other units: same solution."""
@@ -164,6 +165,7 @@ class TestKnownAnswers:
         assert sol.status == jm.Status.SOLVED
         np.testing.assert_allclose(sol.z, [-1.0, 0.5], atol=1e-9)
 
+    @pytest.mark.slow
     def test_equality_alone(self, x64):
         """KKT system solved by numpy."""
         rng = np.random.default_rng(3)
@@ -376,6 +378,7 @@ class TestHonestStatus:
         np.testing.assert_allclose(A.T @ y, 0, atol=1e-12)
         assert y[0] < 0 < y[1] and u[1] * y[1] + l[0] * y[0] < 0
 
+    @pytest.mark.slow
     def test_infeasible_zero_row(self, x64):
         """0'z ≥ 1 contradicts itself."""
         qp = jm.QP(np.eye(2), np.ones(2), np.zeros((1, 2)), np.ones(1), np.array([INF]))
@@ -383,6 +386,7 @@ class TestHonestStatus:
         assert sol.status == jm.Status.PRIMAL_INFEASIBLE
         assert exact.proves_empty(qp.A, qp.l, qp.u, sol.certificate)
 
+    @pytest.mark.slow
     def test_infeasible_float32(self):
         A = np.array([[1, 0], [0, 1], [1, 1]], np.float32)
         l, u = np.array([-1, -1, 2.5], np.float32), np.array([1, 1, INF], np.float32)

@@ -100,7 +100,7 @@ def test_a_small_coefficient_still_bounds(x64, least):
 
 
 @PRECISIONS
-@pytest.mark.first(1)
+@pytest.mark.slow
 def test_negative_curvature_has_a_status(x64):
     """Indefinite but for rounding; whatever stands on the diagonal, and in whatever units."""
     rng = np.random.default_rng(3)

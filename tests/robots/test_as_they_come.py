@@ -27,6 +27,7 @@ def load(text, **options):
 # --- set-points ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_home_at_a_limit_and_an_object_that_nothing_moves():
     """The margin goes at that limit alone; the terminal cost is the LQR's of the finger alone."""
     robot = load(GRIPPER)
