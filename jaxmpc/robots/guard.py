@@ -73,7 +73,9 @@ def compared(
 def _idle(given: "mujoco.MjModel", found: list[Lack], inputs: Box, home: np.ndarray) -> list[str]:
     """Return the texts of the lacks without which motions of the file are the same."""
     trials = [lack for lack in found if not lack.acts]
-    whole = motion(given, inputs, home).after if trials else None
+    if not trials:
+        return []
+    whole = motion(given, inputs, home).after
     idle = []
     for lack in trials:
         model = copy.deepcopy(given)

@@ -5,6 +5,7 @@ import os
 import resource
 import shutil
 import time
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -116,12 +117,13 @@ def test_random_damage(sound, report, count, seed):
 
 def edited(folder, change, sign=False):
     """Change the metadata of the group; sign: with hashes to match, as a forger would."""
-    file = folder / "sweep.zarr" / "zarr.json"
+    (there,) = folder.glob("*.zarr")
+    file = there / "zarr.json"
     root = json.loads(file.read_text())
     change(root)
     if sign:
         known, names = root["attributes"], root["attributes"]["variables"]
-        group = zarr.open_group(folder / "sweep.zarr", mode="r", use_consolidated=False)
+        group = zarr.open_group(there, mode="r", use_consolidated=False)
         data = {k: np.asarray(group[k][...]) for k in [*names["axes"], *names["constants"]]}
         known["fingerprint"] = store._fingerprint(store._record(known), data)
         known["digest"] = store._digest(known)
@@ -319,6 +321,37 @@ def test_forgery(sound, tmp_path, report, name):
     shutil.copytree(sound, tmp_path / "out")
     change(tmp_path / "out")
     assert said in report(tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_forged_maps_of_a_robot(tmp_path, report, capsys):
+    """The problem is built again from the robot; where its file is gone, that is said."""
+    model = tmp_path / "mine.xml"
+    model.write_text((resources.files("jaxmpc.robots") / "models/joint.xml").read_text())
+    line = f"sweep --robot {model} --grid 4 4 --seconds 0.02 --horizon 4 --output"
+    sound = tmp_path / "out"
+    assert cli.main([*line.split(), str(sound)]) == 0
+    assert cli.main(["verify", str(sound)]) == 0
+    for change, said in (
+        (attributes("problem", "A", value=[[1.0, 0.0], [0.0, 1.0]]), "problem.A"),
+        (attributes("problem", "rows", 0, "upper", value=[9.0]), "problem.rows"),
+        (attributes("config", "terminal", value="box"), "problem."),
+        (attributes("config", "horizon", value=10**9), "horizon"),
+        (attributes("config", "lower", value=[-9.0, -9.0]), "not the points"),
+        (attributes("config", "axes", value=["nothing", "here"]), "makes no problem"),
+        (attributes("config", "fixed", value=7), "makes no problem"),
+        (attributes("config", "robot", value="quadrotor"), "makes no problem"),
+        (attributes("config", "robot", value=3), "makes no problem"),
+    ):  # fmt: skip
+        forged = tmp_path / "forged"
+        shutil.copytree(sound, forged, dirs_exist_ok=True)
+        change(forged)
+        assert said in report(forged)
+        shutil.rmtree(forged)
+    model.unlink()
+    capsys.readouterr()
+    assert cli.main(["verify", str(sound)]) == 0
+    assert "mine.xml: is not here" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -52,6 +52,38 @@ def rows(out):
     return {line[2:16].strip(): line[16:].strip() for line in lines}
 
 
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+@pytest.mark.parametrize(
+    ("command", "module", "record"),
+    [("weights", tune, "tuning.json"), ("penalties", tune_penalties, tune_penalties.FILES[0])],
+)
+def test_a_run_is_kept_until_the_one_that_overwrites_it_has_a_checkpoint(
+    command, module, record, error, tmp_path, monkeypatch, given_starts
+):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    old = {record: b"{}", "checkpoint.npz": b"1", "tuned.toml": b"", "notes.txt": b"mine"}
+    for file, content in old.items():
+        (folder / file).write_bytes(content)
+    contents = lambda: {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def stopped(*_, checkpoint, **__):
+        assert not checkpoint.exists()
+        if made:
+            checkpoint.write_bytes(b"2")
+        raise error
+
+    monkeypatch.setattr(module, f"tune_{command}", stopped)
+    line = f"{command} --count 16 --updates 1 --output out --overwrite"
+    made = False
+    assert run(line) != 0 and contents() == old
+    made = True
+    assert run(line) != 0
+    found = contents()
+    assert found.pop("checkpoint.npz") == b"2" and found.pop(record) != b"{}"
+    assert found == {"notes.txt": b"mine"}
+
+
 @pytest.mark.slow
 def test_weights_cut_off_resumed_and_read_back(tmp_path, monkeypatch, capsys, given_starts):
     """Ctrl-C writes what there is; tuned.toml is the problem that was tuned."""

@@ -30,6 +30,7 @@ from jaxmpc.app.commands.tuning import (
     check_validation,
     open_run,
     optimizer_of,
+    overwriting,
 )
 from jaxmpc.app.commands.tuning_report import save_results
 from jaxmpc.app.commands.tuning_task import TuningTask, linear_task, robot_task
@@ -204,6 +205,10 @@ class TuneWeights:
 
     def run(self) -> int:
         """Run the command and return the exit code."""
+        with overwriting(self.output):
+            return self._run()
+
+    def _run(self) -> int:
         begun, compiled = time.perf_counter(), Compiled.seconds
         try:
             task = self.prepare()

@@ -28,6 +28,7 @@ from jaxmpc.app.commands.tuning import (
     feasible_states,
     open_run,
     optimizer_of,
+    overwriting,
     problem_file,
     start_range,
 )
@@ -134,6 +135,10 @@ class TunePenalties:
 
     def run(self) -> int:
         """Run the command and return the exit code."""
+        with overwriting(self.output):
+            return self._run()
+
+    def _run(self) -> int:
         begun = time.perf_counter()
         try:
             config, mpc, (lower, upper) = self.prepare()

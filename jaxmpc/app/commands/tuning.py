@@ -1,6 +1,9 @@
 """Helpers of `jaxmpc tune weights` and `tune penalties`: optimizer, initial states, folder."""
 
+import contextlib
 import json
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,8 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.runs import differences, text_within, write_json
 
 CHECKPOINT = "checkpoint.npz"
+# Where the files of a run that is overwritten wait.
+ASIDE = "overwritten"
 TUNED = "tuned.toml"
 # The most random states that are drawn for each state wanted.
 TRIES = 10
@@ -97,16 +102,38 @@ def feasible_states(
     fail("initial states", f"{len(found)} of {TRIES * count} drawn have a plan", cure)
 
 
+@contextlib.contextmanager
+def overwriting(folder: Path) -> Iterator[None]:
+    """Keep a run that is overwritten until the new one has a checkpoint, whatever ends it."""
+    try:
+        yield
+    finally:
+        settle(folder)
+
+
+def settle(folder: Path) -> None:
+    """Remove a run that was overwritten where the new one has a checkpoint, else bring it back."""
+    aside = folder / ASIDE
+    if not aside.is_dir():
+        return
+    if not (folder / CHECKPOINT).exists():
+        for path in aside.iterdir():
+            path.replace(folder / path.name)
+    shutil.rmtree(aside)
+
+
 def open_run(
     folder: Path, files: tuple[str, ...], options: dict[str, Any], resume: bool, overwrite: bool
 ) -> None:
     """Open the folder of a new run, or of one that is resumed with the same options.
 
-    files[0] is the record of the run, a JSON file that holds the options. All files are removed and
-    a new record is written. Raises ValueError where the folder holds a run with other options, or
-    any run without `resume` or `overwrite`.
+    files[0] is the record of the run, a JSON file that holds the options. All files are removed,
+    those of a run that is overwritten put aside (`overwriting`), and a new record is written.
+    Raises ValueError where the folder holds a run with other options, or any run without `resume`
+    or `overwrite`.
     """
     record = folder / files[0]
+    settle(folder)
     for path in (record, folder / CHECKPOINT):
         check_results(path, resume, overwrite)
     if resume and record.exists():
@@ -117,6 +144,11 @@ def open_run(
         if changes := differences(stored, options):
             fail(str(record), "; ".join(changes), "Give the same options, or --overwrite")
     open_folder(folder)
-    for name in (*files, *([CHECKPOINT] if overwrite else [])):  # of an earlier run
-        (folder / name).unlink(missing_ok=True)
+    aside = folder / ASIDE
+    if overwrite:
+        aside.mkdir()
+    for path in [folder / name for name in (*files, *([CHECKPOINT] if overwrite else []))]:
+        if overwrite and path.exists():
+            path.replace(aside / path.name)
+        path.unlink(missing_ok=True)
     write_json(record, {"options": options, "finished": False})

@@ -3,7 +3,7 @@
 import dataclasses
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
@@ -104,12 +104,12 @@ def contradictions(attributes: Mapping[str, Any], axes: Mapping[str, np.ndarray]
     config, problem = attributes.get("config"), attributes.get("problem")
     if not isinstance(config, Mapping) or not isinstance(problem, Mapping):
         return ["zarr.json: holds no configuration or no problem"]
-    lines: list[np.ndarray] = []
+    lines: Sequence[np.ndarray] = ()
     try:
         if "system" in config:
             made = configs.from_results(config, "sweep" if axes else "recursion")
             region = configs.sweep_points(made) if axes else None
-            lines = [] if region is None else region.along
+            lines = () if region is None else region.along
             view = (None, None) if region is None else (region.axes, region.fixed)
             built = FeasibilityProblem.of(made.build_mpc(), *view).plain()
         elif not _is_here(config["robot"]):
@@ -124,7 +124,7 @@ def contradictions(attributes: Mapping[str, Any], axes: Mapping[str, np.ndarray]
             lines = [np.linspace(low, high, len(axis)) for low, high, axis in
                      zip(lower, upper, axes.values(), strict=True)]  # fmt: skip
             built = problem_again(config, np.array([lower, upper])).plain()
-    except (ArithmeticError, KeyError, LookupError, TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         return [f"configuration: makes no problem ({error})"]
     found = [f"problem.{key}: {shown(problem.get(key))}, the configuration says {shown(value)}"
              for key, value in built.items() if not alike(problem.get(key), value)]  # fmt: skip
