@@ -99,6 +99,7 @@ def _sizes(controller: Controller) -> dict[str, Any]:
         "VARIABLES": c.P.shape[0], "ROWS": c.C.shape[0], "STAGES": factor.rho.shape[0],
         "ITERATIONS": solver.admm_steps(), "THIN": int(factor.G is None),
         "SOFT": int(c.soft_linear is not None), "BALLS": len(c.balls), "BALL_ROWS": sum(c.balls),
+        "RATES": int(mpc.rate_limited),
     }  # fmt: skip
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxmpc.checks import fail
 from jaxmpc.control.sets import Box
+from jaxmpc.mpc.plan import rate_ends
 from jaxmpc.mpc.problem import MPC
 
 TEMPLATES = Path(__file__).parent
@@ -48,12 +49,14 @@ def prepared_paths(folder: Path, names: list[str], overwrite: bool) -> list[Path
 
 
 def input_limits(mpc: MPC) -> dict[str, np.ndarray]:
-    """Return the tables of the limits (m,) into which the code clips inputs, ±inf for none."""
+    """Return the tables of the limits (m,) into which the code clips inputs, ±inf for none, and
+    their changes, where these are limited."""
     free = np.full(mpc.system.m, np.inf)
-    lower, upper = (
-        (mpc.inputs.lower, mpc.inputs.upper) if isinstance(mpc.inputs, Box) else (-free, free)
-    )
-    return {"input_lower": np.asarray(lower), "input_upper": np.asarray(upper)}
+    ends = (mpc.inputs.lower, mpc.inputs.upper) if isinstance(mpc.inputs, Box) else (-free, free)
+    tables: dict[str, Any] = dict(zip(("input_lower", "input_upper"), ends, strict=True))
+    if mpc.rate_limited:
+        tables |= zip(("rate_lower", "rate_upper"), rate_ends(mpc), strict=True)
+    return {name: np.broadcast_to(v, free.shape) for name, v in tables.items()}
 
 
 def write(paths: list[Path], texts: list[str], name: str, states: int) -> list[Path]:

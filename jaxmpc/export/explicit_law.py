@@ -148,6 +148,7 @@ def export_explicit_c(
     sizes = {
         "PARAMETERS": mpc.dimension, "INPUTS": mpc.system.m, "REGIONS": len(regions),
         "NODES": len(tree.plane), "DEPTH": tree.depth, "MOST": _most(tree),
+        "RATES": int(mpc.rate_limited),
         "TOLERANCE": literal(tolerance * size, real).replace("(real)", ""),
     }  # fmt: skip
     paths = prepared_paths(Path(folder), [f"{name}{kind}" for kind in KINDS], overwrite)

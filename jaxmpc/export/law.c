@@ -21,8 +21,16 @@ static real beyond(int i, const real *x) {
   return sum;
 }
 
-static void clip(real *u) {
+static void clip(const real *x, real *u) {
   for (int i = 0; i < M; i++) {
+#if NAME_RATES /* x ends with the inputs before */
+    real before = isfinite(x[P - M + i]) ? x[P - M + i] : 0;
+    if (!isfinite(u[i])) u[i] = before;
+    if (u[i] < before + rate_lower[i]) u[i] = before + rate_lower[i];
+    if (u[i] > before + rate_upper[i]) u[i] = before + rate_upper[i];
+#else
+    (void)x;
+#endif
     if (!isfinite(u[i])) u[i] = 0;
     if (u[i] < input_lower[i]) u[i] = input_lower[i];
     if (u[i] > input_upper[i]) u[i] = input_upper[i];
@@ -30,10 +38,10 @@ static void clip(real *u) {
 }
 
 int NAME_evaluate(const real x[NAME_PARAMETERS], real u[NAME_INPUTS]) {
-  for (int i = 0; i < M; i++) u[i] = 0;
+  for (int i = 0; i < M; i++) u[i] = NAN;
   for (int k = 0; k < P; k++) {
     if (!isfinite(x[k])) {
-      clip(u);
+      clip(x, u);
       return NAME_NON_FINITE;
     }
   }
@@ -58,6 +66,6 @@ int NAME_evaluate(const real x[NAME_PARAMETERS], real u[NAME_INPUTS]) {
   }
   int finite = 1;
   for (int i = 0; i < M; i++) finite = finite && isfinite(u[i]);
-  clip(u);
+  clip(x, u);
   return finite && least <= NAME_TOLERANCE ? NAME_INSIDE : NAME_OUTSIDE;
 }

@@ -15,7 +15,8 @@ extern "C" {
 enum {
   NAME_INSIDE = 1,     /* x has a plan that keeps the limits; u is its first input */
   NAME_OUTSIDE = 2,    /* it has none; u is the law of a region near by, clipped into the limits */
-  NAME_NON_FINITE = 3  /* x holds NaN or infinity; u is clipped zero */
+  NAME_NON_FINITE = 3  /* x holds NaN or infinity; u is the input before where its rate is limited,
+                        * else zero, within the limits */
 };
 
 /* First input u of the plan from x, in the units of the problem, and its status. x: the state, then

@@ -243,7 +243,13 @@ int NAME_step(NAME_memory *memory, const real x[N], const real *state_reference,
   memcpy(memory->y, y, M * sizeof(real));
   memcpy(memory->z, z, sizeof z);
   memcpy(memory->theta, theta, sizeof theta);
-  for (int i = 0; i < MU; i++) memory->u[i] = input[i] = clipped(i, input[i]);
+  for (int i = 0; i < MU; i++) {
+#if NAME_RATES
+    real least = theta[N + i] + rate_lower[i], most = theta[N + i] + rate_upper[i];
+    input[i] = input[i] < least ? least : input[i] > most ? most : input[i];
+#endif
+    memory->u[i] = input[i] = clipped(i, input[i]);
+  }
   memory->warm = 1;
   return status;
 }

@@ -141,29 +141,44 @@ def answer(
 
 def limited(inputs: Any, u: Array) -> Array:
     """Return u clipped into the input limits, if these are a Box: no rounding beyond them."""
-    if not isinstance(inputs, Box):
-        return u
-    lower, upper = arrays((inputs.lower, inputs.upper))
-    return jnp.clip(u, jnp.asarray(lower, u.dtype), jnp.asarray(upper, u.dtype))
+    return _between(u, inputs.lower, inputs.upper) if isinstance(inputs, Box) else u
+
+
+def rate_ends(mpc: MPC) -> tuple[Any, Any]:
+    """Return the least and the largest change of the inputs from one sample to the next, (m,)."""
+    limit: Any = mpc.input_rate_limit
+    return (limit.lower, limit.upper) if isinstance(limit, Box) else (jnp.negative(limit), limit)
+
+
+def _between(u: Array, lower: Any, upper: Any, base: Any = 0) -> Array:
+    """Return u clipped between base + lower and base + upper."""
+    low, high = (jnp.asarray(v, u.dtype) for v in arrays((lower, upper)))
+    return jnp.clip(u, base + low, base + high)
 
 
 def applied(mpc: MPC, plan: Plan, before: Plan | None, last: Any) -> tuple[Array, Plan, Plan]:
-    """Return what a controller gives for a plan: the first input (m,) within the limits, the plan
-    as what it carries to the next sample, and the plan.
+    """Return what a controller gives for a plan: the first input (m,) within the limits and, from
+    `last` (m,), the one before (None: zero), within those of its rate; the plan as what it carries
+    to the next sample; and the plan.
 
-    Where the plan is not finite the input is `last`, the one before (None: zero), if its rate is
-    limited or weighed, else zero, and what is carried is the plan before (None: zeros). So a bad
-    reading is forgotten with the next sample."""
+    Where the plan is not finite the input is `last`, if its rate is limited or weighed, else zero,
+    and what is carried is the plan before (None: zeros). So a bad reading is forgotten with the
+    next sample."""
     finite = jnp.isfinite(plan.cost)  # no state or input is NaN or infinite without it
     u = plan.inputs[0]
     hold = jnp.zeros_like(u)
     if mpc.input_in_state and last is not None:
-        hold = jnp.where(jnp.isfinite(last), last, 0.0)
+        hold = limited(mpc.inputs, jnp.where(jnp.isfinite(last), last, 0.0))
+    u = jnp.where(finite, u, hold)
+    if mpc.rate_limited:
+        u = _between(u, *rate_ends(mpc), base=hold)
+    u = limited(mpc.inputs, u)
     start = lambda plan: (plan.states, plan.inputs, plan.multipliers)
     old = jax.tree.map(jnp.zeros_like, start(plan)) if before is None else start(before)
     kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), start(plan), old)
-    carry = replace(plan, states=kept[0], inputs=kept[1], multipliers=kept[2])
-    return limited(mpc.inputs, jnp.where(finite, u, hold)), carry, plan
+    inputs = kept[1].at[0].set(u) if mpc.rate_limited else kept[1]
+    carry = replace(plan, states=kept[0], inputs=inputs, multipliers=kept[2])
+    return u, carry, plan
 
 
 def cost(

@@ -115,11 +115,20 @@ int main(int count, char **arguments) {
       law_reset(&cold);
       memcpy(cold.u, memory.u, sizeof cold.u);
     }
+    real before[MU]; /* what the code takes for the last input */
+    for (int i = 0; i < MU; i++) {
+      before[i] = isfinite(memory.u[i]) ? memory.u[i] : 0;
+      before[i] = fmax(fmin(before[i], input_upper[i]), input_lower[i]);
+    }
     const real *a = references ? xr : NULL, *b = references ? ur : NULL;
     int status = law_step(&memory, x, a, b, u, &info);
     for (int i = 0; i < MU; i++) {
       not_finite += !isfinite(u[i]);
       beyond += u[i] < input_lower[i] || u[i] > input_upper[i];
+#if law_RATES
+      real step = u[i] - before[i], ulp = 4 * (real)1e-7;
+      beyond += step < rate_lower[i] * (1 + ulp) || step > rate_upper[i] * (1 + ulp);
+#endif
     }
     strange += status < 1 || status > 4 || status != info.status;
     statuses[status >= 1 && status <= 4 ? status : 0]++;

@@ -1,5 +1,11 @@
-"""One bad reading, NaN or far off: a finite input within the limits; the next sample forgets it."""
+"""One bad reading, NaN or far off: a finite input within the limits; the next sample forgets it.
 
+By hand, ten million calls of each kind and type (on a GPU, minutes):
+
+    python tests/mpc/test_bad_readings.py 10000000
+"""
+
+import sys
 from dataclasses import replace
 from functools import partial
 
@@ -103,3 +109,98 @@ def test_a_carry_that_is_not_finite():
 def test_joint_without_rates_gives_zero():
     u, _, plan = jm.Controller(problems.joint(5))(np.array([np.nan, 0.0]))
     assert plan.status == jm.Status.NON_FINITE and u == 0
+
+
+FEW = 8  # samples of a fuzzed loop
+
+
+def fuzzed(controller, key):
+    """Counts along a loop whose readings, and what is carried, are garbage now and then.
+
+    Beside each plan that claims to be solved lies one made without a memory in the same precision:
+    its cost must be the same, and its states must be those that its inputs lead to.
+    """
+    mpc = controller.mpc
+    dtype = mpc.Q.dtype
+    A, B = mpc.system.A, mpc.system.B
+    rates = mpc.input_rate_limit is not None
+    small = 1e-9 if dtype == jnp.float64 else 1e-5
+
+    def garbage(key, like):
+        """Of any size and sign; a quarter are not finite; a half of the entries stay."""
+        which, size, sign, keep = jax.random.split(key, 4)
+        most = float(jnp.finfo(dtype).maxexp) * 0.301
+        found = 10.0 ** jax.random.uniform(size, like.shape, dtype, -most, most)
+        found = jnp.where(jax.random.bernoulli(sign, 0.5, like.shape), found, -found)
+        kind = jax.random.randint(which, like.shape, 0, 12)
+        for i, value in enumerate((jnp.nan, jnp.inf, -jnp.inf)):
+            found = jnp.where(kind == i, value, found)
+        return jnp.where(jax.random.bernoulli(keep, 0.5, like.shape), found, like)
+
+    def sample(memory, key):
+        carry, last, spoilt = memory
+        keys = jax.random.split(key, 4)
+        good = jax.random.uniform(keys[0], (2,), dtype, -0.3, 0.3)
+        bad, broken = jax.random.bernoulli(keys[1], jnp.array([0.3, 0.1]))
+        x = jnp.where(bad, garbage(keys[2], good), good)
+        floats = lambda v: jnp.issubdtype(v.dtype, jnp.floating)
+        carry = jax.tree.map(
+            lambda v: jnp.where(broken, garbage(keys[3], v), v) if floats(v) else v, carry
+        )
+        before = jnp.where(jnp.isfinite(carry.inputs[0]), carry.inputs[0], 0.0)
+        u, carry, plan = controller(x, carry)
+        cold = controller(x, replace(controller.start(x), inputs=jnp.broadcast_to(
+            before, plan.inputs.shape)))[2]  # fmt: skip
+        claimed = (plan.status == jm.Status.SOLVED) & ~broken
+        step = lambda x, u: (A @ x + B @ u,) * 2
+        led = jax.lax.scan(step, x, plan.inputs)[1]
+        size = 1 + jnp.abs(led).max()
+        counts = {
+            "not finite": ~jnp.all(jnp.isfinite(u)),
+            "beyond limits": ~jnp.all(jnp.abs(u) <= 2),
+            "steps beyond": rates & ~broken & jnp.any(jnp.abs(u - before) > 0.5 * (1 + 4 * small)),
+            "solved without number": (plan.status == jm.Status.SOLVED) & ~jnp.all(jnp.isfinite(x)),
+            "solved elsewhere": claimed
+            & (jnp.abs(led - plan.states[1:]).max() > 1e3 * small * size),
+            "solved at another cost": claimed & (cold.status == jm.Status.SOLVED)
+            & (jnp.abs(plan.cost - cold.cost) > 1e3 * small * (1 + jnp.abs(cold.cost))),
+            "not forgotten": spoilt & ~bad & ~broken & (cold.status == jm.Status.SOLVED)
+            & (plan.status != jm.Status.SOLVED),
+            "solved": plan.status == jm.Status.SOLVED,
+        }  # fmt: skip
+        return (carry, u, bad | broken), jax.tree.map(jnp.int32, counts)
+
+    start = jnp.zeros(2, dtype)
+    memory = controller.start(start), jnp.zeros(1, dtype), jnp.bool_(False)
+    counts = jax.lax.scan(sample, memory, jax.random.split(key, FEW))[1]
+    return jax.tree.map(lambda v: v.sum(0), counts)
+
+
+def fuzz(kind, x64, calls, most=2**17):
+    """Sum of the counts over some calls."""
+    with jax.enable_x64(x64):
+        controller = jm.Controller(KINDS[kind]())
+        loops = min(-(-calls // FEW), most)
+        run = jax.jit(lambda keys: jax.tree.map(
+            jnp.sum, jax.vmap(partial(fuzzed, controller))(keys)))  # fmt: skip
+        parts = -(-calls // (FEW * loops))
+        found = [run(jax.random.split(jax.random.key(i), loops)) for i in range(parts)]
+    total = {name: sum(int(part[name]) for part in found) for name in found[0]}
+    return total | {"calls": parts * loops * FEW}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("x64", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_garbage(kind, x64):
+    counts = fuzz(kind, x64, 4000)
+    assert counts.pop("solved") > 0.5 * counts.pop("calls")
+    assert not any(counts.values()), counts
+
+
+if __name__ == "__main__":
+    for kind in KINDS:
+        for x64 in (False, True):
+            print(
+                kind, "float64" if x64 else "float32", fuzz(kind, x64, int(sys.argv[1])), flush=True
+            )
