@@ -26,6 +26,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.checks import fail, require_kind, require_real, require_shape, whole
+from jaxmpc.control.sets import Box
 from jaxmpc.mpc.interior_point import STEPS as INTERIOR_STEPS
 from jaxmpc.mpc.interior_point import Interior, interior_step
 from jaxmpc.mpc.kernels import recurrence
@@ -98,7 +99,8 @@ def solve_nonlinear(
     reference (n,) or (N+1, n), input_reference (m,) or (N, m), None for zero. targets: one array
     for each task, in place of its own. solver: of the QPs, as in `solve_stagewise` (no ADMM steps
     where solver.iterations is None); its eps is the tolerance of the nonlinear problem.
-    warm_start: an earlier Plan or a WarmStart; None: at rest at x0 under the first input reference.
+    warm_start: an earlier Plan or a WarmStart; None, or where it costs a hundred times as much: at
+    rest at x0 under the first input reference.
     steps: QPs at most. 1: the real-time iteration, a full step, whose plan, residuals and status
     are those of the QP about the warm start.
     hessian: "exact", the Lagrangian's where it is convex (few QPs near the solution), or
@@ -172,7 +174,7 @@ def _solve(
         eps = jnp.maximum(eps, SINGLE)
     # What is not finite in a warm start counts as 0.
     x, u, y = (jnp.nan_to_num(v.astype(base.P.dtype), posinf=0, neginf=0) for v in warm_start)
-    x = x.at[0].set(aims.x0)
+    x, u, y = within_reason(base, problem, aims, x.at[0].set(aims.x0), u, y)
     count: Any = 1
     if steps > 1:
         constants = jax.lax.stop_gradient((base, problem, aims, scale, eps))
@@ -203,6 +205,24 @@ def _solve(
     x = predict(s, sample.x0, u)
     plan = answer(problem.mpc, s.layout, found, fault, x, u, aims.states, aims.inputs)
     return with_tasks(plan, s, sample, base, problem, aims)
+
+
+def within_reason(
+    base: Stages, problem: NonlinearMPC, aims: Aims, x: Array, u: Array, y: Array
+) -> tuple[Array, Array, Array]:
+    """Return the warm start x, u, y, or rest at x0 where it costs more than anybody plans: 100
+    times what rest does, under the first input reference or under inputs at their limits.
+
+    About the plan of a reading that is far off, the expansion would be rounding."""
+    rest_x, rest_u = jnp.broadcast_to(aims.x0, x.shape), jnp.broadcast_to(aims.inputs[:1], u.shape)
+    most = rest_u
+    if isinstance(problem.mpc.inputs, Box):
+        ends = arrays((problem.mpc.inputs.lower, problem.mpc.inputs.upper))
+        sizes = jnp.stack([jnp.abs(jnp.asarray(v, u.dtype)) for v in ends])
+        most = jnp.max(jnp.where(jnp.isfinite(sizes), sizes, 0.0), axis=0) + jnp.abs(rest_u)
+    J = lambda x, u: jax.lax.stop_gradient(total_cost(base, problem, aims, x, u))
+    sane = J(x, u) <= 100 * (J(rest_x, rest_u) + J(rest_x, most))
+    return jnp.where(sane, x, rest_x), jnp.where(sane, u, rest_u), jnp.where(sane, y, 0.0)
 
 
 def rows_of(

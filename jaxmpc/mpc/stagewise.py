@@ -307,6 +307,18 @@ def errors(
     return v, s.bounds.scaled(E).prox_residual(v, rho) - push, found.gradient
 
 
+def distance(s: Stages, sample: Sample, E: Array, rho: Array, u: Array, y: Array) -> Array:
+    """Return how far the conditions of `newton_step` are from holding, a number in units of the
+    cost: Σ ρ c², c in rows of variance 1 under exp(−J), and Σ gradient²/R over the inputs.
+
+    Compared with that of zero it tells a warm start from numbers that are none, such as the plan of
+    a state far off.
+    """
+    _, c, gradient = errors(s, sample, E, rho, u, y)
+    weight = jnp.diagonal(s.R, axis1=-2, axis2=-1) * s.stage[:, None]
+    return jnp.sum(rho * c**2) + jnp.sum(gradient**2 / jnp.where(weight > 0, weight, 1.0))
+
+
 def newton(s: Stages, E: Array, rho: Array, D: Array) -> Callable[[Array, Array], Any]:
     """(c, gradient) → (du, dy) of `newton_step`: linear."""
     loose = 1 - D + D * rho / Constants.of(E.dtype).linear
@@ -416,7 +428,10 @@ def solution(
     u, y = jnp.zeros((s.horizon, s.B.shape[-1]), E.dtype), jnp.zeros_like(E)
     if warm_start is not None:  # what is not finite counts as 0
         clean = lambda v: jnp.nan_to_num(jnp.asarray(v, E.dtype), posinf=0.0, neginf=0.0)
-        u, y = clean(warm_start.inputs), clean(warm_start.multipliers)
+        given = clean(warm_start.inputs), clean(warm_start.multipliers)
+        far = lambda pair: jax.lax.stop_gradient(distance(s, sample, E, rho[-1], *pair))
+        near = far(given) < far((u, y))
+        u, y = (jnp.where(near, v, 0.0) for v in given)
     rows = s.rows(predict(s, sample.x0, u), u)
     fixed = jnp.where(E == 0, s.bounds.penalty_gradient(rows), 0.0)
     if factor.gains is not None:
