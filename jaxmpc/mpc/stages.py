@@ -306,11 +306,16 @@ def conditions(s: Stages, sample: Sample, u: Array, y: Array) -> Conditions:
     # A state is a difference of the terms of its step, as where torques balance the weight.
     moved = apply(absolute.A, jnp.abs(x[:-1])) + apply(absolute.B, jnp.abs(u)) + absolute.c
     terms = jnp.concatenate([jnp.abs(x[:1]), moved])
+    # Its gradient, of the terms of its distance from the reference, and of slopes.
+    far = jax.tree.map(jnp.abs, sample)
+    far = far._replace(states=-far.states, inputs=-far.inputs)
+    weighed, own_terms = far.gradient(absolute, terms, jnp.abs(u))
+    later = jax.lax.cumsum(weighed[1:], reverse=True)
     return Conditions(
         s.rows(x, u), own + pushed + apply_transposed(s.B, of_cost + of_rows),
         absolute.rows(terms, jnp.abs(u)),
-        jnp.abs(own) + absolute.pull(jnp.abs(y))[1]
-        + apply_transposed(absolute.B, jnp.abs(of_cost) + jnp.abs(of_rows)),
+        own_terms + absolute.pull(jnp.abs(y))[1]
+        + apply_transposed(absolute.B, later + jnp.abs(of_cost) + jnp.abs(of_rows)),
         jnp.abs(own + apply_transposed(s.B, of_cost))
         + jnp.abs(pushed + apply_transposed(s.B, of_rows)),
     )  # fmt: skip
