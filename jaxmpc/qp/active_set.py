@@ -34,7 +34,7 @@ from jax import Array
 from jaxmpc.qp.batches import repeat_while, true_places
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import matmul
-from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.projection import Bounds, sign
 from jaxmpc.qp.triton import has_kernels
 
 # Most rows in W.
@@ -233,7 +233,7 @@ class WorkingRows(NamedTuple):
     def sign(self) -> Array:
         """That of the multiplier, or of the violation where there is none yet."""
         outside = self.v - jnp.clip(self.v, self.bounds.l, self.bounds.u)
-        return jnp.where(self.y != 0, jnp.sign(self.y), jnp.sign(outside))
+        return jnp.where(self.y != 0, sign(self.y), sign(outside))
 
     @property
     def beyond(self) -> Array:

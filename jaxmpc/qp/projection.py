@@ -25,6 +25,18 @@ from jax import Array
 FREE = (-math.inf, math.inf, math.inf, 0.0)
 
 
+# In a kernel `jnp.sign` and `jnp.isfinite` compute in the default type, which is another one where
+# 64-bit mode is off (JAX 0.12).
+def sign(v: Array) -> Array:
+    """Return the sign of v, 0 where it is NaN."""
+    return (v > 0).astype(v.dtype) - (v < 0).astype(v.dtype)
+
+
+def finite(v: Array) -> Array:
+    """Return where v is finite."""
+    return jnp.abs(v) < jnp.inf
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Bounds:
@@ -64,7 +76,7 @@ class Bounds:
         """Return e = v − prox(v) (m,) with penalty rho, a number or (m,)."""
         s = v - jnp.clip(v, self.l, self.u)
         if self.linear is not None:
-            s = s - jnp.sign(s) * self._soft_slack(s, rho)
+            s = s - sign(s) * self._soft_slack(s, rho)
         for rows, radius in self.blocks():
             s = s.at[rows].multiply(1 - self._projection_factor(s[rows], radius))
         return s
@@ -78,14 +90,14 @@ class Bounds:
         """Return the penalty of each soft row at p; 0 for hard rows and balls (`violation`)."""
         if self.linear is None:
             return jnp.zeros_like(p)
-        soft = jnp.isfinite(self.linear)
+        soft = finite(self.linear)
         d = jnp.where(soft, jnp.abs(p - jnp.clip(p, self.l, self.u)), 0.0)
         return d * (jnp.where(soft, self.linear, 0.0) + 0.5 * self.quadratic * d)
 
     def sizes(self) -> Array:
         """Return what a violation of each row is compared with (m,): the larger of its finite ends,
         in a ball the radius."""
-        sizes = [jnp.where(jnp.isfinite(v), jnp.abs(v), 0.0) for v in (self.l, self.u)]
+        sizes = [jnp.where(finite(v), jnp.abs(v), 0.0) for v in (self.l, self.u)]
         found = jnp.maximum(*sizes)
         for rows, radius in self.blocks():
             found = found.at[rows].set(radius)
@@ -102,9 +114,9 @@ class Bounds:
         if self.linear is None:
             return jnp.zeros_like(v)
         s = v - jnp.clip(v, self.l, self.u)
-        soft = jnp.isfinite(self.linear)
+        soft = finite(self.linear)
         slope = jnp.where(soft, self.linear, 0.0) + self.quadratic * jnp.abs(s)
-        return jnp.where(soft, jnp.sign(s) * slope, 0.0)
+        return jnp.where(soft, sign(s) * slope, 0.0)
 
     def violation(self, v: Array) -> Array:
         """Return v minus its projection where a constraint is hard; 0 in soft rows."""
@@ -136,11 +148,11 @@ class Bounds:
         outside and past the L1 weight; for a ball 0 inside and 1 outside."""
         s = v - jnp.clip(v, self.l, self.u)
         if self.linear is None and not self.balls:
-            return jnp.sign(s)
+            return sign(s)
         count = jnp.ones_like(s)
         if self.linear is not None:
             count = count + (self._soft_slack(s, rho) > 0)
-        piece = jnp.sign(s) * count
+        piece = sign(s) * count
         for rows, radius in self.blocks():
             piece = piece.at[rows].set((self._length(s[rows]) > radius).astype(v.dtype))
         return piece
@@ -178,7 +190,7 @@ class Bounds:
         """Return the hard constraints alone: soft rows become free."""
         if self.linear is None:
             return self
-        soft = jnp.isfinite(self.linear)
+        soft = finite(self.linear)
         l, u = jnp.where(soft, -jnp.inf, self.l), jnp.where(soft, jnp.inf, self.u)
         return replace(self, l=l, u=u, linear=None, quadratic=None)
 
@@ -189,13 +201,13 @@ class Bounds:
 
         def bound(v: Array, free: float) -> Array:
             # E·inf would give NaN gradients with respect to what E depends on.
-            keep = jnp.isfinite(v) & ~zero
+            keep = finite(v) & ~zero
             return jnp.where(zero, free, jnp.where(keep, E * jnp.where(keep, v, 0.0), v))
 
         new = replace(self, l=bound(self.l, -jnp.inf), u=bound(self.u, jnp.inf))
         E = jnp.where(zero, 1.0, E)
         if self.linear is not None:
-            soft = jnp.isfinite(self.linear)
+            soft = finite(self.linear)
             linear = jnp.where(soft, jnp.where(soft, self.linear, 0.0) / E, jnp.inf)
             new = replace(new, linear=linear, quadratic=self.quadratic / E**2)
         for i, (rows, radius) in enumerate(self.blocks()):
@@ -228,7 +240,7 @@ class Bounds:
 
     def _soft_slack(self, s: Array, rho: Any) -> Array:
         """Return d ≥ 0 (m,): how far prox(v) stays outside a soft row; s: signed distance of v."""
-        soft = jnp.isfinite(self.linear)
+        soft = finite(self.linear)
         over = jnp.abs(s) - jnp.where(soft, self.linear, 0.0) / rho
         beyond = soft & (over > 0)
         return jnp.where(beyond, rho / (rho + self.quadratic) * jnp.where(beyond, over, 0.0), 0.0)

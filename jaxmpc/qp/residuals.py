@@ -24,7 +24,7 @@ from jax import Array
 from jaxmpc.qp.certificate import Proof
 from jaxmpc.qp.precision import matmul, precisely, rounding
 from jaxmpc.qp.problem import QP, QPSolution
-from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.projection import Bounds, finite
 from jaxmpc.qp.status import Status
 
 # Multiple of the rounding floor below which steps on ill-conditioned programs gain nothing.
@@ -142,11 +142,11 @@ def worst(terms: Terms, floor: Any) -> tuple[list[Array], list[Array]]:
     above, relative = [], []
     for values, sizes, own in terms:
         # A maximum need not propagate NaN (XLA on CPUs).
-        finite = jnp.isfinite(values) & jnp.isfinite(sizes) & jnp.isfinite(own)
-        error = jnp.where(finite, jnp.abs(values), jnp.inf)
+        sound = finite(values) & finite(sizes) & finite(own)
+        error = jnp.where(sound, jnp.abs(values), jnp.inf)
         least = jnp.finfo(error.dtype).tiny
-        size = jnp.where(finite, jnp.maximum(sizes, least), 1.0)
-        total = jnp.where(finite, size + own, 1.0)
+        size = jnp.where(sound, jnp.maximum(sizes, least), 1.0)
+        total = jnp.where(sound, size + own, 1.0)
         above.append(_largest((error - floor * total) / size))
         relative.append(_largest(error / total))
     return above, relative

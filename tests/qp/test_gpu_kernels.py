@@ -175,11 +175,8 @@ def test_plans_by_kernels_are_those_without(soft, x64, monkeypatch):
     np.testing.assert_allclose(found.gap[solved], wanted.gap[solved], atol=1e-9)
 
 
-@pytest.mark.filterwarnings("ignore:The Pallas Triton backend:DeprecationWarning")
-@pytest.mark.parametrize("gradient", [False, True])
-@pytest.mark.first(1)
-def test_kernels_can_be_lowered_for_a_gpu(gradient, x64, monkeypatch):
-    """All operations of the kernels exist in Triton's dialect; no GPU is needed to see that."""
+def lowered(function, states, monkeypatch):
+    """The program of a batch for a GPU, as text; no GPU is needed for it."""
     mesh_module = pytest.importorskip("jax._src.mesh")
     if not hasattr(mesh_module, "AbstractDevice"):
         pytest.skip("this JAX lowers kernels on machines with a GPU alone")
@@ -187,18 +184,39 @@ def test_kernels_can_be_lowered_for_a_gpu(gradient, x64, monkeypatch):
     monkeypatch.setattr(newton, "on_gpu", lambda: True)
     device = mesh_module.AbstractDevice("NVIDIA H100 80GB HBM3", 132, "gpu")
     axes = dict(axis_types=(jax.sharding.AxisType.Auto,), abstract_device=device)
+    program = jax.jit(function)
+    try:
+        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((1,), ("x",), **axes)):
+            return program.trace(states).lower(lowering_platforms=("cuda",)).as_text()
+    except (TypeError, RuntimeError) as error:
+        if "same dtypes" in str(error):
+            raise
+        pytest.skip(f"this JAX lowers kernels on machines with a GPU alone: {error}")
+
+
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend:DeprecationWarning")
+@pytest.mark.parametrize("gradient", [False, True])
+@pytest.mark.first(1)
+def test_kernels_can_be_lowered_for_a_gpu(gradient, x64, monkeypatch):
+    """All operations of the kernels exist in Triton's dialect."""
     plan = jax.vmap(jm.Controller(joint(), SOLVER).plan)
     if gradient:
         plan = jax.grad(lambda x, plan=plan: jnp.sum(plan(x).cost))
-    plan = jax.jit(plan)
-    try:
-        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((1,), ("x",), **axes)):
-            lowered = plan.trace(jnp.asarray(STATES)).lower(lowering_platforms=("cuda",))
-    except (TypeError, RuntimeError) as error:
-        pytest.skip(f"this JAX lowers kernels on machines with a GPU alone: {error}")
     # ADMM; the search on the dual and corrections, twice (two sizes each), and four loops' judges;
     # derivatives: two halves of three sizes.
-    assert lowered.as_text().count("xla.gpu.triton") == (17 if gradient else 11)
+    text = lowered(plan, jnp.asarray(STATES), monkeypatch)
+    assert text.count("xla.gpu.triton") == (17 if gradient else 11)
+
+
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend:DeprecationWarning")
+@pytest.mark.parametrize("soft", [True, False])
+@pytest.mark.first(1)
+def test_kernels_can_be_lowered_outside_64_bit_mode(soft, monkeypatch):
+    """Their float64 stays float64 where the mode is off as the program is lowered."""
+    mpc = jm.mpc.soften(joint(), 50.0) if soft else joint()
+    mpc = jax.tree.map(lambda v: np.asarray(v, np.float32), mpc)
+    text = lowered(jax.vmap(lambda x: jm.solve(mpc, x)), np.float32(STATES), monkeypatch)
+    assert text.count("xla.gpu.triton") > 3 and "f64" in text
 
 
 def test_without_triton_there_are_no_kernels(monkeypatch):
