@@ -311,8 +311,8 @@ def distance(s: Stages, sample: Sample, E: Array, rho: Array, u: Array, y: Array
     """Return how far the conditions of `newton_step` are from holding, a number in units of the
     cost: Σ ρ c², c in rows of variance 1 under exp(−J), and Σ gradient²/R over the inputs.
 
-    Compared with that of zero it tells a warm start from numbers that are none, such as the plan of
-    a state far off.
+    Beside a hundred times that of zero it tells a warm start from numbers that are none, such as
+    the plan of a state far off.
     """
     _, c, gradient = errors(s, sample, E, rho, u, y)
     weight = jnp.diagonal(s.R, axis1=-2, axis2=-1) * s.stage[:, None]
@@ -430,7 +430,7 @@ def solution(
         clean = lambda v: jnp.nan_to_num(jnp.asarray(v, E.dtype), posinf=0.0, neginf=0.0)
         given = clean(warm_start.inputs), clean(warm_start.multipliers)
         far = lambda pair: jax.lax.stop_gradient(distance(s, sample, E, rho[-1], *pair))
-        near = far(given) < far((u, y))
+        near = far(given) <= 100 * far((u, y))
         u, y = (jnp.where(near, v, 0.0) for v in given)
     rows = s.rows(predict(s, sample.x0, u), u)
     fixed = jnp.where(E == 0, s.bounds.penalty_gradient(rows), 0.0)
