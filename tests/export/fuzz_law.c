@@ -4,35 +4,7 @@
  * "Inside" is computed again in long double: some region holds the state, and u is its law. */
 #include "law.c"
 
-#include <stdint.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-
-typedef long double wide;
-
-static uint64_t state;
-
-static uint64_t bits(void) { /* xorshift64* */
-  state ^= state >> 12, state ^= state << 25, state ^= state >> 27;
-  return state * UINT64_C(2685821657736338717);
-}
-
-static double uniform(double low, double high) {
-  return low + (high - low) * (double)(bits() >> 11) / 9007199254740992.0;
-}
-
-static real wild(void) {
-  uint64_t raw = bits();
-  real value;
-  switch (bits() % 8) {
-    case 0: return (real)NAN;
-    case 1: return (real)(raw & 1 ? INFINITY : -INFINITY);
-    case 2: memcpy(&value, &raw, sizeof value); return value;
-    case 3: return (real)(uniform(-1, 1) * pow(10, uniform(0, sizeof(real) == 4 ? 38 : 308)));
-    default: return (real)uniform(-3, 3);
-  }
-}
+#include "fuzz.h"
 
 static int is_inside(const real *x, const real *u) {
   wide rounding = (sizeof(real) == 4 ? 1e-6L : 1e-14L);

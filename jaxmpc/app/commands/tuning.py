@@ -144,11 +144,11 @@ def open_run(
         if changes := differences(stored, options):
             fail(str(record), "; ".join(changes), "Give the same options, or --overwrite")
     open_folder(folder)
-    aside = folder / ASIDE
     if overwrite:
-        aside.mkdir()
-    for path in [folder / name for name in (*files, *([CHECKPOINT] if overwrite else []))]:
-        if overwrite and path.exists():
-            path.replace(aside / path.name)
-        path.unlink(missing_ok=True)
+        (folder / ASIDE).mkdir()
+    for name in filter(lambda name: (folder / name).exists(), (*files, CHECKPOINT)):
+        if overwrite:
+            (folder / name).replace(folder / ASIDE / name)
+        elif name != CHECKPOINT:  # which a resumed run reads
+            (folder / name).unlink()
     write_json(record, {"options": options, "finished": False})
