@@ -13,11 +13,9 @@ import tyro
 
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import Switch, check_counts, option, print_table
-from jaxmpc.app.commands.robot_map import problem_again
 from jaxmpc.checks import shown
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.verification import Verification, find_store, verify
-from jaxmpc.robots.load import MODELS
 
 # Failures that are printed.
 SHOWN = 10
@@ -117,6 +115,8 @@ def contradictions(attributes: Mapping[str, Any], axes: Mapping[str, np.ndarray]
                   file=sys.stderr)  # fmt: skip
             return []
         else:
+            from jaxmpc.app.commands.robot_map import problem_again  # a third of a second
+
             if config["horizon"] != problem.get("horizon"):
                 raise ValueError(f"horizon {shown(config['horizon'])}, the problem says "
                                  f"{shown(problem.get('horizon'))}")  # fmt: skip
@@ -136,6 +136,8 @@ def contradictions(attributes: Mapping[str, Any], axes: Mapping[str, np.ndarray]
 
 def _is_here(robot: Any) -> bool:
     """Return whether a robot, a name or a path, can be loaded."""
+    from jaxmpc.robots.load import MODELS
+
     return bool(find_spec("mujoco")) and (robot in MODELS or Path(robot).is_file())
 
 
