@@ -34,10 +34,10 @@ from typing import Any
 import numpy as np
 
 import jaxmpc as jm
+from jaxmpc import store
 from jaxmpc.app.commands import linear_sweep
 from jaxmpc.app.commands.linear_sweep import LinearSweep
 from jaxmpc.app.config import load
-from jaxmpc.feasible import store
 
 CHUNK = 1024
 

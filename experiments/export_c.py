@@ -17,9 +17,9 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from bench.families import half_widths, problem
 
 import jaxmpc as jm
-from jaxmpc.bench.families import half_widths, problem
 
 FLAGS = "-std=c99 -O3 -shared -fPIC".split()
 

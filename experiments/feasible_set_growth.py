@@ -41,9 +41,9 @@ from jax.scipy.linalg import expm
 
 import jaxmpc as jm
 from jaxmpc.app.config import load
-from jaxmpc.control.riccati import cost_of_law
 from jaxmpc.feasible import FeasibleSetMap
-from jaxmpc.tuning.feasible_fraction import feasible_fraction
+from jaxmpc.feasible.fraction import feasible_fraction
+from jaxmpc.systems.riccati import cost_of_law
 from jaxmpc.tuning.feasible_set import tune_feasible_set
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter

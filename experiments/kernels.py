@@ -15,11 +15,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from bench.cases import SAMPLES, weighted_loops, weights_of
+from bench.families import family
+from bench.roofline import best_seconds
 
 import jaxmpc as jm
-from jaxmpc.bench.cases import SAMPLES, weighted_loops, weights_of
-from jaxmpc.bench.families import family
-from jaxmpc.bench.roofline import best_seconds
 from jaxmpc.qp.admm import scaled
 from jaxmpc.qp.admm_kernel import iterate_batch
 from jaxmpc.qp.triton import ROUGH, on_gpu

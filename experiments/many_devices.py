@@ -18,15 +18,14 @@ from typing import Any
 
 import jax
 import numpy as np
+from bench.families import joint
 
 import jaxmpc as jm
-from jaxmpc.bench.families import joint
-from jaxmpc.compiled import default_chunk, gather_size
-from jaxmpc.devices import chosen_devices, placement
+from jaxmpc.batches import chosen_devices, default_chunk, gather_size, placement
 from jaxmpc.feasible.candidates import ALPHA, compiled_admm, compiled_newton
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.mpc.batch import _plans
 from jaxmpc.mpc.condense import in_float64
+from jaxmpc.mpc.many import _plans
 
 BEGUN = perf_counter()
 

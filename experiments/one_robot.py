@@ -15,11 +15,12 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 import tyro
+from bench.cases import condensed, moving_rows, pair_of
+from bench.families import family
+from bench.rivals import RIVALS, Batch, residuals
+from bench.roofline import best_seconds
 
 import jaxmpc as jm
-from jaxmpc.bench import RIVALS, Batch, condensed, family, pair_of, residuals
-from jaxmpc.bench.cases import moving_rows
-from jaxmpc.bench.roofline import best_seconds
 
 
 @dataclass(frozen=True)

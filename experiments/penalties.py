@@ -30,13 +30,13 @@ import jax.numpy as jnp
 import numpy as np
 import osqp
 import tyro
+from bench import families
 from hidden_product import JOINTS, product
 from hidden_product import Settings as Product
 from scipy import sparse
 
 import jaxmpc as jm
 from jaxmpc.app import config
-from jaxmpc.bench import families
 from jaxmpc.mpc.condense import Condensed, condense, in_float64
 from jaxmpc.qp.admm import factor, iterate, read, scaled, splittings, unscaled
 from jaxmpc.qp.residuals import largest_of, residual_terms, worst

@@ -13,9 +13,9 @@ from typing import Any
 
 import jax
 import numpy as np
+from bench.families import joint
 
 import jaxmpc as jm
-from jaxmpc.bench.families import joint
 
 TRACED, COMPILED = "jaxpr_trace_duration", "backend_compile_duration"
 

@@ -9,9 +9,9 @@ Proofs         map_feasible_set, boundary, feasible_polytope, recursive_feasibil
 Sets and laws  lqr, maximal_invariant_set, maximal_control_invariant_set, invariant_ellipsoid
 Tuning         tune_weights, tune_penalties with Parameter and ClosedLoopLoss
 
-The rest, and the types of all results, are in `qp`, `control`, `sets`, `mpc`, `feasible`,
-`recursion`, `explicit`, `export`, `robots`, `robot_maps`, `closed_loop`, `tuning`, `workflow` and
-`bench`. Each name is imported when it is first used, so that the command can answer Ctrl-C before
+The rest, and the types of all results, are in `qp`, `systems`, `sets`, `mpc`, `feasible`, `verify`,
+`recursion`, `explicit`, `export`, `robots`, `robot_maps`, `closed_loop`, `tuning` and `workflow`.
+Each name is imported when it is first used, so that the command can answer Ctrl-C before
 JAX is loaded.
 """
 
@@ -20,9 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxmpc import (
-        bench,
         closed_loop,
-        control,
         explicit,
         export,
         feasible,
@@ -32,26 +30,18 @@ if TYPE_CHECKING:
         robot_maps,
         robots,
         sets,
+        systems,
         tuning,
+        verify,
         workflow,
     )
     from jaxmpc.closed_loop import RobotController, robot_mpc, simulate, simulate_many
-    from jaxmpc.control.invariant import (
-        invariant_ellipsoid,
-        maximal_control_invariant_set,
-        maximal_invariant_set,
-    )
-    from jaxmpc.control.limits import joint_limits
-    from jaxmpc.control.riccati import lqr
-    from jaxmpc.control.sets import Box, Ellipsoid, Polytope
-    from jaxmpc.control.system import LinearSystem
-    from jaxmpc.control.terminal import verify_terminal
     from jaxmpc.explicit import exact_penalty
     from jaxmpc.feasible import boundary, feasible_polytope, grid, map_feasible_set
     from jaxmpc.mpc.controller import Controller
     from jaxmpc.mpc.plan import Plan
     from jaxmpc.mpc.problem import MPC, Outputs, Soft
-    from jaxmpc.mpc.soften import soften
+    from jaxmpc.mpc.softening import soften
     from jaxmpc.mpc.solve import solve, solve_many
     from jaxmpc.qp.admm import ADMM
     from jaxmpc.qp.problem import QP
@@ -60,6 +50,16 @@ if TYPE_CHECKING:
     from jaxmpc.recursion import recursive_feasibility
     from jaxmpc.robots.linear import LinearPlant
     from jaxmpc.robots.load import load_robot
+    from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
+    from jaxmpc.sets.invariant import (
+        invariant_ellipsoid,
+        maximal_control_invariant_set,
+        maximal_invariant_set,
+    )
+    from jaxmpc.sets.limits import joint_limits
+    from jaxmpc.sets.terminal import verify_terminal
+    from jaxmpc.systems.riccati import lqr
+    from jaxmpc.systems.system import LinearSystem
     from jaxmpc.tuning.losses import ClosedLoopLoss
     from jaxmpc.tuning.parameters import Parameter
     from jaxmpc.tuning.penalties import tune_penalties
@@ -86,10 +86,8 @@ __all__ = [
     "RobotController",
     "Soft",
     "Status",
-    "bench",
     "boundary",
     "closed_loop",
-    "control",
     "design",
     "exact_penalty",
     "explicit",
@@ -119,9 +117,11 @@ __all__ = [
     "solve",
     "solve_many",
     "solve_qp",
+    "systems",
     "tune_penalties",
     "tune_weights",
     "tuning",
+    "verify",
     "verify_terminal",
     "workflow",
 ]
@@ -129,18 +129,12 @@ __all__ = [
 # The module of each name that is no module itself.
 HOMES = {
     "closed_loop": "RobotController robot_mpc simulate simulate_many",
-    "control.invariant": "invariant_ellipsoid maximal_control_invariant_set maximal_invariant_set",
-    "control.limits": "joint_limits",
-    "control.riccati": "lqr",
-    "control.sets": "Box Ellipsoid Polytope",
-    "control.system": "LinearSystem",
-    "control.terminal": "verify_terminal",
     "explicit": "exact_penalty",
     "feasible": "boundary feasible_polytope grid map_feasible_set",
     "mpc.controller": "Controller",
     "mpc.plan": "Plan",
     "mpc.problem": "MPC Outputs Soft",
-    "mpc.soften": "soften",
+    "mpc.softening": "soften",
     "mpc.solve": "solve solve_many",
     "qp.admm": "ADMM",
     "qp.problem": "QP",
@@ -149,6 +143,12 @@ HOMES = {
     "recursion": "recursive_feasibility",
     "robots.linear": "LinearPlant",
     "robots.load": "load_robot",
+    "sets.convex": "Box Ellipsoid Polytope",
+    "sets.invariant": "invariant_ellipsoid maximal_control_invariant_set maximal_invariant_set",
+    "sets.limits": "joint_limits",
+    "sets.terminal": "verify_terminal",
+    "systems.riccati": "lqr",
+    "systems.system": "LinearSystem",
     "tuning.losses": "ClosedLoopLoss",
     "tuning.parameters": "Parameter",
     "tuning.penalties": "tune_penalties",

@@ -194,7 +194,7 @@ with tempfile.TemporaryDirectory() as folder:
     command = [sys.executable, "-m", "jaxmpc", "sweep", "--grid", "24", "24", "--output", folder]
     done = subprocess.run([*command, "--overwrite"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    found = jm.feasible.verify(folder, exact=True)
+    found = jm.verify.verify_map(folder, exact=True)
 print(found.labels, "verified:", found.verified, "exactly:", found.exactly)
 assert found.passed and found.verified == sum(found.labels.values()) == 24 * 24
 

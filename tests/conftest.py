@@ -66,7 +66,7 @@ def _forget_programs():
         return
     import jax
 
-    from jaxmpc.compiled import Compiled
+    from jaxmpc.batches import Compiled
 
     for found in gc.get_objects():
         if type(found) is Compiled:

@@ -216,9 +216,9 @@ def check_programs():
     import jax
     import jax.numpy as jnp
 
-    from jaxmpc.devices import over_devices
+    from jaxmpc.batches import over_devices
     from jaxmpc.feasible.candidates import compiled_admm, compiled_check, compiled_newton
-    from jaxmpc.mpc.batch import _plans
+    from jaxmpc.mpc.many import _plans
 
     def count_to(end, x):
         step = lambda v: (v[0] + 1, v[1] + 1)
@@ -381,7 +381,7 @@ def test_maps_on_several_gpus_name_the_partitioner():
     import jax
     import pytest
 
-    from jaxmpc.devices import require_partitioner
+    from jaxmpc.batches import require_partitioner
 
     class Device:
         platform = "gpu"

@@ -18,7 +18,7 @@ import tyro
 from lesson_joint import GOAL, SYSTEM, TAU_MAX, X_MAX, A, B, Q, R, joint, rows
 
 import jaxmpc as jm
-from jaxmpc.closed_loop.simulate import simulate
+from jaxmpc.closed_loop.simulation import simulate
 
 
 @dataclass(frozen=True)

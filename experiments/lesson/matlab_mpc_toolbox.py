@@ -37,7 +37,7 @@ import tyro
 from lesson_joint import GOAL, SYSTEM, TAU_MAX, X_MAX, A, B, joint, rows
 
 import jaxmpc as jm
-from jaxmpc.closed_loop.simulate import simulate
+from jaxmpc.closed_loop.simulation import simulate
 
 # Wy, Wu, WΔu: as MATLAB reads the lesson, and the cost of the lesson's other sections.
 WEIGHTS = {

@@ -19,7 +19,7 @@ import tyro
 from lesson_joint import LIMITS, Q, R, joint
 
 import jaxmpc as jm
-from jaxmpc.mpc.soften import soften
+from jaxmpc.mpc.softening import soften
 
 
 @dataclass(frozen=True)

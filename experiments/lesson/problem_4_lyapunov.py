@@ -18,7 +18,7 @@ from lesson_joint import LIMITS, SYSTEM, TORQUE, A, B, Q, R, joint
 
 import jaxmpc as jm
 from jaxmpc.closed_loop.run import lyapunov_decrease
-from jaxmpc.closed_loop.simulate import simulate
+from jaxmpc.closed_loop.simulation import simulate
 
 
 @dataclass(frozen=True)

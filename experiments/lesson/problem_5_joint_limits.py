@@ -10,7 +10,7 @@ first of them; a joint without a limit (here the last one, which turns for ever)
 import numpy as np
 import tyro
 
-from jaxmpc.control.limits import JointLimits, joint_limits
+from jaxmpc.sets.limits import JointLimits, joint_limits
 
 Q_MIN = np.array([-2.9, -1.8, -np.inf])
 Q_MAX = np.array([2.9, 1.2, np.inf])

@@ -15,7 +15,7 @@ import tyro
 from lesson_joint import GOAL, SYSTEM, TAU_MAX, X_MAX, A, B, Q, R, joint, rows
 
 import jaxmpc as jm
-from jaxmpc.closed_loop.simulate import simulate
+from jaxmpc.closed_loop.simulation import simulate
 
 TIGHT = {"eps_abs": 1e-10, "eps_rel": 1e-10, "max_iter": 100_000}
 

@@ -24,9 +24,9 @@ import tyro
 from jax import Array
 
 import jaxmpc as jm
-from jaxmpc.closed_loop.simulate import simulate
-from jaxmpc.control.limits import JointLimits, joint_limits
-from jaxmpc.mpc.soften import soften
+from jaxmpc.closed_loop.simulation import simulate
+from jaxmpc.mpc.softening import soften
+from jaxmpc.sets.limits import JointLimits, joint_limits
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,8 @@ import numpy as np
 import tyro
 
 import jaxmpc as jm
-from jaxmpc.devices import chosen_devices, over_devices, placement
-from jaxmpc.mpc.stagewise import factor_stages, plan_stages
+from jaxmpc.batches import chosen_devices, over_devices, placement
+from jaxmpc.mpc.stagewise.newton import factor_stages, plan_stages
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,8 @@ from jax.flatten_util import ravel_pytree
 from searchers import SEARCHERS, Space, search, within
 
 import jaxmpc as jm
-from jaxmpc.closed_loop.simulate_many import as_argument
-from jaxmpc.compiled import Compiled
+from jaxmpc.batches import Compiled
+from jaxmpc.closed_loop.many import as_argument
 from jaxmpc.robots import Robot
 from jaxmpc.tuning.closed_loop_objective import ClosedLoopObjective
 from jaxmpc.tuning.losses import ClosedLoopLoss

@@ -30,7 +30,6 @@ COMMANDS = {
     "verify": ("verify", "Verify"),
     "export": ("export", "Export"),
     "report": ("report", "Report"),
-    "bench": ("bench", "Bench"),
 }
 DESCRIPTION = "Constrained MPC in batches, with proofs. Also: jaxmpc --version"
 # Options of tyro that write a completion script for a shell, and the words that each needs.

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxmpc.checks import fail
-from jaxmpc.runs import text_within
+from jaxmpc.files import text_within
 
 # What the commands write their results to.
 RESULTS = ("summary.json", "tuning.json", "penalties.json")

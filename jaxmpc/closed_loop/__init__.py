@@ -16,14 +16,14 @@ randomised                 random masses, damping, payloads of robots, for `vari
 
 from jaxmpc.closed_loop.environment import Environment, EnvironmentState, MPCPolicy
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
+from jaxmpc.closed_loop.many import simulate_many
 from jaxmpc.closed_loop.noise import Noise
 from jaxmpc.closed_loop.observer import Belief, KalmanFilter
 from jaxmpc.closed_loop.outcome import Outcome, evaluate_runs
 from jaxmpc.closed_loop.robot_controller import RobotController
-from jaxmpc.closed_loop.robot_mpc import robot_mpc
+from jaxmpc.closed_loop.robot_problem import robot_mpc
 from jaxmpc.closed_loop.run import Run, lyapunov_decrease
-from jaxmpc.closed_loop.simulate import simulate
-from jaxmpc.closed_loop.simulate_many import simulate_many
+from jaxmpc.closed_loop.simulation import simulate
 from jaxmpc.closed_loop.variations import randomised
 
 __all__ = [

@@ -9,16 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import as_weight
 from jaxmpc.checks import number, require_kind, require_shape, whole
 from jaxmpc.closed_loop.observer import model_of
-from jaxmpc.closed_loop.robot_mpc import robot_mpc
-from jaxmpc.control.system import as_weight
-from jaxmpc.control.violation import TOLERANCE, worst_violation
+from jaxmpc.closed_loop.robot_problem import robot_mpc
 from jaxmpc.mpc.plan import limited
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.precision import matmul
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
+from jaxmpc.sets.violations import TOLERANCE, worst_violation
 
 
 @pytree

@@ -9,13 +9,13 @@ from jax import Array
 
 from jaxmpc.checks import concrete, fail, require_finite, require_kind, require_shape
 from jaxmpc.closed_loop.noise import covariance, require_spread, whole_array
-from jaxmpc.control.riccati import least_reached, lqr
-from jaxmpc.control.system import LinearSystem
 from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import matmul
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
+from jaxmpc.systems.riccati import least_reached, lqr
+from jaxmpc.systems.system import LinearSystem
 
 
 @named_pytree

@@ -6,13 +6,12 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.closed_loop.run import Run
-from jaxmpc.control.sets import Box
-from jaxmpc.control.system import host_array
-from jaxmpc.control.violation import kept, row_violations
 from jaxmpc.qp.status import Status
-from jaxmpc.reals import Reals
+from jaxmpc.sets.convex import Box
+from jaxmpc.sets.violations import kept, row_violations
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,15 +9,14 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail, whole
-from jaxmpc.control.sets import Box
 from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.nonlinear import NonlinearMPC, Task, task_layout
 from jaxmpc.mpc.plan import Plan, WarmStart, anchored, applied, limited
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import layout
-from jaxmpc.mpc.soften import soften
-from jaxmpc.mpc.sqp import solve_nonlinear
-from jaxmpc.mpc.stagewise import factor_stages, solve_stagewise
+from jaxmpc.mpc.softening import soften
+from jaxmpc.mpc.stagewise.newton import factor_stages, solve_stagewise
+from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, Task, task_layout
+from jaxmpc.mpc.stagewise.sqp import solve_nonlinear
 from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT
 from jaxmpc.qp.modes import varying
@@ -25,6 +24,7 @@ from jaxmpc.qp.precision import arrays, floating_dtype
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.model import RobotModel
 from jaxmpc.robots.robot import Robot
+from jaxmpc.sets.convex import Box
 
 LINEARIZATIONS = ("set-point", "state", "trajectory")
 

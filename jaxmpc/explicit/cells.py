@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
-from jaxmpc.control.geometry import distinct
-from jaxmpc.control.lp import maximise
 from jaxmpc.explicit.least_distance import SMALLEST, LeastDistanceForm
+from jaxmpc.sets.geometry import distinct
+from jaxmpc.sets.lp import maximise
 
 # Relative rounding of a law: below it a coefficient is zero.
 ZERO = 1e-11

@@ -12,14 +12,14 @@ import jax
 import numpy as np
 from scipy.optimize import lsq_linear, nnls
 
-from jaxmpc.control.sets import Box, unit_rows
-from jaxmpc.control.system import host_matrices
 from jaxmpc.explicit.regions import CriticalRegions
 from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import solve_many
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
+from jaxmpc.sets.convex import Box, unit_rows
+from jaxmpc.systems.system import host_matrices
 
 # Residuals to which plans are solved.
 EPS = 1e-8

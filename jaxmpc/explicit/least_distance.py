@@ -21,11 +21,11 @@ import numpy as np
 from scipy.optimize import nnls
 
 from jaxmpc.checks import fail
-from jaxmpc.control.lp import ROUNDING, AffineHull, Program, affine_hull, framed, maximise, scaling
-from jaxmpc.control.sets import Box, Polytope, unit_half_spaces
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.sets.convex import Box, Polytope, unit_half_spaces
+from jaxmpc.sets.lp import ROUNDING, AffineHull, Program, affine_hull, framed, maximise, scaling
 
 # In coordinates where X_N just fits into [−1, 1]^n: the smallest ball of a region.
 SMALLEST = 1e-9

@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.control.lp import scaling
-from jaxmpc.control.sets import Box, Polytope, unit_rows
 from jaxmpc.explicit.cells import Cell, volume
 from jaxmpc.explicit.least_distance import (
     GivenProgram,
@@ -19,6 +17,8 @@ from jaxmpc.explicit.least_distance import (
 )
 from jaxmpc.explicit.search import RegionSearch, explore
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.sets.convex import Box, Polytope, unit_rows
+from jaxmpc.sets.lp import scaling
 
 # Residual of the optimality conditions at a vertex, relative to the size of the terms, up to which
 # a region counts as one of the program as given.

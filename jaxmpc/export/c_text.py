@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.control.sets import Box
 from jaxmpc.mpc.plan import rate_ends
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.sets.convex import Box
 
 TEMPLATES = Path(__file__).parent
 REAL = {"float64": "double", "float32": "float"}

@@ -7,14 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import number, require_finite, require_kind, require_shape, whole
-from jaxmpc.control.system import host_array
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.status import Status
-from jaxmpc.reals import Reals
 
 LOOPS = 20
 

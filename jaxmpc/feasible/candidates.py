@@ -19,8 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.compiled import Compiled
-from jaxmpc.devices import Devices, over_devices
+from jaxmpc.batches import Compiled, Devices, over_devices
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData

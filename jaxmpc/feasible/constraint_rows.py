@@ -11,8 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.control.lp import scaling
-from jaxmpc.control.set_bounds import set_bounds
 from jaxmpc.feasible.centered_polytope import power_of_two
 from jaxmpc.feasible.exact_data import absorbed
 from jaxmpc.feasible.view import View
@@ -20,6 +18,8 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Block
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
+from jaxmpc.sets.lp import scaling
+from jaxmpc.sets.set_bounds import set_bounds
 
 
 @jax.tree_util.register_dataclass

@@ -7,14 +7,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxmpc.control.set_bounds import set_bounds
-from jaxmpc.control.sets import Box, Ellipsoid
-from jaxmpc.control.system import host_matrices
 from jaxmpc.feasible.centered_polytope import power_of_two
 from jaxmpc.feasible.view import View
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Block
 from jaxmpc.mpc.rows import blocks as row_blocks
+from jaxmpc.sets.convex import Box, Ellipsoid
+from jaxmpc.sets.set_bounds import set_bounds
+from jaxmpc.systems.system import host_matrices
 
 
 @jax.tree_util.register_dataclass

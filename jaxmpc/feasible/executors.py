@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.feasible.cascade import Scope, label_parts
 from jaxmpc.feasible.labels import Labels
+from jaxmpc.feasible.pipeline import Scope, label_parts
 from jaxmpc.feasible.problem import FeasibilityProblem
 
 # Parts that are submitted and not yet joined, at most: enough for some hundred workers.

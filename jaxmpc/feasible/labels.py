@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.compiled import cores, joined, side_by_side
+from jaxmpc.batches import cores, joined, side_by_side
 from jaxmpc.feasible.candidates import Verdict
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.qp.status import Status

@@ -13,21 +13,20 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm.std import tqdm
 
+from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, number, require_kind, require_memory, whole
-from jaxmpc.control.sets import Ellipsoid, Polytope, hull_volume
-from jaxmpc.control.system import host_array
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.candidates import StagePenalties
-from jaxmpc.feasible.cascade import label_chunks
 from jaxmpc.feasible.centered_polytope import power_of_two
 from jaxmpc.feasible.executors import label_elsewhere
 from jaxmpc.feasible.labels import Labels, OnDemand
+from jaxmpc.feasible.pipeline import label_chunks
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays
 from jaxmpc.feasible.refinement import refined
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
-from jaxmpc.reals import Reals
+from jaxmpc.sets.convex import Ellipsoid, Polytope, hull_volume
 
 # Volumes are sums of rounded products; bounds are widened by more than that.
 VOLUME_ROUNDING = 1e-11

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.control.lp import Program, affine_hull, bound, framed, maximise, safe_extent
-from jaxmpc.control.sets import Polytope
 from jaxmpc.feasible.centered_polytope import CenteredPolytope, power_of_two
 from jaxmpc.mpc.inequalities import Inequalities, row_lengths
+from jaxmpc.sets.convex import Polytope
+from jaxmpc.sets.lp import Program, affine_hull, bound, framed, maximise, safe_extent
 
 # Bounds of linear programs are trusted to this, relative to the size of the set.
 TOLERANCE = 1e-9

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.control.invariant import predecessor
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope, unit_rows
 from jaxmpc.feasible.plan_polytope import DIMENSIONS, FACETS, CenteredPolytope, projected
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.sets.convex import Box, Ellipsoid, Polytope, unit_rows
+from jaxmpc.sets.invariant import predecessor
 
 
 def feasible_polytope(mpc: MPC) -> Polytope:

@@ -8,21 +8,21 @@ import numpy as np
 from scipy.linalg import qr
 
 from jaxmpc.checks import require_kind
-from jaxmpc.control.geometry import binding_rows
-from jaxmpc.control.lp import FLAT, ROUNDING, implied_equalities, scaling
-from jaxmpc.control.set_bounds import set_bounds
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope, unit_rows
 from jaxmpc.feasible import constraint_rows, exact_data
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.plan_polytope import PlanPolytope
 from jaxmpc.feasible.row_programs import RowPrograms
 from jaxmpc.feasible.view import View, make_view
+from jaxmpc.files import as_json
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.inequalities import condensed_in_float64
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
 from jaxmpc.mpc.rows import Block
-from jaxmpc.runs import as_json
+from jaxmpc.sets.convex import Box, Ellipsoid, Polytope, unit_rows
+from jaxmpc.sets.geometry import binding_rows
+from jaxmpc.sets.lp import FLAT, ROUNDING, implied_equalities, scaling
+from jaxmpc.sets.set_bounds import set_bounds
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,8 @@ import jax
 import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail
-from jaxmpc.control.system import host_array
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.candidates import cut_of, inputs_of
 from jaxmpc.feasible.constraint_rows import ConstraintRows

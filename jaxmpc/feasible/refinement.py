@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from jaxmpc.control.sets import Polytope, hull_volume
 from jaxmpc.feasible.centered_polytope import power_of_two
 from jaxmpc.feasible.rays import Cuts, Rays
+from jaxmpc.sets.convex import Polytope, hull_volume
 
 # The most rays that are sent in one round.
 MOST_RAYS = 2000

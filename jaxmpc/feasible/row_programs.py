@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.control.lp import FLAT, Program, scaling
 from jaxmpc.feasible.constraint_rows import ConstraintRows
+from jaxmpc.sets.lp import FLAT, Program, scaling
 
 # Tangents of a ball are added to a program up to so often.
 TANGENTS = 200

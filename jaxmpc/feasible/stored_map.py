@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.feasible.centered_polytope import power_of_two
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import FeasibleSetMap, count_labels, excluded, mesh
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays
 from jaxmpc.qp.status import Status
+from jaxmpc.sets.convex import Box, Polytope
 
 # Points, or half-spaces, from which on they are reduced to those that matter, and the most mapped
 # states with which they are.

@@ -9,8 +9,8 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.control.set_bounds import set_bounds
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.sets.set_bounds import set_bounds
 
 
 @jax.tree_util.register_dataclass

@@ -7,21 +7,23 @@ NonlinearMPC, Task    a problem with a nonlinear model, costs and limits on func
 solve_nonlinear       its plan by sequential quadratic programming
 solve_many            one plan for each of many states -> Plan with a batch axis
 WarmStart             where a solver begins: states, inputs, multipliers
+equilibrium           steady state and input for a reference
 active_constraints    which rows of a plan are active -> ActiveConstraint
 row_table             each row of the problem: kind, name, unit, step -> Row
 soften, harden        make rows soft or hard
 """
 
-from jaxmpc.mpc.active_constraints import ActiveConstraint, active_constraints
+from jaxmpc.mpc.active_limits import ActiveConstraint, active_constraints
 from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.nonlinear import NonlinearMPC, Point, Task
 from jaxmpc.mpc.plan import Multipliers, Plan, WarmStart
 from jaxmpc.mpc.problem import MPC, Outputs, Soft
 from jaxmpc.mpc.rows import Row, row_table
-from jaxmpc.mpc.soften import harden, soften
+from jaxmpc.mpc.softening import harden, soften
 from jaxmpc.mpc.solve import solve, solve_many
-from jaxmpc.mpc.sqp import solve_nonlinear
-from jaxmpc.mpc.stagewise import solve_stagewise
+from jaxmpc.mpc.stagewise.newton import solve_stagewise
+from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, Point, Task
+from jaxmpc.mpc.stagewise.sqp import solve_nonlinear
+from jaxmpc.mpc.targets import equilibrium
 
 __all__ = [
     "MPC",
@@ -37,6 +39,7 @@ __all__ = [
     "Task",
     "WarmStart",
     "active_constraints",
+    "equilibrium",
     "harden",
     "row_table",
     "soften",

@@ -19,9 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import host_array
 from jaxmpc.checks import concrete, require_memory
-from jaxmpc.control.riccati import lqr
-from jaxmpc.control.system import host_array, host_matrices
 from jaxmpc.mpc.problem import MPC, Switch, weights_of
 from jaxmpc.mpc.rows import Layout, blocks, split, stacked
 from jaxmpc.pytrees import pytree
@@ -30,6 +29,8 @@ from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
+from jaxmpc.systems.riccati import lqr
+from jaxmpc.systems.system import host_matrices
 
 
 @pytree

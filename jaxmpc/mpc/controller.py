@@ -10,11 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import as_array, host_array
 from jaxmpc.checks import concrete, fail, require_kind
-from jaxmpc.control.sets import Box, Polytope
-from jaxmpc.control.system import as_array, host_array
 from jaxmpc.mpc.condense import Condensed, condense
-from jaxmpc.mpc.judge import judged
 from jaxmpc.mpc.plan import (
     Multipliers,
     Plan,
@@ -25,6 +23,7 @@ from jaxmpc.mpc.plan import (
     sorted_multipliers,
 )
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.stated_residuals import judged
 from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.active_set import has_dual_steps
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor
@@ -33,6 +32,7 @@ from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.solve import in_two_parts, solve_factored
 from jaxmpc.qp.status import Status
+from jaxmpc.sets.convex import Box, Polytope
 
 
 @dataclass(frozen=True, eq=False, repr=False)

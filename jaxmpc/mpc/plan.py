@@ -9,7 +9,6 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
-from jaxmpc.control.sets import Box
 from jaxmpc.mpc.problem import MPC, weights_of
 from jaxmpc.mpc.rows import Layout, blocks, split
 from jaxmpc.pytrees import named_pytree, pytree
@@ -17,6 +16,7 @@ from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.residuals import marked
 from jaxmpc.qp.status import Status
+from jaxmpc.sets.convex import Box
 
 
 @pytree

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import as_array, as_weight, dimensions, host_array, store_floats
 from jaxmpc.checks import (
     concrete,
     fail,
@@ -16,18 +17,10 @@ from jaxmpc.checks import (
     require_shape,
     require_symmetric_psd,
 )
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope
-from jaxmpc.control.system import (
-    LinearSystem,
-    as_array,
-    as_weight,
-    dimensions,
-    host_array,
-    host_matrices,
-    store_floats,
-)
 from jaxmpc.pytrees import pytree, static_pytree
 from jaxmpc.qp.precision import symmetric
+from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
+from jaxmpc.systems.system import LinearSystem, host_matrices
 
 # Curvature of the cost, relative to its terms, below which a direction of the inputs costs nothing.
 FLAT = 1e-12

@@ -15,11 +15,11 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import require_kind
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, output_steps
 from jaxmpc.qp.linalg import cholesky
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
+from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
 
 # (kind, steps, rows a step) of each block of rows.
 Layout = tuple[tuple[str, tuple[int, ...], int], ...]

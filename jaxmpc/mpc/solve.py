@@ -7,17 +7,16 @@ import jax
 import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import Reals, host_array
+from jaxmpc.batches import chosen_devices, first_rows, require_step_type
 from jaxmpc.checks import fail, require_kind, require_memory, whole
-from jaxmpc.compiled import first_rows, require_step_type
-from jaxmpc.control.system import LinearSystem, host_array
-from jaxmpc.devices import chosen_devices
-from jaxmpc.mpc.batch import Batch
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller, plan_arguments
+from jaxmpc.mpc.many import Batch
 from jaxmpc.mpc.plan import Plan, WarmStart
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM, DEFAULT
-from jaxmpc.reals import Reals
+from jaxmpc.systems.system import LinearSystem
 
 
 def solve(

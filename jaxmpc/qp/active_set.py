@@ -31,8 +31,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.qp.batches import repeat_while, true_places
 from jaxmpc.qp.linalg import solve
+from jaxmpc.qp.loops import repeat_while, true_places
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds, sign
 from jaxmpc.qp.triton import has_kernels

@@ -17,7 +17,7 @@ from jax import Array
 
 from jaxmpc.qp import triton
 from jaxmpc.qp.admm import Factor
-from jaxmpc.qp.batches import LARGE
+from jaxmpc.qp.loops import LARGE
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import FREE, Bounds
 from jaxmpc.qp.triton import (

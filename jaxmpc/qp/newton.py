@@ -20,9 +20,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.qp.batches import in_blocks, repeat_while, true_places
 from jaxmpc.qp.dual_kernel import MOST_ROWS, damped_kernel
 from jaxmpc.qp.linalg import definite_solver, solve
+from jaxmpc.qp.loops import in_blocks, repeat_while, true_places
 from jaxmpc.qp.modes import varying
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds

@@ -23,8 +23,8 @@ from jaxmpc.qp.active_set import (
     single_step,
 )
 from jaxmpc.qp.admm import Factor, natural, scaled, scaled_multipliers, unscaled
-from jaxmpc.qp.batches import repeat_while
 from jaxmpc.qp.certificate import Proof, correcting_rows, farkas, prove, recession, to_length_one
+from jaxmpc.qp.loops import repeat_while
 from jaxmpc.qp.modes import varying
 from jaxmpc.qp.newton import (
     Constants,

@@ -28,9 +28,9 @@ from jaxmpc.qp.admm import (
     unscaled,
 )
 from jaxmpc.qp.admm_kernel import iterate_batch, suits
-from jaxmpc.qp.batches import in_blocks
 from jaxmpc.qp.certificate import Proof, correcting_rows, prove
 from jaxmpc.qp.derivative import dense_conditions, implicit
+from jaxmpc.qp.loops import in_blocks
 from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.newton import multipliers_start, multipliers_step
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely

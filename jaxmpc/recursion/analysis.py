@@ -20,15 +20,14 @@ from typing import Any
 
 import numpy as np
 
+from jaxmpc.arrays import Reals, host_array
+from jaxmpc.batches import default_chunk
 from jaxmpc.checks import fail, whole
-from jaxmpc.compiled import default_chunk
-from jaxmpc.control.system import host_array
 from jaxmpc.explicit.law import Law, RegionLaw
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import grid
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.reals import Reals
 from jaxmpc.recursion.ascent import ascend
 from jaxmpc.recursion.budget import LABELS, PLANS, PROOFS, Budget
 from jaxmpc.recursion.claims import (
@@ -46,7 +45,7 @@ from jaxmpc.recursion.counterexample import (
     outer_bound,
     worst_samples,
 )
-from jaxmpc.recursion.loops import LawLoops, closed_loops, map_states
+from jaxmpc.recursion.law_loops import LawLoops, closed_loops, map_states
 from jaxmpc.recursion.report import NOT_FEASIBLE, Claim, Counterexample, RecursionReport
 
 

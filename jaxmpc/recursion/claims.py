@@ -6,10 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.control.set_bounds import set_bounds
-from jaxmpc.control.sets import Polytope
-from jaxmpc.control.system import host_matrices
-from jaxmpc.control.terminal import verify_terminal
 from jaxmpc.explicit.regions import CriticalRegions, critical_regions
 from jaxmpc.feasible.centered_polytope import CenteredPolytope
 from jaxmpc.feasible.plan_polytope import DIMENSIONS, TOLERANCE, PlanPolytope, projected
@@ -17,6 +13,10 @@ from jaxmpc.feasible.polytope import backward, is_standard_form
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.recursion.report import Claim, in_words
+from jaxmpc.sets.convex import Polytope
+from jaxmpc.sets.set_bounds import set_bounds
+from jaxmpc.sets.terminal import verify_terminal
+from jaxmpc.systems.system import host_matrices
 
 # Distance from a facet of X_N, relative to the facet's from the centre, from which a state counts
 # as outside: well above the residuals of plans. Next states are moved towards the centre by as much

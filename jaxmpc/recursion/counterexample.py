@@ -11,7 +11,7 @@ from jaxmpc.feasible.proofs import first_of_block
 from jaxmpc.feasible.rays import BACKOFFS, Rays, ray_directions
 from jaxmpc.qp.status import Status
 from jaxmpc.recursion.claims import CLEAR, Claims
-from jaxmpc.recursion.loops import LawLoops
+from jaxmpc.recursion.law_loops import LawLoops
 from jaxmpc.recursion.report import Counterexample
 
 STARTS = 96

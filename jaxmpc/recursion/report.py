@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.control.sets import Polytope
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.sets.convex import Polytope
 
 # `lost_at` of samples that are infeasible from the start, and of those that were not decided.
 NOT_FEASIBLE, UNDECIDED = -1, -2

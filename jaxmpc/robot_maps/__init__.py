@@ -5,7 +5,7 @@ RobotLoops     what those closed loops did
 OUTCOMES       what can become of a state
 """
 
-from jaxmpc.robot_maps.loops import RobotLoops
+from jaxmpc.robot_maps.outcomes import RobotLoops
 from jaxmpc.robot_maps.robot_map import OUTCOMES, RobotMap
 from jaxmpc.robot_maps.setting import map_robot
 

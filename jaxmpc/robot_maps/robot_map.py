@@ -14,7 +14,7 @@ import numpy as np
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.qp.status import Status
 from jaxmpc.recursion.report import RecursionReport
-from jaxmpc.robot_maps.loops import RobotLoops
+from jaxmpc.robot_maps.outcomes import RobotLoops
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
 

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.control.sets import Box, translated
-from jaxmpc.control.system import LinearSystem, host_matrices
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
+from jaxmpc.sets.convex import Box, translated
+from jaxmpc.systems.system import LinearSystem, host_matrices
 
 
 def with_initial_limits(mpc: MPC, limits: Box) -> MPC:

@@ -10,20 +10,19 @@ import jax
 import numpy as np
 from tqdm.std import tqdm
 
+from jaxmpc.arrays import Reals, host_array
+from jaxmpc.batches import default_chunk, padded
 from jaxmpc.checks import fail, require_shape
+from jaxmpc.closed_loop.many import simulate_many
 from jaxmpc.closed_loop.robot_controller import RobotController
-from jaxmpc.closed_loop.simulate_many import simulate_many
-from jaxmpc.compiled import default_chunk, padded
-from jaxmpc.control.system import host_array
-from jaxmpc.feasible.cascade import Scope, label_chunks
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import FeasibleSetMap
+from jaxmpc.feasible.pipeline import Scope, label_chunks
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.reals import Reals
 from jaxmpc.recursion.analysis import examine
 from jaxmpc.recursion.budget import Budget
-from jaxmpc.robot_maps.loops import RobotLoops
+from jaxmpc.robot_maps.outcomes import RobotLoops
 from jaxmpc.robot_maps.robot_map import RobotMap
 from jaxmpc.robot_maps.set_point import deviations, with_initial_limits
 from jaxmpc.robots.linear import LinearPlant

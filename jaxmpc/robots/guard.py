@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from jaxmpc.control.sets import Box
 from jaxmpc.qp.linalg import JAXLIB
 from jaxmpc.robots.physics import Physics
 from jaxmpc.robots.supported import Lack, name_of
+from jaxmpc.sets.convex import Box
 
 if TYPE_CHECKING:
     import mujoco

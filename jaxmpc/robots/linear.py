@@ -7,10 +7,10 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
-from jaxmpc.control.equilibrium import equilibrium
-from jaxmpc.control.sets import Box
-from jaxmpc.control.system import LinearSystem
+from jaxmpc.mpc.targets import equilibrium
 from jaxmpc.pytrees import pytree
+from jaxmpc.sets.convex import Box
+from jaxmpc.systems.system import LinearSystem
 
 
 @pytree
@@ -86,7 +86,7 @@ class LinearPlant:
 
     def equilibrium(self, x: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Return (x, u): the state x (n,), None for home, and the input that holds it
-        (`jaxmpc.control.equilibrium`). Raises ValueError where none does, or only beyond the
+        (`jaxmpc.mpc.targets`). Raises ValueError where none does, or only beyond the
         limits."""
         target = self.home if x is None else x
         return equilibrium(self.system, target, states=self.state_limits, inputs=self.input_limits)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxmpc.arrays import Reals
 from jaxmpc.checks import (
     fail,
     require_finite,
@@ -18,16 +19,15 @@ from jaxmpc.checks import (
     require_printable,
     require_shape,
 )
-from jaxmpc.control.limits import Limit, limit_pair
-from jaxmpc.control.sets import Box
-from jaxmpc.control.system import require_period
-from jaxmpc.reals import Reals
 from jaxmpc.robots.guard import compared
 from jaxmpc.robots.physics import RK4, Physics
 from jaxmpc.robots.robot import Robot
 from jaxmpc.robots.supported import lacks, translate
 from jaxmpc.robots.tangent import unit_orientations
 from jaxmpc.robots.urdf import compiled_urdf
+from jaxmpc.sets.convex import Box
+from jaxmpc.sets.limits import Limit, limit_pair
+from jaxmpc.systems.system import require_period
 
 if TYPE_CHECKING:
     import mujoco

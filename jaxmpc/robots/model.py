@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.control.system import LinearSystem
 from jaxmpc.pytrees import pytree
 from jaxmpc.robots.robot import Robot
+from jaxmpc.systems.system import LinearSystem
 
 
 @pytree

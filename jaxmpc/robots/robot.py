@@ -17,9 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.control.sets import Box
-from jaxmpc.control.system import LinearSystem, host_array
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import eigh
 from jaxmpc.qp.modes import own_modes, varying
@@ -28,6 +27,8 @@ from jaxmpc.robots.balance import lacking, nearest_rest, require_rest, rest_at, 
 from jaxmpc.robots.physics import Physics
 from jaxmpc.robots.report import RobotReport, report_of
 from jaxmpc.robots.tangent import difference, quaternions, retract, unit_orientations
+from jaxmpc.sets.convex import Box
+from jaxmpc.systems.system import LinearSystem
 
 if TYPE_CHECKING:
     import mujoco

@@ -3,7 +3,7 @@
 tune_weights                              fields of an MPC, through its closed loops
 Parameter                                 a quantity that is tuned, and its domain
 ClosedLoopLoss                            tracking, effort, violations and settling
-tune_feasible_set, feasible_fraction      states from which all limits can be kept
+tune_feasible_set                         the share of states from which all limits can be kept
 tune_penalties, transfer_penalties        penalties of ADMM, also for another horizon
 tune_sweep_penalties                      penalties of the first stage of a map
 Settings, TuningRun, Descent              arguments and results of all of these
@@ -11,7 +11,6 @@ Interrupted                               what they raise on Ctrl-C, with the be
 """
 
 from jaxmpc.tuning.descent import Descent
-from jaxmpc.tuning.feasible_fraction import feasible_fraction
 from jaxmpc.tuning.feasible_set import tune_feasible_set
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
@@ -29,7 +28,6 @@ __all__ = [
     "Parameter",
     "Settings",
     "TuningRun",
-    "feasible_fraction",
     "transfer_penalties",
     "tune_feasible_set",
     "tune_penalties",

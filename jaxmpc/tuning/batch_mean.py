@@ -6,8 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxmpc.compiled import first_rows, padded
-from jaxmpc.devices import Devices, count, divisible, over_devices
+from jaxmpc.batches import Devices, count, divisible, first_rows, over_devices, padded
 
 
 class BatchMean:

@@ -12,16 +12,16 @@ import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
+from jaxmpc.batches import Devices
 from jaxmpc.checks import fail
+from jaxmpc.closed_loop.many import simulate_batch
 from jaxmpc.closed_loop.memory import device_bytes, program_bytes
-from jaxmpc.closed_loop.simulate_many import simulate_batch
-from jaxmpc.control.violation import TOLERANCE
-from jaxmpc.devices import Devices
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.precision import arrays
 from jaxmpc.qp.status import Status
+from jaxmpc.sets.violations import TOLERANCE
 from jaxmpc.tuning.batch_mean import BatchMean
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameters, values

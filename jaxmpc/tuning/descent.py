@@ -17,7 +17,7 @@ import optax
 from tqdm.std import tqdm
 
 from jaxmpc.checks import fail
-from jaxmpc.runs import fingerprint, read_arrays, remove_partial, write_arrays
+from jaxmpc.files import fingerprint, read_arrays, remove_partial, write_arrays
 from jaxmpc.tuning.settings import Settings
 
 # (loss, numbers to record) and (loss, gradient, numbers to record).

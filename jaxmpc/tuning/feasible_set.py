@@ -9,15 +9,15 @@ import numpy as np
 import optax
 from jax import Array
 
+from jaxmpc.arrays import Reals
+from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail
-from jaxmpc.devices import chosen_devices
+from jaxmpc.feasible.fraction import STEPS, membership
+from jaxmpc.files import fingerprint
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.precision import arrays
-from jaxmpc.reals import Reals
-from jaxmpc.runs import fingerprint
 from jaxmpc.tuning.batch_mean import BatchMean
 from jaxmpc.tuning.descent import descend
-from jaxmpc.tuning.feasible_fraction import STEPS, membership
 from jaxmpc.tuning.parameters import Parameters, raw, require_parameters, values
 from jaxmpc.tuning.result import TuningRun, finished
 from jaxmpc.tuning.settings import Settings

@@ -10,9 +10,9 @@ from jax import Array
 
 from jaxmpc.checks import fail, require_symmetric_psd
 from jaxmpc.closed_loop.run import Run
-from jaxmpc.control import violation
-from jaxmpc.control.sets import Box, Polytope
 from jaxmpc.qp.precision import matmul
+from jaxmpc.sets import violations
+from jaxmpc.sets.convex import Box, Polytope
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ class ClosedLoopLoss:
         """Return by how much the states x (T+1, n) violate each row of the limits, (T+1, rows)."""
         limits = jax.tree.map(lambda v: jnp.asarray(v, x.dtype), self.limits)
         size = self.limits.half_widths() if isinstance(self.limits, Box) else 1.0
-        return violation.row_violations(limits, x) / jnp.asarray(size, x.dtype)
+        return violations.row_violations(limits, x) / jnp.asarray(size, x.dtype)
 
     def worst(self, run: Run) -> Array:
         """Return the largest violation of a run."""

@@ -10,15 +10,15 @@ import jax
 import numpy as np
 import optax
 
+from jaxmpc.arrays import Reals
+from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, require_finite, require_kind, whole
-from jaxmpc.devices import chosen_devices
+from jaxmpc.files import fingerprint
 from jaxmpc.mpc.condense import condense, in_float64
 from jaxmpc.mpc.plan import Plan, WarmStart
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM, factor
 from jaxmpc.qp.status import Status
-from jaxmpc.reals import Reals
-from jaxmpc.runs import fingerprint
 from jaxmpc.tuning.descent import descend
 from jaxmpc.tuning.penalty_objective import (
     PenaltyObjective,

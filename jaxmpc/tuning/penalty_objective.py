@@ -21,8 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.compiled import Compiled, first_rows, padded
-from jaxmpc.devices import Devices, divisible, over_devices
+from jaxmpc.batches import Compiled, Devices, divisible, first_rows, over_devices, padded
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.qp.admm import ADMM, factor, iterate, natural, read, scaled, splittings, unscaled
 from jaxmpc.qp.problem import QP

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail
+from jaxmpc.files import read_arrays, write_arrays
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.runs import read_arrays, write_arrays
 from jaxmpc.tuning.descent import Descent
 from jaxmpc.tuning.parameters import Parameters, exact_values, trajectory
 from jaxmpc.tuning.settings import Settings

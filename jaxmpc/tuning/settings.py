@@ -8,8 +8,8 @@ import jax
 import numpy as np
 import optax
 
+from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, whole
-from jaxmpc.devices import chosen_devices
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,9 +23,16 @@ import numpy as np
 import optax
 from jax import Array
 
+from jaxmpc.arrays import Reals
+from jaxmpc.batches import (
+    Devices,
+    chosen_devices,
+    default_chunk,
+    divisible,
+    padded,
+    require_step_type,
+)
 from jaxmpc.checks import fail, whole
-from jaxmpc.compiled import default_chunk, padded, require_step_type
-from jaxmpc.devices import Devices, chosen_devices, divisible
 from jaxmpc.feasible.candidates import (
     ALPHA,
     StagePenalties,
@@ -37,12 +44,11 @@ from jaxmpc.feasible.constraint_rows import ConstraintRows, weighted
 from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.map import map_points
 from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.files import fingerprint
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp import linalg
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.reals import Reals
-from jaxmpc.runs import fingerprint
 from jaxmpc.tuning.batch_mean import BatchMean
 from jaxmpc.tuning.descent import descend
 from jaxmpc.tuning.result import TuningRun, cached

@@ -8,15 +8,15 @@ import jax
 import numpy as np
 import optax
 
+from jaxmpc.arrays import Reals
+from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, whole
+from jaxmpc.closed_loop.many import as_argument, require_variations
 from jaxmpc.closed_loop.run import Run
-from jaxmpc.closed_loop.simulate_many import as_argument, require_variations
-from jaxmpc.devices import chosen_devices
+from jaxmpc.files import fingerprint
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.soften import harden
+from jaxmpc.mpc.softening import harden
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.reals import Reals
-from jaxmpc.runs import fingerprint
 from jaxmpc.tuning.closed_loop_objective import (
     MODES,
     ClosedLoopObjective,

@@ -5,8 +5,8 @@ Test: `offline_report` collects proofs, simulations and failed hypotheses in an 
 `NominalLoops` are the closed loops that were simulated.
 """
 
+from jaxmpc.workflow.closed_loops import NominalLoops
 from jaxmpc.workflow.controller_design import Design, design
-from jaxmpc.workflow.nominal_loops import NominalLoops
 from jaxmpc.workflow.offline_test import OfflineReport, offline_report
 
 __all__ = [

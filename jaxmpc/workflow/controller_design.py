@@ -3,18 +3,18 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
+from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail
-from jaxmpc.control.limits import JointLimits
-from jaxmpc.control.named_terminal import named_terminal_set
-from jaxmpc.control.riccati import LQR, lqr
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope
-from jaxmpc.control.system import LinearSystem
-from jaxmpc.explicit.exact_penalty import ExactPenalty, exact_penalty
+from jaxmpc.explicit.penalties import ExactPenalty, exact_penalty
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.soften import soften
+from jaxmpc.mpc.softening import soften
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.reals import Reals
+from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
+from jaxmpc.sets.limits import JointLimits
+from jaxmpc.sets.named_terminal import named_terminal_set
+from jaxmpc.systems.riccati import LQR, lqr
+from jaxmpc.systems.system import LinearSystem
 from jaxmpc.workflow.offline_test import OfflineReport, offline_report
 
 

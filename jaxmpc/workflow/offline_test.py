@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_kind, whole
-from jaxmpc.control.sets import Box
-from jaxmpc.control.terminal import TerminalReport, verify_terminal
-from jaxmpc.explicit.exact_penalty import ExactPenalty, exact_penalty
+from jaxmpc.explicit.penalties import ExactPenalty, exact_penalty
 from jaxmpc.feasible.map import FeasibleSetMap, grid, map_points
 from jaxmpc.feasible.polytope import is_standard_form
 from jaxmpc.feasible.problem import FeasibilityProblem
@@ -17,12 +16,13 @@ from jaxmpc.feasible.rays import boundary
 from jaxmpc.mpc.inequalities import condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import row_table
-from jaxmpc.mpc.soften import harden
-from jaxmpc.reals import Reals
+from jaxmpc.mpc.softening import harden
 from jaxmpc.recursion import RecursionReport
 from jaxmpc.recursion.analysis import examine
 from jaxmpc.recursion.budget import LABELS, LOOPS, PROOFS, Budget
-from jaxmpc.workflow.nominal_loops import NominalLoops, nominal_loops
+from jaxmpc.sets.convex import Box
+from jaxmpc.sets.terminal import TerminalReport, verify_terminal
+from jaxmpc.workflow.closed_loops import NominalLoops, nominal_loops
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,9 +18,9 @@ import zarr
 from jaxmpc.app import cli
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands import linear_sweep, recursion
-from jaxmpc.control.sets import Box
+from jaxmpc.files import read_arrays, write_arrays
 from jaxmpc.recursion import Claim, Counterexample, RecursionReport, SmallestHorizon
-from jaxmpc.runs import read_arrays, write_arrays
+from jaxmpc.sets.convex import Box
 
 
 @pytest.fixture(autouse=True)

@@ -12,7 +12,7 @@ from problems import MINIMAL_FILE
 from pydantic import TypeAdapter
 
 from jaxmpc.app.config import Config, load, load_robot_config, sweep_points
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope
+from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 

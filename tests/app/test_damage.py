@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import zarr
 
+from jaxmpc import store
 from jaxmpc.app import cli
-from jaxmpc.feasible import store
-from jaxmpc.runs import fingerprint, read_arrays, write_arrays
+from jaxmpc.files import fingerprint, read_arrays, write_arrays
 
 SECONDS, BYTES = 30.0, 2**30
 

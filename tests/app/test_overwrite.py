@@ -9,9 +9,9 @@ import xarray as xr
 from problems import MINIMAL_FILE
 
 import jaxmpc as jm
+from jaxmpc import store
 from jaxmpc.app import cli
 from jaxmpc.app.commands import linear_sweep, recursion
-from jaxmpc.feasible import store
 from jaxmpc.feasible.problem import FeasibilityProblem
 
 LINE = ["sweep", "--grid", "6", "6", "--horizon", "4", "--no-refine", "--output"]

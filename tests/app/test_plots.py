@@ -8,9 +8,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from jaxmpc.app.plots import plot_feasible_set, plot_recursion, plot_robot_map
-from jaxmpc.control.sets import Box, Polytope
-from jaxmpc.control.system import LinearSystem
 from jaxmpc.recursion import Claim, Counterexample, RecursionReport
+from jaxmpc.sets.convex import Box, Polytope
+from jaxmpc.systems.system import LinearSystem
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,7 @@ from jaxmpc.app import programs
 from jaxmpc.app.commands import compiling
 from jaxmpc.app.commands.compiling import Compiling
 from jaxmpc.app.programs import kept_programs, times_file
-from jaxmpc.compiled import Compiled
+from jaxmpc.batches import Compiled
 
 VARIABLE = "JAX_COMPILATION_CACHE_DIR"
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from jaxmpc import store
 from jaxmpc.app import cli
 from jaxmpc.app.commands import linear_sweep
-from jaxmpc.feasible import store
 
 
 @pytest.fixture(autouse=True)
@@ -130,7 +130,7 @@ SHARD = """
     import os, sys, time, zarr
     from jaxmpc.app import cli
     from jaxmpc.app.commands import linear_sweep
-    from jaxmpc.feasible.store import Store
+    from jaxmpc.store import Store
     linear_sweep.CHUNK = 200
     commit, log = Store.commit, os.open(sys.argv[1], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
     write, delay = zarr.Array.__setitem__, float(sys.argv[2])

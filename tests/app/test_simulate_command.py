@@ -25,9 +25,9 @@ from jaxmpc.app.plots import plot_runs
 from jaxmpc.app.plots.closed_loops import PLANS
 from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.qp.status import Status
-from jaxmpc.robots.captions import exceeded_limits
+from jaxmpc.robots.film.captions import exceeded_limits
+from jaxmpc.robots.film.video import Film, render, save_video
 from jaxmpc.robots.load import load_robot
-from jaxmpc.robots.video import Film, render, save_video
 
 # Models at the set-point compile in half the time.
 LINE = (
@@ -309,7 +309,7 @@ choose_renderer()
 import jaxmpc as jm
 from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.robots.load import load_robot
-from jaxmpc.robots.video import render, save_video
+from jaxmpc.robots.film.video import render, save_video
 q = np.linspace(0, 1.2, 9)
 states = np.zeros((3, 9, 2))
 states[0, :, 0], states[1, :, 0] = q, -q

@@ -13,7 +13,7 @@ import jaxmpc as jm
 from jaxmpc.app import cli, report
 from jaxmpc.app.config import files, load
 from jaxmpc.checks import installing, printable, require_package
-from jaxmpc.runs import text_within
+from jaxmpc.files import text_within
 
 STEERING = ("\x1b[2J", "\x07", "a\nb", "a\rb", "\x9b31m", "\u202etxt", "\u2028", "\x7f")
 

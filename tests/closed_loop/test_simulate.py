@@ -11,7 +11,7 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.closed_loop.run import Run, lyapunov_decrease
-from jaxmpc.closed_loop.simulate import simulate
+from jaxmpc.closed_loop.simulation import simulate
 from jaxmpc.mpc.problem import Soft
 
 # Compiles quickly.

@@ -10,12 +10,12 @@ import scipy.sparse as sparse
 from scipy.optimize import linprog
 
 import jaxmpc as jm
-from jaxmpc.explicit.exact_penalty import exact_penalty
 from jaxmpc.explicit.least_distance import least_distance_form
+from jaxmpc.explicit.penalties import exact_penalty
 from jaxmpc.explicit.regions import critical_regions
 from jaxmpc.mpc.inequalities import condensed_in_float64
 from jaxmpc.mpc.problem import Soft
-from jaxmpc.mpc.soften import soften
+from jaxmpc.mpc.softening import soften
 from jaxmpc.qp.status import Status
 
 

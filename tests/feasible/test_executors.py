@@ -12,11 +12,11 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.control.sets import Ellipsoid
 from jaxmpc.feasible import executors
-from jaxmpc.feasible.cascade import Scope, label_chunks, label_parts
 from jaxmpc.feasible.labels import PROOFS
+from jaxmpc.feasible.pipeline import Scope, label_chunks, label_parts
 from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.sets.convex import Ellipsoid
 
 POINTS = jm.grid([-1.2, -1.2], [1.2, 1.2], (20, 20))
 
@@ -129,25 +129,25 @@ CASES = {
 def test_labels_of_a_part_do_not_depend_on_the_others(case, monkeypatch):
     """Linear programs, whose tangents to a ball are kept, and whose number is bounded, included:
     no stage before them decides a point here."""
-    from jaxmpc.feasible import cascade
+    from jaxmpc.feasible import pipeline
     from jaxmpc.feasible.candidates import compiled_check
 
     make, ends, settings = CASES[case]
-    run = cascade._run
+    run = pipeline._run
 
     def undecided(program, *arguments):
         found = run(program, *arguments)
         if program is compiled_check(None) or case == "joint":
             return found
         verdict, *w = found if isinstance(found, tuple) else (found,)
-        verdict = cascade.replace(verdict, label=0 * verdict.label)
+        verdict = pipeline.replace(verdict, label=0 * verdict.label)
         return (verdict, *w) if w else verdict
 
-    monkeypatch.setattr(cascade, "_run", undecided)
-    monkeypatch.setattr(cascade, "MOST_PROGRAMS", 8)
+    monkeypatch.setattr(pipeline, "_run", undecided)
+    monkeypatch.setattr(pipeline, "MOST_PROGRAMS", 8)
     problem = FeasibilityProblem.of(make())
     lines = [np.linspace(-end, end, 10) for end in ends]
-    points = cascade.np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 2)
+    points = pipeline.np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 2)
     scope = Scope.of_grid(lines, 4)
     whole = dict(label_chunks_of(problem, points, scope, settings))
     assert len(whole) == 4

@@ -15,7 +15,7 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.feasible import cascade
+from jaxmpc.feasible import pipeline
 from jaxmpc.feasible.candidates import compiled_check
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.row_programs import RowPrograms
@@ -151,7 +151,7 @@ class TestLastPrograms:
         mpc = problems.lecture()
         points = 1e-3 + jm.grid([-1.2, -1.2], [1.2, 1.2], (7, 7))
         inside = exact.feasible_polygon(mpc).contains(points)
-        run = cascade._run
+        run = pipeline._run
 
         def without_verdict(program, *args):
             found = run(program, *args)
@@ -161,10 +161,10 @@ class TestLastPrograms:
             verdict = replace(verdict, label=0 * verdict.label)
             return (verdict, *w) if w else verdict
 
-        monkeypatch.setattr(cascade, "_run", without_verdict)
+        monkeypatch.setattr(pipeline, "_run", without_verdict)
         fmap = jm.map_feasible_set(mpc, points)
         np.testing.assert_array_equal(fmap.label, np.where(inside, 1, -1))
-        monkeypatch.setattr(cascade, "MOST_PROGRAMS", 10)
+        monkeypatch.setattr(pipeline, "MOST_PROGRAMS", 10)
         some = jm.map_feasible_set(mpc, points)
         np.testing.assert_array_equal(some.label[:10], fmap.label[:10])
         assert (some.label[10:] == 0).all()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.compiled import clear_programs
+from jaxmpc.batches import clear_programs
 
 
 @pytest.mark.slow

@@ -10,9 +10,9 @@ import xarray as xr
 import zarr
 from test_store import AXES, CONFIG, FIELDS, array_files, rows
 
+from jaxmpc import store
 from jaxmpc.app.commands.options import chosen_shard
-from jaxmpc.feasible import store
-from jaxmpc.feasible.store import Store
+from jaxmpc.store import Store
 
 
 def open_shard(path, shard=None, config=CONFIG):

@@ -15,8 +15,8 @@ import xarray as xr
 import zarr
 from damage import turned_bits
 
-from jaxmpc.feasible import store
-from jaxmpc.feasible.store import Constant, Store
+from jaxmpc import store
+from jaxmpc.store import Constant, Store
 
 AXES = {
     "q": Constant(np.linspace(-1, 1, 5), ("q",), {"units": "rad", "long_name": "q"}),
@@ -250,7 +250,7 @@ class TestDamage:
 WRITER = """
     import sys
     import numpy as np
-    from jaxmpc.feasible.store import Constant, Field, Store
+    from jaxmpc.store import Constant, Field, Store
     count, chunk = 16_000, 1000
     points = np.arange(2.0 * count).reshape(count, 2)
     fields = {"label": Field((), "int8", 0, ()), "plan": Field((3,), "float64", np.nan, ("time",))}

@@ -7,13 +7,13 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.control.sets import hull_volume
 from jaxmpc.feasible import stored_map
-from jaxmpc.feasible.cascade import Scope, label_parts
 from jaxmpc.feasible.map import FeasibleSetMap, mesh
+from jaxmpc.feasible.pipeline import Scope, label_parts
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.store import label_rows, open_labels
 from jaxmpc.feasible.stored_map import HalfSpaces, StoredMap, extreme, line_ends
+from jaxmpc.sets.convex import hull_volume
+from jaxmpc.store import label_rows, open_labels
 
 
 def test_points_of_a_part_of_a_grid():
@@ -79,9 +79,9 @@ def test_says_what_a_map_of_all_points_says(tmp_path, monkeypatch, name, many):
 
 def test_undecided_states_that_rays_exclude_count_as_infeasible(tmp_path, monkeypatch):
     """As in `FeasibleSetMap.refine`, here block by block."""
-    from jaxmpc.feasible import cascade
+    from jaxmpc.feasible import pipeline
 
-    monkeypatch.setattr(cascade, "MOST_PROGRAMS", 0)
+    monkeypatch.setattr(pipeline, "MOST_PROGRAMS", 0)
     problem = FeasibilityProblem.of(problems.lecture())
     lines = [np.linspace(-1.2, 1.2, 20), np.linspace(-1.2, 1.2, 21)]
     with labelled(tmp_path / "a.zarr", problem, lines, 100) as kept:

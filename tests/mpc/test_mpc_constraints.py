@@ -15,15 +15,15 @@ import scipy
 from jax import enable_x64
 
 import jaxmpc as jm
-from jaxmpc.control.equilibrium import equilibrium
-from jaxmpc.control.sets import Ellipsoid
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.exact_data import exact_data, hard_blocks
 from jaxmpc.feasible.view import make_view
-from jaxmpc.mpc.active_constraints import active_constraints
+from jaxmpc.mpc.active_limits import active_constraints
 from jaxmpc.mpc.problem import Outputs, Soft
 from jaxmpc.mpc.rows import row_table
-from jaxmpc.mpc.soften import soften
+from jaxmpc.mpc.softening import soften
+from jaxmpc.mpc.targets import equilibrium
+from jaxmpc.sets.convex import Ellipsoid
 
 ONE, EYE = np.ones(2), np.eye(2)
 FINE = jm.ADMM(iterations=300, refine=30, eps=1e-8)

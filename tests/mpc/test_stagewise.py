@@ -12,9 +12,9 @@ from jax import enable_x64
 from problems import rows_of, symmetric
 
 import jaxmpc as jm
-from jaxmpc.mpc import interior_point, stagewise
 from jaxmpc.mpc.plan import WarmStart
-from jaxmpc.mpc.stagewise import factor_stages, plan_stages, solve_stagewise
+from jaxmpc.mpc.stagewise import interior_point, newton
+from jaxmpc.mpc.stagewise.newton import factor_stages, plan_stages, solve_stagewise
 from jaxmpc.qp import admm
 from jaxmpc.qp.residuals import residuals
 
@@ -126,13 +126,13 @@ def test_iterates_are_those_of_the_dense_solver(kind):
     q, bounds, _ = admm.scaled(dense, qp, 1.0)
     schedule = admm.splittings(dense, q)
     t, _ = admm.iterate(schedule, bounds, jnp.zeros(count), 50, settings.alpha)
-    sample = stagewise.Sample(jnp.asarray(X0), jnp.zeros((N + 1, n)), jnp.zeros((N, m)))
+    sample = newton.Sample(jnp.asarray(X0), jnp.zeros((N + 1, n)), jnp.zeros((N, m)))
     bounds = factor.stages.bounds.scaled(factor.E)
-    still = stagewise.predict(factor.stages, sample.x0, jnp.zeros((N, m)))
+    still = newton.predict(factor.stages, sample.x0, jnp.zeros((N, m)))
     first = E * factor.stages.rows(still, jnp.zeros((N, m)))
-    schedule, free = stagewise.splittings(factor, sample)
+    schedule, free = newton.splittings(factor, sample)
     t_stages, _ = admm.iterate(schedule, bounds, first, 50, settings.alpha)
-    u, _ = stagewise.read(factor, bounds, t_stages, free[-1])
+    u, _ = newton.read(factor, bounds, t_stages, free[-1])
     expected = np.asarray(t)[moved] / E_dense[moved] + shift[moved]
     np.testing.assert_allclose(np.asarray(t_stages)[moved] / E[moved], expected, atol=1e-9)
     w, y = admm.read(dense, t, q, admm.scaled(dense, qp, 1.0)[1])

@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bench.families import joint
 
 import jaxmpc as jm
-from jaxmpc.bench.families import joint
 from jaxmpc.qp import active_set, dual_kernel, newton, refine, solve, triton
 from jaxmpc.qp.active_set import DualPoint, DualSearch, dual_search
 from jaxmpc.qp.admm import ADMM, factor, iterate, scaled, splittings
 from jaxmpc.qp.admm_kernel import iterate_batch, pieces
 from jaxmpc.qp.admm_kernel import suits as suits_kernel
-from jaxmpc.qp.batches import true_places
+from jaxmpc.qp.loops import true_places
 
 STEPS = 12
 

@@ -20,7 +20,7 @@ from jaxmpc.mpc.problem import Soft
 from jaxmpc.recursion import analysis, ascent, recursive_feasibility, smallest_horizon
 from jaxmpc.recursion.budget import Budget
 from jaxmpc.recursion.claims import _by_theorem, settle_claims
-from jaxmpc.recursion.loops import closed_loops
+from jaxmpc.recursion.law_loops import closed_loops
 
 
 def settled(mpc):

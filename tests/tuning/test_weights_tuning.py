@@ -304,7 +304,7 @@ def test_loss_in_closed_form(x64):
     ],
 )
 def test_bad_arguments_before_any_compile(more, message, monkeypatch):
-    monkeypatch.setattr("jaxmpc.compiled.Compiled.program", None)
+    monkeypatch.setattr("jaxmpc.batches.Compiled.program", None)
     with pytest.raises(ValueError, match=message):
         tune(**more)
 

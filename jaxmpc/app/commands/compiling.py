@@ -13,9 +13,9 @@ import jax
 
 from jaxmpc.app.commands.options import model_hash
 from jaxmpc.app.programs import times_file
-from jaxmpc.compiled import Compiled
+from jaxmpc.batches import Compiled
+from jaxmpc.files import fingerprint, text_within, versions, write_json
 from jaxmpc.robots.robot import Robot
-from jaxmpc.runs import fingerprint, text_within, versions, write_json
 
 # Seconds of the first compile on free cores: with no degree of freedom, and for each of them.
 GUESSES = {

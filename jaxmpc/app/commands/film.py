@@ -9,8 +9,8 @@ import jax
 import numpy as np
 
 from jaxmpc.closed_loop.run import Run
+from jaxmpc.robots.film.video import render, save_video
 from jaxmpc.robots.robot import Robot
-from jaxmpc.robots.video import render, save_video
 
 # Seconds between frames.
 FRAME = 0.04

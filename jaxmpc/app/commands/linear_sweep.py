@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from tqdm.std import tqdm
 
+from jaxmpc import store
 from jaxmpc.app.commands.options import (
     Timing,
     check_results,
@@ -22,17 +23,16 @@ from jaxmpc.app.commands.options import (
 )
 from jaxmpc.app.config import Config, SweepPoints, sweep_points
 from jaxmpc.app.programs import user_cache
+from jaxmpc.batches import CHUNK
 from jaxmpc.checks import fail
-from jaxmpc.compiled import CHUNK
-from jaxmpc.feasible import store
 from jaxmpc.feasible.candidates import StagePenalties
-from jaxmpc.feasible.cascade import Scope, label_parts
 from jaxmpc.feasible.executors import label_elsewhere
 from jaxmpc.feasible.map import mesh
+from jaxmpc.feasible.pipeline import Scope, label_parts
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.stored_map import StoredMap
+from jaxmpc.files import versions, write_results
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.runs import versions, write_results
 from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
 
 # States from which penalties are learned, at most.

@@ -14,8 +14,8 @@ import tyro
 from jaxmpc.checks import MOST_COUNT, fail
 
 if TYPE_CHECKING:
-    from jaxmpc.feasible.store import Store
     from jaxmpc.robots.robot import Robot
+    from jaxmpc.store import Store
 
 
 def option(metavar: str | None, default: str, text: str | None = None) -> Any:

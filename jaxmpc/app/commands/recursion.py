@@ -26,14 +26,14 @@ from jaxmpc.app.commands.robot_map import RobotMapCommand
 from jaxmpc.app.config.states import recursion_states
 from jaxmpc.checks import fail
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.store import label_rows
+from jaxmpc.files import sha256, versions, write_arrays, write_results
 from jaxmpc.recursion import (
     RecursionReport,
     SmallestHorizon,
     recursive_feasibility,
     smallest_horizon,
 )
-from jaxmpc.runs import sha256, versions, write_arrays, write_results
+from jaxmpc.store import label_rows
 
 FILES = ("summary.json", "recursion.npz", "recursion.png")
 

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from tqdm.std import tqdm
 
+from jaxmpc import store
 from jaxmpc.app.commands.compiling import Compiling
 from jaxmpc.app.commands.options import (
     check_positive,
@@ -21,24 +22,23 @@ from jaxmpc.app.commands.options import (
     report_damage,
 )
 from jaxmpc.app.config.states import axis_indices, grid_ends
+from jaxmpc.batches import first_rows
 from jaxmpc.checks import fail
-from jaxmpc.closed_loop.robot_mpc import robot_mpc
-from jaxmpc.compiled import first_rows
-from jaxmpc.control.named_terminal import named_terminal_set
-from jaxmpc.control.riccati import lqr
-from jaxmpc.control.sets import translated
-from jaxmpc.feasible import store
+from jaxmpc.closed_loop.robot_problem import robot_mpc
 from jaxmpc.feasible.map import grid
 from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.files import versions, write_arrays, write_results
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
-from jaxmpc.robot_maps.loops import RobotLoops
+from jaxmpc.robot_maps.outcomes import RobotLoops
 from jaxmpc.robot_maps.robot_map import RobotMap
 from jaxmpc.robot_maps.set_point import deviations
 from jaxmpc.robot_maps.setting import RobotSetting
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import Robot
-from jaxmpc.runs import versions, write_arrays, write_results
+from jaxmpc.sets.convex import translated
+from jaxmpc.sets.named_terminal import named_terminal_set
+from jaxmpc.systems.riccati import lqr
 
 # Points along each of two axes; total number of points for another number of axes.
 SIDE, POINTS = 32, 1024

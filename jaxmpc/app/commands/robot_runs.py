@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from tqdm.std import tqdm
 
+from jaxmpc import store
 from jaxmpc.app.commands.compiling import Compiling
 from jaxmpc.app.commands.film import choose_renderer
 from jaxmpc.app.commands.options import (
@@ -23,21 +24,20 @@ from jaxmpc.app.commands.options import (
 )
 from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
 from jaxmpc.app.config import load_robot_config
+from jaxmpc.batches import Compiled, first_rows, padded
 from jaxmpc.checks import fail, require_disk, require_memory, require_package
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
+from jaxmpc.closed_loop.many import simulate_many
 from jaxmpc.closed_loop.robot_controller import RobotController
-from jaxmpc.closed_loop.robot_mpc import robot_mpc
+from jaxmpc.closed_loop.robot_problem import robot_mpc
 from jaxmpc.closed_loop.run import Run
-from jaxmpc.closed_loop.simulate_many import simulate_many
-from jaxmpc.compiled import Compiled, first_rows, padded
-from jaxmpc.control.riccati import lqr
-from jaxmpc.feasible import store
 from jaxmpc.mpc.condense import condensed_bytes
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import Robot
+from jaxmpc.systems.riccati import lqr
 
 if TYPE_CHECKING:
     from jaxmpc.app.commands.simulate import Simulate

@@ -10,9 +10,9 @@ from jaxmpc.app.commands.options import Timing
 from jaxmpc.app.commands.robot_runs import RobotRuns
 from jaxmpc.closed_loop.outcome import Outcome
 from jaxmpc.closed_loop.run import Run
-from jaxmpc.control.violation import TOLERANCE
+from jaxmpc.files import versions
 from jaxmpc.qp.status import Status
-from jaxmpc.runs import versions
+from jaxmpc.sets.violations import TOLERANCE
 
 
 def summarise(runs: RobotRuns, run: Run, outcome: Outcome, timing: Timing) -> dict[str, Any]:

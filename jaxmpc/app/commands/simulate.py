@@ -18,10 +18,10 @@ from jaxmpc.app.commands.options import (
 from jaxmpc.app.commands.robot_runs import RobotRuns
 from jaxmpc.app.commands.runs_summary import summarise, summary_rows
 from jaxmpc.app.config import load_robot_config
+from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.outcome import evaluate_runs
-from jaxmpc.devices import chosen_devices
-from jaxmpc.runs import write_json
+from jaxmpc.files import write_json
 
 # Defaults of options that --config can give too.
 USUAL = {"horizon": 20, "margin": 0.02, "linearize": "state", "penalty": 1e4}

@@ -22,8 +22,8 @@ from jaxmpc.app.commands.options import (
     refuse,
 )
 from jaxmpc.app.commands.robot_map import RobotMapCommand
+from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, require_disk
-from jaxmpc.devices import chosen_devices
 
 # By how much the files of a sweep are smaller than its arrays, at most: the joint's 13 times.
 COMPRESSION = 20

@@ -35,8 +35,8 @@ from jaxmpc.app.commands.tuning import (
 from jaxmpc.app.commands.tuning_report import save_results
 from jaxmpc.app.commands.tuning_task import TuningTask, linear_task, robot_task
 from jaxmpc.app.report import report_error
+from jaxmpc.batches import Compiled
 from jaxmpc.checks import fail
-from jaxmpc.compiled import Compiled
 from jaxmpc.tuning.result import Interrupted, TuningRun
 from jaxmpc.tuning.weights import tune_weights
 

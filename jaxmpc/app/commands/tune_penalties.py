@@ -36,11 +36,11 @@ from jaxmpc.app.plots.style import save
 from jaxmpc.app.plots.tuning import plot_penalties
 from jaxmpc.app.report import report_error
 from jaxmpc.checks import fail, require_memory
+from jaxmpc.files import versions, write_json
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import solve
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
-from jaxmpc.runs import versions, write_json
 from jaxmpc.tuning.penalties import tune_penalties
 from jaxmpc.tuning.result import Interrupted, TuningRun
 

@@ -14,12 +14,12 @@ import optax
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import check_results, given_options, open_folder
 from jaxmpc.checks import fail
-from jaxmpc.control.lp import Program
-from jaxmpc.control.sets import Polytope
 from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.files import differences, text_within, write_json
 from jaxmpc.mpc.inequalities import Inequalities
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.runs import differences, text_within, write_json
+from jaxmpc.sets.convex import Polytope
+from jaxmpc.sets.lp import Program
 
 CHECKPOINT = "checkpoint.npz"
 # Where the files of a run that is overwritten wait.

@@ -12,7 +12,7 @@ from jaxmpc.app.commands.tuning_task import TuningTask
 from jaxmpc.app.plots.style import save
 from jaxmpc.app.plots.tuning import plot_before_after, plot_maps, plot_tuning
 from jaxmpc.feasible.map import grid, map_feasible_set
-from jaxmpc.runs import versions, write_json
+from jaxmpc.files import versions, write_json
 from jaxmpc.tuning.result import TuningRun
 
 # Entries of a weight that the table shows.

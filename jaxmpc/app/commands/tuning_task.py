@@ -14,22 +14,22 @@ from jaxmpc.app.commands.options import given_options, model_hash
 from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
 from jaxmpc.app.commands.tuning import feasible_states, problem_file, start_range
 from jaxmpc.checks import MOST_COUNT, fail, require_memory
+from jaxmpc.closed_loop.many import simulate_many
 from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.closed_loop.robot_controller import RobotController
-from jaxmpc.closed_loop.robot_mpc import robot_mpc
+from jaxmpc.closed_loop.robot_problem import robot_mpc
 from jaxmpc.closed_loop.run import Run
-from jaxmpc.closed_loop.simulate_many import simulate_many
-from jaxmpc.control import violation
-from jaxmpc.control.riccati import lqr
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope
 from jaxmpc.mpc.condense import prestabilising_gain
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.soften import soften
+from jaxmpc.mpc.softening import soften
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.load import load_robot
+from jaxmpc.sets import violations
+from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
+from jaxmpc.systems.riccati import lqr
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
 
@@ -86,11 +86,11 @@ class TuningTask(NamedTuple):
         kept = outcome.kept
         if isinstance(self.limits, Polytope):
             limits = jax.tree.map(lambda v: np.asarray(v, float), self.limits)
-            kept = kept & violation.kept(limits, outcome.coordinates).all(axis=(1, 2))
+            kept = kept & violations.kept(limits, outcome.coordinates).all(axis=(1, 2))
         status = np.asarray(run.status)
         return {
             "loops": len(kept), "plans": int(status.size), "violated": float(np.mean(~kept)),
-            "kept_to": violation.TOLERANCE["float64"],
+            "kept_to": violations.TOLERANCE["float64"],
             "unsolved": float(np.mean(status != Status.SOLVED)),
             "infeasible": float(np.mean(status == Status.PRIMAL_INFEASIBLE)),
             "fallback": float(np.mean((status == Status.SOLVED) & np.asarray(run.fallback))),

@@ -15,7 +15,7 @@ from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import Switch, check_counts, option, print_table
 from jaxmpc.checks import shown
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.verification import Verification, find_store, verify
+from jaxmpc.verify.stored_maps import Verification, find_store, verify_map
 
 # Failures that are printed.
 SHOWN = 10
@@ -33,7 +33,7 @@ class Verify:
       proved where data cannot be read. Else proves each label:
         feasible    the stored plan is rolled out from the state and keeps every limit
         infeasible  a half-space that no feasible state leaves, made anew, excludes the state
-      by a roll-out and by weak duality of their own (jaxmpc/feasible/exact_check.py, to be read by
+      by a roll-out and by weak duality of their own (jaxmpc/verify/exact.py, to be read by
       a sceptic). Half-spaces are evaluated in exact arithmetic, plans in float64 with a bound on
       its rounding, and exactly where that leaves a doubt and on a sample. Of a recursion report
       the counterexample is proved too, and each state that counts as lost after one step.
@@ -67,7 +67,7 @@ class Verify:
         there is no map."""
         check_counts(self, sample=0, seed=0)
         path, begun = find_store(self.directory), time.perf_counter()
-        found = verify(
+        found = verify_map(
             path, exact=self.exact, sample=self.sample, seed=self.seed, progress=True,
             check=contradictions,
         )  # fmt: skip

@@ -7,8 +7,8 @@ import numpy as np
 
 from jaxmpc.app.config.problem import COMMANDS, Config
 from jaxmpc.app.config.states import grid_shape, mapped_axes, recursion_shape, section_ends
+from jaxmpc.batches import CHUNK
 from jaxmpc.checks import fail, require_memory, require_printable
-from jaxmpc.compiled import CHUNK
 from jaxmpc.mpc.condense import condensed_bytes
 
 

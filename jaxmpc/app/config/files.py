@@ -10,7 +10,7 @@ from typing import Any
 import tomli_w
 
 from jaxmpc.checks import fail
-from jaxmpc.runs import text_within
+from jaxmpc.files import text_within
 
 # A problem of a hundred states takes a tenth of that; what tomllib makes of a byte, up to 10 kB.
 MOST_BYTES = 10**6

@@ -22,14 +22,14 @@ from jaxmpc.app.config.sections import (
     SystemSection,
     to_matrix,
 )
-from jaxmpc.control.named_terminal import named_terminal_set
-from jaxmpc.control.riccati import lqr
-from jaxmpc.control.sets import Box, Ellipsoid, Polytope
-from jaxmpc.control.system import LinearSystem
-from jaxmpc.explicit.exact_penalty import exact_penalty
+from jaxmpc.explicit.penalties import exact_penalty
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.soften import soften
+from jaxmpc.mpc.softening import soften
 from jaxmpc.qp.admm import ADMM
+from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
+from jaxmpc.sets.named_terminal import named_terminal_set
+from jaxmpc.systems.riccati import lqr
+from jaxmpc.systems.system import LinearSystem
 
 # Commands that have a section of their own.
 COMMANDS = ("sweep", "recursion")

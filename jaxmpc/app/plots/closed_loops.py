@@ -12,9 +12,9 @@ from jaxmpc.app.plots.style import EDGE, INFEASIBLE, NOT_SOLVED, OUTER, TERMINAL
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.outcome import with_limits
 from jaxmpc.closed_loop.run import Run
-from jaxmpc.control import violation
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.robot import Robot
+from jaxmpc.sets import violations
 
 RUN, BROKEN = "#0072b2", "#a50f15"
 # Plans that stand out, by `plan_outcomes`: colour and words.
@@ -44,7 +44,7 @@ def plot_runs(
     if not len(shown) or np.any((shown < 0) | (shown >= count)):
         fail("robots", f"{robots}", f"Give indices from 0 to {count - 1}")
     pairs = with_limits(plant, run)
-    xi, kept = pairs[0][1], [violation.kept(*pair) for pair in pairs]
+    xi, kept = pairs[0][1], [violations.kept(*pair) for pair in pairs]
     time = plant.dt * np.arange(samples + 1)
     figure, panels = panel_grid(plant, time, 2.6, (1.15, 2.0, 1.1))
     for ax, kind, i in panels:

@@ -1,0 +1,89 @@
+"""Numbers in arguments of public functions: their type, and arrays made of them."""
+
+from collections.abc import Sequence
+from numbers import Real
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxmpc.checks import concrete, fail, require_real
+
+# A number, an array of JAX or NumPy, or lists of these: not a text.
+# (One Sequence: with two a type checker finds none for rows like [[1, 0.1], [0, 1]].)
+Reals: TypeAlias = ArrayLike | Sequence[ArrayLike | Sequence[ArrayLike]]
+
+
+def host_array(argument: str, value: Any) -> np.ndarray:
+    """Return `value` as a float64 NumPy array; raise ValueError if it cannot be read as real
+    numbers.
+
+    All NumPy code (LPs, qhull, Riccati) calls it, so it computes in float64 in either mode of JAX.
+    """
+    if not concrete(value):
+        fail(
+            argument,
+            "is traced by JAX, and this computation is not traceable",
+            "Call it outside jit, vmap and grad",
+        )
+    require_real(argument, value)
+    return np.asarray(value).astype(np.float64)
+
+
+def dimensions(value: Any) -> int | None:
+    """Return the number of axes of an array, number or nested lists; None for anything else, such
+    as the placeholders by which JAX rebuilds an object."""
+    if hasattr(value, "ndim"):
+        return value.ndim
+    if not isinstance(value, Real | list | tuple):
+        return None
+    try:
+        return np.ndim(as_array(value))
+    except (TypeError, ValueError):
+        return None
+
+
+def store_floats(instance: Any, *names: str) -> None:
+    """Make arrays of floats of the named fields of a frozen dataclass where they are lists, or
+    NumPy arrays of whole numbers: one leaf each, which can be differentiated and stacked.
+
+    All else stays as it is: numbers, JAX's arrays, the placeholders by which JAX rebuilds an
+    object, and what is no array of numbers, which `validate` refuses."""
+    for name in names:
+        value = getattr(instance, name)
+        if isinstance(value, list | tuple) and dimensions(value) is not None:
+            value = as_array(value)
+            value = value if isinstance(value, jax.Array) else np.asarray(value)
+        if isinstance(value, np.ndarray) and value.dtype.kind in "iu":
+            value = value.astype(float)
+        if isinstance(value, jax.Array) or (
+            isinstance(value, np.ndarray) and value.dtype.kind == "f"
+        ):
+            object.__setattr__(instance, name, value)
+
+
+def as_weight(value: Any, size: int) -> Any:
+    """Return a weight as a matrix where it has one meaning: a number for size 1, and a vector
+    (size,), which is a diagonal; anything else unchanged."""
+    shape = np.shape(as_array(value)) if dimensions(value) in (0, 1) else None
+    if (shape == () and size == 1) or shape == (size,):
+        value = as_array(value)
+        value = value if isinstance(value, jax.Array) else np.asarray(value)
+        if value.dtype.kind in "iufV":
+            value = value.astype(float) if value.dtype.kind in "iu" else value
+            value = value.reshape(size)
+            return jnp.diag(value) if isinstance(value, jax.Array) else np.diag(value)
+    return value
+
+
+def as_column(value: Any) -> Any:
+    """Return a vector (n,) as a matrix (n, 1)."""
+    value = as_array(value)
+    return (value if isinstance(value, jax.Array) else np.asarray(value))[:, None]
+
+
+def as_array(value: Any) -> Any:
+    """Return `value`, made an array if it is nested lists of traced numbers (lists under `jit`)."""
+    return value if concrete(value) else jnp.asarray(value)

@@ -1,0 +1,237 @@
+"""Batches: compile once a shape, timed apart; pad to few shapes; divide among devices.
+
+The batch axis is divided among the devices of a one-dimensional mesh, all other data are whole on
+each of them. The programs hold no collectives: a device leaves its data-dependent loops when its
+own part is done, and waits for no other. What the parts have in common, such as the mean of a loss,
+is computed on the host (`tuning/batch_mean.py`).
+
+Under `jax.distributed` a process can read no array that lies on devices of another. So each process
+calls with states of its own and with devices of its own, and has the results of these; no call
+waits for another process.
+"""
+
+import os
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from jaxmpc.checks import fail, shown, whole
+from jaxmpc.qp.modes import own_modes
+
+# Points a compiled program takes at once on a CPU: a step's data stay within the cache.
+CHUNK = 8192
+
+
+def default_chunk() -> int:
+    """Points a compiled program takes at once on the present device."""
+    return CHUNK if jax.default_backend() == "cpu" else 32 * CHUNK
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    # Linux knows which.
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def workers() -> int:
+    """Return how many chunks to run side by side: one a core of a CPU, whose programs use little
+    more than one, for most of their steps are too small to be divided; one on other devices."""
+    return cores() if jax.default_backend() == "cpu" else 1
+
+
+def side_by_side(
+    call: Callable[[Any], Any], items: Iterable[Any], count: int | None = None
+) -> list[Any]:
+    """Return [call(item) for item in items], `count` at once, by default as many as `workers`.
+
+    `call` runs in threads of its own, which see none of the caller's JAX contexts.
+    """
+    items, count = list(items), workers() if count is None else count
+    if min(count, len(items)) < 2:
+        return [call(item) for item in items]
+    with ThreadPoolExecutor(count) as pool:
+        return list(pool.map(call, items))
+
+
+def gather_size(chunk: int) -> int:
+    """Size of the batches in which undecided points of a chunk go on: one, so that few compile."""
+    return max(chunk // 16, 64)
+
+
+class Compiled:
+    """A jitted function, compiled ahead once for each shape. `Compiled.seconds`: spent on that
+    in this process so far. `Compiled.listeners`: called after each program.
+    """
+
+    seconds = 0.0
+    listeners: ClassVar[list[Callable[[], None]]] = []
+    everyone: ClassVar["weakref.WeakSet[Compiled]"] = weakref.WeakSet()
+
+    def __init__(self, function: Any, places: Any = None) -> None:
+        self.function = function
+        self.places = places
+        self.programs: dict[Any, Any] = {}
+        self._compiles = threading.Lock()
+        self.everyone.add(self)
+
+    def __call__(self, *args: Any) -> Any:
+        return jax.device_get(self.run(*args))
+
+    def run(self, *args: Any) -> Any:
+        """The result, left on the device."""
+        args = self.placed(args)
+        return self.program(*args)(*args)
+
+    def placed(self, args: tuple) -> tuple:
+        """The arguments where `places`, one sharding of each, says; None leaves it to JAX, which
+        refuses to divide host arrays among devices under `jax.distributed`."""
+        return args if self.places is None else jax.device_put(args, self.places)
+
+    def program(self, *args: Any) -> Any:
+        """The program for arguments of these shapes."""
+        args = self.placed(args)
+        leaves, tree = jax.tree.flatten(args)
+        key = tree, tuple(jax.typeof(leaf) for leaf in leaves)
+        with self._compiles:  # threads that need the same program wait for one of them
+            if key not in self.programs:
+                start = time.perf_counter()
+                self.programs[key] = self.function.lower(*args).compile()
+                Compiled.seconds += time.perf_counter() - start
+                for listener in Compiled.listeners:
+                    listener()
+        return self.programs[key]
+
+
+def clear_programs() -> None:
+    """Free all programs of this process, those of JAX's own caches too. What is called again
+    compiles again."""
+    for each in list(Compiled.everyone):
+        with each._compiles:
+            each.programs.clear()
+    jax.clear_caches()
+
+
+def padded(x: np.ndarray, size: int) -> np.ndarray:
+    """The first row repeated up to `size` rows."""
+    return np.concatenate([x, np.broadcast_to(x[:1], (size - len(x), *x.shape[1:]))])
+
+
+def first_rows(tree: Any, count: int) -> Any:
+    """The leaves without what `padded` added."""
+    return jax.tree.map(lambda v: v[:count], tree)
+
+
+def joined(parts: Sequence[Any]) -> Any:
+    """The host arrays of pytrees one after the other, copied by as many threads as there are cores:
+    a single one is slower than a fast device."""
+    ends = np.cumsum([len(jax.tree.leaves(part)[0]) for part in parts])
+    whole = jax.tree.map(lambda v: np.empty((ends[-1], *v.shape[1:]), v.dtype), parts[0])
+
+    def put(end: int, part: Any) -> None:
+        for out, v in zip(jax.tree.leaves(whole), jax.tree.leaves(part), strict=True):
+            out[end - len(v) : end] = v
+
+    side_by_side(lambda pair: put(*pair), zip(ends, parts, strict=True), cores())
+    return whole
+
+
+def require_step_type(dtype: Any) -> None:
+    """Raise unless iterates of this type are offered."""
+    try:
+        known = np.dtype(dtype) in (np.float32, np.float64)
+    except TypeError:
+        known = False
+    if not known:
+        fail("dtype", f"{dtype!r}", "Iterate in 'float32' or 'float64'")
+
+
+# Devices to work on, None for JAX's default device alone.
+Devices = tuple[jax.Device, ...] | None
+
+
+def chosen_devices(devices: Any, name: str = "devices") -> Devices:
+    """Return the devices that an argument `devices`, or another name, stands for.
+
+    devices: None, the default device; a number, so many of `jax.local_devices()`; or a sequence of
+    them. Raises ValueError for no device, for the same one twice, and for those of another process
+    or of another platform than JAX's default backend.
+    """
+    if devices is None:
+        return None
+    there = jax.local_devices()
+    if not isinstance(devices, Sequence | np.ndarray) or isinstance(devices, str):
+        count = whole(name, devices, 1)
+        if count > len(there):
+            fail(name, f"{count} where this process has {len(there)}", "Give fewer")
+        return tuple(there[:count])
+    chosen = tuple(devices)
+    if not chosen:
+        fail(name, "an empty sequence", "Give at least one device, or None for the default")
+    for device in chosen:
+        if not isinstance(device, jax.Device):
+            fail(name, f"holds {shown(device)}", "Give a number, or some of jax.devices()")
+        if device.process_index != jax.process_index():
+            fail(name, f"{device} is of another process", "Give some of jax.local_devices()")
+        if device not in there:
+            what = f"{device} is not of JAX's default backend, {there[0].platform}"
+            fail(name, what, f"Set JAX_PLATFORMS={device.platform} for programs made for it")
+    if len(set(chosen)) < len(chosen):
+        fail(name, "the same one twice", "Give each once")
+    return chosen
+
+
+def require_partitioner(devices: Devices) -> None:
+    """Raise ValueError where programs of labels cannot be compiled for these devices: on several
+    GPUs XLA's Shardy partitioner crashes in the roll-out of `proofs.py` (JAX 0.11.2, H100)."""
+    if devices is None or len(devices) < 2 or devices[0].platform != "gpu":
+        return
+    if getattr(jax.config, "jax_use_shardy_partitioner", False):
+        what = "maps on several GPUs crash the partitioner that this process uses"
+        fail("devices", what, "Set JAX_USE_SHARDY_PARTITIONER=false in the environment")
+
+
+def count(devices: Devices) -> int:
+    """Return the number of devices."""
+    return 1 if devices is None else len(devices)
+
+
+def divisible(size: int, devices: Devices) -> int:
+    """Return the least number, not below `size`, that the devices can share equally."""
+    return -(-size // count(devices)) * count(devices)
+
+
+def placement(devices: Devices, batched: bool = False) -> NamedSharding | None:
+    """Return where `jax.device_put` puts a batch, a part on each device, or whole data; None is
+    the default device."""
+    if devices is None:
+        return None
+    spec = PartitionSpec("batch") if batched else PartitionSpec()
+    return NamedSharding(Mesh(np.array(devices), ("batch",)), spec)
+
+
+def over_devices(function: Callable, devices: Devices, batched: Sequence[bool]) -> Compiled:
+    """Return the function of a batch as a compiled program over the devices.
+
+    batched: of each argument, a pytree, whether its leaves have the batch axis in front, as all
+    leaves of the result must. The size of the batch is a multiple of the number of devices. Each
+    device gets an equal part, in order, of arguments on the host directly from there. devices None:
+    the program for the default device.
+    """
+    function = own_modes(function)
+    if devices is None:
+        return Compiled(jax.jit(function))
+    places: Any = tuple(placement(devices, each) for each in batched)
+    out: Any = placement(devices, True)
+    # Each device runs the function as it stands: nothing in it has to be known as replicated.
+    parts = jax.shard_map(
+        function, mesh=out.mesh, in_specs=tuple(place.spec for place in places),
+        out_specs=out.spec, check_vma=False,
+    )  # fmt: skip
+    return Compiled(jax.jit(parts, in_shardings=places, out_shardings=out), places)

@@ -1,0 +1,355 @@
+"""Exact penalties: from which weight on slacks the soft problem keeps limits that can be kept."""
+
+import time
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxmpc.arrays import Reals, host_array
+from jaxmpc.checks import fail, require_kind, whole
+from jaxmpc.explicit.cells import ActivePiece, active_piece, capped_ball
+from jaxmpc.explicit.least_distance import SMALLEST, LeastDistanceForm, least_distance_form
+from jaxmpc.explicit.regions import CriticalRegions
+from jaxmpc.explicit.search import exchange, explore
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.rows import Row, row_table
+from jaxmpc.qp.status import Status
+from jaxmpc.sets.convex import Box, Polytope
+from jaxmpc.sets.lp import Program, maximise
+
+# "auto" enumerates regions up to this dimension of the state.
+ENUMERATED = 4
+# The sampled search: where samples lie on a ray to the boundary of X_N, from how many regions it
+# starts, after how many regions without improvement it ends, and how many rays look for the facets
+# of a region.
+FRACTIONS = (0.5, 0.9, 0.99, 1 - 1e-4, 1 - 1e-7)
+STARTS = 32
+PATIENCE = 20
+RAYS = 64
+# Relative rounding of rho_bar up to which a weight is called equal to it.
+ROUNDING = 1e-9
+# Row kinds that `soften` makes soft.
+SOFTENED = ("state", "output", "terminal")
+
+
+@dataclass(frozen=True, eq=False)
+class ExactPenalty:
+    """The least ρ for which the penalty ρ·Σ slack is exact (see `exact_penalty`).
+
+    rho_bar: sup over X_N of the threshold, or with exact False a lower bound of it, in cost per
+    unit of the rows as given. at (p,): the state where it is approached, row: the soft row that
+    needs it (None where rho_bar is 0), label: that row with bound, step and unit. method:
+    "regions" or "samples". advised: a weight with a margin. thresholds (B,), status (B,): at the
+    given states, NaN and PRIMAL_INFEASIBLE or NON_FINITE where there is none. sufficient:
+    whether the given weight ρ is exact on all of X_N; None where that is not known, or none
+    was given. regions: the critical regions, where they were enumerated. evaluated: number of
+    active sets.
+    """
+
+    rho_bar: float
+    at: np.ndarray
+    row: Row | None
+    label: str
+    method: str
+    exact: bool
+    advised: float
+    thresholds: np.ndarray
+    status: np.ndarray
+    sufficient: bool | None
+    regions: CriticalRegions | None
+    evaluated: int
+
+    def __str__(self) -> str:
+        """Return `sentence`."""
+        return self.sentence
+
+    @property
+    def sentence(self) -> str:
+        """Return the result and its basis as sentences."""
+        value, at = f"{self.rho_bar:.6g}", np.array2string(self.at, precision=6)
+        if self.exact:
+            found = f"rho_bar = {value} over the feasible set, by {self.evaluated} critical regions"
+        else:
+            found = f"rho_bar >= {value}: a lower bound, from {self.evaluated} active sets"
+            if self.regions is not None and not self.regions.complete:
+                found += f" ({self.regions.reason})"
+        where = f", reached at x0 = {at} by {self.label}" if self.row else ""
+        answer = {
+            True: "The weight given is exact.",
+            False: "The weight given is too small: limits are violated that can be kept.",
+            None: "",
+        }[self.sufficient]
+        advice = f"Use rho = {self.advised:.6g}" + (
+            "." if self.exact else ", which is not guaranteed: watch the slacks."
+        )
+        return " ".join(part for part in (f"{found}{where}.", answer, advice) if part)
+
+
+def exact_penalty(
+    mpc: MPC, x0s: Reals | None = None, *, method: str = "auto", rho: float | None = None,
+    limit: int = 2000, within: Box | Polytope | None = None, samples: int = 200, seed: int = 0,
+    seconds: float = np.inf,
+) -> ExactPenalty:  # fmt: skip
+    """Return the exact-penalty threshold of an MPC problem with an L1 penalty on slacks.
+
+    The soft problem min J + ρ·Σε, C z + D x ≤ bound + ε, ε ≥ 0 has the hard problem's plan at a
+    state x of its feasible set X_N if and only if ρ ≥ rho_bar(x) = min over the multipliers λ of
+    x of max_i λ_i, i over the soft rows. That holds for J without ½ and rows as given (a row scaled
+    by s has λ/s); a quadratic slack term does not change it. rho_bar = sup over X_N.
+
+    The soft rows are those of `mpc.soft`, or if there are none all state, output and terminal rows.
+    Rows that no input moves (k = 0) are constants and do not count; inputs and rates stay hard.
+
+    x0s (B, p) or None: states at which to give the threshold as well; p = mpc.dimension.
+    method: "regions": λ is affine on each critical region and its maximum is at a vertex; exact
+    when the regions are complete. "samples": a lower bound, from `samples` rays to the boundary of
+    X_N and a search across facets from the best regions found (on a region λ is maximised by LPs);
+    it can miss the greatest. "auto": regions up to four states, and samples as well where there are
+    more than `limit` regions. Where active rows are dependent the multipliers are not unique, and
+    an LP finds those with the least maximum. rho: a weight to check; None: those of `mpc.soft`, if
+    any. within: the set of initial states, needed where X_N is unbounded. seconds: after which the
+    search stops, and rho_bar is a lower bound.
+
+    Raises ValueError for ill-posed problems, wrong arguments, an ellipsoidal terminal set, no soft
+    row, and where X_N is empty, flat or unbounded. NumPy in float64; not traceable.
+
+    Sources: Fletcher 1987, Practical Methods of Optimization, section 14.3; Kerrigan &
+    Maciejowski 2000, Proc. UKACC Control; Hovd & Stoican 2014, Comput. Chem. Eng. 70.
+    """
+    deadline = time.monotonic() + seconds
+    if method not in ("auto", "regions", "samples"):
+        fail("method", f"{method!r}", 'Give "auto", "regions" or "samples"')
+    samples = whole("samples", samples, 1)
+    if rho is not None and not (np.ndim(rho) == 0 and np.isfinite(rho) and rho >= 0):
+        fail("rho", f"{rho!r}", "Give one finite weight of at least 0, or None")
+    require_kind("mpc", mpc, MPC)
+    mpc.validate()
+    x0s = np.zeros((0, mpc.dimension)) if x0s is None else host_array("x0s", x0s)
+    if x0s.ndim != 2 or x0s.shape[1] != mpc.dimension:
+        fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.dimension})")
+
+    p, table = least_distance_form(mpc, within), row_table(mpc)
+    weigh = Thresholds(p, softened(p, table))
+    found: dict[tuple[int, ...], Worst | None] = {}
+    regions: CriticalRegions | None = None
+    few = len(p.center) <= ENUMERATED
+    if method == "regions" or (method == "auto" and few):
+        search = explore(p, limit, deadline)
+        regions = CriticalRegions.of(mpc, search)
+        for c in search.found:
+            found[c.law.active] = weigh.over(c.law, c.vertices)
+    exact = regions is not None and regions.complete
+    if method == "samples" or (method == "auto" and not exact):
+        climb_regions(p, weigh, found, samples, np.random.default_rng(seed), deadline)
+    worsts = [worst for worst in found.values() if worst is not None]
+    worst = max(worsts, key=lambda w: w.value, default=Worst(0.0, p.interior, -1))
+
+    value = worst.value
+    row = table[p.row[worst.row]] if value > 0 else None
+    thresholds, status = weigh.at(x0s)
+    return ExactPenalty(
+        rho_bar=value,
+        at=p.center + p.size * worst.xi,
+        row=row,
+        label="" if row is None else row_in_words(row, p.side[worst.row]),
+        method="regions" if exact or method == "regions" else "samples",
+        exact=exact,
+        # At rho_bar = 0 every positive weight is exact.
+        advised=(1.1 if exact else 2.0) * value if value > 0 else 1.0,
+        thresholds=thresholds,
+        status=status,
+        sufficient=is_sufficient(p, value, exact, rho),
+        regions=regions,
+        evaluated=len(worsts),
+    )
+
+
+def softened(p: LeastDistanceForm, table: tuple[Row, ...]) -> np.ndarray:
+    """Return which rows (r,) of the program are soft rows that inputs can move."""
+    any_soft = any(row.soft for row in table)
+    soft = np.array([row.soft if any_soft else row.kind in SOFTENED for row in table], bool)
+    tied = p.given.row[p.hull.equal]
+    if len(soft) and np.any((tied >= 0) & soft[tied]):
+        what = "has soft rows that imply an equality, which any weight lets plans violate"
+        fail("mpc", what, "Keep those rows hard, or give them some width")
+    mine = (p.row >= 0) & soft[np.maximum(p.row, 0)] if len(soft) else np.zeros(len(p.row), bool)
+    if not mine.any():
+        fail("mpc", "has no limit on states or outputs to soften", "Give states, or soft rows")
+    return mine & ~p.still
+
+
+def is_sufficient(
+    p: LeastDistanceForm, value: float, exact: bool, rho: float | None
+) -> bool | None:
+    """Return whether the weight rho (None: those of the soft rows) is exact; None where unknown."""
+    weights = p.condensed.soft_linear if rho is None else np.array([rho])
+    if weights is None:
+        return None
+    weights = np.asarray(weights)[np.isfinite(weights)]
+    # Rows may have weights of their own: the least decides for, the greatest against.
+    if exact and weights.min() >= value * (1 - ROUNDING):
+        return True
+    return False if weights.max() < value * (1 - ROUNDING) else None
+
+
+def row_in_words(row: Row, side: float) -> str:
+    """Return the row as text: "upper bound of dq at k = 3 [rad/s]"."""
+    bound = "upper" if side > 0 else "lower"
+    spoken = any(sign in row.name for sign in "<>≤≥")
+    text = row.name if spoken else f"{bound} bound of {row.name}"
+    return f"{text} at k = {row.step}" + (f" [{row.unit}]" if row.unit else "")
+
+
+class Worst(NamedTuple):
+    """The largest threshold of a region, the ξ where it is approached and the program's row."""
+
+    value: float
+    xi: np.ndarray
+    row: int
+
+
+class Thresholds:
+    """Least maximal multipliers of the soft rows of a program."""
+
+    def __init__(self, p: LeastDistanceForm, soft: np.ndarray) -> None:
+        self.p, self.soft = p, soft
+
+    def least(
+        self, rows: np.ndarray, active: tuple[int, ...], multipliers: np.ndarray
+    ) -> tuple[float, int]:
+        """Return min t over λ ≥ 0 on `rows` with the same Σ λ_i M_i as those on `active` and λ_i ≤
+        t over soft rows (NaN: there are none), and a soft row that attains it.
+        """
+        total = self.p.M[list(active)].T @ np.maximum(multipliers, 0.0)
+        mine, size = self.soft[rows], np.abs(total).max(initial=0.0)
+        if not mine.any() or size == 0:
+            return 0.0, -1
+        # In units of that sum, and per row of M; t counts in the rows as given.
+        per_row = 1 / self.p.length[rows]
+        unit = per_row[mine].max()
+        count = len(rows)
+        A, b = self.p.balance(rows, total / size)
+        least = np.column_stack([np.diag(per_row / unit)[mine], -np.ones(mine.sum())])
+        G = np.vstack([np.column_stack([A, np.zeros(len(b))]), least, -np.eye(count + 1)])
+        g = np.append(b, np.zeros(len(G) - len(b)))
+        top = Program(G, g, np.arange(len(G)) < len(b)).maximise(-np.eye(count + 1)[count])
+        if top.x is None:
+            return np.nan, -1
+        each = np.where(mine, top.x[:count] * per_row, 0.0)
+        return float(-top.value * unit * size), int(rows[np.argmax(each)])
+
+    def over(self, found: ActivePiece, points: np.ndarray) -> Worst:
+        """Return the largest threshold at points ξ (k, p) of a region, as limits from its inside.
+
+        Inside a region the multipliers of `active` are the only ones, unless other rows are active
+        all over it; the threshold is convex there, hence greatest at vertices.
+        """
+        rows = np.array((*found.active, *found.also_active), int)
+        affine = np.column_stack([points, np.ones(len(points))])
+        if found.also_active and self.soft[rows].any():
+            each = [self.least(rows, found.active, found.multipliers @ at) for at in affine]
+            if np.isnan([value for value, _ in each]).any():
+                fail("mpc", "no multipliers are found at a vertex", "Scale states and inputs")
+            best = int(np.argmax([value for value, _ in each]))
+            return Worst(each[best][0], points[best], each[best][1])
+        mine = [i for i, row in enumerate(found.active) if self.soft[row]]
+        if not mine or found.also_active:
+            return Worst(0.0, points[0], -1)
+        values = affine @ found.multipliers[mine].T / self.p.length[rows[mine]]
+        best, which = np.unravel_index(values.argmax(), values.shape)
+        return Worst(max(float(values[best, which]), 0.0), points[best], int(rows[mine[which]]))
+
+    def maximal(self, found: ActivePiece) -> Worst | None:
+        """Return the largest threshold of a whole region, each multiplier maximised by an LP; None
+        if it is flat.
+
+        Where rows are dependent the LPs maximise multipliers that need not be the least: what they
+        lead to is a threshold of the region, but perhaps not the greatest.
+        """
+        middle, radius = capped_ball(found.H, found.h)
+        if radius <= SMALLEST:
+            return None
+        points = [middle]
+        for i, row in enumerate(found.active):
+            gain = found.multipliers[i, :-1]
+            if self.soft[row] and gain.any():
+                corner = maximise(gain, found.H, found.h).x
+                points += [] if corner is None else [corner]
+        return self.over(found, np.array(points))
+
+    def at(self, x0s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the thresholds (B,) and statuses (B,) at states x0s (B, p)."""
+        values, status = np.full(len(x0s), np.nan), np.full(len(x0s), Status.NON_FINITE, np.int8)
+        for i in np.flatnonzero(np.all(np.isfinite(x0s), axis=1)):
+            xi = (x0s[i] - self.p.center) / self.p.size
+            found = self.p.solution(xi)
+            if found is not None:
+                values[i], _ = self.least(found.touching, found.active, found.multipliers)
+                status[i] = Status.ITERATION_LIMIT if np.isnan(values[i]) else Status.SOLVED
+            else:
+                empty = self.p.margin(xi) < -1e-9
+                status[i] = Status.PRIMAL_INFEASIBLE if empty else Status.ITERATION_LIMIT
+        return values, status
+
+
+def climb_regions(
+    p: LeastDistanceForm, weigh: Thresholds, found: dict[tuple[int, ...], Worst | None],
+    samples: int, random: np.random.Generator, deadline: float,
+) -> None:  # fmt: skip
+    """Add to `found` the regions that samples, and a search from the best of them, meet.
+
+    The search goes on from the best region not yet left, across its facets, until PATIENCE
+    regions in turn have led to nothing better, or until the deadline of `time.monotonic`.
+    """
+    seen: dict[tuple[int, ...], float] = {}
+    n, half = len(p.center), samples // 2
+    tops = [p.support(d)[1] for d in random.standard_normal((max(half, 1), n))]
+    corners = np.array([xi for xi in tops if xi is not None]).reshape(-1, n)
+    # At random, and towards points between corners of X_N, where regions are smallest.
+    weights = random.dirichlet(np.full(max(len(corners), 1), 1 / max(len(corners), 1)), half)
+    between = weights @ corners - p.interior if len(corners) else np.zeros((0, n))
+    for direction in [*random.standard_normal((samples - half, n)), *between]:
+        if time.monotonic() > deadline:
+            break
+        end = p.leave(direction)
+        for fraction in FRACTIONS if end is not None else ():
+            solution = p.solution(p.interior + fraction * (end - p.interior))
+            if solution is not None:
+                rows = list(solution.active)
+                loads = (solution.multipliers / p.length[rows])[weigh.soft[rows]]
+                active = p.basis(solution) or ()
+                seen[active] = max(seen.get(active, 0.0), loads.max(initial=0.0))
+
+    def visit(active: tuple[int, ...] | None) -> None:
+        if active is not None and active not in found:
+            here = active_piece(p, active)
+            found[active] = None if here is None else weigh.maximal(here)
+
+    visit(p.active(p.interior))
+    for active in sorted(seen, key=lambda a: -seen[a])[:STARTS]:
+        visit(active)
+    left: set[tuple[int, ...]] = set()
+    best, stale = -1.0, 0
+    while stale < PATIENCE:
+        waiting = {a: w for a, w in found.items() if w is not None and a not in left}
+        if not waiting or time.monotonic() > deadline:
+            return
+        here, worst = max(waiting.items(), key=lambda item: item[1].value)
+        stale = 0 if worst.value > best * (1 + ROUNDING) else stale + 1
+        best = max(best, worst.value)
+        left.add(here)
+        leaving = active_piece(p, here)
+        assert leaving is not None
+        # Random rays inside the region hit its facets: from its middle, and from near the corner
+        # where the multiplier is largest.
+        middle, _ = capped_ball(leaving.H, leaving.h)
+        facets: set[int] = set()
+        for start in (middle, middle + 0.95 * (worst.xi - middle)):
+            slope = leaving.H @ random.standard_normal((len(start), RAYS))
+            gap = (leaving.h - leaving.H @ start)[:, None]
+            with np.errstate(divide="ignore"):
+                facets.update(np.where(slope > 0, gap / slope, np.inf).argmin(axis=0).tolist())
+        for row in sorted(leaving.which[list(facets)].tolist()):
+            for active in exchange(p, here, row) or []:
+                visit(tuple(sorted(active)))

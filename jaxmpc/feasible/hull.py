@@ -1,0 +1,256 @@
+"""Labels by the polytopes that rays have found: the price of a few products a point.
+
+The hull of proved points v is divided into cones from the centre c of the rays, one for each of its
+facets. In a cone a point θ and its inputs are the same combination of the centre's and of those of
+the facet's vertices: with λ = M (θ − c), M = [v_1 − c, …, v_d − c]⁻¹, the inputs are
+u_c + Σ λ_i (u_i − u_c), affine in θ. The gauge Σ λ_i tells the cone of a point, in which it is
+largest, and whether the point lies in the hull, where it is at most 1.
+
+*Labels.* A point of the hull is feasible, for the plans of the vertices keep all limits and so does
+their combination: λ ≥ 0 and Σ λ_i ≤ 1 prove it, each by more than the rounding of λ. A point that a
+half-space excludes is infeasible (`proofs.excludes`). Nothing is rolled out (`label`).
+
+*Plans* are made when they are asked for (`verdict`). They are these inputs in floats, rolled out
+like all candidates. That roll-out succeeds where a point has been labelled so: rows are linear and
+the bounds of their rounding are sublinear, so the slack of a row net of rounding, s, is concave in
+θ, at least (1 − Σ λ_i) s_c + Σ λ_i s_i. Where the vertices' own s_i, evaluated for inputs that may
+be off by the rounding of this combination, are not below −δ s_c, Σ λ_i ≤ 1 − δ suffices.
+
+What is not labelled so, within rounding of the boundary or between the polytopes, gets its plan
+rolled out at once, and is else left to the other stages.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy.spatial import ConvexHull, QhullError
+
+from jaxmpc.batches import Compiled, Devices, over_devices
+from jaxmpc.feasible import proofs
+from jaxmpc.feasible.candidates import Verdict
+from jaxmpc.feasible.constraint_rows import ConstraintRows
+from jaxmpc.feasible.exact_data import ExactData
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.rays import Rays, filled
+from jaxmpc.feasible.refinement import refined
+from jaxmpc.qp.modes import own_modes
+
+# Coordinates up to which the polytopes have few facets.
+MOST_COORDINATES = 4
+# Rays: gap of the volumes at which they stop, and with which the cones are of use; rounds, and the
+# most rays in one.
+GAP, USEFUL, ROUNDS, MOST_RAYS = 1e-9, 0.05, 8, 200
+# Points of two coordinates that take longer by the other stages, on a CPU, than the rays do; each
+# further coordinate takes four times as many.
+MANY = 2**18
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Cones:
+    """Cones about center (d,): M (F, d, d) and gauge (F, d) of each, the least λ_i and the largest
+    gauge (F,) of points that are labelled; inputs and, in a projection, free states value + slope_i
+    (θ − center), value (v,), slope (F, v, d). Half-spaces normals (K, d) θ ≤ offsets (K,) that hold
+    on the whole feasible set, and the cuts that they follow from."""
+
+    center: Any
+    M: Any
+    gauge: Any
+    least: Any
+    most: Any
+    value: Any
+    slope: Any
+    normals: Any
+    offsets: Any
+    cuts: Any
+
+    @classmethod
+    def of(cls, problem: FeasibilityProblem) -> "Cones | None":
+        """Return the cones of a problem, or None where rays bring no polytopes together: in more
+        than `MOST_COORDINATES`, or where the set is flat, unbounded or has many vertices."""
+        d, rows = problem.dimension, problem.rows
+        if d > MOST_COORDINATES:
+            return None
+        try:
+            found = refined(Rays.of(problem), GAP, ROUNDS, MOST_RAYS)
+        except ValueError:
+            return None
+        if not found.gap <= USEFUL:
+            return None
+        center, points = found.rays.center, found.points
+        unit = np.ptp(points, axis=0)
+        try:
+            facets = hull_facets((points - center) / unit)
+        except QhullError:
+            return None
+        edges = (points - center)[facets].transpose(0, 2, 1)  # (F, d, d), a column a vertex
+        regular = np.linalg.cond(edges / unit[:, None]) < 1e8
+        facets, edges = facets[regular], edges[regular]
+        M = np.linalg.inv(edges)
+        free = len(problem.view.others) if problem.view.projects else 0
+        theta, w = np.vstack([points, center]), np.vstack([found.w, found.rays.w])
+        every = values(found.rays.exact, rows, theta, w, free)
+        each, value = every[:-1], every[-1]
+        moves = (each - value)[facets].transpose(0, 2, 1)  # (F, v, d)
+        ends = label_limits(found.rays.exact, theta, every, facets, edges, M, moves)
+        return cls(
+            center, M, M.sum(axis=1), *ends, value, moves @ M, found.normals, found.offsets,
+            found.cuts,
+        )  # fmt: skip
+
+
+def label_limits(
+    p: ExactData, points: np.ndarray, values: np.ndarray, facets: np.ndarray, edges: np.ndarray,
+    M: np.ndarray, moves: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the least λ_i and the largest gauge (F,) with which points of each cone are labelled
+    (top of this file); a gauge of −∞ for none: with free states, equalities or a terminal
+    ellipsoid, whose plans are rolled out.
+
+    points (K + 1, d), the centre last, with inputs values (K + 1, v). With E the edges and γ of
+    `proofs.gamma`, λ is off by no more than ‖I − M E‖ + O(γ) ‖|M||E|‖ in the hull, four times which
+    is allowed for; and inputs by d max|u_i − u_c| times that, in `roll_out` as `moved`.
+    """
+    d, N, (_, m) = points.shape[1], p.horizon, p.B.shape
+    norm = lambda v: np.abs(v).sum(axis=2).max(axis=1)
+    few = proofs.gamma(d + 3)
+    off = 4 * (norm(np.eye(d) - M @ edges) + 4 * few * norm(np.abs(M) @ np.abs(edges)))
+    none = np.full(len(off), -np.inf)
+    if values.shape[1] != N * m or p.equalities is not None or p.P is not None:
+        return off, none
+    rounding = 4 * proofs.UNIT_ROUNDOFF * np.abs(values).max()
+    moved = 2 * d * np.abs(moves).max(axis=(1, 2)) * off + rounding
+    # One bound for all cones but those so thin that it would be the others' loss.
+    usable = (off < 1e-3) & (moved <= 1e4 * (np.median(moved) + rounding))
+    most = np.max(moved, where=usable, initial=0.0)
+
+    some = filled(len(points))
+    with jax.enable_x64(True):
+        found = np.asarray(_slack(p, points[some], values[some], most))
+    unmoved, slack = found[:, : len(points)]
+    at_center = slack[-1]
+    proved = usable & np.all(unmoved[facets] >= 0, axis=1) & (at_center > 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        lost = np.max(np.maximum(-slack[facets], 0.0), axis=1) / at_center
+    return off, np.where(proved, 1 - 2 * lost - d * off, none)
+
+
+@jax.jit
+@own_modes
+def _slack(p: ExactData, points: Any, values: Any, moved: Any) -> Array:
+    """Return the slack of `roll_out` (2, K) from the points with these inputs: as they are, and
+    where each may be off by `moved`."""
+    N, (_, m) = p.horizon, p.B.shape
+    none = jnp.zeros(0)
+
+    def one(theta: Array, inputs: Array, moved: Any) -> Array:
+        x, inputs = p.view.initial_state(theta, none), inputs.reshape(N, m)
+        return proofs.roll_out(p, x, inputs, jnp.broadcast_to(moved, inputs.shape))[0]
+
+    each = jax.vmap(one, in_axes=(0, 0, None))
+    return jnp.stack([each(points, values, 0.0), each(points, values, moved)])
+
+
+def hull_facets(points: np.ndarray) -> np.ndarray:
+    """Return the indices (F, d) of the vertices of each facet of the hull of points (K, d)."""
+    if points.shape[1] == 1:
+        return np.array([[np.argmin(points)], [np.argmax(points)]])
+    return ConvexHull(points).simplices
+
+
+def values(
+    p: ExactData, rows: ConstraintRows, theta: np.ndarray, w: np.ndarray, free: int
+) -> np.ndarray:
+    """Return the inputs (K, N·m), within their limits, and the `free` states that w (K, k) stand
+    for at θ (K, d), side by side."""
+    variables = w @ rows.back.T
+    by = lambda M, v: np.tensordot(v, M, (1, 2))
+    inputs = by(rows.Psi, theta) + by(rows.Omega, variables) + rows.psi
+    with jax.enable_x64(True):
+        inputs = np.asarray(jax.vmap(functools.partial(proofs.within_limits, p))(inputs))
+    return np.hstack([inputs.reshape(len(w), -1), variables[:, variables.shape[1] - free :]])
+
+
+# The cones of problems that have been asked for, for as long as the problems live.
+_made: WeakKeyDictionary[FeasibilityProblem, Cones | None] = WeakKeyDictionary()
+
+
+def cones_for(problem: FeasibilityProblem, points: int) -> Cones | None:
+    """Return the cones of a problem if so many points are worth the rays, or if they were made for
+    it before; None else, and where it has none."""
+    least = MANY * 4.0 ** (problem.dimension - 2) * (1 if jax.default_backend() == "cpu" else 8)
+    if problem not in _made and points >= least:
+        _made[problem] = Cones.of(problem)
+    return _made.get(problem)
+
+
+@functools.cache
+def compiled_labels(devices: Devices) -> Compiled:
+    """Return the compiled labels: (cones, points (B, d)) → labels (B,)."""
+    each = lambda cones, points: jax.vmap(lambda theta: label(cones, theta))(points)
+    return over_devices(each, devices, (False, True))
+
+
+@functools.cache
+def compiled_plans(devices: Devices) -> Compiled:
+    """Return the compiled plans: (p, cones, points (B, d)) → verdicts."""
+    each = lambda p, cones, points: jax.vmap(lambda theta: verdict(p, cones, theta))(points)
+    return over_devices(each, devices, (False, False, True))
+
+
+def label(cones: Cones, theta: Array) -> Array:
+    """Return the label of θ (d,), 0 where it is left to others: nothing is rolled out."""
+    cone, facet = nearest(cones, theta)
+    share = jnp.sum(cones.M[cone] * (theta - cones.center), axis=1)
+    inside = jnp.all(share >= cones.least[cone]) & (jnp.sum(share) <= cones.most[cone])
+    a, b, w = (v[facet] for v in cones.cuts)
+    outside = proofs.excludes(a, b, w, theta)
+    return jnp.where(inside, 1, jnp.where(outside, -1, 0)).astype(jnp.int8)
+
+
+def verdict(p: ExactData, cones: Cones, theta: Array) -> Verdict:
+    """Return the verdict on θ (d,), with its proof."""
+    N, (_, m) = p.horizon, p.B.shape
+    cone, facet = nearest(cones, theta)
+    value = cones.value + jnp.sum(cones.slope[cone] * (theta - cones.center), axis=1)
+    inputs, free = value[: N * m].reshape(N, m), value[N * m :]
+    feasible, inputs = proofs.prove_feasible(p, theta, free, inputs)
+    # The cut at the point rests on no linear program; a half-space may (`proofs.everywhere`).
+    a, b, w = (v[facet] for v in cones.cuts)
+    infeasible = proofs.excludes(a, b, w, theta)
+    normal, offset = cones.normals[facet], cones.offsets[facet]
+    everywhere = proofs.excludes(normal, offset, jnp.zeros_like(normal), theta)
+    offset = jnp.where(everywhere, offset, jnp.inf)
+    label = jnp.where(feasible, 1, jnp.where(infeasible, -1, 0)).astype(jnp.int8)
+    return Verdict(label, p.view.initial_state(theta, free), inputs, normal, offset)
+
+
+def nearest(cones: Cones, theta: Array) -> tuple[Array, Array]:
+    """Return the indices of the cone of θ (d,), and of the half-space that it exceeds most."""
+    length = jnp.linalg.norm(cones.normals, axis=1)
+    cone = largest(cones.gauge, jnp.zeros(len(cones.gauge)), theta - cones.center)
+    return cone, largest(cones.normals / length[:, None], cones.offsets / length, theta)
+
+
+def largest(rows: Array, offsets: Array, x: Array) -> Array:
+    """Return the index of the largest rows·x − offsets, rows (K, d), x (d,).
+
+    Row by row: so a batch is one loop over its points in each, which CPUs take in vectors. (A
+    product and an argmax take twice as long.)
+    """
+
+    def better(best: tuple[Array, Array], row: tuple) -> tuple[Any, None]:
+        value, index = best
+        normal, offset, i = row
+        here = sum(normal[j] * x[j] for j in range(x.shape[0])) - offset
+        return (jnp.maximum(value, here), jnp.where(here > value, i, index)), None
+
+    count = jnp.arange(len(rows), dtype=jnp.int32)
+    begin = jnp.asarray(-jnp.inf, x.dtype), jnp.int32(0)
+    return jax.lax.scan(better, begin, (rows, offsets, count))[0][1]

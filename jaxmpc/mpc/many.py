@@ -1,0 +1,175 @@
+"""Plans from many states: in chunks of one shape, on all cores, with transfer between states."""
+
+import functools
+import threading
+from contextlib import nullcontext
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.batches import (
+    Compiled,
+    Devices,
+    count,
+    default_chunk,
+    divisible,
+    over_devices,
+    padded,
+    placement,
+    side_by_side,
+    workers,
+)
+from jaxmpc.mpc import reuse
+from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.plan import Plan
+from jaxmpc.qp.active_set import MORE_STEPS, MOST_STEPS
+from jaxmpc.qp.status import Status
+
+# States from which on transfer is tried: below, compiling its programs costs more than it saves.
+MANY = 32_768
+# States that a program takes at once where they are few, or follow others.
+BLOCK = 2048
+# Of chunks so many or more, one is tried before all others; where fewer than this fraction of those
+# that can be solved are by following, solving takes less time.
+TRIAL, LEAST = 16, 0.3
+# Steps on the dual from the law of a neighbour.
+STEPS = MOST_STEPS + MORE_STEPS
+
+
+class Batch:
+    """Plans from the states x (B, p), which lie in NumPy or on the device.
+
+    chunk, block: states that a program takes at once, of many and of few; devices share them.
+    answer: the plans so far, B in front, in NumPy (to_host) or on the device.
+    """
+
+    def __init__(
+        self, controller: Controller, x: Any, chunk: int | None, to_host: bool, devices: Devices
+    ) -> None:
+        self.x, self.to_host, self.devices = x, to_host, devices
+        self.controller = jax.device_put(controller, placement(devices))
+        # Of several devices two chunks at once: one is computed while the other goes to the host.
+        self.together = workers() if devices is None else 2
+        shares = workers() if devices is None else 1
+        most = min(count(devices) * default_chunk(), -(-len(x) // shares))
+        self.chunk = divisible(max(min(chunk or most, len(x)), 1), devices)
+        self.block = divisible(min(self.chunk, count(devices) * BLOCK), devices)
+        # On several devices one program begins after the other, in the same order on all of them.
+        self._begins: Any = nullcontext() if devices is None else threading.Lock()
+        self._stores = threading.Lock()
+        self.answer: Plan | None = None
+
+    def solve(self, follow: bool) -> Plan:
+        """Return the plans from all states. follow: whether states may follow solved ones."""
+        B = len(self.x)
+        left = np.arange(B)
+        # (On GPUs the solver's kernels take less time than the laws and the host's indices would.)
+        on_cpu = jax.default_backend() == "cpu"
+        if follow and on_cpu and B >= MANY and reuse.transferable(self.controller):
+            self.chunk = self.block  # larger arrays a CPU's allocator would give back each time
+            left = self._transfer()
+        self._run(_plans(self.devices), (self.controller,), left)
+        assert self.answer is not None
+        return self.answer
+
+    def _transfer(self) -> np.ndarray:
+        """Solve from some states, and from those that follow them; return the indices of those that
+        are left."""
+        index, cells = reuse.choose(self.x)
+        self._run(_plans(self.devices), (self.controller,), index)
+        solved = jax.tree.map(lambda v: v[padded(index, len(cells.states))], self.answer)
+        laws = _laws(self.controller, solved.multipliers, solved.status)
+        arguments = (self.controller, laws, cells)
+        left = np.delete(np.arange(len(self.x)), index)
+        if len(left) >= TRIAL * self.chunk:
+            few = np.random.default_rng(0).choice(left, self.chunk, replace=False)
+            self._run(_follow(self.devices, 0), arguments, few)
+            solvable = 1 - np.mean(self._unsolved(index))
+            if 1 - np.mean(self._unsolved(few)) < LEAST * solvable:
+                return left
+        # The first time all states, for those that are next to each other are copied faster.
+        left = np.arange(len(self.x))
+        for steps in (0, STEPS):
+            self._run(_follow(self.devices, steps), arguments, left)
+            left = left[self._unsolved(left)]
+        return left
+
+    def _unsolved(self, index: np.ndarray) -> np.ndarray:
+        """Return which of these states (k,) have no plan yet."""
+        assert self.answer is not None
+        return np.asarray(self.answer.status)[index] != Status.SOLVED
+
+    def _run(self, program: Compiled, arguments: tuple, index: np.ndarray) -> None:
+        """Put the plans of program(*arguments, states) from the states at `index` (k,) into
+        `answer`."""
+        size = self.chunk if len(index) >= self.chunk else self.block
+
+        def part(where: np.ndarray) -> None:
+            with jax.enable_x64(True):
+                if isinstance(self.x, np.ndarray):
+                    x = padded(self.x[places(where)], size)
+                else:
+                    x = _rows(self.x, padded(where, size))
+                with self._begins:
+                    plans = program.run(*arguments, x)
+                self._put(where, size, plans)
+
+        pieces = [index[i : i + size] for i in range(0, len(index), size)]
+        side_by_side(part, pieces, self.together)
+
+    def _put(self, where: np.ndarray, size: int, plans: Plan) -> None:
+        B, plans = len(self.x), jax.device_get(plans) if self.to_host else plans
+        with self._stores:
+            if self.answer is None:
+                zeros = np.zeros if self.to_host else jnp.zeros
+                self.answer = jax.tree.map(lambda v: zeros((B, *v.shape[1:]), v.dtype), plans)
+            if not self.to_host:
+                self.answer = _put(self.answer, padded(where, size), plans)
+                return
+        for all_, rows in zip(*map(jax.tree.leaves, (self.answer, plans)), strict=True):
+            all_[places(where)] = rows[: len(where)]
+
+
+def places(where: np.ndarray) -> np.ndarray | slice:
+    """Return ascending indices (k,), as a slice where they are next to each other."""
+    first, last = int(where[0]), int(where[-1])
+    return slice(first, last + 1) if last - first == len(where) - 1 else where
+
+
+@jax.jit
+def _rows(x: Array, where: Array) -> Array:
+    return x[where]
+
+
+@partial(jax.jit, donate_argnums=0)
+def _put(answer: Plan, where: Array, plans: Plan) -> Plan:
+    return jax.tree.map(lambda v, rows: v.at[where].set(rows), answer, plans)
+
+
+@functools.cache
+def _plans(devices: Devices) -> Compiled:
+    """Return the program (controller, x (B, p)) → plans."""
+
+    def run(controller: Controller, x: Array) -> Plan:
+        n = controller.mpc.system.n
+        previous = lambda x: x[n:] if controller.mpc.input_in_state else None
+        return jax.vmap(lambda x: controller.plan(x[:n], previous_input=previous(x)))(x)
+
+    return over_devices(run, devices, (False, True))
+
+
+@functools.cache
+def _follow(devices: Devices, steps: int) -> Compiled:
+    """Return the program (controller, laws, cells, x (B, p)) → plans of `reuse.follow`."""
+
+    def run(controller: Controller, laws: reuse.Laws, cells: reuse.Cells, x: Array) -> Plan:
+        return jax.vmap(partial(reuse.follow, controller, laws, cells, steps))(x)
+
+    return over_devices(run, devices, (False, False, False, True))
+
+
+_laws = jax.jit(reuse.laws_of)

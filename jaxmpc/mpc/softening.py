@@ -1,0 +1,100 @@
+"""Hard limits made soft, and soft ones hard."""
+
+from dataclasses import replace
+from functools import reduce
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.arrays import Reals
+from jaxmpc.checks import concrete, fail, require_kind
+from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple, output_steps
+from jaxmpc.sets.convex import Ellipsoid, Polytope
+from jaxmpc.sets.limits import output_limits
+
+
+def soften(mpc: MPC, rho: Reals, quadratic: Reals = 0.0) -> MPC:
+    """The same problem with all state, output and terminal rows soft; inputs and rates stay hard.
+
+    rho, quadratic: weights of every row, as in `Soft`. Rows keep their units: a violation is
+    measured as H x − h in the row as given. Raises ValueError for an Ellipsoid as terminal set,
+    which has no rows.
+    """
+    require_kind("mpc", mpc, MPC)
+    mpc.validate()
+    system, N, soft = mpc.system, mpc.horizon, list(as_tuple("soft", mpc.soft, Soft))
+    if isinstance(mpc.terminal_set, Ellipsoid):
+        fail("terminal_set", "is an Ellipsoid, which stays hard", "Use a Polytope inside it")
+
+    def add(C: Any, D: Any, lower: Any, upper: Any, steps: Any, names: Any, units: Any) -> None:
+        # Limits inside a trace cannot be read: all their rows are taken. One at infinity asks for
+        # nothing.
+        read = concrete(C, D, lower, upper)
+        bounded, below = np.ones(np.shape(lower), bool), True
+        if read:
+            bounded, below = np.isfinite(lower) | np.isfinite(upper), np.isfinite(lower).any()
+        if not bounded.any() or not steps:
+            return
+        keep = lambda v: None if v is None else (np.asarray(v) if read else v)[bounded]
+        text = lambda v: tuple(str(part) for part in np.asarray(v)[bounded]) if v else ()
+        soft.append(
+            Soft(
+                keep(C),
+                keep(upper),
+                rho,
+                quadratic,
+                keep(D),
+                tuple(steps),
+                text(names),
+                text(units),
+                keep(lower) if below else None,
+            )  # fmt: skip
+        )
+
+    for kind, set_, steps in (
+        ("state", mpc.states, mpc.state_steps), ("terminal", mpc.terminal_set, (N,))
+    ):  # fmt: skip
+        if set_ is not None:
+            C, lower, upper = set_.rows()
+            names, units = system.state_names, system.state_units
+            if isinstance(set_, Polytope):
+                names, units = set_.labels, ()
+            names = names or tuple(f"{kind} row {i + 1}" for i in range(np.size(lower)))
+            add(C, None, lower, upper, steps, names, units)
+    for rows in as_tuple("outputs", mpc.outputs, Outputs):
+        names = rows.names or tuple(f"output row {i + 1}" for i in range(len(rows.lower)))
+        steps = output_steps(mpc, rows)
+        add(rows.C, rows.D, rows.lower, rows.upper, steps, names, rows.units)
+    softened = replace(mpc, states=None, terminal_set=None, outputs=(), soft=tuple(soft))
+    softened.validate()
+    return softened
+
+
+def harden(mpc: MPC) -> MPC:
+    """The same problem with every soft row hard: what a large enough penalty enforces where it can.
+
+    The opposite of `soften`: rows that hold at all steps of the state limits join `states`, rows at
+    k = N the terminal set, where these are not sets of another kind; the rest become `outputs`.
+    """
+    N, every = mpc.horizon, mpc.state_steps
+    states, terminal, outputs = [], [], list(as_tuple("outputs", mpc.outputs, Outputs))
+    for s in as_tuple("soft", mpc.soft, Soft):
+        steps = tuple(range(N + (s.D is None))) if s.steps is None else s.steps
+        lower, upper = s.sides
+        rows = Polytope(s.C, s.d, s.names)
+        if s.lower is not None:
+            rows = output_limits(s.C, lower, upper, s.names, s.units)
+        whole = s.D is None and every and set(every) <= set(steps) <= {*every, N}
+        if whole and mpc.states is None:
+            states.append(rows)
+            steps = tuple(set(steps) - set(every))
+        if s.D is None and steps == (N,) and mpc.terminal_set is None:
+            terminal.append(rows)
+            steps = ()
+        if steps:
+            outputs.append(Outputs(s.C, lower, upper, s.D, steps, s.names, s.units))
+    join = lambda given, found: reduce(Polytope.intersect, found) if found else given
+    return replace(
+        mpc, soft=(), outputs=tuple(outputs), states=join(mpc.states, states),
+        terminal_set=join(mpc.terminal_set, terminal),
+    )  # fmt: skip

@@ -1,0 +1,380 @@
+"""MPC of a nonlinear model with costs and limits on functions of its state, and its expansion.
+
+About a trajectory x (N+1, n), u (N, m) the problem becomes one of `stages.py`: the model affine,
+functions affine, the cost of weighed functions |g − target|²_W by Gauss and Newton: gradient
+2 G'W(g − target), Hessian 2 G'WG with G the Jacobian of g. All quadratic terms stand about the
+trajectory itself, so the gradient there is that of the true cost.
+
+Near a solution, and for its derivatives, the Hessian of the Lagrangian takes the place of Gauss and
+Newton's, stage by stage: with the costates λ and the multipliers y of the functions' rows
+
+    ½ ∇²[ℓ_k(x, u) + λ_{k+1}'f(x, u) + y_k'g(x, u)].
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import (
+    concrete,
+    fail,
+    require_finite,
+    require_kind,
+    require_real,
+    require_symmetric_psd,
+)
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.stagewise.stages import Sample, Stages, apply, apply_transposed, at, spread
+from jaxmpc.pytrees import named_pytree, pytree, static_pytree
+from jaxmpc.qp.precision import matmul, symmetric
+
+
+@pytree
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A cost or a limit on a smooth function g of the state and the input:
+
+        Σ_k (g_k − target_k)'W (g_k − target_k)  in the cost (no ½),
+        lower ≤ g_k ≤ upper.
+
+    function: one step of the model -> (p,) or a number, written in JAX, of what `model.view(x, u)`
+        gives: for a robot mjx.Data with the poses and velocities of all bodies, for other models
+        a `Point` with x and u. A constant of compiled programs, told apart by identity.
+    weight: W, a number, (p,) for a diagonal or (p, p); None: no cost.
+    target: (p,), or (N + 1, p) for each step; None: zero.
+    lower, upper: (p,) or a number, ±inf or None for no limit.
+    penalty: weight ρ of the violations ρ Σ e with which the limits are soft (`Soft`); None: hard.
+    steps: the k at which cost and limits hold; None: 1 … N. At N the input counts as zero.
+    name, unit: in tables.
+    """
+
+    function: Callable[[Any], Any] = field(metadata={"static": True})
+    weight: Any = None
+    target: Any = None
+    lower: Any = None
+    upper: Any = None
+    penalty: Any = 1e4
+    steps: tuple[int, ...] | None = field(default=None, metadata={"static": True})
+    name: str = field(default="task", metadata={"static": True})
+    unit: str = field(default="", metadata={"static": True})
+
+    @property
+    def limited(self) -> bool:
+        """Return whether there are limits."""
+        return self.lower is not None or self.upper is not None
+
+    def at(self, horizon: int) -> tuple[int, ...]:
+        """Return the steps at which cost and limits hold."""
+        return tuple(range(1, horizon + 1)) if self.steps is None else self.steps
+
+    def validate(self, size: int, horizon: int) -> None:
+        """Raise ValueError for arguments that do not fit a function of `size` numbers."""
+        name = self.name
+        for what, value, shapes in (
+            ("weight", self.weight, ((), (size,), (size, size))),
+            ("target", self.target, ((), (size,), (horizon + 1, size))),
+            ("lower", self.lower, ((), (size,))), ("upper", self.upper, ((), (size,))),
+            ("penalty", self.penalty, ((),)),
+        ):  # fmt: skip
+            if value is None:
+                continue
+            require_real(f"{name}.{what}", value)
+            if np.shape(value) not in shapes:
+                listed = " or ".join(map(str, shapes))
+                fail(f"{name}.{what}", f"shape {np.shape(value)}", f"The function gives {size} "
+                     f"numbers: give {listed}")  # fmt: skip
+            if what not in ("lower", "upper"):
+                require_finite(f"{name}.{what}", value)
+        if self.weight is not None and concrete(self.weight):
+            values = np.asarray(self.weight, float)
+            values = np.diag(values) if values.ndim == 1 else np.atleast_2d(values)
+            require_symmetric_psd(f"{name}.weight", values)
+        if self.penalty is not None and concrete(self.penalty) and not self.penalty >= 0:
+            fail(f"{name}.penalty", f"{self.penalty}", "Give at least 0, or None for hard limits")
+        if self.limited and concrete(self.lower, self.upper):
+            lower = -np.inf if self.lower is None else np.asarray(self.lower, float)
+            upper = np.inf if self.upper is None else np.asarray(self.upper, float)
+            if not np.all(lower <= upper):
+                fail(f"{name}.lower", "exceeds upper or is NaN", "Give lower ≤ upper")
+        if self.steps is not None:
+            whole = all(isinstance(k, int) and 0 <= k <= horizon for k in self.steps)
+            if not whole or len(set(self.steps)) != len(self.steps) or not self.steps:
+                fail(f"{name}.steps", f"{self.steps}", f"Give different steps from 0 to {horizon}")
+
+
+@named_pytree
+class Point(NamedTuple):
+    """State x (n,) and input u (m,) of one step."""
+
+    x: Array
+    u: Array
+
+
+@static_pytree
+@dataclass(frozen=True)
+class Plain:
+    """A model x⁺ = f(x, u) given as a function or as an object that is no pytree."""
+
+    given: Any
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return x⁺."""
+        return getattr(self.given, "step", self.given)(x, u)
+
+
+@pytree
+@dataclass(frozen=True, eq=False)
+class NonlinearMPC:
+    """The problem of `MPC` with a nonlinear model, and with costs and limits on functions:
+
+        min  Σ_{k<N} (e_k'Q e_k + d_k'R d_k) + e_N'P e_N + Σ (costs of the tasks)
+        s.t. x_{k+1} = f(x_k, u_k), the limits of mpc, the limits of the tasks,
+
+    e = x − reference, d = u − input_reference.
+
+    mpc: `MPC`, whose `system` is read for its sizes and names only. Not for an Ellipsoid, control
+        horizons and input rates.
+    model: f, a function (x, u) -> x⁺ written in JAX, or an object with such a `step`, and, if it
+        has them, `linearize(x, u)` -> LinearSystem and `view(x, u)`, of which tasks are functions.
+        A pytree is data of the program (derivatives with respect to its leaves), any other object
+        a constant of it.
+    tasks: `Task`s.
+    """
+
+    mpc: MPC
+    model: Any
+    tasks: tuple[Task, ...] = ()
+
+    def __post_init__(self) -> None:
+        if isinstance(self.mpc, MPC) and jax.tree_util.all_leaves([self.model]):
+            if callable(getattr(self.model, "step", self.model)):
+                object.__setattr__(self, "model", Plain(self.model))
+
+    @property
+    def targets(self) -> int:
+        """Return how many numbers the functions of all tasks give together."""
+        return sum(self.sizes())
+
+    def sizes(self) -> list[int]:
+        """Return how many numbers the function of each task gives."""
+        return [shape[0] for shape in self._shapes()[1]] if self.tasks else []
+
+    def _shapes(self) -> tuple[tuple[int, ...], list[tuple[int, ...]]]:
+        leaves, tree = jax.tree.flatten(self)
+        kind = lambda v: jax.dtypes.canonicalize_dtype(jnp.result_type(v))
+        return _shapes(tree, tuple((np.shape(v), kind(v)) for v in leaves))
+
+    def validate(self) -> None:
+        """Raise ValueError for a bad problem, before any compile."""
+        require_kind("mpc", self.mpc, MPC)
+        self.mpc.validate()
+        self.mpc.require_unique_inputs()
+        if not callable(getattr(self.model, "step", None)):
+            fail("model", f"is a {type(self.model).__name__}", "Give f(x, u) -> x⁺, or its object")
+        if not isinstance(self.tasks, tuple) or not all(isinstance(t, Task) for t in self.tasks):
+            fail("tasks", f"is a {type(self.tasks).__name__}", "Give a tuple of jm.mpc.Task")
+        after, values = self._shapes()
+        if after != (self.mpc.system.n,):
+            cure = f"Give the next state ({self.mpc.system.n},), as mpc.system has it"
+            fail("model.step(x, u)", f"shape {after}", cure)
+        for task, shape in zip(self.tasks, values, strict=True):
+            if len(shape) > 1:
+                fail(f"{task.name}.function", f"gives shape {shape}", "Give a vector of numbers")
+            task.validate(shape[0], self.mpc.horizon)
+
+    def value(self, task: Task, x: Array, u: Array) -> Array:
+        """Return what the task's function gives at x, u, as a vector."""
+        view = getattr(self.model, "view", Point)
+        return jnp.atleast_1d(jnp.asarray(task.function(view(x, u)))).astype(x.dtype)
+
+    def values(self, x: Array, u: Array) -> list[Array]:
+        """Return what each task's function gives at its steps, (steps, p), along x (N+1, n),
+        u (N, m)."""
+        found = []
+        for task in self.tasks:
+            steps = task.at(len(u))
+            each = jax.vmap(lambda x, u, task=task: self.value(task, x, u))
+            found.append(each(at(x, steps), at(u, steps)))
+        return found
+
+
+@functools.lru_cache(maxsize=256)
+def _shapes(tree: Any, leaves: tuple) -> tuple[tuple[int, ...], list[tuple[int, ...]]]:
+    """Return the shapes of the next state and of what each task's function gives, for a problem
+    with this structure and these shapes and dtypes of its leaves."""
+    abstract = tree.unflatten([jax.ShapeDtypeStruct(*leaf) for leaf in leaves])
+    system = abstract.mpc.system
+    x, u = (jax.ShapeDtypeStruct((size,), jnp.result_type(float)) for size in (system.n, system.m))
+
+    def outputs(problem: NonlinearMPC, x: Array, u: Array) -> Any:
+        return problem.model.step(x, u), [problem.value(task, x, u) for task in problem.tasks]
+
+    after, values = jax.eval_shape(outputs, abstract, x, u)
+    return after.shape, [value.shape for value in values]
+
+
+class Aims(NamedTuple):
+    """What one plan tracks: x0 (n,), references (N+1, n) and (N, m), targets of the tasks, each
+    (N+1, p)."""
+
+    x0: Array
+    states: Array
+    inputs: Array
+    targets: tuple[Array, ...]
+
+
+def weighed(weight: Any, v: Array) -> Array:
+    """Return W v for v (..., p) with a weight that is a number, a diagonal or a matrix."""
+    weight = jnp.asarray(weight, v.dtype)
+    return matmul(v, symmetric(weight)) if weight.ndim == 2 else v * weight
+
+
+def task_cost(task: Task, value: Array, target: Array) -> Array:
+    """Return the cost of a task's function `value` (..., p), summed."""
+    e = value - target
+    return jnp.zeros((), e.dtype) if task.weight is None else jnp.sum(e * weighed(task.weight, e))
+
+
+def total_cost(s: Stages, problem: NonlinearMPC, aims: Aims, x: Array, u: Array) -> Array:
+    """Return the cost of a trajectory without penalties; s: `stages` of the MPC."""
+    e, d = x - aims.states, u - aims.inputs
+    J = jnp.sum(s.stage * (jnp.sum(e[:-1] * apply(s.Q, e[:-1]), 1) + jnp.sum(d * apply(s.R, d), 1)))
+    J = J + jnp.sum(e[-1] * matmul(e[-1], s.P.T))
+    for task, value, target in zip(problem.tasks, problem.values(x, u), aims.targets, strict=True):
+        J = J + task_cost(task, value, at(target, task.at(len(u))))
+    return J
+
+
+def all_rows(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Array:
+    """Return the limited quantities of a trajectory (rows,), in the order of the expansion."""
+    found = [s.rows(x, u)]
+    for task, value in zip(problem.tasks, problem.values(x, u), strict=True):
+        found += [value.ravel()] if task.limited else []
+    return jnp.concatenate(found)
+
+
+def linear_models(model: Any, x: Array, u: Array) -> tuple[Array, Array, Array]:
+    """Return A (N, n, n), B (N, n, m), c (N, n) about each step of x (N, n), u (N, m)."""
+    own = getattr(model, "linearize", None)
+    if own is not None:
+        found = jax.vmap(own)(x, u)
+        cast = lambda v: jnp.asarray(v, x.dtype)
+        c = jnp.zeros_like(x) if found.c is None else cast(found.c)
+        return cast(found.A), cast(found.B), c
+
+    def affine(x: Array, u: Array) -> tuple[Array, Array, Array]:
+        moved = lambda x, u: (model.step(x, u),) * 2
+        (A, B), after = jax.jacfwd(moved, argnums=(0, 1), has_aux=True)(x, u)
+        return A, B, after - matmul(A, x) - matmul(B, u)
+
+    return jax.vmap(affine)(x, u)
+
+
+def expanded(
+    s: Stages, problem: NonlinearMPC, aims: Aims, x: Array, u: Array
+) -> tuple[Stages, Sample]:  # fmt: skip
+    """Return the problem about x (N+1, n), u (N, m); s: `stages` of the MPC."""
+    N, dtype = s.horizon, s.P.dtype
+    A, B, c = linear_models(problem.model, x[:-1], u)
+    weights = s.stage[:, None, None]
+    Q, R, P, cross = weights * s.Q, weights * s.R, s.P, None
+    e, d = x - aims.states, u - aims.inputs
+    gx = 2 * jnp.concatenate([s.stage[:, None] * apply(s.Q, e[:-1]), matmul(e[-1:], s.P.T)])
+    gu = 2 * s.stage[:, None] * apply(s.R, d)
+    rows: dict[str, list[Any]] = {name: [] for name in ("H", "D", "layout", "boxes")}
+    bounds = [(s.lower, s.upper, s.linear, s.quadratic)]
+    for task, target in zip(problem.tasks, aims.targets, strict=True):
+        steps = task.at(N)
+        pair = lambda x, u, task=task: (problem.value(task, x, u),) * 2
+        slopes = jax.vmap(jax.jacfwd(pair, argnums=(0, 1), has_aux=True))
+        (G, D), value = slopes(at(x, steps), at(u, steps))
+        if task.weight is not None:
+            error = 2 * weighed(task.weight, value - at(target, steps))
+            turned = jnp.swapaxes(G, 1, 2), jnp.swapaxes(D, 1, 2)
+            WG, WD = (jnp.swapaxes(weighed(task.weight, M), 1, 2) for M in turned)
+            bent = spread(matmul(turned[0], WG), steps, N + 1)
+            Q, P, R = Q + bent[:-1], P + bent[-1], R + spread(matmul(turned[1], WD), steps, N)
+            cross = (0.0 if cross is None else cross) + spread(matmul(turned[1], WG), steps, N)
+            gx = gx + spread(apply_transposed(G, error), steps, N + 1)
+            gu = gu + spread(apply_transposed(D, error), steps, N)
+        if task.limited:
+            size = value.shape[1]
+            moved = apply(G, at(x, steps)) + apply(D, at(u, steps)) - value
+            sides = []
+            for given, free in ((task.lower, -jnp.inf), (task.upper, jnp.inf)):
+                bound = jnp.asarray(free if given is None else given, dtype)
+                sides.append((bound + moved).ravel())
+            soft = jnp.inf if task.penalty is None else task.penalty
+            weight = jnp.full(moved.size, soft, dtype)
+            bounds.append((*sides, weight, jnp.zeros_like(weight)))
+            for name, part in (("H", G), ("D", D), ("boxes", False),
+                               ("layout", ("task", steps, size))):  # fmt: skip
+                rows[name].append(part)
+    lower, upper = (jnp.concatenate([part[i] for part in bounds]) for i in (0, 1))
+    linear, quadratic = s.linear, s.quadratic
+    if len(bounds) > 1:
+        if linear is None:
+            bounds[0] = (s.lower, s.upper, jnp.full_like(s.lower, jnp.inf), jnp.zeros_like(s.lower))
+        linear, quadratic = (jnp.concatenate([part[i] for part in bounds]) for i in (2, 3))
+    found = replace(
+        s, A=A, B=B, c=c, Q=Q, R=R, P=P, cross=cross,
+        stage=jnp.ones_like(s.stage), H=(*s.H, *rows["H"]), D=(*s.D, *rows["D"]), lower=lower,
+        upper=upper, linear=linear, quadratic=quadratic, layout=(*s.layout, *rows["layout"]),
+        boxes=(*s.boxes, *rows["boxes"]),
+    )  # fmt: skip
+    return found, Sample(aims.x0, x, u, (gx, gu))
+
+
+def task_layout(problem: NonlinearMPC) -> tuple:
+    """Return (kind, steps, rows a step) of the rows that tasks add."""
+    N = problem.mpc.horizon
+    sized = zip(problem.tasks, problem.sizes(), strict=True)
+    return tuple(("task", task.at(N), size) for task, size in sized if task.limited)
+
+
+def curved(
+    s: Stages, base: Stages, problem: NonlinearMPC, aims: Aims, x: Array, u: Array,
+    costates: Array, y: Array,
+) -> Stages:  # fmt: skip
+    """Return the expansion s with the Hessian of the Lagrangian in place of Gauss and Newton's.
+
+    base: `stages` of the MPC; costates λ (N+1, n) of x_0 … x_N; y (rows,) of s.
+    """
+    N, n, dtype = s.horizon, s.P.shape[0], s.P.dtype
+    hessian = lambda f, *args: jax.jacfwd(jax.grad(f))(*args) / 2
+    join = lambda x, u: jnp.concatenate([x, u], axis=-1)
+
+    def of_model(z: Array, pull: Array) -> Array:
+        return hessian(lambda z: jnp.sum(pull * problem.model.step(z[:n], z[n:])), z)
+
+    blocks = jnp.pad(jax.vmap(of_model)(join(x[:-1], u), costates[1:]), ((0, 1), (0, 0), (0, 0)))
+    first = len(base.lower)
+    for task, target in zip(problem.tasks, aims.targets, strict=True):
+        steps = task.at(N)
+        size = target.shape[1]
+        pull = jnp.zeros((len(steps), size), dtype)
+        if task.limited:
+            pull = y[first : first + pull.size].reshape(pull.shape)
+            first += pull.size
+
+        def of_task(z: Array, r: Array, pull: Array, task: Task = task) -> Array:
+            def part(z: Array) -> Array:
+                value = problem.value(task, z[:n], z[n:])
+                return task_cost(task, value, r) + jnp.sum(pull * value)
+
+            return hessian(part, z)
+
+        where = join(at(x, steps), at(u, steps))
+        found = jax.vmap(of_task)(where, at(target, steps), pull)
+        blocks = blocks + spread(found, steps, N + 1)
+    weights = s.stage[:, None, None] * base.stage[:, None, None]
+    return replace(
+        s, Q=weights * base.Q + blocks[:-1, :n, :n], R=weights * base.R + blocks[:-1, n:, n:],
+        cross=blocks[:-1, n:, :n], P=base.P + blocks[-1, :n, :n],
+    )  # fmt: skip

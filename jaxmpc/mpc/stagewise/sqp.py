@@ -1,0 +1,457 @@
+"""Nonlinear MPC by sequential quadratic programming on the stages (direct multiple shooting).
+
+Each QP is the expansion of `nonlinear.py` about the iterate x (N+1, n), u (N, m), solved as in
+`stagewise.py`; states and inputs are both variables, so an iterate may have defects
+f(x_k, u_k) − x_{k+1}. The step to the QP's solution is shortened until the merit function
+
+    φ = J + penalties of soft rows + Σ w |defect| + Σ w (violation of hard rows)
+
+falls by a part of what the QP predicts (Armijo). It is exact where each weight w exceeds its
+multiplier; Powell's rule, w ← max(|λ|, (w + |λ|)/2), keeps that with λ of the QP (Nocedal, Wright
+2006, §18.3). One QP a sample with a full step from the last plan shifted by one sample is the
+real-time iteration (Diehl, Bock, Schlöder 2005).
+
+The status comes from the residuals of the nonlinear problem itself at the returned x, u, y: the
+conditions of the expansion about them, whose gradients are the true ones, and the defects.
+Derivatives follow from the same conditions by the implicit function theorem, with the Hessian of
+the Lagrangian (`nonlinear.curved`): one Riccati recursion.
+"""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxmpc.arrays import Reals
+from jaxmpc.checks import fail, require_kind, require_real, require_shape, whole
+from jaxmpc.mpc.plan import Plan, WarmStart, answer
+from jaxmpc.mpc.stagewise.interior_point import STEPS as INTERIOR_STEPS
+from jaxmpc.mpc.stagewise.interior_point import Interior, interior_step
+from jaxmpc.mpc.stagewise.newton import (
+    NEWTON_STEPS,
+    Search,
+    StageFactor,
+    checked,
+    row_scale,
+    search_step,
+    solution,
+    stage_conditions,
+    stated,
+)
+from jaxmpc.mpc.stagewise.nonlinear import (
+    Aims,
+    NonlinearMPC,
+    all_rows,
+    curved,
+    expanded,
+    task_layout,
+    total_cost,
+)
+from jaxmpc.mpc.stagewise.riccati import recurrence
+from jaxmpc.mpc.stagewise.stages import (
+    Sample,
+    Stages,
+    apply,
+    cleaned,
+    dynamics_terms,
+    judged,
+    predict,
+    riccati,
+    spread,
+    stage_residuals,
+    stages,
+)
+from jaxmpc.qp.admm import ADMM, DEFAULT, default_rho, scaled_multipliers
+from jaxmpc.qp.certificate import Proof
+from jaxmpc.qp.derivative import Undo, implicit
+from jaxmpc.qp.linalg import cholesky
+from jaxmpc.qp.loops import repeat_while
+from jaxmpc.qp.modes import own_modes, varying
+from jaxmpc.qp.newton import Constants
+from jaxmpc.qp.precision import arrays, precisely, rounding
+from jaxmpc.qp.residuals import SHARE, Measured, Terms, assess
+from jaxmpc.qp.solve import tolerance
+from jaxmpc.qp.status import Status
+from jaxmpc.sets.convex import Box
+
+# QPs at most, of `solve_nonlinear`.
+STEPS = 100
+# Part of the predicted decrease that a step has to make, and the shortest step.
+DECREASE, SHORTEST = 1e-4, 1e-4
+# A multiplier, relative to the largest, above which a row counts as held.
+HELD = 1e-6
+# Least tolerance in float32, in which the model itself is evaluated.
+SINGLE = 1e-3
+# The fields of `Stages` that a Hessian fills.
+QUADRATIC = ("Q", "R", "P", "cross")
+
+
+def solve_nonlinear(
+    problem: NonlinearMPC, x0: Reals, reference: Reals | None = None, solver: ADMM = DEFAULT,
+    warm_start: Any = None, *, input_reference: Reals | None = None, targets: Any = None,
+    steps: int = STEPS, hessian: str = "exact", scale: Any = None,
+) -> Plan:  # fmt: skip
+    """Solve a nonlinear MPC from the state x0 (n,) by sequential quadratic programming.
+
+    reference (n,) or (N+1, n), input_reference (m,) or (N, m), None for zero. targets: one array
+    for each task, in place of its own. solver: of the QPs, as in `solve_stagewise` (no ADMM steps
+    where solver.iterations is None); its eps is the tolerance of the nonlinear problem.
+    warm_start: an earlier Plan or a WarmStart; None, or where it costs a hundred times as much: at
+    rest at x0 under the first input reference.
+    steps: QPs at most. 1: the real-time iteration, a full step, whose plan, residuals and status
+    are those of the QP about the warm start.
+    hessian: "exact", the Lagrangian's where it is convex (few QPs near the solution), or
+    "gauss-newton", which needs no second derivatives of the model. scale (rows,): row scale of a
+    similar problem, as in `solve_stagewise`.
+
+    Returns the Plan at which the search ended, SOLVED where the residuals of the nonlinear problem
+    are at most eps (a point that satisfies the first-order conditions: a local minimum, mostly),
+    with the number of QPs as `iterations`. `jax.vmap` over x0, references, targets, warm starts and
+    the arrays of the problem; an instance leaves the batch when it is solved. Derivatives are those
+    of the solution (implicit function theorem, exact second derivatives), with respect to all
+    arrays of the problem and x0, where the plan is SOLVED and a strict minimum, and finite numbers
+    elsewhere. Raises ValueError for wrong shapes, and for what `solve_stagewise` does not support.
+    """
+    require_kind("problem", problem, NonlinearMPC)
+    problem.validate()
+    mpc, N = problem.mpc, problem.mpc.horizon
+    n, m = mpc.system.n, mpc.system.m
+    whole("steps", steps, 1)
+    if solver.iterations is None:
+        solver = replace(solver, iterations=0)
+    checked(mpc, mpc.system, replace(solver, rho=None))
+    if hessian not in ("exact", "gauss-newton"):
+        fail("hessian", f"{hessian!r}", 'Give "exact" or "gauss-newton"')
+    if solver.differentiate != "implicit" and steps > 1:
+        fail("solver.differentiate", f"{solver.differentiate!r}", 'With steps > 1: "implicit"')
+    # The model's own system is not read; the one of the set-point may differ from step to step.
+    s = jax.eval_shape(stages, mpc)
+    dtype = s.P.dtype
+    require_shape("x0", x0, (n,), f"Give one state ({n},); use jax.vmap for many")
+    x0 = jnp.asarray(x0, dtype)
+    sizes = problem.sizes()
+    aims = [("reference", reference, n, N + 1), ("input_reference", input_reference, m, N)]
+    given = [task.target for task in problem.tasks] if targets is None else list(targets)
+    if len(given) != len(sizes):
+        fail("targets", f"{len(given)} for {len(sizes)} tasks", "Give one for each task")
+    aims += [(f"targets[{i}]", v, sizes[i], N + 1) for i, v in enumerate(given)]
+    found = []
+    for name, value, size, length in aims:
+        require_real(name, 0.0 if value is None else value)
+        aim = jnp.zeros(size, dtype) if value is None else jnp.asarray(value, dtype)
+        if aim.shape not in ((), (size,), (length, size)):
+            fail(name, f"shape {aim.shape}", f"Give ({size},) or ({length}, {size})")
+        found.append(jnp.broadcast_to(aim, (length, size)))
+    rows = (*s.layout, *task_layout(problem))
+    if warm_start is None:
+        count = sum(len(steps) * size for _, steps, size in rows)
+        x, u = jnp.broadcast_to(x0, (N + 1, n)), jnp.zeros((N, m), dtype)
+        warm_start = WarmStart(x, u + found[1][:1], jnp.zeros(count, dtype))
+    warm_start = WarmStart.of(warm_start, rows, N, n, m)
+    sample = Aims(x0, found[0], found[1], tuple(found[2:]))
+    return _solve(
+        *arrays((problem, solver, sample, warm_start, scale)), steps=int(steps), hessian=hessian
+    )
+
+
+@partial(jax.jit, static_argnames=("steps", "hessian"))
+@own_modes
+def _solve(
+    problem: NonlinearMPC, solver: ADMM, aims: Aims, warm_start: WarmStart, scale: Any, steps: int,
+    hessian: str,
+) -> Plan:  # fmt: skip
+    base, fault = cleaned(stages(problem.mpc))
+    numbers = (aims, [(t.weight, t.penalty) for t in problem.tasks])
+    finite = [jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(numbers)]
+    fault = jnp.where(jnp.all(jnp.stack(finite)), fault, jnp.int32(Status.NON_FINITE))
+    usable = fault == Status.NOT_RUN
+    aims = jax.tree.map(lambda v: jnp.where(usable, v, 0), aims)
+    eps = tolerance(solver, base.P.dtype)
+    if eps.dtype != jnp.float64:
+        eps = jnp.maximum(eps, SINGLE)
+    # What is not finite in a warm start counts as 0.
+    x, u, y = (jnp.nan_to_num(v.astype(base.P.dtype), posinf=0, neginf=0) for v in warm_start)
+    x, u, y = within_reason(base, problem, aims, x.at[0].set(aims.x0), u, y)
+    count: Any = 1
+    if steps > 1:
+        constants = jax.lax.stop_gradient((base, problem, aims, scale, eps))
+        start = Iterate.begin(*jax.lax.stop_gradient((x, u, y)))
+        is_open = lambda state: state.open
+        step = partial(sqp_step, steps, hessian)
+        last = repeat_while(is_open, step, constants, start, steps="stages")
+        x, u, y, count = last.x, last.u, last.y, last.steps
+    s, sample = expanded(base, problem, aims, x, u)
+    E, rho = scales(jax.lax.stop_gradient(s), scale)
+    if steps == 1:
+        gains = None
+        if solver.admm_steps():
+            gains = jax.tree.map(lambda v: v[None], riccati(s, rho * E**2))
+        factor = StageFactor(s, E, rho[None], gains, fault)
+        given = factor, sample, solver, WarmStart(x, u, y)
+        if solver.differentiate == "unrolled":
+            u, y, measured = solution(*given)
+        else:
+            u, y, measured = solution(*jax.lax.stop_gradient(given))
+            u, y = implicit(stage_conditions, (s, sample), (E, rho), u, y)
+        found = stated(solver, s, sample, u, y, measured)
+    else:
+        at_solution = jax.lax.stop_gradient((E, rho, base, problem, aims))
+        u, y = implicit(nonlinear_conditions, (s, sample), at_solution, u, y)
+        found = assess(nonlinear_residuals, (s, sample), u, y, Proof.none(u, y), eps)
+    found = replace(found, iterations=jnp.asarray(count, jnp.int32))
+    x = predict(s, sample.x0, u)
+    plan = answer(problem.mpc, s.layout, found, fault, x, u, aims.states, aims.inputs)
+    return with_tasks(plan, s, sample, base, problem, aims)
+
+
+def within_reason(
+    base: Stages, problem: NonlinearMPC, aims: Aims, x: Array, u: Array, y: Array
+) -> tuple[Array, Array, Array]:
+    """Return the warm start x, u, y, or rest at x0 where it costs more than anybody plans: 100
+    times what rest does, under the first input reference or under inputs at their limits.
+
+    About the plan of a reading that is far off, the expansion would be rounding."""
+    rest_x, rest_u = jnp.broadcast_to(aims.x0, x.shape), jnp.broadcast_to(aims.inputs[:1], u.shape)
+    most = rest_u
+    if isinstance(problem.mpc.inputs, Box):
+        ends = arrays((problem.mpc.inputs.lower, problem.mpc.inputs.upper))
+        sizes = jnp.stack([jnp.abs(jnp.asarray(v, u.dtype)) for v in ends])
+        most = jnp.max(jnp.where(jnp.isfinite(sizes), sizes, 0.0), axis=0) + jnp.abs(rest_u)
+    J = lambda x, u: jax.lax.stop_gradient(total_cost(base, problem, aims, x, u))
+    sane = J(x, u) <= 100 * (J(rest_x, rest_u) + J(rest_x, most))
+    return jnp.where(sane, x, rest_x), jnp.where(sane, u, rest_u), jnp.where(sane, y, 0.0)
+
+
+def rows_of(
+    s: Stages, base: Stages, problem: NonlinearMPC, sample: Sample, x: Array, u: Array
+) -> Array:  # fmt: skip
+    """Return the limited quantities (rows,) at x, u, moved as the bounds of the expansion are: for
+    each row by the constant by which its expansion at 0 differs from the function's."""
+    about = sample.states, sample.inputs
+    return all_rows(base, problem, x, u) + (s.rows(*about) - all_rows(base, problem, *about))
+
+
+def with_tasks(
+    plan: Plan, s: Stages, sample: Sample, base: Stages, problem: NonlinearMPC, aims: Aims
+) -> Plan:  # fmt: skip
+    """Return the plan with what tasks add to cost and slack."""
+    if not problem.tasks:
+        return plan
+    x, u = plan.states, plan.inputs
+    rows = rows_of(s, base, problem, sample, x, u)
+    J = total_cost(base, problem, aims, x, u) + jnp.sum(s.bounds.cost(rows))
+    slack, first = [plan.slack], len(base.lower)
+    out = jnp.abs(rows - jnp.clip(rows, s.lower, s.upper))
+    for (_, steps, size), limited in zip(
+        task_layout(problem), [t for t in problem.tasks if t.limited], strict=True
+    ):
+        last = first + len(steps) * size
+        if limited.penalty is not None:
+            slack.append(spread(out[first:last].reshape(len(steps), size), steps, len(x)))
+        first = last
+    return replace(plan, cost=J, slack=jnp.concatenate(slack, axis=1))
+
+
+def scales(s: Stages, scale: Any) -> tuple[Array, Array]:
+    """Return the row scale E (rows,) and the penalty ρ (rows,) of the expansion."""
+    E = row_scale(s) if scale is None else jnp.asarray(scale, s.P.dtype)
+    rho = default_rho(E, s.horizon * s.B.shape[-1])
+    return E, jnp.broadcast_to(rho, E.shape)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Merit:
+    """The merit function φ: its weights of defects (N, n) and of hard rows (rows,)."""
+
+    defects: Array
+    rows: Array
+
+    def value(
+        self, s: Stages, sample: Sample, base: Stages, problem: NonlinearMPC, aims: Aims,
+        x: Array, u: Array,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Return φ at x, u, and the sum of its terms' sizes; s, sample: an expansion."""
+        rows = rows_of(s, base, problem, sample, x, u)
+        gap = jax.vmap(problem.model.step)(x[:-1], u) - x[1:]
+        parts = jnp.stack([
+            total_cost(base, problem, aims, x, u), jnp.sum(s.bounds.cost(rows)),
+            jnp.sum(self.defects * jnp.abs(gap)),
+            jnp.sum(self.rows * jnp.abs(s.bounds.violation(rows))),
+        ])  # fmt: skip
+        return jnp.sum(parts), jnp.sum(jnp.abs(parts))
+
+    def decrease(self, s: Stages, sample: Sample, dx: Array, du: Array) -> Array:
+        """Return by how much φ falls along the whole step dx, du in the expansion."""
+        x, u, bounds = sample.states, sample.inputs, s.bounds
+        before, after = s.rows(x, u), s.rows(x + dx, u + du)
+        outside = lambda v: jnp.sum(bounds.cost(v) + self.rows * jnp.abs(bounds.violation(v)))
+        # The cost is quadratic: its change is the mean of the gradients at both ends.
+        ends = zip(sample.gradient(s, x, u), sample.gradient(s, x + dx, u + du), strict=True)
+        gx, gu = ((a + b) / 2 for a, b in ends)
+        gaps = jnp.sum(self.defects * jnp.abs(defects(s, x, u)[0]))
+        return outside(before) - outside(after) + gaps - jnp.sum(gx * dx) - jnp.sum(gu * du)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Iterate:
+    """Loop state of one instance: x (N+1, n), u (N, m), multipliers y (rows,), the merit function,
+    the QPs solved, whether the next may have the exact Hessian, and whether to go on."""
+
+    x: Array
+    u: Array
+    y: Array
+    merit: Merit
+    steps: Array
+    exact: Array
+    open: Array
+
+    @classmethod
+    def begin(cls, x: Array, u: Array, y: Array) -> "Iterate":
+        """Return the state before the first QP."""
+        merit = Merit(jnp.zeros_like(x[1:]), jnp.abs(y))
+        return cls(x, u, y, merit, jnp.int32(0), jnp.asarray(False), jnp.asarray(True))
+
+
+def costates(s: Stages, sample: Sample, u: Array, y: Array) -> Array:
+    """Return λ (N+1, n), the multipliers of x_0 … x_N: λ_k = ∂(J + y'rows)/∂x_k + A'λ_{k+1}."""
+    x = predict(s, sample.x0, u)
+    g = sample.gradient(s, x, u)[0] + s.pull(y)[0]
+    return jnp.concatenate([recurrence(s.A, g[:-1], g[-1], adjoint=True), g[-1:]])
+
+
+def defects(s: Stages, x: Array, u: Array) -> tuple[Array, Array, Array]:
+    """Return f(x_k, u_k) − x_{k+1} (N, n) at the point of expansion, what it is compared with, and
+    its terms. A state that rests at 0 has no size but a small share of the latter."""
+    parts = apply(s.A, x[:-1]), apply(s.B, u), s.c
+    terms = dynamics_terms(s.A, s.B, s.c, x, u)
+    sizes = sum(map(jnp.abs, parts), jnp.abs(x[1:])) + SHARE * jnp.max(terms, axis=0)
+    return parts[0] + parts[1] + parts[2] - x[1:], sizes, terms
+
+
+def nonlinear_residuals(s: Stages, sample: Sample, u: Array, y: Array) -> Terms:
+    """Return the residuals of the nonlinear problem at the point of expansion: those of the
+    expansion, with the defects among the rows."""
+    of_rows, *rest = stage_residuals(s, sample, u, y)
+    of_defects = defects(s, sample.states, u)
+    joined = [jnp.concatenate([a, b.ravel()]) for a, b in zip(of_rows, of_defects, strict=True)]
+    return [(joined[0], joined[1], joined[2]), *rest]
+
+
+def nonlinear_conditions(
+    data: tuple[Stages, Sample], constants: tuple, u: Array, y: Array
+) -> tuple[Any, Undo]:
+    """The `conditions_of` that `implicit` takes for the expansion about a solution: those of the
+    QP, with the Hessian of the Lagrangian.
+
+    The gradients of an expansion about a fixed point, which depend on the data, and this Hessian,
+    which is a constant, are the first derivatives of the optimality conditions of the nonlinear
+    problem with respect to the data and to x, u.
+    """
+    E, rho, base, problem, aims = constants
+    s, sample = data
+    lam = costates(s, sample, u, s.bounds.admissible(y))
+    exact = curved(s, base, problem, aims, sample.states, u, lam, y)
+    # Elsewhere than at a strict minimum, as where the search has not ended, the exact one has no
+    # solution: NaN would spoil the sums of a batch.
+    strict = convex_with(exact, held(s, E, y))
+    pairs = ((getattr(exact, name), getattr(with_cross(s), name)) for name in QUADRATIC)
+    chosen = (jnp.where(strict, *pair) for pair in pairs)
+    bent: dict[str, Any] = jax.lax.stop_gradient(dict(zip(QUADRATIC, chosen, strict=True)))
+    conditions, undo = stage_conditions((replace(s, **bent), sample), (E, rho), u, y)
+    return lambda data: conditions((replace(data[0], **bent), data[1])), undo
+
+
+def sqp_step(most: int, hessian: str, constants: tuple, state: Iterate) -> Iterate:
+    """Solve the QP about the iterate and go towards its solution; the search ends after `most` QPs,
+    where the residuals are below a tenth of the tolerance, or where no step lowers the merit.
+
+    hessian="exact": after a full step the next QP has the Hessian of the Lagrangian, if that is
+    convex with the active rows held. It is then solved by Newton steps on the active rows alone,
+    and where that fails the step after takes Gauss and Newton's again.
+    """
+    base, problem, aims, scale, eps = constants
+    x, u, y = state.x, state.u, state.y
+    s, sample = expanded(base, problem, aims, x, u)
+    y = s.bounds.admissible(y)
+    measure = lambda s, sample, u, y, eps: Measured.of(
+        nonlinear_residuals(s, sample, u, y), eps, rounding(x.dtype)
+    )
+    solved = precisely(measure, s, sample, u, y, eps / 10).small
+    E, rho = scales(s, scale)
+    exact = jnp.asarray(False)
+    if hessian == "exact":
+        curved_s = curved(s, base, problem, aims, x, u, costates(s, sample, u, y), y)
+        exact = state.exact & convex_with(curved_s, held(s, E, y))
+        s = jax.tree.map(lambda a, b: jnp.where(exact, a, b), curved_s, with_cross(s))
+    fixed = jnp.where(E == 0, s.bounds.penalty_gradient(s.rows(x, u)), 0.0)
+    u_qp, y_qp, usable = precisely(solved_qp, s, sample, E, rho, fixed, eps, u, y, exact)
+    dx, du, dy = predict(s, sample.x0, u_qp) - x, u_qp - u, y_qp - y
+
+    powell = lambda w, m: jnp.maximum(jnp.abs(m), (w + jnp.abs(m)) / 2)
+    merit = Merit(
+        powell(state.merit.defects, costates(s, sample, u_qp, y_qp)[1:]),
+        powell(state.merit.rows, y_qp),
+    )
+    value = partial(merit.value, s, sample, base, problem, aims)
+    (now, size), predicted = value(x, u), merit.decrease(s, sample, dx, du)
+    slack = 10 * jnp.finfo(x.dtype).eps * size
+    enough = lambda a: value(x + a * dx, u + a * du)[0] <= now - DECREASE * a * predicted + slack
+    shorten = lambda search: (search[0] / 2, enough(search[0] / 2))
+    go_on = lambda search: ~search[1] & (search[0] > SHORTEST)
+    one = jnp.ones((), x.dtype)
+    length, found = jax.lax.while_loop(go_on, shorten, varying((one, enough(one)), x))
+    moves = ~solved & found & jnp.all(jnp.isfinite(du))
+    moves = moves & (~exact | (usable & (predicted > -slack)))
+    step = lambda v, d: v + jnp.where(moves, length * d, 0.0)
+    count = state.steps + ~solved
+    return Iterate(
+        step(x, dx), step(u, du), step(y, dy), merit, count,
+        moves & usable & (length == 1), ~solved & (moves | exact) & (count < most),
+    )  # fmt: skip
+
+
+def solved_qp(
+    s: Stages, sample: Sample, E: Array, rho: Array, fixed: Array, eps: Array, u: Array, y: Array,
+    exact: Array,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Return the solution of a QP from u (N, m), y (rows,), and whether it is one: Newton steps,
+    and after them, unless `exact`, interior point steps."""
+    loop = lambda step, constants, state: jax.lax.while_loop(
+        lambda state: state.open, partial(step, constants), varying(state, (state, constants))
+    )
+    best = judged(eps, s, sample, u, y)
+    first = Search(best.z, best.y, best, jnp.int32(0), ~(best.near | best.solved))
+    best = loop(partial(search_step, NEWTON_STEPS), (s, sample, E, rho, eps), first).best
+    second = Interior.begin(best)
+    second = replace(second, open=second.open & ~exact)
+    best = loop(partial(interior_step, INTERIOR_STEPS), (s, sample, E, fixed, eps), second).best
+    return best.z, best.y, best.measured.small
+
+
+def with_cross(s: Stages) -> Stages:
+    """Return the stages with a cross term, zero where there was none."""
+    cross = jnp.zeros((s.horizon, s.B.shape[-1], s.A.shape[-1]), s.P.dtype)
+    return replace(s, cross=cross if s.cross is None else s.cross)
+
+
+def held(s: Stages, E: Array, y: Array) -> Array:
+    """Return large weights (rows,) for the rows that multipliers y hold at their limits, 0 for
+    others: soft rows beyond their limits give way."""
+    push = jnp.abs(scaled_multipliers(E, y))
+    active = push > HELD * jnp.max(push, initial=0.0)
+    if s.linear is not None:
+        active = active & (jnp.abs(y) < (1 - 1e-6) * s.linear)
+    return Constants.of(y.dtype).linear * E**2 * active
+
+
+def convex_with(s: Stages, weights: Array) -> Array:
+    """Return whether the cost with penalties ½ weights·row² is strictly convex in the inputs: all G
+    of the recursion are definite."""
+    inverse = riccati(s, weights).inverse
+    roots = jax.vmap(cholesky)((inverse + jnp.swapaxes(inverse, -1, -2)) / 2)
+    return jnp.all(jnp.isfinite(roots))

@@ -1,0 +1,364 @@
+"""A linear-quadratic problem stage by stage: its data, recursions and optimality conditions.
+
+The problem of all stages has states x (N+1, n) that follow from inputs u (N, m), the cost of `MPC`
+and rows H x_k + D u_k with bounds and penalties. Everything that a solver needs of it costs N
+products with n×n matrices; the condensed matrices are never formed. To minimise the cost with
+penalties ½ W row² on the rows and linear terms is an LQR problem. With the weights doubled (J has
+no ½, the QP has) the stage cost is
+
+    ½ [x; u]' [2Q + H'WH, H'WD; D'WH, 2R + D'WD] [x; u] − g_x'x − g_u'u
+
+and the value function ½ x'S x + p'x of the steps after k gives (Rawlings, Mayne, Diehl 2017, §1.3)
+
+    G = 2R + D'WD + B'S⁺B,   K = −G⁻¹(B'S⁺A + D'WH),   u = K x + G⁻¹(g_u − B'p⁺),
+    p = (A + BK)'p⁺ − g_x − K'g_u.
+
+Only p runs backward and only x forward; all else is done for all stages at once.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxmpc.mpc.problem import MPC, weights_of
+from jaxmpc.mpc.rows import Layout, blocks
+from jaxmpc.mpc.stagewise.riccati import Gains, recurrence, riccati_recursion, tracking
+from jaxmpc.qp.admm import convex
+from jaxmpc.qp.precision import floating_dtype, matmul, precisely, rounding
+from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.residuals import SHARE, Pair, Terms
+from jaxmpc.qp.status import Status
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Stages:
+    """The data of a problem in one floating type.
+
+    A (n, n), B (n, m), c (n,), or with a leading axis N. Q, R, P: weights, without ½; P of x_N; Q
+    and R may have a leading axis N; cross M (N, m, n): of the term 2 u'M x, None for zero; stage
+    (N,): weights of the stages, of all three.
+    H (r, n) and D (r, m) of each block of rows (`rows.blocks`), or one a step of the block, None
+    for zero; D does not count at step N, which has no input. lower, upper, linear, quadratic
+    (rows,): as in `Bounds`. layout: (kind, steps, rows a step) of each block; boxes: whether its
+    matrix is the identity.
+    """
+
+    A: Array
+    B: Array
+    c: Array
+    Q: Array
+    R: Array
+    P: Array
+    stage: Array
+    H: tuple[Any, ...]
+    D: tuple[Any, ...]
+    lower: Array
+    upper: Array
+    linear: Any
+    quadratic: Any
+    layout: Layout = field(metadata={"static": True})
+    boxes: tuple[bool, ...] = field(metadata={"static": True})
+    horizon: int = field(metadata={"static": True})
+    cross: Any = None
+
+    @property
+    def bounds(self) -> Bounds:
+        """What the problem asks of its rows."""
+        return Bounds(self.lower, self.upper, self.linear, self.quadratic)
+
+    def blocks(self) -> list[tuple[slice, tuple[int, ...], int, Any, Any, bool]]:
+        """(its rows, steps, rows a step, H, D, whether that is the identity) of each block."""
+        found, first = [], 0
+        for (_, steps, size), H, D, box in zip(
+            self.layout, self.H, self.D, self.boxes, strict=True
+        ):
+            last = first + len(steps) * size
+            found.append((slice(first, last), steps, size, H, D, box))
+            first = last
+        return found
+
+    def rows(self, x: Array, u: Array) -> Array:
+        """H x_k + D u_k of all blocks (rows,) along x (N+1, n), u (N, m)."""
+        parts = [jnp.zeros(0, x.dtype)]
+        for _, steps, _, H, D, box in self.blocks():
+            value: Any = 0.0
+            for M, v in ((H, x), (D, u)):
+                if M is not None:
+                    v = at(v, steps)
+                    value = value + (v if box else apply(M, v))
+            parts.append(value.ravel())
+        return jnp.concatenate(parts)
+
+    def pull(self, weights: Array) -> tuple[Array, Array]:
+        """Σ weights·(gradient of the row) in x (N+1, n) and u (N, m): the transpose of `rows`."""
+        N, n, m = self.horizon, self.A.shape[-1], self.B.shape[-1]
+        gx: Any = jnp.zeros((N + 1, n), weights.dtype)
+        gu: Any = jnp.zeros((N, m), weights.dtype)
+        for rows, steps, size, H, D, box in self.blocks():
+            w = weights[rows].reshape(len(steps), size)
+            if H is not None:
+                gx = gx + spread(w if box else apply_transposed(H, w), steps, N + 1)
+            if D is not None:
+                gu = gu + spread(w if box else apply_transposed(D, w), steps, N)
+        return gx, gu
+
+    def varying(self, *names: str) -> list[Any]:
+        """The named ones of A, B, c where they differ from step to step, else None."""
+        values = [(getattr(self, name), 1 if name == "c" else 2) for name in names]
+        return [v if v.ndim > dimensions else None for v, dimensions in values]
+
+
+def consecutive(steps: tuple[int, ...]) -> bool:
+    """Return whether the steps are k, k + 1, …"""
+    return bool(steps) and steps == tuple(range(steps[0], steps[0] + len(steps)))
+
+
+def at(v: Array, steps: tuple[int, ...]) -> Array:
+    """Return v_k at the steps, zero at the one after the last of v."""
+    if max(steps, default=0) == len(v):
+        v = jnp.pad(v, ((0, 1), *[(0, 0)] * (v.ndim - 1)))
+    if consecutive(steps):
+        return v[steps[0] : steps[0] + len(steps)]
+    return v[np.array(steps, int)]
+
+
+def spread(part: Array, steps: tuple[int, ...], length: int) -> Array:
+    """Return the array of so many steps that is `part` at the steps and zero elsewhere; a part at
+    the step after the last is left out."""
+    if max(steps, default=0) == length:
+        return spread(part, steps, length + 1)[:-1]
+    if consecutive(steps):
+        ends = (steps[0], length - steps[0] - len(steps))
+        return jnp.pad(part, (ends, *[(0, 0)] * (part.ndim - 1)))
+    return jnp.zeros((length, *part.shape[1:]), part.dtype).at[np.array(steps, int)].add(part)
+
+
+def apply(M: Array, v: Array) -> Array:
+    """Return M_k v_k, or M v_k, for all steps: M (N, a, b) or (a, b), v (N, b)."""
+    return matmul(v, M.T) if M.ndim == 2 else matmul(M, v[..., None])[..., 0]
+
+
+def apply_transposed(M: Array, v: Array) -> Array:
+    """Return M_k'v_k, or M'v_k, for all steps."""
+    return matmul(v, M) if M.ndim == 2 else matmul(v[..., None, :], M)[..., 0, :]
+
+
+def dynamics_terms(A: Array, B: Array, c: Array, x: Array, u: Array) -> Array:
+    """Return |A||x_k| + |B||u_k| + |c| (N, n), what x_{k+1} is made of."""
+    return apply(jnp.abs(A), jnp.abs(x[:-1])) + apply(jnp.abs(B), jnp.abs(u)) + jnp.abs(c)
+
+
+def stages(mpc: MPC) -> Stages:
+    """Return the data of `mpc`. Works inside jit, vmap and grad."""
+    system, n = mpc.system, mpc.system.n
+    dtype = floating_dtype(mpc)
+    weights = weights_of(mpc, dtype)
+    cast = lambda v: jnp.asarray(v, dtype)
+    found = blocks(mpc, dtype)
+    none = [jnp.zeros(0, dtype)]
+    tiled = lambda values: jnp.concatenate(none + [
+        jnp.tile(v, len(b.steps)) for v, b in zip(values, found, strict=True)
+    ])  # fmt: skip
+    linear = quadratic = None
+    if any(b.linear is not None for b in found):
+        weight = lambda b, name, hard: (
+            jnp.full(b.size, hard, dtype) if b.linear is None else getattr(b, name)
+        )
+        linear = tiled([weight(b, "linear", jnp.inf) for b in found])
+        quadratic = tiled([weight(b, "quadratic", 0.0) for b in found])
+    return Stages(
+        A=cast(system.A), B=cast(system.B),
+        c=jnp.zeros(n, dtype) if system.c is None else cast(system.c),
+        Q=weights.Q, R=weights.R, P=weights.P, stage=weights.stage,
+        H=tuple(b.H for b in found), D=tuple(b.D for b in found),
+        lower=tiled([b.lower for b in found]), upper=tiled([b.upper for b in found]),
+        linear=linear, quadratic=quadratic,
+        layout=tuple((b.kind, b.steps, b.size) for b in found),
+        boxes=tuple(b.box for b in found), horizon=mpc.horizon,
+    )  # fmt: skip
+
+
+def cleaned(s: Stages) -> tuple[Stages, Array]:
+    """The data with harmless numbers in place of those that are not usable, and the fault in them
+    (see `qp.solve.cleaned`): NOT_RUN for none, NON_CONVEX where Q, R or P is indefinite.
+
+    Each array by itself: what a batch shares is read and cleaned once, whatever its instances hold.
+    """
+    everywhere = lambda *tests: jnp.all(jnp.stack([jnp.all(test) for test in tests]))
+    numbers = jax.tree.leaves((s.A, s.B, s.c, s.Q, s.R, s.P, s.stage, s.H, s.D))
+    ordered = (s.lower <= s.upper) & ~jnp.isposinf(s.lower) & ~jnp.isneginf(s.upper)
+    tests = [*map(jnp.isfinite, numbers), ordered]
+    finite = lambda tree: jax.tree.map(lambda v: jnp.where(jnp.isfinite(v), v, 0.0), tree)
+    linear, quadratic = s.linear, s.quadratic
+    if linear is not None:
+        tests += [linear >= 0, (quadratic >= 0) & jnp.isfinite(quadratic)]
+        linear, quadratic = (
+            jnp.where(test, v, harmless)
+            for test, v, harmless in zip(tests[-2:], (linear, quadratic), (jnp.inf, 0), strict=True)
+        )
+    Q, R, P = finite((s.Q, s.R, s.P))
+    convexity = [convex(Q), convex(R), convex(P)]
+    positive = jnp.isfinite(s.stage) & (s.stage > 0)
+    fault = jnp.where(everywhere(*convexity, positive), Status.NOT_RUN, Status.NON_CONVEX)
+    fault = jnp.where(everywhere(*tests), fault, Status.NON_FINITE).astype(jnp.int32)
+    others = (jnp.zeros_like(Q), jnp.eye(len(R), dtype=R.dtype), jnp.zeros_like(P))
+    Q, R, P = map(jnp.where, convexity, (Q, R, P), others)
+    return replace(
+        s, A=finite(s.A), B=finite(s.B), c=finite(s.c), Q=Q, R=R, P=P,
+        stage=jnp.where(positive, s.stage, 1.0), H=finite(s.H), D=finite(s.D),
+        lower=jnp.where(ordered, s.lower, -jnp.inf), upper=jnp.where(ordered, s.upper, jnp.inf),
+        linear=linear, quadratic=quadratic,
+    ), fault  # fmt: skip
+
+
+def riccati(s: Stages, weights: Any = None) -> Gains:
+    """Gains for the cost and ½ Σ weights·row², weights (rows,) or None."""
+    N, stage = s.horizon, s.stage[:, None, None]
+    Q = 2 * jnp.concatenate([stage * s.Q, s.P[None]])
+    R = 2 * stage * s.R
+    cross = None if s.cross is None else 2 * stage * s.cross
+    for rows, steps, size, H, D, box in s.blocks() if weights is not None else ():
+        w = weights[rows].reshape(len(steps), size)
+        diagonal = lambda w: w[:, :, None] * jnp.eye(w.shape[1], dtype=w.dtype)
+        form = lambda M, L, w=w: matmul(jnp.swapaxes(M, -1, -2) * w[:, None, :], L)
+        if H is not None:
+            Q = Q + spread(diagonal(w) if box else form(H, H), steps, N + 1)
+        if D is not None:
+            R = R + spread(diagonal(w) if box else form(D, D), steps, N)
+        if H is not None and D is not None:
+            cross = (0.0 if cross is None else cross) + spread(form(D, H), steps, N)
+    return riccati_recursion(Q, R, cross, s.A, s.B)
+
+
+def minimise(s: Stages, gains: Gains, gx: Array, gu: Array, unroll: int = 1) -> tuple[Array, Array]:
+    """x (N+1, n), u (N, m) of least penalised cost − gx·x − gu·u from x_0 = 0, without c and
+    references."""
+    return tracking(gains, s.A, s.B, gx, gu, unroll)
+
+
+def follow(gains: Gains, x0: Array, w: Array, unroll: int = 1) -> Array:
+    """x (N+1, n) of x⁺ = (A + BK) x + w from x0 (n,), w (N, n)."""
+
+    x = recurrence(gains.closed, w, x0, unroll=unroll)
+    return jnp.concatenate([x0[None], x])
+
+
+def predict(s: Stages, x0: Array, u: Array) -> Array:
+    """x (N+1, n) from x0 (n,) under the inputs u (N, m)."""
+    w = jnp.broadcast_to(apply(s.B, u) + s.c, (s.horizon, len(x0)))
+    return jnp.concatenate([x0[None], recurrence(s.A, w, x0)])
+
+
+class Sample(NamedTuple):
+    """Initial state and references of one solve: x0 (n,), references (N+1, n) and (N, m). slopes
+    (N+1, n) and (N, m): linear terms Σ slope_k·x_k + Σ slope_k·u_k of the cost, None for none."""
+
+    x0: Array
+    states: Array
+    inputs: Array
+    slopes: Any = None
+
+    def gradient(self, s: Stages, x: Array, u: Array) -> tuple[Array, Array]:
+        """Of J at x, u: (N+1, n) and (N, m)."""
+        e, d, stage = 2 * (x - self.states), 2 * (u - self.inputs), s.stage[:, None]
+        gx, gu = apply(s.Q, e[:-1]), apply(s.R, d)
+        if s.cross is not None:
+            gx, gu = gx + apply_transposed(s.cross, d), gu + apply(s.cross, e[:-1])
+        gradient = jnp.concatenate([stage * gx, apply(s.P, e[-1:])]), stage * gu
+        return gradient if self.slopes is None else jax.tree.map(jnp.add, gradient, self.slopes)
+
+
+def unconstrained(s: Stages, gains: Gains, weights: Array, sample: Sample) -> tuple[Array, Array]:
+    """x, u of least cost with the penalties ½ Σ weights·row²."""
+    # From a trajectory that the gains keep bounded, one minimisation of what is left.
+    x = follow(gains, sample.x0, jnp.broadcast_to(s.c, (s.horizon, s.c.shape[-1])))
+    u = apply(gains.K, x[:-1])
+    moved = jax.tree.map(jnp.add, sample.gradient(s, x, u), s.pull(weights * s.rows(x, u)))
+    dx, du = minimise(s, gains, -moved[0], -moved[1])
+    return x + dx, u + du
+
+
+class Conditions(NamedTuple):
+    """Rows (rows,) and gradient (N, m) of the Lagrangian with respect to the inputs, the terms of
+    both, and the sums that the gradient is a difference of."""
+
+    rows: Array
+    gradient: Array
+    row_terms: Array
+    gradient_terms: Array
+    gradient_size: Array
+
+
+def conditions(s: Stages, sample: Sample, u: Array, y: Array) -> Conditions:
+    """Optimality conditions of inputs u (N, m) and multipliers y (rows,), by the states that u
+    leads to and the costates λ_k = ∂J/∂x_k + H'y + A'λ_{k+1}."""
+    x = predict(s, sample.x0, u)
+    (gx, own), (px, pushed) = sample.gradient(s, x, u), s.pull(y)
+    back = lambda g: recurrence(s.A, g[:-1], g[-1], adjoint=True)
+    # Of cost and rows apart: at the solution their sum is small, its rounding is that of the parts.
+    of_cost, of_rows = (jnp.concatenate([back(g)[1:], g[-1:]]) for g in (gx, px))
+    absolute = jax.tree.map(jnp.abs, replace(s, linear=None, quadratic=None))
+    # A state is a difference of the terms of its step, as where torques balance the weight.
+    moved = apply(absolute.A, jnp.abs(x[:-1])) + apply(absolute.B, jnp.abs(u)) + absolute.c
+    terms = jnp.concatenate([jnp.abs(x[:1]), moved])
+    # Its gradient, of the terms of its distance from the reference, and of slopes.
+    far = jax.tree.map(jnp.abs, sample)
+    far = far._replace(states=-far.states, inputs=-far.inputs)
+    weighed, own_terms = far.gradient(absolute, terms, jnp.abs(u))
+    later = jax.lax.cumsum(weighed[1:], reverse=True)
+    return Conditions(
+        s.rows(x, u), own + pushed + apply_transposed(s.B, of_cost + of_rows),
+        absolute.rows(terms, jnp.abs(u)),
+        own_terms + absolute.pull(jnp.abs(y))[1]
+        + apply_transposed(absolute.B, later + jnp.abs(of_cost) + jnp.abs(of_rows)),
+        jnp.abs(own + apply_transposed(s.B, of_cost))
+        + jnp.abs(pushed + apply_transposed(s.B, of_rows)),
+    )  # fmt: skip
+
+
+def stage_residuals(s: Stages, sample: Sample, u: Array, y: Array) -> Terms:
+    """As `qp.residuals.residual_terms`, for the condensed QP in the inputs.
+
+    With the gradient g of the Lagrangian the gap z'Pz + q'z + g(Az) + g*(y) is
+    u'g + g(rows) + g*(y) − y'rows: at the optimum both parts are zero. What is natural for a row
+    and for an input is what is the most of the same one over the horizon.
+    """
+    found, bounds = conditions(s, sample, u, y), s.bounds
+    penalty, support, product = bounds.cost(found.rows), bounds.support(y), y * found.rows
+    gap = jnp.sum(u * found.gradient) + jnp.sum(penalty + support - product)
+    terms = jnp.sum(jnp.abs(u) * found.gradient_terms)
+    slopes = bounds.slope(found.rows) + jnp.abs(y)
+    terms = terms + jnp.sum(slopes * found.row_terms + jnp.abs(support))
+    size = jnp.sum(penalty + jnp.abs(support) + jnp.abs(product))
+    size = size + jnp.sum(jnp.abs(u) * found.gradient_size)
+
+    def most(v: Array) -> Array:
+        parts = [v[rows].reshape(len(steps), size) for rows, steps, size, *_ in s.blocks()]
+        largest = [jnp.max(part, axis=0, initial=0.0) for part in parts]
+        pairs = zip(parts, largest, strict=True)
+        return jnp.concatenate([*(jnp.broadcast_to(m, p.shape).ravel() for p, m in pairs), v[:0]])
+
+    row_size = jnp.maximum(bounds.sizes(), jnp.abs(found.rows))
+    row_terms = found.row_terms + row_size
+    gradient_size = found.gradient_size + SHARE * jnp.max(found.gradient_size, axis=0)
+    gradient_terms = found.gradient_terms + jnp.max(found.gradient_terms, axis=0)
+    return [
+        (
+            bounds.violation(found.rows), row_size + SHARE * most(row_size),
+            row_terms + most(row_terms),
+        ),
+        (found.gradient.ravel(), gradient_size.ravel(), gradient_terms.ravel()),
+        (gap[None], size[None], terms[None]),
+    ]  # fmt: skip
+
+
+def judged(eps: Array, s: Stages, sample: Sample, u: Array, y: Array) -> Pair:
+    """The pair of inputs u (N, m) and multipliers y (rows,), judged in float64."""
+    y, floor = s.bounds.admissible(y), rounding(u.dtype)
+    judge = lambda s, sample, u, y, eps: Pair.of(u, y, stage_residuals(s, sample, u, y), eps, floor)
+    return precisely(judge, s, sample, u, y, eps)

@@ -1,0 +1,262 @@
+"""Videos of robots, by MuJoCo's renderer and without a window."""
+
+import base64
+import copy
+import io
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.arrays import Reals
+from jaxmpc.checks import fail, require_finite, require_shape, whole
+from jaxmpc.robots.film.captions import TARGET, captioned, exceeded_limits
+from jaxmpc.robots.robot import Robot
+
+OPACITY = 0.3  # of the target
+
+# Grey of what a model without a skybox leaves black.
+BACKGROUND = np.array([0.5, 0.5, 0.5, 1], np.float32)
+
+
+def render(
+    robot: Robot, states: Reals, *, inputs: Reals | None = None, target: Any = None, every: int = 1,
+    width: int = 320, height: int = 240, camera: str | None = "view", labels: bool = True,
+    numbers: Sequence[int] | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Return the frames (F, h, w, 3), uint8 RGB, of every `every`-th state.
+
+    states: (T+1, nq + nv) of one robot, or (B, T+1, nq + nv) of several, drawn as tiles, row by
+    row, in a nearly square arrangement. inputs: (T, m) or (B, T, m), for their limits alone.
+    target: a configuration (nq,), or one for each state (T+1, nq), of a green, see-through robot in
+    each tile; None for none. width, height: pixels of a tile. camera: the name of one of the
+    model's; None, or "view" where the model has none of that name, for a camera that sees all that
+    moves, at all times. What a model without a skybox leaves black is grey.
+
+    labels: write the robot's name and the time in s above, a legend below, and `numbers` (by
+    default from 0) on the tiles. A tile has a red frame, with the name of the limit, where the
+    robot is beyond one (by more than 1e-6) at a sample from the one shown to the last before the
+    next frame; of several it is the one exceeded most as a fraction of half its range.
+
+    Without a display MuJoCo renders through EGL, on a GPU or not: the environment variable
+    MUJOCO_GL=egl must be set before mujoco is imported, hence before the first `load_robot`.
+    Raises ValueError for wrong shapes and cameras, RuntimeError where nothing can be rendered.
+    """
+    import mujoco
+
+    if not isinstance(robot, Robot):
+        fail("robot", f"is a {type(robot).__name__}", "Only a Robot has a shape to draw")
+    states = np.asarray(states, float)
+    if states.ndim not in (2, 3) or states.shape[-1] != robot.state_size or not states.size:
+        fail("states", f"shape {states.shape}", f"Give ([robots,] samples, {robot.state_size})")
+    require_finite("states", states)
+    for name, value in (("every", every), ("width", width), ("height", height)):
+        whole(name, value, 1)
+    model, samples, every = copy.deepcopy(robot.mujoco), states.shape[-2], int(every)
+    if inputs is not None:
+        inputs = np.asarray(inputs, float)
+        shape = (*states.shape[:-2], samples - 1, robot.m)
+        require_shape("inputs", inputs, shape, "Give those between the states")
+        inputs = inputs.reshape(-1, *shape[-2:])
+    if target is not None:
+        target = np.asarray(target, float)
+        shape = (samples, model.nq) if target.ndim == 2 else (model.nq,)
+        require_shape("target", target, shape, "Give one qpos, or one for each state")
+        require_finite("target", target)
+        target = np.broadcast_to(target, (samples, model.nq))[::every]
+    states = states.reshape(-1, *states.shape[-2:])
+    count = len(states)
+    if numbers is not None and len(numbers) != count:
+        fail("numbers", f"{len(numbers)} of {count} robots", "Give one for each")
+    if camera is not None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera) < 0:
+        if camera != "view":
+            fail("camera", f"the model has none named {camera!r}", "Give one of its, or None")
+        camera = None
+    buffer = model.vis.global_
+    buffer.offwidth, buffer.offheight = max(buffer.offwidth, width), max(buffer.offheight, height)
+    # MuJoCo's default of 4096 takes most of the time where the CPU draws.
+    model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, 1024)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # GLFW warns of what follows as an error
+            renderer = mujoco.Renderer(model, height, width)
+    except Exception as error:  # of MuJoCo, OpenGL or EGL, whichever is missing
+        raise RuntimeError(
+            f"no video: MuJoCo finds no renderer ({' '.join(str(error).split())[:120]}). Without "
+            "a display set MUJOCO_GL=egl before Python starts; on Debian or Ubuntu install "
+            "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1"
+        ) from None
+    view: Any = camera
+    if camera is None:
+        poses = states[:, :: max(1, samples // 20), : model.nq].reshape(-1, model.nq)
+        poses = poses if target is None else np.concatenate([poses, target])
+        view = _camera(model, poses, width / height)
+    sky = np.any(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+    if not model.nlight:
+        light = model.vis.headlight
+        light.ambient[:], light.diffuse[:] = (
+            np.maximum(v, 0.6) for v in (light.ambient, light.diffuse)
+        )
+    columns = int(np.ceil(np.sqrt(count)))
+    rows = -(-count // columns)
+    tiles = [(height * (i // columns), width * (i % columns)) for i in range(count)]
+    motions = states[:, ::every, : model.nq]
+    film = np.full((motions.shape[1], rows * height, columns * width, 3), 255, np.uint8)
+    data, ghost = mujoco.MjData(model), mujoco.MjData(model)
+    with renderer:
+        for (top, left), motion in zip(tiles, motions, strict=True):
+            for k, (frame, q) in enumerate(zip(film, motion, strict=True)):
+                data.qpos[:] = q
+                mujoco.mj_forward(model, data)
+                renderer.update_scene(data, view)
+                if target is not None:
+                    ghost.qpos[:] = target[k]
+                    mujoco.mj_forward(model, ghost)
+                    _add_ghost(renderer.scene, model, ghost)
+                if not sky:
+                    _add_backdrop(renderer.scene)
+                frame[top : top + height, left : left + width] = renderer.render()
+    for row in range(1, rows):
+        film[:, row * height - 1 : row * height + 1] = 255
+    for column in range(1, columns):
+        film[:, :, column * width - 1 : column * width + 1] = 255
+    if not labels:
+        return film
+    times = robot.dt * every * np.arange(len(film))
+    return captioned(
+        film, tiles, (height, width), robot, times, range(count) if numbers is None else numbers,
+        exceeded_limits(robot, states, inputs, every), target is not None,
+    )  # fmt: skip
+
+
+def _add_backdrop(scene: Any) -> None:
+    """Add a grey wall far behind a scene whose model has no skybox, which would be black there."""
+    import mujoco
+
+    eye = (scene.camera[0].pos + scene.camera[1].pos) / 2
+    ahead, up = scene.camera[0].forward, scene.camera[0].up
+    far = 0.9 * scene.camera[0].frustum_far
+    wall = scene.geoms[scene.ngeom]
+    frame = np.stack([np.cross(up, -ahead), up, -ahead], axis=1)
+    mujoco.mjv_initGeom(
+        wall, mujoco.mjtGeom.mjGEOM_BOX, far * np.array([3, 3, 1e-3]), eye + far * ahead,
+        frame.ravel(), BACKGROUND,
+    )  # fmt: skip
+    wall.emission, wall.specular, wall.category = 1, 0, mujoco.mjtCatBit.mjCAT_DECOR
+    scene.ngeom += 1
+
+
+def _camera(model: Any, poses: np.ndarray, aspect: float) -> Any:
+    """Return MuJoCo's free camera, moved so that it sees what moves at all poses (k, nq).
+
+    aspect: width by height of a picture."""
+    import mujoco
+
+    camera, data = mujoco.MjvCamera(), mujoco.MjData(model)
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    moving = (model.body_weldid[model.geom_bodyid] != 0) & (model.geom_rbound > 0)
+    if not np.any(moving):
+        return camera
+    size, ends = model.geom_rbound[moving, None], []
+    for pose in poses:
+        data.qpos[:] = pose
+        mujoco.mj_kinematics(model, data)
+        at = data.geom_xpos[moving]
+        ends += [(at - size).min(axis=0), (at + size).max(axis=0)]
+    lower, upper = np.min(ends, axis=0), np.max(ends, axis=0)
+    half = np.deg2rad(model.vis.global_.fovy) / 2
+    narrow = min(half, np.arctan(np.tan(half) * aspect))
+    camera.lookat[:] = (lower + upper) / 2
+    camera.distance = 0.5 * np.linalg.norm(upper - lower) / np.sin(narrow)
+    return camera
+
+
+def _add_ghost(scene: Any, model: Any, data: Any) -> None:
+    """Add the moving bodies of a second robot to a scene, green and see-through.
+
+    Each is 1 % further from the camera than it should be, along its line of sight: what coincides
+    with the robot itself is then hidden behind it, rather than drawn in turns with it.
+    """
+    import mujoco
+
+    first, moving = scene.ngeom, mujoco.mjtCatBit.mjCAT_DYNAMIC.value
+    mujoco.mjv_addGeoms(model, data, mujoco.MjvOption(), mujoco.MjvPerturb(), moving, scene)
+    eye = (scene.camera[0].pos + scene.camera[1].pos) / 2
+    for geom in scene.geoms[first : scene.ngeom]:
+        geom.rgba[:] = [*(v / 255 for v in TARGET), OPACITY]
+        geom.matid, geom.reflectance = -1, 0.0
+        geom.pos[:] += 0.01 * (geom.pos - eye)
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """Frames (F, h, w, 3), uint8, of `render`, at `fps` of them a second: notebooks play it.
+
+    It is an image in the page (a GIF), so that a saved notebook needs no file beside it.
+    Raises ValueError for other frames.
+    """
+
+    frames: np.ndarray
+    fps: float
+
+    def __post_init__(self) -> None:
+        check_frames(self.frames, self.fps)
+
+    def _repr_html_(self) -> str:
+        """Return the film as HTML, which Jupyter shows."""
+        data = io.BytesIO()
+        write_gif(data, self.frames, self.fps)
+        text = base64.b64encode(data.getvalue()).decode()
+        return f'<img src="data:image/gif;base64,{text}" alt="{len(self.frames)} frames">'
+
+
+def save_video(path: str | Path, frames: Any, fps: float) -> None:
+    """Write frames (F, h, w, 3), uint8, as path.gif, or as path.mp4 if imageio has ffmpeg.
+
+    fps: frames a second; GIF rounds the time of a frame to 10 ms and joins frames that are equal.
+    Raises ValueError for other endings and frames, and where .mp4 cannot be written.
+    """
+    path, frames = Path(path), np.asarray(frames)
+    check_frames(frames, fps)
+    kind = path.suffix.lower()
+    if kind == ".gif":
+        write_gif(path, frames, fps)
+    elif kind == ".mp4":
+        try:
+            import imageio.v3 as imageio
+            import imageio_ffmpeg  # noqa: F401
+        except ImportError:
+            fail(
+                str(path), "MP4 needs imageio with ffmpeg", "Install imageio[ffmpeg], or give .gif"
+            )
+        imageio.imwrite(path, frames, fps=fps)
+    else:
+        fail(str(path), f"the ending {kind!r} is no video", "Give .gif or .mp4")
+
+
+def check_frames(frames: Any, fps: float) -> None:
+    """Raise ValueError unless these are frames, and a number of them a second."""
+    frames = np.asarray(frames)
+    if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or not frames.size:
+        problem = f"shape {frames.shape}, {frames.dtype}"
+        fail("frames", problem, "Give (frames, height, width, 3), uint8")
+    if not 0 < fps < np.inf:
+        fail("fps", f"{fps}", "Give a positive number")
+
+
+def write_gif(file: Any, frames: np.ndarray, fps: float) -> None:
+    """Write frames to a path or an open file, as a GIF that starts again at its end."""
+    from PIL import Image
+
+    # One palette for all frames: with one each, colours flicker.
+    sheet = Image.fromarray(frames[:: max(1, len(frames) // 8)].reshape(-1, *frames.shape[2:]))
+    palette = sheet.quantize(256)
+    first, *rest = (
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in frames
+    )
+    milliseconds = max(10, 10 * round(100 / fps))
+    first.save(file, format="GIF", save_all=True, append_images=rest, duration=milliseconds, loop=0)

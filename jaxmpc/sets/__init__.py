@@ -1,0 +1,41 @@
+"""Sets of states and inputs, in the coordinates and units of the system that they constrain.
+
+Box, Polytope, Ellipsoid         sets that contain, intersect, support, project
+maximal_invariant_set            largest set that a law u = K x keeps within limits
+invariant_ellipsoid              largest level set of x'Px that it keeps within limits
+maximal_control_invariant_set    largest set that some input keeps -> ControlInvariantSet
+predecessor                      states from which some input leads into a set
+joint_limits, output_limits      limits of robot joints and of outputs -> JointLimits, Box, Polytope
+named_terminal_set               terminal set from its name
+verify_terminal                  hypotheses of the stability theorems -> TerminalReport of Check
+"""
+
+from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
+from jaxmpc.sets.invariant import (
+    ControlInvariantSet,
+    invariant_ellipsoid,
+    maximal_control_invariant_set,
+    maximal_invariant_set,
+    predecessor,
+)
+from jaxmpc.sets.limits import JointLimits, joint_limits, output_limits
+from jaxmpc.sets.named_terminal import named_terminal_set
+from jaxmpc.sets.terminal import Check, TerminalReport, verify_terminal
+
+__all__ = [
+    "Box",
+    "Check",
+    "ControlInvariantSet",
+    "Ellipsoid",
+    "JointLimits",
+    "Polytope",
+    "TerminalReport",
+    "invariant_ellipsoid",
+    "joint_limits",
+    "maximal_control_invariant_set",
+    "maximal_invariant_set",
+    "named_terminal_set",
+    "output_limits",
+    "predecessor",
+    "verify_terminal",
+]

@@ -1,0 +1,278 @@
+"""Geometry of H x <= h in NumPy, in float64: hulls, redundant rows, elimination.
+
+About a point c with G c < g the set {G x <= g} reads {Y (x - c) <= 1}, Y = G / (g - G c). The rows
+of Y are points of the polar set: a row is irredundant exactly if it is a vertex of the convex
+hull of all of them and 0 (Ziegler 1995, section 2.3), and the polar of a projection is a section.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import scipy
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
+
+from jaxmpc.arrays import Reals, host_array
+from jaxmpc.checks import fail, require_finite
+from jaxmpc.sets.lp import Program, extent, framed, maximise
+
+_ZERO = 1e-12  # a coefficient that moves a row by less, relative to its distance, counts as 0
+_MERGE = "C-1e-12"  # qhull's option: merge facets of the dual that are flat to 1e-12
+_HULL_DIMENSIONS = 6  # above, hulls have too many facets and one LP a row is faster
+_MOST_ROWS = 100_000  # an elimination step with more candidate rows raises ValueError
+
+
+def largest_ball(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return (centre, radius) of the largest ball in {G x <= g}; ValueError if empty.
+
+    The LP max r subject to G_i x + |G_i| r <= g_i (Boyd & Vandenberghe 2004, section 4.3.1), with r
+    of either sign so that it is always feasible: 0, or negative by rounding, where the set is flat.
+    inf, and a point of the set, if there are balls of every radius.
+    """
+    n, length = G.shape[1], np.linalg.norm(G, axis=1)
+    if Program(G, g).empty:
+        fail(argument, "is empty: no point satisfies all its rows", "Loosen its rows")
+    top = maximise(np.eye(n + 1)[n], np.column_stack([G, length]), g)
+    if top.x is None:
+        return Program(G, g).margin()[0], np.inf
+    return top.x[:n], float(((g - G @ top.x[:n]) / length).min(initial=np.inf))
+
+
+def irredundant_rows(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows of a set with volume, which may be unbounded, that the others do not imply;
+    ValueError if it is empty or flat."""
+    keep = irredundant(framed(argument, G, g).Z)
+    return G[keep], g[keep]
+
+
+def binding_rows(H: np.ndarray, h: np.ndarray, argument: str = "Polytope") -> np.ndarray:
+    """Return the indices of the rows of H x <= h that can bind; ValueError for NaN and for empty
+    rows."""
+    require_finite(f"{argument}.H", H)
+    if np.isnan(h).any():
+        fail(f"{argument}.h", "holds NaN", "Use inf for a row that does not bind")
+    zero = ~H.any(axis=1)
+    if np.any((h == -np.inf) | (zero & (h < 0))):
+        fail(argument, "is empty: a row reads 0'x <= h < 0 or has h = -inf", "Remove that row")
+    return np.flatnonzero(~zero & (h < np.inf))
+
+
+def unit_rows(H: Any, h: Any, argument: str = "Polytope") -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows of H x <= h that can bind, scaled to norm 1, in float64."""
+    H, h = host_array(f"{argument}.H", H), host_array(f"{argument}.h", h)
+    binding = binding_rows(H, h, argument)
+    H, h = H[binding], h[binding]
+    length = np.linalg.norm(H, axis=1)
+    return H / length[:, None], h / length
+
+
+def hull_volume(points: Reals) -> float:
+    """Return the volume of the convex hull of points (k, n): 0 where they lie in a hyperplane.
+    NumPy; not traceable."""
+    points = host_array("points", points)
+    if len(points) <= points.shape[1]:
+        return 0.0
+    # qhull works best in coordinates of like size.
+    scale = np.ptp(points, axis=0)
+    if not scale.all():
+        return 0.0
+    if len(scale) == 1:
+        return float(scale[0])
+    scaled = (points - points.mean(axis=0)) / scale
+    # Clusters confuse qhull; one point of each spans a hull that is no larger.
+    try:
+        hull = ConvexHull(scaled[distinct(scaled, 1e-11)])
+    except QhullError:  # flat
+        return 0.0
+    return float(hull.volume * np.prod(scale))
+
+
+def dual_hull(Y: np.ndarray) -> HalfspaceIntersection:
+    """Return the vertices of {Y x <= 1} and the rows that meet in each, by a convex hull of Y
+    (qhull).
+
+    A zero row makes facets through 0, whose vertices are at infinity.
+    """
+    halfspaces = np.column_stack([Y, -np.ones(len(Y))])
+    with explained("Polytope"), np.errstate(divide="ignore", invalid="ignore"):
+        return HalfspaceIntersection(halfspaces, np.zeros(Y.shape[1]), qhull_options=_MERGE)
+
+
+@contextmanager
+def explained(argument: str) -> Iterator[None]:
+    """Turn errors of qhull into a ValueError that names the argument."""
+    try:
+        yield
+    except QhullError as error:
+        reason = str(error).splitlines()[0]
+        fail(argument, f"too ill-conditioned for qhull ({reason})", "Rescale the coordinates")
+
+
+def distinct(points: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return the indices of the points, of each cluster closer than `tolerance` only one."""
+    close = KDTree(points).query_pairs(tolerance, output_type="ndarray")
+    return np.setdiff1d(np.arange(len(points)), close.max(axis=1, initial=-1))
+
+
+def factors(Y: np.ndarray) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
+    """Write {Y x <= 1} as a product of sets, in the finest way its rows allow.
+
+    Returns ([(rows, Z), ...], S): in the coordinates s = S x the rows `rows` read Z t <= 1 with
+    t the factor's own entries of s, which no other factor's rows contain. S is square unless
+    rank Y < n: then directions along which the set is a cylinder are left out.
+
+    S consists of linearly independent rows of Y. Y = C S, and two rows share a factor if
+    they are connected through the nonzeros of C: these are the connected components of the
+    matroid of Y's rows (Oxley 2011, proposition 4.1.2 and section 4.2), so no other choice of
+    S would split further.
+    """
+    if len(Y) == 0:
+        return [], Y
+    scale = np.abs(Y).max(axis=0)
+    scaled = Y / np.where(scale > 0, scale, 1.0)
+    _, R, pivots = scipy.linalg.qr(scaled.T, mode="economic", pivoting=True)
+    diagonal = np.abs(np.diag(R))
+    rank = int((diagonal > _ZERO * diagonal[0]).sum())
+    S = pivots[:rank]
+    C = np.linalg.lstsq(scaled[S].T, scaled.T, rcond=None)[0].T
+    C[np.abs(C) <= _ZERO] = 0.0
+    row, column = np.nonzero(C)
+    size = len(Y) + rank
+    links = scipy.sparse.coo_array((np.ones(len(row)), (row, len(Y) + column)), (size, size))
+    count, label = connected_components(links, directed=False)
+    rows, columns = label[: len(Y)], label[len(Y) :]
+    parts = []
+    for part in range(count):
+        own = np.flatnonzero(rows == part)
+        parts.append((own, C[np.ix_(own, np.flatnonzero(columns == part))]))
+    return parts, Y[S]
+
+
+def irredundant(Y: np.ndarray, known: Sequence[int] | np.ndarray = ()) -> np.ndarray:
+    """Return the indices of the rows of Y x <= 1 that the others do not imply, ascending.
+
+    Arguments:
+        Y: (rows, n); the set may be unbounded.
+        known: indices of rows that are known to be irredundant.
+
+    Of rows that differ by less than about 1e-12, and of those that cut off less than about
+    1e-10 of the set's size (1e-12 in few dimensions), only one is kept, or none.
+
+    Factor by factor of the product that the rows make: in up to six dimensions by a hull of
+    the polar points, above by LPs.
+    """
+    length = np.linalg.norm(Y, axis=1)
+    directions = np.round(Y / np.where(length > 0, length, 1.0)[:, None], 12) + 0.0
+    order = np.argsort(-length, kind="stable")
+    _, first = np.unique(directions[order], axis=0, return_index=True)
+    candidates = np.sort(order[first])  # of parallel rows the closest
+    candidates = candidates[length[candidates] > 0]
+    known = np.isin(candidates, np.asarray(known, dtype=int))
+    keep = []
+    for rows, Z in factors(Y[candidates])[0]:
+        if not Z.size:  # rows of rounding errors, which cannot bind
+            continue
+        Z = Z / np.abs(Z).max(axis=0)
+        if Z.shape[1] == 1:
+            ends = {int(np.argmax(Z)), int(np.argmin(Z))}
+            kept = np.array([i for i in ends if Z[i, 0] == Z.max() > 0 or Z[i, 0] == Z.min() < 0])
+        elif Z.shape[1] <= _HULL_DIMENSIONS:
+            # The point 0 is a vertex of the hull if the set is unbounded, inside it otherwise.
+            hull = dual_hull(np.vstack([Z, np.zeros(Z.shape[1])]))
+            kept = np.setdiff1d(np.concatenate(hull.dual_facets), [len(Z)])
+        else:
+            kept = _by_programs(Z, known[rows])
+        keep.append(candidates[rows[kept]])
+    return np.sort(np.concatenate(keep)) if keep else np.zeros(0, dtype=int)
+
+
+def _by_programs(Y: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return the indices of the irredundant rows of Y x <= 1, by LPs whose rows are known
+    irredundant ones.
+
+    The first row that a ray from an interior point meets is irredundant. So an LP either
+    proves a row redundant, or its maximiser lies outside the set and the ray towards it finds
+    a new irredundant row: few rows an LP, however many are redundant (Clarkson 1994, "More
+    output-sensitive geometric algorithms", FOCS). The multipliers of one proof often prove others
+    too. The rays start off the centre, at random, so that none meets a corner.
+    """
+    keep = known.copy()
+    random = np.random.default_rng(0)
+    n = Y.shape[1]
+    start = random.standard_normal(n)
+    start *= 0.1 / (np.linalg.norm(start) * np.linalg.norm(Y, axis=1).max())
+    slack = 1 - Y @ start
+    count = min(len(Y), 3_000_000 // len(Y))
+    rays = np.vstack([Y[:count], random.standard_normal((2 * count, n))])
+    nearness = rays @ (Y / slack[:, None]).T  # 1 / distance along the ray to the row
+    second, first = np.argpartition(nearness, -2, axis=1)[:, -2:].T
+    ray = np.arange(len(rays))
+    nearest = nearness[ray, first]  # not above 0: the ray meets no row
+    keep[first[(nearest > 0) & (nearness[ray, second] < (1 - 1e-9) * nearest)]] = True
+    open_rows = ~keep
+    while open_rows.any():
+        i = int(np.argmax(open_rows))
+        # The row itself, loosened, keeps the LP bounded.
+        rows = np.vstack([Y[keep], Y[i]])
+        best = maximise(Y[i], *unit_rows(rows, np.append(np.ones(len(rows) - 1), 2.0)))
+        if best.x is not None and best.y is not None and best.value > 1 + 1e-10:
+            hit = int(np.argmax(Y @ (best.x - start) / slack))
+            i = i if keep[hit] else hit
+            keep[i], open_rows[i] = True, False
+            continue
+        open_rows[i] = False
+        if best.y is None:
+            continue
+        # The row is S'w with w >= 0 and sum(w) <= 1 for few rows S, and so are others often.
+        S = rows[best.y > 1e-9 * best.y.max()]
+        W = Y[open_rows] @ np.linalg.pinv(S)
+        error = np.abs(W @ S - Y[open_rows]).max(axis=1)
+        implied = (W >= 0).all(axis=1) & (W.sum(axis=1) <= 1 + 1e-10) & (error <= _ZERO)
+        open_rows[np.flatnonzero(open_rows)[implied]] = False
+    return np.flatnonzero(keep)
+
+
+def eliminate(Y: np.ndarray, axes: Sequence[int]) -> np.ndarray:
+    """Return the irredundant rows of the projection of {x : Y x <= 1} along the coordinates `axes`.
+
+    Fourier-Motzkin, one coordinate at a time, that with the fewest new rows first: of rows p
+    and q with p_j > 0 > q_j the convex combination with j-th entry 0, and all rows with j-th
+    entry 0. The latter stay irredundant: the facet of such a row holds the direction e_j or
+    projects onto as many dimensions as a facet needs. Columns of `axes` are dropped.
+
+    An entry that changes its row by less than 1e-12 within the set counts as 0.
+
+    Raises ValueError if a step makes more than 100,000 rows.
+    """
+    scale = np.abs(Y).max(axis=0, initial=0.0)
+    scale[scale == 0] = 1.0
+    Y = Y / scale
+    Y = Y[irredundant(Y)]
+    reach = np.full(Y.shape[1], np.inf)
+    reach[list(axes)] = extent(*unit_rows(Y, np.ones(len(Y))), axes)
+    left = list(axes)
+    while left:
+        entries = np.where(np.abs(Y[:, left]) <= _ZERO / reach[left], 0.0, Y[:, left])
+        above, below = (entries > 0).sum(axis=0), (entries < 0).sum(axis=0)
+        cheapest = int(np.argmin(above * below - above - below))
+        if above[cheapest] * below[cheapest] > _MOST_ROWS:
+            fail(
+                "axes",
+                f"{above[cheapest]} x {below[cheapest]} new rows to eliminate one coordinate",
+                "Keep more axes, or project fewer rows",
+            )
+        j, y = left.pop(cheapest), entries[:, cheapest]
+        plus, minus = Y[y > 0][:, None], Y[y < 0][None]
+        p, q = y[y > 0][:, None, None], -y[y < 0][None, :, None]
+        first, second = plus * (q / (p + q)), minus * (p / (p + q))
+        new = first + second
+        # What the sum cancels to rounding is 0.
+        new[np.abs(new) <= 8 * np.finfo(float).eps * (np.abs(first) + np.abs(second))] = 0.0
+        new[..., j] = 0.0
+        old = Y[y == 0]
+        old[:, j] = 0.0
+        Y = np.vstack([old, new.reshape(-1, Y.shape[1])])
+        Y = Y[irredundant(Y, np.arange(len(old)))]
+    return np.delete(Y * scale, list(axes), axis=1)

@@ -1,0 +1,157 @@
+"""Limits of joints and outputs as sets, their rows named."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from jaxmpc.arrays import Reals, host_array
+from jaxmpc.checks import fail, require_finite
+from jaxmpc.sets.convex import Box, Polytope
+
+Limit = float | Reals | tuple[Reals, Reals] | None
+
+
+@dataclass(frozen=True, eq=False)
+class JointLimits:
+    """Limits of n joints with the state x = (q, dq) in R^2n and the torques u in R^n.
+
+    states: Polytope in R^2n, a labelled row for each limit. inputs: Box in R^n.
+    state_names, state_units: 2n each; input_names, input_units: n each.
+    """
+
+    states: Polytope
+    inputs: Box
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_names: tuple[str, ...]
+    input_units: tuple[str, ...]
+
+    @property
+    def names(self) -> dict[str, tuple[str, ...]]:
+        """Return the names and units as LinearSystem takes them: LinearSystem(A, B,
+        **limits.names)."""
+        keys = ("state_names", "state_units", "input_names", "input_units")
+        return {key: getattr(self, key) for key in keys}
+
+
+def joint_limits(
+    position: Limit = None,
+    velocity: Limit = None,
+    torque: Limit = None,
+    *,
+    names: Sequence[str] | None = None,
+    units: Sequence[str | Sequence[str]] = ("rad", "rad/s", "N m"),
+) -> JointLimits:
+    """Return the limits of a robot's joints as sets, for x = (q, dq), q in R^n, and u the n
+    torques.
+
+    Arguments:
+        position, velocity, torque: (lower, upper), each a number for all joints or (n,) with
+            -inf or inf for no bound; one number v for |.| <= v; None for no limit.
+        names: of the n joints. Without names they are q1..qn, and n is the length of the
+            limits given as arrays (1 if there is none).
+        units: of position, velocity and torque; each a string, or n strings.
+
+    Returns JointLimits. With S_q = [I 0] and S_dq = [0 I], `states` is G_x x <= g_x,
+        G_x = [S_q; -S_q; S_dq; -S_dq],  g_x = (q_max, -q_min, dq_max, -dq_min),
+    without the rows of infinite bounds; `inputs` is the Box of the
+    torques. Rows are named after joints, such as "q1 <= 1.5 rad" and "dq1 >= -2 rad/s", or with
+    the joint's own name "elbow <= 1.5 rad" and "elbow velocity >= -2 rad/s".
+
+    Raises ValueError for limits that are not pairs, of different lengths, NaN or empty.
+    """
+    limits = {"position": position, "velocity": velocity, "torque": torque}
+    pairs = {key: limit_pair(key, value) for key, value in limits.items()}
+    sizes = {key: np.size(end) for key, pair in pairs.items() for end in pair if np.ndim(end)}
+    n = len(names) if names is not None else max(sizes.values(), default=1)
+    for key, pair in pairs.items():
+        for end in pair:
+            if np.shape(end) not in ((), (n,)):
+                fail(key, f"{np.size(end)} entries for {n} joints", "Give one a joint, or a number")
+    if isinstance(units, str) or len(units) != 3:
+        fail("units", f"{units!r} is not one of position, velocity, torque", "Give three")
+    if names is None:
+        numbers = range(1, n + 1)
+        q, dq, tau = ([f"{letter}{i}" for i in numbers] for letter in ("q", "dq", "tau"))
+    else:
+        q, dq, tau = ([name + what for name in names] for what in ("", " velocity", " torque"))
+    unit = [[u] * n if isinstance(u, str) else list(u) for u in units]
+    if any(len(u) != n for u in unit):
+        fail("units", f"{units!r} does not fit {n} joints", "Give a string, or one a joint")
+    selector = np.eye(2 * n)
+    positions = output_limits(selector[:n], *pairs["position"], q, unit[0], "position")
+    velocities = output_limits(selector[n:], *pairs["velocity"], dq, unit[1], "velocity")
+    inputs = Box(*(np.broadcast_to(end, n).copy() for end in pairs["torque"]))
+    inputs.validate("torque", n)
+    return JointLimits(
+        positions.intersect(velocities),
+        inputs,
+        (*q, *dq),
+        (*unit[0], *unit[1]),
+        tuple(tau),
+        tuple(unit[2]),
+    )
+
+
+def output_limits(
+    C: Reals,
+    lower: Reals | None,
+    upper: Reals | None,
+    names: Sequence[str] = (),
+    units: Sequence[str] = (),
+    argument: str = "limits",
+) -> Polytope:
+    """Return {x : lower <= C x <= upper} as [C; -C] x <= (upper, -lower), infinite rows dropped.
+
+    Arguments:
+        C: (p, n), one row an output.
+        lower, upper: numbers or (p,); -inf, inf or None for no bound.
+        names, units: of the p outputs, for the rows' labels; default y1..yp and no units.
+        argument: what errors call the limits.
+
+    Raises ValueError for wrong shapes, NaN, or lower > upper.
+    """
+    C = host_array("C", C)
+    if C.ndim != 2 or 0 in C.shape:
+        fail("C", f"shape {C.shape} is not (p, n)", "Give one row an output")
+    require_finite("C", C)
+    p = len(C)
+    ends = []
+    for name, value, free in (("lower", lower, -np.inf), ("upper", upper, np.inf)):
+        end = host_array(f"{argument}.{name}", free if value is None else value)
+        if end.shape not in ((), (p,)):
+            fail(f"{argument}.{name}", f"shape {end.shape} is not ({p},)", "Give one an output")
+        ends.append(np.broadcast_to(end, p))
+    Box(*ends).validate(argument, p)
+    for name, given in (("names", names), ("units", units)):
+        if isinstance(given, str) or len(given) not in (0, p):
+            fail(name, f"{given!r} is not one string an output", f"Give {p} strings, or none")
+    names = names or [f"y{i + 1}" for i in range(p)]
+    units = units or [""] * p
+    rows = [(sign, end, i) for sign, end in ((1, ends[1]), (-1, ends[0])) for i in range(p)]
+    rows = [(sign, end, i) for sign, end, i in rows if np.isfinite(end[i])]
+    relation = {1: "<=", -1: ">="}
+    return Polytope(
+        np.array([sign * C[i] + 0.0 for sign, _, i in rows]).reshape(-1, C.shape[1]),  # no -0.0
+        np.array([sign * end[i] + 0.0 for sign, end, i in rows]),
+        tuple(f"{names[i]} {relation[s]} {e[i]:.6g} {units[i]}".rstrip() for s, e, i in rows),
+    )
+
+
+def limit_pair(argument: str, limit: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return (lower, upper) of a limit given as in `joint_limits`."""
+    if limit is None:
+        return np.array(-np.inf), np.array(np.inf)
+    if not isinstance(limit, tuple | list) and np.ndim(limit) == 0:
+        bound = host_array(argument, limit)
+        return -bound, bound
+    if len(limit) != 2:
+        fail(
+            argument,
+            f"{limit!r} is not a pair",
+            "Give (lower, upper), each a number or one a joint, or one number v for |.| ≤ v",
+        )
+    lower, upper = (host_array(argument, end) for end in limit)
+    return lower, upper

@@ -1,0 +1,255 @@
+"""Linear systems in discrete time, x+ = A x + B u + c."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from numbers import Real
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+
+from jaxmpc.arrays import Reals, as_array, as_column, dimensions, host_array, store_floats
+from jaxmpc.checks import (
+    concrete,
+    fail,
+    nearest,
+    require_finite,
+    require_printable,
+    require_shape,
+)
+from jaxmpc.pytrees import pytree
+
+
+def require_period(argument: str, dt: Any) -> None:
+    """Raise unless `dt` is a positive finite Python number (seconds)."""
+    number = isinstance(dt, Real) and not isinstance(dt, bool)
+    if not (number and np.isfinite(dt) and dt > 0):
+        fail(argument, f"{dt!r} is not a positive number", "Give the sampling period in seconds")
+
+
+@pytree
+@dataclass(frozen=True, eq=False)
+class LinearSystem:
+    """x+ = A x + B u + c, with x in R^n and u in R^m.
+
+    Arguments:
+        A: (n, n), state to next state.
+        B: (n, m), input to next state.
+        c: (n,) constant drift, or None for zero. Linearizing off an equilibrium gives one.
+        dt: sampling period in seconds, or None where it does not matter.
+        state_names, input_names: tuples of n and m names; empty means x1..xn, u1..um.
+        state_units, input_units: tuples of n and m units ("rad", "N m"); empty means none.
+
+    A, B and c are pytree leaves (they may be batched and differentiated); the rest is
+    static. The constructor checks nothing, `validate` does, and takes a vector B (n,) as one input.
+    """
+
+    A: Reals
+    B: Reals
+    c: Reals | None = None
+    dt: float | None = field(default=None, metadata={"static": True})
+    state_names: tuple[str, ...] = field(default=(), metadata={"static": True})
+    input_names: tuple[str, ...] = field(default=(), metadata={"static": True})
+    state_units: tuple[str, ...] = field(default=(), metadata={"static": True})
+    input_units: tuple[str, ...] = field(default=(), metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        store_floats(self, "A", "B", "c")
+        if dimensions(self.A) == 2 and dimensions(self.B) == 1:
+            object.__setattr__(self, "B", as_column(self.B))
+
+    @property
+    def n(self) -> int:
+        """Return the number of states."""
+        return np.shape(as_array(self.A))[-1]
+
+    @property
+    def m(self) -> int:
+        """Return the number of inputs."""
+        return np.shape(as_array(self.B))[-1]
+
+    @property
+    def state_size(self) -> int:
+        """Return the length of the state of this plant: n (a robot with orientations has more)."""
+        return self.n
+
+    @property
+    def state_labels(self) -> tuple[str, ...]:
+        """Return n labels for axes and tables, such as "q [rad]"."""
+        return _labels(self.state_names or _numbered("x", self.n), self.state_units)
+
+    @property
+    def input_labels(self) -> tuple[str, ...]:
+        """Return m labels for axes and tables, such as "torque [N m]"."""
+        return _labels(self.input_names or _numbered("u", self.m), self.input_units)
+
+    def step(self, x: Reals, u: Reals) -> jax.Array:
+        """Return A x + B u + c for x (n,) and u (m,), computed in the dtype of x."""
+        x = jnp.asarray(x)
+        A, B = jnp.asarray(self.A, x.dtype), jnp.asarray(self.B, x.dtype)
+        product = lambda M, v: jnp.matmul(M, v, precision="highest")
+        after = product(A, x) + product(B, jnp.asarray(u, x.dtype))
+        return after if self.c is None else after + jnp.asarray(self.c, x.dtype)
+
+    def validate(self) -> None:
+        """Raise ValueError for wrong shapes, non-finite entries, bad dt or bad names."""
+        for name in ("A", "B") if self.c is None else ("A", "B", "c"):
+            value = getattr(self, name)
+            if concrete(value):
+                require_finite(name, host_array(name, value))
+        for name, shape in (("A", "(n, n)"), ("B", "(n, m)")):
+            given = np.shape(as_array(getattr(self, name)))
+            if len(given) != 2 or 0 in given:
+                fail(name, f"shape {given} is not {shape}", "Give a matrix")
+        n, m = self.n, self.m
+        require_shape("A", as_array(self.A), (n, n), "A must be square")
+        require_shape("B", as_array(self.B), (n, m), "Give B as many rows as A")
+        if self.c is not None:
+            require_shape(
+                "c",
+                as_array(self.c),
+                (n,),
+                "Give one number a state, or None; outputs are no part of a system: see jm.Outputs",
+            )
+        if self.dt is not None:
+            require_period("dt", self.dt)
+        for kind, count in (("state", self.n), ("input", self.m)):
+            for what in (f"{kind}_names", f"{kind}_units"):
+                _require_strings(what, getattr(self, what), count)
+            names = getattr(self, f"{kind}_names")
+            if len(set(names)) < len(names):
+                fail(f"{kind}_names", f"{names} has a name twice", "Give each a name of its own")
+
+    @classmethod
+    def from_continuous(
+        cls,
+        A: Reals,
+        B: Reals,
+        dt: float,
+        c: Reals | None = None,
+        **names: tuple[str, ...],
+    ) -> "LinearSystem":
+        """Sample dx/dt = A x + B u + c exactly, the input held constant over each period.
+
+        With w = (x, u, 1), dw/dt = M w for M = [[A, B, c], [0, 0, 0]], so the first n rows
+        of exp(M dt) are [Ad, Bd, cd] (Van Loan 1978, "Computing integrals involving the
+        matrix exponential").
+
+        Arguments:
+            A: (n, n) in 1/s, B: (n, m), c: (n,) or None: continuous-time matrices.
+            dt: sampling period in seconds.
+            names: state_names, input_names, state_units, input_units.
+
+        Raises ValueError for bad shapes or values, or dt <= 0.
+        """
+        require_period("dt", dt)
+        known = ("state_names", "input_names", "state_units", "input_units")
+        for key, value in names.items():
+            if key not in known:
+                delayed = "delay" in key.lower() or "latency" in key.lower()
+                fail(
+                    key, f"is no argument (A, B, dt, c, {', '.join(known)} are)",
+                    "Put the previous input into the state: for a delay below dt, "
+                    "LinearSystem([[A, B − B0], [0, 0]], [[B0], [I]], dt=dt) has the state "
+                    "(x, u₋₁), with A, B sampled at dt and B0 = from_continuous(A, B, dt − delay).B"
+                    if delayed else f"{nearest(key, known)}Leave it out",
+                )  # fmt: skip
+            if not isinstance(value, list | tuple):
+                fail(key, f"{value!r} is not a tuple of strings", 'Write it as ("q", "dq")')
+        tuples: dict[str, Any] = {key: tuple(value) for key, value in names.items()}
+        continuous = cls(A, B, c, dt, **tuples)
+        continuous.validate()
+        n, m = continuous.n, continuous.m
+        M = np.zeros((n + m + 1, n + m + 1))
+        M[:n, :n] = host_array("A", continuous.A)
+        M[:n, n:-1] = host_array("B", continuous.B)
+        if c is not None:
+            M[:n, -1] = host_array("c", c)
+        top = scipy.linalg.expm(M * dt)[:n]
+        return dataclasses.replace(
+            continuous, A=top[:, :n], B=top[:, n:-1], c=None if c is None else top[:, -1]
+        )
+
+    @classmethod
+    def from_object(cls, obj: Any, dt: float | None = None) -> "LinearSystem":
+        """Return the system held by any object with `.A`, `.B` and `.dt`.
+
+        Understands python-control (`dt=0` continuous, `dt=True` discrete with unspecified
+        period), scipy.signal (`lti` continuous, `dlti` discrete) and LinearSystem itself.
+        Labels (`state_labels`, `input_labels`) become names where present. Outputs are dropped.
+
+        Arguments:
+            obj: the object.
+            dt: sampling period in seconds. Required if `obj` is continuous (it is then
+                sampled with the input held); fills in an unspecified period; otherwise it
+                must agree with the object's own.
+
+        Raises ValueError rather than guess: continuous without dt, a period that differs
+        from dt, or an object that does not say whether it is continuous.
+        """
+        if isinstance(obj, LinearSystem):
+            obj.validate()
+            system = obj
+            period: Any = True if obj.dt is None else obj.dt
+        else:
+            for name in ("A", "B", "dt"):
+                if not hasattr(obj, name):
+                    fail("obj", f"has no .{name}", "Give a state-space object (in scipy: .to_ss())")
+            names: dict[str, Any] = {
+                f"{kind}_names": tuple(getattr(obj, f"{kind}_labels", None) or ())
+                for kind in ("state", "input")
+            }
+            A, B = host_array("obj.A", obj.A), host_array("obj.B", obj.B)
+            system, period = cls(A, B, **names), obj.dt
+            if period is None and isinstance(obj, scipy.signal.lti):
+                period = 0
+        if dt is not None:
+            require_period("dt", dt)
+        if period is None:
+            fail(
+                "obj.dt",
+                "is None, which does not say whether the system is continuous or discrete",
+                "Use LinearSystem.from_continuous(A, B, dt) or LinearSystem(A, B, dt=dt)",
+            )
+        if period is True:
+            period = dt
+        elif period == 0:
+            if dt is None:
+                fail("dt", "is missing and obj is continuous", "Give the sampling period, dt=...")
+            return cls.from_continuous(system.A, system.B, dt, **names)
+        elif dt is not None and not np.isclose(dt, period, rtol=1e-12, atol=0):
+            fail(
+                "dt",
+                f"{dt} differs from obj.dt = {period}",
+                "Leave dt out, or sample the continuous system again",
+            )
+        system = dataclasses.replace(system, dt=period)
+        system.validate()
+        return system
+
+
+def host_matrices(system: LinearSystem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return A (n, n), B (n, m) and c (n,), zero for None, as float64 NumPy arrays."""
+    A, B = host_array("A", system.A), host_array("B", system.B)
+    return A, B, np.zeros(len(A)) if system.c is None else host_array("c", system.c)
+
+
+def _numbered(letter: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{letter}{i + 1}" for i in range(count))
+
+
+def _labels(names: tuple[str, ...], units: tuple[str, ...]) -> tuple[str, ...]:
+    units = units or ("",) * len(names)
+    return tuple(
+        f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)
+    )
+
+
+def _require_strings(argument: str, value: Any, count: int) -> None:
+    if not isinstance(value, tuple) or not all(isinstance(name, str) for name in value):
+        fail(argument, f"{value!r} is not a tuple of strings", 'Write it as ("q", "dq")')
+    if len(value) not in (0, count):
+        fail(argument, f"{len(value)} entries where {count} are needed", "Give all or none")
+    require_printable(argument, *value)

@@ -1,0 +1,8 @@
+"""Prove what a stored map says once more, by code that shares nothing with what made the map.
+
+verify_map    prove the labels of a stored map again -> Verification
+"""
+
+from jaxmpc.verify.stored_maps import Verification, verify_map
+
+__all__ = ["Verification", "verify_map"]

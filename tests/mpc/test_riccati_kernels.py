@@ -1,0 +1,131 @@
+"""The GPU kernels of the stage recursions, run by Pallas' interpreter, and batches side by side on
+CPUs, against the scans."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmpc.mpc.stagewise.newton import riccati
+
+
+def batch(rng, N, n, m, staged):
+    """Two random problems: Q, R, A, B, gx, gu."""
+    square = lambda *shape: (
+        lambda W: jnp.asarray(W @ W.swapaxes(-1, -2) + np.eye(shape[-1]), jnp.float32)
+    )(rng.normal(size=(2, *shape)))
+    stages = (N,) if staged else ()
+    random = lambda *shape: jnp.asarray(0.4 * rng.normal(size=(2, *shape)), jnp.float32)
+    return (
+        square(N + 1, n, n), square(N, m, m), random(*stages, n, n), random(*stages, n, m),
+        random(N + 1, n), random(N, m),
+    )  # fmt: skip
+
+
+def close(found, expected):
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-5 * float(jnp.max(jnp.abs(b))))
+
+
+@pytest.mark.parametrize("staged", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_kernels_equal_the_scans(staged):
+    """N, n and m that are no powers of two, under vmap, as all programs of a batch run."""
+    rng = np.random.default_rng(3)
+    Q, R, A, B, gx, gu = batch(rng, 3, 5, 2, staged)
+    both = lambda scan, kernel, *args, **options: (
+        jax.vmap(lambda *a: kernel(*a, **options))(*args),
+        jax.vmap(lambda *a: scan(*a, **options))(*args),
+    )
+    found, gains = both(riccati._riccati_scan, riccati._riccati_kernel, Q, R, A, B)
+    close(found, gains)
+    close(*both(riccati._tracking_scan, riccati._tracking_kernel, *gains, A, B, gx, gu))
+    for adjoint in (False, True):
+        scan = lambda *a, adjoint: riccati._scan(*a, adjoint=adjoint, unroll=1)
+        close(*both(scan, riccati._recurrence_kernel, A, gx[:, 1:], gx[:, 0], adjoint=adjoint))
+
+
+@pytest.mark.first(1)
+@pytest.mark.parametrize("staged", [False, True])
+def test_a_batch_side_by_side_is_the_scan(staged):
+    """On CPUs: values, and the derivative of the scans, of nested batches too."""
+    with jax.enable_x64(True):
+        problems = batch(np.random.default_rng(2), 3, 5, 2, staged)[:4]
+        Q, R, A, B = (jnp.asarray(v, jnp.float64) for v in problems)
+        last = lambda v: jnp.moveaxis(v, 0, -1)
+        first = lambda v: jnp.moveaxis(v, -1, 0)
+        scan = jax.vmap(lambda *v: riccati._riccati_scan(*v))
+        own = lambda *v: jax.tree.map(first, riccati._riccati_lanes(*map(last, v)))
+        chosen = lambda Q, R, A, B: riccati.riccati_recursion(Q, R, None, A, B)
+        nested = jax.vmap(jax.vmap(chosen, (0, 0, None, 0)), (None, None, 0, None))
+        expected = jax.vmap(lambda A: scan(Q, R, jnp.stack([A, A]), B))(A)
+        for found, wanted in (
+            (own(Q, R, A, B), scan(Q, R, A, B)), (nested(Q, R, A, B), expected)
+        ):  # fmt: skip
+            for a, b in zip(found, wanted, strict=True):
+                np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+        slope = lambda of: jax.grad(lambda A: jnp.sum(of(Q, R, A, B).K ** 3))(A)
+        np.testing.assert_allclose(slope(jax.vmap(chosen)), slope(scan), rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_tracking_is_the_minimiser():
+    """Gradient of Σ ½ x'Qx + ½ u'Ru − g·(x, u) along its own x, u: zero (float64, by autodiff)."""
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(0)
+        Q, R, A, B, gx, gu = (
+            jnp.asarray(v[0], jnp.float64) for v in batch(rng, 4, 3, 2, True)
+        )  # fmt: skip
+        gains = riccati.riccati_recursion(Q, R, None, A, B)
+        x, u = riccati.tracking(gains, A, B, gx, gu)
+
+        def value(u):
+            states = [jnp.zeros(3)]
+            for k in range(4):
+                states.append(A[k] @ states[-1] + B[k] @ u[k])
+            s = jnp.stack(states)
+            quadratic = jnp.einsum("ki,kij,kj", s, Q, s) + jnp.einsum("ki,kij,kj", u, R, u)
+            return quadratic / 2 - jnp.sum(gx * s) - jnp.sum(gu * u), s
+
+        gradient, states = jax.grad(value, has_aux=True)(u)
+        np.testing.assert_allclose(states, x, atol=1e-12)
+        np.testing.assert_allclose(gradient, 0, atol=1e-11)
+
+
+def test_a_kernel_is_chosen_on_gpus_only(monkeypatch):
+    """And only for sides that a warp holds; its derivative is the scan's."""
+    calls = []
+
+    def kernel(v):
+        calls.append(v.shape)
+        return v**2
+
+    scan = lambda v: v**2
+    monkeypatch.setattr(riccati, "on_gpu", lambda: False)
+    assert riccati._or_kernel(scan, kernel, jnp.ones(3)).shape == (3,) and not calls
+    monkeypatch.setattr(riccati, "on_gpu", lambda: True)
+    riccati._or_kernel(scan, kernel, jnp.ones(33))
+    assert not calls
+    one = jnp.array([3.0])
+    assert jax.grad(lambda v: riccati._or_kernel(scan, kernel, v)[0])(one) == 6
+    assert calls == [] or set(calls) == {(1,)}
+    assert riccati._or_kernel(scan, kernel, one) == 9 and calls
+
+
+def test_derivatives_under_vmap_and_jit(monkeypatch):
+    """Where the kernels run, a batched loop has the derivative of the scans, in both modes."""
+    rng = np.random.default_rng(1)
+    _, _, A, _, gx, _ = batch(rng, 3, 4, 2, False)
+
+    def loop(A, gx):
+        def sample(x, w):
+            states = riccati.recurrence(A, jnp.stack([w, w]), x)
+            return jnp.concatenate([x[None], states])[2], None
+
+        return jnp.sum(jax.lax.scan(sample, gx[0], gx[1:])[0] ** 2)
+
+    total = lambda A, gx: jnp.sum(jax.vmap(loop)(A, gx))
+    by = lambda mode: jax.jit(mode(lambda A, gx: total(A, gx)))(A, gx)
+    scans = by(jax.grad)
+    monkeypatch.setattr(riccati, "on_gpu", lambda: True)
+    close(by(jax.grad), scans)
+    close(by(jax.jacfwd), scans)

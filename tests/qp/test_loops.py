@@ -1,0 +1,92 @@
+"""Loops that instances leave one by one, against plain Python; answers beside their neighbours."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmpc as jm
+from jaxmpc.qp import loops
+from jaxmpc.qp.loops import BLOCK, group_sizes, in_blocks, repeat_while, true_places
+
+
+def collatz(start: int) -> int:
+    steps = 0
+    while start != 1:
+        start, steps = start // 2 if start % 2 == 0 else 3 * start + 1, steps + 1
+    return steps
+
+
+def counted(multiplier, start):
+    """Steps until 1, with the 3 of the rule as a constant of the loop."""
+
+    def step(multiplier, state):
+        n, steps = state
+        return jnp.where(n % 2 == 0, n // 2, multiplier * n + 1), steps + 1
+
+    state = jnp.asarray(start, jnp.int32), jnp.int32(0)
+    return repeat_while(lambda state: state[0] != 1, step, multiplier, state)[1]
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 300, 1000])
+def test_each_instance_takes_its_own_number_of_steps(count):
+    """Sizes below one group, of several groups, and none at all."""
+    starts = np.arange(1, count + 1, dtype=np.int32)
+    found = jax.jit(jax.vmap(counted, in_axes=(None, 0)))(jnp.int32(3), starts)
+    np.testing.assert_array_equal(found, [collatz(int(n)) for n in starts])
+
+
+@pytest.mark.parametrize("axes", [(None, 0), (0, 0), (0, None)])
+def test_nested_batches(axes):
+    """The outer batch has constants of its own, or states of its own, or both."""
+    starts = np.arange(1, 25, dtype=np.int32).reshape(4, 6)
+    multipliers = jnp.full(4, 3, jnp.int32)
+    inner = jax.vmap(counted, in_axes=(None, 0))
+    outer = jax.vmap(inner, in_axes=axes)
+    found = outer(
+        multipliers if axes[0] == 0 else jnp.int32(3), starts if axes[1] == 0 else starts[0]
+    )
+    wanted = starts if axes[1] == 0 else np.broadcast_to(starts[0], (4, 6))
+    np.testing.assert_array_equal(found, np.vectorize(collatz)(wanted))
+
+
+def test_groups_cover_and_shrink():
+    for batch in (1, 31, 256, 257, 4096, 1 << 20):
+        sizes = group_sizes(batch)
+        assert sizes[0] <= batch and sizes == sorted(sizes, reverse=True)
+
+
+@pytest.mark.parametrize("long", [10, 5])
+def test_true_places(long, monkeypatch):
+    """Put in their places, and looked up."""
+    monkeypatch.setattr(loops, "LONG", long)
+    mask = np.array([0, 1, 1, 0, 1], bool)
+    np.testing.assert_array_equal(true_places(mask, 2), [1, 2])
+    np.testing.assert_array_equal(true_places(mask, 4), [1, 2, 4, 5])
+
+
+def test_blocks_are_the_batch():
+    x = np.arange(2.0 * BLOCK + 3)
+    square = lambda c, v: c * v**2
+    found = jax.vmap(lambda v: in_blocks(square, jnp.float32(2), v))(x.astype(np.float32))
+    np.testing.assert_allclose(found, 2 * x.astype(np.float32) ** 2, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_an_answer_is_its_own_in_any_batch():
+    """Feasible and infeasible programs side by side: those of a batch of one."""
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(0)
+        A = np.vstack([np.eye(4), rng.standard_normal((8, 4))])
+        P, u = np.diag([1.0, 2.0, 3.0, 4.0]), np.ones(12)
+        q, l = 5 * rng.standard_normal((40, 4)), np.tile(-u, (40, 1))
+        l[::3, 4] = 20.0  # no point keeps this row and the others
+        upper = np.maximum(l, u)
+        solve = lambda q, l, u: jm.solve_qp(jm.QP(P, q, A, l, u))
+        many = jax.jit(jax.vmap(solve))(q, l, upper)
+        assert set(np.asarray(many.status[::3])) == {jm.Status.PRIMAL_INFEASIBLE}
+        for i in (0, 1, 2, 17):
+            one = solve(q[i], l[i], upper[i])
+            assert one.status == many.status[i]
+            if one.status == jm.Status.SOLVED:
+                np.testing.assert_allclose(many.z[i], one.z, atol=1e-9)

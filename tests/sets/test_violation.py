@@ -1,0 +1,58 @@
+"""By how much limits are violated: Box, Polytope and rows, NumPy and JAX, NaN and infinity."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmpc as jm
+from jaxmpc.sets.violations import TOLERANCE, kept, row_violations, worst_violation
+
+INF = np.inf
+BOX = jm.Box(np.array([-1.0, -INF]), np.array([2.0, 3.0]))
+POINTS = np.array([[0.0, 0.0], [-1.5, 3.25], [2.0, 3.0], [np.nan, 0.0], [0.0, -INF]])
+EXPECTED = np.array([[0, 0], [0.5, 0.25], [0, 0], [np.nan, 0], [0, np.nan]])
+
+
+@pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
+def test_box(array):
+    found = row_violations(BOX, array(POINTS))
+    assert isinstance(found, jax.Array) == (array is jnp.asarray)
+    np.testing.assert_array_equal(found, EXPECTED)
+    np.testing.assert_array_equal(worst_violation(BOX, array(POINTS)), [0, 0.5, 0, np.nan, np.nan])
+    np.testing.assert_array_equal(kept(BOX, array(POINTS)), EXPECTED == 0)
+
+
+@pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
+def test_polytope_and_rows(array):
+    """The same limits in three ways: their largest violation is the same."""
+    body, rows = BOX.to_polytope(), BOX.rows()
+    for limits in (body, rows):
+        np.testing.assert_array_equal(
+            worst_violation(limits, array(POINTS)), worst_violation(BOX, array(POINTS))
+        )
+        np.testing.assert_array_equal(
+            kept(limits, array(POINTS)).all(axis=-1), [True, False, True, False, False]
+        )
+    slanted = jm.Polytope(np.array([[3.0, 4.0]]), np.array([5.0]))
+    assert row_violations(slanted, array([1.0, 1.0])) == 2.0
+
+
+def test_no_limits():
+    assert row_violations(None, POINTS).shape == (5, 0)
+    np.testing.assert_array_equal(worst_violation(None, np.zeros((2, 3))), [0, 0])
+    assert kept(None, np.zeros((2, 3))).all()
+
+
+def test_tolerance_is_relative_above_one():
+    limits = jm.Box(np.array([-0.5]), np.array([150.0]))
+    at = TOLERANCE["float64"]
+    points = np.array([[150 * (1 + 0.9 * at)], [150 * (1 + 1.1 * at)], [-0.5 - 0.9 * at], [-0.51]])
+    np.testing.assert_array_equal(kept(limits, points)[:, 0], [True, False, True, False])
+    assert kept(limits, points, np.float32)[:, 0].tolist() == [True, True, True, False]
+
+
+def test_traced_limits():
+    """Limits may be traced where points are not, and derivatives pass."""
+    worst = lambda end: worst_violation(jm.Box([-1.0], [end]), np.array([3.0]))
+    assert jax.jit(jax.grad(worst))(2.0) == -1.0
