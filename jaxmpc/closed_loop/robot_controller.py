@@ -50,7 +50,7 @@ class RobotController:
     sqp_steps: quadratic programs a sample at most. With "trajectory" more than one solve the
       nonlinear problem (`solve_nonlinear`, Gauss and Newton's Hessian), and the status is that of
       the nonlinear problem.
-    penalty: L1 weight (cost per unit) with which state limits and terminal rows are soft. Where it
+    rho: L1 weight (cost per unit) with which state limits and terminal rows are soft. Where it
       exceeds the multipliers of the hard problem, plans keep the limits whenever the model can
       (exact penalty), and elsewhere trade violations against the cost by that weight. Each such
       plan is counted: `Run.fallback`. Input limits are hard.
@@ -69,7 +69,7 @@ class RobotController:
     solver: ADMM
     linearize: str = field(metadata={"static": True})
     exact: bool = field(metadata={"static": True})
-    penalty: Any
+    rho: Any
     tasks: tuple[Task, ...]
     sqp_steps: int = field(metadata={"static": True})
     soft: Any = field(init=False)
@@ -78,16 +78,16 @@ class RobotController:
 
     def __init__(
         self, robot: Any, mpc: MPC, solver: ADMM | None = None, linearize: str = "state",
-        exact: bool = False, penalty: Any = 1e4, tasks: tuple[Task, ...] = (), sqp_steps: int = 1,
+        exact: bool = False, rho: Any = 1e4, tasks: tuple[Task, ...] = (), sqp_steps: int = 1,
     ) -> None:  # fmt: skip
         solver = DEFAULT if solver is None else solver
         if solver.iterations is None and linearize != "set-point":
             solver = replace(solver, iterations=0)
         exact = exact or sqp_steps > 1
-        parts = prepared(robot, mpc, solver, linearize, penalty, tasks, sqp_steps)
+        parts = prepared(robot, mpc, solver, linearize, rho, tasks, sqp_steps)
         self.__dict__.update(
             robot=robot, mpc=mpc, solver=arrays(solver), linearize=linearize, exact=exact,
-            penalty=penalty, tasks=tuple(tasks), sqp_steps=int(sqp_steps), **parts,
+            rho=rho, tasks=tuple(tasks), sqp_steps=int(sqp_steps), **parts,
         )  # fmt: skip
 
     @property
@@ -186,7 +186,7 @@ def as_model(robot: Any, exact: bool = True) -> Any:
 
 
 def prepared(
-    robot: Any, mpc: MPC, solver: ADMM, linearize: str, penalty: Any, tasks: Any, sqp_steps: Any
+    robot: Any, mpc: MPC, solver: ADMM, linearize: str, rho: Any, tasks: Any, sqp_steps: Any
 ) -> dict[str, Any]:  # fmt: skip
     """Check the arguments of a RobotController and compute what all its samples share.
 
@@ -206,7 +206,7 @@ def prepared(
     for name, given in (("tasks", len(tasks) > 0), ("sqp_steps", sqp_steps > 1)):
         if given and linearize != "trajectory":
             fail(name, f"given with linearize={linearize!r}", 'Give linearize="trajectory"')
-    soft = soften(mpc, penalty)
+    soft = soften(mpc, rho)
     if linearize == "set-point":
         return {"soft": arrays(soft), "fixed": Controller(soft, solver), "scale": None}
     if linearize == "trajectory":

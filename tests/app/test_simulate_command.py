@@ -204,7 +204,7 @@ def test_help_is_a_page_a_stranger_can_use(capsys):
     assert caught.value.code == 0
     text = capsys.readouterr().out
     options = """robot count seconds target spread seed linearize horizon state-weights
-        input-weights margin penalty iterations refine mass damping payload tolerance dtype chunk
+        input-weights margin rho iterations newton-steps mass damping payload tolerance dtype chunk
         devices video output resume overwrite"""
     for word in options.split():
         assert f"--{word}" in text

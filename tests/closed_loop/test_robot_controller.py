@@ -73,7 +73,7 @@ def mpc_of(robot):
 
 
 def controller_of(robot, mode):
-    return jm.RobotController(robot, mpc_of(robot), PRECISE, linearize=mode, penalty=PENALTY)
+    return jm.RobotController(robot, mpc_of(robot), PRECISE, linearize=mode, rho=PENALTY)
 
 
 def loops_of(robot, mode, steps=100):
@@ -345,7 +345,7 @@ def test_bad_problems_and_controllers_are_named(pendulum, linear_mpc):
             lambda: jm.RobotController(two, mpc, solver),
             r"mpc: has \(2, 1\) states and inputs. This robot has \(4, 2\): robot_mpc makes",
         ),
-        (lambda: jm.RobotController(pendulum, mpc, solver, penalty=-1.0), "rho"),
+        (lambda: jm.RobotController(pendulum, mpc, solver, rho=-1.0), "rho"),
         (lambda: jm.RobotController(pendulum, mpc, jm.ADMM(rho=[1.0, 2.0])), "rho: shape"),
         (lambda: follow([1.0, 2.0]), "K: shape .2,. where .1, 2. is needed"),
         (lambda: follow([[np.nan, 2.0]]), "K: holds NaN"),

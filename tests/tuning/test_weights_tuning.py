@@ -238,7 +238,7 @@ def test_derivatives_through_a_robot(x64, linearize):
     def cost(v):
         problem = replace(mpc, Q=v["Q"], R=v["R"])
         controller = jm.RobotController(
-            robot, problem, jm.ADMM(iterations=50, refine=8), linearize, penalty=v["rho"]
+            robot, problem, jm.ADMM(iterations=50, refine=8), linearize, rho=v["rho"]
         )
         loop = lambda x0: loss(jm.simulate(controller, robot, x0, 10, **goal))
         return jnp.mean(jax.vmap(loop)(x0s))

@@ -113,9 +113,9 @@ class RobotRuns:
             if command.linearize == "lqr":
                 controller = LinearFeedback(mpc, lqr(mpc.system, mpc.Q, mpc.R).K, robot)
             else:
-                solver = ADMM(iterations=command.iterations, refine=command.refine)
+                solver = ADMM(iterations=command.iterations, refine=command.newton_steps)
                 controller = RobotController(
-                    robot, mpc, solver, linearize=str(command.linearize), penalty=command.penalty
+                    robot, mpc, solver, linearize=str(command.linearize), rho=command.rho
                 )
         with jax.enable_x64(True):
             reference = np.asarray(robot.coordinates(x))
@@ -192,7 +192,7 @@ def require_sizes(command: "Simulate", robot: Robot) -> None:
 
 
 # Options that change the compiled programs.
-PROGRAM = ("horizon", "linearize", "iterations", "refine", "dtype", "devices")
+PROGRAM = ("horizon", "linearize", "iterations", "newton_steps", "dtype", "devices")
 # The fields of `Run` that the store keeps: no robot here has an observer.
 STORED = tuple(
     field.name for field in dataclasses.fields(Run) if field.name not in ("slack", "estimates")

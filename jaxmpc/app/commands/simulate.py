@@ -24,7 +24,7 @@ from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.files import write_json
 
 # Defaults of options that --config can give too.
-USUAL = {"horizon": 20, "margin": 0.02, "linearize": "state", "penalty": 1e4}
+USUAL = {"horizon": 20, "margin": 0.02, "linearize": "state", "rho": 1e4}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Simulate:
       drives all of them to a target: physics by MuJoCo MJX, at each sample a linear model and an
       MPC that keeps joint, velocity and torque limits. Then assesses every run by its own
       states and inputs, not by what the MPC planned.
-      Limits that a plan cannot keep are violated at the cost --penalty (fallback), and counted.
+      Limits that a plan cannot keep are violated at the cost --rho (fallback), and counted.
 
     How to start
       $ jaxmpc simulate
@@ -118,11 +118,11 @@ class Simulate:
     """Diagonal of R, one number an actuator."""
     margin: Annotated[float | None, option("FRACTION", "from --config, else 0.02")] = None
     """Room that the MPC leaves to state limits, as a fraction of half the range."""
-    penalty: Annotated[float | None, option("RHO", "from --config, else 1e4")] = None
+    rho: Annotated[float | None, option("RHO", "from --config, else 1e4")] = None
     """L1 weight of state limits; too small a weight violates limits that could be kept."""
     iterations: Annotated[int | None, option("K", "0; with set-point 50")] = None
     """ADMM steps of each plan."""
-    refine: Annotated[int | None, option("K", "as many as are needed")] = None
+    newton_steps: Annotated[int | None, option("K", "as many as are needed")] = None
     """Newton steps after them at most. A number bounds the time of a plan and gives up the
     interior point method, which solves what Newton steps do not."""
     mass: Annotated[float, option("FRACTION", "0")] = 0.0
@@ -190,7 +190,7 @@ class Simulate:
             file = load_robot_config(self.config)
             found |= {
                 "horizon": file.robot.horizon, "margin": file.robot.margin,
-                "linearize": file.robot.linearize, "penalty": file.cost.rho,
+                "linearize": file.robot.linearize, "rho": file.cost.rho,
             }  # fmt: skip
         missing = {key: value for key, value in found.items() if getattr(self, key) is None}
         return dataclasses.replace(self, **missing)
@@ -198,8 +198,8 @@ class Simulate:
     def check(self) -> None:
         """Raise ValueError for options that make no sense."""
         chosen_devices(self.devices, "--devices")
-        check_counts(self, count=1, horizon=1, iterations=0, refine=0, video=0, seed=0, chunk=1)
-        check_positive(self, "seconds", "penalty", "tolerance")
+        check_counts(self, count=1, horizon=1, iterations=0, newton_steps=0, video=0, seed=0, chunk=1)
+        check_positive(self, "seconds", "rho", "tolerance")
         for name, wrong, cure in (
             ("target", lambda v: False, "Give finite numbers"),
             ("state_weights", lambda v: v < 0, "Give finite numbers, at least 0"),

@@ -325,8 +325,8 @@ def robot_task(command: Any) -> TuningTask:
     dtype = command.dtype or "float32"
     loss = loss_of(command, Q, R, robot.state_limits, robot, r, s)
 
-    def controller(mpc: MPC, penalty: Any, linearize: str) -> RobotController:
-        return RobotController(robot, mpc, solver, linearize=linearize, penalty=penalty)
+    def controller(mpc: MPC, rho: Any, linearize: str) -> RobotController:
+        return RobotController(robot, mpc, solver, linearize=linearize, rho=rho)
 
     def make(values: Mapping[str, Any]) -> RobotController:
         changed = dataclasses.replace(mpc, Q=values.get("Q", Q), R=values.get("R", R))
