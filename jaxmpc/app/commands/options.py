@@ -109,11 +109,11 @@ def check_counts(command: Any, **least: int) -> None:
     """Raise ValueError for an option that is given and below its least value, or too large for a
     count."""
     for name, lowest in least.items():
-        value = getattr(command, name)
+        value, option = getattr(command, name), f"--{name.replace('_', '-')}"
         if value is not None and value < lowest:
-            fail(f"--{name}", f"{value}", f"Give a whole number, at least {lowest}")
+            fail(option, f"{value}", f"Give a whole number, at least {lowest}")
         if value is not None and value > MOST_COUNT:
-            fail(f"--{name}", f"{value}", f"Give at most {MOST_COUNT}")
+            fail(option, f"{value}", f"Give at most {MOST_COUNT}")
 
 
 def check_positive(command: Any, *names: str) -> None:

@@ -198,7 +198,8 @@ class Simulate:
     def check(self) -> None:
         """Raise ValueError for options that make no sense."""
         chosen_devices(self.devices, "--devices")
-        check_counts(self, count=1, horizon=1, iterations=0, newton_steps=0, video=0, seed=0, chunk=1)
+        check_counts(self, count=1, horizon=1, iterations=0, newton_steps=0)
+        check_counts(self, video=0, seed=0, chunk=1)
         check_positive(self, "seconds", "rho", "tolerance")
         for name, wrong, cure in (
             ("target", lambda v: False, "Give finite numbers"),
