@@ -516,7 +516,7 @@ CALLS = [
     ("x0s: 'x' where real numbers are", lambda: jm.exact_penalty(M, "x")),
     ("steps: 0. Give a whole number of at", lambda: jm.recursive_feasibility(M, steps=0)),
     ("steps: 1.5. Give a whole number of at", lambda: jm.recursive_feasibility(M, steps=1.5)),
-    ("regions: -1. Give a whole number of at", lambda: jm.recursive_feasibility(M, regions=-1)),
+    ("max_regions: -1. Give a whole number", lambda: jm.recursive_feasibility(M, max_regions=-1)),
     ("seconds: 0. Give a positive number", lambda: jm.recursive_feasibility(M, seconds=0)),
     ("seconds: '1'. Give a positive number", lambda: jm.recursive_feasibility(M, seconds="1")),
     ("system: is a str. Give a jm.LinearSystem", lambda: jm.lqr("S", np.eye(2), np.eye(1))),

@@ -88,8 +88,8 @@ class ExactPenalty:
 
 def exact_penalty(
     mpc: MPC, x0s: Reals | None = None, *, method: str = "auto", rho: float | None = None,
-    limit: int = 2000, within: Box | Polytope | None = None, samples: int = 200, seed: int = 0,
-    seconds: float = np.inf,
+    max_regions: int = 2000, within: Box | Polytope | None = None, samples: int = 200,
+    seed: int = 0, seconds: float = np.inf,
 ) -> ExactPenalty:  # fmt: skip
     """Return the exact-penalty threshold of an MPC problem with an L1 penalty on slacks.
 
@@ -106,10 +106,10 @@ def exact_penalty(
     when the regions are complete. "samples": a lower bound, from `samples` rays to the boundary of
     X_N and a search across facets from the best regions found (on a region λ is maximised by LPs);
     it can miss the greatest. "auto": regions up to four states, and samples as well where there are
-    more than `limit` regions. Where active rows are dependent the multipliers are not unique, and
-    an LP finds those with the least maximum. rho: a weight to check; None: those of `mpc.soft`, if
-    any. within: the set of initial states, needed where X_N is unbounded. seconds: after which the
-    search stops, and rho_bar is a lower bound.
+    more than `max_regions` of them. Where active rows are dependent the multipliers are not unique,
+    and an LP finds those with the least maximum. rho: a weight to check; None: those of `mpc.soft`,
+    if any. within: the set of initial states, needed where X_N is unbounded. seconds: after which
+    the search stops, and rho_bar is a lower bound.
 
     Raises ValueError for ill-posed problems, wrong arguments, an ellipsoidal terminal set, no soft
     row, and where X_N is empty, flat or unbounded. NumPy in float64; not traceable.
@@ -135,7 +135,7 @@ def exact_penalty(
     regions: CriticalRegions | None = None
     few = len(p.center) <= ENUMERATED
     if method == "regions" or (method == "auto" and few):
-        search = explore(p, limit, deadline)
+        search = explore(p, max_regions, deadline)
         regions = CriticalRegions.of(mpc, search)
         for c in search.found:
             found[c.law.active] = weigh.over(c.law, c.vertices)

@@ -147,14 +147,18 @@ class CriticalRegions:
 
 
 def critical_regions(
-    mpc: MPC, *, limit: int = 5000, within: Box | Polytope | None = None, seconds: float = np.inf
+    mpc: MPC,
+    *,
+    max_regions: int = 5000,
+    within: Box | Polytope | None = None,
+    seconds: float = np.inf,
 ) -> CriticalRegions:
     """Return all critical regions of positive volume of the MPC problem (multiparametric QP).
 
     The state is x, or (x, u_{−1}) with u_{−1} within `mpc.inputs` where input rates matter, as for
     `feasible_polytope`. Equalities that rows imply, as two opposite ones do, are taken out first.
 
-    limit: the most regions to look for. within: the set of initial states, needed where the
+    max_regions: the most regions to look for. within: the set of initial states, needed where the
     feasible set X_N is unbounded. seconds: after which the search stops (some linear programs and
     the hull of all vertices are finished; in five and six dimensions that may take long). The
     search crosses every facet of every region: a row that becomes active joins the active set, a
@@ -174,7 +178,7 @@ def critical_regions(
     mpc.validate()
     if mpc.soft:
         fail("mpc.soft", "has rows, and slacks make another QP", "Make the rows hard first")
-    return CriticalRegions.of(mpc, explore(least_distance_form(mpc, within), limit, deadline))
+    return CriticalRegions.of(mpc, explore(least_distance_form(mpc, within), max_regions, deadline))
 
 
 def region(p: LeastDistanceForm, c: Cell) -> Region:

@@ -25,8 +25,8 @@ class RegionSearch:
     """Breadth-first search across facets, from random points again until X_N is full. cells: active
     set → region, None for no volume."""
 
-    def __init__(self, p: LeastDistanceForm, limit: int, deadline: float = np.inf) -> None:
-        self.p, self.limit, self.deadline = p, limit, deadline
+    def __init__(self, p: LeastDistanceForm, max_regions: int, deadline: float = np.inf) -> None:
+        self.p, self.max_regions, self.deadline = p, max_regions, deadline
         self.begun = time.perf_counter()
         self.random = np.random.default_rng(0)
         self.cells: dict[tuple[int, ...], Cell | None] = {}
@@ -35,8 +35,8 @@ class RegionSearch:
 
     @property
     def full(self) -> bool:
-        """Return True once the limit is reached, or the deadline."""
-        return len(self.found) >= self.limit or self.late
+        """Return True once there are `max_regions`, or the deadline."""
+        return len(self.found) >= self.max_regions or self.late
 
     @property
     def late(self) -> bool:
@@ -108,7 +108,7 @@ class RegionSearch:
             if self.late:
                 return False, f"stopped by the time limit, after {len(self.found)} regions"
             if self.full:
-                return False, f"stopped at the limit of {self.limit} regions"
+                return False, f"stopped at the limit of {self.max_regions} regions"
             points = np.concatenate([c.vertices for c in self.found])
             volumes, whole = sum(volume(c.vertices) for c in self.found), volume(points)
             hull = Polytope.from_points(points)
@@ -146,16 +146,16 @@ class RegionSearch:
         return False, why.replace("the volumes of", "a part was not found: the volumes of")
 
 
-def explore(p: LeastDistanceForm, limit: Any, deadline: float = np.inf) -> RegionSearch:
+def explore(p: LeastDistanceForm, max_regions: Any, deadline: float = np.inf) -> RegionSearch:
     """Run the search from an interior point across all facets, until the deadline of
     `time.monotonic`, and return it."""
-    limit = whole("limit", limit, 1)
+    max_regions = whole("max_regions", max_regions, 1)
     if len(p.center) > DIMENSIONS:
         fail(
             "mpc", f"its states have {len(p.center)} coordinates, too many for vertices",
             f"Regions serve up to {DIMENSIONS}; exact_penalty(method='samples') serves more",
         )  # fmt: skip
-    search = RegionSearch(p, limit, deadline)
+    search = RegionSearch(p, max_regions, deadline)
     search.visit(p.active(p.interior))
     search.cross_all()
     for _ in range(REPAIRS):

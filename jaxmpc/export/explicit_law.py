@@ -131,7 +131,9 @@ def export_explicit_c(
         tolerance = TOLERANCE[dtype]
     number("tolerance", tolerance, 0, "Give a positive number")
     if not regions.complete:
-        fail("regions", f"are not all of the law ({regions.reason})", "Raise limit or seconds")
+        fail(
+            "regions", f"are not all of the law ({regions.reason})", "Raise max_regions or seconds"
+        )
     vertices = [region.vertices for region in regions.regions]
     size = float(np.ptp(np.concatenate(vertices), axis=0).max())
     facets = Facets.of(regions, size)

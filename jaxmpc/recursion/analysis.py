@@ -51,7 +51,7 @@ from jaxmpc.recursion.report import NOT_FEASIBLE, Claim, Counterexample, Recursi
 
 def recursive_feasibility(
     mpc: MPC, x0s: Reals | None = None, *, steps: int = 20, search: bool = True,
-    regions: int = 2000, seconds: float = 60.0, progress: bool = False,
+    max_regions: int = 2000, seconds: float = 60.0, progress: bool = False,
 ) -> RecursionReport:  # fmt: skip
     """Examine whether `mpc` is recursively feasible: proofs, the worst counterexample, the states
     lost.
@@ -71,8 +71,8 @@ def recursive_feasibility(
     where input rates are limited; None: none where the law is proved, else a grid over X_N, random
     states in more than three dimensions. steps: length of the closed loops x⁺ = A x + B u_0(x) + c
     from each sample. search: where regions are incomplete look for a counterexample by gradient
-    ascent too. regions: critical regions to enumerate at most (0: none). seconds: time limit of the
-    whole call; 1. may take half of it, 2. half of what is left. What is not settled by then is
+    ascent too. max_regions: critical regions to enumerate at most (0: none). seconds: time limit of
+    the whole call; 1. may take half of it, 2. half of what is left. What is not settled by then is
     open, and samples that are not labelled or followed to the end are undecided. Compiling, one
     step of all closed loops, and a linear program cannot be interrupted: a stage that has to
     compile is left out where less than the seconds above are left. progress: print each stage on
@@ -93,15 +93,15 @@ def recursive_feasibility(
     critical regions.
     """
     budget = Budget.of(seconds, progress)
-    return examine(mpc, x0s, steps, search, regions, budget, budget.share(0.5))
+    return examine(mpc, x0s, steps, search, max_regions, budget, budget.share(0.5))
 
 
 def examine(
-    mpc: MPC, x0s: Any, steps: int, search: bool, regions: int, budget: Budget, settled: float
+    mpc: MPC, x0s: Any, steps: int, search: bool, max_regions: int, budget: Budget, settled: float
 ) -> RecursionReport:
     """Return the report of `recursive_feasibility`; settled: when its stage 1 has to end."""
     problem = FeasibilityProblem.of(mpc)
-    steps, regions = whole("steps", steps, 1), whole("regions", regions, 0)
+    steps, max_regions = whole("steps", steps, 1), whole("max_regions", max_regions, 0)
     if x0s is not None:
         x0s, p = host_array("x0s", x0s), problem.dimension
         if x0s.ndim != 2 or x0s.shape[1] != p or not len(x0s):
@@ -110,9 +110,9 @@ def examine(
     claims = settle_claims(mpc, problem, settled)
     lost = 0.0 if claims.law.holds and np.isfinite(claims.volume) else np.nan
     verdict: RegionVerdict | None = None
-    if regions and not claims.law.holds and np.isfinite(claims.volume):
+    if max_regions and not claims.law.holds and np.isfinite(claims.volume):
         budget.say("critical regions of the law")
-        verdict = settle_by_regions(claims, regions, budget.share(0.5))
+        verdict = settle_by_regions(claims, max_regions, budget.share(0.5))
         lost = verdict.lost
         if claims.law.holds is None:
             claims = replace(claims, law=verdict.claim)
@@ -247,7 +247,7 @@ def _samples(claims: Claims, starts: np.ndarray, center: np.ndarray) -> np.ndarr
 
 @dataclass(frozen=True, eq=False)
 class SmallestHorizon:
-    """The least horizon at which the law is proved recursively feasible, None if none up to limit.
+    """The least horizon at which the law is proved recursively feasible, None where none was found.
 
     strong: the least at which every feasible first move is proved to stay (None: none). reasons:
     the claim about the law at each horizon looked at.
@@ -260,13 +260,13 @@ class SmallestHorizon:
 
 def smallest_horizon(
     mpc: MPC,
-    limit: int = 20,
+    max_horizon: int = 20,
     *,
-    regions: int = 2000,
+    max_regions: int = 2000,
     seconds: float = 60.0,
     progress: bool = False,
 ) -> SmallestHorizon:
-    """Try horizons 1, 2, … up to `limit` with proofs alone (no samples, no search).
+    """Try horizons 1, 2, … up to `max_horizon` with proofs alone (no samples, no search).
 
     seconds: time limit, after which larger horizons are left out (some linear programs are
     finished); a horizon takes a second or so with two states, minutes with hundreds of facets or
@@ -276,10 +276,11 @@ def smallest_horizon(
     free moves than steps) is left out of it. Raises ValueError for an ill-posed problem.
     """
     mpc.validate()
-    limit, regions = whole("limit", limit, 1), whole("regions", regions, 0)
+    max_horizon = whole("max_horizon", max_horizon, 1)
+    max_regions = whole("max_regions", max_regions, 0)
     least, reasons = None, {}
     budget = Budget.of(seconds, progress)
-    for N in range(1, limit + 1):
+    for N in range(1, max_horizon + 1):
         if not budget.affords(0):
             break
         budget.say(f"horizon {N}")
@@ -291,8 +292,8 @@ def smallest_horizon(
         try:
             claims = settle_claims(changed, problem, budget.deadline)
             law = claims.law
-            if law.holds is None and least is None and regions and np.isfinite(claims.volume):
-                law = settle_by_regions(claims, regions, budget.deadline).claim
+            if law.holds is None and least is None and max_regions and np.isfinite(claims.volume):
+                law = settle_by_regions(claims, max_regions, budget.deadline).claim
         except ValueError as error:  # too ill-conditioned: the other horizons stay settled
             reasons[N] = Claim(None, f"not settled ({error})")
             continue

@@ -240,8 +240,8 @@ class RegionVerdict:
     regions: CriticalRegions | None
 
 
-def settle_by_regions(claims: Claims, limit: int, deadline: float = np.inf) -> RegionVerdict:
-    """Settle the law claim by at most `limit` critical regions, found before the deadline.
+def settle_by_regions(claims: Claims, max_regions: int, deadline: float = np.inf) -> RegionVerdict:
+    """Settle the law claim by at most `max_regions` critical regions, found before the deadline.
 
     On a region x⁺ is affine and its distance from X_N convex, hence largest at a vertex: where the
     regions are complete, the worst vertex is the worst state of X_N.
@@ -252,7 +252,7 @@ def settle_by_regions(claims: Claims, limit: int, deadline: float = np.inf) -> R
     try:
         if mpc.input_in_state:
             fail("mpc", "its law depends on the previous input", "They are not enumerated then")
-        found = critical_regions(mpc, limit=limit, seconds=deadline - time.monotonic())
+        found = critical_regions(mpc, max_regions=max_regions, seconds=deadline - time.monotonic())
     except ValueError as error:
         return RegionVerdict(Claim(None, f"no critical regions ({error})"), np.nan, none, None)
     A, B, c = host_matrices(mpc.system)

@@ -182,7 +182,7 @@ class TestRegions:
         np.testing.assert_allclose(found.law(x), plain.law(x), atol=1e-9)
 
     def test_limit(self):
-        found = critical_regions(problems.lecture(), limit=4)
+        found = critical_regions(problems.lecture(), max_regions=4)
         assert len(found) == 4 and not found.complete and "limit of 4" in found.reason
         assert found.volume < 1043 / 400
 
@@ -222,7 +222,7 @@ class TestRegions:
                 critical_regions(changed)
         for limit in (0, 1.5, True):
             with pytest.raises(ValueError, match="limit"):
-                critical_regions(mpc, limit=limit)
+                critical_regions(mpc, max_regions=limit)
         with pytest.raises(ValueError, match="within"):
             critical_regions(mpc, within=np.ones(2))
         with pytest.raises(ValueError, match="x: shape"):
@@ -349,7 +349,7 @@ class TestExactPenalty:
         assert exact_penalty(mpc, rho=12.0, method="samples", samples=5).sufficient is None
 
     def test_auto_goes_on_past_the_limit(self):
-        found = exact_penalty(problems.lecture(), limit=3, samples=20)
+        found = exact_penalty(problems.lecture(), max_regions=3, samples=20)
         assert not found.exact and found.method == "samples" and found.regions is not None
         assert found.rho_bar == pytest.approx(11.25, rel=1e-9)
 

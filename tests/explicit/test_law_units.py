@@ -340,7 +340,7 @@ def test_settled_horizons_survive_one_that_fails(monkeypatch):
 
     monkeypatch.setattr(analysis, "settle_claims", fails_at_two)
     weak = jm.MPC(INTEGRATOR, [1.0, 1], 10.0, 3, X, jm.Box(-0.1, 0.1))
-    found = smallest_horizon(weak, limit=3, regions=0)
+    found = smallest_horizon(weak, max_horizon=3, max_regions=0)
     assert list(found.reasons) == [1, 2, 3] and found.reasons[2].holds is None
     assert "LP: no answer" in found.reasons[2].reason
 
@@ -350,5 +350,5 @@ def test_programs_of_a_long_unstable_prediction_end():
     """2^18 between the first and last rows: HiGHS stops on some of the programs, or cycles."""
     system = jm.LinearSystem([[2.0, 1], [0, 0.5]], [1, 0.0])
     mpc = integrator(system=system, R=10.0, terminal_set=None)
-    found = smallest_horizon(mpc, limit=19, regions=0, seconds=250)
+    found = smallest_horizon(mpc, max_horizon=19, max_regions=0, seconds=250)
     assert found.horizon is None and list(found.reasons) == list(range(1, 20))

@@ -137,7 +137,7 @@ def joint_sets():
 
 def joint_needle():
     """N = 4: 0.0134 % of the area is lost; the search finds (1.444, 2) → (1.464, 1.6)."""
-    report = jm.recursive_feasibility(problems.joint(4), steps=1, regions=0)
+    report = jm.recursive_feasibility(problems.joint(4), steps=1, max_regions=0)
     worst = report.counterexample
     assert report.M is False and worst.distance == pytest.approx(0.0039968, abs=1e-5)
     np.testing.assert_allclose(np.abs(worst.state), [1.444, 2.0], atol=1e-3)
@@ -147,7 +147,7 @@ def joint_recursion():
     """N = 5: the law stays, not every move; N = 6: every move does."""
     five = jm.recursive_feasibility(problems.joint(5), steps=1)
     assert (five.W, five.S, five.M) == (True, False, True)
-    six = jm.recursive_feasibility(problems.joint(6), steps=1, regions=0)
+    six = jm.recursive_feasibility(problems.joint(6), steps=1, max_regions=0)
     assert (six.W, six.S, six.M) == (True, True, True)
 
 

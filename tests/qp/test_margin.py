@@ -61,7 +61,7 @@ def test_known_values(qp, t):
 def test_scale_and_limit():
     qp = filled(rows([[1], [1]], [2, -INF], [INF, 1]))
     assert margin(qp, scale=np.array([3.0, 1.0, 1.0])) == pytest.approx(-0.25, abs=1e-8)
-    assert margin(filled(rows([[1]], [0], [INF])), limit=7.0) == pytest.approx(7.0)
+    assert margin(filled(rows([[1]], [0], [INF])), max_margin=7.0) == pytest.approx(7.0)
 
 
 @pytest.mark.slow

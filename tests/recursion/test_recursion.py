@@ -335,7 +335,9 @@ class TestReport:
         assert counts["kept"] == counts["feasible"] > 2000
         # The middles of the grid's cells measure the area.
         assert counts["feasible"] * (2 / 64) ** 2 == pytest.approx(2.8108, rel=0.02)
-        without = recursive_feasibility(problems.lecture(0.3, 3), steps=1, regions=0, search=False)
+        without = recursive_feasibility(
+            problems.lecture(0.3, 3), steps=1, max_regions=0, search=False
+        )
         assert without.law.holds is None and "no counterexample" in without.law.reason
 
     @pytest.mark.parametrize("search", [True, False])
@@ -376,7 +378,7 @@ class TestReport:
     def test_some_regions_already_refute(self, monkeypatch):
         """What is lost is not known then, nor how far outside the worst state leads."""
         monkeypatch.setattr(analysis, "LABELS", np.inf)  # no time for samples, nor for a search
-        report = recursive_feasibility(problems.lecture(0.25, 3), regions=5)
+        report = recursive_feasibility(problems.lecture(0.25, 3), max_regions=5)
         assert report.law.holds is False and np.isnan(report.lost_by_law)
         assert 0.01 < report.counterexample.distance <= 0.0474341650
         check_counterexample(report.mpc, report.counterexample)
@@ -433,7 +435,7 @@ class TestSlow:
     def test_needle_is_found_by_search(self):
         """Uniform samples hit the needle of the joint, 0.0134 % of X_4, once in 7,400."""
         mpc = problems.joint(4)
-        report = recursive_feasibility(mpc, regions=0)
+        report = recursive_feasibility(mpc, max_regions=0)
         c = report.counterexample
         assert holds(report) == (False, False, False) and c.found == "search"
         assert c.distance == pytest.approx(0.0039968, abs=1e-6)
@@ -446,7 +448,7 @@ class TestSlow:
         real = analysis.settle_claims
         bare = lambda *a: replace(real(*a), seeds=np.zeros((0, 2)))
         monkeypatch.setattr(analysis, "settle_claims", bare)
-        c = recursive_feasibility(problems.joint(4), regions=0).counterexample
+        c = recursive_feasibility(problems.joint(4), max_regions=0).counterexample
         assert c.distance == pytest.approx(0.0039968, abs=1e-6)
 
     @pytest.mark.parametrize(
@@ -464,7 +466,9 @@ class TestSlow:
     def test_gradient_alone_and_regions_alone_find_the_worst(self, monkeypatch):
         """From one sample and the starts on the boundary; the worst state is no vertex of X_1."""
         mpc, one = problems.lecture(0.25, 1), np.zeros((1, 2))
-        found = lambda: recursive_feasibility(mpc, one, steps=1, regions=0).counterexample.distance
+        found = lambda: (
+            recursive_feasibility(mpc, one, steps=1, max_regions=0).counterexample.distance
+        )
         climb_regions, value = ascent._climb_regions, ascent._value_and_gradient
         monkeypatch.setattr(ascent, "_climb_regions", lambda _, b, x, v, d: x[np.argsort(-v)[:6]])
         assert found() == pytest.approx(0.546401, abs=1e-4)
@@ -485,7 +489,7 @@ class TestSlow:
         assert holds(report) == (False, False, False)
         check_counterexample(mpc, report.counterexample)
         # The regions know the worst vertex, which search alone finds too.
-        report = recursive_feasibility(mpc, regions=0)
+        report = recursive_feasibility(mpc, max_regions=0)
         worst = -np.inf
         for region in critical_regions(mpc).regions:
             E = mpc.system.A + mpc.system.B @ region.K

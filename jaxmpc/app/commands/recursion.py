@@ -170,13 +170,13 @@ class Recursion:
         print(f"{config.name}: horizon {mpc.horizon} -> {self.output}")
         seconds = settings.seconds / (1 if self.smallest is None else 2)
         report = recursive_feasibility(
-            mpc, states, steps=settings.steps, search=self.search, regions=settings.regions,
+            mpc, states, steps=settings.steps, search=self.search, max_regions=settings.regions,
             seconds=seconds, progress=True,
         )  # fmt: skip
         rows, least = [], None
         if self.smallest is not None:
             least = smallest_horizon(
-                mpc, self.smallest, regions=settings.regions, seconds=seconds, progress=True
+                mpc, self.smallest, max_regions=settings.regions, seconds=seconds, progress=True
             )
             rows.append(("smallest horizon", _horizon_text(least, self.smallest)))
         files = self.save(config, report, least)
