@@ -164,7 +164,7 @@ class TestRefusals:
 
     def test_a_second_process(self, full):
         with open_store(full):
-            code = "from jaxmpc.feasible import store; import sys; store.remove(sys.argv[1])"
+            code = "from jaxmpc import store; import sys; store.remove(sys.argv[1])"
             command = [sys.executable, "-c", code, str(full)]
             second = subprocess.run(command, capture_output=True, text=True)
         assert second.returncode and "another process writes there" in second.stderr

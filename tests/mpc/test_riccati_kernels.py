@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmpc.mpc.stagewise.newton import riccati
+from jaxmpc.mpc.stagewise import riccati
 
 
 def batch(rng, N, n, m, staged):
