@@ -94,7 +94,7 @@ def osqp_code(mpc: jm.MPC, iterations: int, folder: Path):
     from scipy import sparse
 
     with jax.enable_x64(True):
-        controller = jm.Controller(mpc, jm.ADMM(iterations=iterations, refine=0))
+        controller = jm.Controller(mpc, jm.ADMM(iterations=iterations, newton_steps=0))
         c = jax.tree.map(np.asarray, controller.condensed)
     moved = np.abs(c.C).max(axis=1) > 0
     C, D, d = c.C[moved], c.D[moved], c.d[moved]
@@ -169,7 +169,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=1000)
     parser.add_argument("--iterations", type=int, default=100)
     given = parser.parse_args()
-    solver = jm.ADMM(iterations=given.iterations, refine=0)
+    solver = jm.ADMM(iterations=given.iterations, newton_steps=0)
     arm_limits = np.asarray(arm().states.upper)
     systems = {
         "joint": (joint := problem("joint"), half_widths(joint)),

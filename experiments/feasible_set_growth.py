@@ -127,7 +127,7 @@ def inside(fmap: FeasibleSetMap, count: int, seed: int) -> np.ndarray:
 
 def cost(mpc: jm.MPC, x0s: np.ndarray, s: Settings) -> tuple[float, float]:
     """Mean Σ x'Qx + u'Ru of closed loops, and the share of plans that were not solved."""
-    controller = jm.Controller(mpc, jm.ADMM(iterations=300, refine=20))
+    controller = jm.Controller(mpc, jm.ADMM(iterations=300, newton_steps=20))
     with jax.enable_x64(True):
         run = jm.simulate_many(controller, mpc.system, x0s, s.steps)
     stage = np.einsum("bti,ij,btj->bt", run.states[:, :-1], mpc.Q, run.states[:, :-1])
@@ -248,7 +248,7 @@ def horizon(name: str, s: Settings) -> None:
 
     def beyond(problem: jm.MPC, period: float, x0s: np.ndarray) -> tuple[float, float]:
         """Largest excess between samples, and ∫ x'Qx + u'Ru dt over the same time, over dt."""
-        controller = jm.Controller(problem, jm.ADMM(iterations=300, refine=20))
+        controller = jm.Controller(problem, jm.ADMM(iterations=300, newton_steps=20))
         length = int(np.ceil(s.steps * dt / period))
         with jax.enable_x64(True):
             run = jm.simulate_many(controller, problem.system, x0s, length)
@@ -298,7 +298,7 @@ def trade(name: str, s: Settings) -> None:
             run = tune_weights(
                 lambda v: with_law(mpc, v["Q_t"]), {"Q_t": Parameter(mpc.Q, "definite")},
                 mpc.system, x0s, loss, s.steps,
-                solver=jm.ADMM(iterations=50, refine=5), optimizer=optax.adam(s.rate),
+                solver=jm.ADMM(iterations=50, newton_steps=5), optimizer=optax.adam(s.rate),
                 updates=s.updates, batch=16, seed=s.seed, mode="forward",
                 design_loss=lambda made, k=scale: -k * feasible_fraction(made, points, s.width),
             )  # fmt: skip

@@ -206,7 +206,7 @@ class Table:
         at = self.s.steps // EVERY - 1
         rank = lambda r: (-np.mean(r[at] <= 1), np.median(r[at]))
         best = min(residuals, key=lambda k: rank(residuals[k]))
-        share = self.solved(jm.ADMM(self.s.steps, *best, refine=0))
+        share = self.solved(jm.ADMM(self.s.steps, *best, newton_steps=0))
         soon = min(residuals, key=lambda k: to_99(residuals[k])[::-1])
         held = np.asarray(run(self.condensed, self.tracked, self.test, *soon))
         name = f"best constant, rho = {best[0]:.2g}, alpha = {best[1]}"
@@ -308,7 +308,9 @@ def report(s: Settings) -> None:
     show = lambda name, share, more="": print(f"  {name:<44}{share:8.2%}  {more}", flush=True)
     few = np.asarray(run(table.condensed, table.tracked, table.test, 1.0, 1.6))
     show(
-        "default, rho = 1, alpha = 1.6", table.solved(jm.ADMM(s.steps, refine=0)), told(to_99(few))
+        "default, rho = 1, alpha = 1.6",
+        table.solved(jm.ADMM(s.steps, newton_steps=0)),
+        told(to_99(few)),
     )
     show(*table.constants())
     begun = time.perf_counter()
@@ -327,7 +329,7 @@ def report(s: Settings) -> None:
         table = Table(s, mpc, c.tracked, feasible(c, mpc, s.learn + s.test, s.seed))
         print(f"  twice the horizon, N = {mpc.horizon}, {table.condensed.C.shape[0]} rows")
         for steps in (s.steps, 2 * s.steps):
-            show(f"{steps} steps: default", table.solved(jm.ADMM(steps, refine=0)))
+            show(f"{steps} steps: default", table.solved(jm.ADMM(steps, newton_steps=0)))
             show("groups of the shorter one", table.solved(transfer_penalties(found, mpc, steps)))
             show("learned anew", table.solved(table.learn(steps, 4, "step").solver))
 

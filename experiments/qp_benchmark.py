@@ -44,12 +44,13 @@ FIELDS = ("P", "q", "G", "h", "A", "b", "lb", "ub")
 
 @dataclass(frozen=True)
 class Settings:
-    """problems: folder with .npz files. iterations, refine: settings of jaxmpc's solver. dtype: of
-    the solvers in JAX. solvers: packages to run (none: all). each: print a line a problem."""
+    """problems: folder with .npz files. iterations, newton_steps: settings of jaxmpc's solver.
+    dtype: of the solvers in JAX. solvers: packages to run (none: all). each: print a line a
+    problem."""
 
     problems: Path
     iterations: int = 200
-    refine: int = 60
+    newton_steps: int = 60
     dtype: Literal["float64", "float32"] = "float64"
     solvers: tuple[str, ...] = ()
     each: bool = False
@@ -85,13 +86,15 @@ def one_sided(qp: jm.QP) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
 
 
 @cache
-def compiled(iterations: int, refine: int, eps: float | None) -> Callable:
-    return jax.jit(lambda qp: jm.solve_qp(qp, jm.ADMM(iterations, refine=refine, eps=eps)))
+def compiled(iterations: int, newton_steps: int, eps: float | None) -> Callable:
+    return jax.jit(
+        lambda qp: jm.solve_qp(qp, jm.ADMM(iterations, newton_steps=newton_steps, eps=eps))
+    )
 
 
 def jaxmpc(qp: jm.QP, s: Settings) -> Solve:
     data = jax.tree.map(lambda v: jnp.asarray(v, s.dtype), qp)
-    run = compiled(s.iterations, s.refine, 1e-6 if s.dtype == "float64" else None)
+    run = compiled(s.iterations, s.newton_steps, 1e-6 if s.dtype == "float64" else None)
 
     def solve():
         solution = jax.block_until_ready(run(data))

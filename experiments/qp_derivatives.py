@@ -84,7 +84,7 @@ def direction(qp: jm.QP, field: str, rng: np.random.Generator) -> jm.QP:
 
 def agreement(s: Settings) -> None:
     """Table of part (a)."""
-    solver = jm.ADMM(500, refine=20, eps=1e-6)
+    solver = jm.ADMM(500, newton_steps=20, eps=1e-6)
 
     @jax.jit
     @jax.vmap

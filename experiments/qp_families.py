@@ -388,14 +388,15 @@ def draw(family: str, seed: int) -> Instance:
 
 @dataclass(frozen=True)
 class Settings:
-    """count: programs a family, from seed on. families: which (none: all). iterations, refine:
-    of jaxmpc's solver, its defaults; dtype: of the data. reference: run Clarabel too."""
+    """count: programs a family, from seed on. families: which (none: all). iterations,
+    newton_steps: of jaxmpc's solver, its defaults; dtype: of the data. reference: run Clarabel
+    too."""
 
     count: int = 1000
     seed: int = 0
     families: tuple[str, ...] = ()
     iterations: int = jm.ADMM().iterations
-    refine: int | None = None  # None: the default
+    newton_steps: int | None = None  # None: the default
     dtype: Literal["float64", "float32"] = "float64"
     reference: bool = False
 
@@ -479,11 +480,11 @@ def line(family: str, name: str, instances: list[Instance], answers: list[Answer
 def run(s: Settings) -> None:
     """Draw, solve, judge; a row a family and solver."""
     jax.config.update("jax_enable_x64", s.dtype == "float64")
-    solver = jm.ADMM(s.iterations, refine=s.refine)
+    solver = jm.ADMM(s.iterations, newton_steps=s.newton_steps)
     solve = jax.jit(jax.vmap(lambda qp: jm.solve_qp(qp, solver)))
     print(
         f"{s.count} a family, jaxmpc in {s.dtype}: {s.iterations} steps, "
-        f"{solver.newton_steps()} Newton steps at most"
+        f"{solver.most_newton_steps()} Newton steps at most"
     )
     for status, columns in (
         (jm.Status.SOLVED, ("right", "absolute", "relative", "median")),

@@ -4,8 +4,8 @@
 
 Random arms with masses, stiffness and drift of their own, box limits on angles, speeds and
 torques: n = 2 joints, m = joints. "factor" is what a new linearization costs (condensed: condense
-and factor), "steps" the ADMM steps and the judgement of the plan, "newton" what `refine` Newton
-steps add (stage by stage only). Median over repeats, the functions taking turns; compilation apart.
+and factor), "steps" the ADMM steps and the judgement of the plan, "newton" what the Newton steps
+add (stage by stage only). Median over repeats, the functions taking turns; compilation apart.
 "difference": the greatest between the inputs of both after these steps.
 """
 
@@ -24,15 +24,15 @@ from jaxmpc.mpc.stagewise.newton import factor_stages, plan_stages
 
 @dataclass(frozen=True)
 class Settings:
-    """robots: of a batch. period: of control, s. iterations: ADMM steps. refine: Newton steps of
-    the last column. precisions: bits of floating-point numbers."""
+    """robots: of a batch. period: of control, s. iterations: ADMM steps. newton_steps: those
+    of the last column. precisions: bits of floating-point numbers."""
 
     robots: int = 64
     joints: int = 7
     horizon: int = 20
     period: float = 0.05
     iterations: int = 50
-    refine: int = 3
+    newton_steps: int = 3
     repeats: int = 5
     precisions: tuple[int, ...] = (32, 64)
     seed: int = 0
@@ -77,8 +77,8 @@ def run(s: Settings) -> None:
 
 def report(s: Settings, mpc: jm.MPC, arms: list, x0s: np.ndarray, bits: int) -> None:
     """Two lines of the table."""
-    solver = jm.ADMM(iterations=s.iterations, refine=0)
-    polished = replace(solver, refine=s.refine)
+    solver = jm.ADMM(iterations=s.iterations, newton_steps=0)
+    polished = replace(solver, newton_steps=s.newton_steps)
     dtype = jnp.float32 if bits == 32 else jnp.float64
     of = lambda name: jnp.asarray([getattr(a, name) for a in arms], dtype)
     systems, x = jm.LinearSystem(of("A"), of("B"), of("c")), jnp.asarray(x0s, dtype)
@@ -129,7 +129,7 @@ def report(s: Settings, mpc: jm.MPC, arms: list, x0s: np.ndarray, bits: int) -> 
     solved = int(jnp.sum(found["newton"].status == jm.Status.SOLVED))
     print(
         f"{'':8}{theirs / ours:.1f} times as fast (factor and steps); "
-        f"{solved} SOLVED with {s.refine} Newton steps"
+        f"{solved} SOLVED with {s.newton_steps} Newton steps"
     )
 
 

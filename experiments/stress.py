@@ -29,7 +29,7 @@ import tyro
 
 import jaxmpc as jm
 
-SHORT = jm.ADMM(iterations=5, refine=2)
+SHORT = jm.ADMM(iterations=5, newton_steps=2)
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ def joint() -> jm.MPC:
 def run(s: Settings) -> None:
     """Drive the loops with exact plans, count beside them, print the table."""
     mpc = joint()
-    controller = jm.Controller(mpc, jm.ADMM(refine=30))
+    controller = jm.Controller(mpc, jm.ADMM(newton_steps=30))
     condensed, factor = controller.condensed, controller.factor
 
     def steps_to_solve(qp: QP, warm_start: tuple[Array, Array]) -> Array:

@@ -164,7 +164,7 @@ plt.show()
 # no refinement.
 
 # %%
-short = jm.ADMM(iterations=30, refine=0)
+short = jm.ADMM(iterations=30, newton_steps=0)
 residual = jax.vmap(lambda x0: jm.solve(mpc, x0, solver=short).primal_residual)(x0s)
 guess = np.where(np.asarray(residual) <= 1e-3, 1, -1)
 missed = int(np.sum((guess == -1) & (fmap.label == 1)))

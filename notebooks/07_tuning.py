@@ -142,7 +142,7 @@ states = states[jm.map_feasible_set(guess, states).label == 1]
 rhos = np.logspace(-2, 2, 9)
 accuracy, solved = [], []
 for rho in rhos:
-    admm = jm.ADMM(iterations=48, rho=rho, refine=0)
+    admm = jm.ADMM(iterations=48, rho=rho, newton_steps=0)
     plans = jax.vmap(jm.Controller(run.mpc, admm).plan)(states)
     accuracy.append(np.maximum(plans.primal_residual, plans.dual_residual))
     solved.append(np.mean(plans.status == jm.Status.SOLVED))

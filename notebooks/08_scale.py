@@ -132,11 +132,11 @@ fig.tight_layout()
 # %% [markdown]
 # ## A failure on purpose: ADMM alone
 #
-# ADMM is cheap, so let us save the Newton steps: 50 steps of ADMM, `refine=0`, in float64.
+# ADMM is cheap, so let us save the Newton steps: 50 steps of ADMM, `newton_steps=0`, in float64.
 
 # %%
 with jax.enable_x64(True):
-    admm = jm.Controller(mpc, jm.ADMM(iterations=50, refine=0))
+    admm = jm.Controller(mpc, jm.ADMM(iterations=50, newton_steps=0))
     short = jax.vmap(admm.plan)(x0s)
 reference = jm.solve_many(mpc, x0s)
 print("50 ADMM steps:   ", count_status(short.status))

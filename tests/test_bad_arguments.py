@@ -145,7 +145,10 @@ CALLS = [
         "iterations: True. Give a whole number of at",
         lambda: jm.solve(M, x, solver=jm.ADMM(iterations=True)),
     ),
-    ("refine: 1.5. Give a whole number of at", lambda: jm.solve(M, x, solver=jm.ADMM(refine=1.5))),
+    (
+        "newton_steps: 1.5. Give a whole number of at",
+        lambda: jm.solve(M, x, solver=jm.ADMM(newton_steps=1.5)),
+    ),
     ("rho: 'x' where real numbers are", lambda: jm.solve(M, x, solver=jm.ADMM(rho="x"))),
     ("rho: holds a value that is not", lambda: jm.solve(M, x, solver=jm.ADMM(rho=0))),
     ("alpha: 2. Over-relaxation lies in (0,", lambda: jm.solve(M, x, solver=jm.ADMM(alpha=2))),

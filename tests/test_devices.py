@@ -103,7 +103,7 @@ def check_plans():
 
     import jaxmpc as jm
 
-    x, mpc, solver = states(), problem(), jm.ADMM(30, refine=5)
+    x, mpc, solver = states(), problem(), jm.ADMM(30, newton_steps=5)
     solve = lambda x, **options: jm.solve_many(mpc, x, solver, dtype="float64", **options)
     one = solve(x, chunk=SHAPE)
     for count in (1, 2, 4):
@@ -128,7 +128,7 @@ def check_loops():
     plant = jm.LinearPlant(mpc.system, mpc.states, mpc.inputs)
     B = np.asarray(mpc.system.B) * np.linspace(0.9, 1.1, 11)[:, None, None]
     with jax.enable_x64(True):
-        controller = jm.Controller(mpc, jm.ADMM(30, refine=0))
+        controller = jm.Controller(mpc, jm.ADMM(30, newton_steps=0))
         run = lambda **options: jm.simulate_many(
             controller, plant, x, 4, variations={"B": B}, **options
         )
@@ -162,7 +162,7 @@ def weights(mode):
             return jm.tune_weights(
                 lambda v: replace(mpc, Q=v["Q"]), {"Q": jm.Parameter(Q, "diagonal")}, mpc.system, x,
                 jm.ClosedLoopLoss(np.diag([50, 0.1]), R / 10), 3, mode=mode, updates=2,
-                solver=jm.ADMM(10, refine=0, differentiate="unrolled"), devices=devices,
+                solver=jm.ADMM(10, newton_steps=0, differentiate="unrolled"), devices=devices,
                 design_loss=lambda mpc: 0.1 * mpc.Q[0, 0],
             )  # fmt: skip
 
@@ -304,7 +304,7 @@ def results(x, devices):
 
     chunk = SHAPE * (devices or 1)
     plans = jm.solve_many(
-        problem(), x, jm.ADMM(30, refine=5), dtype="float64", chunk=chunk, devices=devices
+        problem(), x, jm.ADMM(30, newton_steps=5), dtype="float64", chunk=chunk, devices=devices
     )
     return map_of(x, chunk=chunk, devices=devices) | {"inputs": plans.inputs, "solve": plans.status}
 

@@ -93,9 +93,11 @@ FUNCTIONS = {
     "loop": looped,
     "simulate": lambda x: jm.simulate(controller(), system(), x, 2).states,
     "unrolled": lambda x: (
-        jm.solve(problem(), x, solver=jm.ADMM(20, refine=2, differentiate="unrolled")).inputs
+        jm.solve(problem(), x, solver=jm.ADMM(20, newton_steps=2, differentiate="unrolled")).inputs
     ),
-    "fixed": lambda x: jm.solve(rich_problem(), x, solver=jm.ADMM(20, refine=5, fixed=True)).inputs,
+    "fixed": lambda x: (
+        jm.solve(rich_problem(), x, solver=jm.ADMM(20, newton_steps=5, fixed=True)).inputs
+    ),
     "jacobian": lambda x: jax.jacfwd(lambda x: jm.solve(problem(), x).inputs)(x),
     "nonlinear": nonlinear,
     "robot": robot,

@@ -90,7 +90,7 @@ def law(s: Settings) -> jm.Controller:
         states=jm.Box([-np.inf, -1.0], [np.inf, 1.0]),
         terminal_cost=np.asarray(jm.lqr(system, Q, R).P),
     )  # fmt: skip
-    return jm.Controller(jm.soften(mpc, 1e3), jm.ADMM(iterations=100, refine=0))
+    return jm.Controller(jm.soften(mpc, 1e3), jm.ADMM(iterations=100, newton_steps=0))
 
 
 def draw(s: Settings, seed: int) -> dict[str, Array]:

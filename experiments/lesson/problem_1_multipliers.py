@@ -67,7 +67,7 @@ def kkt(mpc: jm.MPC, plan: jm.Plan, x0: np.ndarray) -> dict[str, float]:
 def prices(controller: jm.Controller, x0: np.ndarray, rows: np.ndarray, upper, step: float):
     """−dJ*/d(limit) of some rows by central differences, outward positive: (rows,)."""
     qp = controller.condensed.qp(jnp.asarray(x0))
-    solver = jm.ADMM(iterations=1000, refine=40)
+    solver = jm.ADMM(iterations=1000, newton_steps=40)
 
     def cost(row, amount, is_upper):
         moved = jnp.where(jnp.arange(qp.u.shape[0]) == row, amount, 0.0)
@@ -85,7 +85,7 @@ def run(s: Settings) -> Table:
     x0 = np.array([s.q, s.dq])
     lqr = jm.lqr(joint().system, Q, R)
     mpc = joint(s.horizon, terminal_cost=lqr.P, terminal_set=LIMITS)
-    controller = jm.Controller(mpc, jm.ADMM(refine=40))
+    controller = jm.Controller(mpc, jm.ADMM(newton_steps=40))
     plan = controller.plan(x0)
     print(jm.Status(int(plan.status)).sentence)
     residuals = kkt(mpc, plan, x0)

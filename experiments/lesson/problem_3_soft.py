@@ -39,7 +39,7 @@ def run(s: Settings) -> dict[str, np.ndarray]:
     """Print and return, for both states, rows (ρ, largest slack, largest |u − u_hard|, cost)."""
     lqr = jm.lqr(joint().system, Q, R)
     mpc = joint(s.horizon, terminal_cost=lqr.P, terminal_set=LIMITS)
-    solver = jm.ADMM(iterations=400, refine=40)
+    solver = jm.ADMM(iterations=400, newton_steps=40)
 
     def compare(x0: np.ndarray, hard: jm.Plan, rho: float, quadratic: float = 0.0) -> list[float]:
         plan = jm.solve(soften(mpc, rho, quadratic), x0, solver=solver)

@@ -35,7 +35,7 @@ class Settings:
     seconds: float = 1.0
     horizon: int = 20
     iterations: int = 0  # ADMM steps
-    refine: int | None = None  # Newton steps at most; None: as many as are needed
+    newton_steps: int | None = None  # Newton steps at most; None: as many as are needed
     repeats: int = 3
     pieces: bool = True
     loop: bool = True  # also the closed loop, whose compilation takes longest
@@ -68,7 +68,7 @@ def run(settings: Settings) -> dict[str, Any]:
     nv, x_ref, u_ref = robot.mujoco.nv, *robot.equilibrium()
     Q, R = np.r_[np.full(nv, 10.0), np.full(nv, 0.1)], np.full(robot.m, 1e-3)
     mpc = jm.robot_mpc(robot, Q, R, s.horizon)
-    solver = jm.ADMM(iterations=s.iterations, refine=s.refine)
+    solver = jm.ADMM(iterations=s.iterations, newton_steps=s.newton_steps)
     controller = jm.RobotController(robot, mpc, solver, linearize="state")
     soft = controller.soft
     rng = np.random.default_rng(0)
@@ -93,8 +93,8 @@ def run(settings: Settings) -> dict[str, Any]:
     factor = jax.jit(jax.vmap(lambda model: factor_stages(soft, model, solver, controller.scale)))
     factors = factor(models)
 
-    def planned(iterations: int, refine: int | None) -> Any:
-        chosen = replace(solver, iterations=iterations, refine=refine)
+    def planned(iterations: int, newton_steps: int | None) -> Any:
+        chosen = replace(solver, iterations=iterations, newton_steps=newton_steps)
         plan = jax.vmap(
             lambda f, x: plan_stages(f, soft, x, reference, chosen, input_reference=inputs)
         )
@@ -117,7 +117,7 @@ def run(settings: Settings) -> dict[str, Any]:
         ),
         "plan, judged": (repeated(planned(0, 0), few), x0s, factors),
         "plan, ADMM": (repeated(planned(s.iterations, 0), few), x0s, factors),
-        "plan, cold": (repeated(planned(s.iterations, s.refine), few), x0s, factors),
+        "plan, cold": (repeated(planned(s.iterations, s.newton_steps), few), x0s, factors),
     }  # fmt: skip
     if not s.iterations:
         del pieces["plan, ADMM"]

@@ -44,7 +44,7 @@ class Settings:
     rate: float = 0.15
     horizon: int = 20
     iterations: int = 50
-    refine: int = 3
+    newton_steps: int = 3
     linearize: str = "state"
     spread: float = 0.4
     wrong: tuple[float, float] = (3.0, 10.0)
@@ -75,7 +75,7 @@ def joint(s: Settings, rng: np.random.Generator) -> Case:
         system, np.eye(2), np.eye(1), s.horizon, states=jm.Box(-limit, limit),
         inputs=jm.Box([-2.0], [2.0]), constrained_steps=tuple(range(1, s.horizon + 1)),
     )  # fmt: skip
-    solver = jm.ADMM(s.iterations, refine=s.refine)
+    solver = jm.ADMM(s.iterations, newton_steps=s.newton_steps)
 
     def controller(q: Any, r: Any) -> Any:
         Q = jnp.diag(jnp.asarray(q))
@@ -92,7 +92,8 @@ def arm2(s: Settings, rng: np.random.Generator) -> Case:
     """The two-link arm from random starts to its home."""
     robot = jm.load_robot("arm2")
     x_ref, u_ref = robot.equilibrium()
-    mpc, solver = jm.robot_mpc(robot, horizon=s.horizon), jm.ADMM(s.iterations, refine=s.refine)
+    mpc = jm.robot_mpc(robot, horizon=s.horizon)
+    solver = jm.ADMM(s.iterations, newton_steps=s.newton_steps)
 
     def controller(q: Any, r: Any) -> Any:
         Q, R = jnp.diag(jnp.asarray(q)), jnp.diag(jnp.asarray(r))

@@ -46,7 +46,7 @@ START = {
 
 @dataclass(frozen=True)
 class Settings:
-    """loops: initial states. samples: of each closed loop. iterations, refine: of jaxmpc's ADMM.
+    """loops: initial states. samples: of each closed loop. iterations, newton_steps: of ADMM.
     precisions: bits jaxmpc computes in. problems, rivals: which to run. repeats, rival_repeats:
     of a time, of which the median counts."""
 
@@ -54,7 +54,7 @@ class Settings:
     samples: int = 50
     horizon: int = 20
     iterations: int = 50
-    refine: int = 8
+    newton_steps: int = 8
     precisions: tuple[int, ...] = (32, 64)
     problems: tuple[str, ...] = ("box", "full")
     rivals: tuple[str, ...] = ("mpc.pytorch", "cvxpylayers")
@@ -107,7 +107,7 @@ def report(s: Settings, limits: str, x0s: np.ndarray) -> None:
     """The table of one problem."""
     theta, ones = raw(START), np.ones(s.loops)
     with jax.enable_x64(True):
-        exact = problem(s, limits, jm.ADMM(200, refine=30, eps=1e-9))
+        exact = problem(s, limits, jm.ADMM(200, newton_steps=30, eps=1e-9))
         total = Compiled(jax.jit(exact.total))
         at = lambda theta: total(*exact.arguments(theta, x0s, {}, ones))
         unsolved, truth = float(at(theta)[1]["unsolved"].mean()), central(at, theta, STEP)
@@ -129,7 +129,7 @@ def report(s: Settings, limits: str, x0s: np.ndarray) -> None:
 
     for bits in s.precisions:
         with jax.enable_x64(bits == 64):
-            ours = problem(s, limits, jm.ADMM(s.iterations, refine=s.refine))
+            ours = problem(s, limits, jm.ADMM(s.iterations, newton_steps=s.newton_steps))
             begun = time.perf_counter()
             total = Compiled(jax.jit(ours.total))
             at = lambda theta, ours=ours, total=total: total(

@@ -60,7 +60,7 @@ class Settings:
     rate: float = 0.2
     horizon: int = 20
     iterations: int = 20
-    refine: int = 2
+    newton_steps: int = 2
     linearize: str = "state"
     mass: float = 0.3
     damping: float = 0.5
@@ -101,7 +101,7 @@ def world(s: Settings, robot: Robot, count: int, seed: int) -> tuple[np.ndarray,
 def law(s: Settings, robot: Robot) -> tuple[dict, Callable, jm.ADMM]:
     """The guess, and the controller as a function of the diagonals of Q and R."""
     mpc = jm.robot_mpc(robot, horizon=s.horizon, margin=s.margin)
-    solver = jm.ADMM(s.iterations, refine=s.refine)
+    solver = jm.ADMM(s.iterations, newton_steps=s.newton_steps)
 
     def make(v: Any) -> jm.RobotController:
         Q, R = jnp.diag(jnp.asarray(v["q"])), jnp.diag(jnp.asarray(v["r"]))

@@ -44,10 +44,10 @@ def export_c(
     """Write a controller as C99 code: what `Controller(mpc, solver)` does in a closed loop.
 
     Each call of `NAME_step` warm-starts from the plan before, takes `solver.iterations` steps of
-    ADMM (50 where that is None) and none of Newton's: `solver` is taken with refine=0. Nothing is
-    allocated and no loop depends on data but for the branches of a projection, so the time of a
-    call hardly varies. What it returns as status comes from residuals that it computes itself.
-    Choose iterations and rho with `tune_penalties`, or watch the status along closed loops.
+    ADMM (50 where that is None) and none of Newton's: `solver` is taken with newton_steps=0.
+    Nothing is allocated and no loop depends on data but for the branches of a projection, so the
+    time of a call hardly varies. What it returns as status comes from residuals that it computes
+    itself. Choose iterations and rho with `tune_penalties`, or watch the status along closed loops.
 
     References are constant over the horizon. Inputs in a Box are clipped into it.
 
@@ -67,7 +67,7 @@ def export_c(
     number("tolerance", tolerance, 0, "Give a positive number")
     paths = prepared_paths(Path(folder), [f"{name}{kind}" for kind in KINDS], overwrite)
     with jax.enable_x64(True):
-        controller = Controller(mpc, replace(solver, refine=0))
+        controller = Controller(mpc, replace(solver, newton_steps=0))
         assert controller.factor is not None
         fault = Status(int(controller.factor.fault))
         if fault != Status.NOT_RUN:

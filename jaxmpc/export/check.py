@@ -39,8 +39,8 @@ def check_fixed_steps(
     mpc: MPC, solver: ADMM, lower: Reals, upper: Reals, samples: int = 1000,
     tolerance: float = 1e-6, seed: int = 0,
 ) -> ClosedLoopCheck:  # fmt: skip
-    """Run `Controller(mpc, solver)` with refine=0 from random states of the box [lower, upper]
-    (n,), and at each state solve the plan precisely too.
+    """Run `Controller(mpc, solver)` with newton_steps=0 from random states of the box [lower,
+    upper] (n,), and at each state solve the plan precisely too.
 
     20 closed loops begin at states that have a plan; `samples` are rounded up to a multiple of 20.
 
@@ -55,7 +55,7 @@ def check_fixed_steps(
         require_finite(argument, bound)
     with jax.enable_x64(True):
         lower, upper = host_array("lower", lower), host_array("upper", upper)
-        fixed = Controller(mpc, replace(solver, refine=0, eps=tolerance))
+        fixed = Controller(mpc, replace(solver, newton_steps=0, eps=tolerance))
         precise = Controller(mpc, ADMM())
         starts = np.random.default_rng(seed).uniform(lower, upper, (50 * LOOPS, len(lower)))
         plans = jax.jit(jax.vmap(lambda x: precise(x)[2].status))(starts)

@@ -67,11 +67,11 @@ class ADMM:
     √(min(1, n/m)), m counting the rows that z moves; or a number, one value a row (m,), or a
     schedule (stages, m) or (stages, 1) whose stages have equally many iterations.
     alpha: over-relaxation in (0, 2).
-    refine: Newton steps after the loop at most, 0 for none (`active_set.py`, `newton.py`). None:
+    newton_steps: at most so many after the loop, 0 for none (`active_set.py`, `newton.py`). None:
     1,000, of which badly scaled linear programs need most, 150 where every instance takes them all,
     and in `solve_stagewise` as many as are needed. An instance leaves when its residuals are small
-    enough, also in a batch. fixed: take all `refine` steps of the method of multipliers, for every
-    instance: constant time; so do unrolled derivatives. dtype: floating type of ADMM's iterates,
+    enough, also in a batch. fixed: every instance takes all `newton_steps`, of the method of
+    multipliers: constant time; so do unrolled derivatives. dtype: floating type of ADMM's iterates,
     "float32" or "float64"; None: float32 before Newton steps, that of the data without any. Newton
     steps are float64 whatever it is, except unrolled ones.
     eps: tolerance of status SOLVED, relative: each entry of the primal and of the dual residual,
@@ -89,7 +89,7 @@ class ADMM:
     iterations: int | None = field(default=None, metadata={"static": True})
     rho: Any = None
     alpha: Any = 1.9
-    refine: int | None = field(default=None, metadata={"static": True})
+    newton_steps: int | None = field(default=None, metadata={"static": True})
     eps: Any = 1e-6
     differentiate: str = field(default="implicit", metadata={"static": True})
     smoothing: Any = 0.0
@@ -105,12 +105,14 @@ class ADMM:
 
     def __hash__(self) -> int:
         """Return a number that equal settings share."""
-        return hash((self.iterations, self.refine, self.differentiate, self.fixed, self.dtype))
+        return hash(
+            (self.iterations, self.newton_steps, self.differentiate, self.fixed, self.dtype)
+        )
 
     def validate(self, rows: int | None = None) -> None:
         """Raise ValueError for settings that make no iteration of a program with so many rows
         (None: not known yet)."""
-        for name in ("iterations", "refine"):
+        for name in ("iterations", "newton_steps"):
             count = getattr(self, name)
             if count is not None and whole(name, count, 0) > MOST_COUNT:
                 fail(name, f"{count}", f"Give at most {MOST_COUNT}")
@@ -137,15 +139,15 @@ class ADMM:
         """Return how many ADMM steps there are. warm: there is a warm start."""
         if self.iterations is not None:
             return self.iterations
-        few = warm and self.newton_steps() > 0 and self.differentiate != "unrolled"
+        few = warm and self.most_newton_steps() > 0 and self.differentiate != "unrolled"
         return STEPS_WARM if few and np.ndim(self.rho) < 2 else STEPS
 
-    def newton_steps(self, most: int = 1000) -> int:
-        """Return how many Newton steps there are at most: `refine`, or where that is None `most`,
-        and 150 at most where every instance takes them all."""
-        if self.refine is not None:
-            return self.refine
-        return min(most, 150) if self.fixed or self.differentiate == "unrolled" else most
+    def most_newton_steps(self, default: int = 1000) -> int:
+        """Return how many Newton steps there are at most: `newton_steps`, or where that is None
+        `default`, and 150 at most where every instance takes them all."""
+        if self.newton_steps is not None:
+            return self.newton_steps
+        return min(default, 150) if self.fixed or self.differentiate == "unrolled" else default
 
 
 DEFAULT = ADMM()

@@ -11,7 +11,7 @@ from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.solve import as_arrays, solve_qp
 
-LINEAR = ADMM(iterations=100, refine=60)
+LINEAR = ADMM(iterations=100, newton_steps=60)
 
 
 def feasibility_margin(

@@ -99,7 +99,7 @@ def in_two_parts(
     warm start, which mostly is as near as these would come; what it leaves open is solved again
     with both. hard: known to need them.
     """
-    every = hard or solver.fixed or solver.refine == 0 or solver.differentiate != "implicit"
+    every = hard or solver.fixed or solver.newton_steps == 0 or solver.differentiate != "implicit"
     if every or not concrete(arguments):
         return program(*arguments, whole=True)
     found = program(*arguments, whole=False)
@@ -170,7 +170,7 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = 
     if warm_start is not None:
         t = warm(factor, qp, unit, bounds, warm_start)
         t = nearer(splittings(factor, q)[0], bounds, t)
-    unrolled, refine = solver.differentiate == "unrolled", solver.newton_steps()
+    unrolled, refine = solver.differentiate == "unrolled", solver.most_newton_steps()
     rough = "float32" if refine and not unrolled else qp.q.dtype
     dtype = jnp.dtype(rough if solver.dtype is None else solver.dtype)
     cast = lambda tree, dtype=dtype: jax.tree.map(

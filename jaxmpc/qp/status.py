@@ -45,7 +45,7 @@ _SENTENCES = {
     ),
     Status.ITERATION_LIMIT: (
         "Neither solved nor proved infeasible within all steps, the last of which still gained. "
-        "Raise refine, or iterations where refine is 0."
+        "Raise newton_steps, or iterations where newton_steps is 0."
     ),
     Status.NON_CONVEX: (
         "The Hessian of the cost has a negative eigenvalue beyond rounding. "

@@ -40,7 +40,7 @@ FEWEST, FEWEST_VALIDATION = 8, 2
 # Learning rate of log rho at the start: rho may be wrong by decades there. How often the validation
 # set is solved, which costs as much as many steps.
 RATE, VALIDATIONS = 0.2, 15
-SOLVER = ADMM(refine=0)
+SOLVER = ADMM(newton_steps=0)
 
 
 def tune_penalties(
@@ -55,8 +55,8 @@ def tune_penalties(
     stages: number of penalties of each row in the schedule, each for iterations/stages steps.
     groups: "step": rows of a kind share 5 values along the horizon, linear between them; "row":
         each row has its own.
-    solver: the solver that the result is compared with, and the source of refine, eps and so on;
-        tuned and compared without Newton steps. None: ADMM(refine=0).
+    solver: the solver that the result is compared with, and the source of newton_steps, eps, …;
+        tuned and compared without Newton steps. None: ADMM(newton_steps=0).
     warm_start: (z (B, nz), y (B, rows)) or plans of all states, to tune for warm starts.
     reference, input_reference: to track, as in `solve`, one for all.
     cache: folder that keeps results by a fingerprint of all of this; not with an optimizer.
@@ -244,7 +244,7 @@ def _prepared(
         train, test = samples, Samples(states("validation", settings.validation))
     W = interpolation(groups, c.layout, mpc.horizon, c.balls, _knots(mpc))
     plain = replace(
-        solver, iterations=int(iterations), rho=1.0, alpha=ALPHA, refine=0,
+        solver, iterations=int(iterations), rho=1.0, alpha=ALPHA, newton_steps=0,
         differentiate="unrolled",
     )  # fmt: skip
     return PenaltyObjective(c, W, tracked[0], tracked[1], plain), train, test

@@ -31,7 +31,7 @@ from jaxmpc.tuning.result import TuningRun, finished
 from jaxmpc.tuning.settings import Settings
 
 # Where make_mpc returns a problem and no solver is given.
-SOLVER = ADMM(iterations=50, rho=1.0, alpha=1.6, refine=20)
+SOLVER = ADMM(iterations=50, rho=1.0, alpha=1.6, newton_steps=20)
 
 
 def tune_weights(

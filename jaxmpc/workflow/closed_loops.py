@@ -64,7 +64,7 @@ def nominal_loops(mpc: MPC, starts: np.ndarray, steps: int) -> NominalLoops:
     starts: states (B, n), or (B, n + m) with the previous input where input rates are limited.
     """
     with jax.enable_x64(True):
-        controller = Controller(in_float64(mpc), ADMM(refine=30))
+        controller = Controller(in_float64(mpc), ADMM(newton_steps=30))
         n = mpc.system.n
 
         def loop(start: Any) -> Any:  # from x, or (x, u_{−1}) where input rates are limited

@@ -222,7 +222,7 @@ def test_margin_terminal_set_and_solver_become_what_they_say(write):
 
     path = write("[sweep]", "[solver]\nrho = [1.0, 2.0]\niterations = 7\n[sweep]")
     solver = load(path).build_solver()
-    assert (solver.iterations, solver.alpha, solver.refine) == (7, 1.9, None)
+    assert (solver.iterations, solver.alpha, solver.newton_steps) == (7, 1.9, None)
     np.testing.assert_array_equal(solver.rho, [1.0, 2.0])
     assert load(write()).build_solver() is None
 

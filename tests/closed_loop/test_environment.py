@@ -98,7 +98,7 @@ def test_mpc_policy_is_the_controller_and_has_its_derivatives():
     system = jm.LinearSystem(np.array([[1, 0.1], [0, 1]]), np.array([[0.0], [0.2]]), dt=0.1)
     plant = jm.LinearPlant(system, jm.Box([-1.5, -2.0], [1.5, 2.0]), jm.Box([-0.4], [0.4]))
     mpc = jm.MPC(system, np.diag([5.0, 0.1]), np.eye(1) / 10, 3, inputs=plant.input_limits)
-    controller = jm.Controller(mpc, jm.ADMM(iterations=100, refine=0))
+    controller = jm.Controller(mpc, jm.ADMM(iterations=100, newton_steps=0))
     environment = Environment.of(plant, Q=[5.0, 0.1], R=[0.1])
     policy = environment.policy(controller)
     starts = np.array([[0.05, 0.0], [-0.1, 0.02], [1.4, 1.5]])

@@ -151,7 +151,7 @@ def test_delay_is_the_augmented_state(compensate):
 def test_delayed_mpc_with_filter_and_moving_references():
     """Under perfect prediction the delayed loop is the one without delay, a sample later, also for
     references over time and through an observer."""
-    controller = jm.Controller(MPC, jm.ADMM(iterations=200, refine=0))
+    controller = jm.Controller(MPC, jm.ADMM(iterations=200, newton_steps=0))
     x0, u0 = np.array([0.4, -0.1]), np.array([0.3])
     r = np.stack([np.sin(np.arange(20 + 3) / 5), np.zeros(23)], axis=1)
     s = 0.1 * np.cos(np.arange(20 + 2))[:, None]

@@ -17,7 +17,7 @@ DOUBLE = jm.LinearSystem(np.array([[1, T], [0, 1]]), np.array([[T * T / J], [T /
 STATES = jm.Box(np.array([-1.5, -2.0]), np.array([1.5, 2.0]))
 TORQUE = jm.Box(np.array([-2.0]), np.array([2.0]))
 PLANT = jm.LinearPlant(DOUBLE, STATES, TORQUE)
-PRECISE = jm.ADMM(iterations=500, rho=1.0, alpha=1.6, refine=6)
+PRECISE = jm.ADMM(iterations=500, rho=1.0, alpha=1.6, newton_steps=6)
 PENALTY = 1e4
 
 
@@ -322,7 +322,7 @@ def test_weights_under_vmap(linear_mpc):
 
 def test_bad_problems_and_controllers_are_named(pendulum, linear_mpc):
     two, mpc, Q, R = jm.load_robot("arm2"), linear_mpc, [50.0, 1.0], [0.1]
-    solver = jm.ADMM(iterations=10, rho=1.0, alpha=1.6, refine=0)
+    solver = jm.ADMM(iterations=10, rho=1.0, alpha=1.6, newton_steps=0)
     make = jm.robot_mpc
     follow = lambda K: jm.simulate(jm.closed_loop.LinearFeedback(mpc, K), PLANT, [0.0, 0.0], 1)
     for call, message in (

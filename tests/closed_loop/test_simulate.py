@@ -15,7 +15,7 @@ from jaxmpc.closed_loop.simulation import simulate
 from jaxmpc.mpc.problem import Soft
 
 # Compiles quickly.
-CHEAP = jm.ADMM(iterations=400, refine=0)
+CHEAP = jm.ADMM(iterations=400, newton_steps=0)
 ONE_STEP = problems.scalar(a=2.0, horizon=1, x_max=5.0, u_max=1.0)
 
 

@@ -37,7 +37,7 @@ def exported(case, folder, dtype):
         export_explicit_c(LAW(), folder, dtype=dtype)
         return "fuzz_law.c"
     make, _ = CASES[case]
-    steps = jm.ADMM(iterations=60, refine=0)
+    steps = jm.ADMM(iterations=60, newton_steps=0)
     export_c(make(), folder, steps, name="law", dtype=dtype)
     return "fuzz_mpc.c"
 
@@ -81,7 +81,7 @@ def test_whatever_comes_inputs_are_finite_and_the_status_is_true(case, dtype, tm
 
 def test_one_bad_reading_is_forgotten_after_one_sample(tmp_path):
     """The sample after it is that of a controller that has seen none."""
-    code = Compiled(CASES["ellipsoid"][0](), jm.ADMM(iterations=80, refine=0), tmp_path)
+    code = Compiled(CASES["ellipsoid"][0](), jm.ADMM(iterations=80, newton_steps=0), tmp_path)
     cold, status = code.step([0.2, 0.1])
     assert status == 1
     for bad in (np.nan, np.inf, 1e4, 1e15, 1e200, 1.7e308):
@@ -94,7 +94,7 @@ def test_one_bad_reading_is_forgotten_after_one_sample(tmp_path):
 
 @pytest.mark.parametrize("name", ["axisX0", "VERSION2", "NAMEs", "X0", "mpc"])
 def test_names_that_hold_words_of_the_templates(name, tmp_path):
-    export_c(pendulum(horizon=2), tmp_path, jm.ADMM(iterations=4, refine=0), name=name)
+    export_c(pendulum(horizon=2), tmp_path, jm.ADMM(iterations=4, newton_steps=0), name=name)
     command = [COMPILERS[0], *STRICT, f"{name}.c", f"{name}_example.c", "-lm", "-o", "example"]
     subprocess.run(command, cwd=tmp_path, check=True)
 

@@ -15,7 +15,7 @@ from jaxmpc.export import check_fixed_steps, export_c
 
 CC = shutil.which("cc")
 compiled = pytest.mark.skipif(CC is None, reason="there is no C compiler")
-STEPS = jm.ADMM(iterations=12, refine=0)
+STEPS = jm.ADMM(iterations=12, newton_steps=0)
 
 
 def pendulum(**changes):
@@ -40,7 +40,7 @@ CASES = {
             ),
             terminal_set=jm.Ellipsoid(np.array([[2.0, 0.3], [0.3, 1.0]]), 0.2),
         ),
-        jm.ADMM(iterations=12, refine=0, rho=[[0.3], [2.0]]),
+        jm.ADMM(iterations=12, newton_steps=0, rho=[[0.3], [2.0]]),
     ),
     "prestabilised, drift": (pendulum, STEPS),
     "soft": (lambda: jm.mpc.soften(pendulum(), 5.0), STEPS),
@@ -51,7 +51,7 @@ CASES = {
         lambda: pendulum(input_rate_limit=0.4, input_rate_weight=0.3 * np.eye(2)), STEPS,
     ),
     "moves": (lambda: pendulum(control_horizon=(1, 2, 2)), STEPS),
-    "schedule": (pendulum, jm.ADMM(iterations=12, refine=0, rho=[[0.3], [2.0]])),
+    "schedule": (pendulum, jm.ADMM(iterations=12, newton_steps=0, rho=[[0.3], [2.0]])),
     "no rows": (lambda: pendulum(states=None, inputs=None), STEPS),
 }  # fmt: skip
 
@@ -110,7 +110,7 @@ def test_closed_loop_is_the_controllers(case, tmp_path):
 @compiled
 def test_status_is_true_and_bad_states_are_answered(tmp_path):
     mpc = problems.joint_o_inf(6)
-    code = Compiled(mpc, jm.ADMM(iterations=300, refine=0), tmp_path)
+    code = Compiled(mpc, jm.ADMM(iterations=300, newton_steps=0), tmp_path)
     with jax.enable_x64(True):
         best = jm.solve(mpc, [0.2, -0.1])
     u, status = code.step([0.2, -0.1])
@@ -125,7 +125,7 @@ def test_status_is_true_and_bad_states_are_answered(tmp_path):
 
 @compiled
 def test_float(tmp_path):
-    mpc, solver = problems.joint_o_inf(6), jm.ADMM(iterations=100, refine=0)
+    mpc, solver = problems.joint_o_inf(6), jm.ADMM(iterations=100, newton_steps=0)
     code = Compiled(mpc, solver, tmp_path, dtype="float32")
     with jax.enable_x64(True):
         u, *_ = jm.Controller(mpc, solver)(np.array([0.2, -0.1]))

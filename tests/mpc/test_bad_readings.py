@@ -55,7 +55,9 @@ def readings(good):
 
 
 @pytest.mark.first(1)
-@pytest.mark.parametrize("steps", [{}, {"refine": 0, "iterations": 200}], ids=["exact", "ADMM"])
+@pytest.mark.parametrize(
+    "steps", [{}, {"newton_steps": 0, "iterations": 200}], ids=["exact", "ADMM"]
+)
 @pytest.mark.parametrize("kind", KINDS)
 def test_controller(kind, steps):
     with jax.enable_x64(True):

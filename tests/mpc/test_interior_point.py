@@ -47,8 +47,8 @@ def instances() -> tuple[np.ndarray, ...]:
 
 
 @cache
-def planned(kind: str = "hard", dtype: str = "float64", refine: int | None = None) -> jm.Plan:
-    mpc, solver = PROBLEMS[kind], replace(SOLVER, refine=refine)
+def planned(kind: str = "hard", dtype: str = "float64", newton_steps: int | None = None) -> jm.Plan:
+    mpc, solver = PROBLEMS[kind], replace(SOLVER, newton_steps=newton_steps)
     with enable_x64(dtype == "float64"):
         data = [jnp.asarray(v, dtype) for v in instances()]
         mpc = jax.tree.map(lambda v: jnp.asarray(v, dtype), mpc)
@@ -88,7 +88,7 @@ def test_every_plan_is_solved_however_far_outside(dtype):
 
 @pytest.mark.slow
 def test_newton_steps_alone_do_not_solve_them():
-    plan = planned(refine=20)
+    plan = planned(newton_steps=20)
     assert (plan.status == jm.Status.SOLVED).mean() < 0.99
 
 

@@ -15,7 +15,7 @@ import jaxmpc as jm
 from jaxmpc.mpc.condense import condense
 from jaxmpc.mpc.plan import WarmStart
 
-FINE = jm.ADMM(iterations=400, refine=30, eps=1e-8)
+FINE = jm.ADMM(iterations=400, newton_steps=30, eps=1e-8)
 
 
 @pytest.fixture(autouse=True)
@@ -432,7 +432,7 @@ class TestController:
         mpc = problems.joint_o_inf(horizon=10)
         x = np.array([0.35, -0.5])
         fine = jm.Controller(mpc, FINE)
-        few = jm.Controller(mpc, jm.ADMM(iterations=5, refine=0))
+        few = jm.Controller(mpc, jm.ADMM(iterations=5, newton_steps=0))
         plan = fine.plan(x)
         cold, warm = few.plan(x), few.plan(x, warm_start=plan)
         assert warm.status == jm.Status.SOLVED != cold.status
@@ -451,7 +451,7 @@ class TestController:
         x = np.array([0.02, -0.01])
         plan = jm.Controller(mpc, FINE).plan(x)
         x = mpc.system.A @ x + mpc.system.B @ plan.inputs[0]
-        controller = jm.Controller(mpc, jm.ADMM(iterations=0, refine=0))
+        controller = jm.Controller(mpc, jm.ADMM(iterations=0, newton_steps=0))
         start, condensed = controller.shifted(plan), controller.condensed
         z = condensed.variables(start.states, start.inputs)
         inputs = condensed.trajectory(x, z)[1]

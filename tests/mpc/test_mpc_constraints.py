@@ -26,7 +26,7 @@ from jaxmpc.mpc.targets import equilibrium
 from jaxmpc.sets.convex import Ellipsoid
 
 ONE, EYE = np.ones(2), np.eye(2)
-FINE = jm.ADMM(iterations=300, refine=30, eps=1e-8)
+FINE = jm.ADMM(iterations=300, newton_steps=30, eps=1e-8)
 
 
 @pytest.fixture(autouse=True)
@@ -610,7 +610,7 @@ def test_shifted_plan_helps(name):
     """Few steps from the shifted plan end closer to the next plan than from nothing."""
     explicit, x0, previous, reference, effort, _ = batch(name)
     mpc = explicit.mpc
-    fine, few = jm.Controller(mpc, FINE), jm.Controller(mpc, jm.ADMM(iterations=10, refine=0))
+    fine, few = jm.Controller(mpc, FINE), jm.Controller(mpc, jm.ADMM(iterations=10, newton_steps=0))
     ratio = []
     for x, v, r, ur in zip(x0, previous, reference, effort, strict=True):
         r, ur = np.tile(r[0], (mpc.horizon + 1, 1)), np.tile(ur[0], (mpc.horizon, 1))

@@ -37,7 +37,7 @@ def test_plans_are_those_of_solve(plans, states):
     mpc = problems.joint_o_inf(10)
     some = np.flatnonzero(plans.status == jm.Status.SOLVED)[::17]
     with jax.enable_x64(True):
-        solver = jm.ADMM(iterations=1000, refine=20)
+        solver = jm.ADMM(iterations=1000, newton_steps=20)
         one = jax.vmap(lambda x: jm.solve(mpc, x, solver=solver))(states[some])
     np.testing.assert_allclose(plans.inputs[some], one.inputs, atol=1e-5)
     np.testing.assert_allclose(plans.cost[some], one.cost, rtol=1e-6, atol=1e-6)

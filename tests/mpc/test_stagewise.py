@@ -19,7 +19,7 @@ from jaxmpc.qp import admm
 from jaxmpc.qp.residuals import residuals
 
 N, n, m = 8, 3, 2
-SOLVER = jm.ADMM(iterations=20, refine=5)  # ADMM alone leaves 1e-3
+SOLVER = jm.ADMM(iterations=20, newton_steps=5)  # ADMM alone leaves 1e-3
 
 
 @pytest.fixture(autouse=True)
@@ -213,7 +213,7 @@ def test_stage_weights():
     rows = np.concatenate([(root[:, None, None] * push).reshape(10, 4), np.diag(root[:4])])
     aim = np.concatenate([(root[:, None] * (r - free)).ravel(), root[:4] * v[:, 0]])
     exact = np.linalg.lstsq(rows, aim, rcond=None)[0]
-    solver = jm.ADMM(iterations=1, refine=0)
+    solver = jm.ADMM(iterations=1, newton_steps=0)
     for plan in (
         jm.solve(mpc, x0, r, solver, input_reference=v),
         solve_stagewise(mpc, mpc.system, x0, r, solver, input_reference=v),
@@ -245,7 +245,7 @@ def test_residuals_are_those_of_the_qp():
     """Far from the optimum: the residuals of `residuals(qp, z, y)`, from adjoints."""
     mpc, system = problem(), varying()
     qp, _ = condensed(mpc, system, X0)
-    plan = solve_stagewise(mpc, system, X0, solver=jm.ADMM(iterations=2, refine=0))
+    plan = solve_stagewise(mpc, system, X0, solver=jm.ADMM(iterations=2, newton_steps=0))
     assert plan.status == jm.Status.ITERATION_LIMIT
     found = plan.primal_residual, plan.dual_residual, plan.gap
     np.testing.assert_allclose(
@@ -275,7 +275,7 @@ def test_rows_that_no_input_moves():
 def test_warm_start_and_parts():
     mpc, system = problem(), varying()
     plan = solve_stagewise(mpc, system, X0, solver=SOLVER)
-    again = jm.ADMM(iterations=2, refine=0)
+    again = jm.ADMM(iterations=2, newton_steps=0)
     cold = solve_stagewise(mpc, system, X0, solver=again)
     assert cold.status != jm.Status.SOLVED
     factor = factor_stages(mpc, system, again)

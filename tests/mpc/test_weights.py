@@ -17,7 +17,7 @@ n, m, N = 2, 2, 4
 A, B = np.array([[1.0, 0.3], [-0.1, 0.9]]), np.array([[0.1, 0.0], [0.4, 0.3]])
 SYSTEM = jm.LinearSystem(A, B, c=[0.02, -0.01], dt=0.1)
 X0, AIM, EFFORT = np.array([1.0, -0.6]), np.array([0.3, 0.1]), np.array([0.1, -0.05])
-SOLVER, UNROLLED = jm.ADMM(eps=1e-9), jm.ADMM(200, refine=0, differentiate="unrolled")
+SOLVER, UNROLLED = jm.ADMM(eps=1e-9), jm.ADMM(200, newton_steps=0, differentiate="unrolled")
 
 
 @pytest.fixture(scope="module", autouse=True)

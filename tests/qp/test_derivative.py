@@ -20,7 +20,7 @@ from jaxmpc.qp.newton import linearised
 
 INF = np.inf
 # Without the polish a program compiles several times faster; ADMM alone converges on easy ones.
-PLAIN = jm.ADMM(iterations=1000, refine=0)
+PLAIN = jm.ADMM(iterations=1000, newton_steps=0)
 UNROLLED = replace(PLAIN, differentiate="unrolled")
 # Directions of the data; "bounds" moves l and u alike, equalities and centres of balls included.
 DIRECTIONS = ("P", "q", "A", "l", "u", "bounds", "soft_linear", "soft_quadratic", "radius")
@@ -42,13 +42,13 @@ def outputs(qp: jm.QP, solver: jm.ADMM) -> tuple:
 
 
 @cache
-def program(iterations: int = 200, refine: int = 30, differentiate: str = "implicit"):
+def program(iterations: int = 200, newton_steps: int = 30, differentiate: str = "implicit"):
     """(qp, d, ct, smoothing) → outputs, status, J d, J'ct for BATCH programs of one shape."""
 
     @jax.jit
     def run(qp, d, ct, smoothing):
         solver = jm.ADMM(
-            iterations, refine=refine, differentiate=differentiate, smoothing=smoothing
+            iterations, newton_steps=newton_steps, differentiate=differentiate, smoothing=smoothing
         )
 
         @jax.vmap
@@ -474,7 +474,7 @@ class TestTransformations:
         respect to x0 and Q through `scan` against central differences."""
         A, B = np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[0.02], [0.2]])
         system = jm.LinearSystem(A, B)
-        solver = jm.ADMM(iterations=800, refine=0)
+        solver = jm.ADMM(iterations=800, newton_steps=0)
 
         def cost(x0, Q):
             one = np.ones(1)
@@ -751,7 +751,7 @@ class TestUnrolled:
         rows[10:12], rows[12:] = rows[10], rows[12]  # a ball has one penalty
 
         def f(rho, alpha, z, y):
-            solver = jm.ADMM(9, rho=rho, alpha=alpha, refine=0, differentiate="unrolled")
+            solver = jm.ADMM(9, rho=rho, alpha=alpha, newton_steps=0, differentiate="unrolled")
             sol = jm.solve_qp(qp, solver, warm_start=(z, y))
             return jnp.sum(jnp.sin(sol.z)) + jnp.sum(sol.y**2)
 
@@ -793,7 +793,7 @@ class TestUnrolled:
         qp, _ = joint_batch(1)
         q = jnp.asarray(qp.q[0], jnp.float32)
         qp = jax.tree.map(np.float32, replace(qp, l=qp.l[0], u=qp.u[0]))
-        solver = jm.ADMM(20, refine=0, differentiate="unrolled")
+        solver = jm.ADMM(20, newton_steps=0, differentiate="unrolled")
         gradient = jax.grad(lambda q: loss(replace(qp, q=q), solver))(q)
         assert gradient.dtype == jnp.float32 and np.isfinite(gradient).all()
 
@@ -803,7 +803,7 @@ class TestUnrolled:
         qp, axes = joint_batch(256)
 
         def temporary(iterations):
-            solver = jm.ADMM(iterations, refine=0, differentiate="unrolled")
+            solver = jm.ADMM(iterations, newton_steps=0, differentiate="unrolled")
             total = lambda q: jnp.sum(
                 jax.vmap(partial(loss, solver=solver), in_axes=(axes,))(replace(qp, q=q))
             )

@@ -152,7 +152,7 @@ def test_damped_systems_in_a_kernel_are_those_of_xla(x64):
 
 
 # Settings of no other test: programs that are traced for a GPU must not be taken for others.
-SOLVER = jm.ADMM(refine=1001)
+SOLVER = jm.ADMM(newton_steps=1001)
 
 
 @pytest.mark.slow

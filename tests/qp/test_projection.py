@@ -25,8 +25,8 @@ N, ROWS = 5, 12  # variables and rows of every program below
 BALLS = (3, 2)
 COUNT = 32  # programs in a batch
 
-FINE = jm.ADMM(iterations=400, refine=60)
-COARSE = jm.ADMM(iterations=3, refine=0)
+FINE = jm.ADMM(iterations=400, newton_steps=60)
+COARSE = jm.ADMM(iterations=3, newton_steps=0)
 solve_fine = jax.jit(jax.vmap(lambda qp, eps: jm.solve_qp(qp, replace(FINE, eps=eps)), (0, None)))
 solve_coarse = jax.jit(
     jax.vmap(lambda qp, eps: jm.solve_qp(qp, replace(COARSE, eps=eps)), (0, None))
@@ -907,7 +907,7 @@ q, l = rng.standard_normal((B, n)), np.where(np.arange(m) < m - 4, -1.0, 0.0) * 
 soft = np.where(np.arange(m) < 5, 1.0, np.inf) * np.ones((B, 1))
 qp = jm.QP(P, q, A, l, -l, soft_linear=soft, radius=np.ones((B, 1)), balls=(4,))
 qp = jax.tree.map(np.float32, qp)
-status = jax.jit(jax.vmap(lambda p: jm.solve_qp(p, jm.ADMM(iterations=10, refine=10)).status))
+status = jax.jit(jax.vmap(lambda p: jm.solve_qp(p, jm.ADMM(iterations=10, newton_steps=10)).status))
 assert (np.asarray(status(qp)) == 1).mean() > 0.9
 """
 
@@ -1026,7 +1026,7 @@ class TestBadInput:
                 eye, [-3, -3, -3, -3], eye, [-1, -1, 0, 0], [1, 1, 0, 0],
                 soft_linear=[1, 2, INF, INF], soft_quadratic=[1, 0, 0, 0], radius=[1], balls=(2,),
             ),
-            jm.ADMM(iterations=300, refine=0),
+            jm.ADMM(iterations=300, newton_steps=0),
         )  # fmt: skip
         assert sol.status == jm.Status.SOLVED
         np.testing.assert_allclose(sol.z, [1.5, 1, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-6)

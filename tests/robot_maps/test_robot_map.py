@@ -33,7 +33,7 @@ def hanging():
     beyond = [[-1.51, 2.0]]  # comes in at once
     points = np.concatenate([jm.grid(-1.1 * limit, 1.1 * limit, (7, 7)), near, beyond])
     with jax.enable_x64(True):  # few Newton steps, for a quick compile
-        controller = jm.RobotController(robot, mpc, jm.ADMM(100, refine=3), "set-point")
+        controller = jm.RobotController(robot, mpc, jm.ADMM(100, newton_steps=3), "set-point")
     rmap = map_robot(robot, mpc, points, SECONDS, controller=controller)
     return robot, mpc, points, controller, rmap
 
@@ -130,7 +130,7 @@ def test_linear_robot_keeps_every_promise_with_an_invariant_end():
     plant, mpc = lecture_with_end(1.0)
     points = jm.grid([-1.0, -1.0], [1.0, 1.0], (12, 12))
     with jax.enable_x64(True):
-        controller = jm.RobotController(plant, mpc, jm.ADMM(100, refine=6), "set-point")
+        controller = jm.RobotController(plant, mpc, jm.ADMM(100, newton_steps=6), "set-point")
     rmap = map_robot(plant, mpc, points, 8.0, controller=controller, chunk=100)
     assert not rmap.broken.any() and rmap.worst() is None
     assert np.sum(rmap.promised == 1) > 40 and np.all(rmap.recursive[rmap.promised == 1] == 1)

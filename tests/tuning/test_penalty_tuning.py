@@ -24,7 +24,7 @@ from jaxmpc.tuning.settings import Settings
 from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
 
 # The double integrator of five steps: 5 variables, 17 rows.
-DEFAULT = jm.ADMM(rho=1.0, alpha=1.6, refine=0)
+DEFAULT = jm.ADMM(rho=1.0, alpha=1.6, newton_steps=0)
 SETTINGS = {"iterations": 30, "stages": 2, "updates": 40, "batch": 32, "solver": DEFAULT}
 
 
@@ -57,7 +57,7 @@ def learned(tmp_path_factory):
 def test_more_states_are_solved_on_others(learned):
     found, x = learned[0], states(300, 1)
     rows = len(jm.mpc.row_table(mpc()))
-    assert found.solver.iterations == 30 and found.solver.refine == 0
+    assert found.solver.iterations == 30 and found.solver.newton_steps == 0
     assert np.shape(found.solver.rho) == (2, rows)
     # Two stages, so that one program serves both.
     before = solved(replace(DEFAULT, iterations=30, rho=np.ones((2, rows))), x, mpc())
@@ -114,9 +114,9 @@ def test_cache(learned, monkeypatch):
     assert np.array_equal(again().rho, found.solver.rho) and not calls
     assert again().alpha == found.solver.alpha
     assert (
-        again(solver=replace(DEFAULT, refine=3)).refine == 3 and not calls
+        again(solver=replace(DEFAULT, newton_steps=3)).newton_steps == 3 and not calls
     )  # plays no part in learning
-    for other in ({"seed": 1}, {"iterations": 32}, {"solver": jm.ADMM(rho=2.0, refine=0)}):
+    for other in ({"seed": 1}, {"iterations": 32}, {"solver": jm.ADMM(rho=2.0, newton_steps=0)}):
         again(**other)
         assert calls.pop() and not calls
     # A damaged file is learned anew and replaced.
@@ -369,9 +369,9 @@ def test_the_joint_is_solved_in_a_hundred_steps():
     x = np.random.default_rng(0).uniform([-1.5, -2], [1.5, 2], (6000, 2))
     x = x[jm.map_feasible_set(problem, x).label == 1]
     solver = tune_penalties(problem, x[:3000]).solver
-    assert solver.iterations == 100 and solver.refine == 0
+    assert solver.iterations == 100 and solver.newton_steps == 0
     assert solved(solver, x[3000:], problem) > 0.95
-    assert solved(jm.ADMM(refine=0), x[3000:], problem) < 0.1
+    assert solved(jm.ADMM(newton_steps=0), x[3000:], problem) < 0.1
     many = jm.solve_many(problem, x[:500], solver)
     assert np.all(many.status == jm.Status.SOLVED)
 
@@ -388,7 +388,7 @@ def test_warm_starts_have_penalties_of_their_own():
     """Learned from perturbed solutions: fewer steps serve."""
     problem, x = mpc(10), states(300, 4)
     with jax.enable_x64(True):
-        controller = jm.Controller(jax.tree.map(np.float64, problem), jm.ADMM(refine=30))
+        controller = jm.Controller(jax.tree.map(np.float64, problem), jm.ADMM(newton_steps=30))
         near = jax.tree.map(np.asarray, plans(controller, 0.98 * x))
     found = tune_penalties(problem, x, 20, stages=2, updates=150, warm_start=near)
     cold = tune_penalties(problem, x, 20, stages=2, updates=150)

@@ -139,7 +139,7 @@ def test_weights_cut_off_resumed_and_read_back(tmp_path, monkeypatch, capsys, gi
     np.testing.assert_array_equal(job.mpc.Q, mpc.Q)
     # The loops after tuning, counted from outside: |q| <= 1.5, |dq| <= 2.
     with jax.enable_x64(True):
-        controller = jm.Controller(mpc, ADMM(iterations=8, refine=0))
+        controller = jm.Controller(mpc, ADMM(iterations=8, newton_steps=0))
         x0s = np.random.default_rng(1).uniform([-1.35, -1.8], [1.35, 1.8], (8, 2))[6:]
         plant = jm.LinearPlant(mpc.system, mpc.states, mpc.inputs, name="joint")
         loops = jm.simulate_many(controller, plant, x0s, 5)  # compiled already
@@ -156,7 +156,7 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
 
     def learn(mpc, x0s, iterations, **more):
         asked.update(more, count=len(x0s), iterations=iterations)
-        solver = ADMM(iterations=iterations, rho=rho, alpha=1.7, refine=0)
+        solver = ADMM(iterations=iterations, rho=rho, alpha=1.7, newton_steps=0)
         blocks = [["input", [0, 1, 2], 1], ["state", [0, 1, 2], 2]]
         before, after = (
             {"solved": solved, "residual": residual, "infeasible": 2.0}
@@ -177,7 +177,7 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
     config = load(tmp_path / "out" / "tuned.toml")
     solver = config.build_solver()
     np.testing.assert_array_equal(solver.rho, rho)
-    assert (solver.iterations, solver.alpha, solver.refine) == (6, 1.7, 0)
+    assert (solver.iterations, solver.alpha, solver.newton_steps) == (6, 1.7, 0)
     assert replace(config, solver=None) == load(None, {"horizon": 3})
     record = json.loads((tmp_path / "out" / "penalties.json").read_text())
     assert record["finished"] and record["result"]["after"]["solved"] == 0.5
@@ -199,7 +199,7 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
     assert not record["finished"] and record["solved"] == [0.25, 0.5]
 
     # Where nothing learned is better the words say so.
-    default = replace(made[0], improved=False, build=lambda _: ADMM(refine=0))
+    default = replace(made[0], improved=False, build=lambda _: ADMM(newton_steps=0))
     table = rows(tune_penalties.TunePenalties().report_text(default, 4, 0, 1.0))
     assert "the default is kept" in table["safeguard"]
 

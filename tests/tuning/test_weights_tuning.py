@@ -23,7 +23,7 @@ MPC = jm.MPC(
     SYSTEM, np.diag([4.0, 0.5]), np.array([[0.2]]), 5, states=LIMITS, inputs=symmetric(1.0),
     terminal_cost=np.diag([4.0, 0.5]), constrain_initial=False,
 )  # fmt: skip
-SOLVER = jm.ADMM(iterations=80, refine=0, eps=1e-3)  # compiles fastest
+SOLVER = jm.ADMM(iterations=80, newton_steps=0, eps=1e-3)  # compiles fastest
 LOSS = ClosedLoopLoss(np.diag([4.0, 0.5]), [0.02], limits=LIMITS, violation=5.0)
 PARAMETERS = {"Q": Parameter(MPC.Q / 4, "definite"), "R": Parameter(10 * MPC.R, "diagonal")}
 
@@ -211,11 +211,13 @@ def test_derivatives_of_100_random_problems(x64):
                 error = np.abs(change - found[name][(slice(None), *place)])
                 assert np.all(error <= 1e-4 * scale + 1e-8), (name, place, error.max())
 
-    compare(lambda v, x: cost(v, x, jm.ADMM(iterations=50, refine=20)), settings)
+    compare(lambda v, x: cost(v, x, jm.ADMM(iterations=50, newton_steps=20)), settings)
     # ADMM's own penalty, one a row and stage, of a loop that is far from converged.
     rows = len(jm.mpc.row_table(jm.soften(MPC, 1.0)))
     settings = {"rho_admm": np.exp(0.5 * rng.normal(size=(100, 2, rows)))}
-    few = lambda v: jm.ADMM(iterations=8, refine=0, rho=v["rho_admm"], differentiate="unrolled")
+    few = lambda v: jm.ADMM(
+        iterations=8, newton_steps=0, rho=v["rho_admm"], differentiate="unrolled"
+    )
     fixed = {"Q": MPC.Q, "R": MPC.R, "P": MPC.Q, "rho": 5.0}
     compare(lambda v, x: cost(fixed, x, few(v)), settings)
 
@@ -238,7 +240,7 @@ def test_derivatives_through_a_robot(x64, linearize):
     def cost(v):
         problem = replace(mpc, Q=v["Q"], R=v["R"])
         controller = jm.RobotController(
-            robot, problem, jm.ADMM(iterations=50, refine=8), linearize, rho=v["rho"]
+            robot, problem, jm.ADMM(iterations=50, newton_steps=8), linearize, rho=v["rho"]
         )
         loop = lambda x0: loss(jm.simulate(controller, robot, x0, 10, **goal))
         return jnp.mean(jax.vmap(loop)(x0s))

@@ -113,7 +113,7 @@ class RobotRuns:
             if command.linearize == "lqr":
                 controller = LinearFeedback(mpc, lqr(mpc.system, mpc.Q, mpc.R).K, robot)
             else:
-                solver = ADMM(iterations=command.iterations, refine=command.newton_steps)
+                solver = ADMM(iterations=command.iterations, newton_steps=command.newton_steps)
                 controller = RobotController(
                     robot, mpc, solver, linearize=str(command.linearize), rho=command.rho
                 )

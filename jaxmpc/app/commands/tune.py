@@ -301,6 +301,6 @@ class TuneWeights:
         """Return the options that determine the result, as JSON data, without --updates."""
         ignored = ("config", "output", "resume", "overwrite", "updates")
         found = {k: v for k, v in dataclasses.asdict(self).items() if k not in ignored}
-        solver = {"iterations": task.solver.iterations, "refine": task.solver.refine}
+        solver = {"iterations": task.solver.iterations, "refine": task.solver.newton_steps}
         found |= {"steps": task.steps, "dtype": task.dtype, **solver, **task.options}
         return json.loads(json.dumps(found))

@@ -151,7 +151,7 @@ class TunePenalties:
                 f"{config.name}: penalties of {self.iterations} ADMM steps from {len(states):,} "
                 f"states -> {self.output}", flush=True,
             )  # fmt: skip
-            given, learning, stopped = ADMM(refine=0), time.perf_counter(), False
+            given, learning, stopped = ADMM(newton_steps=0), time.perf_counter(), False
             found = self.learned(mpc, train, test, given)
         except ValueError as error:
             return report_error(error)

@@ -220,10 +220,10 @@ def linear_task(command: Any) -> TuningTask:
         hard.system, limits if isinstance(limits, Box) else free, hard.inputs,
         name=config.name,
     )  # fmt: skip
-    settings = config.build_solver() or ADMM(iterations=50, rho=1.0, alpha=1.6, refine=20)
+    settings = config.build_solver() or ADMM(iterations=50, rho=1.0, alpha=1.6, newton_steps=20)
     count = settings.iterations if command.iterations is None else command.iterations
-    refine = settings.refine if command.refine is None else command.refine
-    solver = dataclasses.replace(settings, iterations=count, refine=refine)
+    refine = settings.newton_steps if command.refine is None else command.refine
+    solver = dataclasses.replace(settings, iterations=count, newton_steps=refine)
     dtype = command.dtype or "float64"
     fraction = 0.9 if command.spread is None else command.spread
     steps = command.steps or 50
@@ -313,7 +313,7 @@ def robot_task(command: Any) -> TuningTask:
         r = np.asarray(robot.coordinates(x))
     if "tightening" in command.tune:
         parameters["tightening"] = tightening(section.margin, robot.state_limits, r)
-    solver = ADMM(iterations=command.iterations, refine=command.refine)
+    solver = ADMM(iterations=command.iterations, newton_steps=command.refine)
     x0s, variations = draw_robots(
         robot, command.count, command.seed,
         spread=0.5 if command.spread is None else command.spread,

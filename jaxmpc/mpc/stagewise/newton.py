@@ -70,7 +70,7 @@ from jaxmpc.systems.system import LinearSystem
 # Most stages that the passes of an ADMM step write out, without a loop over them. Loops reorder
 # (batch, N, …) to (N, batch, …) at each step, which takes longer than the products.
 UNROLL = 32
-# Newton steps before the interior point method, where ADMM.refine is None.
+# Newton steps before the interior point method, where ADMM.newton_steps is None.
 NEWTON_STEPS = 6
 
 
@@ -87,9 +87,9 @@ def solve_stagewise(
     no infeasibility is proved (a problem without a solution ends as ITERATION_LIMIT: soften the
     rows that may not hold). Derivatives with respect to every array of data are those of
     solver.differentiate. warm_start: an earlier Plan or a WarmStart, whose states are not read.
-    solver.refine: Newton steps at most, a Riccati recursion each; 5 suffice where ADMM, or the warm
-    start, has found the active rows. None: 6, after them an interior point method where they have
-    not ended at the solution (its steps need rows with l < u), and 6 again; all in float64.
+    solver.newton_steps: at most so many, a Riccati recursion each; 5 suffice where ADMM, or the
+    warm start, has found the active rows. None: 6, after them an interior point method where they
+    have not ended at the solution (its steps need rows with l < u), and 6 again; all in float64.
     mpc.prestabilise is not read: the inputs are the variables, so a plant that grows more than
     1e5-fold over the horizon in open loop has residuals above eps by rounding alone; `solve` takes
     those. scale (rows,): the row scale of a similar problem
@@ -441,14 +441,14 @@ def solution(
         t, _ = iterate(schedule, bounds, t, solver.admm_steps(), solver.alpha)
         u, y = read(factor, bounds, t, free[-1])
     y = jnp.where(E == 0, fixed, y)
-    newton, measured = solver.newton_steps(NEWTON_STEPS), None
+    newton, measured = solver.most_newton_steps(NEWTON_STEPS), None
     if newton and solver.differentiate == "unrolled":
         step = lambda pair, _: (newton_step(s, sample, E, rho[-1], *pair), None)
         u, y = jax.lax.scan(step, (u, y), length=newton)[0]
         y = s.bounds.admissible(y)
     elif newton:
         eps = tolerance(solver, u.dtype)
-        last = STEPS if solver.refine is None else 0
+        last = STEPS if solver.newton_steps is None else 0
         search = partial(refined, newton, last, solver.fixed)
         u, y, measured = precisely(search, s, sample, E, rho[-1], fixed, eps, u, y)
     return u, y, measured
