@@ -130,7 +130,7 @@ KINDS = {"processes": (processes, ""), "Dask": (dask, "distributed"), "Ray": (ra
 
 def the_same(found: Any, expected: Any) -> bool:
     """Return whether labels and proofs agree bit for bit."""
-    names = ("label", "status", "starts", "plans", "cut_normals", "cut_offsets")
+    names = ("label", "status", "start", "plan", "cut_normal", "cut_offset")
     return all(
         np.array_equal(
             getattr(found, name), getattr(expected, name), equal_nan=name not in names[:2]

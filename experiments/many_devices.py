@@ -94,7 +94,7 @@ def print_labels(x: np.ndarray, devices: tuple[jax.Device, ...], rounds: int) ->
         lambda: jm.map_feasible_set(mpc, x, devices=devices).labels.fetch(), rounds
     )
     labels = fmap.labels
-    proofs = (labels.starts, labels.plans, labels.cut_normals, labels.cut_offsets)
+    proofs = (labels.start, labels.plan, labels.cut_normal, labels.cut_offset)
     size = sum(v.nbytes for v in (labels.label, labels.status, *proofs))
     report("labels", len(devices), len(x), found, size)
     found["check"] = float(np.sum(labels.label * (1 + np.arange(len(x)) % 1009)))

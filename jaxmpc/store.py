@@ -61,15 +61,6 @@ from jaxmpc.qp.status import Status
 if TYPE_CHECKING:
     import xarray as xr
 
-# Names in the store, one row a sample, and the fields of `Labels` that they hold.
-LABELS = {
-    "label": "label",
-    "status": "status",
-    "start": "starts",
-    "plan": "plans",
-    "cut_normal": "cut_normals",
-    "cut_offset": "cut_offsets",
-}
 BOUNDS = {
     "bound_point": ("ray", "coordinate"),
     "bound_normal": ("facet", "coordinate"),
@@ -134,7 +125,7 @@ def label_fields(n: int, horizon: int, m: int, d: int) -> dict[str, Field]:
 
 def label_rows(labels: Labels) -> dict[str, np.ndarray]:
     """Return labels as the variables of `label_fields`."""
-    return {name: getattr(labels, stored) for name, stored in LABELS.items()}
+    return {name: getattr(labels, name) for name in ("label", "status", *PROOFS)}
 
 
 def open_labels(
@@ -149,7 +140,7 @@ def open_labels(
     mpc, system = problem.mpc, problem.mpc.system
     all_fields = label_fields(mpc.dimension, mpc.horizon, system.m, problem.dimension)
     all_fields |= dict(fields or {})
-    names = [_name_and_unit(label) for label in problem.labels]
+    names = [_name_and_unit(label) for label in problem.axis_names]
     axes = {
         dimension: Constant(values, (dimension,), {"long_name": name, "units": unit or "1"})
         for dimension, values, (name, unit) in zip(
@@ -159,7 +150,7 @@ def open_labels(
     text = lambda dimension, values: Constant(np.array(list(values), str), (dimension,))
     period = system.dt or 1.0
     constants = {
-        "coordinate": text("coordinate", problem.labels),
+        "coordinate": text("coordinate", problem.axis_names),
         "state": text("state", mpc.labels),
         "input": text("input", system.input_labels),
         "time": Constant(period * np.arange(mpc.horizon), ("time",), {
@@ -365,10 +356,7 @@ class Store:
 
     def labels(self) -> Labels:
         """Return the labels in the store; proofs are read when they are used."""
-        later = {
-            stored: OnDemand(partial(self.read, name))
-            for name, stored in LABELS.items() if stored in PROOFS
-        }  # fmt: skip
+        later = {name: OnDemand(partial(self.read, name)) for name in PROOFS}
         return Labels(self.read("label"), self.read("status"), later)
 
     def save_bounds(self, points: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> None:

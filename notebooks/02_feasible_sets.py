@@ -126,7 +126,7 @@ exact = np.vectorize(Fraction)
 A_exact, B_exact = exact(A), exact(B)
 x = exact(x0s[chosen])
 margin = Fraction(2)
-for u in exact(fmap.labels.plans[chosen]):
+for u in exact(fmap.labels.plan[chosen]):
     margin = min(margin, 2 - abs(u[0]), Fraction(1.5) - abs(x[0]), 2 - abs(x[1]))
     x = A_exact @ x + B_exact @ u
 print(f"state {x0s[chosen].round(4)}: least distance to a limit {float(margin):.2e}")
@@ -140,7 +140,7 @@ assert margin >= 0
 # %%
 infeasible = np.flatnonzero((fmap.label == -1) & np.all(np.abs(x0s) <= [1.5, 2.0], axis=1))
 worst = infeasible[np.argmax(x0s[infeasible] @ np.array([1.0, 0.5]))]
-a, b = fmap.labels.cut_normals[worst], fmap.labels.cut_offsets[worst]
+a, b = fmap.labels.cut_normal[worst], fmap.labels.cut_offset[worst]
 a, b = a / np.abs(a).max(), b / np.abs(a).max()
 print(f"state {x0s[worst].round(4)} violates {a[0]:.4f} q + {a[1]:.4f} dq <= {b:.4f}")
 assert a @ x0s[worst] > b

@@ -508,8 +508,8 @@ CALLS = [
     ),
     ("penalties: is a int. Give a", lambda: jm.map_feasible_set(M, np.zeros((3, 2)), penalties=3)),
     (
-        "refine: 'x' where real numbers are",
-        lambda: jm.map_feasible_set(M, np.zeros((3, 2)), refine="x"),
+        "gap: 'x' where real numbers are",
+        lambda: jm.map_feasible_set(M, np.zeros((3, 2)), gap="x"),
     ),
     ("mpc: is a str. Give a jm.MPC", lambda: jm.boundary("M", 3)),
     ("mpc: is a str. Give a jm.MPC", lambda: jm.recursive_feasibility("M")),

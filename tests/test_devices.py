@@ -58,7 +58,7 @@ def map_of(x, horizon=5, **options):
     found = jm.map_feasible_set(mpc, x, **options).labels
     return {
         name: getattr(found, name)
-        for name in ("label", "status", "starts", "plans", "cut_normals", "cut_offsets")
+        for name in ("label", "status", "start", "plan", "cut_normal", "cut_offset")
     }
 
 
@@ -71,7 +71,7 @@ def prove_by_hand(x, found):
     for k in range(plans.shape[1] - 1):
         rolled = mpc.system.A @ rolled + mpc.system.B @ plans[:, k].T
         assert (np.abs(rolled).max(axis=1) <= [1.5 + 1e-9, 2 + 1e-9]).all()
-    assert (np.sum(found["cut_normals"][no] * x[no], axis=1) > found["cut_offsets"][no]).all()
+    assert (np.sum(found["cut_normal"][no] * x[no], axis=1) > found["cut_offset"][no]).all()
 
 
 def check_map():

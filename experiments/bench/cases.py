@@ -304,14 +304,14 @@ def _own_labels(case: Case) -> Iterator[Contestant]:
     def judge(fmap: Any) -> tuple[float, int]:
         labels = fmap.labels
         with np.errstate(invalid="ignore"):
-            out = (x * labels.cut_normals).sum(axis=1) > labels.cut_offsets
+            out = (x * labels.cut_normal).sum(axis=1) > labels.cut_offset
         # ∞ stands for a proof at the point without a half-space.
-        out |= np.isposinf(labels.cut_offsets)
+        out |= np.isposinf(labels.cut_offset)
         inside = labels.label == 1
         z = np.zeros((len(x), len(c.P)))
         if inside.any():
-            states = jax.vmap(lambda x, u: rolled_out(mpc, x, u))(x[inside], labels.plans[inside])
-            z[inside] = np.asarray(jax.vmap(c.variables)(states, labels.plans[inside]))
+            states = jax.vmap(lambda x, u: rolled_out(mpc, x, u))(x[inside], labels.plan[inside])
+            z[inside] = np.asarray(jax.vmap(c.variables)(states, labels.plan[inside]))
         primal = residuals(Batch.of(c, x), z, np.zeros((len(x), len(c.C))))[0]
         kept = inside & (primal <= case.tolerance) & ~_breaks_at_once(case, x)
         good = kept | ((labels.label == -1) & out)

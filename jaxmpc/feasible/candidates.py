@@ -23,6 +23,7 @@ from jaxmpc.batches import Compiled, Devices, over_devices
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
+from jaxmpc.feasible.proofs import Verdict
 from jaxmpc.qp.newton import least_distance
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
@@ -42,24 +43,6 @@ class StagePenalties:
 
     weight: np.ndarray
     alpha: float = ALPHA
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
-class Verdict:
-    """What was proved of one point, and the proof.
-
-    label: 1 feasible, −1 infeasible, 0 undecided. start (n,), inputs (N, m): x_0 and the inputs
-    that prove 1. normal (d,), offset: the half-space normal'θ ≤ offset that holds on the whole
-    feasible set and excludes the point; ∞ where none is known; then `proofs.cut` at the point
-    proves −1.
-    """
-
-    label: Array
-    start: Array
-    inputs: Array
-    normal: Array
-    offset: Array
 
 
 def inputs_of(p: ExactData, rows: ConstraintRows, theta: Array, w: Array) -> tuple[Array, Array]:
@@ -221,7 +204,9 @@ def compiled_newton(batch: int, devices: Devices) -> Compiled:
         def waiting(verdict: Verdict, rounds: Array) -> Array:
             return usable & (verdict.label == 0) & (rounds < NEWTON_ROUNDS)
 
-        def newton(carry: tuple[Verdict, Array, Array]) -> tuple[Verdict, Array, Array]:
+        def newton(
+            carry: tuple[Verdict, Array, Array],
+        ) -> tuple[Verdict, Array, Array]:
             verdict, w, rounds = carry
             open_ = waiting(verdict, rounds)
             least = jnp.min(jnp.where(open_, rounds, NEWTON_ROUNDS))

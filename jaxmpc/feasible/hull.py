@@ -33,7 +33,6 @@ from scipy.spatial import ConvexHull, QhullError
 
 from jaxmpc.batches import Compiled, Devices, over_devices
 from jaxmpc.feasible import proofs
-from jaxmpc.feasible.candidates import Verdict
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.problem import FeasibilityProblem
@@ -214,7 +213,7 @@ def label(cones: Cones, theta: Array) -> Array:
     return jnp.where(inside, 1, jnp.where(outside, -1, 0)).astype(jnp.int8)
 
 
-def verdict(p: ExactData, cones: Cones, theta: Array) -> Verdict:
+def verdict(p: ExactData, cones: Cones, theta: Array) -> proofs.Verdict:
     """Return the verdict on θ (d,), with its proof."""
     N, (_, m) = p.horizon, p.B.shape
     cone, facet = nearest(cones, theta)
@@ -228,7 +227,7 @@ def verdict(p: ExactData, cones: Cones, theta: Array) -> Verdict:
     everywhere = proofs.excludes(normal, offset, jnp.zeros_like(normal), theta)
     offset = jnp.where(everywhere, offset, jnp.inf)
     label = jnp.where(feasible, 1, jnp.where(infeasible, -1, 0)).astype(jnp.int8)
-    return Verdict(label, p.view.initial_state(theta, free), inputs, normal, offset)
+    return proofs.Verdict(label, p.view.initial_state(theta, free), inputs, normal, offset)
 
 
 def nearest(cones: Cones, theta: Array) -> tuple[Array, Array]:

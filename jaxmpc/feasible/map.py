@@ -60,38 +60,31 @@ def mesh(lines: Sequence[np.ndarray], index: np.ndarray | None = None) -> np.nda
     return np.stack([line[i] for line, i in zip(lines, place, strict=True)], axis=-1)
 
 
-def count_labels(label: np.ndarray, status: np.ndarray) -> dict[str, int]:
-    """Return how many points are feasible, infeasible, undecided, not finite, not run."""
-    return {
-        "feasible": int(np.sum(label == 1)),
-        "infeasible": int(np.sum(label == -1)),
-        "undecided": int(np.sum(status == Status.ITERATION_LIMIT)),
-        "not finite": int(np.sum(status == Status.NON_FINITE)),
-        "not run": int(np.sum(status == Status.NOT_RUN)),
-    }
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FeasibleSetMap:
     """Points of a state space, each with its label and the proof of it (see `Labels`).
 
-    points (B, d) in the states `axes`. extra_points (K, d), extra_normals (F, d), extra_offsets
-    (F,): points proved feasible and half-spaces proved valid by `refine`.
+    x0s (B, d): the points, in the states `axes`. bound_point (K, d), bound_normal (F, d),
+    bound_offset (F,): points proved feasible and half-spaces proved valid by `refine`.
     """
 
     problem: FeasibilityProblem
-    points: np.ndarray
+    x0s: np.ndarray
     labels: Labels
-    extra_points: np.ndarray
-    extra_normals: np.ndarray
-    extra_offsets: np.ndarray
+    bound_point: np.ndarray
+    bound_normal: np.ndarray
+    bound_offset: np.ndarray
+
+    def __repr__(self) -> str:
+        bounds = f"; bounds: {len(self.bound_point)} points, {len(self.bound_offset)} half-spaces"
+        return f"FeasibleSetMap in {', '.join(self.axis_names)}: {self.labels}{bounds}"
 
     @classmethod
-    def of(cls, problem: FeasibilityProblem, points: Any, labels: Labels) -> "FeasibleSetMap":
+    def of(cls, problem: FeasibilityProblem, x0s: Reals, labels: Labels) -> "FeasibleSetMap":
         """Return a map from labels that were made elsewhere, by chunks or from a store."""
         d = problem.dimension
         none = np.zeros((0, d)), np.zeros((0, d)), np.zeros(0)
-        return cls(problem, np.asarray(points, float), labels, *none)
+        return cls(problem, np.asarray(x0s, float), labels, *none)
 
     @property
     def mpc(self) -> MPC:
@@ -120,27 +113,27 @@ class FeasibleSetMap:
         return self.labels.status
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Return the labels of the mapped states with their units."""
-        return self.problem.labels
+    def axis_names(self) -> tuple[str, ...]:
+        """Return the names of the mapped states with their units."""
+        return self.problem.axis_names
 
     def counts(self) -> dict[str, int]:
         """Return how many points are feasible, infeasible, undecided, not finite, not run."""
-        return count_labels(self.label, self.status)
+        return self.labels.counts()
 
     def inner(self) -> Polytope:
         """Return the convex hull of all points proved feasible: a subset of the feasible set.
 
         Raises ValueError while these points have no interior.
         """
-        points = np.concatenate([self.points[self.label == 1], self.extra_points])
+        points = np.concatenate([self.x0s[self.label == 1], self.bound_point])
         return scaled_back(Polytope.from_points(points / self._unit), self._unit)
 
     def cuts(self) -> tuple[np.ndarray, np.ndarray]:
         """Return all half-spaces a'x ≤ b proved valid for the feasible set: a (K, d), b (K,)."""
-        proved = (self.label == -1) & np.isfinite(self.labels.cut_offsets)
-        normals = np.concatenate([self.labels.cut_normals[proved], self.extra_normals])
-        offsets = np.concatenate([self.labels.cut_offsets[proved], self.extra_offsets])
+        proved = (self.label == -1) & np.isfinite(self.labels.cut_offset)
+        normals = np.concatenate([self.labels.cut_normal[proved], self.bound_normal])
+        offsets = np.concatenate([self.labels.cut_offset[proved], self.bound_offset])
         return normals, offsets
 
     def outer(self) -> Polytope:
@@ -158,7 +151,7 @@ class FeasibleSetMap:
     def _unit(self) -> np.ndarray:
         """Return units (d,) in which the points proved feasible are about 1 apart: qhull and LPs
         need coordinates of like size."""
-        points = np.concatenate([self.points[self.label == 1], self.extra_points])
+        points = np.concatenate([self.x0s[self.label == 1], self.bound_point])
         return power_of_two(np.ptp(points, axis=0) if len(points) else np.zeros(points.shape[1]))
 
     def volume_bounds(self) -> tuple[float, float]:
@@ -168,7 +161,7 @@ class FeasibleSetMap:
         (0, 0) where the half-spaces leave nothing, an upper bound of inf where they leave an
         unbounded set.
         """
-        points = np.concatenate([self.points[self.label == 1], self.extra_points])
+        points = np.concatenate([self.x0s[self.label == 1], self.bound_point])
         low = hull_volume(points) * (1 - VOLUME_ROUNDING)
         normals, offsets = self.cuts()
         outer = Polytope(normals * self._unit, offsets)
@@ -201,31 +194,31 @@ class FeasibleSetMap:
         return Polytope(H[:, axes], h - H[:, others] @ rest)
 
     def refine(
-        self, tolerance: float = 1e-6, rounds: int = 30, *, deadline: float = np.inf
+        self, gap: float = 1e-6, rounds: int = 30, *, deadline: float = np.inf
     ) -> "FeasibleSetMap":
         """Send rays through the vertices of the outer polytope until the volume bounds meet.
 
         Each ray adds a proved boundary point and a proved facet (`boundary`); in up to four
         mapped dimensions this ends at the exact polytope. Undecided points that a facet excludes
-        are labelled infeasible. tolerance: relative gap of the volume bounds at which to stop;
+        are labelled infeasible. gap: relative gap of the volume bounds at which to stop;
         a warning tells the gap where the rays, or rounds of them, end before. deadline: of
         `time.monotonic`, after which no round of rays begins. A set without interior, or unbounded,
         is returned as it is.
         """
         try:
-            found = refined(Rays.of(self.problem), tolerance, rounds, deadline=deadline)
+            found = refined(Rays.of(self.problem), gap, rounds, deadline=deadline)
         except ValueError:
             return self
-        gap, box = found.gap, self.problem.programs.bounding_box[0]
-        if gap > tolerance and box is not None and np.all(np.isfinite(box)):
+        left, box = found.gap, self.problem.programs.bounding_box[0]
+        if left > gap and box is not None and np.all(np.isfinite(box)):
             warnings.warn(
-                f"refine: the bounds of the volume differ by {gap:.2g} of it, more than the "
-                f"tolerance {tolerance:.2g}", stacklevel=2,
+                f"refine: the bounds of the volume differ by {left:.2g} of it, more than the "
+                f"gap {gap:.2g}", stacklevel=2,
             )  # fmt: skip
-        labels = excluded(self.labels, found.rays, self.points, found.normals, found.offsets)
+        labels = excluded(self.labels, found.rays, self.x0s, found.normals, found.offsets)
         return replace(
-            self, labels=labels, extra_points=found.points, extra_normals=found.normals,
-            extra_offsets=found.offsets,
+            self, labels=labels, bound_point=found.points, bound_normal=found.normals,
+            bound_offset=found.offsets,
         )  # fmt: skip
 
     def to_xarray(self) -> Any:
@@ -236,18 +229,18 @@ class FeasibleSetMap:
         data = {
             "label": ("sample", self.label),
             "status": ("sample", self.status),
-            "points": (("sample", "coordinate"), self.points),
-            "start": (("sample", "state"), self.labels.starts),
-            "plan": (("sample", "time", "input"), self.labels.plans),
-            "cut_normal": (("sample", "coordinate"), self.labels.cut_normals),
-            "cut_offset": ("sample", self.labels.cut_offsets),
-            "bound_point": (("ray", "coordinate"), self.extra_points),
-            "bound_normal": (("facet", "coordinate"), self.extra_normals),
-            "bound_offset": ("facet", self.extra_offsets),
+            "x0": (("sample", "coordinate"), self.x0s),
+            "start": (("sample", "state"), self.labels.start),
+            "plan": (("sample", "time", "input"), self.labels.plan),
+            "cut_normal": (("sample", "coordinate"), self.labels.cut_normal),
+            "cut_offset": ("sample", self.labels.cut_offset),
+            "bound_point": (("ray", "coordinate"), self.bound_point),
+            "bound_normal": (("facet", "coordinate"), self.bound_normal),
+            "bound_offset": ("facet", self.bound_offset),
         }
         system = self.mpc.system
         names = {
-            "coordinate": list(self.names),
+            "coordinate": list(self.axis_names),
             "state": list(self.mpc.labels),
             "input": list(system.input_labels),
         }
@@ -299,7 +292,7 @@ def excluded(
     out = np.flatnonzero(excludes.any(axis=1))
     left, by = left[out], np.argmax(excludes[out], axis=1)
     found = {
-        "cut_normals": OnDemand(lambda: normals[by]), "cut_offsets": OnDemand(lambda: offsets[by])
+        "cut_normal": OnDemand(lambda: normals[by]), "cut_offset": OnDemand(lambda: offsets[by])
     }  # fmt: skip
     return labels.changed(left, -1, Status.PRIMAL_INFEASIBLE, found)
 
@@ -308,7 +301,7 @@ def map_feasible_set(
     mpc: MPC | FeasibilityProblem, x0s: Reals, *, axes: Any = None,
     fixed: Reals | None = None,
     iterations: int = 50, dtype: Any = "float32", chunk: int | None = None,
-    refine: float | None = None,
+    gap: float | None = None,
     penalties: StagePenalties | None = None, progress: bool = False, executor: Any = None,
     devices: Any = None,
 ) -> FeasibleSetMap:  # fmt: skip
@@ -325,8 +318,8 @@ def map_feasible_set(
     limits exclude, which cannot have been applied, is labelled −1. iterations and dtype affect the
     ADMM stage alone and cannot make a label wrong. The last undecided points, up to 2,000 in a
     call, get linear programs of some milliseconds each, an equal share of each chunk. chunk: number
-    of points that a compiled program takes at once (None: by device). refine: tolerance of
-    `FeasibleSetMap.refine`, None to skip it. penalties: of the ADMM stage, from
+    of points that a compiled program takes at once (None: by device). gap: call
+    `FeasibleSetMap.refine` with this gap, None to skip it. penalties: of the ADMM stage, from
     `tune_sweep_penalties`. progress: show a bar. executor: what labels the chunks, such as a
     `concurrent.futures.ProcessPoolExecutor` with the start method spawn, or the executor of a
     cluster: `submit(function, *arguments)` returns a future with `result()`. Labels and proofs are
@@ -346,15 +339,15 @@ def map_feasible_set(
     whole("iterations", iterations, 1)
     if chunk is not None:
         whole("chunk", chunk, 1)
-    if refine is not None:
-        number("refine", refine, 0, "Give a tolerance of at least 0, or None")
+    if gap is not None:
+        number("gap", gap, 0, "Give a gap of at least 0, or None")
     if penalties is not None:
         require_kind("penalties", penalties, StagePenalties)
     result = map_points(
         problem, x0s, iterations=iterations, dtype=dtype, chunk=chunk, penalties=penalties,
         progress=progress, executor=executor, devices=devices,
     )  # fmt: skip
-    return result if refine is None else result.refine(refine)
+    return result if gap is None else result.refine(gap)
 
 
 def map_points(

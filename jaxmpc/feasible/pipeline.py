@@ -33,7 +33,6 @@ from jaxmpc.checks import fail
 from jaxmpc.feasible.candidates import (
     ALPHA,
     StagePenalties,
-    Verdict,
     compiled_admm,
     compiled_check,
     compiled_newton,
@@ -42,6 +41,7 @@ from jaxmpc.feasible.constraint_rows import ConstraintRows, weighted
 from jaxmpc.feasible.hull import compiled_labels, compiled_plans, cones_for
 from jaxmpc.feasible.labels import Labels, OnDemand
 from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.proofs import Verdict
 from jaxmpc.feasible.row_programs import RowPrograms
 from jaxmpc.qp.precision import matmul
 

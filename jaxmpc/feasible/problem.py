@@ -62,8 +62,8 @@ class FeasibilityProblem:
         return len(self.view.axes)
 
     @property
-    def labels(self) -> tuple[str, ...]:
-        """Return the labels of these coordinates, with units."""
+    def axis_names(self) -> tuple[str, ...]:
+        """Return the names of these coordinates, with units."""
         return tuple(self.mpc.labels[i] for i in self.view.axes)
 
     @cached_property

@@ -42,6 +42,8 @@ whole set, (a + s∘w)'θ ≤ b + w'reach_0, if limits on x_0, or twice the exte
 both directions along a facet there is none: the facet's normal is no vector of floats.)
 """
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,6 +54,24 @@ from jaxmpc.feasible.exact_data import ExactData
 UNIT_ROUNDOFF = 2.0**-53
 # Covers products that underflow; data smaller than this count as zero.
 TINY = 1e-290
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What was proved of one point, and the proof.
+
+    label: 1 feasible, −1 infeasible, 0 undecided. start (n,), plan (N, m): x_0 and the inputs
+    that prove 1. cut_normal (d,), cut_offset: the half-space cut_normal'θ ≤ cut_offset that holds
+    on the whole feasible set and excludes the point; ∞ where none is known; then `cut` at the point
+    proves −1.
+    """
+
+    label: Array
+    start: Array
+    plan: Array
+    cut_normal: Array
+    cut_offset: Array
 
 
 def gamma(terms: int) -> float:

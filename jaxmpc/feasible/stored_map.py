@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from jaxmpc.feasible.centered_polytope import power_of_two
 from jaxmpc.feasible.labels import Labels
-from jaxmpc.feasible.map import FeasibleSetMap, count_labels, excluded, mesh
+from jaxmpc.feasible.map import FeasibleSetMap, excluded, mesh
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays
 from jaxmpc.qp.status import Status
@@ -65,14 +65,14 @@ class StoredMap:
         nothing = FeasibleSetMap.of(
             problem, np.zeros((0, problem.dimension)), Labels.empty(0, problem)
         )
-        points = nothing.extra_points
+        points = nothing.bound_point
         cuts = HalfSpaces.none(np.array([[line[0], line[-1]] for line in along]).T)
         lines = [len(line[:: step(line)]) for line in along]
         image = np.zeros(lines, np.int8) if len(along) == 2 else None
         found = cls(problem, kept, along, nothing, {}, [], image)
         for block in range(len(kept.regions)):
             label, status = kept.read("label", block), kept.read("status", block)
-            found._count(block, label, status)
+            found._count(block, replace(nothing.labels, label=label, status=status))
             if np.any(status == Status.ITERATION_LIMIT):
                 found.undecided.append(block)
             ends = line_ends(label == 1, kept.regions[block][-1])
@@ -82,7 +82,7 @@ class StoredMap:
             if np.any(label == -1):
                 cuts = cuts.add(kept.read("cut_normal", block), kept.read("cut_offset", block))
         bounds = replace(
-            nothing, extra_points=points, extra_normals=cuts.normals, extra_offsets=cuts.offsets
+            nothing, bound_point=points, bound_normal=cuts.normals, bound_offset=cuts.offsets
         )
         return replace(found, bounds=bounds)
 
@@ -91,29 +91,29 @@ class StoredMap:
         `FeasibleSetMap.refine`. Undecided points that they exclude count as infeasible."""
         none = np.zeros((0, self.problem.dimension))
         alone = FeasibleSetMap.of(self.problem, none, Labels.empty(0, self.problem)).refine()
-        normals, offsets = alone.extra_normals, alone.extra_offsets
+        normals, offsets = alone.bound_normal, alone.bound_offset
         bounds = replace(
             self.bounds,
-            extra_points=np.concatenate([self.bounds.extra_points, alone.extra_points]),
-            extra_normals=np.concatenate([self.bounds.extra_normals, normals]),
-            extra_offsets=np.concatenate([self.bounds.extra_offsets, offsets]),
+            bound_point=np.concatenate([self.bounds.bound_point, alone.bound_point]),
+            bound_normal=np.concatenate([self.bounds.bound_normal, normals]),
+            bound_offset=np.concatenate([self.bounds.bound_offset, offsets]),
         )
         for block in self.undecided if len(offsets) else ():
             label, status = self.kept.read("label", block), self.kept.read("status", block)
-            labels = replace(Labels.empty(0, self.problem), label=label, status=status)
+            before = replace(Labels.empty(0, self.problem), label=label, status=status)
             points = mesh(self.along, self.kept.samples(block))
-            labels = excluded(labels, Rays.of(self.problem), points, normals, offsets)
-            self._count(block, label, status, -1)
-            self._count(block, labels.label, labels.status)
+            labels = excluded(before, Rays.of(self.problem), points, normals, offsets)
+            self._count(block, before, -1)
+            self._count(block, labels)
         return replace(self, bounds=bounds), alone
 
-    def _count(self, block: int, label: np.ndarray, status: np.ndarray, sign: int = 1) -> None:
+    def _count(self, block: int, labels: Labels, sign: int = 1) -> None:
         """Add the labels of a block to the counts, or take them away, and draw the picture."""
-        for name, count in count_labels(label, status).items():
+        for name, count in labels.counts().items():
             self.counts[name] = self.counts.get(name, 0) + sign * count
         if self.image is not None:
             region = self.kept.regions[block]
-            whole = label.reshape([part.stop - part.start for part in region])
+            whole = labels.label.reshape([part.stop - part.start for part in region])
             place, lines = [], []
             for part, line in zip(region, self.along, strict=True):
                 at = np.r_[part]

@@ -28,7 +28,7 @@ def map_states(law: Law, problem: FeasibilityProblem, states: np.ndarray) -> Fea
     """Return the labels of states (B, p or more columns), in programs of the law's shape."""
     p, count = problem.dimension, len(states)
     fmap = map_points(problem, law.filled(states[:, :p]), chunk=law.chunk)
-    return FeasibleSetMap.of(problem, fmap.points[:count], fmap.labels.first(count))
+    return FeasibleSetMap.of(problem, fmap.x0s[:count], fmap.labels.first(count))
 
 
 def closed_loops(

@@ -31,7 +31,7 @@ OUTCOMES = {
 class RobotMap:
     """States of a robot with the linear promise and what became of it.
 
-    points (B, d) in the coordinates `axes` of ξ, the other coordinates at `linear.fixed`.
+    x0s (B, d) in the coordinates `axes` of ξ, the other coordinates at `linear.fixed`.
     linear: the map of the linear problem, x_0 within the robot's limits included. claim: "limits",
     a state promises what linear.label says, and holds where all limits are kept for T samples; or
     "recursion", a state promises to have a plan at each of T samples of the linear closed loop
@@ -48,9 +48,9 @@ class RobotMap:
     set_point: np.ndarray
 
     @property
-    def points(self) -> np.ndarray:
+    def x0s(self) -> np.ndarray:
         """Return the mapped coordinates (B, d)."""
-        return self.linear.points
+        return self.linear.x0s
 
     @property
     def seconds(self) -> float:
@@ -114,9 +114,9 @@ class RobotMap:
         return np.select(same, range(len(same)), len(same))
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def axis_names(self) -> tuple[str, ...]:
         """Return the labels of the mapped coordinates with their units."""
-        return self.linear.names
+        return self.linear.axis_names
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Return the table promise × robot: of how many states each kind of promise held, failed,
@@ -147,14 +147,14 @@ class RobotMap:
         Minkowski's gauge of their intersection about m.
         """
         normals, offsets = self.linear.cuts()
-        inside = self.points[self.linear.label == 1]
+        inside = self.x0s[self.linear.label == 1]
         if not len(offsets) or not len(inside):
-            return np.full(len(self.points), np.nan)
+            return np.full(len(self.x0s), np.nan)
         middle = inside.mean(axis=0)
         room = offsets - normals @ middle
         with np.errstate(invalid="ignore", divide="ignore"):
             scaled = normals / room[:, None]
-            return 1 - np.max((self.points - middle) @ scaled.T, axis=1)
+            return 1 - np.max((self.x0s - middle) @ scaled.T, axis=1)
 
     def worst(self) -> int | None:
         """Return the index of the broken promise deepest in the linear feasible set; None without
@@ -181,7 +181,7 @@ class RobotMap:
         if i is not None:
             at = ", ".join(
                 f"{name} = {value:.4g}"
-                for name, value in zip(self.names, self.points[i], strict=True)
+                for name, value in zip(self.axis_names, self.x0s[i], strict=True)
             )
             rows.append((
                 "deepest broken", f"{at}: fails at sample {self.first_loss[i]}, "

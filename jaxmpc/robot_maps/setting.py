@@ -34,7 +34,7 @@ CLAIMS = ("limits", "recursion")
 def map_robot(
     robot: Robot | LinearPlant, mpc: MPC, x0s: Reals, seconds: float = 2.0, *,
     controller: Any = None, target: Any = None, axes: Any = None, fixed: Reals | None = None,
-    claim: str = "limits", chunk: int | None = None, refine: float | None = None,
+    claim: str = "limits", chunk: int | None = None, gap: float | None = None,
     search_seconds: float = 60.0, progress: bool = False,
 ) -> RobotMap:  # fmt: skip
     """Label each state twice: what the linear model of `mpc` promises, and what the robot does.
@@ -52,7 +52,7 @@ def map_robot(
             terminal set. "recursion": the promise is a plan at each of T
             samples of the linear closed loop (`recursive_feasibility`, which spends at most
             about search_seconds on claims about all states), kept where the robot has them.
-        chunk: loops that run at once (None: 256 on a CPU, 8192 on a GPU). refine: as in
+        chunk: loops that run at once (None: 256 on a CPU, 8192 on a GPU). gap: as in
             `map_feasible_set`.
 
     Both labels apply the robot's limits to x_0 too, which `robot_mpc` does not: a state beyond them
@@ -70,7 +70,7 @@ def map_robot(
             labels.append(part)
             loops.append(looped)
             bar.update(len(part.label))
-    return setting.map(Labels.joined(labels), loops, refine=refine, search_seconds=search_seconds)
+    return setting.map(Labels.joined(labels), loops, gap=gap, search_seconds=search_seconds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +198,7 @@ class RobotSetting:
             return RobotLoops.of(run, self.robot, self.dtype)
 
     def map(
-        self, labels: Any, loops: list[RobotLoops], *, refine: float | None = None,
+        self, labels: Any, loops: list[RobotLoops], *, gap: float | None = None,
         search_seconds: float = 60.0,
     ) -> RobotMap:  # fmt: skip
         """Make the map from its chunks, and examine the recursion of the linear problem."""
@@ -215,7 +215,7 @@ class RobotSetting:
                 self.deviations(), self.states(self.points) - self.reference,
                 max(self.steps - 1, 1), False, 0, budget, time.monotonic() + search_seconds,
             )  # fmt: skip
-        linear = linear if refine is None else linear.refine(refine)
+        linear = linear if gap is None else linear.refine(gap)
         return RobotMap(
             self.robot, self.claim, linear, report, whole, self.steps, self.reference
         )  # fmt: skip

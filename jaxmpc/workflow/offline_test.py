@@ -135,7 +135,7 @@ def offline_report(
     left = proofs.deadline - time.monotonic()
     penalty = attempt("penalty", lambda: exact_penalty(mpc, seconds=left))
     fmap = mapped(problem, x0s, budget)
-    inside = np.zeros((0, problem.dimension)) if fmap is None else fmap.points[fmap.label == 1]
+    inside = np.zeros((0, problem.dimension)) if fmap is None else fmap.x0s[fmap.label == 1]
     closed = None
     late = "no time was left: {} takes some {:.0f} s of compiling"
     notes["feasible_set"] = late.format("the map", PROOFS + LABELS)

@@ -141,7 +141,7 @@ def test_names_of_states_do_not_break_a_store(tmp_path, name):
     with xr.open_zarr(path) as data:
         assert data["label"].shape == (3, 4)
         axis = data[data["label"].dims[0]]
-        assert axis.attrs["long_name"] == problem.labels[0]
+        assert axis.attrs["long_name"] == problem.axis_names[0]
     assert [v.name for v in tmp_path.iterdir()] == ["sweep.zarr"]
 
 

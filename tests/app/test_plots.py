@@ -17,14 +17,14 @@ from jaxmpc.systems.system import LinearSystem
 class Map:
     """What the picture asks of a FeasibleSetMap: |x| <= 1.1 feasible, to 1.3 undecided."""
 
-    points: np.ndarray
+    x0s: np.ndarray
     n: int = 2
     fixed: np.ndarray | None = None
     axes: tuple[int, int] = (0, 1)
 
     @property
     def label(self) -> np.ndarray:
-        distance = np.abs(self.points).max(axis=1)
+        distance = np.abs(self.x0s).max(axis=1)
         return np.where(distance <= 1.1, 1, np.where(distance <= 1.3, 0, -1)).astype(np.int8)
 
     @property
@@ -35,7 +35,7 @@ class Map:
         return SimpleNamespace(system=system, horizon=7, rate_limited=False)
 
     @property
-    def names(self):
+    def axis_names(self):
         return self.mpc.system.state_labels[:2]
 
     def inner(self) -> Polytope:
@@ -164,7 +164,7 @@ def test_robot_map_says_in_words_what_became_of_each_state(claim):
     fmap, size = Map(points), np.abs(points).max(axis=1)
     fmap = SimpleNamespace(**{
         name: getattr(fmap, name)
-        for name in ("points", "fixed", "axes", "mpc", "inner", "outer", "terminal_section")
+        for name in ("x0s", "fixed", "axes", "mpc", "inner", "outer", "terminal_section")
     })  # fmt: skip
     promised = np.select([size > 1.5, size > 1.3], [-1, 0], 1)
     held = np.where(points[:, 0] > 0.9, -1, 1)
@@ -172,9 +172,9 @@ def test_robot_map_says_in_words_what_became_of_each_state(claim):
         held[points[:, 1] > 0.9] = 0
     unsure = (promised == 1) & (held == -1) & (points[:, 1] > 0)
     rmap = SimpleNamespace(
-        points=points, linear=fmap, claim=claim, promised=promised, held=held, unsure=unsure,
-        names=("q [rad]", "dq [rad/s]"), set_point=np.zeros(2), worst=lambda: None, seconds=2.0,
-        robot=SimpleNamespace(name="pendulum", dt=0.02),
+        x0s=points, linear=fmap, claim=claim, promised=promised, held=held, unsure=unsure,
+        axis_names=("q [rad]", "dq [rad/s]"), set_point=np.zeros(2), worst=lambda: None,
+        seconds=2.0, robot=SimpleNamespace(name="pendulum", dt=0.02),
     )  # fmt: skip
     ax = plot_robot_map(rmap)
     counts = {
@@ -193,4 +193,4 @@ def test_robot_map_says_in_words_what_became_of_each_state(claim):
     image = ax.images[0].get_array().T.ravel()
     assert len(np.unique(image)) == len(counts) + 2 + bool(open_)
     assert ax.get_title(loc="left").startswith("pendulum: ") and "2 s" in ax.get_title(loc="left")
-    assert (ax.get_xlabel(), ax.get_ylabel()) == rmap.names
+    assert (ax.get_xlabel(), ax.get_ylabel()) == rmap.axis_names

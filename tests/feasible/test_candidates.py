@@ -17,7 +17,6 @@ from jax import enable_x64
 import jaxmpc as jm
 from jaxmpc.feasible.candidates import (
     INSET,
-    Verdict,
     admm_stage,
     check_candidates,
     compiled_newton,
@@ -28,6 +27,7 @@ from jaxmpc.feasible.candidates import (
     with_violated_limit,
 )
 from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.proofs import Verdict
 
 GAIN = np.array([[-0.4, -0.1], [0.1, -0.5]])
 ROUND = replace(problems.lecture(), terminal_set=jm.Ellipsoid(np.diag([1.0, 4.0]), 0.5))

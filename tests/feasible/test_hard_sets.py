@@ -52,7 +52,7 @@ class TestTerminalPoint:
         fmap = jm.map_feasible_set(self.mpc, points)
         assert (fmap.label == 1).all()
         A, B = exact.rational(self.mpc.system.A), exact.rational(self.mpc.system.B)
-        for x0, plan in zip(points, fmap.labels.plans, strict=True):
+        for x0, plan in zip(points, fmap.labels.plan, strict=True):
             inputs = [u[0] for u in exact.rational(plan)]
             free = np.argsort(np.abs(plan[:, 0]))[:2]  # far from their limits
             move = lambda u, x0=x0: roll(A, B, exact.rational(x0), u)[-1]

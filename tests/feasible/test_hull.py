@@ -49,13 +49,13 @@ def test_labels_and_proofs(name, monkeypatch):
     assert set(expected) == {-1, 1}
     inside, outside = labels.label == 1, labels.label == -1
     p = Constraints(problem.plain())
-    assert np.all(roll_out_exactly(p, labels.starts[inside], labels.plans[inside]) >= 0)
-    np.testing.assert_array_equal(labels.starts[inside][:, list(problem.view.axes)], points[inside])
+    assert np.all(roll_out_exactly(p, labels.start[inside], labels.plan[inside]) >= 0)
+    np.testing.assert_array_equal(labels.start[inside][:, list(problem.view.axes)], points[inside])
     # Half-spaces exclude their point and no feasible one.
-    normals, offsets = labels.cut_normals[outside], labels.cut_offsets[outside]
+    normals, offsets = labels.cut_normal[outside], labels.cut_offset[outside]
     assert np.all(np.sum(normals * points[outside], axis=1) > offsets)
     assert np.all(points[inside] @ normals.T <= offsets)
-    assert np.all(np.isnan(labels.plans[outside])) and np.all(np.isnan(labels.cut_offsets[inside]))
+    assert np.all(np.isnan(labels.plan[outside])) and np.all(np.isnan(labels.cut_offset[inside]))
 
 
 def test_they_decide_nearly_all(always, monkeypatch):
@@ -93,8 +93,7 @@ def test_points_labelled_without_a_roll_out_have_plans(name):
     assert set(label) <= {-1, 0, 1} and np.all((found.label == label)[label != 0])
     inside = found.label == 1
     assert np.all(
-        roll_out_exactly(Constraints(problem.plain()), found.start[inside], found.inputs[inside])
-        >= 0
+        roll_out_exactly(Constraints(problem.plain()), found.start[inside], found.plan[inside]) >= 0
     )
     if problem.view.projects:
         assert not np.any(label == 1)  # with free states plans are rolled out
@@ -118,7 +117,7 @@ def test_points_that_are_not_finite(always):
     assert np.all(found.status[[7, 11]] == jm.Status.NON_FINITE)
     others = np.delete(np.arange(50), [7, 11])
     np.testing.assert_array_equal(found.label[others], expected.label[others])
-    np.testing.assert_array_equal(found.labels.plans[others], expected.labels.plans[others])
+    np.testing.assert_array_equal(found.labels.plan[others], expected.labels.plan[others])
 
 
 def test_a_problem_keeps_its_cones(monkeypatch):

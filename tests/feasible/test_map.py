@@ -60,9 +60,9 @@ class TestBadPoints:
         got = jm.map_feasible_set(problems.lecture(), spoiled)
         bad = np.isin(np.arange(len(points)), [3, 80, 81])
         assert np.all(got.status[bad] == Status.NON_FINITE) and np.all(got.label[bad] == 0)
-        assert np.isnan(got.labels.plans[bad]).all() and np.isnan(got.labels.cut_offsets[bad]).all()
+        assert np.isnan(got.labels.plan[bad]).all() and np.isnan(got.labels.cut_offset[bad]).all()
         np.testing.assert_array_equal(got.label[~bad], fmap.label[~bad])
-        np.testing.assert_array_equal(got.labels.plans[~bad], fmap.labels.plans[~bad])
+        np.testing.assert_array_equal(got.labels.plan[~bad], fmap.labels.plan[~bad])
         assert got.counts()["not finite"] == 3
 
     def test_all_bad(self):
@@ -105,8 +105,8 @@ class TestBadPoints:
         polygon = exact.feasible_polygon(mpc)
         got = jm.map_feasible_set(mpc, np.array([[0.0, 0.8], [0.1, -0.9], [1.4, 0.3], [0.9, 0.9]]))
         for i in np.flatnonzero(got.label == -1):
-            b = Fraction(float(got.labels.cut_offsets[i]))
-            assert polygon.support(got.labels.cut_normals[i]) <= b
+            b = Fraction(float(got.labels.cut_offset[i]))
+            assert polygon.support(got.labels.cut_normal[i]) <= b
 
     @pytest.mark.parametrize("shape", [(2,), (3, 3), (3, 1), (2, 2, 2)])
     def test_wrong_shape(self, shape):
@@ -166,7 +166,7 @@ class TestIndependenceOf:
 
     def test_run(self, points, fmap):
         again = jm.map_feasible_set(problems.lecture(), points)
-        for name in ("label", "status", "plans", "cut_normals", "cut_offsets"):
+        for name in ("label", "status", "plan", "cut_normal", "cut_offset"):
             np.testing.assert_array_equal(getattr(again.labels, name), getattr(fmap.labels, name))
 
     def test_order(self, points, fmap):
@@ -229,22 +229,22 @@ def test_proofs_are_copied_when_asked_for(points, fmap):
     labels = jm.map_feasible_set(problems.lecture(), points, iterations=1, chunk=64).labels
     np.testing.assert_array_equal(labels.label, fmap.label)
     inside, outside = labels.label == 1, labels.label == -1
-    np.testing.assert_array_equal(np.isfinite(labels.plans).all(axis=(1, 2)), inside)
-    np.testing.assert_array_equal(labels.starts[inside], points[inside])
-    np.testing.assert_array_equal(np.isfinite(labels.cut_normals).all(axis=1), outside)
-    beyond = np.sum(labels.cut_normals * points, axis=1) - labels.cut_offsets
+    np.testing.assert_array_equal(np.isfinite(labels.plan).all(axis=(1, 2)), inside)
+    np.testing.assert_array_equal(labels.start[inside], points[inside])
+    np.testing.assert_array_equal(np.isfinite(labels.cut_normal).all(axis=1), outside)
+    beyond = np.sum(labels.cut_normal * points, axis=1) - labels.cut_offset
     assert np.all(beyond[outside] > 0)
-    assert np.array_equal(labels.first(5).plans, labels.plans[:5], equal_nan=True)
+    assert np.array_equal(labels.first(5).plan, labels.plan[:5], equal_nan=True)
 
 
 class TestMapObject:
     def test_names_and_counts(self, fmap):
-        assert fmap.names == ("x1", "x2")
+        assert fmap.axis_names == ("x1", "x2")
         counts = fmap.counts()
         assert sum(counts.values()) == len(fmap.label)
 
     def test_refine_from_nothing(self, polygon):
-        got = jm.map_feasible_set(problems.lecture(), np.zeros((0, 2)), refine=1e-8)
+        got = jm.map_feasible_set(problems.lecture(), np.zeros((0, 2)), gap=1e-8)
         low, high = got.volume_bounds()
         assert low <= polygon.area <= high and high - low <= 1e-7 * high
 
@@ -258,7 +258,7 @@ class TestMapObject:
         data = fmap.to_xarray()
         np.testing.assert_array_equal(data["label"], fmap.label)
         assert data["plan"].dims == ("sample", "time", "input")
-        assert list(data["state"].values) == list(fmap.names)
+        assert list(data["state"].values) == list(fmap.axis_names)
 
     @pytest.mark.slow
     def test_terminal_section(self, fmap):
@@ -297,9 +297,9 @@ def test_projection_keeps_the_state_it_starts_from():
     mpc = problems.hidden_product(3)
     fmap = jm.map_feasible_set(mpc, jm.grid([-1, -1], [1, 1], (5, 5)), axes=(0, 3))
     feasible = fmap.label == 1
-    starts = fmap.labels.starts
+    starts = fmap.labels.start
     assert feasible.any()
-    np.testing.assert_array_equal(starts[feasible][:, [0, 3]], fmap.points[feasible])
+    np.testing.assert_array_equal(starts[feasible][:, [0, 3]], fmap.x0s[feasible])
     H, h = np.asarray(mpc.states.H, float), np.asarray(mpc.states.h, float)
     assert (starts[feasible] @ H.T <= h).all()
     assert np.isnan(starts[~feasible]).all()
@@ -314,7 +314,7 @@ def test_undecided_points_are_labelled_by_the_facets_of_refine():
     forgot = replace(fmap, labels=replace(fmap.labels, label=label, status=status))
     again = forgot.refine()
     assert again.label.tolist() == [-1, 1]
-    assert again.labels.cut_normals[0] @ fmap.points[0] > again.labels.cut_offsets[0]
+    assert again.labels.cut_normal[0] @ fmap.x0s[0] > again.labels.cut_offset[0]
 
 
 def test_second_call_compiles_nothing():

@@ -47,7 +47,7 @@ def test_labels_do_not_depend_on_the_scale_of_rows():
     twos, tens = labelled(*np.ldexp(1.0, powers)), labelled(*10.0 ** (powers / 50).round())
     np.testing.assert_array_equal(twos.label, unit.label)
     np.testing.assert_array_equal(tens.label, unit.label)
-    np.testing.assert_array_equal(twos.labels.plans, unit.labels.plans)
+    np.testing.assert_array_equal(twos.labels.plan, unit.labels.plan)
 
 
 def test_programs_of_many_shapes_are_freed():

@@ -88,33 +88,33 @@ def test_published_areas():
 
 def test_labels(planar):
     _, polygon, fmap = planar
-    assert_right(fmap, polygon.contains(fmap.points), polygon.distance(fmap.points))
+    assert_right(fmap, polygon.contains(fmap.x0s), polygon.distance(fmap.x0s))
     assert fmap.counts()["feasible"] > 50 and fmap.counts()["infeasible"] > 50
 
 
 def test_plans_in_rationals(planar):
     mpc, _, fmap = planar
     found = np.flatnonzero(fmap.label == 1)
-    assert np.isnan(fmap.labels.plans[fmap.label != 1]).all()
+    assert np.isnan(fmap.labels.plan[fmap.label != 1]).all()
     chosen = np.random.default_rng(0).choice(found, 25, replace=False)
     near = np.flatnonzero((fmap.label == 1) & (np.arange(len(fmap.label)) >= 576))
     for i in np.concatenate([chosen, near]):
-        assert exact.keeps_all_rows(mpc, fmap.points[i], fmap.labels.plans[i])
+        assert exact.keeps_all_rows(mpc, fmap.x0s[i], fmap.labels.plan[i])
 
 
 def test_cuts_in_rationals(planar):
     _, polygon, fmap = planar
-    assert np.isnan(fmap.labels.cut_offsets[fmap.label != -1]).all()
+    assert np.isnan(fmap.labels.cut_offset[fmap.label != -1]).all()
     for i in np.flatnonzero(fmap.label == -1):
-        a, b = fmap.labels.cut_normals[i], Fraction(float(fmap.labels.cut_offsets[i]))
+        a, b = fmap.labels.cut_normal[i], Fraction(float(fmap.labels.cut_offset[i]))
         assert polygon.support(a) <= b
-        assert exact.dot(exact.rational(a), exact.rational(fmap.points[i])) > b
+        assert exact.dot(exact.rational(a), exact.rational(fmap.x0s[i])) > b
 
 
 def test_what_refine_adds_in_rationals(planar):
     _, polygon, fmap = planar
-    assert polygon.contains(fmap.extra_points).all()
-    for a, b in zip(fmap.extra_normals, fmap.extra_offsets, strict=True):
+    assert polygon.contains(fmap.bound_point).all()
+    for a, b in zip(fmap.bound_normal, fmap.bound_offset, strict=True):
         assert polygon.support(a) <= Fraction(float(b))
 
 
@@ -126,7 +126,7 @@ def test_volume_and_polytopes(planar):
     outer, inner = fmap.outer(), fmap.inner()
     assert len(outer.vertices()) == len(polygon.vertices)
     hull = exact.hull(
-        [tuple(exact.rational(p)) for p in [*fmap.points[fmap.label == 1], *fmap.extra_points]]
+        [tuple(exact.rational(p)) for p in [*fmap.x0s[fmap.label == 1], *fmap.bound_point]]
     )
     assert low <= hull.area
     for a in np.random.default_rng(1).standard_normal((20, 2)):
@@ -183,11 +183,11 @@ def test_nothing_wrong_and_nothing_open_near_the_boundary(name, count):
     np.testing.assert_array_equal(polygon.contains(points), inside)
     chosen = np.random.default_rng(0).choice(count, 30, replace=False)
     for i in chosen[fmap.label[chosen] == 1]:
-        assert exact.keeps_all_rows(mpc, points[i], fmap.labels.plans[i])
+        assert exact.keeps_all_rows(mpc, points[i], fmap.labels.plan[i])
     cuts = np.flatnonzero(fmap.label == -1)
     for i in np.random.default_rng(1).choice(cuts, 200, replace=False):
-        assert polygon.support(fmap.labels.cut_normals[i]) <= Fraction(
-            float(fmap.labels.cut_offsets[i])
+        assert polygon.support(fmap.labels.cut_normal[i]) <= Fraction(
+            float(fmap.labels.cut_offset[i])
         )
 
 
@@ -257,9 +257,9 @@ class TestHiddenProduct:
     def test_proofs(self, blocks, product_map):
         mpc = problems.hidden_product()
         for i in np.flatnonzero(product_map.label == 1)[:15]:
-            assert exact.keeps_all_rows(mpc, product_map.points[i], product_map.labels.plans[i])
+            assert exact.keeps_all_rows(mpc, product_map.x0s[i], product_map.labels.plan[i])
         out = product_map.label == -1
-        a, b = product_map.labels.cut_normals[out], product_map.labels.cut_offsets[out]
+        a, b = product_map.labels.cut_normal[out], product_map.labels.cut_offset[out]
         support = (a @ corners(blocks).T).max(axis=1)
         # The float data is a product only up to its own rounding.
         assert np.all(support <= b + 1e-12 * np.linalg.norm(a, axis=1))
@@ -291,7 +291,7 @@ class TestHiddenProduct:
         fmap = jm.map_feasible_set(problems.hidden_product(), theta, axes=axes, fixed=fixed)
         np.testing.assert_array_equal(fmap.label, np.where(in_product(blocks, whole), 1, -1))
         for i in np.flatnonzero(fmap.label == 1)[:5]:
-            assert exact.keeps_all_rows(problems.hidden_product(), whole[i], fmap.labels.plans[i])
+            assert exact.keeps_all_rows(problems.hidden_product(), whole[i], fmap.labels.plan[i])
 
     @pytest.mark.parametrize("axes", [(0, 3), pytest.param((1, 2), marks=pytest.mark.slow)])
     def test_projection(self, blocks, axes):
@@ -326,8 +326,8 @@ def test_unstable_long_horizon():
     fmap = jm.map_feasible_set(mpc, points, chunk=512)
     assert_right(fmap, inside, polygon.distance(points), allow=0)
     for i in np.flatnonzero(fmap.label == 1)[:10]:
-        assert exact.keeps_all_rows(mpc, points[i], fmap.labels.plans[i])
+        assert exact.keeps_all_rows(mpc, points[i], fmap.labels.plan[i])
     for i in np.flatnonzero(fmap.label == -1):
-        assert polygon.support(fmap.labels.cut_normals[i]) <= Fraction(
-            float(fmap.labels.cut_offsets[i])
+        assert polygon.support(fmap.labels.cut_normal[i]) <= Fraction(
+            float(fmap.labels.cut_offset[i])
         )

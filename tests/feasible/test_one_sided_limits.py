@@ -54,10 +54,10 @@ def test_scalar(none, sign):
     fmap = jm.map_feasible_set(mpc, x[:, None])
     np.testing.assert_array_equal(fmap.label, [-1] * 4 + [1] * 5)
     for i in range(4):
-        a, b = fmap.labels.cut_normals[i], Fraction(fmap.labels.cut_offsets[i])
+        a, b = fmap.labels.cut_normal[i], Fraction(fmap.labels.cut_offset[i])
         assert sign * a[0] > 0 and sign * Fraction(a[0]) <= b < Fraction(a[0]) * Fraction(x[i])
     for i in range(4, 9):
-        assert exact.keeps_all_rows(mpc, x[i : i + 1], fmap.labels.plans[i])
+        assert exact.keeps_all_rows(mpc, x[i : i + 1], fmap.labels.plan[i])
     assert fmap.volume_bounds() == (pytest.approx(1 + 1e6), np.inf)
     with pytest.raises(ValueError, match="unbounded"):
         fmap.outer()
@@ -139,12 +139,12 @@ def check(mpc, allow=0, whole=True) -> FeasibleSetMap:
     np.testing.assert_array_equal(fmap.label[decided], np.where(truth, 1, -1)[decided])
     assert np.sum(~decided) <= allow and 10 < truth.sum() < len(truth) - 10
     for i in np.flatnonzero(fmap.label == 1)[::6]:
-        assert exact.keeps_all_rows(mpc, points[i], fmap.labels.plans[i])
+        assert exact.keeps_all_rows(mpc, points[i], fmap.labels.plan[i])
     out = np.flatnonzero(fmap.label == -1)
-    known = out[np.isfinite(fmap.labels.cut_offsets[out])]
+    known = out[np.isfinite(fmap.labels.cut_offset[out])]
     assert len(fmap.cuts()[1]) == len(known) and (not whole or len(known) == len(out))
     for i in known:
-        a, b = fmap.labels.cut_normals[i], Fraction(fmap.labels.cut_offsets[i])
+        a, b = fmap.labels.cut_normal[i], Fraction(fmap.labels.cut_offset[i])
         assert polygon.support(a) <= b < exact.dot(exact.rational(a), exact.rational(points[i]))
     return fmap
 
@@ -204,7 +204,7 @@ class TestRowsThatNoInputMoves:
         mpc = replace(ceiling(), inputs=None)
         fmap = jm.map_feasible_set(mpc, np.concatenate([OUTSIDE, INSIDE])[:, None])
         np.testing.assert_array_equal(fmap.label, [-1] * 4 + [1] * 5)
-        edges = fmap.labels.cut_offsets[:4] / fmap.labels.cut_normals[:4, 0]
+        edges = fmap.labels.cut_offset[:4] / fmap.labels.cut_normal[:4, 0]
         assert np.all((edges >= 1) & (edges < 1 + 1e-11))
 
     def test_euler(self):
@@ -380,4 +380,4 @@ def test_views_rates_and_blocks(view, settings, none):
     normals, offsets = fmap.cuts()
     assert np.all(points[fmap.label == 1] @ normals.T <= offsets)
     for i in np.flatnonzero(fmap.label == 1)[::5]:
-        assert exact.keeps_all_rows(mpc, fmap.labels.starts[i], fmap.labels.plans[i])
+        assert exact.keeps_all_rows(mpc, fmap.labels.start[i], fmap.labels.plan[i])

@@ -47,14 +47,14 @@ def require_proofs(points, parts):
         for j, label in enumerate(part.label):
             x = points[i + j]
             if label == 1:
-                assert part.starts[j] == x
-                u = part.plans[j, :, 0]
+                assert part.start[j] == x
+                u = part.plan[j, :, 0]
                 assert np.abs(u).max() <= 0.3 and np.abs(x + np.cumsum(u)).max() <= 1
             elif label == -1:
-                normal, offset = part.cut_normals[j, 0], part.cut_offsets[j]
+                normal, offset = part.cut_normal[j, 0], part.cut_offset[j]
                 assert abs(normal) * LIMIT * (1 - 1e-15) <= offset < normal * x
             else:
-                assert np.isnan(part.plans[j]).all() and np.isnan(part.cut_offsets[j])
+                assert np.isnan(part.plan[j]).all() and np.isnan(part.cut_offset[j])
         i += len(part.label)
     assert i == len(points)
 

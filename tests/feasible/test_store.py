@@ -80,7 +80,7 @@ class TestBlocks:
             kept.commit(0, **rows(8, 1))
             np.testing.assert_array_equal(kept.read("label"), [1] * 8 + [0] * 8 + [-1] * 4)
             labels = kept.labels()
-        assert labels.plans.shape == (20, 3, 1) and np.isnan(labels.cut_offsets[8:16]).all()
+        assert labels.plan.shape == (20, 3, 1) and np.isnan(labels.cut_offset[8:16]).all()
 
     def test_a_block_counts_once_its_rows_are_written(self, tmp_path, monkeypatch):
         """Killed before any of its writes, a block is not done; after the last it is."""

@@ -59,11 +59,11 @@ def test_says_what_a_map_of_all_points_says(tmp_path, monkeypatch, name, many):
         np.testing.assert_allclose(
             found.bounds.volume_bounds(), whole.volume_bounds(), rtol=1e-9, atol=1e-12
         )
-        assert len(found.bounds.extra_points) <= many + 200
+        assert len(found.bounds.bound_point) <= many + 200
         refined, alone = found.refine()
         expected = whole.refine()
         assert refined.counts == expected.counts()
-        np.testing.assert_array_equal(alone.extra_points, expected.extra_points)
+        np.testing.assert_array_equal(alone.bound_point, expected.bound_point)
         np.testing.assert_allclose(
             refined.bounds.volume_bounds(), expected.volume_bounds(), rtol=1e-9
         )

@@ -731,14 +731,14 @@ def staged() -> jm.MPC:
 
 def assert_proofs(mpc, fmap, plans=30, seed=0):
     """Plans in rationals; every cut excludes its point."""
-    assert np.isnan(fmap.labels.plans[fmap.label != 1]).all()
+    assert np.isnan(fmap.labels.plan[fmap.label != 1]).all()
     found = np.flatnonzero(fmap.label == 1)
     for i in np.random.default_rng(seed).permutation(found)[:plans]:
-        assert exact.keeps_all_rows(mpc, fmap.labels.starts[i], fmap.labels.plans[i])
-        np.testing.assert_array_equal(fmap.labels.starts[i][list(fmap.axes)], fmap.points[i])
+        assert exact.keeps_all_rows(mpc, fmap.labels.start[i], fmap.labels.plan[i])
+        np.testing.assert_array_equal(fmap.labels.start[i][list(fmap.axes)], fmap.x0s[i])
     for i in np.flatnonzero(fmap.label == -1):
-        a, b = (exact.rational(v[i]) for v in (fmap.labels.cut_normals, fmap.labels.cut_offsets))
-        assert exact.dot(a, exact.rational(fmap.points[i])) > b
+        a, b = (exact.rational(v[i]) for v in (fmap.labels.cut_normal, fmap.labels.cut_offset))
+        assert exact.dot(a, exact.rational(fmap.x0s[i])) > b
 
 
 @pytest.mark.slow
@@ -751,16 +751,16 @@ def test_feasible_set_by_elimination():
     middle = corners.mean(axis=0)
     near = [middle + (corners - middle) * (1 + s) for s in (1e-3, -1e-3, 1e-6, -1e-6)]
     fmap = jm.map_feasible_set(mpc, np.concatenate([points, *near]), chunk=512).refine(1e-7)
-    inside = polygon.contains(fmap.points)
+    inside = polygon.contains(fmap.x0s)
     decided = fmap.label != 0
     np.testing.assert_array_equal(fmap.label[decided] == 1, inside[decided])
-    assert np.all(polygon.distance(fmap.points[~decided]) <= 1e-9)
+    assert np.all(polygon.distance(fmap.x0s[~decided]) <= 1e-9)
     assert 30 < inside.sum() < len(inside) - 30
     assert_proofs(mpc, fmap)
     normals, offsets = fmap.cuts()
     for a, b in zip(normals, offsets, strict=True):
         assert polygon.support(a) <= exact.rational(b)
-    assert polygon.contains(fmap.extra_points).all()
+    assert polygon.contains(fmap.bound_point).all()
     lowest, highest = fmap.volume_bounds()
     assert lowest <= polygon.area <= highest and highest - lowest <= 1e-6 * highest
 
@@ -824,8 +824,8 @@ def test_feasible_set_of_rates_blocks_and_ellipsoid():
     inner, outer = refined.inner(), refined.outer()
     assert np.all((inner.vertices() @ directions.T).max(axis=0) <= reach + 1e-8)
     assert np.all((outer.vertices() @ directions.T).max(axis=0) >= reach - 1e-8)
-    assert fmap.names == mpc.system.state_labels
-    assert Explicit(mpc).n == 2 and fmap.labels.starts.shape[1] == 4
+    assert fmap.axis_names == mpc.system.state_labels
+    assert Explicit(mpc).n == 2 and fmap.labels.start.shape[1] == 4
 
 
 @pytest.mark.slow
@@ -866,7 +866,7 @@ def test_feasible_set_with_previous_input(view):
     normals, offsets = fmap.cuts()
     assert np.all(normals @ points[fmap.label == 1].T <= offsets[:, None])
     names = {"whole": 4, "projection": 2, "slice in (x1, u1)": 2}
-    assert len(fmap.names) == names[view] and np.sum(sure) > 140
+    assert len(fmap.axis_names) == names[view] and np.sum(sure) > 140
 
 
 @pytest.mark.slow

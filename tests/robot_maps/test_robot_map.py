@@ -106,7 +106,7 @@ def test_picture(hanging):
     assert broken in texts and "set-point" in texts
     assert ax.get_xlabel() == "theta [rad]" and "0.8 s" in ax.get_title(loc="left")
     assert "broken promises" in str(rmap)
-    line = replace(rmap, linear=replace(rmap.linear, points=rmap.points[:, :1]))
+    line = replace(rmap, linear=replace(rmap.linear, x0s=rmap.x0s[:, :1]))
     with pytest.raises(ValueError, match="needs 2"):
         plot_robot_map(line)
 

@@ -101,7 +101,7 @@ def test_a_map_that_runs_out_of_time_says_so():
         FeasibilityProblem.of(problems.lecture()), np.zeros((5, 2)), chunk=2, deadline=-np.inf
     )
     assert fmap.counts()["feasible"] == 2 and fmap.counts()["not run"] == 3
-    assert len(fmap.labels.plans) == 5
+    assert len(fmap.labels.plan) == 5
 
 
 @pytest.mark.slow

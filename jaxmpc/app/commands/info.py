@@ -97,7 +97,7 @@ class Info:
 def _pictures(report: OfflineReport) -> list[str]:
     """The feasible set, where there is one of two states."""
     fmap = report.feasible_set
-    if fmap is None or fmap.points.shape[1] != 2:
+    if fmap is None or fmap.x0s.shape[1] != 2:
         return []
     from jaxmpc.app.plots.feasible_set import plot_feasible_set
     from jaxmpc.app.plots.style import save

@@ -119,7 +119,7 @@ class LinearSweep:
         if refine and dimension <= 3:
             print("closing the bounds by rays; long horizons take a while", file=sys.stderr)
             found, rays = found.refine()
-            kept.save_bounds(rays.extra_points, rays.extra_normals, rays.extra_offsets)
+            kept.save_bounds(rays.bound_point, rays.bound_normal, rays.bound_offset)
         files = [str(kept.path), str(self.output / "summary.json")]
         if dimension == 2:
             from jaxmpc.app.plots.feasible_set import plot_feasible_set

@@ -208,16 +208,14 @@ class RobotMapCommand:
     def map(self, setting: RobotSetting, kept: store.Store) -> RobotMap:
         """Return the map that the store holds."""
         loops = RobotLoops(**{f.name: kept.read(f.name) for f in fields(RobotLoops)})
-        refine = 1e-6 if self.refine and len(setting.axes) <= 3 else None
-        return setting.map(
-            kept.labels(), [loops], refine=refine, search_seconds=self.search_seconds
-        )
+        gap = 1e-6 if self.refine and len(setting.axes) <= 3 else None
+        return setting.map(kept.labels(), [loops], gap=gap, search_seconds=self.search_seconds)
 
     def save(self, setting: RobotSetting, rmap: RobotMap, config: dict[str, Any]) -> list[str]:
         """Write the files and return their names."""
         loops = vars(rmap.loops)
         arrays = {
-            "points": rmap.points, "states": setting.states(rmap.points),
+            "points": rmap.x0s, "states": setting.states(rmap.x0s),
             "promised": rmap.promised, "held": rmap.held, "kept": rmap.kept,
             "recursive": rmap.recursive, "feasible": rmap.linear.label,
             "depth": rmap.depth, **loops,
@@ -232,7 +230,7 @@ class RobotMapCommand:
             "broken": int(np.sum(rmap.broken)),
             "broken_after_an_unsolved_plan": int(np.sum(rmap.unsure)),
             "deepest_broken": None if worst is None else {
-                "state": setting.states(rmap.points)[worst].tolist(),
+                "state": setting.states(rmap.x0s)[worst].tolist(),
                 "sample": int(rmap.first_loss[worst]),
                 "beyond": rmap.loops.worst[worst],
             },
@@ -249,7 +247,7 @@ class RobotMapCommand:
                 name: str(getattr(report, name)) for name in ("strong", "law", "weak")
             } | {"counts": report.counts()}
         write_results(self.output / "summary.json", summary)
-        if rmap.points.shape[1] != 2:
+        if rmap.x0s.shape[1] != 2:
             return ["summary.json", "robot_map.npz"]
         from jaxmpc.app.plots.robot_map import plot_robot_map
         from jaxmpc.app.plots.style import save

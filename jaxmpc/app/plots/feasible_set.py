@@ -34,7 +34,7 @@ def plot_feasible_set(
     with `ax.figure.savefig(path)`. picture: of a stored map, instead of the map's points. Raises
     ValueError for a map not of two states.
     """
-    points, label, counts = np.asarray(fmap.points), np.asarray(fmap.label), None
+    points, label, counts = np.asarray(fmap.x0s), np.asarray(fmap.label), None
     if picture is not None:
         points, label, counts = picture
     if points.ndim != 2 or points.shape[1] != 2:
@@ -55,8 +55,8 @@ def plot_feasible_set(
         (fmap.outer, "outer bound", {"color": OUTER, "lw": 2.4}),
         (fmap.inner, "inner bound", {"color": INNER, "lw": 1.4, "ls": (0, (3, 3))}),
     ])  # fmt: skip
-    ax.set_xlabel(fmap.names[0])
-    ax.set_ylabel(fmap.names[1])
+    ax.set_xlabel(fmap.axis_names[0])
+    ax.set_ylabel(fmap.axis_names[1])
     ax.set_title(_map_title(fmap), loc="left", fontsize=11)
     legend(ax, handles)
     return ax

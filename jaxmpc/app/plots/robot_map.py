@@ -36,7 +36,7 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
     set. The circle is the broken promise deepest in that set, the cross the set-point. Without
     `ax` a new figure is made. Raises ValueError for a map not of two coordinates.
     """
-    points = rmap.points
+    points = rmap.x0s
     if points.shape[1] != 2:
         fail("rmap", f"maps {points.shape[1]} coordinates", "A plot needs 2: choose `axes`")
     ax = new_axes(9.6) if ax is None else ax
@@ -70,8 +70,8 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
     for (x, y), name, style in marks:
         ax.plot(x, y, ls="", zorder=6, **style)
         handles.append(Line2D([], [], ls="", label=name, **style))
-    ax.set_xlabel(rmap.names[0])
-    ax.set_ylabel(rmap.names[1])
+    ax.set_xlabel(rmap.axis_names[0])
+    ax.set_ylabel(rmap.axis_names[1])
     ax.set_title(_robot_map_title(rmap), loc="left", fontsize=11)
     legend(ax, handles)
     return ax

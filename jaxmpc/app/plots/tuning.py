@@ -207,8 +207,8 @@ def plot_maps(before: FeasibleSetMap, after: FeasibleSetMap) -> Figure:
         if len(corners):
             label = f"{name}: area {low:.5g} to {high:.5g}"
             ax.plot(*corners.T, color=colour, ls=dashes, lw=1.6, label=label)
-    ax.set_xlabel(before.names[0])
-    ax.set_ylabel(before.names[1])
+    ax.set_xlabel(before.axis_names[0])
+    ax.set_ylabel(before.axis_names[1])
     title = f"Feasible initial states, horizon N = {before.mpc.horizon}, inner bounds"
     ax.set_title(title, loc="left", fontsize=11)
     ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), frameon=False)
