@@ -9,6 +9,7 @@ import hashlib
 import json
 import math
 import os
+import tempfile
 import uuid
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -194,3 +195,32 @@ def _replacing(path: Path) -> Iterator[BinaryIO]:
     except BaseException:
         side.unlink(missing_ok=True)
         raise
+
+
+def check_results(
+    path: Path | str, resume: bool, overwrite: bool, exists: bool | None = None
+) -> None:
+    """Raise ValueError where results at `path` exist (None: look) and a run is neither to resume
+    nor to overwrite them, or to do both."""
+    if resume and overwrite:
+        fail("overwrite", "given beside resume (--overwrite, --resume)", "Choose one")
+    exists = Path(path).exists() if exists is None else exists
+    if exists and not (resume or overwrite):
+        cure = "Add --resume (resume=True) to go on, or --overwrite (overwrite=True) to start again"
+        fail(str(path), "exists", cure)
+
+
+def open_folder(path: Path) -> None:
+    """Create a folder for results. Raises ValueError where it cannot be written."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        fail(str(path), f"{error.strerror}", "Give a folder you can write to")
+
+
+def remove_files(path: Path, *files: str) -> None:
+    """Remove files of an earlier run from a folder, where they are."""
+    for name in files:
+        (path / name).unlink(missing_ok=True)

@@ -38,6 +38,7 @@ import math
 import os
 import re
 import shutil
+import sys
 import uuid
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -1014,3 +1015,13 @@ class _Lock:
             self._held = None
 
     __del__ = _close
+
+
+def report_damage(store: Store) -> None:
+    """Say on stderr how many blocks of a store are computed again because their data are damaged or
+    missing."""
+    if store.damaged:
+        what = "blocks that were done are" if store.damaged > 1 else "block that was done is"
+        count = f"{store.damaged:,} of {len(store.regions):,}"
+        text = f"{store.path}: {count} {what} missing or damaged, computed again"
+        print(text, file=sys.stderr)

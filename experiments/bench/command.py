@@ -11,17 +11,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from jaxmpc.app.commands.options import (
-    Switch,
-    check_counts,
-    open_folder,
-    option,
-    print_table,
-    refuse,
-    remove_files,
-)
+from jaxmpc.app.commands.options import Switch, check_counts, option, print_table, refuse
 from jaxmpc.checks import available_memory, fail, in_units, nearest
-from jaxmpc.files import versions, write_json
+from jaxmpc.files import open_folder, remove_files, versions, write_json
 
 if TYPE_CHECKING:
     from jaxmpc.bench import Case, Ceilings, Point, Row

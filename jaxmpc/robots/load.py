@@ -1,6 +1,7 @@
 """load_robot: from a model file to a Robot, its limits read and checked."""
 
 import copy
+import hashlib
 import warnings
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
@@ -406,3 +407,12 @@ def _home(host: "mujoco.MjModel") -> tuple[np.ndarray, np.ndarray, str]:
             q[at] = np.clip(q[at], *host.jnt_range[j])
     moved = "" if np.array_equal(q, host.qpos0) else ", moved inside the joint ranges"
     return q, np.zeros(host.na), f"file, qpos0{moved}"
+
+
+def model_hash(robot: Robot) -> str:
+    """Return a hash of the compiled model, by which a resumed run notices a change."""
+    import mujoco
+
+    binary = np.zeros(mujoco.mj_sizeModel(robot.mujoco), np.uint8)
+    mujoco.mj_saveModel(robot.mujoco, None, binary)
+    return hashlib.sha256(binary.tobytes()).hexdigest()

@@ -183,7 +183,7 @@ def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsy
         ("--axes q w", "no state 'w'. States are q, dq"),
         ("--axes q --grid 5", "sweep.fixed: 2 states, 1 mapped"),
         ("--config absent.toml", "absent.toml: cannot be read"),
-        ("--output file/below", "--output file/below"),
+        ("--output file/below", "file/below: Not a directory"),
         ("--resume --overwrite", "Choose one"),
     ],
 )
@@ -342,7 +342,7 @@ def test_recursion_of_many_states_needs_no_slice(tmp_path, examined, capsys):
         ("--seconds 0", "--seconds"),
         ("--smallest 0", "--smallest"),
         ("--config absent.toml", "absent.toml: cannot be read"),
-        ("--output file/below", "--output file/below"),
+        ("--output file/below", "file/below: Not a directory"),
     ],
 )
 def test_recursion_errors_are_one_line(tmp_path, capsys, arguments, message, monkeypatch):

@@ -11,10 +11,10 @@ from typing import Any
 
 import jax
 
-from jaxmpc.app.commands.options import model_hash
 from jaxmpc.app.programs import times_file
 from jaxmpc.batches import Compiled
 from jaxmpc.files import fingerprint, text_within, versions, write_json
+from jaxmpc.robots.load import model_hash
 from jaxmpc.robots.robot import Robot
 
 # Seconds of the first compile on free cores: with no degree of freedom, and for each of them.

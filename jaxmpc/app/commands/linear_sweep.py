@@ -13,14 +13,7 @@ import numpy as np
 from tqdm.std import tqdm
 
 from jaxmpc import store
-from jaxmpc.app.commands.options import (
-    Timing,
-    check_results,
-    open_folder,
-    print_table,
-    remove_files,
-    report_damage,
-)
+from jaxmpc.app.commands.options import Timing, print_table
 from jaxmpc.app.config import Config, SweepPoints, sweep_points
 from jaxmpc.app.programs import user_cache
 from jaxmpc.batches import CHUNK
@@ -31,8 +24,9 @@ from jaxmpc.feasible.map import mesh
 from jaxmpc.feasible.pipeline import Scope, label_parts
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.stored_map import StoredMap
-from jaxmpc.files import versions, write_results
+from jaxmpc.files import check_results, open_folder, remove_files, versions, write_results
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.store import report_damage
 from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
 
 # States from which penalties are learned, at most.

@@ -1,11 +1,7 @@
 """Options that several commands share, their checks, and helpers to open results and print."""
 
-import hashlib
-import sys
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -14,8 +10,7 @@ import tyro
 from jaxmpc.checks import MOST_COUNT, fail
 
 if TYPE_CHECKING:
-    from jaxmpc.robots.robot import Robot
-    from jaxmpc.store import Store
+    pass
 
 
 def option(metavar: str | None, default: str, text: str | None = None) -> Any:
@@ -56,18 +51,6 @@ class Timing:
     count: int = 0
     compile_seconds: float = 0.0
     run_seconds: float = 0.0
-
-
-def check_results(
-    path: Path | str, resume: bool, overwrite: bool, exists: bool | None = None
-) -> None:
-    """Raise ValueError where `path` exists (None: look) and neither --resume nor --overwrite is
-    given."""
-    if resume and overwrite:
-        fail("--overwrite", "given beside --resume", "Choose one")
-    exists = Path(path).exists() if exists is None else exists
-    if exists and not (resume or overwrite):
-        fail(str(path), "exists", "Add --resume to go on with it or --overwrite to start again")
 
 
 def chosen_shard(text: str, environment: Mapping[str, str]) -> tuple[int, int]:
@@ -132,42 +115,6 @@ def refuse(given: dict[str, Any], robot: str | None, needs: str) -> None:
             fail(f"--{name}", problem, needs)
 
 
-def open_folder(path: Path) -> None:
-    """Create the folder of --output. Raises ValueError where it cannot be written."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
-            pass
-    except OSError as error:
-        fail(f"--output {path}", f"{error.strerror}", "Give a folder you can write to")
-
-
-def remove_files(path: Path, *files: str) -> None:
-    """Remove files of an earlier run from a folder, once a new one has results."""
-    for name in files:
-        (path / name).unlink(missing_ok=True)
-
-
 def print_table(rows: list[tuple[str, Any]], width: int) -> None:
     """Print names and values, one pair a line."""
     print("\n".join(f"  {name:<{width}} {value}" for name, value in rows))
-
-
-def model_hash(robot: "Robot") -> str:
-    """Return a hash of the compiled model, by which --resume notices a changed file."""
-    import mujoco
-
-    binary = np.zeros(mujoco.mj_sizeModel(robot.mujoco), np.uint8)
-    mujoco.mj_saveModel(robot.mujoco, None, binary)
-    return hashlib.sha256(binary.tobytes()).hexdigest()
-
-
-def report_damage(kept: "Store") -> None:
-    """Say on stderr how many blocks of a store are computed again because their data are damaged or
-    missing."""
-    if kept.damaged:
-        what = "blocks that were done are" if kept.damaged > 1 else "block that was done is"
-        print(
-            f"{kept.path}: {kept.damaged:,} of {len(kept.regions):,} {what} missing or damaged, "
-            "computed again", file=sys.stderr,
-        )  # fmt: skip

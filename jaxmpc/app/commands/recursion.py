@@ -16,17 +16,15 @@ from jaxmpc.app.commands.options import (
     check_counts,
     check_positive,
     given_options,
-    open_folder,
     option,
     print_table,
     refuse,
-    remove_files,
 )
 from jaxmpc.app.commands.robot_map import RobotMapCommand
 from jaxmpc.app.config.states import recursion_states
 from jaxmpc.checks import fail
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.files import sha256, versions, write_arrays, write_results
+from jaxmpc.files import open_folder, remove_files, sha256, versions, write_arrays, write_results
 from jaxmpc.recursion import (
     RecursionReport,
     SmallestHorizon,

@@ -13,31 +13,32 @@ from tqdm.std import tqdm
 
 from jaxmpc import store
 from jaxmpc.app.commands.compiling import Compiling
-from jaxmpc.app.commands.options import (
-    check_positive,
-    check_results,
-    model_hash,
-    open_folder,
-    remove_files,
-    report_damage,
-)
+from jaxmpc.app.commands.options import check_positive
 from jaxmpc.app.config.states import axis_indices, grid_ends
 from jaxmpc.batches import first_rows
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.robot_problem import robot_mpc
 from jaxmpc.feasible.map import grid
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.files import versions, write_arrays, write_results
+from jaxmpc.files import (
+    check_results,
+    open_folder,
+    remove_files,
+    versions,
+    write_arrays,
+    write_results,
+)
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
 from jaxmpc.robot_maps.outcomes import RobotLoops
 from jaxmpc.robot_maps.robot_map import RobotMap
 from jaxmpc.robot_maps.set_point import deviations
 from jaxmpc.robot_maps.setting import RobotSetting
-from jaxmpc.robots.load import load_robot
+from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.convex import translated
 from jaxmpc.sets.named_terminal import named_terminal_set
+from jaxmpc.store import report_damage
 from jaxmpc.systems.riccati import lqr
 
 # Points along each of two axes; total number of points for another number of axes.

@@ -14,14 +14,7 @@ from tqdm.std import tqdm
 from jaxmpc import store
 from jaxmpc.app.commands.compiling import Compiling
 from jaxmpc.app.commands.film import choose_renderer
-from jaxmpc.app.commands.options import (
-    Timing,
-    check_results,
-    model_hash,
-    open_folder,
-    remove_files,
-    report_damage,
-)
+from jaxmpc.app.commands.options import Timing
 from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
 from jaxmpc.app.config import load_robot_config
 from jaxmpc.batches import Compiled, first_rows, padded
@@ -31,12 +24,14 @@ from jaxmpc.closed_loop.many import simulate_many
 from jaxmpc.closed_loop.robot_controller import RobotController
 from jaxmpc.closed_loop.robot_problem import robot_mpc
 from jaxmpc.closed_loop.run import Run
+from jaxmpc.files import check_results, open_folder, remove_files
 from jaxmpc.mpc.condense import condensed_bytes
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
-from jaxmpc.robots.load import load_robot
+from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.robots.robot import Robot
+from jaxmpc.store import report_damage
 from jaxmpc.systems.riccati import lqr
 
 if TYPE_CHECKING:

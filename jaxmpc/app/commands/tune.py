@@ -20,7 +20,6 @@ from jaxmpc.app.commands.options import (
     Terminal,
     check_counts,
     check_positive,
-    check_results,
     option,
     refuse,
 )
@@ -37,6 +36,7 @@ from jaxmpc.app.commands.tuning_task import TuningTask, linear_task, robot_task
 from jaxmpc.app.report import report_error
 from jaxmpc.batches import Compiled
 from jaxmpc.checks import fail
+from jaxmpc.files import check_results
 from jaxmpc.tuning.result import Interrupted, TuningRun
 from jaxmpc.tuning.weights import tune_weights
 

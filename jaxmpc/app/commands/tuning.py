@@ -12,10 +12,10 @@ import numpy as np
 import optax
 
 from jaxmpc.app import config as configs
-from jaxmpc.app.commands.options import check_results, given_options, open_folder
+from jaxmpc.app.commands.options import given_options
 from jaxmpc.checks import fail
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.files import differences, text_within, write_json
+from jaxmpc.files import check_results, differences, open_folder, text_within, write_json
 from jaxmpc.mpc.inequalities import Inequalities
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.sets.convex import Polytope

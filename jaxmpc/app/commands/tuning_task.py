@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jaxmpc.app import config as configs
-from jaxmpc.app.commands.options import given_options, model_hash
+from jaxmpc.app.commands.options import given_options
 from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
 from jaxmpc.app.commands.tuning import feasible_states, problem_file, start_range
 from jaxmpc.checks import MOST_COUNT, fail, require_memory
@@ -26,7 +26,7 @@ from jaxmpc.mpc.softening import soften
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.linear import LinearPlant
-from jaxmpc.robots.load import load_robot
+from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.sets import violations
 from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
 from jaxmpc.systems.riccati import lqr
