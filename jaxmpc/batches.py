@@ -14,8 +14,10 @@ import os
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import jax
@@ -107,6 +109,25 @@ class Compiled:
                 for listener in Compiled.listeners:
                     listener()
         return self.programs[key]
+
+
+@dataclass
+class Timing:
+    """Work done by this process, in a run that may have been resumed, and the time it took (s)."""
+
+    count: int = 0
+    compile_seconds: float = 0.0
+    run_seconds: float = 0.0
+
+    @contextmanager
+    def work(self, count: int) -> Iterator[None]:
+        """Add what is done meanwhile, on `count` items."""
+        begun, compiled = time.perf_counter(), Compiled.seconds
+        yield
+        compiling = Compiled.seconds - compiled
+        self.count += count
+        self.compile_seconds += compiling
+        self.run_seconds += time.perf_counter() - begun - compiling
 
 
 def clear_programs() -> None:

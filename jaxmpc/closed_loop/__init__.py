@@ -2,6 +2,8 @@
 
 simulate, simulate_many    one closed loop, or many chunk by chunk -> Run
 lyapunov_decrease          change of the optimal value along a run
+simulate_into              the same of robots into a store, block by block -> StoredRuns
+summarise_runs             the numbers and the table of many runs -> RunsSummary
 evaluate_runs              limits kept, target reached, settling time and cost -> Outcome
 RobotController            an MPC with the linear models of a robot
 robot_mpc                  the MPC of a robot, from the limits of its model
@@ -11,6 +13,7 @@ KalmanFilter               estimates of the state from noisy outputs -> Belief
 Environment                a robot with a task, reset and step as pure functions
                            -> EnvironmentState; robot_env.RobotEnv is Gymnasium's form
 MPCPolicy                  a controller as a policy of observations
+draw_robots                random starts and random factors of masses, damping and payloads
 randomised                 random masses, damping, payloads of robots, for `variations`
 """
 
@@ -23,8 +26,10 @@ from jaxmpc.closed_loop.outcome import Outcome, evaluate_runs
 from jaxmpc.closed_loop.robot_controller import RobotController
 from jaxmpc.closed_loop.robot_problem import robot_mpc
 from jaxmpc.closed_loop.run import Run, lyapunov_decrease
+from jaxmpc.closed_loop.runs_summary import RunsSummary, summarise_runs
 from jaxmpc.closed_loop.simulation import simulate
-from jaxmpc.closed_loop.variations import randomised
+from jaxmpc.closed_loop.stored_runs import StoredRuns, simulate_into
+from jaxmpc.closed_loop.variations import draw_robots, randomised
 
 __all__ = [
     "Belief",
@@ -37,10 +42,15 @@ __all__ = [
     "Outcome",
     "RobotController",
     "Run",
+    "RunsSummary",
+    "StoredRuns",
+    "draw_robots",
     "evaluate_runs",
     "lyapunov_decrease",
     "randomised",
     "robot_mpc",
     "simulate",
+    "simulate_into",
     "simulate_many",
+    "summarise_runs",
 ]

@@ -13,6 +13,7 @@ from jaxmpc.arrays import as_weight
 from jaxmpc.checks import number, require_kind, require_shape, whole
 from jaxmpc.closed_loop.observer import model_of
 from jaxmpc.closed_loop.robot_problem import robot_mpc
+from jaxmpc.closed_loop.variations import start_room
 from jaxmpc.mpc.plan import limited
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.precision import matmul
@@ -171,15 +172,3 @@ class MPCPolicy:
             x, None, self.reference, input_reference=self.input_reference
         )  # fmt: skip
         return u
-
-
-def start_room(robot: Robot | LinearPlant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the coordinates (n,) of home, and how far the limits are below and above it, 1 where
-    there are none."""
-    with jax.enable_x64(True):
-        home = np.asarray(robot.coordinates(np.asarray(robot.home)))
-    below, above = (
-        np.where(np.isfinite(end), np.abs(end - home), 1.0)
-        for end in (np.asarray(robot.state_limits.lower), np.asarray(robot.state_limits.upper))
-    )
-    return home, below, above

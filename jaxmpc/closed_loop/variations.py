@@ -4,9 +4,11 @@ import zlib
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import numpy as np
 
 from jaxmpc.checks import fail, nearest, require_kind, require_shape, whole
+from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
 
 # Of each quantity, the field of MuJoCo's model that its factor multiplies and whose it is. The
@@ -42,6 +44,28 @@ def randomised(
             cure = f"Set {field} in the file, or leave it out"
             fail(name, f"is a factor of {field}, which is 0 in {robot.name}", cure)
     return plant_numbers(robot, draw_factors(robot, count, seed, ranges))
+
+
+def draw_robots(
+    robot: Robot, count: int, seed: int = 0, *, spread: float = 0.5, mass: float = 0.0,
+    damping: float = 0.0, payload: float = 0.0,
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:  # fmt: skip
+    """Draw starts (count, nq + nv) and the factors by which each plant differs from the model.
+
+    spread: largest fraction of the way from home to the limits. mass, damping: factors are from
+    1 − this to 1 + this; payload: masses in kg are from 0 to this. The dictionary has those that
+    are not zero: "mass" (count, bodies), "damping" (count, nv), "payload" (count,).
+    """
+    starts = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
+    home, below, above = start_room(robot)
+    aside = spread * starts.uniform(-1, 1, (count, robot.n))
+    with jax.enable_x64(True):
+        x0s = np.asarray(jax.vmap(robot.state)(home + np.where(aside > 0, above, below) * aside))
+    ranges = {"mass": (1 - mass, 1 + mass), "damping": (1 - damping, 1 + damping)}
+    ranges = {name: range_ for name, range_ in ranges.items() if range_[1] > 1}
+    if payload:
+        ranges["payload"] = (0, payload)
+    return x0s, draw_factors(robot, count, seed, ranges)
 
 
 def draw_factors(
@@ -123,3 +147,15 @@ def _places(robot: Robot, argument: str, name: str, kind: str) -> np.ndarray:
     if kind != "joint":
         return np.array([number])
     return np.flatnonzero(model.dof_jntid == number)
+
+
+def start_room(robot: Robot | LinearPlant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the coordinates (n,) of home, and how far the limits are below and above it, 1 where
+    there are none."""
+    with jax.enable_x64(True):
+        home = np.asarray(robot.coordinates(np.asarray(robot.home)))
+    below, above = (
+        np.where(np.isfinite(end), np.abs(end - home), 1.0)
+        for end in (np.asarray(robot.state_limits.lower), np.asarray(robot.state_limits.upper))
+    )
+    return home, below, above

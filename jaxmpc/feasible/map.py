@@ -26,9 +26,7 @@ from jaxmpc.feasible.rays import Rays
 from jaxmpc.feasible.refinement import refined
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
-from jaxmpc.sets.ellipsoid import Ellipsoid
-from jaxmpc.sets.geometry import hull_volume
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.convex import Ellipsoid, Polytope, hull_volume
 
 # Volumes are sums of rounded products; bounds are widened by more than that.
 VOLUME_ROUNDING = 1e-11

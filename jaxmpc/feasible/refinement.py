@@ -8,8 +8,7 @@ from scipy.spatial import KDTree
 
 from jaxmpc.feasible.centered_polytope import power_of_two
 from jaxmpc.feasible.rays import Cuts, Rays
-from jaxmpc.sets.geometry import hull_volume
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.convex import Polytope, hull_volume
 
 # The most rays that are sent in one round.
 MOST_RAYS = 2000

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
-from jaxmpc.sets.any_set import translated
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex import Box, translated
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
 

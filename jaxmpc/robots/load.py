@@ -20,13 +20,14 @@ from jaxmpc.checks import (
     require_printable,
     require_shape,
 )
+from jaxmpc.robots.engine import model_bytes
 from jaxmpc.robots.guard import compared
 from jaxmpc.robots.physics import RK4, Physics
 from jaxmpc.robots.robot import Robot
 from jaxmpc.robots.supported import lacks, translate
 from jaxmpc.robots.tangent import unit_orientations
 from jaxmpc.robots.urdf import compiled_urdf
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex import Box
 from jaxmpc.sets.limits import Limit, limit_pair
 from jaxmpc.systems.system import require_period
 
@@ -411,8 +412,4 @@ def _home(host: "mujoco.MjModel") -> tuple[np.ndarray, np.ndarray, str]:
 
 def model_hash(robot: Robot) -> str:
     """Return a hash of the compiled model, by which a resumed run notices a change."""
-    import mujoco
-
-    binary = np.zeros(mujoco.mj_sizeModel(robot.mujoco), np.uint8)
-    mujoco.mj_saveModel(robot.mujoco, None, binary)
-    return hashlib.sha256(binary.tobytes()).hexdigest()
+    return hashlib.sha256(model_bytes(robot.mujoco).tobytes()).hexdigest()

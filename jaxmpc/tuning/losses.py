@@ -12,8 +12,7 @@ from jaxmpc.checks import fail, require_symmetric_psd
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.qp.precision import matmul
 from jaxmpc.sets import violations
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.convex import Box, Polytope
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,11 +19,12 @@ from PIL import Image
 
 import jaxmpc as jm
 from jaxmpc.app import cli
-from jaxmpc.app.commands import robot_runs
-from jaxmpc.app.commands.robot_samples import draw_robots
+from jaxmpc.app.commands import simulate
 from jaxmpc.app.plots import plot_runs
 from jaxmpc.app.plots.closed_loops import PLANS
+from jaxmpc.closed_loop import stored_runs
 from jaxmpc.closed_loop.outcome import evaluate_runs
+from jaxmpc.closed_loop.variations import draw_robots
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.film.captions import exceeded_limits
 from jaxmpc.robots.film.video import Film, render, save_video
@@ -55,7 +56,7 @@ def _in_empty_folder(tmp_path, monkeypatch, joint):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
     given = lambda name: joint if name == "joint" else jm.load_robot(name)
-    monkeypatch.setattr(robot_runs, "load_robot", given)
+    monkeypatch.setattr(simulate, "load_robot", given)
 
 
 def run(line):
@@ -75,7 +76,7 @@ def rows(out):
 @pytest.mark.slow
 def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
     """Ctrl-C in the second chunk loses that chunk only; the table is that of the states."""
-    real, asked = robot_runs.simulate_many, []
+    real, asked = stored_runs.simulate_many, []
 
     def default(robot, Q, R, horizon, *, target, margin):
         assert (Q, R, horizon, target, margin) == (None, None, mpc.horizon, None, 0.02)
@@ -87,8 +88,8 @@ def test_interrupted_resumed_and_judged(tmp_path, monkeypatch, capsys, mpc):
             raise KeyboardInterrupt
         return real(*args, **kwargs)
 
-    monkeypatch.setattr(robot_runs, "robot_mpc", default)
-    monkeypatch.setattr(robot_runs, "simulate_many", interrupted)
+    monkeypatch.setattr(simulate, "robot_mpc", default)
+    monkeypatch.setattr(stored_runs, "simulate_many", interrupted)
     assert run(f"{LINE} --output 'my runs'") == 130
     out = capsys.readouterr().out
     assert f"jaxmpc simulate {LINE} --output 'my runs' --resume" in out
@@ -191,7 +192,7 @@ def test_other_robots_and_laws(tmp_path, capsys, arguments):
     ],
 )
 def test_errors_are_one_line_before_any_compile(tmp_path, capsys, monkeypatch, arguments, message):
-    monkeypatch.setattr(robot_runs, "simulate_many", lambda *a, **k: pytest.fail("it started"))
+    monkeypatch.setattr(stored_runs, "simulate_many", lambda *a, **k: pytest.fail("it started"))
     assert run(arguments) == 2
     err = capsys.readouterr().err
     assert err.startswith("jaxmpc: error: ") and err.count("\n") == 1

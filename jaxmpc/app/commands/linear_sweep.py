@@ -13,10 +13,10 @@ import numpy as np
 from tqdm.std import tqdm
 
 from jaxmpc import store
-from jaxmpc.app.commands.options import Timing, print_table
+from jaxmpc.app.commands.options import print_table
 from jaxmpc.app.config import Config, SweepPoints, sweep_points
 from jaxmpc.app.programs import user_cache
-from jaxmpc.batches import CHUNK
+from jaxmpc.batches import CHUNK, Timing
 from jaxmpc.checks import fail
 from jaxmpc.feasible.candidates import StagePenalties
 from jaxmpc.feasible.executors import label_elsewhere

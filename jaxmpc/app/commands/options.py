@@ -1,16 +1,12 @@
 """Options that several commands share, their checks, and helpers to open results and print."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
 
 from jaxmpc.checks import MOST_COUNT, fail
-
-if TYPE_CHECKING:
-    pass
 
 
 def option(metavar: str | None, default: str, text: str | None = None) -> Any:
@@ -42,15 +38,6 @@ Devices = Annotated[
     ),
 ]
 Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")]
-
-
-@dataclass
-class Timing:
-    """Work done by this process, in a run that may have been resumed, and the time it took (s)."""
-
-    count: int = 0
-    compile_seconds: float = 0.0
-    run_seconds: float = 0.0
 
 
 def chosen_shard(text: str, environment: Mapping[str, str]) -> tuple[int, int]:
@@ -92,11 +79,11 @@ def check_counts(command: Any, **least: int) -> None:
     """Raise ValueError for an option that is given and below its least value, or too large for a
     count."""
     for name, lowest in least.items():
-        value, option = getattr(command, name), f"--{name.replace('_', '-')}"
+        value, given = getattr(command, name), f"--{name.replace('_', '-')}"
         if value is not None and value < lowest:
-            fail(option, f"{value}", f"Give a whole number, at least {lowest}")
+            fail(given, f"{value}", f"Give a whole number, at least {lowest}")
         if value is not None and value > MOST_COUNT:
-            fail(option, f"{value}", f"Give at most {MOST_COUNT}")
+            fail(given, f"{value}", f"Give at most {MOST_COUNT}")
 
 
 def check_positive(command: Any, *names: str) -> None:

@@ -1,12 +1,17 @@
 """The command `jaxmpc simulate`."""
 
 import dataclasses
+import importlib
+import os
+import warnings
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import jax
 import numpy as np
 
-from jaxmpc.app.commands.film import film
+from jaxmpc.app.commands.compiling import Compiling
+from jaxmpc.app.commands.film import choose_renderer, film
 from jaxmpc.app.commands.options import (
     Devices,
     Switch,
@@ -15,16 +20,27 @@ from jaxmpc.app.commands.options import (
     option,
     print_table,
 )
-from jaxmpc.app.commands.robot_runs import RobotRuns
-from jaxmpc.app.commands.runs_summary import summarise, summary_rows
 from jaxmpc.app.config import load_robot_config
 from jaxmpc.batches import chosen_devices
-from jaxmpc.checks import fail
-from jaxmpc.closed_loop.outcome import evaluate_runs
-from jaxmpc.files import write_json
+from jaxmpc.checks import fail, require_disk, require_memory, require_package
+from jaxmpc.closed_loop.linear_feedback import LinearFeedback
+from jaxmpc.closed_loop.robot_controller import RobotController
+from jaxmpc.closed_loop.robot_problem import robot_mpc
+from jaxmpc.closed_loop.runs_summary import summarise_runs
+from jaxmpc.closed_loop.stored_runs import simulate_into
+from jaxmpc.closed_loop.variations import draw_robots
+from jaxmpc.files import as_json, check_results, open_folder, remove_files, write_json
+from jaxmpc.mpc.condense import condensed_bytes
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.admm import ADMM
+from jaxmpc.robots.load import load_robot, model_hash
+from jaxmpc.robots.robot import Robot
+from jaxmpc.systems.riccati import lqr
 
 # Defaults of options that --config can give too.
 USUAL = {"horizon": 20, "margin": 0.02, "linearize": "state", "rho": 1e4}
+# Options that change the compiled programs.
+PROGRAM = ("horizon", "linearize", "iterations", "newton_steps", "dtype", "devices")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,29 +175,114 @@ class Simulate:
         """
         self.check()
         command = self.settled()
-        runs = RobotRuns.open(command)
-        robot = runs.robot
+        path = self.output / "runs.zarr"
+        check_results(path, self.resume, self.overwrite)
+        robot = command.robot_of_file()
+        command.require_sizes(robot)
+        file = {} if self.config is None else load_robot_config(self.config).weights(robot)
+        target = None if self.target is None else np.array(self.target)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # robot_mpc says the same
+            x, input_reference = robot.set_point(target)
+        steps = max(1, round(self.seconds / robot.dt))
+        each = 256 if jax.default_backend() == "cpu" else 4096
+        chunk = self.chunk or (self.devices or 1) * each
+        # The steps from here on compile programs.
+        programs = {name: getattr(command, name) for name in PROGRAM}
+        programs |= {"steps": steps, "chunk": min(chunk, self.count)}
+        compiling = Compiling.announce(robot, "loops", programs)
+        mpc = command.problem(robot, target, file)
+        with jax.enable_x64(True):
+            reference = np.asarray(robot.coordinates(x))
+        starts, factors = draw_robots(
+            robot, self.count, self.seed, spread=self.spread, mass=self.mass,
+            damping=self.damping, payload=self.payload,
+        )  # fmt: skip
+        open_folder(self.output)
         print(f"{robot.name}: {self.count:,} robots for {self.seconds:g} s -> {self.output}")
-        with runs.kept:
-            timing = runs.simulate()
-            run = runs.load()
-        outcome = evaluate_runs(run, robot, runs.reference, tolerance=self.tolerance)
+        old = "summary.json", "runs.png", "robots.gif"
+        with jax.enable_x64(self.dtype == "float64"), compiling.followed(programs=1):
+            runs = simulate_into(
+                path, command.controller(robot, mpc), robot, starts, steps, reference=reference,
+                input_reference=input_reference, factors=factors,
+                settings=command.settings(robot, mpc), chunk=chunk, devices=self.devices,
+                resume=self.resume, overwrite=self.overwrite, progress=True,
+                begun=lambda: remove_files(self.output, *old),
+            )  # fmt: skip
+        compiling.over()
+        summary = summarise_runs(runs, robot, reference, input_reference, tolerance=self.tolerance)
         files = ["runs.zarr", "summary.json", "runs.png"]
         from jaxmpc.app.plots.closed_loops import plot_runs
         from jaxmpc.app.plots.style import save
 
-        figure = plot_runs(
-            run, robot, reference=runs.reference, input_reference=runs.input_reference
-        )
+        figure = plot_runs(runs.run, robot, reference=reference, input_reference=input_reference)
         save(figure, self.output / "runs.png")
         video = self.output / "robots.gif"
-        if self.video and film(robot, run, runs.reference, self.video, video):
+        if self.video and film(robot, runs.run, reference, self.video, video):
             files.append("robots.gif")
-        summary = summarise(runs, run, outcome, timing)
-        write_json(self.output / "summary.json", summary)
-        rows = summary_rows(summary)
-        rows.append(("files", " ".join(str(self.output / name) for name in files)))
+        write_json(self.output / "summary.json", summary.data)
+        rows = [*summary.rows(), ("files", " ".join(str(self.output / name) for name in files))]
         print_table(rows, 13)
+
+    def robot_of_file(self) -> Robot:
+        """Return the robot; raise ValueError where options do not fit it."""
+        if self.video:
+            choose_renderer()
+        require_package("mujoco", "robots")
+        try:
+            importlib.import_module("mujoco")
+        except (AttributeError, ImportError, RuntimeError) as error:
+            problem = f"mujoco does not start with {os.environ.get('MUJOCO_GL')!r} ({error})"
+            fail("MUJOCO_GL", problem, "Unset it, or install the OpenGL library that it names")
+        robot = load_robot(self.robot)
+        for name, given, size in (
+            ("--target", self.target, robot.mujoco.nq),
+            ("--state-weights", self.state_weights, robot.n),
+            ("--input-weights", self.input_weights, robot.m),
+        ):
+            if given is not None and len(given) != size:
+                fail(name, f"has {len(given)} numbers", f"{robot.name} needs {size}")
+        return robot
+
+    def require_sizes(self, robot: Robot) -> None:
+        """Raise ValueError where the runs, or the condensed problem, do not fit into memory."""
+        samples, n, m = self.seconds / robot.dt, robot.n, robot.m
+        each = np.dtype(self.dtype).itemsize * (robot.state_size + m + 3) + 2
+        needed, folder, horizon = self.count * samples * each, self.output, self.horizon
+        require_memory("--count, --seconds", needed, "Simulate fewer robots, or for less time")
+        # Trajectories hardly compress; the files are seldom a quarter of the arrays.
+        require_disk(f"--output {folder}", needed / 4, folder, "Simulate less, or use another disk")
+        assert horizon is not None
+        require_memory("--horizon", condensed_bytes(horizon, n, m, None, n + m), "Give fewer steps")
+
+    def problem(self, robot: Robot, target: np.ndarray | None, file: dict[str, Any]) -> MPC:
+        """Return the problem: weights of options before those of the file."""
+        options = {"Q": self.state_weights, "R": self.input_weights}
+        given = file | {key: np.array(v) for key, v in options.items() if v is not None}
+        horizon: Any = self.horizon
+        more = {"terminal_cost": given["terminal_cost"]} if "terminal_cost" in given else {}
+        return robot_mpc(
+            robot, given.get("Q"), given.get("R"), horizon, target=target,
+            margin=self.margin or 0.0, **more,
+        )  # fmt: skip
+
+    def controller(self, robot: Robot, mpc: MPC) -> RobotController | LinearFeedback:
+        """Return the controller of --linearize."""
+        if self.linearize == "lqr":
+            return LinearFeedback(mpc, lqr(mpc.system, mpc.Q, mpc.R).K, robot)
+        solver = ADMM(iterations=self.iterations, newton_steps=self.newton_steps)
+        return RobotController(robot, mpc, solver, linearize=str(self.linearize), rho=self.rho)
+
+    def settings(self, robot: Robot, mpc: MPC) -> dict[str, Any]:
+        """Return the options that determine the results, as JSON data."""
+        irrelevant = ("output", "video", "tolerance", "resume", "overwrite", "chunk", "devices")
+        options = {k: v for k, v in dataclasses.asdict(self).items() if k not in irrelevant}
+        options |= {"state_weights": np.diag(mpc.Q), "input_weights": np.diag(mpc.R)}
+        if self.config is None:
+            del options["config"]
+        else:  # what is in the file, not where it lies
+            options |= {"config": "tuned", "Q": mpc.Q, "R": mpc.R, "P": mpc.terminal_cost}
+        return as_json(options | {"model": model_hash(robot)})
 
     def settled(self) -> "Simulate":
         """Return the command with the values of --config or `USUAL` for options not given."""

@@ -11,7 +11,6 @@ import numpy as np
 
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import given_options
-from jaxmpc.app.commands.robot_samples import draw_robots, plant_numbers
 from jaxmpc.app.commands.tuning import feasible_states, problem_file, start_range
 from jaxmpc.checks import MOST_COUNT, fail, require_memory
 from jaxmpc.closed_loop.many import simulate_many
@@ -19,6 +18,7 @@ from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.closed_loop.robot_controller import RobotController
 from jaxmpc.closed_loop.robot_problem import robot_mpc
 from jaxmpc.closed_loop.run import Run
+from jaxmpc.closed_loop.variations import draw_robots, plant_numbers
 from jaxmpc.mpc.condense import prestabilising_gain
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
@@ -28,9 +28,7 @@ from jaxmpc.qp.status import Status
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.sets import violations
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.ellipsoid import Ellipsoid
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
 from jaxmpc.systems.riccati import lqr
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
