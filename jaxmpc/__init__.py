@@ -50,14 +50,13 @@ if TYPE_CHECKING:
     from jaxmpc.recursion import recursive_feasibility
     from jaxmpc.robots.linear import LinearPlant
     from jaxmpc.robots.load import load_robot
-    from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
-    from jaxmpc.sets.invariant import (
-        invariant_ellipsoid,
-        maximal_control_invariant_set,
-        maximal_invariant_set,
-    )
+    from jaxmpc.sets.box import Box
+    from jaxmpc.sets.control_invariant import maximal_control_invariant_set
+    from jaxmpc.sets.ellipsoid import Ellipsoid
+    from jaxmpc.sets.invariant import invariant_ellipsoid, maximal_invariant_set
     from jaxmpc.sets.limits import joint_limits
-    from jaxmpc.sets.terminal import verify_terminal
+    from jaxmpc.sets.polytope import Polytope
+    from jaxmpc.sets.terminal_hypotheses import verify_terminal
     from jaxmpc.systems.riccati import lqr
     from jaxmpc.systems.system import LinearSystem
     from jaxmpc.tuning.losses import ClosedLoopLoss
@@ -143,10 +142,13 @@ HOMES = {
     "recursion": "recursive_feasibility",
     "robots.linear": "LinearPlant",
     "robots.load": "load_robot",
-    "sets.convex": "Box Ellipsoid Polytope",
-    "sets.invariant": "invariant_ellipsoid maximal_control_invariant_set maximal_invariant_set",
+    "sets.box": "Box",
+    "sets.control_invariant": "maximal_control_invariant_set",
+    "sets.ellipsoid": "Ellipsoid",
+    "sets.invariant": "invariant_ellipsoid maximal_invariant_set",
     "sets.limits": "joint_limits",
-    "sets.terminal": "verify_terminal",
+    "sets.polytope": "Polytope",
+    "sets.terminal_hypotheses": "verify_terminal",
     "systems.riccati": "lqr",
     "systems.system": "LinearSystem",
     "tuning.losses": "ClosedLoopLoss",

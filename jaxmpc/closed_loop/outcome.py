@@ -10,7 +10,7 @@ from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.qp.status import Status
-from jaxmpc.sets.convex import Box
+from jaxmpc.sets.box import Box
 from jaxmpc.sets.violations import kept, row_violations
 
 

@@ -24,7 +24,7 @@ from jaxmpc.qp.precision import arrays, floating_dtype
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.model import RobotModel
 from jaxmpc.robots.robot import Robot
-from jaxmpc.sets.convex import Box
+from jaxmpc.sets.box import Box
 
 LINEARIZATIONS = ("set-point", "state", "trajectory")
 

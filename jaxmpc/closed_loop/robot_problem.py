@@ -13,7 +13,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.robots.balance import settled
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
-from jaxmpc.sets.convex import Box
+from jaxmpc.sets.box import Box
 from jaxmpc.systems.riccati import least_reached, lqr
 from jaxmpc.systems.system import LinearSystem
 

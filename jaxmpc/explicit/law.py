@@ -18,7 +18,8 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import solve_many
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
-from jaxmpc.sets.convex import Box, unit_rows
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.geometry import unit_rows
 from jaxmpc.systems.system import host_matrices
 
 # Residuals to which plans are solved.

@@ -24,8 +24,10 @@ from jaxmpc.checks import fail
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.sets.convex import Box, Polytope, unit_half_spaces
+from jaxmpc.sets.any_set import unit_half_spaces
+from jaxmpc.sets.box import Box
 from jaxmpc.sets.lp import ROUNDING, AffineHull, Program, affine_hull, framed, maximise, scaling
+from jaxmpc.sets.polytope import Polytope
 
 # In coordinates where X_N just fits into [−1, 1]^n: the smallest ball of a region.
 SMALLEST = 1e-9
@@ -264,7 +266,7 @@ def least_distance_form(mpc: MPC, within: Box | Polytope | None = None) -> Least
     typical = np.where(still, 1.0, np.median((reach + np.abs(v))[~still]) if any(~still) else 1.0)
     # An orthonormal basis of the columns of M keeps tiny coefficients out of the LPs.
     U = np.linalg.svd(M, full_matrices=False)[0]
-    ball = framed("mpc: its feasible set", np.hstack([U, -V]), v).centre
+    ball = framed("mpc: its feasible set", np.hstack([U, -V]), v).center
     # Multiples of the golden ratio spread evenly and have no small integer relations.
     epsilon = 1 + np.modf(np.arange(1, len(v) + 1) * (np.sqrt(5) - 1) / 2)[0]
     return LeastDistanceForm(

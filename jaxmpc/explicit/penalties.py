@@ -15,8 +15,9 @@ from jaxmpc.explicit.search import exchange, explore
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Row, row_table
 from jaxmpc.qp.status import Status
-from jaxmpc.sets.convex import Box, Polytope
+from jaxmpc.sets.box import Box
 from jaxmpc.sets.lp import Program, maximise
+from jaxmpc.sets.polytope import Polytope
 
 # "auto" enumerates regions up to this dimension of the state.
 ENUMERATED = 4

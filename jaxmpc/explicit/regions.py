@@ -17,8 +17,10 @@ from jaxmpc.explicit.least_distance import (
 )
 from jaxmpc.explicit.search import RegionSearch, explore
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.sets.convex import Box, Polytope, unit_rows
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.geometry import unit_rows
 from jaxmpc.sets.lp import scaling
+from jaxmpc.sets.polytope import Polytope
 
 # Residual of the optimality conditions at a vertex, relative to the size of the terms, up to which
 # a region counts as one of the program as given.

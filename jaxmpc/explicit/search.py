@@ -9,7 +9,7 @@ import numpy as np
 from jaxmpc.checks import fail, whole
 from jaxmpc.explicit.cells import Cell, cell, volume
 from jaxmpc.explicit.least_distance import DEPENDENT, LeastDistanceForm
-from jaxmpc.sets.convex import Polytope
+from jaxmpc.sets.polytope import Polytope
 
 # The fraction of the volume, and the distance of a facet in coordinates where X_N just fits into
 # [−1, 1]^n, up to which the regions must fill X_N.

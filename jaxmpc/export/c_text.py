@@ -10,7 +10,7 @@ import numpy as np
 from jaxmpc.checks import fail
 from jaxmpc.mpc.plan import rate_ends
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.sets.convex import Box
+from jaxmpc.sets.box import Box
 
 TEMPLATES = Path(__file__).parent
 REAL = {"float64": "double", "float32": "float"}

@@ -6,8 +6,8 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import nnls
 
-from jaxmpc.sets.convex import Polytope
 from jaxmpc.sets.lp import Program, bound, safe_extent
+from jaxmpc.sets.polytope import Polytope
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,8 +18,8 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Block
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
+from jaxmpc.sets.any_set import set_bounds
 from jaxmpc.sets.lp import scaling
-from jaxmpc.sets.set_bounds import set_bounds
 
 
 @jax.tree_util.register_dataclass

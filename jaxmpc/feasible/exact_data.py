@@ -12,8 +12,9 @@ from jaxmpc.feasible.view import View
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Block
 from jaxmpc.mpc.rows import blocks as row_blocks
-from jaxmpc.sets.convex import Box, Ellipsoid
-from jaxmpc.sets.set_bounds import set_bounds
+from jaxmpc.sets.any_set import set_bounds
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.systems.system import host_matrices
 
 

@@ -26,7 +26,9 @@ from jaxmpc.feasible.rays import Rays
 from jaxmpc.feasible.refinement import refined
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.status import Status
-from jaxmpc.sets.convex import Ellipsoid, Polytope, hull_volume
+from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.geometry import hull_volume
+from jaxmpc.sets.polytope import Polytope
 
 # Volumes are sums of rounded products; bounds are widened by more than that.
 VOLUME_ROUNDING = 1e-11

@@ -16,8 +16,8 @@ import numpy as np
 from jaxmpc.checks import fail
 from jaxmpc.feasible.centered_polytope import CenteredPolytope, power_of_two
 from jaxmpc.mpc.inequalities import Inequalities, row_lengths
-from jaxmpc.sets.convex import Polytope
 from jaxmpc.sets.lp import Program, affine_hull, bound, framed, maximise, safe_extent
+from jaxmpc.sets.polytope import Polytope
 
 # Bounds of linear programs are trusted to this, relative to the size of the set.
 TOLERANCE = 1e-9
@@ -124,7 +124,7 @@ class PlanPolytope:
         feasible set is empty or flat."""
         if self.flat:
             fail("mpc", "its feasible set is flat: equalities tie the states", "Relax one of them")
-        return framed("mpc: its feasible set", self.G, self.g).centre[: self.p]
+        return framed("mpc: its feasible set", self.G, self.g).center[: self.p]
 
     def ray(self, centre: np.ndarray, direction: np.ndarray) -> tuple[float, np.ndarray, float]:
         """Return max s with centre + s·direction in the projection, and a half-space a'θ ≤ b of it,

@@ -11,8 +11,11 @@ from jaxmpc.checks import fail
 from jaxmpc.feasible.plan_polytope import DIMENSIONS, FACETS, CenteredPolytope, projected
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.sets.convex import Box, Ellipsoid, Polytope, unit_rows
-from jaxmpc.sets.invariant import predecessor
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.geometry import unit_rows
+from jaxmpc.sets.one_step import predecessor
+from jaxmpc.sets.polytope import Polytope
 
 
 def feasible_polytope(mpc: MPC) -> Polytope:

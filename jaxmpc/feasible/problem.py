@@ -19,10 +19,12 @@ from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.inequalities import condensed_in_float64
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
 from jaxmpc.mpc.rows import Block
-from jaxmpc.sets.convex import Box, Ellipsoid, Polytope, unit_rows
-from jaxmpc.sets.geometry import binding_rows
+from jaxmpc.sets.any_set import set_bounds
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.geometry import binding_rows, unit_rows
 from jaxmpc.sets.lp import FLAT, ROUNDING, implied_equalities, scaling
-from jaxmpc.sets.set_bounds import set_bounds
+from jaxmpc.sets.polytope import Polytope
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,8 @@ from scipy.spatial import KDTree
 
 from jaxmpc.feasible.centered_polytope import power_of_two
 from jaxmpc.feasible.rays import Cuts, Rays
-from jaxmpc.sets.convex import Polytope, hull_volume
+from jaxmpc.sets.geometry import hull_volume
+from jaxmpc.sets.polytope import Polytope
 
 # The most rays that are sent in one round.
 MOST_RAYS = 2000

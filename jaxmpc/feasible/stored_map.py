@@ -19,7 +19,8 @@ from jaxmpc.feasible.map import FeasibleSetMap, excluded, mesh
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays
 from jaxmpc.qp.status import Status
-from jaxmpc.sets.convex import Box, Polytope
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.polytope import Polytope
 
 # Points, or half-spaces, from which on they are reduced to those that matter, and the most mapped
 # states with which they are.

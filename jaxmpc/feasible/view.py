@@ -10,7 +10,7 @@ from jax import Array
 
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.sets.set_bounds import set_bounds
+from jaxmpc.sets.any_set import set_bounds
 
 
 @jax.tree_util.register_dataclass

@@ -32,7 +32,8 @@ from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.solve import in_two_parts, solve_factored
 from jaxmpc.qp.status import Status
-from jaxmpc.sets.convex import Box, Polytope
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.polytope import Polytope
 
 
 @dataclass(frozen=True, eq=False, repr=False)

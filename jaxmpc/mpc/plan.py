@@ -16,7 +16,7 @@ from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.residuals import marked
 from jaxmpc.qp.status import Status
-from jaxmpc.sets.convex import Box
+from jaxmpc.sets.box import Box
 
 
 @pytree

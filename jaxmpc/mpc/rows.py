@@ -19,7 +19,9 @@ from jaxmpc.mpc.problem import MPC, Outputs, Soft, output_steps
 from jaxmpc.qp.linalg import cholesky
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.polytope import Polytope
 
 # (kind, steps, rows a step) of each block of rows.
 Layout = tuple[tuple[str, tuple[int, ...], int], ...]

@@ -12,7 +12,7 @@ import numpy as np
 from jaxmpc.explicit.law import Law
 from jaxmpc.feasible.centered_polytope import CenteredPolytope
 from jaxmpc.qp.status import Status
-from jaxmpc.sets.convex import maximise
+from jaxmpc.sets.lp import maximise
 
 # Gradient ascent: distance kept from the half-spaces (on the boundary only one plan is feasible,
 # and solvers converge slowly), and step lengths; relative to the size of the set.

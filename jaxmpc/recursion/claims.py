@@ -13,9 +13,9 @@ from jaxmpc.feasible.polytope import backward, is_standard_form
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.recursion.report import Claim, in_words
-from jaxmpc.sets.convex import Polytope
-from jaxmpc.sets.set_bounds import set_bounds
-from jaxmpc.sets.terminal import verify_terminal
+from jaxmpc.sets.any_set import set_bounds
+from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.terminal_hypotheses import verify_terminal
 from jaxmpc.systems.system import host_matrices
 
 # Distance from a facet of X_N, relative to the facet's from the centre, from which a state counts

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.sets.convex import Polytope
+from jaxmpc.sets.polytope import Polytope
 
 # `lost_at` of samples that are infeasible from the start, and of those that were not decided.
 NOT_FEASIBLE, UNDECIDED = -1, -2

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
-from jaxmpc.sets.convex import Box, translated
+from jaxmpc.sets.any_set import translated
+from jaxmpc.sets.box import Box
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
 

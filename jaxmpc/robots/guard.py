@@ -19,7 +19,7 @@ import numpy as np
 from jaxmpc.qp.linalg import JAXLIB
 from jaxmpc.robots.physics import Physics
 from jaxmpc.robots.supported import Lack, name_of
-from jaxmpc.sets.convex import Box
+from jaxmpc.sets.box import Box
 
 if TYPE_CHECKING:
     import mujoco

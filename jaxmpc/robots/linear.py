@@ -9,7 +9,7 @@ from jax import Array
 from jaxmpc.checks import fail
 from jaxmpc.mpc.targets import equilibrium
 from jaxmpc.pytrees import pytree
-from jaxmpc.sets.convex import Box
+from jaxmpc.sets.box import Box
 from jaxmpc.systems.system import LinearSystem
 
 

@@ -27,7 +27,7 @@ from jaxmpc.robots.robot import Robot
 from jaxmpc.robots.supported import lacks, translate
 from jaxmpc.robots.tangent import unit_orientations
 from jaxmpc.robots.urdf import compiled_urdf
-from jaxmpc.sets.convex import Box
+from jaxmpc.sets.box import Box
 from jaxmpc.sets.limits import Limit, limit_pair
 from jaxmpc.systems.system import require_period
 

@@ -27,7 +27,7 @@ from jaxmpc.robots.balance import lacking, nearest_rest, require_rest, rest_at, 
 from jaxmpc.robots.physics import Physics
 from jaxmpc.robots.report import RobotReport, report_of
 from jaxmpc.robots.tangent import difference, quaternions, retract, unit_orientations
-from jaxmpc.sets.convex import Box
+from jaxmpc.sets.box import Box
 from jaxmpc.systems.system import LinearSystem
 
 if TYPE_CHECKING:

@@ -10,17 +10,15 @@ named_terminal_set               terminal set from its name
 verify_terminal                  hypotheses of the stability theorems -> TerminalReport of Check
 """
 
-from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
-from jaxmpc.sets.invariant import (
-    ControlInvariantSet,
-    invariant_ellipsoid,
-    maximal_control_invariant_set,
-    maximal_invariant_set,
-    predecessor,
-)
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.control_invariant import ControlInvariantSet, maximal_control_invariant_set
+from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.invariant import invariant_ellipsoid, maximal_invariant_set
 from jaxmpc.sets.limits import JointLimits, joint_limits, output_limits
-from jaxmpc.sets.named_terminal import named_terminal_set
-from jaxmpc.sets.terminal import Check, TerminalReport, verify_terminal
+from jaxmpc.sets.one_step import predecessor
+from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.terminal_hypotheses import Check, TerminalReport, verify_terminal
+from jaxmpc.sets.terminal_sets import named_terminal_set
 
 __all__ = [
     "Box",

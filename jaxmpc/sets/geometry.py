@@ -25,7 +25,7 @@ _MOST_ROWS = 100_000  # an elimination step with more candidate rows raises Valu
 
 
 def largest_ball(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return (centre, radius) of the largest ball in {G x <= g}; ValueError if empty.
+    """Return (center, radius) of the largest ball in {G x <= g}; ValueError if empty.
 
     The LP max r subject to G_i x + |G_i| r <= g_i (Boyd & Vandenberghe 2004, section 4.3.1), with r
     of either sign so that it is always feasible: 0, or negative by rounding, where the set is flat.
@@ -196,7 +196,7 @@ def _by_programs(Y: np.ndarray, known: np.ndarray) -> np.ndarray:
     proves a row redundant, or its maximiser lies outside the set and the ray towards it finds
     a new irredundant row: few rows an LP, however many are redundant (Clarkson 1994, "More
     output-sensitive geometric algorithms", FOCS). The multipliers of one proof often prove others
-    too. The rays start off the centre, at random, so that none meets a corner.
+    too. The rays start off the center, at random, so that none meets a corner.
     """
     keep = known.copy()
     random = np.random.default_rng(0)

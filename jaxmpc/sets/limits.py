@@ -8,7 +8,8 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite
-from jaxmpc.sets.convex import Box, Polytope
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.polytope import Polytope
 
 Limit = float | Reals | tuple[Reals, Reals] | None
 

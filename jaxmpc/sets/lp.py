@@ -93,6 +93,11 @@ class Program:
                     return Optimum(np.inf)
         fail("LP", "HiGHS finds no answer that can be checked", "Scale the rows to like size")
 
+    def bound(self, d: np.ndarray, best: Optimum, extent: np.ndarray) -> float:
+        """Return an upper bound of d'x over the set within |x| <= extent, from the multipliers of
+        an optimum found for d; the optimum's value, which is infinite, where it has none."""
+        return best.value if best.y is None else bound(d, best.y, self.G, self.g, extent)
+
     def _by_dual(self, cost: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Solve min b'y with M'y = cost, y >= 0 but for equalities: its multipliers are x."""
         free = np.eye(len(self.b))[~self.equal]
@@ -318,13 +323,13 @@ class Flat(ValueError):
 
 
 class Frame(NamedTuple):
-    """{G x <= g} about a point inside, in coordinates of like size: Z ((x - centre) / scale) <= 1.
+    """{G x <= g} about a point inside, in coordinates of like size: Z ((x - center) / scale) <= 1.
 
     The entries of Z (rows, n) are at most 1 in size.
     """
 
     Z: np.ndarray
-    centre: np.ndarray
+    center: np.ndarray
     scale: np.ndarray
 
     @property
@@ -350,7 +355,7 @@ def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
     the set is flat if the margin is below 1e-9 of it, or if a slack is rounding.
     """
     program = Program(G, g)
-    centre, margin, _ = program.margin()
+    center, margin, _ = program.margin()
     if margin <= ROUNDING and program.empty:
         fail(argument, "is empty: no point satisfies all its rows", "Loosen its rows")
 
@@ -366,10 +371,10 @@ def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
             "Check the rows: this needs a set with volume"
         )
 
-    slack = slack_at(centre)
+    slack = slack_at(center)
     step, margin, _ = Program(G, slack).margin()
-    centre = centre + step
-    slack = slack_at(centre)
+    center = center + step
+    slack = slack_at(center)
     if margin <= _DOUBTFUL:
         low, high = Program(G, slack).bounds()
         half = (high - low) / 2
@@ -382,12 +387,12 @@ def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
         margin = float((inside / length).min())
         if margin <= FLAT:
             flat(margin)
-        centre = centre + unit * step
-        slack = slack_at(centre)
+        center = center + unit * step
+        slack = slack_at(center)
     Y = G / slack[:, None]
     top = np.abs(Y).max(axis=0, initial=0.0)
     scale = 1 / np.where(top > 0, top, 1.0)
-    return Frame(Y * scale, centre, scale)
+    return Frame(Y * scale, center, scale)
 
 
 def implied_equalities(G: np.ndarray, g: np.ndarray, tolerance: float = FLAT) -> np.ndarray:

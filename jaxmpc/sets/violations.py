@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.sets.convex import Box, Polytope
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.polytope import Polytope
 
 # A limit counts as kept where it is exceeded by at most this, in its unit; relative to the bound
 # where that is above 1, since float32 holds 150 N m only to 1e-5.

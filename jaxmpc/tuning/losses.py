@@ -12,7 +12,8 @@ from jaxmpc.checks import fail, require_symmetric_psd
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.qp.precision import matmul
 from jaxmpc.sets import violations
-from jaxmpc.sets.convex import Box, Polytope
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.polytope import Polytope
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,11 @@ from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.softening import soften
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.sets.limits import JointLimits
-from jaxmpc.sets.named_terminal import named_terminal_set
+from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.terminal_sets import named_terminal_set
 from jaxmpc.systems.riccati import LQR, lqr
 from jaxmpc.systems.system import LinearSystem
 from jaxmpc.workflow.offline_test import OfflineReport, offline_report

@@ -20,8 +20,8 @@ from jaxmpc.mpc.softening import harden
 from jaxmpc.recursion import RecursionReport
 from jaxmpc.recursion.analysis import examine
 from jaxmpc.recursion.budget import LABELS, LOOPS, PROOFS, Budget
-from jaxmpc.sets.convex import Box
-from jaxmpc.sets.terminal import TerminalReport, verify_terminal
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.terminal_hypotheses import TerminalReport, verify_terminal
 from jaxmpc.workflow.closed_loops import NominalLoops, nominal_loops
 
 

@@ -20,7 +20,7 @@ from jaxmpc.app import config as configs
 from jaxmpc.app.commands import linear_sweep, recursion
 from jaxmpc.files import read_arrays, write_arrays
 from jaxmpc.recursion import Claim, Counterexample, RecursionReport, SmallestHorizon
-from jaxmpc.sets.convex import Box
+from jaxmpc.sets.box import Box
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 
 from jaxmpc.app.plots import plot_feasible_set, plot_recursion, plot_robot_map
 from jaxmpc.recursion import Claim, Counterexample, RecursionReport
-from jaxmpc.sets.convex import Box, Polytope
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.polytope import Polytope
 from jaxmpc.systems.system import LinearSystem
 
 

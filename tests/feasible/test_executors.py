@@ -16,7 +16,7 @@ from jaxmpc.feasible import executors
 from jaxmpc.feasible.labels import PROOFS
 from jaxmpc.feasible.pipeline import Scope, label_chunks, label_parts
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.sets.convex import Ellipsoid
+from jaxmpc.sets.ellipsoid import Ellipsoid
 
 POINTS = jm.grid([-1.2, -1.2], [1.2, 1.2], (20, 20))
 

@@ -12,7 +12,7 @@ from jaxmpc.feasible.map import FeasibleSetMap, mesh
 from jaxmpc.feasible.pipeline import Scope, label_parts
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.stored_map import HalfSpaces, StoredMap, extreme, line_ends
-from jaxmpc.sets.convex import hull_volume
+from jaxmpc.sets.geometry import hull_volume
 from jaxmpc.store import label_rows, open_labels
 
 

@@ -11,16 +11,15 @@ import pytest
 from problems import symmetric
 
 from jaxmpc import Box, LinearSystem, Polytope, lqr, maximal_invariant_set
-from jaxmpc.sets.convex import Ellipsoid
-from jaxmpc.sets.invariant import (
+from jaxmpc.sets.control_invariant import (
     ControlInvariantSet,
-    invariant_ellipsoid,
     largest_cut,
     maximal_control_invariant_set,
-    one_step,
-    predecessor,
 )
-from jaxmpc.sets.terminal import _exact_factor, _Rows, verify_terminal
+from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.invariant import invariant_ellipsoid
+from jaxmpc.sets.one_step import one_step, predecessor
+from jaxmpc.sets.terminal_hypotheses import _exact_factor, _Rows, verify_terminal
 
 INF = np.inf
 JOINT = LinearSystem(np.array([[1, 0.01], [0, 1]]), np.array([[0], [0.2]]), dt=0.01)
@@ -93,7 +92,7 @@ def test_predecessor_by_ridges_and_by_elimination(monkeypatch):
     system = LinearSystem(np.eye(4), rng.standard_normal((4, 2)))
     inputs = Box([-0.3, -0.1], [0.2, 0.4])
     by_ridges = predecessor(system, target, None, inputs)
-    monkeypatch.setattr("jaxmpc.sets.invariant._MANY", 1000)
+    monkeypatch.setattr("jaxmpc.sets.one_step._MANY", 1000)
     by_pairs = predecessor(system, target, None, inputs)
     assert len(by_ridges.h) == len(by_pairs.h) > 250
     assert by_ridges.volume() == pytest.approx(by_pairs.volume(), rel=1e-12)

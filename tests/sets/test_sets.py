@@ -15,9 +15,11 @@ from scipy.optimize import linprog
 
 import jaxmpc.sets.geometry as geometry
 from jaxmpc import LinearSystem
-from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.sets.geometry import factors, irredundant
 from jaxmpc.sets.limits import joint_limits, output_limits
+from jaxmpc.sets.polytope import Polytope
 
 INF = np.inf
 TRIANGLE = Polytope([[-1, 0], [0, -1], [1, 1]], [0, 0, 1], ("x >= 0", "y >= 0", "x + y <= 1"))

@@ -13,7 +13,7 @@ import scipy
 
 from jaxmpc import Box, LinearSystem, Polytope, lqr, maximal_invariant_set
 from jaxmpc.sets import lp
-from jaxmpc.sets.convex import _irredundant
+from jaxmpc.sets.geometry import irredundant as _irredundant
 from jaxmpc.systems import LQR
 
 INF = np.inf

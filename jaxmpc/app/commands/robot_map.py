@@ -36,8 +36,8 @@ from jaxmpc.robot_maps.set_point import deviations
 from jaxmpc.robot_maps.setting import RobotSetting
 from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.robots.robot import Robot
-from jaxmpc.sets.convex import translated
-from jaxmpc.sets.named_terminal import named_terminal_set
+from jaxmpc.sets.any_set import translated
+from jaxmpc.sets.terminal_sets import named_terminal_set
 from jaxmpc.store import report_damage
 from jaxmpc.systems.riccati import lqr
 

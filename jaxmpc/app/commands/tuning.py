@@ -18,8 +18,8 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.files import check_results, differences, open_folder, text_within, write_json
 from jaxmpc.mpc.inequalities import Inequalities
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.sets.convex import Polytope
 from jaxmpc.sets.lp import Program
+from jaxmpc.sets.polytope import Polytope
 
 CHECKPOINT = "checkpoint.npz"
 # Where the files of a run that is overwritten wait.

@@ -28,7 +28,9 @@ from jaxmpc.qp.status import Status
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.sets import violations
-from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.polytope import Polytope
 from jaxmpc.systems.riccati import lqr
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter

@@ -26,8 +26,10 @@ from jaxmpc.explicit.penalties import exact_penalty
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.softening import soften
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
-from jaxmpc.sets.named_terminal import named_terminal_set
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.terminal_sets import named_terminal_set
 from jaxmpc.systems.riccati import lqr
 from jaxmpc.systems.system import LinearSystem
 

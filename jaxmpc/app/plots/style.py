@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 
-from jaxmpc.sets.convex import Polytope
+from jaxmpc.sets.polytope import Polytope
 
 # Okabe and Ito's palette: distinct with any colour vision, and in grey by lightness.
 INFEASIBLE, FEASIBLE, UNDECIDED = "#dddcd8", "#9fcbe6", "#f0d024"

@@ -64,7 +64,7 @@ from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.residuals import Measured, Pair, assess, concluded
 from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
-from jaxmpc.sets.convex import Ellipsoid
+from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.systems.system import LinearSystem
 
 # Most stages that the passes of an ADMM step write out, without a loop over them. Loops reorder

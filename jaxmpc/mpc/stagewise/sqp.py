@@ -75,7 +75,7 @@ from jaxmpc.qp.precision import arrays, precisely, rounding
 from jaxmpc.qp.residuals import SHARE, Measured, Terms, assess
 from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
-from jaxmpc.sets.convex import Box
+from jaxmpc.sets.box import Box
 
 # QPs at most, of `solve_nonlinear`.
 STEPS = 100

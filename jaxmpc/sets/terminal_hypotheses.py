@@ -9,17 +9,16 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, as_weight, host_array
 from jaxmpc.checks import fail, require_finite, require_kind, require_shape
-from jaxmpc.sets.convex import Box, Ellipsoid, Polytope, translated, unit_half_spaces
+from jaxmpc.sets.any_set import translated, unit_half_spaces
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.control_invariant import largest_cut
+from jaxmpc.sets.disturbance import disturbance_set, largest_norm, supports
+from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.sets.geometry import unit_rows
-from jaxmpc.sets.invariant import (
-    contraction,
-    disturbance_set,
-    largest_cut,
-    largest_norm,
-    one_step,
-    supports,
-)
+from jaxmpc.sets.invariant import contraction
 from jaxmpc.sets.lp import Flat, Program, affine_hull, bound, framed, maximise, safe_extent
+from jaxmpc.sets.one_step import one_step
+from jaxmpc.sets.polytope import Polytope
 from jaxmpc.systems.riccati import least_reached, lqr
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
@@ -262,9 +261,9 @@ class _Rows:
     def width(self, rows: np.ndarray | None = None) -> np.ndarray:
         """Return how far the set reaches along each row (None: its own) from a point inside; where
         that is rounding, as in a flat set, the size of the row's terms."""
-        centre = Program(self.G, self.g).margin()[0]
+        center = Program(self.G, self.g).margin()[0]
         tops, rows = (self.g, self.G) if rows is None else (self.top(rows)[0], rows)
-        width = np.maximum(tops - rows @ centre, 0.0)
+        width = np.maximum(tops - rows @ center, 0.0)
         size = np.abs(tops) + np.abs(rows) @ np.where(np.isfinite(self.reach), self.reach, 0.0)
         return np.where(width > _TOUCH * size, width, np.where(size > 1e-280, size, 1.0))
 
@@ -282,7 +281,7 @@ class _Ellipse:
         return np.sqrt(self.level * squares), None
 
     def width(self, rows: np.ndarray) -> np.ndarray:
-        """Return how far the set reaches along each row from its centre."""
+        """Return how far the set reaches along each row from its center."""
         width = self.top(rows)[0]
         return np.where(width > 0, width, 1.0)
 

@@ -3,8 +3,10 @@
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.sets.convex import Box, Ellipsoid, Polytope
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.sets.invariant import invariant_ellipsoid, maximal_invariant_set
+from jaxmpc.sets.polytope import Polytope
 from jaxmpc.systems.riccati import LQR
 from jaxmpc.systems.system import LinearSystem
 

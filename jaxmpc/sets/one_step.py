@@ -1,0 +1,186 @@
+"""One step of x+ = A x + B u + c + w backwards: the states that some input takes into a set."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxmpc.arrays import host_array
+from jaxmpc.checks import require_kind
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.disturbance import disturbance_set
+from jaxmpc.sets.geometry import irredundant_rows, unit_rows
+from jaxmpc.sets.lp import FLAT, ROUNDING, Flat, affine_hull, framed, safe_extent
+from jaxmpc.sets.polytope import Polytope, as_polytope
+from jaxmpc.systems.system import LinearSystem, host_matrices
+
+
+def predecessor(
+    system: LinearSystem,
+    target: Box | Polytope,
+    states: Box | Polytope | None,
+    inputs: Box | Polytope | None,
+    disturbance: Box | Polytope | None = None,
+) -> Polytope:
+    """Return the states that some input takes into a target within one step for every w.
+
+    Pre = {x in states : there is u in inputs with A x + B u + c + w in target for all w in
+    disturbance}, the one-step controllable set.
+
+    Arguments:
+        system: n states, m inputs; A may be singular, c may be anything.
+        target: set in R^n with volume.
+        states: set in R^n, or None for all of R^n.
+        inputs: set in R^m, or None for all of R^m. It may be flat (an input that is off, two that
+            are equal).
+        disturbance: bounded set in R^n that holds the origin, or None for w = 0. If it leaves
+            of the target a flat set only, that is enlarged by 4e-9 of its size.
+
+    Returns irredundant rows of norm 1; rows of a flat set are not reduced. An empty set comes
+    as the row 0'x <= -1 (`is_empty()` is True), all of R^n as 0'x <= 1.
+
+    With T = {H y <= h - max Hw} the target shrunk by the disturbance, Pre is the preimage of the
+    Minkowski sum T + (-B inputs) under x -> A x + c. The sum is the projection to y of {(y, u) : y
+    + B u in T, u in inputs}, so that A need not be inverted. NumPy in float64; not traceable.
+
+    Raises ValueError for wrong shapes, empty arguments, a target from which no input leads to a set
+    with volume, or as `Polytope.project` does.
+
+    Source: Kerrigan 2000, thesis, Cambridge, section 2.3.
+    """
+    step = one_step(system, inputs, disturbance)
+    X = [] if states is None else [as_polytope("states", states, step.n)]
+    return step.back(as_polytope("target", target, step.n), *X)
+
+
+@dataclass(frozen=True, eq=False)
+class OneStep:
+    """x+ = A x + B u + c + w with u in U, w in W.
+
+    U is {u : u = moving v + fixed, v in V}, with V None if nothing bounds v; where V is a
+    bounded box, `ends` has its (lower, upper), else it is None.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    c: np.ndarray
+    V: Polytope | None
+    moving: np.ndarray
+    fixed: np.ndarray
+    W: Box | Polytope | None
+    ends: np.ndarray | None
+
+    @property
+    def n(self) -> int:
+        """Return the number of states."""
+        return len(self.A)
+
+    def back(self, target: Polytope, states: Polytope | None = None) -> Polytope:
+        """Return the `predecessor` of the target; `states` None stands for all of R^n."""
+        n, k = self.n, self.moving.shape[1]
+        T = Polytope(target.H, target.h)
+        if self.W is not None:
+            T = T.pontryagin_difference(self.W)
+            if T.is_empty():
+                return tidy(T)
+            G, g = unit_rows(T.H, T.h)
+            try:
+                framed("target", G, g)
+            except Flat:  # an elimination needs a set with volume
+                reach = safe_extent(*unit_rows(target.H, target.h))
+                reach = np.where(np.isfinite(reach), reach, 0.0)
+                T = Polytope(G, g + 4 * FLAT * (np.abs(g) + np.abs(G) @ reach))
+        # y in T - B u, where the inputs are u = moving v + fixed
+        T = T.preimage(np.eye(n), self.B @ self.fixed)
+        many = n in (3, 4) and np.asarray(T.h).size > _MANY
+        if k and self.ends is not None and many and _bounded(T):
+            for b, (lower, upper) in zip((self.B @ self.moving).T, self.ends, strict=True):
+                T = _plus_segment(T, -b, lower, upper)
+        elif k:
+            T = T.preimage(np.hstack([np.eye(n), self.B @ self.moving]))
+            if self.V is not None:
+                T = T.intersect(self.V.preimage(np.hstack([np.zeros((k, n)), np.eye(k)])))
+            T = T.project(range(n))
+        before = T.preimage(self.A, self.c)
+        H, h = host_array("H", before.H), host_array("h", before.h)
+        # Of a singular A, rows of T whose product with it is 0 but for rounding.
+        T_H, T_h = np.abs(host_array("H", T.H)), np.abs(host_array("h", T.h))
+        H[np.all(np.abs(H) <= 1e-13 * T_H @ np.abs(self.A), axis=1)] = 0.0
+        h[~H.any(axis=1) & (np.abs(h) <= ROUNDING * (T_h + T_H @ np.abs(self.c)))] = 0.0
+        before = Polytope(H, h)
+        return tidy(before if states is None else states.intersect(before))
+
+
+def one_step(
+    system: LinearSystem, inputs: Box | Polytope | None, disturbance: Box | Polytope | None
+) -> OneStep:
+    """Return the exact data of x⁺ = A x + B u + c + w, with what equalities fix of the inputs
+    (lower = upper, or two opposite rows) taken out."""
+    require_kind("system", system, LinearSystem)
+    system.validate()
+    m = system.m
+    inputs = None if inputs is None else inputs.spread(m)
+    A, B, c = host_matrices(system)
+    V, moving, fixed, ends = None, np.eye(m), np.zeros(m), None
+    if isinstance(inputs, Polytope):
+        V = as_polytope("inputs", inputs, m)
+        hull = affine_hull(*unit_rows(V.H, V.h))
+        assert hull is not None
+        if hull.equal.any():
+            moving, fixed = hull.basis, hull.shift
+            V = Polytope(hull.G, hull.g) if len(hull.g) else None
+    elif inputs is not None:
+        as_polytope("inputs", inputs, m)
+    if isinstance(inputs, Box):
+        lower, upper = host_array("inputs", inputs.lower), host_array("inputs", inputs.upper)
+        free = upper > lower
+        moving, fixed = np.eye(m)[:, free], np.where(free, 0.0, lower)
+        V = Box(lower[free], upper[free]).to_polytope() if free.any() else None
+        ends = np.column_stack([lower, upper])[free]
+        ends = ends if np.isfinite(ends).all() else None
+    return OneStep(A, B, c, V, moving, fixed, disturbance_set(disturbance, system.n), ends)
+
+
+def _bounded(polytope: Polytope) -> bool:
+    """Return whether a polytope is bounded."""
+    return framed("Polytope", *unit_rows(polytope.H, polytope.h)).bounded
+
+
+def _plus_segment(T: Polytope, b: np.ndarray, lower: float, upper: float) -> Polytope:
+    """Return {y + b v : y in T, lower <= v <= upper}, for a bounded T with volume, n >= 2.
+
+    Its facets are those of T, shifted, and the sums of the segment and a ridge of T where facets
+    p and q meet with p'b > 0 > q'b. A ridge has at least n - 1 vertices: of all pairs (p, q),
+    those with so many common vertices are combined, far fewer than an elimination would make.
+    """
+    G, g = unit_rows(T.H, T.h)
+    slope, n = G @ b, G.shape[1]
+    slope[np.abs(slope) <= 1e-13 * np.abs(G) @ np.abs(b)] = 0.0
+    V = T.vertices()
+    touches = (np.abs(V @ G.T - g) <= 1e-7 * np.ptp(V @ G.T, axis=0)).T.astype(float)
+    up, down = np.flatnonzero(slope > 0), np.flatnonzero(slope < 0)
+    p, q = np.nonzero(touches[up] @ touches[down].T >= n - 1)
+    p, q = up[p], down[q]
+    weight = -slope[q] / (slope[p] - slope[q])
+    H = weight[:, None] * G[p] + (1 - weight)[:, None] * G[q]
+    h = weight * g[p] + (1 - weight) * g[q]
+    new = np.any(np.abs(H) > 1e-12 * (weight[:, None] * np.abs(G[p]) + np.abs(G[q])), axis=1)
+    shifted = g + np.maximum(slope * lower, slope * upper)
+    return Polytope(np.vstack([G, H[new]]), np.r_[shifted, h[new]]).reduce()
+
+
+def tidy(polytope: Polytope) -> Polytope:
+    """Return the same set with irredundant unit rows; 0'x <= -1 if empty, 0'x <= 1 if all of
+    R^n."""
+    zero = np.zeros((1, polytope.dimension))
+    if polytope.is_empty():
+        return Polytope(zero, np.array([-1.0]))
+    G, g = unit_rows(polytope.H, polytope.h)
+    if not len(G):
+        return Polytope(zero, np.array([1.0]))
+    try:
+        return Polytope(*irredundant_rows("Polytope", G, g))
+    except Flat:
+        return Polytope(G, g)
+
+
+_MANY = 60  # rows of a target from which ridges are looked for, instead of pairs of rows

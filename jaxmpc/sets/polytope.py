@@ -1,0 +1,479 @@
+"""Polytopes: {x : H x <= h}, bounded or not."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import scipy
+from scipy.spatial import ConvexHull
+
+from jaxmpc.arrays import Reals, as_array, host_array, store_floats
+from jaxmpc.checks import (
+    concrete,
+    fail,
+    require_finite,
+    require_printable,
+    require_real,
+    require_shape,
+)
+from jaxmpc.pytrees import pytree
+from jaxmpc.sets.convex_set import (
+    ConvexSet,
+    LinearSet,
+    Rows,
+    as_floats,
+    numbers,
+    product,
+    require_matching,
+)
+from jaxmpc.sets.geometry import (
+    binding_rows,
+    distinct,
+    dual_hull,
+    eliminate,
+    explained,
+    factors,
+    hull_volume,
+    irredundant,
+    irredundant_rows,
+    largest_ball,
+    unit_rows,
+)
+from jaxmpc.sets.lp import (
+    FLAT,
+    ROUNDING,
+    Flat,
+    Frame,
+    Program,
+    affine_hull,
+    bound,
+    cleaned,
+    framed,
+    maximise,
+    safe_extent,
+    scaling,
+)
+
+
+@pytree
+@dataclass(frozen=True, eq=False)
+class Polytope(LinearSet):
+    """{x in R^n : H x <= h}.
+
+    Arguments:
+        H: (rows, n) outward normals, of any length.
+        h: (rows,) offsets; inf for a row that does not bind.
+        labels: names of the rows, such as "q1 <= 1.5 rad"; empty for none. A row that comes
+            out of `intersect`, `reduce` or `preimage` keeps the label it went in with.
+    """
+
+    H: Reals
+    h: Reals
+    labels: tuple[str, ...] = field(default=(), metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        store_floats(self, "H", "h")
+
+    @classmethod
+    def from_points(cls, points: Reals) -> "Polytope":
+        """Return the convex hull of `points` (k, n), one unit outward normal per facet. NumPy; not
+        traceable.
+
+        Raises ValueError if the points are not finite or lie in a hyperplane.
+        """
+        points = host_array("points", points)
+        if points.ndim != 2 or not points.size:
+            fail("points", f"shape {points.shape} is not (k, n)", "Give one row per point")
+        require_finite("points", points)
+        center = points.mean(axis=0)
+        scale = np.abs(points - center).max(axis=0)
+        scaled = (points - center) / np.where(scale > 0, scale, 1.0)
+        if np.linalg.matrix_rank(scaled, rtol=FLAT) < points.shape[1]:
+            fail("points", "lie in a hyperplane", "Give points that span a set with volume")
+        if points.shape[1] == 1:
+            return cls(np.array([[1.0], [-1.0]]), np.array([points.max(), -points.min()]))
+        # qhull's facets are simplices: a facet with more corners comes several times.
+        with explained("points"):
+            facets = ConvexHull(scaled).equations
+        facets = facets[distinct(facets, 1e-10)]
+        normals, offsets = facets[:, :-1] / scale, -facets[:, -1]
+        size = np.abs(offsets) + np.abs(normals) @ np.abs(center)
+        return cls(*unit_rows(normals, cleaned(offsets + normals @ center, size)))
+
+    @property
+    def dimension(self) -> int:
+        """Return n, the number of coordinates."""
+        return np.shape(as_array(self.H))[-1]
+
+    def validate(self, argument: str, dimension: int | None = None) -> None:
+        """Raise ValueError, naming `argument`, for wrong shapes, NaN or an empty set.
+
+        The set is empty if a checked Farkas vector says so (`is_empty`).
+        """
+        self._require_fields(argument, dimension)
+        if concrete((self.H, self.h)) and Program(*unit_rows(self.H, self.h, argument)).empty:
+            fail(argument, "is empty: no point satisfies all its rows", "Loosen its rows")
+
+    def is_empty(self) -> bool:
+        """Return whether no point satisfies all rows: whether an LP finds multipliers y >= 0 with
+        G'y = 0 and g'y < 0, by more than rounding (1e-11 of the terms). NumPy; not traceable."""
+        H, h = self.half_spaces()
+        if np.any((h == -np.inf) | (~H.any(axis=1) & (h < 0))):
+            return True
+        return Program(*unit_rows(H, h)).empty
+
+    def contains(self, x: Reals, tolerance: float = 0.0) -> Any:
+        """Return whether H x <= h + tolerance (in the scale of each row), x of shape (n,)."""
+        self._require_vector("x", x, "point")
+        xp, (H, h, x, tolerance) = numbers(self.H, self.h, x, tolerance)
+        return xp.all(product(xp, H, x) <= h + tolerance)
+
+    def support(self, d: Reals) -> float:
+        """Return max d'x over the set, by one LP; inf if unbounded along d. NumPy; not traceable.
+        Raises ValueError if the set is empty."""
+        G, g = self._rows()
+        d = host_array("d", d)
+        require_shape("d", d, (self.dimension,), "Give one direction")
+        require_finite("d", d)
+        value = maximise(d, G, g).value
+        if value == -np.inf:
+            fail("Polytope", "is empty: no point satisfies all its rows", "Loosen its rows")
+        return value
+
+    def rows(self) -> tuple[Rows, Rows, Rows]:
+        """Return (H, lower, upper) of the two-sided rows lower <= H x <= upper; lower is -inf."""
+        H, h = as_floats(self.H), as_floats(self.h)
+        return H, np.full(np.shape(h), -np.inf, dtype=h.dtype), h
+
+    def chebyshev(self) -> tuple[np.ndarray, float]:
+        """Return (center, radius) of the largest ball inside, by one LP. NumPy; not traceable.
+
+        The radius of a flat set is 0. Raises ValueError if the set is empty, or holds balls
+        of every radius.
+        """
+        center, radius = largest_ball("Polytope", *self._rows())
+        if radius == np.inf:
+            fail("Polytope", "is unbounded: it holds arbitrarily large balls", "Add rows")
+        return center, max(radius, 0.0)
+
+    def intersect(self, other: LinearSet) -> "Polytope":
+        """Return the points in both sets: the rows of both, not reduced. NumPy; not traceable.
+
+        If one of the two has labels, the unlabelled rows of the other get the label "".
+        """
+        parts = (self, as_polytope("other", other))
+        for argument, part in zip(("Polytope", "other"), parts, strict=True):
+            part._require_fields(argument, self.dimension)
+        H = [host_array("H", part.H) for part in parts]
+        h = [host_array("h", part.h) for part in parts]
+        labels = [part.labels or ("",) * len(b) for part, b in zip(parts, h, strict=True)]
+        named = any(part.labels for part in parts)
+        return Polytope(np.vstack(H), np.concatenate(h), labels[0] + labels[1] if named else ())
+
+    def half_spaces(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (H, h) in float64. NumPy; not traceable."""
+        return host_array("Polytope.H", self.H), host_array("Polytope.h", self.h)
+
+    def scale(self, factor: float) -> "Polytope":
+        """Return {factor x : x in the set}, factor > 0. NumPy; not traceable."""
+        self._require_fields("Polytope")
+        require_real("factor", factor)
+        if not (np.ndim(factor) == 0 and np.isfinite(factor) and factor > 0):
+            fail("factor", f"{factor!r} is not a positive number", "Give a finite factor > 0")
+        H, h = self.half_spaces()
+        return Polytope(H, h * float(factor))
+
+    def preimage(self, M: Reals, t: Reals | None = None) -> "Polytope":
+        """Return {x : M x + t in the set} = {x : H M x <= h - H t}, row by row, not reduced. NumPy;
+        not traceable.
+
+        Arguments:
+            M: (n, k), any matrix.
+            t: (n,), or None for 0.
+        """
+        self._require_fields("Polytope")
+        H, h = self.half_spaces()
+        M, t = _affine(M, t, (self.dimension, None))
+        return Polytope(
+            cleaned(H @ M, np.abs(H) @ np.abs(M)),
+            cleaned(h - H @ t, np.abs(h) + np.abs(H) @ np.abs(t)), self.labels,
+        )  # fmt: skip
+
+    def image(self, M: Reals, t: Reals | None = None) -> "Polytope":
+        """Return {M x + t : x in the set}, reduced unless M is square. NumPy; not traceable.
+
+        Arguments:
+            M: (k, n) of rank k.
+            t: (k,), or None for 0.
+
+        With k < n, y = M x is solved for k entries of x, which leaves the set of all (y, rest
+        of x); `project` then eliminates the rest.
+
+        Raises ValueError if rank M < k (the image is flat), or as `project` does.
+        """
+        M, t = _affine(M, t, (None, self.dimension))
+        k, n = M.shape
+        # Units of x and y must not decide the rank.
+        row, column = scaling(M, np.zeros(k))
+        scaled = row[:, None] * M * column
+        if np.linalg.matrix_rank(scaled, rtol=FLAT) < k:
+            fail("M", f"has rank below {k}, so the image is flat", "Map to fewer coordinates")
+        order = scipy.linalg.qr(scaled, mode="r", pivoting=True)[1]
+        # z = (y - t, x[order[k:]]) = T x
+        T = np.vstack([M, np.eye(n)[order[k:]]])
+        lifted = self.preimage(np.linalg.inv(T))
+        image = lifted if k == n else lifted.project(range(k))
+        return image.preimage(np.eye(k), -t)
+
+    def project(self, axes: Sequence[int]) -> "Polytope":
+        """Return the set of (x_i for i in axes) over all x in the set, with irredundant unit rows.
+        NumPy; not traceable.
+
+        Arguments:
+            axes: the coordinates to keep, in the order wanted.
+
+        Exact up to rounding: Fourier-Motzkin elimination of the other coordinates, redundant
+        rows removed after each (Ziegler 1995, section 1.2). The set may be unbounded, and flat if
+        its projection is not: then coordinates are eliminated by its equalities first.
+
+        Raises ValueError if the projection is empty or flat, or there are too many rows to
+        eliminate.
+        """
+        axes, n = list(axes), self.dimension
+        wrong = not axes or len(set(axes)) < len(axes) or not set(axes) <= set(range(n))
+        if wrong:
+            fail("axes", f"{axes} are not distinct numbers in 0..{n - 1}", "Name those to keep")
+        G, g = self._rows()
+        try:
+            Z, center, scale = framed("Polytope", G, g)
+        except Flat:
+            return self._project_flat(G, g, axes)
+        Z = eliminate(Z, sorted(set(range(n)) - set(axes)))[:, np.argsort(np.argsort(axes))]
+        Y, about = Z / scale[axes], center[axes]
+        return Polytope(*unit_rows(Y, cleaned(1 + Y @ about, 1 + np.abs(Y) @ np.abs(about))))
+
+    @staticmethod
+    def _project_flat(G: np.ndarray, g: np.ndarray, axes: list[int]) -> "Polytope":
+        """Return the projection of a flat set, in coordinates of its affine hull."""
+        hull = affine_hull(G, g)
+        assert hull is not None
+        onto = hull.basis[axes]
+        row, column = scaling(onto, np.zeros(len(axes)))
+        if not hull.equal.any() or not (
+            onto.shape[1] >= len(axes)
+            and np.linalg.matrix_rank(row[:, None] * onto * column, rtol=FLAT) == len(axes)
+        ):
+            cure = "Check the rows: this needs a result with volume"
+            fail("Polytope", "is flat, and so is its projection", cure)
+        image = Polytope(hull.G, hull.g).image(onto, hull.shift[axes])
+        return Polytope(*irredundant_rows("Polytope", *image._rows()))
+
+    def minkowski_sum(self, other: LinearSet | Reals) -> "Polytope":
+        """Return {x + w : x in the set, w in other}, with irredundant unit rows. NumPy; not
+        traceable.
+
+        Arguments:
+            other: Box, Polytope, or points (k, n), which stand for their convex hull.
+
+        Bounded sets in up to three dimensions: the hull of all sums of vertices. Else the
+        projection to x of {(x, w) : x - w in the set, w in other}.
+
+        Raises ValueError if a set is empty, or the sum flat.
+        """
+        n = self.dimension
+        if isinstance(other, LinearSet):
+            other.validate("other", n)
+            points = _vertices_of(other) if n <= 3 else None
+        else:
+            points = _points(other, n)
+        vertices = _vertices_of(self) if n <= 3 and points is not None else None
+        if points is not None and vertices is not None:
+            return Polytope.from_points((vertices[:, None] + points).reshape(-1, n))
+        # x = s + D w + shift with s in the set and w in `weights`, a set with volume.
+        if isinstance(other, LinearSet):
+            D, shift, weights = np.eye(n), np.zeros(n), as_polytope("other", other)
+        else:
+            D, shift, weights = _combinations(_points(other, n))
+        k = D.shape[1]
+        lifted = self.preimage(np.hstack([np.eye(n), -D]), -shift)
+        if k:  # a single point has no weights
+            lifted = lifted.intersect(weights.preimage(np.eye(k, n + k, n)))
+        return lifted.project(range(n))
+
+    def pontryagin_difference(self, other: ConvexSet | Reals) -> "Polytope":
+        """Return {x : x + w in the set for all w in other}: H x <= h - max {H w : w in other}.
+        NumPy; not traceable.
+
+        Arguments:
+            other: Box, Polytope, Ellipsoid, or points (k, n), which stand for their convex hull.
+
+        Row by row, not reduced, and exact (Kolmanovsky & Gilbert 1998, Math. Problems in Eng. 4,
+        theorem 2.3). The result may be empty (`is_empty` tells).
+        """
+        self._require_fields("Polytope")
+        H, h = self.half_spaces()
+        binding = binding_rows(H, h)
+        reach = np.zeros(len(h))
+        if isinstance(other, ConvexSet):
+            other.validate("other", self.dimension)
+            reach[binding] = [other.support(row) for row in H[binding]]
+        else:
+            reach[binding] = (H[binding] @ _points(other, self.dimension).T).max(axis=1)
+        return Polytope(H, cleaned(h - reach, np.abs(h) + np.abs(reach)))
+
+    def is_subset(self, other: LinearSet, tolerance: float = 1e-9) -> bool:
+        """Return whether no point of the set violates a row of `other` by more than `tolerance`,
+        relative to the row's own terms. NumPy; not traceable.
+
+        A row a'x <= b may be exceeded by tolerance (|b| + sum_i |a_i| max |x_i|), whatever its
+        units and those of x; the maxima are over the set, infinite ones left out. It is judged by
+        an upper bound of its maximum made from an LP's multipliers (`lp.bound`), valid for any LP
+        error but along coordinates in which the set is unbounded. An empty set is a subset of
+        every set.
+        """
+        if self.is_empty():
+            return True
+        other = as_polytope("other", other)
+        other._require_fields("other", self.dimension)
+        rows, offsets = unit_rows(other.H, other.h, "other")
+        G, g = self._rows()
+        reach = safe_extent(G, g)
+        reach[np.isinf(reach)] = 0.0
+        allowed = max(tolerance, ROUNDING) * (np.abs(offsets) + np.abs(rows) @ reach)
+        program = Program(G, g)
+        for row, most in zip(rows, offsets + allowed, strict=True):
+            y = program.maximise(row).y
+            if y is None or bound(row, y, G, g, reach) > most:
+                return False
+        return True
+
+    def reduce(self) -> "Polytope":
+        """Return the same set with the fewest rows, each of norm 1. NumPy; not traceable.
+
+        Rows that cut off less than about 1e-12 of the set's size (near-duplicates, rows that
+        touch a vertex) are dropped; 1e-10 in more than six dimensions. Raises ValueError if
+        the set is empty, flat or unbounded.
+
+        Method: about an interior point c the row a'x <= b reads y'(x - c) <= 1 with
+        y = a / (b - a'c), and it is irredundant exactly if y is a vertex of the convex hull
+        of all the y (polarity; Ziegler 1995, section 2.3). A product of sets is reduced factor by
+        factor; factors of more than six dimensions by one LP per row.
+        """
+        G, g = self._rows()
+        keep = irredundant(self._dual(G, g).Z)
+        labels: tuple[str, ...] = ()
+        if self.labels:
+            binding = binding_rows(*self.half_spaces())
+            labels = tuple(self.labels[i] for i in binding[keep])
+        return Polytope(G[keep], g[keep], labels)
+
+    def vertices(self) -> np.ndarray:
+        """Return the vertices (k, n); counter-clockwise in 2-D, ascending in 1-D. NumPy; not
+        traceable.
+
+        The vertex dual to the facet {y : v'y = 1} of the hull described in `reduce` is
+        c + v. Raises ValueError if the set is empty, flat or unbounded.
+        """
+        Z, center, scale = self._dual(*self.reduce()._rows())
+        if self.dimension == 1:
+            return np.sort(center + scale / Z, axis=0)
+        V = dual_hull(Z).intersections
+        V = V[distinct(V / np.abs(V).max(axis=0), 1e-10)]
+        if self.dimension == 2:
+            V = V[np.argsort(np.arctan2(V[:, 1], V[:, 0]))]
+        return center + V * scale
+
+    def volume(self) -> float:
+        """Return the length, area or volume, of a product of sets factor by factor. NumPy; not
+        traceable.
+
+        Raises ValueError if the set is empty, flat or unbounded.
+        """
+        Z, _, scale = self._dual(*self.reduce()._rows())
+        parts, S = factors(Z)
+        if len(parts) == 1:
+            return hull_volume(self.vertices())
+        volumes = [Polytope(part, np.ones(len(part))).volume() for _, part in parts]
+        return float(np.prod(volumes) * np.prod(scale) / abs(np.linalg.det(S)))
+
+    def _require_fields(self, argument: str, dimension: int | None = None) -> None:
+        require_matching(argument, {"H": self.H, "h": self.h}, 2, dimension)
+        require_labels(f"{argument}.labels", self.labels, np.shape(as_array(self.h))[0])
+
+    def _rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows that can bind, scaled to norm 1."""
+        self._require_fields("Polytope")
+        return unit_rows(self.H, self.h)
+
+    @staticmethod
+    def _dual(G: np.ndarray, g: np.ndarray) -> Frame:
+        """Return the frame of a bounded set with volume; raise ValueError for any other."""
+        frame = framed("Polytope", G, g)
+        if not frame.bounded:
+            fail("Polytope", "is unbounded", "Check the rows: this needs a bounded set")
+        return frame
+
+
+def require_labels(argument: str, labels: Any, rows: int) -> None:
+    """Raise unless `labels` is a tuple of strings, one a row or none."""
+    if not isinstance(labels, tuple) or not all(isinstance(label, str) for label in labels):
+        fail(argument, f"{labels!r} is not a tuple of strings", 'Write it as ("q <= 1", "q >= -1")')
+    if len(labels) not in (0, rows):
+        fail(argument, f"{len(labels)} entries for {rows} rows", "Label all rows or none")
+    require_printable(argument, *labels)
+
+
+def _affine(
+    M: Reals, t: Reals | None, shape: tuple[int | None, int | None]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return M and t of x -> M x + t, checked: M has this shape (None: any), t one entry a row of
+    M."""
+    M = host_array("M", M)
+    fits = [size is None or size == given for size, given in zip(shape, M.shape, strict=False)]
+    if M.ndim != 2 or 0 in M.shape or not all(fits):
+        wanted = ", ".join("k" if size is None else str(size) for size in shape)
+        fail("M", f"shape {M.shape} is not ({wanted})", "Give a matrix, one row an entry of Mx")
+    require_finite("M", M)
+    t = np.zeros(len(M)) if t is None else host_array("t", t)
+    require_shape("t", t, (len(M),), "Give one entry a row of M")
+    require_finite("t", t)
+    return M, t
+
+
+def _points(points: Reals, n: int) -> np.ndarray:
+    """Return the points of an argument `other` (k, n), checked."""
+    values = host_array("other", points)
+    if values.ndim != 2 or values.shape[1] != n or not len(values):
+        fail("other", f"shape {values.shape} is not (k, {n})", "Give a set, or points")
+    require_finite("other", values)
+    return values
+
+
+def _combinations(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, Polytope]:
+    """Return (D, shift, W) with {D w + shift : w in W} = the hull of points (k, n): weights w >= 0
+    of all points but the last with a sum <= 1, the last gets the rest."""
+    k = len(points) - 1
+    W = Polytope(np.vstack([-np.eye(k), np.ones((1, k))]), np.r_[np.zeros(k), 1.0])
+    return (points[:-1] - points[-1]).T, points[-1], W
+
+
+def _vertices_of(set_: LinearSet) -> np.ndarray | None:
+    """Return the vertices of a set; None where it is unbounded or flat."""
+    try:
+        return set_.vertices()
+    except ValueError:
+        return None
+
+
+def as_polytope(argument: str, value: object, n: int | None = None) -> Polytope:
+    """Return a Box or Polytope as a Polytope; with n, checked to be a set in R^n.
+
+    Raises ValueError, naming `argument`, for anything else.
+    """
+    if not isinstance(value, LinearSet):
+        fail(argument, f"{type(value).__name__} is no Box or Polytope", "Give one")
+    if n is not None:
+        value = value.spread(n)
+        value.validate(argument, n)
+    return value if isinstance(value, Polytope) else Polytope(*value.half_spaces())
