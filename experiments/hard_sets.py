@@ -134,7 +134,7 @@ def without_rates(mpc: jm.MPC) -> jm.MPC:
     wide = lambda set_: set_ and jm.Box(np.append(set_.lower, -free), np.append(set_.upper, free))
     limit = np.broadcast_to(np.asarray(mpc.input_rate_limit, float), (m,))
     rates = jm.Outputs(np.hstack([np.zeros((m, n)), -np.eye(m)]), -limit, limit, np.eye(m),
-                       steps=tuple(range(mpc.horizon)))  # fmt: skip
+                       stages=tuple(range(mpc.horizon)))  # fmt: skip
     system = jm.LinearSystem(
         np.block([[A, np.zeros((n, m))], [np.zeros((m, n + m))]]), np.vstack([B, np.eye(m)])
     )
@@ -393,7 +393,7 @@ def singular() -> Case:
 
 def index_set() -> Case:
     return elimination(problem([[1.1, 0.5], [-0.3, 1.0]], [[0.1], [0.7]], 7, box(2, 1), box(0.5),
-                               constrained_steps=(2, 5, 7)))  # fmt: skip
+                               constrained_stages=(2, 5, 7)))  # fmt: skip
 
 
 def one_sided() -> Case:
@@ -402,7 +402,7 @@ def one_sided() -> Case:
 
 
 def one_sided_outputs() -> Case:
-    outputs = jm.Outputs(np.array([[1.0, 0.4]]), [-1e9], [1.0], D=np.array([[0.3]]), steps=(1, 3))
+    outputs = jm.Outputs(np.array([[1.0, 0.4]]), [-1e9], [1.0], D=np.array([[0.3]]), stages=(1, 3))
     states = jm.Box([-np.inf, -1.0], [1e9, np.inf])
     return elimination(problem([[1.0, 0.3], [-0.2, 1.1]], [[0.2], [0.6]], 5, states, box(1.0),
                                outputs=outputs), center=[0.0, 0.0], scale=[1.0, 1.0])  # fmt: skip
@@ -427,7 +427,7 @@ def chain_6() -> Case:
 
 def empty() -> Case:
     """Only x_0 is limited; from (1, 1) full input leads to x_N = 25 and no farther."""
-    mpc = problem(*INTEGRATOR, 6, box(1, 1), box(1.0), constrained_steps=(0,),
+    mpc = problem(*INTEGRATOR, 6, box(1, 1), box(1.0), constrained_stages=(0,),
                   terminal_set=jm.Box([25 + 1e-9, -np.inf], [np.inf, np.inf]))  # fmt: skip
     corner, none = np.ones(2), lambda points: np.zeros(len(points), bool)
     return Case(mpc, corner, lambda c, rays: np.full(len(rays), 1e-3), none)

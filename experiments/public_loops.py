@@ -539,7 +539,7 @@ class Statement:
         if mpc.states is not None:
             add(mpc.states.rows(), state, range(N))
         for rows in outputs:
-            add((rows.C, rows.lower, rows.upper), state, range(N))
+            add((rows.C, *rows.sides), state, range(N))
         if mpc.terminal_set is not None:
             add(mpc.terminal_set.rows(), state, [N])
 

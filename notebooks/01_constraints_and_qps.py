@@ -160,7 +160,7 @@ assert max(ours) < 1e-6 and max(theirs) < 1e-6
 active = jm.mpc.active_constraints(mpc, plan)
 for constraint in active:
     print(constraint)
-assert len(active) == 1 and active[0].name.startswith("dq") and active[0].step == 1
+assert len(active) == 1 and active[0].name.startswith("dq") and active[0].stage == 1
 
 # %%
 row = 3  # the velocity in x_1: rows 0, 1 are torques, 2, 3 are x_1, 4, 5 are x_2

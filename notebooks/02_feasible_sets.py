@@ -204,7 +204,7 @@ assert found.passed and found.verified == sum(found.labels.values()) == 24 * 24
 # 1. A scalar system $x_{k+1} = x_k + u_k$ has $|u_k| \le u_{\max}$ and $|x_k| \le x_{\max}$ for all
 #    $k = 0, \dots, N$. A common answer is that $\mathcal X_N$ is
 #    $|x_0| \le x_{\max} + N u_{\max}$. Test it with $x_{\max} = 1$, $u_{\max} = 0.25$, $N = 4$.
-# 2. For which index set of the state limit is that answer right? (`constrained_steps`)
+# 2. For which index set of the state limit is that answer right? (`constrained_stages`)
 # 3. What happens to the area of the joint's feasible set if the torque is halved? Predict it with
 #    the integral above, then compute it.
 
@@ -225,7 +225,7 @@ def scalar(steps):
         horizon=4,
         states=jm.Box([-1.0], [1.0]),
         inputs=jm.Box([-0.25], [0.25]),
-        constrained_steps=steps,
+        constrained_stages=steps,
     )
 
 

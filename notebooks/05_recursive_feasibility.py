@@ -222,7 +222,7 @@ scalar = jm.MPC(
 limit = jm.Box(-x_max, x_max)
 cases = {
     "k = 0 … N": (dict(states=limit, terminal_set=limit), x_max),
-    "k = 1 … N": (dict(states=limit, constrained_steps=tuple(range(1, N + 1))), x_max + u_max),
+    "k = 1 … N": (dict(states=limit, constrained_stages=tuple(range(1, N + 1))), x_max + u_max),
     "k = N": (dict(terminal_set=limit), x_max + N * u_max),
 }
 for name, (fields, expected) in cases.items():

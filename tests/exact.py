@@ -46,13 +46,13 @@ def holds(rows, x) -> bool:
 def steps_of(mpc, rows=None) -> tuple:
     """The k at which the state limits hold, or those of an `Outputs`."""
     N = mpc.horizon
-    steps = mpc.constrained_steps
+    steps = mpc.constrained_stages
     if steps is None:
         steps = range(N) if mpc.constrain_initial else range(1, N)
     if rows is None:
         return tuple(steps)
-    if rows.steps is not None:
-        return tuple(rows.steps)
+    if rows.stages is not None:
+        return tuple(rows.stages)
     return tuple(k for k in steps if k < N or rows.D is None)
 
 

@@ -268,20 +268,20 @@ CALLS = [
     ),
     ("constrain_initial: 'no'. Give True or False", lambda: mpc(constrain_initial="no").validate()),
     (
-        "constrained_steps: [1, 2]. Give a tuple of different",
-        lambda: mpc(constrained_steps=[1, 2]).validate(),
+        "constrained_stages: [1, 2]. Give a tuple of different",
+        lambda: mpc(constrained_stages=[1, 2]).validate(),
     ),
     (
-        "constrained_steps: (1, 9). Give a tuple of different",
-        lambda: mpc(constrained_steps=(1, 9)).validate(),
+        "constrained_stages: (1, 9). Give a tuple of different",
+        lambda: mpc(constrained_stages=(1, 9)).validate(),
     ),
     (
-        "constrained_steps: (1.5,). Give a tuple of different",
-        lambda: mpc(constrained_steps=(1.5,)).validate(),
+        "constrained_stages: (1.5,). Give a tuple of different",
+        lambda: mpc(constrained_stages=(1.5,)).validate(),
     ),
     (
-        "constrained_steps: 1. Give a tuple of different",
-        lambda: mpc(constrained_steps=1).validate(),
+        "constrained_stages: 1. Give a tuple of different",
+        lambda: mpc(constrained_stages=1).validate(),
     ),
     (
         "control_horizon: 9 moves in 3 steps. Give at most",
@@ -339,28 +339,31 @@ CALLS = [
     ("soft: int. Give a jm.Soft, or a tuple", lambda: mpc(soft=3).validate()),
     (
         "soft[0].C: shape (3, 3). Give (p, 2), one",
-        lambda: mpc(soft=jm.Soft(np.eye(3), [1, 1, 1])).validate(),
+        lambda: mpc(soft=jm.Soft(np.eye(3), upper=[1, 1, 1])).validate(),
     ),
     (
         "soft[0].rho: -1. Penalties are at least 0",
-        lambda: mpc(soft=jm.Soft(np.eye(2), [1, 1], rho=-1)).validate(),
+        lambda: mpc(soft=jm.Soft(np.eye(2), upper=[1, 1], rho=-1)).validate(),
     ),
     (
         "soft[0].rho: 'x' where real numbers are",
-        lambda: mpc(soft=jm.Soft(np.eye(2), [1, 1], rho="x")).validate(),
+        lambda: mpc(soft=jm.Soft(np.eye(2), upper=[1, 1], rho="x")).validate(),
     ),
-    ("soft[0].C: 'C' where real numbers are", lambda: mpc(soft=jm.Soft("C", [1, 1])).validate()),
+    (
+        "soft[0].C: 'C' where real numbers are",
+        lambda: mpc(soft=jm.Soft("C", upper=[1, 1])).validate(),
+    ),
     (
         "soft[0].C: entries of type <U1 where real",
-        lambda: mpc(soft=jm.Soft([["a", "b"]], [1])).validate(),
+        lambda: mpc(soft=jm.Soft([["a", "b"]], upper=[1])).validate(),
     ),
     (
-        "soft[0].d: 'dd' where real numbers are",
-        lambda: mpc(soft=jm.Soft(np.eye(2), "dd")).validate(),
+        "soft[0].upper: 'dd' where real numbers are",
+        lambda: mpc(soft=jm.Soft(np.eye(2), upper="dd")).validate(),
     ),
     (
-        "soft[0].d: None where real numbers are",
-        lambda: mpc(soft=jm.Soft(np.eye(2), None)).validate(),
+        "soft[0].upper: is None, and so is lower. Give one",
+        lambda: mpc(soft=jm.Soft(np.eye(2), upper=None)).validate(),
     ),
     ("outputs: str. Give a jm.Outputs, or a", lambda: mpc(outputs="y").validate()),
     (
@@ -376,8 +379,8 @@ CALLS = [
         lambda: mpc(outputs=jm.Outputs(np.eye(2), ["a", "b"], [1, 1])).validate(),
     ),
     (
-        "outputs[0].steps: (9,). Give a tuple of different",
-        lambda: mpc(outputs=jm.Outputs(np.eye(2), [0, 0], [1, 1], steps=(9,))).validate(),
+        "outputs[0].stages: (9,). Give a tuple of different",
+        lambda: mpc(outputs=jm.Outputs(np.eye(2), [0, 0], [1, 1], stages=(9,))).validate(),
     ),
     (
         "outputs[0].names: ['a', 'b']. Give a tuple of",

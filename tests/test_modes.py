@@ -34,7 +34,7 @@ def problem(**more):
 
 
 def soft_problem(**more):
-    return problem(soft=jm.Soft([[1.0, 0.0]], [0.5], rho=3.0, quadratic=1.0), **more)
+    return problem(soft=jm.Soft([[1.0, 0.0]], upper=[0.5], rho=3.0, quadratic=1.0), **more)
 
 
 def rich_problem():

@@ -50,7 +50,9 @@ def test_no_class_compares_arrays():
 
 
 def test_equality_and_hash():
-    mpc = problem(soft=jm.Soft([[1.0, 0.0]], [1.0]), outputs=jm.Outputs([[1.0, 1.0]], [-3], [3]))
+    mpc = problem(
+        soft=jm.Soft([[1.0, 0.0]], upper=[1.0]), outputs=jm.Outputs([[1.0, 1.0]], [-3], [3])
+    )
     plan = jm.solve(mpc, X0)
     for one in (mpc, plan, plan.multipliers, mpc.soft, mpc.outputs, jm.Controller(problem())):
         other = replace(one)
@@ -102,9 +104,9 @@ def test_donated_controller():
 @pytest.mark.slow
 def test_stored_programs():
     """jax.export stores problems and controllers as arguments, plans as results."""
-    names = dict(constrain_initial=False, constrained_steps=(np.int64(1), 2))
+    names = dict(constrain_initial=False, constrained_stages=(np.int64(1), 2))
     rich = problem(
-        soft=(jm.Soft([[1.0, 0.0]], [1.0], steps=(1, 2)),), prestabilise=True,
+        soft=(jm.Soft([[1.0, 0.0]], upper=[1.0], stages=(1, 2)),), prestabilise=True,
         terminal_set=jm.Ellipsoid(np.eye(2), 9.0), states=jm.Polytope(np.eye(2), [2, 2]), **names,
     )  # fmt: skip
     rich = jax.tree.map(jnp.asarray, rich)

@@ -13,7 +13,7 @@ hence, in the words of `jm.MPC`:
 * ManipulatedVariablesRate is 0.1 where it is not given (the toolbox says so when it builds the
   object): input_rate_weight = 0.01, and the previous input matters. Write 0 for none;
 * outputs count at i = 1..p: the last one has the weight of the others (terminal_cost = Q), and
-  limits hold at k = 1..p (constrained_steps), not at k = 0;
+  limits hold at k = 1..p (constrained_stages), not at k = 0;
 * the control horizon m = 3 leaves three moves free, u_{k+i} = u_{k+2} from i = 2 on
   (control_horizon=3);
 * limits with MinECR, MaxECR > 0 are soft, all through one slack ε, −ECR ε ≤ y − limit ≤ ECR ε;
@@ -64,7 +64,7 @@ def problem(s: Settings, Wy, Wu: float, Wdu: float) -> jm.MPC:
     return joint(
         s.p, Q=Q, R=np.array([[Wu**2]]), terminal_cost=Q,
         input_rate_weight=np.array([Wdu**2]) if Wdu else None, control_horizon=s.m,
-        constrained_steps=tuple(range(1, s.p + 1)),
+        constrained_stages=tuple(range(1, s.p + 1)),
     )  # fmt: skip
 
 

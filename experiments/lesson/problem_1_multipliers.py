@@ -99,7 +99,7 @@ def run(s: Settings) -> Table:
     print(f"\n{'active limit':36}{'multiplier':>14}{'−dJ*/dh':>14}{'difference':>12}")
     for i, price in zip(active, measured, strict=True):
         row, side = table[i], "upper" if y[i] > 0 else "lower"
-        labels.append(f"{row.name} {side} at k = {row.step}, per {row.unit}")
+        labels.append(f"{row.name} {side} at k = {row.stage}, per {row.unit}")
         error = abs(abs(y[i]) - price)
         print(f"{labels[-1]:36}{abs(y[i]):14.6f}{price:14.6f}{error:12.1e}")
     return Table(residuals, labels, y[active], measured)

@@ -83,7 +83,7 @@ def run(s: Settings) -> None:
         problem, rng = published.problem(), np.random.default_rng(s.seed)
         starts = np.array([published.start(rng) for _ in range(s.count)])
         one = lambda x, published=published, problem=problem: solve_nonlinear(
-            problem, x, published.target, input_reference=published.middle, steps=s.steps,
+            problem, x, published.target, input_reference=published.middle, iterations=s.steps,
             hessian=s.hessian,
         )  # fmt: skip
         many = jax.jit(jax.vmap(one))

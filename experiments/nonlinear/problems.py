@@ -61,7 +61,7 @@ class Published:
         if self.distance is not None:
             distance = self.distance
             far = lambda at: jnp.stack(distance(at.x, jnp))
-            tasks = (Task(far, lower=0.0, penalty=None, name="distance", unit="m"),)
+            tasks = (Task(far, lower=0.0, rho=None, name="distance", unit="m"),)
         return NonlinearMPC(mpc, self.step, tasks)
 
 

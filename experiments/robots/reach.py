@@ -81,7 +81,7 @@ def controller(s: Settings, robot: Robot) -> jm.RobotController:
     )
     distances = [tasks.distance(robot, name, (BALL, s.radius)) for name in CAPSULES]
     apart = lambda data: jax.numpy.stack([each(data) for each in distances])
-    away = Task(apart, lower=s.clear, penalty=1e4, name="distance", unit="m")
+    away = Task(apart, lower=s.clear, rho=1e4, name="distance", unit="m")
     return jm.RobotController(robot, mpc, linearize="trajectory", tasks=(*goals, away))
 
 

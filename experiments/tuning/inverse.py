@@ -73,7 +73,7 @@ def joint(s: Settings, rng: np.random.Generator) -> Case:
     limit, count = np.array([1.5, 2.0]), s.train + s.test
     mpc = jm.MPC(
         system, np.eye(2), np.eye(1), s.horizon, states=jm.Box(-limit, limit),
-        inputs=jm.Box([-2.0], [2.0]), constrained_steps=tuple(range(1, s.horizon + 1)),
+        inputs=jm.Box([-2.0], [2.0]), constrained_stages=tuple(range(1, s.horizon + 1)),
     )  # fmt: skip
     solver = jm.ADMM(s.iterations, newton_steps=s.newton_steps)
 

@@ -70,7 +70,7 @@ def problem(s: Settings, limits: str, solver: jm.ADMM) -> ClosedLoopObjective:
     states = jm.Box(-j.x_max, j.x_max) if limits == "full" else None
     mpc = jm.MPC(
         system, j.Q, j.R, s.horizon, states=states, inputs=jm.Box([-j.u_max], [j.u_max]),
-        constrained_steps=tuple(range(1, s.horizon + 1)) if states else None,
+        constrained_stages=tuple(range(1, s.horizon + 1)) if states else None,
     )  # fmt: skip
     make = lambda v: replace(mpc, Q=v["Q"], R=v["R"], terminal_cost=v["Q"])
     loss = ClosedLoopLoss(j.Q, j.R, violation=0.0)

@@ -151,7 +151,7 @@ class RobotController:
             reference, targets = self._targets(problem, reference)
             plan = solve_nonlinear(
                 problem, xi, reference, self.solver, start, targets=targets, **given,
-                steps=self.sqp_steps, hessian="gauss-newton",
+                iterations=self.sqp_steps, hessian="gauss-newton",
             )  # fmt: skip
         else:
             u = self._resting(x, input_reference)[1][0] if carry is None else carry.inputs[0]

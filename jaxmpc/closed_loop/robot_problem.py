@@ -74,7 +74,7 @@ def robot_mpc(
         system = jax.tree.map(np.asarray, robot.linearize(x, u, exact=exact))
     mpc = MPC(system, Q, R, horizon, states=states, inputs=robot.input_limits)
     mpc.validate()
-    mpc = replace(mpc, constrained_steps=tuple(range(1, horizon + 1)))
+    mpc = replace(mpc, constrained_stages=tuple(range(1, horizon + 1)))
     if isinstance(terminal_cost, str):
         if terminal_cost != "lqr":
             fail("terminal_cost", f"{terminal_cost!r}", 'Give "lqr", a matrix or None')

@@ -199,7 +199,7 @@ def row_in_words(row: Row, side: float) -> str:
     bound = "upper" if side > 0 else "lower"
     spoken = any(sign in row.name for sign in "<>≤≥")
     text = row.name if spoken else f"{bound} bound of {row.name}"
-    return f"{text} at k = {row.step}" + (f" [{row.unit}]" if row.unit else "")
+    return f"{text} at k = {row.stage}" + (f" [{row.unit}]" if row.unit else "")
 
 
 class Worst(NamedTuple):

@@ -236,7 +236,7 @@ def exact_data(
 
     def limits(k: int) -> np.ndarray:
         """Return the bounds (2, p) of x_k, without those that the inputs have on it."""
-        sets = [mpc.states] if k in mpc.state_steps else []
+        sets = [mpc.states] if k in mpc.state_stages else []
         bound = np.repeat([[-np.inf], [np.inf]], p, axis=1)
         for set_ in [*sets, mpc.terminal_set] if k == N else sets:
             lower, upper = boxes[id(set_)]

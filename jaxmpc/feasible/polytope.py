@@ -118,4 +118,4 @@ def is_standard_form(mpc: MPC) -> bool:
     """Return whether limits are on states and inputs alone, at the standard steps, with inputs free
     at each step."""
     free = not (mpc.outputs or mpc.rate_limited) and mpc.control_horizon is None
-    return free and mpc.constrained_steps is None
+    return free and mpc.constrained_stages is None

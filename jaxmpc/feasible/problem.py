@@ -188,7 +188,7 @@ def with_equalities(mpc: MPC) -> MPC:
     outputs = list(as_tuple("outputs", mpc.outputs, Outputs))
     changes: dict[str, Any] = {}
     for name, size, steps in (
-        ("inputs", m, tuple(range(N))), ("states", n, mpc.state_steps), ("terminal_set", n, (N,)),
+        ("inputs", m, tuple(range(N))), ("states", n, mpc.state_stages), ("terminal_set", n, (N,)),
     ):  # fmt: skip
         set_ = getattr(mpc, name)
         if not isinstance(set_, Polytope):

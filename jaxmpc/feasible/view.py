@@ -65,7 +65,7 @@ def make_view(mpc: MPC, axes: Any = None, fixed: Any = None) -> View:
         require_finite("fixed", np.asarray(fixed, float)[list(others)])
         fixed = np.asarray(fixed, np.float64)
         return View(axes, others, np.where(np.isin(np.arange(n), others), fixed, 0.0), None, None)
-    constrained = others and 0 in mpc.state_steps
+    constrained = others and 0 in mpc.state_stages
     sides = set_bounds(mpc.states if constrained else None, mpc.system.n)
     if n > mpc.system.n:  # a previous input is one that could be applied
         limits = set_bounds(mpc.inputs, mpc.system.m)

@@ -14,7 +14,7 @@ from jaxmpc.sets.ellipsoid import Ellipsoid
 class ActiveConstraint:
     """One limit that shapes a plan.
 
-    constraint: kind of the row (see `Row`). name, unit: of the quantity that is bounded. step: its
+    constraint: kind of the row (see `Row`). name, unit: of the quantity that is bounded. stage: its
     k. bound: "upper" or "lower". multiplier > 0: by how much the least cost J (without ½) falls for
     each unit that this one bound is relaxed. For an ellipsoid bound is "radius", the root of its
     level. violation: how far a soft row is broken.
@@ -23,7 +23,7 @@ class ActiveConstraint:
     constraint: str
     name: str
     unit: str
-    step: int
+    stage: int
     bound: str
     multiplier: float
     violation: float = 0.0
@@ -34,7 +34,7 @@ class ActiveConstraint:
         name = (
             self.name if self.name.startswith(self.constraint) else f"{self.constraint} {self.name}"
         )
-        return f"{name}, {self.bound} at k = {self.step}: {self.multiplier:.6g}{unit}{broken}"
+        return f"{name}, {self.bound} at k = {self.stage}: {self.multiplier:.6g}{unit}{broken}"
 
 
 def active_constraints(
@@ -56,10 +56,10 @@ def active_constraints(
     column = soft_columns(mpc)
     for i, (row, value) in enumerate(zip(table, y, strict=True)):
         if abs(value) > tolerance and not (last and row.kind == "terminal"):
-            broken = slack[row.step, column[i]] if row.soft else 0.0
+            broken = slack[row.stage, column[i]] if row.soft else 0.0
             found.append(
                 ActiveConstraint(
-                    row.kind, row.name, row.unit, row.step, "upper" if value > 0 else "lower",
+                    row.kind, row.name, row.unit, row.stage, "upper" if value > 0 else "lower",
                     float(abs(value)), float(broken),
                 )
             )  # fmt: skip

@@ -236,7 +236,7 @@ def sorted_multipliers(mpc: MPC, layout: Layout, y: Array) -> Multipliers:
         of.setdefault(kind, []).append(part)
     empty = lambda *shape: [jnp.zeros(shape, y.dtype)]
     return Multipliers(
-        states=of.get("state", empty(len(mpc.state_steps), 0))[0],
+        states=of.get("state", empty(len(mpc.state_stages), 0))[0],
         inputs=of.get("input", empty(mpc.horizon, 0))[0],
         terminal=of.get("terminal", empty(1, 0))[0][0],
         outputs=tuple(of.get("output", ())), soft=tuple(of.get("soft", ())),

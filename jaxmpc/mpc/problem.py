@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import as_array, as_weight, dimensions, host_array, store_floats
+from jaxmpc.arrays import Reals, as_array, as_weight, dimensions, host_array, store_floats
 from jaxmpc.checks import (
     concrete,
     fail,
@@ -33,56 +33,69 @@ FLAT = 1e-12
 class Soft:
     """Rows that may be violated at a penalty:
 
-        lower − ε_k ≤ C x_k + D u_k ≤ d + ε_k,  ε_k ≥ 0,   cost + ρ Σ ε_k + quadratic Σ ε_k²
+        lower − ε_k ≤ C x_k + D u_k ≤ upper + ε_k,  ε_k ≥ 0,   cost + ρ Σ ε_k + quadratic Σ ε_k²
         (no ½).
 
-    C (p, n), d (p,), lower (p,) or None (no such side; −inf and inf likewise), rho ρ ≥ 0 and
-    quadratic ≥ 0: numbers or (p,). D (p, m) or None. steps: the k at which the rows hold; None:
-    k = 0..N, with D k = 0..N−1. names, units: of the p rows.
+    C (p, n), lower and upper (p,), None where all rows lack that side (in single rows −inf, inf),
+    rho ρ ≥ 0 and quadratic ≥ 0: numbers or (p,). D (p, m) or None. stages: the k at which the rows
+    hold; None: k = 0..N, with D k = 0..N−1. names, units: of the p rows.
     For ρ above the greatest multiplier of the hard rows (`exact_penalty`) the plan violates them
     only where the hard problem has no solution.
     """
 
-    C: Any
-    d: Any
-    rho: Any = 1e3
-    quadratic: Any = 0.0
-    D: Any = None
-    steps: tuple[int, ...] | None = field(default=None, metadata={"static": True})
+    C: Reals
+    lower: Reals | None = None
+    upper: Reals | None = None
+    rho: Reals = 1e3
+    quadratic: Reals = 0.0
+    D: Reals | None = None
+    stages: tuple[int, ...] | None = field(default=None, metadata={"static": True})
     names: tuple[str, ...] = field(default=(), metadata={"static": True})
     units: tuple[str, ...] = field(default=(), metadata={"static": True})
-    lower: Any = None
 
     def __post_init__(self) -> None:
-        store_floats(self, "C", "d", "rho", "quadratic", "D", "lower")
+        store_floats(self, "C", "lower", "upper", "rho", "quadratic", "D")
 
     @property
     def sides(self) -> tuple[Any, Any]:
-        """(lower, d), −inf for no lower side."""
-        free = np.full(np.shape(as_array(self.d)), -np.inf)
-        return (free if self.lower is None else self.lower), self.d
+        """(lower, upper), infinite where there is no such side."""
+        return _sides(self)
 
 
 @pytree
 @dataclass(frozen=True, eq=False)
 class Outputs:
-    """Hard limits of outputs, lower ≤ C x_k + D u_k ≤ upper (±inf for none).
+    """Hard limits of outputs, lower ≤ C x_k + D u_k ≤ upper.
 
-    C (p, n), lower and upper (p,), D (p, m) or None. steps: the k at which they hold; None: those
-    of the state limits, and where the state limits hold at k = N, without D there too. names,
-    units: of the p outputs.
+    C (p, n), lower and upper (p,), None where all rows lack that side (in single rows −inf, inf),
+    D (p, m) or None. stages: the k at which they hold; None: those of the state limits, and where
+    the state limits hold at k = N, without D there too. names, units: of the p outputs.
     """
 
-    C: Any
-    lower: Any
-    upper: Any
-    D: Any = None
-    steps: tuple[int, ...] | None = field(default=None, metadata={"static": True})
+    C: Reals
+    lower: Reals | None = None
+    upper: Reals | None = None
+    D: Reals | None = None
+    stages: tuple[int, ...] | None = field(default=None, metadata={"static": True})
     names: tuple[str, ...] = field(default=(), metadata={"static": True})
     units: tuple[str, ...] = field(default=(), metadata={"static": True})
 
     def __post_init__(self) -> None:
         store_floats(self, "C", "lower", "upper", "D")
+
+    @property
+    def sides(self) -> tuple[Any, Any]:
+        """(lower, upper), infinite where there is no such side."""
+        return _sides(self)
+
+
+def _sides(rows: Soft | Outputs) -> tuple[Any, Any]:
+    given = rows.upper if rows.lower is None else rows.lower
+    free = np.full(np.shape(as_array(given)), np.inf)
+    return (
+        -free if rows.lower is None else rows.lower,
+        free if rows.upper is None else rows.upper,
+    )
 
 
 class Weights(NamedTuple):
@@ -125,7 +138,7 @@ class MPC:
     is unique then. Later ones may have none, as the last has without an end cost; solvers stage by
     stage and explicit laws need a cost of each. states, inputs: Box, Polytope or None;
     terminal_set: these or an Ellipsoid.
-    constrained_steps: the k in 0..N at which `states` hold, where that is another index set.
+    constrained_stages: the k in 0..N at which `states` hold, where that is another index set.
     outputs: `Outputs`, or a tuple of them; soft: `Soft`, or a tuple of them. stage_weights s (N,) >
     0: weighs the stages, Σ s_k (x_k'Q x_k + u_k'R u_k); None: all 1.
 
@@ -155,7 +168,7 @@ class MPC:
     prestabilise: Any = None
     soft: tuple[Soft, ...] | Soft = ()
     outputs: tuple[Outputs, ...] | Outputs = ()
-    constrained_steps: tuple[int, ...] | None = field(default=None, metadata={"static": True})
+    constrained_stages: tuple[int, ...] | None = field(default=None, metadata={"static": True})
     control_horizon: int | tuple[int, ...] | None = field(default=None, metadata={"static": True})
     input_rate_weight: Any = None
     input_rate_limit: Any = None
@@ -202,10 +215,10 @@ class MPC:
         return system.state_labels + (previous if self.input_in_state else ())
 
     @property
-    def state_steps(self) -> tuple[int, ...]:
+    def state_stages(self) -> tuple[int, ...]:
         """The k at which `states` hold."""
-        if self.constrained_steps is not None:
-            return tuple(sorted(self.constrained_steps))
+        if self.constrained_stages is not None:
+            return tuple(sorted(self.constrained_stages))
         return tuple(range(0 if self.constrain_initial else 1, self.horizon))
 
     @property
@@ -254,17 +267,14 @@ class MPC:
             require_shape("prestabilise", self.prestabilise, (m, n), "A gain K with u = Kx + v")
         if not isinstance(self.constrain_initial, bool | np.bool_):
             fail("constrain_initial", f"{self.constrain_initial!r}", "Give True or False")
-        self._validate_steps()
+        self._validate_stages()
         for i, soft in enumerate(as_tuple("soft", self.soft, Soft)):
-            sides = ("d",) if soft.lower is None else ("d", "lower")
-            self._validate_rows(f"soft[{i}]", soft, sides)
-            if concrete(soft.sides):  # −inf above or inf below: no violation reaches that
-                Box(*soft.sides).validate(f"soft[{i}].lower, d")
+            self._validate_rows(f"soft[{i}]", soft)
             for name in ("rho", "quadratic"):
                 weight = getattr(soft, name)
                 if concrete(weight):
                     host_array(f"soft[{i}].{name}", weight)
-                if np.shape(weight) not in ((), np.shape(as_array(soft.d))):
+                if np.shape(weight) not in ((), np.shape(soft.sides[0])):
                     fail(
                         f"soft[{i}].{name}", f"shape {np.shape(weight)}", "One number, or one a row"
                     )
@@ -272,15 +282,13 @@ class MPC:
                 if concrete(weight) and np.any(np.asarray(weight) < 0):
                     fail(f"soft[{i}].{name}", f"{weight}", "Penalties are at least 0")
         for i, outputs in enumerate(as_tuple("outputs", self.outputs, Outputs)):
-            self._validate_rows(f"outputs[{i}]", outputs, ("lower", "upper"))
-            if concrete(outputs.lower, outputs.upper):
-                Box(outputs.lower, outputs.upper).validate(f"outputs[{i}]")
+            self._validate_rows(f"outputs[{i}]", outputs)
         self._validate_rates()
         self.require_unique_inputs(first=1)
 
-    def _validate_steps(self) -> None:
+    def _validate_stages(self) -> None:
         N = self.horizon
-        self._require_steps("constrained_steps", self.constrained_steps, N)
+        _require_stages("constrained_stages", self.constrained_stages, N)
         blocks = self.control_horizon
         if blocks is None:
             return
@@ -300,7 +308,7 @@ class MPC:
         if not isinstance(blocks, tuple) and blocks > N:
             fail("control_horizon", f"{blocks} moves in {N} steps", f"Give at most {N}")
 
-    def _validate_rows(self, name: str, rows: Any, bounds: tuple[str, ...]) -> None:
+    def _validate_rows(self, name: str, rows: Soft | Outputs) -> None:
         n, m = self.system.n, self.system.m
         require_real(f"{name}.C", rows.C)
         shape = np.shape(as_array(rows.C))
@@ -311,11 +319,17 @@ class MPC:
         if rows.D is not None:
             require_shape(f"{name}.D", rows.D, (p, m), "One column an input, or None")
             require_finite(f"{name}.D", rows.D)
-        for bound in bounds:
+        if rows.lower is None and rows.upper is None:
+            fail(f"{name}.upper", "is None, and so is lower", "Give one of them, or both")
+        for bound in ("lower", "upper"):
             value = getattr(rows, bound)
+            if value is None:
+                continue
             require_shape(f"{name}.{bound}", value, (p,), "One bound for each row of C")
             if concrete(value) and np.isnan(np.asarray(value, float)).any():
                 fail(f"{name}.{bound}", "holds NaN", "Use inf where there is no limit")
+        if concrete(rows.sides):  # −inf above or inf below: no row reaches that
+            Box(*rows.sides).validate(name)
         for what in ("names", "units"):
             given = getattr(rows, what)
             if not isinstance(given, tuple) or not all(isinstance(text, str) for text in given):
@@ -323,14 +337,7 @@ class MPC:
             if len(given) not in (0, p):
                 fail(f"{name}.{what}", f"{len(given)} for {p} rows", "All or none")
         last = self.horizon - (rows.D is not None)
-        self._require_steps(f"{name}.steps", rows.steps, last)
-
-    def _require_steps(self, name: str, steps: Any, last: int) -> None:
-        if steps is None:
-            return
-        whole = isinstance(steps, tuple) and all(isinstance(k, int | np.integer) for k in steps)
-        if not whole or len(set(steps)) != len(steps) or not all(0 <= k <= last for k in steps):
-            fail(name, f"{steps!r}", f"Give a tuple of different steps from 0 to {last}")
+        _require_stages(f"{name}.stages", rows.stages, last)
 
     def _validate_rates(self) -> None:
         m, W, limit = self.system.m, self.input_rate_weight, self.input_rate_limit
@@ -434,11 +441,20 @@ def _form(M: np.ndarray, size: np.ndarray) -> np.ndarray:
     return abs(M).T @ size @ abs(M)
 
 
-def output_steps(mpc: MPC, rows: Outputs) -> tuple[int, ...]:
+def _require_stages(name: str, stages: Any, last: int) -> None:
+    """Raise ValueError unless `stages` is None or different whole numbers from 0 to `last`."""
+    if stages is None:
+        return
+    whole = isinstance(stages, tuple) and all(isinstance(k, int | np.integer) for k in stages)
+    if not whole or len(set(stages)) != len(stages) or not all(0 <= k <= last for k in stages):
+        fail(name, f"{stages!r}", f"Give a tuple of different stages from 0 to {last}")
+
+
+def output_stages(mpc: MPC, rows: Outputs) -> tuple[int, ...]:
     """The k at which output limits hold."""
-    if rows.steps is not None:
-        return rows.steps
-    return tuple(k for k in mpc.state_steps if k < mpc.horizon or rows.D is None)
+    if rows.stages is not None:
+        return rows.stages
+    return tuple(k for k in mpc.state_stages if k < mpc.horizon or rows.D is None)
 
 
 def as_tuple(name: str, value: Any, kind: type) -> tuple:

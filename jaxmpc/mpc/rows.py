@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import require_kind
-from jaxmpc.mpc.problem import MPC, Outputs, Soft, output_steps
+from jaxmpc.mpc.problem import MPC, Outputs, Soft, output_stages
 from jaxmpc.qp.linalg import cholesky
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
@@ -69,12 +69,12 @@ class Block:
 class Row:
     """What one row of the condensed QP stands for.
 
-    kind: "input", "state", "output", "rate", "soft" or "terminal". step: its k. name, unit: of the
-    quantity that is bounded. index: of the row within its step. soft: whether it may be violated.
+    kind: "input", "state", "output", "rate", "soft" or "terminal". stage: its k. name, unit: of the
+    quantity that is bounded. index: of the row within its stage. soft: whether it may be violated.
     """
 
     kind: str
-    step: int
+    stage: int
     name: str
     unit: str
     index: int
@@ -111,10 +111,11 @@ def blocks(mpc: MPC, dtype: Any) -> list[Block]:
         H, lower, upper = mpc.states.rows()
         texts = described(mpc.states, state_names, system.state_units)
         box = isinstance(mpc.states, Box)
-        add("state", H, None, lower, upper, mpc.state_steps, *texts, box=box)
+        add("state", H, None, lower, upper, mpc.state_stages, *texts, box=box)
     for rows in (mpc.outputs,) if isinstance(mpc.outputs, Outputs) else mpc.outputs:
-        steps = output_steps(mpc, rows)
-        add("output", rows.C, rows.D, rows.lower, rows.upper, steps, rows.names, rows.units)
+        steps = output_stages(mpc, rows)
+        lower, upper = rows.sides
+        add("output", rows.C, rows.D, lower, upper, steps, rows.names, rows.units)
     if mpc.rate_limited:
         limit: Any = mpc.input_rate_limit
         if not isinstance(limit, Box):
@@ -135,10 +136,10 @@ def blocks(mpc: MPC, dtype: Any) -> list[Block]:
         )
     for soft in (mpc.soft,) if isinstance(mpc.soft, Soft) else mpc.soft:
         every = range(N + 1) if soft.D is None else range(N)
-        weight = lambda w, d=soft.d: jnp.broadcast_to(cast(w), cast(d).shape)
+        weight = lambda w, lower=soft.sides[0]: jnp.broadcast_to(cast(w), np.shape(lower))
         add(
             "soft", soft.C, soft.D, *soft.sides,
-            every if soft.steps is None else soft.steps, soft.names, soft.units,
+            every if soft.stages is None else soft.stages, soft.names, soft.units,
             linear=weight(soft.rho), quadratic=2 * weight(soft.quadratic),
         )  # fmt: skip
     last = mpc.terminal_set

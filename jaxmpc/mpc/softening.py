@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import concrete, fail, require_kind
-from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple, output_steps
+from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple, output_stages
 from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.sets.limits import output_limits
 from jaxmpc.sets.polytope import Polytope
@@ -41,6 +41,7 @@ def soften(mpc: MPC, rho: Reals, quadratic: Reals = 0.0) -> MPC:
         soft.append(
             Soft(
                 keep(C),
+                keep(lower) if below else None,
                 keep(upper),
                 rho,
                 quadratic,
@@ -48,12 +49,11 @@ def soften(mpc: MPC, rho: Reals, quadratic: Reals = 0.0) -> MPC:
                 tuple(steps),
                 text(names),
                 text(units),
-                keep(lower) if below else None,
             )  # fmt: skip
         )
 
     for kind, set_, steps in (
-        ("state", mpc.states, mpc.state_steps), ("terminal", mpc.terminal_set, (N,))
+        ("state", mpc.states, mpc.state_stages), ("terminal", mpc.terminal_set, (N,))
     ):  # fmt: skip
         if set_ is not None:
             C, lower, upper = set_.rows()
@@ -63,9 +63,10 @@ def soften(mpc: MPC, rho: Reals, quadratic: Reals = 0.0) -> MPC:
             names = names or tuple(f"{kind} row {i + 1}" for i in range(np.size(lower)))
             add(C, None, lower, upper, steps, names, units)
     for rows in as_tuple("outputs", mpc.outputs, Outputs):
-        names = rows.names or tuple(f"output row {i + 1}" for i in range(len(rows.lower)))
-        steps = output_steps(mpc, rows)
-        add(rows.C, rows.D, rows.lower, rows.upper, steps, names, rows.units)
+        names = rows.names or tuple(f"output row {i + 1}" for i in range(np.size(rows.sides[0])))
+        steps = output_stages(mpc, rows)
+        lower, upper = rows.sides
+        add(rows.C, rows.D, lower, upper, steps, names, rows.units)
     softened = replace(mpc, states=None, terminal_set=None, outputs=(), soft=tuple(soft))
     softened.validate()
     return softened
@@ -77,12 +78,12 @@ def harden(mpc: MPC) -> MPC:
     The opposite of `soften`: rows that hold at all steps of the state limits join `states`, rows at
     k = N the terminal set, where these are not sets of another kind; the rest become `outputs`.
     """
-    N, every = mpc.horizon, mpc.state_steps
+    N, every = mpc.horizon, mpc.state_stages
     states, terminal, outputs = [], [], list(as_tuple("outputs", mpc.outputs, Outputs))
     for s in as_tuple("soft", mpc.soft, Soft):
-        steps = tuple(range(N + (s.D is None))) if s.steps is None else s.steps
+        steps = tuple(range(N + (s.D is None))) if s.stages is None else s.stages
         lower, upper = s.sides
-        rows = Polytope(s.C, s.d, s.names)
+        rows = Polytope(s.C, upper, s.names)
         if s.lower is not None:
             rows = output_limits(s.C, lower, upper, s.names, s.units)
         whole = s.D is None and every and set(every) <= set(steps) <= {*every, N}

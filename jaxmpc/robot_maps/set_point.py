@@ -16,11 +16,11 @@ def with_initial_limits(mpc: MPC, limits: Box) -> MPC:
     0."""
     lower, upper = np.asarray(limits.lower, float), np.asarray(limits.upper, float)
     bounded = np.isfinite(lower) | np.isfinite(upper)
-    if not bounded.any() or (mpc.states is not None and 0 in mpc.state_steps):
+    if not bounded.any() or (mpc.states is not None and 0 in mpc.state_stages):
         return mpc
     pick = lambda names: tuple(str(v) for v in np.asarray(names)[bounded]) if names else ()
     rows = Outputs(
-        np.eye(len(bounded))[bounded], lower[bounded], upper[bounded], steps=(0,),
+        np.eye(len(bounded))[bounded], lower[bounded], upper[bounded], stages=(0,),
         names=pick(mpc.system.state_names), units=pick(mpc.system.state_units),
     )  # fmt: skip
     return replace(mpc, outputs=(*as_tuple("outputs", mpc.outputs, Outputs), rows))

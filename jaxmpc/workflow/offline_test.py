@@ -208,7 +208,7 @@ def limits_text(mpc: MPC) -> str:
     found: dict[tuple[str, str, bool], list[int]] = {}
     for row in row_table(mpc):
         unit = f" [{row.unit}]" if row.unit else ""
-        found.setdefault((row.kind, row.name + unit, row.soft), []).append(row.step)
+        found.setdefault((row.kind, row.name + unit, row.soft), []).append(row.stage)
     groups: dict[tuple[str, bool, tuple[int, ...]], list[str]] = {}
     for (kind, name, soft), at in found.items():
         names = groups.setdefault((kind, soft, tuple(sorted(set(at)))), [])

@@ -164,7 +164,7 @@ def test_previous_input_starts_the_loop():
 @pytest.mark.slow
 def test_soft_violation_is_reported():
     """A soft limit at 1: from x0 = 2 the violation is 1 at once, and 2 − 0.5 − 1 a step later."""
-    rows = Soft(np.array([[1.0]]), np.array([1.0]), rho=100.0)
+    rows = Soft(np.array([[1.0]]), upper=np.array([1.0]), rho=100.0)
     mpc = problems.scalar(horizon=2, x_max=None, u_max=0.5, soft=rows)
     run = simulate(jm.Controller(mpc, CHEAP), mpc.system, np.array([2.0]), 3)
     np.testing.assert_allclose(run.slack[:, 0], [1.0, 0.5, 0.0], atol=1e-4)

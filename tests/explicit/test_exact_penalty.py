@@ -216,7 +216,7 @@ class TestRegions:
             (replace(mpc, terminal_set=nowhere), "empty"),
             (replace(mpc, states=line), "flat"),
             (replace(mpc, terminal_set=jm.Ellipsoid(np.eye(2), 0.5)), "ellipsoid"),
-            (replace(mpc, soft=(Soft(np.eye(2), np.ones(2)),)), "soft"),
+            (replace(mpc, soft=(Soft(np.eye(2), upper=np.ones(2)),)), "soft"),
         ]:
             with pytest.raises(ValueError, match=message):
                 critical_regions(changed)
@@ -238,7 +238,7 @@ class TestExactPenalty:
         assert found.rho_bar == pytest.approx(max(0.0, 2 * (r * u_max - q)), rel=1e-9)
         assert found.exact is (method == "regions")
         if found.rho_bar > 0:
-            assert abs(found.at[0]) == pytest.approx(1 + u_max) and found.row.step == 1
+            assert abs(found.at[0]) == pytest.approx(1 + u_max) and found.row.stage == 1
             assert found.advised > found.rho_bar
         else:
             assert found.row is None and found.advised > 0
@@ -248,7 +248,7 @@ class TestExactPenalty:
         found = exact_penalty(problems.lecture(), method=method, samples=20)
         assert found.rho_bar == pytest.approx(11.25, rel=1e-9)
         np.testing.assert_allclose(np.abs(found.at), [0.25, 0.6], rtol=1e-9)
-        assert found.row.step == 3 and "k = 3" in found.label and "x1" in found.label
+        assert found.row.stage == 3 and "k = 3" in found.label and "x1" in found.label
         assert ("lower bound" in found.sentence.split(",")[0]) is (method == "samples")
 
     @pytest.mark.parametrize(
@@ -337,9 +337,9 @@ class TestExactPenalty:
         # Only the soft rows count: with the terminal set hard, others need less.
         mpc = problems.lecture()
         box = mpc.states.to_polytope()
-        some = replace(mpc, states=None, soft=(Soft(box.H, box.h, steps=(0, 1, 2)),))
+        some = replace(mpc, states=None, soft=(Soft(box.H, upper=box.h, stages=(0, 1, 2)),))
         part = exact_penalty(some)
-        assert part.exact and part.rho_bar < 11.25 and part.row.step in (1, 2)
+        assert part.exact and part.rho_bar < 11.25 and part.row.stage in (1, 2)
 
     def test_sufficient(self):
         mpc = problems.lecture()

@@ -298,7 +298,7 @@ def test_a_law_starts_at_random_points_where_the_centre_is_degenerate():
     A = np.array([[1, 0, -1], [-1, 0, -1], [0, 1, -1], [0, -1, -1], [0.75, 0.64, -1],
                   [-0.75, -0.64, -1]])  # fmt: skip
     W = np.array([[1, 0], [-1, 0], [0, -1], [0, 1], [1, 0], [-1, 0.0]])
-    rows = jm.Outputs(-W, np.full(6, -np.inf), -np.ones(6), A, steps=(0,))
+    rows = jm.Outputs(-W, np.full(6, -np.inf), -np.ones(6), A, stages=(0,))
     system = jm.LinearSystem(np.zeros((2, 2)), np.zeros((2, 3)))
     limits = jm.Box([-1.5] * 2, [1.5] * 2)
     mpc = jm.MPC(system, np.zeros((2, 2)), np.eye(3) / 2, 1, limits, outputs=rows)

@@ -110,7 +110,7 @@ def test_empty_by_little(gap):
     for sign, label in ((1, -1), (-1, 1)):
         last = jm.Box([2.5 + sign * gap], [9.0])
         mpc = replace(
-            problems.scalar(x_max=None), states=jm.Box([-1.0], [1.0]), constrained_steps=(0,),
+            problems.scalar(x_max=None), states=jm.Box([-1.0], [1.0]), constrained_stages=(0,),
             terminal_set=last,
         )  # fmt: skip
         assert jm.map_feasible_set(mpc, points).label[2] == label

@@ -31,7 +31,7 @@ def scalar_integrator():
             (range(N), X / 4, min(X, X / 4 + N * U)),
         ):
             mpc = problems.scalar(
-                horizon=N, x_max=X, u_max=U, terminal=terminal, constrained_steps=tuple(steps)
+                horizon=N, x_max=X, u_max=U, terminal=terminal, constrained_stages=tuple(steps)
             )
             ends = jm.feasible_polytope(mpc).vertices().ravel()
             np.testing.assert_allclose(ends, [-radius, radius], rtol=1e-9)
@@ -104,7 +104,7 @@ def lecture_penalty():
     found = jm.exact_penalty(problems.lecture())
     assert found.exact and found.rho_bar == pytest.approx(11.25, rel=1e-6)
     np.testing.assert_allclose(np.abs(found.at), [0.25, 0.6], atol=1e-6)
-    assert found.row.step == 3
+    assert found.row.stage == 3
     system = jm.LinearSystem(np.eye(1), np.eye(1))
     for q, r, u_max, rho in ((1.0, 2.0, 1.0, 2.0), (1.0, 5.0, 0.5, 3.0), (3.0, 1.0, 1.0, 0.0)):
         mpc = jm.MPC(
@@ -130,7 +130,7 @@ def joint_sets():
     ):
         whole = jm.feasible_polytope(
             jm.MPC(mpc.system, mpc.Q, mpc.R, 20, mpc.states, mpc.inputs,
-                   constrained_steps=tuple(steps))
+                   constrained_stages=tuple(steps))
         )  # fmt: skip
         assert whole.volume() == pytest.approx(area, abs=1e-8)
 

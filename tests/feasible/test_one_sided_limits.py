@@ -67,7 +67,7 @@ def test_scalar(none, sign):
     ("settings", "edge"),
     [
         (dict(constrain_initial=False), 2.0),
-        (dict(constrained_steps=(3,)), 4.0),
+        (dict(constrained_stages=(3,)), 4.0),
         (dict(terminal_set=jm.Box([-np.inf], [-7.0])), -2.0),
         (dict(terminal_set=jm.Polytope(np.array([[-2.0]]), np.array([1.0]))), -5.5),
         (dict(terminal_set=jm.Box([3.0], [np.inf])), None),
@@ -318,7 +318,7 @@ def margin(mpc, pinned) -> float:
     start = np.concatenate([x[0], u[0]])
     equal.append(start[list(pinned)])
     right.append(np.array(list(pinned.values())))
-    limits = [(mpc.states, x[k]) for k in mpc.state_steps]
+    limits = [(mpc.states, x[k]) for k in mpc.state_stages]
     limits += [(mpc.inputs, u[k + 1]) for k in range(N)] + [(mpc.terminal_set, x[N])]
     if mpc.rate_limited:
         rate = problems.symmetric(*mpc.input_rate_limit)

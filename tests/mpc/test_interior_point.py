@@ -28,7 +28,7 @@ def problem() -> jm.MPC:
     mpc = jm.MPC(
         jm.LinearSystem(A, B, np.zeros(n)), Q, R, N, states=jm.Box(-np.ones(n), np.ones(n)),
         inputs=jm.Box([-3.0, -2.0], [3.0, 2.0]), terminal_cost=Q,
-        constrained_steps=tuple(range(1, N + 1)),
+        constrained_stages=tuple(range(1, N + 1)),
     )  # fmt: skip
     return soften(mpc, 1e4)
 
@@ -62,7 +62,7 @@ def least_cost(mpc: jm.MPC, i: int) -> float:
     x, u = cp.Variable((N + 1, n)), cp.Variable((N, m))
     soft = mpc.soft[0]
     rows = x[1:] @ np.asarray(soft.C).T
-    over = cp.pos(rows - np.asarray(soft.d)[None]) + cp.pos(np.asarray(soft.lower)[None] - rows)
+    over = cp.pos(rows - np.asarray(soft.upper)[None]) + cp.pos(np.asarray(soft.lower)[None] - rows)
     cost = sum(cp.quad_form(x[k], mpc.Q) + cp.quad_form(u[k], mpc.R) for k in range(N))
     cost += cp.quad_form(x[N], mpc.terminal_cost) + float(np.ravel(soft.rho)[0]) * cp.sum(over)
     rules = [x[0] == x0, u <= np.asarray(mpc.inputs.upper)[None]]

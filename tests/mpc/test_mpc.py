@@ -599,7 +599,7 @@ def test_problems_from_lists_and_whole_numbers_are_pytrees_of_float_arrays():
     lists = jm.MPC(
         jm.LinearSystem(A=[[1, 0.01], [0, 1]], B=[0, 0.2], dt=0.01), Q=[50, 1], R=1, horizon=3,
         states=jm.Box([-1, -2], [1, 2]), inputs=jm.Box(-2, 2),
-        soft=jm.Soft([[1, 0]], [1], lower=[-1]), stage_weights=[1, 1, 2],
+        soft=jm.Soft([[1, 0]], upper=[1], lower=[-1]), stage_weights=[1, 1, 2],
         terminal_set=jm.Polytope([[1, 0], [-1, 0]], [1, 1]),
     )  # fmt: skip
     leaves = jax.tree.leaves(lists)

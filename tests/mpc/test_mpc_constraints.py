@@ -110,7 +110,7 @@ class Explicit:
             names = out.names or [f"output row {i + 1}" for i in range(len(out.C))]
             for k in exact.steps_of(mpc, out):
                 parts = [(self.x[k], out.C)] + ([] if out.D is None else [(self.u[k], out.D)])
-                self._add("output", k, names, parts, out.lower, out.upper)
+                self._add("output", k, names, parts, *out.sides)
         limit = mpc.input_rate_limit
         if limit is not None:
             box = isinstance(limit, jm.Box)
@@ -124,17 +124,17 @@ class Explicit:
             p = len(soft.C)
             names = soft.names or [f"soft row {i + 1}" for i in range(p)]
             weights = (np.broadcast_to(soft.rho, p), np.broadcast_to(soft.quadratic, p))
-            steps = range(N + (soft.D is None)) if soft.steps is None else soft.steps
+            steps = range(N + (soft.D is None)) if soft.stages is None else soft.stages
             for k in steps:
                 parts = [(self.x[k], soft.C)] + ([] if soft.D is None else [(self.u[k], soft.D)])
-                self._add("soft", k, names, parts, soft.sides[0], soft.d, weights)
+                self._add("soft", k, names, parts, *soft.sides, weights)
 
     def keys(self):
         """Row names of the library, made as unique as those here."""
         found, keys = set(), []
         for row in row_table(self.mpc):
-            key = (row.kind, row.step, row.name)
-            keys.append((row.kind, row.step, f"{row.name} again") if key in found else key)
+            key = (row.kind, row.stage, row.name)
+            keys.append((row.kind, row.stage, f"{row.name} again") if key in found else key)
             found.add(key)
         return keys
 
@@ -296,12 +296,12 @@ def rated() -> jm.MPC:
             Outputs(np.array([[0.5, 1.0]]), np.array([-0.3]), np.array([0.35]),
                     D=np.array([[0.3, -0.4]]), names=("power",), units=("W",)),
             Outputs(np.array([[1.0, -1.0], [1.0, 1.0]]), np.array([-np.inf, -0.9]),
-                    np.array([1.1, np.inf]), steps=(2, 5)),
+                    np.array([1.1, np.inf]), stages=(2, 5)),
         ),
         input_rate_weight=np.array([[0.5, 0.2], [0.2, 0.4]]),
         input_rate_limit=jm.Box(np.array([-0.3, -0.25]), np.array([0.25, 0.35])),
-        soft=Soft(np.array([[1.0, 0.3]]), np.array([0.05]), rho=0.3, quadratic=0.5,
-                  D=np.array([[0.2, 0.5]]), steps=(0, 3), names=("reach",), units=("m",)),
+        soft=Soft(np.array([[1.0, 0.3]]), upper=np.array([0.05]), rho=0.3, quadratic=0.5,
+                  D=np.array([[0.2, 0.5]]), stages=(0, 3), names=("reach",), units=("m",)),
     )  # fmt: skip
 
 
@@ -323,14 +323,14 @@ def blocked() -> jm.MPC:
         terminal_set=Ellipsoid(
             np.array([[3.0, 1.0, 0.0], [1.0, 2.0, 0.2], [0.0, 0.2, 1.0]]), 0.15
         ),
-        control_horizon=(1, 2, 3), constrained_steps=(2, 3, 6),
+        control_horizon=(1, 2, 3), constrained_stages=(2, 3, 6),
         input_rate_weight=np.array([0.1, 0]),
         soft=(
-            Soft(np.array([[1.0, 0.0, 0.5], [0.0, -1.0, 0.0]]), np.array([0.2, 0.1]),
+            Soft(np.array([[1.0, 0.0, 0.5], [0.0, -1.0, 0.0]]), upper=np.array([0.2, 0.1]),
                  rho=np.array([0.4, 30.0]), quadratic=np.array([1.0, 0.0]),
                  names=("reach", "height"), units=("m", "m")),
-            Soft(np.array([[0.0, 0.0, 1.0]]), np.array([0.15]), rho=0.7,
-                 D=np.array([[1.0, 0.0]]), steps=(1, 4)),
+            Soft(np.array([[0.0, 0.0, 1.0]]), upper=np.array([0.15]), rho=0.7,
+                 D=np.array([[1.0, 0.0]]), stages=(1, 4)),
         ),
     )  # fmt: skip
 
@@ -345,9 +345,9 @@ def rounded() -> jm.MPC:
         inputs=problems.symmetric(0.35, 0.4), terminal_cost=np.array([[2.0, 0.5], [0.5, 1.0]]),
         terminal_set=Ellipsoid(np.array([[3.0, 1.0], [1.0, 2.0]]), 0.3),
         outputs=Outputs(np.array([[-0.6, 0.8]]), np.array([-np.inf]), np.array([0.2]),
-                        steps=(1, 2, 4)),
+                        stages=(1, 2, 4)),
         input_rate_limit=0.5,
-        soft=Soft(np.array([[-1.0, 0.0], [0.0, 1.0]]), np.array([0.3, 0.25]), rho=2.0,
+        soft=Soft(np.array([[-1.0, 0.0], [0.0, 1.0]]), upper=np.array([0.3, 0.25]), rho=2.0,
                   quadratic=np.array([0.0, 3.0])),
     )  # fmt: skip
 
@@ -494,14 +494,14 @@ class TestAnotherSolver:
             blocks = explicit.mpc.control_horizon
             y = dict(zip(explicit.keys(), problems.rows_of(explicit.mpc, plan), strict=True))
             for c in found:
-                key = (c.constraint, c.step, c.name)
+                key = (c.constraint, c.stage, c.name)
                 names, push = [key], c.multiplier
                 if c.bound == "radius":
                     names = [None]
                 elif c.constraint == "input" and blocks is not None:
                     # The same row several times: only their sum is determined.
                     ends = np.cumsum(blocks)
-                    j = int(np.searchsorted(ends, c.step, side="right"))
+                    j = int(np.searchsorted(ends, c.stage, side="right"))
                     names = [("input", k, c.name) for k in range(ends[j] - blocks[j], ends[j])]
                     push = sum(abs(y[k]) for k in names)
                 h = 2e-4
@@ -514,7 +514,7 @@ class TestAnotherSolver:
                 slope = (values[1] - values[0]) / (2 * h)
                 np.testing.assert_allclose(slope, push, rtol=2e-3, atol=2e-4, err_msg=str(c))
                 text = str(c)
-                assert f"k = {c.step}" in text and c.bound in text and c.unit in text
+                assert f"k = {c.stage}" in text and c.bound in text and c.unit in text
                 if c.constraint == "soft":
                     h, _, upper, _ = explicit.rows[key]
                     value = h @ explicit.v_of(*arguments[:2], plan.inputs) - upper
@@ -670,9 +670,9 @@ def test_float32(name):
 
 @pytest.mark.slow
 def test_gradients():
-    """dJ*/d(ρ, quadratic, d) over a batch of states, by differences of Clarabel's cost."""
-    soft = Soft(np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([0.25, 0.1]), np.array([0.9, 0.5]),
-                np.array([0.0, 0.6]), D=np.array([[0.0], [0.3]]))  # fmt: skip
+    """dJ*/d(ρ, quadratic, upper) over a batch of states, by differences of Clarabel's cost."""
+    soft = Soft(np.array([[1.0, 0.0], [0.0, 1.0]]), upper=np.array([0.25, 0.1]),
+                rho=np.array([0.9, 0.5]), quadratic=np.array([0.0, 0.6]), D=np.array([[0.0], [0.3]]))  # fmt: skip
     mpc = jm.MPC(
         system=jm.LinearSystem(np.array([[1.0, 0.5], [0.0, 1.0]]), np.array([[0.1], [0.5]])),
         Q=np.eye(2), R=0.1 * np.eye(1), horizon=3, inputs=problems.symmetric(1.0),
@@ -681,12 +681,12 @@ def test_gradients():
     x0 = np.random.default_rng(5).uniform(-0.7, 0.7, (10, 2))
 
     def cost(weights, x):
-        rho, quadratic, d = weights
-        changed = replace(mpc, soft=replace(soft, rho=rho, quadratic=quadratic, d=d))
+        rho, quadratic, upper = weights
+        changed = replace(mpc, soft=replace(soft, rho=rho, quadratic=quadratic, upper=upper))
         plan = jm.solve(changed, x, solver=FINE)
         return plan.cost, (plan.status, plan.slack)
 
-    weights = (soft.rho, soft.quadratic, soft.d)
+    weights = (soft.rho, soft.quadratic, soft.upper)
     (J, (status, slack)), gradients = jax.vmap(
         jax.value_and_grad(cost, has_aux=True), in_axes=(None, 0)
     )(weights, x0)
@@ -698,7 +698,7 @@ def test_gradients():
             for sign in (1, -1, 0):
                 changed = [np.array(v) for v in weights]
                 changed[j][entry] = max(changed[j][entry] + sign * h, 0.0)
-                parts = dict(zip(("rho", "quadratic", "d"), changed, strict=True))
+                parts = dict(zip(("rho", "quadratic", "upper"), changed, strict=True))
                 values.append(Explicit(replace(mpc, soft=replace(soft, **parts))).solve(x0[i])[0])
             width = 2 * h if weights[j][entry] > 0 else h
             assert J[i] == pytest.approx(values[2], rel=1e-8)
@@ -714,7 +714,7 @@ def test_gradients():
 def staged() -> jm.MPC:
     """A polytope of two inputs, limits at some steps, outputs with D: exact by elimination."""
     return replace(
-        problems.drifting(4), terminal_cost=None, constrained_steps=(1, 3, 4),
+        problems.drifting(4), terminal_cost=None, constrained_stages=(1, 3, 4),
         inputs=jm.Polytope(
             np.array([[1.0, 0.5], [-1.0, 1.0], [0.0, -1.0], [-0.5, -1.0], [1.0, 1.0]]),
             np.array([0.4, 0.5, 0.3, 0.35, 0.45]),
@@ -722,10 +722,10 @@ def staged() -> jm.MPC:
         terminal_set=None,
         outputs=(
             Outputs(np.array([[0.6, -1.0]]), np.array([-0.7]), np.array([0.8]),
-                    D=np.array([[0.5, 1.0]]), steps=(0, 2)),
+                    D=np.array([[0.5, 1.0]]), stages=(0, 2)),
             Outputs(np.array([[1.0, 1.0]]), np.array([-1.2]), np.array([np.inf])),
         ),
-        soft=Soft(np.array([[1.0, 0.0]]), np.array([-5.0])),
+        soft=Soft(np.array([[1.0, 0.0]]), upper=np.array([-5.0])),
     )  # fmt: skip
 
 
@@ -1024,20 +1024,24 @@ class TestEquilibrium:
         np.testing.assert_allclose(inputs, np.tile(u, (5, 1)), atol=1e-6)
 
 
-soft = lambda **k: dict(soft=Soft(**{"C": EYE, "d": ONE, **k}))
+soft = lambda **k: dict(soft=Soft(**{"C": EYE, "upper": ONE, **k}))
 outputs = lambda **k: dict(outputs=Outputs(**{"C": EYE, "lower": -ONE, "upper": ONE, **k}))
 # (settings, argument named, cure named)
 WRONG = {
     "soft: a number": (dict(soft=3), "soft", "Give a jm.Soft"),
     "soft: a box": (dict(soft=jm.Box(-ONE, ONE)), "soft", "Give a jm.Soft"),
     "soft: a list of numbers": (dict(soft=[3]), "soft", "tuple of them"),
-    "second soft": (dict(soft=(Soft(EYE, ONE), Soft(EYE, np.ones(3)))), r"soft\[1\].d", "bound"),
+    "second soft": (
+        dict(soft=(Soft(EYE, upper=ONE), Soft(EYE, upper=np.ones(3)))),
+        r"soft\[1\].upper",
+        "bound",
+    ),
     "C a vector": (soft(C=ONE), r"soft\[0\].C", "one column a state"),
     "C of three states": (soft(C=np.eye(3)), r"soft\[0\].C", r"\(p, 2\)"),
-    "C of no rows": (soft(C=np.zeros((0, 2)), d=np.zeros(0)), r"soft\[0\].C", "Give"),
+    "C of no rows": (soft(C=np.zeros((0, 2)), upper=np.zeros(0)), r"soft\[0\].C", "Give"),
     "C with NaN": (soft(C=EYE * np.nan), r"soft\[0\].C", "finite"),
-    "d too long": (soft(d=np.ones(3)), r"soft\[0\].d", "each row of C"),
-    "d NaN": (soft(d=ONE * np.nan), r"soft\[0\].d", "inf where there is no limit"),
+    "upper too long": (soft(upper=np.ones(3)), r"soft\[0\].upper", "each row of C"),
+    "upper NaN": (soft(upper=ONE * np.nan), r"soft\[0\].upper", "inf where there is no limit"),
     "rho negative": (soft(rho=-1.0), r"soft\[0\].rho", "at least 0"),
     "rho infinite": (soft(rho=np.inf), r"soft\[0\].rho", "finite"),
     "rho of three": (soft(rho=np.ones(3)), r"soft\[0\].rho", "one a row"),
@@ -1045,12 +1049,12 @@ WRONG = {
     "quadratic square": (soft(quadratic=EYE), r"soft\[0\].quadratic", "one a row"),
     "D": (soft(D=np.ones((2, 3))), r"soft\[0\].D", "One column an input"),
     "D NaN": (soft(D=EYE * np.nan), r"soft\[0\].D", "finite"),
-    "steps beyond N": (soft(steps=(0, 5)), r"soft\[0\].steps", "from 0 to 4"),
-    "D at N": (soft(D=EYE, steps=(4,)), r"soft\[0\].steps", "from 0 to 3"),
-    "steps a list": (soft(steps=[0, 1]), r"soft\[0\].steps", "tuple"),
-    "steps twice": (soft(steps=(1, 1)), r"soft\[0\].steps", "different"),
-    "steps negative": (soft(steps=(-1,)), r"soft\[0\].steps", "from 0"),
-    "steps a number": (soft(steps=2), r"soft\[0\].steps", "tuple"),
+    "stages beyond N": (soft(stages=(0, 5)), r"soft\[0\].stages", "from 0 to 4"),
+    "D at N": (soft(D=EYE, stages=(4,)), r"soft\[0\].stages", "from 0 to 3"),
+    "stages a list": (soft(stages=[0, 1]), r"soft\[0\].stages", "tuple"),
+    "stages twice": (soft(stages=(1, 1)), r"soft\[0\].stages", "different"),
+    "stages negative": (soft(stages=(-1,)), r"soft\[0\].stages", "from 0"),
+    "stages a number": (soft(stages=2), r"soft\[0\].stages", "tuple"),
     "names": (soft(names=("a",)), r"soft\[0\].names", "All or none"),
     "units": (soft(units=("a", "b", "c")), r"soft\[0\].units", "All or none"),
     "outputs: a number": (dict(outputs=3), "outputs", "Give a jm.Outputs"),
@@ -1059,11 +1063,11 @@ WRONG = {
     "outputs: upper NaN": (outputs(upper=ONE * np.nan), r"outputs\[0\].upper", "inf"),
     "outputs: C": (outputs(C=np.eye(3)), r"outputs\[0\].C", "one column a state"),
     "outputs: D": (outputs(D=ONE), r"outputs\[0\].D", "One column an input"),
-    "outputs: D at N": (outputs(D=EYE, steps=(4,)), r"outputs\[0\].steps", "from 0 to 3"),
+    "outputs: D at N": (outputs(D=EYE, stages=(4,)), r"outputs\[0\].stages", "from 0 to 3"),
     "outputs: names": (outputs(names=("a",)), r"outputs\[0\].names", "All or none"),
-    "constrained_steps: a list": (dict(constrained_steps=[1]), "constrained_steps", "tuple"),
-    "constrained_steps: beyond N": (dict(constrained_steps=(5,)), "constrained_steps", "0 to 4"),
-    "constrained_steps: twice": (dict(constrained_steps=(1, 1)), "constrained_steps", "different"),
+    "stages: a list": (dict(constrained_stages=[1]), "constrained_stages", "tuple"),
+    "stages: beyond N": (dict(constrained_stages=(5,)), "constrained_stages", "0 to 4"),
+    "stages: twice": (dict(constrained_stages=(1, 1)), "constrained_stages", "different"),
     "control_horizon 0": (dict(control_horizon=0), "control_horizon", "Give a number of moves"),
     "control_horizon 5": (dict(control_horizon=5), "control_horizon", "at most 4"),
     "control_horizon 2.0": (dict(control_horizon=2.0), "control_horizon", "Give a number"),

@@ -64,7 +64,7 @@ def around(steps=8, **fields):
     system = jm.LinearSystem(np.eye(2), np.eye(2))
     mpc = jm.MPC(system, 0.1 * np.eye(2), np.eye(2), steps, inputs=jm.Box([-2.0, -2.0], [2.0, 2.0]),
                  terminal_cost=50 * np.eye(2))  # fmt: skip
-    far = Task(squared, lower=1.0, penalty=None, name="disc")
+    far = Task(squared, lower=1.0, rho=None, name="disc")
     return NonlinearMPC(mpc, bent, (replace(far, **fields),))
 
 
@@ -103,7 +103,7 @@ class TestSolution:
         x0, r = np.array([0.9, -0.5, 0.4]), np.array([0.2, 0.0, 0.1])
         expected = solve_stagewise(soft, system, x0, r)
         for steps in (1, 20):
-            plan = solve_nonlinear(NonlinearMPC(soft, system), x0, r, steps=steps)
+            plan = solve_nonlinear(NonlinearMPC(soft, system), x0, r, iterations=steps)
             assert plan.status == SOLVED and plan.iterations <= 2
             np.testing.assert_allclose(plan.inputs, expected.inputs, atol=1e-7)
             np.testing.assert_allclose(plan.cost, expected.cost, rtol=1e-9)
@@ -168,8 +168,8 @@ class TestSolution:
 
     @pytest.mark.slow
     def test_a_soft_limit_gives_way_and_says_so(self, x64):
-        inside = solve_nonlinear(around(penalty=0.5), START, GOAL)
-        exact = solve_nonlinear(around(penalty=1e3), START, GOAL)
+        inside = solve_nonlinear(around(rho=0.5), START, GOAL)
+        exact = solve_nonlinear(around(rho=1e3), START, GOAL)
         hard = solve_nonlinear(around(), START, GOAL)
         for plan in (inside, exact, hard):
             assert plan.status == SOLVED
@@ -199,7 +199,7 @@ class TestSolution:
         problem = around()
         plan = None
         for _ in range(60):
-            plan = solve_nonlinear(problem, START, GOAL, warm_start=plan, steps=1)
+            plan = solve_nonlinear(problem, START, GOAL, warm_start=plan, iterations=1)
         assert plan.status == SOLVED
         expected = solve_nonlinear(problem, START, GOAL)
         np.testing.assert_allclose(plan.inputs, expected.inputs, atol=1e-5)
@@ -314,7 +314,7 @@ def test_an_impossible_limit_is_not_solved(x64):
     slow = replace(problem, mpc=replace(problem.mpc, inputs=jm.Box([-0.1, -0.1], [0.1, 0.1])))
     plan = solve_nonlinear(slow, np.array([0.1, 0.0]), GOAL)
     assert plan.status == jm.Status.ITERATION_LIMIT
-    soft = replace(slow, tasks=(replace(slow.tasks[0], penalty=1e3),))
+    soft = replace(slow, tasks=(replace(slow.tasks[0], rho=1e3),))
     plan = solve_nonlinear(soft, np.array([0.1, 0.0]), GOAL)
     assert plan.slack.max() > 0.5
 
@@ -323,7 +323,7 @@ BAD = {
     "x0": (lambda p: solve_nonlinear(p, np.zeros(3)), r"x0: shape \(3,\)"),
     "reference": (lambda p: solve_nonlinear(p, START, np.zeros(3)), r"reference: shape \(3,\)"),
     "targets": (lambda p: solve_nonlinear(p, START, targets=[]), "targets: 0 for 1 tasks"),
-    "steps": (lambda p: solve_nonlinear(p, START, steps=0), "steps: 0"),
+    "iterations": (lambda p: solve_nonlinear(p, START, iterations=0), "iterations: 0"),
     "hessian": (lambda p: solve_nonlinear(p, START, hessian="bfgs"), "hessian: 'bfgs'"),
     "weight": (
         lambda p: solve_nonlinear(replace(p, tasks=(replace(p.tasks[0], weight=-1.0),)), START),
@@ -339,9 +339,9 @@ BAD = {
         lambda p: solve_nonlinear(replace(p, tasks=(replace(p.tasks[0], upper=0.5),)), START),
         "disc.lower: exceeds upper",
     ),
-    "task steps": (
-        lambda p: solve_nonlinear(replace(p, tasks=(replace(p.tasks[0], steps=(0, 9)),)), START),
-        r"disc.steps: \(0, 9\)",
+    "task stages": (
+        lambda p: solve_nonlinear(replace(p, tasks=(replace(p.tasks[0], stages=(0, 9)),)), START),
+        r"disc.stages: \(0, 9\)",
     ),
     "function": (
         lambda p: solve_nonlinear(

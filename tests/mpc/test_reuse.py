@@ -65,14 +65,14 @@ def kkt_residual(mpc, x, plan):
     for k in range(N):
         X[k + 1] = A @ X[k] + B @ plan.inputs[k]
     y = np.zeros((N + 1, len(x)))
-    y[list(mpc.state_steps)] = plan.multipliers.states
+    y[list(mpc.state_stages)] = plan.multipliers.states
     H = np.asarray(mpc.terminal_set.rows()[0])
     p = 2 * np.asarray(mpc.terminal_cost) @ X[N] + y[N] + H.T @ plan.multipliers.terminal
     for k in reversed(range(N)):
         gradient = 2 * np.asarray(mpc.R) @ plan.inputs[k] + B.T @ p + plan.multipliers.inputs[k]
         worst = max(worst, np.abs(gradient).max())
         p = 2 * np.asarray(mpc.Q) @ X[k] + y[k] + A.T @ p
-    limits = np.maximum(np.abs(X) - np.asarray(mpc.states.upper), 0)[list(mpc.state_steps)]
+    limits = np.maximum(np.abs(X) - np.asarray(mpc.states.upper), 0)[list(mpc.state_stages)]
     return max(worst, limits.max(), np.abs(plan.inputs).max() - float(mpc.inputs.upper[0]))
 
 
@@ -157,7 +157,7 @@ def test_on_the_device_and_from_a_controller(mpc, states, solved, few):
 
 def test_problems_that_do_not_qualify(mpc):
     soft = jm.MPC(mpc.system, mpc.Q, mpc.R, 5, inputs=mpc.inputs,
-                  soft=jm.Soft(np.eye(2), [1.0, 1.0], rho=10.0))  # fmt: skip
+                  soft=jm.Soft(np.eye(2), upper=[1.0, 1.0], rho=10.0))  # fmt: skip
     wide = jm.MPC(jm.LinearSystem(np.eye(5), np.eye(5)), np.eye(5), np.eye(5), 3,
                   inputs=jm.Box(-1, 1))  # fmt: skip
     with jax.enable_x64(True):

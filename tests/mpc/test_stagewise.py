@@ -43,11 +43,11 @@ def problem() -> jm.MPC:
         terminal_set=jm.Polytope(np.vstack([H, -H]), np.full(8, 0.9)),
         outputs=jm.Outputs(
             [[0.2, 0.5, 0.0], [0.0, 0.3, 0.4]], [-0.3, -0.3], [0.35, np.inf],
-            [[1.0, 0.0], [0.5, -1.0]], steps=(0, 2, 5),
+            [[1.0, 0.0], [0.5, -1.0]], stages=(0, 2, 5),
         ),
         soft=jm.Soft(
-            np.array([[0.0, 1.0, 0.5]]), np.array([-0.5]), rho=0.3, quadratic=2.0,
-            steps=(1, 2, 3, 4),
+            np.array([[0.0, 1.0, 0.5]]), upper=np.array([-0.5]), rho=0.3, quadratic=2.0,
+            stages=(1, 2, 3, 4),
         ),
         prestabilise=False,
     )  # fmt: skip
@@ -83,8 +83,8 @@ def condensed(mpc: jm.MPC, system: jm.LinearSystem, x0: np.ndarray) -> tuple:
     blocks = (
         (np.zeros((m, n)), np.eye(m), mpc.inputs.lower, mpc.inputs.upper, range(N)),
         (np.eye(n), np.zeros((n, m)), mpc.states.lower, mpc.states.upper, range(N)),
-        (np.array(o.C), np.array(o.D), o.lower, o.upper, o.steps),
-        (np.array(s.C), np.zeros((1, m)), [-np.inf], s.d, s.steps),
+        (np.array(o.C), np.array(o.D), o.lower, o.upper, o.stages),
+        (np.array(s.C), np.zeros((1, m)), [-np.inf], s.upper, s.stages),
         (last.H, np.zeros((len(last.h), m)), none, last.h, (N,)),
     )
     C, shift, lower, upper = [], [], [], []
@@ -186,7 +186,7 @@ def test_derivative():
 
     def total(h, system):
         moved = replace(system, A=system.A + h * dA)
-        soft = replace(mpc.soft, d=mpc.soft.d + h * dd)
+        soft = replace(mpc.soft, upper=mpc.soft.upper + h * dd)
         plan = solve_stagewise(replace(mpc, soft=soft), moved, X0 + h * dx, solver=SOLVER)
         return jnp.sum(plan.inputs)
 
@@ -264,7 +264,7 @@ def test_rows_that_no_input_moves():
     assert plan.primal_residual >= 0.05 - 1e-12
     soft = replace(
         mpc, states=None, outputs=(), terminal_set=None,
-        soft=jm.Soft(np.eye(n), np.array([1.0, 0.7, 1.2]), rho=10.0),
+        soft=jm.Soft(np.eye(n), upper=np.array([1.0, 0.7, 1.2]), rho=10.0),
     )  # fmt: skip
     plan = solve_stagewise(soft, mpc.system, far, solver=SOLVER)
     assert plan.status == jm.Status.SOLVED and plan.gap < 1e-9

@@ -162,7 +162,10 @@ def test_plans_by_kernels_are_those_without(soft, x64, monkeypatch):
     far = np.array([[1.49, 1.99]])  # beyond the limit after one step
     states, mpc = np.concatenate([STATES, far]), replace(joint(), horizon=8)
     if soft:
-        mpc = replace(mpc, soft=jm.Soft(np.array([[0.0, 1.0]]), np.array([0.5]), 5.0, 20.0))
+        mpc = replace(
+            mpc,
+            soft=jm.Soft(np.array([[0.0, 1.0]]), upper=np.array([0.5]), rho=5.0, quadratic=20.0),
+        )
     plans = lambda solver: jax.jit(jax.vmap(jm.Controller(mpc, solver).plan))(states)
     wanted = plans(jm.ADMM())
     for module in (active_set, refine):

@@ -245,7 +245,13 @@ class TestLaw:
     """The affine pieces and the projection that the ascent uses."""
 
     @pytest.mark.parametrize(
-        "soft", [(), pytest.param((Soft([[0.0, 1.0]], [0.2], 2.0, 0.5),), marks=pytest.mark.slow)]
+        "soft",
+        [
+            (),
+            pytest.param(
+                (Soft([[0.0, 1.0]], upper=[0.2], rho=2.0, quadratic=0.5),), marks=pytest.mark.slow
+            ),
+        ],
     )
     @pytest.mark.slow
     def test_piece_predicts_the_plan_beside(self, soft):

@@ -104,7 +104,7 @@ def test_tightening_and_rows_that_no_input_moves():
         found = membership(still, x0s, 0.1)
     beyond = np.maximum(np.abs(x0s[:, 0]) - 0.9, 0)  # at k = 1 x is half as large
     np.testing.assert_allclose(found, 1 / (1 + (beyond / 0.1) ** 2), rtol=1e-12)
-    soft = replace(still, soft=jm.Soft([[1.0]], [0.1]), input_rate_weight=[1.0])
+    soft = replace(still, soft=jm.Soft([[1.0]], upper=[0.1]), input_rate_weight=[1.0])
     with jax.enable_x64(True):  # what has no part in feasibility has none here
         assert float(feasible_fraction(soft, x0s, 0.1)) == float(found.mean())
     for arguments, message in (

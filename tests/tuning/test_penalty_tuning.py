@@ -172,10 +172,10 @@ def test_groups_over_horizons(learned):
     assert longer.iterations == 40 and longer.alpha == found.solver.alpha
     # Step 2k of ten stands where step k of five does.
     tables = [jm.mpc.row_table(problem) for problem in (mpc(), mpc(10))]
-    of = {(r.kind, r.step, r.index): rho for r, rho in zip(tables[1], longer.rho.T, strict=True)}
+    of = {(r.kind, r.stage, r.index): rho for r, rho in zip(tables[1], longer.rho.T, strict=True)}
     assert len(of) == len(tables[1])
     for row, rho in zip(tables[0], found.solver.rho.T, strict=True):
-        assert np.allclose(of[row.kind, 2 * row.step, row.index], rho)
+        assert np.allclose(of[row.kind, 2 * row.stage, row.index], rho)
     with pytest.raises(ValueError, match="blocks"):
         transfer_penalties(found, problems.scalar())
     by_row = {**found.settings, "groups": "row"}

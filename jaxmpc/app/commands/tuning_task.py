@@ -200,7 +200,7 @@ def linear_task(command: Any) -> TuningTask:
     hard, rho = config.build_mpc(), config.cost.rho
     if rho is not None:  # the number that "exact" stands for
         controlled = config.build_controlled()
-        rho = float(controlled.soft[0].rho) if controlled.soft else 0.0  # type: ignore[index]
+        rho = float(controlled.soft[0].rho) if controlled.soft else 0.0  # type: ignore[index, arg-type]
     if "rho" in command.tune and not rho:
         fail("--tune rho", "the problem has no soft limits", "Give it [cost] rho")
     config = with_numbers(config, hard, rho)

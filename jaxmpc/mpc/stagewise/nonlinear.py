@@ -49,8 +49,8 @@ class Task:
     weight: W, a number, (p,) for a diagonal or (p, p); None: no cost.
     target: (p,), or (N + 1, p) for each step; None: zero.
     lower, upper: (p,) or a number, ±inf or None for no limit.
-    penalty: weight ρ of the violations ρ Σ e with which the limits are soft (`Soft`); None: hard.
-    steps: the k at which cost and limits hold; None: 1 … N. At N the input counts as zero.
+    rho: weight ρ of the violations ρ Σ e with which the limits are soft (`Soft`); None: hard.
+    stages: the k at which cost and limits hold; None: 1 … N. At N the input counts as zero.
     name, unit: in tables.
     """
 
@@ -59,8 +59,8 @@ class Task:
     target: Any = None
     lower: Any = None
     upper: Any = None
-    penalty: Any = 1e4
-    steps: tuple[int, ...] | None = field(default=None, metadata={"static": True})
+    rho: Any = 1e4
+    stages: tuple[int, ...] | None = field(default=None, metadata={"static": True})
     name: str = field(default="task", metadata={"static": True})
     unit: str = field(default="", metadata={"static": True})
 
@@ -70,8 +70,8 @@ class Task:
         return self.lower is not None or self.upper is not None
 
     def at(self, horizon: int) -> tuple[int, ...]:
-        """Return the steps at which cost and limits hold."""
-        return tuple(range(1, horizon + 1)) if self.steps is None else self.steps
+        """Return the stages at which cost and limits hold."""
+        return tuple(range(1, horizon + 1)) if self.stages is None else self.stages
 
     def validate(self, size: int, horizon: int) -> None:
         """Raise ValueError for arguments that do not fit a function of `size` numbers."""
@@ -80,7 +80,7 @@ class Task:
             ("weight", self.weight, ((), (size,), (size, size))),
             ("target", self.target, ((), (size,), (horizon + 1, size))),
             ("lower", self.lower, ((), (size,))), ("upper", self.upper, ((), (size,))),
-            ("penalty", self.penalty, ((),)),
+            ("rho", self.rho, ((),)),
         ):  # fmt: skip
             if value is None:
                 continue
@@ -95,17 +95,18 @@ class Task:
             values = np.asarray(self.weight, float)
             values = np.diag(values) if values.ndim == 1 else np.atleast_2d(values)
             require_symmetric_psd(f"{name}.weight", values)
-        if self.penalty is not None and concrete(self.penalty) and not self.penalty >= 0:
-            fail(f"{name}.penalty", f"{self.penalty}", "Give at least 0, or None for hard limits")
+        if self.rho is not None and concrete(self.rho) and not self.rho >= 0:
+            fail(f"{name}.rho", f"{self.rho}", "Give at least 0, or None for hard limits")
         if self.limited and concrete(self.lower, self.upper):
             lower = -np.inf if self.lower is None else np.asarray(self.lower, float)
             upper = np.inf if self.upper is None else np.asarray(self.upper, float)
             if not np.all(lower <= upper):
                 fail(f"{name}.lower", "exceeds upper or is NaN", "Give lower ≤ upper")
-        if self.steps is not None:
-            whole = all(isinstance(k, int) and 0 <= k <= horizon for k in self.steps)
-            if not whole or len(set(self.steps)) != len(self.steps) or not self.steps:
-                fail(f"{name}.steps", f"{self.steps}", f"Give different steps from 0 to {horizon}")
+        if self.stages is not None:
+            given = self.stages
+            whole = all(isinstance(k, int) and 0 <= k <= horizon for k in given)
+            if not whole or len(set(given)) != len(given) or not given:
+                fail(f"{name}.stages", f"{given}", f"Give different stages from 0 to {horizon}")
 
 
 @named_pytree
@@ -310,7 +311,7 @@ def expanded(
             for given, free in ((task.lower, -jnp.inf), (task.upper, jnp.inf)):
                 bound = jnp.asarray(free if given is None else given, dtype)
                 sides.append((bound + moved).ravel())
-            soft = jnp.inf if task.penalty is None else task.penalty
+            soft = jnp.inf if task.rho is None else task.rho
             weight = jnp.full(moved.size, soft, dtype)
             bounds.append((*sides, weight, jnp.zeros_like(weight)))
             for name, part in (("H", G), ("D", D), ("boxes", False),

@@ -78,7 +78,7 @@ from jaxmpc.qp.status import Status
 from jaxmpc.sets.box import Box
 
 # QPs at most, of `solve_nonlinear`.
-STEPS = 100
+ITERATIONS = 100
 # Part of the predicted decrease that a step has to make, and the shortest step.
 DECREASE, SHORTEST = 1e-4, 1e-4
 # A multiplier, relative to the largest, above which a row counts as held.
@@ -92,7 +92,7 @@ QUADRATIC = ("Q", "R", "P", "cross")
 def solve_nonlinear(
     problem: NonlinearMPC, x0: Reals, reference: Reals | None = None, solver: ADMM = DEFAULT,
     warm_start: Any = None, *, input_reference: Reals | None = None, targets: Any = None,
-    steps: int = STEPS, hessian: str = "exact", scale: Any = None,
+    iterations: int = ITERATIONS, hessian: str = "exact", scale: Any = None,
 ) -> Plan:  # fmt: skip
     """Solve a nonlinear MPC from the state x0 (n,) by sequential quadratic programming.
 
@@ -101,7 +101,7 @@ def solve_nonlinear(
     where solver.iterations is None); its eps is the tolerance of the nonlinear problem.
     warm_start: an earlier Plan or a WarmStart; None, or where it costs a hundred times as much: at
     rest at x0 under the first input reference.
-    steps: QPs at most. 1: the real-time iteration, a full step, whose plan, residuals and status
+    iterations: QPs at most. 1: the real-time iteration, a full step, whose plan, residuals and status
     are those of the QP about the warm start.
     hessian: "exact", the Lagrangian's where it is convex (few QPs near the solution), or
     "gauss-newton", which needs no second derivatives of the model. scale (rows,): row scale of a
@@ -119,14 +119,14 @@ def solve_nonlinear(
     problem.validate()
     mpc, N = problem.mpc, problem.mpc.horizon
     n, m = mpc.system.n, mpc.system.m
-    whole("steps", steps, 1)
+    whole("iterations", iterations, 1)
     if solver.iterations is None:
         solver = replace(solver, iterations=0)
     checked(mpc, mpc.system, replace(solver, rho=None))
     if hessian not in ("exact", "gauss-newton"):
         fail("hessian", f"{hessian!r}", 'Give "exact" or "gauss-newton"')
-    if solver.differentiate != "implicit" and steps > 1:
-        fail("solver.differentiate", f"{solver.differentiate!r}", 'With steps > 1: "implicit"')
+    if solver.differentiate != "implicit" and iterations > 1:
+        fail("solver.differentiate", f"{solver.differentiate!r}", 'With iterations > 1: "implicit"')
     # The model's own system is not read; the one of the set-point may differ from step to step.
     s = jax.eval_shape(stages, mpc)
     dtype = s.P.dtype
@@ -153,18 +153,20 @@ def solve_nonlinear(
     warm_start = WarmStart.of(warm_start, rows, N, n, m)
     sample = Aims(x0, found[0], found[1], tuple(found[2:]))
     return _solve(
-        *arrays((problem, solver, sample, warm_start, scale)), steps=int(steps), hessian=hessian
+        *arrays((problem, solver, sample, warm_start, scale)),
+        iterations=int(iterations),
+        hessian=hessian,
     )
 
 
-@partial(jax.jit, static_argnames=("steps", "hessian"))
+@partial(jax.jit, static_argnames=("iterations", "hessian"))
 @own_modes
 def _solve(
-    problem: NonlinearMPC, solver: ADMM, aims: Aims, warm_start: WarmStart, scale: Any, steps: int,
+    problem: NonlinearMPC, solver: ADMM, aims: Aims, warm_start: WarmStart, scale: Any, iterations: int,
     hessian: str,
 ) -> Plan:  # fmt: skip
     base, fault = cleaned(stages(problem.mpc))
-    numbers = (aims, [(t.weight, t.penalty) for t in problem.tasks])
+    numbers = (aims, [(t.weight, t.rho) for t in problem.tasks])
     finite = [jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(numbers)]
     fault = jnp.where(jnp.all(jnp.stack(finite)), fault, jnp.int32(Status.NON_FINITE))
     usable = fault == Status.NOT_RUN
@@ -176,16 +178,16 @@ def _solve(
     x, u, y = (jnp.nan_to_num(v.astype(base.P.dtype), posinf=0, neginf=0) for v in warm_start)
     x, u, y = within_reason(base, problem, aims, x.at[0].set(aims.x0), u, y)
     count: Any = 1
-    if steps > 1:
+    if iterations > 1:
         constants = jax.lax.stop_gradient((base, problem, aims, scale, eps))
         start = Iterate.begin(*jax.lax.stop_gradient((x, u, y)))
         is_open = lambda state: state.open
-        step = partial(sqp_step, steps, hessian)
+        step = partial(sqp_step, iterations, hessian)
         last = repeat_while(is_open, step, constants, start, steps="stages")
         x, u, y, count = last.x, last.u, last.y, last.steps
     s, sample = expanded(base, problem, aims, x, u)
     E, rho = scales(jax.lax.stop_gradient(s), scale)
-    if steps == 1:
+    if iterations == 1:
         gains = None
         if solver.admm_steps():
             gains = jax.tree.map(lambda v: v[None], riccati(s, rho * E**2))
@@ -249,7 +251,7 @@ def with_tasks(
         task_layout(problem), [t for t in problem.tasks if t.limited], strict=True
     ):
         last = first + len(steps) * size
-        if limited.penalty is not None:
+        if limited.rho is not None:
             slack.append(spread(out[first:last].reshape(len(steps), size), steps, len(x)))
         first = last
     return replace(plan, cost=J, slack=jnp.concatenate(slack, axis=1))
