@@ -23,53 +23,54 @@ def soften(mpc: MPC, rho: Reals, quadratic: Reals = 0.0) -> MPC:
     """
     require_kind("mpc", mpc, MPC)
     mpc.validate()
-    system, N, soft = mpc.system, mpc.horizon, list(as_tuple("soft", mpc.soft, Soft))
     if isinstance(mpc.terminal_set, Ellipsoid):
         fail("terminal_set", "is an Ellipsoid, which stays hard", "Use a Polytope inside it")
-
-    def add(C: Any, D: Any, lower: Any, upper: Any, steps: Any, names: Any, units: Any) -> None:
-        # Limits inside a trace cannot be read: all their rows are taken. One at infinity asks for
-        # nothing.
-        read = concrete(C, D, lower, upper)
-        bounded, below = np.ones(np.shape(lower), bool), True
-        if read:
-            bounded, below = np.isfinite(lower) | np.isfinite(upper), np.isfinite(lower).any()
-        if not bounded.any() or not steps:
-            return
-        keep = lambda v: None if v is None else (np.asarray(v) if read else v)[bounded]
-        text = lambda v: tuple(str(part) for part in np.asarray(v)[bounded]) if v else ()
-        soft.append(
-            Soft(
-                keep(C),
-                keep(lower) if below else None,
-                keep(upper),
-                rho,
-                quadratic,
-                keep(D),
-                tuple(steps),
-                text(names),
-                text(units),
-            )  # fmt: skip
-        )
-
-    for kind, set_, steps in (
-        ("state", mpc.states, mpc.state_stages), ("terminal", mpc.terminal_set, (N,))
-    ):  # fmt: skip
-        if set_ is not None:
-            C, lower, upper = set_.rows()
-            names, units = system.state_names, system.state_units
-            if isinstance(set_, Polytope):
-                names, units = set_.labels, ()
-            names = names or tuple(f"{kind} row {i + 1}" for i in range(np.size(lower)))
-            add(C, None, lower, upper, steps, names, units)
+    hard = []
+    for kind, limits, stages in (
+        ("state", mpc.states, mpc.state_stages),
+        ("terminal", mpc.terminal_set, (mpc.horizon,)),
+    ):
+        if limits is not None:
+            C, lower, upper = limits.rows()
+            names, units = mpc.system.state_names, mpc.system.state_units
+            if isinstance(limits, Polytope):
+                names, units = limits.labels, ()
+            names = names or _numbered(kind, np.size(lower))
+            hard.append(Outputs(C, lower, upper, None, stages, names, units))
     for rows in as_tuple("outputs", mpc.outputs, Outputs):
-        names = rows.names or tuple(f"output row {i + 1}" for i in range(np.size(rows.sides[0])))
-        steps = output_stages(mpc, rows)
+        names = rows.names or _numbered("output", np.size(rows.sides[0]))
+        hard.append(replace(rows, stages=output_stages(mpc, rows), names=names))
+    soft = list(as_tuple("soft", mpc.soft, Soft))
+    for rows in filter(None, map(_with_limits, hard)):
         lower, upper = rows.sides
-        add(rows.C, rows.D, lower, upper, steps, names, rows.units)
+        if concrete(lower) and not np.isfinite(lower).any():
+            lower = None
+        soft.append(
+            Soft(rows.C, lower, upper, rho, quadratic, rows.D, rows.stages, rows.names, rows.units)
+        )
     softened = replace(mpc, states=None, terminal_set=None, outputs=(), soft=tuple(soft))
     softened.validate()
     return softened
+
+
+def _numbered(kind: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{kind} row {i + 1}" for i in range(count))
+
+
+def _with_limits(rows: Outputs) -> Outputs | None:
+    """Return the rows with a finite limit, None where there are none. Limits inside a trace cannot
+    be read: all their rows are taken."""
+    if not rows.stages or not concrete(rows):
+        return rows if rows.stages else None
+    lower, upper = rows.sides
+    bounded = np.isfinite(lower) | np.isfinite(upper)
+    keep = lambda v: None if v is None else np.asarray(v)[bounded]
+    text = lambda v: tuple(str(part) for part in np.asarray(v)[bounded]) if v else ()
+    kept = Outputs(
+        keep(rows.C), keep(lower), keep(upper), keep(rows.D), rows.stages, text(rows.names),
+        text(rows.units),
+    )  # fmt: skip
+    return kept if bounded.any() else None
 
 
 def harden(mpc: MPC) -> MPC:
