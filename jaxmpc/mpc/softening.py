@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import reduce
-from typing import Any
 
 import numpy as np
 
@@ -42,12 +41,10 @@ def soften(mpc: MPC, rho: Reals, quadratic: Reals = 0.0) -> MPC:
         hard.append(replace(rows, stages=output_stages(mpc, rows), names=names))
     soft = list(as_tuple("soft", mpc.soft, Soft))
     for rows in filter(None, map(_with_limits, hard)):
-        lower, upper = rows.sides
-        if concrete(lower) and not np.isfinite(lower).any():
-            lower = None
-        soft.append(
-            Soft(rows.C, lower, upper, rho, quadratic, rows.D, rows.stages, rows.names, rows.units)
-        )
+        one_sided = concrete(rows.lower) and not np.isfinite(rows.sides[0]).any()
+        lower = None if one_sided else rows.lower
+        more = (rows.D, rows.stages, rows.names, rows.units)
+        soft.append(Soft(rows.C, lower, rows.sides[1], rho, quadratic, *more))
     softened = replace(mpc, states=None, terminal_set=None, outputs=(), soft=tuple(soft))
     softened.validate()
     return softened
@@ -64,10 +61,10 @@ def _with_limits(rows: Outputs) -> Outputs | None:
         return rows if rows.stages else None
     lower, upper = rows.sides
     bounded = np.isfinite(lower) | np.isfinite(upper)
-    keep = lambda v: None if v is None else np.asarray(v)[bounded]
+    keep = lambda v: np.asarray(v)[bounded]
     text = lambda v: tuple(str(part) for part in np.asarray(v)[bounded]) if v else ()
     kept = Outputs(
-        keep(rows.C), keep(lower), keep(upper), keep(rows.D), rows.stages, text(rows.names),
+        keep(rows.C), keep(lower), keep(upper), None if rows.D is None else keep(rows.D), rows.stages, text(rows.names),
         text(rows.units),
     )  # fmt: skip
     return kept if bounded.any() else None

@@ -672,7 +672,8 @@ def test_float32(name):
 def test_gradients():
     """dJ*/d(ρ, quadratic, upper) over a batch of states, by differences of Clarabel's cost."""
     soft = Soft(np.array([[1.0, 0.0], [0.0, 1.0]]), upper=np.array([0.25, 0.1]),
-                rho=np.array([0.9, 0.5]), quadratic=np.array([0.0, 0.6]), D=np.array([[0.0], [0.3]]))  # fmt: skip
+                rho=np.array([0.9, 0.5]), quadratic=np.array([0.0, 0.6]),
+                D=np.array([[0.0], [0.3]]))  # fmt: skip
     mpc = jm.MPC(
         system=jm.LinearSystem(np.array([[1.0, 0.5], [0.0, 1.0]]), np.array([[0.1], [0.5]])),
         Q=np.eye(2), R=0.1 * np.eye(1), horizon=3, inputs=problems.symmetric(1.0),

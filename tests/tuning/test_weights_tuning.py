@@ -134,7 +134,7 @@ def test_design_loss_references_and_other_fields(x64):
     aim = ClosedLoopLoss(np.eye(2), [0.0], reference=np.array([0.3, 0.0]))
     found = tune(
         make=make, parameters=parameters, loss=aim, reference=lambda v: v["goal"],
-        design_loss=lambda mpc: 1e-3 * mpc.soft[0].d[0], updates=3, optimizer=optax.adam(0.05),
+        design_loss=lambda mpc: 1e-3 * mpc.soft[0].upper[0], updates=3, optimizer=optax.adam(0.05),
     )  # fmt: skip
     goal = found.history.thetas["goal"][:, 0]
     assert np.all(np.diff(goal) > 0)  # towards 0.3

@@ -43,7 +43,7 @@ def test_harden_undoes_soften():
     before, after = jm.feasible_polytope(mpc), jm.feasible_polytope(back)
     assert before.is_subset(after) and after.is_subset(before)
     odd = jm.Soft(np.array([[1.0, 0.0]]), upper=np.array([0.5]), stages=(2,))
-    assert jm.mpc.harden(jm.MPC(mpc.system, mpc.Q, mpc.R, 3, soft=odd)).outputs[0].steps == (2,)
+    assert jm.mpc.harden(jm.MPC(mpc.system, mpc.Q, mpc.R, 3, soft=odd)).outputs[0].stages == (2,)
 
 
 @pytest.mark.parametrize(

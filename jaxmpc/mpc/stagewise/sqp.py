@@ -101,8 +101,8 @@ def solve_nonlinear(
     where solver.iterations is None); its eps is the tolerance of the nonlinear problem.
     warm_start: an earlier Plan or a WarmStart; None, or where it costs a hundred times as much: at
     rest at x0 under the first input reference.
-    iterations: QPs at most. 1: the real-time iteration, a full step, whose plan, residuals and status
-    are those of the QP about the warm start.
+    iterations: QPs at most. 1: the real-time iteration, a full step, whose plan, residuals and
+    status are those of the QP about the warm start.
     hessian: "exact", the Lagrangian's where it is convex (few QPs near the solution), or
     "gauss-newton", which needs no second derivatives of the model. scale (rows,): row scale of a
     similar problem, as in `solve_stagewise`.
@@ -162,8 +162,8 @@ def solve_nonlinear(
 @partial(jax.jit, static_argnames=("iterations", "hessian"))
 @own_modes
 def _solve(
-    problem: NonlinearMPC, solver: ADMM, aims: Aims, warm_start: WarmStart, scale: Any, iterations: int,
-    hessian: str,
+    problem: NonlinearMPC, solver: ADMM, aims: Aims, warm_start: WarmStart, scale: Any,
+    iterations: int, hessian: str,
 ) -> Plan:  # fmt: skip
     base, fault = cleaned(stages(problem.mpc))
     numbers = (aims, [(t.weight, t.rho) for t in problem.tasks])
