@@ -41,10 +41,10 @@ def soften(mpc: MPC, rho: Reals, quadratic: Reals = 0.0) -> MPC:
         hard.append(replace(rows, stages=output_stages(mpc, rows), names=names))
     soft = list(as_tuple("soft", mpc.soft, Soft))
     for rows in filter(None, map(_with_limits, hard)):
-        one_sided = concrete(rows.lower) and not np.isfinite(rows.sides[0]).any()
-        lower = None if one_sided else rows.lower
+        below, above = rows.sides
+        one_sided = concrete(below) and not np.isfinite(below).any()
         more = (rows.D, rows.stages, rows.names, rows.units)
-        soft.append(Soft(rows.C, lower, rows.sides[1], rho, quadratic, *more))
+        soft.append(Soft(rows.C, None if one_sided else below, above, rho, quadratic, *more))
     softened = replace(mpc, states=None, terminal_set=None, outputs=(), soft=tuple(soft))
     softened.validate()
     return softened
@@ -62,11 +62,16 @@ def _with_limits(rows: Outputs) -> Outputs | None:
     lower, upper = rows.sides
     bounded = np.isfinite(lower) | np.isfinite(upper)
     keep = lambda v: np.asarray(v)[bounded]
-    text = lambda v: tuple(str(part) for part in np.asarray(v)[bounded]) if v else ()
-    kept = Outputs(
-        keep(rows.C), keep(lower), keep(upper), None if rows.D is None else keep(rows.D), rows.stages, text(rows.names),
-        text(rows.units),
-    )  # fmt: skip
+    text = lambda v: tuple(str(part) for part in keep(v)) if v else ()
+    kept = replace(
+        rows,
+        C=keep(rows.C),
+        lower=keep(lower),
+        upper=keep(upper),
+        D=None if rows.D is None else keep(rows.D),
+        names=text(rows.names),
+        units=text(rows.units),
+    )
     return kept if bounded.any() else None
 
 
