@@ -1,7 +1,6 @@
 """Learned penalties beside constant and adaptive ones: states solved by ADMM in fixed steps.
 
     python experiments/penalties.py --problem joint
-    python experiments/penalties.py --problem joint --terminal --sweep 1024
 
 "solved" is the share of held-out feasible states with status SOLVED (residuals and gap below 1e-6,
 float64) after the steps, no Newton. "steps to 99 %": the fewest, on a grid, after which 99 %
@@ -14,10 +13,8 @@ feasible. Learning and the choice of the constant see the first part only; both 
 default: rho = 1, alpha = 1.6. constant: best of a grid of rho and alpha on states of the first part
 (for "steps to 99 %" the best for that). OSQP: OSQP itself with its scaling and its adaptive
 rho, intervals of 5 to 100 steps, whichever is best, run to the given number of iterations without
-termination checks or polish; its answers judged by our residuals. learned: `tune_penalties`;
+termination checks or polish; its answers judged by our residuals. learned: `tune_solver`;
 for "steps to 99 %" learned anew for each number of steps that was tried.
-
-With --sweep K: maps of K×K states, with and without learned penalties of the first pass.
 """
 
 import time
@@ -40,10 +37,9 @@ from jaxmpc.app import config
 from jaxmpc.mpc.condense import Condensed, condense, in_float64
 from jaxmpc.qp.admm import factor, iterate, read, scaled, splittings, unscaled
 from jaxmpc.qp.residuals import largest_of, residual_terms, worst
-from jaxmpc.tuning.penalties import tune_penalties
 from jaxmpc.tuning.penalty_schedule import transfer_penalties
 from jaxmpc.tuning.result import TuningRun
-from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
+from jaxmpc.tuning.solver import tune_solver
 
 HERE = Path(__file__).parent
 RHOS, ALPHAS = np.logspace(-2, 2, 13), (1.0, 1.6, 1.9)
@@ -72,7 +68,6 @@ class Settings:
     longer: bool = True
     to_99: bool = True
     seed: int = 0
-    sweep: int = 0
     """States along each of two axes."""
     terminal: bool = False
     """The joint's invariant set as terminal set."""
@@ -251,7 +246,7 @@ class Table:
 
     def learn(self, iterations: int, stages: int, groups: str) -> TuningRun:
         """Penalties learned on the first part."""
-        return tune_penalties(
+        return tune_solver(
             self.mpc, self.first, iterations, stages=stages, groups=groups, seed=self.s.seed,
             updates=self.s.updates, batch=self.s.batch, **self.given,
         )  # fmt: skip
@@ -334,51 +329,9 @@ def report(s: Settings) -> None:
             show("learned anew", table.solved(table.learn(steps, 4, "step").solver))
 
 
-def sweeps(s: Settings) -> None:
-    """Sweeps with and without learned penalties, in turns; the first ones compile."""
-    mpc = case(s.problem).mpc
-    if s.terminal:
-        invariant = jm.maximal_invariant_set(
-            mpc.system, jm.lqr(mpc.system, mpc.Q, mpc.R).K, mpc.states, mpc.inputs
-        )
-        mpc = replace(mpc, terminal_set=invariant)
-    lower, upper = np.asarray(mpc.states.lower), np.asarray(mpc.states.upper)
-    margin = 0.03 * (upper - lower)
-    points = jm.grid(lower - margin, upper + margin, (s.sweep, s.sweep))
-    clock = time.perf_counter
-    begun = clock()
-    jm.map_feasible_set(mpc, points[:: max(len(points) // 8192, 1)][:8192], chunk=8192)
-    compiling, begun = clock() - begun, clock()
-    found = tune_sweep_penalties(mpc, points, chunk=8192)
-    learning = clock() - begun
-    print(f"{s.problem}, {len(points):,} states; compiling {compiling:.1f} s")
-    print(
-        f"  learning {learning:.1f} s, first pass decides {found.before['decided']:.2%} -> ", end=""
-    )
-    print(f"{found.after['decided']:.2%} of the validation set")
-    times: dict[bool, list[float]] = {False: [], True: []}
-    labels = {}
-    for _ in range(3 if len(points) < 2**18 else 1):
-        for learned in times:
-            penalties = found.penalties if learned else None
-            begun = clock()
-            fmap = jm.map_feasible_set(mpc, points, chunk=8192, penalties=penalties)
-            times[learned].append(clock() - begun)
-            labels[learned] = fmap.label
-    for learned, spent in times.items():
-        count = int(np.sum(labels[learned] == 0))
-        name = "learned" if learned else "equal"
-        print(f"  {name:<8} {min(spent):8.2f} s, {count} undecided")
-    both = (labels[True] != 0) & (labels[False] != 0)
-    print(f"  labels that differ: {np.sum((labels[True] != labels[False]) & both)}")
-
-
 def main() -> None:
     """Print."""
     s = tyro.cli(Settings, description=__doc__)
-    if s.sweep:
-        sweeps(s)
-        return
     with jax.enable_x64(True):
         report(s)
 

@@ -3,7 +3,7 @@
     python experiments/programs.py
 
 A program counts as traced where Python functions became a jaxpr and as compiled where XLA made an
-executable of it. Times, memory and growth: `jaxmpc bench`.
+executable of it. Times, memory and growth: `python experiments/bench`.
 """
 
 import functools

@@ -7,7 +7,7 @@ Closed loops   load_robot, LinearPlant, robot_mpc, RobotController, simulate, si
 Proofs         map_feasible_set, boundary, feasible_polytope, recursive_feasibility,
                verify_terminal, exact_penalty, offline_report
 Sets and laws  lqr, maximal_invariant_set, maximal_control_invariant_set, invariant_ellipsoid
-Tuning         tune_weights, tune_penalties with Parameter and ClosedLoopLoss
+Tuning         tune_weights, tune_solver with Parameter and ClosedLoopLoss
 
 The rest, and the types of all results, are in `qp`, `systems`, `sets`, `mpc`, `feasible`, `verify`,
 `recursion`, `explicit`, `export`, `robots`, `robot_maps`, `closed_loop`, `tuning` and `workflow`.
@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from jaxmpc.systems.system import LinearSystem
     from jaxmpc.tuning.losses import ClosedLoopLoss
     from jaxmpc.tuning.parameters import Parameter
-    from jaxmpc.tuning.penalties import tune_penalties
+    from jaxmpc.tuning.solver import tune_solver
     from jaxmpc.tuning.weights import tune_weights
     from jaxmpc.workflow import design, offline_report
 
@@ -117,7 +117,7 @@ __all__ = [
     "solve_many",
     "solve_qp",
     "systems",
-    "tune_penalties",
+    "tune_solver",
     "tune_weights",
     "tuning",
     "verify",
@@ -153,7 +153,7 @@ HOMES = {
     "systems.system": "LinearSystem",
     "tuning.losses": "ClosedLoopLoss",
     "tuning.parameters": "Parameter",
-    "tuning.penalties": "tune_penalties",
+    "tuning.solver": "tune_solver",
     "tuning.weights": "tune_weights",
     "workflow": "design offline_report",
 }

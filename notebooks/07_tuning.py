@@ -160,12 +160,12 @@ right.legend()
 fig.tight_layout()
 
 # %% [markdown]
-# `tune_penalties` learns this step size by gradient through the ADMM steps: one value for each
+# `tune_solver` learns this step size by gradient through the ADMM steps: one value for each
 # group of rows and each quarter of the iterations. Its start is the best constant, and
 # what it returns is never worse on the validation states than the solver that it is compared with.
 
 # %%
-penalties = jm.tune_penalties(run.mpc, states, iterations=48, updates=30, batch=16)
+penalties = jm.tune_solver(run.mpc, states, iterations=48, updates=30, batch=16)
 print("solved to 1e-6:", penalties.before["solved"], "->", penalties.after["solved"])
 print("median residual:", penalties.before["residual"], "->", penalties.after["residual"])
 assert penalties.after["solved"] >= penalties.before["solved"]

@@ -581,10 +581,10 @@ CALLS = [
         lambda: jm.simulate_many("c", S, np.zeros((2, 2)), 3),
     ),
     ('parameters: is a dict. Give {"Q":', lambda: jm.tune_weights("m", {}, S, x, 3, 4)),
-    ("mpc: is a str. Give a jm.MPC", lambda: jm.tune_penalties("m", np.zeros((3, 2)), 5)),
+    ("mpc: is a str. Give a jm.MPC", lambda: jm.tune_solver("m", np.zeros((3, 2)), 5)),
     (
         "iterations: 0. Give a whole number of at",
-        lambda: jm.tune_penalties(M, np.zeros((30, 2)), 0),
+        lambda: jm.tune_solver(M, np.zeros((30, 2)), 0),
     ),
     ("position: 'x' where real numbers are", lambda: jm.joint_limits("x")),
     ("robot: is a str. Give a Robot or a", lambda: jm.robot_mpc("joint")),

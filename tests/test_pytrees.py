@@ -28,7 +28,7 @@ def problem(**changes):
 def classes():
     """Each dataclass of the package that is not of the command line."""
     for module in pkgutil.walk_packages(jm.__path__, "jaxmpc."):
-        if not module.name.startswith(("jaxmpc.app", "jaxmpc.__main__", "jaxmpc.bench")):
+        if not module.name.startswith(("jaxmpc.app", "jaxmpc.__main__")):
             found = vars(importlib.import_module(module.name)).values()
             yield from (
                 c for c in found

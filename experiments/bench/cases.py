@@ -147,9 +147,14 @@ def measure(
     """
     mpc = case.states[0]
     common: dict[str, Any] = dict(
-        what=case.what, family=case.family, horizon=mpc.horizon, batch=case.batch,
-        tolerance=case.tolerance, variables=len(case.condensed.P), rows=len(case.condensed.C),
-    )  # fmt: skip
+        what=case.what,
+        family=case.family,
+        horizon=mpc.horizon,
+        batch=case.batch,
+        tolerance=case.tolerance,
+        variables=len(case.condensed.P),
+        rows=len(case.condensed.C),
+    )
     rows: dict[str, Row] = {}
     running = []
     for each in _contestants(case):
@@ -166,11 +171,20 @@ def measure(
         solved, false = each.judge(answer)
         work, once = each.work(), max(cold - compiling[0], 1e-9)
         rows[each.name] = Row(
-            **common, solver=each.name, version=each.version, states=each.states,
-            extrapolated=each.states < case.batch, microseconds=_each(once, each), solved=solved,
-            false=false, cold_seconds=cold, compile_seconds=compiling[0], warm_seconds=once,
-            work=work, **each.extra(answer),
-        )  # fmt: skip
+            **common,
+            solver=each.name,
+            version=each.version,
+            states=each.states,
+            extrapolated=each.states < case.batch,
+            microseconds=_each(once, each),
+            solved=solved,
+            false=false,
+            cold_seconds=cold,
+            compile_seconds=compiling[0],
+            warm_seconds=once,
+            work=work,
+            **each.extra(answer),
+        )
         if once <= PATIENCE:
             running.append(each)
         yield _compared(rows, ceilings)
@@ -465,9 +479,13 @@ def _best_each(each: Callable[[], Any], states: int) -> float:
 
 
 def _differentiated(
-    case: Case, name: str, release: str, count: int, loss: Callable[..., Any],
+    case: Case,
+    name: str,
+    release: str,
+    count: int,
+    loss: Callable[..., Any],
     judge: Callable[[Any], tuple[float | None, int | None]],
-) -> Contestant:  # fmt: skip
+) -> Contestant:
     """Return a contestant whose loss(weights, x) -> (value, more) JAX differentiates."""
     mpc, x = case.states
     weights, there = weights_of(mpc), jnp.asarray(x[:count])
@@ -621,6 +639,12 @@ def _own_loops(case: Case) -> Iterator[Contestant]:
         return {"forward_microseconds": spent}
 
     yield Contestant(
-        OURS[0], __version__, len(x), prepare, judge, per=SAMPLES, extra=extra,
+        OURS[0],
+        __version__,
+        len(x),
+        prepare,
+        judge,
+        per=SAMPLES,
+        extra=extra,
         work=lambda: Work.of(both, weights, there),
-    )  # fmt: skip
+    )

@@ -1,4 +1,4 @@
-"""The command `jaxmpc bench`."""
+"""How fast is jaxmpc on this machine, beside other solvers: `python experiments/bench`."""
 
 import dataclasses
 import itertools
@@ -6,18 +6,27 @@ import os
 import platform
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, cast
 
-from jaxmpc.app.commands.options import Switch, check_counts, option, print_table, refuse
+import jax
+import tyro
+from bench.cases import OURS, Case, Row, What, measure
+from bench.families import FAMILIES, problem
+from bench.growth import Growth, Point, exponents
+from bench.plots import plot_bench, plot_growth
+from bench.rivals import RIVALS
+from bench.roofline import Ceilings
+from matplotlib.figure import Figure
+
+from jaxmpc.batches import workers
 from jaxmpc.checks import available_memory, fail, in_units, nearest
-from jaxmpc.files import open_folder, remove_files, versions, write_json
+from jaxmpc.files import remove_files, versions, write_json
 
-if TYPE_CHECKING:
-    from jaxmpc.bench import Case, Ceilings, Point, Row
-
+PROG = "python experiments/bench"
+KINDS = ("labels", "plans", "gradients", "loops", "none")
 # What is measured where no option says otherwise.
 USUAL: dict[str, Any] = {
     "what": ("labels", "plans", "gradients"),
@@ -36,6 +45,14 @@ QUICK: dict[str, Any] = USUAL | {
 }
 MOST_BATCH = 2**20
 FILES = ("bench.json", "bench.png", "growth.png")
+
+
+def option(metavar: str, default: str) -> Any:
+    """Return the tyro annotation that sets how an option and its default appear in the help."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
+
+
+Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,10 +77,10 @@ class Bench:
         --growth   time and memory against batch, horizon N and number of states n, with exponents
 
     How to start
-      $ jaxmpc bench --quick                     # about a minute on two cores
-      $ jaxmpc bench --what plans --families joint springs4 --batches 1024 16384
-      $ jaxmpc bench --what loops --families turbompc --batches 64 1024
-      $ jaxmpc bench --growth --what none
+      $ python experiments/bench --quick          # about a minute on two cores
+      $ python experiments/bench --what plans --families joint springs4 --batches 1024 16384
+      $ python experiments/bench --what loops --families turbompc --batches 64 1024
+      $ python experiments/bench --growth --what none
       Without options: some twenty minutes on two cores.
 
     How to read the output
@@ -89,11 +106,10 @@ class Bench:
                    130 stopped by Ctrl-C.
     """
 
-    what: Annotated[
-        tuple[Literal["labels", "plans", "gradients", "loops", "none"], ...] | None,
-        option("{labels,plans,gradients,loops,none} [...]", "labels plans gradients"),
-    ] = None
-    """What to measure."""
+    what: Annotated[tuple[str, ...] | None, option("WHAT [WHAT ...]", "labels plans gradients")] = (
+        None
+    )
+    """What to measure: labels, plans, gradients, loops; or none."""
     families: Annotated[
         tuple[str, ...] | None, option("NAME [NAME ...]", "joint springs4 springs8 turbompc")
     ] = None
@@ -120,18 +136,6 @@ class Bench:
     output: Annotated[Path, option("DIR", "jaxmpc-bench")] = Path("jaxmpc-bench")
     """Folder for the files; made where absent. Files of an earlier run there are replaced."""
 
-    keeps = ""
-
-    def run(self) -> int:
-        """Measure, print the tables, write the files; return 130 where Ctrl-C stopped it.
-
-        Raises ValueError for options that make no sense, before anything compiles.
-        """
-        command = self.settled()
-        command.check()
-        open_folder(self.output)
-        return Record(command).run()
-
     def settled(self) -> "Bench":
         """Return the command with values for the options that are not given."""
         usual = QUICK if self.quick else USUAL
@@ -140,10 +144,11 @@ class Bench:
 
     def check(self) -> None:
         """Raise ValueError for options that make no sense."""
-        from jaxmpc.bench import FAMILIES, RIVALS
-
-        check_counts(self, loop=1, rounds=1, seed=0)
-        for name, known in (("families", FAMILIES), ("rivals", (*RIVALS, "none"))):
+        for name, known in (
+            ("what", KINDS),
+            ("families", tuple(FAMILIES)),
+            ("rivals", (*RIVALS, "none")),
+        ):
             for value in getattr(self, name) or ():
                 if value not in known:
                     there = f"There are {', '.join(known)}"
@@ -154,51 +159,60 @@ class Bench:
         for name in ("what", "rivals"):
             if "none" in (getattr(self, name) or ()) and len(getattr(self, name)) > 1:
                 fail(f"--{name}", "none beside others", "Give none alone")
-        for name, most in (("batches", MOST_BATCH), ("horizons", 10_000)):
-            for value in getattr(self, name) or ():
-                if not 1 <= value <= most:
-                    fail(f"--{name}", f"{value}", f"Give whole numbers from 1 to {most}")
+        for name, least, most in (
+            ("batches", 1, MOST_BATCH),
+            ("horizons", 1, 10_000),
+            ("loop", 1, MOST_BATCH),
+            ("rounds", 1, 10_000),
+            ("seed", 0, 2**31 - 1),
+        ):
+            given = getattr(self, name)
+            for value in given if isinstance(given, tuple) else [given] * (given is not None):
+                if not least <= value <= most:
+                    fail(f"--{name}", f"{value}", f"Give whole numbers from {least} to {most}")
         for value in self.tolerances or ():
             if not 1e-12 <= value < 1:
                 fail("--tolerances", f"{value}", "Give numbers from 1e-12 to below 1")
         if self.what == ("none",) and not self.growth:
             fail("--what", "none without --growth", "Name what to measure")
-        if self.what == ("none",):
-            refuse({"horizons": self.horizons}, None, "Growth takes horizons of its own")
+        if self.what == ("none",) and self.horizons is not None:
+            fail("--horizons", "given beside --what none", "Growth takes horizons of its own")
 
     def chosen(self) -> tuple[str, ...]:
         """Return the rivals that are asked for, installed or not."""
-        from jaxmpc.bench import RIVALS
-
         given = tuple(RIVALS) if self.rivals is None else self.rivals
         return () if given == ("none",) else given
 
-    def cases(self) -> Iterator["Case"]:
+    def cases(self) -> Iterator[Case]:
         """Yield what is to be compared."""
-        from bench.cases import OURS
-        from jaxmpc.bench import Case
-
         least = (min(self.tolerances or (1e-6,)),)
         tolerances = {"labels": (1e-6,), "plans": self.tolerances}
         for what in self.what or ():
             if what == "none":
                 continue
             for family, horizon, batch, tolerance in itertools.product(
-                self.families or (), self.horizons or (None,), self.batches or (),
+                self.families or (),
+                self.horizons or (None,),
+                self.batches or (),
                 tolerances.get(what) or least,
-            ):  # fmt: skip
+            ):
                 yield Case(
-                    what, family, batch, tolerance, horizon, (*OURS, *self.chosen()),
-                    self.loop or 1, self.rounds or 1, self.seed,
-                )  # fmt: skip
+                    cast(What, what),
+                    family,
+                    batch,
+                    tolerance,
+                    horizon,
+                    solvers=(*OURS, *self.chosen()),
+                    loop=self.loop or 1,
+                    rounds=self.rounds or 1,
+                    seed=self.seed,
+                )
 
 
 class Record:
     """A run of the command: its rows so far, printed case by case and written after each call."""
 
     def __init__(self, command: Bench) -> None:
-        from jaxmpc.bench import RIVALS
-
         self.command = command
         self.rows: list[Row] = []
         self.points: list[Point] = []
@@ -214,9 +228,6 @@ class Record:
 
     def run(self) -> int:
         """Measure all of it and return the exit code."""
-        import jax
-        from jaxmpc.bench import Ceilings
-
         try:
             with jax.enable_x64(True):
                 self.ceilings = Ceilings.measure()
@@ -230,13 +241,11 @@ class Record:
         remove_files(self.command.output, *FILES)
         self.write()
         files = ["bench.json", *self.draw()]
-        print_table([("files", " ".join(str(self.command.output / name) for name in files))], 6)
+        print("  files ", *(self.command.output / name for name in files))
         return 0 if self.complete else 130
 
     def compare(self) -> None:
         """Measure the cases, print a table of each."""
-        from jaxmpc.bench import Ceilings, measure, problem
-
         for case in self.command.cases():
             if case.what == "labels" and problem(case.family).states is None:
                 self.note(f"labels of {case.family} left out: no state limits, all are feasible")
@@ -255,18 +264,17 @@ class Record:
 
     def grow(self) -> None:
         """Measure growth and print its table."""
-        from bench.growth import exponents
-        from jaxmpc.bench import Growth
-
         print("growth of jax.vmap(controller.plan)")
-        print(f"  {'':6}{'family':>12}{'batch':>10}{'N':>6}{'n':>5}{'variables':>11}"
-              f"{'seconds':>10}{'µs each':>10}{'memory':>11}{'solved':>9}")  # fmt: skip
+        print(
+            f"  {'':6}{'family':>12}{'batch':>10}{'N':>6}{'n':>5}{'variables':>11}"
+            f"{'seconds':>10}{'µs each':>10}{'memory':>11}{'solved':>9}"
+        )
         family = (self.command.families or ("joint",))[0]
         for point in Growth(family, seed=self.command.seed).run():
             self.points.append(point)
             self.write()
-            print(f"  {point.axis:6}{point.family:>12}{point.batch:>10,}{point.horizon:>6}"
-                  f"{point.states:>5}{point.variables:>11}", end="")  # fmt: skip
+            size = f"{point.batch:>10,}{point.horizon:>6}{point.states:>5}{point.variables:>11}"
+            print(f"  {point.axis:6}{point.family:>12}{size}", end="")
             memory = f"{in_units(point.memory):>11}"
             if point.seconds is None:
                 print(f"{'':20}{memory}  {point.note}", flush=True)
@@ -286,10 +294,8 @@ class Record:
 
     def document(self) -> dict[str, Any]:
         """Return all that is known so far as JSON data."""
-        from bench.growth import exponents
-
         return {
-            "command": shlex.join(["jaxmpc", *sys.argv[1:]]),
+            "command": shlex.join([*PROG.split(), *sys.argv[1:]]),
             "date": self.date,
             "complete": self.complete,
             "settings": {
@@ -312,17 +318,14 @@ class Record:
 
     def draw(self) -> list[str]:
         """Write the plots of what there is and return their names."""
-        from bench.plots import plot_bench, plot_growth
-
-        from jaxmpc.app.plots.style import save
-
-        figures = {}
+        figures: dict[str, Figure] = {}
         if self.rows:
             figures["bench.png"] = plot_bench(self.rows)
         if self.points:
             figures["growth.png"] = plot_growth(self.points)
         for name, figure in figures.items():
-            save(figure, self.command.output / name)
+            path = self.command.output / name
+            figure.savefig(path, dpi=150, bbox_inches="tight", pad_inches=0.15)
         return list(figures)
 
     def print_head(self) -> None:
@@ -330,26 +333,23 @@ class Record:
         m, c = self.machine, self.ceilings
         assert c is not None
         devices = f"{m['devices']} x {m['device']}"
+        operations = f"{c.gflops32:,.0f} GFLOP/s float32, {c.gflops64:,.0f} float64"
         rows = [
             ("machine", f"{m['cpu']}, {m['cores']} cores, {in_units(m['memory'])}"),
             ("device", devices if m["backend"] != "cpu" else "the CPU"),
             ("jaxmpc", ", ".join(f"{k} {self.versions[k]}" for k in ("python", "jax", "numpy"))),
             ("rivals", ", ".join(f"{k} {v}" for k, v in self.rivals.items()) or "none"),
-            ("ceilings", f"{c.gflops32:,.0f} GFLOP/s float32, {c.gflops64:,.0f} float64, "
-                         f"{c.gigabytes:,.1f} GB/s"),
-        ]  # fmt: skip
+            ("ceilings", f"{operations}, {c.gigabytes:,.1f} GB/s"),
+        ]
         if self.skipped:
             rows.append(("skipped", f"not installed: {', '.join(self.skipped)}"))
-        print_table(rows, 9)
+        for name, value in rows:
+            print(f"  {name:<9} {value}")
         print(flush=True)
 
 
 def machine() -> dict[str, Any]:
     """Return what the machine is: processor, cores this process may use, memory, devices."""
-    import jax
-
-    from jaxmpc.batches import workers
-
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         cpu = next(
@@ -375,15 +375,17 @@ def machine() -> dict[str, Any]:
     }
 
 
-def print_case(rows: list["Row"]) -> None:
+def print_case(rows: list[Row]) -> None:
     """Print the table of one case."""
     if not rows:
         return
     r = rows[0]
-    print(f"{r.what}: {r.family}, N = {r.horizon}, {r.batch:,} states, {r.variables} variables, "
-          f"{r.rows} rows, to {r.tolerance:g}")  # fmt: skip
-    print(f"  {'':13}{'µs each':>12} {'best/this':>10}{'solved':>9}{'false':>7}{'cold s':>9}"
-          f"{'compile s':>11}  ceiling")  # fmt: skip
+    size = f"{r.batch:,} states, {r.variables} variables, {r.rows} rows"
+    print(f"{r.what}: {r.family}, N = {r.horizon}, {size}, to {r.tolerance:g}")
+    print(
+        f"  {'':13}{'µs each':>12} {'best/this':>10}{'solved':>9}{'false':>7}{'cold s':>9}"
+        f"{'compile s':>11}  ceiling"
+    )
     for r in sorted(rows, key=lambda r: r.microseconds):
         mark = "~" if r.extrapolated else ""
         speedup = "" if r.speedup is None else f"{r.speedup:.2f}"
@@ -397,9 +399,27 @@ def print_case(rows: list["Row"]) -> None:
         if r.proofs_microseconds is not None:
             more += f"  with all proofs {r.proofs_microseconds:.2f} µs"
         each = f"{mark}{r.microseconds:.2f}"
-        print(f"  {r.solver:13}{each:>12} {speedup:>10}{solved:>9}{false:>7}"
-              f"{r.cold_seconds:>9.2f}{r.compile_seconds:>11.2f}  {more.strip(', ')}")  # fmt: skip
+        seconds = f"{r.cold_seconds:>9.2f}{r.compile_seconds:>11.2f}"
+        found = f"{each:>12} {speedup:>10}{solved:>9}{false:>7}"
+        print(f"  {r.solver:13}{found}{seconds}  {more.strip(', ')}")
     some = sorted({r.states for r in rows if r.extrapolated})
     if some:
         print(f"  ~ over {' or '.join(map(str, some))} of the states, extrapolated")
     print(flush=True)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure, print the tables, write the files; return the exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    try:
+        command = tyro.cli(Bench, prog=PROG, args=words).settled()
+        command.check()
+        command.output.mkdir(parents=True, exist_ok=True)
+        record = Record(command)
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    except (ValueError, OSError) as error:
+        where = f"--output: {error.strerror}" if isinstance(error, OSError) else str(error)
+        print(f"{PROG}: error: {where}", file=sys.stderr)
+        return 2
+    return record.run()

@@ -26,14 +26,24 @@ BLOCK = 8192
 
 
 def regulator(
-    A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray, horizon: int, x: np.ndarray,
+    A: np.ndarray,
+    B: np.ndarray,
+    Q: np.ndarray,
+    R: np.ndarray,
+    horizon: int,
+    x: np.ndarray,
     u: np.ndarray,
-) -> MPC:  # fmt: skip
+) -> MPC:
     """The problem |x_k| ≤ x, |u_k| ≤ u with the LQR's terminal cost."""
     return MPC(
-        LinearSystem(A, B), Q, R, horizon, states=Box(-x, x), inputs=Box(-u, u),
+        LinearSystem(A, B),
+        Q,
+        R,
+        horizon,
+        states=Box(-x, x),
+        inputs=Box(-u, u),
         terminal_cost=solve_discrete_are(A, B, Q, R),
-    )  # fmt: skip
+    )
 
 
 def sampled(Ac: np.ndarray, Bc: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
@@ -46,10 +56,14 @@ def joint() -> MPC:
     """The lesson's joint: angle and rate, torque."""
     Q = np.diag([50.0, 1.0])
     return MPC(
-        LinearSystem(np.array([[1, 0.01], [0, 1]]), np.array([[0], [0.2]])), Q,
-        np.array([[0.1]]), 20, states=Box(np.array([-1.5, -2]), np.array([1.5, 2])),
-        inputs=Box(np.array([-2.0]), np.array([2.0])), terminal_cost=Q,
-    )  # fmt: skip
+        LinearSystem(np.array([[1, 0.01], [0, 1]]), np.array([[0], [0.2]])),
+        Q,
+        np.array([[0.1]]),
+        20,
+        states=Box(np.array([-1.5, -2]), np.array([1.5, 2])),
+        inputs=Box(np.array([-2.0]), np.array([2.0])),
+        terminal_cost=Q,
+    )
 
 
 def springs(masses: int, horizon: int) -> MPC:
@@ -102,9 +116,13 @@ def turbompc(
     B, c, x0 = random.randn(n, m), 0.01 * random.randn(n), 5 * random.randn(batch, n)
     limit = np.full(m, umax)
     mpc = MPC(
-        LinearSystem(A, B, c), np.eye(n), np.eye(m), horizon, inputs=Box(-limit, limit),
+        LinearSystem(A, B, c),
+        np.eye(n),
+        np.eye(m),
+        horizon,
+        inputs=Box(-limit, limit),
         terminal_cost=np.eye(n),
-    )  # fmt: skip
+    )
     return mpc, x0
 
 

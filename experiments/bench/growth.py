@@ -85,12 +85,12 @@ class Growth:
         begun = time.perf_counter()
         shape = jax.ShapeDtypeStruct((batch, n), np.float64)
         compiled = program.lower(controller, shape).compile()
-        point = partial(
-            Point, axis, value, family, batch, mpc.horizon, n,
-            controller.condensed.P.shape[0] if controller.condensed else 0,
-            memory_of(compiled), time.perf_counter() - begun,
-        )  # fmt: skip
-        if memory_of(compiled) > free_memory():
+        memory = memory_of(compiled)
+        variables = controller.condensed.P.shape[0] if controller.condensed else 0
+        compile_seconds = time.perf_counter() - begun
+        size = (axis, value, family, batch, mpc.horizon, n, variables)
+        point = partial(Point, *size, memory, compile_seconds)
+        if memory > free_memory():
             return point(None, None, "does not fit into memory")
         if expected > LONGEST:
             return point(None, None, f"would take about {expected:.0f} s")

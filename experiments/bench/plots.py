@@ -1,10 +1,11 @@
-"""Plots of `jaxmpc bench`: time a state against the batch, and growth."""
+"""Plots of `python experiments/bench`: time a state against the batch, and growth."""
 
+from itertools import product
 from typing import Any
 
 import numpy as np
-from bench.growth import exponents
-from jaxmpc.bench import Point, Row
+from bench.cases import Row
+from bench.growth import Point, exponents
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -32,15 +33,12 @@ def plot_bench(rows: list[Row]) -> Figure:
     size = (3.2 * len(problems) + 1.9, 2.7 * len(kinds) + 0.4)
     figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(len(kinds), len(problems), squeeze=False, sharex=True, sharey="row")
-    for (i, (what, tolerance)), (j, (family, horizon)) in (
-        (a, b) for a in enumerate(kinds) for b in enumerate(problems)
+    for (i, (what, tolerance)), (j, (family, horizon)) in product(
+        enumerate(kinds), enumerate(problems)
     ):
         ax = panels[i, j]
-        here = [
-            row for row in rows
-            if (row.what, row.tolerance, row.family, row.horizon)
-            == (what, tolerance, family, horizon)
-        ]  # fmt: skip
+        wanted = (what, tolerance, family, horizon)
+        here = [r for r in rows if (r.what, r.tolerance, r.family, r.horizon) == wanted]
         ax.set_title(f"{what} to {tolerance:g}: {family}, N = {horizon}", fontsize=9)
         if not here:
             ax.set_axis_off()
@@ -52,8 +50,7 @@ def plot_bench(rows: list[Row]) -> Figure:
             x, y = [row.batch for row in mine], [row.microseconds for row in mine]
             ax.plot(x, y, **{**style, "marker": ""})
             for hollow in (False, True):
-                points = [(a, b) for a, b, r in zip(x, y, mine, strict=True)
-                          if r.extrapolated == hollow]  # fmt: skip
+                points = [(r.batch, r.microseconds) for r in mine if r.extrapolated == hollow]
                 if points:
                     face = "white" if hollow else style["color"]
                     ax.plot(*np.transpose(points), **{**style, "ls": "", "mfc": face}, ms=5)
@@ -86,8 +83,8 @@ def plot_growth(points: list[Point]) -> Figure:
     for j, axis in enumerate(axes):
         for i, (quantity, unit) in enumerate((("seconds", "s"), ("memory", "bytes"))):
             ax = panels[i, j]
-            known = np.array([(p.value, getattr(p, quantity)) for p in points
-                              if p.axis == axis and getattr(p, quantity)], float)  # fmt: skip
+            on_axis = [(p.value, getattr(p, quantity)) for p in points if p.axis == axis]
+            known = np.array([(size, value) for size, value in on_axis if value], float)
             ax.set_xscale("log", base=2)
             ax.set_yscale("log")
             ax.grid(True, which="major", color="0.9", lw=0.6)

@@ -134,9 +134,16 @@ def osqp(qps: Batch, tolerance: float) -> Call:
     solver = osqp.OSQP()
     P, A = sparse.csc_matrix(np.triu(qps.P)), sparse.csc_matrix(qps.A)
     solver.setup(
-        P, qps.q[0], A, qps.l[0], qps.u[0], eps_abs=tolerance, eps_rel=0.0, max_iter=20_000,
+        P,
+        qps.q[0],
+        A,
+        qps.l[0],
+        qps.u[0],
+        eps_abs=tolerance,
+        eps_rel=0.0,
+        max_iter=20_000,
         verbose=False,
-    )  # fmt: skip
+    )
     known = {1: SOLVED, 3: EMPTY}
 
     def one(i: int) -> tuple[Any, Any, int]:
@@ -201,17 +208,23 @@ def moreau(qps: Batch, tolerance: float, gradient: bool = False) -> Call:
     G, h, multiplier = _one_sided(qps)
     P, A = sparse.csr_matrix(qps.P), sparse.csr_matrix(G)
     solver = moreau.CompiledSolver(
-        n=len(qps.P), m=len(G), P_row_offsets=P.indptr, P_col_indices=P.indices,
-        A_row_offsets=A.indptr, A_col_indices=A.indices,
+        n=len(qps.P),
+        m=len(G),
+        P_row_offsets=P.indptr,
+        P_col_indices=P.indices,
+        A_row_offsets=A.indptr,
+        A_col_indices=A.indices,
         cones=moreau.Cones(num_nonneg_cones=len(G)),
         settings=moreau.Settings(
-            device="cpu", batch_size=len(qps), enable_grad=gradient,
+            device="cpu",
+            batch_size=len(qps),
+            enable_grad=gradient,
             ipm_settings=moreau.IPMSettings(
                 tol_gap_abs=tolerance, tol_gap_rel=1e-15, tol_feas=tolerance
             ),
             active_set_settings=moreau.ActiveSetSettings(primal_tol=min(1e-6, tolerance)),
         ),
-    )  # fmt: skip
+    )
     solver.setup(P.data, A.data)
     known = {"Solved": SOLVED, "PrimalInfeasible": EMPTY}
 

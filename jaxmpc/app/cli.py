@@ -35,7 +35,7 @@ DESCRIPTION = "Constrained MPC in batches, with proofs. Also: jaxmpc --version"
 # Options of tyro that write a completion script for a shell, and the words that each needs.
 COMPLETIONS = {"--tyro-print-completion": 2, "--tyro-write-completion": 3}
 TUNE = "Learn what is usually guessed: an MPC's weights, or the penalties of its solver."
-TUNERS = {"weights": ("tune", "TuneWeights"), "penalties": ("tune_penalties", "TunePenalties")}
+TUNERS = {"weights": ("tune", "TuneWeights"), "solver": ("tune_solver", "TuneSolver")}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

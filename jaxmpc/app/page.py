@@ -11,7 +11,7 @@ from jaxmpc.checks import fail
 from jaxmpc.files import text_within
 
 # What the commands write their results to.
-RESULTS = ("summary.json", "tuning.json", "penalties.json")
+RESULTS = ("summary.json", "tuning.json", "solver.json")
 STYLE = (
     "body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem}"
     "table{border-collapse:collapse;margin:.5rem 0}td,th{text-align:left;vertical-align:top;"

@@ -21,7 +21,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-# Commands that keep programs: all but `bench`, which measures compiling, among others.
+# Commands that keep programs: those that compile for more than some seconds.
 KEEPING = ("sweep", "recursion", "simulate", "tune", "info", "verify")
 # Bytes that all entries may take; the oldest go first.
 LIMIT = 2**28

@@ -47,7 +47,7 @@ def export_c(
     ADMM (50 where that is None) and none of Newton's: `solver` is taken with newton_steps=0.
     Nothing is allocated and no loop depends on data but for the branches of a projection, so the
     time of a call hardly varies. What it returns as status comes from residuals that it computes
-    itself. Choose iterations and rho with `tune_penalties`, or watch the status along closed loops.
+    itself. Choose iterations and rho with `tune_solver`, or watch the status along closed loops.
 
     References are constant over the horizon. Inputs in a Box are clipped into it.
 

@@ -321,8 +321,8 @@ def map_feasible_set(
     ADMM stage alone and cannot make a label wrong. The last undecided points, up to 2,000 in a
     call, get linear programs of some milliseconds each, an equal share of each chunk. chunk: number
     of points that a compiled program takes at once (None: by device). gap: call
-    `FeasibleSetMap.refine` with this gap, None to skip it. penalties: of the ADMM stage, from
-    `tune_sweep_penalties`. progress: show a bar. executor: what labels the chunks, such as a
+    `FeasibleSetMap.refine` with this gap, None to skip it. penalties: of the ADMM stage.
+    progress: show a bar. executor: what labels the chunks, such as a
     `concurrent.futures.ProcessPoolExecutor` with the start method spawn, or the executor of a
     cluster: `submit(function, *arguments)` returns a future with `result()`. Labels and proofs are
     those without it, bit for bit on processors of one kind. A chunk whose worker died is submitted

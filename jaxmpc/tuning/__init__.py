@@ -4,8 +4,7 @@ tune_weights                              fields of an MPC, through its closed l
 Parameter                                 a quantity that is tuned, and its domain
 ClosedLoopLoss                            tracking, effort, violations and settling
 tune_feasible_set                         the share of states from which all limits can be kept
-tune_penalties, transfer_penalties        penalties of ADMM, also for another horizon
-tune_sweep_penalties                      penalties of the first stage of a map
+tune_solver, transfer_penalties        penalties of ADMM, also for another horizon
 Settings, TuningRun, Descent              arguments and results of all of these
 Interrupted                               what they raise on Ctrl-C, with the best so far
 """
@@ -14,11 +13,10 @@ from jaxmpc.tuning.descent import Descent
 from jaxmpc.tuning.feasible_set import tune_feasible_set
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
-from jaxmpc.tuning.penalties import tune_penalties
 from jaxmpc.tuning.penalty_schedule import transfer_penalties
 from jaxmpc.tuning.result import Interrupted, TuningRun
 from jaxmpc.tuning.settings import Settings
-from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
+from jaxmpc.tuning.solver import tune_solver
 from jaxmpc.tuning.weights import tune_weights
 
 __all__ = [
@@ -30,7 +28,6 @@ __all__ = [
     "TuningRun",
     "transfer_penalties",
     "tune_feasible_set",
-    "tune_penalties",
-    "tune_sweep_penalties",
+    "tune_solver",
     "tune_weights",
 ]

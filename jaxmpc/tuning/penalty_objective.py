@@ -150,7 +150,7 @@ def _solve_batch(
 
 
 def score(status: np.ndarray, worst: np.ndarray) -> dict[str, float]:
-    """Return how well samples were solved, as `tune_penalties` documents it.
+    """Return how well samples were solved, as `tune_solver` documents it.
 
     loss: the states that are not solved, plus a fraction of one that grows with the median
     residual from 1e-16 to 1e16: less is better. solved: fraction SOLVED. residual: median of the

@@ -47,7 +47,7 @@ def interpolation(
 
 
 def transfer_penalties(run: TuningRun, mpc: MPC, iterations: int | None = None) -> ADMM:
-    """Return the solver that `tune_penalties` found, for a problem with another horizon.
+    """Return the solver that `tune_solver` found, for a problem with another horizon.
 
     run: of groups="step", unless mpc has the very rows of the problem tuned. Its penalties are
     interpolated at k/N. mpc: a problem with the same blocks of rows. iterations: None for those

@@ -62,8 +62,8 @@ class TuningRun:
     def result(self) -> Any:
         """Return the tuned object, with the values found.
 
-        From `tune_weights` a controller, from `tune_feasible_set` an MPC, from `tune_penalties`
-        an ADMM, from `tune_sweep_penalties` the penalties for `map_feasible_set`.
+        From `tune_weights` a controller, from `tune_feasible_set` an MPC, from `tune_solver`
+        an ADMM.
         """
         return self.build(self.values)
 

@@ -206,7 +206,7 @@ def test_wrong_usage(arguments, capsys):
 
 @pytest.mark.parametrize(
     ("line", "names"),
-    [("--help", "init sweep recursion info simulate tune"), ("tune --help", "weights penalties")],
+    [("--help", "init sweep recursion info simulate tune"), ("tune --help", "weights solver")],
 )
 def test_help_has_a_line_for_each_command(line, names, capsys):
     with pytest.raises(SystemExit) as caught:

@@ -104,8 +104,8 @@ def test_file_systems_without_links(monkeypatch, links):
 
 
 def test_switches(tmp_path, monkeypatch):
-    """JAXMPC_CACHE=off, the user's own folder, a command that measures, no folder at all."""
-    with kept_programs(["bench"]):
+    """JAXMPC_CACHE=off, the user's own folder, a command that compiles little, no folder at all."""
+    with kept_programs(["report"]):
         assert VARIABLE not in os.environ
     monkeypatch.setenv("JAXMPC_CACHE", "off")
     with kept_programs(["simulate"]):

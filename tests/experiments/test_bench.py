@@ -1,4 +1,4 @@
-"""jaxmpc bench: answers are judged by residuals of its own, and nothing measured is lost."""
+"""`python experiments/bench`: answers are judged by residuals of its own, nothing is lost."""
 
 import json
 import shlex
@@ -8,22 +8,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bench import cases, rivals
-from bench import command as command
+from bench import cases, command, rivals
+from bench.cases import Case, Row, measure
 from bench.growth import Growth, Point, exponents
+from bench.rivals import RIVALS, Batch, Rival, residuals
+from bench.roofline import Ceilings, Work
 
-from jaxmpc import bench
-from jaxmpc.app import cli
 from jaxmpc.qp.status import Status
 
-PLANS = "bench --what plans --families joint --horizons 3 --batches 8 --tolerances 1e-6 --rounds 1"
+PLANS = "--what plans --families joint --horizons 3 --batches 8 --tolerances 1e-6 --rounds 1"
 
 
 @pytest.fixture(autouse=True)
 def _in_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.setattr(bench.Ceilings, "measure", lambda rounds=3: bench.Ceilings(1.0, 1.0, 1.0))
+    monkeypatch.setattr(Ceilings, "measure", lambda rounds=3: Ceilings(1.0, 1.0, 1.0))
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def without(monkeypatch):
 
 
 def run(line):
-    return cli.main(shlex.split(line))
+    return command.main(shlex.split(line))
 
 
 def known_qps(count=20, n=6, rows=9, seed=0):
@@ -49,34 +49,30 @@ def known_qps(count=20, n=6, rows=9, seed=0):
     room = random.uniform(0.1, 1, (2, count, rows))
     l = z @ A.T - np.where(y < 0, 0, room[0])
     u = z @ A.T + np.where(y > 0, 0, room[1])
-    return bench.Batch(P, A, -z @ P - y @ A, l, u), z, y
+    return Batch(P, A, -z @ P - y @ A, l, u), z, y
 
 
 def test_residuals_of_a_known_answer_and_of_others():
     qps, z, y = known_qps()
-    assert bench.residuals(qps, z, y).max() < 1e-12
+    assert residuals(qps, z, y).max() < 1e-12
     off = z.copy()
     off[3] += 1e-5 * qps.A[0] / np.linalg.norm(qps.A[0]) * np.sign(y[3, 0])
-    worst = bench.residuals(qps, off, y)
+    worst = residuals(qps, off, y)
     step = 1e-5 * np.linalg.norm(qps.A[0])  # beyond the row that is active
     assert worst[0, 3] >= step * (1 - 1e-9) and np.delete(worst, 3, axis=1).max() < 1e-12
     # A multiplier of the wrong size shows in the dual residual, one at a bound that is not active
     # in the gap, and one at a bound that is not there as if it were zero.
     wrong = y.copy()
     wrong[5, 0] *= 2
-    np.testing.assert_allclose(
-        bench.residuals(qps, z, wrong)[1, 5], np.abs(y[5, 0] * qps.A[0]).max()
-    )
+    np.testing.assert_allclose(residuals(qps, z, wrong)[1, 5], np.abs(y[5, 0] * qps.A[0]).max())
     free = replace(qps, u=np.where(y > 0, np.inf, qps.u), l=np.where(y < 0, -np.inf, qps.l))
-    np.testing.assert_allclose(
-        bench.residuals(free, z, y)[1], np.abs(y @ qps.A).max(axis=1), rtol=1e-9
-    )
-    assert np.all(np.isinf(bench.residuals(qps, np.full_like(z, np.nan), y)))
+    np.testing.assert_allclose(residuals(free, z, y)[1], np.abs(y @ qps.A).max(axis=1), rtol=1e-9)
+    assert np.all(np.isinf(residuals(qps, np.full_like(z, np.nan), y)))
 
 
-@pytest.mark.parametrize("name", [n for n, r in bench.RIVALS.items() if not r.in_jax])
+@pytest.mark.parametrize("name", [n for n, r in RIVALS.items() if not r.in_jax])
 def test_rivals_find_known_answers(name):
-    rival = bench.RIVALS[name]
+    rival = RIVALS[name]
     if not rival.installed:
         pytest.skip(f"{name} is not installed")
     qps, z, y = known_qps()
@@ -84,8 +80,12 @@ def test_rivals_find_known_answers(name):
     np.testing.assert_allclose(found[0], z, atol=1e-5)
     np.testing.assert_allclose(found[1], y, atol=1e-4)
     assert np.all(found[2] == Status.SOLVED)
-    nowhere = replace(qps, A=np.vstack([qps.A, qps.A[:1]]), l=np.c_[qps.l, qps.u[:, 0] + 1],
-                      u=np.c_[qps.u, qps.u[:, 0] + 2])  # fmt: skip
+    nowhere = replace(
+        qps,
+        A=np.vstack([qps.A, qps.A[:1]]),
+        l=np.c_[qps.l, qps.u[:, 0] + 1],
+        u=np.c_[qps.u, qps.u[:, 0] + 2],
+    )
     status = rival.make(nowhere, 1e-8)()[2]
     assert np.all(status != Status.SOLVED)
     # ProxQP ends at its limit of steps on most of these.
@@ -96,7 +96,7 @@ def test_rivals_find_known_answers(name):
 def test_a_solver_that_lies_is_found_out(monkeypatch):
     """It says solved with answers that are 1e-5 off: counted as not solved, each status as false,
     and never as the best rival."""
-    honest = bench.RIVALS["osqp"]
+    honest = RIVALS["osqp"]
 
     def make(qps, tolerance):
         call = honest.make(qps, 1e-9)
@@ -107,10 +107,10 @@ def test_a_solver_that_lies_is_found_out(monkeypatch):
 
         return answers
 
-    monkeypatch.setitem(rivals.RIVALS, "osqp", bench.Rival("osqp", make))
+    monkeypatch.setitem(rivals.RIVALS, "osqp", Rival("osqp", make))
     with jax.enable_x64(True):
-        case = bench.Case("plans", "joint", 8, 1e-6, 3, ("jaxmpc", "osqp", "clarabel"), rounds=1)
-        rows = {row.solver: row for row in list(bench.measure(case))[-1]}
+        case = Case("plans", "joint", 8, 1e-6, 3, ("jaxmpc", "osqp", "clarabel"), rounds=1)
+        rows = {row.solver: row for row in list(measure(case))[-1]}
     assert rows["osqp"].solved == 0 and rows["osqp"].false == 8
     for name in ("jaxmpc", "clarabel"):
         assert rows[name].solved == 1 and rows[name].false == 0
@@ -129,9 +129,19 @@ def test_command_writes_table_json_and_plot(tmp_path, capsys, without):
     assert {path.name for path in folder.iterdir()} == {"bench.json", "bench.png"}
     document = json.loads((folder / "bench.json").read_text())
     assert set(document) == {
-        "command", "date", "complete", "settings", "versions", "machine", "ceilings", "skipped",
-        "notes", "rows", "growth", "exponents",
-    }  # fmt: skip
+        "command",
+        "date",
+        "complete",
+        "settings",
+        "versions",
+        "machine",
+        "ceilings",
+        "skipped",
+        "notes",
+        "rows",
+        "growth",
+        "exponents",
+    }
     assert document["complete"] and document["skipped"] == ["daqp"]
     assert {"jax", "osqp", "clarabel"} <= set(document["versions"])
     assert document["machine"]["cpu"] and document["machine"]["cores"] >= 1
@@ -148,7 +158,7 @@ def test_command_writes_table_json_and_plot(tmp_path, capsys, without):
 
 
 def test_ctrl_c_keeps_what_was_measured(tmp_path, capsys, monkeypatch):
-    row = bench.Row(
+    row = Row(
         "plans", "joint", 3, 3, 12, 8, 1e-6, "jaxmpc", "1", 8, False, 2.0, 1.0, 0, 1.0, 0.5, 2e-6
     )
 
@@ -156,7 +166,7 @@ def test_ctrl_c_keeps_what_was_measured(tmp_path, capsys, monkeypatch):
         yield [row]
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(bench, "measure", interrupted)
+    monkeypatch.setattr(command, "measure", interrupted)
     assert run(f"{PLANS} --rivals none") == 130
     document = json.loads((tmp_path / "jaxmpc-bench" / "bench.json").read_text())
     assert [r["solver"] for r in document["rows"]] == ["jaxmpc"] and not document["complete"]
@@ -186,7 +196,7 @@ def test_ctrl_c_keeps_what_was_measured(tmp_path, capsys, monkeypatch):
 )
 def test_bad_options_are_refused_in_a_line(options, words, capsys, monkeypatch):
     monkeypatch.setattr(command.Record, "run", lambda self: pytest.fail("it started"))
-    assert run(f"bench {options}") == 2
+    assert run(options) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and all(word in error for word in words), error
 
@@ -197,15 +207,15 @@ def test_quick_gives_way_to_other_options():
 
 
 def test_labels_of_a_family_without_state_limits_are_left_out(tmp_path, capsys):
-    assert run("bench --what labels --families turbompc --batches 4 --rivals none") == 0
+    assert run("--what labels --families turbompc --batches 4 --rivals none") == 0
     assert "no state limits" in capsys.readouterr().out
     assert json.loads((tmp_path / "jaxmpc-bench/bench.json").read_text())["rows"] == []
 
 
 def test_labels_agree_with_an_independent_solver(without):
     with jax.enable_x64(True):
-        case = bench.Case("labels", "joint", 64, 1e-6, 3, ("jaxmpc", "clarabel"), rounds=1)
-        rows = {row.solver: row for row in list(bench.measure(case))[-1]}
+        case = Case("labels", "joint", 64, 1e-6, 3, ("jaxmpc", "clarabel"), rounds=1)
+        rows = {row.solver: row for row in list(measure(case))[-1]}
         labels = rows["jaxmpc"], rows["clarabel"]
         assert [row.solved for row in labels] == [1, 1] and [row.false for row in labels] == [0, 0]
         # Proofs of the negated labels are no proofs.
@@ -222,10 +232,10 @@ def test_work_counts_products_times_loops():
         step = lambda c, _: (A @ (A.T @ c), None)
         return jax.lax.scan(step, x, length=7)[0]
 
-    work = bench.Work.of(program, jnp.ones((20, 5), jnp.float32))
+    work = Work.of(program, jnp.ones((20, 5), jnp.float32))
     assert work.flops32 == 7 * 2 * (2 * 20 * 30 * 5) and work.flops64 == 0
     assert work.bytes == 7 * 2 * 4 * (20 * 30 + 20 * 5 + 30 * 5)
-    ceilings = bench.Ceilings(1.0, 2.0, 1e9)
+    ceilings = Ceilings(1.0, 2.0, 1e9)
     assert ceilings.share(work, 1.0) == (work.flops32 / 1e9, "flops")
 
 
@@ -257,8 +267,8 @@ def test_growth_ends_where_memory_does(monkeypatch, tmp_path):
 @pytest.mark.parametrize("what, family", [("gradients", "joint"), ("loops", "turbompc")])
 def test_gradients_and_loops(what, family):
     with jax.enable_x64(True):
-        case = bench.Case(what, family, 8, 1e-6, 5, ("jaxmpc vmap", "moreau"), rounds=1)
-        for row in list(bench.measure(case))[-1]:
+        case = Case(what, family, 8, 1e-6, 5, ("jaxmpc vmap", "moreau"), rounds=1)
+        for row in list(measure(case))[-1]:
             assert row.solved == 1 and row.false == 0
             assert row.forward_microseconds > 0 and row.forward_microseconds < 3 * row.microseconds
             assert what == "loops" or row.gradient_error < 1e-4

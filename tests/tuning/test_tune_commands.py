@@ -10,7 +10,7 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.app import cli
-from jaxmpc.app.commands import tune, tune_penalties, tuning_task
+from jaxmpc.app.commands import tune, tune_solver, tuning_task
 from jaxmpc.app.commands.sweep import Sweep
 from jaxmpc.app.commands.tuning import feasible_states
 from jaxmpc.app.config import load, load_robot_config
@@ -38,7 +38,7 @@ def given_starts(monkeypatch):
     def uniform(mpc, limits, lower, upper, count, seed):
         return np.random.default_rng(seed).uniform(lower, upper, (count, len(lower))), 3
 
-    for module in (tuning_task, tune_penalties):
+    for module in (tuning_task, tune_solver):
         monkeypatch.setattr(module, "feasible_states", uniform)
 
 
@@ -55,7 +55,7 @@ def rows(out):
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
 @pytest.mark.parametrize(
     ("command", "module", "record"),
-    [("weights", tune, "tuning.json"), ("penalties", tune_penalties, tune_penalties.FILES[0])],
+    [("weights", tune, "tuning.json"), ("solver", tune_solver, tune_solver.FILES[0])],
 )
 def test_a_run_is_kept_until_the_one_that_overwrites_it_has_a_checkpoint(
     command, module, record, error, tmp_path, monkeypatch, given_starts
@@ -166,8 +166,8 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
         made.append(found)
         return found
 
-    monkeypatch.setattr(tune_penalties, "tune_penalties", learn)
-    line = "penalties --horizon 3 --iterations 6 --stages 2 --count 16 --updates 1"
+    monkeypatch.setattr(tune_solver, "tune_solver", learn)
+    line = "solver --horizon 3 --iterations 6 --stages 2 --count 16 --updates 1"
     assert run(f"{line} --output out") == 0
     table = rows(capsys.readouterr().out)
     assert table["solved"].split()[:4] == ["25.00", "%", "50.00", "%"]
@@ -179,9 +179,9 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
     np.testing.assert_array_equal(solver.rho, rho)
     assert (solver.iterations, solver.alpha, solver.newton_steps) == (6, 1.7, 0)
     assert replace(config, solver=None) == load(None, {"horizon": 3})
-    record = json.loads((tmp_path / "out" / "penalties.json").read_text())
+    record = json.loads((tmp_path / "out" / "solver.json").read_text())
     assert record["finished"] and record["result"]["after"]["solved"] == 0.5
-    assert (tmp_path / "out" / "penalties.png").read_bytes()[:4] == b"\x89PNG"
+    assert (tmp_path / "out" / "solver.png").read_bytes()[:4] == b"\x89PNG"
 
     # Ctrl-C: the same files, from the steps that were done.
     ones = np.ones(1)
@@ -191,16 +191,16 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
     def stopped(*_, **__):
         raise Interrupted(replace(made[0], history=history))
 
-    monkeypatch.setattr(tune_penalties, "tune_penalties", stopped)
+    monkeypatch.setattr(tune_solver, "tune_solver", stopped)
     assert run(f"{line} --output cut") == 130
     assert "--output cut --resume" in capsys.readouterr().out
     np.testing.assert_array_equal(load(tmp_path / "cut" / "tuned.toml").build_solver().rho, rho)
-    record = json.loads((tmp_path / "cut" / "penalties.json").read_text())
+    record = json.loads((tmp_path / "cut" / "solver.json").read_text())
     assert not record["finished"] and record["solved"] == [0.25, 0.5]
 
     # Where nothing learned is better the words say so.
     default = replace(made[0], improved=False, build=lambda _: ADMM(newton_steps=0))
-    table = rows(tune_penalties.TunePenalties().report_text(default, 4, 0, 1.0))
+    table = rows(tune_solver.TuneSolver().report_text(default, 4, 0, 1.0))
     assert "the default is kept" in table["safeguard"]
 
 
@@ -238,14 +238,14 @@ def test_starts_are_feasible_and_others_counted():
         ("weights --robot joint --terminal box", "--terminal: given beside --robot joint"),
         ("weights --validation 1", "--validation: 1"),
         ("weights --resume --overwrite", "Choose one"),
-        ("penalties --iterations 10", "--iterations: 10 for 4 stages"),
-        ("penalties --count 4", "--count: 4"),
-        ("penalties --learning-rate 0.1", "without --optimizer"),
-        ("penalties --optimizer sgd --learning-rate -1", "--learning-rate: -1"),
+        ("solver --iterations 10", "--iterations: 10 for 4 stages"),
+        ("solver --count 4", "--count: 4"),
+        ("solver --learning-rate 0.1", "without --optimizer"),
+        ("solver --optimizer sgd --learning-rate -1", "--learning-rate: -1"),
     ],
 )
 def test_errors_are_one_line_before_any_run(capsys, monkeypatch, given_starts, arguments, message):
-    for module, name in ((tune, "tune_weights"), (tune_penalties, "tune_penalties")):
+    for module, name in ((tune, "tune_weights"), (tune_solver, "tune_solver")):
         monkeypatch.setattr(module, name, lambda *a, **k: pytest.fail("it started"))
     assert run(arguments) == 2
     err = capsys.readouterr().err
@@ -271,7 +271,7 @@ def test_help_is_a_page_a_stranger_can_use(capsys):
             optimizer learning-rate mode tracking effort violation settling tolerance lower upper
             spread horizon terminal margin target linearize mass damping payload iterations refine
             dtype seed output resume overwrite""",
-        "penalties": """config iterations stages groups updates count batch validation optimizer
+        "solver": """config iterations stages groups updates count batch validation optimizer
             learning-rate lower upper horizon terminal seed output resume overwrite""",
     }
     for name, options in pages.items():
@@ -286,7 +286,7 @@ def test_help_is_a_page_a_stranger_can_use(capsys):
             assert word in text
     with pytest.raises(SystemExit):
         run("--help")
-    assert "penalties" in capsys.readouterr().out
+    assert "solver" in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -321,10 +321,10 @@ def test_robots(tmp_path, capsys, arguments):
 
 @pytest.mark.slow
 def test_penalties_of_the_joint(tmp_path, capsys):
-    line = "penalties --horizon 10 --iterations 20 --count 64 --batch 16 --updates 10"
+    line = "solver --horizon 10 --iterations 20 --count 64 --batch 16 --updates 10"
     assert run(line) == 0
     table = rows(capsys.readouterr().out)
     before, after = (float(table["solved"].split()[i]) for i in (0, 2))
     assert after >= before
-    config = load(tmp_path / "jaxmpc-penalties" / "tuned.toml")
+    config = load(tmp_path / "jaxmpc-solver" / "tuned.toml")
     jm.Controller(config.build_mpc(), config.build_solver())

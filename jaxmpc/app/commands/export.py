@@ -53,7 +53,7 @@ class Export:
     How to read the output
       "solved by the C code's steps" is the share of the plans with a solution whose residuals the
       fixed steps bring below the tolerance: take more --iterations, or penalties learned by
-      jaxmpc tune penalties (section [solver] of the file), where that is too few. States without a
+      jaxmpc tune solver (section [solver] of the file), where that is too few. States without a
       plan are answered with the best iterate and status 2: see soft limits, cost.rho in the file.
       Exit code  0 done; 2 error (one line on stderr says which); 130 stopped by Ctrl-C.
     """

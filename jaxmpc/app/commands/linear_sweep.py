@@ -15,10 +15,8 @@ from tqdm.std import tqdm
 from jaxmpc import store
 from jaxmpc.app.commands.options import print_table
 from jaxmpc.app.config import Config, SweepPoints, sweep_points
-from jaxmpc.app.programs import user_cache
 from jaxmpc.batches import CHUNK, Timing
 from jaxmpc.checks import fail
-from jaxmpc.feasible.candidates import StagePenalties
 from jaxmpc.feasible.executors import label_elsewhere
 from jaxmpc.feasible.map import mesh
 from jaxmpc.feasible.pipeline import Scope, label_parts
@@ -27,10 +25,6 @@ from jaxmpc.feasible.stored_map import StoredMap
 from jaxmpc.files import check_results, open_folder, remove_files, versions, write_results
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.store import report_damage
-from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
-
-# States from which penalties are learned, at most.
-LEARN = 65_536
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +74,6 @@ class LinearSweep:
         self,
         *,
         refine: bool = True,
-        learn_penalties: bool = False,
         executor: Any = None,
         devices: int | None = None,
     ) -> None:
@@ -90,9 +83,9 @@ class LinearSweep:
         shard labels its own, and is done unless it is the last.
         """
         with self.store:
-            self._run(refine, learn_penalties, executor, devices)
+            self._run(refine, executor, devices)
 
-    def _run(self, refine: bool, learn_penalties: bool, executor: Any, devices: int | None) -> None:
+    def _run(self, refine: bool, executor: Any, devices: int | None) -> None:
         start, kept = time.perf_counter(), self.store
         part = ""
         if kept.shard is not None:
@@ -102,7 +95,7 @@ class LinearSweep:
         # The compiler keeps one core busy; meanwhile another can load matplotlib.
         plots = Thread(target=import_module, args=("jaxmpc.app.plots.feasible_set",), daemon=True)
         plots.start()
-        timing = self.label(self.penalties(devices) if learn_penalties else None, executor, devices)
+        timing = self.label(executor, devices)
         speed = f", {timing.count / timing.run_seconds:,.0f} QPs/s" if timing.count else ""
         run = ("run", f"{timing.run_seconds:.2f} s for {timing.count:,} QPs{speed}")
         if why := kept.unfinished():
@@ -155,37 +148,7 @@ class LinearSweep:
             ("files", " ".join(files)),
         ], 12)  # fmt: skip
 
-    def penalties(self, devices: int | None = None) -> StagePenalties | None:
-        """Return penalties learned for the problem, or cached from an earlier run.
-
-        Raises ValueError for too few states, and where the cache folder cannot be written.
-        """
-        if not self.store.pending():
-            return None
-        start, region, settings = time.perf_counter(), self.region, self.config.sweep
-        cache, points = user_cache() / "penalties", region.points if region.total <= LEARN else None
-        if points is None:
-            random = np.random.default_rng(0).choice(region.total, LEARN, replace=False)
-            points = mesh(region.along, random)
-        try:
-            found = tune_sweep_penalties(
-                self.mpc, points, axes=region.axes, fixed=region.fixed, chunk=CHUNK,
-                iterations=settings.iterations, dtype=settings.dtype, cache=cache,
-                devices=devices,
-            )  # fmt: skip
-        except OSError as error:
-            fail(str(cache), f"{error.strerror}", "Set XDG_CACHE_HOME to a folder of yours")
-        first, best = found.before["decided"], found.after["decided"]
-        verdict = f"{first:.2%} -> {best:.2%} decided by the first pass"
-        if not found.improved:
-            verdict = f"nothing better found, {best:.2%} decided by the first pass"
-        print(f"penalties: {verdict}, {time.perf_counter() - start:.1f} s", file=sys.stderr)
-        return found.result if found.improved else None
-
-    def label(
-        self, penalties: StagePenalties | None = None, executor: Any = None,
-        devices: int | None = None,
-    ) -> Timing:  # fmt: skip
+    def label(self, executor: Any = None, devices: int | None = None) -> Timing:
         """Label the blocks that are not done, and commit each."""
         todo, along, settings = self.store.pending(), self.region.along, self.config.sweep
         timing, decided, begun = Timing(), 0, time.perf_counter()
@@ -195,8 +158,7 @@ class LinearSweep:
         found = label(
             self.problem, (mesh(along, self.store.samples(block)) for block in todo),
             Scope.of_grid(along, len(self.store.regions)), self.store.size,
-            iterations=settings.iterations, dtype=settings.dtype, penalties=penalties,
-            devices=devices,
+            iterations=settings.iterations, dtype=settings.dtype, devices=devices,
         )  # fmt: skip
         total = sum(len(self.store.samples(block)) for block in todo)
         with tqdm(total=total, unit=" states", unit_scale=True, disable=None) as bar:

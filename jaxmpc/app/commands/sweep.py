@@ -23,7 +23,7 @@ from jaxmpc.app.commands.options import (
 )
 from jaxmpc.app.commands.robot_map import RobotMapCommand
 from jaxmpc.batches import chosen_devices
-from jaxmpc.checks import fail, require_disk
+from jaxmpc.checks import require_disk
 
 # By how much the files of a sweep are smaller than its arrays, at most: the joint's 13 times.
 COMPRESSION = 20
@@ -129,18 +129,6 @@ class Sweep:
         option("{float32,float64}", "from the file, else float32"),
     ] = None
     """Precision of the solver's steps. Proofs are in float64 always."""
-    learn_penalties: Annotated[
-        bool,
-        tyro.conf.FlagCreatePairsOff,
-        option(
-            None,
-            "off",
-            "Learn penalties of the first pass for this problem (kept in "
-            "~/.cache/jaxmpc/penalties), so that it leaves fewer states open. Learning costs about "
-            "what a million states cost, and saves up to a quarter of that: for problems that are "
-            "swept again and again.",
-        ),
-    ] = False
     shard: Annotated[
         str | None,
         option(
@@ -175,15 +163,10 @@ class Sweep:
             return
         refuse({"seconds": self.seconds}, None, "It is how long a robot's loops last")
         chosen_devices(self.devices, "--devices")
-        self.open().run(
-            refine=self.refine, learn_penalties=self.learn_penalties, devices=self.devices
-        )
+        self.open().run(refine=self.refine, devices=self.devices)
 
     def open(self) -> LinearSweep:
         """Read, check and open what a sweep needs. Raises ValueError; compiles nothing."""
-        if self.shard is not None and self.learn_penalties:
-            what = "Each shard would learn its own, and results depend on the split"
-            fail("--learn-penalties", "given beside --shard", what)
         keys = "horizon terminal grid lower upper axes fixed iterations dtype".split()
         overrides = given_options(self, *keys) | ({"projection": True} if self.projection else {})
         config = configs.load(self.config, overrides)
@@ -198,7 +181,6 @@ class Sweep:
         """Return the map of --robot. Raises ValueError for options that do not go with it."""
         given = {"config": self.config, "projection": self.projection}
         refuse(given, robot, "Give a problem or a robot; a robot's map is a slice")
-        refuse({"learn-penalties": self.learn_penalties}, robot, "They are for linear maps")
         refuse({"shard": self.shard, "store": self.store}, robot, "They are for linear maps")
         chosen_devices(self.devices, "--devices")
         return RobotMapCommand(

@@ -103,7 +103,7 @@ class TuneWeights:
       [limits]  margin, the tightening (needs x_min, x_max)
       [mpc]     H_f, h_f (H_f x_N <= h_f) or P_f, level_f (x_N'P_f x_N <= level_f) instead of
                 terminal
-      [solver]  iterations, rho, alpha, refine; jaxmpc tune penalties writes them
+      [solver]  iterations, rho, alpha, refine; jaxmpc tune solver writes them
       With --robot: the sections that tuned.toml has, [robot] and [cost].
     """
 

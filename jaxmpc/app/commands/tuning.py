@@ -1,4 +1,4 @@
-"""Helpers of `jaxmpc tune weights` and `tune penalties`: optimizer, initial states, folder."""
+"""Helpers of `jaxmpc tune weights` and `tune solver`: optimizer, initial states, folder."""
 
 import contextlib
 import json

@@ -122,7 +122,7 @@ class RecursionSection:
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class SolverSection:
-    """ADMM as the controller runs it; see `ADMM`. What jaxmpc tune penalties learns."""
+    """ADMM as the controller runs it; see `ADMM`. What jaxmpc tune solver learns."""
 
     iterations: Annotated[Whole, Field(ge=0)] = 50
     # Number, one a row of the QP, or (stages, rows); None: chosen from the problem.

@@ -215,10 +215,10 @@ def plot_maps(before: FeasibleSetMap, after: FeasibleSetMap) -> Figure:
     return figure
 
 
-def plot_penalties(
+def plot_solver(
     run: TuningRun, before: np.ndarray, after: np.ndarray, eps: float, title: str = ""
 ) -> Figure:
-    """Draw the penalties of `tune_penalties` by kind of row and stage, and the residuals.
+    """Draw the penalties of `tune_solver` by kind of row and stage, and the residuals.
 
     before, after (B,): largest residual of each validation state with the solver that was given
     and with the tuned one. eps: what counts as solved. Rows of a kind are drawn over the step k

@@ -1,7 +1,6 @@
 """Penalties learned by unrolling: gradients, gains on other states, safeguards, cache, horizons."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -10,18 +9,13 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.app.cli import main
-from jaxmpc.app.commands import linear_sweep
-from jaxmpc.feasible.candidates import StagePenalties, compiled_admm
 from jaxmpc.feasible.constraint_rows import weighted
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.tuning import penalties, sweep_penalties
-from jaxmpc.tuning.penalties import tune_penalties
+from jaxmpc.tuning import solver as tuning_solver
 from jaxmpc.tuning.penalty_objective import loss_and_gradient
 from jaxmpc.tuning.penalty_schedule import interpolation, transfer_penalties
-from jaxmpc.tuning.result import TuningRun
 from jaxmpc.tuning.settings import Settings
-from jaxmpc.tuning.sweep_penalties import tune_sweep_penalties
+from jaxmpc.tuning.solver import tune_solver
 
 # The double integrator of five steps: 5 variables, 17 rows.
 DEFAULT = jm.ADMM(rho=1.0, alpha=1.6, newton_steps=0)
@@ -50,7 +44,7 @@ def solved(solver, x, problem):
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory):
     folder = tmp_path_factory.mktemp("penalties")
-    return tune_penalties(mpc(), states(160, 0), cache=folder, **SETTINGS), folder
+    return tune_solver(mpc(), states(160, 0), cache=folder, **SETTINGS), folder
 
 
 @pytest.mark.slow
@@ -73,7 +67,7 @@ def test_gradient_against_differences():
     rng = np.random.default_rng(0)
     x, rows = states(12, 2), len(jm.mpc.row_table(mpc()))
     start = rng.normal(size=(12, 5)), rng.normal(size=(12, rows))
-    objective, samples, _ = penalties._prepared(
+    objective, samples, _ = tuning_solver._prepared(
         mpc(), x, 20, 2, "step", DEFAULT, start, np.array([0.3, 0.1]), None,
         Settings(validation=0.5),
     )  # fmt: skip
@@ -95,7 +89,7 @@ def test_gradient_against_differences():
 def test_sabotaged_learning_returns_the_given_solver(learned, rate):
     given = learned[0].solver
     with pytest.warns(UserWarning, match="nothing found is better"):
-        found = tune_penalties(
+        found = tune_solver(
             mpc(), states(160, 0), optimizer=optax.sgd(rate),
             **{**SETTINGS, "solver": given, "updates": 4},
         )  # fmt: skip
@@ -107,10 +101,10 @@ def test_sabotaged_learning_returns_the_given_solver(learned, rate):
 def test_cache(learned, monkeypatch):
     found, folder = learned
     again = lambda **more: (
-        tune_penalties(mpc(), states(160, 0), cache=folder, **{**SETTINGS, **more}).solver
+        tune_solver(mpc(), states(160, 0), cache=folder, **{**SETTINGS, **more}).solver
     )
     calls = []
-    monkeypatch.setattr(penalties, "tune_schedule", lambda *_: calls.append(1) or found)
+    monkeypatch.setattr(tuning_solver, "tune_schedule", lambda *_: calls.append(1) or found)
     assert np.array_equal(again().rho, found.solver.rho) and not calls
     assert again().alpha == found.solver.alpha
     assert (
@@ -140,8 +134,8 @@ def test_an_interrupt_gives_the_best_so_far_and_no_cache(learned, tmp_path, monk
             raise KeyboardInterrupt
         return program(*arguments)
 
-    monkeypatch.setattr(penalties, "loss_and_gradient", lambda devices: trap)
-    tune = lambda: tune_penalties(mpc(), states(160, 0), cache=tmp_path, **SETTINGS)
+    monkeypatch.setattr(tuning_solver, "loss_and_gradient", lambda devices: trap)
+    tune = lambda: tune_solver(mpc(), states(160, 0), cache=tmp_path, **SETTINGS)
     with pytest.raises(jm.tuning.Interrupted, match="after 3 steps") as stop:
         tune()
     run = stop.value.run
@@ -156,11 +150,13 @@ def unimproved(run):
 
 def test_a_cached_failure_warns_again(tmp_path, learned, monkeypatch):
     failed = unimproved(learned[0])
-    monkeypatch.setattr(penalties, "tune_schedule", lambda *_: failed)
+    monkeypatch.setattr(tuning_solver, "tune_schedule", lambda *_: failed)
     for _ in range(2):
         with pytest.warns(UserWarning, match="nothing found is better"):
-            kept = tune_penalties(mpc(), states(160, 0), cache=tmp_path, **SETTINGS)
-        monkeypatch.setattr(penalties, "tune_schedule", lambda *_: pytest.fail("searched again"))
+            kept = tune_solver(mpc(), states(160, 0), cache=tmp_path, **SETTINGS)
+        monkeypatch.setattr(
+            tuning_solver, "tune_schedule", lambda *_: pytest.fail("searched again")
+        )
     assert not kept.improved and kept.solver == replace(DEFAULT, iterations=30)
     assert kept.before == failed.before and kept.history is None
 
@@ -231,7 +227,7 @@ def test_bad_input(settings, match):
     if settings["mpc"].system.n == 1:
         settings["x0s"] = settings["x0s"][:, :1]
     with pytest.raises(ValueError, match=match):
-        tune_penalties(settings.pop("mpc"), settings.pop("x0s"), **settings)
+        tune_solver(settings.pop("mpc"), settings.pop("x0s"), **settings)
 
 
 def moving(problem):
@@ -259,108 +255,6 @@ def test_weighted_rows_are_the_same_rows(ball):
     assert not ball or np.allclose(new.radius, 3 * old.radius)
 
 
-# Eight ADMM steps, so that the first pass leaves enough open; one size, so that few compile.
-SWEEP = {"iterations": 8, "chunk": 800}
-POINTS = jm.grid([-5.2, -5.2], [5.2, 5.2], (40, 40))
-
-
-@pytest.mark.slow
-def test_the_first_pass_of_a_sweep_decides_more_and_labels_stay(tmp_path):
-    learn = lambda: tune_sweep_penalties(
-        mpc(4), POINTS, updates=25, batch=64, cache=tmp_path, **SWEEP
-    )
-    found = learn()
-    assert found.after["decided"] > found.before["decided"] + 0.01 and found.improved
-    assert np.all(found.result.weight > 0) and 0 < found.result.alpha < 2
-    fmap = jm.map_feasible_set(mpc(4), POINTS, penalties=found.result, **SWEEP)
-    plain = jm.map_feasible_set(mpc(4), POINTS, **SWEEP)
-    both = (fmap.label != 0) & (plain.label != 0)
-    assert np.array_equal(fmap.label[both], plain.label[both]) and both.mean() > 0.995
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweep_penalties, "tune_row_weights", lambda *_: pytest.fail("searched again"))
-        again = learn()
-    assert np.array_equal(again.result.weight, found.result.weight)
-    assert again.after == found.after
-    with pytest.raises(ValueError, match="Learn them for this map"):
-        jm.map_feasible_set(mpc(5), POINTS, penalties=found.result)
-
-
-@pytest.mark.slow
-def test_sweep_shortfalls_against_the_stages_own_verdicts():
-    """Where nothing is missing the stage decides (in float32, the edge apart); infeasible states it
-    decides only there."""
-    x, problem = POINTS[800:], FeasibilityProblem.of(mpc(4))
-    rows, p = problem.rows, problem.exact(np.abs(POINTS).max(axis=0))
-    truth = jm.map_feasible_set(mpc(4), x, **SWEEP).label
-    with jax.enable_x64(True):
-        decided = compiled_admm(8, np.dtype(np.float32), None)(p, rows, x, np.float64(1.6))[0].label
-        one = lambda x, label: sweep_penalties.shortfall(
-            p, rows, x, label, np.ones(len(rows.lower)), 1.6, 8
-        )
-        short = np.asarray(jax.jit(jax.vmap(one))(x, truth))
-    outside = (truth < 0) & (np.abs(short) > 1e-4)
-    assert outside.sum() > 100 and np.any(short[outside] > 0)
-    assert np.array_equal(decided[outside] == -1, short[outside] < 0)
-    inside = (truth > 0) & (short == 0)
-    assert inside.sum() > 100 and np.mean(decided[inside] == 1) > 0.98
-
-
-CASE = """
-[system]
-A = [[1.0, 1.0], [0.0, 1.0]]
-B = [[1.0], [0.5]]
-dt = 1.0
-[limits]
-x_min = [-5.0, -5.0]
-x_max = [5.0, 5.0]
-u_min = [-1.0]
-u_max = [1.0]
-[cost]
-Q = [1.0, 1.0]
-R = [1.0]
-[mpc]
-horizon = 4
-terminal = "box"
-"""
-
-
-@pytest.mark.slow
-def test_sweep_command_learns_and_its_labels_agree(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(linear_sweep, "CHUNK", 800)
-    Path("case.toml").write_text(CASE)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    asked = []
-
-    def tune(problem, points, cache, **settings):
-        asked.append((cache, settings))
-        weight = np.exp(np.random.default_rng(0).normal(size=len(moving(problem).lower)))
-        values = {"weight": weight, "alpha": np.array(1.4)}
-        build = lambda v: StagePenalties(v["weight"], float(v["alpha"]))
-        return TuningRun(values, values, {"decided": 0.8}, {"decided": 0.9}, True, {}, build)
-
-    monkeypatch.setattr(linear_sweep, "tune_sweep_penalties", tune)
-    command = "sweep --config case.toml --grid 40 20 --iterations 8 --no-refine --output"
-    assert main([*command.split(), "a"]) == 0 and not asked
-    assert main([*command.split(), "b", "--learn-penalties"]) == 0
-    assert "80.00% -> 90.00% decided" in capsys.readouterr().err
-    assert asked[0][0] == tmp_path / "cache/jaxmpc/penalties" and asked[0][1]["iterations"] == 8
-    labels = [
-        np.asarray(linear_sweep.store.open_dataset(tmp_path / k / "sweep.zarr")["label"])
-        for k in "ab"
-    ]
-    both = (labels[0] != 0) & (labels[1] != 0)
-    assert np.array_equal(labels[0][both], labels[1][both]) and both.mean() > 0.99
-    assert main([*command.split(), "b", "--resume", "--learn-penalties"]) == 0 and len(asked) == 1
-    assert main(["sweep", "--robot", "pendulum", "--learn-penalties", "--output", "c"]) == 2
-    assert "--learn-penalties: given beside --robot" in capsys.readouterr().err
-
-
-def test_too_few_points_to_learn_from():
-    with pytest.raises(ValueError, match="at least 64"):
-        tune_sweep_penalties(mpc(4), np.zeros((63, 2)))
-
-
 @pytest.mark.slow
 def test_the_joint_is_solved_in_a_hundred_steps():
     """95 % of held-out feasible states to 1e-6 at least (96 to 99 % by seed and machine); constant
@@ -368,7 +262,7 @@ def test_the_joint_is_solved_in_a_hundred_steps():
     problem = problems.joint(20)
     x = np.random.default_rng(0).uniform([-1.5, -2], [1.5, 2], (6000, 2))
     x = x[jm.map_feasible_set(problem, x).label == 1]
-    solver = tune_penalties(problem, x[:3000]).solver
+    solver = tune_solver(problem, x[:3000]).solver
     assert solver.iterations == 100 and solver.newton_steps == 0
     assert solved(solver, x[3000:], problem) > 0.95
     assert solved(jm.ADMM(newton_steps=0), x[3000:], problem) < 0.1
@@ -390,8 +284,8 @@ def test_warm_starts_have_penalties_of_their_own():
     with jax.enable_x64(True):
         controller = jm.Controller(jax.tree.map(np.float64, problem), jm.ADMM(newton_steps=30))
         near = jax.tree.map(np.asarray, plans(controller, 0.98 * x))
-    found = tune_penalties(problem, x, 20, stages=2, updates=150, warm_start=near)
-    cold = tune_penalties(problem, x, 20, stages=2, updates=150)
+    found = tune_solver(problem, x, 20, stages=2, updates=150, warm_start=near)
+    cold = tune_solver(problem, x, 20, stages=2, updates=150)
     assert found.improved and found.after["solved"] > found.before["solved"] + 0.1
     with jax.enable_x64(True):
         one = lambda c, x, start: c.plan(x, warm_start=start).status

@@ -1,4 +1,4 @@
-"""tune_penalties: ADMM's penalties rho and over-relaxation alpha, tuned for one MPC problem."""
+"""tune_solver: ADMM's penalties rho and over-relaxation alpha, tuned for one MPC problem."""
 
 import warnings
 from dataclasses import replace
@@ -43,7 +43,7 @@ RATE, VALIDATIONS = 0.2, 15
 SOLVER = ADMM(newton_steps=0)
 
 
-def tune_penalties(
+def tune_solver(
     mpc: MPC, x0s: Reals, iterations: int = 100, *, stages: int = 4, groups: str = "step",
     solver: ADMM | None = None, warm_start: Any = None, reference: Reals | None = None,
     input_reference: Reals | None = None, cache: str | Path | None = None, **settings: Any,
@@ -102,7 +102,7 @@ def tune_penalties(
     run = cached(cache, decides, chosen, partial(_with_values, given), tune)
     if not run.improved:
         warnings.warn(
-            "tune_penalties: nothing found is better on the validation set than the solver given "
+            "tune_solver: nothing found is better on the validation set than the solver given "
             f"({run.before['solved']:.1%} solved); that one is the result", stacklevel=2,
         )  # fmt: skip
     return run

@@ -1,4 +1,4 @@
-"""The command `jaxmpc tune penalties`: its options, files and table."""
+"""The command `jaxmpc tune solver`: its options, files and table."""
 
 import dataclasses
 import json
@@ -33,7 +33,7 @@ from jaxmpc.app.commands.tuning import (
     start_range,
 )
 from jaxmpc.app.plots.style import save
-from jaxmpc.app.plots.tuning import plot_penalties
+from jaxmpc.app.plots.tuning import plot_solver
 from jaxmpc.app.report import report_error
 from jaxmpc.checks import fail, require_memory
 from jaxmpc.files import versions, write_json
@@ -41,14 +41,14 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import solve
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
-from jaxmpc.tuning.penalties import tune_penalties
 from jaxmpc.tuning.result import Interrupted, TuningRun
+from jaxmpc.tuning.solver import tune_solver
 
-FILES = ("penalties.json", TUNED, "penalties.png")
+FILES = ("solver.json", TUNED, "solver.png")
 
 
 @dataclasses.dataclass(frozen=True)
-class TunePenalties:
+class TuneSolver:
     """Tune the penalties of the solver (ADMM), so that fewer steps solve an MPC problem.
 
     What it does
@@ -62,8 +62,8 @@ class TunePenalties:
       Without a file the problem is one robot joint: x = (q, dq), torque u, 20 steps of 0.01 s.
 
     How to start
-      $ jaxmpc tune penalties
-      $ jaxmpc tune penalties --config pendulum.toml --iterations 60 --count 1024 --output tuned/p
+      $ jaxmpc tune solver
+      $ jaxmpc tune solver --config pendulum.toml --iterations 60 --count 1024 --output tuned/p
       The joint takes less than a minute on two idle CPU cores.
 
     How to read the table
@@ -79,8 +79,8 @@ class TunePenalties:
       tuned.toml      The whole problem with [solver] iterations, rho, alpha, refine = 0, for
                       --config of jaxmpc tune weights; in Python Config.build_solver() makes an
                       ADMM of it for jm.solve, jm.Controller, jm.solve_many.
-      penalties.json  Options, the numbers of the table, loss of every step, versions.
-      penalties.png   rho by kind of limit, step of the horizon and stage; distribution of the
+      solver.json     Options, the numbers of the table, loss of every step, versions.
+      solver.png      rho by kind of limit, step of the horizon and stage; distribution of the
                       residuals before and after.
       checkpoint.npz  The state of the run after every step, for --resume.
       Ctrl-C          Stops, and writes all files from the best of the finished steps; --resume
@@ -124,7 +124,7 @@ class TunePenalties:
     """Terminal set, as in jaxmpc sweep."""
     seed: Annotated[int, option("K", "0")] = 0
     """Seed of initial states and batches."""
-    output: Annotated[Path, option("DIR", "jaxmpc-penalties")] = Path("jaxmpc-penalties")
+    output: Annotated[Path, option("DIR", "jaxmpc-solver")] = Path("jaxmpc-solver")
     """Folder for the files; created if absent."""
     resume: Switch = False
     """Resume the run in --output."""
@@ -171,10 +171,10 @@ class TunePenalties:
     def learned(
         self, mpc: MPC, train: np.ndarray, test: np.ndarray, given: ADMM
     ) -> TuningRun:  # fmt: skip
-        """Return the run of `tune_penalties`."""
+        """Return the run of `tune_solver`."""
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "tune_penalties", UserWarning)
-            return tune_penalties(
+            warnings.filterwarnings("ignore", "tune_solver", UserWarning)
+            return tune_solver(
                 mpc, train, self.iterations, stages=self.stages, groups=self.groups,
                 solver=given, updates=self.updates, optimizer=self.stepper(), batch=self.batch,
                 validation=test, seed=self.seed, checkpoint=self.output / CHECKPOINT,
@@ -248,8 +248,8 @@ class TunePenalties:
         write_json(self.output / FILES[0], document)
         words = "tuned" if found.improved else "default kept, no step is better"
         title = f"{config.name}: {self.iterations} ADMM steps, {words}"
-        figure = plot_penalties(found, worst[0], worst[1], 1e-6, title)
-        save(figure, self.output / "penalties.png")
+        figure = plot_solver(found, worst[0], worst[1], 1e-6, title)
+        save(figure, self.output / "solver.png")
 
     def report_text(self, found: TuningRun, count: int, dropped: int, seconds: float) -> str:
         """Return the result as a table of text."""
