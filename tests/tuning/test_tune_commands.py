@@ -20,7 +20,7 @@ from jaxmpc.tuning.result import Interrupted, TuningRun
 
 # The built-in joint with a horizon that is too short for its terminal weight.
 LINE = (
-    "--horizon 3 --count 8 --steps 5 --mode forward --iterations 8 --refine 0 --seed 1 "
+    "--horizon 3 --count 8 --steps 5 --mode forward --iterations 8 --newton-steps 0 --seed 1 "
     "--tracking 1 0.01 --effort 1e-3"
 )
 
@@ -269,7 +269,7 @@ def test_help_is_a_page_a_stranger_can_use(capsys):
     pages = {
         "weights": """config robot tune weights updates count batch validation steps seconds
             optimizer learning-rate mode tracking effort violation settling tolerance lower upper
-            spread horizon terminal margin target linearize mass damping payload iterations refine
+            spread horizon terminal margin target linearize mass damping payload iterations newton-steps
             dtype seed output resume overwrite""",
         "solver": """config iterations stages groups updates count batch validation optimizer
             learning-rate lower upper horizon terminal seed output resume overwrite""",

@@ -103,7 +103,7 @@ class TuneWeights:
       [limits]  margin, the tightening (needs x_min, x_max)
       [mpc]     H_f, h_f (H_f x_N <= h_f) or P_f, level_f (x_N'P_f x_N <= level_f) instead of
                 terminal
-      [solver]  iterations, rho, alpha, refine; jaxmpc tune solver writes them
+      [solver]  iterations, rho, alpha, newton_steps; jaxmpc tune solver writes them
       With --robot: the sections that tuned.toml has, [robot] and [cost].
     """
 
@@ -185,7 +185,7 @@ class TuneWeights:
     """With --robot: mass from 0 to KG at the site "tool"; the MPC keeps the nominal model."""
     iterations: Annotated[int | None, option("K", "[solver], else 50; robots 0")] = None
     """ADMM steps of each plan."""
-    refine: Annotated[int | None, option("K", "[solver], else 20; robots as needed")] = None
+    newton_steps: Annotated[int | None, option("K", "[solver], else 20; robots as needed")] = None
     """Newton steps after them."""
     dtype: Annotated[
         Literal["float32", "float64"] | None,
@@ -281,7 +281,9 @@ class TuneWeights:
             fail("--tune", f"{' '.join(self.tune) or 'nothing'}", "Name each quantity once")
         if self.steps is not None and self.seconds is not None:
             fail("--seconds", "given beside --steps", "Give one of them")
-        check_counts(self, updates=0, count=2, batch=1, steps=1, iterations=1, refine=0, seed=0)
+        check_counts(
+            self, updates=0, count=2, batch=1, steps=1, iterations=1, newton_steps=0, seed=0
+        )
         check_validation(self)
         check_positive(self, "seconds", "learning_rate", "tolerance")
         for name in ("violation", "settling", "payload"):
@@ -301,6 +303,6 @@ class TuneWeights:
         """Return the options that determine the result, as JSON data, without --updates."""
         ignored = ("config", "output", "resume", "overwrite", "updates")
         found = {k: v for k, v in dataclasses.asdict(self).items() if k not in ignored}
-        solver = {"iterations": task.solver.iterations, "refine": task.solver.newton_steps}
+        solver = {"iterations": task.solver.iterations, "newton_steps": task.solver.newton_steps}
         found |= {"steps": task.steps, "dtype": task.dtype, **solver, **task.options}
         return json.loads(json.dumps(found))

@@ -76,7 +76,7 @@ class TuneSolver:
       safeguard   whether the tuned penalties are used or the default is kept
 
     Files, all in the folder of --output
-      tuned.toml      The whole problem with [solver] iterations, rho, alpha, refine = 0, for
+      tuned.toml      The whole problem with [solver] iterations, rho, alpha, newton_steps = 0, for
                       --config of jaxmpc tune weights; in Python Config.build_solver() makes an
                       ADMM of it for jm.solve, jm.Controller, jm.solve_many.
       solver.json     Options, the numbers of the table, loss of every step, versions.
@@ -219,7 +219,7 @@ class TuneSolver:
         """Write the files."""
         rho = np.asarray(found.solver.rho, float)
         solver = configs.SolverSection(
-            iterations=found.solver.admm_steps(), refine=0,
+            iterations=found.solver.admm_steps(), newton_steps=0,
             alpha=float(np.asarray(found.solver.alpha)),
             rho=float(rho) if rho.ndim == 0 else tuple(map(tuple, np.atleast_2d(rho).tolist())),
         )  # fmt: skip

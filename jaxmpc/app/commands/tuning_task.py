@@ -224,8 +224,8 @@ def linear_task(command: Any) -> TuningTask:
     )  # fmt: skip
     settings = config.build_solver() or ADMM(iterations=50, rho=1.0, alpha=1.6, newton_steps=20)
     count = settings.iterations if command.iterations is None else command.iterations
-    refine = settings.newton_steps if command.refine is None else command.refine
-    solver = dataclasses.replace(settings, iterations=count, newton_steps=refine)
+    newton_steps = settings.newton_steps if command.newton_steps is None else command.newton_steps
+    solver = dataclasses.replace(settings, iterations=count, newton_steps=newton_steps)
     dtype = command.dtype or "float64"
     fraction = 0.9 if command.spread is None else command.spread
     steps = command.steps or 50
@@ -315,7 +315,7 @@ def robot_task(command: Any) -> TuningTask:
         r = np.asarray(robot.coordinates(x))
     if "tightening" in command.tune:
         parameters["tightening"] = tightening(section.margin, robot.state_limits, r)
-    solver = ADMM(iterations=command.iterations, newton_steps=command.refine)
+    solver = ADMM(iterations=command.iterations, newton_steps=command.newton_steps)
     x0s, variations = draw_robots(
         robot, command.count, command.seed,
         spread=0.5 if command.spread is None else command.spread,

@@ -166,7 +166,7 @@ class Config:
             return None
         given = self.solver.rho
         rho = np.asarray(given) if isinstance(given, tuple) else given
-        return ADMM(self.solver.iterations, rho, self.solver.alpha, self.solver.refine)
+        return ADMM(self.solver.iterations, rho, self.solver.alpha, self.solver.newton_steps)
 
     def state_limits(self) -> Box | Polytope | None:
         """Return the state limits without the margin; None where there are none."""

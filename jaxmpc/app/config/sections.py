@@ -129,7 +129,7 @@ class SolverSection:
     rho: Number | Vector | Matrix | None = None
     alpha: Annotated[Number, Field(gt=0, lt=2)] = 1.9
     # Newton steps after them at most; None: as `ADMM`.
-    refine: Annotated[Whole, Field(ge=0)] | None = None
+    newton_steps: Annotated[Whole, Field(ge=0)] | None = None
 
 
 def to_matrix(value: Any) -> np.ndarray:
