@@ -269,8 +269,8 @@ def test_help_is_a_page_a_stranger_can_use(capsys):
     pages = {
         "weights": """config robot tune weights updates count batch validation steps seconds
             optimizer learning-rate mode tracking effort violation settling tolerance lower upper
-            spread horizon terminal margin target linearize mass damping payload iterations newton-steps
-            dtype seed output resume overwrite""",
+            spread horizon terminal margin target linearize mass damping payload iterations
+            newton-steps dtype seed output resume overwrite""",
         "solver": """config iterations stages groups updates count batch validation optimizer
             learning-rate lower upper horizon terminal seed output resume overwrite""",
     }
