@@ -1,8 +1,8 @@
 """Sets of states and inputs, in the coordinates and units of the system that they constrain.
 
 Box, Polytope, Ellipsoid         sets that contain, intersect, support, project
-maximal_invariant_set            largest set that a law u = K x keeps within limits
-invariant_ellipsoid              largest level set of x'Px that it keeps within limits
+maximal_invariant_set            largest set that u = K x keeps within limits -> InvariantSet
+invariant_ellipsoid              the same, a level set of x'Px -> InvariantEllipsoid
 maximal_control_invariant_set    largest set that some input keeps -> ControlInvariantSet
 predecessor                      states from which some input leads into a set
 joint_limits, output_limits      limits of robot joints and of outputs -> JointLimits, Box, Polytope
@@ -13,7 +13,12 @@ verify_terminal                  hypotheses of the stability theorems -> Termina
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.control_invariant import ControlInvariantSet, maximal_control_invariant_set
 from jaxmpc.sets.ellipsoid import Ellipsoid
-from jaxmpc.sets.invariant import invariant_ellipsoid, maximal_invariant_set
+from jaxmpc.sets.invariant import (
+    InvariantEllipsoid,
+    InvariantSet,
+    invariant_ellipsoid,
+    maximal_invariant_set,
+)
 from jaxmpc.sets.limits import JointLimits, joint_limits, output_limits
 from jaxmpc.sets.one_step import predecessor
 from jaxmpc.sets.polytope import Polytope
@@ -25,6 +30,8 @@ __all__ = [
     "Check",
     "ControlInvariantSet",
     "Ellipsoid",
+    "InvariantEllipsoid",
+    "InvariantSet",
     "JointLimits",
     "Polytope",
     "TerminalReport",

@@ -1,6 +1,6 @@
 """Invariant sets of x+ = A x + B u + w under u = K x: the maximal one, the largest ellipsoid."""
 
-from typing import Any, Literal, overload
+from dataclasses import dataclass, field
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,16 +15,13 @@ from jaxmpc.checks import (
     require_shape,
     require_symmetric_psd,
 )
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import cholesky, eigh, solve_triangular
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.disturbance import disturbance_set, largest_norm, supports
 from jaxmpc.sets.ellipsoid import Ellipsoid
-from jaxmpc.sets.lp import (
-    ROUNDING,
-    Program,
-    safe_extent,
-)
+from jaxmpc.sets.lp import ROUNDING, Program, safe_extent
 from jaxmpc.sets.polytope import Polytope, as_polytope
 from jaxmpc.systems.system import LinearSystem
 
@@ -33,28 +30,28 @@ from jaxmpc.systems.system import LinearSystem
 _REDUNDANT = 1e-12
 
 
-@overload
-def maximal_invariant_set(
-    system: LinearSystem,
-    K: Reals,
-    states: Box | Polytope,
-    inputs: Box | Polytope | None,
-    *,
-    disturbance: Box | Polytope | None = ...,
-    max_iterations: int = ...,
-    return_index: Literal[False] = ...,
-) -> Polytope: ...
-@overload
-def maximal_invariant_set(
-    system: LinearSystem,
-    K: Reals,
-    states: Box | Polytope,
-    inputs: Box | Polytope | None,
-    *,
-    disturbance: Box | Polytope | None = ...,
-    max_iterations: int = ...,
-    return_index: Literal[True],
-) -> tuple[Polytope, int]: ...
+@pytree
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InvariantSet(Polytope):
+    """{H x <= h}, the largest set that u = K x never lets the state leave.
+
+    index: of determination, the least t for which constraints kept at k = 0..t are kept for ever.
+    """
+
+    index: int = field(metadata={"static": True})
+
+
+@pytree
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InvariantEllipsoid(Ellipsoid):
+    """{x'P x <= level}, which u = K x never lets the state leave.
+
+    contraction: gamma2, with x+'P x+ <= gamma2 x'P x without disturbance.
+    """
+
+    contraction: Reals
+
+
 def maximal_invariant_set(
     system: LinearSystem,
     K: Reals,
@@ -63,8 +60,7 @@ def maximal_invariant_set(
     *,
     disturbance: Box | Polytope | None = None,
     max_iterations: int = 500,
-    return_index: bool = False,
-) -> Polytope | tuple[Polytope, int]:
+) -> InvariantSet:
     """Return O_inf, the states from which u = K x keeps all constraints for ever.
 
     O_inf = {x : x_k in states and K x_k in inputs for all k >= 0 and all w_k in disturbance},
@@ -77,15 +73,13 @@ def maximal_invariant_set(
         inputs: set in R^m with the origin in its interior, or None.
         disturbance: bounded set in R^n that holds the origin, or None for w = 0.
         max_iterations: how far ahead to look at most.
-        return_index: also return the index of determination.
 
-    Returns O_inf with irredundant rows of norm 1, or (O_inf, t*): t* is the least t for
-    which constraints kept at k = 0..t are kept for ever.
+    Returns O_inf with irredundant rows of norm 1, and its index of determination.
 
     With the constraints written as F x <= 1 and W the disturbance, O_t = {x : F_i (A+BK)^j x <=
     b_ij, j = 0..t}, where b_i0 = 1 and b_i,j+1 = b_ij - max {F_i (A+BK)^j w : w in W}; O_inf = O_t
-    as soon as max {F_i (A+BK)^(t+1) x : x in O_t} <= b_i,t+1 for every i. The maximum is judged by
-    an upper bound made from the LP's multipliers, valid for any LP error, and may exceed the
+    as soon as max {F_i (A+BK)^(t+1) x : x in O_t} <= b_i,t+1 for every i. An upper bound of the
+    maximum is checked, made from the LP's multipliers and valid for any LP error; it may exceed the
     right-hand side by 1e-12 of it. NumPy in float64; not traceable.
 
     Raises ValueError if A + BK is not strictly stable, the origin is not in the interior of
@@ -96,6 +90,9 @@ def maximal_invariant_set(
     Gilbert 1998, Math. Problems in Engineering 4, section 6, for the disturbance; Neumaier &
     Shcherbina 2004, Math. Programming 99, for the bound.
     """
+    require_kind("system", system, LinearSystem)
+    if states is None:
+        as_polytope("states", states)
     closed, F = _closed_loop(system, K, states, inputs)
     n = system.n
     W = disturbance_set(disturbance, n)
@@ -109,8 +106,10 @@ def maximal_invariant_set(
     rows, newest, b = F, F, np.ones(len(F))
     reach = np.full(n, np.inf)
     for t in range(max_iterations + 1):
-        if not np.isfinite(reach).all():
+        bounded = np.isfinite(reach).all()
+        if not bounded:
             reach = safe_extent(rows, np.ones(len(rows)))
+            bounded = np.isfinite(reach).all()
         # A row once redundant stays so: if F_i Acl^(t+1) x <= b_(t+1) on O_t, and Acl x + w is
         # in O_t for x in O_(t+1) and w in W, then F_i Acl^(t+2) x <= b_(t+2) on O_(t+1).
         # Only the others are propagated.
@@ -128,10 +127,10 @@ def maximal_invariant_set(
         bounds = [program.bound(*pair, reach) for pair in zip(scaled, tops, strict=True)]
         follow = np.array(bounds) > 1 + _REDUNDANT
         newest, b = candidates[follow], b[follow]
-        if len(newest) == 0 and np.isfinite(reach).all():
-            invariant = Polytope(rows, np.ones(len(rows))).reduce()
-            return (invariant, t) if return_index else invariant
-        if not np.isfinite(reach).all() and max(top.value for top in tops) <= 1 + _REDUNDANT:
+        if bounded and len(newest) == 0:
+            found = Polytope(rows, np.ones(len(rows))).reduce()
+            return InvariantSet(found.H, found.h, index=t)
+        if not bounded and max(top.value for top in tops) <= 1 + _REDUNDANT:
             fail(
                 "states",
                 "the invariant set is unbounded: some motion is never constrained",
@@ -152,9 +151,7 @@ def invariant_ellipsoid(
     states: Box | Polytope | None,
     inputs: Box | Polytope | None,
     disturbance: Box | Polytope | None = None,
-    *,
-    return_contraction: bool = False,
-) -> Ellipsoid | tuple[Ellipsoid, float]:
+) -> InvariantEllipsoid:
     """Return the largest {x : x'P x <= alpha} within the limits; u = K x never lets the state leave
     it.
 
@@ -164,9 +161,8 @@ def invariant_ellipsoid(
         P: (n, n), symmetric positive definite, with (A+BK)'P (A+BK) <= P. That of `lqr` is one.
         states, inputs: sets with the origin in their interior, or None for no limit.
         disturbance: bounded set that holds the origin, or None for w = 0.
-        return_contraction: also return gamma2.
 
-    Returns the ellipsoid, or (ellipsoid, gamma2). With rows a_i'x <= b_i of the states and of
+    Returns the ellipsoid, and its contraction gamma2. With rows a_i'x <= b_i of the states and of
     K x in inputs,
         alpha = min_i b_i^2 / (a_i'P^-1 a_i),
         gamma2 = max |P^(1/2) (A+BK) P^(-1/2)|^2, so x+'P x+ <= gamma2 x'P x for w = 0.
@@ -189,9 +185,8 @@ def invariant_ellipsoid(
     if not concrete(system.A, system.B, system.c, K, P, states, inputs):
         if disturbance is not None:
             fail("disturbance", "given inside a trace", "Compute the ellipsoid outside, or omit it")
-        traced = _traced_ellipsoid(system, K, P, states, inputs)
-        return traced if return_contraction else traced[0]
-    closed, F = _closed_loop(system, K, states, inputs, optional=("states", "inputs"))
+        return _traced_ellipsoid(system, K, P, states, inputs)
+    closed, F = _closed_loop(system, K, states, inputs)
     n = system.n
     require_shape("P", P, (n, n), "Give one matrix for the states")
     P = host_array("P", P)
@@ -217,16 +212,17 @@ def invariant_ellipsoid(
                 f"{needed - level:.6g} too little",
                 "Shrink the disturbance, widen the limits, or use another K and P",
             )
-    ellipsoid = Ellipsoid(P, level)
-    return (ellipsoid, gamma2) if return_contraction else ellipsoid
+    return InvariantEllipsoid(P, level, contraction=gamma2)
 
 
 def _traced_ellipsoid(
-    system: LinearSystem, K: Any, P: Any, states: Box | Polytope | None,
+    system: LinearSystem,
+    K: Reals,
+    P: Reals,
+    states: Box | Polytope | None,
     inputs: Box | Polytope | None,
-) -> tuple[Ellipsoid, Any]:  # fmt: skip
+) -> InvariantEllipsoid:
     """Compute `invariant_ellipsoid` in JAX, with NaN in place of errors."""
-    require_kind("system", system, LinearSystem)
     system.validate()
     n, m = system.n, system.m
     require_shape("K", K, (m, n), "Give u = Kx one row an input, one column a state")
@@ -235,11 +231,11 @@ def _traced_ellipsoid(
         fail("states", "the invariant set is unbounded: nothing is constrained", "Add bounds")
     data = arrays((jnp.asarray(system.A), jnp.asarray(system.B), jnp.asarray(K), jnp.asarray(P)))
     dtype = floating_dtype(data)
-    A, B, K, P = (part.astype(dtype) for part in data)
-    P = (P + P.T) / 2
-    L = cholesky(P)  # NaN if P is not definite
+    A, B, gain, cost = (part.astype(dtype) for part in data)
+    cost = (cost + cost.T) / 2
+    L = cholesky(cost)  # NaN if P is not definite
     most, inside = jnp.zeros((), dtype), jnp.asarray(True)  # 1/alpha
-    for limits, output in ((states, jnp.eye(n, dtype=dtype)), (inputs, K)):
+    for limits, output in ((states, jnp.eye(n, dtype=dtype)), (inputs, gain)):
         if limits is None:
             continue
         H, lower, upper = (jnp.asarray(part, dtype) for part in limits.rows())
@@ -248,12 +244,12 @@ def _traced_ellipsoid(
         # 1/alpha_i = a_i'P^-1 a_i / b_i^2 = |L^-1 a_i|^2 / b_i^2, 0 where b_i = inf.
         rows = solve_triangular(L, matmul(H, output).T)
         most = jnp.maximum(most, jnp.max(jnp.sum(rows**2, axis=0) / reach**2, initial=0.0))
-    # With P = LL', (A+BK)'P(A+BK) <= gamma2 P says |M|^2 <= gamma2 for M' = L^-1 (A+BK)'L.
-    M = solve_triangular(L, matmul((A + matmul(B, K)).T, L))
+    # With P = L L', (A+BK)'P(A+BK) <= gamma2 P says |M|^2 <= gamma2 for M' = L^-1 (A+BK)'L.
+    M = solve_triangular(L, matmul((A + matmul(B, gain)).T, L))
     gamma2 = eigh(matmul(M, M.T))[0][-1]
-    rest = jnp.zeros((), dtype) if system.c is None else jnp.max(jnp.abs(jnp.asarray(system.c)))
-    sound = (gamma2 <= 1 + 100 * jnp.finfo(dtype).eps) & inside & (most > 0) & (rest == 0)
-    return Ellipsoid(P, jnp.where(sound, 1 / most, jnp.nan)), gamma2
+    drift = jnp.zeros((), dtype) if system.c is None else jnp.max(jnp.abs(jnp.asarray(system.c)))
+    sound = (gamma2 <= 1 + 100 * jnp.finfo(dtype).eps) & inside & (most > 0) & (drift == 0)
+    return InvariantEllipsoid(cost, jnp.where(sound, 1 / most, jnp.nan), contraction=gamma2)
 
 
 def contraction(closed: np.ndarray, P: np.ndarray) -> float:
@@ -262,14 +258,9 @@ def contraction(closed: np.ndarray, P: np.ndarray) -> float:
 
 
 def _closed_loop(
-    system: LinearSystem,
-    K: Reals,
-    states: Box | Polytope | None,
-    inputs: Box | Polytope | None,
-    optional: tuple[str, ...] = ("inputs",),
+    system: LinearSystem, K: Reals, states: Box | Polytope | None, inputs: Box | Polytope | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return A + BK, and F of the constraints F x <= 1 on the state, inputs included."""
-    require_kind("system", system, LinearSystem)
     system.validate()
     n, m = system.n, system.m
     require_shape("K", K, (m, n), "Give u = Kx one row an input, one column a state")
@@ -281,13 +272,11 @@ def _closed_loop(
             "is not zero, so the origin is no equilibrium",
             "Write the system in deviations from its equilibrium",
         )
-    parts = []
-    constraints = [("states", states, n, np.eye(n)), ("inputs", inputs, m, K)]
-    for argument, constraint, dimension, output in constraints:
-        if constraint is None and argument in optional:
+    parts = [np.zeros((0, n))]
+    for argument, limits, output in (("states", states, np.eye(n)), ("inputs", inputs, K)):
+        if limits is None:
             continue
-        polytope = as_polytope(argument, constraint, dimension)
-        H, h = host_array(argument, polytope.H), host_array(argument, polytope.h)
+        H, h = as_polytope(argument, limits, len(output)).half_spaces()
         F = H @ output
         # Rows that u = K x keeps identically, as that of two inputs which K makes equal: their
         # terms cancel.
@@ -301,7 +290,7 @@ def _closed_loop(
                 "Shift the coordinates, or widen the bounds around 0",
             )
         parts.append(F / h[:, None])
-    F = np.vstack(parts) if parts else np.zeros((0, n))
+    F = np.vstack(parts)
     F = F[np.abs(F).max(axis=1, initial=0.0) > 0]
     if len(F) == 0:
         fail("states", "the invariant set is unbounded: nothing is constrained", "Add bounds")

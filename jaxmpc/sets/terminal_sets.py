@@ -14,9 +14,12 @@ TERMINAL_SETS = ("none", "box", "invariant", "ellipsoid")
 
 
 def named_terminal_set(
-    name: str, system: LinearSystem, law: LQR | None, states: Box | Polytope | None,
+    name: str,
+    system: LinearSystem,
+    law: LQR | None,
+    states: Box | Polytope | None,
     inputs: Box | Polytope | None,
-) -> Box | Polytope | Ellipsoid | None:  # fmt: skip
+) -> Box | Polytope | Ellipsoid | None:
     """Return the terminal set of this name for x⁺ = A x + B u within the limits.
 
     "none": None. "box": the state limits. "invariant": the maximal invariant set of the LQR `law`.
@@ -36,8 +39,6 @@ def named_terminal_set(
         fail("terminal", f"{name!r} without limits", "Give states or inputs, or 'none'")
     assert law is not None
     if name == "ellipsoid":
-        ellipsoid = invariant_ellipsoid(system, law.K, law.P, states, inputs)
-        assert isinstance(ellipsoid, Ellipsoid)
-        return ellipsoid
+        return invariant_ellipsoid(system, law.K, law.P, states, inputs)
     free = Box(np.full(system.n, -np.inf), np.full(system.n, np.inf))
     return maximal_invariant_set(system, law.K, free if states is None else states, inputs)

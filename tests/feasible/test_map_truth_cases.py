@@ -51,14 +51,12 @@ def double_integrator_lqr():
     mpc = problems.double_integrator()
     law = jm.lqr(mpc.system, np.eye(2), np.eye(1))
     np.testing.assert_allclose(law.K, [[-0.5197540074523589, -0.9399575360220684]], rtol=1e-9)
-    body, t = jm.maximal_invariant_set(mpc.system, law.K, mpc.states, mpc.inputs, return_index=True)
-    assert t == 2 and len(body.vertices()) == 6
+    body = jm.maximal_invariant_set(mpc.system, law.K, mpc.states, mpc.inputs)
+    assert body.index == 2 and len(body.vertices()) == 6
     assert body.volume() == pytest.approx(13.74039794963338, rel=1e-9)
-    ellipsoid, gamma2 = jm.invariant_ellipsoid(
-        mpc.system, law.K, law.P, mpc.states, mpc.inputs, return_contraction=True
-    )
+    ellipsoid = jm.invariant_ellipsoid(mpc.system, law.K, law.P, mpc.states, mpc.inputs)
     assert ellipsoid.level == pytest.approx(2.2690725611388145, rel=1e-9)
-    assert gamma2 == pytest.approx(0.4595183119694164, rel=1e-9)
+    assert ellipsoid.contraction == pytest.approx(0.4595183119694164, rel=1e-9)
     assert ellipsoid.volume() == pytest.approx(3.2752599406821137, rel=1e-9)
 
 
@@ -157,15 +155,13 @@ def joint_lqr():
     law = jm.lqr(mpc.system, mpc.Q, mpc.R)
     np.testing.assert_allclose(law.K, K_DARE, rtol=1e-9)
     np.testing.assert_allclose(law.P, P_DARE, rtol=1e-9)
-    body, t = jm.maximal_invariant_set(mpc.system, law.K, mpc.states, mpc.inputs, return_index=True)
-    assert t == 3 and len(body.vertices()) == 10
+    body = jm.maximal_invariant_set(mpc.system, law.K, mpc.states, mpc.inputs)
+    assert body.index == 3 and len(body.vertices()) == 10
     assert body.volume() == pytest.approx(0.9473310116683459, rel=1e-8)
-    ellipsoid, gamma2 = jm.invariant_ellipsoid(
-        mpc.system, law.K, law.P, mpc.states, mpc.inputs, return_contraction=True
-    )
+    ellipsoid = jm.invariant_ellipsoid(mpc.system, law.K, law.P, mpc.states, mpc.inputs)
     assert ellipsoid.level == pytest.approx(1.4137628195913876, rel=1e-8)
     assert ellipsoid.volume() == pytest.approx(0.10389475972612443, rel=1e-8)
-    assert gamma2 == pytest.approx(0.9168846938332548, rel=1e-8)
+    assert ellipsoid.contraction == pytest.approx(0.9168846938332548, rel=1e-8)
 
 
 # Area of X_N with terminal set O_inf.

@@ -295,10 +295,8 @@ def test_robust_invariant_sets_on_the_line():
     half = LinearSystem([[-0.5]], [[1.0]])
     limits, w = Box([-1], [3]), symmetric(0.1)
     # -x/2 + w >= -1 asks x <= 1.8; what x <= 3 asks of later steps is weaker
-    found, index = maximal_invariant_set(
-        half, no_input, limits, None, disturbance=w, return_index=True
-    )
-    assert interval(found) == pytest.approx((-1, 1.8), abs=1e-14) and index == 1
+    found = maximal_invariant_set(half, no_input, limits, None, disturbance=w)
+    assert interval(found) == pytest.approx((-1, 1.8), abs=1e-14) and found.index == 1
     same = maximal_invariant_set(half, no_input, limits, None, disturbance=symmetric(0))
     assert interval(same) == interval(maximal_invariant_set(half, no_input, limits, None))
     assert interval(same) == pytest.approx((-1, 2))
@@ -355,11 +353,10 @@ def test_robust_invariant_set_in_the_plane(shape):
 def test_known_ellipsoids(system, Q, R, states, inputs, level, gamma2, area):
     law = lqr(system, Q, R)
     arguments = (system, law.K, law.P, symmetric(*states), symmetric(inputs))
-    ellipsoid, contraction = invariant_ellipsoid(*arguments, return_contraction=True)
+    ellipsoid = invariant_ellipsoid(*arguments)
     assert ellipsoid.level == pytest.approx(level, rel=1e-12)
-    assert contraction == pytest.approx(gamma2, rel=1e-12)
+    assert ellipsoid.contraction == pytest.approx(gamma2, rel=1e-12)
     assert ellipsoid.volume() == pytest.approx(area, rel=1e-12)
-    assert invariant_ellipsoid(*arguments).level == ellipsoid.level
 
 
 def test_ellipsoids_on_the_line():

@@ -122,23 +122,21 @@ def test_invariant_ellipsoid_follows_the_weights_of_its_law():
 
     def terminal(Q):
         found = jm.lqr(joint, Q, np.array([[0.1]]))
-        return jm.invariant_ellipsoid(
-            joint, found.K, found.P, states, inputs, return_contraction=True
-        )
+        return jm.invariant_ellipsoid(joint, found.K, found.P, states, inputs)
 
     def level(Q):
-        ellipsoid, contraction = terminal(Q)
-        return ellipsoid.level, (ellipsoid.P, contraction)
+        ellipsoid = terminal(Q)
+        return ellipsoid.level, (ellipsoid.P, ellipsoid.contraction)
 
     weights = np.diag([50.0, 1.0])
     with jax.enable_x64(True):
         (value, rest), gradient = jax.jit(jax.value_and_grad(level, has_aux=True))(weights)
-    ellipsoid, contraction = terminal(weights)
+    ellipsoid = terminal(weights)
     np.testing.assert_allclose(value, ellipsoid.level, rtol=1e-12)
     np.testing.assert_allclose(rest[0], ellipsoid.P, rtol=1e-12)
-    np.testing.assert_allclose(rest[1], contraction, rtol=1e-12)
+    np.testing.assert_allclose(rest[1], ellipsoid.contraction, rtol=1e-12)
     for V in (np.diag([1.0, 0.0]), np.diag([0.0, 1.0]), np.array([[0.0, 1.0], [1.0, 0.0]])):
-        ends = [terminal(weights + step * V)[0].level for step in (1e-5, -1e-5)]
+        ends = [terminal(weights + step * V).level for step in (1e-5, -1e-5)]
         np.testing.assert_allclose(
             np.sum(np.asarray(gradient) * V), (ends[0] - ends[1]) / 2e-5, rtol=1e-6
         )

@@ -543,8 +543,8 @@ def test_lqr_leaves_decaying_modes_alone():
 def test_invariant_set_of_the_joint():
     law = lqr(*JOINT_LQR)
     states, inputs = Box([-1.5, -2], [1.5, 2]), Box([-2], [2])
-    invariant, index = maximal_invariant_set(JOINT, law.K, states, inputs, return_index=True)
-    assert index == 3 and invariant.H.shape == (10, 2)
+    invariant = maximal_invariant_set(JOINT, law.K, states, inputs)
+    assert invariant.index == 3 and invariant.H.shape == (10, 2)
     assert invariant.volume() == pytest.approx(0.9473310116683459, abs=1e-12)
     assert_same_points(invariant.vertices(), JOINT_O_INF)
     alone = maximal_invariant_set(
@@ -558,8 +558,8 @@ def test_invariant_set_of_the_joint():
 def test_invariant_set_of_the_published_double_integrator():
     K = lqr(DOUBLE, np.eye(2), np.eye(1)).K
     states, inputs = Box([-5, -5], [5, 5]), Box([-1], [1])
-    invariant, index = maximal_invariant_set(DOUBLE, K, states, inputs, return_index=True)
-    assert index == 2
+    invariant = maximal_invariant_set(DOUBLE, K, states, inputs)
+    assert invariant.index == 2
     assert invariant.volume() == pytest.approx(13.74039794963338, rel=1e-12)
     assert_same_points(invariant.H / invariant.h[:, None], DOUBLE_O_INF_ROWS)
 
@@ -593,23 +593,17 @@ def test_invariant_sets_of_product_and_closed_forms():
     K = lqr(*JOINT_LQR).K
     arm = LinearSystem(np.kron(np.eye(4), JOINT.A), np.kron(np.eye(4), JOINT.B))
     states, inputs = Box([-1.5, -2] * 4, [1.5, 2] * 4), Box([-2] * 4, [2] * 4)
-    product, index = maximal_invariant_set(
-        arm, np.kron(np.eye(4), K), states, inputs, return_index=True
-    )
-    assert index == 3 and product.H.shape == (40, 8)
+    product = maximal_invariant_set(arm, np.kron(np.eye(4), K), states, inputs)
+    assert product.index == 3 and product.H.shape == (40, 8)
     # A shift register keeps its box at once, though its rows touch it for ever.
     shift = LinearSystem(np.diag([1.0, 1.0], 1), np.ones((3, 1)))
-    kept, index = maximal_invariant_set(
-        shift, np.zeros((1, 3)), Box([-1] * 3, [1] * 3), None, return_index=True
-    )
-    assert index == 0 and kept.volume() == pytest.approx(8)
+    kept = maximal_invariant_set(shift, np.zeros((1, 3)), Box([-1] * 3, [1] * 3), None)
+    assert kept.index == 0 and kept.volume() == pytest.approx(8)
     # Constraints need not bound the set by themselves, if the motion does:
     # |x1| <= 1 and |x1/2 + x2| <= 1 after a step, |x1/4 + x2| <= 1 after two.
     chain = LinearSystem([[0.5, 1], [0, 0.5]], [[1], [0]])
-    half, index = maximal_invariant_set(
-        chain, np.zeros((1, 2)), Box([-1, -INF], [1, INF]), None, return_index=True
-    )
-    assert index == 2
+    half = maximal_invariant_set(chain, np.zeros((1, 2)), Box([-1, -INF], [1, INF]), None)
+    assert half.index == 2
     rows = np.array([[1, 0], [0.5, 1], [0.25, 1]])
     assert_same_points(half.H / half.h[:, None], np.vstack([rows, -rows]))
 
