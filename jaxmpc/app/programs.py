@@ -81,16 +81,6 @@ def kept_programs(words: Sequence[str]) -> Iterator[None]:
         del os.environ["JAX_COMPILATION_CACHE_DIR"]
 
 
-def times_file() -> Path | None:
-    """Return the file with compile times of earlier runs: it lies with the programs of these, here
-    or in the user's own JAX_COMPILATION_CACHE_DIR. None where none are kept."""
-    own = os.environ.get("JAX_COMPILATION_CACHE_DIR", "")
-    if not own or "://" in own:
-        return None
-    folder = Path(own)
-    return (folder.parent if folder.name.startswith(RUN) else folder) / "jaxmpc-seconds.json"
-
-
 def _begin(folder: Path) -> Path:
     """Make the folder of this process, with links to all entries of `folder` that are whole."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)

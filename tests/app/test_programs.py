@@ -16,7 +16,7 @@ import jaxmpc as jm
 from jaxmpc.app import programs
 from jaxmpc.app.commands import compiling
 from jaxmpc.app.commands.compiling import Compiling
-from jaxmpc.app.programs import kept_programs, times_file
+from jaxmpc.app.programs import kept_programs
 from jaxmpc.batches import Compiled
 
 VARIABLE = "JAX_COMPILATION_CACHE_DIR"
@@ -48,7 +48,6 @@ def test_entries_are_kept_whole_or_not_at_all():
         write("b-cache", b"second")
         write("notes", b"no entry")
         assert entries() == {}, "nothing half written is seen"
-        assert times_file() == own.parent / "jaxmpc-seconds.json"
     assert entries() == {"a-cache": b"first", "b-cache": b"second"}
     assert VARIABLE not in os.environ and not own.exists()
     (damaged,) = own.parent.glob("b-cache.*")
@@ -109,7 +108,7 @@ def test_switches(tmp_path, monkeypatch):
         assert VARIABLE not in os.environ
     monkeypatch.setenv("JAXMPC_CACHE", "off")
     with kept_programs(["simulate"]):
-        assert VARIABLE not in os.environ and times_file() is None
+        assert VARIABLE not in os.environ
     monkeypatch.delenv("JAXMPC_CACHE")
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
@@ -118,48 +117,36 @@ def test_switches(tmp_path, monkeypatch):
     monkeypatch.setenv(VARIABLE, str(tmp_path / "mine"))
     with kept_programs(["simulate"]):
         assert os.environ[VARIABLE] == str(tmp_path / "mine")
-        assert times_file() == tmp_path / "mine" / "jaxmpc-seconds.json"
     assert os.environ[VARIABLE] == str(tmp_path / "mine") and not (tmp_path / "mine").exists()
 
 
-def test_a_wait_is_announced_by_the_last_one(tmp_path, monkeypatch, capsys):
-    """By a guess, then by the first time, then by the last; other options are another program."""
-    robot, clock = jm.load_robot("joint"), [0.0]
-    monkeypatch.setenv(VARIABLE, str(tmp_path))
+def test_a_wait_is_told_with_its_seconds(monkeypatch, capsys):
+    """A line at the start and one when the last program is ready; a line that counts on a
+    terminal; no second line where nothing had to be compiled."""
+    clock = [0.0]
     monkeypatch.setattr(compiling, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
 
-    def waited(seconds, options):
-        program = Compiled(jax.jit(lambda x: x + 1.0))
-        wait = Compiling.announce(robot, "loops", options)
-        with wait.followed(programs=1):
-            clock[0] += seconds
-            program(np.zeros(3))
+    def waited(programs, *waits):
+        with Compiling() as wait:
+            wait.begin("closed loops of joint", programs)
+            for k, seconds in enumerate(waits):
+                clock[0] += seconds
+                Compiled(jax.jit(lambda x: x + 1.0))(np.zeros(k + 1))
             clock[0] += 1000.0  # it runs
-        wait.over()
         return capsys.readouterr().err
 
-    first = waited(40.0, {"horizon": 5})
-    assert first.startswith("compiling, about ") and "guess by the number of joints" in first
-    assert first.count("\n") == 2 and first.endswith("\ncompiled in 40 s\n")
-    assert "less than the 40 s of the first time" in waited(7.0, {"horizon": 5})
-    assert "about 7 s, as last time" in waited(6.0, {"horizon": 5})
-    assert "about 6 s, as last time" in waited(6.0, {"horizon": 5})
-    assert "guess" in waited(6.0, {"horizon": 6})
-    (tmp_path / "jaxmpc-seconds.json").write_text('{"a": [')
-    assert "guess" in waited(6.0, {"horizon": 5})
-    wait = Compiling.announce(robot, "gradients", {})
-    with wait.followed():  # nobody knows how many
-        for k, seconds in enumerate((7.0, 3.0, 20.0)):
-            clock[0] += seconds
-            Compiled(jax.jit(lambda x: x + 1.0))(np.zeros(k))
-    wait.over()
-    assert capsys.readouterr().err.splitlines()[1:] == [
-        "compiling, 1 program ready after 7 s", "compiling, 3 programs ready after 30 s",
-        "compiled in 30 s",
-    ]  # fmt: skip
-    assert not Compiled.listeners
-    Compiling.announce(robot, "loops", {}).over()  # nothing had to be compiled
-    assert capsys.readouterr().err.count("\n") == 1
+    begun = "compiling closed loops of joint\n"
+    assert waited(1, 40.0) == begun + "compiled closed loops of joint in 40 s\n"
+    assert waited(0, 7.0, 3.0, 20.0) == begun + "compiled closed loops of joint in 30 s\n"
+    assert waited(1) == begun and not Compiled.listeners
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    drawn = waited(1, 40.0)
+    first, blank, end = drawn.rsplit("\r", 2)
+    assert first.split("\r")[1].rstrip() == "compiling closed loops of joint, 0 s"
+    assert not blank.strip() and end == "compiled closed loops of joint in 40 s\n"
+    with Compiling():
+        pass  # refused before anything compiles
+    assert capsys.readouterr().err == ""
 
 
 PROGRAM = """

@@ -89,20 +89,21 @@ class RobotMapCommand:
     def run(self) -> None:
         """Make the map, write the files, print the table. Raises ValueError before it compiles."""
         begun = time.perf_counter()
-        setting, config, kept, compiling = self.prepare()
-        with kept:
-            self._run(setting, config, kept, compiling, begun)
+        with Compiling() as wait:
+            setting, config, kept = self.prepare(wait)
+            with kept:
+                self._run(setting, config, kept, wait, begun)
 
     def _run(
         self, setting: RobotSetting, config: dict[str, Any], kept: store.Store,
-        compiling: Compiling, begun: float,
+        wait: Compiling, begun: float,
     ) -> None:  # fmt: skip
         count = len(setting.points)
         print(
             f"{setting.robot.name}: {count:,} states, {setting.steps} samples -> {self.output}",
             flush=True,
         )
-        self.label(setting, kept, compiling)
+        self.label(setting, kept, wait)
         if self.claim == "recursion":
             what = "linear model: closed loops and a search for counterexamples"
             most = f"up to {self.search_seconds:g} s and compiling"
@@ -115,9 +116,8 @@ class RobotMapCommand:
         print(f"  {'total':<16} {time.perf_counter() - begun:.2f} s with set-up and files")
         print(f"  {'files':<16} {' '.join(str(self.output / name) for name in files)}")
 
-    def prepare(self) -> tuple[RobotSetting, dict[str, Any], store.Store, Compiling]:
-        """Return the checked setting, its configuration (JSON data), the opened store, and the
-        wait for the compiler, announced."""
+    def prepare(self, wait: Compiling) -> tuple[RobotSetting, dict[str, Any], store.Store]:
+        """Return the checked setting, its configuration (JSON data) and the opened store."""
         path = self.output / "robot_map.zarr"
         check_results(path, self.resume, self.overwrite)
         robot = load_robot(self.robot)
@@ -138,11 +138,7 @@ class RobotMapCommand:
         if self.steps is not None:
             seconds = self.steps * robot.dt
         # The steps from here on compile programs.
-        programs = {
-            "seconds": seconds, "horizon": self.horizon, "terminal": self.terminal, "axes": axes,
-            "grid": [len(line) for line in along], "devices": self.devices, **self.settings,
-        }  # fmt: skip
-        compiling = Compiling.announce(robot, f"map of {self.claim}", programs)
+        wait.begin(f"closed loops of {robot.name}")
         fixed = _home_coordinates(robot)
         fixed[others] = fixed[others] if self.values is None else self.values
         mpc = default_mpc(robot, self.horizon or 20, self.terminal or "none")
@@ -173,7 +169,7 @@ class RobotMapCommand:
             overwrite=self.overwrite, begun=lambda: remove_files(self.output, *old),
         )  # fmt: skip
         report_damage(kept)
-        return setting, config, kept, compiling
+        return setting, config, kept
 
     def _along(self, robot: Robot, axes: tuple[int, ...]) -> list[np.ndarray]:
         """Return the coordinates of the grid along each axis. Raises ValueError for options of
@@ -189,7 +185,7 @@ class RobotMapCommand:
         ends = grid_ends("--", self.lower, self.upper, limits)
         return [np.linspace(*line) for line in zip(*ends, shape, strict=True)]
 
-    def label(self, setting: RobotSetting, kept: store.Store, compiling: Compiling) -> None:
+    def label(self, setting: RobotSetting, kept: store.Store, wait: Compiling) -> None:
         """Label the blocks that are not done, and commit each; the first one compiles."""
         todo, index = kept.batches()
         if not todo:
@@ -198,9 +194,9 @@ class RobotMapCommand:
         chunks = setting.chunks(
             index.ravel(), chunk=index.shape[1], devices=self.devices, **self.settings
         )
-        with tqdm(total=total, unit=" loops", disable=None) as bar, compiling.followed():
+        with tqdm(total=total, unit=" loops", disable=None) as bar:
             for (block, here), (_, labels, loops) in zip(todo, chunks, strict=True):
-                compiling.over()
+                wait.end()
                 count = here.stop - here.start
                 looped = first_rows(vars(loops), count)
                 kept.commit(block, **store.label_rows(labels.first(count)), **looped)

@@ -39,8 +39,6 @@ from jaxmpc.systems.riccati import lqr
 
 # Defaults of options that --config can give too.
 USUAL = {"horizon": 20, "margin": 0.02, "linearize": "state", "rho": 1e4}
-# Options that change the compiled programs.
-PROGRAM = ("horizon", "linearize", "iterations", "newton_steps", "dtype", "devices")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +55,7 @@ class Simulate:
     How to start
       $ jaxmpc simulate
       $ jaxmpc simulate --robot arm7 --count 256 --seconds 1 --mass 0.1 --output runs/a
-      It compiles before the first samples, and says for about how long. What is compiled is kept
+      It compiles before the first samples, and says for how long so far. What is compiled is kept
       for the next time in ~/.cache/jaxmpc/programs (with JAXMPC_CACHE=off nothing is; with
       JAX_COMPILATION_CACHE_DIR it is there).
 
@@ -187,29 +185,41 @@ class Simulate:
         steps = max(1, round(self.seconds / robot.dt))
         each = 256 if jax.default_backend() == "cpu" else 4096
         chunk = self.chunk or (self.devices or 1) * each
-        # The steps from here on compile programs.
-        programs = {name: getattr(command, name) for name in PROGRAM}
-        programs |= {"steps": steps, "chunk": min(chunk, self.count)}
-        compiling = Compiling.announce(robot, "loops", programs)
-        mpc = command.problem(robot, target, file)
-        with jax.enable_x64(True):
-            reference = np.asarray(robot.coordinates(x))
-        starts, factors = draw_robots(
-            robot, self.count, self.seed, spread=self.spread, mass=self.mass,
-            damping=self.damping, payload=self.payload,
-        )  # fmt: skip
-        open_folder(self.output)
-        print(f"{robot.name}: {self.count:,} robots for {self.seconds:g} s -> {self.output}")
-        old = "summary.json", "runs.png", "robots.gif"
-        with jax.enable_x64(self.dtype == "float64"), compiling.followed(programs=1):
-            runs = simulate_into(
-                path, command.controller(robot, mpc), robot, starts, steps, reference=reference,
-                input_reference=input_reference, factors=factors,
-                settings=command.settings(robot, mpc), chunk=chunk, devices=self.devices,
-                resume=self.resume, overwrite=self.overwrite, progress=True,
-                begun=lambda: remove_files(self.output, *old),
-            )  # fmt: skip
-        compiling.over()
+        with Compiling() as wait:
+            wait.begin(f"closed loops of {robot.name}", programs=1)
+            mpc = command.problem(robot, target, file)
+            with jax.enable_x64(True):
+                reference = np.asarray(robot.coordinates(x))
+            starts, factors = draw_robots(
+                robot,
+                self.count,
+                self.seed,
+                spread=self.spread,
+                mass=self.mass,
+                damping=self.damping,
+                payload=self.payload,
+            )
+            open_folder(self.output)
+            print(f"{robot.name}: {self.count:,} robots for {self.seconds:g} s -> {self.output}")
+            old = "summary.json", "runs.png", "robots.gif"
+            with jax.enable_x64(self.dtype == "float64"):
+                runs = simulate_into(
+                    path,
+                    command.controller(robot, mpc),
+                    robot,
+                    starts,
+                    steps,
+                    reference=reference,
+                    input_reference=input_reference,
+                    factors=factors,
+                    settings=command.settings(robot, mpc),
+                    chunk=chunk,
+                    devices=self.devices,
+                    resume=self.resume,
+                    overwrite=self.overwrite,
+                    progress=True,
+                    begun=lambda: remove_files(self.output, *old),
+                )
         summary = summarise_runs(runs, robot, reference, input_reference, tolerance=self.tolerance)
         files = ["runs.zarr", "summary.json", "runs.png"]
         from jaxmpc.app.plots.closed_loops import plot_runs

@@ -1,11 +1,9 @@
 """The command `jaxmpc tune weights`: its options and help."""
 
-import contextlib
 import dataclasses
 import json
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -232,7 +230,8 @@ class TuneWeights:
 
     def tuned(self, task: TuningTask) -> TuningRun:
         """Return the run of `tune_weights`."""
-        with jax.enable_x64(task.dtype == "float64"), self.waiting(task):
+        with jax.enable_x64(task.dtype == "float64"), Compiling() as wait:
+            wait.begin(f"closed loops of {task.name} and their gradient", programs=2)
             return tune_weights(
                 task.make, task.parameters, task.plant, task.x0s, task.loss, task.steps,
                 reference=task.reference, input_reference=task.input_reference,
@@ -241,20 +240,6 @@ class TuneWeights:
                 batch=self.batch, mode=self.mode, seed=self.seed,
                 checkpoint=self.output / CHECKPOINT, progress=sys.stderr.isatty(),
             )  # fmt: skip
-
-    @contextlib.contextmanager
-    def waiting(self, task: TuningTask) -> Iterator[None]:
-        """Say with --robot how long it compiles; only in the end is it known which was the last."""
-        if self.robot is None:
-            yield
-            return
-        options = self.options(task)
-        irrelevant = "seed spread mass damping payload violation settling tolerance".split()
-        programs = {k: v for k, v in options.items() if k not in irrelevant}
-        compiling = Compiling.announce(task.plant, "gradients", programs)
-        with compiling.followed():
-            yield
-        compiling.over()
 
     def prepare(self) -> TuningTask:
         """Check the options, build the task and open the folder. No closed loop compiles.
