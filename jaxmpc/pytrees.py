@@ -1,9 +1,11 @@
-"""Public classes of arrays as pytrees of JAX, which stored programs (`jax.export`) know by name."""
+"""Classes of arrays: frozen dataclasses that print in a few lines, and pytrees of JAX made of them,
+which stored programs (`jax.export`) know by name."""
 
 import ast
 import dataclasses
+import textwrap
 from collections.abc import Callable, Iterable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, dataclass_transform
 
 import jax
 import numpy as np
@@ -12,70 +14,103 @@ from jax import export
 from jaxmpc.checks import fail, shown
 
 T = TypeVar("T", bound=type)
+# Entries of an array that is printed as numbers, and characters of a field, at most.
+FEW, SHORT = 6, 60
+# Stands for a space at which no line ends.
+UNBROKEN = "\N{NO-BREAK SPACE}"
 
 
+def static(*, default: Any = dataclasses.MISSING) -> Any:
+    """Return a field of a pytree that is a constant of programs: part of its structure, no leaf."""
+    return dataclasses.field(default=default, metadata={"static": True})
+
+
+@dataclass_transform(eq_default=False, frozen_default=True, field_specifiers=(dataclasses.field,))
+def record(cls: T) -> T:
+    """Make a frozen dataclass of a class, which compares by identity, and prints as `short_text`
+    says unless it has a way of its own."""
+    dataclasses.dataclass(cls, frozen=True, eq=False, repr=False)
+    if cls.__repr__ is object.__repr__:
+        cls.__repr__ = short_text  # type: ignore[method-assign, assignment]
+    return cls
+
+
+@dataclass_transform(eq_default=False, frozen_default=True, field_specifiers=(static,))
 def pytree(cls: T) -> T:
-    """Register a dataclass whose fields are data, or static where their metadata say so.
+    """Make a `record` of a class, and a pytree whose leaves are its fields but `static` ones.
 
-    Its name in stored programs is "jaxmpc." and that of the class, wherever that is defined.
+    Its name in stored programs is "jaxmpc." and that of the class, wherever that is defined: no two
+    have the same.
     """
-    jax.tree_util.register_dataclass(cls)
+    jax.tree_util.register_dataclass(record(cls))
     return _stored(cls)
 
 
-def prepared_pytree(cls: type) -> None:
-    """Register a dataclass that computes in its constructor: JAX rebuilds it from its fields
+@dataclass_transform(
+    eq_default=False, frozen_default=True, field_specifiers=(static, dataclasses.field)
+)
+def prepared_pytree(cls: T) -> T:
+    """`pytree` for a class that computes in its constructor: JAX rebuilds it from its fields
     without that, `dataclasses.replace` with it."""
-    fields = dataclasses.fields(cls)
-    static = tuple(f.name for f in fields if f.metadata.get("static"))
+    fields = dataclasses.fields(record(cls))
+    constants = tuple(f.name for f in fields if f.metadata.get("static"))
     data = tuple(f.name for f in fields if not f.metadata.get("static"))
 
+    def values(instance: Any, names: tuple[str, ...]) -> tuple:
+        return tuple(getattr(instance, name) for name in names)
+
     def flatten(instance: Any) -> tuple[tuple, tuple]:
-        return tuple(getattr(instance, k) for k in data), tuple(
-            getattr(instance, k) for k in static
-        )
+        return values(instance, data), values(instance, constants)
 
     def with_keys(instance: Any) -> tuple[tuple, tuple]:
-        leaves, rest = flatten(instance)
         keys = map(jax.tree_util.GetAttrKey, data)
-        return tuple(zip(keys, leaves, strict=True)), rest
+        return tuple(zip(keys, values(instance, data), strict=True)), values(instance, constants)
 
     def unflatten(rest: tuple, leaves: Iterable[Any]) -> Any:
         instance: Any = object.__new__(cls)
-        vars(instance).update(zip((*data, *static), (*leaves, *rest), strict=True))
+        vars(instance).update(zip((*data, *constants), (*leaves, *rest), strict=True))
         return instance
 
     jax.tree_util.register_pytree_with_keys(cls, with_keys, unflatten, flatten)
-    _stored(cls)
+    return _stored(cls)
 
 
 def static_pytree(cls: T) -> T:
     """Register a dataclass without arrays: a constant of programs."""
     jax.tree_util.register_static(cls)
-    values = lambda instance: tuple(getattr(instance, f.name) for f in dataclasses.fields(cls))
+
+    def values(instance: Any) -> tuple:
+        return tuple(getattr(instance, f.name) for f in dataclasses.fields(cls))
+
     return _stored(cls, values, lambda values: cls(*values))
 
 
 def named_pytree(cls: T) -> T:
     """Give a NamedTuple, which is a pytree, its name in stored programs."""
+    cls.__repr__ = short_text  # type: ignore[method-assign, assignment]
     export.register_namedtuple_serialization(cls, serialized_name=f"jaxmpc.{cls.__name__}")
     return cls
 
 
 def _stored(
-    cls: T, values: Callable[[Any], Any] = lambda aux: aux,
-    rebuilt: Callable[[Any], Any] = lambda values: values,
-) -> T:  # fmt: skip
+    cls: T,
+    values: Callable[[Any], Any] = lambda constants: constants,
+    rebuilt: Callable[[Any], Any] = lambda constants: constants,
+) -> T:
     """Register the name and what is static of a class, as the text of a Python literal."""
 
-    def write(aux: Any) -> bytes:
-        return repr(_literal(cls.__name__, values(aux))).encode()
+    def write(constants: Any) -> bytes:
+        return repr(_literal(cls.__name__, values(constants))).encode()
 
-    read = lambda text: rebuilt(ast.literal_eval(text.decode()))
+    def read(text: bytes) -> Any:
+        return rebuilt(ast.literal_eval(text.decode()))
+
     export.register_pytree_node_serialization(
-        cls, serialized_name=f"jaxmpc.{cls.__name__}", serialize_auxdata=write,
+        cls,
+        serialized_name=f"jaxmpc.{cls.__name__}",
+        serialize_auxdata=write,
         deserialize_auxdata=read,
-    )  # fmt: skip
+    )
     return cls
 
 
@@ -88,3 +123,45 @@ def _literal(name: str, value: Any) -> Any:
         cure = "Close the program over it, instead of passing it as an argument or a result"
         fail(name, f"holds {shown(value)}, which cannot be stored", cure)
     return value
+
+
+def short_text(instance: Any, **texts: str) -> str:
+    """Return a dataclass or NamedTuple as a few lines of text: of large or traced arrays type and
+    shape, and no fields that have their defaults. texts: of some fields, in place of theirs."""
+    is_record = dataclasses.is_dataclass(instance)
+    names = [f.name for f in dataclasses.fields(instance)] if is_record else instance._fields
+    parts = [
+        f"{name}={texts.get(name) or short_value(getattr(instance, name))}".replace(" ", UNBROKEN)
+        for name in names
+        if not (is_record and _has_default(instance, name))
+    ]
+    text = f"{type(instance).__name__}({', '.join(parts)})"
+    lines = textwrap.wrap(text, 100, subsequent_indent="    ", break_on_hyphens=False)
+    return "\n".join(lines).replace(UNBROKEN, " ")
+
+
+def _has_default(instance: Any, name: str) -> bool:
+    value, default = getattr(instance, name), instance.__dataclass_fields__[name].default
+    plain = isinstance(value, bool | int | float | str | tuple)
+    return value is default or (plain and type(value) is type(default) and value == default)
+
+
+def short_value(value: Any) -> str:
+    """Return what stands in a field as text of one line."""
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        traced = isinstance(value, jax.core.Tracer)
+        if traced or not 0 < value.size <= FEW or not _is_here(value):
+            return f"{'traced ' * traced}{value.dtype} {value.shape}"
+        return np.array2string(np.asarray(value), precision=4, separator=", ").replace("\n", "")
+    if isinstance(value, tuple) and not hasattr(value, "_fields"):
+        return f"({', '.join(map(short_value, value))}{',' * (len(value) == 1)})"
+    if dataclasses.is_dataclass(value) or hasattr(value, "_fields"):
+        text = " ".join(repr(value).split())
+        return text if len(text) <= SHORT else f"{type(value).__name__}(…)"
+    return shown(value)
+
+
+def _is_here(array: Any) -> bool:
+    """Return whether an array can be read: not donated, and all of it of this process."""
+    on_host = not isinstance(array, jax.Array)
+    return on_host or (array.is_fully_addressable and not array.is_deleted())

@@ -42,7 +42,7 @@ import sys
 import uuid
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias
@@ -57,6 +57,7 @@ from jaxmpc.feasible.labels import PROOFS, Labels, OnDemand
 from jaxmpc.feasible.map import mesh
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.files import differences, faithful, fingerprint, text_within, versions
+from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 
 if TYPE_CHECKING:
@@ -552,7 +553,7 @@ class Store:
             return -1
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Stored:
     """A store as it lies on the disk, read without being changed.
 

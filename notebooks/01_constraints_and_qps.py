@@ -65,7 +65,7 @@ bound = np.concatenate([np.full(N, u_max), x_max, x_max])
 qp = jm.QP(P_z, q, C, l=-bound - free, u=bound - free)
 solution = jm.solve_qp(qp)
 z = np.asarray(solution.z)
-print(jm.Status(int(solution.status)).sentence)
+print(solution.sentence)
 print("torques:", z, "N m")
 assert int(solution.status) == jm.Status.SOLVED
 

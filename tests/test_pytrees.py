@@ -127,3 +127,19 @@ def test_what_cannot_be_stored_says_so():
 def test_names_are_told_apart():
     with pytest.raises(ValueError, match="Duplicate"):
         pytree(dataclasses.dataclass(type("Plan", (), {})))
+
+
+def test_objects_print_in_a_few_lines():
+    """Large and traced arrays as type and shape, no field that has its default."""
+    assert repr(jm.ADMM()) == "ADMM()"
+    assert repr(jm.ADMM(5, rho=np.ones((4, 9)))) == "ADMM(iterations=5, rho=float64 (4, 9))"
+    assert repr(jm.Box([-1, -2], [1, 2])) == "Box(lower=[-1., -2.], upper=[1., 2.])"
+    text = repr(jm.Controller(problem()).condensed)
+    assert all(len(line) <= 100 for line in text.splitlines()) and len(text.splitlines()) < 10
+    traced = []
+    jax.make_jaxpr(lambda x: traced.append(repr(jm.ADMM(rho=x))))(np.float32(1))
+    assert traced == ["ADMM(rho=traced float32 ())"]
+    assert repr(jax.tree.map(lambda _: None, jm.Box(1.0, 2.0))) == "Box(lower=None, upper=None)"
+    donated = jnp.ones(2)
+    donated.delete()
+    assert repr(jm.ADMM(rho=donated)) == "ADMM(rho=float32 (2,))"

@@ -1,7 +1,6 @@
 """Environment: a robot with a task as functions for reinforcement learning; MPCPolicy: an MPC in
 the place of the agent."""
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -15,7 +14,7 @@ from jaxmpc.closed_loop.observer import model_of
 from jaxmpc.closed_loop.robot_problem import robot_mpc
 from jaxmpc.closed_loop.variations import start_room
 from jaxmpc.mpc.plan import limited
-from jaxmpc.pytrees import pytree
+from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.precision import matmul
 from jaxmpc.robots.linear import LinearPlant
 from jaxmpc.robots.robot import Robot
@@ -23,7 +22,6 @@ from jaxmpc.sets.violations import TOLERANCE, worst_violation
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class EnvironmentState:
     """The state of an episode: a pytree, with batch axes in front under `jax.vmap`.
 
@@ -48,7 +46,6 @@ class EnvironmentState:
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class Environment:
     """A robot that has to reach a target from random starts; made by `Environment.of`.
 
@@ -74,8 +71,8 @@ class Environment:
     home: Any
     below: Any
     above: Any
-    length: int = field(metadata={"static": True})
-    stop_at_limits: bool = field(default=False, metadata={"static": True})
+    length: int = static()
+    stop_at_limits: bool = static(default=False)
 
     @classmethod
     def of(
@@ -146,7 +143,6 @@ class Environment:
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class MPCPolicy:
     """A controller as a policy: `policy(observation) -> action`, a pure function.
 

@@ -1,6 +1,5 @@
 """LinearFeedback: LQR or PD control with clipped inputs, to compare an MPC with."""
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -25,7 +24,6 @@ class NoPlan(NamedTuple):
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class LinearFeedback:
     """The law u = clip(s + K (ξ − r)): linear state feedback inside the input limits of `mpc`.
 

@@ -1,6 +1,6 @@
 """Noise: random disturbances of a plant and of its measurements."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -15,7 +15,6 @@ from jaxmpc.qp.precision import arrays, matmul, symmetric
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class Noise:
     """White Gaussian noise of a closed loop: ξ_{t+1} = f(ξ_t, u_t) + w_t, y_t = C ξ_t + v_t.
 

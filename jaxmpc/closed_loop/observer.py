@@ -1,6 +1,6 @@
 """KalmanFilter: the estimate of the state from noisy outputs."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -27,7 +27,6 @@ class Belief(NamedTuple):
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class KalmanFilter:
     """Kalman filter of a model ξ⁺ = f(ξ, u) + w with outputs y = C ξ + v, w and v white.
 

@@ -1,6 +1,5 @@
 """The outcome of closed loops: limits kept, target reached, settling time, cost."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -9,12 +8,13 @@ import numpy as np
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.closed_loop.run import Run
+from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.violations import kept, row_violations
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Outcome:
     """What B closed loops of T samples achieved, from their states and inputs, in float64.
 

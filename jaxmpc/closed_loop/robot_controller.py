@@ -1,6 +1,6 @@
 """RobotController: MPC of a nonlinear robot by linear models, with soft state limits."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import jax
@@ -17,7 +17,7 @@ from jaxmpc.mpc.softening import soften
 from jaxmpc.mpc.stagewise.newton import factor_stages, solve_stagewise
 from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, Task, task_layout
 from jaxmpc.mpc.stagewise.sqp import solve_nonlinear
-from jaxmpc.pytrees import prepared_pytree
+from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.admm import ADMM, DEFAULT
 from jaxmpc.qp.modes import varying
 from jaxmpc.qp.precision import arrays, floating_dtype
@@ -29,7 +29,7 @@ from jaxmpc.sets.box import Box
 LINEARIZATIONS = ("set-point", "state", "trajectory")
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@prepared_pytree
 class RobotController:
     """MPC of a nonlinear robot by linear models, soft where the limits cannot be kept.
 
@@ -67,11 +67,11 @@ class RobotController:
     robot: Any
     mpc: MPC
     solver: ADMM
-    linearize: str = field(metadata={"static": True})
-    exact: bool = field(metadata={"static": True})
+    linearize: str = static()
+    exact: bool = static()
     rho: Any
     tasks: tuple[Task, ...]
-    sqp_steps: int = field(metadata={"static": True})
+    sqp_steps: int = static()
     soft: Any = field(init=False)
     fixed: Controller | None = field(init=False)
     scale: Any = field(init=False)
@@ -214,6 +214,3 @@ def prepared(
     # Rows of tasks differ from state to state.
     scale = None if tasks else factor_stages(soft, soft.system, solver).E
     return {"soft": arrays(soft), "fixed": None, "scale": scale}
-
-
-prepared_pytree(RobotController)

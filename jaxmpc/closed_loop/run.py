@@ -1,6 +1,5 @@
 """Run: the record of a closed loop at each sample."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -13,7 +12,6 @@ from jaxmpc.qp.status import Status
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class Run:
     """A closed loop of T samples: x_{t+1} = plant(x_t, u_t) + w_t, u_t the first input of a plan
     (with a delay, of the plan one sample earlier).

@@ -1,6 +1,6 @@
 """Summary of many closed loops: as JSON data, and as a table."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import jax
@@ -11,12 +11,13 @@ from jaxmpc.closed_loop.outcome import Outcome, evaluate_runs
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.closed_loop.stored_runs import StoredRuns
 from jaxmpc.files import versions
+from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.violations import TOLERANCE
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class RunsSummary:
     """What many runs of a robot come to. data: the numbers, as JSON data; `print` shows the table
     of `rows`. outcome: of each robot."""

@@ -1,6 +1,6 @@
 """simulate: plant and controller together, one sample after the other, under one scan."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,6 +16,7 @@ from jaxmpc.closed_loop.noise import Noise
 from jaxmpc.closed_loop.observer import KalmanFilter, model_of, model_step
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.mpc.problem import weights_of
+from jaxmpc.pytrees import record
 from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.sets.violations import worst_violation
@@ -148,7 +149,7 @@ def _checked_plant(plant: Any, n: int, m: int) -> Any:
 
 
 @jax.tree_util.register_static
-@dataclass(frozen=True, eq=False)
+@record
 class ConstantPlant:
     """A plant that is no pytree: a constant of the compiled program, compared by identity."""
 

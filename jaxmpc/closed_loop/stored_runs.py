@@ -1,7 +1,7 @@
 """Closed loops of many robots in a store: block by block, resumed after an interruption."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from jaxmpc.closed_loop.many import simulate_many
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.closed_loop.variations import plant_numbers
 from jaxmpc.files import check_results, fingerprint
+from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.load import model_hash
 from jaxmpc.robots.robot import Robot
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 STORED = tuple(field.name for field in fields(Run) if field.name not in ("slack", "estimates"))
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class StoredRuns:
     """What `simulate_into` returns: the runs (B, ...) in NumPy arrays, the settings in the store,
     and the work of this call."""

@@ -1,11 +1,10 @@
 """The affine law of one active set and the polytope on which it holds, in scaled coordinates."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from jaxmpc.explicit.least_distance import SMALLEST, LeastDistanceForm
+from jaxmpc.pytrees import record
 from jaxmpc.sets.geometry import distinct
 from jaxmpc.sets.lp import maximise
 
@@ -13,7 +12,7 @@ from jaxmpc.sets.lp import maximise
 ZERO = 1e-11
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class ActivePiece:
     """The affine law of an active set: λ (a, p + 1) and y (nz, p + 1), constant last, on H ξ ≤ h.
 
@@ -58,7 +57,7 @@ def active_piece(p: LeastDistanceForm, active: tuple[int, ...]) -> ActivePiece |
     return ActivePiece(active, also_active, multipliers[:, :-1], y[:, :-1], H, h, which)
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Cell:
     """A region in the coordinates ξ. H ξ ≤ h: its facets, one row each; behind: for each the rows
     of the program that vanish on it; middles: a point inside each. vertices (k, p); radius of the

@@ -5,7 +5,6 @@ active rows of the plan there, by the optimality conditions, and holds on a poly
 region.
 """
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +15,7 @@ from jaxmpc.explicit.regions import CriticalRegions
 from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import solve_many
+from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.box import Box
@@ -28,7 +28,7 @@ EPS = 1e-8
 TOUCHING, MATCHING = 1e-7, 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class AffinePiece:
     """x⁺ = E x + e on the region R x ≤ r (unit rows) where one set of rows is active."""
 

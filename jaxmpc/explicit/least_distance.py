@@ -14,7 +14,6 @@ independent rows; so regions where rows are dependent (duplicates, apexes of a l
 without overlap, and rows that vanish identically are decided by their first order in δ.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +23,7 @@ from jaxmpc.checks import fail
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import record
 from jaxmpc.sets.any_set import unit_half_spaces
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.lp import ROUNDING, AffineHull, Program, affine_hull, framed, maximise, scaling
@@ -35,7 +35,7 @@ SMALLEST = 1e-9
 DEPENDENT = 1e-7
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class LeastDistanceForm:
     """min ½|y|² s.t. M y ≤ v + V ξ, one-sided rows; x = center + size·ξ with X_N in [−1, 1]^n.
 

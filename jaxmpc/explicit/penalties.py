@@ -1,7 +1,6 @@
 """Exact penalties: from which weight on slacks the soft problem keeps limits that can be kept."""
 
 import time
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +13,7 @@ from jaxmpc.explicit.regions import CriticalRegions
 from jaxmpc.explicit.search import exchange, explore
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Row, row_table
+from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.lp import Program, maximise
@@ -34,7 +34,7 @@ ROUNDING = 1e-9
 SOFTENED = ("state", "output", "terminal")
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class ExactPenalty:
     """The least ρ for which the penalty ρ·Σ slack is exact (see `exact_penalty`).
 

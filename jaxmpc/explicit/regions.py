@@ -1,7 +1,6 @@
 """The explicit solution of an MPC problem: its critical regions, and the law on them."""
 
 import time
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -17,6 +16,7 @@ from jaxmpc.explicit.least_distance import (
 )
 from jaxmpc.explicit.search import RegionSearch, explore
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import record
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.geometry import unit_rows
 from jaxmpc.sets.lp import scaling
@@ -27,7 +27,7 @@ from jaxmpc.sets.polytope import Polytope
 OPTIMAL = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Region:
     """One critical region and its affine law.
 
@@ -54,7 +54,7 @@ class Region:
     volume: float
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class CriticalRegions:
     """Critical regions of an MPC problem: the polytopes on which its plan is affine in x0.
 

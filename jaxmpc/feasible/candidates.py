@@ -11,7 +11,7 @@ by `proofs.py`.
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -24,6 +24,7 @@ from jaxmpc.feasible import proofs
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.proofs import Verdict
+from jaxmpc.pytrees import record
 from jaxmpc.qp.newton import least_distance
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
@@ -35,7 +36,7 @@ NEWTON_STEPS = 8
 NEWTON_ROUNDS = 8
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class StagePenalties:
     """Penalties of the ADMM stage: weight (R,) of the constraint rows, the root of ADMM's rho, and
     the over-relaxation alpha. No proof depends on them: they influence which points this stage

@@ -1,16 +1,16 @@
 """A polytope with a point inside: distances from it, bounds by weak duality, nearest points."""
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from scipy.optimize import nnls
 
+from jaxmpc.pytrees import record
 from jaxmpc.sets.lp import Program, bound, safe_extent
 from jaxmpc.sets.polytope import Polytope
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class CenteredPolytope:
     """{θ : normals θ ≤ offsets} about a point `center` (p,) inside.
 

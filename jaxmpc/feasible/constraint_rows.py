@@ -3,10 +3,9 @@
 No label depends on these numbers; proofs use `ExactData`.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -16,14 +15,14 @@ from jaxmpc.feasible.exact_data import absorbed
 from jaxmpc.feasible.view import View
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Block
+from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.sets.any_set import set_bounds
 from jaxmpc.sets.lp import scaling
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class ConstraintRows:
     """Rows of the condensed constraints: lower ≤ (U w)_i + D_i θ ≤ upper, i = 1..R.
 
@@ -51,7 +50,7 @@ class ConstraintRows:
     still: Any
     size: Any
     radius: Any
-    balls: tuple[int, ...] = field(metadata={"static": True})
+    balls: tuple[int, ...] = static()
 
     def bounds(self, theta: Array) -> Bounds:
         """Return the bounds that θ leaves for U w."""

@@ -1,7 +1,7 @@
 """The hard constraints of an MPC problem as float64 arrays: the exact data that proofs rest on."""
 
 import itertools
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -12,14 +12,14 @@ from jaxmpc.feasible.view import View
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Block
 from jaxmpc.mpc.rows import blocks as row_blocks
+from jaxmpc.pytrees import pytree, static
 from jaxmpc.sets.any_set import set_bounds
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.systems.system import host_matrices
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class ExactData:
     """The hard constraints of an MPC problem as float64 arrays: exact data for proofs.
 
@@ -58,7 +58,7 @@ class ExactData:
     reach_0: Any
     equalities: "Equalities | None"
     view: View
-    moves: tuple[int, ...] = field(metadata={"static": True})
+    moves: tuple[int, ...] = static()
 
     @property
     def horizon(self) -> int:
@@ -66,8 +66,7 @@ class ExactData:
         return len(self.moves)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Equalities:
     """Rows with lower = upper which inputs can keep all at once, and how.
 

@@ -21,7 +21,6 @@ rolled out at once, and is else left to the other stages.
 """
 
 import functools
-from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -38,6 +37,7 @@ from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays, filled
 from jaxmpc.feasible.refinement import refined
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.modes import own_modes
 
 # Coordinates up to which the polytopes have few facets.
@@ -50,8 +50,7 @@ GAP, USEFUL, ROUNDS, MOST_RAYS = 1e-9, 0.05, 8, 200
 MANY = 2**18
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Cones:
     """Cones about center (d,): M (F, d, d) and gauge (F, d) of each, the least λ_i and the largest
     gauge (F,) of points that are labelled; inputs and, in a projection, free states value + slope_i

@@ -1,7 +1,7 @@
 """Labels of points, each with its proof."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -10,6 +10,7 @@ from jax import Array
 from jaxmpc.batches import cores, joined, side_by_side
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import Verdict
+from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 
 # The arrays of `Labels` that may still be on the device, and the label that each of them proves.
@@ -35,7 +36,7 @@ class OnDemand(Generic[T]):
         return self._value
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@record
 class Labels:
     """Labels of b points and their proofs: a `Verdict` of each point, and its status.
 

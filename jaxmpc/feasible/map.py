@@ -4,7 +4,7 @@ import math
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -25,6 +25,7 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays
 from jaxmpc.feasible.refinement import refined
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.sets.geometry import hull_volume
@@ -62,7 +63,7 @@ def mesh(lines: Sequence[np.ndarray], index: np.ndarray | None = None) -> np.nda
     return np.stack([line[i] for line, i in zip(lines, place, strict=True)], axis=-1)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@record
 class FeasibleSetMap:
     """Points of a state space, each with its label and the proof of it (see `Labels`).
 

@@ -10,7 +10,7 @@ import functools
 import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -43,6 +43,7 @@ from jaxmpc.feasible.labels import Labels, OnDemand
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import Verdict
 from jaxmpc.feasible.row_programs import RowPrograms
+from jaxmpc.pytrees import record
 from jaxmpc.qp.precision import matmul
 
 # Steps of the longer ADMM run, relative to the first, on points that Newton leaves undecided.
@@ -57,7 +58,7 @@ ON_DEVICE = 2**31
 SAMPLE = 4096
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Scope:
     """What the labels of a part take from all points together.
 

@@ -7,7 +7,7 @@ linear programs over it, solved by HiGHS in float64.
 """
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from jaxmpc.checks import fail
 from jaxmpc.feasible.centered_polytope import CenteredPolytope, power_of_two
 from jaxmpc.mpc.inequalities import Inequalities, row_lengths
+from jaxmpc.pytrees import record
 from jaxmpc.sets.lp import Program, affine_hull, bound, framed, maximise, safe_extent
 from jaxmpc.sets.polytope import Polytope
 
@@ -25,7 +26,7 @@ TOLERANCE = 1e-9
 DIMENSIONS, FACETS = 4, 2000
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class PlanPolytope:
     """The polytope {v = (θ, z): G v ≤ g} of states θ (p,) and decisions z that keep all rows.
 

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from jaxmpc.checks import fail
 from jaxmpc.feasible.plan_polytope import DIMENSIONS, FACETS, CenteredPolytope, projected
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import record
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.sets.geometry import unit_rows
@@ -49,7 +50,7 @@ def feasible_polytope(mpc: MPC) -> Polytope:
     return body.polytope
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Growth:
     """Feasible sets at several horizons: horizons (H,), volume (H,), facets (H,), and the sets."""
 

@@ -1,6 +1,6 @@
 """The feasibility problem: which initial states have inputs that keep all hard constraints."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -19,6 +19,7 @@ from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.inequalities import condensed_in_float64
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
 from jaxmpc.mpc.rows import Block
+from jaxmpc.pytrees import record
 from jaxmpc.sets.any_set import set_bounds
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.ellipsoid import Ellipsoid
@@ -27,7 +28,7 @@ from jaxmpc.sets.lp import FLAT, ROUNDING, implied_equalities, scaling
 from jaxmpc.sets.polytope import Polytope
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class FeasibilityProblem:
     """The hard constraints of an MPC problem, and which initial states points θ (d,) stand for.
 

@@ -42,22 +42,20 @@ whole set, (a + s∘w)'θ ≤ b + w'reach_0, if limits on x_0, or twice the exte
 both directions along a facet there is none: the facet's normal is no vector of floats.)
 """
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxmpc.feasible.exact_data import ExactData
+from jaxmpc.pytrees import pytree
 
 UNIT_ROUNDOFF = 2.0**-53
 # Covers products that underflow; data smaller than this count as zero.
 TINY = 1e-290
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Verdict:
     """What was proved of one point, and the proof.
 

@@ -5,7 +5,6 @@ of the feasible set there. HiGHS solves the LP; `proofs.py` then proves a point 
 feasible, and a half-space valid on the whole set.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -20,6 +19,7 @@ from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import record
 from jaxmpc.qp.modes import own_modes
 
 # How far a boundary point is moved towards the centre before it is proved: the least that works.
@@ -30,7 +30,7 @@ BACKOFFS = 10.0 ** np.arange(-14, -1)
 Cuts = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Boundary:
     """Rays from `center` (d,) along `directions` (K, d), and what was proved on each.
 
@@ -89,7 +89,7 @@ def ray_directions(count: int, d: int) -> np.ndarray:
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Rays:
     """Rays from one centre of the feasible set, for any number of directions.
 

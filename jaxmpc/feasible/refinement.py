@@ -1,13 +1,13 @@
 """Polytopes inside and outside a feasible set that rays bring together, vertex by vertex."""
 
 import time
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from jaxmpc.feasible.centered_polytope import power_of_two
 from jaxmpc.feasible.rays import Cuts, Rays
+from jaxmpc.pytrees import record
 from jaxmpc.sets.geometry import hull_volume
 from jaxmpc.sets.polytope import Polytope
 
@@ -15,7 +15,7 @@ from jaxmpc.sets.polytope import Polytope
 MOST_RAYS = 2000
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Refinement:
     """What rays have proved: points (K, d) feasible, with w (K, k) of the constraint rows, and
     half-spaces normals (F, d) θ ≤ offsets (F,) valid on the whole set, with their cuts. gap: of the

@@ -7,7 +7,7 @@ no bound wrong.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import FeasibleSetMap, excluded, mesh
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays
+from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.polytope import Polytope
@@ -39,7 +40,7 @@ class Picture(NamedTuple):
     counts: dict[str, int]
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class StoredMap:
     """A stored map of a grid.
 
@@ -159,7 +160,7 @@ def extreme(points: np.ndarray) -> np.ndarray:
         return points
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class HalfSpaces:
     """Half-spaces normals (K, d) x ≤ offsets (K,) of which those that do not matter are dropped.
 

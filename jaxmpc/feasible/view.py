@@ -1,20 +1,18 @@
 """Which initial states a point of a map stands for: all states, a slice, or a projection."""
 
-from dataclasses import dataclass, field
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import pytree, static
 from jaxmpc.sets.any_set import set_bounds
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class View:
     """Which initial states a point θ (d,) of the map stands for.
 
@@ -22,8 +20,8 @@ class View:
     box [lower, upper] of the other states (projection: feasible if some value is).
     """
 
-    axes: tuple[int, ...] = field(metadata={"static": True})
-    others: tuple[int, ...] = field(metadata={"static": True})
+    axes: tuple[int, ...] = static()
+    others: tuple[int, ...] = static()
     fixed: Any
     lower: Any
     upper: Any

@@ -11,7 +11,7 @@ lower ≤ C z + D θ + d ≤ upper, in the order of `rows.blocks`; the cost is
 Rows at k = 0 have C = 0 unless they bound inputs.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -23,7 +23,7 @@ from jaxmpc.arrays import host_array
 from jaxmpc.checks import concrete, require_memory
 from jaxmpc.mpc.problem import MPC, Switch, weights_of
 from jaxmpc.mpc.rows import Layout, blocks, split, stacked
-from jaxmpc.pytrees import pytree
+from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul
@@ -34,7 +34,6 @@ from jaxmpc.systems.system import host_matrices
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class Condensed:
     """The parametric QP of an MPC problem; `qp(theta)` is the QP at θ.
 
@@ -72,9 +71,9 @@ class Condensed:
     stage: Array
     K: Array
     K_N: Array
-    layout: Layout = field(metadata={"static": True})
-    balls: tuple[int, ...] = field(metadata={"static": True})
-    begins: tuple[int, ...] = field(metadata={"static": True})
+    layout: Layout = static()
+    balls: tuple[int, ...] = static()
+    begins: tuple[int, ...] = static()
 
     def qp(self, theta: Array, reference: Any = None, input_reference: Any = None) -> QP:
         """QP at θ (p,). reference (N+1, n), input_reference (N, m): what to track, None for 0."""

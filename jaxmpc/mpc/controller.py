@@ -1,7 +1,7 @@
 """Controller: an MPC law whose matrices are condensed and factored once."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import partial
 from typing import Any
 
@@ -36,7 +36,7 @@ from jaxmpc.sets.box import Box
 from jaxmpc.sets.polytope import Polytope
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@prepared_pytree
 class Controller:
     """An MPC law whose matrices are condensed and factored once, at construction.
 
@@ -162,9 +162,6 @@ class Controller:
         """Sort the QP's multipliers y (rows,) by constraint and step."""
         c = self.condensed
         return sorted_multipliers(self.mpc, c.layout, y)
-
-
-prepared_pytree(Controller)
 
 
 def unshared(parts: tuple) -> tuple:

@@ -1,6 +1,6 @@
 """Plan, the answer of every solver; WarmStart; what a trajectory costs and violates."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +20,6 @@ from jaxmpc.sets.box import Box
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class Multipliers:
     """Lagrange multipliers of a plan, for the cost without ½: y > 0 where the upper bound of the
     row is active, y < 0 where the lower is.
@@ -42,7 +41,6 @@ class Multipliers:
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class Plan:
     """Answer of `solve`: states (N+1, n), inputs (N, m), cost J (without ½), multipliers, status.
 

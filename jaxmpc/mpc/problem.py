@@ -1,6 +1,6 @@
 """The constrained MPC problem as a user states it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from jaxmpc.checks import (
     require_shape,
     require_symmetric_psd,
 )
-from jaxmpc.pytrees import pytree, static_pytree
+from jaxmpc.pytrees import pytree, static, static_pytree
 from jaxmpc.qp.precision import symmetric
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.ellipsoid import Ellipsoid
@@ -29,7 +29,6 @@ FLAT = 1e-12
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class Soft:
     """Rows that may be violated at a penalty:
 
@@ -49,9 +48,9 @@ class Soft:
     rho: Reals = 1e3
     quadratic: Reals = 0.0
     D: Reals | None = None
-    stages: tuple[int, ...] | None = field(default=None, metadata={"static": True})
-    names: tuple[str, ...] = field(default=(), metadata={"static": True})
-    units: tuple[str, ...] = field(default=(), metadata={"static": True})
+    stages: tuple[int, ...] | None = static(default=None)
+    names: tuple[str, ...] = static(default=())
+    units: tuple[str, ...] = static(default=())
 
     def __post_init__(self) -> None:
         store_floats(self, "C", "lower", "upper", "rho", "quadratic", "D")
@@ -63,7 +62,6 @@ class Soft:
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class Outputs:
     """Hard limits of outputs, lower ≤ C x_k + D u_k ≤ upper.
 
@@ -76,9 +74,9 @@ class Outputs:
     lower: Reals | None = None
     upper: Reals | None = None
     D: Reals | None = None
-    stages: tuple[int, ...] | None = field(default=None, metadata={"static": True})
-    names: tuple[str, ...] = field(default=(), metadata={"static": True})
-    units: tuple[str, ...] = field(default=(), metadata={"static": True})
+    stages: tuple[int, ...] | None = static(default=None)
+    names: tuple[str, ...] = static(default=())
+    units: tuple[str, ...] = static(default=())
 
     def __post_init__(self) -> None:
         store_floats(self, "C", "lower", "upper", "D")
@@ -122,7 +120,6 @@ class Switch:
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class MPC:
     """Constrained linear-quadratic MPC over the horizon N:
 
@@ -159,17 +156,17 @@ class MPC:
     system: LinearSystem
     Q: Any
     R: Any
-    horizon: int = field(metadata={"static": True})
+    horizon: int = static()
     states: Box | Polytope | None = None
     inputs: Box | Polytope | None = None
     terminal_cost: Any = None
     terminal_set: Box | Polytope | Ellipsoid | None = None
-    constrain_initial: bool = field(default=True, metadata={"static": True})
+    constrain_initial: bool = static(default=True)
     prestabilise: Any = None
     soft: tuple[Soft, ...] | Soft = ()
     outputs: tuple[Outputs, ...] | Outputs = ()
-    constrained_stages: tuple[int, ...] | None = field(default=None, metadata={"static": True})
-    control_horizon: int | tuple[int, ...] | None = field(default=None, metadata={"static": True})
+    constrained_stages: tuple[int, ...] | None = static(default=None)
+    control_horizon: int | tuple[int, ...] | None = static(default=None)
     input_rate_weight: Any = None
     input_rate_limit: Any = None
     stage_weights: Any = None

@@ -13,7 +13,6 @@ state of each cell is solved, and each state follows the nearest of its own cell
 it. That needs few coordinates.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -25,6 +24,7 @@ from jaxmpc.batches import padded
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Multipliers, Plan, answer, flat_multipliers
 from jaxmpc.mpc.stated_residuals import judged
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.active_set import RIDGE, has_dual_steps, most_rows
 from jaxmpc.qp.admm import scaled_multipliers
 from jaxmpc.qp.linalg import solve
@@ -43,8 +43,7 @@ CHOICE, SAMPLE = 4, 4096
 INACTIVE = 1e-9
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Laws:
     """The laws of S solved states: y[rows] = slope (θ, 1), rows (S, K), filled up with the number
     of rows, slope (S, K, p + 1); NaN where a state has none. sign (S, K): of these multipliers."""
@@ -60,8 +59,7 @@ class Laws:
         return jnp.zeros(count, y.dtype).at[self.rows[i]].add(y, mode="drop")
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Cells:
     """Cells of R^p: edges (g − 1, p) divide each coordinate in g. lower, width (g, p): of the
     intervals, in which distances are measured. law (g^p,): index of the state of each cell that is

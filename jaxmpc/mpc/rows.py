@@ -16,6 +16,7 @@ from jax import Array
 
 from jaxmpc.checks import require_kind
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, output_stages
+from jaxmpc.pytrees import record
 from jaxmpc.qp.linalg import cholesky
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
@@ -27,7 +28,7 @@ from jaxmpc.sets.polytope import Polytope
 Layout = tuple[tuple[str, tuple[int, ...], int], ...]
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Block:
     """lower ≤ H x_k + D v_k ≤ upper at `steps`: H (r, n) or None, D (r, m) or None. box: the one of
     them that is there is the identity.

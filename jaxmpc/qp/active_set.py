@@ -23,7 +23,6 @@ The steps see nothing but S, the bounds, y and v: `DualSearch`. On NVIDIA GPUs t
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -31,6 +30,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.loops import repeat_while, true_places
 from jaxmpc.qp.precision import matmul
@@ -54,8 +54,7 @@ DIVERGED = 1 / RIDGE
 CONVERGED, ROUNDING = 1e-11, 1e-15
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class DualPoint:
     """Multipliers y (m,) with w = −q − A'y (n,) and the rows v = A w (m,)."""
 
@@ -86,8 +85,7 @@ class DualPoint:
         return DualPoint(self.y if y is None else y, w, matmul(w, A.T))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class DualSearch:
     """Loop state of one instance: its point, the steps taken, whether to go on, and whether its
     multipliers are optimal."""

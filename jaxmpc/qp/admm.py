@@ -21,7 +21,7 @@ pays for one factorization and then for one matrix product a step. prox is the p
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -31,7 +31,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import MOST_COUNT, concrete, fail, number, require_real, whole
-from jaxmpc.pytrees import pytree
+from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import cholesky, inverse_root
 from jaxmpc.qp.modes import varying
 from jaxmpc.qp.precision import matmul, precisely, rounding
@@ -56,7 +56,6 @@ CENTRINGS = 30
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class ADMM:
     """Settings of the solver.
 
@@ -86,15 +85,15 @@ class ADMM:
     interior-point method stopped at slack·multiplier = μ (scaled coordinates) would.
     """
 
-    iterations: int | None = field(default=None, metadata={"static": True})
+    iterations: int | None = static(default=None)
     rho: Any = None
     alpha: Any = 1.9
-    newton_steps: int | None = field(default=None, metadata={"static": True})
+    newton_steps: int | None = static(default=None)
     eps: Any = 1e-6
-    differentiate: str = field(default="implicit", metadata={"static": True})
+    differentiate: str = static(default="implicit")
     smoothing: Any = 0.0
-    fixed: bool = field(default=False, metadata={"static": True})
-    dtype: str | None = field(default=None, metadata={"static": True})
+    fixed: bool = static(default=False)
+    dtype: str | None = static(default=None)
 
     def __eq__(self, other: object) -> bool:
         """Return whether all settings are the same numbers; traced ones only where identical."""
@@ -154,7 +153,6 @@ DEFAULT = ADMM()
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class Factor:
     """What P, A and rho alone decide; shared by every instance of a batch.
 

@@ -7,14 +7,14 @@ left of A'y, exactly up to one rounding (Neumaier & Shcherbina 2004, safe bounds
 box rows in the role of the correction). The bound is valid for any y; convergence makes it tight.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.precision import matmul, rounding
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
@@ -23,8 +23,7 @@ from jaxmpc.qp.projection import Bounds
 RAY = 25
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Proof:
     """A Farkas vector and a descent ray, and whether they are proved to be. beyond: the rows
     contradict each other also where each is widened by its tolerance."""

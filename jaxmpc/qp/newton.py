@@ -12,7 +12,6 @@ e ≠ 0, which is a Farkas vector: e'A w is 0 for all w but at least g*(e) fails
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.dual_kernel import MOST_ROWS, damped_kernel
 from jaxmpc.qp.linalg import definite_solver, solve
 from jaxmpc.qp.loops import in_blocks, repeat_while, true_places
@@ -147,9 +147,8 @@ def least_distance(
     return w, e
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
-class Multipliers:
+@pytree
+class MultiplierState:
     """State of the proximal method of multipliers: w (n,), y (m,); `change`: the last change of y,
     on an infeasible program nearly a Farkas vector; `move`: the last change of w, on an unbounded
     one nearly a ray; the penalties rho and sigma, the violation before and the tolerance for φ."""
@@ -174,25 +173,25 @@ def norms(*vectors: Array) -> Array:
     return jnp.max(jnp.abs(jnp.stack(vectors)), axis=1, initial=0.0)
 
 
-def multipliers_start(q: Array, w: Array, y: Array) -> Multipliers:
+def multipliers_start(q: Array, w: Array, y: Array) -> MultiplierState:
     """Return the state of the method of multipliers at (w, y)."""
     scalar = lambda v: jnp.asarray(v, w.dtype)
-    return Multipliers(
+    return MultiplierState(
         w, y, jnp.zeros_like(y), jnp.zeros_like(w), scalar(Constants.of(w.dtype).rho[0]),
         scalar(1.0), scalar(jnp.inf), 0.1 * (largest(q) + largest(y)),
     )  # fmt: skip
 
 
 def multipliers_step(
-    H: Array, q: Array, A: Array, bounds: Bounds, state: Multipliers
-) -> Multipliers:
+    H: Array, q: Array, A: Array, bounds: Bounds, state: MultiplierState
+) -> MultiplierState:
     """One Newton step of the proximal method of multipliers."""
     s = state
     step = newton_step(s.w, s.y, H, q, bounds, s.rho, s.sigma, A)
     return multipliers_update(q, s, step)
 
 
-def multipliers_update(q: Array, state: Multipliers, step: Newton) -> Multipliers:
+def multipliers_update(q: Array, state: MultiplierState, step: Newton) -> MultiplierState:
     """The state after a Newton step on φ.
 
     Whenever φ is minimised the multipliers become ρ e; ρ grows tenfold if the violation has not
@@ -212,7 +211,7 @@ def multipliers_update(q: Array, state: Multipliers, step: Newton) -> Multiplier
     rho = jnp.where(grow, jnp.minimum(10 * s.rho, constants.rho[1]), s.rho)
     # A Newton step has a ridge of 10 ε ρ, which must be little beside σ.
     least = jnp.maximum(constants.sigma, 40 * eps * rho)
-    return Multipliers(
+    return MultiplierState(
         step.w, new, jnp.where(done, new - s.y, s.change), step.w - s.w,
         rho, jnp.maximum(jnp.where(done, s.sigma / 100, s.sigma), least),
         jnp.where(done, violation, s.before), jnp.where(done, s.tolerance / 10, s.tolerance),

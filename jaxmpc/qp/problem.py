@@ -1,6 +1,6 @@
 """The quadratic program and its solution."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -15,12 +15,12 @@ from jaxmpc.checks import (
     require_shape,
     require_symmetric_psd,
 )
-from jaxmpc.pytrees import named_pytree, pytree
+from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.status import WithStatus
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class QP:
     """Quadratic program: minimise ½ z'Pz + q'z subject to l ≤ Az ≤ u.
 
@@ -52,7 +52,7 @@ class QP:
     soft_quadratic: Any = None
     radius: Any = None
     row_sizes: Any = None
-    balls: tuple[int, ...] = field(default=(), metadata={"static": True})
+    balls: tuple[int, ...] = static(default=())
 
     @property
     def bounds(self) -> Bounds:
@@ -178,8 +178,7 @@ class Duals(NamedTuple):
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
-class QPSolution:
+class QPSolution(WithStatus):
     """A primal-dual pair and what is known about it.
 
     z (n,) primal. y (m,) multipliers: Pz + q + A'y = 0, y > 0 where the upper bound is active,
@@ -187,6 +186,7 @@ class QPSolution:
     that of the optimal value. Residuals are in the problem's own units (see `residuals`).
     certificate (m,): for PRIMAL_INFEASIBLE the Farkas vector, else zeros. ray (n,): for
     DUAL_INFEASIBLE a direction of unbounded descent, else zeros. iterations: ADMM steps run.
+    `solved` and `sentence` say what the status means.
     """
 
     z: Array

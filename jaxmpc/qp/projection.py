@@ -14,12 +14,13 @@ d = (ρ s − c)/(ρ + k). ρ e is a subgradient of g at p: the multiplier.
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jax import Array
+
+from jaxmpc.pytrees import pytree, static
 
 # What leaves a row free: l, u, linear and quadratic.
 FREE = (-math.inf, math.inf, math.inf, 0.0)
@@ -37,8 +38,7 @@ def finite(v: Array) -> Array:
     return jnp.abs(v) < jnp.inf
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Bounds:
     """The function g above. l, u (m,): intervals; in the rows of a ball l = u is its centre.
 
@@ -51,7 +51,7 @@ class Bounds:
     linear: Any = None
     quadratic: Any = None
     radius: Any = None
-    balls: tuple[int, ...] = field(default=(), metadata={"static": True})
+    balls: tuple[int, ...] = static(default=())
 
     @classmethod
     def of_rows(cls, columns: Iterable[Any]) -> "Bounds":

@@ -5,7 +5,7 @@ them is corrected; the method of multipliers (`newton.py`) takes the rest, and p
 no solution where there is none.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.active_set import (
     DIVERGED,
     MORE_STEPS,
@@ -28,7 +29,7 @@ from jaxmpc.qp.loops import repeat_while
 from jaxmpc.qp.modes import varying
 from jaxmpc.qp.newton import (
     Constants,
-    Multipliers,
+    MultiplierState,
     largest,
     multipliers_start,
     multipliers_update,
@@ -50,8 +51,7 @@ from jaxmpc.qp.residuals import (
 from jaxmpc.qp.triton import has_kernels, in_one_program, indices
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Program:
     """A program in its own units and, as `q` (n,) and `bounds`, in ADMM's coordinates, which are
     measured in `unit`; eps: the tolerance."""
@@ -139,16 +139,15 @@ def judge_in_one_program(
     return (Measured(primal, dual, gap, small > 0), error, near > 0, solved > 0), gradient
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
-class Search:
+@pytree
+class Refinement:
     """Loop state of one instance: the point of the method of multipliers; its program, whose bounds
     may have been widened; q (n,) corrected by what rounding leaves of the gradient; the best pair
     so far; Newton steps taken, and those since the best pair became better; what is proved; w (n,)
     of the search for a proof; what is done (`PRIMAL`, `DISTANCE`, `RAY`), the steps left for it,
     whether the bounds have been widened, and whether to go on."""
 
-    point: Multipliers
+    point: MultiplierState
     bounds: Bounds
     q: Array
     best: Pair
@@ -168,7 +167,7 @@ IDLE = 40
 
 
 def improve(
-    refine: int, fixed: bool, whole: bool, p: Program, begin: Multipliers
+    refine: int, fixed: bool, whole: bool, p: Program, begin: MultiplierState
 ) -> tuple[Pair, Proof, Array, Array]:
     """Return the best pair (z, y) and what is proved, after `refine` Newton steps at most, in
     float64, whether there is nothing left to try, and whether the last half of many steps have
@@ -186,13 +185,13 @@ def improve(
         _, _, empty = farkas(qp, factor.E * begin.change, correcting, allowed)
         best, y = by_the_dual(p, begin.y, ~factor.flat & ~empty, refine)
         go_on = ~best.solved
-        # Multipliers that grow without bound are nearly a Farkas vector.
+        # MultiplierState that grow without bound are nearly a Farkas vector.
         begin = replace(begin, change=jnp.where(largest(y) > most_multiplier(p), y, begin.change))
         begin = least_violation(begin, empty)
     if not whole:
         return best, Proof.none(p.q, p.bounds.l), best.solved, false
     constants, none = (p, matmul(factor.H, factor.H), correcting), jnp.int32(0)
-    s = Search(
+    s = Refinement(
         begin, p.bounds, p.q, best, none, none, Proof.none(p.q, p.bounds.l), begin.w,
         jnp.int32(PRIMAL), jnp.int32(refine), false, go_on,
     )  # fmt: skip
@@ -208,8 +207,7 @@ def improve(
     return s.best, s.proof, ~false, s.idle > max(refine // 2, 50)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Correction:
     """Loop state of one instance whose dual steps leave residuals: its point, the gradient of its
     Lagrangian in w (n,), the best pair so far, the corrections made, and whether to go on."""
@@ -243,7 +241,7 @@ def most_multiplier(p: Program) -> Array:
     return DIVERGED * (1 + largest(p.q))
 
 
-def from_multipliers(p: Program, s: Search) -> Pair:
+def from_multipliers(p: Program, s: Refinement) -> Pair:
     """Return the best pair after corrections from where the method of multipliers ends.
 
     Its penalty multiplies the rounding of rows, so that it stops short of rounding. Where the
@@ -278,7 +276,7 @@ def proof_steps(refine: int) -> int:
     return max(min(refine // 5, 30), 1)
 
 
-def by_multipliers(refine: int, constants: tuple, s: Search) -> Search:
+def by_multipliers(refine: int, constants: tuple, s: Refinement) -> Refinement:
     """Take one Newton step: of the method of multipliers, `refine` times at most; then of least
     distance to the rows, whose residual becomes a Farkas vector; then, if P is singular, of
     `recession`, whose minimiser becomes a ray.
@@ -340,14 +338,14 @@ def by_multipliers(refine: int, constants: tuple, s: Search) -> Search:
     fresh = multipliers_start(p.q, step.w, none)
     wider = s.bounds.widened(step.excess * widen)
     anew = lambda new, old: jax.tree.map(lambda a, b: jnp.where(widen, a, b), new, old)
-    return Search(
+    return Refinement(
         anew(fresh, point), wider, anew(p.q, q), best, steps, idle, proof, w,
         jnp.where(widen, PRIMAL, doing), jnp.where(widen, refine - steps, left),
         s.widened | widen, ~ended,
     )  # fmt: skip
 
 
-def least_violation(point: Multipliers, infeasible: Array) -> Multipliers:
+def least_violation(point: MultiplierState, infeasible: Array) -> MultiplierState:
     """`point`, or where the program is infeasible the start of a search for the least violation of
     the rows: the last penalty at once, and no multipliers."""
     top = Constants.of(point.w.dtype).rho[1]
@@ -356,7 +354,7 @@ def least_violation(point: Multipliers, infeasible: Array) -> Multipliers:
     )
 
 
-def still_open(refine: int, constants: tuple, s: Search, _: None) -> tuple[Search, None]:
+def still_open(refine: int, constants: tuple, s: Refinement, _: None) -> tuple[Refinement, None]:
     """Body of a scan: `by_multipliers`, no change once the instance is finished."""
     new = by_multipliers(refine, constants, s)
     return jax.tree.map(lambda a, b: jnp.where(s.open, a, b), new, s), None

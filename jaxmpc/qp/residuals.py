@@ -14,13 +14,14 @@ share of what is natural for the whole program is added to both (`Natural`).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.certificate import Proof
 from jaxmpc.qp.precision import matmul, precisely, rounding
 from jaxmpc.qp.problem import QP, QPSolution
@@ -55,8 +56,7 @@ class Products(NamedTuple):
         return cls(*multiply(z, y, qp.P, qp.A), *sizes)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Natural:
     """What is natural for the whole program, for rows (m,), variables (n,) and the gap: sizes, and
     the terms of rows and variables.
@@ -164,8 +164,7 @@ def largest_of(numbers: list[Array]) -> Array:
     return found
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Measured:
     """Primal residual, dual residual and gap of a pair, in the units of the problem, and whether
     each entry is at most eps·size + floor·terms."""
@@ -187,8 +186,7 @@ class Measured:
         return cls(primal, dual, gap, largest_of(above[:3]) <= eps)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Pair:
     """Primal z and dual y in the units of the problem, what was measured of them, the largest of
     their residuals, each less its rounding and relative to its size, whether all are small, and

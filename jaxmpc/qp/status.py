@@ -1,6 +1,13 @@
-"""Status codes of a solve, with a sentence for each."""
+"""Status codes of a solve, with a sentence for each, and what results say by them."""
 
+from collections import Counter
 from enum import IntEnum
+
+import numpy as np
+from jax import Array
+
+from jaxmpc.checks import concrete, fail
+from jaxmpc.pytrees import short_text, short_value
 
 
 class Status(IntEnum):
@@ -26,6 +33,40 @@ class Status(IntEnum):
     def sentence(self) -> str:
         """What happened and what to try."""
         return _SENTENCES[self]
+
+
+class WithStatus:
+    """A result with the `status` of one instance, or of each instance of a batch."""
+
+    status: Array
+
+    @property
+    def solved(self) -> Array:
+        """Whether the status is SOLVED: one truth value, or one for each instance of a batch."""
+        return self.status == Status.SOLVED
+
+    @property
+    def sentence(self) -> str:
+        """What happened and what to try. Raises ValueError for a batch and for traced values."""
+        if np.ndim(self.status) or not concrete(self.status):
+            cure = "Take one: jax.tree.map(lambda v: v[i], result), outside jit and vmap"
+            fail("sentence", f"of {status_text(self.status)}", cure)
+        return Status(int(self.status)).sentence
+
+    def __repr__(self) -> str:
+        """Return a few lines of text, without large arrays."""
+        return short_text(self, status=status_text(self.status))
+
+
+def status_text(status: Array) -> str:
+    """Return the name of a status, or how many instances of a batch have which."""
+    known = {int(code): code.name for code in Status}
+    if not isinstance(status, np.ndarray | np.generic | Array) or not concrete(status):
+        return short_value(status)
+    names = [known.get(int(code), str(code)) for code in np.ravel(status)]
+    if np.ndim(status) == 0:
+        return names[0]
+    return " + ".join(f"{count} {name}" for name, count in Counter(names).most_common())
 
 
 _SENTENCES = {

@@ -15,7 +15,7 @@ state. The worst is at a vertex of a critical region; without all regions counte
 for among samples and by gradient ascent (`ascent.py`).
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import grid
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import record
 from jaxmpc.recursion.ascent import ascend
 from jaxmpc.recursion.budget import LABELS, PLANS, PROOFS, Budget
 from jaxmpc.recursion.claims import (
@@ -245,7 +246,7 @@ def _samples(claims: Claims, starts: np.ndarray, center: np.ndarray) -> np.ndarr
     return center + random.uniform(0, 1, (len(ends), 1)) ** (1 / p) * ends
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class SmallestHorizon:
     """The least horizon at which the law is proved recursively feasible, None where none was found.
 

@@ -1,7 +1,7 @@
 """The three claims of recursive feasibility, proved or refuted by theorems and linear programs."""
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from jaxmpc.feasible.plan_polytope import DIMENSIONS, TOLERANCE, PlanPolytope, p
 from jaxmpc.feasible.polytope import backward, is_standard_form
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import record
 from jaxmpc.recursion.report import Claim, in_words
 from jaxmpc.sets.any_set import set_bounds
 from jaxmpc.sets.polytope import Polytope
@@ -25,7 +26,7 @@ CLEAR = 1e-7
 LATE = "the time was over before its linear programs were solved"
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Claims:
     """The three claims about a problem, as far as they are settled without the law, and X_N.
 
@@ -229,7 +230,7 @@ def _by_theorem(mpc: MPC) -> Claim:
     return Claim(None, f"Theorem 1 does not apply: {missing.name}")
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class RegionVerdict:
     """What critical regions say of the law: the claim, the volume that it loses (NaN unless they
     are complete), states (K, n) from which it leads farthest outside X_N, and the regions."""

@@ -1,20 +1,19 @@
 """Closed loops of the MPC law from many samples, until the problem is proved infeasible."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from tqdm.std import tqdm
 
 from jaxmpc.explicit.law import Law
 from jaxmpc.feasible.map import FeasibleSetMap, map_points
 from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.recursion.budget import Budget
 from jaxmpc.recursion.claims import CLEAR
 from jaxmpc.recursion.report import NOT_FEASIBLE, UNDECIDED
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class LawLoops:
     """Closed loops from B samples; fields as in `RecursionReport`."""
 

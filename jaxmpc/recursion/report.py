@@ -1,19 +1,19 @@
 """What is known about recursive feasibility: claims, the worst counterexample, states lost."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import record
 from jaxmpc.sets.polytope import Polytope
 
 # `lost_at` of samples that are infeasible from the start, and of those that were not decided.
 NOT_FEASIBLE, UNDECIDED = -1, -2
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Claim:
     """A claim: holds True (proved), False (refuted) or None (open); and why.
 
@@ -28,7 +28,7 @@ class Claim:
         return f"{ {True: 'proved', False: 'refuted', None: 'open'}[self.holds] }: {self.reason}"
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Counterexample:
     """A feasible state whose optimal first move leads to an infeasible one.
 
@@ -57,7 +57,7 @@ class Counterexample:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class RecursionReport:
     """What is known about the recursive feasibility of one MPC problem.
 

@@ -1,17 +1,17 @@
 """What the closed loops of a robot did: limits kept or exceeded, plans found or not."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from jaxmpc.closed_loop.outcome import with_limits
 from jaxmpc.closed_loop.run import Run
+from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.violations import kept, worst_violation
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class RobotLoops:
     """What b closed loops of T samples did.
 

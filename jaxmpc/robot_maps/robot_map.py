@@ -6,12 +6,12 @@ exists, by proof (`map_feasible_set`), or one exists at every sample of the line
 promise or breaks it. The robot's labels are measured over T samples, not proved.
 """
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from jaxmpc.feasible.map import FeasibleSetMap
+from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.recursion.report import RecursionReport
 from jaxmpc.robot_maps.outcomes import RobotLoops
@@ -27,7 +27,7 @@ OUTCOMES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class RobotMap:
     """States of a robot with the linear promise and what became of it.
 

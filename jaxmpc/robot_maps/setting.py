@@ -3,7 +3,6 @@
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -20,6 +19,7 @@ from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.pipeline import Scope, label_chunks
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import record
 from jaxmpc.recursion.analysis import examine
 from jaxmpc.recursion.budget import Budget
 from jaxmpc.robot_maps.outcomes import RobotLoops
@@ -73,7 +73,7 @@ def map_robot(
     return setting.map(Labels.joined(labels), loops, gap=gap, search_seconds=search_seconds)
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class RobotSetting:
     """A checked description of a map, for callers who compute and store it chunk by chunk.
 

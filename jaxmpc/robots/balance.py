@@ -5,13 +5,13 @@ contacts, equalities and dry friction do not help. What was found is tried on th
 """
 
 import copy
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.optimize import least_squares, lsq_linear
 
 from jaxmpc.checks import fail
+from jaxmpc.pytrees import record
 from jaxmpc.robots.supported import name_of
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ _WEIGHTS = (1e-2, 1e-4, 1e-6, 1e-9, 1e-12)
 _STEP = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Rest:
     """A robot at rest in q (nq,) under u (m,) with activation states act (na,).
 

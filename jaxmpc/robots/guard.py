@@ -10,12 +10,12 @@ import contextlib
 import copy
 import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
+from jaxmpc.pytrees import record
 from jaxmpc.qp.linalg import JAXLIB
 from jaxmpc.robots.physics import Physics
 from jaxmpc.robots.supported import Lack, name_of
@@ -36,7 +36,7 @@ _MOST_STEPS = 250
 _known: dict[bytes, tuple[str, ...]] = {}
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Motion:
     """Steps of the C engine: states before and after (K, nq + nv + na), inputs (K, nu), and whether
     rows of constraints acted (K,)."""

@@ -1,6 +1,6 @@
 """A linear system as a plant, behind the interface of robots."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,13 +8,12 @@ from jax import Array
 
 from jaxmpc.checks import fail
 from jaxmpc.mpc.targets import equilibrium
-from jaxmpc.pytrees import pytree
+from jaxmpc.pytrees import pytree, static
 from jaxmpc.sets.box import Box
 from jaxmpc.systems.system import LinearSystem
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class LinearPlant:
     """A linear plant x⁺ = A x + B u + c with limits and the interface of `Robot`.
 
@@ -26,7 +25,7 @@ class LinearPlant:
     state_limits: Box
     input_limits: Box
     home: Any = None
-    name: str = field(default="linear", metadata={"static": True})
+    name: str = static(default="linear")
 
     def __post_init__(self) -> None:
         if isinstance(self.system, LinearSystem) and self.home is None:

@@ -1,19 +1,18 @@
 """RobotModel: what a controller predicts of a robot, as the model of a `NonlinearMPC`."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.pytrees import pytree
+from jaxmpc.pytrees import pytree, static
 from jaxmpc.robots.robot import Robot
 from jaxmpc.systems.system import LinearSystem
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class RobotModel:
     """The predictor of a robot (no contacts, no joint limits) in the coordinates ξ.
 
@@ -24,7 +23,7 @@ class RobotModel:
 
     robot: Robot
     numbers: dict[str, Any] = field(default_factory=dict)
-    exact: bool = field(default=True, metadata={"static": True})
+    exact: bool = static(default=True)
 
     def step(self, xi: Array, u: Array) -> Array:
         """Return ξ (n,) one control period later."""

@@ -25,7 +25,6 @@ The torque S_i·F_i, F_i the sum of f over the bodies after i, does not change b
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import wraps
 from typing import Any, NamedTuple
 
@@ -35,6 +34,7 @@ import numpy as np
 from jax import Array
 from jax.custom_batching import custom_vmap
 
+from jaxmpc.pytrees import record
 from jaxmpc.robots.tangent import BALL, FREE
 
 SLIDE = 2
@@ -46,7 +46,7 @@ FIELDS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Tree:
     """Which body hangs on which, in constants of NumPy.
 

@@ -9,7 +9,7 @@ derivative is wrong at the bound, where MPC often operates: the controller has t
 """
 
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -19,7 +19,7 @@ from jax import Array
 
 from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.pytrees import pytree
+from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import eigh
 from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import floating_dtype, matmul
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class Robot:
     """A MuJoCo model as a plant with sampled inputs; made by `load_robot`.
 
@@ -56,19 +55,19 @@ class Robot:
     state_limits: Box
     input_limits: Box
     home: Any
-    plant: Physics = field(metadata={"static": True})
-    predictor: Physics = field(metadata={"static": True})
-    anchor: tuple[float, ...] = field(metadata={"static": True})
-    substeps: int = field(metadata={"static": True})
-    dt: float = field(metadata={"static": True})
-    name: str = field(default="", metadata={"static": True})
-    state_names: tuple[str, ...] = field(default=(), metadata={"static": True})
-    state_units: tuple[str, ...] = field(default=(), metadata={"static": True})
-    input_names: tuple[str, ...] = field(default=(), metadata={"static": True})
-    input_units: tuple[str, ...] = field(default=(), metadata={"static": True})
+    plant: Physics = static()
+    predictor: Physics = static()
+    anchor: tuple[float, ...] = static()
+    substeps: int = static()
+    dt: float = static()
+    name: str = static(default="")
+    state_names: tuple[str, ...] = static(default=())
+    state_units: tuple[str, ...] = static(default=())
+    input_names: tuple[str, ...] = static(default=())
+    input_units: tuple[str, ...] = static(default=())
     numbers: dict[str, Any] = field(default_factory=dict)
-    notes: tuple[tuple[str, str], ...] = field(default=(), metadata={"static": True})
-    file: Any = field(default=None, metadata={"static": True})
+    notes: tuple[tuple[str, str], ...] = static(default=())
+    file: Any = static(default=None)
 
     @property
     def mujoco(self) -> "mujoco.MjModel":

@@ -3,13 +3,13 @@
 import copy
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxmpc.checks import fail
+from jaxmpc.pytrees import record
 from jaxmpc.robots.physics import mjx_module
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _BITS = 31
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Lack:
     """What a model has and MJX has not. text: in words. take_out: removes it from a model, in
     place. acts: whether it is known to change motions, without trying."""

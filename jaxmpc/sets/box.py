@@ -1,7 +1,6 @@
 """Boxes: {x : lower <= x <= upper}."""
 
 import itertools
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -16,7 +15,6 @@ from jaxmpc.sets.polytope import Polytope
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class Box(LinearSet):
     """{x in R^n : lower <= x <= upper}, elementwise.
 

@@ -6,14 +6,14 @@ vertices.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY
 
 import numpy as np
 import scipy
 from scipy.spatial import KDTree
 
 from jaxmpc.checks import fail
-from jaxmpc.pytrees import pytree
+from jaxmpc.pytrees import pytree, static
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.disturbance import supports
 from jaxmpc.sets.geometry import factors, unit_rows
@@ -26,7 +26,6 @@ from jaxmpc.systems.system import LinearSystem
 
 
 @pytree
-@dataclass(frozen=True, eq=False, kw_only=True)
 class ControlInvariantSet(Polytope):
     """{H x <= h}, a set that some admissible input never lets the state leave.
 
@@ -38,11 +37,12 @@ class ControlInvariantSet(Polytope):
     reason: what was found and how it was checked, in words.
     """
 
-    exact: bool = field(metadata={"static": True})
+    _: KW_ONLY
+    exact: bool = static()
     outer: Polytope
-    iterations: int = field(metadata={"static": True})
-    gap: float = field(metadata={"static": True})
-    reason: str = field(metadata={"static": True})
+    iterations: int = static()
+    gap: float = static()
+    reason: str = static()
 
 
 def maximal_control_invariant_set(

@@ -1,7 +1,6 @@
 """Ellipsoids about the origin: {x : x'P x <= level}."""
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from jaxmpc.sets.convex_set import ConvexSet, numbers, product, require_dimensio
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class Ellipsoid(ConvexSet):
     """{x in R^n : x'P x <= level}, centered at the origin.
 

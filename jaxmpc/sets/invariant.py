@@ -1,6 +1,6 @@
 """Invariant sets of x+ = A x + B u + w under u = K x: the maximal one, the largest ellipsoid."""
 
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +15,7 @@ from jaxmpc.checks import (
     require_shape,
     require_symmetric_psd,
 )
-from jaxmpc.pytrees import pytree
+from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import cholesky, eigh, solve_triangular
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 from jaxmpc.sets.box import Box
@@ -31,24 +31,24 @@ _REDUNDANT = 1e-12
 
 
 @pytree
-@dataclass(frozen=True, eq=False, kw_only=True)
 class InvariantSet(Polytope):
     """{H x <= h}, the largest set that u = K x never lets the state leave.
 
     index: of determination, the least t for which constraints kept at k = 0..t are kept for ever.
     """
 
-    index: int = field(metadata={"static": True})
+    _: KW_ONLY
+    index: int = static()
 
 
 @pytree
-@dataclass(frozen=True, eq=False, kw_only=True)
 class InvariantEllipsoid(Ellipsoid):
     """{x'P x <= level}, which u = K x never lets the state leave.
 
     contraction: gamma2, with x+'P x+ <= gamma2 x'P x without disturbance.
     """
 
+    _: KW_ONLY
     contraction: Reals
 
 

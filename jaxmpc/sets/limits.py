@@ -1,20 +1,20 @@
 """Limits of joints and outputs as sets, their rows named."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite
+from jaxmpc.pytrees import record
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.polytope import Polytope
 
 Limit = float | Reals | tuple[Reals, Reals] | None
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class JointLimits:
     """Limits of n joints with the state x = (q, dq) in R^2n and the torques u in R^n.
 

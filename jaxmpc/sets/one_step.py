@@ -1,11 +1,10 @@
 """One step of x+ = A x + B u + c + w backwards: the states that some input takes into a set."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from jaxmpc.arrays import host_array
 from jaxmpc.checks import require_kind
+from jaxmpc.pytrees import record
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.disturbance import disturbance_set
 from jaxmpc.sets.geometry import irredundant_rows, unit_rows
@@ -52,7 +51,7 @@ def predecessor(
     return step.back(as_polytope("target", target, step.n), *X)
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class OneStep:
     """x+ = A x + B u + c + w with u in U, w in W.
 

@@ -1,7 +1,6 @@
 """Polytopes: {x : H x <= h}, bounded or not."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from jaxmpc.checks import (
     require_real,
     require_shape,
 )
-from jaxmpc.pytrees import pytree
+from jaxmpc.pytrees import pytree, static
 from jaxmpc.sets.convex_set import (
     ConvexSet,
     LinearSet,
@@ -57,7 +56,6 @@ from jaxmpc.sets.lp import (
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class Polytope(LinearSet):
     """{x in R^n : H x <= h}.
 
@@ -70,7 +68,7 @@ class Polytope(LinearSet):
 
     H: Reals
     h: Reals
-    labels: tuple[str, ...] = field(default=(), metadata={"static": True})
+    labels: tuple[str, ...] = static(default=())
 
     def __post_init__(self) -> None:
         store_floats(self, "H", "h")

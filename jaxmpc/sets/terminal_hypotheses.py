@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, as_weight, host_array
 from jaxmpc.checks import fail, require_finite, require_kind, require_shape
+from jaxmpc.pytrees import record
 from jaxmpc.sets.any_set import translated, unit_half_spaces
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.control_invariant import largest_cut
@@ -46,7 +47,7 @@ class Check:
     theorems: tuple[int, ...]
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class TerminalReport:
     """What `verify_terminal` found: `report["Lyapunov inequality"]` is one check, `str` a table.
 
@@ -227,7 +228,7 @@ def verify_terminal(
     return TerminalReport(tuple(checks), gain, certificate, factor, exact)
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class _Rows:
     """{G x <= g}, rows of norm 1; no rows for all of R^n."""
 
@@ -268,7 +269,7 @@ class _Rows:
         return np.where(width > _TOUCH * size, width, np.where(size > 1e-280, size, 1.0))
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class _Ellipse:
     """{x'P x <= level}."""
 

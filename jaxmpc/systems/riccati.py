@@ -1,7 +1,6 @@
 """The infinite-horizon linear-quadratic regulator in discrete time."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -27,7 +26,6 @@ _RESIDUAL = 1e-6
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class LQR:
     """The optimal law u = K x and its cost x'P x.
 

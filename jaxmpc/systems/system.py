@@ -1,7 +1,6 @@
 """Linear systems in discrete time, x+ = A x + B u + c."""
 
 import dataclasses
-from dataclasses import dataclass, field
 from numbers import Real
 from typing import Any
 
@@ -19,7 +18,7 @@ from jaxmpc.checks import (
     require_printable,
     require_shape,
 )
-from jaxmpc.pytrees import pytree
+from jaxmpc.pytrees import pytree, static
 
 
 def require_period(argument: str, dt: Any) -> None:
@@ -30,7 +29,6 @@ def require_period(argument: str, dt: Any) -> None:
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class LinearSystem:
     """x+ = A x + B u + c, with x in R^n and u in R^m.
 
@@ -49,11 +47,11 @@ class LinearSystem:
     A: Reals
     B: Reals
     c: Reals | None = None
-    dt: float | None = field(default=None, metadata={"static": True})
-    state_names: tuple[str, ...] = field(default=(), metadata={"static": True})
-    input_names: tuple[str, ...] = field(default=(), metadata={"static": True})
-    state_units: tuple[str, ...] = field(default=(), metadata={"static": True})
-    input_units: tuple[str, ...] = field(default=(), metadata={"static": True})
+    dt: float | None = static(default=None)
+    state_names: tuple[str, ...] = static(default=())
+    input_names: tuple[str, ...] = static(default=())
+    state_units: tuple[str, ...] = static(default=())
+    input_units: tuple[str, ...] = static(default=())
 
     def __post_init__(self) -> None:
         store_floats(self, "A", "B", "c")

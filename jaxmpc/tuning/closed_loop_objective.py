@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -18,6 +17,7 @@ from jaxmpc.closed_loop.many import simulate_batch
 from jaxmpc.closed_loop.memory import device_bytes, program_bytes
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.precision import arrays
 from jaxmpc.qp.status import Status
@@ -36,7 +36,7 @@ FACTORING = ("cholesky", "triangular_solve", "lu", "eigh", "qr", "householder_pr
 Data = tuple[np.ndarray, dict[str, np.ndarray]]
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class ClosedLoopObjective:
     """The mean loss of closed loops as a function of θ.
 

@@ -18,6 +18,7 @@ from tqdm.std import tqdm
 
 from jaxmpc.checks import fail
 from jaxmpc.files import fingerprint, read_arrays, remove_partial, write_arrays
+from jaxmpc.pytrees import record
 from jaxmpc.tuning.settings import Settings
 
 # (loss, numbers to record) and (loss, gradient, numbers to record).
@@ -25,7 +26,7 @@ Validate = Callable[[Any], tuple[float, Mapping[str, float]]]
 Gradient = Callable[[Any, int], tuple[float, Any, Mapping[str, float]]]
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Descent:
     """The record of T steps from θ_0 to θ_T.
 

@@ -1,6 +1,5 @@
 """ClosedLoopLoss: the cost of a closed loop, as a differentiable number."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -10,13 +9,14 @@ from jax import Array
 
 from jaxmpc.checks import fail, require_symmetric_psd
 from jaxmpc.closed_loop.run import Run
+from jaxmpc.pytrees import record
 from jaxmpc.qp.precision import matmul
 from jaxmpc.sets import violations
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.polytope import Polytope
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class ClosedLoopLoss:
     """Loss of one closed loop: tracking, effort, violations and time to settle,
 

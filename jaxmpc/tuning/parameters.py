@@ -13,7 +13,6 @@ so that a step of θ is a relative change of a weight, independent of its units.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -23,11 +22,12 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail, require_finite, require_symmetric_psd
+from jaxmpc.pytrees import record
 
 DOMAINS = ("real", "positive", "interval", "diagonal", "definite")
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Parameter:
     """One quantity to tune: its initial value, its domain, and which of its entries are trained.
 

@@ -13,7 +13,7 @@ iteration are the solutions: a bad rho costs steps but cannot make a solution wr
 """
 
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -23,6 +23,7 @@ from jax import Array
 
 from jaxmpc.batches import Compiled, Devices, divisible, first_rows, over_devices, padded
 from jaxmpc.mpc.condense import Condensed
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ADMM, factor, iterate, natural, read, scaled, splittings, unscaled
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.residuals import joined, marked, residual_terms
@@ -34,8 +35,7 @@ from jaxmpc.tuning.batch_mean import BatchMean
 MARGIN = 0.3
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Samples:
     """States to solve from: x (B, p), and warm starts (z (B, nz), y (B, rows)) or None."""
 
@@ -50,8 +50,7 @@ class Samples:
         return jax.tree.map(lambda v: v[where], self)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class PenaltyObjective:
     """The problem, references and iteration for which penalties are tuned.
 

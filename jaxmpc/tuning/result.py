@@ -1,7 +1,7 @@
 """TuningRun: the result of every tuner, its cache, and what an interrupt leaves of it."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +10,14 @@ import numpy as np
 from jaxmpc.checks import fail
 from jaxmpc.files import read_arrays, write_arrays
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.tuning.descent import Descent
 from jaxmpc.tuning.parameters import Parameters, exact_values, trajectory
 from jaxmpc.tuning.settings import Settings
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class TuningRun:
     """The result of a tuner: the values with the least loss on the validation set.
 

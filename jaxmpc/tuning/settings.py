@@ -1,6 +1,5 @@
 """Settings: the keyword arguments that all tuners share, and how they divide their samples."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +9,10 @@ import optax
 
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, whole
+from jaxmpc.pytrees import record
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Settings:
     """Settings of the descent of a tuner.
 

@@ -1,6 +1,5 @@
 """Nominal closed loops from feasible states: violations and decrease of the optimal value."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -11,6 +10,7 @@ from jaxmpc.closed_loop.simulation import simulate
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 
@@ -18,7 +18,7 @@ from jaxmpc.qp.status import Status
 ROUNDING = 1e-7
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class NominalLoops:
     """The results of nominal closed loops from sampled feasible states.
 

@@ -1,6 +1,6 @@
 """From limits, weights and a horizon to an MPC problem with terminal set, cost and penalties."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from jaxmpc.arrays import Reals
@@ -9,6 +9,7 @@ from jaxmpc.explicit.penalties import ExactPenalty, exact_penalty
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.softening import soften
+from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.ellipsoid import Ellipsoid
@@ -20,7 +21,7 @@ from jaxmpc.systems.system import LinearSystem
 from jaxmpc.workflow.offline_test import OfflineReport, offline_report
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Design:
     """The result of `design`.
 

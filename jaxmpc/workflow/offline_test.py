@@ -1,7 +1,7 @@
 """The test of an MPC problem before it runs: proofs, simulations, and failed hypotheses."""
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from jaxmpc.mpc.inequalities import condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import row_table
 from jaxmpc.mpc.softening import harden
+from jaxmpc.pytrees import record
 from jaxmpc.recursion import RecursionReport
 from jaxmpc.recursion.analysis import examine
 from jaxmpc.recursion.budget import LABELS, LOOPS, PROOFS, Budget
@@ -25,7 +26,7 @@ from jaxmpc.sets.terminal_hypotheses import TerminalReport, verify_terminal
 from jaxmpc.workflow.closed_loops import NominalLoops, nominal_loops
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class OfflineReport:
     """Everything that is known of an MPC problem before it runs; `print` shows it.
 

@@ -208,3 +208,21 @@ def test_a_pair_near_the_solution_is_not_lost():
         )
         assert best.near and not other.near and other.error > best.error
         assert best.or_better(other).error == best.error
+
+
+def test_solutions_say_what_their_status_means():
+    qp = jm.QP(np.eye(3), np.ones(3), np.eye(3), -np.ones(3), np.ones(3))
+    one = jm.solve_qp(qp)
+    assert one.solved and one.sentence == jm.Status.SOLVED.sentence
+    assert "status=SOLVED" in repr(one)
+    q = np.ones((50, 3))
+    q[7] = np.nan
+    many = jax.vmap(lambda q: jm.solve_qp(replace(qp, q=q)))(q)
+    np.testing.assert_array_equal(many.solved, np.arange(50) != 7)
+    assert "status=49 SOLVED + 1 NON_FINITE" in repr(many) and len(repr(many)) < 500
+    with pytest.raises(ValueError, match="sentence: of 49 SOLVED"):
+        _ = many.sentence
+    assert jax.tree.map(lambda v: v[7], many).sentence == jm.Status.NON_FINITE.sentence
+    with pytest.raises(ValueError, match="sentence: of traced int32"):
+        jax.jit(lambda: jm.solve_qp(qp).sentence)()
+    assert jax.jit(lambda q: jm.solve_qp(replace(qp, q=q)).solved)(np.ones(3))

@@ -17,7 +17,6 @@ What is left is an LQR problem with the weights ω on the rows. It converges fro
 row is violated: there ω → k.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -25,6 +24,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.mpc.stagewise.stages import conditions, judged, minimise, riccati
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.residuals import Pair
 
@@ -120,8 +120,7 @@ class Limits(NamedTuple):
         return Sides(t, z, jnp.where(self.soft, e, 0.0))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Interior:
     """Loop state of one instance: inputs u (N, m), the sides' numbers, the best pair of all so far,
     the steps taken, and whether to go on."""

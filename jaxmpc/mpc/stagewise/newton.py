@@ -14,7 +14,7 @@ runs forward, Σ⁺ = (A + BK) Σ (A + BK)' + B G⁻¹ B' from Σ_0 = 0.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -44,6 +44,7 @@ from jaxmpc.mpc.stagewise.stages import (
     stages,
     unconstrained,
 )
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import (
     ADMM,
     DEFAULT,
@@ -153,8 +154,7 @@ def checked(mpc: MPC, system: LinearSystem, solver: ADMM) -> MPC:
     return mpc
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class StageFactor:
     """What data and penalties decide: row scale E (rows,), 0 for a row that no input moves; rho
     (S, rows) with the gains of each of the S penalties of a schedule, None where there are no ADMM
@@ -254,8 +254,7 @@ def read(
     return u, s.bounds.admissible(y)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Search:
     """Loop state of one instance: inputs u (N, m) and multipliers y (rows,) of the last Newton
     step, the best pair of all so far, the steps taken, and whether to go on."""

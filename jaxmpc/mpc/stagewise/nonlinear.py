@@ -13,7 +13,7 @@ Newton's, stage by stage: with the costates λ and the multipliers y of the func
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -31,12 +31,11 @@ from jaxmpc.checks import (
 )
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.stagewise.stages import Sample, Stages, apply, apply_transposed, at, spread
-from jaxmpc.pytrees import named_pytree, pytree, static_pytree
+from jaxmpc.pytrees import named_pytree, pytree, static, static_pytree
 from jaxmpc.qp.precision import matmul, symmetric
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class Task:
     """A cost or a limit on a smooth function g of the state and the input:
 
@@ -54,15 +53,15 @@ class Task:
     name, unit: in tables.
     """
 
-    function: Callable[[Any], Any] = field(metadata={"static": True})
+    function: Callable[[Any], Any] = static()
     weight: Any = None
     target: Any = None
     lower: Any = None
     upper: Any = None
     rho: Any = 1e4
-    stages: tuple[int, ...] | None = field(default=None, metadata={"static": True})
-    name: str = field(default="task", metadata={"static": True})
-    unit: str = field(default="", metadata={"static": True})
+    stages: tuple[int, ...] | None = static(default=None)
+    name: str = static(default="task")
+    unit: str = static(default="")
 
     @property
     def limited(self) -> bool:
@@ -130,7 +129,6 @@ class Plain:
 
 
 @pytree
-@dataclass(frozen=True, eq=False)
 class NonlinearMPC:
     """The problem of `MPC` with a nonlinear model, and with costs and limits on functions:
 

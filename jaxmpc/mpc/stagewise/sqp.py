@@ -17,7 +17,7 @@ Derivatives follow from the same conditions by the implicit function theorem, wi
 the Lagrangian (`nonlinear.curved`): one Riccati recursion.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -64,6 +64,7 @@ from jaxmpc.mpc.stagewise.stages import (
     stage_residuals,
     stages,
 )
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, default_rho, scaled_multipliers
 from jaxmpc.qp.certificate import Proof
 from jaxmpc.qp.derivative import Undo, implicit
@@ -264,8 +265,7 @@ def scales(s: Stages, scale: Any) -> tuple[Array, Array]:
     return E, jnp.broadcast_to(rho, E.shape)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Merit:
     """The merit function φ: its weights of defects (N, n) and of hard rows (rows,)."""
 
@@ -298,8 +298,7 @@ class Merit:
         return outside(before) - outside(after) + gaps - jnp.sum(gx * dx) - jnp.sum(gu * du)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Iterate:
     """Loop state of one instance: x (N+1, n), u (N, m), multipliers y (rows,), the merit function,
     the QPs solved, whether the next may have the exact Hessian, and whether to go on."""

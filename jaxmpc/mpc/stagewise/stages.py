@@ -16,7 +16,7 @@ and the value function ½ x'S x + p'x of the steps after k gives (Rawlings, Mayn
 Only p runs backward and only x forward; all else is done for all stages at once.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -27,6 +27,7 @@ from jax import Array
 from jaxmpc.mpc.problem import MPC, weights_of
 from jaxmpc.mpc.rows import Layout, blocks
 from jaxmpc.mpc.stagewise.riccati import Gains, recurrence, riccati_recursion, tracking
+from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.admm import convex
 from jaxmpc.qp.precision import floating_dtype, matmul, precisely, rounding
 from jaxmpc.qp.projection import Bounds
@@ -34,8 +35,7 @@ from jaxmpc.qp.residuals import SHARE, Pair, Terms
 from jaxmpc.qp.status import Status
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
+@pytree
 class Stages:
     """The data of a problem in one floating type.
 
@@ -61,9 +61,9 @@ class Stages:
     upper: Array
     linear: Any
     quadratic: Any
-    layout: Layout = field(metadata={"static": True})
-    boxes: tuple[bool, ...] = field(metadata={"static": True})
-    horizon: int = field(metadata={"static": True})
+    layout: Layout = static()
+    boxes: tuple[bool, ...] = static()
+    horizon: int = static()
     cross: Any = None
 
     @property

@@ -5,7 +5,6 @@ import copy
 import io
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_shape, whole
+from jaxmpc.pytrees import record
 from jaxmpc.robots.film.captions import TARGET, captioned, exceeded_limits
 from jaxmpc.robots.robot import Robot
 
@@ -191,7 +191,7 @@ def _add_ghost(scene: Any, model: Any, data: Any) -> None:
         geom.pos[:] += 0.01 * (geom.pos - eye)
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Film:
     """Frames (F, h, w, 3), uint8, of `render`, at `fps` of them a second: notebooks play it.
 
