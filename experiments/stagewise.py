@@ -84,7 +84,9 @@ def report(s: Settings, mpc: jm.MPC, arms: list, x0s: np.ndarray, bits: int) -> 
     systems, x = jm.LinearSystem(of("A"), of("B"), of("c")), jnp.asarray(x0s, dtype)
     condensed = lambda system: jm.Controller(replace(mpc, system=system), solver)
     programs: dict[str, tuple[Callable, Callable]] = {
-        "factor": (lambda system: factor_stages(mpc, system, solver), lambda: (systems,)),
+        "factor": (
+            lambda system: factor_stages(replace(mpc, system=system), solver), lambda: (systems,)
+        ),
         "steps": (
             lambda f, x: plan_stages(f, mpc, x, solver=solver), lambda: (found["factor"], x)
         ),

@@ -97,7 +97,7 @@ def arm_controller(batch: int) -> Callable[[], Any]:
 def stagewise(x: Any, scale: Any) -> Any:
     mpc = joint()
     system = replace(mpc.system, B=mpc.system.B * scale)
-    return jm.mpc.solve_stagewise(mpc, system, x, solver=SHORT).inputs
+    return jm.mpc.solve_stagewise(replace(mpc, system=system), x, solver=SHORT).inputs
 
 
 def lqr_gain(scale: Any) -> Any:

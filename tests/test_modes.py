@@ -86,7 +86,7 @@ def robot(x):
 FUNCTIONS = {
     "plan": lambda x: controller().plan(x),
     "derivative": lambda x: jax.grad(lambda x: jm.solve(rich_problem(), x).cost)(x),
-    "stagewise": lambda x: solve_stagewise(soft_problem(), system(), x).inputs,
+    "stagewise": lambda x: solve_stagewise(soft_problem(), x).inputs,
     "data": lambda x: jm.solve(problem(Q=jnp.diag(1 + x**2)), x).inputs,
     "qp": lambda x: jm.solve_qp(program(x)).z,
     "lqr": lambda x: jm.lqr(system(), jnp.diag(1 + x**2), 0.1).K,

@@ -90,7 +90,8 @@ def run(settings: Settings) -> dict[str, Any]:
     substeps = lambda x, u: repeated(bare, robot.substeps)(x, u)
     linear = jax.vmap(robot.linearize)
     models = jax.jit(linear)(x0s, us)
-    factor = jax.jit(jax.vmap(lambda model: factor_stages(soft, model, solver, controller.scale)))
+    own = lambda model: replace(soft, system=model)
+    factor = jax.jit(jax.vmap(lambda s: factor_stages(own(s), solver, controller.scale)))
     factors = factor(models)
 
     def planned(iterations: int, newton_steps: int | None) -> Any:

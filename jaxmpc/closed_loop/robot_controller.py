@@ -156,7 +156,8 @@ class RobotController:
         else:
             u = self._resting(x, input_reference)[1][0] if carry is None else carry.inputs[0]
             system = self.robot.linearize(x, limited(self.soft.inputs, u), exact=self.exact)
-            plan = solve_stagewise(self.soft, system, xi, reference, self.solver, start, **given)
+            mpc = replace(self.soft, system=system)
+            plan = solve_stagewise(mpc, xi, reference, self.solver, start, **given)
         return applied(self.soft, plan, carry, None if carry is None else carry.inputs[0])
 
     @property
@@ -212,5 +213,5 @@ def prepared(
     if linearize == "trajectory":
         NonlinearMPC(soft, as_model(robot), tuple(tasks)).validate()
     # Rows of tasks differ from state to state.
-    scale = None if tasks else factor_stages(soft, soft.system, solver).E
+    scale = None if tasks else factor_stages(soft, solver).E
     return {"soft": arrays(soft), "fixed": None, "scale": scale}

@@ -180,7 +180,8 @@ class MPC:
         system = self.system
         if not isinstance(system, LinearSystem):
             return
-        if dimensions(system.A) != 2 or dimensions(system.B) != 2:
+        # (Three where the system differs from step to step: `solve_stagewise`.)
+        if not {dimensions(system.A), dimensions(system.B)} <= {2, 3}:
             return
         n, m = system.n, system.m
         for name, size in (("Q", n), ("R", m), ("terminal_cost", n)):

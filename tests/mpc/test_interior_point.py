@@ -52,7 +52,8 @@ def planned(kind: str = "hard", dtype: str = "float64", newton_steps: int | None
     with enable_x64(dtype == "float64"):
         data = [jnp.asarray(v, dtype) for v in instances()]
         mpc = jax.tree.map(lambda v: jnp.asarray(v, dtype), mpc)
-        plan = lambda A, B, c, x: solve_stagewise(mpc, jm.LinearSystem(A, B, c), x, None, solver)
+        system = lambda *data: replace(mpc, system=jm.LinearSystem(*data))
+        plan = lambda A, B, c, x: solve_stagewise(system(A, B, c), x, None, solver)
         return jax.tree.map(np.asarray, jax.jit(jax.vmap(plan))(*data))
 
 
@@ -112,7 +113,9 @@ def test_states_that_are_not_finite_stay_by_themselves():
     bad[3], bad[7, 1] = np.nan, np.inf
     with enable_x64(True):
         plan = jax.jit(jax.vmap(
-            lambda A, B, c, x: solve_stagewise(MPC, jm.LinearSystem(A, B, c), x, None, SOLVER)
+            lambda A, B, c, x: solve_stagewise(
+                replace(MPC, system=jm.LinearSystem(A, B, c)), x, None, SOLVER
+            )
         ))(A, B, c, bad)  # fmt: skip
     fine = np.delete(np.arange(COUNT), [3, 7])
     assert (plan.status[np.array([3, 7])] == jm.Status.NON_FINITE).all()

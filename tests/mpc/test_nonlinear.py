@@ -101,7 +101,7 @@ class TestSolution:
                      inputs=jm.Box([-0.3, -0.3], [0.3, 0.3]), constrain_initial=False)  # fmt: skip
         soft = jm.soften(mpc, 20.0)
         x0, r = np.array([0.9, -0.5, 0.4]), np.array([0.2, 0.0, 0.1])
-        expected = solve_stagewise(soft, system, x0, r)
+        expected = solve_stagewise(soft, x0, r)
         for steps in (1, 20):
             plan = solve_nonlinear(NonlinearMPC(soft, system), x0, r, iterations=steps)
             assert plan.status == SOLVED and plan.iterations <= 2

@@ -115,7 +115,7 @@ def test_iterates_are_those_of_the_dense_solver(kind):
     rho = np.stack([np.geomspace(0.3, 3, count), np.geomspace(5, 0.5, count)])
     settings = jm.ADMM(iterations=50, rho=rho)
     dense = admm.factor(qp.P, qp.A, settings)
-    factor = factor_stages(mpc, system, settings)
+    factor = factor_stages(replace(mpc, system=system), settings)
     E, E_dense = np.asarray(factor.E), np.asarray(dense.E)
     np.testing.assert_array_equal(E == 0, E_dense == 0)
     np.testing.assert_allclose(E, E_dense, rtol=1e-4)
@@ -147,7 +147,7 @@ def test_plan_is_that_of_solve():
     mpc = problem()
     rng = np.random.default_rng(3)
     aims = rng.normal(size=(N + 1, n)) / 10, rng.normal(size=(N, m)) / 10
-    plan = solve_stagewise(mpc, mpc.system, X0, aims[0], SOLVER, input_reference=aims[1])
+    plan = solve_stagewise(mpc, X0, aims[0], SOLVER, input_reference=aims[1])
     exact = jm.solve(mpc, X0, aims[0], jm.ADMM(iterations=400), input_reference=aims[1])
     assert plan.status == exact.status == jm.Status.SOLVED
     assert np.max(exact.slack) > 0.01 and np.sum(np.abs(rows_of(mpc, exact)) > 1e-3) > 5
@@ -166,7 +166,7 @@ def test_plan_is_that_of_solve():
 def test_varying_system():
     """Optimal for the QP built by hand, to rounding after five Newton steps."""
     mpc, system = problem(), varying()
-    plan = solve_stagewise(mpc, system, X0, solver=SOLVER)
+    plan = solve_stagewise(replace(mpc, system=system), X0, solver=SOLVER)
     assert plan.status == jm.Status.SOLVED
     qp, _ = condensed(mpc, system, X0)
     assert max(residuals(qp, plan.inputs.ravel(), rows_of(mpc, plan))) < 1e-9
@@ -187,7 +187,7 @@ def test_derivative():
     def total(h, system):
         moved = replace(system, A=system.A + h * dA)
         soft = replace(mpc.soft, upper=mpc.soft.upper + h * dd)
-        plan = solve_stagewise(replace(mpc, soft=soft), moved, X0 + h * dx, solver=SOLVER)
+        plan = solve_stagewise(replace(mpc, soft=soft, system=moved), X0 + h * dx, solver=SOLVER)
         return jnp.sum(plan.inputs)
 
     backward = jax.jit(jax.vmap(jax.grad(total), in_axes=(None, 0)))(0.0, batch)
@@ -216,7 +216,7 @@ def test_stage_weights():
     solver = jm.ADMM(iterations=1, newton_steps=0)
     for plan in (
         jm.solve(mpc, x0, r, solver, input_reference=v),
-        solve_stagewise(mpc, mpc.system, x0, r, solver, input_reference=v),
+        solve_stagewise(mpc, x0, r, solver, input_reference=v),
     ):
         np.testing.assert_allclose(plan.inputs[:, 0], exact, rtol=1e-9)
         np.testing.assert_allclose(plan.cost, np.sum((rows @ exact - aim) ** 2), rtol=1e-9)
@@ -230,12 +230,13 @@ def test_stage_weights():
 def test_fixed_count_of_newton_steps():
     """By default those of the interior point method are the most."""
     early, all_of_them = (
-        solve_stagewise(problem(), varying(), X0, solver=solver)
+        solve_stagewise(replace(problem(), system=varying()), X0, solver=solver)
         for solver in (SOLVER, replace(SOLVER, fixed=True))
     )
     np.testing.assert_array_equal(early.status, all_of_them.status)
     np.testing.assert_allclose(early.inputs, all_of_them.inputs, atol=1e-9)
-    solve = lambda x0: solve_stagewise(problem(), varying(), x0, solver=jm.ADMM(fixed=True)).inputs
+    mpc = replace(problem(), system=varying())
+    solve = lambda x0: solve_stagewise(mpc, x0, solver=jm.ADMM(fixed=True)).inputs
     lengths = re.findall(r" length=(\d+)", str(jax.make_jaxpr(solve)(X0)))
     assert max(map(int, lengths)) == interior_point.STEPS
 
@@ -245,7 +246,9 @@ def test_residuals_are_those_of_the_qp():
     """Far from the optimum: the residuals of `residuals(qp, z, y)`, from adjoints."""
     mpc, system = problem(), varying()
     qp, _ = condensed(mpc, system, X0)
-    plan = solve_stagewise(mpc, system, X0, solver=jm.ADMM(iterations=2, newton_steps=0))
+    plan = solve_stagewise(
+        replace(mpc, system=system), X0, solver=jm.ADMM(iterations=2, newton_steps=0)
+    )
     assert plan.status == jm.Status.ITERATION_LIMIT
     found = plan.primal_residual, plan.dual_residual, plan.gap
     np.testing.assert_allclose(
@@ -259,45 +262,59 @@ def test_rows_that_no_input_moves():
     """x_0 outside hard limits: violated, and said; outside soft ones: their slack."""
     mpc = problem()
     far = np.array([1.05, 0.0, 0.0])
-    plan = solve_stagewise(mpc, mpc.system, far, solver=SOLVER)
+    plan = solve_stagewise(mpc, far, solver=SOLVER)
     assert plan.status == jm.Status.ITERATION_LIMIT
     assert plan.primal_residual >= 0.05 - 1e-12
     soft = replace(
         mpc, states=None, outputs=(), terminal_set=None,
         soft=jm.Soft(np.eye(n), upper=np.array([1.0, 0.7, 1.2]), rho=10.0),
     )  # fmt: skip
-    plan = solve_stagewise(soft, mpc.system, far, solver=SOLVER)
+    plan = solve_stagewise(soft, far, solver=SOLVER)
     assert plan.status == jm.Status.SOLVED and plan.gap < 1e-9
     np.testing.assert_allclose(plan.slack[0], [0.05, 0, 0], atol=1e-12)
 
 
+def test_a_varying_system_in_the_problem():
+    """Numbers and diagonals become matrices and vectors as they do for a constant system."""
+    short = dict(horizon=N, inputs=jm.Box(-1, 1), terminal_cost=[1.0] * n)
+    mpc = jm.MPC(varying(), [2.0, 1.0, 0.5], [0.4, 0.3], **short)
+    assert mpc.Q.shape == (n, n) and mpc.inputs.upper.shape == (m,)
+    found = solve_stagewise(mpc, X0)
+    same = jm.MPC(problem().system, np.diag([2.0, 1.0, 0.5]), np.diag([0.4, 0.3]), **short)
+    expected = solve_stagewise(replace(same, system=varying()), X0)
+    np.testing.assert_array_equal(found.inputs, expected.inputs)
+    assert found.status == jm.Status.SOLVED
+
+
 @pytest.mark.slow
 def test_warm_start_and_parts():
-    mpc, system = problem(), varying()
-    plan = solve_stagewise(mpc, system, X0, solver=SOLVER)
+    mpc = replace(problem(), system=varying())
+    plan = solve_stagewise(mpc, X0, solver=SOLVER)
     again = jm.ADMM(iterations=2, newton_steps=0)
-    cold = solve_stagewise(mpc, system, X0, solver=again)
+    cold = solve_stagewise(mpc, X0, solver=again)
     assert cold.status != jm.Status.SOLVED
-    factor = factor_stages(mpc, system, again)
+    factor = factor_stages(mpc, again)
     y = rows_of(mpc, plan)
     for start in (plan, WarmStart(plan.states, plan.inputs, y)):
         warm = plan_stages(factor, mpc, X0, solver=again, warm_start=start)
         assert warm.status == jm.Status.SOLVED
         np.testing.assert_allclose(warm.inputs, plan.inputs, atol=1e-9)
     with pytest.raises(ValueError, match="warm_start"):
-        solve_stagewise(mpc, system, X0, warm_start=WarmStart(plan.states, plan.inputs, y[1:]))
+        solve_stagewise(mpc, X0, warm_start=WarmStart(plan.states, plan.inputs, y[1:]))
 
 
 @pytest.mark.slow
 def test_float32_and_bad_elements():
     """Penalties, and with them factors, differ in the batch; NaN stays in its element."""
     mpc, system = problem(), varying()
-    exact = solve_stagewise(mpc, system, X0, solver=SOLVER)
+    exact = solve_stagewise(replace(mpc, system=system), X0, solver=SOLVER)
     batch, x0s = jax.tree.map(lambda v: np.stack([v] * 4), system), np.stack([X0] * 4)
     batch.A[1, 3, 0, 0], x0s[2, 1] = np.nan, np.inf
     with enable_x64(False):
         plans = jax.vmap(
-            lambda s, x, rho: solve_stagewise(mpc, s, x, solver=replace(SOLVER, rho=rho))
+            lambda s, x, rho: solve_stagewise(
+                replace(mpc, system=s), x, solver=replace(SOLVER, rho=rho)
+            )
         )(batch, x0s, jnp.array([0.5, 1.0, 1.0, 1.0]))
     assert plans.inputs.dtype == jnp.float32
     S, good = jm.Status, np.array([0, 3])
@@ -324,14 +341,14 @@ def test_float32_and_bad_elements():
 def test_bad_problems_raise(change, words):
     mpc, system = change(problem(), varying())
     with pytest.raises(ValueError, match=words):
-        solve_stagewise(mpc, system, X0)
+        solve_stagewise(replace(mpc, system=system), X0)
 
 
 def test_bad_arguments_raise():
-    mpc, system = problem(), varying()
+    mpc = replace(problem(), system=varying())
     with pytest.raises(ValueError, match="x0"):
-        solve_stagewise(mpc, system, X0[:2])
+        solve_stagewise(mpc, X0[:2])
     with pytest.raises(ValueError, match="reference"):
-        solve_stagewise(mpc, system, X0, np.zeros((N, n)))
+        solve_stagewise(mpc, X0, np.zeros((N, n)))
     with pytest.raises(ValueError, match="rho"):
-        factor_stages(mpc, system, jm.ADMM(rho=np.ones(3)))
+        factor_stages(mpc, jm.ADMM(rho=np.ones(3)))

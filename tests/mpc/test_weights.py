@@ -60,7 +60,7 @@ def controlled(w):
 
 
 def stagewise(w):
-    return solve_stagewise(problem(w), SYSTEM, X0, AIM, SOLVER, input_reference=EFFORT)
+    return solve_stagewise(problem(w), X0, AIM, SOLVER, input_reference=EFFORT)
 
 
 def bent(x, u):
@@ -217,7 +217,7 @@ def test_the_cure_for_a_singular_R_helps():
     with pytest.raises(
         ValueError, match=r"k = 3 no other weight gives u1, u2 a cost.* or give a t"
     ):
-        solve_stagewise(mpc, mpc.system, X0)
+        solve_stagewise(mpc, X0)
     for cure in (
         {"R": 1e-3 * np.eye(2)},
         {"input_rate_weight": [0.1, 0.1]},

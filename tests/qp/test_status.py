@@ -168,7 +168,7 @@ def test_a_bad_plan_leaves_the_shared_gradient(stagewise):
     def plan(a, weight, x):
         system = jm.LinearSystem(A * a, B * a)
         mpc = jm.MPC(system, Q=jnp.eye(2) * weight, R=np.eye(1), horizon=5, inputs=limit)
-        return jm.mpc.solve_stagewise(mpc, system, x) if stagewise else jm.solve(mpc, x)
+        return jm.mpc.solve_stagewise(mpc, x) if stagewise else jm.solve(mpc, x)
 
     def loss(a, weights, x):
         plans = jax.vmap(plan, in_axes=(None, 0, 0))(a, weights, x)

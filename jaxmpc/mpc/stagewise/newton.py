@@ -22,9 +22,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from jaxmpc.arrays import Reals, as_array, host_array
-from jaxmpc.checks import concrete, fail, require_finite
+from jaxmpc.checks import concrete, fail, require_finite, require_kind
 from jaxmpc.mpc.plan import Plan, WarmStart, answer
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import layout
@@ -76,12 +77,20 @@ NEWTON_STEPS = 6
 
 
 def solve_stagewise(
-    mpc: MPC, system: LinearSystem, x0: Reals, reference: Reals | None = None,
-    solver: ADMM = DEFAULT, warm_start: Any = None, *, input_reference: Reals | None = None,
-    scale: Any = None,
-) -> Plan:  # fmt: skip
-    """Solve `mpc` with `system` in place of its own, whose A (n, n), B (n, m) and c (n,) may have
-    a leading axis N: x_{k+1} = A_k x_k + B_k u_k + c_k.
+    mpc: MPC,
+    x0: Reals,
+    reference: Reals | None = None,
+    solver: ADMM = DEFAULT,
+    warm_start: Plan | WarmStart | None = None,
+    *,
+    input_reference: Reals | None = None,
+    scale: ArrayLike | None = None,
+) -> Plan:
+    """Solve an MPC problem stage by stage from the state x0 (n,): what takes the least time where
+    the system is another one in each problem, or at each step.
+
+    A (n, n), B (n, m) and c (n,) of mpc.system may have a leading axis N:
+    x_{k+1} = A_k x_k + B_k u_k + c_k. `replace(mpc, system=...)` puts a system into a problem.
 
     x0, references, solver and the Plan are those of `solve`, and so is the status: residuals and
     gap of the returned inputs and multipliers, evaluated from the data in float64. What differs:
@@ -98,34 +107,36 @@ def solve_stagewise(
     A row of scale 0 counts as one that no input moves: where that is not so, the plan does not
     become SOLVED.
 
-    `jax.vmap` over system, x0, references or the arrays of `mpc`. Raises ValueError for bad data
-    that can be read, and for what only `solve` supports: Ellipsoids, control horizons, input rates.
+    `jax.vmap` over x0, references or the arrays of `mpc`, its system's among them. Raises ValueError
+    for bad data that can be read, and for what only `solve` supports: Ellipsoids, control horizons,
+    input rates.
     """
-    factor = factor_stages(mpc, system, solver, scale)
+    factor = factor_stages(mpc, solver, scale)
     return plan_stages(
-        factor, replace(mpc, system=system), x0, reference, solver, warm_start,
-        input_reference=input_reference,
-    )  # fmt: skip
+        factor, mpc, x0, reference, solver, warm_start, input_reference=input_reference
+    )
 
 
 def factor_stages(
-    mpc: MPC, system: LinearSystem, solver: ADMM = DEFAULT, scale: Any = None
-) -> "StageFactor":  # fmt: skip
+    mpc: MPC, solver: ADMM = DEFAULT, scale: ArrayLike | None = None
+) -> "StageFactor":
     """What x0, references and warm start do not change: row scale and Riccati gains.
 
     Arguments and errors as in `solve_stagewise`; `plan_stages` does the rest.
     """
-    mpc = checked(mpc, system, solver)
+    mpc = checked(mpc, solver)
     rows = sum(len(steps) * size for _, steps, size in layout(mpc))
     if scale is not None and np.shape(scale) != (rows,):
         fail("scale", f"shape {np.shape(scale)}", f"Give ({rows},), one number a row")
     return _factor(*arrays((mpc, solver.rho, scale)), steps=solver.admm_steps() > 0)
 
 
-def checked(mpc: MPC, system: LinearSystem, solver: ADMM) -> MPC:
-    """The problem with `system` in it; ValueError for what is wrong with either."""
-    if not isinstance(system, LinearSystem):
-        fail("system", f"is a {type(system).__name__}", "Give a jm.LinearSystem")
+def checked(mpc: MPC, solver: ADMM) -> MPC:
+    """The problem without prestabilising gain; ValueError for what is wrong with it or the solver,
+    and for what is not solved stage by stage."""
+    require_kind("mpc", mpc, MPC)
+    system = mpc.system
+    require_kind("system", system, LinearSystem)
     for name, found in (
         ("terminal_set is an Ellipsoid", isinstance(mpc.terminal_set, Ellipsoid)),
         ("control_horizon is given", mpc.control_horizon is not None),
@@ -149,9 +160,8 @@ def checked(mpc: MPC, system: LinearSystem, solver: ADMM) -> MPC:
     at_first = replace(mpc, system=replace(system, **first), prestabilise=None)
     at_first.validate()
     at_first.require_unique_inputs()  # the recursion divides by R + B'SB
-    mpc = replace(mpc, system=system, prestabilise=None)
     solver.validate(sum(len(steps) * size for _, steps, size in layout(mpc)))
-    return mpc
+    return replace(mpc, prestabilise=None)
 
 
 @pytree

@@ -123,7 +123,7 @@ def solve_nonlinear(
     whole("iterations", iterations, 1)
     if solver.iterations is None:
         solver = replace(solver, iterations=0)
-    checked(mpc, mpc.system, replace(solver, rho=None))
+    checked(mpc, replace(solver, rho=None))
     if hessian not in ("exact", "gauss-newton"):
         fail("hessian", f"{hessian!r}", 'Give "exact" or "gauss-newton"')
     if solver.differentiate != "implicit" and iterations > 1:
