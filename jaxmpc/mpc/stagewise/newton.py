@@ -107,9 +107,9 @@ def solve_stagewise(
     A row of scale 0 counts as one that no input moves: where that is not so, the plan does not
     become SOLVED.
 
-    `jax.vmap` over x0, references or the arrays of `mpc`, its system's among them. Raises ValueError
-    for bad data that can be read, and for what only `solve` supports: Ellipsoids, control horizons,
-    input rates.
+    `jax.vmap` over x0, references or the arrays of `mpc`, its system's among them. Raises
+    ValueError for bad data that can be read, and for what only `solve` supports: Ellipsoids,
+    control horizons, input rates.
     """
     factor = factor_stages(mpc, solver, scale)
     return plan_stages(
