@@ -1,13 +1,16 @@
-"""Batches: compile once a shape, timed apart; pad to few shapes; divide among devices.
+"""Batches: programs compiled once for each shape, devices that share them, and parts of a batch.
 
-The batch axis is divided among the devices of a one-dimensional mesh, all other data are whole on
-each of them. The programs hold no collectives: a device leaves its data-dependent loops when its
-own part is done, and waits for no other. What the parts have in common, such as the mean of a loss,
-is computed on the host (`tuning/batch_mean.py`).
+Programs. `Compiled` compiles a function ahead, apart from running it, so that both can be timed.
 
-Under `jax.distributed` a process can read no array that lies on devices of another. So each process
-calls with states of its own and with devices of its own, and has the results of these; no call
-waits for another process.
+Devices. The batch axis is divided among the devices of a one-dimensional mesh, all other data are
+whole on each of them. The programs hold no collectives: a device leaves its data-dependent loops
+when its own part is done, and waits for no other. What the parts have in common, such as the mean
+of a loss, is computed on the host (`tuning/batch_mean.py`). Under `jax.distributed` a process can
+read no array that lies on devices of another. So each process calls with states of its own and with
+devices of its own, and has the results of these; no call waits for another process.
+
+Parts. A large batch goes through one program part by part (`each_part`, or another generator of
+`Part`s), and `work_off` gives each result to a sink: a list, arrays, a store.
 """
 
 import os
@@ -18,53 +21,18 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from tqdm.std import tqdm
 
 from jaxmpc.checks import fail, shown, whole
 from jaxmpc.qp.modes import own_modes
 
-# Points a compiled program takes at once on a CPU: a step's data stay within the cache.
-CHUNK = 8192
-
-
-def default_chunk() -> int:
-    """Points a compiled program takes at once on the present device."""
-    return CHUNK if jax.default_backend() == "cpu" else 32 * CHUNK
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    # Linux knows which.
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def workers() -> int:
-    """Return how many chunks to run side by side: one a core of a CPU, whose programs use little
-    more than one, for most of their steps are too small to be divided; one on other devices."""
-    return cores() if jax.default_backend() == "cpu" else 1
-
-
-def side_by_side(
-    call: Callable[[Any], Any], items: Iterable[Any], count: int | None = None
-) -> list[Any]:
-    """Return [call(item) for item in items], `count` at once, by default as many as `workers`.
-
-    `call` runs in threads of its own, which see none of the caller's JAX contexts.
-    """
-    items, count = list(items), workers() if count is None else count
-    if min(count, len(items)) < 2:
-        return [call(item) for item in items]
-    with ThreadPoolExecutor(count) as pool:
-        return list(pool.map(call, items))
-
-
-def gather_size(chunk: int) -> int:
-    """Size of the batches in which undecided points of a chunk go on: one, so that few compile."""
-    return max(chunk // 16, 64)
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 class Compiled:
@@ -139,38 +107,18 @@ def clear_programs() -> None:
     jax.clear_caches()
 
 
-def padded(x: np.ndarray, size: int) -> np.ndarray:
-    """The first row repeated up to `size` rows."""
-    return np.concatenate([x, np.broadcast_to(x[:1], (size - len(x), *x.shape[1:]))])
+def program_bytes(program: Any) -> float:
+    """Return the bytes that a compiled program needs for temporaries and output, on each device."""
+    found = program.memory_analysis()
+    return 0.0 if found is None else found.temp_size_in_bytes + found.output_size_in_bytes
 
 
-def first_rows(tree: Any, count: int) -> Any:
-    """The leaves without what `padded` added."""
-    return jax.tree.map(lambda v: v[:count], tree)
-
-
-def joined(parts: Sequence[Any]) -> Any:
-    """The host arrays of pytrees one after the other, copied by as many threads as there are cores:
-    a single one is slower than a fast device."""
-    ends = np.cumsum([len(jax.tree.leaves(part)[0]) for part in parts])
-    whole = jax.tree.map(lambda v: np.empty((ends[-1], *v.shape[1:]), v.dtype), parts[0])
-
-    def put(end: int, part: Any) -> None:
-        for out, v in zip(jax.tree.leaves(whole), jax.tree.leaves(part), strict=True):
-            out[end - len(v) : end] = v
-
-    side_by_side(lambda pair: put(*pair), zip(ends, parts, strict=True), cores())
-    return whole
-
-
-def require_step_type(dtype: Any) -> None:
-    """Raise unless iterates of this type are offered."""
-    try:
-        known = np.dtype(dtype) in (np.float32, np.float64)
-    except TypeError:
-        known = False
-    if not known:
-        fail("dtype", f"{dtype!r}", "Iterate in 'float32' or 'float64'")
+def device_bytes() -> float:
+    """Return the bytes of memory of the present device; on a CPU, of the machine."""
+    found = jax.local_devices()[0].memory_stats()
+    if found and "bytes_limit" in found:
+        return found["bytes_limit"]
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 # Devices to work on, None for JAX's default device alone.
@@ -256,3 +204,123 @@ def over_devices(function: Callable, devices: Devices, batched: Sequence[bool]) 
         out_specs=out.spec, check_vma=False,
     )  # fmt: skip
     return Compiled(jax.jit(parts, in_shardings=places, out_shardings=out), places)
+
+
+# Points a compiled program takes at once on a CPU: a step's data stay within the cache.
+CHUNK = 8192
+# Rows from which on a progress bar counts in thousands.
+MANY = 100_000
+
+
+def default_chunk() -> int:
+    """Points a compiled program takes at once on the present device."""
+    return CHUNK if jax.default_backend() == "cpu" else 32 * CHUNK
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    # Linux knows which.
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def workers() -> int:
+    """Return how many chunks to run side by side: one a core of a CPU, whose programs use little
+    more than one, for most of their steps are too small to be divided; one on other devices."""
+    return cores() if jax.default_backend() == "cpu" else 1
+
+
+def side_by_side(
+    call: Callable[[Any], Any], items: Iterable[Any], count: int | None = None
+) -> list[Any]:
+    """Return [call(item) for item in items], `count` at once, by default as many as `workers`.
+
+    `call` runs in threads of its own, which see none of the caller's JAX contexts.
+    """
+    items, count = list(items), workers() if count is None else count
+    if min(count, len(items)) < 2:
+        return [call(item) for item in items]
+    with ThreadPoolExecutor(count) as pool:
+        return list(pool.map(call, items))
+
+
+def gather_size(chunk: int) -> int:
+    """Size of the batches in which undecided points of a chunk go on: one, so that few compile."""
+    return max(chunk // 16, 64)
+
+
+def padded(x: np.ndarray, size: int) -> np.ndarray:
+    """The first row repeated up to `size` rows."""
+    return np.concatenate([x, np.broadcast_to(x[:1], (size - len(x), *x.shape[1:]))])
+
+
+def first_rows(tree: Any, count: int) -> Any:
+    """The leaves without what `padded` added."""
+    return jax.tree.map(lambda v: v[:count], tree)
+
+
+def joined(parts: Sequence[Any]) -> Any:
+    """The host arrays of pytrees one after the other, copied by as many threads as there are cores:
+    a single one is slower than a fast device."""
+    ends = np.cumsum([len(jax.tree.leaves(part)[0]) for part in parts])
+    whole = jax.tree.map(lambda v: np.empty((ends[-1], *v.shape[1:]), v.dtype), parts[0])
+
+    def put(end: int, part: Any) -> None:
+        for out, v in zip(jax.tree.leaves(whole), jax.tree.leaves(part), strict=True):
+            out[end - len(v) : end] = v
+
+    side_by_side(lambda pair: put(*pair), zip(ends, parts, strict=True), cores())
+    return whole
+
+
+class Part(NamedTuple, Generic[R]):
+    """The results of a part of a batch: its place (a slice of the rows, or a block of a store), the
+    number of its rows, and the seconds that compiling took."""
+
+    place: Any
+    count: int
+    result: R
+    compile_seconds: float = 0.0
+
+
+def slices(total: int, size: int) -> list[slice]:
+    """Return the slices of so many rows in parts of `size`, the last of which may be smaller."""
+    return [slice(i, min(i + size, total)) for i in range(0, total, size)]
+
+
+def each_part(program: Callable[[Any], R], rows: Any, size: int) -> Iterator[Part[R]]:
+    """Yield program(part) of a pytree of host arrays (B, ...), `size` rows at once: the last part
+    is filled up with its first row, and its results are without that."""
+    for here in slices(len(jax.tree.leaves(rows)[0]), size):
+        part = jax.tree.map(lambda v, here=here: padded(np.asarray(v)[here], size), rows)
+        compiled, count = Compiled.seconds, here.stop - here.start
+        result = first_rows(program(part), count)
+        yield Part(here, count, result, Compiled.seconds - compiled)
+
+
+def work_off(
+    parts: Iterable[Part[R]],
+    sink: Callable[[Part[R]], str | None],
+    total: int,
+    *,
+    unit: str,
+    progress: bool | None = False,
+    deadline: float = np.inf,
+) -> Timing:
+    """Give each part to a sink as soon as it is there, until all are or the deadline has passed.
+
+    The sink may return a note for the progress bar, which counts the `total` rows: shown where
+    `progress` is True, or None and stderr is a terminal. deadline: of `time.monotonic`. Returns the
+    rows that were done, the seconds that compiling took, and those of all the rest.
+    """
+    begun, timing = time.perf_counter(), Timing()
+    hidden = None if progress is None else not progress
+    with tqdm(total=total, unit=f" {unit}", unit_scale=total >= MANY, disable=hidden) as bar:
+        for part in parts:
+            bar.set_postfix_str(sink(part) or "", refresh=False)
+            bar.update(part.count)
+            timing.count += part.count
+            timing.compile_seconds += part.compile_seconds
+            if time.monotonic() > deadline:
+                break
+    timing.run_seconds = time.perf_counter() - begun - timing.compile_seconds
+    return timing

@@ -197,3 +197,13 @@ def require_symmetric_psd(argument: str, value: Any, *, definite: bool = False) 
             f"is not positive semidefinite (least eigenvalue {least:.3g})",
             "A negative weight makes the problem non-convex: check signs",
         )
+
+
+def require_step_type(dtype: Any) -> None:
+    """Raise unless ADMM's iterates may have this type."""
+    try:
+        known = np.dtype(dtype) in (np.float32, np.float64)
+    except TypeError:
+        known = False
+    if not known:
+        fail("dtype", f"{dtype!r}", "Iterate in 'float32' or 'float64'")

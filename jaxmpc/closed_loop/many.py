@@ -15,15 +15,16 @@ from jaxmpc.batches import (
     Devices,
     chosen_devices,
     count,
+    device_bytes,
     divisible,
     first_rows,
     joined,
     over_devices,
     padded,
     placement,
+    program_bytes,
 )
 from jaxmpc.checks import fail, require_real
-from jaxmpc.closed_loop.memory import device_bytes, program_bytes
 from jaxmpc.closed_loop.noise import Noise
 from jaxmpc.closed_loop.observer import KalmanFilter
 from jaxmpc.closed_loop.run import Run

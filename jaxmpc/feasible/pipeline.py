@@ -27,9 +27,8 @@ from jaxmpc.batches import (
     padded,
     placement,
     require_partitioner,
-    require_step_type,
 )
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, require_step_type
 from jaxmpc.feasible.candidates import (
     ALPHA,
     StagePenalties,

@@ -8,8 +8,8 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.batches import chosen_devices, first_rows, require_step_type
-from jaxmpc.checks import fail, require_kind, require_memory, whole
+from jaxmpc.batches import chosen_devices, first_rows
+from jaxmpc.checks import fail, require_kind, require_memory, require_step_type, whole
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller, plan_arguments
 from jaxmpc.mpc.many import Batch

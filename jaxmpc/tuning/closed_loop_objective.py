@@ -11,10 +11,9 @@ import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from jaxmpc.batches import Devices
+from jaxmpc.batches import Devices, device_bytes, program_bytes
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.many import simulate_batch
-from jaxmpc.closed_loop.memory import device_bytes, program_bytes
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
