@@ -5,19 +5,16 @@ contacts, equalities and dry friction do not help. What was found is tried on th
 """
 
 import copy
-from typing import TYPE_CHECKING, Any
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares, lsq_linear
 
 from jaxmpc.checks import fail
 from jaxmpc.pytrees import record
-from jaxmpc.robots.supported import name_of
-
-if TYPE_CHECKING:
-    import mujoco
-
-    from jaxmpc.robots.robot import Robot
+from jaxmpc.robots.description import RobotDescription
+from jaxmpc.robots.engine import BALL, FREE, flag, mujoco, name_of, single_joints
+from jaxmpc.sets.box import Box
 
 # Forces that count as balanced, relative to 1 + the largest one.
 BALANCED = 1e-6
@@ -74,23 +71,18 @@ class Forces:
     equals the input, or of an integrator is any number while the input is zero.
     """
 
-    def __init__(self, robot: "Robot") -> None:
-        import mujoco
-
-        self.model = robot.predictor.model
-        self.data = mujoco.MjData(self.model)
-        m, model = robot.m, self.model
+    def __init__(self, robot: RobotDescription) -> None:
+        self.model = model = robot.predictor.model
+        self.data = mujoco.MjData(model)
         self.active = np.flatnonzero(model.actuator_dyntype != mujoco.mjtDyn.mjDYN_NONE)
         self.integrators = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR
-        lower, upper = (np.array(v, float) for v in (
-            robot.input_limits.lower, robot.input_limits.upper,
-        ))  # fmt: skip
+        lower, upper = robot.input_limits.bounds()
         lower[self.integrators], upper[self.integrators] = -np.inf, np.inf
         bounded = np.flatnonzero(model.actuator_actlimited)
         low, high = model.actuator_actrange[bounded].T
         lower[bounded] = np.maximum(lower[bounded], low)
         upper[bounded] = np.minimum(upper[bounded], high)
-        self.lower, self.upper, self.m = lower, upper, m
+        self.lower, self.upper, self.m = lower, upper, robot.m
 
     def parts(self, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the inputs u (m,) and the activations (na,) of a drive."""
@@ -100,8 +92,6 @@ class Forces:
 
     def at(self, q: np.ndarray, drive: np.ndarray) -> np.ndarray:
         """Return the sum (nv,) of all forces at rest."""
-        import mujoco
-
         self.data.qpos, self.data.qvel = q, 0
         self.data.ctrl, act = self.parts(drive)
         if len(act):
@@ -120,7 +110,7 @@ class Forces:
         return Rest(q, *self.parts(drive), drive, self.lower, self.upper, missing, size)
 
 
-def rest_at(robot: "Robot", q: np.ndarray, *, within: bool = False) -> Rest:
+def rest_at(robot: RobotDescription, q: np.ndarray, *, within: bool = False) -> Rest:
     """Return the robot at rest in q (nq,) under the drive that comes nearest to a balance: the
     least one of all inputs, or one within the limits."""
     forces = Forces(robot)
@@ -133,131 +123,123 @@ def rest_at(robot: "Robot", q: np.ndarray, *, within: bool = False) -> Rest:
     return forces.rest(q, drive, f)
 
 
+class Cause(NamedTuple):
+    """What takes a rest away: the bit of mjtDisableBit that switches it off, none for the limits of
+    forces, what it is, and what helps."""
+
+    kind: str
+    text: str
+    cure: str
+
+
+CAUSES = (
+    Cause(
+        "",
+        "limits of actuators' forces (forcerange, actuatorfrcrange)",
+        "Choose a configuration that needs less force, or widen them in the file",
+    ),
+    Cause(
+        "equality",
+        "couplings (equalities), which linear models lack",
+        "Choose a configuration that meets them without their force, or take them out of the file",
+    ),
+    Cause("contact", "contacts", "Choose a configuration in which nothing touches"),
+    Cause("limit", "stops of joints or tendons", "Choose a configuration inside their ranges"),
+)
+
+
 def require_rest(
-    argument: str, robot: "Robot", rests: list[Rest], *, touching: bool = False
-) -> str:
+    argument: str, robot: RobotDescription, rests: list[Rest], *, touching: bool = False
+) -> list[str]:
     """Raise ValueError where the file moves in MuJoCo at what the predictor takes for a rest.
 
     Names the joint, its acceleration, and what takes the rest away: what the predictor ignores.
     touching: where contacts or stops do, return the sentence instead.
     """
-    import mujoco
-
-    plant, file = robot.mujoco, copy.deepcopy(robot.file or robot.mujoco)
+    plant, smooth = robot.mujoco, robot.predictor.model
+    file = copy.deepcopy(robot.file or plant)
     # Inputs are not clamped, and of a motor's force limits the box of inputs is in charge.
-    file.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
+    file.opt.disableflags |= flag("clampctrl")
     file.actuator_forcelimited[:] = plant.actuator_forcelimited
     file.jnt_actfrclimited[:] = plant.jnt_actfrclimited
     if hasattr(file, "actuator_delay"):
         file.actuator_delay[:] = 0  # inputs at rest are old enough
-    smooth = robot.predictor.model
-    data, expected = mujoco.MjData(file), mujoco.MjData(smooth)
-    limited = file.jnt_limited.copy()
-    straight = np.flatnonzero(np.isin(file.jnt_type, (2, 3)))
-    at, dof = file.jnt_qposadr[straight], file.jnt_dofadr[straight]
-    low, high = (np.asarray(v)[dof] for v in (robot.state_limits.lower, robot.state_limits.upper))
+    limited, single = file.jnt_limited.copy(), single_joints(file)
+    at, dof = file.jnt_qposadr[single], file.jnt_dofadr[single]
+    low, high = (end[dof] for end in robot.state_limits.bounds())
     for rest in rests:
         # A position beyond its limit is for the controller to refuse, not for the stop.
         inside = (low <= rest.q[at]) & (rest.q[at] <= high)
-        file.jnt_limited[straight] = limited[straight] & inside
-        wanted = _accelerations(smooth, expected, rest)
-        moves = lambda a, wanted=wanted: not np.all(np.abs(a - wanted) <= STILL)
-        found = _accelerations(file, data, rest)
-        if not moves(found):
+        file.jnt_limited[single] = limited[single] & inside
+        wanted, found = _accelerations(smooth, rest), _accelerations(file, rest)
+        if np.all(np.abs(found - wanted) <= STILL):
             continue
         i = int(np.argmax(np.nan_to_num(np.abs(found - wanted), nan=np.inf)))
         joint = name_of(file, "joint", file.dof_jntid[i])
         problem = f"{rest.q} is no rest: in MuJoCo {joint} accelerates by {found[i]:.3g} a second²"
-        for take_out, cause, cure in _CAUSES:
-            without = copy.deepcopy(file)
-            take_out(without)
-            if not moves(_accelerations(without, mujoco.MjData(without), rest)):
-                text = f"{problem}, by {cause}"
-                if touching and take_out in (_no_contacts, _no_stops):
-                    return f"{text}; the model is taken there"
-                fail(argument, text, cure)
+        for cause in CAUSES:
+            if np.all(np.abs(_accelerations(_without(file, cause.kind), rest) - wanted) <= STILL):
+                text = f"{problem}, by {cause.text}"
+                if touching and cause.kind in ("contact", "limit"):
+                    return [f"{text}; the model is taken there"]
+                fail(argument, text, cause.cure)
         fail(argument, problem, "See what robot.report() says is left out or ignored")
-    return ""
+    return []
 
 
-def _accelerations(model: "mujoco.MjModel", data: "mujoco.MjData", rest: Rest) -> np.ndarray:
-    import mujoco
-
-    mujoco.mj_resetData(model, data)
+def _accelerations(model: "mujoco.MjModel", rest: Rest) -> np.ndarray:
+    """Return what a model accelerates by at rest, (nv,)."""
+    data = mujoco.MjData(model)
     data.qpos[:], data.ctrl[:], data.act[:] = rest.q, rest.u, rest.act
     mujoco.mj_forward(model, data)
     return data.qacc.copy()
 
 
-def _no_force_limits(model: "mujoco.MjModel") -> None:
-    for limited in (
-        model.actuator_forcelimited,
-        model.jnt_actfrclimited,
-        model.tendon_actfrclimited,
-    ):
-        limited[:] = 0
+def _without(model: "mujoco.MjModel", kind: str) -> "mujoco.MjModel":
+    """Return a copy of the model without the `Cause` of this kind."""
+    model = copy.deepcopy(model)
+    if kind:
+        model.opt.disableflags |= flag(kind)
+    else:
+        for limited in ("actuator_forcelimited", "jnt_actfrclimited", "tendon_actfrclimited"):
+            getattr(model, limited)[:] = 0
+    return model
 
 
-def _no_contacts(model: "mujoco.MjModel") -> None:
-    model.opt.disableflags |= 16  # mjDSBL_CONTACT
-
-
-def _no_stops(model: "mujoco.MjModel") -> None:
-    model.opt.disableflags |= 8  # mjDSBL_LIMIT
-
-
-def _no_couplings(model: "mujoco.MjModel") -> None:
-    model.opt.disableflags |= 2  # mjDSBL_EQUALITY
-
-
-# What takes a rest away: how it is taken out, what it is, and what helps.
-_CAUSES = (
-    (_no_force_limits, "limits of actuators' forces (forcerange, actuatorfrcrange)",
-     "Choose a configuration that needs less force, or widen them in the file"),
-    (_no_couplings, "couplings (equalities), which linear models lack",
-     "Choose a configuration that meets them without their force, or take them out of the file"),
-    (_no_contacts, "contacts", "Choose a configuration in which nothing touches"),
-    (_no_stops, "stops of joints or tendons", "Choose a configuration inside their ranges"),
-)  # fmt: skip
-
-
-def settled(robot: "Robot") -> tuple[Rest, list[str]]:
+def settled(robot: RobotDescription) -> tuple[Rest, list[str]]:
     """Return the rest of `Robot.set_point`, and in words each way in which it is not home at
     rest."""
-    model, texts = robot.mujoco, []
-    nv, of = model.nv, np.isin(model.jnt_type, (2, 3))
+    model, texts, single = robot.mujoco, list[str](), single_joints(robot.mujoco)
     q, at, dof = (
         np.array(robot.home[: model.nq], float),
-        model.jnt_qposadr[of],
-        model.jnt_dofadr[of],
+        model.jnt_qposadr[single],
+        model.jnt_dofadr[single],
     )
-    lower, upper = (np.asarray(v)[:nv][dof] for v in (
-        robot.state_limits.lower, robot.state_limits.upper,
-    ))  # fmt: skip
-    inside = np.clip(q[at], lower, upper)
+    inside = np.clip(q[at], *(end[dof] for end in robot.state_limits.bounds()))
     beyond = [robot.state_names[i] for i in dof[inside != q[at]]]
-    say = lambda text: texts.append(f"robot {robot.name}: {text}")
     if beyond:
-        say(f"home lies beyond the limits of {', '.join(beyond)}, and is moved to them")
+        texts.append(f"home lies beyond the limits of {', '.join(beyond)}, and is moved to them")
         q[at] = inside
-    rest = rest_at(robot, q)
+    rest, moved = rest_at(robot, q), list[str]()
     if rest.held:
         moved = require_rest("home", robot, [rest], touching=True)
-        return rest, [*texts, *([moved] if moved else [])]
-    near = nearest_rest(robot, q)
-    if near.held:
-        moved = require_rest("home", robot, [near], touching=True)
-        texts += [moved] if moved else []
-        say("no input within the limits holds home; the nearest configuration that one holds is "
-            f"taken, up to {np.abs(near.q - q).max():.2g} rad or m away")  # fmt: skip
-        return near, texts
-    rest = rest_at(robot, q, within=True)
-    say(f"no input holds home or a configuration near it ({lacking(robot, rest)}); the model is "
-        "taken at home, where it does not rest")  # fmt: skip
-    return rest, texts
+    elif (near := nearest_rest(robot, q)).held:
+        rest, far = near, np.abs(near.q - q).max()
+        moved = require_rest("home", robot, [rest], touching=True)
+        texts.append(
+            "no input within the limits holds home; the nearest configuration that one "
+            f"holds is taken, up to {far:.2g} rad or m away"
+        )
+    else:
+        rest = rest_at(robot, q, within=True)
+        texts.append(
+            f"no input holds home or a configuration near it ({lacking(robot, rest)}); "
+            "the model is taken at home, where it does not rest"
+        )
+    return rest, [*(f"robot {robot.name}: {text}" for text in texts), *moved]
 
 
-def lacking(robot: "Robot", rest: Rest) -> str:
+def lacking(robot: RobotDescription, rest: Rest) -> str:
     """Return in words what is missing for the robot to rest."""
     if rest.balanced:
         i = int(np.argmax(rest.over))
@@ -267,7 +249,48 @@ def lacking(robot: "Robot", rest: Rest) -> str:
     return f"{missing[dof]:.3g} are missing at {robot.state_names[dof]}"
 
 
-def nearest_rest(robot: "Robot", q: np.ndarray) -> Rest:
+@record
+class Neighbourhood:
+    """Rests near a configuration q (nq,), as z = (motion from q (nv,), drive (m,)).
+
+    size: of the forces. width (m,): of the drives.
+    """
+
+    forces: Forces
+    q: np.ndarray
+    size: float
+    width: np.ndarray
+
+    def position(self, z: np.ndarray) -> np.ndarray:
+        """Return the configuration (nq,)."""
+        position, nv = self.q.copy(), self.forces.model.nv
+        mujoco.mj_integratePos(self.forces.model, position, z[:nv], 1.0)
+        return position
+
+    def force(self, z: np.ndarray) -> np.ndarray:
+        """Return the sum (nv,) of all forces."""
+        return self.forces.at(self.position(z), z[self.forces.model.nv :])
+
+    def scales(self, weight: float) -> np.ndarray:
+        """Return the roots of the weights of z. Drives weigh next to nothing: of many that hold q,
+        a small one."""
+        root = np.sqrt(weight)
+        return np.append(np.full(self.forces.model.nv, root), 1e-3 * root / self.width)
+
+    def residual(self, z: np.ndarray, weight: float) -> np.ndarray:
+        """Return what is to be small, in the sum of its squares."""
+        return np.concatenate([self.force(z) / self.size, self.scales(weight) * z])
+
+    def jacobian(self, z: np.ndarray, weight: float) -> np.ndarray:
+        """Return the derivative of `residual`, by central differences in the motion."""
+        steps = _STEP * np.eye(len(z))[: self.forces.model.nv]
+        by_motion = [(self.force(z + e) - self.force(z - e)) / (2 * _STEP) for e in steps]
+        by_drive, _ = self.forces.affine(self.position(z))
+        top = np.hstack([np.array(by_motion).T, by_drive]) / self.size
+        return np.vstack([top, np.diag(self.scales(weight))])
+
+
+def nearest_rest(robot: RobotDescription, q: np.ndarray) -> Rest:
     """Return the robot at rest in the configuration nearest to q (nq,) that inputs hold, where the
     search finds one (see `Rest.held`).
 
@@ -275,69 +298,61 @@ def nearest_rest(robot: "Robot", q: np.ndarray) -> Rest:
     inside theirs, for weights w that fall to almost nothing: a local search, whose end is a local
     minimum of the distance. Forces are scaled by the largest one at q, motions by rad or m.
     """
-    import mujoco
-
     forces = Forces(robot)
-    model, nv = forces.model, forces.model.nv
     J, f = forces.affine(q)
-    size = 1 + float(np.abs(f).max())
-
-    def moved(d: np.ndarray) -> np.ndarray:
-        position = q.copy()
-        mujoco.mj_integratePos(model, position, d, 1.0)
-        return position
-
-    low, high = np.full(nv, -np.inf), np.full(nv, np.inf)
-    limits = robot.state_limits
-    for kind, at, dof in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True):
-        count = {0: 3, 1: 0}.get(int(kind), 1)  # free joints move along the world's axes
-        here = q[at : at + count]
-        low[dof : dof + count] = np.asarray(limits.lower)[dof : dof + count] - here
-        high[dof : dof + count] = np.asarray(limits.upper)[dof : dof + count] - here
+    drive = np.linalg.lstsq(J, -f, rcond=None)[0]
+    low, high = _room(forces.model, robot.state_limits, q)
     lower, upper = np.append(low, forces.lower), np.append(high, forces.upper)
     tight = upper - lower < 1e-9
     lower, upper = lower - 1e-9 * tight, upper + 1e-9 * tight
-    inside = lambda z: np.clip(z, lower + _inset(lower, upper), upper - _inset(lower, upper))
-    drive = np.linalg.lstsq(J, -f, rcond=None)[0]
-    z = inside(np.append(np.zeros(nv), drive))
-    width = np.maximum(1.0, np.abs(drive))
-
+    width = upper - lower
+    inset = np.where(np.isfinite(width), 1e-10 * np.where(np.isfinite(width), width, 0), 1e-10)
+    near = Neighbourhood(forces, q, 1 + float(np.abs(f).max()), np.maximum(1.0, np.abs(drive)))
+    z = np.clip(np.append(np.zeros(len(low)), drive), lower + inset, upper - inset)
     for weight in _WEIGHTS:
-        root = np.sqrt(weight)
-        # Drives weigh next to nothing: of many that hold q, a small one.
-        tiny = 1e-3 * root / width
-
-        def residual(z: np.ndarray, root: float = root, tiny: Any = tiny) -> np.ndarray:
-            missing = forces.at(moved(z[:nv]), z[nv:]) / size
-            return np.concatenate([missing, root * z[:nv], tiny * z[nv:]])
-
-        def jacobian(z: np.ndarray, root: float = root, tiny: Any = tiny) -> np.ndarray:
-            change = [
-                (forces.at(moved(z[:nv] + e), z[nv:]) - forces.at(moved(z[:nv] - e), z[nv:]))
-                / (2 * _STEP)
-                for e in _STEP * np.eye(nv)
-            ]
-            by_drive, _ = forces.affine(moved(z[:nv]))
-            top = np.hstack([np.array(change).T, by_drive]) / size
-            return np.vstack([top, np.diag(np.append(np.full(nv, root), tiny))])
-
         found = least_squares(
-            residual, z, jacobian, bounds=(lower, upper), x_scale=np.append(np.ones(nv), width),
-            xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=50,
+            near.residual, z, near.jacobian, args=(weight,), bounds=(lower, upper),
+            x_scale=np.append(np.ones(len(low)), near.width), xtol=1e-14, ftol=1e-14, gtol=1e-14,
+            max_nfev=50,
         )  # fmt: skip
-        z = inside(found.x)
-    position = moved(z[:nv])
+        z = np.clip(found.x, lower + inset, upper - inset)
+    position = near.position(z)
     J, f = forces.affine(position)
-    drive = np.clip(z[nv:], forces.lower, forces.upper)
+    drive = np.clip(z[len(low) :], forces.lower, forces.upper)
     # The search leaves rounding; what it found is the balance of its neighbourhood.
-    better = np.clip(
-        drive - np.linalg.lstsq(J, J @ drive + f, rcond=None)[0], forces.lower, forces.upper
-    )
-    rests = [forces.rest(position, v, f) for v in (drive, better)]
+    better = drive - np.linalg.lstsq(J, J @ drive + f, rcond=None)[0]
+    drives = (drive, np.clip(better, forces.lower, forces.upper))
+    rests = [forces.rest(position, v, f) for v in drives]
     return min(rests, key=lambda rest: float(np.abs(rest.missing).max()))
 
 
-def _inset(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return how far a start has to be from its bounds."""
-    width = upper - lower
-    return np.where(np.isfinite(width), 1e-10 * np.where(np.isfinite(width), width, 0), 1e-10)
+def _room(model: "mujoco.MjModel", limits: Box, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bounds (nv,) of motions from q that keep position limits; ±inf for rotations."""
+    low, high = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
+    lower, upper = limits.bounds()
+    for kind, at, dof in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True):
+        # Free joints move along the world's axes.
+        count = 3 if kind == FREE else 0 if kind == BALL else 1
+        here, dofs = q[at : at + count], slice(dof, dof + count)
+        low[dofs], high[dofs] = lower[dofs] - here, upper[dofs] - here
+    return low, high
+
+
+def inverse_actuation(
+    model: "mujoco.MjModel", q: np.ndarray, v: np.ndarray, a: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the inputs u (m,) that give the accelerations a (nv,) at q (nq,), v (nv,), the sizes
+    (nv,) of the forces that they lack, and 1 + the largest force that is needed."""
+    data = mujoco.MjData(model)
+    data.qpos, data.qvel, data.qacc = q, v, a
+    mujoco.mj_inverse(model, data)
+    needed, forces = data.qfrc_inverse.copy(), []
+    for i in range(-1, model.nu):  # forces of the actuators are affine in u
+        data.ctrl = np.arange(model.nu) == i
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_fwdActuation(model, data)
+        forces.append(data.qfrc_actuator.copy())
+    J, offset = np.array(forces[1:]).T - forces[0][:, None], forces[0]
+    u = np.linalg.lstsq(J, needed - offset, rcond=None)[0]
+    return u, np.abs(J @ u + offset - needed), 1 + np.abs(needed).max()

@@ -26,6 +26,7 @@ FREE, BALL, SLIDE, HINGE = range(4)
 _COUNTS = {
     "body": "nbody", "joint": "njnt", "actuator": "nu", "site": "nsite", "geom": "ngeom",
     "camera": "ncam", "tendon": "ntendon", "pair": "npair", "equality": "neq", "key": "nkey",
+    "numeric": "nnumeric",
 }  # fmt: skip
 
 
@@ -69,6 +70,12 @@ def flag(kind: str) -> int:
 def acts(model: "mujoco.MjModel", kind: str) -> bool:
     """Return whether constraints of a kind, see `flag`, are switched on."""
     return not model.opt.disableflags & (flag(kind) | flag("constraint"))
+
+
+def equalities(model: "mujoco.MjModel") -> list[str]:
+    """Return the type of each equality that acts: "joint", "weld", ..."""
+    acting = model.eq_type[model.eq_active0.astype(bool)] if acts(model, "equality") else ()
+    return [word(mujoco.mjtEq(int(kind))) for kind in acting]
 
 
 def single_joints(model: "mujoco.MjModel") -> np.ndarray:

@@ -8,21 +8,27 @@ pile up, and forces with a memory (delays, filters) show.
 
 import contextlib
 import copy
-import hashlib
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
 
+from jaxmpc.files import fingerprint
 from jaxmpc.pytrees import record
 from jaxmpc.qp.linalg import JAXLIB
+from jaxmpc.robots.engine import (
+    FREE,
+    SLIDE,
+    flag,
+    model_bytes,
+    mujoco,
+    name_of,
+    single_joints,
+)
 from jaxmpc.robots.physics import Physics
-from jaxmpc.robots.supported import Lack, name_of
+from jaxmpc.robots.supported import Lack
 from jaxmpc.sets.box import Box
-
-if TYPE_CHECKING:
-    import mujoco
 
 # What counts as a difference, relative to the largest acceleration of the same dof: without and
 # with rows of constraints, whose two solvers stop where further steps gain little.
@@ -33,11 +39,11 @@ _STEPS, _STARTS = 10, 4
 # Half a second, but no more steps than this.
 _MOST_STEPS = 250
 
-_known: dict[bytes, tuple[str, ...]] = {}
+_known: dict[str, tuple[str, ...]] = {}
 
 
 @record
-class Motion:
+class EngineSteps:
     """Steps of the C engine: states before and after (K, nq + nv + na), inputs (K, nu), and whether
     rows of constraints acted (K,)."""
 
@@ -75,12 +81,12 @@ def _idle(given: "mujoco.MjModel", found: list[Lack], inputs: Box, home: np.ndar
     trials = [lack for lack in found if not lack.acts]
     if not trials:
         return []
-    whole = motion(given, inputs, home).after
+    whole = engine_steps(given, inputs, home).after
     idle = []
     for lack in trials:
         model = copy.deepcopy(given)
         lack.take_out(model)
-        after = motion(model, inputs, home).after
+        after = engine_steps(model, inputs, home).after
         if after.shape == whole.shape and np.allclose(after, whole, rtol=0, atol=1e-12):
             idle.append(lack.text)
     return idle
@@ -91,20 +97,19 @@ def _differences(
 ) -> tuple[str, ...]:
     """Return in words where steps of the plant are not those of `reference`. Computed once a
     process for equal models."""
-    key = hashlib.sha256()
-    for part in (_bytes(reference), _bytes(plant.model), home, *map(np.asarray, _box(inputs))):
-        key.update(np.ascontiguousarray(part).tobytes())
-    if key.digest() not in _known:
+    models = (model_bytes(reference), model_bytes(plant.model))
+    key = fingerprint([], *models, home, inputs.bounds())
+    if key not in _known:
         exact = copy.deepcopy(reference)
         exact.opt.solver = plant.model.opt.solver
         exact.opt.iterations = max(exact.opt.iterations, 100)
         exact.opt.tolerance = min(exact.opt.tolerance, 1e-10)
-        seen = motion(exact, inputs, home)
-        _known[key.digest()] = _unlike(exact, plant, seen) if len(seen.before) else ()
-    return _known[key.digest()]
+        seen = engine_steps(exact, inputs, home)
+        _known[key] = _unlike(exact, plant, seen) if len(seen.before) else ()
+    return _known[key]
 
 
-def _unlike(model: "mujoco.MjModel", plant: Physics, seen: Motion) -> tuple[str, ...]:
+def _unlike(model: "mujoco.MjModel", plant: Physics, seen: EngineSteps) -> tuple[str, ...]:
     nq, h = model.nq, model.opt.timestep
     a, wanted = ((after - seen.before)[:, nq:] / h for after in (_steps(plant, seen), seen.after))
     off = np.abs(np.where(np.isfinite(a), a, np.inf) - wanted)
@@ -139,14 +144,12 @@ def _unit(model: "mujoco.MjModel", i: Any) -> str:
     if i >= model.nv:
         return "a second"
     j = model.dof_jntid[i]
-    straight = model.jnt_type[j] == 2 or (model.jnt_type[j] == 0 and i - model.jnt_dofadr[j] < 3)
-    return "m/s²" if straight else "rad/s²"
+    shift = model.jnt_type[j] == FREE and i - model.jnt_dofadr[j] < 3
+    return "m/s²" if shift or model.jnt_type[j] == SLIDE else "rad/s²"
 
 
-def _sources(model: "mujoco.MjModel", plant: Physics, seen: Motion, k: int) -> list[str]:
+def _sources(model: "mujoco.MjModel", plant: Physics, seen: EngineSteps, k: int) -> list[str]:
     """Return the actuators, tendons and contacts that differ before step k."""
-    import mujoco
-
     data = mujoco.MjData(model)
     _set(model, data, seen.before[k], seen.inputs[k])
     mujoco.mj_forward(model, data)
@@ -165,16 +168,13 @@ def _sources(model: "mujoco.MjModel", plant: Physics, seen: Motion, k: int) -> l
     if plant.rows and not texts:
         mine, theirs = _contacts(ours._impl.contact), _contacts(data.contact)
         unlike = [pair for pair in mine | theirs if not _alike(mine.get(pair), theirs.get(pair))]
-        texts += [
-            f"contacts of {name_of(model, 'geom', a)} with {name_of(model, 'geom', b)}, of which "
-            "MJX finds other points or directions" for a, b in unlike[:3]
-        ]  # fmt: skip
-    if not texts and not model.opt.disableflags & 2:  # mjDSBL_EQUALITY
-        placed = np.flatnonzero(model.eq_active0 & (model.eq_type < 2))  # connect, weld
-        texts += [
-            f"{name_of(model, 'equality', i)} pushes otherwise (MJX has no force for the turning "
-            "of connect and weld)" for i in placed[:3]
-        ]  # fmt: skip
+        for pair in unlike[:3]:
+            a, b = (name_of(model, "geom", geom) for geom in pair)
+            texts.append(f"contacts of {a} with {b}, of which MJX finds other points or directions")
+    if not texts and not model.opt.disableflags & flag("equality"):
+        for i in np.flatnonzero(model.eq_active0 & (model.eq_type < 2))[:3]:  # connect, weld
+            what = "pushes otherwise (MJX has no force for the turning of connect and weld)"
+            texts.append(f"{name_of(model, 'equality', i)} {what}")
     return texts
 
 
@@ -182,27 +182,25 @@ def _contacts(found: Any) -> dict[tuple[int, int], np.ndarray]:
     """Return distances and frames of the contacts (count, 10) that exert forces, by geoms."""
     distance, geoms = np.asarray(found.dist), np.asarray(found.geom).reshape(-1, 2)
     near = distance < np.asarray(found.includemargin)
-    rows = np.hstack([distance[:, None], np.asarray(found.frame).reshape(-1, 9)])
-    pairs = [tuple(sorted(pair)) for pair in geoms.tolist()]
-    return {
-        pair: np.array(sorted(r.tolist() for r, p, n in zip(rows, pairs, near, strict=True)
-                              if p == pair and n))
-        for pair, n in zip(pairs, near, strict=True) if n
-    }  # fmt: skip
+    rows = np.hstack([distance[:, None], np.asarray(found.frame).reshape(-1, 9)])[near]
+    pairs = [(min(pair), max(pair)) for pair in geoms[near].tolist()]
+    of_pair: dict[tuple[int, int], list] = {pair: [] for pair in pairs}
+    for pair, row in zip(pairs, rows.tolist(), strict=True):
+        of_pair[pair].append(row)
+    return {pair: np.array(sorted(rows)) for pair, rows in of_pair.items()}
 
 
 def _alike(a: np.ndarray | None, b: np.ndarray | None) -> bool:
     return a is not None and b is not None and a.shape == b.shape and np.allclose(a, b, atol=1e-6)
 
 
-def _steps(plant: Physics, seen: Motion) -> np.ndarray:
+def _steps(plant: Physics, seen: EngineSteps) -> np.ndarray:
     """Return the states after the steps of the plant.
 
     Computed on a CPU where JAX has one, compiled in haste: it runs once.
     """
-    options: dict[str, Any] = {
-        "xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True,
-    }  # fmt: skip
+    options: dict[str, Any] = {"xla_backend_optimization_level": 0}
+    options["xla_llvm_disable_expensive_passes"] = True
     if (0, 7, 0) <= JAXLIB < (0, 11, 1):
         options["xla_cpu_use_fusion_emitters"] = False
     device = None
@@ -220,8 +218,6 @@ def _steps(plant: Physics, seen: Motion) -> np.ndarray:
 @contextlib.contextmanager
 def _unlogged() -> Iterator[None]:
     """Let MuJoCo write no file and no line where a motion blows up, which ends it here."""
-    import mujoco
-
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda text: None)
     try:
@@ -231,17 +227,14 @@ def _unlogged() -> Iterator[None]:
 
 
 @_unlogged()
-def motion(model: "mujoco.MjModel", inputs: Box, home: np.ndarray) -> Motion:
+def engine_steps(model: "mujoco.MjModel", inputs: Box, home: np.ndarray) -> EngineSteps:
     """Return steps of the C engine: the same states and inputs for models of the same sizes."""
-    import mujoco
-
     rng, data = np.random.default_rng(0), mujoco.MjData(model)
-    lower, upper = _box(inputs)
-    low, high = (
-        np.maximum(lower, np.minimum(-1, upper - 2)),
-        np.minimum(upper, np.maximum(1, lower + 2)),
-    )
-    rows = []
+    lower, upper = inputs.bounds()
+    low = np.maximum(lower, np.minimum(-1, upper - 2))
+    high = np.minimum(upper, np.maximum(1, lower + 2))
+    warning, steps = mujoco.mjtWarning, []
+    blown = (warning.mjWARN_BADQPOS, warning.mjWARN_BADQVEL, warning.mjWARN_BADQACC)
     for start in range(_STARTS + 1):
         mujoco.mj_resetData(model, data)
         x = home if start in (0, _STARTS) else _moved(model, home, rng)
@@ -254,28 +247,20 @@ def motion(model: "mujoco.MjModel", inputs: Box, home: np.ndarray) -> Motion:
             data.ctrl[:] = u = rng.uniform(low, high)
             x = _state(data)
             mujoco.mj_step(model, data)
-            rows.append((x, u, _state(data), data.nefc > 0))
-            bad = any(data.warning[int(w)].number for w in _blown())
-            if bad or not np.all(np.isfinite(rows[-1][2])):
-                rows.pop()
+            after = _state(data)
+            bad = any(data.warning[int(kind)].number for kind in blown)
+            if bad or not np.all(np.isfinite(after)):
                 break
-    return Motion(*(np.array([row[part] for row in rows]) for part in range(4)))
-
-
-def _blown() -> tuple:
-    import mujoco
-
-    kind = mujoco.mjtWarning
-    return kind.mjWARN_BADQPOS, kind.mjWARN_BADQVEL, kind.mjWARN_BADQACC
+            steps.append((x, u, after, data.nefc > 0))
+    columns = zip(*steps, strict=True) if steps else [()] * 4
+    return EngineSteps(*(np.array(column) for column in columns))
 
 
 def _moved(model: "mujoco.MjModel", home: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return a random state near home, inside the ranges of joints and activations."""
-    import mujoco
-
     q = home[: model.nq].copy()
     mujoco.mj_integratePos(model, q, rng.normal(scale=0.3, size=model.nv), 1.0)
-    for j in np.flatnonzero(model.jnt_limited & np.isin(model.jnt_type, (2, 3))):
+    for j in np.flatnonzero(model.jnt_limited & single_joints(model)):
         low, high = model.jnt_range[j]
         q[model.jnt_qposadr[j]] = rng.uniform(0.95 * low + 0.05 * high, 0.05 * low + 0.95 * high)
     act = rng.uniform(0.1, 0.9, size=model.na)
@@ -291,16 +276,3 @@ def _set(model: "mujoco.MjModel", data: "mujoco.MjData", x: np.ndarray, u: np.nd
 
 def _state(data: "mujoco.MjData") -> np.ndarray:
     return np.concatenate([data.qpos, data.qvel, data.act])
-
-
-def _box(inputs: Box) -> tuple[np.ndarray, np.ndarray]:
-    return np.asarray(inputs.lower, float), np.asarray(inputs.upper, float)
-
-
-def _bytes(model: "mujoco.MjModel") -> np.ndarray:
-    """Return the model as MuJoCo stores it."""
-    import mujoco
-
-    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer

@@ -1,12 +1,10 @@
 """One physics step of a MuJoCo model in MJX, and how it is differentiated."""
 
-import contextlib
 import copy
-import io
 import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,13 +17,10 @@ from jax.extend.core.primitives import acos_p, sqrt_p
 from jaxmpc.checks import fail
 from jaxmpc.qp.linalg import JAXLIB, solve, stand_ins
 from jaxmpc.qp.precision import matmul
+from jaxmpc.robots.engine import BALL, mjx_module, mujoco
 from jaxmpc.robots.rewrite import moving, rewritten
 from jaxmpc.robots.rigid import FIELDS, Tree, dynamics, inverse_dynamics, side_by_side, slopes
-from jaxmpc.robots.tangent import BALL, normalised, rates, retract
-
-if TYPE_CHECKING:
-    import mujoco
-
+from jaxmpc.robots.tangent import normalised, rates, retract
 
 # mjtIntegrator.
 EULER, RK4 = 0, 1
@@ -350,13 +345,6 @@ TAMED = {
     sqrt_p: _tamed(jax.lax.sqrt, lambda x: 0.5 / jax.lax.sqrt(x), lambda x: x > 0),
     acos_p: _tamed(jax.lax.acos, lambda x: -jax.lax.rsqrt(1 - x * x), lambda x: jnp.abs(x) < 1),
 }
-
-
-def mjx_module() -> Any:
-    """Import mujoco.mjx without its message on stdout that Warp is not installed, and return it."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        from mujoco import mjx
-    return mjx
 
 
 def in_pieces(function: Callable, size: int = PIECE) -> Callable:

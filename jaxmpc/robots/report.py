@@ -1,18 +1,15 @@
 """What was read from a robot's file, where its limits come from, and what is ignored."""
 
 from collections import Counter
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxmpc.robots.physics import mjx_module
+from jaxmpc.pytrees import record
+from jaxmpc.robots.description import RobotDescription
+from jaxmpc.robots.engine import acts, equalities, mjx_module, mujoco, single_joints, word
 
-if TYPE_CHECKING:
-    from jaxmpc.robots.robot import Robot
 
-
-@dataclass(frozen=True)
+@record
 class RobotReport:
     """An account of a loaded robot; `print(robot.report())` shows it as a table.
 
@@ -33,11 +30,14 @@ class RobotReport:
 
     def __str__(self) -> str:
         lines = [f"robot {self.name}"]
-        for title, items in (
-            ("read", self.read), ("the predictor ignores", self.predictor_ignores),
-            ("left out of the plant", self.left_out), ("cleared", self.cleared),
-            ("mended", self.mended),
-        ):  # fmt: skip
+        accounts = {
+            "read": self.read,
+            "the predictor ignores": self.predictor_ignores,
+            "left out of the plant": self.left_out,
+            "cleared": self.cleared,
+            "mended": self.mended,
+        }
+        for title, items in accounts.items():
             lines += [f"{title}:", *(f"  {item}" for item in items or ("nothing",))]
         width = max(len(name) for name, *_ in self.limits)
         lines.append(f"{'limits':{width + 2}}{'unit':>8}{'lower':>11}{'upper':>11}  source")
@@ -48,39 +48,39 @@ class RobotReport:
         return "\n".join(lines)
 
 
-def report_of(robot: "Robot") -> RobotReport:
+def report_of(robot: RobotDescription) -> RobotReport:
     """Return the account of a robot."""
     notes = lambda key: tuple(text for name, text in robot.notes if name == key)
-    states, inputs = robot.state_limits, robot.input_limits
-    lower, upper = (
-        np.append(np.asarray(a), np.asarray(b)).tolist()
-        for a, b in ((states.lower, inputs.lower), (states.upper, inputs.upper))
-    )
+    ends = (robot.state_limits.bounds(), robot.input_limits.bounds())
+    lower, upper = (np.concatenate(end).tolist() for end in zip(*ends, strict=True))
     names = (*robot.state_names, *robot.input_names)
     units = (*robot.state_units, *robot.input_units)
     sources = notes("limit") or ("",) * len(names)
+    home = tuple(f"home: {text}" for text in notes("home"))
     return RobotReport(
-        robot.name, _read(robot, tuple(f"home: {v}" for v in notes("home")) + notes("welded")),
-        tuple(zip(names, units, lower, upper, sources, strict=True)), _ignored(robot),
-        notes("left out"), notes("cleared"), notes("mended"),
-    )  # fmt: skip
+        name=robot.name,
+        read=_read(robot, (*home, *notes("welded"))),
+        limits=tuple(zip(names, units, lower, upper, sources, strict=True)),
+        predictor_ignores=_ignored(robot.mujoco),
+        left_out=notes("left out"),
+        cleared=notes("cleared"),
+        mended=notes("mended"),
+    )
 
 
-def _read(robot: "Robot", more: tuple[str, ...]) -> tuple[str, ...]:
+def _read(robot: RobotDescription, more: tuple[str, ...]) -> tuple[str, ...]:
     """Return what the file gave, and `more`."""
-    import mujoco
-
-    model = robot.mujoco
-    kinds = Counter(mujoco.mjtJoint(int(j)).name[6:].lower() for j in model.jnt_type)
+    model, options = robot.mujoco, robot.mujoco.opt
+    kinds = Counter(word(mujoco.mjtJoint(int(j))) for j in model.jnt_type)
     joints = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+    integrator, solver = mujoco.mjtIntegrator(options.integrator), mujoco.mjtSolver(options.solver)
     lines = [
         f"{model.nbody - 1} bodies of {model.body_mass.sum():.4g} kg; joints: {joints}; "
         f"{model.nv} degrees of freedom",
         f"{model.nu} actuators; {model.ngeom} shapes, {model.ntendon} tendons",
-        f"integrator {mujoco.mjtIntegrator(model.opt.integrator).name[6:].lower()}, step "
-        f"{model.opt.timestep:g} s, {robot.substeps} in a control period of {robot.dt:g} s",
-        f"solver {mujoco.mjtSolver(model.opt.solver).name[6:].lower()}, "
-        f"{model.opt.iterations} iterations",
+        f"integrator {word(integrator)}, step {options.timestep:g} s, {robot.substeps} in a "
+        f"control period of {robot.dt:g} s",
+        f"solver {word(solver)}, {options.iterations} iterations",
         *more,
     ]
     if model.na:
@@ -90,34 +90,23 @@ def _read(robot: "Robot", more: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def _ignored(robot: "Robot") -> tuple[str, ...]:
+def _ignored(model: "mujoco.MjModel") -> tuple[str, ...]:
     """Return what acts in the plant and not in the predictor."""
-    import mujoco
-
     mjx_module()
     from mujoco.mjx._src import collision_driver
 
-    model, bit = robot.mujoco, mujoco.mjtDisableBit
-    counts: dict[str, int] = {}
-
-    def acts(flag: "mujoco.mjtDisableBit") -> bool:
-        return not model.opt.disableflags & (int(flag) | int(bit.mjDSBL_CONSTRAINT))
-
-    if acts(bit.mjDSBL_CONTACT):
+    counts: Counter[str] = Counter()
+    if acts(model, "contact"):
         counts["pairs of shapes in contact"] = sum(1 for _ in collision_driver.geom_pairs(model))
-    if acts(bit.mjDSBL_EQUALITY):
-        for kind in model.eq_type[model.eq_active0.astype(bool)]:
-            name = f"equalities of type {mujoco.mjtEq(int(kind)).name[5:].lower()}"
-            counts[name] = counts.get(name, 0) + 1
-    if acts(bit.mjDSBL_FRICTIONLOSS):
+    for kind in equalities(model):
+        counts[f"equalities of type {kind}"] += 1
+    if acts(model, "frictionloss"):
         counts["joints with dry friction"] = np.sum(model.dof_frictionloss > 0)
         counts["tendons with dry friction"] = np.sum(model.tendon_frictionloss > 0)
-    if acts(bit.mjDSBL_LIMIT):
-        single = np.isin(model.jnt_type, (2, 3))
-        counts["stops of joints, whose ranges are limits of the MPC"] = np.sum(
-            model.jnt_limited[single]
-        )
-        counts["stops of ball joints, no limits of the MPC"] = np.sum(model.jnt_limited[~single])
+    if acts(model, "limit"):
+        single, limited = single_joints(model), model.jnt_limited
+        counts["stops of joints, whose ranges are limits of the MPC"] = np.sum(limited[single])
+        counts["stops of ball joints, no limits of the MPC"] = np.sum(limited[~single])
         counts["stops of tendons, no limits of the MPC"] = np.sum(model.tendon_limited)
     limited = (model.actuator_forcelimited, model.jnt_actfrclimited, model.tendon_actfrclimited)
     counts["limits of forces that are no limits of inputs"] = sum(map(np.sum, limited))

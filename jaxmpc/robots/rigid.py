@@ -35,9 +35,7 @@ from jax import Array
 from jax.custom_batching import custom_vmap
 
 from jaxmpc.pytrees import record
-from jaxmpc.robots.tangent import BALL, FREE
-
-SLIDE = 2
+from jaxmpc.robots.engine import BALL, FREE, SLIDE
 
 # What is read of mjx.Model.
 FIELDS = (

@@ -9,8 +9,8 @@ derivative is wrong at the bound, where MPC often operates: the controller has t
 """
 
 import warnings
-from dataclasses import field, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,23 +19,27 @@ from jax import Array
 
 from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.pytrees import pytree, static
-from jaxmpc.qp.linalg import eigh
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.modes import own_modes, varying
-from jaxmpc.qp.precision import floating_dtype, matmul
-from jaxmpc.robots.balance import lacking, nearest_rest, require_rest, rest_at, settled
-from jaxmpc.robots.physics import Physics
+from jaxmpc.qp.precision import matmul
+from jaxmpc.robots.balance import (
+    inverse_actuation,
+    lacking,
+    nearest_rest,
+    require_rest,
+    rest_at,
+    settled,
+)
+from jaxmpc.robots.description import RobotDescription
+from jaxmpc.robots.engine import number_of
+from jaxmpc.robots.payload import with_payload
 from jaxmpc.robots.report import RobotReport, report_of
-from jaxmpc.robots.tangent import difference, quaternions, retract, unit_orientations
-from jaxmpc.sets.box import Box
+from jaxmpc.robots.tangent import difference, quaternions, retract
 from jaxmpc.systems.system import LinearSystem
-
-if TYPE_CHECKING:
-    import mujoco
 
 
 @pytree
-class Robot:
+class Robot(RobotDescription):
     """A MuJoCo model as a plant with sampled inputs; made by `load_robot`.
 
     State of the plant: x = (qpos, qvel), size nq + nv. State of models and controllers: coordinates
@@ -52,52 +56,6 @@ class Robot:
     `load_robot` found, see `report`. file: the mujoco.MjModel as it was given.
     """
 
-    state_limits: Box
-    input_limits: Box
-    home: Any
-    plant: Physics = static()
-    predictor: Physics = static()
-    anchor: tuple[float, ...] = static()
-    substeps: int = static()
-    dt: float = static()
-    name: str = static(default="")
-    state_names: tuple[str, ...] = static(default=())
-    state_units: tuple[str, ...] = static(default=())
-    input_names: tuple[str, ...] = static(default=())
-    input_units: tuple[str, ...] = static(default=())
-    numbers: dict[str, Any] = field(default_factory=dict)
-    notes: tuple[tuple[str, str], ...] = static(default=())
-    file: Any = static(default=None)
-
-    @property
-    def mujoco(self) -> "mujoco.MjModel":
-        """Return the plant as MuJoCo's own model, for rendering and the C engine."""
-        return self.plant.model
-
-    def __repr__(self) -> str:
-        """Return the name and the sizes, in one line; `report` has the rest."""
-        return f"Robot({self.name!r}, n={self.n}, m={self.m}, dt={self.dt:g} s)"
-
-    @property
-    def n(self) -> int:
-        """Return the number of coordinates ξ, 2 nv + na."""
-        return 2 * self.mujoco.nv + self.mujoco.na
-
-    @property
-    def m(self) -> int:
-        """Return the number of inputs."""
-        return self.mujoco.nu
-
-    @property
-    def joints(self) -> tuple[int, ...]:
-        """Return the mjtJoint of each joint."""
-        return tuple(int(joint) for joint in self.mujoco.jnt_type)
-
-    @property
-    def state_size(self) -> int:
-        """Return the length of the state x, nq + nv + na."""
-        return self.mujoco.nq + self.mujoco.nv + self.mujoco.na
-
     def step(self, x: Any, u: Any) -> Array:
         """Return the state x one control period later, with the input u (m,) held.
 
@@ -105,15 +63,15 @@ class Robot:
         step computes its Jacobian by forward mode, that of constraint forces by the implicit
         function theorem instead of through MJX's solver. Second derivatives: forward over either.
         """
-        return _stepped(self, *self._checked_arrays(x, u))
+        return _stepped(self, *self.checked_arrays(x, u))
 
     def _step(self, x: Array, u: Array) -> Array:
         body = lambda x, _: (self.plant.step(x, u, self.numbers), None)
         return jax.lax.scan(body, x, length=self.substeps)[0]
 
     def linearize(
-        self, x: Any, u: Any, *, exact: bool = False, numbers: Any = None
-    ) -> LinearSystem:  # fmt: skip
+        self, x: Any, u: Any, *, exact: bool = False, numbers: dict[str, Any] | None = None
+    ) -> LinearSystem:
         """Return the affine model ξ⁺ = A ξ + B u + c of a whole control period about x (nq + nv,),
         u (m,).
 
@@ -123,45 +81,40 @@ class Robot:
         that the model passes through the predictor's own next state. numbers: fields of mjx.Model
         in place of the predictor's own, see `vary`.
         """
-        return _linearized(self, *self._checked_arrays(x, u), numbers or {}, exact=exact)
+        return _linearized(self, *self.checked_arrays(x, u), numbers or {}, exact=exact)
 
-    def _linearize(
-        self, x: Array, u: Array, numbers: dict[str, Any], exact: bool
-    ) -> LinearSystem:  # fmt: skip
-        advance = lambda s, u: self.coordinates(self.predictor.step(self.state(s), u, numbers))
+    def _linearize(self, x: Array, u: Array, numbers: dict[str, Any], exact: bool) -> LinearSystem:
+        def step(xi: Array, u: Array) -> tuple[Array, Array]:
+            after = self.coordinates(self.predictor.step(self.state(xi), u, numbers))
+            return after, after
 
-        def affine(s: Array) -> tuple[Array, Array, Array]:
-            moved = lambda s, u: (advance(s, u),) * 2
-            (A, B), after = jax.jacfwd(moved, argnums=(0, 1), has_aux=True)(s, u)
-            return A, B, after
-
+        one = jax.jacfwd(step, argnums=(0, 1), has_aux=True)
         start = self.coordinates(x)
-        zero = jnp.zeros((self.n, self.m), x.dtype)
         if exact:
 
-            def chain(carry: tuple, _: None) -> tuple[tuple, None]:
-                s, A, B = carry
-                A_1, B_1, after = affine(s)
+            def chain(carry: tuple[Array, ...], _: None) -> tuple[tuple[Array, ...], None]:
+                xi, A, B = carry
+                (A_1, B_1), after = one(xi, u)
                 return (after, matmul(A_1, A), matmul(A_1, B) + B_1), None
 
+            zero = jnp.zeros((self.n, self.m), x.dtype)
             first = (start, jnp.eye(self.n, dtype=x.dtype), zero)
             (after, A, B), _ = jax.lax.scan(chain, varying(first, first), length=self.substeps)
             c = after - matmul(A, start) - matmul(B, u)
         else:
-            A_1, B_1, after = affine(start)
-            c_1 = after - matmul(A_1, start) - matmul(B_1, u)
-            A, B, c = A_1, B_1, c_1
+            (A_1, B_1), after = one(start, u)
+            A, B, c = A_1, B_1, after - matmul(A_1, start) - matmul(B_1, u)
+            c_1 = c
             for _ in range(self.substeps - 1):
                 A, B, c = matmul(A_1, A), matmul(A_1, B) + B_1, matmul(A_1, c) + c_1
-        return LinearSystem(
-            A, B, c, self.dt, state_names=self.state_names, state_units=self.state_units,
-            input_names=self.input_names, input_units=self.input_units,
-        )  # fmt: skip
+        states = {"state_names": self.state_names, "state_units": self.state_units}
+        inputs = {"input_names": self.input_names, "input_units": self.input_units}
+        return LinearSystem(A, B, c, self.dt, **states, **inputs)
 
     def transition(self, x: Any, u: Any) -> tuple[Array, Array]:
         """Return A (n, n), B (n, m) of one physics step of the plant about x, u, in tangent
         coordinates: those of mujoco.mjd_transitionFD, by automatic differentiation."""
-        return _differentiated(self, *self._checked_arrays(x, u))
+        return _differentiated(self, *self.checked_arrays(x, u))
 
     def _transition(self, x: Array, u: Array) -> tuple[Array, Array]:
         nq, nv = self.mujoco.nq, self.mujoco.nv
@@ -174,26 +127,6 @@ class Robot:
 
         A, B = jax.jacfwd(motion, argnums=(0, 1))(jnp.zeros(self.n, x.dtype), u)
         return A, B
-
-    def coordinates(self, x: Any) -> Array:
-        """Return ξ (n,) of a state x (nq + nv + na,)."""
-        x = jnp.asarray(x)
-        require_shape("x", x, (self.state_size,), "Give (qpos, qvel, act) of one robot")
-        if not quaternions(self.joints):
-            return x
-        nq = self.mujoco.nq
-        anchor = jnp.asarray(self.anchor, x.dtype)
-        return jnp.concatenate([difference(self.joints, anchor, x[:nq]), x[nq:]])
-
-    def state(self, coordinates: Any) -> Array:
-        """Return x (nq + nv + na,) with the coordinates ξ (n,)."""
-        xi = jnp.asarray(coordinates)
-        require_shape("coordinates", xi, (self.n,), "Two numbers a dof; use jax.vmap for many")
-        if not quaternions(self.joints):
-            return xi
-        nv = self.mujoco.nv
-        anchor = jnp.asarray(self.anchor, xi.dtype)
-        return jnp.concatenate([retract(self.joints, anchor, xi[:nv]), xi[nv:]])
 
     def equilibrium(self, q: Any = None, *, near: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Return (x, u): the robot at rest in the configuration q (nq,), and the input that holds
@@ -215,35 +148,29 @@ class Robot:
             if q is not None:
                 fail("near", "is given beside q", "Give one of them")
             require_shape("near", near, (self.mujoco.nq,), "One configuration, as in qpos")
-            rest = nearest_rest(self, self._configurations("near", near))
+            rest = nearest_rest(self, self.configurations("near", near))
             if not rest.held:
-                fail(
-                    "near", f"no configuration that can be held was found from there: "
-                    f"{lacking(self, rest)}", "Start elsewhere, or give the robot what holds it",
-                )  # fmt: skip
+                missing = "no configuration that can be held was found from there: "
+                cure = "Start elsewhere, or give the robot what holds it"
+                fail("near", missing + lacking(self, rest), cure)
             require_rest("near", self, [rest])
             return rest.x, rest.u
-        q = self._configurations("q", self.home[: self.mujoco.nq] if q is None else q)
+        q = self.configurations("q", self.home[: self.mujoco.nq] if q is None else q)
         rests = [rest_at(self, row) for row in q.reshape(-1, q.shape[-1])]
+        cure = "Choose a configuration that the actuators hold, or search with near="
         for rest in rests:
             if not rest.balanced:
-                fail(
-                    "q", f"{rest.q}: no input balances the forces; {lacking(self, rest)}",
-                    "Choose a configuration that the actuators hold, or search with near=",
-                )  # fmt: skip
+                missing = f"no input balances the forces; {lacking(self, rest)}"
+                fail("q", f"{rest.q}: {missing}", cure)
         over = np.array([rest.over for rest in rests])
         if np.any(over > 1e-9):
             i = int(np.argmax(over.max(axis=0)))
             needed = np.array([rest.drive[i] for rest in rests])
-            fail(
-                "q", f"needs {self.input_names[i]} = {needed}, "
-                f"the limits are [{rests[0].lower[i]:g}, {rests[0].upper[i]:g}]",
-                "Choose a configuration that the actuators hold, or search with near=",
-            )  # fmt: skip
+            limits = f"the limits are [{rests[0].lower[i]:g}, {rests[0].upper[i]:g}]"
+            fail("q", f"needs {self.input_names[i]} = {needed}, {limits}", cure)
         require_rest("q", self, rests)
-        join = lambda rows, size: np.array(rows).reshape(*q.shape[:-1], size)
-        x = join([rest.x for rest in rests], self.state_size)
-        return x, join([rest.u for rest in rests], self.m)
+        x, u = (np.array([getattr(rest, name) for rest in rests]) for name in ("x", "u"))
+        return x.reshape(*q.shape[:-1], self.state_size), u.reshape(*q.shape[:-1], self.m)
 
     def set_point(self, target: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Return (x, u), the state and the input about which `robot_mpc` takes its model.
@@ -274,41 +201,23 @@ class Robot:
         engine (mj_inverse). Raises ValueError where no input does, as for a model whose actuators
         have activation states.
         """
-        import mujoco
-
         nv = self.mujoco.nv
         if self.mujoco.na:
-            fail("robot", "has activation states between inputs and forces",
-                 "Inverse dynamics need actuators with dyntype none")  # fmt: skip
-        q = self._configurations("q", q)
-        rates = []
+            cure = "Inverse dynamics need actuators with dyntype none"
+            fail("robot", "has activation states between inputs and forces", cure)
+        q = self.configurations("q", q)
+        motions = [q.reshape(-1, q.shape[-1])]
         for argument, value in (("velocity", velocity), ("acceleration", acceleration)):
             require_shape(argument, value, (*q.shape[:-1], nv), "One number for each dof")
             require_finite(argument, value)
-            rates.append(host_array(argument, value).reshape(-1, nv))
-        smooth = self.predictor.model
-        data, found = mujoco.MjData(smooth), []
-        for position, speed, change in zip(q.reshape(-1, q.shape[-1]), *rates, strict=True):
-            data.qpos, data.qvel, data.qacc = position, speed, change
-            data.ctrl = 0
-            mujoco.mj_inverse(smooth, data)
-            needed = data.qfrc_inverse.copy()
-            forces = []
-            for i in range(-1, self.m):  # forces of the actuators are affine in u
-                data.ctrl = np.arange(self.m) == i
-                mujoco.mj_fwdPosition(smooth, data)
-                mujoco.mj_fwdVelocity(smooth, data)
-                mujoco.mj_fwdActuation(smooth, data)
-                forces.append(data.qfrc_actuator.copy())
-            J, offset = np.array(forces[1:]).T - forces[0][:, None], forces[0]
-            u = np.linalg.lstsq(J, needed - offset, rcond=None)[0]
-            missing = np.abs(J @ u + offset - needed)
-            if np.any(missing > 1e-6 * (1 + np.abs(needed).max())):
-                dof = self.state_names[int(np.argmax(missing))]
-                fail(
-                    "q", f"{position}: no input balances the forces; {missing.max():.3g} are "
-                    f"missing at {dof}", "Choose a motion that the actuators can make",
-                )  # fmt: skip
+            motions.append(host_array(argument, value).reshape(-1, nv))
+        found = []
+        for row in zip(*motions, strict=True):
+            u, missing, size = inverse_actuation(self.predictor.model, *row)
+            if np.any(missing > 1e-6 * size):
+                place = f"at {self.state_names[int(np.argmax(missing))]}"
+                problem = f"no input balances the forces; {missing.max():.3g} are missing {place}"
+                fail("q", f"{row[0]}: {problem}", "Choose a motion that the actuators can make")
             found.append(u)
         return np.array(found).reshape(*q.shape[:-1], self.m)
 
@@ -355,72 +264,15 @@ class Robot:
                 fail(key, "is zero for some joints of the file, which then have no such row", cure)
         varied = {**self.numbers, **numbers}
         if payload is not None:
-            varied |= self._loaded(payload, varied)
+            site = number_of(self.mujoco, "site", "tool")
+            if site < 0:
+                fail("payload", "the model has no site named tool", "Add one where loads are held")
+            require_shape("payload", payload, (), "Mass in kg")
+            varied |= with_payload(self.plant.mjx, varied, site, payload)
         return replace(self, numbers=varied)
-
-    def _loaded(self, payload: Any, varied: dict[str, Any]) -> dict[str, Array]:
-        """Return the mass, centre and inertia of the body that carries the site "tool", with a
-        point mass there: parallel axes about the new centre (Steiner), then principal axes."""
-        import mujoco
-
-        site = mujoco.mj_name2id(self.mujoco, mujoco.mjtObj.mjOBJ_SITE, "tool")
-        if site < 0:
-            fail("payload", "the model has no site named tool", "Add one where loads are held")
-        require_shape("payload", payload, (), "Mass in kg")
-        i, at = int(self.mujoco.site_bodyid[site]), jnp.asarray(self.mujoco.site_pos[site])
-        of = lambda key: jnp.asarray(varied.get(key, getattr(self.plant.mjx, key)))
-        mass, centre = of("body_mass")[i], of("body_ipos")[i]
-        total = mass + payload
-        middle = (mass * centre + payload * at) / total
-        w, v = of("body_iquat")[i, 0], of("body_iquat")[i, 1:]
-        cross = lambda a: jnp.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
-        turn = jnp.eye(3) + 2 * w * cross(v) + 2 * matmul(cross(v), cross(v))
-        inertia = matmul(turn * of("body_inertia")[i], turn.T)
-        for m, p in ((mass, centre), (payload, at)):
-            inertia = inertia + m * matmul(cross(p - middle).T, cross(p - middle))
-        principal, axes = eigh(inertia)
-        axes = axes * jnp.sign(jnp.linalg.det(axes))
-        put = lambda key, value: of(key).at[i].set(value)
-        return {
-            "body_mass": put("body_mass", total), "body_ipos": put("body_ipos", middle),
-            "body_inertia": put("body_inertia", principal),
-            "body_iquat": put("body_iquat", _quaternion(axes)),
-        }  # fmt: skip
-
-    def _checked_arrays(self, x: Any, u: Any) -> tuple[Array, Array]:
-        """Return a state and an input as arrays of one dtype; raise ValueError for wrong shapes."""
-        size = self.state_size
-        problem = "Give (qpos, qvel, act) of one robot; use jax.vmap for many"
-        if np.shape(x) == (self.n,) != (size,):
-            problem = "That is the size of the coordinates: robot.state(ξ) makes a state of them"
-        require_shape("x", x, (size,), problem)
-        require_shape("u", u, (self.m,), "One number for each actuator")
-        dtype = floating_dtype((x, u))
-        return jnp.asarray(x, dtype), jnp.asarray(u, dtype)
-
-    def _configurations(self, argument: str, q: Any) -> np.ndarray:
-        q = host_array(argument, q)
-        if q.shape[-1:] != (self.mujoco.nq,):
-            fail(argument, f"shape {q.shape}", f"Give (..., {self.mujoco.nq}), as in qpos")
-        require_finite(argument, q)
-        return unit_orientations(argument, self.joints, q)
 
 
 # Compiled once a robot, also where the user calls them outside `jit`.
 _stepped = jax.jit(own_modes(Robot._step))
 _linearized = jax.jit(own_modes(Robot._linearize), static_argnames="exact")
 _differentiated = jax.jit(own_modes(Robot._transition))
-
-
-def _quaternion(R: Array) -> Array:
-    """Return the unit quaternion (w first) of a rotation matrix: the eigenvector of Bar-Itzhack's K
-    (2000, J. Guidance 23, eq. 6) with the largest eigenvalue, right for every rotation."""
-    x, y, z = R[:, 0], R[:, 1], R[:, 2]
-    K = jnp.array([
-        [x[0] - y[1] - z[2], y[0] + x[1], z[0] + x[2], y[2] - z[1]],
-        [y[0] + x[1], y[1] - x[0] - z[2], z[1] + y[2], z[0] - x[2]],
-        [z[0] + x[2], z[1] + y[2], z[2] - x[0] - y[1], x[1] - y[0]],
-        [y[2] - z[1], z[0] - x[2], x[1] - y[0], x[0] + y[1] + z[2]],
-    ])  # fmt: skip
-    q = eigh(K / 3)[1][:, -1]
-    return jnp.array([q[3], q[0], q[1], q[2]])

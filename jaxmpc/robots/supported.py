@@ -4,16 +4,13 @@ import copy
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from jaxmpc.checks import fail
 from jaxmpc.pytrees import record
-from jaxmpc.robots.physics import mjx_module
-
-if TYPE_CHECKING:
-    import mujoco
+from jaxmpc.robots.engine import acts, flag, mjx_module, mujoco, name_of, word
 
 # Bits of MuJoCo's contype and conaffinity.
 _BITS = 31
@@ -62,21 +59,19 @@ def translate(model: "mujoco.MjModel") -> list[str]:
 
     Raises ValueError for actuators with several inputs.
     """
-    import mujoco
-
     mjx_module()
     from mujoco.mjx._src import types
 
     several = np.flatnonzero(getattr(model, "actuator_ctrlnum", np.ones(0)) != 1)
     if len(several):
         names = ", ".join(name_of(model, "actuator", i) for i in several)
-        fail("model", f"has actuators with several inputs ({names}), which MJX lacks",
-             "Put motors or position actuators, one input each, in their place")  # fmt: skip
+        cure = "Put motors or position actuators, one input each, in their place"
+        fail("model", f"has actuators with several inputs ({names}), which MJX lacks", cure)
     cleared, options = [], model.opt
-    for flag in (mujoco.mjtEnableBit.mjENBL_ENERGY, mujoco.mjtEnableBit.mjENBL_FWDINV):
-        if options.enableflags & flag:
-            options.enableflags &= ~int(flag)
-            cleared.append(f"switch {_name(flag)}")
+    for switch in (mujoco.mjtEnableBit.mjENBL_ENERGY, mujoco.mjtEnableBit.mjENBL_FWDINV):
+        if options.enableflags & switch:
+            options.enableflags &= ~int(switch)
+            cleared.append(f"switch {word(switch)}")
     strange = ~np.isin(model.sensor_type, [int(kind) for kind in types.SensorType])
     if np.any(strange):
         cleared.append(f"{np.sum(strange)} sensors of types unknown to MJX")
@@ -84,14 +79,13 @@ def translate(model: "mujoco.MjModel") -> list[str]:
     if options.solver == mujoco.mjtSolver.mjSOL_PGS:
         options.solver = mujoco.mjtSolver.mjSOL_NEWTON
         cleared.append("solver PGS, Newton in its place (same problem)")
-    bit = mujoco.mjtDisableBit
-    both = int(bit.mjDSBL_SPRING) | int(bit.mjDSBL_DAMPER)
+    both = flag("spring") | flag("damper")
     off = options.disableflags & both
-    for flag, words, fields in (
-        (bit.mjDSBL_SPRING, "springs", ("jnt_stiffness", "tendon_stiffness")),
-        (bit.mjDSBL_DAMPER, "dampers", ("dof_damping", "tendon_damping")),
+    for switch, words, fields in (
+        ("spring", "springs", ("jnt_stiffness", "tendon_stiffness")),
+        ("damper", "dampers", ("dof_damping", "tendon_damping")),
     ):
-        if off & flag:
+        if off & flag(switch):
             for field in fields:
                 getattr(model, field)[:] = 0
             cleared.append(f"{words}, switched off in the file")
@@ -105,7 +99,7 @@ def translate(model: "mujoco.MjModel") -> list[str]:
         model.actuator_gainprm[idle] = model.actuator_biasprm[idle] = 0
         names = ", ".join(name_of(model, "actuator", i) for i in np.flatnonzero(idle))
         cleared.append(f"forces of {names}, whose groups are switched off in the file")
-    without = options.disableflags & _NO_CONTACTS and _leave_out_contacts(model)
+    without = "" if acts(model, "contact") else _leave_out_contacts(model)
     if without:
         cleared.append(f"contacts of {without}, switched off in the file")
     return cleared
@@ -120,21 +114,16 @@ def lacks(model: "mujoco.MjModel") -> list[Lack]:
     Raises ValueError where such shapes are in an explicit <pair>, or where the contacts that stay
     cannot be written as bits of contype and conaffinity.
     """
-    import mujoco
-
     mjx_module()
-    found, contacts = [], not model.opt.disableflags & _NO_CONTACTS
+    found, contacts = list[Lack](), acts(model, "contact")
     if model.opt.noslip_iterations:
         text = f"{model.opt.noslip_iterations} noslip iterations of dry contacts"
-        found.append(Lack(text, lambda model: _zero(model.opt, "noslip_iterations"), True))
-    without = contacts and _leave_out_contacts(copy.deepcopy(model))
+        found.append(Lack(text, _without_noslip, True))
+    without = _leave_out_contacts(copy.deepcopy(model)) if contacts else ""
     if without:
         found.append(Lack(f"contacts of {without}", _leave_out_contacts, True))
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
-        awake = lambda model: setattr(
-            model.opt, "enableflags", model.opt.enableflags & ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-        )
-        found.append(Lack("sleep of bodies at rest", awake, True))
+        found.append(Lack("sleep of bodies at rest", _awake, True))
     for field, words, kind, in_contact in _DROPPED:
         values = getattr(model, field, np.zeros(0))
         rows = np.flatnonzero([np.any(row != 0) for row in values])
@@ -153,9 +142,17 @@ def lacks(model: "mujoco.MjModel") -> list[Lack]:
     return found
 
 
-def _zero(model: Any, field: str) -> None:
-    """Set a number of the model, or all of an array, to zero."""
-    setattr(model, field, 0 * getattr(model, field))
+def _zero(model: "mujoco.MjModel", field: str) -> None:
+    """Set an array of the model to zero."""
+    getattr(model, field)[:] = 0
+
+
+def _without_noslip(model: "mujoco.MjModel") -> None:
+    model.opt.noslip_iterations = 0
+
+
+def _awake(model: "mujoco.MjModel") -> None:
+    model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 
 
 def _touches(model: "mujoco.MjModel", geom: Any) -> bool:
@@ -172,22 +169,6 @@ def _listed(model: "mujoco.MjModel", kind: str, field: str, rows: np.ndarray) ->
     return ", ".join(name_of(model, kind, i) for i in rows[:5]) + more
 
 
-def name_of(model: "mujoco.MjModel", kind: str, i: Any) -> str:
-    """Return "joint hip", or "joint 3" (counted from 1) where it has no name."""
-    import mujoco
-
-    of = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
-    return f"{kind} {mujoco.mj_id2name(model, of, int(i)) or int(i) + 1}"
-
-
-# mjtDisableBit: all constraints, contacts.
-_NO_CONTACTS = 1 | 16
-
-
-def _name(member: Any) -> str:
-    return member.name.split("_", 1)[1].lower()
-
-
 def _leave_out_contacts(model: "mujoco.MjModel") -> str:
     """Switch off contacts between shapes that MJX cannot bring together; return them in words.
 
@@ -195,7 +176,6 @@ def _leave_out_contacts(model: "mujoco.MjModel") -> str:
     their conaffinity has the bits of the kinds that they may touch: any symmetric relation between
     up to 31 kinds is written so, and MuJoCo's C engine reads the same one.
     """
-    import mujoco
     from mujoco.mjx._src import collision_driver
 
     rough = (int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_HFIELD))
@@ -213,22 +193,23 @@ def _leave_out_contacts(model: "mujoco.MjModel") -> str:
         if supported(first, second, margin):
             continue
         shapes = " with ".join(
-            sorted(_name(mujoco.mjtGeom(model.geom_type[g])) for g in (first, second))
+            sorted(word(mujoco.mjtGeom(model.geom_type[g])) for g in (first, second))
         )
         if pair >= 0:
-            fail("model", f"has a <pair> of contacts of {shapes}, which MJX does not have",
-                 "Take that pair out of the file")  # fmt: skip
+            problem = f"has a <pair> of contacts of {shapes}, which MJX does not have"
+            fail("model", problem, "Take that pair out of the file")
         missing[shapes] += 1
     if not missing:
         return ""
-    features = np.stack([
-        model.geom_type, model.geom_contype, model.geom_conaffinity, model.geom_margin > 0,
-    ], axis=1).astype(np.int64)  # fmt: skip
+    margined = model.geom_margin > 0
+    kinds_of = (model.geom_type, model.geom_contype, model.geom_conaffinity, margined)
+    features = np.stack(kinds_of, axis=1).astype(np.int64)
     touching = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
     kinds, of = np.unique(features[touching], axis=0, return_inverse=True)
     if len(kinds) > _BITS:
-        fail("model", f"has contacts that MJX lacks ({', '.join(missing)}), and {len(kinds)} kinds "
-             f"of shapes, more than {_BITS}", "Switch those contacts off in the file")  # fmt: skip
+        count = f"{len(kinds)} kinds of shapes, more than {_BITS}"
+        problem = f"has contacts that MJX lacks ({', '.join(missing)}), and {count}"
+        fail("model", problem, "Switch those contacts off in the file")
     examples = [int(touching[np.argmax(of == k)]) for k in range(len(kinds))]
     allowed = np.zeros(len(kinds), np.int64)
     for i, a in enumerate(examples):

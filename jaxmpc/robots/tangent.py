@@ -13,9 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
-
-# mjtJoint: free (3 + 4 numbers), ball (4), slide (1), hinge (1).
-FREE, BALL = 0, 1
+from jaxmpc.robots.engine import BALL, FREE
 
 # Below this angle² the series of sin and cos are exact in float64.
 SMALL = 1e-8

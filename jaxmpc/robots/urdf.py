@@ -2,14 +2,12 @@
 request."""
 
 import xml.etree.ElementTree as ElementTree
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxmpc.checks import fail
-
-if TYPE_CHECKING:
-    import mujoco
+from jaxmpc.robots.engine import mujoco
 
 # A mended inertia keeps a + b ≥ c with this much room, relative to c: rounding in MuJoCo's own
 # eigenvalues must not refuse it again.
@@ -17,18 +15,24 @@ _ROOM = 1e-9
 # Mass of a moving link that has none, of the robot's: a ball of water of that mass.
 _SHARE = 1e-4
 _WATER = 1000.0
+# Entries of an inertia in a URDF, those of the upper triangle row by row.
+_AXES = ("xx", "xy", "xz", "yy", "yz", "zz")
 
 
-def compiled_urdf(
-    text: str, *, floating_base: bool, mend_inertias: bool
-) -> tuple["mujoco.MjModel", dict[str, float], tuple[str, ...]]:
-    """Return the compiled model of a URDF, the velocity limit of each joint, and what was changed.
+class CompiledURDF(NamedTuple):
+    """The compiled model of a URDF, the velocity limit of each joint, and what was mended."""
+
+    model: "mujoco.MjModel"
+    velocities: dict[str, float]
+    mended: tuple[str, ...]
+
+
+def compiled_urdf(text: str, *, floating_base: bool, mend_inertias: bool) -> CompiledURDF:
+    """Return a URDF, compiled.
 
     Visual and collision geometry is left out, so that no mesh is looked for. Each hinge and slide
     joint gets a motor, as a URDF cannot have any.
     """
-    import mujoco
-
     root = ElementTree.fromstring(text)
     for link in root.iter("link"):
         for kind in ("visual", "collision"):
@@ -50,12 +54,12 @@ def compiled_urdf(
     try:
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
         _add_motors(spec)
-        return spec.compile(), velocities, changes
+        return CompiledURDF(spec.compile(), velocities, changes)
     except ValueError as error:
         if "inertia" in str(error) and not mend_inertias:
             problem = " ".join(str(error).split())
-            fail("model", f"has an inertia that no body can have: {problem}",
-                 "Mend the file, or load it with mend_inertias=True")  # fmt: skip
+            cure = "Mend the file, or load it with mend_inertias=True"
+            fail("model", f"has an inertia that no body can have: {problem}", cure)
         raise
 
 
@@ -73,8 +77,8 @@ def _free(root: ElementTree.Element) -> None:
     """Put a joint of type floating, which MuJoCo reads as a free joint, before the root link."""
     base = _root_link(root)
     if base == "world":
-        fail("floating_base", "the root link of the file is the world, to which it is mounted",
-             "Leave the argument out")  # fmt: skip
+        problem = "the root link of the file is the world, to which it is mounted"
+        fail("floating_base", problem, "Leave the argument out")
     ElementTree.SubElement(root, "link", name="world")
     joint = ElementTree.SubElement(root, "joint", name="base", type="floating")
     ElementTree.SubElement(joint, "parent", link="world")
@@ -91,10 +95,9 @@ def _inertia(inertial: ElementTree.Element) -> np.ndarray:
     element = inertial.find("inertia")
     if element is None:
         return np.zeros((3, 3))
-    xx, xy, xz, yy, yz, zz = (
-        float(element.get(f"i{axes}", "0")) for axes in ("xx", "xy", "xz", "yy", "yz", "zz")
-    )
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    inertia = np.zeros((3, 3))
+    inertia[np.triu_indices(3)] = [float(element.get(f"i{axes}", "0")) for axes in _AXES]
+    return inertia + np.triu(inertia, 1).T
 
 
 def _ball(mass: float) -> float:
@@ -160,9 +163,9 @@ def _write(inertial: ElementTree.Element, mass: float, inertia: np.ndarray) -> N
         for element in inertial.findall(tag):
             inertial.remove(element)
     ElementTree.SubElement(inertial, "mass", value=repr(float(mass)))
-    ElementTree.SubElement(inertial, "inertia", {
-        f"i{'xyz'[i]}{'xyz'[j]}": repr(float(inertia[i, j])) for i in range(3) for j in range(i, 3)
-    })  # fmt: skip
+    moments = zip(_AXES, inertia[np.triu_indices(3)], strict=True)
+    values = {f"i{axes}": repr(float(value)) for axes, value in moments}
+    ElementTree.SubElement(inertial, "inertia", values)
 
 
 def _numbers(values: np.ndarray) -> str:
@@ -171,8 +174,6 @@ def _numbers(values: np.ndarray) -> str:
 
 def _add_motors(spec: "mujoco.MjSpec") -> None:
     """Add a motor to each hinge and slide joint."""
-    import mujoco
-
     single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     for joint in spec.joints:
         if joint.type in single:

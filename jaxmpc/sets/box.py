@@ -61,7 +61,7 @@ class Box(LinearSet):
         self._require_fields(argument, dimension)
         if not concrete((self.lower, self.upper)):
             return
-        lower, upper = self._bounds(argument)
+        lower, upper = self.bounds(argument)
         for name, value in (("lower", lower), ("upper", upper)):
             if np.isnan(value).any():
                 fail(f"{argument}.{name}", "holds NaN", "Use -inf or inf for no bound")
@@ -100,7 +100,7 @@ class Box(LinearSet):
         """Return half the distance between the two ends of each coordinate, (n,); 1 where an end
         is infinite or both coincide. It is the unit of weights and tolerances. NumPy; not
         traceable."""
-        lower, upper = self.spread(1)._bounds()
+        lower, upper = self.spread(1).bounds()
         width = (upper - lower) / 2
         return np.where(np.isfinite(width) & (width > 0), width, 1.0)
 
@@ -130,7 +130,7 @@ class Box(LinearSet):
             return self.to_polytope().intersect(other)
         lower, upper = self._checked_bounds()
         other.validate("other", len(lower))
-        lower_too, upper_too = other._bounds("other")
+        lower_too, upper_too = other.bounds("other")
         return Box(np.maximum(lower, lower_too), np.minimum(upper, upper_too))
 
     def vertices(self) -> np.ndarray:
@@ -149,14 +149,15 @@ class Box(LinearSet):
     def _require_fields(self, argument: str, dimension: int | None = None) -> None:
         require_matching(argument, {"lower": self.lower, "upper": self.upper}, 1, dimension)
 
-    def _bounds(self, argument: str = "Box") -> tuple[np.ndarray, np.ndarray]:
+    def bounds(self, argument: str = "Box") -> tuple[np.ndarray, np.ndarray]:
+        """Return copies of (lower, upper) in float64. NumPy; not traceable."""
         lower = host_array(f"{argument}.lower", self.lower)
         return lower, host_array(f"{argument}.upper", self.upper)
 
     def _checked_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         self = self.spread(1)
         self.validate("Box")
-        return self._bounds()
+        return self.bounds()
 
     def _finite_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         lower, upper = self._checked_bounds()
