@@ -277,7 +277,7 @@ class Part(NamedTuple, Generic[R]):
     number of its rows, and the seconds that compiling took."""
 
     place: Any
-    count: int
+    size: int
     result: R
     compile_seconds: float = 0.0
 
@@ -317,8 +317,8 @@ def work_off(
     with tqdm(total=total, unit=f" {unit}", unit_scale=total >= MANY, disable=hidden) as bar:
         for part in parts:
             bar.set_postfix_str(sink(part) or "", refresh=False)
-            bar.update(part.count)
-            timing.count += part.count
+            bar.update(part.size)
+            timing.count += part.size
             timing.compile_seconds += part.compile_seconds
             if time.monotonic() > deadline:
                 break

@@ -31,7 +31,7 @@ def test_parts_go_through_one_program_into_a_sink():
     expected, found = rows["x"] + rows["y"].sum(axis=1), np.full(7, np.nan)
 
     def sink(part):
-        assert part.count == len(part.result)
+        assert part.size == len(part.result)
         found[part.place] = part.result
 
     timing = work_off(each_part(program, rows, 3), sink, 7, unit="rows")
