@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from jaxmpc.qp.solve import solve_qp
     from jaxmpc.qp.status import Status
     from jaxmpc.recursion import recursive_feasibility
-    from jaxmpc.robots.linear import LinearPlant
+    from jaxmpc.robots.linear_plant import LinearPlant
     from jaxmpc.robots.load import load_robot
     from jaxmpc.sets.box import Box
     from jaxmpc.sets.control_invariant import maximal_control_invariant_set

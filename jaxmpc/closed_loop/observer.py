@@ -12,7 +12,7 @@ from jaxmpc.closed_loop.noise import covariance, require_spread, whole_array
 from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import matmul
-from jaxmpc.robots.linear import LinearPlant
+from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
 from jaxmpc.systems.riccati import least_reached, lqr
 from jaxmpc.systems.system import LinearSystem

@@ -21,9 +21,9 @@ from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.admm import ADMM, DEFAULT
 from jaxmpc.qp.modes import varying
 from jaxmpc.qp.precision import arrays, floating_dtype
-from jaxmpc.robots.linear import LinearPlant
-from jaxmpc.robots.model import RobotModel
+from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
+from jaxmpc.robots.robot_model import RobotModel
 from jaxmpc.sets.box import Box
 
 LINEARIZATIONS = ("set-point", "state", "trajectory")

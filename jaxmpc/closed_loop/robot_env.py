@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.environment import Environment, EnvironmentState
-from jaxmpc.robots.linear import LinearPlant
+from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.load import load_robot
 from jaxmpc.robots.robot import Robot
 

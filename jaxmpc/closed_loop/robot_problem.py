@@ -10,8 +10,8 @@ import numpy as np
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, whole
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.robots.balance import settled
-from jaxmpc.robots.linear import LinearPlant
+from jaxmpc.robots.equilibria import settled
+from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.box import Box
 from jaxmpc.systems.riccati import least_reached, lqr

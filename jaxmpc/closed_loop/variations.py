@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxmpc.checks import fail, nearest, require_kind, require_shape, whole
-from jaxmpc.robots.linear import LinearPlant
+from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
 
 # Of each quantity, the field of MuJoCo's model that its factor multiplies and whose it is. The

@@ -331,7 +331,7 @@ def _triangular_in_place(
 
 def stand_ins() -> dict[Any, Callable]:
     """Return what replaces JAX's own operations in functions of other libraries
-    (`robots/rewrite.py`), by primitive: nothing where batches of them are safe."""
+    (`robots/jaxpr_rewriting.py`), by primitive: nothing where batches of them are safe."""
     if not WAITS:
         return {}
     return {

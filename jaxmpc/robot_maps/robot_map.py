@@ -15,7 +15,7 @@ from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.recursion.report import RecursionReport
 from jaxmpc.robot_maps.outcomes import RobotLoops
-from jaxmpc.robots.linear import LinearPlant
+from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
 
 # What becomes of a state: (promised, held) by outcome.

@@ -25,7 +25,7 @@ from jaxmpc.recursion.budget import Budget
 from jaxmpc.robot_maps.outcomes import RobotLoops
 from jaxmpc.robot_maps.robot_map import RobotMap
 from jaxmpc.robot_maps.set_point import deviations, with_initial_limits
-from jaxmpc.robots.linear import LinearPlant
+from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
 
 CLAIMS = ("limits", "recursion")

@@ -11,11 +11,11 @@ Film                  the same for a notebook, which plays it
 
 from jaxmpc.robots import tasks
 from jaxmpc.robots.film.video import Film, render, save_video
-from jaxmpc.robots.linear import LinearPlant
+from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.load import load_robot
-from jaxmpc.robots.model import RobotModel
 from jaxmpc.robots.report import RobotReport
 from jaxmpc.robots.robot import Robot
+from jaxmpc.robots.robot_model import RobotModel
 
 __all__ = [
     "Film",

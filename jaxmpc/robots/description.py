@@ -11,9 +11,9 @@ from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.pytrees import record, static
 from jaxmpc.qp.precision import floating_dtype
+from jaxmpc.robots.configurations import difference, quaternions, retract, unit_orientations
 from jaxmpc.robots.engine import mujoco
 from jaxmpc.robots.physics import Physics
-from jaxmpc.robots.tangent import difference, quaternions, retract, unit_orientations
 from jaxmpc.sets.box import Box
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_package, require_printable, require_shape
+from jaxmpc.robots.configurations import unit_orientations
 from jaxmpc.robots.engine import (
     BALL,
     FREE,
@@ -25,6 +26,7 @@ from jaxmpc.robots.engine import (
     number_of,
     single_joints,
 )
+from jaxmpc.robots.file_comparison import compared
 from jaxmpc.robots.file_limits import (
     coordinate_names,
     input_limits,
@@ -34,11 +36,9 @@ from jaxmpc.robots.file_limits import (
     overridden,
     state_limits,
 )
-from jaxmpc.robots.guard import compared
+from jaxmpc.robots.mjx_gaps import lacks, translate
 from jaxmpc.robots.physics import RK4, Physics
 from jaxmpc.robots.robot import Robot
-from jaxmpc.robots.supported import lacks, translate
-from jaxmpc.robots.tangent import unit_orientations
 from jaxmpc.robots.urdf import compiled_urdf
 from jaxmpc.sets.limits import Limit
 from jaxmpc.systems.system import require_period

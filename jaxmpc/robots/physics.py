@@ -17,10 +17,17 @@ from jax.extend.core.primitives import acos_p, sqrt_p
 from jaxmpc.checks import fail
 from jaxmpc.qp.linalg import JAXLIB, solve, stand_ins
 from jaxmpc.qp.precision import matmul
+from jaxmpc.robots.configurations import normalised, rates, retract
 from jaxmpc.robots.engine import BALL, mjx_module, mujoco
-from jaxmpc.robots.rewrite import moving, rewritten
-from jaxmpc.robots.rigid import FIELDS, Tree, dynamics, inverse_dynamics, side_by_side, slopes
-from jaxmpc.robots.tangent import normalised, rates, retract
+from jaxmpc.robots.jaxpr_rewriting import moving, rewritten
+from jaxmpc.robots.rigid_bodies import (
+    FIELDS,
+    Tree,
+    dynamics,
+    inverse_dynamics,
+    side_by_side,
+    slopes,
+)
 
 # mjtIntegrator.
 EULER, RK4 = 0, 1
@@ -39,7 +46,7 @@ class Physics:
     model: the mujoco.MjModel. mjx: mjx.Model with NumPy arrays, in float64 in either mode of JAX.
     Raises ValueError for models that MJX does not support.
 
-    Inertia, velocities and their forces are those of `rigid.py`; MJX gives the forces of springs,
+    Inertia, velocities and their forces are those of `rigid_bodies.py`; MJX gives the forces of springs,
     tendons and actuators, the rows of constraints and their solver.
     """
 
@@ -233,7 +240,7 @@ class Physics:
         return model, data
 
     def _rigid(self, function: Callable, numbers: dict[str, Array], q: Array, *rest: Array) -> Any:
-        """Return what a function of `rigid.py` does."""
+        """Return what a function of `rigid_bodies.py` does."""
         fixed = {key: np.array(getattr(self.mjx, key), q.dtype)[..., None] for key in FIELDS}
         off = bool(self.model.opt.disableflags & NO_GRAVITY)
         fixed["gravity"] = (0.0 if off else 1.0) * np.array(self.mjx.opt.gravity, q.dtype)[:, None]

@@ -22,7 +22,10 @@ from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import matmul
-from jaxmpc.robots.balance import (
+from jaxmpc.robots.configurations import difference, quaternions, retract
+from jaxmpc.robots.description import RobotDescription
+from jaxmpc.robots.engine import number_of
+from jaxmpc.robots.equilibria import (
     inverse_actuation,
     lacking,
     nearest_rest,
@@ -30,11 +33,8 @@ from jaxmpc.robots.balance import (
     rest_at,
     settled,
 )
-from jaxmpc.robots.description import RobotDescription
-from jaxmpc.robots.engine import number_of
 from jaxmpc.robots.payload import with_payload
 from jaxmpc.robots.report import RobotReport, report_of
-from jaxmpc.robots.tangent import difference, quaternions, retract
 from jaxmpc.systems.system import LinearSystem
 
 

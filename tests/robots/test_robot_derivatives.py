@@ -14,7 +14,7 @@ from jax.scipy.linalg import cho_factor, cho_solve
 
 import jaxmpc as jm
 from jaxmpc.qp.linalg import cholesky, solve_general
-from jaxmpc.robots.rewrite import rewritten
+from jaxmpc.robots.jaxpr_rewriting import rewritten
 
 
 def pair(first, second, cone="elliptic"):

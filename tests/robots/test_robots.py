@@ -11,7 +11,7 @@ from c_engine import c_affine, c_state, c_steps, c_transition, data_at
 
 import jaxmpc as jm
 from jaxmpc.robots import physics
-from jaxmpc.robots.tangent import difference, retract
+from jaxmpc.robots.configurations import difference, retract
 
 SLOW = ["quadrotor"] + [
     pytest.param(name, marks=pytest.mark.slow)

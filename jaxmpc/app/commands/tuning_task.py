@@ -25,7 +25,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.softening import soften
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
-from jaxmpc.robots.linear import LinearPlant
+from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.sets import violations
 from jaxmpc.sets.box import Box

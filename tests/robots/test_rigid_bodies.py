@@ -11,9 +11,9 @@ import pytest
 from c_engine import c_steps
 
 import jaxmpc as jm
-from jaxmpc.robots import rigid
+from jaxmpc.robots import rigid_bodies
+from jaxmpc.robots.configurations import retract
 from jaxmpc.robots.physics import Physics
-from jaxmpc.robots.tangent import retract
 
 # Several joints on one body, anchors off the centre, a body without joints, a branch, a ball joint
 # behind a hinge, a free body that carries a hinge.
@@ -150,22 +150,22 @@ def state_of(model, rng, low=False, still=False):
 @pytest.mark.slow
 def test_poses_inertia_and_forces_are_the_c_engines(name):
     model = model_of("plain") if name == "tree" else jm.load_robot(name).mujoco
-    tree, rng, data = rigid.Tree.of(model), np.random.default_rng(0), mujoco.MjData(model)
-    numbers = {key: np.array(getattr(model, key))[..., None] for key in rigid.FIELDS}
+    tree, rng, data = rigid_bodies.Tree.of(model), np.random.default_rng(0), mujoco.MjData(model)
+    numbers = {key: np.array(getattr(model, key))[..., None] for key in rigid_bodies.FIELDS}
     numbers["gravity"] = np.array(model.opt.gravity)[:, None]
     x = np.array([state_of(model, rng)[0] for _ in range(3)]).T
     q, v = np.split(x, [model.nq])
     a = rng.normal(size=v.shape)
     with jax.enable_x64(True):
-        found = jax.jit(lambda q: rigid.bodies(tree, numbers, q))(q)
-        M, bias, fields = jax.jit(lambda q, v: rigid.dynamics(tree, numbers, q, v))(q, v)
-        needed = jax.jit(lambda *of: rigid.inverse_dynamics(tree, numbers, *of))(q, v, a)
-        slopes = jax.jit(lambda *of: rigid.slopes(tree, numbers, *of))(q, v, a)
+        found = jax.jit(lambda q: rigid_bodies.bodies(tree, numbers, q))(q)
+        M, bias, fields = jax.jit(lambda q, v: rigid_bodies.dynamics(tree, numbers, q, v))(q, v)
+        needed = jax.jit(lambda *of: rigid_bodies.inverse_dynamics(tree, numbers, *of))(q, v, a)
+        slopes = jax.jit(lambda *of: rigid_bodies.slopes(tree, numbers, *of))(q, v, a)
         joints = tuple(int(joint) for joint in model.jnt_type)
 
         def moved(d, q, v, a):
             start = retract(joints, q, d)[:, None]
-            return rigid.inverse_dynamics(tree, numbers, start, v[:, None], a[:, None])[:, 0]
+            return rigid_bodies.inverse_dynamics(tree, numbers, start, v[:, None], a[:, None])[:, 0]
 
         jacobians = jax.jit(jax.vmap(jax.jacfwd(moved, argnums=(0, 2, 3)), in_axes=(None, 1, 1, 1)))
         wanted = jacobians(jnp.zeros(model.nv), q, v, a)
@@ -210,7 +210,7 @@ def test_every_number_that_varies_counts():
     """Fields of mjx.Model as arguments, one other in each row, against a file with that number."""
     model, rng = model_of("site"), np.random.default_rng(2)
     x, u = state_of(model, rng)
-    names = ("dof_damping", "jnt_stiffness", "actuator_gear", "body_gravcomp", *rigid.FIELDS)
+    names = ("dof_damping", "jnt_stiffness", "actuator_gear", "body_gravcomp", *rigid_bodies.FIELDS)
     numbers = {name: np.array(getattr(model, name)) for name in names}
     rows = {name: np.tile(value, (len(names), 1, 1)[: value.ndim + 1]) for name, value in
             numbers.items()}  # fmt: skip

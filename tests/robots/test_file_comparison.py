@@ -10,8 +10,8 @@ import pytest
 from c_engine import c_transition
 
 import jaxmpc as jm
+from jaxmpc.robots.jaxpr_rewriting import rewritten
 from jaxmpc.robots.physics import TAMED
-from jaxmpc.robots.rewrite import rewritten
 
 ARM = """
 <mujoco>{top}<option timestep=".002" {option}>{flag}</option><worldbody>{world}
@@ -421,7 +421,7 @@ def test_versions_are_compared(monkeypatch):
 
 def test_equal_models_are_compared_once(monkeypatch):
     jm.load_robot("pendulum")
-    monkeypatch.setattr("jaxmpc.robots.guard._unlike", None)
+    monkeypatch.setattr("jaxmpc.robots.file_comparison._unlike", None)
     jm.load_robot("pendulum", position=1.0)
     with pytest.raises(TypeError):
         jm.load_robot("pendulum", timestep=0.0005, control_period=0.01)

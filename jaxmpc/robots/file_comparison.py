@@ -26,8 +26,8 @@ from jaxmpc.robots.engine import (
     name_of,
     single_joints,
 )
+from jaxmpc.robots.mjx_gaps import Lack
 from jaxmpc.robots.physics import Physics
-from jaxmpc.robots.supported import Lack
 from jaxmpc.sets.box import Box
 
 # What counts as a difference, relative to the largest acceleration of the same dof: without and
