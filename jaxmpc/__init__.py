@@ -140,7 +140,7 @@ HOMES = {
     "qp.solve": "solve_qp",
     "qp.status": "Status",
     "recursion": "recursive_feasibility",
-    "robots.linear": "LinearPlant",
+    "robots.linear_plant": "LinearPlant",
     "robots.load": "load_robot",
     "sets.box": "Box",
     "sets.control_invariant": "maximal_control_invariant_set",

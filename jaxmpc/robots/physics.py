@@ -46,8 +46,8 @@ class Physics:
     model: the mujoco.MjModel. mjx: mjx.Model with NumPy arrays, in float64 in either mode of JAX.
     Raises ValueError for models that MJX does not support.
 
-    Inertia, velocities and their forces are those of `rigid_bodies.py`; MJX gives the forces of springs,
-    tendons and actuators, the rows of constraints and their solver.
+    Inertia, velocities and their forces are those of `rigid_bodies.py`; MJX gives the forces of
+    springs, tendons and actuators, the rows of constraints and their solver.
     """
 
     def __init__(self, model: "mujoco.MjModel") -> None:
