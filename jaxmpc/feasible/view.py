@@ -41,6 +41,13 @@ class View:
             x = x.at[np.array(self.others)].set(jnp.clip(free, self.lower, self.upper))
         return x
 
+    def states(self, points: np.ndarray) -> np.ndarray:
+        """Return the states (B, n) of points (B, d) of a slice."""
+        x = np.zeros(len(self.axes) + len(self.others)) if self.fixed is None else self.fixed
+        states = np.tile(x, (len(points), 1))
+        states[:, list(self.axes)] = points
+        return states
+
 
 def make_view(mpc: MPC, axes: Any = None, fixed: Any = None) -> View:
     """Check and complete the choice of states to map; raise ValueError for a wrong one.

@@ -1,12 +1,13 @@
-"""Maps of a robot: what the linear model promises of a state, and what the robot then does.
+"""RobotMap: states of a robot with what the linear model predicts and what the robot did.
 
-Each state is labelled twice. The promise is the linear model's: a plan that keeps all limits
-exists, by proof (`map_feasible_set`), or one exists at every sample of the linear closed loop
-(`recursive_feasibility`). The robot's own closed loop, nonlinear and simulated in MJX, keeps the
-promise or breaks it. The robot's labels are measured over T samples, not proved.
+Each state is labelled twice. The linear model predicts limits kept by a plan that exists, by proof
+(`map_feasible_set`), or plans at every time step of the linear closed loop
+(`recursive_feasibility`). The robot's own closed loop, nonlinear and simulated in MJX, does what is
+predicted or fails. The robot's labels are measured over T time steps, not proved.
 """
 
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -14,29 +15,31 @@ from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.recursion.report import RecursionReport
-from jaxmpc.robot_maps.outcomes import RobotLoops
+from jaxmpc.robot_maps.robot_loops import RobotLoops
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
 
-# What becomes of a state: (promised, held) by outcome.
+# What a map can look at, in words.
+CLAIMS = {"limits": "all limits kept", "recursion": "a plan at each time step"}
+# What becomes of a state: (predicted, held) by outcome.
 OUTCOMES = {
-    "promise kept": (1, 1),
-    "promise broken": (1, -1),
-    "not promised, failed": (-1, -1),
-    "not promised, kept": (-1, 1),
+    "predicted, kept": (1, 1),
+    "predicted, failed": (1, -1),
+    "not predicted, failed": (-1, -1),
+    "not predicted, kept": (-1, 1),
 }
 
 
 @record
 class RobotMap:
-    """States of a robot with the linear promise and what became of it.
+    """States of a robot with what the linear model predicts and what became of it.
 
     x0s (B, d) in the coordinates `axes` of ξ, the other coordinates at `linear.fixed`.
     linear: the map of the linear problem, x_0 within the robot's limits included. claim: "limits",
-    a state promises what linear.label says, and holds where all limits are kept for T samples; or
-    "recursion", a state promises to have a plan at each of T samples of the linear closed loop
-    (recursion: the report; its states are deviations from set_point (n,)), and holds where the
-    robot has. loops: what the robot did in `steps` T samples of dt seconds.
+    linear.label predicts for a state that all limits are kept for T time steps, and it holds where
+    the robot keeps them; or "recursion", the linear closed loop predicts a plan at each of T time
+    steps (recursion: the report; its states are deviations from set_point (n,)), and it holds where
+    the robot has them. loops: what the robot did in `steps` T time steps of dt seconds.
     """
 
     robot: Robot | LinearPlant
@@ -53,82 +56,87 @@ class RobotMap:
         return self.linear.x0s
 
     @property
-    def seconds(self) -> float:
-        """Return the length of the closed loops."""
-        return self.steps * self.robot.dt
-
-    @property
-    def kept(self) -> np.ndarray:
-        """Return whether the robot kept all its limits, without margin, at all T+1 samples, and
-        every number was finite, (B,)."""
-        return self.loops.broken_at < 0
-
-    @property
-    def recursive(self) -> np.ndarray:
-        """Return (B,) int8: 1 a plan without fallback at each of T samples, −1 none at sample
-        `loops.lost_at`, 0 undecided because an earlier plan is not SOLVED."""
-        lost, unsolved = self.loops.lost_at, self.loops.unsolved_at
-        open_ = (unsolved >= 0) & ((lost < 0) | (unsolved < lost))
-        return np.select([open_, lost >= 0], [0, -1], 1).astype(np.int8)
-
-    @property
-    def promised(self) -> np.ndarray:
-        """Return the promise of the linear model, (B,) int8: 1 promised, −1 proved that it cannot
-        be, 0 undecided."""
-        report = self.recursion
-        if report is None:
-            return self.linear.label
-        kept, lost = report.lost_at == 0, (report.lost_at > 0) | (report.label == -1)
-        return np.select([kept, lost], [1, -1], 0).astype(np.int8)
-
-    @property
-    def held(self) -> np.ndarray:
-        """Return what the robot did, (B,) int8: 1 what the claim says, −1 not, 0 undecided."""
-        if self.claim == "recursion":
-            return self.recursive
-        return np.where(self.kept, 1, -1).astype(np.int8)
-
-    @property
-    def broken(self) -> np.ndarray:
-        """Return whether the promise was made and the robot broke it, (B,)."""
-        return (self.promised == 1) & (self.held == -1)
-
-    @property
-    def first_loss(self) -> np.ndarray:
-        """Return the sample at which the robot failed the claim first, (B,); −1 where it did
-        not."""
-        found = self.loops.lost_at if self.claim == "recursion" else self.loops.broken_at
-        return np.where(self.held == -1, found, -1)
-
-    @property
-    def unsure(self) -> np.ndarray:
-        """Return whether a broken promise was preceded by a plan that is not SOLVED, (B,): the
-        solver may be to blame, not the model."""
-        unsolved = self.loops.unsolved_at
-        return self.broken & (unsolved >= 0) & (unsolved < self.first_loss)
-
-    @property
-    def outcome(self) -> np.ndarray:
-        """Return the index into `OUTCOMES`, (B,) int; their number for undecided."""
-        same = [(self.promised == p) & (self.held == h) for p, h in OUTCOMES.values()]
-        return np.select(same, range(len(same)), len(same))
+    def states(self) -> np.ndarray:
+        """Return all coordinates ξ (B, n)."""
+        return self.linear.problem.view.states(self.x0s)
 
     @property
     def axis_names(self) -> tuple[str, ...]:
         """Return the labels of the mapped coordinates with their units."""
         return self.linear.axis_names
 
+    @property
+    def seconds(self) -> float:
+        """Return the length of the closed loops."""
+        return self.steps * self.robot.dt
+
+    @property
+    def within_limits(self) -> np.ndarray:
+        """Return whether the robot kept all its limits, without margin, at all T+1 time steps, and
+        every number was finite, (B,)."""
+        return self.loops.broken_at < 0
+
+    @property
+    def recursive(self) -> np.ndarray:
+        """Return (B,) int8: 1 a plan without fallback at each of T time steps, −1 none at time step
+        `loops.lost_at`, 0 undecided because an earlier plan is not SOLVED."""
+        lost, unsolved = self.loops.lost_at, self.loops.unsolved_at
+        open_ = (unsolved >= 0) & ((lost < 0) | (unsolved < lost))
+        return np.select([open_, lost >= 0], [0, -1], 1).astype(np.int8)
+
+    @property
+    def predicted(self) -> np.ndarray:
+        """Return what the linear model predicts, (B,) int8: 1 what the claim says, −1 the contrary,
+        by proof, 0 undecided."""
+        report = self.recursion
+        if report is None:
+            return self.linear.label
+        lost = (report.lost_at > 0) | (report.label == -1)
+        return np.select([report.lost_at == 0, lost], [1, -1], 0).astype(np.int8)
+
+    @property
+    def held(self) -> np.ndarray:
+        """Return what the robot did, (B,) int8: 1 what the claim says, −1 not, 0 undecided."""
+        if self.claim == "recursion":
+            return self.recursive
+        return np.where(self.within_limits, 1, -1).astype(np.int8)
+
+    @property
+    def broken(self) -> np.ndarray:
+        """Return whether the linear model predicted what the robot then failed to do, (B,)."""
+        return (self.predicted == 1) & (self.held == -1)
+
+    @property
+    def first_loss(self) -> np.ndarray:
+        """Return the time step at which the robot failed the claim first, (B,); −1 where it did
+        not."""
+        found = self.loops.lost_at if self.claim == "recursion" else self.loops.broken_at
+        return np.where(self.held == -1, found, -1)
+
+    @property
+    def unsure(self) -> np.ndarray:
+        """Return whether a failure against the prediction was preceded by a plan that is not
+        SOLVED, (B,): the solver may be to blame, not the model."""
+        unsolved = self.loops.unsolved_at
+        return self.broken & (unsolved >= 0) & (unsolved < self.first_loss)
+
+    @property
+    def outcome(self) -> np.ndarray:
+        """Return the index into `OUTCOMES`, (B,) int; their number for undecided."""
+        same = [(self.predicted == p) & (self.held == h) for p, h in OUTCOMES.values()]
+        return np.select(same, range(len(same)), len(same))
+
     def counts(self) -> dict[str, dict[str, int]]:
-        """Return the table promise × robot: of how many states each kind of promise held, failed,
-        or is open since a plan of the robot was not solved."""
+        """Return the table prediction × robot: of how many states each kind of prediction held,
+        failed, or is open since a plan of the robot was not solved."""
         words = {1: "kept", -1: "failed", 0: "unsolved"}
-        promises = {1: "promised", -1: "not promised", 0: "undecided"}
+        predictions = {1: "predicted", -1: "not predicted", 0: "undecided"}
         return {
             name: {
-                word: int(np.sum((self.promised == p) & (self.held == h)))
+                word: int(np.sum((self.predicted == p) & (self.held == h)))
                 for h, word in words.items()
             }
-            for p, name in promises.items()
+            for p, name in predictions.items()
         }
 
     def plan_counts(self) -> dict[str, int]:
@@ -157,34 +165,57 @@ class RobotMap:
             return 1 - np.max((self.x0s - middle) @ scaled.T, axis=1)
 
     def worst(self) -> int | None:
-        """Return the index of the broken promise deepest in the linear feasible set; None without
-        any."""
+        """Return the index of the failure against the prediction deepest in the linear feasible
+        set; None without any."""
         found = np.flatnonzero(self.broken)
         if not len(found):
             return None
         return int(found[np.argmax(np.nan_to_num(self.depth[found], nan=-np.inf))])
 
+    def summary(self) -> dict[str, Any]:
+        """Return the counts of the map and its deepest failure as JSON data."""
+        worst, report = self.worst(), self.recursion
+        linear = {"counts": self.linear.counts(), "volume": list(self.linear.volume_bounds())}
+        if report is not None:
+            claims = {name: str(getattr(report, name)) for name in ("strong", "law", "weak")}
+            linear["recursion"] = claims | {"counts": report.counts()}
+        deepest = None
+        if worst is not None:
+            deepest = {
+                "state": self.states[worst].tolist(),
+                "step": int(self.first_loss[worst]),
+                "beyond": self.loops.worst[worst],
+            }
+        return {
+            "name": self.robot.name,
+            "claim": self.claim,
+            "counts": self.counts(),
+            "broken": int(np.sum(self.broken)),
+            "broken_after_an_unsolved_plan": int(np.sum(self.unsure)),
+            "deepest_broken": deepest,
+            "linear": linear,
+            "plans": self.plan_counts(),
+            "seconds": self.seconds,
+        }
+
     def __str__(self) -> str:
-        """Return the claim, table of counts, statuses and worst broken promise, one a line."""
-        what = {
-            "limits": "all limits kept", "recursion": "a plan at each sample"
-        }[self.claim]  # fmt: skip
-        rows = [("claim", f"{what} for {self.seconds:g} s, {self.steps} samples")]
+        """Return the claim, table of counts, statuses and the deepest failure, one a line."""
+        what = f"{CLAIMS[self.claim]} for {self.seconds:g} s, {self.steps} time steps"
+        rows = [("claim", what)]
         for name, row in self.counts().items():
             if sum(row.values()) or name != "undecided":
                 cells = "".join(f"{k:>10,} {word}" for word, k in row.items() if k)
                 rows.append((name, f"{sum(row.values()):>10,}  {cells}"))
         percent = f"{np.mean(self.broken):.2%}, {np.sum(self.unsure):,} after a plan not SOLVED"
-        rows.append(("broken promises", f"{np.sum(self.broken):>10,}  {percent}"))
+        rows.append(("predicted, failed", f"{np.sum(self.broken):>10,}  {percent}"))
         rows.append(("plans", ", ".join(f"{k:,} {n}" for n, k in self.plan_counts().items())))
         i = self.worst()
         if i is not None:
-            at = ", ".join(
-                f"{name} = {value:.4g}"
-                for name, value in zip(self.axis_names, self.x0s[i], strict=True)
-            )
-            rows.append((
-                "deepest broken", f"{at}: fails at sample {self.first_loss[i]}, "
-                f"most beyond a limit {self.loops.worst[i]:.3g}",
-            ))  # fmt: skip
-        return "\n".join(f"  {name:<16} {value}" for name, value in rows)
+            pairs = zip(self.axis_names, self.x0s[i], strict=True)
+            at = ", ".join(f"{name} = {value:.4g}" for name, value in pairs)
+            when = f"fails at time step {self.first_loss[i]}"
+            beyond = f"most beyond a limit {self.loops.worst[i]:.3g}"
+            rows.append(("deepest of these", f"{at}: {when}, {beyond}"))
+        return "\n".join(f"  {name:<17} {value}" for name, value in rows)
+
+    __repr__ = __str__

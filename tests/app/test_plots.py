@@ -167,13 +167,13 @@ def test_robot_map_says_in_words_what_became_of_each_state(claim):
         name: getattr(fmap, name)
         for name in ("x0s", "fixed", "axes", "mpc", "inner", "outer", "terminal_section")
     })  # fmt: skip
-    promised = np.select([size > 1.5, size > 1.3], [-1, 0], 1)
+    predicted = np.select([size > 1.5, size > 1.3], [-1, 0], 1)
     held = np.where(points[:, 0] > 0.9, -1, 1)
     if claim == "recursion":
         held[points[:, 1] > 0.9] = 0
-    unsure = (promised == 1) & (held == -1) & (points[:, 1] > 0)
+    unsure = (predicted == 1) & (held == -1) & (points[:, 1] > 0)
     rmap = SimpleNamespace(
-        x0s=points, linear=fmap, claim=claim, promised=promised, held=held, unsure=unsure,
+        x0s=points, linear=fmap, claim=claim, predicted=predicted, held=held, unsure=unsure,
         axis_names=("q [rad]", "dq [rad/s]"), set_point=np.zeros(2), worst=lambda: None,
         seconds=2.0, robot=SimpleNamespace(name="pendulum", dt=0.02),
     )  # fmt: skip
@@ -184,12 +184,12 @@ def test_robot_map_says_in_words_what_became_of_each_state(claim):
     }  # fmt: skip
     assert sum(counts.values()) == len(points)
     undecided = [name for name in counts if "undecided" in name]
-    assert [counts.pop(name) for name in undecided] == [np.sum(promised == 0)]
+    assert [counts.pop(name) for name in undecided] == [np.sum(predicted == 0)]
     assert counts.pop("the same, but after a plan that was not solved") == unsure.sum() > 0
     open_ = counts.pop("a plan of the robot was not solved", 0)
-    assert open_ == np.sum((promised != 0) & (held == 0)) and bool(open_) == (claim == "recursion")
+    assert open_ == np.sum((predicted != 0) & (held == 0)) and bool(open_) == (claim == "recursion")
     both = [(1, 1), (1, -1), (-1, -1), (-1, 1)]
-    wanted = [np.sum((promised == p) & (held == h) & ~unsure) for p, h in both]
+    wanted = [np.sum((predicted == p) & (held == h) & ~unsure) for p, h in both]
     assert list(counts.values()) == wanted and min(wanted) > 0
     image = ax.images[0].get_array().T.ravel()
     assert len(np.unique(image)) == len(counts) + 2 + bool(open_)

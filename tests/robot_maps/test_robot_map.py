@@ -1,4 +1,4 @@
-"""Maps of robots: promises against the C engine, closed loops of known ends, and the files."""
+"""Maps of robots: predictions against the C engine, closed loops of known ends, and the files."""
 
 import json
 import shlex
@@ -14,16 +14,17 @@ from scipy.optimize import linprog
 import jaxmpc as jm
 from jaxmpc.app import cli
 from jaxmpc.app.plots import plot_robot_map
-from jaxmpc.robot_maps import OUTCOMES, RobotLoops, map_robot, setting
-from jaxmpc.robot_maps.set_point import deviations, with_initial_limits
-from jaxmpc.robot_maps.setting import RobotSetting
+from jaxmpc.feasible.labels import Labels
+from jaxmpc.robot_maps import OUTCOMES, RobotLoops, map_robot, mapping
+from jaxmpc.robot_maps.linear_problem import deviations, with_initial_limits
+from jaxmpc.robot_maps.mapping import RobotSetting
 
 SECONDS = 0.8
 
 
 @pytest.fixture(scope="module")
 def hanging():
-    """A pendulum that hangs: the tangent of the sine promises more braking than there is."""
+    """A pendulum that hangs: the tangent of the sine predicts more braking than there is."""
     model = jm.load_robot("pendulum").mujoco
     model.opt.gravity[2] *= -1
     robot = jm.load_robot(model, torque=3.0, position=1.5, control_period=0.05)
@@ -55,15 +56,15 @@ def has_plan(mpc, x):
 
 
 @pytest.mark.slow
-def test_promise_is_that_of_the_linear_map(hanging):
+def test_prediction_is_that_of_the_linear_map(hanging):
     robot, mpc, points, _, rmap = hanging
     feasible = np.array([has_plan(mpc, x) for x in points])
     beyond = np.any(np.abs(points) > np.asarray(robot.state_limits.upper), axis=1)
     assert np.any(beyond & feasible), "robot_mpc leaves x_0 free"
-    np.testing.assert_array_equal(rmap.promised, np.where(feasible & ~beyond, 1, -1))
+    np.testing.assert_array_equal(rmap.predicted, np.where(feasible & ~beyond, 1, -1))
     counts = rmap.counts()
     assert sum(sum(row.values()) for row in counts.values()) == len(points)
-    assert counts["promised"]["failed"] == rmap.broken.sum() > 0, "the sine matters"
+    assert counts["predicted"]["failed"] == rmap.broken.sum() > 0, "the sine matters"
     assert rmap.broken[rmap.worst()] and 0 < rmap.depth[rmap.worst()] < 1
     np.testing.assert_array_equal(rmap.outcome == 1, rmap.broken)
 
@@ -90,9 +91,9 @@ def test_loops_equal_the_c_engine(hanging):
             mujoco.mj_step(robot.mujoco, data, robot.substeps)
             excess.append(np.max(np.abs([*data.qpos, *data.qvel]) - limit))
         beyond = np.array(excess) > 1e-6
-        assert rmap.kept[i] == ~beyond.any()
+        assert rmap.within_limits[i] == ~beyond.any()
         assert rmap.loops.broken_at[i] == (np.argmax(beyond) if beyond.any() else -1)
-        if rmap.kept[i]:
+        if rmap.within_limits[i]:
             assert rmap.loops.worst[i] == pytest.approx(max(*excess, 0), abs=1e-9)
 
 
@@ -102,10 +103,10 @@ def test_picture(hanging):
     ax = plot_robot_map(rmap)
     texts = [text.get_text() for text in ax.get_legend().get_texts()]
     count = np.sum(rmap.broken & ~rmap.unsure)
-    broken = f"promise broken: a plan exists,\nthe robot leaves its limits ({count})"
+    broken = f"predicted, failed: a plan exists,\nthe robot leaves its limits ({count})"
     assert broken in texts and "set-point" in texts
     assert ax.get_xlabel() == "theta [rad]" and "0.8 s" in ax.get_title(loc="left")
-    assert "broken promises" in str(rmap)
+    assert "predicted, failed" in str(rmap)
     line = replace(rmap, linear=replace(rmap.linear, x0s=rmap.x0s[:, :1]))
     with pytest.raises(ValueError, match="needs 2"):
         plot_robot_map(line)
@@ -126,14 +127,14 @@ def lecture_with_end(size):
 
 
 @pytest.mark.slow
-def test_linear_robot_keeps_every_promise_with_an_invariant_end():
+def test_linear_robot_keeps_every_prediction_with_an_invariant_end():
     plant, mpc = lecture_with_end(1.0)
     points = jm.grid([-1.0, -1.0], [1.0, 1.0], (12, 12))
     with jax.enable_x64(True):
         controller = jm.RobotController(plant, mpc, jm.ADMM(100, newton_steps=6), "set-point")
     rmap = map_robot(plant, mpc, points, 8.0, controller=controller, chunk=100)
     assert not rmap.broken.any() and rmap.worst() is None
-    assert np.sum(rmap.promised == 1) > 40 and np.all(rmap.recursive[rmap.promised == 1] == 1)
+    assert np.sum(rmap.predicted == 1) > 40 and np.all(rmap.recursive[rmap.predicted == 1] == 1)
 
 
 @pytest.mark.slow
@@ -144,8 +145,8 @@ def test_linear_robot_loses_what_the_linear_recursion_loses():
     rmap = map_robot(plant, mpc, points, 8.0, claim="recursion", chunk=100)
     report = jm.recursive_feasibility(mpc, points, steps=7, search=False, max_regions=0)
     lost = report.lost_at
-    np.testing.assert_array_equal(rmap.promised, np.select([lost == 0, lost > 0], [1, -1], -1))
-    np.testing.assert_array_equal(rmap.held, rmap.promised)
+    np.testing.assert_array_equal(rmap.predicted, np.select([lost == 0, lost > 0], [1, -1], -1))
+    np.testing.assert_array_equal(rmap.held, rmap.predicted)
     later = lost > 0
     assert later.sum() > 4 and np.any(lost == 0)
     np.testing.assert_array_equal(rmap.first_loss[later], lost[later])
@@ -179,8 +180,8 @@ def test_labels_of_loops_by_hand():
     mpc = problems.scalar(horizon=2)
     points = np.zeros((6, 1))
     setting = RobotSetting.of(plant, mpc, points, 0.2)
-    rmap = setting.map(setting.none(), [loops])
-    np.testing.assert_array_equal(rmap.kept, [True, False, False, False, False, True])
+    rmap = setting.map(Labels.empty(6, setting.problem), loops, None, 60.0)
+    np.testing.assert_array_equal(rmap.within_limits, [True, False, False, False, False, True])
     np.testing.assert_array_equal(rmap.recursive, [1, -1, 1, -1, -1, 0])
     assert rmap.plan_counts() == {"SOLVED": 11, "ITERATION_LIMIT": 1}
 
@@ -242,7 +243,7 @@ def run(line):
 @pytest.mark.slow
 def test_command_goes_on_where_it_was_stopped(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(setting, "default_chunk", lambda: 32 * 8)
+    monkeypatch.setattr(mapping, "default_chunk", lambda: 32 * 8)
     real, calls = RobotSetting.run, []
 
     def stopped(self, points, size):
@@ -263,15 +264,17 @@ def test_command_goes_on_where_it_was_stopped(tmp_path, monkeypatch, capsys):
     assert [len(points) for points in calls] == [8, 8, 8, 8], "the first chunk is kept"
     assert run("verify out") == 0
     out = capsys.readouterr().out
-    assert "broken promises" in out and "robot_map.png" in out
+    assert "predicted, failed" in out and "robot_map.png" in out
     summary = json.loads((tmp_path / "out/summary.json").read_text())
-    assert summary["precision"] == "float64" and summary["config"]["samples"] == 5
+    assert summary["precision"] == "float64" and summary["config"]["steps"] == 5
     robot = jm.load_robot("joint")
     with np.load(tmp_path / "out/robot_map.npz") as data:
         found = dict(data)
     limit = np.asarray(robot.state_limits.upper)
-    np.testing.assert_allclose(found["points"], jm.grid(-1.06 * limit, 1.06 * limit, (5, 4)))
-    assert summary["counts"]["promised"]["kept"] == np.sum((found["promised"] == 1) & found["kept"])
+    np.testing.assert_allclose(found["x0s"], jm.grid(-1.06 * limit, 1.06 * limit, (5, 4)))
+    assert summary["counts"]["predicted"]["kept"] == np.sum(
+        (found["predicted"] == 1) & found["within_limits"]
+    )
     assert run("recursion --robot joint --grid 5 4 --horizon 3 --steps 5 --output rec") == 0
     summary = json.loads((tmp_path / "rec/summary.json").read_text())
     assert summary["claim"] == "recursion" and "law" in summary["linear"]["recursion"]
@@ -286,9 +289,9 @@ def test_command_goes_on_where_it_was_stopped(tmp_path, monkeypatch, capsys):
         ("sweep --robot jont", "is no file"),
         ("sweep --robot joint --axes elbow --grid 4", "no coordinate 'elbow'"),
         ("sweep --robot joint --axes 0 0", "repeats"),
-        ("sweep --robot joint --grid 4", "--grid"),
-        ("sweep --robot joint --fixed 1", "--fixed"),
-        ("sweep --robot joint --lower 2 2 --upper 1 1", "--lower"),
+        ("sweep --robot joint --grid 4", "grid: has 1 entries"),
+        ("sweep --robot joint --fixed 1", "fixed: has 1 entries"),
+        ("sweep --robot joint --lower 2 2 --upper 1 1", "lower: [2.0, 2.0] not below"),
         ("sweep --robot joint --seconds -1", "seconds"),
         ("sweep --robot joint --terminal ellipsoid", "ellipsoid"),
         ("sweep --robot joint --resume --overwrite", "--overwrite"),

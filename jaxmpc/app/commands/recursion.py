@@ -20,7 +20,7 @@ from jaxmpc.app.commands.options import (
     print_table,
     refuse,
 )
-from jaxmpc.app.commands.robot_map import RobotMapCommand
+from jaxmpc.app.commands.robot_map import map_robot_into
 from jaxmpc.app.config.states import recursion_states
 from jaxmpc.checks import fail
 from jaxmpc.feasible.problem import FeasibilityProblem
@@ -82,10 +82,10 @@ class Recursion:
       Exit code       0 done, for any answer; 2 error (one line on stderr says which); 130
                       stopped by Ctrl-C (nothing is kept).
 
-    With --robot NAME or FILE: the promise and the robot
+    With --robot NAME or FILE: the prediction and the robot
       Such as jaxmpc recursion --robot pendulum --horizon 40 --steps 100
-      As in jaxmpc sweep --help, with another promise: the linear closed loop has a plan at each
-      of --steps samples (of the robot's control period). The robot keeps the promise where each
+      As in jaxmpc sweep --help, with another prediction: the linear closed loop has a plan at each
+      of --steps time steps (of the robot's control period). The robot does the same where each
       plan of its own loop is solved without violating a limit. Same files, and robot_map.png.
 
     What the TOML file holds
@@ -96,7 +96,7 @@ class Recursion:
     config: Annotated[Path | None, option("FILE", "the built-in joint")] = None
     """TOML file with the problem."""
     robot: Annotated[str | None, option("NAME|FILE", "none, a linear system")] = None
-    """Map a robot instead, linear promise against nonlinear closed loop."""
+    """Map a robot instead, linear prediction against nonlinear closed loop."""
     output: Annotated[Path, option("DIR", "jaxmpc-recursion")] = Path("jaxmpc-recursion")
     """Folder for the files; made where absent."""
     horizon: Horizon = None
@@ -150,7 +150,7 @@ class Recursion:
         check_positive(self, "seconds")
         check_counts(self, smallest=1)
         if self.robot is not None:
-            self.robot_map(self.robot).run()
+            self.map_robot(self.robot)
             return
         given = {"axes": self.axes, "fixed": self.fixed, "resume": self.resume}
         refuse(given, None, "It is for maps of robots")
@@ -183,15 +183,16 @@ class Recursion:
         rows.append(("files", " ".join(str(self.output / name) for name in files)))
         print_table(rows, 20)
 
-    def robot_map(self, robot: str) -> RobotMapCommand:
-        """Return the map of --robot. Raises ValueError for options that do not go with it."""
+    def map_robot(self, robot: str) -> None:
+        """Make the map of --robot. Raises ValueError for options that do not go with it."""
         given = {"config": self.config, "smallest": self.smallest, "regions": self.regions}
         refuse(given, robot, "Claims about all states are those of a linear problem")
-        return RobotMapCommand(
-            robot, self.output, "recursion", steps=100 if self.steps is None else self.steps,
-            horizon=self.horizon, terminal=self.terminal, axes=self.axes, values=self.fixed,
+        check_counts(self, horizon=1, steps=1)
+        map_robot_into(
+            robot, self.output, claim="recursion", steps=100 if self.steps is None else self.steps,
+            horizon=self.horizon, terminal=self.terminal, axes=self.axes, fixed=self.fixed,
             grid=self.grid, lower=self.lower, upper=self.upper, resume=self.resume,
-            overwrite=self.overwrite, search_seconds=self.seconds or 60.0,
+            overwrite=self.overwrite, search_seconds=self.seconds,
         )  # fmt: skip
 
     def save(

@@ -16,12 +16,14 @@ from jaxmpc.app.commands.options import (
     Horizon,
     Switch,
     Terminal,
+    check_counts,
+    check_positive,
     chosen_shard,
     given_options,
     option,
     refuse,
 )
-from jaxmpc.app.commands.robot_map import RobotMapCommand
+from jaxmpc.app.commands.robot_map import map_robot_into
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import require_disk
 
@@ -60,25 +62,26 @@ class Sweep:
       jaxmpc verify DIR proves every label again, from these files alone.
       Exit code     0 done, 2 error (one line on stderr says which), 130 stopped by Ctrl-C.
 
-    With --robot NAME or FILE: the promise and the robot
+    With --robot NAME or FILE: the prediction and the robot
       Such as jaxmpc sweep --robot pendulum --terminal invariant --seconds 2
       The MPC of a robot (joint, pendulum, cartpole, arm2, arm6, arm7, quadrotor, or an MJCF or
       URDF file), linear about its home, weights from its limits. The grid is a slice: the first
       joint's position and velocity unless --axes says otherwise, the rest at home unless --fixed.
       Each state is labelled as above, by the linear model, and by the closed loop of the
       nonlinear robot in MJX: are all its limits kept for --seconds? Costs about 0.3 ms a state
-      and sample on one CPU core, after compiling, which is announced. What is compiled is kept
+      and time step on one CPU core, after compiling, which is announced. What is compiled is kept
       for the next time, see jaxmpc simulate --help.
-      robot_map.png  Blue: promise kept. Red: promise broken (feasible by the linear model, the
-                     robot leaves its limits); orange: the same, but a plan before that was not
+      robot_map.png  Blue: predicted, kept. Red: predicted, failed (feasible by the linear model,
+                     the robot leaves its limits); orange: the same, but a plan before that was not
                      solved, so that the solver may be to blame. Grey: infeasible, and the robot
                      fails. Green: infeasible, yet the robot keeps its limits. Yellow: the linear
-                     model's label is undecided. Circle: the broken promise deepest in the linear
-                     feasible set.
-                     Without an invariant terminal set a plan promises its horizon only.
-      summary.json   Counts, plans by status, deepest broken promise, configuration.
-      robot_map.npz  points, states, promised, held (1 yes, -1 no, 0 undecided), kept, recursive,
-                     feasible, depth, worst (most beyond a limit), broken_at, lost_at, unsolved_at.
+                     model's label is undecided. Circle: of what was predicted and failed, the
+                     state deepest in the linear feasible set.
+                     Without an invariant terminal set a plan covers its horizon only.
+      summary.json   Counts, plans by status, deepest failure, configuration.
+      robot_map.npz  x0s, states, predicted, held (1 yes, -1 no, 0 undecided), within_limits,
+                     recursive, feasible, depth, worst (most beyond a limit), broken_at, lost_at,
+                     unsolved_at.
       robot_map.zarr The state for --resume: a killed run loses one chunk of 256 states.
 
     What the TOML file holds (n states, m inputs; dt in seconds, other units are yours)
@@ -98,7 +101,7 @@ class Sweep:
     config: Annotated[Path | None, option("FILE", "the built-in joint")] = None
     """TOML file with the problem and the sweep."""
     robot: Annotated[str | None, option("NAME|FILE", "none, a linear system")] = None
-    """Map a robot instead, linear promise against nonlinear closed loop."""
+    """Map a robot instead, linear prediction against nonlinear closed loop."""
     seconds: Annotated[float | None, option("S", "2")] = None
     """With --robot: length of its closed loops."""
     output: Annotated[Path, option("DIR", "jaxmpc-sweep")] = Path("jaxmpc-sweep")
@@ -159,7 +162,7 @@ class Sweep:
         Raises ValueError for options and files that make no sense.
         """
         if self.robot is not None:
-            self.robot_map(self.robot).run()
+            self.map_robot(self.robot)
             return
         refuse({"seconds": self.seconds}, None, "It is how long a robot's loops last")
         chosen_devices(self.devices, "--devices")
@@ -177,16 +180,17 @@ class Sweep:
         shard = None if self.shard is None else chosen_shard(self.shard, os.environ)
         return LinearSweep.open(config, self.output, self.resume, self.overwrite, shard, self.store)
 
-    def robot_map(self, robot: str) -> RobotMapCommand:
-        """Return the map of --robot. Raises ValueError for options that do not go with it."""
+    def map_robot(self, robot: str) -> None:
+        """Make the map of --robot. Raises ValueError for options that do not go with it."""
         given = {"config": self.config, "projection": self.projection}
         refuse(given, robot, "Give a problem or a robot; a robot's map is a slice")
         refuse({"shard": self.shard, "store": self.store}, robot, "They are for linear maps")
         chosen_devices(self.devices, "--devices")
-        return RobotMapCommand(
-            robot, self.output, "limits", seconds=self.seconds, horizon=self.horizon,
-            terminal=self.terminal, axes=self.axes, values=self.fixed, grid=self.grid,
-            lower=self.lower, upper=self.upper, refine=self.refine, resume=self.resume,
-            overwrite=self.overwrite, devices=self.devices,
-            settings=given_options(self, "iterations", "dtype"),
+        check_counts(self, horizon=1)
+        check_positive(self, "seconds")
+        map_robot_into(
+            robot, self.output, seconds=self.seconds, horizon=self.horizon, terminal=self.terminal,
+            axes=self.axes, fixed=self.fixed, grid=self.grid, lower=self.lower, upper=self.upper,
+            refine=self.refine, resume=self.resume, overwrite=self.overwrite,
+            devices=self.devices, iterations=self.iterations, dtype=self.dtype,
         )  # fmt: skip

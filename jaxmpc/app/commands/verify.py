@@ -115,7 +115,7 @@ def contradictions(attributes: Mapping[str, Any], axes: Mapping[str, np.ndarray]
                   file=sys.stderr)  # fmt: skip
             return []
         else:
-            from jaxmpc.app.commands.robot_map import problem_again  # a third of a second
+            from jaxmpc.robot_maps.stored_sweep import problem_again  # a third of a second
 
             if config["horizon"] != problem.get("horizon"):
                 raise ValueError(f"horizon {shown(config['horizon'])}, the problem says "

@@ -1,14 +1,14 @@
 """Initial states of the commands sweep and recursion: grids over the state limits."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxmpc.app.config.problem import Config
 from jaxmpc.app.config.sections import RecursionSection, SweepSection
-from jaxmpc.checks import fail
+from jaxmpc.feasible.grids import axis_indices, grid_ends
 from jaxmpc.feasible.map import grid, mesh
 
 
@@ -70,27 +70,6 @@ def mapped_axes(config: Config) -> tuple[int, ...]:
     return axis_indices("sweep.axes", "state", given, config.system.state_names or (), n)
 
 
-def axis_indices(
-    where: str, what: str, given: Sequence[int | str], names: Sequence[str], n: int
-) -> tuple[int, ...]:
-    """Return the indices of axes that are given by name or by index below n.
-
-    where, what: the option and the kind of axis, for the ValueError that is raised for an axis
-    which does not exist or is repeated.
-    """
-    names = list(names)
-    known = f"{what.capitalize()}s are {', '.join(map(str, [*names, *range(n)]))}"
-    axes = []
-    for axis in given:
-        i = names.index(str(axis)) if axis in names else int(axis) if f"{axis}".isdecimal() else -1
-        if not 0 <= i < n:
-            fail(where, f"no {what} {axis!r}", known)
-        axes.append(i)
-    if not axes or len(set(axes)) != len(axes):
-        fail(where, f"{list(given)} repeats a {what} or is empty", known)
-    return tuple(axes)
-
-
 def section_ends(
     config: Config, axes: Sequence[int], section: SweepSection | RecursionSection
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -98,26 +77,3 @@ def section_ends(
     where = "sweep." if isinstance(section, SweepSection) else "recursion."
     limits = lambda: tuple(end[list(axes)] for end in config.state_range())
     return grid_ends(where, section.lower, section.upper, limits)
-
-
-def grid_ends(
-    where: str, lower: Sequence[float] | None, upper: Sequence[float] | None,
-    limits: Callable[[], tuple[np.ndarray, ...]],
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Return the corners of a grid: as given, else the limits widened by 3 % on each side.
-
-    where: what stands before lower and upper in the ValueError that is raised where an end is not
-    finite, or lower not below upper.
-    """
-    ends = limits() if lower is None or upper is None else (lower, upper)
-    low, high = (np.asarray(end, float) for end in ends)
-    room = 0.03 * np.where(np.isfinite(low) & np.isfinite(high), high - low, 0.0)
-    low = np.asarray(low - room if lower is None else lower)
-    high = np.asarray(high + room if upper is None else upper)
-    if not np.all(np.isfinite([low, high])):
-        cure = f"Give {where}lower and {where}upper: the limits do not bound the mapped axes"
-        fail(f"{where}lower", "no finite range to map", cure)
-    if np.any(low >= high):
-        what = f"{low.tolist()} not below upper {high.tolist()}"
-        fail(f"{where}lower", what, "Lower must be below upper")
-    return low, high

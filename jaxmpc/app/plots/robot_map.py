@@ -1,4 +1,4 @@
-"""The plot of a robot map: what the linear model promises and what the robot does."""
+"""The plot of a robot map: what the linear model predicts and what the robot does."""
 
 from typing import Any
 
@@ -27,14 +27,14 @@ BROKEN, UNSURE, BETTER = "#cc4b1c", "#f0a868", "#8ccfae"
 
 
 def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
-    """Draw a map of two coordinates: what the linear model promises and what the robot did.
+    """Draw a map of two coordinates: what the linear model predicts and what the robot did.
 
-    Blue: promise kept. Red: promise broken; orange: after a plan that was not solved. Grey: no
-    promise, and the robot fails. Green: no promise, yet the robot does it. Purple: a plan of the
-    robot was not solved, so that its claim is open. Yellow: the linear promise is undecided. Lines
-    as in `plot_feasible_set`: inner and outer bound of the linear feasible set, and the terminal
-    set. The circle is the broken promise deepest in that set, the cross the set-point. Without
-    `ax` a new figure is made. Raises ValueError for a map not of two coordinates.
+    Blue: predicted, kept. Red: predicted, failed; orange: after a plan that was not solved. Grey:
+    not predicted, and the robot fails. Green: not predicted, yet the robot does it. Purple: a plan
+    of the robot was not solved, so that its claim is open. Yellow: the linear prediction is
+    undecided. Lines as in `plot_feasible_set`: inner and outer bound of the linear feasible set,
+    and the terminal set. The circle is the failure deepest in that set, the cross the set-point.
+    Without `ax` a new figure is made. Raises ValueError for a map not of two coordinates.
     """
     points = rmap.x0s
     if points.shape[1] != 2:
@@ -61,9 +61,7 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
     )]  # fmt: skip
     worst = rmap.worst()
     if worst is not None:
-        name = (
-            f"deepest broken promise,\nfails after {rmap.first_loss[worst] * rmap.robot.dt:.3g} s"
-        )
+        name = f"deepest failure,\nfails after {rmap.first_loss[worst] * rmap.robot.dt:.3g} s"
         marks.append(
             (points[worst], name, {"marker": "o", "ms": 6, "mfc": "white", "mec": "black"})
         )
@@ -81,30 +79,30 @@ def _outcomes(rmap: RobotMap) -> list[tuple[str, str, np.ndarray]]:
     """Return what can become of a state: words, colour, and which states it is, (B,)."""
     if rmap.claim == "limits":
         words = (
-            "promise kept: a plan exists,\nthe robot keeps its limits",
-            "promise broken: a plan exists,\nthe robot leaves its limits",
+            "predicted, kept: a plan exists,\nthe robot keeps its limits",
+            "predicted, failed: a plan exists,\nthe robot leaves its limits",
             "infeasible, and the robot\nleaves its limits",
             "infeasible, yet the robot\nkeeps its limits",
             "linear model undecided:\nno plan and no proof found",
         )  # fmt: skip
     else:
         words = (
-            "promise kept: the robot has\na plan at each sample",
-            "promise broken: the robot's\nplans run out",
+            "predicted, kept: the robot has\na plan at each time step",
+            "predicted, failed: the robot's\nplans run out",
             "plans run out on the linear\nmodel, and on the robot",
             "plans run out on the linear\nmodel, not on the robot",
             "linear closed loop undecided",
         )  # fmt: skip
-    promised, held = rmap.promised, rmap.held
-    unsure = rmap.unsure & (promised == 1)
+    predicted, held = rmap.predicted, rmap.held
+    unsure = rmap.unsure & (predicted == 1)
     found = [
-        (words[0], FEASIBLE, (promised == 1) & (held == 1)),
-        (words[1], BROKEN, (promised == 1) & (held == -1) & ~unsure),
+        (words[0], FEASIBLE, (predicted == 1) & (held == 1)),
+        (words[1], BROKEN, (predicted == 1) & (held == -1) & ~unsure),
         ("the same, but after a plan\nthat was not solved", UNSURE, unsure),
-        (words[2], INFEASIBLE, (promised == -1) & (held == -1)),
-        (words[3], BETTER, (promised == -1) & (held == 1)),
-        ("a plan of the robot\nwas not solved", NOT_SOLVED, (promised != 0) & (held == 0)),
-        (words[4], UNDECIDED, promised == 0),
+        (words[2], INFEASIBLE, (predicted == -1) & (held == -1)),
+        (words[3], BETTER, (predicted == -1) & (held == 1)),
+        ("a plan of the robot\nwas not solved", NOT_SOLVED, (predicted != 0) & (held == 0)),
+        (words[4], UNDECIDED, predicted == 0),
     ]
     assert np.all(sum(where.astype(int) for _, _, where in found) == 1)
     return found

@@ -1,0 +1,213 @@
+"""Make a robot map: the linear labels and the robot's closed loops, part by part."""
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from tqdm.std import tqdm
+
+from jaxmpc.arrays import Reals, host_array
+from jaxmpc.batches import default_chunk, first_rows, padded
+from jaxmpc.checks import fail, require_shape
+from jaxmpc.closed_loop.many import simulate_many
+from jaxmpc.closed_loop.robot_controller import RobotController
+from jaxmpc.feasible.labels import Labels
+from jaxmpc.feasible.map import FeasibleSetMap
+from jaxmpc.feasible.pipeline import Scope, label_chunks
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import record
+from jaxmpc.recursion.analysis import examine
+from jaxmpc.recursion.budget import Budget
+from jaxmpc.robot_maps.linear_problem import deviations, home_coordinates, with_initial_limits
+from jaxmpc.robot_maps.robot_loops import RobotLoops
+from jaxmpc.robot_maps.robot_map import CLAIMS, RobotMap
+from jaxmpc.robots.linear_plant import LinearPlant
+from jaxmpc.robots.robot import Robot
+
+
+def map_robot(
+    robot: Robot | LinearPlant,
+    mpc: MPC,
+    x0s: Reals,
+    seconds: float = 2.0,
+    *,
+    controller: RobotController | None = None,
+    target: Reals | None = None,
+    axes: Sequence[int] | None = None,
+    fixed: Reals | None = None,
+    claim: str = "limits",
+    chunk: int | None = None,
+    gap: float | None = None,
+    search_seconds: float = 60.0,
+    progress: bool = False,
+) -> RobotMap:
+    """Label each state twice: what the linear model of `mpc` predicts, and what the robot does.
+
+    Arguments:
+        mpc: hard limits, linear about the set-point, from `robot_mpc` (target: as given there).
+        x0s: points (B, d) in coordinates ξ. axes: indices of the d mapped coordinates, None for
+            all; fixed (n,): values of the others, None for those of `robot.home`.
+        seconds: length T·dt of the closed loops, in which home (or target) is held as reference.
+        controller: None for a RobotController at the set-point, in float64. Another one decides
+            the precision of the loops, by its dtype.
+        claim: "limits": the linear model has a plan over the horizon (`map_feasible_set`), and the
+            robot keeps all its limits for `seconds`. A plan over N steps implies that for the
+            linear model only if the problem is recursively feasible, as with an invariant terminal
+            set. "recursion": the linear closed loop has a plan at each of T time steps
+            (`recursive_feasibility`, which spends at most about search_seconds on claims about all
+            states), and so has the robot.
+        chunk: loops that run at once (None: 256 on a CPU, 8192 on a GPU). gap: as in
+            `map_feasible_set`.
+
+    Both labels apply the robot's limits to x_0 too, which `robot_mpc` does not: a state beyond them
+    is neither feasible nor within limits. A limit counts as kept up to 1e-6 (float32: 1e-4) in its
+    units. Raises ValueError for wrong arguments before anything compiles.
+    """
+    setting = RobotSetting.of(
+        robot, mpc, x0s, seconds, controller=controller, target=target, axes=axes, fixed=fixed,
+        claim=claim,
+    )  # fmt: skip
+    labels, loops = [], []
+    with tqdm(total=len(setting.x0s), unit=" loops", disable=not progress) as bar:
+        for part in setting.parts(setting.x0s, setting.chunk(chunk)):
+            labels.append(part[0])
+            loops.append(part[1])
+            bar.update(len(part[0].label))
+    return setting.map(Labels.joined(labels), RobotLoops.joined(loops), gap, search_seconds)
+
+
+@record
+class RobotSetting:
+    """A checked description of a map, for callers who compute and store it part by part.
+
+    mpc: the linear problem with the robot's limits on x_0; problem: its feasibility problem.
+    reference (n,), input_reference (m,): the set-point. The rest is that of `map_robot`.
+    """
+
+    robot: Robot | LinearPlant
+    mpc: MPC
+    problem: FeasibilityProblem
+    controller: RobotController
+    x0s: np.ndarray
+    reference: np.ndarray
+    input_reference: np.ndarray
+    steps: int
+    claim: str
+
+    @classmethod
+    def of(
+        cls,
+        robot: Robot | LinearPlant,
+        mpc: MPC,
+        x0s: Reals,
+        seconds: float,
+        *,
+        controller: RobotController | None = None,
+        target: Reals | None = None,
+        axes: Sequence[int] | None = None,
+        fixed: Reals | None = None,
+        claim: str = "limits",
+    ) -> "RobotSetting":
+        """Check the arguments of `map_robot`. Raises ValueError; compiles no loop."""
+        if not isinstance(robot, Robot | LinearPlant):
+            fail("robot", f"is a {type(robot).__name__}", "Give a Robot or a LinearPlant")
+        if claim not in CLAIMS:
+            fail("claim", f"{claim!r}", f"Give one of {', '.join(CLAIMS)}")
+        mpc.validate()
+        if (mpc.system.n, mpc.system.m) != (robot.n, robot.m):
+            sizes, needed = (mpc.system.n, mpc.system.m), (robot.n, robot.m)
+            fail("mpc", f"has {sizes} states and inputs", f"This robot has {needed}: see robot_mpc")
+        if mpc.input_in_state:
+            fail("mpc", "limits or weighs input rates", "A state alone decides nothing then")
+        number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
+        if not number or not 0 < seconds < math.inf:
+            fail("seconds", f"{seconds!r}", "Give a positive number")
+        x, u = robot.equilibrium(target)
+        with jax.enable_x64(True):
+            reference = np.asarray(robot.coordinates(np.asarray(x)), np.float64)
+        limited = with_initial_limits(mpc, robot.state_limits)
+        if axes is not None and fixed is None and len(set(axes)) < robot.n:
+            fixed = home_coordinates(robot)
+        if fixed is not None:
+            require_shape("fixed", fixed, (robot.n,), "One value a coordinate")
+        problem = FeasibilityProblem.of(limited, axes, fixed)
+        d = problem.dimension
+        x0s = host_array("x0s", x0s)
+        if x0s.ndim != 2 or x0s.shape[1] != d or not len(x0s):
+            cure = f"Give points (B, {d}), B ≥ 1, one column a mapped coordinate"
+            fail("x0s", f"shape {x0s.shape}", cure)
+        if controller is None:
+            with jax.enable_x64(True):
+                controller = RobotController(robot, mpc, linearize="set-point")
+        setting = cls(
+            robot, limited, problem, controller, x0s, reference, np.asarray(u),
+            max(1, round(seconds / robot.dt)), claim,
+        )  # fmt: skip
+        if claim == "recursion":
+            setting.deviations()
+        return setting
+
+    @property
+    def dtype(self) -> str:
+        """Return the precision of the loops: that of the controller's numbers."""
+        with jax.enable_x64(True):  # outside it JAX calls float64 numbers float32
+            return str(np.dtype(self.controller.dtype))
+
+    def chunk(self, chunk: int | None = None) -> int:
+        """Return how many loops run at once."""
+        if chunk is not None and (isinstance(chunk, bool) or chunk < 1):
+            fail("chunk", f"{chunk}", "Give a count of at least 1")
+        return min(default_chunk() // 32 if chunk is None else int(chunk), len(self.x0s))
+
+    def parts(
+        self, x0s: np.ndarray, size: int, devices: Any = None, **settings: Any
+    ) -> Iterator[tuple[Labels, RobotLoops]]:
+        """Yield labels and loops of points (b, d), `size` at a time, in one shape throughout.
+
+        devices: as in `map_feasible_set`. settings: iterations, dtype of the linear labels, as
+        there.
+        """
+        scope = Scope.of(self.x0s, -(-len(self.x0s) // size))
+        labelled = label_chunks(
+            self.problem, x0s, chunk=size, scope=scope, devices=devices, **settings
+        )
+        for here, labels in labelled:
+            yield labels, self.run(x0s[here], size, devices)
+
+    def run(self, x0s: np.ndarray, size: int, devices: Any = None) -> RobotLoops:
+        """Simulate closed loops from points (b, d), b ≤ size, filled up to `size` of them."""
+        with jax.enable_x64(self.dtype == "float64"):
+            xi = padded(self.problem.view.states(x0s).astype(self.dtype), size)
+            start = xi
+            if self.robot.state_size != self.robot.n:
+                start = np.asarray(jax.vmap(self.robot.state)(xi))
+            run = simulate_many(
+                self.controller, self.robot, start, self.steps, devices=devices,
+                reference=self.reference.astype(self.dtype),
+                input_reference=self.input_reference.astype(self.dtype),
+            )  # fmt: skip
+            return RobotLoops.of(first_rows(run, len(x0s)), self.robot, self.dtype)
+
+    def map(
+        self, labels: Labels, loops: RobotLoops, gap: float | None, search_seconds: float
+    ) -> RobotMap:
+        """Return the map with these labels and loops, its bounds refined unless gap is None, and
+        examine the recursion of the linear problem where the claim is that."""
+        linear = FeasibleSetMap.of(self.problem, self.x0s, labels)
+        report = None
+        if self.claim == "recursion":
+            # Plans at T time steps: that at the first, and T − 1 after it.
+            states = self.problem.view.states(self.x0s) - self.reference
+            end = time.monotonic() + search_seconds
+            budget, steps = Budget.of(np.inf), max(self.steps - 1, 1)
+            report = examine(self.deviations(), states, steps, False, 0, budget, end)
+        linear = linear if gap is None else linear.refine(gap)
+        return RobotMap(self.robot, self.claim, linear, report, loops, self.steps, self.reference)
+
+    def deviations(self) -> MPC:
+        """Return the linear problem about its set-point, whose law regulates to the origin."""
+        return deviations(self.mpc, self.reference, self.input_reference)

@@ -1,0 +1,224 @@
+"""Sweep a grid of states of a robot into a folder, block by block, to be resumed.
+
+robot_map.zarr   what is known of each state; what --resume goes on from
+robot_map.npz    the same as arrays, and what follows from it
+summary.json     counts and the configuration
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm.std import tqdm
+
+from jaxmpc import store
+from jaxmpc.arrays import Reals, host_array
+from jaxmpc.batches import Compiled, first_rows
+from jaxmpc.checks import fail, whole
+from jaxmpc.feasible.grids import axis_indices, grid_ends
+from jaxmpc.feasible.map import mesh
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.files import (
+    check_results,
+    open_folder,
+    remove_files,
+    versions,
+    write_arrays,
+    write_results,
+)
+from jaxmpc.qp.status import Status
+from jaxmpc.recursion.budget import Budget
+from jaxmpc.robot_maps.linear_problem import home_coordinates, mpc_with_terminal
+from jaxmpc.robot_maps.mapping import RobotSetting
+from jaxmpc.robot_maps.robot_loops import RobotLoops
+from jaxmpc.robot_maps.robot_map import RobotMap
+from jaxmpc.robots.load import load_robot, model_hash
+from jaxmpc.robots.robot import Robot
+
+# Points along each of two axes; total number of points for another number of axes.
+SIDE, POINTS = 32, 1024
+FILES = "summary.json", "robot_map.npz", "robot_map.png"
+# What the store has of each closed loop, beside the labels.
+LOOPS = {
+    name: store.Field((), "int64", -1, (), {"long_name": text})
+    for name, text in (
+        ("broken_at", "time step at which the robot leaves its limits; -1: never"),
+        ("lost_at", "time step at which a plan is not within the limits; -1: never"),
+        ("unsolved_at", "time step at which a plan is not solved; -1: never"),
+    )
+}
+LOOPS["worst"] = store.Field((), "float64", np.nan, (), {"long_name": "most beyond a limit"})
+LOOPS["statuses"] = store.Field(
+    (len(Status),), "int64", 0, ("kind",), {"long_name": "number of plans by status"}
+)
+
+
+def sweep_robot(
+    robot: str,
+    folder: Path | str,
+    *,
+    claim: str = "limits",
+    seconds: float = 2.0,
+    steps: int | None = None,
+    horizon: int = 20,
+    terminal: str = "none",
+    axes: Sequence[str | int] | None = None,
+    fixed: Reals | None = None,
+    grid: Sequence[int] | None = None,
+    lower: Reals | None = None,
+    upper: Reals | None = None,
+    gap: float | None = 1e-6,
+    search_seconds: float = 60.0,
+    resume: bool = False,
+    overwrite: bool = False,
+    devices: int | None = None,
+    progress: bool = False,
+    **settings: Any,
+) -> RobotMap:
+    """Map a robot over a grid of states (`map_robot`), and keep each block in a folder when done.
+
+    Arguments:
+        robot: as in `load_robot`. folder: is made where absent.
+        claim, search_seconds: as in `map_robot`; gap: likewise, for up to three axes.
+        seconds: length of the closed loops; or steps: their number of time steps.
+        horizon, terminal: of the MPC of `robot_mpc`; "none", "box" or "invariant" about home.
+        axes: coordinates by name or index; None: position and velocity of the first joint. fixed:
+            values of the other coordinates, in their order; None: those of home.
+        grid: points along each axis, ends included. lower, upper: its ends; None: the limits, 3 %
+            wider on each side.
+        resume: go on with the map in the folder. overwrite: replace it, once there are results.
+        devices: as in `map_feasible_set`, and so are settings: iterations and dtype of the linear
+            labels. progress: say on stderr what is done.
+
+    Raises ValueError for wrong arguments before anything compiles, where there is a map and neither
+    resume nor overwrite, and for another map than the one to resume.
+    """
+    budget = Budget.of(np.inf, progress)
+    folder = Path(folder)
+    path = folder / "robot_map.zarr"
+    check_results(path, resume, overwrite)
+    plant = load_robot(robot)
+    names, n = plant.state_names, plant.n
+    mapped = axis_indices("axes", "coordinate", axes or (names[0], names[n // 2]), names, n)
+    along = _grid_lines(plant, mapped, grid, lower, upper)
+    others = [i for i in range(n) if i not in mapped]
+    whole("horizon", horizon, 1)
+    if terminal == "ellipsoid":
+        fail("terminal", "ellipsoid: a robot's limits are soft rows", "Give invariant or box")
+    if steps is not None:
+        seconds = whole("steps", steps, 1) * plant.dt
+    at = home_coordinates(plant)
+    if fixed is not None:
+        values = host_array("fixed", fixed)
+        if values.shape != (len(others),):
+            what = f"has {values.size} entries where {len(others)} are needed"
+            fail("fixed", what, "One for each coordinate that is not on an axis")
+        at[others] = values
+    mpc = mpc_with_terminal(plant, horizon, terminal)
+    setting = RobotSetting.of(plant, mpc, mesh(along), seconds, axes=mapped, fixed=at, claim=claim)
+    config = {
+        "robot": robot,
+        "claim": claim,
+        "steps": setting.steps,
+        "horizon": horizon,
+        "terminal": terminal,
+        "axes": [names[i] for i in mapped],
+        "fixed": {names[i]: float(at[i]) for i in others},
+        "lower": [float(line[0]) for line in along],
+        "upper": [float(line[-1]) for line in along],
+        "Q": np.diag(mpc.Q).tolist(),
+        "R": np.diag(mpc.R).tolist(),
+        "model": model_hash(plant),
+        "home": np.asarray(plant.home).tolist(),
+        "period": plant.dt,
+        **settings,
+    }
+    open_folder(folder)
+    blocks = store.open_labels(
+        path, setting.problem, along, config, setting.chunk(), LOOPS, overwrite=overwrite,
+        begun=lambda: remove_files(folder, *FILES),
+    )  # fmt: skip
+    store.report_damage(blocks)
+    with blocks:
+        count = f"{len(setting.x0s):,} states, {setting.steps} time steps"
+        budget.say(f"{plant.name}: {count} -> {folder}")
+        _label(setting, blocks, budget, devices, settings)
+        if claim == "recursion":
+            budget.say("linear model: closed loops and a search for counterexamples, which compile")
+        loops = RobotLoops(**{field.name: blocks.read(field.name) for field in fields(RobotLoops)})
+        gap = gap if len(mapped) <= 3 else None
+        found = setting.map(blocks.labels(), loops, gap, search_seconds)
+    _save(folder, setting, found, config)
+    return found
+
+
+def _grid_lines(
+    robot: Robot, axes: tuple[int, ...], grid: Any, lower: Any, upper: Any
+) -> list[np.ndarray]:
+    """Return the coordinates of the grid along each axis. Raises ValueError for arguments of other
+    sizes."""
+    d = len(axes)
+    shape = tuple(grid or ((SIDE, SIDE) if d == 2 else (int(POINTS ** (1 / d)),) * d))
+    for name, value in (("grid", shape), ("lower", lower), ("upper", upper)):
+        if value is not None and len(value) != d:
+            what = f"has {len(value)} entries where {d} are needed"
+            fail(name, what, "One for each axis")
+    box = robot.state_limits
+    low, high = grid_ends(
+        "", lower, upper, lambda: tuple(np.asarray(v)[list(axes)] for v in (box.lower, box.upper))
+    )
+    return [np.linspace(*line) for line in zip(low, high, shape, strict=True)]
+
+
+def _label(
+    setting: RobotSetting, blocks: store.Store, budget: Budget, devices: Any,
+    settings: Mapping[str, Any],
+) -> None:  # fmt: skip
+    """Label the blocks that are not done, and commit each."""
+    todo, index = blocks.batches()
+    if not todo:
+        return
+    budget.say("compiling labels and closed loops")
+    before = Compiled.seconds
+    parts = setting.parts(setting.x0s[index.ravel()], index.shape[1], devices, **settings)
+    total = sum(here.stop - here.start for _, here in todo)
+    with tqdm(total=total, unit=" loops", disable=None if budget.progress else True) as bar:
+        for (block, here), (labels, loops) in zip(todo, parts, strict=True):
+            count = here.stop - here.start
+            fields_of_loops = first_rows(vars(loops), count)
+            blocks.commit(block, **store.label_rows(labels.first(count)), **fields_of_loops)
+            if bar.n == 0:
+                budget.say(f"first block done; {Compiled.seconds - before:.0f} s of compiling")
+            bar.update(count)
+
+
+def _save(folder: Path, setting: RobotSetting, found: RobotMap, config: dict[str, Any]) -> None:
+    """Write robot_map.npz and summary.json."""
+    write_arrays(
+        folder / "robot_map.npz", x0s=found.x0s, states=found.states,
+        predicted=found.predicted, held=found.held, within_limits=found.within_limits,
+        recursive=found.recursive, feasible=found.linear.label, depth=found.depth,
+        **vars(found.loops),
+    )  # fmt: skip
+    run = {"precision": setting.dtype, "config": config, "versions": versions()}
+    write_results(folder / "summary.json", found.summary() | run)
+
+
+def problem_again(config: Mapping[str, Any], x0s: np.ndarray) -> FeasibilityProblem:
+    """Build the problem of a map of points (B, d) from its stored configuration alone. Raises
+    ValueError, KeyError or TypeError for one that makes none."""
+    robot = load_robot(config["robot"])
+    names, fixed = robot.state_names, home_coordinates(robot)
+    for name, value in config["fixed"].items():
+        fixed[names.index(name)] = value
+    return RobotSetting.of(
+        robot,
+        mpc_with_terminal(robot, config["horizon"], config["terminal"]),
+        x0s,
+        config["steps"] * robot.dt,
+        axes=tuple(names.index(name) for name in config["axes"]),
+        fixed=fixed,
+        claim=config["claim"],
+    ).problem
