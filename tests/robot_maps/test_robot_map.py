@@ -246,11 +246,11 @@ def test_command_goes_on_where_it_was_stopped(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(mapping, "default_chunk", lambda: 32 * 8)
     real, calls = RobotSetting.run, []
 
-    def stopped(self, points, size):
+    def stopped(self, points, size, devices=None):
         calls.append(points)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return real(self, points, size)
+        return real(self, points, size, devices)
 
     monkeypatch.setattr(RobotSetting, "run", stopped)
     line = "sweep --robot joint --grid 5 4 --horizon 3 --seconds 0.05 --output out"
