@@ -5,8 +5,8 @@ exact_penalty        the least weight on slacks that keeps limits that can be ke
 Law                  plans, and the affine law on the region of a given state -> AffinePiece
 """
 
+from jaxmpc.explicit.exact_penalties import ExactPenalty, exact_penalty
 from jaxmpc.explicit.law import AffinePiece, Law
-from jaxmpc.explicit.penalties import ExactPenalty, exact_penalty
 from jaxmpc.explicit.regions import CriticalRegions, Region, critical_regions
 
 __all__ = [

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.explicit.cells import Cell, volume
+from jaxmpc.explicit.active_sets import Cell, volume
 from jaxmpc.explicit.least_distance import (
     GivenProgram,
     LeastDistanceForm,
     least_distance_form,
     positive_maximum,
 )
-from jaxmpc.explicit.search import RegionSearch, explore
+from jaxmpc.explicit.region_search import RegionSearch, explore
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.sets.box import Box

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxmpc.checks import fail, require_kind, require_package
-from jaxmpc.export.c_text import prepared_paths
+from jaxmpc.export.c_files import prepared_paths
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM

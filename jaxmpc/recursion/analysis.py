@@ -9,10 +9,10 @@ Three claims about the feasible set X_N of an MPC problem, each weaker than the 
 
 A claim is proved by an invariant terminal set (Theorem 1 of `verify_terminal`; Rawlings, Mayne &
 Diehl 2017, section 2.4), by linear programs over the polytope of all states and plans, or by the
-critical regions of the law (`claims.py`). It is
+critical regions of the law (`proofs.py`). It is
 refuted by a counterexample: a state with a feasible plan, and a half-space that excludes the next
 state. The worst is at a vertex of a critical region; without all regions counterexamples are looked
-for among samples and by gradient ascent (`ascent.py`).
+for among samples and by gradient ascent (`counterexample_search.py`).
 """
 
 from dataclasses import field, replace
@@ -29,9 +29,15 @@ from jaxmpc.feasible.map import grid
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
-from jaxmpc.recursion.ascent import ascend
-from jaxmpc.recursion.budget import LABELS, PLANS, PROOFS, Budget
-from jaxmpc.recursion.claims import (
+from jaxmpc.recursion.counterexample_search import ascend
+from jaxmpc.recursion.counterexamples import (
+    STARTS,
+    certified,
+    farthest_first,
+    outer_bound,
+    worst_samples,
+)
+from jaxmpc.recursion.proofs import (
     Claims,
     RegionVerdict,
     every_move_leaves,
@@ -39,15 +45,9 @@ from jaxmpc.recursion.claims import (
     settle_by_regions,
     settle_claims,
 )
-from jaxmpc.recursion.counterexample import (
-    STARTS,
-    certified,
-    farthest_first,
-    outer_bound,
-    worst_samples,
-)
-from jaxmpc.recursion.law_loops import LawLoops, closed_loops, map_states
 from jaxmpc.recursion.report import NOT_FEASIBLE, Claim, Counterexample, RecursionReport
+from jaxmpc.recursion.sampled_loops import LawLoops, closed_loops, map_states
+from jaxmpc.recursion.time_budget import LABELS, PLANS, PROOFS, Budget
 
 
 def recursive_feasibility(

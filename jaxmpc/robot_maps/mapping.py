@@ -21,7 +21,7 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.recursion.analysis import examine
-from jaxmpc.recursion.budget import Budget
+from jaxmpc.recursion.time_budget import Budget
 from jaxmpc.robot_maps.linear_problem import deviations, home_coordinates, with_initial_limits
 from jaxmpc.robot_maps.robot_loops import RobotLoops
 from jaxmpc.robot_maps.robot_map import CLAIMS, RobotMap

@@ -29,7 +29,7 @@ from jaxmpc.files import (
     write_results,
 )
 from jaxmpc.qp.status import Status
-from jaxmpc.recursion.budget import Budget
+from jaxmpc.recursion.time_budget import Budget
 from jaxmpc.robot_maps.linear_problem import home_coordinates, mpc_with_terminal
 from jaxmpc.robot_maps.mapping import RobotSetting
 from jaxmpc.robot_maps.robot_loops import RobotLoops

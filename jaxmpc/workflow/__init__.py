@@ -5,9 +5,9 @@ Test: `offline_report` collects proofs, simulations and failed hypotheses in an 
 `NominalLoops` are the closed loops that were simulated.
 """
 
-from jaxmpc.workflow.closed_loops import NominalLoops
 from jaxmpc.workflow.controller_design import Design, design
-from jaxmpc.workflow.offline_test import OfflineReport, offline_report
+from jaxmpc.workflow.nominal_closed_loops import NominalLoops
+from jaxmpc.workflow.offline_checks import OfflineReport, offline_report
 
 __all__ = [
     "Design",

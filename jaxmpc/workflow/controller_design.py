@@ -5,7 +5,7 @@ from typing import Any
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail
-from jaxmpc.explicit.penalties import ExactPenalty, exact_penalty
+from jaxmpc.explicit.exact_penalties import ExactPenalty, exact_penalty
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.softening import soften
@@ -18,7 +18,7 @@ from jaxmpc.sets.polytope import Polytope
 from jaxmpc.sets.terminal_sets import named_terminal_set
 from jaxmpc.systems.riccati import LQR, lqr
 from jaxmpc.systems.system import LinearSystem
-from jaxmpc.workflow.offline_test import OfflineReport, offline_report
+from jaxmpc.workflow.offline_checks import OfflineReport, offline_report
 
 
 @record

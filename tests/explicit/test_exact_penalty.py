@@ -10,8 +10,8 @@ import scipy.sparse as sparse
 from scipy.optimize import linprog
 
 import jaxmpc as jm
+from jaxmpc.explicit.exact_penalties import exact_penalty
 from jaxmpc.explicit.least_distance import least_distance_form
-from jaxmpc.explicit.penalties import exact_penalty
 from jaxmpc.explicit.regions import critical_regions
 from jaxmpc.mpc.inequalities import condensed_in_float64
 from jaxmpc.mpc.problem import Soft
@@ -194,8 +194,8 @@ class TestRegions:
 
     def test_missing_part_is_seen(self, monkeypatch):
         """Completeness rests on volumes: a search that loses its way does not say so."""
-        monkeypatch.setattr("jaxmpc.explicit.search.RegionSearch.cross", lambda *_: None)
-        monkeypatch.setattr("jaxmpc.explicit.search.REPAIRS", 1)
+        monkeypatch.setattr("jaxmpc.explicit.region_search.RegionSearch.cross", lambda *_: None)
+        monkeypatch.setattr("jaxmpc.explicit.region_search.REPAIRS", 1)
         found = critical_regions(problems.lecture())
         assert not found.complete and "not found" in found.reason
 

@@ -32,7 +32,7 @@ pytestmark = pytest.mark.skipif(not COMPILERS, reason="there is no C compiler")
 
 
 def exported(case, folder, dtype):
-    """The code of a case of `test_c_code.py`, or of the explicit law, in the folder, as `law.c`."""
+    """The code of a case of `test_c_solver.py`, or of the law, in the folder, as `law.c`."""
     if case == "explicit":
         export_explicit_c(LAW(), folder, dtype=dtype)
         return "fuzz_law.c"

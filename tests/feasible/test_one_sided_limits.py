@@ -20,7 +20,7 @@ from jaxmpc.feasible.exact_data import exact_data, hard_blocks
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.view import make_view
-from jaxmpc.recursion.claims import settle_claims
+from jaxmpc.recursion.proofs import settle_claims
 
 NONE = (np.inf, 1e9, 1e12, 1e20)
 

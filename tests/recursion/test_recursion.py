@@ -17,10 +17,17 @@ from jaxmpc.feasible.plan_polytope import projected
 from jaxmpc.feasible.polytope import backward
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import Soft
-from jaxmpc.recursion import analysis, ascent, recursive_feasibility, smallest_horizon
-from jaxmpc.recursion.budget import Budget
-from jaxmpc.recursion.claims import _by_theorem, settle_claims
-from jaxmpc.recursion.law_loops import closed_loops
+from jaxmpc.recursion import (
+    analysis,
+    recursive_feasibility,
+    smallest_horizon,
+)
+from jaxmpc.recursion import (
+    counterexample_search as search,
+)
+from jaxmpc.recursion.proofs import _by_theorem, settle_claims
+from jaxmpc.recursion.sampled_loops import closed_loops
+from jaxmpc.recursion.time_budget import Budget
 
 
 def settled(mpc):
@@ -475,13 +482,13 @@ class TestSlow:
         found = lambda: (
             recursive_feasibility(mpc, one, steps=1, max_regions=0).counterexample.distance
         )
-        climb_regions, value = ascent._climb_regions, ascent._value_and_gradient
-        monkeypatch.setattr(ascent, "_climb_regions", lambda _, b, x, v, d: x[np.argsort(-v)[:6]])
+        climb_regions, value = search._climb_regions, search._value_and_gradient
+        monkeypatch.setattr(search, "_climb_regions", lambda _, b, x, v, d: x[np.argsort(-v)[:6]])
         assert found() == pytest.approx(0.546401, abs=1e-4)
         still = lambda *a, **k: (value(*a, **k)[0], np.zeros_like(a[2]))
-        monkeypatch.setattr(ascent, "_value_and_gradient", still)
+        monkeypatch.setattr(search, "_value_and_gradient", still)
         assert found() < 0.546
-        monkeypatch.setattr(ascent, "_climb_regions", climb_regions)
+        monkeypatch.setattr(search, "_climb_regions", climb_regions)
         assert found() == pytest.approx(0.546401, abs=1e-5)
 
     def test_joint_of_five_steps(self):

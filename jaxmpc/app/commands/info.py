@@ -16,7 +16,7 @@ from jaxmpc.app.commands.options import (
     option,
 )
 from jaxmpc.checks import fail
-from jaxmpc.workflow.offline_test import OfflineReport, offline_report
+from jaxmpc.workflow.offline_checks import OfflineReport, offline_report
 
 
 @dataclasses.dataclass(frozen=True)

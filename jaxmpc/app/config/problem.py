@@ -22,7 +22,7 @@ from jaxmpc.app.config.sections import (
     SystemSection,
     to_matrix,
 )
-from jaxmpc.explicit.penalties import exact_penalty
+from jaxmpc.explicit.exact_penalties import exact_penalty
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.softening import soften
 from jaxmpc.qp.admm import ADMM

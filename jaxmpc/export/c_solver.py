@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.checks import fail, number, require_kind
-from jaxmpc.export.c_text import (
+from jaxmpc.export.c_files import (
     KINDS,
     REAL,
     input_limits,

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_kind, whole
-from jaxmpc.explicit.penalties import ExactPenalty, exact_penalty
+from jaxmpc.explicit.exact_penalties import ExactPenalty, exact_penalty
 from jaxmpc.feasible.map import FeasibleSetMap, grid, map_points
 from jaxmpc.feasible.polytope import is_standard_form
 from jaxmpc.feasible.problem import FeasibilityProblem
@@ -20,10 +20,10 @@ from jaxmpc.mpc.softening import harden
 from jaxmpc.pytrees import record
 from jaxmpc.recursion import RecursionReport
 from jaxmpc.recursion.analysis import examine
-from jaxmpc.recursion.budget import LABELS, LOOPS, PROOFS, Budget
+from jaxmpc.recursion.time_budget import LABELS, LOOPS, PROOFS, Budget
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.terminal_hypotheses import TerminalReport, verify_terminal
-from jaxmpc.workflow.closed_loops import NominalLoops, nominal_loops
+from jaxmpc.workflow.nominal_closed_loops import NominalLoops, nominal_loops
 
 
 @record

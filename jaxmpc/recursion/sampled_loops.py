@@ -8,9 +8,9 @@ from jaxmpc.feasible.map import FeasibleSetMap, map_points
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
-from jaxmpc.recursion.budget import Budget
-from jaxmpc.recursion.claims import CLEAR
+from jaxmpc.recursion.proofs import CLEAR
 from jaxmpc.recursion.report import NOT_FEASIBLE, UNDECIDED
+from jaxmpc.recursion.time_budget import Budget
 
 
 @record

@@ -10,9 +10,9 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import first_of_block
 from jaxmpc.feasible.rays import BACKOFFS, Rays, ray_directions
 from jaxmpc.qp.status import Status
-from jaxmpc.recursion.claims import CLEAR, Claims
-from jaxmpc.recursion.law_loops import LawLoops
+from jaxmpc.recursion.proofs import CLEAR, Claims
 from jaxmpc.recursion.report import Counterexample
+from jaxmpc.recursion.sampled_loops import LawLoops
 
 STARTS = 96
 

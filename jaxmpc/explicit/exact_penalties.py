@@ -7,10 +7,10 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_kind, whole
-from jaxmpc.explicit.cells import ActivePiece, active_piece, capped_ball
+from jaxmpc.explicit.active_sets import ActivePiece, active_piece, capped_ball
 from jaxmpc.explicit.least_distance import SMALLEST, LeastDistanceForm, least_distance_form
+from jaxmpc.explicit.region_search import exchange, explore
 from jaxmpc.explicit.regions import CriticalRegions
-from jaxmpc.explicit.search import exchange, explore
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Row, row_table
 from jaxmpc.pytrees import record

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail, whole
-from jaxmpc.explicit.cells import Cell, cell, volume
+from jaxmpc.explicit.active_sets import Cell, cell, volume
 from jaxmpc.explicit.least_distance import DEPENDENT, LeastDistanceForm
 from jaxmpc.sets.polytope import Polytope
 
