@@ -186,13 +186,13 @@ def main() -> None:
             c = 0 if mpc.system.c is None else np.asarray(mpc.system.c)
             states, laws, plans, good = [], [], [], []
             for x in starts:
-                carry = best = None
+                control = best = None
                 for _ in range(length):
-                    u, carry, _ = law(x, carry)
-                    v, best, plan = precise(x, best)
-                    states.append(x), laws.append(np.asarray(u)), plans.append(np.asarray(v))
-                    good.append(int(plan.status) == jm.Status.SOLVED)
-                    x = A @ x + B @ np.asarray(u) + c
+                    control, best = law(x, control), precise(x, best)
+                    u, v = np.asarray(control.u), np.asarray(best.u)
+                    states.append(x), laws.append(u), plans.append(v)
+                    good.append(int(best.plan.status) == jm.Status.SOLVED)
+                    x = A @ x + B @ u + c
             good = np.array(good)
             codes = {}
             for dtype in ("float64", "float32"):

@@ -3,7 +3,7 @@ before, beside the solvers that embedded control uses.
 
     python experiments/one_robot.py
 
-jaxmpc: `u, carry, plan = controller(x, carry)` from plain Python with 64-bit mode on, all that it
+jaxmpc: `control = controller(x, control)` from plain Python with 64-bit mode on, all that it
 does: checks, warm start, plan, status. The others solve the same condensed QPs, of the states that
 this loop went through, in the same order; forming q, l and u from the state is not counted. OSQP
 starts from its last solution, DAQP and PIQP start cold. Residuals of all are computed here.
@@ -41,14 +41,14 @@ def drive(controller: jm.Controller, x0s: np.ndarray, samples: int) -> tuple:
     A, B = np.asarray(system.A), np.asarray(system.B)
     states, plans, seconds = [], [], []
     for x in x0s:
-        carry = None
+        control = None
         for _ in range(samples):
             begun = time.perf_counter()
-            u, carry, plan = controller(x, carry)
-            u = np.asarray(u)
+            control = controller(x, control)
+            u = np.asarray(control.u)
             seconds.append(time.perf_counter() - begun)
             states.append(x)
-            plans.append(plan)
+            plans.append(control.plan)
             x = A @ x + B @ u
     return np.array(states), plans, np.array(seconds)
 

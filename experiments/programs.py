@@ -34,8 +34,8 @@ def print_programs() -> None:
         "second solve, other state": lambda: jm.solve(mpc, x[1]),
         "solve, other weights": lambda: jm.solve(joint_with(2.0), x[0]),
         "Controller, first call": lambda: controller()(x[0]),
-        "its first call with a carry": lambda: controller()(x[0], controller()(x[1])[1]),
-        "ten more": lambda: [controller()(x[0], controller()(x[1])[1]) for _ in range(10)],
+        "its first call after another": lambda: controller()(x[0], controller()(x[1])),
+        "ten more": lambda: [controller()(x[0], controller()(x[1])) for _ in range(10)],
         "solve_many, 100 states": lambda: jm.solve_many(mpc, np.tile(x, (50, 1))),
         "solve_many, 100 others": lambda: jm.solve_many(mpc, np.tile(x, (50, 1)) / 2),
     }

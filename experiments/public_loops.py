@@ -658,12 +658,13 @@ def follow(one: Loop, samples: int) -> Record:
         record.refused = str(error)
         return record
     x, N, system = one.x0, one.mpc.horizon, one.mpc.system
-    carry = controller.start(x)
+    control = controller.start(x)
     for target in one.reference(samples):
         r = statement.target(target, one.input_reference)
         known = dict(input_reference=np.tile(one.input_reference, (N, 1)))
-        u, carry, plan = controller(x, carry, np.tile(target, (N + 1, 1)), **known)
-        u, status = np.asarray(u), jm.Status(int(plan.status))
+        control = controller(x, control, np.tile(target, (N + 1, 1)), **known)
+        plan = control.plan
+        u, status = np.asarray(control.u), jm.Status(int(plan.status))
         best = statement.solve(x, r)
         if status == jm.Status.SOLVED:
             w = np.concatenate([np.ravel(plan.states), np.ravel(plan.inputs)])

@@ -123,19 +123,19 @@ assert np.abs(np.asarray(plan.states)[:, 0]).max() <= 1.5
 #
 # A plan is a forecast. MPC applies only the first input, measures the state again and plans anew.
 # The controller takes the state and the previous plan, from which it starts the solver;
-# `controller.start` makes a plan of zeros for the first sample. Here the joint moves from rest
+# `controller.start` stands for the time step before the first. Here the joint moves from rest
 # to the reference $q = 1$ rad; the reference enters the cost, the constraints stay where they are.
 
 # %%
 x = np.zeros(2)
-carry = controller.start(x)
+control = controller.start(x)
 states, inputs = [x], []
 for _ in range(120):
-    u, carry, plan = controller(x, carry, reference=np.array([1.0, 0.0]))
-    assert int(plan.status) == jm.Status.SOLVED
-    x = np.asarray(system.A) @ x + np.asarray(system.B) @ np.asarray(u)
+    control = controller(x, control, reference=np.array([1.0, 0.0]))
+    assert control.plan.solved
+    x = np.asarray(system.A) @ x + np.asarray(system.B) @ np.asarray(control.u)
     states.append(x)
-    inputs.append(np.asarray(u))
+    inputs.append(np.asarray(control.u))
 states, inputs = np.array(states), np.array(inputs)
 draw(states, inputs, "Closed loop from rest to the reference 1 rad")
 

@@ -70,9 +70,9 @@ def nonlinear(x):
 def looped(x):
     """A loop that the user writes, which carries the plan."""
 
-    def sample(carry, _):
-        u, carry, _ = controller()(x, carry)
-        return carry, u
+    def sample(before, _):
+        control = controller()(x, before)
+        return control, control.u
 
     return jax.lax.scan(sample, controller().start(x), None, length=2)[1]
 

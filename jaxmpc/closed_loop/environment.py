@@ -148,7 +148,7 @@ class MPCPolicy:
 
     controller: a Controller, RobotController or LinearFeedback. reference, input_reference: the
     target, as in `simulate`. The observation (n,) is the coordinates ξ. Each call solves its plan
-    from a cold start; `controller(x, carry)` is warm-started. Under `jax.jit`, `jax.vmap`, and
+    from a cold start; `controller(x, before)` is warm-started. Under `jax.jit`, `jax.vmap`, and
     differentiable in the observation, the references and all that the controller is made of. A
     pytree: `replace(policy, reference=...)` under `jax.vmap` gives each robot its own target.
     """
@@ -164,7 +164,5 @@ class MPCPolicy:
         xi = jnp.asarray(observation, self.controller.dtype)
         model = model_of(self.controller)
         x = model.state(xi) if hasattr(model, "state") else xi
-        u, *_ = self.controller(
-            x, None, self.reference, input_reference=self.input_reference
-        )  # fmt: skip
-        return u
+        aims = {"reference": self.reference, "input_reference": self.input_reference}
+        return self.controller(x, **aims).u

@@ -7,7 +7,8 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.mpc.plan import limited
+from jaxmpc.mpc.controller import zeros_of
+from jaxmpc.mpc.plan import Control, limited
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.precision import floating_dtype, matmul
@@ -61,15 +62,15 @@ class LinearFeedback:
         """Return the coordinates ξ (n,) of a state."""
         return x if self.plant is None else self.plant.coordinates(x)
 
-    def start(self, x: Array, input_reference: Any = None) -> tuple:
-        """Return the first carry, which is empty."""
-        return ()
+    def start(self, x: Array, input_reference: Any = None) -> Control[NoPlan]:
+        """Return what stands for the time step before the first: zeros."""
+        return zeros_of(self, x)
 
     def __call__(
-        self, x: Any, carry: Any = None, reference: Any = None, *, input_reference: Any = None,
+        self, x: Any, before: Any = None, reference: Any = None, *, input_reference: Any = None,
         previous_input: Any = None,
-    ) -> tuple[Array, tuple, NoPlan]:  # fmt: skip
-        """Return the input (m,) at the state x, an empty carry, and no plan."""
+    ) -> Control[NoPlan]:  # fmt: skip
+        """Return the input (m,) at the state x, without plan and memory."""
         self.validate()
         if np.shape(x) != (self.state_size,):
             fail("x", f"shape {np.shape(x)}", f"Give one state ({self.state_size},)")
@@ -86,4 +87,4 @@ class LinearFeedback:
             jnp.asarray(jnp.nan, x.dtype), jnp.asarray(Status.NOT_RUN, jnp.int32),
             jnp.zeros((1, 0), x.dtype),
         )  # fmt: skip
-        return u, (), nothing
+        return Control(u, nothing, None)

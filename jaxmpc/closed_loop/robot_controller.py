@@ -1,16 +1,16 @@
 """RobotController: MPC of a nonlinear robot by linear models, with soft state limits."""
 
 from dataclasses import field, replace
+from functools import partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail, whole
-from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.plan import Plan, WarmStart, anchored, applied, limited
+from jaxmpc.mpc.controller import Controller, zeros_of
+from jaxmpc.mpc.plan import Control, Plan, WarmStart, anchored, applied, limited
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import layout
 from jaxmpc.mpc.softening import soften
@@ -19,7 +19,6 @@ from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, Task, task_layout
 from jaxmpc.mpc.stagewise.sqp import solve_nonlinear
 from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.admm import ADMM, DEFAULT
-from jaxmpc.qp.modes import varying
 from jaxmpc.qp.precision import arrays, floating_dtype
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
@@ -55,9 +54,9 @@ class RobotController:
       (exact penalty), and elsewhere trade violations against the cost by that weight. Each such
       plan is counted: `Run.fallback`. Input limits are hard.
 
-    `controller(x, carry, reference, input_reference=)` as `Controller`, x (nq + nv,) the state of
+    `controller(x, before, reference, input_reference=)` as `Controller`, x (nq + nv,) the state of
     the robot, references in its coordinates (see `robot.trajectory`). `start` gives the first
-    carry, and takes the first point of linearisation from input_reference.
+    `before`, and takes the first point of linearisation from input_reference.
 
     A pytree. Calling the class prepares the problem, see `prepared`; JAX and `tree_map` rebuild
     the object without that, `dataclasses.replace` prepares it again. Raises ValueError for
@@ -109,12 +108,14 @@ class RobotController:
         """Return the coordinates ξ (n,) of the robot's state."""
         return self.robot.coordinates(x)
 
-    def start(self, x: Array, input_reference: Any = None) -> Plan:
-        """Return a plan at rest at x under the first input of input_reference, zero for none."""
-        shapes = jax.eval_shape(lambda x: self(x, None, input_reference=input_reference)[2], x)
-        zeros = varying(jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), (x, self))
+    def start(self, x: Array, input_reference: Any = None) -> Control[Plan]:
+        """Return what stands for the time step before the first: at rest at x under the first input
+        of input_reference, zero for none."""
+        zeros = zeros_of(partial(self, input_reference=input_reference), x)
         states, inputs = self._resting(x, input_reference)
-        return replace(zeros, states=states, inputs=inputs)
+        assert zeros.memory is not None
+        memory = zeros.memory._replace(states=states, inputs=inputs)
+        return zeros._replace(u=inputs[0], memory=memory)
 
     def _resting(self, x: Array, input_reference: Any) -> tuple[Array, Array]:
         """Return states (N+1, n) that stay at x and inputs (N, m), the first of input_reference."""
@@ -124,23 +125,22 @@ class RobotController:
         return jnp.broadcast_to(xi, (N + 1, len(xi))), u
 
     def __call__(
-        self, x: Any, carry: Plan | None = None, reference: Any = None, *,
+        self, x: Any, before: Control[Plan] | None = None, reference: Any = None, *,
         input_reference: Any = None, previous_input: Any = None,
-    ) -> tuple[Array, Plan, Plan]:  # fmt: skip
-        """Return the first input (m,) from the state x, the next carry, and the plan in ξ."""
+    ) -> Control[Plan]:  # fmt: skip
+        """Return the input (m,) at the state x, its plan, in ξ, and what to remember."""
         x = jnp.asarray(x, self.dtype)
         if np.shape(x) != (self.state_size,):
             fail("x", f"shape {np.shape(x)}", f"Give one state ({self.state_size},)")
         if self.fixed is not None:
             return self.fixed(
-                self.coordinates(x), carry, reference, input_reference=input_reference,
+                self.coordinates(x), before, reference, input_reference=input_reference,
                 previous_input=previous_input,
             )  # fmt: skip
         problem = self.problem
         rows = layout(self.soft) + task_layout(problem)
-        start = None
-        if carry is not None:
-            start = WarmStart.shifted(rows, carry, carry.inputs[-1])
+        memory = None if before is None else before.memory
+        start = None if memory is None else memory.shifted(rows, memory.inputs[-1])
         given = {"input_reference": input_reference, "scale": self.scale}
         xi = self.coordinates(x)
         if self.linearize == "trajectory":
@@ -154,11 +154,11 @@ class RobotController:
                 iterations=self.sqp_steps, hessian="gauss-newton",
             )  # fmt: skip
         else:
-            u = self._resting(x, input_reference)[1][0] if carry is None else carry.inputs[0]
-            system = self.robot.linearize(x, limited(self.soft.inputs, u), exact=self.exact)
+            inputs = self._resting(x, input_reference)[1] if memory is None else memory.inputs
+            system = self.robot.linearize(x, limited(self.soft.inputs, inputs[0]), exact=self.exact)
             mpc = replace(self.soft, system=system)
             plan = solve_stagewise(mpc, xi, reference, self.solver, start, **given)
-        return applied(self.soft, plan, carry, None if carry is None else carry.inputs[0])
+        return applied(self.soft, rows, plan, memory)
 
     @property
     def problem(self) -> NonlinearMPC:

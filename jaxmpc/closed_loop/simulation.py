@@ -213,10 +213,8 @@ def _simulate(
             elif compensate:
                 seen = state(model_step(model_of(controller), coordinates(seen), previous))
         r, s = rows(t + 1 if ahead_by else t)
-        found, carried, plan = controller(
-            seen, before, r, input_reference=s, previous_input=previous
-        )
-        u = previous if delay else found
+        control = controller(seen, before, r, input_reference=s, previous_input=previous)
+        plan, u = control.plan, previous if delay else control.u
         error, effort = (
             value
             if target is None
@@ -236,7 +234,7 @@ def _simulate(
             after = state(coordinates(after) + w)
         if observer is not None and not delay:
             belief = observer.predicted(belief, u)
-        return (after if d is None else after + d, carried, found, belief), record
+        return (after if d is None else after + d, control, control.u, belief), record
 
     before = controller.start(x0, ahead(references[1], ahead_by, N))
     previous = jnp.zeros(mpc.system.m, x0.dtype) if previous_input is None else previous_input

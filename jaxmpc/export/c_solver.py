@@ -27,7 +27,7 @@ from jaxmpc.export.c_files import (
     write,
 )
 from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.plan import WarmStart, sorted_multipliers
+from jaxmpc.mpc.plan import WarmStart
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
@@ -142,10 +142,7 @@ def _later_rows(controller: Controller) -> np.ndarray:
     c, mpc = controller.condensed, controller.mpc
     assert c is not None
     N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
-    plan = jax.eval_shape(lambda x: controller(x)[1], jnp.zeros(n))
-    numbers = sorted_multipliers(mpc, c.layout, jnp.arange(1.0, c.C.shape[0] + 1))
-    plan = replace(
-        plan, multipliers=numbers, states=jnp.zeros((N + 1, n)), inputs=jnp.zeros((N, m))
-    )
-    shifted = WarmStart.shifted(c.layout, plan, jnp.zeros(m), bool(c.balls))
+    numbers = jnp.arange(1.0, c.C.shape[0] + 1)
+    start = WarmStart(jnp.zeros((N + 1, n)), jnp.zeros((N, m)), numbers)
+    shifted = start.shifted(c.layout, jnp.zeros(m), bool(c.balls))
     return np.asarray(shifted.multipliers).astype(int) - 1

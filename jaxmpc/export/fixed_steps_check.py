@@ -58,20 +58,19 @@ def check_fixed_steps(
         fixed = Controller(mpc, replace(solver, newton_steps=0, eps=tolerance))
         precise = Controller(mpc, ADMM())
         starts = np.random.default_rng(seed).uniform(lower, upper, (50 * LOOPS, len(lower)))
-        plans = jax.jit(jax.vmap(lambda x: precise(x)[2].status))(starts)
+        plans = jax.jit(jax.vmap(lambda x: precise(x).plan.status))(starts)
         starts = starts[np.argsort(np.asarray(plans) != Status.SOLVED, kind="stable")[:LOOPS]]
         A, B = (jnp.asarray(host_array("system", v)) for v in (mpc.system.A, mpc.system.B))
         drift = 0.0 if mpc.system.c is None else jnp.asarray(host_array("system.c", mpc.system.c))
 
         def sample(state: Any, _: Any) -> Any:
-            x, carry, before = state
-            u, carry, plan = fixed(x, carry)
-            exact, kept, best = precise(x, before)
-            # The previous input of the next sample is what was applied.
-            kept = replace(kept, inputs=kept.inputs.at[0].set(u))
-            after = matmul(A, x) + matmul(B, u) + drift
-            error = jnp.max(jnp.abs(u - exact))
-            return (after, carry, kept), (plan.status, best.status, error)
+            x, before, best_before = state
+            control, best = fixed(x, before), precise(x, best_before)
+            after = matmul(A, x) + matmul(B, control.u) + drift
+            error = jnp.max(jnp.abs(control.u - best.u))
+            # The previous input of the next time step is what was applied.
+            carried = after, control, best._replace(u=control.u)
+            return carried, (control.plan.status, best.plan.status, error)
 
         def loop(x: Any) -> Any:
             start = x, fixed.start(x), precise.start(x)

@@ -1,7 +1,7 @@
 """Model predictive control of linear systems.
 
 MPC, Outputs, Soft    a problem, with rows of outputs and soft rows
-solve, Controller     one plan, or a factored law u = controller(x) -> Plan with Multipliers
+solve, Controller     one plan, or a factored law: controller(x) -> Control with u and Plan
 solve_stagewise       one plan, factored along the horizon
 NonlinearMPC, Task    a problem with a nonlinear model, costs and limits on functions of a Point
 solve_nonlinear       its plan by sequential quadratic programming
@@ -15,7 +15,7 @@ soften, harden        make rows soft or hard
 
 from jaxmpc.mpc.active_limits import ActiveConstraint, active_constraints
 from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.plan import Multipliers, Plan, WarmStart
+from jaxmpc.mpc.plan import Control, Multipliers, Plan, WarmStart
 from jaxmpc.mpc.problem import MPC, Outputs, Soft
 from jaxmpc.mpc.rows import Row, row_table
 from jaxmpc.mpc.softening import harden, soften
@@ -28,6 +28,7 @@ from jaxmpc.mpc.targets import equilibrium
 __all__ = [
     "MPC",
     "ActiveConstraint",
+    "Control",
     "Controller",
     "Multipliers",
     "NonlinearMPC",

@@ -10,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import as_array, host_array
+from jaxmpc.arrays import Reals, as_array, host_array
 from jaxmpc.checks import concrete, fail, require_kind
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.plan import (
+    Control,
     Multipliers,
     Plan,
+    Planned,
     WarmStart,
     answer,
     applied,
@@ -40,15 +42,14 @@ from jaxmpc.sets.polytope import Polytope
 class Controller:
     """An MPC law whose matrices are condensed and factored once, at construction.
 
-    `controller(x, carry) -> (u, carry, plan)`: u (m,) is the first input of the plan, clipped
-    into its limits if these are a Box. carry is None at the start and the previous plan
-    afterwards. Its `shifted` form is the warm start, and its first input is the previous input
-    (zero at the start). The plan is returned twice, as carry and as output of `jax.lax.scan`. When
-    the plan is not SOLVED, u is still the first input of the best iterate: look at plan.status.
-    Of a state that is not finite the plan is NaN, u is finite: the last input where its rate is
-    limited or weighed, else zero, within the limits; and the carry is the last finite plan. A plan
-    is a warm start only where that is nearer to the solution than none: one bad reading, finite or
-    not, is forgotten with the next sample.
+    `controller(x, before) -> Control`: its u (m,) is the first input of its plan, clipped into the
+    limits if these are a Box. before: what the controller gave at the time step before, None at the
+    start. The plan then, `shifted`, is the warm start, and the input then the previous input (zero
+    at the start). When the plan is not SOLVED, u is still the first input of the best iterate: look
+    at plan.solved. Of a state that is not finite the plan is NaN, u is finite: the last input where
+    its rate is limited or weighed, else zero, within the limits; and what is remembered is the last
+    finite plan. A plan is a warm start only where that is nearer to the solution than none: one bad
+    reading, finite or not, is forgotten with the next time step.
 
     `condensed` and `factor` are filled in at construction, which `dataclasses.replace` repeats and
     JAX, which rebuilds pytrees, does not. Each array has a buffer of its own: a controller may be
@@ -102,34 +103,41 @@ class Controller:
         """The state in which `mpc` is written: x itself."""
         return x
 
-    def start(self, x: Array, input_reference: Any = None) -> Plan:
-        """What to carry into the first sample: a plan of zeros, a cold start.
+    def start(self, x: Array, input_reference: Reals | None = None) -> Control[Plan]:
+        """What stands for the time step before the first: zeros, a cold start.
 
         (So that a scan compiles one solve, not two: without a warm start and with.)"""
-        shapes = jax.eval_shape(lambda x: self(x)[1], x)
-        return varying(jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), (x, self))
+        return zeros_of(self, x)
 
     def __call__(
-        self, x: Any, carry: Plan | None = None, reference: Any = None, *,
-        input_reference: Any = None, previous_input: Any = None,
-    ) -> tuple[Array, Plan, Plan]:  # fmt: skip
-        """First input from state x (n,), what to carry to the next sample, and the whole plan.
+        self,
+        x: Reals,
+        before: Control[Plan] | None = None,
+        reference: Reals | None = None,
+        *,
+        input_reference: Reals | None = None,
+        previous_input: Reals | None = None,
+    ) -> Control[Plan]:
+        """The input at the state x (n,), the plan that it belongs to, and what to remember.
 
-        References and previous_input as in `solve`; previous_input None: what the carry says.
+        before: None, or what was returned at the time step before. References and previous_input as
+        in `solve`; previous_input None: the input of `before`.
         """
         given = self._checked(x, reference, input_reference, previous_input)
-        return self._in_two_parts(_sample, *given, carry, status=lambda found: found[2].status)
+        last = None if before is None else (before.u, before.memory)
+        return self._in_two_parts(_control, *given, last, status=lambda found: found.plan.status)
 
-    def shifted(self, plan: Plan) -> WarmStart:
-        """The plan seen one sample later, as a warm start (`WarmStart.shifted`).
+    def shifted(self, plan: Plan | WarmStart) -> WarmStart:
+        """The plan seen one time step later, as a warm start (`WarmStart.shifted`).
 
         The new last input is the unconstrained optimum of that step for the terminal cost about
-        the origin, clipped into its limits. With a control horizon each move becomes what the plan
-        did one step after its beginning.
+        the origin, clipped into its limits. With a control horizon each free input becomes what the
+        plan did one step after its beginning.
         """
-        c = self.condensed
-        tail = limited(self.mpc.inputs, matmul(c.K_N, plan.states[-1]))
-        return WarmStart.shifted(c.layout, plan, tail, bool(c.balls))
+        c, system = self.condensed, self.mpc.system
+        start = WarmStart.of(plan, c.layout, self.mpc.horizon, system.n, system.m)
+        tail = limited(self.mpc.inputs, matmul(c.K_N, start.states[-1]))
+        return start.shifted(c.layout, tail, bool(c.balls))
 
     def plan(
         self, x0: Any, reference: Any = None, warm_start: Any = None, input_reference: Any = None,
@@ -234,6 +242,13 @@ def _harmless(data: dict[str, Any], R: np.ndarray) -> tuple[dict[str, Any], Arra
     return {**clean, "R": jnp.where(finite, jnp.asarray(data["R"]), R)}, finite
 
 
+def zeros_of(controller: Callable[[Array], Control[Planned]], x: Array) -> Control[Planned]:
+    """Return zeros in place of what a controller gives at x."""
+    shapes = jax.eval_shape(controller, x)
+    zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+    return varying(zeros, (x, controller))
+
+
 @jax.jit
 @own_modes
 def _factor(condensed: Condensed, solver: ADMM) -> Factor:
@@ -243,18 +258,24 @@ def _factor(condensed: Condensed, solver: ADMM) -> Factor:
 
 @partial(jax.jit, static_argnames="whole")
 @own_modes
-def _sample(
-    controller: Controller, x: Array, reference: Any, input_reference: Any, previous_input: Any,
-    carry: Plan | None, *, whole: bool,
-) -> tuple[Array, Plan, Plan]:  # fmt: skip
-    start, inputs = None, controller.mpc.inputs
-    if carry is not None:
-        start = controller.shifted(carry)
+def _control(
+    controller: Controller,
+    x: Array,
+    reference: Array | None,
+    input_reference: Array | None,
+    previous_input: Array | None,
+    last: tuple[Array, WarmStart | None] | None,
+    *,
+    whole: bool,
+) -> Control[Plan]:
+    start = memory = None
+    if last is not None:
+        u, memory = last
+        start = None if memory is None else controller.shifted(memory)
         if previous_input is None:  # read where the problem limits or weighs input rates
-            before = carry.inputs[0]
-            previous_input = limited(inputs, jnp.where(jnp.isfinite(before), before, 0.0))
+            previous_input = limited(controller.mpc.inputs, jnp.where(jnp.isfinite(u), u, 0.0))
     plan = _plan(controller, x, reference, input_reference, previous_input, start, whole=whole)
-    return applied(controller.mpc, plan, carry, previous_input)
+    return applied(controller.mpc, controller.condensed.layout, plan, memory, previous_input)
 
 
 @partial(jax.jit, static_argnames="whole")

@@ -1,7 +1,8 @@
 """Plan, the answer of every solver; WarmStart; what a trajectory costs and violates."""
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.residuals import marked
-from jaxmpc.qp.status import Status
+from jaxmpc.qp.status import Status, WithStatus
 from jaxmpc.sets.box import Box
 
 
@@ -41,7 +42,7 @@ class Multipliers:
 
 
 @pytree
-class Plan:
+class Plan(WithStatus):
     """Answer of `solve`: states (N+1, n), inputs (N, m), cost J (without ½), multipliers, status.
 
     cost includes what soft rows and input rates pay. slack (N+1, p): violation of the p soft rows,
@@ -90,22 +91,35 @@ class WarmStart(NamedTuple):
                 fail(f"warm_start.{name}", f"shape {np.shape(value)}", f"Needed: {shape}")
         return start
 
-    @classmethod
-    def shifted(
-        cls, layout: Layout, plan: Plan, tail: Array, terminal_is_ball: bool = False
-    ) -> "WarmStart":
-        """Return the plan seen one sample later, with `tail` (m,) as its new last input.
+    def shifted(self, layout: Layout, tail: Array, terminal_is_ball: bool = False) -> "WarmStart":
+        """Return the warm start one time step later, with `tail` (m,) as its new last input.
 
         Inputs and multipliers move up by one step; those of the last step are zero. What bounded
         x_N through the terminal set bounds it as a state from now on, where both have the same
         rows; not where it is an ellipsoid (terminal_is_ball), whose rows are no limits.
         """
-        y = flat_multipliers(layout, plan.multipliers)
-        return cls(
-            jnp.concatenate([plan.states[1:], plan.states[-1:]]),
-            jnp.concatenate([plan.inputs[1:], tail[None]]),
-            _shifted_multipliers(layout, len(plan.inputs), y, terminal_is_ball),
+        return WarmStart(
+            jnp.concatenate([self.states[1:], self.states[-1:]]),
+            jnp.concatenate([self.inputs[1:], tail[None]]),
+            _shifted_multipliers(layout, len(self.inputs), self.multipliers, terminal_is_ball),
         )
+
+
+Planned = TypeVar("Planned")
+
+
+@named_pytree
+class Control(NamedTuple, Generic[Planned]):
+    """What a controller gives at one time step, from which it goes on at the next.
+
+    u (m,): the input to apply, within its limits. plan: the plan whose first input it is, NaN where
+    the state was not finite. memory: the last finite plan, of which the next is warm-started; None
+    for a controller without plans.
+    """
+
+    u: Array
+    plan: Planned
+    memory: WarmStart | None
 
 
 def anchored(start: WarmStart, x0: Array) -> WarmStart:
@@ -154,14 +168,15 @@ def _between(u: Array, lower: Any, upper: Any, base: Any = 0) -> Array:
     return jnp.clip(u, base + low, base + high)
 
 
-def applied(mpc: MPC, plan: Plan, before: Plan | None, last: Any) -> tuple[Array, Plan, Plan]:
-    """Return what a controller gives for a plan: the first input (m,) within the limits and, from
-    `last` (m,), the one before (None: zero), within those of its rate; the plan as what it carries
-    to the next sample; and the plan.
+def applied(
+    mpc: MPC, layout: Layout, plan: Plan, before: WarmStart | None, last: Array | None = None
+) -> Control[Plan]:
+    """Return what a controller gives for a plan: its first input (m,) within the limits and, from
+    `last` (m,), the input before (None: zero), within those of its rate.
 
     Where the plan is not finite the input is `last`, if its rate is limited or weighed, else zero,
-    and what is carried is the plan before (None: zeros). So a bad reading is forgotten with the
-    next sample."""
+    and the memory is that of `before` (None: zeros). So a bad reading is forgotten with the next
+    time step."""
     finite = jnp.isfinite(plan.cost)  # no state or input is NaN or infinite without it
     u = plan.inputs[0]
     hold = jnp.zeros_like(u)
@@ -170,13 +185,10 @@ def applied(mpc: MPC, plan: Plan, before: Plan | None, last: Any) -> tuple[Array
     u = jnp.where(finite, u, hold)
     if mpc.rate_limited:
         u = _between(u, *rate_ends(mpc), base=hold)
-    u = limited(mpc.inputs, u)
-    start = lambda plan: (plan.states, plan.inputs, plan.multipliers)
-    old = jax.tree.map(jnp.zeros_like, start(plan)) if before is None else start(before)
-    kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), start(plan), old)
-    inputs = kept[1].at[0].set(u) if mpc.rate_limited else kept[1]
-    carry = replace(plan, states=kept[0], inputs=inputs, multipliers=kept[2])
-    return u, carry, plan
+    new = WarmStart(plan.states, plan.inputs, flat_multipliers(layout, plan.multipliers))
+    old = jax.tree.map(jnp.zeros_like, new) if before is None else before
+    memory = jax.tree.map(partial(jnp.where, finite), new, old)
+    return Control(limited(mpc.inputs, u), plan, memory)
 
 
 def cost(

@@ -161,12 +161,14 @@ def test_plans_are_those_of_another_solver(pendulum, loops):
 def test_trajectory_mode_linearises_about_the_shifted_plan(pendulum):
     """The second plan, by linear models of the C engine about each step of the first, shifted."""
     controller = controller_of(pendulum, "trajectory")
-    call = jax.jit(lambda x, carry: controller(x, carry, np.zeros(2), input_reference=np.zeros(1)))
+    zero = {"reference": np.zeros(2), "input_reference": np.zeros(1)}
+    call = jax.jit(lambda x, before: controller(x, before, **zero))
     x = STARTS[0]
     start = controller.start(x, np.zeros(1))
-    u, carry, first = call(x, start)
+    control = call(x, start)
+    u, first, _ = control
     x = c_steps(pendulum.mujoco, x, np.asarray(u), pendulum.substeps)
-    _, _, second = call(x, carry)
+    second = call(x, control).plan
     states = np.concatenate([x[None], first.states[2:]])
     inputs = np.concatenate([first.inputs[1:], first.inputs[-1:]])
     models = []

@@ -95,14 +95,14 @@ def test_closed_loop_is_the_controllers(case, tmp_path):
         code, law = Compiled(mpc, solver, tmp_path), jm.Controller(mpc, solver)
         system = law.mpc.system
         for start, reference, effort in ((0.5, None, None), (1.2, 0.3, 0.1)):
-            x, carry = np.full(system.n, start), None
+            x, control = np.full(system.n, start), None
             code.memory[:] = 0
             target = None if reference is None else np.full(system.n, reference)
             input_target = None if effort is None else np.full(system.m, effort)
             for _ in range(8):
-                u, carry, _ = law(x, carry, target, input_reference=input_target)
+                control = law(x, control, target, input_reference=input_target)
                 mine, _ = code.step(x, target, input_target)
-                np.testing.assert_allclose(mine, u, rtol=0, atol=1e-8)
+                np.testing.assert_allclose(mine, control.u, rtol=0, atol=1e-8)
                 x = np.asarray(system.A) @ x + np.asarray(system.B) @ mine
                 x = x if system.c is None else x + np.asarray(system.c)
 

@@ -249,11 +249,12 @@ class TestRiccati:
     def test_cost_falls_along_the_closed_loop(self):
         """With O_inf and the DARE's P, J* falls by at least the stage cost (Mayne et al. 2000)."""
         mpc = problems.joint_o_inf(horizon=12)
-        controller, x, carry = jm.Controller(mpc, FINE), np.array([0.35, -1.0]), None
-        step = jax.jit(lambda c, x, carry: c(x, carry))
+        controller, x, control = jm.Controller(mpc, FINE), np.array([0.35, -1.0]), None
+        step = jax.jit(lambda c, x, before: c(x, before))
         last = np.inf
         for _ in range(15):
-            u, carry, plan = step(controller, x, carry)
+            control = step(controller, x, control)
+            u, plan, _ = control
             assert plan.status == jm.Status.SOLVED
             assert plan.cost <= last + 1e-7
             last = plan.cost - x @ mpc.Q @ x - u @ mpc.R @ u
@@ -476,24 +477,26 @@ class TestController:
         mpc = problems.lecture()
         controller = jm.Controller(mpc)
         x0 = np.array([0.3, -0.2])
-        u, carry, plan = controller(x0)
+        first = controller(x0)
+        u, plan, _ = first
         np.testing.assert_allclose(plan.inputs, jm.solve(mpc, x0).inputs, atol=1e-12)
         np.testing.assert_array_equal(u, plan.inputs[0])
 
         def body(state, _):
-            x, carry = state
-            u, carry, plan = controller(x, carry)
-            return (mpc.system.A @ x + mpc.system.B @ u, carry), (x, plan.status)
+            x, before = state
+            control = controller(x, before)
+            after = mpc.system.A @ x + mpc.system.B @ control.u
+            return (after, control), (x, control.plan.status)
 
         _, (xs, status) = jax.jit(lambda s: jax.lax.scan(body, s, length=12))(
-            (jnp.asarray(x0), carry)
+            (jnp.asarray(x0), first)
         )
         assert np.all(np.asarray(status) == jm.Status.SOLVED)
         assert np.abs(xs[-1]).max() < 0.2
 
         # From plain Python the shifted plan is good enough to go without ADMM, and the same comes.
         x = mpc.system.A @ x0 + mpc.system.B @ u
-        _, _, plan = controller(x, carry)
+        plan = controller(x, first).plan
         assert plan.status == jm.Status.SOLVED and plan.iterations == 0
         np.testing.assert_allclose(plan.inputs, jm.solve(mpc, x).inputs, atol=1e-6)
 
@@ -501,7 +504,7 @@ class TestController:
         controller = jm.Controller(problems.lecture())
         leaves, structure = jax.tree.flatten(controller)
         again = jax.tree.unflatten(structure, leaves)
-        np.testing.assert_array_equal(again(np.ones(2) * 0.1)[0], controller(np.ones(2) * 0.1)[0])
+        np.testing.assert_array_equal(again(np.ones(2) * 0.1).u, controller(np.ones(2) * 0.1).u)
         for filler in (None, 0, object()):
             jax.tree.unflatten(structure, [filler] * len(leaves))
 
@@ -589,7 +592,7 @@ def test_gradients_are_finite_with_half_open_rows():
 
 
 def test_applied_input_stays_within_its_limits():
-    u, _, plan = jm.Controller(problems.joint(5))(np.array([1.4, 1.0]))
+    u, plan, _ = jm.Controller(problems.joint(5))(np.array([1.4, 1.0]))
     assert plan.status == jm.Status.SOLVED and -2 <= u[0] <= 2
 
 
@@ -621,4 +624,4 @@ def test_a_float64_controller_outside_64_bit_mode_is_refused():
     with jax.enable_x64(False), pytest.raises(ValueError, match="controller: was made in float64"):
         controller(np.zeros(2))
     with jax.enable_x64(True):
-        assert controller(np.zeros(2))[0].dtype == np.float64
+        assert controller(np.zeros(2)).u.dtype == np.float64

@@ -569,15 +569,16 @@ def test_closed_loop_is_solving_afresh(name):
     """Warm-started samples against Clarabel from the state and the input really applied."""
     explicit, x0, _, reference, effort, plans = batch(name)
     mpc = explicit.mpc
-    controller, carry, before, samples = jm.Controller(mpc, FINE), None, None, 0
+    controller, control, before, samples = jm.Controller(mpc, FINE), None, None, 0
     i = int(np.flatnonzero(plans.status == jm.Status.SOLVED)[1])
     x, r, ur = x0[i], 0.3 * reference[i], 0.3 * effort[i]
     for sample in range(9):
         forced = np.full(explicit.m, 0.05) if sample == 4 else None
-        u, carry, plan = controller(
-            x, carry, r, input_reference=ur,
+        control = controller(
+            x, control, r, input_reference=ur,
             previous_input=np.zeros(explicit.m) if sample == 0 else forced,
         )  # fmt: skip
+        u, plan, memory = control
         before = before if forced is None else forced
         cost, _, inputs, _, _, _ = explicit.solve(x, before, r, ur)
         if cost is None:
@@ -588,8 +589,9 @@ def test_closed_loop_is_solving_afresh(name):
         np.testing.assert_allclose(plan.inputs, inputs, atol=1e-6)
         np.testing.assert_allclose(plan.cost, cost, rtol=1e-7, atol=1e-8)
         np.testing.assert_allclose(u, plan.inputs[0], atol=1e-7)
-        assert carry is plan
+        np.testing.assert_array_equal(memory.inputs, plan.inputs)
         start = controller.shifted(plan)
+        jax.tree.map(np.testing.assert_array_equal, start, controller.shifted(memory))
         assert start.inputs.shape == plan.inputs.shape
         assert all(np.isfinite(part).all() for part in start)
         c = 0.0 if mpc.system.c is None else mpc.system.c

@@ -179,10 +179,10 @@ def solve_many(mpc, x0s):
 
 def call_controller(mpc, x0s):
     controller = jm.Controller(mpc)
-    carry, plans = controller.start(x0s[0]), []
+    control, plans = controller.start(x0s[0]), []
     for x0 in x0s:  # each with the last one's plan as a start
-        _, carry, plan = controller(x0, carry)
-        plans.append(plan)
+        control = controller(x0, control)
+        plans.append(control.plan)
     return plans
 
 

@@ -66,3 +66,19 @@ def test_no_states_and_wrong_shapes():
         jm.solve_many(mpc, np.zeros((1, 2)), dtype="int32")
     with pytest.raises(ValueError, match="chunk"):
         jm.solve_many(mpc, np.zeros((1, 2)), chunk=0)
+
+
+def test_solved_and_sentence(states):
+    """Of one plan, and of many: one truth value each, and a print of a few lines."""
+    mpc = problems.joint_o_inf(10)
+    plans = jm.solve_many(mpc, states[:3])
+    np.testing.assert_array_equal(plans.solved, plans.status == jm.Status.SOLVED)
+    plan = jm.solve(mpc, np.array([0.1, 0.0]))
+    assert plan.solved and plan.sentence == jm.Status.SOLVED.sentence
+    with pytest.raises(ValueError, match="sentence: of"):
+        print(plans.sentence)
+    for text in (repr(plan), repr(plans), repr(jm.Controller(mpc)), repr(mpc)):
+        assert len(text.splitlines()) < 12 and len(text) < 1000
+    seen = []
+    jax.eval_shape(lambda x: seen.append(repr(jm.solve(mpc, x))), np.zeros(2))
+    assert "traced" in seen[0]

@@ -55,8 +55,7 @@ def rates(w):
 
 def controlled(w):
     controller = jm.Controller(problem(w, input_rate_weight=w["W"], control_horizon=2), SOLVER)
-    _, carry, _ = controller(X0)
-    return controller(X0 + 0.1, carry, AIM)[2]
+    return controller(X0 + 0.1, controller(X0), AIM).plan
 
 
 def stagewise(w):
