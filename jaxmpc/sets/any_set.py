@@ -9,7 +9,6 @@ from jaxmpc.checks import fail
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.convex_set import LinearSet
 from jaxmpc.sets.ellipsoid import Ellipsoid
-from jaxmpc.sets.geometry import unit_rows
 from jaxmpc.sets.lp import Program
 from jaxmpc.sets.polytope import Polytope, as_polytope
 
@@ -34,8 +33,7 @@ def unit_half_spaces(argument: str, set_: Any, n: int) -> tuple[np.ndarray, np.n
         return np.zeros((0, n)), np.zeros(0)
     if not isinstance(set_, LinearSet):
         fail(argument, f"{type(set_).__name__} is no convex set", "Give a Box or Polytope")
-    polytope = as_polytope(argument, set_, n)
-    return unit_rows(polytope.H, polytope.h, argument)
+    return as_polytope(argument, set_, n).unit_rows(argument)
 
 
 def set_bounds(set_: Box | Polytope | Ellipsoid | None, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -54,7 +52,7 @@ def set_bounds(set_: Box | Polytope | Ellipsoid | None, n: int) -> tuple[np.ndar
         upper = np.sqrt(np.asarray(set_.level, np.float64) * np.diag(inverse))
         lower = -upper
     else:
-        program = Program(*unit_rows(set_.H, set_.h))
+        program = Program(*set_.unit_rows())
         lower, upper = program.bounds()
         least = 1e-6 * program.column
     size = [np.where(np.isfinite(v), np.abs(v), 0.0) for v in (lower, upper)]

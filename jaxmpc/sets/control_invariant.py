@@ -7,6 +7,7 @@ vertices.
 
 from collections.abc import Iterator
 from dataclasses import KW_ONLY
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -18,11 +19,14 @@ from jaxmpc.sets.box import Box
 from jaxmpc.sets.disturbance import supports
 from jaxmpc.sets.geometry import factors, unit_rows
 from jaxmpc.sets.invariant import maximal_invariant_set
-from jaxmpc.sets.lp import FLAT, Program, framed, maximise, safe_extent, scaling
+from jaxmpc.sets.lp import FLAT, ROUNDING, Program, maximise, safe_extent, scaling
 from jaxmpc.sets.one_step import OneStep, one_step, tidy
 from jaxmpc.sets.polytope import Polytope, as_polytope
 from jaxmpc.systems.riccati import lqr
 from jaxmpc.systems.system import LinearSystem
+
+_CUT = 1e-7  # the last step of a recursion that ends cuts off more than this
+_VERTICES = 500  # up to this many vertices, an input is found for each
 
 
 @pytree
@@ -98,81 +102,106 @@ def maximal_control_invariant_set(
         fail("tolerance", f"{tolerance!r} is not between 0 and 1", "Give a relative gap")
     step = one_step(system, inputs, disturbance)
     X = as_polytope("states", states, step.n)
-    if not framed("states", *unit_rows(X.H, X.h)).bounded:
+    if not X.frame("states").bounded:
         fail("states", "is unbounded", "Bound every coordinate")
-    whole = safe_extent(*unit_rows(X.H, X.h))
-    empty = Polytope(np.zeros((1, step.n)), np.array([-1.0]))
-
-    def result(inner, outer, k, reason, gap=0.0, exact=True):
-        return ControlInvariantSet(
-            inner.H, inner.h, inner.labels,
-            exact=exact, outer=outer, iterations=k, gap=gap, reason=reason,
-        )  # fmt: skip
-
     center, margin = _equilibrium(step, X)
     if margin < -FLAT:
-        short = (
-            "" if margin == -np.inf else f" (the best misses them by {-margin:.3g} of their size)"
-        )
-        return result(
-            empty, empty, 0,
-            f"empty: no equilibrium x = A x + B u + c lies within the limits{short}",
-        )  # fmt: skip
-    C, cut, last, outer = X.reduce(), 1.0, np.inf, None
-    stop = "max_iterations is reached"
-    for k in range(max_iterations + 1):
-        try:
+        short = f" (the best misses them by {-margin:.3g} of their size)"
+        why = "empty: no equilibrium x = A x + B u + c lies within the limits"
+        end = _End(_empty(step.n), 0, f"{why}{'' if margin == -np.inf else short}", exact=True)
+    else:
+        end = _recursion(step, X, max_iterations, tolerance)
+    inner, gap, reason = end.C, 0.0, end.why
+    if not end.exact:
+        found = _inside(step, end, X, center, max_iterations, tolerance)
+        inner, gap, reason = _described(step, end, center, *found)
+    return ControlInvariantSet(
+        inner.H,
+        inner.h,
+        inner.labels,
+        exact=end.exact,
+        outer=end.C if end.flat is None else end.flat,
+        iterations=end.k,
+        gap=gap,
+        reason=reason,
+    )
+
+
+class _End(NamedTuple):
+    """How the recursion ended: with C_k, for a reason in words.
+
+    exact: whether C_k is C_inf. cut: what the last step cut off of it. flat: the set without volume
+    to which C_k converges, if that is the reason.
+    """
+
+    C: Polytope
+    k: int
+    why: str
+    exact: bool = False
+    cut: float = 0.0
+    flat: Polytope | None = None
+
+
+def _recursion(step: OneStep, X: Polytope, max_iterations: int, tolerance: float) -> _End:
+    """Run C_0 = X, C_{k+1} = Pre(C_k) & C_k to its end."""
+    whole = safe_extent(*X.unit_rows())
+    C, cut, last, k = X.reduce(), 1.0, np.inf, 0
+    try:
+        for k in range(max_iterations + 1):
             before = step.back(C)
             following = C if before.is_empty() else C.intersect(before)
             if before.is_empty() or following.is_empty():
                 against = "" if step.W is None else " against every disturbance"
-                return result(
-                    empty, empty, k + 1,
-                    f"empty: from no state do the limits hold for {k + 1} steps{against}",
-                )  # fmt: skip
+                why = f"empty: from no state do the limits hold for {k + 1} steps{against}"
+                return _End(_empty(step.n), k + 1, why, exact=True)
             cut = largest_cut(before, C, enough=_CUT)
             # Convergence without end makes each cut a fraction of the last; an end makes it 0.
-            if cut <= _ROUNDING and last > _CUT:
-                text, worst = _vertex_proof(step, C)
-                if worst > FLAT:
-                    stop = f"C_k = C_k+1 at k = {k}, but for rounding{text}"
-                    break
-                return result(
-                    C, C, k,
+            if cut <= ROUNDING and last > _CUT:
+                proof = _vertex_proof(step, C)
+                if proof.worst > FLAT:
+                    why = f"C_k = C_k+1 at k = {k}, but for rounding{proof.text}"
+                    return _End(C, k, why, cut=cut)
+                why = (
                     f"exact: C_{k} = C_{k + 1}; rows of its predecessor cut off at most "
-                    f"{max(cut, 0.0):.0e} of its extent (upper bound){text}",
-                )  # fmt: skip
+                    f"{max(cut, 0.0):.0e} of its extent (upper bound){proof.text}"
+                )
+                return _End(C, k, why, exact=True)
             if cut <= tolerance / 10:
-                stop = f"C_k converges without end: step {k} cuts off {cut:.0e} of its extent"
-                break
+                why = f"C_k converges without end: step {k} cuts off {cut:.0e} of its extent"
+                return _End(C, k, why, cut=cut)
             if k < max_iterations:
                 width = _width(following, whole)
                 if width <= FLAT:
-                    outer = following
-                    stop = f"C_k converges to a set without volume (margin {width:.0e})"
-                    break
+                    why = f"C_k converges to a set without volume (margin {width:.0e})"
+                    return _End(C, k, why, cut=cut, flat=following)
                 C, last = following.reduce(), cut
-        except ValueError as error:
-            stop = f"the recursion is given up at step {k} ({error})"
-            break
-    outer = C if outer is None else outer
-    inner, gap = _inside(step, C, X, center, max(cut, _ROUNDING), max_iterations, tolerance)
-    if inner is None:
-        found = "no control invariant set with volume was found in it"
-        if step.W is None:
-            inner = Polytope(
-                np.vstack([np.eye(step.n), -np.eye(step.n)]),
-                np.r_[center[: step.n], -center[: step.n]],
-            )
-            found += ", so the set returned is an equilibrium alone"
-        return result(inner or empty, outer, k, f"outer bound: {stop}; {found}", np.inf, False)
-    return result(
-        inner, outer, k,
-        f"inner and outer set: {stop}; the inner one is invariant, as its predecessor's rows cut "
-        f"off nothing (upper bound, to {_ROUNDING:.0e}){_vertex_proof(step, inner)[0]}; enlarged "
-        f"about its center by 1 + {gap:.1e} it holds the outer one",
-        gap, False,
-    )  # fmt: skip
+    except ValueError as error:
+        return _End(C, k, f"the recursion is given up at step {k} ({error})", cut=cut)
+    return _End(C, k, "max_iterations is reached", cut=cut)
+
+
+def _empty(n: int) -> Polytope:
+    return Polytope(np.zeros((1, n)), np.array([-1.0]))
+
+
+def _described(
+    step: OneStep, end: _End, center: np.ndarray, inner: Polytope | None, gap: float
+) -> tuple[Polytope, float, str]:
+    """Return the set to give, its gap, and the reason, where the recursion has no end."""
+    if inner is not None:
+        reason = (
+            f"inner and outer set: {end.why}; the inner one is invariant, as its predecessor's "
+            f"rows cut off nothing (upper bound, to {ROUNDING:.0e})"
+            f"{_vertex_proof(step, inner).text}; enlarged about its center by 1 + {gap:.1e} it "
+            "holds the outer one"
+        )
+        return inner, gap, reason
+    reason = f"outer bound: {end.why}; no control invariant set with volume was found in it"
+    if step.W is not None:
+        return _empty(step.n), gap, reason
+    x, identity = center[: step.n], np.eye(step.n)
+    point = Polytope(np.vstack([identity, -identity]), np.r_[x, -x])
+    return point, gap, f"{reason}, so the set returned is an equilibrium alone"
 
 
 def _equilibrium(step: OneStep, X: Polytope) -> tuple[np.ndarray, float]:
@@ -196,8 +225,8 @@ def _equilibrium(step: OneStep, X: Polytope) -> tuple[np.ndarray, float]:
     for part, polytope in ((slice(0, n), X), (slice(n, None), step.V)):
         if polytope is None:
             continue
-        G, g = unit_rows(polytope.H, polytope.h)
-        depth = g - G @ framed("limits", G, g).center
+        G, g = polytope.unit_rows()
+        depth = g - G @ polytope.frame("limits").center
         rows.append(np.column_stack([G @ free[part], depth]))
         limits.append(g - G @ z0[part])
     top = maximise(np.eye(free.shape[1] + 1)[-1], *unit_rows(np.vstack(rows), np.hstack(limits)))
@@ -205,103 +234,98 @@ def _equilibrium(step: OneStep, X: Polytope) -> tuple[np.ndarray, float]:
     return z0 + free @ top.x[:-1], float(top.x[-1])
 
 
+class _Invariant(NamedTuple):
+    """A control invariant set and its predecessor."""
+
+    C: Polytope
+    before: Polytope
+
+
 def _inside(
-    step: OneStep, C: Polytope, X: Polytope, center: np.ndarray, cut: float, rounds: int,
-    tolerance: float,
-) -> tuple[Polytope | None, float]:  # fmt: skip
+    step: OneStep, end: _End, X: Polytope, center: np.ndarray, rounds: int, tolerance: float
+) -> tuple[Polytope | None, float]:
     """Return a control invariant set within C_k, as large as `rounds` steps make it, and the
     gap."""
-    found = None
+    cut, x_e = max(end.cut, ROUNDING), center[: step.n]
     margins = [m for m in 4 * cut * 30.0 ** np.arange(9) if m < 0.5] + [0.5]
+    found = None
     for candidates in (
-        _shrunk(step, C, center, margins),
+        _shrunk(step, end.C, x_e, margins),
         _of_regulator(step, X, center),
-        _contractive(step, C, center, margins),
+        _contractive(step, end.C, x_e, margins),
     ):
         try:
-            found = found or next(candidates, None)
+            found = found or next(filter(None, candidates), None)
         except ValueError:  # too many rows to eliminate, a set too thin for qhull, no such law
             continue
     if found is None:
         return None, np.inf
-    inner, before = found
-    gap = _gap(C, inner)
+    gap = _gap(end.C, found.C)
     for _ in range(rounds):
         if gap <= tolerance:
             break
         try:
-            larger = tidy(X.intersect(before))
-            before, narrower = step.back(larger), _gap(C, larger)
+            larger = _if_invariant(step, tidy(X.intersect(found.before)))
+            narrower = np.inf if larger is None else _gap(end.C, larger.C)
         except ValueError:
             break
-        if narrower > 0.999 * gap or largest_cut(before, larger, enough=_ROUNDING) > _ROUNDING:
+        if larger is None or narrower > 0.999 * gap:
             break
-        inner, gap = larger, narrower
-    return inner, gap
+        found, gap = larger, narrower
+    return found.C, gap
 
 
 def _shrunk(
-    step: OneStep, C: Polytope, center: np.ndarray, margins: list[float]
-) -> Iterator[tuple[Polytope, Polytope]]:
-    """Yield C_k shrunk about the equilibrium by each margin, with its predecessor, where it is
-    invariant."""
+    step: OneStep, C: Polytope, x_e: np.ndarray, margins: list[float]
+) -> Iterator[_Invariant | None]:
+    """Yield C_k shrunk about the equilibrium by each margin, where it is invariant."""
     for margin in margins:
-        yield from _kept(step, _about(C, center[: step.n], 1 - margin))
+        yield _if_invariant(step, _resized(C, x_e, 1 - margin))
 
 
 def _contractive(
-    step: OneStep, C: Polytope, center: np.ndarray, margins: list[float]
-) -> Iterator[tuple[Polytope, Polytope]]:
-    """Yield for each margin the end of C <- Pre(x_e + (1 - margin) (C - x_e)) & C, with its
-    predecessor."""
-    whole = safe_extent(*unit_rows(C.H, C.h))
+    step: OneStep, C: Polytope, x_e: np.ndarray, margins: list[float]
+) -> Iterator[_Invariant | None]:
+    """Yield for each margin the sets C <- Pre(x_e + (1 - margin) (C - x_e)) & C, where they are
+    invariant."""
+    whole = safe_extent(*C.unit_rows())
     for margin in margins:
         inner = C
         for _ in range(30):
-            before = step.back(_about(inner, center[: step.n], 1 - margin))
-            inner = tidy(inner.intersect(before))
+            inner = tidy(inner.intersect(step.back(_resized(inner, x_e, 1 - margin))))
             if inner.is_empty() or _width(inner, whole) <= FLAT:
                 break
-            found = list(_kept(step, inner))
-            if found:
-                yield from found
-                break
+            yield _if_invariant(step, inner)
 
 
-def _of_regulator(
-    step: OneStep, X: Polytope, center: np.ndarray
-) -> Iterator[tuple[Polytope, Polytope]]:
-    """Yield O_inf of an LQR about the equilibrium (x_e, v_e), with its predecessor."""
+def _of_regulator(step: OneStep, X: Polytope, center: np.ndarray) -> Iterator[_Invariant | None]:
+    """Yield O_inf of an LQR about the equilibrium (x_e, v_e), where it is invariant."""
     n, k = step.n, step.moving.shape[1]
     system = LinearSystem(step.A, step.B @ step.moving)
     x_e, v_e = center[:n], center[n:]
-    G, g = unit_rows(X.H, X.h)
-    V = None
+    V, input_size = None, np.ones(k)
     if step.V is not None:
-        H, h = unit_rows(step.V.H, step.V.h)
-        V = Polytope(H, h - H @ v_e)
-    input_size = np.ones(k)
-    if step.V is not None:
-        size = safe_extent(*unit_rows(step.V.H, step.V.h))
+        V = step.V.preimage(np.eye(k), v_e)
+        size = safe_extent(*step.V.unit_rows())
         input_size = np.where(np.isfinite(size), size, 1.0)
-    law = lqr(system, np.diag(1 / safe_extent(G, g) ** 2), np.diag(1 / input_size**2))
-    invariant = maximal_invariant_set(
-        system, law.K, Polytope(G, g - G @ x_e), V, disturbance=step.W
-    )
-    H, h = unit_rows(invariant.H, invariant.h)
-    yield from _kept(step, Polytope(H, h + H @ x_e))
+    state_size = safe_extent(*X.unit_rows())
+    law = lqr(system, np.diag(1 / state_size**2), np.diag(1 / input_size**2))
+    about = X.preimage(np.eye(n), x_e)
+    found = maximal_invariant_set(system, law.K, about, V, disturbance=step.W)
+    yield _if_invariant(step, Polytope(found.H, found.h).preimage(np.eye(n), -x_e))
 
 
-def _kept(step: OneStep, C: Polytope) -> Iterator[tuple[Polytope, Polytope]]:
-    """Yield (C, Pre(C)) if no row of Pre(C) cuts C."""
+def _if_invariant(step: OneStep, C: Polytope) -> _Invariant | None:
+    """Return C and Pre(C) if no row of Pre(C) cuts C."""
     before = step.back(C)
-    if not before.is_empty() and largest_cut(before, C, enough=_ROUNDING) <= _ROUNDING:
-        yield C, before
+    if before.is_empty() or largest_cut(before, C, enough=ROUNDING) > ROUNDING:
+        return None
+    return _Invariant(C, before)
 
 
-def _about(C: Polytope, center: np.ndarray, factor: float) -> Polytope:
+def _resized(C: Polytope, center: np.ndarray, factor: float) -> Polytope:
     """Return {center + factor (x - center) : x in C}."""
-    H, h = unit_rows(C.H, C.h)
+    H, h = C.unit_rows()
     return Polytope(H, factor * h + (1 - factor) * (H @ center))
 
 
@@ -311,8 +335,8 @@ def largest_cut(before: Polytope, C: Polytope, enough: float = np.inf) -> float:
 
     The number is an upper bound; the search ends at the first fraction above `enough`.
     """
-    H, h = unit_rows(before.H, before.h)
-    level, worst = H @ framed("Polytope", *unit_rows(C.H, C.h)).center, -np.inf
+    H, h = before.unit_rows()
+    level, worst = H @ C.frame().center, -np.inf
     for i, top in _tops(H, C, h):
         worst = max(worst, (top - h[i]) / max(top - level[i], np.finfo(float).tiny))
         if worst > enough:
@@ -322,8 +346,8 @@ def largest_cut(before: Polytope, C: Polytope, enough: float = np.inf) -> float:
 
 def _gap(outer: Polytope, inner: Polytope) -> float:
     """Return the least s with outer within the inner set enlarged by 1 + s about its center."""
-    H, h = unit_rows(inner.H, inner.h)
-    slack = h - H @ framed("Polytope", H, h).center
+    H, h = inner.unit_rows()
+    slack = h - H @ inner.frame().center
     return max(0.0, *((top - h[i]) / slack[i] for i, top in _tops(H, outer)))
 
 
@@ -333,9 +357,9 @@ def _tops(H: np.ndarray, C: Polytope, h: np.ndarray | None = None) -> Iterator[t
 
     With h, where a row of C next to H_i x <= h_i implies it, that row's bound.
     """
-    G, g = unit_rows(C.H, C.h)
+    G, g = C.unit_rows()
     # In coordinates of like size, rows of length 1: x = scale ξ.
-    scale = framed("Polytope", G, g).scale
+    scale = C.frame().scale
     length = np.linalg.norm(np.vstack([G, H]) * scale, axis=1)
     G, g = G * scale / length[: len(G), None], g / length[: len(G)]
     length = length[len(G) :]
@@ -353,51 +377,45 @@ def _tops(H: np.ndarray, C: Polytope, h: np.ndarray | None = None) -> Iterator[t
             yield int(i), float(top * length[i])
 
 
-def _vertex_proof(step: OneStep, C: Polytope) -> tuple[str, float]:
-    """Return by how much the worst vertex of C leaves it under the best input for each, as a text
-    and as a number, relative to the set's extent along the row (inputs: theirs)."""
+class _VertexProof(NamedTuple):
+    """By how much the worst vertex leaves its set under the best input for each, relative to the
+    set's extent along the row (inputs: theirs); and a text of it, empty where it is not found."""
+
+    worst: float
+    text: str
+
+
+def _vertex_proof(step: OneStep, C: Polytope) -> _VertexProof:
+    """Find the best input for each vertex of C, if they are few."""
     vertices = C.vertices() if step.n <= 4 else np.zeros((0, step.n))
     if not 0 < len(vertices) <= _VERTICES:
-        return "", 0.0
-    G, g = unit_rows(C.H, C.h)
-    depth = g - G @ framed("Polytope", G, g).center
+        return _VertexProof(0.0, "")
+    G, g = C.unit_rows()
+    depth = g - G @ C.frame().center
     g = g - supports(step.W, G)
     BU = step.B @ step.moving
     k = BU.shape[1]
-    rows, worst = np.column_stack([G @ BU, depth]), 0.0
     H, h, room = np.zeros((0, k)), np.zeros(0), np.zeros(0)
     if step.V is not None:
-        H, h = unit_rows(step.V.H, step.V.h)
-        room = h - H @ framed("inputs", H, h).center
+        H, h = step.V.unit_rows()
+        room = h - H @ step.V.frame("inputs").center
+    rows = np.block([[G @ BU, depth[:, None]], [H, np.zeros((len(H), 1))]])
+    worst = 0.0
     for v in vertices:
         drift = step.A @ v + step.c + step.B @ step.fixed
-        limits = np.r_[g - G @ drift, h]
-        top = maximise(
-            np.eye(k + 1)[k],
-            *unit_rows(np.vstack([rows, np.column_stack([H, np.zeros(len(H))])]), limits),
-        )
+        top = maximise(np.eye(k + 1)[k], *unit_rows(rows, np.r_[g - G @ drift, h]))
         assert top.x is not None  # any u within its limits is feasible, with a slack low enough
         u = top.x[:-1]
         worst = max(worst, float(((G @ (drift + BU @ u) - g) / depth).max()))
         worst = max(worst, float(((H @ u - h) / room).max(initial=0.0)))
-    text = f"; each of its {len(vertices)} vertices has an input that keeps it in, to {worst:.0e}"
-    return text, worst
+    count = len(vertices)
+    text = f"; each of its {count} vertices has an input that keeps it in, to {worst:.0e}"
+    return _VertexProof(worst, text)
 
 
 def _width(body: Polytope, whole: np.ndarray) -> float:
     """Return the largest margin of the rows of a set, relative to the extents `whole` (n,) of one
     that holds it: 0 for a flat set."""
-    G, g = unit_rows(body.H, body.h)
-    length = np.abs(G) @ whole
-    top = maximise(np.eye(len(whole) + 1)[-1], np.column_stack([G, length]), g)
-    return max(top.value, 0.0)
-
-
-_VERTICES = 500  # up to this many vertices, an input is found for each
-
-
-_CUT = 1e-7  # the last step of a recursion that ends cuts off more than this
-
-
-# The same for a predecessor's rows, where rounding in 12 dimensions reaches 1e-12.
-_ROUNDING = 1e-11
+    G, g = body.unit_rows()
+    rows = np.column_stack([G, np.abs(G) @ whole])
+    return max(maximise(np.eye(len(whole) + 1)[-1], rows, g).value, 0.0)

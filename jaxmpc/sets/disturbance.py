@@ -5,7 +5,6 @@ import numpy as np
 from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail
 from jaxmpc.sets.box import Box
-from jaxmpc.sets.geometry import unit_rows
 from jaxmpc.sets.lp import extent
 from jaxmpc.sets.polytope import Polytope, as_polytope
 
@@ -14,8 +13,7 @@ def disturbance_set(disturbance: Box | Polytope | None, n: int) -> Box | Polytop
     """Return the disturbance; raise ValueError unless it is None or a bounded set that holds 0."""
     if disturbance is None:
         return None
-    W = as_polytope("disturbance", disturbance, n)
-    G, g = unit_rows(W.H, W.h, "disturbance")
+    G, g = as_polytope("disturbance", disturbance, n).unit_rows("disturbance")
     if not np.isfinite(extent(G, g)).all():
         fail("disturbance", "is unbounded", "Bound every coordinate")
     if g.min() < 0:

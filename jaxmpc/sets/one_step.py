@@ -2,15 +2,16 @@
 
 import numpy as np
 
-from jaxmpc.arrays import host_array
 from jaxmpc.checks import require_kind
 from jaxmpc.pytrees import record
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.disturbance import disturbance_set
-from jaxmpc.sets.geometry import irredundant_rows, unit_rows
-from jaxmpc.sets.lp import FLAT, ROUNDING, Flat, affine_hull, framed, safe_extent
+from jaxmpc.sets.geometry import irredundant_rows
+from jaxmpc.sets.lp import FLAT, ROUNDING, Flat, affine_hull, safe_extent
 from jaxmpc.sets.polytope import Polytope, as_polytope
 from jaxmpc.systems.system import LinearSystem, host_matrices
+
+_MANY = 60  # rows of a target from which ridges are looked for, instead of pairs of rows
 
 
 def predecessor(
@@ -47,16 +48,16 @@ def predecessor(
     Source: Kerrigan 2000, thesis, Cambridge, section 2.3.
     """
     step = one_step(system, inputs, disturbance)
-    X = [] if states is None else [as_polytope("states", states, step.n)]
-    return step.back(as_polytope("target", target, step.n), *X)
+    X = None if states is None else as_polytope("states", states, step.n)
+    return step.back(as_polytope("target", target, step.n), X)
 
 
 @record
 class OneStep:
-    """x+ = A x + B u + c + w with u in U, w in W.
+    """x+ = A x + B u + c + w with u in U, w in W (None: w = 0).
 
     U is {u : u = moving v + fixed, v in V}, with V None if nothing bounds v; where V is a
-    bounded box, `ends` has its (lower, upper), else it is None.
+    bounded box, `ends` has (lower, upper) of each v, else it is None.
     """
 
     A: np.ndarray
@@ -76,72 +77,63 @@ class OneStep:
     def back(self, target: Polytope, states: Polytope | None = None) -> Polytope:
         """Return the `predecessor` of the target; `states` None stands for all of R^n."""
         n, k = self.n, self.moving.shape[1]
-        T = Polytope(target.H, target.h)
-        if self.W is not None:
-            T = T.pontryagin_difference(self.W)
-            if T.is_empty():
-                return tidy(T)
-            G, g = unit_rows(T.H, T.h)
-            try:
-                framed("target", G, g)
-            except Flat:  # an elimination needs a set with volume
-                reach = safe_extent(*unit_rows(target.H, target.h))
-                reach = np.where(np.isfinite(reach), reach, 0.0)
-                T = Polytope(G, g + 4 * FLAT * (np.abs(g) + np.abs(G) @ reach))
+        T = Polytope(target.H, target.h) if self.W is None else self._shrunk(target, self.W)
+        if self.W is not None and T.is_empty():
+            return tidy(T)
         # y in T - B u, where the inputs are u = moving v + fixed
-        T = T.preimage(np.eye(n), self.B @ self.fixed)
+        T, BU = T.preimage(np.eye(n), self.B @ self.fixed), self.B @ self.moving
         many = n in (3, 4) and np.asarray(T.h).size > _MANY
-        if k and self.ends is not None and many and _bounded(T):
-            for b, (lower, upper) in zip((self.B @ self.moving).T, self.ends, strict=True):
+        if k and self.ends is not None and many and T.frame().bounded:
+            for b, (lower, upper) in zip(BU.T, self.ends, strict=True):
                 T = _plus_segment(T, -b, lower, upper)
         elif k:
-            T = T.preimage(np.hstack([np.eye(n), self.B @ self.moving]))
+            T = T.preimage(np.hstack([np.eye(n), BU]))
             if self.V is not None:
                 T = T.intersect(self.V.preimage(np.hstack([np.zeros((k, n)), np.eye(k)])))
             T = T.project(range(n))
-        before = T.preimage(self.A, self.c)
-        H, h = host_array("H", before.H), host_array("h", before.h)
+        H, h = T.preimage(self.A, self.c).half_spaces()
         # Of a singular A, rows of T whose product with it is 0 but for rounding.
-        T_H, T_h = np.abs(host_array("H", T.H)), np.abs(host_array("h", T.h))
+        T_H, T_h = np.abs(T.half_spaces()[0]), np.abs(T.half_spaces()[1])
         H[np.all(np.abs(H) <= 1e-13 * T_H @ np.abs(self.A), axis=1)] = 0.0
         h[~H.any(axis=1) & (np.abs(h) <= ROUNDING * (T_h + T_H @ np.abs(self.c)))] = 0.0
         before = Polytope(H, h)
         return tidy(before if states is None else states.intersect(before))
 
+    @staticmethod
+    def _shrunk(target: Polytope, W: Box | Polytope) -> Polytope:
+        """Return the target less W, with volume unless empty: an elimination needs it."""
+        T = Polytope(target.H, target.h).pontryagin_difference(W)
+        try:
+            if not T.is_empty():
+                T.frame()
+        except Flat:
+            reach = safe_extent(*target.unit_rows())
+            reach = np.where(np.isfinite(reach), reach, 0.0)
+            G, g = T.unit_rows()
+            T = Polytope(G, g + 4 * FLAT * (np.abs(g) + np.abs(G) @ reach))
+        return T
+
 
 def one_step(
     system: LinearSystem, inputs: Box | Polytope | None, disturbance: Box | Polytope | None
 ) -> OneStep:
-    """Return the exact data of x⁺ = A x + B u + c + w, with what equalities fix of the inputs
+    """Return the data of x⁺ = A x + B u + c + w, checked, with what equalities fix of the inputs
     (lower = upper, or two opposite rows) taken out."""
     require_kind("system", system, LinearSystem)
     system.validate()
     m = system.m
-    inputs = None if inputs is None else inputs.spread(m)
-    A, B, c = host_matrices(system)
     V, moving, fixed, ends = None, np.eye(m), np.zeros(m), None
-    if isinstance(inputs, Polytope):
-        V = as_polytope("inputs", inputs, m)
-        hull = affine_hull(*unit_rows(V.H, V.h))
+    if inputs is not None:
+        hull = affine_hull(*as_polytope("inputs", inputs, m).unit_rows("inputs"))
         assert hull is not None
-        if hull.equal.any():
-            moving, fixed = hull.basis, hull.shift
-            V = Polytope(hull.G, hull.g) if len(hull.g) else None
-    elif inputs is not None:
-        as_polytope("inputs", inputs, m)
+        moving, fixed = hull.basis, hull.shift
+        V = Polytope(hull.G, hull.g) if len(hull.g) else None
     if isinstance(inputs, Box):
-        lower, upper = host_array("inputs", inputs.lower), host_array("inputs", inputs.upper)
-        free = upper > lower
-        moving, fixed = np.eye(m)[:, free], np.where(free, 0.0, lower)
-        V = Box(lower[free], upper[free]).to_polytope() if free.any() else None
-        ends = np.column_stack([lower, upper])[free]
-        ends = ends if np.isfinite(ends).all() else None
-    return OneStep(A, B, c, V, moving, fixed, disturbance_set(disturbance, system.n), ends)
-
-
-def _bounded(polytope: Polytope) -> bool:
-    """Return whether a polytope is bounded."""
-    return framed("Polytope", *unit_rows(polytope.H, polytope.h)).bounded
+        # Each v is one of the inputs.
+        bounds = np.column_stack([*inputs.spread(m).bounds()])[moving.argmax(axis=0)]
+        ends = bounds if np.isfinite(bounds).all() else None
+    W = disturbance_set(disturbance, system.n)
+    return OneStep(*host_matrices(system), V, moving, fixed, W, ends)
 
 
 def _plus_segment(T: Polytope, b: np.ndarray, lower: float, upper: float) -> Polytope:
@@ -151,7 +143,7 @@ def _plus_segment(T: Polytope, b: np.ndarray, lower: float, upper: float) -> Pol
     p and q meet with p'b > 0 > q'b. A ridge has at least n - 1 vertices: of all pairs (p, q),
     those with so many common vertices are combined, far fewer than an elimination would make.
     """
-    G, g = unit_rows(T.H, T.h)
+    G, g = T.unit_rows()
     slope, n = G @ b, G.shape[1]
     slope[np.abs(slope) <= 1e-13 * np.abs(G) @ np.abs(b)] = 0.0
     V = T.vertices()
@@ -173,13 +165,10 @@ def tidy(polytope: Polytope) -> Polytope:
     zero = np.zeros((1, polytope.dimension))
     if polytope.is_empty():
         return Polytope(zero, np.array([-1.0]))
-    G, g = unit_rows(polytope.H, polytope.h)
+    G, g = polytope.unit_rows()
     if not len(G):
         return Polytope(zero, np.array([1.0]))
     try:
         return Polytope(*irredundant_rows("Polytope", G, g))
     except Flat:
         return Polytope(G, g)
-
-
-_MANY = 60  # rows of a target from which ridges are looked for, instead of pairs of rows

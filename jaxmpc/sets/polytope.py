@@ -130,7 +130,7 @@ class Polytope(LinearSet):
     def support(self, d: Reals) -> float:
         """Return max d'x over the set, by one LP; inf if unbounded along d. NumPy; not traceable.
         Raises ValueError if the set is empty."""
-        G, g = self._rows()
+        G, g = self.unit_rows()
         d = host_array("d", d)
         require_shape("d", d, (self.dimension,), "Give one direction")
         require_finite("d", d)
@@ -150,7 +150,7 @@ class Polytope(LinearSet):
         The radius of a flat set is 0. Raises ValueError if the set is empty, or holds balls
         of every radius.
         """
-        center, radius = largest_ball("Polytope", *self._rows())
+        center, radius = largest_ball("Polytope", *self.unit_rows())
         if radius == np.inf:
             fail("Polytope", "is unbounded: it holds arbitrarily large balls", "Add rows")
         return center, max(radius, 0.0)
@@ -172,6 +172,16 @@ class Polytope(LinearSet):
     def half_spaces(self) -> tuple[np.ndarray, np.ndarray]:
         """Return (H, h) in float64. NumPy; not traceable."""
         return host_array("Polytope.H", self.H), host_array("Polytope.h", self.h)
+
+    def unit_rows(self, argument: str = "Polytope") -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows that can bind, scaled to norm 1. NumPy; not traceable."""
+        self._require_fields(argument)
+        return unit_rows(self.H, self.h, argument)
+
+    def frame(self, argument: str = "Polytope") -> Frame:
+        """Return a point inside, and the set about it in units in which it is about 1 wide; raise
+        ValueError, naming `argument`, if it is empty or flat. NumPy; not traceable."""
+        return framed(argument, *self.unit_rows(argument))
 
     def scale(self, factor: float) -> "Polytope":
         """Return {factor x : x in the set}, factor > 0. NumPy; not traceable."""
@@ -242,7 +252,7 @@ class Polytope(LinearSet):
         wrong = not axes or len(set(axes)) < len(axes) or not set(axes) <= set(range(n))
         if wrong:
             fail("axes", f"{axes} are not distinct numbers in 0..{n - 1}", "Name those to keep")
-        G, g = self._rows()
+        G, g = self.unit_rows()
         try:
             Z, center, scale = framed("Polytope", G, g)
         except Flat:
@@ -265,7 +275,7 @@ class Polytope(LinearSet):
             cure = "Check the rows: this needs a result with volume"
             fail("Polytope", "is flat, and so is its projection", cure)
         image = Polytope(hull.G, hull.g).image(onto, hull.shift[axes])
-        return Polytope(*irredundant_rows("Polytope", *image._rows()))
+        return Polytope(*irredundant_rows("Polytope", *image.unit_rows()))
 
     def minkowski_sum(self, other: LinearSet | Reals) -> "Polytope":
         """Return {x + w : x in the set, w in other}, with irredundant unit rows. NumPy; not
@@ -335,7 +345,7 @@ class Polytope(LinearSet):
         other = as_polytope("other", other)
         other._require_fields("other", self.dimension)
         rows, offsets = unit_rows(other.H, other.h, "other")
-        G, g = self._rows()
+        G, g = self.unit_rows()
         reach = safe_extent(G, g)
         reach[np.isinf(reach)] = 0.0
         allowed = max(tolerance, ROUNDING) * (np.abs(offsets) + np.abs(rows) @ reach)
@@ -358,7 +368,7 @@ class Polytope(LinearSet):
         of all the y (polarity; Ziegler 1995, section 2.3). A product of sets is reduced factor by
         factor; factors of more than six dimensions by one LP per row.
         """
-        G, g = self._rows()
+        G, g = self.unit_rows()
         keep = irredundant(self._dual(G, g).Z)
         labels: tuple[str, ...] = ()
         if self.labels:
@@ -373,7 +383,7 @@ class Polytope(LinearSet):
         The vertex dual to the facet {y : v'y = 1} of the hull described in `reduce` is
         c + v. Raises ValueError if the set is empty, flat or unbounded.
         """
-        Z, center, scale = self._dual(*self.reduce()._rows())
+        Z, center, scale = self._dual(*self.reduce().unit_rows())
         if self.dimension == 1:
             return np.sort(center + scale / Z, axis=0)
         V = dual_hull(Z).intersections
@@ -388,7 +398,7 @@ class Polytope(LinearSet):
 
         Raises ValueError if the set is empty, flat or unbounded.
         """
-        Z, _, scale = self._dual(*self.reduce()._rows())
+        Z, _, scale = self._dual(*self.reduce().unit_rows())
         parts, S = factors(Z)
         if len(parts) == 1:
             return hull_volume(self.vertices())
@@ -398,11 +408,6 @@ class Polytope(LinearSet):
     def _require_fields(self, argument: str, dimension: int | None = None) -> None:
         require_matching(argument, {"H": self.H, "h": self.h}, 2, dimension)
         require_labels(f"{argument}.labels", self.labels, np.shape(as_array(self.h))[0])
-
-    def _rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows that can bind, scaled to norm 1."""
-        self._require_fields("Polytope")
-        return unit_rows(self.H, self.h)
 
     @staticmethod
     def _dual(G: np.ndarray, g: np.ndarray) -> Frame:

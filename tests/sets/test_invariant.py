@@ -19,7 +19,7 @@ from jaxmpc.sets.control_invariant import (
 from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.sets.invariant import invariant_ellipsoid
 from jaxmpc.sets.one_step import one_step, predecessor
-from jaxmpc.sets.terminal_hypotheses import _exact_factor, _Rows, verify_terminal
+from jaxmpc.sets.terminal_hypotheses import _exact_factor, _Loop, _Rows, verify_terminal
 
 INF = np.inf
 JOINT = LinearSystem(np.array([[1, 0.01], [0, 1]]), np.array([[0], [0.2]]), dt=0.01)
@@ -480,9 +480,9 @@ def test_rational_certificates_of_dyadic_data():
 
 def test_rational_bound_charges_the_residual():
     # Without multipliers all of H (A+BK) x is residual: |x| <= 1, up to the LPs' margin, bounds it.
-    system = [[0.5, 0.25], [0.0, -0.25]], np.zeros((2, 1)), np.zeros((1, 2))
+    data = np.array([[0.5, 0.25], [0.0, -0.25]]), np.zeros((2, 1)), np.zeros((1, 2))
     body = _Rows(np.vstack([np.eye(2), -np.eye(2)]), np.ones(4))
-    factor = _exact_factor(np.zeros((4, 4)), body, np.zeros(2), None, system)
+    factor = _exact_factor(np.zeros((4, 4)), body, _Loop(*data, np.zeros(2), None))
     assert Fraction(3, 4) <= factor <= Fraction(3, 4) * (1 + Fraction(1, 10**5))
 
 
