@@ -26,7 +26,8 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.sets.any_set import unit_half_spaces
 from jaxmpc.sets.box import Box
-from jaxmpc.sets.lp import ROUNDING, AffineHull, Program, affine_hull, framed, maximise, scaling
+from jaxmpc.sets.interior import AffineHull, affine_hull, framed
+from jaxmpc.sets.lp import ROUNDING, Program, maximise, scaling
 from jaxmpc.sets.polytope import Polytope
 
 # In coordinates where X_N just fits into [−1, 1]^n: the smallest ball of a region.

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from jaxmpc.pytrees import record
-from jaxmpc.sets.lp import Program, bound, safe_extent
+from jaxmpc.sets.lp import Program, bound, extent
 from jaxmpc.sets.polytope import Polytope
 
 
@@ -37,7 +37,7 @@ class CenteredPolytope:
     @cached_property
     def extent(self) -> np.ndarray:
         """Return bounds |θ_i| ≤ extent_i on the polytope, (p,)."""
-        return safe_extent(self.normals, self.offsets)
+        return extent(self.normals, self.offsets)
 
     def support(self, direction: np.ndarray) -> tuple[float, np.ndarray | None]:
         """Return an upper bound of max direction'θ, by weak duality, and where it is attained."""

@@ -17,7 +17,8 @@ from jaxmpc.checks import fail
 from jaxmpc.feasible.centered_polytope import CenteredPolytope, power_of_two
 from jaxmpc.mpc.inequalities import Inequalities, row_lengths
 from jaxmpc.pytrees import record
-from jaxmpc.sets.lp import Program, affine_hull, bound, framed, maximise, safe_extent
+from jaxmpc.sets.interior import affine_hull, framed
+from jaxmpc.sets.lp import Program, bound, extent, maximise
 from jaxmpc.sets.polytope import Polytope
 
 # Bounds of linear programs are trusted to this, relative to the size of the set.
@@ -87,7 +88,7 @@ class PlanPolytope:
     @cached_property
     def extent(self) -> np.ndarray:
         """Return bounds |v_i| ≤ extent_i on the polytope."""
-        return safe_extent(self.G, self.g)
+        return extent(self.G, self.g)
 
     def followed(self) -> "PlanPolytope":
         """Return the polytope of (θ, z, z⁺) with (θ, z) and (θ⁺, z⁺) both in this one: the

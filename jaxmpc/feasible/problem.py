@@ -24,7 +24,8 @@ from jaxmpc.sets.any_set import set_bounds
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.sets.geometry import binding_rows, unit_rows
-from jaxmpc.sets.lp import FLAT, ROUNDING, implied_equalities, scaling
+from jaxmpc.sets.interior import implied_equalities
+from jaxmpc.sets.lp import FLAT, ROUNDING, scaling
 from jaxmpc.sets.polytope import Polytope
 
 
@@ -182,7 +183,7 @@ def with_equalities(mpc: MPC) -> MPC:
     """Return the problem with the rows of polytopes that imply equalities, as two opposite ones do,
     as outputs with lower = upper, and a box around each of these sets in its place.
 
-    The equalities are `lp.implied_equalities` to rounding: two rows that are opposite but for that
+    The equalities are `implied_equalities` to rounding: two rows that are opposite but for that
     are one equality. Of those that depend on each other as many are kept as are independent.
     """
     n, m, N = mpc.system.n, mpc.system.m, mpc.horizon

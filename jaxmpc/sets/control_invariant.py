@@ -19,7 +19,7 @@ from jaxmpc.sets.box import Box
 from jaxmpc.sets.disturbance import supports
 from jaxmpc.sets.geometry import factors, unit_rows
 from jaxmpc.sets.invariant import maximal_invariant_set
-from jaxmpc.sets.lp import FLAT, ROUNDING, Program, maximise, safe_extent, scaling
+from jaxmpc.sets.lp import FLAT, ROUNDING, Program, extent, maximise, scaling
 from jaxmpc.sets.one_step import OneStep, one_step, tidy
 from jaxmpc.sets.polytope import Polytope, as_polytope
 from jaxmpc.systems.riccati import lqr
@@ -144,7 +144,7 @@ class _End(NamedTuple):
 
 def _recursion(step: OneStep, X: Polytope, max_iterations: int, tolerance: float) -> _End:
     """Run C_0 = X, C_{k+1} = Pre(C_k) & C_k to its end."""
-    whole = safe_extent(*X.unit_rows())
+    whole = extent(*X.unit_rows())
     C, cut, last, k = X.reduce(), 1.0, np.inf, 0
     try:
         for k in range(max_iterations + 1):
@@ -288,7 +288,7 @@ def _contractive(
 ) -> Iterator[_Invariant | None]:
     """Yield for each margin the sets C <- Pre(x_e + (1 - margin) (C - x_e)) & C, where they are
     invariant."""
-    whole = safe_extent(*C.unit_rows())
+    whole = extent(*C.unit_rows())
     for margin in margins:
         inner = C
         for _ in range(30):
@@ -306,9 +306,9 @@ def _of_regulator(step: OneStep, X: Polytope, center: np.ndarray) -> Iterator[_I
     V, input_size = None, np.ones(k)
     if step.V is not None:
         V = step.V.preimage(np.eye(k), v_e)
-        size = safe_extent(*step.V.unit_rows())
+        size = extent(*step.V.unit_rows())
         input_size = np.where(np.isfinite(size), size, 1.0)
-    state_size = safe_extent(*X.unit_rows())
+    state_size = extent(*X.unit_rows())
     law = lqr(system, np.diag(1 / state_size**2), np.diag(1 / input_size**2))
     about = X.preimage(np.eye(n), x_e)
     found = maximal_invariant_set(system, law.K, about, V, disturbance=step.W)
@@ -370,7 +370,7 @@ def _tops(H: np.ndarray, C: Polytope, h: np.ndarray | None = None) -> Iterator[t
         near = KDTree(Z[own]).query(Z[~own])[1][::-1] if own.any() and not own.all() else []
         # What an elimination made comes last, and cuts most.
         for i, row, j in zip(rows[~own][::-1] - len(G), Z[~own][::-1], near, strict=True):
-            reach = safe_extent(Z[own], limits) if reach is None else reach
+            reach = extent(Z[own], limits) if reach is None else reach
             top = limits[j] + np.abs(row - Z[own][j]) @ reach
             if h is None or top > h[i]:
                 top = program.bound(row, program.maximise(row), reach)

@@ -16,7 +16,8 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite
-from jaxmpc.sets.lp import Program, extent, framed, maximise
+from jaxmpc.sets.interior import framed
+from jaxmpc.sets.lp import Program, extent, maximise
 
 _ZERO = 1e-12  # a coefficient that moves a row by less, relative to its distance, counts as 0
 _MERGE = "C-1e-12"  # qhull's option: merge facets of the dual that are flat to 1e-12

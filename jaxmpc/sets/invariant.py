@@ -21,7 +21,7 @@ from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.disturbance import disturbance_set, largest_norm, supports
 from jaxmpc.sets.ellipsoid import Ellipsoid
-from jaxmpc.sets.lp import ROUNDING, Program, safe_extent
+from jaxmpc.sets.lp import ROUNDING, Program, extent
 from jaxmpc.sets.polytope import Polytope, as_polytope
 from jaxmpc.systems.system import LinearSystem
 
@@ -108,7 +108,7 @@ def maximal_invariant_set(
     for t in range(max_iterations + 1):
         bounded = np.isfinite(reach).all()
         if not bounded:
-            reach = safe_extent(rows, np.ones(len(rows)))
+            reach = extent(rows, np.ones(len(rows)))
             bounded = np.isfinite(reach).all()
         # A row once redundant stays so: if F_i Acl^(t+1) x <= b_(t+1) on O_t, and Acl x + w is
         # in O_t for x in O_(t+1) and w in W, then F_i Acl^(t+2) x <= b_(t+2) on O_(t+1).

@@ -10,11 +10,11 @@ HiGHS' word is taken for an optimum alone, whose multipliers bound it whatever H
 A number counts as zero if it is within the rounding of the terms that it is the sum of.
 """
 
+from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, NamedTuple, NoReturn
+from typing import NamedTuple
 
 import numpy as np
-import scipy
 from scipy.optimize import linprog
 
 from jaxmpc.checks import fail
@@ -33,7 +33,6 @@ FLAT = 1e-9
 ROUNDING = 1e-11
 # What is left of G'y in a Farkas vector is charged for points so many times as far as typical ones.
 FAR = 1e3
-_DOUBTFUL = 1e-5  # a smaller margin is looked at again, in other units
 _SWEEPS = 40  # of the least squares of `scaling`; fewer where they end before
 
 
@@ -188,7 +187,7 @@ class Program:
             return False
         return self.farkas is not None
 
-    def bounds(self, axes: Any = None) -> tuple[np.ndarray, np.ndarray]:
+    def bounds(self, axes: Sequence[int] | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the least and the largest x_i over the set for each i of `axes` (None: all);
         infinite where the set is unbounded, (inf, -inf) where it is empty."""
         directions = np.eye(self.G.shape[1])[slice(None) if axes is None else list(axes)]
@@ -219,23 +218,13 @@ def solve(
     """Return (x, y) of max cost'x over M x <= b, with equality where `equal`, or None where HiGHS
     does not call it optimal; and whether it claims that there is no optimum. The data must be
     scaled. On ill-conditioned data HiGHS may cycle: its steps are limited."""
-    some = equal.any()
-    result = linprog(
-        -cost,
-        A_ub=M[~equal] if some else M,
-        b_ub=b[~equal] if some else b,
-        A_eq=M[equal] if some else None,
-        b_eq=b[equal] if some else None,
-        bounds=(None, None),
-        method=method,
-        options={**HIGHS, "maxiter": 1000 + 20 * sum(M.shape)},
-    )
+    options = {**HIGHS, "maxiter": 1000 + 20 * sum(M.shape)}
+    sides = {"A_ub": M[~equal], "b_ub": b[~equal], "A_eq": M[equal], "b_eq": b[equal]}
+    result = linprog(-cost, **sides, bounds=(None, None), method=method, options=options)
     if result.status != 0:
         return None, result.status in (2, 3)
     y = np.zeros(len(b))
-    y[~equal] = np.maximum(-result.ineqlin.marginals, 0.0)
-    if some:
-        y[equal] = -result.eqlin.marginals
+    y[~equal], y[equal] = np.maximum(-result.ineqlin.marginals, 0.0), -result.eqlin.marginals
     return (result.x, y), False
 
 
@@ -290,7 +279,7 @@ def maximise(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> Optimum:
     return Program(G, g).maximise(d)
 
 
-def cleaned(value: np.ndarray, size: Any) -> np.ndarray:
+def cleaned(value: np.ndarray, size: np.ndarray | float) -> np.ndarray:
     """Return sums with 0 in place of those that are rounding beside their terms, of this size."""
     return np.where(np.abs(value) < 16 * np.finfo(float).eps * size, 0.0, value)
 
@@ -306,182 +295,7 @@ def bound(d: np.ndarray, y: np.ndarray, G: np.ndarray, g: np.ndarray, extent: np
     return float(y @ g + left[off] @ extent[off])
 
 
-def extent(G: np.ndarray, g: np.ndarray, axes: Any = None) -> np.ndarray:
-    """Return max |x_i| over G x <= g for each i of `axes` (None: all), by two programs each; inf
-    where the set is unbounded."""
-    return np.max(np.abs(Program(G, g).bounds(axes)), axis=0)
-
-
-def safe_extent(G: np.ndarray, g: np.ndarray) -> np.ndarray:
-    """Return bounds of |x_i| over G x <= g that outweigh the error of the programs that find them:
-    larger by a part in 10^6."""
-    return extent(G, g) * (1 + 1e-6)
-
-
-class Flat(ValueError):
-    """A set without volume, where one with volume is needed."""
-
-
-class Frame(NamedTuple):
-    """{G x <= g} about a point inside, in coordinates of like size: Z ((x - center) / scale) <= 1.
-
-    The entries of Z (rows, n) are at most 1 in size.
-    """
-
-    Z: np.ndarray
-    center: np.ndarray
-    scale: np.ndarray
-
-    @property
-    def bounded(self) -> bool:
-        """Return whether the set is bounded: no ray r with Z r <= 0, by one LP, its answer
-        checked."""
-        n = self.Z.shape[1]
-        if len(self.Z) <= n or np.linalg.matrix_rank(self.Z) < n:
-            return False
-        # If there is one then one that reaches -1 in -1 <= Z r <= 0.
-        both = np.vstack([self.Z, -self.Z])
-        r = maximise(-self.Z.sum(axis=0), both, np.repeat([0.0, 1.0], len(self.Z))).x
-        assert r is not None  # 0 is feasible, and Z has rank n
-        off, size = self.Z @ r, np.abs(self.Z) @ np.abs(r)
-        return not (np.any(off < -0.5) and np.all(off <= ROUNDING * size))
-
-
-def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
-    """Return the frame of {G x <= g} about a point inside; ValueError if it is empty or flat.
-
-    The point has the largest common margin of all rows, first in the data's own scale, then in that
-    of the slacks found. Where that leaves a doubt, in units in which the bounding box has size 1:
-    the set is flat if the margin is below 1e-9 of it, or if a slack is rounding.
-    """
-    program = Program(G, g)
-    center, margin, _ = program.margin()
-    if margin <= ROUNDING and program.empty:
-        fail(argument, "is empty: no point satisfies all its rows", "Loosen its rows")
-
-    def slack_at(x: np.ndarray) -> np.ndarray:
-        slack, size = g - G @ x, np.abs(g) + np.abs(G) @ np.abs(x)
-        if np.any(slack <= 4 * np.finfo(float).eps * size):
-            flat(0.0)
-        return slack
-
-    def flat(margin: float) -> NoReturn:
-        raise Flat(
-            f"{argument}: is flat (its rows keep a margin of {max(margin, 0.0):.1e} of its size). "
-            "Check the rows: this needs a set with volume"
-        )
-
-    slack = slack_at(center)
-    step, margin, _ = Program(G, slack).margin()
-    center = center + step
-    slack = slack_at(center)
-    if margin <= _DOUBTFUL:
-        low, high = Program(G, slack).bounds()
-        half = (high - low) / 2
-        if np.any(half <= 0):
-            flat(0.0)
-        unit = np.where(np.isfinite(half), half, Program(G, slack).column)
-        length = np.linalg.norm(G * unit, axis=1)
-        step, margin, _ = Program(G * unit / length[:, None], slack / length).margin()
-        inside = slack - G @ (unit * step)
-        margin = float((inside / length).min())
-        if margin <= FLAT:
-            flat(margin)
-        center = center + unit * step
-        slack = slack_at(center)
-    Y = G / slack[:, None]
-    top = np.abs(Y).max(axis=0, initial=0.0)
-    scale = 1 / np.where(top > 0, top, 1.0)
-    return Frame(Y * scale, center, scale)
-
-
-def implied_equalities(G: np.ndarray, g: np.ndarray, tolerance: float = FLAT) -> np.ndarray:
-    """Return which rows of G x <= g (not empty) hold with equality all over the set.
-
-    The rows with a multiplier in max t, G x + t <= g, do if t = 0: y'(g - G x) = 0 for every x.
-    They are made equalities, and so on until the rest keeps a margin (facial reduction; Freund,
-    Roundy & Todd 1985). A margin counts as 0 below `tolerance`, in scaled rows and columns, if
-    `framed` calls the set flat too.
-    """
-    equal = np.zeros(len(g), bool)
-    for _ in range(len(g)):
-        _, t, y = Program(G, g, equal).margin()
-        if t > tolerance or equal.all():
-            return equal
-        if not equal.any():
-            try:  # a narrow set far from the origin has volume
-                framed("", G, g)
-                return equal
-            except ValueError:
-                pass
-        if t == -np.inf:
-            break
-        on = (y > 1e-6 * y.max(initial=0.0)) & ~equal
-        if not on.any():
-            return equal
-        equal = equal | on
-    return equal
-
-
-class AffineHull(NamedTuple):
-    """The points x = shift + basis w of an affine space, and a set {G w <= g} in it, with volume.
-
-    equal (all rows,): which rows of the set hold all over it. rows: the others that move with w, of
-    which G and g are.
-    """
-
-    shift: np.ndarray
-    basis: np.ndarray
-    equal: np.ndarray
-    rows: np.ndarray
-    G: np.ndarray
-    g: np.ndarray
-
-
-def affine_hull(
-    G: np.ndarray, g: np.ndarray, *, keep: int = 0, tolerance: float = FLAT
-) -> AffineHull | None:
-    """Return the affine hull of G x <= g (not empty), and the set in its coordinates, with volume.
-
-    keep: so many first coordinates of x are the first of w; None where the equalities tie these to
-    each other. The others are affine in them and in the rest of w, which are some of them. Where no
-    equality is implied, w = x.
-    """
-    n = G.shape[1]
-    equal = implied_equalities(G, g, tolerance)
-    if not equal.any():
-        return AffineHull(np.zeros(n), np.eye(n), equal, np.arange(len(g)), G, g)
-    row, column = scaling(G, g)
-    E, e = (row[:, None] * G * column)[equal], (row * g)[equal]
-    U, size, Vt = np.linalg.svd(E[:, keep:], full_matrices=False)
-    rank = int((size > 1e-10 * max(size.max(initial=0.0), 1e-300)).sum())
-    U, S, V = U[:, :rank], size[:rank], Vt[:rank].T
-    if np.any(np.abs(E[:, :keep] - U @ (U.T @ E[:, :keep])) > FLAT):
-        return None
-    shift = np.append(np.zeros(keep), V @ ((U.T @ e) / S))
-    follow = np.where(np.abs(tied := -V @ ((U.T @ E[:, :keep]) / S[:, None])) > 1e-14, tied, 0.0)
-    null, free = plain_null_space(V.T)
-    basis = np.block([[np.eye(keep), np.zeros((keep, n - keep - rank))], [follow, null]])
-    # Each w is a coordinate of x, in its own units.
-    free = np.append(np.arange(keep), keep + free)
-    basis, shift = column[:, None] * basis / column[free], column * shift
-    rest = np.flatnonzero(~equal)
-    H = cleaned(G[rest] @ basis, np.abs(G[rest]) @ np.abs(basis) * 1e3)
-    h = cleaned(g[rest] - G[rest] @ shift, np.abs(g[rest]) + np.abs(G[rest]) @ np.abs(shift))
-    moved = H.any(axis=1)
-    return AffineHull(shift, basis, equal, rest[moved], H[moved], h[moved])
-
-
-def plain_null_space(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a basis (n, n - r) of {x : rows x = 0}, rows (r, n) independent, whose parameters are
-    the entries `free` (n - r,) of x, and these: the r others are found by pivoting."""
-    r, n = rows.shape
-    if r == 0:
-        return np.eye(n), np.arange(n)
-    _, R, order = scipy.linalg.qr(rows, mode="economic", pivoting=True)
-    tied, free = order[:r], np.sort(order[r:])
-    basis = np.zeros((n, n - r))
-    basis[free] = np.eye(n - r)
-    S = np.linalg.solve(rows[:, tied], rows[:, free])
-    basis[tied] = np.where(np.abs(S) <= 1e-14, 0.0, -S)
-    return basis, free
+def extent(G: np.ndarray, g: np.ndarray, axes: Sequence[int] | None = None) -> np.ndarray:
+    """Return bounds of |x_i| over G x <= g for each i of `axes` (None: all), by two programs each,
+    larger by a part in 10^6, which outweighs their error; inf where the set is unbounded."""
+    return np.max(np.abs(Program(G, g).bounds(axes)), axis=0) * (1 + 1e-6)

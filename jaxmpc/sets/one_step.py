@@ -7,7 +7,8 @@ from jaxmpc.pytrees import record
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.disturbance import disturbance_set
 from jaxmpc.sets.geometry import irredundant_rows
-from jaxmpc.sets.lp import FLAT, ROUNDING, Flat, affine_hull, safe_extent
+from jaxmpc.sets.interior import Flat, affine_hull
+from jaxmpc.sets.lp import FLAT, ROUNDING, extent
 from jaxmpc.sets.polytope import Polytope, as_polytope
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
@@ -107,7 +108,7 @@ class OneStep:
             if not T.is_empty():
                 T.frame()
         except Flat:
-            reach = safe_extent(*target.unit_rows())
+            reach = extent(*target.unit_rows())
             reach = np.where(np.isfinite(reach), reach, 0.0)
             G, g = T.unit_rows()
             T = Polytope(G, g + 4 * FLAT * (np.abs(g) + np.abs(G) @ reach))

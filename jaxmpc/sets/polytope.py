@@ -17,42 +17,10 @@ from jaxmpc.checks import (
     require_shape,
 )
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.sets.convex_set import (
-    ConvexSet,
-    LinearSet,
-    Rows,
-    as_floats,
-    numbers,
-    product,
-    require_matching,
-)
-from jaxmpc.sets.geometry import (
-    binding_rows,
-    distinct,
-    dual_hull,
-    eliminate,
-    explained,
-    factors,
-    hull_volume,
-    irredundant,
-    irredundant_rows,
-    largest_ball,
-    unit_rows,
-)
-from jaxmpc.sets.lp import (
-    FLAT,
-    ROUNDING,
-    Flat,
-    Frame,
-    Program,
-    affine_hull,
-    bound,
-    cleaned,
-    framed,
-    maximise,
-    safe_extent,
-    scaling,
-)
+from jaxmpc.sets import convex_set, geometry
+from jaxmpc.sets.convex_set import ConvexSet, LinearSet, Rows
+from jaxmpc.sets.interior import Flat, Frame, affine_hull, framed
+from jaxmpc.sets.lp import FLAT, ROUNDING, Program, cleaned, extent, maximise, scaling
 
 
 @pytree
@@ -64,6 +32,8 @@ class Polytope(LinearSet):
         h: (rows,) offsets; inf for a row that does not bind.
         labels: names of the rows, such as "q1 <= 1.5 rad"; empty for none. A row that comes
             out of `intersect`, `reduce` or `preimage` keeps the label it went in with.
+
+    All methods but `contains` and `rows` run in NumPy in float64, and are not traceable.
     """
 
     H: Reals
@@ -75,8 +45,7 @@ class Polytope(LinearSet):
 
     @classmethod
     def from_points(cls, points: Reals) -> "Polytope":
-        """Return the convex hull of `points` (k, n), one unit outward normal per facet. NumPy; not
-        traceable.
+        """Return the convex hull of `points` (k, n), one unit outward normal per facet.
 
         Raises ValueError if the points are not finite or lie in a hyperplane.
         """
@@ -92,12 +61,12 @@ class Polytope(LinearSet):
         if points.shape[1] == 1:
             return cls(np.array([[1.0], [-1.0]]), np.array([points.max(), -points.min()]))
         # qhull's facets are simplices: a facet with more corners comes several times.
-        with explained("points"):
+        with geometry.explained("points"):
             facets = ConvexHull(scaled).equations
-        facets = facets[distinct(facets, 1e-10)]
+        facets = facets[geometry.distinct(facets, 1e-10)]
         normals, offsets = facets[:, :-1] / scale, -facets[:, -1]
         size = np.abs(offsets) + np.abs(normals) @ np.abs(center)
-        return cls(*unit_rows(normals, cleaned(offsets + normals @ center, size)))
+        return cls(*geometry.unit_rows(normals, cleaned(offsets + normals @ center, size)))
 
     @property
     def dimension(self) -> int:
@@ -110,26 +79,26 @@ class Polytope(LinearSet):
         The set is empty if a checked Farkas vector says so (`is_empty`).
         """
         self._require_fields(argument, dimension)
-        if concrete((self.H, self.h)) and Program(*unit_rows(self.H, self.h, argument)).empty:
+        if concrete((self.H, self.h)) and Program(*self.unit_rows(argument)).empty:
             fail(argument, "is empty: no point satisfies all its rows", "Loosen its rows")
 
     def is_empty(self) -> bool:
         """Return whether no point satisfies all rows: whether an LP finds multipliers y >= 0 with
-        G'y = 0 and g'y < 0, by more than rounding (1e-11 of the terms). NumPy; not traceable."""
+        G'y = 0 and g'y < 0, by more than rounding (1e-11 of the terms)."""
         H, h = self.half_spaces()
         if np.any((h == -np.inf) | (~H.any(axis=1) & (h < 0))):
             return True
-        return Program(*unit_rows(H, h)).empty
+        return Program(*geometry.unit_rows(H, h)).empty
 
     def contains(self, x: Reals, tolerance: float = 0.0) -> Any:
         """Return whether H x <= h + tolerance (in the scale of each row), x of shape (n,)."""
         self._require_vector("x", x, "point")
-        xp, (H, h, x, tolerance) = numbers(self.H, self.h, x, tolerance)
-        return xp.all(product(xp, H, x) <= h + tolerance)
+        xp, (H, h, x, tolerance) = convex_set.numbers(self.H, self.h, x, tolerance)
+        return xp.all(convex_set.product(xp, H, x) <= h + tolerance)
 
     def support(self, d: Reals) -> float:
-        """Return max d'x over the set, by one LP; inf if unbounded along d. NumPy; not traceable.
-        Raises ValueError if the set is empty."""
+        """Return max d'x over the set, by one LP; inf if unbounded along d. Raises ValueError if
+        the set is empty."""
         G, g = self.unit_rows()
         d = host_array("d", d)
         require_shape("d", d, (self.dimension,), "Give one direction")
@@ -141,50 +110,51 @@ class Polytope(LinearSet):
 
     def rows(self) -> tuple[Rows, Rows, Rows]:
         """Return (H, lower, upper) of the two-sided rows lower <= H x <= upper; lower is -inf."""
-        H, h = as_floats(self.H), as_floats(self.h)
+        H, h = convex_set.as_floats(self.H), convex_set.as_floats(self.h)
         return H, np.full(np.shape(h), -np.inf, dtype=h.dtype), h
 
+    def half_spaces(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return copies of (H, h) in float64."""
+        return host_array("Polytope.H", self.H), host_array("Polytope.h", self.h)
+
+    def unit_rows(self, argument: str = "Polytope") -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows that can bind, scaled to norm 1."""
+        self._require_fields(argument)
+        return geometry.unit_rows(self.H, self.h, argument)
+
+    def frame(self, argument: str = "Polytope") -> Frame:
+        """Return a point inside, and the set about it in units in which it is about 1 wide; raise
+        ValueError, naming `argument`, if it is empty or flat."""
+        return framed(argument, *self.unit_rows(argument))
+
     def chebyshev(self) -> tuple[np.ndarray, float]:
-        """Return (center, radius) of the largest ball inside, by one LP. NumPy; not traceable.
+        """Return (center, radius) of the largest ball inside, by one LP.
 
         The radius of a flat set is 0. Raises ValueError if the set is empty, or holds balls
         of every radius.
         """
-        center, radius = largest_ball("Polytope", *self.unit_rows())
+        center, radius = geometry.largest_ball("Polytope", *self.unit_rows())
         if radius == np.inf:
             fail("Polytope", "is unbounded: it holds arbitrarily large balls", "Add rows")
         return center, max(radius, 0.0)
 
     def intersect(self, other: LinearSet) -> "Polytope":
-        """Return the points in both sets: the rows of both, not reduced. NumPy; not traceable.
+        """Return the points in both sets, another being a Box or Polytope: the rows of both, not
+        reduced.
 
         If one of the two has labels, the unlabelled rows of the other get the label "".
         """
-        parts = (self, as_polytope("other", other))
-        for argument, part in zip(("Polytope", "other"), parts, strict=True):
-            part._require_fields(argument, self.dimension)
-        H = [host_array("H", part.H) for part in parts]
-        h = [host_array("h", part.h) for part in parts]
-        labels = [part.labels or ("",) * len(b) for part, b in zip(parts, h, strict=True)]
-        named = any(part.labels for part in parts)
-        return Polytope(np.vstack(H), np.concatenate(h), labels[0] + labels[1] if named else ())
-
-    def half_spaces(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return (H, h) in float64. NumPy; not traceable."""
-        return host_array("Polytope.H", self.H), host_array("Polytope.h", self.h)
-
-    def unit_rows(self, argument: str = "Polytope") -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows that can bind, scaled to norm 1. NumPy; not traceable."""
-        self._require_fields(argument)
-        return unit_rows(self.H, self.h, argument)
-
-    def frame(self, argument: str = "Polytope") -> Frame:
-        """Return a point inside, and the set about it in units in which it is about 1 wide; raise
-        ValueError, naming `argument`, if it is empty or flat. NumPy; not traceable."""
-        return framed(argument, *self.unit_rows(argument))
+        other = as_polytope("other", other)
+        self._require_fields("Polytope", self.dimension)
+        other._require_fields("other", self.dimension)
+        (H, h), (H_too, h_too) = self.half_spaces(), other.half_spaces()
+        labels: tuple[str, ...] = ()
+        if self.labels or other.labels:
+            labels = (self.labels or ("",) * len(h)) + (other.labels or ("",) * len(h_too))
+        return Polytope(np.vstack([H, H_too]), np.concatenate([h, h_too]), labels)
 
     def scale(self, factor: float) -> "Polytope":
-        """Return {factor x : x in the set}, factor > 0. NumPy; not traceable."""
+        """Return {factor x : x in the set}, factor > 0."""
         self._require_fields("Polytope")
         require_real("factor", factor)
         if not (np.ndim(factor) == 0 and np.isfinite(factor) and factor > 0):
@@ -193,8 +163,7 @@ class Polytope(LinearSet):
         return Polytope(H, h * float(factor))
 
     def preimage(self, M: Reals, t: Reals | None = None) -> "Polytope":
-        """Return {x : M x + t in the set} = {x : H M x <= h - H t}, row by row, not reduced. NumPy;
-        not traceable.
+        """Return {x : M x + t in the set} = {x : H M x <= h - H t}, row by row, not reduced.
 
         Arguments:
             M: (n, k), any matrix.
@@ -203,13 +172,12 @@ class Polytope(LinearSet):
         self._require_fields("Polytope")
         H, h = self.half_spaces()
         M, t = _affine(M, t, (self.dimension, None))
-        return Polytope(
-            cleaned(H @ M, np.abs(H) @ np.abs(M)),
-            cleaned(h - H @ t, np.abs(h) + np.abs(H) @ np.abs(t)), self.labels,
-        )  # fmt: skip
+        normals = cleaned(H @ M, np.abs(H) @ np.abs(M))
+        offsets = cleaned(h - H @ t, np.abs(h) + np.abs(H) @ np.abs(t))
+        return Polytope(normals, offsets, self.labels)
 
     def image(self, M: Reals, t: Reals | None = None) -> "Polytope":
-        """Return {M x + t : x in the set}, reduced unless M is square. NumPy; not traceable.
+        """Return {M x + t : x in the set}, reduced unless M is square.
 
         Arguments:
             M: (k, n) of rank k.
@@ -222,9 +190,7 @@ class Polytope(LinearSet):
         """
         M, t = _affine(M, t, (None, self.dimension))
         k, n = M.shape
-        # Units of x and y must not decide the rank.
-        row, column = scaling(M, np.zeros(k))
-        scaled = row[:, None] * M * column
+        scaled = _scaled(M)
         if np.linalg.matrix_rank(scaled, rtol=FLAT) < k:
             fail("M", f"has rank below {k}, so the image is flat", "Map to fewer coordinates")
         order = scipy.linalg.qr(scaled, mode="r", pivoting=True)[1]
@@ -236,7 +202,6 @@ class Polytope(LinearSet):
 
     def project(self, axes: Sequence[int]) -> "Polytope":
         """Return the set of (x_i for i in axes) over all x in the set, with irredundant unit rows.
-        NumPy; not traceable.
 
         Arguments:
             axes: the coordinates to keep, in the order wanted.
@@ -249,37 +214,32 @@ class Polytope(LinearSet):
         eliminate.
         """
         axes, n = list(axes), self.dimension
-        wrong = not axes or len(set(axes)) < len(axes) or not set(axes) <= set(range(n))
-        if wrong:
+        if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(range(n)):
             fail("axes", f"{axes} are not distinct numbers in 0..{n - 1}", "Name those to keep")
-        G, g = self.unit_rows()
         try:
-            Z, center, scale = framed("Polytope", G, g)
+            Z, center, scale = self.frame()
         except Flat:
-            return self._project_flat(G, g, axes)
-        Z = eliminate(Z, sorted(set(range(n)) - set(axes)))[:, np.argsort(np.argsort(axes))]
-        Y, about = Z / scale[axes], center[axes]
-        return Polytope(*unit_rows(Y, cleaned(1 + Y @ about, 1 + np.abs(Y) @ np.abs(about))))
+            return self._project_flat(axes)
+        others = sorted(set(range(n)) - set(axes))
+        Y = geometry.eliminate(Z, others)[:, np.argsort(np.argsort(axes))] / scale[axes]
+        about = center[axes]
+        offsets = cleaned(1 + Y @ about, 1 + np.abs(Y) @ np.abs(about))
+        return Polytope(*geometry.unit_rows(Y, offsets))
 
-    @staticmethod
-    def _project_flat(G: np.ndarray, g: np.ndarray, axes: list[int]) -> "Polytope":
+    def _project_flat(self, axes: list[int]) -> "Polytope":
         """Return the projection of a flat set, in coordinates of its affine hull."""
-        hull = affine_hull(G, g)
+        hull = affine_hull(*self.unit_rows())
         assert hull is not None
         onto = hull.basis[axes]
-        row, column = scaling(onto, np.zeros(len(axes)))
-        if not hull.equal.any() or not (
-            onto.shape[1] >= len(axes)
-            and np.linalg.matrix_rank(row[:, None] * onto * column, rtol=FLAT) == len(axes)
-        ):
+        full = onto.shape[1] >= len(axes) == np.linalg.matrix_rank(_scaled(onto), rtol=FLAT)
+        if not (hull.equal.any() and full):
             cure = "Check the rows: this needs a result with volume"
             fail("Polytope", "is flat, and so is its projection", cure)
         image = Polytope(hull.G, hull.g).image(onto, hull.shift[axes])
-        return Polytope(*irredundant_rows("Polytope", *image.unit_rows()))
+        return Polytope(*geometry.irredundant_rows("Polytope", *image.unit_rows()))
 
     def minkowski_sum(self, other: LinearSet | Reals) -> "Polytope":
-        """Return {x + w : x in the set, w in other}, with irredundant unit rows. NumPy; not
-        traceable.
+        """Return {x + w : x in the set, w in other}, with irredundant unit rows.
 
         Arguments:
             other: Box, Polytope, or points (k, n), which stand for their convex hull.
@@ -298,7 +258,7 @@ class Polytope(LinearSet):
         vertices = _vertices_of(self) if n <= 3 and points is not None else None
         if points is not None and vertices is not None:
             return Polytope.from_points((vertices[:, None] + points).reshape(-1, n))
-        # x = s + D w + shift with s in the set and w in `weights`, a set with volume.
+        # x = s + D w + shift with s in the set and w in `weights`.
         if isinstance(other, LinearSet):
             D, shift, weights = np.eye(n), np.zeros(n), as_polytope("other", other)
         else:
@@ -311,7 +271,6 @@ class Polytope(LinearSet):
 
     def pontryagin_difference(self, other: ConvexSet | Reals) -> "Polytope":
         """Return {x : x + w in the set for all w in other}: H x <= h - max {H w : w in other}.
-        NumPy; not traceable.
 
         Arguments:
             other: Box, Polytope, Ellipsoid, or points (k, n), which stand for their convex hull.
@@ -321,7 +280,7 @@ class Polytope(LinearSet):
         """
         self._require_fields("Polytope")
         H, h = self.half_spaces()
-        binding = binding_rows(H, h)
+        binding = geometry.binding_rows(H, h)
         reach = np.zeros(len(h))
         if isinstance(other, ConvexSet):
             other.validate("other", self.dimension)
@@ -331,11 +290,11 @@ class Polytope(LinearSet):
         return Polytope(H, cleaned(h - reach, np.abs(h) + np.abs(reach)))
 
     def is_subset(self, other: LinearSet, tolerance: float = 1e-9) -> bool:
-        """Return whether no point of the set violates a row of `other` by more than `tolerance`,
-        relative to the row's own terms. NumPy; not traceable.
+        """Return whether no point of the set violates a row of `other`, a Box or Polytope, by more
+        than `tolerance`, relative to the row's own terms.
 
         A row a'x <= b may be exceeded by tolerance (|b| + sum_i |a_i| max |x_i|), whatever its
-        units and those of x; the maxima are over the set, infinite ones left out. It is judged by
+        units and those of x; the maxima are over the set, infinite ones left out. What counts is
         an upper bound of its maximum made from an LP's multipliers (`lp.bound`), valid for any LP
         error but along coordinates in which the set is unbounded. An empty set is a subset of
         every set.
@@ -344,20 +303,18 @@ class Polytope(LinearSet):
             return True
         other = as_polytope("other", other)
         other._require_fields("other", self.dimension)
-        rows, offsets = unit_rows(other.H, other.h, "other")
-        G, g = self.unit_rows()
-        reach = safe_extent(G, g)
+        rows, offsets = other.unit_rows("other")
+        program = Program(*self.unit_rows())
+        reach = extent(program.G, program.g)
         reach[np.isinf(reach)] = 0.0
         allowed = max(tolerance, ROUNDING) * (np.abs(offsets) + np.abs(rows) @ reach)
-        program = Program(G, g)
-        for row, most in zip(rows, offsets + allowed, strict=True):
-            y = program.maximise(row).y
-            if y is None or bound(row, y, G, g, reach) > most:
-                return False
-        return True
+        return all(
+            program.bound(row, program.maximise(row), reach) <= most
+            for row, most in zip(rows, offsets + allowed, strict=True)
+        )
 
     def reduce(self) -> "Polytope":
-        """Return the same set with the fewest rows, each of norm 1. NumPy; not traceable.
+        """Return the same set with the fewest rows, each of norm 1.
 
         Rows that cut off less than about 1e-12 of the set's size (near-duplicates, rows that
         touch a vertex) are dropped; 1e-10 in more than six dimensions. Raises ValueError if
@@ -369,56 +326,65 @@ class Polytope(LinearSet):
         factor; factors of more than six dimensions by one LP per row.
         """
         G, g = self.unit_rows()
-        keep = irredundant(self._dual(G, g).Z)
+        rows = geometry.irredundant(self._bounded_frame().Z)
         labels: tuple[str, ...] = ()
         if self.labels:
-            binding = binding_rows(*self.half_spaces())
-            labels = tuple(self.labels[i] for i in binding[keep])
-        return Polytope(G[keep], g[keep], labels)
+            binding = geometry.binding_rows(*self.half_spaces())
+            labels = tuple(self.labels[i] for i in binding[rows])
+        return Polytope(G[rows], g[rows], labels)
 
     def vertices(self) -> np.ndarray:
-        """Return the vertices (k, n); counter-clockwise in 2-D, ascending in 1-D. NumPy; not
-        traceable.
+        """Return the vertices (k, n); counter-clockwise in 2-D, ascending in 1-D.
 
         The vertex dual to the facet {y : v'y = 1} of the hull described in `reduce` is
         c + v. Raises ValueError if the set is empty, flat or unbounded.
         """
-        Z, center, scale = self._dual(*self.reduce().unit_rows())
+        Z, center, scale = self.reduce()._bounded_frame()
         if self.dimension == 1:
             return np.sort(center + scale / Z, axis=0)
-        V = dual_hull(Z).intersections
-        V = V[distinct(V / np.abs(V).max(axis=0), 1e-10)]
+        V = geometry.dual_hull(Z).intersections
+        V = V[geometry.distinct(V / np.abs(V).max(axis=0), 1e-10)]
         if self.dimension == 2:
             V = V[np.argsort(np.arctan2(V[:, 1], V[:, 0]))]
         return center + V * scale
 
     def volume(self) -> float:
-        """Return the length, area or volume, of a product of sets factor by factor. NumPy; not
-        traceable.
+        """Return the length, area or volume, of a product of sets factor by factor.
 
         Raises ValueError if the set is empty, flat or unbounded.
         """
-        Z, _, scale = self._dual(*self.reduce().unit_rows())
-        parts, S = factors(Z)
+        Z, _, scale = self.reduce()._bounded_frame()
+        parts, S = geometry.factors(Z)
         if len(parts) == 1:
-            return hull_volume(self.vertices())
+            return geometry.hull_volume(self.vertices())
         volumes = [Polytope(part, np.ones(len(part))).volume() for _, part in parts]
         return float(np.prod(volumes) * np.prod(scale) / abs(np.linalg.det(S)))
 
     def _require_fields(self, argument: str, dimension: int | None = None) -> None:
-        require_matching(argument, {"H": self.H, "h": self.h}, 2, dimension)
+        convex_set.require_matching(argument, {"H": self.H, "h": self.h}, 2, dimension)
         require_labels(f"{argument}.labels", self.labels, np.shape(as_array(self.h))[0])
 
-    @staticmethod
-    def _dual(G: np.ndarray, g: np.ndarray) -> Frame:
-        """Return the frame of a bounded set with volume; raise ValueError for any other."""
-        frame = framed("Polytope", G, g)
+    def _bounded_frame(self) -> Frame:
+        frame = self.frame()
         if not frame.bounded:
             fail("Polytope", "is unbounded", "Check the rows: this needs a bounded set")
         return frame
 
 
-def require_labels(argument: str, labels: Any, rows: int) -> None:
+def as_polytope(argument: str, value: object, n: int | None = None) -> Polytope:
+    """Return a Box or Polytope as a Polytope; with n, checked to be a set in R^n.
+
+    Raises ValueError, naming `argument`, for anything else.
+    """
+    if not isinstance(value, LinearSet):
+        fail(argument, f"{type(value).__name__} is no Box or Polytope", "Give one")
+    if n is not None:
+        value = value.spread(n)
+        value.validate(argument, n)
+    return value if isinstance(value, Polytope) else Polytope(*value.half_spaces())
+
+
+def require_labels(argument: str, labels: object, rows: int) -> None:
     """Raise unless `labels` is a tuple of strings, one a row or none."""
     if not isinstance(labels, tuple) or not all(isinstance(label, str) for label in labels):
         fail(argument, f"{labels!r} is not a tuple of strings", 'Write it as ("q <= 1", "q >= -1")')
@@ -444,6 +410,12 @@ def _affine(
     return M, t
 
 
+def _scaled(M: np.ndarray) -> np.ndarray:
+    """Return M in scaled rows and columns: units must not decide its rank."""
+    row, column = scaling(M, np.zeros(len(M)))
+    return row[:, None] * M * column
+
+
 def _points(points: Reals, n: int) -> np.ndarray:
     """Return the points of an argument `other` (k, n), checked."""
     values = host_array("other", points)
@@ -467,16 +439,3 @@ def _vertices_of(set_: LinearSet) -> np.ndarray | None:
         return set_.vertices()
     except ValueError:
         return None
-
-
-def as_polytope(argument: str, value: object, n: int | None = None) -> Polytope:
-    """Return a Box or Polytope as a Polytope; with n, checked to be a set in R^n.
-
-    Raises ValueError, naming `argument`, for anything else.
-    """
-    if not isinstance(value, LinearSet):
-        fail(argument, f"{type(value).__name__} is no Box or Polytope", "Give one")
-    if n is not None:
-        value = value.spread(n)
-        value.validate(argument, n)
-    return value if isinstance(value, Polytope) else Polytope(*value.half_spaces())

@@ -16,8 +16,9 @@ from jaxmpc.sets.box import Box
 from jaxmpc.sets.control_invariant import largest_cut
 from jaxmpc.sets.disturbance import disturbance_set, largest_norm, supports
 from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.interior import Flat, affine_hull, framed
 from jaxmpc.sets.invariant import contraction
-from jaxmpc.sets.lp import Flat, Program, affine_hull, framed, maximise, safe_extent
+from jaxmpc.sets.lp import Program, extent, maximise
 from jaxmpc.sets.one_step import one_step
 from jaxmpc.sets.polytope import Polytope
 from jaxmpc.systems.riccati import least_reached, lqr
@@ -265,7 +266,7 @@ class _Rows:
         is none."""
         if not len(self.g):
             return np.full(self.G.shape[1], np.inf)
-        return safe_extent(self.G, self.g)
+        return extent(self.G, self.g)
 
     def width(self, rows: np.ndarray, tops: np.ndarray) -> np.ndarray:
         """Return how far the set, with these maxima of the rows, reaches along each from a point
