@@ -7,6 +7,7 @@ mj_differentiatePos; both are smooth where the rotation is zero, and differentia
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,92 +20,98 @@ from jaxmpc.robots.engine import BALL, FREE
 SMALL = 1e-8
 
 
+class Block(NamedTuple):
+    """Numbers of a configuration: where they are in q (nq,) and in motions (nv,), and whether they
+    are an orientation, four of the one and three of the other."""
+
+    place: slice
+    motion: slice
+    turns: bool
+
+
+def blocks(joints: Sequence[int]) -> list[Block]:
+    """Return the blocks of a configuration, in order. joints: mjtJoint numbers."""
+    found, i, j = list[Block](), 0, 0
+    for joint in joints:
+        shift = {FREE: 3, BALL: 0}.get(joint, 1)
+        if shift:
+            found.append(Block(slice(i, i + shift), slice(j, j + shift), False))
+            i, j = i + shift, j + shift
+        if joint in (FREE, BALL):
+            found.append(Block(slice(i, i + 4), slice(j, j + 3), True))
+            i, j = i + 4, j + 3
+    return found
+
+
 def unit_orientations(argument: str, joints: Sequence[int], q: np.ndarray) -> np.ndarray:
     """Return the configurations q (..., nq) with quaternions of length 1; raise ValueError, naming
-    the argument, where one is far from that. joints: mjtJoint numbers."""
-    i, q = 0, np.array(q, float)
-    for joint in joints:
-        i += 3 if joint == FREE else 0
-        if joint in (FREE, BALL):
-            size = np.linalg.norm(q[..., i : i + 4], axis=-1, keepdims=True)
+    the argument, where one is far from that."""
+    q = np.array(q, float)
+    for place, _, turns in blocks(joints):
+        if turns:
+            size = np.linalg.norm(q[..., place], axis=-1, keepdims=True)
             if not np.all((size > 0.5) & (size < 2)):
-                worst = q.reshape(-1, q.shape[-1])[np.argmax(np.abs(size - 1)), i : i + 4]
+                worst = q.reshape(-1, q.shape[-1])[np.argmax(np.abs(size - 1)), place]
                 problem = f"quaternion {worst} of length {np.linalg.norm(worst):g}"
                 fail(argument, problem, "Give unit length, w first")
-            q[..., i : i + 4] /= size
-        i += 4 if joint in (FREE, BALL) else 1
+            q[..., place] /= size
     return q
 
 
-def retract(joints: tuple[int, ...], q: Array, dq: Array) -> Array:
-    """Return q ⊕ dq (nq,): the configuration q (nq,) moved by dq (nv,). joints: mjtJoint
-    numbers."""
+def retract(joints: Sequence[int], q: Array, dq: Array) -> Array:
+    """Return q ⊕ dq (nq,): the configuration q (nq,) moved by dq (nv,)."""
     if not quaternions(joints):
         return q + dq
-    parts, i, j = [], 0, 0
-    for joint in joints:
-        if joint == FREE:
-            parts.append(q[i : i + 3] + dq[j : j + 3])
-            i, j = i + 3, j + 3
-        if joint in (FREE, BALL):
-            parts.append(_product(q[i : i + 4], _exponential(dq[j : j + 3])))
-            i, j = i + 4, j + 3
-        else:
-            parts.append(q[i : i + 1] + dq[j : j + 1])
-            i, j = i + 1, j + 1
+    parts = [
+        _product(q[place], _exponential(dq[motion])) if turns else q[place] + dq[motion]
+        for place, motion, turns in blocks(joints)
+    ]
     return jnp.concatenate(parts)
 
 
-def difference(joints: tuple[int, ...], start: Array, end: Array) -> Array:
+def difference(joints: Sequence[int], start: Array, end: Array) -> Array:
     """Return end ⊖ start (nv,): the motion dq with start ⊕ dq = end, rotations of at most π."""
     if not quaternions(joints):
         return end - start
-    parts, i = [], 0
-    for joint in joints:
-        if joint == FREE:
-            parts.append(end[i : i + 3] - start[i : i + 3])
-            i += 3
-        if joint in (FREE, BALL):
-            inverse = start[i : i + 4] * jnp.array([1.0, -1.0, -1.0, -1.0], start.dtype)
-            parts.append(_logarithm(_product(inverse, end[i : i + 4])))
-            i += 4
-        else:
-            parts.append(end[i : i + 1] - start[i : i + 1])
-            i += 1
+    parts = [
+        _between(start[place], end[place]) if turns else end[place] - start[place]
+        for place, _, turns in blocks(joints)
+    ]
     return jnp.concatenate(parts)
 
 
-def rates(joints: tuple[int, ...], q: Array, dq: Array) -> Array:
+def rates(joints: Sequence[int], q: Array, dq: Array) -> Array:
     """Return the motion (nv,) in the tangent space at q (nq,), with quaternions of length 1, that
     changes the numbers of q by dq (nq,). Linear in dq."""
     if not quaternions(joints):
         return dq
-    parts, i = [], 0
-    for joint in joints:
-        size = 1 if joint not in (FREE, BALL) else 3 if joint == FREE else 0
-        parts.append(dq[i : i + size])
-        i += size
-        if joint in (FREE, BALL):
-            inverse = q[i : i + 4] * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype)
-            parts.append(2 * _product(inverse, dq[i : i + 4])[1:])
-            i += 4
+    parts = [
+        2 * _product(_inverse(q[place]), dq[place])[1:] if turns else dq[place]
+        for place, _, turns in blocks(joints)
+    ]
     return jnp.concatenate(parts)
 
 
-def quaternions(joints: tuple[int, ...]) -> bool:
+def quaternions(joints: Sequence[int]) -> bool:
     """Return whether an orientation is among the joints, so that nq and nv differ."""
     return any(joint in (FREE, BALL) for joint in joints)
 
 
-def normalised(joints: tuple[int, ...], q: Array) -> Array:
+def normalised(joints: Sequence[int], q: Array) -> Array:
     """Return q (nq,) with quaternions of length 1."""
-    i = 0
-    for joint in joints:
-        i += 3 if joint == FREE else 0
-        if joint in (FREE, BALL):
-            q = q.at[i : i + 4].set(q[i : i + 4] / jnp.linalg.norm(q[i : i + 4]))
-        i += 4 if joint in (FREE, BALL) else 1
+    for place, _, turns in blocks(joints):
+        q = q.at[place].set(q[place] / jnp.linalg.norm(q[place])) if turns else q
     return q
+
+
+def _between(start: Array, end: Array) -> Array:
+    """Return the rotation vector from one unit quaternion to another."""
+    return _logarithm(_product(_inverse(start), end))
+
+
+def _inverse(q: Array) -> Array:
+    """Return the inverse of a unit quaternion."""
+    return q * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype)
 
 
 def _product(a: Array, b: Array) -> Array:

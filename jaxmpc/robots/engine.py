@@ -22,12 +22,8 @@ else:
 # mjtJoint. Joints of one dof are the last two.
 FREE, BALL, SLIDE, HINGE = range(4)
 
-# The number of objects of a kind, as a field of the model.
-_COUNTS = {
-    "body": "nbody", "joint": "njnt", "actuator": "nu", "site": "nsite", "geom": "ngeom",
-    "camera": "ncam", "tendon": "ntendon", "pair": "npair", "equality": "neq", "key": "nkey",
-    "numeric": "nnumeric",
-}  # fmt: skip
+# The number of objects of a kind, as a field of the model, where it is not n and the kind.
+_COUNTS = {"joint": "njnt", "actuator": "nu", "camera": "ncam", "equality": "neq"}
 
 
 def mjx_module() -> Any:
@@ -39,7 +35,7 @@ def mjx_module() -> Any:
 
 def names(model: "mujoco.MjModel", kind: str) -> list[str]:
     """Return the names of the bodies, joints, ... of a model, "" where there is none."""
-    count, of = getattr(model, _COUNTS[kind]), _type_of(kind)
+    count, of = getattr(model, _COUNTS.get(kind, f"n{kind}")), _type_of(kind)
     return [mujoco.mj_id2name(model, of, i) or "" for i in range(count)]
 
 

@@ -5,7 +5,6 @@ contacts, equalities and dry friction do not help. What was found is tried on th
 """
 
 import copy
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares, lsq_linear
@@ -123,28 +122,21 @@ def rest_at(robot: RobotDescription, q: np.ndarray, *, within: bool = False) -> 
     return forces.rest(q, drive, f)
 
 
-class Cause(NamedTuple):
-    """What takes a rest away: the bit of mjtDisableBit that switches it off, none for the limits of
-    forces, what it is, and what helps."""
-
-    kind: str
-    text: str
-    cure: str
-
-
+# What takes a rest away: the constraints, see `engine.flag`, or "" for limits of forces; in words;
+# and what helps.
 CAUSES = (
-    Cause(
+    (
         "",
         "limits of actuators' forces (forcerange, actuatorfrcrange)",
         "Choose a configuration that needs less force, or widen them in the file",
     ),
-    Cause(
+    (
         "equality",
         "couplings (equalities), which linear models lack",
         "Choose a configuration that meets them without their force, or take them out of the file",
     ),
-    Cause("contact", "contacts", "Choose a configuration in which nothing touches"),
-    Cause("limit", "stops of joints or tendons", "Choose a configuration inside their ranges"),
+    ("contact", "contacts", "Choose a configuration in which nothing touches"),
+    ("limit", "stops of joints or tendons", "Choose a configuration inside their ranges"),
 )
 
 
@@ -177,12 +169,13 @@ def require_rest(
         i = int(np.argmax(np.nan_to_num(np.abs(found - wanted), nan=np.inf)))
         joint = name_of(file, "joint", file.dof_jntid[i])
         problem = f"{rest.q} is no rest: in MuJoCo {joint} accelerates by {found[i]:.3g} a second²"
-        for cause in CAUSES:
-            if np.all(np.abs(_accelerations(_without(file, cause.kind), rest) - wanted) <= STILL):
-                text = f"{problem}, by {cause.text}"
-                if touching and cause.kind in ("contact", "limit"):
+        for kind, cause, cure in CAUSES:
+            without = _accelerations(_without(file, kind), rest)
+            if np.all(np.abs(without - wanted) <= STILL):
+                text = f"{problem}, by {cause}"
+                if touching and kind in ("contact", "limit"):
                     return [f"{text}; the model is taken there"]
-                fail(argument, text, cause.cure)
+                fail(argument, text, cure)
         fail(argument, problem, "See what robot.report() says is left out or ignored")
     return []
 
@@ -196,7 +189,7 @@ def _accelerations(model: "mujoco.MjModel", rest: Rest) -> np.ndarray:
 
 
 def _without(model: "mujoco.MjModel", kind: str) -> "mujoco.MjModel":
-    """Return a copy of the model without the `Cause` of this kind."""
+    """Return a copy of the model without a kind of `CAUSES`."""
     model = copy.deepcopy(model)
     if kind:
         model.opt.disableflags |= flag(kind)
@@ -303,18 +296,17 @@ def nearest_rest(robot: RobotDescription, q: np.ndarray) -> Rest:
     drive = np.linalg.lstsq(J, -f, rcond=None)[0]
     low, high = _room(forces.model, robot.state_limits, q)
     lower, upper = np.append(low, forces.lower), np.append(high, forces.upper)
-    tight = upper - lower < 1e-9
-    lower, upper = lower - 1e-9 * tight, upper + 1e-9 * tight
+    narrow = 1e-9 * (upper - lower < 1e-9)
+    lower, upper = lower - narrow, upper + narrow
     width = upper - lower
     inset = np.where(np.isfinite(width), 1e-10 * np.where(np.isfinite(width), width, 0), 1e-10)
     near = Neighbourhood(forces, q, 1 + float(np.abs(f).max()), np.maximum(1.0, np.abs(drive)))
     z = np.clip(np.append(np.zeros(len(low)), drive), lower + inset, upper - inset)
+    tight = {"xtol": 1e-14, "ftol": 1e-14, "gtol": 1e-14, "max_nfev": 50}
+    scale = np.append(np.ones(len(low)), near.width)
     for weight in _WEIGHTS:
-        found = least_squares(
-            near.residual, z, near.jacobian, args=(weight,), bounds=(lower, upper),
-            x_scale=np.append(np.ones(len(low)), near.width), xtol=1e-14, ftol=1e-14, gtol=1e-14,
-            max_nfev=50,
-        )  # fmt: skip
+        options = {"args": (weight,), "bounds": (lower, upper), "x_scale": scale, **tight}
+        found = least_squares(near.residual, z, near.jacobian, **options)
         z = np.clip(found.x, lower + inset, upper - inset)
     position = near.position(z)
     J, f = forces.affine(position)

@@ -1,11 +1,18 @@
-"""Replace some of JAX's primitives in a function by other functions, in all nested bodies."""
+"""Functions of JAX, rewritten: other primitives, smaller pieces, derivatives by forward mode."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+from jax import Array
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun
+
+from jaxmpc.qp.linalg import JAXLIB
+
+# How many operations XLA of old jaxlibs may fuse on a CPU.
+PIECE = 15
 
 
 def rewritten(function: Callable, rules: Mapping[Primitive, Callable]) -> Callable:
@@ -107,3 +114,61 @@ def moving(function: Callable, primals: Sequence, tangents: Sequence) -> tuple:
         return function(*jax.tree.unflatten(tree, new))
 
     return of, tuple(leaves[i] for i in which), tuple(directions[i] for i in which)
+
+
+def in_pieces(function: Callable, size: int = PIECE) -> Callable:
+    """Return the same function of arrays, split into parts of `size` operations that XLA does not
+    fuse.
+
+    XLA's CPU backend of jaxlib 0.7 to 0.11.0 (the newest for Python 3.11) fuses long chains of
+    small operations, joint after joint, and then computes the beginning of the chain again for each
+    number that depends on it: a linear model of 7 joints takes 800 times as long. With any
+    other version or device the function is left as it is.
+    """
+
+    def run(*args: Any) -> Any:
+        if jax.default_backend() != "cpu" or not (0, 7, 0) <= JAXLIB < (0, 11, 1):
+            return function(*args)
+        closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
+        jaxpr, leaves = closed.jaxpr, jax.tree.leaves(args)
+        values = dict(
+            zip((*jaxpr.constvars, *jaxpr.invars), (*closed.consts, *leaves), strict=True)
+        )
+        reads = lambda eqns: dict.fromkeys(
+            v for eqn in eqns for v in eqn.invars if not isinstance(v, Literal)
+        )
+        for start in range(0, len(jaxpr.eqns), size):
+            eqns, later = jaxpr.eqns[start : start + size], jaxpr.eqns[start + size :]
+            ends = (v for v in jaxpr.outvars if not isinstance(v, Literal))
+            needed = reads(later) | dict.fromkeys(ends)
+            made = [v for eqn in eqns for v in eqn.outvars if v in needed]
+            given = [v for v in reads(eqns) if v in values]
+            piece = jaxpr.replace(constvars=[], invars=given, outvars=made, eqns=eqns)
+            out = jaxpr_as_fun(ClosedJaxpr(piece, ()))(*(values[v] for v in given))
+            values.update(zip(made, jax.lax.optimization_barrier(out), strict=True))
+        out = [v.val if isinstance(v, Literal) else values[v] for v in jaxpr.outvars]
+        return jax.tree.unflatten(jax.tree.structure(shape), out)
+
+    return run
+
+
+def with_forward_jacobian(function: Callable) -> Callable:
+    """Return the same function of pytrees, its derivative a Jacobian made by forward mode.
+
+    Reverse mode then transposes one matrix product instead of the function. It stores one Jacobian
+    a step, and does not multiply infinite derivatives, as those of distances of shapes
+    that do not touch can be, by zeros.
+    """
+    wrapped = jax.custom_jvp(function)
+
+    def rule(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+        of, at, directions = moving(lambda *args: (function(*args),) * 2, primals, tangents)
+        jacobians, value = jax.jacfwd(of, argnums=tuple(range(len(at))), has_aux=True)(*at)
+        products = (
+            jnp.tensordot(J, d, d.ndim, precision="highest")
+            for J, d in zip(jacobians, directions, strict=True)
+        )
+        return value, sum(products, jnp.zeros_like(value))
+
+    wrapped.defjvp(rule, symbolic_zeros=True)
+    return wrapped

@@ -11,15 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
-from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jax.extend.core.primitives import acos_p, sqrt_p
 
 from jaxmpc.checks import fail
-from jaxmpc.qp.linalg import JAXLIB, solve, stand_ins
+from jaxmpc.qp.linalg import solve, stand_ins
 from jaxmpc.qp.precision import matmul
 from jaxmpc.robots.configurations import normalised, rates, retract
 from jaxmpc.robots.engine import BALL, mjx_module, mujoco
-from jaxmpc.robots.jaxpr_rewriting import moving, rewritten
+from jaxmpc.robots.jaxpr_rewriting import in_pieces, moving, rewritten, with_forward_jacobian
 from jaxmpc.robots.rigid_bodies import (
     FIELDS,
     Tree,
@@ -35,9 +34,6 @@ EULER, RK4 = 0, 1
 # mjtDisableBit, mjtEq, the last mjtTrn of a joint.
 NO_GRAVITY, NO_EULER_DAMPING = 128, 32768
 EQUALITY_OF_JOINTS, TRANSMISSION_BY_JOINT = 2, 1
-
-# How many operations XLA of old jaxlibs may fuse on a CPU.
-PIECE = 15
 
 
 class Physics:
@@ -69,10 +65,8 @@ class Physics:
         light = getattr(model, "flg_gravcomp", False) or np.any(model.body_gravcomp)
         in_fluid = model.opt.density or model.opt.viscosity or np.any(model.opt.wind)
         # Whether a force depends on where the bodies are, other than through the joints.
-        self.posed = bool(
-            model.ntendon or light or in_fluid or (self.rows and placed)
-            or np.any(model.actuator_trntype > TRANSMISSION_BY_JOINT)
-        )  # fmt: skip
+        led = np.any(model.actuator_trntype > TRANSMISSION_BY_JOINT)
+        self.posed = bool(model.ntendon or light or in_fluid or led or (self.rows and placed))
 
     def step(self, x: Array, u: Array, numbers: Mapping[str, Any] | None = None) -> Array:
         """Return x = (qpos, qvel, act) one physics step later: a function of x, u and nothing
@@ -97,15 +91,12 @@ class Physics:
         x_q, v, act = jnp.split(x, [self.model.nq, self.model.nq + self.model.nv])
         q, h = normalised(self.joints, x_q), jnp.asarray(self.mjx.opt.timestep, x.dtype)
         if self.model.opt.integrator == RK4:
-            forward = lambda q, v: self._accelerations(numbers, q, v, act, u)
+            forward = lambda q, v: self._accelerations(False, numbers, q, v, act, u)
             return self._runge_kutta(forward, q, v, h)
-        if self.model.na:
-            act_next = _next_activations(*self._forced(numbers, q, v, act, u))
-        else:
-            act_next = act
-        v = v + h * self._accelerations(numbers, q, v, act, u, damped=True)
+        moved = _next_activations(*self._forced(numbers, q, v, act, u)) if self.model.na else act
+        v = v + h * self._accelerations(True, numbers, q, v, act, u)
         # MJX's own integration of positions has the derivative 0 for a body that does not turn.
-        return jnp.concatenate([retract(self.joints, q, h * v), v, act_next])
+        return jnp.concatenate([retract(self.joints, q, h * v), v, moved])
 
     def data(self, x: Array, u: Array, numbers: Mapping[str, Any] | None = None) -> Any:
         """Return mjx.Data at x = (qpos, qvel, act) under u: poses and velocities of bodies, geoms
@@ -117,11 +108,9 @@ class Physics:
         _, bias, poses = self._dynamics(own, q, v)
         return self._forced(own, q, v, act, u)[1].replace(qfrc_bias=bias, **poses)
 
-    def _accelerations(
-        self, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array,
-        damped: bool = False,
-    ) -> Array:  # fmt: skip
-        """Return the accelerations (nv,); damped: with the integrator's implicit part.
+    def _accelerations(self, damped: bool, *point: Any) -> Array:
+        """Return the accelerations (nv,) at point = (numbers, q, v, act, u); damped: with the
+        integrator's implicit part.
 
         Differentiated as the solution of the balance of forces (implicit function theorem), not by
         the iterations of MJX's solver, which err in their derivatives as much as in the
@@ -144,7 +133,7 @@ class Physics:
             return found, (da, moved)
 
         solved.defjvp(rule, symbolic_zeros=True)
-        return solved(numbers, q, v, act, u)[0]
+        return solved(*point)[0]
 
     def _solved(
         self, damped: bool, numbers: dict[str, Array], q: Array, v: Array, act: Array, u: Array
@@ -162,13 +151,12 @@ class Physics:
         return solve(M + self._added(model, data, damped), force + pushed), first
 
     def _missing(
-        self, damped: bool, found: tuple[Array, Array], numbers: dict[str, Array], q: Array,
-        v: Array, act: Array, u: Array,
-    ) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:  # fmt: skip
+        self, damped: bool, found: tuple[Array, Array], *point: Any
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:
         """Return the generalised forces that the accelerations `found` without and with the
-        implicit part lack, then what is added to M for each, and the derivative of the constraint
-        forces in the accelerations."""
-        model, data = self._forced(numbers, q, v, act, u)
+        implicit part lack at point = (numbers, q, v, act, u), then what is added to M for each, and
+        the derivative of the constraint forces in the accelerations."""
+        (model, data), (numbers, q, v, *_) = self._forced(*point), point
         a, first = found
         forces, still = data.qfrc_smooth, jnp.zeros_like(a)
         added = self._added(model, data, False), self._added(model, data, damped)
@@ -220,10 +208,8 @@ class Physics:
             data = mjx.tendon(model, data)
             data = mjx.collision(model, data) if self.rows else data
         data = mjx.transmission(model, mjx.make_constraint(model, data))
-        data = data.tree_replace({
-            "_impl.actuator_velocity": matmul(data._impl.actuator_moment, v),
-            "_impl.ten_velocity": matmul(data._impl.ten_J, v),
-        })  # fmt: skip
+        speeds = {"actuator_velocity": data._impl.actuator_moment, "ten_velocity": data._impl.ten_J}
+        data = data.tree_replace({f"_impl.{name}": matmul(J, v) for name, J in speeds.items()})
         data = mjx.fwd_actuation(model, mjx.passive(model, data))
         force = data.qfrc_passive + data.qfrc_actuator
         if self.model.ntendon:
@@ -352,61 +338,3 @@ TAMED = {
     sqrt_p: _tamed(jax.lax.sqrt, lambda x: 0.5 / jax.lax.sqrt(x), lambda x: x > 0),
     acos_p: _tamed(jax.lax.acos, lambda x: -jax.lax.rsqrt(1 - x * x), lambda x: jnp.abs(x) < 1),
 }
-
-
-def in_pieces(function: Callable, size: int = PIECE) -> Callable:
-    """Return the same function of arrays, split into parts of `size` operations that XLA does not
-    fuse.
-
-    XLA's CPU backend of jaxlib 0.7 to 0.11.0 (the newest for Python 3.11) fuses long chains of
-    small operations, joint after joint, and then computes the beginning of the chain again for each
-    number that depends on it: a linear model of 7 joints takes 800 times as long. With any
-    other version or device the function is left as it is.
-    """
-
-    def run(*args: Any) -> Any:
-        if jax.default_backend() != "cpu" or not (0, 7, 0) <= JAXLIB < (0, 11, 1):
-            return function(*args)
-        closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
-        jaxpr, leaves = closed.jaxpr, jax.tree.leaves(args)
-        values = dict(
-            zip((*jaxpr.constvars, *jaxpr.invars), (*closed.consts, *leaves), strict=True)
-        )
-        reads = lambda eqns: dict.fromkeys(
-            v for eqn in eqns for v in eqn.invars if not isinstance(v, Literal)
-        )
-        for start in range(0, len(jaxpr.eqns), size):
-            eqns, later = jaxpr.eqns[start : start + size], jaxpr.eqns[start + size :]
-            ends = (v for v in jaxpr.outvars if not isinstance(v, Literal))
-            needed = reads(later) | dict.fromkeys(ends)
-            made = [v for eqn in eqns for v in eqn.outvars if v in needed]
-            given = [v for v in reads(eqns) if v in values]
-            piece = jaxpr.replace(constvars=[], invars=given, outvars=made, eqns=eqns)
-            out = jaxpr_as_fun(ClosedJaxpr(piece, ()))(*(values[v] for v in given))
-            values.update(zip(made, jax.lax.optimization_barrier(out), strict=True))
-        out = [v.val if isinstance(v, Literal) else values[v] for v in jaxpr.outvars]
-        return jax.tree.unflatten(jax.tree.structure(shape), out)
-
-    return run
-
-
-def with_forward_jacobian(function: Callable) -> Callable:
-    """Return the same function of pytrees, its derivative a Jacobian made by forward mode.
-
-    Reverse mode then transposes one matrix product instead of the function. It stores one Jacobian
-    a step, and does not multiply infinite derivatives, as those of distances of shapes
-    that do not touch can be, by zeros.
-    """
-    wrapped = jax.custom_jvp(function)
-
-    def rule(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-        of, at, directions = moving(lambda *args: (function(*args),) * 2, primals, tangents)
-        jacobians, value = jax.jacfwd(of, argnums=tuple(range(len(at))), has_aux=True)(*at)
-        products = (
-            jnp.tensordot(J, d, d.ndim, precision="highest")
-            for J, d in zip(jacobians, directions, strict=True)
-        )
-        return value, sum(products, jnp.zeros_like(value))
-
-    wrapped.defjvp(rule, symbolic_zeros=True)
-    return wrapped

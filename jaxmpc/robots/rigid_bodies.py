@@ -39,9 +39,10 @@ from jaxmpc.robots.engine import BALL, FREE, SLIDE
 
 # What is read of mjx.Model.
 FIELDS = (
-    "body_pos", "body_quat", "body_ipos", "body_iquat", "body_mass", "body_inertia", "jnt_pos",
-    "jnt_axis", "qpos0", "geom_pos", "geom_quat", "site_pos", "site_quat", "dof_armature",
-)  # fmt: skip
+    *("body_pos", "body_quat", "body_ipos", "body_iquat", "body_mass", "body_inertia"),
+    *("jnt_pos", "jnt_axis", "geom_pos", "geom_quat", "site_pos", "site_quat"),
+    *("qpos0", "dof_armature"),
+)
 
 
 @record
@@ -84,9 +85,8 @@ class Tree:
         nv, bodies, joints = model.nv, model.nbody, model.njnt
         links, tip, link = [(0, 0, -1)], [0], np.zeros(joints, int)
         for b in range(1, bodies):
-            start, count, last = (
-                model.body_jntadr[b], model.body_jntnum[b], tip[model.body_parentid[b]]
-            )  # fmt: skip
+            start, count = model.body_jntadr[b], model.body_jntnum[b]
+            last = tip[model.body_parentid[b]]
             for j in range(start, start + count) if count else [-1]:
                 links.append((last, b, j))
                 last = len(links) - 1
@@ -115,13 +115,17 @@ class Tree:
         earlier = np.array([[b < a for b in group] for a in group])
         acts = moves[model.dof_bodyid]
         before = acts * earlier
-        whole = lambda v: np.array(v, np.int32)
-        return cls(
-            whole(parent), whole(body), whole(joint), first, whole(tip), whole(link), whole(kinds),
-            whole(model.jnt_qposadr), whole(model.dof_bodyid), whole(model.dof_jntid), whole(axis),
-            np.array(turns, float), moves, before, acts * (1 - before.T),
-            whole(model.body_rootid), whole(model.geom_bodyid), whole(model.site_bodyid), below,
-        )  # fmt: skip
+        numbers = {
+            **{"parent": parent, "body": body, "joint": joint, "tip": tip, "link": link},
+            **{"kinds": kinds, "position": model.jnt_qposadr, "axis": axis},
+            **{"dof_body": model.dof_bodyid, "dof_joint": model.dof_jntid},
+            **{"geom_body": model.geom_bodyid, "site_body": model.site_bodyid},
+            "root": model.body_rootid,
+        }
+        masks = {"first": first, "moves": moves, "before": before, "below": below}
+        masks |= {"after": acts * (1 - before.T), "turns": np.array(turns, float)}
+        whole = {name: np.array(value, np.int32) for name, value in numbers.items()}
+        return cls(**whole, **masks)
 
 
 class Bodies(NamedTuple):
@@ -155,7 +159,7 @@ class Inertia(NamedTuple):
     mass: Array
 
 
-def kept(function: Callable) -> Callable:
+def unfused(function: Callable) -> Callable:
     """Return the same function; XLA keeps what it returns instead of computing it at each use."""
     keep = jax.lax.optimization_barrier
     return wraps(function)(lambda *args: jax.tree.map(keep, function(*args)))
@@ -167,7 +171,7 @@ def cross(a: Array, b: Array) -> Array:
     return turn(a * turn(b) - turn(a) * b)
 
 
-@kept
+@unfused
 def product(a: Array, b: Array) -> Array:
     """Return the Hamilton product of quaternions (items, 4, lanes)."""
     (s, u), (t, v) = ((q[:, :1], q[:, 1:]) for q in (a, b))
@@ -175,14 +179,14 @@ def product(a: Array, b: Array) -> Array:
     return jnp.concatenate([real, s * v + t * u + cross(u, v)], axis=1)
 
 
-@kept
+@unfused
 def rotated(q: Array, v: Array) -> Array:
     """Return vectors (items, 3, lanes) turned by unit quaternions."""
     t = 2 * cross(q[:, 1:], v)
     return v + q[:, :1] * t + cross(q[:, 1:], t)
 
 
-@kept
+@unfused
 def matrix(q: Array) -> Array:
     """Return the rotation matrices (items, 3, 3, lanes) of unit quaternions."""
     w, x, y, z = (q[:, i] for i in range(4))
@@ -194,7 +198,7 @@ def matrix(q: Array) -> Array:
     return jnp.stack(rows, axis=1).reshape(len(q), 3, 3, q.shape[-1])
 
 
-@kept
+@unfused
 def total(mask: np.ndarray, v: Array) -> Array:
     """Return the sums of v (items, …) that the rows of `mask` choose."""
     return jnp.tensordot(mask.astype(v.dtype), v, 1, precision="highest")
@@ -208,7 +212,7 @@ def _unit(q: Array) -> Array:
     return q / jnp.sqrt(jnp.sum(q * q, axis=1, keepdims=True))
 
 
-@kept
+@unfused
 def link_poses(tree: Tree, model: Mapping[str, Any], q: Array) -> tuple[Array, Array]:
     """Return positions (links, 3, lanes) and quaternions (links, 4, lanes) in the world."""
     lanes, kinds = q.shape[-1], np.where(tree.joint < 0, -1, tree.kinds[tree.joint])
@@ -250,7 +254,7 @@ def link_poses(tree: Tree, model: Mapping[str, Any], q: Array) -> tuple[Array, A
     return p, r
 
 
-@kept
+@unfused
 def bodies(tree: Tree, model: Mapping[str, Any], q: Array) -> Bodies:
     """Return the poses for the configuration q (nq, lanes)."""
     p, r = link_poses(tree, model, q)
@@ -280,21 +284,21 @@ def bodies(tree: Tree, model: Mapping[str, Any], q: Array) -> Bodies:
     return Bodies(position, quaternion, R, middle, principal, centre, S)
 
 
-@kept
+@unfused
 def motion_cross(v: Array, s: Array) -> Array:
     """Return v × s of motions (items, 6, lanes)."""
     turned = cross(v[:, :3], s[:, :3])
     return jnp.concatenate([turned, cross(v[:, :3], s[:, 3:]) + cross(v[:, 3:], s[:, :3])], axis=1)
 
 
-@kept
+@unfused
 def force_cross(v: Array, f: Array) -> Array:
     """Return v ×* f of a motion and a force (items, 6, lanes), torque first."""
     shifted = cross(v[:, :3], f[:, 3:])
     return jnp.concatenate([cross(v[:, :3], f[:, :3]) + cross(v[:, 3:], f[:, 3:]), shifted], axis=1)
 
 
-@kept
+@unfused
 def momentum(inertia: Inertia, v: Array) -> Array:
     """Return I v (items, 6, lanes), torque first."""
     J, h, mass = inertia
@@ -302,7 +306,7 @@ def momentum(inertia: Inertia, v: Array) -> Array:
     return jnp.concatenate([angular, mass[:, None] * v[:, 3:] - cross(h, v[:, :3])], axis=1)
 
 
-@kept
+@unfused
 def inertias(tree: Tree, model: Mapping[str, Any], found: Bodies) -> Inertia:
     """Return the inertia of each body about the centre of mass of its tree."""
     arm, mass = found.middle - found.centre[tree.root], jnp.asarray(model["body_mass"])
@@ -314,7 +318,7 @@ def inertias(tree: Tree, model: Mapping[str, Any], found: Bodies) -> Inertia:
     return Inertia(J, mass[:, None] * arm, mass)
 
 
-@kept
+@unfused
 def motion(tree: Tree, S: Array, v: Array) -> Motion:
     """Return what moves at the speeds v (nv, lanes)."""
     sums = total(np.concatenate([tree.before, tree.moves]), S * v[:, None])
@@ -322,7 +326,7 @@ def motion(tree: Tree, S: Array, v: Array) -> Motion:
     return Motion(S, motion_cross(earlier, S), velocity, earlier)
 
 
-@kept
+@unfused
 def forces(
     tree: Tree, inertia: Inertia, moving: Motion, gravity: Any, v: Array, a: Array | None
 ) -> tuple[Array, Array]:
@@ -355,9 +359,7 @@ def _chosen(tree: Tree, upper: Array, lower: Array) -> Array:
     return up * upper + down * lower
 
 
-def inverse_dynamics(
-    tree: Tree, model: Mapping[str, Any], q: Array, v: Array, a: Array
-) -> Array:  # fmt: skip
+def inverse_dynamics(tree: Tree, model: Mapping[str, Any], q: Array, v: Array, a: Array) -> Array:
     """Return the forces τ (nv, lanes) that the accelerations a need: M a + bias."""
     found = bodies(tree, model, q)
     inertia, moving = inertias(tree, model, found), motion(tree, found.S, v)
@@ -376,11 +378,9 @@ def dynamics(
     *of_dofs, F = composite(tree, *inertia, force)
     S, P = found.S, momentum(Inertia(*of_dofs), found.S)
     M = _chosen(tree, dot(S, P), dot(P, S)) + _diagonal(model["dof_armature"])
-    fields = {
-        "xpos": found.position, "xquat": found.quaternion, "xmat": found.matrix,
-        "xipos": found.middle, "ximat": found.principal, "subtree_com": found.centre,
-        "cdof": S, "cdof_dot": moving.psi, "cvel": moving.velocity,
-    }  # fmt: skip
+    fields = {"xpos": found.position, "xquat": found.quaternion, "xmat": found.matrix}
+    fields |= {"xipos": found.middle, "ximat": found.principal, "subtree_com": found.centre}
+    fields |= {"cdof": S, "cdof_dot": moving.psi, "cvel": moving.velocity}
     for kind, body in (("geom", tree.geom_body), ("site", tree.site_body)):
         turn = found.quaternion[body]
         fields[f"{kind}_xpos"] = found.position[body] + rotated(turn, model[f"{kind}_pos"])
@@ -395,7 +395,7 @@ def _diagonal(v: Any) -> Array:
 
 def slopes(
     tree: Tree, model: Mapping[str, Any], q: Array, v: Array, a: Array
-) -> tuple[Array, Array, Array]:  # fmt: skip
+) -> tuple[Array, Array, Array]:
     """Return ∂τ/∂q in the tangent space, ∂τ/∂v and M, all (nv, nv, lanes)."""
     found = bodies(tree, model, q)
     inertia, moving = inertias(tree, model, found), motion(tree, found.S, v)
@@ -425,7 +425,7 @@ def slopes(
     return by_q, by_v, M
 
 
-@kept
+@unfused
 def _coriolis(inertia: Inertia, velocity: Array) -> tuple[Array, Array]:
     """Return E (bodies, 3, 3, lanes) and r (bodies, 3, lanes) of each body."""
     J, h, _ = inertia
@@ -455,8 +455,8 @@ def side_by_side(function: Callable) -> Callable:
 
     @many.def_vmap
     def _(size: int, in_batched: Any, *args: Any) -> Any:
-        counts = [v.shape[1] if b else v.shape[0] for v, b in _pairs(args, in_batched)]
-        count = max(counts)
+        lengths = jax.tree.map(lambda v, b: v.shape[1 if b else 0], args, tuple(in_batched))
+        count = max(jax.tree.leaves(lengths))
 
         def flat(v: Array, batched: bool) -> Array:
             if not batched and len(v) == 1:
@@ -479,7 +479,3 @@ def side_by_side(function: Callable) -> Callable:
     fast = jax.custom_jvp(batched)
     fast.defjvp(lambda primals, tangents: (fast(*primals), jax.jvp(single, primals, tangents)[1]))
     return fast
-
-
-def _pairs(args: Any, in_batched: Any) -> list[tuple[Array, bool]]:
-    return list(zip(jax.tree.leaves(args), jax.tree.leaves(in_batched), strict=True))

@@ -13,6 +13,7 @@ from jax import Array
 
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.qp.precision import matmul
+from jaxmpc.robots.engine import names, number_of
 from jaxmpc.robots.robot import Robot
 
 # mjtGeom.
@@ -29,7 +30,7 @@ def position(robot: Robot, name: str, kind: str = "site") -> Callable[[Any], Arr
 
 def orientation(
     robot: Robot, name: str, target: Any = (1, 0, 0, 0), kind: str = "site"
-) -> Callable[[Any], Array]:  # fmt: skip
+) -> Callable[[Any], Array]:
     """Return the function that gives the rotation vector (3,) in rad, in the world, that turns the
     target orientation, a quaternion (w first), into that of a site, body or geom.
 
@@ -107,18 +108,11 @@ def energy(robot: Robot) -> Callable[[Any], Array]:
 
 def _number(robot: Robot, kind: str, name: str) -> int:
     """Return the number of a site, body or geom."""
-    import mujoco
-
     if kind not in KINDS:
         fail("kind", f"{kind!r}", f"Give one of {', '.join(KINDS)}")
-    objects = {"site": mujoco.mjtObj.mjOBJ_SITE, "body": mujoco.mjtObj.mjOBJ_BODY,
-               "geom": mujoco.mjtObj.mjOBJ_GEOM}  # fmt: skip
-    model = robot.predictor.model
-    i = mujoco.mj_name2id(model, objects[kind], name)
+    i = number_of(robot.mujoco, kind, name)
     if i < 0:
-        count = {"site": model.nsite, "body": model.nbody, "geom": model.ngeom}[kind]
-        names = [mujoco.mj_id2name(model, objects[kind], j) for j in range(count)]
-        listed = ", ".join(name for name in names if name) or "none with a name"
+        listed = ", ".join(filter(None, names(robot.mujoco, kind))) or "none with a name"
         fail("name", f"no {kind} {name!r} in {robot.name}", f"It has: {listed}")
     return i
 

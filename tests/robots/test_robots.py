@@ -10,7 +10,7 @@ import pytest
 from c_engine import c_affine, c_state, c_steps, c_transition, data_at
 
 import jaxmpc as jm
-from jaxmpc.robots import physics
+from jaxmpc.robots import jaxpr_rewriting
 from jaxmpc.robots.configurations import difference, retract
 
 SLOW = ["quadrotor"] + [
@@ -455,7 +455,7 @@ def assert_gradient(modes):
 
 def test_in_pieces_changes_nothing(monkeypatch):
     """As on the old jaxlibs: values, vmap, jit, forward mode, conditionals, constants."""
-    monkeypatch.setattr(physics, "JAXLIB", (0, 10, 2))
+    monkeypatch.setattr(jaxpr_rewriting, "JAXLIB", (0, 10, 2))
     table = np.arange(5.0)
 
     def function(x, tree):
@@ -465,7 +465,7 @@ def test_in_pieces_changes_nothing(monkeypatch):
         body = lambda c: (c[0] + 1, c[1] * 1.1)
         return {"y": jax.lax.while_loop(lambda c: c[0] < 4, body, (0, y))[1], "same": x}
 
-    pieces = physics.in_pieces(function, size=4)
+    pieces = jaxpr_rewriting.in_pieces(function, size=4)
     x, tree = np.array([0.3, -0.2, 0.7]), {"a": np.eye(3) * 0.1}
     text = str(jax.make_jaxpr(pieces)(x, tree))
     assert text.count("optimization_barrier") > 5
@@ -483,7 +483,7 @@ def test_in_pieces_changes_nothing(monkeypatch):
 
 @pytest.mark.slow
 def test_physics_in_pieces(monkeypatch, pendulum):
-    monkeypatch.setattr(physics, "JAXLIB", (0, 10, 2))
+    monkeypatch.setattr(jaxpr_rewriting, "JAXLIB", (0, 10, 2))
     x, u = np.array([1.6, 0.4]), np.array([1.0])
     after = jax.jit(pendulum.plant.step)(x, u)
     np.testing.assert_allclose(after, c_steps(pendulum.mujoco, x, u, 1), atol=1e-12)

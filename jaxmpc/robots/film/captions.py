@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -14,44 +14,56 @@ from jaxmpc.sets.violations import kept, row_violations
 INK, PAPER, RED, TARGET = (40, 40, 40), (255, 255, 255), (200, 20, 20), (0, 158, 115)
 
 
+class Captions(NamedTuple):
+    """What is written on F frames of B tiles: the robot's name, the numbers of the robots, the
+    times (F,) in s, the name of the limit that is exceeded (B, F), "" for none, and whether there
+    is a target."""
+
+    robot: str
+    numbers: Sequence[int]
+    times: np.ndarray
+    exceeded: np.ndarray
+    has_target: bool
+
+
 def captioned(
-    film: np.ndarray, tiles: Sequence[tuple[int, int]], size: tuple[int, int], robot: Robot,
-    times: np.ndarray, numbers: Sequence[int], exceeded: np.ndarray, has_target: bool,
-) -> np.ndarray:  # fmt: skip
+    film: np.ndarray, tiles: Sequence[tuple[int, int]], size: tuple[int, int], words: Captions
+) -> np.ndarray:
     """Return the frames (F, h, w, 3) with a line above and a legend below.
 
-    tiles: (top, left) of each of the B robots; size: (height, width) of a tile. times (F,) in s.
-    numbers: of the robots. exceeded (B, F): the name of the limit that is exceeded, "" for none.
+    tiles: (top, left) of each of the B robots; size: (height, width) of a tile.
     """
     from PIL import Image, ImageDraw
 
     font = _font(round(np.clip(size[0] / 18, 12, 18)))
     line = font.size + 8
-    legend = _lines(_legend(has_target), font, film.shape[2] - 8)
+    legend = _lines(_legend(words.has_target), font, film.shape[2] - 8)
     room = ((0, 0), (line, line * len(legend)), (0, 0), (0, 0))
     film = np.pad(film, room, constant_values=255)
     edge = max(3, size[0] // 60)
     for k, frame in enumerate(film):
         picture = Image.fromarray(frame)
         draw = ImageDraw.Draw(picture)
-        clock = f"{times[k]:.2f} s"
-        draw.text((6, 3), robot.name, INK, font)
+        clock = f"{words.times[k]:.2f} s"
+        draw.text((6, 3), words.robot, INK, font)
         draw.text((film.shape[2] - 6 - font.getlength(clock), 3), clock, INK, font)
-        for (top, left), number, words in zip(tiles, numbers, exceeded[:, k], strict=True):
+        for (top, left), number, limit in zip(
+            tiles, words.numbers, words.exceeded[:, k], strict=True
+        ):
             top += line
-            if words:
+            if limit:
                 corners = (left, top, left + size[1] - 1, top + size[0] - 1)
                 draw.rectangle(corners, outline=RED, width=edge)
-                words = _fitting(f"beyond limit: {words}", font, size[1] - 2 * edge - 8)
-                _plate(draw, (left + edge, top + size[0] - edge - line), words, font, PAPER, RED)
+                text = _fitting(f"beyond limit: {limit}", font, size[1] - 2 * edge - 8)
+                _plate(draw, (left + edge, top + size[0] - edge - line), text, font, PAPER, RED)
             _plate(draw, (left + edge, top + edge), f"robot {number}", font, INK, PAPER)
         for i, entries in enumerate(legend):
             x, y = 6.0, film.shape[1] - line * (len(legend) - i) + 3
-            for colour, words in entries:
+            for colour, text in entries:
                 box = (x, y + 2, x + font.size - 2, y + font.size)
                 draw.rectangle(box, colour if colour == TARGET else PAPER, colour, width=2)
-                draw.text((x + font.size + 3, y), words, INK, font)
-                x += _width((colour, words), font)
+                draw.text((x + font.size + 3, y), text, INK, font)
+                x += _width((colour, text), font)
         frame[:] = np.asarray(picture)
     return film
 
@@ -66,12 +78,9 @@ def exceeded_limits(robot: Robot, states: np.ndarray, inputs: Any, every: int) -
         xi = states
         if robot.n != robot.state_size:
             xi = np.asarray(jax.vmap(jax.vmap(robot.coordinates))(states))
-    units = (robot.state_units, robot.input_units)
-    names = (robot.state_names, robot.input_names)
-    words = ["", *(
-        f"{name} [{unit}]" if unit else name
-        for pair in zip(names, units, strict=True) for name, unit in zip(*pair, strict=True)
-    )]  # fmt: skip
+    names = (*robot.state_names, *robot.input_names)
+    units = (*robot.state_units, *robot.input_units)
+    labels = [f"{n} [{unit}]" if unit else n for n, unit in zip(names, units, strict=True)]
     over = np.zeros((*xi.shape[:2], robot.n + robot.m))
     pairs = [(robot.state_limits, xi, slice(0, robot.n))]
     if inputs is not None:
@@ -82,7 +91,7 @@ def exceeded_limits(robot: Robot, states: np.ndarray, inputs: Any, every: int) -
         over[..., part] = np.where(kept(limits, values), 0.0, excess)
     worst = np.maximum.reduceat(over, np.arange(0, over.shape[1], every), axis=1)
     index = np.where(worst.max(axis=2) > 0, 1 + worst.argmax(axis=2), 0)
-    return np.array(words)[index]
+    return np.array(["", *labels])[index]
 
 
 def _legend(has_target: bool) -> list[tuple[tuple[int, int, int], str]]:

@@ -6,14 +6,15 @@ import io
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_shape, whole
 from jaxmpc.pytrees import record
-from jaxmpc.robots.film.captions import TARGET, captioned, exceeded_limits
+from jaxmpc.robots.engine import mujoco, number_of
+from jaxmpc.robots.film.captions import TARGET, Captions, captioned, exceeded_limits
 from jaxmpc.robots.robot import Robot
 
 OPACITY = 0.3  # of the target
@@ -23,10 +24,18 @@ BACKGROUND = np.array([0.5, 0.5, 0.5, 1], np.float32)
 
 
 def render(
-    robot: Robot, states: Reals, *, inputs: Reals | None = None, target: Any = None, every: int = 1,
-    width: int = 320, height: int = 240, camera: str | None = "view", labels: bool = True,
+    robot: Robot,
+    states: Reals,
+    *,
+    inputs: Reals | None = None,
+    target: Reals | None = None,
+    every: int = 1,
+    width: int = 320,
+    height: int = 240,
+    camera: str | None = "view",
+    labels: bool = True,
     numbers: Sequence[int] | None = None,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Return the frames (F, h, w, 3), uint8 RGB, of every `every`-th state.
 
     states: (T+1, nq + nv) of one robot, or (B, T+1, nq + nv) of several, drawn as tiles, row by
@@ -45,17 +54,72 @@ def render(
     MUJOCO_GL=egl must be set before mujoco is imported, hence before the first `load_robot`.
     Raises ValueError for wrong shapes and cameras, RuntimeError where nothing can be rendered.
     """
-    import mujoco
+    scenes = _checked(robot, states, inputs, target, every)
+    for name, value in (("width", width), ("height", height)):
+        whole(name, value, 1)
+    count = len(scenes.states)
+    if numbers is not None and len(numbers) != count:
+        fail("numbers", f"{len(numbers)} of {count} robots", "Give one for each")
+    model = _drawn(robot.mujoco, width, height)
+    view: Any = camera
+    if camera is not None and number_of(model, "camera", camera) < 0:
+        if camera != "view":
+            fail("camera", f"the model has none named {camera!r}", "Give one of its, or None")
+        view = None
+    if view is None:
+        poses = scenes.states[:, :: max(1, scenes.samples // 20), : model.nq].reshape(-1, model.nq)
+        poses = poses if scenes.target is None else np.concatenate([poses, scenes.target])
+        view = _camera(model, poses, width / height)
+    columns = int(np.ceil(np.sqrt(count)))
+    rows = -(-count // columns)
+    tiles = [(height * (i // columns), width * (i % columns)) for i in range(count)]
+    motions = scenes.states[:, :: scenes.every, : model.nq]
+    film = np.full((motions.shape[1], rows * height, columns * width, 3), 255, np.uint8)
+    with _renderer(model, width, height) as renderer:
+        for (top, left), motion in zip(tiles, motions, strict=True):
+            tile = film[:, top : top + height, left : left + width]
+            _draw(tile, renderer, model, view, motion, scenes.target)
+    for row in range(1, rows):
+        film[:, row * height - 1 : row * height + 1] = 255
+    for column in range(1, columns):
+        film[:, :, column * width - 1 : column * width + 1] = 255
+    if not labels:
+        return film
+    words = Captions(
+        robot=robot.name,
+        numbers=range(count) if numbers is None else numbers,
+        times=robot.dt * scenes.every * np.arange(len(film)),
+        exceeded=exceeded_limits(robot, scenes.states, scenes.inputs, scenes.every),
+        has_target=scenes.target is not None,
+    )
+    return captioned(film, tiles, (height, width), words)
 
+
+class _Scenes(NamedTuple):
+    """What is drawn: states (B, T+1, nq + nv), inputs (B, T, m) or None, of the target the qpos at
+    each frame (F, nq), or None, and how many samples lie between frames."""
+
+    states: np.ndarray
+    inputs: np.ndarray | None
+    target: np.ndarray | None
+    every: int
+
+    @property
+    def samples(self) -> int:
+        """Return T + 1."""
+        return self.states.shape[1]
+
+
+def _checked(robot: Robot, states: Reals, inputs: Reals | None, target: Any, every: int) -> _Scenes:
+    """Return the scenes; raise ValueError for wrong arguments of `render`."""
     if not isinstance(robot, Robot):
         fail("robot", f"is a {type(robot).__name__}", "Only a Robot has a shape to draw")
     states = np.asarray(states, float)
     if states.ndim not in (2, 3) or states.shape[-1] != robot.state_size or not states.size:
         fail("states", f"shape {states.shape}", f"Give ([robots,] samples, {robot.state_size})")
     require_finite("states", states)
-    for name, value in (("every", every), ("width", width), ("height", height)):
-        whole(name, value, 1)
-    model, samples, every = copy.deepcopy(robot.mujoco), states.shape[-2], int(every)
+    whole("every", every, 1)
+    samples, nq = states.shape[-2], robot.mujoco.nq
     if inputs is not None:
         inputs = np.asarray(inputs, float)
         shape = (*states.shape[:-2], samples - 1, robot.m)
@@ -63,98 +127,81 @@ def render(
         inputs = inputs.reshape(-1, *shape[-2:])
     if target is not None:
         target = np.asarray(target, float)
-        shape = (samples, model.nq) if target.ndim == 2 else (model.nq,)
+        shape = (samples, nq) if target.ndim == 2 else (nq,)
         require_shape("target", target, shape, "Give one qpos, or one for each state")
         require_finite("target", target)
-        target = np.broadcast_to(target, (samples, model.nq))[::every]
-    states = states.reshape(-1, *states.shape[-2:])
-    count = len(states)
-    if numbers is not None and len(numbers) != count:
-        fail("numbers", f"{len(numbers)} of {count} robots", "Give one for each")
-    if camera is not None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera) < 0:
-        if camera != "view":
-            fail("camera", f"the model has none named {camera!r}", "Give one of its, or None")
-        camera = None
-    buffer = model.vis.global_
+        target = np.broadcast_to(target, (samples, nq))[::every]
+    return _Scenes(states.reshape(-1, *states.shape[-2:]), inputs, target, int(every))
+
+
+def _drawn(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.MjModel":
+    """Return a copy of a model with room for pictures of this size, and light enough."""
+    model = copy.deepcopy(model)
+    buffer, light = model.vis.global_, model.vis.headlight
     buffer.offwidth, buffer.offheight = max(buffer.offwidth, width), max(buffer.offheight, height)
     # MuJoCo's default of 4096 takes most of the time where the CPU draws.
     model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, 1024)
+    if not model.nlight:
+        light.ambient[:] = np.maximum(light.ambient, 0.6)
+        light.diffuse[:] = np.maximum(light.diffuse, 0.6)
+    return model
+
+
+def _renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.Renderer":
+    """Return MuJoCo's renderer; raise RuntimeError where there is none."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # GLFW warns of what follows as an error
-            renderer = mujoco.Renderer(model, height, width)
+            return mujoco.Renderer(model, height, width)
     except Exception as error:  # of MuJoCo, OpenGL or EGL, whichever is missing
         raise RuntimeError(
             f"no video: MuJoCo finds no renderer ({' '.join(str(error).split())[:120]}). Without "
             "a display set MUJOCO_GL=egl before Python starts; on Debian or Ubuntu install "
             "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1"
         ) from None
-    view: Any = camera
-    if camera is None:
-        poses = states[:, :: max(1, samples // 20), : model.nq].reshape(-1, model.nq)
-        poses = poses if target is None else np.concatenate([poses, target])
-        view = _camera(model, poses, width / height)
-    sky = np.any(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
-    if not model.nlight:
-        light = model.vis.headlight
-        light.ambient[:], light.diffuse[:] = (
-            np.maximum(v, 0.6) for v in (light.ambient, light.diffuse)
-        )
-    columns = int(np.ceil(np.sqrt(count)))
-    rows = -(-count // columns)
-    tiles = [(height * (i // columns), width * (i % columns)) for i in range(count)]
-    motions = states[:, ::every, : model.nq]
-    film = np.full((motions.shape[1], rows * height, columns * width, 3), 255, np.uint8)
+
+
+def _draw(
+    frames: np.ndarray,
+    renderer: "mujoco.Renderer",
+    model: "mujoco.MjModel",
+    view: Any,
+    motion: np.ndarray,
+    target: np.ndarray | None,
+) -> None:
+    """Draw one robot at its qpos (F, nq) into frames (F, h, w, 3), and the target beside it."""
     data, ghost = mujoco.MjData(model), mujoco.MjData(model)
-    with renderer:
-        for (top, left), motion in zip(tiles, motions, strict=True):
-            for k, (frame, q) in enumerate(zip(film, motion, strict=True)):
-                data.qpos[:] = q
-                mujoco.mj_forward(model, data)
-                renderer.update_scene(data, view)
-                if target is not None:
-                    ghost.qpos[:] = target[k]
-                    mujoco.mj_forward(model, ghost)
-                    _add_ghost(renderer.scene, model, ghost)
-                if not sky:
-                    _add_backdrop(renderer.scene)
-                frame[top : top + height, left : left + width] = renderer.render()
-    for row in range(1, rows):
-        film[:, row * height - 1 : row * height + 1] = 255
-    for column in range(1, columns):
-        film[:, :, column * width - 1 : column * width + 1] = 255
-    if not labels:
-        return film
-    times = robot.dt * every * np.arange(len(film))
-    return captioned(
-        film, tiles, (height, width), robot, times, range(count) if numbers is None else numbers,
-        exceeded_limits(robot, states, inputs, every), target is not None,
-    )  # fmt: skip
+    sky = np.any(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+    for k, (frame, q) in enumerate(zip(frames, motion, strict=True)):
+        data.qpos[:] = q
+        mujoco.mj_forward(model, data)
+        renderer.update_scene(data, view)
+        if target is not None:
+            ghost.qpos[:] = target[k]
+            mujoco.mj_forward(model, ghost)
+            _add_ghost(renderer.scene, model, ghost)
+        if not sky:
+            _add_backdrop(renderer.scene)
+        frame[:] = renderer.render()
 
 
-def _add_backdrop(scene: Any) -> None:
+def _add_backdrop(scene: "mujoco.MjvScene") -> None:
     """Add a grey wall far behind a scene whose model has no skybox, which would be black there."""
-    import mujoco
-
     eye = (scene.camera[0].pos + scene.camera[1].pos) / 2
     ahead, up = scene.camera[0].forward, scene.camera[0].up
     far = 0.9 * scene.camera[0].frustum_far
     wall = scene.geoms[scene.ngeom]
     frame = np.stack([np.cross(up, -ahead), up, -ahead], axis=1)
-    mujoco.mjv_initGeom(
-        wall, mujoco.mjtGeom.mjGEOM_BOX, far * np.array([3, 3, 1e-3]), eye + far * ahead,
-        frame.ravel(), BACKGROUND,
-    )  # fmt: skip
+    size, place = far * np.array([3, 3, 1e-3]), eye + far * ahead
+    mujoco.mjv_initGeom(wall, mujoco.mjtGeom.mjGEOM_BOX, size, place, frame.ravel(), BACKGROUND)
     wall.emission, wall.specular, wall.category = 1, 0, mujoco.mjtCatBit.mjCAT_DECOR
     scene.ngeom += 1
 
 
-def _camera(model: Any, poses: np.ndarray, aspect: float) -> Any:
+def _camera(model: "mujoco.MjModel", poses: np.ndarray, aspect: float) -> "mujoco.MjvCamera":
     """Return MuJoCo's free camera, moved so that it sees what moves at all poses (k, nq).
 
     aspect: width by height of a picture."""
-    import mujoco
-
     camera, data = mujoco.MjvCamera(), mujoco.MjData(model)
     mujoco.mjv_defaultFreeCamera(model, camera)
     moving = (model.body_weldid[model.geom_bodyid] != 0) & (model.geom_rbound > 0)
@@ -174,14 +221,12 @@ def _camera(model: Any, poses: np.ndarray, aspect: float) -> Any:
     return camera
 
 
-def _add_ghost(scene: Any, model: Any, data: Any) -> None:
+def _add_ghost(scene: "mujoco.MjvScene", model: "mujoco.MjModel", data: "mujoco.MjData") -> None:
     """Add the moving bodies of a second robot to a scene, green and see-through.
 
     Each is 1 % further from the camera than it should be, along its line of sight: what coincides
     with the robot itself is then hidden behind it, rather than drawn in turns with it.
     """
-    import mujoco
-
     first, moving = scene.ngeom, mujoco.mjtCatBit.mjCAT_DYNAMIC.value
     mujoco.mjv_addGeoms(model, data, mujoco.MjvOption(), mujoco.MjvPerturb(), moving, scene)
     eye = (scene.camera[0].pos + scene.camera[1].pos) / 2
