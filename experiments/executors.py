@@ -36,7 +36,6 @@ import numpy as np
 import jaxmpc as jm
 from jaxmpc import store
 from jaxmpc.app.commands import linear_sweep
-from jaxmpc.app.commands.linear_sweep import LinearSweep
 from jaxmpc.app.config import load
 
 CHUNK = 1024
@@ -180,15 +179,17 @@ def stored(config: Any) -> None:
     linear_sweep.CHUNK = CHUNK
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(StringIO()) as text:
         first, second = Path(folder) / "alone", Path(folder) / "pools"
-        LinearSweep.open(config, first).run()
+        linear_sweep.linear_sweep(config, first)
         lost = 0
         for kill in (20, None):
-            sweep, before = LinearSweep.open(config, second, resume=bool(lost)), lost
+            before = lost
             with processes() as pool:
                 try:
-                    sweep.run(executor=Noting(pool, kill))
+                    executor = Noting(pool, kill)
+                    linear_sweep.linear_sweep(config, second, resume=bool(lost), executor=executor)
                 except BrokenProcessPool:
-                    lost = len(sweep.store.pending())
+                    there = store.read(second / "sweep.zarr")
+                    lost = there.blocks - there.done
         alone, pools = (store.read(path / "sweep.zarr").arrays for path in (first, second))
         same = all(np.array_equal(alone[k], v, equal_nan=v.dtype.kind == "f") for k, v in
                    pools.items() if v.dtype.kind in "fiu")  # fmt: skip

@@ -22,7 +22,7 @@ from bench.families import joint
 
 import jaxmpc as jm
 from jaxmpc.batches import chosen_devices, default_chunk, gather_size, placement
-from jaxmpc.feasible.candidates import ALPHA, compiled_admm, compiled_newton
+from jaxmpc.feasible.candidates import compiled_admm, compiled_newton
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.many import _plans
@@ -65,17 +65,16 @@ def print_labels(x: np.ndarray, devices: tuple[jax.Device, ...], rounds: int) ->
         ones = jax.device_put(np.ones(len(chunks[0]), bool), placement(devices, True))
         stage = compiled_admm(50, np.dtype(np.float32), devices)
         newton = compiled_newton(gather_size(each), devices)
-        here, alpha = x[: len(ones)], np.float64(ALPHA)  # on the host, as the calls below have them
-        first = stage.program(exact, rows, here, alpha)
-        found_first = first(exact, rows, here, alpha)
+        here = x[: len(ones)]  # on the host, as the calls below have them
+        first = stage.program(exact, rows, here)
+        found_first = first(exact, rows, here)
         second = newton.program(exact, rows, here, np.ones(len(here), bool), *found_first)
         spent: list[float] = []
 
         def call() -> None:
             begun = perf_counter()
             out = [
-                second(exact, rows, part, ones, *first(exact, rows, part, alpha)).label
-                for part in chunks
+                second(exact, rows, part, ones, *first(exact, rows, part)).label for part in chunks
             ]
             spent.append(perf_counter() - begun)
             jax.block_until_ready(out)

@@ -1,15 +1,8 @@
 """A batch of results stored block by block, so that a killed run loses one block at most.
 
 The store is a zarr v3 group that opens as a data set, `xarray.open_zarr(path)`. A grid has one
-dimension an axis, with its coordinates; other samples lie along `sample`. Of each sample a sweep
-holds
-
-    label, status, start (state), plan (time, input): x_0 and inputs that prove feasible,
-    cut_normal (coordinate), cut_offset: the half-space that proves infeasible (offset inf: none
-    that holds on the whole feasible set is known)
-
-and after refinement bound_point (ray, coordinate), bound_normal (facet, coordinate) and
-bound_offset (facet): proved boundary points and half-spaces.
+dimension an axis, with its coordinates; other samples lie along `sample`. `Field`s have a value a
+sample, `Constant`s are known from the start or follow from all samples (`Store.save`).
 
 A block is a run of consecutive samples, one zarr chunk of each variable. checksum (block) is a hash
 of its data, written after them, and 0 before: a block whose data are missing, unreadable or others
@@ -36,14 +29,12 @@ import hashlib
 import itertools
 import math
 import os
-import re
 import shutil
 import sys
 import uuid
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias
 
@@ -53,27 +44,17 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from jaxmpc.batches import padded
 from jaxmpc.checks import fail, in_units, require_memory, shortened, shown
-from jaxmpc.feasible.labels import PROOFS, Labels, OnDemand
-from jaxmpc.feasible.map import mesh
-from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.files import differences, faithful, fingerprint, text_within, versions
+from jaxmpc.grids import mesh
 from jaxmpc.pytrees import record
-from jaxmpc.qp.status import Status
 
 if TYPE_CHECKING:
     import xarray as xr
 
-BOUNDS = {
-    "bound_point": ("ray", "coordinate"),
-    "bound_normal": ("facet", "coordinate"),
-    "bound_offset": ("facet",),
-}
 
 # Of each chunk; the last one adds a checksum of the file itself.
 CODECS = (ZstdCodec(), Crc32cCodec())
 
-# Bytes of the name of a dimension, at most; file systems have 255 for a name.
-MOST_NAME = 100
 
 # Most blocks of a store that is read. Its data are no larger than SMALL bytes, or so many times its
 # files: a sweep's are some 13 times as large, one number throughout is far more.
@@ -98,94 +79,6 @@ class Constant(NamedTuple):
     data: np.ndarray
     dimensions: tuple[str, ...]
     attributes: Mapping[str, Any] = {}
-
-
-def label_fields(n: int, horizon: int, m: int, d: int) -> dict[str, Field]:
-    """Return the variables that hold `Labels` of d mapped states and plans (horizon, m) from states
-    of size n."""
-    flags = lambda values, names: {"flag_values": values, "flag_meanings": " ".join(names)}
-    return {
-        "label": Field((), "int8", 0, (), {
-            "long_name": "label",
-            **flags([-1, 0, 1], ["infeasible", "undecided", "feasible"]),
-        }),
-        "status": Field((), "int8", 0, (), {
-            "long_name": "status of the problem at this state",
-            **flags([int(s) for s in Status], [s.name.lower() for s in Status]),
-        }),
-        "start": Field((n,), "float64", np.nan, ("state",), {
-            "long_name": "initial state of the plan that proves feasible"}),
-        "plan": Field((horizon, m), "float64", np.nan, ("time", "input"), {
-            "long_name": "inputs that prove feasible"}),
-        "cut_normal": Field((d,), "float64", np.nan, ("coordinate",), {
-            "long_name": "normal a of a half-space a'x <= b that no feasible state leaves and this "
-            "one does"}),
-        "cut_offset": Field((), "float64", np.nan, (), {
-            "long_name": "offset b of the half-space a'x <= b; inf: proved at this state alone"}),
-    }  # fmt: skip
-
-
-def label_rows(labels: Labels) -> dict[str, np.ndarray]:
-    """Return labels as the variables of `label_fields`."""
-    return {name: getattr(labels, name) for name in ("label", "status", *PROOFS)}
-
-
-def open_labels(
-    path: str | Path, problem: FeasibilityProblem, along: Sequence[np.ndarray],
-    config: Mapping[str, Any], chunk: int, fields: Mapping[str, Field] | None = None,
-    **how: Any,
-) -> "Store":  # fmt: skip
-    """Open the store of the labels of a grid; how: to open it, see `Store`.
-
-    along: the coordinates of the grid along each mapped state. fields: variables beside the labels.
-    """
-    mpc, system = problem.mpc, problem.mpc.system
-    all_fields = label_fields(mpc.dimension, mpc.horizon, system.m, problem.dimension)
-    all_fields |= dict(fields or {})
-    names = [_name_and_unit(label) for label in problem.axis_names]
-    axes = {
-        dimension: Constant(values, (dimension,), {"long_name": name, "units": unit or "1"})
-        for dimension, values, (name, unit) in zip(
-            dimension_names([name for name, _ in names], all_fields), along, names, strict=True
-        )
-    }
-    text = lambda dimension, values: Constant(np.array(list(values), str), (dimension,))
-    period = system.dt or 1.0
-    constants = {
-        "coordinate": text("coordinate", problem.axis_names),
-        "state": text("state", mpc.labels),
-        "input": text("input", system.input_labels),
-        "time": Constant(period * np.arange(mpc.horizon), ("time",), {
-            "long_name": "time of the input", "units": "s" if system.dt else "1"}),
-    }  # fmt: skip
-    attributes = {"problem": problem.plain()}
-    return Store(
-        path, axes, all_fields, config, chunk, constants=constants, attributes=attributes, **how
-    )  # fmt: skip
-
-
-def _name_and_unit(label: str) -> tuple[str, str]:
-    """Split a label such as "q [rad]" into its name and its unit."""
-    found = re.fullmatch(r"(.*?) \[(.*)\]", label)
-    return (found[1], found[2]) if found else (label, "")
-
-
-def dimension_names(names: Sequence[str], taken: Mapping[str, Any]) -> list[str]:
-    """Return names of dimensions for mapped states: their own, without characters that a path
-    cannot hold; x0, x1, ... where these are not distinct, or too long for a path, or have a meaning
-    in a store. Some file systems do not tell capital letters from others."""
-    found = [re.sub(r"[^\w.\- ]", "_", name).strip(". ") for name in names]
-    own = {"checksum", "block", "state", "input", "time", "coordinate", "sample", "zarr.json"}
-    known, bare = {*taken, *BOUNDS, *own}, [name.casefold() for name in found]
-    if (
-        len(set(bare)) < len(found)
-        or not all(found)
-        or known & {*found, *bare}
-        or any(len(name.encode()) > MOST_NAME for name in found)
-        or any(name.startswith("__") or name.endswith(".partial") for name in found)
-    ):
-        return [f"x{i}" for i in range(len(found))]
-    return found
 
 
 class Store:
@@ -356,20 +249,13 @@ class Store:
         found = np.asarray(_array(self.group, name)[region])
         return found.reshape(-1, *found.shape[len(self.shape) :])
 
-    def labels(self) -> Labels:
-        """Return the labels in the store; proofs are read when they are used."""
-        later = {name: OnDemand(partial(self.read, name)) for name in PROOFS}
-        return Labels(self.read("label"), self.read("status"), later)
-
-    def save_bounds(self, points: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> None:
-        """Write what refinement proved: points (K, d) and half-spaces normals (F, d), offsets
-        (F,)."""
-        for (name, dimensions), value in zip(
-            BOUNDS.items(), (points, normals, offsets), strict=True
-        ):
+    def save(self, values: Mapping[str, "Constant"]) -> None:
+        """Write further variables, which follow from all blocks, with their checksums."""
+        for name, (data, dimensions, attributes) in values.items():
+            mark = {"checksum": str(checksum({name: data}))}
             self.group.create_array(
-                name, data=value, overwrite=True, dimension_names=dimensions, compressors=CODECS,
-                attributes={"checksum": str(checksum({name: value}))},
+                name, data=data, overwrite=True, dimension_names=dimensions, compressors=CODECS,
+                attributes={**attributes, **mark},
             )  # fmt: skip
         _consolidate(self.group)
 
@@ -585,20 +471,28 @@ class Stored:
 
 # What looks at attributes and axes before data are read, and returns what is wrong with them.
 Check: TypeAlias = Callable[[Mapping[str, Any], Mapping[str, np.ndarray]], list[str]]
+# Returns the shapes of variables, a sample, that follow from attributes.
+Shapes: TypeAlias = Callable[[Mapping[str, Any]], Mapping[str, tuple[int, ...]]]
 
 
-def read(path: str | Path, check: Check = lambda attributes, axes: []) -> Stored:
+def read(
+    path: str | Path,
+    check: Check = lambda attributes, axes: [],
+    shapes: Shapes = lambda attributes: {},
+) -> Stored:
     """Read a store and compare it with its checksums; raises ValueError where there is none.
 
     Metadata come first: nothing is read that is larger than they and the files allow, and nothing
     but axes and constants before the fingerprint is found to be theirs. check: looks at these.
+    shapes: of variables, a sample, that follow from the attributes; raises ValueError where these
+    make no sense.
     """
     path = location(path)
     if isinstance(path, Path) and (path / "zarr.json").is_file():
         text_of(path, "zarr.json")  # raises for what is too large to be metadata
     group = _open(path, "r")
     try:
-        return _read(path, group, check)
+        return _read(path, group, check, shapes)
     except Exception as error:  # of zarr, its codecs, JSON: what damaged bytes may raise
         text = reason(error)
         return Stored.damaged(text if isinstance(error, ValueError) else f"cannot be read ({text})")
@@ -611,9 +505,9 @@ def reason(error: Exception) -> str:
     return shortened(text if known else f"{type(error).__name__}: {text}")
 
 
-def _read(path: Path | str, group: zarr.Group, check: Check) -> Stored:
+def _read(path: Path | str, group: zarr.Group, check: Check, shapes: Shapes) -> Stored:
     """Read an open store; raises where nothing can be said of its data."""
-    found, described = _described(path)
+    found, described = _described(path, shapes)
     names, block = found["variables"], found["variables"]["block"]
 
     def load(name: str) -> np.ndarray:
@@ -638,12 +532,12 @@ def _read(path: Path | str, group: zarr.Group, check: Check) -> Stored:
         if marks[k] != checksum({name: v[parts[k]] for name, v in arrays.items()}):
             _require_files(path, arrays, parts[k], block, f"block {k}")
             problems.append(f"block {k}: data are not as they were written")
-    for name in BOUNDS:
-        if name in described:
-            constants[name] = load(name)
-            stored = described[name]["attributes"].get("checksum")
-            if stored != str(checksum({name: constants[name]})):
-                problems.append(f"{name}: data are not as they were written")
+    own = {*axes, *constants, *arrays, "checksum"}
+    for name in [name for name in described if name not in own]:  # what `Store.save` wrote
+        constants[name] = load(name)
+        stored = described[name]["attributes"].get("checksum")
+        if stored != str(checksum({name: constants[name]})):
+            problems.append(f"{name}: data are not as they were written")
     flat = {k: v.reshape(-1, *v.shape[len(shape) :]) for k, v in arrays.items()} | constants
     return Stored(found, flat, axes, len(parts), int(np.count_nonzero(marks)), problems)
 
@@ -654,7 +548,7 @@ def _record(attributes: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in attributes.items() if name not in others}
 
 
-def _described(path: Path | str) -> tuple[dict[str, Any], dict[str, Any]]:
+def _described(path: Path | str, shapes: Shapes) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the attributes of a store and the metadata of each variable. Raises ValueError where
     they do not fit each other, or describe more than the files can hold; no data are read."""
     root = faithful("zarr.json", text_of(path, "zarr.json"))
@@ -689,8 +583,7 @@ def _described(path: Path | str) -> tuple[dict[str, Any], dict[str, Any]]:
     if count > MOST_BLOCKS:
         fail("zarr.json", f"describes {count:,} blocks", f"At most {MOST_BLOCKS:,} can be read")
     last = {name: sizes[name].shape[len(grid) :] for name in fields}
-    if isinstance(found.get("problem"), dict):
-        last |= {k: v for k, v in tails(found["problem"]).items() if k in fields}
+    last |= {name: shape for name, shape in shapes(found).items() if name in fields}
     expected = {
         name: Layout((*grid, *tail), (*block, *tail)) for name, tail in last.items()
     } | {"checksum": Layout((count,), (1,))}  # fmt: skip
@@ -734,38 +627,6 @@ def _layout(name: str, one: Any) -> Layout:
     if not fine:
         fail(name, "metadata are not such as are written here", "Overwrite the store")
     return Layout(tuple(shape), tuple(chunks), size)
-
-
-def tails(problem: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
-    """Return the shapes, a sample, of the variables that hold labels of a stored problem. Raises
-    ValueError unless its parts fit one another."""
-    try:
-        (n, m), N, d = np.shape(problem["B"]), problem["horizon"], len(problem["axes"])
-        moves, others, ball = problem["moves"], problem["others"]["index"], problem["ellipsoid"]
-        fine = (
-            np.shape(problem["A"]) == (n, n)
-            and np.shape(problem["c"]) == (n,)
-            and type(N) is int
-            and len(moves) == N > 0
-            and all(type(move) is int and 0 <= move < N for move in moves)
-            and sorted([*problem["axes"], *others]) == list(range(n))
-            and all(
-                np.shape(b["H"]) in ((len(b["lower"]), n), (0,))
-                and np.shape(b["D"]) in ((len(b["lower"]), m), (0,))
-                and len(b["lower"]) == len(b["upper"])
-                and all(type(k) is int and 0 <= k <= N for k in b["steps"])
-                and len(set(b["steps"])) == len(b["steps"])
-                for b in problem["rows"]
-            )
-            and (ball is None or len(np.shape(ball["P"])) == 2)
-        )  # fmt: skip
-    except (LookupError, TypeError, ValueError):
-        fine = False
-    if not fine:
-        fail("problem", "its matrices, horizon, rows and axes do not fit each other",
-             "Overwrite the store")  # fmt: skip
-    return {"plan": (N, m), "start": (n,), "cut_normal": (d,), "label": (), "status": (),
-            "cut_offset": ()}  # fmt: skip
 
 
 def _marks(path: Path | str, group: zarr.Group, count: int) -> np.ndarray:

@@ -4,7 +4,6 @@ the check of those that linear programs find.
 For the question "feasible or not" the cost is dropped. In an orthonormal basis U of the range
 of the (row-normalised) constraint matrix a zero-cost ADMM step is t⁺ = t + α(U U'r − clip(t)):
 the alternating projection of Douglas and Rachford between {U w} and the box of the bounds.
-Rows multiplied by √rho_i before U is made are the same as penalties rho_i (`StagePenalties`).
 Iterates may be float32. No label is decided here: every candidate, a w or a multiplier, is checked
 by `proofs.py`.
 """
@@ -12,38 +11,29 @@ by `proofs.py`.
 import functools
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 
 from jaxmpc.batches import Compiled, Devices, over_devices
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.proofs import Verdict
-from jaxmpc.pytrees import record
 from jaxmpc.qp.newton import least_distance
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
 
+# Over-relaxation of ADMM.
 ALPHA = 1.6
 INSET = 1e-10
 # Newton steps between two attempts at a proof, and number of attempts; decided points drop out.
 NEWTON_STEPS = 8
 NEWTON_ROUNDS = 8
-
-
-@record
-class StagePenalties:
-    """Penalties of the ADMM stage: weight (R,) of the constraint rows, the root of ADMM's rho, and
-    the over-relaxation alpha. No proof depends on them: they influence which points this stage
-    decides, and from what iterates the next stages start."""
-
-    weight: np.ndarray
-    alpha: float = ALPHA
 
 
 def inputs_of(p: ExactData, rows: ConstraintRows, theta: Array, w: Array) -> tuple[Array, Array]:
@@ -54,9 +44,8 @@ def inputs_of(p: ExactData, rows: ConstraintRows, theta: Array, w: Array) -> tup
     return inputs + rows.psi, variables[len(variables) - free :]
 
 
-def cut_of(p: ExactData, rows: ConstraintRows, y: Array) -> tuple[Array, Array, Array]:
-    """Return the bound (a, b, w) of `proofs.cut` that follows from multipliers y (R,) of the
-    rows."""
+def cut_of(p: ExactData, rows: ConstraintRows, y: Array) -> proofs.Cut:
+    """Return the `proofs.cut` that follows from multipliers y (R,) of the rows."""
     y = jnp.append(y * rows.weight, 0.0)[jnp.asarray(rows.index)]
     staged, last = p.horizon * p.H.shape[0], p.H_N.shape[0]
     y_states, y_N, y_ball = jnp.split(y, [staged, staged + last])
@@ -65,19 +54,19 @@ def cut_of(p: ExactData, rows: ConstraintRows, y: Array) -> tuple[Array, Array, 
 
 def with_violated_limit(rows: ConstraintRows, theta: Array, y: Array) -> Array:
     """Return the multipliers y (R,), or that of a single row: the one that θ violates most,
-    relative to its terms, among the rows that nothing moves. It is a proof for any inputs, limited
+    relative to its terms, among the zero rows. It is a proof for any inputs, limited
     or not.
     """
-    if not len(rows.still):
+    if not len(rows.zero_rows):
         return y
-    still, D = jnp.asarray(rows.still), jnp.asarray(rows.D)[rows.still]
+    zero, D = jnp.asarray(rows.zero_rows), jnp.asarray(rows.D)[rows.zero_rows]
     value = D @ theta
-    violation = value - jnp.clip(value, rows.lower[still], rows.upper[still])
+    violation = value - jnp.clip(value, rows.lower[zero], rows.upper[zero])
     # A violation within rounding is none: then the other rows may prove more.
     size = jnp.sum(jnp.abs(D * theta), axis=1) + jnp.abs(violation)
     relative = jnp.where(violation == 0, 0.0, jnp.abs(violation) / jnp.where(size > 0, size, 1.0))
     worst = jnp.argmax(relative)
-    alone = jnp.where(np.arange(len(y)) == still[worst], jnp.sign(violation[worst]), 0.0)
+    alone = jnp.where(np.arange(len(y)) == zero[worst], jnp.sign(violation[worst]), 0.0)
     return jnp.where(relative[worst] > 1e-13, alone, y)
 
 
@@ -106,45 +95,60 @@ def check_candidates(
 
 
 def feasibility_steps(
-    project: Callable[[Array], Array], onto: Callable[[Array], Array], t: Array, alpha: Any,
+    project: Callable[[Array], Array],
+    onto: Callable[[Array], Array],
+    t: Array,
     iterations: int,
-) -> tuple[Array, Array]:  # fmt: skip
+    alpha: float = ALPHA,
+) -> tuple[Array, Array]:
     """Take zero-cost ADMM steps t⁺ = t + α (P (2s − t) − s), s = project(t).
 
     project: onto the bounds. onto: v → P v, the orthogonal projection onto the range of the rows.
     Returns the last t and the one before.
     """
+    relaxation = jnp.asarray(alpha, t.dtype)
 
     def step(t: Array, _: None = None) -> tuple[Array, None]:
         s = project(t)
-        return t + alpha * (onto(2 * s - t) - s), None
+        return t + relaxation * (onto(2 * s - t) - s), None
 
     before, _ = jax.lax.scan(step, t, length=iterations - 1)
     return step(before)[0], before
 
 
 def admm_stage(
-    p: ExactData, rows: ConstraintRows, points: Array, alpha: Array, iterations: int, dtype: Any
+    p: ExactData,
+    rows: ConstraintRows,
+    points: Array,
+    iterations: int,
+    dtype: DTypeLike,
+    alpha: float = ALPHA,
 ) -> tuple[Verdict, Array]:
     """Return verdicts on points (B, d) after ADMM steps in `dtype`, and the last w (B, k)."""
-    U, alpha = jnp.asarray(rows.U, dtype), jnp.asarray(alpha, dtype)
+    U = jnp.asarray(rows.U, dtype)
     shift = matmul(jnp.asarray(rows.D), points.T)  # (R, B): columns are points
     l = (jnp.asarray(rows.lower)[:, None] - shift).astype(dtype)
     u = (jnp.asarray(rows.upper)[:, None] - shift).astype(dtype)
+    radius = jnp.asarray(rows.radius, dtype) if rows.balls else None
 
-    project = lambda t: jnp.clip(t, l, u)
-    if rows.balls:
-        radius = jnp.asarray(rows.radius, dtype)
-        one = lambda t, l, u: Bounds(l, u, radius=radius, balls=rows.balls).project(t, 1.0)
-        project = lambda t: jax.vmap(one, in_axes=1, out_axes=1)(t, l, u)
+    def project_one(t: Array, l: Array, u: Array) -> Array:
+        return Bounds(l, u, radius=radius, balls=rows.balls).project(t, 1.0)
 
-    onto = lambda v: matmul(U, matmul(U.T, v))
-    t, before = feasibility_steps(project, onto, project(jnp.zeros_like(l)), alpha, iterations)
-    residual = lambda t: t - project(t)
-    w = matmul(U.T, project(t) - residual(t)).T
-    multipliers = (residual(t) - residual(before)).T, residual(t).T
-    check = lambda x, w, change, y: check_candidates(p, rows, x, w, [change, y])
-    return jax.vmap(check)(points, w, *multipliers), w
+    def project(t: Array) -> Array:
+        if not rows.balls:
+            return jnp.clip(t, l, u)
+        return jax.vmap(project_one, in_axes=1, out_axes=1)(t, l, u)
+
+    def onto(v: Array) -> Array:
+        return matmul(U, matmul(U.T, v))
+
+    def check(theta: Array, w: Array, change: Array, y: Array) -> Verdict:
+        return check_candidates(p, rows, theta, w, [change, y])
+
+    t, before = feasibility_steps(project, onto, project(jnp.zeros_like(l)), iterations, alpha)
+    residual, earlier = t - project(t), before - project(before)
+    w = matmul(U.T, project(t) - residual).T
+    return jax.vmap(check)(points, w, (residual - earlier).T, residual.T), w
 
 
 def newton_stage(
@@ -170,11 +174,59 @@ def newton_stage(
     return jax.vmap(one)(points, w)
 
 
+class Rounds(NamedTuple):
+    """Verdicts on points, the last w (B, k), and how many rounds of Newton steps each had (B,)."""
+
+    verdict: Verdict
+    w: Array
+    rounds: Array
+
+
+def newton_rounds(
+    p: ExactData,
+    rows: ConstraintRows,
+    points: Array,
+    usable: Array,
+    verdict: Verdict,
+    w: Array,
+    batch: int,
+) -> Verdict:
+    """Return verdicts on usable points (B, d) after rounds of Newton steps from w (B, k).
+
+    Those that are undecided are gathered in batches of `batch` until none is undecided or each has
+    had NEWTON_ROUNDS rounds; those with the fewest rounds come first.
+    """
+
+    def waiting(now: Rounds) -> Array:
+        return usable & (now.verdict.label == 0) & (now.rounds < NEWTON_ROUNDS)
+
+    def any_waiting(now: Rounds) -> Array:
+        return jnp.any(waiting(now))
+
+    def newton(now: Rounds) -> Rounds:
+        open_ = waiting(now)
+        least = jnp.min(jnp.where(open_, now.rounds, NEWTON_ROUNDS))
+        (index,) = jnp.nonzero(open_ & (now.rounds == least), size=batch, fill_value=len(points))
+
+        def take(v: Array) -> Array:
+            return v.at[index].get(mode="clip")
+
+        def put(old: Array, new: Array) -> Array:
+            return old.at[index].set(new, mode="drop")
+
+        found, better = newton_stage(p, rows, take(points), take(now.w), NEWTON_STEPS)
+        verdict = jax.tree.map(put, now.verdict, found)
+        return Rounds(verdict, put(now.w, better), now.rounds.at[index].add(1, mode="drop"))
+
+    start = Rounds(verdict, w.astype(jnp.float64), jnp.zeros(len(points), int))
+    return jax.lax.while_loop(any_waiting, newton, start).verdict
+
+
 @functools.cache
-def compiled_admm(iterations: int, dtype: Any, devices: Devices) -> Compiled:
-    """Return the compiled ADMM stage: (p, rows, points (B, d), alpha) → verdicts and w (B, k)."""
-    stage = lambda p, rows, points, alpha: admm_stage(p, rows, points, alpha, iterations, dtype)
-    return over_devices(stage, devices, (False, False, True, False))
+def compiled_admm(iterations: int, dtype: DTypeLike, devices: Devices) -> Compiled:
+    """Return the compiled ADMM stage: (p, rows, points (B, d)) → verdicts and w (B, k)."""
+    stage = functools.partial(admm_stage, iterations=iterations, dtype=dtype)
+    return over_devices(stage, devices, (False, False, True))
 
 
 @functools.cache
@@ -183,43 +235,14 @@ def compiled_check(devices: Devices) -> Compiled:
     verdicts."""
 
     def run(p: ExactData, rows: ConstraintRows, points: Array, w: Array, y: Array) -> Verdict:
-        check = lambda theta, w, y: check_candidates(p, rows, theta, w, [y])
-        return jax.vmap(check)(points, w, y)
+        return jax.vmap(lambda theta, w, y: check_candidates(p, rows, theta, w, [y]))(points, w, y)
 
     return over_devices(run, devices, (False, False, True, True, True))
 
 
 @functools.cache
 def compiled_newton(batch: int, devices: Devices) -> Compiled:
-    """Return the compiled Newton stages: (p, rows, points (B, d), usable (B,), verdicts, w (B, k))
-    → verdicts.
-
-    Usable points that are undecided are gathered in batches of `batch`, on each device, until none
-    is undecided or each has had NEWTON_ROUNDS rounds; those with the fewest rounds come first.
-    """
-
-    def run(
-        p: ExactData, rows: ConstraintRows, points: Array, usable: Array, verdict: Verdict,
-        w: Array,
-    ) -> Verdict:  # fmt: skip
-        def waiting(verdict: Verdict, rounds: Array) -> Array:
-            return usable & (verdict.label == 0) & (rounds < NEWTON_ROUNDS)
-
-        def newton(
-            carry: tuple[Verdict, Array, Array],
-        ) -> tuple[Verdict, Array, Array]:
-            verdict, w, rounds = carry
-            open_ = waiting(verdict, rounds)
-            least = jnp.min(jnp.where(open_, rounds, NEWTON_ROUNDS))
-            (index,) = jnp.nonzero(open_ & (rounds == least), size=batch, fill_value=len(points))
-            take = lambda v: v.at[index].get(mode="clip")
-            put = lambda old, new: old.at[index].set(new, mode="drop")
-            found, better = newton_stage(p, rows, take(points), take(w), NEWTON_STEPS)
-            verdict = jax.tree.map(put, verdict, found)
-            return verdict, put(w, better), rounds.at[index].add(1, mode="drop")
-
-        go_on = lambda carry: jnp.any(waiting(carry[0], carry[2]))
-        start = verdict, w.astype(jnp.float64), jnp.zeros(len(points), int)
-        return jax.lax.while_loop(go_on, newton, start)[0]
-
-    return over_devices(run, devices, (False, False, True, True, True, True))
+    """Return the compiled `newton_rounds`: (p, rows, points (B, d), usable (B,), verdicts, w (B,
+    k)) → verdicts; batch: on each device."""
+    rounds = functools.partial(newton_rounds, batch=batch)
+    return over_devices(rounds, devices, (False, False, True, True, True, True))

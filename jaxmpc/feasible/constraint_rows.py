@@ -3,14 +3,12 @@
 No label depends on these numbers; proofs use `ExactData`.
 """
 
-from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.feasible.centered_polytope import power_of_two
 from jaxmpc.feasible.exact_data import absorbed
 from jaxmpc.feasible.view import View
 from jaxmpc.mpc.problem import MPC
@@ -19,7 +17,7 @@ from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.sets.any_set import set_bounds
-from jaxmpc.sets.lp import scaling
+from jaxmpc.sets.lp import power_of_two, scaling
 
 
 @pytree
@@ -28,12 +26,12 @@ class ConstraintRows:
 
     U (R, k) is an orthonormal basis of the range of the normalised rows' matrix in the decision
     variables (inputs, prestabilised or not, and in a projection the free states); back (nz, k) maps
-    w to the variables. A row that no variable moves (such as those at k = 0) has U = 0: a
-    half-space on θ alone. weight (R,) brings multipliers to the units of the problem's
+    w to the variables. A zero row, which no variable moves (such as those at k = 0), has
+    U = 0: a half-space on θ alone. weight (R,) brings multipliers to the units of the problem's
     rows, and index says where the multiplier of each row of `ExactData` (step by step, then
     terminal rows, then those of the terminal ellipsoid) stands among the R (R where there is
     none). The last `balls` rows are those of the ellipsoid: |v − lower| ≤ radius. Psi, Omega, psi:
-    inputs from θ and the variables. still: the rows that nothing moves, but for those of a ball.
+    inputs from θ and the variables. zero_rows: indices of those with U = 0, but for a ball's.
     size: of the bounds (`typical_bound`).
     """
 
@@ -47,7 +45,7 @@ class ConstraintRows:
     Psi: Any
     Omega: Any
     psi: Any
-    still: Any
+    zero_rows: Any
     size: Any
     radius: Any
     balls: tuple[int, ...] = static()
@@ -102,22 +100,22 @@ def constraint_rows(
     norm = np.linalg.norm(C, axis=1)
     ends = np.abs([lower, upper])
     ends = np.where(np.isfinite(ends), ends, 0.0).max(axis=0)
-    # Nothing moves a row whose entries are rounding beside its other terms.
+    # A row counts as zero if its entries are rounding beside its other terms.
     others_of_row = np.linalg.norm(D * scaling(D, ends)[1], axis=1) + ends
-    still = norm * row_unit <= 1e-13 * others_of_row
+    zero = norm * row_unit <= 1e-13 * others_of_row
     keep = np.flatnonzero(np.isfinite(lower) | np.isfinite(upper))
-    size = np.where(still, np.linalg.norm(D, axis=1), norm * row_unit)
+    size = np.where(zero, np.linalg.norm(D, axis=1), norm * row_unit)
     first = len(size) - sum(c.balls)
     if c.balls:  # one scale for all rows of the ball
         moved = norm[first:].max() > 0
         own = norm * row_unit if moved else np.linalg.norm(D, axis=1)
         size[first:] = own[first:].max()
-    size, still = size[keep], still[keep]
+    size, zero = size[keep], zero[keep]
     weight = 1 / np.where(size > 0, size, 1.0)
-    scaled = np.where(still[:, None], 0.0, (weight * row_unit[keep])[:, None] * C[keep])
+    scaled = np.where(zero[:, None], 0.0, (weight * row_unit[keep])[:, None] * C[keep])
     U, singular, Vt = np.linalg.svd(scaled, full_matrices=False)
     rank = int(np.sum(singular > 1e-12 * singular.max(initial=0.0)))
-    U, back = np.where(still[:, None], 0.0, U[:, :rank]), Vt[:rank].T / singular[:rank]
+    U, back = np.where(zero[:, None], 0.0, U[:, :rank]), Vt[:rank].T / singular[:rank]
     back = unit[:, None] * back
     if growth is not None:
         U, back = scaled, np.diag(unit)
@@ -130,7 +128,7 @@ def constraint_rows(
     return ConstraintRows(
         U, back, weight[:, None] * D[keep], lower, upper, weight,
         index, Psi, Omega, psi,
-        np.flatnonzero(still[: len(keep) - sum(c.balls)]), size,
+        np.flatnonzero(zero[: len(keep) - sum(c.balls)]), size,
         weight[-1:] * c.radius if c.balls else None, c.balls,
     )  # fmt: skip
 
@@ -141,18 +139,6 @@ def typical_bound(lower: np.ndarray, upper: np.ndarray) -> float:
     ends = np.abs(np.concatenate([lower, upper]))
     ends = ends[np.isfinite(ends) & (ends > 0)]
     return float(np.quantile(ends, 0.25)) if len(ends) else 1.0
-
-
-def weighted(rows: ConstraintRows, weight: np.ndarray) -> tuple[ConstraintRows, np.ndarray]:
-    """Return the rows multiplied by weights > 0 (R,), alike in a ball, and M (k, k) with w = M w',
-    the old coordinates from the new."""
-    U, singular, Vt = np.linalg.svd(weight[:, None] * rows.U, full_matrices=False)
-    M = Vt.T / singular
-    return replace(
-        rows, U=U, back=rows.back @ M, D=weight[:, None] * rows.D, lower=weight * rows.lower,
-        upper=weight * rows.upper, weight=weight * rows.weight,
-        radius=None if rows.radius is None else weight[-1:] * rows.radius,
-    ), M  # fmt: skip
 
 
 def multiplier_index(

@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxmpc.feasible.centered_polytope import power_of_two
 from jaxmpc.feasible.view import View
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Block
@@ -16,6 +15,7 @@ from jaxmpc.pytrees import pytree, static
 from jaxmpc.sets.any_set import set_bounds
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.lp import power_of_two
 from jaxmpc.systems.system import host_matrices
 
 

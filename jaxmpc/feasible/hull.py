@@ -35,14 +35,13 @@ from jaxmpc.feasible import proofs
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.rays import Rays, filled
-from jaxmpc.feasible.refinement import refined
+from jaxmpc.feasible.rays import Rays, filled, refined
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.modes import own_modes
 
 # Coordinates up to which the polytopes have few facets.
 MOST_COORDINATES = 4
-# Rays: gap of the volumes at which they stop, and with which the cones are of use; rounds, and the
+# Rays: gap of the volumes at which they stop, and with which the hull is of use; rounds, and the
 # most rays in one.
 GAP, USEFUL, ROUNDS, MOST_RAYS = 1e-9, 0.05, 8, 200
 # Points of two coordinates that take longer by the other stages, on a CPU, than the rays do; each
@@ -51,7 +50,7 @@ MANY = 2**18
 
 
 @pytree
-class Cones:
+class Hull:
     """Cones about center (d,): M (F, d, d) and gauge (F, d) of each, the least λ_i and the largest
     gauge (F,) of points that are labelled; inputs and, in a projection, free states value + slope_i
     (θ − center), value (v,), slope (F, v, d). Half-spaces normals (K, d) θ ≤ offsets (K,) that hold
@@ -66,11 +65,11 @@ class Cones:
     slope: Any
     normals: Any
     offsets: Any
-    cuts: Any
+    cuts: proofs.Cut
 
     @classmethod
-    def of(cls, problem: FeasibilityProblem) -> "Cones | None":
-        """Return the cones of a problem, or None where rays bring no polytopes together: in more
+    def of(cls, problem: FeasibilityProblem) -> "Hull | None":
+        """Return the hull of a problem, or None where rays bring no polytopes together: in more
         than `MOST_COORDINATES`, or where the set is flat, unbounded or has many vertices."""
         d, rows = problem.dimension, problem.rows
         if d > MOST_COORDINATES:
@@ -81,7 +80,8 @@ class Cones:
             return None
         if not found.gap <= USEFUL:
             return None
-        center, points = found.rays.center, found.points
+        center, proved = found.rays.center, found.proved
+        points = proved.points
         unit = np.ptp(points, axis=0)
         try:
             facets = hull_facets((points - center) / unit)
@@ -92,15 +92,14 @@ class Cones:
         facets, edges = facets[regular], edges[regular]
         M = np.linalg.inv(edges)
         free = len(problem.view.others) if problem.view.projects else 0
-        theta, w = np.vstack([points, center]), np.vstack([found.w, found.rays.w])
+        theta, w = np.vstack([points, center]), np.vstack([proved.w, found.rays.w])
         every = values(found.rays.exact, rows, theta, w, free)
         each, value = every[:-1], every[-1]
         moves = (each - value)[facets].transpose(0, 2, 1)  # (F, v, d)
         ends = label_limits(found.rays.exact, theta, every, facets, edges, M, moves)
-        return cls(
-            center, M, M.sum(axis=1), *ends, value, moves @ M, found.normals, found.offsets,
-            found.cuts,
-        )  # fmt: skip
+        gauge, slope = M.sum(axis=1), moves @ M
+        _, _, normals, offsets, cuts = proved
+        return cls(center, M, gauge, *ends, value, slope, normals, offsets, cuts)
 
 
 def label_limits(
@@ -175,65 +174,65 @@ def values(
     return np.hstack([inputs.reshape(len(w), -1), variables[:, variables.shape[1] - free :]])
 
 
-# The cones of problems that have been asked for, for as long as the problems live.
-_made: WeakKeyDictionary[FeasibilityProblem, Cones | None] = WeakKeyDictionary()
+# The hulls of problems that have been asked for, for as long as the problems live.
+_made: WeakKeyDictionary[FeasibilityProblem, Hull | None] = WeakKeyDictionary()
 
 
-def cones_for(problem: FeasibilityProblem, points: int) -> Cones | None:
-    """Return the cones of a problem if so many points are worth the rays, or if they were made for
+def hull_for(problem: FeasibilityProblem, points: int) -> Hull | None:
+    """Return the hull of a problem if so many points are worth the rays, or if they were made for
     it before; None else, and where it has none."""
     least = MANY * 4.0 ** (problem.dimension - 2) * (1 if jax.default_backend() == "cpu" else 8)
     if problem not in _made and points >= least:
-        _made[problem] = Cones.of(problem)
+        _made[problem] = Hull.of(problem)
     return _made.get(problem)
 
 
 @functools.cache
 def compiled_labels(devices: Devices) -> Compiled:
-    """Return the compiled labels: (cones, points (B, d)) → labels (B,)."""
-    each = lambda cones, points: jax.vmap(lambda theta: label(cones, theta))(points)
+    """Return the compiled labels: (hull, points (B, d)) → labels (B,)."""
+    each = lambda hull, points: jax.vmap(lambda theta: label(hull, theta))(points)
     return over_devices(each, devices, (False, True))
 
 
 @functools.cache
-def compiled_plans(devices: Devices) -> Compiled:
-    """Return the compiled plans: (p, cones, points (B, d)) → verdicts."""
-    each = lambda p, cones, points: jax.vmap(lambda theta: verdict(p, cones, theta))(points)
+def compiled_verdicts(devices: Devices) -> Compiled:
+    """Return the compiled plans: (p, hull, points (B, d)) → verdicts."""
+    each = lambda p, hull, points: jax.vmap(lambda theta: verdict(p, hull, theta))(points)
     return over_devices(each, devices, (False, False, True))
 
 
-def label(cones: Cones, theta: Array) -> Array:
+def label(hull: Hull, theta: Array) -> Array:
     """Return the label of θ (d,), 0 where it is left to others: nothing is rolled out."""
-    cone, facet = nearest(cones, theta)
-    share = jnp.sum(cones.M[cone] * (theta - cones.center), axis=1)
-    inside = jnp.all(share >= cones.least[cone]) & (jnp.sum(share) <= cones.most[cone])
-    a, b, w = (v[facet] for v in cones.cuts)
+    cone, facet = nearest(hull, theta)
+    share = jnp.sum(hull.M[cone] * (theta - hull.center), axis=1)
+    inside = jnp.all(share >= hull.least[cone]) & (jnp.sum(share) <= hull.most[cone])
+    a, b, w = (v[facet] for v in hull.cuts)
     outside = proofs.excludes(a, b, w, theta)
     return jnp.where(inside, 1, jnp.where(outside, -1, 0)).astype(jnp.int8)
 
 
-def verdict(p: ExactData, cones: Cones, theta: Array) -> proofs.Verdict:
+def verdict(p: ExactData, hull: Hull, theta: Array) -> proofs.Verdict:
     """Return the verdict on θ (d,), with its proof."""
     N, (_, m) = p.horizon, p.B.shape
-    cone, facet = nearest(cones, theta)
-    value = cones.value + jnp.sum(cones.slope[cone] * (theta - cones.center), axis=1)
+    cone, facet = nearest(hull, theta)
+    value = hull.value + jnp.sum(hull.slope[cone] * (theta - hull.center), axis=1)
     inputs, free = value[: N * m].reshape(N, m), value[N * m :]
     feasible, inputs = proofs.prove_feasible(p, theta, free, inputs)
     # The cut at the point rests on no linear program; a half-space may (`proofs.everywhere`).
-    a, b, w = (v[facet] for v in cones.cuts)
+    a, b, w = (v[facet] for v in hull.cuts)
     infeasible = proofs.excludes(a, b, w, theta)
-    normal, offset = cones.normals[facet], cones.offsets[facet]
+    normal, offset = hull.normals[facet], hull.offsets[facet]
     everywhere = proofs.excludes(normal, offset, jnp.zeros_like(normal), theta)
     offset = jnp.where(everywhere, offset, jnp.inf)
     label = jnp.where(feasible, 1, jnp.where(infeasible, -1, 0)).astype(jnp.int8)
     return proofs.Verdict(label, p.view.initial_state(theta, free), inputs, normal, offset)
 
 
-def nearest(cones: Cones, theta: Array) -> tuple[Array, Array]:
+def nearest(hull: Hull, theta: Array) -> tuple[Array, Array]:
     """Return the indices of the cone of θ (d,), and of the half-space that it exceeds most."""
-    length = jnp.linalg.norm(cones.normals, axis=1)
-    cone = largest(cones.gauge, jnp.zeros(len(cones.gauge)), theta - cones.center)
-    return cone, largest(cones.normals / length[:, None], cones.offsets / length, theta)
+    length = jnp.linalg.norm(hull.normals, axis=1)
+    cone = largest(hull.gauge, jnp.zeros(len(hull.gauge)), theta - hull.center)
+    return cone, largest(hull.normals / length[:, None], hull.offsets / length, theta)
 
 
 def largest(rows: Array, offsets: Array, x: Array) -> Array:

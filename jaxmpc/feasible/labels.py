@@ -183,6 +183,11 @@ class Labels:
             proofs={**self.proofs, **{name: merged(name, rows) for name, rows in proofs.items()}},
         )
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return label, status and all proofs by their names."""
+        proofs = {name: proof.get() for name, proof in self.proofs.items()}
+        return {"label": self.label, "status": self.status, **proofs}
+
     def fetch(self) -> None:
         """Copy all proofs from the device."""
         for proof in self.proofs.values():

@@ -1,5 +1,9 @@
-"""The cascade that labels points, part by part: ADMM on all, Newton on those undecided, and a
-linear program or three for each of the last, up to `MOST_PROGRAMS` points of all parts together.
+"""The pipeline of stages that labels points, part by part (`Pipeline.stages` is their order).
+
+The first stage takes a whole part: ADMM, then Newton steps on what it leaves open; or, where so
+many points are worth the rays, the hull of proved points. The points that are still undecided go
+through the other stages, and the last of them, up to `MOST_PROGRAMS` points of all parts together,
+get a linear program or three.
 
 The labels and proofs of a part depend on its own points, on the shape of a part and on the `Scope`
 of all points, not on which other parts a process has labelled: any split among processes gives the
@@ -11,17 +15,15 @@ import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.batches import (
     Compiled,
     chosen_devices,
     count,
-    default_chunk,
     divisible,
     gather_size,
     padded,
@@ -29,21 +31,14 @@ from jaxmpc.batches import (
     require_partitioner,
 )
 from jaxmpc.checks import fail, require_step_type
-from jaxmpc.feasible.candidates import (
-    ALPHA,
-    StagePenalties,
-    compiled_admm,
-    compiled_check,
-    compiled_newton,
-)
-from jaxmpc.feasible.constraint_rows import ConstraintRows, weighted
-from jaxmpc.feasible.hull import compiled_labels, compiled_plans, cones_for
+from jaxmpc.feasible.candidates import compiled_admm, compiled_check, compiled_newton
+from jaxmpc.feasible.constraint_rows import ConstraintRows
+from jaxmpc.feasible.hull import compiled_labels, compiled_verdicts, hull_for
 from jaxmpc.feasible.labels import Labels, OnDemand
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import Verdict
 from jaxmpc.feasible.row_programs import RowPrograms
 from jaxmpc.pytrees import record
-from jaxmpc.qp.precision import matmul
 
 # Steps of the longer ADMM run, relative to the first, on points that Newton leaves undecided.
 LONGER = 20
@@ -88,138 +83,177 @@ class Scope:
         return cls(largest, typical, parts)
 
 
-def label_chunks(
-    problem: FeasibilityProblem, points: Any, *, chunk: int | None = None,
-    scope: Scope | None = None, label: Callable[..., Iterator[Labels]] | None = None,
-    **settings: Any,
-) -> Iterator[tuple[slice, Labels]]:  # fmt: skip
-    """Label points chunk by chunk; yield (slice of the points, Labels). See `map_feasible_set`.
+class Part(NamedTuple):
+    """A part as programs take it: points (whole, d), zeros where they are not usable, of which the
+    first `size` are the part's; found: what the first stage has left on the device."""
 
-    scope: None for that of these points. label: what labels the chunks, None for `label_parts`;
-    settings: further ones of it.
+    points: np.ndarray
+    usable: np.ndarray
+    size: int
+    found: Any
+
+
+class Stage(NamedTuple):
+    """A stage for points that are undecided: its name, and points (batch, d) → labels."""
+
+    name: str
+    label: Callable[[np.ndarray], Labels]
+
+
+class Pipeline:
+    """The stages for parts of up to `chunk` points of one problem, compiled for these sizes.
+
+    Of a part that a stage leaves undecided points are gathered in batches of one size.
     """
-    d = problem.dimension
-    points = np.asarray(points, np.float64)
-    if points.ndim != 2 or points.shape[1] != d:
-        fail("x0s", f"shape {points.shape}", f"Give points (B, {d}), one column a mapped state")
-    if chunk is None:
-        chunk = count(chosen_devices(settings.get("devices"))) * default_chunk()
-    if chunk < 1:
-        fail("chunk", f"{chunk}", "Give a count of at least 1")
-    chunk = min(chunk, max(len(points), 1))
-    slices = [slice(i, min(i + chunk, len(points))) for i in range(0, len(points), chunk)]
-    scope = Scope.of(points, len(slices)) if scope is None else scope
-    parts = (points[here] for here in slices)
-    found = (label or label_parts)(problem, parts, scope, chunk, **settings)
-    yield from zip(slices, found, strict=True)
+
+    def __init__(
+        self,
+        problem: FeasibilityProblem,
+        scope: Scope,
+        chunk: int,
+        iterations: int = 50,
+        dtype: Any = "float32",
+        devices: Any = None,
+    ) -> None:
+        """Check the settings, choose the programs, and put the data of the problem on the devices.
+
+        Sends the rays of the hull if it is worth them. Raises ValueError for wrong settings.
+        """
+        if iterations < 1:
+            fail("iterations", f"{iterations}", "Give a count of at least 1")
+        require_step_type(dtype)
+        self.devices = chosen_devices(devices)
+        require_partitioner(self.devices)
+        self.problem, self.scope = problem, scope
+        exact = problem.exact(scope.largest, scope.typical)
+        self.margins = problem.row_margins(exact, scope.typical)
+        programs = min(MOST_PROGRAMS, MOST_ENTRIES // max(problem.rows.U.size, 1))
+        self.share = -(-programs // max(scope.parts, 1))
+        self.whole = divisible(chunk, self.devices)  # the chunk as the devices share it
+        each = gather_size(self.whole // count(self.devices))
+        self.batch = count(self.devices) * each
+        self.short = compiled_admm(iterations, np.dtype(dtype), self.devices)
+        self.long = compiled_admm(LONGER * iterations, np.dtype(np.float64), self.devices)
+        self.newton = compiled_newton(each, self.devices)
+        data = exact, problem.rows, hull_for(problem, scope.parts * chunk)
+        with jax.enable_x64(True):
+            self.exact, self.rows, self.hull = jax.device_put(data, placement(self.devices))
+
+    @property
+    def stages(self) -> list[Stage]:
+        """Return the stages after the first one in their order, but for the linear programs that
+        come last."""
+        longer = Stage("longer ADMM, Newton", functools.partial(self.by_admm, self.long))
+        if self.hull is None:
+            return [longer]
+        return [
+            Stage("roll-out of the hull's plans", self.by_hull),
+            Stage("ADMM, Newton", functools.partial(self.by_admm, self.short)),
+            longer,
+        ]
+
+    def begin(self, points: np.ndarray) -> Part:
+        """Start the first stage of points (b, d), b ≤ chunk, on the device, and return at once."""
+        x = padded(points, self.whole)
+        usable = np.all(np.isfinite(x), axis=1)
+        x = np.where(usable[:, None], x, 0.0)
+        if self.hull is not None:
+            found = _run(compiled_labels(self.devices), self.hull, x)
+        else:
+            found = _run(self.short, self.exact, self.rows, x)
+        return Part(x, usable, len(points), found)
+
+    def finish(self, part: Part) -> Labels:
+        """Return the labels of a part, by all stages."""
+        if self.hull is None:
+            labels = self.by_newton(part.points, part.usable, part.found)
+        else:
+            verdict = OnDemand(functools.partial(self.hull_verdict, part.points))
+            labels = Labels.proved(part.found, verdict.get, part.usable)
+        for stage in self.stages:
+            left = np.flatnonzero((labels.label == 0) & part.usable)
+            for where in self.batches(left):
+                more = stage.label(padded(part.points[where], self.batch)).first(len(where))
+                labels = labels.changed(where, more.label, more.status, more.proofs)
+        left = np.flatnonzero((labels.label == 0) & part.usable)[: self.share]
+        labels = self.by_programs(labels, part.points, left) if len(left) else labels
+        return labels.first(part.size)
+
+    def batches(self, index: np.ndarray) -> Iterator[np.ndarray]:
+        """Yield indices in batches of one size at most."""
+        for first in range(0, len(index), self.batch):
+            yield index[first : first + self.batch]
+
+    def hull_verdict(self, points: np.ndarray) -> Verdict:
+        """Return the verdicts of the hull on points, with their proofs."""
+        with jax.enable_x64(True):
+            return _run(compiled_verdicts(self.devices), self.exact, self.hull, points)
+
+    def by_hull(self, points: np.ndarray) -> Labels:
+        """Return the labels of points by roll-outs of the plans that the hull gives them."""
+        return decided(self.hull_verdict(points))
+
+    def by_admm(self, admm: Compiled, points: np.ndarray) -> Labels:
+        """Return the labels of points by steps of ADMM and of Newton."""
+        found = _run(admm, self.exact, self.rows, points)
+        return self.by_newton(points, np.ones(len(points), bool), found)
+
+    def by_newton(
+        self, points: np.ndarray, usable: np.ndarray, found: tuple[Verdict, Any]
+    ) -> Labels:
+        """Return the labels after Newton steps from the w of an ADMM stage, if it left any usable
+        point undecided."""
+        verdict, w = found
+        labels = decided(verdict, usable)
+        if np.any((labels.label == 0) & usable):
+            verdict = _run(self.newton, self.exact, self.rows, points, usable, verdict, w)
+            labels = decided(verdict, usable)
+        return labels
+
+    def by_programs(self, labels: Labels, points: np.ndarray, last: np.ndarray) -> Labels:
+        """Return the labels where linear programs have looked for proofs of points[last]."""
+        check = compiled_check(self.devices)
+        for rows, program in last_programs(self.problem, self.margins):
+            last = last[labels.label[last] == 0]
+            for where in self.batches(last):
+                solved = [program(theta) for theta in points[where]]
+                candidates = [padded(np.array(v), self.batch) for v in zip(*solved, strict=True)]
+                x = padded(points[where], self.batch)
+                more = decided(_run(check, self.exact, rows, x, *candidates)).first(len(where))
+                labels = labels.changed(where, more.label, more.status, more.proofs)
+        return labels
+
+
+def decided(verdict: Verdict, usable: np.ndarray | None = None) -> Labels:
+    """Return the labels of a verdict; usable: which points are, None for all."""
+    usable = np.ones(len(verdict.label), bool) if usable is None else usable
+    return Labels.proved(verdict.label, lambda: verdict, usable)
 
 
 def label_parts(
-    problem: FeasibilityProblem, parts: Iterable[np.ndarray], scope: Scope, chunk: int, *,
-    iterations: int = 50, dtype: Any = "float32", penalties: StagePenalties | None = None,
-    devices: Any = None,
-) -> Iterator[Labels]:  # fmt: skip
+    problem: FeasibilityProblem,
+    parts: Iterable[np.ndarray],
+    scope: Scope,
+    chunk: int,
+    **settings: Any,
+) -> Iterator[Labels]:
     """Label parts, each an array of up to `chunk` points (b, d), in compiled programs for `chunk`;
-    yield their Labels in order. The next part is taken before the labels of one are yielded."""
-    if iterations < 1:
-        fail("iterations", f"{iterations}", "Give a count of at least 1")
-    require_step_type(dtype)
-    devices = chosen_devices(devices)
-    require_partitioner(devices)
-    quick, back, alpha = _penalised(problem.rows, penalties)
-    exact = problem.exact(scope.largest, scope.typical)
-    margins = problem.row_margins(exact, scope.typical)
-    programs = min(MOST_PROGRAMS, MOST_ENTRIES // max(problem.rows.U.size, 1))
-    share = -(-programs // max(scope.parts, 1))
-    whole = divisible(chunk, devices)  # the chunk as the devices share it
-    batch = count(devices) * (each := gather_size(whole // count(devices)))
-    all_ = np.ones(batch, bool)
-    short, long = (
-        compiled_admm(iterations, np.dtype(dtype), devices),
-        compiled_admm(LONGER * iterations, np.dtype(np.float64), devices),
-    )
-    newton, check = compiled_newton(each, devices), compiled_check(devices)
-    with jax.enable_x64(True):
-        exact, rows, quick = jax.device_put((exact, problem.rows, quick), placement(devices))
+    yield their Labels in order. The next part is taken before the labels of one are yielded.
 
+    settings: iterations, dtype, devices, see `map_feasible_set`.
+    """
     begun, compiled = time.perf_counter(), Compiled.seconds
-    cones = cones_for(problem, scope.parts * chunk)
-    if cones is not None:
-        with jax.enable_x64(True):
-            cones = jax.device_put(cones, placement(devices))
-
-    def started(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
-        """Return a part, which of it is usable, and the first stage, which the device still works
-        on: labels from cones, or verdicts and the last w from ADMM."""
-        x = padded(points, whole)
-        ok = np.all(np.isfinite(x), axis=1)
-        x = np.where(ok[:, None], x, 0.0)
-        if cones is not None:
-            return x, ok, _run(compiled_labels(devices), cones, x)
-        return x, ok, _run(short, exact, quick, x, alpha)
-
-    def planned(x: np.ndarray) -> Verdict:
-        """Return the verdicts of the cones on points, with their proofs."""
-        with jax.enable_x64(True):
-            return _run(compiled_plans(devices), exact, cones, x)
-
-    def decided(verdict: Verdict, ok: np.ndarray) -> Labels:
-        """Return the labels of a verdict; ok: which points are usable."""
-        return Labels.proved(verdict.label, lambda: verdict, ok)
-
-    def by_newton(
-        x: np.ndarray, ok: np.ndarray, found: tuple[Verdict, Any], back: np.ndarray | None
-    ) -> Labels:
-        """Return the labels after Newton from the w of an ADMM stage, if it left a point open."""
-        verdict, w = found
-        labels = decided(verdict, ok)
-        if np.any((labels.label == 0) & ok):
-            w = w if back is None else matmul(w.astype(np.float64), jnp.asarray(back.T))
-            labels = decided(_run(newton, exact, rows, x, ok, verdict, w), ok)
-        return labels
-
-    def by_admm(
-        stage: Compiled, basis: Any, relaxation: Any, to_rows: np.ndarray | None
-    ) -> Callable[[np.ndarray], Labels]:
-        """Return the stage of ADMM and Newton, a function of points."""
-        return lambda x: by_newton(x, all_, _run(stage, exact, basis, x, relaxation), to_rows)
-
-    def finished(x: np.ndarray, ok: np.ndarray, found: Any) -> Labels:
-        """Return the labels of a part, by all stages."""
-        if cones is None:
-            labels, again = by_newton(x, ok, found, back), []
-        else:
-            labels = Labels.proved(found, OnDemand(lambda: planned(x)).get, ok)
-            again = [lambda x: decided(planned(x), all_), by_admm(short, quick, alpha, back)]
-        # Points still undecided get a longer ADMM run without weights, and Newton once more.
-        for stage in (*again, by_admm(long, rows, np.float64(ALPHA), None)):
-            left = np.flatnonzero((labels.label == 0) & ok)
-            for i in range(0, len(left), batch):
-                where = left[i : i + batch]
-                more = stage(padded(x[where], batch)).first(len(where))
-                labels = labels.changed(where, more.label, more.status, more.proofs)
-        last = np.flatnonzero((labels.label == 0) & ok)[:share]
-        for some_rows, program in last_programs(problem, margins) if len(last) else ():
-            last = last[labels.label[last] == 0]
-            for i in range(0, len(last), batch):
-                where = last[i : i + batch]
-                solved = [program(theta) for theta in x[where]]
-                candidates = [padded(np.array(v), batch) for v in zip(*solved, strict=True)]
-                verdict = _run(check, exact, some_rows, padded(x[where], batch), *candidates)
-                more = decided(verdict, all_).first(len(where))
-                labels = labels.changed(where, more.label, more.status, more.proofs)
-        return labels
-
+    pipeline = Pipeline(problem, scope, chunk, **settings)
     waiting = None
     for points in itertools.chain(parts, [None]):
         with jax.enable_x64(True):
-            ahead = None if points is None else (len(points), started(points))
+            ahead = None if points is None else pipeline.begin(points)
             if waiting is None:
                 waiting = ahead
                 continue
-            size, now = waiting
-            labels = finished(*now).first(size)
-            if scope.parts * sum(v.nbytes for v in jax.tree.leaves(now[2])) > ON_DEVICE:
+            labels = pipeline.finish(waiting)
+            size = sum(v.nbytes for v in jax.tree.leaves(waiting.found))
+            if scope.parts * size > ON_DEVICE:
                 labels.fetch()
         compile_seconds = Compiled.seconds - compiled
         run_seconds = time.perf_counter() - begun - compile_seconds
@@ -227,10 +261,14 @@ def label_parts(
         begun, compiled, waiting = time.perf_counter(), Compiled.seconds, ahead
 
 
+# θ (d,) → candidates for proofs: w (k,) and multipliers (R,).
+LinearProgram = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
 def last_programs(
     problem: FeasibilityProblem, margins: np.ndarray
-) -> Iterator[tuple[ConstraintRows, Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]]]:
-    """Yield linear programs for the last undecided points θ, as the rows and θ → (w, multipliers).
+) -> Iterator[tuple[ConstraintRows, LinearProgram]]:
+    """Yield linear programs for the last undecided points, with the rows of their candidates.
 
     First the ray from the centre through θ: inside, θ lies between the centre and the ray's end,
     and so do their plans; outside, the end's multipliers are few. Where the plant is unstable the
@@ -239,7 +277,7 @@ def last_programs(
     """
     found = RowPrograms(problem.rows)
     try:
-        center, w_center = found.centre()
+        center, w_center = found.center()
     except ValueError:  # flat or empty: no rays
         center = None
 
@@ -255,26 +293,9 @@ def last_programs(
         yield problem.rows, between
         for rows in problem.weighted_rows:
             yield rows, functools.partial(end, RowPrograms(rows))
-    yield problem.rows, lambda theta: found.margin(theta, margins)
+    yield problem.rows, functools.partial(found.margin, size=margins)
 
 
 def _run(program: Compiled, *args: Any) -> Any:
     """Run the program and leave its result on the device."""
     return program.run(*args)
-
-
-def _penalised(
-    rows: ConstraintRows, penalties: StagePenalties | None
-) -> tuple[ConstraintRows, np.ndarray | None, np.float64]:
-    """Return the rows of the ADMM stage, the matrix that leads back from their w (None where it is
-    the same), and alpha."""
-    if penalties is None:
-        return rows, None, np.float64(ALPHA)
-    shape, right = np.shape(penalties.weight), rows.lower.shape
-    if shape != right:
-        fail("penalties", f"weights {shape}", f"Learn them for this map: {right}")
-    if not (np.all(np.isfinite(penalties.weight)) and np.all(penalties.weight > 0)):
-        fail("penalties", "hold a weight that is not positive", "Learn them again")
-    if not 0 < penalties.alpha < 2:
-        fail("penalties", f"alpha {penalties.alpha}", "Over-relaxation lies in (0, 2)")
-    return *weighted(rows, penalties.weight), np.float64(penalties.alpha)

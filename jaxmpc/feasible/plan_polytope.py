@@ -12,19 +12,90 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.optimize import nnls
 
 from jaxmpc.checks import fail
-from jaxmpc.feasible.centered_polytope import CenteredPolytope, power_of_two
 from jaxmpc.mpc.inequalities import Inequalities, row_lengths
 from jaxmpc.pytrees import record
 from jaxmpc.sets.interior import affine_hull, framed
-from jaxmpc.sets.lp import Program, bound, extent, maximise
+from jaxmpc.sets.lp import Program, bound, extent, maximise, power_of_two
 from jaxmpc.sets.polytope import Polytope
 
 # Bounds of linear programs are trusted to this, relative to the size of the set.
 TOLERANCE = 1e-9
 # Facets are enumerated up to this dimension, and this many of them.
 DIMENSIONS, FACETS = 4, 2000
+
+
+@record
+class CenteredPolytope:
+    """{θ : normals θ ≤ offsets} about a point `center` (p,) inside.
+
+    normals (K, p) of length 1, offsets (K,). vertices (k, p): each was reached to `TOLERANCE` by a
+    feasible state; (0, p) where none were enumerated.
+    """
+
+    center: np.ndarray
+    normals: np.ndarray
+    offsets: np.ndarray
+    vertices: np.ndarray
+
+    @property
+    def depths(self) -> np.ndarray:
+        """Return the distance (K,) of each facet from the centre, the scale of its tolerances."""
+        return self.offsets - self.normals @ self.center
+
+    @cached_property
+    def unit(self) -> np.ndarray:
+        """Return units (p,) of θ in which the polytope is about 1 wide, powers of two."""
+        low, high = Program(self.normals, self.depths).bounds()
+        return power_of_two((high - low) / 2)
+
+    @cached_property
+    def extent(self) -> np.ndarray:
+        """Return bounds |θ_i| ≤ extent_i on the polytope, (p,)."""
+        return extent(self.normals, self.offsets)
+
+    def support(self, direction: np.ndarray) -> tuple[float, np.ndarray | None]:
+        """Return an upper bound of max direction'θ, by weak duality, and where it is attained."""
+        top = Program(self.normals, self.offsets).maximise(direction)
+        if top.y is None:
+            return top.value, None
+        return bound(direction, top.y, self.normals, self.offsets, self.extent), top.x
+
+    @property
+    def polytope(self) -> Polytope:
+        """Return the same set as H x ≤ h."""
+        return Polytope(self.normals, self.offsets)
+
+    def beyond(self, points: np.ndarray) -> np.ndarray:
+        """Return how far outside points (B, p) are, negative inside: the largest distance from a
+        facet relative to that facet's from the centre, (B,). It does not depend on units."""
+        return np.max((points @ self.normals.T - self.offsets) / self.depths, axis=1)
+
+    def nearest(self, points: np.ndarray, inset: float = 0.0) -> np.ndarray:
+        """Return the point nearest to each of `points` (B, p), in coordinates in which the polytope
+        is about 1 wide, that keeps all half-spaces by `inset`, relative to their depths.
+
+        Least distance by non-negative least squares (Lawson & Hanson 1974, ch. 23).
+        """
+        answer, unit = np.array(points, float), self.unit
+        normals = self.normals * unit
+        length = np.linalg.norm(normals, axis=1)
+        normals = normals / length[:, None]
+        room = (self.offsets - inset * self.depths - answer @ self.normals.T) / length
+        target = np.append(np.zeros(answer.shape[1]), 1.0)
+        for i in np.flatnonzero(room.min(axis=1) < 0):
+            scale = -room[i].min()
+            E = -np.vstack([normals.T, room[i] / scale])
+            try:
+                y, _ = nnls(E, target, maxiter=20 * E.shape[1])
+            except RuntimeError:  # stays outside, where there is no plan
+                continue
+            r = E @ y - target
+            if r[-1] < -1e-12:
+                answer[i] -= unit * (scale * r[:-1] / r[-1])
+        return answer
 
 
 @record
@@ -121,15 +192,15 @@ class PlanPolytope:
     def _bound(self, d: np.ndarray, y: np.ndarray) -> float:
         return bound(d, y, self.G, self.g, self.extent)
 
-    def centre(self) -> np.ndarray:
+    def center(self) -> np.ndarray:
         """Return the θ of a point well inside. Raises ValueError where there is none, because the
         feasible set is empty or flat."""
         if self.flat:
             fail("mpc", "its feasible set is flat: equalities tie the states", "Relax one of them")
         return framed("mpc: its feasible set", self.G, self.g).center[: self.p]
 
-    def ray(self, centre: np.ndarray, direction: np.ndarray) -> tuple[float, np.ndarray, float]:
-        """Return max s with centre + s·direction in the projection, and a half-space a'θ ≤ b of it,
+    def ray(self, center: np.ndarray, direction: np.ndarray) -> tuple[float, np.ndarray, float]:
+        """Return max s with center + s·direction in the projection, and a half-space a'θ ≤ b of it,
         as (s, a, b).
 
         (s, a, b). The LP's multipliers y give a = G_θ'y and b = y'g, plus what their error G_z'y
@@ -137,7 +208,7 @@ class PlanPolytope:
         """
         p = self.p
         G = np.column_stack([self.G[:, :p] @ direction, self.G[:, p:]])
-        top = maximise(np.eye(G.shape[1])[0], G, self.g - self.G[:, :p] @ centre)
+        top = maximise(np.eye(G.shape[1])[0], G, self.g - self.G[:, :p] @ center)
         if top.x is None or top.y is None:
             fail("centre", "the ray does not end inside the set", "Give a bounded problem")
         normal = self.G[:, :p].T @ top.y
@@ -157,7 +228,7 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
     if plans.p > DIMENSIONS:
         return f"vertices are not enumerated in {plans.p} dimensions (up to {DIMENSIONS} they are)"
     try:
-        center = plans.centre()
+        center = plans.center()
     except ValueError as error:
         empty = "empty" in str(error)
         return "the feasible set is " + ("empty" if empty else "flat: it has no volume")

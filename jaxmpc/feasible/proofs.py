@@ -42,6 +42,8 @@ whole set, (a + s∘w)'θ ≤ b + w'reach_0, if limits on x_0, or twice the exte
 both directions along a facet there is none: the facet's normal is no vector of floats.)
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -70,6 +72,14 @@ class Verdict:
     plan: Array
     cut_normal: Array
     cut_offset: Array
+
+
+class Cut(NamedTuple):
+    """a'θ ≤ b + w'|θ| for every feasible θ: a (d,), b, w (d,) ≥ 0, which covers rounding."""
+
+    a: Array
+    b: Array
+    w: Array
 
 
 def gamma(terms: int) -> float:
@@ -169,13 +179,12 @@ def roll_out(p: ExactData, x: Array, inputs: Array, moved: Array) -> tuple[Array
     return slack, off, jnp.abs(off) * (1 + 1e-9) + size
 
 
-def cut(p: ExactData, y_states: Array, y_N: Array, y_ball: Array) -> tuple[Array, Array, Array]:
-    """Return what multipliers imply, a'θ ≤ b + w'|θ| for every feasible θ, as a (d,), b, w (d,) ≥
-    0.
+def cut(p: ExactData, y_states: Array, y_N: Array, y_ball: Array) -> Cut:
+    """Return the half-space proof: what multipliers imply of every feasible θ.
 
     y_states (N, r) and y_N (r_N,): y > 0 on the upper bound, y < 0 on the lower. y_ball: of the
-    rows L'x of the terminal ellipsoid P = LL', any length without one. w covers rounding;
-    b = inf where nothing can be said. The multipliers are scaled to about one first.
+    rows L'x of the terminal ellipsoid P = LL', any length without one. b = inf where nothing can
+    be said. The multipliers are scaled to about one first.
     """
     n, m = p.B.shape
     N, r = p.horizon, p.H.shape[0]
@@ -240,7 +249,7 @@ def cut(p: ExactData, y_states: Array, y_N: Array, y_ball: Array) -> tuple[Array
         total, size = total - p_0[others] @ fixed, size + moved[others] @ jnp.abs(fixed)
     a, b, w = p_0[axes], total + unit * size + TINY, unit * moved[axes]
     # 0'θ ≤ b excludes nothing, unless b < 0: then no θ at all is feasible.
-    return a, jnp.where(jnp.isfinite(b) & (jnp.any(a != 0) | (b < 0)), b, jnp.inf), w
+    return Cut(a, jnp.where(jnp.isfinite(b) & (jnp.any(a != 0) | (b < 0)), b, jnp.inf), w)
 
 
 def everywhere(p: ExactData, a: Array, b: Array, w: Array) -> tuple[Array, Array]:

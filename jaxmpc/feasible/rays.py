@@ -2,14 +2,17 @@
 
 For a ray centre + t d the LP max t over (t, w) gives the boundary point; its dual gives a facet
 of the feasible set there. HiGHS solves the LP; `proofs.py` then proves a point just inside
-feasible, and a half-space valid on the whole set.
+feasible, and a half-space valid on the whole set. Rays through the vertices of the intersection of
+all half-spaces bring it and the hull of the points together (`refined`).
 """
 
-from typing import Any
+import time
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax import Array
+from scipy.spatial import KDTree
 
 from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail
@@ -18,16 +21,33 @@ from jaxmpc.feasible.candidates import cut_of, inputs_of
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.proofs import Cut
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.qp.modes import own_modes
+from jaxmpc.sets.geometry import hull_volume
+from jaxmpc.sets.lp import power_of_two
+from jaxmpc.sets.polytope import Polytope
 
 # How far a boundary point is moved towards the centre before it is proved: the least that works.
 BACKOFFS = 10.0 ** np.arange(-14, -1)
+# The most rays that are sent in one round of `refined`.
+MOST_RAYS = 2000
 
 
-# a (K, d), b (K,), w (K, d): a'θ ≤ b + w'|θ| for every feasible θ.
-Cuts = tuple[np.ndarray, np.ndarray, np.ndarray]
+class Bounds(NamedTuple):
+    """Points (K, d) proved feasible, with w (K, k) of the constraint rows, and half-spaces
+    normals (F, d) θ ≤ offsets (F,) valid on the whole set, with the cuts they follow from."""
+
+    points: np.ndarray
+    w: np.ndarray
+    normals: np.ndarray
+    offsets: np.ndarray
+    cuts: Cut
+
+    def joined(self, more: "Bounds") -> "Bounds":
+        """Return these points and half-spaces and more."""
+        return jax.tree.map(lambda *parts: np.concatenate(parts), self, more)
 
 
 @record
@@ -38,8 +58,7 @@ class Boundary:
     where the ray leaves all the half-spaces (inf: never). points (K, d): the points at `inner`,
     w (K, k): with which the constraint rows hold there.
     normals (K, d), offsets (K,): half-spaces a'x ≤ b that hold on the whole feasible set
-    (b = inf where the LP gave none), and cuts, the bounds (a, b, w) of `proofs.cut` they follow
-    from.
+    (b = inf where the LP gave none), and cuts, the `proofs.Cut` they follow from.
     """
 
     center: np.ndarray
@@ -50,13 +69,33 @@ class Boundary:
     w: np.ndarray
     normals: np.ndarray
     offsets: np.ndarray
-    cuts: Cuts
+    cuts: Cut
+
+    def __repr__(self) -> str:
+        inside, bounded = np.isfinite(self.inner).sum(), np.isfinite(self.outer).sum()
+        return (
+            f"Boundary along {len(self.directions)} rays from {np.round(self.center, 6).tolist()}: "
+            f"{inside} points proved feasible, {bounded} rays bounded"
+        )
+
+    @property
+    def proved(self) -> Bounds:
+        """Return the points and half-spaces of those rays that have them."""
+        inside, valid = np.isfinite(self.inner), np.isfinite(self.offsets)
+        cuts = Cut(*(part[valid] for part in self.cuts))
+        return Bounds(
+            self.points[inside], self.w[inside], self.normals[valid], self.offsets[valid], cuts
+        )
 
 
 def boundary(
-    mpc: MPC, directions: int | np.ndarray, *, center: np.ndarray | None = None,
-    axes: tuple[int, ...] | None = None, fixed: np.ndarray | None = None,
-) -> Boundary:  # fmt: skip
+    mpc: MPC,
+    directions: int | np.ndarray,
+    *,
+    center: np.ndarray | None = None,
+    axes: tuple[int, ...] | None = None,
+    fixed: np.ndarray | None = None,
+) -> Boundary:
     """Compute exact boundary points and facets of the feasible set of `mpc` along rays.
 
     directions: a number of rays (equally spaced in 2-D, random in more dimensions) or an array
@@ -85,8 +124,7 @@ def ray_directions(count: int, d: int) -> np.ndarray:
     if d == 2:
         angle = 2 * np.pi * np.arange(count) / count
         return np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    normal = np.random.default_rng(0).standard_normal((count, d))
-    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    return of_length_one(np.random.default_rng(0).standard_normal((count, d)))
 
 
 @record
@@ -107,19 +145,19 @@ class Rays:
 
         Raises ValueError where the feasible set is empty or flat, or the centre not inside it.
         """
-        center, w = problem.programs.centre(center)
+        center, w = problem.programs.center(center)
         return cls(problem, center, w, problem.exact(np.abs(center)))
 
-    def box(self) -> tuple[np.ndarray, np.ndarray, Cuts]:
-        """Return the half-spaces (normals, offsets) of the bounding box, those that exist, and
-        their cuts."""
+    def box(self) -> Bounds:
+        """Return the half-spaces of the bounding box, those that exist."""
         _, sides = self.problem.programs.bounding_box
         # No rays go with these multipliers; the program is that of `cast`, so that one compiles.
         still = np.zeros((len(sides), len(BACKOFFS), 1))
-        _, normals, offsets, *cuts = self.proved(still + self.center, still + self.w, sides)
-        valid = np.isfinite(offsets)
-        a, b, w = (v[valid] for v in cuts)
-        return normals[valid], offsets[valid], (a, b, w)
+        found = self.prove(still + self.center, still + self.w, sides)
+        valid = np.isfinite(found.offsets)
+        cuts = Cut(*(part[valid] for part in found.cuts))
+        none = self.center[None][:0], self.w[None][:0]
+        return Bounds(*none, found.normals[valid], found.offsets[valid], cuts)
 
     def cast(self, directions: np.ndarray) -> Boundary:
         """Return the boundary points along every direction (K, d), moved inwards and proved."""
@@ -130,28 +168,28 @@ class Rays:
         reach = np.where(bounded, t, 0.0)[:, None] * (1 - BACKOFFS)
         theta = self.center + reach[:, :, None] * directions[:, None, :]
         w = self.w + (w - self.w)[:, None, :] * (1 - BACKOFFS)[:, None]
-        feasible, normals, offsets, *cuts = self.proved(theta, w, y)
-        feasible = feasible & bounded[:, None]
+        found = self.prove(theta, w, y)
+        feasible = found.feasible & bounded[:, None]
         best, each = np.argmax(feasible, axis=1), np.arange(len(directions))
-        found = feasible.any(axis=1)
+        proved = feasible.any(axis=1)
         return Boundary(
             center=self.center,
             directions=directions,
-            inner=np.where(found, reach[each, best], np.nan),
-            outer=leaving(self.center, directions, normals, offsets),
-            points=np.where(found[:, None], theta[each, best], np.nan),
-            w=np.where(found[:, None], w[each, best], np.nan),
-            normals=normals,
-            offsets=offsets,
-            cuts=(cuts[0], cuts[1], cuts[2]),
+            inner=np.where(proved, reach[each, best], np.nan),
+            outer=leaving(self.center, directions, found.normals, found.offsets),
+            points=np.where(proved[:, None], theta[each, best], np.nan),
+            w=np.where(proved[:, None], w[each, best], np.nan),
+            normals=found.normals,
+            offsets=found.offsets,
+            cuts=found.cuts,
         )
 
-    def proved(self, theta: np.ndarray, w: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
+    def prove(self, theta: np.ndarray, w: np.ndarray, y: np.ndarray) -> "ProvedRays":
         """Return `prove_rays` of (K, backoffs, …) points and (K, R) multipliers."""
         count, fill = len(y), filled(len(y))
         with jax.enable_x64(True):
             found = prove_rays(self.exact, self.problem.rows, theta[fill], w[fill], y[fill])
-        return [np.asarray(v)[:count] for v in found]
+        return jax.tree.map(lambda v: np.asarray(v)[:count], found)
 
 
 def filled(count: int) -> np.ndarray:
@@ -159,20 +197,29 @@ def filled(count: int) -> np.ndarray:
     return np.arange(max(32, 1 << (count - 1).bit_length())) % count
 
 
+class ProvedRays(NamedTuple):
+    """Which points (K, backoffs) of rays are proved feasible, and the half-spaces
+    normals (K, d) θ ≤ offsets (K,) that hold on the whole feasible set, with their cuts."""
+
+    feasible: Any
+    normals: Any
+    offsets: Any
+    cuts: Cut
+
+
 @jax.jit
 @own_modes
-def prove_rays(p: ExactData, rows: ConstraintRows, theta: Any, w: Any, y: Any) -> tuple[Array, ...]:
-    """Return which points (K, backoffs, d) of the rays are proved feasible, and the normals (K, d)
-    and offsets (K,) of half-spaces that hold on the whole feasible set, from multipliers (K, R),
-    with the bounds of `proofs.cut` they follow from."""
+def prove_rays(p: ExactData, rows: ConstraintRows, theta: Array, w: Array, y: Array) -> ProvedRays:
+    """Prove points θ (K, backoffs, d) with w (K, backoffs, k), and half-spaces from multipliers y
+    (K, R)."""
 
     def feasible(theta: Array, w: Array) -> Array:
         inputs, free = inputs_of(p, rows, theta, w)
         return proofs.prove_feasible(p, theta, free, inputs)[0]
 
     cuts = jax.vmap(lambda y: cut_of(p, rows, y))(y)
-    half_spaces = jax.vmap(lambda *cut: proofs.everywhere(p, *cut))(*cuts)
-    return jax.vmap(jax.vmap(feasible))(theta, w), *half_spaces, *cuts
+    normals, offsets = jax.vmap(lambda *cut: proofs.everywhere(p, *cut))(*cuts)
+    return ProvedRays(jax.vmap(jax.vmap(feasible))(theta, w), normals, offsets, cuts)
 
 
 def leaving(
@@ -183,3 +230,53 @@ def leaving(
     with np.errstate(divide="ignore", invalid="ignore"):
         t = (offsets - normals @ center) / slope
     return np.where(slope > 0, t, np.inf).min(axis=1, initial=np.inf)
+
+
+class Refinement(NamedTuple):
+    """What rays have proved. gap: of the volumes of hull and intersection, relative to the latter;
+    inf where one of them has none."""
+
+    rays: Rays
+    proved: Bounds
+    gap: float
+
+
+def refined(
+    rays: Rays, gap: float, rounds: int, most: int = MOST_RAYS, deadline: float = np.inf
+) -> Refinement:
+    """Send rays through the vertices of the outer polytope until the volumes differ by no more than
+    `gap`, `most` of them a round, before `deadline` (of `time.monotonic`)."""
+    d = rays.problem.dimension
+    box, _ = rays.problem.programs.bounding_box
+    unit = power_of_two(np.zeros(d) if box is None else np.ptp(box, axis=0))
+    directions = np.concatenate([np.eye(d), -np.eye(d), -np.ones((1, d))])
+    proved, sent, left = rays.box(), of_length_one(directions), np.inf
+    for _ in range(rounds):
+        if time.monotonic() > deadline:
+            break
+        proved = proved.joined(rays.cast(directions * unit).proved)
+        try:
+            outer = Polytope(proved.normals * unit, proved.offsets).reduce()
+            low, high = hull_volume(proved.points / unit), outer.volume()
+            directions = fresh(outer.vertices() - rays.center / unit, sent)
+            sent = np.concatenate([sent, of_length_one(directions)])
+        except ValueError:  # unbounded, or too thin for qhull
+            break
+        left = (high - low) / high
+        # Sets with a curved boundary have no end of vertices.
+        if left <= gap or not 0 < len(directions) <= most:
+            break
+    return Refinement(rays, proved, left)
+
+
+def of_length_one(directions: np.ndarray) -> np.ndarray:
+    """Return directions (K, d) scaled to length one."""
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def fresh(directions: np.ndarray, sent: np.ndarray) -> np.ndarray:
+    """Return the directions, except zeros, along which no ray of `sent` (unit length) has been
+    sent."""
+    directions = directions[np.any(directions != 0, axis=1)]
+    distance = KDTree(sent).query(of_length_one(directions))[0]
+    return directions[distance > 1e-9]

@@ -158,7 +158,7 @@ class RowPrograms:
         margin = np.where(np.isfinite(ends), np.abs(ends), 0.0).max(axis=0) + 1e-300
         return np.array([-ends[1] - margin, ends[0] + margin]), np.array(y)
 
-    def centre(self, given: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def center(self, given: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return θ (the one given, or the best) and w with the largest common margin of all rows,
         but for equalities that the variables can keep; margins count in scaled rows.
 

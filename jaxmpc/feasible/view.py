@@ -1,15 +1,20 @@
 """Which initial states a point of a map stands for: all states, a slice, or a projection."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.sets.any_set import set_bounds
+
+# Indices or names of states, None for all.
+Axes: TypeAlias = Sequence[int | str] | np.ndarray | None
 
 
 @pytree
@@ -31,6 +36,13 @@ class View:
         """Return whether the states that are not mapped are free."""
         return self.fixed is None and bool(self.others)
 
+    def states(self, points: np.ndarray) -> np.ndarray:
+        """Return the states (B, n) of points (B, d) of a slice."""
+        x = np.zeros(len(self.axes) + len(self.others)) if self.fixed is None else self.fixed
+        states = np.tile(x, (len(points), 1))
+        states[:, list(self.axes)] = points
+        return states
+
     def initial_state(self, theta: Array, free: Array) -> Array:
         """Return x_0 (n,) of a point θ and values `free` of the other states, clipped into their
         box."""
@@ -41,15 +53,8 @@ class View:
             x = x.at[np.array(self.others)].set(jnp.clip(free, self.lower, self.upper))
         return x
 
-    def states(self, points: np.ndarray) -> np.ndarray:
-        """Return the states (B, n) of points (B, d) of a slice."""
-        x = np.zeros(len(self.axes) + len(self.others)) if self.fixed is None else self.fixed
-        states = np.tile(x, (len(points), 1))
-        states[:, list(self.axes)] = points
-        return states
 
-
-def make_view(mpc: MPC, axes: Any = None, fixed: Any = None) -> View:
+def make_view(mpc: MPC, axes: Axes = None, fixed: Reals | None = None) -> View:
     """Check and complete the choice of states to map; raise ValueError for a wrong one.
 
     axes: indices or names of the mapped states, None for all. fixed: values (n,) of all states

@@ -25,8 +25,8 @@ from jaxmpc.batches import default_chunk
 from jaxmpc.checks import fail, whole
 from jaxmpc.explicit.law import Law, RegionLaw
 from jaxmpc.feasible.labels import Labels
-from jaxmpc.feasible.map import grid
 from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.grids import grid
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.recursion.counterexample_search import ascend

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.explicit.law import Law
-from jaxmpc.feasible.centered_polytope import CenteredPolytope
+from jaxmpc.feasible.plan_polytope import CenteredPolytope
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.lp import maximise
 

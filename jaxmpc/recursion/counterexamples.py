@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxmpc.explicit.law import Law
-from jaxmpc.feasible.centered_polytope import CenteredPolytope
+from jaxmpc.feasible.plan_polytope import CenteredPolytope
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import first_of_block
 from jaxmpc.feasible.rays import BACKOFFS, Rays, ray_directions
@@ -111,7 +111,7 @@ def _proved_plans(rays: Rays, candidates: np.ndarray) -> tuple[np.ndarray, np.nd
         t, w, y = rays.problem.programs.ray(rays.center, direction)
         if not np.isfinite(t):
             try:
-                t, w = 1.0, rays.problem.programs.centre(rays.center + direction)[1]
+                t, w = 1.0, rays.problem.programs.center(rays.center + direction)[1]
             except ValueError:  # no margin there
                 t, w = 0.0, rays.w
         reach = (min(t, 1.0) * (1 - BACKOFFS))[:, None]
@@ -119,7 +119,7 @@ def _proved_plans(rays: Rays, candidates: np.ndarray) -> tuple[np.ndarray, np.nd
         plans.append(rays.w + reach / max(t, 1e-300) * (w - rays.w))
         multipliers.append(y)
     theta, w = np.array(states), np.array(plans)
-    proved = rays.proved(theta, w, np.array(multipliers))[0].ravel()
+    proved = rays.prove(theta, w, np.array(multipliers)).feasible.ravel()
     theta, rows, exact = np.concatenate(states), rays.problem.rows, rays.exact
     inputs = np.einsum("kmz,bz->bkm", rows.Omega, np.concatenate(plans) @ rows.back.T)
     inputs += np.einsum("kmp,bp->bkm", rows.Psi, theta) + rows.psi

@@ -7,8 +7,13 @@ import numpy as np
 
 from jaxmpc.checks import fail
 from jaxmpc.explicit.regions import CriticalRegions, critical_regions
-from jaxmpc.feasible.centered_polytope import CenteredPolytope
-from jaxmpc.feasible.plan_polytope import DIMENSIONS, TOLERANCE, PlanPolytope, projected
+from jaxmpc.feasible.plan_polytope import (
+    DIMENSIONS,
+    TOLERANCE,
+    CenteredPolytope,
+    PlanPolytope,
+    projected,
+)
 from jaxmpc.feasible.polytope import backward, is_standard_form
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
@@ -195,7 +200,7 @@ def no_move_stays(plans: PlanPolytope, state: np.ndarray) -> bool:
     if not plans.exact:
         return False
     try:
-        center = later.centre()
+        center = later.center()
         _, normal, offset = later.ray(center, state - center)
     except ValueError:  # flat, or the ray does not end
         return False

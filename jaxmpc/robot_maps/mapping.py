@@ -15,8 +15,8 @@ from jaxmpc.checks import fail, require_shape
 from jaxmpc.closed_loop.many import simulate_many
 from jaxmpc.closed_loop.robot_controller import RobotController
 from jaxmpc.feasible.labels import Labels
-from jaxmpc.feasible.map import FeasibleSetMap
-from jaxmpc.feasible.pipeline import Scope, label_chunks
+from jaxmpc.feasible.map import FeasibleSetMap, label_chunks
+from jaxmpc.feasible.pipeline import Scope
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record

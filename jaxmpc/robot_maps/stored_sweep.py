@@ -17,9 +17,8 @@ from jaxmpc import store
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import Compiled, first_rows
 from jaxmpc.checks import fail, whole
-from jaxmpc.feasible.grids import axis_indices, grid_ends
-from jaxmpc.feasible.map import mesh
 from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.stored import open_labels, stored_labels
 from jaxmpc.files import (
     check_results,
     open_folder,
@@ -28,6 +27,7 @@ from jaxmpc.files import (
     write_arrays,
     write_results,
 )
+from jaxmpc.grids import axis_indices, grid_ends, mesh
 from jaxmpc.qp.status import Status
 from jaxmpc.recursion.time_budget import Budget
 from jaxmpc.robot_maps.linear_problem import home_coordinates, mpc_with_terminal
@@ -136,7 +136,7 @@ def sweep_robot(
         **settings,
     }
     open_folder(folder)
-    blocks = store.open_labels(
+    blocks = open_labels(
         path, setting.problem, along, config, setting.chunk(), LOOPS, overwrite=overwrite,
         begun=lambda: remove_files(folder, *FILES),
     )  # fmt: skip
@@ -149,7 +149,7 @@ def sweep_robot(
             budget.say("linear model: closed loops and a search for counterexamples, which compile")
         loops = RobotLoops(**{field.name: blocks.read(field.name) for field in fields(RobotLoops)})
         gap = gap if len(mapped) <= 3 else None
-        found = setting.map(blocks.labels(), loops, gap, search_seconds)
+        found = setting.map(stored_labels(blocks), loops, gap, search_seconds)
     _save(folder, setting, found, config)
     return found
 
@@ -188,7 +188,7 @@ def _label(
         for (block, here), (labels, loops) in zip(todo, parts, strict=True):
             count = here.stop - here.start
             fields_of_loops = first_rows(vars(loops), count)
-            blocks.commit(block, **store.label_rows(labels.first(count)), **fields_of_loops)
+            blocks.commit(block, **labels.first(count).arrays(), **fields_of_loops)
             if bar.n == 0:
                 budget.say(f"first block done; {Compiled.seconds - before:.0f} s of compiling")
             bar.update(count)

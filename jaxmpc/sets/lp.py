@@ -299,3 +299,10 @@ def extent(G: np.ndarray, g: np.ndarray, axes: Sequence[int] | None = None) -> n
     """Return bounds of |x_i| over G x <= g for each i of `axes` (None: all), by two programs each,
     larger by a part in 10^6, which outweighs their error; inf where the set is unbounded."""
     return np.max(np.abs(Program(G, g).bounds(axes)), axis=0) * (1 + 1e-6)
+
+
+def power_of_two(sizes: np.ndarray) -> np.ndarray:
+    """Return the powers of two next below sizes, 1 for those that are zero or infinite: units that
+    change no digit."""
+    usable = np.isfinite(sizes) & (sizes > 1e-200) & (sizes < 1e200)
+    return 2.0 ** np.floor(np.log2(np.where(usable, sizes, 1.0)))

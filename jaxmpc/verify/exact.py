@@ -3,7 +3,7 @@
 Every float is a whole number times a power of two, and so are sums and products of floats. With all
 data of a problem written as integers over one 2ᵉ, a state after k steps is integers over
 2^((k+1)e): no rounding, no tolerance. What is checked is the problem as it is stored
-(`FeasibilityProblem.plain`): x⁺ = Ax + Bu + c, rows lower ≤ Hx + Du ≤ upper, and a terminal
+(`stored_problem.Constraints`): x⁺ = Ax + Bu + c, rows lower ≤ Hx + Du ≤ upper, and a terminal
 ellipsoid x'Px ≤ level.
 
 *Feasible* (`roll_out_exactly`): the plan, rolled out from the state, keeps every row. Equalities
@@ -20,106 +20,20 @@ state beyond that half-space starts no trajectory, wherever the multipliers came
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from fractions import Fraction
-from functools import cached_property
-from typing import Any
 
 import numpy as np
+
+from jaxmpc.arrays import Reals
+from jaxmpc.verify.stored_problem import Constraints
 
 UNIT_ROUNDOFF = 2.0**-53
 # Change of the inputs, relative to the largest, up to which it counts as rounding.
 TINY = 1e-9
 
 
-class Constraints:
-    """The hard constraints as float64 arrays: of each step k = 0..N the rows H[k], D[k], lower[k],
-    upper[k], D[N] being zero. `plain`: see `FeasibilityProblem.plain`."""
-
-    def __init__(self, plain: Mapping[str, Any]) -> None:
-        """Stack the rows of each step."""
-        self.A, self.B, self.c = (np.array(plain[k], float) for k in ("A", "B", "c"))
-        self.N, self.moves = plain["horizon"], np.array(plain["moves"])
-        n, m = self.B.shape
-        bound = lambda values, none: np.array([none if v is None else v for v in values], float)
-        rows: list[list[tuple[Any, ...]]] = [[] for _ in range(self.N + 1)]
-        for b in plain["rows"]:
-            H = np.array(b["H"], float).reshape(-1, n)
-            D = np.array(b["D"], float).reshape(-1, m)
-            lower, upper = bound(b["lower"], -np.inf), bound(b["upper"], np.inf)
-            for k in b["steps"]:
-                rows[k].append((H, D if k < self.N else 0 * D, lower, upper))
-        none = np.zeros((0, n)), np.zeros((0, m)), np.zeros(0), np.zeros(0)
-        stacked = [[np.concatenate(v) for v in zip(none, *at, strict=True)] for at in rows]
-        self.H, self.D, self.lower, self.upper = (list(v) for v in zip(*stacked, strict=True))
-        ball = plain["ellipsoid"]
-        self.P = None if ball is None else np.zeros((n, n))
-        if ball is not None:
-            given = np.array(ball["P"], float)
-            self.P[: len(given), : len(given)] = given  # type: ignore[index]
-            self.level = float(np.asarray(ball["level"]))
-        others = plain["others"]
-        self.axes, self.others = np.array(plain["axes"], int), np.array(others["index"], int)
-        if "value" in others:
-            self.low = self.high = np.array(others["value"], float)
-        else:
-            self.low = bound(others.get("lower", []), -np.inf)
-            self.high = bound(others.get("upper", []), np.inf)
-
-    @cached_property
-    def equalities(self) -> tuple[list[tuple[int, int]], np.ndarray]:
-        """The rows (k, i) with lower = upper that inputs move, and changes (q, N, m) of the inputs
-        that change the values of one of these q rows each by about one: the pseudoinverse of the
-        matrix by which the moves act on them."""
-        n, m = self.B.shape
-        moves = int(self.moves.max()) + 1
-        states, rows, where = np.zeros((moves * m, n)), [], []
-        for k in range(self.N + 1):
-            u = np.zeros((moves * m, m))
-            if k < self.N:
-                at = int(self.moves[k]) * m
-                u[at : at + m] = np.eye(m)
-            values = states @ self.H[k].T + u @ self.D[k].T
-            for i in np.flatnonzero((self.lower[k] == self.upper[k]) & np.any(values, axis=0)):
-                where.append((k, int(i)))
-                rows.append(values[:, i])
-            states = states @ self.A.T + u @ self.B.T
-        X = np.linalg.pinv(np.reshape(rows, (-1, moves * m)))
-        return where, X.T.reshape(-1, moves, m)[:, self.moves]
-
-    def input_rows(self) -> Iterator[tuple[int, int, float, float]]:
-        """Yield (move, i, lower, upper) for each row that bounds an input u_i alone."""
-        for k in range(self.N):
-            D = self.D[k]
-            alone = (self.H[k] == 0).all(axis=1) & (np.sum(D != 0, axis=1) == 1)
-            for row in np.flatnonzero(alone & (np.abs(D).sum(axis=1) == 1)):
-                i = int(np.flatnonzero(D[row])[0])
-                ends = self.lower[k][row], self.upper[k][row]
-                lower, upper = ends if D[row, i] > 0 else (-ends[1], -ends[0])
-                yield int(self.moves[k]), i, lower, upper
-
-    def exponent(self, *more: np.ndarray) -> int:
-        """Return e such that all data, and these arrays, are integers over 2ᵉ."""
-        parts = [self.A, self.B, self.c, self.low, self.high, *self.H, *self.D, *self.lower,
-                 *self.upper, *more]  # fmt: skip
-        if self.P is not None:
-            parts += [self.P, np.array(self.level)]
-        return max(0, *(_bits(v) for v in parts))
-
-
-def _bits(values: Any) -> int:
-    """Return the least e ≥ 0 for which values·2ᵉ are whole; what is not finite does not count."""
-    values = np.asarray(values, float).ravel()
-    values = values[np.isfinite(values) & (values != 0)]
-    if not len(values):
-        return 0
-    mantissa, power = np.frexp(values)
-    whole = (mantissa * 2.0**53).astype(np.int64)
-    zeros = np.log2((whole & -whole).astype(float)).astype(int)
-    return int(max(0, np.max(53 - power - zeros)))
-
-
-def integers(values: Any, e: int) -> np.ndarray:
+def integers(values: Reals, e: int) -> np.ndarray:
     """Return values·2ᵉ as an array of Python integers; ±∞ become 0."""
     values = np.asarray(values, float)
     mantissa, power = np.frexp(np.where(np.isfinite(values), values, 0.0))

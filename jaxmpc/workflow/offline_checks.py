@@ -9,10 +9,11 @@ import numpy as np
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_kind, whole
 from jaxmpc.explicit.exact_penalties import ExactPenalty, exact_penalty
-from jaxmpc.feasible.map import FeasibleSetMap, grid, map_points
+from jaxmpc.feasible.map import FeasibleSetMap, map_points
 from jaxmpc.feasible.polytope import is_standard_form
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import boundary
+from jaxmpc.grids import grid
 from jaxmpc.mpc.inequalities import condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import row_table

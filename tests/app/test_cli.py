@@ -15,9 +15,11 @@ import pytest
 import xarray as xr
 import zarr
 
+from jaxmpc import store
 from jaxmpc.app import cli
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands import linear_sweep, recursion
+from jaxmpc.feasible import labelling
 from jaxmpc.files import read_arrays, write_arrays
 from jaxmpc.recursion import Claim, Counterexample, RecursionReport, SmallestHorizon
 from jaxmpc.sets.box import Box
@@ -32,9 +34,7 @@ def _in_empty_folder(tmp_path, monkeypatch):
 @pytest.fixture
 def no_compile(monkeypatch):
     """Fail if the sweep starts: errors must be found before."""
-    monkeypatch.setattr(
-        linear_sweep, "label_parts", lambda *a, **k: pytest.fail("the sweep started")
-    )
+    monkeypatch.setattr(labelling, "label_parts", lambda *a, **k: pytest.fail("the sweep started"))
 
 
 def run(line):
@@ -143,7 +143,7 @@ def interruptible():
 @pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(linear_sweep, "CHUNK", 50)
-    real = linear_sweep.label_parts
+    real = labelling.label_parts
 
     def interrupted(*args, **kwargs):
         for k, chunk in enumerate(real(*args, **kwargs)):
@@ -151,7 +151,7 @@ def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsy
                 signal.raise_signal(signal.SIGINT)
             yield chunk
 
-    monkeypatch.setattr(linear_sweep, "label_parts", interrupted)
+    monkeypatch.setattr(labelling, "label_parts", interrupted)
     assert run("sweep --grid 16 12 --horizon 5 --output 'my maps'") == 130
     out = capsys.readouterr().out
     assert "jaxmpc sweep --grid 16 12 --horizon 5 --output 'my maps' --resume" in out
@@ -162,7 +162,7 @@ def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsy
         asked.append(list(parts))
         return real(mpc, asked[-1], *args, **kwargs)
 
-    monkeypatch.setattr(linear_sweep, "label_parts", counted)
+    monkeypatch.setattr(labelling, "label_parts", counted)
     resume = "sweep --grid 16 12 --horizon 5 --output 'my maps' --resume"
     assert run(resume) == 0
     data = xr.open_zarr(tmp_path / "my maps" / "sweep.zarr")
@@ -504,7 +504,7 @@ def test_a_full_disk_is_one_line_and_resume_goes_on(tmp_path, capsys):
 
 def test_two_processes_on_one_folder(tmp_path, capsys):
     line = "sweep --grid 16 12 --horizon 5 --no-refine"
-    first = linear_sweep.store._Lock(tmp_path / "jaxmpc-sweep")
+    first = store._Lock(tmp_path / "jaxmpc-sweep")
     assert run(line) == 2
     assert "another process writes there" in capsys.readouterr().err
     first.release()

@@ -12,7 +12,9 @@ import jaxmpc as jm
 from jaxmpc import store
 from jaxmpc.app import cli
 from jaxmpc.app.commands import linear_sweep, recursion
+from jaxmpc.feasible import labelling
 from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.stored import open_labels
 
 LINE = ["sweep", "--grid", "6", "6", "--horizon", "4", "--no-refine", "--output"]
 
@@ -44,7 +46,7 @@ def test_a_run_that_fails_keeps_the_results(folder, monkeypatch, capsys):
         yield
 
     for place, name, raises in (
-        (linear_sweep, "label_parts", broken), (FeasibilityProblem, "of", _raises),
+        (labelling, "label_parts", broken), (FeasibilityProblem, "of", _raises),
     ):  # fmt: skip
         with monkeypatch.context() as patch:
             patch.setattr(place, name, raises)
@@ -61,14 +63,14 @@ def _raises(*_, **__):
 
 def test_a_run_that_is_stopped_after_a_block_keeps_that(folder, monkeypatch):
     monkeypatch.setattr(linear_sweep, "CHUNK", 12)
-    real = linear_sweep.label_parts
+    real = labelling.label_parts
 
     def one_block(*arguments, **settings):
         yield next(iter(real(*arguments, **settings)))
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(linear_sweep, "label_parts", one_block)
+        patch.setattr(labelling, "label_parts", one_block)
         assert cli.main([*LINE, str(folder), "--overwrite", "--horizon", "5"]) == 130
     found = store.read(folder / "sweep.zarr")
     assert found.done == 1 and found.blocks == 3 and not found.problems
@@ -129,7 +131,7 @@ def test_names_of_states_do_not_break_a_store(tmp_path, name):
     problem, along = FeasibilityProblem.of(mpc), [np.linspace(-1, 1, 3), np.linspace(-1, 1, 4)]
     path = tmp_path / "sweep.zarr"
     for _ in range(2):  # new, and once more
-        with store.open_labels(path, problem, along, {}, 12) as kept:
+        with open_labels(path, problem, along, {}, 12) as kept:
             for block in kept.pending():
                 kept.commit(
                     block, label=np.ones(12), status=np.ones(12), start=np.ones((12, 2)),

@@ -70,7 +70,7 @@ def test_refusals_and_resume(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     for line, answer in (
         (f"{LINE} --shard 1/2", "holds 3 blocks of shard 1/2. Add --resume"),
-        (f"{LINE} --shard 0/2 --overwrite", "--overwrite: given beside --shard"),
+        (f"{LINE} --shard 0/2 --overwrite", "overwrite: given beside shard"),
         (f"{LINE} --shard 2/2", "--shard 2/2: shard 2 of 2. Give i/n"),
         (f"{LINE} --shard auto", "--shard auto: SLURM_ARRAY_TASK_ID, _MIN and _COUNT"),
         ("sweep --grid 40 30 --horizon 4 --shard 0/2", "mpc.horizon: 5 there, 4 here"),

@@ -159,7 +159,7 @@ class TestViolatedLimit:
     def test_the_most_violated_alone(self, theta, axis, sign):
         got, _, rows = self.found(theta)
         (i,) = np.flatnonzero(got)
-        assert i in rows.still and got[i] == sign
+        assert i in rows.zero_rows and got[i] == sign
         np.testing.assert_allclose(np.abs(rows.D[i]), np.eye(2)[axis])
 
     @pytest.mark.parametrize("theta", [[0.3, -0.9], [1.0, -1.0], [1 + 2e-16, 0.0]])
@@ -168,7 +168,7 @@ class TestViolatedLimit:
         np.testing.assert_array_equal(got, y)
 
     def test_no_such_rows(self):
-        rows = replace(made("lecture")[2], still=np.zeros(0, int))
+        rows = replace(made("lecture")[2], zero_rows=np.zeros(0, int))
         got, y, _ = self.found([5.0, 5.0], rows)
         np.testing.assert_array_equal(got, y)
 
@@ -188,10 +188,10 @@ def require_proof(theta, verdict, i=()):
     """The verdict proves what it says: a plan that keeps all rows, or a half-space."""
     label = int(verdict.label[i])
     if label == 1:
-        assert exact.keeps_all_rows(problems.lecture(), theta, np.asarray(verdict.inputs[i]))
+        assert exact.keeps_all_rows(problems.lecture(), theta, np.asarray(verdict.plan[i]))
         np.testing.assert_array_equal(verdict.start[i], theta)
     if label == -1:
-        normal, offset = np.asarray(verdict.normal[i]), float(verdict.offset[i])
+        normal, offset = np.asarray(verdict.cut_normal[i]), float(verdict.cut_offset[i])
         assert polygon().support(normal) <= offset < np.sum(normal * theta)
     return label
 
@@ -220,16 +220,16 @@ class TestCheck:
         beyond = np.array([0.0, 1.1])
         found = check(beyond, wrong, none, none)
         assert require_proof(beyond, found) == -1
-        np.testing.assert_allclose(found.normal / found.offset, [0, 1], atol=1e-9)
+        np.testing.assert_allclose(found.cut_normal / found.cut_offset, [0, 1], atol=1e-9)
         # The first that proves it is kept.
         first, second = (check(np.array([1.1, 1.2]), wrong, m, none) for m in (y, none))
-        assert np.all(np.abs(first.normal) > 0) and second.normal[0] == 0
+        assert np.all(np.abs(first.cut_normal) > 0) and second.cut_normal[0] == 0
 
     def test_nothing_is_said_of_what_is_not_proved(self):
         _, p, rows, *_ = made("lecture")
         w, y = np.full(rows.U.shape[1], np.nan), np.full(len(rows.U), np.nan)
         found = CHECK(p, rows, np.zeros(2), w, y, y)
-        assert found.label == 0 and found.offset == np.inf and found.label.dtype == np.int8
+        assert found.label == 0 and found.cut_offset == np.inf and found.label.dtype == np.int8
 
 
 def project(rows, theta, v):
@@ -262,7 +262,7 @@ def test_feasibility_steps():
         ts.append(ts[-1] + 1.3 * (onto(2 * s - ts[-1]) - s))
     for iterations in (1, 2, 5):
         last, before = feasibility_steps(
-            lambda v: jax.numpy.clip(v, -1, 1), onto, jax.numpy.asarray(ts[0]), 1.3, iterations
+            lambda v: jax.numpy.clip(v, -1, 1), onto, jax.numpy.asarray(ts[0]), iterations, 1.3
         )
         np.testing.assert_allclose(last, ts[iterations], rtol=1e-12)
         np.testing.assert_allclose(before, ts[iterations - 1], rtol=1e-12)
@@ -276,8 +276,8 @@ def test_admm(name, dtype):
     _, p, rows, lower, upper = made(name)
     alpha, iterations = 1.3, 3
     thetas = np.concatenate([random_points(name, 60)[0], [[0.0, 0.97], [0.0, -0.97]]])
-    stage = jax.jit(lambda p, rows, x, alpha: admm_stage(p, rows, x, alpha, iterations, dtype))
-    verdict, w = jax.tree.map(np.asarray, stage(p, rows, thetas, alpha))
+    stage = jax.jit(lambda p, rows, x: admm_stage(p, rows, x, iterations, dtype, alpha))
+    verdict, w = jax.tree.map(np.asarray, stage(p, rows, thetas))
     assert w.dtype == dtype
     provers = set()
     for i, theta in enumerate(thetas):
@@ -305,7 +305,7 @@ def test_admm(name, dtype):
             continue
         assert verdict.label[i] == (1 if room > 0 else -1 if max(beyond) > 0 else 0)
         if verdict.label[i] == -1:
-            normal = verdict.normal[i] / np.linalg.norm(verdict.normal[i])
+            normal = verdict.cut_normal[i] / np.linalg.norm(verdict.cut_normal[i])
             np.testing.assert_allclose(normal, normals[int(beyond[0] < 0)], atol=1e-9)
             provers.add(beyond[0] > 0)
     assert {-1, 0, 1} == set(verdict.label)

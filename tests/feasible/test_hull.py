@@ -7,9 +7,10 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.feasible import hull, pipeline
-from jaxmpc.feasible.hull import Cones, hull_facets
+from jaxmpc.feasible.hull import Hull, hull_facets
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.verify.exact import Constraints, roll_out_exactly
+from jaxmpc.verify.exact import roll_out_exactly
+from jaxmpc.verify.stored_problem import Constraints
 
 # Problem, half the size of the mapped box, view.
 CASES = {
@@ -43,7 +44,7 @@ def test_labels_and_proofs(name, monkeypatch):
     expected = jm.map_feasible_set(mpc, points, **view).label
     monkeypatch.setattr(hull, "MANY", 0)
     problem = FeasibilityProblem.of(mpc, **view)
-    assert Cones.of(problem) is not None
+    assert Hull.of(problem) is not None
     labels = jm.map_feasible_set(mpc, points, **view).labels
     np.testing.assert_array_equal(labels.label, expected)
     assert set(expected) == {-1, 1}
@@ -68,7 +69,7 @@ def test_they_decide_nearly_all(always, monkeypatch):
     monkeypatch.setattr(pipeline, "_run", lambda *a: programs.append(a[0]) or run(*a))
     label = jm.map_feasible_set(mpc, points[np.abs(distance) > 1e-6], chunk=1000).label
     np.testing.assert_array_equal(label, np.where(distance < 0, 1, -1)[np.abs(distance) > 1e-6])
-    assert set(programs) <= {hull.compiled_labels(None), hull.compiled_plans(None)}
+    assert set(programs) <= {hull.compiled_labels(None), hull.compiled_verdicts(None)}
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -78,7 +79,7 @@ def test_points_labelled_without_a_roll_out_have_plans(name):
     whatever is said to be feasible has a plan that keeps all limits, in exact arithmetic."""
     mpc, _, view = CASES[name]
     problem = FeasibilityProblem.of(mpc, **view)
-    made = Cones.of(problem)
+    made = Hull.of(problem)
     random, d = np.random.default_rng(1), problem.dimension
     share = random.dirichlet(np.ones(d), (len(made.M), 40))
     share[:, :10] *= random.choice([0.0, 1e-16, 1e-12, 1.0], (len(made.M), 10, d))
@@ -89,7 +90,7 @@ def test_points_labelled_without_a_roll_out_have_plans(name):
     with jax.enable_x64(True):
         label = np.asarray(hull.compiled_labels(None).run(made, points))
         exact = problem.exact(np.abs(points).max(axis=0))
-        found = jax.device_get(hull.compiled_plans(None).run(exact, made, points))
+        found = jax.device_get(hull.compiled_verdicts(None).run(exact, made, points))
     assert set(label) <= {-1, 0, 1} and np.all((found.label == label)[label != 0])
     inside = found.label == 1
     assert np.all(
@@ -124,9 +125,9 @@ def test_a_problem_keeps_its_cones(monkeypatch):
     monkeypatch.setattr(hull, "MANY", 500)
     problem = FeasibilityProblem.of(problems.lecture())
     points = points_of("lecture", 600)
-    assert hull.cones_for(problem, 100) is None
+    assert hull.hull_for(problem, 100) is None
     whole = jm.map_feasible_set(problem, points)
-    monkeypatch.setattr(Cones, "of", lambda _: pytest.fail("made again"))
+    monkeypatch.setattr(Hull, "of", lambda _: pytest.fail("made again"))
     part = jm.map_feasible_set(problem, points[:100])
     np.testing.assert_array_equal(part.label, whole.label[:100])
     with pytest.raises(ValueError, match="axes, fixed: given with a FeasibilityProblem"):
@@ -145,7 +146,7 @@ def test_problems_without_cones(case):
     if case == "no interior":
         mpc = jm.MPC(system, np.eye(2), np.eye(2), 1, inputs=jm.Box([0, -1], [0, 1]),
                      terminal_set=jm.Box([0.5, -1], [0.5, 1]))  # fmt: skip
-    assert Cones.of(FeasibilityProblem.of(mpc)) is None
+    assert Hull.of(FeasibilityProblem.of(mpc)) is None
 
 
 def test_facets_of_an_interval_and_of_a_square():

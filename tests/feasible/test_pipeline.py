@@ -12,8 +12,9 @@ import problems
 import pytest
 
 from jaxmpc.feasible import pipeline
-from jaxmpc.feasible.candidates import StagePenalties, compiled_check
-from jaxmpc.feasible.pipeline import label_chunks, last_programs
+from jaxmpc.feasible.candidates import compiled_check
+from jaxmpc.feasible.map import label_chunks
+from jaxmpc.feasible.pipeline import last_programs
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.qp.status import Status
 
@@ -186,7 +187,7 @@ class TestLastPrograms:
         problem = FeasibilityProblem.of(replace(problems.drifting(), prestabilise=GAIN))
         rows, programs = problem.rows, list(last_programs(problem, np.ones(len(problem.rows.U))))
         assert programs[0][0] is rows and programs[-1][0] is rows
-        center, w_center = problem.programs.centre()
+        center, w_center = problem.programs.center()
         margin = lambda theta, w: np.minimum(
             rows.upper - rows.U @ w - rows.D @ theta, rows.U @ w + rows.D @ theta - rows.lower
         ).min()
@@ -221,7 +222,7 @@ class TestLastPrograms:
         problem = FeasibilityProblem.of(problems.unstable(6))
         programs = list(last_programs(problem, np.ones(len(problem.rows.U))))
         assert [rows is problem.rows for rows, _ in programs] == [True, False, True]
-        center, _ = problem.programs.centre()
+        center, _ = problem.programs.center()
         rows, end = programs[1]
         for direction in np.random.default_rng(2).normal(size=(3, 2)):
             t, w_ray, _ = problem.programs.ray(center, direction)
@@ -231,42 +232,6 @@ class TestLastPrograms:
             assert y @ rows.D @ (center + t * direction) == pytest.approx(reach, rel=1e-6)
             value = rows.U @ w + rows.D @ (center + t * direction)
             assert np.all(value <= rows.upper + 1e-6 * (1 + np.abs(rows.upper)))
-
-
-class TestPenalties:
-    def test_they_change_no_label(self):
-        rows = scalar().rows
-        weight = np.random.default_rng(3).uniform(0.3, 3, len(rows.U))
-        points = TestChunks.POINTS
-        for alpha in (0.5, 1.9):
-            _, parts, label, _ = labelled(points, penalties=StagePenalties(weight, alpha))
-            np.testing.assert_array_equal(label, expected(points))
-            require_proofs(points, parts)
-
-    def test_coordinates_lead_back(self):
-        """The weighted rows' w' is M w', and D, bounds and U w are multiplied alike."""
-        rows = scalar().rows
-        weight = np.random.default_rng(4).uniform(0.3, 3, len(rows.U))
-        new, back, alpha = pipeline._penalised(rows, StagePenalties(weight, 1.0))
-        assert alpha == 1.0
-        np.testing.assert_allclose(new.U, weight[:, None] * rows.U @ back, atol=1e-12)
-        np.testing.assert_allclose(new.upper, weight * rows.upper)
-        same, none, alpha = pipeline._penalised(rows, None)
-        assert same is rows and none is None and alpha == pipeline.ALPHA
-
-    @pytest.mark.parametrize(
-        ("change", "alpha", "words"),
-        [(lambda v: v[:-1], 1.0, "weights"), (lambda v: 0 * v, 1.0, "not positive"),
-         (lambda v: v * np.where(v == v[0], np.nan, 1), 1.0, "not positive"),
-         (lambda v: v / 0, 1.0, "not positive"), (lambda v: np.append(-v[:1], v[1:]), 1, "not pos"),
-         (lambda v: v, 0.0, "alpha"), (lambda v: v, 2.0, "alpha"), (lambda v: v, -1.0, "alpha"),
-         (lambda v: v, 3.0, "alpha"), (lambda v: v, np.nan, "alpha")],
-    )  # fmt: skip
-    def test_errors(self, change, alpha, words):
-        weight = np.random.default_rng(5).uniform(0.3, 3, len(scalar().rows.U))
-        with np.errstate(divide="ignore"), pytest.raises(ValueError, match=words):
-            next(label_chunks(scalar(), np.zeros((1, 1)),
-                              penalties=StagePenalties(change(weight), alpha)))  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,7 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.explicit.law import Law, RegionLaw
 from jaxmpc.explicit.regions import critical_regions
-from jaxmpc.feasible.centered_polytope import CenteredPolytope
-from jaxmpc.feasible.plan_polytope import projected
+from jaxmpc.feasible.plan_polytope import CenteredPolytope, projected
 from jaxmpc.feasible.polytope import backward
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import Soft

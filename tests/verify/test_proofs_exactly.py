@@ -11,7 +11,8 @@ from jax import enable_x64
 import jaxmpc as jm
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.verify.exact import Constraints, beyond, roll_out, roll_out_exactly
+from jaxmpc.verify.exact import beyond, roll_out, roll_out_exactly
+from jaxmpc.verify.stored_problem import Constraints
 
 RANDOM = np.random.default_rng(3)
 N, n, m = 4, 3, 2

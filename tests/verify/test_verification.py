@@ -10,9 +10,13 @@ from damage import turned_bits
 
 import jaxmpc as jm
 from jaxmpc import store
+from jaxmpc.feasible.labels import PROOFS
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.verify.exact import Constraints, beyond, integers, roll_out, roll_out_exactly
-from jaxmpc.verify.stored_maps import Programs, verify_map
+from jaxmpc.feasible.stored import open_labels
+from jaxmpc.verify.exact import beyond, integers, roll_out, roll_out_exactly
+from jaxmpc.verify.half_spaces import Programs
+from jaxmpc.verify.stored_map import verify_map
+from jaxmpc.verify.stored_problem import Constraints
 
 SYSTEM = jm.LinearSystem(
     np.array([[1.1, 0.2], [0.0, 0.9]]), np.array([[0.02], [0.2]]), c=np.array([0.01, -0.02]),
@@ -67,10 +71,10 @@ def stored(path, mpc, axes, fixed, side=15):
     along = [np.linspace(-1.4, 1.4, side), np.linspace(-1.7, 1.7, side + 1)]
     points = np.stack(np.meshgrid(*along, indexing="ij"), -1).reshape(-1, 2)
     labels = jm.map_feasible_set(mpc, points, axes=axes, fixed=fixed).labels
-    with store.open_labels(path, problem, along, {}, 128) as kept:
+    with open_labels(path, problem, along, {}, 128) as kept:
         for block in kept.pending():
             rows = kept.rows(block)
-            kept.commit(block, **{k: v[rows] for k, v in store.label_rows(labels).items()})
+            kept.commit(block, **{k: v[rows] for k, v in labels.arrays().items()})
     return labels
 
 
@@ -238,16 +242,19 @@ class TestFindsWhatIsWrong:
         weaker = replace(mpc(), inputs=jm.Box([-0.5], [0.4]))
         problem = FeasibilityProblem.of(weaker)
         found = store.read(sound)
-        with store.open_labels(path, problem, list(found.axes.values()), {}, 128) as kept:
+        with open_labels(path, problem, list(found.axes.values()), {}, 128) as kept:
             for block in kept.pending():
                 rows = kept.rows(block)
-                kept.commit(block, **{name: found.arrays[name][rows] for name in store.LABELS})
+                kept.commit(
+                    block,
+                    **{name: found.arrays[name][rows] for name in ("label", "status", *PROOFS)},
+                )
         assert "breaks a limit" in " ".join(verify_map(path).failures.values())
 
     def test_blocks_that_are_not_done(self, sound, tmp_path):
         problem = FeasibilityProblem.of(mpc())
         axes = list(store.read(sound).axes.values())
-        store.open_labels(tmp_path / "sweep.zarr", problem, axes, {}, 128).close()
+        open_labels(tmp_path / "sweep.zarr", problem, axes, {}, 128).close()
         assert "2 of 2 blocks are not done" in verify_map(tmp_path).problems[0]
 
     @pytest.mark.slow

@@ -31,7 +31,6 @@ from jaxmpc.recursion import (
     recursive_feasibility,
     smallest_horizon,
 )
-from jaxmpc.store import label_rows
 
 FILES = ("summary.json", "recursion.npz", "recursion.png")
 
@@ -203,7 +202,7 @@ class Recursion:
         facets: dict[str, Any] = {}
         if body is not None:
             facets = {"facet_normals": np.asarray(body.H), "facet_offsets": np.asarray(body.h)}
-        labels = {} if report.labels is None else label_rows(report.labels)
+        labels = {} if report.labels is None else report.labels.arrays()
         facets |= {name: value for name, value in labels.items() if name != "label"}
         plain = {"problem": FeasibilityProblem.of(report.mpc).plain()}
         remove_files(self.output, *FILES)

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from jaxmpc.app import config as configs
-from jaxmpc.app.commands.linear_sweep import LinearSweep
+from jaxmpc.app.commands.linear_sweep import linear_sweep
 from jaxmpc.app.commands.options import (
     Devices,
     End,
@@ -166,10 +166,6 @@ class Sweep:
             return
         refuse({"seconds": self.seconds}, None, "It is how long a robot's loops last")
         chosen_devices(self.devices, "--devices")
-        self.open().run(refine=self.refine, devices=self.devices)
-
-    def open(self) -> LinearSweep:
-        """Read, check and open what a sweep needs. Raises ValueError; compiles nothing."""
         keys = "horizon terminal grid lower upper axes fixed iterations dtype".split()
         overrides = given_options(self, *keys) | ({"projection": True} if self.projection else {})
         config = configs.load(self.config, overrides)
@@ -178,7 +174,16 @@ class Sweep:
             where, cure = f"--output {self.output}", "Map fewer points, or use another disk"
             require_disk(where, needed, self.output, cure)
         shard = None if self.shard is None else chosen_shard(self.shard, os.environ)
-        return LinearSweep.open(config, self.output, self.resume, self.overwrite, shard, self.store)
+        linear_sweep(
+            config,
+            self.output,
+            url=self.store,
+            resume=self.resume,
+            overwrite=self.overwrite,
+            shard=shard,
+            refine=self.refine,
+            devices=self.devices,
+        )
 
     def map_robot(self, robot: str) -> None:
         """Make the map of --robot. Raises ValueError for options that do not go with it."""

@@ -11,8 +11,9 @@ from jaxmpc.app.commands.tuning import CHECKPOINT, TUNED
 from jaxmpc.app.commands.tuning_task import TuningTask
 from jaxmpc.app.plots.style import save
 from jaxmpc.app.plots.tuning import plot_before_after, plot_maps, plot_tuning
-from jaxmpc.feasible.map import grid, map_feasible_set
+from jaxmpc.feasible.map import map_feasible_set
 from jaxmpc.files import versions, write_json
+from jaxmpc.grids import grid
 from jaxmpc.tuning.result import TuningRun
 
 # Entries of a weight that the table shows.

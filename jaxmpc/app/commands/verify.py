@@ -15,7 +15,7 @@ from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import Switch, check_counts, option, print_table
 from jaxmpc.checks import shown
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.verify.stored_maps import Verification, find_store, verify_map
+from jaxmpc.verify.stored_map import Verification, find_store, verify_map
 
 # Failures that are printed.
 SHOWN = 10

@@ -8,8 +8,7 @@ import numpy as np
 
 from jaxmpc.app.config.problem import Config
 from jaxmpc.app.config.sections import RecursionSection, SweepSection
-from jaxmpc.feasible.grids import axis_indices, grid_ends
-from jaxmpc.feasible.map import grid, mesh
+from jaxmpc.grids import axis_indices, grid, grid_ends, mesh
 
 
 class SweepPoints(NamedTuple):

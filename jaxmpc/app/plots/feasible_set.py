@@ -20,7 +20,7 @@ from jaxmpc.app.plots.style import (
 )
 from jaxmpc.checks import fail
 from jaxmpc.feasible.map import FeasibleSetMap
-from jaxmpc.feasible.stored_map import Picture
+from jaxmpc.feasible.stored import Picture
 
 
 def plot_feasible_set(

@@ -12,9 +12,10 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.feasible import executors
+from jaxmpc.feasible import labelling
 from jaxmpc.feasible.labels import PROOFS
-from jaxmpc.feasible.pipeline import Scope, label_chunks, label_parts
+from jaxmpc.feasible.map import label_chunks
+from jaxmpc.feasible.pipeline import Scope, label_parts
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.sets.ellipsoid import Ellipsoid
 
@@ -72,7 +73,7 @@ def test_threads(expected, threads):
 
 
 def test_what_is_sent_is_enough_and_few_are_in_flight(expected, monkeypatch):
-    monkeypatch.setattr(executors, "IN_FLIGHT", 3)
+    monkeypatch.setattr(labelling, "IN_FLIGHT", 3)
     executor = Inline()
     same(
         jm.map_feasible_set(problems.lecture(), POINTS, chunk=64, executor=executor).labels,
@@ -153,7 +154,7 @@ def test_labels_of_a_part_do_not_depend_on_the_others(case, monkeypatch):
     assert len(whole) == 4
     for k in (2, 0, 3, 1):
         alone = FeasibilityProblem.of(make())
-        alone.programs.centre()  # an earlier question
+        alone.programs.center()  # an earlier question
         (found,) = label_parts(alone, [points[25 * k : 25 * k + 25]], scope, 25, **settings)
         same(found, whole[k])
     if case != "joint":

@@ -7,13 +7,14 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.feasible import stored_map
-from jaxmpc.feasible.map import FeasibleSetMap, mesh
+from jaxmpc.feasible import extremes, stored
+from jaxmpc.feasible.extremes import HalfSpaces, extreme, line_ends
+from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.pipeline import Scope, label_parts
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.stored_map import HalfSpaces, StoredMap, extreme, line_ends
+from jaxmpc.feasible.stored import StoredMap, open_labels, stored_labels
+from jaxmpc.grids import mesh
 from jaxmpc.sets.geometry import hull_volume
-from jaxmpc.store import label_rows, open_labels
 
 
 def test_points_of_a_part_of_a_grid():
@@ -36,7 +37,7 @@ def labelled(path, problem, lines, chunk, **changes):
     parts = (mesh(lines, kept.samples(block)) for block in kept.pending())
     scope = Scope.of_grid(lines, len(kept.regions))
     for block, labels in enumerate(label_parts(problem, parts, scope, kept.size, **changes)):
-        kept.commit(block, **label_rows(labels))
+        kept.commit(block, **labels.arrays())
     return kept
 
 
@@ -46,24 +47,25 @@ def labelled(path, problem, lines, chunk, **changes):
 @pytest.mark.first(1)
 def test_says_what_a_map_of_all_points_says(tmp_path, monkeypatch, name, many):
     """Also where points and half-spaces are reduced again and again."""
-    monkeypatch.setattr(stored_map, "MANY", many)
-    monkeypatch.setattr(stored_map, "LINES", 10)
+    monkeypatch.setattr(extremes, "MANY", many)
+    monkeypatch.setattr(stored, "LINES", 10)
     problem = FeasibilityProblem.of(getattr(problems, name)())
     extent = 2.1 * np.ones(problem.dimension)
     lines = [np.linspace(-e, e, 24 + i) for i, e in enumerate(extent)]
     with labelled(tmp_path / "a.zarr", problem, lines, 100) as kept:
         found = StoredMap.read(problem, kept, lines)
-        whole = FeasibleSetMap.of(problem, mesh(lines), kept.labels())
+        whole = FeasibleSetMap.of(problem, mesh(lines), stored_labels(kept))
         assert found.counts == whole.counts()
         assert found.counts["feasible"] and found.counts["infeasible"]
         np.testing.assert_allclose(
             found.bounds.volume_bounds(), whole.volume_bounds(), rtol=1e-9, atol=1e-12
         )
         assert len(found.bounds.bound_point) <= many + 200
-        refined, alone = found.refine()
+        refined = found.refine()
         expected = whole.refine()
         assert refined.counts == expected.counts()
-        np.testing.assert_array_equal(alone.bound_point, expected.bound_point)
+        written = np.asarray(kept.group["bound_point"])
+        np.testing.assert_array_equal(written, expected.bound_point)
         np.testing.assert_allclose(
             refined.bounds.volume_bounds(), expected.volume_bounds(), rtol=1e-9
         )
@@ -93,8 +95,8 @@ def test_undecided_states_that_rays_exclude_count_as_infeasible(tmp_path, monkey
         kept.commit(1, **rows | {"label": blank[0], "status": blank[1]})
         found = StoredMap.read(problem, kept, lines)
         assert found.counts["undecided"] == len(undecided) > 5
-        refined, _ = found.refine()
-        whole = FeasibleSetMap.of(problem, mesh(lines), kept.labels()).refine()
+        refined = found.refine()
+        whole = FeasibleSetMap.of(problem, mesh(lines), stored_labels(kept)).refine()
         assert refined.counts == whole.counts()
         assert refined.counts["undecided"] < len(undecided)
         np.testing.assert_array_equal(refined.picture().label, whole.label)
@@ -115,7 +117,7 @@ def test_extreme_points_span_the_hull(d):
     points = np.random.default_rng(d).standard_normal((200, d))
     found = extreme(points)
     assert hull_volume(found) == pytest.approx(hull_volume(points), rel=1e-12)
-    assert len(found) < 200 or d > stored_map.REDUCED
+    assert len(found) < 200 or d > extremes.REDUCED
     flat = np.column_stack([points, np.zeros(200)])
     assert len(extreme(flat)) == 200 or d == 1 and len(extreme(flat)) in (2, 200)
 
@@ -123,7 +125,7 @@ def test_extreme_points_span_the_hull(d):
 class TestHalfSpaces:
     def test_intersection_is_kept(self, monkeypatch):
         """Of a polytope with known facets, hidden among many half-spaces that do not matter."""
-        monkeypatch.setattr(stored_map, "MANY", 40)
+        monkeypatch.setattr(extremes, "MANY", 40)
         random = np.random.default_rng(0)
         facets = random.standard_normal((7, 2))
         facets = np.concatenate([facets, -facets])
@@ -148,7 +150,7 @@ class TestHalfSpaces:
 
     def test_one_side_is_read_before_the_other(self, monkeypatch):
         """Unbounded at first: what bounds it on that side is kept all the same."""
-        monkeypatch.setattr(stored_map, "MANY", 40)
+        monkeypatch.setattr(extremes, "MANY", 40)
         found = HalfSpaces.none(np.array([[-2.0, -2], [2, 2]]))
         angle = np.linspace(0, 2 * np.pi, 401)[:-1]
         rows = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -161,7 +163,7 @@ class TestHalfSpaces:
 
     @pytest.mark.parametrize("d", [2, 5])
     def test_empty_intersections(self, monkeypatch, d):
-        monkeypatch.setattr(stored_map, "MANY", 40)
+        monkeypatch.setattr(extremes, "MANY", 40)
         normals = np.random.default_rng(0).standard_normal((100, d))
         empty = HalfSpaces.none(np.array([-np.ones(d), np.ones(d)])).add(normals, -np.ones(100))
         assert len(empty.offsets) == (40 if d == 2 else 100) and empty.vertices is None
@@ -174,7 +176,7 @@ def test_reads_one_block_at_a_time(tmp_path):
     with labelled(tmp_path / "a.zarr", problem, lines, 100) as kept:
         asked = []
         spy = SimpleNamespace(
-            regions=kept.regions, samples=kept.samples,
+            regions=kept.regions, samples=kept.samples, save=kept.save,
             read=lambda name, block: (asked.append(name), kept.read(name, block))[1],
         )  # fmt: skip
         StoredMap.read(problem, spy, lines).refine()

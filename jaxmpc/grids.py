@@ -1,10 +1,40 @@
-"""Grids of states by name and limits: which axes, and from where to where."""
+"""Regular grids of states: their points; axes by name, ends by limits."""
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from jaxmpc.checks import fail
+from jaxmpc.arrays import Reals, host_array
+from jaxmpc.checks import fail, require_memory, whole
+
+
+def grid(lower: Reals, upper: Reals, shape: int | Sequence[int]) -> np.ndarray:
+    """Return the points of a regular grid, end points included: (Π shape, d), first coordinate
+    slowest. A number among lower, upper (d,) and shape (d,) holds along each axis.
+
+    Raises ValueError for what is no grid, and for one that does not fit into memory.
+    """
+    given = (host_array("grid lower", lower), host_array("grid upper", upper), np.asarray(shape))
+    d = max(np.size(value) for value in given)
+    lower, upper, sizes = (v if v.ndim else np.full(d, v) for v in given)
+    shape = tuple(whole("grid shape", k, 1) for k in sizes.ravel().tolist())
+    if not shape or not lower.shape == upper.shape == (len(shape),):
+        fail("grid", f"lower {lower.shape}, upper {upper.shape}, shape {shape}", "Same length each")
+    if not (np.all(np.isfinite(lower)) and np.all(np.isfinite(upper)) and np.all(lower <= upper)):
+        fail("grid", f"lower {lower}, upper {upper}", "Give finite lower ≤ upper")
+    require_memory("grid", 16 * len(shape) * math.prod(shape), "Give fewer points")
+    lines = [np.linspace(*ends) for ends in zip(lower, upper, shape, strict=True)]
+    return mesh(lines)
+
+
+def mesh(lines: Sequence[np.ndarray], index: np.ndarray | None = None) -> np.ndarray:
+    """Return the points (B, d) of a grid with these d coordinates, the first one slowest; index
+    (k,): only these of them, which needs no memory for the others."""
+    if index is None:
+        return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(lines))
+    place = np.unravel_index(index, [len(line) for line in lines])
+    return np.stack([line[i] for line, i in zip(lines, place, strict=True)], axis=-1)
 
 
 def axis_indices(

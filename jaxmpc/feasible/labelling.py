@@ -1,4 +1,4 @@
-"""Labels of parts by workers elsewhere: processes, or machines, behind an executor.
+"""The one loop over parts of a batch of points: labelled here, or by workers elsewhere.
 
 An executor is anything with the interface of `concurrent.futures`: `submit(function, *arguments)`
 returns a future, whose `result()` waits. A part is labelled from what is sent with it alone, by
@@ -8,12 +8,14 @@ returns a future, whose `result()` waits. A part is labelled from what is sent w
 import functools
 import itertools
 import pickle
+import time
 import warnings
 from collections import deque
-from collections.abc import Iterable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
+from tqdm.std import tqdm
 
 from jaxmpc.checks import fail
 from jaxmpc.feasible.labels import Labels
@@ -24,6 +26,48 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 IN_FLIGHT = 256
 # How often a part is submitted again whose worker died.
 RETRIES = 3
+
+Key = TypeVar("Key")
+
+
+def labelled(
+    problem: FeasibilityProblem,
+    keys: Sequence[Key],
+    points: Callable[[Key], np.ndarray],
+    scope: Scope,
+    size: int,
+    *,
+    total: int,
+    progress: bool | None = False,
+    deadline: float = np.inf,
+    executor: Any = None,
+    **settings: Any,
+) -> Iterator[tuple[Key, Labels]]:
+    """Label the points (b, d), b ≤ size, that each of the keys stands for; yield (key, Labels) in
+    order. What the caller does with a part counts as work on it in the bar.
+
+    total: number of all points. progress: show a bar; None: where stderr is a terminal. deadline:
+    of `time.monotonic`, after which no further part is yielded. executor: None to label here.
+    settings: those of `label_parts`.
+    """
+    if not keys:
+        return
+    parts = map(points, keys)
+    if executor is None:
+        found = label_parts(problem, parts, scope, size, **settings)
+    else:
+        found = label_elsewhere(executor, problem, parts, scope, size, **settings)
+    disable = None if progress is None else not progress
+    count = decided = 0
+    with tqdm(total=total, unit=" states", unit_scale=True, disable=disable) as bar:
+        for key, labels in zip(keys, found, strict=True):
+            yield key, labels
+            count += len(labels.label)
+            decided += int(np.count_nonzero(labels.label))
+            bar.set_postfix_str(f"{decided / count:.2%} decided", refresh=False)
+            bar.update(len(labels.label))
+            if time.monotonic() > deadline:
+                return
 
 
 def label_elsewhere(
@@ -41,12 +85,17 @@ def label_elsewhere(
     described = pickle.dumps(
         (FeasibilityProblem(problem.mpc, problem.view), scope, chunk, settings)
     )
-    submit = lambda points: executor.submit(label_part, described, points)
+
+    def submit(points: np.ndarray) -> Any:
+        return executor.submit(label_part, described, points)
+
     parts, waiting = iter(parts), deque[tuple[Any, np.ndarray]]()
-    more = lambda count: waiting.extend((submit(v), v) for v in itertools.islice(parts, count))
     try:
-        more(IN_FLIGHT)
-        while waiting:
+        while True:
+            missing = IN_FLIGHT - len(waiting)
+            waiting.extend((submit(v), v) for v in itertools.islice(parts, missing))
+            if not waiting:
+                return
             future, points = waiting.popleft()
             for left in reversed(range(RETRIES + 1)):
                 try:
@@ -63,7 +112,6 @@ def label_elsewhere(
             if isinstance(found, Exception):
                 raise found
             yield found
-            more(1)
     finally:
         for future, _ in waiting:
             getattr(future, "cancel", int)()

@@ -4,11 +4,10 @@ import gc
 import os
 import warnings
 
-import numpy as np
 import pytest
 import xarray as xr
 import zarr
-from test_store import AXES, CONFIG, FIELDS, array_files, rows
+from test_store import AXES, CONFIG, FIELDS, array_files, bounds, rows
 
 from jaxmpc import store
 from jaxmpc.app.commands.options import chosen_shard
@@ -195,10 +194,10 @@ class TestObjects:
                 assert kept.unfinished() == "1 of 3 blocks are missing, of other shards"
                 fill(other)
             assert kept.unfinished() == ""
-            kept.save_bounds(np.ones((3, 2)), np.ones((4, 2)), np.arange(4.0))
+            kept.save(bounds(3))
         with open_shard(path) as kept:
             fill(kept)
-            kept.save_bounds(np.ones((3, 2)), np.ones((4, 2)), np.arange(4.0))
+            kept.save(bounds(3))
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             there = xr.open_zarr(url).load()

@@ -16,6 +16,7 @@ import zarr
 from damage import turned_bits
 
 from jaxmpc import store
+from jaxmpc.feasible.stored import BOUNDS, dimension_names, label_fields, stored_labels
 from jaxmpc.store import Constant, Store
 
 AXES = {
@@ -23,7 +24,7 @@ AXES = {
     "dq": Constant(np.linspace(0, 3, 4), ("dq",), {"units": "rad/s", "long_name": "dq"}),
 }
 CONFIG = {"mpc": {"horizon": 3}, "limits": {"x_min": ["-Infinity", 0.0]}}
-FIELDS = store.label_fields(2, 3, 1, 2)
+FIELDS = label_fields(2, 3, 1, 2)
 
 
 def rows(count, value):
@@ -35,6 +36,12 @@ def rows(count, value):
         "cut_normal": np.full((count, 2), np.nan),
         "cut_offset": np.full(count, 2.0),
     }
+
+
+def bounds(count):
+    """What refinement saves: so many points, and four half-spaces."""
+    values = np.ones((count, 2)), np.ones((4, 2)), np.arange(4.0)
+    return {name: Constant(v, BOUNDS[name]) for name, v in zip(BOUNDS, values, strict=True)}
 
 
 def open_store(path, config=CONFIG, axes=AXES, chunk=8):
@@ -50,7 +57,7 @@ def full(tmp_path):
         for block in kept.pending():
             here = kept.rows(block)
             kept.commit(block, **rows(here.stop - here.start, 1 - 2 * (block % 2)))
-        kept.save_bounds(np.ones((3, 2)), np.ones((4, 2)), np.arange(4.0))
+        kept.save(bounds(3))
     return path
 
 
@@ -79,7 +86,7 @@ class TestBlocks:
             assert kept.pending() == [0, 1] and kept.damaged == 0
             kept.commit(0, **rows(8, 1))
             np.testing.assert_array_equal(kept.read("label"), [1] * 8 + [0] * 8 + [-1] * 4)
-            labels = kept.labels()
+            labels = stored_labels(kept)
         assert labels.plan.shape == (20, 3, 1) and np.isnan(labels.cut_offset[8:16]).all()
 
     def test_a_block_counts_once_its_rows_are_written(self, tmp_path, monkeypatch):
@@ -127,14 +134,14 @@ class TestDataSet:
         assert len(line[0].get_xdata()) == 4
 
     def test_names_of_dimensions(self):
-        assert store.dimension_names(["q", "dq"], FIELDS) == ["q", "dq"]
-        assert store.dimension_names(["a/b", "dq"], FIELDS) == ["a_b", "dq"]
+        assert dimension_names(["q", "dq"], FIELDS) == ["q", "dq"]
+        assert dimension_names(["a/b", "dq"], FIELDS) == ["a_b", "dq"]
         for names in (["label", "q"], ["q", "q"], ["", "q"], ["..", "q"], ["time", "q"]):
-            assert store.dimension_names(names, FIELDS) == ["x0", "x1"]
+            assert dimension_names(names, FIELDS) == ["x0", "x1"]
 
     def test_bounds_are_replaced(self, full):
         with open_store(full) as kept:
-            kept.save_bounds(np.ones((5, 2)), np.ones((4, 2)), np.arange(4.0))
+            kept.save(bounds(5))
         assert xr.open_zarr(full)["bound_point"].shape == (5, 2)
         assert not store.read(full).problems
 

@@ -1,0 +1,379 @@
+"""Maps of grids in a store: `sweep_into` labels a grid block by block, `StoredMap` is what it says.
+
+A grid has one dimension an axis, with its coordinates. Of each sample the store holds label,
+status, start (state), plan (time, input), cut_normal (coordinate) and cut_offset: see `Labels`; and
+after refinement bound_point (ray, coordinate), bound_normal (facet, coordinate) and bound_offset
+(facet): see `FeasibleSetMap`.
+"""
+
+import re
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from jaxmpc.arrays import Reals
+from jaxmpc.batches import CHUNK, Timing
+from jaxmpc.checks import fail
+from jaxmpc.feasible import extremes
+from jaxmpc.feasible.extremes import HalfSpaces
+from jaxmpc.feasible.labelling import labelled
+from jaxmpc.feasible.labels import PROOFS, Labels, OnDemand
+from jaxmpc.feasible.map import FeasibleSetMap, excluded
+from jaxmpc.feasible.pipeline import Scope
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.feasible.rays import Rays
+from jaxmpc.feasible.view import Axes
+from jaxmpc.files import check_results
+from jaxmpc.grids import mesh
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import record
+from jaxmpc.qp.status import Status
+
+if TYPE_CHECKING:
+    from jaxmpc.store import Field, Store
+
+# Lines of a picture along each axis, at most.
+LINES = 1024
+# What refinement proves, and its dimensions.
+BOUNDS = {
+    "bound_point": ("ray", "coordinate"),
+    "bound_normal": ("facet", "coordinate"),
+    "bound_offset": ("facet",),
+}
+# Dimensions and files of a store that no mapped state may be called.
+TAKEN = {"checksum", "block", "state", "input", "time", "coordinate", "sample", "zarr.json"}
+# Bytes of the name of a dimension, at most; file systems have 255 for a name.
+MOST_NAME = 100
+
+
+class Picture(NamedTuple):
+    """Labels (b,) on points (b, 2), evenly spaced lines of a grid, and the counts on all of it."""
+
+    points: np.ndarray
+    label: np.ndarray
+    counts: dict[str, int]
+
+
+@record
+class StoredMap:
+    """A stored map of a grid.
+
+    store, along: where it lies, and the coordinates along each axis. bounds: a map without points
+    whose bound points and half-spaces bound the feasible set. counts: as of
+    `FeasibleSetMap.counts`. undecided: blocks with undecided points. image: labels on every
+    step-th line of two axes, None for other maps. timing: the work of this process. left: why the
+    map is not whole, in words, "" where it is; then bounds and counts are not read.
+    """
+
+    problem: FeasibilityProblem
+    store: "Store"
+    along: tuple[np.ndarray, ...]
+    bounds: FeasibleSetMap
+    counts: dict[str, int]
+    undecided: list[int]
+    image: np.ndarray | None
+    timing: Timing
+    left: str = ""
+
+    def __repr__(self) -> str:
+        size = " × ".join(str(len(line)) for line in self.along)
+        counts = ", ".join(f"{n:,} {name}" for name, n in self.counts.items() if n)
+        return f"StoredMap of {size} states at {self.store.path}: {self.left or counts}"
+
+    @classmethod
+    def unread(
+        cls,
+        problem: FeasibilityProblem,
+        store: "Store",
+        along: Sequence[np.ndarray],
+        timing: Timing | None = None,
+        left: str = "",
+    ) -> "StoredMap":
+        """Return the map of a store of which nothing has been read."""
+        along, none = tuple(along), np.zeros((0, len(along)))
+        nothing = FeasibleSetMap.of(problem, none, Labels.empty(0, problem))
+        lines = [len(line[:: step(line)]) for line in along]
+        image = np.zeros(lines, np.int8) if len(along) == 2 else None
+        return cls(problem, store, along, nothing, {}, [], image, timing or Timing(), left)
+
+    @classmethod
+    def read(
+        cls, problem: FeasibilityProblem, store: "Store", along: Sequence[np.ndarray]
+    ) -> "StoredMap":
+        """Read all labels of an open store, and the proofs that matter, block by block: memory does
+        not grow with the grid up to `extremes.REDUCED` mapped states."""
+        found = cls.unread(problem, store, along)
+        points = found.bounds.bound_point
+        cuts = HalfSpaces.none(np.array([[line[0], line[-1]] for line in along]).T)
+        for block in range(len(store.regions)):
+            labels = found._labels(block)
+            found._count(block, labels)
+            if np.any(labels.status == Status.ITERATION_LIMIT):
+                found.undecided.append(block)
+            ends = extremes.line_ends(labels.label == 1, store.regions[block][-1])
+            if len(ends):
+                points = np.concatenate([points, mesh(along, store.samples(block)[ends])])
+                points = extremes.extreme(points) if len(points) > extremes.MANY else points
+            if np.any(labels.label == -1):
+                cuts = cuts.add(store.read("cut_normal", block), store.read("cut_offset", block))
+        return found._with_bounds(points, cuts.normals, cuts.offsets)
+
+    def refine(self, gap: float = 1e-6) -> "StoredMap":
+        """Return the map with the bounds that rays add, and write these into the store; see
+        `FeasibleSetMap.refine`. Undecided points that they exclude count as infeasible."""
+        from jaxmpc.store import Constant
+
+        none = np.zeros((0, self.problem.dimension))
+        alone = FeasibleSetMap.of(self.problem, none, Labels.empty(0, self.problem)).refine(gap)
+        normals, offsets = alone.bound_normal, alone.bound_offset
+        for block in self.undecided if len(offsets) else ():
+            before = self._labels(block)
+            points = mesh(self.along, self.store.samples(block))
+            self._count(block, before, -1)
+            self._count(block, excluded(before, Rays.of(self.problem), points, normals, offsets))
+        self.store.save(
+            {name: Constant(getattr(alone, name), axes) for name, axes in BOUNDS.items()}
+        )
+        old = self.bounds
+        return self._with_bounds(
+            np.concatenate([old.bound_point, alone.bound_point]),
+            np.concatenate([old.bound_normal, normals]),
+            np.concatenate([old.bound_offset, offsets]),
+        )
+
+    def _with_bounds(
+        self, points: np.ndarray, normals: np.ndarray, offsets: np.ndarray
+    ) -> "StoredMap":
+        bounds = replace(
+            self.bounds, bound_point=points, bound_normal=normals, bound_offset=offsets
+        )
+        return replace(self, bounds=bounds)
+
+    def _labels(self, block: int) -> Labels:
+        """Return the labels of a block, without proofs."""
+        label, status = self.store.read("label", block), self.store.read("status", block)
+        return replace(self.bounds.labels, label=label, status=status)
+
+    def _count(self, block: int, labels: Labels, sign: int = 1) -> None:
+        """Add the labels of a block to the counts, or take them away, and draw the picture."""
+        for name, count in labels.counts().items():
+            self.counts[name] = self.counts.get(name, 0) + sign * count
+        if self.image is not None:
+            region = self.store.regions[block]
+            whole = labels.label.reshape([part.stop - part.start for part in region])
+            place, lines = [], []
+            for part, line in zip(region, self.along, strict=True):
+                at = np.r_[part]
+                lines.append(at[at % step(line) == 0] - part.start)
+                place.append(at[at % step(line) == 0] // step(line))
+            self.image[np.ix_(*place)] = whole[np.ix_(*lines)]
+
+    def picture(self) -> Picture:
+        """Return the picture of a map of two states."""
+        assert self.image is not None
+        lines = [line[:: step(line)] for line in self.along]
+        return Picture(mesh(lines), self.image.ravel(), self.counts)
+
+
+def step(line: np.ndarray) -> int:
+    """Return how far apart lines of the picture are."""
+    return -(-len(line) // LINES)
+
+
+def sweep_into(
+    path: str | Path,
+    mpc: MPC,
+    along: Sequence[np.ndarray],
+    *,
+    axes: Axes = None,
+    fixed: Reals | None = None,
+    iterations: int = 50,
+    dtype: str = "float32",
+    chunk: int = CHUNK,
+    gap: float | None = 1e-6,
+    settings: Mapping[str, Any] | None = None,
+    shard: tuple[int, int] | None = None,
+    executor: Any = None,
+    devices: Any = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: bool = False,
+    begun: Callable[[], None] = lambda: None,
+    opened: "Callable[[Store], None]" = lambda store: None,
+    concluded: Callable[[StoredMap], None] = lambda found: None,
+) -> StoredMap:
+    """Label all points of a grid into a store, block by block, each written as soon as it is done.
+
+    path: a folder or URL (`jaxmpc.store`), which xarray.open_zarr reads. mpc, axes, fixed,
+    iterations, dtype, executor, devices: as in `map_feasible_set`. along: the coordinates of the
+    grid along each of the d mapped states. chunk: points of a block: what is written at once, and
+    lost at most. gap: of `StoredMap.refine` at the end, None to skip it.
+
+    settings: JSON data that determine the labels: a store with others is refused; None: iterations
+    and dtype. shard: (i, n) to label the blocks k with k mod n = i, beside other processes; the
+    last of them concludes, for all others `left` of the result says what is missing. resume: go on
+    with the sweep at `path`. overwrite: put a new one in its place, once its first block is done.
+    Without either there must be none. progress: show a bar, where stderr is a terminal. begun: is
+    called when these labels lie at `path`, hence when overwritten ones are gone; opened: with the
+    store before anything is compiled; concluded: with the whole map while no other process can
+    conclude.
+
+    Raises ValueError for wrong arguments, and as `jaxmpc.store.Store` does.
+    """
+    from jaxmpc.store import exists, location, report_damage
+
+    path = location(path)
+    if shard is None:
+        check_results(path, resume, overwrite, exists(path))
+    elif overwrite:
+        fail(
+            "overwrite",
+            "given beside shard (--overwrite, --shard)",
+            "Delete the store before shards start",
+        )
+    problem = FeasibilityProblem.of(mpc, axes, fixed)
+    settings = {"iterations": iterations, "dtype": dtype} if settings is None else settings
+    how: dict[str, Any] = {"shard": shard, "overwrite": overwrite, "begun": begun}
+    with open_labels(path, problem, along, settings, chunk, **how) as store:
+        pending = store.pending()
+        done = len(store.own) - len(pending)
+        if shard is not None and (done or store.damaged) and not resume:
+            what = f"holds {done:,} blocks of shard {shard[0]}/{shard[1]}"
+            fail(str(path), what, "Add --resume (resume=True) to go on with it")
+        report_damage(store)
+        opened(store)
+        timing, start = Timing(), time.perf_counter()
+        found = labelled(
+            problem,
+            pending,
+            lambda block: mesh(along, store.samples(block)),
+            Scope.of_grid(along, len(store.regions)),
+            store.size,
+            total=sum(len(store.samples(block)) for block in pending),
+            progress=None if progress else False,
+            executor=executor,
+            iterations=iterations,
+            dtype=dtype,
+            devices=devices,
+        )
+        for block, labels in found:
+            store.commit(block, **labels.arrays())
+            timing.count += len(labels.label)
+            timing.compile_seconds += labels.compile_seconds
+        # By the clock: blocks are computed while others are stored.
+        timing.run_seconds = time.perf_counter() - start - timing.compile_seconds
+        if left := store.unfinished():
+            return StoredMap.unread(problem, store, along, timing, left)
+        whole = replace(StoredMap.read(problem, store, along), timing=timing)
+        if gap is not None:
+            if progress:
+                print("closing the bounds by rays; long horizons take a while", file=sys.stderr)
+            whole = whole.refine(gap)
+        concluded(whole)
+        return whole
+
+
+def open_labels(
+    path: str | Path,
+    problem: FeasibilityProblem,
+    along: Sequence[np.ndarray],
+    config: Mapping[str, Any],
+    chunk: int,
+    fields: "Mapping[str, Field] | None" = None,
+    **how: Any,
+) -> "Store":
+    """Open the store of the labels of a grid; how: to open it, see `Store`.
+
+    along: the coordinates of the grid along each mapped state. fields: variables beside the labels.
+    """
+    from jaxmpc.store import Constant, Store
+
+    mpc, system = problem.mpc, problem.mpc.system
+    all_fields = label_fields(mpc.dimension, mpc.horizon, system.m, problem.dimension)
+    all_fields |= dict(fields or {})
+    names = [_name_and_unit(name) for name in problem.axis_names]
+    dimensions = dimension_names([name for name, _ in names], all_fields)
+    axes = {
+        dimension: Constant(values, (dimension,), {"long_name": name, "units": unit or "1"})
+        for dimension, values, (name, unit) in zip(dimensions, along, names, strict=True)
+    }
+    texts = {"coordinate": problem.axis_names, "state": mpc.labels, "input": system.input_labels}
+    constants = {
+        name: Constant(np.array(list(values), str), (name,)) for name, values in texts.items()
+    }
+    about_time = {"long_name": "time of the input", "units": "s" if system.dt else "1"}
+    times = (system.dt or 1.0) * np.arange(mpc.horizon)
+    constants["time"] = Constant(times, ("time",), about_time)
+    attributes = {"problem": problem.plain()}
+    return Store(
+        path, axes, all_fields, config, chunk, constants=constants, attributes=attributes, **how
+    )
+
+
+def label_fields(n: int, horizon: int, m: int, d: int) -> "dict[str, Field]":
+    """Return the variables that hold `Labels` of d mapped states and plans (horizon, m) from states
+    of size n."""
+    from jaxmpc.store import Field
+
+    meanings = "infeasible undecided feasible", " ".join(s.name.lower() for s in Status)
+    values = [-1, 0, 1], [int(s) for s in Status]
+    label, status = (
+        {"flag_values": v, "flag_meanings": text} for v, text in zip(values, meanings, strict=True)
+    )
+    about = {
+        "label": "label",
+        "status": "status of the problem at this state",
+        "start": "initial state of the plan that proves feasible",
+        "plan": "inputs that prove feasible",
+        "cut_normal": (
+            "normal a of a half-space a'x <= b that no feasible state leaves and this one does"
+        ),
+        "cut_offset": "offset b of the half-space a'x <= b; inf: proved at this state alone",
+    }
+    fields = {
+        "label": Field((), "int8", 0, (), label),
+        "status": Field((), "int8", 0, (), status),
+        "start": Field((n,), "float64", np.nan, ("state",)),
+        "plan": Field((horizon, m), "float64", np.nan, ("time", "input")),
+        "cut_normal": Field((d,), "float64", np.nan, ("coordinate",)),
+        "cut_offset": Field((), "float64", np.nan, ()),
+    }
+    return {
+        name: field._replace(attributes={"long_name": about[name], **field.attributes})
+        for name, field in fields.items()
+    }
+
+
+def stored_labels(store: "Store") -> Labels:
+    """Return the labels in a store; proofs are read when they are used."""
+    proofs = {name: OnDemand(partial(store.read, name)) for name in PROOFS}
+    return Labels(store.read("label"), store.read("status"), proofs)
+
+
+def dimension_names(names: Sequence[str], taken: Mapping[str, Any]) -> list[str]:
+    """Return names of dimensions for mapped states: their own, without characters that a path
+    cannot hold; x0, x1, ... where these are not distinct, or too long for a path, or have a meaning
+    in a store. Some file systems do not tell capital letters from others."""
+    found = [re.sub(r"[^\w.\- ]", "_", name).strip(". ") for name in names]
+    known, bare = {*taken, *BOUNDS, *TAKEN}, [name.casefold() for name in found]
+    if (
+        len(set(bare)) < len(found)
+        or not all(found)
+        or known & {*found, *bare}
+        or any(len(name.encode()) > MOST_NAME for name in found)
+        or any(name.startswith("__") or name.endswith(".partial") for name in found)
+    ):
+        return [f"x{i}" for i in range(len(found))]
+    return found
+
+
+def _name_and_unit(label: str) -> tuple[str, str]:
+    """Split a label such as "q [rad]" into its name and its unit."""
+    found = re.fullmatch(r"(.*?) \[(.*)\]", label)
+    return (found[1], found[2]) if found else (label, "")

@@ -1,0 +1,285 @@
+"""Prove the labels of a stored map again, from what is stored alone.
+
+Nothing here is shared with what made the labels: plans are rolled out by `exact.py`, half-spaces
+are found anew by `half_spaces.py`.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from tqdm.std import tqdm
+
+from jaxmpc.checks import fail
+from jaxmpc.files import read_results
+from jaxmpc.qp.status import Status
+from jaxmpc.store import Check, Stored, read, reason
+from jaxmpc.verify.exact import roll_out, roll_out_exactly
+from jaxmpc.verify.half_spaces import exclude
+from jaxmpc.verify.recursion_report import read_report, wrong_next_states
+from jaxmpc.verify.stored_problem import Constraints, label_shapes
+
+
+@dataclass(repr=False)
+class Verification:
+    """What was verified of a store.
+
+    labels: number of stored labels of each kind. verified: how many of the decided ones are proved.
+    exactly: how many of these in exact arithmetic. margin: the least margin of a limit along a
+    plan, in the units of that limit; excess: the least by which an infeasible state lies beyond its
+    half-space, relative to the largest entry of the normal; ∞ where there are none. failures: index
+    of each state whose label is not proved, with where it lies and the reason. problems: what is
+    wrong with the store.
+    """
+
+    labels: dict[str, int]
+    verified: int = 0
+    exactly: int = 0
+    margin: float = np.inf
+    excess: float = np.inf
+    failures: dict[int, str] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        verdict = "passed" if self.passed else "FAILED"
+        first = [*self.problems, *self.failures.values()][:1]
+        counts = ", ".join(f"{n:,} {name}" for name, n in self.labels.items())
+        lines = [
+            f"Verification {verdict}: {self.verified:,} labels proved, {self.exactly:,} exactly",
+            f"labels: {counts or 'none read'}",
+            f"{len(self.failures):,} failures, {len(self.problems)} problems",
+        ]
+        return "\n  ".join([*lines, *first])
+
+    @property
+    def passed(self) -> bool:
+        """Return whether the store is sound and each of its labels is proved."""
+        return not self.failures and not self.problems
+
+
+def verify_map(
+    path: str | Path,
+    *,
+    exact: bool = False,
+    sample: int = 1000,
+    seed: int = 0,
+    progress: bool = False,
+    check: Check = lambda attributes, axes: [],
+) -> Verification:
+    """Prove every label of a stored map again, from its plans, half-spaces and problem.
+
+    path: a store that `jaxmpc sweep` or `jaxmpc recursion --robot` made, its URL, or its folder; or
+    the folder of a report of `jaxmpc recursion`, whose counterexample, and next states that count
+    as lost after one step, are proved again too. exact: all plans in exact arithmetic, else a
+    random sample of them and those with margins near rounding, the others in float64; half-spaces
+    are exact always. What summary.json beside it counts is compared. check: takes the attributes
+    and axes of the store before its labels are read, and returns what is wrong with them. Nothing
+    is written. Where the store is damaged, `problems` says where, and no label is looked at unless
+    its data can be read. Raises ValueError where there is no store.
+    """
+    path = find_store(path)
+    report = isinstance(path, Path) and path.suffix == ".npz"
+    found = read_report(Path(path), check) if report else read(path, check, label_shapes)
+    result = Verification({}, problems=list(found.problems))
+    if not found.whole:
+        return result
+    try:
+        with np.errstate(all="ignore"):  # of numbers that are no plans: they fail
+            if _count(found, result):
+                _prove(_Labels.of(found), exact, sample, seed, progress, result)
+                if report:
+                    p = Constraints(found.attributes["problem"])
+                    result.problems += wrong_next_states(p, found)
+        if not report and isinstance(path, Path) and (path.parent / "summary.json").exists():
+            _compare_summary(path.parent / "summary.json", found, result)
+    except Exception as error:  # what numbers that fit no problem may raise
+        result.problems.append(f"its labels cannot be proved again ({reason(error)})")
+    return result
+
+
+@dataclass(frozen=True)
+class _Labels:
+    """Stored labels: the constraints, the states (B, d), the arrays, and the indices of the states
+    labelled feasible and infeasible."""
+
+    p: Constraints
+    points: np.ndarray
+    arrays: dict[str, np.ndarray]
+    feasible: np.ndarray
+    infeasible: np.ndarray
+
+    @classmethod
+    def of(cls, found: Stored) -> "_Labels":
+        label = found.arrays["label"]
+        where = np.flatnonzero(label == 1), np.flatnonzero(label == -1)
+        return cls(Constraints(found.attributes["problem"]), found.points, found.arrays, *where)
+
+
+def _count(found: Stored, result: Verification) -> bool:
+    """Count the labels, compare them with their status, and return whether they can be proved."""
+    label, status = found.arrays.get("label"), found.arrays.get("status")
+    if found.done < found.blocks:
+        left = found.blocks - found.done
+        result.problems.append(f"{left} of {found.blocks} blocks are not done: resume the sweep")
+    needed = ("label", "status", "start", "plan", "cut_normal", "cut_offset")
+    missing = [name for name in needed if name not in found.arrays]
+    if (
+        label is None
+        or status is None
+        or missing
+        or not found.axes
+        or "problem" not in found.attributes
+    ):
+        result.problems.append(f"cannot be verified without {missing or 'its problem'}")
+        return False
+    names = {1: "feasible", -1: "infeasible", 0: "undecided"}
+    result.labels = {name: int(np.sum(label == value)) for value, name in names.items()}
+    if len(found.points) != len(label):
+        result.problems.append(f"{len(label)} labels for {len(found.points)} states")
+        return False
+    for i in np.flatnonzero(~np.isin(label, list(names))):
+        result.failures[int(i)] = f"label {label[i]} means nothing"
+    for value, expected in {1: Status.SOLVED, -1: Status.PRIMAL_INFEASIBLE}.items():
+        for i in np.flatnonzero((label == value) & (status != expected)):
+            result.failures[int(i)] = f"label {value} with status {status[i]}"
+    return True
+
+
+def _prove(
+    labels: _Labels, exact: bool, sample: int, seed: int, progress: bool, result: Verification
+) -> None:
+    """Prove all labels."""
+    count = len(labels.feasible) + len(labels.infeasible)
+    # None: where stderr is no terminal.
+    with tqdm(total=count, unit=" labels", disable=None if progress else True) as bar:
+        size = 4096
+        for i in range(0, len(labels.feasible), size):
+            here = labels.feasible[i : i + size]
+            draw = np.random.default_rng([seed, i]).random(len(here))
+            drawn = exact | (draw * len(labels.feasible) < sample)
+            _prove_feasible(labels, here, drawn, result)
+            bar.update(len(here))
+        _prove_infeasible(labels, result, bar)
+    _compare_half_spaces(labels, result)
+    result.failures = {
+        i: f"at {labels.points[i].tolist()}: {why}" for i, why in result.failures.items()
+    }
+
+
+def _prove_feasible(
+    labels: _Labels, here: np.ndarray, drawn: np.ndarray, result: Verification
+) -> None:
+    """Prove states `here` feasible by their plans, those that are drawn in exact arithmetic."""
+    p, same = labels.p, np.searchsorted(labels.p.moves, labels.p.moves)
+    starts, plans = labels.arrays["start"][here], labels.arrays["plan"][here]
+    known = np.isfinite(starts).all(axis=1) & np.isfinite(plans).all(axis=(1, 2))
+    others = starts[:, p.others]
+    at_point = (starts[:, p.axes] == labels.points[here]).all(axis=1)
+    within = ((others >= p.low) & (others <= p.high)).all(axis=1)
+    held = (plans == plans[:, same]).all(axis=(1, 2))
+    reasons = {
+        "it has no plan": known,
+        "the start of its plan is another state": (at_point & within) | ~known,
+        "inputs that a control horizon holds differ": held | ~known,
+    }
+    for why, fine in reasons.items():
+        result.failures |= {int(j): why for j in here[~fine]}
+    margin = np.where(known, 0.0, -np.inf)
+    margin[known] = roll_out(p, starts[known], plans[known])
+    again = known & (drawn | ~(margin > 0))
+    margin[again] = roll_out_exactly(p, starts[again], plans[again])
+    for j in np.flatnonzero(again & (margin < 0)):
+        result.failures[int(here[j])] = f"its plan breaks a limit by {-margin[j]:.3g}"
+    good = [j for j, at in enumerate(here) if int(at) not in result.failures]
+    result.verified += len(good)
+    result.exactly += int(np.sum(again[good]))
+    result.margin = min(result.margin, float(margin[good].min(initial=np.inf)))
+
+
+def _prove_infeasible(labels: _Labels, result: Verification, bar: tqdm) -> None:
+    """Prove that no trajectory starts at states labelled infeasible."""
+    where = np.array([i for i in labels.infeasible if int(i) not in result.failures], int)
+    excess = exclude(labels.p, labels.points[where], labels.arrays["cut_normal"][where], bar)
+    result.failures |= {
+        int(i): "no half-space is found that excludes it" for i in where[~(excess > 0)]
+    }
+    proved = excess[excess > 0]
+    result.verified += len(proved)
+    result.exactly += len(proved)
+    result.excess = min(result.excess, float(proved.min(initial=np.inf)))
+
+
+def _compare_half_spaces(labels: _Labels, result: Verification) -> None:
+    """Look for stored half-spaces that contradict the labels: that do not exclude their own state,
+    or exclude a feasible one or a proved boundary point."""
+    points, arrays, infeasible = labels.points, labels.arrays, labels.infeasible
+    normals, offsets = arrays["cut_normal"][infeasible], arrays["cut_offset"][infeasible]
+    known = np.isfinite(offsets)
+    inside = known & ~(np.sum(normals * points[infeasible], axis=1) > offsets)
+    result.failures |= {int(i): "its half-space does not exclude it" for i in infeasible[inside]}
+    size = np.abs(normals).max(axis=1, initial=0.0, where=np.isfinite(normals))
+    known &= size > 0
+    H, h = normals[known] / size[known, None], offsets[known] / size[known]
+    _, first = np.unique(np.round(np.column_stack([H, h]), 9), axis=0, return_index=True)
+    H, h = H[first], h[first]
+    if "bound_normal" in arrays:
+        more = np.column_stack([arrays["bound_normal"], arrays["bound_offset"]])
+        more = np.unique(more, axis=0)
+        if not np.all(np.isfinite(more)):
+            result.problems.append("bound_normal, bound_offset: hold NaN or infinity")
+        H, h = np.concatenate([H, more[:, :-1]]), np.append(h, more[:, -1])
+    proved = points[labels.feasible]
+    if "bound_point" in arrays:
+        proved = np.concatenate([proved, arrays["bound_point"]])
+    for i in range(0, len(H), 256):
+        off = np.max(proved @ H[i : i + 256].T - h[i : i + 256], axis=0, initial=-np.inf)
+        reach = np.abs(proved).max(axis=0, initial=0.0) @ np.abs(H[i : i + 256]).T
+        for j in np.flatnonzero(off > 1e-12 * (reach + np.abs(h[i : i + 256]))):
+            what = f"half-space {H[i + j].tolist()} x <= {h[i + j]:.9g}"
+            result.problems.append(f"{what} excludes a feasible state by {off[j]:.3g}")
+
+
+def _compare_summary(path: Path, found: Stored, result: Verification) -> None:
+    """Compare what a summary says with the store beside it. Half-spaces of refinement exclude some
+    of the undecided states: those count as infeasible there."""
+    try:
+        summary, wrong = read_results(path)
+        counts = summary.get("linear", summary)["counts"]
+        feasible, infeasible, undecided = (
+            int(counts[k]) for k in ("feasible", "infeasible", "undecided")
+        )
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError):
+        result.problems.append(f"{path.name}: cannot be read, or holds no counts")
+        return
+    arrays, there = found.arrays, result.labels
+    open_, more = arrays["status"] == Status.ITERATION_LIMIT, infeasible - there["infeasible"]
+    beyond_bounds = np.zeros(len(open_), bool)
+    for a, b in zip(arrays.get("bound_normal", ()), arrays.get("bound_offset", ()), strict=True):
+        beyond_bounds |= found.points @ a > b
+    fine = (
+        feasible == there["feasible"]
+        and undecided == int(np.sum(open_)) - more
+        and 0 <= more <= int(np.sum(open_ & beyond_bounds))
+    )
+    if not fine and found.done == found.blocks:
+        what = f"{feasible} feasible, {infeasible} infeasible, {undecided} undecided"
+        wrong = f"{path.name}: counts {what}, the store {' '.join(map(str, there.values()))}"
+    elif summary.get("config") != found.attributes["config"]:
+        wrong = f"{path.name}: its configuration is not that of the store"
+    result.problems += [wrong] if wrong else []
+
+
+def find_store(path: str | Path) -> str | Path:
+    """Return the store at `path` or in that folder, or the arrays of a recursion report there; a
+    URL as it is."""
+    if "://" in str(path):
+        return str(path)
+    path = Path(path)
+    if (path / "zarr.json").exists() or path.suffix == ".npz":
+        return path
+    names = ("sweep.zarr", "robot_map.zarr", "recursion.npz")
+    inside = [path / name for name in names if (path / name).exists()]
+    if len(inside) != 1:
+        what = f"holds {' and '.join(v.name for v in inside)}" if inside else "holds no labels"
+        fail(str(path), what, "Give the folder of a sweep or a recursion report, or what it holds")
+    return inside[0]
