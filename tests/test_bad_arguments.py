@@ -509,7 +509,6 @@ CALLS = [
         "chunk: 1.5. Give a whole number of at",
         lambda: jm.map_feasible_set(M, np.zeros((3, 2)), chunk=1.5),
     ),
-    ("penalties: is a int. Give a", lambda: jm.map_feasible_set(M, np.zeros((3, 2)), penalties=3)),
     (
         "gap: 'x' where real numbers are",
         lambda: jm.map_feasible_set(M, np.zeros((3, 2)), gap="x"),
