@@ -43,7 +43,7 @@ def measure(case: tuple[str, float, bool]) -> tuple[Any, ...]:
     report = examine(mpc, seconds=seconds, search=search)
     wall, worst = time.perf_counter() - begun, report.counterexample
     distance = np.nan if worst is None else worst.distance
-    return wall, report.M, distance, report.lost_by_law, len(report.states)
+    return wall, report.law.holds, distance, report.lost_by_law, len(report.loops.x0s)
 
 
 def main() -> None:

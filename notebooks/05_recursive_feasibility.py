@@ -50,9 +50,9 @@ mpc = jm.MPC(
 # `recursive_feasibility` examines three claims about the feasible set $\mathcal X_N$, each weaker
 # than the one before:
 #
-# * **strong**: every feasible first move leads to a state in $\mathcal X_N$;
-# * **law**: the *optimal* first move does, which is recursive feasibility of the MPC law;
-# * **weak**: at least *some* feasible first move does.
+# * **strong**: every feasible first input leads to a state in $\mathcal X_N$;
+# * **law**: the *optimal* first input does, which is recursive feasibility of the MPC law;
+# * **weak**: at least *some* feasible first input does.
 #
 # For two states it enumerates the critical regions of the law, the polytopes on which the optimal
 # input is affine. The distance of the next state from $\mathcal X_N$ is convex on each region, so

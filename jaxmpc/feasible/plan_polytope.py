@@ -1,8 +1,8 @@
 """States, feasible decisions and next states as one polytope, and its projection on the states.
 
 A state θ and the decision variables z of the condensed problem are one vector v = (θ, z); the hard
-rows are a polytope G v ≤ g of such pairs, and the state after the first move is θ⁺ = M v + t. The
-feasible set is the projection of this polytope on θ; "every first move" and "some first move" are
+rows are a polytope G v ≤ g of such pairs, and the state after the first input is θ⁺ = M v + t. The
+feasible set is the projection of this polytope on θ; "every first input" and "some first input" are
 linear programs over it, solved by HiGHS in float64.
 """
 
@@ -102,7 +102,7 @@ class CenteredPolytope:
 class PlanPolytope:
     """The polytope {v = (θ, z): G v ≤ g} of states θ (p,) and decisions z that keep all rows.
 
-    G (rows, p + nz) has rows of length 1. M (p, p + nz), t (p,): the state after the first move is
+    G (rows, p + nz) has rows of length 1. M (p, p + nz), t (p,): the state after the first input is
     M v + t. exact: False where a constraint is no row (the terminal ellipsoid) and the polytope is
     too large for that. flat: whether equalities tie the coordinates of θ to each other, so that the
     feasible set has no volume.

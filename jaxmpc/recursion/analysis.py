@@ -1,22 +1,21 @@
-"""Recursive feasibility: does a controller that has a plan now have one at the next sample?
+"""Recursive feasibility: does a controller that has a plan now have one at the next time step?
 
 Three claims about the feasible set X_N of an MPC problem, each weaker than the one before:
 
-    strong  every first move of a feasible plan leads to a state in X_N,
-    law     the optimal first move does,
-    weak    some first move of a feasible plan does (X_N ⊆ X_{N+1}, where longer horizons can only
+    strong  every first input of a feasible plan leads to a state in X_N,
+    law     the optimal first input does,
+    weak    some first input of a feasible plan does (X_N ⊆ X_{N+1}, where longer horizons can only
             make these sets smaller; else the claim is slightly stronger).
 
 A claim is proved by an invariant terminal set (Theorem 1 of `verify_terminal`; Rawlings, Mayne &
 Diehl 2017, section 2.4), by linear programs over the polytope of all states and plans, or by the
-critical regions of the law (`proofs.py`). It is
-refuted by a counterexample: a state with a feasible plan, and a half-space that excludes the next
-state. The worst is at a vertex of a critical region; without all regions counterexamples are looked
-for among samples and by gradient ascent (`counterexample_search.py`).
+critical regions of the law (`proofs.py`). It is refuted by a counterexample: a state with a
+feasible plan, and a half-space that excludes the next state. The worst is at a vertex of a critical
+region; without all regions counterexamples are looked for among samples and by gradient ascent
+(`counterexample_search.py`).
 """
 
-from dataclasses import field, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,11 +23,11 @@ from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import default_chunk
 from jaxmpc.checks import fail, whole
 from jaxmpc.explicit.law import Law, RegionLaw
-from jaxmpc.feasible.labels import Labels
+from jaxmpc.feasible.plan_polytope import CenteredPolytope
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.grids import grid
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.pytrees import record
+from jaxmpc.recursion.claims import Claim, Counterexample
 from jaxmpc.recursion.counterexample_search import ascend
 from jaxmpc.recursion.counterexamples import (
     STARTS,
@@ -40,20 +39,26 @@ from jaxmpc.recursion.counterexamples import (
 from jaxmpc.recursion.proofs import (
     Claims,
     RegionVerdict,
-    every_move_leaves,
-    no_move_stays,
+    every_input_leaves,
+    no_input_stays,
     settle_by_regions,
     settle_claims,
 )
-from jaxmpc.recursion.report import NOT_FEASIBLE, Claim, Counterexample, RecursionReport
-from jaxmpc.recursion.sampled_loops import LawLoops, closed_loops, map_states
+from jaxmpc.recursion.report import RecursionReport
+from jaxmpc.recursion.sampled_loops import SampledLoops, closed_loops, labelled
 from jaxmpc.recursion.time_budget import LABELS, PLANS, PROOFS, Budget
 
 
 def recursive_feasibility(
-    mpc: MPC, x0s: Reals | None = None, *, steps: int = 20, search: bool = True,
-    max_regions: int = 2000, seconds: float = 60.0, progress: bool = False,
-) -> RecursionReport:  # fmt: skip
+    mpc: MPC,
+    x0s: Reals | None = None,
+    *,
+    steps: int = 20,
+    search: bool = True,
+    max_regions: int = 2000,
+    seconds: float = 60.0,
+    progress: bool = False,
+) -> RecursionReport:
     """Examine whether `mpc` is recursively feasible: proofs, the worst counterexample, the states
     lost.
 
@@ -98,139 +103,147 @@ def recursive_feasibility(
 
 
 def examine(
-    mpc: MPC, x0s: Any, steps: int, search: bool, max_regions: int, budget: Budget, settled: float
+    mpc: MPC,
+    x0s: Reals | None,
+    steps: int,
+    search: bool,
+    max_regions: int,
+    budget: Budget,
+    settled: float,
 ) -> RecursionReport:
     """Return the report of `recursive_feasibility`; settled: when its stage 1 has to end."""
     problem = FeasibilityProblem.of(mpc)
+    p = problem.dimension
     steps, max_regions = whole("steps", steps, 1), whole("max_regions", max_regions, 0)
-    if x0s is not None:
-        x0s, p = host_array("x0s", x0s), problem.dimension
-        if x0s.ndim != 2 or x0s.shape[1] != p or not len(x0s):
-            fail("x0s", f"shape {x0s.shape}", f"Give at least one state, (B, {p})")
+    given = np.zeros((0, p)) if x0s is None else host_array("x0s", x0s)
+    if x0s is not None and (given.ndim != 2 or given.shape[1] != p or not len(given)):
+        fail("x0s", f"shape {given.shape}", f"Give at least one state, (B, {p})")
     budget.say("theorem and linear programs")
     claims = settle_claims(mpc, problem, settled)
     lost = 0.0 if claims.law.holds and np.isfinite(claims.volume) else np.nan
-    verdict: RegionVerdict | None = None
+    verdict = RegionVerdict.none(p)
     if max_regions and not claims.law.holds and np.isfinite(claims.volume):
         budget.say("critical regions of the law")
         verdict = settle_by_regions(claims, max_regions, budget.share(0.5))
         lost = verdict.lost
         if claims.law.holds is None:
             claims = replace(claims, law=verdict.claim)
-    none = np.zeros((0, problem.dimension))
+    loops = SampledLoops.undecided(problem, given, steps)
     if x0s is None and claims.law.holds:
-        return _report(claims, None, lost, none, _unfollowed(problem, none), steps, budget)
+        return _report(claims, None, lost, loops, budget)
     if not budget.affords(PROOFS):
         budget.say("the time is over before a counterexample is proved")
-        x0s = none if x0s is None else x0s
-        return _report(
-            _open(claims, verdict), None, lost, x0s, _unfollowed(problem, x0s), steps, budget
-        )
+        return _report(_open(claims, verdict, None), None, lost, loops, budget)
+
     bound, starts = outer_bound(claims)
-    asked = x0s is not None
+    samples = given
     if x0s is None:
         if bound is None:
             fail("x0s", f"None, and {claims.why}", "Give the states to look at, (B, n)")
-        x0s = _samples(claims, starts, bound.center)
-    easy = x0s[0] if bound is None else bound.center
-    chunk = 1024 if len(x0s) <= 16_384 else default_chunk()
-    found = None if verdict is None else verdict.regions
-    complete = found is not None and found.complete
-    law = RegionLaw(found, easy, chunk) if found is not None and complete else Law(mpc, easy, chunk)
-    worst = None
-    if verdict is not None and found is not None and len(verdict.worst):
+        samples = _samples(claims, starts, bound.center)
+    easy = samples[0] if bound is None else bound.center
+    chunk = 1024 if len(samples) <= 16_384 else default_chunk()
+    regions, worst = verdict.regions, None
+    region_law = None if regions is None else RegionLaw(regions, easy, chunk)
+    complete = regions is not None and regions.complete
+    law = region_law if region_law is not None and complete else Law(mpc, easy, chunk)
+    if region_law is not None and len(verdict.worst):
         budget.say(f"proof of the counterexample; compiles for some {PROOFS:.0f} s")
         by = ["regions"] * len(verdict.worst)
-        worst = certified(RegionLaw(found, easy, chunk), problem, bound, verdict.worst, by)
+        worst = certified(region_law, problem, bound, verdict.worst, by)
     compiles, ascents = LABELS + (0.0 if complete else PLANS), 0
-    followed = _unfollowed(problem, x0s if asked else none)
     if not budget.affords(compiles):
         budget.say(f"no samples: they compile for some {compiles:.0f} s, which are not left")
-        x0s = x0s if asked else none
     else:
-        budget.say(
-            f"closed loops of {steps} steps from {len(x0s):,} samples; compile for some "
-            f"{compiles:.0f} s"
-        )
-        labels = map_states(law, problem, x0s).labels
-        label = labels.label
-        loops = closed_loops(law, problem, x0s, label, steps, budget)
-        followed = labels, loops
+        what = f"closed loops of {steps} steps from {len(samples):,} samples"
+        budget.say(f"{what}; compile for some {compiles:.0f} s")
+        labels = labelled(law, problem, samples)
+        loops = closed_loops(law, problem, samples, labels, steps, budget)
         if bound is not None and not complete and not claims.law.holds:
-            candidates = worst_samples(bound, x0s, loops)
+            candidates = worst_samples(bound, loops)
             by = ["sample"] * len(candidates)
             if search:
-                far = farthest_first(bound, loops.next_states[label == 1])[: STARTS // 4]
-                starts = np.concatenate([claims.seeds, starts[:STARTS], x0s[label == 1][far]])
+                starts = _search_starts(claims, bound, starts, loops)
                 ascents = len(starts)
                 budget.say(f"gradient ascent from {ascents} states")
                 tops = ascend(law, bound, starts, budget.share(0.8))
-                candidates, by = np.concatenate([candidates, tops]), by + ["search"] * len(tops)
+                by += ["search"] * len(tops)
+                candidates = np.concatenate([candidates, tops])
             budget.say(f"proof of the counterexample; compiles for some {PROOFS:.0f} s")
             other = certified(law, problem, bound, candidates, by)
             if worst is None or (other is not None and other.distance > worst.distance):
                 worst = other
-    if worst is not None:
-        refuted = Claim(False, str(worst), worst.state)
-        strong = claims.strong if claims.strong.holds is False else refuted
-        weak = claims.weak
-        if weak.holds is None and no_move_stays(problem.plan_polytope, worst.state):
-            weak = every_move_leaves(worst.state)
-        claims = replace(claims, law=refuted, strong=strong, weak=weak)
-    else:
-        claims = _open(claims, verdict, followed, ascents)
-    return _report(claims, worst, lost, x0s, followed, steps, budget)
+    if worst is None:
+        return _report(_open(claims, verdict, loops, ascents), None, lost, loops, budget)
+    return _report(_refuted(claims, worst), worst, lost, loops, budget)
+
+
+def _search_starts(
+    claims: Claims, bound: CenteredPolytope, starts: np.ndarray, loops: SampledLoops
+) -> np.ndarray:
+    """Return states (S, p) from which to search: those of a claim refuted already, some near the
+    boundary, and samples that lead farthest outside."""
+    feasible = loops.label == 1
+    far = farthest_first(bound, loops.next_states[feasible])[: STARTS // 4]
+    return np.concatenate([claims.seeds, starts[:STARTS], loops.x0s[feasible][far]])
+
+
+def _refuted(claims: Claims, worst: Counterexample) -> Claims:
+    """Return the claims with a certified counterexample to the law."""
+    refuted = Claim(False, str(worst), worst.state)
+    strong = claims.strong if claims.strong.holds is False else refuted
+    weak = claims.weak
+    if weak.holds is None and no_input_stays(claims.problem.plan_polytope, worst.state):
+        weak = every_input_leaves(worst.state)
+    return replace(claims, law=refuted, strong=strong, weak=weak)
 
 
 def _open(
-    claims: Claims, verdict: RegionVerdict | None, followed: Any = None, ascents: int = 0
+    claims: Claims, verdict: RegionVerdict, loops: SampledLoops | None, ascents: int = 0
 ) -> Claims:
     """Return the claims without a certified counterexample: that about the law stays open unless
     some other proof or counterexample settles it, and says what was tried.
 
-    followed: labels and closed loops of the samples, None where the time was over before.
+    loops: None where the time was over before.
     """
     if claims.law.holds or claims.weak.holds is False:
         return claims
     reason = claims.law.reason
-    if verdict is not None and verdict.claim.holds is False:
-        why = "no time was left for that" if followed is None else "its proof failed"
+    if verdict.claim.holds is False:
+        why = "no time was left for that" if loops is None else "its proof failed"
         reason = f"{verdict.claim.reason}, which is not certified: {why}"
         return replace(claims, law=Claim(None, reason, verdict.claim.state))
-    if followed is None or not len(followed[0].label):
+    if loops is None or not len(loops.x0s):
         return replace(claims, law=Claim(None, f"no time was left for samples; no proof: {reason}"))
-    label, loops = followed[0].label, followed[1]
-    tried = f"{np.sum(label == 1):,} samples" + (f" and {ascents} ascents" if ascents else "")
+    tried = f"{np.sum(loops.label == 1):,} samples" + (f" and {ascents} ascents" if ascents else "")
     lost = np.sum(loops.lost_at == 1)
     what = f"{lost:,} lost after one step, but no" if lost else "no"
-    return replace(
-        claims, law=Claim(None, f"{what} counterexample among {tried}; no proof: {reason}")
-    )
-
-
-def _unfollowed(problem: FeasibilityProblem, x0s: np.ndarray) -> tuple[Labels, LawLoops]:
-    """Return labels and closed loops of samples (B, p) that there was no time for: undecided."""
-    count = len(x0s)
-    nowhere = np.full_like(x0s, np.nan)
-    loops = LawLoops(
-        np.full((count, problem.mpc.system.m), np.nan), nowhere, np.full(count, NOT_FEASIBLE),
-        np.zeros(count, int),
-    )  # fmt: skip
-    return Labels.empty(count, problem), loops
+    reason = f"{what} counterexample among {tried}; no proof: {reason}"
+    return replace(claims, law=Claim(None, reason))
 
 
 def _report(
-    claims: Claims, worst: Counterexample | None, lost: float, x0s: np.ndarray,
-    followed: tuple[Labels, LawLoops], steps: int, budget: Budget,
-) -> RecursionReport:  # fmt: skip
-    """Return the report of all that was found. followed: labels and closed loops of x0s."""
-    body, (labels, loops) = claims.feasible_set, followed
+    claims: Claims,
+    worst: Counterexample | None,
+    lost_by_law: float,
+    loops: SampledLoops,
+    budget: Budget,
+) -> RecursionReport:
+    """Return the report of all that was found."""
+    body = claims.feasible_set
     return RecursionReport(
-        claims.mpc, claims.strong, claims.law, claims.weak, worst,
-        None if body is None else body.polytope, claims.volume, claims.lost, lost,
-        x0s, labels.label, loops.inputs, loops.next_states, loops.lost_at, loops.undecided_at,
-        steps, budget.spent, labels,
-    )  # fmt: skip
+        mpc=claims.mpc,
+        strong=claims.strong,
+        law=claims.law,
+        weak=claims.weak,
+        counterexample=worst,
+        feasible_set=None if body is None else body.polytope,
+        volume=claims.volume,
+        lost_by_any=claims.lost,
+        lost_by_law=lost_by_law,
+        loops=loops,
+        seconds=budget.spent,
+    )
 
 
 def _samples(claims: Claims, starts: np.ndarray, center: np.ndarray) -> np.ndarray:
@@ -244,62 +257,3 @@ def _samples(claims: Claims, starts: np.ndarray, center: np.ndarray) -> np.ndarr
     random = np.random.default_rng(0)
     ends = starts[random.integers(len(starts), size=4096)] - center
     return center + random.uniform(0, 1, (len(ends), 1)) ** (1 / p) * ends
-
-
-@record
-class SmallestHorizon:
-    """The least horizon at which the law is proved recursively feasible, None where none was found.
-
-    strong: the least at which every feasible first move is proved to stay (None: none). reasons:
-    the claim about the law at each horizon looked at.
-    """
-
-    horizon: int | None
-    strong: int | None
-    reasons: dict[int, Claim] = field(default_factory=dict)
-
-
-def smallest_horizon(
-    mpc: MPC,
-    max_horizon: int = 20,
-    *,
-    max_regions: int = 2000,
-    seconds: float = 60.0,
-    progress: bool = False,
-) -> SmallestHorizon:
-    """Try horizons 1, 2, … up to `max_horizon` with proofs alone (no samples, no search).
-
-    seconds: time limit, after which larger horizons are left out (some linear programs are
-    finished); a horizon takes a second or so with two states, minutes with hundreds of facets or
-    thousands of regions. progress: print each horizon on stderr. The horizon of `mpc` itself has
-    no influence. The answer is the least horizon with a proof; a smaller one that is neither proved
-    nor refuted is in `reasons` with holds None, and one at which the problem is ill-posed (more
-    free moves than steps) is left out of it. Raises ValueError for an ill-posed problem.
-    """
-    mpc.validate()
-    max_horizon = whole("max_horizon", max_horizon, 1)
-    max_regions = whole("max_regions", max_regions, 0)
-    least, reasons = None, {}
-    budget = Budget.of(seconds, progress)
-    for N in range(1, max_horizon + 1):
-        if not budget.affords(0):
-            break
-        budget.say(f"horizon {N}")
-        changed = replace(mpc, horizon=N)
-        try:
-            problem = FeasibilityProblem.of(changed)
-        except ValueError:  # such as more free moves than steps
-            continue
-        try:
-            claims = settle_claims(changed, problem, budget.deadline)
-            law = claims.law
-            if law.holds is None and least is None and max_regions and np.isfinite(claims.volume):
-                law = settle_by_regions(claims, max_regions, budget.deadline).claim
-        except ValueError as error:  # too ill-conditioned: the other horizons stay settled
-            reasons[N] = Claim(None, f"not settled ({error})")
-            continue
-        reasons[N] = law
-        least = N if law.holds and least is None else least
-        if claims.strong.holds:
-            return SmallestHorizon(least, N, reasons)
-    return SmallestHorizon(least, None, reasons)

@@ -10,9 +10,9 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import first_of_block
 from jaxmpc.feasible.rays import BACKOFFS, Rays, ray_directions
 from jaxmpc.qp.status import Status
-from jaxmpc.recursion.proofs import CLEAR, Claims
-from jaxmpc.recursion.report import Counterexample
-from jaxmpc.recursion.sampled_loops import LawLoops
+from jaxmpc.recursion.claims import CLEAR, Counterexample
+from jaxmpc.recursion.proofs import Claims
+from jaxmpc.recursion.sampled_loops import SampledLoops
 
 STARTS = 96
 
@@ -57,10 +57,10 @@ def farthest_first(bound: CenteredPolytope, after: np.ndarray) -> np.ndarray:
     return np.argsort(-np.nan_to_num(bound.beyond(after), nan=-np.inf))
 
 
-def worst_samples(bound: CenteredPolytope, x0s: np.ndarray, loops: LawLoops) -> np.ndarray:
+def worst_samples(bound: CenteredPolytope, loops: SampledLoops) -> np.ndarray:
     """Return up to three of the samples (B, p) lost after one step, farthest outside."""
     lost = np.flatnonzero(loops.lost_at == 1)
-    return x0s[lost[farthest_first(bound, loops.next_states[lost])[:3]]]
+    return loops.x0s[lost[farthest_first(bound, loops.next_states[lost])[:3]]]
 
 
 def certified(

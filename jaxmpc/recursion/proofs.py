@@ -18,16 +18,12 @@ from jaxmpc.feasible.polytope import backward, is_standard_form
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
-from jaxmpc.recursion.report import Claim, in_words
+from jaxmpc.recursion.claims import CLEAR, Claim, in_words
 from jaxmpc.sets.any_set import set_bounds
 from jaxmpc.sets.polytope import Polytope
 from jaxmpc.sets.terminal_hypotheses import verify_terminal
 from jaxmpc.systems.system import host_matrices
 
-# Distance from a facet of X_N, relative to the facet's from the centre, from which a state counts
-# as outside: well above the residuals of plans. Next states are moved towards the centre by as much
-# before they are labelled.
-CLEAR = 1e-7
 LATE = "the time was over before its linear programs were solved"
 
 
@@ -36,7 +32,7 @@ class Claims:
     """The three claims about a problem, as far as they are settled without the law, and X_N.
 
     feasible_set: X_N, or None and `why`. volume: of X_N; lost: of the part from which every first
-    move leaves X_N; NaN where unknown. seeds (S, p): states with a first move that leaves X_N, or
+    input leaves X_N; NaN where unknown. seeds (S, p): states with a first input that leaves X_N, or
     without one that stays.
     """
 
@@ -77,7 +73,7 @@ def settle_claims(mpc: MPC, problem: FeasibilityProblem, deadline: float = np.in
     else:
         strong, leaving = _by_theorem(mpc), none
     if strong.holds is None and found is not None:
-        strong, leaving = _every_move(mpc, plans, found, deadline)
+        strong, leaving = _every_input(mpc, plans, found, deadline)
     elif strong.holds is None:
         strong = Claim(None, f"{strong.reason}; {why}")
     if strong.holds:
@@ -87,7 +83,7 @@ def settle_claims(mpc: MPC, problem: FeasibilityProblem, deadline: float = np.in
     if found is not None and before is not None and after is not None:
         weak, stuck = _longer(before, found, after, deadline)
     elif found is not None:
-        weak, lost, stuck = _some_move(plans, found, deadline)
+        weak, lost, stuck = _some_input(plans, found, deadline)
     law = Claim(None, why or "the critical regions were not looked at")
     if weak.holds is False:
         law = replace(weak, reason=f"{weak.reason}, the optimal one too")
@@ -95,7 +91,7 @@ def settle_claims(mpc: MPC, problem: FeasibilityProblem, deadline: float = np.in
     return Claims(mpc, problem, found, why, strong, law, weak, volume, lost, seeds)
 
 
-def _every_move(
+def _every_input(
     mpc: MPC, plans: PlanPolytope, body: CenteredPolytope, deadline: float
 ) -> tuple[Claim, np.ndarray]:
     """Settle the strong claim by one LP for each facet of X_N; return it and the states led
@@ -110,14 +106,14 @@ def _every_move(
     points = [v for _, _, v in tops if v is not None]
     if violation.max() <= TOLERANCE:
         count = f"one LP for each of {len(tops)} facets, largest violation {violation.max():.1e}"
-        reason = f"every feasible first move stays ({_set_before(mpc, body)}{count})"
+        reason = f"every feasible first input stays ({_set_before(mpc, body)}{count})"
         return Claim(True, reason), np.zeros((0, p))
     if not len(outside) or len(points) < len(tops):
         reason = f"an LP is within {CLEAR:g} of the size of X_N, {violation.max():.1e}"
         return Claim(None, reason), np.zeros((0, p))
     where, after = points[i][:p], plans.M @ points[i] + plans.t
     reason = (
-        f"from x = {in_words(where)} a feasible first move leads to {in_words(after)}, "
+        f"from x = {in_words(where)} a feasible first input leads to {in_words(after)}, "
         f"{beyond[i] * body.depths[i]:.6g} beyond a facet of X_N"
     )
     return Claim(False, reason, where), np.array(points)[outside, :p]
@@ -141,11 +137,11 @@ def _nested(mpc: MPC) -> bool:
     return mpc.constrain_initial and (mpc.terminal_set is None or mpc.terminal_set is mpc.states)
 
 
-def _some_move(
+def _some_input(
     plans: PlanPolytope, body: CenteredPolytope, deadline: float
 ) -> tuple[Claim, float, np.ndarray]:
     """Settle the weak claim by comparing X_N with the states that can go on; return it, the volume
-    lost whatever the move, and the vertices of X_N that are lost.
+    lost whatever the input, and the vertices of X_N that are lost.
     """
     none = np.zeros((0, plans.p))
     later = projected(plans.followed(), deadline)
@@ -155,19 +151,19 @@ def _some_move(
     i = int(np.argmax(violation))
     lost = max(body.polytope.volume() - later.polytope.volume(), 0.0)
     if violation[i] <= TOLERANCE:
-        what = f"all {len(violation)} vertices of X_N have a first move that stays"
+        what = f"all {len(violation)} vertices of X_N have a first input that stays"
         return Claim(True, f"{what} (largest violation {max(violation[i], 0.0):.1e})"), 0.0, none
     if violation[i] <= CLEAR:
         reason = f"a vertex is within {CLEAR:g} of the size of X_N, {violation[i]:.1e}"
         return Claim(None, reason), lost, none
-    return every_move_leaves(body.vertices[i]), lost, body.vertices[violation > CLEAR]
+    return every_input_leaves(body.vertices[i]), lost, body.vertices[violation > CLEAR]
 
 
 def _longer(
     before: CenteredPolytope, body: CenteredPolytope, after: CenteredPolytope, deadline: float
 ) -> tuple[Claim, np.ndarray]:
     """Settle the weak claim by half-spaces alone: X_N ⊆ X_{N+1}, and X_N ⊆ X_{N−1}, so that a first
-    move into X_N is that of a feasible plan. Return it and the states that are not in X_{N+1}.
+    input into X_N is that of a feasible plan. Return it and the states that are not in X_{N+1}.
     """
     tops = [body.support(normal) for normal in after.normals if time.monotonic() < deadline]
     if len(tops) < len(after.normals):
@@ -179,7 +175,7 @@ def _longer(
     if len(seeds):
         x = seeds[0]
         return Claim(
-            False, f"from x = {in_words(x)} every feasible first move leaves X_N", x
+            False, f"from x = {in_words(x)} every feasible first input leaves X_N", x
         ), seeds
     nested = np.array([body.support(normal)[0] for normal in before.normals]) - before.offsets
     if max(violation[i], (nested / before.depths).max()) <= TOLERANCE:
@@ -187,15 +183,15 @@ def _longer(
     return Claim(None, "X_N lies in X_N+1, but not in X_N-1: its plans may lead elsewhere"), seeds
 
 
-def every_move_leaves(state: np.ndarray) -> Claim:
+def every_input_leaves(state: np.ndarray) -> Claim:
     """Return the weak claim, refuted at a state."""
-    reason = f"from x = {in_words(state)} every feasible first move leaves X_N"
+    reason = f"from x = {in_words(state)} every feasible first input leaves X_N"
     return Claim(False, reason, state)
 
 
-def no_move_stays(plans: PlanPolytope, state: np.ndarray) -> bool:
-    """Return whether no feasible first move from `state` stays: it lies outside the states that can
-    go on."""
+def no_input_stays(plans: PlanPolytope, state: np.ndarray) -> bool:
+    """Return whether no feasible first input from `state` stays: it lies outside the states that
+    can go on."""
     later = plans.followed()
     if not plans.exact:
         return False
@@ -245,6 +241,11 @@ class RegionVerdict:
     worst: np.ndarray
     regions: CriticalRegions | None
 
+    @classmethod
+    def none(cls, dimension: int, reason: str = "they were not looked at") -> "RegionVerdict":
+        """Return what is known without regions."""
+        return cls(Claim(None, reason), np.nan, np.zeros((0, dimension)), None)
+
 
 def settle_by_regions(claims: Claims, max_regions: int, deadline: float = np.inf) -> RegionVerdict:
     """Settle the law claim by at most `max_regions` critical regions, found before the deadline.
@@ -260,7 +261,7 @@ def settle_by_regions(claims: Claims, max_regions: int, deadline: float = np.inf
             fail("mpc", "its law depends on the previous input", "They are not enumerated then")
         found = critical_regions(mpc, max_regions=max_regions, seconds=deadline - time.monotonic())
     except ValueError as error:
-        return RegionVerdict(Claim(None, f"no critical regions ({error})"), np.nan, none, None)
+        return RegionVerdict.none(claims.problem.dimension, f"no critical regions ({error})")
     A, B, c = host_matrices(mpc.system)
     violation, parts, lost = [-np.inf], [none], 0.0
     for region in found.regions:

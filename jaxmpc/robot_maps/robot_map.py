@@ -91,8 +91,9 @@ class RobotMap:
         report = self.recursion
         if report is None:
             return self.linear.label
-        lost = (report.lost_at > 0) | (report.label == -1)
-        return np.select([report.lost_at == 0, lost], [1, -1], 0).astype(np.int8)
+        loops = report.loops
+        lost = (loops.lost_at > 0) | (loops.label == -1)
+        return np.select([loops.lost_at == 0, lost], [1, -1], 0).astype(np.int8)
 
     @property
     def held(self) -> np.ndarray:
@@ -175,10 +176,13 @@ class RobotMap:
     def summary(self) -> dict[str, Any]:
         """Return the counts of the map and its deepest failure as JSON data."""
         worst, report = self.worst(), self.recursion
-        linear = {"counts": self.linear.counts(), "volume": list(self.linear.volume_bounds())}
+        linear: dict[str, Any] = {
+            "counts": self.linear.counts(),
+            "volume": list(self.linear.volume_bounds()),
+        }
         if report is not None:
-            claims = {name: str(getattr(report, name)) for name in ("strong", "law", "weak")}
-            linear["recursion"] = claims | {"counts": report.counts()}
+            claims = {name: str(claim) for name, claim in report.claims.items()}
+            linear["recursion"] = claims | {"counts": report.loops.counts()}
         deepest = None
         if worst is not None:
             deepest = {

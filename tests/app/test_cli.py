@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -20,8 +21,11 @@ from jaxmpc.app import cli
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands import linear_sweep, recursion
 from jaxmpc.feasible import labelling
+from jaxmpc.feasible.labels import Labels
+from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.files import read_arrays, write_arrays
 from jaxmpc.recursion import Claim, Counterexample, RecursionReport, SmallestHorizon
+from jaxmpc.recursion.sampled_loops import SampledLoops
 from jaxmpc.sets.box import Box
 
 
@@ -246,12 +250,15 @@ def canned(mpc, x0s, **settings):
         found="search",
     )  # fmt: skip
     refuted = Claim(False, "an example", x0s[0])
+    labels = Labels.empty(count, FeasibilityProblem.of(mpc))
     return RecursionReport(
         mpc=mpc, strong=refuted, law=refuted, weak=Claim(None, "no facets"), counterexample=worst,
         feasible_set=Box(-np.ones(n), np.ones(n)).to_polytope(), volume=4.0, lost_by_any=np.nan,
-        lost_by_law=0.5, states=x0s, label=np.ones(count, np.int8), inputs=np.zeros((count, 1)),
-        next_states=x0s, lost_at=np.arange(count) % 3, undecided_at=np.zeros(count, int),
-        steps=settings["steps"], seconds=1.0,
+        lost_by_law=0.5, seconds=1.0, loops=SampledLoops(
+            x0s=x0s, labels=replace(labels, label=np.ones(count, np.int8)),
+            inputs=np.zeros((count, 1)), next_states=x0s, lost_at=np.arange(count) % 3,
+            undecided_at=np.zeros(count, int), steps=settings["steps"],
+        ),
     )  # fmt: skip
 
 
@@ -265,7 +272,7 @@ def examined(monkeypatch):
         return canned(mpc, x0s, **settings)
 
     monkeypatch.setattr(recursion, "recursive_feasibility", record)
-    least = SmallestHorizon(5, 6, {5: Claim(True, "by regions")})
+    least = SmallestHorizon(5, 6, {5: Claim(True, "by regions")}, 8)
     monkeypatch.setattr(recursion, "smallest_horizon", lambda *a, **k: least)
     return calls
 
@@ -276,7 +283,7 @@ def test_recursion_writes_files_and_table(tmp_path, capsys, examined):
     mpc, x0s, settings = examined[0]
     assert (mpc.horizon, x0s.shape) == (4, (30, 2))
     # Half of the time is for --smallest.
-    expected = {"steps": 3, "search": False, "regions": 0, "seconds": 4.5, "progress": True}
+    expected = {"steps": 3, "search": False, "max_regions": 0, "seconds": 4.5, "progress": True}
     assert settings == expected
     np.testing.assert_allclose(x0s[0], [-1.59, -2.12])  # limits and 3 %
     out = capsys.readouterr().out

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from jaxmpc.app.plots import plot_feasible_set, plot_recursion, plot_robot_map
 from jaxmpc.recursion import Claim, Counterexample, RecursionReport
+from jaxmpc.recursion.sampled_loops import SampledLoops
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.polytope import Polytope
 from jaxmpc.systems.system import LinearSystem
@@ -114,9 +115,11 @@ def recursion_report(points, worst=True):
         strong=Claim(False, "a"), law=Claim(False, "b"), weak=Claim(None, "c"),
         counterexample=counterexample if worst else None,
         feasible_set=Box(-np.ones(2), np.ones(2)).to_polytope(), volume=4.0, lost_by_any=np.nan,
-        lost_by_law=0.1, states=points, label=np.where(inside, 1, -1).astype(np.int8),
-        inputs=np.zeros((len(points), 1)), next_states=points, lost_at=lost_at,
-        undecided_at=np.where(lost_at == -2, 1, 0), steps=9, seconds=1.0,
+        lost_by_law=0.1, seconds=1.0, loops=SampledLoops(
+            x0s=points, labels=SimpleNamespace(label=np.where(inside, 1, -1).astype(np.int8)),
+            inputs=np.zeros((len(points), 1)), next_states=points, lost_at=lost_at,
+            undecided_at=np.where(lost_at == -2, 1, 0), steps=9,
+        ),
     )  # fmt: skip
 
 
@@ -126,10 +129,10 @@ def test_recursion_shows_fates_set_and_counterexample(tmp_path):
     ax = plot_recursion(report)
     image = ax.images[0].get_array().T.ravel()
     for fate, lost in ((0, -1), (1, -2), (2, 0), (3, 1), (6, 4)):
-        np.testing.assert_array_equal(image == fate, report.lost_at == lost)
+        np.testing.assert_array_equal(image == fate, report.loops.lost_at == lost)
     shown = texts(ax)
     names = ("infeasible", -1), ("undecided", -2), ("kept for 9 steps", 0), ("lost at step 1", 1)
-    counts = [(f"{name} ({np.sum(report.lost_at == fate):,})") for name, fate in names]
+    counts = [(f"{name} ({np.sum(report.loops.lost_at == fate):,})") for name, fate in names]
     assert shown[:4] == counts and shown[4].startswith("lost at step 4 to 5 (")
     assert shown[-4:] == [
         "X_7: states with a plan",
@@ -153,8 +156,9 @@ def test_recursion_refuses_what_it_cannot_draw():
     report = recursion_report(square(5), worst=False)
     with pytest.raises(ValueError, match="enlarge: without a counterexample"):
         plot_recursion(report, enlarge=True)
+    loops = dataclasses.replace(report.loops, x0s=np.zeros((5, 3)))
     with pytest.raises(ValueError, match="report: is of 3 states"):
-        plot_recursion(dataclasses.replace(report, states=np.zeros((5, 3))))
+        plot_recursion(dataclasses.replace(report, loops=loops))
 
 
 @pytest.mark.parametrize("claim", ["limits", "recursion"])

@@ -221,7 +221,7 @@ class TestRegions:
             with pytest.raises(ValueError, match=message):
                 critical_regions(changed)
         for limit in (0, 1.5, True):
-            with pytest.raises(ValueError, match="limit"):
+            with pytest.raises(ValueError, match="max_regions"):
                 critical_regions(mpc, max_regions=limit)
         with pytest.raises(ValueError, match="within"):
             critical_regions(mpc, within=np.ones(2))
@@ -362,7 +362,7 @@ class TestExactPenalty:
             ({"rho": np.ones(2)}, "rho"),
             ({"x0s": np.zeros(2)}, "x0s"),
             ({"x0s": np.zeros((3, 1))}, "x0s"),
-            ({"limit": 0}, "limit"),
+            ({"max_regions": 0}, "max_regions"),
         ]:
             with pytest.raises(ValueError, match=message):
                 exact_penalty(mpc, **settings)

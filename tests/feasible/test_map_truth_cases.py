@@ -82,7 +82,7 @@ def lecture_sets():
 def lecture_recursion():
     """|u| ≤ 1/4, N = 3: lost, at worst by 0.0474341649 from (−0.95, 1); N = 4: kept."""
     report = jm.recursive_feasibility(problems.lecture(), steps=2)
-    assert (report.W, report.S, report.M) == (False, False, False)
+    assert (report.weak.holds, report.strong.holds, report.law.holds) == (False, False, False)
     worst = report.counterexample
     assert worst.distance == pytest.approx(0.04743416490252569, abs=1e-4)
     assert np.abs(np.abs(worst.state) - [0.95, 1.0]).max() < 1e-3
@@ -94,7 +94,7 @@ def lecture_recursion():
 def lecture_weaker():
     """|u| ≤ 0.3, N = 3: the law stays although not every feasible move does."""
     report = jm.recursive_feasibility(problems.lecture(0.3), steps=2)
-    assert (report.W, report.S, report.M) == (True, False, True)
+    assert (report.weak.holds, report.strong.holds, report.law.holds) == (True, False, True)
 
 
 def lecture_penalty():
@@ -137,7 +137,7 @@ def joint_needle():
     """N = 4: 0.0134 % of the area is lost; the search finds (1.444, 2) → (1.464, 1.6)."""
     report = jm.recursive_feasibility(problems.joint(4), steps=1, max_regions=0)
     worst = report.counterexample
-    assert report.M is False and worst.distance == pytest.approx(0.0039968, abs=1e-5)
+    assert report.law.holds is False and worst.distance == pytest.approx(0.0039968, abs=1e-5)
     np.testing.assert_allclose(np.abs(worst.state), [1.444, 2.0], atol=1e-3)
 
 

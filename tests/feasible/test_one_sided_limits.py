@@ -296,7 +296,7 @@ class TestOtherQuestions:
         """Samples are lost by proof, though no half-space of the whole set shows it."""
         x0s = np.random.default_rng(0).uniform([-4, -1], [1.2, 2], (60, 2))
         report = jm.recursive_feasibility(self.car, x0s, steps=1, search=False)
-        assert report.counts()["lost after one step"] > 0 and report.M is None
+        assert report.loops.counts()["lost after one step"] > 0 and report.law.holds is None
         assert "unbounded" in str(report.law) and "lost after one step" in str(report.law)
 
 

@@ -12,6 +12,7 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.explicit.law import Law, RegionLaw
 from jaxmpc.explicit.regions import critical_regions
+from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.plan_polytope import CenteredPolytope, projected
 from jaxmpc.feasible.polytope import backward
 from jaxmpc.feasible.problem import FeasibilityProblem
@@ -170,7 +171,7 @@ class TestProofs:
         assert "X_5 = X_6" in reason and "14 facets" in reason
         found = settled(problems.lecture(0.25, 3))
         body = exact.feasible_polygon(problems.lecture(0.25, 4))
-        assert "every feasible first move leaves X_N" in found.weak.reason
+        assert "every feasible first input leaves X_N" in found.weak.reason
         assert not body.contains(found.weak.state[None])[0]  # it is not in X_4
         assert "beyond a facet of X_N" in found.strong.reason
         assert str(found.strong).startswith("refuted: from x = (")
@@ -184,7 +185,7 @@ class TestProofs:
             blocked = _by_theorem(replace(problems.joint_o_inf(6), **change))
             assert blocked.holds is None and "does not cover" in blocked.reason
         short = replace(problems.scalar(0.5, 1, 1.0, 0.1), terminal_set=None)
-        assert _by_theorem(short).holds is None  # its first move may leave the limits
+        assert _by_theorem(short).holds is None  # its first input may leave the limits
         assert _by_theorem(replace(short, horizon=2)).holds is True
 
     def test_no_limit_on_the_state(self):
@@ -219,7 +220,7 @@ class TestProofs:
 
     @pytest.mark.slow
     def test_weak_where_sets_do_not_nest(self):
-        """The first move must be that of a feasible plan: X_N against Pre(X_N ∩ X_{N−1})."""
+        """The first input must be that of a feasible plan: X_N against Pre(X_N ∩ X_{N−1})."""
         mpc = problems.drifting()
         body = exact.feasible_polygon(mpc)
         shorter = exact.feasible_polygon(replace(mpc, horizon=mpc.horizon - 1))
@@ -320,11 +321,11 @@ class TestReport:
         check_counterexample(mpc, c)
         assert report.lost_by_law == pytest.approx(0.02, abs=1e-9)
         assert report.lost_by_any == pytest.approx(0.02, abs=1e-9)
-        np.testing.assert_array_equal(report.label, [1, 1, 1, -1, 0])
-        np.testing.assert_array_equal(report.lost_at, [1, 1, 0, -1, -1])
-        np.testing.assert_allclose(report.inputs[1], [-0.25], atol=1e-8)
-        assert np.isnan(report.next_states[3]).all()
-        assert report.counts()["lost after one step"] == 2
+        np.testing.assert_array_equal(report.loops.label, [1, 1, 1, -1, 0])
+        np.testing.assert_array_equal(report.loops.lost_at, [1, 1, 0, -1, -1])
+        np.testing.assert_allclose(report.loops.inputs[1], [-0.25], atol=1e-8)
+        assert np.isnan(report.loops.next_states[3]).all()
+        assert report.loops.counts()["lost after one step"] == 2
         text = str(report)
         assert "refuted" in text and "0.0474342" in text and "lost by any" in text
         data = report.to_xarray()
@@ -336,14 +337,14 @@ class TestReport:
         assert holds(report) == (False, True, True)
         assert "13 critical regions fill X_N" in report.law.reason
         assert report.counterexample is None and report.lost_by_law == 0.0
-        assert report.states.shape == (0, 2) and report.counts()["feasible"] == 0
+        assert report.loops.x0s.shape == (0, 2) and report.loops.counts()["feasible"] == 0
         assert "none: its law is proved" in str(report)
 
     @pytest.mark.slow
     def test_samples_that_are_asked_for_are_kept_where_the_law_is_proved(self):
         cells = jm.grid([-63 / 64] * 2, [63 / 64] * 2, (64, 64))
         report = recursive_feasibility(problems.lecture(0.3, 3), cells, steps=3)
-        counts = report.counts()
+        counts = report.loops.counts()
         assert counts["kept"] == counts["feasible"] > 2000
         # The middles of the grid's cells measure the area.
         assert counts["feasible"] * (2 / 64) ** 2 == pytest.approx(2.8108, rel=0.02)
@@ -366,7 +367,7 @@ class TestReport:
         monkeypatch.setattr(analysis, "LABELS", np.inf)  # no time for samples
         mpc = problem()
         report = recursive_feasibility(mpc, search=search)
-        assert holds(report) == (False, False, False) and len(report.states) == 0
+        assert holds(report) == (False, False, False) and len(report.loops.x0s) == 0
         assert "no time was left" in str(report)
         c = report.counterexample
         check_counterexample(mpc, c)
@@ -400,8 +401,8 @@ class TestReport:
         mpc, states = problems.joint(20), np.array([[0.0, 0.0], [1.0, 1.0]])
         report = recursive_feasibility(mpc, states, seconds=0.01, progress=True)
         assert holds(report) == (None, None, None) and report.counterexample is None
-        np.testing.assert_array_equal(report.label, [0, 0])
-        np.testing.assert_array_equal(report.lost_at, [-1, -1])
+        np.testing.assert_array_equal(report.loops.label, [0, 0])
+        np.testing.assert_array_equal(report.loops.lost_at, [-1, -1])
         assert "time" in report.law.reason and report.seconds < 20
         assert "theorem and linear programs" in capsys.readouterr().err
         found = smallest_horizon(mpc, 50, seconds=0.01, progress=True)
@@ -411,8 +412,9 @@ class TestReport:
     def test_closed_loops_stop_in_time(self):
         mpc, over = problems.lecture(), Budget(0.0, -np.inf, False)
         law = RegionLaw(critical_regions(mpc), np.zeros(2), 64)
-        states, label = np.zeros((3, 2)), np.array([1, 1, -1])
-        loops = closed_loops(law, FeasibilityProblem.of(mpc), states, label, 5, over)
+        states, problem = np.zeros((3, 2)), FeasibilityProblem.of(mpc)
+        labels = replace(Labels.empty(3, problem), label=np.array([1, 1, -1]))
+        loops = closed_loops(law, problem, states, labels, 5, over)
         np.testing.assert_array_equal(loops.lost_at, [-2, -2, -1])
         np.testing.assert_array_equal(loops.undecided_at, [1, 1, 0])
 
@@ -424,14 +426,14 @@ class TestReport:
             ({"x0s": np.zeros((0, 2))}, "x0s: shape"),
             ({"steps": 0}, "steps: 0"),
             ({"steps": 2.5}, "steps: 2.5"),
-            ({"regions": -1}, "regions: -1"),
+            ({"max_regions": -1}, "max_regions: -1"),
             ({"seconds": 0.0}, "seconds: 0.0"),
         ],
     )
     def test_bad_arguments(self, arguments, message):
         with pytest.raises(ValueError, match=message):
             recursive_feasibility(problems.lecture(), **arguments)
-        with pytest.raises(ValueError, match="limit: 0"):
+        with pytest.raises(ValueError, match="max_horizon: 0"):
             smallest_horizon(problems.lecture(), 0)
 
     def test_empty_and_unbounded_sets_ask_for_states(self):
@@ -471,7 +473,7 @@ class TestSlow:
         report = recursive_feasibility(mpc)
         assert report.counterexample.distance == pytest.approx(distance, abs=1e-5)
         assert report.lost_by_law == pytest.approx(lost, abs=1e-6)
-        fraction = report.counts()["lost after one step"] / report.counts()["feasible"]
+        fraction = report.loops.counts()["lost after one step"] / report.loops.counts()["feasible"]
         assert fraction == pytest.approx(lost / report.volume, abs=0.01)
         check_counterexample(mpc, report.counterexample)
 
@@ -493,7 +495,7 @@ class TestSlow:
     def test_joint_of_five_steps(self):
         report = recursive_feasibility(problems.joint(5), steps=30)
         assert holds(report) == (False, True, True)
-        assert report.counts()["kept"] == report.counts()["feasible"]
+        assert report.loops.counts()["kept"] == report.loops.counts()["feasible"]
 
     def test_oblique_limits_and_drift(self):
         mpc = problems.drifting()
@@ -519,7 +521,7 @@ class TestSlow:
         report = recursive_feasibility(mpc, states, steps=12)
         step = np.ceil(np.log2(4 * 2.0**-N / e) + 1e-9).astype(int)
         expected = np.concatenate([step, step, [0, 0, -1]])
-        np.testing.assert_array_equal(report.lost_at, expected)
+        np.testing.assert_array_equal(report.loops.lost_at, expected)
         assert report.volume == pytest.approx(2 * (1 + 4 * 2.0**-N))
         assert report.counterexample.distance == pytest.approx(4 * 2.0**-N, abs=1e-6)
 
@@ -535,7 +537,7 @@ class TestSlow:
         mpc = replace(problems.lecture(), input_rate_limit=0.2)
         report = recursive_feasibility(mpc, steps=3)
         c = report.counterexample
-        assert report.states.shape[1] == 3 and holds(report) == (False, False, False)
+        assert report.loops.x0s.shape[1] == 3 and holds(report) == (False, False, False)
         assert abs(c.next_state[2] - c.state[2]) <= 0.2 + 1e-9
         assert c.next_state[2] == c.inputs[0, 0]
 

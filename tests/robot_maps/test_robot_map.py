@@ -144,7 +144,7 @@ def test_linear_robot_loses_what_the_linear_recursion_loses():
     points = jm.grid([-1.0, -1.0], [1.0, 1.0], (12, 12))
     rmap = map_robot(plant, mpc, points, 8.0, claim="recursion", chunk=100)
     report = jm.recursive_feasibility(mpc, points, steps=7, search=False, max_regions=0)
-    lost = report.lost_at
+    lost = report.loops.lost_at
     np.testing.assert_array_equal(rmap.predicted, np.select([lost == 0, lost > 0], [1, -1], -1))
     np.testing.assert_array_equal(rmap.held, rmap.predicted)
     later = lost > 0

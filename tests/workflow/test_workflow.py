@@ -87,7 +87,7 @@ def test_report_keeps_to_its_time(capsys):
     """Stages are announced, and what is left out is said."""
     report = jm.offline_report(problems.joint(20), seconds=0.01, progress=True)
     assert report.feasible_set is None and report.loops is None
-    assert report.terminal is not None and report.recursion.M is None
+    assert report.terminal is not None and report.recursion.law.holds is None
     text = str(report)
     assert text.count("no time was left") >= 2 and "no samples are mapped" in text
     lines = capsys.readouterr().err.splitlines()
@@ -115,7 +115,7 @@ def test_report_of_an_ellipsoidal_and_of_a_4d_problem():
     )
     assert report.terminal.recursive_feasibility and report.terminal.stability
     assert report.penalty is None and "ellips" in report.notes["penalty"].lower()
-    assert report.recursion.S is True
+    assert report.recursion.strong.holds is True
     assert report.loops.feasible == 8 and report.loops.increase <= 1e-7
     product = jm.offline_report(problems.hidden_product(3), steps=3, loops=8, seconds=20)
     assert product.feasible_set.counts()["undecided"] == 0 and product.loops.feasible <= 8

@@ -3,9 +3,7 @@
 import dataclasses
 import time
 from pathlib import Path
-from typing import Annotated, Any
-
-import numpy as np
+from typing import Annotated
 
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import (
@@ -23,16 +21,9 @@ from jaxmpc.app.commands.options import (
 from jaxmpc.app.commands.robot_map import map_robot_into
 from jaxmpc.app.config.states import recursion_states
 from jaxmpc.checks import fail
-from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.files import open_folder, remove_files, sha256, versions, write_arrays, write_results
-from jaxmpc.recursion import (
-    RecursionReport,
-    SmallestHorizon,
-    recursive_feasibility,
-    smallest_horizon,
-)
-
-FILES = ("summary.json", "recursion.npz", "recursion.png")
+from jaxmpc.files import open_folder
+from jaxmpc.recursion import recursive_feasibility, smallest_horizon
+from jaxmpc.recursion.stored_report import FILES, save_report
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,9 +33,9 @@ class Recursion:
     What it does
       An MPC without a suitable terminal set can steer itself into a state from which no input
       keeps its limits. Three claims about the set X_N of states that have a plan over N steps:
-        strong  every first move of a plan within the limits leads back into X_N
-        law     the optimal first move does (what one wants of the controller)
-        weak    some first move does
+        strong  every first input of a plan within the limits leads back into X_N
+        law     the optimal first input does (what one wants of the controller)
+        weak    some first input does
       Each is proved, refuted by a counterexample, or open, with the reason; strong implies law,
       law implies weak. Where the law is not proved, closed loops from a grid of states show which
       states are lost, and when.
@@ -75,7 +66,7 @@ class Recursion:
       summary.json    The claims with reasons, the counterexample, areas, counts, configuration.
                       jaxmpc verify DIR proves labels and counterexample again.
       recursion.npz   state, label (1 feasible, -1 infeasible, 0 undecided), input (the optimal
-                      first move), next_state, lost_at (step at which the problem is proved
+                      first input), next_state, lost_at (step at which the problem is proved
                       infeasible; 0 never, -1 infeasible at the start, -2 undecided), and
                       facet_normals, facet_offsets of X_N. Opens with numpy.load(path).
       Exit code       0 done, for any answer; 2 error (one line on stderr says which); 130
@@ -175,8 +166,15 @@ class Recursion:
             least = smallest_horizon(
                 mpc, self.smallest, max_regions=settings.regions, seconds=seconds, progress=True
             )
-            rows.append(("smallest horizon", _horizon_text(least, self.smallest)))
-        files = self.save(config, report, least)
+            rows.append(("smallest horizon", str(least)))
+        save_report(self.output, report, config.to_dict("recursion"), least)
+        files = ["summary.json", "recursion.npz"]
+        if mpc.dimension == 2:
+            from jaxmpc.app.plots.recursion import draw_recursion
+            from jaxmpc.app.plots.style import save
+
+            save(draw_recursion(report), self.output / "recursion.png", config.name)
+            files.append("recursion.png")
         print(report)
         rows.append(("total", f"{time.perf_counter() - begun:.2f} s with set-up and files"))
         rows.append(("files", " ".join(str(self.output / name) for name in files)))
@@ -193,56 +191,3 @@ class Recursion:
             grid=self.grid, lower=self.lower, upper=self.upper, resume=self.resume,
             overwrite=self.overwrite, search_seconds=self.seconds,
         )  # fmt: skip
-
-    def save(
-        self, config: configs.Config, report: RecursionReport, least: SmallestHorizon | None
-    ) -> list[str]:
-        """Write the files and return their names."""
-        body, worst = report.feasible_set, report.counterexample
-        facets: dict[str, Any] = {}
-        if body is not None:
-            facets = {"facet_normals": np.asarray(body.H), "facet_offsets": np.asarray(body.h)}
-        labels = {} if report.labels is None else report.labels.arrays()
-        facets |= {name: value for name, value in labels.items() if name != "label"}
-        plain = {"problem": FeasibilityProblem.of(report.mpc).plain()}
-        remove_files(self.output, *FILES)
-        write_arrays(
-            self.output / "recursion.npz", plain, state=report.states, label=report.label,
-            input=report.inputs, next_state=report.next_states, lost_at=report.lost_at,
-            undecided_at=report.undecided_at, **facets,
-        )  # fmt: skip
-        summary = {
-            "name": config.name,
-            "claims": {
-                name: dataclasses.asdict(getattr(report, name))
-                for name in ("strong", "law", "weak")
-            },
-            "counterexample": None if worst is None else dataclasses.asdict(worst),
-            "volume": report.volume,
-            "lost_by_any": report.lost_by_any,
-            "lost_by_law": report.lost_by_law,
-            "counts": report.counts(),
-            "steps": report.steps,
-            "seconds": report.seconds,
-            "config": config.to_dict("recursion"),
-            "sha256": sha256(self.output / "recursion.npz"),
-            "versions": versions(),
-        }
-        if least is not None:
-            summary["smallest_horizon"] = dataclasses.asdict(least)
-        write_results(self.output / "summary.json", summary)
-        if report.states.shape[1] != 2:
-            return ["summary.json", "recursion.npz"]
-        from jaxmpc.app.plots.recursion import draw_recursion
-        from jaxmpc.app.plots.style import save
-
-        save(draw_recursion(report), self.output / "recursion.png", config.name)
-        return list(FILES)
-
-
-def _horizon_text(least: SmallestHorizon, limit: int) -> str:
-    """Return the smallest horizon with its reason, or that none up to `limit` is proved."""
-    if least.horizon is None:
-        return f"none up to {limit} is proved"
-    strong = f"; strong from {least.strong}" if least.strong is not None else ""
-    return f"{least.horizon} ({least.reasons[least.horizon].reason}){strong}"

@@ -48,15 +48,15 @@ def plot_recursion(
     Without `ax` a new figure is made. Raises ValueError for other than two states, and for
     enlarge without a counterexample.
     """
-    if report.states.shape[1] != 2:
-        fail("report", f"is of {report.states.shape[1]} states", "A plot needs 2")
+    if report.loops.x0s.shape[1] != 2:
+        fail("report", f"is of {report.loops.x0s.shape[1]} states", "A plot needs 2")
     worst = report.counterexample
     if enlarge and worst is None:
         fail("enlarge", "without a counterexample there is nothing to enlarge", "Leave it out")
     ax = new_axes() if ax is None else ax
     handles: list[Any] = []
     corners = ring(lambda: report.feasible_set)
-    if enlarge or not len(report.states):
+    if enlarge or not len(report.loops.x0s):
         ax.fill(*corners.T, color=FEASIBLE, zorder=0)
     else:
         handles += _draw_losses(ax, report)
@@ -75,8 +75,8 @@ def plot_recursion(
     names = report.mpc.labels
     ax.set_xlabel(names[0])
     ax.set_ylabel(names[1])
-    title = f"Closed loops of {report.steps} steps, horizon N = {report.mpc.horizon}"
-    if not len(report.states):
+    title = f"Closed loops of {report.loops.steps} steps, horizon N = {report.mpc.horizon}"
+    if not len(report.loops.x0s):
         verdict = {True: "kept for ever", False: "not all kept", None: "not followed"}
         title = f"Feasible states, {verdict[report.law.holds]}, horizon N = {report.mpc.horizon}"
     if enlarge and worst is not None:
@@ -88,11 +88,11 @@ def plot_recursion(
 
 def _draw_losses(ax: Axes, report: RecursionReport) -> list[Any]:
     """Draw samples by outcome: infeasible, undecided, kept, or lost at some step."""
-    lost = report.lost_at
+    lost = report.loops.lost_at
     outcomes = [
-        ("infeasible", INFEASIBLE, (lost == -1) & (report.label == -1)),
-        ("undecided", UNDECIDED, (lost == -2) | (report.label == 0)),
-        (f"kept for {report.steps} steps", FEASIBLE, lost == 0),
+        ("infeasible", INFEASIBLE, (lost == -1) & (report.loops.label == -1)),
+        ("undecided", UNDECIDED, (lost == -2) | (report.loops.label == 0)),
+        (f"kept for {report.loops.steps} steps", FEASIBLE, lost == 0),
     ]
     ends = (1, 2, 3, 5, 10, np.inf)
     for first, last, colour in zip((1, 2, 3, 4, 6, 11), ends, LOST, strict=True):
@@ -103,7 +103,7 @@ def _draw_losses(ax: Axes, report: RecursionReport) -> list[Any]:
     for i, (_, _, where) in enumerate(outcomes):
         outcome[where] = i
     colours = {i: colour for i, (_, colour, _) in enumerate(outcomes)}
-    draw_values(ax, report.states, outcome, colours)
+    draw_values(ax, report.loops.x0s, outcome, colours)
     return [
         patch(name, colour, count)
         for name, colour, where in outcomes
