@@ -26,7 +26,7 @@ from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp import linalg
 from jaxmpc.qp.modes import own_modes, varying
-from jaxmpc.qp.newton import Constants, newton_step, ridged
+from jaxmpc.qp.newton import Augmented, Constants, newton_step, ridged
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.projection import Bounds
 
@@ -126,18 +126,16 @@ def nearest(A: Array, bounds: Bounds, w: Array, steps: int) -> tuple[Array, Arra
     It ends when the gradient A'e is small beside e, or as small as rounding leaves it for bounds
     of size one. In a batch all wait for the slowest.
     """
-    damping = jnp.asarray(Constants.of(w.dtype).damping, w.dtype)
-    H, q = jnp.zeros((w.shape[0], w.shape[0]), w.dtype), jnp.zeros_like(w)
-    y, one = jnp.zeros_like(bounds.l), jnp.ones((), w.dtype)
+    phi = Augmented.distance(bounds, w, Constants.of(w.dtype).damping)
     size = lambda v: jnp.max(jnp.abs(v), initial=0.0)
 
     def body(carry: tuple[Array, ...]) -> tuple[Array, ...]:
         k, w, _, _ = carry
-        step = newton_step(w, y, H, q, bounds, one, damping, A)
+        step = newton_step(w, phi, A)
         enough = jnp.finfo(w.dtype).eps * (1e4 * size(step.excess) + 30)
         return k + 1, step.w, step.excess, size(step.gradient) <= enough
 
-    start: tuple[Array, ...] = (jnp.asarray(0), w, y, jnp.asarray(False))
+    start: tuple[Array, ...] = (jnp.asarray(0), w, jnp.zeros_like(bounds.l), jnp.asarray(False))
     start = varying(start, (start, A, bounds))
     _, w, e, _ = jax.lax.while_loop(lambda carry: (carry[0] < steps) & ~carry[3], body, start)
     return w, e

@@ -27,9 +27,9 @@ from jaxmpc.mpc.plan import (
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.stated_residuals import judged
 from jaxmpc.pytrees import prepared_pytree
-from jaxmpc.qp.active_set import has_dual_steps
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor
 from jaxmpc.qp.admm import factor as factorise
+from jaxmpc.qp.dual_search import has_dual_steps
 from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.solve import in_two_parts, solve_factored

@@ -26,7 +26,7 @@ from jaxmpc.batches import (
 from jaxmpc.mpc import reuse
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Plan
-from jaxmpc.qp.active_set import MORE_STEPS, MOST_STEPS
+from jaxmpc.qp.dual_search import MORE_STEPS, MOST_STEPS
 from jaxmpc.qp.status import Status
 
 # States from which on transfer is tried: below, compiling its programs costs more than it saves.

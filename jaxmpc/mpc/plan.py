@@ -15,7 +15,7 @@ from jaxmpc.mpc.rows import Layout, blocks, split
 from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.problem import QPSolution
-from jaxmpc.qp.residuals import marked
+from jaxmpc.qp.residuals import with_fault
 from jaxmpc.qp.status import Status, WithStatus
 from jaxmpc.sets.box import Box
 
@@ -140,7 +140,7 @@ def answer(
 ) -> Plan:  # fmt: skip
     """Return the plan of a QP's solution: NaN and the status `fault` where the data had one."""
     J = cost(mpc, states, inputs, reference, input_reference, previous_input)
-    solution = marked(replace(found, cost=J), fault)
+    solution = with_fault(replace(found, cost=J), fault)
     nan = lambda v: jnp.where(fault == Status.NOT_RUN, v, jnp.nan)
     return Plan(
         states=nan(states), inputs=nan(inputs), cost=solution.cost,

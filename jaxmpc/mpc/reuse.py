@@ -25,8 +25,9 @@ from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Multipliers, Plan, answer, flat_multipliers
 from jaxmpc.mpc.stated_residuals import judged
 from jaxmpc.pytrees import pytree
-from jaxmpc.qp.active_set import RIDGE, has_dual_steps, most_rows
 from jaxmpc.qp.admm import scaled_multipliers
+from jaxmpc.qp.dual_search import has_dual_steps
+from jaxmpc.qp.dual_step import RIDGE, most_rows
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.loops import true_places
 from jaxmpc.qp.precision import matmul

@@ -431,10 +431,15 @@ class Splitting(NamedTuple):
         return t + jnp.asarray(alpha, t.dtype) * (self.image(2 * s - t) + self.offset - s)
 
 
+def splitting(factor: Factor, q: Array, stage: int) -> Splitting:
+    """Return the splitting of a stage of the schedule; q = T'q (n,)."""
+    offset = -matmul(matmul(q, factor.Minv[stage]), factor.A.T)
+    return Splitting(factor.rho[stage], partial(factor.image, stage), offset)
+
+
 def splittings(factor: Factor, q: Array) -> list[Splitting]:
-    """The splitting of each stage of the schedule; q = T'q (n,)."""
-    offset = lambda i: -matmul(matmul(q, factor.Minv[i]), factor.A.T)
-    return [Splitting(rho, partial(factor.image, i), offset(i)) for i, rho in enumerate(factor.rho)]
+    """Return the splitting of each stage of the schedule; q = T'q (n,)."""
+    return [splitting(factor, q, stage) for stage in range(len(factor.rho))]
 
 
 def iterate(

@@ -32,8 +32,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.qp.admm import Factor, scaled, scaled_rows
+from jaxmpc.qp.linearised import linearised
 from jaxmpc.qp.modes import own_modes
-from jaxmpc.qp.newton import Constants, linearised
+from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds

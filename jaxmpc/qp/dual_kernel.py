@@ -1,5 +1,5 @@
 """Systems in the active rows W as kernels for NVIDIA GPUs, a program an instance: the search on the
-dual of `active_set.py`, and the derivatives of `newton.linearised`.
+dual (`dual_search.py`), and the derivatives of `newton.linearised`.
 
 As a loop of XLA each step is some twenty launches, and all instances of a group wait for the
 largest system. Here an instance takes all its steps within one program and leaves when it is done.
@@ -8,25 +8,26 @@ system is solved in as many pivots as W has rows.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.qp.active_set import (
+from jaxmpc.qp.dual_step import (
     JOINTLY,
     LENGTHS,
     RIDGE,
+    Dual,
     DualPoint,
-    DualSearch,
+    MostSteps,
     WorkingRows,
     after_step,
     sizes,
     working_set,
 )
 from jaxmpc.qp.projection import FREE, Bounds
-from jaxmpc.qp.triton import LEAST, barrier, call, indices, load, padded_side, store
+from jaxmpc.qp.triton import LEAST, Ref, barrier, call, indices, load, padded_side, store
 
 # Rows of W, one kernel after the other: each takes the instances that did not fit into the last.
 SIDES = (16, 32)
@@ -44,34 +45,43 @@ def sides(rows: int) -> list[int]:
 
 
 def dual_search_kernel(
-    A: Array, S: Array, bounds: Bounds, limit: Array, cold: DualPoint, state: DualSearch,
-    most: int, more: int,
-) -> tuple[DualPoint, Array]:  # fmt: skip
-    """Return the point at the end of `active_set.dual_search` of one instance, in float64, and
-    whether it is optimal. `vmap` for many."""
-    rows = min(*A.shape, MOST_ROWS)
-    flags = jnp.stack([state.steps, *(v.astype(jnp.int32) for v in (state.open, state.optimal))])
-    y, v = state.point.y, state.point.v
+    dual: Dual, cold: DualPoint, point: DualPoint, taken: Array, go_on: Array, steps: MostSteps
+) -> tuple[DualPoint, Array]:
+    """Return `dual_search` of one instance, in float64, that has `taken` steps already. `vmap` for
+    many."""
+    rows = min(*dual.A.shape, MOST_ROWS)
+    flags = jnp.stack([taken, go_on.astype(jnp.int32), jnp.int32(0)])
+    y, v = point.y, point.v
     for side in sides(rows):
-        last = side >= rows
-        search = _kernel(S, bounds, min(side, rows), side, most, more, last)
-        y, v, flags = search(limit, cold.v, flags, y, v)
+        search = _search(dual, min(side, rows), side, steps, last=side >= rows)
+        y, v, flags = search(dual.limit, cold.v, flags, y, v)
     # A search that began again has other multipliers, all of which count from the cold point.
-    again = flags[0] > most
-    begin = jax.tree.map(lambda old, new: jnp.where(again, new, old), state.point, cold)
-    return begin.moved(A, y - begin.y), flags[2] > 0
+    again = flags[0] > steps.first
+    begin = jax.tree.map(lambda old, new: jnp.where(again, new, old), point, cold)
+    return begin.moved(dual.A, y - begin.y), flags[2] > 0
 
 
-def _kernel(
-    S: Array, bounds: Bounds, rows: int, side: int, most: int, more: int, last: bool
-) -> Any:
+class SearchState(NamedTuple):
+    """What a program of the search holds: y and v (m,), the count of steps, and whether to go on,
+    whether the point is optimal, and whether W has too many rows for this kernel, as 0 or 1."""
+
+    y: Array
+    v: Array
+    taken: Array
+    open: Array
+    optimal: Array
+    stays: Array
+
+
+def _search(dual: Dual, rows: int, side: int, steps: MostSteps, *, last: bool) -> Callable:
     """Return the kernel (limit, v of the cold point, flags, y, v) → (y, v, flags), with systems of
     `rows` rows, in arrays of `side`. An instance with more stays as it is, unless this is the last
     kernel. flags: count of steps, whether to go on, whether the point is optimal."""
+    S, bounds = dual.S, dual.bounds
     m, dtype = S.shape[-1], S.dtype
     width = padded_side(m)
 
-    def kernel(*refs: Any) -> None:
+    def kernel(*refs: Ref) -> None:
         limit_ref, cold_ref, flags_in, S_ref, y_in, v_in, *others = refs
         *bound_refs, y_ref, v_ref, flags_ref, order_ref, change_ref, moved_ref = others
         i, k, few = indices(width), indices(side), indices(ROWS)
@@ -81,12 +91,11 @@ def _kernel(
         rows_of = zip(bound_refs, FREE, strict=False)
         own = Bounds.of_rows(load(ref.at[i], here, free) for ref, free in rows_of)
 
-        def step(carry: tuple) -> tuple:
-            y, v, taken, _, _, _ = carry
-            again = taken == most
-            y = jnp.where(again, 0.0, y)
-            v = jnp.where(again, load(cold_ref.at[i], here & again), v)
-            in_W = working_set(own, y, v, again | (taken >= JOINTLY))
+        def step(s: SearchState) -> SearchState:
+            again = s.taken == steps.first
+            y = jnp.where(again, 0.0, s.y)
+            v = jnp.where(again, load(cold_ref.at[i], here & again), s.v)
+            in_W = working_set(own, y, v, again | (s.taken >= JOINTLY))
             ones = in_W.astype(jnp.int32)
             wanted = jnp.sum(ones, dtype=jnp.int32)
             count = jnp.minimum(wanted, rows)
@@ -99,32 +108,16 @@ def _kernel(
             barrier()
             inside = k < count
             W = load(order_ref.at[k], inside, 0)
-            take = lambda ref: load(ref.at[W], inside)
-            W_rows = WorkingRows(Bounds.of_rows(map(take, bound_refs)), take(y_ref), take(v_ref))
-            diagonal = jnp.where(inside, W_rows.slack + RIDGE, 1.0)
-            S_W = lambda: load(S_ref.at[W[:, None], W[None, :]], inside[:, None] & inside[None, :])
-            M = S_W() + jnp.where(k[:, None] == k[None, :], diagonal[:, None], 0.0)
-            d = solved(M, W_rows.gradient, k, count)
-
-            def searched(_: Any) -> Array:
-                """Return the change with the best dual value."""
-                S, best, least = S_W(), jnp.zeros_like(d), jnp.asarray(jnp.inf, dtype)
-                for t in (*LENGTHS, jnp.min(W_rows.stops(d))):
-                    change = W_rows.moved(t * d)
-                    image = jnp.sum(S * change[None, :], axis=1)
-                    loss = jnp.sum(W_rows.loss(change, image))
-                    best, least = jnp.where(loss < least, change, best), jnp.minimum(loss, least)
-                return best
-
-            whole = W_rows.moved(d)
-            stopped = jnp.max(jnp.where(whole != d, 1, 0)) > 0
-            change = jax.lax.cond(stopped, searched, lambda _: whole, jnp.int32(0))
+            *bounds_W, y_W, v_W = (load(ref.at[W], inside) for ref in (*bound_refs, y_ref, v_ref))
+            W_rows = WorkingRows(Bounds.of_rows(bounds_W), y_W, v_W)
+            change = _best_change(W_rows, S_ref, W, k, count, inside)
             store(change_ref.at[k], change, inside)
             store(moved_ref.at[jnp.where(inside, W, m + k)], W_rows.y + change, inside)
             barrier()
             new_y = jnp.where(joined, load(moved_ref.at[i], here), y)
 
-            def image(number: Array, v: Array) -> Array:
+            def less(number: Array, v: Array) -> Array:
+                """Return the rows v less those of S in a part of W times their change."""
                 j = number * ROWS + few
                 some = j < count
                 row, change = load(order_ref.at[j], some, 0), load(change_ref.at[j], some)
@@ -132,40 +125,65 @@ def _kernel(
                 return v - jnp.sum(part * change[:, None], axis=0)
 
             parts = (count + ROWS - 1) // ROWS
-            new_v = jax.lax.fori_loop(jnp.int32(0), parts, image, v)
+            new_v = jax.lax.fori_loop(jnp.int32(0), parts, less, v)
             barrier()
             largest = [jnp.max(part) for part in sizes(own, new_y, new_v)]
             after, go_on, optimal = after_step(
-                largest, CONVERGED, limit, taken + 1, wanted <= rows, most, more
+                largest, CONVERGED, limit, s.taken + 1, wanted <= rows, steps
             )
             stays = wanted > (m if last else rows)
             y, v = jnp.where(stays, y, new_y), jnp.where(stays, v, new_v)
-            taken = jnp.where(stays, taken, after)
-            flag = lambda value: value.astype(jnp.int32)
-            return y, v, taken, flag(go_on | stays), flag(optimal), flag(stays)
+            taken = jnp.where(stays, s.taken, after)
+            flags = (flag.astype(jnp.int32) for flag in (go_on | stays, optimal, stays))
+            return SearchState(y, v, taken, *flags)
 
         y, v = load(y_in.at[i], here), load(v_in.at[i], here)
-        begin = y, v, flags_in[0], flags_in[1], flags_in[2], jnp.int32(0)
-        y, v, *flags, _ = jax.lax.while_loop(lambda s: (s[3] > 0) & (s[5] == 0), step, begin)
-        store(y_ref.at[i], y, here)
-        store(v_ref.at[i], v, here)
+        begin = SearchState(y, v, flags_in[0], flags_in[1], flags_in[2], jnp.int32(0))
+        end = jax.lax.while_loop(lambda s: (s.open > 0) & (s.stays == 0), step, begin)
+        store(y_ref.at[i], end.y, here)
+        store(v_ref.at[i], end.v, here)
         four = indices(4)
-        taken, go_on, optimal = flags
-        all_flags = jnp.where(four == 0, taken, jnp.where(four == 1, go_on, optimal))
-        store(flags_ref.at[four], all_flags, (four < 3) & busy)
+        flags = jnp.where(four == 0, end.taken, jnp.where(four == 1, end.open, end.optimal))
+        store(flags_ref.at[four], flags, (four < 3) & busy)
 
-    number = lambda count, kind=dtype: jax.ShapeDtypeStruct((count,), kind)
-    shapes = [
-        number(m), number(m), number(3, jnp.int32), number(side + width, jnp.int32), number(side),
-        number(m + side),
-    ]  # fmt: skip
+    vectors = [(m, dtype), (m, dtype), (3, jnp.int32)]
+    scratch = [(side + width, jnp.int32), (side, dtype), (m + side, dtype)]
+    shapes = [jax.ShapeDtypeStruct((count,), kind) for count, kind in vectors + scratch]
     warps = 1 if width <= 64 and side <= LEAST else 2 if side <= 32 and width <= 128 else 4
     program = call(kernel, shapes, warps, aliases={2: 2, 4: 0, 5: 1})
 
-    def run(limit: Array, cold: Array, flags: Array, y: Array, v: Array) -> tuple:
+    def run(limit: Array, cold: Array, flags: Array, y: Array, v: Array) -> tuple[Array, ...]:
         return tuple(program(limit[None], cold, flags, S, y, v, *bounds.columns)[:3])
 
     return run
+
+
+def _best_change(
+    rows: WorkingRows, S_ref: Ref, W: Array, k: Array, count: Array, inside: Array
+) -> Array:
+    """Return the change of the multipliers in W (k,) with the best dual value: a Newton step, or
+    where it would stop rows the best of several lengths. k: 0, 1, …; inside: k < count, which of
+    them are in W."""
+    diagonal = jnp.where(inside, rows.slack + RIDGE, 1.0)
+
+    def S_W() -> Array:
+        return load(S_ref.at[W[:, None], W[None, :]], inside[:, None] & inside[None, :])
+
+    M = S_W() + jnp.where(k[:, None] == k[None, :], diagonal[:, None], 0.0)
+    d = solved(M, rows.gradient, k, count)
+
+    def searched(_: Array) -> Array:
+        S, best, least = S_W(), jnp.zeros_like(d), jnp.asarray(jnp.inf, d.dtype)
+        for t in (*LENGTHS, jnp.min(rows.stops(d))):
+            change = rows.moved(t * d)
+            image = jnp.sum(S * change[None, :], axis=1)
+            loss = jnp.sum(rows.loss(change, image))
+            best, least = jnp.where(loss < least, change, best), jnp.minimum(loss, least)
+        return best
+
+    whole = rows.moved(d)
+    stopped = jnp.max(jnp.where(whole != d, 1, 0)) > 0
+    return jax.lax.cond(stopped, searched, lambda _: whole, jnp.int32(0))
 
 
 def solved(M: Array, b: Array, k: Array, count: Array) -> Array:
@@ -204,11 +222,13 @@ def damped_kernel(S: Array, W: Array, slack: Array, b: Array, damping: float, st
     return y
 
 
-def _damped(m: int, rows: int, side: int, damping: float, steps: int, dtype: Any) -> Callable:
+def _damped(m: int, rows: int, side: int, damping: float, steps: int, dtype: jnp.dtype) -> Callable:
     """Return the kernel (count (1,), S, W, slack, b) → y (k,) with systems of `rows` rows at most,
     in arrays of `side`; y is zero where the count is."""
 
-    def kernel(count_ref: Any, S_ref: Any, W_ref: Any, slack_ref: Any, b_ref: Any, y_ref: Any):
+    def kernel(
+        count_ref: Ref, S_ref: Ref, W_ref: Ref, slack_ref: Ref, b_ref: Ref, y_ref: Ref
+    ) -> None:
         k, count = indices(side), count_ref[0]
         inside = k < count
         W = load(W_ref.at[k], inside, 0)

@@ -11,26 +11,19 @@ and ρ = 1 the minimum is the distance to feasibility: there e = 0 (a feasible w
 e ≠ 0, which is a Farkas vector: e'A w is 0 for all w but at least g*(e) fails by |e|².
 """
 
-from collections.abc import Callable
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import DTypeLike
 
 from jaxmpc.pytrees import pytree
-from jaxmpc.qp.dual_kernel import MOST_ROWS, damped_kernel
-from jaxmpc.qp.linalg import definite_solver, solve
-from jaxmpc.qp.loops import in_blocks, repeat_while, true_places
+from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.modes import varying
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.triton import on_gpu
 
-# For derivatives: rows of the reduced system at most, where there is no kernel, steps of the method
-# of multipliers, and instances whose matrices of the size of H are held at once.
-REDUCED_ROWS, STEPS, DENSE_BLOCK = 48, 8, 512
 # Steps of the line search, a scalar Newton method. Penalties put almost vertical pieces into the
 # derivative, which only bisection finds.
 LINE_STEPS, LINE_STEPS_SOFT = 6, 24
@@ -47,7 +40,8 @@ class Constants(NamedTuple):
     linear: float
 
     @classmethod
-    def of(cls, dtype: Any) -> "Constants":
+    def of(cls, dtype: DTypeLike) -> "Constants":
+        """Return those of float64, or of float32."""
         double = jnp.finfo(dtype).eps < 1e-10
         return cls((1e3, 1e8), 1e-8, 1e-10, 1e6) if double else cls((1e3, 1e4), 1e-4, 1e-5, 1e3)
 
@@ -61,14 +55,37 @@ def gram(A: Array, weights: Array, normals: list[Array]) -> Array:
     return K
 
 
-def ridged(K: Array, scale: Any = 0.0) -> Array:
+def ridged(K: Array, scale: float | Array = 0.0) -> Array:
     """Return K plus a ridge at rounding level, for the null space of K."""
     n = K.shape[0]
     ridge = 10 * jnp.finfo(K.dtype).eps * (jnp.trace(K) / n + scale)
     return K + ridge * jnp.eye(n, dtype=K.dtype)
 
 
-class Newton(NamedTuple):
+class Augmented(NamedTuple):
+    """φ with a proximal term, φ + ½σ d'(I − H)d for steps d: it acts where the cost has no
+    curvature (H = I elsewhere in ADMM's coordinates) and bounds the iterates of linear programs.
+
+    y (m,), H (n, n), q (n,), bounds, rho and sigma as above.
+    """
+
+    y: Array
+    H: Array
+    q: Array
+    bounds: Bounds
+    rho: Array | float
+    sigma: Array | float
+
+    @classmethod
+    def distance(cls, bounds: Bounds, w: Array, damping: float | Array) -> "Augmented":
+        """Return half the squared distance of the rows from hard bounds, as a function of w (n,).
+        damping: weight of the proximal term; a little keeps w where it is where rows only touch."""
+        n, one = w.shape[0], jnp.ones((), w.dtype)
+        H, q = jnp.zeros((n, n), w.dtype), jnp.zeros_like(w)
+        return cls(jnp.zeros_like(bounds.l), H, q, bounds, one, damping * one)
+
+
+class NewtonStep(NamedTuple):
     """Result of one step: w (n,), its prox residual (m,), the gradient of φ (n,), and whether φ was
     minimised."""
 
@@ -78,15 +95,13 @@ class Newton(NamedTuple):
     minimised: Array
 
 
-def newton_step(
-    w: Array, y: Array, H: Array, q: Array, bounds: Bounds, rho: Array, sigma: Array, A: Array
-) -> Newton:
-    """One step on φ + ½σ d'(I − H)d with exact line search.
+def newton_step(w: Array, phi: Augmented, A: Array) -> NewtonStep:
+    """Take one step on φ from w (n,) with exact line search; A (m, n).
 
-    The proximal term acts where the cost has no curvature (H = I elsewhere in ADMM's
-    coordinates) and keeps the iterates of linear programs bounded. φ is quadratic where no row
-    changes its piece, so a full step that leaves all pieces as they were has reached the minimum.
+    φ is quadratic where no row changes its piece, so a full step that leaves all pieces as they
+    were has reached the minimum.
     """
+    y, H, q, bounds, rho, sigma = phi
     v = matmul(w, A.T) + y / rho
     e = bounds.prox_residual(v, rho)
     gradient = matmul(w, H) + q + rho * matmul(e, A)
@@ -99,7 +114,9 @@ def newton_step(
     slope, bend = jnp.sum(d * jnp.stack([matmul(w, H) + q, Hd]), axis=1)
     minimised = jnp.all(bounds.active_set(v + Ad, rho) == bounds.active_set(v, rho))
 
-    def bracket(carry: tuple[Array, Array, Array], _: None) -> tuple[Any, None]:
+    Bracket = tuple[Array, Array, Array]
+
+    def bracket(carry: Bracket, _: None) -> tuple[Bracket, None]:
         """Newton on the derivative of φ, which grows with t, between what it has bracketed."""
         t, low, high = carry
         at = v + t * Ad
@@ -123,28 +140,26 @@ def newton_step(
         # The prox residual is linear where the active set does not change. Adding the change keeps
         # the rounding of a small e small; ρ will multiply it.
         e_new = jnp.where(minimised, e + weights * Ad, e_new)
-    return Newton(w_new, e_new, matmul(w_new, H) + q + rho * matmul(e_new, A), minimised)
+    return NewtonStep(w_new, e_new, matmul(w_new, H) + q + rho * matmul(e_new, A), minimised)
 
 
 def least_distance(
     A: Array, bounds: Bounds, w: Array, steps: int, damping: float = 0.0
 ) -> tuple[Array, Array]:
-    """Minimise ½ dist²(A w, set) from w; returns w and e = A w − its projection.
+    """Minimise ½ dist²(A w, set) from w (n,); return w and e = A w − its projection.
 
     e = 0: w satisfies the rows. A'e = 0 with e ≠ 0: no w does, and e is the Farkas vector.
-    damping: weight of a proximal term; a little keeps w still where rows only touch.
+    damping: as in `Augmented.distance`.
     """
     bounds = bounds.hard()
-    H, q = jnp.zeros((w.shape[0], w.shape[0]), w.dtype), jnp.zeros_like(w)
-    y, one = jnp.zeros_like(bounds.l), jnp.ones((), w.dtype)
-    sigma = damping * one
+    phi = Augmented.distance(bounds, w, damping)
 
-    def body(carry: tuple[Array, Array], _: None) -> tuple[Any, None]:
-        step = newton_step(carry[0], y, H, q, bounds, one, sigma, A)
+    def body(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+        step = newton_step(carry[0], phi, A)
         return (step.w, step.excess), None
 
-    (w, e), _ = jax.lax.scan(body, varying((w, y), (w, A, bounds)), length=steps)
-    return w, e
+    begin = varying((w, phi.y), (w, A, bounds))
+    return jax.lax.scan(body, begin, length=steps)[0]
 
 
 @pytree
@@ -175,24 +190,23 @@ def norms(*vectors: Array) -> Array:
 
 def multipliers_start(q: Array, w: Array, y: Array) -> MultiplierState:
     """Return the state of the method of multipliers at (w, y)."""
-    scalar = lambda v: jnp.asarray(v, w.dtype)
-    return MultiplierState(
-        w, y, jnp.zeros_like(y), jnp.zeros_like(w), scalar(Constants.of(w.dtype).rho[0]),
-        scalar(1.0), scalar(jnp.inf), 0.1 * (largest(q) + largest(y)),
-    )  # fmt: skip
+    none_y, none_w = jnp.zeros_like(y), jnp.zeros_like(w)
+    first = (Constants.of(w.dtype).rho[0], 1.0, jnp.inf)
+    rho, sigma, before = (jnp.asarray(v, w.dtype) for v in first)
+    tolerance = 0.1 * (largest(q) + largest(y))
+    return MultiplierState(w, y, none_y, none_w, rho, sigma, before, tolerance)
 
 
 def multipliers_step(
     H: Array, q: Array, A: Array, bounds: Bounds, state: MultiplierState
 ) -> MultiplierState:
-    """One Newton step of the proximal method of multipliers."""
-    s = state
-    step = newton_step(s.w, s.y, H, q, bounds, s.rho, s.sigma, A)
-    return multipliers_update(q, s, step)
+    """Take one Newton step of the proximal method of multipliers."""
+    phi = Augmented(state.y, H, q, bounds, state.rho, state.sigma)
+    return multipliers_update(q, state, newton_step(state.w, phi, A))
 
 
-def multipliers_update(q: Array, state: MultiplierState, step: Newton) -> MultiplierState:
-    """The state after a Newton step on φ.
+def multipliers_update(q: Array, state: MultiplierState, step: NewtonStep) -> MultiplierState:
+    """Return the state after a Newton step on φ.
 
     Whenever φ is minimised the multipliers become ρ e; ρ grows tenfold if the violation has not
     fallen tenfold, and σ falls a hundredfold. "Minimised" is exact (`newton_step`), or the
@@ -212,139 +226,12 @@ def multipliers_update(q: Array, state: MultiplierState, step: Newton) -> Multip
     # A Newton step has a ridge of 10 ε ρ, which must be little beside σ.
     least = jnp.maximum(constants.sigma, 40 * eps * rho)
     return MultiplierState(
-        step.w, new, jnp.where(done, new - s.y, s.change), step.w - s.w,
-        rho, jnp.maximum(jnp.where(done, s.sigma / 100, s.sigma), least),
-        jnp.where(done, violation, s.before), jnp.where(done, s.tolerance / 10, s.tolerance),
-    )  # fmt: skip
-
-
-def linearised(
-    H: Array, A: Array, weights: Array, normals: list[Array], rho: float, flat: Array
-) -> Callable[[Array, Array], tuple[Array, Array]]:
-    """Solver of the optimality conditions with the pieces of g held fixed.
-
-    The conditions Hw + q + A'y = 0 and e(Aw + y/ρ) = y/ρ, moved by a (n,) and c (m,), move
-    their solution by
-
-        H dw + A'dy = −a,        dy/ρ = D (A dw + dy/ρ) + c,        D = diag(weights) + Σ h h'.
-
-    The function returned maps (a, c) to (dw, dy); it is linear. D is singular or not: eliminating
-    dy by the method of multipliers needs only the definite K = H + ρ A'DA (with a ridge), and
-    eight steps leave an error (1 + ρ s²)⁻⁸ for active rows with least singular value s. Where
-    active rows contradict each other, dw tends to their least-squares solution and dy stays
-    bounded by 8ρ times the contradiction.
-
-    flat: whether H is not nearly the identity. Without normals the rows R with D = 0 have dy = ρc,
-    and the others, W, make the system symmetric, Λ = (1/D − 1)/ρ:
-
-        H dw + A_W'dy_W = −a − A_R'dy_R,        A_W dw − Λ dy_W = −c_W/D.
-    """
-    D = lambda v: weights * v + sum(h * jnp.sum(h * v) for h in normals)
-    if normals:
-        inverse = definite_solver(dense_system(H, A, weights, normals, rho))
-        return partial(swept, H, A, D, rho, inverse)
-    n, active = A.shape[1], weights > jnp.finfo(A.dtype).eps ** 2
-    slack = (1 / jnp.where(active, weights, 1.0) - 1) / rho
-    only = lambda y: jnp.where(active, y, 0.0)
-
-    def product(wy: Array) -> Array:
-        w, y = wy[:n], wy[n:]
-        rows = jnp.where(active, matmul(w, A.T) - slack * y, y)
-        return jnp.concatenate([matmul(w, H) + matmul(only(y), A), rows])
-
-    constants, own = jax.lax.stop_gradient(((H, A, flat), (weights, active, slack)))
-
-    def approach(_: Any, b: Array) -> Array:
-        return jnp.concatenate(approximate(rho, constants, own, (b[:n], b[n:])))
-
-    def solver(a: Array, c: Array) -> tuple[Array, Array]:
-        rest = jnp.where(active, 0.0, rho * c)
-        b = [-a - matmul(rest, A), only(-c / jnp.where(active, weights, 1.0))]
-        # In one vector: a part without tangents could not be transposed.
-        moved = jax.lax.custom_linear_solve(product, jnp.concatenate(b), approach, symmetric=True)
-        return moved[:n], moved[n:] + rest
-
-    return solver
-
-
-def dense_system(H: Array, A: Array, weights: Array, normals: list[Array], rho: float) -> Array:
-    """Return K = H + ρ A'DA (n, n) of `linearised`, with a ridge."""
-    return ridged(H + rho * gram(A, weights, normals), rho)
-
-
-def swept(
-    H: Array, A: Array, D: Callable, rho: float, inverse: Callable, a: Array, c: Array
-) -> tuple[Array, Array]:
-    """Return (dw, dy) of `linearised` by eight steps of the method of multipliers; inverse: K⁻¹."""
-
-    def sweep(carry: tuple[Array, Array], _: None) -> tuple[Any, None]:
-        dw, dy = carry
-        rows = D(matmul(dw, A.T) + dy / rho) + c - dy / rho
-        gradient = a + matmul(dw, H) + matmul(dy, A)
-        step = -inverse(gradient + rho * matmul(rows, A))
-        return (dw + step, dy + rho * (D(matmul(step, A.T)) + rows)), None
-
-    return jax.lax.scan(sweep, (jnp.zeros_like(a), jnp.zeros_like(c)), length=STEPS)[0]
-
-
-def approximate(
-    rho: float, constants: tuple, own: tuple, b: tuple[Array, Array]
-) -> tuple[Array, Array]:
-    """Return (dw, dy) of the symmetric system in `linearised` with right-hand sides b; not
-    differentiable. constants: H, A, flat; own: weights, active, Λ.
-
-    Where H is nearly the identity and few rows are active, the eight steps are taken in these rows
-    (`damped`), four of them on what the first four leave of the system, in which H is what it is.
-    The other instances of a batch take them with systems of the size of H.
-    """
-    (H, A, flat), (weights, active, slack) = constants, own
-    if min(A.shape) <= REDUCED_ROWS and not on_gpu():
-        return in_blocks(partial(dense_steps, rho), (H, A), (weights, b))
-    most = MOST_ROWS if on_gpu() else REDUCED_ROWS
-    W, S = true_places(active, most), matmul(A, A.T)
-    take = lambda v: v.at[W].get(mode="fill", fill_value=0.0)
-
-    def half(b: tuple[Array, Array]) -> tuple[Array, Array]:
-        right = take(matmul(b[0], A.T) - b[1])
-        y = damped(S, W, take(slack), right, 1 / rho, STEPS // 2)
-        dy = jnp.zeros_like(b[1]).at[W].add(y, mode="drop")
-        return b[0] - matmul(dy, A), dy
-
-    dw, dy = half(b)
-    rows = jnp.where(active, matmul(dw, A.T) - slack * dy, b[1])
-    more_w, more_y = half((b[0] - matmul(dw, H) - matmul(dy, A), b[1] - rows))
-    reduced = dw + more_w, jnp.where(active, dy + more_y, b[1])
-
-    def by_blocks(constants: tuple, state: tuple) -> tuple:
-        weights, b, _, is_open = state
-        found = in_blocks(partial(dense_steps, rho), constants, (weights, b), large=DENSE_BLOCK)
-        # What stayed the same XLA would take for constant, and factor before the loop, for nothing.
-        none = jax.tree.map(jnp.zeros_like, (weights, b))
-        return *none, found, ~is_open
-
-    many = (jnp.sum(active) > most) | flat
-    state = weights, b, reduced, many
-    return repeat_while(lambda s: s[3], by_blocks, (H, A), state, steps="long")[2]
-
-
-def dense_steps(rho: float, constants: tuple, data: tuple) -> tuple[Array, Array]:
-    """Return `approximate` of one instance with any number of active rows, by systems of the size
-    of H. constants: H, A; data: weights, and b, which has no entries in inactive rows."""
-    (H, A), (weights, (a, c)) = constants, data
-    inverse = definite_solver(dense_system(H, A, weights, [], rho))
-    return swept(H, A, lambda v: weights * v, rho, inverse, -a, -weights * c)
-
-
-def damped(S: Array, W: Array, slack: Array, b: Array, damping: float, steps: int) -> Array:
-    """Return y (k,) after so many steps y += (M + damping·I)⁻¹(b − M y) from 0, M = S_WW +
-    diag(slack) positive semidefinite: b's solution, or where M is singular and b contradicts it,
-    least-squares with a bounded part in the null space. W (k,): rows of S, filled up with their
-    number; slack, b (k,)."""
-    if on_gpu():
-        return damped_kernel(S, W, slack, b, damping, steps)
-    M = S.at[W[:, None], W[None, :]].get(mode="fill", fill_value=0.0) + jnp.diag(slack)
-    inverse = definite_solver(M + damping * jnp.eye(len(W), dtype=b.dtype))
-    y = jnp.zeros_like(b)
-    for _ in range(steps):
-        y = y + inverse(b - matmul(y, M))
-    return y
+        w=step.w,
+        y=new,
+        change=jnp.where(done, new - s.y, s.change),
+        move=step.w - s.w,
+        rho=rho,
+        sigma=jnp.maximum(jnp.where(done, s.sigma / 100, s.sigma), least),
+        before=jnp.where(done, violation, s.before),
+        tolerance=jnp.where(done, s.tolerance / 10, s.tolerance),
+    )

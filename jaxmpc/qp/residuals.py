@@ -1,4 +1,4 @@
-"""Residuals of a primal-dual pair, each judged relative to the size of its own entry.
+"""Residuals of a primal-dual pair, each relative to the size of its own entry, and the status.
 
 Residuals come in parts, those of rows (m,), of variables (n,) and the gap (1,): `residual_terms`
 for a QP, `mpc.judge` for the plan of an MPC problem, `mpc.stages.stage_residuals` for a problem
@@ -211,10 +211,8 @@ class Pair:
     def of(
         cls, z: Array, y: Array, terms: Terms, eps: Array, floor: float, others: Terms = ()
     ) -> "Pair":
-        """Return the pair judged; eps and floor as in `Measured`. near: all residuals are below a
-        small part of their tolerance (NEAR), or below a tenth and a small multiple of their
-        rounding; solved: below a tenth of that part. others: terms that count for these alone."""
-        return cls(z, y, *judgment(terms, eps, floor, others))
+        """Return the pair with what `check_terms` says of its terms."""
+        return cls(z, y, *check_terms(terms, eps, floor, others))
 
     def or_better(self, other: "Pair") -> "Pair":
         """Return the other pair where that is solved or its residuals are smaller; one that is
@@ -226,15 +224,27 @@ class Pair:
         return replace(best, solved=best.solved | self.near)
 
 
-def judgment(
-    terms: Terms, eps: Any, floor: float, others: Terms = ()
-) -> tuple[Measured, Array, Array, Array]:
-    """Return what `Pair.of` says of the terms: the last four fields of the pair."""
+class PairCheck(NamedTuple):
+    """What residuals say of a pair: its fields of these names."""
+
+    measured: Measured
+    error: Array
+    near: Array
+    solved: Array
+
+
+def check_terms(terms: Terms, eps: Array, floor: float, others: Terms = ()) -> PairCheck:
+    """Return what the terms say of a pair; eps and floor as in `Measured`.
+
+    near: all residuals are below a small part of their tolerance (NEAR), or below a tenth and a
+    small multiple of their rounding. solved: below a tenth of that part. others: terms that count
+    for these alone."""
     ratios, relatives = worst([*terms, *others], floor)
     above, relative = largest_of(ratios), largest_of(relatives)
     at_rounding = (relative <= STALLED * floor) & (above <= 0.1 * eps)
     near = (above <= NEAR * eps) | at_rounding
-    return Measured.from_ratios(terms, eps, ratios), above, near, above <= 0.1 * NEAR * eps
+    measured = Measured.from_ratios(terms, eps, ratios)
+    return PairCheck(measured, above, near, above <= 0.1 * NEAR * eps)
 
 
 def assess(
@@ -245,10 +255,10 @@ def assess(
     float64, and the proofs give it; without its cost and count of iterations."""
     dtype, floor = z.dtype, rounding(z.dtype)
     measure = lambda data, z, y, eps, more: Measured.of(terms(*data, z, y, **more), eps, floor)
-    return concluded(precisely(measure, data, z, y, jnp.asarray(eps, dtype), more), z, y, proof)
+    return with_status(precisely(measure, data, z, y, jnp.asarray(eps, dtype), more), z, y, proof)
 
 
-def concluded(measured: Measured, z: Array, y: Array, proof: Proof) -> QPSolution:
+def with_status(measured: Measured, z: Array, y: Array, proof: Proof) -> QPSolution:
     """Return the solution (z, y) with the status that its residuals and the proofs give it; without
     its cost and count of iterations."""
     solved, dtype = measured.small, z.dtype
@@ -268,7 +278,7 @@ def concluded(measured: Measured, z: Array, y: Array, proof: Proof) -> QPSolutio
     )  # fmt: skip
 
 
-def marked(solution: QPSolution, fault: Array) -> QPSolution:
+def with_fault(solution: QPSolution, fault: Array) -> QPSolution:
     """Return the solution where the data were usable; NaN and the status `fault` where not."""
     nan = lambda v: jnp.where(fault == Status.NOT_RUN, v, jnp.nan)
     s = solution

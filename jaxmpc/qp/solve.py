@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.typing import DTypeLike
 
 from jaxmpc.checks import concrete, fail, require_kind, require_shape
-from jaxmpc.qp.active_set import has_dual_steps
 from jaxmpc.qp.admm import (
     ADMM,
     DEFAULT,
@@ -23,32 +23,36 @@ from jaxmpc.qp.admm import (
     nearer,
     read,
     scaled_rows,
+    splitting,
     splittings,
     start,
     unscaled,
 )
 from jaxmpc.qp.admm_kernel import iterate_batch, suits
 from jaxmpc.qp.certificate import Proof, correcting_rows, prove
+from jaxmpc.qp.defect_correction import solve_dual
 from jaxmpc.qp.derivative import dense_conditions, implicit
+from jaxmpc.qp.dual_search import has_dual_steps
 from jaxmpc.qp.loops import in_blocks
 from jaxmpc.qp.modes import own_modes, varying
-from jaxmpc.qp.newton import multipliers_start, multipliers_step
+from jaxmpc.qp.newton import MultiplierState, multipliers_start, multipliers_step
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.refine import Program, by_the_dual, improve, unrounded
+from jaxmpc.qp.refine import Improved, improve
 from jaxmpc.qp.residuals import (
     Pair,
     assess,
-    concluded,
     largest_of,
-    marked,
     residual_terms,
     row_sizes,
+    with_fault,
+    with_status,
     worst,
 )
+from jaxmpc.qp.scaled_program import ScaledProgram
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.triton import EXACT, ROUGH
+from jaxmpc.qp.triton import EXACT, ROUGH, Product
 
 T = TypeVar("T", bound=Any)
 
@@ -85,7 +89,7 @@ def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: Any = None) -> QPSoluti
 @own_modes
 def _solve(qp: QP, solver: ADMM, warm_start: Any, *, whole: bool) -> QPSolution:
     made = factor(qp.P, qp.A, solver, qp.balls)
-    return marked(*solve_factored(qp, made, solver, warm_start, whole=whole))
+    return with_fault(*solve_factored(qp, made, solver, warm_start, whole=whole))
 
 
 def in_two_parts(
@@ -126,7 +130,7 @@ def solve_factored(
     whole: False leaves out the method of multipliers and proofs, and ADMM after a warm start
     (`in_two_parts`).
     Returns the solution and the fault of the data, NOT_RUN for none. Where there is one the
-    solution is that of harmless data: `marked` says so, after all that is computed from it, for
+    solution is that of harmless data: `with_fault` says so, after all that is computed from it, for
     the derivative of a product with NaN is NaN even where nobody looks at it.
     """
     clean, fault = cleaned(qp, factor.fault)
@@ -148,64 +152,87 @@ def solve_from(
 ) -> tuple[QPSolution, Array]:
     """`solve_factored` by `steps` steps on the dual from multipliers y (m,) in ADMM's coordinates:
     SOLVED, or ITERATION_LIMIT, at once where y is not finite. Without a step, for multipliers of
-    the solution, the status is yet to be judged: ITERATION_LIMIT. For hard rows, without balls, in
+    the solution, nothing is measured yet: ITERATION_LIMIT. For hard rows, without balls, in
     float64; not differentiable."""
     clean, fault = cleaned(qp, factor.fault)
-    p = Program.of(clean, factor, tolerance(solver, qp.q.dtype))
+    p = ScaledProgram.of(clean, factor, tolerance(solver, qp.q.dtype))
     proof, usable = Proof.none(p.q, p.bounds.l), jnp.all(jnp.isfinite(y))
     y = p.bounds.admissible(jnp.where(usable, y / p.unit, 0.0))
     if not steps:
         z, y = unscaled(clean, factor, p.unit, -p.q - matmul(y, factor.A), y)
-        return concluded(Pair.none(z, y).measured, z, y, proof), fault
-    pair, _ = by_the_dual(p, y, usable & ~factor.flat, steps)
-    return concluded(pair.measured, pair.z, pair.y, proof), fault
+        return with_status(Pair.none(z, y).measured, z, y, proof), fault
+    pair, _ = solve_dual(p, y, usable & ~factor.flat, steps)
+    return with_status(pair.measured, pair.z, pair.y, proof), fault
 
 
 def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = True) -> QPSolution:
     """Return the solution of clean data by ADMM and Newton steps, with its status, without its cost
     and count of iterations. whole: see `in_two_parts`."""
-    p = Program.of(qp, factor, tolerance(solver, qp.q.dtype))
-    q, bounds, unit, eps = p.q, p.bounds, p.unit, p.eps
-    t = jnp.zeros_like(qp.l)
+    p = ScaledProgram.of(qp, factor, tolerance(solver, qp.q.dtype))
+    most, unrolled = solver.most_newton_steps(), solver.differentiate == "unrolled"
+    begin = admm_end(p, solver, warm_start, refined=most > 0 and not unrolled)
+    if most and not unrolled:
+        return refined_end(p, solver, begin, whole)
+    return stepped_end(p, begin, most)
+
+
+def admm_end(p: ScaledProgram, solver: ADMM, warm_start: Any, *, refined: bool) -> MultiplierState:
+    """Return where the steps of ADMM end, as the state at which Newton steps begin. refined: these
+    follow, are in float64, and make up for rough products."""
+    q, bounds, unit, factor = p.q, p.bounds, p.unit, p.factor
+    t = jnp.zeros_like(bounds.l)
     if warm_start is not None:
-        t = warm(factor, qp, unit, bounds, warm_start)
-        t = nearer(splittings(factor, q)[0], bounds, t)
-    unrolled, refine = solver.differentiate == "unrolled", solver.most_newton_steps()
-    rough = "float32" if refine and not unrolled else qp.q.dtype
-    dtype = jnp.dtype(rough if solver.dtype is None else solver.dtype)
-    cast = lambda tree, dtype=dtype: jax.tree.map(
-        lambda v: v.astype(dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v, tree
-    )
+        t = warm(factor, p.qp, unit, bounds, warm_start)
+        t = nearer(splitting(factor, q, 0), bounds, t)
+    own = q.dtype
+    dtype = jnp.dtype(solver.dtype or ("float32" if refined else own))
     steps = solver.admm_steps(warm_start is not None)
-    # Newton steps make up for rough products.
-    product = ROUGH if refine and not unrolled else EXACT
-    kernel = (
-        partial(loop_kernel, steps, product) if suits(factor, qp.balls, dtype, product) else None
-    )
-    run = partial(loop, steps)
-    arguments = cast(((factor, jnp.asarray(solver.alpha)), (q, bounds, t)))
-    (w, y), (w_old, y_old) = cast(
-        run(*arguments) if unrolled else in_blocks(run, *arguments, kernel=kernel), qp.q.dtype
-    )
-    begin = replace(multipliers_start(q, w, y), change=y - y_old, move=w - w_old)
-    if refine and not unrolled:
-        single, method = qp.q.dtype != jnp.float64, partial(improve, refine, solver.fixed, whole)
-        polish = lambda p, begin: method(unrounded(p) if single else p, begin)
-        best, proof, ended, idle = precisely(polish, p, begin)
-        found = concluded(best.measured, best.z, best.y, proof)
-        open_ = found.status == Status.ITERATION_LIMIT
-        status = jnp.where(open_ & idle, jnp.int32(Status.INACCURATE), found.status)
-        return replace(found, status=jnp.where(ended, status, jnp.int32(Status.ITERATION_LIMIT)))
-    pair, end = unscaled(qp, factor, unit, w, y), begin
-    if refine:
+    product = ROUGH if refined else EXACT
+    constants, data = cast(((factor, jnp.asarray(solver.alpha)), (q, bounds, t)), dtype)
+    if solver.differentiate == "unrolled":
+        ends = loop(steps, constants, data)
+    else:
+        fits = suits(factor, p.qp.balls, dtype, product)
+        kernel = partial(loop_kernel, steps, product) if fits else None
+        ends = in_blocks(partial(loop, steps), constants, data, kernel=kernel)
+    (w, y), (w_old, y_old) = cast(ends, own)
+    return replace(multipliers_start(q, w, y), change=y - y_old, move=w - w_old)
+
+
+def cast(tree: T, dtype: DTypeLike) -> T:
+    """Return the tree with floating leaves of this type."""
+    floating = lambda v: jnp.issubdtype(v.dtype, jnp.floating)
+    return jax.tree.map(lambda v: v.astype(dtype) if floating(v) else v, tree)
+
+
+def refined_end(p: ScaledProgram, solver: ADMM, begin: MultiplierState, whole: bool) -> QPSolution:
+    """Return the solution by Newton steps in float64 (`refine.py`)."""
+    single, most = p.q.dtype != jnp.float64, solver.most_newton_steps()
+
+    def polish(p: ScaledProgram, begin: MultiplierState) -> Improved:
+        return improve(most, solver.fixed, whole, p.unrounded() if single else p, begin)
+
+    pair, proof, ended, idle = precisely(polish, p, begin)
+    found = with_status(pair.measured, pair.z, pair.y, proof)
+    unsolved = found.status == Status.ITERATION_LIMIT
+    status = jnp.where(unsolved & idle, jnp.int32(Status.INACCURATE), found.status)
+    return replace(found, status=jnp.where(ended, status, jnp.int32(Status.ITERATION_LIMIT)))
+
+
+def stepped_end(p: ScaledProgram, begin: MultiplierState, most: int) -> QPSolution:
+    """Return the solution by a fixed number of Newton steps, which may be 0, in the type of the
+    data: differentiable step by step."""
+    qp, factor, q, bounds = p.qp, p.factor, p.q, p.bounds
+    pair, end = unscaled(qp, factor, p.unit, begin.w, begin.y), begin
+    if most:
         advance = lambda s, _: (multipliers_step(factor.H, q, factor.A, bounds, s), None)
-        end = lax.scan(advance, varying(begin, begin), length=refine)[0]
-        pair = better(qp, pair, unscaled(qp, factor, unit, end.w, end.y))
+        end = lax.scan(advance, varying(begin, begin), length=most)[0]
+        pair = better(qp, pair, unscaled(qp, factor, p.unit, end.w, end.y))
     sizes = p.natural(end.w, end.y)
-    allowed = eps * row_sizes(0.0, qp.row_sizes, sizes)
+    allowed = p.eps * row_sizes(0.0, qp.row_sizes, sizes)
     certified = partial(prove, qp, factor.T, factor.E, correcting_rows(qp), allowed)
     proof = certified(end.change, end.move).joined(certified(end.y, end.w))
-    return assess(residual_terms, (qp,), *pair, proof, eps, natural=sizes)
+    return assess(residual_terms, (qp,), *pair, proof, p.eps, natural=sizes)
 
 
 def loop(iterations: int, constants: tuple, data: tuple) -> list[tuple[Array, Array]]:
@@ -217,7 +244,7 @@ def loop(iterations: int, constants: tuple, data: tuple) -> list[tuple[Array, Ar
 
 
 def loop_kernel(
-    iterations: int, product: Any, constants: tuple, data: tuple
+    iterations: int, product: Product, constants: tuple, data: tuple
 ) -> list[tuple[Array, Array]]:
     """`loop` of a batch, as a kernel for NVIDIA GPUs; B in front of all leaves of `data`."""
     (factor, alpha), (q, bounds, t) = constants, data

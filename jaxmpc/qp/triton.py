@@ -8,7 +8,7 @@ so that machines without GPUs never load it.
 import functools
 import importlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +18,23 @@ from jax import Array
 LEAST, MOST = 16, 512
 # float32 products as sums of six products of bfloat16, as exact as float32's own, or of three, with
 # errors of 2⁻¹⁶.
-EXACT: Any = jax.lax.DotAlgorithmPreset.BF16_BF16_F32_X6
-ROUGH: Any = jax.lax.DotAlgorithmPreset.BF16_BF16_F32_X3
+Product = jax.lax.DotAlgorithmPreset
+EXACT, ROUGH = Product.BF16_BF16_F32_X6, Product.BF16_BF16_F32_X3
+
+
+class Ref(Protocol):
+    """Memory of a kernel: of an argument, of a result, or of its own."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The number of entries along each axis."""
+
+    @property
+    def at(self) -> Any:
+        """`at[i]`: the place of entry i, to `load` from or to `store` to."""
+
+    def __getitem__(self, i: int) -> Array:
+        """Return entry i."""
 
 
 def on_gpu() -> bool:
@@ -43,9 +58,12 @@ def has_triton() -> bool:
 
 
 def call(
-    kernel: Callable, shapes: Any, warps: int = 1, grid: tuple[int, ...] = (),
+    kernel: Callable,
+    shapes: Any,
+    warps: int = 1,
+    grid: tuple[int, ...] = (),
     aliases: dict[int, int] | None = None,
-) -> Callable:  # fmt: skip
+) -> Callable:
     """Return the kernel as a function of arrays, with one program for each place of the grid;
     `vmap` puts another axis in front of it. aliases: arguments whose memory a result takes over."""
     from jax.experimental import pallas
@@ -53,9 +71,13 @@ def call(
 
     options = triton.CompilerParams(num_warps=warps, num_stages=1)
     return pallas.pallas_call(
-        kernel, out_shape=shapes, grid=grid, compiler_params=options, interpret=not on_gpu(),
+        kernel,
+        out_shape=shapes,
+        grid=grid,
+        compiler_params=options,
+        interpret=not on_gpu(),
         input_output_aliases=aliases or {},
-    )  # fmt: skip
+    )
 
 
 def padded_side(n: int) -> int:
@@ -75,7 +97,7 @@ def program() -> Array:
     return pallas.program_id(0)
 
 
-def dot(a: Array, b: Array, product: Any) -> Array:
+def dot(a: Array, b: Array, product: Product) -> Array:
     """Return the product of two matrices; product: EXACT or ROUGH, for float32 on tensor cores."""
     precision = product if on_gpu() and a.dtype == jnp.float32 else None
     return jax.lax.dot_general(
@@ -83,14 +105,14 @@ def dot(a: Array, b: Array, product: Any) -> Array:
     )
 
 
-def load(place: Any, mask: Any, other: Any = 0.0) -> Array:
+def load(place: Any, mask: Array, other: float = 0.0) -> Array:
     """Return what stands at `place`, and `other` where the mask is false."""
     from jax.experimental.pallas import triton
 
     return triton.load(place, mask=mask, other=other)
 
 
-def store(place: Any, value: Array, mask: Any) -> None:
+def store(place: Any, value: Array, mask: Array) -> None:
     """Store where the mask is true."""
     from jax.experimental.pallas import triton
 
@@ -116,11 +138,11 @@ def in_one_program(
     """
     dtype = data[0][0].dtype
 
-    def kernel(*refs: Any) -> None:
+    def kernel(*refs: Ref) -> None:
         *in_refs, numbers_ref = refs
         in_refs, out_refs = in_refs[: len(data)], in_refs[len(data) :]
 
-        def read(ref: Any, count: int, fill: float) -> Array:
+        def read(ref: Ref, count: int, fill: float) -> Array:
             i = indices(padded_side(count))
             return load(ref.at[i], i < count, fill)
 

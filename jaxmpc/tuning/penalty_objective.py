@@ -26,7 +26,7 @@ from jaxmpc.mpc.condense import Condensed
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ADMM, factor, iterate, natural, read, scaled, splittings, unscaled
 from jaxmpc.qp.problem import QP
-from jaxmpc.qp.residuals import joined, marked, residual_terms
+from jaxmpc.qp.residuals import joined, residual_terms, with_fault
 from jaxmpc.qp.solve import solve_factored, warm
 from jaxmpc.qp.status import Status
 from jaxmpc.tuning.batch_mean import BatchMean
@@ -141,7 +141,7 @@ def _solve_batch(
     made = factor(c.P, c.C, solver, c.balls)
 
     def one(sample: Samples) -> tuple[Array, Array]:
-        s = marked(*solve_factored(objective.qp(sample.x), made, solver, sample.start))
+        s = with_fault(*solve_factored(objective.qp(sample.x), made, solver, sample.start))
         worst = jnp.maximum(jnp.maximum(s.primal_residual, s.dual_residual), jnp.abs(s.gap))
         return s.status, worst
 

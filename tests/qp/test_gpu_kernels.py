@@ -11,11 +11,11 @@ import pytest
 from bench.families import joint
 
 import jaxmpc as jm
-from jaxmpc.qp import active_set, dual_kernel, newton, refine, solve, triton
-from jaxmpc.qp.active_set import DualPoint, DualSearch, dual_search
+from jaxmpc.qp import dual_kernel, dual_search, linearised, scaled_program, solve, triton
 from jaxmpc.qp.admm import ADMM, factor, iterate, scaled, splittings
 from jaxmpc.qp.admm_kernel import iterate_batch, pieces
 from jaxmpc.qp.admm_kernel import suits as suits_kernel
+from jaxmpc.qp.dual_step import Dual, DualPoint, MostSteps
 from jaxmpc.qp.loops import true_places
 
 STEPS = 12
@@ -84,16 +84,17 @@ def searches(case, first, more):
     """The end of the search by XLA's loop and by the kernel, and which instances are optimal."""
     made, q, bounds, t = scaled_batch(**case, dtype=jnp.float64)
     start = 0.02 * t * (jnp.abs(t) > 1)
-    limit, A, S = jnp.asarray(1e7), made.A, made.S
-    points = jax.vmap(lambda q, b, y: DualPoint.of(A, q, b, y))
+    limit, steps = jnp.asarray(1e7), MostSteps(first, more)
+    points = jax.vmap(lambda q, b, y: DualPoint.of(made.A, q, b, y))
     cold, point = points(q, bounds, 0 * start), points(q, bounds, start)
 
     def loop(bounds, cold, point):
-        return dual_search(A, S, bounds, limit, cold, point, jnp.asarray(True), first, more)
+        dual = Dual(made.A, made.S, bounds, limit)
+        return dual_search.dual_search(dual, cold, point, jnp.asarray(True), steps)
 
     def kernel(bounds, cold, point):
-        state = DualSearch(point, jnp.int32(0), jnp.asarray(True), jnp.asarray(False))
-        return dual_kernel.dual_search_kernel(A, S, bounds, limit, cold, state, first, more)
+        dual, true = Dual(made.A, made.S, bounds, limit), jnp.asarray(True)
+        return dual_kernel.dual_search_kernel(dual, cold, point, jnp.int32(0), true, steps)
 
     return [jax.jit(jax.vmap(search))(bounds, cold, point) for search in (loop, kernel)]
 
@@ -145,7 +146,7 @@ def test_damped_systems_in_a_kernel_are_those_of_xla(x64):
     b = jnp.where(W < 120, rng.standard_normal((6, 48)), 0.0)
     S = jnp.asarray(A @ A.T)
     each = lambda function: jax.vmap(lambda *v: function(S, *v, 1e-6, 4))(W, slack, b)
-    found, wanted = each(dual_kernel.damped_kernel), each(newton.damped)
+    found, wanted = each(dual_kernel.damped_kernel), each(linearised.damped)
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
     whole = np.asarray(S)[np.ix_(W[5], W[5])] + np.diag(slack[5])
     np.testing.assert_allclose(whole @ found[5], b[5], atol=1e-9)
@@ -168,7 +169,7 @@ def test_plans_by_kernels_are_those_without(soft, x64, monkeypatch):
         )
     plans = lambda solver: jax.jit(jax.vmap(jm.Controller(mpc, solver).plan))(states)
     wanted = plans(jm.ADMM())
-    for module in (active_set, refine):
+    for module in (dual_search, scaled_program):
         monkeypatch.setattr(module, "has_kernels", lambda rows: rows > 0)
     found = plans(SOLVER)
     np.testing.assert_array_equal(found.status, wanted.status)
@@ -184,7 +185,7 @@ def lowered(function, states, monkeypatch):
     if not hasattr(mesh_module, "AbstractDevice"):
         pytest.skip("this JAX lowers kernels on machines with a GPU alone")
     monkeypatch.setattr(triton, "on_gpu", lambda: True)
-    monkeypatch.setattr(newton, "on_gpu", lambda: True)
+    monkeypatch.setattr(linearised, "on_gpu", lambda: True)
     device = mesh_module.AbstractDevice("NVIDIA H100 80GB HBM3", 132, "gpu")
     axes = dict(axis_types=(jax.sharding.AxisType.Auto,), abstract_device=device)
     program = jax.jit(function)

@@ -63,7 +63,7 @@ from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.precision import arrays, matmul, precisely
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.residuals import Measured, Pair, assess, concluded
+from jaxmpc.qp.residuals import Measured, Pair, assess, with_status
 from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.ellipsoid import Ellipsoid
@@ -424,7 +424,7 @@ def stated(
     end at, before it was rounded, or where there were none what is measured of this pair."""
     none = Proof.none(u, y)
     if measured is not None:
-        return concluded(measured, u, y, none)
+        return with_status(measured, u, y, none)
     return assess(stage_residuals, (s, sample), u, y, none, tolerance(solver, u.dtype))
 
 

@@ -18,13 +18,12 @@ violated rows join W at first; where that does not end soon, one at a time, as i
 of Goldfarb and Idnani (1983).
 Where H is not the identity (P singular) or there are balls, nothing is done here.
 
-The steps see nothing but S, the bounds, y and v: `DualSearch`. On NVIDIA GPUs they are one kernel
-(`dual_kernel.py`), made of the same functions.
+The steps see nothing but the `Dual` and a `DualPoint`: the loop of `dual_search.py` and the kernel
+of `dual_kernel.py` are made of them.
 """
 
 from collections.abc import Sequence
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,26 +31,40 @@ from jax import Array
 
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import solve
-from jaxmpc.qp.loops import repeat_while, true_places
+from jaxmpc.qp.loops import true_places
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds, sign
-from jaxmpc.qp.triton import has_kernels
 
 # Most rows in W.
 MOST_ROWS = 48
-# Most steps, of these those in which all violated rows join W, and most steps of a second search.
-MOST_STEPS, JOINTLY, MORE_STEPS = 24, 2, 100
+# Steps in which all violated rows join W.
+JOINTLY = 2
 # Step lengths that are tried, beside the largest that stops no row.
 LENGTHS = (1.0, 0.5, 0.25, 0.0625)
 # Ridge on S_WW, whose diagonal is 1, for linearly dependent rows: they share their multiplier.
 RIDGE = 1e-11
 # Violations relative to the largest row that count as rounding.
 NOISE = 1e-13
-# Multipliers from which on the dual seems unbounded: see `refine.most_multiplier`.
-DIVERGED = 1 / RIDGE
-# Distance from the optimum at which the steps end: relative to the largest row, and, for rounding,
-# to the largest multiplier.
-CONVERGED, ROUNDING = 1e-11, 1e-15
+# Distance from the optimum at which the steps end that is rounding of the largest multiplier.
+ROUNDING = 1e-15
+
+
+@pytree
+class Dual:
+    """What the steps need of a program in ADMM's coordinates: rows A (m, n), S = A A' (m, m), its
+    bounds, and the size of multipliers from which on the dual seems unbounded."""
+
+    A: Array
+    S: Array
+    bounds: Bounds
+    limit: Array
+
+
+class MostSteps(NamedTuple):
+    """Steps of a search on the dual at most, and of a second one where that does not get there."""
+
+    first: int
+    more: int
 
 
 @pytree
@@ -85,107 +98,24 @@ class DualPoint:
         return DualPoint(self.y if y is None else y, w, matmul(w, A.T))
 
 
-@pytree
-class DualSearch:
-    """Loop state of one instance: its point, the steps taken, whether to go on, and whether its
-    multipliers are optimal."""
-
-    point: DualPoint
-    steps: Array
-    open: Array
-    optimal: Array
-
-
-def dual_search(
-    A: Array, S: Array, bounds: Bounds, limit: Array, cold: DualPoint, point: DualPoint,
-    go_on: Array, most: int, more: int,
-) -> tuple[DualPoint, Array]:  # fmt: skip
-    """Return the point after steps on the dual, and whether it is optimal. A (m, n), S = A A'.
-
-    Where `most` steps do not get there, multipliers exceed `limit`, or rows that join singly are
-    too many for W, it begins once more from `cold`, the point without multipliers, with rows that
-    join singly and `more` steps at most."""
-    state = DualSearch(point, jnp.int32(0), go_on, jnp.asarray(False))
-    if has_kernels(len(S)):
-        from jaxmpc.qp.dual_kernel import dual_search_kernel  # which is made of what stands here
-
-        return dual_search_kernel(A, S, bounds, limit, cold, state, most, more)
-    step = partial(_search_step, most_rows(A), most, more)
-    end = repeat_while(lambda s: s.open, step, (A, S, bounds, limit, cold), state)
-    return end.point, end.optimal
-
-
-def single_step(A: Array, S: Array, bounds: Bounds, limit: Array, point: DualPoint) -> DualPoint:
-    """Return the point after one step, in which rows join singly."""
-    true = jnp.asarray(True)
-    if has_kernels(len(S)):
-        from jaxmpc.qp.dual_kernel import dual_search_kernel
-
-        state = DualSearch(point, jnp.int32(JOINTLY), true, ~true)
-        return dual_search_kernel(A, S, bounds, limit, point, state, JOINTLY + 1, 0)[0]
-    return dual_step(A, S, bounds, point, true, most_rows(A))[0]
-
-
-def _search_step(rows: int, most: int, more: int, constants: tuple, s: DualSearch) -> DualSearch:
-    A, S, bounds, limit, cold = constants
-    again = s.steps == most
-    point = jax.tree.map(lambda old, new: jnp.where(again, new, old), s.point, cold)
-    singly = again | (s.steps >= JOINTLY)
-    point, fits = dual_step(A, S, bounds, point, singly, rows)
-    largest = [jnp.max(v, initial=0.0) for v in sizes(bounds, point.y, point.v)]
-    after = after_step(largest, CONVERGED, limit, s.steps + 1, fits, most, more)
-    return DualSearch(point, *after)
-
-
-def sizes(bounds: Bounds, y: Array, v: Array) -> tuple[Array, Array, Array]:
-    """Return by how much v misses prox(v + y), at which it is optimal, |v| and |y|, row by row."""
-    return jnp.abs(bounds.prox_residual(v + y, 1.0) - y), jnp.abs(v), jnp.abs(y)
-
-
-def after_step(
-    largest: Sequence[Array], converged: float, limit: Any, steps: Array, fits: Any, most: int,
-    more: int,
-) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Return the count of steps, whether to go on, and whether the point is optimal, after a step
-    to a point with these largest `sizes`. converged: distance from the optimum, relative to the
-    largest row, at which the steps end. fits: whether all its rows were in W. The count is `most`
-    where the search begins once more."""
-    error, largest_v, largest_y = largest
-    optimal = error <= converged * (1 + largest_v) + ROUNDING * largest_y
-    # (Without "not": Triton's dialect lacks it for booleans.)
-    lost = jnp.where(largest_y <= limit, jnp.where(fits, False, steps > JOINTLY), True)
-    first = steps <= most
-    ended = optimal | jnp.where(first, False, lost)
-    steps = jnp.where(first & lost, most, steps)
-    return steps, jnp.where(ended, False, steps < most + more), optimal
-
-
-def has_dual_steps(balls: tuple[int, ...], A: Any) -> bool:
-    """Return whether `active_set.py` can take steps: there are rows, and no balls."""
-    return not balls and len(A) > 0
-
-
 def most_rows(A: Array) -> int:
     """Return the number of rows that W may hold: no more than n are independent."""
     return min(*A.shape, MOST_ROWS)
 
 
-def dual_step(
-    A: Array, S: Array, bounds: Bounds, point: DualPoint, singly: Array, most: int
-) -> tuple[DualPoint, Array]:
-    """Take a step from `point`; A (m, n), S = A A'. singly: of the rows without multiplier that are
-    violated only the one that is so most joins W. most: rows that W may hold; the first so many
-    where there are more.
+def dual_step(dual: Dual, point: DualPoint, singly: Array) -> tuple[DualPoint, Array]:
+    """Take a step from `point`. singly: of the rows without multiplier that are violated only the
+    one that is so most joins W. Where W would have more than `most_rows`, it has the first of them.
 
     Returns the new point, and whether W held all its rows.
     """
-    y, v = point.y, point.v
+    bounds, y, v, most = dual.bounds, point.y, point.v, most_rows(dual.A)
     in_W = working_set(bounds, y, v, singly)
     W = true_places(in_W, most)
     inside = W < len(y)
     y_W, v_W, *rest = jnp.stack([y, v, *bounds.columns]).at[:, W].get(mode="fill", fill_value=0.0)
     rows = WorkingRows(Bounds.of_rows(rest), y_W, v_W)
-    S_W = S.at[W[:, None], W[None, :]].get(mode="fill", fill_value=0.0)
+    S_W = dual.S.at[W[:, None], W[None, :]].get(mode="fill", fill_value=0.0)
     d = solve(S_W + jnp.diag(jnp.where(inside, rows.slack + RIDGE, 1.0)), rows.gradient)
     t = jnp.append(jnp.asarray(LENGTHS, y.dtype), jnp.min(rows.stops(d), initial=1.0))
     moved = jax.vmap(lambda t: rows.moved(t * d))(t)
@@ -193,10 +123,10 @@ def dual_step(
     # (An argmin in a float64 program cannot be lowered where 64-bit mode is off.)
     best = (loss <= jnp.min(loss)).astype(y.dtype)
     change = jnp.zeros_like(y).at[W].add(matmul(best / jnp.sum(best), moved), mode="drop")
-    return point.moved(A, change), jnp.sum(in_W) <= most
+    return point.moved(dual.A, change), jnp.sum(in_W) <= most
 
 
-def working_set(bounds: Bounds, y: Array, v: Array, singly: Any) -> Array:
+def working_set(bounds: Bounds, y: Array, v: Array, singly: Array) -> Array:
     """Return which rows are in W (m,)."""
     new = jnp.where(y == 0, jnp.abs(violation(bounds, v)), 0.0)
     least = jnp.where(singly, jnp.max(new, initial=0.0), 0.0)
@@ -230,15 +160,11 @@ class WorkingRows(NamedTuple):
     @property
     def sign(self) -> Array:
         """That of the multiplier, or of the violation where there is none yet."""
-        outside = self.v - jnp.clip(self.v, self.bounds.l, self.bounds.u)
+        outside = violation(self.bounds, self.v)
         return jnp.where(self.y != 0, sign(self.y), sign(outside))
 
-    @property
-    def beyond(self) -> Array:
-        """By how much |y| exceeds the weight of an L1 penalty."""
-        return self._beyond(self.y)
-
-    def _beyond(self, y: Array) -> Array:
+    def beyond(self, y: Array) -> Array:
+        """Return by how much |y| exceeds the weight of an L1 penalty."""
         return jnp.maximum(jnp.abs(y) - self.bounds.linear, 0.0)
 
     @property
@@ -264,7 +190,7 @@ class WorkingRows(NamedTuple):
         """Right-hand side of the Newton step."""
         if self.bounds.linear is None:
             return self.excess
-        return self.excess - self.slack * self.sign * self.beyond
+        return self.excess - self.slack * self.sign * self.beyond(self.y)
 
     def stops(self, d: Array) -> Array:
         """Return the largest step lengths up to 1 along d that take no multiplier past zero."""
@@ -288,6 +214,37 @@ class WorkingRows(NamedTuple):
         to g*, as terms (k,) of a sum, for a change δ of y and its image S_WW δ."""
         loss = change * (0.5 * image - self.excess)
         if self.bounds.linear is not None:
-            added = lambda y: 0.5 * self.give * self._beyond(y) ** 2
-            loss = loss + added(self.y + change) - added(self.y)
+            loss = loss + self._soft_loss(self.y + change) - self._soft_loss(self.y)
         return loss
+
+    def _soft_loss(self, y: Array) -> Array:
+        return 0.5 * self.give * self.beyond(y) ** 2
+
+
+def sizes(bounds: Bounds, y: Array, v: Array) -> tuple[Array, Array, Array]:
+    """Return by how much v misses prox(v + y), at which it is optimal, |v| and |y|, row by row."""
+    return jnp.abs(bounds.prox_residual(v + y, 1.0) - y), jnp.abs(v), jnp.abs(y)
+
+
+def after_step(
+    largest: Sequence[Array],
+    converged: float,
+    limit: Array,
+    taken: Array,
+    fits: Array,
+    steps: MostSteps,
+) -> tuple[Array, Array, Array]:
+    """Return the count of steps, whether to go on, and whether the point is optimal, after a step,
+    the number `taken`, to a point with these largest `sizes`.
+
+    converged: distance from the optimum, relative to the largest row, at which the steps end.
+    limit: that of the `Dual`. fits: whether all rows were in W. The count is `steps.first` where
+    the search begins once more."""
+    error, largest_v, largest_y = largest
+    optimal = error <= converged * (1 + largest_v) + ROUNDING * largest_y
+    # (Without "not": Triton's dialect lacks it for booleans.)
+    lost = jnp.where(largest_y <= limit, jnp.where(fits, False, taken > JOINTLY), True)
+    first = taken <= steps.first
+    ended = optimal | jnp.where(first, False, lost)
+    taken = jnp.where(first & lost, steps.first, taken)
+    return taken, jnp.where(ended, False, taken < steps.first + steps.more), optimal
