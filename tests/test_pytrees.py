@@ -41,7 +41,7 @@ def test_no_class_compares_arrays():
     """A dataclass that may hold arrays is equal to itself alone: == of arrays has no truth."""
     scalars = {int, float, str, bool, int | None, float | None, bool | None}
     words = ("numpy", "Array", "Any", "Reals", "jaxmpc.")
-    own = {"ADMM", "Plain", "ConstantPlant", "Switch"}  # settings, constants
+    own = {"ADMM", "ConstantModel", "Switch"}  # settings, constants
     for c in classes():
         kinds = {f.type for f in dataclasses.fields(c)} - scalars
         if any(word in str(kind) for kind in kinds for word in words) and c.__name__ not in own:

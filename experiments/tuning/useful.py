@@ -36,7 +36,7 @@ from searchers import SEARCHERS, Space, search, within
 
 import jaxmpc as jm
 from jaxmpc.batches import Compiled
-from jaxmpc.closed_loop.many import as_argument
+from jaxmpc.mpc.stagewise.nonlinear import as_argument
 from jaxmpc.robots import Robot
 from jaxmpc.tuning.closed_loop_objective import ClosedLoopObjective
 from jaxmpc.tuning.losses import ClosedLoopLoss

@@ -2,50 +2,59 @@
 
 import functools
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import jax
 import numpy as np
-from jax import Array
-from tqdm.std import tqdm
 
 from jaxmpc.arrays import Reals
 from jaxmpc.batches import (
     Compiled,
     Devices,
+    Part,
     chosen_devices,
     count,
     device_bytes,
     divisible,
-    first_rows,
+    each_part,
     joined,
     over_devices,
     padded,
     placement,
     program_bytes,
+    work_off,
 )
 from jaxmpc.checks import fail, require_real
 from jaxmpc.closed_loop.noise import Noise
 from jaxmpc.closed_loop.observer import KalmanFilter
 from jaxmpc.closed_loop.run import Run
-from jaxmpc.closed_loop.simulation import (
-    ConstantPlant,
-    as_argument,
-    checked_arguments,
-    reference_sizes,
-    simulate,
-)
+from jaxmpc.closed_loop.simulation import Conditions, checked_loop, reference_shapes, simulate
+from jaxmpc.mpc.stagewise.nonlinear import ConstantModel
+from jaxmpc.pytrees import pytree
 from jaxmpc.qp.precision import arrays
 
 
 def simulate_many(
-    controller: Any, plant: Any, x0s: Reals, steps: int, *, reference: Reals | None = None,
-    input_reference: Reals | None = None, references: Reals | None = None,
-    input_references: Reals | None = None, previous_input: Reals | None = None,
-    noise: Noise | None = None, observer: KalmanFilter | None = None,
-    delay: int = 0, compensate: bool = True, variations: Mapping[str, Any] | None = None,
-    chunk: int | None = None, progress: bool = False, devices: Any = None,
-) -> Run:  # fmt: skip
+    controller: Any,
+    plant: Any,
+    x0s: Reals,
+    steps: int,
+    *,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
+    references: Reals | None = None,
+    input_references: Reals | None = None,
+    previous_input: Reals | None = None,
+    noise: Noise | None = None,
+    observer: KalmanFilter | None = None,
+    delay: int = 0,
+    compensate: bool = True,
+    variations: Mapping[str, Any] | None = None,
+    chunk: int | None = None,
+    progress: bool = False,
+    devices: Any = None,
+) -> Run:
     """Simulate closed loops from many initial states x0s (B, n); return NumPy arrays (B, ...).
 
     controller, plant, steps, previous_input, observer, delay, compensate: as in `simulate`.
@@ -73,59 +82,66 @@ def simulate_many(
     if chunk is not None and chunk < 1:
         fail("chunk", f"{chunk}", "Give a count of at least 1")
     devices = chosen_devices(devices)
-    shared = {
-        "reference": reference, "input_reference": input_reference,
-        "previous_input": previous_input, "noise": noise, "observer": observer,
-    }  # fmt: skip
-    shared = {name: value for name, value in shared.items() if value is not None}
-    given = {"reference": references, "input_reference": input_references}
-    own = {name: np.asarray(v) for name, v in given.items() if v is not None}
-    checked = checked_arguments(controller, plant, x0s[0], steps, **shared, delay=delay)
-    require_own(own, shared, controller, steps, len(x0s))
-    if noise is not None:
-        shared["noise"], own["index"] = checked[-2], np.arange(len(x0s))
-    if observer is not None:
-        shared["observer"] = checked[-1]
-    host = ("reference", "input_reference", "previous_input")
-    shared |= {name: np.asarray(shared[name]) for name in host if name in shared}
-    whole = jax.device_put(arrays((controller, as_argument(plant), shared)), placement(devices))
-    rows = lambda start, size: jax.tree.map(
-        lambda v: padded(np.asarray(v)[start : start + size], size), (x0s, variations, own)
+    given = Conditions(
+        reference=reference,
+        input_reference=input_reference,
+        previous_input=previous_input,
+        noise=noise,
+        observer=observer,
+        delay=delay,
+        compensate=bool(compensate),
     )
-    part = lambda start, size: jax.device_put(rows(start, size), placement(devices, True))
-    loops = _compiled_loops(int(steps), int(delay), bool(compensate), devices)
+    plant, _, shared = checked_loop(controller, plant, x0s[0], steps, given)
+    several = {"reference": references, "input_reference": input_references}
+    own = {name: np.asarray(value) for name, value in several.items() if value is not None}
+    _require_own(own, given, controller, steps, len(x0s))
+    numbers = None if noise is None else np.arange(len(x0s))
+    each = Each(x0s, variations, own, numbers)
+    whole = jax.device_put(arrays((controller, plant, shared)), placement(devices))
+    loops = _compiled_loops(int(steps), devices)
+
+    def run(part: Each) -> Run:
+        return loops(*whole, jax.device_put(part, placement(devices, True)))
+
     size = divisible(min(chunk or len(x0s), len(x0s)), devices)
     while chunk is None and size > count(devices):
-        if program_bytes(loops.program(*whole, *part(0, size))) <= 0.8 * device_bytes():
+        first = jax.tree.map(lambda v, size=size: padded(np.asarray(v)[:size], size), each)
+        program = loops.program(*whole, jax.device_put(first, placement(devices, True)))
+        if program_bytes(program) <= 0.8 * device_bytes():
             break
         size = divisible(-(-size // 2), devices)
-    runs = []
-    with tqdm(total=len(x0s), unit=" loops", disable=not progress) as bar:
-        for start in range(0, len(x0s), size):
-            here = min(size, len(x0s) - start)
-            runs.append(first_rows(loops(*whole, *part(start, size)), here))
-            bar.update(here)
+    runs = list[Run]()
+
+    def keep(part: Part[Run]) -> None:
+        runs.append(part.result)
+
+    work_off(each_part(run, each, size), keep, len(x0s), unit="loops", progress=progress)
     return joined(runs)
 
 
-def require_own(
-    own: Mapping[str, np.ndarray], shared: Mapping[str, Any], controller: Any, steps: int,
-    count: int,
-) -> None:  # fmt: skip
+@pytree
+class Each:
+    """What differs between B loops: initial states (B, n), variations of the plant, references of
+    their own by name, and the numbers (B,) of the loops for their noise, None without noise."""
+
+    x0s: Any
+    variations: dict[str, Any]
+    references: dict[str, Any]
+    numbers: Any = None
+
+
+def _require_own(
+    own: Mapping[str, np.ndarray], shared: Conditions, controller: Any, steps: int, count: int
+) -> None:
     """Raise ValueError unless the references of each loop have these shapes."""
-    mpc = controller.mpc
-    sizes = {
-        "reference": (reference_sizes(controller), steps + mpc.horizon),
-        "input_reference": ((mpc.system.m,), steps + mpc.horizon - 1),
-    }
+    shapes = reference_shapes(controller, steps)
     for name, value in own.items():
-        widths, length = sizes[name]
-        if name in shared:
+        if getattr(shared, name) is not None:
             fail(f"{name}s", f"given beside {name}", "Give one for all loops, or one for each")
         require_real(f"{name}s", value)
-        shapes = [shape for k in widths for shape in ((count, k), (count, length, k))]
-        if value.shape not in shapes:
-            listed = " or ".join(map(str, shapes))
+        choice = [(count, *shape) for shape in shapes[name]]
+        if value.shape not in choice:
+            listed = " or ".join(map(str, choice))
             cure = f"Give {listed}, one for each loop; {name} is for all of them"
             fail(f"{name}s", f"shape {value.shape}", cure)
 
@@ -141,38 +157,27 @@ def require_variations(plant: Any, variations: Mapping[str, Any], count: int) ->
         plant.vary(**{key: np.asarray(value)[0] for key, value in variations.items()})
 
 
-def simulate_batch(
-    controller: Any, plant: Any, reference: Any, input_reference: Any, x0s: Array,
-    variations: dict[str, Array], steps: int, checkpoint: bool = False,
-) -> Run:  # fmt: skip
-    """Simulate from x0s (B, n), loop i with entry i of the variations in its plant. Works inside
-    jit, vmap and grad.
+def simulate_each(
+    controller: Any, plant: Any, shared: Conditions, each: Each, *, steps: int, checkpoint: bool
+) -> Run:
+    """Return the runs (B, ...) of loops under shared conditions and those of their own. Works
+    inside jit, vmap and grad.
 
-    plant: from `as_argument`. The rest is as in `simulate` and `simulate_many`.
+    plant: from `as_argument`; each loop has it with its own variations.
     """
-    shared = {"reference": reference, "input_reference": input_reference}
-    options = {"steps": steps, "checkpoint": checkpoint}
-    return _loops(controller, plant, shared, x0s, variations, {}, **options)
+    plant = plant.given if isinstance(plant, ConstantModel) else plant
 
+    def loop(one: Each) -> Run:
+        given = replace(shared, **one.references)
+        if shared.noise is not None:
+            given = replace(given, noise=shared.noise.of_loop(one.numbers))
+        varied = plant.vary(**one.variations) if one.variations else plant
+        return simulate(controller, varied, one.x0s, steps, checkpoint=checkpoint, **vars(given))
 
-def _loops(
-    controller: Any, plant: Any, shared: dict[str, Any], x0s: Array, variations: dict[str, Array],
-    own: dict[str, Array], **options: Any,
-) -> Run:  # fmt: skip
-    """Return the runs from x0s (B, n), with arguments of `simulate` that all loops share and others
-    that each has of its own; "index" is the number of the loop for its noise."""
-    plant = plant.plant if isinstance(plant, ConstantPlant) else plant
-
-    def loop(x0: Array, varied: dict[str, Array], own: dict[str, Array]) -> Run:
-        given = shared | own | options
-        if "index" in own:
-            given["noise"] = shared["noise"].of_loop(given.pop("index"))
-        return simulate(controller, plant.vary(**varied) if varied else plant, x0, **given)
-
-    return jax.vmap(loop)(x0s, variations, own)
+    return jax.vmap(loop)(each)
 
 
 @functools.cache
-def _compiled_loops(steps: int, delay: int, compensate: bool, devices: Devices) -> Compiled:
-    loops = functools.partial(_loops, steps=steps, delay=delay, compensate=compensate)
-    return over_devices(loops, devices, (False,) * 3 + (True,) * 3)
+def _compiled_loops(steps: int, devices: Devices) -> Compiled:
+    loops = functools.partial(simulate_each, steps=steps, checkpoint=False)
+    return over_devices(loops, devices, (False, False, False, True))

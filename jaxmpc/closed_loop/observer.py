@@ -14,6 +14,7 @@ from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.precision import matmul
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
+from jaxmpc.robots.robot_model import RobotModel
 from jaxmpc.systems.riccati import least_reached, lqr
 from jaxmpc.systems.system import LinearSystem
 
@@ -168,8 +169,7 @@ def _gain(P: Array, C: Array, V: Array) -> Array:
 def model_step(model: Any, xi: Array, u: Array) -> Array:
     """Return the coordinates (n,) one sample later by a model: of a Robot, its predictor."""
     if isinstance(model, Robot):
-        smooth = replace(model, plant=model.predictor, numbers={})
-        return smooth.coordinates(smooth.step(smooth.state(xi), u))
+        return RobotModel(model).step(xi, u)
     return model.step(xi, u)
 
 

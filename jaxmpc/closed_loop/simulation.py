@@ -1,8 +1,8 @@
-"""simulate: plant and controller together, one sample after the other, under one scan."""
+"""simulate: plant and controller together, one time step after the other, under one scan."""
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +13,12 @@ from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_real, whole
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
 from jaxmpc.closed_loop.noise import Noise
-from jaxmpc.closed_loop.observer import KalmanFilter, model_of, model_step
+from jaxmpc.closed_loop.observer import Belief, KalmanFilter, model_of, model_step
 from jaxmpc.closed_loop.run import Run
+from jaxmpc.mpc.plan import Control
 from jaxmpc.mpc.problem import weights_of
-from jaxmpc.pytrees import record
+from jaxmpc.mpc.stagewise.nonlinear import ConstantModel, as_argument
+from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.sets.violations import worst_violation
@@ -27,20 +29,29 @@ SLACK = {"float64": 1e-6, "float32": 1e-3}
 
 
 def simulate(
-    controller: Any, plant: Any, x0: Reals, steps: int, *, reference: Reals | None = None,
-    input_reference: Reals | None = None, disturbance: Reals | None = None,
+    controller: Any,
+    plant: Any,
+    x0: Reals,
+    steps: int,
+    *,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
+    disturbance: Reals | None = None,
     previous_input: Reals | None = None,
-    noise: Noise | None = None, observer: KalmanFilter | None = None, delay: int = 0,
-    compensate: bool = True, checkpoint: bool = False,
-) -> Run:  # fmt: skip
-    """Simulate `plant` under `controller` from the state x0 (n,) for T = steps samples.
+    noise: Noise | None = None,
+    observer: KalmanFilter | None = None,
+    delay: int = 0,
+    compensate: bool = True,
+    checkpoint: bool = False,
+) -> Run:
+    """Simulate `plant` under `controller` from the state x0 (n,) for T = steps time steps.
 
     controller: a Controller, RobotController or LinearFeedback.
     plant: a LinearSystem, LinearPlant or Robot, or any object with `step(x, u) -> x` written in
         JAX; the controller's own `mpc.system` gives the nominal loop. A plant that is a pytree is
         an argument of the compiled program, any other object a constant of it.
     reference: state to track in the coordinates of the controller, (n,), or (T + N, n): the plan at
-        sample t sees the rows t … t+N. None: their origin, also where a robot's problem was made
+        step t sees the rows t … t+N. None: their origin, also where a robot's problem was made
         about another target.
     input_reference: input to track, (m,), or (T + N − 1, m); None: zero.
     disturbance (T, n): added to the next states.
@@ -49,65 +60,81 @@ def simulate(
     noise: `Noise` of the plant and of what is measured; None for none.
     observer: a `KalmanFilter`; the controller sees its estimate, `run.estimates`. None: the
         controller sees the state, with the measurement noise if there is any.
-    delay: samples from the measurement to the input that follows from it, 0 or 1. With 1 the input
-        computed at sample t acts at t + 1, and previous_input at 0.
-    compensate: with a delay, plan from the state one sample later, which the controller's own model
-        predicts under the input on its way, with the references of that sample (their last row is
+    delay: steps from the measurement to the input that follows from it, 0 or 1. With 1 the input
+        computed at step t acts at t + 1, and previous_input at 0.
+    compensate: with a delay, plan from the state one step later, which the controller's own model
+        predicts under the input on its way, with the references of that step (their last row is
         repeated). False: plan as if there were no delay.
-    checkpoint: under reverse-mode differentiation store only what is carried from sample to
-        sample and compute the samples again: less memory, more time.
+    checkpoint: under reverse-mode differentiation store only what is carried from step to step and
+        compute the steps again: less memory, more time.
 
     Returns one `Run` in the controller's precision. For many initial states use
     `jax.vmap(lambda x: simulate(controller, plant, x, 50))(x0s)`, or `simulate_many`, which splits
     them into chunks that fit into memory. After a plan that is not SOLVED the loop goes on with
-    the first input of the best iterate; `run.feasible_steps` counts the samples before that.
+    the first input of the best iterate; `run.feasible_steps` counts the steps before that.
     Raises ValueError for wrong shapes, before any compile; numbers that are not finite give the
     status NON_FINITE.
     """
-    checked = checked_arguments(
-        controller, plant, x0, steps, reference=reference, input_reference=input_reference,
-        disturbance=disturbance, previous_input=previous_input, noise=noise, observer=observer,
+    given = Conditions(
+        reference=reference,
+        input_reference=input_reference,
+        disturbance=disturbance,
+        previous_input=previous_input,
+        noise=noise,
+        observer=observer,
         delay=delay,
-    )  # fmt: skip
-    return _simulate(*checked, int(steps), int(delay), bool(compensate), checkpoint)
+        compensate=bool(compensate),
+    )
+    plant, x0, given = checked_loop(controller, plant, x0, steps, given)
+    return _simulate(controller, plant, x0, given, steps=int(steps), checkpoint=checkpoint)
 
 
-def checked_arguments(
-    controller: Any, plant: Any, x0: Any, steps: Any, *, reference: Any = None,
-    input_reference: Any = None, disturbance: Any = None, previous_input: Any = None,
-    noise: Any = None, observer: Any = None, delay: Any = 0,
-) -> tuple:  # fmt: skip
-    """Return the traced arguments of `_simulate`; raise ValueError where one is wrong."""
+@pytree
+class Conditions:
+    """What a closed loop has beside its controller, plant and initial state; see `simulate`."""
+
+    reference: Any = None
+    input_reference: Any = None
+    disturbance: Any = None
+    previous_input: Any = None
+    noise: Noise | None = None
+    observer: KalmanFilter | None = None
+    delay: int = static(default=0)
+    compensate: bool = static(default=True)
+
+
+def checked_loop(
+    controller: Any, plant: Any, x0: Any, steps: int, given: Conditions
+) -> tuple[Any, Array, Conditions]:
+    """Return plant, initial state and conditions as arguments of a program, in the controller's
+    precision; raise ValueError where one is wrong."""
     if isinstance(controller, LinearFeedback):
         controller.validate()
     if not hasattr(controller, "mpc"):
         what = f"is a {type(controller).__name__}"
         fail("controller", what, "Give a Controller, RobotController or LinearFeedback")
-    mpc = controller.mpc
-    N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
-    size = controller.state_size
+    n, size = controller.mpc.system.n, controller.state_size
     whole("steps", steps, 1)
     require_real("x0", x0)
     if np.shape(x0) != (size,):
         fail("x0", f"shape {np.shape(x0)}", f"Give one state ({size},); use jax.vmap for many")
-    for name, value, shapes in (
-        (
-            "reference",
-            reference,
-            tuple(shape for k in reference_sizes(controller) for shape in ((k,), (steps + N, k))),
-        ),
-        ("input_reference", input_reference, ((m,), (steps + N - 1, m))),
-        ("disturbance", disturbance, ((steps, size),)),
-        ("previous_input", previous_input, ((m,),)),
-    ):
-        if value is None:
-            continue
-        require_real(name, value)
-        if np.shape(value) not in shapes:
-            fail(name, f"shape {np.shape(value)}", f"Give {' or '.join(map(str, shapes))}")
-    if whole("delay", delay, 0) > 1:
-        fail("delay", f"{delay}", "Give 0 or 1 samples; put longer delays into the model")
-    plant = _checked_plant(plant, size, m)
+    shapes: dict[str, list[tuple[int, ...]]] = {
+        **reference_shapes(controller, steps),
+        "disturbance": [(steps, size)],
+        "previous_input": [(controller.mpc.system.m,)],
+    }
+    cast: dict[str, Any] = {}
+    for name, choice in shapes.items():
+        value = getattr(given, name)
+        if value is not None:
+            require_real(name, value)
+            if np.shape(value) not in choice:
+                fail(name, f"shape {np.shape(value)}", f"Give {' or '.join(map(str, choice))}")
+            cast[name] = jnp.asarray(value, controller.dtype)
+    if whole("delay", given.delay, 0) > 1:
+        fail("delay", f"{given.delay}", "Give 0 or 1 samples; put longer delays into the model")
+    plant = _checked_plant(plant, size, controller.mpc.system.m)
+    observer, noise = given.observer, given.noise
     if observer is not None:
         if not isinstance(observer, KalmanFilter):
             fail("observer", f"is a {type(observer).__name__}", "Give a closed_loop.KalmanFilter")
@@ -122,15 +149,18 @@ def checked_arguments(
     if size != n and (noise is not None or observer is not None) and not hasattr(plant, "state"):
         what = f"a {type(plant).__name__} does not say which state has the coordinates ξ"
         fail("plant", what, "Give a Robot, or an object with coordinates(x) and state(ξ)")
-    cast = lambda v: None if v is None else jnp.asarray(v, controller.dtype)
-    references = (cast(reference), cast(input_reference))
-    given = (cast(x0), references, cast(disturbance), cast(previous_input))
-    return controller, as_argument(plant), *given, noise, observer
+    given = replace(given, noise=noise, observer=observer, delay=int(given.delay), **cast)
+    return as_argument(plant), jnp.asarray(x0, controller.dtype), given
 
 
-def reference_sizes(controller: Any) -> tuple[int, ...]:
-    """Return how many columns the reference of a controller may have."""
-    return getattr(controller, "reference_sizes", (controller.mpc.system.n,))
+def reference_shapes(controller: Any, steps: int) -> dict[str, list[tuple[int, ...]]]:
+    """Return the shapes that references of a loop of so many steps may have."""
+    mpc = controller.mpc
+    sizes = getattr(controller, "reference_sizes", (mpc.system.n,))
+    return {
+        "reference": [shape for k in sizes for shape in ((k,), (steps + mpc.horizon, k))],
+        "input_reference": [(mpc.system.m,), (steps + mpc.horizon - 1, mpc.system.m)],
+    }
 
 
 def _checked_plant(plant: Any, n: int, m: int) -> Any:
@@ -141,118 +171,146 @@ def _checked_plant(plant: Any, n: int, m: int) -> Any:
         plant.validate()
     sizes = getattr(plant, "state_size", n), getattr(plant, "m", m)
     if sizes != (n, m):
-        fail(
-            "plant", f"has {sizes[0]} states and {sizes[1]} inputs, the controller {n} and {m}",
-            "Give them in its coordinates (a RobotController knows those of its robot)",
-        )  # fmt: skip
+        what = f"has {sizes[0]} states and {sizes[1]} inputs, the controller {n} and {m}"
+        cure = "Give them in its coordinates (a RobotController knows those of its robot)"
+        fail("plant", what, cure)
     return plant if jax.tree_util.all_leaves([plant]) else arrays(plant)
 
 
-@jax.tree_util.register_static
-@record
-class ConstantPlant:
-    """A plant that is no pytree: a constant of the compiled program, compared by identity."""
+class Carried(NamedTuple):
+    """What goes from one time step to the next: the state, what the controller gave at the step
+    before, the input then, and the observer's belief."""
 
-    plant: Any
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, ConstantPlant) and self.plant is other.plant
-
-    def __hash__(self) -> int:
-        return id(self.plant)
+    x: Array
+    before: Control
+    previous: Array
+    belief: Belief | None
 
 
-def as_argument(plant: Any) -> Any:
-    """Return the plant as an argument of a program: itself where it is a pytree."""
-    return ConstantPlant(plant) if jax.tree_util.all_leaves([plant]) else plant
+class Happening(NamedTuple):
+    """What befalls one time step: its number, the disturbance, the noise of plant and outputs."""
+
+    t: Array
+    disturbance: Array | None
+    process: Array | None
+    measurement: Array | None
 
 
-@partial(jax.jit, static_argnames=("steps", "delay", "compensate", "checkpoint"))
-@own_modes
-def _simulate(
-    controller: Any, plant: Any, x0: Array, references: tuple[Array | None, Array | None],
-    disturbance: Array | None, previous_input: Array | None, noise: Noise | None,
-    observer: KalmanFilter | None, steps: int, delay: int, compensate: bool, checkpoint: bool,
-) -> Run:  # fmt: skip
-    plant = plant.plant if isinstance(plant, ConstantPlant) else plant
-    mpc = controller.mpc
-    N, (Q, R, *_) = mpc.horizon, weights_of(mpc, x0.dtype)
-    tolerance = SLACK[x0.dtype.name]
-    square = lambda v, W: jnp.sum(v * matmul(W, v))
-    ahead_by = delay if compensate else 0
-    # ξ of a state and the state of ξ, where the plant tells them apart.
-    coordinates = getattr(plant, "coordinates", lambda x: x)
-    state = getattr(plant, "state", lambda xi: xi)
+class Loop:
+    """One closed loop: what its time steps share."""
 
-    def ahead(reference: Array | None, t: Any, length: int) -> Array | None:
-        """Return the rows of a reference that a plan which begins at sample t tracks."""
+    def __init__(self, controller: Any, plant: Any, given: Conditions, dtype: Any) -> None:
+        self.controller, self.given = controller, given
+        self.plant = plant = plant.given if isinstance(plant, ConstantModel) else plant
+        self.horizon, (self.Q, self.R, *_) = (
+            controller.mpc.horizon,
+            weights_of(controller.mpc, dtype),
+        )
+        # Steps by which plans begin later than what is measured.
+        self.later = given.delay if given.compensate else 0
+        # ξ of a state and the state of ξ, where the plant tells them apart.
+        self.coordinates = getattr(plant, "coordinates", lambda x: x)
+        self.state = getattr(plant, "state", lambda xi: xi)
+
+    def rows(self, reference: Array | None, t: Array | int, length: int) -> Array | None:
+        """Return the rows of a reference that a plan which begins at step t tracks."""
         if reference is None or reference.ndim == 1:
             return reference
-        if ahead_by:
+        if self.later:
             reference = jnp.concatenate([reference, reference[-1:]])
         return jax.lax.dynamic_slice_in_dim(reference, t, length)
 
-    def rows(t: Any) -> tuple[Array | None, Array | None]:
-        """Return both references as a plan that begins at sample t tracks them."""
-        return ahead(references[0], t, N + 1), ahead(references[1], t, N)
+    def references(self, t: Array) -> tuple[Array | None, Array | None]:
+        """Return both references as a plan that begins at step t tracks them."""
+        N, given = self.horizon, self.given
+        return self.rows(given.reference, t, N + 1), self.rows(given.input_reference, t, N)
 
-    def sample(carry: tuple[Array, Any, Array, Any], at: tuple) -> tuple:
-        (x, before, previous, belief), (t, d, w, v) = carry, at
-        seen = x
-        if observer is not None:
-            y = observer.outputs(coordinates(x))
-            belief = observer.corrected(belief, y if v is None else y + v)
-            seen = state(belief.mean)
-        elif v is not None:
-            seen = state(coordinates(x) + v)
+    def seen(
+        self, x: Array, previous: Array, belief: Belief | None, noise: Array | None
+    ) -> tuple[Array, Array | None, Belief | None]:
+        """Return the state that the controller plans from, the observer's estimate of the state,
+        and its belief."""
+        observer, seen = self.given.observer, x
+        if observer is not None and belief is not None:
+            y = observer.outputs(self.coordinates(x))
+            belief = observer.corrected(belief, y if noise is None else y + noise)
+            seen = self.state(belief.mean)
+        elif noise is not None:
+            seen = self.state(self.coordinates(x) + noise)
         estimate = None if observer is None else seen
-        if delay:
-            belief = None if observer is None else observer.predicted(belief, previous)
-            if compensate and belief is not None:
-                seen = state(belief.mean)
-            elif compensate:
-                seen = state(model_step(model_of(controller), coordinates(seen), previous))
-        r, s = rows(t + 1 if ahead_by else t)
-        control = controller(seen, before, r, input_reference=s, previous_input=previous)
-        plan, u = control.plan, previous if delay else control.u
-        error, effort = (
-            value
-            if target is None
-            else value - (target if target.ndim == 1 else target[0])[: len(value)]
-            for value, target in zip(
-                (controller.coordinates(x), u), rows(t) if ahead_by else (r, s), strict=True
-            )
-        )
+        if self.given.delay and observer is not None and belief is not None:
+            belief = observer.predicted(belief, previous)
+        if self.later and belief is not None:
+            seen = self.state(belief.mean)
+        elif self.later:
+            model = model_of(self.controller)
+            seen = self.state(model_step(model, self.coordinates(seen), previous))
+        return seen, estimate, belief
+
+    def stage_cost(self, x: Array, u: Array, r: Array | None, s: Array | None) -> Array:
+        """Return (x − r)'Q(x − r) + (u − s)'R(u − s), r and s the first rows of references."""
+        error = _distance(self.controller.coordinates(x), r)
+        effort = _distance(u, s)
+        return jnp.sum(error * matmul(self.Q, error)) + jnp.sum(effort * matmul(self.R, effort))
+
+    def violation(self, x: Array) -> Array:
+        """Return the most by which x exceeds a row of the controller's state limits."""
+        limits = jax.tree.map(lambda v: jnp.asarray(v, x.dtype), self.controller.limits)
+        return worst_violation(limits, self.controller.coordinates(x))
+
+    def step(self, carried: Carried, now: Happening) -> tuple[Carried, Run]:
+        """Return what goes on to the next time step, and the record of this one."""
+        x, before, previous, belief = carried
+        seen, estimate, belief = self.seen(x, previous, belief, now.measurement)
+        r, s = self.references(now.t + 1 if self.later else now.t)
+        control = self.controller(seen, before, r, input_reference=s, previous_input=previous)
+        plan, u = control.plan, previous if self.given.delay else control.u
         record = Run(
-            states=x, inputs=u, cost=plan.cost, status=plan.status,
-            stage_cost=square(error, Q) + square(effort, R),
-            violation=_violation(controller, x), slack=plan.slack[0],
-            fallback=jnp.any(plan.slack > tolerance), estimates=estimate,
-        )  # fmt: skip
-        after = jnp.asarray(plant.step(x, u), x.dtype)
-        if w is not None:
-            after = state(coordinates(after) + w)
-        if observer is not None and not delay:
+            states=x,
+            inputs=u,
+            cost=plan.cost,
+            status=plan.status,
+            stage_cost=self.stage_cost(x, u, *(self.references(now.t) if self.later else (r, s))),
+            violation=self.violation(x),
+            slack=plan.slack[0],
+            fallback=jnp.any(plan.slack > SLACK[x.dtype.name]),
+            estimates=estimate,
+        )
+        after = jnp.asarray(self.plant.step(x, u), x.dtype)
+        if now.process is not None:
+            after = self.state(self.coordinates(after) + now.process)
+        observer = self.given.observer
+        if observer is not None and belief is not None and not self.given.delay:
             belief = observer.predicted(belief, u)
-        return (after if d is None else after + d, control, control.u, belief), record
-
-    before = controller.start(x0, ahead(references[1], ahead_by, N))
-    previous = jnp.zeros(mpc.system.m, x0.dtype) if previous_input is None else previous_input
-    n, p = mpc.system.n, mpc.system.n if observer is None else observer.p
-    w, v = (None, None) if noise is None else noise.draw(steps, n, p, x0.dtype)
-    belief = None if observer is None else observer.first(coordinates(x0))
-    run: Run
-    if checkpoint:
-        sample = jax.checkpoint(sample, prevent_cse=False)
-    samples, first = (jnp.arange(steps), disturbance, w, v), (x0, before, previous, belief)
-    (last, *_), run = jax.lax.scan(sample, varying(first, first), samples, length=steps)
-    return replace(
-        run, states=jnp.concatenate([run.states, last[None]]),
-        violation=jnp.append(run.violation, _violation(controller, last)),
-    )  # fmt: skip
+        after = after if now.disturbance is None else after + now.disturbance
+        return Carried(after, control, control.u, belief), record
 
 
-def _violation(controller: Any, x: Array) -> Array:
-    """Return the most by which x exceeds a row of the controller's state limits."""
-    limits = jax.tree.map(lambda v: jnp.asarray(v, x.dtype), controller.limits)
-    return worst_violation(limits, controller.coordinates(x))
+def _distance(value: Array, target: Array | None) -> Array:
+    """Return the distance from a reference, or from its first row."""
+    if target is None:
+        return value
+    return value - (target if target.ndim == 1 else target[0])[: len(value)]
+
+
+@partial(jax.jit, static_argnames=("steps", "checkpoint"))
+@own_modes
+def _simulate(
+    controller: Any, plant: Any, x0: Array, given: Conditions, *, steps: int, checkpoint: bool
+) -> Run:
+    loop, system = Loop(controller, plant, given, x0.dtype), controller.mpc.system
+    observer, previous = given.observer, given.previous_input
+    before = controller.start(x0, loop.rows(given.input_reference, loop.later, loop.horizon))
+    previous = jnp.zeros(system.m, x0.dtype) if previous is None else previous
+    outputs = system.n if observer is None else observer.p
+    w = v = belief = None
+    if given.noise is not None:
+        w, v = given.noise.draw(steps, system.n, outputs, x0.dtype)
+    if observer is not None:
+        belief = observer.first(loop.coordinates(x0))
+    first = Carried(x0, before, previous, belief)
+    steps_given = Happening(jnp.arange(steps), given.disturbance, w, v)
+    step = jax.checkpoint(loop.step, prevent_cse=False) if checkpoint else loop.step
+    last, run = jax.lax.scan(step, varying(first, first), steps_given, length=steps)
+    states = jnp.concatenate([run.states, last.x[None]])
+    return replace(run, states=states, violation=jnp.append(run.violation, loop.violation(last.x)))

@@ -13,7 +13,8 @@ from jax.flatten_util import ravel_pytree
 
 from jaxmpc.batches import Devices, device_bytes, program_bytes
 from jaxmpc.checks import fail
-from jaxmpc.closed_loop.many import simulate_batch
+from jaxmpc.closed_loop.many import Each, simulate_each
+from jaxmpc.closed_loop.simulation import Conditions
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
@@ -65,8 +66,9 @@ class ClosedLoopObjective:
         controller = self.build(given)
         aims = (self.reference, self.input_reference)
         r, s = (aim(given) if callable(aim) else aim for aim in aims)
-        run = simulate_batch(
-            controller, plant, r, s, x0s.astype(controller.dtype), varied, self.steps, checkpoint
+        each = Each(x0s.astype(controller.dtype), varied, {})
+        run = simulate_each(
+            controller, plant, Conditions(r, s), each, steps=self.steps, checkpoint=checkpoint
         )
         losses = jax.vmap(self.loss)(run)
         total = jnp.sum(jnp.where(weights > 0, weights * losses, 0.0)) / jnp.sum(weights)

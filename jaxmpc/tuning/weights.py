@@ -11,11 +11,12 @@ import optax
 from jaxmpc.arrays import Reals
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, whole
-from jaxmpc.closed_loop.many import as_argument, require_variations
+from jaxmpc.closed_loop.many import require_variations
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.files import fingerprint
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.softening import harden
+from jaxmpc.mpc.stagewise.nonlinear import as_argument
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.tuning.closed_loop_objective import (
     MODES,

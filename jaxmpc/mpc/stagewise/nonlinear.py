@@ -117,15 +117,29 @@ class Point(NamedTuple):
 
 
 @static_pytree
-@dataclass(frozen=True)
-class Plain:
-    """A model x⁺ = f(x, u) given as a function or as an object that is no pytree."""
+@dataclass(frozen=True, eq=False)
+class ConstantModel:
+    """A model or plant that is no pytree: a constant of compiled programs, compared by identity.
+
+    given: a function (x, u) -> x⁺, or an object with such a `step`.
+    """
 
     given: Any
 
     def step(self, x: Array, u: Array) -> Array:
         """Return x⁺."""
         return getattr(self.given, "step", self.given)(x, u)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ConstantModel) and self.given is other.given
+
+    def __hash__(self) -> int:
+        return id(self.given)
+
+
+def as_argument(model: Any) -> Any:
+    """Return a model or plant as an argument of a program: itself where it is a pytree."""
+    return ConstantModel(model) if jax.tree_util.all_leaves([model]) else model
 
 
 @pytree
@@ -151,9 +165,8 @@ class NonlinearMPC:
     tasks: tuple[Task, ...] = ()
 
     def __post_init__(self) -> None:
-        if isinstance(self.mpc, MPC) and jax.tree_util.all_leaves([self.model]):
-            if callable(getattr(self.model, "step", self.model)):
-                object.__setattr__(self, "model", Plain(self.model))
+        if isinstance(self.mpc, MPC) and callable(getattr(self.model, "step", self.model)):
+            object.__setattr__(self, "model", as_argument(self.model))
 
     @property
     def targets(self) -> int:
