@@ -35,18 +35,18 @@ class ConstraintRows:
     size: of the bounds (`typical_bound`).
     """
 
-    U: Any
-    back: Any
-    D: Any
-    lower: Any
-    upper: Any
-    weight: Any
-    index: Any
-    Psi: Any
-    Omega: Any
-    psi: Any
-    zero_rows: Any
-    size: Any
+    U: np.ndarray
+    back: np.ndarray
+    D: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    weight: np.ndarray
+    index: np.ndarray
+    Psi: np.ndarray
+    Omega: np.ndarray
+    psi: np.ndarray
+    zero_rows: np.ndarray
+    size: float
     radius: Any
     balls: tuple[int, ...] = static()
 
@@ -124,13 +124,22 @@ def constraint_rows(
     place[keep] = np.arange(len(keep))
     index = multiplier_index(mpc, blocks, c.layout, place[extra:], len(keep))
     lower, upper = weight * lower[keep], weight * upper[keep]
-    size = typical_bound(lower * row_unit[keep], upper * row_unit[keep])
     return ConstraintRows(
-        U, back, weight[:, None] * D[keep], lower, upper, weight,
-        index, Psi, Omega, psi,
-        np.flatnonzero(zero[: len(keep) - sum(c.balls)]), size,
-        weight[-1:] * c.radius if c.balls else None, c.balls,
-    )  # fmt: skip
+        U=U,
+        back=back,
+        D=weight[:, None] * D[keep],
+        lower=lower,
+        upper=upper,
+        weight=weight,
+        index=index,
+        Psi=Psi,
+        Omega=Omega,
+        psi=psi,
+        zero_rows=np.flatnonzero(zero[: len(keep) - sum(c.balls)]),
+        size=typical_bound(lower * row_unit[keep], upper * row_unit[keep]),
+        radius=weight[-1:] * c.radius if c.balls else None,
+        balls=c.balls,
+    )
 
 
 def typical_bound(lower: np.ndarray, upper: np.ndarray) -> float:

@@ -34,28 +34,28 @@ class ExactData:
     are none, or none that inputs can keep. moves: index of the free move that each input equals.
     """
 
-    A: Any
-    B: Any
-    c: Any
-    H: Any
-    D: Any
-    lower: Any
-    upper: Any
-    H_N: Any
-    lower_N: Any
-    upper_N: Any
-    P: Any
+    A: np.ndarray
+    B: np.ndarray
+    c: np.ndarray
+    H: np.ndarray
+    D: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    H_N: np.ndarray
+    lower_N: np.ndarray
+    upper_N: np.ndarray
+    P: Any  # an array, or None
     level: Any
     back: Any
-    u_lower: Any
-    u_upper: Any
-    move_lower: Any
-    move_upper: Any
-    left: Any
-    side: Any
-    reach: Any
-    side_0: Any
-    reach_0: Any
+    u_lower: np.ndarray
+    u_upper: np.ndarray
+    move_lower: np.ndarray
+    move_upper: np.ndarray
+    left: np.ndarray
+    side: np.ndarray
+    reach: np.ndarray
+    side_0: np.ndarray
+    reach_0: np.ndarray
     equalities: "Equalities | None"
     view: View
     moves: tuple[int, ...] = static()
@@ -76,11 +76,11 @@ class Equalities:
     most·max_i |r_i| / rows_i, for any amounts r.
     """
 
-    at: Any
-    at_N: Any
-    inverse: Any
-    rows: Any
-    most: Any
+    at: np.ndarray
+    at_N: np.ndarray
+    inverse: np.ndarray
+    rows: np.ndarray
+    most: np.ndarray
 
     @classmethod
     def of(cls, p: "ExactData") -> "Equalities | None":
@@ -93,14 +93,14 @@ class Equalities:
         """
         (n, m), N = np.shape(p.B), p.horizon
         moves = np.equal.outer(np.array(p.moves), np.arange(max(p.moves) + 1)).astype(float)
-        move = lambda k: np.kron(moves[k], np.eye(m))  # u_k from all moves
         free = np.tile(p.u_lower < p.u_upper, moves.shape[1])
         gain, off = np.zeros((n, free.size)), np.zeros((n, free.size))
         unit = 2.0**-52 * (n + m + 4)
         values, errors, at, at_N = [], [], p.lower == p.upper, p.lower_N == p.upper_N
         for k in range(N + 1):
             H, D, found = (p.H, p.D, at[k]) if k < N else (p.H_N, np.zeros((len(at_N), m)), at_N)
-            u = move(k) if k < N else np.zeros((m, free.size))
+            # u_k from all moves.
+            u = np.kron(moves[k], np.eye(m)) if k < N else np.zeros((m, free.size))
             value = (H @ gain + D @ u) * free
             size = np.abs(H) @ (off + unit * np.abs(gain)) + unit * np.abs(D) @ u
             # A row that no input moves is kept by itself, or not at all.
@@ -160,20 +160,19 @@ def hard_blocks(mpc: MPC) -> list[Block]:
     and u."""
     with jax.enable_x64(True):
         found = row_blocks(mpc, np.float64)
-    to64 = lambda v: np.asarray(v, np.float64)
     n, m, p = mpc.system.n, mpc.system.m, mpc.dimension
     hard = previous_inputs(mpc)
     for b in found:
-        r = b.size
-        H = np.zeros((r, p))
-        D = np.zeros((r, m)) if b.D is None else to64(b.D)
+        if b.linear is not None:
+            continue
+        H = np.zeros((b.size, p))
+        D = np.zeros((b.size, m)) if b.D is None else np.asarray(b.D, np.float64)
         if b.rate:
             H[:, n:] = -D
         elif b.H is not None:
-            H[:, :n] = to64(b.H)
-        if b.linear is None:
-            lower, upper = to64(b.lower), to64(b.upper)
-            hard.append(replace(b, H=H, D=D, lower=lower, upper=upper))
+            H[:, :n] = b.H
+        lower, upper = np.asarray(b.lower, np.float64), np.asarray(b.upper, np.float64)
+        hard.append(replace(b, H=H, D=D, lower=lower, upper=upper))
     return hard
 
 
@@ -207,76 +206,96 @@ def exact_data(
     |θ|. size (d,): typical size of θ (None: that of extent), which selects how rounding errors are
     bounded, not whether they are.
     """
-    n, m, N, p = mpc.system.n, mpc.system.m, mpc.horizon, mpc.dimension
+    n, m, N = mpc.system.n, mpc.system.m, mpc.horizon
     A, B, c = dynamics(mpc)
+    limits = state_limits(mpc)
     u_lower, u_upper = set_bounds(mpc.inputs, m)
-    H, D, lower, upper = [np.zeros((0, p))], [np.zeros((0, m))], [], []
-    H_N, lower_N, upper_N = [np.zeros((0, p))], [np.zeros(0)], [np.zeros(0)]
-    for b in blocks:
-        if absorbed(mpc, b) or b.radius is not None:
-            continue
-        if any(k < N for k in b.steps):
-            holds = np.isin(np.arange(N), b.steps)[:, None]
-            H, D = [*H, b.H], [*D, b.D]
-            lower.append(np.where(holds, b.lower, -np.inf))
-            upper.append(np.where(holds, b.upper, np.inf))
-        if N in b.steps:
-            H_N, lower_N, upper_N = [*H_N, b.H], [*lower_N, b.lower], [*upper_N, b.upper]
-    P = level = back = None
-    if isinstance(mpc.terminal_set, Ellipsoid):
-        P = np.zeros((p, p))
-        P[:n, :n] = np.asarray(mpc.terminal_set.P, np.float64)
-        P = (P + P.T) / 2
-        level = np.asarray(mpc.terminal_set.level, np.float64)
-        back = np.zeros((p, n))
-        back[:n] = np.linalg.inv(np.linalg.cholesky(P[:n, :n])).T
 
-    boxes = {id(set_): set_bounds(set_, n) for set_ in (mpc.states, mpc.terminal_set)}
-
-    def limits(k: int) -> np.ndarray:
-        """Return the bounds (2, p) of x_k, without those that the inputs have on it."""
-        sets = [mpc.states] if k in mpc.state_stages else []
-        bound = np.repeat([[-np.inf], [np.inf]], p, axis=1)
-        for set_ in [*sets, mpc.terminal_set] if k == N else sets:
-            lower, upper = boxes[id(set_)]
-            bound[:, :n] = np.maximum(bound[0, :n], lower), np.minimum(bound[1, :n], upper)
-        if k == 0 and p > n:
-            bound[:, n:] = u_lower, u_upper
-        return bound
-
-    axes, others = list(view.axes), list(view.others)
     extent = np.asarray(extent) if np.ndim(extent) == 2 else np.array([-extent, extent])
-    first = limits(0)[:, axes]
+    first = limits[0][:, list(view.axes)]
     side_0, reach_0 = one_sided(np.maximum(extent[0], first[0]), np.minimum(extent[1], first[1]))
-    start = np.zeros(p)
-    start[axes] = reach_0 if size is None else size
+    grown = start_sizes(view, reach_0 if size is None else size)
+    u_size = largest_magnitude(u_lower, u_upper)
+    left, sides, reach = np.zeros((3, N, mpc.dimension))
+    for k in range(N):
+        with np.errstate(invalid="ignore"):  # 0·inf below counts as 0
+            grown = np.nansum(np.abs(A) * grown, axis=1) + np.abs(c)
+            grown = grown + np.nansum(np.abs(B) * u_size, axis=1)
+        side, bound = one_sided(*limits[k + 1])
+        far = (bound > grown) | np.isinf(bound)
+        left[k], sides[k], reach[k] = far, np.where(far, 0.0, side), np.where(far, 0.0, bound)
+        grown = np.minimum(grown, bound)
+    x_size = [largest_magnitude(*limit[:, :n]) for limit in limits]
+    implied = input_size(A[:n, :n], B[:n], c[:n], x_size)
+    same_move = [np.equal(mpc.moves, i) for i in range(max(mpc.moves) + 1)]
+    implied = np.array([implied[same].min(axis=0) for same in same_move])
+    rows: list[Any] = [*staged_rows(mpc, blocks), *terminal_ball(mpc)]
+    inputs = u_lower, u_upper, np.maximum(u_lower, -implied), np.minimum(u_upper, implied)
+    errors = left, sides, reach, side_0, reach_0
+    parts: tuple[Any, ...] = (A, B, c, *rows, *inputs, *errors, None, view, mpc.moves)
+    data = ExactData(*parts)
+    return replace(data, equalities=Equalities.of(data))
+
+
+def start_sizes(view: View, size: np.ndarray) -> np.ndarray:
+    """Return the sizes (n,) of the entries of x_0 for points of this size (d,), 0 for infinite
+    ones."""
+    others, start = list(view.others), np.zeros(len(view.axes) + len(view.others))
+    start[list(view.axes)] = size
     if view.projects:
         start[others] = one_sided(view.lower, view.upper)[1]
     elif others:
         start[others] = np.abs(view.fixed)[others]
-    grown, u_size = np.where(np.isfinite(start), start, 0.0), largest_magnitude(u_lower, u_upper)
-    errors = []
-    for k in range(1, N + 1):
-        with np.errstate(invalid="ignore"):  # 0·inf below counts as 0
-            grown = np.nansum(np.abs(A) * grown, axis=1) + np.abs(c)
-            grown = grown + np.nansum(np.abs(B) * u_size, axis=1)
-        side, bound = one_sided(*limits(k))
-        far = (bound > grown) | np.isinf(bound)
-        errors.append((1.0 * far, np.where(far, 0.0, side), np.where(far, 0.0, bound)))
-        grown = np.minimum(grown, bound)
-    x_size = [largest_magnitude(*limits(k)[:, :n]) for k in range(N + 1)]
-    implied = input_size(A[:n, :n], B[:n], c[:n], x_size)
-    steps = [np.equal(mpc.moves, i) for i in range(max(mpc.moves) + 1)]
-    implied = np.array([implied[same].min(axis=0) for same in steps])
-    every_step = lambda parts: np.concatenate([np.zeros((N, 0)), *parts], axis=1)
-    left, sides, reach = np.array(errors).transpose(1, 0, 2)
-    data = ExactData(
-        A, B, c, np.concatenate(H), np.concatenate(D), every_step(lower), every_step(upper),
-        np.concatenate(H_N), np.concatenate(lower_N), np.concatenate(upper_N), P, level, back,
-        u_lower, u_upper, np.maximum(u_lower, -implied), np.minimum(u_upper, implied),
-        left, sides, reach, side_0, reach_0, None, view, mpc.moves,
-    )  # fmt: skip
-    return replace(data, equalities=Equalities.of(data))
+    return np.where(np.isfinite(start), start, 0.0)
+
+
+def staged_rows(mpc: MPC, blocks: list[Block]) -> list[np.ndarray]:
+    """Return H, D, lower, upper of the rows of the stages and H_N, lower_N, upper_N of the last
+    state, as in `ExactData`."""
+    N, p = mpc.horizon, mpc.dimension
+    rows = [b for b in blocks if not absorbed(mpc, b) and b.radius is None]
+    staged = [b for b in rows if any(k < N for k in b.steps)]
+    last = [b for b in rows if N in b.steps]
+    holds = [np.isin(np.arange(N), b.steps)[:, None] for b in staged]
+    lower = [np.where(at, b.lower, -np.inf) for at, b in zip(holds, staged, strict=True)]
+    upper = [np.where(at, b.upper, np.inf) for at, b in zip(holds, staged, strict=True)]
+    none = np.zeros((0, p)), np.zeros((0, mpc.system.m)), np.zeros((N, 0)), np.zeros(0)
+    return [
+        np.concatenate([none[0], *(b.H for b in staged)]),
+        np.concatenate([none[1], *(b.D for b in staged)]),
+        np.concatenate([none[2], *lower], axis=1),
+        np.concatenate([none[2], *upper], axis=1),
+        np.concatenate([none[0], *(b.H for b in last)]),
+        np.concatenate([none[3], *(b.lower for b in last)]),
+        np.concatenate([none[3], *(b.upper for b in last)]),
+    ]
+
+
+def terminal_ball(mpc: MPC) -> tuple[np.ndarray | None, np.ndarray | None, np.ndarray | None]:
+    """Return P, level and back of `ExactData`, None without a terminal ellipsoid."""
+    if not isinstance(mpc.terminal_set, Ellipsoid):
+        return None, None, None
+    n, p = mpc.system.n, mpc.dimension
+    P, back = np.zeros((p, p)), np.zeros((p, n))
+    P[:n, :n] = np.asarray(mpc.terminal_set.P, np.float64)
+    P = (P + P.T) / 2
+    back[:n] = np.linalg.inv(np.linalg.cholesky(P[:n, :n])).T
+    return P, np.asarray(mpc.terminal_set.level, np.float64), back
+
+
+def state_limits(mpc: MPC) -> list[np.ndarray]:
+    """Return bounds (2, p) of each x_k, k = 0..N, without those that the inputs have on it."""
+    n, N = mpc.system.n, mpc.horizon
+    states, last = set_bounds(mpc.states, n), set_bounds(mpc.terminal_set, n)
+    found = []
+    for k in range(N + 1):
+        bound = np.repeat([[-np.inf], [np.inf]], mpc.dimension, axis=1)
+        for lower, upper in [states] * (k in mpc.state_stages) + [last] * (k == N):
+            bound[:, :n] = np.maximum(bound[0, :n], lower), np.minimum(bound[1, :n], upper)
+        found.append(bound)
+    if mpc.dimension > n:
+        found[0][:, n:] = set_bounds(mpc.inputs, mpc.system.m)
+    return found
 
 
 def input_size(A: np.ndarray, B: np.ndarray, c: np.ndarray, size: list[np.ndarray]) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""The one loop over parts of a batch of points: labelled here, or by workers elsewhere.
+"""Labels of the parts of a batch of points, for the loop of `batches.work_off`: made here, or by
+workers elsewhere.
 
 An executor is anything with the interface of `concurrent.futures`: `submit(function, *arguments)`
 returns a future, whose `result()` waits. A part is labelled from what is sent with it alone, by
@@ -8,15 +9,14 @@ returns a future, whose `result()` waits. A part is labelled from what is sent w
 import functools
 import itertools
 import pickle
-import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
-from tqdm.std import tqdm
 
+from jaxmpc.batches import Part
 from jaxmpc.checks import fail
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.pipeline import Scope, label_parts
@@ -27,53 +27,37 @@ IN_FLIGHT = 256
 # How often a part is submitted again whose worker died.
 RETRIES = 3
 
-Key = TypeVar("Key")
+T = TypeVar("T")
 
 
 def labelled(
     problem: FeasibilityProblem,
-    keys: Sequence[Key],
-    points: Callable[[Key], np.ndarray],
+    places: Sequence[T],
+    points: Callable[[T], np.ndarray],
     scope: Scope,
     size: int,
     *,
-    total: int,
-    progress: bool | None = False,
-    deadline: float = np.inf,
     executor: Any = None,
     **settings: Any,
-) -> Iterator[tuple[Key, Labels]]:
-    """Label the points (b, d), b ≤ size, that each of the keys stands for; yield (key, Labels) in
-    order. What the caller does with a part counts as work on it in the bar.
+) -> Iterator[Part[Labels]]:
+    """Label the points (b, d), b ≤ size, at each of the places, and yield the parts in order.
 
-    total: number of all points. progress: show a bar; None: where stderr is a terminal. deadline:
-    of `time.monotonic`, after which no further part is yielded. executor: None to label here.
-    settings: those of `label_parts`.
+    executor: None to label here. settings: those of `label_parts`.
     """
-    if not keys:
-        return
-    parts = map(points, keys)
-    if executor is None:
-        found = label_parts(problem, parts, scope, size, **settings)
-    else:
-        found = label_elsewhere(executor, problem, parts, scope, size, **settings)
-    disable = None if progress is None else not progress
-    count = decided = 0
-    with tqdm(total=total, unit=" states", unit_scale=True, disable=disable) as bar:
-        for key, labels in zip(keys, found, strict=True):
-            yield key, labels
-            count += len(labels.label)
-            decided += int(np.count_nonzero(labels.label))
-            bar.set_postfix_str(f"{decided / count:.2%} decided", refresh=False)
-            bar.update(len(labels.label))
-            if time.monotonic() > deadline:
-                return
+    label = label_parts if executor is None else functools.partial(label_elsewhere, executor)
+    found = label(problem, map(points, places), scope, size, **settings) if places else ()
+    for place, labels in zip(places, found, strict=True):
+        yield Part(place, len(labels.label), labels, labels.compile_seconds)
 
 
 def label_elsewhere(
-    executor: Any, problem: FeasibilityProblem, parts: Iterable[np.ndarray], scope: Scope,
-    chunk: int, **settings: Any,
-) -> Iterator[Labels]:  # fmt: skip
+    executor: Any,
+    problem: FeasibilityProblem,
+    parts: Iterable[np.ndarray],
+    scope: Scope,
+    chunk: int,
+    **settings: Any,
+) -> Iterator[Labels]:
     """Label parts by an executor; arguments and labels are those of `label_parts`.
 
     A part whose future fails because its worker died is submitted again, `RETRIES` times at most,
@@ -104,10 +88,9 @@ def label_elsewhere(
                 except Exception as error:  # the executor's: those of the labels are returned
                     if not left:
                         raise
-                    warnings.warn(
-                        f"executor: no labels of {len(points):,} points came back "
-                        f"({type(error).__name__}); they are submitted again", stacklevel=2,
-                    )  # fmt: skip
+                    what = f"no labels of {len(points):,} points came back"
+                    again = f"({type(error).__name__}); they are submitted again"
+                    warnings.warn(f"executor: {what} {again}", stacklevel=2)
                     future = submit(points)
             if isinstance(found, Exception):
                 raise found

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.batches import chosen_devices, count, default_chunk
+from jaxmpc.batches import Part, chosen_devices, count, default_chunk, slices, work_off
 from jaxmpc.checks import fail, number, whole
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.labelling import labelled
@@ -333,16 +333,20 @@ def map_feasible_set(
 
 
 def map_points(
-    problem: FeasibilityProblem, x0s: Reals, *, chunk: int | None = None, **settings: Any
+    problem: FeasibilityProblem,
+    x0s: Reals,
+    *,
+    progress: bool = False,
+    deadline: float = np.inf,
+    **settings: Any,
 ) -> FeasibleSetMap:
-    """Label the points (B, d) of a feasibility problem; settings: those of `labelled`. Points that
-    are left at its deadline get status NOT_RUN."""
-    x0s = host_array("x0s", x0s)
-    parts = [Labels.empty(0, problem)]
-    parts += [part for _, part in label_chunks(problem, x0s, chunk=chunk, **settings)]
-    done = sum(len(part.label) for part in parts)
-    parts.append(Labels.empty(len(x0s) - done, problem))
-    return FeasibleSetMap.of(problem, x0s, Labels.joined(parts))
+    """Label the points (B, d) of a feasibility problem; settings: those of `label_chunks`. Points
+    that are left at the deadline (of `time.monotonic`) get status NOT_RUN."""
+    x0s, parts = host_array("x0s", x0s), list[Part[Labels]]()
+    chunks = label_chunks(problem, x0s, **settings)
+    done = work_off(chunks, parts.append, len(x0s), unit="pt", progress=progress, deadline=deadline)
+    left = Labels.empty(len(x0s) - done.count, problem)
+    return FeasibleSetMap.of(problem, x0s, Labels.joined([*(p.result for p in parts), left]))
 
 
 def label_chunks(
@@ -352,8 +356,8 @@ def label_chunks(
     chunk: int | None = None,
     scope: Scope | None = None,
     **settings: Any,
-) -> Iterator[tuple[slice, Labels]]:
-    """Label points chunk by chunk; yield (slice of the points, Labels). See `map_feasible_set`.
+) -> Iterator[Part[Labels]]:
+    """Label points chunk by chunk; the place of each part is its slice. See `map_feasible_set`.
 
     scope: None for that of these points; settings: further ones of `labelled`.
     """
@@ -366,8 +370,6 @@ def label_chunks(
     if chunk < 1:
         fail("chunk", f"{chunk}", "Give a count of at least 1")
     chunk = min(chunk, max(len(points), 1))
-    slices = [slice(i, min(i + chunk, len(points))) for i in range(0, len(points), chunk)]
-    scope = Scope.of(points, len(slices)) if scope is None else scope
-    yield from labelled(
-        problem, slices, points.__getitem__, scope, chunk, total=len(points), **settings
-    )
+    places = slices(len(points), chunk)
+    scope = Scope.of(points, len(places)) if scope is None else scope
+    yield from labelled(problem, places, points.__getitem__, scope, chunk, **settings)

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 from scipy.linalg import qr
 
+from jaxmpc.arrays import Reals
 from jaxmpc.checks import require_kind
 from jaxmpc.feasible import constraint_rows, exact_data
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.plan_polytope import PlanPolytope
 from jaxmpc.feasible.row_programs import RowPrograms
-from jaxmpc.feasible.view import View, make_view
+from jaxmpc.feasible.view import Axes, View, make_view
 from jaxmpc.files import as_json
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.inequalities import condensed_in_float64
@@ -45,19 +46,15 @@ class FeasibilityProblem:
     view: View
 
     @classmethod
-    def of(cls, mpc: MPC, axes: Any = None, fixed: Any = None) -> "FeasibilityProblem":
+    def of(cls, mpc: MPC, axes: Axes = None, fixed: Reals | None = None) -> "FeasibilityProblem":
         """Return the feasibility problem of `mpc`; axes, fixed: the view, as in `map_feasible_set`.
 
         Raises ValueError for an ill-posed problem and for a wrong view.
         """
         require_kind("mpc", mpc, MPC)
         mpc.validate()
-        hard = with_equalities(
-            replace(
-                mpc, soft=(), input_rate_weight=None, states=as_box(mpc.states),
-                inputs=as_box(mpc.inputs), terminal_set=as_box(mpc.terminal_set),
-            )
-        )  # fmt: skip
+        boxes = {name: as_box(getattr(mpc, name)) for name in ("states", "inputs", "terminal_set")}
+        hard = with_equalities(replace(mpc, soft=(), input_rate_weight=None, **boxes))
         return cls(hard, make_view(hard, axes, fixed))
 
     @property
@@ -136,29 +133,23 @@ class FeasibilityProblem:
         A, B, c = exact_data.dynamics(mpc)
         rows = [
             {"steps": list(b.steps), "H": b.H, "D": b.D, "lower": b.lower, "upper": b.upper}
-            for b in self.blocks if b.radius is None
-        ]  # fmt: skip
+            for b in self.blocks
+            if b.radius is None
+        ]
         ellipsoid = {"P": set_.P, "level": set_.level} if isinstance(set_, Ellipsoid) else None
         others: dict[str, Any] = {"index": list(view.others)}
         if view.projects:
             others |= {"lower": view.lower, "upper": view.upper}
         elif view.others:
             others["value"] = np.asarray(view.fixed)[list(view.others)]
-        return as_json({
-            "A": A, "B": B, "c": c, "horizon": mpc.horizon, "moves": list(mpc.moves), "rows": rows,
-            "ellipsoid": ellipsoid, "axes": list(view.axes), "others": others,
-        })  # fmt: skip
+        plain = {"A": A, "B": B, "c": c, "horizon": mpc.horizon, "moves": list(mpc.moves)}
+        plain |= {"rows": rows, "ellipsoid": ellipsoid, "axes": list(view.axes), "others": others}
+        return as_json(plain)
 
     def row_margins(self, exact: ExactData, size: np.ndarray) -> np.ndarray:
         """Return what margins (R,) of the rows a proof needs relative to each other: as rounding
         can move them at points of this size (d,), within a factor of 1e8."""
-        view, start = self.view, np.zeros(self.mpc.dimension)
-        start[list(view.axes)] = size
-        if view.projects:
-            free = exact_data.one_sided(view.lower, view.upper)[1]
-            start[list(view.others)] = np.where(np.isfinite(free), free, 0.0)
-        elif view.others:
-            start[list(view.others)] = np.abs(view.fixed)[list(view.others)]
+        start = exact_data.start_sizes(self.view, size)
         rounding = exact_data.rounding_of_rows(exact, start)
         found = np.zeros(len(self.rows.lower) + 1)
         found[self.rows.index] = np.concatenate([np.ravel(part) for part in rounding])
@@ -169,13 +160,14 @@ def with_previous_inputs(mpc: MPC, c: Condensed) -> Condensed:
     """Return the condensed problem with the rows of `exact_data.previous_inputs` before all
     others."""
     for b in exact_data.previous_inputs(mpc):
-        above = lambda top, old: np.concatenate([top, old])
-        more: dict[str, Any] = dict(
-            C=above(np.zeros((b.size, c.C.shape[1])), c.C), D=above(b.H, c.D),
-            d=above(np.zeros(b.size), c.d), lower=above(b.lower, c.lower),
-            upper=above(b.upper, c.upper), layout=((b.kind, b.steps, b.size), *c.layout),
-        )  # fmt: skip
-        c = replace(c, **more)
+        more: dict[str, Any] = {
+            "C": np.concatenate([np.zeros((b.size, c.C.shape[1])), c.C]),
+            "D": np.concatenate([b.H, c.D]),
+            "d": np.concatenate([np.zeros(b.size), c.d]),
+            "lower": np.concatenate([b.lower, c.lower]),
+            "upper": np.concatenate([b.upper, c.upper]),
+        }
+        c = replace(c, layout=((b.kind, b.steps, b.size), *c.layout), **more)
     return c
 
 
@@ -189,9 +181,12 @@ def with_equalities(mpc: MPC) -> MPC:
     n, m, N = mpc.system.n, mpc.system.m, mpc.horizon
     outputs = list(as_tuple("outputs", mpc.outputs, Outputs))
     changes: dict[str, Any] = {}
-    for name, size, steps in (
-        ("inputs", m, tuple(range(N))), ("states", n, mpc.state_stages), ("terminal_set", n, (N,)),
-    ):  # fmt: skip
+    places = {
+        "inputs": (m, tuple(range(N))),
+        "states": (n, mpc.state_stages),
+        "terminal_set": (n, (N,)),
+    }
+    for name, (size, stages) in places.items():
         set_ = getattr(mpc, name)
         if not isinstance(set_, Polytope):
             continue
@@ -206,7 +201,7 @@ def with_equalities(mpc: MPC) -> MPC:
         lower = np.where(np.arange(len(rows)) < len(one), h[rows], -np.inf)
         C, D = (H[rows], None) if name != "inputs" else (np.zeros((len(rows), n)), H[rows])
         labels = tuple(set_.labels[i] for i in part[rows]) if set_.labels else ()
-        outputs.append(Outputs(C, lower, h[rows], D, steps, labels))
+        outputs.append(Outputs(C, lower, h[rows], D, stages, labels))
         changes[name] = Box(*set_bounds(set_, size))
     return replace(mpc, outputs=tuple(outputs), **changes) if changes else mpc
 

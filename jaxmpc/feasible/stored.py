@@ -8,7 +8,6 @@ after refinement bound_point (ray, coordinate), bound_normal (facet, coordinate)
 
 import re
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from jaxmpc.arrays import Reals
-from jaxmpc.batches import CHUNK, Timing
+from jaxmpc.batches import CHUNK, Part, Timing, work_off
 from jaxmpc.checks import fail
 from jaxmpc.feasible import extremes
 from jaxmpc.feasible.extremes import HalfSpaces
@@ -248,26 +247,20 @@ def sweep_into(
             fail(str(path), what, "Add --resume (resume=True) to go on with it")
         report_damage(store)
         opened(store)
-        timing, start = Timing(), time.perf_counter()
         found = labelled(
             problem,
             pending,
             lambda block: mesh(along, store.samples(block)),
             Scope.of_grid(along, len(store.regions)),
             store.size,
-            total=sum(len(store.samples(block)) for block in pending),
-            progress=None if progress else False,
             executor=executor,
             iterations=iterations,
             dtype=dtype,
             devices=devices,
         )
-        for block, labels in found:
-            store.commit(block, **labels.arrays())
-            timing.count += len(labels.label)
-            timing.compile_seconds += labels.compile_seconds
-        # By the clock: blocks are computed while others are stored.
-        timing.run_seconds = time.perf_counter() - start - timing.compile_seconds
+        total = sum(len(store.samples(block)) for block in pending)
+        show = None if progress else False
+        timing = work_off(found, partial(commit_labels, store), total, unit="states", progress=show)
         if left := store.unfinished():
             return StoredMap.unread(problem, store, along, timing, left)
         whole = replace(StoredMap.read(problem, store, along), timing=timing)
@@ -277,6 +270,12 @@ def sweep_into(
             whole = whole.refine(gap)
         concluded(whole)
         return whole
+
+
+def commit_labels(store: "Store", part: Part[Labels]) -> str:
+    """Write the labels of a block; return a note for the progress bar."""
+    store.commit(part.place, **part.result.arrays())
+    return f"{np.mean(part.result.label != 0):.2%} of the last block decided"
 
 
 def open_labels(

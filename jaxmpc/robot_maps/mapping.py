@@ -175,8 +175,8 @@ class RobotSetting:
         labelled = label_chunks(
             self.problem, x0s, chunk=size, scope=scope, devices=devices, **settings
         )
-        for here, labels in labelled:
-            yield labels, self.run(x0s[here], size, devices)
+        for part in labelled:
+            yield part.result, self.run(x0s[part.place], size, devices)
 
     def run(self, x0s: np.ndarray, size: int, devices: Any = None) -> RobotLoops:
         """Simulate closed loops from points (b, d), b ≤ size, filled up to `size` of them."""

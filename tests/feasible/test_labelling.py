@@ -163,8 +163,8 @@ def test_labels_of_a_part_do_not_depend_on_the_others(case, monkeypatch):
 
 
 def label_chunks_of(problem, points, scope, settings):
-    for here, labels in label_chunks(problem, points, chunk=25, scope=scope, **settings):
-        yield here.start // 25, labels
+    for part in label_chunks(problem, points, chunk=25, scope=scope, **settings):
+        yield part.place.start // 25, part.result
 
 
 @pytest.mark.slow

@@ -30,9 +30,8 @@ def scalar():
 
 def labelled(points, **settings):
     """The slices and labels of all chunks, labels and status in one array each."""
-    slices, parts = zip(
-        *label_chunks(scalar(), np.reshape(points, (-1, 1)), **settings), strict=True
-    )
+    found = list(label_chunks(scalar(), np.reshape(points, (-1, 1)), **settings))
+    slices, parts = [part.place for part in found], [part.result for part in found]
     return slices, parts, *(np.concatenate([getattr(p, k) for p in parts])
                             for k in ("label", "status"))  # fmt: skip
 
@@ -105,7 +104,7 @@ class TestChunks:
         pause = 0.05
         for again in (False, True):
             begun, spent, compiled = time.perf_counter(), 0.0, 0.0
-            for _, part in label_chunks(scalar(), self.POINTS[:, None], chunk=77):
+            for part in (p.result for p in label_chunks(scalar(), self.POINTS[:, None], chunk=77)):
                 assert part.run_seconds > 0 and part.compile_seconds >= 0
                 spent += part.run_seconds + part.compile_seconds
                 compiled += part.compile_seconds
@@ -214,7 +213,8 @@ class TestLastPrograms:
         """Without a centre the margin alone is left."""
         flat = FeasibilityProblem.of(problems.scalar(x_max=0.0, terminal=0.0))
         assert len(list(last_programs(flat, np.ones(len(flat.rows.U))))) == 1
-        ((_, labels),) = label_chunks(flat, np.array([[0.0], [0.1]]))
+        (part,) = label_chunks(flat, np.array([[0.0], [0.1]]))
+        labels = part.result
         assert labels.label[0] >= 0 and labels.label[1] == -1
 
     def test_growth(self):
