@@ -13,5 +13,9 @@ from jaxmpc.export.fixed_steps_check import ClosedLoopCheck, check_fixed_steps
 from jaxmpc.export.jax_program import export_jax
 
 __all__ = [
-    "ClosedLoopCheck", "check_fixed_steps", "export_c", "export_explicit_c", "export_jax",
-]  # fmt: skip
+    "ClosedLoopCheck",
+    "check_fixed_steps",
+    "export_c",
+    "export_explicit_c",
+    "export_jax",
+]

@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.checks import fail
+from jaxmpc.checks import fail, number
+from jaxmpc.files import versions
 from jaxmpc.mpc.plan import rate_ends
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.pytrees import record
 from jaxmpc.sets.box import Box
 
 TEMPLATES = Path(__file__).parent
@@ -19,18 +21,76 @@ HEADERS = (
     "assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg "
     "stdbool stddef stdint stdio stdlib string tgmath time wchar wctype"
 ).split()
-# Endings of the files of a controller, in the order of their texts.
-KINDS = (".h", ".c", "_sizes.h", "_tables.h", "_example.c")
 
 
-def require_c_names(name: str, dtype: str) -> None:
-    """Raise ValueError for names that C does not take and types that are not offered."""
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-        fail("name", f"{name!r}", "Give letters, digits and _, a letter first")
-    if name in HEADERS:
-        fail("name", f"{name!r}", f"{name}.h is a header of C: give another name")
-    if dtype not in REAL:
-        fail("dtype", f"{dtype!r}", 'Give "float64" or "float32"')
+@record
+class CFiles:
+    """The files of a controller to be written: NAME.h, .c, _sizes.h, _tables.h and _example.c.
+
+    real: the C type of all numbers. tolerance: that of the code.
+    """
+
+    name: str
+    paths: tuple[Path, ...]
+    real: str
+    tolerance: float
+
+    @classmethod
+    def open(
+        cls,
+        folder: str | Path,
+        name: str,
+        dtype: str,
+        tolerance: float | None,
+        usual: Mapping[str, float],
+        overwrite: bool,
+    ) -> "CFiles":
+        """Check the arguments and make the folder. usual: the tolerance of each dtype, for None.
+
+        Raises ValueError for names that C does not take, types that are not offered, a tolerance
+        that is not positive, and files that exist, unless overwrite.
+        """
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+            fail("name", f"{name!r}", "Give letters, digits and _, a letter first")
+        if name in HEADERS:
+            fail("name", f"{name!r}", f"{name}.h is a header of C: give another name")
+        if dtype not in REAL:
+            fail("dtype", f"{dtype!r}", 'Give "float64" or "float32"')
+        tolerance = usual[dtype] if tolerance is None else tolerance
+        number("tolerance", tolerance, 0, "Give a positive number")
+        kinds = (".h", ".c", "_sizes.h", "_tables.h", "_example.c")
+        paths = prepared_paths(Path(folder), [f"{name}{kind}" for kind in kinds], overwrite)
+        return cls(name, tuple(paths), REAL[dtype], tolerance)
+
+    def write(
+        self,
+        templates: tuple[str, str, str],
+        sizes: Mapping[str, Any],
+        tables: Mapping[str, np.ndarray],
+        states: int,
+        macros: Mapping[str, str] | None = None,
+    ) -> list[Path]:
+        """Write header and code of these templates, sizes, tables and example; return the paths.
+
+        NAME, VERSION and X0 (zeros for so many states) in them are replaced.
+        """
+        header, code, example = (
+            (TEMPLATES / source).read_text(encoding="utf-8") for source in templates
+        )
+        texts = (
+            header,
+            code,
+            sizes_header(sizes, self.real),
+            tables_header(tables, macros or {}, self.real),
+            example,
+        )
+        zeros = " ".join(["0"] * states)
+        own = {"NAME": self.name, "VERSION": versions()["jaxmpc"], "X0": zeros}
+        for path, text in zip(self.paths, texts, strict=True):
+            # In one pass: the name may hold such a word.
+            filled = re.sub("|".join(own), lambda found: own[found[0]], text)
+            path.write_text(filled, encoding="utf-8")
+        return list(self.paths)
 
 
 def prepared_paths(folder: Path, names: list[str], overwrite: bool) -> list[Path]:
@@ -57,23 +117,6 @@ def input_limits(mpc: MPC) -> dict[str, np.ndarray]:
     if mpc.rate_limited:
         tables |= zip(("rate_lower", "rate_upper"), rate_ends(mpc), strict=True)
     return {name: np.broadcast_to(v, free.shape) for name, v in tables.items()}
-
-
-def write(paths: list[Path], texts: list[str], name: str, states: int) -> list[Path]:
-    """Write the texts, NAME, VERSION and X0 (a state of zeros) in them replaced; return the
-    paths."""
-    import jaxmpc
-
-    own = {"NAME": name, "VERSION": str(jaxmpc.__version__), "X0": " ".join(["0"] * states)}
-    for path, text in zip(paths, texts, strict=True):  # in one pass: the name may hold such a word
-        text = re.sub("|".join(own), lambda found: own[found[0]], text)
-        path.write_text(text, encoding="utf-8")
-    return paths
-
-
-def template(source: str) -> str:
-    """Return the text of a file beside this one."""
-    return (TEMPLATES / source).read_text(encoding="utf-8")
 
 
 def sizes_header(macros: Mapping[str, Any], real: str) -> str:

@@ -8,24 +8,13 @@ mostly, and the code checks their facets: so its answer "inside" does not rest o
 """
 
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from jaxmpc.checks import fail, number, require_kind
+from jaxmpc.checks import fail, require_kind
 from jaxmpc.explicit.regions import CriticalRegions
-from jaxmpc.export.c_files import (
-    KINDS,
-    REAL,
-    input_limits,
-    literal,
-    prepared_paths,
-    require_c_names,
-    sizes_header,
-    tables_header,
-    template,
-    write,
-)
+from jaxmpc.export.c_files import CFiles, input_limits, literal
 
 # How far beyond a facet counts as inside, relative to the size of X_N.
 TOLERANCE = {"float64": 1e-9, "float32": 1e-5}
@@ -108,10 +97,14 @@ class SearchTree(NamedTuple):
 
 
 def export_explicit_c(
-    regions: CriticalRegions, folder: str | Path, *, name: str = "law",
-    dtype: Literal["float64", "float32"] = "float64", tolerance: float | None = None,
+    regions: CriticalRegions,
+    folder: str | Path,
+    *,
+    name: str = "law",
+    dtype: Literal["float64", "float32"] = "float64",
+    tolerance: float | None = None,
     overwrite: bool = False,
-) -> list[Path]:  # fmt: skip
+) -> list[Path]:
     """Write the explicit law of `jm.explicit.critical_regions` as C99 code, for references of zero.
 
     Nothing is allocated, and nothing is solved: a call takes as many products of p numbers as the
@@ -126,42 +119,37 @@ def export_explicit_c(
     not take, and for files that exist, unless overwrite.
     """
     require_kind("regions", regions, CriticalRegions)
-    require_c_names(name, dtype)
-    if tolerance is None:
-        tolerance = TOLERANCE[dtype]
-    number("tolerance", tolerance, 0, "Give a positive number")
+    files = CFiles.open(folder, name, dtype, tolerance, TOLERANCE, overwrite)
     if not regions.complete:
-        fail(
-            "regions", f"are not all of the law ({regions.reason})", "Raise max_regions or seconds"
-        )
+        cure = "Raise max_regions or seconds"
+        fail("regions", f"are not all of the law ({regions.reason})", cure)
     vertices = [region.vertices for region in regions.regions]
     size = float(np.ptp(np.concatenate(vertices), axis=0).max())
     facets = Facets.of(regions, size)
     tree = SearchTree.of(facets, vertices, 1e-9 * size)
-    mpc, real = regions.mpc, REAL[dtype]
-    tables: dict[str, Any] = {
-        "plane_normal": facets.normal.ravel(), "plane_offset": facets.offset,
-        "node_plane": tree.plane, "node_inside": tree.inside, "node_outside": tree.outside,
-        "leaf_region": tree.regions, "facet_begin": facets.begin, "facet_plane": facets.plane,
-        "facet_side": facets.side, "law_gain": np.array([r.K.T.ravel() for r in regions.regions]).T,
-        "law_offset": np.array([r.k for r in regions.regions]).T,
+    mpc = regions.mpc
+    tables = {
+        "plane_normal": facets.normal.ravel(),
+        "plane_offset": facets.offset,
+        "node_plane": tree.plane,
+        "node_inside": tree.inside,
+        "node_outside": tree.outside,
+        "leaf_region": tree.regions,
+        "facet_begin": facets.begin,
+        "facet_plane": facets.plane,
+        "facet_side": facets.side,
+        "law_gain": np.array([region.K.T.ravel() for region in regions.regions]).T,
+        "law_offset": np.array([region.k for region in regions.regions]).T,
         **input_limits(mpc),
-    }  # fmt: skip
+    }
     sizes = {
-        "PARAMETERS": mpc.dimension, "INPUTS": mpc.system.m, "REGIONS": len(regions),
-        "NODES": len(tree.plane), "DEPTH": tree.depth, "MOST": _most(tree),
+        "PARAMETERS": mpc.dimension,
+        "INPUTS": mpc.system.m,
+        "REGIONS": len(regions),
+        "NODES": len(tree.plane),
+        "DEPTH": tree.depth,
+        "MOST": int(tree.outside[tree.plane < 0].max()),  # regions of a leaf
         "RATES": int(mpc.rate_limited),
-        "TOLERANCE": literal(tolerance * size, real).replace("(real)", ""),
-    }  # fmt: skip
-    paths = prepared_paths(Path(folder), [f"{name}{kind}" for kind in KINDS], overwrite)
-    arrays = {key: np.asarray(value) for key, value in tables.items()}
-    texts = [
-        template("law.h"), template("law.c"), sizes_header(sizes, real),
-        tables_header(arrays, {}, real), template("law_example.c"),
-    ]  # fmt: skip
-    return write(paths, texts, name, mpc.dimension)
-
-
-def _most(tree: SearchTree) -> int:
-    """Return the most regions of a leaf."""
-    return int(tree.outside[tree.plane < 0].max())
+        "TOLERANCE": literal(files.tolerance * size, files.real).replace("(real)", ""),
+    }
+    return files.write(("law.h", "law.c", "law_example.c"), sizes, tables, mpc.dimension)

@@ -13,19 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmpc.checks import fail, number, require_kind
-from jaxmpc.export.c_files import (
-    KINDS,
-    REAL,
-    input_limits,
-    literal,
-    prepared_paths,
-    require_c_names,
-    sizes_header,
-    tables_header,
-    template,
-    write,
-)
+from jaxmpc.checks import fail, require_kind
+from jaxmpc.export.c_files import CFiles, input_limits, literal
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import WarmStart
 from jaxmpc.mpc.problem import MPC
@@ -37,10 +26,15 @@ TOLERANCE = {"float64": 1e-6, "float32": 1e-3}
 
 
 def export_c(
-    mpc: MPC, folder: str | Path, solver: ADMM | None = None, *, name: str = "mpc",
-    dtype: Literal["float64", "float32"] = "float64", tolerance: float | None = None,
+    mpc: MPC,
+    folder: str | Path,
+    solver: ADMM | None = None,
+    *,
+    name: str = "mpc",
+    dtype: Literal["float64", "float32"] = "float64",
+    tolerance: float | None = None,
     overwrite: bool = False,
-) -> list[Path]:  # fmt: skip
+) -> list[Path]:
     """Write a controller as C99 code: what `Controller(mpc, solver)` does in a closed loop.
 
     Each call of `NAME_step` warm-starts from the plan before, takes `solver.iterations` steps of
@@ -61,11 +55,7 @@ def export_c(
     solver = ADMM() if solver is None else solver
     require_kind("mpc", mpc, MPC)
     require_kind("solver", solver, ADMM)
-    require_c_names(name, dtype)
-    if tolerance is None:
-        tolerance = TOLERANCE[dtype]
-    number("tolerance", tolerance, 0, "Give a positive number")
-    paths = prepared_paths(Path(folder), [f"{name}{kind}" for kind in KINDS], overwrite)
+    files = CFiles.open(folder, name, dtype, tolerance, TOLERANCE, overwrite)
     with jax.enable_x64(True):
         controller = Controller(mpc, replace(solver, newton_steps=0))
         assert controller.factor is not None
@@ -73,34 +63,32 @@ def export_c(
         if fault != Status.NOT_RUN:
             fail("mpc", f"cannot be factored: {fault.name}", "See the status in jm.Status")
         sizes, tables = _sizes(controller), _tables(controller)
-    real = REAL[dtype]
-    sizes["TOLERANCE"] = literal(tolerance, real)
+    real = files.real
+    sizes["TOLERANCE"] = literal(files.tolerance, real)
     suffix = "f" if real == "float" else ""
-    macros = {key: f"{key.lower()}{suffix}" for key in ("FABS", "SQRT")}
+    macros = {"FABS": f"fabs{suffix}", "SQRT": f"sqrt{suffix}"}
     macros["ALPHA"] = literal(float(np.asarray(controller.solver.alpha)), real)
-    texts = [
-        template("mpc.h"), template("mpc.c"), sizes_header(sizes, real),
-        tables_header(tables, macros, real), template("example.c"),
-    ]  # fmt: skip
-    return write(paths, texts, name, mpc.system.n)
+    return files.write(("mpc.h", "mpc.c", "example.c"), sizes, tables, mpc.system.n, macros)
 
 
 def _sizes(controller: Controller) -> dict[str, Any]:
     """What the code needs to know before it is compiled."""
-    mpc, c, factor, solver = (
-        controller.mpc,
-        controller.condensed,
-        controller.factor,
-        controller.solver,
-    )
+    mpc, c, factor = controller.mpc, controller.condensed, controller.factor
     assert c is not None and factor is not None
     return {
-        "STATES": mpc.system.n, "INPUTS": mpc.system.m, "PARAMETERS": mpc.dimension,
-        "VARIABLES": c.P.shape[0], "ROWS": c.C.shape[0], "STAGES": factor.rho.shape[0],
-        "ITERATIONS": solver.admm_steps(), "THIN": int(factor.G is None),
-        "SOFT": int(c.soft_linear is not None), "BALLS": len(c.balls), "BALL_ROWS": sum(c.balls),
+        "STATES": mpc.system.n,
+        "INPUTS": mpc.system.m,
+        "PARAMETERS": mpc.dimension,
+        "VARIABLES": c.P.shape[0],
+        "ROWS": c.C.shape[0],
+        "STAGES": factor.rho.shape[0],
+        "ITERATIONS": controller.solver.admm_steps(),
+        "THIN": int(factor.G is None),
+        "SOFT": int(c.soft_linear is not None),
+        "BALLS": len(c.balls),
+        "BALL_ROWS": sum(c.balls),
         "RATES": int(mpc.rate_limited),
-    }  # fmt: skip
+    }
 
 
 def _tables(controller: Controller) -> dict[str, Any]:
@@ -108,22 +96,40 @@ def _tables(controller: Controller) -> dict[str, Any]:
     mpc, c, factor = controller.mpc, controller.condensed, controller.factor
     assert c is not None and factor is not None
     N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
-    origin = jnp.zeros(mpc.dimension)
-    state = lambda r: c.qp(origin, reference=jnp.broadcast_to(r, (N + 1, n))).q
-    inputs = lambda r: c.qp(origin, input_reference=jnp.broadcast_to(r, (N, m))).q
+    origin, T = jnp.zeros(mpc.dimension), factor.T
+
+    def q_of_reference(r: jax.Array) -> jax.Array:
+        return c.qp(origin, reference=jnp.broadcast_to(r, (N + 1, n))).q
+
+    def q_of_input_reference(r: jax.Array) -> jax.Array:
+        return c.qp(origin, input_reference=jnp.broadcast_to(r, (N, m))).q
+
     bounds = c.qp(origin).bounds.scaled(factor.E)
-    # From coordinates w to z = T w, and from q to q_w = T'q.
-    T = factor.T
     tables = {
-        "P": c.P, "C": c.C, "E": factor.E, "rho": factor.rho.ravel(),
-        "ZF": T @ factor.F, "ZQ": -(T @ factor.Minv @ T.T),
-        "q_theta": c.F, "q_constant": c.f,
-        "q_state": jax.jacfwd(state)(jnp.zeros(n)), "q_input": jax.jacfwd(inputs)(jnp.zeros(m)),
-        "shift_theta": c.D, "shift_constant": c.d, "lower": c.lower, "upper": c.upper,
-        "first_theta": c.Psi[0], "first_z": c.Omega[0], "first_constant": c.psi[0],
-        "end_theta": c.Phi[N], "end_z": c.Gamma[N], "end_constant": c.phi[N],
-        "tail_gain": c.K_N, "prestabilising_gain": c.K,
-    }  # fmt: skip
+        "P": c.P,
+        "C": c.C,
+        "E": factor.E,
+        "rho": factor.rho.ravel(),
+        # From coordinates w to z = T w, and from q to q_w = T'q.
+        "ZF": T @ factor.F,
+        "ZQ": -(T @ factor.Minv @ T.T),
+        "q_theta": c.F,
+        "q_constant": c.f,
+        "q_state": jax.jacfwd(q_of_reference)(jnp.zeros(n)),
+        "q_input": jax.jacfwd(q_of_input_reference)(jnp.zeros(m)),
+        "shift_theta": c.D,
+        "shift_constant": c.d,
+        "lower": c.lower,
+        "upper": c.upper,
+        "first_theta": c.Psi[0],
+        "first_z": c.Omega[0],
+        "first_constant": c.psi[0],
+        "end_theta": c.Phi[N],
+        "end_z": c.Gamma[N],
+        "end_constant": c.phi[N],
+        "tail_gain": c.K_N,
+        "prestabilising_gain": c.K,
+    }
     if factor.G is not None:
         tables["G"] = factor.G
     if bounds.linear is not None:

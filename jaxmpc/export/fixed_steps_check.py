@@ -36,9 +36,14 @@ class ClosedLoopCheck:
 
 
 def check_fixed_steps(
-    mpc: MPC, solver: ADMM, lower: Reals, upper: Reals, samples: int = 1000,
-    tolerance: float = 1e-6, seed: int = 0,
-) -> ClosedLoopCheck:  # fmt: skip
+    mpc: MPC,
+    solver: ADMM,
+    lower: Reals,
+    upper: Reals,
+    samples: int = 1000,
+    tolerance: float = 1e-6,
+    seed: int = 0,
+) -> ClosedLoopCheck:
     """Run `Controller(mpc, solver)` with newton_steps=0 from random states of the box [lower,
     upper] (n,), and at each state solve the plan precisely too.
 
@@ -79,7 +84,10 @@ def check_fixed_steps(
         status, best, error = (np.asarray(v) for v in jax.jit(jax.vmap(loop))(starts))
     solvable = best == Status.SOLVED
     both = solvable & (status == Status.SOLVED)
-    most = lambda where: float(error[where].max(initial=0.0))
     return ClosedLoopCheck(
-        best.size, int(solvable.sum()), int(both.sum()), most(both), most(solvable)
+        samples=best.size,
+        solvable=int(solvable.sum()),
+        reached=int(both.sum()),
+        input_error=float(error[both].max(initial=0.0)),
+        input_error_any=float(error[solvable].max(initial=0.0)),
     )

@@ -16,9 +16,14 @@ PLATFORMS = ("cpu", "cuda")
 
 
 def export_jax(
-    mpc: MPC, path: str | Path, solver: ADMM | None = None, *, dtype: str = "float64",
-    platforms: tuple[str, ...] = PLATFORMS, overwrite: bool = False,
-) -> Path:  # fmt: skip
+    mpc: MPC,
+    path: str | Path,
+    solver: ADMM | None = None,
+    *,
+    dtype: str = "float64",
+    platforms: tuple[str, ...] = PLATFORMS,
+    overwrite: bool = False,
+) -> Path:
     """Write the plans of a batch of any size as one file that needs jax alone to run.
 
         program = jax.export.deserialize(path.read_bytes())

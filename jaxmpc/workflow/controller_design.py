@@ -43,11 +43,18 @@ class Design:
 
 
 def design(
-    system: LinearSystem, Q: Reals, R: Reals, horizon: int, *, limits: JointLimits | None = None,
-    states: Box | Polytope | None = None, inputs: Box | Polytope | None = None,
-    terminal: str | Box | Polytope | Ellipsoid = "invariant", soft: float | str | None = None,
+    system: LinearSystem,
+    Q: Reals,
+    R: Reals,
+    horizon: int,
+    *,
+    limits: JointLimits | None = None,
+    states: Box | Polytope | None = None,
+    inputs: Box | Polytope | None = None,
+    terminal: str | Box | Polytope | Ellipsoid = "invariant",
+    soft: float | str | None = None,
     **settings: Any,
-) -> Design:  # fmt: skip
+) -> Design:
     """Make an MPC problem from limits and weights, with terminal set, terminal cost and penalties.
 
     Arguments:
@@ -73,13 +80,11 @@ def design(
             system = replace(system, **named)
     regulator = lqr(system, Q, R)
     if isinstance(terminal, str):
-        terminal_set = named_terminal_set(terminal, system, regulator, states, inputs)
+        last = named_terminal_set(terminal, system, regulator, states, inputs)
     else:
-        terminal_set = terminal
-    mpc = MPC(
-        system=system, Q=Q, R=R, horizon=horizon, states=states, inputs=inputs,
-        terminal_set=terminal_set, **{"terminal_cost": regulator.P, **settings},
-    )  # fmt: skip
+        last = terminal
+    settings = {"terminal_cost": regulator.P, **settings}
+    mpc = MPC(system, Q, R, horizon, states, inputs, terminal_set=last, **settings)
     mpc.validate()
     if soft is None:
         return Design(mpc, regulator, None)

@@ -1,8 +1,10 @@
-"""The test of an MPC problem before it runs: proofs, simulations, and failed hypotheses."""
+"""What is checked of an MPC problem before it runs: proofs, simulations, failed hypotheses."""
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,6 +27,8 @@ from jaxmpc.recursion.time_budget import LABELS, LOOPS, PROOFS, Budget
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.terminal_hypotheses import TerminalReport, verify_terminal
 from jaxmpc.workflow.nominal_closed_loops import NominalLoops, nominal_loops
+
+T = TypeVar("T")
 
 
 @record
@@ -52,41 +56,53 @@ class OfflineReport:
     notes: dict[str, str]
 
     def __str__(self) -> str:
-        def section(title: str, body: Any, note: str) -> list[str]:
-            text = f"not done: {self.notes[note]}" if body is None else str(body)
-            return [title, *("  " + line.strip("\n") for line in text.splitlines()), ""]
-
         mpc, system = self.mpc, self.mpc.system
-        found = {} if self.feasible_set is None else self.feasible_set.counts()
-        known = ", ".join(f"{count:,} {name}" for name, count in found.items() if count)
-        low, high = self.volume
-        size = f"volume from {low:.9g} to {high:.9g}, " if np.isfinite(high) and high > 0 else ""
+        span = f" ({mpc.horizon * system.dt:g} s)" if system.dt else ""
         problem = (
-            f"{system.n} states, {system.m} inputs, horizon {mpc.horizon}"
-            + (f" ({mpc.horizon * system.dt:g} s)" if system.dt else "")
-            + f"\n{self.variables} variables, {self.rows} rows, condition of the Hessian "
-            f"{self.condition:.3g}\n" + limits_text(mpc)
+            f"{system.n} states, {system.m} inputs, horizon {mpc.horizon}{span}\n"
+            f"{self.variables} variables, {self.rows} rows, condition of the Hessian "
+            f"{self.condition:.3g}\n{limits_text(mpc)}"
         )
-        lines = section("Problem", problem, "")
-        text = None if self.feasible_set is None else f"{size}samples: {known}"
-        lines += section("Feasible set (limits hard)", text, "feasible_set")
-        lines += section("Recursive feasibility (limits hard)", self.recursion, "recursion")
-        penalty = None if self.penalty is None else self.penalty.sentence
-        lines += section("Exact penalty", penalty, "penalty")
-        lines += section("Terminal ingredients", self.terminal, "terminal")
-        lines += section("Closed loops", self.loops, "loops")
+        samples = None
+        if self.feasible_set is not None:
+            low, high = self.volume
+            bounded = np.isfinite(high) and high > 0
+            size = f"volume from {low:.9g} to {high:.9g}, " if bounded else ""
+            counts = self.feasible_set.counts().items()
+            known = ", ".join(f"{count:,} {name}" for name, count in counts if count)
+            samples = f"{size}samples: {known}"
+        sections = (
+            ("Problem", problem, ""),
+            ("Feasible set (limits hard)", samples, "feasible_set"),
+            ("Recursive feasibility (limits hard)", self.recursion, "recursion"),
+            ("Exact penalty", self.penalty, "penalty"),
+            ("Terminal ingredients", self.terminal, "terminal"),
+            ("Closed loops", self.loops, "loops"),
+        )
+        lines = []
+        for title, body, note in sections:
+            text = f"not done: {self.notes[note]}" if body is None else str(body)
+            lines += [title, *("  " + line.strip("\n") for line in text.splitlines()), ""]
         return "\n".join(lines).rstrip()
+
+    __repr__ = __str__
 
 
 def offline_report(
-    mpc: MPC, x0s: Reals | None = None, *, K: Reals | None = None, steps: int = 50,
-    loops: int = 128, seconds: float = 120.0, progress: bool = False,
-) -> OfflineReport:  # fmt: skip
+    mpc: MPC,
+    x0s: Reals | None = None,
+    *,
+    K: Reals | None = None,
+    steps: int = 50,
+    loops: int = 128,
+    seconds: float = 120.0,
+    progress: bool = False,
+) -> OfflineReport:
     """Test an MPC problem before its controller runs, and return one report.
 
     Covers every hypothesis of the terminal theorems, recursive feasibility, the exact penalty, the
-    feasible set and its volume, and `loops` nominal closed loops of `steps` samples from feasible
-    states, in this order. Soft rows count as hard but for the closed loops.
+    feasible set and its volume, and `loops` nominal closed loops of `steps` time steps from
+    feasible states, in this order. Soft rows count as hard but for the closed loops.
 
     Arguments:
         x0s: states (B, n), or (B, n + m) with the previous input where input rates are limited, to
@@ -114,31 +130,22 @@ def offline_report(
     problem = FeasibilityProblem.of(hard)
     notes: dict[str, str] = {}
 
-    def attempt(name: str, action: Any) -> Any:
-        try:
-            return action()
-        except ValueError as error:
-            notes[name] = str(error)
-            return None
-
     budget.say("terminal ingredients")
-    terminal = attempt("terminal", lambda: theorems(hard, K))
+    terminal = _or_note(notes, "terminal", partial(theorems, hard, K))
     # Where map and closed loops can fit, time is kept for their compiles.
     compiles = PROOFS + LABELS + LOOPS
-    kept = compiles if budget.affords(1.5 * compiles) else 0.0
-    proofs = replace(budget, deadline=budget.deadline - kept)
+    reserved = compiles if budget.affords(1.5 * compiles) else 0.0
+    proofs = replace(budget, deadline=budget.deadline - reserved)
     part = replace(proofs, deadline=proofs.share(2 / 3))
     follow = x0s if problem.dimension > 3 else None
-    recursion = attempt(
-        "recursion",
-        lambda: examine(hard, follow, steps, True, 2000, part, part.share(0.75)),
-    )
+    examined = partial(examine, hard, follow, steps, True, 2000, part, part.share(0.75))
+    recursion = _or_note(notes, "recursion", examined)
     budget.say("exact penalty, by critical regions")
     left = proofs.deadline - time.monotonic()
-    penalty = attempt("penalty", lambda: exact_penalty(mpc, seconds=left))
+    penalty = _or_note(notes, "penalty", partial(exact_penalty, mpc, seconds=left))
     fmap = mapped(problem, x0s, budget)
     inside = np.zeros((0, problem.dimension)) if fmap is None else fmap.x0s[fmap.label == 1]
-    closed = None
+    followed = None
     late = "no time was left: {} takes some {:.0f} s of compiling"
     notes["feasible_set"] = late.format("the map", PROOFS + LABELS)
     if not len(inside):
@@ -148,19 +155,33 @@ def offline_report(
     else:
         budget.say(f"closed loops; compile for some {LOOPS:.0f} s")
         pick = np.unique(np.linspace(0, len(inside) - 1, min(loops, len(inside))).astype(int))
-        closed = nominal_loops(mpc, inside[pick], steps)
+        followed = nominal_loops(mpc, inside[pick], steps)
     condensed = condensed_in_float64(mpc)
-    volume = (0.0, np.inf)
-    if fmap is not None and problem.dimension <= 3:
-        volume = fmap.volume_bounds()
     return OfflineReport(
-        mpc, fmap, volume, recursion, penalty, terminal,
-        closed, condensed.P.shape[0], condensed.C.shape[0],
-        float(np.linalg.cond(np.asarray(condensed.P))), notes,
-    )  # fmt: skip
+        mpc=mpc,
+        feasible_set=fmap,
+        volume=fmap.volume_bounds() if fmap and problem.dimension <= 3 else (0.0, np.inf),
+        recursion=recursion,
+        penalty=penalty,
+        terminal=terminal,
+        loops=followed,
+        variables=condensed.P.shape[0],
+        rows=condensed.C.shape[0],
+        condition=float(np.linalg.cond(np.asarray(condensed.P))),
+        notes=notes,
+    )
 
 
-def mapped(problem: FeasibilityProblem, x0s: Any, budget: Budget) -> FeasibleSetMap | None:
+def _or_note(notes: dict[str, str], name: str, action: Callable[[], T]) -> T | None:
+    """Return the result of an action; None, and the reason in notes[name], for a ValueError."""
+    try:
+        return action()
+    except ValueError as error:
+        notes[name] = str(error)
+        return None
+
+
+def mapped(problem: FeasibilityProblem, x0s: Reals | None, budget: Budget) -> FeasibleSetMap | None:
     """Return the map of the states x0s, or of `samples`; None where there is no time for it."""
     if not budget.affords(PROOFS + LABELS):
         return None
@@ -171,11 +192,13 @@ def mapped(problem: FeasibilityProblem, x0s: Any, budget: Budget) -> FeasibleSet
     return fmap.refine(deadline=budget.deadline) if d <= 3 else fmap
 
 
-def theorems(mpc: MPC, K: Any = None) -> TerminalReport:
+def theorems(mpc: MPC, K: Reals | None = None) -> TerminalReport:
     """Return the `verify_terminal` report of a problem; ValueError where no theorem covers it."""
     if not is_standard_form(mpc) or (mpc.terminal_set is None and mpc.horizon == 1):
-        fail("mpc", "is not of the theorems' form", "They cover limits of states and inputs alone, "
-             "at the usual steps, inputs free at each")  # fmt: skip
+        cure = (
+            "They cover limits of states and inputs alone, at the usual steps, inputs free at each"
+        )
+        fail("mpc", "is not of the theorems' form", cure)
     if mpc.input_rate_weight is not None:
         fail("mpc", "weighs input rates", "The theorems' optimal value depends on x alone")
     if mpc.stage_weights is not None:
@@ -199,10 +222,10 @@ def samples(mpc: MPC, d: int) -> np.ndarray:
     if d <= 3:
         return grid(lower - margin, upper + margin, ({1: 256, 2: 48, 3: 14}[d],) * d)
     rng = np.random.default_rng(0)
-    centre, reach = edges.center, np.nanmax(np.abs(edges.points - edges.center), axis=0)
+    center, reach = edges.center, np.nanmax(np.abs(edges.points - edges.center), axis=0)
     # Uniform samples of the box hardly meet the set in many dimensions: half of them are shrunk.
     shrink = np.where(np.arange(2048) % 2, 1.0, rng.uniform(0, 1, 2048))[:, None]
-    return centre + shrink * rng.uniform(-1, 1, (2048, d)) * reach
+    return center + shrink * rng.uniform(-1, 1, (2048, d)) * reach
 
 
 def limits_text(mpc: MPC) -> str:
