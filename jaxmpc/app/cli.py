@@ -17,7 +17,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import tyro
 
 import jaxmpc
-from jaxmpc.app.report import plain_output, report_error
+from jaxmpc.app.commands.options import check_values
+from jaxmpc.app.terminal import plain_output, report_error
 from jaxmpc.checks import fail, nearest
 
 # Module and class of each command: only the one that is called is imported.
@@ -35,7 +36,7 @@ DESCRIPTION = "Constrained MPC in batches, with proofs. Also: jaxmpc --version"
 # Options of tyro that write a completion script for a shell, and the words that each needs.
 COMPLETIONS = {"--tyro-print-completion": 2, "--tyro-write-completion": 3}
 TUNE = "Learn what is usually guessed: an MPC's weights, or the penalties of its solver."
-TUNERS = {"weights": ("tune", "TuneWeights"), "solver": ("tune_solver", "TuneSolver")}
+TUNERS = {"weights": ("tune_weights", "TuneWeights"), "solver": ("tune_solver", "TuneSolver")}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -47,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         command = parse(argv)
     except (ValueError, OSError, AssertionError) as error:  # tyro asserts that it knows a shell
-        return report_error(error)
+        return report_error(str(error))
     with plain_output():
         return run(command, argv)
 
@@ -57,9 +58,10 @@ def run(command: Any, argv: Sequence[str]) -> int:
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in the background
         signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
+        check_values(command)
         return command.run() or 0
     except (ValueError, OSError, MemoryError, ImportError) as error:
-        return report_error(error)
+        return report_error(named_options(str(error), command))
     except KeyboardInterrupt:
         if not command.keeps:
             print("\nstopped; nothing is kept")
@@ -68,6 +70,16 @@ def run(command: Any, argv: Sequence[str]) -> int:
         resume = shlex.join(["jaxmpc", *again, "--resume"])
         print(f"\nstopped; {command.keeps} that were done are kept. Go on with:\n  {resume}")
         return 130
+
+
+def named_options(message: str, command: Any) -> str:
+    """Return an error of the library, which begins with its arguments, with their options."""
+    names, colon, rest = message.partition(": ")
+    known = {field.name for field in fields(command)}
+    option_of = lambda word: f"--{word[0].replace('_', '-')}" if word[0] in known else word[0]
+    if re.fullmatch(r"\w+(,? \w+)*", names):
+        names = re.sub(r"\w+", option_of, names)
+    return names + colon + rest
 
 
 def parse(argv: Sequence[str]) -> Any:

@@ -10,12 +10,13 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.app import cli
-from jaxmpc.app.commands import tune, tune_solver, tuning_task
+from jaxmpc.app.commands import tune_solver, weight_files
 from jaxmpc.app.commands.sweep import Sweep
-from jaxmpc.app.commands.tuning import feasible_states
 from jaxmpc.app.config import load, load_robot_config
 from jaxmpc.qp.admm import ADMM
+from jaxmpc.tuning import tasks
 from jaxmpc.tuning.descent import Descent
+from jaxmpc.tuning.initial_states import feasible_states
 from jaxmpc.tuning.result import Interrupted, TuningRun
 
 # The built-in joint with a horizon that is too short for its terminal weight.
@@ -35,10 +36,10 @@ def _in_empty_folder(tmp_path, monkeypatch):
 def given_starts(monkeypatch):
     """Spare the compile of the search for infeasible starts."""
 
-    def uniform(mpc, limits, lower, upper, count, seed):
+    def uniform(mpc, lower, upper, count, seed, limits):
         return np.random.default_rng(seed).uniform(lower, upper, (count, len(lower))), 3
 
-    for module in (tuning_task, tune_solver):
+    for module in (weight_files, tune_solver):
         monkeypatch.setattr(module, "feasible_states", uniform)
 
 
@@ -55,7 +56,7 @@ def rows(out):
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
 @pytest.mark.parametrize(
     ("command", "module", "record"),
-    [("weights", tune, "tuning.json"), ("solver", tune_solver, tune_solver.FILES[0])],
+    [("weights", tasks, "tuning.json"), ("solver", tune_solver, tune_solver.FILES[0])],
 )
 def test_a_run_is_kept_until_the_one_that_overwrites_it_has_a_checkpoint(
     command, module, record, error, tmp_path, monkeypatch, given_starts
@@ -87,13 +88,13 @@ def test_a_run_is_kept_until_the_one_that_overwrites_it_has_a_checkpoint(
 @pytest.mark.slow
 def test_weights_cut_off_resumed_and_read_back(tmp_path, monkeypatch, capsys, given_starts):
     """Ctrl-C writes what there is; tuned.toml is the problem that was tuned."""
-    real = tune.tune_weights
+    real = tasks.tune_weights
 
     def interrupted(*args, **more):
         found = real(*args, **{**more, "updates": 0})
         raise Interrupted(replace(found, history=replace(found.history, interrupted=True)))
 
-    monkeypatch.setattr(tune, "tune_weights", interrupted)
+    monkeypatch.setattr(tasks, "tune_weights", interrupted)
     assert run(f"weights {LINE} --updates 2 --output 'my runs'") == 130
     out = capsys.readouterr().out
     assert "steps that were done are kept. Go on with:" in out
@@ -109,7 +110,7 @@ def test_weights_cut_off_resumed_and_read_back(tmp_path, monkeypatch, capsys, gi
 
     found = []
     monkeypatch.setattr(
-        tune, "tune_weights", lambda *a, **k: found.append(real(*a, **k)) or found[0]
+        tasks, "tune_weights", lambda *a, **k: found.append(real(*a, **k)) or found[0]
     )
     assert run(f"weights {LINE} --updates 2 --output 'my runs' --resume") == 0
     table = rows(capsys.readouterr().out)
@@ -200,7 +201,8 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
 
     # Where nothing learned is better the words say so.
     default = replace(made[0], improved=False, build=lambda _: ADMM(newton_steps=0))
-    table = rows(tune_solver.TuneSolver().report_text(default, 4, 0, 1.0))
+    found = tune_solver.SolverResults(tmp_path, config, default, np.zeros((2, 4)), 0, 1.0)
+    table = dict(found.rows())
     assert "the default is kept" in table["safeguard"]
 
 
@@ -209,12 +211,12 @@ def test_starts_are_feasible_and_others_counted():
     system = jm.LinearSystem([[1, 1], [0, 1]], [[0.5], [1]], dt=1.0)
     box = lambda *v: jm.Box(-np.array(v), np.array(v))
     mpc = jm.MPC(system, np.eye(2), np.eye(1), 4, states=box(1.0, 2.0), inputs=box(0.5))
-    x0s, dropped = feasible_states(mpc, mpc.states, -np.ones(2), np.ones(2), 40, 0)
+    x0s, dropped = feasible_states(mpc, -np.ones(2), np.ones(2), 40, 0, mpc.states)
     assert x0s.shape == (40, 2) and 0 < dropped < 60
     # One step ahead |q + dq + u/2| <= 1 with |u| <= 0.5: necessary.
     assert np.all(np.abs(x0s.sum(axis=1)) <= 1.25 + 1e-6)
     with pytest.raises(ValueError, match="initial states: 0 of 40 drawn have a plan"):
-        feasible_states(mpc, mpc.states, np.array([0.8, 1.6]), np.array([1.0, 2.0]), 4, 0)
+        feasible_states(mpc, np.array([0.8, 1.6]), np.array([1.0, 2.0]), 4, 0, mpc.states)
 
 
 @pytest.mark.parametrize(
@@ -245,7 +247,7 @@ def test_starts_are_feasible_and_others_counted():
     ],
 )
 def test_errors_are_one_line_before_any_run(capsys, monkeypatch, given_starts, arguments, message):
-    for module, name in ((tune, "tune_weights"), (tune_solver, "tune_solver")):
+    for module, name in ((tasks, "tune_weights"), (tune_solver, "tune_solver")):
         monkeypatch.setattr(module, name, lambda *a, **k: pytest.fail("it started"))
     assert run(arguments) == 2
     err = capsys.readouterr().err

@@ -9,11 +9,11 @@ import numpy as np
 
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import (
+    POSITIVE,
     Horizon,
     Switch,
     Terminal,
-    check_counts,
-    check_positive,
+    at_least,
     given_options,
     option,
     print_table,
@@ -69,13 +69,13 @@ class Export:
     terminal: Terminal = None
     law: Literal["steps", "explicit", "jax"] = "steps"
     """What to write: ADMM steps in C, the explicit law in C, or a stored program of JAX."""
-    iterations: Annotated[int | None, option("K", "from the file, else 50")] = None
+    iterations: Annotated[int | None, option("K", "from the file, else 50"), at_least(1)] = None
     """ADMM steps a call, all of them always."""
     single: Switch = False
     """Numbers of type float instead of double."""
-    tolerance: Annotated[float | None, option("EPS", "1e-6; with --single 1e-3")] = None
+    tolerance: Annotated[float | None, option("EPS", "1e-6; with --single 1e-3"), POSITIVE] = None
     """Relative residuals below which the code says "solved"."""
-    samples: Annotated[int, option("K", "1000")] = 1000
+    samples: Annotated[int, option("K", "1000"), at_least(0)] = 1000
     """Samples of the closed loops that check the law; 0 for no check."""
     overwrite: Switch = False
     """Replace the files where there are some."""
@@ -85,8 +85,6 @@ class Export:
     def run(self) -> None:
         """Write the code and print the check. Raises ValueError for options and files that make no
         sense."""
-        check_counts(self, iterations=1, samples=0)
-        check_positive(self, "tolerance")
         config = configs.load(self.config, given_options(self, "horizon", "terminal"), "info")
         lower, upper = config.state_range()
         if self.law == "steps" and self.samples and not np.isfinite([*lower, *upper]).all():

@@ -8,10 +8,11 @@ from typing import Annotated
 from jaxmpc.app import config as configs
 from jaxmpc.app import page
 from jaxmpc.app.commands.options import (
+    POSITIVE,
     Horizon,
+    ProblemFile,
     Terminal,
-    check_counts,
-    check_positive,
+    at_least,
     given_options,
     option,
 )
@@ -60,16 +61,14 @@ class Info:
       The sections [system], [limits], [cost], [mpc] of jaxmpc sweep --help.
     """
 
-    config: Annotated[Path | None, option("FILE", "the built-in joint")] = None
-    """TOML file with the problem."""
+    config: ProblemFile = None
     horizon: Horizon = None
-    """Prediction horizon, in steps of dt."""
     terminal: Terminal = None
-    steps: Annotated[int, option("K", "50")] = 50
+    steps: Annotated[int, option("K", "50"), at_least(2)] = 50
     """Length of the closed loops."""
-    loops: Annotated[int, option("K", "128")] = 128
+    loops: Annotated[int, option("K", "128"), at_least(1)] = 128
     """Number of the closed loops."""
-    seconds: Annotated[float, option("S", "120")] = 120.0
+    seconds: Annotated[float, option("S", "120"), POSITIVE] = 120.0
     """Time for all of it; claims not settled by then are open."""
     html: Annotated[Path | None, option("FILE", "none")] = None
     """Write the report as a page too, with a picture of a feasible set of two states."""
@@ -78,8 +77,6 @@ class Info:
 
     def run(self) -> None:
         """Print the report. Raises ValueError for options and files that make no sense."""
-        check_counts(self, steps=2, loops=1)
-        check_positive(self, "seconds")
         if self.html is not None and not self.html.parent.is_dir():
             fail(f"--html {self.html}", "its folder does not exist", "Make it, or give another")
         config = configs.load(self.config, given_options(self, "horizon", "terminal"), "info")

@@ -1,7 +1,10 @@
-"""Options that several commands share, their checks, and helpers to open results and print."""
+"""Options of several commands: how they appear in the help, which values they take, shared ones."""
 
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_type_hints
 
 import numpy as np
 import tyro
@@ -12,13 +15,53 @@ from jaxmpc.checks import MOST_COUNT, fail
 def option(metavar: str | None, default: str, text: str | None = None) -> Any:
     """Return the tyro annotation that sets how an option and its default appear in the help.
 
-    text: its meaning, where that takes more than a line; else the string below the field.
+    text: its meaning, where that is not the string below the field.
     """
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})", help=text)
 
 
-# Options that several commands have.
-Horizon = Annotated[int | None, option("N", "from the file; joint 20")]
+@dataclass(frozen=True)
+class Values:
+    """An annotation: the values that an option takes, each of several; cure: in words."""
+
+    allowed: Callable[[Any], bool]
+    cure: str
+
+
+def at_least(count: int) -> Values:
+    """Return the annotation of whole numbers."""
+    return Values(lambda value: value >= count, f"Give a whole number, at least {count}")
+
+
+POSITIVE = Values(lambda value: 0 < value < np.inf, "Give a positive number")
+NOT_NEGATIVE = Values(lambda value: 0 <= value < np.inf, "Give a finite number, at least 0")
+MASS = Values(lambda value: 0 <= value < np.inf, "Give a mass in kg")
+FINITE = Values(np.isfinite, "Give finite numbers")
+SHARE = Values(lambda value: 0 <= value < 1, "Give a fraction from 0 to below 1")
+PART = Values(lambda value: 0 < value < 1, "Give a fraction above 0 and below 1")
+WHOLE_OR_PART = Values(lambda value: 0 <= value <= 1, "Give a fraction from 0 to 1")
+
+
+def check_values(command: Any) -> None:
+    """Raise ValueError for an option whose value its annotation excludes, and for a count that is
+    too large."""
+    hints = get_type_hints(type(command), include_extras=True)
+    for field in fields(command):
+        given, name = getattr(command, field.name), f"--{field.name.replace('_', '-')}"
+        for value in given if isinstance(given, tuple) else (given,):
+            if isinstance(value, int) and value > MOST_COUNT:
+                fail(name, f"{value}", f"Give at most {MOST_COUNT}")
+            for values in getattr(hints[field.name], "__metadata__", ()):
+                if isinstance(values, Values) and value is not None and not values.allowed(value):
+                    fail(name, f"{value}", values.cure)
+
+
+ProblemFile = Annotated[
+    Path | None, option("FILE", "the built-in joint", "TOML file with the problem.")
+]
+Horizon = Annotated[
+    int | None, option("N", "from the file; joint 20", "Prediction horizon, in steps of dt.")
+]
 Terminal = Annotated[
     Literal["none", "invariant", "ellipsoid", "box"] | None,
     option(
@@ -38,6 +81,14 @@ Devices = Annotated[
     ),
 ]
 Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")]
+Resume = Annotated[
+    bool, tyro.conf.FlagCreatePairsOff, option(None, "off", "Resume the run in --output.")
+]
+Overwrite = Annotated[
+    bool,
+    tyro.conf.FlagCreatePairsOff,
+    option(None, "off", "Delete the run in --output and start again."),
+]
 
 
 def chosen_shard(text: str, environment: Mapping[str, str]) -> tuple[int, int]:
@@ -75,15 +126,22 @@ def given_options(command: Any, *names: str) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-def check_counts(command: Any, **least: int) -> None:
-    """Raise ValueError for an option that is given and below its least value, or too large for a
-    count."""
-    for name, lowest in least.items():
-        value, given = getattr(command, name), f"--{name.replace('_', '-')}"
-        if value is not None and value < lowest:
-            fail(given, f"{value}", f"Give a whole number, at least {lowest}")
-        if value is not None and value > MOST_COUNT:
-            fail(given, f"{value}", f"Give at most {MOST_COUNT}")
+def arguments(
+    command: Any, *functions: Callable[..., Any], leave: Iterable[str] = ()
+) -> dict[str, Any]:
+    """Return the options that have the names of arguments of the functions, and are given."""
+    known = {name for function in functions for name in inspect.signature(function).parameters}
+    here = {field.name for field in fields(command)}
+    return given_options(command, *sorted((known & here) - set(leave)))
+
+
+def require_lengths(command: Any, needs: str, **lengths: int) -> None:
+    """Raise ValueError for an option that is given and does not hold so many numbers."""
+    for name, length in lengths.items():
+        given = getattr(command, name)
+        if given is not None and len(given) != length:
+            option_name = f"--{name.replace('_', '-')}"
+            fail(option_name, f"has {len(given)} numbers", f"{needs} needs {length}")
 
 
 def check_positive(command: Any, *names: str) -> None:

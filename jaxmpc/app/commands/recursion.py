@@ -7,12 +7,13 @@ from typing import Annotated
 
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import (
+    POSITIVE,
     End,
     Horizon,
+    ProblemFile,
     Switch,
     Terminal,
-    check_counts,
-    check_positive,
+    at_least,
     given_options,
     option,
     print_table,
@@ -83,14 +84,12 @@ class Recursion:
       [recursion]  all optional: steps, grid, lower, upper, regions, seconds
     """
 
-    config: Annotated[Path | None, option("FILE", "the built-in joint")] = None
-    """TOML file with the problem."""
+    config: ProblemFile = None
     robot: Annotated[str | None, option("NAME|FILE", "none, a linear system")] = None
     """Map a robot instead, linear prediction against nonlinear closed loop."""
     output: Annotated[Path, option("DIR", "jaxmpc-recursion")] = Path("jaxmpc-recursion")
     """Folder for the files; made where absent."""
     horizon: Horizon = None
-    """Prediction horizon, in steps of dt."""
     terminal: Terminal = None
     steps: Annotated[int | None, option("K", "from the file, else 20; robots 100")] = None
     """Length of the closed loops."""
@@ -115,11 +114,11 @@ class Recursion:
     """With --robot: values of the other coordinates, in their order."""
     regions: Annotated[int | None, option("K", "from the file, else 2000")] = None
     """Critical regions of the law to enumerate at most; 0: none."""
-    seconds: Annotated[float | None, option("S", "from the file, else 60")] = None
+    seconds: Annotated[float | None, option("S", "from the file, else 60"), POSITIVE] = None
     """Time for all of it; what is not settled by then is open. With --smallest half is for that."""
     search: Annotated[bool, option(None, "on")] = True
     """Without all regions, look for a counterexample by gradient ascent, beside the samples."""
-    smallest: Annotated[int | None, option("N", "off")] = None
+    smallest: Annotated[int | None, option("N", "off"), at_least(1)] = None
     """Look also for the smallest horizon, up to N, that is proved recursively feasible."""
     overwrite: Switch = False
     """Replace the results in --output."""
@@ -137,8 +136,6 @@ class Recursion:
         Raises ValueError for options and files that make no sense.
         """
         begun = time.perf_counter()
-        check_positive(self, "seconds")
-        check_counts(self, smallest=1)
         if self.robot is not None:
             self.map_robot(self.robot)
             return

@@ -13,12 +13,19 @@ import numpy as np
 from jaxmpc.app.commands.compiling import Compiling
 from jaxmpc.app.commands.film import choose_renderer, film
 from jaxmpc.app.commands.options import (
+    FINITE,
+    MASS,
+    POSITIVE,
+    SHARE,
+    WHOLE_OR_PART,
     Devices,
-    Switch,
-    check_counts,
-    check_positive,
+    Overwrite,
+    Resume,
+    Values,
+    at_least,
     option,
     print_table,
+    require_lengths,
 )
 from jaxmpc.app.config import load_robot_config
 from jaxmpc.batches import chosen_devices
@@ -102,16 +109,18 @@ class Simulate:
             "[cost] Q, R, P, rho. An option given here wins over the file.",
         ),
     ] = None
-    count: Annotated[int, option("B", "64")] = 64
+    count: Annotated[int, option("B", "64"), at_least(1)] = 64
     """Number of robots."""
-    seconds: Annotated[float, option("S", "2")] = 2.0
+    seconds: Annotated[float, option("S", "2"), POSITIVE] = 2.0
     """Simulated time of each robot."""
-    target: Annotated[tuple[float, ...] | None, option("Q [Q ...]", "home of the model")] = None
+    target: Annotated[
+        tuple[float, ...] | None, option("Q [Q ...]", "home of the model"), FINITE
+    ] = None
     """Configuration to rest at, one number a joint, in rad or m (qpos of MuJoCo)."""
-    spread: Annotated[float, option("FRACTION", "0.5")] = 0.5
+    spread: Annotated[float, option("FRACTION", "0.5"), WHOLE_OR_PART] = 0.5
     """Starts are uniform around home, up to this fraction of the way to the limits.
     Where there is no limit, up to this number itself. In positions and velocities."""
-    seed: Annotated[int, option("K", "0")] = 0
+    seed: Annotated[int, option("K", "0"), at_least(0)] = 0
     """Seed of starts, masses, damping and payloads."""
     linearize: Annotated[
         Literal["set-point", "state", "trajectory", "lqr"] | None,
@@ -119,50 +128,53 @@ class Simulate:
     ] = None
     """Linear models: once at the target, at each measured state, along the last plan.
     lqr: no MPC but linear feedback, clipped to the input limits, to compare with."""
-    horizon: Annotated[int | None, option("N", "from --config, else 20")] = None
+    horizon: Annotated[int | None, option("N", "from --config, else 20"), at_least(1)] = None
     """Prediction horizon, in control periods."""
     state_weights: Annotated[
         tuple[float, ...] | None,
         option("Q [Q ...]", "from --config, else Bryson's rule, velocities x 0.01"),
+        Values(lambda value: 0 <= value < np.inf, "Give finite numbers, at least 0"),
     ] = None
     """Diagonal of Q: positions, then velocities. Bryson's rule: 1/(half the range)^2."""
     input_weights: Annotated[
-        tuple[float, ...] | None, option("R [R ...]", "from --config, else Bryson's rule x 0.01")
+        tuple[float, ...] | None,
+        option("R [R ...]", "from --config, else Bryson's rule x 0.01"),
+        Values(lambda value: 0 < value < np.inf, "Give finite positive numbers"),
     ] = None
     """Diagonal of R, one number an actuator."""
-    margin: Annotated[float | None, option("FRACTION", "from --config, else 0.02")] = None
+    margin: Annotated[float | None, option("FRACTION", "from --config, else 0.02"), SHARE] = None
     """Room that the MPC leaves to state limits, as a fraction of half the range."""
-    rho: Annotated[float | None, option("RHO", "from --config, else 1e4")] = None
+    rho: Annotated[float | None, option("RHO", "from --config, else 1e4"), POSITIVE] = None
     """L1 weight of state limits; too small a weight violates limits that could be kept."""
-    iterations: Annotated[int | None, option("K", "0; with set-point 50")] = None
+    iterations: Annotated[int | None, option("K", "0; with set-point 50"), at_least(0)] = None
     """ADMM steps of each plan."""
-    newton_steps: Annotated[int | None, option("K", "as many as are needed")] = None
+    newton_steps: Annotated[int | None, option("K", "as many as are needed"), at_least(0)] = None
     """Newton steps after them at most. A number bounds the time of a plan and gives up the
     interior point method, which solves what Newton steps do not."""
-    mass: Annotated[float, option("FRACTION", "0")] = 0.0
+    mass: Annotated[float, option("FRACTION", "0"), SHARE] = 0.0
     """Each body's mass and inertia times a number from 1 - FRACTION to 1 + FRACTION.
     The MPC does not know: it has the model of the file."""
-    damping: Annotated[float, option("FRACTION", "0")] = 0.0
+    damping: Annotated[float, option("FRACTION", "0"), SHARE] = 0.0
     """Each joint's damping times a number from 1 - FRACTION to 1 + FRACTION."""
-    payload: Annotated[float, option("KG", "0")] = 0.0
+    payload: Annotated[float, option("KG", "0"), MASS] = 0.0
     """Mass from 0 to KG at the site "tool" of the model; the MPC does not know."""
-    tolerance: Annotated[float, option("FRACTION", "0.02")] = 0.02
+    tolerance: Annotated[float, option("FRACTION", "0.02"), POSITIVE] = 0.02
     """How near the target counts as there, as a fraction of half the range."""
     dtype: Annotated[Literal["float32", "float64"], option("{float32,float64}", "float32")] = (
         "float32"
     )
     """Precision of physics and MPC."""
-    chunk: Annotated[int | None, option("B", "256 on a CPU, 4096 on others, of each device")] = None
+    chunk: Annotated[
+        int | None, option("B", "256 on a CPU, 4096 on others, of each device"), at_least(1)
+    ] = None
     """Robots at a time: what is written at once, and lost at most."""
     devices: Devices = None
-    video: Annotated[int, option("K", "4")] = 4
+    video: Annotated[int, option("K", "4"), at_least(0)] = 4
     """Number of robots in the video; 0: none."""
     output: Annotated[Path, option("DIR", "jaxmpc-simulate")] = Path("jaxmpc-simulate")
     """Folder for the files; made where absent."""
-    resume: Switch = False
-    """Resume the run in --output."""
-    overwrite: Switch = False
-    """Delete the run in --output and start again."""
+    resume: Resume = False
+    overwrite: Overwrite = False
 
     keeps = "chunks"
 
@@ -171,7 +183,7 @@ class Simulate:
 
         Raises ValueError for options and files that make no sense.
         """
-        self.check()
+        chosen_devices(self.devices, "--devices")
         command = self.settled()
         path = self.output / "runs.zarr"
         check_results(path, self.resume, self.overwrite)
@@ -245,13 +257,8 @@ class Simulate:
             problem = f"mujoco does not start with {os.environ.get('MUJOCO_GL')!r} ({error})"
             fail("MUJOCO_GL", problem, "Unset it, or install the OpenGL library that it names")
         robot = load_robot(self.robot)
-        for name, given, size in (
-            ("--target", self.target, robot.mujoco.nq),
-            ("--state-weights", self.state_weights, robot.n),
-            ("--input-weights", self.input_weights, robot.m),
-        ):
-            if given is not None and len(given) != size:
-                fail(name, f"has {len(given)} numbers", f"{robot.name} needs {size}")
+        lengths = {"target": robot.mujoco.nq, "state_weights": robot.n, "input_weights": robot.m}
+        require_lengths(self, robot.name, **lengths)
         return robot
 
     def require_sizes(self, robot: Robot) -> None:
@@ -305,26 +312,3 @@ class Simulate:
             }  # fmt: skip
         missing = {key: value for key, value in found.items() if getattr(self, key) is None}
         return dataclasses.replace(self, **missing)
-
-    def check(self) -> None:
-        """Raise ValueError for options that make no sense."""
-        chosen_devices(self.devices, "--devices")
-        check_counts(self, count=1, horizon=1, iterations=0, newton_steps=0)
-        check_counts(self, video=0, seed=0, chunk=1)
-        check_positive(self, "seconds", "rho", "tolerance")
-        for name, wrong, cure in (
-            ("target", lambda v: False, "Give finite numbers"),
-            ("state_weights", lambda v: v < 0, "Give finite numbers, at least 0"),
-            ("input_weights", lambda v: v <= 0, "Give finite positive numbers"),
-        ):
-            for value in getattr(self, name) or ():
-                if not np.isfinite(value) or wrong(value):
-                    fail(f"--{name.replace('_', '-')}", f"{value}", cure)
-        if not 0 <= self.payload < np.inf:
-            fail("--payload", f"{self.payload}", "Give a mass in kg")
-        if not 0 <= self.spread <= 1:
-            fail("--spread", f"{self.spread}", "Give a fraction from 0 to 1")
-        for name in ("margin", "mass", "damping"):
-            value = getattr(self, name)
-            if value is not None and not 0 <= value < 1:
-                fail(f"--{name}", f"{value}", "Give a fraction from 0 to below 1")

@@ -1,7 +1,6 @@
 """The command `jaxmpc tune solver`: its options, files and table."""
 
 import dataclasses
-import json
 import sys
 import time
 import warnings
@@ -10,41 +9,37 @@ from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
-import optax
 
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import (
+    PART,
+    POSITIVE,
     Horizon,
-    Switch,
+    Overwrite,
+    ProblemFile,
+    Resume,
     Terminal,
-    check_counts,
-    check_positive,
+    at_least,
+    given_options,
     option,
+    print_table,
 )
-from jaxmpc.app.commands.tuning import (
-    CHECKPOINT,
-    TUNED,
-    check_validation,
-    feasible_states,
-    open_run,
-    optimizer_of,
-    overwriting,
-    problem_file,
-    start_range,
-)
+from jaxmpc.app.commands.tune_options import TUNED, optimizer_of, two_columns
 from jaxmpc.app.plots.style import save
 from jaxmpc.app.plots.tuning import plot_solver
-from jaxmpc.app.report import report_error
-from jaxmpc.checks import fail, require_memory
-from jaxmpc.files import versions, write_json
+from jaxmpc.checks import fail
+from jaxmpc.files import as_json, versions, write_json
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.solve import solve
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
+from jaxmpc.tuning.initial_states import feasible_states, initial_range
 from jaxmpc.tuning.result import Interrupted, TuningRun
+from jaxmpc.tuning.run_folder import CHECKPOINT, run_folder
 from jaxmpc.tuning.solver import tune_solver
 
 FILES = ("solver.json", TUNED, "solver.png")
+GIVEN = ADMM(newton_steps=0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,191 +88,182 @@ class TuneSolver:
       replaced.
     """
 
-    config: Annotated[Path | None, option("FILE", "the built-in joint")] = None
-    """TOML file with the problem."""
-    iterations: Annotated[int, option("K", "100")] = 100
+    config: ProblemFile = None
+    iterations: Annotated[int, option("K", "100"), at_least(1)] = 100
     """ADMM steps of each plan."""
-    stages: Annotated[int, option("K", "4")] = 4
+    stages: Annotated[int, option("K", "4"), at_least(1)] = 4
     """Number of penalties for each row, each used for an equal part of the steps, in turn."""
     groups: Annotated[Literal["step", "row"], option("{step,row}", "step")] = "step"
     """step: five penalties along the horizon for each limit, linear between them.
     row: one for each limit and step of the horizon."""
-    updates: Annotated[int, option("K", "200")] = 200
+    updates: Annotated[int, option("K", "200"), at_least(0)] = 200
     """Steps of the optimizer."""
-    count: Annotated[int, option("B", "1024")] = 1024
+    count: Annotated[int, option("B", "1024"), at_least(16)] = 1024
     """Number of feasible initial states, validation included."""
-    batch: Annotated[int, option("B", "32")] = 32
+    batch: Annotated[int, option("B", "32"), at_least(1)] = 32
     """Number of states of each step, drawn again each time."""
-    validation: Annotated[float, option("FRACTION", "0.25")] = 0.25
+    validation: Annotated[float, option("FRACTION", "0.25"), PART] = 0.25
     """Fraction of the initial states in the validation set."""
     optimizer: Annotated[str | None, option("NAME", "adam, its rate falling to 3 %")] = None
     """Optimizer of optax, by name: adam, adamw, sgd, rmsprop, lion, ..."""
-    learning_rate: Annotated[float | None, option("X", "0.1")] = None
+    learning_rate: Annotated[float | None, option("X", "0.1"), POSITIVE] = None
     """Learning rate, in log rho; needs --optimizer."""
     lower: Annotated[tuple[float, ...] | None, option("X [X ...]", "state limits")] = None
     """Lower ends of the initial states, one number a state."""
     upper: Annotated[tuple[float, ...] | None, option("X [X ...]", "state limits")] = None
     """Upper ends of the initial states."""
     horizon: Horizon = None
-    """Prediction horizon, in steps of dt."""
     terminal: Terminal = None
-    """Terminal set, as in jaxmpc sweep."""
-    seed: Annotated[int, option("K", "0")] = 0
+    seed: Annotated[int, option("K", "0"), at_least(0)] = 0
     """Seed of initial states and batches."""
     output: Annotated[Path, option("DIR", "jaxmpc-solver")] = Path("jaxmpc-solver")
     """Folder for the files; created if absent."""
-    resume: Switch = False
-    """Resume the run in --output."""
-    overwrite: Switch = False
-    """Delete the run in --output and start again."""
+    resume: Resume = False
+    overwrite: Overwrite = False
 
     keeps = "steps"
 
-    def run(self) -> int:
-        """Run the command and return the exit code."""
-        with overwriting(self.output):
-            return self._run()
+    def run(self) -> None:
+        """Tune, write the files, print the table.
 
-    def _run(self) -> int:
-        begun = time.perf_counter()
-        try:
-            config, mpc, (lower, upper) = self.prepare()
-            states, dropped = feasible_states(
-                mpc, config.state_limits(), lower, upper, self.count, self.seed
-            )
-            kept = max(2, round(self.validation * self.count))
-            train, test = states[:-kept], states[-kept:]
-            print(
-                f"{config.name}: penalties of {self.iterations} ADMM steps from {len(states):,} "
-                f"states -> {self.output}", flush=True,
-            )  # fmt: skip
-            given, learning, stopped = ADMM(newton_steps=0), time.perf_counter(), False
-            found = self.learned(mpc, train, test, given)
-        except ValueError as error:
-            return report_error(error)
-        except Interrupted as stop:
-            print("\nstopped; writing the best of the steps that were done")
-            found, stopped = stop.run, True
-        seconds = time.perf_counter() - learning
-        given = dataclasses.replace(given, iterations=self.iterations)
-        worst = largest_residuals(mpc, test, (given, found.solver))
-        self.save(config, found, worst, dropped, seconds)
-        print(self.report_text(found, worst.shape[1], dropped, seconds))
-        print(f"  {'total':<13} {time.perf_counter() - begun:.1f} s with set-up and files")
-        if stopped:
-            raise KeyboardInterrupt
-        return 0
-
-    def learned(
-        self, mpc: MPC, train: np.ndarray, test: np.ndarray, given: ADMM
-    ) -> TuningRun:  # fmt: skip
-        """Return the run of `tune_solver`."""
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "tune_solver", UserWarning)
-            return tune_solver(
-                mpc, train, self.iterations, stages=self.stages, groups=self.groups,
-                solver=given, updates=self.updates, optimizer=self.stepper(), batch=self.batch,
-                validation=test, seed=self.seed, checkpoint=self.output / CHECKPOINT,
-                progress=sys.stderr.isatty(),
-            )  # fmt: skip
-
-    def prepare(self) -> tuple[configs.Config, MPC, tuple[np.ndarray, np.ndarray]]:
-        """Return the problem and the ends of the initial states; open the folder.
-
-        Nothing compiles. Raises ValueError for options that do not fit together.
+        Raises ValueError for options that do not fit together, before anything compiles.
         """
-        check_counts(self, iterations=1, stages=1, updates=0, count=16, batch=1, seed=0)
-        check_validation(self)
-        check_positive(self, "learning_rate")
+        begun = time.perf_counter()
         if self.iterations % self.stages:
             fail("--iterations", f"{self.iterations} for {self.stages} stages", "Use a multiple")
         if self.learning_rate is not None and self.optimizer is None:
             fail("--learning-rate", "given without --optimizer", "Name one, such as adam")
-        self.stepper(np.zeros(1))
-        config = problem_file(self)
-        require_memory("--count", 8 * self.count * len(config.system.A), "Tune on fewer states")
-        ends = start_range(config, self.lower, self.upper, 1.0)
-        mpc = config.build_controlled()
-        ignored = ("config", "output", "resume", "overwrite", "updates")
-        options = {k: v for k, v in dataclasses.asdict(self).items() if k not in ignored}
-        if self.optimizer is None:  # its schedule knows the number of steps
-            options["updates"] = self.updates
-        options = json.loads(json.dumps({**options, "problem": config.to_dict("tune")}))
-        open_run(self.output, FILES, options, self.resume, self.overwrite)
-        return config, mpc, ends
+        rate = self.learning_rate or 0.1
+        optimizer = None if self.optimizer is None else optimizer_of(self.optimizer, rate)
+        overrides = given_options(self, "horizon", "terminal")
+        config = configs.load(self.config, overrides, "tune")
+        limits, mpc = config.state_limits(), config.build_controlled()
+        ends = initial_range(config.state_range(), self.lower, self.upper)
+        options = self.record(config)
+        with (
+            run_folder(self.output, FILES, options, self.resume, self.overwrite) as checkpoint,
+            warnings.catch_warnings(),
+        ):
+            warnings.filterwarnings("ignore", "tune_solver", UserWarning)
+            x0s, without_plan = feasible_states(mpc, *ends, self.count, self.seed, limits)
+            for_validation = max(2, round(self.validation * self.count))
+            test = x0s[-for_validation:]
+            what = f"penalties of {self.iterations} ADMM steps from {len(x0s):,} states"
+            print(f"{config.name}: {what} -> {self.output}", flush=True)
+            learning, stopped = time.perf_counter(), False
+            try:
+                found = tune_solver(
+                    mpc,
+                    x0s[:-for_validation],
+                    self.iterations,
+                    stages=self.stages,
+                    groups=self.groups,
+                    solver=GIVEN,
+                    updates=self.updates,
+                    optimizer=optimizer,
+                    batch=self.batch,
+                    validation=test,
+                    seed=self.seed,
+                    checkpoint=checkpoint,
+                    progress=sys.stderr.isatty(),
+                )
+            except Interrupted as stop:
+                print("\nstopped; writing the best of the steps that were done")
+                found, stopped = stop.run, True
+        seconds = time.perf_counter() - learning
+        given = dataclasses.replace(GIVEN, iterations=self.iterations)
+        worst = largest_residuals(mpc, test, (given, found.solver))
+        results = SolverResults(self.output, config, found, worst, without_plan, seconds)
+        results.save(options)
+        print_table(results.rows(), 13)
+        print(f"  {'total':<13} {time.perf_counter() - begun:.1f} s with set-up and files")
+        if stopped:
+            raise KeyboardInterrupt
 
-    def stepper(self, tried: Any = None) -> optax.GradientTransformation | None:
-        """Return the optimizer; None for the default one."""
-        if self.optimizer is None:
-            return None
-        return optimizer_of(self.optimizer, self.learning_rate or 0.1, tried)
+    def record(self, config: configs.Config) -> dict[str, Any]:
+        """Return the options that determine the result, as JSON data."""
+        ignored = {"config", "output", "resume", "overwrite"}
+        if self.optimizer is not None:  # the schedule of the default knows the number of steps
+            ignored.add("updates")
+        found = {k: v for k, v in dataclasses.asdict(self).items() if k not in ignored}
+        return as_json({**found, "problem": config.to_dict("tune")})
 
-    def save(
-        self, config: configs.Config, found: TuningRun, worst: np.ndarray, dropped: int,
-        seconds: float,
-    ) -> None:  # fmt: skip
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SolverResults:
+    """A run of `tune_solver` that is written to a folder.
+
+    worst (2, B): the largest residual of the validation states with the solver given and the one
+    found. without_plan: number of states drawn that have none. seconds: of learning.
+    """
+
+    folder: Path
+    config: configs.Config
+    run: TuningRun
+    worst: np.ndarray
+    without_plan: int
+    seconds: float
+
+    @property
+    def infeasible(self) -> int:
+        """Return how many states drawn have no plan."""
+        return self.without_plan + round(self.run.after["infeasible"])
+
+    def save(self, options: dict[str, Any]) -> None:
         """Write the files."""
-        rho = np.asarray(found.solver.rho, float)
+        run, h = self.run, self.run.history
+        rho, alpha = np.asarray(run.solver.rho, float), float(np.asarray(run.solver.alpha))
         solver = configs.SolverSection(
-            iterations=found.solver.admm_steps(), newton_steps=0,
-            alpha=float(np.asarray(found.solver.alpha)),
+            iterations=run.solver.admm_steps(),
+            newton_steps=0,
+            alpha=alpha,
             rho=float(rho) if rho.ndim == 0 else tuple(map(tuple, np.atleast_2d(rho).tolist())),
-        )  # fmt: skip
-        text = dataclasses.replace(config, solver=solver).to_toml()
-        (self.output / TUNED).write_text(text)
-        h = found.history
-        numbers = {
-            "improved": found.improved, "before": found.before, "after": found.after,
-            "alpha": solver.alpha,
-        }  # fmt: skip
-        finite = lambda v: [float(x) if np.isfinite(x) else None for x in v]
+        )
+        (self.folder / TUNED).write_text(dataclasses.replace(self.config, solver=solver).to_toml())
+        result = {"improved": run.improved, "before": run.before, "after": run.after}
         document = {
-            "name": config.name,
-            "options": json.loads((self.output / FILES[0]).read_text())["options"],
-            "finished": not (h and h.interrupted), "result": numbers,
-            "validation_states": worst.shape[1],
-            "states_without_plan": dropped + round(found.after["infeasible"]),
-            "learning_seconds": seconds,
-            "loss": finite(h.loss) if h else [],
-            "gradient_norm": finite(h.gradient_norm) if h else [],
-            "accepted": h.accepted.tolist() if h else [],
-            "solved": finite(h.validation_numbers["solved"]) if h else [],
-            "residual": finite(h.validation_numbers["residual"]) if h else [],
+            "name": self.config.name,
+            "options": options,
+            "finished": not (h and h.interrupted),
+            "result": result | {"alpha": alpha},
+            "validation_states": self.worst.shape[1],
+            "states_without_plan": self.infeasible,
+            "learning_seconds": self.seconds,
+            "loss": h.loss if h else [],
+            "gradient_norm": h.gradient_norm if h else [],
+            "accepted": h.accepted if h else [],
+            "solved": h.validation_numbers["solved"] if h else [],
+            "residual": h.validation_numbers["residual"] if h else [],
             "versions": versions(),
-        }  # fmt: skip
-        write_json(self.output / FILES[0], document)
-        words = "tuned" if found.improved else "default kept, no step is better"
-        title = f"{config.name}: {self.iterations} ADMM steps, {words}"
-        figure = plot_solver(found, worst[0], worst[1], 1e-6, title)
-        save(figure, self.output / "solver.png")
+        }
+        write_json(self.folder / FILES[0], as_json(document))
+        words = "tuned" if run.improved else "default kept, no step is better"
+        title = f"{self.config.name}: {solver.iterations} ADMM steps, {words}"
+        save(
+            plot_solver(run, self.worst[0], self.worst[1], 1e-6, title), self.folder / "solver.png"
+        )
 
-    def report_text(self, found: TuningRun, count: int, dropped: int, seconds: float) -> str:
-        """Return the result as a table of text."""
-        row = lambda name, a, b, more="": f"  {name:<13} {a:>12} {b:>12}  {more}".rstrip()
-        first, last = found.before, found.after
-        percent = lambda numbers: f"{100 * numbers['solved']:.2f} %"
-        alpha = float(np.asarray(found.solver.alpha))
-        rho = np.asarray(found.solver.rho, float)
-        spread = (
-            f"{rho.min():.3g}" if rho.min() == rho.max() else f"{rho.min():.3g}-{rho.max():.3g}"
-        )
-        kept = (
-            "passed: the tuned penalties are used"
-            if found.improved
-            else "no step is better on the validation states: the default is kept"
-        )
-        out = dropped + round(found.after["infeasible"])
-        return "\n".join([
-            row("", "default", "as written"),
-            row("solved", percent(first), percent(last), f"of {count} states"),
-            row("residual", f"{first['residual']:.3g}", f"{last['residual']:.3g}", "median"),
-            row("rho", "1", spread), row("alpha", "1.6", f"{alpha:.4g}"),
-            f"  {'infeasible':<13} {out:,} states drawn have no plan: left out",
-            f"  {'learning':<13} {seconds:.1f} s, compiler included",
-            f"  {'safeguard':<13} {kept}",
-            f"  {'files':<13} "
-            + " ".join(str(self.output / name) for name in (*FILES, CHECKPOINT)),
-        ])  # fmt: skip
+    def rows(self) -> list[tuple[str, str]]:
+        """Return the table."""
+        run, first, last = self.run, self.run.before, self.run.after
+        solved = (f"{100 * numbers['solved']:.2f} %" for numbers in (first, last))
+        rho, alpha = np.asarray(run.solver.rho, float), float(np.asarray(run.solver.alpha))
+        spread = "-".join(f"{end:.3g}" for end in sorted({rho.min(), rho.max()}))
+        safeguard = "no step is better on the validation states: the default is kept"
+        if run.improved:
+            safeguard = "passed: the tuned penalties are used"
+        residual = (f"{numbers['residual']:.3g}" for numbers in (first, last))
+        return [
+            ("", two_columns(("default", "as written"))),
+            ("solved", two_columns(solved, f"of {self.worst.shape[1]} states")),
+            ("residual", two_columns(residual, "median")),
+            ("rho", two_columns(("1", spread))),
+            ("alpha", two_columns(("1.6", f"{alpha:.4g}"))),
+            ("infeasible", f"{self.infeasible:,} states drawn have no plan: left out"),
+            ("learning", f"{self.seconds:.1f} s, compiler included"),
+            ("safeguard", safeguard),
+            ("files", " ".join(str(self.folder / name) for name in (*FILES, CHECKPOINT))),
+        ]
 
 
 def largest_residuals(mpc: MPC, states: np.ndarray, solvers: tuple[ADMM, ADMM]) -> np.ndarray:

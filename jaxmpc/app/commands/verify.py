@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 
 from jaxmpc.app import config as configs
-from jaxmpc.app.commands.options import Switch, check_counts, option, print_table
+from jaxmpc.app.commands.options import Switch, at_least, option, print_table
 from jaxmpc.checks import shown
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.verify.stored_map import Verification, find_store, verify_map
@@ -55,9 +55,9 @@ class Verify:
     store."""
     exact: Switch = False
     """Roll out all plans in exact arithmetic."""
-    sample: Annotated[int, option("K", "1000")] = 1000
+    sample: Annotated[int, option("K", "1000"), at_least(0)] = 1000
     """Plans to roll out exactly without --exact, drawn at random."""
-    seed: Annotated[int, option("K", "0")] = 0
+    seed: Annotated[int, option("K", "0"), at_least(0)] = 0
     """Seed of that draw."""
 
     keeps = ""
@@ -65,7 +65,6 @@ class Verify:
     def run(self) -> int:
         """Verify, print the table or what is damaged, return the exit code. Raises ValueError where
         there is no map."""
-        check_counts(self, sample=0, seed=0)
         path, begun = find_store(self.directory), time.perf_counter()
         found = verify_map(
             path, exact=self.exact, sample=self.sample, seed=self.seed, progress=True,

@@ -33,7 +33,7 @@ def plain_output() -> Iterator[None]:
         yield
 
 
-def report_error(error: Exception) -> int:
+def report_error(message: str) -> int:
     """Print one line on stderr and return the exit code, 2."""
-    print(f"jaxmpc: error: {printable(' '.join(str(error).split()))}", file=sys.stderr)
+    print(f"jaxmpc: error: {printable(' '.join(message.split()))}", file=sys.stderr)
     return 2

@@ -1,0 +1,357 @@
+"""Tasks of `tune_weights`, for a linear problem and for a robot: which weights, loops and loss.
+
+Beside the weights Q, R and P (the terminal weight) a task may tune rho, the L1 weight of soft
+limits, and the tightening: the fraction of their half-width by which state limits are moved
+inwards. All is checked before a closed loop compiles.
+"""
+
+import dataclasses
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxmpc.arrays import Reals
+from jaxmpc.checks import fail
+from jaxmpc.closed_loop.many import simulate_many
+from jaxmpc.closed_loop.outcome import evaluate_runs
+from jaxmpc.closed_loop.robot_controller import RobotController
+from jaxmpc.closed_loop.run import Run
+from jaxmpc.closed_loop.variations import plant_numbers
+from jaxmpc.mpc.condense import prestabilising_gain
+from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.softening import soften
+from jaxmpc.qp.admm import ADMM
+from jaxmpc.qp.status import Status
+from jaxmpc.robots.linear_plant import LinearPlant
+from jaxmpc.robots.robot import Robot
+from jaxmpc.sets import violations
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.polytope import Polytope
+from jaxmpc.systems.riccati import lqr
+from jaxmpc.tuning.losses import ClosedLoopLoss
+from jaxmpc.tuning.parameters import Parameter
+from jaxmpc.tuning.result import TuningRun
+from jaxmpc.tuning.weights import SOLVER, tune_weights
+
+# The largest fraction by which limits can be tightened.
+TIGHTEST = 0.5
+# Values of the parameters by name: traced ones, or arrays.
+Values = Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WeightTask:
+    """Weights to tune, from `linear_task` or `robot_task`.
+
+    make: values → MPC or controller. x0s (B, n or nq + nv) and variations (B, ...), of which the
+    last `validation` are for validation. limits: of the states, not tightened. mpc: the problem
+    before tuning, with hard limits. dtype: of loops and derivatives.
+    """
+
+    name: str
+    make: Callable[[Values], MPC | RobotController]
+    parameters: dict[str, Parameter]
+    plant: LinearPlant | Robot
+    x0s: np.ndarray
+    variations: dict[str, np.ndarray]
+    validation: int
+    loss: ClosedLoopLoss
+    reference: np.ndarray | None
+    input_reference: np.ndarray | None
+    steps: int
+    solver: ADMM
+    dtype: str
+    limits: Box | Polytope | None
+    mpc: MPC
+
+    def tune(self, **settings: Any) -> TuningRun:
+        """Return the run of `tune_weights`. settings: its mode, and those of `Settings`."""
+        with jax.enable_x64(self.dtype == "float64"):
+            return tune_weights(
+                self.make,
+                self.parameters,
+                self.plant,
+                self.x0s,
+                self.loss,
+                self.steps,
+                reference=self.reference,
+                input_reference=self.input_reference,
+                variations=self.variations,
+                solver=self.solver,
+                validation=self.validation / len(self.x0s),
+                **settings,
+            )
+
+    def simulate(self, make: Callable[[], Any]) -> Run:
+        """Simulate the validation loops with the controller, or the MPC, that `make` returns."""
+        count = self.validation
+        with jax.enable_x64(self.dtype == "float64"):
+            made = make()
+            return simulate_many(
+                Controller(made, self.solver) if isinstance(made, MPC) else made,
+                self.plant,
+                self.x0s[-count:],
+                self.steps,
+                reference=self.reference,
+                input_reference=self.input_reference,
+                variations={name: v[-count:] for name, v in self.variations.items()},
+            )
+
+    def counts(self, run: Run, tolerance: float) -> dict[str, float]:
+        """Return fractions of loops and plans from states and inputs alone: violated, unsolved,
+        infeasible, fallback, at_target (within this fraction of half the range of each state)."""
+        goal = np.zeros(self.plant.n) if self.reference is None else self.reference
+        outcome = evaluate_runs(run, self.plant, goal, tolerance=tolerance)
+        kept = outcome.kept
+        if isinstance(self.limits, Polytope):
+            limits = jax.tree.map(lambda v: np.asarray(v, float), self.limits)
+            kept = kept & violations.kept(limits, outcome.coordinates).all(axis=(1, 2))
+        status = np.asarray(run.status)
+        return {
+            "loops": len(kept),
+            "plans": int(status.size),
+            "violated": float(np.mean(~kept)),
+            "kept_to": violations.TOLERANCE["float64"],
+            "unsolved": float(np.mean(status != Status.SOLVED)),
+            "infeasible": float(np.mean(status == Status.PRIMAL_INFEASIBLE)),
+            "fallback": float(np.mean((status == Status.SOLVED) & np.asarray(run.fallback))),
+            "at_target": float(np.mean(outcome.reached)),
+        }
+
+
+def weight_parameters(
+    mpc: MPC,
+    tune: Sequence[str] = ("Q", "R"),
+    *,
+    weights: str = "diagonal",
+    rho: float | None = None,
+    margin: float = 0.0,
+    limits: Box | Polytope | None = None,
+    target: np.ndarray | None = None,
+) -> dict[str, Parameter]:
+    """Return what is tuned, of Q, R, P, rho and tightening, as it is at the start.
+
+    weights: "diagonal" or "full", the form of Q and R; P is full unless it starts diagonal. rho:
+    the L1 weight of soft limits. margin: the tightening of the state `limits` at the start, which
+    is at most TIGHTEST and leaves the target (n,) inside. Raises ValueError for a weight that is
+    not positive definite, and for what the problem does not have.
+    """
+    found: dict[str, Parameter] = {}
+    for name, value in (("Q", mpc.Q), ("R", mpc.R), ("P", mpc.terminal_cost)):
+        if name not in tune:
+            continue
+        if value is None:
+            fail(f"tune {name}", "the problem has no terminal weight", 'Give [cost] P = "lqr"')
+        value = np.asarray(value, float)
+        diagonal = bool(np.all(value == np.diag(np.diag(value))))
+        if weights == "diagonal" and not diagonal and name != "P":
+            fail("weights", f"diagonal, and {name} of the problem is not", "Add --weights full")
+        if np.linalg.eigvalsh((value + value.T) / 2)[0] <= 0:
+            cure = "Give each direction a small weight to start from"
+            fail(f"tune {name}", f"{name} is not positive definite", cure)
+        domain = "diagonal" if weights == "diagonal" and diagonal else "definite"
+        found[name] = Parameter(value, domain)
+    if "rho" in tune:
+        if not rho:
+            fail("tune rho", "the problem has no soft limits", "Give it [cost] rho")
+        found["rho"] = Parameter(rho, "positive")
+    if "tightening" in tune:
+        if not isinstance(limits, Box):
+            fail("tune tightening, margin", "the problem has no x_min, x_max", "Give limits")
+        found["tightening"] = _tightening(
+            margin, limits, np.zeros(mpc.system.n) if target is None else target
+        )
+    return found
+
+
+def linear_task(
+    mpc: MPC,
+    parameters: dict[str, Parameter],
+    x0s: Reals,
+    *,
+    name: str = "mpc",
+    terminal_weight: str = "given",
+    rho: float | None = None,
+    limits: Box | Polytope | None = None,
+    solver: ADMM = SOLVER,
+    steps: int = 50,
+    validation: float = 0.25,
+    dtype: str = "float64",
+    **terms: Any,
+) -> WeightTask:
+    """Return the task of a linear problem with hard limits, controlled by `Controller`.
+
+    parameters: of `weight_parameters`. terminal_weight: where P is not tuned it follows the tuned
+    Q and R as "lqr" or "Q", or stays as "given". rho: the L1 weight of soft limits, None for hard
+    ones. limits: of the states, where those of the problem are tightened ones. validation: fraction
+    of the initial states x0s (B, n). terms: of `weight_loss`.
+    """
+    limits = mpc.states if limits is None else limits
+    n, inputs = mpc.system.n, mpc.inputs
+    assert isinstance(inputs, Box)
+    box = limits if isinstance(limits, Box) else Box(np.full(n, -np.inf), np.full(n, np.inf))
+    # The gain that keeps predictions of unstable plants in bounds changes rounding only.
+    base = dataclasses.replace(mpc, prestabilise=prestabilising_gain(mpc))
+    shared = mpc.terminal_set is mpc.states
+
+    def make(values: Values) -> MPC:
+        made = _weighted(base, values, terminal_weight)
+        if "tightening" in values:
+            states = box.tightened(values["tightening"])
+            end = states if shared else made.terminal_set
+            made = dataclasses.replace(made, states=states, terminal_set=end)
+        return made if rho is None else soften(made, values.get("rho", rho))
+
+    return WeightTask(
+        name=name,
+        make=make,
+        parameters=parameters,
+        plant=LinearPlant(mpc.system, box, inputs, name=name),
+        x0s=np.asarray(x0s),
+        variations={},
+        validation=_validation(validation, len(np.asarray(x0s))),
+        loss=weight_loss(mpc.Q, mpc.R, limits, **terms),
+        reference=None,
+        input_reference=None,
+        steps=steps,
+        solver=solver,
+        dtype=dtype,
+        limits=limits,
+        mpc=mpc,
+    )
+
+
+def robot_task(
+    robot: Robot,
+    mpc: MPC,
+    parameters: dict[str, Parameter],
+    x0s: Reals,
+    *,
+    terminal_weight: str = "lqr",
+    rho: float = 1e4,
+    target: Reals | None = None,
+    linearize: str = "state",
+    factors: Mapping[str, np.ndarray] | None = None,
+    solver: ADMM | None = None,
+    steps: int = 50,
+    validation: float = 0.25,
+    dtype: str = "float32",
+    **terms: Any,
+) -> WeightTask:
+    """Return the task of a robot under `RobotController`, which rests at `target`.
+
+    mpc: of `robot_mpc` for this target. x0s, factors: of `draw_robots`; the MPC keeps
+    the nominal model. linearize, rho, solver: of `RobotController`. The rest as in `linear_task`.
+    """
+    reference, input_reference = set_point(robot, target)
+    loss = weight_loss(mpc.Q, mpc.R, robot.state_limits, reference, input_reference, robot, **terms)
+    variations = plant_numbers(robot, dict(factors or {}))
+    if variations:
+        robot.vary(**{key: value[0] for key, value in variations.items()})
+
+    def make(values: Values) -> RobotController:
+        made = _weighted(mpc, values, terminal_weight)
+        if "tightening" in values:
+            states = robot.state_limits.tightened(values["tightening"])
+            made = dataclasses.replace(made, states=states)
+        return RobotController(robot, made, solver, linearize=linearize, rho=values.get("rho", rho))
+
+    return WeightTask(
+        name=robot.name,
+        make=make,
+        parameters=parameters,
+        plant=robot,
+        x0s=np.asarray(x0s),
+        variations=variations,
+        validation=_validation(validation, len(np.asarray(x0s))),
+        loss=weight_loss(
+            mpc.Q, mpc.R, robot.state_limits, reference, input_reference, robot, **terms
+        ),
+        reference=reference,
+        input_reference=input_reference,
+        steps=steps,
+        solver=ADMM() if solver is None else solver,
+        dtype=dtype,
+        limits=robot.state_limits,
+        mpc=mpc,
+    )
+
+
+def set_point(robot: Robot, target: Reals | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the coordinates (n,) and inputs (m,) at which a robot rests at the target."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # robot_mpc has said the same
+        state, inputs = robot.set_point(target)
+    with jax.enable_x64(True):
+        return np.asarray(robot.coordinates(state)), np.asarray(inputs)
+
+
+def weight_loss(
+    Q: Reals,
+    R: Reals,
+    limits: Box | Polytope | None,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
+    robot: Robot | None = None,
+    *,
+    tracking: Reals | None = None,
+    effort: Reals | None = None,
+    violation: float = 10.0,
+    settling: float = 0.0,
+    tolerance: float = 0.02,
+) -> ClosedLoopLoss:
+    """Return the loss of a task: `ClosedLoopLoss` with weights of its own.
+
+    tracking, effort: diagonals in place of Q and R. tolerance: fraction of half the range of each
+    state that counts as settled.
+    """
+    Q, R = (
+        np.asarray(W) if given is None else np.asarray(given)
+        for W, given in ((Q, tracking), (R, effort))
+    )
+    half = limits.half_widths() if isinstance(limits, Box) else np.ones(len(Q))
+    return ClosedLoopLoss(
+        Q,
+        R,
+        reference,
+        input_reference,
+        limits,
+        violation,
+        settling,
+        band=tolerance * half,
+        plant=robot,
+    )
+
+
+def _validation(fraction: float, count: int) -> int:
+    """Return how many of the initial states are for validation, at least one and not all."""
+    return min(max(1, round(fraction * count)), count - 1)
+
+
+def _weighted(mpc: MPC, values: Values, terminal_weight: str) -> MPC:
+    """Return the problem with tuned weights; P is tuned itself, follows Q and R, or is as given."""
+    mpc = dataclasses.replace(mpc, Q=values.get("Q", mpc.Q), R=values.get("R", mpc.R))
+    P = values.get("P", mpc.Q if terminal_weight == "Q" else mpc.terminal_cost)
+    if terminal_weight == "lqr" and "P" not in values and {"Q", "R"} & set(values):
+        P = lqr(mpc.system, mpc.Q, mpc.R).P
+    return dataclasses.replace(mpc, terminal_cost=P)
+
+
+def _tightening(start: float, limits: Box, target: np.ndarray) -> Parameter:
+    """Return the fraction by which limits are tightened as a Parameter: at most TIGHTEST, and the
+    target stays inside."""
+    lower, upper = np.asarray(limits.lower, float), np.asarray(limits.upper, float)
+    half = (upper - lower) / 2
+    both = np.isfinite(half) & (half > 0)
+    if not both.any():
+        fail("tune tightening", "no state has limits on both sides", "Tune something else")
+    room = (np.minimum(upper - target, target - lower) / np.where(both, half, 1.0))[both]
+    highest = min(TIGHTEST, 0.9 * float(room.min()))
+    if not 0 < start < highest:
+        fail("margin", f"{start}", f"To tune it start above 0 and below {highest:.4g}")
+    return Parameter(start, "interval", lower=0.0, upper=highest)
