@@ -75,6 +75,8 @@ def run(command: Any, argv: Sequence[str]) -> int:
 def named_options(message: str, command: Any) -> str:
     """Return an error of the library, which begins with its arguments, with their options."""
     names, colon, rest = message.partition(": ")
+    if names == str(getattr(command, "output", None)):
+        return f"--output {message}"
     known = {field.name for field in fields(command)}
     option_of = lambda word: f"--{word[0].replace('_', '-')}" if word[0] in known else word[0]
     if re.fullmatch(r"\w+(,? \w+)*", names):

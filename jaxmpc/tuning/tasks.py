@@ -269,9 +269,7 @@ def robot_task(
         x0s=np.asarray(x0s),
         variations=variations,
         validation=_validation(validation, len(np.asarray(x0s))),
-        loss=weight_loss(
-            mpc.Q, mpc.R, robot.state_limits, reference, input_reference, robot, **terms
-        ),
+        loss=loss,
         reference=reference,
         input_reference=input_reference,
         steps=steps,

@@ -49,11 +49,13 @@ def check_values(command: Any) -> None:
     for field in fields(command):
         given, name = getattr(command, field.name), f"--{field.name.replace('_', '-')}"
         for value in given if isinstance(given, tuple) else (given,):
-            if isinstance(value, int) and value > MOST_COUNT:
-                fail(name, f"{value}", f"Give at most {MOST_COUNT}")
             for values in getattr(hints[field.name], "__metadata__", ()):
-                if isinstance(values, Values) and value is not None and not values.allowed(value):
+                if not isinstance(values, Values) or value is None:
+                    continue
+                if not values.allowed(value):
                     fail(name, f"{value}", values.cure)
+                if isinstance(value, int) and value > MOST_COUNT:
+                    fail(name, f"{value}", f"Give at most {MOST_COUNT}")
 
 
 ProblemFile = Annotated[
