@@ -27,6 +27,13 @@ class Values:
     allowed: Callable[[Any], bool]
     cure: str
 
+    def check(self, name: str, value: Any) -> None:
+        """Raise ValueError, naming the option, for a value that it does not take."""
+        if value is not None and not self.allowed(value):
+            fail(name, f"{value}", self.cure)
+        if isinstance(value, int) and value > MOST_COUNT:
+            fail(name, f"{value}", f"Give at most {MOST_COUNT}")
+
 
 def at_least(count: int) -> Values:
     """Return the annotation of whole numbers."""
@@ -50,12 +57,8 @@ def check_values(command: Any) -> None:
         given, name = getattr(command, field.name), f"--{field.name.replace('_', '-')}"
         for value in given if isinstance(given, tuple) else (given,):
             for values in getattr(hints[field.name], "__metadata__", ()):
-                if not isinstance(values, Values) or value is None:
-                    continue
-                if not values.allowed(value):
-                    fail(name, f"{value}", values.cure)
-                if isinstance(value, int) and value > MOST_COUNT:
-                    fail(name, f"{value}", f"Give at most {MOST_COUNT}")
+                if isinstance(values, Values):
+                    values.check(name, value)
 
 
 ProblemFile = Annotated[
@@ -144,14 +147,6 @@ def require_lengths(command: Any, needs: str, **lengths: int) -> None:
         if given is not None and len(given) != length:
             option_name = f"--{name.replace('_', '-')}"
             fail(option_name, f"has {len(given)} numbers", f"{needs} needs {length}")
-
-
-def check_positive(command: Any, *names: str) -> None:
-    """Raise ValueError for an option that is given and not a positive number."""
-    for name in names:
-        value = getattr(command, name)
-        if value is not None and not 0 < value < np.inf:
-            fail(f"--{name.replace('_', '-')}", f"{value}", "Give a positive number")
 
 
 def refuse(given: dict[str, Any], robot: str | None, needs: str) -> None:

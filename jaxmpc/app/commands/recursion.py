@@ -181,7 +181,8 @@ class Recursion:
         """Make the map of --robot. Raises ValueError for options that do not go with it."""
         given = {"config": self.config, "smallest": self.smallest, "regions": self.regions}
         refuse(given, robot, "Claims about all states are those of a linear problem")
-        check_counts(self, horizon=1, steps=1)
+        at_least(1).check("--horizon", self.horizon)
+        at_least(1).check("--steps", self.steps)
         map_robot_into(
             robot, self.output, claim="recursion", steps=100 if self.steps is None else self.steps,
             horizon=self.horizon, terminal=self.terminal, axes=self.axes, fixed=self.fixed,

@@ -11,13 +11,13 @@ import tyro
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.linear_sweep import linear_sweep
 from jaxmpc.app.commands.options import (
+    POSITIVE,
     Devices,
     End,
     Horizon,
     Switch,
     Terminal,
-    check_counts,
-    check_positive,
+    at_least,
     chosen_shard,
     given_options,
     option,
@@ -102,7 +102,7 @@ class Sweep:
     """TOML file with the problem and the sweep."""
     robot: Annotated[str | None, option("NAME|FILE", "none, a linear system")] = None
     """Map a robot instead, linear prediction against nonlinear closed loop."""
-    seconds: Annotated[float | None, option("S", "2")] = None
+    seconds: Annotated[float | None, option("S", "2"), POSITIVE] = None
     """With --robot: length of its closed loops."""
     output: Annotated[Path, option("DIR", "jaxmpc-sweep")] = Path("jaxmpc-sweep")
     """Folder for sweep.zarr, map.png and summary.json; made where absent."""
@@ -191,8 +191,7 @@ class Sweep:
         refuse(given, robot, "Give a problem or a robot; a robot's map is a slice")
         refuse({"shard": self.shard, "store": self.store}, robot, "They are for linear maps")
         chosen_devices(self.devices, "--devices")
-        check_counts(self, horizon=1)
-        check_positive(self, "seconds")
+        at_least(1).check("--horizon", self.horizon)
         map_robot_into(
             robot, self.output, seconds=self.seconds, horizon=self.horizon, terminal=self.terminal,
             axes=self.axes, fixed=self.fixed, grid=self.grid, lower=self.lower, upper=self.upper,
