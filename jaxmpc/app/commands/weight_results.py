@@ -14,8 +14,9 @@ from jaxmpc.app.commands.tune_options import TUNED, two_columns
 from jaxmpc.app.commands.weight_files import WeightProblem
 from jaxmpc.app.plots.style import save
 from jaxmpc.app.plots.tuning import plot_before_after, plot_maps, plot_tuning
-from jaxmpc.feasible.map import grid, map_feasible_set
+from jaxmpc.feasible.map import map_feasible_set
 from jaxmpc.files import versions, write_json
+from jaxmpc.grids import grid
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.tuning.result import TuningRun
 from jaxmpc.tuning.run_folder import CHECKPOINT
