@@ -39,8 +39,8 @@ class RobotLoops:
         limits."""
         states, inputs = with_limits(robot, run)
         worst = np.maximum(worst_violation(*states), _with_last(worst_violation(*inputs)))
-        state_kept, input_kept = (kept(*pair, dtype).all(axis=-1) for pair in (states, inputs))
-        beyond = ~state_kept | _with_last(~input_kept)
+        state_kept, input_kept = (np.all(kept(*pair, dtype), axis=-1) for pair in (states, inputs))
+        beyond = ~state_kept | _with_last(np.logical_not(input_kept))
         status = np.asarray(run.status)
         solved = status == Status.SOLVED
         return cls(

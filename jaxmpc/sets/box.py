@@ -1,7 +1,6 @@
 """Boxes: {x : lower <= x <= upper}."""
 
 import itertools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +9,15 @@ import numpy as np
 from jaxmpc.arrays import Reals, as_array, dimensions, host_array, store_floats
 from jaxmpc.checks import concrete, fail
 from jaxmpc.pytrees import pytree
-from jaxmpc.sets.convex_set import LinearSet, Rows, as_floats, numbers, require_matching
+from jaxmpc.sets.convex_set import (
+    AnyArray,
+    AnyNumber,
+    AnyTruth,
+    LinearSet,
+    as_floats,
+    numbers,
+    require_matching,
+)
 from jaxmpc.sets.polytope import Polytope
 
 
@@ -68,20 +75,17 @@ class Box(LinearSet):
         empty = (lower > upper) | (lower == np.inf) | (upper == -np.inf)
         if empty.any():
             i = int(np.argmax(empty))
-            fail(
-                argument,
-                f"is empty: lower[{i}] = {lower[i]:g}, upper[{i}] = {upper[i]:g}",
-                "Give lower <= upper, with -inf below or inf above for no bound",
-            )
+            cure = "Give lower <= upper, with -inf below or inf above for no bound"
+            fail(argument, f"is empty: lower[{i}] = {lower[i]:g}, upper[{i}] = {upper[i]:g}", cure)
 
-    def contains(self, x: Reals, tolerance: float = 0.0) -> Any:
+    def contains(self, x: Reals, tolerance: float = 0.0) -> AnyTruth:
         """Return whether lower - tolerance <= x <= upper + tolerance, x of shape (n,)."""
         self = self.spread(1)
         self._require_vector("x", x, "point")
         xp, (x, lower, upper, tolerance) = numbers(x, self.lower, self.upper, tolerance)
         return xp.all((lower - tolerance <= x) & (x <= upper + tolerance))
 
-    def support(self, d: Reals) -> Any:
+    def support(self, d: Reals) -> AnyNumber:
         """Return max d'x over the box, d of shape (n,); inf where the box is unbounded along d."""
         self = self.spread(1)
         self._require_vector("d", d, "direction")
@@ -89,7 +93,7 @@ class Box(LinearSet):
         # The maximiser, with 0 where d is 0: there 0 * inf would be NaN.
         return along @ xp.where(along > 0, upper, xp.where(along < 0, lower, 0))
 
-    def tightened(self, fraction: Any) -> "Box":
+    def tightened(self, fraction: float | jax.Array) -> "Box":
         """Return the box with its two-sided coordinates narrowed on each side by a fraction of
         their half-width. Works inside jit, vmap and grad with respect to `fraction`."""
         lower, upper = np.asarray(self.lower, float), np.asarray(self.upper, float)
@@ -104,7 +108,7 @@ class Box(LinearSet):
         width = (upper - lower) / 2
         return np.where(np.isfinite(width) & (width > 0), width, 1.0)
 
-    def rows(self) -> tuple[Rows, Rows, Rows]:
+    def rows(self) -> tuple[AnyArray, AnyArray, AnyArray]:
         """Return (H, lower, upper) of the two-sided rows lower <= H x <= upper; H is the
         identity."""
         self = self.spread(1)

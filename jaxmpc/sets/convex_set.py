@@ -8,6 +8,7 @@ make no sense.
 """
 
 from abc import ABC, abstractmethod
+from types import ModuleType
 from typing import Any, Self, TypeAlias
 
 import jax
@@ -17,8 +18,10 @@ import numpy as np
 from jaxmpc.arrays import Reals, as_array, host_array
 from jaxmpc.checks import concrete, fail, require_shape
 
-# An array of JAX or NumPy.
-Rows: TypeAlias = jax.Array | np.ndarray
+# An array, a number, True or False, of JAX or NumPy.
+AnyArray: TypeAlias = jax.Array | np.ndarray
+AnyNumber: TypeAlias = jax.Array | np.floating | float
+AnyTruth: TypeAlias = jax.Array | np.bool
 
 
 class ConvexSet(ABC):
@@ -34,11 +37,11 @@ class ConvexSet(ABC):
         """Raise ValueError, naming `argument`, for fields that describe no set in R^dimension."""
 
     @abstractmethod
-    def contains(self, x: Reals, tolerance: float = 0.0) -> Any:
+    def contains(self, x: Reals, tolerance: float = 0.0) -> AnyTruth:
         """Return whether the set, its limits loosened by `tolerance`, holds x (n,)."""
 
     @abstractmethod
-    def support(self, d: Reals) -> Any:
+    def support(self, d: Reals) -> AnyNumber:
         """Return max d'x over the set, d (n,); inf where it is unbounded along d."""
 
     @abstractmethod
@@ -59,7 +62,7 @@ class LinearSet(ConvexSet):
         return self
 
     @abstractmethod
-    def rows(self) -> tuple[Rows, Rows, Rows]:
+    def rows(self) -> tuple[AnyArray, AnyArray, AnyArray]:
         """Return (H, lower, upper) of the two-sided rows lower <= H x <= upper."""
 
     @abstractmethod
@@ -75,19 +78,19 @@ class LinearSet(ConvexSet):
         """Return the length, area or volume; ValueError if the set is unbounded."""
 
 
-def numbers(*values: Any) -> tuple[Any, list[Any]]:
+def numbers(*values: Any) -> tuple[ModuleType, list[Any]]:
     """Return NumPy and the values in float64, or jax.numpy and its arrays where one is traced."""
     if concrete(*values):
         return np, [host_array("argument", value) for value in values]
     return jnp, [jnp.asarray(value) for value in values]
 
 
-def product(xp: Any, M: Any, v: Any) -> Any:
-    """Return M v, by JAX in the precision of the arrays."""
+def product(xp: ModuleType, M: Any, v: Any) -> Any:
+    """Return the matrix product M v, by JAX in the precision of the arrays."""
     return M @ v if xp is np else jnp.matmul(M, v, precision="highest")
 
 
-def as_floats(value: Any) -> Any:
+def as_floats(value: Reals) -> AnyArray:
     """Return `value` as an array that keeps its floating dtype; traced values stay traced."""
     value = as_array(value)
     value = value if isinstance(value, jax.Array) else np.asarray(value)
@@ -114,8 +117,5 @@ def require_matching(
 def require_dimension(argument: str, given: int, wanted: int | None) -> None:
     """Raise unless a set has the dimension that is wanted (None: any)."""
     if wanted is not None and given != wanted:
-        fail(
-            argument,
-            f"has dimension {given} where {wanted} is needed",
-            "Bound every coordinate (inf for no bound)",
-        )
+        cure = "Bound every coordinate (inf for no bound)"
+        fail(argument, f"has dimension {given} where {wanted} is needed", cure)

@@ -1,7 +1,6 @@
 """Ellipsoids about the origin: {x : x'P x <= level}."""
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -10,7 +9,14 @@ from jaxmpc.checks import concrete, fail, require_shape, require_symmetric_psd
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import solve
 from jaxmpc.sets.box import Box
-from jaxmpc.sets.convex_set import ConvexSet, numbers, product, require_dimension
+from jaxmpc.sets.convex_set import (
+    AnyNumber,
+    AnyTruth,
+    ConvexSet,
+    numbers,
+    product,
+    require_dimension,
+)
 
 
 @pytree
@@ -44,13 +50,13 @@ class Ellipsoid(ConvexSet):
         if not (np.isfinite(level) and level > 0):
             fail(f"{argument}.level", f"{level:g} is not a positive number", "Give x'Px's maximum")
 
-    def contains(self, x: Reals, tolerance: float = 0.0) -> Any:
+    def contains(self, x: Reals, tolerance: float = 0.0) -> AnyTruth:
         """Return whether x'P x <= level + tolerance, x of shape (n,)."""
         self._require_vector("x", x, "point")
         xp, (P, level, x, tolerance) = numbers(self.P, self.level, x, tolerance)
         return product(xp, x, product(xp, P, x)) <= level + tolerance
 
-    def support(self, d: Reals) -> Any:
+    def support(self, d: Reals) -> AnyNumber:
         """Return max d'x over the ellipsoid = sqrt(level d'P^-1 d), d of shape (n,)."""
         self._require_vector("d", d, "direction")
         xp, (along, P, level) = numbers(d, self.P, self.level)

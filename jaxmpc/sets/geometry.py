@@ -259,11 +259,8 @@ def eliminate(Y: np.ndarray, axes: Sequence[int]) -> np.ndarray:
         above, below = (entries > 0).sum(axis=0), (entries < 0).sum(axis=0)
         cheapest = int(np.argmin(above * below - above - below))
         if above[cheapest] * below[cheapest] > _MOST_ROWS:
-            fail(
-                "axes",
-                f"{above[cheapest]} x {below[cheapest]} new rows to eliminate one coordinate",
-                "Keep more axes, or project fewer rows",
-            )
+            problem = f"{above[cheapest]} x {below[cheapest]} new rows to eliminate one coordinate"
+            fail("axes", problem, "Keep more axes, or project fewer rows")
         j, y = left.pop(cheapest), entries[:, cheapest]
         plus, minus = Y[y > 0][:, None], Y[y < 0][None]
         p, q = y[y > 0][:, None, None], -y[y < 0][None, :, None]

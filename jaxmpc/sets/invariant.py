@@ -98,11 +98,8 @@ def maximal_invariant_set(
     W = disturbance_set(disturbance, n)
     radius = np.abs(np.linalg.eigvals(closed)).max()
     if not radius < 1:
-        fail(
-            "K",
-            f"A + BK has spectral radius {radius:.9g}, which is not below 1",
-            "Use a stabilizing K with u = Kx (python-control's K has the other sign)",
-        )
+        cure = "Use a stabilizing K with u = Kx (python-control's K has the other sign)"
+        fail("K", f"A + BK has spectral radius {radius:.9g}, which is not below 1", cure)
     rows, newest, b = F, F, np.ones(len(F))
     reach = np.full(n, np.inf)
     for t in range(max_iterations + 1):
@@ -131,17 +128,11 @@ def maximal_invariant_set(
             found = Polytope(rows, np.ones(len(rows))).reduce()
             return InvariantSet(found.H, found.h, index=t)
         if not bounded and max(top.value for top in tops) <= 1 + _REDUNDANT:
-            fail(
-                "states",
-                "the invariant set is unbounded: some motion is never constrained",
-                "Bound the states on every side",
-            )
+            cure = "Bound the states on every side"
+            fail("states", "the invariant set is unbounded: some motion is never constrained", cure)
         rows = np.vstack([rows, scaled[follow]])
-    fail(
-        "max_iterations",
-        f"{max_iterations} steps do not determine the set (spectral radius {radius:.6g})",
-        "Raise it, or choose a K that decays faster",
-    )
+    problem = f"{max_iterations} steps do not determine the set (spectral radius {radius:.6g})"
+    fail("max_iterations", problem, "Raise it, or choose a K that decays faster")
 
 
 def invariant_ellipsoid(
@@ -267,11 +258,8 @@ def _closed_loop(
     K = host_array("K", K)
     require_finite("K", K)
     if system.c is not None and np.any(host_array("c", system.c)):
-        fail(
-            "system.c",
-            "is not zero, so the origin is no equilibrium",
-            "Write the system in deviations from its equilibrium",
-        )
+        cure = "Write the system in deviations from its equilibrium"
+        fail("system.c", "is not zero, so the origin is no equilibrium", cure)
     parts = [np.zeros((0, n))]
     for argument, limits, output in (("states", states, np.eye(n)), ("inputs", inputs, K)):
         if limits is None:
@@ -284,11 +272,8 @@ def _closed_loop(
         vacuous = ~F.any(axis=1) & (h >= 0)
         F, h = F[~vacuous], h[~vacuous]
         if not np.all(h > 0):
-            fail(
-                argument,
-                "the origin is not in its interior",
-                "Shift the coordinates, or widen the bounds around 0",
-            )
+            cure = "Shift the coordinates, or widen the bounds around 0"
+            fail(argument, "the origin is not in its interior", cure)
         parts.append(F / h[:, None])
     F = np.vstack(parts)
     F = F[np.abs(F).max(axis=1, initial=0.0) > 0]

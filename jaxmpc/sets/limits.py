@@ -65,12 +65,11 @@ def joint_limits(
     """
     limits = {"position": position, "velocity": velocity, "torque": torque}
     pairs = {key: limit_pair(key, value) for key, value in limits.items()}
-    sizes = {key: np.size(end) for key, pair in pairs.items() for end in pair if np.ndim(end)}
-    n = len(names) if names is not None else max(sizes.values(), default=1)
-    for key, pair in pairs.items():
-        for end in pair:
-            if np.shape(end) not in ((), (n,)):
-                fail(key, f"{np.size(end)} entries for {n} joints", "Give one a joint, or a number")
+    ends = [(key, end) for key, pair in pairs.items() for end in pair]
+    n = max((end.size for _, end in ends if end.ndim), default=1) if names is None else len(names)
+    for key, end in ends:
+        if end.shape not in ((), (n,)):
+            fail(key, f"{end.size} entries for {n} joints", "Give one a joint, or a number")
     if isinstance(units, str) or len(units) != 3:
         fail("units", f"{units!r} is not one of position, velocity, torque", "Give three")
     if names is None:
@@ -131,14 +130,12 @@ def output_limits(
             fail(name, f"{given!r} is not one string an output", f"Give {p} strings, or none")
     names = names or [f"y{i + 1}" for i in range(p)]
     units = units or [""] * p
-    rows = [(sign, end, i) for sign, end in ((1, ends[1]), (-1, ends[0])) for i in range(p)]
-    rows = [(sign, end, i) for sign, end, i in rows if np.isfinite(end[i])]
-    relation = {1: "<=", -1: ">="}
-    return Polytope(
-        np.array([sign * C[i] + 0.0 for sign, _, i in rows]).reshape(-1, C.shape[1]),  # no -0.0
-        np.array([sign * end[i] + 0.0 for sign, end, i in rows]),
-        tuple(f"{names[i]} {relation[s]} {e[i]:.6g} {units[i]}".rstrip() for s, e, i in rows),
-    )
+    H = np.vstack([C, -C]) + 0.0  # no -0.0
+    h = np.concatenate([ends[1], -ends[0]]) + 0.0
+    texts = [f"<= {end:.6g}" for end in ends[1]] + [f">= {end:.6g}" for end in ends[0]]
+    rows = np.flatnonzero(np.isfinite(h)).tolist()
+    labels = tuple(f"{names[i % p]} {texts[i]} {units[i % p]}".rstrip() for i in rows)
+    return Polytope(H[rows], h[rows], labels)
 
 
 def limit_pair(argument: str, limit: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -149,10 +146,6 @@ def limit_pair(argument: str, limit: Any) -> tuple[np.ndarray, np.ndarray]:
         bound = host_array(argument, limit)
         return -bound, bound
     if len(limit) != 2:
-        fail(
-            argument,
-            f"{limit!r} is not a pair",
-            "Give (lower, upper), each a number or one a joint, or one number v for |.| ≤ v",
-        )
-    lower, upper = (host_array(argument, end) for end in limit)
-    return lower, upper
+        each = "each a number or one a joint, or one number v for |.| ≤ v"
+        fail(argument, f"{limit!r} is not a pair", f"Give (lower, upper), {each}")
+    return host_array(argument, limit[0]), host_array(argument, limit[1])

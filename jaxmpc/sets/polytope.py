@@ -1,7 +1,6 @@
 """Polytopes: {x : H x <= h}, bounded or not."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import scipy
@@ -18,7 +17,7 @@ from jaxmpc.checks import (
 )
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.sets import convex_set, geometry
-from jaxmpc.sets.convex_set import ConvexSet, LinearSet, Rows
+from jaxmpc.sets.convex_set import AnyArray, AnyTruth, ConvexSet, LinearSet
 from jaxmpc.sets.interior import Flat, Frame, affine_hull, framed
 from jaxmpc.sets.lp import FLAT, ROUNDING, Program, cleaned, extent, maximise, scaling
 
@@ -90,7 +89,7 @@ class Polytope(LinearSet):
             return True
         return Program(*geometry.unit_rows(H, h)).empty
 
-    def contains(self, x: Reals, tolerance: float = 0.0) -> Any:
+    def contains(self, x: Reals, tolerance: float = 0.0) -> AnyTruth:
         """Return whether H x <= h + tolerance (in the scale of each row), x of shape (n,)."""
         self._require_vector("x", x, "point")
         xp, (H, h, x, tolerance) = convex_set.numbers(self.H, self.h, x, tolerance)
@@ -108,7 +107,7 @@ class Polytope(LinearSet):
             fail("Polytope", "is empty: no point satisfies all its rows", "Loosen its rows")
         return value
 
-    def rows(self) -> tuple[Rows, Rows, Rows]:
+    def rows(self) -> tuple[AnyArray, AnyArray, AnyArray]:
         """Return (H, lower, upper) of the two-sided rows lower <= H x <= upper; lower is -inf."""
         H, h = convex_set.as_floats(self.H), convex_set.as_floats(self.h)
         return H, np.full(np.shape(h), -np.inf, dtype=h.dtype), h

@@ -1,7 +1,7 @@
 """The infinite-horizon linear-quadratic regulator in discrete time."""
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -84,15 +84,13 @@ def lqr(system: LinearSystem, Q: Reals, R: Reals) -> LQR:
     Q, R = (Q + Q.T) / 2, (R + R.T) / 2
     weights, axes = np.linalg.eigh(Q)
     output = np.sqrt(np.maximum(weights, 0.0))[:, None] * axes.T  # Q = output'output
-    control, control_mode = least_reached(A, B)
-    cost, cost_mode = least_reached(A.T, output.T)
-    name = lambda A, B, mode: f"{_coordinates(A, B, system.state_names)} (eigenvalue {mode})"
-    unmoved = ("B", f"does not move {name(A, B, control_mode)}", "Actuate that")
-    unseen = ("Q", f"puts no weight on {name(A.T, output.T, cost_mode)}", "Give it some")
-    if control <= _UNREACHED:
-        fail(unmoved[0], f"not stabilizable: {unmoved[1]}", unmoved[2])
-    if cost <= _UNREACHED:
-        fail(unseen[0], f"not detectable: {unseen[1]}", unseen[2])
+    unmoved, unseen = _rank_tests(A, B), _rank_tests(A.T, output.T)
+    moving = f"does not move {unmoved.described(system.state_names)}"
+    seeing = f"puts no weight on {unseen.described(system.state_names)}"
+    if unmoved.least <= _UNREACHED:
+        fail("B", f"not stabilizable: {moving}", "Actuate that")
+    if unseen.least <= _UNREACHED:
+        fail("Q", f"not detectable: {seeing}", "Give it some")
     try:
         P = _refine(A, B, Q, R, scipy.linalg.solve_discrete_are(A, B, Q, R))
         K = _gain(A, B, R, P)
@@ -100,12 +98,14 @@ def lqr(system: LinearSystem, Q: Reals, R: Reals) -> LQR:
     except (np.linalg.LinAlgError, ValueError):
         radius = np.inf
     if not radius < 1:  # too close to the threshold for the test above: name the likelier cause
-        argument, problem, cure = unmoved if control <= cost else unseen
-        fail(argument, f"hardly {problem}, so the Riccati equation was not solved", cure)
+        problem = "so the Riccati equation was not solved"
+        if unmoved.least <= unseen.least:
+            fail("B", f"hardly {moving}, {problem}", "Actuate that")
+        fail("Q", f"hardly {seeing}, {problem}", "Give it some")
     return LQR(K=K, P=P)
 
 
-def cost_of_law(system: LinearSystem, K: Reals, Q: Reals, R: Reals) -> Any:
+def cost_of_law(system: LinearSystem, K: Reals, Q: Reals, R: Reals) -> Array | np.ndarray:
     """Return P with x'P x = sum over k >= 0 of x_k'Q x_k + u_k'R u_k under u = K x.
 
     P = (A+BK)'P(A+BK) + Q + K'RK: as terminal cost it falls by the stage cost along u = K x, which
@@ -166,11 +166,11 @@ def _refine(
 
 
 @own_modes
-def _traced(*data: Any) -> LQR:
+def _traced(*data: Reals) -> LQR:
     """Return K and P for traced A, B, Q, R."""
-    data = tuple(jnp.asarray(v) for v in data)  # lists of traced numbers
-    dtype = floating_dtype(data)
-    A, B, Q, R = (v.astype(dtype) for v in arrays(data))
+    values = tuple(jnp.asarray(v) for v in data)  # lists of traced numbers
+    dtype = floating_dtype(values)
+    A, B, Q, R = (v.astype(dtype) for v in arrays(values))
     Q, R = (Q + Q.T) / 2, (R + R.T) / 2
     P = _solution(A, B, Q, R)
     return LQR(K=_traced_gain(A, B, R, P), P=P)
@@ -262,56 +262,79 @@ def _power_sum(M: Array, S: Array) -> tuple[Array, Array]:
 
 def _solve_lyapunov(M: Array, S: Array) -> Array:
     """Return the solution X of X = M'X M + S, for M with spectral radius below 1."""
+
+    def residual(X: Array) -> Array:
+        return X - matmul(M.T, matmul(X, M))
+
     return jax.lax.custom_linear_solve(
-        lambda X: X - matmul(M.T, matmul(X, M)), S,
-        solve=lambda _, S: _power_sum(M, S)[0], transpose_solve=lambda _, S: _power_sum(M.T, S)[0],
-    )  # fmt: skip
+        residual,
+        S,
+        solve=lambda _, S: _power_sum(M, S)[0],
+        transpose_solve=lambda _, S: _power_sum(M.T, S)[0],
+    )
 
 
 def least_reached(A: np.ndarray, B: np.ndarray) -> tuple[float, str]:
-    """Return how far the modes that do not decay are from uncontrollable, and the worst eigenvalue.
+    """Return how far the modes that do not decay are from uncontrollable, and the worst eigenvalue,
+    "none" if all decay: see `_RankTests`."""
+    tests = _rank_tests(A, B)
+    return tests.least, tests.mode
 
-    Popov-Belevitch-Hautus: all are reached if [A - s I, B] has full row rank at every
-    eigenvalue |s| >= 1. The distance is its least singular value, B scaled to norm 1.
+
+class _RankTests(NamedTuple):
+    """Popov-Belevitch-Hautus: all modes that do not decay are reached if [A - s I, B] has full row
+    rank at every eigenvalue |s| >= 1.
+
+    eigenvalues: these s. vectors, values: the left singular vectors and values of each matrix, with
+    B scaled to norm 1 and the values by max(1, |A|); the least value is the distance from a mode
+    that is not reached.
     """
-    worst, mode = np.inf, "none"
-    for s, _, sizes in _rank_tests(A, B):
-        if sizes[-1] < worst:
-            worst = float(sizes[-1])
-            mode = f"{s.real:.6g}" if s.imag == 0 else f"{s.real:.6g}{s.imag:+.6g}j"
-    return worst, mode
+
+    eigenvalues: list[complex]
+    vectors: list[np.ndarray]
+    values: list[np.ndarray]
+
+    @property
+    def least(self) -> float:
+        """Return the least singular value; inf if every mode decays."""
+        return min((float(values[-1]) for values in self.values), default=np.inf)
+
+    @property
+    def mode(self) -> str:
+        """Return the eigenvalue of the least singular value in words; "none" if there is none."""
+        if not self.values:
+            return "none"
+        s = self.eigenvalues[int(np.argmin([values[-1] for values in self.values]))]
+        return f"{s.real:.6g}" if s.imag == 0 else f"{s.real:.6g}{s.imag:+.6g}j"
+
+    def described(self, names: Sequence[str], most: int = 6) -> str:
+        """Return the unreached modes in words: the worst eigenvalue, and the coordinates in which a
+        left null vector of a test, or of the one that comes nearest to one, has more than a tenth
+        of its largest entry."""
+        if not self.values:
+            return f"a mode (eigenvalue {self.mode})"
+        bound = max(_UNREACHED, self.least)
+        found: set[int] = set()
+        for vectors, values in zip(self.vectors, self.values, strict=True):
+            for entries in np.abs(vectors[:, values <= bound]).T:
+                found |= set(np.flatnonzero(entries > 0.1 * entries.max()).tolist())
+        words = [names[i] if names else f"coordinate {i}" for i in sorted(found)]
+        rest = f" and {len(words) - most} more" if len(words) > most else ""
+        return f"{', '.join(words[:most])}{rest} (eigenvalue {self.mode})"
 
 
-def _rank_tests(
-    A: np.ndarray, B: np.ndarray
-) -> Iterator[tuple[complex, np.ndarray, np.ndarray]]:  # fmt: skip
-    """Yield each eigenvalue s, |s| >= 1, and the left singular vectors and values of
-    [A - s I, B], B scaled to norm 1 and the values by max(1, |A|)."""
+def _rank_tests(A: np.ndarray, B: np.ndarray) -> _RankTests:
+    """Test the rank of [A - s I, B] at each eigenvalue that does not decay."""
     B = B / max(np.linalg.norm(B, 2), np.finfo(np.float64).tiny)
     # A k-fold eigenvalue is computed as a ring of radius eps^(1/k); its mean is accurate.
     computed = np.linalg.eigvals(A)
     means = [computed[np.abs(computed - s) < 1e-4].mean() for s in computed]
     size = max(1.0, np.linalg.norm(A, 2))
+    tests = _RankTests([], [], [])
     for s in np.unique(np.concatenate([computed, means])):
         if abs(s) >= 1 - 1e-12:
             vectors, values, _ = np.linalg.svd(np.hstack([A - s * np.eye(len(A)), B]))
-            yield s, vectors, values / size
-
-
-def _coordinates(A: np.ndarray, B: np.ndarray, names: Sequence[str], most: int = 6) -> str:
-    """Return the coordinates of the unreached modes in words: those in which a left null vector of
-    a rank test, or of the test that comes nearest to one, has more than a tenth of its largest
-    entry."""
-    tests = list(_rank_tests(A, B))
-    if not tests:
-        return "a mode"
-    bound = max(_UNREACHED, min(values[-1] for _, _, values in tests))
-    weight = np.zeros(len(A))
-    for _, vectors, values in tests:
-        entries = np.abs(vectors[:, values <= bound])
-        largest = entries.max(axis=0, initial=0.0)
-        weight = np.maximum(weight, (entries > 0.1 * largest).max(axis=1, initial=0.0))
-    of = np.flatnonzero(weight).tolist()
-    found = [names[i] for i in of] if names else [f"coordinate {i}" for i in of]
-    rest = len(found) - most
-    return ", ".join(found[:most]) + (f" and {rest} more" if rest > 0 else "")
+            tests.eigenvalues.append(complex(s))
+            tests.vectors.append(vectors)
+            tests.values.append(values / size)
+    return tests

@@ -10,15 +10,16 @@ import numpy as np
 import scipy
 
 from jaxmpc.arrays import Reals, as_array, as_column, dimensions, host_array, store_floats
-from jaxmpc.checks import (
-    concrete,
-    fail,
-    nearest,
-    require_finite,
-    require_printable,
-    require_shape,
-)
+from jaxmpc.checks import concrete, fail, nearest, require_finite, require_printable, require_shape
 from jaxmpc.pytrees import pytree, static
+from jaxmpc.qp.precision import matmul
+
+_TEXTS = ("state_names", "input_names", "state_units", "input_units")
+_DELAY = (
+    "Put the previous input into the state: for a delay below dt, LinearSystem([[A, B − B0], "
+    "[0, 0]], [[B0], [I]], dt=dt) has the state (x, u₋₁), with A, B sampled at dt and "
+    "B0 = from_continuous(A, B, dt − delay).B"
+)
 
 
 def require_period(argument: str, dt: Any) -> None:
@@ -76,19 +77,18 @@ class LinearSystem:
     @property
     def state_labels(self) -> tuple[str, ...]:
         """Return n labels for axes and tables, such as "q [rad]"."""
-        return _labels(self.state_names or _numbered("x", self.n), self.state_units)
+        return _labels("x", self.n, self.state_names, self.state_units)
 
     @property
     def input_labels(self) -> tuple[str, ...]:
         """Return m labels for axes and tables, such as "torque [N m]"."""
-        return _labels(self.input_names or _numbered("u", self.m), self.input_units)
+        return _labels("u", self.m, self.input_names, self.input_units)
 
     def step(self, x: Reals, u: Reals) -> jax.Array:
         """Return A x + B u + c for x (n,) and u (m,), computed in the dtype of x."""
         x = jnp.asarray(x)
         A, B = jnp.asarray(self.A, x.dtype), jnp.asarray(self.B, x.dtype)
-        product = lambda M, v: jnp.matmul(M, v, precision="highest")
-        after = product(A, x) + product(B, jnp.asarray(u, x.dtype))
+        after = matmul(A, x) + matmul(B, jnp.asarray(u, x.dtype))
         return after if self.c is None else after + jnp.asarray(self.c, x.dtype)
 
     def validate(self) -> None:
@@ -105,15 +105,13 @@ class LinearSystem:
         require_shape("A", as_array(self.A), (n, n), "A must be square")
         require_shape("B", as_array(self.B), (n, m), "Give B as many rows as A")
         if self.c is not None:
+            outputs = "outputs are no part of a system: see jm.Outputs"
             require_shape(
-                "c",
-                as_array(self.c),
-                (n,),
-                "Give one number a state, or None; outputs are no part of a system: see jm.Outputs",
+                "c", as_array(self.c), (n,), f"Give one number a state, or None; {outputs}"
             )
         if self.dt is not None:
             require_period("dt", self.dt)
-        for kind, count in (("state", self.n), ("input", self.m)):
+        for kind, count in (("state", n), ("input", m)):
             for what in (f"{kind}_names", f"{kind}_units"):
                 _require_strings(what, getattr(self, what), count)
             names = getattr(self, f"{kind}_names")
@@ -122,12 +120,7 @@ class LinearSystem:
 
     @classmethod
     def from_continuous(
-        cls,
-        A: Reals,
-        B: Reals,
-        dt: float,
-        c: Reals | None = None,
-        **names: tuple[str, ...],
+        cls, A: Reals, B: Reals, dt: float, c: Reals | None = None, **names: tuple[str, ...]
     ) -> "LinearSystem":
         """Sample dx/dt = A x + B u + c exactly, the input held constant over each period.
 
@@ -143,21 +136,15 @@ class LinearSystem:
         Raises ValueError for bad shapes or values, or dt <= 0.
         """
         require_period("dt", dt)
-        known = ("state_names", "input_names", "state_units", "input_units")
         for key, value in names.items():
-            if key not in known:
+            if key not in _TEXTS:
                 delayed = "delay" in key.lower() or "latency" in key.lower()
-                fail(
-                    key, f"is no argument (A, B, dt, c, {', '.join(known)} are)",
-                    "Put the previous input into the state: for a delay below dt, "
-                    "LinearSystem([[A, B − B0], [0, 0]], [[B0], [I]], dt=dt) has the state "
-                    "(x, u₋₁), with A, B sampled at dt and B0 = from_continuous(A, B, dt − delay).B"
-                    if delayed else f"{nearest(key, known)}Leave it out",
-                )  # fmt: skip
+                cure = _DELAY if delayed else f"{nearest(key, _TEXTS)}Leave it out"
+                fail(key, f"is no argument (A, B, dt, c, {', '.join(_TEXTS)} are)", cure)
             if not isinstance(value, list | tuple):
                 fail(key, f"{value!r} is not a tuple of strings", 'Write it as ("q", "dq")')
-        tuples: dict[str, Any] = {key: tuple(value) for key, value in names.items()}
-        continuous = cls(A, B, c, dt, **tuples)
+        texts: dict[str, Any] = {key: tuple(value) for key, value in names.items()}
+        continuous = cls(A, B, c, dt, **texts)
         continuous.validate()
         n, m = continuous.n, continuous.m
         M = np.zeros((n + m + 1, n + m + 1))
@@ -187,18 +174,17 @@ class LinearSystem:
         Raises ValueError rather than guess: continuous without dt, a period that differs
         from dt, or an object that does not say whether it is continuous.
         """
+        names: dict[str, Any] = {}
+        period: bool | float | None
         if isinstance(obj, LinearSystem):
             obj.validate()
-            system = obj
-            period: Any = True if obj.dt is None else obj.dt
+            system, period = obj, True if obj.dt is None else obj.dt
         else:
             for name in ("A", "B", "dt"):
                 if not hasattr(obj, name):
                     fail("obj", f"has no .{name}", "Give a state-space object (in scipy: .to_ss())")
-            names: dict[str, Any] = {
-                f"{kind}_names": tuple(getattr(obj, f"{kind}_labels", None) or ())
-                for kind in ("state", "input")
-            }
+            for kind in ("state", "input"):
+                names[f"{kind}_names"] = tuple(getattr(obj, f"{kind}_labels", None) or ())
             A, B = host_array("obj.A", obj.A), host_array("obj.B", obj.B)
             system, period = cls(A, B, **names), obj.dt
             if period is None and isinstance(obj, scipy.signal.lti):
@@ -206,11 +192,9 @@ class LinearSystem:
         if dt is not None:
             require_period("dt", dt)
         if period is None:
-            fail(
-                "obj.dt",
-                "is None, which does not say whether the system is continuous or discrete",
-                "Use LinearSystem.from_continuous(A, B, dt) or LinearSystem(A, B, dt=dt)",
-            )
+            problem = "is None, which does not say whether the system is continuous or discrete"
+            cure = "Use LinearSystem.from_continuous(A, B, dt) or LinearSystem(A, B, dt=dt)"
+            fail("obj.dt", problem, cure)
         if period is True:
             period = dt
         elif period == 0:
@@ -218,11 +202,8 @@ class LinearSystem:
                 fail("dt", "is missing and obj is continuous", "Give the sampling period, dt=...")
             return cls.from_continuous(system.A, system.B, dt, **names)
         elif dt is not None and not np.isclose(dt, period, rtol=1e-12, atol=0):
-            fail(
-                "dt",
-                f"{dt} differs from obj.dt = {period}",
-                "Leave dt out, or sample the continuous system again",
-            )
+            cure = "Leave dt out, or sample the continuous system again"
+            fail("dt", f"{dt} differs from obj.dt = {period}", cure)
         system = dataclasses.replace(system, dt=period)
         system.validate()
         return system
@@ -234,15 +215,12 @@ def host_matrices(system: LinearSystem) -> tuple[np.ndarray, np.ndarray, np.ndar
     return A, B, np.zeros(len(A)) if system.c is None else host_array("c", system.c)
 
 
-def _numbered(letter: str, count: int) -> tuple[str, ...]:
-    return tuple(f"{letter}{i + 1}" for i in range(count))
-
-
-def _labels(names: tuple[str, ...], units: tuple[str, ...]) -> tuple[str, ...]:
-    units = units or ("",) * len(names)
-    return tuple(
-        f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)
-    )
+def _labels(
+    letter: str, count: int, names: tuple[str, ...], units: tuple[str, ...]
+) -> tuple[str, ...]:
+    names = names or tuple(f"{letter}{i + 1}" for i in range(count))
+    pairs = zip(names, units or ("",) * len(names), strict=True)
+    return tuple(f"{name} [{unit}]" if unit else name for name, unit in pairs)
 
 
 def _require_strings(argument: str, value: Any, count: int) -> None:
