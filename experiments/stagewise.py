@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 import jaxmpc as jm
-from jaxmpc.mpc.stagewise.newton import factor_stages, plan_stages
+from jaxmpc.mpc.stagewise.solve import factor_stages, plan_stages
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ def run(s: Settings) -> None:
         x = mpc.system.A @ x + mpc.system.B @ before.inputs[0]
         qp, plan = condensed.qp(x), controller.plan(x)
         zero = (jnp.zeros_like(qp.q), jnp.zeros_like(qp.l))
-        of = lambda plan: WarmStart.of(plan, condensed.layout, mpc.horizon, 2, 1)
+        of = lambda plan: WarmStart.of(plan, condensed.layout, mpc)
         pair = lambda w: (condensed.variables(w.states, w.inputs), w.multipliers)
         starts = (zero, pair(of(before)), pair(controller.shifted(before)))
         return (x, plan), (*(steps_to_solve(qp, each) for each in starts), plan.status)

@@ -38,11 +38,11 @@ if TYPE_CHECKING:
     from jaxmpc.closed_loop import RobotController, robot_mpc, simulate, simulate_many
     from jaxmpc.explicit import exact_penalty
     from jaxmpc.feasible import boundary, feasible_polytope, grid, map_feasible_set
-    from jaxmpc.mpc.controller import Controller
+    from jaxmpc.mpc.controller import Controller, solve
+    from jaxmpc.mpc.many import solve_many
     from jaxmpc.mpc.plan import Plan
     from jaxmpc.mpc.problem import MPC, Outputs, Soft
     from jaxmpc.mpc.softening import soften
-    from jaxmpc.mpc.solve import solve, solve_many
     from jaxmpc.qp.admm import ADMM
     from jaxmpc.qp.problem import QP
     from jaxmpc.qp.solve import solve_qp
@@ -130,11 +130,11 @@ HOMES = {
     "closed_loop": "RobotController robot_mpc simulate simulate_many",
     "explicit": "exact_penalty",
     "feasible": "boundary feasible_polytope grid map_feasible_set",
-    "mpc.controller": "Controller",
+    "mpc.controller": "Controller solve",
+    "mpc.many": "solve_many",
     "mpc.plan": "Plan",
     "mpc.problem": "MPC Outputs Soft",
     "mpc.softening": "soften",
-    "mpc.solve": "solve solve_many",
     "qp.admm": "ADMM",
     "qp.problem": "QP",
     "qp.solve": "solve_qp",

@@ -26,9 +26,9 @@ from jaxmpc.feasible.map import map_feasible_set
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.condense import Condensed, condense, in_float64
 from jaxmpc.mpc.controller import Controller
+from jaxmpc.mpc.many import solve_many
 from jaxmpc.mpc.plan import Plan, flat_multipliers
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.solve import solve_many
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 

@@ -25,7 +25,7 @@ import tyro
 
 import jaxmpc as jm
 from jaxmpc.batches import chosen_devices, over_devices, placement
-from jaxmpc.mpc.stagewise.newton import factor_stages, plan_stages
+from jaxmpc.mpc.stagewise.solve import factor_stages, plan_stages
 
 
 @dataclass(frozen=True)

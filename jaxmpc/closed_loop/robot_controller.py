@@ -14,8 +14,8 @@ from jaxmpc.mpc.plan import Control, Plan, WarmStart, anchored, applied, limited
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import layout
 from jaxmpc.mpc.softening import soften
-from jaxmpc.mpc.stagewise.newton import factor_stages, solve_stagewise
 from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, Task, task_layout
+from jaxmpc.mpc.stagewise.solve import factor_stages, solve_stagewise
 from jaxmpc.mpc.stagewise.sqp import solve_nonlinear
 from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.admm import ADMM, DEFAULT

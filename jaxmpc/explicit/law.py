@@ -12,9 +12,9 @@ import numpy as np
 from scipy.optimize import lsq_linear, nnls
 
 from jaxmpc.explicit.regions import CriticalRegions
-from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
+from jaxmpc.mpc.condense import Inequalities, condensed_in_float64
+from jaxmpc.mpc.many import solve_many
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.solve import solve_many
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status

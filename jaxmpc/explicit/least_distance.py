@@ -20,8 +20,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from jaxmpc.checks import fail
-from jaxmpc.mpc.condense import Condensed
-from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
+from jaxmpc.mpc.condense import Condensed, Inequalities, condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.sets.any_set import unit_half_spaces

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from jaxmpc.checks import fail
-from jaxmpc.mpc.inequalities import Inequalities, row_lengths
+from jaxmpc.mpc.condense import Inequalities, row_lengths
 from jaxmpc.pytrees import record
 from jaxmpc.sets.interior import affine_hull, framed
 from jaxmpc.sets.lp import Program, bound, extent, maximise, power_of_two

@@ -16,8 +16,7 @@ from jaxmpc.feasible.plan_polytope import PlanPolytope
 from jaxmpc.feasible.row_programs import RowPrograms
 from jaxmpc.feasible.view import Axes, View, make_view
 from jaxmpc.files import as_json
-from jaxmpc.mpc.condense import Condensed
-from jaxmpc.mpc.inequalities import condensed_in_float64
+from jaxmpc.mpc.condense import Condensed, condensed_in_float64
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
 from jaxmpc.mpc.rows import Block
 from jaxmpc.pytrees import record

@@ -3,15 +3,16 @@
 from collections.abc import Callable
 from dataclasses import field, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import Reals, as_array, host_array
+from jaxmpc.arrays import Reals
 from jaxmpc.checks import concrete, fail, require_kind
+from jaxmpc.mpc.arguments import Aim, checked_aim
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.plan import (
     Control,
@@ -22,20 +23,24 @@ from jaxmpc.mpc.plan import (
     answer,
     applied,
     limited,
+    require_warm_start,
     sorted_multipliers,
 )
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.stated_residuals import judged
+from jaxmpc.mpc.stated_residuals import with_stated_status
 from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor
 from jaxmpc.qp.admm import factor as factorise
 from jaxmpc.qp.dual_search import has_dual_steps
 from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, matmul
+from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.solve import in_two_parts, solve_factored
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.polytope import Polytope
+
+T = TypeVar("T")
 
 
 @prepared_pytree
@@ -123,9 +128,9 @@ class Controller:
         before: None, or what was returned at the time step before. References and previous_input as
         in `solve`; previous_input None: the input of `before`.
         """
-        given = self._checked(x, reference, input_reference, previous_input)
+        aim = self._checked(x, reference, input_reference, previous_input)
         last = None if before is None else (before.u, before.memory)
-        return self._in_two_parts(_control, *given, last, status=lambda found: found.plan.status)
+        return self._in_two_parts(_control, aim, last, status=lambda found: found.plan.status)
 
     def shifted(self, plan: Plan | WarmStart) -> WarmStart:
         """The plan seen one time step later, as a warm start (`WarmStart.shifted`).
@@ -134,37 +139,37 @@ class Controller:
         the origin, clipped into its limits. With a control horizon each free input becomes what the
         plan did one step after its beginning.
         """
-        c, system = self.condensed, self.mpc.system
-        start = WarmStart.of(plan, c.layout, self.mpc.horizon, system.n, system.m)
+        c = self.condensed
+        start = WarmStart.of(plan, c.layout, self.mpc)
         tail = limited(self.mpc.inputs, matmul(c.K_N, start.states[-1]))
         return start.shifted(c.layout, tail, bool(c.balls))
 
     def plan(
-        self, x0: Any, reference: Any = None, warm_start: Any = None, input_reference: Any = None,
-        previous_input: Any = None,
-    ) -> Plan:  # fmt: skip
+        self,
+        x0: Reals,
+        reference: Reals | None = None,
+        warm_start: Plan | WarmStart | None = None,
+        input_reference: Reals | None = None,
+        previous_input: Reals | None = None,
+    ) -> Plan:
         """Plan from x0 (n,); arguments as in `solve`."""
-        given = self._checked(x0, reference, input_reference, previous_input)
+        aim = self._checked(x0, reference, input_reference, previous_input)
         if warm_start is not None:
-            c, mpc = self.condensed, self.mpc
-            start = WarmStart.of(warm_start, c.layout, mpc.horizon, mpc.system.n, mpc.system.m)
-            warm_start = arrays(start)
-        return self._in_two_parts(_plan, *given, warm_start)
+            warm_start = arrays(WarmStart.of(warm_start, self.condensed.layout, self.mpc))
+        return self._in_two_parts(_plan, aim, warm_start)
 
-    def _in_two_parts(self, program: Callable[..., Any], *given: Any, **kwargs: Any) -> Any:
-        c = self.condensed
-        hard = not has_dual_steps(c.balls, c.C)
-        return in_two_parts(program, hard, self.solver, self, *given, **kwargs)
+    def _in_two_parts(self, program: Callable[..., T], *given: Any, **status: Any) -> T:
+        hard = not has_dual_steps(self.condensed.balls, self.condensed.C)
+        return in_two_parts(program, hard, self.solver, self, *given, **status)
 
-    def _checked(
-        self, x0: Any, reference: Any, input_reference: Any, previous_input: Any
-    ) -> list[Any]:
-        """The arguments in the controller's precision; ValueError for wrong ones."""
+    def _checked(self, x0: Reals, *aim: Reals | None) -> Aim:
+        """The aim in the controller's precision; ValueError for wrong arguments."""
         if self.dtype == jnp.float64 and jnp.result_type(float) != jnp.float64:
             cure = "Call it under jax.enable_x64(True), or make it outside"
             fail("controller", "was made in float64, and 64-bit mode is off", cure)
-        given = plan_arguments(self.mpc, x0, reference, input_reference, previous_input)
-        return [v.astype(self.dtype) if isinstance(v, np.ndarray) else v for v in given]
+        given = checked_aim(self.mpc, x0, *aim)
+        cast = lambda v: v.astype(self.dtype) if isinstance(v, np.ndarray) else v
+        return jax.tree.map(cast, given)
 
     def multipliers(self, y: Array) -> Multipliers:
         """Sort the QP's multipliers y (rows,) by constraint and step."""
@@ -184,43 +189,6 @@ def unshared(parts: tuple) -> tuple:
 
     given = jax.tree.map(lambda v: jnp.array(v) if concrete(v) else v, parts[:2])
     return jax.tree.map(own, (*given, *parts[2:]))
-
-
-def plan_arguments(
-    mpc: MPC, x0: Any, reference: Any = None, input_reference: Any = None,
-    previous_input: Any = None,
-) -> list[Any]:  # fmt: skip
-    """Return the arguments of a plan as arrays, None where they are None; ValueError for wrong
-    kinds and shapes. A number will do for one state or input."""
-    N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
-    shapes = {
-        "x0": ((n,), (n,)), "reference": ((n,), (N + 1, n)),
-        "input_reference": ((m,), (N, m)), "previous_input": ((m,), (m,)),
-    }  # fmt: skip
-    checked = []
-    for (name, (one, all_steps)), value in zip(
-        shapes.items(), (x0, reference, input_reference, previous_input), strict=True
-    ):
-        if value is not None or name == "x0":
-            value = _real_array(name, value)
-            if np.shape(value) == () and one == (1,):
-                value = value.reshape(1)
-            if np.shape(value) not in (one, all_steps):
-                cure = f"Give {one}" if one == all_steps else f"Give {one} or {all_steps}"
-                fail(name, f"shape {np.shape(value)}", f"{cure}; use jax.vmap for many")
-        checked.append(value)
-    return checked
-
-
-def _real_array(name: str, value: Any) -> Any:
-    if isinstance(value, np.ndarray) and value.dtype.kind in "iuf":  # the usual case, and fast
-        return value
-    value = as_array(value)
-    if not isinstance(value, jax.Array):
-        return host_array(name, value)
-    if jnp.issubdtype(value.dtype, jnp.complexfloating):
-        fail(name, f"entries of type {value.dtype} where real numbers are needed", "Use .real")
-    return value
 
 
 def harmless(mpc: MPC) -> tuple[MPC, Any]:
@@ -259,55 +227,84 @@ def _factor(condensed: Condensed, solver: ADMM) -> Factor:
 @partial(jax.jit, static_argnames="whole")
 @own_modes
 def _control(
-    controller: Controller,
-    x: Array,
-    reference: Array | None,
-    input_reference: Array | None,
-    previous_input: Array | None,
-    last: tuple[Array, WarmStart | None] | None,
-    *,
-    whole: bool,
+    controller: Controller, aim: Aim, last: tuple[Array, WarmStart | None] | None, *, whole: bool
 ) -> Control[Plan]:
     start = memory = None
     if last is not None:
         u, memory = last
         start = None if memory is None else controller.shifted(memory)
-        if previous_input is None:  # read where the problem limits or weighs input rates
-            previous_input = limited(controller.mpc.inputs, jnp.where(jnp.isfinite(u), u, 0.0))
-    plan = _plan(controller, x, reference, input_reference, previous_input, start, whole=whole)
-    return applied(controller.mpc, controller.condensed.layout, plan, memory, previous_input)
+        if aim.previous_input is None:  # read where the problem limits or weighs input rates
+            u = limited(controller.mpc.inputs, jnp.where(jnp.isfinite(u), u, 0.0))
+            aim = aim._replace(previous_input=u)
+    plan = _plan(controller, aim, start, whole=whole)
+    return applied(controller.mpc, controller.condensed.layout, plan, memory, aim.previous_input)
 
 
 @partial(jax.jit, static_argnames="whole")
 @own_modes
-def _plan(
-    controller: Controller, x0: Array, reference: Any, input_reference: Any, previous_input: Any,
-    start: WarmStart | None, *, whole: bool,
-) -> Plan:  # fmt: skip
+def _plan(controller: Controller, aim: Aim, start: WarmStart | None, *, whole: bool) -> Plan:
     c, mpc = controller.condensed, controller.mpc
-    given = (x0, reference, input_reference, previous_input if mpc.input_in_state else None)
-    given = jax.tree.map(lambda v: jnp.asarray(v, c.P.dtype), given)
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(given)]))
-    # Harmless numbers until all is computed: the derivative of a product with NaN is NaN.
-    x0, reference, input_reference, previous = jax.tree.map(
-        lambda v: jnp.where(finite, v, 0.0), given
-    )
     N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
-    if reference is not None:
-        reference = jnp.broadcast_to(reference, (N + 1, n))
-    if input_reference is not None:
-        input_reference = jnp.broadcast_to(input_reference, (N, m))
-    theta = x0
+    aim = aim if mpc.input_in_state else aim._replace(previous_input=None)
+    aim = jax.tree.map(lambda v: jnp.asarray(v, c.P.dtype), aim)
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(aim)]))
+    # Harmless numbers until all is computed: the derivative of a product with NaN is NaN.
+    aim = jax.tree.map(lambda v: jnp.where(finite, v, 0.0), aim)
+    if aim.states is not None:
+        aim = aim._replace(states=jnp.broadcast_to(aim.states, (N + 1, n)))
+    if aim.inputs is not None:
+        aim = aim._replace(inputs=jnp.broadcast_to(aim.inputs, (N, m)))
+    theta = aim.x0
     if mpc.input_in_state:
-        previous = jnp.zeros(m, x0.dtype) if previous is None else previous
-        theta = jnp.concatenate([x0, previous])
-    qp = c.qp(theta, reference, input_reference)
+        previous = aim.previous_input
+        aim = aim._replace(
+            previous_input=jnp.zeros(m, theta.dtype) if previous is None else previous
+        )
+        theta = jnp.concatenate([theta, aim.previous_input])
+    qp = c.qp(theta, aim.states, aim.inputs)
     pair = None if start is None else (c.variables(start.states, start.inputs), start.multipliers)
     found, fault = solve_factored(qp, controller.factor, controller.solver, pair, whole=whole)
     fault = jnp.where(finite, fault, Status.NON_FINITE)
+    return planned(controller, theta, aim, found, fault)
+
+
+def planned(
+    controller: Controller, theta: Array, aim: Aim, found: QPSolution, fault: Array
+) -> Plan:
+    """Return the plan of a solution of the condensed QP at θ (p,), with its status as the problem
+    was stated; fault: the status that faulty data give, NOT_RUN for none."""
+    c, mpc = controller.condensed, controller.mpc
     states, inputs = c.trajectory(theta, found.z)
-    found = judged(
-        mpc, c, controller.factor, controller.solver, found, states, inputs, reference,
-        input_reference, previous,
-    )  # fmt: skip
-    return answer(mpc, c.layout, found, fault, states, inputs, reference, input_reference, previous)
+    found = with_stated_status(
+        mpc, c, controller.factor, controller.solver, found, states, inputs, aim
+    )
+    return answer(mpc, c.layout, found, fault, states, inputs, aim)
+
+
+def solve(
+    mpc: MPC,
+    x0: Reals,
+    reference: Reals | None = None,
+    solver: ADMM = DEFAULT,
+    warm_start: Plan | WarmStart | None = None,
+    *,
+    input_reference: Reals | None = None,
+    previous_input: Reals | None = None,
+) -> Plan:
+    """Solve one MPC problem from the state x0 (n,).
+
+    reference: state to track, (n,) or (N+1, n), in place of the origin: the cost becomes
+    Σ (x_k − r_k)'Q(x_k − r_k) + …; constraints, the terminal set too, stay where they are.
+    input_reference: input to track, (m,) or (N, m), such as that of `equilibrium`; None for zero.
+    previous_input: u_{−1} (m,) where the problem limits or weighs input rates; None for zero.
+    warm_start: an earlier Plan or a WarmStart.
+
+    `jax.vmap(solve, in_axes=(None, 0))(mpc, x0s)` solves for many states and factors
+    once. Raises ValueError for an ill-posed problem or wrong shapes, before any compile; what
+    depends on values inside a batch is answered by `plan.status`.
+    """
+    require_kind("mpc", mpc, MPC)
+    mpc.require_sizes()
+    checked_aim(mpc, x0, reference, input_reference, previous_input)
+    require_warm_start(warm_start)
+    return Controller(mpc, solver).plan(x0, reference, warm_start, input_reference, previous_input)

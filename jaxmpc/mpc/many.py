@@ -1,8 +1,11 @@
-"""Plans from many states: in chunks of one shape, on all cores, with transfer between states."""
+"""solve_many: plans from many states, in chunks of one shape, on all cores, with transfer between
+states."""
 
 import functools
 import threading
+from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -10,22 +13,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 
+from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import (
     Compiled,
     Devices,
+    chosen_devices,
     count,
     default_chunk,
     divisible,
+    first_rows,
     over_devices,
     padded,
     placement,
     side_by_side,
     workers,
 )
+from jaxmpc.checks import fail, require_kind, require_memory, require_step_type, whole
 from jaxmpc.mpc import reuse
+from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Plan
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.qp.admm import ADMM, DEFAULT
 from jaxmpc.qp.dual_search import MORE_STEPS, MOST_STEPS
 from jaxmpc.qp.status import Status
 
@@ -154,12 +165,12 @@ def _put(answer: Plan, where: Array, plans: Plan) -> Plan:
 def _plans(devices: Devices) -> Compiled:
     """Return the program (controller, x (B, p)) → plans."""
 
-    def run(controller: Controller, x: Array) -> Plan:
+    def plan(controller: Controller, x: Array) -> Plan:
         n = controller.mpc.system.n
-        previous = lambda x: x[n:] if controller.mpc.input_in_state else None
-        return jax.vmap(lambda x: controller.plan(x[:n], previous_input=previous(x)))(x)
+        previous = x[n:] if controller.mpc.input_in_state else None
+        return controller.plan(x[:n], previous_input=previous)
 
-    return over_devices(run, devices, (False, True))
+    return over_devices(jax.vmap(plan, (None, 0)), devices, (False, True))
 
 
 @functools.cache
@@ -173,3 +184,60 @@ def _follow(devices: Devices, steps: int) -> Compiled:
 
 
 _laws = jax.jit(reuse.laws_of)
+
+
+def solve_many(
+    mpc: MPC | Controller,
+    x0s: Reals,
+    solver: ADMM = DEFAULT,
+    *,
+    dtype: DTypeLike = "float32",
+    chunk: int | None = None,
+    transfer: bool = True,
+    to_host: bool = True,
+    devices: int | Sequence[jax.Device] | None = None,
+) -> Plan:
+    """Solve the MPC problem from each state x0s (B, n); the Plan holds host arrays, B in front.
+
+    Where input rates are limited or weighted x0s may be (B, n + m), with the previous inputs in the
+    last columns; (B, n) takes them as zero. The plans track the origin.
+
+    mpc: the problem, or a Controller of it in float64, already condensed and factored, whose own
+    solver counts. dtype: type of the ADMM iterates; Newton steps, residuals, status and the answer
+    are float64 whatever it is, and whether or not 64-bit mode is on. chunk: states that a compiled
+    program takes at once; None: by device. transfer: on a CPU, of very many states with few
+    coordinates solve some, and let the others follow these (`reuse.py`). The status of each plan
+    comes from its own residuals all the same: this changes the time, and which of several plans
+    within the tolerances is found.
+    to_host: False leaves the plans on the device. devices: a number of them, or a sequence of JAX
+    devices, which share the states of a chunk; None: the default device. A state with NaN gets
+    status NON_FINITE. Raises ValueError for wrong shapes and ill-posed problems.
+    """
+    if isinstance(mpc, Controller):
+        problem = mpc.mpc
+        if mpc.dtype != np.float64:
+            fail("mpc", f"a controller in {mpc.dtype}", "Make it with jax.enable_x64(True)")
+    else:
+        require_kind("mpc", mpc, MPC)
+        mpc.validate()
+        problem = mpc
+    require_kind("solver", solver, ADMM)
+    require_step_type(dtype)
+    chosen = chosen_devices(devices)
+    if chunk is not None:
+        whole("chunk", chunk, 1)
+    n, p = problem.system.n, problem.dimension
+    if not (isinstance(x0s, Array) and x0s.dtype == np.float64):
+        x0s = host_array("x0s", x0s)
+    if x0s.ndim != 2 or x0s.shape[1] not in (n, p):
+        fail("x0s", f"shape {x0s.shape}", f"Give states (B, {n})")
+    each = 8 * (problem.horizon + 1) * (n + problem.system.m)
+    require_memory("x0s", len(x0s) * each, "Solve some of them at a time")
+    with jax.enable_x64(True):
+        if not isinstance(mpc, Controller):
+            mpc = Controller(in_float64(mpc), replace(solver, dtype=np.dtype(dtype).name))
+        if x0s.shape[1] < p:
+            x0s = np.pad(np.asarray(x0s), ((0, 0), (0, p - n)))
+        some = x0s if len(x0s) else np.zeros((1, p))  # and none of the plans from these
+        plans = Batch(mpc, some, chunk, to_host, chosen).solve(transfer)
+    return plans if len(x0s) else first_rows(plans, 0)

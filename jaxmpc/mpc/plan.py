@@ -10,8 +10,9 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
+from jaxmpc.mpc.arguments import Aim
 from jaxmpc.mpc.problem import MPC, weights_of
-from jaxmpc.mpc.rows import Layout, blocks, split
+from jaxmpc.mpc.rows import Layout, blocks, row_count, split
 from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.problem import QPSolution
@@ -77,15 +78,13 @@ class WarmStart(NamedTuple):
     multipliers: Array
 
     @classmethod
-    def of(cls, start: Any, layout: Layout, horizon: int, n: int, m: int) -> "WarmStart":
+    def of(cls, start: "Plan | WarmStart", layout: Layout, mpc: MPC) -> "WarmStart":
         """Return a Plan or WarmStart as the latter; ValueError where it is of another problem."""
+        require_warm_start(start)
         if isinstance(start, Plan):
             start = cls(start.states, start.inputs, flat_multipliers(layout, start.multipliers))
-        if not isinstance(start, WarmStart):
-            kind = type(start).__name__
-            fail("warm_start", f"is a {kind}", "Give a Plan or a jm.mpc.WarmStart")
-        rows = sum(len(steps) * size for _, steps, size in layout)
-        shapes = ((horizon + 1, n), (horizon, m), (rows,))
+        N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
+        shapes = ((N + 1, n), (N, m), (row_count(layout),))
         for name, value, shape in zip(cls._fields, start, shapes, strict=True):
             if np.shape(value) != shape:
                 fail(f"warm_start.{name}", f"shape {np.shape(value)}", f"Needed: {shape}")
@@ -103,6 +102,13 @@ class WarmStart(NamedTuple):
             jnp.concatenate([self.inputs[1:], tail[None]]),
             _shifted_multipliers(layout, len(self.inputs), self.multipliers, terminal_is_ball),
         )
+
+
+def require_warm_start(start: Any) -> None:
+    """Raise ValueError unless a warm start is a Plan, a WarmStart or None."""
+    if start is not None and not isinstance(start, Plan | WarmStart):
+        what = f"is a {type(start).__name__}"
+        fail("warm_start", what, "Give a Plan or a jm.mpc.WarmStart")
 
 
 Planned = TypeVar("Planned")
@@ -135,20 +141,30 @@ def anchored(start: WarmStart, x0: Array) -> WarmStart:
 
 
 def answer(
-    mpc: MPC, layout: Layout, found: QPSolution, fault: Array, states: Array, inputs: Array,
-    reference: Any, input_reference: Any, previous_input: Any = None,
-) -> Plan:  # fmt: skip
+    mpc: MPC,
+    layout: Layout,
+    found: QPSolution,
+    fault: Array,
+    states: Array,
+    inputs: Array,
+    aim: Aim,
+) -> Plan:
     """Return the plan of a QP's solution: NaN and the status `fault` where the data had one."""
-    J = cost(mpc, states, inputs, reference, input_reference, previous_input)
+    J = cost(mpc, states, inputs, aim)
     solution = with_fault(replace(found, cost=J), fault)
     nan = lambda v: jnp.where(fault == Status.NOT_RUN, v, jnp.nan)
     return Plan(
-        states=nan(states), inputs=nan(inputs), cost=solution.cost,
+        states=nan(states),
+        inputs=nan(inputs),
+        cost=solution.cost,
         slack=nan(slack(mpc, states, inputs)),
-        multipliers=sorted_multipliers(mpc, layout, solution.y), status=solution.status,
-        primal_residual=solution.primal_residual, dual_residual=solution.dual_residual,
-        gap=solution.gap, iterations=solution.iterations,
-    )  # fmt: skip
+        multipliers=sorted_multipliers(mpc, layout, solution.y),
+        status=solution.status,
+        primal_residual=solution.primal_residual,
+        dual_residual=solution.dual_residual,
+        gap=solution.gap,
+        iterations=solution.iterations,
+    )
 
 
 def limited(inputs: Any, u: Array) -> Array:
@@ -191,14 +207,11 @@ def applied(
     return Control(limited(mpc.inputs, u), plan, memory)
 
 
-def cost(
-    mpc: MPC, states: Array, inputs: Array, reference: Any = None, input_reference: Any = None,
-    previous_input: Any = None,
-) -> Array:  # fmt: skip
+def cost(mpc: MPC, states: Array, inputs: Array, aim: Aim) -> Array:
     """Return J (without ½) of a trajectory, states (N+1, n) and inputs (N, m), with what input
-    rates and soft rows add. previous_input (m,): None for zero."""
-    error = states if reference is None else states - reference
-    effort = inputs if input_reference is None else inputs - input_reference
+    rates and soft rows add."""
+    error = states if aim.states is None else states - aim.states
+    effort = inputs if aim.inputs is None else inputs - aim.inputs
     square = lambda v, W, s=1.0: jnp.sum(s * v * matmul(v, W))
     weights = weights_of(mpc, states.dtype)
     stage = 1.0 if mpc.stage_weights is None else weights.stage[:, None]
@@ -206,7 +219,8 @@ def cost(
     if mpc.terminal_cost is not None:
         J = J + square(error[-1:], weights.P)
     if mpc.input_rate_weight is not None:
-        first = jnp.zeros_like(inputs[0]) if previous_input is None else previous_input
+        last = aim.previous_input
+        first = jnp.zeros_like(inputs[0]) if last is None else last
         J = J + square(jnp.diff(inputs, axis=0, prepend=first[None]), weights.W)
     for block, e in _violations(mpc, states, inputs):
         J = J + jnp.sum(e * (block.linear + 0.5 * block.quadratic * e))

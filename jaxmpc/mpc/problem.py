@@ -231,12 +231,8 @@ class MPC:
 
     def validate(self) -> None:
         """Raise ValueError that names the field, its value and the cure, before any compile."""
-        require_kind("system", self.system, LinearSystem)
-        self.system.validate()
+        self.require_sizes()
         n, m = self.system.n, self.system.m
-        whole = isinstance(self.horizon, int | np.integer) and not isinstance(self.horizon, bool)
-        if not whole or self.horizon < 1:
-            fail("horizon", f"{self.horizon!r}", "Give a whole number of steps, at least 1")
         require_shape("Q", self.Q, (n, n), "Q weighs the states: one row for each")
         require_shape("R", self.R, (m, m), "R weighs the inputs: one row for each")
         require_symmetric_psd("Q", self.Q)
@@ -283,6 +279,14 @@ class MPC:
             self._validate_rows(f"outputs[{i}]", outputs)
         self._validate_rates()
         self.require_unique_inputs(first=1)
+
+    def require_sizes(self) -> None:
+        """Raise ValueError where system or horizon are wrong, which give all else its shape."""
+        require_kind("system", self.system, LinearSystem)
+        self.system.validate()
+        whole = isinstance(self.horizon, int | np.integer) and not isinstance(self.horizon, bool)
+        if not whole or self.horizon < 1:
+            fail("horizon", f"{self.horizon!r}", "Give a whole number of steps, at least 1")
 
     def _validate_stages(self) -> None:
         N = self.horizon

@@ -1,4 +1,4 @@
-"""What one state teaches its neighbours: affine laws of multipliers, tried on many states.
+"""Reuse of active sets: affine laws of multipliers of some states, tried on their neighbours.
 
 In ADMM's coordinates (H = I; `qp/admm.py`) a solution with active rows W has multipliers
 S_WW y_W = v_W − b_W, where v = −A q are the rows of the unconstrained minimiser and b the active
@@ -21,9 +21,9 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.batches import padded
-from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.plan import Multipliers, Plan, answer, flat_multipliers
-from jaxmpc.mpc.stated_residuals import judged
+from jaxmpc.mpc.arguments import Aim
+from jaxmpc.mpc.controller import Controller, planned
+from jaxmpc.mpc.plan import Multipliers, Plan, flat_multipliers
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import scaled_multipliers
 from jaxmpc.qp.dual_search import has_dual_steps
@@ -166,8 +166,6 @@ def follow(controller: Controller, laws: Laws, cells: Cells, steps: int, theta: 
     i = cells.nearest(theta)
     y = jnp.where(i < 0, jnp.nan, laws.evaluate(i, theta, len(f.E)))
     found, fault = solve_from(c.qp(theta), f, controller.solver, y, steps)
-    states, inputs = c.trajectory(theta, found.z)
-    mpc = controller.mpc
-    previous = theta[mpc.system.n :] if mpc.input_in_state else None
-    found = judged(mpc, c, f, controller.solver, found, states, inputs, None, None, previous)
-    return answer(mpc, c.layout, found, fault, states, inputs, None, None, previous)
+    x0, previous = jnp.split(theta, [controller.mpc.system.n])
+    aim = Aim(x0, previous_input=previous if controller.mpc.input_in_state else None)
+    return planned(controller, theta, aim, found, fault)

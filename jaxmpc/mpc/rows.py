@@ -217,6 +217,11 @@ def layout(mpc: MPC) -> Layout:
     return tuple((b.kind, b.steps, b.size) for b in blocks(mpc, float))
 
 
+def row_count(layout: Layout) -> int:
+    """Return the number of all rows."""
+    return sum(len(steps) * size for _, steps, size in layout)
+
+
 def split(layout: Layout, y: Array) -> list[Array]:
     """Return y (rows,) as one array (steps, rows a step) for each block."""
     ends = np.cumsum([len(steps) * size for _, steps, size in layout], dtype=int)

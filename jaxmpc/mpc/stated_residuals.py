@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxmpc.mpc.arguments import Aim
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import blocks, split
@@ -36,9 +37,9 @@ from jaxmpc.qp.status import Status
 ROUNDED = 1000
 
 
-def judged(
+def with_stated_status(
     mpc: MPC, c: Condensed, factor: Factor, solver: ADMM, found: QPSolution, states: Array,
-    inputs: Array, reference: Any, input_reference: Any, previous_input: Any,
+    inputs: Array, aim: Aim,
 ) -> QPSolution:  # fmt: skip
     """Return the solution of the condensed QP with the status and the residuals of the plan,
     states (N+1, n) and inputs (N, m).
@@ -46,8 +47,7 @@ def judged(
     In float32 the status is that of the QP, which speaks of the plan before it was rounded; rows
     and dynamics are checked to the precision that is left.
     """
-    given = mpc, c, factor, found.y, states, inputs, reference, input_reference, previous_input
-    terms = stated_terms(*jax.lax.stop_gradient(given))
+    terms = stated_terms(*jax.lax.stop_gradient((mpc, c, factor, found.y, states, inputs, aim)))
     eps, dtype = jnp.asarray(solver.eps, states.dtype), states.dtype
     if dtype == jnp.float64:
         measured = Measured.of(terms, eps, rounding(dtype))
@@ -63,14 +63,13 @@ def judged(
 
 
 def stated_terms(
-    mpc: MPC, c: Condensed, factor: Factor, y: Array, x: Array, u: Array, reference: Any,
-    input_reference: Any, previous_input: Any,
-) -> Terms:  # fmt: skip
+    mpc: MPC, c: Condensed, factor: Factor, y: Array, x: Array, u: Array, aim: Aim
+) -> Terms:
     """Return the residuals at the top of this file, with their sizes and terms: rows and dynamics
     (rows + N·n,), inputs (variables of the QP,), gap (1,)."""
     N, cast = mpc.horizon, lambda v: jnp.asarray(v, x.dtype)
-    e = x if reference is None else x - reference
-    d = u if input_reference is None else u - input_reference
+    e = x if aim.states is None else x - aim.states
+    d = u if aim.inputs is None else u - aim.inputs
     weighted = lambda e, d: (
         jnp.concatenate([c.stage[:, None] * matmul(e[:-1], c.Q), matmul(e[-1:], c.P_N)]),
         c.stage[:, None] * matmul(d, c.R),
@@ -79,9 +78,9 @@ def stated_terms(
     J = jnp.sum(e * gx) + jnp.sum(d * gu)
     # What the tracking errors are differences of.
     cancels = J
-    if reference is not None or input_reference is not None:
+    if aim.states is not None or aim.inputs is not None:
         cancels = J + jnp.sum(x * weighted(x, u)[0]) + jnp.sum(u * weighted(x, u)[1])
-    before = jnp.zeros_like(u[0]) if previous_input is None else previous_input
+    before = jnp.zeros_like(u[0]) if aim.previous_input is None else aim.previous_input
     rates = jnp.diff(u, axis=0, prepend=before[None])
     if mpc.input_rate_weight is not None:
         push = matmul(rates, c.W)

@@ -7,7 +7,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
-from jaxmpc.mpc.targets import equilibrium
+from jaxmpc.mpc.steady_state import equilibrium
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.sets.box import Box
 from jaxmpc.systems.system import LinearSystem
@@ -85,7 +85,7 @@ class LinearPlant:
 
     def equilibrium(self, x: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Return (x, u): the state x (n,), None for home, and the input that holds it
-        (`jaxmpc.mpc.targets`). Raises ValueError where none does, or only beyond the
+        (`jaxmpc.mpc.steady_state`). Raises ValueError where none does, or only beyond the
         limits."""
         target = self.home if x is None else x
         return equilibrium(self.system, target, states=self.state_limits, inputs=self.input_limits)

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxmpc.checks import fail, require_memory
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.mpc.inequalities import Inequalities
+from jaxmpc.mpc.condense import Inequalities
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.lp import Program

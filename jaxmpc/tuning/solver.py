@@ -14,6 +14,7 @@ from jaxmpc.arrays import Reals
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, require_finite, require_kind, whole
 from jaxmpc.files import fingerprint
+from jaxmpc.mpc.arguments import checked_array
 from jaxmpc.mpc.condense import condense, in_float64
 from jaxmpc.mpc.plan import Plan, WarmStart
 from jaxmpc.mpc.problem import MPC
@@ -210,8 +211,7 @@ def _prepared(
         ("input_reference", input_reference, (mpc.horizon, mpc.system.m)),
     ):
         if value is not None:
-            if np.shape(value) not in (shape[1:], shape):
-                fail(name, f"shape {np.shape(value)}", f"Give {shape[1:]} or {shape}")
+            value = checked_array(name, value, [shape[1:], shape])
             value = np.broadcast_to(np.asarray(value, np.float64), shape)
             require_finite(name, value)
         tracked.append(value)
@@ -228,7 +228,7 @@ def _prepared(
         fail("x0s", f"{len(x)} states", f"Give at least {FEWEST}, better some hundred")
     if warm_start is not None:
         if isinstance(warm_start, Plan | WarmStart):
-            of = lambda p: WarmStart.of(p, c.layout, mpc.horizon, n, mpc.system.m)
+            of = lambda p: WarmStart.of(p, c.layout, mpc)
             each = jax.vmap(of)(warm_start)
             warm_start = jax.vmap(c.variables)(each.states, each.inputs), each.multipliers
         warm_start = tuple(np.asarray(part, np.float64) for part in warm_start)

@@ -16,7 +16,7 @@ from jaxmpc.feasible.polytope import is_standard_form
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import boundary
 from jaxmpc.grids import grid
-from jaxmpc.mpc.inequalities import condensed_in_float64
+from jaxmpc.mpc.condense import condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import row_table
 from jaxmpc.mpc.softening import harden

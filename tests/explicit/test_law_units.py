@@ -72,7 +72,7 @@ def require_optimal(mpc, regions, x):
     """The plans are optimal: no hidden row, no other active set, by brute force at some states."""
     from scipy.optimize import minimize
 
-    from jaxmpc.mpc.inequalities import condensed_in_float64
+    from jaxmpc.mpc.condense import condensed_in_float64
 
     c = condensed_in_float64(mpc)
     for state, z in zip(x[:3], regions.plan(x[:3]), strict=True):
@@ -220,7 +220,7 @@ def test_equalities_as_rows(name):
 def test_a_terminal_point_has_the_laws_multipliers():
     """At each vertex of each region P z + F x + f + C'y = 0 with y of the right signs."""
     regions = critical_regions(integrator(terminal_set=ORIGIN, horizon=4))
-    from jaxmpc.mpc.inequalities import condensed_in_float64
+    from jaxmpc.mpc.condense import condensed_in_float64
 
     c = condensed_in_float64(regions.mpc)
     for r in regions.regions:

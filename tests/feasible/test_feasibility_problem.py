@@ -9,7 +9,7 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.feasible import problem
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.mpc.inequalities import Inequalities, condensed_in_float64
+from jaxmpc.mpc.condense import Inequalities, condensed_in_float64
 from jaxmpc.mpc.softening import soften
 
 

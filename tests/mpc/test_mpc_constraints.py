@@ -22,7 +22,7 @@ from jaxmpc.mpc.active_limits import active_constraints
 from jaxmpc.mpc.problem import Outputs, Soft
 from jaxmpc.mpc.rows import row_table
 from jaxmpc.mpc.softening import soften
-from jaxmpc.mpc.targets import equilibrium
+from jaxmpc.mpc.steady_state import equilibrium
 from jaxmpc.sets.ellipsoid import Ellipsoid
 
 ONE, EYE = np.ones(2), np.eye(2)

@@ -14,7 +14,7 @@ from problems import rows_of, symmetric
 import jaxmpc as jm
 from jaxmpc.mpc.plan import WarmStart
 from jaxmpc.mpc.stagewise import interior_point, newton
-from jaxmpc.mpc.stagewise.newton import factor_stages, plan_stages, solve_stagewise
+from jaxmpc.mpc.stagewise.solve import factor_stages, plan_stages, solve_stagewise
 from jaxmpc.qp import admm
 from jaxmpc.qp.residuals import residuals
 

@@ -29,8 +29,8 @@ from jaxmpc.app.plots.style import save
 from jaxmpc.app.plots.tuning import plot_solver
 from jaxmpc.checks import fail
 from jaxmpc.files import as_json, versions, write_json
+from jaxmpc.mpc.controller import solve
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.solve import solve
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.tuning.initial_states import feasible_states, initial_range

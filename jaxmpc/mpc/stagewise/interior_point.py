@@ -23,13 +23,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.mpc.stagewise.stages import conditions, judged, minimise, riccati
+from jaxmpc.mpc.stagewise.stages import conditions, measured_pair, minimise, riccati
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.residuals import Pair
 
 # Steps at most.
-STEPS = 40
+INTERIOR_STEPS = 40
 # Slack of the first step at least, in scaled rows; part of the way to the boundary that is taken;
 # and the part of a step below which the iterates have come to rest.
 LEAST_SLACK, FRACTION, REST = 1e-2, 0.995, 1e-8
@@ -121,7 +121,7 @@ class Limits(NamedTuple):
 
 
 @pytree
-class Interior:
+class InteriorState:
     """Loop state of one instance: inputs u (N, m), the sides' numbers, the best pair of all so far,
     the steps taken, and whether to go on."""
 
@@ -132,7 +132,7 @@ class Interior:
     open: Array
 
     @classmethod
-    def begin(cls, best: Pair) -> "Interior":
+    def begin(cls, best: Pair) -> "InteriorState":
         """Return the state before the first step, which will go from the inputs of `best` to those
         of least cost without rows."""
         blank = jnp.zeros((2, len(best.y)), best.y.dtype)
@@ -140,16 +140,16 @@ class Interior:
         return cls(best.z, at, best, jnp.int32(0), ~(best.near | best.solved))
 
 
-def interior_step(most: int, constants: tuple, state: Interior) -> Interior:
+def interior_step(most: int, constants: tuple, state: InteriorState) -> InteriorState:
     """One step; the search ends after `most`, when the residuals are below a thousandth of eps, one
     step after they are small enough, or when the iterates have come to rest.
 
-    constants: stages, sample, row scale E (rows,), the multipliers `fixed` (rows,) of soft rows
+    constants: stages, row scale E (rows,), the multipliers `fixed` (rows,) of soft rows
     that no input moves, 0 in others, and eps.
     """
-    s, sample, E, fixed, eps = constants
+    s, E, fixed, eps = constants
     limits, at, first = Limits.of(s.bounds.scaled(E)), state.at, state.steps == 0
-    found = conditions(s, sample, state.u, fixed + E * limits.multipliers(at))
+    found = conditions(s, state.u, fixed + E * limits.multipliers(at))
     nu, has = limits.nu(at), limits.present
     v = E * found.rows
     r = limits.sign * (v - limits.b) - at.e + at.t
@@ -184,8 +184,8 @@ def interior_step(most: int, constants: tuple, state: Interior) -> Interior:
     begun, at = limits.start(v + dv), at.moved(clean(step), length)
     at = jax.tree.map(lambda a, b: jnp.where(first, a, b), begun, at)
     y = fixed + E * limits.multipliers(at)
-    pair = judged(eps, s, sample, u, y)
+    pair = measured_pair(eps, s, u, y)
     best, again = state.best.or_better(pair), pair.measured.small & state.best.measured.small
     steps = state.steps + 1
     wanted = ~(best.near | best.solved | again) & sound & (steps < most)
-    return Interior(u, at, best, steps, wanted)
+    return InteriorState(u, at, best, steps, wanted)

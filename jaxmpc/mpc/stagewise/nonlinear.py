@@ -29,8 +29,9 @@ from jaxmpc.checks import (
     require_real,
     require_symmetric_psd,
 )
+from jaxmpc.mpc.arguments import Aim
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.stagewise.stages import Sample, Stages, apply, apply_transposed, at, spread
+from jaxmpc.mpc.stagewise.stages import Stages, apply, apply_transposed, at, spread
 from jaxmpc.pytrees import named_pytree, pytree, static, static_pytree
 from jaxmpc.qp.precision import matmul, symmetric
 
@@ -231,16 +232,6 @@ def _shapes(tree: Any, leaves: tuple) -> tuple[tuple[int, ...], list[tuple[int, 
     return after.shape, [value.shape for value in values]
 
 
-class Aims(NamedTuple):
-    """What one plan tracks: x0 (n,), references (N+1, n) and (N, m), targets of the tasks, each
-    (N+1, p)."""
-
-    x0: Array
-    states: Array
-    inputs: Array
-    targets: tuple[Array, ...]
-
-
 def weighed(weight: Any, v: Array) -> Array:
     """Return W v for v (..., p) with a weight that is a number, a diagonal or a matrix."""
     weight = jnp.asarray(weight, v.dtype)
@@ -253,12 +244,13 @@ def task_cost(task: Task, value: Array, target: Array) -> Array:
     return jnp.zeros((), e.dtype) if task.weight is None else jnp.sum(e * weighed(task.weight, e))
 
 
-def total_cost(s: Stages, problem: NonlinearMPC, aims: Aims, x: Array, u: Array) -> Array:
+def total_cost(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Array:
     """Return the cost of a trajectory without penalties; s: `stages` of the MPC."""
-    e, d = x - aims.states, u - aims.inputs
+    aim = s.aim
+    e, d = x - aim.states, u - aim.inputs
     J = jnp.sum(s.stage * (jnp.sum(e[:-1] * apply(s.Q, e[:-1]), 1) + jnp.sum(d * apply(s.R, d), 1)))
     J = J + jnp.sum(e[-1] * matmul(e[-1], s.P.T))
-    for task, value, target in zip(problem.tasks, problem.values(x, u), aims.targets, strict=True):
+    for task, value, target in zip(problem.tasks, problem.values(x, u), aim.targets, strict=True):
         J = J + task_cost(task, value, at(target, task.at(len(u))))
     return J
 
@@ -288,20 +280,18 @@ def linear_models(model: Any, x: Array, u: Array) -> tuple[Array, Array, Array]:
     return jax.vmap(affine)(x, u)
 
 
-def expanded(
-    s: Stages, problem: NonlinearMPC, aims: Aims, x: Array, u: Array
-) -> tuple[Stages, Sample]:  # fmt: skip
+def expanded(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Stages:
     """Return the problem about x (N+1, n), u (N, m); s: `stages` of the MPC."""
     N, dtype = s.horizon, s.P.dtype
     A, B, c = linear_models(problem.model, x[:-1], u)
     weights = s.stage[:, None, None]
     Q, R, P, cross = weights * s.Q, weights * s.R, s.P, None
-    e, d = x - aims.states, u - aims.inputs
+    e, d = x - s.aim.states, u - s.aim.inputs
     gx = 2 * jnp.concatenate([s.stage[:, None] * apply(s.Q, e[:-1]), matmul(e[-1:], s.P.T)])
     gu = 2 * s.stage[:, None] * apply(s.R, d)
     rows: dict[str, list[Any]] = {name: [] for name in ("H", "D", "layout", "boxes")}
     bounds = [(s.lower, s.upper, s.linear, s.quadratic)]
-    for task, target in zip(problem.tasks, aims.targets, strict=True):
+    for task, target in zip(problem.tasks, s.aim.targets, strict=True):
         steps = task.at(N)
         pair = lambda x, u, task=task: (problem.value(task, x, u),) * 2
         slopes = jax.vmap(jax.jacfwd(pair, argnums=(0, 1), has_aux=True))
@@ -334,13 +324,12 @@ def expanded(
         if linear is None:
             bounds[0] = (s.lower, s.upper, jnp.full_like(s.lower, jnp.inf), jnp.zeros_like(s.lower))
         linear, quadratic = (jnp.concatenate([part[i] for part in bounds]) for i in (2, 3))
-    found = replace(
-        s, A=A, B=B, c=c, Q=Q, R=R, P=P, cross=cross,
+    return replace(
+        s, A=A, B=B, c=c, Q=Q, R=R, P=P, cross=cross, aim=Aim(s.aim.x0, x, u, slopes=(gx, gu)),
         stage=jnp.ones_like(s.stage), H=(*s.H, *rows["H"]), D=(*s.D, *rows["D"]), lower=lower,
         upper=upper, linear=linear, quadratic=quadratic, layout=(*s.layout, *rows["layout"]),
         boxes=(*s.boxes, *rows["boxes"]),
     )  # fmt: skip
-    return found, Sample(aims.x0, x, u, (gx, gu))
 
 
 def task_layout(problem: NonlinearMPC) -> tuple:
@@ -351,9 +340,8 @@ def task_layout(problem: NonlinearMPC) -> tuple:
 
 
 def curved(
-    s: Stages, base: Stages, problem: NonlinearMPC, aims: Aims, x: Array, u: Array,
-    costates: Array, y: Array,
-) -> Stages:  # fmt: skip
+    s: Stages, base: Stages, problem: NonlinearMPC, x: Array, u: Array, costates: Array, y: Array
+) -> Stages:
     """Return the expansion s with the Hessian of the Lagrangian in place of Gauss and Newton's.
 
     base: `stages` of the MPC; costates λ (N+1, n) of x_0 … x_N; y (rows,) of s.
@@ -367,7 +355,7 @@ def curved(
 
     blocks = jnp.pad(jax.vmap(of_model)(join(x[:-1], u), costates[1:]), ((0, 1), (0, 0), (0, 0)))
     first = len(base.lower)
-    for task, target in zip(problem.tasks, aims.targets, strict=True):
+    for task, target in zip(problem.tasks, base.aim.targets, strict=True):
         steps = task.at(N)
         size = target.shape[1]
         pull = jnp.zeros((len(steps), size), dtype)

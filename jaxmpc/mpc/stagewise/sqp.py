@@ -17,32 +17,24 @@ Derivatives follow from the same conditions by the implicit function theorem, wi
 the Lagrangian (`nonlinear.curved`): one Riccati recursion.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike, DTypeLike
 
 from jaxmpc.arrays import Reals
-from jaxmpc.checks import fail, require_kind, require_real, require_shape, whole
+from jaxmpc.checks import fail, require_kind, whole
+from jaxmpc.mpc.arguments import Aim, checked_aim, checked_array
 from jaxmpc.mpc.plan import Plan, WarmStart, answer
-from jaxmpc.mpc.stagewise.interior_point import STEPS as INTERIOR_STEPS
-from jaxmpc.mpc.stagewise.interior_point import Interior, interior_step
-from jaxmpc.mpc.stagewise.newton import (
-    NEWTON_STEPS,
-    Search,
-    StageFactor,
-    checked,
-    row_scale,
-    search_step,
-    solution,
-    stage_conditions,
-    stated,
-)
+from jaxmpc.mpc.rows import row_count, split
+from jaxmpc.mpc.stagewise.interior_point import INTERIOR_STEPS
+from jaxmpc.mpc.stagewise.newton import Search, stage_conditions
 from jaxmpc.mpc.stagewise.nonlinear import (
-    Aims,
     NonlinearMPC,
     all_rows,
     curved,
@@ -51,13 +43,20 @@ from jaxmpc.mpc.stagewise.nonlinear import (
     total_cost,
 )
 from jaxmpc.mpc.stagewise.riccati import recurrence
+from jaxmpc.mpc.stagewise.solve import (
+    NEWTON_STEPS,
+    StageFactor,
+    checked,
+    full_aim,
+    row_scale,
+    stage_solution,
+)
 from jaxmpc.mpc.stagewise.stages import (
-    Sample,
     Stages,
     apply,
     cleaned,
     dynamics_terms,
-    judged,
+    measured_pair,
     predict,
     riccati,
     spread,
@@ -86,15 +85,21 @@ DECREASE, SHORTEST = 1e-4, 1e-4
 HELD = 1e-6
 # Least tolerance in float32, in which the model itself is evaluated.
 SINGLE = 1e-3
-# The fields of `Stages` that a Hessian fills.
-QUADRATIC = ("Q", "R", "P", "cross")
 
 
 def solve_nonlinear(
-    problem: NonlinearMPC, x0: Reals, reference: Reals | None = None, solver: ADMM = DEFAULT,
-    warm_start: Any = None, *, input_reference: Reals | None = None, targets: Any = None,
-    iterations: int = ITERATIONS, hessian: str = "exact", scale: Any = None,
-) -> Plan:  # fmt: skip
+    problem: NonlinearMPC,
+    x0: Reals,
+    reference: Reals | None = None,
+    solver: ADMM = DEFAULT,
+    warm_start: Plan | WarmStart | None = None,
+    *,
+    input_reference: Reals | None = None,
+    targets: Sequence[Reals | None] | None = None,
+    iterations: int = ITERATIONS,
+    hessian: Literal["exact", "gauss-newton"] = "exact",
+    scale: ArrayLike | None = None,
+) -> Plan:
     """Solve a nonlinear MPC from the state x0 (n,) by sequential quadratic programming.
 
     reference (n,) or (N+1, n), input_reference (m,) or (N, m), None for zero. targets: one array
@@ -118,8 +123,7 @@ def solve_nonlinear(
     """
     require_kind("problem", problem, NonlinearMPC)
     problem.validate()
-    mpc, N = problem.mpc, problem.mpc.horizon
-    n, m = mpc.system.n, mpc.system.m
+    mpc = problem.mpc
     whole("iterations", iterations, 1)
     if solver.iterations is None:
         solver = replace(solver, iterations=0)
@@ -128,137 +132,127 @@ def solve_nonlinear(
         fail("hessian", f"{hessian!r}", 'Give "exact" or "gauss-newton"')
     if solver.differentiate != "implicit" and iterations > 1:
         fail("solver.differentiate", f"{solver.differentiate!r}", 'With iterations > 1: "implicit"')
-    # The model's own system is not read; the one of the set-point may differ from step to step.
     s = jax.eval_shape(stages, mpc)
-    dtype = s.P.dtype
-    require_shape("x0", x0, (n,), f"Give one state ({n},); use jax.vmap for many")
-    x0 = jnp.asarray(x0, dtype)
-    sizes = problem.sizes()
-    aims = [("reference", reference, n, N + 1), ("input_reference", input_reference, m, N)]
-    given = [task.target for task in problem.tasks] if targets is None else list(targets)
-    if len(given) != len(sizes):
-        fail("targets", f"{len(given)} for {len(sizes)} tasks", "Give one for each task")
-    aims += [(f"targets[{i}]", v, sizes[i], N + 1) for i, v in enumerate(given)]
-    found = []
-    for name, value, size, length in aims:
-        require_real(name, 0.0 if value is None else value)
-        aim = jnp.zeros(size, dtype) if value is None else jnp.asarray(value, dtype)
-        if aim.shape not in ((), (size,), (length, size)):
-            fail(name, f"shape {aim.shape}", f"Give ({size},) or ({length}, {size})")
-        found.append(jnp.broadcast_to(aim, (length, size)))
+    aim = full_aim(mpc, checked_aim(mpc, x0, reference, input_reference), s.P.dtype)
+    aim = aim._replace(targets=_full_targets(problem, targets, s.P.dtype))
     rows = (*s.layout, *task_layout(problem))
     if warm_start is None:
-        count = sum(len(steps) * size for _, steps, size in rows)
-        x, u = jnp.broadcast_to(x0, (N + 1, n)), jnp.zeros((N, m), dtype)
-        warm_start = WarmStart(x, u + found[1][:1], jnp.zeros(count, dtype))
-    warm_start = WarmStart.of(warm_start, rows, N, n, m)
-    sample = Aims(x0, found[0], found[1], tuple(found[2:]))
-    return _solve(
-        *arrays((problem, solver, sample, warm_start, scale)),
-        iterations=int(iterations),
-        hessian=hessian,
-    )
+        x = jnp.broadcast_to(aim.x0, aim.states.shape)
+        u = jnp.broadcast_to(aim.inputs[:1], aim.inputs.shape)
+        start = WarmStart(x, u, jnp.zeros(row_count(rows), s.P.dtype))
+    else:
+        start = WarmStart.of(warm_start, rows, mpc)
+    given = arrays((problem, solver, aim, start, scale))
+    return _solve(*given, iterations=int(iterations), hessian=hessian)
+
+
+def _full_targets(
+    problem: NonlinearMPC, targets: Sequence[Reals | None] | None, dtype: DTypeLike
+) -> tuple[Array, ...]:
+    """Return the targets of all tasks at all stages, (N+1, p) each: those given, or the tasks'
+    own. Raises ValueError for wrong shapes."""
+    given = [task.target for task in problem.tasks] if targets is None else list(targets)
+    if len(given) != len(problem.tasks):
+        fail("targets", f"{len(given)} for {len(problem.tasks)} tasks", "Give one for each task")
+    full = []
+    for i, (value, size) in enumerate(zip(given, problem.sizes(), strict=True)):
+        shape = (problem.mpc.horizon + 1, size)
+        value = checked_array(f"targets[{i}]", 0 if value is None else value, [(), (size,), shape])
+        full.append(jnp.broadcast_to(jnp.asarray(value, dtype), shape))
+    return tuple(full)
 
 
 @partial(jax.jit, static_argnames=("iterations", "hessian"))
 @own_modes
 def _solve(
-    problem: NonlinearMPC, solver: ADMM, aims: Aims, warm_start: WarmStart, scale: Any,
-    iterations: int, hessian: str,
-) -> Plan:  # fmt: skip
+    problem: NonlinearMPC,
+    solver: ADMM,
+    aim: Aim,
+    warm_start: WarmStart,
+    scale: Array | None,
+    iterations: int,
+    hessian: str,
+) -> Plan:
     base, fault = cleaned(stages(problem.mpc))
-    numbers = (aims, [(t.weight, t.rho) for t in problem.tasks])
+    numbers = (aim, [(task.weight, task.rho) for task in problem.tasks])
     finite = [jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(numbers)]
     fault = jnp.where(jnp.all(jnp.stack(finite)), fault, jnp.int32(Status.NON_FINITE))
     usable = fault == Status.NOT_RUN
-    aims = jax.tree.map(lambda v: jnp.where(usable, v, 0), aims)
+    base = replace(base, aim=jax.tree.map(lambda v: jnp.where(usable, v, 0), aim))
     eps = tolerance(solver, base.P.dtype)
     if eps.dtype != jnp.float64:
         eps = jnp.maximum(eps, SINGLE)
     # What is not finite in a warm start counts as 0.
     x, u, y = (jnp.nan_to_num(v.astype(base.P.dtype), posinf=0, neginf=0) for v in warm_start)
-    x, u, y = within_reason(base, problem, aims, x.at[0].set(aims.x0), u, y)
-    count: Any = 1
+    x, u, y = within_reason(base, problem, x.at[0].set(base.aim.x0), u, y)
+    count = jnp.int32(1)
     if iterations > 1:
-        constants = jax.lax.stop_gradient((base, problem, aims, scale, eps))
-        start = Iterate.begin(*jax.lax.stop_gradient((x, u, y)))
-        is_open = lambda state: state.open
+        constants = jax.lax.stop_gradient((base, problem, scale, eps))
+        first = Iterate.begin(*jax.lax.stop_gradient((x, u, y)))
         step = partial(sqp_step, iterations, hessian)
-        last = repeat_while(is_open, step, constants, start, steps="stages")
+        last = repeat_while(lambda state: state.open, step, constants, first, steps="stages")
         x, u, y, count = last.x, last.u, last.y, last.steps
-    s, sample = expanded(base, problem, aims, x, u)
+    s = expanded(base, problem, x, u)
     E, rho = scales(jax.lax.stop_gradient(s), scale)
     if iterations == 1:
         gains = None
         if solver.admm_steps():
             gains = jax.tree.map(lambda v: v[None], riccati(s, rho * E**2))
         factor = StageFactor(s, E, rho[None], gains, fault)
-        given = factor, sample, solver, WarmStart(x, u, y)
-        if solver.differentiate == "unrolled":
-            u, y, measured = solution(*given)
-        else:
-            u, y, measured = solution(*jax.lax.stop_gradient(given))
-            u, y = implicit(stage_conditions, (s, sample), (E, rho), u, y)
-        found = stated(solver, s, sample, u, y, measured)
+        found = stage_solution(factor, s, solver, WarmStart(x, u, y))
     else:
-        at_solution = jax.lax.stop_gradient((E, rho, base, problem, aims))
-        u, y = implicit(nonlinear_conditions, (s, sample), at_solution, u, y)
-        found = assess(nonlinear_residuals, (s, sample), u, y, Proof.none(u, y), eps)
+        at_solution = jax.lax.stop_gradient((E, rho, base, problem))
+        u, y = implicit(nonlinear_conditions, s, at_solution, u, y)
+        found = assess(nonlinear_residuals, (s,), u, y, Proof.none(u, y), eps)
     found = replace(found, iterations=jnp.asarray(count, jnp.int32))
-    x = predict(s, sample.x0, u)
-    plan = answer(problem.mpc, s.layout, found, fault, x, u, aims.states, aims.inputs)
-    return with_tasks(plan, s, sample, base, problem, aims)
+    x, u = predict(s, found.z), found.z
+    plan = answer(problem.mpc, s.layout, found, fault, x, u, base.aim)
+    return with_tasks(plan, s, base, problem)
 
 
 def within_reason(
-    base: Stages, problem: NonlinearMPC, aims: Aims, x: Array, u: Array, y: Array
+    base: Stages, problem: NonlinearMPC, x: Array, u: Array, y: Array
 ) -> tuple[Array, Array, Array]:
     """Return the warm start x, u, y, or rest at x0 where it costs more than anybody plans: 100
     times what rest does, under the first input reference or under inputs at their limits.
 
     About the plan of a reading that is far off, the expansion would be rounding."""
-    rest_x, rest_u = jnp.broadcast_to(aims.x0, x.shape), jnp.broadcast_to(aims.inputs[:1], u.shape)
+    rest_x = jnp.broadcast_to(base.aim.x0, x.shape)
+    rest_u = jnp.broadcast_to(base.aim.inputs[:1], u.shape)
     most = rest_u
     if isinstance(problem.mpc.inputs, Box):
         ends = arrays((problem.mpc.inputs.lower, problem.mpc.inputs.upper))
         sizes = jnp.stack([jnp.abs(jnp.asarray(v, u.dtype)) for v in ends])
         most = jnp.max(jnp.where(jnp.isfinite(sizes), sizes, 0.0), axis=0) + jnp.abs(rest_u)
-    J = lambda x, u: jax.lax.stop_gradient(total_cost(base, problem, aims, x, u))
+    J = lambda x, u: jax.lax.stop_gradient(total_cost(base, problem, x, u))
     sane = J(x, u) <= 100 * (J(rest_x, rest_u) + J(rest_x, most))
     return jnp.where(sane, x, rest_x), jnp.where(sane, u, rest_u), jnp.where(sane, y, 0.0)
 
 
-def rows_of(
-    s: Stages, base: Stages, problem: NonlinearMPC, sample: Sample, x: Array, u: Array
-) -> Array:  # fmt: skip
+def rows_of(s: Stages, base: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Array:
     """Return the limited quantities (rows,) at x, u, moved as the bounds of the expansion are: for
     each row by the constant by which its expansion at 0 differs from the function's."""
-    about = sample.states, sample.inputs
+    about = s.aim.states, s.aim.inputs
     return all_rows(base, problem, x, u) + (s.rows(*about) - all_rows(base, problem, *about))
 
 
-def with_tasks(
-    plan: Plan, s: Stages, sample: Sample, base: Stages, problem: NonlinearMPC, aims: Aims
-) -> Plan:  # fmt: skip
+def with_tasks(plan: Plan, s: Stages, base: Stages, problem: NonlinearMPC) -> Plan:
     """Return the plan with what tasks add to cost and slack."""
     if not problem.tasks:
         return plan
     x, u = plan.states, plan.inputs
-    rows = rows_of(s, base, problem, sample, x, u)
-    J = total_cost(base, problem, aims, x, u) + jnp.sum(s.bounds.cost(rows))
-    slack, first = [plan.slack], len(base.lower)
-    out = jnp.abs(rows - jnp.clip(rows, s.lower, s.upper))
-    for (_, steps, size), limited in zip(
-        task_layout(problem), [t for t in problem.tasks if t.limited], strict=True
-    ):
-        last = first + len(steps) * size
-        if limited.rho is not None:
-            slack.append(spread(out[first:last].reshape(len(steps), size), steps, len(x)))
-        first = last
+    rows = rows_of(s, base, problem, x, u)
+    J = total_cost(base, problem, x, u) + jnp.sum(s.bounds.cost(rows))
+    slack = [plan.slack]
+    out = jnp.abs(rows - jnp.clip(rows, s.lower, s.upper))[len(base.lower) :]
+    layout, limited = task_layout(problem), [task for task in problem.tasks if task.limited]
+    for (_, steps, _), task, part in zip(layout, limited, split(layout, out), strict=True):
+        if task.rho is not None:
+            slack.append(spread(part, steps, len(x)))
     return replace(plan, cost=J, slack=jnp.concatenate(slack, axis=1))
 
 
-def scales(s: Stages, scale: Any) -> tuple[Array, Array]:
+def scales(s: Stages, scale: Array | None) -> tuple[Array, Array]:
     """Return the row scale E (rows,) and the penalty ρ (rows,) of the expansion."""
     E = row_scale(s) if scale is None else jnp.asarray(scale, s.P.dtype)
     rho = default_rho(E, s.horizon * s.B.shape[-1])
@@ -272,27 +266,32 @@ class Merit:
     defects: Array
     rows: Array
 
+    def raised(self, defects: Array, rows: Array) -> "Merit":
+        """Return the weights after Powell's rule, for multipliers of these sizes."""
+        powell = lambda w, m: jnp.maximum(jnp.abs(m), (w + jnp.abs(m)) / 2)
+        return Merit(powell(self.defects, defects), powell(self.rows, rows))
+
     def value(
-        self, s: Stages, sample: Sample, base: Stages, problem: NonlinearMPC, aims: Aims,
-        x: Array, u: Array,
-    ) -> tuple[Array, Array]:  # fmt: skip
-        """Return φ at x, u, and the sum of its terms' sizes; s, sample: an expansion."""
-        rows = rows_of(s, base, problem, sample, x, u)
+        self, s: Stages, base: Stages, problem: NonlinearMPC, x: Array, u: Array
+    ) -> tuple[Array, Array]:
+        """Return φ at x, u, and the sum of its terms' sizes; s: an expansion."""
+        rows = rows_of(s, base, problem, x, u)
         gap = jax.vmap(problem.model.step)(x[:-1], u) - x[1:]
-        parts = jnp.stack([
-            total_cost(base, problem, aims, x, u), jnp.sum(s.bounds.cost(rows)),
+        parts = [
+            total_cost(base, problem, x, u),
+            jnp.sum(s.bounds.cost(rows)),
             jnp.sum(self.defects * jnp.abs(gap)),
             jnp.sum(self.rows * jnp.abs(s.bounds.violation(rows))),
-        ])  # fmt: skip
-        return jnp.sum(parts), jnp.sum(jnp.abs(parts))
+        ]
+        return jnp.sum(jnp.stack(parts)), jnp.sum(jnp.abs(jnp.stack(parts)))
 
-    def decrease(self, s: Stages, sample: Sample, dx: Array, du: Array) -> Array:
+    def decrease(self, s: Stages, dx: Array, du: Array) -> Array:
         """Return by how much φ falls along the whole step dx, du in the expansion."""
-        x, u, bounds = sample.states, sample.inputs, s.bounds
+        x, u, bounds = s.aim.states, s.aim.inputs, s.bounds
         before, after = s.rows(x, u), s.rows(x + dx, u + du)
         outside = lambda v: jnp.sum(bounds.cost(v) + self.rows * jnp.abs(bounds.violation(v)))
         # The cost is quadratic: its change is the mean of the gradients at both ends.
-        ends = zip(sample.gradient(s, x, u), sample.gradient(s, x + dx, u + du), strict=True)
+        ends = zip(s.gradient(x, u), s.gradient(x + dx, u + du), strict=True)
         gx, gu = ((a + b) / 2 for a, b in ends)
         gaps = jnp.sum(self.defects * jnp.abs(defects(s, x, u)[0]))
         return outside(before) - outside(after) + gaps - jnp.sum(gx * dx) - jnp.sum(gu * du)
@@ -318,10 +317,9 @@ class Iterate:
         return cls(x, u, y, merit, jnp.int32(0), jnp.asarray(False), jnp.asarray(True))
 
 
-def costates(s: Stages, sample: Sample, u: Array, y: Array) -> Array:
+def costates(s: Stages, u: Array, y: Array) -> Array:
     """Return λ (N+1, n), the multipliers of x_0 … x_N: λ_k = ∂(J + y'rows)/∂x_k + A'λ_{k+1}."""
-    x = predict(s, sample.x0, u)
-    g = sample.gradient(s, x, u)[0] + s.pull(y)[0]
+    g = s.gradient(predict(s, u), u)[0] + s.pull(y)[0]
     return jnp.concatenate([recurrence(s.A, g[:-1], g[-1], adjoint=True), g[-1:]])
 
 
@@ -334,18 +332,18 @@ def defects(s: Stages, x: Array, u: Array) -> tuple[Array, Array, Array]:
     return parts[0] + parts[1] + parts[2] - x[1:], sizes, terms
 
 
-def nonlinear_residuals(s: Stages, sample: Sample, u: Array, y: Array) -> Terms:
+def nonlinear_residuals(s: Stages, u: Array, y: Array) -> Terms:
     """Return the residuals of the nonlinear problem at the point of expansion: those of the
     expansion, with the defects among the rows."""
-    of_rows, *rest = stage_residuals(s, sample, u, y)
-    of_defects = defects(s, sample.states, u)
+    of_rows, *rest = stage_residuals(s, u, y)
+    of_defects = defects(s, s.aim.states, u)
     joined = [jnp.concatenate([a, b.ravel()]) for a, b in zip(of_rows, of_defects, strict=True)]
     return [(joined[0], joined[1], joined[2]), *rest]
 
 
 def nonlinear_conditions(
-    data: tuple[Stages, Sample], constants: tuple, u: Array, y: Array
-) -> tuple[Any, Undo]:
+    s: Stages, constants: tuple, u: Array, y: Array
+) -> tuple[Callable[[Any], Any], Undo]:
     """The `conditions_of` that `implicit` takes for the expansion about a solution: those of the
     QP, with the Hessian of the Lagrangian.
 
@@ -353,18 +351,27 @@ def nonlinear_conditions(
     which is a constant, are the first derivatives of the optimality conditions of the nonlinear
     problem with respect to the data and to x, u.
     """
-    E, rho, base, problem, aims = constants
-    s, sample = data
-    lam = costates(s, sample, u, s.bounds.admissible(y))
-    exact = curved(s, base, problem, aims, sample.states, u, lam, y)
+    E, rho, base, problem = constants
+    lam = costates(s, u, s.bounds.admissible(y))
+    exact = curved(s, base, problem, s.aim.states, u, lam, y)
     # Elsewhere than at a strict minimum, as where the search has not ended, the exact one has no
     # solution: NaN would spoil the sums of a batch.
-    strict = convex_with(exact, held(s, E, y))
-    pairs = ((getattr(exact, name), getattr(with_cross(s), name)) for name in QUADRATIC)
-    chosen = (jnp.where(strict, *pair) for pair in pairs)
-    bent: dict[str, Any] = jax.lax.stop_gradient(dict(zip(QUADRATIC, chosen, strict=True)))
-    conditions, undo = stage_conditions((replace(s, **bent), sample), (E, rho), u, y)
-    return lambda data: conditions((replace(data[0], **bent), data[1])), undo
+    bent = jax.lax.stop_gradient(where_hessian(convex_with(exact, held(s, E, y)), exact, s))
+    conditions, undo = stage_conditions(with_hessian(s, bent), (E, rho), u, y)
+    return lambda s: conditions(with_hessian(s, bent)), undo
+
+
+def with_hessian(s: Stages, other: Stages) -> Stages:
+    """Return the stages with the Hessian of others."""
+    return replace(s, Q=other.Q, R=other.R, P=other.P, cross=other.cross)
+
+
+def where_hessian(condition: Array, exact: Stages, s: Stages) -> Stages:
+    """Return the stages s, with the Hessian of `exact` where the condition holds."""
+    if s.cross is None:
+        s = replace(s, cross=jnp.zeros((s.horizon, s.B.shape[-1], s.A.shape[-1]), s.P.dtype))
+    chosen = jax.tree.map(lambda a, b: jnp.where(condition, a, b), with_hessian(s, exact), s)
+    return with_hessian(s, chosen)
 
 
 def sqp_step(most: int, hessian: str, constants: tuple, state: Iterate) -> Iterate:
@@ -375,69 +382,69 @@ def sqp_step(most: int, hessian: str, constants: tuple, state: Iterate) -> Itera
     convex with the active rows held. It is then solved by Newton steps on the active rows alone,
     and where that fails the step after takes Gauss and Newton's again.
     """
-    base, problem, aims, scale, eps = constants
+    base, problem, scale, eps = constants
     x, u, y = state.x, state.u, state.y
-    s, sample = expanded(base, problem, aims, x, u)
+    s = expanded(base, problem, x, u)
     y = s.bounds.admissible(y)
-    measure = lambda s, sample, u, y, eps: Measured.of(
-        nonlinear_residuals(s, sample, u, y), eps, rounding(x.dtype)
-    )
-    solved = precisely(measure, s, sample, u, y, eps / 10).small
+    measure = lambda s, u, y, eps: Measured.of(nonlinear_residuals(s, u, y), eps, rounding(x.dtype))
+    solved = precisely(measure, s, u, y, eps / 10).small
     E, rho = scales(s, scale)
     exact = jnp.asarray(False)
     if hessian == "exact":
-        curved_s = curved(s, base, problem, aims, x, u, costates(s, sample, u, y), y)
-        exact = state.exact & convex_with(curved_s, held(s, E, y))
-        s = jax.tree.map(lambda a, b: jnp.where(exact, a, b), curved_s, with_cross(s))
+        bent = curved(s, base, problem, x, u, costates(s, u, y), y)
+        exact = state.exact & convex_with(bent, held(s, E, y))
+        s = where_hessian(exact, bent, s)
     fixed = jnp.where(E == 0, s.bounds.penalty_gradient(s.rows(x, u)), 0.0)
-    u_qp, y_qp, usable = precisely(solved_qp, s, sample, E, rho, fixed, eps, u, y, exact)
-    dx, du, dy = predict(s, sample.x0, u_qp) - x, u_qp - u, y_qp - y
+    u_qp, y_qp, usable = precisely(solved_qp, s, E, rho, fixed, eps, u, y, exact)
+    dx, du, dy = predict(s, u_qp) - x, u_qp - u, y_qp - y
 
-    powell = lambda w, m: jnp.maximum(jnp.abs(m), (w + jnp.abs(m)) / 2)
-    merit = Merit(
-        powell(state.merit.defects, costates(s, sample, u_qp, y_qp)[1:]),
-        powell(state.merit.rows, y_qp),
-    )
-    value = partial(merit.value, s, sample, base, problem, aims)
-    (now, size), predicted = value(x, u), merit.decrease(s, sample, dx, du)
+    merit = state.merit.raised(costates(s, u_qp, y_qp)[1:], y_qp)
+    length, found, predicted, slack = line_search(merit, s, base, problem, dx, du)
+    go = ~solved & found & jnp.all(jnp.isfinite(du))
+    go = go & (~exact | (usable & (predicted > -slack)))
+    step = lambda v, d: v + jnp.where(go, length * d, 0.0)
+    count = state.steps + ~solved
+    exact_next, open_ = go & usable & (length == 1), ~solved & (go | exact) & (count < most)
+    return Iterate(step(x, dx), step(u, du), step(y, dy), merit, count, exact_next, open_)
+
+
+def line_search(
+    merit: Merit, s: Stages, base: Stages, problem: NonlinearMPC, dx: Array, du: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Return the part of the step dx, du that is long enough and lowers the merit by a part of what
+    the expansion predicts, whether there is one, the decrease predicted, and its rounding."""
+    x, u = s.aim.states, s.aim.inputs
+    value = partial(merit.value, s, base, problem)
+    (now, size), predicted = value(x, u), merit.decrease(s, dx, du)
     slack = 10 * jnp.finfo(x.dtype).eps * size
     enough = lambda a: value(x + a * dx, u + a * du)[0] <= now - DECREASE * a * predicted + slack
     shorten = lambda search: (search[0] / 2, enough(search[0] / 2))
     go_on = lambda search: ~search[1] & (search[0] > SHORTEST)
     one = jnp.ones((), x.dtype)
     length, found = jax.lax.while_loop(go_on, shorten, varying((one, enough(one)), x))
-    moves = ~solved & found & jnp.all(jnp.isfinite(du))
-    moves = moves & (~exact | (usable & (predicted > -slack)))
-    step = lambda v, d: v + jnp.where(moves, length * d, 0.0)
-    count = state.steps + ~solved
-    return Iterate(
-        step(x, dx), step(u, du), step(y, dy), merit, count,
-        moves & usable & (length == 1), ~solved & (moves | exact) & (count < most),
-    )  # fmt: skip
+    return length, found, predicted, slack
 
 
 def solved_qp(
-    s: Stages, sample: Sample, E: Array, rho: Array, fixed: Array, eps: Array, u: Array, y: Array,
+    s: Stages,
+    E: Array,
+    rho: Array,
+    fixed: Array,
+    eps: Array,
+    u: Array,
+    y: Array,
     exact: Array,
-) -> tuple[Array, Array, Array]:  # fmt: skip
+) -> tuple[Array, Array, Array]:
     """Return the solution of a QP from u (N, m), y (rows,), and whether it is one: Newton steps,
     and after them, unless `exact`, interior point steps."""
-    loop = lambda step, constants, state: jax.lax.while_loop(
-        lambda state: state.open, partial(step, constants), varying(state, (state, constants))
-    )
-    best = judged(eps, s, sample, u, y)
-    first = Search(best.z, best.y, best, jnp.int32(0), ~(best.near | best.solved))
-    best = loop(partial(search_step, NEWTON_STEPS), (s, sample, E, rho, eps), first).best
-    second = Interior.begin(best)
-    second = replace(second, open=second.open & ~exact)
-    best = loop(partial(interior_step, INTERIOR_STEPS), (s, sample, E, fixed, eps), second).best
+
+    def loop(step: Callable, most: int, constants: tuple, state: Any) -> Any:
+        is_open, step = (lambda state: state.open), partial(step, constants)
+        return jax.lax.while_loop(is_open, step, varying(state, (state, constants)))
+
+    search = Search(NEWTON_STEPS, INTERIOR_STEPS, loop)
+    best = search.from_pair(s, E, rho, fixed, eps, measured_pair(eps, s, u, y), ~exact)
     return best.z, best.y, best.measured.small
-
-
-def with_cross(s: Stages) -> Stages:
-    """Return the stages with a cross term, zero where there was none."""
-    cross = jnp.zeros((s.horizon, s.B.shape[-1], s.A.shape[-1]), s.P.dtype)
-    return replace(s, cross=cross if s.cross is None else s.cross)
 
 
 def held(s: Stages, E: Array, y: Array) -> Array:

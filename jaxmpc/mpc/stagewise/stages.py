@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.mpc.arguments import Aim
 from jaxmpc.mpc.problem import MPC, weights_of
 from jaxmpc.mpc.rows import Layout, blocks
 from jaxmpc.mpc.stagewise.riccati import Gains, recurrence, riccati_recursion, tracking
@@ -45,7 +46,8 @@ class Stages:
     H (r, n) and D (r, m) of each block of rows (`rows.blocks`), or one a step of the block, None
     for zero; D does not count at step N, which has no input. lower, upper, linear, quadratic
     (rows,): as in `Bounds`. layout: (kind, steps, rows a step) of each block; boxes: whether its
-    matrix is the identity.
+    matrix is the identity. aim: where a plan begins and what it tracks, with full references; none
+    of it until it is known.
     """
 
     A: Array
@@ -64,7 +66,8 @@ class Stages:
     layout: Layout = static()
     boxes: tuple[bool, ...] = static()
     horizon: int = static()
-    cross: Any = None
+    cross: Array | None = None
+    aim: Aim = Aim(None)
 
     @property
     def bounds(self) -> Bounds:
@@ -106,6 +109,16 @@ class Stages:
             if D is not None:
                 gu = gu + spread(w if box else apply_transposed(D, w), steps, N)
         return gx, gu
+
+    def gradient(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """Of J at x, u: (N+1, n) and (N, m)."""
+        aim, stage = self.aim, self.stage[:, None]
+        e, d = 2 * (x - aim.states), 2 * (u - aim.inputs)
+        gx, gu = apply(self.Q, e[:-1]), apply(self.R, d)
+        if self.cross is not None:
+            gx, gu = gx + apply_transposed(self.cross, d), gu + apply(self.cross, e[:-1])
+        gradient = jnp.concatenate([stage * gx, apply(self.P, e[-1:])]), stage * gu
+        return gradient if aim.slopes is None else jax.tree.map(jnp.add, gradient, aim.slopes)
 
     def varying(self, *names: str) -> list[Any]:
         """The named ones of A, B, c where they differ from step to step, else None."""
@@ -248,37 +261,19 @@ def follow(gains: Gains, x0: Array, w: Array, unroll: int = 1) -> Array:
     return jnp.concatenate([x0[None], x])
 
 
-def predict(s: Stages, x0: Array, u: Array) -> Array:
-    """x (N+1, n) from x0 (n,) under the inputs u (N, m)."""
+def predict(s: Stages, u: Array) -> Array:
+    """x (N+1, n) from x_0 under the inputs u (N, m)."""
+    x0 = s.aim.x0
     w = jnp.broadcast_to(apply(s.B, u) + s.c, (s.horizon, len(x0)))
     return jnp.concatenate([x0[None], recurrence(s.A, w, x0)])
 
 
-class Sample(NamedTuple):
-    """Initial state and references of one solve: x0 (n,), references (N+1, n) and (N, m). slopes
-    (N+1, n) and (N, m): linear terms Σ slope_k·x_k + Σ slope_k·u_k of the cost, None for none."""
-
-    x0: Array
-    states: Array
-    inputs: Array
-    slopes: Any = None
-
-    def gradient(self, s: Stages, x: Array, u: Array) -> tuple[Array, Array]:
-        """Of J at x, u: (N+1, n) and (N, m)."""
-        e, d, stage = 2 * (x - self.states), 2 * (u - self.inputs), s.stage[:, None]
-        gx, gu = apply(s.Q, e[:-1]), apply(s.R, d)
-        if s.cross is not None:
-            gx, gu = gx + apply_transposed(s.cross, d), gu + apply(s.cross, e[:-1])
-        gradient = jnp.concatenate([stage * gx, apply(s.P, e[-1:])]), stage * gu
-        return gradient if self.slopes is None else jax.tree.map(jnp.add, gradient, self.slopes)
-
-
-def unconstrained(s: Stages, gains: Gains, weights: Array, sample: Sample) -> tuple[Array, Array]:
+def unconstrained(s: Stages, gains: Gains, weights: Array) -> tuple[Array, Array]:
     """x, u of least cost with the penalties ½ Σ weights·row²."""
     # From a trajectory that the gains keep bounded, one minimisation of what is left.
-    x = follow(gains, sample.x0, jnp.broadcast_to(s.c, (s.horizon, s.c.shape[-1])))
+    x = follow(gains, s.aim.x0, jnp.broadcast_to(s.c, (s.horizon, s.c.shape[-1])))
     u = apply(gains.K, x[:-1])
-    moved = jax.tree.map(jnp.add, sample.gradient(s, x, u), s.pull(weights * s.rows(x, u)))
+    moved = jax.tree.map(jnp.add, s.gradient(x, u), s.pull(weights * s.rows(x, u)))
     dx, du = minimise(s, gains, -moved[0], -moved[1])
     return x + dx, u + du
 
@@ -294,11 +289,11 @@ class Conditions(NamedTuple):
     gradient_size: Array
 
 
-def conditions(s: Stages, sample: Sample, u: Array, y: Array) -> Conditions:
+def conditions(s: Stages, u: Array, y: Array) -> Conditions:
     """Optimality conditions of inputs u (N, m) and multipliers y (rows,), by the states that u
     leads to and the costates λ_k = ∂J/∂x_k + H'y + A'λ_{k+1}."""
-    x = predict(s, sample.x0, u)
-    (gx, own), (px, pushed) = sample.gradient(s, x, u), s.pull(y)
+    x = predict(s, u)
+    (gx, own), (px, pushed) = s.gradient(x, u), s.pull(y)
     back = lambda g: recurrence(s.A, g[:-1], g[-1], adjoint=True)
     # Of cost and rows apart: at the solution their sum is small, its rounding is that of the parts.
     of_cost, of_rows = (jnp.concatenate([back(g)[1:], g[-1:]]) for g in (gx, px))
@@ -307,9 +302,8 @@ def conditions(s: Stages, sample: Sample, u: Array, y: Array) -> Conditions:
     moved = apply(absolute.A, jnp.abs(x[:-1])) + apply(absolute.B, jnp.abs(u)) + absolute.c
     terms = jnp.concatenate([jnp.abs(x[:1]), moved])
     # Its gradient, of the terms of its distance from the reference, and of slopes.
-    far = jax.tree.map(jnp.abs, sample)
-    far = far._replace(states=-far.states, inputs=-far.inputs)
-    weighed, own_terms = far.gradient(absolute, terms, jnp.abs(u))
+    far = absolute.aim._replace(states=-absolute.aim.states, inputs=-absolute.aim.inputs)
+    weighed, own_terms = replace(absolute, aim=far).gradient(terms, jnp.abs(u))
     later = jax.lax.cumsum(weighed[1:], reverse=True)
     return Conditions(
         s.rows(x, u), own + pushed + apply_transposed(s.B, of_cost + of_rows),
@@ -321,14 +315,14 @@ def conditions(s: Stages, sample: Sample, u: Array, y: Array) -> Conditions:
     )  # fmt: skip
 
 
-def stage_residuals(s: Stages, sample: Sample, u: Array, y: Array) -> Terms:
+def stage_residuals(s: Stages, u: Array, y: Array) -> Terms:
     """As `qp.residuals.residual_terms`, for the condensed QP in the inputs.
 
     With the gradient g of the Lagrangian the gap z'Pz + q'z + g(Az) + g*(y) is
     u'g + g(rows) + g*(y) − y'rows: at the optimum both parts are zero. What is natural for a row
     and for an input is what is the most of the same one over the horizon.
     """
-    found, bounds = conditions(s, sample, u, y), s.bounds
+    found, bounds = conditions(s, u, y), s.bounds
     penalty, support, product = bounds.cost(found.rows), bounds.support(y), y * found.rows
     gap = jnp.sum(u * found.gradient) + jnp.sum(penalty + support - product)
     terms = jnp.sum(jnp.abs(u) * found.gradient_terms)
@@ -357,8 +351,8 @@ def stage_residuals(s: Stages, sample: Sample, u: Array, y: Array) -> Terms:
     ]  # fmt: skip
 
 
-def judged(eps: Array, s: Stages, sample: Sample, u: Array, y: Array) -> Pair:
-    """The pair of inputs u (N, m) and multipliers y (rows,), judged in float64."""
+def measured_pair(eps: Array, s: Stages, u: Array, y: Array) -> Pair:
+    """The pair of inputs u (N, m) and multipliers y (rows,), its residuals measured in float64."""
     y, floor = s.bounds.admissible(y), rounding(u.dtype)
-    judge = lambda s, sample, u, y, eps: Pair.of(u, y, stage_residuals(s, sample, u, y), eps, floor)
-    return precisely(judge, s, sample, u, y, eps)
+    pair = lambda s, u, y, eps: Pair.of(u, y, stage_residuals(s, u, y), eps, floor)
+    return precisely(pair, s, u, y, eps)

@@ -1,0 +1,384 @@
+"""MPC stage by stage, for A, B, c that differ for every problem of a batch or at every step.
+
+ADMM's iteration is that of `qp/admm.py` on the condensed QP, the iterates are the same; only the
+condensed matrices are never formed. A step needs "linear terms on the rows, minimise the quadratic
+with its penalties", the LQR problem of `stages.py` with W = diag(ρE²): a backward and a forward
+pass over the stages, where the dense step reads a matrix of (rows)² entries. Newton steps on the
+active rows follow, a Riccati recursion each, and where these do not end at the solution an interior
+point method (`interior_point.py`).
+
+The row scale E of `qp/admm.scale` makes the rows a_i of all inputs one unit long in the metric of
+the Hessian: 1/E_i² = a_i' P⁻¹ a_i. P⁻¹ is the covariance of inputs drawn with density exp(−J): by
+the same recursion without penalties u_k = K x_k + e_k with e_k of covariance G⁻¹, hence that of x_k
+runs forward, Σ⁺ = (A + BK) Σ (A + BK)' + B G⁻¹ B' from Σ_0 = 0.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike, DTypeLike
+
+from jaxmpc.arrays import Reals, as_array, host_array
+from jaxmpc.checks import concrete, fail, require_finite, require_kind
+from jaxmpc.mpc.arguments import Aim, checked_aim
+from jaxmpc.mpc.plan import Plan, WarmStart, answer
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.rows import layout, row_count
+from jaxmpc.mpc.stagewise.interior_point import INTERIOR_STEPS
+from jaxmpc.mpc.stagewise.newton import Search, distance, stage_conditions, stage_newton_step
+from jaxmpc.mpc.stagewise.riccati import Gains
+from jaxmpc.mpc.stagewise.stages import (
+    Stages,
+    at,
+    cleaned,
+    measured_pair,
+    minimise,
+    predict,
+    riccati,
+    stage_residuals,
+    stages,
+    unconstrained,
+)
+from jaxmpc.pytrees import pytree
+from jaxmpc.qp.admm import (
+    ADMM,
+    DEFAULT,
+    Splitting,
+    default_rho,
+    iterate,
+    scaled_multipliers,
+    start,
+)
+from jaxmpc.qp.certificate import Proof
+from jaxmpc.qp.derivative import implicit
+from jaxmpc.qp.loops import repeat_while
+from jaxmpc.qp.modes import own_modes, varying
+from jaxmpc.qp.precision import arrays, matmul, precisely
+from jaxmpc.qp.problem import QPSolution
+from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.residuals import Measured, Pair, assess, with_status
+from jaxmpc.qp.solve import tolerance
+from jaxmpc.qp.status import Status
+from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.systems.system import LinearSystem
+
+# Most stages that the passes of an ADMM step write out, without a loop over them. Loops reorder
+# (batch, N, …) to (N, batch, …) at each step, which takes longer than the products.
+UNROLL = 32
+# Newton steps before the interior point method, where ADMM.newton_steps is None.
+NEWTON_STEPS = 6
+
+
+def solve_stagewise(
+    mpc: MPC,
+    x0: Reals,
+    reference: Reals | None = None,
+    solver: ADMM = DEFAULT,
+    warm_start: Plan | WarmStart | None = None,
+    *,
+    input_reference: Reals | None = None,
+    scale: ArrayLike | None = None,
+) -> Plan:
+    """Solve an MPC problem stage by stage from the state x0 (n,): what takes the least time where
+    the system is another one in each problem, or at each step.
+
+    A (n, n), B (n, m) and c (n,) of mpc.system may have a leading axis N:
+    x_{k+1} = A_k x_k + B_k u_k + c_k. `replace(mpc, system=...)` puts a system into a problem.
+
+    x0, references, solver and the Plan are those of `solve`, and so is the status: residuals and
+    gap of the returned inputs and multipliers, evaluated from the data in float64. What differs:
+    no infeasibility is proved (a problem without a solution ends as ITERATION_LIMIT: soften the
+    rows that may not hold). Derivatives with respect to every array of data are those of
+    solver.differentiate. warm_start: an earlier Plan or a WarmStart, whose states are not read.
+    solver.newton_steps: at most so many, a Riccati recursion each; 5 suffice where ADMM, or the
+    warm start, has found the active rows. None: 6, after them an interior point method where they
+    have not ended at the solution (its steps need rows with l < u), and 6 again; all in float64.
+    mpc.prestabilise is not read: the inputs are the variables, so a plant that grows more than
+    1e5-fold over the horizon in open loop has residuals above eps by rounding alone; `solve` takes
+    those. scale (rows,): the row scale of a similar problem
+    (`factor_stages(...).E`), which saves a Riccati recursion; it changes the path, not the answer.
+    A row of scale 0 counts as one that no input moves: where that is not so, the plan does not
+    become SOLVED.
+
+    `jax.vmap` over x0, references or the arrays of `mpc`, its system's among them. Raises
+    ValueError for bad data that can be read, and for what only `solve` supports: Ellipsoids,
+    control horizons, input rates.
+    """
+    factor = factor_stages(mpc, solver, scale)
+    return plan_stages(
+        factor, mpc, x0, reference, solver, warm_start, input_reference=input_reference
+    )
+
+
+def factor_stages(
+    mpc: MPC, solver: ADMM = DEFAULT, scale: ArrayLike | None = None
+) -> "StageFactor":
+    """What x0, references and warm start do not change: row scale and Riccati gains.
+
+    Arguments and errors as in `solve_stagewise`; `plan_stages` does the rest.
+    """
+    mpc = checked(mpc, solver)
+    rows = row_count(layout(mpc))
+    if scale is not None and np.shape(scale) != (rows,):
+        fail("scale", f"shape {np.shape(scale)}", f"Give ({rows},), one number a row")
+    return _factor(*arrays((mpc, solver.rho, scale)), steps=solver.admm_steps() > 0)
+
+
+def checked(mpc: MPC, solver: ADMM) -> MPC:
+    """The problem without prestabilising gain; ValueError for what is wrong with it or the solver,
+    and for what is not solved stage by stage."""
+    require_kind("mpc", mpc, MPC)
+    system = mpc.system
+    require_kind("system", system, LinearSystem)
+    for name, found in (
+        ("terminal_set is an Ellipsoid", isinstance(mpc.terminal_set, Ellipsoid)),
+        ("control_horizon is given", mpc.control_horizon is not None),
+        ("input rates are limited or weighed", mpc.input_in_state),
+    ):
+        if found:
+            fail("mpc", name, "Stage by stage there is no such thing: use jm.solve")
+    first: dict[str, Any] = {}
+    for name, dimensions in (("A", 2), ("B", 2), ("c", 1)):
+        value = getattr(system, name)
+        if value is None:
+            continue
+        if concrete(value):
+            require_finite(name, host_array(name, value))
+        value = as_array(value)
+        shape = np.shape(value)
+        staged = len(shape) == dimensions + 1
+        if staged and shape[0] != mpc.horizon:
+            fail(name, f"shape {shape}", f"A leading axis counts the {mpc.horizon} steps")
+        first[name] = value[0] if staged and shape[0] else value
+    at_first = replace(mpc, system=replace(system, **first), prestabilise=None)
+    at_first.validate()
+    at_first.require_unique_inputs()  # the recursion divides by R + B'SB
+    solver.validate(row_count(layout(mpc)))
+    return replace(mpc, prestabilise=None)
+
+
+@pytree
+class StageFactor:
+    """What data and penalties decide: row scale E (rows,), 0 for a row that no input moves; rho
+    (S, rows) with the gains of each of the S penalties of a schedule, None where there are no ADMM
+    steps; fault: NOT_RUN where the data are usable, else the status that says why not."""
+
+    stages: Stages
+    E: Array
+    rho: Array
+    gains: Gains | None
+    fault: Array
+
+
+@partial(jax.jit, static_argnames="steps")
+@own_modes
+def _factor(mpc: MPC, rho: Any, scale: Any, steps: bool) -> StageFactor:
+    s, fault = cleaned(stages(mpc))
+    E = row_scale(s) if scale is None else jnp.asarray(scale, s.Q.dtype)
+    inputs = s.horizon * s.B.shape[-1]
+    rho = default_rho(E, inputs) if rho is None else jnp.asarray(rho, E.dtype)
+    rho = jnp.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, E.shape[0]))
+    gains = jax.lax.map(lambda rho: riccati(s, rho * E**2), rho) if steps else None
+    # Finite data can still overflow, or be too near singular for their precision.
+    leaves = jax.tree.leaves((E, gains))
+    sound = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in leaves]))
+    E, gains = jax.tree.map(lambda v: jnp.where(sound, v, 0.0), (E, gains))
+    return StageFactor(s, E, rho, gains, jnp.where(sound, fault, jnp.int32(Status.ITERATION_LIMIT)))
+
+
+def row_scale(s: Stages) -> Array:
+    """E (rows,): 1/E² is the variance of the row under exp(−J); 0 where that is zero."""
+    gains = riccati(s)
+
+    def forward(Sigma: Array, stage: tuple) -> tuple[Array, Array]:
+        (closed, _, inverse), B = stage
+        B = s.B if B is None else B
+        spread = matmul(B, matmul(inverse, B.T))
+        return matmul(closed, matmul(Sigma, closed.T)) + spread, Sigma
+
+    start = jnp.zeros_like(s.P)
+    last, Sigma = jax.lax.scan(forward, start, (gains, *s.varying("B")))
+    Sigma = jnp.concatenate([Sigma, last[None]])
+    variance, own = [jnp.zeros(0, s.Q.dtype)], [jnp.zeros(0, s.Q.dtype)]
+    square = lambda M, V: jnp.sum(matmul(M, V) * M, axis=-1)
+    deviation = lambda V: jnp.sqrt(jnp.maximum(jnp.diagonal(V, axis1=-2, axis2=-1), 0.0))
+    for _, steps, _, H, D, _ in s.blocks():
+        # H x + D (K x + e), e of covariance G⁻¹.
+        F: Any = 0.0 if H is None else H
+        noise: Any = 0.0
+        V = at(Sigma, steps)
+        if D is not None:
+            K, inverse = at(gains.K, steps), at(gains.inverse, steps)
+            F, noise = F + matmul(D, K), square(D, inverse)
+        value = square(F, V) + noise
+        size = jnp.sum(jnp.abs(F) * deviation(jax.lax.stop_gradient(V))[:, None, :], axis=-1) ** 2
+        variance.append(value.ravel())
+        own.append((size + noise).ravel())
+    squared, terms = jnp.concatenate(variance), jnp.concatenate(own)
+    # A row is zero when it is rounding noise, of its own terms or beside the others.
+    eps = jnp.finfo(squared.dtype).eps
+    noise = jnp.maximum((100 * eps) ** 2 * terms, eps**2 * jnp.max(squared, initial=0.0))
+    zero = squared <= noise
+    return jnp.where(zero, 0.0, 1 / jnp.sqrt(jnp.where(zero, 1.0, squared)))
+
+
+def stage_splittings(
+    factor: StageFactor, s: Stages, unroll: int = 1
+) -> tuple[list[Splitting], tuple[Array, Array]]:
+    """The splitting of each penalty of the schedule, and with the last one the x (N+1, n) and
+    u (N, m) of least cost with that penalty on the rows alone. Bounds and E·row include what x0 and
+    c put into the rows; in the condensed QP they are moved by that."""
+    E, made = factor.E, []
+    for i, rho in enumerate(factor.rho):
+        gains = jax.tree.map(lambda v, i=i: v[i], factor.gains)
+        free = unconstrained(s, gains, rho * E**2)
+
+        def image(r: Array, rho: Array = rho, gains: Gains = gains) -> Array:
+            return E * s.rows(*minimise(s, gains, *s.pull(rho * E * r), unroll))
+
+        made.append(Splitting(rho, image, E * s.rows(*free)))
+    return made, free
+
+
+def read(
+    factor: StageFactor, s: Stages, bounds: Bounds, t: Array, free: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """Inputs u (N, m) and multipliers y (rows,) that t stands for at the last penalty."""
+    E, rho = factor.E, factor.rho[-1]
+    gains = jax.tree.map(lambda v: v[-1], factor.gains)
+    p = bounds.project(t, rho)
+    pushed = minimise(s, gains, *s.pull(rho * E * (2 * p - t)))
+    x, u = jax.tree.map(jnp.add, free, pushed)
+    # A soft row that no input moves gets its penalty's gradient as multiplier: the gap closes.
+    y = jnp.where(E == 0, s.bounds.penalty_gradient(s.rows(x, u)), E * rho * (t - p))
+    return u, s.bounds.admissible(y)
+
+
+def plan_stages(
+    factor: StageFactor,
+    mpc: MPC,
+    x0: Reals,
+    reference: Reals | None = None,
+    solver: ADMM = DEFAULT,
+    warm_start: Plan | WarmStart | None = None,
+    *,
+    input_reference: Reals | None = None,
+) -> Plan:
+    """The rest of `solve_stagewise`, for the same mpc and solver; mpc.system is not read."""
+    aim = full_aim(mpc, checked_aim(mpc, x0, reference, input_reference), factor.E.dtype)
+    if warm_start is not None:
+        warm_start = WarmStart.of(warm_start, factor.stages.layout, mpc)
+    mpc = replace(mpc, prestabilise=None)
+    return _plan(*arrays((factor, mpc, solver, aim, warm_start)))
+
+
+def full_aim(mpc: MPC, aim: Aim, dtype: DTypeLike) -> Aim:
+    """Return x0 (n,) and the references at all stages, (N+1, n) and (N, m), in one floating
+    type."""
+    N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
+    spread = lambda v, *shape: jnp.broadcast_to(jnp.asarray(0 if v is None else v, dtype), shape)
+    x0 = jnp.asarray(aim.x0, dtype)
+    return Aim(x0, spread(aim.states, N + 1, n), spread(aim.inputs, N, m))
+
+
+@jax.jit
+@own_modes
+def _plan(
+    factor: StageFactor, mpc: MPC, solver: ADMM, aim: Aim, warm_start: WarmStart | None
+) -> Plan:
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(aim)]))
+    fault = jnp.where(finite, factor.fault, jnp.int32(Status.NON_FINITE))
+    usable = fault == Status.NOT_RUN
+    aim = jax.tree.map(lambda v: jnp.where(jnp.isfinite(v), v, 0), aim)
+    # Only cost and slack are read from the problem as given.
+    mpc = jax.tree.map(lambda v: jnp.where(usable, v, 0), mpc)
+    s = replace(factor.stages, aim=aim)
+    found = stage_solution(factor, s, solver, warm_start)
+    found = replace(found, iterations=jnp.int32(solver.admm_steps()))
+    return answer(mpc, s.layout, found, fault, predict(s, found.z), found.z, aim)
+
+
+def stage_solution(
+    factor: StageFactor, s: Stages, solver: ADMM, warm_start: WarmStart | None
+) -> QPSolution:
+    """Return the solution, inputs z (N, m) and multipliers y (rows,), with its status and its
+    derivatives: that of what was measured of the float64 pair that Newton steps end at, before it
+    was rounded, or where there were none of what is measured of this pair."""
+    given = factor, s, solver, warm_start
+    if solver.differentiate == "implicit":
+        factor, *_ = given = jax.lax.stop_gradient(given)
+        u, y, measured = searched(*given)
+        u, y = implicit(stage_conditions, s, (factor.E, factor.rho[-1]), u, y)
+    else:
+        u, y, measured = searched(*given)
+    none = Proof.none(u, y)
+    if measured is not None:
+        return with_status(measured, u, y, none)
+    return assess(stage_residuals, (s,), u, y, none, tolerance(solver, u.dtype))
+
+
+def searched(
+    factor: StageFactor, s: Stages, solver: ADMM, warm_start: WarmStart | None
+) -> tuple[Array, Array, Measured | None]:
+    """Inputs u (N, m) and multipliers y (rows,): ADMM, Newton steps, interior point method; and
+    what was measured of them where Newton steps end at them."""
+    E, rho = factor.E, factor.rho
+    u, y = jnp.zeros((s.horizon, s.B.shape[-1]), E.dtype), jnp.zeros_like(E)
+    if warm_start is not None:  # what is not finite counts as 0
+        clean = lambda v: jnp.nan_to_num(jnp.asarray(v, E.dtype), posinf=0.0, neginf=0.0)
+        given = clean(warm_start.inputs), clean(warm_start.multipliers)
+        far = lambda pair: jax.lax.stop_gradient(distance(s, E, rho[-1], *pair))
+        near = far(given) <= 100 * far((u, y))
+        u, y = (jnp.where(near, v, 0.0) for v in given)
+    rows = s.rows(predict(s, u), u)
+    fixed = jnp.where(E == 0, s.bounds.penalty_gradient(rows), 0.0)
+    if factor.gains is not None:
+        bounds, v = s.bounds.scaled(E), E * rows
+        t = v if warm_start is None else start(bounds, rho[0], v, scaled_multipliers(E, y))
+        schedule, free = stage_splittings(factor, s, min(s.horizon, UNROLL))
+        t, _ = iterate(schedule, bounds, t, solver.admm_steps(), solver.alpha)
+        u, y = read(factor, s, bounds, t, free)
+    y = jnp.where(E == 0, fixed, y)
+    newton = solver.most_newton_steps(NEWTON_STEPS)
+    if not newton:
+        return u, y, None
+    if solver.differentiate == "unrolled":
+        step = lambda pair, _: (stage_newton_step(s, E, rho[-1], *pair), None)
+        u, y = jax.lax.scan(step, (u, y), length=newton)[0]
+        return u, s.bounds.admissible(y), None
+    interior = INTERIOR_STEPS if solver.newton_steps is None else 0
+    refine = partial(refined, Search(newton, interior, _always if solver.fixed else _while_open))
+    best = precisely(refine, s, E, rho[-1], fixed, tolerance(solver, u.dtype), u, y)
+    return best.z, best.y, best.measured
+
+
+def _always(step: Callable, most: int, constants: tuple, state: Any) -> Any:
+    """Take `most` steps."""
+    return jax.lax.scan(lambda state, _: (step(constants, state), None), state, length=most)[0]
+
+
+def _while_open(step: Callable, most: int, constants: tuple, state: Any) -> Any:
+    """Take steps until the instance has left."""
+    return repeat_while(lambda state: state.open, step, constants, state, "stages")
+
+
+def refined(
+    search: Search, s: Stages, E: Array, rho: Array, fixed: Array, eps: Array, u: Array, y: Array
+) -> Pair:
+    """Return the best pair that a search finds from u (N, m), y (rows,); with interior point steps
+    Newton steps follow them once more."""
+
+    def go_on(best: Pair, first: Array) -> tuple[Pair, None]:
+        return search.from_pair(s, E, rho, fixed, eps, best, first), None
+
+    best = measured_pair(eps, s, u, y)
+    # Weights of rows that are held grow until rounding stops the interior point method; Newton's
+    # are bounded. As a loop, so that both are compiled once.
+    rounds = jnp.arange(2 if search.interior else 1) == 0
+    return jax.lax.scan(go_on, varying(best, (best, s, fixed)), rounds)[0]
