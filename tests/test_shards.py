@@ -12,6 +12,8 @@ from test_store import AXES, CONFIG, FIELDS, array_files, bounds, rows
 from jaxmpc import store
 from jaxmpc.app.commands.options import chosen_shard
 from jaxmpc.store import Store
+from jaxmpc.store.lock import Lock
+from jaxmpc.store.places import zarr_place
 
 
 def open_shard(path, shard=None, config=CONFIG):
@@ -74,7 +76,7 @@ class TestLocks:
 
     def test_a_lock_file_that_its_holder_removed(self, path, monkeypatch):
         """It is made again: a lock of a file without a name locks out nobody."""
-        first = store._Lock(path.parent, file=".lock")
+        first = Lock(path.parent, file=".lock")
         opened, open_ = [], os.open
 
         def late(*arguments):
@@ -84,10 +86,10 @@ class TestLocks:
             return opened[-1]
 
         monkeypatch.setattr(os, "open", late)
-        second = store._Lock(path.parent, file=".lock")
+        second = Lock(path.parent, file=".lock")
         assert len(opened) == 2
         with pytest.raises(ValueError, match="another process"):
-            store._Lock(path.parent, file=".lock")
+            Lock(path.parent, file=".lock")
         second.release()
 
 
@@ -209,7 +211,7 @@ class TestObjects:
     def test_damage(self, url):
         with open_shard(url) as kept:
             fill(kept)
-        group = zarr.open_group(store._place(url), mode="r+", use_consolidated=False)
+        group = zarr.open_group(zarr_place(url), mode="r+", use_consolidated=False)
         group["label"][0, 1] = -group["label"][0, 1]
         assert store.read(url).problems
         with open_shard(url) as kept:
@@ -240,7 +242,7 @@ class TestObjects:
         assert not store.read(url).problems
 
     def test_refusals(self, url, tmp_path):
-        zarr.open_group(store._place(url), mode="w", attributes={"mine": 1})
+        zarr.open_group(zarr_place(url), mode="w", attributes={"mine": 1})
         with pytest.raises(ValueError, match="no sweep store"):
             open_shard(url)
         with pytest.raises(ValueError, match="Delete it with the tools of that store"):

@@ -18,6 +18,7 @@ from damage import turned_bits
 from jaxmpc import store
 from jaxmpc.feasible.stored import BOUNDS, dimension_names, label_fields, stored_labels
 from jaxmpc.store import Constant, Store
+from jaxmpc.store.blocks import block_shape, regions
 
 AXES = {
     "q": Constant(np.linspace(-1, 1, 5), ("q",), {"units": "rad", "long_name": "q"}),
@@ -67,9 +68,9 @@ class TestBlocks:
         [((5, 4), 8), ((7,), 3), ((3, 5, 7), 14), ((3, 5, 7), 8), ((4, 4), 1), ((2, 3), 100)],
     )
     def test_are_consecutive_and_cover_the_grid(self, shape, most):
-        block = store.block_shape(shape, most)
+        block = block_shape(shape, most)
         whole, found = np.arange(np.prod(shape)).reshape(shape), []
-        for region in store.regions(shape, block):
+        for region in regions(shape, block):
             part = whole[region].ravel()
             assert len(part) <= most
             np.testing.assert_array_equal(np.diff(part), 1)

@@ -16,7 +16,6 @@ import pytest
 import xarray as xr
 import zarr
 
-from jaxmpc import store
 from jaxmpc.app import cli
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands import linear_sweep, recursion
@@ -27,6 +26,7 @@ from jaxmpc.files import read_arrays, write_arrays
 from jaxmpc.recursion import Claim, Counterexample, RecursionReport, SmallestHorizon
 from jaxmpc.recursion.sampled_loops import SampledLoops
 from jaxmpc.sets.box import Box
+from jaxmpc.store.lock import Lock
 
 
 @pytest.fixture(autouse=True)
@@ -511,7 +511,7 @@ def test_a_full_disk_is_one_line_and_resume_goes_on(tmp_path, capsys):
 
 def test_two_processes_on_one_folder(tmp_path, capsys):
     line = "sweep --grid 16 12 --horizon 5 --no-refine"
-    first = store._Lock(tmp_path / "jaxmpc-sweep")
+    first = Lock(tmp_path / "jaxmpc-sweep")
     assert run(line) == 2
     assert "another process writes there" in capsys.readouterr().err
     first.release()

@@ -16,6 +16,7 @@ import xarray as xr
 from jaxmpc import store
 from jaxmpc.app import cli
 from jaxmpc.app.commands import linear_sweep
+from jaxmpc.store.lock import Lock
 
 
 @pytest.fixture(autouse=True)
@@ -80,7 +81,7 @@ def test_refusals_and_resume(tmp_path, monkeypatch, capsys):
         assert run(f"{line} --output out") == 2
         err = capsys.readouterr().err
         assert answer in err and err.count("\n") == 1
-    held = store._Lock(tmp_path / "out", file=".sweep.zarr.1-of-2.lock")
+    held = Lock(tmp_path / "out", file=".sweep.zarr.1-of-2.lock")
     assert run(f"{LINE} --output out --shard 1/2 --resume") == 2
     assert "another process computes shard 1/2" in capsys.readouterr().err
     held.release()

@@ -13,6 +13,7 @@ from jaxmpc import store
 from jaxmpc.feasible.labels import PROOFS
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.stored import open_labels
+from jaxmpc.store.blocks import checksum, regions
 from jaxmpc.verify.exact import beyond, integers, roll_out, roll_out_exactly
 from jaxmpc.verify.half_spaces import Programs
 from jaxmpc.verify.stored_map import verify_map
@@ -184,9 +185,9 @@ def tampered(sound, path, name, change):
     change(values, np.asarray(group["label"][...]))
     group[name][...] = values
     names = group.attrs["variables"]
-    for block, region in enumerate(store.regions(group["label"].shape, names["block"])):
+    for block, region in enumerate(regions(group["label"].shape, names["block"])):
         parts = {k: np.asarray(group[k][region]) for k in names["fields"]}
-        group["checksum"][block] = store.checksum(parts)
+        group["checksum"][block] = checksum(parts)
     return verify_map(path)
 
 

@@ -1,0 +1,255 @@
+"""A store as it lies on the disk, read without being changed, and distrusted."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+import numpy as np
+import zarr
+
+from jaxmpc.checks import fail, in_units, require_memory, shortened, shown
+from jaxmpc.files import faithful
+from jaxmpc.grids import mesh
+from jaxmpc.pytrees import record
+from jaxmpc.store.blocks import checksum, determining, digest_of, regions, store_fingerprint
+from jaxmpc.store.places import array_of, location, open_group, text_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# Most blocks of a store that is read. Its data are no larger than SMALL bytes, or so many times its
+# files: a sweep's are some 13 times as large, one number throughout is far more.
+MOST_BLOCKS, SMALL, MOST_COMPRESSED = 2**17, 2**28, 1000
+
+
+# What looks at attributes and axes before data are read, and returns what is wrong with them.
+Check: TypeAlias = Callable[[Mapping[str, Any], Mapping[str, np.ndarray]], list[str]]
+# Returns the shapes of variables, a sample, that follow from attributes.
+Shapes: TypeAlias = Callable[[Mapping[str, Any]], Mapping[str, tuple[int, ...]]]
+
+
+@record
+class Stored:
+    """A store as it lies on the disk, read without being changed.
+
+    arrays: its variables (samples, ...), bounds and constants. done: how many of its `blocks` were
+    done. problems: what is wrong, a line each; none in a sound store. whole: whether all of it was
+    read; where it is False the last problem is the reason, and arrays may be missing.
+    """
+
+    attributes: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+    axes: dict[str, np.ndarray]
+    blocks: int
+    done: int
+    problems: list[str] = field(default_factory=list)
+    whole: bool = True
+
+    @classmethod
+    def damaged(cls, reason: str) -> "Stored":
+        """Return a store of which nothing can be used, for a reason."""
+        return cls({}, {}, {}, 0, 0, [reason], False)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Return the samples (B, d)."""
+        if "points" in self.arrays:
+            return self.arrays["points"]
+        return mesh(list(self.axes.values()))
+
+
+def read(
+    path: str | Path,
+    check: Check = lambda attributes, axes: [],
+    shapes: Shapes = lambda attributes: {},
+) -> Stored:
+    """Read a store and compare it with its checksums; raises ValueError where there is none.
+
+    Metadata come first: nothing is read that is larger than they and the files allow, and nothing
+    but axes and constants before the fingerprint is found to be theirs. check: looks at these.
+    shapes: of variables, a sample, that follow from the attributes; raises ValueError where these
+    make no sense.
+    """
+    path = location(path)
+    if isinstance(path, Path) and (path / "zarr.json").is_file():
+        text_of(path, "zarr.json")  # raises for what is too large to be metadata
+    group = open_group(path, "r")
+    try:
+        return _read(path, group, check, shapes)
+    except Exception as error:  # of zarr, its codecs, JSON: what damaged bytes may raise
+        text = reason(error)
+        return Stored.damaged(text if isinstance(error, ValueError) else f"cannot be read ({text})")
+
+
+def reason(error: Exception) -> str:
+    """Return an error as one line, with its kind unless it is one of values with a text."""
+    text = " ".join(str(error).split())
+    known = isinstance(error, ValueError) and text
+    return shortened(text if known else f"{type(error).__name__}: {text}")
+
+
+def _read(path: Path | str, group: zarr.Group, check: Check, shapes: Shapes) -> Stored:
+    """Read an open store; raises where nothing can be said of its data."""
+    found, described = _described(path, shapes)
+    names, block = found["variables"], found["variables"]["block"]
+
+    def load(name: str) -> np.ndarray:
+        try:
+            return np.asarray(array_of(group, name)[...])
+        except Exception as error:
+            fail(name, f"cannot be read ({type(error).__name__})", "Its file is damaged")
+
+    axes = {name: load(name) for name in names["axes"]}
+    constants = {name: load(name) for name in names["constants"]}
+    if found["fingerprint"] != store_fingerprint(determining(found), {**axes, **constants}):
+        what = "configuration, axes or constants are not as they were written"
+        fail("zarr.json", what, "Overwrite it")
+    if problems := check(found, axes):
+        return Stored(found, {}, axes, 0, 0, problems, False)
+    shape = tuple(len(axis) for axis in axes.values())
+    parts = regions(shape, block)
+    marks = _marks(path, group, len(parts))
+    arrays = {name: load(name) for name in names["fields"]}
+    problems = []
+    for k in np.flatnonzero(marks):
+        if marks[k] != checksum({name: v[parts[k]] for name, v in arrays.items()}):
+            _require_files(path, arrays, parts[k], block, f"block {k}")
+            problems.append(f"block {k}: data are not as they were written")
+    own = {*axes, *constants, *arrays, "checksum"}
+    for name in [name for name in described if name not in own]:  # what `Store.save` wrote
+        constants[name] = load(name)
+        stored = described[name]["attributes"].get("checksum")
+        if stored != str(checksum({name: constants[name]})):
+            problems.append(f"{name}: data are not as they were written")
+    flat = {k: v.reshape(-1, *v.shape[len(shape) :]) for k, v in arrays.items()} | constants
+    return Stored(found, flat, axes, len(parts), int(np.count_nonzero(marks)), problems)
+
+
+def _described(path: Path | str, shapes: Shapes) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the attributes of a store and the metadata of each variable. Raises ValueError where
+    they do not fit each other, or describe more than the files can hold; no data are read."""
+    root = faithful("zarr.json", text_of(path, "zarr.json"))
+    try:
+        found, together = root["attributes"], root["consolidated_metadata"]["metadata"]
+        names, block = found["variables"], found["variables"]["block"]
+        axes, fields = names["axes"], [*names["fields"]]
+        own = [*axes, *names["constants"], *fields, "checksum"]
+        digest = found.get("digest")
+        fine = (
+            digest in (None, digest_of(found))
+            and all(
+                isinstance(name, str) and name and "/" not in name for name in [*own, *together]
+            )
+            and len(block) == len(axes) > 0
+            and all(type(size) is int and size > 0 for size in block)
+        )
+    except (LookupError, TypeError, AttributeError):
+        fine = False
+    if not fine:
+        fail("zarr.json", "attributes are not as they were written", "Overwrite it")
+    for name in dict.fromkeys([*own, *together]):
+        try:
+            same = faithful(name, text_of(path, f"{name}/zarr.json")) == together.get(name)
+        except (OSError, ValueError):
+            same = False
+        if not same:
+            fail(name, "metadata are missing or not as they were written", "Resume or overwrite it")
+    sizes = {name: _layout(name, one) for name, one in together.items()}
+    grid = tuple(math.prod(sizes[name].shape) for name in axes)
+    count = math.prod(-(-n // size) for n, size in zip(grid, block, strict=True))
+    if count > MOST_BLOCKS:
+        fail("zarr.json", f"describes {count:,} blocks", f"At most {MOST_BLOCKS:,} can be read")
+    last = {name: sizes[name].shape[len(grid) :] for name in fields}
+    last |= {name: shape for name, shape in shapes(found).items() if name in fields}
+    expected = {name: Layout((*grid, *tail), (*block, *tail)) for name, tail in last.items()}
+    expected["checksum"] = Layout((count,), (1,))
+    for name, layout in expected.items():
+        if sizes[name][:2] != layout[:2]:
+            what = f"shape {sizes[name].shape} where axes and problem say {layout.shape}"
+            fail(name, what, "Overwrite the store")
+    needed = sum(math.prod(v.shape) * v.itemsize for v in sizes.values())
+    there = needed if isinstance(path, str) else _stored_bytes(path)
+    if needed > max(SMALL, MOST_COMPRESSED * there):
+        what = f"describes {in_units(needed)} of data, its files hold {in_units(there)}"
+        fail("zarr.json", what, "Overwrite it")
+    require_memory("zarr.json", needed, "Read it on a larger machine")
+    return found, together
+
+
+class Layout(NamedTuple):
+    """Shape and chunks of a variable, and the bytes of one number."""
+
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+    itemsize: int = 8
+
+
+def _layout(name: str, one: Any) -> Layout:
+    """Return the layout that the metadata of a variable describe. Raises ValueError unless they are
+    such as `Store` writes."""
+    try:
+        shape, chunks = one["shape"], one["chunk_grid"]["configuration"]["chunk_shape"]
+        kind, codecs = one["data_type"], [codec["name"] for codec in one["codecs"]]
+        fine = (
+            all(type(size) is int and size >= 0 for size in [*shape, *chunks])
+            and codecs == ["vlen-utf8" if kind == "string" else "bytes", "zstd", "crc32c"]
+            and not one["storage_transformers"]
+            and len(shape) == len(chunks)
+            and isinstance(one["attributes"], dict)
+        )
+        size = 64 if kind == "string" else np.dtype(kind).itemsize
+    except (LookupError, TypeError):
+        fine = False
+    if not fine:
+        fail(name, "metadata are not such as are written here", "Overwrite the store")
+    return Layout(tuple(shape), tuple(chunks), size)
+
+
+def _marks(path: Path | str, group: zarr.Group, count: int) -> np.ndarray:
+    """Return the checksums of all blocks, 0 of those that are not done."""
+    array, marks = array_of(group, "checksum"), np.zeros(count, np.uint64)
+    if isinstance(path, str):
+        return np.asarray(array[:])
+    for file in (path / "checksum" / "c").glob("*"):
+        if not (file.name.isdecimal() and int(file.name) < count):
+            fail("checksum", f"holds {shown(file.name)}, which is of no block", "Overwrite it")
+        marks[int(file.name)] = array[int(file.name)]
+    return marks
+
+
+def _require_files(
+    path: Path | str,
+    arrays: Mapping[str, np.ndarray],
+    part: tuple[slice, ...],
+    block: Sequence[int],
+    where: str,
+) -> None:
+    """Raise ValueError where a variable has no file of a block whose data are not as written. One
+    whose numbers are all the fill value has none either, which alone is no damage."""
+    place = [str(along.start // size) for along, size in zip(part, block, strict=True)]
+    for name, value in arrays.items():
+        tail = ["0"] * (value.ndim - len(part))
+        if isinstance(path, Path) and not path.joinpath(name, "c", *place, *tail).exists():
+            fail(where, f"data are not as they were written, {name} has no file", "Resume")
+
+
+def _stored_bytes(path: Path) -> int:
+    """Return the bytes of all files of a store. Raises ValueError where one is no ordinary file,
+    such as a pipe, which would be waited for."""
+    total = 0
+    for file in path.rglob("*"):
+        if not file.is_file() and not file.is_dir():
+            fail(str(file.relative_to(path)), "is no file", "Overwrite the store")
+        total += file.stat().st_size if file.is_file() else 0
+    return total
+
+
+def open_dataset(path: str | Path) -> "xr.Dataset":
+    """Return the store as an xarray Dataset (lazy); samples of blocks not done hold the fill
+    values. `xarray.open_zarr(path)` does the same."""
+    import xarray as xr  # takes longer to import than to read
+
+    open_group(location(path), "r")
+    return xr.open_zarr(path)
