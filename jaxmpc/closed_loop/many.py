@@ -29,7 +29,8 @@ from jaxmpc.checks import fail, require_real
 from jaxmpc.closed_loop.noise import Noise
 from jaxmpc.closed_loop.observer import KalmanFilter
 from jaxmpc.closed_loop.run import Run
-from jaxmpc.closed_loop.simulation import Conditions, checked_loop, reference_shapes, simulate
+from jaxmpc.closed_loop.simulation import Conditions, checked_loop, simulate
+from jaxmpc.mpc.arguments import reference_shapes
 from jaxmpc.mpc.stagewise.nonlinear import ConstantModel
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.precision import arrays
@@ -134,7 +135,8 @@ def _require_own(
     own: Mapping[str, np.ndarray], shared: Conditions, controller: Any, steps: int, count: int
 ) -> None:
     """Raise ValueError unless the references of each loop have these shapes."""
-    shapes = reference_shapes(controller, steps)
+    widths = getattr(controller, "reference_sizes", None)
+    shapes = reference_shapes(controller.mpc, steps, widths)
     for name, value in own.items():
         if getattr(shared, name) is not None:
             fail(f"{name}s", f"given beside {name}", "Give one for all loops, or one for each")

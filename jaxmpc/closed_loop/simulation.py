@@ -6,15 +6,15 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals
-from jaxmpc.checks import fail, require_real, whole
+from jaxmpc.checks import fail, whole
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
 from jaxmpc.closed_loop.noise import Noise
 from jaxmpc.closed_loop.observer import Belief, KalmanFilter, model_of, model_step
 from jaxmpc.closed_loop.run import Run
+from jaxmpc.mpc.arguments import checked_aim, checked_array
 from jaxmpc.mpc.plan import Control
 from jaxmpc.mpc.problem import weights_of
 from jaxmpc.mpc.stagewise.nonlinear import ConstantModel, as_argument
@@ -115,22 +115,19 @@ def checked_loop(
         fail("controller", what, "Give a Controller, RobotController or LinearFeedback")
     n, size = controller.mpc.system.n, controller.state_size
     whole("steps", steps, 1)
-    require_real("x0", x0)
-    if np.shape(x0) != (size,):
-        fail("x0", f"shape {np.shape(x0)}", f"Give one state ({size},); use jax.vmap for many")
-    shapes: dict[str, list[tuple[int, ...]]] = {
-        **reference_shapes(controller, steps),
-        "disturbance": [(steps, size)],
-        "previous_input": [(controller.mpc.system.m,)],
-    }
-    cast: dict[str, Any] = {}
-    for name, choice in shapes.items():
-        value = getattr(given, name)
-        if value is not None:
-            require_real(name, value)
-            if np.shape(value) not in choice:
-                fail(name, f"shape {np.shape(value)}", f"Give {' or '.join(map(str, choice))}")
-            cast[name] = jnp.asarray(value, controller.dtype)
+    aim = checked_aim(
+        controller.mpc,
+        x0,
+        given.reference,
+        given.input_reference,
+        given.previous_input,
+        steps=steps,
+        state_size=size,
+        widths=getattr(controller, "reference_sizes", None),
+    )
+    disturbance = given.disturbance
+    if disturbance is not None:
+        disturbance = checked_array("disturbance", disturbance, [(steps, size)])
     if whole("delay", given.delay, 0) > 1:
         fail("delay", f"{given.delay}", "Give 0 or 1 samples; put longer delays into the model")
     plant = _checked_plant(plant, size, controller.mpc.system.m)
@@ -149,18 +146,18 @@ def checked_loop(
     if size != n and (noise is not None or observer is not None) and not hasattr(plant, "state"):
         what = f"a {type(plant).__name__} does not say which state has the coordinates ξ"
         fail("plant", what, "Give a Robot, or an object with coordinates(x) and state(ξ)")
-    given = replace(given, noise=noise, observer=observer, delay=int(given.delay), **cast)
-    return as_argument(plant), jnp.asarray(x0, controller.dtype), given
-
-
-def reference_shapes(controller: Any, steps: int) -> dict[str, list[tuple[int, ...]]]:
-    """Return the shapes that references of a loop of so many steps may have."""
-    mpc = controller.mpc
-    sizes = getattr(controller, "reference_sizes", (mpc.system.n,))
-    return {
-        "reference": [shape for k in sizes for shape in ((k,), (steps + mpc.horizon, k))],
-        "input_reference": [(mpc.system.m,), (steps + mpc.horizon - 1, mpc.system.m)],
-    }
+    aim, disturbance = jax.tree.map(lambda v: jnp.asarray(v, controller.dtype), (aim, disturbance))
+    given = replace(
+        given,
+        reference=aim.states,
+        input_reference=aim.inputs,
+        disturbance=disturbance,
+        previous_input=aim.previous_input,
+        noise=noise,
+        observer=observer,
+        delay=int(given.delay),
+    )
+    return as_argument(plant), aim.x0, given
 
 
 def _checked_plant(plant: Any, n: int, m: int) -> Any:

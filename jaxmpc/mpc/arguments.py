@@ -47,18 +47,29 @@ def checked_aim(
     columns that a reference may have, where these are not n. Raises ValueError that names argument,
     shape and cure.
     """
-    N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
-    references = [shape for k in widths or (n,) for shape in ((k,), (N + steps, k))]
+    shapes = reference_shapes(mpc, steps, widths)
+    size = mpc.system.n if state_size is None else state_size
 
     def checked(name: str, value: Reals | None, shapes: Sequence[tuple[int, ...]]) -> Any:
         return None if value is None else checked_array(name, value, shapes)
 
     return Aim(
-        checked_array("x0", x0, [(n if state_size is None else state_size,)]),
-        checked("reference", reference, references),
-        checked("input_reference", input_reference, [(m,), (N + steps - 1, m)]),
-        checked("previous_input", previous_input, [(m,)]),
+        checked_array("x0", x0, [(size,)]),
+        checked("reference", reference, shapes["reference"]),
+        checked("input_reference", input_reference, shapes["input_reference"]),
+        checked("previous_input", previous_input, [(mpc.system.m,)]),
     )
+
+
+def reference_shapes(
+    mpc: MPC, steps: int = 1, widths: Sequence[int] | None = None
+) -> dict[str, list[tuple[int, ...]]]:
+    """Return the shapes that references of `steps` plans in a row may have; see `checked_aim`."""
+    N, m = mpc.horizon, mpc.system.m
+    states: list[tuple[int, ...]] = []
+    for k in widths or (mpc.system.n,):
+        states += [(k,), (N + steps, k)]
+    return {"reference": states, "input_reference": [(m,), (N + steps - 1, m)]}
 
 
 def checked_array(name: str, value: Any, shapes: Sequence[tuple[int, ...]]) -> Any:

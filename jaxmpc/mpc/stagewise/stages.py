@@ -278,7 +278,7 @@ def unconstrained(s: Stages, gains: Gains, weights: Array) -> tuple[Array, Array
     return x + dx, u + du
 
 
-class Conditions(NamedTuple):
+class Optimality(NamedTuple):
     """Rows (rows,) and gradient (N, m) of the Lagrangian with respect to the inputs, the terms of
     both, and the sums that the gradient is a difference of."""
 
@@ -289,7 +289,7 @@ class Conditions(NamedTuple):
     gradient_size: Array
 
 
-def conditions(s: Stages, u: Array, y: Array) -> Conditions:
+def conditions(s: Stages, u: Array, y: Array) -> Optimality:
     """Optimality conditions of inputs u (N, m) and multipliers y (rows,), by the states that u
     leads to and the costates λ_k = ∂J/∂x_k + H'y + A'λ_{k+1}."""
     x = predict(s, u)
@@ -305,7 +305,7 @@ def conditions(s: Stages, u: Array, y: Array) -> Conditions:
     far = absolute.aim._replace(states=-absolute.aim.states, inputs=-absolute.aim.inputs)
     weighed, own_terms = replace(absolute, aim=far).gradient(terms, jnp.abs(u))
     later = jax.lax.cumsum(weighed[1:], reverse=True)
-    return Conditions(
+    return Optimality(
         s.rows(x, u), own + pushed + apply_transposed(s.B, of_cost + of_rows),
         absolute.rows(terms, jnp.abs(u)),
         own_terms + absolute.pull(jnp.abs(y))[1]
