@@ -199,10 +199,10 @@ def over_devices(function: Callable, devices: Devices, batched: Sequence[bool]) 
     places: Any = tuple(placement(devices, each) for each in batched)
     out: Any = placement(devices, True)
     # Each device runs the function as it stands: nothing in it has to be known as replicated.
+    specs = tuple(place.spec for place in places)
     parts = jax.shard_map(
-        function, mesh=out.mesh, in_specs=tuple(place.spec for place in places),
-        out_specs=out.spec, check_vma=False,
-    )  # fmt: skip
+        function, mesh=out.mesh, in_specs=specs, out_specs=out.spec, check_vma=False
+    )
     return Compiled(jax.jit(parts, in_shardings=places, out_shardings=out), places)
 
 

@@ -393,10 +393,9 @@ def natural(factor: Factor, unit: Array, q: Array, bounds: Bounds, w: Array, y: 
     push = unit * jnp.where(factor.flat, force, length)
     rounds = unit * jnp.where(factor.flat, length, length + force)
     per_variable = 1 / jnp.sum(jnp.abs(factor.T), axis=1)
-    return Natural(
-        along * factor.reach, push * per_variable, along * push,
-        rounds * factor.reach, unit * force * per_variable,
-    )  # fmt: skip
+    rows, variables = along * factor.reach, push * per_variable
+    gap, row_terms = along * push, rounds * factor.reach
+    return Natural(rows, variables, gap, row_terms, unit * force * per_variable)
 
 
 def scaled_rows(factor: Factor, qp: QP, unit: Array, z: Array, y: Array) -> tuple[Array, Array]:

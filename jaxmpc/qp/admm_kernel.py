@@ -8,12 +8,14 @@ The rows are divided into pieces of powers of two, the sizes that Triton takes.
 """
 
 import functools
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 
 from jaxmpc.qp import triton
 from jaxmpc.qp.admm import Factor
@@ -24,6 +26,8 @@ from jaxmpc.qp.triton import (
     EXACT,
     LEAST,
     ROUGH,
+    Product,
+    Ref,
     call,
     has_kernels,
     indices,
@@ -60,7 +64,7 @@ def row_pieces(rows: int, balls: tuple[int, ...]) -> list[tuple[int, int]]:
     return [(0, padded_side(rows))] if balls else pieces(rows)
 
 
-def suits(factor: Factor, balls: tuple[int, ...], dtype: Any, product: Any) -> bool:
+def suits(factor: Factor, balls: tuple[int, ...], dtype: DTypeLike, product: Product) -> bool:
     """Return whether there is a kernel for iterates of this type and matrices of this size."""
     m, n = factor.A.shape[-2:]
     if not has_kernels(m) or dtype != jnp.float32:
@@ -71,28 +75,30 @@ def suits(factor: Factor, balls: tuple[int, ...], dtype: Any, product: Any) -> b
 
 
 def iterate_batch(
-    factor: Factor, alpha: Array, q: Array, bounds: Bounds, t: Array, iterations: int,
-    product: Any = EXACT,
-) -> tuple[Array, Array]:  # fmt: skip
+    made: Factor,
+    alpha: Array,
+    q: Array,
+    bounds: Bounds,
+    t: Array,
+    iterations: int,
+    product: Product = EXACT,
+) -> tuple[Array, Array]:
     """Return `iterate` of a batch: q (B, n), t (B, m) and bounds with B in front of all leaves.
     product: how float32 is multiplied, EXACT, or ROUGH where Newton steps follow."""
-    (B, m), dtype, stages = t.shape, t.dtype, len(factor.rho)
+    (B, m), dtype, stages, balls = t.shape, t.dtype, len(made.rho), bounds.balls
     if not iterations:
         return t, t
-    balls = bounds.balls
-    columns = row_pieces(m, balls)
-    inner = pieces(factor.A.shape[1])
+    columns, inner = row_pieces(m, balls), pieces(made.A.shape[1])
     low_rank = 2 * total(inner) < total(columns)
     # More instances a program where there are programs enough for all of the GPU's processors.
     T = 64 if total(columns) <= 64 and B >= LARGE else LEAST
     dot = functools.partial(triton.dot, product=product)
 
-    offsets = [-matmul(matmul(q, Minv), factor.A.T) for Minv in factor.Minv]
-    turned = lambda M: jnp.swapaxes(M, -1, -2)
+    offsets = [-matmul(matmul(q, Minv), made.A.T) for Minv in made.Minv]
     if low_rank:
-        matrices = [turned(factor.F), factor.A.T]
+        matrices = [_turned(made.F), made.A.T]
     else:
-        matrices = [turned(matmul(factor.A, factor.F) if factor.G is None else factor.G)]
+        matrices = [_turned(matmul(made.A, made.F) if made.G is None else made.G)]
     vectors = [jnp.stack(offsets, axis=1), t, *bounds.columns]
     if balls:
         free = m - sum(balls)
@@ -102,88 +108,138 @@ def iterate_batch(
         vectors.append(jnp.pad(radius, ((0, 0), (free, 0)), constant_values=jnp.inf))
         matrices.append(jnp.asarray(same, dtype))
 
-    def kernel(*refs: Any) -> None:
-        alpha_ref, rho_ref, *rest = refs
-        *rest, out_ref, previous_ref = rest
-        matrix_refs, vector_refs = rest[: len(matrices)], rest[len(matrices) :]
-        row = program() * T + indices(T)
+    def kernel(*refs: Ref) -> None:
+        alpha_ref, rho_ref, *rest, out_ref, previous_ref = refs
+        matrix_refs, (b_ref, t_ref, *bound_refs) = rest[: len(matrices)], rest[len(matrices) :]
+        tile = Tile(program() * T + indices(T), B, m)
         places = [first + indices(size) for first, size in columns]
         ranks = [first + indices(size) for first, size in inner]
-
-        def matrix(ref: Any, i: Array, j: Array, stage: int | None) -> Array:
-            at = (i[:, None], j[None, :])
-            rows, cols = ref.shape[-2:]
-            where = ref.at[at] if stage is None else ref.at[(stage, *at)]
-            return load(where, (i[:, None] < rows) & (j[None, :] < cols))
-
-        def vector(ref: Any, i: Array, *stage: int, other: float = 0.0) -> Array:
-            at = (row[:, None], *stage, i[None, :])
-            return load(ref.at[at], (row[:, None] < B) & (i[None, :] < m), other)
-
-        def times(parts: list[Array], blocks: list[list[Array]]) -> list[Array]:
-            return [
-                sum((dot(r, M) for r, M in zip(parts[1:], column[1:], strict=True)),
-                    dot(parts[0], column[0]))
-                for column in blocks
-            ]  # fmt: skip
-
-        def all_blocks(ref: Any, rows: list, cols: list, stage: int | None) -> list[list[Array]]:
-            return [[matrix(ref, i, j, stage) for i in rows] for j in cols]
-
-        b_ref, t_ref, *bound_refs = vector_refs
-        if balls:
-            *bound_refs, radius_ref = bound_refs
-            radius = vector(radius_ref, places[0], other=jnp.inf)
-            same = matrix(matrix_refs[-1], places[0], places[0], None)
-        tiles = [
-            Bounds.of_rows(
-                vector(ref, i, other=free) for ref, free in zip(bound_refs, FREE, strict=False)
-            )
-            for i in places
-        ]
-
-        def project(t: list[Array], rho: list[Array]) -> list[Array]:
-            if not balls:
-                return [b.project(v, r) for b, v, r in zip(tiles, t, rho, strict=True)]
-            [b], [v], [r] = tiles, t, rho
-            s, in_ball = v - jnp.clip(v, b.l, b.u), radius < jnp.inf
-            squared = jnp.where(in_ball, s * s, 0.0)
-            length = jnp.sqrt(dot(squared, same))
-            outside = length > radius
-            factor = jnp.where(outside, radius / jnp.where(outside, length, 1.0), 1.0)
-            return [v - jnp.where(in_ball, s * (1 - factor), b.prox_residual(v, r))]
-
+        within = TileBounds.read(tile, places, bound_refs, matrix_refs[-1] if balls else None, dot)
         alpha = alpha_ref[0]
-        t = [vector(t_ref, i) for i in places]
+        t = [tile.load(t_ref, i) for i in places]
         previous, before = t, None
         for stage in range(stages):
             rho = [load(rho_ref.at[stage, i], i < m, 1.0)[None, :] for i in places]
             if before is not None:  # the multiplier R v is what carries over, not v
-                s = project(t, before)
+                s = within.project(t, before)
                 t = [s + b / r * (t - s) for s, t, b, r in zip(s, t, before, rho, strict=True)]
             before = rho
-            b = [vector(b_ref, i, stage) for i in places]
+            b = [tile.load(b_ref, i, stage) for i in places]
             if low_rank:
-                down = all_blocks(matrix_refs[0], places, ranks, stage)
-                factors = [down, all_blocks(matrix_refs[1], ranks, places, None)]
+                down = _blocks(matrix_refs[0], places, ranks, stage)
+                factors = [down, _blocks(matrix_refs[1], ranks, places, None)]
             else:
-                factors = [all_blocks(matrix_refs[0], places, places, stage)]
-
-            def step(_: Any, carry: Any, rho: Any = rho, b: Any = b, factors: Any = factors) -> Any:
-                t, _ = carry
-                s = project(t, rho)
-                r = [2 * s - t for s, t in zip(s, t, strict=True)]
-                image = functools.reduce(times, factors, r)
-                new = [t + alpha * (i + b - s) for t, i, b, s in zip(t, image, b, s, strict=True)]
-                return new, t
-
+                factors = [_blocks(matrix_refs[0], places, places, stage)]
+            step = functools.partial(_step, within, factors, alpha, rho, b)
             count = jnp.int32(iterations // stages)
             t, previous = jax.lax.fori_loop(jnp.int32(0), count, step, (t, previous))
         for ref, value in ((out_ref, t), (previous_ref, previous)):
             for i, v in zip(places, value, strict=True):
-                inside = (row[:, None] < B) & (i[None, :] < m)
-                store(ref.at[row[:, None], i[None, :]], v, inside)
+                tile.store(ref, i, v)
 
     shapes = [jax.ShapeDtypeStruct((B, m), dtype)] * 2
     run = call(kernel, shapes, WARPS, (-(-B // T),))
-    return tuple(run(jnp.reshape(alpha, 1).astype(dtype), factor.rho, *matrices, *vectors))
+    return tuple(run(jnp.reshape(alpha, 1).astype(dtype), made.rho, *matrices, *vectors))
+
+
+# A vector of each instance of a tile, (T, size) a piece.
+Parts = list[Array]
+# Pieces of a matrix: a list for each piece of columns, of a block for each piece of rows.
+Blocks = list[list[Array]]
+
+
+@dataclass(frozen=True)
+class Tile:
+    """The instances of one program: places (T,) in a batch of `batch` with `rows` rows each."""
+
+    places: Array
+    batch: int
+    rows: int
+
+    def load(self, ref: Ref, i: Array, *stage: int, other: float = 0.0) -> Array:
+        """Return the entries i of the vectors of a stage."""
+        at = (self.places[:, None], *stage, i[None, :])
+        return load(ref.at[at], self._inside(i), other)
+
+    def store(self, ref: Ref, i: Array, value: Array) -> None:
+        """Store the entries i of the vectors."""
+        inside = self._inside(i)
+        store(ref.at[self.places[:, None], i[None, :]], value, inside)
+
+    def _inside(self, i: Array) -> Array:
+        return (self.places[:, None] < self.batch) & (i[None, :] < self.rows)
+
+
+@dataclass(frozen=True)
+class TileBounds:
+    """The bounds of the instances of a tile, piece by piece; with balls, of which there is one
+    piece, the radius of the ball of each row, and which rows are of the same."""
+
+    pieces: list[Bounds]
+    dot: Callable[[Array, Array], Array]
+    balls: tuple[Array, Array] | None
+
+    @classmethod
+    def read(
+        cls, tile: Tile, places: list[Array], refs: list[Ref], same: Ref | None, dot: Callable
+    ) -> "TileBounds":
+        """Return them as they are in memory: l, u, weights of soft rows, and radius."""
+        balls = None
+        if same is not None:
+            *refs, radius_ref = refs
+            radius = tile.load(radius_ref, places[0], other=jnp.inf)
+            balls = radius, _block(same, places[0], places[0], None)
+        columns = list(zip(refs, FREE, strict=False))
+        pieces = [(tile.load(ref, i, other=free) for ref, free in columns) for i in places]
+        return cls(list(map(Bounds.of_rows, pieces)), dot, balls)
+
+    def project(self, t: Parts, rho: Parts) -> Parts:
+        """Return prox(t) of g/rho."""
+        if self.balls is None:
+            return [b.project(v, r) for b, v, r in zip(self.pieces, t, rho, strict=True)]
+        (radius, same), [b], [v], [r] = self.balls, self.pieces, t, rho
+        s, in_ball = v - jnp.clip(v, b.l, b.u), radius < jnp.inf
+        squared = jnp.where(in_ball, s * s, 0.0)
+        length = jnp.sqrt(self.dot(squared, same))
+        outside = length > radius
+        factor = jnp.where(outside, radius / jnp.where(outside, length, 1.0), 1.0)
+        return [v - jnp.where(in_ball, s * (1 - factor), b.prox_residual(v, r))]
+
+    def times(self, parts: Parts, blocks: Blocks) -> Parts:
+        """Return the product of vectors and a matrix."""
+        products = [list(map(self.dot, parts, column)) for column in blocks]
+        return [sum(rest, first) for first, *rest in products]
+
+
+def _step(
+    within: TileBounds,
+    factors: list[Blocks],
+    alpha: Array,
+    rho: Parts,
+    b: Parts,
+    _: Array,
+    carry: tuple[Parts, Parts],
+) -> tuple[Parts, Parts]:
+    """Return t after a step of ADMM, and before it."""
+    t, _previous = carry
+    s = within.project(t, rho)
+    r = [2 * s - t for s, t in zip(s, t, strict=True)]
+    image = functools.reduce(within.times, factors, r)
+    new = [t + alpha * (i + b - s) for t, i, b, s in zip(t, image, b, s, strict=True)]
+    return new, t
+
+
+def _turned(M: Array) -> Array:
+    return jnp.swapaxes(M, -1, -2)
+
+
+def _block(ref: Ref, i: Array, j: Array, stage: int | None) -> Array:
+    """Return the rows i and columns j of a matrix, of a stage where there are several."""
+    at = (i[:, None], j[None, :])
+    rows, columns = ref.shape[-2:]
+    where = ref.at[at] if stage is None else ref.at[(stage, *at)]
+    return load(where, (i[:, None] < rows) & (j[None, :] < columns))
+
+
+def _blocks(ref: Ref, rows: list[Array], columns: list[Array], stage: int | None) -> Blocks:
+    return [[_block(ref, i, j, stage) for i in rows] for j in columns]

@@ -8,7 +8,6 @@ box rows in the role of the correction). The bound is valid for any y; convergen
 """
 
 from dataclasses import replace
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +20,8 @@ from jaxmpc.qp.projection import Bounds
 
 # Tolerance of a ray's products, in multiples of `rounding`: rays are solutions of linear systems.
 RAY = 25
+# Rows that correct a certificate, and their entries: see `correcting_rows`.
+Correcting = tuple[Array, Array]
 
 
 @pytree
@@ -36,26 +37,24 @@ class Proof:
 
     @classmethod
     def none(cls, z: Array, y: Array) -> "Proof":
-        """Nothing proved of a program with variables like z and rows like y."""
+        """Return that nothing is proved of a program with variables like z and rows like y."""
         false = jnp.asarray(False)
         return cls(jnp.zeros_like(y), false, false, jnp.zeros_like(z), false)
 
     def joined(self, other: "Proof") -> "Proof":
-        """What either proves; of Farkas vectors the first one beyond the tolerance."""
+        """Return what either proves; of Farkas vectors the first one beyond the tolerance."""
         old, new = self, other
         first = old.beyond | (old.infeasible & ~new.beyond)
-        return Proof(
-            jnp.where(first, old.certificate, new.certificate), old.infeasible | new.infeasible,
-            old.beyond | new.beyond,
-            jnp.where(old.unbounded, old.ray, new.ray), old.unbounded | new.unbounded,
-        )  # fmt: skip
+        certificate = jnp.where(first, old.certificate, new.certificate)
+        infeasible, beyond = old.infeasible | new.infeasible, old.beyond | new.beyond
+        ray = jnp.where(old.unbounded, old.ray, new.ray)
+        return Proof(certificate, infeasible, beyond, ray, old.unbounded | new.unbounded)
 
 
 def prove(
-    qp: QP, T: Array, E: Array, correcting: tuple[Array, Array], tolerances: Array, y: Array,
-    d: Array,
-) -> Proof:  # fmt: skip
-    """What is proved of the program by candidates for a Farkas vector y and for a ray d, both in
+    qp: QP, T: Array, E: Array, correcting: Correcting, tolerances: Array, y: Array, d: Array
+) -> Proof:
+    """Return what is proved of the program by candidates for a Farkas vector y and a ray d, both in
     ADMM's coordinates (`admm.scale`). correcting: `correcting_rows(qp)`. tolerances (m,): by how
     much rows may be violated."""
     ray, unbounded = descent_ray(qp, matmul(d, T.T))
@@ -67,7 +66,7 @@ def prove(
     return Proof(*farkas(qp, candidate, correcting, tolerances), ray, unbounded)
 
 
-def correcting_rows(qp: QP) -> tuple[Array, Array]:
+def correcting_rows(qp: QP) -> Correcting:
     """Return for each variable a row that bounds it alone, (n,), and the entry of A there, 0 where
     there is none: the rows that correct a certificate. The choice rests on A and on which rows are
     soft, so a batch shares it."""
@@ -85,9 +84,9 @@ def correcting_rows(qp: QP) -> tuple[Array, Array]:
 
 
 def farkas(
-    qp: QP, y: Array, correcting: tuple[Array, Array], tolerances: Any = 0.0
+    qp: QP, y: Array, correcting: Correcting, tolerances: Array | float = 0.0
 ) -> tuple[Array, Array, Array]:
-    """The candidate y made into a certificate: returns (y, proved, beyond).
+    """Make a certificate of the candidate y: return (y, proved, beyond).
 
     y is scaled to length one, set to zero against infinite bounds, and corrected on rows
     that bound one variable (`correcting_rows`). `proved` is True when Σ u y⁺ − l y⁻ is below zero
@@ -137,7 +136,7 @@ def recession(P: Array, q: Array, bounds: Bounds) -> tuple[Array, Array, Bounds]
 
 
 def descent_ray(qp: QP, d: Array) -> tuple[Array, Array]:
-    """The candidate direction d made into a ray of unbounded descent: returns (d, found).
+    """Make a ray of unbounded descent of the direction d: return (d, found).
 
     Pd = 0, q'd < 0, and A d ≤ 0 where u is finite, ≥ 0 where l is finite, each product to within
     the rounding of its own terms, (|P||d|)_i, |q|'|d| and (|A||d|)_i. Units of

@@ -113,9 +113,8 @@ def _side_by_side(plain: Callable, args: tuple[Array, ...]) -> Any:
         return jnp.moveaxis(v.reshape(-1, lanes, *v.shape[1:]), 1, -1)
 
     out = lax.map(lambda group: plain(*group), tuple(grouped(v) for v in args))
-    return jax.tree.map(
-        lambda v: jnp.moveaxis(v, -1, 1).reshape(-1, *v.shape[1:-1])[:count], out
-    )  # fmt: skip
+    flat = lambda v: jnp.moveaxis(v, -1, 1).reshape(-1, *v.shape[1:-1])[:count]
+    return jax.tree.map(flat, out)
 
 
 def _eliminated(M: Array) -> tuple[Array, Array]:
@@ -221,10 +220,9 @@ def solve(K: Array, B: Array) -> Array:
 def solve_general(M: Array, B: Array) -> Array:
     """Return M⁻¹B for M (n, n) nonsingular and B (n,) or (n, k)."""
     fixed = lax.stop_gradient(M)
-    return lax.custom_linear_solve(
-        lambda X: matmul(M, X), B, lambda _, B: _columns(_general, fixed, B),
-        lambda _, B: _columns(_general, fixed.T, B),
-    )  # fmt: skip
+    forward = lambda _, B: _columns(_general, fixed, B)
+    backward = lambda _, B: _columns(_general, fixed.T, B)
+    return lax.custom_linear_solve(lambda X: matmul(M, X), B, forward, backward)
 
 
 def solve_triangular(L: Array, B: Array) -> Array:
@@ -314,9 +312,15 @@ def _cholesky_in_place(K: Array, **_: Any) -> Array:
 
 
 def _triangular_in_place(
-    M: Array, B: Array, *, left_side: bool, lower: bool, transpose_a: bool, unit_diagonal: bool,
+    M: Array,
+    B: Array,
+    *,
+    left_side: bool,
+    lower: bool,
+    transpose_a: bool,
+    unit_diagonal: bool,
     **_: Any,
-) -> Array:  # fmt: skip
+) -> Array:
     """The operation of `jax.lax.linalg.triangular_solve` for one real matrix."""
     if not left_side:  # X M = B is M'X' = B'
         B, transpose_a = B.T, not transpose_a

@@ -60,9 +60,13 @@ def group_sizes(batch: int, steps: Steps = "short") -> list[int]:
 
 
 def in_blocks(
-    function: Callable, constants: Any, data: Any, *, kernel: Callable | None = None,
+    function: Callable,
+    constants: Any,
+    data: Any,
+    *,
+    kernel: Callable | None = None,
     large: int | None = None,
-) -> Any:  # fmt: skip
+) -> Any:
     """Return function(constants, data), for a batch on a CPU in blocks, one after the other.
 
     kernel: the same of a batch, (constants, data with the batch in front), as a kernel for NVIDIA

@@ -43,10 +43,7 @@ def feasibility_margin(
     last = jnp.zeros(n + 1, dtype).at[n].set(1.0)
     A = jnp.concatenate([jnp.block([[qp.A, s[:, None]], [qp.A, -s[:, None]]]), last[None]])
     none = jnp.full(m, jnp.inf, dtype)
-    program = QP(
-        P=jnp.zeros((n + 1, n + 1), dtype), q=-last, A=A,
-        l=jnp.concatenate([-none, bounds.l, -jnp.full(1, jnp.inf, dtype)]),
-        u=jnp.concatenate([bounds.u, none, jnp.full(1, max_margin, dtype)]),
-    )  # fmt: skip
-    solution = solve_qp(program, solver)
+    l = jnp.concatenate([-none, bounds.l, -jnp.full(1, jnp.inf, dtype)])
+    u = jnp.concatenate([bounds.u, none, jnp.full(1, max_margin, dtype)])
+    solution = solve_qp(QP(jnp.zeros((n + 1, n + 1), dtype), -last, A, l, u), solver)
     return -solution.cost, solution.status

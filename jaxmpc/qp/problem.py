@@ -66,9 +66,16 @@ class QP:
 
     @classmethod
     def from_qpsolvers(
-        cls, P: Any, q: Any, G: Any = None, h: Any = None, A: Any = None, b: Any = None,
-        lb: Any = None, ub: Any = None,
-    ) -> "QP":  # fmt: skip
+        cls,
+        P: Any,
+        q: Any,
+        G: Any = None,
+        h: Any = None,
+        A: Any = None,
+        b: Any = None,
+        lb: Any = None,
+        ub: Any = None,
+    ) -> "QP":
         """The same program from qpsolvers' form: Gz ≤ h, Az = b, lb ≤ z ≤ ub (None: absent).
 
         Rows come in that order: inequalities, equalities, bounds; `QPSolution.duals` splits their

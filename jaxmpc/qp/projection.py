@@ -211,22 +211,17 @@ class Bounds:
             linear = jnp.where(soft, jnp.where(soft, self.linear, 0.0) / E, jnp.inf)
             new = replace(new, linear=linear, quadratic=self.quadratic / E**2)
         for i, (rows, radius) in enumerate(self.blocks()):
-            centre = jnp.where(zero[rows], 0.0, E[rows] * self.l[rows])
+            center = jnp.where(zero[rows], 0.0, E[rows] * self.l[rows])
             radius = jnp.where(zero[rows][0], jnp.inf, E[rows][0] * radius)
-            new = replace(
-                new, l=new.l.at[rows].set(centre), u=new.u.at[rows].set(centre),
-                radius=new.radius.at[i].set(radius),
-            )  # fmt: skip
+            l, u = new.l.at[rows].set(center), new.u.at[rows].set(center)
+            new = replace(new, l=l, u=u, radius=new.radius.at[i].set(radius))
         return new
 
     def divided(self, unit: Array) -> "Bounds":
         """Return what is asked of v/unit when this is asked of v, where the whole program is
         measured in `unit`: multipliers, and with them L1 weights, are divided as v is."""
-        over = lambda v: None if v is None else v / unit
-        return replace(
-            self, l=over(self.l), u=over(self.u), linear=over(self.linear),
-            radius=over(self.radius),
-        )  # fmt: skip
+        parts = {name: getattr(self, name) for name in ("l", "u", "linear", "radius")}
+        return replace(self, **{name: v / unit for name, v in parts.items() if v is not None})
 
     def widened(self, e: Array) -> "Bounds":
         """Return the bounds that a v with the prox residual e (m,) of hard rows meets."""

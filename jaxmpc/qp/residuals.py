@@ -248,20 +248,19 @@ def check_terms(terms: Terms, eps: Array, floor: float, others: Terms = ()) -> P
 
 
 def assess(
-    terms: Callable[..., Terms], data: tuple, z: Array, y: Array, proof: Proof, eps: Any,
-    **more: Any,
-) -> QPSolution:  # fmt: skip
-    """Return the solution (z, y) with the status that its residuals, terms(*data, z, y, **more) in
-    float64, and the proofs give it; without its cost and count of iterations."""
+    terms: Callable[..., Terms], data: tuple, z: Array, y: Array, proof: Proof, eps: Array
+) -> QPSolution:
+    """Return the solution (z, y) with the status that its residuals, terms(*data, z, y) in float64,
+    and the proofs give it; without its cost and count of iterations."""
     dtype, floor = z.dtype, rounding(z.dtype)
-    measure = lambda data, z, y, eps, more: Measured.of(terms(*data, z, y, **more), eps, floor)
-    return with_status(precisely(measure, data, z, y, jnp.asarray(eps, dtype), more), z, y, proof)
+    measure = lambda data, z, y, eps: Measured.of(terms(*data, z, y), eps, floor)
+    return with_status(precisely(measure, data, z, y, jnp.asarray(eps, dtype)), z, y, proof)
 
 
 def with_status(measured: Measured, z: Array, y: Array, proof: Proof) -> QPSolution:
     """Return the solution (z, y) with the status that its residuals and the proofs give it; without
     its cost and count of iterations."""
-    solved, dtype = measured.small, z.dtype
+    solved = measured.small
     # Rows that contradict each other by less than eps are both solved and proved empty: say solved.
     infeasible = proof.infeasible & ~solved
     unbounded = proof.unbounded & ~solved & ~infeasible
@@ -270,20 +269,17 @@ def with_status(measured: Measured, z: Array, y: Array, proof: Proof) -> QPSolut
         [Status.SOLVED, Status.PRIMAL_INFEASIBLE, Status.DUAL_INFEASIBLE],
         Status.ITERATION_LIMIT,
     )
-    return QPSolution(
-        z=z, y=y, cost=jnp.zeros((), dtype), status=status.astype(jnp.int32),
-        primal_residual=measured.primal, dual_residual=measured.dual, gap=measured.gap,
-        iterations=jnp.int32(0), certificate=jnp.where(infeasible, proof.certificate, 0.0),
-        ray=jnp.where(unbounded, proof.ray, 0.0),
-    )  # fmt: skip
+    cost, status = jnp.zeros((), z.dtype), status.astype(jnp.int32)
+    primal, dual, gap, _ = vars(measured).values()
+    certificate = jnp.where(infeasible, proof.certificate, 0.0)
+    ray = jnp.where(unbounded, proof.ray, 0.0)
+    none = jnp.int32(0)
+    return QPSolution(z, y, cost, status, primal, dual, gap, none, certificate, ray)
 
 
 def with_fault(solution: QPSolution, fault: Array) -> QPSolution:
     """Return the solution where the data were usable; NaN and the status `fault` where not."""
-    nan = lambda v: jnp.where(fault == Status.NOT_RUN, v, jnp.nan)
-    s = solution
-    return replace(
-        s, z=nan(s.z), y=nan(s.y), cost=nan(s.cost), primal_residual=nan(s.primal_residual),
-        dual_residual=nan(s.dual_residual), gap=nan(s.gap),
-        status=jnp.where(fault == Status.NOT_RUN, s.status, fault),
-    )  # fmt: skip
+    usable = fault == Status.NOT_RUN
+    names = ("z", "y", "cost", "primal_residual", "dual_residual", "gap")
+    found = {name: jnp.where(usable, getattr(solution, name), jnp.nan) for name in names}
+    return replace(solution, **found, status=jnp.where(usable, solution.status, fault))

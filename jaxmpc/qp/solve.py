@@ -4,6 +4,7 @@ implicit derivative."""
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from operator import attrgetter
 from typing import Any, TypeVar
 
 import jax
@@ -36,12 +37,14 @@ from jaxmpc.qp.dual_search import has_dual_steps
 from jaxmpc.qp.loops import in_blocks
 from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.newton import MultiplierState, multipliers_start, multipliers_step
-from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely
+from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely, symmetric
 from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.refine import Improved, improve
 from jaxmpc.qp.residuals import (
+    Natural,
     Pair,
+    Terms,
     assess,
     largest_of,
     residual_terms,
@@ -93,9 +96,12 @@ def _solve(qp: QP, solver: ADMM, warm_start: Any, *, whole: bool) -> QPSolution:
 
 
 def in_two_parts(
-    program: Callable[..., T], hard: bool, solver: ADMM, *arguments: Any,
-    status: Callable[[T], Any] = lambda found: found.status,
-) -> T:  # fmt: skip
+    program: Callable[..., T],
+    hard: bool,
+    solver: ADMM,
+    *arguments: Any,
+    status: Callable[[T], Array] = attrgetter("status"),
+) -> T:
     """Return program(*arguments, whole=True), whose status is status(result).
 
     One instance from plain Python runs first without the method of multipliers, which most programs
@@ -116,10 +122,9 @@ def as_arrays(qp: QP) -> QP:
     symmetric, and bounds of 1e20 and above as infinity."""
     dtype = floating_dtype(qp)
     qp = jax.tree.map(lambda v: jnp.asarray(v, dtype), qp, is_leaf=lambda v: isinstance(v, list))
-    return replace(
-        qp, P=(qp.P + qp.P.T) / 2, l=jnp.where(qp.l <= -INFINITE, -jnp.inf, qp.l),
-        u=jnp.where(qp.u >= INFINITE, jnp.inf, qp.u),
-    )  # fmt: skip
+    l = jnp.where(qp.l <= -INFINITE, -jnp.inf, qp.l)
+    u = jnp.where(qp.u >= INFINITE, jnp.inf, qp.u)
+    return replace(qp, P=symmetric(qp.P), l=l, u=u)
 
 
 def solve_factored(
@@ -232,7 +237,12 @@ def stepped_end(p: ScaledProgram, begin: MultiplierState, most: int) -> QPSoluti
     allowed = p.eps * row_sizes(0.0, qp.row_sizes, sizes)
     certified = partial(prove, qp, factor.T, factor.E, correcting_rows(qp), allowed)
     proof = certified(end.change, end.move).joined(certified(end.y, end.w))
-    return assess(residual_terms, (qp,), *pair, proof, p.eps, natural=sizes)
+    return assess(terms_beside, (qp, sizes), *pair, proof, p.eps)
+
+
+def terms_beside(qp: QP, natural: Natural, z: Array, y: Array) -> Terms:
+    """Return `residual_terms` with the data in front."""
+    return residual_terms(qp, z, y, natural)
 
 
 def loop(iterations: int, constants: tuple, data: tuple) -> list[tuple[Array, Array]]:
