@@ -72,9 +72,14 @@ def joint(s: Settings, rng: np.random.Generator) -> Case:
     system = jm.LinearSystem(np.array([[1, 0.01], [0, 1]]), np.array([[0], [0.2]]), dt=0.01)
     limit, count = np.array([1.5, 2.0]), s.train + s.test
     mpc = jm.MPC(
-        system, np.eye(2), np.eye(1), s.horizon, states=jm.Box(-limit, limit),
-        inputs=jm.Box([-2.0], [2.0]), constrained_stages=tuple(range(1, s.horizon + 1)),
-    )  # fmt: skip
+        system,
+        np.eye(2),
+        np.eye(1),
+        s.horizon,
+        states=jm.Box(-limit, limit),
+        inputs=jm.Box([-2.0], [2.0]),
+        constrained_stages=tuple(range(1, s.horizon + 1)),
+    )
     solver = jm.ADMM(s.iterations, newton_steps=s.newton_steps)
 
     def controller(q: Any, r: Any) -> Any:
@@ -127,17 +132,23 @@ def trial(s: Settings, name: str, seed: int) -> None:
     )
     expert = drive(case.hidden)
     wrong = {
-        key: value * np.exp(rng.choice([-1, 1], value.shape)
-                            * rng.uniform(*np.log(s.wrong), value.shape))
+        key: value
+        * np.exp(rng.choice([-1, 1], value.shape) * rng.uniform(*np.log(s.wrong), value.shape))
         for key, value in case.hidden.items()
-    }  # fmt: skip
+    }
     seen, unseen = slice(None, s.train), slice(s.train, None)
     tuned = tune_weights(
-        lambda v: case.controller(**v), {k: Parameter(v, "positive") for k, v in wrong.items()},
-        case.plant, case.starts[seen], imitation(case.starts, expert.states, case.size), s.samples,
+        lambda v: case.controller(**v),
+        {k: Parameter(v, "positive") for k, v in wrong.items()},
+        case.plant,
+        case.starts[seen],
+        imitation(case.starts, expert.states, case.size),
+        s.samples,
         optimizer=optax.adam(optax.cosine_decay_schedule(s.rate, s.updates, 0.01)),
-        updates=s.updates, mode=s.mode, **case.aims,
-    )  # fmt: skip
+        updates=s.updates,
+        mode=s.mode,
+        **case.aims,
+    )
     print(
         f"\n{name}, trial {seed}: {len(case.starts[seen])} starts to learn from (a quarter to "
         f"validate), {len(case.starts[unseen])} unseen, {s.samples} samples, N = {s.horizon}, "

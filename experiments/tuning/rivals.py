@@ -34,9 +34,16 @@ def mpc_pytorch(joint: Joint, horizon: int, loops: int, states: bool) -> Callabl
         C = torch.block_diag(2 * L @ L.T, 2 * r).expand(horizon + 1, loops, 3, 3)
         c = torch.zeros(*C.shape[:3], dtype=x.dtype)
         solver = mpc.MPC(
-            2, 1, horizon + 1, u_lower=-joint.u_max, u_upper=joint.u_max, n_batch=loops, verbose=-1,
-            exit_unconverged=False, detach_unconverged=False,
-        )  # fmt: skip
+            2,
+            1,
+            horizon + 1,
+            u_lower=-joint.u_max,
+            u_upper=joint.u_max,
+            n_batch=loops,
+            verbose=-1,
+            exit_unconverged=False,
+            detach_unconverged=False,
+        )
         return solver(x, mpc.QuadCost(C, c), mpc.LinDx(F, None))[1][0]
 
     return law
@@ -62,7 +69,7 @@ def cvxpylayers(joint: Joint, horizon: int, loops: int, states: bool) -> Callabl
 
 def with_torch(
     joint: Joint, law: Callable, theta: dict, x0s: np.ndarray, samples: int
-) -> tuple[float, np.ndarray]:  # fmt: skip
+) -> tuple[float, np.ndarray]:
     """Time of the forward pass, and the gradient with respect to θ."""
     import torch
 

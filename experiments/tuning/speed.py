@@ -69,15 +69,26 @@ def problem(s: Settings, limits: str, solver: jm.ADMM) -> ClosedLoopObjective:
     system = jm.LinearSystem(j.A, j.B, dt=0.01)
     states = jm.Box(-j.x_max, j.x_max) if limits == "full" else None
     mpc = jm.MPC(
-        system, j.Q, j.R, s.horizon, states=states, inputs=jm.Box([-j.u_max], [j.u_max]),
+        system,
+        j.Q,
+        j.R,
+        s.horizon,
+        states=states,
+        inputs=jm.Box([-j.u_max], [j.u_max]),
         constrained_stages=tuple(range(1, s.horizon + 1)) if states else None,
-    )  # fmt: skip
+    )
     make = lambda v: replace(mpc, Q=v["Q"], R=v["R"], terminal_cost=v["Q"])
     loss = ClosedLoopLoss(j.Q, j.R, violation=0.0)
     return ClosedLoopObjective(
-        lambda v: jm.Controller(make(v), solver), START, as_argument(system), s.samples, loss,
-        None, None, None,
-    )  # fmt: skip
+        lambda v: jm.Controller(make(v), solver),
+        START,
+        as_argument(system),
+        s.samples,
+        loss,
+        None,
+        None,
+        None,
+    )
 
 
 def central(at: Callable, theta: dict, h: float) -> np.ndarray:
@@ -86,8 +97,9 @@ def central(at: Callable, theta: dict, h: float) -> np.ndarray:
     for name, entries in theta.items():
         for i in range(len(entries)):
             moved = lambda side, name=name, i=i: {
-                **theta, name: theta[name] + side * h * (np.arange(len(theta[name])) == i)
-            }  # fmt: skip
+                **theta,
+                name: theta[name] + side * h * (np.arange(len(theta[name])) == i),
+            }
             slope.append((float(at(moved(1))[0]) - float(at(moved(-1))[0])) / (2 * h))
     return np.array(slope)
 
@@ -132,9 +144,7 @@ def report(s: Settings, limits: str, x0s: np.ndarray) -> None:
             ours = problem(s, limits, jm.ADMM(s.iterations, newton_steps=s.newton_steps))
             begun = time.perf_counter()
             total = Compiled(jax.jit(ours.total))
-            at = lambda theta, ours=ours, total=total: total(
-                *ours.arguments(theta, x0s, {}, ones)
-            )  # fmt: skip
+            at = lambda theta, ours=ours, total=total: total(*ours.arguments(theta, x0s, {}, ones))
             at(theta)
             first = time.perf_counter() - begun
             forward, *_ = timed(lambda at=at: at(theta), s.repeats)

@@ -90,9 +90,10 @@ def world(s: Settings, robot: Robot, count: int, seed: int) -> tuple[np.ndarray,
     factor = rng.uniform(1 - s.mass, 1 + s.mass, (count, model.nbody))
     damping = rng.uniform(1 - s.damping, 1 + s.damping, (count, model.nv)) * model.dof_damping
     varied = {
-        "body_mass": factor * model.body_mass, "dof_damping": damping,
+        "body_mass": factor * model.body_mass,
+        "dof_damping": damping,
         "body_inertia": factor[..., None] * model.body_inertia,
-    }  # fmt: skip
+    }
     if s.payload:
         varied["payload"] = rng.uniform(0, s.payload, count)
     return np.asarray(robot.home) + shift, varied
@@ -122,19 +123,32 @@ def run(s: Settings) -> None:
     aims = {"reference": np.asarray(robot.coordinates(x_ref)), "input_reference": u_ref}
     guess, make = law(s, robot)
     loss = ClosedLoopLoss(
-        guess["q"] * np.repeat([s.tracking, s.damped], nv), guess["r"] * s.effort,
-        *aims.values(), robot.state_limits, violation=s.violation, plant=robot,
-    )  # fmt: skip
+        guess["q"] * np.repeat([s.tracking, s.damped], nv),
+        guess["r"] * s.effort,
+        *aims.values(),
+        robot.state_limits,
+        violation=s.violation,
+        plant=robot,
+    )
     parameters = {name: Parameter(v, "positive") for name, v in guess.items()}
     known, unseen = world(s, robot, s.train + s.validation, 0), world(s, robot, s.test, 1)
     print(f"{s}\n{jax.devices()[0].device_kind}, JAX {jax.__version__}", flush=True)
 
     begun, compiling = time.perf_counter(), Compiled.seconds
     tuned = tune_weights(
-        make, parameters, robot, known[0], loss, s.samples, variations=known[1], mode=s.mode,
-        validation=s.validation / (s.train + s.validation), updates=s.updates,
-        optimizer=optax.adam(optax.cosine_decay_schedule(s.rate, s.updates, 0.1)), **aims,
-    )  # fmt: skip
+        make,
+        parameters,
+        robot,
+        known[0],
+        loss,
+        s.samples,
+        variations=known[1],
+        mode=s.mode,
+        validation=s.validation / (s.train + s.validation),
+        updates=s.updates,
+        optimizer=optax.adam(optax.cosine_decay_schedule(s.rate, s.updates, 0.1)),
+        **aims,
+    )
     compiling = Compiled.seconds - compiling
     wall = time.perf_counter() - begun - compiling
 

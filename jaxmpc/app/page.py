@@ -48,8 +48,10 @@ def table(title: str, values: dict[str, Any], level: int = 2) -> str:
         for key, value in values.items()
         if key not in inner and value is not None
     ]
-    below = [table(f"{title}: {_words(key)}" if level > 2 else _words(key), value, level + 1)
-             for key, value in inner.items()]  # fmt: skip
+    below = [
+        table(f"{title}: {_words(key)}" if level > 2 else _words(key), value, level + 1)
+        for key, value in inner.items()
+    ]
     heading = [f"<h{min(level, 4)}>{html.escape(title)}</h{min(level, 4)}>"]
     body = [f"<table>{''.join(rows)}</table>"] if rows else []
     return "\n".join([*heading, *body, *below])

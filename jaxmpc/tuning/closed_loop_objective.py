@@ -58,9 +58,14 @@ class ClosedLoopObjective:
         return arrays((theta, self.plant, x0s, varied, weights))
 
     def total(
-        self, theta: Any, plant: Any, x0s: Array, varied: dict[str, Array], weights: Array,
+        self,
+        theta: Any,
+        plant: Any,
+        x0s: Array,
+        varied: dict[str, Array],
+        weights: Array,
         checkpoint: bool = False,
-    ) -> tuple[Array, dict[str, Array]]:  # fmt: skip
+    ) -> tuple[Array, dict[str, Array]]:
         """Return the weighted mean loss, and the recorded numbers of each loop."""
         given = values(self.parameters, theta)
         controller = self.build(given)
@@ -80,12 +85,13 @@ class ClosedLoopObjective:
             worst = jax.vmap(self.loss.worst)(run)
         fraction = lambda v: jnp.mean(v.astype(float), axis=1)
         aux = {
-            "losses": losses, "design": design,
+            "losses": losses,
+            "design": design,
             "unsolved": fraction(run.status != Status.SOLVED),
             "infeasible": fraction(run.status == Status.PRIMAL_INFEASIBLE),
             "fallback": fraction(run.fallback & (run.status == Status.SOLVED)),
             "violation": worst > TOLERANCE[run.states.dtype.name],
-        }  # fmt: skip
+        }
         return total + design, aux
 
     def check(self, theta: Any, data: Data) -> None:

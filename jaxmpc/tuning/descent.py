@@ -75,9 +75,15 @@ class State:
 
 
 def descend(
-    theta: Any, gradient: Gradient, validate: Validate, optimizer: optax.GradientTransformation,
-    settings: Settings, decides: Any = None, every: int = 1, shown: str | None = None,
-) -> Descent:  # fmt: skip
+    theta: Any,
+    gradient: Gradient,
+    validate: Validate,
+    optimizer: optax.GradientTransformation,
+    settings: Settings,
+    decides: Any = None,
+    every: int = 1,
+    shown: str | None = None,
+) -> Descent:
     """Minimise from θ = `theta`, a pytree of NumPy arrays, by `settings.updates` optimiser steps.
 
     gradient(θ, t): loss, gradient and further numbers on the batch of step t; a function of its
@@ -205,20 +211,24 @@ def _checked(validate: Validate, theta: Any) -> dict[str, float]:
 def _record(state: State) -> Descent:
     """Return the public record of the descent."""
     column = lambda rows, name: np.array([row.get(name, np.nan) for row in rows])
-    names = lambda rows, known: [n for n in dict.fromkeys(n for r in rows for n in r)
-                                 if n not in known]  # fmt: skip
+    names = lambda rows, known: [
+        n for n in dict.fromkeys(n for r in rows for n in r) if n not in known
+    ]
     known = ("loss", "gradient_norm", "accepted")
     validation = column(state.checks, "loss")
     best = int(np.nanargmin(validation))
     return Descent(
-        theta=state.thetas[best], best=best,
+        theta=state.thetas[best],
+        best=best,
         thetas=jax.tree.map(lambda *v: np.stack(v), *state.thetas),
-        loss=column(state.rows, "loss"), gradient_norm=column(state.rows, "gradient_norm"),
-        accepted=column(state.rows, "accepted").astype(bool), validation=validation,
+        loss=column(state.rows, "loss"),
+        gradient_norm=column(state.rows, "gradient_norm"),
+        accepted=column(state.rows, "accepted").astype(bool),
+        validation=validation,
         numbers={n: column(state.rows, n) for n in names(state.rows, known)},
         validation_numbers={n: column(state.checks, n) for n in names(state.checks, ("loss",))},
         seconds=state.seconds,
-    )  # fmt: skip
+    )
 
 
 def _save_checkpoint(path: Path | None, state: State, mark: str, decides: Any) -> None:
@@ -231,10 +241,14 @@ def _save_checkpoint(path: Path | None, state: State, mark: str, decides: Any) -
     for k, theta in enumerate((state.theta, jax.tree.map(lambda *v: np.stack(v), *state.thetas))):
         leaves |= {f"theta_{k}_{i}": v for i, v in enumerate(jax.tree.leaves(theta))}
     plain = {
-        "fingerprint": mark, "decides": decides, "fraction": state.fraction,
-        "seconds": state.seconds, "rows": state.rows, "checks": state.checks,
+        "fingerprint": mark,
+        "decides": decides,
+        "fraction": state.fraction,
+        "seconds": state.seconds,
+        "rows": state.rows,
+        "checks": state.checks,
         "moved": state.good is not None,
-    }  # fmt: skip
+    }
     write_arrays(path, plain, **leaves)
 
 
@@ -261,10 +275,11 @@ def _load_checkpoint(
         with jax.enable_x64(True):
             good = restored((theta, theta, optimizer.init(theta)), "good")
     state = State(
-        restored(theta, "theta_0"), good,
+        restored(theta, "theta_0"),
+        good,
         thetas=[jax.tree.map(lambda v, t=t: v[t], every) for t in range(count)],
         **{name: plain[name] for name in ("fraction", "seconds", "rows", "checks")},
-    )  # fmt: skip
+    )
     if good is not None:  # the step that was taken is the one that this optimiser takes
         again = _after_step(good, state.fraction, optimizer)
         close = lambda a, b: np.allclose(a, b, rtol=1e-6, atol=1e-9)

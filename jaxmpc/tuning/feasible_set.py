@@ -24,10 +24,15 @@ from jaxmpc.tuning.settings import Settings
 
 
 def tune_feasible_set(
-    make_mpc: Callable[[Mapping[str, Any]], MPC], parameters: Parameters, x0s: Reals,
-    width: float = 0.02, *, design_loss: Callable[[MPC], Any] | None = None,
-    newton_steps: int = STEPS, **settings: Any,
-) -> TuningRun:  # fmt: skip
+    make_mpc: Callable[[Mapping[str, Any]], MPC],
+    parameters: Parameters,
+    x0s: Reals,
+    width: float = 0.02,
+    *,
+    design_loss: Callable[[MPC], Any] | None = None,
+    newton_steps: int = STEPS,
+    **settings: Any,
+) -> TuningRun:
     """Enlarge the feasible set by gradient: min_θ design_loss(mpc) − feasible_fraction(mpc, x0s).
 
     make_mpc, parameters: as in `tune_weights`, make_mpc to an MPC. x0s (B, n): states spread
@@ -60,11 +65,9 @@ def tune_feasible_set(
         return design - fraction, {"fraction": fraction, "design": design}
 
     slope, value = (
-        BatchMean(
-            lambda *args, f=f: (f(*args), {}), chosen_devices(chosen.devices), (False, True)
-        )
+        BatchMean(lambda *args, f=f: (f(*args), {}), chosen_devices(chosen.devices), (False, True))
         for f in (jax.value_and_grad(total, has_aux=True), total)
-    )  # fmt: skip
+    )
 
     def gradient(theta: Any, step: int) -> tuple[float, Any, dict[str, float]]:
         rows = chosen.minibatch(len(train), step)
@@ -80,9 +83,14 @@ def tune_feasible_set(
 
     decides = {
         "parameters": {name: p.record() for name, p in parameters.items()},
-        "width": float(width), "batch": min(chosen.batch or len(train), len(train)),
-        "train": len(train), "validation": len(test), "newton_steps": newton_steps,
-        "seed": chosen.seed, "dtype": "float64", "data": fingerprint(None, train, test),
-    }  # fmt: skip
+        "width": float(width),
+        "batch": min(chosen.batch or len(train), len(train)),
+        "train": len(train),
+        "validation": len(test),
+        "newton_steps": newton_steps,
+        "seed": chosen.seed,
+        "dtype": "float64",
+        "data": fingerprint(None, train, test),
+    }
     history = descend(raw(parameters), gradient, validate, optax.adam(0.05), chosen, decides)
     return finished(TuningRun.of_parameters(parameters, history, decides, make_mpc))

@@ -100,9 +100,11 @@ class Parameter:
             None if end is None else np.asarray(end).tolist() for end in (self.lower, self.upper)
         ]
         return {
-            "domain": self.domain, "value": self.value.tolist(), "train": self.train.tolist(),
+            "domain": self.domain,
+            "value": self.value.tolist(),
+            "train": self.train.tolist(),
             "ends": ends,
-        }  # fmt: skip
+        }
 
     def raw(self) -> np.ndarray:
         """Return θ of the entries that are trained, (k,)."""

@@ -108,9 +108,13 @@ def loss_and_gradient(devices: Devices = None) -> BatchMean:
 
 
 def solve_samples(
-    rho: np.ndarray, alpha: Any, objective: PenaltyObjective, samples: Samples, chunk: int,
+    rho: np.ndarray,
+    alpha: Any,
+    objective: PenaltyObjective,
+    samples: Samples,
+    chunk: int,
     devices: Devices = None,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray]:
     """Return status and largest residual (B,) of the samples by the solver itself.
 
     rho (stages, rows). chunk: samples at once; one size, so that it compiles once.
@@ -120,9 +124,11 @@ def solve_samples(
     for i in range(0, len(samples), chunk):
         part = samples.take(slice(i, i + chunk))
         found = program(
-            jnp.asarray(rho), jnp.asarray(alpha, float), objective,
+            jnp.asarray(rho),
+            jnp.asarray(alpha, float),
+            objective,
             jax.tree.map(lambda v: padded(v, chunk), part),
-        )  # fmt: skip
+        )
         parts.append(first_rows(found, len(part)))
     status, worst = (np.concatenate(part) for part in zip(*parts, strict=True))
     return status, worst
@@ -135,7 +141,7 @@ def _solve_batches(devices: Devices) -> Compiled:
 
 def _solve_batch(
     rho: Array, alpha: Array, objective: PenaltyObjective, samples: Samples
-) -> tuple[Array, Array]:  # fmt: skip
+) -> tuple[Array, Array]:
     """Return status and largest residual (B,) of a batch, in JAX."""
     c, solver = objective.condensed, replace(objective.solver, rho=rho, alpha=alpha)
     made = factor(c.P, c.C, solver, c.balls)
@@ -159,5 +165,6 @@ def score(status: np.ndarray, worst: np.ndarray) -> dict[str, float]:
     digits = float(np.log10(np.clip(median, 1e-16, 1e16)))
     return {
         "loss": float(np.sum(status != Status.SOLVED)) + (digits + 17) / 34,
-        "solved": float(np.mean(status == Status.SOLVED)), "residual": median,
-    }  # fmt: skip
+        "solved": float(np.mean(status == Status.SOLVED)),
+        "residual": median,
+    }

@@ -43,9 +43,12 @@ class TuningRun:
 
     @classmethod
     def of_parameters(
-        cls, parameters: Parameters, history: Descent, settings: dict[str, Any],
+        cls,
+        parameters: Parameters,
+        history: Descent,
+        settings: dict[str, Any],
         build: Callable[[Mapping[str, Any]], Any],
-    ) -> "TuningRun":  # fmt: skip
+    ) -> "TuningRun":
         """Return the run of a descent of `parameters`, whose start is what was given."""
         at = lambda k: {
             "loss": float(history.validation[k]),
@@ -54,10 +57,16 @@ class TuningRun:
         initial = {name: np.asarray(p.value) for name, p in parameters.items()}
         improved = history.best > 0
         return cls(
-            exact_values(parameters, history.theta) if improved else initial, initial, at(0),
-            at(history.best), improved, settings, build, history,
+            exact_values(parameters, history.theta) if improved else initial,
+            initial,
+            at(0),
+            at(history.best),
+            improved,
+            settings,
+            build,
+            history,
             trajectory(parameters, history.thetas),
-        )  # fmt: skip
+        )
 
     @property
     def result(self) -> Any:
@@ -91,20 +100,28 @@ class TuningRun:
         listed = lambda tree: {name: np.asarray(v).tolist() for name, v in tree.items()}
         column = lambda v: [float(x) if np.isfinite(x) else None for x in v]
         found = {
-            "settings": self.settings, "initial": listed(self.initial),
-            "values": listed(self.values), "improved": self.improved,
-            "improvement": self.improvement, "before": self.before, "after": self.after,
-        }  # fmt: skip
+            "settings": self.settings,
+            "initial": listed(self.initial),
+            "values": listed(self.values),
+            "improved": self.improved,
+            "improvement": self.improvement,
+            "before": self.before,
+            "after": self.after,
+        }
         h = self.history
         if h is None:
             return found
         return found | {
-            "best_step": h.best, "loss": column(h.loss), "gradient_norm": column(h.gradient_norm),
-            "accepted": h.accepted.tolist(), "validation": column(h.validation),
+            "best_step": h.best,
+            "loss": column(h.loss),
+            "gradient_norm": column(h.gradient_norm),
+            "accepted": h.accepted.tolist(),
+            "validation": column(h.validation),
             "numbers": {name: column(v) for name, v in h.numbers.items()},
             "validation_numbers": {name: column(v) for name, v in h.validation_numbers.items()},
-            "values_by_step": listed(self.trace), "seconds": h.seconds,
-        }  # fmt: skip
+            "values_by_step": listed(self.trace),
+            "seconds": h.seconds,
+        }
 
 
 class Interrupted(KeyboardInterrupt):
@@ -127,9 +144,12 @@ def finished(run: TuningRun) -> TuningRun:
 
 
 def cached(
-    cache: str | Path | None, decides: Mapping[str, Any], settings: Settings,
-    build: Callable[[Mapping[str, Any]], Any], tune: Callable[[], TuningRun],
-) -> TuningRun:  # fmt: skip
+    cache: str | Path | None,
+    decides: Mapping[str, Any],
+    settings: Settings,
+    build: Callable[[Mapping[str, Any]], Any],
+    tune: Callable[[], TuningRun],
+) -> TuningRun:
     """Return the run kept in the folder `cache`, else the run of `tune`, which is kept there.
 
     decides["fingerprint"]: names the file; a damaged one counts as absent. build: of the run.

@@ -45,10 +45,19 @@ SOLVER = ADMM(newton_steps=0)
 
 
 def tune_solver(
-    mpc: MPC, x0s: Reals, iterations: int = 100, *, stages: int = 4, groups: str = "step",
-    solver: ADMM | None = None, warm_start: Any = None, reference: Reals | None = None,
-    input_reference: Reals | None = None, cache: str | Path | None = None, **settings: Any,
-) -> TuningRun:  # fmt: skip
+    mpc: MPC,
+    x0s: Reals,
+    iterations: int = 100,
+    *,
+    stages: int = 4,
+    groups: str = "step",
+    solver: ADMM | None = None,
+    warm_start: Any = None,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
+    cache: str | Path | None = None,
+    **settings: Any,
+) -> TuningRun:
     """Tune ADMM's rho and alpha for an MPC problem, so that `iterations` steps solve more states.
 
     x0s (B, n), or (B, n + m) with the previous inputs where these count: states such as the
@@ -79,19 +88,33 @@ def tune_solver(
     chosen.validate()
     solver = SOLVER if solver is None else solver
     objective, train, test = _prepared(
-        mpc, x0s, iterations, stages, groups, solver, warm_start, reference, input_reference,
+        mpc,
+        x0s,
+        iterations,
+        stages,
+        groups,
+        solver,
+        warm_start,
+        reference,
+        input_reference,
         chosen,
-    )  # fmt: skip
+    )
     given, c = replace(solver, iterations=iterations), objective.condensed
     if solver.rho is None:
         with jax.enable_x64(True):
             given = replace(given, rho=float(factor(c.P, c.C, solver, c.balls).rho[0, 0]))
     decides: dict[str, Any] = {
-        "version": VERSION, "iterations": int(iterations), "stages": int(stages),
-        "groups": groups, "batch": chosen.batch, "seed": chosen.seed, "knots": _knots(mpc),
-        "horizon": mpc.horizon, "blocks": [[k, list(s), n] for k, s, n in c.layout],
+        "version": VERSION,
+        "iterations": int(iterations),
+        "stages": int(stages),
+        "groups": groups,
+        "batch": chosen.batch,
+        "seed": chosen.seed,
+        "knots": _knots(mpc),
+        "horizon": mpc.horizon,
+        "blocks": [[k, list(s), n] for k, s, n in c.layout],
         "balls": list(c.balls),
-    }  # fmt: skip
+    }
     if chosen.optimizer is None:  # its schedule knows their number; with another, a run may grow
         decides["updates"] = chosen.updates
     decides["fingerprint"] = fingerprint(decides, objective, train, test, given.rho, given.alpha)
@@ -104,15 +127,21 @@ def tune_solver(
     if not run.improved:
         warnings.warn(
             "tune_solver: nothing found is better on the validation set than the solver given "
-            f"({run.before['solved']:.1%} solved); that one is the result", stacklevel=2,
-        )  # fmt: skip
+            f"({run.before['solved']:.1%} solved); that one is the result",
+            stacklevel=2,
+        )
     return run
 
 
 def tune_schedule(
-    objective: PenaltyObjective, train: Samples, test: Samples, given: ADMM, stages: int,
-    settings: Settings, decides: dict[str, Any],
-) -> TuningRun:  # fmt: skip
+    objective: PenaltyObjective,
+    train: Samples,
+    test: Samples,
+    given: ADMM,
+    stages: int,
+    settings: Settings,
+    decides: dict[str, Any],
+) -> TuningRun:
     """Start at the best constant penalty, descend, and compare with `given`."""
     rows, parameters = objective.W.shape
     chunk, devices = len(test), chosen_devices(settings.devices)
@@ -156,9 +185,15 @@ def tune_schedule(
     schedule = optax.cosine_decay_schedule(RATE, max(settings.updates, 1), 0.03)
     every = max(settings.updates // VALIDATIONS, 1)
     history = descend(
-        theta, gradient, validate, optax.adam(schedule, b2=0.99), settings, decides, every,
+        theta,
+        gradient,
+        validate,
+        optax.adam(schedule, b2=0.99),
+        settings,
+        decides,
+        every,
         "solved",
-    )  # fmt: skip
+    )
     after = {"loss": history.validation[history.best]} | {
         name: float(v[history.best]) for name, v in history.validation_numbers.items()
     }
@@ -166,10 +201,16 @@ def tune_schedule(
     before = score(*measure(**initial, samples=test))
     improved = bool(after["loss"] < before["loss"])
     return TuningRun(
-        _values(history.theta, objective.W) if improved else initial, initial, before | left_out,
-        (after if improved else before) | left_out, improved, decides,
-        partial(_with_values, given), history, _values(history.thetas, objective.W),
-    )  # fmt: skip
+        _values(history.theta, objective.W) if improved else initial,
+        initial,
+        before | left_out,
+        (after if improved else before) | left_out,
+        improved,
+        decides,
+        partial(_with_values, given),
+        history,
+        _values(history.thetas, objective.W),
+    )
 
 
 def _values(theta: Any, W: np.ndarray) -> dict[str, np.ndarray]:
@@ -189,9 +230,17 @@ def _knots(mpc: MPC) -> int:
 
 
 def _prepared(
-    mpc: MPC, x0s: Any, iterations: int, stages: int, groups: str, solver: ADMM, warm_start: Any,
-    reference: Any, input_reference: Any, settings: Settings,
-) -> tuple[PenaltyObjective, Samples, Samples]:  # fmt: skip
+    mpc: MPC,
+    x0s: Any,
+    iterations: int,
+    stages: int,
+    groups: str,
+    solver: ADMM,
+    warm_start: Any,
+    reference: Any,
+    input_reference: Any,
+    settings: Settings,
+) -> tuple[PenaltyObjective, Samples, Samples]:
     """Return the objective, and states for training and validation; ValueError for bad input."""
     require_kind("mpc", mpc, MPC)
     mpc.validate()
@@ -244,7 +293,11 @@ def _prepared(
         train, test = samples, Samples(states("validation", settings.validation))
     W = interpolation(groups, c.layout, mpc.horizon, c.balls, _knots(mpc))
     plain = replace(
-        solver, iterations=int(iterations), rho=1.0, alpha=ALPHA, newton_steps=0,
+        solver,
+        iterations=int(iterations),
+        rho=1.0,
+        alpha=ALPHA,
+        newton_steps=0,
         differentiate="unrolled",
-    )  # fmt: skip
+    )
     return PenaltyObjective(c, W, tracked[0], tracked[1], plain), train, test

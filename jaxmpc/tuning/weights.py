@@ -36,12 +36,21 @@ SOLVER = ADMM(iterations=50, rho=1.0, alpha=1.6, newton_steps=20)
 
 
 def tune_weights(
-    make_mpc: Callable[[Mapping[str, Any]], Any], parameters: Parameters, plant: Any, x0s: Reals,
-    loss: Callable[[Run], Any] | None = None, steps: int = 50, *, reference: Reals | None = None,
-    input_reference: Reals | None = None, variations: Mapping[str, Any] | None = None,
-    solver: ADMM | None = None, design_loss: Callable[[MPC], Any] | None = None,
-    mode: str = "auto", **settings: Any,
-) -> TuningRun:  # fmt: skip
+    make_mpc: Callable[[Mapping[str, Any]], Any],
+    parameters: Parameters,
+    plant: Any,
+    x0s: Reals,
+    loss: Callable[[Run], Any] | None = None,
+    steps: int = 50,
+    *,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
+    variations: Mapping[str, Any] | None = None,
+    solver: ADMM | None = None,
+    design_loss: Callable[[MPC], Any] | None = None,
+    mode: str = "auto",
+    **settings: Any,
+) -> TuningRun:
     """Minimise the mean loss of closed loops over parameters of their MPC, by gradient.
 
         min_θ  mean_i loss(run_i(θ)) + design_loss(mpc(θ)),   run_i from x0s[i], T = steps samples
@@ -106,16 +115,26 @@ def tune_weights(
         aims = (aim(initial) if callable(aim) else aim for aim in (reference, input_reference))
         loss = _default_loss(controller, plant, *aims)
     objective = ClosedLoopObjective(
-        build, parameters, as_argument(plant), steps, loss, reference, input_reference,
+        build,
+        parameters,
+        as_argument(plant),
+        steps,
+        loss,
+        reference,
+        input_reference,
         design_loss,
-    )  # fmt: skip
+    )
     objective.check(start, train)
     decides = {
-        "parameters": {name: p.record() for name, p in parameters.items()}, "steps": steps,
-        "batch": min(chosen.batch or len(train[0]), len(train[0])), "train": len(train[0]),
-        "validation": len(test[0]), "seed": chosen.seed,
-        "data": fingerprint(None, train, test), "dtype": np.dtype(controller.dtype).name,
-    }  # fmt: skip
+        "parameters": {name: p.record() for name, p in parameters.items()},
+        "steps": steps,
+        "batch": min(chosen.batch or len(train[0]), len(train[0])),
+        "train": len(train[0]),
+        "validation": len(test[0]),
+        "seed": chosen.seed,
+        "data": fingerprint(None, train, test),
+        "dtype": np.dtype(controller.dtype).name,
+    }
 
     def data(step: int) -> Data:
         """Return the initial states and variations of a step."""

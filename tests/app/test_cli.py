@@ -244,22 +244,40 @@ def canned(mpc, x0s, **settings):
     x0s = np.zeros((7, n)) if x0s is None else x0s
     count = len(x0s)
     worst = Counterexample(
-        state=x0s[0], inputs=np.ones((mpc.horizon, 1)), next_state=x0s[0] + 1.0,
-        normal=np.eye(n)[0], offset=1.0, distance=0.25,
-        feasible_inputs=np.ones((mpc.horizon, 1)), primal_residual=0.0, dual_residual=0.0,
+        state=x0s[0],
+        inputs=np.ones((mpc.horizon, 1)),
+        next_state=x0s[0] + 1.0,
+        normal=np.eye(n)[0],
+        offset=1.0,
+        distance=0.25,
+        feasible_inputs=np.ones((mpc.horizon, 1)),
+        primal_residual=0.0,
+        dual_residual=0.0,
         found="search",
-    )  # fmt: skip
+    )
     refuted = Claim(False, "an example", x0s[0])
     labels = Labels.empty(count, FeasibilityProblem.of(mpc))
     return RecursionReport(
-        mpc=mpc, strong=refuted, law=refuted, weak=Claim(None, "no facets"), counterexample=worst,
-        feasible_set=Box(-np.ones(n), np.ones(n)).to_polytope(), volume=4.0, lost_by_any=np.nan,
-        lost_by_law=0.5, seconds=1.0, loops=SampledLoops(
-            x0s=x0s, labels=replace(labels, label=np.ones(count, np.int8)),
-            inputs=np.zeros((count, 1)), next_states=x0s, lost_at=np.arange(count) % 3,
-            undecided_at=np.zeros(count, int), steps=settings["steps"],
+        mpc=mpc,
+        strong=refuted,
+        law=refuted,
+        weak=Claim(None, "no facets"),
+        counterexample=worst,
+        feasible_set=Box(-np.ones(n), np.ones(n)).to_polytope(),
+        volume=4.0,
+        lost_by_any=np.nan,
+        lost_by_law=0.5,
+        seconds=1.0,
+        loops=SampledLoops(
+            x0s=x0s,
+            labels=replace(labels, label=np.ones(count, np.int8)),
+            inputs=np.zeros((count, 1)),
+            next_states=x0s,
+            lost_at=np.arange(count) % 3,
+            undecided_at=np.zeros(count, int),
+            steps=settings["steps"],
         ),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture
@@ -287,14 +305,23 @@ def test_recursion_writes_files_and_table(tmp_path, capsys, examined):
     assert settings == expected
     np.testing.assert_allclose(x0s[0], [-1.59, -2.12])  # limits and 3 %
     out = capsys.readouterr().out
-    for word in ("strong", "refuted: an example", "open: no facets", "0.25", "lost by law",
-                 "smallest horizon     5 (by regions); strong from 6"):  # fmt: skip
+    for word in (
+        "strong",
+        "refuted: an example",
+        "open: no facets",
+        "0.25",
+        "lost by law",
+        "smallest horizon     5 (by regions); strong from 6",
+    ):
         assert word in out
     folder = tmp_path / "jaxmpc-recursion"
     assert {path.name for path in folder.iterdir()} == set(recursion.FILES)
     summary = json.loads((folder / "summary.json").read_text())
-    assert summary["claims"]["law"] == {"holds": False, "reason": "an example",
-                                        "state": x0s[0].tolist()}  # fmt: skip
+    assert summary["claims"]["law"] == {
+        "holds": False,
+        "reason": "an example",
+        "state": x0s[0].tolist(),
+    }
     assert summary["counterexample"]["distance"] == 0.25 and summary["lost_by_any"] is None
     assert summary["counts"]["lost after one step"] == 10
     assert summary["config"]["recursion"]["steps"] == 3 and "sweep" not in summary["config"]
@@ -531,9 +558,11 @@ def test_fifty_kills_at_random_moments(tmp_path):
             shutil.rmtree(tmp_path / "killed", ignore_errors=True)
             more = []
         with subprocess.Popen(
-            [*command, "killed", *more], cwd=tmp_path, stdout=subprocess.DEVNULL,
+            [*command, "killed", *more],
+            cwd=tmp_path,
+            stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-        ) as process:  # fmt: skip
+        ) as process:
             time.sleep(random.uniform(1, 6))
             process.kill()
     more = ["--resume"] if (tmp_path / "killed" / "sweep.zarr").exists() else []

@@ -246,10 +246,12 @@ FORGERIES = {
     "horizon that is text": (attributes("problem", "horizon", value="6"), "problem: its"),
     "horizon and plans that fit": (attributes("config", "mpc", "horizon", value=7), "horizon"),
     "a limit of the problem": (
-        attributes("problem", "rows", 0, "upper", value=[9.0]), "problem.rows",
+        attributes("problem", "rows", 0, "upper", value=[9.0]),
+        "problem.rows",
     ),
     "a limit of the configuration": (
-        attributes("config", "limits", "u_max", value=[2.5]), "problem.rows",
+        attributes("config", "limits", "u_max", value=[2.5]),
+        "problem.rows",
     ),
     "a huge number": (attributes("config", "system", "dt", value=1e308), "its configuration is"),
     "a configuration that is none": (attributes("config", "cost", "Q", value=-1), "cost.Q"),
@@ -275,7 +277,8 @@ FORGERIES = {
     "versions": (attributes("versions", value={}, sign=False), "attributes"),
     "the fingerprint": (attributes("fingerprint", value="0" * 32, sign=False), "attributes"),
     "no fingerprint": (
-        lambda folder: edited(folder, lambda root: root["attributes"].pop("fingerprint")), "zarr",
+        lambda folder: edited(folder, lambda root: root["attributes"].pop("fingerprint")),
+        "zarr",
     ),
     "a long axis": (shape("q", 0, HUGE), "blocks"),
     "a long axis in one block": (shape("q", 0, HUGE, chunk=True), "blocks"),
@@ -312,7 +315,7 @@ FORGERIES = {
     "a summary of infinity": (summary(counts={"feasible": 1e999}), "summary.json"),
     "a deep summary": (replaced("summary.json", "[" * 100_000), "summary.json"),
     "no summary": (lambda folder: (folder / "summary.json").unlink(), "summary.json: is missing"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", FORGERIES)
@@ -342,7 +345,7 @@ def test_forged_maps_of_a_robot(tmp_path, report, capsys):
         (attributes("config", "fixed", value=7), "makes no problem"),
         (attributes("config", "robot", value="quadrotor"), "makes no problem"),
         (attributes("config", "robot", value=3), "makes no problem"),
-    ):  # fmt: skip
+    ):
         forged = tmp_path / "forged"
         shutil.copytree(sound, forged, dirs_exist_ok=True)
         change(forged)

@@ -46,8 +46,9 @@ def test_a_run_that_fails_keeps_the_results(folder, monkeypatch, capsys):
         yield
 
     for place, name, raises in (
-        (labelling, "label_parts", broken), (FeasibilityProblem, "of", _raises),
-    ):  # fmt: skip
+        (labelling, "label_parts", broken),
+        (FeasibilityProblem, "of", _raises),
+    ):
         with monkeypatch.context() as patch:
             patch.setattr(place, name, raises)
             assert cli.main([*LINE, str(folder), "--overwrite"]) == 2
@@ -116,9 +117,28 @@ def test_recursion_keeps_its_files_until_it_has_others(tmp_path, monkeypatch):
 
 
 NAMES = (
-    "zarr.json", "ZARR.JSON", ".zgroup", "..", ".", "a/b", "/", "", "__init", "c", "label", "Plan",
-    "x.partial", "checksum", "time", "q" * 300, "角" * 60, "a\\b", "q?", "-", "bound_point",
-)  # fmt: skip
+    "zarr.json",
+    "ZARR.JSON",
+    ".zgroup",
+    "..",
+    ".",
+    "a/b",
+    "/",
+    "",
+    "__init",
+    "c",
+    "label",
+    "Plan",
+    "x.partial",
+    "checksum",
+    "time",
+    "q" * 300,
+    "角" * 60,
+    "a\\b",
+    "q?",
+    "-",
+    "bound_point",
+)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -134,9 +154,14 @@ def test_names_of_states_do_not_break_a_store(tmp_path, name):
         with open_labels(path, problem, along, {}, 12) as kept:
             for block in kept.pending():
                 kept.commit(
-                    block, label=np.ones(12), status=np.ones(12), start=np.ones((12, 2)),
-                    plan=np.ones((12, 2, 1)), cut_normal=np.ones((12, 2)), cut_offset=np.ones(12),
-                )  # fmt: skip
+                    block,
+                    label=np.ones(12),
+                    status=np.ones(12),
+                    start=np.ones((12, 2)),
+                    plan=np.ones((12, 2, 1)),
+                    cut_normal=np.ones((12, 2)),
+                    cut_offset=np.ones(12),
+                )
     found = store.read(path)
     assert found.whole and not found.problems and found.done == 1
     assert found.attributes["problem"]["horizon"] == 2

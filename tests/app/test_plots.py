@@ -105,22 +105,39 @@ def recursion_report(points, worst=True):
     height = points[:, 1]
     lost_at = np.select([~inside, height > 0.9, height > 0.8, height > 0.7], [-1, 1, 4, -2], 0)
     counterexample = Counterexample(
-        state=np.array([0.5, 1.0]), inputs=np.zeros((7, 1)), next_state=np.array([1.2, 0.9]),
-        normal=np.array([1.0, 0.0]), offset=1.0, distance=0.2, feasible_inputs=np.zeros((7, 1)),
-        primal_residual=0.0, dual_residual=0.0, found="search",
-    )  # fmt: skip
+        state=np.array([0.5, 1.0]),
+        inputs=np.zeros((7, 1)),
+        next_state=np.array([1.2, 0.9]),
+        normal=np.array([1.0, 0.0]),
+        offset=1.0,
+        distance=0.2,
+        feasible_inputs=np.zeros((7, 1)),
+        primal_residual=0.0,
+        dual_residual=0.0,
+        found="search",
+    )
     system = LinearSystem(np.eye(2), np.ones((2, 1)), state_names=("q", "dq"))
     return RecursionReport(
         mpc=SimpleNamespace(system=system, horizon=7, labels=system.state_labels),
-        strong=Claim(False, "a"), law=Claim(False, "b"), weak=Claim(None, "c"),
+        strong=Claim(False, "a"),
+        law=Claim(False, "b"),
+        weak=Claim(None, "c"),
         counterexample=counterexample if worst else None,
-        feasible_set=Box(-np.ones(2), np.ones(2)).to_polytope(), volume=4.0, lost_by_any=np.nan,
-        lost_by_law=0.1, seconds=1.0, loops=SampledLoops(
-            x0s=points, labels=SimpleNamespace(label=np.where(inside, 1, -1).astype(np.int8)),
-            inputs=np.zeros((len(points), 1)), next_states=points, lost_at=lost_at,
-            undecided_at=np.where(lost_at == -2, 1, 0), steps=9,
+        feasible_set=Box(-np.ones(2), np.ones(2)).to_polytope(),
+        volume=4.0,
+        lost_by_any=np.nan,
+        lost_by_law=0.1,
+        seconds=1.0,
+        loops=SampledLoops(
+            x0s=points,
+            labels=SimpleNamespace(label=np.where(inside, 1, -1).astype(np.int8)),
+            inputs=np.zeros((len(points), 1)),
+            next_states=points,
+            lost_at=lost_at,
+            undecided_at=np.where(lost_at == -2, 1, 0),
+            steps=9,
         ),
-    )  # fmt: skip
+    )
 
 
 def test_recursion_shows_fates_set_and_counterexample(tmp_path):
@@ -167,25 +184,36 @@ def test_robot_map_says_in_words_what_became_of_each_state(claim):
     label."""
     points = square(21)
     fmap, size = Map(points), np.abs(points).max(axis=1)
-    fmap = SimpleNamespace(**{
-        name: getattr(fmap, name)
-        for name in ("x0s", "fixed", "axes", "mpc", "inner", "outer", "terminal_section")
-    })  # fmt: skip
+    fmap = SimpleNamespace(
+        **{
+            name: getattr(fmap, name)
+            for name in ("x0s", "fixed", "axes", "mpc", "inner", "outer", "terminal_section")
+        }
+    )
     predicted = np.select([size > 1.5, size > 1.3], [-1, 0], 1)
     held = np.where(points[:, 0] > 0.9, -1, 1)
     if claim == "recursion":
         held[points[:, 1] > 0.9] = 0
     unsure = (predicted == 1) & (held == -1) & (points[:, 1] > 0)
     rmap = SimpleNamespace(
-        x0s=points, linear=fmap, claim=claim, predicted=predicted, held=held, unsure=unsure,
-        axis_names=("q [rad]", "dq [rad/s]"), set_point=np.zeros(2), worst=lambda: None,
-        seconds=2.0, robot=SimpleNamespace(name="pendulum", dt=0.02),
-    )  # fmt: skip
+        x0s=points,
+        linear=fmap,
+        claim=claim,
+        predicted=predicted,
+        held=held,
+        unsure=unsure,
+        axis_names=("q [rad]", "dq [rad/s]"),
+        set_point=np.zeros(2),
+        worst=lambda: None,
+        seconds=2.0,
+        robot=SimpleNamespace(name="pendulum", dt=0.02),
+    )
     ax = plot_robot_map(rmap)
     counts = {
         text.rsplit(" (", 1)[0].replace("\n", " "): int(text.rsplit(" (", 1)[1][:-1])
-        for text in texts(ax) if text.endswith(")")
-    }  # fmt: skip
+        for text in texts(ax)
+        if text.endswith(")")
+    }
     assert sum(counts.values()) == len(points)
     undecided = [name for name in counts if "undecided" in name]
     assert [counts.pop(name) for name in undecided] == [np.sum(predicted == 0)]

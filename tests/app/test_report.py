@@ -34,10 +34,12 @@ class Reader(html.parser.HTMLParser):
 def folder(path, name="a <b> & joint"):
     """What a command leaves: results, configuration, a picture."""
     results = {
-        "name": name, "counts": {"feasible": 12, "undecided": 0}, "volume": 0.123456789,
+        "name": name,
+        "counts": {"feasible": 12, "undecided": 0},
+        "volume": 0.123456789,
         "proved": True,
         "config": {"name": name, "mpc": {"horizon": 20, "terminal": None, "P": [[1, 2], [3, 4]]}},
-    }  # fmt: skip
+    }
     (path / "summary.json").write_text(json.dumps(results))
     figure = Figure()
     figure.add_subplot().plot(np.arange(3))

@@ -162,9 +162,11 @@ def test_kills_at_random_moments(tmp_path, kills):
     def start(i):
         command = [sys.executable, "-c", textwrap.dedent(SHARD), str(log), delay, *line, "out"]
         return subprocess.Popen(
-            [*command, "--shard", f"{i}/2", "--resume"], stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            [*command, "--shard", f"{i}/2", "--resume"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
 
     def opened(process):
         """Wait until the process has said what it does; its store is open then."""

@@ -219,10 +219,14 @@ def by_hand(states, inputs, **fields):
     count, samples = inputs.shape[:2]
     zeros = np.zeros((count, samples))
     given = {
-        "cost": zeros, "status": np.ones((count, samples), np.int32), "stage_cost": zeros + 1.0,
-        "violation": np.zeros((count, samples + 1)), "slack": np.zeros((count, samples, 0)),
-        "fallback": np.zeros((count, samples), bool), **fields,
-    }  # fmt: skip
+        "cost": zeros,
+        "status": np.ones((count, samples), np.int32),
+        "stage_cost": zeros + 1.0,
+        "violation": np.zeros((count, samples + 1)),
+        "slack": np.zeros((count, samples, 0)),
+        "fallback": np.zeros((count, samples), bool),
+        **fields,
+    }
     return jm.closed_loop.Run(states=states, inputs=inputs, **given)
 
 
@@ -259,20 +263,29 @@ def test_outcome_and_picture_of_runs_made_by_hand(joint):
     )
     colours = {name: colour for name, (colour, _) in PLANS.items()}
     (slack,), (open_,) = (
-        [line for line in figure.axes[0].lines if line.get_color() == colours[name]
-         and np.isfinite(line.get_ydata()).any()] for name in ("fallback", "unsolved")
-    )  # fmt: skip
+        [
+            line
+            for line in figure.axes[0].lines
+            if line.get_color() == colours[name] and np.isfinite(line.get_ydata()).any()
+        ]
+        for name in ("fallback", "unsolved")
+    )
     for line, first, last in ((slack, 2, 3), (open_, 6, 8)):
-        np.testing.assert_array_equal(np.flatnonzero(np.isfinite(line.get_ydata()))[[0, -1]],
-                                      [first, last])  # fmt: skip
+        np.testing.assert_array_equal(
+            np.flatnonzero(np.isfinite(line.get_ydata()))[[0, -1]], [first, last]
+        )
     (red,) = (line for line in figure.axes[1].lines if len(line.get_xdata()) == 1)
     np.testing.assert_allclose(red.get_xydata(), [[0.03, -2.00001]])
     low, high = figure.axes[1].get_ylim()
     assert low < -2 < 2 < high
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [
-        "one robot", "beyond the limits", "set-point", "its plan needs slack (fallback)",
-        "its plan was not solved", "limit exceeded",
-    ]  # fmt: skip
+        "one robot",
+        "beyond the limits",
+        "set-point",
+        "its plan needs slack (fallback)",
+        "its plan was not solved",
+        "limit exceeded",
+    ]
     feedback = by_hand(x[:1], u[:1], status=np.zeros((1, 10), int))  # a law without plans
     assert "a law without plans" in plot_runs(feedback, joint).get_suptitle()
     with pytest.raises(ValueError, match="robots: .*from 0 to 3"):
@@ -371,8 +384,10 @@ def test_film_shows_the_motion(tmp_path):
     moving = data["still"].astype(int)
     assert green(moving[0]) == 0 and green(moving[2]) > 50, "the target moves away at the end"
     red = (inner[..., 0] > 180) & (inner[..., 1:] < 60).all(axis=-1)
-    edge = {(top, left): red[:, top + 1, left + 30 : left + 130].all(axis=1)
-            for top, left in ((0, 0), (0, 160), (120, 0))}  # fmt: skip
+    edge = {
+        (top, left): red[:, top + 1, left + 30 : left + 130].all(axis=1)
+        for top, left in ((0, 0), (0, 160), (120, 0))
+    }
     np.testing.assert_array_equal(edge[0, 0], [0, 0, 0, 0, 0])
     np.testing.assert_array_equal(edge[0, 160], [0, 1, 0, 0, 0])  # sample 3, between two frames
     np.testing.assert_array_equal(edge[120, 0], [0, 0, 1, 0, 0])  # sample 5

@@ -60,9 +60,11 @@ def test_dots_in_texts_and_numbers_are_none_of_keys(tmp_path):
 def test_names_that_steer_a_terminal_are_refused(tmp_path, name):
     A, B = np.eye(2), np.ones((2, 1))
     for field, value in (
-        ("state_names", ("q", name)), ("state_units", ("m", name)),
-        ("input_names", (name,)), ("input_units", (name,)),
-    ):  # fmt: skip
+        ("state_names", ("q", name)),
+        ("state_units", ("m", name)),
+        ("input_names", (name,)),
+        ("input_units", (name,)),
+    ):
         with pytest.raises(ValueError, match=f"{field}: .* control characters"):
             jm.LinearSystem(A, B, **{field: value}).validate()
     with pytest.raises(ValueError, match="labels: .* control characters"):

@@ -62,9 +62,11 @@ def test_comes_to_the_minimum_and_keeps_the_best():
 
 def test_sgd_steps_are_optax_own():
     """Plain gradient descent on the quadratic has a closed form."""
-    exact = lambda theta, step: (*slope(theta, step)[:1], {
-        name: 2 * (theta[name] - TARGET[name]) for name in TARGET
-    }, {})  # fmt: skip
+    exact = lambda theta, step: (
+        *slope(theta, step)[:1],
+        {name: 2 * (theta[name] - TARGET[name]) for name in TARGET},
+        {},
+    )
     found = bowl(10, exact, optimizer=optax.sgd(0.1))
     np.testing.assert_allclose(found.thetas["b"], 3 * (1 - 0.8 ** np.arange(11)), rtol=1e-12)
 
@@ -113,9 +115,11 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path, monkeypatch, target, late):
     """Killed three times, within the gradient, while writing, before and after the rename."""
     path = tmp_path / "run.npz"
     whole = bowl(12)
-    module = sys.modules[__name__] if target.startswith("test") else importlib.import_module(
-        target.split(".")[0]
-    )  # fmt: skip
+    module = (
+        sys.modules[__name__]
+        if target.startswith("test")
+        else importlib.import_module(target.split(".")[0])
+    )
     name = target.split(".")[1]
     real = getattr(module, name)
     for calls in (2, 3, 4):
@@ -154,9 +158,15 @@ def test_an_interrupt_keeps_the_steps_that_are_done(tmp_path, monkeypatch, capsy
     path = tmp_path / "run.npz"
     settings = Settings(12, optax.adam(0.3), checkpoint=path, progress=True)
     go = lambda: descend(
-        START, lambda *v: slope(*v), lambda *v: check(*v), optax.sgd(0.0), settings, DECIDES, 4,
+        START,
+        lambda *v: slope(*v),
+        lambda *v: check(*v),
+        optax.sgd(0.0),
+        settings,
+        DECIDES,
+        4,
         "first",
-    )  # fmt: skip
+    )
     monkeypatch.setattr(module, names[where], trap)
     if where == "validation":  # before the first step there is nothing to keep
         with pytest.raises(KeyboardInterrupt):
@@ -308,7 +318,7 @@ def test_masks_hold_entries():
         (lambda: require_parameters({"Q": np.eye(2)}), r"parameters\['Q'\].*ndarray"),
         (lambda: require_parameters({"r": Parameter(1.0, train=False)}), "none is trained"),
     ],
-)  # fmt: skip
+)
 def test_bad_parameters(make, message):
     with pytest.raises(ValueError, match=message):
         make()

@@ -26,10 +26,12 @@ def changed(v) -> jm.MPC:
     tight = lambda box, t: jm.Box(box.lower * (1 - t / 2), box.upper * (1 - t))
     P = np.array(P_JOINT) + jnp.array([[v[1], v[2]], [v[2], v[3]]])
     return replace(
-        MPC, states=tight(MPC.states, v[4]), inputs=tight(MPC.inputs, v[5]),
+        MPC,
+        states=tight(MPC.states, v[4]),
+        inputs=tight(MPC.inputs, v[5]),
         terminal_set=jm.Ellipsoid(P, v[0]),
         system=replace(MPC.system, A=MPC.system.A + v[6] * np.array([[0.1, 0.02], [-0.01, 0.2]])),
-    )  # fmt: skip
+    )
 
 
 POINT = np.array([300.0, 0, 0, 0, 0.05, 0.1, 0])
@@ -96,9 +98,13 @@ def test_fraction_of_a_fine_grid_is_the_exact_area():
 def test_tightening_and_rows_that_no_input_moves():
     """One free state: x_0 of |x| ≤ 1 alone; its margin is known, and so is the membership."""
     still = jm.MPC(
-        jm.LinearSystem([[0.5]], [[0.0]]), np.eye(1), np.eye(1), horizon=2,
-        states=jm.Box([-1.0], [1.0]), inputs=jm.Box([-1.0], [1.0]),
-    )  # fmt: skip
+        jm.LinearSystem([[0.5]], [[0.0]]),
+        np.eye(1),
+        np.eye(1),
+        horizon=2,
+        states=jm.Box([-1.0], [1.0]),
+        inputs=jm.Box([-1.0], [1.0]),
+    )
     x0s = np.array([0.0, 0.9, 0.95, 1.0, -1.1])[:, None]
     with jax.enable_x64(True):
         found = membership(still, x0s, 0.1)
@@ -127,9 +133,15 @@ def terminal_law(v) -> jm.MPC:
 @pytest.mark.slow
 def test_tuning_grows_the_set_and_the_terminal_set_stays_invariant():
     run = tune_feasible_set(
-        terminal_law, {"Qt": Parameter(MPC.Q, "diagonal")}, STATES[3:], 0.1, updates=6,
-        optimizer=optax.adam(0.3), batch=64, validation=0.25,
-    )  # fmt: skip
+        terminal_law,
+        {"Qt": Parameter(MPC.Q, "diagonal")},
+        STATES[3:],
+        0.1,
+        updates=6,
+        optimizer=optax.adam(0.3),
+        batch=64,
+        validation=0.25,
+    )
     history = run.history
     assert history.steps == 6 and history.accepted.all()
     assert history.validation[history.best] < history.validation[0] - 0.02
@@ -143,9 +155,13 @@ def test_tuning_grows_the_set_and_the_terminal_set_stays_invariant():
 def test_the_tuned_set_is_larger_by_proof():
     """The area that `map_feasible_set` proves; the exact set without terminal set is its limit."""
     run = tune_feasible_set(
-        terminal_law, {"Qt": Parameter(MPC.Q, "definite")}, STATES[3:], 0.05, updates=25,
+        terminal_law,
+        {"Qt": Parameter(MPC.Q, "definite")},
+        STATES[3:],
+        0.05,
+        updates=25,
         optimizer=optax.adam(0.3),
-    )  # fmt: skip
+    )
     areas = [
         jm.map_feasible_set(mpc, STATES[3:]).refine(1e-3).volume_bounds()
         for mpc in (terminal_law({"Qt": MPC.Q}), run.mpc)

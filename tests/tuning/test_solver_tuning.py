@@ -68,9 +68,17 @@ def test_gradient_against_differences():
     x, rows = states(12, 2), len(jm.mpc.row_table(mpc()))
     start = rng.normal(size=(12, 5)), rng.normal(size=(12, rows))
     objective, samples, _ = tuning_solver._prepared(
-        mpc(), x, 20, 2, "step", DEFAULT, start, np.array([0.3, 0.1]), None,
+        mpc(),
+        x,
+        20,
+        2,
+        "step",
+        DEFAULT,
+        start,
+        np.array([0.3, 0.1]),
+        None,
         Settings(validation=0.5),
-    )  # fmt: skip
+    )
     parameters = objective.W.shape[1]
     theta = {"log_rho": 0.3 * rng.normal(size=(2, parameters)), "alpha": np.array(1.2)}
     with jax.enable_x64(True):
@@ -90,9 +98,11 @@ def test_sabotaged_learning_returns_the_given_solver(learned, rate):
     given = learned[0].solver
     with pytest.warns(UserWarning, match="nothing found is better"):
         found = tune_solver(
-            mpc(), states(160, 0), optimizer=optax.sgd(rate),
+            mpc(),
+            states(160, 0),
+            optimizer=optax.sgd(rate),
             **{**SETTINGS, "solver": given, "updates": 4},
-        )  # fmt: skip
+        )
     assert found.solver is not learned[0].solver and not found.improved
     assert np.array_equal(found.solver.rho, given.rho) and found.solver.alpha == given.alpha
     assert found.after == found.before == learned[0].after
@@ -214,14 +224,16 @@ def test_parameters_stand_for_rows():
         ({"validation": 1.5}, "validation"),
         ({"validation": np.zeros((4, 3))}, "validation: shape"),
         ({"warm_start": (np.zeros((30, 5)), np.zeros((30, 4)))}, "warm_start"),
-        ({"warm_start": (np.zeros((30, 5)), np.zeros((30, 17))), "validation": np.zeros((9, 2))},
-         "beside warm starts"),
+        (
+            {"warm_start": (np.zeros((30, 5)), np.zeros((30, 17))), "validation": np.zeros((9, 2))},
+            "beside warm starts",
+        ),
         ({"reference": np.zeros(3)}, "reference"),
         ({"solver": jm.ADMM(rho=-1.0)}, "rho"),
         ({"mpc": replace(problems.scalar(x_max=None), inputs=None)}, "no rows"),
         ({"cache": "x", "optimizer": optax.sgd(1.0)}, "cache"),
     ],
-)  # fmt: skip
+)
 def test_bad_input(settings, match):
     settings = {"mpc": mpc(), "x0s": states(30, 0), "updates": 1, **settings}
     if settings["mpc"].system.n == 1:

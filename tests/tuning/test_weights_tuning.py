@@ -20,9 +20,15 @@ from jaxmpc.tuning.weights import tune_weights
 SYSTEM = jm.LinearSystem(np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[0.02], [0.2]]), dt=0.2)
 LIMITS = symmetric(1.0, 0.6)
 MPC = jm.MPC(
-    SYSTEM, np.diag([4.0, 0.5]), np.array([[0.2]]), 5, states=LIMITS, inputs=symmetric(1.0),
-    terminal_cost=np.diag([4.0, 0.5]), constrain_initial=False,
-)  # fmt: skip
+    SYSTEM,
+    np.diag([4.0, 0.5]),
+    np.array([[0.2]]),
+    5,
+    states=LIMITS,
+    inputs=symmetric(1.0),
+    terminal_cost=np.diag([4.0, 0.5]),
+    constrain_initial=False,
+)
 SOLVER = jm.ADMM(iterations=80, newton_steps=0, eps=1e-3)  # compiles fastest
 LOSS = ClosedLoopLoss(np.diag([4.0, 0.5]), [0.02], limits=LIMITS, violation=5.0)
 PARAMETERS = {"Q": Parameter(MPC.Q / 4, "definite"), "R": Parameter(10 * MPC.R, "diagonal")}
@@ -133,9 +139,14 @@ def test_design_loss_references_and_other_fields(x64):
 
     aim = ClosedLoopLoss(np.eye(2), [0.0], reference=np.array([0.3, 0.0]))
     found = tune(
-        make=make, parameters=parameters, loss=aim, reference=lambda v: v["goal"],
-        design_loss=lambda mpc: 1e-3 * mpc.soft[0].upper[0], updates=3, optimizer=optax.adam(0.05),
-    )  # fmt: skip
+        make=make,
+        parameters=parameters,
+        loss=aim,
+        reference=lambda v: v["goal"],
+        design_loss=lambda mpc: 1e-3 * mpc.soft[0].upper[0],
+        updates=3,
+        optimizer=optax.adam(0.05),
+    )
     goal = found.history.thetas["goal"][:, 0]
     assert np.all(np.diff(goal) > 0)  # towards 0.3
     assert found.values["tight"] > 0.05  # narrower limits lower the design loss

@@ -99,18 +99,27 @@ class Export:
             print("searching regions", file=sys.stderr)
             regions = critical_regions(mpc)
             paths = export_explicit_c(
-                regions, self.output, name=self.name, dtype=dtype, tolerance=self.tolerance,
+                regions,
+                self.output,
+                name=self.name,
+                dtype=dtype,
+                tolerance=self.tolerance,
                 overwrite=self.overwrite,
-            )  # fmt: skip
+            )
             rows += [("regions", f"{len(regions)}, which fill the feasible set")]
         elif self.law == "jax":
             path = self.output / f"{self.name}.jax"
             paths = [export_jax(mpc, path, solver, dtype=dtype, overwrite=self.overwrite)]
         else:
             paths = export_c(
-                mpc, self.output, solver, name=self.name, dtype=dtype, tolerance=tolerance,
+                mpc,
+                self.output,
+                solver,
+                name=self.name,
+                dtype=dtype,
+                tolerance=tolerance,
                 overwrite=self.overwrite,
-            )  # fmt: skip
+            )
         print(f"{config.name}\n")
         kind = "" if self.law == "jax" else " of text"
         size = lambda path: f"{path.stat().st_size / 1024:.1f} KiB{kind}"

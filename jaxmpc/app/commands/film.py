@@ -29,9 +29,13 @@ def film(robot: Robot, run: Run, reference: np.ndarray, count: int, path: Path) 
         with jax.enable_x64(True):
             target = np.asarray(robot.state(reference))[: robot.mujoco.nq]
         frames = render(
-            robot, run.states[finite], inputs=run.inputs[finite], target=target, every=every,
+            robot,
+            run.states[finite],
+            inputs=run.inputs[finite],
+            target=target,
+            every=every,
             numbers=finite.tolist(),
-        )  # fmt: skip
+        )
     except RuntimeError as error:
         print(f"jaxmpc: {error}", file=sys.stderr)
         return False

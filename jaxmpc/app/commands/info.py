@@ -81,9 +81,12 @@ class Info:
             fail(f"--html {self.html}", "its folder does not exist", "Make it, or give another")
         config = configs.load(self.config, given_options(self, "horizon", "terminal"), "info")
         report = offline_report(
-            config.build_controlled(), steps=self.steps, loops=self.loops, seconds=self.seconds,
+            config.build_controlled(),
+            steps=self.steps,
+            loops=self.loops,
+            seconds=self.seconds,
             progress=True,
-        )  # fmt: skip
+        )
         print(f"{config.name}\n\n{report}")
         if self.html is not None:
             parts = [*_pictures(report), page.text("Offline report", str(report))]

@@ -155,9 +155,14 @@ class Recursion:
         print(f"{config.name}: horizon {mpc.horizon} -> {self.output}")
         seconds = settings.seconds / (1 if self.smallest is None else 2)
         report = recursive_feasibility(
-            mpc, states, steps=settings.steps, search=self.search, max_regions=settings.regions,
-            seconds=seconds, progress=True,
-        )  # fmt: skip
+            mpc,
+            states,
+            steps=settings.steps,
+            search=self.search,
+            max_regions=settings.regions,
+            seconds=seconds,
+            progress=True,
+        )
         rows, least = [], None
         if self.smallest is not None:
             least = smallest_horizon(
@@ -184,8 +189,18 @@ class Recursion:
         at_least(1).check("--horizon", self.horizon)
         at_least(1).check("--steps", self.steps)
         map_robot_into(
-            robot, self.output, claim="recursion", steps=100 if self.steps is None else self.steps,
-            horizon=self.horizon, terminal=self.terminal, axes=self.axes, fixed=self.fixed,
-            grid=self.grid, lower=self.lower, upper=self.upper, resume=self.resume,
-            overwrite=self.overwrite, search_seconds=self.seconds,
-        )  # fmt: skip
+            robot,
+            self.output,
+            claim="recursion",
+            steps=100 if self.steps is None else self.steps,
+            horizon=self.horizon,
+            terminal=self.terminal,
+            axes=self.axes,
+            fixed=self.fixed,
+            grid=self.grid,
+            lower=self.lower,
+            upper=self.upper,
+            resume=self.resume,
+            overwrite=self.overwrite,
+            search_seconds=self.seconds,
+        )

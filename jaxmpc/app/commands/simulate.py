@@ -279,9 +279,14 @@ class Simulate:
         horizon: Any = self.horizon
         more = {"terminal_cost": given["terminal_cost"]} if "terminal_cost" in given else {}
         return robot_mpc(
-            robot, given.get("Q"), given.get("R"), horizon, target=target,
-            margin=self.margin or 0.0, **more,
-        )  # fmt: skip
+            robot,
+            given.get("Q"),
+            given.get("R"),
+            horizon,
+            target=target,
+            margin=self.margin or 0.0,
+            **more,
+        )
 
     def controller(self, robot: Robot, mpc: MPC) -> RobotController | LinearFeedback:
         """Return the controller of --linearize."""
@@ -307,8 +312,10 @@ class Simulate:
         if self.config is not None:
             file = load_robot_config(self.config)
             found |= {
-                "horizon": file.robot.horizon, "margin": file.robot.margin,
-                "linearize": file.robot.linearize, "rho": file.cost.rho,
-            }  # fmt: skip
+                "horizon": file.robot.horizon,
+                "margin": file.robot.margin,
+                "linearize": file.robot.linearize,
+                "rho": file.cost.rho,
+            }
         missing = {key: value for key, value in found.items() if getattr(self, key) is None}
         return dataclasses.replace(self, **missing)

@@ -193,8 +193,20 @@ class Sweep:
         chosen_devices(self.devices, "--devices")
         at_least(1).check("--horizon", self.horizon)
         map_robot_into(
-            robot, self.output, seconds=self.seconds, horizon=self.horizon, terminal=self.terminal,
-            axes=self.axes, fixed=self.fixed, grid=self.grid, lower=self.lower, upper=self.upper,
-            refine=self.refine, resume=self.resume, overwrite=self.overwrite,
-            devices=self.devices, iterations=self.iterations, dtype=self.dtype,
-        )  # fmt: skip
+            robot,
+            self.output,
+            seconds=self.seconds,
+            horizon=self.horizon,
+            terminal=self.terminal,
+            axes=self.axes,
+            fixed=self.fixed,
+            grid=self.grid,
+            lower=self.lower,
+            upper=self.upper,
+            refine=self.refine,
+            resume=self.resume,
+            overwrite=self.overwrite,
+            devices=self.devices,
+            iterations=self.iterations,
+            dtype=self.dtype,
+        )

@@ -67,9 +67,13 @@ class Verify:
         there is no map."""
         path, begun = find_store(self.directory), time.perf_counter()
         found = verify_map(
-            path, exact=self.exact, sample=self.sample, seed=self.seed, progress=True,
+            path,
+            exact=self.exact,
+            sample=self.sample,
+            seed=self.seed,
+            progress=True,
             check=contradictions,
-        )  # fmt: skip
+        )
         folder = Path(self.directory)
         if folder.is_dir() and folder != path and not (folder / "summary.json").exists():
             found.problems.append("summary.json: is missing. Resume the sweep, which writes it")
@@ -110,23 +114,32 @@ def contradictions(attributes: Mapping[str, Any], axes: Mapping[str, np.ndarray]
             view = (None, None) if region is None else (region.axes, region.fixed)
             built = FeasibilityProblem.of(made.build_mpc(), *view).plain()
         elif not _is_here(config["robot"]):
-            print(f"{config['robot']}: is not here; the map's problem is not built from it again",
-                  file=sys.stderr)  # fmt: skip
+            print(
+                f"{config['robot']}: is not here; the map's problem is not built from it again",
+                file=sys.stderr,
+            )
             return []
         else:
             from jaxmpc.robot_maps.stored_sweep import problem_again  # a third of a second
 
             if config["horizon"] != problem.get("horizon"):
-                raise ValueError(f"horizon {shown(config['horizon'])}, the problem says "
-                                 f"{shown(problem.get('horizon'))}")  # fmt: skip
+                raise ValueError(
+                    f"horizon {shown(config['horizon'])}, the problem says "
+                    f"{shown(problem.get('horizon'))}"
+                )
             lower, upper = config["lower"], config["upper"]
-            lines = [np.linspace(low, high, len(axis)) for low, high, axis in
-                     zip(lower, upper, axes.values(), strict=True)]  # fmt: skip
+            lines = [
+                np.linspace(low, high, len(axis))
+                for low, high, axis in zip(lower, upper, axes.values(), strict=True)
+            ]
             built = problem_again(config, np.array([lower, upper])).plain()
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         return [f"configuration: makes no problem ({error})"]
-    found = [f"problem.{key}: {shown(problem.get(key))}, the configuration says {shown(value)}"
-             for key, value in built.items() if not alike(problem.get(key), value)]  # fmt: skip
+    found = [
+        f"problem.{key}: {shown(problem.get(key))}, the configuration says {shown(value)}"
+        for key, value in built.items()
+        if not alike(problem.get(key), value)
+    ]
     for (name, line), stated in zip(axes.items(), lines, strict=bool(lines)):
         if not alike(line.tolist(), stated.tolist()):
             found.append(f"{name}: not the points of the grid in the configuration")

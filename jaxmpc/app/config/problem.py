@@ -40,16 +40,35 @@ KEYS = {
     **{
         name: f"system.{name}"
         for name in (
-            "A", "B", "c", "dt", "state_names", "state_units", "input_names", "input_units",
+            "A",
+            "B",
+            "c",
+            "dt",
+            "state_names",
+            "state_units",
+            "input_names",
+            "input_units",
         )
     },
-    "Q": "cost.Q", "R": "cost.R", "terminal_cost": "cost.P",
-    "horizon": "mpc.horizon", "control_horizon": "mpc.control_horizon", "terminal": "mpc.terminal",
-    "states": "limits.x_min, x_max", "states.lower": "limits.x_min", "states.upper": "limits.x_max",
-    "inputs": "limits.u_min, u_max", "inputs.lower": "limits.u_min", "inputs.upper": "limits.u_max",
-    "states.H": "limits.H_x", "states.h": "limits.h_x", "terminal_set.H": "mpc.H_f",
-    "terminal_set.h": "mpc.h_f", "terminal_set.P": "mpc.P_f", "terminal_set.level": "mpc.level_f",
-}  # fmt: skip
+    "Q": "cost.Q",
+    "R": "cost.R",
+    "terminal_cost": "cost.P",
+    "horizon": "mpc.horizon",
+    "control_horizon": "mpc.control_horizon",
+    "terminal": "mpc.terminal",
+    "states": "limits.x_min, x_max",
+    "states.lower": "limits.x_min",
+    "states.upper": "limits.x_max",
+    "inputs": "limits.u_min, u_max",
+    "inputs.lower": "limits.u_min",
+    "inputs.upper": "limits.u_max",
+    "states.H": "limits.H_x",
+    "states.h": "limits.h_x",
+    "terminal_set.H": "mpc.H_f",
+    "terminal_set.h": "mpc.h_f",
+    "terminal_set.P": "mpc.P_f",
+    "terminal_set.level": "mpc.level_f",
+}
 Result = TypeVar("Result")
 
 

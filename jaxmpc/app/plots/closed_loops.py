@@ -25,9 +25,13 @@ PLANS = {
 
 
 def plot_runs(
-    run: Run, plant: Any, *, reference: Any = None, input_reference: Any = None,
+    run: Run,
+    plant: Any,
+    *,
+    reference: Any = None,
+    input_reference: Any = None,
     robots: Sequence[int] | None = None,
-) -> Figure:  # fmt: skip
+) -> Figure:
     """Draw closed loops over time: a panel for each position, velocity and input.
 
     run: of `simulate` or `simulate_many`, of a Robot or LinearPlant. Limits are lines, what lies
@@ -57,8 +61,10 @@ def plot_runs(
     figure.suptitle(
         f"{plant.name}: {count:,} closed loop{'s' * (count > 1)} of {time[-1]:g} s, {len(shown):,} "
         f"shown. Limits kept by {np.count_nonzero(whole):,} of {count:,}\n{_plans_text(plans)}",
-        fontsize=9, x=0.01, ha="left",
-    )  # fmt: skip
+        fontsize=9,
+        x=0.01,
+        ha="left",
+    )
     line = lambda label, **style: Line2D([], [], label=label, **style)
     handles: list[Any] = [
         line("one robot" if isinstance(plant, Robot) else "one loop", color=RUN, lw=0.8),
@@ -156,9 +162,12 @@ def panel_columns(plant: Any) -> list[tuple[str, list[tuple[int, int, str]]]]:
 
 
 def _draw_lines(
-    ax: Axes, time: np.ndarray, values: np.ndarray, parts: list[tuple[str, np.ndarray]],
+    ax: Axes,
+    time: np.ndarray,
+    values: np.ndarray,
+    parts: list[tuple[str, np.ndarray]],
     broken: np.ndarray,
-) -> None:  # fmt: skip
+) -> None:
     """Draw thin lines (samples, robots), on top parts (colour, plans) and points beyond limits."""
     held = len(values) < len(time)  # inputs, each held for a period
     if held:

@@ -50,11 +50,14 @@ def plot_feasible_set(
         )
         if (count := counts[name] if counts else np.count_nonzero(label == value))
     ]
-    handles += draw_polygons(ax, [
-        (fmap.terminal_section, "terminal set", {"color": TERMINAL, "lw": 1.8}),
-        (fmap.outer, "outer bound", {"color": OUTER, "lw": 2.4}),
-        (fmap.inner, "inner bound", {"color": INNER, "lw": 1.4, "ls": (0, (3, 3))}),
-    ])  # fmt: skip
+    handles += draw_polygons(
+        ax,
+        [
+            (fmap.terminal_section, "terminal set", {"color": TERMINAL, "lw": 1.8}),
+            (fmap.outer, "outer bound", {"color": OUTER, "lw": 2.4}),
+            (fmap.inner, "inner bound", {"color": INNER, "lw": 1.4, "ls": (0, (3, 3))}),
+        ],
+    )
     ax.set_xlabel(fmap.axis_names[0])
     ax.set_ylabel(fmap.axis_names[1])
     ax.set_title(_map_title(fmap), loc="left", fontsize=11)

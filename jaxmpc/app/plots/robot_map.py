@@ -49,16 +49,25 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
     draw_values(ax, points, shown, colours)
     linear = rmap.linear
     ax.autoscale(False)
-    handles += draw_polygons(ax, [
-        (linear.terminal_section, "terminal set", {"color": TERMINAL, "lw": 1.6}),
-        (linear.outer, "linear feasible set, outer bound", {"color": OUTER, "lw": 2.4}),
-        (linear.inner, "linear feasible set, inner bound",
-         {"color": INNER, "lw": 1.4, "ls": (0, (3, 3))}),
-    ])  # fmt: skip
-    marks: list[tuple[Any, str, dict[str, Any]]] = [(
-        rmap.set_point[list(linear.axes)], "set-point",
-        {"marker": "+", "ms": 9, "mew": 1.6, "color": "black"},
-    )]  # fmt: skip
+    handles += draw_polygons(
+        ax,
+        [
+            (linear.terminal_section, "terminal set", {"color": TERMINAL, "lw": 1.6}),
+            (linear.outer, "linear feasible set, outer bound", {"color": OUTER, "lw": 2.4}),
+            (
+                linear.inner,
+                "linear feasible set, inner bound",
+                {"color": INNER, "lw": 1.4, "ls": (0, (3, 3))},
+            ),
+        ],
+    )
+    marks: list[tuple[Any, str, dict[str, Any]]] = [
+        (
+            rmap.set_point[list(linear.axes)],
+            "set-point",
+            {"marker": "+", "ms": 9, "mew": 1.6, "color": "black"},
+        )
+    ]
     worst = rmap.worst()
     if worst is not None:
         name = f"deepest failure,\nfails after {rmap.first_loss[worst] * rmap.robot.dt:.3g} s"
@@ -84,7 +93,7 @@ def _outcomes(rmap: RobotMap) -> list[tuple[str, str, np.ndarray]]:
             "infeasible, and the robot\nleaves its limits",
             "infeasible, yet the robot\nkeeps its limits",
             "linear model undecided:\nno plan and no proof found",
-        )  # fmt: skip
+        )
     else:
         words = (
             "predicted, kept: the robot has\na plan at each time step",
@@ -92,7 +101,7 @@ def _outcomes(rmap: RobotMap) -> list[tuple[str, str, np.ndarray]]:
             "plans run out on the linear\nmodel, and on the robot",
             "plans run out on the linear\nmodel, not on the robot",
             "linear closed loop undecided",
-        )  # fmt: skip
+        )
     predicted, held = rmap.predicted, rmap.held
     unsure = rmap.unsure & (predicted == 1)
     found = [

@@ -69,9 +69,12 @@ def patch(name: str, colour: str, count: Any = None) -> Patch:
 def legend(ax: Axes, handles: list[Any]) -> None:
     """Put the legend to the right of the axes."""
     ax.legend(
-        handles=handles, loc="upper left", bbox_to_anchor=(1.02, 1.0), frameon=False,
+        handles=handles,
+        loc="upper left",
+        bbox_to_anchor=(1.02, 1.0),
+        frameon=False,
         handlelength=2.4,
-    )  # fmt: skip
+    )
 
 
 def draw_polygons(
@@ -100,9 +103,13 @@ def draw_values(ax: Axes, points: np.ndarray, value: np.ndarray, colours: dict[i
         ax.imshow(
             value.reshape(len(x), len(y)).T,
             cmap=ListedColormap([colour for _, colour in sorted(colours.items())]),
-            vmin=min(colours), vmax=max(colours), extent=extent, origin="lower", aspect="auto",
+            vmin=min(colours),
+            vmax=max(colours),
+            extent=extent,
+            origin="lower",
+            aspect="auto",
             interpolation="nearest",
-        )  # fmt: skip
+        )
         return
     size = float(np.clip(2e4 / len(points), 1.0, 30.0))
     for key, colour in colours.items():

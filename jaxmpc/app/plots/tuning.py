@@ -61,9 +61,15 @@ def plot_tuning(
     for ax in (top, norm):
         if len(rejected):
             ax.plot(
-                rejected, np.full(len(rejected), 0.04), "x", color=_REJECTED, ms=5, ls="",
-                transform=ax.get_xaxis_transform(), label=f"rejected steps ({len(rejected)})",
-            )  # fmt: skip
+                rejected,
+                np.full(len(rejected), 0.04),
+                "x",
+                color=_REJECTED,
+                ms=5,
+                ls="",
+                transform=ax.get_xaxis_transform(),
+                label=f"rejected steps ({len(rejected)})",
+            )
     _scale(top, loss, validation)
     _scale(norm, history.gradient_norm)
     _draw_weights(ratio, every, weights)
@@ -150,9 +156,15 @@ def _draw_weights(
 
 
 def plot_before_after(
-    before: Run, after: Run, plant: Any, *, reference: Any = None, input_reference: Any = None,
-    loops: Sequence[int] | None = None, title: str = "",
-) -> Figure:  # fmt: skip
+    before: Run,
+    after: Run,
+    plant: Any,
+    *,
+    reference: Any = None,
+    input_reference: Any = None,
+    loops: Sequence[int] | None = None,
+    title: str = "",
+) -> Figure:
     """Draw the same closed loops before and after tuning: a panel a position, velocity and input.
 
     before, after: of `simulate_many` from the same starts, of a Robot or LinearPlant, whose limits
@@ -262,7 +274,7 @@ def plot_solver(
         Line2D([], [], color="#8a8a8a", ls=dashes, label=f"row {i + 1}")
         for i, dashes in enumerate(_DASHES[:widest])
         if widest > 1
-    ]  # fmt: skip
+    ]
     figure.legend(handles=stages, loc="outside lower left", ncols=8, fontsize=8, frameon=False)
     last = axes[-1]
     for values, name, colour in ((before, "before", _BEFORE), (after, "after", _AFTER)):
@@ -271,9 +283,13 @@ def plot_solver(
         fraction = 100 * np.arange(1, len(values) + 1) / len(values)
         solved = 100 * np.mean(values <= eps)
         last.step(
-            np.maximum(values, 1e-17), fraction, where="post", color=colour, lw=1.6,
+            np.maximum(values, 1e-17),
+            fraction,
+            where="post",
+            color=colour,
+            lw=1.6,
             label=f"{name}: {solved:.1f} % ≤ {eps:g}",
-        )  # fmt: skip
+        )
     last.axvline(eps, color="#8a8a8a", lw=0.9, ls=(0, (4, 2)))
     last.set_xscale("log")
     last.set_ylim(0, 103)
