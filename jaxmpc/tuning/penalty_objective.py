@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.batches import Compiled, Devices, divisible, first_rows, over_devices, padded
+from jaxmpc.batches import Compiled, Devices, divisible, each_part, over_devices
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ADMM, factor, iterate, natural, read, scaled, splittings, unscaled
@@ -119,18 +119,14 @@ def solve_samples(
 
     rho (stages, rows). chunk: samples at once; one size, so that it compiles once.
     """
-    parts, program = [], _solve_batches(devices)
-    chunk = divisible(chunk, devices)
-    for i in range(0, len(samples), chunk):
-        part = samples.take(slice(i, i + chunk))
-        found = program(
-            jnp.asarray(rho),
-            jnp.asarray(alpha, float),
-            objective,
-            jax.tree.map(lambda v: padded(v, chunk), part),
-        )
-        parts.append(first_rows(found, len(part)))
-    status, worst = (np.concatenate(part) for part in zip(*parts, strict=True))
+    solve = _solve_batches(devices)
+    given = jnp.asarray(rho), jnp.asarray(alpha, float), objective
+
+    def program(part: Samples) -> tuple[np.ndarray, np.ndarray]:
+        return solve(*given, part)
+
+    found = [part.result for part in each_part(program, samples, divisible(chunk, devices))]
+    status, worst = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return status, worst
 
 

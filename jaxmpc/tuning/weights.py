@@ -1,6 +1,7 @@
 """tune_weights: tune parameters of an MPC problem by gradients through its closed loops."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -114,16 +115,8 @@ def tune_weights(
     if loss is None:
         aims = (aim(initial) if callable(aim) else aim for aim in (reference, input_reference))
         loss = _default_loss(controller, plant, *aims)
-    objective = ClosedLoopObjective(
-        build,
-        parameters,
-        as_argument(plant),
-        steps,
-        loss,
-        reference,
-        input_reference,
-        design_loss,
-    )
+    given = as_argument(plant), steps, loss, reference, input_reference, design_loss
+    objective = ClosedLoopObjective(build, parameters, *given)
     objective.check(start, train)
     decides = {
         "parameters": {name: p.record() for name, p in parameters.items()},
@@ -135,44 +128,65 @@ def tune_weights(
         "data": fingerprint(None, train, test),
         "dtype": np.dtype(controller.dtype).name,
     }
+    loops = _Loops(objective, chosen, start, train, test, mode)
+    history = descend(start, loops.gradient, loops.validate, optax.adam(0.05), chosen, decides)
+    decides["mode"] = loops.mode
+    return finished(TuningRun.of_parameters(parameters, history, decides, build))
 
-    def data(step: int) -> Data:
+
+@dataclass(eq=False)
+class _Loops:
+    """The closed loops of a descent from `start`, those of its steps and those of validation.
+
+    mode: as given, from the first step on the one that is used; slope: its program. finite: of the
+    validation loops, those that are finite at the start.
+    """
+
+    objective: ClosedLoopObjective
+    settings: Settings
+    start: dict[str, np.ndarray]
+    train: Data
+    test: Data
+    mode: str
+    slope: Callable | None = None
+    finite: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        self.devices = chosen_devices(self.settings.devices)
+        self.evaluate = self.objective.evaluation(self.devices)
+
+    def of_step(self, step: int) -> Data:
         """Return the initial states and variations of a step."""
-        rows = chosen.minibatch(len(train[0]), step)
-        return jax.tree.map(lambda v: v[rows], train)
+        rows = self.settings.minibatch(len(self.train[0]), step)
+        return jax.tree.map(lambda v: v[rows], self.train)
 
-    gradients: list[tuple[str, Callable]] = []  # filled with the chosen mode at the first step
-    devices = chosen_devices(chosen.devices)
-    evaluate = objective.evaluation(devices)
-    sound: list[np.ndarray] = []  # of the validation loops, those finite at the start
-
-    def gradient(theta: Any, step: int) -> tuple[float, Any, dict[str, float]]:
-        x, varied = data(step)
-        if not gradients:
-            gradients.append(objective.gradient(start, data(0), mode, devices))
-        slope, weights = gradients[0][1], np.ones(len(x))
-        value, slopes, aux = slope(theta, x, varied, weights)
+    def gradient(self, theta: Any, step: int) -> tuple[float, Any, dict[str, float]]:
+        """Return loss, gradient and numbers of a step; without the loops that are not finite."""
+        x, varied = self.of_step(step)
+        if self.slope is None:
+            chosen = self.start, self.of_step(0), self.mode, self.devices
+            self.mode, self.slope = self.objective.gradient(*chosen)
+        weights = np.ones(len(x))
+        value, slopes, aux = self.slope(theta, x, varied, weights)
         finite = np.isfinite(value) and all(np.all(np.isfinite(v)) for v in jax.tree.leaves(slopes))
         bad = ~np.isfinite(aux["losses"])
-        if not finite and bad.any() and not bad.all():  # the rest without them
+        if not finite and bad.any() and not bad.all():
             weights = np.where(bad, 0.0, 1.0)
-            keep = np.where(bad, np.argmin(bad), np.arange(len(x)))
-            x, varied = jax.tree.map(lambda v: v[keep], (x, varied))
-            value, slopes, aux = slope(theta, x, varied, weights)
+            replaced = np.where(bad, np.argmin(bad), np.arange(len(x)))
+            x, varied = jax.tree.map(lambda v: v[replaced], (x, varied))
+            value, slopes, aux = self.slope(theta, x, varied, weights)
         return value, slopes, means(aux, weights)
 
-    def validate(theta: Any) -> tuple[float, dict[str, float]]:
-        design, aux = evaluate(theta, test[0], test[1], np.ones(len(test[0])))
-        if not sound:
-            sound.append(np.isfinite(aux["losses"]))
-        # Loops that are not finite at the start are left out for good; another makes the loss NaN.
-        used = aux["losses"][sound[0]]
+    def validate(self, theta: Any) -> tuple[float, dict[str, float]]:
+        """Return loss and numbers of the validation loops. Those that are not finite at the start
+        are left out for good; another one makes the loss NaN."""
+        x, varied = self.test
+        design, aux = self.evaluate(theta, x, varied, np.ones(len(x)))
+        if self.finite is None:
+            self.finite = np.isfinite(aux["losses"])
+        used = aux["losses"][self.finite]
         value = np.mean(used) + design if len(used) else np.nan
-        return float(value), means(aux, sound[0])
-
-    history = descend(start, gradient, validate, optax.adam(0.05), chosen, decides)
-    decides["mode"] = gradients[0][0] if gradients else mode
-    return finished(TuningRun.of_parameters(parameters, history, decides, build))
+        return float(value), means(aux, self.finite)
 
 
 def _default_loss(controller: Any, plant: Any, r: Any, s: Any) -> ClosedLoopLoss:
