@@ -2,11 +2,10 @@
 
 from dataclasses import replace
 
-import jax
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.mpc.condense import condense, in_float64
+from jaxmpc.mpc.condense import condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.tuning.result import TuningRun
@@ -59,8 +58,7 @@ def transfer_penalties(run: TuningRun, mpc: MPC, iterations: int | None = None) 
     solver, settings = run.solver, run.settings
     rho = np.asarray(solver.rho)
     if run.improved:
-        with jax.enable_x64(True):
-            c = condense(in_float64(mpc))
+        c = condensed_in_float64(mpc)
         blocks = tuple((kind, tuple(steps), size) for kind, steps, size in settings["blocks"])
         if settings["groups"] == "row" and c.layout != blocks:
             fail("mpc", "has other rows than the problem tuned", 'Use groups="step"')

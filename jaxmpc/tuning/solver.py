@@ -15,7 +15,7 @@ from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, require_finite, require_kind, whole
 from jaxmpc.files import fingerprint
 from jaxmpc.mpc.arguments import checked_array
-from jaxmpc.mpc.condense import condense, in_float64
+from jaxmpc.mpc.condense import Condensed, condensed_in_float64
 from jaxmpc.mpc.plan import Plan, WarmStart
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM, factor
@@ -87,18 +87,9 @@ def tune_solver(
     chosen = Settings(**{"updates": 200, "batch": 32, **settings})
     chosen.validate()
     solver = SOLVER if solver is None else solver
-    objective, train, test = _prepared(
-        mpc,
-        x0s,
-        iterations,
-        stages,
-        groups,
-        solver,
-        warm_start,
-        reference,
-        input_reference,
-        chosen,
-    )
+    references = reference, input_reference
+    objective = _objective(mpc, iterations, stages, groups, solver, references)
+    train, test = _samples(mpc, objective.condensed, x0s, warm_start, chosen)
     given, c = replace(solver, iterations=iterations), objective.condensed
     if solver.rho is None:
         with jax.enable_x64(True):
@@ -184,16 +175,8 @@ def tune_schedule(
 
     schedule = optax.cosine_decay_schedule(RATE, max(settings.updates, 1), 0.03)
     every = max(settings.updates // VALIDATIONS, 1)
-    history = descend(
-        theta,
-        gradient,
-        validate,
-        optax.adam(schedule, b2=0.99),
-        settings,
-        decides,
-        every,
-        "solved",
-    )
+    adam = optax.adam(schedule, b2=0.99)
+    history = descend(theta, gradient, validate, adam, settings, decides, every, "solved")
     after = {"loss": history.validation[history.best]} | {
         name: float(v[history.best]) for name, v in history.validation_numbers.items()
     }
@@ -229,75 +212,67 @@ def _knots(mpc: MPC) -> int:
     return min(KNOTS, mpc.horizon + 1)
 
 
-def _prepared(
+def _objective(
     mpc: MPC,
-    x0s: Any,
     iterations: int,
     stages: int,
     groups: str,
     solver: ADMM,
-    warm_start: Any,
-    reference: Any,
-    input_reference: Any,
-    settings: Settings,
-) -> tuple[PenaltyObjective, Samples, Samples]:
-    """Return the objective, and states for training and validation; ValueError for bad input."""
+    references: tuple[Reals | None, Reals | None],
+) -> PenaltyObjective:
+    """Return the objective; ValueError for bad input."""
     require_kind("mpc", mpc, MPC)
     mpc.validate()
     if whole("iterations", iterations, 1) % whole("stages", stages, 1):
         fail("iterations", f"{iterations} for {stages} stages", "Use a multiple")
     if groups not in ("row", "step"):
         fail("groups", f"{groups!r}", 'Give "row" or "step"')
-    with jax.enable_x64(True):
-        c = jax.tree.map(np.asarray, condense(in_float64(mpc)))
-    rows, n, nz = c.C.shape[0], mpc.system.n, c.P.shape[0]
-    if not rows:
+    c, N = condensed_in_float64(mpc), mpc.horizon
+    if not len(c.C):
         fail("mpc", "has no rows", "Without limits one Newton step solves it; ADMM has no rho")
-    replace(solver, iterations=iterations).validate(rows)
-    tracked: list[Any] = []
-    for name, value, shape in (
-        ("reference", reference, (mpc.horizon + 1, n)),
-        ("input_reference", input_reference, (mpc.horizon, mpc.system.m)),
-    ):
+    replace(solver, iterations=iterations).validate(len(c.C))
+    tracked: list[np.ndarray | None] = []
+    names = ("reference", "input_reference")
+    shapes = ((N + 1, mpc.system.n), (N, mpc.system.m))
+    for name, value, shape in zip(names, references, shapes, strict=True):
         if value is not None:
-            value = checked_array(name, value, [shape[1:], shape])
-            value = np.broadcast_to(np.asarray(value, np.float64), shape)
+            value = np.asarray(checked_array(name, value, [shape[1:], shape]), np.float64)
             require_finite(name, value)
+            value = np.broadcast_to(value, shape)
         tracked.append(value)
+    W = interpolation(groups, c.layout, N, c.balls, _knots(mpc))
+    plain = replace(solver, iterations=int(iterations), rho=1.0, alpha=ALPHA, newton_steps=0)
+    unrolled = replace(plain, differentiate="unrolled")
+    return PenaltyObjective(c, W, tracked[0], tracked[1], unrolled)
 
-    def states(name: str, x: Any) -> np.ndarray:
-        x = np.asarray(x, np.float64)
-        if x.ndim != 2 or x.shape[1] not in (n, mpc.dimension) or not len(x):
-            fail(name, f"shape {x.shape}", f"Give states (B, {n})")
-        require_finite(name, x)
-        return np.pad(x, ((0, 0), (0, mpc.dimension - x.shape[1])))
 
-    x = states("x0s", x0s)
+def _samples(
+    mpc: MPC, c: Condensed, x0s: Reals, warm_start: Any, settings: Settings
+) -> tuple[Samples, Samples]:
+    """Return the samples for training and for validation; ValueError for bad input."""
+    x = _states(mpc, "x0s", x0s)
     if len(x) < FEWEST:
         fail("x0s", f"{len(x)} states", f"Give at least {FEWEST}, better some hundred")
     if warm_start is not None:
         if isinstance(warm_start, Plan | WarmStart):
-            of = lambda p: WarmStart.of(p, c.layout, mpc)
-            each = jax.vmap(of)(warm_start)
+            each = jax.vmap(lambda plan: WarmStart.of(plan, c.layout, mpc))(warm_start)
             warm_start = jax.vmap(c.variables)(each.states, each.inputs), each.multipliers
         warm_start = tuple(np.asarray(part, np.float64) for part in warm_start)
-        for part, size in zip(warm_start, (nz, rows), strict=True):
+        for part, size in zip(warm_start, (len(c.P), len(c.C)), strict=True):
             if part.shape != (len(x), size):
                 fail("warm_start", f"shape {part.shape}", f"Needed: {(len(x), size)}")
     samples = Samples(x, warm_start)
     if settings.splits:
-        train, test = settings.split(samples, FEWEST_VALIDATION, shuffle=True)
-    elif warm_start is not None:
+        return settings.split(samples, FEWEST_VALIDATION, shuffle=True)
+    if warm_start is not None:
         fail("validation", "given as states beside warm starts", "Give a fraction in (0, 1)")
-    else:
-        train, test = samples, Samples(states("validation", settings.validation))
-    W = interpolation(groups, c.layout, mpc.horizon, c.balls, _knots(mpc))
-    plain = replace(
-        solver,
-        iterations=int(iterations),
-        rho=1.0,
-        alpha=ALPHA,
-        newton_steps=0,
-        differentiate="unrolled",
-    )
-    return PenaltyObjective(c, W, tracked[0], tracked[1], plain), train, test
+    return samples, Samples(_states(mpc, "validation", settings.validation))
+
+
+def _states(mpc: MPC, name: str, x0s: Reals) -> np.ndarray:
+    """Return states (B, n), or (B, n + m) with the previous inputs, with zeros for these."""
+    x = np.asarray(x0s, np.float64)
+    if x.ndim != 2 or x.shape[1] not in (mpc.system.n, mpc.dimension) or not len(x):
+        fail(name, f"shape {x.shape}", f"Give states (B, {mpc.system.n})")
+    require_finite(name, x)
+    return np.pad(x, ((0, 0), (0, mpc.dimension - x.shape[1])))

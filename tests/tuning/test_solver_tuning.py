@@ -9,8 +9,6 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.feasible.constraint_rows import weighted
-from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.tuning import solver as tuning_solver
 from jaxmpc.tuning.penalty_objective import loss_and_gradient
 from jaxmpc.tuning.penalty_schedule import interpolation, transfer_penalties
@@ -67,18 +65,10 @@ def test_gradient_against_differences():
     rng = np.random.default_rng(0)
     x, rows = states(12, 2), len(jm.mpc.row_table(mpc()))
     start = rng.normal(size=(12, 5)), rng.normal(size=(12, rows))
-    objective, samples, _ = tuning_solver._prepared(
-        mpc(),
-        x,
-        20,
-        2,
-        "step",
-        DEFAULT,
-        start,
-        np.array([0.3, 0.1]),
-        None,
-        Settings(validation=0.5),
-    )
+    references = np.array([0.3, 0.1]), None
+    objective = tuning_solver._objective(mpc(), 20, 2, "step", DEFAULT, references)
+    given = objective.condensed, x, start, Settings(validation=0.5)
+    samples, _ = tuning_solver._samples(mpc(), *given)
     parameters = objective.W.shape[1]
     theta = {"log_rho": 0.3 * rng.normal(size=(2, parameters)), "alpha": np.array(1.2)}
     with jax.enable_x64(True):
@@ -240,31 +230,6 @@ def test_bad_input(settings, match):
         settings["x0s"] = settings["x0s"][:, :1]
     with pytest.raises(ValueError, match=match):
         tune_solver(settings.pop("mpc"), settings.pop("x0s"), **settings)
-
-
-def moving(problem):
-    return FeasibilityProblem.of(problem).rows
-
-
-@pytest.mark.parametrize("ball", [False, True])
-def test_weighted_rows_are_the_same_rows(ball):
-    problem = mpc()
-    if ball:
-        problem = replace(problem, terminal_set=jm.Ellipsoid(np.diag([1.0, 2.0]), 3.0))
-    old, rng = moving(problem), np.random.default_rng(0)
-    weight = np.exp(rng.normal(size=len(old.lower)))
-    weight[len(weight) - sum(old.balls) :] = 3.0
-    new, M = weighted(old, weight)
-    assert np.allclose(new.U.T @ new.U, np.eye(new.U.shape[1]))
-    w, theta, y = rng.normal(size=M.shape[1]), rng.normal(size=2), rng.normal(size=len(weight))
-    assert np.allclose(new.U @ w, weight * (old.U @ (M @ w)))
-    assert np.allclose(new.back @ w, old.back @ (M @ w))
-    assert np.allclose(new.D @ theta, weight * (old.D @ theta))
-    for name in ("lower", "upper"):
-        assert np.allclose(getattr(new, name), weight * getattr(old, name))
-    # Multipliers in the units of the problem: y of the new rows is weight·y of the old.
-    assert np.allclose(y * new.weight, (weight * y) * old.weight)
-    assert not ball or np.allclose(new.radius, 3 * old.radius)
 
 
 @pytest.mark.slow
