@@ -1,7 +1,7 @@
 """The affine law of one active set and the polytope on which it holds, in scaled coordinates."""
 
 import numpy as np
-from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
+from scipy.spatial import HalfspaceIntersection, QhullError
 
 from jaxmpc.explicit.least_distance import SMALLEST, LeastDistanceForm
 from jaxmpc.pytrees import record
@@ -53,7 +53,7 @@ def active_piece(p: LeastDistanceForm, active: tuple[int, ...]) -> ActivePiece |
     H, h = -a[which] / size[which, None], b[which] / size[which]
     h = np.where(np.abs(b[which]) <= 1e-3 * ZERO * terms[which], 0.0, h)
     zero[rows] = False
-    also_active = tuple(np.flatnonzero(zero & ~p.still).tolist())
+    also_active = tuple(np.flatnonzero(zero & ~p.zero_row).tolist())
     return ActivePiece(active, also_active, multipliers[:, :-1], y[:, :-1], H, h, which)
 
 
@@ -71,6 +71,10 @@ class Cell:
     middles: np.ndarray
     vertices: np.ndarray
     radius: float
+
+    def touches(self, xi: np.ndarray) -> bool:
+        """Return whether ξ lies in the region, up to 1e-9."""
+        return bool(np.all(self.H @ xi <= self.h + 1e-9))
 
 
 def cell(p: LeastDistanceForm, active: tuple[int, ...]) -> Cell | None:
@@ -93,9 +97,14 @@ def cell(p: LeastDistanceForm, active: tuple[int, ...]) -> Cell | None:
             spanning.append((group, corners.mean(axis=0)))
     first = [group[0] for group, _ in spanning]
     return Cell(
-        found, H[first], h[first], tuple(found.which[group] for group, _ in spanning),
-        np.array([middle for _, middle in spanning]), vertices, radius,
-    )  # fmt: skip
+        law=found,
+        H=H[first],
+        h=h[first],
+        behind=tuple(found.which[group] for group, _ in spanning),
+        middles=np.array([middle for _, middle in spanning]),
+        vertices=vertices,
+        radius=radius,
+    )
 
 
 def interior(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float] | None:
@@ -135,23 +144,3 @@ def capped_ball(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float]:
     ball = maximise(radius, rows, np.append(h, 1.0)).x
     assert ball is not None  # a ball of negative radius fits
     return ball[:n], min(float((h - H @ ball[:n]).min()), 1.0)
-
-
-def volume(points: np.ndarray) -> float:
-    """Return the volume of the convex hull of points (k, n), computed in coordinates in which they
-    spread alike.
-
-    Regions can be thin along oblique directions, so that qhull calls them flat; where it still
-    fails, it moves the points by some 1e-11 ("QJ").
-    """
-    if points.shape[1] == 1:
-        return float(np.ptp(points))
-    _, size, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
-    if len(points) <= points.shape[1] or size[-1] == 0:
-        return 0.0
-    alike = (points - points.mean(axis=0)) @ axes.T / size
-    try:
-        hull = ConvexHull(alike)
-    except QhullError:
-        hull = ConvexHull(alike, qhull_options="QJ")
-    return float(hull.volume * np.prod(size))

@@ -177,7 +177,7 @@ def softened(p: LeastDistanceForm, table: tuple[Row, ...]) -> np.ndarray:
     mine = (p.row >= 0) & soft[np.maximum(p.row, 0)] if len(soft) else np.zeros(len(p.row), bool)
     if not mine.any():
         fail("mpc", "has no limit on states or outputs to soften", "Give states, or soft rows")
-    return mine & ~p.still
+    return mine & ~p.zero_row
 
 
 def is_sufficient(

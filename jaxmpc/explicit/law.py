@@ -5,9 +5,8 @@ active rows of the plan there, by the optimality conditions, and holds on a poly
 region.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import numpy as np
 from scipy.optimize import lsq_linear, nnls
 
@@ -61,10 +60,11 @@ class Law:
         easy = np.pad(self.easy, (0, states.shape[1] - len(self.easy)))
         return np.vstack([states, np.tile(easy, (-len(states) % self.chunk, 1))])
 
-    def plans(self, states: np.ndarray) -> Any:
-        """Return a Plan of NumPy arrays (B, ...) from states (B, p), in programs of one shape."""
+    def plans(self, states: np.ndarray) -> "LawPlans":
+        """Return the plans from states (B, p), in programs of one shape."""
         found = solve_many(self.mpc, self.filled(states), ADMM(eps=EPS), chunk=self.chunk)
-        return jax.tree.map(lambda v: np.asarray(v)[: len(states)], found)
+        first = [np.asarray(getattr(found, name))[: len(states)] for name in LawPlans._fields]
+        return LawPlans(*first)
 
     def limited(self, u: np.ndarray) -> np.ndarray:
         """Return inputs (B, m) clipped into a box of limits: an actuator takes no rounding beyond
@@ -91,8 +91,9 @@ class Law:
         """
         c, p = self.condensed, len(state)
         theta = np.append(state, np.zeros(c.D.shape[1] - p))
-        moves = (inputs - c.Psi @ theta - c.psi).ravel()
-        z = np.linalg.lstsq(c.Omega.reshape(len(moves), -1), moves, rcond=None)[0]
+        one = np.append(theta, 1.0)
+        free = (inputs - c.Psi @ theta - c.psi).ravel()
+        z = np.linalg.lstsq(c.Omega.reshape(len(free), -1), free, rcond=None)[0]
         if c.balls and self._touches_ball(theta, z):
             return None
         gap = self.C @ z + self.D @ theta - self.b
@@ -104,15 +105,13 @@ class Law:
         S = self.kappa[over, None] * self.C[over]
         P = c.P + S.T @ self.C[over]
         # q(x) = Q (x, 1), likewise for the bounds of the active rows.
-        Q = np.column_stack([c.F, c.f])
-        Q += S.T @ np.column_stack([self.D[over], -self.b[over]])
+        Q = np.column_stack([c.F, c.f]) + S.T @ np.column_stack([self.D[over], -self.b[over]])
         Q[:, -1] += self.C[over].T @ self.rho[over]
-        one = np.append(theta, 1.0)
         force = -(P @ z + Q @ one)
         y = self._multipliers(self.C[touching].T, force, self.rho[touching])
-        scale = np.abs(force).max(initial=0.0)
         most = y >= self.rho[touching] * (1 - 1e-9)
-        active, full = touching[(y > 1e-9 * scale) & ~most], touching[most]
+        active = touching[(y > 1e-9 * np.abs(force).max(initial=0.0)) & ~most]
+        full = touching[most]
         Q[:, -1] += self.C[full].T @ self.rho[full]
         zero = np.zeros((len(active), len(active)))
         KKT = np.block([[P, self.C[active].T], [self.C[active], zero]])
@@ -125,22 +124,30 @@ class Law:
         size = np.abs(z) + np.abs(Z) @ np.abs(one)
         if np.any(np.abs(Z @ one - z) > MATCHING * np.maximum(size, 1e-3 * size.max())):
             return None
-        # Region: inactive rows hold, violated ones stay so, multipliers stay in [0, ρ].
-        slack = np.column_stack([self.D, -self.b]) + self.C @ Z
-        slack[over | np.isin(np.arange(len(slack)), full)] *= -1
-        limited = np.isfinite(self.rho[active])
-        above = Y[limited] - np.outer(self.rho[active][limited], np.append(0 * theta, 1.0))
-        rows = np.vstack([np.delete(slack, active, axis=0), -Y, above])
-        # Columns of a previous input that is not among the states meet a zero; rows that are
-        # constant to rounding are redundant.
-        rows = np.column_stack([rows[:, :p], rows[:, -1]])
-        moving = np.linalg.norm(rows[:, :p], axis=1) > 1e-11 * np.abs(rows).max(axis=1, initial=0.0)
-        R, r = rows[moving, :p], -rows[moving, p]
+        over[full] = True
+        R, r = self._region(Z, Y, active, over, p)
         K = c.Psi[0] + c.Omega[0] @ Z[:, :-1]
         k = c.psi[0] + c.Omega[0] @ Z[:, -1]
         E = np.vstack([self.B @ K[:, :p], K[:, :p]])[:p]
         E[: len(self.A), : len(self.A)] += self.A
-        return AffinePiece(E, np.append(self.B @ k + self.c, k)[:p], *unit_rows(R, r))
+        return AffinePiece(E, np.append(self.B @ k + self.c, k)[:p], R, r)
+
+    def _region(
+        self, Z: np.ndarray, Y: np.ndarray, active: np.ndarray, over: np.ndarray, p: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return where inactive rows hold, those `over` stay violated or full, and multipliers Y of
+        active rows stay in [0, ρ], as unit rows R x ≤ r."""
+        slack = np.column_stack([self.D, -self.b]) + self.C @ Z
+        slack[over] *= -1
+        limited = np.isfinite(self.rho[active])
+        above = Y[limited]
+        above[:, -1] -= self.rho[active][limited]
+        rows = np.vstack([np.delete(slack, active, axis=0), -Y, above])
+        # Columns of a previous input that is not among the states meet a zero; rows that are
+        # constant to rounding are redundant.
+        rows = np.column_stack([rows[:, :p], rows[:, -1]])
+        varying = np.linalg.norm(rows[:, :p], axis=1) > 1e-11 * np.abs(rows).max(axis=1, initial=0)
+        return unit_rows(rows[varying, :p], -rows[varying, p])
 
     def _multipliers(self, A: np.ndarray, force: np.ndarray, rho: np.ndarray) -> np.ndarray:
         """Return y with A y = force as nearly as possible and 0 ≤ y ≤ rho."""
@@ -161,8 +168,8 @@ class Law:
         return bool(np.linalg.norm(centred) > (1 - TOUCHING) * float(np.ravel(c.radius)[0]))
 
 
-class RegionPlans(NamedTuple):
-    """Plans from critical regions: inputs (B, N, m), status and residuals (B,), as in `Plan`."""
+class LawPlans(NamedTuple):
+    """Plans of a law: inputs (B, N, m), status and residuals (B,), as in `Plan`."""
 
     inputs: np.ndarray
     status: np.ndarray
@@ -178,7 +185,7 @@ class RegionLaw(Law):
         super().__init__(regions.mpc, easy, chunk)
         self.regions = regions
 
-    def plans(self, states: np.ndarray) -> RegionPlans:
+    def plans(self, states: np.ndarray) -> LawPlans:
         """Return the plans from states (B, p), with the largest row violated and the largest entry
         of P z + F x + f + C'y; NaN, ITERATION_LIMIT and inf where no region holds a state."""
         c, where = self.condensed, self.regions.find(states)
@@ -192,7 +199,7 @@ class RegionLaw(Law):
         rows = z @ c.C.T + states @ c.D.T + c.d
         violated = np.maximum(rows - c.upper, c.lower - rows).max(axis=1, initial=0.0)
         gradient = z @ c.P.T + states @ c.F.T + c.f + y @ c.C
-        return RegionPlans(
+        return LawPlans(
             inputs + c.psi,
             np.where(known, Status.SOLVED, Status.ITERATION_LIMIT).astype(np.int8),
             np.where(known, violated, np.inf),

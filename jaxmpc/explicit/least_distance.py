@@ -26,7 +26,7 @@ from jaxmpc.pytrees import record
 from jaxmpc.sets.any_set import unit_half_spaces
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.interior import AffineHull, affine_hull, framed
-from jaxmpc.sets.lp import ROUNDING, Program, maximise, scaling
+from jaxmpc.sets.lp import ROUNDING, Program, maximise, maximise_nonnegative, scaling
 from jaxmpc.sets.polytope import Polytope
 
 # In coordinates where X_N just fits into [−1, 1]^n: the smallest ball of a region.
@@ -40,7 +40,7 @@ class LeastDistanceForm:
     """min ½|y|² s.t. M y ≤ v + V ξ, one-sided rows; x = center + size·ξ with X_N in [−1, 1]^n.
 
     length (r,): multipliers of the rows as given are those of M divided by it. row (r,): index
-    into `condensed`. side (r,): 1 upper, −1 lower. still (r,): M_i = 0, a half-space on ξ alone.
+    into `condensed`. side (r,): 1 upper, −1 lower. zero_row (r,): M_i = 0, a half-space on ξ alone.
     typical (r,): size of v + V ξ, for tolerances. epsilon (r,): direction of the perturbation.
     factor: ℓ. U: orthonormal columns that span those of M.
     shift (N·m, n + 1): ℓ⁻¹(F, f). interior (n,): ξ with a margin.
@@ -61,7 +61,7 @@ class LeastDistanceForm:
     length: np.ndarray
     row: np.ndarray
     side: np.ndarray
-    still: np.ndarray
+    zero_row: np.ndarray
     epsilon: np.ndarray
     center: np.ndarray
     size: np.ndarray
@@ -75,6 +75,11 @@ class LeastDistanceForm:
     def scaled(self, x: np.ndarray) -> np.ndarray:
         """Return the ξ of a state x."""
         return (x - self.center) / self.size
+
+    def in_states(self, affine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return gain (r, n) and offset (r,) in x of what is affine in ξ, constant last."""
+        gain = affine[:, :-1] / self.size
+        return gain, affine[:, -1] - gain @ self.center
 
     def leave(self, direction: np.ndarray) -> np.ndarray | None:
         """Return where the ray from the interior point along `direction` leaves X_N; None if not
@@ -118,13 +123,10 @@ class LeastDistanceForm:
         """Return the solution at ξ; None where there is none, or none that keeps all rows to
         1e-8."""
         b = self.v + self.V @ xi
-        if np.any(b[self.still] < -1e-9):
+        if np.any(b[self.zero_row] < -1e-9):
             return None
-        moving = np.flatnonzero(~self.still)
-        for allowance in (
-            0.0,
-            1e-9 * self.typical[moving],
-        ):  # points on the boundary of X_N may need one
+        moving = np.flatnonzero(~self.zero_row)
+        for allowance in (0.0, 1e-9 * self.typical[moving]):  # the boundary of X_N may need one
             active: tuple[int, ...] = ()
             worst = -b[moving].min(initial=0.0)
             if worst > 0:
@@ -156,7 +158,7 @@ class LeastDistanceForm:
         # The limit of the perturbed multipliers minimises ε'λ.
         on = found.touching
         A, b = self.balance(on, -found.y)
-        best = positive_maximum(-self.epsilon[on], A, b)
+        best = maximise_nonnegative(-self.epsilon[on], A, b)
         if best is None:
             return found.active
         return tuple(on[best > 1e-12 * best.max(initial=0.0)].tolist())
@@ -239,10 +241,10 @@ def least_distance_form(mpc: MPC, within: Box | Polytope | None = None) -> Least
     # if its entries are rounding beside its other terms, in columns of like size.
     unit = scaling(hull.G, hull.g)[1]
     others = np.linalg.norm(V * unit[:n], axis=1) + np.abs(v)
-    still = np.linalg.norm(G * unit[n:], axis=1) <= ROUNDING / 100 * others
+    zero_row = np.linalg.norm(G * unit[n:], axis=1) <= ROUNDING / 100 * others
     M = np.linalg.solve(factor, G.T).T
-    M[still] = 0.0
-    length = np.where(still, 1.0, np.linalg.norm(M, axis=1))
+    M[zero_row] = 0.0
+    length = np.where(zero_row, 1.0, np.linalg.norm(M, axis=1))
     M, V, v = M / length[:, None], V / length[:, None], v / length
     shift = np.linalg.solve(
         factor, N.T @ (np.column_stack([c.F, c.f]) + c.P @ np.column_stack([S, shift_z]))
@@ -261,21 +263,17 @@ def least_distance_form(mpc: MPC, within: Box | Polytope | None = None) -> Least
     V, v = V * size, v + V @ center
     # Rows on ξ alone get length 1; the others are as long as y, in units of cost, is.
     reach = np.linalg.norm(V, axis=1)
-    unit = np.where(still, np.maximum(reach, 1e-300), 1.0)
+    unit = np.where(zero_row, np.maximum(reach, 1e-300), 1.0)
     V, v, length = V / unit[:, None], v / unit, length * unit
-    typical = np.where(still, 1.0, np.median((reach + np.abs(v))[~still]) if any(~still) else 1.0)
+    typical = np.where(
+        zero_row, 1.0, np.median((reach + np.abs(v))[~zero_row]) if any(~zero_row) else 1.0
+    )
     # An orthonormal basis of the columns of M keeps tiny coefficients out of the LPs.
     U = np.linalg.svd(M, full_matrices=False)[0]
     ball = framed("mpc: its feasible set", np.hstack([U, -V]), v).center
     # Multiples of the golden ratio spread evenly and have no small integer relations.
     epsilon = 1 + np.modf(np.arange(1, len(v) + 1) * (np.sqrt(5) - 1) / 2)[0]
     return LeastDistanceForm(
-        given, hull, c, factor, shift, M, U, V, v, typical, length, row, side, still, epsilon,
+        given, hull, c, factor, shift, M, U, V, v, typical, length, row, side, zero_row, epsilon,
         center, size, ball[-n:],
     )  # fmt: skip
-
-
-def positive_maximum(d: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray | None:
-    """Return λ of max d'λ over A λ = b, λ ≥ 0; None where there is none."""
-    rows, limits = np.vstack([A, -np.eye(len(d))]), np.append(b, np.zeros(len(d)))
-    return Program(rows, limits, np.arange(len(rows)) < len(b)).maximise(d).x

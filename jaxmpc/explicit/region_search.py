@@ -2,13 +2,13 @@
 
 import time
 from collections import deque
-from typing import Any
 
 import numpy as np
 
 from jaxmpc.checks import fail, whole
-from jaxmpc.explicit.active_sets import Cell, cell, volume
+from jaxmpc.explicit.active_sets import Cell, cell
 from jaxmpc.explicit.least_distance import DEPENDENT, LeastDistanceForm
+from jaxmpc.sets.geometry import hull_volume
 from jaxmpc.sets.polytope import Polytope
 
 # The fraction of the volume, and the distance of a facet in coordinates where X_N just fits into
@@ -74,13 +74,12 @@ class RegionSearch:
             candidates += beyond
         reached = [self.visit(active) for active in candidates]
         middle = here.middles[i]
-        touches = lambda c: c is not None and np.all(c.H @ middle <= c.h + 1e-9)
-        if any(touches(c) for c in reached):
+        if any(c is not None and c.touches(middle) for c in reached):
             return
         # Several rows vanish on the facet at once: look just behind it.
         for step in STEPS:
             behind = self.visit(self.p.active(middle + step * here.radius * here.H[i]))
-            if touches(behind):
+            if behind is not None and behind.touches(middle):
                 return
 
     def restart(self) -> None:
@@ -110,7 +109,8 @@ class RegionSearch:
             if self.full:
                 return False, f"stopped at the limit of {self.max_regions} regions"
             points = np.concatenate([c.vertices for c in self.found])
-            volumes, whole = sum(volume(c.vertices) for c in self.found), volume(points)
+            volumes = sum(hull_volume(c.vertices, thin=True) for c in self.found)
+            whole = hull_volume(points, thin=True)
             hull = Polytope.from_points(points)
             tops = [self.p.support(a) for a in np.asarray(hull.H) if not self.late]
             if self.late:
@@ -146,15 +146,14 @@ class RegionSearch:
         return False, why.replace("the volumes of", "a part was not found: the volumes of")
 
 
-def explore(p: LeastDistanceForm, max_regions: Any, deadline: float = np.inf) -> RegionSearch:
+def explore(p: LeastDistanceForm, max_regions: int, deadline: float = np.inf) -> RegionSearch:
     """Run the search from an interior point across all facets, until the deadline of
     `time.monotonic`, and return it."""
     max_regions = whole("max_regions", max_regions, 1)
     if len(p.center) > DIMENSIONS:
-        fail(
-            "mpc", f"its states have {len(p.center)} coordinates, too many for vertices",
-            f"Regions serve up to {DIMENSIONS}; exact_penalty(method='samples') serves more",
-        )  # fmt: skip
+        what = f"its states have {len(p.center)} coordinates, too many for vertices"
+        cure = f"Regions serve up to {DIMENSIONS}; exact_penalty(method='samples') serves more"
+        fail("mpc", what, cure)
     search = RegionSearch(p, max_regions, deadline)
     search.visit(p.active(p.interior))
     search.cross_all()
@@ -180,7 +179,7 @@ def exchange(
     rows = [j for j in active if j != row]
     if len(rows) < len(active):
         return [tuple(rows)]
-    if p.still[row]:
+    if p.zero_row[row]:
         return None
     Q, R = np.linalg.qr(p.M[rows].T)
     along = Q.T @ p.M[row]

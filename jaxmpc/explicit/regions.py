@@ -2,24 +2,23 @@
 
 import time
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
+from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail
-from jaxmpc.explicit.active_sets import Cell, volume
+from jaxmpc.explicit.active_sets import Cell
 from jaxmpc.explicit.least_distance import (
     GivenProgram,
     LeastDistanceForm,
     least_distance_form,
-    positive_maximum,
 )
 from jaxmpc.explicit.region_search import RegionSearch, explore
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.sets.box import Box
-from jaxmpc.sets.geometry import unit_rows
-from jaxmpc.sets.lp import scaling
+from jaxmpc.sets.geometry import hull_volume, unit_rows
+from jaxmpc.sets.lp import maximise_nonnegative, scaling
 from jaxmpc.sets.polytope import Polytope
 
 # Residual of the optimality conditions at a vertex, relative to the size of the terms, up to which
@@ -93,17 +92,20 @@ class CriticalRegions:
     def __getitem__(self, i: int) -> Region:
         return self.regions[i]
 
-    def vertices(self, i: int) -> np.ndarray:
-        """Return (k, p) vertices of region i."""
-        return self.regions[i].vertices
+    def __repr__(self) -> str:
+        """Return how many regions there are, and what was checked."""
+        what = "fill X_N" if self.complete else "do not fill X_N"
+        return (
+            f"CriticalRegions: {len(self)} regions {what}, volume {self.volume:.6g}; {self.reason}"
+        )
 
-    def find(self, x: Any, tolerance: float = 1e-9) -> np.ndarray:
-        """Return the index (B,) of the region that holds each state x (B, p), −1 where none does.
+    def find(self, x0s: Reals, tolerance: float = 1e-9) -> np.ndarray:
+        """Return the index (B,) of the region that holds each state x0s (B, p), −1 where none does.
 
         tolerance: how far outside all regions a state may lie, relative to the width of X_N across
         the facet that it exceeds.
         """
-        x = self._states(x)
+        x = self._states(x0s)
         H, h, starts, width = self._stacked
         answer = np.full(len(x), -1)
         finite = np.flatnonzero(np.all(np.isfinite(x), axis=1))
@@ -114,28 +116,29 @@ class CriticalRegions:
             answer[chunk] = np.where(near, beyond.argmin(axis=1), -1)
         return answer
 
-    def plan(self, x: Any) -> np.ndarray:
-        """Return optimal decisions z (B, nz) at states x (B, p); NaN where no region holds a
+    def plan(self, x0s: Reals) -> np.ndarray:
+        """Return optimal decisions z (B, nz) at states x0s (B, p); NaN where no region holds a
         state."""
-        return self._evaluate(x, "Z", "z0")
+        return self._evaluate(x0s, [(region.Z, region.z0) for region in self.regions])
 
-    def law(self, x: Any) -> np.ndarray:
-        """Return first inputs u_0 (B, m) at states x (B, p); NaN where no region holds a state."""
-        return self._evaluate(x, "K", "k")
+    def law(self, x0s: Reals) -> np.ndarray:
+        """Return first inputs u_0 (B, m) at states x0s (B, p); NaN where no region holds a
+        state."""
+        return self._evaluate(x0s, [(region.K, region.k) for region in self.regions])
 
-    def _evaluate(self, x: Any, gain: str, offset: str) -> np.ndarray:
-        x = self._states(x)
-        where = self.find(x)
-        values = np.full((len(x), len(getattr(self.regions[0], offset))), np.nan)
+    def _evaluate(self, x0s: Reals, laws: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+        """Return gain x + offset of the region that holds each state."""
+        x, where = self._states(x0s), self.find(x0s)
+        values = np.full((len(x), len(laws[0][1])), np.nan)
         for i in np.unique(where[where >= 0]):
-            region, here = self.regions[i], where == i
-            values[here] = x[here] @ getattr(region, gain).T + getattr(region, offset)
+            gain, offset = laws[i]
+            values[where == i] = x[where == i] @ gain.T + offset
         return values
 
-    def _states(self, x: Any) -> np.ndarray:
-        x, p = np.asarray(x, np.float64), self.mpc.dimension
+    def _states(self, x0s: Reals) -> np.ndarray:
+        x, p = np.asarray(x0s, np.float64), self.mpc.dimension
         if x.ndim != 2 or x.shape[1] != p:
-            fail("x", f"shape {x.shape}", f"Give states (B, {p})")
+            fail("x0s", f"shape {x.shape}", f"Give states (B, {p})")
         return x
 
     @cached_property
@@ -186,14 +189,9 @@ def critical_regions(
 def region(p: LeastDistanceForm, c: Cell) -> Region:
     """Return a cell in the coordinates of x, with the law of z, the multipliers and the first
     input."""
-    rows = list(c.law.active)
-    on_x = (
-        lambda by_xi: (  # affine in ξ, constant last → affine in x
-            by_xi[:, :-1] / p.size,
-            by_xi[:, -1] - by_xi[:, :-1] / p.size @ p.center,
-        )
-    )
-    (L, l0), (Y, y0), n = on_x(c.law.multipliers), on_x(c.law.y), len(p.center)
+    n, rows = len(p.center), list(c.law.active)
+    L, l0 = p.in_states(c.law.multipliers)
+    Y, y0 = p.in_states(c.law.y)
     W = np.linalg.solve(p.factor.T, Y - p.shift[:, :n])
     w0 = np.linalg.solve(p.factor.T, y0 - p.shift[:, n])
     S, N = p.hull.basis[n:, :n], p.hull.basis[n:, n:]
@@ -208,19 +206,28 @@ def region(p: LeastDistanceForm, c: Cell) -> Region:
         active = np.append(active, tied)
         L, l0 = np.vstack([L, both[:, :-1]]), np.append(l0, both[:, -1])
     return Region(
-        rows=active, also_active=p.row[list(c.law.also_active)],
-        Z=Z, z0=z0, L=L, l0=l0,
+        rows=active,
+        also_active=p.row[list(c.law.also_active)],
+        Z=Z,
+        z0=z0,
+        L=L,
+        l0=l0,
         K=np.asarray(condensed.Psi[0] + condensed.Omega[0] @ Z),
         k=np.asarray(condensed.Omega[0] @ z0 + condensed.psi[0]),
-        polytope=Polytope(*unit_rows(H, h)), vertices=vertices,
-        volume=volume(c.vertices) * float(np.prod(p.size)),
-    )  # fmt: skip
+        polytope=Polytope(*unit_rows(H, h)),
+        vertices=vertices,
+        volume=hull_volume(c.vertices, thin=True) * float(np.prod(p.size)),
+    )
 
 
 def of_equalities(
-    p: LeastDistanceForm, active: np.ndarray, L: np.ndarray, Z: np.ndarray, z0: np.ndarray,
+    p: LeastDistanceForm,
+    active: np.ndarray,
+    L: np.ndarray,
+    Z: np.ndarray,
+    z0: np.ndarray,
     vertices: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the condensed rows of the implied equalities and their multipliers, affine in (x, 1).
 
     They balance what is left of the gradient, E'y = −(P z + F x + f + C_a'y_a). One-sided rows that
@@ -233,7 +240,7 @@ def of_equalities(
     E = row[:, None] * given.C[usable] * column
     y = np.linalg.lstsq(E.T, column[:, None] * left, rcond=1e-10)[0]
     # ν = 1 + μ with μ ≥ 0 as small as possible
-    more = positive_maximum(-np.ones(len(E)), E.T, -E.sum(axis=0))
+    more = maximise_nonnegative(-np.ones(len(E)), E.T, -E.sum(axis=0))
     if more is not None:
         lowest = (y @ np.column_stack([vertices, np.ones(len(vertices))]).T).min(axis=1)
         y[:, -1] += max(np.max(-lowest / (1 + more)), 0.0) * (1 + more)

@@ -69,24 +69,36 @@ def unit_rows(H: Any, h: Any, argument: str = "Polytope") -> tuple[np.ndarray, n
     return H / length[:, None], h / length
 
 
-def hull_volume(points: Reals) -> float:
+def hull_volume(points: Reals, *, thin: bool = False) -> float:
     """Return the volume of the convex hull of points (k, n): 0 where they lie in a hyperplane.
-    NumPy; not traceable."""
+
+    thin: the set may be thin along oblique directions, so that qhull calls it flat. Then it is
+    computed in coordinates in which the points spread alike, moved by some 1e-11 ("QJ") where qhull
+    still fails. NumPy; not traceable.
+    """
     points = host_array("points", points)
     if len(points) <= points.shape[1]:
         return 0.0
+    if points.shape[1] == 1:
+        return float(np.ptp(points))
+    center = points.mean(axis=0)
     # qhull works best in coordinates of like size.
-    scale = np.ptp(points, axis=0)
+    if thin:
+        _, scale, axes = np.linalg.svd(points - center, full_matrices=False)
+        points, center = (points - center) @ axes.T, 0.0
+    else:
+        scale = np.ptp(points, axis=0)
     if not scale.all():
         return 0.0
-    if len(scale) == 1:
-        return float(scale[0])
-    scaled = (points - points.mean(axis=0)) / scale
+    scaled = (points - center) / scale
     # Clusters confuse qhull; one point of each spans a hull that is no larger.
+    scaled = scaled if thin else scaled[distinct(scaled, 1e-11)]
     try:
-        hull = ConvexHull(scaled[distinct(scaled, 1e-11)])
+        hull = ConvexHull(scaled)
     except QhullError:  # flat
-        return 0.0
+        if not thin:
+            return 0.0
+        hull = ConvexHull(scaled, qhull_options="QJ")
     return float(hull.volume * np.prod(scale))
 
 

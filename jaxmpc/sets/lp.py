@@ -279,6 +279,12 @@ def maximise(d: np.ndarray, G: np.ndarray, g: np.ndarray) -> Optimum:
     return Program(G, g).maximise(d)
 
 
+def maximise_nonnegative(d: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray | None:
+    """Return x of max d'x over A x = b, x >= 0; None where there is no optimum."""
+    rows, limits = np.vstack([A, -np.eye(len(d))]), np.append(b, np.zeros(len(d)))
+    return Program(rows, limits, np.arange(len(rows)) < len(b)).maximise(d).x
+
+
 def cleaned(value: np.ndarray, size: np.ndarray | float) -> np.ndarray:
     """Return sums with 0 in place of those that are rounding beside their terms, of this size."""
     return np.where(np.abs(value) < 16 * np.finfo(float).eps * size, 0.0, value)

@@ -225,7 +225,7 @@ class TestRegions:
                 critical_regions(mpc, max_regions=limit)
         with pytest.raises(ValueError, match="within"):
             critical_regions(mpc, within=np.ones(2))
-        with pytest.raises(ValueError, match="x: shape"):
+        with pytest.raises(ValueError, match="x0s: shape"):
             critical_regions(mpc).law(np.zeros(2))
 
 
