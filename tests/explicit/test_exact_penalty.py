@@ -385,7 +385,7 @@ class TestExactPenalty:
         xi, z = random.standard_normal(2), random.standard_normal(c.P.shape[0])
         x = p.center + p.size * xi
         y = p.factor.T @ z + p.shift @ np.append(x, 1.0)
-        slack = (p.v + p.V @ xi - p.M @ y)[~p.still] * p.length[~p.still]
+        slack = (p.v + p.V @ xi - p.M @ y)[~p.zero_row] * p.length[~p.zero_row]
         s = c.C @ z + c.D @ x + c.d
         expected = np.where(p.side > 0, c.upper[p.row] - s[p.row], s[p.row] - c.lower[p.row])
-        np.testing.assert_allclose(slack, expected[~p.still], atol=1e-12)
+        np.testing.assert_allclose(slack, expected[~p.zero_row], atol=1e-12)
