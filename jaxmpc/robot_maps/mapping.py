@@ -7,10 +7,9 @@ from typing import Any
 
 import jax
 import numpy as np
-from tqdm.std import tqdm
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.batches import default_chunk, first_rows, padded
+from jaxmpc.batches import Compiled, Part, default_chunk, first_rows, padded, work_off
 from jaxmpc.checks import fail, require_shape
 from jaxmpc.closed_loop.many import simulate_many
 from jaxmpc.closed_loop.robot_controller import RobotController
@@ -71,12 +70,11 @@ def map_robot(
         robot, mpc, x0s, seconds, controller=controller, target=target, axes=axes, fixed=fixed,
         claim=claim,
     )  # fmt: skip
-    labels, loops = [], []
-    with tqdm(total=len(setting.x0s), unit=" loops", disable=not progress) as bar:
-        for part in setting.parts(setting.x0s, setting.chunk(chunk)):
-            labels.append(part[0])
-            loops.append(part[1])
-            bar.update(len(part[0].label))
+    found: list[tuple[Labels, RobotLoops]] = []
+    parts = setting.parts(setting.x0s, setting.chunk(chunk))
+    total = len(setting.x0s)
+    work_off(parts, lambda part: found.append(part.result), total, unit="loops", progress=progress)
+    labels, loops = zip(*found, strict=True)
     return setting.map(Labels.joined(labels), RobotLoops.joined(loops), gap, search_seconds)
 
 
@@ -165,18 +163,18 @@ class RobotSetting:
 
     def parts(
         self, x0s: np.ndarray, size: int, devices: Any = None, **settings: Any
-    ) -> Iterator[tuple[Labels, RobotLoops]]:
+    ) -> Iterator[Part[tuple[Labels, RobotLoops]]]:
         """Yield labels and loops of points (b, d), `size` at a time, in one shape throughout.
 
         devices: as in `map_feasible_set`. settings: iterations, dtype of the linear labels, as
         there.
         """
-        scope = Scope.of(self.x0s, -(-len(self.x0s) // size))
-        labelled = label_chunks(
-            self.problem, x0s, chunk=size, scope=scope, devices=devices, **settings
-        )
-        for part in labelled:
-            yield part.result, self.run(x0s[part.place], size, devices)
+        settings["scope"] = Scope.of(self.x0s, -(-len(self.x0s) // size))
+        for part in label_chunks(self.problem, x0s, chunk=size, devices=devices, **settings):
+            compiled = Compiled.seconds
+            loops = self.run(x0s[part.place], size, devices)
+            seconds = part.compile_seconds + Compiled.seconds - compiled
+            yield Part(part.place, part.size, (part.result, loops), seconds)
 
     def run(self, x0s: np.ndarray, size: int, devices: Any = None) -> RobotLoops:
         """Simulate closed loops from points (b, d), b ≤ size, filled up to `size` of them."""

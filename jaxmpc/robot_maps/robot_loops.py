@@ -1,5 +1,6 @@
 """What the closed loops of a robot did: limits kept or exceeded, plans found or not."""
 
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -51,8 +52,12 @@ class RobotLoops:
             statuses=np.stack([np.sum(status == s, axis=1) for s in Status], axis=1),
         )
 
+    def first(self, count: int) -> "RobotLoops":
+        """Return the first so many loops."""
+        return RobotLoops(*(values[:count] for values in vars(self).values()))
+
     @classmethod
-    def joined(cls, parts: "list[RobotLoops]") -> "RobotLoops":
+    def joined(cls, parts: "Sequence[RobotLoops]") -> "RobotLoops":
         """Return the loops of all parts, one after the other."""
         names = [field.name for field in fields(cls)]
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))

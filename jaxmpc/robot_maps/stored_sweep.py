@@ -5,18 +5,18 @@ robot_map.npz    the same as arrays, and what follows from it
 summary.json     counts and the configuration
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm.std import tqdm
 
 from jaxmpc import store
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.batches import Compiled, first_rows
+from jaxmpc.batches import Part, work_off
 from jaxmpc.checks import fail, whole
+from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.stored import open_labels, stored_labels
 from jaxmpc.files import (
@@ -67,8 +67,8 @@ def sweep_robot(
     axes: Sequence[str | int] | None = None,
     fixed: Reals | None = None,
     grid: Sequence[int] | None = None,
-    lower: Reals | None = None,
-    upper: Reals | None = None,
+    lower: Sequence[float] | None = None,
+    upper: Sequence[float] | None = None,
     gap: float | None = 1e-6,
     search_seconds: float = 60.0,
     resume: bool = False,
@@ -155,16 +155,20 @@ def sweep_robot(
 
 
 def _grid_lines(
-    robot: Robot, axes: tuple[int, ...], grid: Any, lower: Any, upper: Any
+    robot: Robot,
+    axes: tuple[int, ...],
+    grid: Sequence[int] | None,
+    lower: Sequence[float] | None,
+    upper: Sequence[float] | None,
 ) -> list[np.ndarray]:
     """Return the coordinates of the grid along each axis. Raises ValueError for arguments of other
     sizes."""
     d = len(axes)
     shape = tuple(grid or ((SIDE, SIDE) if d == 2 else (int(POINTS ** (1 / d)),) * d))
     for name, value in (("grid", shape), ("lower", lower), ("upper", upper)):
-        if value is not None and len(value) != d:
-            what = f"has {len(value)} entries where {d} are needed"
-            fail(name, what, "One for each axis")
+        size = d if value is None else len(value)
+        if size != d:
+            fail(name, f"has {size} entries where {d} are needed", "One for each axis")
     box = robot.state_limits
     low, high = grid_ends(
         "", lower, upper, lambda: tuple(np.asarray(v)[list(axes)] for v in (box.lower, box.upper))
@@ -173,25 +177,37 @@ def _grid_lines(
 
 
 def _label(
-    setting: RobotSetting, blocks: store.Store, budget: Budget, devices: Any,
-    settings: Mapping[str, Any],
-) -> None:  # fmt: skip
+    setting: RobotSetting,
+    blocks: store.Store,
+    budget: Budget,
+    devices: int | None,
+    settings: dict[str, Any],
+) -> None:
     """Label the blocks that are not done, and commit each."""
     todo, index = blocks.batches()
     if not todo:
         return
     budget.say("compiling labels and closed loops")
-    before = Compiled.seconds
-    parts = setting.parts(setting.x0s[index.ravel()], index.shape[1], devices, **settings)
+
+    def commit(part: Part[tuple[Labels, RobotLoops]]) -> None:
+        labels, loops = part.result
+        blocks.commit(part.place, **labels.arrays(), **vars(loops))
+
+    found = setting.parts(setting.x0s[index.ravel()], index.shape[1], devices, **settings)
     total = sum(here.stop - here.start for _, here in todo)
-    with tqdm(total=total, unit=" loops", disable=None if budget.progress else True) as bar:
-        for (block, here), (labels, loops) in zip(todo, parts, strict=True):
-            count = here.stop - here.start
-            fields_of_loops = first_rows(vars(loops), count)
-            blocks.commit(block, **labels.first(count).arrays(), **fields_of_loops)
-            if bar.n == 0:
-                budget.say(f"first block done; {Compiled.seconds - before:.0f} s of compiling")
-            bar.update(count)
+    progress = None if budget.progress else False
+    timing = work_off(_in_blocks(todo, found), commit, total, unit="loops", progress=progress)
+    budget.say(f"{timing.count:,} loops; {timing.compile_seconds:.0f} s of that was compiling")
+
+
+def _in_blocks(
+    todo: list[tuple[int, slice]], parts: Iterable[Part[tuple[Labels, RobotLoops]]]
+) -> Iterator[Part[tuple[Labels, RobotLoops]]]:
+    """Yield parts with the block that they are of as their place, without what fills it up."""
+    for (block, here), part in zip(todo, parts, strict=True):
+        count = here.stop - here.start
+        labels, loops = part.result
+        yield Part(block, count, (labels.first(count), loops.first(count)), part.compile_seconds)
 
 
 def _save(folder: Path, setting: RobotSetting, found: RobotMap, config: dict[str, Any]) -> None:
