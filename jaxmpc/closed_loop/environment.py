@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import as_weight
+from jaxmpc.arrays import Reals, as_weight
 from jaxmpc.checks import number, require_kind, require_shape, whole
 from jaxmpc.closed_loop.observer import model_of
 from jaxmpc.closed_loop.robot_problem import robot_mpc
@@ -27,7 +27,7 @@ class EnvironmentState:
 
     x (nq + nv,): the robot's state. observation (n,): its coordinates ξ. reward: of the step that
     led here, 0 at the start. terminated: a limit was exceeded, or the state is not finite.
-    truncated: the episode has its full length. samples: steps so far. violation: the most by which
+    truncated: the episode has its full length. steps: so far. violation: the most by which
     ξ exceeds a state limit, in its unit.
     """
 
@@ -36,7 +36,7 @@ class EnvironmentState:
     reward: Array
     terminated: Array
     truncated: Array
-    samples: Array
+    steps: Array
     violation: Array
 
     @property
@@ -76,9 +76,16 @@ class Environment:
 
     @classmethod
     def of(
-        cls, robot: Robot | LinearPlant, target: Any = None, *, Q: Any = None, R: Any = None,
-        spread: float = 0.5, length: int = 200, stop_at_limits: bool = False,
-    ) -> "Environment":  # fmt: skip
+        cls,
+        robot: Robot | LinearPlant,
+        target: Reals | None = None,
+        *,
+        Q: Reals | None = None,
+        R: Reals | None = None,
+        spread: float = 0.5,
+        length: int = 200,
+        stop_at_limits: bool = False,
+    ) -> "Environment":
         """Return the environment of a robot and a target (nq,), None for its home.
 
         Q, R: weights, matrices or diagonals; None for those of `robot_mpc`. spread: starts are
@@ -98,9 +105,8 @@ class Environment:
         home, below, above = start_room(robot)
         with jax.enable_x64(True):
             reference = np.asarray(robot.coordinates(x))
-        return cls(
-            robot, reference, u, Q, R, home, spread * below, spread * above, length, stop_at_limits
-        )
+        room = (home, spread * below, spread * above)
+        return cls(robot, reference, u, Q, R, *room, length, stop_at_limits)
 
     def reset(self, key: Array) -> EnvironmentState:
         """Return a random start."""
@@ -123,13 +129,13 @@ class Environment:
         effort = u - jnp.asarray(self.input_reference, dtype)
         square = lambda v, W: jnp.sum(v * matmul(jnp.asarray(W, dtype), v))
         reward = -square(error, self.Q) - square(effort, self.R)
-        return self._state(robot.step(state.x, u), reward, state.samples + 1)
+        return self._state(robot.step(state.x, u), reward, state.steps + 1)
 
     def policy(self, controller: Any) -> "MPCPolicy":
         """Return a controller of this robot as a policy for the target."""
         return MPCPolicy(controller, self.reference, self.input_reference)
 
-    def _state(self, x: Array, reward: Array, samples: Array) -> EnvironmentState:
+    def _state(self, x: Array, reward: Array, steps: Array) -> EnvironmentState:
         xi = self.robot.coordinates(x)
         limits = jax.tree.map(lambda v: jnp.asarray(v, xi.dtype), self.robot.state_limits)
         violation = worst_violation(limits, xi)
@@ -137,9 +143,14 @@ class Environment:
         if self.stop_at_limits:
             ended = ended | (violation > TOLERANCE[xi.dtype.name])
         return EnvironmentState(
-            x=x, observation=xi, reward=reward.astype(xi.dtype), terminated=ended,
-            truncated=samples >= self.length, samples=samples, violation=violation,
-        )  # fmt: skip
+            x=x,
+            observation=xi,
+            reward=reward.astype(xi.dtype),
+            terminated=ended,
+            truncated=steps >= self.length,
+            steps=steps,
+            violation=violation,
+        )
 
 
 @pytree

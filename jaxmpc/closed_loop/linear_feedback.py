@@ -3,9 +3,9 @@
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.mpc.controller import zeros_of
 from jaxmpc.mpc.plan import Control, limited
@@ -67,24 +67,30 @@ class LinearFeedback:
         return zeros_of(self, x)
 
     def __call__(
-        self, x: Any, before: Any = None, reference: Any = None, *, input_reference: Any = None,
-        previous_input: Any = None,
-    ) -> Control[NoPlan]:  # fmt: skip
+        self,
+        x: Reals,
+        before: Control[NoPlan] | None = None,
+        reference: Reals | None = None,
+        *,
+        input_reference: Reals | None = None,
+        previous_input: Reals | None = None,
+    ) -> Control[NoPlan]:
         """Return the input (m,) at the state x, without plan and memory."""
         self.validate()
-        if np.shape(x) != (self.state_size,):
-            fail("x", f"shape {np.shape(x)}", f"Give one state ({self.state_size},)")
         x = jnp.asarray(x, self.dtype)
-        first = lambda v, size: (
-            jnp.zeros(size, x.dtype) if v is None
-            else jnp.asarray(v, x.dtype) if np.ndim(v) == 1 else jnp.asarray(v, x.dtype)[0]
-        )  # fmt: skip
-        r = first(reference, self.mpc.system.n)
-        u = first(input_reference, self.mpc.system.m)
-        u = u + matmul(jnp.asarray(self.K, x.dtype), self.coordinates(x) - r)
+        if x.shape != (self.state_size,):
+            fail("x", f"shape {x.shape}", f"Give one state ({self.state_size},)")
+        r = _first_row(reference, self.mpc.system.n, x.dtype)
+        s = _first_row(input_reference, self.mpc.system.m, x.dtype)
+        u = s + matmul(jnp.asarray(self.K, x.dtype), self.coordinates(x) - r)
         u = limited(self.mpc.inputs, u)
-        nothing = NoPlan(
-            jnp.asarray(jnp.nan, x.dtype), jnp.asarray(Status.NOT_RUN, jnp.int32),
-            jnp.zeros((1, 0), x.dtype),
-        )  # fmt: skip
-        return Control(u, nothing, None)
+        not_run, no_slack = jnp.asarray(Status.NOT_RUN, jnp.int32), jnp.zeros((1, 0), x.dtype)
+        return Control(u, NoPlan(jnp.asarray(jnp.nan, x.dtype), not_run, no_slack), None)
+
+
+def _first_row(reference: Reals | None, size: int, dtype: Any) -> Array:
+    """Return a reference, or the first of its rows; zeros for none."""
+    if reference is None:
+        return jnp.zeros(size, dtype)
+    rows = jnp.asarray(reference, dtype)
+    return rows if rows.ndim == 1 else rows[0]

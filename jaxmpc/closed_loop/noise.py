@@ -59,18 +59,11 @@ class Noise:
         """Return the noise of loop `index` of many."""
         return replace(self, seed=jax.random.fold_in(self.key(), index))
 
-    def draw(
-        self, steps: int, n: int, p: int, dtype: Any
-    ) -> tuple[Array | None, Array | None]:  # fmt: skip
+    def draw(self, steps: int, n: int, p: int, dtype: Any) -> tuple[Array | None, Array | None]:
         """Return w (steps, n) and v (steps, p), None where there is no such noise."""
-        keys = jax.random.split(self.key())
-        spreads = (self.process, self.measurement)
-        w, v = (
-            None if spread is None
-            else _scaled(jax.random.normal(key, (steps, size), dtype), jnp.asarray(spread, dtype))
-            for key, spread, size in zip(keys, spreads, (n, p), strict=True)
-        )  # fmt: skip
-        return w, v
+        first, second = jax.random.split(self.key())
+        w = _drawn(first, self.process, (steps, n), dtype)
+        return w, _drawn(second, self.measurement, (steps, p), dtype)
 
 
 def require_spread(name: str, value: Any, size: int) -> None:
@@ -105,8 +98,11 @@ def covariance(spread: Any, size: int) -> Any:
     return xp.diag(xp.broadcast_to(spread, (size,)) ** 2)
 
 
-def _scaled(draws: Array, spread: Array) -> Array:
-    """Return standard normal draws (T, k) with this spread."""
+def _drawn(key: Array, spread: Any, shape: tuple[int, int], dtype: Any) -> Array | None:
+    """Return draws (T, k) with this spread, None for none."""
+    if spread is None:
+        return None
+    draws, spread = jax.random.normal(key, shape, dtype), jnp.asarray(spread, dtype)
     if spread.ndim < 2:
         return draws * spread
     variances, axes = eigh(symmetric(spread))  # no Cholesky factor: covariances may be singular

@@ -1,15 +1,16 @@
 """The outcome of closed loops: limits kept, target reached, settling time, cost."""
 
-from typing import Any
-
 import jax
 import numpy as np
+from jax import Array
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
+from jaxmpc.robots.linear_plant import LinearPlant
+from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.violations import kept, row_violations
 
@@ -45,7 +46,9 @@ class Outcome:
         return self.kept & self.reached
 
 
-def evaluate_runs(run: Run, plant: Any, reference: Reals, *, tolerance: float = 0.02) -> Outcome:
+def evaluate_runs(
+    run: Run, plant: Robot | LinearPlant, reference: Reals, *, tolerance: float = 0.02
+) -> Outcome:
     """Evaluate closed loops whose target is rest at `reference`.
 
     run: from `simulate` or `simulate_many`, with or without a batch axis. plant: the Robot or
@@ -61,30 +64,33 @@ def evaluate_runs(run: Run, plant: Any, reference: Reals, *, tolerance: float = 
     limits = with_limits(plant, run)
     xi, band = limits[0][1], tolerance * plant.state_limits.half_widths()
     inside = (np.abs(xi - host_array("reference", reference)) <= band).all(axis=2)
-    # Samples before the last run of samples inside: T + 1 less the length of that run.
+    # Time steps before the last stretch inside: T + 1 less its length.
     before = inside.shape[1] - np.cumprod(inside[:, ::-1], axis=1).sum(axis=1)
-    status, fallback = np.asarray(run.status), np.asarray(run.fallback)
+    state_excess, input_excess = (row_violations(*pair) for pair in limits)
+    solved = np.asarray(run.status) == Status.SOLVED
     return Outcome(
-        coordinates=xi, state_excess=row_violations(*limits[0]),
-        input_excess=row_violations(*limits[1]), band=band,
+        coordinates=xi,
+        state_excess=state_excess,
+        input_excess=input_excess,
+        band=band,
         kept=np.all([kept(*pair).all(axis=(1, 2)) for pair in limits], axis=0),
-        reached=inside[:, -1], settling=np.where(inside[:, -1], before * plant.dt, np.inf),
+        reached=inside[:, -1],
+        settling=np.where(inside[:, -1], before * plant.dt, np.inf),
         cost=np.asarray(run.stage_cost, float).sum(axis=1),
-        plans_valid=((status == Status.SOLVED) & ~fallback).all(axis=1),
-    )  # fmt: skip
+        plans_valid=(solved & ~np.asarray(run.fallback)).all(axis=1),
+    )
 
 
-def with_limits(plant: Any, run: Run) -> list[tuple[Box, np.ndarray]]:
+def with_limits(plant: Robot | LinearPlant, run: Run) -> list[tuple[Box, np.ndarray]]:
     """Return (limits, values) of the states, as coordinates, and of the inputs of a run, in
     float64 NumPy arrays."""
-    plain = lambda box: jax.tree.map(lambda v: np.asarray(v, float), box)
     return [
-        (plain(plant.state_limits), coordinates(plant, run.states)),
-        (plain(plant.input_limits), np.asarray(run.inputs, float)),
+        (Box(*plant.state_limits.bounds()), coordinates(plant, run.states)),
+        (Box(*plant.input_limits.bounds()), np.asarray(run.inputs, float)),
     ]
 
 
-def coordinates(plant: Any, states: Any) -> np.ndarray:
+def coordinates(plant: Robot | LinearPlant, states: Array | np.ndarray) -> np.ndarray:
     """Return the coordinates (..., n) of plant states (..., nq + nv), in float64."""
     states = np.asarray(states, float)
     if plant.n == plant.state_size:  # no orientation: the same numbers

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, whole
 from jaxmpc.mpc.controller import Controller, zeros_of
 from jaxmpc.mpc.plan import Control, Plan, WarmStart, anchored, applied, limited
@@ -39,14 +40,14 @@ class RobotController:
       (`solve_stagewise`); with "set-point" the steps are those of `solve`.
     linearize: where the linear models are taken,
       "set-point"   once, as mpc.system says; matrices are factored once for all robots;
-      "state"       about the measured state and the last input, at each sample;
-      "trajectory"  about the last plan shifted by one sample, a model for each step: the real-time
+      "state"       about the measured state and the last input, at each time step;
+      "trajectory"  about the last plan shifted by one time step, a model for each: the real-time
                     iteration of sequential quadratic programming.
     exact: see `Robot.linearize`; always with sqp_steps > 1.
     tasks: `jaxmpc.mpc.Task`s, costs and limits on functions of mjx.Data, such as the position of
       the gripper; with "trajectory" only. Their targets are the columns of `reference` after the
       first n, or those of the tasks where the reference has just n.
-    sqp_steps: quadratic programs a sample at most. With "trajectory" more than one solve the
+    sqp_steps: quadratic programs a time step at most. With "trajectory" more than one solve the
       nonlinear problem (`solve_nonlinear`, Gauss and Newton's Hessian), and the status is that of
       the nonlinear problem.
     rho: L1 weight (cost per unit) with which state limits and terminal rows are soft. Where it
@@ -58,7 +59,7 @@ class RobotController:
     the robot, references in its coordinates (see `robot.trajectory`). `start` gives the first
     `before`, and takes the first point of linearisation from input_reference.
 
-    A pytree. Calling the class prepares the problem, see `prepared`; JAX and `tree_map` rebuild
+    A pytree. Calling the class prepares the problem; JAX and `tree_map` rebuild
     the object without that, `dataclasses.replace` prepares it again. Raises ValueError for
     arguments that do not fit together.
     """
@@ -76,18 +77,22 @@ class RobotController:
     scale: Any = field(init=False)
 
     def __init__(
-        self, robot: Any, mpc: MPC, solver: ADMM | None = None, linearize: str = "state",
-        exact: bool = False, rho: Any = 1e4, tasks: tuple[Task, ...] = (), sqp_steps: int = 1,
-    ) -> None:  # fmt: skip
+        self,
+        robot: Robot | LinearPlant,
+        mpc: MPC,
+        solver: ADMM | None = None,
+        linearize: str = "state",
+        exact: bool = False,
+        rho: Reals = 1e4,
+        tasks: tuple[Task, ...] = (),
+        sqp_steps: int = 1,
+    ) -> None:
         solver = DEFAULT if solver is None else solver
         if solver.iterations is None and linearize != "set-point":
             solver = replace(solver, iterations=0)
-        exact = exact or sqp_steps > 1
-        parts = prepared(robot, mpc, solver, linearize, rho, tasks, sqp_steps)
-        self.__dict__.update(
-            robot=robot, mpc=mpc, solver=arrays(solver), linearize=linearize, exact=exact,
-            rho=rho, tasks=tuple(tasks), sqp_steps=int(sqp_steps), **parts,
-        )  # fmt: skip
+        vars(self).update(robot=robot, mpc=mpc, linearize=linearize, rho=rho, tasks=tuple(tasks))
+        vars(self).update(exact=exact or sqp_steps > 1, sqp_steps=sqp_steps)
+        vars(self).update(_prepared(self, solver), solver=arrays(solver))
 
     @property
     def dtype(self) -> Any:
@@ -125,23 +130,26 @@ class RobotController:
         return jnp.broadcast_to(xi, (N + 1, len(xi))), u
 
     def __call__(
-        self, x: Any, before: Control[Plan] | None = None, reference: Any = None, *,
-        input_reference: Any = None, previous_input: Any = None,
-    ) -> Control[Plan]:  # fmt: skip
+        self,
+        x: Reals,
+        before: Control[Plan] | None = None,
+        reference: Reals | None = None,
+        *,
+        input_reference: Reals | None = None,
+        previous_input: Reals | None = None,
+    ) -> Control[Plan]:
         """Return the input (m,) at the state x, its plan, in ξ, and what to remember."""
         x = jnp.asarray(x, self.dtype)
         if np.shape(x) != (self.state_size,):
             fail("x", f"shape {np.shape(x)}", f"Give one state ({self.state_size},)")
         if self.fixed is not None:
-            return self.fixed(
-                self.coordinates(x), before, reference, input_reference=input_reference,
-                previous_input=previous_input,
-            )  # fmt: skip
+            known = {"input_reference": input_reference, "previous_input": previous_input}
+            return self.fixed(self.coordinates(x), before, reference, **known)
         problem = self.problem
         rows = layout(self.soft) + task_layout(problem)
         memory = None if before is None else before.memory
         start = None if memory is None else memory.shifted(rows, memory.inputs[-1])
-        given = {"input_reference": input_reference, "scale": self.scale}
+        given: dict[str, Any] = {"input_reference": input_reference, "scale": self.scale}
         xi = self.coordinates(x)
         if self.linearize == "trajectory":
             if start is None:
@@ -149,10 +157,8 @@ class RobotController:
                 start = WarmStart(*self._resting(x, input_reference), blank)
             start = anchored(start, xi)
             reference, targets = self._targets(problem, reference)
-            plan = solve_nonlinear(
-                problem, xi, reference, self.solver, start, targets=targets, **given,
-                iterations=self.sqp_steps, hessian="gauss-newton",
-            )  # fmt: skip
+            given |= {"iterations": self.sqp_steps, "hessian": "gauss-newton", "targets": targets}
+            plan = solve_nonlinear(problem, xi, reference, self.solver, start, **given)
         else:
             inputs = self._resting(x, input_reference)[1] if memory is None else memory.inputs
             system = self.robot.linearize(x, limited(self.soft.inputs, inputs[0]), exact=self.exact)
@@ -186,14 +192,13 @@ def as_model(robot: Any, exact: bool = True) -> Any:
     return RobotModel(robot, exact=exact) if isinstance(robot, Robot) else robot
 
 
-def prepared(
-    robot: Any, mpc: MPC, solver: ADMM, linearize: str, rho: Any, tasks: Any, sqp_steps: Any
-) -> dict[str, Any]:  # fmt: skip
-    """Check the arguments of a RobotController and compute what all its samples share.
+def _prepared(given: RobotController, solver: ADMM) -> dict[str, Any]:
+    """Check the arguments of a controller and compute what all its time steps share.
 
     Returns soft, the problem with soft state limits; fixed, the Controller of the linear model if
     that model does not change, else None; scale, the row scaling if it does, else None.
     """
+    robot, mpc, linearize = given.robot, given.mpc, given.linearize
     if linearize not in LINEARIZATIONS:
         fail("linearize", f"{linearize!r}", f"Give one of {', '.join(LINEARIZATIONS)}")
     if not isinstance(robot, Robot | LinearPlant):
@@ -203,15 +208,15 @@ def prepared(
     if sizes != (robot.n, robot.m):
         needed = f"{(robot.n, robot.m)}: robot_mpc makes such a problem"
         fail("mpc", f"has {sizes} states and inputs", f"This robot has {needed}")
-    whole("sqp_steps", sqp_steps, 1)
-    for name, given in (("tasks", len(tasks) > 0), ("sqp_steps", sqp_steps > 1)):
-        if given and linearize != "trajectory":
+    whole("sqp_steps", given.sqp_steps, 1)
+    for name, there in (("tasks", len(given.tasks) > 0), ("sqp_steps", given.sqp_steps > 1)):
+        if there and linearize != "trajectory":
             fail(name, f"given with linearize={linearize!r}", 'Give linearize="trajectory"')
-    soft = soften(mpc, rho)
+    soft = soften(mpc, given.rho)
     if linearize == "set-point":
         return {"soft": arrays(soft), "fixed": Controller(soft, solver), "scale": None}
     if linearize == "trajectory":
-        NonlinearMPC(soft, as_model(robot), tuple(tasks)).validate()
+        NonlinearMPC(soft, as_model(robot), given.tasks).validate()
     # Rows of tasks differ from state to state.
-    scale = None if tasks else factor_stages(soft, solver).E
+    scale = None if given.tasks else factor_stages(soft, solver).E
     return {"soft": arrays(soft), "fixed": None, "scale": scale}

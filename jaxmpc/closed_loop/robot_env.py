@@ -35,10 +35,10 @@ class RobotEnv(gymnasium.Env):
     def __init__(self, robot: Any = "pendulum", target: Any = None, **options: Any) -> None:
         robot = robot if isinstance(robot, Robot | LinearPlant) else load_robot(robot)
         self.environment = Environment.of(robot, target, **options)
-        bounds = (np.asarray(end, np.float32) for end in (
-            robot.input_limits.lower, robot.input_limits.upper
-        ))  # fmt: skip
-        lower, upper = (np.broadcast_to(end, (robot.m,)) for end in bounds)
+        lower, upper = (
+            np.broadcast_to(end.astype(np.float32), (robot.m,))
+            for end in robot.input_limits.bounds()
+        )
         if not np.all(np.isfinite([lower, upper])):
             fail("robot", "has inputs without limits", "Give torque limits, see load_robot")
         self.action_space = gymnasium.spaces.Box(lower, upper, dtype=np.float32)
@@ -60,9 +60,8 @@ class RobotEnv(gymnasium.Env):
             fail("step", "before the first reset", "Call reset()")
         self._state = state = _step(self.environment, self._state, np.asarray(action))
         observation, info = self._seen()
-        return (
-            observation, float(state.reward), bool(state.terminated), bool(state.truncated), info
-        )  # fmt: skip
+        ended = bool(state.terminated), bool(state.truncated)
+        return observation, float(state.reward), *ended, info
 
     def _seen(self) -> tuple[np.ndarray, dict[str, Any]]:
         assert self._state is not None

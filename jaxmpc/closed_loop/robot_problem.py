@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxmpc.arrays import Reals
+from jaxmpc.arrays import Reals, as_weight
 from jaxmpc.checks import fail, whole
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.robots.equilibria import settled
@@ -19,10 +19,17 @@ from jaxmpc.systems.system import LinearSystem
 
 
 def robot_mpc(
-    robot: Robot | LinearPlant, Q: Reals | None = None, R: Reals | None = None, horizon: int = 20,
-    *, target: Any = None, margin: float = 0.02, terminal_cost: Reals | str | None = "lqr",
-    exact: bool = True, **fields: Any,
-) -> MPC:  # fmt: skip
+    robot: Robot | LinearPlant,
+    Q: Reals | None = None,
+    R: Reals | None = None,
+    horizon: int = 20,
+    *,
+    target: Reals | None = None,
+    margin: float = 0.02,
+    terminal_cost: Reals | str | None = "lqr",
+    exact: bool = True,
+    **fields: Any,
+) -> MPC:
     """Return the MPC of a robot about a set-point, with the limits of its model.
 
     Arguments:
@@ -51,13 +58,7 @@ def robot_mpc(
     whole("horizon", horizon, 1)
     if not 0 <= margin < 1:
         fail("margin", f"{margin}", "Give a fraction in [0, 1)")
-    if Q is None:
-        positions = robot.mujoco.nv if isinstance(robot, Robot) else robot.n - robot.n // 2
-        Q = np.repeat([1.0, 0.01], [positions, robot.n - positions])
-        Q = Q / robot.state_limits.half_widths() ** 2
-    R = 0.01 / robot.input_limits.half_widths() ** 2 if R is None else R
-    diagonal = lambda W: np.diag(W) if np.ndim(W) == 1 else W
-    Q, R = diagonal(Q), diagonal(R)
+    Q, R = _weights(robot, Q, R)
     rests = True
     if target is None and isinstance(robot, Robot):
         rest, texts = settled(robot)
@@ -66,38 +67,44 @@ def robot_mpc(
             warnings.warn(text, stacklevel=2)
     else:
         x, u = robot.equilibrium(target)
+    names = robot.state_names or tuple(f"coordinate {i}" for i in range(robot.n))
     with jax.enable_x64(True):
         point = np.asarray(robot.coordinates(x))
-    names = robot.state_names or tuple(f"coordinate {i}" for i in range(robot.n))
-    states = _around(robot.state_limits, margin, point, names)
-    with jax.enable_x64(True):
+        states = _around(robot.state_limits, margin, point, names)
         system = jax.tree.map(np.asarray, robot.linearize(x, u, exact=exact))
     mpc = MPC(system, Q, R, horizon, states=states, inputs=robot.input_limits)
     mpc.validate()
-    mpc = replace(mpc, constrained_stages=tuple(range(1, horizon + 1)))
     if isinstance(terminal_cost, str):
         if terminal_cost != "lqr":
             fail("terminal_cost", f"{terminal_cost!r}", 'Give "lqr", a matrix or None')
         terminal_cost = _terminal_cost(system, np.asarray(Q), R, names) if rests else None
-    mpc = replace(mpc, **{"terminal_cost": terminal_cost, **fields})
+    usual = {"constrained_stages": tuple(range(1, horizon + 1)), "terminal_cost": terminal_cost}
+    mpc = replace(mpc, **{**usual, **fields})
     mpc.validate()
     return mpc
+
+
+def _weights(robot: Robot | LinearPlant, Q: Reals | None, R: Reals | None) -> tuple[Reals, Reals]:
+    """Return the weights as matrices, those of Bryson's rule for None."""
+    if Q is None:
+        positions = robot.mujoco.nv if isinstance(robot, Robot) else robot.n - robot.n // 2
+        parts = np.repeat([1.0, 0.01], [positions, robot.n - positions])
+        Q = parts / robot.state_limits.half_widths() ** 2
+    if R is None:
+        R = 0.01 / robot.input_limits.half_widths() ** 2
+    return as_weight(Q, robot.n), as_weight(R, robot.m)
 
 
 def _around(limits: Box, margin: float, point: np.ndarray, names: tuple[str, ...]) -> Box:
     """Return the limits tightened by the margin, by less where that would leave out the point
     (n,)."""
-    lower, upper = np.asarray(limits.lower, float), np.asarray(limits.upper, float)
-    rounding = 1e-9 * limits.half_widths()
-    outside = np.maximum(lower - point, point - upper) - rounding
+    lower, upper = limits.bounds()
+    outside = np.maximum(lower - point, point - upper) - 1e-9 * limits.half_widths()
     if np.any(outside > 0):
         i = int(np.argmax(outside))
-        fail(
-            "target", f"has {names[i]} = {point[i]:g}, limits are [{lower[i]:g}, {upper[i]:g}]",
-            "Choose another target",
-        )  # fmt: skip
-    tight = limits.tightened(margin)
-    lower, upper = np.asarray(tight.lower), np.asarray(tight.upper)
+        problem = f"has {names[i]} = {point[i]:g}, limits are [{lower[i]:g}, {upper[i]:g}]"
+        fail("target", problem, "Choose another target")
+    lower, upper = limits.tightened(margin).bounds()
     low, high = np.minimum(lower, point), np.maximum(upper, point)
     less = np.flatnonzero((low < lower) | (high > upper))
     if len(less):
@@ -110,8 +117,8 @@ def _around(limits: Box, margin: float, point: np.ndarray, names: tuple[str, ...
 
 
 def _terminal_cost(
-    system: LinearSystem, Q: np.ndarray, R: Any, names: tuple[str, ...]
-) -> np.ndarray:  # fmt: skip
+    system: LinearSystem, Q: np.ndarray, R: Reals, names: tuple[str, ...]
+) -> np.ndarray:
     """Return P of the LQR; where inputs do not move all modes that last, P = T P_r T' with P_r of
     the LQR on the subspace that they reach, T (n, r) an orthonormal basis of it.
 
@@ -122,10 +129,9 @@ def _terminal_cost(
     if least_reached(A, B)[0] > _UNREACHED:
         return np.asarray(lqr(system, Q, R).P)
     T = reached_subspace(A, B)
-    moved = np.linalg.norm(T, axis=1)
-    still = np.flatnonzero(moved < 0.999)
+    unmoved = np.flatnonzero(np.linalg.norm(T, axis=1) < 0.999)
     warnings.warn(
-        f"terminal_cost: inputs do not move all of {_listed(still, names)} (no equilibrium there "
+        f"terminal_cost: inputs do not move all of {_listed(unmoved, names)} (no equilibrium there "
         "is stabilizable); it is the LQR's of what they move",
         stacklevel=3,
     )
@@ -140,8 +146,8 @@ _UNREACHED = 1e-10
 def reached_subspace(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """Return an orthonormal basis T (n, r) of what inputs reach, the span of B, AB, A²B, ...
 
-    F = A − I reaches the same, and moves each direction by as much as one sample does. Directions
-    that a sample moves by less than 1e-9 of |F| count as not reached.
+    F = A − I reaches the same, and moves each direction by as much as one time step does.
+    Directions that it moves by less than 1e-9 of |F| count as not reached.
     """
     F = A - np.eye(len(A))
     F = F / max(np.linalg.norm(F, 2), np.finfo(np.float64).tiny)
@@ -156,5 +162,6 @@ def reached_subspace(A: np.ndarray, B: np.ndarray) -> np.ndarray:
 
 
 def _listed(which: np.ndarray, names: tuple[str, ...], most: int = 6) -> str:
+    """Return the first names, and how many more there are."""
     found = [names[i] for i in which]
     return ", ".join(found[:most]) + (f" and {len(found) - most} more" if found[most:] else "")

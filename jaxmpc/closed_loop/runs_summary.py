@@ -34,9 +34,13 @@ class RunsSummary:
 
 
 def summarise_runs(
-    runs: StoredRuns | Run, robot: Robot, reference: Reals, input_reference: Reals, *,
+    runs: StoredRuns | Run,
+    robot: Robot,
+    reference: Reals,
+    input_reference: Reals,
+    *,
     tolerance: float = 0.02,
-) -> RunsSummary:  # fmt: skip
+) -> RunsSummary:
     """Return the summary of runs whose target is rest at reference (n,) under input_reference (m,).
 
     runs: of `simulate_into`, or of `simulate_many`, with a batch axis. tolerance: see

@@ -1,16 +1,16 @@
 """Closed loops of many robots in a store: block by block, resumed after an interruption."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
-from tqdm.std import tqdm
 
 from jaxmpc.arrays import Reals
-from jaxmpc.batches import Timing, first_rows, padded
+from jaxmpc.batches import Part, Timing, first_rows, padded, work_off
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.many import simulate_many
 from jaxmpc.closed_loop.run import Run
@@ -22,7 +22,7 @@ from jaxmpc.robots.load import model_hash
 from jaxmpc.robots.robot import Robot
 
 if TYPE_CHECKING:
-    from jaxmpc.store import Field
+    from jaxmpc.store import Field, Store
 
 # The fields of `Run` in a store. Stored runs have no observer, hence no estimates, and no soft rows
 # at k = 0: x_0 is measured, and no limit binds it.
@@ -40,12 +40,23 @@ class StoredRuns:
 
 
 def simulate_into(
-    path: str | Path, controller: Any, robot: Robot, x0s: Reals, steps: int, *,
-    reference: Reals | None = None, input_reference: Reals | None = None,
-    factors: Mapping[str, np.ndarray] | None = None, settings: Mapping[str, Any] | None = None,
-    chunk: int = 256, devices: Any = None, resume: bool = False, overwrite: bool = False,
-    progress: bool = False, begun: Callable[[], None] = lambda: None,
-) -> StoredRuns:  # fmt: skip
+    path: str | Path,
+    controller: Any,
+    robot: Robot,
+    x0s: Reals,
+    steps: int,
+    *,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
+    factors: Mapping[str, np.ndarray] | None = None,
+    settings: Mapping[str, Any] | None = None,
+    chunk: int = 256,
+    devices: Any = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: bool = False,
+    begun: Callable[[], None] = lambda: None,
+) -> StoredRuns:
     """Simulate many robots into a store, block by block, each written as soon as it is done.
 
     path: a folder or URL (`jaxmpc.store`), which xarray.open_zarr reads: `points` (the starts),
@@ -66,66 +77,93 @@ def simulate_into(
     from jaxmpc.store import Constant, Store, report_damage
 
     check_results(path, resume, overwrite)
-    target: dict[str, Any] = {"reference": reference, "input_reference": input_reference}
-    x0s, factors, timing = np.asarray(x0s), dict(factors or {}), Timing()
-    if x0s.ndim != 2 or not len(x0s):
-        fail("x0s", f"shape {x0s.shape}", f"Give (B, {robot.state_size}), B ≥ 1")
-    if settings is None:
-        data = jax.tree.leaves((controller, target, factors))
-        data_hash = fingerprint(_constants(controller), data)
-        settings = {"steps": steps, "model": model_hash(robot), "data": data_hash}
-    if factors:  # raises ValueError where they do not fit, before there is a store
-        robot.vary(**{key: value[0] for key, value in plant_numbers(robot, factors).items()})
-    number = Constant(np.arange(len(x0s)), ("sample",), {"long_name": "robot"})
-    points = Constant(x0s, ("sample", "state"), {"long_name": "initial state"})
-    results = _fields(robot, steps, np.dtype(controller.dtype).name, factors)
+    target = {"reference": reference, "input_reference": input_reference, "devices": devices}
+    loops = _Loops(controller, robot, np.asarray(x0s), int(steps), target, dict(factors or {}))
+    loops.validate()
+    number = Constant(np.arange(len(loops.x0s)), ("sample",), {"long_name": "robot"})
+    points = Constant(loops.x0s, ("sample", "state"), {"long_name": "initial state"})
+    settings, axes = loops.settings() if settings is None else settings, {"sample": number}
+    options: dict[str, Any] = {"constants": {"points": points}, "begun": begun}
+    timing, shown = Timing(), None if progress else False
     with Store(
-        path, {"sample": number}, results, settings, chunk, constants={"points": points},
-        overwrite=overwrite, begun=begun,
-    ) as store:  # fmt: skip
+        path, axes, loops.fields(), settings, chunk, overwrite=overwrite, **options
+    ) as store:
         report_damage(store)
-        blocks = {block: store.rows(block) for block in store.pending()}
-        total = sum(rows.stop - rows.start for rows in blocks.values())
-        with tqdm(total=total, unit=" robots", disable=None if progress else True) as bar:
-            for block, rows in blocks.items():
-                own = {key: value[rows] for key, value in factors.items()}
-                numbers = plant_numbers(robot, own)
-                variations = {key: padded(value, store.size) for key, value in numbers.items()}
-                count = rows.stop - rows.start
-                with timing.work(count):
-                    run = simulate_many(
-                        controller, robot, padded(x0s[rows], store.size), steps, **target,
-                        variations=variations, devices=devices,
-                    )  # fmt: skip
-                run = first_rows(run, count)
-                store.commit(block, **{name: getattr(run, name) for name in STORED}, **own)
-                bar.update(count)
+        total = sum(len(store.samples(block)) for block in store.pending())
+        commit, parts = partial(loops.commit, store), loops.parts(store, timing)
+        work_off(parts, commit, total, unit="robots", progress=shown)
         found: dict[str, Any] = {name: store.read(name) for name in STORED}
         found["slack"] = np.zeros((*found["status"].shape, 0))
-        run = Run(**found)
-        return StoredRuns(run, store.attributes["config"], timing)
+        return StoredRuns(Run(**found), store.attributes["config"], timing)
 
 
-def _fields(
-    robot: Robot, steps: int, dtype: str, factors: Mapping[str, np.ndarray]
-) -> "dict[str, Field]":
-    """Return what the store holds of each robot."""
-    from jaxmpc.store import Field
+@record
+class _Loops:
+    """Loops that a store is to hold: arguments of `simulate_many`, target and devices by name, and
+    the factors of the plants."""
 
-    number = lambda shape, *axes: Field(shape, dtype, np.nan, axes)
-    found = {
-        "states": number((steps + 1, robot.state_size), "sample_time", "state"),
-        "inputs": number((steps, robot.m), "time", "input"),
-        "cost": number((steps,), "time"),
-        "status": Field((steps,), "int8", int(Status.NOT_RUN), ("time",)),
-        "stage_cost": number((steps,), "time"),
-        "violation": number((steps + 1,), "sample_time"),
-        "fallback": Field((steps,), "bool", False, ("time",)),
-    }
-    for name, factor in factors.items():
-        shape = np.shape(factor)[1:]
-        found[name] = Field(shape, "float64", np.nan, (f"{name}_of",) * len(shape))
-    return found
+    controller: Any
+    robot: Robot
+    x0s: np.ndarray
+    steps: int
+    target: dict[str, Any]
+    factors: dict[str, np.ndarray]
+
+    def validate(self) -> None:
+        """Raise ValueError for starts and factors of other shapes, before there is a store."""
+        size = self.robot.state_size
+        if self.x0s.ndim != 2 or self.x0s.shape[1] != size or not len(self.x0s):
+            fail("x0s", f"shape {self.x0s.shape}", f"Give (B, {size}), B ≥ 1")
+        if self.factors:
+            numbers = plant_numbers(self.robot, self.factors)
+            self.robot.vary(**{key: value[0] for key, value in numbers.items()})
+
+    def settings(self) -> dict[str, Any]:
+        """Return what determines the runs, as hashes."""
+        aims = (self.target["reference"], self.target["input_reference"])
+        data = jax.tree.leaves((self.controller, aims, self.factors))
+        data_hash = fingerprint(_constants(self.controller), data)
+        return {"steps": self.steps, "model": model_hash(self.robot), "data": data_hash}
+
+    def fields(self) -> "dict[str, Field]":
+        """Return what the store holds of each robot."""
+        from jaxmpc.store import Field
+
+        steps, dtype = self.steps, np.dtype(self.controller.dtype).name
+        number = lambda shape, *axes: Field(shape, dtype, np.nan, axes)
+        found = {
+            "states": number((steps + 1, self.robot.state_size), "sample_time", "state"),
+            "inputs": number((steps, self.robot.m), "time", "input"),
+            "cost": number((steps,), "time"),
+            "status": Field((steps,), "int8", int(Status.NOT_RUN), ("time",)),
+            "stage_cost": number((steps,), "time"),
+            "violation": number((steps + 1,), "sample_time"),
+            "fallback": Field((steps,), "bool", False, ("time",)),
+        }
+        for name, factor in self.factors.items():
+            shape = np.shape(factor)[1:]
+            found[name] = Field(shape, "float64", np.nan, (f"{name}_of",) * len(shape))
+        return found
+
+    def parts(self, store: "Store", timing: Timing) -> Iterator[Part[Run]]:
+        """Yield the runs of each block that is to be done; `timing` counts no writing of files."""
+        for block in store.pending():
+            rows = store.rows(block)
+            own = {key: value[rows] for key, value in self.factors.items()}
+            numbers = plant_numbers(self.robot, own)
+            given = self.target | {
+                "variations": {key: padded(value, store.size) for key, value in numbers.items()}
+            }
+            x0s, size = padded(self.x0s[rows], store.size), rows.stop - rows.start
+            with timing.work(size):
+                run = simulate_many(self.controller, self.robot, x0s, self.steps, **given)
+            yield Part(block, size, first_rows(run, size))
+
+    def commit(self, store: "Store", part: Part[Run]) -> None:
+        """Write the runs of a block."""
+        rows = store.rows(part.place)
+        own = {key: value[rows] for key, value in self.factors.items()}
+        store.commit(part.place, **{name: getattr(part.result, name) for name in STORED}, **own)
 
 
 def _constants(value: Any) -> Any:

@@ -8,16 +8,20 @@ import jax
 import numpy as np
 
 from jaxmpc.checks import fail, nearest, require_kind, require_shape, whole
+from jaxmpc.robots.engine import names, number_of
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
 
 # Of each quantity, the field of MuJoCo's model that its factor multiplies and whose it is. The
 # order decides the random numbers: add at the end.
 QUANTITIES = {
-    "mass": ("body_mass", "body"), "damping": ("dof_damping", "joint"), "payload": (None, None),
-    "armature": ("dof_armature", "joint"), "friction": ("dof_frictionloss", "joint"),
+    "mass": ("body_mass", "body"),
+    "damping": ("dof_damping", "joint"),
+    "payload": (None, None),
+    "armature": ("dof_armature", "joint"),
+    "friction": ("dof_frictionloss", "joint"),
     "gear": ("actuator_gear", "actuator"),
-}  # fmt: skip
+}
 
 
 def randomised(
@@ -47,9 +51,15 @@ def randomised(
 
 
 def draw_robots(
-    robot: Robot, count: int, seed: int = 0, *, spread: float = 0.5, mass: float = 0.0,
-    damping: float = 0.0, payload: float = 0.0,
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:  # fmt: skip
+    robot: Robot,
+    count: int,
+    seed: int = 0,
+    *,
+    spread: float = 0.5,
+    mass: float = 0.0,
+    damping: float = 0.0,
+    payload: float = 0.0,
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Draw starts (count, nq + nv) and the factors by which each plant differs from the model.
 
     spread: largest fraction of the way from home to the limits. mass, damping: factors are from
@@ -134,19 +144,14 @@ def _named(robot: Robot, ranges: Mapping[str, Any]) -> dict[str, tuple[str, np.n
 
 def _places(robot: Robot, argument: str, name: str, kind: str) -> np.ndarray:
     """Return where the numbers of one body, joint or actuator are in their fields."""
-    import mujoco
-
-    model = robot.mujoco
-    number = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
+    number = number_of(robot.mujoco, kind, name)
     if number < 0:
-        count = {"body": model.nbody, "joint": model.njnt, "actuator": model.nu}[kind]
-        known = [getattr(model, kind)(i).name for i in range(count)]
-        known = [found for found in known if found not in ("", "world")]
+        known = [found for found in names(robot.mujoco, kind) if found not in ("", "world")]
         cure = f"{nearest(name, known)}It has {', '.join(known) or 'none with a name'}"
         fail(argument, f"{robot.name} has no {kind} named {name!r}", cure)
     if kind != "joint":
         return np.array([number])
-    return np.flatnonzero(model.dof_jntid == number)
+    return np.flatnonzero(robot.mujoco.dof_jntid == number)
 
 
 def start_room(robot: Robot | LinearPlant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -155,7 +160,6 @@ def start_room(robot: Robot | LinearPlant) -> tuple[np.ndarray, np.ndarray, np.n
     with jax.enable_x64(True):
         home = np.asarray(robot.coordinates(np.asarray(robot.home)))
     below, above = (
-        np.where(np.isfinite(end), np.abs(end - home), 1.0)
-        for end in (np.asarray(robot.state_limits.lower), np.asarray(robot.state_limits.upper))
+        np.where(np.isfinite(end), np.abs(end - home), 1.0) for end in robot.state_limits.bounds()
     )
     return home, below, above

@@ -293,7 +293,8 @@ class Simulate:
         if self.linearize == "lqr":
             return LinearFeedback(mpc, lqr(mpc.system, mpc.Q, mpc.R).K, robot)
         solver = ADMM(iterations=self.iterations, newton_steps=self.newton_steps)
-        return RobotController(robot, mpc, solver, linearize=str(self.linearize), rho=self.rho)
+        assert self.linearize is not None and self.rho is not None
+        return RobotController(robot, mpc, solver, linearize=self.linearize, rho=self.rho)
 
     def settings(self, robot: Robot, mpc: MPC) -> dict[str, Any]:
         """Return the options that determine the results, as JSON data."""

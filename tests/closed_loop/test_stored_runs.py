@@ -1,0 +1,96 @@
+"""Robot runs in a store, from Python: what the command `jaxmpc simulate` calls."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import jaxmpc as jm
+from jaxmpc.closed_loop import (
+    LinearFeedback,
+    draw_robots,
+    simulate_into,
+    simulate_many,
+    stored_runs,
+    summarise_runs,
+)
+from jaxmpc.closed_loop.variations import plant_numbers
+
+STEPS = 30
+
+
+@pytest.fixture(scope="module")
+def joint():
+    return jm.load_robot("joint")
+
+
+@pytest.fixture(scope="module")
+def feedback(joint):
+    """A law without plans, which compiles in a moment."""
+    system = jm.LinearSystem([[1, 0.01], [0, 1]], [[0.002], [0.2]], dt=0.01)
+    plant = jm.LinearPlant(system, joint.state_limits, joint.input_limits)
+    return LinearFeedback(jm.robot_mpc(plant, horizon=5), np.array([[-4.0, -2.0]]), joint)
+
+
+def test_runs_are_stored_resumed_and_those_of_simulate_many(tmp_path, monkeypatch, joint, feedback):
+    """Six robots in blocks of three: the second block is done by the second call."""
+    x0s, factors = draw_robots(joint, 6, seed=3, mass=0.2)
+    path, options = tmp_path / "runs.zarr", {"factors": factors, "chunk": 4}
+    real, asked = stored_runs.simulate_many, []
+
+    def interrupted(*args, **kwargs):
+        asked.append(len(args[2]))
+        if len(asked) == 2:
+            raise KeyboardInterrupt
+        return real(*args, **kwargs)
+
+    monkeypatch.setattr(stored_runs, "simulate_many", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        simulate_into(path, feedback, joint, x0s, STEPS, **options)
+    monkeypatch.setattr(stored_runs, "simulate_many", real)
+    with pytest.raises(ValueError, match="exists"):
+        simulate_into(path, feedback, joint, x0s, STEPS, **options)
+    with pytest.raises(ValueError, match="steps: 30 there, 29 here"):
+        simulate_into(path, feedback, joint, x0s, STEPS - 1, resume=True, **options)
+    other = LinearFeedback(feedback.mpc, 2 * feedback.K, joint)
+    with pytest.raises(ValueError, match="data: "):
+        simulate_into(path, other, joint, x0s, STEPS, resume=True, **options)
+
+    begun = []
+    found = simulate_into(
+        path, feedback, joint, x0s, STEPS, resume=True, begun=lambda: begun.append(1), **options
+    )
+    assert found.timing.count == 3 and begun == [1] and "StoredRuns(" in repr(found)
+    numbers = plant_numbers(joint, factors)
+    run = simulate_many(feedback, joint, x0s, STEPS, variations=numbers, chunk=4)
+    np.testing.assert_array_equal(found.run.states, run.states)
+    data = xr.open_zarr(path).load()
+    np.testing.assert_array_equal(data["states"], run.states)
+    np.testing.assert_array_equal(data["points"], x0s)
+    np.testing.assert_array_equal(data["mass"], factors["mass"])
+    again = simulate_into(path, feedback, joint, x0s[:4], STEPS, overwrite=True)
+    assert again.run.states.shape == (4, STEPS + 1, 2) and again.timing.count == 4
+
+
+def test_summary_says_what_the_states_say(joint, feedback):
+    """Of runs that no store holds: without settings, and without the time they took."""
+    x0s, _ = draw_robots(joint, 5, seed=1)
+    run = simulate_many(feedback, joint, x0s, 400)
+    summary = summarise_runs(run, joint, np.zeros(2), np.zeros(1))
+    outcome = jm.closed_loop.evaluate_runs(run, joint, np.zeros(2))
+    assert summary.data["success"] == np.count_nonzero(outcome.success)
+    assert summary.data["settling"]["median"] == np.sort(outcome.settling)[2]
+    assert summary.data["plans"] == 0 and "config" not in summary.data
+    names = [name for name, _ in summary.rows()]
+    assert names == ["robots", "success", "limits kept", "worst", "settling", "cost"]
+    assert str(summary).splitlines()[0].split()[:2] == ["robots", "5"]
+
+
+def test_wrong_arguments_leave_no_store(tmp_path, joint, feedback):
+    for x0s, factors, message in (
+        (np.zeros(2), None, r"x0s: shape \(2,\)"),
+        (np.zeros((2, 3)), None, r"x0s: shape \(2, 3\)"),
+        (np.zeros((2, 2)), {"friction": np.ones((2, 1))}, "dof_frictionloss: is zero"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            simulate_into(tmp_path / "runs.zarr", feedback, joint, x0s, 3, factors=factors)
+    assert not any(tmp_path.iterdir())
