@@ -88,10 +88,17 @@ class ExactPenalty:
 
 
 def exact_penalty(
-    mpc: MPC, x0s: Reals | None = None, *, method: str = "auto", rho: float | None = None,
-    max_regions: int = 2000, within: Box | Polytope | None = None, samples: int = 200,
-    seed: int = 0, seconds: float = np.inf,
-) -> ExactPenalty:  # fmt: skip
+    mpc: MPC,
+    x0s: Reals | None = None,
+    *,
+    method: str = "auto",
+    rho: float | None = None,
+    max_regions: int = 2000,
+    within: Box | Polytope | None = None,
+    samples: int = 200,
+    seed: int = 0,
+    seconds: float = np.inf,
+) -> ExactPenalty:
     """Return the exact-penalty threshold of an MPC problem with an L1 penalty on slacks.
 
     The soft problem min J + ρ·Σε, C z + D x ≤ bound + ε, ε ≥ 0 has the hard problem's plan at a
@@ -132,18 +139,17 @@ def exact_penalty(
 
     p, table = least_distance_form(mpc, within), row_table(mpc)
     weigh = Thresholds(p, softened(p, table))
-    found: dict[tuple[int, ...], Worst | None] = {}
+    search = PenaltySearch(p, weigh, np.random.default_rng(seed), deadline)
     regions: CriticalRegions | None = None
-    few = len(p.center) <= ENUMERATED
-    if method == "regions" or (method == "auto" and few):
-        search = explore(p, max_regions, deadline)
-        regions = CriticalRegions.of(mpc, search)
-        for c in search.found:
-            found[c.law.active] = weigh.over(c.law, c.vertices)
+    if method == "regions" or (method == "auto" and len(p.center) <= ENUMERATED):
+        explored = explore(p, max_regions, deadline)
+        regions = CriticalRegions.of(mpc, explored)
+        for c in explored.found:
+            search.found[c.law.active] = weigh.over(c.law, c.vertices)
     exact = regions is not None and regions.complete
     if method == "samples" or (method == "auto" and not exact):
-        climb_regions(p, weigh, found, samples, np.random.default_rng(seed), deadline)
-    worsts = [worst for worst in found.values() if worst is not None]
+        search.run(samples)
+    worsts = [worst for worst in search.found.values() if worst is not None]
     worst = max(worsts, key=lambda w: w.value, default=Worst(0.0, p.interior, -1))
 
     value = worst.value
@@ -294,63 +300,90 @@ class Thresholds:
         return values, status
 
 
-def climb_regions(
-    p: LeastDistanceForm, weigh: Thresholds, found: dict[tuple[int, ...], Worst | None],
-    samples: int, random: np.random.Generator, deadline: float,
-) -> None:  # fmt: skip
-    """Add to `found` the regions that samples, and a search from the best of them, meet.
+class PenaltySearch:
+    """Search for the region with the largest threshold, by samples and from region to region.
 
-    The search goes on from the best region not yet left, across its facets, until PATIENCE
-    regions in turn have led to nothing better, or until the deadline of `time.monotonic`.
+    found: the largest threshold of each active set that was looked at, None without a region.
     """
-    seen: dict[tuple[int, ...], float] = {}
-    n, half = len(p.center), samples // 2
-    tops = [p.support(d)[1] for d in random.standard_normal((max(half, 1), n))]
-    corners = np.array([xi for xi in tops if xi is not None]).reshape(-1, n)
-    # At random, and towards points between corners of X_N, where regions are smallest.
-    weights = random.dirichlet(np.full(max(len(corners), 1), 1 / max(len(corners), 1)), half)
-    between = weights @ corners - p.interior if len(corners) else np.zeros((0, n))
-    for direction in [*random.standard_normal((samples - half, n)), *between]:
-        if time.monotonic() > deadline:
-            break
-        end = p.leave(direction)
-        for fraction in FRACTIONS if end is not None else ():
-            solution = p.solution(p.interior + fraction * (end - p.interior))
-            if solution is not None:
-                rows = list(solution.active)
-                loads = (solution.multipliers / p.length[rows])[weigh.soft[rows]]
-                active = p.basis(solution) or ()
-                seen[active] = max(seen.get(active, 0.0), loads.max(initial=0.0))
 
-    def visit(active: tuple[int, ...] | None) -> None:
-        if active is not None and active not in found:
-            here = active_piece(p, active)
-            found[active] = None if here is None else weigh.maximal(here)
+    def __init__(
+        self, p: LeastDistanceForm, weigh: Thresholds, random: np.random.Generator, deadline: float
+    ) -> None:
+        self.p, self.weigh, self.random, self.deadline = p, weigh, random, deadline
+        self.found: dict[tuple[int, ...], Worst | None] = {}
 
-    visit(p.active(p.interior))
-    for active in sorted(seen, key=lambda a: -seen[a])[:STARTS]:
-        visit(active)
-    left: set[tuple[int, ...]] = set()
-    best, stale = -1.0, 0
-    while stale < PATIENCE:
-        waiting = {a: w for a, w in found.items() if w is not None and a not in left}
-        if not waiting or time.monotonic() > deadline:
-            return
-        here, worst = max(waiting.items(), key=lambda item: item[1].value)
-        stale = 0 if worst.value > best * (1 + ROUNDING) else stale + 1
-        best = max(best, worst.value)
-        left.add(here)
-        leaving = active_piece(p, here)
-        assert leaving is not None
-        # Random rays inside the region hit its facets: from its middle, and from near the corner
-        # where the multiplier is largest.
-        middle, _ = capped_ball(leaving.H, leaving.h)
+    @property
+    def late(self) -> bool:
+        """Return True once the deadline, of `time.monotonic`, is over."""
+        return time.monotonic() > self.deadline
+
+    def run(self, samples: int) -> None:
+        """Look at the regions that samples meet, and climb from the best of them."""
+        seen = self._sampled(samples)
+        self.visit(self.p.active(self.p.interior))
+        for active in sorted(seen, key=seen.__getitem__, reverse=True)[:STARTS]:
+            self.visit(active)
+        self._climb()
+
+    def visit(self, active: tuple[int, ...] | None) -> None:
+        """Find the largest threshold of an active set that is new."""
+        if active is not None and active not in self.found:
+            here = active_piece(self.p, active)
+            self.found[active] = None if here is None else self.weigh.maximal(here)
+
+    def _sampled(self, samples: int) -> dict[tuple[int, ...], float]:
+        """Return the active sets met on rays to the boundary of X_N, with their largest loads.
+
+        The rays are at random, and towards points between corners of X_N, where regions are
+        smallest.
+        """
+        p, random, n, half = self.p, self.random, len(self.p.center), samples // 2
+        seen: dict[tuple[int, ...], float] = {}
+        tops = [p.support(d)[1] for d in random.standard_normal((max(half, 1), n))]
+        corners = np.array([xi for xi in tops if xi is not None]).reshape(-1, n)
+        weights = random.dirichlet(np.full(max(len(corners), 1), 1 / max(len(corners), 1)), half)
+        between = weights @ corners - p.interior if len(corners) else np.zeros((0, n))
+        for direction in [*random.standard_normal((samples - half, n)), *between]:
+            if self.late:
+                break
+            end = p.leave(direction)
+            for fraction in FRACTIONS if end is not None else ():
+                solution = p.solution(p.interior + fraction * (end - p.interior))
+                if solution is not None:
+                    rows = list(solution.active)
+                    loads = (solution.multipliers / p.length[rows])[self.weigh.soft[rows]]
+                    active = p.basis(solution) or ()
+                    seen[active] = max(seen.get(active, 0.0), loads.max(initial=0.0))
+        return seen
+
+    def _climb(self) -> None:
+        """Go on from the best region not yet left, across its facets, until PATIENCE regions in
+        turn have led to nothing better, or until the deadline."""
+        left: set[tuple[int, ...]] = set()
+        best, stale = -1.0, 0
+        while stale < PATIENCE:
+            waiting = {a: w for a, w in self.found.items() if w is not None and a not in left}
+            if not waiting or self.late:
+                return
+            here = max(waiting, key=lambda active: waiting[active].value)
+            worst = waiting[here]
+            stale = 0 if worst.value > best * (1 + ROUNDING) else stale + 1
+            best = max(best, worst.value)
+            left.add(here)
+            for row in self._facets(here, worst):
+                for active in exchange(self.p, here, row) or []:
+                    self.visit(tuple(sorted(active)))
+
+    def _facets(self, active: tuple[int, ...], worst: Worst) -> list[int]:
+        """Return rows of facets of a region, those that random rays inside it hit: from its middle,
+        and from near the corner where the multiplier is largest."""
+        piece = active_piece(self.p, active)
+        assert piece is not None
+        middle, _ = capped_ball(piece.H, piece.h)
         facets: set[int] = set()
         for start in (middle, middle + 0.95 * (worst.xi - middle)):
-            slope = leaving.H @ random.standard_normal((len(start), RAYS))
-            gap = (leaving.h - leaving.H @ start)[:, None]
+            slope = piece.H @ self.random.standard_normal((len(start), RAYS))
+            gap = (piece.h - piece.H @ start)[:, None]
             with np.errstate(divide="ignore"):
                 facets.update(np.where(slope > 0, gap / slope, np.inf).argmin(axis=0).tolist())
-        for row in sorted(leaving.which[list(facets)].tolist()):
-            for active in exchange(p, here, row) or []:
-                visit(tuple(sorted(active)))
+        return sorted(piece.which[list(facets)].tolist())

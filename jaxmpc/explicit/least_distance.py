@@ -274,6 +274,22 @@ def least_distance_form(mpc: MPC, within: Box | Polytope | None = None) -> Least
     # Multiples of the golden ratio spread evenly and have no small integer relations.
     epsilon = 1 + np.modf(np.arange(1, len(v) + 1) * (np.sqrt(5) - 1) / 2)[0]
     return LeastDistanceForm(
-        given, hull, c, factor, shift, M, U, V, v, typical, length, row, side, zero_row, epsilon,
-        center, size, ball[-n:],
-    )  # fmt: skip
+        given=given,
+        hull=hull,
+        condensed=c,
+        factor=factor,
+        shift=shift,
+        M=M,
+        U=U,
+        V=V,
+        v=v,
+        typical=typical,
+        length=length,
+        row=row,
+        side=side,
+        zero_row=zero_row,
+        epsilon=epsilon,
+        center=center,
+        size=size,
+        interior=ball[-n:],
+    )

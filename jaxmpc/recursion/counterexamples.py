@@ -69,7 +69,7 @@ def certified(
     bound: CenteredPolytope | None,
     candidates: np.ndarray,
     found: list[str],
-) -> Counterexample | None:  # fmt: skip
+) -> Counterexample | None:
     """Return the candidate (K, p) whose next state is farthest outside, with both ends proved; or
     None.
 
@@ -92,10 +92,17 @@ def certified(
         distance = float((normal @ after[best] - offset) / np.linalg.norm(normal))
         if normal @ after[best] - offset > CLEAR * (offset - normal @ bound.center):
             return Counterexample(
-                states[best], inputs[best], after[best], normal, offset, distance,
-                feasible[best], float(plans.primal_residual[best]),
-                float(plans.dual_residual[best]), found[best // len(BACKOFFS)],
-            )  # fmt: skip
+                state=states[best],
+                inputs=inputs[best],
+                next_state=after[best],
+                normal=normal,
+                offset=offset,
+                distance=distance,
+                feasible_inputs=feasible[best],
+                primal_residual=float(plans.primal_residual[best]),
+                dual_residual=float(plans.dual_residual[best]),
+                found=found[best // len(BACKOFFS)],
+            )
     return None
 
 

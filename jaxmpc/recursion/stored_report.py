@@ -29,11 +29,10 @@ def save_report(
         facets = {"facet_normals": np.asarray(body.H), "facet_offsets": np.asarray(body.h)}
     remove_files(folder, *FILES)
     arrays = folder / "recursion.npz"
-    write_arrays(
-        arrays, {"problem": FeasibilityProblem.of(report.mpc).plain()}, **facets,
-        **loops.labels.arrays(), state=loops.x0s, input=loops.inputs,
-        next_state=loops.next_states, lost_at=loops.lost_at, undecided_at=loops.undecided_at,
-    )  # fmt: skip
+    problem = {"problem": FeasibilityProblem.of(report.mpc).plain()}
+    found = {name: getattr(loops, name) for name in ("lost_at", "undecided_at")}
+    found |= {"state": loops.x0s, "input": loops.inputs, "next_state": loops.next_states}
+    write_arrays(arrays, problem, **facets, **loops.labels.arrays(), **found)
     summary = {
         "name": config["name"],
         "claims": {name: dataclasses.asdict(claim) for name, claim in report.claims.items()},

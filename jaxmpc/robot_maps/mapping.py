@@ -66,10 +66,13 @@ def map_robot(
     is neither feasible nor within limits. A limit counts as kept up to 1e-6 (float32: 1e-4) in its
     units. Raises ValueError for wrong arguments before anything compiles.
     """
-    setting = RobotSetting.of(
-        robot, mpc, x0s, seconds, controller=controller, target=target, axes=axes, fixed=fixed,
-        claim=claim,
-    )  # fmt: skip
+    given: dict[str, Any] = {
+        "controller": controller,
+        "target": target,
+        "axes": axes,
+        "fixed": fixed,
+    }
+    setting = RobotSetting.of(robot, mpc, x0s, seconds, claim=claim, **given)
     found: list[tuple[Labels, RobotLoops]] = []
     parts = setting.parts(setting.x0s, setting.chunk(chunk))
     total = len(setting.x0s)
@@ -142,9 +145,16 @@ class RobotSetting:
             with jax.enable_x64(True):
                 controller = RobotController(robot, mpc, linearize="set-point")
         setting = cls(
-            robot, limited, problem, controller, x0s, reference, np.asarray(u),
-            max(1, round(seconds / robot.dt)), claim,
-        )  # fmt: skip
+            robot=robot,
+            mpc=limited,
+            problem=problem,
+            controller=controller,
+            x0s=x0s,
+            reference=reference,
+            input_reference=np.asarray(u),
+            steps=max(1, round(seconds / robot.dt)),
+            claim=claim,
+        )
         if claim == "recursion":
             setting.deviations()
         return setting
@@ -184,10 +194,14 @@ class RobotSetting:
             if self.robot.state_size != self.robot.n:
                 start = np.asarray(jax.vmap(self.robot.state)(xi))
             run = simulate_many(
-                self.controller, self.robot, start, self.steps, devices=devices,
+                self.controller,
+                self.robot,
+                start,
+                self.steps,
                 reference=self.reference.astype(self.dtype),
                 input_reference=self.input_reference.astype(self.dtype),
-            )  # fmt: skip
+                devices=devices,
+            )
             return RobotLoops.of(first_rows(run, len(x0s)), self.robot, self.dtype)
 
     def map(

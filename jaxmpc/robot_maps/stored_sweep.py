@@ -7,6 +7,7 @@ summary.json     counts and the configuration
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -137,9 +138,15 @@ def sweep_robot(
     }
     open_folder(folder)
     blocks = open_labels(
-        path, setting.problem, along, config, setting.chunk(), LOOPS, overwrite=overwrite,
-        begun=lambda: remove_files(folder, *FILES),
-    )  # fmt: skip
+        path,
+        setting.problem,
+        along,
+        config,
+        setting.chunk(),
+        LOOPS,
+        overwrite=overwrite,
+        begun=partial(remove_files, folder, *FILES),
+    )
     store.report_damage(blocks)
     with blocks:
         count = f"{len(setting.x0s):,} states, {setting.steps} time steps"
@@ -212,12 +219,9 @@ def _in_blocks(
 
 def _save(folder: Path, setting: RobotSetting, found: RobotMap, config: dict[str, Any]) -> None:
     """Write robot_map.npz and summary.json."""
-    write_arrays(
-        folder / "robot_map.npz", x0s=found.x0s, states=found.states,
-        predicted=found.predicted, held=found.held, within_limits=found.within_limits,
-        recursive=found.recursive, feasible=found.linear.label, depth=found.depth,
-        **vars(found.loops),
-    )  # fmt: skip
+    names = "x0s states predicted held within_limits recursive depth".split()
+    arrays = {name: getattr(found, name) for name in names} | vars(found.loops)
+    write_arrays(folder / "robot_map.npz", feasible=found.linear.label, **arrays)
     run = {"precision": setting.dtype, "config": config, "versions": versions()}
     write_results(folder / "summary.json", found.summary() | run)
 
