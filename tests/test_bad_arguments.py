@@ -46,7 +46,7 @@ CALLS = [
     ("x0: {'q': 1, 'dq': 2} where real", lambda: jm.solve(M, {"q": 1, "dq": 2})),
     ("x0: entries of type object where real", lambda: jm.solve(M, [None, None])),
     ("x0: {1, 2} where real numbers are", lambda: jm.solve(M, {1, 2})),
-    ("reference: ADMM(iterations=None", lambda: jm.solve(M, x, jm.ADMM())),
+    ("reference: ADMM() where real", lambda: jm.solve(M, x, jm.ADMM())),
     ("reference: 'r' where real numbers are", lambda: jm.solve(M, x, "r")),
     ("reference: entries of type complex128 where", lambda: jm.solve(M, x, x + 1j)),
     ("reference: shape (3,). Give (2,) or (4, 2);", lambda: jm.solve(M, x, np.zeros(3))),
@@ -625,7 +625,7 @@ def test_wrong_arguments_of_a_controller_are_named():
     with pytest.raises(ValueError, match=r"rho: shape \(2,\). Give \(\), \(9,\) or"):
         jm.Controller(M, jm.ADMM(rho=[1, 2]))
     for given, message in (
-        ("x", "x0: 'x' where real"), (jm.ADMM(), "x0: ADMM(iterations"), (None, "x0: None where"),
+        ("x", "x0: 'x' where real"), (jm.ADMM(), "x0: ADMM() where real"), (None, "x0: None where"),
         (x + 1j, "x0: entries of type complex"), (jnp.zeros(2, complex), "x0: entries of type c"),
         (0.5, "x0: shape ()"),
     ):  # fmt: skip

@@ -22,7 +22,7 @@ from jax import Array
 from jaxmpc.arrays import host_array
 from jaxmpc.checks import concrete, require_memory
 from jaxmpc.mpc.problem import MPC, Switch, weights_of
-from jaxmpc.mpc.rows import Layout, blocks, split, stacked
+from jaxmpc.mpc.rows import Layout, blocks, bounds_of, layout_of, split, stacked
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import solve
 from jaxmpc.qp.modes import own_modes, varying
@@ -238,32 +238,40 @@ def _condense(mpc: MPC) -> Condensed:
     K_N = -solve(G + ridge * jnp.eye(m, dtype=dtype), matmul(BtP, A))
 
     found = blocks(mpc, dtype)
+    bounds = bounds_of(found, dtype)
     states, inputs = (Gamma, Phi, phi), (Omega, Psi, psi)
-    empty = (
-        jnp.zeros((0, P.shape[0]), dtype),
-        jnp.zeros((0, p), dtype),
-        *[jnp.zeros(0, dtype)] * 3,
-    )
+    empty = (jnp.zeros((0, P.shape[0]), dtype), jnp.zeros((0, p), dtype), jnp.zeros(0, dtype))
     parts = [empty] + [stacked(b, states, rates if b.rate else inputs) for b in found]
-    C, D, d, lower, upper = (jnp.concatenate(part) for part in zip(*parts, strict=True))
-    linear = quadratic = radius = None
-    if any(b.linear is not None for b in found):
-        spread = lambda name, hard: jnp.concatenate([
-            jnp.tile(jnp.full(b.size, hard, dtype) if b.linear is None else getattr(b, name),
-                     len(b.steps))
-            for b in found
-        ])  # fmt: skip
-        linear, quadratic = spread("linear", jnp.inf), spread("quadratic", 0.0)
-    ball_blocks = [b for b in found if b.radius is not None]
-    if ball_blocks:
-        radius = jnp.stack([b.radius for b in ball_blocks])
+    C, D, d = (jnp.concatenate(part) for part in zip(*parts, strict=True))
     return Condensed(
-        Phi, Gamma, phi, Psi, Omega, psi, (P + P.T) / 2, form(Phi, Psi, rates[1]),
-        form(phi, psi, rates[2]), C, D, d, lower, upper, linear, quadratic, radius, Q, R, P_N, W,
-        stage, K, K_N, tuple((b.kind, b.steps, b.size) for b in found),
-        tuple(b.size for b in ball_blocks),
-        tuple(int(k) for k in np.unique(mpc.moves, return_index=True)[1]),
-    )  # fmt: skip
+        Phi=Phi,
+        Gamma=Gamma,
+        phi=phi,
+        Psi=Psi,
+        Omega=Omega,
+        psi=psi,
+        P=(P + P.T) / 2,
+        F=form(Phi, Psi, rates[1]),
+        f=form(phi, psi, rates[2]),
+        C=C,
+        D=D,
+        d=d,
+        lower=bounds.l,
+        upper=bounds.u,
+        soft_linear=bounds.linear,
+        soft_quadratic=bounds.quadratic,
+        radius=bounds.radius,
+        Q=Q,
+        R=R,
+        P_N=P_N,
+        W=W,
+        stage=stage,
+        K=K,
+        K_N=K_N,
+        layout=layout_of(found),
+        balls=bounds.balls,
+        begins=tuple(int(k) for k in np.unique(mpc.moves, return_index=True)[1]),
+    )
 
 
 def condensed_in_float64(mpc: MPC) -> Condensed:

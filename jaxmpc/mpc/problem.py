@@ -29,39 +29,6 @@ FLAT = 1e-12
 
 
 @pytree
-class Soft:
-    """Rows that may be violated at a penalty:
-
-        lower − ε_k ≤ C x_k + D u_k ≤ upper + ε_k,  ε_k ≥ 0,   cost + ρ Σ ε_k + quadratic Σ ε_k²
-        (no ½).
-
-    C (p, n), lower and upper (p,), None where all rows lack that side (in single rows −inf, inf),
-    rho ρ ≥ 0 and quadratic ≥ 0: numbers or (p,). D (p, m) or None. stages: the k at which the rows
-    hold; None: k = 0..N, with D k = 0..N−1. names, units: of the p rows.
-    For ρ above the greatest multiplier of the hard rows (`exact_penalty`) the plan violates them
-    only where the hard problem has no solution.
-    """
-
-    C: Reals
-    lower: Reals | None = None
-    upper: Reals | None = None
-    rho: Reals = 1e3
-    quadratic: Reals = 0.0
-    D: Reals | None = None
-    stages: tuple[int, ...] | None = static(default=None)
-    names: tuple[str, ...] = static(default=())
-    units: tuple[str, ...] = static(default=())
-
-    def __post_init__(self) -> None:
-        store_floats(self, "C", "lower", "upper", "rho", "quadratic", "D")
-
-    @property
-    def sides(self) -> tuple[Any, Any]:
-        """(lower, upper), infinite where there is no such side."""
-        return _sides(self)
-
-
-@pytree
 class Outputs:
     """Hard limits of outputs, lower ≤ C x_k + D u_k ≤ upper.
 
@@ -87,13 +54,42 @@ class Outputs:
         return _sides(self)
 
 
-def _sides(rows: Soft | Outputs) -> tuple[Any, Any]:
-    given = rows.upper if rows.lower is None else rows.lower
-    free = np.full(np.shape(as_array(given)), np.inf)
-    return (
-        -free if rows.lower is None else rows.lower,
-        free if rows.upper is None else rows.upper,
-    )
+@pytree
+class Soft:
+    """Rows that may be violated at a penalty:
+
+        lower − ε_k ≤ C x_k + D u_k ≤ upper + ε_k,  ε_k ≥ 0,   cost + ρ Σ ε_k + quadratic Σ ε_k²
+        (no ½).
+
+    rho ρ ≥ 0 and quadratic ≥ 0: numbers or (p,). stages None: k = 0..N, with D k = 0..N−1. All else
+    as in `Outputs`.
+    For ρ above the greatest multiplier of the hard rows (`exact_penalty`) the plan violates them
+    only where the hard problem has no solution.
+    """
+
+    C: Reals
+    lower: Reals | None = None
+    upper: Reals | None = None
+    rho: Reals = 1e3
+    quadratic: Reals = 0.0
+    D: Reals | None = None
+    stages: tuple[int, ...] | None = static(default=None)
+    names: tuple[str, ...] = static(default=())
+    units: tuple[str, ...] = static(default=())
+
+    def __post_init__(self) -> None:
+        store_floats(self, "C", "lower", "upper", "rho", "quadratic", "D")
+
+    @property
+    def sides(self) -> tuple[Any, Any]:
+        """(lower, upper), infinite where there is no such side."""
+        return _sides(self)
+
+
+def _sides(rows: Outputs | Soft) -> tuple[Any, Any]:
+    free = np.full(np.shape(as_array(rows.upper if rows.lower is None else rows.lower)), np.inf)
+    lower, upper = rows.lower, rows.upper
+    return (-free if lower is None else lower), (free if upper is None else upper)
 
 
 class Weights(NamedTuple):

@@ -6,13 +6,15 @@ a block step by step. The condensed QP, the proofs and the names of multipliers 
 this one list.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 
 from jaxmpc.checks import require_kind
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, output_stages
@@ -82,87 +84,88 @@ class Row:
     soft: bool
 
 
-def blocks(mpc: MPC, dtype: Any) -> list[Block]:
+def blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
     """Return the blocks of a problem, arrays in `dtype`. Works inside jit, vmap and grad."""
-    system, N, found = mpc.system, mpc.horizon, []
-    n, m = system.n, system.m
-    cast = lambda v: jnp.asarray(v, dtype)
+    system, N, n, m = mpc.system, mpc.horizon, mpc.system.n, mpc.system.m
+    found: list[Block] = []
     state_names = system.state_names or tuple(f"x{i + 1}" for i in range(n))
     input_names = system.input_names or tuple(f"u{i + 1}" for i in range(m))
+    of_states = state_names, system.state_units
+    of_inputs = input_names, system.input_units
 
-    def add(kind: str, H: Any, D: Any, lower: Any, upper: Any, steps: Any, names: Any, units: Any,
-            **more: Any) -> None:  # fmt: skip
+    def cast(v: Any) -> Array:
+        return jnp.asarray(v, dtype)
+
+    def add(
+        kind: str, H: Any, D: Any, sides: tuple, stages: Iterable[int], texts: tuple, **more: Any
+    ) -> None:
         H, D = (None if M is None else cast(M) for M in (H, D))
         r = (H if D is None else D).shape[0]
+        names, units = texts
         names = tuple(names) or tuple(f"{kind} row {i + 1}" for i in range(r))
         units = tuple(units) or ("",) * r
-        found.append(
-            Block(kind, H, D, cast(lower), cast(upper), tuple(steps), names, units, **more)
-        )
+        lower, upper = map(cast, sides)
+        found.append(Block(kind, H, D, lower, upper, tuple(stages), names, units, **more))
 
-    def described(set_: Box | Polytope, names: Any, units: Any) -> tuple[Any, Any]:
-        return (set_.labels, ()) if isinstance(set_, Polytope) else (names, units)
+    def add_set(kind: str, limits: Box | Polytope, stages: Iterable[int], texts: tuple) -> None:
+        M, *sides = limits.rows()
+        H, D = (None, M) if kind == "input" else (M, None)
+        texts = (limits.labels, ()) if isinstance(limits, Polytope) else texts
+        add(kind, H, D, tuple(sides), stages, texts, box=isinstance(limits, Box))
 
     if mpc.inputs is not None:
-        D, lower, upper = mpc.inputs.rows()
-        texts = described(mpc.inputs, input_names, system.input_units)
-        box = isinstance(mpc.inputs, Box)
-        add("input", None, D, lower, upper, range(N), *texts, box=box)
+        add_set("input", mpc.inputs, range(N), of_inputs)
     if mpc.states is not None:
-        H, lower, upper = mpc.states.rows()
-        texts = described(mpc.states, state_names, system.state_units)
-        box = isinstance(mpc.states, Box)
-        add("state", H, None, lower, upper, mpc.state_stages, *texts, box=box)
+        add_set("state", mpc.states, mpc.state_stages, of_states)
     for rows in (mpc.outputs,) if isinstance(mpc.outputs, Outputs) else mpc.outputs:
-        steps = output_stages(mpc, rows)
-        lower, upper = rows.sides
-        add("output", rows.C, rows.D, lower, upper, steps, rows.names, rows.units)
+        stages = output_stages(mpc, rows)
+        add("output", rows.C, rows.D, rows.sides, stages, (rows.names, rows.units))
     if mpc.rate_limited:
         limit: Any = mpc.input_rate_limit
         if not isinstance(limit, Box):
             limit = Box(-jnp.broadcast_to(cast(limit), (m,)), jnp.broadcast_to(cast(limit), (m,)))
-        units = tuple(f"{unit}/step" for unit in system.input_units)
         names = tuple(f"rate of {name}" for name in input_names)
-        add(
-            "rate",
-            None,
-            limit.rows()[0],
-            limit.lower,
-            limit.upper,
-            range(N),
-            names,
-            units,
-            rate=True,
-            box=True,
-        )
+        texts = names, tuple(f"{unit}/step" for unit in system.input_units)
+        D, *sides = limit.rows()
+        add("rate", None, D, tuple(sides), range(N), texts, rate=True, box=True)
     for soft in (mpc.soft,) if isinstance(mpc.soft, Soft) else mpc.soft:
-        every = range(N + 1) if soft.D is None else range(N)
-        weight = lambda w, lower=soft.sides[0]: jnp.broadcast_to(cast(w), np.shape(lower))
-        add(
-            "soft", soft.C, soft.D, *soft.sides,
-            every if soft.stages is None else soft.stages, soft.names, soft.units,
-            linear=weight(soft.rho), quadratic=2 * weight(soft.quadratic),
-        )  # fmt: skip
+        every = tuple(range(N + (soft.D is None)))
+        stages = every if soft.stages is None else soft.stages
+        p = np.shape(soft.sides[0])
+        linear = jnp.broadcast_to(cast(soft.rho), p)
+        quadratic = 2 * jnp.broadcast_to(cast(soft.quadratic), p)
+        weights = {"linear": linear, "quadratic": quadratic}
+        add("soft", soft.C, soft.D, soft.sides, stages, (soft.names, soft.units), **weights)
     last = mpc.terminal_set
     if isinstance(last, Ellipsoid):  # x'Px = |L'x|²
         P = cast(last.P)
-        L = cholesky((P + P.T) / 2)
-        names = ("terminal ellipsoid",) * n
-        zero, radius = jnp.zeros(n, dtype), jnp.sqrt(cast(last.level))
-        add("terminal", L.T, None, zero, zero, (N,), names, (), radius=radius)
+        L, zero = cholesky((P + P.T) / 2), jnp.zeros(n, dtype)
+        texts = ("terminal ellipsoid",) * n, ()
+        add("terminal", L.T, None, (zero, zero), (N,), texts, radius=jnp.sqrt(cast(last.level)))
     elif last is not None:
-        H, lower, upper = last.rows()
-        add(
-            "terminal",
-            H,
-            None,
-            lower,
-            upper,
-            (N,),
-            *described(last, state_names, system.state_units),
-            box=isinstance(last, Box),
-        )
+        add_set("terminal", last, (N,), of_states)
     return found
+
+
+def bounds_of(found: list[Block], dtype: DTypeLike) -> Bounds:
+    """Return what is asked of the rows of all blocks, one after the other; the rows of balls are
+    the last."""
+    each = [block.bounds() for block in found]
+    joined = lambda parts: jnp.concatenate([jnp.zeros(0, dtype), *parts])
+    bounds = Bounds(joined(b.l for b in each), joined(b.u for b in each))
+    if any(b.linear is not None for b in each):
+        hard = [(jnp.full_like(b.l, jnp.inf), jnp.zeros_like(b.l)) for b in each]
+        weights = [
+            none if b.linear is None else (b.linear, b.quadratic)
+            for b, none in zip(each, hard, strict=True)
+        ]
+        linear, quadratic = map(joined, zip(*weights, strict=True))
+        bounds = replace(bounds, linear=linear, quadratic=quadratic)
+    balls = [b for b in each if b.balls]
+    if balls:
+        radius = jnp.concatenate([b.radius for b in balls])
+        bounds = replace(bounds, radius=radius, balls=tuple(b.balls[0] for b in balls))
+    return bounds
 
 
 def row_table(mpc: MPC) -> tuple[Row, ...]:
@@ -179,8 +182,8 @@ def row_table(mpc: MPC) -> tuple[Row, ...]:
 
 def stacked(
     block: Block, states: tuple[Array, ...], inputs: tuple[Array, ...]
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return (C, D, d, lower, upper) of a block: its rows are C z + D θ + d.
+) -> tuple[Array, Array, Array]:
+    """Return (C, D, d) of a block: its rows are C z + D θ + d.
 
     states (Γ, Φ, φ): x_k = Γ_k z + Φ_k θ + φ_k. inputs: the same for v_k. What an input adds to a
     row counts as zero where it is rounding beside what it adds to the same row at other times: a
@@ -203,8 +206,7 @@ def stacked(
     noise = 8 * jnp.finfo(terms.dtype).eps * jnp.tile(most, terms.shape[-1] // m)
     none = jax.lax.stop_gradient(jnp.where(jnp.abs(parts[0]) <= noise, parts[0], 0.0))
     C, D, d = (v.reshape(-1, *v.shape[2:]) for v in (parts[0] - none, *parts[1:]))
-    repeat = lambda v: jnp.tile(v, len(steps))
-    return C, D, d, repeat(block.lower), repeat(block.upper)
+    return C, D, d
 
 
 def _each(H: Array, M: Array) -> Array:
@@ -214,7 +216,12 @@ def _each(H: Array, M: Array) -> Array:
 
 def layout(mpc: MPC) -> Layout:
     """Return (kind, steps, rows a step) of each block of rows."""
-    return tuple((b.kind, b.steps, b.size) for b in blocks(mpc, float))
+    return layout_of(blocks(mpc, float))
+
+
+def layout_of(found: list[Block]) -> Layout:
+    """Return the layout of some blocks."""
+    return tuple((b.kind, b.steps, b.size) for b in found)
 
 
 def row_count(layout: Layout) -> int:

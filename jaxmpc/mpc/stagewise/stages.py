@@ -26,7 +26,7 @@ from jax import Array
 
 from jaxmpc.mpc.arguments import Aim
 from jaxmpc.mpc.problem import MPC, weights_of
-from jaxmpc.mpc.rows import Layout, blocks
+from jaxmpc.mpc.rows import Layout, blocks, bounds_of, layout_of
 from jaxmpc.mpc.stagewise.riccati import Gains, recurrence, riccati_recursion, tracking
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.admm import convex
@@ -173,27 +173,25 @@ def stages(mpc: MPC) -> Stages:
     weights = weights_of(mpc, dtype)
     cast = lambda v: jnp.asarray(v, dtype)
     found = blocks(mpc, dtype)
-    none = [jnp.zeros(0, dtype)]
-    tiled = lambda values: jnp.concatenate(none + [
-        jnp.tile(v, len(b.steps)) for v, b in zip(values, found, strict=True)
-    ])  # fmt: skip
-    linear = quadratic = None
-    if any(b.linear is not None for b in found):
-        weight = lambda b, name, hard: (
-            jnp.full(b.size, hard, dtype) if b.linear is None else getattr(b, name)
-        )
-        linear = tiled([weight(b, "linear", jnp.inf) for b in found])
-        quadratic = tiled([weight(b, "quadratic", 0.0) for b in found])
+    bounds = bounds_of(found, dtype)
     return Stages(
-        A=cast(system.A), B=cast(system.B),
+        A=cast(system.A),
+        B=cast(system.B),
         c=jnp.zeros(n, dtype) if system.c is None else cast(system.c),
-        Q=weights.Q, R=weights.R, P=weights.P, stage=weights.stage,
-        H=tuple(b.H for b in found), D=tuple(b.D for b in found),
-        lower=tiled([b.lower for b in found]), upper=tiled([b.upper for b in found]),
-        linear=linear, quadratic=quadratic,
-        layout=tuple((b.kind, b.steps, b.size) for b in found),
-        boxes=tuple(b.box for b in found), horizon=mpc.horizon,
-    )  # fmt: skip
+        Q=weights.Q,
+        R=weights.R,
+        P=weights.P,
+        stage=weights.stage,
+        H=tuple(b.H for b in found),
+        D=tuple(b.D for b in found),
+        lower=bounds.l,
+        upper=bounds.u,
+        linear=bounds.linear,
+        quadratic=bounds.quadratic,
+        layout=layout_of(found),
+        boxes=tuple(b.box for b in found),
+        horizon=mpc.horizon,
+    )
 
 
 def cleaned(s: Stages) -> tuple[Stages, Array]:
