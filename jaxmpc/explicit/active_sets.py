@@ -1,12 +1,11 @@
 """The affine law of one active set and the polytope on which it holds, in scaled coordinates."""
 
 import numpy as np
-from scipy.spatial import HalfspaceIntersection, QhullError
 
 from jaxmpc.explicit.least_distance import SMALLEST, LeastDistanceForm
 from jaxmpc.pytrees import record
-from jaxmpc.sets.geometry import distinct
-from jaxmpc.sets.lp import maximise
+from jaxmpc.sets.geometry import distinct, dual_hull
+from jaxmpc.sets.lp import largest_margin
 
 # Relative rounding of a law: below it a coefficient is zero.
 ZERO = 1e-11
@@ -122,10 +121,8 @@ def interior(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float] | None:
     dual = H / gap[:, None]
     scale = 1 / np.abs(dual).max(axis=0)
     try:
-        hull = HalfspaceIntersection(
-            np.column_stack([dual * scale, -np.ones(len(h))]), np.zeros(n), qhull_options="C-1e-12"
-        )
-    except QhullError:
+        hull = dual_hull(dual * scale)
+    except ValueError:  # too ill-conditioned
         return None
     # Where exactly n rows meet, their crossing is more accurate than qhull's.
     points = middle + hull.intersections * scale
@@ -136,11 +133,8 @@ def interior(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float] | None:
 
 
 def capped_ball(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the centre and radius of the largest ball in H ξ ≤ h (unit rows), at most 1; −1 for
+    """Return the center and radius of the largest ball in H ξ ≤ h (unit rows), at most 1; −1 for
     none."""
-    n = H.shape[1]
-    radius = np.eye(n + 1)[n]
-    rows = np.vstack([np.column_stack([H, np.ones(len(h))]), radius])
-    ball = maximise(radius, rows, np.append(h, 1.0)).x
-    assert ball is not None  # a ball of negative radius fits
-    return ball[:n], min(float((h - H @ ball[:n]).min()), 1.0)
+    center, _ = largest_margin(H, h, np.ones(len(h)), 1.0)
+    assert center is not None  # a ball of negative radius fits
+    return center, min(float((h - H @ center).min()), 1.0)

@@ -26,7 +26,14 @@ from jaxmpc.pytrees import record
 from jaxmpc.sets.any_set import unit_half_spaces
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.interior import AffineHull, affine_hull, framed
-from jaxmpc.sets.lp import ROUNDING, Program, maximise, maximise_nonnegative, scaling
+from jaxmpc.sets.lp import (
+    ROUNDING,
+    Program,
+    largest_margin,
+    maximise,
+    maximise_nonnegative,
+    scaling,
+)
 from jaxmpc.sets.polytope import Polytope
 
 # In coordinates where X_N just fits into [−1, 1]^n: the smallest ball of a region.
@@ -90,10 +97,7 @@ class LeastDistanceForm:
 
     def margin(self, xi: np.ndarray) -> float:
         """Return the greatest t ≤ 1 with M y + t·typical ≤ v + V ξ: ξ is outside X_N if t < 0."""
-        rows = np.column_stack([self.U, self.typical])
-        rows = np.vstack([rows, np.eye(rows.shape[1])[-1]])
-        d = np.eye(rows.shape[1])[-1]
-        return maximise(d, rows, np.append(self.v + self.V @ xi, 1.0)).value
+        return largest_margin(self.U, self.v + self.V @ xi, self.typical, 1.0)[1]
 
     def solve_active(self, active: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray] | None:
         """Return λ (a, n + 2) and y (nz, n + 2), affine in ξ, constant and δ; None for dependent

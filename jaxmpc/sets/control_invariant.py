@@ -17,9 +17,9 @@ from jaxmpc.checks import fail
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.disturbance import supports
-from jaxmpc.sets.geometry import factors, unit_rows
+from jaxmpc.sets.geometry import factors
 from jaxmpc.sets.invariant import maximal_invariant_set
-from jaxmpc.sets.lp import FLAT, ROUNDING, Program, extent, maximise, scaling
+from jaxmpc.sets.lp import FLAT, ROUNDING, Program, extent, largest_margin, scaling
 from jaxmpc.sets.one_step import OneStep, one_step, tidy
 from jaxmpc.sets.polytope import Polytope, as_polytope
 from jaxmpc.systems.riccati import lqr
@@ -221,17 +221,17 @@ def _equilibrium(step: OneStep, X: Polytope) -> tuple[np.ndarray, float]:
     if np.any(np.abs(M @ z0 + drift) > 1e-9 * (np.abs(drift) + np.abs(M) @ np.abs(z0))):
         return column * z0, -np.inf
     z0, free = column * z0, column[:, None] * scipy.linalg.null_space(M)
-    rows, limits = [], []
+    rows, limits, depths = [], [], []
     for part, polytope in ((slice(0, n), X), (slice(n, None), step.V)):
         if polytope is None:
             continue
         G, g = polytope.unit_rows()
-        depth = g - G @ polytope.frame("limits").center
-        rows.append(np.column_stack([G @ free[part], depth]))
+        rows.append(G @ free[part])
         limits.append(g - G @ z0[part])
-    top = maximise(np.eye(free.shape[1] + 1)[-1], *unit_rows(np.vstack(rows), np.hstack(limits)))
-    assert top.x is not None  # feasible with a margin low enough, bounded as X is
-    return z0 + free @ top.x[:-1], float(top.x[-1])
+        depths.append(g - G @ polytope.frame("limits").center)
+    z, margin = largest_margin(np.vstack(rows), np.hstack(limits), np.hstack(depths))
+    assert z is not None  # feasible with a margin low enough, bounded as X is
+    return z0 + free @ z, margin
 
 
 class _Invariant(NamedTuple):
@@ -399,13 +399,11 @@ def _vertex_proof(step: OneStep, C: Polytope) -> _VertexProof:
     if step.V is not None:
         H, h = step.V.unit_rows()
         room = h - H @ step.V.frame("inputs").center
-    rows = np.block([[G @ BU, depth[:, None]], [H, np.zeros((len(H), 1))]])
-    worst = 0.0
+    rows, depths, worst = np.vstack([G @ BU, H]), np.append(depth, np.zeros(len(H))), 0.0
     for v in vertices:
         drift = step.A @ v + step.c + step.B @ step.fixed
-        top = maximise(np.eye(k + 1)[k], *unit_rows(rows, np.r_[g - G @ drift, h]))
-        assert top.x is not None  # any u within its limits is feasible, with a slack low enough
-        u = top.x[:-1]
+        u, _ = largest_margin(rows, np.append(g - G @ drift, h), depths)
+        assert u is not None  # any u within its limits is feasible, with a slack low enough
         worst = max(worst, float(((G @ (drift + BU @ u) - g) / depth).max()))
         worst = max(worst, float(((H @ u - h) / room).max(initial=0.0)))
     count = len(vertices)
@@ -417,5 +415,4 @@ def _width(body: Polytope, whole: np.ndarray) -> float:
     """Return the largest margin of the rows of a set, relative to the extents `whole` (n,) of one
     that holds it: 0 for a flat set."""
     G, g = body.unit_rows()
-    rows = np.column_stack([G, np.abs(G) @ whole])
-    return max(maximise(np.eye(len(whole) + 1)[-1], rows, g).value, 0.0)
+    return max(largest_margin(G, g, np.abs(G) @ whole)[1], 0.0)

@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite
 from jaxmpc.sets.interior import framed
-from jaxmpc.sets.lp import Program, extent, maximise
+from jaxmpc.sets.lp import Program, extent, largest_margin, maximise
 
 _ZERO = 1e-12  # a coefficient that moves a row by less, relative to its distance, counts as 0
 _MERGE = "C-1e-12"  # qhull's option: merge facets of the dual that are flat to 1e-12
@@ -32,13 +32,13 @@ def largest_ball(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarra
     of either sign so that it is always feasible: 0, or negative by rounding, where the set is flat.
     inf, and a point of the set, if there are balls of every radius.
     """
-    n, length = G.shape[1], np.linalg.norm(G, axis=1)
+    length = np.linalg.norm(G, axis=1)
     if Program(G, g).empty:
         fail(argument, "is empty: no point satisfies all its rows", "Loosen its rows")
-    top = maximise(np.eye(n + 1)[n], np.column_stack([G, length]), g)
-    if top.x is None:
+    x, _ = largest_margin(G, g, length)
+    if x is None:
         return Program(G, g).margin()[0], np.inf
-    return top.x[:n], float(((g - G @ top.x[:n]) / length).min(initial=np.inf))
+    return x, float(((g - G @ x) / length).min(initial=np.inf))
 
 
 def irredundant_rows(argument: str, G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -285,6 +285,19 @@ def maximise_nonnegative(d: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndar
     return Program(rows, limits, np.arange(len(rows)) < len(b)).maximise(d).x
 
 
+def largest_margin(
+    G: np.ndarray, g: np.ndarray, weight: np.ndarray, most: float = np.inf
+) -> tuple[np.ndarray | None, float]:
+    """Return x and the largest t <= most with G x + t weight <= g; as t inf or -inf with no x where
+    there is none."""
+    margin = np.eye(G.shape[1] + 1)[-1]
+    rows = np.column_stack([G, weight])
+    if most < np.inf:
+        rows, g = np.vstack([rows, margin]), np.append(g, most)
+    top = maximise(margin, rows, g)
+    return None if top.x is None else top.x[:-1], top.value
+
+
 def cleaned(value: np.ndarray, size: np.ndarray | float) -> np.ndarray:
     """Return sums with 0 in place of those that are rounding beside their terms, of this size."""
     return np.where(np.abs(value) < 16 * np.finfo(float).eps * size, 0.0, value)
