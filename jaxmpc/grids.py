@@ -59,9 +59,11 @@ def axis_indices(
 
 
 def grid_ends(
-    where: str, lower: Sequence[float] | None, upper: Sequence[float] | None,
+    where: str,
+    lower: Sequence[float] | None,
+    upper: Sequence[float] | None,
     limits: Callable[[], tuple[np.ndarray, ...]],
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of a grid: as given, else the limits widened by 3 % on each side.
 
     where: what stands before lower and upper in the ValueError that is raised where an end is not

@@ -56,6 +56,7 @@ class Hull:
     (θ − center), value (v,), slope (F, v, d). Half-spaces normals (K, d) θ ≤ offsets (K,) that hold
     on the whole feasible set, and the cuts that they follow from."""
 
+    # Arrays of NumPy, or on a device.
     center: Any
     M: Any
     gauge: Any
@@ -87,25 +88,31 @@ class Hull:
             facets = hull_facets((points - center) / unit)
         except QhullError:
             return None
-        edges = (points - center)[facets].transpose(0, 2, 1)  # (F, d, d), a column a vertex
-        regular = np.linalg.cond(edges / unit[:, None]) < 1e8
-        facets, edges = facets[regular], edges[regular]
-        M = np.linalg.inv(edges)
-        free = len(problem.view.others) if problem.view.projects else 0
         theta, w = np.vstack([points, center]), np.vstack([proved.w, found.rays.w])
-        every = values(found.rays.exact, rows, theta, w, free)
-        each, value = every[:-1], every[-1]
-        moves = (each - value)[facets].transpose(0, 2, 1)  # (F, v, d)
-        ends = label_limits(found.rays.exact, theta, every, facets, edges, M, moves)
-        gauge, slope = M.sum(axis=1), moves @ M
+        facets = facets[np.linalg.cond(edges_of(theta, facets) / unit[:, None]) < 1e8]
+        M = np.linalg.inv(edges_of(theta, facets))
+        free = len(problem.view.others) if problem.view.projects else 0
+        value = values(found.rays.exact, rows, theta, w, free)
+        least, most = label_limits(found.rays.exact, theta, value, facets, M)
+        gauge, slope = M.sum(axis=1), edges_of(value, facets) @ M
         _, _, normals, offsets, cuts = proved
-        return cls(center, M, gauge, *ends, value, slope, normals, offsets, cuts)
+        return cls(center, M, gauge, least, most, value[-1], slope, normals, offsets, cuts)
+
+
+def edges_of(values: np.ndarray, facets: np.ndarray) -> np.ndarray:
+    """Return the differences (F, v, d) of the values (K + 1, v) at each facet's vertices, a column
+    each, from those of the centre, the last ones."""
+    return (values[:-1] - values[-1])[facets].transpose(0, 2, 1)
+
+
+def largest_row_sum(matrices: np.ndarray) -> np.ndarray:
+    """Return the maximum norm (F,) of matrices (F, d, d)."""
+    return np.abs(matrices).sum(axis=2).max(axis=1)
 
 
 def label_limits(
-    p: ExactData, points: np.ndarray, values: np.ndarray, facets: np.ndarray, edges: np.ndarray,
-    M: np.ndarray, moves: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    p: ExactData, points: np.ndarray, values: np.ndarray, facets: np.ndarray, M: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the least λ_i and the largest gauge (F,) with which points of each cone are labelled
     (top of this file); a gauge of −∞ for none: with free states, equalities or a terminal
     ellipsoid, whose plans are rolled out.
@@ -115,14 +122,14 @@ def label_limits(
     is allowed for; and inputs by d max|u_i − u_c| times that, in `roll_out` as `moved`.
     """
     d, N, (_, m) = points.shape[1], p.horizon, p.B.shape
-    norm = lambda v: np.abs(v).sum(axis=2).max(axis=1)
-    few = proofs.gamma(d + 3)
-    off = 4 * (norm(np.eye(d) - M @ edges) + 4 * few * norm(np.abs(M) @ np.abs(edges)))
+    edges = edges_of(points, facets)
+    size = largest_row_sum(np.abs(M) @ np.abs(edges))
+    off = 4 * (largest_row_sum(np.eye(d) - M @ edges) + 4 * proofs.gamma(d + 3) * size)
     none = np.full(len(off), -np.inf)
     if values.shape[1] != N * m or p.equalities is not None or p.P is not None:
         return off, none
     rounding = 4 * proofs.UNIT_ROUNDOFF * np.abs(values).max()
-    moved = 2 * d * np.abs(moves).max(axis=(1, 2)) * off + rounding
+    moved = 2 * d * np.abs(edges_of(values, facets)).max(axis=(1, 2)) * off + rounding
     # One bound for all cones but those so thin that it would be the others' loss.
     usable = (off < 1e-3) & (moved <= 1e4 * (np.median(moved) + rounding))
     most = np.max(moved, where=usable, initial=0.0)
@@ -140,7 +147,7 @@ def label_limits(
 
 @jax.jit
 @own_modes
-def _slack(p: ExactData, points: Any, values: Any, moved: Any) -> Array:
+def _slack(p: ExactData, points: Array, values: Array, moved: Array) -> Array:
     """Return the slack of `roll_out` (2, K) from the points with these inputs: as they are, and
     where each may be off by `moved`."""
     N, (_, m) = p.horizon, p.B.shape
@@ -167,8 +174,8 @@ def values(
     """Return the inputs (K, N·m), within their limits, and the `free` states that w (K, k) stand
     for at θ (K, d), side by side."""
     variables = w @ rows.back.T
-    by = lambda M, v: np.tensordot(v, M, (1, 2))
-    inputs = by(rows.Psi, theta) + by(rows.Omega, variables) + rows.psi
+    inputs = np.tensordot(theta, rows.Psi, (1, 2)) + np.tensordot(variables, rows.Omega, (1, 2))
+    inputs = inputs + rows.psi
     with jax.enable_x64(True):
         inputs = np.asarray(jax.vmap(functools.partial(proofs.within_limits, p))(inputs))
     return np.hstack([inputs.reshape(len(w), -1), variables[:, variables.shape[1] - free :]])
@@ -190,14 +197,13 @@ def hull_for(problem: FeasibilityProblem, points: int) -> Hull | None:
 @functools.cache
 def compiled_labels(devices: Devices) -> Compiled:
     """Return the compiled labels: (hull, points (B, d)) → labels (B,)."""
-    each = lambda hull, points: jax.vmap(lambda theta: label(hull, theta))(points)
-    return over_devices(each, devices, (False, True))
+    return over_devices(jax.vmap(label, in_axes=(None, 0)), devices, (False, True))
 
 
 @functools.cache
 def compiled_verdicts(devices: Devices) -> Compiled:
     """Return the compiled plans: (p, hull, points (B, d)) → verdicts."""
-    each = lambda p, hull, points: jax.vmap(lambda theta: verdict(p, hull, theta))(points)
+    each = jax.vmap(verdict, in_axes=(None, None, 0))
     return over_devices(each, devices, (False, False, True))
 
 

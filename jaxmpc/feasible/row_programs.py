@@ -12,8 +12,8 @@ from jaxmpc.sets.lp import FLAT, Program, scaling
 
 # Tangents of a ball are added to a program up to so often.
 TANGENTS = 200
-# A ball counts as kept where it is exceeded by no more than this, relative to its radius.
-KEPT = 1e-9
+# A point counts as in a ball that it exceeds by no more than this, relative to its radius.
+IN_BALL = 1e-9
 
 
 class Solved(NamedTuple):
@@ -35,26 +35,31 @@ class RowPrograms:
     def __init__(self, rows: ConstraintRows) -> None:
         self.rows, k = rows, sum(rows.balls)
         self.normals = np.concatenate([np.eye(k), -np.eye(k)])
-        self.size = float(rows.size)
-        equal = (rows.lower == rows.upper) & (np.linalg.norm(rows.U, axis=1) > 0)
         # Equalities that the variables can keep, whatever θ is: they leave no margin.
+        equal = (rows.lower == rows.upper) & (np.linalg.norm(rows.U, axis=1) > 0)
         both = np.hstack([rows.U, rows.D])
         both = both * scaling(both[equal], np.zeros(equal.sum()))[1]
         both = both / np.maximum(np.linalg.norm(both, axis=1), 1e-300)[:, None]
-        rank = lambda M: np.linalg.matrix_rank(M, rtol=FLAT) if len(M) else 0
-        free = rank(both[equal, : rows.U.shape[1]]) == rank(both[equal])
-        self.kept = equal & free
+        variables = both[:, : rows.U.shape[1]]
+        self.equalities = equal & (_rank(variables[equal]) == _rank(both[equal]))
 
     def solve_lp(
-        self, cost: np.ndarray, U: np.ndarray, lower: np.ndarray, upper: np.ndarray,
-        more: tuple[np.ndarray, np.ndarray] | None = None, margin: np.ndarray | None = None,
+        self,
+        cost: np.ndarray,
+        U: np.ndarray,
+        shift: np.ndarray | float = 0.0,
+        *,
+        least: float = -np.inf,
+        most: float = np.inf,
+        margin: np.ndarray | None = None,
         pinned: np.ndarray | None = None,
-    ) -> Solved:  # fmt: skip
-        """Maximise cost'x over lower ≤ U x ≤ upper and the ball.
+    ) -> Solved:
+        """Maximise cost'x over lower ≤ U x + shift ≤ upper and the ball.
 
-        margin (R,): the last variable times this is kept from every bound. more: further rows A x ≤
-        b. pinned: values of the variables before the last, the last of those.
+        least, most: bounds of the last variable. margin (R,): the last variable times this is kept
+        from every bound. pinned: values of the variables before the last, the last of those.
         """
+        lower, upper = self.rows.lower - shift, self.rows.upper - shift
         balls, R = sum(self.rows.balls), len(lower)
         flat, reduced = slice(0, R - balls), np.zeros(R) if margin is None else margin
         same = (lower == upper)[flat] & (reduced[flat] == 0)
@@ -65,35 +70,34 @@ class RowPrograms:
         A = np.concatenate([up[high], low[has_low]])
         b = np.concatenate([upper[flat][high], -lower[flat][has_low]])
         equal = np.append(same[high], np.zeros(has_low.sum(), bool))
-        extra, limits = (np.zeros((0, len(cost))), np.zeros(0)) if more is None else more
+        ends = np.array([most, -least])
+        last = np.outer([1.0, -1.0], np.eye(len(cost))[-1])[np.isfinite(ends)]
+        limits = ends[np.isfinite(ends)]
         radius = float(self.rows.radius[0]) if balls else 0.0
-        shift = np.zeros(len(cost))
-        part = np.ones(len(cost), bool)
+        fixed, part = np.zeros(len(cost)), np.ones(len(cost), bool)
         if pinned is not None and len(pinned):
-            shift[-1 - len(pinned) : -1] = pinned
+            fixed[-1 - len(pinned) : -1] = pinned
             part[-1 - len(pinned) : -1] = False
         for _ in range(TANGENTS):
             planes = self.normals @ U[R - balls :]
             planes[:, -1] += reduced[-1] if balls else 0.0
             reach = radius + self.normals @ lower[R - balls :]
-            G, g = np.vstack([A, planes, extra]), np.concatenate([b, reach, limits])
+            G, g = np.vstack([A, planes, last]), np.concatenate([b, reach, limits])
             mask = np.append(equal, np.zeros(len(g) - len(b), bool))
-            top = Program(G[:, part], g - G @ shift, mask).maximise(cost[part])
-            if top.x is None:
+            top = Program(G[:, part], g - G @ fixed, mask).maximise(cost[part])
+            if top.x is None or top.y is None:
                 return Solved(top.value, None, np.zeros(R))
-            x = shift.copy()
+            x = fixed.copy()
             x[part] = top.x
             if not balls:
                 break
             v = U[R - balls :] @ x - lower[R - balls :]
-            kept = radius - reduced[-1] * x[-1]
-            norm = np.linalg.norm(v)
-            if norm <= kept + KEPT * radius:
+            norm, allowed = np.linalg.norm(v), radius - reduced[-1] * x[-1]
+            if norm <= allowed + IN_BALL * radius:
                 break
             self.normals = np.concatenate([self.normals, v[None] / norm])
-        y = np.zeros(R)
         assert top.y is not None
-        first, second = high.sum(), len(A)
+        y, first, second = np.zeros(R), high.sum(), len(A)
         y[flat][high] += top.y[:first]
         y[flat][has_low] -= top.y[first:second]
         y[R - balls :] = top.y[second : second + len(planes)] @ self.normals[: len(planes)]
@@ -104,7 +108,7 @@ class RowPrograms:
         w, and the multipliers of the rows."""
         k = self.rows.U.shape[1]
         U = np.hstack([self.rows.U, self.rows.D])
-        return self._maximum(np.append(np.zeros(k), direction), U, np.zeros(len(U)), None)
+        return self._with_w(self.solve_lp(np.append(np.zeros(k), direction), U))
 
     def ray(
         self, center: np.ndarray, direction: np.ndarray
@@ -114,15 +118,12 @@ class RowPrograms:
         rows, k = self.rows, self.rows.U.shape[1]
         length = np.abs(direction).max(initial=0.0) or 1.0  # must not choose among equal ends
         U = np.hstack([rows.U, (rows.D @ (direction / length))[:, None]])
-        return self._maximum(np.append(np.zeros(k), 1 / length), U, rows.D @ center, 0)
+        cost = np.append(np.zeros(k), 1 / length)
+        return self._with_w(self.solve_lp(cost, U, rows.D @ center, least=0.0))
 
-    def _maximum(
-        self, cost: np.ndarray, U: np.ndarray, shift: np.ndarray, low: float | None
-    ) -> tuple[float, np.ndarray, np.ndarray]:
+    def _with_w(self, found: Solved) -> tuple[float, np.ndarray, np.ndarray]:
         k = self.rows.U.shape[1]
-        more = None if low is None else (-np.eye(U.shape[1])[-1:], np.array([-low]))
-        value, x, y = self.solve_lp(cost, U, self.rows.lower - shift, self.rows.upper - shift, more)
-        return value, np.zeros(k) if x is None else x[:k], y
+        return found.value, np.zeros(k) if found.x is None else found.x[:k], found.y
 
     def margin(self, theta: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return w and the multipliers of the largest s with which all rows at the point θ (d,)
@@ -131,11 +132,10 @@ class RowPrograms:
         Equalities keep no margin, unless nothing feasible is found.
         """
         rows, k = self.rows, self.rows.U.shape[1]
-        shift = rows.D @ theta
         U, cost = np.hstack([rows.U, np.zeros((len(rows.U), 1))]), np.append(np.zeros(k), 1.0)
-        most = np.eye(k + 1)[-1:], np.array([self.size / size.max()])
-        for kept in [np.where(self.kept, 0.0, size), size][: 1 + np.any(self.kept)]:
-            found = self.solve_lp(cost, U, rows.lower - shift, rows.upper - shift, most, kept)
+        most, without = rows.size / size.max(), np.where(self.equalities, 0.0, size)
+        for each in [without, size][: 1 + np.any(self.equalities)]:
+            found = self.solve_lp(cost, U, rows.D @ theta, most=most, margin=each)
             if found.x is not None:
                 return found.x[:k], found.y
         return np.zeros(k), np.zeros(len(rows.U))
@@ -170,22 +170,22 @@ class RowPrograms:
         ends = np.abs([rows.lower, rows.upper])
         ends = np.where(np.isfinite(ends), ends, 0.0).max(axis=0)
         # Margins in units in which rows and coordinates are about 1.
-        size = np.where(self.kept, 0.0, 1 / scaling(both, ends)[0])
+        size = np.where(self.equalities, 0.0, 1 / scaling(both, ends)[0])
         if rows.balls:
             size[-sum(rows.balls) :] = size[-sum(rows.balls) :].max()
-        wide = np.hstack([both, np.zeros((len(both), 1))])
-        most = np.eye(k + d + 1)[-1:], np.array([4.0])
-        cost = np.eye(k + d + 1)[-1]
-        found = self.solve_lp(cost, wide, rows.lower, rows.upper, most, size, given)
-        if found.x is None or found.x[-1] <= FLAT:
-            if given is not None:
-                fail("center", f"{given} is not inside the feasible set", "Give None or another")
-            if found.x is None or found.x[-1] < -FLAT:
-                what = "is empty: no initial state has a plan"
-            else:
-                what = "is flat: no initial state keeps a margin"
-            fail(
-                "mpc", f"its feasible set {what}",
-                "Relax a limit, lengthen the horizon or enlarge the terminal set",
-            )  # fmt: skip
-        return found.x[k : k + d], found.x[:k]
+        wide, cost = np.hstack([both, np.zeros((len(both), 1))]), np.eye(k + d + 1)[-1]
+        found = self.solve_lp(cost, wide, most=4.0, margin=size, pinned=given)
+        t = -np.inf if found.x is None else found.x[-1]
+        if found.x is not None and t > FLAT:
+            return found.x[k : k + d], found.x[:k]
+        if given is not None:
+            fail("center", f"{given} is not inside the feasible set", "Give None or another")
+        empty, flat = "is empty: no initial state has a plan", "is flat: no initial state keeps"
+        what = empty if t < -FLAT else f"{flat} a margin"
+        cure = "Relax a limit, lengthen the horizon or enlarge the terminal set"
+        fail("mpc", f"its feasible set {what}", cure)
+
+
+def _rank(M: np.ndarray) -> int:
+    """Return the rank of rows of length one."""
+    return int(np.linalg.matrix_rank(M, rtol=FLAT)) if len(M) else 0

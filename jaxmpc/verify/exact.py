@@ -103,9 +103,14 @@ def _values(
 
 
 def _at(
-    p: Constraints, e: int, rows: list[tuple[int, int]], x: np.ndarray, u: np.ndarray, one: int,
+    p: Constraints,
+    e: int,
+    rows: list[tuple[int, int]],
+    x: np.ndarray,
+    u: np.ndarray,
+    one: int,
     bounds: list[np.ndarray] | None,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Return bounds (None: 0) less the values (b, q) of rows (k, i), over 2^((N+2)e)."""
     found = []
     for k, value, _ in _values(p, e, x, u, one):
@@ -118,8 +123,10 @@ def _at(
 def _inverse(G: np.ndarray) -> tuple[np.ndarray, int] | None:
     """Return integers K (q, q) and d with G K = d I; None for a singular matrix G of integers."""
     q = len(G)
-    rows = [[Fraction(int(v)) for v in row] + [Fraction(i == j) for j in range(q)]
-            for i, row in enumerate(G)]  # fmt: skip
+    rows = [
+        [*(Fraction(int(v)) for v in row), *(Fraction(i == j) for j in range(q))]
+        for i, row in enumerate(G)
+    ]
     for i in range(q):
         pivot = next((j for j in range(i, q) if rows[j][i]), None)
         if pivot is None:

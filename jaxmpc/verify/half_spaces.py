@@ -89,6 +89,8 @@ class Programs:
             variables[i] = (max(lower, -1e300), min(upper, 1e300))
         for i, value in zip(p.axes, [] if theta is None else theta, strict=False):
             variables[i] = (value, value)
+        if elastic:
+            cost, variables = np.append(np.zeros(self.count), 1.0), [*variables, (None, None)]
         for _ in range(TANGENTS):
             rows, bounds = self.rows, self.bounds
             if self.tangents:
@@ -101,11 +103,9 @@ class Programs:
             if elastic:
                 rows = sp.hstack([rows, -np.ones((rows.shape[0], 1))])
                 motion = sp.hstack([motion, np.zeros((motion.shape[0], 1))])
-            found = linprog(
-                np.append(np.zeros(self.count), 1.0) if elastic else cost, rows, bounds, motion,
-                self.drift, [*variables, (None, None)] if elastic else variables, method="highs-ds",
-                options=TOLERANCES,
-            )  # fmt: skip
+            equations = {"A_eq": motion, "b_eq": self.drift, "bounds": variables}
+            how = {"method": "highs-ds", "options": TOLERANCES}
+            found = linprog(cost, rows, bounds, **equations, **how)
             if found.status != 0 or p.P is None:
                 return found
             last = found.x[self.states - n : self.states]

@@ -113,8 +113,8 @@ class Constraints:
 
     def exponent(self, *more: np.ndarray) -> int:
         """Return e such that all data, and these arrays, are integers over 2ᵉ."""
-        parts = [self.A, self.B, self.c, self.low, self.high, *self.H, *self.D, *self.lower,
-                 *self.upper, *more]  # fmt: skip
+        parts = [self.A, self.B, self.c, self.low, self.high]
+        parts += [*self.H, *self.D, *self.lower, *self.upper, *more]
         if self.P is not None:
             parts += [self.P, np.array(self.level)]
         return max(0, *(_bits(v) for v in parts))
