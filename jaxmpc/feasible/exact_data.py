@@ -145,7 +145,7 @@ def rounding_of_rows(p: ExactData, start: np.ndarray) -> tuple[np.ndarray, np.nd
     return np.array(stages), np.abs(p.H_N) @ (error + x), ball * np.linalg.norm(error + x)
 
 
-def dynamics(mpc: MPC) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def augmented_dynamics(mpc: MPC) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return A, B, c of x⁺ = Ax + Bu + c, for (x, u_{−1}) where input rates are limited."""
     n, m = mpc.system.n, mpc.system.m
     A, B, c = host_matrices(mpc.system)
@@ -207,8 +207,8 @@ def exact_data(
     bounded, not whether they are.
     """
     n, m, N = mpc.system.n, mpc.system.m, mpc.horizon
-    A, B, c = dynamics(mpc)
-    limits = state_limits(mpc)
+    A, B, c = augmented_dynamics(mpc)
+    limits = limits_of_states(mpc)
     u_lower, u_upper = set_bounds(mpc.inputs, m)
 
     extent = np.asarray(extent) if np.ndim(extent) == 2 else np.array([-extent, extent])
@@ -283,7 +283,7 @@ def terminal_ball(mpc: MPC) -> tuple[np.ndarray | None, np.ndarray | None, np.nd
     return P, np.asarray(mpc.terminal_set.level, np.float64), back
 
 
-def state_limits(mpc: MPC) -> list[np.ndarray]:
+def limits_of_states(mpc: MPC) -> list[np.ndarray]:
     """Return bounds (2, p) of each x_k, k = 0..N, without those that the inputs have on it."""
     n, N = mpc.system.n, mpc.horizon
     states, last = set_bounds(mpc.states, n), set_bounds(mpc.terminal_set, n)

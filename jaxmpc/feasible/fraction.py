@@ -109,7 +109,7 @@ def _membership(c: Condensed, x0s: Array, width: Array, scale: Any, steps: int) 
         x0 = jnp.where(given, x0, 0.0)
         fixed, bounds = jax.lax.stop_gradient((C, at(C, D, tight, x0)))
         z = linalg.solve(normal, matmul(jnp.where(both, bounds.l + bounds.u, 0) / 2, centred))
-        z, e = nearest(fixed, bounds, z, steps)
+        z, e = nearest_point(fixed, bounds, z, steps)
         usable = given & jnp.isfinite(jnp.sum(e**2) / width**4) & jnp.all(jnp.isfinite(z))
         x0, z = jnp.where(usable, x0, 0.0), jax.lax.stop_gradient(jnp.where(usable, z, 0.0))
         residual = at(C, D, tight, x0).prox_residual(matmul(z, C.T), 1.0)
@@ -120,7 +120,7 @@ def _membership(c: Condensed, x0s: Array, width: Array, scale: Any, steps: int) 
     return jnp.where(missing, jnp.nan, jax.vmap(one)(x0s.astype(dtype)))
 
 
-def nearest(A: Array, bounds: Bounds, w: Array, steps: int) -> tuple[Array, Array]:
+def nearest_point(A: Array, bounds: Bounds, w: Array, steps: int) -> tuple[Array, Array]:
     """Minimise ½ dist²(A w, set) as `least_distance` does; return w and the prox residual.
 
     It ends when the gradient A'e is small beside e, or as small as rounding leaves it for bounds

@@ -35,7 +35,7 @@ from jaxmpc.feasible import proofs
 from jaxmpc.feasible.constraint_rows import ConstraintRows
 from jaxmpc.feasible.exact_data import ExactData
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.rays import Rays, filled, refined
+from jaxmpc.feasible.rays import Rays, close_gap, filled
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.modes import own_modes
 
@@ -76,7 +76,7 @@ class Hull:
         if d > MOST_COORDINATES:
             return None
         try:
-            found = refined(Rays.of(problem), GAP, ROUNDS, MOST_RAYS)
+            found = close_gap(Rays.of(problem), GAP, ROUNDS, MOST_RAYS)
         except ValueError:
             return None
         if not found.gap <= USEFUL:
@@ -92,7 +92,7 @@ class Hull:
         facets = facets[np.linalg.cond(edges_of(theta, facets) / unit[:, None]) < 1e8]
         M = np.linalg.inv(edges_of(theta, facets))
         free = len(problem.view.others) if problem.view.projects else 0
-        value = values(found.rays.exact, rows, theta, w, free)
+        value = vertex_values(found.rays.exact, rows, theta, w, free)
         least, most = label_limits(found.rays.exact, theta, value, facets, M)
         gauge, slope = M.sum(axis=1), edges_of(value, facets) @ M
         _, _, normals, offsets, cuts = proved
@@ -168,7 +168,7 @@ def hull_facets(points: np.ndarray) -> np.ndarray:
     return ConvexHull(points).simplices
 
 
-def values(
+def vertex_values(
     p: ExactData, rows: ConstraintRows, theta: np.ndarray, w: np.ndarray, free: int
 ) -> np.ndarray:
     """Return the inputs (K, N·m), within their limits, and the `free` states that w (K, k) stand
@@ -209,7 +209,7 @@ def compiled_verdicts(devices: Devices) -> Compiled:
 
 def label(hull: Hull, theta: Array) -> Array:
     """Return the label of θ (d,), 0 where it is left to others: nothing is rolled out."""
-    cone, facet = nearest(hull, theta)
+    cone, facet = nearest_cone(hull, theta)
     share = jnp.sum(hull.M[cone] * (theta - hull.center), axis=1)
     inside = jnp.all(share >= hull.least[cone]) & (jnp.sum(share) <= hull.most[cone])
     a, b, w = (v[facet] for v in hull.cuts)
@@ -220,7 +220,7 @@ def label(hull: Hull, theta: Array) -> Array:
 def verdict(p: ExactData, hull: Hull, theta: Array) -> proofs.Verdict:
     """Return the verdict on θ (d,), with its proof."""
     N, (_, m) = p.horizon, p.B.shape
-    cone, facet = nearest(hull, theta)
+    cone, facet = nearest_cone(hull, theta)
     value = hull.value + jnp.sum(hull.slope[cone] * (theta - hull.center), axis=1)
     inputs, free = value[: N * m].reshape(N, m), value[N * m :]
     feasible, inputs = proofs.prove_feasible(p, theta, free, inputs)
@@ -234,14 +234,14 @@ def verdict(p: ExactData, hull: Hull, theta: Array) -> proofs.Verdict:
     return proofs.Verdict(label, p.view.initial_state(theta, free), inputs, normal, offset)
 
 
-def nearest(hull: Hull, theta: Array) -> tuple[Array, Array]:
+def nearest_cone(hull: Hull, theta: Array) -> tuple[Array, Array]:
     """Return the indices of the cone of θ (d,), and of the half-space that it exceeds most."""
     length = jnp.linalg.norm(hull.normals, axis=1)
-    cone = largest(hull.gauge, jnp.zeros(len(hull.gauge)), theta - hull.center)
-    return cone, largest(hull.normals / length[:, None], hull.offsets / length, theta)
+    cone = index_of_largest(hull.gauge, jnp.zeros(len(hull.gauge)), theta - hull.center)
+    return cone, index_of_largest(hull.normals / length[:, None], hull.offsets / length, theta)
 
 
-def largest(rows: Array, offsets: Array, x: Array) -> Array:
+def index_of_largest(rows: Array, offsets: Array, x: Array) -> Array:
     """Return the index of the largest rows·x − offsets, rows (K, d), x (d,).
 
     Row by row: so a batch is one loop over its points in each, which CPUs take in vectors. (A

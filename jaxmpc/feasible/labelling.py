@@ -30,7 +30,7 @@ RETRIES = 3
 T = TypeVar("T")
 
 
-def labelled(
+def labelled_parts(
     problem: FeasibilityProblem,
     places: Sequence[T],
     points: Callable[[T], np.ndarray],

@@ -13,11 +13,11 @@ from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import Part, chosen_devices, count, default_chunk, slices, work_off
 from jaxmpc.checks import fail, number, whole
 from jaxmpc.feasible import proofs
-from jaxmpc.feasible.labelling import labelled
+from jaxmpc.feasible.labelling import labelled_parts
 from jaxmpc.feasible.labels import Labels, OnDemand
 from jaxmpc.feasible.pipeline import Scope
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.rays import Rays, refined
+from jaxmpc.feasible.rays import Rays, close_gap
 from jaxmpc.feasible.view import Axes
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
@@ -180,7 +180,7 @@ class FeasibleSetMap:
         is returned as it is.
         """
         try:
-            found = refined(Rays.of(self.problem), gap, rounds, deadline=deadline)
+            found = close_gap(Rays.of(self.problem), gap, rounds, deadline=deadline)
         except ValueError:
             return self
         box = self.problem.programs.bounding_box[0]
@@ -359,7 +359,7 @@ def label_chunks(
 ) -> Iterator[Part[Labels]]:
     """Label points chunk by chunk; the place of each part is its slice. See `map_feasible_set`.
 
-    scope: None for that of these points; settings: further ones of `labelled`.
+    scope: None for that of these points; settings: further ones of `labelled_parts`.
     """
     d = problem.dimension
     points = np.asarray(points, np.float64)
@@ -372,4 +372,4 @@ def label_chunks(
     chunk = min(chunk, max(len(points), 1))
     places = slices(len(points), chunk)
     scope = Scope.of(points, len(places)) if scope is None else scope
-    yield from labelled(problem, places, points.__getitem__, scope, chunk, **settings)
+    yield from labelled_parts(problem, places, points.__getitem__, scope, chunk, **settings)

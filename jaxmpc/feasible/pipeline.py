@@ -83,7 +83,7 @@ class Scope:
         return cls(largest, typical, parts)
 
 
-class Part(NamedTuple):
+class BegunPart(NamedTuple):
     """A part as programs take it: points (whole, d), zeros where they are not usable, of which the
     first `size` are the part's; found: what the first stage has left on the device."""
 
@@ -152,7 +152,7 @@ class Pipeline:
             longer,
         ]
 
-    def begin(self, points: np.ndarray) -> Part:
+    def begin(self, points: np.ndarray) -> BegunPart:
         """Start the first stage of points (b, d), b ≤ chunk, on the device, and return at once."""
         x = padded(points, self.whole)
         usable = np.all(np.isfinite(x), axis=1)
@@ -161,9 +161,9 @@ class Pipeline:
             found = _run(compiled_labels(self.devices), self.hull, x)
         else:
             found = _run(self.short, self.exact, self.rows, x)
-        return Part(x, usable, len(points), found)
+        return BegunPart(x, usable, len(points), found)
 
-    def finish(self, part: Part) -> Labels:
+    def finish(self, part: BegunPart) -> Labels:
         """Return the labels of a part, by all stages."""
         if self.hull is None:
             labels = self.by_newton(part.points, part.usable, part.found)

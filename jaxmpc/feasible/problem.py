@@ -129,7 +129,7 @@ class FeasibilityProblem:
         that are not, and their value or bounds.
         """
         mpc, view, set_ = self.mpc, self.view, self.mpc.terminal_set
-        A, B, c = exact_data.dynamics(mpc)
+        A, B, c = exact_data.augmented_dynamics(mpc)
         rows = [
             {"steps": list(b.steps), "H": b.H, "D": b.D, "lower": b.lower, "upper": b.upper}
             for b in self.blocks

@@ -3,7 +3,7 @@
 For a ray centre + t d the LP max t over (t, w) gives the boundary point; its dual gives a facet
 of the feasible set there. HiGHS solves the LP; `proofs.py` then proves a point just inside
 feasible, and a half-space valid on the whole set. Rays through the vertices of the intersection of
-all half-spaces bring it and the hull of the points together (`refined`).
+all half-spaces bring it and the hull of the points together (`close_gap`).
 """
 
 import time
@@ -31,11 +31,11 @@ from jaxmpc.sets.polytope import Polytope
 
 # How far a boundary point is moved towards the centre before it is proved: the least that works.
 BACKOFFS = 10.0 ** np.arange(-14, -1)
-# The most rays that are sent in one round of `refined`.
+# The most rays that are sent in one round of `close_gap`.
 MOST_RAYS = 2000
 
 
-class Bounds(NamedTuple):
+class ProvedBounds(NamedTuple):
     """Points (K, d) proved feasible, with w (K, k) of the constraint rows, and half-spaces
     normals (F, d) θ ≤ offsets (F,) valid on the whole set, with the cuts they follow from."""
 
@@ -45,7 +45,7 @@ class Bounds(NamedTuple):
     offsets: np.ndarray
     cuts: Cut
 
-    def joined(self, more: "Bounds") -> "Bounds":
+    def joined(self, more: "ProvedBounds") -> "ProvedBounds":
         """Return these points and half-spaces and more."""
         return jax.tree.map(lambda *parts: np.concatenate(parts), self, more)
 
@@ -79,11 +79,11 @@ class Boundary:
         )
 
     @property
-    def proved(self) -> Bounds:
+    def proved(self) -> ProvedBounds:
         """Return the points and half-spaces of those rays that have them."""
         inside, valid = np.isfinite(self.inner), np.isfinite(self.offsets)
         cuts = Cut(*(part[valid] for part in self.cuts))
-        return Bounds(
+        return ProvedBounds(
             self.points[inside], self.w[inside], self.normals[valid], self.offsets[valid], cuts
         )
 
@@ -148,7 +148,7 @@ class Rays:
         center, w = problem.programs.center(center)
         return cls(problem, center, w, problem.exact(np.abs(center)))
 
-    def box(self) -> Bounds:
+    def box(self) -> ProvedBounds:
         """Return the half-spaces of the bounding box, those that exist."""
         _, sides = self.problem.programs.bounding_box
         # No rays go with these multipliers; the program is that of `cast`, so that one compiles.
@@ -157,7 +157,7 @@ class Rays:
         valid = np.isfinite(found.offsets)
         cuts = Cut(*(part[valid] for part in found.cuts))
         none = self.center[None][:0], self.w[None][:0]
-        return Bounds(*none, found.normals[valid], found.offsets[valid], cuts)
+        return ProvedBounds(*none, found.normals[valid], found.offsets[valid], cuts)
 
     def cast(self, directions: np.ndarray) -> Boundary:
         """Return the boundary points along every direction (K, d), moved inwards and proved."""
@@ -232,18 +232,18 @@ def leaving(
     return np.where(slope > 0, t, np.inf).min(axis=1, initial=np.inf)
 
 
-class Refinement(NamedTuple):
+class ClosedGap(NamedTuple):
     """What rays have proved. gap: of the volumes of hull and intersection, relative to the latter;
     inf where one of them has none."""
 
     rays: Rays
-    proved: Bounds
+    proved: ProvedBounds
     gap: float
 
 
-def refined(
+def close_gap(
     rays: Rays, gap: float, rounds: int, most: int = MOST_RAYS, deadline: float = np.inf
-) -> Refinement:
+) -> ClosedGap:
     """Send rays through the vertices of the outer polytope until the volumes differ by no more than
     `gap`, `most` of them a round, before `deadline` (of `time.monotonic`)."""
     d = rays.problem.dimension
@@ -266,7 +266,7 @@ def refined(
         # Sets with a curved boundary have no end of vertices.
         if left <= gap or not 0 < len(directions) <= most:
             break
-    return Refinement(rays, proved, left)
+    return ClosedGap(rays, proved, left)
 
 
 def of_length_one(directions: np.ndarray) -> np.ndarray:

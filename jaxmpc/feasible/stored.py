@@ -21,7 +21,7 @@ from jaxmpc.batches import CHUNK, Part, Timing, work_off
 from jaxmpc.checks import fail
 from jaxmpc.feasible import extremes
 from jaxmpc.feasible.extremes import HalfSpaces
-from jaxmpc.feasible.labelling import labelled
+from jaxmpc.feasible.labelling import labelled_parts
 from jaxmpc.feasible.labels import PROOFS, Labels, OnDemand
 from jaxmpc.feasible.map import FeasibleSetMap, excluded
 from jaxmpc.feasible.pipeline import Scope
@@ -247,7 +247,7 @@ def sweep_into(
             fail(str(path), what, "Add --resume (resume=True) to go on with it")
         report_damage(store)
         opened(store)
-        found = labelled(
+        found = labelled_parts(
             problem,
             pending,
             lambda block: mesh(along, store.samples(block)),

@@ -141,7 +141,7 @@ def _inverse(G: np.ndarray) -> tuple[np.ndarray, int] | None:
     return np.array([[int(v * d) for v in row] for row in inverse], object).reshape(q, q), d
 
 
-def roll_out(p: Constraints, starts: np.ndarray, plans: np.ndarray) -> np.ndarray:
+def roll_out_in_floats(p: Constraints, starts: np.ndarray, plans: np.ndarray) -> np.ndarray:
     """Return the same in float64, less a bound on its rounding: at least so much room is left."""
     n, m = p.B.shape
     gamma = 4 * (n + m + 2) * UNIT_ROUNDOFF

@@ -14,7 +14,7 @@ from jaxmpc.checks import fail
 from jaxmpc.files import read_results
 from jaxmpc.qp.status import Status
 from jaxmpc.store import Check, Stored, read, reason
-from jaxmpc.verify.exact import roll_out, roll_out_exactly
+from jaxmpc.verify.exact import roll_out_exactly, roll_out_in_floats
 from jaxmpc.verify.half_spaces import exclude
 from jaxmpc.verify.recursion_report import read_report, wrong_next_states
 from jaxmpc.verify.stored_problem import Constraints, label_shapes
@@ -185,7 +185,7 @@ def _prove_feasible(
     for why, fine in reasons.items():
         result.failures |= {int(j): why for j in here[~fine]}
     margin = np.where(known, 0.0, -np.inf)
-    margin[known] = roll_out(p, starts[known], plans[known])
+    margin[known] = roll_out_in_floats(p, starts[known], plans[known])
     again = known & (drawn | ~(margin > 0))
     margin[again] = roll_out_exactly(p, starts[again], plans[again])
     for j in np.flatnonzero(again & (margin < 0)):

@@ -11,7 +11,7 @@ from jax import enable_x64
 import jaxmpc as jm
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.verify.exact import beyond, roll_out, roll_out_exactly
+from jaxmpc.verify.exact import beyond, roll_out_exactly, roll_out_in_floats
 from jaxmpc.verify.stored_problem import Constraints
 
 RANDOM = np.random.default_rng(3)
@@ -91,7 +91,7 @@ def test_plans_that_are_proved_keep_limits_to_the_last_bit(terminal):
             if p.P is not None:
                 same.level = level
             margins.append(roll_out_exactly(same, x[j : j + 1], u[j : j + 1])[0])
-            bounds.append(margins[-1] - roll_out(same, x[j : j + 1], u[j : j + 1])[0])
+            bounds.append(margins[-1] - roll_out_in_floats(same, x[j : j + 1], u[j : j + 1])[0])
     proved, margins, bounds = (np.array(v) for v in (proved, margins, bounds))
     assert 0.1 < proved.mean() < 0.9
     assert np.all(margins[proved] >= 0)

@@ -14,7 +14,7 @@ from jaxmpc.feasible.labels import PROOFS
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.stored import open_labels
 from jaxmpc.store.blocks import checksum, regions
-from jaxmpc.verify.exact import beyond, integers, roll_out, roll_out_exactly
+from jaxmpc.verify.exact import beyond, integers, roll_out_exactly, roll_out_in_floats
 from jaxmpc.verify.half_spaces import Programs
 from jaxmpc.verify.stored_map import verify_map
 from jaxmpc.verify.stored_problem import Constraints
@@ -106,8 +106,8 @@ def test_roll_out_is_that_of_fractions(name):
     starts, plans = random.normal(size=(4, 2)), random.normal(size=(4, 5, 1))
     exact = lambda v: np.vectorize(Fraction, otypes=[object])(v)
     found = roll_out_exactly(p, starts, plans)
-    assert np.all(roll_out(p, starts, plans) < found)
-    np.testing.assert_allclose(roll_out(p, starts, plans), found, atol=1e-13)
+    assert np.all(roll_out_in_floats(p, starts, plans) < found)
+    np.testing.assert_allclose(roll_out_in_floats(p, starts, plans), found, atol=1e-13)
     for x, u, margin in zip(exact(starts), exact(plans), found, strict=True):
         least = []
         for k in range(6):
