@@ -1,4 +1,4 @@
-"""Closed loops: plant and controller together, one sample after the other.
+"""Closed loops: plant and controller together, one time step after the other.
 
 simulate, simulate_many    one closed loop, or many chunk by chunk -> Run
 lyapunov_decrease          change of the optimal value along a run

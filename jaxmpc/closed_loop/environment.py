@@ -10,6 +10,7 @@ from jax import Array
 
 from jaxmpc.arrays import Reals, as_weight
 from jaxmpc.checks import number, require_kind, require_shape, whole
+from jaxmpc.closed_loop.interfaces import Feedback
 from jaxmpc.closed_loop.observer import model_of
 from jaxmpc.closed_loop.robot_problem import robot_mpc
 from jaxmpc.closed_loop.variations import start_room
@@ -131,7 +132,7 @@ class Environment:
         reward = -square(error, self.Q) - square(effort, self.R)
         return self._state(robot.step(state.x, u), reward, state.steps + 1)
 
-    def policy(self, controller: Any) -> "MPCPolicy":
+    def policy(self, controller: Feedback) -> "MPCPolicy":
         """Return a controller of this robot as a policy for the target."""
         return MPCPolicy(controller, self.reference, self.input_reference)
 
@@ -164,7 +165,7 @@ class MPCPolicy:
     pytree: `replace(policy, reference=...)` under `jax.vmap` gives each robot its own target.
     """
 
-    controller: Any
+    controller: Feedback
     reference: Any = None
     input_reference: Any = None
 

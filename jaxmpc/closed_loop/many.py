@@ -26,6 +26,7 @@ from jaxmpc.batches import (
     work_off,
 )
 from jaxmpc.checks import fail, require_real
+from jaxmpc.closed_loop.interfaces import Feedback, Plant
 from jaxmpc.closed_loop.noise import Noise
 from jaxmpc.closed_loop.observer import KalmanFilter
 from jaxmpc.closed_loop.run import Run
@@ -37,8 +38,8 @@ from jaxmpc.qp.precision import arrays
 
 
 def simulate_many(
-    controller: Any,
-    plant: Any,
+    controller: Feedback,
+    plant: Plant,
     x0s: Reals,
     steps: int,
     *,
@@ -83,15 +84,8 @@ def simulate_many(
     if chunk is not None and chunk < 1:
         fail("chunk", f"{chunk}", "Give a count of at least 1")
     devices = chosen_devices(devices)
-    given = Conditions(
-        reference=reference,
-        input_reference=input_reference,
-        previous_input=previous_input,
-        noise=noise,
-        observer=observer,
-        delay=delay,
-        compensate=bool(compensate),
-    )
+    aims = (reference, input_reference)
+    given = Conditions(*aims, None, previous_input, noise, observer, delay, bool(compensate))
     plant, _, shared = checked_loop(controller, plant, x0s[0], steps, given)
     several = {"reference": references, "input_reference": input_references}
     own = {name: np.asarray(value) for name, value in several.items() if value is not None}
@@ -132,7 +126,7 @@ class Each:
 
 
 def _require_own(
-    own: Mapping[str, np.ndarray], shared: Conditions, controller: Any, steps: int, count: int
+    own: Mapping[str, np.ndarray], shared: Conditions, controller: Feedback, steps: int, count: int
 ) -> None:
     """Raise ValueError unless the references of each loop have these shapes."""
     widths = getattr(controller, "reference_sizes", None)
@@ -160,20 +154,26 @@ def require_variations(plant: Any, variations: Mapping[str, Any], count: int) ->
 
 
 def simulate_each(
-    controller: Any, plant: Any, shared: Conditions, each: Each, *, steps: int, checkpoint: bool
+    controller: Feedback,
+    plant: Plant,
+    shared: Conditions,
+    each: Each,
+    *,
+    steps: int,
+    checkpoint: bool,
 ) -> Run:
     """Return the runs (B, ...) of loops under shared conditions and those of their own. Works
     inside jit, vmap and grad.
 
     plant: from `as_argument`; each loop has it with its own variations.
     """
-    plant = plant.given if isinstance(plant, ConstantModel) else plant
+    bare: Any = plant.given if isinstance(plant, ConstantModel) else plant
 
     def loop(one: Each) -> Run:
         given = replace(shared, **one.references)
         if shared.noise is not None:
             given = replace(given, noise=shared.noise.of_loop(one.numbers))
-        varied = plant.vary(**one.variations) if one.variations else plant
+        varied = bare.vary(**one.variations) if one.variations else bare
         return simulate(controller, varied, one.x0s, steps, checkpoint=checkpoint, **vars(given))
 
     return jax.vmap(loop)(each)

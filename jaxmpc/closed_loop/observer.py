@@ -8,6 +8,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import concrete, fail, require_finite, require_kind, require_shape
+from jaxmpc.closed_loop.interfaces import Feedback
 from jaxmpc.closed_loop.noise import covariance, require_spread, whole_array
 from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.linalg import solve
@@ -115,12 +116,12 @@ class KalmanFilter:
         C, V = self._matrix(xi.dtype), jnp.asarray(covariance(self.measurement, self.p), xi.dtype)
         L = _gain(P, C, V)
         # Joseph's form: a sum of semidefinite terms, whatever the rounding of L.
-        kept = jnp.eye(self.model.n, dtype=xi.dtype) - matmul(L, C)
-        P = matmul(kept, matmul(P, kept.T)) + matmul(L, matmul(V, L.T))
+        left = jnp.eye(self.model.n, dtype=xi.dtype) - matmul(L, C)
+        P = matmul(left, matmul(P, left.T)) + matmul(L, matmul(V, L.T))
         return Belief(xi + matmul(L, y - self.outputs(xi)), P)
 
     def predicted(self, belief: Belief, u: Array) -> Belief:
-        """Return the estimate one sample later, under the input u (m,)."""
+        """Return the estimate one time step later, under the input u (m,)."""
         xi, P = belief
         after = model_step(self.model, xi, u)
         if P is None:
@@ -167,13 +168,13 @@ def _gain(P: Array, C: Array, V: Array) -> Array:
 
 
 def model_step(model: Any, xi: Array, u: Array) -> Array:
-    """Return the coordinates (n,) one sample later by a model: of a Robot, its predictor."""
+    """Return the coordinates (n,) one time step later by a model: of a Robot, its predictor."""
     if isinstance(model, Robot):
         return RobotModel(model).step(xi, u)
     return model.step(xi, u)
 
 
-def model_of(controller: Any) -> Any:
+def model_of(controller: Feedback) -> Any:
     """Return the model that a controller has of its plant: a Robot, LinearPlant or LinearSystem."""
     robot = getattr(controller, "robot", getattr(controller, "plant", None))
     return controller.mpc.system if robot is None else robot

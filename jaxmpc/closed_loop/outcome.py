@@ -17,13 +17,13 @@ from jaxmpc.sets.violations import kept, row_violations
 
 @record
 class Outcome:
-    """What B closed loops of T samples achieved, from their states and inputs, in float64.
+    """What B closed loops of T time steps achieved, from their states and inputs, in float64.
 
     coordinates (B, T+1, n): the states in the coordinates of the limits. state_excess
     (B, T+1, n), input_excess (B, T, m): by how much each limit is violated, in its unit; 0 inside,
     NaN where the run is not finite. band (n,): largest distance that counts as at the target.
     The other fields have one entry for each loop, (B,):
-      kept          all limits of states and inputs hold at all samples (to `violation.TOLERANCE`)
+      kept          all limits of states and inputs hold at all time steps (to `violation.TOLERANCE`)
       reached       the last state is within the band of the target, in every coordinate
       settling      time in s from which on every coordinate stays within the band; inf: never
       cost          sum of the stage costs

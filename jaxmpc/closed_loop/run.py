@@ -1,4 +1,4 @@
-"""Run: the record of a closed loop at each sample."""
+"""Run: the record of a closed loop at each time step."""
 
 from typing import Any
 
@@ -13,8 +13,8 @@ from jaxmpc.qp.status import Status
 
 @pytree
 class Run:
-    """A closed loop of T samples: x_{t+1} = plant(x_t, u_t) + w_t, u_t the first input of a plan
-    (with a delay, of the plan one sample earlier).
+    """A closed loop of T time steps: x_{t+1} = plant(x_t, u_t) + w_t, u_t the first input of a plan
+    (with a delay, of the plan one time step earlier).
 
     states (T+1, n), inputs (T, m). Of each plan: cost (T,), the optimal value V_N(x_t) (without
     ½), and status (T,). stage_cost (T,): (x_t − r_t)'Q(x_t − r_t) + (u_t − s_t)'R(u_t − s_t) with
@@ -23,7 +23,7 @@ class Run:
     of the soft rows at k = 0 of each plan, hence of what happens. fallback (T,): whether the plan
     violates soft rows anywhere on its horizon by more than 1e-6 (1e-3 in float32), as happens
     where the limits cannot all be kept. estimates (T, n): the states as an observer estimates them
-    from the outputs up to each sample; None without an observer. Batches have their axes in front.
+    from the outputs up to each time step; None without an observer. Batches have their axes in front.
     For robots states are the plant's, (qpos, qvel), and x in costs and limits means their
     coordinates.
     """
@@ -45,7 +45,7 @@ class Run:
 
     @property
     def feasible_steps(self) -> Array:
-        """Return the number of samples before the first plan that is not SOLVED: T if all are."""
+        """Return the number of time steps before the first plan that is not SOLVED: T if all are."""
         solved = jnp.asarray(self.status) == Status.SOLVED
         return jnp.sum(jnp.cumprod(solved, axis=-1), axis=-1)
 

@@ -10,6 +10,7 @@ from jax import Array
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, whole
+from jaxmpc.closed_loop.interfaces import Feedback, Plant
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
 from jaxmpc.closed_loop.noise import Noise
 from jaxmpc.closed_loop.observer import Belief, KalmanFilter, model_of, model_step
@@ -29,8 +30,8 @@ SLACK = {"float64": 1e-6, "float32": 1e-3}
 
 
 def simulate(
-    controller: Any,
-    plant: Any,
+    controller: Feedback,
+    plant: Plant,
     x0: Reals,
     steps: int,
     *,
@@ -75,16 +76,8 @@ def simulate(
     Raises ValueError for wrong shapes, before any compile; numbers that are not finite give the
     status NON_FINITE.
     """
-    given = Conditions(
-        reference=reference,
-        input_reference=input_reference,
-        disturbance=disturbance,
-        previous_input=previous_input,
-        noise=noise,
-        observer=observer,
-        delay=delay,
-        compensate=bool(compensate),
-    )
+    aims = (reference, input_reference)
+    given = Conditions(*aims, disturbance, previous_input, noise, observer, delay, bool(compensate))
     plant, x0, given = checked_loop(controller, plant, x0, steps, given)
     return _simulate(controller, plant, x0, given, steps=int(steps), checkpoint=checkpoint)
 
@@ -104,7 +97,7 @@ class Conditions:
 
 
 def checked_loop(
-    controller: Any, plant: Any, x0: Any, steps: int, given: Conditions
+    controller: Feedback, plant: Plant, x0: Any, steps: int, given: Conditions
 ) -> tuple[Any, Array, Conditions]:
     """Return plant, initial state and conditions as arguments of a program, in the controller's
     precision; raise ValueError where one is wrong."""
@@ -196,7 +189,7 @@ class Happening(NamedTuple):
 class Loop:
     """One closed loop: what its time steps share."""
 
-    def __init__(self, controller: Any, plant: Any, given: Conditions, dtype: Any) -> None:
+    def __init__(self, controller: Feedback, plant: Plant, given: Conditions, dtype: Any) -> None:
         self.controller, self.given = controller, given
         self.plant = plant = plant.given if isinstance(plant, ConstantModel) else plant
         self.horizon, (self.Q, self.R, *_) = (
@@ -293,7 +286,13 @@ def _distance(value: Array, target: Array | None) -> Array:
 @partial(jax.jit, static_argnames=("steps", "checkpoint"))
 @own_modes
 def _simulate(
-    controller: Any, plant: Any, x0: Array, given: Conditions, *, steps: int, checkpoint: bool
+    controller: Feedback,
+    plant: Plant,
+    x0: Array,
+    given: Conditions,
+    *,
+    steps: int,
+    checkpoint: bool,
 ) -> Run:
     loop, system = Loop(controller, plant, given, x0.dtype), controller.mpc.system
     observer, previous = given.observer, given.previous_input

@@ -12,6 +12,7 @@ import numpy as np
 from jaxmpc.arrays import Reals
 from jaxmpc.batches import Part, Timing, first_rows, padded, work_off
 from jaxmpc.checks import fail
+from jaxmpc.closed_loop.interfaces import Feedback
 from jaxmpc.closed_loop.many import simulate_many
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.closed_loop.variations import plant_numbers
@@ -41,7 +42,7 @@ class StoredRuns:
 
 def simulate_into(
     path: str | Path,
-    controller: Any,
+    controller: Feedback,
     robot: Robot,
     x0s: Reals,
     steps: int,
@@ -102,7 +103,7 @@ class _Loops:
     """Loops that a store is to hold: arguments of `simulate_many`, target and devices by name, and
     the factors of the plants."""
 
-    controller: Any
+    controller: Feedback
     robot: Robot
     x0s: np.ndarray
     steps: int

@@ -18,7 +18,7 @@ from jaxmpc.sets.box import Box
 # Forces that count as balanced, relative to 1 + the largest one.
 BALANCED = 1e-6
 # Accelerations (rad/s², m/s²) that count as rest.
-STILL = 1e-3
+AT_REST = 1e-3
 # Weights of the distance in the search, one after the other; the last leaves balanced forces.
 _WEIGHTS = (1e-2, 1e-4, 1e-6, 1e-9, 1e-12)
 _STEP = 1e-6
@@ -164,14 +164,14 @@ def require_rest(
         inside = (low <= rest.q[at]) & (rest.q[at] <= high)
         file.jnt_limited[single] = limited[single] & inside
         wanted, found = _accelerations(smooth, rest), _accelerations(file, rest)
-        if np.all(np.abs(found - wanted) <= STILL):
+        if np.all(np.abs(found - wanted) <= AT_REST):
             continue
         i = int(np.argmax(np.nan_to_num(np.abs(found - wanted), nan=np.inf)))
         joint = name_of(file, "joint", file.dof_jntid[i])
         problem = f"{rest.q} is no rest: in MuJoCo {joint} accelerates by {found[i]:.3g} a second²"
         for kind, cause, cure in CAUSES:
             without = _accelerations(_without(file, kind), rest)
-            if np.all(np.abs(without - wanted) <= STILL):
+            if np.all(np.abs(without - wanted) <= AT_REST):
                 text = f"{problem}, by {cause}"
                 if touching and kind in ("contact", "limit"):
                     return [f"{text}; the model is taken there"]

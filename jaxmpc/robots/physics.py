@@ -158,14 +158,14 @@ class Physics:
         the derivative of the constraint forces in the accelerations."""
         (model, data), (numbers, q, v, *_) = self._forced(*point), point
         a, first = found
-        forces, still = data.qfrc_smooth, jnp.zeros_like(a)
+        forces, zero = data.qfrc_smooth, jnp.zeros_like(a)
         added = self._added(model, data, False), self._added(model, data, damped)
         lack = lambda a, added: self._inverse_dynamics(numbers, q, v, a) + matmul(added, a) - forces
         if not self.rows:
-            return (still, lack(a, added[1])), (*added, jnp.zeros_like(added[0]))
+            return (zero, lack(a, added[1])), (*added, jnp.zeros_like(added[0]))
         pushed = partial(_constraint_forces, model, data)
         forces = forces + pushed(first)
-        second = lack(a, added[1]) if damped else still
+        second = lack(a, added[1]) if damped else zero
         return (lack(first, added[0]), second), (*added, jax.jacfwd(pushed)(first))
 
     def _constrained(self, model: Any, data: Any, M: Array, force: Array) -> Array:
@@ -220,9 +220,9 @@ class Physics:
         rows = data._impl
         if self.rows:
             idle = jnp.all(rows.efc_J == 0, axis=1) & (rows.efc_aref == 0)
-            still = lambda v: jnp.where(idle, jax.lax.stop_gradient(v.T), v.T).T
+            constant = lambda v: jnp.where(idle, jax.lax.stop_gradient(v.T), v.T).T
             names = ("efc_J", "efc_D", "efc_aref")
-            data = data.tree_replace({f"_impl.{n}": still(getattr(rows, n)) for n in names})
+            data = data.tree_replace({f"_impl.{n}": constant(getattr(rows, n)) for n in names})
         return model, data
 
     def _rigid(self, function: Callable, numbers: dict[str, Array], q: Array, *rest: Array) -> Any:
@@ -250,15 +250,15 @@ class Physics:
         def rule(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
             numbers, q, v, a = primals
             moved, dq, dv, da = tangents
-            still = lambda t: isinstance(t, SymbolicZero)
+            is_zero = lambda t: isinstance(t, SymbolicZero)
             found = jnp.zeros_like(a)
-            if not all(map(still, jax.tree.leaves(moved, is_leaf=still))):
+            if not all(map(is_zero, jax.tree.leaves(moved, is_leaf=is_zero))):
                 inner = lambda numbers: self._rigid(inverse_dynamics, numbers, q, v, a)
                 of, at, directions = moving(inner, (numbers,), (moved,))
                 found = found + jax.jvp(of, at, directions)[1]
-            dq = dq if still(dq) else rates(self.joints, q, dq)
+            dq = dq if is_zero(dq) else rates(self.joints, q, dq)
             for K, d in zip(self._rigid(slopes, numbers, q, v, a), (dq, dv, da), strict=True):
-                found = found if still(d) else found + matmul(K, d)
+                found = found if is_zero(d) else found + matmul(K, d)
             return inverse(*primals), found
 
         inverse.defjvp(rule, symbolic_zeros=True)

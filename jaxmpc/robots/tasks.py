@@ -10,6 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from scipy.spatial.transform import Rotation
 
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.qp.precision import matmul
@@ -39,12 +40,7 @@ def orientation(
     i, field = _number(robot, kind, name), "xmat" if kind == "body" else f"{kind}_xmat"
     require_shape("target", target, (4,), "Give a quaternion (w, x, y, z)")
     require_finite("target", target)
-    w, x, y, z = np.asarray(target, float) / np.linalg.norm(target)
-    wanted = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    wanted = Rotation.from_quat(np.roll(np.asarray(target, float), -1)).as_matrix()
 
     def turned(data: Any) -> Array:
         R = getattr(data, field)[i].reshape(3, 3)
