@@ -18,8 +18,8 @@ from jaxmpc.qp.precision import arrays, matmul, symmetric
 class Noise:
     """White Gaussian noise of a closed loop: ξ_{t+1} = f(ξ_t, u_t) + w_t, y_t = C ξ_t + v_t.
 
-    process: of w_t, one time step's, in the coordinates ξ (n,) of the plant. measurement: of v_t, in
-        the outputs (p,) of the observer; without an observer all coordinates are measured, p = n.
+    process: of w_t, of one time step, in the coordinates ξ (n,) of the plant. measurement: of v_t,
+        in the outputs (p,) of the observer; without one all coordinates are measured, p = n.
         Each is a standard deviation for all entries, one for each (k,), or a covariance (k, k);
         None for no noise.
     seed: a whole number or a JAX key; the same seed, the same noise. `simulate_many` gives loop i

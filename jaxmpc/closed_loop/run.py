@@ -23,8 +23,8 @@ class Run:
     of the soft rows at k = 0 of each plan, hence of what happens. fallback (T,): whether the plan
     violates soft rows anywhere on its horizon by more than 1e-6 (1e-3 in float32), as happens
     where the limits cannot all be kept. estimates (T, n): the states as an observer estimates them
-    from the outputs up to each time step; None without an observer. Batches have their axes in front.
-    For robots states are the plant's, (qpos, qvel), and x in costs and limits means their
+    from the outputs so far; None without an observer. Batches have their axes in front. For robots
+    states are the plant's, (qpos, qvel), and x in costs and limits means their
     coordinates.
     """
 
@@ -45,7 +45,7 @@ class Run:
 
     @property
     def feasible_steps(self) -> Array:
-        """Return the number of time steps before the first plan that is not SOLVED: T if all are."""
+        """Return the number of plans before the first that is not SOLVED: T if all are."""
         solved = jnp.asarray(self.status) == Status.SOLVED
         return jnp.sum(jnp.cumprod(solved, axis=-1), axis=-1)
 
