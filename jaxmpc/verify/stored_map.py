@@ -12,6 +12,7 @@ from tqdm.std import tqdm
 
 from jaxmpc.checks import fail
 from jaxmpc.files import read_results
+from jaxmpc.pytrees import short_text
 from jaxmpc.qp.status import Status
 from jaxmpc.store import Check, Stored, read, reason
 from jaxmpc.verify.exact import roll_out_exactly, roll_out_in_floats
@@ -40,16 +41,7 @@ class Verification:
     failures: dict[int, str] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
 
-    def __repr__(self) -> str:
-        verdict = "passed" if self.passed else "FAILED"
-        first = [*self.problems, *self.failures.values()][:1]
-        counts = ", ".join(f"{n:,} {name}" for name, n in self.labels.items())
-        lines = [
-            f"Verification {verdict}: {self.verified:,} labels proved, {self.exactly:,} exactly",
-            f"labels: {counts or 'none read'}",
-            f"{len(self.failures):,} failures, {len(self.problems)} problems",
-        ]
-        return "\n  ".join([*lines, *first])
+    __repr__ = short_text
 
     @property
     def passed(self) -> bool:

@@ -7,6 +7,7 @@ import problems
 import pytest
 
 import jaxmpc as jm
+from jaxmpc import store
 from jaxmpc.feasible import extremes, stored
 from jaxmpc.feasible.extremes import HalfSpaces, extreme, line_ends
 from jaxmpc.feasible.map import FeasibleSetMap
@@ -181,3 +182,50 @@ def test_reads_one_block_at_a_time(tmp_path):
         )  # fmt: skip
         StoredMap.read(problem, spy, lines).refine()
     assert asked and "plan" not in asked and "start" not in asked
+
+
+LINES = [np.linspace(-1.2, 1.2, 20), np.linspace(-1.2, 1.2, 21)]
+
+
+def test_sweep_into_a_store(tmp_path):
+    """Labels and bounds are those of a map of all points; no run but the first has work to do."""
+    mpc, path = problems.lecture(), tmp_path / "a.zarr"
+    found = jm.feasible.sweep_into(path, mpc, LINES, chunk=100)
+    whole = jm.map_feasible_set(mpc, mesh(LINES), gap=1e-6)
+    assert found.counts == whole.counts() and found.left == "" and found.timing.count == 420
+    np.testing.assert_allclose(found.bounds.volume_bounds(), whole.volume_bounds(), rtol=1e-9)
+    there = store.read(path)
+    assert not there.problems and there.done == there.blocks > 3
+    np.testing.assert_array_equal(there.arrays["label"] == 1, whole.label == 1)
+    with pytest.raises(ValueError, match="exists"):
+        jm.feasible.sweep_into(path, mpc, LINES, chunk=100)
+    with pytest.raises(ValueError, match="iterations: 50 there, 60 here"):
+        jm.feasible.sweep_into(path, mpc, LINES, chunk=100, iterations=60, resume=True)
+    again = jm.feasible.sweep_into(path, mpc, LINES, chunk=100, resume=True)
+    assert again.timing.count == 0 and again.counts == found.counts
+
+
+def test_shards_sweep_into_one_store(tmp_path):
+    concluded = []
+    how = {"chunk": 100, "gap": None, "concluded": concluded.append}
+    path = tmp_path / "a.zarr"
+    first = jm.feasible.sweep_into(path, problems.lecture(), LINES, shard=(1, 2), **how)
+    assert "are missing, of other shards" in first.left and not first.counts and not concluded
+    last = jm.feasible.sweep_into(path, problems.lecture(), LINES, shard=(0, 2), **how)
+    assert last.left == "" and concluded == [last]
+    assert first.timing.count + last.timing.count == sum(last.counts.values()) == 420
+    with pytest.raises(ValueError, match="overwrite: given beside shard"):
+        jm.feasible.sweep_into(path, None, LINES, shard=(0, 2), overwrite=True)
+
+
+def test_results_print_in_a_few_lines(tmp_path):
+    mpc, points = problems.lecture(), mesh(LINES)
+    fmap = jm.map_feasible_set(mpc, points, gap=1e-6)
+    swept = jm.feasible.sweep_into(tmp_path / "a.zarr", mpc, LINES)
+    edges, growth = jm.boundary(mpc, 8), jm.feasible.feasible_growth(mpc, (2, 3))
+    verified = jm.verify.verify_map(tmp_path / "a.zarr")
+    for found in (fmap, fmap.labels, swept, edges, growth, verified):
+        text = repr(found)
+        assert text.startswith(type(found).__name__)
+        assert text.count("\n") < 5 and max(map(len, text.split("\n"))) <= 200
+    assert f"{int(np.sum(fmap.label == 1))} feasible" in repr(fmap)
