@@ -1,9 +1,14 @@
-"""The pipeline of stages that labels points, part by part (`Pipeline.stages` is their order).
+"""The pipeline of stages that labels points, part by part. A point goes through them in this order
+until it is decided:
 
-The first stage takes a whole part: ADMM, then Newton steps on what it leaves open; or, where so
-many points are worth the rays, the hull of proved points. The points that are still undecided go
-through the other stages, and the last of them, up to `MOST_PROGRAMS` points of all parts together,
-get a linear program or three.
+    hull                   in the hull of proved points, or beyond a half-space; then the roll-out
+                           of its plan. Only where so many points are worth the rays (`hull_for`)
+    ADMM, Newton           `iterations` steps, then Newton steps on what they leave undecided
+    longer ADMM, Newton    the same with `LONGER` times as many steps, in float64
+    linear programs        up to three for each of the last `MOST_PROGRAMS` points of all parts
+
+The first of them takes a whole part on the device (`Pipeline.begin`), the others batches of what is
+left (`Pipeline.stages`, `by_programs`).
 
 The labels and proofs of a part depend on its own points, on the shape of a part and on the `Scope`
 of all points, not on which other parts a process has labelled: any split among processes gives the

@@ -225,7 +225,7 @@ def test_compiles_once_for_all_chunks():
 
 @pytest.mark.slow
 def test_proofs_are_copied_when_asked_for(points, fmap):
-    """And are the same rows whichever part of the cascade found them."""
+    """And are the same rows whichever stage of the pipeline found them."""
     labels = jm.map_feasible_set(problems.lecture(), points, iterations=1, chunk=64).labels
     np.testing.assert_array_equal(labels.label, fmap.label)
     inside, outside = labels.label == 1, labels.label == -1

@@ -1,4 +1,4 @@
-"""The cascade: every point once and in order, the last programs, its limits and its errors.
+"""The pipeline: every point once and in order, the last programs, its limits and its errors.
 
 The problem is x⁺ = x + u with |x| ≤ 1 from k = 1 on and |u| ≤ 0.3: feasible for |x_0| ≤ 1.3.
 """
