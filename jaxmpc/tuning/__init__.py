@@ -1,6 +1,9 @@
 """Tuning by gradient descent, with a checkpoint after each step.
 
 tune_weights                              fields of an MPC, through its closed loops
+linear_task, robot_task                   what `jaxmpc tune weights` tunes: loops, loss, weights
+weight_parameters, feasible_states        its parameters, and initial states that have a plan
+run_folder                                the folder of a run that is resumed or overwritten
 Parameter                                 a quantity that is tuned, and its domain
 ClosedLoopLoss                            tracking, effort, violations and settling
 tune_feasible_set                         the share of states from which all limits can be kept
@@ -11,12 +14,15 @@ Interrupted                               what they raise on Ctrl-C, with the be
 
 from jaxmpc.tuning.descent import Descent
 from jaxmpc.tuning.feasible_set import tune_feasible_set
+from jaxmpc.tuning.initial_states import feasible_states
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
 from jaxmpc.tuning.penalty_schedule import transfer_penalties
 from jaxmpc.tuning.result import Interrupted, TuningRun
+from jaxmpc.tuning.run_folder import run_folder
 from jaxmpc.tuning.settings import Settings
 from jaxmpc.tuning.solver import tune_solver
+from jaxmpc.tuning.tasks import linear_task, robot_task, weight_parameters
 from jaxmpc.tuning.weights import tune_weights
 
 __all__ = [
@@ -26,8 +32,13 @@ __all__ = [
     "Parameter",
     "Settings",
     "TuningRun",
+    "feasible_states",
+    "linear_task",
+    "robot_task",
+    "run_folder",
     "transfer_penalties",
     "tune_feasible_set",
     "tune_solver",
     "tune_weights",
+    "weight_parameters",
 ]

@@ -28,8 +28,9 @@ def initial_range(
     for name, given in (("lower", lower), ("upper", upper)):
         if given is not None and len(given) != len(low):
             fail(name, f"has {len(given)} numbers", f"The problem has {len(low)} states")
-    bounded = np.isfinite(high - low)
-    middle, half = (np.where(bounded, part / 2, np.nan) for part in (high + low, high - low))
+    bounded = np.isfinite(low) & np.isfinite(high)
+    low, high = np.where(bounded, low, np.nan), np.where(bounded, high, np.nan)
+    middle, half = (high + low) / 2, (high - low) / 2
     low = middle - spread * half if lower is None else np.asarray(lower, float)
     high = middle + spread * half if upper is None else np.asarray(upper, float)
     if not np.all(np.isfinite([low, high])):

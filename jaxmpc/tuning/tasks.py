@@ -207,11 +207,13 @@ def linear_task(
             made = dataclasses.replace(made, states=states, terminal_set=end)
         return made if rho is None else soften(made, values.get("rho", rho))
 
+    plant = LinearPlant(mpc.system, box, inputs, name=name)
+    plant.validate()
     return WeightTask(
         name=name,
         make=make,
         parameters=parameters,
-        plant=LinearPlant(mpc.system, box, inputs, name=name),
+        plant=plant,
         x0s=np.asarray(x0s),
         variations={},
         validation=_validation(validation, len(np.asarray(x0s))),

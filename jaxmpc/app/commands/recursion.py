@@ -13,6 +13,7 @@ from jaxmpc.app.commands.options import (
     ProblemFile,
     Switch,
     Terminal,
+    arguments,
     at_least,
     given_options,
     option,
@@ -25,6 +26,7 @@ from jaxmpc.checks import fail
 from jaxmpc.files import open_folder
 from jaxmpc.recursion import recursive_feasibility, smallest_horizon
 from jaxmpc.recursion.stored_report import FILES, save_report
+from jaxmpc.robot_maps.stored_sweep import sweep_robot
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,19 +190,8 @@ class Recursion:
         refuse(given, robot, "Claims about all states are those of a linear problem")
         at_least(1).check("--horizon", self.horizon)
         at_least(1).check("--steps", self.steps)
-        map_robot_into(
-            robot,
-            self.output,
-            claim="recursion",
-            steps=100 if self.steps is None else self.steps,
-            horizon=self.horizon,
-            terminal=self.terminal,
-            axes=self.axes,
-            fixed=self.fixed,
-            grid=self.grid,
-            lower=self.lower,
-            upper=self.upper,
-            resume=self.resume,
-            overwrite=self.overwrite,
-            search_seconds=self.seconds,
-        )
+        options = arguments(self, sweep_robot, leave=("robot", "seconds", "steps"))
+        if self.seconds is not None:
+            options["search_seconds"] = self.seconds
+        steps = 100 if self.steps is None else self.steps
+        map_robot_into(robot, self.output, claim="recursion", steps=steps, **options)

@@ -8,14 +8,10 @@ from jaxmpc.robot_maps.stored_sweep import sweep_robot
 
 
 def map_robot_into(robot: str, output: Path, refine: bool = True, **options: Any) -> None:
-    """Run `sweep_robot` with options, None for those that are not given; draw and print its map.
-
-    Raises ValueError as it does, before anything compiles.
-    """
+    """Run `sweep_robot`, draw and print its map. Raises ValueError as it does, before anything
+    compiles."""
     begun = time.perf_counter()
-    given = {name: value for name, value in options.items() if value is not None}
-    gap = 1e-6 if refine else None
-    rmap = sweep_robot(robot, output, gap=gap, progress=True, **given)
+    rmap = sweep_robot(robot, output, gap=1e-6 if refine else None, progress=True, **options)
     files = ["summary.json", "robot_map.npz"]
     if rmap.x0s.shape[1] == 2:
         from jaxmpc.app.plots.robot_map import plot_robot_map

@@ -17,6 +17,7 @@ from jaxmpc.app.commands.options import (
     Horizon,
     Switch,
     Terminal,
+    arguments,
     at_least,
     chosen_shard,
     given_options,
@@ -26,6 +27,7 @@ from jaxmpc.app.commands.options import (
 from jaxmpc.app.commands.robot_map import map_robot_into
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import require_disk
+from jaxmpc.robot_maps.stored_sweep import sweep_robot
 
 # By how much the files of a sweep are smaller than its arrays, at most: the joint's 13 times.
 COMPRESSION = 20
@@ -192,21 +194,6 @@ class Sweep:
         refuse({"shard": self.shard, "store": self.store}, robot, "They are for linear maps")
         chosen_devices(self.devices, "--devices")
         at_least(1).check("--horizon", self.horizon)
-        map_robot_into(
-            robot,
-            self.output,
-            seconds=self.seconds,
-            horizon=self.horizon,
-            terminal=self.terminal,
-            axes=self.axes,
-            fixed=self.fixed,
-            grid=self.grid,
-            lower=self.lower,
-            upper=self.upper,
-            refine=self.refine,
-            resume=self.resume,
-            overwrite=self.overwrite,
-            devices=self.devices,
-            iterations=self.iterations,
-            dtype=self.dtype,
-        )
+        given = arguments(self, sweep_robot, leave=("robot",))
+        given |= given_options(self, "iterations", "dtype")
+        map_robot_into(robot, self.output, self.refine, **given)

@@ -1,0 +1,99 @@
+"""Learning tasks from Python: what the command tunes, with the same functions."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import problems
+import pytest
+
+import jaxmpc as jm
+from jaxmpc.tuning.initial_states import initial_range
+from jaxmpc.tuning.run_folder import CHECKPOINT, run_folder
+from jaxmpc.tuning.tasks import TIGHTEST, weight_loss
+
+SYSTEM = replace(problems.double_integrator(4).system, dt=1.0)
+MPC = replace(problems.double_integrator(4), system=SYSTEM, terminal_cost=np.eye(2))
+X0S = np.random.default_rng(0).uniform(-0.5, 0.5, (6, 2))
+
+
+def test_parameters_say_what_is_tuned():
+    found = jm.tuning.weight_parameters(
+        MPC, ("Q", "P", "rho", "tightening"), weights="full", rho=3.0, margin=0.1, limits=MPC.states
+    )
+    assert list(found) == ["Q", "P", "rho", "tightening"]
+    assert (found["Q"].domain, found["rho"].value) == ("definite", 3.0)
+    assert found["tightening"].upper == TIGHTEST
+    with pytest.raises(ValueError, match="tune rho: the problem has no soft limits"):
+        jm.tuning.weight_parameters(MPC, ("rho",))
+    with pytest.raises(ValueError, match="tune tightening, margin"):
+        jm.tuning.weight_parameters(MPC, ("tightening",))
+
+
+def test_the_problem_follows_the_values():
+    """P as given, as Q, as the Riccati solution, or tuned; limits tightened; soft where rho is."""
+    Q = np.diag([3.0, 2.0])
+
+    def made(values, **settings):
+        task = jm.tuning.linear_task(MPC, {}, X0S, **settings)
+        return task.make(values)
+
+    np.testing.assert_array_equal(made({"Q": Q}).terminal_cost, MPC.terminal_cost)
+    np.testing.assert_array_equal(made({"Q": Q}, terminal_weight="Q").terminal_cost, Q)
+    expected = jm.lqr(MPC.system, Q, MPC.R).P
+    np.testing.assert_allclose(made({"Q": Q}, terminal_weight="lqr").terminal_cost, expected)
+    P = 7 * np.eye(2)
+    np.testing.assert_array_equal(made({"Q": Q, "P": P}, terminal_weight="lqr").terminal_cost, P)
+    tight = made({"tightening": 0.2})
+    np.testing.assert_allclose(tight.states.upper, 0.8 * np.asarray(MPC.states.upper))
+    assert made({}).soft is None or not made({}).soft
+    assert made({}, rho=5.0).soft
+
+
+def test_loss_has_weights_of_its_own():
+    loss = weight_loss(MPC.Q, MPC.R, MPC.states, tracking=[1.0, 2.0], tolerance=0.1)
+    np.testing.assert_array_equal(loss.Q, np.diag([1.0, 2.0]))
+    np.testing.assert_array_equal(loss.R, MPC.R)
+    np.testing.assert_allclose(loss.band, 0.1 * MPC.states.half_widths())
+
+
+def test_initial_states_lie_in_the_range():
+    limits = np.array([-1.0, -np.inf]), np.array([3.0, np.inf])
+    with pytest.raises(ValueError, match="lower, upper: the state limits do not bound"):
+        initial_range(limits)
+    low, high = initial_range((limits[0][:1], limits[1][:1]), spread=0.5)
+    assert low == 0 and high == 2
+    with pytest.raises(ValueError, match="lower: has 2 numbers"):
+        initial_range((limits[0][:1], limits[1][:1]), lower=(0.0, 1.0))
+
+
+def test_a_folder_is_opened_resumed_and_given_back(tmp_path):
+    options, files = {"seed": 1}, ("run.json", "picture.png")
+    with run_folder(tmp_path, files, options, False, False) as checkpoint:
+        assert checkpoint == tmp_path / CHECKPOINT
+        checkpoint.write_bytes(b"1")
+    assert json.loads((tmp_path / "run.json").read_text())["options"] == options
+    with pytest.raises(ValueError, match="exists"), run_folder(tmp_path, files, {}, False, False):
+        pass
+    with pytest.raises(ValueError, match="seed: 1 there, 2 here"):
+        with run_folder(tmp_path, files, {"seed": 2}, True, False):
+            pass
+    (tmp_path / "picture.png").write_bytes(b"old")
+    with pytest.raises(KeyboardInterrupt):
+        with run_folder(tmp_path, files, options, False, True):
+            assert not (tmp_path / "picture.png").exists()
+            raise KeyboardInterrupt  # before the first checkpoint
+    assert (tmp_path / "picture.png").read_bytes() == b"old"
+    with run_folder(tmp_path, files, options, False, True) as checkpoint:
+        checkpoint.write_bytes(b"2")
+    assert {path.name for path in tmp_path.iterdir()} == {"run.json", CHECKPOINT}
+
+
+@pytest.mark.slow
+def test_a_task_is_tuned_simulated_and_counted():
+    parameters = jm.tuning.weight_parameters(MPC)
+    task = jm.tuning.linear_task(MPC, parameters, X0S, steps=3, validation=0.34)
+    run = task.tune(updates=1, mode="forward")
+    assert run.settings["validation"] == task.validation == 2
+    counts = task.counts(task.simulate(lambda: run.mpc), 0.02)
+    assert counts["loops"] == 2 and counts["plans"] == 6 and counts["violated"] == 0
