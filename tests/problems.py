@@ -4,6 +4,8 @@ Every entry is a function, so that a test can change a field with `dataclasses.r
 areas hold for the decimal data as printed; for the float64 data use `exact.feasible_polygon`.
 """
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 
@@ -179,3 +181,80 @@ horizon = 3
 [sweep]
 grid = [3, 4]
 """
+
+
+def octahedron(n=3, radius=0.3):
+    """{x: Σ|x_i| ≤ radius}; 2^(n−1) facets meet in each vertex."""
+    signs = np.stack(np.meshgrid(*[[1.0, -1.0]] * n), -1).reshape(-1, n)
+    return jm.Polytope(signs, np.full(len(signs), radius))
+
+
+def apex():
+    """Three states, three inputs: x_N sits on apexes of the terminal set for open sets of x_0."""
+    return jm.MPC(
+        system=jm.LinearSystem(0.9 * np.eye(3), np.diag([1.0, 0.5, 0.8])), Q=np.eye(3),
+        R=np.eye(3), horizon=1, states=symmetric(1.0, 1.0, 1.0),
+        inputs=symmetric(1.0, 1.5, 1.0), terminal_set=octahedron(),
+    )  # fmt: skip
+
+
+def duplicated():
+    """The lecture's problem with state rows twice, scaled, and a row that touches a corner."""
+    H = np.vstack([np.eye(2), -np.eye(2), 3 * np.eye(2), [[1.0, 1.0]]])
+    rows = jm.Polytope(H, np.array([1.0, 1, 1, 1, 3, 3, 2]))
+    return replace(lecture(), states=rows, terminal_set=rows)
+
+
+def pair():
+    """Two lectures side by side: regions and volume are the products."""
+    a = lecture()
+    both = lambda M: np.kron(np.eye(2), M)
+    return replace(
+        a, system=jm.LinearSystem(both(a.system.A), both(a.system.B)), Q=both(a.Q), R=both(a.R),
+        states=symmetric(*[1.0] * 4), inputs=symmetric(0.25, 0.25),
+        terminal_cost=both(a.terminal_cost), terminal_set=symmetric(*[1.0] * 4),
+    )  # fmt: skip
+
+
+def least_distance(mpc, x):
+    """Optimal inputs (N, m) by non-negative least squares on rolled-out matrices."""
+    from scipy.optimize import nnls
+
+    N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
+    A, B = mpc.system.A, mpc.system.B
+    drift = np.zeros(n) if mpc.system.c is None else mpc.system.c
+    Phi, Gamma, phi = [np.eye(n)], [np.zeros((n, N * m))], [np.zeros(n)]
+    for k in range(N):
+        step = A @ Gamma[-1]
+        step[:, k * m : (k + 1) * m] += B
+        Phi.append(A @ Phi[-1])
+        Gamma.append(step)
+        phi.append(A @ phi[-1] + drift)
+    end = np.zeros((n, n)) if mpc.terminal_cost is None else mpc.terminal_cost
+    weights = [mpc.Q] * N + [end]
+    P = sum(G.T @ W @ G for G, W in zip(Gamma, weights, strict=True))
+    P = P + np.kron(np.eye(N), mpc.R)
+    free = [M @ x + d for M, d in zip(Phi, phi, strict=True)]
+    q = sum(G.T @ W @ v for G, W, v in zip(Gamma, weights, free, strict=True))
+    rows, bounds = [], []
+    sets = [(mpc.states, k) for k in range(1, N)] + [(mpc.terminal_set, N)]
+    for set_, k in sets:
+        H, lower, upper = (np.asarray(v) for v in set_.rows())
+        rows += [H @ Gamma[k], -H @ Gamma[k]]
+        bounds += [upper - H @ free[k], H @ free[k] - lower]
+    eye = np.eye(N * m)
+    rows += [eye, -eye]
+    bounds += [np.tile(mpc.inputs.upper, N), -np.tile(mpc.inputs.lower, N)]
+    G, h = np.vstack(rows), np.concatenate(bounds)
+    G, h = G[np.isfinite(h)], h[np.isfinite(h)]
+    factor = np.linalg.cholesky(P)
+    M = np.linalg.solve(factor, G.T).T
+    # min |y|², M y ≤ h + M L⁻¹q (Lawson & Hanson 1974, ch. 23).
+    shift = np.linalg.solve(factor, q)
+    right = h + M @ shift
+    if right.min() < 0:
+        E = -np.vstack([M.T, right / -right.min()])
+        y, _ = nnls(E, np.eye(len(E))[-1], maxiter=10_000)
+        r = E @ y - np.eye(len(E))[-1]
+        shift = shift - right.min() * r[:-1] / r[-1]
+    return -np.linalg.solve(factor.T, shift).reshape(N, m)

@@ -2,6 +2,7 @@
 
 recursive_feasibility    proofs, the worst counterexample, states lost -> RecursionReport
 smallest_horizon         the least horizon with a proof -> SmallestHorizon
+save_report              both as files, which `jaxmpc verify` proves again
 Claim, Counterexample    what the reports hold
 """
 
@@ -9,6 +10,7 @@ from jaxmpc.recursion.analysis import recursive_feasibility
 from jaxmpc.recursion.claims import Claim, Counterexample
 from jaxmpc.recursion.horizons import SmallestHorizon, smallest_horizon
 from jaxmpc.recursion.report import RecursionReport
+from jaxmpc.recursion.stored_report import save_report
 
 __all__ = [
     "Claim",
@@ -16,5 +18,6 @@ __all__ = [
     "RecursionReport",
     "SmallestHorizon",
     "recursive_feasibility",
+    "save_report",
     "smallest_horizon",
 ]

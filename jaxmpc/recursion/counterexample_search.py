@@ -5,7 +5,6 @@ its gradient, and on a region be maximised exactly by a linear program.
 """
 
 import time
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +19,7 @@ INSET = 1e-6
 LENGTHS = 0.3 * 0.5 ** np.arange(16)
 # Then the search goes from region to region: with how many states at once, in how many rounds, from
 # how many neighbours at what distance.
-KEPT, ROUNDS, NEIGHBOURS, NEAR = 6, 10, 4, 1e-4
+FOLLOWED, ROUNDS, NEIGHBOURS, NEAR = 6, 10, 4, 1e-4
 
 
 def ascend(law: Law, bound: CenteredPolytope, starts: np.ndarray, deadline: float) -> np.ndarray:
@@ -45,7 +44,11 @@ def ascend(law: Law, bound: CenteredPolytope, starts: np.ndarray, deadline: floa
 
 
 def _value_and_gradient(
-    law: Law, bound: CenteredPolytope, x: np.ndarray, deadline: float, than: Any = -np.inf
+    law: Law,
+    bound: CenteredPolytope,
+    x: np.ndarray,
+    deadline: float,
+    than: np.ndarray | float = -np.inf,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return v (S,) at x (S, p), −inf where there is no plan, and its unit gradient in coordinates
     x / bound.unit where v > than, and before the deadline."""
@@ -70,36 +73,45 @@ def _climb_regions(
     """Follow the best of x (S, p) to the best vertex of its region, and on from beside it; return
     states (K, p)."""
     random = np.random.default_rng(0)
-    order = np.argsort(-value)[:KEPT]
+    order = np.argsort(-value)[:FOLLOWED]
     best, top = x[order], value[order]
     for tried in range(ROUNDS):
         if time.monotonic() > deadline:
             break
         beside = random.standard_normal((NEIGHBOURS, *best.shape)) * NEAR * bound.unit
         around = bound.nearest(np.concatenate([best, *(best + beside)]), INSET)
-        plans = law.plans(around)
-        found = []
-        for i in np.flatnonzero(plans.status == Status.SOLVED):
-            if time.monotonic() > deadline:
-                break
-            state, piece = around[i], law.piece(around[i], plans.inputs[i])
-            if piece is None:
-                continue
-            off = bound.normals @ (piece.E @ state + piece.e) - bound.offsets
-            facet = int(np.argmax(off / bound.depths))
-            up = piece.E.T @ bound.normals[facet]
-            R = np.vstack([piece.R, bound.normals])
-            peak = maximise(up, R, np.append(piece.r, bound.offsets)).x
-            if peak is not None:
-                found.append((float(bound.beyond((piece.E @ peak + piece.e)[None])[0]), peak))
-        values = np.append(top, [v for v, _ in found])
-        states = np.concatenate([best, *(peak[None] for _, peak in found)])
-        kept: list[int] = []
+        peaks, heights = _peaks(law, bound, around, deadline)
+        states, values = np.concatenate([best, peaks]), np.append(top, heights)
+        chosen: list[int] = []
         for i in np.argsort(-values):
-            if all(np.any(np.abs(states[i] - states[j]) > 1e-6 * bound.unit) for j in kept):
-                kept.append(int(i))
-        before, kept = top.max(initial=-np.inf), kept[:KEPT]
-        best, top = states[kept], values[kept]
+            if all(np.any(np.abs(states[i] - states[j]) > 1e-6 * bound.unit) for j in chosen):
+                chosen.append(int(i))
+        before, chosen = top.max(initial=-np.inf), chosen[:FOLLOWED]
+        best, top = states[chosen], values[chosen]
         if tried > 1 and top.max(initial=-np.inf) <= before + 1e-12:
             break
     return best
+
+
+def _peaks(
+    law: Law, bound: CenteredPolytope, around: np.ndarray, deadline: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the best states (K, p) of the regions of some states (B, p), and how far outside the
+    bound their next states lie (K,)."""
+    plans = law.plans(around)
+    peaks, values = [np.zeros((0, around.shape[1]))], []
+    for i in np.flatnonzero(plans.status == Status.SOLVED):
+        if time.monotonic() > deadline:
+            break
+        state, piece = around[i], law.piece(around[i], plans.inputs[i])
+        if piece is None:
+            continue
+        off = bound.normals @ (piece.E @ state + piece.e) - bound.offsets
+        facet = int(np.argmax(off / bound.depths))
+        up = piece.E.T @ bound.normals[facet]
+        R = np.vstack([piece.R, bound.normals])
+        peak = maximise(up, R, np.append(piece.r, bound.offsets)).x
+        if peak is not None:
+            peaks.append(peak[None])
+            values.append(float(bound.beyond((piece.E @ peak + piece.e)[None])[0]))
+    return np.concatenate(peaks), np.array(values)

@@ -182,12 +182,12 @@ def _or_note(notes: dict[str, str], name: str, action: Callable[[], T]) -> T | N
 
 
 def mapped(problem: FeasibilityProblem, x0s: Reals | None, budget: Budget) -> FeasibleSetMap | None:
-    """Return the map of the states x0s, or of `samples`; None where there is no time for it."""
+    """Return the map of the states x0s, or of `sample_states`; None where there is no time for it."""
     if not budget.affords(PROOFS + LABELS):
         return None
     budget.say(f"map of the feasible set; compiles for some {PROOFS + LABELS:.0f} s")
     d = problem.dimension
-    points = samples(problem.mpc, d) if x0s is None else x0s
+    points = sample_states(problem.mpc, d) if x0s is None else x0s
     fmap = map_points(problem, points, progress=budget.bar, deadline=budget.deadline)
     return fmap.refine(deadline=budget.deadline) if d <= 3 else fmap
 
@@ -207,7 +207,7 @@ def theorems(mpc: MPC, K: Reals | None = None) -> TerminalReport:
     return verify_terminal(mpc.system, mpc.Q, mpc.R, P, mpc.terminal_set, mpc.states, mpc.inputs, K)
 
 
-def samples(mpc: MPC, d: int) -> np.ndarray:
+def sample_states(mpc: MPC, d: int) -> np.ndarray:
     """Return states (B, d) over the bounding box of the feasible set, 3 % wider on each side."""
     edges = boundary(mpc, np.concatenate([np.eye(d), -np.eye(d)]))
     if not np.isfinite(edges.offsets).all():

@@ -1,4 +1,4 @@
-"""Critical regions and exact penalties: closed forms, tilings, KKT residuals, another solver."""
+"""Exact penalties: closed forms, regions against samples, another solver."""
 
 from dataclasses import replace
 
@@ -26,58 +26,6 @@ def one_step(q, r, u_max, rows=None):
         horizon=1, inputs=problems.symmetric(u_max), terminal_cost=q * np.eye(1),
         terminal_set=problems.symmetric(1.0) if rows is None else rows,
     )  # fmt: skip
-
-
-def octahedron(n=3, radius=0.3):
-    """{x: Σ|x_i| ≤ radius}; 2^(n−1) facets meet in each vertex."""
-    signs = np.stack(np.meshgrid(*[[1.0, -1.0]] * n), -1).reshape(-1, n)
-    return jm.Polytope(signs, np.full(len(signs), radius))
-
-
-def apex():
-    """Three states, three inputs: x_N sits on apexes of the terminal set for open sets of x_0."""
-    return jm.MPC(
-        system=jm.LinearSystem(0.9 * np.eye(3), np.diag([1.0, 0.5, 0.8])), Q=np.eye(3),
-        R=np.eye(3), horizon=1, states=problems.symmetric(1.0, 1.0, 1.0),
-        inputs=problems.symmetric(1.0, 1.5, 1.0), terminal_set=octahedron(),
-    )  # fmt: skip
-
-
-def duplicated():
-    """The lecture's problem with state rows twice, scaled, and a row that touches a corner."""
-    H = np.vstack([np.eye(2), -np.eye(2), 3 * np.eye(2), [[1.0, 1.0]]])
-    rows = jm.Polytope(H, np.array([1.0, 1, 1, 1, 3, 3, 2]))
-    return replace(problems.lecture(), states=rows, terminal_set=rows)
-
-
-def pair():
-    """Two lectures side by side: regions and volume are the products."""
-    a = problems.lecture()
-    both = lambda M: np.kron(np.eye(2), M)
-    return replace(
-        a, system=jm.LinearSystem(both(a.system.A), both(a.system.B)), Q=both(a.Q), R=both(a.R),
-        states=problems.symmetric(*[1.0] * 4), inputs=problems.symmetric(0.25, 0.25),
-        terminal_cost=both(a.terminal_cost), terminal_set=problems.symmetric(*[1.0] * 4),
-    )  # fmt: skip
-
-
-def kkt(mpc, found, count=100):
-    """Largest KKT residual of the regions' plans at random states of each region."""
-    c, random, worst = condensed_in_float64(mpc), np.random.default_rng(0), 0.0
-    for region in found.regions[:count]:
-        x = random.dirichlet(np.ones(len(region.vertices))) @ region.vertices
-        z, y = region.Z @ x + region.z0, np.zeros(len(c.C))
-        np.add.at(y, region.rows, region.L @ x + region.l0)
-        s = c.C @ z + c.D @ x + c.d
-        upper, lower = np.maximum(y, 0), np.maximum(-y, 0)
-        scale = 1 + np.abs(y).max()
-        worst = max(
-            worst, np.abs(c.P @ z + c.F @ x + c.f + c.C.T @ y).max() / scale,
-            (s - c.upper).max(), (c.lower - s).max(),
-            np.abs(upper[upper > 0] * (c.upper - s)[upper > 0]).max(initial=0.0) / scale,
-            np.abs(lower[lower > 0] * (s - c.lower)[lower > 0]).max(initial=0.0) / scale,
-        )  # fmt: skip
-    return worst
 
 
 def slack_by_osqp(mpc, x0, rho):
@@ -123,112 +71,6 @@ def slack_by_osqp(mpc, x0, rho):
     return answer.x[-count:].sum()
 
 
-class TestRegions:
-    @pytest.mark.parametrize(
-        ("mpc", "count", "area"),
-        [
-            (problems.lecture(), 15, 1043 / 400),
-            (problems.joint(20, None), 409, problems.AREA_JOINT),
-            (problems.joint_o_inf(5), None, None),
-            (problems.drifting(), None, None),
-            (problems.double_integrator(), None, problems.C_INF_DOUBLE_INTEGRATOR),
-            (problems.scalar(), None, 2.0),
-            (duplicated(), 15, 1043 / 400),
-            (apex(), None, None),
-            (pair(), 15 * 15, (1043 / 400) ** 2),
-            (replace(problems.lecture(), input_rate_limit=0.2), None, None),
-        ],
-        ids=["lecture", "joint", "joint O_inf", "drifting", "double", "scalar", "duplicated",
-             "apex", "pair", "rates"],
-    )  # fmt: skip
-    @pytest.mark.first(1)
-    def test_complete(self, mpc, count, area):
-        """The regions tile X_N, their number and volume are known, and their plans are optimal."""
-        found = critical_regions(mpc)
-        assert found.complete, found.reason
-        assert count is None or len(found) == count
-        if area is not None:
-            assert found.volume == pytest.approx(area, rel=1e-9)
-        assert kkt(mpc, found) < 1e-9
-
-    def test_dependent_rows(self):
-        """On the apexes four rows are active at once, three of them independent."""
-        found = critical_regions(apex())
-        degenerate = [region for region in found.regions if len(region.also_active)]
-        assert degenerate and all(len(region.rows) <= 3 for region in found.regions)
-
-    @pytest.mark.slow
-    def test_law(self):
-        """The first input is that of the solver, at random states in and out of X_N."""
-        mpc = problems.lecture()
-        x = np.random.default_rng(1).uniform(-1.1, 1.1, (300, 2))
-        plans = jm.solve_many(mpc, x, dtype="float64", chunk=300)
-        found = critical_regions(mpc)
-        solved = plans.status == Status.SOLVED
-        assert 100 < solved.sum() < 250
-        np.testing.assert_array_equal(found.find(x) >= 0, solved)
-        np.testing.assert_allclose(found.law(x)[solved], plans.inputs[solved, 0], atol=1e-8)
-        assert np.isnan(found.plan(x)[~solved]).all()
-        x[:2] = np.nan, np.inf
-        assert list(found.find(x[:2])) == [-1, -1]
-
-    def test_prestabilised(self):
-        """u_0 counts the prestabilising gain; the regions do not depend on it."""
-        mpc = problems.unstable(6)
-        plain = critical_regions(replace(mpc, prestabilise=False))
-        found = critical_regions(replace(mpc, prestabilise=True))
-        assert len(plain) == len(found) and found.complete
-        x = np.concatenate([region.vertices.mean(axis=0)[None] for region in found.regions])
-        np.testing.assert_allclose(found.law(x), plain.law(x), atol=1e-9)
-
-    def test_limit(self):
-        found = critical_regions(problems.lecture(), max_regions=4)
-        assert len(found) == 4 and not found.complete and "limit of 4" in found.reason
-        assert found.volume < 1043 / 400
-
-    def test_time_limit(self):
-        found = critical_regions(problems.joint(20), seconds=1e-9)
-        assert not found.complete and "stopped by the time limit" in found.reason
-        bound = exact_penalty(problems.joint(20), seconds=1e-9)
-        assert not bound.exact and bound.rho_bar >= 0
-
-    def test_missing_part_is_seen(self, monkeypatch):
-        """Completeness rests on volumes: a search that loses its way does not say so."""
-        monkeypatch.setattr("jaxmpc.explicit.region_search.RegionSearch.cross", lambda *_: None)
-        monkeypatch.setattr("jaxmpc.explicit.region_search.REPAIRS", 1)
-        found = critical_regions(problems.lecture())
-        assert not found.complete and "not found" in found.reason
-
-    def test_within(self):
-        """Without state limits X_N is unbounded; a box bounds what is looked at."""
-        mpc = replace(problems.lecture(), states=None, terminal_set=None)
-        with pytest.raises(ValueError, match="unbounded.*within"):
-            critical_regions(mpc)
-        found = critical_regions(mpc, within=problems.symmetric(2.0, 2.0))
-        assert found.complete and found.volume == pytest.approx(16.0)
-        assert kkt(mpc, found) < 1e-9
-
-    def test_errors(self):
-        mpc = problems.lecture()
-        nowhere = jm.Box(np.array([5.0, 5.0]), np.array([6.0, 6.0]))
-        line = jm.Box(np.array([-1.0, 0.0]), np.array([1.0, 0.0]))
-        for changed, message in [
-            (replace(mpc, terminal_set=nowhere), "empty"),
-            (replace(mpc, states=line), "flat"),
-            (replace(mpc, terminal_set=jm.Ellipsoid(np.eye(2), 0.5)), "ellipsoid"),
-            (replace(mpc, soft=(Soft(np.eye(2), upper=np.ones(2)),)), "soft"),
-        ]:
-            with pytest.raises(ValueError, match=message):
-                critical_regions(changed)
-        for limit in (0, 1.5, True):
-            with pytest.raises(ValueError, match="max_regions"):
-                critical_regions(mpc, max_regions=limit)
-        with pytest.raises(ValueError, match="within"):
-            critical_regions(mpc, within=np.ones(2))
-        with pytest.raises(ValueError, match="x0s: shape"):
-            critical_regions(mpc).law(np.zeros(2))
-
-
 class TestExactPenalty:
     @pytest.mark.parametrize("method", ["regions", "samples"])
     @pytest.mark.parametrize(("q", "r", "u_max"), [(1, 2, 1), (1, 5, 0.5), (3, 1, 1)])
@@ -252,9 +94,15 @@ class TestExactPenalty:
         assert ("lower bound" in found.sentence.split(",")[0]) is (method == "samples")
 
     @pytest.mark.parametrize(
-        "mpc", [problems.drifting(), problems.joint_o_inf(5), pair(), duplicated(), apex()],
-        ids=["drifting", "joint O_inf", "pair", "duplicated", "apex"],
-    )  # fmt: skip
+        "mpc",
+        [
+            pytest.param(problems.drifting(), id="drifting"),
+            pytest.param(problems.joint_o_inf(5), id="joint O_inf"),
+            pytest.param(problems.pair(), id="pair"),
+            pytest.param(problems.duplicated(), id="duplicated"),
+            pytest.param(problems.apex(), id="apex"),
+        ],
+    )
     @pytest.mark.first(1)
     def test_samples_reach_regions(self, mpc):
         exact = exact_penalty(mpc, method="regions")

@@ -10,13 +10,12 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.explicit.law import Law, RegionLaw
+from jaxmpc.explicit.law import RegionLaw
 from jaxmpc.explicit.regions import critical_regions
 from jaxmpc.feasible.labels import Labels
-from jaxmpc.feasible.plan_polytope import CenteredPolytope, projected
+from jaxmpc.feasible.plan_polytope import projected
 from jaxmpc.feasible.polytope import backward
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.mpc.problem import Soft
 from jaxmpc.recursion import (
     analysis,
     recursive_feasibility,
@@ -58,52 +57,8 @@ def check_counterexample(mpc, c) -> None:
 def check_optimal(mpc, c) -> None:
     """The plan costs no more than the best that another solver finds."""
     assert c.primal_residual < 1e-7 and c.dual_residual < 1e-7
-    u0 = least_distance(mpc, c.state)[0]
+    u0 = problems.least_distance(mpc, c.state)[0]
     np.testing.assert_allclose(c.inputs[0], u0, atol=1e-6)
-
-
-def least_distance(mpc, x):
-    """Optimal inputs (N, m) by non-negative least squares on rolled-out matrices."""
-    from scipy.optimize import nnls
-
-    N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
-    A, B = mpc.system.A, mpc.system.B
-    drift = np.zeros(n) if mpc.system.c is None else mpc.system.c
-    Phi, Gamma, phi = [np.eye(n)], [np.zeros((n, N * m))], [np.zeros(n)]
-    for k in range(N):
-        step = A @ Gamma[-1]
-        step[:, k * m : (k + 1) * m] += B
-        Phi.append(A @ Phi[-1])
-        Gamma.append(step)
-        phi.append(A @ phi[-1] + drift)
-    end = np.zeros((n, n)) if mpc.terminal_cost is None else mpc.terminal_cost
-    weights = [mpc.Q] * N + [end]
-    P = sum(G.T @ W @ G for G, W in zip(Gamma, weights, strict=True))
-    P = P + np.kron(np.eye(N), mpc.R)
-    free = [M @ x + d for M, d in zip(Phi, phi, strict=True)]
-    q = sum(G.T @ W @ v for G, W, v in zip(Gamma, weights, free, strict=True))
-    rows, bounds = [], []
-    sets = [(mpc.states, k) for k in range(1, N)] + [(mpc.terminal_set, N)]
-    for set_, k in sets:
-        H, lower, upper = (np.asarray(v) for v in set_.rows())
-        rows += [H @ Gamma[k], -H @ Gamma[k]]
-        bounds += [upper - H @ free[k], H @ free[k] - lower]
-    eye = np.eye(N * m)
-    rows += [eye, -eye]
-    bounds += [np.tile(mpc.inputs.upper, N), -np.tile(mpc.inputs.lower, N)]
-    G, h = np.vstack(rows), np.concatenate(bounds)
-    G, h = G[np.isfinite(h)], h[np.isfinite(h)]
-    factor = np.linalg.cholesky(P)
-    M = np.linalg.solve(factor, G.T).T
-    # min |y|², M y ≤ h + M L⁻¹q (Lawson & Hanson 1974, ch. 23).
-    shift = np.linalg.solve(factor, q)
-    right = h + M @ shift
-    if right.min() < 0:
-        E = -np.vstack([M.T, right / -right.min()])
-        y, _ = nnls(E, np.eye(len(E))[-1], maxiter=10_000)
-        r = E @ y - np.eye(len(E))[-1]
-        shift = shift - right.min() * r[:-1] / r[-1]
-    return -np.linalg.solve(factor.T, shift).reshape(N, m)
 
 
 class TestProofs:
@@ -248,64 +203,6 @@ class TestProofs:
         assert holds(settled(replace(mpc, horizon=4))) == (False, False, False)
 
 
-class TestLaw:
-    """The affine pieces and the projection that the ascent uses."""
-
-    @pytest.mark.parametrize(
-        "soft",
-        [
-            (),
-            pytest.param(
-                (Soft([[0.0, 1.0]], upper=[0.2], rho=2.0, quadratic=0.5),), marks=pytest.mark.slow
-            ),
-        ],
-    )
-    @pytest.mark.slow
-    def test_piece_predicts_the_plan_beside(self, soft):
-        mpc = replace(problems.lecture(0.25, 3), soft=soft)
-        random = np.random.default_rng(0)
-        affine = Law(mpc, np.zeros(2), 1024)
-        x = random.uniform(-1, 1, (100, 2)) * [0.9, 0.5]
-        plans = affine.plans(x)
-        pieces = [affine.piece(*pair) for pair in zip(x, plans.inputs, strict=True)]
-        beside = x + 1e-4 * random.standard_normal(x.shape)
-        after = affine.following(beside, affine.plans(beside).inputs[:, 0])
-        compared = 0
-        for piece, here, there in zip(pieces, beside, after, strict=True):
-            if piece is not None and np.all(piece.R @ here <= piece.r):
-                np.testing.assert_allclose(piece.E @ here + piece.e, there, atol=1e-7)
-                compared += 1
-        assert compared > 60
-
-    def test_plans_from_regions(self):
-        """They are those of another solver, optimal to rounding; outside of X_N there is none."""
-        mpc = problems.drifting()
-        law = RegionLaw(critical_regions(mpc), np.zeros(2), 64)
-        corners = np.concatenate([region.vertices for region in law.regions.regions])
-        states = np.random.default_rng(0).dirichlet(np.ones(len(corners)), 40) @ corners
-        plans = law.plans(np.vstack([states, [[9.0, 9.0]]]))
-        expected = [least_distance(mpc, x) for x in states]
-        np.testing.assert_allclose(plans.inputs[:-1], expected, atol=1e-8)
-        assert np.all(plans.status[:-1] == jm.Status.SOLVED)
-        assert max(plans.primal_residual[:-1].max(), plans.dual_residual[:-1].max()) < 1e-9
-        assert plans.status[-1] != jm.Status.SOLVED and np.isnan(plans.inputs[-1]).all()
-
-    def test_nearest_point_of_a_polytope(self):
-        square = CenteredPolytope(
-            np.zeros(2), np.vstack([np.eye(2), -np.eye(2)]), np.ones(4), np.zeros((0, 2))
-        )
-        points = np.array([[3.0, 0.5], [2.0, -5.0], [0.2, 0.3]])
-        near = [[1.0, 0.5], [1.0, -1.0], [0.2, 0.3]]
-        np.testing.assert_allclose(square.nearest(points), near, atol=1e-12)
-        np.testing.assert_allclose(square.beyond(points), [2.0, 4.0, -0.7], atol=1e-12)
-        np.testing.assert_array_equal(square.depths, np.ones(4))
-        # In other units of one coordinate the same facets are as far away.
-        unit = np.array([1.0, 1e-7])
-        thin = CenteredPolytope(np.zeros(2), square.normals, np.tile(unit, 2), np.zeros((0, 2)))
-        np.testing.assert_allclose(thin.beyond(points * unit), [2.0, 4.0, -0.7], atol=1e-12)
-        np.testing.assert_allclose(thin.nearest(points * unit) / unit, near, atol=1e-12)
-
-
 class TestReport:
     @pytest.mark.slow
     def test_lecture_loses_and_keeps(self):
@@ -383,7 +280,10 @@ class TestReport:
         corners = np.asarray(report.feasible_set.vertices())
         weights = np.random.default_rng(0).dirichlet(np.full(len(corners), 0.3), 150)
         beyond = [
-            (H @ (mpc.system.A @ x + mpc.system.B @ least_distance(mpc, x)[0]) / size - h).max()
+            (
+                H @ (mpc.system.A @ x + mpc.system.B @ problems.least_distance(mpc, x)[0]) / size
+                - h
+            ).max()
             for x in [*corners * (1 - 1e-9), *weights @ corners * (1 - 1e-9)]
         ]
         assert c.distance - 0.1 * c.distance < max(beyond) < c.distance + 1e-6
@@ -532,6 +432,7 @@ class TestSlow:
         assert "61 critical regions" in found.reasons[5].reason
         found = smallest_horizon(problems.lecture(0.25), 2)
         assert (found.horizon, found.strong) == (None, None)
+        assert str(found) == "none up to 2 is proved"
 
     def test_previous_input_is_part_of_the_state(self):
         mpc = replace(problems.lecture(), input_rate_limit=0.2)
