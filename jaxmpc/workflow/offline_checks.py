@@ -182,7 +182,7 @@ def _or_note(notes: dict[str, str], name: str, action: Callable[[], T]) -> T | N
 
 
 def mapped(problem: FeasibilityProblem, x0s: Reals | None, budget: Budget) -> FeasibleSetMap | None:
-    """Return the map of the states x0s, or of `sample_states`; None where there is no time for it."""
+    """Return the map of x0s, or of `sample_states`; None where there is no time for it."""
     if not budget.affords(PROOFS + LABELS):
         return None
     budget.say(f"map of the feasible set; compiles for some {PROOFS + LABELS:.0f} s")
