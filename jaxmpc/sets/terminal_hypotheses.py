@@ -1,6 +1,5 @@
 """The hypotheses under which a terminal set and cost make MPC recursively feasible and stable."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
@@ -19,7 +18,7 @@ from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.sets.interior import Flat, affine_hull, framed
 from jaxmpc.sets.invariant import contraction
 from jaxmpc.sets.lp import Program, extent, maximise
-from jaxmpc.sets.one_step import one_step
+from jaxmpc.sets.one_step import OneStep, one_step
 from jaxmpc.sets.polytope import Polytope
 from jaxmpc.systems.riccati import least_reached, lqr
 from jaxmpc.systems.system import LinearSystem, host_matrices
@@ -29,7 +28,6 @@ from jaxmpc.systems.system import LinearSystem, host_matrices
 _TOUCH = 1e-9
 _EXACT_PRODUCTS = 200_000  # a certificate with no more products is also evaluated in rationals
 _DETECTABLE = 1e-10  # as in `lqr`
-_FREE_END = "terminal cost where x_N is free"
 
 
 @dataclass(frozen=True)
@@ -75,27 +73,31 @@ class TerminalReport:
 
     @property
     def recursive_feasibility(self) -> bool | None:
-        """Return whether Theorem 1 applies: all its hypotheses hold (None: some are undecided, none
-        fails)."""
-        return _all(check.holds for check in self.checks if 1 in check.theorems)
+        """Return whether Theorem 1 applies: True if all its hypotheses hold, False if one fails,
+        None if some are undecided."""
+        return self._applies(1)
 
     @property
     def stability(self) -> bool | None:
-        """Return whether Theorem 3 applies: all its hypotheses hold (None: some are undecided, none
-        fails)."""
-        return _all(check.holds for check in self.checks if 3 in check.theorems)
+        """Return whether Theorem 3 applies, as `recursive_feasibility` does."""
+        return self._applies(3)
+
+    def _applies(self, theorem: int) -> bool | None:
+        answers = [check.holds for check in self.checks if theorem in check.theorems]
+        return False if False in answers else None if None in answers else True
+
+    def __repr__(self) -> str:
+        """Return what the checks say of each theorem."""
+        lines = []
+        for number, title in ((1, "recursive feasibility"), (3, "asymptotic stability")):
+            missing = [c.name for c in self.checks if number in c.theorems and not c.holds]
+            answer = f"does not apply: {', '.join(missing)}" if missing else "applies"
+            lines.append(f"Theorem {number} ({title}) {answer}.")
+        return "\n".join(lines)
 
     def __str__(self) -> str:
-        """Return the answers to both theorems, and a table of the checks."""
-        lines = []
-        for number, title, holds in (
-            (1, "recursive feasibility", self.recursive_feasibility),
-            (3, "asymptotic stability", self.stability),
-        ):
-            missing = [c.name for c in self.checks if number in c.theorems and not c.holds]
-            answer = "applies" if holds else f"does not apply: {', '.join(missing)}"
-            lines.append(f"Theorem {number} ({title}) {answer}.")
-        words = {True: "yes", False: "NO", None: "?"}
+        """Return what the checks say of each theorem, and a table of them."""
+        words, lines = {True: "yes", False: "NO", None: "?"}, [repr(self)]
         width = max(len(check.name) for check in self.checks)
         for check in self.checks:
             margin = "" if check.margin is None else f"{check.margin:.6g} {check.unit}"
@@ -152,27 +154,32 @@ def verify_terminal(
     """
     require_kind("system", system, LinearSystem)
     system.validate()
-    n, m = system.n, system.m
     A, B, c = host_matrices(system)
-    Q, R = _symmetric("Q", Q, n), _symmetric("R", R, m)
-    X = _Rows(*unit_half_spaces("states", states, n))
-    U = _Rows(*unit_half_spaces("inputs", inputs, m))
+    Q, R = _symmetric("Q", Q, system.n), _symmetric("R", R, system.m)
+    X = _Rows(*unit_half_spaces("states", states, system.n))
+    U = _Rows(*unit_half_spaces("inputs", inputs, system.m))
     gain, P, no_law = _gain_and_cost(system, Q, R, K, terminal_cost)
-    W = disturbance_set(disturbance, n)
-    X_f, role = _terminal_set(terminal_set, X, n)
-    loop = None if gain is None else _Loop(A, B, gain, c, W)
-    if loop is None:
+    W = disturbance_set(disturbance, system.n)
+    X_f = X if terminal_set is None else _terminal_set(terminal_set, system.n)
+    role = " (there is no terminal set: X in its role, at horizon N - 1)"
+    role = role if terminal_set is None else ""
+    name = "inputs of K admissible"
+    if gain is None:
+        loop = None
         kept = _Invariance(Check("invariance under K", None, None, "", no_law))
-        admissible = Check("inputs of K admissible", None, None, "", no_law)
+        admissible = Check(name, None, None, "", no_law)
     else:
+        loop = _Loop(A, B, gain, c, W)
         kept = X_f.invariance(loop)
-        admissible = _within("inputs of K admissible", system.input_labels, U, loop.K, X_f)
-    inside = _within("terminal set within states", system.state_labels, X, np.eye(n), X_f, role)
+        admissible = _within(name, system.input_labels, U, gain, X_f)
+    name = "terminal set within states"
+    inside = _within(name, system.state_labels, X, np.eye(system.n), X_f, role)
+    step = one_step(system, inputs, disturbance)
     checks = [
         _compact("states", "X", X),
         _compact("inputs", "U", U),
         replace(inside, theorems=(1, 3)),
-        _control_invariance(system, X_f, inputs, disturbance, kept.check, admissible, role),
+        _control_invariance(step, X_f, kept.check, admissible, role),
         kept.check,
         admissible,
         _lyapunov(loop, P, Q, R, no_law),
@@ -181,34 +188,32 @@ def verify_terminal(
         X_f.origin_inside(),
     ]
     if terminal_set is None:
-        sentence = (
-            "x_N may leave X, where the Lyapunov inequality and K in U do not hold: Theorem 3 "
-            "requires a terminal set."
-        )
-        checks.append(Check(_FREE_END, None, None, "", sentence))
+        where = "x_N may leave X, where the Lyapunov inequality and K in U do not hold"
+        sentence = f"{where}: Theorem 3 requires a terminal set."
+        checks.append(Check("terminal cost where x_N is free", None, None, "", sentence))
     return TerminalReport(tuple(checks), gain, kept.certificate, kept.factor, kept.exact_factor)
 
 
 def _gain_and_cost(
     system: LinearSystem, Q: np.ndarray, R: np.ndarray, K: Reals | None, P: Reals | None
 ) -> tuple[np.ndarray | None, np.ndarray | None, str]:
-    """Return K and P, those of `lqr` in place of None, and why there are none where it fails."""
+    """Return K and P, those of `lqr` in place of None, and why one is missing where that fails."""
+    gain = cost = None
+    trouble = ""
     if K is not None:
         require_shape("K", K, (system.m, system.n), "Give u = Kx one row an input")
         require_finite("K", K)
-        K = host_array("K", K)
-    P = None if P is None else _symmetric("terminal_cost", P, system.n)
-    if K is not None and P is not None:
-        return K, P, ""
-    try:
-        law = lqr(system, Q, R)
-    except ValueError as error:
-        return K, P, f"lqr has no answer ({error})"
-    return (
-        host_array("K", law.K) if K is None else K,
-        host_array("P", law.P) if P is None else P,
-        "",
-    )
+        gain = host_array("K", K)
+    if P is not None:
+        cost = _symmetric("terminal_cost", P, system.n)
+    if gain is None or cost is None:
+        try:
+            law = lqr(system, Q, R)
+            gain = host_array("K", law.K) if gain is None else gain
+            cost = host_array("P", law.P) if cost is None else cost
+        except ValueError as error:
+            trouble = f"lqr has no answer ({error})"
+    return gain, cost, trouble
 
 
 class _Loop(NamedTuple):
@@ -383,36 +388,30 @@ def _origin_at(depth: float) -> Check:
     return Check("origin inside terminal set", depth > 0, depth, "distance in x", sentence)
 
 
-def _terminal_set(
-    given: Box | Polytope | Ellipsoid | None, X: _Rows, n: int
-) -> tuple[_Rows | _Ellipse, str]:
-    """Return the terminal set, X in place of None, and what sentences say of that."""
-    if given is None:
-        return X, " (there is no terminal set: X in its role, at horizon N - 1)"
-    if isinstance(given, Ellipsoid):
-        given.validate("terminal_set", n)
-        P = host_array("terminal_set.P", given.P)
-        level = float(host_array("terminal_set.level", given.level))
-        return _Ellipse((P + P.T) / 2, level), ""
-    return _Rows(*unit_half_spaces("terminal_set", given, n)), ""
+def _terminal_set(given: Box | Polytope | Ellipsoid, n: int) -> _Rows | _Ellipse:
+    """Return a terminal set in R^n, checked."""
+    if not isinstance(given, Ellipsoid):
+        return _Rows(*unit_half_spaces("terminal_set", given, n))
+    given.validate("terminal_set", n)
+    P = host_array("terminal_set.P", given.P)
+    return _Ellipse((P + P.T) / 2, float(host_array("terminal_set.level", given.level)))
 
 
 def _compact(name: str, letter: str, limits: _Rows) -> Check:
     """Check that a set of linear rows is bounded."""
-    reach = limits.reach
-    holds = bool(np.isfinite(reach).all())
-    sentence = f"{letter} is convex, as every set of linear rows is, and "
-    if holds:
-        sentence += f"bounded: no coordinate exceeds {reach.max() / (1 + 1e-6):.6g}."
+    top = float(limits.reach.max() / (1 + 1e-6))
+    if np.isfinite(top):
+        found = f"bounded: no coordinate exceeds {top:.6g}."
     else:
-        free = ", ".join(str(i + 1) for i in np.flatnonzero(np.isinf(reach)))
-        sentence += (
+        free = ", ".join(str(i + 1) for i in np.flatnonzero(np.isinf(limits.reach)))
+        found = (
             f"unbounded in coordinate {free}. The theorem as stated does not apply; its shifted "
             "plan uses convexity and compactness nowhere, so the conclusion stands if an optimal "
             "plan exists (it does for Q >= 0, R > 0, P >= 0)."
         )
-    margin = float(reach.max() / (1 + 1e-6)) if holds else -np.inf
-    return Check(f"{name} compact", holds, margin, "largest coordinate", sentence, (1,))
+        top = -np.inf
+    sentence = f"{letter} is convex, as every set of linear rows is, and {found}"
+    return Check(f"{name} compact", top > -np.inf, top, "largest coordinate", sentence, (1,))
 
 
 def _within(
@@ -443,15 +442,9 @@ def _within(
 
 
 def _control_invariance(
-    system: LinearSystem,
-    X_f: _Rows | _Ellipse,
-    inputs: Box | Polytope | None,
-    disturbance: Box | Polytope | None,
-    kept: Check,
-    admissible: Check,
-    role: str,
+    step: OneStep, X_f: _Rows | _Ellipse, kept: Check, admissible: Check, role: str
 ) -> Check:
-    """Check control invariance of X_f: by the law K, or by one step of the predecessor."""
+    """Check control invariance of X_f: by the law K, or by one step backwards."""
 
     def check(holds: bool | None, margin: float | None, sentence: str) -> Check:
         return Check("control invariance", holds, margin, "of the extent", sentence, (1,))
@@ -472,7 +465,7 @@ def _control_invariance(
         sentence = f"K does not show it, and the set is unbounded or flat{role}: not decided."
         return check(None, None, sentence)
     body = Polytope(X_f.G, X_f.g)
-    before = one_step(system, inputs, disturbance).back(body)
+    before = step.back(body)
     if before.is_empty():
         sentence = f"From no state can an admissible input reach the terminal set{role}."
         return check(False, -np.inf, sentence)
@@ -576,12 +569,6 @@ def _symmetric(argument: str, value: Reals, n: int) -> np.ndarray:
     if np.abs(matrix - matrix.T).max() > 1e-6 * np.abs(matrix).max():
         fail(argument, "is not symmetric", f"Use ({argument} + {argument}.T) / 2")
     return (matrix + matrix.T) / 2
-
-
-def _all(answers: Iterable[bool | None]) -> bool | None:
-    """Return False if any answer is False, else None if any is None, else True."""
-    answers = list(answers)
-    return False if False in answers else None if None in answers else True
 
 
 # --- Rational arithmetic: arrays of Fractions -------------------------------------------
