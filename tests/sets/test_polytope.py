@@ -1,4 +1,4 @@
-"""Images, projections, sums and differences of sets, ellipsoids and limits.
+"""Polytopes: vertices, rows, volumes, affine maps, projections, sums and differences.
 
 The answers are closed forms, polygons computed by hand, products whose factors are known, and
 support functions taken from LPs over the sets' definitions.
@@ -10,19 +10,237 @@ import math
 import jax
 import numpy as np
 import pytest
-import scipy
 from scipy.optimize import linprog
 
-import jaxmpc.sets.geometry as geometry
-from jaxmpc import LinearSystem
-from jaxmpc.sets.box import Box
+from jaxmpc import Box, Polytope
 from jaxmpc.sets.ellipsoid import Ellipsoid
-from jaxmpc.sets.geometry import factors, irredundant
-from jaxmpc.sets.limits import joint_limits, output_limits
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.geometry import irredundant as _irredundant
 
 INF = np.inf
+
+
+# The maximal control-invariant set of DOUBLE, exact; half of it, the rest is its mirror image.
+C_INF_HALF = [
+    [-5, -1], [-9 / 2, -3 / 2], [-7 / 2, -2], [-2, -5 / 2], [0, -3], [5 / 2, -7 / 2], [5, -47 / 12],
+]  # fmt: skip
+
+
+C_INF = np.array(C_INF_HALF + [[-x, -y] for x, y in C_INF_HALF])
+
+
+def sorted_rows(points):
+    points = np.round(np.asarray(points, dtype=float), 9) + 0.0
+    return points[np.lexsort(points.T)]
+
+
+def assert_same_points(left, right, atol=1e-9):
+    assert np.shape(left) == np.shape(right)
+    np.testing.assert_allclose(sorted_rows(left), sorted_rows(right), atol=atol)
+
+
+def cube(n, half=1.0):
+    return Polytope(np.vstack([np.eye(n), -np.eye(n)]), np.full(2 * n, half))
+
+
+def test_polytope_basics():
+    triangle = Polytope([[-1, 0], [0, -2], [1, 1], [1, 0]], [0, 0, 1, INF])
+    triangle.validate("terminal_set", 2)
+    assert triangle.dimension == 2
+    points = np.array([[0.2, 0.2], [0.6, 0.6], [-0.1, 0.2], [np.nan, 0]])
+    np.testing.assert_array_equal(jax.vmap(triangle.contains)(points), [1, 0, 0, 0])
+    assert triangle.contains([0.6, 0.6], tolerance=0.21)
+    np.testing.assert_allclose(triangle.vertices(), [[0, 0], [1, 0], [0, 1]], atol=1e-14)
+    assert triangle.volume() == pytest.approx(0.5, abs=1e-14)
+    centre, radius = triangle.chebyshev()
+    assert radius == pytest.approx(1 / (2 + math.sqrt(2)), abs=1e-14)
+    np.testing.assert_allclose(centre, [radius, radius], atol=1e-14)
+    assert triangle.support([1, 3]) == pytest.approx(3, abs=1e-14)
+    assert Polytope([[1, 0]], [1]).support([0, 1]) == INF
+    assert Polytope([[1, 0]], [1]).support([2, 0]) == pytest.approx(2)
+    everything = Box([-INF, -INF], [INF, INF]).to_polytope()
+    everything.validate("states", 2)
+    assert everything.support([0, 1]) == INF and everything.contains([1e9, 0])
+    H, lower, upper = triangle.rows()
+    assert np.all(lower == -INF) and H.shape == (4, 2)
+    np.testing.assert_array_equal(upper, triangle.h)
+
+
+def test_polytope_of_exact_vertices():
+    polytope = Polytope.from_points(np.vstack([C_INF, [[0, 0], [1, 1]]]))
+    assert polytope.H.shape == (14, 2)
+    np.testing.assert_allclose(np.linalg.norm(polytope.H, axis=1), 1, atol=1e-15)
+    assert polytope.volume() == pytest.approx(1375 / 24, rel=1e-13)
+    vertices = polytope.vertices()
+    start = int(np.argmin(np.linalg.norm(vertices - C_INF[0], axis=1)))
+    np.testing.assert_allclose(np.roll(vertices, -start, axis=0), C_INF, atol=1e-12)
+    for d in np.random.default_rng(0).standard_normal((5, 2)):
+        assert polytope.support(d) == pytest.approx((C_INF @ d).max(), abs=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_round_trips(n):
+    rng = np.random.default_rng(n)
+    simplex = np.vstack([np.zeros(n), np.eye(n)])
+    assert Polytope.from_points(simplex).volume() == pytest.approx(1 / math.factorial(n))
+    corners = np.array(list(itertools.product([-1.0, 1.0], repeat=n)))
+    box, cross = Polytope.from_points(corners), Polytope(corners, np.ones(2**n))
+    assert box.H.shape == (2 * n, n)
+    assert_same_points(box.vertices(), corners)
+    assert box.volume() == pytest.approx(2**n, rel=1e-13)
+    assert_same_points(cross.vertices(), np.vstack([np.eye(n), -np.eye(n)]))
+    assert cross.volume() == pytest.approx(2**n / math.factorial(n), rel=1e-13)
+    points = rng.standard_normal((30, n))
+    hull = Polytope.from_points(points)
+    assert (points @ hull.H.T - hull.h).max() <= 1e-12
+    vertices = hull.vertices()
+    again = Polytope.from_points(vertices)
+    assert_same_points(np.c_[again.H, again.h], np.c_[hull.H, hull.h])
+    # An affine image: vertices move along, the volume scales by the determinant.
+    T, shift = rng.standard_normal((n, n)) + 3 * np.eye(n), rng.standard_normal(n)
+    H = hull.H @ np.linalg.inv(T)
+    image = Polytope(H, hull.h + H @ shift)
+    assert_same_points(image.vertices(), vertices @ T.T + shift)
+    assert image.volume() == pytest.approx(hull.volume() * abs(np.linalg.det(T)), rel=1e-11)
+
+
+def test_scales_and_units_do_not_matter():
+    lower, upper = np.array([-1e-4, -2e3, 1000.0]), np.array([2e-4, 3e3, 1001.0])
+    box = Box(lower, upper)
+    polytope = box.to_polytope()
+    assert polytope.volume() == pytest.approx(1.5, rel=1e-11)
+    scale = upper - lower
+    assert_same_points((polytope.vertices() - lower) / scale, (box.vertices() - lower) / scale)
+    touching = Polytope([[1, 0], [-1, 0], [0, 1], [0, -1], [-1, -1]], [1, 1e-17, 1e3, 1e-17, 0])
+    assert touching.volume() == pytest.approx(1e3, rel=1e-12)
+    tiny = cube(2, 1e-8)
+    assert tiny.volume() == pytest.approx(4e-16, rel=1e-12)
+    assert tiny.support([1, 1]) == pytest.approx(2e-8, rel=1e-12)
+
+
+def test_intersect():
+    square = cube(2)
+    shifted = square.intersect(Box([0, -INF], [5, 0.5]))
+    assert shifted.H.shape == (7, 2)
+    assert shifted.volume() == pytest.approx(1.5, abs=1e-14)
+    assert shifted.reduce().H.shape == (4, 2)
+    diamond = Polytope(np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]), 1.5 * np.ones(4))
+    assert square.intersect(diamond).volume() == pytest.approx(4 - 4 * 0.125, abs=1e-13)
+    with pytest.raises(ValueError, match="other: has dimension 3 where 2"):
+        square.intersect(cube(3))
+    with pytest.raises(ValueError, match="other: list"):
+        square.intersect([1, 2])
+
+
+def test_reduce_thirty_thousand_tangents_of_a_circle():
+    rng = np.random.default_rng(0)
+    angles = rng.uniform(0, 2 * np.pi, 30_000)
+    H = np.column_stack([np.cos(angles), np.sin(angles)])
+    gaps = np.diff(np.sort(angles), append=angles.min() + 2 * np.pi)
+    area = np.tan(gaps / 2).sum()  # each gap adds two triangles of height 1
+    reduced = Polytope(3 * H, 3 * np.ones(len(H))).reduce()
+    assert 29_900 <= len(reduced.H) <= 30_000  # neighbours closer than 1e-6 rad merge
+    np.testing.assert_allclose(np.linalg.norm(reduced.H, axis=1), 1, atol=1e-14)
+    vertices = reduced.vertices()
+    x, y = vertices.T
+    assert (x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2 == pytest.approx(area, abs=1e-10)
+    assert (H[::30] @ vertices.T).max() <= 1 + 1e-11
+
+
+def test_reduce_near_duplicates():
+    rng = np.random.default_rng(1)
+    angles = np.arange(5000) * 2 * np.pi / 5000
+    H = np.column_stack([np.cos(angles), np.sin(angles)])
+    copies = [H + 1e-14 * rng.standard_normal(H.shape) for _ in range(3)]
+    reduced = Polytope(np.vstack(copies), np.ones(3 * len(H))).reduce()
+    assert len(reduced.H) == 5000
+    assert reduced.volume() == pytest.approx(5000 * np.tan(np.pi / 5000), abs=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 6, 7])
+def test_reduce_drops_copies_and_rows_that_touch(n):
+    rng = np.random.default_rng(n)
+    touching = rng.standard_normal((20, n))  # rows a'x <= |a|_1 touch the cube in a corner
+    outside = rng.standard_normal((20, n))
+    H = np.vstack([touching, 5 * np.eye(n), -np.eye(n), outside, np.zeros((1, n)), np.eye(n)])
+    h = np.abs(H).sum(axis=1) + np.r_[np.zeros(20 + 2 * n), np.ones(21), 1e-14 * np.ones(n)]
+    reduced = Polytope(H, h).reduce()
+    assert_same_points(np.c_[reduced.H, reduced.h], np.c_[cube(n).H, cube(n).h])
+
+
+@pytest.mark.parametrize("n", [2, 3, 5])
+def test_duality_and_linear_programs_agree(n):
+    H = np.random.default_rng(n).standard_normal((40, n))
+    np.testing.assert_array_equal(
+        Polytope(H, np.ones(40)).reduce().H.shape[0], len(_irredundant(H))
+    )
+
+
+@pytest.mark.parametrize(
+    ("polytope", "message"),
+    [
+        (Polytope([[1, 0], [-1, 0]], [0, -1]), "terminal_set: is empty"),
+        (Polytope([[0, 0]], [-1]), "terminal_set: is empty"),
+        (Polytope([[1, 0]], [-INF]), "terminal_set: is empty"),
+        (Polytope([[1, np.nan]], [1]), "terminal_set.H: holds"),
+        (Polytope([[1, 0]], [np.nan]), "terminal_set.h: holds NaN"),
+        (Polytope([[1, 0]], [1, 2]), "terminal_set.h: shape"),
+        (Polytope([1, 0], [1]), "terminal_set.H: shape"),
+        (Polytope([[1, 0, 0]], [1]), "terminal_set: has dimension 3 where 2"),
+    ],
+)
+def test_polytope_errors(polytope, message):
+    with pytest.raises(ValueError, match=message):
+        polytope.validate("terminal_set", 2)
+
+
+@pytest.mark.parametrize("method", ["vertices", "volume", "reduce"])
+@pytest.mark.parametrize(
+    ("H", "h", "message"),
+    [
+        ([[1, 0], [-1, 0], [0, 1], [0, -1]], [1, -1, 1, 1], "Polytope: is flat"),
+        ([[1, 0], [-1, 0], [0, 1], [0, -1]], [1, -2, 1, 1], "Polytope: is empty"),
+        ([[1, 0], [-1, 0]], [1, 1], "Polytope: is unbounded"),
+        ([[1, 0], [-1, 0], [0, 1]], [1, 1, 1], "Polytope: is unbounded"),
+        ([[1, 0]], [1], "Polytope: is unbounded"),
+        ([[1]], [1], "Polytope: is unbounded"),
+        ([[1], [-1]], [1, -1], "Polytope: is flat"),
+        ([[1], [-1]], [1, -1.1], "Polytope: is empty"),
+        (np.vstack([np.eye(8), -np.eye(8)[1:]]), np.ones(15), "Polytope: is unbounded"),
+    ],
+)
+def test_polytope_degenerate(method, H, h, message):
+    with pytest.raises(ValueError, match=message):
+        getattr(Polytope(H, h), method)()
+
+
+def test_polytope_errors_in_use():
+    empty, flat = Polytope([[1], [-1]], [0, -1]), Polytope([[1], [-1]], [1, -1])
+    flat.validate("set")
+    assert flat.chebyshev()[1] == pytest.approx(0, abs=1e-12)
+    for call in (empty.chebyshev, lambda: empty.support([1.0])):
+        with pytest.raises(ValueError, match="Polytope: is empty"):
+            call()
+    with pytest.raises(ValueError, match="arbitrarily large"):
+        Polytope([[1, 0]], [1]).chebyshev()
+    with pytest.raises(ValueError, match="x: shape"):
+        cube(2).contains(np.zeros(3))
+    with pytest.raises(ValueError, match="d: holds NaN"):
+        cube(2).support([np.nan, 0])
+    with pytest.raises(ValueError, match="Polytope.h: shape"):
+        Polytope(np.eye(2), [1]).reduce()
+    for points, message in [
+        ([[0, 0], [1, 1], [2, 2]], "points: lie in a hyperplane"),
+        ([[1], [1]], "points: lie in a hyperplane"),
+        ([1, 2], "points: shape"),
+        ([[np.nan], [1]], "points: holds NaN"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            Polytope.from_points(points)
+
+
 TRIANGLE = Polytope([[-1, 0], [0, -1], [1, 1]], [0, 0, 1], ("x >= 0", "y >= 0", "x + y <= 1"))
+
+
 SQUARE = Polytope([[1, 0], [-1, 0], [0, 1], [0, -1]], [1, 1, 1, 1])
 
 
@@ -47,9 +265,6 @@ def unimodular(rng, n):
     inverse = np.round(np.linalg.inv(T))
     np.testing.assert_array_equal(T @ inverse, np.eye(n))
     return T, inverse
-
-
-# --- Affine maps ------------------------------------------------------------------------
 
 
 def test_image_of_polygons_by_hand():
@@ -88,9 +303,6 @@ def test_preimage_keeps_rows_and_works_unbounded():
     np.testing.assert_array_equal(pulled.h, [1.5, INF])
     assert pulled.labels == ("a", "b") and pulled.support([1, 1, 0]) == 1.5
     assert Polytope([[1, 0]], [-1]).preimage([[0.0], [1.0]]).is_empty()
-
-
-# --- Projection -------------------------------------------------------------------------
 
 
 def test_projection_by_hand():
@@ -188,63 +400,6 @@ def test_unbounded_is_not_called_empty():
     assert polytope.support(d) == INF and not polytope.is_empty()
 
 
-# --- Redundant rows ---------------------------------------------------------------------
-
-
-def test_factors_find_a_hidden_product():
-    rng = np.random.default_rng(0)
-    T, inverse = unimodular(rng, 7)
-    blocks = [rng.standard_normal((rows, n)) for rows, n in ((6, 2), (9, 3), (2, 1), (2, 1))]
-    Y = scipy.linalg.block_diag(*blocks) @ inverse
-    parts, S = factors(Y)
-    assert sorted((len(rows), Z.shape[1]) for rows, Z in parts) == [(2, 1), (2, 1), (6, 2), (9, 3)]
-    points = rng.standard_normal((50, 7))
-    for rows, Z in parts:  # Z t is Y x, for t some entries of S x
-        start = np.linalg.lstsq(Z, (points @ Y[rows].T).T, rcond=None)
-        np.testing.assert_allclose(Z @ start[0], (points @ Y[rows].T).T, atol=1e-10)
-    assert S.shape == (7, 7)
-    bridge = np.vstack([Y, rng.standard_normal(7)])  # one row that contains all coordinates
-    assert len(factors(bridge)[0]) == 1
-    assert factors(np.eye(3)[:2])[1].shape == (2, 3)
-
-
-@pytest.mark.parametrize("n", [2, 3, 5, 6])
-def test_hulls_and_programs_find_the_same_rows(n, monkeypatch):
-    rng = np.random.default_rng(n)
-    Y = rng.standard_normal((60, n)) * rng.uniform(0.3, 1, (60, 1))
-    Y = np.vstack([Y, 0.5 * Y[:10], Y[:10], 0.5 * (Y[10:20] + Y[20:30])])  # all redundant
-    hull = irredundant(Y)
-    monkeypatch.setattr(geometry, "_HULL_DIMENSIONS", 1)
-    programs = irredundant(Y)
-    np.testing.assert_array_equal(hull, programs)
-    np.testing.assert_array_equal(irredundant(Y, known=hull), programs)
-    assert hull.max() < 60
-    unbounded = Y[Y[:, 0] > 0]
-    needed = []  # by definition: over the set of the others its maximum exceeds 1
-    for i, row in enumerate(unbounded):
-        others = [j for j, other in enumerate(unbounded) if j < i or not np.allclose(other, row)]
-        ones = np.ones(len(others))
-        top = linprog(-row, A_ub=unbounded[others], b_ub=ones, bounds=(None, None))
-        if top.status == 3 or -top.fun > 1 + 1e-9:
-            needed.append(i)
-    np.testing.assert_array_equal(irredundant(unbounded), needed)
-    monkeypatch.undo()
-    np.testing.assert_array_equal(irredundant(unbounded), needed)
-
-
-def test_reduce_in_twelve_dimensions():
-    rng = np.random.default_rng(0)
-    # 100 rows on a sphere, all irredundant, and 300 inside their polar hull.
-    Y = rng.standard_normal((100, 12))
-    Y /= np.linalg.norm(Y, axis=1)[:, None]
-    weights = rng.dirichlet(np.ones(4), 300)
-    inside = np.einsum("ij,ijk->ik", weights, Y[rng.integers(0, 100, (300, 4))]) * 0.999
-    order = rng.permutation(400)
-    rows = np.vstack([Y, inside])[order]
-    reduced = Polytope(rows, np.ones(400), tuple(map(str, order))).reduce()
-    assert sorted(map(int, reduced.labels)) == list(range(100))
-
-
 def test_labels_follow_their_rows():
     twice = TRIANGLE.intersect(Box([0.25, -INF], [INF, INF])).intersect(TRIANGLE)
     assert twice.labels == TRIANGLE.labels + ("",) + TRIANGLE.labels
@@ -255,9 +410,6 @@ def test_labels_follow_their_rows():
     for labels, message in [(("a",), "labels: 1 entries for 3"), (["a"] * 3, "labels: .* tuple")]:
         with pytest.raises(ValueError, match=message):
             Polytope(TRIANGLE.H, TRIANGLE.h, labels).validate("states")
-
-
-# --- Sums and differences ---------------------------------------------------------------
 
 
 def test_minkowski_sums_by_hand():
@@ -365,126 +517,5 @@ def test_subsets_scales_and_box_intersections():
     ],
 )
 def test_set_operations_errors(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
-
-
-# --- Ellipsoids -------------------------------------------------------------------------
-
-
-def test_ellipsoid_against_closed_forms_and_sampling():
-    rng = np.random.default_rng(0)
-    axes = Ellipsoid(np.diag([0.25, 4.0]), 9.0)  # half-axes 6 and 1.5
-    axes.validate("terminal_set", 2)
-    assert axes.dimension == 2 and axes.volume() == pytest.approx(9 * math.pi, rel=1e-14)
-    for n, unit in ((1, 2.0), (2, math.pi), (3, 4 / 3 * math.pi), (4, math.pi**2 / 2)):
-        assert Ellipsoid(np.eye(n), 1.0).volume() == pytest.approx(unit, rel=1e-14)
-    root = rng.standard_normal((3, 3))
-    P = root @ root.T + 0.1 * np.eye(3)
-    ellipsoid = Ellipsoid(P, 2.0)
-    box = ellipsoid.bounding_box()
-    points = rng.uniform(box.lower, box.upper, (400_000, 3))
-    inside = np.einsum("ki,ij,kj->k", points, P, points) <= 2
-    assert inside.mean() * box.volume() == pytest.approx(ellipsoid.volume(), rel=0.02)
-    # x = sqrt(2) L'^-1 w over the unit sphere: the boundary.
-    sphere = rng.standard_normal((200_000, 3))
-    sphere /= np.linalg.norm(sphere, axis=1)[:, None]
-    boundary = math.sqrt(2) * np.linalg.solve(np.linalg.cholesky(P).T, sphere.T).T
-    d = rng.standard_normal(3)
-    with jax.enable_x64(True):
-        support = float(ellipsoid.support(d))
-    assert (boundary @ d).max() == pytest.approx(support, rel=1e-3)
-    assert (boundary @ d).max() <= support
-    np.testing.assert_allclose(box.upper, np.abs(boundary).max(axis=0), rtol=1e-3)
-    contains = jax.vmap(ellipsoid.contains)
-    assert contains(0.999 * boundary[:9]).all() and not contains(1.001 * boundary[:9]).any()
-    assert ellipsoid.contains(boundary[0] * 1.001, tolerance=0.01)
-
-
-def test_ellipse_boundary():
-    P, level = np.array([[3.0, 1.0], [1.0, 2.0]]), 5.0
-    points = Ellipsoid(P, level).boundary(1000)
-    np.testing.assert_allclose(np.einsum("ki,ij,kj->k", points, P, points), level, rtol=1e-13)
-    x, y = points.T
-    area = (x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2  # > 0: counter-clockwise
-    assert area == pytest.approx(Ellipsoid(P, level).volume(), rel=1e-5)
-    with pytest.raises(ValueError, match="Ellipsoid: has dimension 3"):
-        Ellipsoid(np.eye(3), 1.0).boundary()
-
-
-@pytest.mark.parametrize(
-    ("ellipsoid", "message"),
-    [
-        (Ellipsoid(np.ones((2, 3)), 1.0), r"X_f.P: shape \(2, 3\) is not \(n, n\)"),
-        (Ellipsoid([[1, 2], [0, 1]], 1.0), "X_f.P: is not symmetric"),
-        (Ellipsoid([[1, 2], [2, 1]], 1.0), "X_f.P: is not positive definite"),
-        (Ellipsoid([[1, np.nan], [np.nan, 1]], 1.0), "X_f.P: holds NaN"),
-        (Ellipsoid(np.eye(2), 0.0), "X_f.level: 0 is not a positive"),
-        (Ellipsoid(np.eye(2), INF), "X_f.level: inf is not"),
-        (Ellipsoid(np.eye(2), [1.0]), r"X_f.level: shape \(1,\)"),
-        (Ellipsoid(np.eye(3), 1.0), "X_f: has dimension 3 where 2"),
-    ],
-)
-def test_ellipsoid_errors(ellipsoid, message):
-    with pytest.raises(ValueError, match=message):
-        ellipsoid.validate("X_f", 2)
-
-
-# --- Limits -----------------------------------------------------------------------------
-
-
-def test_joint_limits_are_problem_5():
-    q_min, q_max, dq = np.array([-1.5, -2.0]), np.array([1.5, 0.5]), np.array([2.0, 3.0])
-    limits = joint_limits((q_min, q_max), (-dq, dq), torque=2)
-    S_q, S_dq = np.hstack([np.eye(2), np.zeros((2, 2))]), np.hstack([np.zeros((2, 2)), np.eye(2)])
-    np.testing.assert_array_equal(limits.states.H, np.vstack([S_q, -S_q, S_dq, -S_dq]))
-    np.testing.assert_array_equal(limits.states.h, np.concatenate([q_max, -q_min, dq, dq]))
-    assert limits.states.labels == (
-        "q1 <= 1.5 rad", "q2 <= 0.5 rad", "q1 >= -1.5 rad", "q2 >= -2 rad",
-        "dq1 <= 2 rad/s", "dq2 <= 3 rad/s", "dq1 >= -2 rad/s", "dq2 >= -3 rad/s",
-    )  # fmt: skip
-    np.testing.assert_array_equal((limits.inputs.lower, limits.inputs.upper), ([-2, -2], [2, 2]))
-    system = LinearSystem(np.eye(4), np.ones((4, 2)), **limits.names)
-    system.validate()
-    assert system.state_labels == ("q1 [rad]", "q2 [rad]", "dq1 [rad/s]", "dq2 [rad/s]")
-    assert system.input_labels == ("tau1 [N m]", "tau2 [N m]")
-    only = joint_limits(position=(-INF, 1), names=("lift",), units=("m", "m/s", "N"))
-    assert only.states.labels == ("lift <= 1 m",) and only.inputs.support([1.0]) == INF
-    assert only.state_names == ("lift", "lift velocity") and only.input_units == ("N",)
-    assert joint_limits(velocity=1).states.labels == ("dq1 <= 1 rad/s", "dq1 >= -1 rad/s")
-    mixed = joint_limits(1, names=("a", "b"), units=(("rad", "m"), ("rad/s", "m/s"), ("N m", "N")))
-    assert mixed.states.labels[:2] == ("a <= 1 rad", "b <= 1 m")
-    assert joint_limits().states.H.shape == (0, 2)
-
-
-def test_output_limits_are_rows_of_C():
-    C = np.array([[1.0, 2.0], [0.0, -1.0]])
-    limits = output_limits(C, [-1, -INF], [3, 4], ("y", "z"), ("m", ""))
-    np.testing.assert_array_equal(limits.H, [[1, 2], [0, -1], [-1, -2]])
-    np.testing.assert_array_equal(limits.h, [3, 4, 1])
-    assert limits.labels == ("y <= 3 m", "z <= 4", "y >= -1 m")
-    assert output_limits(C, None, 1).labels == ("y1 <= 1", "y2 <= 1")
-    assert output_limits(C, None, None).H.shape == (0, 2)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: joint_limits([1, 2, 3]), "position: .* is not a pair"),
-        (lambda: joint_limits((1, -1)), r"position: is empty: lower\[0\] = 1"),
-        (lambda: joint_limits(-1), "position: is empty"),
-        (lambda: joint_limits(torque=(1, -1)), "torque: is empty"),
-        (lambda: joint_limits(velocity=np.nan), "velocity.lower: holds NaN"),
-        (lambda: joint_limits(([-1, -1], [1, 1]), ([-1] * 3, 1)), "position: 2 entries for 3"),
-        (lambda: joint_limits(([-1, -1], 1), names=("q",)), "position: 2 entries for 1"),
-        (lambda: joint_limits(1, units="rad"), "units: "),
-        (lambda: joint_limits(1, units=(("rad", "m"), "", "")), "units: .* does not fit 1"),
-        (lambda: output_limits([1, 2], 0, 1), r"C: shape \(2,\) is not \(p, n\)"),
-        (lambda: output_limits([[1, 2]], [0, 0], 1), r"limits.lower: shape \(2,\) is not \(1,\)"),
-        (lambda: output_limits([[1, 2]], 0, 1, "y"), "names: 'y' is not one string an output"),
-        (lambda: output_limits([[np.inf, 2]], 0, 1), "C: holds NaN"),
-    ],
-)
-def test_limits_errors(call, message):
     with pytest.raises(ValueError, match=message):
         call()

@@ -1,0 +1,71 @@
+"""The states that some input takes into a set, by hand and by two methods."""
+
+import numpy as np
+import pytest
+from problems import symmetric
+
+from jaxmpc import Box, LinearSystem, Polytope
+from jaxmpc.sets.one_step import predecessor
+
+UNSTABLE = LinearSystem([[2.0]], [[1.0]])
+
+
+def interval(polytope):
+    """(lower, upper) of a set on the line."""
+    return -polytope.support(np.array([-1.0])), polytope.support(np.array([1.0]))
+
+
+def test_predecessor_on_the_line():
+    w = Box([-0.5], [0.25])
+    # 2x + u + w in [-3, 3]: 2x <= 3 - 0.25 + 1 and 2x >= -3 + 0.5 - 1
+    before = predecessor(UNSTABLE, symmetric(3), None, symmetric(1), w)
+    assert interval(before) == pytest.approx((-1.75, 1.875), abs=1e-14)
+    before = predecessor(UNSTABLE, symmetric(3), symmetric(1.8), symmetric(1).to_polytope(), w)
+    assert interval(before) == pytest.approx((-1.75, 1.8), abs=1e-14)
+    drifting = LinearSystem([[1.0]], [[1.0]], c=[3.0])
+    before = predecessor(drifting, Box([2], [5]), None, Box([0], [1]))
+    assert interval(before) == pytest.approx((-2, 2), abs=1e-14)
+    # a single admissible input; and inputs that reach anything
+    before = predecessor(UNSTABLE, symmetric(3), None, Box([0.5], [0.5]))
+    assert interval(before) == pytest.approx((-1.75, 1.25), abs=1e-14)
+    before = predecessor(UNSTABLE, symmetric(3), None, None)
+    assert not before.H.any() and before.h == [1.0]
+    assert predecessor(UNSTABLE, symmetric(3), Box([4], [5]), symmetric(1)).is_empty()
+    assert predecessor(UNSTABLE, symmetric(3), None, symmetric(1), symmetric(3.1)).is_empty()
+
+
+def test_predecessor_with_a_singular_matrix_is_a_strip():
+    system = LinearSystem([[1, 1], [0, 0]], [[0.5], [1]])
+    before = predecessor(system, symmetric(1, 1), None, symmetric(1))
+    order = np.argsort(before.H[:, 0])
+    np.testing.assert_allclose(before.H[order] * np.sqrt(2), [[-1, -1], [1, 1]], atol=1e-14)
+    np.testing.assert_allclose(before.h * np.sqrt(2), 1.5, atol=1e-14)
+    # what cannot be reached at all: x2+ = u in [2, 3] with |u| <= 1
+    target = Box([-1, 2], [1, 3])
+    assert predecessor(system, target, None, symmetric(1)).is_empty()
+    stuck = LinearSystem([[1, 0], [0, 0]], [[1], [0]])
+    assert predecessor(stuck, target, None, symmetric(1)).is_empty()
+
+
+def test_predecessor_with_a_triangle_of_inputs():
+    triangle = Polytope([[-1, 0], [0, -1], [1, 1]], [0, 0, 1])
+    system = LinearSystem(np.eye(2), np.eye(2))
+    before = predecessor(system, symmetric(1, 1), symmetric(5, 5), triangle)
+    # area of a sum: 4 + 1/2 + twice the mixed area, 2 (1 + 1)
+    assert before.volume() == pytest.approx(8.5, abs=1e-12) and len(before.h) == 5
+
+
+def test_predecessor_by_ridges_and_by_elimination(monkeypatch):
+    rng = np.random.default_rng(0)
+    normals = rng.standard_normal((66, 4))
+    target = Polytope(normals / np.linalg.norm(normals, axis=1)[:, None], 1 + 0.2 * rng.random(66))
+    system = LinearSystem(np.eye(4), rng.standard_normal((4, 2)))
+    inputs = Box([-0.3, -0.1], [0.2, 0.4])
+    by_ridges = predecessor(system, target, None, inputs)
+    monkeypatch.setattr("jaxmpc.sets.one_step._MANY", 1000)
+    by_pairs = predecessor(system, target, None, inputs)
+    assert len(by_ridges.h) == len(by_pairs.h) > 250
+    assert by_ridges.volume() == pytest.approx(by_pairs.volume(), rel=1e-12)
+    for direction in rng.standard_normal((10, 4)):  # a sum of sets: their supports add up
+        expected = target.support(direction) + float(inputs.support(-direction @ system.B))
+        assert by_ridges.support(direction) == pytest.approx(expected, rel=1e-6)
