@@ -104,6 +104,7 @@ def sweep_robot(
     names, n = plant.state_names, plant.n
     mapped = axis_indices("axes", "coordinate", axes or (names[0], names[n // 2]), names, n)
     along = _grid_lines(plant, mapped, grid, lower, upper)
+    points = mesh(along)
     others = [i for i in range(n) if i not in mapped]
     whole("horizon", horizon, 1)
     if terminal == "ellipsoid":
@@ -118,7 +119,7 @@ def sweep_robot(
             fail("fixed", what, "One for each coordinate that is not on an axis")
         at[others] = values
     mpc = mpc_with_terminal(plant, horizon, terminal)
-    setting = RobotSetting.of(plant, mpc, mesh(along), seconds, axes=mapped, fixed=at, claim=claim)
+    setting = RobotSetting.of(plant, mpc, points, seconds, axes=mapped, fixed=at, claim=claim)
     config = {
         "robot": robot,
         "claim": claim,
