@@ -30,7 +30,7 @@ def test_forty_names_at_the_top():
     assert len(TOP) <= 40
     assert sorted(jm.__all__) == sorted(set(jm.__all__))
     folders = {folder.parent.name for folder in Path(jm.__file__).parent.glob("*/__init__.py")}
-    assert folders - {"app", "sweeps"} <= set(NAMESPACES)
+    assert folders - {"app", "store"} <= set(NAMESPACES)
 
 
 @pytest.mark.parametrize("name", NAMESPACES)

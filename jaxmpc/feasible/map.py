@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,9 +26,6 @@ from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.sets.geometry import hull_volume
 from jaxmpc.sets.lp import power_of_two
 from jaxmpc.sets.polytope import Polytope
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 # Volumes are sums of rounded products; bounds are widened by more than that.
 VOLUME_ROUNDING = 1e-11
@@ -193,7 +190,7 @@ class FeasibleSetMap:
             self, labels=labels, bound_point=points, bound_normal=normals, bound_offset=offsets
         )
 
-    def to_xarray(self) -> "xr.Dataset":
+    def to_xarray(self) -> Any:
         """Return the map as an xarray.Dataset along the dimension `sample`, names and units
         attached; its variables are `x0`, those of `Labels`, and `bound_point`, `bound_normal`,
         `bound_offset`."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,9 +33,7 @@ from jaxmpc.grids import mesh
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
-
-if TYPE_CHECKING:
-    from jaxmpc.store import Field, Store
+from jaxmpc.store import Constant, Field, Store, exists, location, report_damage
 
 # Lines of a picture along each axis, at most.
 LINES = 1024
@@ -71,7 +69,7 @@ class StoredMap:
     """
 
     problem: FeasibilityProblem
-    store: "Store"
+    store: Store
     along: tuple[np.ndarray, ...]
     bounds: FeasibleSetMap
     counts: dict[str, int]
@@ -89,7 +87,7 @@ class StoredMap:
     def unread(
         cls,
         problem: FeasibilityProblem,
-        store: "Store",
+        store: Store,
         along: Sequence[np.ndarray],
         timing: Timing | None = None,
         left: str = "",
@@ -103,7 +101,7 @@ class StoredMap:
 
     @classmethod
     def read(
-        cls, problem: FeasibilityProblem, store: "Store", along: Sequence[np.ndarray]
+        cls, problem: FeasibilityProblem, store: Store, along: Sequence[np.ndarray]
     ) -> "StoredMap":
         """Read all labels of an open store, and the proofs that matter, block by block: memory does
         not grow with the grid up to `extremes.REDUCED` mapped states."""
@@ -126,8 +124,6 @@ class StoredMap:
     def refine(self, gap: float = 1e-6) -> "StoredMap":
         """Return the map with the bounds that rays add, and write these into the store; see
         `FeasibleSetMap.refine`. Undecided points that they exclude count as infeasible."""
-        from jaxmpc.store import Constant
-
         none = np.zeros((0, self.problem.dimension))
         alone = FeasibleSetMap.of(self.problem, none, Labels.empty(0, self.problem)).refine(gap)
         normals, offsets = alone.bound_normal, alone.bound_offset
@@ -204,7 +200,7 @@ def sweep_into(
     overwrite: bool = False,
     progress: bool = False,
     begun: Callable[[], None] = lambda: None,
-    opened: "Callable[[Store], None]" = lambda store: None,
+    opened: Callable[[Store], None] = lambda store: None,
     concluded: Callable[[StoredMap], None] = lambda found: None,
 ) -> StoredMap:
     """Label all points of a grid into a store, block by block, each written as soon as it is done.
@@ -225,8 +221,6 @@ def sweep_into(
 
     Raises ValueError for wrong arguments, and as `jaxmpc.store.Store` does.
     """
-    from jaxmpc.store import exists, location, report_damage
-
     path = location(path)
     if shard is None:
         check_results(path, resume, overwrite, exists(path))
@@ -272,7 +266,7 @@ def sweep_into(
         return whole
 
 
-def commit_labels(store: "Store", part: Part[Labels]) -> str:
+def commit_labels(store: Store, part: Part[Labels]) -> str:
     """Write the labels of a block; return a note for the progress bar."""
     store.commit(part.place, **part.result.arrays())
     return f"{np.mean(part.result.label != 0):.2%} of the last block decided"
@@ -284,15 +278,13 @@ def open_labels(
     along: Sequence[np.ndarray],
     config: Mapping[str, Any],
     chunk: int,
-    fields: "Mapping[str, Field] | None" = None,
+    fields: Mapping[str, Field] | None = None,
     **how: Any,
-) -> "Store":
+) -> Store:
     """Open the store of the labels of a grid; how: to open it, see `Store`.
 
     along: the coordinates of the grid along each mapped state. fields: variables beside the labels.
     """
-    from jaxmpc.store import Constant, Store
-
     mpc, system = problem.mpc, problem.mpc.system
     all_fields = label_fields(mpc.dimension, mpc.horizon, system.m, problem.dimension)
     all_fields |= dict(fields or {})
@@ -315,11 +307,9 @@ def open_labels(
     )
 
 
-def label_fields(n: int, horizon: int, m: int, d: int) -> "dict[str, Field]":
+def label_fields(n: int, horizon: int, m: int, d: int) -> dict[str, Field]:
     """Return the variables that hold `Labels` of d mapped states and plans (horizon, m) from states
     of size n."""
-    from jaxmpc.store import Field
-
     meanings = "infeasible undecided feasible", " ".join(s.name.lower() for s in Status)
     values = [-1, 0, 1], [int(s) for s in Status]
     label, status = (
@@ -349,7 +339,7 @@ def label_fields(n: int, horizon: int, m: int, d: int) -> "dict[str, Field]":
     }
 
 
-def stored_labels(store: "Store") -> Labels:
+def stored_labels(store: Store) -> Labels:
     """Return the labels in a store; proofs are read when they are used."""
     proofs = {name: OnDemand(partial(store.read, name)) for name in PROOFS}
     return Labels(store.read("label"), store.read("status"), proofs)

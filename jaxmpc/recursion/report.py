@@ -1,6 +1,6 @@
 """RecursionReport: all that is known about the recursive feasibility of one MPC problem."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -9,9 +9,6 @@ from jaxmpc.pytrees import record
 from jaxmpc.recursion.claims import Claim, Counterexample
 from jaxmpc.recursion.sampled_loops import SampledLoops
 from jaxmpc.sets.polytope import Polytope
-
-if TYPE_CHECKING:
-    import xarray
 
 
 @record
@@ -66,7 +63,7 @@ class RecursionReport:
 
     __repr__ = __str__
 
-    def to_xarray(self) -> "xarray.Dataset":
+    def to_xarray(self) -> Any:
         """Return the loops as an xarray.Dataset along the dimension `sample`, names attached."""
         import xarray
 

@@ -4,13 +4,14 @@ import shutil
 import uuid
 import warnings
 from pathlib import Path
-from typing import Any
-
-import zarr
+from typing import TYPE_CHECKING, Any
 
 from jaxmpc.checks import fail
 from jaxmpc.files import text_within
 from jaxmpc.store.lock import Lock
+
+if TYPE_CHECKING:
+    import zarr
 
 
 def location(path: str | Path) -> Path | str:
@@ -23,6 +24,8 @@ def location(path: str | Path) -> Path | str:
 
 def exists(path: Path | str) -> bool:
     """Return whether something lies at a path, or a complete store of objects at a URL."""
+    import zarr
+
     if isinstance(path, Path):
         return path.exists()
     try:
@@ -44,6 +47,8 @@ def text_of(path: Path | str, name: str) -> str:
 
 def zarr_place(path: Path | str) -> Any:
     """Return what zarr opens at a path or URL. Raises ValueError where fsspec cannot open it."""
+    import zarr
+
     if isinstance(path, Path):
         return path
     try:
@@ -52,8 +57,10 @@ def zarr_place(path: Path | str) -> Any:
         fail(path, f"{error}", "Install fsspec and what it needs for this kind of URL")
 
 
-def open_group(path: Path | str, mode: Any) -> zarr.Group:
+def open_group(path: Path | str, mode: Any) -> "zarr.Group":
     """Open a store; raise ValueError where `path` holds something else."""
+    import zarr
+
     try:
         group = zarr.open_group(zarr_place(path), mode=mode, use_consolidated=False)
         there = "fingerprint" in group.attrs
@@ -69,14 +76,18 @@ def open_group(path: Path | str, mode: Any) -> zarr.Group:
     return group
 
 
-def consolidate(group: zarr.Group) -> None:
+def consolidate(group: "zarr.Group") -> None:
     """Write the metadata of all variables to the group, so that readers need one file."""
+    import zarr
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # zarr says that its format 3 has no standard for it yet
         zarr.consolidate_metadata(group.store)
 
 
-def array_of(group: zarr.Group, name: str) -> zarr.Array[Any]:
+def array_of(group: "zarr.Group", name: str) -> "zarr.Array[Any]":
+    import zarr
+
     array = group[name]
     assert isinstance(array, zarr.Array)
     return array

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
-import zarr
 
 from jaxmpc.checks import fail, in_units, require_memory, shortened, shown
 from jaxmpc.files import faithful
@@ -18,6 +17,7 @@ from jaxmpc.store.places import array_of, location, open_group, text_of
 
 if TYPE_CHECKING:
     import xarray as xr
+    import zarr
 
 # Most blocks of a store that is read. Its data are no larger than SMALL bytes, or so many times its
 # files: a sweep's are some 13 times as large, one number throughout is far more.
@@ -90,7 +90,7 @@ def reason(error: Exception) -> str:
     return shortened(text if known else f"{type(error).__name__}: {text}")
 
 
-def _read(path: Path | str, group: zarr.Group, check: Check, shapes: Shapes) -> Stored:
+def _read(path: Path | str, group: "zarr.Group", check: Check, shapes: Shapes) -> Stored:
     """Read an open store; raises where nothing can be said of its data."""
     found, described = _described(path, shapes)
     names, block = found["variables"], found["variables"]["block"]
@@ -207,7 +207,7 @@ def _layout(name: str, one: Any) -> Layout:
     return Layout(tuple(shape), tuple(chunks), size)
 
 
-def _marks(path: Path | str, group: zarr.Group, count: int) -> np.ndarray:
+def _marks(path: Path | str, group: "zarr.Group", count: int) -> np.ndarray:
     """Return the checksums of all blocks, 0 of those that are not done."""
     array, marks = array_of(group, "checksum"), np.zeros(count, np.uint64)
     if isinstance(path, str):

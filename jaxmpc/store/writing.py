@@ -7,11 +7,9 @@ import shutil
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
-import zarr
-from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from jaxmpc.batches import padded
 from jaxmpc.checks import fail
@@ -36,8 +34,16 @@ from jaxmpc.store.places import (
     zarr_place,
 )
 
-# Of each chunk; the last one adds a checksum of the file itself.
-CODECS = (ZstdCodec(), Crc32cCodec())
+if TYPE_CHECKING:
+    import zarr
+    from zarr.abc.codec import BytesBytesCodec as Codec
+
+
+def codecs() -> "tuple[Codec, ...]":
+    """Return the codecs of each chunk; the last one adds a checksum of the file itself."""
+    from zarr.codecs import Crc32cCodec, ZstdCodec
+
+    return ZstdCodec(), Crc32cCodec()
 
 
 class Field(NamedTuple):
@@ -245,7 +251,7 @@ class Store:
             made: dict[str, Any] = {
                 "data": data,
                 "dimension_names": dimensions,
-                "compressors": CODECS,
+                "compressors": codecs(),
             }
             attributes = {**attributes, **mark}
             self.group.create_array(name, overwrite=True, attributes=attributes, **made)
@@ -283,6 +289,8 @@ class Store:
 
     def _make(self, path: Path) -> None:
         """Make the store in a folder of its own."""
+        import zarr
+
         group = zarr.open_group(path, mode="w", zarr_format=3, attributes=self.attributes)
         for name in self._names():
             self._create_array(group, name)
@@ -302,6 +310,8 @@ class Store:
 
     def _create_objects(self, url: str) -> None:
         """Create the store in place, attributes last; what another process has made of it stays."""
+        import zarr
+
         group = zarr.open_group(zarr_place(url), mode="a", zarr_format=3)
         maker = {"maker": self.attributes["fingerprint"]}
         if dict(group.attrs) not in ({}, maker) or (not dict(group.attrs) and list(group.keys())):
@@ -332,7 +342,7 @@ class Store:
     def _names(self) -> list[str]:
         return [*self.constants, *self.fields, "checksum"]
 
-    def _create_array(self, group: zarr.Group, name: str, overwrite: bool = True) -> None:
+    def _create_array(self, group: "zarr.Group", name: str, overwrite: bool = True) -> None:
         """Create one variable, without values but for constants."""
         if name in self.constants:
             data, dimensions, attributes = self.constants[name]
@@ -343,7 +353,7 @@ class Store:
             dimensions = (*(() if name == "checksum" else self.dimensions), *further)
             options = {**self._layout(name), "fill_value": fill}
         options |= {"dimension_names": dimensions, "attributes": dict(attributes)}
-        made = group.create_array(name, overwrite=overwrite, compressors=CODECS, **options)
+        made = group.create_array(name, overwrite=overwrite, compressors=codecs(), **options)
         if name in self.constants:
             self._write_constant(made, name)
 
@@ -361,7 +371,7 @@ class Store:
         tail, dtype, *_ = self._field(name)
         return {"shape": (*shape, *tail), "chunks": (*chunks, *tail), "dtype": np.dtype(dtype)}
 
-    def _write_constant(self, array: zarr.Array[Any], name: str) -> None:
+    def _write_constant(self, array: "zarr.Array[Any]", name: str) -> None:
         data = self.constants[name].data
         array[...] = data if data.dtype.kind != "U" else data.astype(object)
 
