@@ -22,13 +22,13 @@ LOOPS = 20
 class ClosedLoopCheck:
     """What `check_fixed_steps` found along closed loops.
 
-    samples: how many. solvable: how many of the plans are solved by ADMM and Newton steps. reached:
+    plans: how many. solvable: how many of them are solved by ADMM and Newton steps. reached:
     how many of these the fixed number of steps solves to the tolerance. input_error: the largest
     difference between the inputs of the two where both are solved; input_error_any: where the
-    precise plan is. Both are 0 where there is no such sample.
+    precise plan is. Both are 0 where there is no such plan.
     """
 
-    samples: int
+    plans: int
     solvable: int
     reached: int
     input_error: float
@@ -40,20 +40,20 @@ def check_fixed_steps(
     solver: ADMM,
     lower: Reals,
     upper: Reals,
-    samples: int = 1000,
+    plans: int = 1000,
     tolerance: float = 1e-6,
     seed: int = 0,
 ) -> ClosedLoopCheck:
     """Run `Controller(mpc, solver)` with newton_steps=0 from random states of the box [lower,
     upper] (n,), and at each state solve the plan precisely too.
 
-    20 closed loops begin at states that have a plan; `samples` are rounded up to a multiple of 20.
+    20 closed loops begin at states that have a plan; `plans` is rounded up to a multiple of 20.
 
     Raises ValueError for an invalid problem, bounds of another shape than (n,) and bad counts.
     """
     require_kind("mpc", mpc, MPC)
     require_kind("solver", solver, ADMM)
-    whole("samples", samples, 1)
+    whole("plans", plans, 1)
     number("tolerance", tolerance, 0, "Give a positive number")
     for argument, bound in (("lower", lower), ("upper", upper)):
         require_shape(argument, bound, (mpc.system.n,), "Give a number for each state")
@@ -63,12 +63,12 @@ def check_fixed_steps(
         fixed = Controller(mpc, replace(solver, newton_steps=0, eps=tolerance))
         precise = Controller(mpc, ADMM())
         starts = np.random.default_rng(seed).uniform(lower, upper, (50 * LOOPS, len(lower)))
-        plans = jax.jit(jax.vmap(lambda x: precise(x).plan.status))(starts)
-        starts = starts[np.argsort(np.asarray(plans) != Status.SOLVED, kind="stable")[:LOOPS]]
+        status = jax.jit(jax.vmap(lambda x: precise(x).plan.status))(starts)
+        starts = starts[np.argsort(np.asarray(status) != Status.SOLVED, kind="stable")[:LOOPS]]
         A, B = (jnp.asarray(host_array("system", v)) for v in (mpc.system.A, mpc.system.B))
         drift = 0.0 if mpc.system.c is None else jnp.asarray(host_array("system.c", mpc.system.c))
 
-        def sample(state: Any, _: Any) -> Any:
+        def step(state: Any, _: Any) -> Any:
             x, before, best_before = state
             control, best = fixed(x, before), precise(x, best_before)
             after = matmul(A, x) + matmul(B, control.u) + drift
@@ -79,13 +79,13 @@ def check_fixed_steps(
 
         def loop(x: Any) -> Any:
             start = x, fixed.start(x), precise.start(x)
-            return jax.lax.scan(sample, start, length=-(-samples // LOOPS))[1]
+            return jax.lax.scan(step, start, length=-(-plans // LOOPS))[1]
 
         status, best, error = (np.asarray(v) for v in jax.jit(jax.vmap(loop))(starts))
     solvable = best == Status.SOLVED
     both = solvable & (status == Status.SOLVED)
     return ClosedLoopCheck(
-        samples=best.size,
+        plans=best.size,
         solvable=int(solvable.sum()),
         reached=int(both.sum()),
         input_error=float(error[both].max(initial=0.0)),

@@ -375,7 +375,7 @@ LINES = [
     ("recursion --seconds inf", "--seconds: inf. Give a positive number"),
     ("recursion --smallest 0", "--smallest: 0"),
     ("export --iterations 0", "--iterations: 0"),
-    ("export --samples -1", "--samples: -1"),
+    ("export --plans -1", "--plans: -1"),
     ("export --tolerance 0", "--tolerance: 0.0"),
     ("export --name 1st", "name: '1st'"),
     ("export --horizon 0", "--horizon: "),

@@ -17,7 +17,7 @@ def test_code_compiles_as_printed(law, tmp_path, capsys):
     folder = tmp_path / "code"
     cli.main(["export", "--horizon", "4", "--law", law, "--output", str(folder)])
     said = capsys.readouterr().out
-    assert "regions" in said or "closed-loop samples" in said
+    assert "regions" in said or "plans of closed loops" in said
     call = said.strip().splitlines()[-1].removeprefix("Next: ")
     subprocess.run(call, shell=True, check=True)
     answer = subprocess.run(

@@ -158,10 +158,10 @@ CHECKED = jm.MPC(
 def test_closed_loop_check():
     """Lists as numbers; enough steps solve every plan, one step few."""
     check = lambda steps: check_fixed_steps(
-        CHECKED, jm.ADMM(iterations=steps), [-0.5, -0.5], [0.5, 0.5], samples=40, tolerance=1e-4
+        CHECKED, jm.ADMM(iterations=steps), [-0.5, -0.5], [0.5, 0.5], plans=40, tolerance=1e-4
     )
     many, one = check(200), check(1)
-    assert many.samples == many.solvable == many.reached == 40 and many.input_error < 1e-3
+    assert many.plans == many.solvable == many.reached == 40 and many.input_error < 1e-3
     assert one.reached < 40
 
 
@@ -170,7 +170,7 @@ def test_closed_loop_check():
     [
         (dict(lower=[0.0]), "lower: "),
         (dict(upper=[np.inf, 1.0]), "upper: "),
-        (dict(samples=0), "samples: "),
+        (dict(plans=0), "plans: "),
         (dict(mpc=3), "mpc: "),
     ],
 )

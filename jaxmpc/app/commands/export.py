@@ -75,8 +75,8 @@ class Export:
     """Numbers of type float instead of double."""
     tolerance: Annotated[float | None, option("EPS", "1e-6; with --single 1e-3"), POSITIVE] = None
     """Relative residuals below which the code says "solved"."""
-    samples: Annotated[int, option("K", "1000"), at_least(0)] = 1000
-    """Samples of the closed loops that check the law; 0 for no check."""
+    plans: Annotated[int, option("K", "1000"), at_least(0)] = 1000
+    """Plans of the closed loops that check the law; 0 for no check."""
     overwrite: Switch = False
     """Replace the files where there are some."""
 
@@ -87,8 +87,8 @@ class Export:
         sense."""
         config = configs.load(self.config, given_options(self, "horizon", "terminal"), "info")
         lower, upper = config.state_range()
-        if self.law == "steps" and self.samples and not np.isfinite([*lower, *upper]).all():
-            fail("limits.x_min", "bounds not every state", "Give --samples 0 for no check")
+        if self.law == "steps" and self.plans and not np.isfinite([*lower, *upper]).all():
+            fail("limits.x_min", "bounds not every state", "Give --plans 0 for no check")
         mpc, solver = config.build_controlled(), config.build_solver() or ADMM()
         if self.iterations is not None:
             solver = dataclasses.replace(solver, iterations=self.iterations)
@@ -124,12 +124,12 @@ class Export:
         kind = "" if self.law == "jax" else " of text"
         size = lambda path: f"{path.stat().st_size / 1024:.1f} KiB{kind}"
         rows = [(str(path), size(path)) for path in paths] + rows
-        if self.law == "steps" and self.samples:
+        if self.law == "steps" and self.plans:
             print("checking closed loops; compiling, some 20 s", file=sys.stderr)
-            found = check_fixed_steps(mpc, solver, lower, upper, self.samples, tolerance)
+            found = check_fixed_steps(mpc, solver, lower, upper, self.plans, tolerance)
             share = 100 * found.reached / max(found.solvable, 1)
             rows += [
-                ("closed-loop samples", f"{found.samples}, {found.solvable} have a plan"),
+                ("plans of closed loops", f"{found.plans}, {found.solvable} can be solved"),
                 ("solved by the C code's steps", f"{share:.1f} % of these, to {tolerance:g}"),
                 ("largest error of u where solved", f"{found.input_error:.2g}"),
                 ("largest error of u at all of these", f"{found.input_error_any:.2g}"),
