@@ -31,9 +31,9 @@ class ActiveConstraint:
     def __str__(self) -> str:
         unit = f" per {self.unit}" if self.unit else ""
         broken = f", broken by {self.violation:.3g} {self.unit}".rstrip() if self.violation else ""
-        name = (
-            self.name if self.name.startswith(self.constraint) else f"{self.constraint} {self.name}"
-        )
+        name = self.name
+        if not name.startswith(self.constraint):
+            name = f"{self.constraint} {name}"
         return f"{name}, {self.bound} at k = {self.stage}: {self.multiplier:.6g}{unit}{broken}"
 
 
@@ -48,35 +48,29 @@ def active_constraints(
     an arbitrary way: only their sum is a sensitivity, of relaxing all of them. NumPy; not
     traceable.
     """
-    table = row_table(mpc)
     y = np.asarray(flat_multipliers(layout(mpc), plan.multipliers), np.float64)
+    ball = isinstance(mpc.terminal_set, Ellipsoid)
+    slack, columns = np.asarray(plan.slack), soft_columns(mpc)
     found = []
-    last = isinstance(mpc.terminal_set, Ellipsoid)
-    slack = np.asarray(plan.slack)
-    column = soft_columns(mpc)
-    for i, (row, value) in enumerate(zip(table, y, strict=True)):
-        if abs(value) > tolerance and not (last and row.kind == "terminal"):
-            broken = slack[row.stage, column[i]] if row.soft else 0.0
-            found.append(
-                ActiveConstraint(
-                    row.kind, row.name, row.unit, row.stage, "upper" if value > 0 else "lower",
-                    float(abs(value)), float(broken),
-                )
-            )  # fmt: skip
-    if last:
-        push = float(np.linalg.norm(np.asarray(plan.multipliers.terminal)))
-        if push > tolerance:
-            found.append(ActiveConstraint("terminal", "ellipsoid", "", mpc.horizon, "radius", push))
+    for row, column, value in zip(row_table(mpc), columns, y, strict=True):
+        if abs(value) > tolerance and not (ball and row.kind == "terminal"):
+            bound, broken = "upper" if value > 0 else "lower", 0.0
+            if column is not None:
+                broken = float(slack[row.stage, column])
+            where = row.kind, row.name, row.unit, row.stage
+            found.append(ActiveConstraint(*where, bound, float(abs(value)), broken))
+    push = float(np.linalg.norm(np.asarray(plan.multipliers.terminal))) if ball else 0.0
+    if push > tolerance:
+        found.append(ActiveConstraint("terminal", "ellipsoid", "", mpc.horizon, "radius", push))
     return tuple(sorted(found, key=lambda constraint: -constraint.multiplier))
 
 
-def soft_columns(mpc: MPC) -> dict[int, int]:
-    """Column of `Plan.slack` for each soft row of the condensed QP."""
-    offset, first, columns = 0, 0, {}
+def soft_columns(mpc: MPC) -> list[int | None]:
+    """Column of `Plan.slack` for each row of the condensed QP, None for hard ones."""
+    columns: list[int | None] = []
+    first = 0
     for b in blocks(mpc, float):
-        if b.linear is not None:
-            for j in range(len(b.steps) * b.size):
-                columns[offset + j] = first + j % b.size
-            first += b.size
-        offset += len(b.steps) * b.size
+        hard = b.linear is None
+        columns += [None if hard else first + j for _ in b.steps for j in range(b.size)]
+        first += 0 if hard else b.size
     return columns

@@ -86,11 +86,9 @@ class Condensed:
             weighted = self.stage[:, None] * matmul(input_reference, self.R)
             q = q - 2 * jnp.einsum("kmi,km->i", self.Omega, weighted, precision="highest")
         shift = matmul(self.D, theta) + self.d
-        return QP(
-            P=self.P, q=q, A=self.C, l=self.lower - shift, u=self.upper - shift,
-            soft_linear=self.soft_linear, soft_quadratic=self.soft_quadratic, radius=self.radius,
-            row_sizes=self.limits.sizes(), balls=self.balls,
-        )  # fmt: skip
+        l, u = self.lower - shift, self.upper - shift
+        soft = self.soft_linear, self.soft_quadratic
+        return QP(self.P, q, self.C, l, u, *soft, self.radius, self.limits.sizes(), self.balls)
 
     @property
     def limits(self) -> Bounds:

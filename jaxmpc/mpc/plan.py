@@ -12,7 +12,7 @@ from jax import Array
 from jaxmpc.checks import fail
 from jaxmpc.mpc.arguments import Aim
 from jaxmpc.mpc.problem import MPC, weights_of
-from jaxmpc.mpc.rows import Layout, blocks, row_count, split
+from jaxmpc.mpc.rows import Block, Layout, blocks, row_count, split
 from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.problem import QPSolution
@@ -37,7 +37,7 @@ class Multipliers:
     inputs: Array
     terminal: Array
     outputs: tuple[Array, ...] = ()
-    rates: Any = None
+    rates: Array | None = None
     soft: tuple[Array, ...] = ()
     tasks: tuple[Array, ...] = ()
 
@@ -141,23 +141,17 @@ def anchored(start: WarmStart, x0: Array) -> WarmStart:
 
 
 def answer(
-    mpc: MPC,
-    layout: Layout,
-    found: QPSolution,
-    fault: Array,
-    states: Array,
-    inputs: Array,
-    aim: Aim,
+    mpc: MPC, layout: Layout, found: QPSolution, fault: Array, x: Array, u: Array, aim: Aim
 ) -> Plan:
-    """Return the plan of a QP's solution: NaN and the status `fault` where the data had one."""
-    J = cost(mpc, states, inputs, aim)
-    solution = with_fault(replace(found, cost=J), fault)
+    """Return the plan of a QP's solution, states x (N+1, n) and inputs u (N, m): NaN and the status
+    `fault` where the data had one."""
+    solution = with_fault(replace(found, cost=cost(mpc, x, u, aim)), fault)
     nan = lambda v: jnp.where(fault == Status.NOT_RUN, v, jnp.nan)
     return Plan(
-        states=nan(states),
-        inputs=nan(inputs),
+        states=nan(x),
+        inputs=nan(u),
         cost=solution.cost,
-        slack=nan(slack(mpc, states, inputs)),
+        slack=nan(slack(mpc, x, u)),
         multipliers=sorted_multipliers(mpc, layout, solution.y),
         status=solution.status,
         primal_residual=solution.primal_residual,
@@ -173,7 +167,7 @@ def limited(inputs: Any, u: Array) -> Array:
 
 
 def rate_ends(mpc: MPC) -> tuple[Any, Any]:
-    """Return the least and the largest change of the inputs from one sample to the next, (m,)."""
+    """Return the least and the largest change of the inputs in one time step, (m,)."""
     limit: Any = mpc.input_rate_limit
     return (limit.lower, limit.upper) if isinstance(limit, Box) else (jnp.negative(limit), limit)
 
@@ -228,8 +222,8 @@ def cost(mpc: MPC, states: Array, inputs: Array, aim: Aim) -> Array:
 
 
 def slack(mpc: MPC, states: Array, inputs: Array) -> Array:
-    """Return the violation of the p soft rows along a trajectory: (N+1, p), zero at steps where a
-    row does not hold."""
+    """Return the violation of the p soft rows along a trajectory: (N+1, p), zero at stages where
+    a row does not hold."""
     columns = [
         jnp.zeros((len(states), block.size), e.dtype).at[np.array(block.steps, int)].set(e)
         for block, e in _violations(mpc, states, inputs)
@@ -237,7 +231,7 @@ def slack(mpc: MPC, states: Array, inputs: Array) -> Array:
     return jnp.concatenate([jnp.zeros((len(states), 0), states.dtype), *columns], axis=1)
 
 
-def _violations(mpc: MPC, states: Array, inputs: Array) -> list[tuple[Any, Array]]:
+def _violations(mpc: MPC, states: Array, inputs: Array) -> list[tuple[Block, Array]]:
     """Return each soft block with its violations (steps, rows)."""
     if not mpc.soft:
         return []
@@ -258,47 +252,49 @@ def sorted_multipliers(mpc: MPC, layout: Layout, y: Array) -> Multipliers:
     of: dict[str, list[Array]] = {}
     for (kind, _, _), part in zip(layout, split(layout, y), strict=True):
         of.setdefault(kind, []).append(part)
-    empty = lambda *shape: [jnp.zeros(shape, y.dtype)]
+
+    def first(kind: str, *shape: int) -> Array:
+        return of[kind][0] if kind in of else jnp.zeros(shape, y.dtype)
+
     return Multipliers(
-        states=of.get("state", empty(len(mpc.state_stages), 0))[0],
-        inputs=of.get("input", empty(mpc.horizon, 0))[0],
-        terminal=of.get("terminal", empty(1, 0))[0][0],
-        outputs=tuple(of.get("output", ())), soft=tuple(of.get("soft", ())),
-        rates=of.get("rate", [None])[0], tasks=tuple(of.get("task", ())),
-    )  # fmt: skip
+        states=first("state", len(mpc.state_stages), 0),
+        inputs=first("input", mpc.horizon, 0),
+        terminal=first("terminal", 1, 0)[0],
+        outputs=tuple(of.get("output", ())),
+        rates=first("rate") if "rate" in of else None,
+        soft=tuple(of.get("soft", ())),
+        tasks=tuple(of.get("task", ())),
+    )
 
 
 def flat_multipliers(layout: Layout, multipliers: Multipliers) -> Array:
     """Return the multipliers of one plan as one vector (rows,): the inverse of
     `sorted_multipliers`. Raises ValueError where they are those of another problem or of many."""
-    of = multipliers
-    kinds = {
-        "state": [of.states], "input": [of.inputs], "rate": [of.rates],
-        "terminal": [of.terminal], "output": list(of.outputs), "soft": list(of.soft),
-        "task": list(of.tasks),
-    }  # fmt: skip
+    y = multipliers
+    one = {"state": y.states, "input": y.inputs, "rate": y.rates, "terminal": y.terminal}
+    several = {"output": iter(y.outputs), "soft": iter(y.soft), "task": iter(y.tasks)}
     parts = []
     for kind, steps, size in layout:
-        part: Any = kinds[kind].pop(0) if kinds[kind] else None
+        part = one[kind] if kind in one else next(several[kind], None)
         shape = (size,) if kind == "terminal" else (len(steps), size)
-        if np.shape(part) != shape:
-            found = f"has multipliers of shape {np.shape(part)} for {shape} {kind} rows"
+        given = () if part is None else np.shape(part)
+        if part is None or given != shape:
+            found = f"has multipliers of shape {given} for {shape} {kind} rows"
             fail("plan", found, "Give one plan of mpc")
         parts.append(jnp.ravel(part))
-    return jnp.concatenate(parts) if parts else jnp.zeros(0, jnp.result_type(of.states))
+    return jnp.concatenate(parts) if parts else jnp.zeros(0, jnp.result_type(y.states))
 
 
 def _shifted_multipliers(
     layout: Layout, horizon: int, y: Array, terminal_is_ball: bool = False
 ) -> Array:
-    """Return the multipliers (rows,) of a plan one sample later: see `WarmStart.shifted`."""
-    parts = split(layout, y)
-    terminal = next((part[0] for (kind, *_), part in zip(layout, parts, strict=True)
-                     if kind == "terminal"), y[:0])  # fmt: skip
+    """Return the multipliers (rows,) of a plan one time step later: see `WarmStart.shifted`."""
+    blocks = list(zip(layout, split(layout, y), strict=True))
+    terminal = next((part[0] for (kind, *_), part in blocks if kind == "terminal"), y[:0])
     moved = []
-    for (kind, steps, size), part in zip(layout, parts, strict=True):
+    for (kind, steps, size), part in blocks:
         if kind != "terminal":
-            # Step k takes over from k + 1: from the block itself, else from the terminal set.
+            # Stage k takes over from k + 1: from the block itself, else from the terminal set.
             place = {k: j for j, k in enumerate(steps)}
             same = kind == "state" and not terminal_is_ball and terminal.shape[0] == size
             last = terminal if same else jnp.zeros(size, y.dtype)

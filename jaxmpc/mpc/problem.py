@@ -260,17 +260,14 @@ class MPC:
         self._validate_stages()
         for i, soft in enumerate(as_tuple("soft", self.soft, Soft)):
             self._validate_rows(f"soft[{i}]", soft)
-            for name in ("rho", "quadratic"):
-                weight = getattr(soft, name)
-                if concrete(weight):
-                    host_array(f"soft[{i}].{name}", weight)
-                if np.shape(weight) not in ((), np.shape(soft.sides[0])):
-                    fail(
-                        f"soft[{i}].{name}", f"shape {np.shape(weight)}", "One number, or one a row"
-                    )
-                require_finite(f"soft[{i}].{name}", weight)
+            for what, weight in (("rho", soft.rho), ("quadratic", soft.quadratic)):
+                name = f"soft[{i}].{what}"
+                require_real(name, weight)
+                if np.shape(as_array(weight)) not in ((), np.shape(soft.sides[0])):
+                    fail(name, f"shape {np.shape(as_array(weight))}", "One number, or one a row")
+                require_finite(name, weight)
                 if concrete(weight) and np.any(np.asarray(weight) < 0):
-                    fail(f"soft[{i}].{name}", f"{weight}", "Penalties are at least 0")
+                    fail(name, f"{weight}", "Penalties are at least 0")
         for i, outputs in enumerate(as_tuple("outputs", self.outputs, Outputs)):
             self._validate_rows(f"outputs[{i}]", outputs)
         self._validate_rates()
@@ -422,16 +419,14 @@ def weights_of(mpc: MPC, dtype: Any) -> Weights:
     would take it for curvature, but Q itself for linear terms.
     """
 
-    def matrix(value: Any, size: int) -> Array:
+    def matrix(value: Reals | None, size: int) -> Array:
         value = jnp.asarray(np.zeros(size) if value is None else value, dtype)
         return symmetric(jnp.diag(value) if value.ndim == 1 else value)
 
-    n, m, stage = mpc.system.n, mpc.system.m, mpc.stage_weights
-    return Weights(
-        matrix(mpc.Q, n), matrix(mpc.R, m), matrix(mpc.terminal_cost, n),
-        matrix(mpc.input_rate_weight, m),
-        jnp.asarray(np.ones(mpc.horizon) if stage is None else stage, dtype),
-    )  # fmt: skip
+    n, m = mpc.system.n, mpc.system.m
+    stage = np.ones(mpc.horizon) if mpc.stage_weights is None else mpc.stage_weights
+    Q, R, P = matrix(mpc.Q, n), matrix(mpc.R, m), matrix(mpc.terminal_cost, n)
+    return Weights(Q, R, P, matrix(mpc.input_rate_weight, m), jnp.asarray(stage, dtype))
 
 
 def _form(M: np.ndarray, size: np.ndarray) -> np.ndarray:

@@ -148,9 +148,12 @@ def blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
 
 
 def bounds_of(found: list[Block], dtype: DTypeLike) -> Bounds:
-    """Return what is asked of the rows of all blocks, one after the other; the rows of balls are
-    the last."""
-    each = [block.bounds() for block in found]
+    """Return what is asked of the rows of all blocks, one after the other."""
+    return joined_bounds([block.bounds() for block in found], dtype)
+
+
+def joined_bounds(each: list[Bounds], dtype: DTypeLike) -> Bounds:
+    """Return the bounds of rows one after the other; those of balls are the last."""
     joined = lambda parts: jnp.concatenate([jnp.zeros(0, dtype), *parts])
     bounds = Bounds(joined(b.l for b in each), joined(b.u for b in each))
     if any(b.linear is not None for b in each):

@@ -99,7 +99,5 @@ def harden(mpc: MPC) -> MPC:
         if steps:
             outputs.append(Outputs(s.C, lower, upper, s.D, steps, s.names, s.units))
     join = lambda given, found: reduce(Polytope.intersect, found) if found else given
-    return replace(
-        mpc, soft=(), outputs=tuple(outputs), states=join(mpc.states, states),
-        terminal_set=join(mpc.terminal_set, terminal),
-    )  # fmt: skip
+    sets = {"states": join(mpc.states, states), "terminal_set": join(mpc.terminal_set, terminal)}
+    return replace(mpc, soft=(), outputs=tuple(outputs), **sets)

@@ -1,4 +1,4 @@
-"""A plan judged as the problem was stated: in states and inputs, from the problem's own data.
+"""The status of a plan as the problem was stated: in states and inputs, from its own data.
 
 The condensed QP is solved in other variables, whose terms can be far larger than what they add up
 to: predictions of an unstable plant, limits less what the present state contributes. So what counts
@@ -38,9 +38,15 @@ ROUNDED = 1000
 
 
 def with_stated_status(
-    mpc: MPC, c: Condensed, factor: Factor, solver: ADMM, found: QPSolution, states: Array,
-    inputs: Array, aim: Aim,
-) -> QPSolution:  # fmt: skip
+    mpc: MPC,
+    c: Condensed,
+    factor: Factor,
+    solver: ADMM,
+    found: QPSolution,
+    states: Array,
+    inputs: Array,
+    aim: Aim,
+) -> QPSolution:
     """Return the solution of the condensed QP with the status and the residuals of the plan,
     states (N+1, n) and inputs (N, m).
 
@@ -92,9 +98,8 @@ def stated_terms(
     gap = products = jnp.zeros((), x.dtype)
     for block, y_block in zip(blocks(mpc, x.dtype), split(c.layout, y), strict=True):
         v: Any = 0.0
-        for M, along, count in (
-            (block.H, x, N + 1), (block.D, rates if block.rate else u, N)
-        ):  # fmt: skip
+        of_inputs = rates if block.rate else u
+        for M, along, count in ((block.H, x, N + 1), (block.D, of_inputs, N)):
             if M is None:
                 continue
             v = v + (at(along, block.steps) if block.box else apply(M, at(along, block.steps)))

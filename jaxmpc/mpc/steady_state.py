@@ -10,9 +10,13 @@ from jaxmpc.systems.system import LinearSystem, host_matrices
 
 
 def equilibrium(
-    system: LinearSystem, target: Reals, *, C: Reals | None = None, states: Box | None = None,
+    system: LinearSystem,
+    target: Reals,
+    *,
+    C: Reals | None = None,
+    states: Box | None = None,
     inputs: Box | None = None,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray]:
     """Return (x, u) with x = A x + B u + c and C x = target: what to track and the input that holds
     it.
 
@@ -59,8 +63,7 @@ def equilibrium(
     if not np.all(np.abs(error) <= 1e-11 + 1e-9 * size):
         closest = C @ found[:n]
         drift = np.abs(error[:n]).max()
-        fail(
-            "target", f"{target} is held by no equilibrium (the closest has outputs {closest} and "
-            f"drifts by {drift:.3g} a step)", "Choose another target or widen the limits",
-        )  # fmt: skip
+        away = f"the closest has outputs {closest} and drifts by {drift:.3g} a step"
+        what = f"{target} is held by no equilibrium ({away})"
+        fail("target", what, "Choose another target or widen the limits")
     return found[:n], found[n:]

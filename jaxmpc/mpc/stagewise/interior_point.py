@@ -92,10 +92,8 @@ class Limits(NamedTuple):
     def length(self, at: Sides, step: Sides) -> Array:
         """Return how far a step leaves all of t, z, e and ν positive, 1e30 at most."""
         change = self.k * step.e - step.z
-        pairs = (
-            (at.t, step.t, self.present), (at.z, step.z, self.present),
-            (at.e, step.e, self.soft), (self.nu(at), change, self.soft),
-        )  # fmt: skip
+        sides = (at.t, step.t, self.present), (at.z, step.z, self.present)
+        pairs = (*sides, (at.e, step.e, self.soft), (self.nu(at), change, self.soft))
         positive = ((v, d, has & (v > 0)) for v, d, has in pairs)
         shrink = [jnp.where(has, -d / jnp.where(has, v, 1.0), 0.0) for v, d, has in positive]
         return 1 / jnp.maximum(jnp.max(jnp.stack(shrink), initial=0.0), 1e-30)

@@ -31,9 +31,11 @@ from jaxmpc.checks import (
 )
 from jaxmpc.mpc.arguments import Aim
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.rows import joined_bounds
 from jaxmpc.mpc.stagewise.stages import Stages, apply, apply_transposed, at, spread
 from jaxmpc.pytrees import named_pytree, pytree, static, static_pytree
 from jaxmpc.qp.precision import matmul, symmetric
+from jaxmpc.qp.projection import Bounds
 
 
 @pytree
@@ -73,22 +75,27 @@ class Task:
         """Return the stages at which cost and limits hold."""
         return tuple(range(1, horizon + 1)) if self.stages is None else self.stages
 
+    def bounds(self, shift: Array) -> Bounds:
+        """Return what is asked of the function's values and `shift` (steps, p), as rows."""
+        lower = jnp.asarray(-jnp.inf if self.lower is None else self.lower, shift.dtype)
+        upper = jnp.asarray(jnp.inf if self.upper is None else self.upper, shift.dtype)
+        rho = jnp.full(shift.size, jnp.inf if self.rho is None else self.rho, shift.dtype)
+        return Bounds((lower + shift).ravel(), (upper + shift).ravel(), rho, jnp.zeros_like(rho))
+
     def validate(self, size: int, horizon: int) -> None:
         """Raise ValueError for arguments that do not fit a function of `size` numbers."""
         name = self.name
-        for what, value, shapes in (
-            ("weight", self.weight, ((), (size,), (size, size))),
-            ("target", self.target, ((), (size,), (horizon + 1, size))),
-            ("lower", self.lower, ((), (size,))), ("upper", self.upper, ((), (size,))),
-            ("rho", self.rho, ((),)),
-        ):  # fmt: skip
+        vector: tuple[tuple[int, ...], ...] = ((), (size,))
+        allowed = {"weight": (*vector, (size, size)), "target": (*vector, (horizon + 1, size))}
+        for what, shapes in {**allowed, "lower": vector, "upper": vector, "rho": ((),)}.items():
+            value = getattr(self, what)
             if value is None:
                 continue
             require_real(f"{name}.{what}", value)
             if np.shape(value) not in shapes:
                 listed = " or ".join(map(str, shapes))
-                fail(f"{name}.{what}", f"shape {np.shape(value)}", f"The function gives {size} "
-                     f"numbers: give {listed}")  # fmt: skip
+                cure = f"The function gives {size} numbers: give {listed}"
+                fail(f"{name}.{what}", f"shape {np.shape(value)}", cure)
             if what not in ("lower", "upper"):
                 require_finite(f"{name}.{what}", value)
         if self.weight is not None and concrete(self.weight):
@@ -289,8 +296,7 @@ def expanded(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Stages:
     e, d = x - s.aim.states, u - s.aim.inputs
     gx = 2 * jnp.concatenate([s.stage[:, None] * apply(s.Q, e[:-1]), matmul(e[-1:], s.P.T)])
     gu = 2 * s.stage[:, None] * apply(s.R, d)
-    rows: dict[str, list[Any]] = {name: [] for name in ("H", "D", "layout", "boxes")}
-    bounds = [(s.lower, s.upper, s.linear, s.quadratic)]
+    limited: list[TaskRows] = []
     for task, target in zip(problem.tasks, s.aim.targets, strict=True):
         steps = task.at(N)
         pair = lambda x, u, task=task: (problem.value(task, x, u),) * 2
@@ -306,30 +312,38 @@ def expanded(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Stages:
             gx = gx + spread(apply_transposed(G, error), steps, N + 1)
             gu = gu + spread(apply_transposed(D, error), steps, N)
         if task.limited:
-            size = value.shape[1]
-            moved = apply(G, at(x, steps)) + apply(D, at(u, steps)) - value
-            sides = []
-            for given, free in ((task.lower, -jnp.inf), (task.upper, jnp.inf)):
-                bound = jnp.asarray(free if given is None else given, dtype)
-                sides.append((bound + moved).ravel())
-            soft = jnp.inf if task.rho is None else task.rho
-            weight = jnp.full(moved.size, soft, dtype)
-            bounds.append((*sides, weight, jnp.zeros_like(weight)))
-            for name, part in (("H", G), ("D", D), ("boxes", False),
-                               ("layout", ("task", steps, size))):  # fmt: skip
-                rows[name].append(part)
-    lower, upper = (jnp.concatenate([part[i] for part in bounds]) for i in (0, 1))
-    linear, quadratic = s.linear, s.quadratic
-    if len(bounds) > 1:
-        if linear is None:
-            bounds[0] = (s.lower, s.upper, jnp.full_like(s.lower, jnp.inf), jnp.zeros_like(s.lower))
-        linear, quadratic = (jnp.concatenate([part[i] for part in bounds]) for i in (2, 3))
+            about = apply(G, at(x, steps)) + apply(D, at(u, steps)) - value
+            limited.append(TaskRows(("task", steps, value.shape[1]), G, D, task.bounds(about)))
+    bounds = s.bounds
+    if limited:
+        bounds = joined_bounds([bounds, *(rows.bounds for rows in limited)], dtype)
     return replace(
-        s, A=A, B=B, c=c, Q=Q, R=R, P=P, cross=cross, aim=Aim(s.aim.x0, x, u, slopes=(gx, gu)),
-        stage=jnp.ones_like(s.stage), H=(*s.H, *rows["H"]), D=(*s.D, *rows["D"]), lower=lower,
-        upper=upper, linear=linear, quadratic=quadratic, layout=(*s.layout, *rows["layout"]),
-        boxes=(*s.boxes, *rows["boxes"]),
-    )  # fmt: skip
+        s,
+        A=A,
+        B=B,
+        c=c,
+        Q=Q,
+        R=R,
+        P=P,
+        cross=cross,
+        stage=jnp.ones_like(s.stage),
+        H=(*s.H, *(rows.G for rows in limited)),
+        D=(*s.D, *(rows.D for rows in limited)),
+        bounds=bounds,
+        layout=(*s.layout, *(rows.layout for rows in limited)),
+        boxes=(*s.boxes, *(False for _ in limited)),
+        aim=Aim(s.aim.x0, x, u, slopes=(gx, gu)),
+    )
+
+
+class TaskRows(NamedTuple):
+    """The limits of a task about a trajectory: their place in the layout, the Jacobians G (steps,
+    p, n) and D (steps, p, m) of its function, and what is asked of G x + D u."""
+
+    layout: tuple[str, tuple[int, ...], int]
+    G: Array
+    D: Array
+    bounds: Bounds
 
 
 def task_layout(problem: NonlinearMPC) -> tuple:
@@ -354,7 +368,7 @@ def curved(
         return hessian(lambda z: jnp.sum(pull * problem.model.step(z[:n], z[n:])), z)
 
     blocks = jnp.pad(jax.vmap(of_model)(join(x[:-1], u), costates[1:]), ((0, 1), (0, 0), (0, 0)))
-    first = len(base.lower)
+    first = len(base.bounds.l)
     for task, target in zip(problem.tasks, base.aim.targets, strict=True):
         steps = task.at(N)
         size = target.shape[1]
@@ -374,7 +388,5 @@ def curved(
         found = jax.vmap(of_task)(where, at(target, steps), pull)
         blocks = blocks + spread(found, steps, N + 1)
     weights = s.stage[:, None, None] * base.stage[:, None, None]
-    return replace(
-        s, Q=weights * base.Q + blocks[:-1, :n, :n], R=weights * base.R + blocks[:-1, n:, n:],
-        cross=blocks[:-1, n:, :n], P=base.P + blocks[-1, :n, :n],
-    )  # fmt: skip
+    Q, R = weights * base.Q + blocks[:-1, :n, :n], weights * base.R + blocks[:-1, n:, n:]
+    return replace(s, Q=Q, R=R, cross=blocks[:-1, n:, :n], P=base.P + blocks[-1, :n, :n])

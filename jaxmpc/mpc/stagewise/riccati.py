@@ -83,9 +83,12 @@ def _or_kernel(scan: Callable, kernel: Callable, *args: Array, lanes: Any = None
     fast = jax.custom_jvp(kernel)
     # The value is the kernel's here too: under `vmap` within `jit` JAX takes the place of the batch
     # axis from the function as it stands, and a scan would put it elsewhere.
-    fast.defjvp(own_modes(
-        lambda primals, tangents: (fast(*primals), jax.jvp(scan, primals, tangents)[1])
-    ))  # fmt: skip
+
+    @fast.defjvp
+    @own_modes
+    def _(primals: tuple, tangents: tuple) -> tuple:
+        return fast(*primals), jax.jvp(scan, primals, tangents)[1]
+
     return fast(*args)
 
 
@@ -101,9 +104,16 @@ def _scan(M: Array, w: Array, start: Array, *, adjoint: bool, unroll: int) -> Ar
 
 
 def _tracking_scan(
-    closed: Array, K: Array, inverse: Array, A: Array, B: Array, gx: Array, gu: Array, *,
+    closed: Array,
+    K: Array,
+    inverse: Array,
+    A: Array,
+    B: Array,
+    gx: Array,
+    gu: Array,
+    *,
     unroll: int = 1,
-) -> tuple[Array, Array]:  # fmt: skip
+) -> tuple[Array, Array]:
     apply = lambda M, v: jnp.einsum("...ij,...j->...i", M, v, precision="highest")
     turned = lambda M, v: apply(jnp.swapaxes(M, -1, -2), v)
     h = gx[:-1] + turned(K, gu)
@@ -183,13 +193,13 @@ def _recurrence_kernel(M: Array, w: Array, start: Array, *, adjoint: bool) -> Ar
 
 
 def _tracking_kernel(
-    closed: Array, K: Array, inverse: Array, A: Array, B: Array, gx: Array, gu: Array,
-) -> tuple[Array, Array]:  # fmt: skip
+    closed: Array, K: Array, inverse: Array, A: Array, B: Array, gx: Array, gu: Array
+) -> tuple[Array, Array]:
     # K and G⁻¹ are half of what `closed` is to read, and reading is what takes the time.
     (N, m), n = gu.shape, gx.shape[-1]
 
-    def kernel(K_ref: Any, inverse_ref: Any, A_ref: Any, B_ref: Any, gx_ref: Any, gu_ref: Any,
-               x_ref: Any, u_ref: Any) -> None:  # fmt: skip
+    def kernel(*refs: Any) -> None:
+        K_ref, inverse_ref, A_ref, B_ref, gx_ref, gu_ref, x_ref, u_ref = refs
         side = padded_side(max(n, m))
         i = indices(side)
         state, moved = i < n, i < m
@@ -233,8 +243,8 @@ def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array) -> Gains:
     side = padded_side(max(n, m))
     dot = partial(triton.dot, product=triton.EXACT)
 
-    def kernel(Q_ref: Any, R_ref: Any, A_ref: Any, B_ref: Any, closed_ref: Any, K_ref: Any,
-               inverse_ref: Any) -> None:  # fmt: skip
+    def kernel(*refs: Any) -> None:
+        Q_ref, R_ref, A_ref, B_ref, closed_ref, K_ref, inverse_ref = refs
         i = indices(side)
         row, column = i[:, None], i[None, :]
         matrix = lambda ref, k, rows, columns: _matrix(ref, k, rows, columns, side)
@@ -251,17 +261,14 @@ def _riccati_kernel(Q: Array, R: Array, A: Array, B: Array) -> Gains:
                 along = jnp.sum(jnp.where(row == j, G, 0.0), axis=0)
                 down = jnp.sum(jnp.where(column == j, G, 0.0), axis=1)
                 pivot = 1 / jnp.sum(jnp.where(i == j, along, 0.0))
-                G = jnp.where(
-                    row == j,
-                    jnp.where(column == j, pivot, along[None, :] * pivot),
-                    jnp.where(column == j, -down[:, None] * pivot,
-                              G - down[:, None] * (along * pivot)[None, :]),
-                )  # fmt: skip
+                pivot_row = jnp.where(column == j, pivot, along[None, :] * pivot)
+                less = G - down[:, None] * (along * pivot)[None, :]
+                others = jnp.where(column == j, -down[:, None] * pivot, less)
+                G = jnp.where(row == j, pivot_row, others)
             K = -dot(G, dot(BtS, A_k))
             closed = A_k + dot(B_k, K)
-            for ref, v, rows, columns in (
-                (closed_ref, closed, n, n), (K_ref, K, m, n), (inverse_ref, G, m, m)
-            ):  # fmt: skip
+            found = (closed_ref, closed, n, n), (K_ref, K, m, n), (inverse_ref, G, m, m)
+            for ref, v, rows, columns in found:
                 inside = (row < rows) & (column < columns)
                 store(ref.at[k, row, column], v, inside)
             S = matrix(Q_ref, k, n, n) + dot(closed.T, dot(S, closed)) + dot(K.T, dot(R_k, K))

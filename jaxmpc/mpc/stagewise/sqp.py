@@ -244,7 +244,7 @@ def with_tasks(plan: Plan, s: Stages, base: Stages, problem: NonlinearMPC) -> Pl
     rows = rows_of(s, base, problem, x, u)
     J = total_cost(base, problem, x, u) + jnp.sum(s.bounds.cost(rows))
     slack = [plan.slack]
-    out = jnp.abs(rows - jnp.clip(rows, s.lower, s.upper))[len(base.lower) :]
+    out = jnp.abs(rows - jnp.clip(rows, s.bounds.l, s.bounds.u))[len(base.bounds.l) :]
     layout, limited = task_layout(problem), [task for task in problem.tasks if task.limited]
     for (_, steps, _), task, part in zip(layout, limited, split(layout, out), strict=True):
         if task.rho is not None:
@@ -452,8 +452,8 @@ def held(s: Stages, E: Array, y: Array) -> Array:
     others: soft rows beyond their limits give way."""
     push = jnp.abs(scaled_multipliers(E, y))
     active = push > HELD * jnp.max(push, initial=0.0)
-    if s.linear is not None:
-        active = active & (jnp.abs(y) < (1 - 1e-6) * s.linear)
+    if s.bounds.linear is not None:
+        active = active & (jnp.abs(y) < (1 - 1e-6) * s.bounds.linear)
     return Constants.of(y.dtype).linear * E**2 * active
 
 

@@ -44,8 +44,8 @@ class Stages:
     and R may have a leading axis N; cross M (N, m, n): of the term 2 u'M x, None for zero; stage
     (N,): weights of the stages, of all three.
     H (r, n) and D (r, m) of each block of rows (`rows.blocks`), or one a step of the block, None
-    for zero; D does not count at step N, which has no input. lower, upper, linear, quadratic
-    (rows,): as in `Bounds`. layout: (kind, steps, rows a step) of each block; boxes: whether its
+    for zero; D does not count at step N, which has no input. bounds: what is asked of the
+    rows (rows,). layout: (kind, steps, rows a step) of each block; boxes: whether its
     matrix is the identity. aim: where a plan begins and what it tracks, with full references; none
     of it until it is known.
     """
@@ -59,20 +59,12 @@ class Stages:
     stage: Array
     H: tuple[Any, ...]
     D: tuple[Any, ...]
-    lower: Array
-    upper: Array
-    linear: Any
-    quadratic: Any
+    bounds: Bounds
     layout: Layout = static()
     boxes: tuple[bool, ...] = static()
     horizon: int = static()
     cross: Array | None = None
     aim: Aim = Aim(None)
-
-    @property
-    def bounds(self) -> Bounds:
-        """What the problem asks of its rows."""
-        return Bounds(self.lower, self.upper, self.linear, self.quadratic)
 
     def blocks(self) -> list[tuple[slice, tuple[int, ...], int, Any, Any, bool]]:
         """(its rows, steps, rows a step, H, D, whether that is the identity) of each block."""
@@ -173,7 +165,6 @@ def stages(mpc: MPC) -> Stages:
     weights = weights_of(mpc, dtype)
     cast = lambda v: jnp.asarray(v, dtype)
     found = blocks(mpc, dtype)
-    bounds = bounds_of(found, dtype)
     return Stages(
         A=cast(system.A),
         B=cast(system.B),
@@ -184,10 +175,7 @@ def stages(mpc: MPC) -> Stages:
         stage=weights.stage,
         H=tuple(b.H for b in found),
         D=tuple(b.D for b in found),
-        lower=bounds.l,
-        upper=bounds.u,
-        linear=bounds.linear,
-        quadratic=bounds.quadratic,
+        bounds=bounds_of(found, dtype),
         layout=layout_of(found),
         boxes=tuple(b.box for b in found),
         horizon=mpc.horizon,
@@ -202,16 +190,18 @@ def cleaned(s: Stages) -> tuple[Stages, Array]:
     """
     everywhere = lambda *tests: jnp.all(jnp.stack([jnp.all(test) for test in tests]))
     numbers = jax.tree.leaves((s.A, s.B, s.c, s.Q, s.R, s.P, s.stage, s.H, s.D))
-    ordered = (s.lower <= s.upper) & ~jnp.isposinf(s.lower) & ~jnp.isneginf(s.upper)
+    lower, upper = s.bounds.l, s.bounds.u
+    ordered = (lower <= upper) & ~jnp.isposinf(lower) & ~jnp.isneginf(upper)
     tests = [*map(jnp.isfinite, numbers), ordered]
     finite = lambda tree: jax.tree.map(lambda v: jnp.where(jnp.isfinite(v), v, 0.0), tree)
-    linear, quadratic = s.linear, s.quadratic
+    linear, quadratic = s.bounds.linear, s.bounds.quadratic
     if linear is not None:
         tests += [linear >= 0, (quadratic >= 0) & jnp.isfinite(quadratic)]
         linear, quadratic = (
             jnp.where(test, v, harmless)
             for test, v, harmless in zip(tests[-2:], (linear, quadratic), (jnp.inf, 0), strict=True)
         )
+    lower, upper = jnp.where(ordered, lower, -jnp.inf), jnp.where(ordered, upper, jnp.inf)
     Q, R, P = finite((s.Q, s.R, s.P))
     convexity = [convex(Q), convex(R), convex(P)]
     positive = jnp.isfinite(s.stage) & (s.stage > 0)
@@ -219,12 +209,20 @@ def cleaned(s: Stages) -> tuple[Stages, Array]:
     fault = jnp.where(everywhere(*tests), fault, Status.NON_FINITE).astype(jnp.int32)
     others = (jnp.zeros_like(Q), jnp.eye(len(R), dtype=R.dtype), jnp.zeros_like(P))
     Q, R, P = map(jnp.where, convexity, (Q, R, P), others)
-    return replace(
-        s, A=finite(s.A), B=finite(s.B), c=finite(s.c), Q=Q, R=R, P=P,
-        stage=jnp.where(positive, s.stage, 1.0), H=finite(s.H), D=finite(s.D),
-        lower=jnp.where(ordered, s.lower, -jnp.inf), upper=jnp.where(ordered, s.upper, jnp.inf),
-        linear=linear, quadratic=quadratic,
-    ), fault  # fmt: skip
+    harmless = replace(
+        s,
+        A=finite(s.A),
+        B=finite(s.B),
+        c=finite(s.c),
+        Q=Q,
+        R=R,
+        P=P,
+        stage=jnp.where(positive, s.stage, 1.0),
+        H=finite(s.H),
+        D=finite(s.D),
+        bounds=Bounds(lower, upper, linear, quadratic),
+    )
+    return harmless, fault
 
 
 def riccati(s: Stages, weights: Any = None) -> Gains:
@@ -295,7 +293,7 @@ def conditions(s: Stages, u: Array, y: Array) -> Optimality:
     back = lambda g: recurrence(s.A, g[:-1], g[-1], adjoint=True)
     # Of cost and rows apart: at the solution their sum is small, its rounding is that of the parts.
     of_cost, of_rows = (jnp.concatenate([back(g)[1:], g[-1:]]) for g in (gx, px))
-    absolute = jax.tree.map(jnp.abs, replace(s, linear=None, quadratic=None))
+    absolute = jax.tree.map(jnp.abs, replace(s, bounds=Bounds(s.bounds.l, s.bounds.u)))
     # A state is a difference of the terms of its step, as where torques balance the weight.
     moved = apply(absolute.A, jnp.abs(x[:-1])) + apply(absolute.B, jnp.abs(u)) + absolute.c
     terms = jnp.concatenate([jnp.abs(x[:1]), moved])
@@ -303,14 +301,18 @@ def conditions(s: Stages, u: Array, y: Array) -> Optimality:
     far = absolute.aim._replace(states=-absolute.aim.states, inputs=-absolute.aim.inputs)
     weighed, own_terms = replace(absolute, aim=far).gradient(terms, jnp.abs(u))
     later = jax.lax.cumsum(weighed[1:], reverse=True)
+    back_terms = later + jnp.abs(of_cost) + jnp.abs(of_rows)
+    cost_part = jnp.abs(own + apply_transposed(s.B, of_cost))
+    row_part = jnp.abs(pushed + apply_transposed(s.B, of_rows))
     return Optimality(
-        s.rows(x, u), own + pushed + apply_transposed(s.B, of_cost + of_rows),
-        absolute.rows(terms, jnp.abs(u)),
-        own_terms + absolute.pull(jnp.abs(y))[1]
-        + apply_transposed(absolute.B, later + jnp.abs(of_cost) + jnp.abs(of_rows)),
-        jnp.abs(own + apply_transposed(s.B, of_cost))
-        + jnp.abs(pushed + apply_transposed(s.B, of_rows)),
-    )  # fmt: skip
+        rows=s.rows(x, u),
+        gradient=own + pushed + apply_transposed(s.B, of_cost + of_rows),
+        row_terms=absolute.rows(terms, jnp.abs(u)),
+        gradient_terms=own_terms
+        + absolute.pull(jnp.abs(y))[1]
+        + apply_transposed(absolute.B, back_terms),
+        gradient_size=cost_part + row_part,
+    )
 
 
 def stage_residuals(s: Stages, u: Array, y: Array) -> Terms:
@@ -339,14 +341,12 @@ def stage_residuals(s: Stages, u: Array, y: Array) -> Terms:
     row_terms = found.row_terms + row_size
     gradient_size = found.gradient_size + SHARE * jnp.max(found.gradient_size, axis=0)
     gradient_terms = found.gradient_terms + jnp.max(found.gradient_terms, axis=0)
+    row_sizes = row_size + SHARE * most(row_size)
     return [
-        (
-            bounds.violation(found.rows), row_size + SHARE * most(row_size),
-            row_terms + most(row_terms),
-        ),
+        (bounds.violation(found.rows), row_sizes, row_terms + most(row_terms)),
         (found.gradient.ravel(), gradient_size.ravel(), gradient_terms.ravel()),
         (gap[None], size[None], terms[None]),
-    ]  # fmt: skip
+    ]
 
 
 def measured_pair(eps: Array, s: Stages, u: Array, y: Array) -> Pair:
