@@ -29,6 +29,8 @@ class Box(LinearSet):
         lower, upper: (n,) arrays, in the units of x; -inf and inf for no bound. A number beside an
             array stands for all its coordinates; two numbers are an interval, n = 1, and in an
             `MPC` the bounds of every coordinate.
+
+    All methods but `contains`, `support`, `tightened` and `rows` run in NumPy, not traceable.
     """
 
     lower: Reals
@@ -102,8 +104,7 @@ class Box(LinearSet):
 
     def half_widths(self) -> np.ndarray:
         """Return half the distance between the two ends of each coordinate, (n,); 1 where an end
-        is infinite or both coincide. It is the unit of weights and tolerances. NumPy; not
-        traceable."""
+        is infinite or both coincide. It is the unit of weights and tolerances."""
         lower, upper = self.spread(1).bounds()
         width = (upper - lower) / 2
         return np.where(np.isfinite(width) & (width > 0), width, 1.0)
@@ -116,7 +117,7 @@ class Box(LinearSet):
         return np.eye(self.dimension, dtype=lower.dtype), lower, upper
 
     def half_spaces(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return (H, h) of the rows H x <= h of finite bounds. NumPy; not traceable."""
+        """Return (H, h) of the rows H x <= h of finite bounds."""
         lower, upper = self._checked_bounds()
         identity = np.eye(len(lower))
         above, below = np.isfinite(upper), np.isfinite(lower)
@@ -124,12 +125,11 @@ class Box(LinearSet):
         return rows, np.concatenate([upper[above], -lower[below]])
 
     def to_polytope(self) -> Polytope:
-        """Return the same set as H x <= h, with infinite bounds dropped. NumPy; not traceable."""
+        """Return the same set as H x <= h, with infinite bounds dropped."""
         return Polytope(*self.half_spaces())
 
     def intersect(self, other: LinearSet) -> "Box | Polytope":
-        """Return the points in both sets: a Box with a Box (perhaps empty), else a Polytope. NumPy;
-        not traceable."""
+        """Return the points in both sets: a Box with a Box (perhaps empty), else a Polytope."""
         if not isinstance(other, Box):
             return self.to_polytope().intersect(other)
         lower, upper = self._checked_bounds()
@@ -138,15 +138,13 @@ class Box(LinearSet):
         return Box(np.maximum(lower, lower_too), np.minimum(upper, upper_too))
 
     def vertices(self) -> np.ndarray:
-        """Return the corners (2^n, n); counter-clockwise in 2-D. NumPy; not traceable. Raises
-        ValueError if unbounded."""
+        """Return the corners (2^n, n), counter-clockwise in 2-D; ValueError if unbounded."""
         lower, upper = self._finite_bounds()
         corners = np.array(list(itertools.product(*zip(lower, upper, strict=True))))
         return corners[[0, 2, 3, 1]] if len(lower) == 2 else corners
 
     def volume(self) -> float:
-        """Return the length, area or volume. NumPy; not traceable. Raises ValueError if
-        unbounded."""
+        """Return the length, area or volume; ValueError if unbounded."""
         lower, upper = self._finite_bounds()
         return float(np.prod(upper - lower))
 

@@ -212,8 +212,8 @@ def _equilibrium(step: OneStep, X: Polytope) -> tuple[np.ndarray, float]:
     theirs), negative if a limit is exceeded, -inf if there is none at all.
     """
     n = step.n
-    M = np.hstack([step.A - np.eye(n), step.B @ step.moving])
-    drift = step.c + step.B @ step.fixed
+    M = np.hstack([step.A - np.eye(n), step.B @ step.basis])
+    drift = step.c + step.B @ step.shift
     # In units in which all entries are about 1.
     row, column = scaling(M, np.zeros(n))
     M, drift = row[:, None] * M * column, row * drift
@@ -300,8 +300,8 @@ def _contractive(
 
 def _of_regulator(step: OneStep, X: Polytope, center: np.ndarray) -> Iterator[_Invariant | None]:
     """Yield O_inf of an LQR about the equilibrium (x_e, v_e), where it is invariant."""
-    n, k = step.n, step.moving.shape[1]
-    system = LinearSystem(step.A, step.B @ step.moving)
+    n, k = step.n, step.basis.shape[1]
+    system = LinearSystem(step.A, step.B @ step.basis)
     x_e, v_e = center[:n], center[n:]
     V, input_size = None, np.ones(k)
     if step.V is not None:
@@ -393,7 +393,7 @@ def _vertex_proof(step: OneStep, C: Polytope) -> _VertexProof:
     G, g = C.unit_rows()
     depth = g - G @ C.frame().center
     g = g - supports(step.W, G)
-    BU = step.B @ step.moving
+    BU = step.B @ step.basis
     k = BU.shape[1]
     H, h, room = np.zeros((0, k)), np.zeros(0), np.zeros(0)
     if step.V is not None:
@@ -401,7 +401,7 @@ def _vertex_proof(step: OneStep, C: Polytope) -> _VertexProof:
         room = h - H @ step.V.frame("inputs").center
     rows, depths, worst = np.vstack([G @ BU, H]), np.append(depth, np.zeros(len(H))), 0.0
     for v in vertices:
-        drift = step.A @ v + step.c + step.B @ step.fixed
+        drift = step.A @ v + step.c + step.B @ step.shift
         u, _ = largest_margin(rows, np.append(g - G @ drift, h), depths)
         assert u is not None  # any u within its limits is feasible, with a slack low enough
         worst = max(worst, float(((G @ (drift + BU @ u) - g) / depth).max()))

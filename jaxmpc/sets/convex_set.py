@@ -37,10 +37,6 @@ class ConvexSet(ABC):
         """Raise ValueError, naming `argument`, for fields that describe no set in R^dimension."""
 
     @abstractmethod
-    def contains(self, x: Reals, tolerance: float = 0.0) -> AnyTruth:
-        """Return whether the set, its limits loosened by `tolerance`, holds x (n,)."""
-
-    @abstractmethod
     def support(self, d: Reals) -> AnyNumber:
         """Return max d'x over the set, d (n,); inf where it is unbounded along d."""
 
@@ -62,20 +58,12 @@ class LinearSet(ConvexSet):
         return self
 
     @abstractmethod
-    def rows(self) -> tuple[AnyArray, AnyArray, AnyArray]:
-        """Return (H, lower, upper) of the two-sided rows lower <= H x <= upper."""
-
-    @abstractmethod
     def half_spaces(self) -> tuple[np.ndarray, np.ndarray]:
         """Return (H, h) of the rows H x <= h. NumPy; not traceable."""
 
     @abstractmethod
     def vertices(self) -> np.ndarray:
         """Return the vertices (k, n); ValueError if the set is unbounded."""
-
-    @abstractmethod
-    def volume(self) -> float:
-        """Return the length, area or volume; ValueError if the set is unbounded."""
 
 
 def numbers(*values: Any) -> tuple[ModuleType, list[Any]]:

@@ -64,23 +64,20 @@ class Ellipsoid(ConvexSet):
         return xp.sqrt(level * (along @ solved))
 
     def volume(self) -> float:
-        """Return the length, area or volume: pi^(n/2) / Gamma(n/2 + 1) level^(n/2) / sqrt(det P).
-        NumPy; not traceable."""
+        """Return the volume pi^(n/2) / Gamma(n/2 + 1) level^(n/2) / sqrt(det P). In NumPy."""
         P, level = self._values()
         half = len(P) / 2
         logarithm = half * np.log(np.pi * level) - math.lgamma(half + 1)
         return float(np.exp(logarithm - np.linalg.slogdet(P)[1] / 2))
 
     def bounding_box(self) -> Box:
-        """Return the smallest box around it: |x_i| <= sqrt(level (P^-1)_ii). NumPy; not
-        traceable."""
+        """Return the smallest box around it: |x_i| <= sqrt(level (P^-1)_ii). In NumPy."""
         P, level = self._values()
         reach = np.sqrt(level * np.diag(np.linalg.inv(P)))
         return Box(-reach, reach)
 
     def boundary(self, count: int = 200) -> np.ndarray:
-        """Return points (count, 2) of an ellipse, counter-clockwise, for plots. NumPy, 2-D only;
-        not traceable."""
+        """Return points (count, 2) of an ellipse, counter-clockwise, for plots. In NumPy."""
         P, level = self._values()
         if len(P) != 2:
             fail("Ellipsoid", f"has dimension {len(P)}", "Only an ellipse can be drawn")

@@ -57,7 +57,7 @@ def predecessor(
 class OneStep:
     """x+ = A x + B u + c + w with u in U, w in W (None: w = 0).
 
-    U is {u : u = moving v + fixed, v in V}, with V None if nothing bounds v; where V is a
+    U is {u : u = basis v + shift, v in V}, with V None if nothing bounds v; where V is a
     bounded box, `ends` has (lower, upper) of each v, else it is None.
     """
 
@@ -65,8 +65,8 @@ class OneStep:
     B: np.ndarray
     c: np.ndarray
     V: Polytope | None
-    moving: np.ndarray
-    fixed: np.ndarray
+    basis: np.ndarray
+    shift: np.ndarray
     W: Box | Polytope | None
     ends: np.ndarray | None
 
@@ -77,12 +77,12 @@ class OneStep:
 
     def back(self, target: Polytope, states: Polytope | None = None) -> Polytope:
         """Return the `predecessor` of the target; `states` None stands for all of R^n."""
-        n, k = self.n, self.moving.shape[1]
+        n, k = self.n, self.basis.shape[1]
         T = Polytope(target.H, target.h) if self.W is None else self._shrunk(target, self.W)
         if self.W is not None and T.is_empty():
             return tidy(T)
-        # y in T - B u, where the inputs are u = moving v + fixed
-        T, BU = T.preimage(np.eye(n), self.B @ self.fixed), self.B @ self.moving
+        # y in T - B u, where the inputs are u = basis v + shift
+        T, BU = T.preimage(np.eye(n), self.B @ self.shift), self.B @ self.basis
         many = n in (3, 4) and np.asarray(T.h).size > _MANY
         if k and self.ends is not None and many and T.frame().bounded:
             for b, (lower, upper) in zip(BU.T, self.ends, strict=True):
@@ -123,18 +123,18 @@ def one_step(
     require_kind("system", system, LinearSystem)
     system.validate()
     m = system.m
-    V, moving, fixed, ends = None, np.eye(m), np.zeros(m), None
+    V, basis, shift, ends = None, np.eye(m), np.zeros(m), None
     if inputs is not None:
         hull = affine_hull(*as_polytope("inputs", inputs, m).unit_rows("inputs"))
         assert hull is not None
-        moving, fixed = hull.basis, hull.shift
+        basis, shift = hull.basis, hull.shift
         V = Polytope(hull.G, hull.g) if len(hull.g) else None
     if isinstance(inputs, Box):
         # Each v is one of the inputs.
-        bounds = np.column_stack([*inputs.spread(m).bounds()])[moving.argmax(axis=0)]
+        bounds = np.column_stack([*inputs.spread(m).bounds()])[basis.argmax(axis=0)]
         ends = bounds if np.isfinite(bounds).all() else None
     W = disturbance_set(disturbance, system.n)
-    return OneStep(*host_matrices(system), V, moving, fixed, W, ends)
+    return OneStep(*host_matrices(system), V, basis, shift, W, ends)
 
 
 def _plus_segment(T: Polytope, b: np.ndarray, lower: float, upper: float) -> Polytope:

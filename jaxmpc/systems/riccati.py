@@ -84,13 +84,14 @@ def lqr(system: LinearSystem, Q: Reals, R: Reals) -> LQR:
     Q, R = (Q + Q.T) / 2, (R + R.T) / 2
     weights, axes = np.linalg.eigh(Q)
     output = np.sqrt(np.maximum(weights, 0.0))[:, None] * axes.T  # Q = output'output
-    unmoved, unseen = _rank_tests(A, B), _rank_tests(A.T, output.T)
-    moving = f"does not move {unmoved.described(system.state_names)}"
-    seeing = f"puts no weight on {unseen.described(system.state_names)}"
-    if unmoved.least <= _UNREACHED:
-        fail("B", f"not stabilizable: {moving}", "Actuate that")
-    if unseen.least <= _UNREACHED:
-        fail("Q", f"not detectable: {seeing}", "Give it some")
+    moved, seen = _rank_tests(A, B), _rank_tests(A.T, output.T)
+    (control, _), (cost, _) = _least(moved), _least(seen)
+    unmoved = f"does not move {_described(moved, system.state_names)}"
+    unseen = f"puts no weight on {_described(seen, system.state_names)}"
+    if control <= _UNREACHED:
+        fail("B", f"not stabilizable: {unmoved}", "Actuate that")
+    if cost <= _UNREACHED:
+        fail("Q", f"not detectable: {unseen}", "Give it some")
     try:
         P = _refine(A, B, Q, R, scipy.linalg.solve_discrete_are(A, B, Q, R))
         K = _gain(A, B, R, P)
@@ -98,10 +99,10 @@ def lqr(system: LinearSystem, Q: Reals, R: Reals) -> LQR:
     except (np.linalg.LinAlgError, ValueError):
         radius = np.inf
     if not radius < 1:  # too close to the threshold for the test above: name the likelier cause
-        problem = "so the Riccati equation was not solved"
-        if unmoved.least <= unseen.least:
-            fail("B", f"hardly {moving}, {problem}", "Actuate that")
-        fail("Q", f"hardly {seeing}, {problem}", "Give it some")
+        rest = "so the Riccati equation was not solved"
+        if control <= cost:
+            fail("B", f"hardly {unmoved}, {rest}", "Actuate that")
+        fail("Q", f"hardly {unseen}, {rest}", "Give it some")
     return LQR(K=K, P=P)
 
 
@@ -191,9 +192,9 @@ def _solution(A: Array, B: Array, Q: Array, R: Array) -> Array:
 
 @_solution.defjvp
 @own_modes
-def _solution_jvp(data: tuple[Array, ...], moves: tuple[Array, ...]) -> tuple[Array, Array]:
+def _solution_jvp(data: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
     A, B, Q, R = data
-    dA, dB, dQ, dR = moves
+    dA, dB, dQ, dR = tangents
     P = _solution(A, B, Q, R)
     K = _traced_gain(A, B, R, P)
     closed = A + matmul(B, K)
@@ -218,13 +219,13 @@ def _doubling(A: Array, B: Array, Q: Array, R: Array) -> Array:
         G, H_next = G + matmul(A, matmul(WG, A.T)), H + grown
         return k + 1, matmul(A, WA), (G + G.T) / 2, (H_next + H_next.T) / 2, H
 
-    def moving(carry: tuple[Array, ...]) -> Array:
+    def unfinished(carry: tuple[Array, ...]) -> Array:
         k, *_, H, before = carry
         return (k < _DOUBLINGS) & (_size(H - before) > jnp.finfo(H.dtype).eps * _size(H))
 
     G = matmul(B, solve(R, B.T))
     start: tuple[Array, ...] = (jnp.asarray(0), A, G, Q, jnp.full_like(Q, jnp.inf))
-    P = jax.lax.while_loop(moving, double, varying(start, start))[3]
+    P = jax.lax.while_loop(unfinished, double, varying(start, start))[3]
 
     def recursion(P: Array) -> tuple[Array, Array]:  # as in `_refine`
         K = _traced_gain(A, B, R, P)
@@ -252,11 +253,11 @@ def _power_sum(M: Array, S: Array) -> tuple[Array, Array]:
         k, M, X = carry
         return k + 1, matmul(M, M), X + matmul(M.T, matmul(X, M))
 
-    def moving(carry: tuple[Array, ...]) -> Array:  # below eps one more term changes nothing
+    def unfinished(carry: tuple[Array, ...]) -> Array:  # below eps one more term changes nothing
         return (carry[0] < _DOUBLINGS) & (_size(carry[1]) > jnp.finfo(M.dtype).eps)
 
     start: tuple[Array, ...] = (jnp.asarray(0), M, S)
-    _, M, X = jax.lax.while_loop(moving, double, varying(start, start))
+    _, M, X = jax.lax.while_loop(unfinished, double, varying(start, start))
     return X, _size(M)
 
 
@@ -274,67 +275,54 @@ def _solve_lyapunov(M: Array, S: Array) -> Array:
     )
 
 
+class _RankTest(NamedTuple):
+    """The left singular vectors and values of [A - s I, B] at an eigenvalue s, B scaled to norm 1
+    and the values by max(1, |A|)."""
+
+    eigenvalue: complex
+    vectors: np.ndarray
+    values: np.ndarray
+
+
 def least_reached(A: np.ndarray, B: np.ndarray) -> tuple[float, str]:
-    """Return how far the modes that do not decay are from uncontrollable, and the worst eigenvalue,
-    "none" if all decay: see `_RankTests`."""
-    tests = _rank_tests(A, B)
-    return tests.least, tests.mode
+    """Return how far the modes that do not decay are from uncontrollable, and the worst eigenvalue;
+    (inf, "none") if all decay.
 
-
-class _RankTests(NamedTuple):
-    """Popov-Belevitch-Hautus: all modes that do not decay are reached if [A - s I, B] has full row
-    rank at every eigenvalue |s| >= 1.
-
-    eigenvalues: these s. vectors, values: the left singular vectors and values of each matrix, with
-    B scaled to norm 1 and the values by max(1, |A|); the least value is the distance from a mode
-    that is not reached.
+    Popov-Belevitch-Hautus: all are reached if [A - s I, B] has full row rank at every
+    eigenvalue |s| >= 1. The distance is its least singular value.
     """
-
-    eigenvalues: list[complex]
-    vectors: list[np.ndarray]
-    values: list[np.ndarray]
-
-    @property
-    def least(self) -> float:
-        """Return the least singular value; inf if every mode decays."""
-        return min((float(values[-1]) for values in self.values), default=np.inf)
-
-    @property
-    def mode(self) -> str:
-        """Return the eigenvalue of the least singular value in words; "none" if there is none."""
-        if not self.values:
-            return "none"
-        s = self.eigenvalues[int(np.argmin([values[-1] for values in self.values]))]
-        return f"{s.real:.6g}" if s.imag == 0 else f"{s.real:.6g}{s.imag:+.6g}j"
-
-    def described(self, names: Sequence[str], most: int = 6) -> str:
-        """Return the unreached modes in words: the worst eigenvalue, and the coordinates in which a
-        left null vector of a test, or of the one that comes nearest to one, has more than a tenth
-        of its largest entry."""
-        if not self.values:
-            return f"a mode (eigenvalue {self.mode})"
-        bound = max(_UNREACHED, self.least)
-        found: set[int] = set()
-        for vectors, values in zip(self.vectors, self.values, strict=True):
-            for entries in np.abs(vectors[:, values <= bound]).T:
-                found |= set(np.flatnonzero(entries > 0.1 * entries.max()).tolist())
-        words = [names[i] if names else f"coordinate {i}" for i in sorted(found)]
-        rest = f" and {len(words) - most} more" if len(words) > most else ""
-        return f"{', '.join(words[:most])}{rest} (eigenvalue {self.mode})"
+    return _least(_rank_tests(A, B))
 
 
-def _rank_tests(A: np.ndarray, B: np.ndarray) -> _RankTests:
-    """Test the rank of [A - s I, B] at each eigenvalue that does not decay."""
+def _rank_tests(A: np.ndarray, B: np.ndarray) -> list[_RankTest]:
+    """Return a test for each eigenvalue |s| >= 1."""
     B = B / max(np.linalg.norm(B, 2), np.finfo(np.float64).tiny)
     # A k-fold eigenvalue is computed as a ring of radius eps^(1/k); its mean is accurate.
     computed = np.linalg.eigvals(A)
     means = [computed[np.abs(computed - s) < 1e-4].mean() for s in computed]
-    size = max(1.0, np.linalg.norm(A, 2))
-    tests = _RankTests([], [], [])
+    size, tests = max(1.0, np.linalg.norm(A, 2)), []
     for s in np.unique(np.concatenate([computed, means])):
         if abs(s) >= 1 - 1e-12:
             vectors, values, _ = np.linalg.svd(np.hstack([A - s * np.eye(len(A)), B]))
-            tests.eigenvalues.append(complex(s))
-            tests.vectors.append(vectors)
-            tests.values.append(values / size)
+            tests.append(_RankTest(complex(s), vectors, values / size))
     return tests
+
+
+def _least(tests: list[_RankTest]) -> tuple[float, str]:
+    if not tests:
+        return np.inf, "none"
+    s, _, values = min(tests, key=lambda test: test.values[-1])
+    text = f"{s.real:.6g}" if s.imag == 0 else f"{s.real:.6g}{s.imag:+.6g}j"
+    return float(values[-1]), text
+
+
+def _described(tests: list[_RankTest], names: Sequence[str], most: int = 6) -> str:
+    """Return the unreached modes in words: the coordinates in which a left null vector of a test,
+    or of the test that comes nearest to one, has more than a tenth of its largest entry."""
+    least, mode = _least(tests)
+    unreached = [test.vectors[:, test.values <= max(_UNREACHED, least)] for test in tests]
+    entries = np.abs(np.hstack(unreached)) if tests else np.zeros((0, 1))
+    large = np.any(entries > 0.1 * entries.max(axis=0, initial=0.0), axis=1)
+    found = [names[i] if names else f"coordinate {i}" for i in np.flatnonzero(large).tolist()]
+    more = f" and {len(found) - most} more" if len(found) > most else ""
+    return f"{', '.join(found[:most]) or 'a mode'}{more} (eigenvalue {mode})"
