@@ -165,3 +165,15 @@ def _listed(which: np.ndarray, names: tuple[str, ...], most: int = 6) -> str:
     """Return the first names, and how many more there are."""
     found = [names[i] for i in which]
     return ", ".join(found[:most]) + (f" and {len(found) - most} more" if found[most:] else "")
+
+
+def robot_references(
+    robot: Robot | LinearPlant, target: Reals | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return reference (n,) and input_reference (m,) with which a robot rests at the target, as in
+    `robot_mpc`, which warns where it cannot."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        state, inputs = robot.set_point(target)
+    with jax.enable_x64(True):
+        return np.asarray(robot.coordinates(state)), np.asarray(inputs)

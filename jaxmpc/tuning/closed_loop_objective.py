@@ -40,8 +40,8 @@ Data = tuple[np.ndarray, dict[str, np.ndarray]]
 class ClosedLoopObjective:
     """The mean loss of closed loops as a function of θ.
 
-    build: values → controller. plant: from `as_argument`. steps: samples of a loop. The rest as in
-    `tune_weights`.
+    build: values → controller. plant: from `as_argument`. steps: time steps of a loop. The rest as
+    in `tune_weights`.
     """
 
     build: Callable[[Mapping[str, Any]], Any]

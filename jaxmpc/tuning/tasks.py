@@ -6,7 +6,6 @@ inwards. All is checked before a closed loop compiles.
 """
 
 import dataclasses
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +18,7 @@ from jaxmpc.checks import fail
 from jaxmpc.closed_loop.many import simulate_many
 from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.closed_loop.robot_controller import RobotController
+from jaxmpc.closed_loop.robot_problem import robot_references
 from jaxmpc.closed_loop.run import Run
 from jaxmpc.closed_loop.variations import plant_numbers
 from jaxmpc.mpc.condense import prestabilising_gain
@@ -250,7 +250,7 @@ def robot_task(
     mpc: of `robot_mpc` for this target. x0s, factors: of `draw_robots`; the MPC keeps
     the nominal model. linearize, rho, solver: of `RobotController`. The rest as in `linear_task`.
     """
-    reference, input_reference = set_point(robot, target)
+    reference, input_reference = robot_references(robot, target)
     loss = weight_loss(mpc.Q, mpc.R, robot.state_limits, reference, input_reference, robot, **terms)
     variations = plant_numbers(robot, dict(factors or {}))
     if variations:
@@ -280,15 +280,6 @@ def robot_task(
         limits=robot.state_limits,
         mpc=mpc,
     )
-
-
-def set_point(robot: Robot, target: Reals | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coordinates (n,) and inputs (m,) at which a robot rests at the target."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # robot_mpc has said the same
-        state, inputs = robot.set_point(target)
-    with jax.enable_x64(True):
-        return np.asarray(robot.coordinates(state)), np.asarray(inputs)
 
 
 def weight_loss(

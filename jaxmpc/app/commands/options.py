@@ -85,6 +85,30 @@ Devices = Annotated[
         "K", "JAX's default device", "Share the work among the first K devices of this machine."
     ),
 ]
+RobotMass = Annotated[
+    float,
+    option(
+        "FRACTION",
+        "0",
+        "Each body's mass and inertia times a number from 1 - FRACTION to 1 + FRACTION, different "
+        "for each robot. The MPC does not know: it has the model of the file.",
+    ),
+    SHARE,
+]
+RobotDamping = Annotated[
+    float,
+    option(
+        "FRACTION",
+        "0",
+        "Each joint's damping times a number from 1 - FRACTION to 1 + FRACTION.",
+    ),
+    SHARE,
+]
+Payload = Annotated[
+    float,
+    option("KG", "0", 'Mass from 0 to KG at the site "tool" of the model; the MPC does not know.'),
+    MASS,
+]
 Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff, option(None, "off")]
 Resume = Annotated[
     bool, tyro.conf.FlagCreatePairsOff, option(None, "off", "Resume the run in --output.")

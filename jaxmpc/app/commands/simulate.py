@@ -3,7 +3,6 @@
 import dataclasses
 import importlib
 import os
-import warnings
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,14 +13,17 @@ from jaxmpc.app.commands.compiling import Compiling
 from jaxmpc.app.commands.film import choose_renderer, film
 from jaxmpc.app.commands.options import (
     FINITE,
-    MASS,
     POSITIVE,
     SHARE,
     WHOLE_OR_PART,
     Devices,
     Overwrite,
+    Payload,
     Resume,
+    RobotDamping,
+    RobotMass,
     Values,
+    arguments,
     at_least,
     option,
     print_table,
@@ -32,7 +34,8 @@ from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, require_disk, require_memory, require_package
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
 from jaxmpc.closed_loop.robot_controller import RobotController
-from jaxmpc.closed_loop.robot_problem import robot_mpc
+from jaxmpc.closed_loop.robot_problem import robot_mpc, robot_references
+from jaxmpc.closed_loop.run import Run
 from jaxmpc.closed_loop.runs_summary import summarise_runs
 from jaxmpc.closed_loop.stored_runs import simulate_into
 from jaxmpc.closed_loop.variations import draw_robots
@@ -44,6 +47,7 @@ from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.robots.robot import Robot
 from jaxmpc.systems.riccati import lqr
 
+FILES = ("summary.json", "runs.png", "robots.gif")
 # Defaults of options that --config can give too.
 USUAL = {"horizon": 20, "margin": 0.02, "linearize": "state", "rho": 1e4}
 
@@ -54,7 +58,7 @@ class Simulate:
 
     What it does
       Puts many copies of a robot at random states, each with its own masses if wanted, and
-      drives all of them to a target: physics by MuJoCo MJX, at each sample a linear model and an
+      drives all of them to a target: physics by MuJoCo MJX, at each time step a linear model and an
       MPC that keeps joint, velocity and torque limits. Then assesses every run by its own
       states and inputs, not by what the MPC planned.
       Limits that a plan cannot keep are violated at the cost --rho (fallback), and counted.
@@ -62,14 +66,14 @@ class Simulate:
     How to start
       $ jaxmpc simulate
       $ jaxmpc simulate --robot arm7 --count 256 --seconds 1 --mass 0.1 --output runs/a
-      It compiles before the first samples, and says for how long so far. What is compiled is kept
+      It compiles before the first steps, and says for how long so far. What is compiled is kept
       for the next time in ~/.cache/jaxmpc/programs (with JAXMPC_CACHE=off nothing is; with
       JAX_COMPILATION_CACHE_DIR it is there).
 
     How to read the table
       success        robots that kept all limits and ended at the target: each coordinate within
                      --tolerance of half its range (limits' half-width; 1 where it has none)
-      limits kept    robots with all states and inputs within the limits at all samples, to 1e-6
+      limits kept    robots with all states and inputs within the limits at all time steps, to 1e-6
                      (1e-6 of the limit, where that is above 1). The margin is not counted in.
       plans valid    robots all of whose plans were solved without fallback; how many kept limits
       worst          the largest violation relative to half the range, in its own unit
@@ -151,13 +155,9 @@ class Simulate:
     newton_steps: Annotated[int | None, option("K", "as many as are needed"), at_least(0)] = None
     """Newton steps after them at most. A number bounds the time of a plan and gives up the
     interior point method, which solves what Newton steps do not."""
-    mass: Annotated[float, option("FRACTION", "0"), SHARE] = 0.0
-    """Each body's mass and inertia times a number from 1 - FRACTION to 1 + FRACTION.
-    The MPC does not know: it has the model of the file."""
-    damping: Annotated[float, option("FRACTION", "0"), SHARE] = 0.0
-    """Each joint's damping times a number from 1 - FRACTION to 1 + FRACTION."""
-    payload: Annotated[float, option("KG", "0"), MASS] = 0.0
-    """Mass from 0 to KG at the site "tool" of the model; the MPC does not know."""
+    mass: RobotMass = 0.0
+    damping: RobotDamping = 0.0
+    payload: Payload = 0.0
     tolerance: Annotated[float, option("FRACTION", "0.02"), POSITIVE] = 0.02
     """How near the target counts as there, as a fraction of half the range."""
     dtype: Annotated[Literal["float32", "float64"], option("{float32,float64}", "float32")] = (
@@ -191,29 +191,16 @@ class Simulate:
         command.require_sizes(robot)
         file = {} if self.config is None else load_robot_config(self.config).weights(robot)
         target = None if self.target is None else np.array(self.target)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # robot_mpc says the same
-            x, input_reference = robot.set_point(target)
+        reference, input_reference = robot_references(robot, target)
         steps = max(1, round(self.seconds / robot.dt))
         each = 256 if jax.default_backend() == "cpu" else 4096
         chunk = self.chunk or (self.devices or 1) * each
+        open_folder(self.output)
         with Compiling() as wait:
             wait.begin(f"closed loops of {robot.name}", programs=1)
             mpc = command.problem(robot, target, file)
-            with jax.enable_x64(True):
-                reference = np.asarray(robot.coordinates(x))
-            starts, factors = draw_robots(
-                robot,
-                self.count,
-                self.seed,
-                spread=self.spread,
-                mass=self.mass,
-                damping=self.damping,
-                payload=self.payload,
-            )
-            open_folder(self.output)
+            starts, factors = draw_robots(robot, **arguments(self, draw_robots, leave=("robot",)))
             print(f"{robot.name}: {self.count:,} robots for {self.seconds:g} s -> {self.output}")
-            old = "summary.json", "runs.png", "robots.gif"
             with jax.enable_x64(self.dtype == "float64"):
                 runs = simulate_into(
                     path,
@@ -226,25 +213,28 @@ class Simulate:
                     factors=factors,
                     settings=command.settings(robot, mpc),
                     chunk=chunk,
-                    devices=self.devices,
-                    resume=self.resume,
-                    overwrite=self.overwrite,
                     progress=True,
-                    begun=lambda: remove_files(self.output, *old),
+                    begun=lambda: remove_files(self.output, *FILES),
+                    **arguments(self, simulate_into, leave=("chunk",)),
                 )
         summary = summarise_runs(runs, robot, reference, input_reference, tolerance=self.tolerance)
-        files = ["runs.zarr", "summary.json", "runs.png"]
+        write_json(self.output / "summary.json", summary.data)
+        files = ["runs.zarr", *self.draw(runs.run, robot, reference, input_reference)]
+        rows = [*summary.rows(), ("files", " ".join(str(self.output / name) for name in files))]
+        print_table(rows, 13)
+
+    def draw(
+        self, run: Run, robot: Robot, reference: np.ndarray, input_reference: np.ndarray
+    ) -> list[str]:
+        """Write picture and video, and return the names of the files beside the runs."""
         from jaxmpc.app.plots.closed_loops import plot_runs
         from jaxmpc.app.plots.style import save
 
-        figure = plot_runs(runs.run, robot, reference=reference, input_reference=input_reference)
+        figure = plot_runs(run, robot, reference=reference, input_reference=input_reference)
         save(figure, self.output / "runs.png")
         video = self.output / "robots.gif"
-        if self.video and film(robot, runs.run, reference, self.video, video):
-            files.append("robots.gif")
-        write_json(self.output / "summary.json", summary.data)
-        rows = [*summary.rows(), ("files", " ".join(str(self.output / name) for name in files))]
-        print_table(rows, 13)
+        filmed = self.video and film(robot, run, reference, self.video, video)
+        return [*FILES[:2], *(["robots.gif"] if filmed else [])]
 
     def robot_of_file(self) -> Robot:
         """Return the robot; raise ValueError where options do not fit it."""

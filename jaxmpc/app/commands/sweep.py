@@ -94,7 +94,7 @@ class Sweep:
       [cost]    Q, R, P = "lqr" | "Q" | "none" | matrix; a flat list is a diagonal; optional rho,
                 the L1 weight of soft limits, a number or "exact" (jaxmpc info; sets stay hard)
       [mpc]     horizon; optional terminal, constrain_initial = false (no limits at k = 0),
-                control_horizon (free moves, the last one is held)
+                control_horizon (free inputs, the last one is held)
       and what jaxmpc tune writes, see its help: [limits] margin, [mpc] H_f, h_f or P_f, level_f,
       [solver]
       [sweep]   all optional: grid, lower, upper, axes, fixed, projection, iterations, dtype

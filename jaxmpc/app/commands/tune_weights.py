@@ -23,11 +23,11 @@ class TuneWeights(WeightOptions):
 
     What it does
       Draws initial states, simulates the closed loop from each, and moves the weights down the
-      gradient of the mean loss: through plant, limits and solver, all samples of all loops. With
+      gradient of the mean loss: through plant, limits and solver, all steps of all loops. With
       e = x - target, v = u - input of the target and the weights Q, R from BEFORE tuning, the loss
       of a loop is
-        mean over samples of e'Q e + v'R v + violation * (sum of violations of state limits)
-        + settling * (samples until |e| stays within the tolerance)
+        mean over time steps of e'Q e + v'R v + violation * (sum of violations of state limits)
+        + settling * (time steps until |e| stays within the tolerance)
       so that the horizon, the limits and what the model leaves out decide what the controller's
       own weights should be. Some of the loops (--validation) are the validation set: the result is
       the step of least loss on these, or the start where no step is better.
@@ -98,7 +98,7 @@ class TuneWeights(WeightOptions):
         task, options = problem.task, self.record(problem)
         folder = run_folder(self.output, FILES, options, self.resume, self.overwrite)
         with folder as checkpoint, Compiling() as wait:
-            loops = f"{len(task.x0s)} closed loops of {task.steps} samples"
+            loops = f"{len(task.x0s)} closed loops of {task.steps} time steps"
             print(f"{task.name}: {', '.join(self.tune)} from {loops} -> {self.output}", flush=True)
             wait.begin(f"closed loops of {task.name} and their gradient", programs=2)
             stopped = False

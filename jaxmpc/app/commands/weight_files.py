@@ -13,7 +13,7 @@ from jaxmpc.app.commands.options import arguments, given_options, require_length
 from jaxmpc.app.commands.weight_options import WeightOptions
 from jaxmpc.checks import MOST_COUNT, fail, require_memory
 from jaxmpc.closed_loop.robot_controller import RobotController
-from jaxmpc.closed_loop.robot_problem import robot_mpc
+from jaxmpc.closed_loop.robot_problem import robot_mpc, robot_references
 from jaxmpc.closed_loop.variations import draw_robots
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
@@ -27,7 +27,6 @@ from jaxmpc.tuning.tasks import (
     WeightTask,
     linear_task,
     robot_task,
-    set_point,
     weight_loss,
     weight_parameters,
 )
@@ -141,7 +140,7 @@ def problem_of_robot(command: WeightOptions) -> WeightProblem:
         rho=rho,
         margin=section.margin,
         limits=robot.state_limits,
-        target=set_point(robot, target)[0],
+        target=robot_references(robot, target)[0],
     )
     task = robot_task(
         robot,

@@ -5,14 +5,16 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from jaxmpc.app.commands.options import (
-    MASS,
     NOT_NEGATIVE,
     PART,
     POSITIVE,
     SHARE,
     Horizon,
     Overwrite,
+    Payload,
     Resume,
+    RobotDamping,
+    RobotMass,
     Terminal,
     Values,
     at_least,
@@ -50,7 +52,7 @@ class WeightOptions:
     validation: Annotated[float, option("FRACTION", "0.25"), PART] = 0.25
     """Fraction of the initial states in the validation set."""
     steps: Annotated[int | None, option("K", "50; robots: 1 s"), at_least(1)] = None
-    """Length of the closed loops in samples."""
+    """Length of the closed loops in time steps."""
     seconds: Annotated[float | None, option("S", "none: --steps"), POSITIVE] = None
     """Length of the closed loops in seconds."""
     optimizer: Annotated[str, option("NAME", "adam")] = "adam"
@@ -69,7 +71,7 @@ class WeightOptions:
     violation: Annotated[float, option("W", "10"), NOT_NEGATIVE] = 10.0
     """Weight in the loss of violations of state limits, as fractions of half the range."""
     settling: Annotated[float, option("W", "0"), NOT_NEGATIVE] = 0.0
-    """Weight in the loss of the time to settle, for each sample."""
+    """Weight in the loss of the time to settle, for each time step."""
     tolerance: Annotated[float, option("FRACTION", "0.02"), POSITIVE] = 0.02
     """Distance that counts as at the target, as a fraction of half the range of each state."""
     lower: Annotated[tuple[float, ...] | None, option("X [X ...]", "state limits x --spread")] = (
@@ -95,13 +97,9 @@ class WeightOptions:
         option("{set-point,state,trajectory}", "from the file, else state"),
     ] = None
     """With --robot: where the linear models are taken; see jaxmpc simulate."""
-    mass: Annotated[float, option("FRACTION", "0"), SHARE] = 0.0
-    """With --robot: masses and inertias are multiplied by numbers from 1 - FRACTION to
-    1 + FRACTION, different in each loop; the MPC keeps the nominal model."""
-    damping: Annotated[float, option("FRACTION", "0"), SHARE] = 0.0
-    """With --robot: the same for the damping of each joint."""
-    payload: Annotated[float, option("KG", "0"), MASS] = 0.0
-    """With --robot: mass from 0 to KG at the site "tool"; the MPC keeps the nominal model."""
+    mass: RobotMass = 0.0
+    damping: RobotDamping = 0.0
+    payload: Payload = 0.0
     iterations: Annotated[int | None, option("K", "[solver], else 50; robots 0"), at_least(1)] = (
         None
     )

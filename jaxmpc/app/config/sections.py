@@ -90,7 +90,7 @@ class MPCSection:
     h_f: Vector | None = None  # (r,)
     P_f: Matrix | None = None  # (n, n): x_N'P_f x_N <= level_f
     level_f: Annotated[Number, Field(gt=0)] | None = None
-    control_horizon: Annotated[Whole, Field(ge=1)] | None = None  # free moves
+    control_horizon: Annotated[Whole, Field(ge=1)] | None = None  # free inputs
     constrain_initial: Switch = True  # False: no state limits at k = 0
 
 
