@@ -46,7 +46,7 @@ SINGULAR = {8: 1e-10, 4: 1e-6}
 # Beside which eigenvalue, relative to the mean, range and null space are told apart.
 SPLIT = 1e-6
 # ADMM steps, and those from a warm start, from which Newton steps mostly could begin at once.
-STEPS, STEPS_WARM = 50, 10
+ADMM_STEPS, WARM_STEPS = 50, 10
 # Rounds of equilibration; half as many decades of an entry's size are left after each.
 EQUILIBRATIONS = 10
 # Ridge of ADMM's system, relative, where P is singular.
@@ -87,11 +87,11 @@ class ADMM:
 
     iterations: int | None = static(default=None)
     rho: Any = None
-    alpha: Any = 1.9
+    alpha: float | Array = 1.9
     newton_steps: int | None = static(default=None)
-    eps: Any = 1e-6
+    eps: float | Array = 1e-6
     differentiate: str = static(default="implicit")
-    smoothing: Any = 0.0
+    smoothing: float | Array = 0.0
     fixed: bool = static(default=False)
     dtype: str | None = static(default=None)
 
@@ -139,7 +139,7 @@ class ADMM:
         if self.iterations is not None:
             return self.iterations
         few = warm and self.most_newton_steps() > 0 and self.differentiate != "unrolled"
-        return STEPS_WARM if few and np.ndim(self.rho) < 2 else STEPS
+        return WARM_STEPS if few and np.ndim(self.rho) < 2 else ADMM_STEPS
 
     def most_newton_steps(self, default: int = 1000) -> int:
         """Return how many Newton steps there are at most: `newton_steps`, or where that is None
@@ -227,7 +227,7 @@ def units(curvature: Array, A: Array) -> Array:
     A, curved = jnp.abs(A), curvature > 0
     root = lambda v: jnp.sqrt(jnp.where(v > 0, v, 1.0))
 
-    def advance(_: Any, scales: tuple[Array, Array]) -> tuple[Array, Array]:
+    def advance(_: Array, scales: tuple[Array, Array]) -> tuple[Array, Array]:
         d, e = scales
         M = e[:, None] * A * d
         rows, columns = (jnp.max(M, axis=axis, initial=0.0) for axis in (1, 0))
@@ -236,7 +236,7 @@ def units(curvature: Array, A: Array) -> Array:
     there = A > 0
     logarithms = jnp.log(jnp.where(there, A, 1.0))
 
-    def centre(scales: tuple[Array, Array], _: Any) -> tuple[tuple[Array, Array], None]:
+    def centre(scales: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         d, e = scales
         mean = lambda M, axis: (
             jnp.sum(jnp.where(there, M, 0.0), axis) / jnp.maximum(jnp.sum(there, axis), 1)
@@ -361,7 +361,7 @@ def convex(P: Array) -> Array:
     return precisely(factored, jax.lax.stop_gradient(P))
 
 
-def scaled(factor: Factor, qp: QP, unit: Any = None) -> tuple[Array, Bounds, Array]:
+def scaled(factor: Factor, qp: QP, unit: Array | None = None) -> tuple[Array, Bounds, Array]:
     """q and bounds in ADMM's coordinates, and their unit, where it is not given. A zero row (scale
     0) is free there; `prove` and `residual_terms` look after it.
 
@@ -424,7 +424,7 @@ class Splitting(NamedTuple):
     image: Callable[[Array], Array]
     offset: Array
 
-    def step(self, t: Array, bounds: Bounds, alpha: Any) -> Array:
+    def step(self, t: Array, bounds: Bounds, alpha: Array | float) -> Array:
         """One ADMM step on t = s + v (m,)."""
         s = bounds.project(t, self.rho)
         return t + jnp.asarray(alpha, t.dtype) * (self.image(2 * s - t) + self.offset - s)
@@ -442,7 +442,7 @@ def splittings(factor: Factor, q: Array) -> list[Splitting]:
 
 
 def iterate(
-    schedule: Sequence[Splitting], bounds: Bounds, t: Array, iterations: int, alpha: Any
+    schedule: Sequence[Splitting], bounds: Bounds, t: Array, iterations: int, alpha: Array | float
 ) -> tuple[Array, Array]:
     """Run the fixed loop from t (m,), equally many steps with each splitting; the last two t."""
     previous, before = t, None

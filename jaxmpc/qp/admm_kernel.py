@@ -190,8 +190,8 @@ class TileBounds:
             radius = tile.load(radius_ref, places[0], other=jnp.inf)
             balls = radius, _block(same, places[0], places[0], None)
         columns = list(zip(refs, FREE, strict=False))
-        pieces = [(tile.load(ref, i, other=free) for ref, free in columns) for i in places]
-        return cls(list(map(Bounds.of_rows, pieces)), dot, balls)
+        at = lambda i: Bounds.of_rows(tile.load(ref, i, other=free) for ref, free in columns)
+        return cls([at(i) for i in places], dot, balls)
 
     def project(self, t: Parts, rho: Parts) -> Parts:
         """Return prox(t) of g/rho."""

@@ -25,7 +25,7 @@ Which element of the generalised derivative is taken, and what it means where no
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -68,7 +68,7 @@ def _implicit_jvp(conditions_of: Conditions, primals: tuple, tangents: tuple) ->
         conditions, undo = conditions_of(data, constants, z, y)
         return undo(jax.jvp(conditions, (data,), (change,))[1])
 
-    # Going backward, all but these arguments is computed then: kept, it would be several times as
+    # Going backward, all but these arguments is computed then: held, it would be several times as
     # much for each solve of a closed loop.
     return (z, y), jax.checkpoint(moved)(data, constants, z, y, tangents[0])
 
@@ -85,17 +85,17 @@ def dense_conditions(
     _, bounds, unit = scaled(factor, qp)
     v, y_w = scaled_rows(factor, qp, unit, z, y)
     # μ is a product of a slack and a multiplier, each of which is measured in the unit.
-    upper, lower, kept = activity(bounds, v, y_w, smoothing / unit**2, rho)
+    upper, lower, others = activity(bounds, v, y_w, smoothing / unit**2, rho)
 
     def conditions(qp: QP) -> tuple[Array, Array]:
         bounds = qp.bounds.scaled(E).divided(unit)
         v = E * matmul(z, qp.A.T) / unit
         sides = upper * (v - bounds.u) + lower * (v - bounds.l)
-        rows = jnp.where(kept, bounds.prox_residual(v + y_w / rho, rho), sides)
+        rows = jnp.where(others, bounds.prox_residual(v + y_w / rho, rho), sides)
         return matmul(matmul(z, qp.P) + qp.q + matmul(y, qp.A), T) / unit, rows
 
     weights, normals = bounds.curvature(v + y_w / rho, rho)
-    weights = jnp.where(kept, weights, upper + lower)
+    weights = jnp.where(others, weights, upper + lower)
     inverse = linearised(H, A, weights, normals, rho, factor.flat)
 
     def undo(moved: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -105,16 +105,21 @@ def dense_conditions(
     return conditions, undo
 
 
-def activity(
-    bounds: Bounds, v: Array, y: Array, smoothing: Any, rho: float
-) -> tuple[Array, Array, Array]:
-    """How far each hard row counts as active, with the choices made at the top of this file:
-    weights in [0, 1] of its upper and its lower bound. And the other rows (soft ones, balls),
-    whose prox residual is kept as it is."""
+class Activity(NamedTuple):
+    """How far each hard row counts as active: weights in [0, 1] of its upper and its lower bound;
+    and which rows are others (soft ones, balls), whose prox residual stands as it is."""
+
+    upper: Array
+    lower: Array
+    others: Array
+
+
+def activity(bounds: Bounds, v: Array, y: Array, smoothing: float | Array, rho: float) -> Activity:
+    """Return how far rows count as active, with the choices made at the top of this file."""
     precision = jnp.finfo(v.dtype).eps
-    kept = jnp.arange(v.shape[0]) >= v.shape[0] - sum(bounds.balls)
+    others = jnp.arange(v.shape[0]) >= v.shape[0] - sum(bounds.balls)
     if bounds.linear is not None:
-        kept = kept | jnp.isfinite(bounds.linear)
+        others = others | jnp.isfinite(bounds.linear)
 
     # Multipliers at rounding level are none.
     pushes = jnp.abs(y) > precision**0.75 * (1 + jnp.max(jnp.abs(y), initial=0.0))
@@ -141,8 +146,6 @@ def activity(
     below = stiffness(v - bounds.l, jnp.maximum(-y, 0.0))
     rounded = (smoothing > 0) & ~equal & ~spring
     total = rho + above + below
-    return (
-        jnp.where(kept, 0.0, jnp.where(rounded, above / total, upper)),
-        jnp.where(kept, 0.0, jnp.where(rounded, below / total, lower)),
-        kept,
-    )
+    upper = jnp.where(others, 0.0, jnp.where(rounded, above / total, upper))
+    lower = jnp.where(others, 0.0, jnp.where(rounded, below / total, lower))
+    return Activity(upper, lower, others)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -56,7 +55,7 @@ def linearised(
 
     constants, own = jax.lax.stop_gradient(((H, A, flat), (weights, active, slack)))
 
-    def approach(_: Any, b: Array) -> Array:
+    def approach(_: Callable, b: Array) -> Array:
         return jnp.concatenate(approximate(rho, constants, own, (b[:n], b[n:])))
 
     def solver(a: Array, c: Array) -> tuple[Array, Array]:
@@ -79,7 +78,7 @@ def swept(
 ) -> tuple[Array, Array]:
     """Return (dw, dy) of `linearised` by eight steps of the method of multipliers; inverse: K⁻¹."""
 
-    def sweep(carry: tuple[Array, Array], _: None) -> tuple[Any, None]:
+    def sweep(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         dw, dy = carry
         rows = D(matmul(dw, A.T) + dy / rho) + c - dy / rho
         gradient = a + matmul(dw, H) + matmul(dy, A)

@@ -8,7 +8,7 @@ number of steps, not of the largest. Nothing returns to the host in between.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,10 @@ from jax import Array, lax
 from jax.custom_batching import custom_vmap
 
 from jaxmpc.qp.modes import own_modes, varying
+
+C = TypeVar("C")
+S = TypeVar("S")
+R = TypeVar("R")
 
 # Of a loop: see `repeat_while`.
 Steps = Literal["short", "long", "stages"]
@@ -60,13 +64,12 @@ def group_sizes(batch: int, steps: Steps = "short") -> list[int]:
 
 
 def in_blocks(
-    function: Callable,
-    constants: Any,
-    data: Any,
-    *,
-    kernel: Callable | None = None,
+    function: Callable[[C, S], R],
+    constants: C,
+    data: S,
+    kernel: Callable[[C, S], R] | None = None,
     large: int | None = None,
-) -> Any:
+) -> R:
     """Return function(constants, data), for a batch on a CPU in blocks, one after the other.
 
     kernel: the same of a batch, (constants, data with the batch in front), as a kernel for NVIDIA
@@ -77,12 +80,12 @@ def in_blocks(
 
     @one.def_vmap
     @own_modes
-    def _(size: int, in_batched: Any, constants: Any, data: Any) -> Any:
+    def _(size: int, in_batched: tuple, constants: C, data: S) -> tuple[R, Any]:
         axes = jax.tree.map(lambda b: 0 if b else None, in_batched[0])
         data = _broadcast(size, in_batched[1], data)
-        together = lambda constants, data: jax.vmap(function, in_axes=(axes, 0))(constants, data)
+        together = jax.vmap(function, in_axes=(axes, 0))
 
-        def blocks(block: int, constants: Any, data: Any) -> Any:
+        def blocks(block: int, constants: C, data: S) -> R:
             if size <= block:
                 return together(constants, data)
             missing = -size % block
@@ -93,19 +96,21 @@ def in_blocks(
 
         small = not isinstance(size, int) or (size <= BLOCK and kernel is None)
         if any(jax.tree.leaves(in_batched[0])) or small:
-            out = together(constants, data)
-        else:
-            others = {} if kernel is None else {"cuda": kernel}
-            cpu, default = partial(blocks, BLOCK), partial(blocks, large or size)
-            out = lax.platform_dependent(constants, data, cpu=cpu, default=default, **others)
-        return out, jax.tree.map(lambda _: True, out)
+            return _batched(together(constants, data))
+        others = {} if kernel is None else {"cuda": kernel}
+        cpu, default = partial(blocks, BLOCK), partial(blocks, large or size)
+        return _batched(lax.platform_dependent(constants, data, cpu=cpu, default=default, **others))
 
     return one(constants, data)
 
 
 def repeat_while(
-    is_open: Callable, step: Callable, constants: Any, state: Any, steps: Steps = "short"
-) -> Any:
+    is_open: Callable[[S], Array],
+    step: Callable[[C, S], S],
+    constants: C,
+    state: S,
+    steps: Steps = "short",
+) -> S:
     """Return `state` after state = step(constants, state) while is_open(state), a scalar.
 
     The functions must close over no arrays: what they read stands in `constants`. One instance is
@@ -119,75 +124,78 @@ def repeat_while(
 
     @single.def_vmap
     @own_modes
-    def _(size: int, in_batched: Any, constants: Any, state: Any) -> Any:
+    def _(size: int, in_batched: tuple, constants: C, state: S) -> tuple[S, Any]:
         leaves, tree = jax.tree.flatten(constants)
         batched = tuple(jax.tree.leaves(in_batched[0]))
         state = _broadcast(size, in_batched[1], state)
-        out = _in_groups(is_open, step, tree, batched, steps)(tuple(leaves), state)
-        return out, jax.tree.map(lambda _: True, out)
+        advance = lambda leaves, state: step(jax.tree.unflatten(tree, leaves), state)
+        return _batched(_in_groups(is_open, advance, batched, steps)(tuple(leaves), state))
 
     return single(constants, state)
 
 
 def _in_groups(
-    is_open: Callable, step: Callable, tree: Any, batched: tuple[bool, ...], steps: Steps
-) -> Callable:
+    is_open: Callable[[S], Array],
+    step: Callable[[tuple, S], S],
+    batched: tuple[bool, ...],
+    steps: Steps,
+) -> Callable[[tuple, S], S]:
     """Return the loop for a batch, (leaves of the constants, states) → states. batched: which
     leaves have the batch axis."""
-    axes = tuple(0 if b else None for b in batched)
+    many = jax.vmap(step, in_axes=(tuple(0 if b else None for b in batched), 0))
+    open_ones = jax.vmap(is_open)
 
-    def run(leaves: tuple, state: Any) -> Any:
+    def advance_all(leaves: tuple, state: S) -> S:
+        found, on = many(leaves, state), open_ones(state)
+        choose = lambda new, old: jnp.where(on.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+        return jax.tree.map(choose, found, state)
+
+    def advance_group(leaves: tuple, count: int, state: S) -> S:
+        where = true_places(open_ones(state), count)
+        taken = lambda v: v.at[where].get(mode="clip")
+        part = tuple(taken(v) if b else v for v, b in zip(leaves, batched, strict=True))
+        found = many(part, jax.tree.map(taken, state))
+        put = lambda old, new: old.at[where].set(new, mode="drop")
+        return jax.tree.map(put, state, found)
+
+    def run(leaves: tuple, state: S) -> S:
         size = jax.tree.leaves(state)[0].shape[0]
         if not size:
             return state
-        advance = lambda leaves, state: step(jax.tree.unflatten(tree, leaves), state)
-        many = jax.vmap(advance, in_axes=(axes, 0))
-        open_ones = lambda state: jax.vmap(is_open)(state)
-
-        def group(count: int, state: Any) -> Any:
-            if count == size:
-                found = many(leaves, state)
-                still = open_ones(state)
-                keep = lambda new, old: jnp.where(
-                    still.reshape(-1, *[1] * (new.ndim - 1)), new, old
-                )
-                return jax.tree.map(keep, found, state)
-            where = true_places(open_ones(state), count)
-            taken = lambda v: v.at[where].get(mode="clip")
-            part = tuple(taken(v) if b else v for v, b in zip(leaves, batched, strict=True))
-            found = many(part, jax.tree.map(taken, state))
-            put = lambda old, new: old.at[where].set(new, mode="drop")
-            return jax.tree.map(put, state, found)
-
         counts = group_sizes(size, steps)
         for count, least in zip(counts, [*counts[1:], 0], strict=True):
-            more = partial(lambda least, state: jnp.sum(open_ones(state)) > least, least)
-            state = lax.while_loop(more, partial(group, count), state)
+            whole = count == size
+            step = partial(advance_all, leaves) if whole else partial(advance_group, leaves, count)
+            more = lambda state, least=least: jnp.sum(open_ones(state)) > least
+            state = lax.while_loop(more, step, state)
         return state
 
     batch = custom_vmap(run)
 
     @batch.def_vmap
     @own_modes
-    def _(size: int, in_batched: Any, leaves: tuple, state: Any) -> Any:
+    def _(size: int, in_batched: tuple, leaves: tuple, state: S) -> tuple[S, Any]:
         outer = in_batched[0]
         state = _broadcast(size, in_batched[1], state)
-        mixed = any(o and not b for o, b in zip(outer, batched, strict=True))
-        if mixed:
+        if any(o and not b for o, b in zip(outer, batched, strict=True)):
             # Each outer instance has constants that its inner batch shares: copies would not fit.
-            out = jax.vmap(run, in_axes=(tuple(0 if o else None for o in outer), 0))(leaves, state)
-        else:
-            inner = jax.tree.leaves(state)[0].shape[1]
-            merged = lambda v: v.reshape(size * inner, *v.shape[2:])
-            flat = tuple(
-                merged(v if o else jnp.broadcast_to(v, (size, *v.shape))) if b else v
-                for v, b, o in zip(leaves, batched, outer, strict=True)
-            )
-            out = batch(flat, jax.tree.map(merged, state))
-            out = jax.tree.map(lambda v: v.reshape(size, inner, *v.shape[1:]), out)
-        return out, jax.tree.map(lambda _: True, out)
+            axes = tuple(0 if o else None for o in outer)
+            return _batched(jax.vmap(run, in_axes=(axes, 0))(leaves, state))
+        inner = jax.tree.leaves(state)[0].shape[1]
+        merged = lambda v: v.reshape(size * inner, *v.shape[2:])
+        flat = tuple(
+            merged(v if o else jnp.broadcast_to(v, (size, *v.shape))) if b else v
+            for v, b, o in zip(leaves, batched, outer, strict=True)
+        )
+        out = batch(flat, jax.tree.map(merged, state))
+        return _batched(jax.tree.map(lambda v: v.reshape(size, inner, *v.shape[1:]), out))
 
     return batch
+
+
+def _batched(out: R) -> tuple[R, Any]:
+    """Return what a rule of batching does: the results, and that all of them are batched."""
+    return out, jax.tree.map(lambda _: True, out)
 
 
 def true_places(mask: Array, size: int) -> Array:
@@ -204,7 +212,7 @@ def true_places(mask: Array, size: int) -> Array:
     return jnp.full(size, m, jnp.int32).at[place].set(np.arange(m, dtype=np.int32), mode="drop")
 
 
-def _broadcast(size: int, batched: Any, tree: Any) -> Any:
+def _broadcast(size: int, batched: Any, tree: S) -> S:
     """Return the tree with `size` copies, in front, of each leaf that is not `batched`."""
     give = lambda v, b: v if b else jnp.broadcast_to(v, (size, *jnp.shape(v)))
     return jax.tree.map(give, tree, batched)

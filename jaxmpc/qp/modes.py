@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import jax
 from jax.sharding import AxisType, PartitionSpec, auto_axes, get_abstract_mesh
 
+T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -44,7 +45,7 @@ def _without_explicit_axes(function: Callable[..., Any], args: tuple) -> Any:
     return auto_axes(call, out_sharding=PartitionSpec())(*(leaves[i] for i in places))
 
 
-def varying(tree: Any, like: Any) -> Any:
+def varying(tree: T, like: Any) -> T:
     """Return the tree, varying over those axes of a `shard_map` over which `like` does.
 
     What a loop carries must do so from the start; constants such as zeros do not.

@@ -1,14 +1,19 @@
 """Float64 evaluation and products at full precision, whatever JAX's settings are."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.custom_batching import custom_vmap
+from jax.typing import DTypeLike
 
 from jaxmpc.qp.modes import own_modes
+
+T = TypeVar("T")
+A = TypeVar("A", Array, np.ndarray)
 
 # float32 products on NVIDIA cards drop to 10 bits (TF32) unless told otherwise.
 PRECISION = jax.lax.Precision.HIGHEST
@@ -23,7 +28,7 @@ def matmul(a: Array, b: Array) -> Array:
     return jnp.matmul(a, b, precision=PRECISION)
 
 
-def arrays(tree: Any) -> Any:
+def arrays(tree: T) -> T:
     """Leaves as JAX arrays of the present precision, before they enter `jit`.
 
     (`jit` mixes up host arrays that it has seen under the other setting of 64-bit mode.)
@@ -32,7 +37,7 @@ def arrays(tree: Any) -> Any:
     return jax.tree.map(cast, tree)
 
 
-def floating_dtype(tree: Any) -> Any:
+def floating_dtype(tree: Any) -> jnp.dtype:
     """The widest floating type among the leaves, at least float32: no factorization exists in half
     precision. JAX's default float where there is none."""
     types = [leaf.dtype for leaf in jax.tree.leaves(arrays(tree))]
@@ -42,12 +47,12 @@ def floating_dtype(tree: Any) -> Any:
     return jnp.dtype(jnp.float64 if jnp.dtype(jnp.float64) in floats else jnp.float32)
 
 
-def symmetric(M: Any) -> Any:
+def symmetric(M: A) -> A:
     """Return the symmetric part of a matrix, which is all that a quadratic form knows of it."""
     return (M + M.swapaxes(-1, -2)) / 2
 
 
-def in_float64(function: Callable) -> Callable:
+def in_float64(function: Callable[..., T]) -> Callable[..., T]:
     """The function of float32 arrays, computed in float64, its floating results in float32.
 
     For residuals, which are small differences of large terms. Works whether or not 64-bit mode
@@ -56,7 +61,7 @@ def in_float64(function: Callable) -> Callable:
     batching rule of our own, which turns the mode on again.
     """
 
-    def convert(tree: Any, dtype: Any) -> Any:
+    def convert(tree: Any, dtype: DTypeLike) -> Any:
         floats = lambda v: jnp.issubdtype(v.dtype, jnp.floating)
         return jax.tree.map(lambda v: v.astype(dtype) if floats(v) else v, tree)
 
@@ -66,7 +71,7 @@ def in_float64(function: Callable) -> Callable:
     return _with_x64(evaluate)
 
 
-def precisely(function: Callable, *arguments: Any) -> Any:
+def precisely(function: Callable[..., T], *arguments: Any) -> T:
     """Return function(*arguments), evaluated in float64 also where the data are float32.
 
     Not differentiable where they are (`in_float64`): the derivative is zero.
@@ -76,7 +81,7 @@ def precisely(function: Callable, *arguments: Any) -> Any:
     return in_float64(function)(*jax.lax.stop_gradient(arguments))
 
 
-def rounding(dtype: Any) -> float:
+def rounding(dtype: DTypeLike) -> float:
     """Return the relative size of what counts as rounding in a residual of data of this type."""
     return (100 if jnp.finfo(dtype).eps < 1e-10 else 4) * float(jnp.finfo(dtype).eps)
 

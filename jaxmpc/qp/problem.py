@@ -179,9 +179,9 @@ class Duals(NamedTuple):
     """Multipliers in qpsolvers' form, Px + q + G'z + A'y + z_box = 0: z ≥ 0 of Gx ≤ h, y of
     Ax = b, z_box (n,) of lb ≤ x ≤ ub, ≥ 0 at the upper bound and ≤ 0 at the lower."""
 
-    z: Any
-    y: Any
-    z_box: Any
+    z: Array
+    y: Array
+    z_box: Array
 
 
 @pytree

@@ -60,7 +60,7 @@ class Bounds:
         return cls(**dict(zip(("l", "u", "linear", "quadratic"), columns, strict=False)))
 
     @property
-    def columns(self) -> list[Any]:
+    def columns(self) -> list[Array]:
         """l, u and, where there are soft rows, linear and quadratic."""
         soft = [] if self.linear is None else [self.linear, self.quadratic]
         return [self.l, self.u, *soft]
@@ -72,7 +72,7 @@ class Bounds:
         sizes = zip(self.balls, ends, strict=True)
         return [(slice(end - k, end), self.radius[i]) for i, (k, end) in enumerate(sizes)]
 
-    def prox_residual(self, v: Array, rho: Any) -> Array:
+    def prox_residual(self, v: Array, rho: Array | float) -> Array:
         """Return e = v − prox(v) (m,) with penalty rho, a number or (m,)."""
         s = v - jnp.clip(v, self.l, self.u)
         if self.linear is not None:
@@ -81,7 +81,7 @@ class Bounds:
             s = s.at[rows].multiply(1 - self._projection_factor(s[rows], radius))
         return s
 
-    def project(self, v: Array, rho: Any) -> Array:
+    def project(self, v: Array, rho: Array | float) -> Array:
         """Return prox(v) (m,) of g/rho."""
         plain = self.linear is None and not self.balls
         return jnp.clip(v, self.l, self.u) if plain else v - self.prox_residual(v, rho)
@@ -122,7 +122,7 @@ class Bounds:
         """Return v minus its projection where a constraint is hard; 0 in soft rows."""
         return self.hard().prox_residual(v, 1.0)
 
-    def curvature(self, v: Array, rho: Any) -> tuple[Array, list[Array]]:
+    def curvature(self, v: Array, rho: Array | float) -> tuple[Array, list[Array]]:
         """Return the derivative of the prox residual at v (an element of its generalised Jacobian):
         diag(weights) plus h h' for each h of the list, both (m,)."""
         s = v - jnp.clip(v, self.l, self.u)
@@ -143,7 +143,7 @@ class Bounds:
             normals.append(jnp.zeros_like(v).at[rows].set(normal))
         return weights, normals
 
-    def active_set(self, v: Array, rho: Any) -> Array:
+    def active_set(self, v: Array, rho: Array | float) -> Array:
         """Return which formula of the prox residual holds in each row: 0 inside, ±1 outside, ±2
         outside and past the L1 weight; for a ball 0 inside and 1 outside."""
         s = v - jnp.clip(v, self.l, self.u)
@@ -233,7 +233,7 @@ class Bounds:
         l, u = self.l + jnp.minimum(e, 0.0), self.u + jnp.maximum(e, 0.0)
         return replace(self, l=l, u=u, radius=radius)
 
-    def _soft_slack(self, s: Array, rho: Any) -> Array:
+    def _soft_slack(self, s: Array, rho: Array | float) -> Array:
         """Return d ≥ 0 (m,): how far prox(v) stays outside a soft row; s: signed distance of v."""
         soft = finite(self.linear)
         over = jnp.abs(s) - jnp.where(soft, self.linear, 0.0) / rho

@@ -15,7 +15,7 @@ share of what is natural for the whole program is added to both (`Natural`).
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -67,11 +67,11 @@ class Natural:
     one of w.
     """
 
-    rows: Any = 0.0
-    variables: Any = 0.0
-    gap: Any = 0.0
-    row_terms: Any = 0.0
-    variable_terms: Any = 0.0
+    rows: Array | float = 0.0
+    variables: Array | float = 0.0
+    gap: Array | float = 0.0
+    row_terms: Array | float = 0.0
+    variable_terms: Array | float = 0.0
 
 
 def residual_terms(qp: QP, z: Array, y: Array, natural: Natural | None = None) -> Terms:
@@ -80,7 +80,7 @@ def residual_terms(qp: QP, z: Array, y: Array, natural: Natural | None = None) -
     return terms_of(qp.q, qp.bounds, qp.row_sizes, z, y, products, natural or Natural())
 
 
-def row_sizes(Az: Any, known: Any, natural: Natural) -> Array:
+def row_sizes(Az: Array | float, known: Array | None, natural: Natural) -> Array:
     """Return what violations of rows are compared with (m,): what is known of a row
     (`QP.row_sizes`), and where that is nothing its value and what is natural."""
     sizes = jnp.abs(Az) + SHARE * natural.rows
@@ -88,7 +88,13 @@ def row_sizes(Az: Any, known: Any, natural: Natural) -> Array:
 
 
 def terms_of(
-    q: Array, bounds: Bounds, known: Any, z: Array, y: Array, products: Products, natural: Natural
+    q: Array,
+    bounds: Bounds,
+    known: Array | None,
+    z: Array,
+    y: Array,
+    products: Products,
+    natural: Natural,
 ) -> Terms:
     """Return `residual_terms` from the products with the matrices. known: `QP.row_sizes`."""
     Az, Pz, Aty, *sizes = products
@@ -136,7 +142,7 @@ def joined(terms: Terms) -> tuple[Array, Array, Array]:
     return jnp.concatenate(values), jnp.concatenate(sizes), jnp.concatenate(terms)
 
 
-def worst(terms: Terms, floor: Any) -> tuple[list[Array], list[Array]]:
+def worst(terms: Terms, floor: float | Array) -> tuple[list[Array], list[Array]]:
     """Return of each part the largest residual, each less floor·terms, relative to its size, and
     the largest relative to size and terms; 0/0 is 0, and inf where one is not finite."""
     above, relative = [], []
@@ -175,12 +181,12 @@ class Measured:
     small: Array
 
     @classmethod
-    def of(cls, terms: Terms, eps: Any, floor: float) -> "Measured":
+    def of(cls, terms: Terms, eps: Array, floor: float) -> "Measured":
         """Return the residuals with these terms, measured."""
         return cls.from_ratios(terms, eps, worst(terms, floor)[0])
 
     @classmethod
-    def from_ratios(cls, terms: Terms, eps: Any, above: list[Array]) -> "Measured":
+    def from_ratios(cls, terms: Terms, eps: Array, above: list[Array]) -> "Measured":
         """Return them where the first three of `worst` are known."""
         primal, dual, gap = (_largest(jnp.abs(values)) for values, *_ in terms)
         return cls(primal, dual, gap, largest_of(above[:3]) <= eps)

@@ -122,7 +122,7 @@ def measure_pair_in_kernel(
 ) -> tuple[PairCheck, Array]:
     """`measure_pair` as a kernel for NVIDIA GPUs. Rows and variables that fill up the vectors are
     free, and zero."""
-    given, tree = jax.tree.flatten((vectors, replace(sizes, gap=None), E, scaled))
+    given, tree = jax.tree.flatten((vectors, replace(sizes, gap=None), E, scaled))  # type: ignore[arg-type]
     free, none = FREE[: len(vectors.bounds.columns)], (0.0,) * len(vectors.products)
     known = None if vectors.known is None else 0.0
     fills = jax.tree.leaves(((0.0, free, known, 0.0, 0.0, none), (0.0,) * 4, 0.0, free))

@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array, lax
 from jax.typing import DTypeLike
 
+from jaxmpc.arrays import Reals
 from jaxmpc.checks import concrete, fail, require_kind, require_shape
 from jaxmpc.qp.admm import (
     ADMM,
@@ -57,13 +58,15 @@ from jaxmpc.qp.scaled_program import ScaledProgram
 from jaxmpc.qp.status import Status
 from jaxmpc.qp.triton import EXACT, ROUGH, Product
 
-T = TypeVar("T", bound=Any)
+T = TypeVar("T")
+# What a solve may begin from: an earlier solution, or z and y.
+WarmPair = QPSolution | tuple[Reals, Reals] | None
 
 # Bounds of this size mean none, as in OSQP, MOSEK and the MPS format.
 INFINITE = 1e20
 
 
-def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: Any = None) -> QPSolution:
+def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: WarmPair = None) -> QPSolution:
     """Minimise ½ z'Pz + q'z subject to l ≤ Az ≤ u by ADMM and Newton steps.
 
     One instance; `jax.vmap` for many. Where P and A are not batched they are factored once;
@@ -90,7 +93,7 @@ def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: Any = None) -> QPSoluti
 
 @partial(jax.jit, static_argnames="whole")
 @own_modes
-def _solve(qp: QP, solver: ADMM, warm_start: Any, *, whole: bool) -> QPSolution:
+def _solve(qp: QP, solver: ADMM, warm_start: WarmPair, *, whole: bool) -> QPSolution:
     made = factor(qp.P, qp.A, solver, qp.balls)
     return with_fault(*solve_factored(qp, made, solver, warm_start, whole=whole))
 
@@ -128,7 +131,7 @@ def as_arrays(qp: QP) -> QP:
 
 
 def solve_factored(
-    qp: QP, factor: Factor, solver: ADMM, warm_start: Any = None, *, whole: bool = True
+    qp: QP, factor: Factor, solver: ADMM, warm_start: WarmPair = None, *, whole: bool = True
 ) -> tuple[QPSolution, Array]:
     """`solve_qp` after its factorization: what a controller repeats at each sample.
 
@@ -170,7 +173,9 @@ def solve_from(
     return with_status(pair.measured, pair.z, pair.y, proof), fault
 
 
-def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = True) -> QPSolution:
+def search(
+    qp: QP, factor: Factor, solver: ADMM, warm_start: WarmPair, whole: bool = True
+) -> QPSolution:
     """Return the solution of clean data by ADMM and Newton steps, with its status, without its cost
     and count of iterations. whole: see `in_two_parts`."""
     p = ScaledProgram.of(qp, factor, tolerance(solver, qp.q.dtype))
@@ -181,7 +186,9 @@ def search(qp: QP, factor: Factor, solver: ADMM, warm_start: Any, whole: bool = 
     return stepped_end(p, begin, most)
 
 
-def admm_end(p: ScaledProgram, solver: ADMM, warm_start: Any, *, refined: bool) -> MultiplierState:
+def admm_end(
+    p: ScaledProgram, solver: ADMM, warm_start: WarmPair, *, refined: bool
+) -> MultiplierState:
     """Return where the steps of ADMM end, as the state at which Newton steps begin. refined: these
     follow, are in float64, and make up for rough products."""
     q, bounds, unit, factor = p.q, p.bounds, p.unit, p.factor
@@ -308,7 +315,7 @@ def cleaned(qp: QP, matrix_fault: Array) -> tuple[QP, Array]:
     return replace(qp, P=P, A=A, **fields), fault
 
 
-def warm(factor: Factor, qp: QP, unit: Array, bounds: Bounds, warm_start: Any) -> Array:
+def warm(factor: Factor, qp: QP, unit: Array, bounds: Bounds, warm_start: WarmPair) -> Array:
     """Return t (m,) of a warm start, a pair z (n,), y (m,) or a solution; what is not finite counts
     as 0. bounds: in ADMM's coordinates, which are measured in `unit`. Raises ValueError for other
     shapes."""
@@ -317,7 +324,7 @@ def warm(factor: Factor, qp: QP, unit: Array, bounds: Bounds, warm_start: Any) -
     return start(bounds, factor.rho[0], *scaled_rows(factor, qp, unit, clean(z), clean(y)))
 
 
-def require_warm_start(qp: QP, warm_start: Any) -> tuple[Any, Any]:
+def require_warm_start(qp: QP, warm_start: Any) -> tuple[Reals, Reals]:
     """Return z and y of a warm start; ValueError for other things and other shapes."""
     pair = (warm_start.z, warm_start.y) if hasattr(warm_start, "z") else warm_start
     if not isinstance(pair, tuple | list) or len(pair) != 2:
@@ -346,6 +353,6 @@ def value(qp: QP, z: Array, y: Array) -> Array:
     return fixed(own + cost) + (lagrangian - fixed(lagrangian))
 
 
-def tolerance(solver: ADMM, dtype: Any) -> Array:
+def tolerance(solver: ADMM, dtype: DTypeLike) -> Array:
     """Return the relative tolerance that `solver` asks for."""
     return jnp.asarray(solver.eps, dtype)

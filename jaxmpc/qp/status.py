@@ -1,6 +1,5 @@
 """Status codes of a solve, with a sentence for each, and what results say by them."""
 
-from collections import Counter
 from enum import IntEnum
 
 import numpy as np
@@ -63,10 +62,11 @@ def status_text(status: Array) -> str:
     known = {int(code): code.name for code in Status}
     if not isinstance(status, np.ndarray | np.generic | Array) or not concrete(status):
         return short_value(status)
-    names = [known.get(int(code), str(code)) for code in np.ravel(status)]
+    codes, counts = np.unique(status, return_counts=True)
+    names = [known.get(int(code), str(code)) for code in codes]
     if np.ndim(status) == 0:
         return names[0]
-    return " + ".join(f"{count} {name}" for name, count in Counter(names).most_common())
+    return " + ".join(f"{counts[i]} {names[i]}" for i in np.argsort(-counts, kind="stable"))
 
 
 _SENTENCES = {

@@ -91,8 +91,9 @@ class Robot(RobotDescription):
         one = jax.jacfwd(step, argnums=(0, 1), has_aux=True)
         start = self.coordinates(x)
         if exact:
+            Chain = tuple[Array, Array, Array]
 
-            def chain(carry: tuple[Array, ...], _: None) -> tuple[tuple[Array, ...], None]:
+            def chain(carry: Chain, _: None) -> tuple[Chain, None]:
                 xi, A, B = carry
                 (A_1, B_1), after = one(xi, u)
                 return (after, matmul(A_1, A), matmul(A_1, B) + B_1), None
