@@ -23,11 +23,8 @@ def host_array(argument: str, value: Any) -> np.ndarray:
     All NumPy code (LPs, qhull, Riccati) calls it, so it computes in float64 in either mode of JAX.
     """
     if not concrete(value):
-        fail(
-            argument,
-            "is traced by JAX, and this computation is not traceable",
-            "Call it outside jit, vmap and grad",
-        )
+        what = "is traced by JAX, and this computation is not traceable"
+        fail(argument, what, "Call it outside jit, vmap and grad")
     require_real(argument, value)
     return np.asarray(value).astype(np.float64)
 
@@ -54,13 +51,11 @@ def store_floats(instance: Any, *names: str) -> None:
     for name in names:
         value = getattr(instance, name)
         if isinstance(value, list | tuple) and dimensions(value) is not None:
-            value = as_array(value)
-            value = value if isinstance(value, jax.Array) else np.asarray(value)
+            value = _array(value)
         if isinstance(value, np.ndarray) and value.dtype.kind in "iu":
             value = value.astype(float)
-        if isinstance(value, jax.Array) or (
-            isinstance(value, np.ndarray) and value.dtype.kind == "f"
-        ):
+        floats = isinstance(value, np.ndarray) and value.dtype.kind == "f"
+        if floats or isinstance(value, jax.Array):
             object.__setattr__(instance, name, value)
 
 
@@ -69,19 +64,22 @@ def as_weight(value: Any, size: int) -> Any:
     (size,), which is a diagonal; anything else unchanged."""
     shape = np.shape(as_array(value)) if dimensions(value) in (0, 1) else None
     if (shape == () and size == 1) or shape == (size,):
-        value = as_array(value)
-        value = value if isinstance(value, jax.Array) else np.asarray(value)
-        if value.dtype.kind in "iufV":
-            value = value.astype(float) if value.dtype.kind in "iu" else value
-            value = value.reshape(size)
-            return jnp.diag(value) if isinstance(value, jax.Array) else np.diag(value)
+        array = _array(value)
+        if array.dtype.kind in "iufV":
+            array = array.astype(float) if array.dtype.kind in "iu" else array
+            return (jnp if isinstance(array, jax.Array) else np).diag(array.reshape(size))
     return value
 
 
-def as_column(value: Any) -> Any:
+def as_column(value: Reals) -> jax.Array | np.ndarray:
     """Return a vector (n,) as a matrix (n, 1)."""
+    return _array(value)[:, None]
+
+
+def _array(value: Reals) -> jax.Array | np.ndarray:
+    """Return an array of JAX as it is, lists of traced numbers as one, all else as NumPy's."""
     value = as_array(value)
-    return (value if isinstance(value, jax.Array) else np.asarray(value))[:, None]
+    return value if isinstance(value, jax.Array) else np.asarray(value)
 
 
 def as_array(value: Any) -> Any:

@@ -85,9 +85,8 @@ def require_disk(argument: str, needed: float, folder: Path, cure: str) -> None:
     there = next((path for path in (folder, *folder.absolute().parents) if path.exists()), None)
     free = shutil.disk_usage(there).free if there else np.inf
     if needed > free:
-        fail(
-            argument, f"needs at least {in_units(needed)} on disk, {in_units(free)} are free", cure
-        )
+        what = f"needs at least {in_units(needed)} on disk, {in_units(free)} are free"
+        fail(argument, what, cure)
 
 
 def available_memory() -> float:
@@ -186,17 +185,11 @@ def require_symmetric_psd(argument: str, value: Any, *, definite: bool = False) 
         fail(argument, "is not symmetric", f"Use ({argument} + {argument}.T) / 2")
     least = np.linalg.eigvalsh((matrix + matrix.T) / 2)[0]
     if definite and least <= 0:
-        fail(
-            argument,
-            f"is not positive definite (least eigenvalue {least:.3g})",
-            "Put a positive weight on every direction",
-        )
+        what = f"is not positive definite (least eigenvalue {least:.3g})"
+        fail(argument, what, "Put a positive weight on every direction")
     if least < -1e-7 * scale:
-        fail(
-            argument,
-            f"is not positive semidefinite (least eigenvalue {least:.3g})",
-            "A negative weight makes the problem non-convex: check signs",
-        )
+        what = f"is not positive semidefinite (least eigenvalue {least:.3g})"
+        fail(argument, what, "A negative weight makes the problem non-convex: check signs")
 
 
 def require_step_type(dtype: Any) -> None:

@@ -21,12 +21,10 @@ import jax
 import numpy as np
 
 from jaxmpc import __version__
-from jaxmpc.checks import fail, require_memory
+from jaxmpc.checks import fail, require_memory, shortened
 
 # Packages, beside this one, whose versions a result depends on.
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "scipy", "zarr")
-
-
 # Bytes of a text file that is read, at most; that of a large problem has a tenth of it.
 MOST_TEXT = 2**24
 
@@ -48,11 +46,9 @@ def differences(there: Any, here: Any, key: str = "") -> list[str]:
             for name in dict.fromkeys([*there, *here])
             for line in differences(there.get(name), here.get(name), f"{key}.{name}".lstrip("."))
         ]
-    texts = [json.dumps(value) for value in (there, here)]
-    if texts[0] == texts[1]:
-        return []
-    first, second = (text if len(text) < 60 else f"{text[:57]}..." for text in texts)
-    return [f"{key}: {first} there, {second} here"]
+    first, second = json.dumps(there), json.dumps(here)
+    same = first == second
+    return [] if same else [f"{key}: {shortened(first, 60)} there, {shortened(second, 60)} here"]
 
 
 def versions() -> dict[str, str]:

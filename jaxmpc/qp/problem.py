@@ -83,21 +83,19 @@ class QP:
         """
         for name, value in (("P", P), ("q", q), *(() if G is None else (("G", G), ("h", h)))):
             require_real(name, dense(value))
-        host = lambda M: np.asarray(dense(M), dtype=float)
-        P, q = host(P), np.asarray(q, dtype=float).ravel()
+        host = lambda v: np.asarray(dense(v), dtype=float)
+        P, q = host(P), host(q).ravel()
         n = q.size
-        rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        free, rows = np.full(n, np.inf), [(np.zeros((0, n)), np.zeros(0), np.zeros(0))]
         if G is not None:
-            upper = np.asarray(h, dtype=float).ravel()
+            upper = host(h).ravel()
             rows.append((host(G).reshape(-1, n), np.full(upper.size, -np.inf), upper))
         if A is not None:
-            value = np.asarray(b, dtype=float).ravel()
+            value = host(b).ravel()
             rows.append((host(A).reshape(-1, n), value, value))
         if lb is not None or ub is not None:
-            lower = np.full(n, -np.inf) if lb is None else np.asarray(lb, dtype=float).ravel()
-            upper = np.full(n, np.inf) if ub is None else np.asarray(ub, dtype=float).ravel()
-            rows.append((np.eye(n), lower, upper))
-        rows = rows or [(np.zeros((0, n)), np.zeros(0), np.zeros(0))]
+            lower = -free if lb is None else host(lb).ravel()
+            rows.append((np.eye(n), lower, free if ub is None else host(ub).ravel()))
         matrix, low, high = (np.concatenate(part) for part in zip(*rows, strict=True))
         return cls(P=P, q=q, A=matrix, l=low, u=high)
 
