@@ -9,7 +9,6 @@ The rows are divided into pieces of powers of two, the sizes that Triton takes.
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +16,7 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
+from jaxmpc.pytrees import record
 from jaxmpc.qp import triton
 from jaxmpc.qp.admm import Factor
 from jaxmpc.qp.loops import LARGE
@@ -148,7 +148,7 @@ Parts = list[Array]
 Blocks = list[list[Array]]
 
 
-@dataclass(frozen=True)
+@record
 class Tile:
     """The instances of one program: places (T,) in a batch of `batch` with `rows` rows each."""
 
@@ -170,7 +170,7 @@ class Tile:
         return (self.places[:, None] < self.batch) & (i[None, :] < self.rows)
 
 
-@dataclass(frozen=True)
+@record
 class TileBounds:
     """The bounds of the instances of a tile, piece by piece; with balls, of which there is one
     piece, the radius of the ball of each row, and which rows are of the same."""
