@@ -89,7 +89,7 @@ def verify_map(
     return result
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Labels:
     """Stored labels: the constraints, the states (B, d), the arrays, and the indices of the states
     labelled feasible and infeasible."""
