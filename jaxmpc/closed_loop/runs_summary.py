@@ -28,6 +28,8 @@ class RunsSummary:
     def __str__(self) -> str:
         return "\n".join(f"  {name:<13} {value}" for name, value in self.rows())
 
+    __repr__ = __str__
+
     def rows(self) -> list[tuple[str, str]]:
         """Return the rows of the table, name and value."""
         return _outcome_rows(self.data) + _plan_rows(self.data) + _time_rows(self.data)

@@ -47,6 +47,8 @@ class RobotReport:
         ]
         return "\n".join(lines)
 
+    __repr__ = __str__
+
 
 def report_of(robot: RobotDescription) -> RobotReport:
     """Return the account of a robot."""
