@@ -1,20 +1,16 @@
 """The plot of a map of two states: labels, proved bounds and terminal set."""
 
-from typing import Any
-
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 
 from jaxmpc.app.plots.style import (
     FEASIBLE,
     INFEASIBLE,
-    INNER,
-    OUTER,
-    TERMINAL,
     UNDECIDED,
-    draw_polygons,
+    draw_bounds,
     draw_values,
-    legend,
+    finish,
     new_axes,
     patch,
 )
@@ -41,7 +37,7 @@ def plot_feasible_set(
         fail("fmap", f"maps {points.shape[-1]} states", "A plot needs 2: choose `axes`")
     ax = new_axes() if ax is None else ax
     draw_values(ax, points, label, {-1: INFEASIBLE, 1: FEASIBLE, 0: UNDECIDED})
-    handles: list[Any] = [
+    handles: list[Artist] = [
         patch(name, colour, count)
         for value, name, colour in (
             (1, "feasible", FEASIBLE),
@@ -50,18 +46,8 @@ def plot_feasible_set(
         )
         if (count := counts[name] if counts else np.count_nonzero(label == value))
     ]
-    handles += draw_polygons(
-        ax,
-        [
-            (fmap.terminal_section, "terminal set", {"color": TERMINAL, "lw": 1.8}),
-            (fmap.outer, "outer bound", {"color": OUTER, "lw": 2.4}),
-            (fmap.inner, "inner bound", {"color": INNER, "lw": 1.4, "ls": (0, (3, 3))}),
-        ],
-    )
-    ax.set_xlabel(fmap.axis_names[0])
-    ax.set_ylabel(fmap.axis_names[1])
-    ax.set_title(_map_title(fmap), loc="left", fontsize=11)
-    legend(ax, handles)
+    handles += draw_bounds(ax, fmap)
+    finish(ax, fmap.axis_names, _map_title(fmap), handles)
     return ax
 
 

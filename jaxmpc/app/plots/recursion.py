@@ -1,8 +1,7 @@
 """The plot of recursive feasibility: states that are lost, and the worst counterexample."""
 
-from typing import Any
-
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -13,8 +12,9 @@ from jaxmpc.app.plots.style import (
     INNER,
     OUTER,
     UNDECIDED,
+    Style,
     draw_values,
-    legend,
+    finish,
     new_axes,
     patch,
     ring,
@@ -54,7 +54,7 @@ def plot_recursion(
     if enlarge and worst is None:
         fail("enlarge", "without a counterexample there is nothing to enlarge", "Leave it out")
     ax = new_axes() if ax is None else ax
-    handles: list[Any] = []
+    handles: list[Artist] = []
     corners = ring(lambda: report.feasible_set)
     if enlarge or not len(report.loops.x0s):
         ax.fill(*corners.T, color=FEASIBLE, zorder=0)
@@ -72,21 +72,17 @@ def plot_recursion(
             (x_low, y_low), (x_high, y_high) = ends.min(axis=0) - room, ends.max(axis=0) + room
             ax.set(xlim=(x_low, x_high), ylim=(y_low, y_high))
         handles += _draw_counterexample(ax, worst)
-    names = report.mpc.labels
-    ax.set_xlabel(names[0])
-    ax.set_ylabel(names[1])
     title = f"Closed loops of {report.loops.steps} steps, horizon N = {report.mpc.horizon}"
     if not len(report.loops.x0s):
         verdict = {True: "kept for ever", False: "not all kept", None: "not followed"}
         title = f"Feasible states, {verdict[report.law.holds]}, horizon N = {report.mpc.horizon}"
     if enlarge and worst is not None:
         title = f"Worst counterexample: next state {worst.distance:.4g} outside"
-    ax.set_title(title, loc="left", fontsize=11)
-    legend(ax, handles)
+    finish(ax, report.mpc.labels, title, handles)
     return ax
 
 
-def _draw_losses(ax: Axes, report: RecursionReport) -> list[Any]:
+def _draw_losses(ax: Axes, report: RecursionReport) -> list[Artist]:
     """Draw samples by outcome: infeasible, undecided, kept, or lost at some step."""
     lost = report.loops.lost_at
     outcomes = [
@@ -111,7 +107,7 @@ def _draw_losses(ax: Axes, report: RecursionReport) -> list[Any]:
     ]
 
 
-def _draw_counterexample(ax: Axes, worst: Counterexample) -> list[Any]:
+def _draw_counterexample(ax: Axes, worst: Counterexample) -> list[Artist]:
     """Draw the arrow x → x⁺ and, across the part of the plane in view, the line a'x = b."""
     ax.autoscale(False)
     (x_low, x_high), (y_low, y_high) = ax.get_xlim(), ax.get_ylim()
@@ -122,15 +118,9 @@ def _draw_counterexample(ax: Axes, worst: Counterexample) -> list[Any]:
     else:
         y = np.array([y_low, y_high])
         x = (b - a[1] * y) / a[0]
-    cut: dict[str, Any] = {"color": OUTER, "lw": 1.6, "ls": (0, (4, 3))}
+    cut: Style = {"color": OUTER, "lw": 1.6, "ls": (0, (4, 3))}
     ax.plot(x, y, **cut)
-    style: dict[str, Any] = {
-        "arrowstyle": "-|>",
-        "color": "black",
-        "lw": 1.4,
-        "shrinkA": 0,
-        "shrinkB": 0,
-    }
+    style: Style = {"arrowstyle": "-|>", "color": "black", "lw": 1.4, "shrinkA": 0, "shrinkB": 0}
     (x, y), tip = worst.state, worst.next_state
     ax.annotate("", (tip[0], tip[1]), (x, y), arrowprops=style, zorder=5)
     ax.plot(*worst.state, "o", color="black", ms=4, zorder=5)

@@ -1,22 +1,19 @@
 """The plot of a robot map: what the linear model predicts and what the robot does."""
 
-from typing import Any
-
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from jaxmpc.app.plots.style import (
     FEASIBLE,
     INFEASIBLE,
-    INNER,
     NOT_SOLVED,
-    OUTER,
-    TERMINAL,
     UNDECIDED,
-    draw_polygons,
+    Style,
+    draw_bounds,
     draw_values,
-    legend,
+    finish,
     new_axes,
     patch,
 )
@@ -40,7 +37,7 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
     if points.shape[1] != 2:
         fail("rmap", f"maps {points.shape[1]} coordinates", "A plot needs 2: choose `axes`")
     ax = new_axes(9.6) if ax is None else ax
-    handles: list[Any] = []
+    handles: list[Artist] = []
     shown, colours = np.zeros(len(points), int), {}
     for i, (name, colour, where) in enumerate(_outcomes(rmap)):
         shown[where], colours[i] = i, colour
@@ -49,38 +46,18 @@ def plot_robot_map(rmap: RobotMap, ax: Axes | None = None) -> Axes:
     draw_values(ax, points, shown, colours)
     linear = rmap.linear
     ax.autoscale(False)
-    handles += draw_polygons(
-        ax,
-        [
-            (linear.terminal_section, "terminal set", {"color": TERMINAL, "lw": 1.6}),
-            (linear.outer, "linear feasible set, outer bound", {"color": OUTER, "lw": 2.4}),
-            (
-                linear.inner,
-                "linear feasible set, inner bound",
-                {"color": INNER, "lw": 1.4, "ls": (0, (3, 3))},
-            ),
-        ],
-    )
-    marks: list[tuple[Any, str, dict[str, Any]]] = [
-        (
-            rmap.set_point[list(linear.axes)],
-            "set-point",
-            {"marker": "+", "ms": 9, "mew": 1.6, "color": "black"},
-        )
-    ]
+    handles += draw_bounds(ax, linear, "linear feasible set, ")
+    cross: Style = {"marker": "+", "ms": 9, "mew": 1.6, "color": "black"}
+    marks = [(rmap.set_point[list(linear.axes)], "set-point", cross)]
     worst = rmap.worst()
     if worst is not None:
         name = f"deepest failure,\nfails after {rmap.first_loss[worst] * rmap.robot.dt:.3g} s"
-        marks.append(
-            (points[worst], name, {"marker": "o", "ms": 6, "mfc": "white", "mec": "black"})
-        )
+        circle: Style = {"marker": "o", "ms": 6, "mfc": "white", "mec": "black"}
+        marks.append((points[worst], name, circle))
     for (x, y), name, style in marks:
         ax.plot(x, y, ls="", zorder=6, **style)
         handles.append(Line2D([], [], ls="", label=name, **style))
-    ax.set_xlabel(rmap.axis_names[0])
-    ax.set_ylabel(rmap.axis_names[1])
-    ax.set_title(_robot_map_title(rmap), loc="left", fontsize=11)
-    legend(ax, handles)
+    finish(ax, rmap.axis_names, _robot_map_title(rmap), handles)
     return ax
 
 
@@ -120,14 +97,11 @@ def _outcomes(rmap: RobotMap) -> list[tuple[str, str, np.ndarray]]:
 def _robot_map_title(rmap: RobotMap) -> str:
     """Return which robot, how long, and the values of the coordinates that are not mapped."""
     name = rmap.robot.name
-    mpc = rmap.linear.mpc
-    what = {
-        "limits": "is a feasible state safe on the robot",
-        "recursion": "does the robot keep having plans",
-    }[rmap.claim]
-    first = (
-        f"{name}: {what} for {rmap.seconds:g} s?\nN = {mpc.horizon} steps of {rmap.robot.dt:g} s"
-    )
+    mpc, what = rmap.linear.mpc, "does the robot keep having plans"
+    if rmap.claim == "limits":
+        what = "is a feasible state safe on the robot"
+    steps = f"N = {mpc.horizon} steps of {rmap.robot.dt:g} s"
+    first = f"{name}: {what} for {rmap.seconds:g} s?\n{steps}"
     labels = mpc.system.state_labels
     others = [i for i in range(len(labels)) if i not in rmap.linear.axes]
     fixed = rmap.linear.fixed

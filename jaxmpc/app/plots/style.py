@@ -1,11 +1,12 @@
 """Colours and drawing functions that the plots share. No function shows a window."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from matplotlib import font_manager, rcParams
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
@@ -13,6 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 
+from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.sets.polytope import Polytope
 
 # Okabe and Ito's palette: distinct with any colour vision, and in grey by lightness.
@@ -21,6 +23,10 @@ OUTER, INNER, TERMINAL = "#d55e00", "#00486b", "#006f52"
 # Plans that the solver did not solve: they say nothing about limits.
 NOT_SOLVED = "#a05fa8"
 EDGE = "#8a8a8a"
+
+
+# Keyword arguments of Matplotlib.
+Style = dict[str, Any]
 
 
 def new_axes(width: float = 8.4) -> Axes:
@@ -66,7 +72,7 @@ def patch(name: str, colour: str, count: Any = None) -> Patch:
     return Patch(facecolor=colour, edgecolor=EDGE, linewidth=0.6, label=label)
 
 
-def legend(ax: Axes, handles: list[Any]) -> None:
+def legend(ax: Axes, handles: list[Artist]) -> None:
     """Put the legend to the right of the axes."""
     ax.legend(
         handles=handles,
@@ -77,17 +83,28 @@ def legend(ax: Axes, handles: list[Any]) -> None:
     )
 
 
-def draw_polygons(
-    ax: Axes, polygons: list[tuple[Callable[[], Polytope | None], str, dict[str, Any]]]
-) -> list[Any]:
-    """Draw outlines of (polytope, name, line style) and return their legend entries."""
+def draw_bounds(ax: Axes, fmap: FeasibleSetMap, of: str = "") -> list[Line2D]:
+    """Draw terminal set, outer and inner bound of a map of two states; return legend entries."""
     handles = []
-    for make, name, line in polygons:
+    lines: tuple[tuple[Callable[[], Polytope | None], str, Style], ...] = (
+        (fmap.terminal_section, "terminal set", {"color": TERMINAL, "lw": 1.8}),
+        (fmap.outer, f"{of}outer bound", {"color": OUTER, "lw": 2.4}),
+        (fmap.inner, f"{of}inner bound", {"color": INNER, "lw": 1.4, "ls": (0, (3, 3))}),
+    )
+    for make, name, style in lines:
         corners = ring(make)
         if len(corners):
-            ax.plot(*corners.T, solid_joinstyle="round", **line)
-            handles.append(Line2D([], [], label=name, **line))
+            ax.plot(*corners.T, solid_joinstyle="round", **style)
+            handles.append(Line2D([], [], label=name, **style))
     return handles
+
+
+def finish(ax: Axes, names: Sequence[str], title: str, handles: list[Artist]) -> None:
+    """Name the two axes, and set the title and the legend."""
+    ax.set_xlabel(names[0])
+    ax.set_ylabel(names[1])
+    ax.set_title(title, loc="left", fontsize=11)
+    legend(ax, handles)
 
 
 def draw_values(ax: Axes, points: np.ndarray, value: np.ndarray, colours: dict[int, str]) -> None:

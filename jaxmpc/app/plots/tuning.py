@@ -21,17 +21,17 @@ from jaxmpc.tuning.descent import Descent
 from jaxmpc.tuning.result import TuningRun
 
 # Okabe and Ito, as in `plots`.
-_BEFORE, _AFTER, _REJECTED, _BEST = "#d55e00", "#0072b2", "#a50f15", "#006f52"
-_FRACTIONS = (
+BEFORE, AFTER, REJECTED, BEST = "#d55e00", "#0072b2", "#a50f15", "#006f52"
+FRACTIONS = (
     ("unsolved", "plans not solved", "#0072b2", "-"),
     ("infeasible", "plans proved infeasible", "#a50f15", "--"),
     ("fallback", "plans with slack in soft limits (fallback)", "#e69f00", "-"),
     ("violation", "loops beyond the limits", "#006f52", ":"),
 )
 # Lines of a panel that get a name each; more are named by the groups they belong to.
-_NAMED = 10
+NAMED = 10
 # Rows of a block.
-_DASHES: tuple[Any, ...] = ("-", (0, (4, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)))
+DASHES: tuple[Any, ...] = ("-", (0, (4, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)))
 
 
 def plot_tuning(
@@ -53,10 +53,10 @@ def plot_tuning(
     if relative:
         loss, validation = loss / loss[0], validation / validation[0]
     top.plot(steps, loss, color="#8a8a8a", lw=1, label="training loops of the step")
-    top.plot(every, validation, color=_AFTER, lw=1.6, label="validation loops")
+    top.plot(every, validation, color=AFTER, lw=1.6, label="validation loops")
     label = f"best: {history.validation[best]:.6g} at step {best}"
-    top.plot(best, validation[best], "o", color=_BEST, ms=6, label=label, zorder=4)
-    norm.plot(steps, history.gradient_norm, color=_AFTER, lw=1.2)
+    top.plot(best, validation[best], "o", color=BEST, ms=6, label=label, zorder=4)
+    norm.plot(steps, history.gradient_norm, color=AFTER, lw=1.2)
     rejected = steps[~history.accepted]
     for ax in (top, norm):
         if len(rejected):
@@ -64,7 +64,7 @@ def plot_tuning(
                 rejected,
                 np.full(len(rejected), 0.04),
                 "x",
-                color=_REJECTED,
+                color=REJECTED,
                 ms=5,
                 ls="",
                 transform=ax.get_xaxis_transform(),
@@ -74,7 +74,7 @@ def plot_tuning(
     _scale(norm, history.gradient_norm)
     _draw_weights(ratio, every, weights)
     highest = 0.0
-    for key, label, colour, dashes in _FRACTIONS:
+    for key, label, colour, dashes in FRACTIONS:
         values = history.validation_numbers.get(key)
         if values is not None:
             counts.plot(every, 100 * values, color=colour, ls=dashes, lw=1.4, label=label)
@@ -131,13 +131,13 @@ def _draw_weights(
     i, handles, ratios = 0, [], []
     for g, (group, entries) in enumerate(weights.items()):
         for name, values in entries.items():
-            colour = colours[(i if count <= _NAMED else g) % len(colours)]
+            colour = colours[(i if count <= NAMED else g) % len(colours)]
             ratios.append(values / values[0])
-            ax.plot(steps, ratios[-1], color=colour, lw=1.3, alpha=1 if count <= _NAMED else 0.6)
-            if count <= _NAMED:
+            ax.plot(steps, ratios[-1], color=colour, lw=1.3, alpha=1 if count <= NAMED else 0.6)
+            if count <= NAMED:
                 handles.append(Line2D([], [], color=colour, label=f"{group} {name}".strip()))
             i += 1
-        if count > _NAMED:
+        if count > NAMED:
             colour = colours[g % len(colours)]
             label = f"{group} ({len(entries)})" if len(entries) > 1 else group
             handles.append(Line2D([], [], color=colour, label=label))
@@ -185,15 +185,15 @@ def plot_before_after(
     figure, panels = panel_grid(plant, time, 3.4, (1.35, 2.4, 1.0))
     for ax, kind, i in panels:
         # Broad lines below narrow ones, so that both are visible where they coincide.
-        for found, colour, width in zip(values, (_BEFORE, _AFTER), (2.2, 1.0), strict=True):
+        for found, colour, width in zip(values, (BEFORE, AFTER), (2.2, 1.0), strict=True):
             lines = found[kind][..., i].T
             lines = np.concatenate([lines, lines[-1:]]) if kind else lines
             style: dict[str, Any] = {"drawstyle": "steps-post"} if kind else {}
             ax.plot(time, lines, color=colour, lw=width, alpha=0.9, **style)
         draw_limits(ax, plant, kind, i, (reference, input_reference)[kind])
     handles: list[Any] = [
-        Line2D([], [], color=_BEFORE, lw=2.2, label="before"),
-        Line2D([], [], color=_AFTER, lw=1.0, label="after"),
+        Line2D([], [], color=BEFORE, lw=2.2, label="before"),
+        Line2D([], [], color=AFTER, lw=1.0, label="after"),
         Patch(facecolor=INFEASIBLE, edgecolor="#8a8a8a", linewidth=0.6, label="outside limits"),
     ]
     if reference is not None or input_reference is not None:
@@ -211,8 +211,8 @@ def plot_maps(before: FeasibleSetMap, after: FeasibleSetMap) -> Figure:
     figure = Figure(figsize=(7.6, 4.6), layout="constrained")
     ax = figure.add_subplot()
     for fmap, name, colour, dashes in (
-        (before, "before", _BEFORE, (0, (4, 2))),
-        (after, "after", _AFTER, "-"),
+        (before, "before", BEFORE, (0, (4, 2))),
+        (after, "after", AFTER, "-"),
     ):
         corners = ring(fmap.inner)
         low, high = fmap.volume_bounds()
@@ -253,7 +253,7 @@ def plot_solver(
             if len(steps) == 1:
                 ax.plot(np.arange(1, size + 1), stage[0], "o", ms=4, color=colour)
             for i in range(size if len(steps) > 1 else 0):
-                ax.plot(steps, stage[:, i], color=colour, ls=_DASHES[i % 4], lw=1.4)
+                ax.plot(steps, stage[:, i], color=colour, ls=DASHES[i % 4], lw=1.4)
         ax.set_yscale("log")
         ax.set_title(kind if len(steps) > 1 else f"{kind}, k = {steps[0]}", fontsize=10)
         ax.set_xlabel("step k" if len(steps) > 1 else "row")
@@ -272,12 +272,12 @@ def plot_solver(
     widest = max((size for _, steps, size in blocks if len(steps) > 1), default=1)
     stages += [
         Line2D([], [], color="#8a8a8a", ls=dashes, label=f"row {i + 1}")
-        for i, dashes in enumerate(_DASHES[:widest])
+        for i, dashes in enumerate(DASHES[:widest])
         if widest > 1
     ]
     figure.legend(handles=stages, loc="outside lower left", ncols=8, fontsize=8, frameon=False)
     last = axes[-1]
-    for values, name, colour in ((before, "before", _BEFORE), (after, "after", _AFTER)):
+    for values, name, colour in ((before, "before", BEFORE), (after, "after", AFTER)):
         # What is not finite stays unsolved at the right end.
         values = np.sort(np.where(np.isfinite(values), values, np.inf))
         fraction = 100 * np.arange(1, len(values) + 1) / len(values)
