@@ -104,39 +104,30 @@ def sweep_robot(
     names, n = plant.state_names, plant.n
     mapped = axis_indices("axes", "coordinate", axes or (names[0], names[n // 2]), names, n)
     along = _grid_lines(plant, mapped, grid, lower, upper)
-    points = mesh(along)
-    others = [i for i in range(n) if i not in mapped]
     whole("horizon", horizon, 1)
     if terminal == "ellipsoid":
         fail("terminal", "ellipsoid: a robot's limits are soft rows", "Give invariant or box")
-    if steps is not None:
-        seconds = whole("steps", steps, 1) * plant.dt
-    at = home_coordinates(plant)
-    if fixed is not None:
-        values = host_array("fixed", fixed)
-        if values.shape != (len(others),):
-            what = f"has {values.size} entries where {len(others)} are needed"
-            fail("fixed", what, "One for each coordinate that is not on an axis")
-        at[others] = values
-    mpc = mpc_with_terminal(plant, horizon, terminal)
-    setting = RobotSetting.of(plant, mpc, points, seconds, axes=mapped, fixed=at, claim=claim)
+    if steps is None:
+        if not 0 < seconds < np.inf:
+            fail("seconds", f"{seconds!r}", "Give a positive number")
+        steps = max(1, round(seconds / plant.dt))
     config = {
         "robot": robot,
         "claim": claim,
-        "steps": setting.steps,
+        "steps": whole("steps", steps, 1),
         "horizon": horizon,
         "terminal": terminal,
         "axes": [names[i] for i in mapped],
-        "fixed": {names[i]: float(at[i]) for i in others},
+        "fixed": _fixed_coordinates(plant, mapped, fixed),
         "lower": [float(line[0]) for line in along],
         "upper": [float(line[-1]) for line in along],
-        "Q": np.diag(mpc.Q).tolist(),
-        "R": np.diag(mpc.R).tolist(),
         "model": model_hash(plant),
         "home": np.asarray(plant.home).tolist(),
         "period": plant.dt,
         **settings,
     }
+    setting = _setting(plant, config, mesh(along))
+    config |= {"Q": np.diag(setting.mpc.Q).tolist(), "R": np.diag(setting.mpc.R).tolist()}
     open_folder(folder)
     blocks = open_labels(
         path,
@@ -150,7 +141,7 @@ def sweep_robot(
     )
     store.report_damage(blocks)
     with blocks:
-        count = f"{len(setting.x0s):,} states, {setting.steps} time steps"
+        count = f"{len(setting.x0s):,} states, {steps} time steps"
         budget.say(f"{plant.name}: {count} -> {folder}")
         _label(setting, blocks, budget, devices, settings)
         if claim == "recursion":
@@ -160,6 +151,41 @@ def sweep_robot(
         found = setting.map(stored_labels(blocks), loops, gap, search_seconds)
     _save(folder, setting, found, config)
     return found
+
+
+def problem_again(config: Mapping[str, Any], x0s: np.ndarray) -> FeasibilityProblem:
+    """Build the problem of a map of points (B, d) from its stored configuration alone. Raises
+    ValueError, KeyError or TypeError for one that makes none."""
+    return _setting(load_robot(config["robot"]), config, x0s).problem
+
+
+def _setting(robot: Robot, config: Mapping[str, Any], x0s: np.ndarray) -> RobotSetting:
+    """Return what a configuration describes, for points (B, d)."""
+    names, fixed = robot.state_names, home_coordinates(robot)
+    for name, value in config["fixed"].items():
+        fixed[names.index(name)] = value
+    return RobotSetting.of(
+        robot,
+        mpc_with_terminal(robot, config["horizon"], config["terminal"]),
+        x0s,
+        config["steps"] * robot.dt,
+        axes=tuple(names.index(name) for name in config["axes"]),
+        fixed=fixed,
+        claim=config["claim"],
+    )
+
+
+def _fixed_coordinates(
+    robot: Robot, axes: tuple[int, ...], fixed: Reals | None
+) -> dict[str, float]:
+    """Return the values of the coordinates that are not on an axis by name; None: those of home."""
+    home = home_coordinates(robot)
+    others = [i for i in range(robot.n) if i not in axes]
+    values = home[others] if fixed is None else host_array("fixed", fixed)
+    if values.shape != (len(others),):
+        what = f"has {values.size} entries where {len(others)} are needed"
+        fail("fixed", what, "One for each coordinate that is not on an axis")
+    return {robot.state_names[i]: float(v) for i, v in zip(others, values, strict=True)}
 
 
 def _grid_lines(
@@ -225,21 +251,3 @@ def _save(folder: Path, setting: RobotSetting, found: RobotMap, config: dict[str
     write_arrays(folder / "robot_map.npz", feasible=found.linear.label, **arrays)
     run = {"precision": setting.dtype, "config": config, "versions": versions()}
     write_results(folder / "summary.json", found.summary() | run)
-
-
-def problem_again(config: Mapping[str, Any], x0s: np.ndarray) -> FeasibilityProblem:
-    """Build the problem of a map of points (B, d) from its stored configuration alone. Raises
-    ValueError, KeyError or TypeError for one that makes none."""
-    robot = load_robot(config["robot"])
-    names, fixed = robot.state_names, home_coordinates(robot)
-    for name, value in config["fixed"].items():
-        fixed[names.index(name)] = value
-    return RobotSetting.of(
-        robot,
-        mpc_with_terminal(robot, config["horizon"], config["terminal"]),
-        x0s,
-        config["steps"] * robot.dt,
-        axes=tuple(names.index(name) for name in config["axes"]),
-        fixed=fixed,
-        claim=config["claim"],
-    ).problem

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import problems
 import pytest
-from test_c_code import CASES, Compiled, pendulum
+from test_c_solver import CASES, Compiled, pendulum
 
 import jaxmpc as jm
 from jaxmpc.export import export_c, export_explicit_c
