@@ -1,7 +1,7 @@
 """Model predictive control of linear systems.
 
 MPC, Outputs, Soft    a problem, with rows of outputs and soft rows
-solve, Controller     one plan, or a factored law: controller(x) -> Control with u and Plan
+solve, Controller     one plan, or a factored problem: controller(x) -> Control with u and Plan
 solve_stagewise       one plan, factored along the horizon
 NonlinearMPC, Task    a problem with a nonlinear model, costs and limits on functions of a Point
 solve_nonlinear       its plan by sequential quadratic programming

@@ -7,7 +7,8 @@ are affine in z and in the parameter θ = x_0, or θ = (x_0, u_{−1}) where inp
 
 With a control horizon z holds the free moves only. Every constraint is then a row
 lower ≤ C z + D θ + d ≤ upper, in the order of `rows.blocks`; the cost is
-½ z'Pz + (F θ + f(references))'z + const. P, F, C, D depend on nothing that moves between samples.
+½ z'Pz + (F θ + f(references))'z + const. P, F, C, D depend on nothing that changes from one time
+step to the next.
 Rows at k = 0 have C = 0 unless they bound inputs.
 """
 
@@ -75,7 +76,9 @@ class Condensed:
     balls: tuple[int, ...] = static()
     begins: tuple[int, ...] = static()
 
-    def qp(self, theta: Array, reference: Any = None, input_reference: Any = None) -> QP:
+    def qp(
+        self, theta: Array, reference: Array | None = None, input_reference: Array | None = None
+    ) -> QP:
         """QP at θ (p,). reference (N+1, n), input_reference (N, m): what to track, None for 0."""
         q = matmul(self.F, theta) + self.f
         if reference is not None:

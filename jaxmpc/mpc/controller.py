@@ -1,4 +1,5 @@
-"""Controller: an MPC law whose matrices are condensed and factored once."""
+"""Controller: an MPC problem condensed and factored once, for plans at each time step; solve: one
+plan."""
 
 from collections.abc import Callable
 from dataclasses import field, replace
@@ -45,7 +46,7 @@ T = TypeVar("T")
 
 @prepared_pytree
 class Controller:
-    """An MPC law whose matrices are condensed and factored once, at construction.
+    """An MPC problem that is condensed and factored once, at construction: a feedback policy.
 
     `controller(x, before) -> Control`: its u (m,) is the first input of its plan, clipped into the
     limits if these are a Box. before: what the controller gave at the time step before, None at the
@@ -76,7 +77,7 @@ class Controller:
         # The factorization reads from P what is wrong with the data.
         condensed = replace(condensed, P=jnp.where(finite, condensed.P, jnp.nan))
         self.solver.validate(condensed.C.shape[0])
-        # Arrays from here on, so that a sample need not convert the whole object again.
+        # Arrays from here on, so that a time step need not convert the whole object again.
         given = arrays((replace(mpc, prestabilise=condensed.K), self.solver))
         made = condensed, _factor(condensed, self.solver)
         parts = unshared((*given, *made))

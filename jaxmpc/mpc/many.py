@@ -48,7 +48,7 @@ BLOCK = 2048
 # that can be solved are by following, solving takes less time.
 TRIAL, LEAST = 16, 0.3
 # Steps on the dual from the law of a neighbour.
-STEPS = MOST_STEPS + MORE_STEPS
+FOLLOW_STEPS = MOST_STEPS + MORE_STEPS
 
 
 class Batch:
@@ -104,7 +104,7 @@ class Batch:
                 return left
         # The first time all states, for those that are next to each other are copied faster.
         left = np.arange(len(self.x))
-        for steps in (0, STEPS):
+        for steps in (0, FOLLOW_STEPS):
             self._run(_follow(self.devices, steps), arguments, left)
             left = left[self._unsolved(left)]
         return left

@@ -80,8 +80,8 @@ class Cells:
         k = jnp.sum(x > self.edges, axis=0)
         lower, width = self.lower[k, axis], self.width[k, axis]
         side = jnp.where(x > lower + 0.5 * width, 1, -1)
-        moves = np.concatenate([np.zeros((1, p), int), np.eye(p, dtype=int), np.ones((1, p), int)])
-        beside = jnp.clip(k + moves * side, 0, g - 1)
+        steps = np.concatenate([np.zeros((1, p), int), np.eye(p, dtype=int), np.ones((1, p), int)])
+        beside = jnp.clip(k + steps * side, 0, g - 1)
         law = self.law[jnp.sum(beside * g ** axis[::-1], axis=1)]
         distance = jnp.sum(((self.states[law] - x) / width) ** 2, axis=1)
         return law[jnp.argmin(jnp.where(law < 0, jnp.inf, distance))]
@@ -113,8 +113,8 @@ def choose(x: Any) -> tuple[np.ndarray, Cells]:
     if not len(some):
         index, some = np.zeros(1, int), np.zeros((1, p))
     few = np.random.default_rng(1).integers(0, len(some), SAMPLE)
-    sample = np.sort(some[few], axis=0)
-    ends = sample[np.linspace(0, len(sample) - 1, g + 1).astype(int)]
+    ordered = np.sort(some[few], axis=0)
+    ends = ordered[np.linspace(0, len(ordered) - 1, g + 1).astype(int)]
     edges, width = ends[1:-1], np.diff(ends, axis=0)
     k = [np.searchsorted(edges[:, j], some[:, j]) for j in range(p)]
     cell = np.ravel_multi_index(k, (g,) * p)

@@ -63,7 +63,7 @@ def _with_limits(rows: Outputs) -> Outputs | None:
     bounded = np.isfinite(lower) | np.isfinite(upper)
     keep = lambda v: np.asarray(v)[bounded]
     text = lambda v: tuple(str(part) for part in keep(v)) if v else ()
-    kept = replace(
+    limited = replace(
         rows,
         C=keep(rows.C),
         lower=keep(lower),
@@ -72,7 +72,7 @@ def _with_limits(rows: Outputs) -> Outputs | None:
         names=text(rows.names),
         units=text(rows.units),
     )
-    return kept if bounded.any() else None
+    return limited if bounded.any() else None
 
 
 def harden(mpc: MPC) -> MPC:

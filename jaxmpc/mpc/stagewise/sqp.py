@@ -8,7 +8,7 @@ f(x_k, u_k) − x_{k+1}. The step to the QP's solution is shortened until the me
 
 falls by a part of what the QP predicts (Armijo). It is exact where each weight w exceeds its
 multiplier; Powell's rule, w ← max(|λ|, (w + |λ|)/2), keeps that with λ of the QP (Nocedal, Wright
-2006, §18.3). One QP a sample with a full step from the last plan shifted by one sample is the
+2006, §18.3). One QP a time step, with a full step from the last plan shifted by one, is the
 real-time iteration (Diehl, Bock, Schlöder 2005).
 
 The status comes from the residuals of the nonlinear problem itself at the returned x, u, y: the
