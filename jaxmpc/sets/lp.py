@@ -118,12 +118,12 @@ class Program:
             return x, np.zeros_like(y)
         better = np.zeros_like(y)
         better[on] = np.linalg.lstsq(self.M[on].T, cost, rcond=None)[0]
-        off = lambda v: np.abs(self.M.T @ v - cost).max()
-        if np.all((better >= 0) | self.equal) and off(better) <= off(y):
+        off, off_before = (np.abs(self.M.T @ v - cost).max() for v in (better, y))
+        if np.all((better >= 0) | self.equal) and off <= off_before:
             y = better
         nearer = x + np.linalg.lstsq(self.M[on], self.b[on] - self.M[on] @ x, rcond=None)[0]
-        worst = lambda v: (self.M @ v - self.b).max(initial=0.0)
-        return (nearer if worst(nearer) <= max(worst(x), 1e-14) else x), y
+        worst, before = ((self.M @ v - self.b).max(initial=0.0) for v in (nearer, x))
+        return (nearer if worst <= max(before, 1e-14) else x), y
 
     @cached_property
     def violation(self) -> tuple[np.ndarray, np.ndarray, float]:

@@ -220,3 +220,14 @@ def test_terminal_errors(changes, message):
         scalar_report(**changes)
     with pytest.raises(ValueError, match="is no check"):
         scalar_report()["nonsense"]
+
+
+def test_results_print_in_a_few_lines():
+    report = scalar_report(K=[[0.75]])
+    assert repr(report).splitlines() == str(report).splitlines()[:2]
+    assert "invariance under K" in repr(report).splitlines()[1]
+    system = LinearSystem([[0.5]], [[1.0]])
+    found = maximal_invariant_set(system, [[0.25]], symmetric(1), symmetric(1))
+    assert repr(found).startswith("InvariantSet(") and "index=0" in repr(found)
+    inner = maximal_control_invariant_set(system, symmetric(1), symmetric(1))
+    assert len(repr(inner).splitlines()) <= 4
