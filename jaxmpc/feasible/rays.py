@@ -79,7 +79,7 @@ class Boundary:
         )
 
     @property
-    def proved(self) -> ProvedBounds:
+    def _proved(self) -> ProvedBounds:
         """Return the points and half-spaces of those rays that have them."""
         inside, valid = np.isfinite(self.inner), np.isfinite(self.offsets)
         cuts = Cut(*(part[valid] for part in self.cuts))
@@ -254,7 +254,7 @@ def close_gap(
     for _ in range(rounds):
         if time.monotonic() > deadline:
             break
-        proved = proved.joined(rays.cast(directions * unit).proved)
+        proved = proved.joined(rays.cast(directions * unit)._proved)
         try:
             outer = Polytope(proved.normals * unit, proved.offsets).reduce()
             low, high = hull_volume(proved.points / unit), outer.volume()
