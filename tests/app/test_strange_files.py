@@ -10,7 +10,7 @@ import pytest
 from problems import MINIMAL_FILE
 
 import jaxmpc as jm
-from jaxmpc.app import cli, report
+from jaxmpc.app import cli, terminal
 from jaxmpc.app.config import files, load
 from jaxmpc.checks import installing, printable, require_package
 from jaxmpc.files import text_within
@@ -92,7 +92,7 @@ def test_paths_are_printed_as_escapes(tmp_path, capsys):
 
 
 def test_progress_passes(capsys):
-    with report.plain_output():
+    with terminal.plain_output():
         print("\r50 %\t\n\x1b[2J", end="")
     assert capsys.readouterr().out == "\r50 %\t\n\\x1b[2J"
 
