@@ -104,6 +104,7 @@ def sweep_robot(
     names, n = plant.state_names, plant.n
     mapped = axis_indices("axes", "coordinate", axes or (names[0], names[n // 2]), names, n)
     along = _grid_lines(plant, mapped, grid, lower, upper)
+    points = mesh(along)
     whole("horizon", horizon, 1)
     if terminal == "ellipsoid":
         fail("terminal", "ellipsoid: a robot's limits are soft rows", "Give invariant or box")
@@ -126,7 +127,7 @@ def sweep_robot(
         "period": plant.dt,
         **settings,
     }
-    setting = _setting(plant, config, mesh(along))
+    setting = _setting(plant, config, points)
     config |= {"Q": np.diag(setting.mpc.Q).tolist(), "R": np.diag(setting.mpc.R).tolist()}
     open_folder(folder)
     blocks = open_labels(
@@ -179,9 +180,8 @@ def _fixed_coordinates(
     robot: Robot, axes: tuple[int, ...], fixed: Reals | None
 ) -> dict[str, float]:
     """Return the values of the coordinates that are not on an axis by name; None: those of home."""
-    home = home_coordinates(robot)
     others = [i for i in range(robot.n) if i not in axes]
-    values = home[others] if fixed is None else host_array("fixed", fixed)
+    values = home_coordinates(robot)[others] if fixed is None else host_array("fixed", fixed)
     if values.shape != (len(others),):
         what = f"has {values.size} entries where {len(others)} are needed"
         fail("fixed", what, "One for each coordinate that is not on an axis")
