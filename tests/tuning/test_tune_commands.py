@@ -11,7 +11,6 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.app import cli
 from jaxmpc.app.commands import tune_solver, weight_files
-from jaxmpc.app.commands.sweep import Sweep
 from jaxmpc.app.config import load, load_robot_config
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.tuning import tasks
@@ -136,8 +135,9 @@ def test_weights_cut_off_resumed_and_read_back(tmp_path, monkeypatch, capsys, gi
     assert mpc.horizon == 3 and not np.array_equal(mpc.Q, load(None).build_mpc().Q)
     same = replace(made.mpc, Q=mpc.Q, R=mpc.R)
     assert jax.tree.structure(replace(same, prestabilise=None)) == jax.tree.structure(mpc)
-    job = Sweep(config=folder / "tuned.toml", output=tmp_path / "maps").open()
-    np.testing.assert_array_equal(job.mpc.Q, mpc.Q)
+    for command in ("sweep", "recursion", "info"):
+        taken = load(folder / "tuned.toml", {}, command).build_mpc()
+        np.testing.assert_array_equal(taken.Q, mpc.Q)
     # The loops after tuning, counted from outside: |q| <= 1.5, |dq| <= 2.
     with jax.enable_x64(True):
         controller = jm.Controller(mpc, ADMM(iterations=8, newton_steps=0))

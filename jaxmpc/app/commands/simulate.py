@@ -215,7 +215,7 @@ class Simulate:
                     chunk=chunk,
                     progress=True,
                     begun=lambda: remove_files(self.output, *FILES),
-                    **arguments(self, simulate_into, leave=("chunk",)),
+                    **arguments(self, simulate_into, leave=("robot", "chunk")),
                 )
         summary = summarise_runs(runs, robot, reference, input_reference, tolerance=self.tolerance)
         write_json(self.output / "summary.json", summary.data)

@@ -130,7 +130,7 @@ def problem_of_robot(command: WeightOptions) -> WeightProblem:
 
     spread = 0.5 if command.spread is None else command.spread
     x0s, factors = draw_robots(
-        robot, spread=spread, **arguments(command, draw_robots, leave=("spread",))
+        robot, spread=spread, **arguments(command, draw_robots, leave=("robot", "spread"))
     )
     mpc = problem(section, weights)
     parameters = weight_parameters(
@@ -154,7 +154,9 @@ def problem_of_robot(command: WeightOptions) -> WeightProblem:
         factors=factors,
         solver=solver,
         steps=steps,
-        **arguments(command, robot_task, weight_loss, leave=("steps", "target", "linearize")),
+        **arguments(
+            command, robot_task, weight_loss, leave=("robot", "steps", "target", "linearize")
+        ),
     )
 
     def write(values: Mapping[str, np.ndarray]) -> str:
