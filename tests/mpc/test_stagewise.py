@@ -12,8 +12,9 @@ from jax import enable_x64
 from problems import rows_of, symmetric
 
 import jaxmpc as jm
+from jaxmpc.mpc.arguments import Aim
 from jaxmpc.mpc.plan import WarmStart
-from jaxmpc.mpc.stagewise import interior_point, newton
+from jaxmpc.mpc.stagewise import interior_point, solve, stages
 from jaxmpc.mpc.stagewise.solve import factor_stages, plan_stages, solve_stagewise
 from jaxmpc.qp import admm
 from jaxmpc.qp.residuals import residuals
@@ -96,7 +97,7 @@ def condensed(mpc: jm.MPC, system: jm.LinearSystem, x0: np.ndarray) -> tuple:
             upper.append(high)
     C, shift, lower, upper = map(np.concatenate, (C, shift, lower, upper))
     soft = np.zeros(len(C), bool)
-    soft[-len(last.h) - len(s.steps) : -len(last.h)] = True
+    soft[-len(last.h) - len(s.stages) : -len(last.h)] = True
     qp = jm.QP(
         (P + P.T) / 2, q, C, lower - shift, upper - shift, np.where(soft, s.rho, np.inf),
         np.where(soft, 2 * s.quadratic, 0.0),
@@ -126,13 +127,14 @@ def test_iterates_are_those_of_the_dense_solver(kind):
     q, bounds, _ = admm.scaled(dense, qp, 1.0)
     schedule = admm.splittings(dense, q)
     t, _ = admm.iterate(schedule, bounds, jnp.zeros(count), 50, settings.alpha)
-    sample = newton.Sample(jnp.asarray(X0), jnp.zeros((N + 1, n)), jnp.zeros((N, m)))
-    bounds = factor.stages.bounds.scaled(factor.E)
-    still = newton.predict(factor.stages, sample.x0, jnp.zeros((N, m)))
-    first = E * factor.stages.rows(still, jnp.zeros((N, m)))
-    schedule, free = newton.splittings(factor, sample)
+    aim = Aim(jnp.asarray(X0), jnp.zeros((N + 1, n)), jnp.zeros((N, m)))
+    staged = replace(factor.stages, aim=aim)
+    bounds = staged.bounds.scaled(factor.E)
+    still = stages.predict(staged, jnp.zeros((N, m)))
+    first = E * staged.rows(still, jnp.zeros((N, m)))
+    schedule, free = solve.stage_splittings(factor, staged)
     t_stages, _ = admm.iterate(schedule, bounds, first, 50, settings.alpha)
-    u, _ = newton.read(factor, bounds, t_stages, free[-1])
+    u, _ = solve.read(factor, staged, bounds, t_stages, free)
     expected = np.asarray(t)[moved] / E_dense[moved] + shift[moved]
     np.testing.assert_allclose(np.asarray(t_stages)[moved] / E[moved], expected, atol=1e-9)
     w, y = admm.read(dense, t, q, admm.scaled(dense, qp, 1.0)[1])
@@ -236,9 +238,9 @@ def test_fixed_count_of_newton_steps():
     np.testing.assert_array_equal(early.status, all_of_them.status)
     np.testing.assert_allclose(early.inputs, all_of_them.inputs, atol=1e-9)
     mpc = replace(problem(), system=varying())
-    solve = lambda x0: solve_stagewise(mpc, x0, solver=jm.ADMM(fixed=True)).inputs
-    lengths = re.findall(r" length=(\d+)", str(jax.make_jaxpr(solve)(X0)))
-    assert max(map(int, lengths)) == interior_point.STEPS
+    inputs = lambda x0: solve_stagewise(mpc, x0, solver=jm.ADMM(fixed=True)).inputs
+    lengths = re.findall(r" length=(\d+)", str(jax.make_jaxpr(inputs)(X0)))
+    assert max(map(int, lengths)) == interior_point.INTERIOR_STEPS
 
 
 @pytest.mark.slow

@@ -74,7 +74,7 @@ def nonlinear(w):
 def robot(w):
     plant = jm.LinearPlant(SYSTEM, jm.Box([-2, -2], [2, 2]), jm.Box([-0.8, -0.8], [0.8, 0.8]))
     mode = jm.RobotController(plant, problem(w), SOLVER, linearize="state")
-    return mode(X0, None, AIM)[2]
+    return mode(X0, None, AIM).plan
 
 
 def regulated(w):
