@@ -41,8 +41,8 @@ from jax.scipy.linalg import expm
 
 import jaxmpc as jm
 from jaxmpc.app.config import load
-from jaxmpc.feasible import FeasibleSetMap
 from jaxmpc.feasible.fraction import feasible_fraction
+from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.systems.riccati import cost_of_law
 from jaxmpc.tuning.feasible_set import tune_feasible_set
 from jaxmpc.tuning.losses import ClosedLoopLoss
@@ -98,7 +98,7 @@ def plant(name: str) -> jm.MPC:
 def with_law(mpc: jm.MPC, Q_t: Any) -> jm.MPC:
     """Terminal set and cost of the law that Q_t asks for."""
     law = jm.lqr(mpc.system, Q_t, mpc.R)
-    terminal = jm.invariant_ellipsoid(mpc.system, law.K, law.P, mpc.states, mpc.inputs)
+    terminal = jm.sets.invariant_ellipsoid(mpc.system, law.K, law.P, mpc.states, mpc.inputs)
     return replace(
         mpc, terminal_set=terminal, terminal_cost=cost_of_law(mpc.system, law.K, mpc.Q, mpc.R)
     )
@@ -176,7 +176,7 @@ def terminal(name: str, s: Settings) -> None:
         paid, unsolved = cost(problem, x0s, s)
         row(label, area(problem, s)[1], first[0], f"cost {paid:10.4f}", f"unsolved {unsolved:.1%}")
     tuned, K = run.mpc, jm.lqr(mpc.system, run.values["Q_t"], mpc.R).K
-    report = jm.verify_terminal(
+    report = jm.sets.verify_terminal(
         mpc.system, mpc.Q, mpc.R, tuned.terminal_cost, tuned.terminal_set, mpc.states, mpc.inputs, K
     )
     print(f"  tuned: recursive feasibility {report.recursive_feasibility}, stability "

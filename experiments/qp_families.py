@@ -24,6 +24,7 @@ from qp_benchmark import clarabel_outcome
 from qp_judge import proves_empty, proves_unbounded, residual_terms
 
 import jaxmpc as jm
+from jaxmpc.qp.problem import QPSolution
 
 INF = np.inf
 
@@ -423,7 +424,7 @@ def padded(qp: jm.QP, n: int = 30, m: int = 100) -> jm.QP:
     return jm.QP(P, np.append(qp.q, np.zeros(n - size)), A, l, u)
 
 
-def ours(solve: Callable[[jm.QP], jm.qp.QPSolution], qps: list[jm.QP], s: Settings) -> list[Answer]:
+def ours(solve: Callable[[jm.QP], QPSolution], qps: list[jm.QP], s: Settings) -> list[Answer]:
     """jaxmpc's answers, 250 programs at a time; the last batch is filled up with repetitions."""
     answers, batch = [], min(250, len(qps))
     for first in range(0, len(qps), batch):

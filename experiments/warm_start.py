@@ -69,7 +69,7 @@ def run(s: Settings) -> None:
         carry = (warm(factor, qp, unit, bounds, warm_start), 0.0, jnp.inf)
         return jax.lax.scan(look, carry, length=s.most // s.every)[0][2]
 
-    def sample(carry: tuple[Array, jm.Plan], _: None) -> tuple:
+    def sample(carry: tuple[Array, jm.mpc.Plan], _: None) -> tuple:
         x, before = carry
         x = mpc.system.A @ x + mpc.system.B @ before.inputs[0]
         qp, plan = condensed.qp(x), controller.plan(x)

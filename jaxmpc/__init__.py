@@ -1,16 +1,17 @@
 """Constrained model predictive control for robots: solved in large batches, with proofs.
 
-Problems       LinearSystem, MPC, Box, Polytope, Ellipsoid, Outputs, Soft, joint_limits, design
-Plans          solve, solve_many, Controller -> Plan, Status; solve_qp of a QP by ADMM
-Nonlinear      mpc.NonlinearMPC, mpc.Task, mpc.solve_nonlinear
+Problems       LinearSystem, MPC, Box, Polytope, Ellipsoid, Outputs, Soft, soften, joint_limits,
+               design
+Plans          solve, solve_many, Controller with ADMM and Status; solve_qp of a QP
+Nonlinear      NonlinearMPC, solve_nonlinear
 Closed loops   load_robot, LinearPlant, robot_mpc, RobotController, simulate, simulate_many
-Proofs         map_feasible_set, boundary, feasible_polytope, recursive_feasibility,
-               verify_terminal, exact_penalty, offline_report
-Sets and laws  lqr, maximal_invariant_set, maximal_control_invariant_set, invariant_ellipsoid
-Tuning         tune_weights, tune_solver with Parameter and ClosedLoopLoss
+Proofs         map_feasible_set of a grid, feasible_polytope, recursive_feasibility
+Regulators     lqr, maximal_invariant_set
+Tuning         tune_weights with Parameter and ClosedLoopLoss
 
-The rest, and the types of all results, are in `qp`, `systems`, `sets`, `mpc`, `feasible`, `verify`,
-`recursion`, `explicit`, `export`, `robots`, `robot_maps`, `closed_loop`, `tuning` and `workflow`.
+The rest is in `qp`, `systems`, `sets`, `mpc`, `feasible`, `verify`, `recursion`, `explicit`,
+`export`, `robots`, `robot_maps`, `closed_loop`, `tuning` and `workflow`; `docs/reference` describes
+the types of all results too.
 Each name is imported when it is first used, so that the command can answer Ctrl-C before
 JAX is loaded.
 """
@@ -36,13 +37,13 @@ if TYPE_CHECKING:
         workflow,
     )
     from jaxmpc.closed_loop import RobotController, robot_mpc, simulate, simulate_many
-    from jaxmpc.explicit import exact_penalty
-    from jaxmpc.feasible import boundary, feasible_polytope, grid, map_feasible_set
+    from jaxmpc.feasible import feasible_polytope, grid, map_feasible_set
     from jaxmpc.mpc.controller import Controller, solve
     from jaxmpc.mpc.many import solve_many
-    from jaxmpc.mpc.plan import Plan
     from jaxmpc.mpc.problem import MPC, Outputs, Soft
     from jaxmpc.mpc.softening import soften
+    from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC
+    from jaxmpc.mpc.stagewise.sqp import solve_nonlinear
     from jaxmpc.qp.admm import ADMM
     from jaxmpc.qp.problem import QP
     from jaxmpc.qp.solve import solve_qp
@@ -51,19 +52,16 @@ if TYPE_CHECKING:
     from jaxmpc.robots.linear_plant import LinearPlant
     from jaxmpc.robots.load import load_robot
     from jaxmpc.sets.box import Box
-    from jaxmpc.sets.control_invariant import maximal_control_invariant_set
     from jaxmpc.sets.ellipsoid import Ellipsoid
-    from jaxmpc.sets.invariant import invariant_ellipsoid, maximal_invariant_set
+    from jaxmpc.sets.invariant import maximal_invariant_set
     from jaxmpc.sets.limits import joint_limits
     from jaxmpc.sets.polytope import Polytope
-    from jaxmpc.sets.terminal_hypotheses import verify_terminal
     from jaxmpc.systems.riccati import lqr
     from jaxmpc.systems.system import LinearSystem
     from jaxmpc.tuning.losses import ClosedLoopLoss
     from jaxmpc.tuning.parameters import Parameter
-    from jaxmpc.tuning.solver import tune_solver
     from jaxmpc.tuning.weights import tune_weights
-    from jaxmpc.workflow import design, offline_report
+    from jaxmpc.workflow import design
 
 # Here and not in the metadata of an installation, which a source tree on the path has none of.
 __version__ = "0.1.0"
@@ -78,31 +76,26 @@ __all__ = [
     "Ellipsoid",
     "LinearPlant",
     "LinearSystem",
+    "NonlinearMPC",
     "Outputs",
     "Parameter",
-    "Plan",
     "Polytope",
     "RobotController",
     "Soft",
     "Status",
-    "boundary",
     "closed_loop",
     "design",
-    "exact_penalty",
     "explicit",
     "export",
     "feasible",
     "feasible_polytope",
     "grid",
-    "invariant_ellipsoid",
     "joint_limits",
     "load_robot",
     "lqr",
     "map_feasible_set",
-    "maximal_control_invariant_set",
     "maximal_invariant_set",
     "mpc",
-    "offline_report",
     "qp",
     "recursion",
     "recursive_feasibility",
@@ -115,26 +108,25 @@ __all__ = [
     "soften",
     "solve",
     "solve_many",
+    "solve_nonlinear",
     "solve_qp",
     "systems",
-    "tune_solver",
     "tune_weights",
     "tuning",
     "verify",
-    "verify_terminal",
     "workflow",
 ]
 
 # The module of each name that is no module itself.
 HOMES = {
     "closed_loop": "RobotController robot_mpc simulate simulate_many",
-    "explicit": "exact_penalty",
-    "feasible": "boundary feasible_polytope grid map_feasible_set",
+    "feasible": "feasible_polytope grid map_feasible_set",
     "mpc.controller": "Controller solve",
     "mpc.many": "solve_many",
-    "mpc.plan": "Plan",
     "mpc.problem": "MPC Outputs Soft",
     "mpc.softening": "soften",
+    "mpc.stagewise.nonlinear": "NonlinearMPC",
+    "mpc.stagewise.sqp": "solve_nonlinear",
     "qp.admm": "ADMM",
     "qp.problem": "QP",
     "qp.solve": "solve_qp",
@@ -143,19 +135,16 @@ HOMES = {
     "robots.linear_plant": "LinearPlant",
     "robots.load": "load_robot",
     "sets.box": "Box",
-    "sets.control_invariant": "maximal_control_invariant_set",
     "sets.ellipsoid": "Ellipsoid",
-    "sets.invariant": "invariant_ellipsoid maximal_invariant_set",
+    "sets.invariant": "maximal_invariant_set",
     "sets.limits": "joint_limits",
     "sets.polytope": "Polytope",
-    "sets.terminal_hypotheses": "verify_terminal",
     "systems.riccati": "lqr",
     "systems.system": "LinearSystem",
     "tuning.losses": "ClosedLoopLoss",
     "tuning.parameters": "Parameter",
-    "tuning.solver": "tune_solver",
     "tuning.weights": "tune_weights",
-    "workflow": "design offline_report",
+    "workflow": "design",
 }
 
 

@@ -144,7 +144,7 @@ mpc = jm.MPC(
 # * Theorem 3, asymptotic stability of the origin on the whole feasible set.
 
 # %%
-report = jm.verify_terminal(system, Q, R, P, terminal_set, limits, torque)
+report = jm.sets.verify_terminal(system, Q, R, P, terminal_set, limits, torque)
 print(report)
 assert report.recursive_feasibility and report.stability
 
@@ -152,7 +152,7 @@ assert report.recursive_feasibility and report.stability
 # The same check on the first controller names what is missing:
 
 # %%
-missing = jm.verify_terminal(system, Q, R, np.zeros((2, 2)), None, limits, torque)
+missing = jm.sets.verify_terminal(system, Q, R, np.zeros((2, 2)), None, limits, torque)
 print("\n".join(str(missing).splitlines()[:2]))
 assert not missing.recursive_feasibility and not missing.stability
 
@@ -225,8 +225,8 @@ plt.show()
 #
 # 1. Show that the LQR satisfies $(A + BK)' P (A + BK) - P + Q + K' R K = 0$, and say what it means.
 # 2. From which horizon on is the controller without terminal ingredients stable near the origin?
-# 3. Terminal sets are often ellipsoids. `jm.invariant_ellipsoid` returns the largest level set of
-#    $x' P x$ in which the LQR keeps all limits. Compare its area with that of the polytope.
+# 3. Terminal sets are often ellipsoids. `jm.sets.invariant_ellipsoid` returns the largest level set
+#    of $x' P x$ in which the LQR keeps all limits. Compare its area with that of the polytope.
 
 # %% [markdown]
 # ### Answers
@@ -260,7 +260,7 @@ assert stable_from == 9
 # **3.** The ellipsoid lies inside the polytope, which is the largest set of all.
 
 # %%
-ellipsoid = jm.invariant_ellipsoid(system, K, P, limits, torque)
+ellipsoid = jm.sets.invariant_ellipsoid(system, K, P, limits, torque)
 share = ellipsoid.volume() / terminal_set.volume()
 print(f"ellipsoid {ellipsoid.volume():.4f}, polytope {terminal_set.volume():.4f}: {share:.0%}")
 assert all(bool(terminal_set.contains(x, 1e-9)) for x in ellipsoid.boundary(100))

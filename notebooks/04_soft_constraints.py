@@ -115,7 +115,7 @@ plt.show()
 
 # %%
 line = np.stack([np.linspace(-1.49, 1.49, 81), np.full(81, 0.1)], axis=1)
-result = jm.exact_penalty(hard, np.vstack([x0, line]), rho=10.0)
+result = jm.explicit.exact_penalty(hard, np.vstack([x0, line]), rho=10.0)
 print(result.sentence)
 threshold = float(result.thresholds[0])
 print(f"threshold at x0: {threshold:.4f}")

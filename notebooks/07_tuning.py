@@ -120,7 +120,7 @@ cart = jm.MPC(
     terminal_cost=np.eye(2),
     terminal_set=unit,
 )
-exact = jm.exact_penalty(cart)
+exact = jm.explicit.exact_penalty(cart)
 factors = np.array([0.1, 0.5, 0.9, 0.99, 1.01, 2.0])
 worst = np.array([0.999999 * exact.at])  # a hair inside the feasible set
 slack = [jm.solve_many(jm.soften(cart, rho=f * exact.rho_bar), worst).slack.max() for f in factors]
@@ -165,7 +165,7 @@ fig.tight_layout()
 # what it returns is never worse on the validation states than the solver that it is compared with.
 
 # %%
-penalties = jm.tune_solver(run.mpc, states, iterations=48, updates=30, batch=16)
+penalties = jm.tuning.tune_solver(run.mpc, states, iterations=48, updates=30, batch=16)
 print("solved to 1e-6:", penalties.before["solved"], "->", penalties.after["solved"])
 print("median residual:", penalties.before["residual"], "->", penalties.after["residual"])
 assert penalties.after["solved"] >= penalties.before["solved"]
@@ -199,8 +199,8 @@ assert tiny.slack.max() < 1e-6 and np.allclose(tiny.inputs, plain.inputs, atol=1
 # %%
 tenfold = replace(cart, Q=10 * cart.Q, R=10 * cart.R, terminal_cost=10 * cart.terminal_cost)
 same = jm.solve_many(cart, worst).inputs - jm.solve_many(tenfold, worst).inputs
-print("difference:", abs(same).max(), " threshold:", jm.exact_penalty(tenfold).rho_bar)
-assert abs(same).max() < 1e-5 and np.isclose(jm.exact_penalty(tenfold).rho_bar, 112.5)
+print("difference:", abs(same).max(), " threshold:", jm.explicit.exact_penalty(tenfold).rho_bar)
+assert abs(same).max() < 1e-5 and np.isclose(jm.explicit.exact_penalty(tenfold).rho_bar, 112.5)
 
 # %% [markdown]
 # **Answer 3.** No, within the tolerance of the residuals: it changes the path of the iterates only.

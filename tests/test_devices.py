@@ -195,7 +195,9 @@ def check_penalties():
 
     x = states(38)[:18]
     compared(
-        lambda devices: jm.tune_solver(problem(), x, 12, stages=2, updates=2, devices=devices),
+        lambda devices: jm.tuning.tune_solver(
+            problem(), x, 12, stages=2, updates=2, devices=devices
+        ),
         1e-6,
     )
 
@@ -256,7 +258,7 @@ def check_refusals():
         lambda d: jm.simulate_many(jm.Controller(mpc), mpc.system, x, 2, devices=d),
         lambda d: jm.tune_weights(make, parameters, mpc.system, x, devices=d),
         lambda d: jm.tuning.tune_feasible_set(make, parameters, x, devices=d),
-        lambda d: jm.tune_solver(mpc, np.zeros((20, 2)), devices=d),
+        lambda d: jm.tuning.tune_solver(mpc, np.zeros((20, 2)), devices=d),
     )
     for k, call in enumerate(calls):
         for given, text in wrong if k == 0 else wrong[:1]:

@@ -114,12 +114,12 @@ def test_stored_programs():
         stored = export.export(jax.jit(function))(first, X0).serialize()
         plan = export.deserialize(stored).call(first, X0)
         np.testing.assert_allclose(plan.inputs, function(first, X0).inputs, atol=1e-5)
-        assert isinstance(plan, jm.Plan) and b"jaxmpc.Plan" in stored
+        assert isinstance(plan, jm.mpc.Plan) and b"jaxmpc.mpc.Plan" in stored
 
 
 def test_what_cannot_be_stored_says_so():
     task = jm.mpc.Task(lambda point: point.x, weight=1.0)
-    problem_ = jm.mpc.NonlinearMPC(problem(), lambda x, u: x, (task,))
+    problem_ = jm.NonlinearMPC(problem(), lambda x, u: x, (task,))
     with pytest.raises(ValueError, match="holds <function .* Close the program over it"):
         export.export(jax.jit(lambda p: p.mpc.Q))(problem_).serialize()
 

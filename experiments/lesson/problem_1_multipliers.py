@@ -45,7 +45,7 @@ class Table:
     differences: np.ndarray
 
 
-def kkt(mpc: jm.MPC, plan: jm.Plan, x0: np.ndarray) -> dict[str, float]:
+def kkt(mpc: jm.MPC, plan: jm.mpc.Plan, x0: np.ndarray) -> dict[str, float]:
     """Largest residual of each KKT condition of the stacked QP."""
     N = mpc.horizon
     qp = independent.stack(A, B, Q, R, mpc.terminal_cost, N, x0, X_MAX, TAU_MAX, range(N + 1))

@@ -74,7 +74,7 @@ def run(s: Settings) -> dict[str, np.ndarray]:
         rows = []
         for N in s.horizons:
             mpc, exact = integrator(s, N, settings), closed_form(N)
-            rays = jm.boundary(mpc, np.array([[1.0], [-1.0]]))
+            rays = jm.feasible.boundary(mpc, np.array([[1.0], [-1.0]]))
             inside = rays.center[0] + rays.directions[:, 0] * rays.inner
             outside = rays.center[0] + rays.directions[:, 0] * rays.outer
             rows.append([N, exact, np.abs(inside).min(), np.abs(outside).max(), np.nan, np.nan])

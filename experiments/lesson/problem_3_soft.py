@@ -19,6 +19,7 @@ import tyro
 from lesson_joint import LIMITS, Q, R, joint
 
 import jaxmpc as jm
+from jaxmpc.mpc import Plan
 from jaxmpc.mpc.softening import soften
 
 
@@ -41,7 +42,7 @@ def run(s: Settings) -> dict[str, np.ndarray]:
     mpc = joint(s.horizon, terminal_cost=lqr.P, terminal_set=LIMITS)
     solver = jm.ADMM(iterations=400, newton_steps=40)
 
-    def compare(x0: np.ndarray, hard: jm.Plan, rho: float, quadratic: float = 0.0) -> list[float]:
+    def compare(x0: np.ndarray, hard: Plan, rho: float, quadratic: float = 0.0) -> list[float]:
         plan = jm.solve(soften(mpc, rho, quadratic), x0, solver=solver)
         assert plan.status == jm.Status.SOLVED
         change = np.abs(np.asarray(plan.inputs) - np.asarray(hard.inputs)).max()

@@ -17,8 +17,8 @@ import tyro
 from jax import Array
 
 import jaxmpc as jm
-from jaxmpc.robots import Robot
 from jaxmpc.robots.physics import Physics
+from jaxmpc.robots.robot import Robot
 
 
 @dataclass(frozen=True)

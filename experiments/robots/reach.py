@@ -23,7 +23,8 @@ import tyro
 
 import jaxmpc as jm
 from jaxmpc.mpc import Task
-from jaxmpc.robots import Robot, render, save_video, tasks
+from jaxmpc.robots import render, save_video, tasks
+from jaxmpc.robots.robot import Robot
 
 # On the figure's upper right, in the way of the flange and, beside it, of the wrist.
 BALL = np.array([0.31, 0.18, 0.71])

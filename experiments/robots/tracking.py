@@ -32,7 +32,7 @@ import tyro
 
 import jaxmpc as jm
 from jaxmpc.closed_loop import KalmanFilter, LinearFeedback, Noise, Run, randomised
-from jaxmpc.robots import Robot
+from jaxmpc.robots.robot import Robot
 
 TOLERANCE = 1e-6
 

@@ -37,7 +37,7 @@ from searchers import SEARCHERS, Space, search, within
 import jaxmpc as jm
 from jaxmpc.batches import Compiled
 from jaxmpc.mpc.stagewise.nonlinear import as_argument
-from jaxmpc.robots import Robot
+from jaxmpc.robots.robot import Robot
 from jaxmpc.tuning.closed_loop_objective import ClosedLoopObjective
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter, raw

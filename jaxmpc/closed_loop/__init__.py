@@ -17,33 +17,28 @@ draw_robots                random starts and random factors of masses, damping a
 randomised                 random masses, damping, payloads of robots, for `variations`
 """
 
-from jaxmpc.closed_loop.environment import Environment, EnvironmentState, MPCPolicy
+from jaxmpc.closed_loop.environment import Environment, MPCPolicy
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
 from jaxmpc.closed_loop.many import simulate_many
 from jaxmpc.closed_loop.noise import Noise
-from jaxmpc.closed_loop.observer import Belief, KalmanFilter
-from jaxmpc.closed_loop.outcome import Outcome, evaluate_runs
+from jaxmpc.closed_loop.observer import KalmanFilter
+from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.closed_loop.robot_controller import RobotController
 from jaxmpc.closed_loop.robot_problem import robot_mpc
 from jaxmpc.closed_loop.run import Run, lyapunov_decrease
-from jaxmpc.closed_loop.runs_summary import RunsSummary, summarise_runs
+from jaxmpc.closed_loop.runs_summary import summarise_runs
 from jaxmpc.closed_loop.simulation import simulate
-from jaxmpc.closed_loop.stored_runs import StoredRuns, simulate_into
+from jaxmpc.closed_loop.stored_runs import simulate_into
 from jaxmpc.closed_loop.variations import draw_robots, randomised
 
 __all__ = [
-    "Belief",
     "Environment",
-    "EnvironmentState",
     "KalmanFilter",
     "LinearFeedback",
     "MPCPolicy",
     "Noise",
-    "Outcome",
     "RobotController",
     "Run",
-    "RunsSummary",
-    "StoredRuns",
     "draw_robots",
     "evaluate_runs",
     "lyapunov_decrease",

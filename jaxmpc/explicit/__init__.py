@@ -5,16 +5,12 @@ exact_penalty        the least weight on slacks that keeps limits that can be ke
 Law                  plans, and the affine law on the region of a given state -> AffinePiece
 """
 
-from jaxmpc.explicit.exact_penalties import ExactPenalty, exact_penalty
-from jaxmpc.explicit.law import AffinePiece, Law
-from jaxmpc.explicit.regions import CriticalRegions, Region, critical_regions
+from jaxmpc.explicit.exact_penalties import exact_penalty
+from jaxmpc.explicit.law import Law
+from jaxmpc.explicit.regions import critical_regions
 
 __all__ = [
-    "AffinePiece",
-    "CriticalRegions",
-    "ExactPenalty",
     "Law",
-    "Region",
     "critical_regions",
     "exact_penalty",
 ]

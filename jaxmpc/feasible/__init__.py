@@ -7,24 +7,17 @@ feasible_polytope    the whole set as a Polytope
 feasible_growth      how it grows with the horizon -> Growth
 feasible_fraction    the share of states that are feasible, with a derivative
 grid                 points of a regular grid
-Labels               labels of points with their proofs
-Picture              labels on evenly spaced lines of a stored map, to be drawn
+StoredMap            the map that such a store holds, read block by block
 """
 
 from jaxmpc.feasible.fraction import feasible_fraction
-from jaxmpc.feasible.labels import Labels
-from jaxmpc.feasible.map import FeasibleSetMap, map_feasible_set
-from jaxmpc.feasible.polytope import Growth, feasible_growth, feasible_polytope
-from jaxmpc.feasible.rays import Boundary, boundary
-from jaxmpc.feasible.stored import Picture, StoredMap, sweep_into
+from jaxmpc.feasible.map import map_feasible_set
+from jaxmpc.feasible.polytope import feasible_growth, feasible_polytope
+from jaxmpc.feasible.rays import boundary
+from jaxmpc.feasible.stored import StoredMap, sweep_into
 from jaxmpc.grids import grid
 
 __all__ = [
-    "Boundary",
-    "FeasibleSetMap",
-    "Growth",
-    "Labels",
-    "Picture",
     "StoredMap",
     "boundary",
     "feasible_fraction",

@@ -9,7 +9,7 @@ feasibility_margin   by how much all limits can be tightened, or must be widened
 
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.margin import feasibility_margin
-from jaxmpc.qp.problem import QP, Duals, QPSolution
+from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.solve import solve_qp
 from jaxmpc.qp.status import Status
@@ -18,8 +18,6 @@ __all__ = [
     "ADMM",
     "QP",
     "Bounds",
-    "Duals",
-    "QPSolution",
     "Status",
     "feasibility_margin",
     "solve_qp",

@@ -3,20 +3,13 @@
 recursive_feasibility    proofs, the worst counterexample, states lost -> RecursionReport
 smallest_horizon         the least horizon with a proof -> SmallestHorizon
 save_report              both as files, which `jaxmpc verify` proves again
-Claim, Counterexample    what the reports hold
 """
 
 from jaxmpc.recursion.analysis import recursive_feasibility
-from jaxmpc.recursion.claims import Claim, Counterexample
-from jaxmpc.recursion.horizons import SmallestHorizon, smallest_horizon
-from jaxmpc.recursion.report import RecursionReport
+from jaxmpc.recursion.horizons import smallest_horizon
 from jaxmpc.recursion.stored_report import save_report
 
 __all__ = [
-    "Claim",
-    "Counterexample",
-    "RecursionReport",
-    "SmallestHorizon",
     "recursive_feasibility",
     "save_report",
     "smallest_horizon",

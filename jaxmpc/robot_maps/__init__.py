@@ -2,13 +2,11 @@
 
 map_robot      label each state twice, by proof and by the robot's closed loop -> RobotMap
 sweep_robot    the same for a grid of states of a robot's file, into a folder, to be resumed
-RobotLoops     what those closed loops did
 OUTCOMES       what can become of a state
 """
 
 from jaxmpc.robot_maps.mapping import map_robot
-from jaxmpc.robot_maps.robot_loops import RobotLoops
-from jaxmpc.robot_maps.robot_map import OUTCOMES, RobotMap
+from jaxmpc.robot_maps.robot_map import OUTCOMES
 from jaxmpc.robot_maps.stored_sweep import sweep_robot
 
-__all__ = ["OUTCOMES", "RobotLoops", "RobotMap", "map_robot", "sweep_robot"]
+__all__ = ["OUTCOMES", "map_robot", "sweep_robot"]

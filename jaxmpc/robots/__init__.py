@@ -1,7 +1,6 @@
 """Plants: robots in MuJoCo MJX, and linear systems in their place.
 
 load_robot            a robot by name, or from an MJCF or URDF file -> Robot
-RobotReport           what was read and ignored of a file: robot.report()
 RobotModel            what a controller predicts of a robot, for jaxmpc.mpc.NonlinearMPC
 tasks                 positions, orientations, distances and energy, for jaxmpc.mpc.Task
 LinearPlant           a linear system with limits, in the place of a robot
@@ -13,16 +12,12 @@ from jaxmpc.robots import tasks
 from jaxmpc.robots.film.video import Film, render, save_video
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.load import load_robot
-from jaxmpc.robots.report import RobotReport
-from jaxmpc.robots.robot import Robot
 from jaxmpc.robots.robot_model import RobotModel
 
 __all__ = [
     "Film",
     "LinearPlant",
-    "Robot",
     "RobotModel",
-    "RobotReport",
     "load_robot",
     "render",
     "save_video",

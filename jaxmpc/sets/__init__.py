@@ -11,30 +11,22 @@ verify_terminal                  hypotheses of the stability theorems -> Termina
 """
 
 from jaxmpc.sets.box import Box
-from jaxmpc.sets.control_invariant import ControlInvariantSet, maximal_control_invariant_set
+from jaxmpc.sets.control_invariant import maximal_control_invariant_set
 from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.sets.invariant import (
-    InvariantEllipsoid,
-    InvariantSet,
     invariant_ellipsoid,
     maximal_invariant_set,
 )
-from jaxmpc.sets.limits import JointLimits, joint_limits, output_limits
+from jaxmpc.sets.limits import joint_limits, output_limits
 from jaxmpc.sets.one_step import predecessor
 from jaxmpc.sets.polytope import Polytope
-from jaxmpc.sets.terminal_hypotheses import Check, TerminalReport, verify_terminal
+from jaxmpc.sets.terminal_hypotheses import verify_terminal
 from jaxmpc.sets.terminal_sets import named_terminal_set
 
 __all__ = [
     "Box",
-    "Check",
-    "ControlInvariantSet",
     "Ellipsoid",
-    "InvariantEllipsoid",
-    "InvariantSet",
-    "JointLimits",
     "Polytope",
-    "TerminalReport",
     "invariant_ellipsoid",
     "joint_limits",
     "maximal_control_invariant_set",

@@ -4,7 +4,7 @@ LinearSystem    a system, also from continuous time
 lqr             the linear-quadratic regulator -> LQR
 """
 
-from jaxmpc.systems.riccati import LQR, lqr
+from jaxmpc.systems.riccati import lqr
 from jaxmpc.systems.system import LinearSystem
 
-__all__ = ["LQR", "LinearSystem", "lqr"]
+__all__ = ["LinearSystem", "lqr"]

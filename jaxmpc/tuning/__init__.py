@@ -7,31 +7,25 @@ run_folder                                the folder of a run that is resumed or
 Parameter                                 a quantity that is tuned, and its domain
 ClosedLoopLoss                            tracking, effort, violations and settling
 tune_feasible_set                         the share of states from which all limits can be kept
-tune_solver, transfer_penalties        penalties of ADMM, also for another horizon
-Settings, TuningRun, Descent              arguments and results of all of these
-Interrupted                               what they raise on Ctrl-C, with the best so far
+tune_solver, transfer_penalties           penalties of ADMM, also for another horizon
+Interrupted                               what all of these raise on Ctrl-C, with the best so far
 """
 
-from jaxmpc.tuning.descent import Descent
 from jaxmpc.tuning.feasible_set import tune_feasible_set
 from jaxmpc.tuning.initial_states import feasible_states
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
 from jaxmpc.tuning.penalty_schedule import transfer_penalties
-from jaxmpc.tuning.result import Interrupted, TuningRun
+from jaxmpc.tuning.result import Interrupted
 from jaxmpc.tuning.run_folder import run_folder
-from jaxmpc.tuning.settings import Settings
 from jaxmpc.tuning.solver import tune_solver
 from jaxmpc.tuning.tasks import linear_task, robot_task, weight_parameters
 from jaxmpc.tuning.weights import tune_weights
 
 __all__ = [
     "ClosedLoopLoss",
-    "Descent",
     "Interrupted",
     "Parameter",
-    "Settings",
-    "TuningRun",
     "feasible_states",
     "linear_task",
     "robot_task",

@@ -3,6 +3,6 @@
 verify_map    prove the labels of a stored map again -> Verification
 """
 
-from jaxmpc.verify.stored_map import Verification, verify_map
+from jaxmpc.verify.stored_map import verify_map
 
-__all__ = ["Verification", "verify_map"]
+__all__ = ["verify_map"]

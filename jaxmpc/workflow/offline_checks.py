@@ -21,8 +21,8 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import row_table
 from jaxmpc.mpc.softening import harden
 from jaxmpc.pytrees import record
-from jaxmpc.recursion import RecursionReport
 from jaxmpc.recursion.analysis import examine
+from jaxmpc.recursion.report import RecursionReport
 from jaxmpc.recursion.time_budget import LABELS, LOOPS, PROOFS, Budget
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.terminal_hypotheses import TerminalReport, verify_terminal

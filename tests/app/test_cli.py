@@ -23,7 +23,9 @@ from jaxmpc.feasible import labelling
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.files import read_arrays, write_arrays
-from jaxmpc.recursion import Claim, Counterexample, RecursionReport, SmallestHorizon
+from jaxmpc.recursion.claims import Claim, Counterexample
+from jaxmpc.recursion.horizons import SmallestHorizon
+from jaxmpc.recursion.report import RecursionReport
 from jaxmpc.recursion.sampled_loops import SampledLoops
 from jaxmpc.sets.box import Box
 from jaxmpc.store.lock import Lock

@@ -8,7 +8,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from jaxmpc.app.plots import plot_feasible_set, plot_recursion, plot_robot_map
-from jaxmpc.recursion import Claim, Counterexample, RecursionReport
+from jaxmpc.recursion.claims import Claim, Counterexample
+from jaxmpc.recursion.report import RecursionReport
 from jaxmpc.recursion.sampled_loops import SampledLoops
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.polytope import Polytope

@@ -284,7 +284,7 @@ def test_previous_inputs_are_within_their_limits():
     fmap = jm.map_feasible_set(mpc, points)
     assert fmap.label.tolist() == [1, -1, -1, 1]
     assert fmap.problem.axis_names[-1] == "previous u1"
-    outer = jm.boundary(mpc, np.array([[0, 0, 1.0], [0, 0, -1]]), center=np.zeros(3)).outer
+    outer = jm.feasible.boundary(mpc, np.array([[0, 0, 1.0], [0, 0, -1]]), center=np.zeros(3)).outer
     np.testing.assert_allclose(outer, [1, 1], rtol=1e-6)
     projected = jm.map_feasible_set(mpc, points[:, :2], axes=(0, 1))
     assert projected.label.tolist() == [1, 1, 1, 1]

@@ -122,7 +122,7 @@ class TestUnits:
     D = np.random.default_rng(0).standard_normal((5, 2))
 
     def test_length_of_directions(self):
-        one, small = (jm.boundary(problems.lecture(), s * self.D) for s in (1.0, 1e-6))
+        one, small = (jm.feasible.boundary(problems.lecture(), s * self.D) for s in (1.0, 1e-6))
         np.testing.assert_allclose(small.inner * 1e-6, one.inner, rtol=1e-11)
         np.testing.assert_allclose(small.outer * 1e-6, one.outer, rtol=1e-11)
 

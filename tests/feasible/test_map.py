@@ -152,7 +152,7 @@ class TestEmptySet:
 
     def test_boundary(self):
         with pytest.raises(ValueError, match="empty"):
-            jm.boundary(EMPTY, 4)
+            jm.feasible.boundary(EMPTY, 4)
 
 
 class TestIndependenceOf:

@@ -137,7 +137,7 @@ def test_volume_and_polytopes(planar):
 
 def test_boundary(planar):
     mpc, polygon, _ = planar
-    found = jm.boundary(mpc, 40)
+    found = jm.feasible.boundary(mpc, 40)
     assert polygon.contains(found.points).all()
     # A roll-out of a plant that doubles at each step needs a thousand times the margin.
     growth = np.linalg.norm(np.linalg.matrix_power(mpc.system.A, mpc.horizon), 2)
@@ -274,7 +274,7 @@ class TestHiddenProduct:
         assert len(refined.outer().h) == 34
 
     def test_boundary(self, blocks):
-        found = jm.boundary(problems.hidden_product(), 24)
+        found = jm.feasible.boundary(problems.hidden_product(), 24)
         a, b = product_facets(blocks)
         exactly = 1 / (found.directions @ a.T / (b - a @ found.center)).max(axis=1)
         assert np.all(found.inner <= exactly + 1e-12) and np.all(found.outer >= exactly - 1e-12)

@@ -40,7 +40,7 @@ def scalar_integrator():
 def double_integrator():
     """The MPT toolbox's example: C_inf of area 1375/24 with 14 facets, found at step 6."""
     mpc = problems.double_integrator()
-    body = jm.maximal_control_invariant_set(mpc.system, mpc.states, mpc.inputs)
+    body = jm.sets.maximal_control_invariant_set(mpc.system, mpc.states, mpc.inputs)
     assert body.exact and body.iterations == 6 and len(body.vertices()) == 14
     assert body.volume() == pytest.approx(1375 / 24, rel=1e-12)
     assert np.abs(body.vertices() - [2.5, -3.5]).max(axis=1).min() < 1e-9
@@ -54,7 +54,7 @@ def double_integrator_lqr():
     body = jm.maximal_invariant_set(mpc.system, law.K, mpc.states, mpc.inputs)
     assert body.index == 2 and len(body.vertices()) == 6
     assert body.volume() == pytest.approx(13.74039794963338, rel=1e-9)
-    ellipsoid = jm.invariant_ellipsoid(mpc.system, law.K, law.P, mpc.states, mpc.inputs)
+    ellipsoid = jm.sets.invariant_ellipsoid(mpc.system, law.K, law.P, mpc.states, mpc.inputs)
     assert ellipsoid.level == pytest.approx(2.2690725611388145, rel=1e-9)
     assert ellipsoid.contraction == pytest.approx(0.4595183119694164, rel=1e-9)
     assert ellipsoid.volume() == pytest.approx(3.2752599406821137, rel=1e-9)
@@ -74,7 +74,7 @@ def lecture_sets():
             body = jm.feasible_polytope(problems.lecture(u_max, N))
             assert body.volume() == pytest.approx(area, abs=1e-9)
         mpc = problems.lecture(u_max)
-        body = jm.maximal_control_invariant_set(mpc.system, mpc.states, mpc.inputs)
+        body = jm.sets.maximal_control_invariant_set(mpc.system, mpc.states, mpc.inputs)
         assert body.exact and body.iterations == {0.25: 4, 0.3: 3}[u_max]
         assert body.volume() == pytest.approx(areas[-1], abs=1e-9)
 
@@ -99,7 +99,7 @@ def lecture_weaker():
 
 def lecture_penalty():
     """rho_bar = 11.25 at (−1/4, −3/5), by the state row at k = 3; 2(r u_max − q) for a scalar."""
-    found = jm.exact_penalty(problems.lecture())
+    found = jm.explicit.exact_penalty(problems.lecture())
     assert found.exact and found.rho_bar == pytest.approx(11.25, rel=1e-6)
     np.testing.assert_allclose(np.abs(found.at), [0.25, 0.6], atol=1e-6)
     assert found.row.stage == 3
@@ -110,7 +110,7 @@ def lecture_penalty():
             inputs=problems.symmetric(u_max),
             terminal_cost=q * np.eye(1), terminal_set=problems.symmetric(1.0),
         )  # fmt: skip
-        assert jm.exact_penalty(mpc).rho_bar == pytest.approx(rho, abs=1e-6)
+        assert jm.explicit.exact_penalty(mpc).rho_bar == pytest.approx(rho, abs=1e-6)
 
 
 def joint_sets():
@@ -118,7 +118,7 @@ def joint_sets():
     for N, area in ((1, 11.96), (4, 11.9136), (5, 11.912)):
         assert jm.feasible_polytope(problems.joint(N)).volume() == pytest.approx(area, abs=1e-9)
     mpc = problems.joint()
-    body = jm.maximal_control_invariant_set(mpc.system, mpc.states, mpc.inputs)
+    body = jm.sets.maximal_control_invariant_set(mpc.system, mpc.states, mpc.inputs)
     assert body.exact and body.iterations == 5 and len(body.vertices()) == 14
     assert body.volume() == pytest.approx(1489 / 125, abs=1e-9)
     for steps, area in (
@@ -158,7 +158,7 @@ def joint_lqr():
     body = jm.maximal_invariant_set(mpc.system, law.K, mpc.states, mpc.inputs)
     assert body.index == 3 and len(body.vertices()) == 10
     assert body.volume() == pytest.approx(0.9473310116683459, rel=1e-8)
-    ellipsoid = jm.invariant_ellipsoid(mpc.system, law.K, law.P, mpc.states, mpc.inputs)
+    ellipsoid = jm.sets.invariant_ellipsoid(mpc.system, law.K, law.P, mpc.states, mpc.inputs)
     assert ellipsoid.level == pytest.approx(1.4137628195913876, rel=1e-8)
     assert ellipsoid.volume() == pytest.approx(0.10389475972612443, rel=1e-8)
     assert ellipsoid.contraction == pytest.approx(0.9168846938332548, rel=1e-8)

@@ -254,7 +254,7 @@ class TestOtherQuestions:
     def test_boundary(self, none):
         mpc = planar("coupled", none, ("-0", "-1"))
         polygon = exact.feasible_polygon_by_elimination(mpc)
-        found = jm.boundary(mpc, 16, center=np.zeros(2))
+        found = jm.feasible.boundary(mpc, 16, center=np.zeros(2))
         ends = np.isfinite(found.inner) & (found.inner < 1e3)
         assert 4 < ends.sum() < 16
         assert np.all(found.outer[ends] - found.inner[ends] <= 1e-9)

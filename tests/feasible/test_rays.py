@@ -17,7 +17,7 @@ def polygon():
 
 class TestBoundaryArguments:
     def test_center_and_slice(self, polygon):
-        found = jm.boundary(problems.lecture(), np.array([[1.0, 0.0], [0.0, 2.0]]),
+        found = jm.feasible.boundary(problems.lecture(), np.array([[1.0, 0.0], [0.0, 2.0]]),
                             center=np.array([0.1, 0.2]))  # fmt: skip
         np.testing.assert_array_equal(found.center, [0.1, 0.2])
         assert polygon.contains(found.points).all()
@@ -39,7 +39,7 @@ class TestBoundaryArguments:
     )
     def test_errors(self, arguments, words):
         with pytest.raises(ValueError, match=words):
-            jm.boundary(problems.lecture(), **arguments)
+            jm.feasible.boundary(problems.lecture(), **arguments)
 
     def test_unbounded_ray(self):
         """No limit on x₁: the ray along it never ends, the other does."""
@@ -47,6 +47,6 @@ class TestBoundaryArguments:
             problems.lecture(), states=jm.Box(np.array([-np.inf, -1.0]), np.array([np.inf, 1.0])),
             terminal_set=None,
         )  # fmt: skip
-        found = jm.boundary(mpc, np.array([[1.0, 0.0], [0.0, 1.0]]), center=np.zeros(2))
+        found = jm.feasible.boundary(mpc, np.array([[1.0, 0.0], [0.0, 1.0]]), center=np.zeros(2))
         assert found.outer[0] == np.inf
         assert found.inner[1] == pytest.approx(1.0, abs=1e-9)

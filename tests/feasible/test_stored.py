@@ -222,7 +222,7 @@ def test_results_print_in_a_few_lines(tmp_path):
     mpc, points = problems.lecture(), mesh(LINES)
     fmap = jm.map_feasible_set(mpc, points, gap=1e-6)
     swept = jm.feasible.sweep_into(tmp_path / "a.zarr", mpc, LINES)
-    edges, growth = jm.boundary(mpc, 8), jm.feasible.feasible_growth(mpc, (2, 3))
+    edges, growth = jm.feasible.boundary(mpc, 8), jm.feasible.feasible_growth(mpc, (2, 3))
     verified = jm.verify.verify_map(tmp_path / "a.zarr")
     for found in (fmap, fmap.labels, swept, edges, growth, verified):
         text = repr(found)

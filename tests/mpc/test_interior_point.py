@@ -11,7 +11,7 @@ import pytest
 from jax import enable_x64
 
 import jaxmpc as jm
-from jaxmpc.mpc import solve_stagewise
+from jaxmpc.mpc import Plan, solve_stagewise
 from jaxmpc.mpc.softening import soften
 
 N, n, m, COUNT = 12, 4, 2, 48
@@ -47,7 +47,7 @@ def instances() -> tuple[np.ndarray, ...]:
 
 
 @cache
-def planned(kind: str = "hard", dtype: str = "float64", newton_steps: int | None = None) -> jm.Plan:
+def planned(kind: str = "hard", dtype: str = "float64", newton_steps: int | None = None) -> Plan:
     mpc, solver = PROBLEMS[kind], replace(SOLVER, newton_steps=newton_steps)
     with enable_x64(dtype == "float64"):
         data = [jnp.asarray(v, dtype) for v in instances()]

@@ -885,7 +885,7 @@ def test_feasible_set_of_blocked_moves(moves):
     sure = np.abs(margin) > 1e-7
     np.testing.assert_array_equal(fmap.label[sure], np.where(margin[sure] > 0, 1, -1))
     assert_proofs(mpc, fmap)
-    found = jm.boundary(mpc, 24)
+    found = jm.feasible.boundary(mpc, 24)
     for point, t in zip(found.directions, found.outer, strict=True):
         place = dict(zip(explicit.x[0], found.center + t * point, strict=True))
         assert abs(explicit.margin(place)) <= 1e-7

@@ -15,9 +15,10 @@ import jaxmpc as jm
 from jaxmpc.app import cli
 from jaxmpc.app.plots import plot_robot_map
 from jaxmpc.feasible.labels import Labels
-from jaxmpc.robot_maps import OUTCOMES, RobotLoops, map_robot, mapping
+from jaxmpc.robot_maps import OUTCOMES, map_robot, mapping
 from jaxmpc.robot_maps.linear_problem import deviations, with_initial_limits
 from jaxmpc.robot_maps.mapping import RobotSetting
+from jaxmpc.robot_maps.robot_loops import RobotLoops
 
 SECONDS = 0.8
 

@@ -19,7 +19,7 @@ def test_names():
     np.testing.assert_array_equal(
         found["invariant"].h, jm.maximal_invariant_set(MPC.system, LAW.K, *limits).h
     )
-    level = jm.invariant_ellipsoid(MPC.system, LAW.K, LAW.P, *limits).level
+    level = jm.sets.invariant_ellipsoid(MPC.system, LAW.K, LAW.P, *limits).level
     assert found["ellipsoid"].level == level
 
 

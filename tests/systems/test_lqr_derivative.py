@@ -122,7 +122,7 @@ def test_invariant_ellipsoid_follows_the_weights_of_its_law():
 
     def terminal(Q):
         found = jm.lqr(joint, Q, np.array([[0.1]]))
-        return jm.invariant_ellipsoid(joint, found.K, found.P, states, inputs)
+        return jm.sets.invariant_ellipsoid(joint, found.K, found.P, states, inputs)
 
     def level(Q):
         ellipsoid = terminal(Q)
@@ -146,7 +146,7 @@ def test_ellipsoids_that_are_not_invariant_have_no_level():
     """P that is no Lyapunov matrix, or limits that do not hold the origin: NaN in a trace."""
     system, limits = jm.LinearSystem([[0.5]], [[1.0]]), jm.Box([-1.0], [2.0])
     level = lambda k, p, low: (
-        jm.invariant_ellipsoid(system, [[k]], [[p]], jm.Box([low], [2.0]), limits).level
+        jm.sets.invariant_ellipsoid(system, [[k]], [[p]], jm.Box([low], [2.0]), limits).level
     )
     with jax.enable_x64(True):
         found = jax.jit(jax.vmap(level))(
@@ -155,7 +155,7 @@ def test_ellipsoids_that_are_not_invariant_have_no_level():
         )  # fmt: skip
     np.testing.assert_allclose(found, [2.0, np.nan, np.nan, np.nan])
     with pytest.raises(ValueError, match="disturbance: given inside a trace"):
-        jax.jit(lambda p: jm.invariant_ellipsoid(system, [[-0.5]], p, limits, None, limits).P)(
+        jax.jit(lambda p: jm.sets.invariant_ellipsoid(system, [[-0.5]], p, limits, None, limits).P)(
             np.eye(1)
         )
 

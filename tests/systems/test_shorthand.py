@@ -18,8 +18,8 @@ def test_weights_of_verify_terminal():
     system = jm.LinearSystem([[1, 0.1], [0, 1]], [0, 0.1])
     X, U = jm.Box([-1, -1], [1, 1]), jm.Box(-1, 1)
     law = jm.lqr(system, [1, 1], 0.1)
-    found = jm.verify_terminal(system, [1, 1], 0.1, law.P, X, X, U)
-    wanted = jm.verify_terminal(system, np.eye(2), [[0.1]], law.P, X, X, U)
+    found = jm.sets.verify_terminal(system, [1, 1], 0.1, law.P, X, X, U)
+    wanted = jm.sets.verify_terminal(system, np.eye(2), [[0.1]], law.P, X, X, U)
     assert str(found) == str(wanted)
 
 

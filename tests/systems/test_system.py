@@ -11,7 +11,7 @@ import pytest
 import scipy
 
 from jaxmpc import Box, LinearSystem, Polytope
-from jaxmpc.systems import LQR
+from jaxmpc.systems.riccati import LQR
 
 INF = np.inf
 

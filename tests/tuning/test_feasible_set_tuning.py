@@ -125,7 +125,7 @@ def test_tightening_and_rows_that_no_input_moves():
 def terminal_law(v) -> jm.MPC:
     """The ellipsoid of the LQR of weights of its own, with the cost that this law has."""
     law = jm.lqr(MPC.system, v["Qt"], MPC.R)
-    ellipsoid = jm.invariant_ellipsoid(MPC.system, law.K, law.P, MPC.states, MPC.inputs)
+    ellipsoid = jm.sets.invariant_ellipsoid(MPC.system, law.K, law.P, MPC.states, MPC.inputs)
     cost = cost_of_law(MPC.system, law.K, MPC.Q, MPC.R)
     return replace(MPC, terminal_set=ellipsoid, terminal_cost=cost)
 

@@ -85,7 +85,7 @@ def test_info_explains_what_it_cannot_read(capsys, tmp_path):
 
 def test_report_keeps_to_its_time(capsys):
     """Stages are announced, and what is left out is said."""
-    report = jm.offline_report(problems.joint(20), seconds=0.01, progress=True)
+    report = jm.workflow.offline_report(problems.joint(20), seconds=0.01, progress=True)
     assert report.feasible_set is None and report.loops is None
     assert report.terminal is not None and report.recursion.law.holds is None
     text = str(report)
@@ -109,13 +109,13 @@ def test_report_of_an_ellipsoidal_and_of_a_4d_problem():
     """What does not apply is said, not left out."""
     mpc = problems.joint(6)
     law = jm.lqr(mpc.system, mpc.Q, mpc.R)
-    last = jm.invariant_ellipsoid(mpc.system, law.K, law.P, mpc.states, mpc.inputs)
-    report = jm.offline_report(
+    last = jm.sets.invariant_ellipsoid(mpc.system, law.K, law.P, mpc.states, mpc.inputs)
+    report = jm.workflow.offline_report(
         jm.MPC(mpc.system, mpc.Q, mpc.R, 6, mpc.states, mpc.inputs, law.P, last), steps=10, loops=8
     )
     assert report.terminal.recursive_feasibility and report.terminal.stability
     assert report.penalty is None and "ellips" in report.notes["penalty"].lower()
     assert report.recursion.strong.holds is True
     assert report.loops.feasible == 8 and report.loops.increase <= 1e-7
-    product = jm.offline_report(problems.hidden_product(3), steps=3, loops=8, seconds=20)
+    product = jm.workflow.offline_report(problems.hidden_product(3), steps=3, loops=8, seconds=20)
     assert product.feasible_set.counts()["undecided"] == 0 and product.loops.feasible <= 8

@@ -20,7 +20,8 @@ from jaxmpc.app.plots.style import (
     ring,
 )
 from jaxmpc.checks import fail
-from jaxmpc.recursion import Counterexample, RecursionReport
+from jaxmpc.recursion.claims import Counterexample
+from jaxmpc.recursion.report import RecursionReport
 
 # States lost at step 1, 2, 3, 4-5, 6-10, later: from dark to light.
 LOST = ("#7a0403", "#b5290a", "#dd5a13", "#f28b30", "#f9b867", "#fbe0ad")
