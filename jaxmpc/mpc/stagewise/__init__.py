@@ -1,1 +1,1 @@
-"""TODO."""
+"""Plans stage by stage along the horizon, for systems that vary and for nonlinear models."""

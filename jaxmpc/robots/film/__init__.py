@@ -1,1 +1,1 @@
-"""TODO."""
+"""Videos of robots in motion, with captions."""
