@@ -23,6 +23,7 @@ def grid(lower: Reals, upper: Reals, shape: int | Sequence[int]) -> np.ndarray:
         fail("grid", f"lower {lower.shape}, upper {upper.shape}, shape {shape}", "Same length each")
     if not (np.all(np.isfinite(lower)) and np.all(np.isfinite(upper)) and np.all(lower <= upper)):
         fail("grid", f"lower {lower}, upper {upper}", "Give finite lower ≤ upper")
+    _require_memory(shape)  # before the lines, of which one alone may be too long
     lines = [np.linspace(*ends) for ends in zip(lower, upper, shape, strict=True)]
     return mesh(lines)
 
@@ -32,11 +33,14 @@ def mesh(lines: Sequence[np.ndarray], index: np.ndarray | None = None) -> np.nda
     (k,): only these of them, which needs no memory for the others. Raises ValueError for a grid
     that does not fit into memory."""
     if index is None:
-        needed = 16 * len(lines) * math.prod(len(line) for line in lines)
-        require_memory("grid", needed, "Give fewer points")
+        _require_memory([len(line) for line in lines])
         return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(lines))
     place = np.unravel_index(index, [len(line) for line in lines])
     return np.stack([line[i] for line, i in zip(lines, place, strict=True)], axis=-1)
+
+
+def _require_memory(shape: Sequence[int]) -> None:
+    require_memory("grid", 16 * len(shape) * math.prod(shape), "Give fewer points")
 
 
 def axis_indices(
