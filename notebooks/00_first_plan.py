@@ -67,7 +67,7 @@ controller = jm.Controller(mpc)
 # %%
 x0 = np.array([-1.2, 0.1])
 plan = controller.plan(x0)
-print(jm.Status(int(plan.status)).sentence)
+print(plan.sentence)
 assert int(plan.status) == jm.Status.SOLVED
 
 # %% [markdown]
@@ -154,7 +154,7 @@ assert abs(final[0] - 1) < 0.01
 x0 = np.array([1.49, 1.9])
 assert bool(limits.contains(x0))
 plan = controller.plan(x0)
-print(jm.Status(int(plan.status)).name, "-", jm.Status(int(plan.status)).sentence)
+print(jm.Status(int(plan.status)).name, "-", plan.sentence)
 assert int(plan.status) == jm.Status.PRIMAL_INFEASIBLE
 
 # %% [markdown]

@@ -184,7 +184,7 @@ free = np.concatenate([np.zeros(N), Phi[1] @ too_fast, Phi[2] @ too_fast])
 slope = 2 * sum(G.T @ W @ F @ too_fast for F, G, W in zip(Phi, Gamma, weights, strict=True))
 impossible = jm.QP(P_z, slope, C, l=-bound - free, u=bound - free)
 answer = jm.solve_qp(impossible)
-print(jm.Status(int(answer.status)).sentence)
+print(answer.sentence)
 assert int(answer.status) == jm.Status.PRIMAL_INFEASIBLE
 
 # %% [markdown]

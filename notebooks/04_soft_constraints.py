@@ -62,7 +62,7 @@ assert bool(limits.contains(pushed)) and not bool(feasible.contains(pushed))
 soft = jm.soften(hard, rho=1000.0)
 plan = jm.solve(soft, pushed)
 slack = np.asarray(plan.slack)
-print(jm.Status(int(plan.status)).sentence)
+print(plan.sentence)
 print(f"q goes up to {np.asarray(plan.states)[:, 0].max():.4f} rad")
 assert int(plan.status) == jm.Status.SOLVED
 # Braking with full torque takes 0.055 rad from 1.9 rad/s, so 1.515 rad is the least possible.

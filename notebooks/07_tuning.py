@@ -145,7 +145,7 @@ for rho in rhos:
     admm = jm.ADMM(iterations=48, rho=rho, newton_steps=0)
     plans = jax.vmap(jm.Controller(run.mpc, admm).plan)(states)
     accuracy.append(np.maximum(plans.primal_residual, plans.dual_residual))
-    solved.append(np.mean(plans.status == jm.Status.SOLVED))
+    solved.append(np.mean(plans.solved))
 print("solved, by rho:", dict(zip(np.round(rhos, 3), np.round(solved, 3), strict=True)))
 
 # %%
@@ -208,7 +208,7 @@ assert abs(same).max() < 1e-5 and np.isclose(jm.explicit.exact_penalty(tenfold).
 # %%
 tuned = jax.vmap(jm.Controller(run.mpc, penalties.solver).plan)(states)
 default = jm.solve_many(run.mpc, states)
-both = (tuned.status == jm.Status.SOLVED) & (default.status == jm.Status.SOLVED)
+both = tuned.solved & default.solved
 gap = np.abs(np.asarray(tuned.inputs) - default.inputs)[both].max()
 print(f"{both.sum()} of {len(states)} states compared; largest difference {gap:.1e} N m")
 assert gap < 1e-2
