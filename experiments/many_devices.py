@@ -22,7 +22,7 @@ from bench.families import joint
 
 import jaxmpc as jm
 from jaxmpc.batches import chosen_devices, default_chunk, gather_size, placement
-from jaxmpc.feasible.candidates import compiled_admm, compiled_newton
+from jaxmpc.feasible.candidate_search import compiled_admm, compiled_newton
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.many import _plans

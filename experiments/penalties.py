@@ -37,8 +37,8 @@ from jaxmpc.app import config
 from jaxmpc.mpc.condense import Condensed, condense, in_float64
 from jaxmpc.qp.admm import factor, iterate, read, scaled, splittings, unscaled
 from jaxmpc.qp.residuals import largest_of, residual_terms, worst
-from jaxmpc.tuning.penalty_schedule import transfer_penalties
 from jaxmpc.tuning.result import TuningRun
+from jaxmpc.tuning.rho_schedule import transfer_penalties
 from jaxmpc.tuning.solver import tune_solver
 
 HERE = Path(__file__).parent

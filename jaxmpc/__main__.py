@@ -12,7 +12,7 @@ def main() -> int:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _stop)  # until the command begins, see `cli.main`
     warnings.formatwarning = lambda message, *_, **__: f"jaxmpc: {message}\n"
-    from jaxmpc.app.programs import kept_programs
+    from jaxmpc.app.program_cache import kept_programs
 
     with kept_programs(sys.argv[1:]):  # before JAX is imported
         from jaxmpc.app import cli

@@ -208,7 +208,7 @@ def check_programs():
     import jax.numpy as jnp
 
     from jaxmpc.batches import over_devices
-    from jaxmpc.feasible.candidates import compiled_admm, compiled_check, compiled_newton
+    from jaxmpc.feasible.candidate_search import compiled_admm, compiled_check, compiled_newton
     from jaxmpc.mpc.many import _plans
 
     def count_to(end, x):

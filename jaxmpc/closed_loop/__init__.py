@@ -11,7 +11,7 @@ LinearFeedback             LQR or PD with clipping, to compare with
 Noise                      random disturbances of the plant and of what is measured
 KalmanFilter               estimates of the state from noisy outputs -> Belief
 Environment                a robot with a task, reset and step as pure functions
-                           -> EnvironmentState; robot_env.RobotEnv is Gymnasium's form
+                           -> EnvironmentState; gymnasium_env.RobotEnv is Gymnasium's form
 MPCPolicy                  a controller as a policy of observations
 draw_robots                random starts and random factors of masses, damping and payloads
 randomised                 random masses, damping, payloads of robots, for `variations`
@@ -25,7 +25,7 @@ from jaxmpc.closed_loop.observer import KalmanFilter
 from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.closed_loop.robot_controller import RobotController
 from jaxmpc.closed_loop.robot_problem import robot_mpc
-from jaxmpc.closed_loop.run import Run, lyapunov_decrease
+from jaxmpc.closed_loop.run_record import Run, lyapunov_decrease
 from jaxmpc.closed_loop.runs_summary import summarise_runs
 from jaxmpc.closed_loop.simulation import simulate
 from jaxmpc.closed_loop.stored_runs import simulate_into

@@ -29,9 +29,9 @@ from jaxmpc.checks import fail, require_real
 from jaxmpc.closed_loop.interfaces import Feedback, Plant
 from jaxmpc.closed_loop.noise import Noise
 from jaxmpc.closed_loop.observer import KalmanFilter
-from jaxmpc.closed_loop.run import Run
+from jaxmpc.closed_loop.run_record import Run
 from jaxmpc.closed_loop.simulation import Conditions, checked_loop, simulate
-from jaxmpc.mpc.arguments import reference_shapes
+from jaxmpc.mpc.aim import reference_shapes
 from jaxmpc.mpc.stagewise.nonlinear import ConstantModel
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.precision import arrays

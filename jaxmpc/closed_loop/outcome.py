@@ -6,7 +6,7 @@ from jax import Array
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.closed_loop.run import Run
+from jaxmpc.closed_loop.run_record import Run
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.linear_plant import LinearPlant

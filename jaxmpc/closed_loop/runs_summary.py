@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals
 from jaxmpc.closed_loop.outcome import Outcome, evaluate_runs
-from jaxmpc.closed_loop.run import Run
+from jaxmpc.closed_loop.run_record import Run
 from jaxmpc.closed_loop.stored_runs import StoredRuns
 from jaxmpc.files import versions
 from jaxmpc.pytrees import record

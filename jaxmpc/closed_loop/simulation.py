@@ -14,13 +14,13 @@ from jaxmpc.closed_loop.interfaces import Feedback, Plant
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
 from jaxmpc.closed_loop.noise import Noise
 from jaxmpc.closed_loop.observer import Belief, KalmanFilter, model_of, model_step
-from jaxmpc.closed_loop.run import Run
-from jaxmpc.mpc.arguments import checked_aim, checked_array
+from jaxmpc.closed_loop.run_record import Run
+from jaxmpc.mpc.aim import checked_aim, checked_array
 from jaxmpc.mpc.plan import Control
 from jaxmpc.mpc.problem import weights_of
 from jaxmpc.mpc.stagewise.nonlinear import ConstantModel, as_argument
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.qp.modes import own_modes, varying
+from jaxmpc.qp.jax_modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.sets.violations import worst_violation
 from jaxmpc.systems.system import LinearSystem

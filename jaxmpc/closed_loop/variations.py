@@ -8,8 +8,8 @@ import jax
 import numpy as np
 
 from jaxmpc.checks import fail, nearest, require_kind, require_shape, whole
-from jaxmpc.robots.engine import names, number_of
 from jaxmpc.robots.linear_plant import LinearPlant
+from jaxmpc.robots.mujoco_access import names, number_of
 from jaxmpc.robots.robot import Robot
 
 # Of each quantity, the field of MuJoCo's model that its factor multiplies and whose it is. The

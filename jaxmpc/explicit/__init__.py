@@ -6,7 +6,7 @@ Law                  plans, and the affine law on the region of a given state ->
 """
 
 from jaxmpc.explicit.exact_penalties import exact_penalty
-from jaxmpc.explicit.law import Law
+from jaxmpc.explicit.law_at_states import Law
 from jaxmpc.explicit.regions import critical_regions
 
 __all__ = [

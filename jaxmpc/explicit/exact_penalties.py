@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_kind, whole
-from jaxmpc.explicit.active_sets import ActivePiece, active_piece, capped_ball
+from jaxmpc.explicit.active_piece import ActivePiece, active_piece, capped_ball
 from jaxmpc.explicit.least_distance import SMALLEST, LeastDistanceForm, least_distance_form
 from jaxmpc.explicit.region_search import exchange, explore
 from jaxmpc.explicit.regions import CriticalRegions

@@ -6,7 +6,7 @@ from collections import deque
 import numpy as np
 
 from jaxmpc.checks import fail, whole
-from jaxmpc.explicit.active_sets import Cell, cell
+from jaxmpc.explicit.active_piece import Cell, cell
 from jaxmpc.explicit.least_distance import DEPENDENT, LeastDistanceForm
 from jaxmpc.sets.geometry import hull_volume
 from jaxmpc.sets.polytope import Polytope

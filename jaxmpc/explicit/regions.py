@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail
-from jaxmpc.explicit.active_sets import Cell
+from jaxmpc.explicit.active_piece import Cell
 from jaxmpc.explicit.least_distance import (
     GivenProgram,
     LeastDistanceForm,

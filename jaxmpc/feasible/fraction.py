@@ -25,7 +25,7 @@ from jaxmpc.checks import concrete, fail, require_shape
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp import linalg
-from jaxmpc.qp.modes import own_modes, varying
+from jaxmpc.qp.jax_modes import own_modes, varying
 from jaxmpc.qp.newton import Augmented, Constants, newton_step, ridged
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.projection import Bounds

@@ -13,7 +13,7 @@ from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import Part, chosen_devices, count, default_chunk, slices, work_off
 from jaxmpc.checks import fail, number, whole
 from jaxmpc.feasible import proofs
-from jaxmpc.feasible.labelling import labelled_parts
+from jaxmpc.feasible.label_workers import labelled_parts
 from jaxmpc.feasible.labels import Labels, OnDemand
 from jaxmpc.feasible.pipeline import Scope
 from jaxmpc.feasible.problem import FeasibilityProblem

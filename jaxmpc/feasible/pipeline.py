@@ -36,13 +36,13 @@ from jaxmpc.batches import (
     require_partitioner,
 )
 from jaxmpc.checks import fail, require_step_type
-from jaxmpc.feasible.candidates import compiled_admm, compiled_check, compiled_newton
-from jaxmpc.feasible.constraint_rows import ConstraintRows
-from jaxmpc.feasible.hull import compiled_labels, compiled_verdicts, hull_for
+from jaxmpc.feasible.candidate_search import compiled_admm, compiled_check, compiled_newton
+from jaxmpc.feasible.hull_labels import compiled_labels, compiled_verdicts, hull_for
 from jaxmpc.feasible.labels import Labels, OnDemand
+from jaxmpc.feasible.orthonormal_rows import ConstraintRows
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import Verdict
-from jaxmpc.feasible.row_programs import RowPrograms
+from jaxmpc.feasible.row_lps import RowPrograms
 from jaxmpc.pytrees import record
 
 # Steps of the longer ADMM run, relative to the first, on points that Newton leaves undecided.

@@ -9,11 +9,11 @@ from scipy.linalg import qr
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import require_kind
-from jaxmpc.feasible import constraint_rows, exact_data
-from jaxmpc.feasible.constraint_rows import ConstraintRows
-from jaxmpc.feasible.exact_data import ExactData
+from jaxmpc.feasible import hard_constraints, orthonormal_rows
+from jaxmpc.feasible.hard_constraints import ExactData
+from jaxmpc.feasible.orthonormal_rows import ConstraintRows
 from jaxmpc.feasible.plan_polytope import PlanPolytope
-from jaxmpc.feasible.row_programs import RowPrograms
+from jaxmpc.feasible.row_lps import RowPrograms
 from jaxmpc.feasible.view import Axes, View, make_view
 from jaxmpc.files import as_json
 from jaxmpc.mpc.condense import Condensed, condensed_in_float64
@@ -74,12 +74,12 @@ class FeasibilityProblem:
     @cached_property
     def blocks(self) -> list[Block]:
         """Return the blocks of hard rows, in the order of the condensed rows."""
-        return exact_data.hard_blocks(self.mpc)
+        return hard_constraints.hard_blocks(self.mpc)
 
     @cached_property
     def rows(self) -> ConstraintRows:
         """Return the condensed rows in θ and an orthonormal basis."""
-        return constraint_rows.constraint_rows(self.mpc, self.view, self.condensed, self.blocks)
+        return orthonormal_rows.constraint_rows(self.mpc, self.view, self.condensed, self.blocks)
 
     @cached_property
     def programs(self) -> RowPrograms:
@@ -99,7 +99,7 @@ class FeasibilityProblem:
         free = replace(self.mpc, prestabilise=False)
         c = with_previous_inputs(free, condensed_in_float64(free))
         return tuple(
-            constraint_rows.constraint_rows(self.mpc, self.view, c, self.blocks, growth)
+            orthonormal_rows.constraint_rows(self.mpc, self.view, c, self.blocks, growth)
             for growth in ([slow, fast] if fast > (1 + 1e-6) * slow else [fast])
         )
 
@@ -118,7 +118,7 @@ class FeasibilityProblem:
         """
         extent, _ = self.programs.bounding_box
         extent = np.array([-region, region]) if extent is None else extent
-        return exact_data.exact_data(self.mpc, self.view, self.blocks, extent, size)
+        return hard_constraints.exact_data(self.mpc, self.view, self.blocks, extent, size)
 
     def plain(self) -> dict[str, Any]:
         """Return the hard constraints as JSON data, from which stored labels can be verified.
@@ -129,7 +129,7 @@ class FeasibilityProblem:
         that are not, and their value or bounds.
         """
         mpc, view, set_ = self.mpc, self.view, self.mpc.terminal_set
-        A, B, c = exact_data.augmented_dynamics(mpc)
+        A, B, c = hard_constraints.augmented_dynamics(mpc)
         rows = [
             {"steps": list(b.steps), "H": b.H, "D": b.D, "lower": b.lower, "upper": b.upper}
             for b in self.blocks
@@ -148,17 +148,17 @@ class FeasibilityProblem:
     def row_margins(self, exact: ExactData, size: np.ndarray) -> np.ndarray:
         """Return what margins (R,) of the rows a proof needs relative to each other: as rounding
         can move them at points of this size (d,), within a factor of 1e8."""
-        start = exact_data.start_sizes(self.view, size)
-        rounding = exact_data.rounding_of_rows(exact, start)
+        start = hard_constraints.start_sizes(self.view, size)
+        rounding = hard_constraints.rounding_of_rows(exact, start)
         found = np.zeros(len(self.rows.lower) + 1)
         found[self.rows.index] = np.concatenate([np.ravel(part) for part in rounding])
         return np.clip(found[:-1] * self.rows.weight, self.rows.size, 1e8 * self.rows.size)
 
 
 def with_previous_inputs(mpc: MPC, c: Condensed) -> Condensed:
-    """Return the condensed problem with the rows of `exact_data.previous_inputs` before all
+    """Return the condensed problem with the rows of `hard_constraints.previous_inputs` before all
     others."""
-    for b in exact_data.previous_inputs(mpc):
+    for b in hard_constraints.previous_inputs(mpc):
         more: dict[str, Any] = {
             "C": np.concatenate([np.zeros((b.size, c.C.shape[1])), c.C]),
             "D": np.concatenate([b.H, c.D]),

@@ -49,7 +49,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.feasible.exact_data import ExactData
+from jaxmpc.feasible.hard_constraints import ExactData
 from jaxmpc.pytrees import pytree
 
 UNIT_ROUNDOFF = 2.0**-53

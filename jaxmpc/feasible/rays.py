@@ -17,14 +17,14 @@ from scipy.spatial import KDTree
 from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail
 from jaxmpc.feasible import proofs
-from jaxmpc.feasible.candidates import cut_of, inputs_of
-from jaxmpc.feasible.constraint_rows import ConstraintRows
-from jaxmpc.feasible.exact_data import ExactData
+from jaxmpc.feasible.candidate_search import cut_of, inputs_of
+from jaxmpc.feasible.hard_constraints import ExactData
+from jaxmpc.feasible.orthonormal_rows import ConstraintRows
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import Cut
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
-from jaxmpc.qp.modes import own_modes
+from jaxmpc.qp.jax_modes import own_modes
 from jaxmpc.sets.geometry import hull_volume
 from jaxmpc.sets.lp import power_of_two
 from jaxmpc.sets.polytope import Polytope

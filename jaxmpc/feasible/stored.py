@@ -19,9 +19,9 @@ import numpy as np
 from jaxmpc.arrays import Reals
 from jaxmpc.batches import CHUNK, Part, Timing, work_off
 from jaxmpc.checks import fail
-from jaxmpc.feasible import extremes
-from jaxmpc.feasible.extremes import HalfSpaces
-from jaxmpc.feasible.labelling import labelled_parts
+from jaxmpc.feasible import irredundant
+from jaxmpc.feasible.irredundant import HalfSpaces
+from jaxmpc.feasible.label_workers import labelled_parts
 from jaxmpc.feasible.labels import PROOFS, Labels, OnDemand
 from jaxmpc.feasible.map import FeasibleSetMap, excluded
 from jaxmpc.feasible.pipeline import Scope
@@ -104,7 +104,7 @@ class StoredMap:
         cls, problem: FeasibilityProblem, store: Store, along: Sequence[np.ndarray]
     ) -> "StoredMap":
         """Read all labels of an open store, and the proofs that matter, block by block: memory does
-        not grow with the grid up to `extremes.REDUCED` mapped states."""
+        not grow with the grid up to `irredundant.REDUCED` mapped states."""
         found = cls.unread(problem, store, along)
         points = found.bounds.bound_point
         cuts = HalfSpaces.none(np.array([[line[0], line[-1]] for line in along]).T)
@@ -113,10 +113,10 @@ class StoredMap:
             found._count(block, labels)
             if np.any(labels.status == Status.ITERATION_LIMIT):
                 found.undecided.append(block)
-            ends = extremes.line_ends(labels.label == 1, store.regions[block][-1])
+            ends = irredundant.line_ends(labels.label == 1, store.regions[block][-1])
             if len(ends):
                 points = np.concatenate([points, mesh(along, store.samples(block)[ends])])
-                points = extremes.extreme(points) if len(points) > extremes.MANY else points
+                points = irredundant.extreme(points) if len(points) > irredundant.MANY else points
             if np.any(labels.label == -1):
                 cuts = cuts.add(store.read("cut_normal", block), store.read("cut_offset", block))
         return found._with_bounds(points, cuts.normals, cuts.offsets)

@@ -25,8 +25,8 @@ from jaxmpc.checks import concrete, require_memory
 from jaxmpc.mpc.problem import MPC, Switch, weights_of
 from jaxmpc.mpc.rows import Layout, blocks, bounds_of, layout_of, split, stacked
 from jaxmpc.pytrees import pytree, static
+from jaxmpc.qp.jax_modes import own_modes, varying
 from jaxmpc.qp.linalg import solve
-from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds

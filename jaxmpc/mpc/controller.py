@@ -13,7 +13,7 @@ from jax import Array
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import concrete, fail, require_kind
-from jaxmpc.mpc.arguments import Aim, checked_aim
+from jaxmpc.mpc.aim import Aim, checked_aim
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.plan import (
     Control,
@@ -33,7 +33,7 @@ from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor
 from jaxmpc.qp.admm import factor as factorise
 from jaxmpc.qp.dual_search import has_dual_steps
-from jaxmpc.qp.modes import own_modes, varying
+from jaxmpc.qp.jax_modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, matmul
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.solve import in_two_parts, solve_factored

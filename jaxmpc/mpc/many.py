@@ -31,7 +31,7 @@ from jaxmpc.batches import (
     workers,
 )
 from jaxmpc.checks import fail, require_kind, require_memory, require_step_type, whole
-from jaxmpc.mpc import reuse
+from jaxmpc.mpc.active_set_reuse import Cells, Laws, choose, follow, laws_of, transferable
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Plan
@@ -80,7 +80,7 @@ class Batch:
         left = np.arange(B)
         # (On GPUs the solver's kernels take less time than the laws and the host's indices would.)
         on_cpu = jax.default_backend() == "cpu"
-        if follow and on_cpu and B >= MANY and reuse.transferable(self.controller):
+        if follow and on_cpu and B >= MANY and transferable(self.controller):
             self.chunk = self.block  # larger arrays a CPU's allocator would give back each time
             left = self._transfer()
         self._run(_plans(self.devices), (self.controller,), left)
@@ -90,7 +90,7 @@ class Batch:
     def _transfer(self) -> np.ndarray:
         """Solve from some states, and from those that follow them; return the indices of those that
         are left."""
-        index, cells = reuse.choose(self.x)
+        index, cells = choose(self.x)
         self._run(_plans(self.devices), (self.controller,), index)
         solved = jax.tree.map(lambda v: v[padded(index, len(cells.states))], self.answer)
         laws = _laws(self.controller, solved.multipliers, solved.status)
@@ -175,15 +175,15 @@ def _plans(devices: Devices) -> Compiled:
 
 @functools.cache
 def _follow(devices: Devices, steps: int) -> Compiled:
-    """Return the program (controller, laws, cells, x (B, p)) → plans of `reuse.follow`."""
+    """Return the program (controller, laws, cells, x (B, p)) → plans of `follow`."""
 
-    def run(controller: Controller, laws: reuse.Laws, cells: reuse.Cells, x: Array) -> Plan:
-        return jax.vmap(partial(reuse.follow, controller, laws, cells, steps))(x)
+    def run(controller: Controller, laws: Laws, cells: Cells, x: Array) -> Plan:
+        return jax.vmap(partial(follow, controller, laws, cells, steps))(x)
 
     return over_devices(run, devices, (False, False, False, True))
 
 
-_laws = jax.jit(reuse.laws_of)
+_laws = jax.jit(laws_of)
 
 
 def solve_many(
@@ -206,9 +206,9 @@ def solve_many(
     solver counts. dtype: type of the ADMM iterates; Newton steps, residuals, status and the answer
     are float64 whatever it is, and whether or not 64-bit mode is on. chunk: states that a compiled
     program takes at once; None: by device. transfer: on a CPU, of very many states with few
-    coordinates solve some, and let the others follow these (`reuse.py`). The status of each plan
-    comes from its own residuals all the same: this changes the time, and which of several plans
-    within the tolerances is found.
+    coordinates solve some, and let the others follow these (`active_set_reuse.py`). The status of
+    each plan comes from its own residuals all the same: this changes the time, and which of several
+    plans within the tolerances is found.
     to_host: False leaves the plans on the device. devices: a number of them, or a sequence of JAX
     devices, which share the states of a chunk; None: the default device. A state with NaN gets
     status NON_FINITE. Raises ValueError for wrong shapes and ill-posed problems.

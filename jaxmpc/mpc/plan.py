@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
-from jaxmpc.mpc.arguments import Aim
+from jaxmpc.mpc.aim import Aim
 from jaxmpc.mpc.problem import MPC, weights_of
 from jaxmpc.mpc.rows import Block, Layout, blocks, row_count, split
 from jaxmpc.pytrees import named_pytree, pytree

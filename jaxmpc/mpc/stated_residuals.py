@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.mpc.arguments import Aim
+from jaxmpc.mpc.aim import Aim
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import blocks, split
@@ -60,7 +60,7 @@ def with_stated_status(
         found = replace(
             found, primal_residual=measured.primal, dual_residual=measured.dual, gap=measured.gap
         )
-        solved = measured.small
+        solved = measured.within_tolerance
     else:
         allowed = eps + ROUNDED * jnp.finfo(dtype).eps
         solved = (found.status == Status.SOLVED) & (worst(terms[:1], allowed)[1][0] <= allowed)

@@ -32,8 +32,8 @@ from jax import Array
 
 from jaxmpc.checks import MOST_COUNT, concrete, fail, number, require_real, whole
 from jaxmpc.pytrees import pytree, static
+from jaxmpc.qp.jax_modes import varying
 from jaxmpc.qp.linalg import cholesky, inverse_root
-from jaxmpc.qp.modes import varying
 from jaxmpc.qp.precision import matmul, precisely, rounding
 from jaxmpc.qp.problem import QP
 from jaxmpc.qp.projection import Bounds
@@ -66,7 +66,7 @@ class ADMM:
     √(min(1, n/m)), m counting the rows that z moves; or a number, one value a row (m,), or a
     schedule (stages, m) or (stages, 1) whose stages have equally many iterations.
     alpha: over-relaxation in (0, 2).
-    newton_steps: at most so many after the loop, 0 for none (`active_set.py`, `newton.py`). None:
+    newton_steps: at most so many after the loop, 0 for none (`dual_search.py`, `newton.py`). None:
     1,000, of which badly scaled linear programs need most, 150 where every instance takes them all,
     and in `solve_stagewise` as many as are needed. An instance leaves when its residuals are small
     enough, also in a batch. fixed: every instance takes all `newton_steps`, of the method of

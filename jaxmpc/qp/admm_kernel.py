@@ -19,7 +19,7 @@ from jax.typing import DTypeLike
 from jaxmpc.pytrees import record
 from jaxmpc.qp import triton
 from jaxmpc.qp.admm import Factor
-from jaxmpc.qp.loops import LARGE
+from jaxmpc.qp.batched_loops import LARGE
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import FREE, Bounds
 from jaxmpc.qp.triton import (

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.pytrees import pytree
+from jaxmpc.qp.batched_loops import repeat_while
 from jaxmpc.qp.dual_search import MORE_STEPS, MOST_STEPS, dual_search, single_step
 from jaxmpc.qp.dual_step import DualPoint, MostSteps
-from jaxmpc.qp.loops import repeat_while
 from jaxmpc.qp.newton import largest
 from jaxmpc.qp.residuals import Pair
 from jaxmpc.qp.scaled_program import ScaledProgram
@@ -36,8 +36,8 @@ def solve_dual(p: ScaledProgram, y: Array, go_on: Array, most: int) -> tuple[Pai
     steps = MostSteps(first, min(most - first, MORE_STEPS))
     point, optimal = dual_search(dual, cold, point, go_on, steps)
     best, gradient, _ = p.measure(point.w, point.y)
-    best = replace(best, solved=best.solved | best.near)
-    start = Correction(point, gradient, best, jnp.int32(0), optimal & ~best.solved)
+    best = replace(best, finished=best.finished | best.near)
+    start = Correction(point, gradient, best, jnp.int32(0), optimal & ~best.finished)
     end = corrected(first, p, start)
     return end.best, end.point.y
 
@@ -55,5 +55,5 @@ def _correct(most: int, p: ScaledProgram, s: Correction) -> Correction:
     point = single_step(dual, s.point.shifted(dual.A, -s.gradient))
     pair, gradient, _ = p.measure(point.w, point.y)
     best = s.best.or_better(pair)
-    go_on = ~best.solved & (largest(point.y) <= dual.limit) & (steps < most)
+    go_on = ~best.finished & (largest(point.y) <= dual.limit) & (steps < most)
     return Correction(point, gradient, best, steps, go_on)

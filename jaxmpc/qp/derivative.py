@@ -3,7 +3,7 @@
 At a solution the conditions Pz + q + A'y = 0 and e(Az + y/ρ) = y/ρ hold for every ρ > 0, with the
 prox residual e(v) = v − prox(v) (`projection.py`). With the formula of e in each row, the active
 set, held fixed they are smooth, and a change of the
-data moves (z, y) by one linear system, which `newton.linearised` solves in ADMM's coordinates.
+data moves (z, y) by one linear system, which `kkt_system.linearised` solves in ADMM's coordinates.
 JAX transposes that for reverse mode and differentiates it again for higher orders.
 
 Which element of the generalised derivative is taken, and what it means where none exists:
@@ -32,8 +32,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.qp.admm import Factor, scaled, scaled_rows
-from jaxmpc.qp.linearised import linearised
-from jaxmpc.qp.modes import own_modes
+from jaxmpc.qp.jax_modes import own_modes
+from jaxmpc.qp.kkt_system import linearised
 from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.problem import QP

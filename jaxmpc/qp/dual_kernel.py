@@ -1,5 +1,5 @@
 """Systems in the active rows W as kernels for NVIDIA GPUs, a program an instance: the search on the
-dual (`dual_search.py`), and the derivatives of `newton.linearised`.
+dual (`dual_search.py`), and the derivatives of `kkt_system.linearised`.
 
 As a loop of XLA each step is some twenty launches, and all instances of a group wait for the
 largest system. Here an instance takes all its steps within one program and leaves when it is done.
@@ -209,7 +209,7 @@ def solved(M: Array, b: Array, k: Array, count: Array) -> Array:
 
 
 def damped_kernel(S: Array, W: Array, slack: Array, b: Array, damping: float, steps: int) -> Array:
-    """Return `newton.damped` (k,) of one instance. W (k,): rows of S, which is shared, filled up
+    """Return `kkt_system.damped` (k,) of one instance. W (k,): rows of S, which is shared, filled up
     with their number; slack, b (k,). `vmap` for many."""
     m, rows = len(S), len(W)
     count = jnp.sum(W < m, dtype=jnp.int32)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.pytrees import pytree
+from jaxmpc.qp.batched_loops import repeat_while
 from jaxmpc.qp.dual_kernel import dual_search_kernel
 from jaxmpc.qp.dual_step import (
     JOINTLY,
@@ -20,7 +21,6 @@ from jaxmpc.qp.dual_step import (
     dual_step,
     sizes,
 )
-from jaxmpc.qp.loops import repeat_while
 from jaxmpc.qp.triton import has_kernels
 
 # Most steps, and most of a second search.

@@ -30,8 +30,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.pytrees import pytree
+from jaxmpc.qp.batched_loops import true_places
 from jaxmpc.qp.linalg import solve
-from jaxmpc.qp.loops import true_places
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds, sign
 

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.custom_batching import custom_vmap
 
-from jaxmpc.qp.modes import own_modes, varying
+from jaxmpc.qp.jax_modes import own_modes, varying
 from jaxmpc.qp.precision import matmul
 
 JAXLIB = tuple(int(part) for part in re.findall(r"\d+", version("jaxlib"))[:3])

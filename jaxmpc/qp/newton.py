@@ -19,8 +19,8 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from jaxmpc.pytrees import pytree
+from jaxmpc.qp.jax_modes import varying
 from jaxmpc.qp.linalg import solve
-from jaxmpc.qp.modes import varying
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.projection import Bounds
 

@@ -10,7 +10,7 @@ from jax import Array
 from jax.custom_batching import custom_vmap
 from jax.typing import DTypeLike
 
-from jaxmpc.qp.modes import own_modes
+from jaxmpc.qp.jax_modes import own_modes
 
 T = TypeVar("T")
 A = TypeVar("A", Array, np.ndarray)

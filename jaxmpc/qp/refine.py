@@ -15,12 +15,12 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxmpc.pytrees import pytree
+from jaxmpc.qp.batched_loops import repeat_while
 from jaxmpc.qp.certificate import Proof, correcting_rows, farkas, prove, recession, to_length_one
 from jaxmpc.qp.defect_correction import Correction, corrected, solve_dual
 from jaxmpc.qp.dual_search import MOST_STEPS, has_dual_steps
 from jaxmpc.qp.dual_step import DualPoint
-from jaxmpc.qp.loops import repeat_while
-from jaxmpc.qp.modes import varying
+from jaxmpc.qp.jax_modes import varying
 from jaxmpc.qp.newton import (
     Augmented,
     Constants,
@@ -107,12 +107,12 @@ def improve(
         allowed = p.eps * row_sizes(0.0, qp.row_sizes, p.natural(begin.w, begin.y))
         _, _, empty = farkas(qp, f.E * begin.change, correcting, allowed)
         best, y = solve_dual(p, begin.y, ~f.flat & ~empty, most)
-        go_on = ~best.solved
+        go_on = ~best.finished
         # Multipliers that grow without bound are nearly a Farkas vector.
         begin = replace(begin, change=jnp.where(largest(y) > p.dual.limit, y, begin.change))
         begin = least_violation(begin, empty)
     if not whole:
-        return Improved(best, Proof.none(p.q, p.bounds.l), best.solved, false)
+        return Improved(best, Proof.none(p.q, p.bounds.l), best.finished, false)
     given, none = RefinementData(p, matmul(f.H, f.H), correcting), jnp.int32(0)
     s = Refinement(
         point=begin,
@@ -149,7 +149,7 @@ def corrected_end(p: ScaledProgram, s: Refinement) -> Pair:
     f, point = p.factor, s.point
     gradient = matmul(point.w, f.H) + s.q + matmul(point.y, f.A)
     begin = DualPoint(point.y, point.w, matmul(point.w, f.A.T))
-    go_on = ~s.best.solved & ~s.proof.beyond & ~s.proof.unbounded & jnp.isfinite(s.best.error)
+    go_on = ~s.best.finished & ~s.proof.beyond & ~s.proof.unbounded & jnp.isfinite(s.best.error)
     start = Correction(begin, gradient, s.best, jnp.int32(0), go_on)
     return corrected(MOST_STEPS, replace(p, bounds=s.bounds), start).best
 
@@ -178,7 +178,7 @@ def advance(most: int, given: RefinementData, s: Refinement) -> Refinement:
     # Where there is no answer, the best is the point of least violation, at which this ends.
     best = _where(primal, s.best.or_better(pair), s.best)
     idle = jnp.where(best.error < 0.5 * s.best.error, 0, s.idle + 1)
-    best = _where(proof.beyond & ~best.solved, pair, best)
+    best = _where(proof.beyond & ~best.finished, pair, best)
     steps, left = s.steps + primal, s.left - 1
     new = replace(s, point=point, q=q, best=best, steps=steps, idle=idle, proof=proof, left=left)
     return next_phase(most, p, new, step, stiff, primal, distance)
@@ -226,7 +226,7 @@ def next_phase(
     proof, point, flat, few = s.proof, s.point, p.factor.flat, proof_steps(most)
     over = s.left <= 0
     narrow = proof.infeasible & ~proof.beyond & ~s.widened
-    ended = s.best.solved | (s.best.measured.small & (s.idle >= IDLE))
+    ended = s.best.finished | (s.best.measured.within_tolerance & (s.idle >= IDLE))
     ended = ended | proof.unbounded | (proof.beyond & ((stiff & step.minimised) | ~primal))
     to_distance = primal & (over | narrow)
     rested = distance & (over | (narrow & step.minimised))

@@ -1,7 +1,7 @@
 """Residuals of a primal-dual pair, each relative to the size of its own entry, and the status.
 
 Residuals come in parts, those of rows (m,), of variables (n,) and the gap (1,): `residual_terms`
-for a QP, `mpc.judge` for the plan of an MPC problem, `mpc.stages.stage_residuals` for a problem
+for a QP, `mpc.stated_residuals` for the plan of an MPC problem, `mpc.stagewise.stages.stage_residuals` for a problem
 stage by stage. With each entry come two numbers in its own unit, so that neither the units of rows
 and variables nor that of the cost change what is said of a pair:
 
@@ -178,7 +178,7 @@ class Measured:
     primal: Array
     dual: Array
     gap: Array
-    small: Array
+    within_tolerance: Array
 
     @classmethod
     def of(cls, terms: Terms, eps: Array, floor: float) -> "Measured":
@@ -203,7 +203,7 @@ class Pair:
     measured: Measured
     error: Array
     near: Array
-    solved: Array
+    finished: Array
 
     @classmethod
     def none(cls, z: Array, y: Array) -> "Pair":
@@ -221,13 +221,13 @@ class Pair:
         return cls(z, y, *check_terms(terms, eps, floor, others))
 
     def or_better(self, other: "Pair") -> "Pair":
-        """Return the other pair where that is solved or its residuals are smaller; one that is
-        near only for another that is. A pair that was near before is solved after one step
+        """Return the other pair where that is finished or its residuals are smaller; one that is
+        near only for another that is. A pair that was near before is finished after one step
         more."""
         smaller = (other.error < self.error) & (other.near | ~self.near)
-        take = ~self.solved & (other.solved | smaller)
+        take = ~self.finished & (other.finished | smaller)
         best = jax.tree.map(lambda old, new: jnp.where(take, new, old), self, other)
-        return replace(best, solved=best.solved | self.near)
+        return replace(best, finished=best.finished | self.near)
 
 
 class PairCheck(NamedTuple):
@@ -236,14 +236,14 @@ class PairCheck(NamedTuple):
     measured: Measured
     error: Array
     near: Array
-    solved: Array
+    finished: Array
 
 
 def check_terms(terms: Terms, eps: Array, floor: float, others: Terms = ()) -> PairCheck:
     """Return what the terms say of a pair; eps and floor as in `Measured`.
 
     near: all residuals are below a small part of their tolerance (NEAR), or below a tenth and a
-    small multiple of their rounding. solved: below a tenth of that part. others: terms that count
+    small multiple of their rounding. finished: below a tenth of that part. others: terms that count
     for these alone."""
     ratios, relatives = worst([*terms, *others], floor)
     above, relative = largest_of(ratios), largest_of(relatives)
@@ -266,7 +266,7 @@ def assess(
 def with_status(measured: Measured, z: Array, y: Array, proof: Proof) -> QPSolution:
     """Return the solution (z, y) with the status that its residuals and the proofs give it; without
     its cost and count of iterations."""
-    solved = measured.small
+    solved = measured.within_tolerance
     # Rows that contradict each other by less than eps are both solved and proved empty: say solved.
     infeasible = proof.infeasible & ~solved
     unbounded = proof.unbounded & ~solved & ~infeasible

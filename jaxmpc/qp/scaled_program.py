@@ -136,5 +136,7 @@ def measure_pair_in_kernel(
 
     data = [(jnp.stack([eps, sizes.gap, unit]), 0.0), *zip(given, fills, strict=True)]
     [gradient], numbers = in_one_program(measure, data, [len(vectors.z)], 7)
-    primal, dual, gap, small, error, near, solved = numbers
-    return PairCheck(Measured(primal, dual, gap, small > 0), error, near > 0, solved > 0), gradient
+    primal, dual, gap, within, error, near, finished = numbers
+    return PairCheck(
+        Measured(primal, dual, gap, within > 0), error, near > 0, finished > 0
+    ), gradient

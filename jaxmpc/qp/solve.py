@@ -31,12 +31,12 @@ from jaxmpc.qp.admm import (
     unscaled,
 )
 from jaxmpc.qp.admm_kernel import iterate_batch, suits
+from jaxmpc.qp.batched_loops import in_blocks
 from jaxmpc.qp.certificate import Proof, correcting_rows, prove
 from jaxmpc.qp.defect_correction import solve_dual
 from jaxmpc.qp.derivative import dense_conditions, implicit
 from jaxmpc.qp.dual_search import has_dual_steps
-from jaxmpc.qp.loops import in_blocks
-from jaxmpc.qp.modes import own_modes, varying
+from jaxmpc.qp.jax_modes import own_modes, varying
 from jaxmpc.qp.newton import MultiplierState, multipliers_start, multipliers_step
 from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely, symmetric
 from jaxmpc.qp.problem import QP, QPSolution

@@ -22,7 +22,7 @@ import numpy as np
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import default_chunk
 from jaxmpc.checks import fail, whole
-from jaxmpc.explicit.law import Law, RegionLaw
+from jaxmpc.explicit.law_at_states import Law, RegionLaw
 from jaxmpc.feasible.plan_polytope import CenteredPolytope
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.grids import grid

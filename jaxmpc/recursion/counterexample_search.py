@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 
-from jaxmpc.explicit.law import Law
+from jaxmpc.explicit.law_at_states import Law
 from jaxmpc.feasible.plan_polytope import CenteredPolytope
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.lp import maximise

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxmpc.explicit.law import Law
+from jaxmpc.explicit.law_at_states import Law
 from jaxmpc.feasible.plan_polytope import CenteredPolytope
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import first_of_block

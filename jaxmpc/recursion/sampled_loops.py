@@ -3,7 +3,7 @@
 import numpy as np
 from tqdm.std import tqdm
 
-from jaxmpc.explicit.law import Law
+from jaxmpc.explicit.law_at_states import Law
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import FeasibleSetMap, map_points
 from jaxmpc.feasible.problem import FeasibilityProblem

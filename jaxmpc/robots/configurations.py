@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail
-from jaxmpc.robots.engine import BALL, FREE
+from jaxmpc.robots.mujoco_access import BALL, FREE
 
 # Below this angle² the series of sin and cos are exact in float64.
 SMALL = 1e-8

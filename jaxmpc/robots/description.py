@@ -12,7 +12,7 @@ from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.pytrees import record, static
 from jaxmpc.qp.precision import floating_dtype
 from jaxmpc.robots.configurations import difference, quaternions, retract, unit_orientations
-from jaxmpc.robots.engine import mujoco
+from jaxmpc.robots.mujoco_access import mujoco
 from jaxmpc.robots.physics import Physics
 from jaxmpc.sets.box import Box
 

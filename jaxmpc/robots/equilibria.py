@@ -12,7 +12,7 @@ from scipy.optimize import least_squares, lsq_linear
 from jaxmpc.checks import fail
 from jaxmpc.pytrees import record
 from jaxmpc.robots.description import RobotDescription
-from jaxmpc.robots.engine import BALL, FREE, flag, mujoco, name_of, single_joints
+from jaxmpc.robots.mujoco_access import BALL, FREE, flag, mujoco, name_of, single_joints
 from jaxmpc.sets.box import Box
 
 # Forces that count as balanced, relative to 1 + the largest one.

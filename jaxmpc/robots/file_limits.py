@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.robots.engine import BALL, FREE, HINGE, SLIDE, mujoco, names, number_of
+from jaxmpc.robots.mujoco_access import BALL, FREE, HINGE, SLIDE, mujoco, names, number_of
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.limits import Limit, limit_pair
 

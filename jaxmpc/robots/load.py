@@ -15,18 +15,7 @@ import numpy as np
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_package, require_printable, require_shape
 from jaxmpc.robots.configurations import unit_orientations
-from jaxmpc.robots.engine import (
-    BALL,
-    FREE,
-    equalities,
-    flag,
-    model_bytes,
-    mujoco,
-    names,
-    number_of,
-    single_joints,
-)
-from jaxmpc.robots.file_comparison import compared
+from jaxmpc.robots.engine_comparison import compared
 from jaxmpc.robots.file_limits import (
     coordinate_names,
     input_limits,
@@ -37,6 +26,17 @@ from jaxmpc.robots.file_limits import (
     state_limits,
 )
 from jaxmpc.robots.mjx_gaps import lacks, translate
+from jaxmpc.robots.mujoco_access import (
+    BALL,
+    FREE,
+    equalities,
+    flag,
+    model_bytes,
+    mujoco,
+    names,
+    number_of,
+    single_joints,
+)
 from jaxmpc.robots.physics import RK4, Physics
 from jaxmpc.robots.robot import Robot
 from jaxmpc.robots.urdf import compiled_urdf

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxmpc.checks import fail
 from jaxmpc.pytrees import record
-from jaxmpc.robots.engine import acts, flag, mjx_module, mujoco, name_of, word
+from jaxmpc.robots.mujoco_access import acts, flag, mjx_module, mujoco, name_of, word
 
 # Bits of MuJoCo's contype and conaffinity.
 _BITS = 31

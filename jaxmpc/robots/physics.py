@@ -17,8 +17,8 @@ from jaxmpc.checks import fail
 from jaxmpc.qp.linalg import solve, stand_ins
 from jaxmpc.qp.precision import matmul
 from jaxmpc.robots.configurations import normalised, rates, retract
-from jaxmpc.robots.engine import BALL, mjx_module, mujoco
 from jaxmpc.robots.jaxpr_rewriting import in_pieces, moving, rewritten, with_forward_jacobian
+from jaxmpc.robots.mujoco_access import BALL, mjx_module, mujoco
 from jaxmpc.robots.rigid_bodies import (
     FIELDS,
     Tree,

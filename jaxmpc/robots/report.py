@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxmpc.pytrees import record
 from jaxmpc.robots.description import RobotDescription
-from jaxmpc.robots.engine import acts, equalities, mjx_module, mujoco, single_joints, word
+from jaxmpc.robots.mujoco_access import acts, equalities, mjx_module, mujoco, single_joints, word
 
 
 @record

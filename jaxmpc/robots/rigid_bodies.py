@@ -35,7 +35,7 @@ from jax import Array
 from jax.custom_batching import custom_vmap
 
 from jaxmpc.pytrees import record
-from jaxmpc.robots.engine import BALL, FREE, SLIDE
+from jaxmpc.robots.mujoco_access import BALL, FREE, SLIDE
 
 # What is read of mjx.Model.
 FIELDS = (

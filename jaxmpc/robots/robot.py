@@ -20,11 +20,10 @@ from jax import Array
 from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.pytrees import pytree
-from jaxmpc.qp.modes import own_modes, varying
+from jaxmpc.qp.jax_modes import own_modes, varying
 from jaxmpc.qp.precision import matmul
 from jaxmpc.robots.configurations import difference, quaternions, retract
 from jaxmpc.robots.description import RobotDescription
-from jaxmpc.robots.engine import number_of
 from jaxmpc.robots.equilibria import (
     inverse_actuation,
     lacking,
@@ -33,6 +32,7 @@ from jaxmpc.robots.equilibria import (
     rest_at,
     settled,
 )
+from jaxmpc.robots.mujoco_access import number_of
 from jaxmpc.robots.payload import with_payload
 from jaxmpc.robots.report import RobotReport, report_of
 from jaxmpc.systems.system import LinearSystem

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.robots.engine import mujoco
+from jaxmpc.robots.mujoco_access import mujoco
 
 # A mended inertia keeps a + b ≥ c with this much room, relative to c: rounding in MuJoCo's own
 # eigenvalues must not refuse it again.

@@ -15,8 +15,8 @@ from jaxmpc.tuning.feasible_set import tune_feasible_set
 from jaxmpc.tuning.initial_states import feasible_states
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
-from jaxmpc.tuning.penalty_schedule import transfer_penalties
 from jaxmpc.tuning.result import Interrupted
+from jaxmpc.tuning.rho_schedule import transfer_penalties
 from jaxmpc.tuning.run_folder import run_folder
 from jaxmpc.tuning.solver import tune_solver
 from jaxmpc.tuning.tasks import linear_task, robot_task, weight_parameters

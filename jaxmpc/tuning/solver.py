@@ -14,22 +14,22 @@ from jaxmpc.arrays import Reals
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, require_finite, require_kind, whole
 from jaxmpc.files import fingerprint
-from jaxmpc.mpc.arguments import checked_array
+from jaxmpc.mpc.aim import checked_array
 from jaxmpc.mpc.condense import Condensed, condensed_in_float64
 from jaxmpc.mpc.plan import Plan, WarmStart
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM, factor
 from jaxmpc.qp.status import Status
 from jaxmpc.tuning.descent import descend
-from jaxmpc.tuning.penalty_objective import (
+from jaxmpc.tuning.result import TuningRun, cached
+from jaxmpc.tuning.rho_objective import (
     PenaltyObjective,
     Samples,
     loss_and_gradient,
     score,
     solve_samples,
 )
-from jaxmpc.tuning.penalty_schedule import KNOTS, interpolation
-from jaxmpc.tuning.result import TuningRun, cached
+from jaxmpc.tuning.rho_schedule import KNOTS, interpolation
 from jaxmpc.tuning.settings import Settings
 
 # Version of the algorithm: results that an older version cached are not used.

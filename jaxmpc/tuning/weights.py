@@ -13,7 +13,7 @@ from jaxmpc.arrays import Reals
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, whole
 from jaxmpc.closed_loop.many import require_variations
-from jaxmpc.closed_loop.run import Run
+from jaxmpc.closed_loop.run_record import Run
 from jaxmpc.files import fingerprint
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.softening import harden

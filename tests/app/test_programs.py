@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.app import programs
-from jaxmpc.app.commands import compiling
-from jaxmpc.app.commands.compiling import Compiling
-from jaxmpc.app.programs import kept_programs
+from jaxmpc.app import program_cache
+from jaxmpc.app.commands import compile_notice
+from jaxmpc.app.commands.compile_notice import Compiling
+from jaxmpc.app.program_cache import kept_programs
 from jaxmpc.batches import Compiled
 
 VARIABLE = "JAX_COMPILATION_CACHE_DIR"
@@ -32,7 +32,7 @@ def _own_cache(tmp_path, monkeypatch):
 
 def entries():
     """What is kept: {name without the checksum: content}."""
-    folder = programs.programs_folder()
+    folder = program_cache.programs_folder()
     return {path.stem: path.read_bytes() for path in folder.glob("*-cache.*")}
 
 
@@ -70,21 +70,21 @@ def test_processes_do_not_disturb_each_other(monkeypatch):
         write("c-cache", b"of the first")
     assert entries().keys() == {"a-cache", "b-cache", "c-cache"}
     # A process that was killed leaves its folder, which goes when it is old.
-    left = programs.programs_folder() / f"{programs.RUN}killed"
+    left = program_cache.programs_folder() / f"{program_cache.RUN}killed"
     left.mkdir()
     with kept_programs(["sweep"]):
         assert left.exists()
-    os.utime(left, (0, time.time() - 1.1 * programs.LEFT))
+    os.utime(left, (0, time.time() - 1.1 * program_cache.LEFT))
     with kept_programs(["sweep"]):
         assert not left.exists()
 
 
 def test_the_oldest_go_when_there_are_too_many(monkeypatch):
-    monkeypatch.setattr(programs, "LIMIT", 25)
+    monkeypatch.setattr(program_cache, "LIMIT", 25)
     for k in range(3):
         with kept_programs(["sweep"]):
             write(f"{k}-cache", b"ten bytes.")
-        (path,) = programs.programs_folder().glob(f"{k}-cache.*")
+        (path,) = program_cache.programs_folder().glob(f"{k}-cache.*")
         os.utime(path, (0, 1000.0 + k))
     with kept_programs(["sweep"]):
         pass
@@ -99,7 +99,7 @@ def test_file_systems_without_links(monkeypatch, links):
         with kept_programs(["info"]):
             write("a-cache", b"one")
     assert entries() == {"a-cache": b"one"}
-    assert len(os.listdir(programs.programs_folder())) == 1
+    assert len(os.listdir(program_cache.programs_folder())) == 1
 
 
 def test_switches(tmp_path, monkeypatch):
@@ -124,7 +124,7 @@ def test_a_wait_is_told_with_its_seconds(monkeypatch, capsys):
     """A line at the start and one when the last program is ready; a line that counts on a
     terminal; no second line where nothing had to be compiled."""
     clock = [0.0]
-    monkeypatch.setattr(compiling, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr(compile_notice, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
 
     def waited(programs, *waits):
         with Compiling() as wait:
@@ -151,7 +151,7 @@ def test_a_wait_is_told_with_its_seconds(monkeypatch, capsys):
 
 PROGRAM = """
 import numpy as np
-from jaxmpc.app.programs import kept_programs
+from jaxmpc.app.program_cache import kept_programs
 with kept_programs(["simulate"]):
     import jax
     import jax.numpy as jnp
@@ -184,17 +184,17 @@ def test_results_are_the_same_with_and_without():
         return hit == "True", values
 
     hit, values = finish(start(JAXMPC_CACHE="off"))
-    assert not hit and not programs.user_cache().exists()
+    assert not hit and not program_cache.user_cache().exists()
     assert finish(start()) == (False, values)
     kept = entries()
     assert any(name.startswith("jit__lambda") for name in kept)
     assert [finish(process) for process in [start(), start()]] == [(True, values)] * 2
     assert entries() == kept, "there was nothing to add"
-    for path in programs.programs_folder().glob("*-cache.*"):
+    for path in program_cache.programs_folder().glob("*-cache.*"):
         path.write_bytes(path.read_bytes()[:-100] + bytes(100))
     assert finish(start()) == (False, values)
     assert entries().keys() == kept.keys()
-    folder = programs.programs_folder()
+    folder = program_cache.programs_folder()
     for path in list(folder.glob("*-cache.*")):  # with the right checksum, but no program
         (folder / f"{path.stem}.{zlib.crc32(b'nothing'):08x}").write_bytes(b"nothing")
         path.unlink()

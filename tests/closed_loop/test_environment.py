@@ -135,10 +135,9 @@ def test_gymnasium_accepts_it(environment):
     gymnasium = pytest.importorskip("gymnasium")
     from gymnasium.utils.env_checker import check_env
 
+    name = "jaxmpc.closed_loop.gymnasium_env:jaxmpc/Robot-v0"
     options = dict(robot=environment.robot, target=[0.1], Q=[200.0, 1.0], R=[0.01], spread=SPREAD)
-    env = gymnasium.make(
-        "jaxmpc.closed_loop.robot_env:jaxmpc/Robot-v0", length=12, stop_at_limits=True, **options
-    )
+    env = gymnasium.make(name, length=12, stop_at_limits=True, **options)
     check_env(env.unwrapped, skip_render_check=True)
     first, info = env.reset(seed=5)
     assert first.dtype == np.float32 and first.shape == (2,) and info["violation"] == 0

@@ -7,7 +7,7 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.explicit.law import Law, RegionLaw
+from jaxmpc.explicit.law_at_states import Law, RegionLaw
 from jaxmpc.explicit.regions import critical_regions
 from jaxmpc.feasible.plan_polytope import CenteredPolytope
 from jaxmpc.mpc.problem import Soft

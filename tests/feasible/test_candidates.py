@@ -15,7 +15,7 @@ import pytest
 from jax import enable_x64
 
 import jaxmpc as jm
-from jaxmpc.feasible.candidates import (
+from jaxmpc.feasible.candidate_search import (
     INSET,
     admm_stage,
     check_candidates,

@@ -6,8 +6,8 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.feasible import hull, pipeline
-from jaxmpc.feasible.hull import Hull, hull_facets
+from jaxmpc.feasible import hull_labels, pipeline
+from jaxmpc.feasible.hull_labels import Hull, hull_facets
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.verify.exact import roll_out_exactly
 from jaxmpc.verify.stored_problem import Constraints
@@ -27,7 +27,7 @@ CASES = {
 
 @pytest.fixture
 def always(monkeypatch):
-    monkeypatch.setattr(hull, "MANY", 0)
+    monkeypatch.setattr(hull_labels, "MANY", 0)
 
 
 def points_of(name, count):
@@ -42,7 +42,7 @@ def test_labels_and_proofs(name, monkeypatch):
     mpc, _, view = CASES[name]
     points = points_of(name, 600)
     expected = jm.map_feasible_set(mpc, points, **view).label
-    monkeypatch.setattr(hull, "MANY", 0)
+    monkeypatch.setattr(hull_labels, "MANY", 0)
     problem = FeasibilityProblem.of(mpc, **view)
     assert Hull.of(problem) is not None
     labels = jm.map_feasible_set(mpc, points, **view).labels
@@ -69,7 +69,7 @@ def test_they_decide_nearly_all(always, monkeypatch):
     monkeypatch.setattr(pipeline, "_run", lambda *a: programs.append(a[0]) or run(*a))
     label = jm.map_feasible_set(mpc, points[np.abs(distance) > 1e-6], chunk=1000).label
     np.testing.assert_array_equal(label, np.where(distance < 0, 1, -1)[np.abs(distance) > 1e-6])
-    assert set(programs) <= {hull.compiled_labels(None), hull.compiled_verdicts(None)}
+    assert set(programs) <= {hull_labels.compiled_labels(None), hull_labels.compiled_verdicts(None)}
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -88,9 +88,9 @@ def test_points_labelled_without_a_roll_out_have_plans(name):
     edges = np.linalg.inv(made.M)
     points = (made.center + np.einsum("fij,fkj->fki", edges, share)).reshape(-1, d)
     with jax.enable_x64(True):
-        label = np.asarray(hull.compiled_labels(None).run(made, points))
+        label = np.asarray(hull_labels.compiled_labels(None).run(made, points))
         exact = problem.exact(np.abs(points).max(axis=0))
-        found = jax.device_get(hull.compiled_verdicts(None).run(exact, made, points))
+        found = jax.device_get(hull_labels.compiled_verdicts(None).run(exact, made, points))
     assert set(label) <= {-1, 0, 1} and np.all((found.label == label)[label != 0])
     inside = found.label == 1
     assert np.all(
@@ -122,10 +122,10 @@ def test_points_that_are_not_finite(always):
 
 
 def test_a_problem_keeps_its_cones(monkeypatch):
-    monkeypatch.setattr(hull, "MANY", 500)
+    monkeypatch.setattr(hull_labels, "MANY", 500)
     problem = FeasibilityProblem.of(problems.lecture())
     points = points_of("lecture", 600)
-    assert hull.hull_for(problem, 100) is None
+    assert hull_labels.hull_for(problem, 100) is None
     whole = jm.map_feasible_set(problem, points)
     monkeypatch.setattr(Hull, "of", lambda _: pytest.fail("made again"))
     part = jm.map_feasible_set(problem, points[:100])

@@ -12,7 +12,7 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.feasible import labelling
+from jaxmpc.feasible import label_workers
 from jaxmpc.feasible.labels import PROOFS
 from jaxmpc.feasible.map import label_chunks
 from jaxmpc.feasible.pipeline import Scope, label_parts
@@ -73,7 +73,7 @@ def test_threads(expected, threads):
 
 
 def test_what_is_sent_is_enough_and_few_are_in_flight(expected, monkeypatch):
-    monkeypatch.setattr(labelling, "IN_FLIGHT", 3)
+    monkeypatch.setattr(label_workers, "IN_FLIGHT", 3)
     executor = Inline()
     same(
         jm.map_feasible_set(problems.lecture(), POINTS, chunk=64, executor=executor).labels,
@@ -131,7 +131,7 @@ def test_labels_of_a_part_do_not_depend_on_the_others(case, monkeypatch):
     """Linear programs, whose tangents to a ball are kept, and whose number is bounded, included:
     no stage before them decides a point here."""
     from jaxmpc.feasible import pipeline
-    from jaxmpc.feasible.candidates import compiled_check
+    from jaxmpc.feasible.candidate_search import compiled_check
 
     make, ends, settings = CASES[case]
     run = pipeline._run

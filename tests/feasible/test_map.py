@@ -12,7 +12,7 @@ import pytest
 from jax import enable_x64
 
 import jaxmpc as jm
-from jaxmpc.feasible import candidates
+from jaxmpc.feasible import candidate_search
 from jaxmpc.qp.status import Status
 
 
@@ -212,8 +212,8 @@ class TestIndependenceOf:
 def test_compiles_once_for_all_chunks():
     """One program of each stage, whatever the number of chunks."""
     stages = (
-        candidates.compiled_admm(7, np.dtype(np.float32), None),
-        candidates.compiled_newton(64, None),
+        candidate_search.compiled_admm(7, np.dtype(np.float32), None),
+        candidate_search.compiled_newton(64, None),
     )
     before = [len(stage.programs) for stage in stages]
     points = np.random.default_rng(0).uniform(-1.2, 1.2, (333, 2))

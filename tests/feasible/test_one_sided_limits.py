@@ -16,7 +16,7 @@ from scipy.optimize import linprog
 
 import jaxmpc as jm
 from jaxmpc.feasible import proofs
-from jaxmpc.feasible.exact_data import exact_data, hard_blocks
+from jaxmpc.feasible.hard_constraints import exact_data, hard_blocks
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.view import make_view

@@ -12,7 +12,7 @@ import problems
 import pytest
 
 from jaxmpc.feasible import pipeline
-from jaxmpc.feasible.candidates import compiled_check
+from jaxmpc.feasible.candidate_search import compiled_check
 from jaxmpc.feasible.map import label_chunks
 from jaxmpc.feasible.pipeline import last_programs
 from jaxmpc.feasible.problem import FeasibilityProblem

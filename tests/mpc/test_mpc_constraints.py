@@ -16,7 +16,7 @@ from jax import enable_x64
 
 import jaxmpc as jm
 from jaxmpc.feasible import proofs
-from jaxmpc.feasible.exact_data import exact_data, hard_blocks
+from jaxmpc.feasible.hard_constraints import exact_data, hard_blocks
 from jaxmpc.feasible.view import make_view
 from jaxmpc.mpc.active_limits import active_constraints
 from jaxmpc.mpc.problem import Outputs, Soft

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmpc.mpc.stagewise import riccati
+from jaxmpc.mpc.stagewise import recursion_kernels as kernels
 
 
 def batch(rng, N, n, m, staged):
@@ -36,12 +36,12 @@ def test_kernels_equal_the_scans(staged):
         jax.vmap(lambda *a: kernel(*a, **options))(*args),
         jax.vmap(lambda *a: scan(*a, **options))(*args),
     )
-    found, gains = both(riccati._riccati_scan, riccati._riccati_kernel, Q, R, A, B)
+    found, gains = both(kernels._riccati_scan, kernels._riccati_kernel, Q, R, A, B)
     close(found, gains)
-    close(*both(riccati._tracking_scan, riccati._tracking_kernel, *gains, A, B, gx, gu))
+    close(*both(kernels._tracking_scan, kernels._tracking_kernel, *gains, A, B, gx, gu))
     for adjoint in (False, True):
-        scan = lambda *a, adjoint: riccati._scan(*a, adjoint=adjoint, unroll=1)
-        close(*both(scan, riccati._recurrence_kernel, A, gx[:, 1:], gx[:, 0], adjoint=adjoint))
+        scan = lambda *a, adjoint: kernels._scan(*a, adjoint=adjoint, unroll=1)
+        close(*both(scan, kernels._recurrence_kernel, A, gx[:, 1:], gx[:, 0], adjoint=adjoint))
 
 
 @pytest.mark.first(1)
@@ -53,9 +53,9 @@ def test_a_batch_side_by_side_is_the_scan(staged):
         Q, R, A, B = (jnp.asarray(v, jnp.float64) for v in problems)
         last = lambda v: jnp.moveaxis(v, 0, -1)
         first = lambda v: jnp.moveaxis(v, -1, 0)
-        scan = jax.vmap(lambda *v: riccati._riccati_scan(*v))
-        own = lambda *v: jax.tree.map(first, riccati._riccati_lanes(*map(last, v)))
-        chosen = lambda Q, R, A, B: riccati.riccati_recursion(Q, R, None, A, B)
+        scan = jax.vmap(lambda *v: kernels._riccati_scan(*v))
+        own = lambda *v: jax.tree.map(first, kernels._riccati_lanes(*map(last, v)))
+        chosen = lambda Q, R, A, B: kernels.riccati_recursion(Q, R, None, A, B)
         nested = jax.vmap(jax.vmap(chosen, (0, 0, None, 0)), (None, None, 0, None))
         expected = jax.vmap(lambda A: scan(Q, R, jnp.stack([A, A]), B))(A)
         for found, wanted in (
@@ -75,8 +75,8 @@ def test_tracking_is_the_minimiser():
         Q, R, A, B, gx, gu = (
             jnp.asarray(v[0], jnp.float64) for v in batch(rng, 4, 3, 2, True)
         )  # fmt: skip
-        gains = riccati.riccati_recursion(Q, R, None, A, B)
-        x, u = riccati.tracking(gains, A, B, gx, gu)
+        gains = kernels.riccati_recursion(Q, R, None, A, B)
+        x, u = kernels.tracking(gains, A, B, gx, gu)
 
         def value(u):
             states = [jnp.zeros(3)]
@@ -100,15 +100,15 @@ def test_a_kernel_is_chosen_on_gpus_only(monkeypatch):
         return v**2
 
     scan = lambda v: v**2
-    monkeypatch.setattr(riccati, "on_gpu", lambda: False)
-    assert riccati._or_kernel(scan, kernel, jnp.ones(3)).shape == (3,) and not calls
-    monkeypatch.setattr(riccati, "on_gpu", lambda: True)
-    riccati._or_kernel(scan, kernel, jnp.ones(33))
+    monkeypatch.setattr(kernels, "on_gpu", lambda: False)
+    assert kernels._or_kernel(scan, kernel, jnp.ones(3)).shape == (3,) and not calls
+    monkeypatch.setattr(kernels, "on_gpu", lambda: True)
+    kernels._or_kernel(scan, kernel, jnp.ones(33))
     assert not calls
     one = jnp.array([3.0])
-    assert jax.grad(lambda v: riccati._or_kernel(scan, kernel, v)[0])(one) == 6
+    assert jax.grad(lambda v: kernels._or_kernel(scan, kernel, v)[0])(one) == 6
     assert calls == [] or set(calls) == {(1,)}
-    assert riccati._or_kernel(scan, kernel, one) == 9 and calls
+    assert kernels._or_kernel(scan, kernel, one) == 9 and calls
 
 
 def test_derivatives_under_vmap_and_jit(monkeypatch):
@@ -118,7 +118,7 @@ def test_derivatives_under_vmap_and_jit(monkeypatch):
 
     def loop(A, gx):
         def sample(x, w):
-            states = riccati.recurrence(A, jnp.stack([w, w]), x)
+            states = kernels.recurrence(A, jnp.stack([w, w]), x)
             return jnp.concatenate([x[None], states])[2], None
 
         return jnp.sum(jax.lax.scan(sample, gx[0], gx[1:])[0] ** 2)
@@ -126,6 +126,6 @@ def test_derivatives_under_vmap_and_jit(monkeypatch):
     total = lambda A, gx: jnp.sum(jax.vmap(loop)(A, gx))
     by = lambda mode: jax.jit(mode(lambda A, gx: total(A, gx)))(A, gx)
     scans = by(jax.grad)
-    monkeypatch.setattr(riccati, "on_gpu", lambda: True)
+    monkeypatch.setattr(kernels, "on_gpu", lambda: True)
     close(by(jax.grad), scans)
     close(by(jax.jacfwd), scans)

@@ -12,7 +12,7 @@ from jax import enable_x64
 from problems import rows_of, symmetric
 
 import jaxmpc as jm
-from jaxmpc.mpc.arguments import Aim
+from jaxmpc.mpc.aim import Aim
 from jaxmpc.mpc.plan import WarmStart
 from jaxmpc.mpc.stagewise import interior_point, solve, stages
 from jaxmpc.mpc.stagewise.solve import factor_stages, plan_stages, solve_stagewise

@@ -11,12 +11,12 @@ import pytest
 from bench.families import joint
 
 import jaxmpc as jm
-from jaxmpc.qp import dual_kernel, dual_search, linearised, scaled_program, solve, triton
+from jaxmpc.qp import dual_kernel, dual_search, kkt_system, scaled_program, solve, triton
 from jaxmpc.qp.admm import ADMM, factor, iterate, scaled, splittings
 from jaxmpc.qp.admm_kernel import iterate_batch, pieces
 from jaxmpc.qp.admm_kernel import suits as suits_kernel
+from jaxmpc.qp.batched_loops import true_places
 from jaxmpc.qp.dual_step import Dual, DualPoint, MostSteps
-from jaxmpc.qp.loops import true_places
 
 STEPS = 12
 
@@ -146,7 +146,7 @@ def test_damped_systems_in_a_kernel_are_those_of_xla(x64):
     b = jnp.where(W < 120, rng.standard_normal((6, 48)), 0.0)
     S = jnp.asarray(A @ A.T)
     each = lambda function: jax.vmap(lambda *v: function(S, *v, 1e-6, 4))(W, slack, b)
-    found, wanted = each(dual_kernel.damped_kernel), each(linearised.damped)
+    found, wanted = each(dual_kernel.damped_kernel), each(kkt_system.damped)
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
     whole = np.asarray(S)[np.ix_(W[5], W[5])] + np.diag(slack[5])
     np.testing.assert_allclose(whole @ found[5], b[5], atol=1e-9)
@@ -185,7 +185,7 @@ def lowered(function, states, monkeypatch):
     if not hasattr(mesh_module, "AbstractDevice"):
         pytest.skip("this JAX lowers kernels on machines with a GPU alone")
     monkeypatch.setattr(triton, "on_gpu", lambda: True)
-    monkeypatch.setattr(linearised, "on_gpu", lambda: True)
+    monkeypatch.setattr(kkt_system, "on_gpu", lambda: True)
     device = mesh_module.AbstractDevice("NVIDIA H100 80GB HBM3", 132, "gpu")
     axes = dict(axis_types=(jax.sharding.AxisType.Auto,), abstract_device=device)
     program = jax.jit(function)

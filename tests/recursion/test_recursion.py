@@ -10,7 +10,7 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.explicit.law import RegionLaw
+from jaxmpc.explicit.law_at_states import RegionLaw
 from jaxmpc.explicit.regions import critical_regions
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.plan_polytope import projected

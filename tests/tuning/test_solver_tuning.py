@@ -10,8 +10,8 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.tuning import solver as tuning_solver
-from jaxmpc.tuning.penalty_objective import loss_and_gradient
-from jaxmpc.tuning.penalty_schedule import interpolation, transfer_penalties
+from jaxmpc.tuning.rho_objective import loss_and_gradient
+from jaxmpc.tuning.rho_schedule import interpolation, transfer_penalties
 from jaxmpc.tuning.settings import Settings
 from jaxmpc.tuning.solver import tune_solver
 

@@ -10,7 +10,7 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.app import cli
-from jaxmpc.app.commands import tune_solver, weight_files
+from jaxmpc.app.commands import tune_solver, weight_problem
 from jaxmpc.app.config import load, load_robot_config
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.tuning import tasks
@@ -38,7 +38,7 @@ def given_starts(monkeypatch):
     def uniform(mpc, lower, upper, count, seed, limits):
         return np.random.default_rng(seed).uniform(lower, upper, (count, len(lower))), 3
 
-    for module in (weight_files, tune_solver):
+    for module in (weight_problem, tune_solver):
         monkeypatch.setattr(module, "feasible_states", uniform)
 
 

@@ -20,7 +20,7 @@ from jaxmpc.app.commands.options import (
     print_table,
     refuse,
 )
-from jaxmpc.app.commands.robot_map import map_robot_into
+from jaxmpc.app.commands.robot_sweep import map_robot_into
 from jaxmpc.app.config.states import recursion_states
 from jaxmpc.checks import fail
 from jaxmpc.files import open_folder

@@ -9,8 +9,7 @@ from typing import Annotated, Any, Literal
 import jax
 import numpy as np
 
-from jaxmpc.app.commands.compiling import Compiling
-from jaxmpc.app.commands.film import choose_renderer, film
+from jaxmpc.app.commands.compile_notice import Compiling
 from jaxmpc.app.commands.options import (
     FINITE,
     POSITIVE,
@@ -29,13 +28,14 @@ from jaxmpc.app.commands.options import (
     print_table,
     require_lengths,
 )
+from jaxmpc.app.commands.simulate_film import choose_renderer, film
 from jaxmpc.app.config import load_robot_config
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, require_disk, require_memory, require_package
 from jaxmpc.closed_loop.linear_feedback import LinearFeedback
 from jaxmpc.closed_loop.robot_controller import RobotController
 from jaxmpc.closed_loop.robot_problem import robot_mpc, robot_references
-from jaxmpc.closed_loop.run import Run
+from jaxmpc.closed_loop.run_record import Run
 from jaxmpc.closed_loop.runs_summary import summarise_runs
 from jaxmpc.closed_loop.stored_runs import simulate_into
 from jaxmpc.closed_loop.variations import draw_robots

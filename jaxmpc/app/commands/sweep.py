@@ -24,7 +24,7 @@ from jaxmpc.app.commands.options import (
     option,
     refuse,
 )
-from jaxmpc.app.commands.robot_map import map_robot_into
+from jaxmpc.app.commands.robot_sweep import map_robot_into
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import require_disk
 from jaxmpc.robot_maps.stored_sweep import sweep_robot

@@ -24,7 +24,7 @@ from jaxmpc.app.commands.options import (
     option,
     print_table,
 )
-from jaxmpc.app.commands.tune_options import TUNED, optimizer_of, two_columns
+from jaxmpc.app.commands.tune_shared import TUNED, optimizer_of, two_columns
 from jaxmpc.app.plots.style import save
 from jaxmpc.app.plots.tuning import plot_solver
 from jaxmpc.checks import fail

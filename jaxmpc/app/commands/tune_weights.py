@@ -4,10 +4,10 @@ import dataclasses
 import sys
 import time
 
-from jaxmpc.app.commands.compiling import Compiling
-from jaxmpc.app.commands.tune_options import TUNED, optimizer_of
-from jaxmpc.app.commands.weight_files import WeightProblem, problem_of_file, problem_of_robot
+from jaxmpc.app.commands.compile_notice import Compiling
+from jaxmpc.app.commands.tune_shared import TUNED, optimizer_of
 from jaxmpc.app.commands.weight_options import WeightOptions
+from jaxmpc.app.commands.weight_problem import WeightProblem, problem_of_file, problem_of_robot
 from jaxmpc.app.commands.weight_results import WeightResults
 from jaxmpc.batches import Compiled
 from jaxmpc.files import as_json, check_results

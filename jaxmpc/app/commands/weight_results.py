@@ -10,8 +10,8 @@ import numpy as np
 
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import print_table
-from jaxmpc.app.commands.tune_options import TUNED, two_columns
-from jaxmpc.app.commands.weight_files import WeightProblem
+from jaxmpc.app.commands.tune_shared import TUNED, two_columns
+from jaxmpc.app.commands.weight_problem import WeightProblem
 from jaxmpc.app.plots.style import save
 from jaxmpc.app.plots.tuning import plot_before_after, plot_maps, plot_tuning
 from jaxmpc.feasible.map import map_feasible_set

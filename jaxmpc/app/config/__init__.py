@@ -16,9 +16,9 @@ file of their own, with the sections [robot] and [cost].
 """
 
 from jaxmpc.app.config.consistency import require_horizon, state_bytes
+from jaxmpc.app.config.loading import from_results, load, load_robot_config
 from jaxmpc.app.config.problem import Config
-from jaxmpc.app.config.reading import from_results, load, load_robot_config
-from jaxmpc.app.config.robot import RobotConfig, RobotCostSection, RobotSection
+from jaxmpc.app.config.robot_weights import RobotConfig, RobotCostSection, RobotSection
 from jaxmpc.app.config.sections import SolverSection
 from jaxmpc.app.config.states import SweepPoints, grid_shape, recursion_states, sweep_points
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc.app.config.problem import COMMANDS, Config
+from jaxmpc.app.config.problem import SECTION_COMMANDS, Config
 from jaxmpc.app.config.states import grid_shape, mapped_axes, recursion_shape, section_ends
 from jaxmpc.batches import CHUNK
 from jaxmpc.checks import fail, require_memory, require_printable
@@ -147,7 +147,7 @@ def _check_order(
 ) -> None:
     """Raise ValueError where a lower end lies above its upper end."""
     for i, (a, b) in enumerate(zip(lower or (), upper or (), strict=False)):
-        if a > b or (where in COMMANDS and a == b):
+        if a > b or (where in SECTION_COMMANDS and a == b):
             fail(
                 f"{where}.{low}", f"entry {i} is {a:g}, above {high} {b:g}", f"Check {low}, {high}"
             )

@@ -34,7 +34,7 @@ from jaxmpc.systems.riccati import lqr
 from jaxmpc.systems.system import LinearSystem
 
 # Commands that have a section of their own.
-COMMANDS = ("sweep", "recursion")
+SECTION_COMMANDS = ("sweep", "recursion")
 # Arguments by which errors of the library name what these keys give.
 KEYS = {
     **{
@@ -115,7 +115,9 @@ class Config:
     def to_dict(self, command: str = "sweep") -> dict[str, Any]:
         """Return the sections that a command reads as JSON data; infinity is "Infinity"."""
         data = json.loads(ADAPTER.dump_json(self))
-        return {key: part for key, part in data.items() if key == command or key not in COMMANDS}
+        return {
+            key: part for key, part in data.items() if key == command or key not in SECTION_COMMANDS
+        }
 
     def to_toml(self) -> str:
         """Return the text of a file that `load` reads back as this very configuration."""

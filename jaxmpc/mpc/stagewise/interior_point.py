@@ -135,7 +135,7 @@ class InteriorState:
         of least cost without rows."""
         blank = jnp.zeros((2, len(best.y)), best.y.dtype)
         at = Sides(blank, blank, blank)
-        return cls(best.z, at, best, jnp.int32(0), ~(best.near | best.solved))
+        return cls(best.z, at, best, jnp.int32(0), ~(best.near | best.finished))
 
 
 def interior_step(most: int, constants: tuple, state: InteriorState) -> InteriorState:
@@ -183,7 +183,10 @@ def interior_step(most: int, constants: tuple, state: InteriorState) -> Interior
     at = jax.tree.map(lambda a, b: jnp.where(first, a, b), begun, at)
     y = fixed + E * limits.multipliers(at)
     pair = measured_pair(eps, s, u, y)
-    best, again = state.best.or_better(pair), pair.measured.small & state.best.measured.small
+    best, again = (
+        state.best.or_better(pair),
+        pair.measured.within_tolerance & state.best.measured.within_tolerance,
+    )
     steps = state.steps + 1
-    wanted = ~(best.near | best.solved | again) & sound & (steps < most)
+    wanted = ~(best.near | best.finished | again) & sound & (steps < most)
     return InteriorState(u, at, best, steps, wanted)

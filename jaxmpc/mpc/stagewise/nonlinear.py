@@ -29,7 +29,7 @@ from jaxmpc.checks import (
     require_real,
     require_symmetric_psd,
 )
-from jaxmpc.mpc.arguments import Aim
+from jaxmpc.mpc.aim import Aim
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import joined_bounds
 from jaxmpc.mpc.stagewise.stages import Stages, apply, apply_transposed, at, spread

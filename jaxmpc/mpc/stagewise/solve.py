@@ -26,13 +26,18 @@ from jax.typing import ArrayLike, DTypeLike
 
 from jaxmpc.arrays import Reals, as_array, host_array
 from jaxmpc.checks import concrete, fail, require_finite, require_kind
-from jaxmpc.mpc.arguments import Aim, checked_aim
+from jaxmpc.mpc.aim import Aim, checked_aim
 from jaxmpc.mpc.plan import Plan, WarmStart, answer
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import layout, row_count
 from jaxmpc.mpc.stagewise.interior_point import INTERIOR_STEPS
-from jaxmpc.mpc.stagewise.newton import Search, distance, stage_conditions, stage_newton_step
-from jaxmpc.mpc.stagewise.riccati import Gains
+from jaxmpc.mpc.stagewise.recursion_kernels import Gains
+from jaxmpc.mpc.stagewise.semismooth_newton import (
+    Search,
+    distance,
+    stage_conditions,
+    stage_newton_step,
+)
 from jaxmpc.mpc.stagewise.stages import (
     Stages,
     at,
@@ -55,10 +60,10 @@ from jaxmpc.qp.admm import (
     scaled_multipliers,
     start,
 )
+from jaxmpc.qp.batched_loops import repeat_while
 from jaxmpc.qp.certificate import Proof
 from jaxmpc.qp.derivative import implicit
-from jaxmpc.qp.loops import repeat_while
-from jaxmpc.qp.modes import own_modes, varying
+from jaxmpc.qp.jax_modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, matmul, precisely
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.projection import Bounds

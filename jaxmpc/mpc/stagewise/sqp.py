@@ -1,7 +1,7 @@
 """Nonlinear MPC by sequential quadratic programming on the stages (direct multiple shooting).
 
 Each QP is the expansion of `nonlinear.py` about the iterate x (N+1, n), u (N, m), solved as in
-`stagewise.py`; states and inputs are both variables, so an iterate may have defects
+`solve.py`; states and inputs are both variables, so an iterate may have defects
 f(x_k, u_k) − x_{k+1}. The step to the QP's solution is shortened until the merit function
 
     φ = J + penalties of soft rows + Σ w |defect| + Σ w (violation of hard rows)
@@ -29,11 +29,10 @@ from jax.typing import ArrayLike, DTypeLike
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_kind, whole
-from jaxmpc.mpc.arguments import Aim, checked_aim, checked_array
+from jaxmpc.mpc.aim import Aim, checked_aim, checked_array
 from jaxmpc.mpc.plan import Plan, WarmStart, answer
 from jaxmpc.mpc.rows import row_count, split
 from jaxmpc.mpc.stagewise.interior_point import INTERIOR_STEPS
-from jaxmpc.mpc.stagewise.newton import Search, stage_conditions
 from jaxmpc.mpc.stagewise.nonlinear import (
     NonlinearMPC,
     all_rows,
@@ -42,7 +41,8 @@ from jaxmpc.mpc.stagewise.nonlinear import (
     task_layout,
     total_cost,
 )
-from jaxmpc.mpc.stagewise.riccati import recurrence
+from jaxmpc.mpc.stagewise.recursion_kernels import recurrence
+from jaxmpc.mpc.stagewise.semismooth_newton import Search, stage_conditions
 from jaxmpc.mpc.stagewise.solve import (
     NEWTON_STEPS,
     StageFactor,
@@ -65,11 +65,11 @@ from jaxmpc.mpc.stagewise.stages import (
 )
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, default_rho, scaled_multipliers
+from jaxmpc.qp.batched_loops import repeat_while
 from jaxmpc.qp.certificate import Proof
 from jaxmpc.qp.derivative import Undo, implicit
+from jaxmpc.qp.jax_modes import own_modes, varying
 from jaxmpc.qp.linalg import cholesky
-from jaxmpc.qp.loops import repeat_while
-from jaxmpc.qp.modes import own_modes, varying
 from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.precision import arrays, precisely, rounding
 from jaxmpc.qp.residuals import SHARE, Measured, Terms, assess
@@ -387,7 +387,7 @@ def sqp_step(most: int, hessian: str, constants: tuple, state: Iterate) -> Itera
     s = expanded(base, problem, x, u)
     y = s.bounds.admissible(y)
     measure = lambda s, u, y, eps: Measured.of(nonlinear_residuals(s, u, y), eps, rounding(x.dtype))
-    solved = precisely(measure, s, u, y, eps / 10).small
+    solved = precisely(measure, s, u, y, eps / 10).within_tolerance
     E, rho = scales(s, scale)
     exact = jnp.asarray(False)
     if hessian == "exact":
@@ -444,7 +444,7 @@ def solved_qp(
 
     search = Search(NEWTON_STEPS, INTERIOR_STEPS, loop)
     best = search.from_pair(s, E, rho, fixed, eps, measured_pair(eps, s, u, y), ~exact)
-    return best.z, best.y, best.measured.small
+    return best.z, best.y, best.measured.within_tolerance
 
 
 def held(s: Stages, E: Array, y: Array) -> Array:

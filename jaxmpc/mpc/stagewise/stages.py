@@ -24,10 +24,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.mpc.arguments import Aim
+from jaxmpc.mpc.aim import Aim
 from jaxmpc.mpc.problem import MPC, weights_of
 from jaxmpc.mpc.rows import Layout, blocks, bounds_of, layout_of
-from jaxmpc.mpc.stagewise.riccati import Gains, recurrence, riccati_recursion, tracking
+from jaxmpc.mpc.stagewise.recursion_kernels import Gains, recurrence, riccati_recursion, tracking
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.admm import convex
 from jaxmpc.qp.precision import floating_dtype, matmul, precisely, rounding

@@ -13,8 +13,8 @@ import numpy as np
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_shape, whole
 from jaxmpc.pytrees import record
-from jaxmpc.robots.engine import mujoco, number_of
 from jaxmpc.robots.film.captions import TARGET, Captions, captioned, exceeded_limits
+from jaxmpc.robots.mujoco_access import mujoco, number_of
 from jaxmpc.robots.robot import Robot
 
 OPACITY = 0.3  # of the target

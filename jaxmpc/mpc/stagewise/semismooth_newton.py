@@ -99,7 +99,7 @@ class NewtonState:
     @classmethod
     def begin(cls, best: Pair) -> "NewtonState":
         """Return the state before the first step."""
-        return cls(best.z, best.y, best, jnp.int32(0), ~(best.near | best.solved))
+        return cls(best.z, best.y, best, jnp.int32(0), ~(best.near | best.finished))
 
 
 def newton_search_step(most: int, constants: tuple, state: NewtonState) -> NewtonState:
@@ -107,7 +107,7 @@ def newton_search_step(most: int, constants: tuple, state: NewtonState) -> Newto
     s, E, rho, eps = constants
     u, y = stage_newton_step(s, E, rho, state.u, state.y)
     best, steps = state.best.or_better(measured_pair(eps, s, u, y)), state.steps + 1
-    return NewtonState(u, y, best, steps, ~(best.near | best.solved) & (steps < most))
+    return NewtonState(u, y, best, steps, ~(best.near | best.finished) & (steps < most))
 
 
 class Search(NamedTuple):

@@ -32,12 +32,12 @@ from scipy.spatial import ConvexHull, QhullError
 
 from jaxmpc.batches import Compiled, Devices, over_devices
 from jaxmpc.feasible import proofs
-from jaxmpc.feasible.constraint_rows import ConstraintRows
-from jaxmpc.feasible.exact_data import ExactData
+from jaxmpc.feasible.hard_constraints import ExactData
+from jaxmpc.feasible.orthonormal_rows import ConstraintRows
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays, close_gap, filled
 from jaxmpc.pytrees import pytree
-from jaxmpc.qp.modes import own_modes
+from jaxmpc.qp.jax_modes import own_modes
 
 # Coordinates up to which the polytopes have few facets.
 MOST_COORDINATES = 4

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxmpc.qp.batched_loops import in_blocks, repeat_while, true_places
 from jaxmpc.qp.dual_kernel import MOST_ROWS, damped_kernel
 from jaxmpc.qp.linalg import definite_solver
-from jaxmpc.qp.loops import in_blocks, repeat_while, true_places
 from jaxmpc.qp.newton import gram, ridged
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.triton import on_gpu

@@ -21,8 +21,8 @@ from jax.typing import DTypeLike
 
 from jaxmpc.batches import Compiled, Devices, over_devices
 from jaxmpc.feasible import proofs
-from jaxmpc.feasible.constraint_rows import ConstraintRows
-from jaxmpc.feasible.exact_data import ExactData
+from jaxmpc.feasible.hard_constraints import ExactData
+from jaxmpc.feasible.orthonormal_rows import ConstraintRows
 from jaxmpc.feasible.proofs import Verdict
 from jaxmpc.qp.newton import least_distance
 from jaxmpc.qp.precision import matmul

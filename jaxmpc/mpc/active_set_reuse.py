@@ -21,15 +21,15 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.batches import padded
-from jaxmpc.mpc.arguments import Aim
+from jaxmpc.mpc.aim import Aim
 from jaxmpc.mpc.controller import Controller, planned
 from jaxmpc.mpc.plan import Multipliers, Plan, flat_multipliers
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import scaled_multipliers
+from jaxmpc.qp.batched_loops import true_places
 from jaxmpc.qp.dual_search import has_dual_steps
 from jaxmpc.qp.dual_step import RIDGE, most_rows
 from jaxmpc.qp.linalg import solve
-from jaxmpc.qp.loops import true_places
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.solve import solve_from
 from jaxmpc.qp.status import Status

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.feasible.constraint_rows import ConstraintRows
+from jaxmpc.feasible.orthonormal_rows import ConstraintRows
 from jaxmpc.sets.lp import FLAT, Program, scaling
 
 # Tangents of a ball are added to a program up to so often.

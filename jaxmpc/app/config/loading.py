@@ -9,8 +9,8 @@ from pydantic import ValidationError
 
 from jaxmpc.app.config.consistency import check
 from jaxmpc.app.config.files import Origin, read_toml
-from jaxmpc.app.config.problem import ADAPTER, COMMANDS, Config
-from jaxmpc.app.config.robot import ROBOT_ADAPTER, RobotConfig
+from jaxmpc.app.config.problem import ADAPTER, SECTION_COMMANDS, Config
+from jaxmpc.app.config.robot_weights import ROBOT_ADAPTER, RobotConfig
 from jaxmpc.checks import fail, nearest, shown
 
 # Inertia 0.05 kg m², period 0.01 s, x = (q, dq), u = τ.
@@ -50,7 +50,7 @@ def load(
     dropped = set()
     for rivals in ({"fixed", "projection"}, {"terminal", "H_f", "h_f", "P_f", "level_f"}):
         dropped |= rivals if rivals & set(overrides) else set()
-    for name in ("mpc", *({command} & set(COMMANDS))):
+    for name in ("mpc", *({command} & set(SECTION_COMMANDS))):
         known = _keys(Config, name)
         changes = {key: value for key, value in overrides.items() if key in known}
         options |= {f"{name}.{key}" for key in changes}

@@ -1,7 +1,7 @@
 """RobotEnv: a robot as an environment of Gymnasium (`pip install -e '.[gymnasium]'`).
 
 import gymnasium
-env = gymnasium.make("jaxmpc.closed_loop.robot_env:jaxmpc/Robot-v0", robot="pendulum")
+env = gymnasium.make("jaxmpc.closed_loop.gymnasium_env:jaxmpc/Robot-v0", robot="pendulum")
 """
 
 from typing import Any

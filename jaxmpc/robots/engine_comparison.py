@@ -17,7 +17,8 @@ import numpy as np
 from jaxmpc.files import fingerprint
 from jaxmpc.pytrees import record
 from jaxmpc.qp.linalg import JAXLIB
-from jaxmpc.robots.engine import (
+from jaxmpc.robots.mjx_gaps import Lack
+from jaxmpc.robots.mujoco_access import (
     FREE,
     SLIDE,
     flag,
@@ -26,7 +27,6 @@ from jaxmpc.robots.engine import (
     name_of,
     single_joints,
 )
-from jaxmpc.robots.mjx_gaps import Lack
 from jaxmpc.robots.physics import Physics
 from jaxmpc.sets.box import Box
 

@@ -1,4 +1,4 @@
-"""The recursions of `stagewise.py`, each one kernel a batch on NVIDIA GPUs.
+"""The recursions along the horizon, each one kernel a batch on NVIDIA GPUs.
 
 As a scan every stage is a launch of its own, or several: 5 to 200 µs each whatever the batch. Here
 one warp runs all stages of one problem with the running vector or matrix in its registers (Pallas,
@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.qp import triton
+from jaxmpc.qp.jax_modes import own_modes
 from jaxmpc.qp.linalg import WAITS, batched, inverse_root_side_by_side, solve
-from jaxmpc.qp.modes import own_modes
 from jaxmpc.qp.precision import matmul
 from jaxmpc.qp.triton import barrier, call, indices, load, on_gpu, padded_side, store
 
