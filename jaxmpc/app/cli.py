@@ -21,9 +21,9 @@ from jaxmpc.app.commands.options import check_values
 from jaxmpc.app.terminal import plain_output, report_error
 from jaxmpc.checks import fail, nearest
 
-# Module and class of each command: only the one that is called is imported. The class is a dataclass
-# of options, its docstring the help, `run()` the command, and `keeps` says what is there of
-# a run that was stopped, which --resume goes on from; "" for nothing (see `commands/init.py`).
+# Module and class of each command: only the one that is called is imported. The class is a
+# dataclass of options, its docstring the help, `run()` the command, and `keeps` says what is there
+# of a run that was stopped, which --resume goes on from; "" for nothing (see `commands/init.py`).
 COMMANDS = {
     "init": ("init", "Init"),
     "sweep": ("sweep", "Sweep"),

@@ -209,8 +209,8 @@ def solved(M: Array, b: Array, k: Array, count: Array) -> Array:
 
 
 def damped_kernel(S: Array, W: Array, slack: Array, b: Array, damping: float, steps: int) -> Array:
-    """Return `kkt_system.damped` (k,) of one instance. W (k,): rows of S, which is shared, filled up
-    with their number; slack, b (k,). `vmap` for many."""
+    """Return `kkt_system.damped` (k,) of one instance. W (k,): rows of S, which is shared, filled
+    up with their number; slack, b (k,). `vmap` for many."""
     m, rows = len(S), len(W)
     count = jnp.sum(W < m, dtype=jnp.int32)
     y, done = jnp.zeros_like(b), 0
