@@ -2,8 +2,9 @@
 
 Residuals come in parts, those of rows (m,), of variables (n,) and the gap (1,): `residual_terms`
 for a QP, `mpc.stated_residuals` for the plan of an MPC problem, `stage_residuals` in
-`mpc.stagewise.stages` for a problem stage by stage. With each entry come two numbers in its own unit, so that neither the units of rows
-and variables nor that of the cost change what is said of a pair:
+`mpc.stagewise.stages` for a problem stage by stage. With each entry come two numbers in its own
+unit, so that neither the units of rows and variables nor that of the cost change what is said of a
+pair:
 
     size    what the entry is compared with: the sums that it is a difference of;
     terms   the absolute terms of these sums, which can be far larger: rounding is a share of them.
