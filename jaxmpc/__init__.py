@@ -19,6 +19,8 @@ JAX is loaded.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from jaxmpc.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from jaxmpc import (
         closed_loop,
@@ -62,9 +64,6 @@ if TYPE_CHECKING:
     from jaxmpc.tuning.parameters import Parameter
     from jaxmpc.tuning.weights import tune_weights
     from jaxmpc.workflow import design
-
-# Here and not in the metadata of an installation, which a source tree on the path has none of.
-__version__ = "0.1.0"
 
 __all__ = [
     "ADMM",

@@ -20,8 +20,8 @@ from typing import Any, BinaryIO
 import jax
 import numpy as np
 
-from jaxmpc import __version__
 from jaxmpc.checks import fail, require_memory, shortened
+from jaxmpc.version import __version__
 
 # Packages, beside this one, whose versions a result depends on.
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "scipy", "zarr")

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxmpc import store
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import Part, work_off
 from jaxmpc.checks import fail, whole
@@ -37,21 +36,22 @@ from jaxmpc.robot_maps.robot_loops import RobotLoops
 from jaxmpc.robot_maps.robot_map import RobotMap
 from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.robots.robot import Robot
+from jaxmpc.store import Field, Store, report_damage
 
 # Points along each of two axes; total number of points for another number of axes.
 SIDE, POINTS = 32, 1024
 FILES = "summary.json", "robot_map.npz", "robot_map.png"
 # What the store has of each closed loop, beside the labels.
 LOOPS = {
-    name: store.Field((), "int64", -1, (), {"long_name": text})
+    name: Field((), "int64", -1, (), {"long_name": text})
     for name, text in (
         ("broken_at", "time step at which the robot leaves its limits; -1: never"),
         ("lost_at", "time step at which a plan is not within the limits; -1: never"),
         ("unsolved_at", "time step at which a plan is not solved; -1: never"),
     )
 }
-LOOPS["worst"] = store.Field((), "float64", np.nan, (), {"long_name": "most beyond a limit"})
-LOOPS["statuses"] = store.Field(
+LOOPS["worst"] = Field((), "float64", np.nan, (), {"long_name": "most beyond a limit"})
+LOOPS["statuses"] = Field(
     (len(Status),), "int64", 0, ("kind",), {"long_name": "number of plans by status"}
 )
 
@@ -140,7 +140,7 @@ def sweep_robot(
         overwrite=overwrite,
         begun=partial(remove_files, folder, *FILES),
     )
-    store.report_damage(blocks)
+    report_damage(blocks)
     with blocks:
         count = f"{len(setting.x0s):,} states, {steps} time steps"
         budget.say(f"{plant.name}: {count} -> {folder}")
@@ -212,7 +212,7 @@ def _grid_lines(
 
 def _label(
     setting: RobotSetting,
-    blocks: store.Store,
+    blocks: Store,
     budget: Budget,
     devices: int | None,
     settings: dict[str, Any],
