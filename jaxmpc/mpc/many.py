@@ -74,13 +74,13 @@ class Batch:
         self._stores = threading.Lock()
         self.answer: Plan | None = None
 
-    def solve(self, follow: bool) -> Plan:
-        """Return the plans from all states. follow: whether states may follow solved ones."""
+    def solve(self, transfer: bool) -> Plan:
+        """Return the plans from all states; transfer: as in `solve_many`."""
         B = len(self.x)
         left = np.arange(B)
         # (On GPUs the solver's kernels take less time than the laws and the host's indices would.)
         on_cpu = jax.default_backend() == "cpu"
-        if follow and on_cpu and B >= MANY and transferable(self.controller):
+        if transfer and on_cpu and B >= MANY and transferable(self.controller):
             self.chunk = self.block  # larger arrays a CPU's allocator would give back each time
             left = self._transfer()
         self._run(_plans(self.devices), (self.controller,), left)

@@ -86,6 +86,7 @@ def consolidate(group: "zarr.Group") -> None:
 
 
 def array_of(group: "zarr.Group", name: str) -> "zarr.Array[Any]":
+    """Return the variable of this name."""
     import zarr
 
     array = group[name]

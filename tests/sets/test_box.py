@@ -4,17 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from polytopes import cube
 
-from jaxmpc import Box, LinearSystem, Polytope
+from jaxmpc import Box, LinearSystem
 from jaxmpc.sets.control_invariant import (
     maximal_control_invariant_set,
 )
 
 INF = np.inf
-
-
-def cube(n, half=1.0):
-    return Polytope(np.vstack([np.eye(n), -np.eye(n)]), np.full(2 * n, half))
 
 
 def test_box():

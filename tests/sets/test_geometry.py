@@ -3,24 +3,12 @@
 import numpy as np
 import pytest
 import scipy
+from polytopes import unimodular
 from scipy.optimize import linprog
 
 import jaxmpc.sets.geometry as geometry
 from jaxmpc.sets.geometry import factors, irredundant
 from jaxmpc.sets.polytope import Polytope
-
-
-def unimodular(rng, n):
-    """An integer matrix with determinant 1 and its inverse, exactly."""
-    T = np.eye(n)
-    for _ in range(3 * n):
-        i, j = rng.choice(n, 2, replace=False)
-        step = np.eye(n)
-        step[i, j] = rng.choice([-1, 1])
-        T = step @ T if np.abs(step @ T).max() <= 3 else T
-    inverse = np.round(np.linalg.inv(T))
-    np.testing.assert_array_equal(T @ inverse, np.eye(n))
-    return T, inverse
 
 
 def test_factors_find_a_hidden_product():

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from polytopes import assert_same_points
 from problems import symmetric
 
 from jaxmpc import Box, LinearSystem, Polytope, lqr, maximal_invariant_set
@@ -45,16 +46,6 @@ DOUBLE_O_INF_ROWS = [  # published in MPT3, test_ltisystem_LQRSet_01: rows of H 
     [-0.519754007452359, -0.939957536022068],
     [0.519754007452359, 0.939957536022068],
 ]
-
-
-def sorted_rows(points):
-    points = np.round(np.asarray(points, dtype=float), 9) + 0.0
-    return points[np.lexsort(points.T)]
-
-
-def assert_same_points(left, right, atol=1e-9):
-    assert np.shape(left) == np.shape(right)
-    np.testing.assert_allclose(sorted_rows(left), sorted_rows(right), atol=atol)
 
 
 def test_invariant_set_of_the_joint():

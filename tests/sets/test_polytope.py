@@ -10,6 +10,7 @@ import math
 import jax
 import numpy as np
 import pytest
+from polytopes import assert_same_points, cube, unimodular
 from scipy.optimize import linprog
 
 from jaxmpc import Box, Polytope
@@ -26,20 +27,6 @@ C_INF_HALF = [
 
 
 C_INF = np.array(C_INF_HALF + [[-x, -y] for x, y in C_INF_HALF])
-
-
-def sorted_rows(points):
-    points = np.round(np.asarray(points, dtype=float), 9) + 0.0
-    return points[np.lexsort(points.T)]
-
-
-def assert_same_points(left, right, atol=1e-9):
-    assert np.shape(left) == np.shape(right)
-    np.testing.assert_allclose(sorted_rows(left), sorted_rows(right), atol=atol)
-
-
-def cube(n, half=1.0):
-    return Polytope(np.vstack([np.eye(n), -np.eye(n)]), np.full(2 * n, half))
 
 
 def test_polytope_basics():
@@ -252,19 +239,6 @@ def random_polytope(rng, n, rows=12):
     """Bounded, with 0 inside: random rows and a box."""
     H = np.vstack([rng.standard_normal((rows, n)), np.eye(n), -np.eye(n)])
     return Polytope(H, np.r_[rng.uniform(0.5, 1.5, rows), np.full(2 * n, 2.0)])
-
-
-def unimodular(rng, n):
-    """An integer matrix with determinant 1 and its inverse, exactly."""
-    T = np.eye(n)
-    for _ in range(3 * n):
-        i, j = rng.choice(n, 2, replace=False)
-        step = np.eye(n)
-        step[i, j] = rng.choice([-1, 1])
-        T = step @ T if np.abs(step @ T).max() <= 3 else T
-    inverse = np.round(np.linalg.inv(T))
-    np.testing.assert_array_equal(T @ inverse, np.eye(n))
-    return T, inverse
 
 
 def test_image_of_polygons_by_hand():
