@@ -17,7 +17,7 @@ from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
 from jaxmpc.tuning.result import Interrupted
 from jaxmpc.tuning.rho_schedule import transfer_penalties
-from jaxmpc.tuning.run_folder import run_folder
+from jaxmpc.tuning.run_folders import run_folder
 from jaxmpc.tuning.solver import tune_solver
 from jaxmpc.tuning.tasks import linear_task, robot_task, weight_parameters
 from jaxmpc.tuning.weights import tune_weights

@@ -9,7 +9,7 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.tuning.initial_states import initial_range
-from jaxmpc.tuning.run_folder import CHECKPOINT, run_folder
+from jaxmpc.tuning.run_folders import CHECKPOINT, run_folder
 from jaxmpc.tuning.tasks import TIGHTEST, weight_loss
 
 SYSTEM = replace(problems.double_integrator(4).system, dt=1.0)

@@ -35,7 +35,7 @@ from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.tuning.initial_states import feasible_states, initial_range
 from jaxmpc.tuning.result import Interrupted, TuningRun
-from jaxmpc.tuning.run_folder import CHECKPOINT, run_folder
+from jaxmpc.tuning.run_folders import CHECKPOINT, run_folder
 from jaxmpc.tuning.solver import tune_solver
 
 FILES = ("solver.json", TUNED, "solver.png")

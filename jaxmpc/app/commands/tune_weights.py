@@ -12,7 +12,7 @@ from jaxmpc.app.commands.weight_results import WeightResults
 from jaxmpc.batches import Compiled
 from jaxmpc.files import as_json, check_results
 from jaxmpc.tuning.result import Interrupted
-from jaxmpc.tuning.run_folder import run_folder
+from jaxmpc.tuning.run_folders import run_folder
 
 FILES = ("tuning.json", TUNED, "tuning.png", "before_after.png", "maps.png")
 

@@ -19,7 +19,7 @@ from jaxmpc.files import versions, write_json
 from jaxmpc.grids import grid
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.tuning.result import TuningRun
-from jaxmpc.tuning.run_folder import CHECKPOINT
+from jaxmpc.tuning.run_folders import CHECKPOINT
 from jaxmpc.tuning.tasks import WeightTask
 
 # Entries of a weight that the table shows.
