@@ -17,8 +17,7 @@ import tyro
 from lesson_joint import LIMITS, SYSTEM, TORQUE, A, B, Q, R, joint
 
 import jaxmpc as jm
-from jaxmpc.closed_loop.run_record import lyapunov_decrease
-from jaxmpc.closed_loop.simulation import simulate
+from jaxmpc.closed_loop.simulation import lyapunov_decrease, simulate
 
 
 @dataclass(frozen=True)

@@ -18,16 +18,11 @@ randomised                 random masses, damping, payloads of robots, for `vari
 """
 
 from jaxmpc.closed_loop.environment import Environment, MPCPolicy
-from jaxmpc.closed_loop.linear_feedback import LinearFeedback
-from jaxmpc.closed_loop.many import simulate_many
-from jaxmpc.closed_loop.noise import Noise
-from jaxmpc.closed_loop.observer import KalmanFilter
-from jaxmpc.closed_loop.outcome import evaluate_runs
-from jaxmpc.closed_loop.robot_controller import RobotController
-from jaxmpc.closed_loop.robot_problem import robot_mpc
-from jaxmpc.closed_loop.run_record import Run, lyapunov_decrease
-from jaxmpc.closed_loop.runs_summary import summarise_runs
-from jaxmpc.closed_loop.simulation import simulate
+from jaxmpc.closed_loop.estimation import KalmanFilter, Noise
+from jaxmpc.closed_loop.feedback import LinearFeedback
+from jaxmpc.closed_loop.outcome import evaluate_runs, summarise_runs
+from jaxmpc.closed_loop.robot_controller import RobotController, robot_mpc
+from jaxmpc.closed_loop.simulation import Run, lyapunov_decrease, simulate, simulate_many
 from jaxmpc.closed_loop.stored_runs import simulate_into
 from jaxmpc.closed_loop.variations import draw_robots, randomised
 

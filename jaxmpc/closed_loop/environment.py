@@ -10,9 +10,8 @@ from jax import Array
 
 from jaxmpc.arrays import Reals, as_weight
 from jaxmpc.checks import number, require_kind, require_shape, whole
-from jaxmpc.closed_loop.interfaces import Feedback
-from jaxmpc.closed_loop.observer import model_of
-from jaxmpc.closed_loop.robot_problem import robot_mpc
+from jaxmpc.closed_loop.feedback import Feedback, model_of
+from jaxmpc.closed_loop.robot_controller import robot_mpc
 from jaxmpc.closed_loop.variations import start_room
 from jaxmpc.mpc.plan import limited
 from jaxmpc.pytrees import pytree, static

@@ -1,4 +1,7 @@
-"""The outcome of closed loops: limits kept, target reached, settling time, cost."""
+"""What closed loops come to: limits kept, target reached, settling time and cost, and the summary of many runs."""
+
+from dataclasses import asdict
+from typing import Any
 
 import jax
 import numpy as np
@@ -6,13 +9,15 @@ from jax import Array
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.closed_loop.run_record import Run
+from jaxmpc.closed_loop.simulation import Run
+from jaxmpc.closed_loop.stored_runs import StoredRuns
+from jaxmpc.files import versions
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.box import Box
-from jaxmpc.sets.violations import kept, row_violations
+from jaxmpc.sets.violations import TOLERANCE, kept, row_violations
 
 
 @record
@@ -98,3 +103,176 @@ def coordinates(plant: Robot | LinearPlant, states: Array | np.ndarray) -> np.nd
     with jax.enable_x64(True):
         flat = jax.vmap(plant.coordinates)(states.reshape(-1, states.shape[-1]))
     return np.asarray(flat).reshape(*states.shape[:-1], plant.n)
+
+
+@record
+class RunsSummary:
+    """What many runs of a robot come to. data: the numbers, as JSON data; `print` shows the table
+    of `rows`. outcome: of each robot."""
+
+    data: dict[str, Any]
+    outcome: Outcome
+
+    def __str__(self) -> str:
+        return "\n".join(f"  {name:<13} {value}" for name, value in self.rows())
+
+    __repr__ = __str__
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return the rows of the table, name and value."""
+        return _outcome_rows(self.data) + _plan_rows(self.data) + _time_rows(self.data)
+
+
+def summarise_runs(
+    runs: StoredRuns | Run,
+    robot: Robot,
+    reference: Reals,
+    input_reference: Reals,
+    *,
+    tolerance: float = 0.02,
+) -> RunsSummary:
+    """Return the summary of runs whose target is rest at reference (n,) under input_reference (m,).
+
+    runs: of `simulate_into`, or of `simulate_many`, with a batch axis. tolerance: see
+    `evaluate_runs`. With runs of a store the summary has their settings and the time they took.
+    """
+    run = (runs.run if isinstance(runs, StoredRuns) else runs).on_host()
+    outcome = evaluate_runs(run, robot, reference, tolerance=tolerance)
+    names = robot.state_names
+    count = lambda v: int(np.count_nonzero(v))
+    solved = run.status == Status.SOLVED
+    mpc = bool(np.any(run.status != Status.NOT_RUN))
+    data = {
+        "robot": robot.name,
+        "robots": len(outcome.kept),
+        "samples": run.inputs.shape[1],
+        "control_period": robot.dt,
+        "success": count(outcome.success),
+        "limits_kept": count(outcome.kept),
+        "limits_kept_to": TOLERANCE["float64"],
+        "reached": count(outcome.reached),
+        "not_finite": count(~np.isfinite(run.states).all(axis=(1, 2))),
+        "plans_valid": count(outcome.plans_valid) if mpc else None,
+        "plans_valid_and_kept": count(outcome.plans_valid & outcome.kept) if mpc else None,
+        **_violations(robot, outcome),
+        "plans": int(np.size(run.status)) if mpc else 0,
+        "plans_solved": count(solved),
+        "fallback_plans": count(solved & run.fallback),
+        "unsolved_plans": count(~solved) if mpc else 0,
+        "settling": _levels(outcome.settling),
+        "cost": _levels(outcome.cost),
+        "target": _by_name(names, reference),
+        "target_input": _by_name(robot.input_names, input_reference),
+        "tolerance": _by_name(names, outcome.band),
+        "versions": versions(),
+        "device": jax.devices()[0].device_kind,
+    }
+    if isinstance(runs, StoredRuns):
+        data |= {"this_run": _speed(runs, robot), "config": runs.settings}
+    return RunsSummary(data, outcome)
+
+
+def _by_name(names: tuple[str, ...], values: Reals) -> dict[str, float]:
+    return dict(zip(names, np.asarray(values).tolist(), strict=True))
+
+
+def _levels(values: np.ndarray) -> dict[str, float | None]:
+    """Return the median and the 95 % quantile, None where they are not finite."""
+    finite = np.where(np.isnan(values), np.inf, values)
+    median, most = np.quantile(finite, [0.5, 0.95], method="higher")
+    return {"median": _finite(median), "95 %": _finite(most)}
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _violations(robot: Robot, outcome: Outcome) -> dict[str, Any]:
+    """Return the largest violation of each coordinate and input, and the one that is the largest
+    relative to half the range."""
+    excess = (outcome.state_excess, outcome.input_excess)
+    states, inputs = (np.nanmax(v, axis=(0, 1), initial=0.0) for v in excess)
+    limits = (robot.state_limits, robot.input_limits)
+    worst = np.concatenate([states, inputs])
+    i = int(np.argmax(worst / np.concatenate([box.half_widths() for box in limits])))
+    names = (*robot.state_names, *robot.input_names)
+    units = (*robot.state_units, *robot.input_units)
+    return {
+        "worst_violation": {"of": names[i], "by": float(worst[i]), "unit": units[i]},
+        "violations": {
+            "states": _by_name(robot.state_names, states),
+            "inputs": _by_name(robot.input_names, inputs),
+        },
+    }
+
+
+def _speed(runs: StoredRuns, robot: Robot) -> dict[str, float]:
+    """Return the work of the call that made the runs, and its speed if there was any."""
+    timing, steps = runs.timing, runs.run.inputs.shape[1]
+    found = asdict(timing)
+    if timing.count:
+        rate = timing.count * steps / timing.run_seconds
+        found["solves_per_second"] = rate
+        found["robot_seconds_per_second"] = rate * robot.dt
+        found["real_time_factor"] = steps * robot.dt / timing.run_seconds
+    return found
+
+
+def _outcome_rows(s: dict[str, Any]) -> list[tuple[str, str]]:
+    length = f"{s['samples']:,} samples of {s['control_period']:g} s each"
+    rows = [
+        ("robots", f"{s['robots']:>9,}  {length}"),
+        ("success", f"{_of_robots(s, 'success')}  limits kept, and at the target at the end"),
+        ("limits kept", f"{_of_robots(s, 'limits_kept')}  to {s['limits_kept_to']:g}, all samples"),
+    ]
+    if s["not_finite"]:
+        rows.append(("not finite", _of_robots(s, "not_finite")))
+    return rows
+
+
+def _of_robots(s: dict[str, Any], key: str) -> str:
+    return f"{s[key]:>9,}  {s[key] / s['robots']:8.2%}"
+
+
+def _plan_rows(s: dict[str, Any]) -> list[tuple[str, str]]:
+    rows, worst = [], s["worst_violation"]
+    if s["plans"]:
+        kept = f"of these {s['plans_valid_and_kept']:,} kept all limits"
+        rows.append(("plans valid", f"{_of_robots(s, 'plans_valid')}  {kept}"))
+    beyond = f"{worst['by']:.3g} {worst['unit']} beyond a limit of {worst['of']}"
+    rows.append(("worst", beyond if worst["by"] else "no limit exceeded"))
+    if s["plans"]:
+        for key, label, what in (
+            ("plans_solved", "plans solved", ""),
+            ("fallback_plans", "fallback", "  solved, but with slack in soft limits"),
+            ("unsolved_plans", "unsolved", "  say nothing about limits"),
+        ):
+            part = f"{s[key]:>9,}  {s[key] / s['plans']:8.2%}"
+            rows.append((label, f"{part}  of {s['plans']:,}{what}"))
+    return rows
+
+
+def _time_rows(s: dict[str, Any]) -> list[tuple[str, str]]:
+    rows = [
+        ("settling", _middle(s["settling"], "never", " s")),
+        ("cost", _middle(s["cost"], "not finite", "")),
+    ]
+    this = s.get("this_run")
+    if this:
+        rows.append(("compile", f"{this['compile_seconds']:.2f} s"))
+    if this and this["count"]:
+        what = "MPC solves" if s["plans"] else "control steps"
+        robots, rate = f"{this['count']:,}", f"{this['solves_per_second']:,.0f} {what}/s"
+        speed = f"{this['robot_seconds_per_second']:,.4g} robot-seconds/s"
+        factor = f"{this['real_time_factor']:.3g} times real time"
+        rows.append(("run", f"{this['run_seconds']:.2f} s for {robots} robots, {rate}"))
+        rows.append(("real time", f"{speed}; all {robots} at {factor}"))
+    return rows
+
+
+def _middle(levels: dict[str, float | None], missing: str, unit: str) -> str:
+    """Return the levels in words."""
+    median, most = (
+        missing if v is None else f"{v:.4g}{unit}" for v in (levels["median"], levels["95 %"])
+    )
+    return f"median {median}, 95 % up to {most}"

@@ -1,29 +1,104 @@
-"""simulate: plant and controller together, one time step after the other, under one scan."""
+"""simulate, simulate_many: plant and controller together, one time step after the other -> Run."""
 
+import functools
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals
-from jaxmpc.checks import fail, whole
-from jaxmpc.closed_loop.interfaces import Feedback, Plant
-from jaxmpc.closed_loop.linear_feedback import LinearFeedback
-from jaxmpc.closed_loop.noise import Noise
-from jaxmpc.closed_loop.observer import Belief, KalmanFilter, model_of, model_step
-from jaxmpc.closed_loop.run_record import Run
-from jaxmpc.mpc.aim import checked_aim, checked_array
+from jaxmpc.batches import (
+    Compiled,
+    Devices,
+    Part,
+    chosen_devices,
+    count,
+    device_bytes,
+    divisible,
+    each_part,
+    joined,
+    over_devices,
+    padded,
+    placement,
+    program_bytes,
+    work_off,
+)
+from jaxmpc.checks import fail, require_real, whole
+from jaxmpc.closed_loop.estimation import Belief, KalmanFilter, Noise, model_step
+from jaxmpc.closed_loop.feedback import Feedback, LinearFeedback, Plant, model_of
+from jaxmpc.mpc.aim import checked_aim, checked_array, reference_shapes
 from jaxmpc.mpc.plan import Control
 from jaxmpc.mpc.problem import weights_of
 from jaxmpc.mpc.stagewise.nonlinear import ConstantModel, as_argument
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_modes import own_modes, varying
 from jaxmpc.qp.precision import arrays, matmul
+from jaxmpc.qp.status import Status
 from jaxmpc.sets.violations import worst_violation
 from jaxmpc.systems.system import LinearSystem
+
+
+@pytree
+class Run:
+    """A closed loop of T time steps: x_{t+1} = plant(x_t, u_t) + w_t, u_t the first input of a plan
+    (with a delay, of the plan one time step earlier).
+
+    states (T+1, n), inputs (T, m). Of each plan: cost (T,), the optimal value V_N(x_t) (without
+    ½), and status (T,). stage_cost (T,): (x_t − r_t)'Q(x_t − r_t) + (u_t − s_t)'R(u_t − s_t) with
+    the references r, s, zero for none. violation (T+1,): the most by which x_t exceeds a row of
+    the state limits, in the units of the row; 0 where it keeps them all. slack (T, p): violations
+    of the soft rows at k = 0 of each plan, hence of what happens. fallback (T,): whether the plan
+    violates soft rows anywhere on its horizon by more than 1e-6 (1e-3 in float32), as happens
+    where the limits cannot all be kept. estimates (T, n): the states as an observer estimates them
+    from the outputs so far; None without an observer. Batches have their axes in front. For robots
+    states are the plant's, (qpos, qvel), and x in costs and limits means their
+    coordinates.
+    """
+
+    states: Array
+    inputs: Array
+    cost: Array
+    status: Array
+    stage_cost: Array
+    violation: Array
+    slack: Array
+    fallback: Array
+    estimates: Any = None
+
+    def __repr__(self) -> str:
+        """Return the shapes, in one line: the arrays may be long."""
+        fields = (f"{name} {np.shape(v)}" for name, v in vars(self).items() if v is not None)
+        return f"Run({', '.join(fields)})"
+
+    @property
+    def feasible_steps(self) -> Array:
+        """Return the number of plans before the first that is not SOLVED: T if all are."""
+        solved = jnp.asarray(self.status) == Status.SOLVED
+        return jnp.sum(jnp.cumprod(solved, axis=-1), axis=-1)
+
+    def on_host(self) -> "Run":
+        """Return the run as NumPy arrays with a batch axis in front, added where there is none."""
+        run = jax.tree.map(np.asarray, self)
+        return run if run.states.ndim == 3 else jax.tree.map(lambda v: v[None], run)
+
+
+def lyapunov_decrease(run: Run) -> Array:
+    """Return V_N(x_{t+1}) − V_N(x_t) + l(x_t, u_t) along the loop, (T−1,), l the stage cost.
+
+    It is nowhere positive where the optimal value is a Lyapunov function: for the nominal plant,
+    inputs free at each step, no weights on input rates or of single stages (the stage cost here
+    leaves them out), references at an equilibrium, a terminal set that a law u = Kx keeps invariant
+    inside the limits, and a terminal cost P ⪰ Q + K'RK + (A+BK)'P(A+BK) (Mayne, Rawlings, Rao &
+    Scokaert 2000, Automatica 36, section 3.3; Rawlings, Mayne & Diehl 2017, section 2.4). The
+    values from `run.feasible_steps` on mean nothing.
+    """
+    return run.cost[..., 1:] - run.cost[..., :-1] + run.stage_cost[..., :-1]
+
 
 # Slack of a plan that counts as rounding, by precision: the accuracy of solved plans.
 SLACK = {"float64": 1e-6, "float32": 1e-3}
@@ -310,3 +385,151 @@ def _simulate(
     last, run = jax.lax.scan(step, varying(first, first), steps_given, length=steps)
     states = jnp.concatenate([run.states, last.x[None]])
     return replace(run, states=states, violation=jnp.append(run.violation, loop.violation(last.x)))
+
+
+def simulate_many(
+    controller: Feedback,
+    plant: Plant,
+    x0s: Reals,
+    steps: int,
+    *,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
+    references: Reals | None = None,
+    input_references: Reals | None = None,
+    previous_input: Reals | None = None,
+    noise: Noise | None = None,
+    observer: KalmanFilter | None = None,
+    delay: int = 0,
+    compensate: bool = True,
+    variations: Mapping[str, Any] | None = None,
+    chunk: int | None = None,
+    progress: bool = False,
+    devices: Any = None,
+) -> Run:
+    """Simulate closed loops from many initial states x0s (B, n); return NumPy arrays (B, ...).
+
+    controller, plant, steps, previous_input, observer, delay, compensate: as in `simulate`.
+    reference, input_reference: as in `simulate`, the same for all loops.
+    references, input_references: one for each loop, (B, n) and (B, m), or over time (B, T + N, n)
+        and (B, T + N − 1, m); in place of those for all.
+    noise: as in `simulate`, each loop with its own (see `Noise.seed`).
+    variations: parameters of the plant that differ between the B loops, as `plant.vary` takes
+        them, each with B in front: dict(body_mass=(B, nbody), payload=(B,)) randomises masses
+        (domain randomisation). The controller keeps the nominal model.
+    chunk: number of loops that the compiled program runs at once; None: all of them, halved until
+        the program fits into the memory of the device.
+    progress: show a progress bar.
+    devices: a number of them, or a sequence of JAX devices, which share the loops of a chunk; None:
+        the default device.
+
+    Raises ValueError as `simulate` does.
+    """
+    require_real("x0s", x0s)
+    x0s, variations = np.asarray(x0s), dict(variations or {})
+    if x0s.ndim != 2 or not len(x0s):
+        size = getattr(controller, "state_size", "n")
+        fail("x0s", f"shape {x0s.shape}", f"Give (B, {size}), B ≥ 1")
+    require_variations(plant, variations, len(x0s))
+    if chunk is not None and chunk < 1:
+        fail("chunk", f"{chunk}", "Give a count of at least 1")
+    devices = chosen_devices(devices)
+    aims = (reference, input_reference)
+    given = Conditions(*aims, None, previous_input, noise, observer, delay, bool(compensate))
+    plant, _, shared = checked_loop(controller, plant, x0s[0], steps, given)
+    several = {"reference": references, "input_reference": input_references}
+    own = {name: np.asarray(value) for name, value in several.items() if value is not None}
+    _require_own(own, given, controller, steps, len(x0s))
+    numbers = None if noise is None else np.arange(len(x0s))
+    each = Each(x0s, variations, own, numbers)
+    whole = jax.device_put(arrays((controller, plant, shared)), placement(devices))
+    loops = _compiled_loops(int(steps), devices)
+
+    def run(part: Each) -> Run:
+        return loops(*whole, jax.device_put(part, placement(devices, True)))
+
+    size = divisible(min(chunk or len(x0s), len(x0s)), devices)
+    while chunk is None and size > count(devices):
+        first = jax.tree.map(lambda v, size=size: padded(np.asarray(v)[:size], size), each)
+        program = loops.program(*whole, jax.device_put(first, placement(devices, True)))
+        if program_bytes(program) <= 0.8 * device_bytes():
+            break
+        size = divisible(-(-size // 2), devices)
+    runs = list[Run]()
+
+    def keep(part: Part[Run]) -> None:
+        runs.append(part.result)
+
+    work_off(each_part(run, each, size), keep, len(x0s), unit="loops", progress=progress)
+    return joined(runs)
+
+
+@pytree
+class Each:
+    """What differs between B loops: initial states (B, n), variations of the plant, references of
+    their own by name, and the numbers (B,) of the loops for their noise, None without noise."""
+
+    x0s: Any
+    variations: dict[str, Any]
+    references: dict[str, Any]
+    numbers: Any = None
+
+
+def _require_own(
+    own: Mapping[str, np.ndarray], shared: Conditions, controller: Feedback, steps: int, count: int
+) -> None:
+    """Raise ValueError unless the references of each loop have these shapes."""
+    widths = getattr(controller, "reference_sizes", None)
+    shapes = reference_shapes(controller.mpc, steps, widths)
+    for name, value in own.items():
+        if getattr(shared, name) is not None:
+            fail(f"{name}s", f"given beside {name}", "Give one for all loops, or one for each")
+        require_real(f"{name}s", value)
+        choice = [(count, *shape) for shape in shapes[name]]
+        if value.shape not in choice:
+            listed = " or ".join(map(str, choice))
+            cure = f"Give {listed}, one for each loop; {name} is for all of them"
+            fail(f"{name}s", f"shape {value.shape}", cure)
+
+
+def require_variations(plant: Any, variations: Mapping[str, Any], count: int) -> None:
+    """Raise ValueError unless `count` plants can differ by these parameters."""
+    for key, value in variations.items():
+        if np.shape(value)[:1] != (count,):
+            fail(f"variations[{key!r}]", f"shape {np.shape(value)}", f"Put {count} in front")
+    if variations and not hasattr(plant, "vary"):
+        fail("variations", f"given for a {type(plant).__name__}", "Give a Robot or LinearPlant")
+    if variations:  # the plant checks names and shapes
+        plant.vary(**{key: np.asarray(value)[0] for key, value in variations.items()})
+
+
+def simulate_each(
+    controller: Feedback,
+    plant: Plant,
+    shared: Conditions,
+    each: Each,
+    *,
+    steps: int,
+    checkpoint: bool,
+) -> Run:
+    """Return the runs (B, ...) of loops under shared conditions and those of their own. Works
+    inside jit, vmap and grad.
+
+    plant: from `as_argument`; each loop has it with its own variations.
+    """
+    bare: Any = plant.given if isinstance(plant, ConstantModel) else plant
+
+    def loop(one: Each) -> Run:
+        given = replace(shared, **one.references)
+        if shared.noise is not None:
+            given = replace(given, noise=shared.noise.of_loop(one.numbers))
+        varied = bare.vary(**one.variations) if one.variations else bare
+        return simulate(controller, varied, one.x0s, steps, checkpoint=checkpoint, **vars(given))
+
+    return jax.vmap(loop)(each)
+
+
+@functools.cache
+def _compiled_loops(steps: int, devices: Devices) -> Compiled:
+    loops = functools.partial(simulate_each, steps=steps, checkpoint=False)
+    return over_devices(loops, devices, (False, False, False, True))

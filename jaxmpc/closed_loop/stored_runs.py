@@ -12,9 +12,8 @@ import numpy as np
 from jaxmpc.arrays import Reals
 from jaxmpc.batches import Part, Timing, first_rows, padded, work_off
 from jaxmpc.checks import fail
-from jaxmpc.closed_loop.interfaces import Feedback
-from jaxmpc.closed_loop.many import simulate_many
-from jaxmpc.closed_loop.run_record import Run
+from jaxmpc.closed_loop.feedback import Feedback
+from jaxmpc.closed_loop.simulation import Run, simulate_many
 from jaxmpc.closed_loop.variations import plant_numbers
 from jaxmpc.files import check_results, fingerprint
 from jaxmpc.pytrees import record

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from jaxmpc.arrays import Reals
-from jaxmpc.closed_loop.robot_problem import robot_mpc
+from jaxmpc.closed_loop.robot_controller import robot_mpc
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot

@@ -11,8 +11,8 @@ import numpy as np
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import Compiled, Part, default_chunk, first_rows, padded, work_off
 from jaxmpc.checks import fail, require_shape
-from jaxmpc.closed_loop.many import simulate_many
 from jaxmpc.closed_loop.robot_controller import RobotController
+from jaxmpc.closed_loop.simulation import simulate_many
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import FeasibleSetMap, label_chunks
 from jaxmpc.feasible.pipeline import Scope

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.closed_loop.outcome import with_limits
-from jaxmpc.closed_loop.run_record import Run
+from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.linear_plant import LinearPlant

@@ -9,10 +9,10 @@ Film                  the same for a notebook, which plays it
 """
 
 from jaxmpc.robots import tasks
-from jaxmpc.robots.film.video import Film, render, save_video
+from jaxmpc.robots.film import Film, render, save_video
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.load import load_robot
-from jaxmpc.robots.robot_model import RobotModel
+from jaxmpc.robots.robot import RobotModel
 
 __all__ = [
     "Film",

@@ -122,7 +122,7 @@ def rest_at(robot: RobotDescription, q: np.ndarray, *, within: bool = False) -> 
     return forces.rest(q, drive, f)
 
 
-# What takes a rest away: the constraints, see `engine.flag`, or "" for limits of forces; in words;
+# What takes a rest away: the constraints, see `mujoco_access.flag`, or "" for limits of forces; in words;
 # and what helps.
 CAUSES = (
     (

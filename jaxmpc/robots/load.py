@@ -1,4 +1,4 @@
-"""load_robot: from a model file to a Robot, its limits read and checked."""
+"""load_robot: from an MJCF or URDF file to a Robot, its limits, names and units read and checked."""
 
 import copy
 import hashlib
@@ -15,20 +15,12 @@ import numpy as np
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_package, require_printable, require_shape
 from jaxmpc.robots.configurations import unit_orientations
-from jaxmpc.robots.engine_comparison import compared
-from jaxmpc.robots.file_limits import (
-    coordinate_names,
-    input_limits,
-    input_unit,
-    named,
-    numeric,
-    overridden,
-    state_limits,
-)
-from jaxmpc.robots.mjx_gaps import lacks, translate
+from jaxmpc.robots.mjx_gaps import compared, lacks, translate
 from jaxmpc.robots.mujoco_access import (
     BALL,
     FREE,
+    HINGE,
+    SLIDE,
     equalities,
     flag,
     model_bytes,
@@ -39,8 +31,8 @@ from jaxmpc.robots.mujoco_access import (
 )
 from jaxmpc.robots.physics import RK4, Physics
 from jaxmpc.robots.robot import Robot
-from jaxmpc.robots.urdf import compiled_urdf
-from jaxmpc.sets.limits import Limit
+from jaxmpc.sets.box import Box
+from jaxmpc.sets.limits import Limit, limit_pair
 from jaxmpc.systems.system import require_period
 
 MODELS = ("joint", "pendulum", "cartpole", "arm2", "arm6", "arm7", "quadrotor")
@@ -290,3 +282,313 @@ def _anchor(host: "mujoco.MjModel", home: np.ndarray) -> tuple[float, ...]:
 def model_hash(robot: Robot) -> str:
     """Return a hash of the compiled model, by which a resumed run notices a change."""
     return hashlib.sha256(model_bytes(robot.mujoco).tobytes()).hexdigest()
+
+
+def numeric(host: "mujoco.MjModel", name: str, default: float) -> np.ndarray | float:
+    """Return the custom numbers of this name in the file."""
+    i = number_of(host, "numeric", name)
+    if i < 0:
+        return default
+    start, size = host.numeric_adr[i], host.numeric_size[i]
+    return host.numeric_data[start : start + size].copy()
+
+
+def named(host: "mujoco.MjModel", kind: str, letter: str) -> list[str]:
+    """Return the names of the joints, actuators, ...; letter and number where there is none."""
+    return [name or f"{letter}{i + 1}" for i, name in enumerate(names(host, kind))]
+
+
+def coordinate_names(host: "mujoco.MjModel") -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names and units of the coordinates, positions first."""
+    positions: list[tuple[str, str]] = []
+    for name, kind in zip(named(host, "joint", "q"), host.jnt_type, strict=True):
+        if kind == FREE:
+            positions += [(f"{name} {axis}", "m") for axis in "xyz"]
+        if kind in (FREE, BALL):
+            positions += [(f"{name} rotation {axis}", "rad") for axis in "xyz"]
+        else:
+            positions.append((name, "m" if kind == SLIDE else "rad"))
+    active = np.flatnonzero(host.actuator_actadr >= 0)
+    inputs = named(host, "actuator", "u")
+    labelled = [
+        *positions,
+        *((f"{name} velocity", f"{unit}/s") for name, unit in positions),
+        *((f"{inputs[i]} activation", "") for i in active),
+    ]
+    return tuple(name for name, _ in labelled), tuple(unit for _, unit in labelled)
+
+
+def input_unit(host: "mujoco.MjModel", i: int) -> str:
+    """Return the unit of an actuator's input: force or torque of a joint's motor, else unknown."""
+    if not _is_motor(host, i) or abs(host.actuator_gainprm[i, 0] * host.actuator_gear[i, 0]) != 1:
+        return ""
+    return "N" if host.jnt_type[host.actuator_trnid[i, 0]] == SLIDE else "N m"
+
+
+def _is_motor(host: "mujoco.MjModel", i: int) -> bool:
+    """Return whether an actuator puts a multiple of its input on one hinge or slide joint."""
+    return (
+        host.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
+        and host.jnt_type[host.actuator_trnid[i, 0]] in (SLIDE, HINGE)
+        and host.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
+        and host.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
+    )
+
+
+def input_limits(host: "mujoco.MjModel") -> tuple[Box, list[str]]:
+    """Return the box of inputs and the source of each, and drop in `host` the motors' force limits
+    that it takes over."""
+    lower, upper = np.full(host.nu, -np.inf), np.full(host.nu, np.inf)
+    limited = host.actuator_ctrllimited.astype(bool)
+    lower[limited], upper[limited] = host.actuator_ctrlrange[limited].T
+    sources = ["ctrlrange" if yes else "" for yes in limited]
+    on_joint = host.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    joints = np.where(on_joint, host.actuator_trnid[:, 0], -1)
+    for i in range(host.nu):
+        gain, gear = host.actuator_gainprm[i, 0], host.actuator_gear[i, 0]
+        if not _is_motor(host, i) or gain * gear == 0:
+            continue
+        alone = np.sum(joints == joints[i]) == 1
+        ends = {}
+        if host.actuator_forcelimited[i]:
+            ends["forcerange"] = host.actuator_forcerange[i] / gain
+            host.actuator_forcelimited[i] = 0
+        # The limit of a joint bounds what compensates gravity there, too.
+        alone = alone and not host.jnt_actgravcomp[joints[i]]
+        if host.jnt_actfrclimited[joints[i]] and alone:
+            ends["actuatorfrcrange"] = host.jnt_actfrcrange[joints[i]] / (gain * gear)
+            host.jnt_actfrclimited[joints[i]] = 0
+        for source, end in ends.items():
+            if end.min() > lower[i] or end.max() < upper[i]:
+                sources[i] = source
+            lower[i], upper[i] = max(lower[i], end.min()), min(upper[i], end.max())
+    sources = ["none" if not source else f"file, {source}" for source in sources]
+    return Box(lower, upper), sources
+
+
+def state_limits(
+    host: "mujoco.MjModel", position: Limit, velocity: Limit, of_file: dict[str, float]
+) -> tuple[Box, list[str]]:
+    """Return the limits of the coordinates ξ (joint ranges, velocities and ranges of activations),
+    and the source of each."""
+    nv, size = host.nv, 2 * host.nv + host.na
+    lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
+    sources = ["none"] * size
+    names = named(host, "joint", "q")
+    for j in range(host.njnt):
+        dof = host.jnt_dofadr[j]
+        if host.jnt_limited[j] and host.jnt_type[j] in (SLIDE, HINGE):
+            lower[dof], upper[dof] = host.jnt_range[j]
+            sources[dof] = "file, range"
+        speed = of_file.get(names[j], np.inf)
+        lower[nv + dof], upper[nv + dof] = -speed, speed
+        if np.isfinite(speed):
+            sources[nv + dof] = "file, velocity"
+    speeds = np.atleast_1d(numeric(host, "velocity_limit", np.inf))
+    if speeds.size not in (1, nv):
+        fail("velocity_limit", f"{speeds.size} numbers in the file, {nv} dofs", "Give one a dof")
+    speeds = np.broadcast_to(speeds, nv)
+    rates = slice(nv, 2 * nv)
+    for dof in np.flatnonzero(speeds < upper[rates]):
+        sources[nv + dof] = "file, velocity_limit"
+    lower[rates], upper[rates] = np.maximum(lower[rates], -speeds), np.minimum(upper[rates], speeds)
+    for k in np.flatnonzero(host.actuator_actlimited & (host.actuator_actadr >= 0)):
+        at = 2 * nv + host.actuator_actadr[k]
+        lower[at], upper[at] = host.actuator_actrange[k]
+        sources[at] = "file, actrange"
+    limits = overridden("position", Box(lower, upper), position, slice(0, nv))
+    limits = overridden("velocity", limits, velocity, rates)
+    for given, part in ((position, slice(0, nv)), (velocity, rates)):
+        sources[part] = sources[part] if given is None else ["argument"] * nv
+    slow, fast = np.asarray(limits.lower)[rates], np.asarray(limits.upper)[rates]
+    if np.any((slow > 0) | (fast < 0)):
+        i = int(np.argmax((slow > 0) | (fast < 0)))
+        cure = "Give (lower, upper) with 0 inside, or one number v for |.| ≤ v"
+        fail("velocity", f"[{slow[i]:g}, {fast[i]:g}] of dof {i} leaves out rest", cure)
+    return limits, sources
+
+
+def overridden(argument: str, limits: Box, override: Limit, part: slice) -> Box:
+    """Return the box with some of its bounds replaced; raise ValueError where it is empty."""
+    lower, upper = np.array(limits.lower), np.array(limits.upper)
+    if override is not None:
+        size = len(lower[part])
+        for ends, end in zip((lower, upper), limit_pair(argument, override), strict=True):
+            if np.shape(end) not in ((), (size,)):
+                fail(argument, f"{np.size(end)} entries where {size} are needed", "Or one number")
+            ends[part] = end
+    Box(lower[part], upper[part]).validate(argument)
+    return Box(lower, upper)
+
+
+# A mended inertia keeps a + b ≥ c with this much room, relative to c: rounding in MuJoCo's own
+# eigenvalues must not refuse it again.
+_ROOM = 1e-9
+# Mass of a moving link that has none, of the robot's: a ball of water of that mass.
+_SHARE = 1e-4
+_WATER = 1000.0
+# Entries of an inertia in a URDF, those of the upper triangle row by row.
+_AXES = ("xx", "xy", "xz", "yy", "yz", "zz")
+
+
+class CompiledURDF(NamedTuple):
+    """The compiled model of a URDF, the velocity limit of each joint, and what was mended."""
+
+    model: "mujoco.MjModel"
+    velocities: dict[str, float]
+    mended: tuple[str, ...]
+
+
+def compiled_urdf(text: str, *, floating_base: bool, mend_inertias: bool) -> CompiledURDF:
+    """Return a URDF, compiled.
+
+    Visual and collision geometry is left out, so that no mesh is looked for. Each hinge and slide
+    joint gets a motor, as a URDF cannot have any.
+    """
+    root = ElementTree.fromstring(text)
+    for link in root.iter("link"):
+        for kind in ("visual", "collision"):
+            for element in link.findall(kind):
+                link.remove(element)
+        inertial = link.find("inertial")
+        # A frame: MuJoCo refuses it, and it weighs nothing.
+        if inertial is not None and _mass(link) == 0 and not np.any(_inertia(inertial)):
+            link.remove(inertial)
+    if floating_base:
+        _free(root)
+    changes = _mended(root) if mend_inertias else ()  # the freed root link counts as moving
+    limits = ((joint.get("name"), joint.find("limit")) for joint in root.iter("joint"))
+    velocities = {
+        str(name): float(limit.get("velocity", "inf")) or np.inf
+        for name, limit in limits
+        if limit is not None
+    }
+    try:
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+        _add_motors(spec)
+        return CompiledURDF(spec.compile(), velocities, changes)
+    except ValueError as error:
+        if "inertia" in str(error) and not mend_inertias:
+            problem = " ".join(str(error).split())
+            cure = "Mend the file, or load it with mend_inertias=True"
+            fail("model", f"has an inertia that no body can have: {problem}", cure)
+        raise
+
+
+def _root_link(root: ElementTree.Element) -> str:
+    """Return the name of the link that is no joint's child."""
+    children = {child.get("link") for child in root.findall("joint/child")}
+    names = [str(link.get("name")) for link in root.findall("link")]
+    roots = [name for name in names if name not in children]
+    if len(roots) != 1:
+        fail("model", f"has {len(roots)} root links", "Give a URDF of one tree")
+    return roots[0]
+
+
+def _free(root: ElementTree.Element) -> None:
+    """Put a joint of type floating, which MuJoCo reads as a free joint, before the root link."""
+    base = _root_link(root)
+    if base == "world":
+        problem = "the root link of the file is the world, to which it is mounted"
+        fail("floating_base", problem, "Leave the argument out")
+    ElementTree.SubElement(root, "link", name="world")
+    joint = ElementTree.SubElement(root, "joint", name="base", type="floating")
+    ElementTree.SubElement(joint, "parent", link="world")
+    ElementTree.SubElement(joint, "child", link=base)
+
+
+def _mass(link: ElementTree.Element) -> float:
+    mass = link.find("inertial/mass")
+    return 0.0 if mass is None else float(mass.get("value", "0"))
+
+
+def _inertia(inertial: ElementTree.Element) -> np.ndarray:
+    """Return the inertia (3, 3) about the centre of mass, zeros where there is none."""
+    element = inertial.find("inertia")
+    if element is None:
+        return np.zeros((3, 3))
+    inertia = np.zeros((3, 3))
+    inertia[np.triu_indices(3)] = [float(element.get(f"i{axes}", "0")) for axes in _AXES]
+    return inertia + np.triu(inertia, 1).T
+
+
+def _ball(mass: float) -> float:
+    """Return the inertia of a ball of water of this mass, 2/5 m r²."""
+    return 0.4 * mass * (3 * mass / (4 * np.pi * _WATER)) ** (2 / 3)
+
+
+def _mended(root: ElementTree.Element) -> tuple[str, ...]:
+    """Give each link an inertia that a body can have, and return what was changed.
+
+    The principal moments a ≤ b ≤ c of a body are positive and satisfy a + b ≥ c. Moments that are
+    not positive, to a millionth, become those of a ball of water of the link's mass; where then
+    a + b < c the moments become the nearest ones with a + b = c (all three move by a third of what
+    is missing). Fixed links without inertia stay, as MuJoCo takes them for point masses.
+    A link that moves without mass, its fixed parts counted in, gets a ball of 1e-4 of the mass of
+    the robot.
+    """
+    changes = []
+    total = sum(_mass(link) for link in root.findall("link"))
+    ends = [
+        (joint.get("type"), parent.get("link"), child.get("link"))
+        for joint in root.findall("joint")
+        for parent, child in zip(joint.findall("parent"), joint.findall("child"), strict=True)
+    ]
+    moving = {child for kind, _, child in ends if kind != "fixed"}
+    for link in root.findall("link"):
+        inertial, mass = link.find("inertial"), _mass(link)
+        if inertial is None or not mass > 0:
+            continue
+        ball = max(_ball(mass), 1e-12)
+        given, axes = np.linalg.eigh(_inertia(inertial))
+        if not np.any(given) and link.get("name") not in moving:
+            continue  # a point mass, which MuJoCo takes
+        moments = np.where(given > 1e-6 * ball, given, ball)
+        order = np.argsort(moments)
+        a, b, c = moments[order]
+        if np.any(moments != given) or c > a + b:
+            missing = max(0.0, (c - a - b) / 3 + _ROOM * c)
+            moments[order] = a + missing, b + missing, c - missing
+            _write(inertial, mass, (axes * moments) @ axes.T)
+            changes.append(
+                f"{link.get('name')}: principal moments {_numbers(given)} to {_numbers(moments)}"
+            )
+    links = {link.get("name"): link for link in root.findall("link")}
+
+    def weight(name: str | None) -> float:
+        fixed = (child for kind, parent, child in ends if kind == "fixed" and parent == name)
+        return _mass(links[name]) + sum(map(weight, fixed))
+
+    for kind, _, child in ends:
+        if kind == "fixed" or weight(child) > 0:
+            continue
+        link, mass = links[child], _SHARE * total
+        for inertial in link.findall("inertial"):
+            link.remove(inertial)
+        _write(ElementTree.SubElement(link, "inertial"), mass, _ball(mass) * np.eye(3))
+        changes.append(f"{child}: no mass to a ball of {mass:.3g} kg")
+    return tuple(changes)
+
+
+def _write(inertial: ElementTree.Element, mass: float, inertia: np.ndarray) -> None:
+    for tag in ("mass", "inertia"):
+        for element in inertial.findall(tag):
+            inertial.remove(element)
+    ElementTree.SubElement(inertial, "mass", value=repr(float(mass)))
+    moments = zip(_AXES, inertia[np.triu_indices(3)], strict=True)
+    values = {f"i{axes}": repr(float(value)) for axes, value in moments}
+    ElementTree.SubElement(inertial, "inertia", values)
+
+
+def _numbers(values: np.ndarray) -> str:
+    return "(" + ", ".join(f"{v:.3g}" for v in values) + ")"
+
+
+def _add_motors(spec: "mujoco.MjSpec") -> None:
+    """Add a motor to each hinge and slide joint."""
+    single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    for joint in spec.joints:
+        if joint.type in single:
+            motor = spec.add_actuator(name=f"{joint.name} torque", target=joint.name)
+            motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
+            motor.set_to_motor()

@@ -1,4 +1,4 @@
-"""A robot of MuJoCo as a plant: one control period forward, and its affine model.
+"""A robot of MuJoCo as a plant: one control period forward, and its affine models.
 
 A file gives two models. The plant is the model as written, except that the force limits of motors
 become `input_limits`. The predictor is the same without constraint rows (joint limits, contacts,
@@ -9,7 +9,8 @@ derivative is wrong at the bound, where MPC often operates: the controller has t
 """
 
 import warnings
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import field, replace
 from typing import Any
 
 import jax
@@ -19,11 +20,12 @@ from jax import Array
 
 from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.pytrees import pytree
+from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_modes import own_modes, varying
+from jaxmpc.qp.linalg import eigh
 from jaxmpc.qp.precision import matmul
 from jaxmpc.robots.configurations import difference, quaternions, retract
-from jaxmpc.robots.description import RobotDescription
+from jaxmpc.robots.description import RobotDescription, RobotReport, report_of
 from jaxmpc.robots.equilibria import (
     inverse_actuation,
     lacking,
@@ -33,8 +35,6 @@ from jaxmpc.robots.equilibria import (
     settled,
 )
 from jaxmpc.robots.mujoco_access import number_of
-from jaxmpc.robots.payload import with_payload
-from jaxmpc.robots.report import RobotReport, report_of
 from jaxmpc.systems.system import LinearSystem
 
 
@@ -277,3 +277,80 @@ class Robot(RobotDescription):
 _stepped = jax.jit(own_modes(Robot._step))
 _linearized = jax.jit(own_modes(Robot._linearize), static_argnames="exact")
 _differentiated = jax.jit(own_modes(Robot._transition))
+
+
+@pytree
+class RobotModel:
+    """The predictor of a robot (no contacts, no joint limits) in the coordinates ξ.
+
+    numbers: fields of mjx.Model in place of the file's, as in `Robot.vary` (masses, damping), with
+    respect to which plans can be differentiated. exact: see `Robot.linearize`; sequential quadratic
+    programming needs it.
+    """
+
+    robot: Robot
+    numbers: dict[str, Any] = field(default_factory=dict)
+    exact: bool = static(default=True)
+
+    def step(self, xi: Array, u: Array) -> Array:
+        """Return ξ (n,) one control period later."""
+        robot = self.robot
+        advance = lambda x, _: (robot.predictor.step(x, u, self.numbers), None)
+        return robot.coordinates(jax.lax.scan(advance, robot.state(xi), length=robot.substeps)[0])
+
+    def linearize(self, xi: Array, u: Array) -> LinearSystem:
+        """Return the affine model about ξ, u."""
+        state = self.robot.state(xi)
+        return self.robot.linearize(state, u, exact=self.exact, numbers=self.numbers)
+
+    def view(self, xi: Array, u: Array) -> Any:
+        """Return mjx.Data at ξ under u: qpos, qvel, act, ctrl, the poses and velocities of bodies,
+        geoms and sites, the forces of actuators and springs."""
+        robot = self.robot
+        x = jnp.asarray(robot.state(xi))
+        return robot.predictor.data(x, u, self.numbers)
+
+
+def with_payload(
+    model: Any, varied: Mapping[str, Any], site: int, payload: Any
+) -> dict[str, Array]:
+    """Return the fields of mjx.Model that a point mass (kg) at a site changes: parallel axes about
+    the new centre (Steiner), then principal axes. varied: fields in place of the model's."""
+    i, at = int(model.site_bodyid[site]), jnp.asarray(model.site_pos[site])
+    of = lambda key: jnp.asarray(varied.get(key, getattr(model, key)))
+    mass, centre = of("body_mass")[i], of("body_ipos")[i]
+    total = mass + payload
+    middle = (mass * centre + payload * at) / total
+    w, v = of("body_iquat")[i, 0], of("body_iquat")[i, 1:]
+    turn = jnp.eye(3) + 2 * w * _cross(v) + 2 * matmul(_cross(v), _cross(v))
+    inertia = matmul(turn * of("body_inertia")[i], turn.T)
+    for m, place in ((mass, centre), (payload, at)):
+        inertia = inertia + m * matmul(_cross(place - middle).T, _cross(place - middle))
+    principal, axes = eigh(inertia)
+    axes = axes * jnp.sign(jnp.linalg.det(axes))
+    new = {
+        "body_mass": total,
+        "body_ipos": middle,
+        "body_inertia": principal,
+        "body_iquat": _quaternion(axes),
+    }
+    return {key: of(key).at[i].set(value) for key, value in new.items()}
+
+
+def _cross(a: Array) -> Array:
+    """Return the matrix of b → a × b."""
+    return jnp.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
+
+
+def _quaternion(R: Array) -> Array:
+    """Return the unit quaternion (w first) of a rotation matrix: the eigenvector of Bar-Itzhack's K
+    (2000, J. Guidance 23, eq. 6) with the largest eigenvalue, right for every rotation."""
+    x, y, z = R[:, 0], R[:, 1], R[:, 2]
+    K = jnp.array([
+        [x[0] - y[1] - z[2], y[0] + x[1], z[0] + x[2], y[2] - z[1]],
+        [y[0] + x[1], y[1] - x[0] - z[2], z[1] + y[2], z[0] - x[2]],
+        [z[0] + x[2], z[1] + y[2], z[2] - x[0] - y[1], x[1] - y[0]],
+        [y[2] - z[1], z[0] - x[2], x[1] - y[0], x[0] + y[1] + z[2]],
+    ])  # fmt: skip
+    q = eigh(K / 3)[1][:, -1]
+    return jnp.array([q[3], q[0], q[1], q[2]])

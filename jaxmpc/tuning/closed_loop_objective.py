@@ -13,8 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from jaxmpc.batches import Devices, device_bytes, program_bytes
 from jaxmpc.checks import fail
-from jaxmpc.closed_loop.many import Each, simulate_each
-from jaxmpc.closed_loop.simulation import Conditions
+from jaxmpc.closed_loop.simulation import Conditions, Each, simulate_each
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record

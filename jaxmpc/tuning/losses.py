@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.checks import fail, require_symmetric_psd
-from jaxmpc.closed_loop.run_record import Run
+from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.pytrees import record
 from jaxmpc.qp.precision import matmul
 from jaxmpc.sets import violations

@@ -15,11 +15,9 @@ import numpy as np
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail
-from jaxmpc.closed_loop.many import simulate_many
 from jaxmpc.closed_loop.outcome import evaluate_runs
-from jaxmpc.closed_loop.robot_controller import RobotController
-from jaxmpc.closed_loop.robot_problem import robot_references
-from jaxmpc.closed_loop.run_record import Run
+from jaxmpc.closed_loop.robot_controller import RobotController, robot_references
+from jaxmpc.closed_loop.simulation import Run, simulate_many
 from jaxmpc.closed_loop.variations import plant_numbers
 from jaxmpc.mpc.condense import prestabilising_gain
 from jaxmpc.mpc.controller import Controller

@@ -12,8 +12,7 @@ import optax
 from jaxmpc.arrays import Reals
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, whole
-from jaxmpc.closed_loop.many import require_variations
-from jaxmpc.closed_loop.run_record import Run
+from jaxmpc.closed_loop.simulation import Run, require_variations
 from jaxmpc.files import fingerprint
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.softening import harden

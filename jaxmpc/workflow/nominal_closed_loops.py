@@ -3,8 +3,7 @@
 import jax
 import numpy as np
 
-from jaxmpc.closed_loop.run_record import Run, lyapunov_decrease
-from jaxmpc.closed_loop.simulation import simulate
+from jaxmpc.closed_loop.simulation import Run, lyapunov_decrease, simulate
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC

@@ -26,8 +26,7 @@ from jaxmpc.closed_loop import stored_runs
 from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.closed_loop.variations import draw_robots
 from jaxmpc.qp.status import Status
-from jaxmpc.robots.film.captions import exceeded_limits
-from jaxmpc.robots.film.video import Film, render, save_video
+from jaxmpc.robots.film import Film, exceeded_limits, render, save_video
 from jaxmpc.robots.load import load_robot
 
 # Models at the set-point compile in half the time.
@@ -323,7 +322,7 @@ choose_renderer()
 import jaxmpc as jm
 from jaxmpc.closed_loop.outcome import evaluate_runs
 from jaxmpc.robots.load import load_robot
-from jaxmpc.robots.film.video import render, save_video
+from jaxmpc.robots.film import render, save_video
 q = np.linspace(0, 1.2, 9)
 states = np.zeros((3, 9, 2))
 states[0, :, 0], states[1, :, 0] = q, -q

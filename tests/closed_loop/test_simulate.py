@@ -10,8 +10,7 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.closed_loop.run_record import Run, lyapunov_decrease
-from jaxmpc.closed_loop.simulation import simulate
+from jaxmpc.closed_loop.simulation import Run, lyapunov_decrease, simulate
 from jaxmpc.mpc.problem import Soft
 
 # Compiles quickly.

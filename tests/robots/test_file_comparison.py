@@ -421,7 +421,7 @@ def test_versions_are_compared(monkeypatch):
 
 def test_equal_models_are_compared_once(monkeypatch):
     jm.load_robot("pendulum")
-    monkeypatch.setattr("jaxmpc.robots.engine_comparison._unlike", None)
+    monkeypatch.setattr("jaxmpc.robots.mjx_gaps._unlike", None)
     jm.load_robot("pendulum", position=1.0)
     with pytest.raises(TypeError):
         jm.load_robot("pendulum", timestep=0.0005, control_period=0.01)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.robots.film.video import _camera
+from jaxmpc.robots.film import _camera
 
 URDF = """<?xml version="1.0"?>
 <!-- <mujoco> in a comment -->

@@ -10,7 +10,7 @@ import pytest
 from problems import symmetric
 
 import jaxmpc as jm
-from jaxmpc.closed_loop.run_record import Run
+from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.tuning import weights
 from jaxmpc.tuning.closed_loop_objective import operations
 from jaxmpc.tuning.losses import ClosedLoopLoss

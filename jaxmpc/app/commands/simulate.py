@@ -32,11 +32,10 @@ from jaxmpc.app.commands.simulate_film import choose_renderer, film
 from jaxmpc.app.config import load_robot_config
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, require_disk, require_memory, require_package
-from jaxmpc.closed_loop.linear_feedback import LinearFeedback
-from jaxmpc.closed_loop.robot_controller import RobotController
-from jaxmpc.closed_loop.robot_problem import robot_mpc, robot_references
-from jaxmpc.closed_loop.run_record import Run
-from jaxmpc.closed_loop.runs_summary import summarise_runs
+from jaxmpc.closed_loop.feedback import LinearFeedback
+from jaxmpc.closed_loop.outcome import summarise_runs
+from jaxmpc.closed_loop.robot_controller import RobotController, robot_mpc, robot_references
+from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.closed_loop.stored_runs import simulate_into
 from jaxmpc.closed_loop.variations import draw_robots
 from jaxmpc.files import as_json, check_results, open_folder, remove_files, write_json

@@ -8,8 +8,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxmpc.closed_loop.run_record import Run
-from jaxmpc.robots.film.video import render, save_video
+from jaxmpc.closed_loop.simulation import Run
+from jaxmpc.robots.film import render, save_video
 from jaxmpc.robots.robot import Robot
 
 # Seconds between frames.

@@ -12,8 +12,7 @@ from jaxmpc.app import config as configs
 from jaxmpc.app.commands.options import arguments, given_options, require_lengths
 from jaxmpc.app.commands.weight_options import WeightOptions
 from jaxmpc.checks import MOST_COUNT, fail, require_memory
-from jaxmpc.closed_loop.robot_controller import RobotController
-from jaxmpc.closed_loop.robot_problem import robot_mpc, robot_references
+from jaxmpc.closed_loop.robot_controller import RobotController, robot_mpc, robot_references
 from jaxmpc.closed_loop.variations import draw_robots
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from jaxmpc.app.plots.style import EDGE, INFEASIBLE, NOT_SOLVED, OUTER, TERMINAL, patch
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.outcome import with_limits
-from jaxmpc.closed_loop.run_record import Run
+from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sets import violations

@@ -15,7 +15,7 @@ from jaxmpc.app.plots.closed_loops import draw_limits, panel_grid
 from jaxmpc.app.plots.style import INFEASIBLE, TERMINAL, ring
 from jaxmpc.checks import fail
 from jaxmpc.closed_loop.outcome import coordinates
-from jaxmpc.closed_loop.run_record import Run
+from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.tuning.descent import Descent
 from jaxmpc.tuning.result import TuningRun

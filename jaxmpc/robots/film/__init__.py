@@ -1,1 +1,0 @@
-"""Videos of robots in motion, with captions."""
