@@ -1,4 +1,4 @@
-"""Noise of a plant and of its measurements, and the Kalman filter that estimates the state in spite of it."""
+"""Noise of a plant and of its measurements, and the Kalman filter that estimates the state."""
 
 from dataclasses import replace
 from typing import Any, NamedTuple

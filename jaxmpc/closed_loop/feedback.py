@@ -1,4 +1,4 @@
-"""What a closed loop needs of a controller and of a plant, and the simplest controller: LinearFeedback."""
+"""What a closed loop needs of a plant and of a controller; LinearFeedback, the simplest one."""
 
 from typing import Any, NamedTuple, Protocol
 

@@ -1,4 +1,5 @@
-"""What closed loops come to: limits kept, target reached, settling time and cost, and the summary of many runs."""
+"""The outcome of closed loops: limits kept, target reached, settling time, cost; a summary of many
+runs."""
 
 from dataclasses import asdict
 from typing import Any

@@ -1,4 +1,5 @@
-"""MPC of robots: robot_mpc, the problem with the limits of a model, and RobotController, which solves it by linear models."""
+"""MPC of robots: robot_mpc makes the problem from a model and its limits, RobotController solves it
+by linear models."""
 
 import warnings
 from dataclasses import field, replace

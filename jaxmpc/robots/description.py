@@ -1,4 +1,4 @@
-"""What is known of a robot: its two models, limits, names, sizes and coordinates, and the account of it."""
+"""What is known of a robot: its two models, limits, names, sizes and coordinates; and a report."""
 
 from collections import Counter
 from dataclasses import field

@@ -122,8 +122,8 @@ def rest_at(robot: RobotDescription, q: np.ndarray, *, within: bool = False) -> 
     return forces.rest(q, drive, f)
 
 
-# What takes a rest away: the constraints, see `mujoco_access.flag`, or "" for limits of forces; in words;
-# and what helps.
+# What takes a rest away: the constraints, see `mujoco_access.flag`, or "" for limits of forces; in
+# words; and what helps.
 CAUSES = (
     (
         "",

@@ -1,4 +1,4 @@
-"""load_robot: from an MJCF or URDF file to a Robot, its limits, names and units read and checked."""
+"""load_robot: from an MJCF or URDF file to a Robot, its limits and names read and checked."""
 
 import copy
 import hashlib
