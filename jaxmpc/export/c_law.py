@@ -8,7 +8,7 @@ mostly, and the code checks their facets: so its answer "inside" does not rest o
 """
 
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -72,7 +72,8 @@ class SearchTree(NamedTuple):
         children: list[list[int]] = []
         leaves: list[int] = []
         depth = 0
-        waiting = [(np.arange(len(vertices)), -1, 0, 0)]  # regions, parent, which child, depth
+        # Regions, parent, which child, depth.
+        waiting: list[tuple[Any, int, int, int]] = [(np.arange(len(vertices)), -1, 0, 0)]
         while waiting:
             here, parent, child, deep = waiting.pop()
             node, depth = len(plane), max(depth, deep)

@@ -85,7 +85,7 @@ def hull_volume(points: Reals, *, thin: bool = False) -> float:
     # qhull works best in coordinates of like size.
     if thin:
         _, scale, axes = np.linalg.svd(points - center, full_matrices=False)
-        points, center = (points - center) @ axes.T, 0.0
+        points, center = (points - center) @ axes.T, np.zeros_like(center)
     else:
         scale = np.ptp(points, axis=0)
     if not scale.all():
