@@ -10,22 +10,26 @@ HiGHS' word is taken for an optimum alone, whose multipliers bound it whatever H
 A number counts as zero if it is within the rounding of the terms that it is the sum of.
 """
 
+import threading
 from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
+import highspy
 import numpy as np
-from scipy.optimize import linprog
+from scipy.sparse import csc_array
 
 from jaxmpc.checks import fail
 
-# Tolerances of HiGHS, in rows and columns that are scaled to about 1. Its presolve calls some
-# unbounded programs infeasible and needs scaling of its own, so it is off.
+# Options of HiGHS: tolerances in rows and columns that are scaled to about 1. Its presolve calls
+# some unbounded programs infeasible and needs scaling of its own, so it is off.
 HIGHS = {
+    "output_flag": False,
+    "presolve": "off",
     "primal_feasibility_tolerance": 1e-10,
     "dual_feasibility_tolerance": 1e-10,
-    "presolve": False,
 }
+METHODS = "simplex", "ipm"
 # A set is flat if its rows keep no larger common margin, relative to its own size.
 FLAT = 1e-9
 # A sum within this of the sum of its terms' sizes is rounding: well above 2^-53, since the data are
@@ -59,7 +63,7 @@ class Program:
         self.M, self.b = self.row[:, None] * self.G * self.column, self.row * self.g
 
     def maximise(self, d: np.ndarray) -> Optimum:
-        """Maximise d'x: the dual simplex, then the interior point, then the dual program.
+        """Maximise d'x: the simplex, then the interior point, then the dual program.
 
         The multipliers y obey G'y = d and g'y = value up to rounding, and y >= 0 but for
         equalities. Raises ValueError where HiGHS finds neither an optimum nor a vector that shows
@@ -70,12 +74,12 @@ class Program:
         length = np.abs(cost).max(initial=0.0) or 1.0
         cost = cost / length
         checked = False
-        for method in ("highs-ds", "highs-ipm", "dual", "none"):
+        for method in (*METHODS, "dual", "none"):
             found, claim = None, True
             if method == "dual":
                 found = self._by_dual(cost)
             elif method != "none":
-                found, claim = solve(cost, self.M, self.b, self.equal, method)
+                found, claim = self._model.maximise(cost, method)
             if found is not None:
                 x, y = self._exact(cost, *found)
                 left = np.abs(self.M.T @ y - cost).max(initial=0.0)
@@ -92,6 +96,10 @@ class Program:
                     return Optimum(np.inf)
         fail("LP", "HiGHS finds no answer that can be checked", "Scale the rows to like size")
 
+    @cached_property
+    def _model(self) -> "Model":
+        return Model(self.M, self.b, self.equal)
+
     def bound(self, d: np.ndarray, best: Optimum, extent: np.ndarray) -> float:
         """Return an upper bound of d'x over the set within |x| <= extent, from the multipliers of
         an optimum found for d; the optimum's value, which is infinite, where it has none."""
@@ -102,7 +110,7 @@ class Program:
         free = np.eye(len(self.b))[~self.equal]
         rows = np.vstack([self.M.T, -free])
         limits = np.append(cost, np.zeros(len(free)))
-        found, _ = solve(-self.b, rows, limits, np.arange(len(rows)) < len(cost), "highs-ds")
+        found, _ = Model(rows, limits, np.arange(len(rows)) < len(cost)).maximise(-self.b)
         if found is None:
             return None
         y, x = found
@@ -132,8 +140,9 @@ class Program:
         M = np.vstack([self.M, -self.M[self.equal], np.zeros((1, self.M.shape[1]))])
         b = np.concatenate([self.b, -self.b[self.equal], [1.0]])
         M = np.column_stack([M, -np.ones(len(M))])
-        for method in ("highs-ds", "highs-ipm"):
-            found, _ = solve(-np.eye(M.shape[1])[-1], M, b, np.zeros(len(b), bool), method)
+        model = Model(M, b, np.zeros(len(b), bool))
+        for method in METHODS:
+            found, _ = model.maximise(-np.eye(M.shape[1])[-1], method)
             if found is not None:
                 x, y, count = found[0][:-1], found[1].copy(), len(self.b)
                 y[:count][self.equal] -= y[count:-1]
@@ -169,8 +178,9 @@ class Program:
         box = np.vstack([self.M, np.eye(n), -np.eye(n)])
         limits = np.append(np.zeros(len(self.b)), np.ones(2 * n))
         equal = np.append(self.equal, np.zeros(2 * n, bool))
-        for method in ("highs-ds", "highs-ipm"):
-            found, _ = solve(cost, box, limits, equal, method)
+        model = Model(box, limits, equal)
+        for method in METHODS:
+            found, _ = model.maximise(cost, method)
             if found is None:
                 continue
             r = np.where(np.abs(found[0]) < 1e-12, 0.0, found[0])
@@ -203,8 +213,8 @@ class Program:
         M = np.hstack([np.vstack([self.M, np.zeros((1, self.M.shape[1]))]), ball])
         b, equal = np.append(self.b, 1.0), np.append(self.equal, False)
         free = np.arange(len(b)) < len(self.b)
-        for method, part in (("highs-ds", free), ("highs-ds", free | True), ("highs-ipm", free)):
-            found, _ = solve(np.eye(M.shape[1])[-1], M[part], b[part], equal[part], method)
+        for method, part in (("simplex", free), ("simplex", free | True), ("ipm", free)):
+            found, _ = Model(M[part], b[part], equal[part]).maximise(np.eye(M.shape[1])[-1], method)
             if found is not None:
                 x, y = found[0][:-1], found[1][: len(self.b)]
                 slack = np.append((self.b - self.M @ x)[~self.equal], found[0][-1])
@@ -212,20 +222,54 @@ class Program:
         return np.zeros(self.G.shape[1]), -np.inf, np.zeros(len(self.g))
 
 
-def solve(
-    cost: np.ndarray, M: np.ndarray, b: np.ndarray, equal: np.ndarray, method: str
-) -> tuple[tuple[np.ndarray, np.ndarray] | None, bool]:
-    """Return (x, y) of max cost'x over M x <= b, with equality where `equal`, or None where HiGHS
-    does not call it optimal; and whether it claims that there is no optimum. The data must be
-    scaled. On ill-conditioned data HiGHS may cycle: its steps are limited."""
-    options = {**HIGHS, "maxiter": 1000 + 20 * sum(M.shape)}
-    sides = {"A_ub": M[~equal], "b_ub": b[~equal], "A_eq": M[equal], "b_eq": b[equal]}
-    result = linprog(-cost, **sides, bounds=(None, None), method=method, options=options)
-    if result.status != 0:
-        return None, result.status in (2, 3)
-    y = np.zeros(len(b))
-    y[~equal], y[equal] = np.maximum(-result.ineqlin.marginals, 0.0), -result.eqlin.marginals
-    return (result.x, y), False
+class Model:
+    """Programs max cost'x over M x <= b, with equality where `equal`, in HiGHS. The data must be
+    scaled. Each program begins at the basis in which the last one ended."""
+
+    def __init__(self, M: np.ndarray, b: np.ndarray, equal: np.ndarray) -> None:
+        rows, n = M.shape
+        program = highspy.HighsLp()
+        program.num_col_, program.num_row_ = n, rows
+        program.sense_ = highspy.ObjSense.kMaximize
+        program.col_cost_ = np.zeros(n)
+        program.col_lower_, program.col_upper_ = np.full(n, -np.inf), np.full(n, np.inf)
+        program.row_lower_, program.row_upper_ = np.where(equal, b, -np.inf), b
+        matrix, sparse = program.a_matrix_, csc_array(M)
+        matrix.format_ = highspy.MatrixFormat.kColwise
+        matrix.start_, matrix.index_, matrix.value_ = sparse.indptr, sparse.indices, sparse.data
+        self.size, self.equal, self._alone = (rows, n), equal, threading.Lock()
+        self.highs = highspy.Highs()
+        # On ill-conditioned data HiGHS may cycle: its steps are limited.
+        steps = 1000 + 20 * (rows + n)
+        limits = {"simplex_iteration_limit": steps, "ipm_iteration_limit": steps}
+        for name, value in {**HIGHS, **limits}.items():
+            self.highs.setOptionValue(name, value)
+        if self.highs.passModel(program) == highspy.HighsStatus.kError:
+            fail("LP", "holds entries that are not finite", "Give finite rows")
+
+    def maximise(
+        self, cost: np.ndarray, method: str = "simplex"
+    ) -> tuple[tuple[np.ndarray, np.ndarray] | None, bool]:
+        """Return (x, y) of max cost'x, or None where HiGHS does not call it optimal; and whether it
+        claims that there is no optimum. method: simplex, or ipm, the interior point."""
+        rows, n = self.size
+        with self._alone:
+            self.highs.changeColsCost(n, np.arange(n, dtype=np.int32), cost)
+            self.highs.setOptionValue("solver", method)
+            self.highs.run()
+            status, solution = self.highs.getModelStatus(), self.highs.getSolution()
+            x, y = np.array(solution.col_value), np.array(solution.row_dual)
+        if status != highspy.HighsModelStatus.kOptimal:
+            return None, status in NO_OPTIMUM
+        return (x, np.where(self.equal, y, np.maximum(y, 0.0))), False
+
+
+# What HiGHS says where it finds that there is no optimum.
+NO_OPTIMUM = (
+    highspy.HighsModelStatus.kInfeasible,
+    highspy.HighsModelStatus.kUnbounded,
+    highspy.HighsModelStatus.kUnboundedOrInfeasible,
+)
 
 
 def scaling(G: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
