@@ -66,9 +66,8 @@ def print_labels(x: np.ndarray, devices: tuple[jax.Device, ...], rounds: int) ->
         stage = compiled_admm(50, np.dtype(np.float32), devices)
         newton = compiled_newton(gather_size(each), devices)
         here = x[: len(ones)]  # on the host, as the calls below have them
-        first = stage.program(exact, rows, here)
-        found_first = first(exact, rows, here)
-        second = newton.program(exact, rows, here, np.ones(len(here), bool), *found_first)
+        first, second = stage.run, newton.run
+        first(exact, rows, here)
         spent: list[float] = []
 
         def call() -> None:
@@ -107,7 +106,7 @@ def print_plans(x: np.ndarray, devices: tuple[jax.Device, ...], rounds: int) -> 
         controller = jm.Controller(in_float64(mpc), jm.ADMM(dtype="float32"))
         controller = jax.device_put(controller, placement(devices))
         chunks, _ = split(x, devices)
-        program = _plans(devices).program(controller, x[: len(chunks[0])])
+        program = _plans(devices).run
 
         def call() -> None:
             jax.block_until_ready([program(controller, part).status for part in chunks])

@@ -2,10 +2,11 @@
 
 Programs. `Compiled` compiles a function ahead, apart from running it, so that both can be timed.
 
-Devices. The batch axis is divided among the devices of a one-dimensional mesh, all other data are
-whole on each of them. The programs hold no collectives: a device leaves its data-dependent loops
-when its own part is done, and waits for no other. What the parts have in common, such as the mean
-of a loss, is computed on the host (`tuning/batch_mean.py`). Under `jax.distributed` a process can
+Devices. Each has the program of one device, and a thread of its own that runs it on an equal part of
+the batch; all other data are whole on each of them. No partitioner has a part in it, and no
+collective: a device leaves its data-dependent loops when its own part is done, and waits for no
+other. What the parts have in common, such as the mean of a loss, is computed on the host
+(`tuning/batch_mean.py`). Under `jax.distributed` a process can
 read no array that lies on devices of another. So each process calls with states of its own and with
 devices of its own, and has the results of these; no call waits for another process.
 
@@ -13,6 +14,7 @@ Parts. A large batch goes through one program part by part (`each_part`, or anot
 `Part`s), and `work_off` gives each result to a sink: a list, arrays, a store.
 """
 
+import functools
 import os
 import threading
 import time
@@ -38,45 +40,71 @@ R = TypeVar("R")
 class Compiled:
     """A jitted function, compiled ahead once for each shape. `Compiled.seconds`: spent on that
     in this process so far. `Compiled.listeners`: called after each program.
+
+    places: where `jax.device_put` puts each argument on several devices, `placement` whole or as a
+    batch, of which each device gets a part; None for one device.
     """
 
     seconds = 0.0
     listeners: ClassVar[list[Callable[[], None]]] = []
     everyone: ClassVar["weakref.WeakSet[Compiled]"] = weakref.WeakSet()
 
-    def __init__(self, function: Any, places: Any = None) -> None:
+    def __init__(self, function: Any, places: tuple[NamedSharding, ...] | None = None) -> None:
         self.function = function
         self.places = places
-        self.programs: dict[Any, Any] = {}
+        self.programs: dict[Any, list[Any]] = {}
         self._compiles = threading.Lock()
         self.everyone.add(self)
 
     def __call__(self, *args: Any) -> Any:
-        return jax.device_get(self.run(*args))
+        return to_host(self.run(*args))
 
     def run(self, *args: Any) -> Any:
-        """The result, left on the device."""
-        args = self.placed(args)
-        return self.program(*args)(*args)
+        """Return the result, left on the device, or on the devices as a batch."""
+        shares = self.shares(args)
+        programs = self._programs(shares)
+        if len(shares) == 1:
+            return programs[0](*shares[0])
+        # A program with a loop whose end depends on the data keeps its thread until the end.
+        parts = side_by_side(lambda i: programs[i](*shares[i]), range(len(shares)), len(shares))
+        return jax.tree.map(self._assembled, *parts)
 
-    def placed(self, args: tuple) -> tuple:
-        """The arguments where `places`, one sharding of each, says; None leaves it to JAX, which
-        refuses to divide host arrays among devices under `jax.distributed`."""
-        return args if self.places is None else jax.device_put(args, self.places)
+    def shares(self, args: tuple) -> list[tuple]:
+        """Return the arguments that each device gets."""
+        if self.places is None:
+            return [args]
+        mesh: Any = self.places[0].mesh
+        args = jax.device_put(args, self.places)
+        leaves, tree = jax.tree.flatten(args)
+        there = [{part.device: part.data for part in v.addressable_shards} for v in leaves]
+        return [jax.tree.unflatten(tree, [v[d] for v in there]) for d in mesh.devices.flat]
 
     def program(self, *args: Any) -> Any:
-        """The program for arguments of these shapes."""
-        args = self.placed(args)
-        leaves, tree = jax.tree.flatten(args)
+        """Return the program for arguments of these shapes; of several devices, that of the
+        first."""
+        return self._programs(self.shares(args))[0]
+
+    def _programs(self, shares: list[tuple]) -> list[Any]:
+        """Return the program of each device."""
+        leaves, tree = jax.tree.flatten(shares[0])
         key = tree, tuple(jax.typeof(leaf) for leaf in leaves)
         with self._compiles:  # threads that need the same program wait for one of them
             if key not in self.programs:
                 start = time.perf_counter()
-                self.programs[key] = self.function.lower(*args).compile()
+                lowered = [self.function.lower(*share) for share in shares]
+                compiled = side_by_side(lambda each: each.compile(), lowered, len(lowered))
+                self.programs[key] = compiled
                 Compiled.seconds += time.perf_counter() - start
                 for listener in Compiled.listeners:
                     listener()
         return self.programs[key]
+
+    def _assembled(self, *parts: jax.Array) -> jax.Array:
+        """Return the batch that lies in these parts on the devices."""
+        assert self.places is not None
+        shape = sum(map(len, parts)), *parts[0].shape[1:]
+        place = NamedSharding(self.places[0].mesh, PartitionSpec("batch"))
+        return jax.make_array_from_single_device_arrays(shape, place, list(parts))
 
 
 @dataclass
@@ -156,16 +184,6 @@ def chosen_devices(devices: Any, name: str = "devices") -> Devices:
     return chosen
 
 
-def require_partitioner(devices: Devices) -> None:
-    """Raise ValueError where programs of labels cannot be compiled for these devices: on several
-    GPUs XLA's Shardy partitioner crashes in the roll-out of `proofs.py` (JAX 0.11.2, H100)."""
-    if devices is None or len(devices) < 2 or devices[0].platform != "gpu":
-        return
-    if getattr(jax.config, "jax_use_shardy_partitioner", False):
-        what = "maps on several GPUs crash the partitioner that this process uses"
-        fail("devices", what, "Set JAX_USE_SHARDY_PARTITIONER=false in the environment")
-
-
 def count(devices: Devices) -> int:
     """Return the number of devices."""
     return 1 if devices is None else len(devices)
@@ -176,9 +194,9 @@ def divisible(size: int, devices: Devices) -> int:
     return -(-size // count(devices)) * count(devices)
 
 
-def placement(devices: Devices, batched: bool = False) -> NamedSharding | None:
-    """Return where `jax.device_put` puts a batch, a part on each device, or whole data; None is
-    the default device."""
+def placement(devices: Devices, batched: bool = False) -> Any:
+    """Return the NamedSharding by which `jax.device_put` puts a batch, a part on each device, or
+    whole data; None is the default device."""
     if devices is None:
         return None
     spec = PartitionSpec("batch") if batched else PartitionSpec()
@@ -186,24 +204,17 @@ def placement(devices: Devices, batched: bool = False) -> NamedSharding | None:
 
 
 def over_devices(function: Callable, devices: Devices, batched: Sequence[bool]) -> Compiled:
-    """Return the function of a batch as a compiled program over the devices.
+    """Return the function of a batch as a compiled program for each of the devices.
 
     batched: of each argument, a pytree, whether its leaves have the batch axis in front, as all
     leaves of the result must. The size of the batch is a multiple of the number of devices. Each
     device gets an equal part, in order, of arguments on the host directly from there. devices None:
     the program for the default device.
     """
-    function = own_modes(function)
+    program = jax.jit(own_modes(function))
     if devices is None:
-        return Compiled(jax.jit(function))
-    places: Any = tuple(placement(devices, each) for each in batched)
-    out: Any = placement(devices, True)
-    # Each device runs the function as it stands: nothing in it has to be known as replicated.
-    specs = tuple(place.spec for place in places)
-    parts = jax.shard_map(
-        function, mesh=out.mesh, in_specs=specs, out_specs=out.spec, check_vma=False
-    )
-    return Compiled(jax.jit(parts, in_shardings=places, out_shardings=out), places)
+        return Compiled(program)
+    return Compiled(program, tuple(placement(devices, each) for each in batched))
 
 
 # Points a compiled program takes at once on a CPU: a step's data stay within the cache.
@@ -270,6 +281,43 @@ def joined(parts: Sequence[Any]) -> Any:
 
     side_by_side(lambda pair: put(*pair), zip(ends, parts, strict=True), cores())
     return whole
+
+
+# Bytes of an array from which on it goes to the host through pinned memory.
+PINNED = 2**20
+
+
+def to_host(tree: T) -> T:
+    """Return the tree with leaves of NumPy. Large arrays go through pinned memory where the device
+    has it, which an array then keeps: 50 GB/s from an H100, beside 1 to 3 through pageable memory.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    # All copies begin before the first is waited for.
+    begun = [_begin_copy(v) if isinstance(v, jax.Array) else v for v in leaves]
+    return jax.tree.unflatten(structure, [_on_host(v) for v in begun])
+
+
+def _begin_copy(v: jax.Array) -> jax.Array:
+    if v.nbytes >= PINNED and _has_pinned(next(iter(v.sharding.device_set))):
+        return jax.device_put(v, v.sharding.with_memory_kind("pinned_host"))
+    v.copy_to_host_async()
+    return v
+
+
+@functools.cache
+def _has_pinned(device: jax.Device) -> bool:
+    """Return whether the device copies to pinned memory of the host. (Of a CPU all is the host's.)"""
+    kinds = {memory.kind for memory in device.addressable_memories()}
+    return device.platform != "cpu" and "pinned_host" in kinds
+
+
+def _on_host(v: Any) -> np.ndarray:
+    if not isinstance(v, jax.Array) or len(v.sharding.device_set) == 1 or v.nbytes < PINNED:
+        return np.asarray(v)
+    if v.sharding.is_fully_replicated:
+        return np.asarray(v.addressable_shards[0].data)
+    parts = sorted(v.addressable_shards, key=lambda part: part.index[0].start or 0)
+    return joined([np.asarray(part.data) for part in parts])
 
 
 class Part(NamedTuple, Generic[R]):

@@ -33,7 +33,6 @@ from jaxmpc.batches import (
     gather_size,
     padded,
     placement,
-    require_partitioner,
 )
 from jaxmpc.checks import fail, require_step_type
 from jaxmpc.feasible.candidate_search import compiled_admm, compiled_check, compiled_newton
@@ -128,7 +127,6 @@ class Pipeline:
             fail("iterations", f"{iterations}", "Give a count of at least 1")
         require_step_type(dtype)
         self.devices = chosen_devices(devices)
-        require_partitioner(self.devices)
         self.problem, self.scope = problem, scope
         exact = problem.exact(scope.largest, scope.typical)
         self.margins = problem.row_margins(exact, scope.typical)

@@ -43,9 +43,9 @@ class BatchMean:
         return self.compiled.program(*self.divided(args))
 
     def traced(self, *args: Any) -> Any:
-        """Return the jaxpr for arguments of these shapes; nothing compiles, and `program` needs not
-        trace again."""
-        return self.compiled.function.trace(*self.compiled.placed(self.divided(args))).jaxpr
+        """Return the jaxpr of a device for arguments of these shapes; nothing compiles, and
+        `program` needs not trace again."""
+        return self.compiled.function.trace(*self.compiled.shares(self.divided(args))[0]).jaxpr
 
     def divided(self, args: tuple) -> tuple:
         """Return the arguments with a batch that the devices can share equally: the first instance
