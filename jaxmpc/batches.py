@@ -2,8 +2,8 @@
 
 Programs. `Compiled` compiles a function ahead, apart from running it, so that both can be timed.
 
-Devices. Each has the program of one device, and a thread of its own that runs it on an equal part of
-the batch; all other data are whole on each of them. No partitioner has a part in it, and no
+Devices. Each has the program of one device, and a thread of its own that runs it on an equal part
+of the batch; all other data are whole on each of them. No partitioner has a part in it, and no
 collective: a device leaves its data-dependent loops when its own part is done, and waits for no
 other. What the parts have in common, such as the mean of a loss, is computed on the host
 (`tuning/batch_mean.py`). Under `jax.distributed` a process can
@@ -306,7 +306,7 @@ def _begin_copy(v: jax.Array) -> jax.Array:
 
 @functools.cache
 def _has_pinned(device: jax.Device) -> bool:
-    """Return whether the device copies to pinned memory of the host. (Of a CPU all is the host's.)"""
+    """Return whether the device copies to pinned memory of the host; a CPU needs none."""
     kinds = {memory.kind for memory in device.addressable_memories()}
     return device.platform != "cpu" and "pinned_host" in kinds
 

@@ -79,7 +79,7 @@ class SearchTree(NamedTuple):
             node, depth = len(plane), max(depth, deep)
             if parent >= 0:
                 children[parent][child] = node
-            own = np.unique(
+            own: np.ndarray = np.unique(
                 np.concatenate([facets.plane[facets.begin[i] : facets.begin[i + 1]] for i in here])
             )
             larger = np.maximum(below[here][:, own].sum(axis=0), above[here][:, own].sum(axis=0))
