@@ -22,7 +22,8 @@ from bench.roofline import best_seconds
 import jaxmpc as jm
 from jaxmpc.qp.admm import scaled
 from jaxmpc.qp.admm_kernel import iterate_batch
-from jaxmpc.qp.triton import ROUGH, on_gpu
+from jaxmpc.qp.transformations import on_gpu
+from jaxmpc.qp.triton import ROUGH
 
 PLANS = [("joint", 2**20), ("springs4", 2**20), ("springs8", 2**16)]
 LOOPS, TOLERANCES, STEPS = (64, 1024, 65_536), (1e-3, 1e-5, 1e-7), 50

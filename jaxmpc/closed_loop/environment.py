@@ -15,7 +15,7 @@ from jaxmpc.closed_loop.robot_controller import robot_mpc
 from jaxmpc.closed_loop.variations import start_room
 from jaxmpc.mpc.plan import limited
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.linalg import matmul
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.violations import TOLERANCE, worst_violation

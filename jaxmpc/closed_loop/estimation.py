@@ -18,8 +18,7 @@ from jaxmpc.checks import (
     require_symmetric_psd,
 )
 from jaxmpc.pytrees import named_pytree, pytree
-from jaxmpc.qp.linalg import eigh, solve
-from jaxmpc.qp.precision import arrays, matmul, symmetric
+from jaxmpc.qp.linalg import arrays, eigh, matmul, solve, symmetric
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot, RobotModel
 from jaxmpc.systems.riccati import least_reached, lqr

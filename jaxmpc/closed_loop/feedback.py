@@ -11,7 +11,7 @@ from jaxmpc.mpc.controller import zeros_of
 from jaxmpc.mpc.plan import Control, limited
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import named_pytree, pytree
-from jaxmpc.qp.precision import floating_dtype, matmul
+from jaxmpc.qp.linalg import floating_dtype, matmul
 from jaxmpc.qp.status import Status
 
 

@@ -23,7 +23,7 @@ from jaxmpc.mpc.stagewise.solve import factor_stages, solve_stagewise
 from jaxmpc.mpc.stagewise.sqp import solve_nonlinear
 from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.admm import ADMM, DEFAULT
-from jaxmpc.qp.precision import arrays, floating_dtype
+from jaxmpc.qp.linalg import arrays, floating_dtype
 from jaxmpc.robots.equilibria import settled
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot, RobotModel

@@ -12,7 +12,7 @@ from jaxmpc.checks import number, require_finite, require_kind, require_shape, w
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.linalg import matmul
 from jaxmpc.qp.status import Status
 
 LOOPS = 20

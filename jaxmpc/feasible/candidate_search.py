@@ -24,9 +24,9 @@ from jaxmpc.feasible import proofs
 from jaxmpc.feasible.hard_constraints import ExactData
 from jaxmpc.feasible.orthonormal_rows import ConstraintRows
 from jaxmpc.feasible.proofs import Verdict
+from jaxmpc.qp.linalg import matmul
 from jaxmpc.qp.newton import least_distance
-from jaxmpc.qp.precision import matmul
-from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.problem import Bounds
 
 # Over-relaxation of ADMM.
 ALPHA = 1.6

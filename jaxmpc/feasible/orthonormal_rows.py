@@ -14,8 +14,8 @@ from jaxmpc.feasible.view import View
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Block
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.qp.precision import matmul
-from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.linalg import matmul
+from jaxmpc.qp.problem import Bounds
 from jaxmpc.sets.any_set import set_bounds
 from jaxmpc.sets.lp import power_of_two, scaling
 

@@ -26,13 +26,11 @@ from jaxmpc.mpc.controller import Controller, planned
 from jaxmpc.mpc.plan import Multipliers, Plan, flat_multipliers
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import scaled_multipliers
-from jaxmpc.qp.batched_loops import true_places
-from jaxmpc.qp.dual_search import has_dual_steps
-from jaxmpc.qp.dual_step import RIDGE, most_rows
-from jaxmpc.qp.linalg import solve
-from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.dual import RIDGE, has_dual_steps, most_rows
+from jaxmpc.qp.linalg import matmul, solve
 from jaxmpc.qp.solve import solve_from
 from jaxmpc.qp.status import Status
+from jaxmpc.qp.transformations import true_places
 
 # Coordinates of a state up to which its neighbours are near enough.
 MOST_COORDINATES = 4

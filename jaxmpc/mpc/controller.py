@@ -32,12 +32,12 @@ from jaxmpc.mpc.stated_residuals import with_stated_status
 from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor
 from jaxmpc.qp.admm import factor as factorise
-from jaxmpc.qp.dual_search import has_dual_steps
-from jaxmpc.qp.jax_modes import own_modes, varying
-from jaxmpc.qp.precision import arrays, matmul
+from jaxmpc.qp.dual import has_dual_steps
+from jaxmpc.qp.linalg import arrays, matmul
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.solve import in_two_parts, solve_factored
 from jaxmpc.qp.status import Status
+from jaxmpc.qp.transformations import own_modes, varying
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.polytope import Polytope
 

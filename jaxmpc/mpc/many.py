@@ -37,7 +37,7 @@ from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.plan import Plan
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM, DEFAULT
-from jaxmpc.qp.dual_search import MORE_STEPS, MOST_STEPS
+from jaxmpc.qp.dual import MORE_STEPS, MOST_STEPS
 from jaxmpc.qp.status import Status
 
 # States from which on transfer is tried: below, compiling its programs costs more than it saves.

@@ -14,7 +14,7 @@ from jaxmpc.mpc.aim import Aim
 from jaxmpc.mpc.problem import MPC, weights_of
 from jaxmpc.mpc.rows import Block, Layout, blocks, row_count, split
 from jaxmpc.pytrees import named_pytree, pytree
-from jaxmpc.qp.precision import arrays, matmul
+from jaxmpc.qp.linalg import arrays, matmul
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.residuals import with_fault
 from jaxmpc.qp.status import Status, WithStatus

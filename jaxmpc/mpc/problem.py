@@ -18,7 +18,7 @@ from jaxmpc.checks import (
     require_symmetric_psd,
 )
 from jaxmpc.pytrees import pytree, static, static_pytree
-from jaxmpc.qp.precision import symmetric
+from jaxmpc.qp.linalg import symmetric
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.sets.polytope import Polytope

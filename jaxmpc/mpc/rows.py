@@ -19,9 +19,8 @@ from jax.typing import DTypeLike
 from jaxmpc.checks import require_kind
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, output_stages
 from jaxmpc.pytrees import record
-from jaxmpc.qp.linalg import cholesky
-from jaxmpc.qp.precision import matmul
-from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.linalg import cholesky, matmul
+from jaxmpc.qp.problem import Bounds
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.sets.polytope import Polytope

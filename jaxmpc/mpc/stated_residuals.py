@@ -28,7 +28,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import blocks, split
 from jaxmpc.mpc.stagewise.stages import apply, apply_transposed, at, dynamics_terms, spread
 from jaxmpc.qp.admm import ADMM, Factor
-from jaxmpc.qp.precision import matmul, rounding
+from jaxmpc.qp.linalg import matmul, rounding
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.residuals import SHARE, Measured, Terms, worst
 from jaxmpc.qp.status import Status

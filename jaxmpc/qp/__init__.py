@@ -8,10 +8,8 @@ feasibility_margin   by how much all limits can be tightened, or must be widened
 """
 
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.qp.margin import feasibility_margin
-from jaxmpc.qp.problem import QP
-from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.solve import solve_qp
+from jaxmpc.qp.problem import QP, Bounds
+from jaxmpc.qp.solve import feasibility_margin, solve_qp
 from jaxmpc.qp.status import Status
 
 __all__ = [

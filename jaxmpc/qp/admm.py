@@ -1,6 +1,6 @@
 """ADMM with a fixed number of steps: scale, factor once, iterate one matrix product a step.
 
-The program min ½ z'Pz + q'z + g(Az), g from `projection.py`, is solved in coordinates w, z = T w,
+The program min ½ z'Pz + q'z + g(Az), g from `problem.py`, is solved in coordinates w, z = T w,
 in which the Hessian H = T'PT is the identity (as nearly as P is definite) and the rows of
 A_w = E A T have length one. Splitting s = A_w w with penalty R = diag(rho) and over-relaxation
 alpha gives (Boyd et al. 2011, §3.4.3; Stellato et al. 2020, eq. 17–20, without the proximal term)
@@ -32,13 +32,22 @@ from jax import Array
 
 from jaxmpc.checks import MOST_COUNT, concrete, fail, number, require_real, whole
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.qp.jax_modes import varying
-from jaxmpc.qp.linalg import cholesky, inverse_root
-from jaxmpc.qp.precision import matmul, precisely, rounding
-from jaxmpc.qp.problem import QP
-from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.residuals import Natural
+from jaxmpc.qp.linalg import cholesky, inverse_root, matmul, precisely, rounding
+from jaxmpc.qp.problem import FREE, QP, Bounds
+from jaxmpc.qp.residuals import (
+    SHARE,
+    Measured,
+    Natural,
+    Pair,
+    PairCheck,
+    Products,
+    check_terms,
+    row_sizes,
+    terms_of,
+)
 from jaxmpc.qp.status import Status
+from jaxmpc.qp.transformations import has_kernels, varying
+from jaxmpc.qp.triton import in_one_program, indices
 
 # Eigenvalue, relative to the mean, below which a direction counts as without curvature, by the
 # size of a number in bytes.
@@ -66,7 +75,7 @@ class ADMM:
     √(min(1, n/m)), m counting the rows that z moves; or a number, one value a row (m,), or a
     schedule (stages, m) or (stages, 1) whose stages have equally many iterations.
     alpha: over-relaxation in (0, 2).
-    newton_steps: at most so many after the loop, 0 for none (`dual_search.py`, `newton.py`). None:
+    newton_steps: at most so many after the loop, 0 for none (`dual.py`, `newton.py`). None:
     1,000, of which badly scaled linear programs need most, 150 where every instance takes them all,
     and in `solve_stagewise` as many as are needed. An instance leaves when its residuals are small
     enough, also in a batch. fixed: every instance takes all `newton_steps`, of the method of
@@ -414,6 +423,112 @@ def unscaled(qp: QP, factor: Factor, unit: Array, w: Array, y: Array) -> tuple[A
     zero = factor.E == 0
     y = jnp.where(zero, qp.bounds.penalty_gradient(jnp.zeros_like(y)), unit * factor.E * y)
     return unit * matmul(w, factor.T.T), qp.bounds.admissible(y)
+
+
+@pytree
+class ScaledProgram:
+    """A program in its own units and, as `q` (n,) and `bounds`, in ADMM's coordinates, which are
+    measured in `unit`; eps: the tolerance."""
+
+    qp: QP
+    factor: Factor
+    q: Array
+    bounds: Bounds
+    unit: Array
+    eps: Array
+
+    @classmethod
+    def of(cls, qp: QP, factor: Factor, eps: Array) -> "ScaledProgram":
+        """Return the program with clean data."""
+        return cls(qp, factor, *scaled(factor, qp), eps)
+
+    def unrounded(self) -> "ScaledProgram":
+        """Return the program whose ADMM coordinates are made anew, in float64, from that in its own
+        units: what rounding to float32 leaves between the two is more than the last Newton steps
+        gain."""
+        qp, f = self.qp, self.factor
+        A = f.E[:, None] * matmul(qp.A, f.T)
+        f = replace(f, H=matmul(f.T.T, matmul(qp.P, f.T)), A=A, S=matmul(A, A.T))
+        return ScaledProgram(qp, f, *scaled(f, qp, self.unit), self.eps)
+
+    def natural(self, w: Array, y: Array) -> Natural:
+        """Return what is natural for the program at w, y."""
+        return natural(self.factor, self.unit, self.q, self.bounds, w, y)
+
+    def measure(self, w: Array, y: Array) -> "MeasuredPair":
+        """Return the pair (z, y) of scaled w (n,) and y (m,), and what is measured of it."""
+        qp, f, sizes = self.qp, self.factor, self.natural(w, y)
+        z, y = unscaled(qp, f, self.unit, w, y)
+        products = Products.of(qp, z, y)
+        measure = measure_pair_in_kernel if has_kernels(len(y)) and not qp.balls else measure_pair
+        vectors = Vectors(qp.q, qp.bounds, qp.row_sizes, z, y, products)
+        found, gradient = measure(self.eps, vectors, sizes, f.E, self.unit, self.bounds)
+        tolerances = self.eps * row_sizes(products.Az, qp.row_sizes, sizes)
+        return MeasuredPair(Pair(z, y, *found), matmul(gradient, f.T) / self.unit, tolerances)
+
+
+class MeasuredPair(NamedTuple):
+    """A pair, the scaled gradient T'(Pz + q + A'y) (n,) of its Lagrangian, and the tolerances of
+    rows (m,)."""
+
+    pair: Pair
+    gradient: Array
+    tolerances: Array
+
+
+class Vectors(NamedTuple):
+    """What the residuals of a pair are computed from, once it is multiplied with the matrices: the
+    arguments of `residuals.terms_of`."""
+
+    q: Array
+    bounds: Bounds
+    known: Array | None
+    z: Array
+    y: Array
+    products: Products
+
+
+def measure_pair(
+    eps: Array, vectors: Vectors, sizes: Natural, E: Array, unit: Array, scaled: Bounds
+) -> tuple[PairCheck, Array]:
+    """Return what is said of a pair, and the gradient of its Lagrangian. scaled: the bounds in
+    ADMM's coordinates, of row scale E and measured in `unit`."""
+    y = vectors.y
+    terms = terms_of(*vectors, sizes)
+    floor = rounding(y.dtype)
+    # For soft rows the gap is quadratic in the error of z; the prox residual is linear.
+    v, push = E * vectors.products.Az / unit, scaled_multipliers(E, y) / unit
+    size = jnp.abs(v) + jnp.abs(push)
+    prox = scaled.prox_residual(v + push, 1.0) - push, SHARE + size, size
+    values, _, own = terms[1]
+    # Entries at rounding level count as zero.
+    gradient = jnp.where(jnp.abs(values) > floor * own, values, 0.0)
+    return check_terms(terms, eps, floor, [prox]), gradient
+
+
+def measure_pair_in_kernel(
+    eps: Array, vectors: Vectors, sizes: Natural, E: Array, unit: Array, scaled: Bounds
+) -> tuple[PairCheck, Array]:
+    """`measure_pair` as a kernel for NVIDIA GPUs. Rows and variables that fill up the vectors are
+    free, and zero."""
+    given, tree = jax.tree.flatten((vectors, replace(sizes, gap=None), E, scaled))  # type: ignore[arg-type]
+    free, none = FREE[: len(vectors.bounds.columns)], (0.0,) * len(vectors.products)
+    known = None if vectors.known is None else 0.0
+    fills = jax.tree.leaves(((0.0, free, known, 0.0, 0.0, none), (0.0,) * 4, 0.0, free))
+
+    def measure(three: Array, *given: Array) -> tuple[list[Array], list[Array]]:
+        i = indices(len(three))
+        eps, gap, unit = (jnp.sum(jnp.where(i == n, three, 0.0)) for n in range(3))
+        vectors, natural, E, scaled = jax.tree.unflatten(tree, given)
+        found, gradient = measure_pair(eps, vectors, replace(natural, gap=gap), E, unit, scaled)
+        return [gradient], jax.tree.leaves(found)
+
+    data = [(jnp.stack([eps, sizes.gap, unit]), 0.0), *zip(given, fills, strict=True)]
+    [gradient], numbers = in_one_program(measure, data, [len(vectors.z)], 7)
+    primal, dual, gap, within, error, near, finished = numbers
+    return PairCheck(
+        Measured(primal, dual, gap, within > 0), error, near > 0, finished > 0
+    ), gradient
 
 
 class Splitting(NamedTuple):

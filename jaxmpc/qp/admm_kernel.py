@@ -19,9 +19,9 @@ from jax.typing import DTypeLike
 from jaxmpc.pytrees import record
 from jaxmpc.qp import triton
 from jaxmpc.qp.admm import Factor
-from jaxmpc.qp.batched_loops import LARGE
-from jaxmpc.qp.precision import matmul
-from jaxmpc.qp.projection import FREE, Bounds
+from jaxmpc.qp.linalg import matmul
+from jaxmpc.qp.problem import FREE, Bounds
+from jaxmpc.qp.transformations import LARGE, has_kernels
 from jaxmpc.qp.triton import (
     EXACT,
     LEAST,
@@ -29,7 +29,6 @@ from jaxmpc.qp.triton import (
     Product,
     Ref,
     call,
-    has_kernels,
     indices,
     load,
     padded_side,

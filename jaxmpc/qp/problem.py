@@ -1,5 +1,20 @@
-"""The quadratic program and its solution."""
+"""The quadratic program, the projection onto its constraints, and its solution.
 
+What a QP asks of v = Az, intervals, hard or soft, and balls, is one convex function g(v), a sum
+over rows and balls:
+
+    hard row   0 if l ≤ v ≤ u, else ∞
+    soft row   c d + ½ k d²,  d = dist(v, [l, u])        (L1 weight c, quadratic weight k)
+    ball       0 if |v_b − centre| ≤ radius, else ∞       (v_b: the rows of the ball)
+
+ADMM and the Newton method need of it only the proximal map p = argmin_p g(p) + ½ρ|p − v|²,
+here through the prox residual e = v − p, which is in closed form: zero inside; the whole distance s
+to the set for a hard row or a ball; for a soft row s as long as ρ s ≤ c, and beyond that s − d with
+d = (ρ s − c)/(ρ + k). ρ e is a subgradient of g at p: the multiplier.
+"""
+
+import math
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -16,8 +31,236 @@ from jaxmpc.checks import (
     require_symmetric_psd,
 )
 from jaxmpc.pytrees import named_pytree, pytree, static
-from jaxmpc.qp.projection import Bounds
 from jaxmpc.qp.status import WithStatus
+
+# What leaves a row free: l, u, linear and quadratic.
+FREE = (-math.inf, math.inf, math.inf, 0.0)
+
+
+# In a kernel `jnp.sign` and `jnp.isfinite` compute in the default type, which is another one where
+# 64-bit mode is off (JAX 0.12).
+def sign(v: Array) -> Array:
+    """Return the sign of v, 0 where it is NaN."""
+    return (v > 0).astype(v.dtype) - (v < 0).astype(v.dtype)
+
+
+def finite(v: Array) -> Array:
+    """Return where v is finite."""
+    return jnp.abs(v) < jnp.inf
+
+
+@pytree
+class Bounds:
+    """The function g above. l, u (m,): intervals; in the rows of a ball l = u is its centre.
+
+    linear, quadratic (m,): weights c and k of soft rows, c = inf for a hard row; None: all are
+    hard. balls: number of rows of each ball; these are the last rows. radius (len(balls),).
+    """
+
+    l: Any
+    u: Any
+    linear: Any = None
+    quadratic: Any = None
+    radius: Any = None
+    balls: tuple[int, ...] = static(default=())
+
+    @classmethod
+    def of_rows(cls, columns: Iterable[Any]) -> "Bounds":
+        """Return the bounds of rows from l, u and, where there are soft ones, linear and quadratic:
+        without balls."""
+        return cls(**dict(zip(("l", "u", "linear", "quadratic"), columns, strict=False)))
+
+    @property
+    def columns(self) -> list[Array]:
+        """l, u and, where there are soft rows, linear and quadratic."""
+        soft = [] if self.linear is None else [self.linear, self.quadratic]
+        return [self.l, self.u, *soft]
+
+    def blocks(self) -> list[tuple[slice, Array]]:
+        """Return the rows and the radius of each ball."""
+        first = self.l.shape[0] - sum(self.balls)
+        ends = [first + sum(self.balls[: i + 1]) for i in range(len(self.balls))]
+        sizes = zip(self.balls, ends, strict=True)
+        return [(slice(end - k, end), self.radius[i]) for i, (k, end) in enumerate(sizes)]
+
+    def prox_residual(self, v: Array, rho: Array | float) -> Array:
+        """Return e = v − prox(v) (m,) with penalty rho, a number or (m,)."""
+        s = v - jnp.clip(v, self.l, self.u)
+        if self.linear is not None:
+            s = s - sign(s) * self._soft_slack(s, rho)
+        for rows, radius in self.blocks():
+            s = s.at[rows].multiply(1 - self._projection_factor(s[rows], radius))
+        return s
+
+    def project(self, v: Array, rho: Array | float) -> Array:
+        """Return prox(v) (m,) of g/rho."""
+        plain = self.linear is None and not self.balls
+        return jnp.clip(v, self.l, self.u) if plain else v - self.prox_residual(v, rho)
+
+    def cost(self, p: Array) -> Array:
+        """Return the penalty of each soft row at p; 0 for hard rows and balls (`violation`)."""
+        if self.linear is None:
+            return jnp.zeros_like(p)
+        soft = finite(self.linear)
+        d = jnp.where(soft, jnp.abs(p - jnp.clip(p, self.l, self.u)), 0.0)
+        return d * (jnp.where(soft, self.linear, 0.0) + 0.5 * self.quadratic * d)
+
+    def sizes(self) -> Array:
+        """Return what a violation of each row is compared with (m,): the larger of its finite ends,
+        in a ball the radius."""
+        sizes = [jnp.where(finite(v), jnp.abs(v), 0.0) for v in (self.l, self.u)]
+        found = jnp.maximum(*sizes)
+        for rows, radius in self.blocks():
+            found = found.at[rows].set(radius)
+        return found
+
+    def slope(self, v: Array) -> Array:
+        """Return by how much the penalty of each row at v (m,) grows with its violation: c + k d
+        of soft rows that are violated, 0 of all others."""
+        return jnp.abs(self.penalty_gradient(v))
+
+    def penalty_gradient(self, v: Array) -> Array:
+        """Return the gradient of the penalties at v (m,): the multiplier of soft rows that are
+        violated, 0 in all others."""
+        if self.linear is None:
+            return jnp.zeros_like(v)
+        s = v - jnp.clip(v, self.l, self.u)
+        soft = finite(self.linear)
+        slope = jnp.where(soft, self.linear, 0.0) + self.quadratic * jnp.abs(s)
+        return jnp.where(soft, sign(s) * slope, 0.0)
+
+    def violation(self, v: Array) -> Array:
+        """Return v minus its projection where a constraint is hard; 0 in soft rows."""
+        return self.hard().prox_residual(v, 1.0)
+
+    def curvature(self, v: Array, rho: Array | float) -> tuple[Array, list[Array]]:
+        """Return the derivative of the prox residual at v (an element of its generalised Jacobian):
+        diag(weights) plus h h' for each h of the list, both (m,)."""
+        s = v - jnp.clip(v, self.l, self.u)
+        weights = (s != 0).astype(v.dtype)
+        if self.linear is not None:
+            beyond = self._soft_slack(s, rho) > 0
+            weights = jnp.where(beyond, self.quadratic / (rho + self.quadratic), weights)
+        normals = []
+        for rows, radius in self.blocks():
+            # Tangential to the ball the prox residual turns, along its normal it grows.
+            shrink, length = self._projection_factor(s[rows], radius), self._length(s[rows])
+            outside = (length > radius).astype(v.dtype)
+            weights = weights.at[rows].set(outside * (1 - shrink))
+            root = jnp.where(
+                length > radius, jnp.sqrt(jnp.where(length > radius, shrink, 1.0)), 0.0
+            )
+            normal = root * s[rows] / jnp.where(length > 0, length, 1.0)
+            normals.append(jnp.zeros_like(v).at[rows].set(normal))
+        return weights, normals
+
+    def active_set(self, v: Array, rho: Array | float) -> Array:
+        """Return which formula of the prox residual holds in each row: 0 inside, ±1 outside, ±2
+        outside and past the L1 weight; for a ball 0 inside and 1 outside."""
+        s = v - jnp.clip(v, self.l, self.u)
+        if self.linear is None and not self.balls:
+            return sign(s)
+        count = jnp.ones_like(s)
+        if self.linear is not None:
+            count = count + (self._soft_slack(s, rho) > 0)
+        piece = sign(s) * count
+        for rows, radius in self.blocks():
+            piece = piece.at[rows].set((self._length(s[rows]) > radius).astype(v.dtype))
+        return piece
+
+    def support(self, y: Array) -> Array:
+        """The conjugate g*(y) = max over v of y'v − g(v), as terms (m,) of a sum; inf where y is
+        not admissible.
+
+        u y⁺ − l y⁻, with 0·inf = 0, plus (|y| − c)²/2k for a soft row with |y| > c; in the first
+        row of a ball also radius·|y_b|.
+        """
+        value = y * jnp.where(y > 0, self.u, jnp.where(y < 0, self.l, 0.0))
+        if self.linear is not None:
+            over = jnp.maximum(jnp.abs(y) - self.linear, 0.0)
+            k = jnp.where(self.quadratic > 0, self.quadratic, 1.0)
+            infinite = (over > 0) & (self.quadratic == 0)
+            value = value + jnp.where(infinite, jnp.inf, over**2 / (2 * k))
+        for rows, radius in self.blocks():
+            length = self._length(y[rows])
+            reach = jnp.where(length > 0, length * jnp.where(length > 0, radius, 0.0), 0.0)
+            value = value.at[rows.start].add(reach)
+        return value
+
+    def admissible(self, y: Array) -> Array:
+        """Return the nearest y of finite conjugate: zero against a bound that is not there, and at
+        most the weight of an L1 penalty."""
+        y = jnp.where(jnp.isposinf(self.u), jnp.minimum(y, 0.0), y)
+        y = jnp.where(jnp.isneginf(self.l), jnp.maximum(y, 0.0), y)
+        if self.linear is not None:
+            limit = jnp.where(self.quadratic > 0, jnp.inf, self.linear)
+            y = jnp.clip(y, -limit, limit)
+        return y
+
+    def hard(self) -> "Bounds":
+        """Return the hard constraints alone: soft rows become free."""
+        if self.linear is None:
+            return self
+        soft = finite(self.linear)
+        l, u = jnp.where(soft, -jnp.inf, self.l), jnp.where(soft, jnp.inf, self.u)
+        return replace(self, l=l, u=u, linear=None, quadratic=None)
+
+    def scaled(self, E: Array) -> "Bounds":
+        """What is asked of E·v, E (m,) ≥ 0, when this is asked of v: distances grow by E, so
+        penalties on them shrink. A row with E = 0 is free."""
+        zero = E == 0
+
+        def bound(v: Array, free: float) -> Array:
+            # E·inf would give NaN gradients with respect to what E depends on.
+            keep = finite(v) & ~zero
+            return jnp.where(zero, free, jnp.where(keep, E * jnp.where(keep, v, 0.0), v))
+
+        new = replace(self, l=bound(self.l, -jnp.inf), u=bound(self.u, jnp.inf))
+        E = jnp.where(zero, 1.0, E)
+        if self.linear is not None:
+            soft = finite(self.linear)
+            linear = jnp.where(soft, jnp.where(soft, self.linear, 0.0) / E, jnp.inf)
+            new = replace(new, linear=linear, quadratic=self.quadratic / E**2)
+        for i, (rows, radius) in enumerate(self.blocks()):
+            center = jnp.where(zero[rows], 0.0, E[rows] * self.l[rows])
+            radius = jnp.where(zero[rows][0], jnp.inf, E[rows][0] * radius)
+            l, u = new.l.at[rows].set(center), new.u.at[rows].set(center)
+            new = replace(new, l=l, u=u, radius=new.radius.at[i].set(radius))
+        return new
+
+    def divided(self, unit: Array) -> "Bounds":
+        """Return what is asked of v/unit when this is asked of v, where the whole program is
+        measured in `unit`: multipliers, and with them L1 weights, are divided as v is."""
+        parts = {name: getattr(self, name) for name in ("l", "u", "linear", "radius")}
+        return replace(self, **{name: v / unit for name, v in parts.items() if v is not None})
+
+    def widened(self, e: Array) -> "Bounds":
+        """Return the bounds that a v with the prox residual e (m,) of hard rows meets."""
+        blocks = self.blocks()
+        radius = self.radius
+        for i, (rows, _) in enumerate(blocks):
+            radius = radius.at[i].add(self._length(e[rows]))
+            e = e.at[rows].set(0.0)
+        l, u = self.l + jnp.minimum(e, 0.0), self.u + jnp.maximum(e, 0.0)
+        return replace(self, l=l, u=u, radius=radius)
+
+    def _soft_slack(self, s: Array, rho: Array | float) -> Array:
+        """Return d ≥ 0 (m,): how far prox(v) stays outside a soft row; s: signed distance of v."""
+        soft = finite(self.linear)
+        over = jnp.abs(s) - jnp.where(soft, self.linear, 0.0) / rho
+        beyond = soft & (over > 0)
+        return jnp.where(beyond, rho / (rho + self.quadratic) * jnp.where(beyond, over, 0.0), 0.0)
+
+    def _length(self, v: Array) -> Array:
+        """Return |v|, with derivative 0 at v = 0."""
+        squared = jnp.sum(v**2)
+        return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+
+    def _projection_factor(self, s: Array, radius: Array) -> Array:
+        """Return the factor that projects s onto the ball: radius/|s| outside, 1 inside."""
+        length = self._length(s)
+        outside = length > radius
+        return jnp.where(outside, radius / jnp.where(outside, length, 1.0), 1.0)
 
 
 @pytree

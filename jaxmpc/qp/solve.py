@@ -1,4 +1,4 @@
-"""solve_qp: ADMM, then Newton steps (`refine.py`), status from residuals and certificates,
+"""solve_qp: ADMM, then Newton steps (`newton.py`), status from residuals and certificates,
 implicit derivative."""
 
 from collections.abc import Callable
@@ -19,6 +19,7 @@ from jaxmpc.qp.admm import (
     ADMM,
     DEFAULT,
     Factor,
+    ScaledProgram,
     factor,
     harmless_matrices,
     iterate,
@@ -31,31 +32,28 @@ from jaxmpc.qp.admm import (
     unscaled,
 )
 from jaxmpc.qp.admm_kernel import iterate_batch, suits
-from jaxmpc.qp.batched_loops import in_blocks
-from jaxmpc.qp.certificate import Proof, correcting_rows, prove
-from jaxmpc.qp.defect_correction import solve_dual
-from jaxmpc.qp.derivative import dense_conditions, implicit
-from jaxmpc.qp.dual_search import has_dual_steps
-from jaxmpc.qp.jax_modes import own_modes, varying
-from jaxmpc.qp.newton import MultiplierState, multipliers_start, multipliers_step
-from jaxmpc.qp.precision import arrays, floating_dtype, matmul, precisely, symmetric
-from jaxmpc.qp.problem import QP, QPSolution
-from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.refine import Improved, improve
+from jaxmpc.qp.derivative import dense_conditions
+from jaxmpc.qp.dual import has_dual_steps, solve_dual
+from jaxmpc.qp.linalg import arrays, floating_dtype, matmul, precisely, symmetric
+from jaxmpc.qp.newton import Improved, MultiplierState, improve, multipliers_start, multipliers_step
+from jaxmpc.qp.problem import QP, Bounds, QPSolution
 from jaxmpc.qp.residuals import (
     Natural,
     Pair,
+    Proof,
     Terms,
     assess,
+    correcting_rows,
     largest_of,
+    prove,
     residual_terms,
     row_sizes,
     with_fault,
     with_status,
     worst,
 )
-from jaxmpc.qp.scaled_program import ScaledProgram
 from jaxmpc.qp.status import Status
+from jaxmpc.qp.transformations import implicit, in_blocks, own_modes, varying
 from jaxmpc.qp.triton import EXACT, ROUGH, Product
 
 T = TypeVar("T")
@@ -64,6 +62,8 @@ WarmPair = QPSolution | tuple[Reals, Reals] | None
 
 # Bounds of this size mean none, as in OSQP, MOSEK and the MPS format.
 INFINITE = 1e20
+# Settings for the linear program of a margin.
+LINEAR = ADMM(iterations=100, newton_steps=60)
 
 
 def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: WarmPair = None) -> QPSolution:
@@ -74,7 +74,7 @@ def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: WarmPair = None) -> QPS
     and above are infinite.
     warm_start: a (z, y) pair or an earlier QPSolution. The status comes from residuals in the
     units of `qp` (see `ADMM.eps`), computed in float64 even for float32 data, or from a
-    certificate (`certificate.py`); of float32 data it speaks of the float64 pair that was found,
+    certificate (`residuals.py`); of float32 data it speaks of the float64 pair that was found,
     which is then rounded. z, y and cost are differentiable with respect to every array
     of `qp`, forward and reverse, for every status (`derivative.py`); an instance with NON_FINITE
     data has derivative zero. Raises ValueError for bad shapes and, where values can be read, bad
@@ -218,7 +218,7 @@ def cast(tree: T, dtype: DTypeLike) -> T:
 
 
 def refined_end(p: ScaledProgram, solver: ADMM, begin: MultiplierState, whole: bool) -> QPSolution:
-    """Return the solution by Newton steps in float64 (`refine.py`)."""
+    """Return the solution by Newton steps in float64 (`newton.py`)."""
     single, most = p.q.dtype != jnp.float64, solver.most_newton_steps()
 
     def polish(p: ScaledProgram, begin: MultiplierState) -> Improved:
@@ -356,3 +356,38 @@ def value(qp: QP, z: Array, y: Array) -> Array:
 def tolerance(solver: ADMM, dtype: DTypeLike) -> Array:
     """Return the relative tolerance that `solver` asks for."""
     return jnp.asarray(solver.eps, dtype)
+
+
+def feasibility_margin(
+    qp: QP, scale: Any = None, max_margin: float = 1e3, solver: ADMM = LINEAR
+) -> tuple[Array, Array]:
+    """The largest t with l + t·scale ≤ Az ≤ u − t·scale for some z, and its status.
+
+    t > 0: all hard rows can be kept with a distance of t·scale at once. t < 0: no z keeps them,
+    and |t|·scale is the least uniform widening of the bounds that lets one. t = 0 is the boundary
+    of the feasible set. An equality keeps t ≤ 0. The cost P, q and soft rows do not count; t
+    stops at `max_margin`, which one-sided rows alone may never do.
+
+    scale (m,) > 0: what a violation of 1 means in each row; None: 1, the row's own unit. t is
+    the value of a linear program, concave in l and u and therefore, in MPC, in the initial
+    state; differentiable (the gradient is one of its supergradients) whatever its sign. The
+    status is that of the linear program: t is exact where it is SOLVED. One instance;
+    `jax.vmap` for many. Raises ValueError for wrong shapes and for balls.
+    """
+    qp.validate()
+    m, n = np.shape(qp.A)
+    if qp.balls:
+        fail("qp", "has balls", "The margin is that of rows; give a program without balls")
+    if scale is not None:
+        require_shape("scale", scale, (m,), "One for each row of A")
+    qp = as_arrays(qp)
+    dtype, bounds = qp.q.dtype, qp.bounds.hard()
+    s = jnp.ones(m, dtype) if scale is None else jnp.asarray(scale, dtype)
+    # Variables (z, t): Az + t s ≤ u, l ≤ Az − t s, t ≤ max_margin.
+    last = jnp.zeros(n + 1, dtype).at[n].set(1.0)
+    A = jnp.concatenate([jnp.block([[qp.A, s[:, None]], [qp.A, -s[:, None]]]), last[None]])
+    none = jnp.full(m, jnp.inf, dtype)
+    l = jnp.concatenate([-none, bounds.l, -jnp.full(1, jnp.inf, dtype)])
+    u = jnp.concatenate([bounds.u, none, jnp.full(1, max_margin, dtype)])
+    solution = solve_qp(QP(jnp.zeros((n + 1, n + 1), dtype), -last, A, l, u), solver)
+    return -solution.cost, solution.status

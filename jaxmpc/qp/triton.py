@@ -5,8 +5,6 @@ Pallas' interpreter runs the kernels, slowly: for tests. Pallas is imported wher
 so that machines without GPUs never load it.
 """
 
-import functools
-import importlib
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -14,8 +12,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-# Least side of a matrix in Triton's products, and most rows that a program's registers hold.
-LEAST, MOST = 16, 512
+from jaxmpc.qp.transformations import on_gpu
+
+# Least side of a matrix in Triton's products.
+LEAST = 16
 # float32 products as sums of six products of bfloat16, as exact as float32's own, or of three, with
 # errors of 2⁻¹⁶.
 Product = jax.lax.DotAlgorithmPreset
@@ -35,26 +35,6 @@ class Ref(Protocol):
 
     def __getitem__(self, i: int) -> Array:
         """Return entry i."""
-
-
-def on_gpu() -> bool:
-    """Return whether programs run by default on a GPU for which there are kernels."""
-    return jax.default_backend() == "gpu" and has_triton()
-
-
-def has_kernels(rows: int) -> bool:
-    """Return whether programs run on such a GPU and kernels take so many rows."""
-    return on_gpu() and 0 < rows <= MOST
-
-
-@functools.cache
-def has_triton() -> bool:
-    """Return whether this JAX has the Triton backend of Pallas, which a later one may lack."""
-    try:
-        importlib.import_module("jax.experimental.pallas.triton")
-    except ImportError:
-        return False
-    return True
 
 
 def call(

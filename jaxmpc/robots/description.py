@@ -11,7 +11,7 @@ from jax import Array
 from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.pytrees import record, static
-from jaxmpc.qp.precision import floating_dtype
+from jaxmpc.qp.linalg import floating_dtype
 from jaxmpc.robots.configurations import difference, quaternions, retract, unit_orientations
 from jaxmpc.robots.mujoco_access import acts, equalities, mjx_module, mujoco, single_joints, word
 from jaxmpc.robots.physics import Physics

@@ -14,8 +14,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core.primitives import acos_p, sqrt_p
 
 from jaxmpc.checks import fail
-from jaxmpc.qp.linalg import solve, stand_ins
-from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.linalg import matmul, solve, stand_ins
 from jaxmpc.robots.configurations import normalised, rates, retract
 from jaxmpc.robots.jaxpr_rewriting import in_pieces, moving, rewritten, with_forward_jacobian
 from jaxmpc.robots.mujoco_access import BALL, mjx_module, mujoco

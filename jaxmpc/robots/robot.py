@@ -21,9 +21,8 @@ from jax import Array
 from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.qp.jax_modes import own_modes, varying
-from jaxmpc.qp.linalg import eigh
-from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.linalg import eigh, matmul
+from jaxmpc.qp.transformations import own_modes, varying
 from jaxmpc.robots.configurations import difference, quaternions, retract
 from jaxmpc.robots.description import RobotDescription, RobotReport, report_of
 from jaxmpc.robots.equilibria import (

@@ -13,7 +13,7 @@ from jax import Array
 from scipy.spatial.transform import Rotation
 
 from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.linalg import matmul
 from jaxmpc.robots.mujoco_access import names, number_of
 from jaxmpc.robots.robot import Robot
 

@@ -16,8 +16,7 @@ from jaxmpc.checks import (
     require_symmetric_psd,
 )
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.qp.linalg import cholesky, eigh, solve_triangular
-from jaxmpc.qp.precision import arrays, floating_dtype, matmul
+from jaxmpc.qp.linalg import arrays, cholesky, eigh, floating_dtype, matmul, solve_triangular
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.disturbance import disturbance_set, largest_norm, supports
 from jaxmpc.sets.ellipsoid import Ellipsoid

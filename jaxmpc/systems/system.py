@@ -12,7 +12,7 @@ import scipy
 from jaxmpc.arrays import Reals, as_array, as_column, dimensions, host_array, store_floats
 from jaxmpc.checks import concrete, fail, nearest, require_finite, require_printable, require_shape
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.linalg import matmul
 
 _TEXTS = ("state_names", "input_names", "state_units", "input_units")
 _DELAY = (

@@ -18,7 +18,7 @@ from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.qp.precision import arrays
+from jaxmpc.qp.linalg import arrays
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.violations import TOLERANCE
 from jaxmpc.tuning.batch_mean import BatchMean

@@ -15,7 +15,7 @@ from jaxmpc.checks import fail
 from jaxmpc.feasible.fraction import STEPS, membership
 from jaxmpc.files import fingerprint
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.qp.precision import arrays
+from jaxmpc.qp.linalg import arrays
 from jaxmpc.tuning.batch_mean import BatchMean
 from jaxmpc.tuning.descent import descend
 from jaxmpc.tuning.parameters import Parameters, raw, require_parameters, values

@@ -10,7 +10,7 @@ from jax import Array
 from jaxmpc.checks import fail, require_symmetric_psd
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.pytrees import record
-from jaxmpc.qp.precision import matmul
+from jaxmpc.qp.linalg import matmul
 from jaxmpc.sets import violations
 from jaxmpc.sets.box import Box
 from jaxmpc.sets.polytope import Polytope

@@ -12,7 +12,8 @@ import pytest
 from jax import enable_x64
 
 import jaxmpc as jm
-from jaxmpc.qp.certificate import (
+from jaxmpc.qp.problem import Bounds
+from jaxmpc.qp.residuals import (
     Proof,
     correcting_rows,
     descent_ray,
@@ -21,7 +22,6 @@ from jaxmpc.qp.certificate import (
     recession,
     to_length_one,
 )
-from jaxmpc.qp.projection import Bounds
 
 INF = np.inf
 EPS = 2.0**-52

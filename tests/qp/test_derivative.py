@@ -16,7 +16,7 @@ import pytest
 from jax import enable_x64
 
 import jaxmpc as jm
-from jaxmpc.qp.kkt_system import linearised
+from jaxmpc.qp.derivative import linearised
 
 INF = np.inf
 # Without the polish a program compiles several times faster; ADMM alone converges on easy ones.

@@ -11,12 +11,12 @@ import pytest
 from bench.families import joint
 
 import jaxmpc as jm
-from jaxmpc.qp import dual_kernel, dual_search, kkt_system, scaled_program, solve, triton
+from jaxmpc.qp import admm, derivative, dual, solve, transformations, triton
 from jaxmpc.qp.admm import ADMM, factor, iterate, scaled, splittings
 from jaxmpc.qp.admm_kernel import iterate_batch, pieces
 from jaxmpc.qp.admm_kernel import suits as suits_kernel
-from jaxmpc.qp.batched_loops import true_places
-from jaxmpc.qp.dual_step import Dual, DualPoint, MostSteps
+from jaxmpc.qp.dual import Dual, DualPoint, MostSteps, dual_search, dual_search_kernel
+from jaxmpc.qp.transformations import true_places
 
 STEPS = 12
 
@@ -90,11 +90,11 @@ def searches(case, first, more):
 
     def loop(bounds, cold, point):
         dual = Dual(made.A, made.S, bounds, limit)
-        return dual_search.dual_search(dual, cold, point, jnp.asarray(True), steps)
+        return dual_search(dual, cold, point, jnp.asarray(True), steps)
 
     def kernel(bounds, cold, point):
         dual, true = Dual(made.A, made.S, bounds, limit), jnp.asarray(True)
-        return dual_kernel.dual_search_kernel(dual, cold, point, jnp.int32(0), true, steps)
+        return dual_search_kernel(dual, cold, point, jnp.int32(0), true, steps)
 
     return [jax.jit(jax.vmap(search))(bounds, cold, point) for search in (loop, kernel)]
 
@@ -146,7 +146,7 @@ def test_damped_systems_in_a_kernel_are_those_of_xla(x64):
     b = jnp.where(W < 120, rng.standard_normal((6, 48)), 0.0)
     S = jnp.asarray(A @ A.T)
     each = lambda function: jax.vmap(lambda *v: function(S, *v, 1e-6, 4))(W, slack, b)
-    found, wanted = each(dual_kernel.damped_kernel), each(kkt_system.damped)
+    found, wanted = each(derivative.damped_kernel), each(derivative.damped)
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
     whole = np.asarray(S)[np.ix_(W[5], W[5])] + np.diag(slack[5])
     np.testing.assert_allclose(whole @ found[5], b[5], atol=1e-9)
@@ -169,7 +169,7 @@ def test_plans_by_kernels_are_those_without(soft, x64, monkeypatch):
         )
     plans = lambda solver: jax.jit(jax.vmap(jm.Controller(mpc, solver).plan))(states)
     wanted = plans(jm.ADMM())
-    for module in (dual_search, scaled_program):
+    for module in (dual, admm):
         monkeypatch.setattr(module, "has_kernels", lambda rows: rows > 0)
     found = plans(SOLVER)
     np.testing.assert_array_equal(found.status, wanted.status)
@@ -184,8 +184,8 @@ def lowered(function, states, monkeypatch):
     mesh_module = pytest.importorskip("jax._src.mesh")
     if not hasattr(mesh_module, "AbstractDevice"):
         pytest.skip("this JAX lowers kernels on machines with a GPU alone")
-    monkeypatch.setattr(triton, "on_gpu", lambda: True)
-    monkeypatch.setattr(kkt_system, "on_gpu", lambda: True)
+    for module in (transformations, triton, derivative):
+        monkeypatch.setattr(module, "on_gpu", lambda: True)
     device = mesh_module.AbstractDevice("NVIDIA H100 80GB HBM3", 132, "gpu")
     axes = dict(axis_types=(jax.sharding.AxisType.Auto,), abstract_device=device)
     program = jax.jit(function)
@@ -226,13 +226,13 @@ def test_kernels_can_be_lowered_outside_64_bit_mode(soft, monkeypatch):
 def test_without_triton_there_are_no_kernels(monkeypatch):
     """Newer versions of JAX may leave it out."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert triton.on_gpu()
+    assert transformations.on_gpu()
     monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
-    triton.has_triton.cache_clear()
+    transformations.has_triton.cache_clear()
     try:
-        assert not triton.on_gpu()
+        assert not transformations.on_gpu()
     finally:
-        triton.has_triton.cache_clear()
+        transformations.has_triton.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -241,7 +241,7 @@ def test_without_triton_there_are_no_kernels(monkeypatch):
 )
 def test_matrices_beyond_shared_memory_are_left_to_xla(n, m, taken, monkeypatch):
     """As are iterates in float64, and rows that no program's registers hold."""
-    monkeypatch.setattr(triton, "on_gpu", lambda: True)
+    monkeypatch.setattr(transformations, "on_gpu", lambda: True)
     made = SimpleNamespace(A=np.zeros((m, n)))
     suits = lambda dtype, product: suits_kernel(made, (), np.dtype(dtype), product)
     assert suits("float32", triton.ROUGH) == taken == suits("float32", triton.EXACT)

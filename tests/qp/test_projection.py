@@ -18,7 +18,7 @@ from jax import enable_x64
 from scipy.optimize import brentq, minimize_scalar
 
 import jaxmpc as jm
-from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.problem import Bounds
 
 INF = np.inf
 N, ROWS = 5, 12  # variables and rows of every program below

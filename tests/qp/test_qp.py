@@ -16,7 +16,7 @@ from jax import enable_x64
 import jaxmpc as jm
 from jaxmpc.mpc.condense import condense
 from jaxmpc.qp.admm import factor
-from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.problem import Bounds
 from jaxmpc.qp.residuals import residuals
 from jaxmpc.qp.solve import solve_factored
 

@@ -25,7 +25,7 @@ from jax import Array
 
 from jaxmpc.mpc.stagewise.stages import conditions, measured_pair, minimise, riccati
 from jaxmpc.pytrees import pytree
-from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.problem import Bounds
 from jaxmpc.qp.residuals import Pair
 
 # Steps at most.

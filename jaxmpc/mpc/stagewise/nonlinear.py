@@ -34,8 +34,8 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import joined_bounds
 from jaxmpc.mpc.stagewise.stages import Stages, apply, apply_transposed, at, spread
 from jaxmpc.pytrees import named_pytree, pytree, static, static_pytree
-from jaxmpc.qp.precision import matmul, symmetric
-from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.linalg import matmul, symmetric
+from jaxmpc.qp.problem import Bounds
 
 
 @pytree

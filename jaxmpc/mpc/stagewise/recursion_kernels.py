@@ -16,10 +16,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.qp import triton
-from jaxmpc.qp.jax_modes import own_modes
-from jaxmpc.qp.linalg import WAITS, batched, inverse_root_side_by_side, solve
-from jaxmpc.qp.precision import matmul
-from jaxmpc.qp.triton import barrier, call, indices, load, on_gpu, padded_side, store
+from jaxmpc.qp.linalg import WAITS, batched, inverse_root_side_by_side, matmul, solve
+from jaxmpc.qp.transformations import on_gpu, own_modes
+from jaxmpc.qp.triton import barrier, call, indices, load, padded_side, store
 
 # Numbers along a side that a warp's registers hold.
 MOST = 32

@@ -1,7 +1,7 @@
 """Newton steps on the active rows stage by stage, the search that they are part of, and the
 derivative of what it finds.
 
-In scaled rows v, multipliers y/E and with the residual e(v) = v − prox(v) of `qp/projection.py` the
+In scaled rows v, multipliers y/E and with the residual e(v) = v − prox(v) of `qp/problem.py` the
 optimality conditions are gradient = 0 and e(v + y/ρ) = y/ρ. With the derivative D of e a semismooth
 Newton step from inputs u (N, m) and multipliers y (rows,) asks
 
@@ -27,9 +27,9 @@ from jaxmpc.mpc.stagewise.interior_point import InteriorState, interior_step
 from jaxmpc.mpc.stagewise.stages import Stages, conditions, measured_pair, minimise, riccati
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import scaled_multipliers
-from jaxmpc.qp.derivative import Undo
 from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.residuals import Pair
+from jaxmpc.qp.transformations import Undo
 
 
 class Errors(NamedTuple):

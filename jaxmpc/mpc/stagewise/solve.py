@@ -60,16 +60,12 @@ from jaxmpc.qp.admm import (
     scaled_multipliers,
     start,
 )
-from jaxmpc.qp.batched_loops import repeat_while
-from jaxmpc.qp.certificate import Proof
-from jaxmpc.qp.derivative import implicit
-from jaxmpc.qp.jax_modes import own_modes, varying
-from jaxmpc.qp.precision import arrays, matmul, precisely
-from jaxmpc.qp.problem import QPSolution
-from jaxmpc.qp.projection import Bounds
-from jaxmpc.qp.residuals import Measured, Pair, assess, with_status
+from jaxmpc.qp.linalg import arrays, matmul, precisely
+from jaxmpc.qp.problem import Bounds, QPSolution
+from jaxmpc.qp.residuals import Measured, Pair, Proof, assess, with_status
 from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
+from jaxmpc.qp.transformations import implicit, own_modes, repeat_while, varying
 from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.systems.system import LinearSystem
 

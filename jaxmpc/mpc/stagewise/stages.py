@@ -30,8 +30,8 @@ from jaxmpc.mpc.rows import Layout, blocks, bounds_of, layout_of
 from jaxmpc.mpc.stagewise.recursion_kernels import Gains, recurrence, riccati_recursion, tracking
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.admm import convex
-from jaxmpc.qp.precision import floating_dtype, matmul, precisely, rounding
-from jaxmpc.qp.projection import Bounds
+from jaxmpc.qp.linalg import floating_dtype, matmul, precisely, rounding
+from jaxmpc.qp.problem import Bounds
 from jaxmpc.qp.residuals import SHARE, Pair, Terms
 from jaxmpc.qp.status import Status
 

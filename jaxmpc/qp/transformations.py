@@ -1,11 +1,21 @@
-"""Loops that each instance of a batch leaves when it is done.
+"""What JAX's modes and transformations make of a program: rules, and loops of batches.
 
-Under `jax.vmap` a plain `jax.lax.while_loop` runs until its slowest instance has finished, and all
-others wait. `repeat_while` gathers, on the device, the instances that are still open into groups of
-static size, advances a group at a time, and scatters the results back: the cost is that of the mean
-number of steps, not of the largest. Nothing returns to the host in between.
+Modes. A user may forbid implicit promotion of ranks or types, call from inside `jax.shard_map`,
+whose default is to check over which mesh axes each value varies, or from under a mesh with explicit
+axes, where every array has its sharding as a part of its type. None of these is a property of the
+problem solved. `own_modes` sets them aside for the time a program is traced. What JAX traces later,
+rules of batching and of derivatives, has the decorator too.
+
+Batches. Under `jax.vmap` a plain `jax.lax.while_loop` runs until its slowest instance has finished,
+and all others wait. `repeat_while` gathers, on the device, the instances that are still open into
+groups of static size, advances a group at a time, and scatters the results back: the cost is that
+of the mean number of steps, not of the largest. Nothing returns to the host in between.
+
+Derivatives. `implicit` gives the solution of a problem those of its optimality conditions.
 """
 
+import functools
+import importlib
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal, TypeVar
@@ -15,13 +25,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jax.custom_batching import custom_vmap
+from jax.sharding import AxisType, PartitionSpec, auto_axes, get_abstract_mesh
 
-from jaxmpc.qp.jax_modes import own_modes, varying
-
+T = TypeVar("T")
 C = TypeVar("C")
 S = TypeVar("S")
 R = TypeVar("R")
+F = TypeVar("F", bound=Callable[..., Any])
 
+# Maps tangents of the optimality conditions to tangents of (z, y) that undo them; linear.
+Undo = Callable[[Any], tuple[Array, Array]]
+Conditions = Callable[[Any, Any, Array, Array], tuple[Callable[[Any], Any], Undo]]
 # Of a loop: see `repeat_while`.
 Steps = Literal["short", "long", "stages"]
 # Instances in a block on a CPU, whose data stay within the cache. (On GPUs blocks gain nothing.)
@@ -41,6 +55,79 @@ PART, SMALLER, LEAST = 4, 16, 256
 LARGE = 16_384
 # Length of masks from which on their true places are looked up.
 LONG = 65_536
+# Most rows that a kernel takes: a program's registers hold no more.
+MOST = 512
+
+
+def own_modes(function: F) -> F:
+    """Return the function with JAX's usual promotions, with arguments and results that all vary
+    over the same axes of a `shard_map`, and without explicit axes: sharded along a batch, as
+    `jax.vmap` has it, or not at all."""
+
+    @functools.wraps(function)
+    def run(*args: Any, **kwargs: Any) -> Any:
+        with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+            if AxisType.Explicit in get_abstract_mesh().axis_types:
+                return _without_explicit_axes(functools.partial(function, **kwargs), args)
+            return varying(function(*varying(args, args), **kwargs), args)
+
+    return run  # type: ignore[return-value]
+
+
+def _without_explicit_axes(function: Callable[..., Any], args: tuple) -> Any:
+    leaves, tree = jax.tree.flatten(args)
+    places = [i for i, v in enumerate(leaves) if isinstance(v, jax.Array)]  # not what is static
+
+    def call(*arrays: Any) -> Any:
+        given = dict(zip(places, arrays, strict=True))
+        full = [given.get(i, v) for i, v in enumerate(leaves)]
+        return function(*jax.tree.unflatten(tree, full))
+
+    return auto_axes(call, out_sharding=PartitionSpec())(*(leaves[i] for i in places))
+
+
+def varying(tree: T, like: Any) -> T:
+    """Return the tree, varying over those axes of a `shard_map` over which `like` does.
+
+    What a loop carries must do so from the start; constants such as zeros do not.
+    """
+    axes = frozenset[str]().union(*map(_axes, jax.tree.leaves(like)))
+    if not axes:
+        return tree
+
+    def cast(v: Any) -> Any:
+        missing = tuple(axes - _axes(v)) if isinstance(v, jax.Array) else ()
+        return jax.lax.pcast(v, missing, to="varying") if missing else v
+
+    return jax.tree.map(cast, tree)
+
+
+def _axes(v: Any) -> frozenset[str]:
+    """Return the axes over which a value varies."""
+    if not isinstance(v, jax.core.Tracer):
+        return frozenset()
+    kind = jax.typeof(v)
+    return kind.mat.varying if hasattr(kind, "mat") else getattr(kind, "vma", frozenset())
+
+
+def on_gpu() -> bool:
+    """Return whether programs run by default on a GPU for which there are kernels."""
+    return jax.default_backend() == "gpu" and has_triton()
+
+
+def has_kernels(rows: int) -> bool:
+    """Return whether programs run on such a GPU and kernels take so many rows."""
+    return on_gpu() and 0 < rows <= MOST
+
+
+@functools.cache
+def has_triton() -> bool:
+    """Return whether this JAX has the Triton backend of Pallas, which a later one may lack."""
+    try:
+        importlib.import_module("jax.experimental.pallas.triton")
+    except ImportError:
+        return False
+    return True
 
 
 def group_sizes(batch: int, steps: Steps = "short") -> list[int]:
@@ -216,3 +303,32 @@ def _broadcast(size: int, batched: Any, tree: S) -> S:
     """Return the tree with `size` copies, in front, of each leaf that is not `batched`."""
     give = lambda v, b: v if b else jnp.broadcast_to(v, (size, *jnp.shape(v)))
     return jax.tree.map(give, tree, batched)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def implicit(
+    conditions_of: Conditions, data: Any, constants: Any, z: Array, y: Array
+) -> tuple[Array, Array]:
+    """Return the solution (z, y), given as constants, with its derivatives with respect to `data`.
+
+    conditions_of(data, constants, z, y) gives the optimality conditions as a function of the data
+    alone, with z, y and the active set held fixed, and the function that maps a change of them to
+    the change of (z, y) that undoes it.
+    """
+    return z, y
+
+
+@implicit.defjvp
+@own_modes
+def _implicit_jvp(conditions_of: Conditions, primals: tuple, tangents: tuple) -> tuple:
+    data, constants, z, y = primals
+    # As a result of this function, z and y carry the derivatives that higher orders need.
+    z, y = implicit(conditions_of, data, constants, z, y)
+
+    def moved(data: Any, constants: Any, z: Array, y: Array, change: Any) -> tuple[Array, Array]:
+        conditions, undo = conditions_of(data, constants, z, y)
+        return undo(jax.jvp(conditions, (data,), (change,))[1])
+
+    # Going backward, all but these arguments is computed then: held, it would be several times as
+    # much for each solve of a closed loop.
+    return (z, y), jax.checkpoint(moved)(data, constants, z, y, tangents[0])
