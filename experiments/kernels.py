@@ -20,7 +20,7 @@ from bench.families import family
 from bench.roofline import best_seconds
 
 import jaxmpc as jm
-from jaxmpc.qp.admm import scaled
+from jaxmpc.qp.admm import ScaledProgram
 from jaxmpc.qp.admm_kernel import iterate_batch
 from jaxmpc.qp.transformations import on_gpu
 from jaxmpc.qp.triton import ROUGH
@@ -51,8 +51,12 @@ def admm_task(name: str, count: int) -> Task:
     """ADMM's steps for a batch, from zero, in one kernel."""
     mpc, x = family(name, count)
     c = jm.Controller(mpc)
-    given = jax.jit(jax.vmap(lambda x: scaled(c.factor, c.condensed.qp(x))))(x)
-    q, bounds, _ = single(given)
+
+    def scaled(x: Any) -> tuple:
+        program = ScaledProgram.of(c.condensed.qp(x), c.factor)
+        return program.q, program.bounds
+
+    q, bounds = single(jax.jit(jax.vmap(scaled))(x))
     made, m = single(c.factor), bounds.l.shape[1]
     alpha = jnp.float32(1.9)
     run = jax.jit(lambda q, b, t: iterate_batch(made, alpha, q, b, t, STEPS, ROUGH)[0])

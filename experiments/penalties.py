@@ -19,6 +19,7 @@ for "steps to 99 %" learned anew for each number of steps that was tried.
 
 import time
 from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,8 +36,8 @@ from scipy import sparse
 import jaxmpc as jm
 from jaxmpc.app import config
 from jaxmpc.mpc.condense import Condensed, condense, in_float64
-from jaxmpc.qp.admm import factor, iterate, read, scaled, splittings, unscaled
-from jaxmpc.qp.residuals import largest_of, residual_terms, worst
+from jaxmpc.qp.admm import ScaledProgram, factorise, iterate, read, splittings
+from jaxmpc.qp.residuals import residual_terms, worst
 from jaxmpc.tuning.result import TuningRun
 from jaxmpc.tuning.rho_schedule import transfer_penalties
 from jaxmpc.tuning.solver import tune_solver
@@ -133,16 +134,16 @@ def feasible(c: Case, mpc: jm.MPC, count: int, seed: int) -> np.ndarray:
 @jax.jit
 def run(condensed: Condensed, tracked: Any, x: jax.Array, rho: Any, alpha: Any) -> jax.Array:
     """Largest residual over tolerance (LONG/EVERY, B) after each EVERY steps of constant rho."""
-    made = factor(condensed.P, condensed.C, jm.ADMM(rho=rho), condensed.balls)
+    made = factorise(condensed.P, condensed.C, jm.ADMM(rho=rho), condensed.balls)
 
     def one(x: jax.Array) -> jax.Array:
         qp = condensed.qp(x, *tracked)
-        q, bounds, unit = scaled(made, qp)
+        p = ScaledProgram.of(qp, made)
 
         def chunk(t: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
-            t, _ = iterate(splittings(made, q), bounds, t, EVERY, alpha)
-            w, y = read(made, t, q, bounds)
-            return t, excess(qp, *unscaled(qp, made, unit, w, y))
+            t, _ = iterate(splittings(made, p.q), p.bounds, t, EVERY, alpha)
+            w, y = read(made, t, p.q, p.bounds)
+            return t, excess(qp, *p.unscaled(w, y))
 
         return jax.lax.scan(chunk, jnp.zeros_like(qp.l), length=LONG // EVERY)[1]
 
@@ -152,7 +153,7 @@ def run(condensed: Condensed, tracked: Any, x: jax.Array, rho: Any, alpha: Any) 
 def excess(qp: jm.QP, z: jax.Array, y: jax.Array) -> jax.Array:
     """Largest residual over its tolerance; SOLVED is ≤ 1."""
     above, _ = worst(residual_terms(qp, z, y), 100 * jnp.finfo(z.dtype).eps)
-    return largest_of(above) / 1e-6
+    return reduce(jnp.maximum, above) / 1e-6
 
 
 @jax.jit

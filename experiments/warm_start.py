@@ -18,9 +18,9 @@ from jax import Array
 
 import jaxmpc as jm
 from jaxmpc.mpc.plan import WarmStart
-from jaxmpc.qp.admm import iterate, read, scaled, splittings, unscaled
+from jaxmpc.qp.admm import ScaledProgram, iterate, read, splittings
 from jaxmpc.qp.problem import QP
-from jaxmpc.qp.residuals import residuals
+from jaxmpc.qp.residuals import residual_terms
 from jaxmpc.qp.solve import warm
 
 
@@ -55,18 +55,19 @@ def run(s: Settings) -> None:
     condensed, factor = controller.condensed, controller.factor
 
     def steps_to_solve(qp: QP, warm_start: tuple[Array, Array]) -> Array:
-        q, bounds, unit = scaled(factor, qp)
+        p = ScaledProgram.of(qp, factor)
 
         def look(carry: tuple[Array, Array, Array], _: None) -> tuple:
             t, count, needed = carry
-            schedule = splittings(factor, q)
-            t, _ = iterate(schedule, bounds, t, s.every, controller.solver.alpha)
-            pair = unscaled(qp, factor, unit, *read(factor, t, q, bounds))
-            done = jnp.max(jnp.stack(residuals(qp, *pair))) <= 1e-6
+            schedule = splittings(factor, p.q)
+            t, _ = iterate(schedule, p.bounds, t, s.every, controller.solver.alpha)
+            pair = p.unscaled(*read(factor, t, p.q, p.bounds))
+            largest = [jnp.max(jnp.abs(v), initial=0.0) for v, *_ in residual_terms(qp, *pair)]
+            done = jnp.max(jnp.stack(largest)) <= 1e-6
             count = count + s.every
             return (t, count, jnp.where(done & jnp.isinf(needed), count, needed)), None
 
-        carry = (warm(factor, qp, unit, bounds, warm_start), 0.0, jnp.inf)
+        carry = (warm(p, warm_start), 0.0, jnp.inf)
         return jax.lax.scan(look, carry, length=s.most // s.every)[0][2]
 
     def sample(carry: tuple[Array, jm.mpc.Plan], _: None) -> tuple:

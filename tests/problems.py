@@ -7,11 +7,13 @@ areas hold for the decimal data as printed; for the float64 data use `exact.feas
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jaxmpc as jm
 from jaxmpc.mpc.plan import flat_multipliers
 from jaxmpc.mpc.rows import layout
+from jaxmpc.qp.residuals import residual_terms
 
 
 def symmetric(*limits: float) -> jm.Box:
@@ -159,6 +161,11 @@ def rows_of(mpc, plans):
     """Multipliers of one plan (rows,), or of many, in the order of `row_table`."""
     flat = lambda multipliers: flat_multipliers(layout(mpc), multipliers)
     return np.asarray((jax.vmap(flat) if plans.cost.ndim else flat)(plans.multipliers))
+
+
+def residuals(qp, z, y):
+    """Primal and dual residual and duality gap of a pair, in the units of the program."""
+    return [jnp.max(jnp.abs(v), initial=0.0) for v, *_ in residual_terms(qp, z, y)]
 
 
 # The least that a file for the commands holds.

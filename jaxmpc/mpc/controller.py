@@ -30,8 +30,7 @@ from jaxmpc.mpc.plan import (
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.stated_residuals import with_stated_status
 from jaxmpc.pytrees import prepared_pytree
-from jaxmpc.qp.admm import ADMM, DEFAULT, Factor
-from jaxmpc.qp.admm import factor as factorise
+from jaxmpc.qp.admm import ADMM, DEFAULT, Factor, factorise
 from jaxmpc.qp.dual import has_dual_steps
 from jaxmpc.qp.linalg import arrays, matmul
 from jaxmpc.qp.problem import QPSolution
@@ -222,7 +221,7 @@ def zeros_of(controller: Callable[[Array], Control[Planned]], x: Array) -> Contr
 @own_modes
 def _factor(condensed: Condensed, solver: ADMM) -> Factor:
     made = factorise(condensed.P, condensed.C, solver, condensed.balls)
-    return replace(made, reach=condensed.reach(made.reach))
+    return replace(made, row_norms=condensed.reach(made.row_norms))
 
 
 @partial(jax.jit, static_argnames="whole")

@@ -123,7 +123,7 @@ def stated_terms(
     moved = [M.reshape(-1, M.shape[-1]) for M in (c.Gamma, c.Omega)]
     g = matmul(jnp.concatenate([gx.ravel(), gu.ravel()]), jnp.concatenate(moved))
     length, rounds = (jnp.sqrt(2 * jnp.maximum(v, 0.0)) for v in (J, cancels))
-    rounds = rounds + jnp.max(jnp.abs(y) * factor.reach, initial=0.0)
+    rounds = rounds + jnp.max(jnp.abs(y) * factor.row_norms, initial=0.0)
 
     A, B = cast(mpc.system.A), cast(mpc.system.B)
     drift = jnp.zeros_like(x[0]) if mpc.system.c is None else cast(mpc.system.c)
@@ -136,8 +136,8 @@ def stated_terms(
     return [
         (
             jnp.concatenate([*violations, defects.ravel()]),
-            jnp.concatenate([row_size + SHARE * length * factor.reach, most.ravel()]),
-            jnp.concatenate([row_size + rounds * factor.reach, terms.ravel()]),
+            jnp.concatenate([row_size + SHARE * length * factor.row_norms, most.ravel()]),
+            jnp.concatenate([row_size + rounds * factor.row_norms, terms.ravel()]),
         ),
         (g, length * per_variable, rounds * per_variable),
         (gap[None], 2 * J[None], (cancels + products)[None]),

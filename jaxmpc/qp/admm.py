@@ -1,18 +1,19 @@
-"""ADMM with a fixed number of steps: scale, factor once, iterate one matrix product a step.
+"""ADMM with a fixed number of steps: scale, factorise once, iterate one matrix product a step.
 
 The program min ½ z'Pz + q'z + g(Az), g from `problem.py`, is solved in coordinates w, z = T w,
 in which the Hessian H = T'PT is the identity (as nearly as P is definite) and the rows of
-A_w = E A T have length one. Splitting s = A_w w with penalty R = diag(rho) and over-relaxation
-alpha gives (Boyd et al. 2011, §3.4.3; Stellato et al. 2020, eq. 17–20, without the proximal term)
+A_w = E A T have length one. Splitting s = A_w w with penalties ρ (m,), which multiply row by row,
+and over-relaxation α gives, with the scaled dual variable v (Boyd et al. 2011, §3.1.1 and §3.4.3;
+Stellato et al. 2020, eq. 17–20, without the proximal term)
 
-    w  = M⁻¹ (A_w' R (s − v) − q_w),        M = H + A_w' R A_w
-    s⁺ = prox(alpha A_w w + (1 − alpha) s + v)
-    v⁺ = v + alpha A_w w + (1 − alpha) s − s⁺
+    w  = M⁻¹ (A_w' ρ(s − v) − q_w),        M = H + A_w' diag(ρ) A_w
+    s⁺ = prox(α A_w w + (1 − α) s + v)
+    v⁺ = v + α A_w w + (1 − α) s − s⁺
 
-where R v is the multiplier. Both s and v are functions of their sum t = s + v, because
-s = prox(t) and v = t − prox(t), so a step needs one vector and, with r = s − v = 2 prox(t) − t,
+The multiplier is ρv. Both s and v are functions of their sum t = s + v, because s = prox(t) and
+v = t − prox(t), so a step needs one vector and, with the reflection r = s − v = 2 prox(t) − t,
 
-    t⁺ = t + alpha (A_w M⁻¹ A_w' R r + b − prox(t)),        b = −A_w M⁻¹ q_w.
+    t⁺ = t + α (G r + b − prox(t)),        G = A_w M⁻¹ A_w' diag(ρ),        b = −A_w M⁻¹ q_w.
 
 M, and all that is computed from it, depends on P, A and rho only: a batch that shares these
 pays for one factorization and then for one matrix product a step. prox is the projection onto
@@ -32,15 +33,14 @@ from jax import Array
 
 from jaxmpc.checks import MOST_COUNT, concrete, fail, number, require_real, whole
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.qp.linalg import cholesky, inverse_root, matmul, precisely, rounding
+from jaxmpc.qp.linalg import cholesky, infinity_norm, inverse_root, matmul, precisely, rounding
 from jaxmpc.qp.problem import FREE, QP, Bounds
 from jaxmpc.qp.residuals import (
     SHARE,
     Measured,
-    Natural,
     Pair,
-    PairCheck,
     Products,
+    TypicalSizes,
     check_terms,
     row_sizes,
     terms_of,
@@ -85,9 +85,9 @@ class ADMM:
     eps: tolerance of status SOLVED, relative: each entry of the primal and of the dual residual,
     and the gap, is at most eps times the size of its terms, Σ_j |A_ij z_j| for row i and
     Σ_j |P_ij z_j| + |q_i| + Σ_j |A_ji y_j| for variable i, or a thousandth of eps times what is
-    natural for the whole program (`residuals.Natural`). So neither the units of rows and variables
-    nor that of the cost play a part. A few machine epsilons of the type in which the pair is
-    computed are added: 100 in float64, 4 in float32.
+    typical of the whole program (`residuals.TypicalSizes`). So neither the units of rows and
+    variables nor that of the cost play a part. A few machine epsilons of the type in which the pair
+    is computed are added: 100 in float64, 4 in float32.
     differentiate: "implicit", derivatives of the solution itself (`derivative.py`), zero with
     respect to rho, alpha and the warm start; or "unrolled", derivatives of the steps as they
     were taken. smoothing: 0, or μ > 0 to round off the kinks of the implicit derivative as an
@@ -165,17 +165,17 @@ DEFAULT = ADMM()
 class Factor:
     """What P, A and rho alone decide; shared by every instance of a batch.
 
-    T (n, n): z = T w. E (m,): row scale, 0 for a zero row. reach (m,): by how much a row moves
-    along a unit of w, 1/E, and 0 or what is known of it for a zero row. H (n, n), A (m, n): Hessian
-    and rows in w. flat: whether P is singular. rho (S, m), and a stage each of F = M⁻¹A'R (S, n, m)
-    and Minv (S, n, n); G = A F (S, m, m), or None where two thin products cost less. S = A A'
-    (m, m). fault: NOT_RUN where P and A are
-    usable, else the status that says why not; the rest is then that of min ½|z|² without rows.
+    T (n, n): z = T w. E (m,): row scale, 0 for a zero row. row_norms (m,): the lengths |T'a| of
+    the rows a of A, 1/E, and 0 or what is known of it for a zero row. H (n, n), A (m, n): Hessian
+    and rows in w. flat: whether P is singular. rho (S, m) for S stages of a schedule, and for each
+    F = M⁻¹A'diag(ρ) (S, n, m) and Minv = M⁻¹ (S, n, n); G = A F (S, m, m), or None where two thin
+    products cost less. S = A A' (m, m). fault: NOT_RUN where P and A are usable, else the status
+    that says why not; the rest is then that of min ½|z|² without rows.
     """
 
     T: Array
     E: Array
-    reach: Array
+    row_norms: Array
     H: Array
     A: Array
     flat: Array
@@ -185,12 +185,6 @@ class Factor:
     Minv: Array
     S: Array
     fault: Array
-
-    def image(self, stage: int, r: Array) -> Array:
-        """Return A M⁻¹A'R r (m,) with the penalties of a stage."""
-        if self.G is None:
-            return matmul(matmul(r, self.F[stage].T), self.A.T)
-        return matmul(r, self.G[stage].T)
 
 
 def scale(
@@ -292,8 +286,8 @@ def null_curvature(P: Array, A: Array) -> tuple[Array, Array]:
     return jnp.maximum(jnp.where(singular, delta, 0.0), least * mean), singular
 
 
-def factor(P: Array, A: Array, solver: ADMM, balls: tuple[int, ...] = ()) -> Factor:
-    """Return the factor of P (n, n) and A (m, n) at the penalties of `solver`."""
+def factorise(P: Array, A: Array, solver: ADMM, balls: tuple[int, ...] = ()) -> Factor:
+    """Return the `Factor` of P (n, n) and A (m, n) at the penalties of `solver`."""
     fault = matrix_fault(P, A)
     P, A = harmless_matrices(P, A, fault == Status.NOT_RUN)
     T, E, H, A_w, flat = scale(P, A, balls)
@@ -305,19 +299,17 @@ def factor(P: Array, A: Array, solver: ADMM, balls: tuple[int, ...] = ()) -> Fac
     least = 40 * n * float(jnp.finfo(P.dtype).eps)
     ridge = jnp.where(flat, max(FLAT_RIDGE, least), least).astype(P.dtype)
 
-    def stage(R: Array) -> tuple[Array, Array]:
-        M = H + matmul(A_w.T, R[:, None] * A_w)
+    def inverse(rho: Array) -> Array:
+        M = H + matmul(A_w.T, rho[:, None] * A_w)
         M = M + ridge * (1 + jnp.trace(M) / n) * jnp.eye(n, dtype=P.dtype)
         W = inverse_root(M)
-        Minv = matmul(W.T, W)
-        return matmul(Minv, A_w.T * R), Minv
+        return matmul(W.T, W)
 
-    stages = [stage(R) for R in rho]
-    F = jnp.stack([F for F, _ in stages])
-    Minv = jnp.stack([Minv for _, Minv in stages])
+    Minv = jnp.stack([inverse(each) for each in rho])
+    F = jnp.stack([matmul(M, A_w.T * each) for M, each in zip(Minv, rho, strict=True)])
     G = None if 2 * n < m else matmul(A_w, F)
-    reach = jnp.where(E > 0, 1 / jnp.where(E > 0, E, 1.0), 0.0)
-    made = Factor(T, E, reach, H, A_w, flat, rho, F, G, Minv, matmul(A_w, A_w.T), fault)
+    row_norms = jnp.where(E > 0, 1 / jnp.where(E > 0, E, 1.0), 0.0)
+    made = Factor(T, E, row_norms, H, A_w, flat, rho, F, G, Minv, matmul(A_w, A_w.T), fault)
     # Finite data can still overflow, or be too near singular for their precision.
     parts = jax.tree.leaves((T, E, H, A_w, F, G, Minv))
     sound = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in parts]))
@@ -370,65 +362,16 @@ def convex(P: Array) -> Array:
     return precisely(factored, jax.lax.stop_gradient(P))
 
 
-def scaled(factor: Factor, qp: QP, unit: Array | None = None) -> tuple[Array, Bounds, Array]:
-    """q and bounds in ADMM's coordinates, and their unit, where it is not given. A zero row (scale
-    0) is free there; `prove` and `residual_terms` look after it.
-
-    The coordinates are measured in a unit of each instance, the power of two next to the largest of
-    |q| and of the distances of 0 from the bounds: the solution, which is homogeneous in these, is
-    of size 1 or so, however large the cost and the limits of a problem are."""
-    q, bounds = matmul(qp.q, factor.T), qp.bounds.scaled(factor.E)
-    if unit is not None:
-        return q / unit, bounds.divided(unit), unit
-    far = jnp.clip(jnp.zeros_like(bounds.l), bounds.l, bounds.u)
-    size = jnp.maximum(*(jnp.max(jnp.abs(v), initial=0.0) for v in jax.lax.stop_gradient((q, far))))
-    exponent = jnp.where((size > 0) & jnp.isfinite(size), jnp.frexp(size)[1], 0)
-    unit = jnp.ldexp(jnp.ones((), q.dtype), exponent)
-    return q / unit, bounds.divided(unit), unit
-
-
-def natural(factor: Factor, unit: Array, q: Array, bounds: Bounds, w: Array, y: Array) -> Natural:
-    """Return what is natural for the program with q and bounds in ADMM's coordinates, at w, y
-    there.
-
-    Where P is singular q and y are no lengths: gradients are compared with them, and the length of
-    w with the nearest of the bounds that are not 0."""
-    length, linear, push = (jnp.max(jnp.abs(v), initial=0.0) for v in (w, q, y))
-    force = jnp.maximum(linear, push)
-    ends = jnp.stack([jnp.abs(bounds.l), jnp.abs(bounds.u)])
-    nearest = jnp.min(jnp.where(ends > 0, ends, jnp.inf), initial=jnp.inf)
-    nearest = jnp.where(jnp.isfinite(nearest), nearest, 1.0)
-    along = unit * jnp.where(factor.flat, length + nearest, length)
-    push = unit * jnp.where(factor.flat, force, length)
-    rounds = unit * jnp.where(factor.flat, length, length + force)
-    per_variable = 1 / jnp.sum(jnp.abs(factor.T), axis=1)
-    rows, variables = along * factor.reach, push * per_variable
-    gap, row_terms = along * push, rounds * factor.reach
-    return Natural(rows, variables, gap, row_terms, unit * force * per_variable)
-
-
-def scaled_rows(factor: Factor, qp: QP, unit: Array, z: Array, y: Array) -> tuple[Array, Array]:
-    """Az and y in ADMM's coordinates; 0 in a zero row."""
-    return factor.E * matmul(z, qp.A.T) / unit, scaled_multipliers(factor.E, y) / unit
-
-
 def scaled_multipliers(E: Array, y: Array) -> Array:
     """Multipliers of the rows E·v from those of v; 0 where E is 0."""
     return jnp.where(E > 0, y / jnp.where(E > 0, E, 1.0), 0.0)
 
 
-def unscaled(qp: QP, factor: Factor, unit: Array, w: Array, y: Array) -> tuple[Array, Array]:
-    """Return z and an admissible y in the units of `qp`. A soft row that z cannot move (scale 0)
-    gets its penalty's gradient as multiplier, so that the duality gap closes."""
-    zero = factor.E == 0
-    y = jnp.where(zero, qp.bounds.penalty_gradient(jnp.zeros_like(y)), unit * factor.E * y)
-    return unit * matmul(w, factor.T.T), qp.bounds.admissible(y)
-
-
 @pytree
 class ScaledProgram:
     """A program in its own units and, as `q` (n,) and `bounds`, in ADMM's coordinates, which are
-    measured in `unit`; eps: the tolerance."""
+    measured in `unit`; eps: the tolerance. A zero row (scale 0) is free there; `prove` and
+    `residual_terms` look after it."""
 
     qp: QP
     factor: Factor
@@ -438,9 +381,21 @@ class ScaledProgram:
     eps: Array
 
     @classmethod
-    def of(cls, qp: QP, factor: Factor, eps: Array) -> "ScaledProgram":
-        """Return the program with clean data."""
-        return cls(qp, factor, *scaled(factor, qp), eps)
+    def of(
+        cls, qp: QP, factor: Factor, eps: Any = 0.0, unit: Array | None = None
+    ) -> "ScaledProgram":
+        """Return the program with clean data.
+
+        unit: None for one of each instance, the power of two next to the largest of |q| and of the
+        distances of 0 from the bounds: the solution, which is homogeneous in these, is of size 1 or
+        so, however large the cost and the limits of a problem are."""
+        q, bounds = matmul(qp.q, factor.T), qp.bounds.scaled(factor.E)
+        if unit is None:
+            far = jnp.clip(jnp.zeros_like(bounds.l), bounds.l, bounds.u)
+            size = jnp.maximum(*map(infinity_norm, jax.lax.stop_gradient((q, far))))
+            exponent = jnp.where((size > 0) & jnp.isfinite(size), jnp.frexp(size)[1], 0)
+            unit = jnp.ldexp(jnp.ones((), q.dtype), exponent)
+        return cls(qp, factor, q / unit, bounds.divided(unit), unit, eps)
 
     def unrounded(self) -> "ScaledProgram":
         """Return the program whose ADMM coordinates are made anew, in float64, from that in its own
@@ -449,57 +404,75 @@ class ScaledProgram:
         qp, f = self.qp, self.factor
         A = f.E[:, None] * matmul(qp.A, f.T)
         f = replace(f, H=matmul(f.T.T, matmul(qp.P, f.T)), A=A, S=matmul(A, A.T))
-        return ScaledProgram(qp, f, *scaled(f, qp, self.unit), self.eps)
+        return ScaledProgram.of(qp, f, self.eps, self.unit)
 
-    def natural(self, w: Array, y: Array) -> Natural:
-        """Return what is natural for the program at w, y."""
-        return natural(self.factor, self.unit, self.q, self.bounds, w, y)
+    def scaled_rows(self, z: Array, y: Array) -> tuple[Array, Array]:
+        """Return Az and y in ADMM's coordinates; 0 in a zero row."""
+        E = self.factor.E
+        return E * matmul(z, self.qp.A.T) / self.unit, scaled_multipliers(E, y) / self.unit
 
-    def measure(self, w: Array, y: Array) -> "MeasuredPair":
-        """Return the pair (z, y) of scaled w (n,) and y (m,), and what is measured of it."""
-        qp, f, sizes = self.qp, self.factor, self.natural(w, y)
-        z, y = unscaled(qp, f, self.unit, w, y)
+    def unscaled(self, w: Array, y: Array) -> tuple[Array, Array]:
+        """Return z and an admissible y in the program's own units. A soft row that z cannot move
+        (scale 0) gets its penalty's gradient as multiplier, so that the duality gap closes."""
+        f, bounds = self.factor, self.qp.bounds
+        penalty = bounds.penalty_gradient(jnp.zeros_like(y))
+        y = jnp.where(f.E == 0, penalty, self.unit * f.E * y)
+        return self.unit * matmul(w, f.T.T), bounds.admissible(y)
+
+    def typical_sizes(self, w: Array, y: Array) -> TypicalSizes:
+        """Return the sizes that are typical of the program at w, y in ADMM's coordinates.
+
+        Where P is singular a gradient is no length: gradients are compared with q and y there, and
+        rows with |w| and the nearest of the bounds that are not 0."""
+        f, unit = self.factor, self.unit
+        norm_w, norm_q, norm_y = map(infinity_norm, (w, self.q, y))
+        gradient = jnp.maximum(norm_q, norm_y)
+        ends = jnp.stack([jnp.abs(self.bounds.l), jnp.abs(self.bounds.u)])
+        nearest = jnp.min(jnp.where(ends > 0, ends, jnp.inf), initial=jnp.inf)
+        nearest = jnp.where(jnp.isfinite(nearest), nearest, 1.0)
+        primal = unit * jnp.where(f.flat, norm_w + nearest, norm_w)
+        dual = unit * jnp.where(f.flat, gradient, norm_w)
+        terms = unit * jnp.where(f.flat, norm_w, norm_w + gradient)
+        per_variable = 1 / jnp.sum(jnp.abs(f.T), axis=1)
+        return TypicalSizes(
+            rows=primal * f.row_norms,
+            variables=dual * per_variable,
+            gap=primal * dual,
+            row_terms=terms * f.row_norms,
+            variable_terms=unit * gradient * per_variable,
+        )
+
+    def measure(self, w: Array, y: Array) -> tuple[Pair, Array, Array]:
+        """Return the pair (z, y) of scaled w (n,) and y (m,), the scaled gradient
+        T'(Pz + q + A'y) (n,) of its Lagrangian, and the tolerances of rows (m,)."""
+        qp, f, sizes = self.qp, self.factor, self.typical_sizes(w, y)
+        z, y = self.unscaled(w, y)
         products = Products.of(qp, z, y)
         measure = measure_pair_in_kernel if has_kernels(len(y)) and not qp.balls else measure_pair
-        vectors = Vectors(qp.q, qp.bounds, qp.row_sizes, z, y, products)
+        vectors = qp.q, qp.bounds, qp.row_sizes, z, y, products
         found, gradient = measure(self.eps, vectors, sizes, f.E, self.unit, self.bounds)
         tolerances = self.eps * row_sizes(products.Az, qp.row_sizes, sizes)
-        return MeasuredPair(Pair(z, y, *found), matmul(gradient, f.T) / self.unit, tolerances)
+        return Pair(z, y, *found), matmul(gradient, f.T) / self.unit, tolerances
 
 
-class MeasuredPair(NamedTuple):
-    """A pair, the scaled gradient T'(Pz + q + A'y) (n,) of its Lagrangian, and the tolerances of
-    rows (m,)."""
-
-    pair: Pair
-    gradient: Array
-    tolerances: Array
-
-
-class Vectors(NamedTuple):
-    """What the residuals of a pair are computed from, once it is multiplied with the matrices: the
-    arguments of `residuals.terms_of`."""
-
-    q: Array
-    bounds: Bounds
-    known: Array | None
-    z: Array
-    y: Array
-    products: Products
+# What residuals are computed from: the arguments of `residuals.terms_of` but the typical sizes.
+Vectors = tuple[Array, Bounds, Array | None, Array, Array, Products]
+# What `residuals.check_terms` returns.
+Checked = tuple[Measured, Array, Array, Array]
 
 
 def measure_pair(
-    eps: Array, vectors: Vectors, sizes: Natural, E: Array, unit: Array, scaled: Bounds
-) -> tuple[PairCheck, Array]:
+    eps: Array, vectors: Vectors, sizes: TypicalSizes, E: Array, unit: Array, scaled: Bounds
+) -> tuple[Checked, Array]:
     """Return what is said of a pair, and the gradient of its Lagrangian. scaled: the bounds in
     ADMM's coordinates, of row scale E and measured in `unit`."""
-    y = vectors.y
+    *_, y, products = vectors
     terms = terms_of(*vectors, sizes)
     floor = rounding(y.dtype)
     # For soft rows the gap is quadratic in the error of z; the prox residual is linear.
-    v, push = E * vectors.products.Az / unit, scaled_multipliers(E, y) / unit
-    size = jnp.abs(v) + jnp.abs(push)
-    prox = scaled.prox_residual(v + push, 1.0) - push, SHARE + size, size
+    v, y_w = E * products.Az / unit, scaled_multipliers(E, y) / unit
+    size = jnp.abs(v) + jnp.abs(y_w)
+    prox = scaled.prox_residual(v + y_w, 1.0) - y_w, SHARE + size, size
     values, _, own = terms[1]
     # Entries at rounding level count as zero.
     gradient = jnp.where(jnp.abs(values) > floor * own, values, 0.0)
@@ -507,53 +480,55 @@ def measure_pair(
 
 
 def measure_pair_in_kernel(
-    eps: Array, vectors: Vectors, sizes: Natural, E: Array, unit: Array, scaled: Bounds
-) -> tuple[PairCheck, Array]:
+    eps: Array, vectors: Vectors, sizes: TypicalSizes, E: Array, unit: Array, scaled: Bounds
+) -> tuple[Checked, Array]:
     """`measure_pair` as a kernel for NVIDIA GPUs. Rows and variables that fill up the vectors are
     free, and zero."""
     given, tree = jax.tree.flatten((vectors, replace(sizes, gap=None), E, scaled))  # type: ignore[arg-type]
-    free, none = FREE[: len(vectors.bounds.columns)], (0.0,) * len(vectors.products)
-    known = None if vectors.known is None else 0.0
-    fills = jax.tree.leaves(((0.0, free, known, 0.0, 0.0, none), (0.0,) * 4, 0.0, free))
+    _, bounds, known, z, _, products = vectors
+    free, none = FREE[: len(bounds.columns)], (0.0,) * len(products)
+    zero = None if known is None else 0.0
+    fills = jax.tree.leaves(((0.0, free, zero, 0.0, 0.0, none), (0.0,) * 4, 0.0, free))
 
     def measure(three: Array, *given: Array) -> tuple[list[Array], list[Array]]:
         i = indices(len(three))
         eps, gap, unit = (jnp.sum(jnp.where(i == n, three, 0.0)) for n in range(3))
-        vectors, natural, E, scaled = jax.tree.unflatten(tree, given)
-        found, gradient = measure_pair(eps, vectors, replace(natural, gap=gap), E, unit, scaled)
+        vectors, sizes, E, scaled = jax.tree.unflatten(tree, given)
+        found, gradient = measure_pair(eps, vectors, replace(sizes, gap=gap), E, unit, scaled)
         return [gradient], jax.tree.leaves(found)
 
     data = [(jnp.stack([eps, sizes.gap, unit]), 0.0), *zip(given, fills, strict=True)]
-    [gradient], numbers = in_one_program(measure, data, [len(vectors.z)], 7)
+    [gradient], numbers = in_one_program(measure, data, [len(z)], 7)
     primal, dual, gap, within, error, near, finished = numbers
-    return PairCheck(
-        Measured(primal, dual, gap, within > 0), error, near > 0, finished > 0
-    ), gradient
+    measured = Measured(primal, dual, gap, within > 0)
+    return (measured, error, near > 0, finished > 0), gradient
 
 
 class Splitting(NamedTuple):
-    """What a step of ADMM needs at one penalty rho (m,), in scaled rows: image, r → A M⁻¹A'R r, and
+    """What a step of ADMM needs at penalties rho (m,), in scaled rows: the product r → G r, and the
     offset b (m,), the rows of the minimiser for r = 0."""
 
     rho: Array
-    image: Callable[[Array], Array]
+    product: Callable[[Array], Array]
     offset: Array
 
     def step(self, t: Array, bounds: Bounds, alpha: Array | float) -> Array:
         """One ADMM step on t = s + v (m,)."""
         s = bounds.project(t, self.rho)
-        return t + jnp.asarray(alpha, t.dtype) * (self.image(2 * s - t) + self.offset - s)
-
-
-def splitting(factor: Factor, q: Array, stage: int) -> Splitting:
-    """Return the splitting of a stage of the schedule; q = T'q (n,)."""
-    offset = -matmul(matmul(q, factor.Minv[stage]), factor.A.T)
-    return Splitting(factor.rho[stage], partial(factor.image, stage), offset)
+        return t + jnp.asarray(alpha, t.dtype) * (self.product(2 * s - t) + self.offset - s)
 
 
 def splittings(factor: Factor, q: Array) -> list[Splitting]:
-    """Return the splitting of each stage of the schedule; q = T'q (n,)."""
-    return [splitting(factor, q, stage) for stage in range(len(factor.rho))]
+    """Return the splitting at each stage of the schedule of penalties; q = T'q (n,)."""
+
+    def product(stage: int, r: Array) -> Array:
+        if factor.G is None:
+            return matmul(matmul(r, factor.F[stage].T), factor.A.T)
+        return matmul(r, factor.G[stage].T)
+
+    offsets = [-matmul(matmul(q, Minv), factor.A.T) for Minv in factor.Minv]
+    stages = enumerate(zip(factor.rho, offsets, strict=True))
+    return [Splitting(rho, partial(product, stage), offset) for stage, (rho, offset) in stages]
 
 
 def iterate(
@@ -562,7 +537,7 @@ def iterate(
     """Run the fixed loop from t (m,), equally many steps with each splitting; the last two t."""
     previous, before = t, None
     for splitting in schedule:
-        if before is not None:  # the multiplier R v is what carries over, not v
+        if before is not None:  # the multiplier ρv is what carries over, not v
             s = bounds.project(t, before)
             t = s + before / splitting.rho * (t - s)
         before = splitting.rho
@@ -579,9 +554,9 @@ def nearer(splitting: Splitting, bounds: Bounds, t: Array) -> Array:
     A step is nonexpansive, so that what it moves t by never grows on the way. A warm start from the
     plan of another state, far off, or with numbers that are no plan at all, is dropped this way."""
     moved = lambda t: jnp.sum((splitting.step(t, bounds, 1.0) - t) ** 2)
-    none = jnp.zeros_like(t)
-    here, there = jax.vmap(moved)(jax.lax.stop_gradient(jnp.stack([t, none])))
-    return jnp.where(here < there, t, none)
+    zero = jnp.zeros_like(t)
+    of_t, of_zero = jax.vmap(moved)(jax.lax.stop_gradient(jnp.stack([t, zero])))
+    return jnp.where(of_t < of_zero, t, zero)
 
 
 def start(bounds: Bounds, rho: Array, rows: Array, y: Array) -> Array:
@@ -603,7 +578,7 @@ def repeat(advance: Callable[[Array], Array], t: Array, count: int) -> Array:
 
 
 def read(factor: Factor, t: Array, q: Array, bounds: Bounds) -> tuple[Array, Array]:
-    """Return primal w (n,) and multiplier R v (m,), both scaled, of t with the last penalty."""
+    """Return primal w (n,) and multiplier ρv (m,), both scaled, of t with the last penalty."""
     s = bounds.project(t, factor.rho[-1])
     w = matmul(2 * s - t, factor.F[-1].T) - matmul(q, factor.Minv[-1])
     return w, factor.rho[-1] * (t - s)

@@ -21,7 +21,7 @@ from jaxmpc.qp import triton
 from jaxmpc.qp.admm import Factor
 from jaxmpc.qp.linalg import matmul
 from jaxmpc.qp.problem import FREE, Bounds
-from jaxmpc.qp.transformations import LARGE, has_kernels
+from jaxmpc.qp.transformations import LARGE
 from jaxmpc.qp.triton import (
     EXACT,
     LEAST,
@@ -66,7 +66,7 @@ def row_pieces(rows: int, balls: tuple[int, ...]) -> list[tuple[int, int]]:
 def suits(factor: Factor, balls: tuple[int, ...], dtype: DTypeLike, product: Product) -> bool:
     """Return whether there is a kernel for iterates of this type and matrices of this size."""
     m, n = factor.A.shape[-2:]
-    if not has_kernels(m) or dtype != jnp.float32:
+    if dtype != jnp.float32:
         return False
     rows, inner = total(row_pieces(m, balls)), total(pieces(n))
     numbers = rows * (min(rows, 2 * inner) + (rows if balls else 0))
@@ -119,17 +119,17 @@ def iterate_batch(
         previous, before = t, None
         for stage in range(stages):
             rho = [load(rho_ref.at[stage, i], i < m, 1.0)[None, :] for i in places]
-            if before is not None:  # the multiplier R v is what carries over, not v
+            if before is not None:  # the multiplier ρv is what carries over, not v
                 s = within.project(t, before)
                 t = [s + b / r * (t - s) for s, t, b, r in zip(s, t, before, rho, strict=True)]
             before = rho
             b = [tile.load(b_ref, i, stage) for i in places]
             if low_rank:
                 down = _blocks(matrix_refs[0], places, ranks, stage)
-                factors = [down, _blocks(matrix_refs[1], ranks, places, None)]
+                parts = [down, _blocks(matrix_refs[1], ranks, places, None)]
             else:
-                factors = [_blocks(matrix_refs[0], places, places, stage)]
-            step = functools.partial(_step, within, factors, alpha, rho, b)
+                parts = [_blocks(matrix_refs[0], places, places, stage)]
+            step = functools.partial(_step, within, parts, alpha, rho, b)
             count = jnp.int32(iterations // stages)
             t, previous = jax.lax.fori_loop(jnp.int32(0), count, step, (t, previous))
         for ref, value in ((out_ref, t), (previous_ref, previous)):
@@ -197,12 +197,12 @@ class TileBounds:
         if self.balls is None:
             return [b.project(v, r) for b, v, r in zip(self.pieces, t, rho, strict=True)]
         (radius, same), [b], [v], [r] = self.balls, self.pieces, t, rho
-        s, in_ball = v - jnp.clip(v, b.l, b.u), radius < jnp.inf
+        s, in_ball = b.outside(v), radius < jnp.inf
         squared = jnp.where(in_ball, s * s, 0.0)
         length = jnp.sqrt(self.dot(squared, same))
         outside = length > radius
-        factor = jnp.where(outside, radius / jnp.where(outside, length, 1.0), 1.0)
-        return [v - jnp.where(in_ball, s * (1 - factor), b.prox_residual(v, r))]
+        shrinking = jnp.where(outside, radius / jnp.where(outside, length, 1.0), 1.0)
+        return [v - jnp.where(in_ball, s * (1 - shrinking), b.prox_residual(v, r))]
 
     def times(self, parts: Parts, blocks: Blocks) -> Parts:
         """Return the product of vectors and a matrix."""
@@ -212,19 +212,19 @@ class TileBounds:
 
 def _step(
     within: TileBounds,
-    factors: list[Blocks],
+    matrices: list[Blocks],
     alpha: Array,
     rho: Parts,
     b: Parts,
     _: Array,
     carry: tuple[Parts, Parts],
 ) -> tuple[Parts, Parts]:
-    """Return t after a step of ADMM, and before it."""
+    """Return t after a step of ADMM, and before it. matrices: G, or A and F whose product it is."""
     t, _previous = carry
     s = within.project(t, rho)
     r = [2 * s - t for s, t in zip(s, t, strict=True)]
-    image = functools.reduce(within.times, factors, r)
-    new = [t + alpha * (i + b - s) for t, i, b, s in zip(t, image, b, s, strict=True)]
+    Gr = functools.reduce(within.times, matrices, r)
+    new = [t + alpha * (g + b - s) for t, g, b, s in zip(t, Gr, b, s, strict=True)]
     return new, t
 
 

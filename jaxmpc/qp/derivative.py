@@ -1,10 +1,10 @@
 """Derivatives of the solution map (P, q, A, l, u, …) → (z, y), by the implicit function theorem.
 
 At a solution the conditions Pz + q + A'y = 0 and e(Az + y/ρ) = y/ρ hold for every ρ > 0, with the
-prox residual e(v) = v − prox(v) (`problem.py`). With the formula of e in each row, the active
-set, held fixed they are smooth, and a change of the
-data moves (z, y) by one linear system, which `linearised` solves in ADMM's coordinates.
-JAX transposes that for reverse mode and differentiates it again for higher orders.
+prox residual e(v) = v − prox(v) (`problem.py`). With the formula of e in each row, the active set,
+fixed they are smooth, and a change of the data moves (z, y) by one linear system, which
+`linearised` solves in ADMM's coordinates. JAX transposes that for reverse mode and differentiates
+it again for higher orders.
 
 Which element of the generalised derivative is taken, and what it means where none exists:
 
@@ -31,7 +31,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.qp.admm import Factor, scaled, scaled_rows
+from jaxmpc.qp.admm import Factor, ScaledProgram
 from jaxmpc.qp.dual import KERNEL_ROWS, inverted, sides
 from jaxmpc.qp.linalg import definite_solver, matmul
 from jaxmpc.qp.newton import Constants, gram, ridged
@@ -40,7 +40,7 @@ from jaxmpc.qp.transformations import Undo, in_blocks, on_gpu, repeat_while, tru
 from jaxmpc.qp.triton import LEAST, Ref, call, indices, load, store
 
 # Rows of the reduced system at most, where there is no kernel, steps of the method of multipliers,
-# and instances whose matrices of the size of H are held at once.
+# and instances whose matrices of the size of H are in memory at once.
 REDUCED_ROWS, SWEEPS, DENSE_BLOCK = 48, 8, 512
 
 
@@ -53,8 +53,9 @@ def dense_conditions(
     A = E[:, None] * matmul(qp.A, T)
     H = matmul(T.T, matmul(qp.P, T))
     rho = Constants.of(z.dtype).linear
-    _, bounds, unit = scaled(factor, qp)
-    v, y_w = scaled_rows(factor, qp, unit, z, y)
+    p = ScaledProgram.of(qp, factor)
+    bounds, unit = p.bounds, p.unit
+    v, y_w = p.scaled_rows(z, y)
     # μ is a product of a slack and a multiplier, each of which is measured in the unit.
     upper, lower, others = activity(bounds, v, y_w, smoothing / unit**2, rho)
 
@@ -93,22 +94,22 @@ def activity(bounds: Bounds, v: Array, y: Array, smoothing: float | Array, rho: 
         others = others | jnp.isfinite(bounds.linear)
 
     # Multipliers at rounding level are none.
-    pushes = jnp.abs(y) > precision**0.75 * (1 + jnp.max(jnp.abs(y), initial=0.0))
+    has_multiplier = jnp.abs(y) > precision**0.75 * (1 + jnp.max(jnp.abs(y), initial=0.0))
     out = jax.lax.stop_gradient(bounds.violation(v))
     spring = (y * out > 0) & (jnp.abs(out) > 0.1 * jnp.sqrt(precision) * (1 + jnp.abs(v)))
     k = jax.lax.stop_gradient(jnp.where(spring, y / jnp.where(spring, out, 1.0), 0.0))
     active = jnp.where(spring, k / (rho + k), 1.0)
-    upper = jnp.where(pushes & (y > 0), active, 0.0)
-    lower = jnp.where(pushes & (y < 0), active, 0.0)
+    upper = jnp.where(has_multiplier & (y > 0), active, 0.0)
+    lower = jnp.where(has_multiplier & (y < 0), active, 0.0)
     equal = bounds.l == bounds.u
-    upper, lower = (jnp.where(equal & ~pushes, 0.5, side) for side in (upper, lower))
+    upper, lower = (jnp.where(equal & ~has_multiplier, 0.5, side) for side in (upper, lower))
 
     smoothing = jnp.asarray(smoothing, v.dtype)
     mu = jnp.where(smoothing > 0, smoothing, 1.0)
 
-    def stiffness(slack: Array, push: Array) -> Array:
+    def stiffness(slack: Array, multiplier: Array) -> Array:
         finite = jnp.isfinite(slack)
-        tau = jnp.where(finite, slack - push, 1.0)
+        tau = jnp.where(finite, slack - multiplier, 1.0)
         s = (jnp.abs(tau) + jnp.sqrt(tau**2 + 4 * mu)) / 2
         s = jnp.where(tau > 0, s, mu / s)  # the product of both roots is μ
         return jnp.where(finite, mu / s**2, 0.0)
@@ -125,7 +126,7 @@ def activity(bounds: Bounds, v: Array, y: Array, smoothing: float | Array, rho: 
 def linearised(
     H: Array, A: Array, weights: Array, normals: list[Array], rho: float, flat: Array
 ) -> Callable[[Array, Array], tuple[Array, Array]]:
-    """Solver of the optimality conditions with the pieces of g held fixed.
+    """Solver of the optimality conditions with the pieces of g fixed.
 
     The conditions Hw + q + A'y = 0 and e(Aw + y/ρ) = y/ρ, moved by a (n,) and c (m,), move
     their solution by
@@ -148,15 +149,15 @@ def linearised(
         inverse = definite_solver(dense_system(H, A, weights, normals, rho))
         return partial(swept, H, A, D, rho, inverse)
     n, active = A.shape[1], weights > jnp.finfo(A.dtype).eps ** 2
-    slack = (1 / jnp.where(active, weights, 1.0) - 1) / rho
+    Lambda = (1 / jnp.where(active, weights, 1.0) - 1) / rho
     only = lambda y: jnp.where(active, y, 0.0)
 
     def product(wy: Array) -> Array:
         w, y = wy[:n], wy[n:]
-        rows = jnp.where(active, matmul(w, A.T) - slack * y, y)
+        rows = jnp.where(active, matmul(w, A.T) - Lambda * y, y)
         return jnp.concatenate([matmul(w, H) + matmul(only(y), A), rows])
 
-    constants, own = jax.lax.stop_gradient(((H, A, flat), (weights, active, slack)))
+    constants, own = jax.lax.stop_gradient(((H, A, flat), (weights, active, Lambda)))
 
     def approach(_: Callable, b: Array) -> Array:
         return jnp.concatenate(approximate(rho, constants, own, (b[:n], b[n:])))
@@ -201,7 +202,7 @@ def approximate(
     (`damped`), four of them on what the first four leave of the system, in which H is what it is.
     The other instances of a batch take them with systems of the size of H.
     """
-    (H, A, flat), (weights, active, slack) = constants, own
+    (H, A, flat), (weights, active, Lambda) = constants, own
     if min(A.shape) <= REDUCED_ROWS and not on_gpu():
         return in_blocks(partial(dense_steps, rho), (H, A), (weights, b))
     most = KERNEL_ROWS if on_gpu() else REDUCED_ROWS
@@ -210,12 +211,12 @@ def approximate(
 
     def half(b: tuple[Array, Array]) -> tuple[Array, Array]:
         right = take(matmul(b[0], A.T) - b[1])
-        y = damped(S, W, take(slack), right, 1 / rho, SWEEPS // 2)
+        y = damped(S, W, take(Lambda), right, 1 / rho, SWEEPS // 2)
         dy = jnp.zeros_like(b[1]).at[W].add(y, mode="drop")
         return b[0] - matmul(dy, A), dy
 
     dw, dy = half(b)
-    rows = jnp.where(active, matmul(dw, A.T) - slack * dy, b[1])
+    rows = jnp.where(active, matmul(dw, A.T) - Lambda * dy, b[1])
     more_w, more_y = half((b[0] - matmul(dw, H) - matmul(dy, A), b[1] - rows))
     reduced = dw + more_w, jnp.where(active, dy + more_y, b[1])
 
@@ -239,14 +240,14 @@ def dense_steps(rho: float, constants: tuple, data: tuple) -> tuple[Array, Array
     return swept(H, A, lambda v: weights * v, rho, inverse, -a, -weights * c)
 
 
-def damped(S: Array, W: Array, slack: Array, b: Array, damping: float, steps: int) -> Array:
+def damped(S: Array, W: Array, Lambda: Array, b: Array, damping: float, steps: int) -> Array:
     """Return y (k,) after so many steps y += (M + damping·I)⁻¹(b − M y) from 0, M = S_WW +
-    diag(slack) positive semidefinite: b's solution, or where M is singular and b contradicts it,
+    diag(Lambda) positive semidefinite: b's solution, or where M is singular and b contradicts it,
     least-squares with a bounded part in the null space. W (k,): rows of S, filled up with their
-    number; slack, b (k,)."""
+    number; Lambda, b (k,)."""
     if on_gpu():
-        return damped_kernel(S, W, slack, b, damping, steps)
-    M = S.at[W[:, None], W[None, :]].get(mode="fill", fill_value=0.0) + jnp.diag(slack)
+        return damped_kernel(S, W, Lambda, b, damping, steps)
+    M = S.at[W[:, None], W[None, :]].get(mode="fill", fill_value=0.0) + jnp.diag(Lambda)
     inverse = definite_solver(M + damping * jnp.eye(len(W), dtype=b.dtype))
     y = jnp.zeros_like(b)
     for _ in range(steps):
@@ -254,35 +255,35 @@ def damped(S: Array, W: Array, slack: Array, b: Array, damping: float, steps: in
     return y
 
 
-def damped_kernel(S: Array, W: Array, slack: Array, b: Array, damping: float, steps: int) -> Array:
-    """Return `damped` (k,) of one instance. W (k,): rows of S, which is shared, filled
-    up with their number; slack, b (k,). `vmap` for many."""
+def damped_kernel(S: Array, W: Array, Lambda: Array, b: Array, damping: float, steps: int) -> Array:
+    """Return `damped` of one instance by kernels as that of `dual_search_kernel`: one program an
+    instance. `vmap` for many, which share S."""
     m, rows = len(S), len(W)
     count = jnp.sum(W < m, dtype=jnp.int32)
     y, done = jnp.zeros_like(b), 0
     for side in sides(rows):
         here = jnp.where((count > done) & (count <= side), count, 0)
         solution = _damped(m, min(rows, side), side, damping, steps, b.dtype)
-        part = solution(here[None], S, W, slack, b)
+        part = solution(here[None], S, W, Lambda, b)
         y, done = jnp.where(here > 0, part, y), side
     return y
 
 
 def _damped(m: int, rows: int, side: int, damping: float, steps: int, dtype: jnp.dtype) -> Callable:
-    """Return the kernel (count (1,), S, W, slack, b) → y (k,) with systems of `rows` rows at most,
+    """Return the kernel (count (1,), S, W, Lambda, b) → y (k,) with systems of `rows` rows at most,
     in arrays of `side`; y is zero where the count is."""
 
     def kernel(
-        count_ref: Ref, S_ref: Ref, W_ref: Ref, slack_ref: Ref, b_ref: Ref, y_ref: Ref
+        count_ref: Ref, S_ref: Ref, W_ref: Ref, Lambda_ref: Ref, b_ref: Ref, y_ref: Ref
     ) -> None:
         k, count = indices(side), count_ref[0]
         inside = k < count
         W = load(W_ref.at[k], inside, 0)
-        slack, b = load(slack_ref.at[k], inside), load(b_ref.at[k], inside)
+        Lambda, b = load(Lambda_ref.at[k], inside), load(b_ref.at[k], inside)
         same, square = k[:, None] == k[None, :], inside[:, None] & inside[None, :]
 
         def M(added: float) -> Array:
-            diagonal = jnp.where(inside, slack + added, 1.0)
+            diagonal = jnp.where(inside, Lambda + added, 1.0)
             whole = load(S_ref.at[W[:, None], W[None, :]], square)
             return whole + jnp.where(same, diagonal[:, None], 0.0)
 
@@ -296,8 +297,8 @@ def _damped(m: int, rows: int, side: int, damping: float, steps: int, dtype: jnp
     warps = 1 if side <= LEAST else 4 if side <= 32 else 8
     program = call(kernel, jax.ShapeDtypeStruct((rows,), dtype), warps)
 
-    def run(count: Array, S: Array, W: Array, slack: Array, b: Array) -> Array:
-        y = program(count, S, W[:rows], slack[:rows], b[:rows])
+    def run(count: Array, S: Array, W: Array, Lambda: Array, b: Array) -> Array:
+        y = program(count, S, W[:rows], Lambda[:rows], b[:rows])
         return jnp.pad(y, (0, len(b) - rows))
 
     return run

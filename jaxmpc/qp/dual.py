@@ -55,11 +55,12 @@ ROUNDING = 1e-15
 MOST_STEPS, MORE_STEPS = 24, 100
 # Distance from the optimum at which the steps end, relative to the largest row.
 CONVERGED = 1e-11
-# Rows of W, one kernel after the other: each takes the instances that did not fit into the last.
+# Of the kernels: rows of W, one after the other, each of which takes the instances that did not fit
+# into the last.
 SIDES = (16, 32)
-# Most rows in W, and rows of S that are read at once.
+# Most rows in W there, and rows of S that are read at once.
 KERNEL_ROWS, ROWS = 64, 8
-# Where the steps end, closer than elsewhere: one more here costs less than a correction, which is
+# Where the steps end there, closer than elsewhere: one more costs less than a correction, which is
 # a loop of launches (with 1e-11 4 % of the joint's plans need one, with this 0.01 %).
 KERNEL_CONVERGED = 2e-13
 
@@ -67,7 +68,7 @@ KERNEL_CONVERGED = 2e-13
 @pytree
 class Dual:
     """What the steps need of a program in ADMM's coordinates: rows A (m, n), S = A A' (m, m), its
-    bounds, and the size of multipliers from which on the dual seems unbounded."""
+    bounds, and the `limit`, the size of multipliers from which on the dual seems unbounded."""
 
     A: Array
     S: Array
@@ -130,7 +131,7 @@ def dual_step(dual: Dual, point: DualPoint, singly: Array) -> tuple[DualPoint, A
     """Take a step from `point`. singly: of the rows without multiplier that are violated only the
     one that is so most joins W. Where W would have more than `most_rows`, it has the first of them.
 
-    Returns the new point, and whether W held all its rows.
+    Returns the new point, and whether W had all its rows.
     """
     bounds, y, v, most = dual.bounds, point.y, point.v, most_rows(dual.A)
     in_W = working_set(bounds, y, v, singly)
@@ -139,7 +140,7 @@ def dual_step(dual: Dual, point: DualPoint, singly: Array) -> tuple[DualPoint, A
     y_W, v_W, *rest = jnp.stack([y, v, *bounds.columns]).at[:, W].get(mode="fill", fill_value=0.0)
     rows = WorkingRows(Bounds.of_rows(rest), y_W, v_W)
     S_W = dual.S.at[W[:, None], W[None, :]].get(mode="fill", fill_value=0.0)
-    d = solve(S_W + jnp.diag(jnp.where(inside, rows.slack + RIDGE, 1.0)), rows.gradient)
+    d = solve(S_W + jnp.diag(jnp.where(inside, rows.soft_diagonal + RIDGE, 1.0)), rows.gradient)
     t = jnp.append(jnp.asarray(LENGTHS, y.dtype), jnp.min(rows.stops(d), initial=1.0))
     moved = jax.vmap(lambda t: rows.moved(t * d))(t)
     loss = jnp.sum(jax.vmap(rows.loss)(moved, matmul(moved, S_W)), axis=1)
@@ -150,21 +151,11 @@ def dual_step(dual: Dual, point: DualPoint, singly: Array) -> tuple[DualPoint, A
 
 
 def working_set(bounds: Bounds, y: Array, v: Array, singly: Array) -> Array:
-    """Return which rows are in W (m,)."""
-    new = jnp.where(y == 0, jnp.abs(violation(bounds, v)), 0.0)
+    """Return which rows are in W (m,): those with a multiplier, and those that are violated by more
+    than rounding, where they join singly only the one that is so most."""
+    outside, noise = bounds.outside(v), NOISE * (1 + infinity_norm(v))
+    new = jnp.where(y == 0, jnp.abs(outside), 0.0)
     least = jnp.where(singly, jnp.max(new, initial=0.0), 0.0)
-    return joins(bounds, y, v, NOISE * (1 + jnp.max(jnp.abs(v), initial=0.0)), least)
-
-
-def violation(bounds: Bounds, v: Array) -> Array:
-    """Return by how much each row is outside its interval, with its sign."""
-    return v - jnp.clip(v, bounds.l, bounds.u)
-
-
-def joins(bounds: Bounds, y: Array, v: Array, noise: Array, least: Array) -> Array:
-    """Return which rows have a multiplier or are violated, by more than `noise` and `least` at
-    least."""
-    outside = violation(bounds, v)
     in_W = (y != 0) | ((jnp.abs(outside) > noise) & (jnp.abs(outside) >= least))
     if bounds.linear is not None:
         # An L1 penalty that is paid in full stays so while its row is outside.
@@ -183,7 +174,7 @@ class WorkingRows(NamedTuple):
     @property
     def sign(self) -> Array:
         """That of the multiplier, or of the violation where there is none yet."""
-        outside = violation(self.bounds, self.v)
+        outside = self.bounds.outside(self.v)
         return jnp.where(self.y != 0, sign(self.y), sign(outside))
 
     def beyond(self, y: Array) -> Array:
@@ -191,17 +182,17 @@ class WorkingRows(NamedTuple):
         return jnp.maximum(jnp.abs(y) - self.bounds.linear, 0.0)
 
     @property
-    def give(self) -> Array:
+    def compliance(self) -> Array:
         """1/k of soft rows, 0 of others."""
         stiff = self.bounds.quadratic
         return jnp.where(stiff > 0, 1 / jnp.where(stiff > 0, stiff, 1.0), 0.0)
 
     @property
-    def slack(self) -> Array:
+    def soft_diagonal(self) -> Array:
         """Γ: what soft rows that pay more than their L1 weight add to the diagonal of S."""
         if self.bounds.linear is None:
             return jnp.zeros_like(self.y)
-        return jnp.where(jnp.abs(self.y) >= self.bounds.linear, self.give, 0.0)
+        return jnp.where(jnp.abs(self.y) >= self.bounds.linear, self.compliance, 0.0)
 
     @property
     def excess(self) -> Array:
@@ -213,7 +204,7 @@ class WorkingRows(NamedTuple):
         """Right-hand side of the Newton step."""
         if self.bounds.linear is None:
             return self.excess
-        return self.excess - self.slack * self.sign * self.beyond(self.y)
+        return self.excess - self.soft_diagonal * self.sign * self.beyond(self.y)
 
     def stops(self, d: Array) -> Array:
         """Return the largest step lengths up to 1 along d that take no multiplier past zero."""
@@ -227,21 +218,21 @@ class WorkingRows(NamedTuple):
         equal = self.bounds.l == self.bounds.u
         change = jnp.where(equal | (self.sign * (self.y + change) > 0), change, -self.y)
         if self.bounds.linear is not None:
-            top = jnp.where(self.bounds.quadratic > 0, jnp.inf, self.bounds.linear)
-            low = jnp.maximum(change, -top - self.y)
-            change = jnp.where(self.y + change > top, top - self.y, low)
+            limit = jnp.where(self.bounds.quadratic > 0, jnp.inf, self.bounds.linear)
+            low = jnp.maximum(change, -limit - self.y)
+            change = jnp.where(self.y + change > limit, limit - self.y, low)
         return change
 
-    def loss(self, change: Array, image: Array) -> Array:
+    def loss(self, change: Array, S_change: Array) -> Array:
         """Return the loss of dual value, ½ δ'S δ − δ'(v − b) and the change of what soft rows add
-        to g*, as terms (k,) of a sum, for a change δ of y and its image S_WW δ."""
-        loss = change * (0.5 * image - self.excess)
+        to g*, as terms (k,) of a sum, for a change δ of y and S_WW δ."""
+        loss = change * (0.5 * S_change - self.excess)
         if self.bounds.linear is not None:
             loss = loss + self._soft_loss(self.y + change) - self._soft_loss(self.y)
         return loss
 
     def _soft_loss(self, y: Array) -> Array:
-        return 0.5 * self.give * self.beyond(y) ** 2
+        return 0.5 * self.compliance * self.beyond(y) ** 2
 
 
 def sizes(bounds: Bounds, y: Array, v: Array) -> tuple[Array, Array, Array]:
@@ -376,8 +367,14 @@ def sides(rows: int) -> list[int]:
 def dual_search_kernel(
     dual: Dual, cold: DualPoint, point: DualPoint, taken: Array, go_on: Array, steps: MostSteps
 ) -> tuple[DualPoint, Array]:
-    """Return `dual_search` of one instance, in float64, that has `taken` steps already. `vmap` for
-    many."""
+    """Return `dual_search` of one instance, in float64, that has `taken` steps already, by a kernel
+    for NVIDIA GPUs. `vmap` for many: one program an instance.
+
+    As a loop of XLA each step is some twenty launches, and all instances of a group wait for the
+    largest system. Here an instance takes all its steps within one program and leaves when it is
+    done. A program keeps y, v and the system of W in registers, and gathers through memory of its
+    own. The system is solved in as many pivots as W has rows.
+    """
     rows = min(*dual.A.shape, KERNEL_ROWS)
     flags = jnp.stack([taken, go_on.astype(jnp.int32), jnp.int32(0)])
     y, v = point.y, point.v
@@ -391,7 +388,7 @@ def dual_search_kernel(
 
 
 class SearchState(NamedTuple):
-    """What a program of the search holds: y and v (m,), the count of steps, and whether to go on,
+    """What a program of the search keeps: y and v (m,), the count of steps, and whether to go on,
     whether the point is optimal, and whether W has too many rows for this kernel, as 0 or 1."""
 
     y: Array
@@ -493,7 +490,7 @@ def _best_change(
     """Return the change of the multipliers in W (k,) with the best dual value: a Newton step, or
     where it would stop rows the best of several lengths. k: 0, 1, …; inside: k < count, which of
     them are in W."""
-    diagonal = jnp.where(inside, rows.slack + RIDGE, 1.0)
+    diagonal = jnp.where(inside, rows.soft_diagonal + RIDGE, 1.0)
 
     def S_W() -> Array:
         return load(S_ref.at[W[:, None], W[None, :]], inside[:, None] & inside[None, :])
@@ -505,8 +502,8 @@ def _best_change(
         S, best, least = S_W(), jnp.zeros_like(d), jnp.asarray(jnp.inf, d.dtype)
         for t in (*LENGTHS, jnp.min(rows.stops(d))):
             change = rows.moved(t * d)
-            image = jnp.sum(S * change[None, :], axis=1)
-            loss = jnp.sum(rows.loss(change, image))
+            S_change = jnp.sum(S * change[None, :], axis=1)
+            loss = jnp.sum(rows.loss(change, S_change))
             best, least = jnp.where(loss < least, change, best), jnp.minimum(loss, least)
         return best
 

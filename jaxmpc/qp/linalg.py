@@ -31,7 +31,7 @@ from jax import Array, lax
 from jax.custom_batching import custom_vmap
 from jax.typing import DTypeLike
 
-from jaxmpc.qp.transformations import own_modes, varying
+from jaxmpc.qp.transformations import all_batched, broadcast, own_modes, varying
 
 T = TypeVar("T")
 A = TypeVar("A", Array, np.ndarray)
@@ -74,6 +74,12 @@ def floating_dtype(tree: Any) -> jnp.dtype:
     return jnp.dtype(jnp.float64 if jnp.dtype(jnp.float64) in floats else jnp.float32)
 
 
+def cast(tree: T, dtype: DTypeLike) -> T:
+    """Return the tree with floating leaves of this type."""
+    floating = lambda v: jnp.issubdtype(v.dtype, jnp.floating)
+    return jax.tree.map(lambda v: v.astype(dtype) if floating(v) else v, tree)
+
+
 def symmetric(M: A) -> A:
     """Return the symmetric part of a matrix, which is all that a quadratic form knows of it."""
     return (M + M.swapaxes(-1, -2)) / 2
@@ -88,12 +94,8 @@ def in_float64(function: Callable[..., T]) -> Callable[..., T]:
     batching rule of our own, which turns the mode on again.
     """
 
-    def convert(tree: Any, dtype: DTypeLike) -> Any:
-        floats = lambda v: jnp.issubdtype(v.dtype, jnp.floating)
-        return jax.tree.map(lambda v: v.astype(dtype) if floats(v) else v, tree)
-
     def evaluate(*arguments: Any) -> Any:
-        return convert(function(*convert(arguments, jnp.float64)), jnp.float32)
+        return cast(function(*cast(arguments, jnp.float64)), jnp.float32)
 
     return _with_x64(evaluate)
 
@@ -123,8 +125,7 @@ def _with_x64(function: Callable) -> Callable:
     @own_modes
     def batched(axis_size: int, in_batched: Any, *arguments: Any) -> Any:
         axes = jax.tree.map(lambda b: 0 if b else None, tuple(in_batched))
-        out = _with_x64(jax.vmap(function, in_axes=axes))(*arguments)
-        return out, jax.tree.map(lambda _: True, out)
+        return all_batched(_with_x64(jax.vmap(function, in_axes=axes))(*arguments))
 
     return wrapped
 
@@ -169,10 +170,9 @@ def batched(
     @many.def_vmap
     @own_modes
     def _(size: int, in_batched: Any, *args: Array) -> Any:
-        args = _all_batched(size, in_batched, args)
+        args = broadcast(size, tuple(in_batched), args)
         out = many(*(v.reshape(-1, *v.shape[2:]) for v in args))
-        out = jax.tree.map(lambda v: v.reshape(size, -1, *v.shape[1:]), out)
-        return out, jax.tree.map(lambda _: True, out)
+        return all_batched(jax.tree.map(lambda v: v.reshape(size, -1, *v.shape[1:]), out))
 
     single = custom_vmap(one)
 
@@ -183,15 +183,9 @@ def batched(
             M, B = args
             out = single(M, jnp.moveaxis(B, 0, -1).reshape(len(M), -1))
             return jnp.moveaxis(out.reshape(*B.shape[1:], size), -1, 0), True
-        out = many(*_all_batched(size, in_batched, args))
-        return out, jax.tree.map(lambda _: True, out)
+        return all_batched(many(*broadcast(size, tuple(in_batched), args)))
 
     return single
-
-
-def _all_batched(size: int, in_batched: Any, args: tuple[Array, ...]) -> tuple[Array, ...]:
-    pairs = zip(args, in_batched, strict=True)
-    return tuple(v if b else jnp.broadcast_to(v, (size, *v.shape)) for v, b in pairs)
 
 
 def _side_by_side(plain: Callable, args: tuple[Array, ...]) -> Any:
@@ -224,10 +218,10 @@ def _eliminated(M: Array) -> tuple[Array, Array]:
     def column(j: Array, M: Array) -> Array:
         pivot = lax.dynamic_index_in_dim(M, j, 0, keepdims=False)
         down = lax.dynamic_index_in_dim(M, j, 1, keepdims=False)
-        factors = jnp.where(row > j, down / lax.dynamic_index_in_dim(down, j, 0), 0.0)
+        ratios = jnp.where(row > j, down / lax.dynamic_index_in_dim(down, j, 0), 0.0)
         # Unless they are materialised, XLA computes them again for each entry of M.
-        factors, pivot = lax.optimization_barrier((factors, pivot))
-        return M - factors[:, None] * pivot
+        ratios, pivot = lax.optimization_barrier((ratios, pivot))
+        return M - ratios[:, None] * pivot
 
     M = lax.fori_loop(0, n, column, M)
     D = jnp.stack([M[i, i] for i in range(n)])

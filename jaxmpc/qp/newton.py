@@ -141,7 +141,7 @@ def newton_step(w: Array, phi: Augmented, A: Array) -> NewtonStep:
 
     # φ along w + t d costs no product with A: two scalars and A d.
     Ad, Hd = matmul(d, A.T), matmul(d, smooth)
-    slope, bend = jnp.sum(d * jnp.stack([matmul(w, H) + q, Hd]), axis=1)
+    slope, curvature = jnp.sum(d * jnp.stack([matmul(w, H) + q, Hd]), axis=1)
     minimised = jnp.all(bounds.active_set(v + Ad, rho) == bounds.active_set(v, rho))
 
     Bracket = tuple[Array, Array, Array]
@@ -150,9 +150,9 @@ def newton_step(w: Array, phi: Augmented, A: Array) -> NewtonStep:
         """Newton on the derivative of φ, which grows with t, between what it has bracketed."""
         t, low, high = carry
         at = v + t * Ad
-        derivative = slope + t * bend + rho * jnp.sum(bounds.prox_residual(at, rho) * Ad)
+        derivative = slope + t * curvature + rho * jnp.sum(bounds.prox_residual(at, rho) * Ad)
         D, hs = bounds.curvature(at, rho)
-        second = bend + rho * (jnp.sum(D * Ad**2) + sum(jnp.sum(h * Ad) ** 2 for h in hs))
+        second = curvature + rho * (jnp.sum(D * Ad**2) + sum(jnp.sum(h * Ad) ** 2 for h in hs))
         low, high = jnp.where(derivative < 0, t, low), jnp.where(derivative < 0, high, t)
         move = t - derivative / jnp.maximum(second, jnp.finfo(w.dtype).tiny)
         middle = jnp.where(jnp.isinf(high), 4 * t, (low + high) / 2)
@@ -208,11 +208,6 @@ class MultiplierState:
     tolerance: Array
 
 
-def norms(*vectors: Array) -> Array:
-    """Return the infinity norms of vectors of one length, in one reduction."""
-    return jnp.max(jnp.abs(jnp.stack(vectors)), axis=1, initial=0.0)
-
-
 def multipliers_start(q: Array, w: Array, y: Array) -> MultiplierState:
     """Return the state of the method of multipliers at (w, y)."""
     none_y, none_w = jnp.zeros_like(y), jnp.zeros_like(w)
@@ -239,7 +234,9 @@ def multipliers_update(q: Array, state: MultiplierState, step: NewtonStep) -> Mu
     pieces never come to rest.
     """
     constants, s = Constants.of(state.w.dtype), state
-    gradient, linear, w = norms(step.gradient, q, step.w)
+    # (In one reduction.)
+    three = jnp.abs(jnp.stack([step.gradient, q, step.w]))
+    gradient, linear, w = jnp.max(three, axis=1, initial=0.0)
     # The rounding of rows A w, which are as large as w, is multiplied by ρ.
     eps = jnp.finfo(s.w.dtype).eps
     noise = 10 * eps * (linear + w + s.rho * infinity_norm(step.excess)) + eps * s.rho * w
@@ -293,38 +290,30 @@ class Refinement:
 
 
 class RefinementData(NamedTuple):
-    """What the steps need: the program, H² (n, n), and `certificate.correcting_rows`."""
+    """What the steps need: the program, H² (n, n), and `correcting_rows`."""
 
     program: ScaledProgram
     squared: Array
     correcting: tuple[Array, Array]
 
 
-class Improved(NamedTuple):
-    """The best pair and what is proved, whether there is nothing left to try, and whether the last
-    half of many steps have not made the pair better."""
-
-    pair: Pair
-    proof: Proof
-    ended: Array
-    idle: Array
-
-
 def improve(
     most: int, fixed: bool, whole: bool, p: ScaledProgram, begin: MultiplierState
-) -> Improved:
+) -> tuple[Pair, Proof, Array, Array]:
     """Improve the point of ADMM by `most` Newton steps at most, in float64. fixed: every instance
     takes them all. whole: with the method of multipliers.
 
     The method of multipliers takes what steps on the dual do not solve: P singular, balls,
     degenerate or infeasible rows.
+    Returns the best pair and what is proved, whether there is nothing left to try, and whether the
+    last half of many steps have not made the pair better.
     """
     qp, f, false = p.qp, p.factor, jnp.asarray(False)
     best, go_on = Pair.none(p.q, p.bounds.l), ~false
     correcting = correcting_rows(qp)
     if has_dual_steps(qp.balls, qp.A) and not fixed:
         # The dual of an infeasible program has no maximum: steps towards it would be wasted.
-        allowed = p.eps * row_sizes(0.0, qp.row_sizes, p.natural(begin.w, begin.y))
+        allowed = p.eps * row_sizes(0.0, qp.row_sizes, p.typical_sizes(begin.w, begin.y))
         _, _, empty = farkas(qp, f.E * begin.change, correcting, allowed)
         best, y = solve_dual(p, begin.y, ~f.flat & ~empty, most)
         go_on = ~best.finished
@@ -333,7 +322,7 @@ def improve(
         begin = replace(begin, change=jnp.where(lost, y, begin.change))
         begin = least_violation(begin, empty)
     if not whole:
-        return Improved(best, Proof.none(p.q, p.bounds.l), best.finished, false)
+        return best, Proof.none(p.q, p.bounds.l), best.finished, false
     given, none = RefinementData(p, matmul(f.H, f.H), correcting), jnp.int32(0)
     s = Refinement(
         point=begin,
@@ -352,12 +341,13 @@ def improve(
     if fixed:
         length = most + 4 * proof_steps(most)
         s = varying(s, (s, given))
-        s = lax.scan(partial(_advance_if_open, most, given), s, length=length)[0]
+        step = lambda s, _: (_where(s.open, advance(most, given, s), s), None)
+        s = lax.scan(step, s, length=length)[0]
     else:
         s = repeat_while(lambda s: s.open, partial(advance, most), given, s, steps="long")
         if has_dual_steps(qp.balls, qp.A):
             s = replace(s, best=corrected_end(p, s))
-    return Improved(s.best, s.proof, ~false, s.idle > max(most // 2, 50))
+    return s.best, s.proof, ~false, s.idle > max(most // 2, 50)
 
 
 def corrected_end(p: ScaledProgram, s: Refinement) -> Pair:
@@ -393,9 +383,8 @@ def advance(most: int, given: RefinementData, s: Refinement) -> Refinement:
     # What rounding of T'PT hides of the gradient counts as a part of q (defect correction).
     q = s.q + gradient - (matmul(point.w, f.H) + s.q + matmul(point.y, f.A))
     ray = jnp.where(distance, point.move, step.w)
-    push = jnp.where(primal, point.change, step.excess)
-    found = prove(p.qp, f.T, f.E, given.correcting, tolerances, push, ray)
-    proof = s.proof.joined(found)
+    y = jnp.where(primal, point.change, step.excess)
+    proof = s.proof.joined(prove(p.qp, f.T, f.E, given.correcting, tolerances, y, ray))
     # Where there is no answer, the best is the point of least violation, at which this ends.
     best = _where(primal, s.best.or_better(pair), s.best)
     idle = jnp.where(best.error < 0.5 * s.best.error, 0, s.idle + 1)
@@ -480,14 +469,6 @@ def _where(condition: Array, new: T, old: T) -> T:
 def least_violation(point: MultiplierState, infeasible: Array) -> MultiplierState:
     """Return `point`, or where the program is infeasible the start of a search for the least
     violation of the rows: the last penalty at once, and no multipliers."""
-    top = Constants.of(point.w.dtype).rho[1]
-    return replace(
-        point, rho=jnp.where(infeasible, top, point.rho), y=jnp.where(infeasible, 0.0, point.y)
-    )
-
-
-def _advance_if_open(
-    most: int, given: RefinementData, s: Refinement, _: None
-) -> tuple[Refinement, None]:
-    """Body of a scan: `advance`, no change once the instance is finished."""
-    return _where(s.open, advance(most, given, s), s), None
+    last = Constants.of(point.w.dtype).rho[1]
+    rho, y = jnp.where(infeasible, last, point.rho), jnp.where(infeasible, 0.0, point.y)
+    return replace(point, rho=rho, y=y)

@@ -83,13 +83,17 @@ class Bounds:
         sizes = zip(self.balls, ends, strict=True)
         return [(slice(end - k, end), self.radius[i]) for i, (k, end) in enumerate(sizes)]
 
+    def outside(self, v: Array) -> Array:
+        """Return by how much each row of v (m,) is outside its interval, with its sign."""
+        return v - jnp.clip(v, self.l, self.u)
+
     def prox_residual(self, v: Array, rho: Array | float) -> Array:
         """Return e = v − prox(v) (m,) with penalty rho, a number or (m,)."""
-        s = v - jnp.clip(v, self.l, self.u)
+        s = self.outside(v)
         if self.linear is not None:
-            s = s - sign(s) * self._soft_slack(s, rho)
+            s = s - sign(s) * self._soft_violation(s, rho)
         for rows, radius in self.blocks():
-            s = s.at[rows].multiply(1 - self._projection_factor(s[rows], radius))
+            s = s.at[rows].multiply(1 - self._shrinking(s[rows], radius))
         return s
 
     def project(self, v: Array, rho: Array | float) -> Array:
@@ -102,7 +106,7 @@ class Bounds:
         if self.linear is None:
             return jnp.zeros_like(p)
         soft = finite(self.linear)
-        d = jnp.where(soft, jnp.abs(p - jnp.clip(p, self.l, self.u)), 0.0)
+        d = jnp.where(soft, jnp.abs(self.outside(p)), 0.0)
         return d * (jnp.where(soft, self.linear, 0.0) + 0.5 * self.quadratic * d)
 
     def sizes(self) -> Array:
@@ -124,7 +128,7 @@ class Bounds:
         violated, 0 in all others."""
         if self.linear is None:
             return jnp.zeros_like(v)
-        s = v - jnp.clip(v, self.l, self.u)
+        s = self.outside(v)
         soft = finite(self.linear)
         slope = jnp.where(soft, self.linear, 0.0) + self.quadratic * jnp.abs(s)
         return jnp.where(soft, sign(s) * slope, 0.0)
@@ -136,15 +140,15 @@ class Bounds:
     def curvature(self, v: Array, rho: Array | float) -> tuple[Array, list[Array]]:
         """Return the derivative of the prox residual at v (an element of its generalised Jacobian):
         diag(weights) plus h h' for each h of the list, both (m,)."""
-        s = v - jnp.clip(v, self.l, self.u)
+        s = self.outside(v)
         weights = (s != 0).astype(v.dtype)
         if self.linear is not None:
-            beyond = self._soft_slack(s, rho) > 0
+            beyond = self._soft_violation(s, rho) > 0
             weights = jnp.where(beyond, self.quadratic / (rho + self.quadratic), weights)
         normals = []
         for rows, radius in self.blocks():
             # Tangential to the ball the prox residual turns, along its normal it grows.
-            shrink, length = self._projection_factor(s[rows], radius), self._length(s[rows])
+            shrink, length = self._shrinking(s[rows], radius), self._length(s[rows])
             outside = (length > radius).astype(v.dtype)
             weights = weights.at[rows].set(outside * (1 - shrink))
             root = jnp.where(
@@ -157,12 +161,12 @@ class Bounds:
     def active_set(self, v: Array, rho: Array | float) -> Array:
         """Return which formula of the prox residual holds in each row: 0 inside, ±1 outside, ±2
         outside and past the L1 weight; for a ball 0 inside and 1 outside."""
-        s = v - jnp.clip(v, self.l, self.u)
+        s = self.outside(v)
         if self.linear is None and not self.balls:
             return sign(s)
         count = jnp.ones_like(s)
         if self.linear is not None:
-            count = count + (self._soft_slack(s, rho) > 0)
+            count = count + (self._soft_violation(s, rho) > 0)
         piece = sign(s) * count
         for rows, radius in self.blocks():
             piece = piece.at[rows].set((self._length(s[rows]) > radius).astype(v.dtype))
@@ -183,8 +187,8 @@ class Bounds:
             value = value + jnp.where(infinite, jnp.inf, over**2 / (2 * k))
         for rows, radius in self.blocks():
             length = self._length(y[rows])
-            reach = jnp.where(length > 0, length * jnp.where(length > 0, radius, 0.0), 0.0)
-            value = value.at[rows.start].add(reach)
+            most = jnp.where(length > 0, length * jnp.where(length > 0, radius, 0.0), 0.0)
+            value = value.at[rows.start].add(most)
         return value
 
     def admissible(self, y: Array) -> Array:
@@ -244,7 +248,7 @@ class Bounds:
         l, u = self.l + jnp.minimum(e, 0.0), self.u + jnp.maximum(e, 0.0)
         return replace(self, l=l, u=u, radius=radius)
 
-    def _soft_slack(self, s: Array, rho: Array | float) -> Array:
+    def _soft_violation(self, s: Array, rho: Array | float) -> Array:
         """Return d ≥ 0 (m,): how far prox(v) stays outside a soft row; s: signed distance of v."""
         soft = finite(self.linear)
         over = jnp.abs(s) - jnp.where(soft, self.linear, 0.0) / rho
@@ -256,8 +260,8 @@ class Bounds:
         squared = jnp.sum(v**2)
         return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
 
-    def _projection_factor(self, s: Array, radius: Array) -> Array:
-        """Return the factor that projects s onto the ball: radius/|s| outside, 1 inside."""
+    def _shrinking(self, s: Array, radius: Array) -> Array:
+        """Return by what s is multiplied to project it onto the ball: radius/|s| outside, or 1."""
         length = self._length(s)
         outside = length > radius
         return jnp.where(outside, radius / jnp.where(outside, length, 1.0), 1.0)
@@ -431,7 +435,9 @@ class QPSolution(WithStatus):
 
     z (n,) primal. y (m,) multipliers: Pz + q + A'y = 0, y > 0 where the upper bound is active,
     y < 0 where the lower is. cost: ½ z'Pz + q'z plus the penalties of soft rows; its derivative is
-    that of the optimal value. Residuals are in the problem's own units (see `residuals`).
+    that of the optimal value. Residuals are infinity norms in the problem's own units: of Az less
+    its projection on hard constraints, of Pz + q + A'y, and of the duality gap
+    z'Pz + q'z + g(Az) + g*(y).
     certificate (m,): for PRIMAL_INFEASIBLE the Farkas vector, else zeros. ray (n,): for
     DUAL_INFEASIBLE a direction of unbounded descent, else zeros. iterations: ADMM steps run.
     `solved` and `sentence` say what the status means.

@@ -11,7 +11,7 @@ pair:
 
 A pair is solved where every entry is at most ε·size + floor·terms, with the floor at a few machine
 epsilons. Sums can all vanish: of a row z_j ≥ 0 at z_j = 0, nothing is left but rounding. So a small
-share of what is natural for the whole program is added to both (`Natural`).
+share of what is typical of the whole program is added to both (`TypicalSizes`).
 
 Proofs. A vector y proves l ≤ Az ≤ u empty when A'y = 0 and Σ u y⁺ − l y⁻ < 0 (Farkas); a ball adds
 radius·|y_b| to the sum, soft rows never take part. Iterates never satisfy A'y = 0 exactly.
@@ -22,6 +22,7 @@ box rows in the role of the correction). The bound is valid for any y; convergen
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import reduce
 from typing import NamedTuple
 
 import jax
@@ -30,7 +31,7 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.pytrees import pytree
-from jaxmpc.qp.linalg import matmul, precisely, rounding
+from jaxmpc.qp.linalg import infinity_norm, matmul, precisely, rounding
 from jaxmpc.qp.problem import QP, Bounds, QPSolution, finite
 from jaxmpc.qp.status import Status
 
@@ -38,7 +39,7 @@ from jaxmpc.qp.status import Status
 STALLED = 10
 # Part of the tolerance below which one more step ends a search.
 NEAR = 1e-4
-# Share of what is natural for the whole program in the size of an entry.
+# Share of what is typical of the whole program in the size of an entry.
 SHARE = 1e-3
 # Parts of the residuals: values, sizes and terms, as above.
 Terms = Sequence[tuple[Array, Array, Array]]
@@ -67,8 +68,8 @@ class Products(NamedTuple):
 
 
 @pytree
-class Natural:
-    """What is natural for the whole program, for rows (m,), variables (n,) and the gap: sizes, and
+class TypicalSizes:
+    """What is typical of the whole program, for rows (m,), variables (n,) and the gap: sizes, and
     the terms of rows and variables.
 
     In ADMM's coordinates z = T w, in which the Hessian is the identity, the solution is
@@ -84,16 +85,19 @@ class Natural:
     variable_terms: Array | float = 0.0
 
 
-def residual_terms(qp: QP, z: Array, y: Array, natural: Natural | None = None) -> Terms:
-    """Return the residuals of rows (m,), variables (n,) and the gap (1,) of a pair."""
+def residual_terms(qp: QP, z: Array, y: Array, typical: TypicalSizes | None = None) -> Terms:
+    """Return the residuals of rows (m,), variables (n,) and the gap (1,) of a pair: Az less its
+    projection on hard constraints, Pz + q + A'y, and z'Pz + q'z + g(Az) + g*(y) with the penalties
+    g of soft rows and the conjugate g* (`Bounds.support`). y is admissible: no multiplier against a
+    bound that is not there."""
     products = Products.of(qp, z, y)
-    return terms_of(qp.q, qp.bounds, qp.row_sizes, z, y, products, natural or Natural())
+    return terms_of(qp.q, qp.bounds, qp.row_sizes, z, y, products, typical or TypicalSizes())
 
 
-def row_sizes(Az: Array | float, known: Array | None, natural: Natural) -> Array:
+def row_sizes(Az: Array | float, known: Array | None, typical: TypicalSizes) -> Array:
     """Return what violations of rows are compared with (m,): what is known of a row
-    (`QP.row_sizes`), and where that is nothing its value and what is natural."""
-    sizes = jnp.abs(Az) + SHARE * natural.rows
+    (`QP.row_sizes`), and where that is nothing its value and what is typical."""
+    sizes = jnp.abs(Az) + SHARE * typical.rows
     return sizes if known is None else jnp.where(known > 0, known, sizes)
 
 
@@ -104,11 +108,10 @@ def terms_of(
     z: Array,
     y: Array,
     products: Products,
-    natural: Natural,
+    typical: TypicalSizes,
 ) -> Terms:
     """Return `residual_terms` from the products with the matrices. known: `QP.row_sizes`."""
     Az, Pz, Aty, *sizes = products
-    size = jnp.abs
     penalty, support = bounds.cost(Az), bounds.support(y)
     curved, along = jnp.sum(z * Pz), jnp.sum(z * q)
     paid, conjugate = jnp.sum(penalty), jnp.sum(support)
@@ -116,40 +119,18 @@ def terms_of(
     terms = jnp.sum(jnp.abs(z) * (jnp.abs(Pz) + jnp.abs(q)))
     terms = terms + jnp.sum(bounds.slope(Az) * sizes[0] + penalty + jnp.abs(support))
     return [
-        (
-            bounds.violation(Az),
-            row_sizes(Az, known, natural),
-            sizes[0] + natural.row_terms,
-        ),
+        (bounds.violation(Az), row_sizes(Az, known, typical), sizes[0] + typical.row_terms),
         (
             Pz + q + Aty,
-            size(Pz) + size(q) + size(Aty) + SHARE * natural.variables,
-            sizes[1] + size(q) + sizes[2] + natural.variable_terms,
+            abs(Pz) + abs(q) + abs(Aty) + SHARE * typical.variables,
+            sizes[1] + abs(q) + sizes[2] + typical.variable_terms,
         ),
         (
             (curved + along + paid + conjugate)[None],
-            (size(curved) + size(along) + paid + size(conjugate) + SHARE * natural.gap)[None],
+            (abs(curved) + abs(along) + paid + abs(conjugate) + SHARE * typical.gap)[None],
             terms[None],
         ),
     ]
-
-
-def residuals(qp: QP, z: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return primal residual, dual residual and duality gap of (z, y), infinity norms, own units.
-
-    primal = max |Az − its projection| over hard constraints, dual = max |Pz + q + A'y|,
-    gap = |z'Pz + q'z + g(Az) + g*(y)| with the penalties g of soft rows and the conjugate
-    g*(y) = Σ u y⁺ − l y⁻ + … (`Bounds.support`). A multiplier that is not admissible (a push
-    against an absent bound) must be made so before.
-    """
-    primal, dual, gap = (_largest(jnp.abs(values)) for values, *_ in residual_terms(qp, z, y))
-    return primal, dual, gap
-
-
-def joined(terms: Terms) -> tuple[Array, Array, Array]:
-    """Return all residuals as one vector (m + n + 1,), their sizes as another, and the terms."""
-    values, sizes, terms = zip(*terms, strict=True)
-    return jnp.concatenate(values), jnp.concatenate(sizes), jnp.concatenate(terms)
 
 
 def worst(terms: Terms, floor: float | Array) -> tuple[list[Array], list[Array]]:
@@ -163,21 +144,9 @@ def worst(terms: Terms, floor: float | Array) -> tuple[list[Array], list[Array]]
         least = jnp.finfo(error.dtype).tiny
         size = jnp.where(sound, jnp.maximum(sizes, least), 1.0)
         total = jnp.where(sound, size + own, 1.0)
-        above.append(_largest((error - floor * total) / size))
-        relative.append(_largest(error / total))
+        above.append(jnp.max((error - floor * total) / size, initial=0.0))
+        relative.append(jnp.max(error / total, initial=0.0))
     return above, relative
-
-
-def _largest(v: Array) -> Array:
-    return jnp.max(v, initial=0.0)
-
-
-def largest_of(numbers: list[Array]) -> Array:
-    """Return the largest of some scalars."""
-    found = numbers[0]
-    for number in numbers[1:]:
-        found = jnp.maximum(found, number)
-    return found
 
 
 @pytree
@@ -198,8 +167,8 @@ class Measured:
     @classmethod
     def from_ratios(cls, terms: Terms, eps: Array, above: list[Array]) -> "Measured":
         """Return them where the first three of `worst` are known."""
-        primal, dual, gap = (_largest(jnp.abs(values)) for values, *_ in terms)
-        return cls(primal, dual, gap, largest_of(above[:3]) <= eps)
+        primal, dual, gap = (infinity_norm(values) for values, *_ in terms)
+        return cls(primal, dual, gap, reduce(jnp.maximum, above[:3]) <= eps)
 
 
 @pytree
@@ -240,27 +209,21 @@ class Pair:
         return replace(best, finished=best.finished | self.near)
 
 
-class PairCheck(NamedTuple):
-    """What residuals say of a pair: its fields of these names."""
-
-    measured: Measured
-    error: Array
-    near: Array
-    finished: Array
-
-
-def check_terms(terms: Terms, eps: Array, floor: float, others: Terms = ()) -> PairCheck:
-    """Return what the terms say of a pair; eps and floor as in `Measured`.
+def check_terms(
+    terms: Terms, eps: Array, floor: float, others: Terms = ()
+) -> tuple[Measured, Array, Array, Array]:
+    """Return `measured`, `error`, `near` and `finished` of the pair with these terms; eps and floor
+    as in `Measured`.
 
     near: all residuals are below a small part of their tolerance (NEAR), or below a tenth and a
     small multiple of their rounding. finished: below a tenth of that part. others: terms that count
     for these alone."""
     ratios, relatives = worst([*terms, *others], floor)
-    above, relative = largest_of(ratios), largest_of(relatives)
+    above, relative = reduce(jnp.maximum, ratios), reduce(jnp.maximum, relatives)
     at_rounding = (relative <= STALLED * floor) & (above <= 0.1 * eps)
     near = (above <= NEAR * eps) | at_rounding
     measured = Measured.from_ratios(terms, eps, ratios)
-    return PairCheck(measured, above, near, above <= 0.1 * NEAR * eps)
+    return measured, above, near, above <= 0.1 * NEAR * eps
 
 
 @pytree
@@ -348,8 +311,8 @@ def farkas(
     noise = gamma * matmul(jnp.abs(y), jnp.abs(qp.A))
     support = bounds.support(y)
     # What the correction leaves of A'y meets at most |z| ≤ bound / |pivot|.
-    reach = jnp.where(has_row, bound / jnp.abs(pivot), jnp.where(left <= noise, 0.0, jnp.inf))
-    leak = jnp.where(reach > 0, (2 * left + noise) * reach, 0.0)
+    z_max = jnp.where(has_row, bound / jnp.abs(pivot), jnp.where(left <= noise, 0.0, jnp.inf))
+    leak = jnp.where(z_max > 0, (2 * left + noise) * z_max, 0.0)
     bound = jnp.sum(jnp.concatenate([support + gamma * jnp.abs(support), leak]))
     proved, beyond = bound < 0, bound + jnp.sum(tolerances * jnp.abs(y)) < 0
     return jnp.where(proved, y, 0.0), proved, beyond
@@ -357,7 +320,7 @@ def farkas(
 
 def to_length_one(v: Array) -> Array:
     """Return v divided by its infinity norm; 0 stays 0."""
-    length = jnp.max(jnp.abs(v), initial=0.0)
+    length = infinity_norm(v)
     return v / jnp.where(length > 0, length, 1.0)
 
 

@@ -1,9 +1,12 @@
-"""solve_qp: ADMM, then Newton steps (`newton.py`), status from residuals and certificates,
-implicit derivative."""
+"""Solve a quadratic program: factorise, ADMM, Newton steps, status, cost, derivative.
+
+The functions stand in the order in which a call comes to them; then what prepares the data, a solve
+from known multipliers, and the margin of feasibility, which is the value of a program.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 from operator import attrgetter
 from typing import Any, TypeVar
 
@@ -20,31 +23,25 @@ from jaxmpc.qp.admm import (
     DEFAULT,
     Factor,
     ScaledProgram,
-    factor,
+    factorise,
     harmless_matrices,
     iterate,
     nearer,
     read,
-    scaled_rows,
-    splitting,
     splittings,
     start,
-    unscaled,
 )
 from jaxmpc.qp.admm_kernel import iterate_batch, suits
 from jaxmpc.qp.derivative import dense_conditions
 from jaxmpc.qp.dual import has_dual_steps, solve_dual
-from jaxmpc.qp.linalg import arrays, floating_dtype, matmul, precisely, symmetric
-from jaxmpc.qp.newton import Improved, MultiplierState, improve, multipliers_start, multipliers_step
-from jaxmpc.qp.problem import QP, Bounds, QPSolution
+from jaxmpc.qp.linalg import arrays, cast, floating_dtype, matmul, precisely, symmetric
+from jaxmpc.qp.newton import MultiplierState, improve, multipliers_start, multipliers_step
+from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.residuals import (
-    Natural,
     Pair,
     Proof,
-    Terms,
     assess,
     correcting_rows,
-    largest_of,
     prove,
     residual_terms,
     row_sizes,
@@ -53,7 +50,7 @@ from jaxmpc.qp.residuals import (
     worst,
 )
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.transformations import implicit, in_blocks, own_modes, varying
+from jaxmpc.qp.transformations import has_kernels, implicit, in_blocks, own_modes, varying
 from jaxmpc.qp.triton import EXACT, ROUGH, Product
 
 T = TypeVar("T")
@@ -94,8 +91,136 @@ def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: WarmPair = None) -> QPS
 @partial(jax.jit, static_argnames="whole")
 @own_modes
 def _solve(qp: QP, solver: ADMM, warm_start: WarmPair, *, whole: bool) -> QPSolution:
-    made = factor(qp.P, qp.A, solver, qp.balls)
+    made = factorise(qp.P, qp.A, solver, qp.balls)
     return with_fault(*solve_factored(qp, made, solver, warm_start, whole=whole))
+
+
+def solve_factored(
+    qp: QP, factor: Factor, solver: ADMM, warm_start: WarmPair = None, *, whole: bool = True
+) -> tuple[QPSolution, Array]:
+    """`solve_qp` after its factorization: what a controller repeats at each sample.
+
+    whole: False leaves out the method of multipliers and proofs, and ADMM after a warm start
+    (`in_two_parts`).
+    Returns the solution and the fault of the data, NOT_RUN for none. Where there is one the
+    solution is that of harmless data: `with_fault` says so, after all that is computed from it, for
+    the derivative of a product with NaN is NaN even where nobody looks at it.
+    """
+    clean, fault = cleaned(qp, factor.fault)
+    if not whole and warm_start is not None:
+        solver = replace(solver, iterations=0)
+    if solver.differentiate == "implicit":
+        constants = jax.lax.stop_gradient((clean, factor, solver, warm_start))
+        found = search(*constants, whole)
+        z, y = implicit(dense_conditions, clean, (constants[1], solver.smoothing), found.z, found.y)
+    else:
+        found = search(clean, factor, solver, warm_start, whole)
+        z, y = found.z, found.y
+    steps = jnp.int32(solver.admm_steps(warm_start is not None))
+    return replace(found, z=z, y=y, cost=value(clean, z, y), iterations=steps), fault
+
+
+def search(
+    qp: QP, factor: Factor, solver: ADMM, warm_start: WarmPair, whole: bool = True
+) -> QPSolution:
+    """Return the solution of clean data by ADMM and Newton steps, with its status, without its cost
+    and count of iterations. whole: see `in_two_parts`."""
+    p = ScaledProgram.of(qp, factor, tolerance(solver, qp.q.dtype))
+    most, unrolled = solver.most_newton_steps(), solver.differentiate == "unrolled"
+    begin = admm_end(p, solver, warm_start, refined=most > 0 and not unrolled)
+    if most and not unrolled:
+        return refined_end(p, solver, begin, whole)
+    return stepped_end(p, begin, most)
+
+
+def admm_end(
+    p: ScaledProgram, solver: ADMM, warm_start: WarmPair, *, refined: bool
+) -> MultiplierState:
+    """Return where the steps of ADMM end, as the state at which Newton steps begin. refined: these
+    follow, are in float64, and make up for rough products."""
+    q, bounds, factor = p.q, p.bounds, p.factor
+    t = jnp.zeros_like(bounds.l)
+    if warm_start is not None:
+        t = nearer(splittings(factor, q)[0], bounds, warm(p, warm_start))
+    own = q.dtype
+    dtype = jnp.dtype(solver.dtype or ("float32" if refined else own))
+    steps = solver.admm_steps(warm_start is not None)
+    product = ROUGH if refined else EXACT
+    constants, data = cast(((factor, jnp.asarray(solver.alpha)), (q, bounds, t)), dtype)
+    if solver.differentiate == "unrolled":
+        ends = loop(steps, constants, data)
+    else:
+        fits = has_kernels(len(t)) and suits(factor, p.qp.balls, dtype, product)
+        kernel = partial(loop_kernel, steps, product) if fits else None
+        ends = in_blocks(partial(loop, steps), constants, data, kernel=kernel)
+    (w, y), (w_old, y_old) = cast(ends, own)
+    return replace(multipliers_start(q, w, y), change=y - y_old, move=w - w_old)
+
+
+def loop(iterations: int, constants: tuple, data: tuple) -> list[tuple[Array, Array]]:
+    """Scaled w (n,) and y (m,) after `iterations` steps of ADMM from t (m,), and one step before.
+    constants: the factor and alpha; data: q, bounds, t."""
+    (factor, alpha), (q, bounds, t) = constants, data
+    ends = iterate(splittings(factor, q), bounds, t, iterations, alpha)
+    return [read(factor, t, q, bounds) for t in ends]
+
+
+def loop_kernel(
+    iterations: int, product: Product, constants: tuple, data: tuple
+) -> list[tuple[Array, Array]]:
+    """`loop` of a batch, as a kernel for NVIDIA GPUs; B in front of all leaves of `data`."""
+    (factor, alpha), (q, bounds, t) = constants, data
+    ends = iterate_batch(factor, alpha, q, bounds, t, iterations, product)
+    return [jax.vmap(partial(read, factor))(t, q, bounds) for t in ends]
+
+
+def refined_end(p: ScaledProgram, solver: ADMM, begin: MultiplierState, whole: bool) -> QPSolution:
+    """Return the solution by Newton steps in float64 (`newton.py`)."""
+    single, settings = p.q.dtype != jnp.float64, (solver.most_newton_steps(), solver.fixed, whole)
+    improved = lambda p, begin: improve(*settings, p.unrounded() if single else p, begin)
+    pair, proof, ended, idle = precisely(improved, p, begin)
+    found = with_status(pair.measured, pair.z, pair.y, proof)
+    unsolved = found.status == Status.ITERATION_LIMIT
+    status = jnp.where(unsolved & idle, jnp.int32(Status.INACCURATE), found.status)
+    return replace(found, status=jnp.where(ended, status, jnp.int32(Status.ITERATION_LIMIT)))
+
+
+def stepped_end(p: ScaledProgram, begin: MultiplierState, most: int) -> QPSolution:
+    """Return the solution by a fixed number of Newton steps, which may be 0, in the type of the
+    data: differentiable step by step."""
+    qp, factor, q, bounds = p.qp, p.factor, p.q, p.bounds
+    pair, end = p.unscaled(begin.w, begin.y), begin
+    if most:
+        advance = lambda s, _: (multipliers_step(factor.H, q, factor.A, bounds, s), None)
+        end = lax.scan(advance, varying(begin, begin), length=most)[0]
+        other = p.unscaled(end.w, end.y)
+        error = lambda z, y: reduce(jnp.maximum, worst(residual_terms(qp, z, y), 0.0)[1])
+        better = lax.stop_gradient(error(*other) < error(*pair))
+        pair = jax.tree.map(lambda old, new: jnp.where(better, new, old), pair, other)
+    sizes = p.typical_sizes(end.w, end.y)
+    allowed = p.eps * row_sizes(0.0, qp.row_sizes, sizes)
+    certified = partial(prove, qp, factor.T, factor.E, correcting_rows(qp), allowed)
+    proof = certified(end.change, end.move).joined(certified(end.y, end.w))
+    terms = lambda qp, sizes, z, y: residual_terms(qp, z, y, sizes)
+    return assess(terms, (qp, sizes), *pair, proof, p.eps)
+
+
+def value(qp: QP, z: Array, y: Array) -> Array:
+    """The cost at z, with the derivative of the optimal value: that of the Lagrangian
+    ½ z'Pz + q'z + y'Az − g*(y) at (z, y) (envelope theorem). Penalties that are being paid stand
+    there as themselves, for at |y| = c the conjugate of an L1 penalty has no derivative."""
+    own = 0.5 * jnp.sum(z * matmul(z, qp.P)) + jnp.sum(qp.q * z)
+    Az, bounds = matmul(z, qp.A.T), qp.bounds
+    cost = jnp.sum(bounds.cost(Az))
+    if bounds.linear is None:
+        lagrangian = own + jnp.sum(y * Az - bounds.support(y))
+    else:
+        paid = jnp.isfinite(bounds.linear) & (jnp.abs(y) >= bounds.linear)
+        y = jnp.where(paid, 0.0, y)
+        penalty = replace(bounds, linear=jnp.where(paid, bounds.linear, jnp.inf)).cost(Az)
+        lagrangian = own + jnp.sum(penalty + y * Az - bounds.support(y))
+    fixed = jax.lax.stop_gradient
+    return fixed(own + cost) + (lagrangian - fixed(lagrangian))
 
 
 def in_two_parts(
@@ -128,152 +253,6 @@ def as_arrays(qp: QP) -> QP:
     l = jnp.where(qp.l <= -INFINITE, -jnp.inf, qp.l)
     u = jnp.where(qp.u >= INFINITE, jnp.inf, qp.u)
     return replace(qp, P=symmetric(qp.P), l=l, u=u)
-
-
-def solve_factored(
-    qp: QP, factor: Factor, solver: ADMM, warm_start: WarmPair = None, *, whole: bool = True
-) -> tuple[QPSolution, Array]:
-    """`solve_qp` after its factorization: what a controller repeats at each sample.
-
-    whole: False leaves out the method of multipliers and proofs, and ADMM after a warm start
-    (`in_two_parts`).
-    Returns the solution and the fault of the data, NOT_RUN for none. Where there is one the
-    solution is that of harmless data: `with_fault` says so, after all that is computed from it, for
-    the derivative of a product with NaN is NaN even where nobody looks at it.
-    """
-    clean, fault = cleaned(qp, factor.fault)
-    if not whole and warm_start is not None:
-        solver = replace(solver, iterations=0)
-    if solver.differentiate == "implicit":
-        constants = jax.lax.stop_gradient((clean, factor, solver, warm_start))
-        found = search(*constants, whole)
-        z, y = implicit(dense_conditions, clean, (constants[1], solver.smoothing), found.z, found.y)
-    else:
-        found = search(clean, factor, solver, warm_start, whole)
-        z, y = found.z, found.y
-    steps = jnp.int32(solver.admm_steps(warm_start is not None))
-    return replace(found, z=z, y=y, cost=value(clean, z, y), iterations=steps), fault
-
-
-def solve_from(
-    qp: QP, factor: Factor, solver: ADMM, y: Array, steps: int
-) -> tuple[QPSolution, Array]:
-    """`solve_factored` by `steps` steps on the dual from multipliers y (m,) in ADMM's coordinates:
-    SOLVED, or ITERATION_LIMIT, at once where y is not finite. Without a step, for multipliers of
-    the solution, nothing is measured yet: ITERATION_LIMIT. For hard rows, without balls, in
-    float64; not differentiable."""
-    clean, fault = cleaned(qp, factor.fault)
-    p = ScaledProgram.of(clean, factor, tolerance(solver, qp.q.dtype))
-    proof, usable = Proof.none(p.q, p.bounds.l), jnp.all(jnp.isfinite(y))
-    y = p.bounds.admissible(jnp.where(usable, y / p.unit, 0.0))
-    if not steps:
-        z, y = unscaled(clean, factor, p.unit, -p.q - matmul(y, factor.A), y)
-        return with_status(Pair.none(z, y).measured, z, y, proof), fault
-    pair, _ = solve_dual(p, y, usable & ~factor.flat, steps)
-    return with_status(pair.measured, pair.z, pair.y, proof), fault
-
-
-def search(
-    qp: QP, factor: Factor, solver: ADMM, warm_start: WarmPair, whole: bool = True
-) -> QPSolution:
-    """Return the solution of clean data by ADMM and Newton steps, with its status, without its cost
-    and count of iterations. whole: see `in_two_parts`."""
-    p = ScaledProgram.of(qp, factor, tolerance(solver, qp.q.dtype))
-    most, unrolled = solver.most_newton_steps(), solver.differentiate == "unrolled"
-    begin = admm_end(p, solver, warm_start, refined=most > 0 and not unrolled)
-    if most and not unrolled:
-        return refined_end(p, solver, begin, whole)
-    return stepped_end(p, begin, most)
-
-
-def admm_end(
-    p: ScaledProgram, solver: ADMM, warm_start: WarmPair, *, refined: bool
-) -> MultiplierState:
-    """Return where the steps of ADMM end, as the state at which Newton steps begin. refined: these
-    follow, are in float64, and make up for rough products."""
-    q, bounds, unit, factor = p.q, p.bounds, p.unit, p.factor
-    t = jnp.zeros_like(bounds.l)
-    if warm_start is not None:
-        t = warm(factor, p.qp, unit, bounds, warm_start)
-        t = nearer(splitting(factor, q, 0), bounds, t)
-    own = q.dtype
-    dtype = jnp.dtype(solver.dtype or ("float32" if refined else own))
-    steps = solver.admm_steps(warm_start is not None)
-    product = ROUGH if refined else EXACT
-    constants, data = cast(((factor, jnp.asarray(solver.alpha)), (q, bounds, t)), dtype)
-    if solver.differentiate == "unrolled":
-        ends = loop(steps, constants, data)
-    else:
-        fits = suits(factor, p.qp.balls, dtype, product)
-        kernel = partial(loop_kernel, steps, product) if fits else None
-        ends = in_blocks(partial(loop, steps), constants, data, kernel=kernel)
-    (w, y), (w_old, y_old) = cast(ends, own)
-    return replace(multipliers_start(q, w, y), change=y - y_old, move=w - w_old)
-
-
-def cast(tree: T, dtype: DTypeLike) -> T:
-    """Return the tree with floating leaves of this type."""
-    floating = lambda v: jnp.issubdtype(v.dtype, jnp.floating)
-    return jax.tree.map(lambda v: v.astype(dtype) if floating(v) else v, tree)
-
-
-def refined_end(p: ScaledProgram, solver: ADMM, begin: MultiplierState, whole: bool) -> QPSolution:
-    """Return the solution by Newton steps in float64 (`newton.py`)."""
-    single, most = p.q.dtype != jnp.float64, solver.most_newton_steps()
-
-    def polish(p: ScaledProgram, begin: MultiplierState) -> Improved:
-        return improve(most, solver.fixed, whole, p.unrounded() if single else p, begin)
-
-    pair, proof, ended, idle = precisely(polish, p, begin)
-    found = with_status(pair.measured, pair.z, pair.y, proof)
-    unsolved = found.status == Status.ITERATION_LIMIT
-    status = jnp.where(unsolved & idle, jnp.int32(Status.INACCURATE), found.status)
-    return replace(found, status=jnp.where(ended, status, jnp.int32(Status.ITERATION_LIMIT)))
-
-
-def stepped_end(p: ScaledProgram, begin: MultiplierState, most: int) -> QPSolution:
-    """Return the solution by a fixed number of Newton steps, which may be 0, in the type of the
-    data: differentiable step by step."""
-    qp, factor, q, bounds = p.qp, p.factor, p.q, p.bounds
-    pair, end = unscaled(qp, factor, p.unit, begin.w, begin.y), begin
-    if most:
-        advance = lambda s, _: (multipliers_step(factor.H, q, factor.A, bounds, s), None)
-        end = lax.scan(advance, varying(begin, begin), length=most)[0]
-        pair = better(qp, pair, unscaled(qp, factor, p.unit, end.w, end.y))
-    sizes = p.natural(end.w, end.y)
-    allowed = p.eps * row_sizes(0.0, qp.row_sizes, sizes)
-    certified = partial(prove, qp, factor.T, factor.E, correcting_rows(qp), allowed)
-    proof = certified(end.change, end.move).joined(certified(end.y, end.w))
-    return assess(terms_beside, (qp, sizes), *pair, proof, p.eps)
-
-
-def terms_beside(qp: QP, natural: Natural, z: Array, y: Array) -> Terms:
-    """Return `residual_terms` with the data in front."""
-    return residual_terms(qp, z, y, natural)
-
-
-def loop(iterations: int, constants: tuple, data: tuple) -> list[tuple[Array, Array]]:
-    """Scaled w (n,) and y (m,) after `iterations` steps of ADMM from t (m,), and one step before.
-    constants: the factor and alpha; data: q, bounds, t."""
-    (factor, alpha), (q, bounds, t) = constants, data
-    ends = iterate(splittings(factor, q), bounds, t, iterations, alpha)
-    return [read(factor, t, q, bounds) for t in ends]
-
-
-def loop_kernel(
-    iterations: int, product: Product, constants: tuple, data: tuple
-) -> list[tuple[Array, Array]]:
-    """`loop` of a batch, as a kernel for NVIDIA GPUs; B in front of all leaves of `data`."""
-    (factor, alpha), (q, bounds, t) = constants, data
-    ends = iterate_batch(factor, alpha, q, bounds, t, iterations, product)
-    return [jax.vmap(partial(read, factor))(t, q, bounds) for t in ends]
-
-
-def better(qp: QP, pair: tuple[Array, Array], other: tuple[Array, Array]) -> tuple:
-    """Return the one of two pairs (z, y) with the smaller largest relative residual."""
-    error = lambda z, y: largest_of(worst(residual_terms(qp, z, y), 0.0)[1])
-    take = lax.stop_gradient(error(*other) < error(*pair))
-    return tuple(jnp.where(take, b, a) for a, b in zip(pair, other, strict=True))
 
 
 def cleaned(qp: QP, matrix_fault: Array) -> tuple[QP, Array]:
@@ -315,13 +294,12 @@ def cleaned(qp: QP, matrix_fault: Array) -> tuple[QP, Array]:
     return replace(qp, P=P, A=A, **fields), fault
 
 
-def warm(factor: Factor, qp: QP, unit: Array, bounds: Bounds, warm_start: WarmPair) -> Array:
+def warm(p: ScaledProgram, warm_start: WarmPair) -> Array:
     """Return t (m,) of a warm start, a pair z (n,), y (m,) or a solution; what is not finite counts
-    as 0. bounds: in ADMM's coordinates, which are measured in `unit`. Raises ValueError for other
-    shapes."""
-    z, y = require_warm_start(qp, warm_start)
-    clean = lambda v: jnp.nan_to_num(jnp.asarray(v, qp.q.dtype), posinf=0.0, neginf=0.0)
-    return start(bounds, factor.rho[0], *scaled_rows(factor, qp, unit, clean(z), clean(y)))
+    as 0. Raises ValueError for other shapes."""
+    z, y = require_warm_start(p.qp, warm_start)
+    clean = lambda v: jnp.nan_to_num(jnp.asarray(v, p.q.dtype), posinf=0.0, neginf=0.0)
+    return start(p.bounds, p.factor.rho[0], *p.scaled_rows(clean(z), clean(y)))
 
 
 def require_warm_start(qp: QP, warm_start: Any) -> tuple[Reals, Reals]:
@@ -335,27 +313,27 @@ def require_warm_start(qp: QP, warm_start: Any) -> tuple[Reals, Reals]:
     return pair[0], pair[1]
 
 
-def value(qp: QP, z: Array, y: Array) -> Array:
-    """The cost at z, with the derivative of the optimal value: that of the Lagrangian
-    ½ z'Pz + q'z + y'Az − g*(y) at (z, y) (envelope theorem). Penalties that are being paid stand
-    there as themselves, for at |y| = c the conjugate of an L1 penalty has no derivative."""
-    own = 0.5 * jnp.sum(z * matmul(z, qp.P)) + jnp.sum(qp.q * z)
-    Az, bounds = matmul(z, qp.A.T), qp.bounds
-    cost = jnp.sum(bounds.cost(Az))
-    if bounds.linear is None:
-        lagrangian = own + jnp.sum(y * Az - bounds.support(y))
-    else:
-        paid = jnp.isfinite(bounds.linear) & (jnp.abs(y) >= bounds.linear)
-        y = jnp.where(paid, 0.0, y)
-        penalty = replace(bounds, linear=jnp.where(paid, bounds.linear, jnp.inf)).cost(Az)
-        lagrangian = own + jnp.sum(penalty + y * Az - bounds.support(y))
-    fixed = jax.lax.stop_gradient
-    return fixed(own + cost) + (lagrangian - fixed(lagrangian))
-
-
 def tolerance(solver: ADMM, dtype: DTypeLike) -> Array:
     """Return the relative tolerance that `solver` asks for."""
     return jnp.asarray(solver.eps, dtype)
+
+
+def solve_from(
+    qp: QP, factor: Factor, solver: ADMM, y: Array, steps: int
+) -> tuple[QPSolution, Array]:
+    """`solve_factored` by `steps` steps on the dual from multipliers y (m,) in ADMM's coordinates:
+    SOLVED, or ITERATION_LIMIT, at once where y is not finite. Without a step, for multipliers of
+    the solution, nothing is measured yet: ITERATION_LIMIT. For hard rows, without balls, in
+    float64; not differentiable."""
+    clean, fault = cleaned(qp, factor.fault)
+    p = ScaledProgram.of(clean, factor, tolerance(solver, qp.q.dtype))
+    proof, usable = Proof.none(p.q, p.bounds.l), jnp.all(jnp.isfinite(y))
+    y = p.bounds.admissible(jnp.where(usable, y / p.unit, 0.0))
+    if not steps:
+        z, y = p.unscaled(-p.q - matmul(y, factor.A), y)
+        return with_status(Pair.none(z, y).measured, z, y, proof), fault
+    pair, _ = solve_dual(p, y, usable & ~factor.flat, steps)
+    return with_status(pair.measured, pair.z, pair.y, proof), fault
 
 
 def feasibility_margin(

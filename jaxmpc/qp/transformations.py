@@ -37,15 +37,15 @@ F = TypeVar("F", bound=Callable[..., Any])
 Undo = Callable[[Any], tuple[Array, Array]]
 Conditions = Callable[[Any, Any, Array, Array], tuple[Callable[[Any], Any], Undo]]
 # Of a loop: see `repeat_while`.
-Steps = Literal["short", "long", "stages"]
+Steps = Literal["short", "long", "recursion"]
 # Instances in a block on a CPU, whose data stay within the cache. (On GPUs blocks gain nothing.)
 BLOCK = 128
 # Instances in a group on a CPU at most, and when fewer are open; small batches are one group.
 PART_CPU, FEW_CPU, SMALL_CPU = 512, 64, 128
-# The same of loops with long steps, or that few instances of a batch enter; then of those over
-# stages, always so many. (64 arms of 7 joints for 1 s: 1.23 s in groups of 32, 1.11 of 16, 1.17
-# of 8.)
-LONG_PART_CPU, LONG_FEW_CPU, STAGES_CPU = 64, 8, 16
+# The same of loops with long steps, or that few instances of a batch enter; then of recursions
+# over a horizon, always so many. (64 arms of 7 joints for 1 s: 1.23 s in groups of 32, 1.11 of 16,
+# 1.17 of 8.)
+LONG_PART_CPU, LONG_FEW_CPU, RECURSION_CPU = 64, 8, 16
 # Instances in a group elsewhere: a quarter of the batch; when fewer are open a sixteenth of that,
 # and so on, but not below LEAST, where a step costs little more than its launches. (H100,
 # TurboMPC's problem, 4,096 at once: 2.6 µs a solve in one group, 1.6 in groups of 512, 1.2 of 1,024
@@ -137,14 +137,14 @@ def group_sizes(batch: int, steps: Steps = "short") -> list[int]:
     if not isinstance(batch, int):
         return [batch]
     if jax.default_backend() == "cpu":
-        if steps == "stages":
-            return [min(batch, STAGES_CPU)]
+        if steps == "recursion":
+            return [min(batch, RECURSION_CPU)]
         if steps == "long":
             return [batch] if batch <= LONG_PART_CPU else [LONG_PART_CPU, LONG_FEW_CPU]
         return [batch] if batch <= SMALL_CPU else [min(batch, PART_CPU), FEW_CPU]
     if batch <= PART * LEAST:
         return [batch]
-    sizes = [batch if steps == "stages" else -(-batch // PART)]
+    sizes = [batch if steps == "recursion" else -(-batch // PART)]
     while sizes[-1] > LEAST:
         sizes.append(max(-(-sizes[-1] // SMALLER), LEAST))
     return sizes
@@ -169,7 +169,7 @@ def in_blocks(
     @own_modes
     def _(size: int, in_batched: tuple, constants: C, data: S) -> tuple[R, Any]:
         axes = jax.tree.map(lambda b: 0 if b else None, in_batched[0])
-        data = _broadcast(size, in_batched[1], data)
+        data = broadcast(size, in_batched[1], data)
         together = jax.vmap(function, in_axes=(axes, 0))
 
         def blocks(block: int, constants: C, data: S) -> R:
@@ -183,10 +183,11 @@ def in_blocks(
 
         small = not isinstance(size, int) or (size <= BLOCK and kernel is None)
         if any(jax.tree.leaves(in_batched[0])) or small:
-            return _batched(together(constants, data))
+            return all_batched(together(constants, data))
         others = {} if kernel is None else {"cuda": kernel}
         cpu, default = partial(blocks, BLOCK), partial(blocks, large or size)
-        return _batched(lax.platform_dependent(constants, data, cpu=cpu, default=default, **others))
+        out = lax.platform_dependent(constants, data, cpu=cpu, default=default, **others)
+        return all_batched(out)
 
     return one(constants, data)
 
@@ -202,9 +203,9 @@ def repeat_while(
 
     The functions must close over no arrays: what they read stands in `constants`. One instance is
     one `while_loop`. A batch, also one of nested `vmap`s, is worked off in groups (top of this
-    file). steps: "long" where a step takes long or few instances are open at first; "stages" where
-    it is a recursion over stages, which on a GPU takes as long for 4,096 instances as for 1,024.
-    Not differentiable.
+    file). steps: "long" where a step takes long or few instances are open at first; "recursion"
+    where it is one over the stages of a horizon, which on a GPU takes as long for 4,096 instances
+    as for 1,024. Not differentiable.
     """
     one = lambda constants, state: lax.while_loop(is_open, lambda s: step(constants, s), state)
     single, state = custom_vmap(one), varying(state, (constants, state))
@@ -214,9 +215,9 @@ def repeat_while(
     def _(size: int, in_batched: tuple, constants: C, state: S) -> tuple[S, Any]:
         leaves, tree = jax.tree.flatten(constants)
         batched = tuple(jax.tree.leaves(in_batched[0]))
-        state = _broadcast(size, in_batched[1], state)
+        state = broadcast(size, in_batched[1], state)
         advance = lambda leaves, state: step(jax.tree.unflatten(tree, leaves), state)
-        return _batched(_in_groups(is_open, advance, batched, steps)(tuple(leaves), state))
+        return all_batched(_in_groups(is_open, advance, batched, steps)(tuple(leaves), state))
 
     return single(constants, state)
 
@@ -263,11 +264,11 @@ def _in_groups(
     @own_modes
     def _(size: int, in_batched: tuple, leaves: tuple, state: S) -> tuple[S, Any]:
         outer = in_batched[0]
-        state = _broadcast(size, in_batched[1], state)
+        state = broadcast(size, in_batched[1], state)
         if any(o and not b for o, b in zip(outer, batched, strict=True)):
             # Each outer instance has constants that its inner batch shares: copies would not fit.
             axes = tuple(0 if o else None for o in outer)
-            return _batched(jax.vmap(run, in_axes=(axes, 0))(leaves, state))
+            return all_batched(jax.vmap(run, in_axes=(axes, 0))(leaves, state))
         inner = jax.tree.leaves(state)[0].shape[1]
         merged = lambda v: v.reshape(size * inner, *v.shape[2:])
         flat = tuple(
@@ -275,12 +276,12 @@ def _in_groups(
             for v, b, o in zip(leaves, batched, outer, strict=True)
         )
         out = batch(flat, jax.tree.map(merged, state))
-        return _batched(jax.tree.map(lambda v: v.reshape(size, inner, *v.shape[1:]), out))
+        return all_batched(jax.tree.map(lambda v: v.reshape(size, inner, *v.shape[1:]), out))
 
     return batch
 
 
-def _batched(out: R) -> tuple[R, Any]:
+def all_batched(out: R) -> tuple[R, Any]:
     """Return what a rule of batching does: the results, and that all of them are batched."""
     return out, jax.tree.map(lambda _: True, out)
 
@@ -299,7 +300,7 @@ def true_places(mask: Array, size: int) -> Array:
     return jnp.full(size, m, jnp.int32).at[place].set(np.arange(m, dtype=np.int32), mode="drop")
 
 
-def _broadcast(size: int, batched: Any, tree: S) -> S:
+def broadcast(size: int, batched: Any, tree: S) -> S:
     """Return the tree with `size` copies, in front, of each leaf that is not `batched`."""
     give = lambda v, b: v if b else jnp.broadcast_to(v, (size, *jnp.shape(v)))
     return jax.tree.map(give, tree, batched)
@@ -312,7 +313,7 @@ def implicit(
     """Return the solution (z, y), given as constants, with its derivatives with respect to `data`.
 
     conditions_of(data, constants, z, y) gives the optimality conditions as a function of the data
-    alone, with z, y and the active set held fixed, and the function that maps a change of them to
+    alone, with z, y and the active set fixed, and the function that maps a change of them to
     the change of (z, y) that undoes it.
     """
     return z, y
@@ -329,6 +330,6 @@ def _implicit_jvp(conditions_of: Conditions, primals: tuple, tangents: tuple) ->
         conditions, undo = conditions_of(data, constants, z, y)
         return undo(jax.jvp(conditions, (data,), (change,))[1])
 
-    # Going backward, all but these arguments is computed then: held, it would be several times as
-    # much for each solve of a closed loop.
+    # Going backward, all but these arguments is computed then: kept, it would be several times as
+    # much memory for each solve of a closed loop.
     return (z, y), jax.checkpoint(moved)(data, constants, z, y, tangents[0])

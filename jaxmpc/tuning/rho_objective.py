@@ -24,9 +24,9 @@ from jax import Array
 from jaxmpc.batches import Compiled, Devices, divisible, each_part, over_devices
 from jaxmpc.mpc.condense import Condensed
 from jaxmpc.pytrees import pytree
-from jaxmpc.qp.admm import ADMM, factor, iterate, natural, read, scaled, splittings, unscaled
+from jaxmpc.qp.admm import ADMM, ScaledProgram, factorise, iterate, read, splittings
 from jaxmpc.qp.problem import QP
-from jaxmpc.qp.residuals import joined, residual_terms, with_fault
+from jaxmpc.qp.residuals import residual_terms, with_fault
 from jaxmpc.qp.solve import solve_factored, warm
 from jaxmpc.qp.status import Status
 from jaxmpc.tuning.batch_mean import BatchMean
@@ -71,22 +71,23 @@ class PenaltyObjective:
         """Return e (B,): log10 of the norm of all residuals over their tolerances."""
         rho, alpha = jnp.exp(theta["log_rho"] @ self.W.T), 2 * jax.nn.sigmoid(theta["alpha"])
         solver, c = replace(self.solver, rho=rho, alpha=alpha), self.condensed
-        made = factor(c.P, c.C, solver, c.balls)
+        made = factorise(c.P, c.C, solver, c.balls)
         eps = solver.eps
 
         def one(sample: Samples) -> Array:
             qp = self.qp(sample.x)
-            q, bounds, unit = scaled(made, qp)
+            p = ScaledProgram.of(qp, made)
             t = jnp.zeros_like(qp.l)
             if sample.start is not None:
-                t = warm(made, qp, unit, bounds, sample.start)
-            t, _ = iterate(splittings(made, q), bounds, t, solver.admm_steps(), solver.alpha)
-            w, y = read(made, t, q, bounds)
-            of_all = natural(made, unit, q, bounds, w, y)
-            z, y = unscaled(qp, made, unit, w, y)
+                t = warm(p, sample.start)
+            t, _ = iterate(splittings(made, p.q), p.bounds, t, solver.admm_steps(), solver.alpha)
+            w, y = read(made, t, p.q, p.bounds)
+            typical = p.typical_sizes(w, y)
+            z, y = p.unscaled(w, y)
             floor = 100 * jnp.finfo(z.dtype).eps
             # A quarter of the rounding stays, for the sake of the logarithm's slope at 0.
-            values, sizes, terms = joined(residual_terms(qp, z, y, natural=of_all))
+            parts = zip(*residual_terms(qp, z, y, typical), strict=True)
+            values, sizes, terms = map(jnp.concatenate, parts)
             allowed = eps * sizes + floor * (sizes + terms)
             squares = jnp.sum((values / jnp.where(allowed > 0, allowed, 1.0)) ** 2)
             return 0.5 * jnp.log10((floor / 4) ** 2 + squares)
@@ -140,7 +141,7 @@ def _solve_batch(
 ) -> tuple[Array, Array]:
     """Return status and largest residual (B,) of a batch, in JAX."""
     c, solver = objective.condensed, replace(objective.solver, rho=rho, alpha=alpha)
-    made = factor(c.P, c.C, solver, c.balls)
+    made = factorise(c.P, c.C, solver, c.balls)
 
     def one(sample: Samples) -> tuple[Array, Array]:
         s = with_fault(*solve_factored(objective.qp(sample.x), made, solver, sample.start))

@@ -18,7 +18,7 @@ from jaxmpc.mpc.aim import checked_array
 from jaxmpc.mpc.condense import Condensed, condensed_in_float64
 from jaxmpc.mpc.plan import Plan, WarmStart
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.qp.admm import ADMM, factor
+from jaxmpc.qp.admm import ADMM, factorise
 from jaxmpc.qp.status import Status
 from jaxmpc.tuning.descent import descend
 from jaxmpc.tuning.result import TuningRun, cached
@@ -93,7 +93,7 @@ def tune_solver(
     given, c = replace(solver, iterations=iterations), objective.condensed
     if solver.rho is None:
         with jax.enable_x64(True):
-            given = replace(given, rho=float(factor(c.P, c.C, solver, c.balls).rho[0, 0]))
+            given = replace(given, rho=float(factorise(c.P, c.C, solver, c.balls).rho[0, 0]))
     decides: dict[str, Any] = {
         "version": VERSION,
         "iterations": int(iterations),

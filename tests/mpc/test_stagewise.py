@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import enable_x64
-from problems import rows_of, symmetric
+from problems import residuals, rows_of, symmetric
 
 import jaxmpc as jm
 from jaxmpc.mpc.aim import Aim
@@ -17,7 +17,6 @@ from jaxmpc.mpc.plan import WarmStart
 from jaxmpc.mpc.stagewise import interior_point, solve, stages
 from jaxmpc.mpc.stagewise.solve import factor_stages, plan_stages, solve_stagewise
 from jaxmpc.qp import admm
-from jaxmpc.qp.residuals import residuals
 
 N, n, m = 8, 3, 2
 SOLVER = jm.ADMM(iterations=20, newton_steps=5)  # ADMM alone leaves 1e-3
@@ -115,7 +114,7 @@ def test_iterates_are_those_of_the_dense_solver(kind):
     # Two penalties a row, one after the other.
     rho = np.stack([np.geomspace(0.3, 3, count), np.geomspace(5, 0.5, count)])
     settings = jm.ADMM(iterations=50, rho=rho)
-    dense = admm.factor(qp.P, qp.A, settings)
+    dense = admm.factorise(qp.P, qp.A, settings)
     factor = factor_stages(replace(mpc, system=system), settings)
     E, E_dense = np.asarray(factor.E), np.asarray(dense.E)
     np.testing.assert_array_equal(E == 0, E_dense == 0)
@@ -123,10 +122,10 @@ def test_iterates_are_those_of_the_dense_solver(kind):
     # In rows of the problem's own units the penalties are rho E²: make them the same.
     moved = E > 0
     rho = np.where(moved, settings.rho * (E / np.where(moved, E_dense, 1)) ** 2, 1)
-    dense = admm.factor(qp.P, qp.A, replace(settings, rho=rho))
-    q, bounds, _ = admm.scaled(dense, qp, 1.0)
-    schedule = admm.splittings(dense, q)
-    t, _ = admm.iterate(schedule, bounds, jnp.zeros(count), 50, settings.alpha)
+    dense = admm.factorise(qp.P, qp.A, replace(settings, rho=rho))
+    program = admm.ScaledProgram.of(qp, dense, unit=1.0)
+    schedule = admm.splittings(dense, program.q)
+    t, _ = admm.iterate(schedule, program.bounds, jnp.zeros(count), 50, settings.alpha)
     aim = Aim(jnp.asarray(X0), jnp.zeros((N + 1, n)), jnp.zeros((N, m)))
     staged = replace(factor.stages, aim=aim)
     bounds = staged.bounds.scaled(factor.E)
@@ -137,7 +136,7 @@ def test_iterates_are_those_of_the_dense_solver(kind):
     u, _ = solve.read(factor, staged, bounds, t_stages, free)
     expected = np.asarray(t)[moved] / E_dense[moved] + shift[moved]
     np.testing.assert_allclose(np.asarray(t_stages)[moved] / E[moved], expected, atol=1e-9)
-    w, y = admm.read(dense, t, q, admm.scaled(dense, qp, 1.0)[1])
+    w, y = admm.read(dense, t, program.q, program.bounds)
     np.testing.assert_allclose(u.ravel(), dense.T @ w, atol=1e-9)
     s = bounds.project(t_stages, factor.rho[-1])
     y_stages = E * factor.rho[-1] * (t_stages - s)

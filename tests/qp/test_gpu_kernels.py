@@ -12,7 +12,7 @@ from bench.families import joint
 
 import jaxmpc as jm
 from jaxmpc.qp import admm, derivative, dual, solve, transformations, triton
-from jaxmpc.qp.admm import ADMM, factor, iterate, scaled, splittings
+from jaxmpc.qp.admm import ADMM, ScaledProgram, factorise, iterate, splittings
 from jaxmpc.qp.admm_kernel import iterate_batch, pieces
 from jaxmpc.qp.admm_kernel import suits as suits_kernel
 from jaxmpc.qp.dual import Dual, DualPoint, MostSteps, dual_search, dual_search_kernel
@@ -41,10 +41,12 @@ def scaled_batch(n, m, B, *, soft=False, balls=(), stages=1, dtype=jnp.float32, 
     if balls:
         fields |= {"balls": balls, "radius": rng.uniform(0.5, 1, len(balls))}
     rho = np.linspace(0.5, 2, stages)[:, None] * np.ones(m)
-    made = factor(jnp.eye(n), A, ADMM(iterations=STEPS, rho=rho), balls)
+    made = factorise(jnp.eye(n), A, ADMM(iterations=STEPS, rho=rho), balls)
 
     def one(q, l, u):
-        return scaled(made, solve.as_arrays(jm.QP(jnp.eye(n), q, A, l, u, **fields)))[:2]
+        qp = solve.as_arrays(jm.QP(jnp.eye(n), q, A, l, u, **fields))
+        program = ScaledProgram.of(qp, made)
+        return program.q, program.bounds
 
     data = made, *jax.vmap(one)(q, l, u), rng.standard_normal((B, m))
     return jax.tree.map(lambda v: jnp.asarray(v, dtype) if v.dtype.kind == "f" else v, data)

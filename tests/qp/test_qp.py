@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 import scipy
 from jax import enable_x64
+from problems import residuals
 
 import jaxmpc as jm
 from jaxmpc.mpc.condense import condense
-from jaxmpc.qp.admm import factor
+from jaxmpc.qp.admm import factorise
 from jaxmpc.qp.problem import Bounds
-from jaxmpc.qp.residuals import residuals
 from jaxmpc.qp.solve import solve_factored
 
 INF = np.inf
@@ -533,7 +533,7 @@ class TestFloat32:
         limits = jm.Box([-1.5, -2.0], [1.5, 2.0]), jm.Box([-2.0], [2.0])
         c = condense(jm.MPC(system, np.diag([50.0, 1.0]), np.array([[0.1]]), 20, *limits))
         x = jnp.asarray(np.random.default_rng(0).uniform([-1.4, -1.2], [1.4, 1.2], (100, 2)))
-        made, solver = factor(c.P, c.C, jm.ADMM()), jm.ADMM()
+        made, solver = factorise(c.P, c.C, jm.ADMM()), jm.ADMM()
         assert x.dtype == c.P.dtype == jnp.float32
         dual = partial(solve_factored, factor=made, solver=solver, whole=False)
         found, _ = jax.jit(jax.vmap(lambda x: dual(c.qp(x))))(x)

@@ -366,7 +366,7 @@ def _always(step: Callable, most: int, constants: tuple, state: Any) -> Any:
 
 def _while_open(step: Callable, most: int, constants: tuple, state: Any) -> Any:
     """Take steps until the instance has left."""
-    return repeat_while(lambda state: state.open, step, constants, state, "stages")
+    return repeat_while(lambda state: state.open, step, constants, state, "recursion")
 
 
 def refined(

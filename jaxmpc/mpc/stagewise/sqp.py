@@ -186,7 +186,7 @@ def _solve(
         constants = jax.lax.stop_gradient((base, problem, scale, eps))
         first = Iterate.begin(*jax.lax.stop_gradient((x, u, y)))
         step = partial(sqp_step, iterations, hessian)
-        last = repeat_while(lambda state: state.open, step, constants, first, steps="stages")
+        last = repeat_while(lambda state: state.open, step, constants, first, steps="recursion")
         x, u, y, count = last.x, last.u, last.y, last.steps
     s = expanded(base, problem, x, u)
     E, rho = scales(jax.lax.stop_gradient(s), scale)
