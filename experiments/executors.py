@@ -35,7 +35,7 @@ import numpy as np
 
 import jaxmpc as jm
 from jaxmpc import store
-from jaxmpc.app.commands import linear_sweep
+from jaxmpc.app.commands import sweep
 from jaxmpc.app.config import load
 
 CHUNK = 1024
@@ -176,17 +176,17 @@ def main() -> None:
 
 def stored(config: Any) -> None:
     """Label a stored sweep by pools of processes, the first of which dies; compare the files."""
-    linear_sweep.CHUNK = CHUNK
+    sweep.CHUNK = CHUNK
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(StringIO()) as text:
         first, second = Path(folder) / "alone", Path(folder) / "pools"
-        linear_sweep.linear_sweep(config, first)
+        sweep.linear_sweep(config, first)
         lost = 0
         for kill in (20, None):
             before = lost
             with processes() as pool:
                 try:
                     executor = Noting(pool, kill)
-                    linear_sweep.linear_sweep(config, second, resume=bool(lost), executor=executor)
+                    sweep.linear_sweep(config, second, resume=bool(lost), executor=executor)
                 except BrokenProcessPool:
                     there = store.read(second / "sweep.zarr")
                     lost = there.blocks - there.done

@@ -9,7 +9,7 @@ import shlex
 import signal
 import sys
 import types
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -18,8 +18,7 @@ import tyro
 
 import jaxmpc
 from jaxmpc.app.commands.options import check_values
-from jaxmpc.app.terminal import plain_output, report_error
-from jaxmpc.checks import fail, nearest
+from jaxmpc.checks import fail, nearest, printable
 
 # Module and class of each command: only the one that is called is imported. The class is a
 # dataclass of options, its docstring the help, `run()` the command, and `keeps` says what is there
@@ -186,3 +185,34 @@ def first_line(module: str, name: str) -> str:
 def _described(name: str, kind: Any, text: str) -> Any:
     """Return the class as a subcommand with this description."""
     return Annotated[kind, tyro.conf.subcommand(name, description=text)]
+
+
+class Plain:
+    """A stream of text in which characters that would steer a terminal are written as escapes, but
+    for ends of lines, tabs and the carriage returns of progress bars."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write a text, and return its length."""
+        self._stream.write(printable(text, keep="\n\r\t"))
+        return len(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextlib.contextmanager
+def plain_output() -> Iterator[None]:
+    """Let all that is printed pass through `Plain`."""
+    out: Any = Plain(sys.stdout)
+    err: Any = Plain(sys.stderr)
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        yield
+
+
+def report_error(message: str) -> int:
+    """Print one line on stderr and return the exit code, 2."""
+    print(f"jaxmpc: error: {printable(' '.join(message.split()))}", file=sys.stderr)
+    return 2

@@ -18,7 +18,7 @@ import zarr
 
 from jaxmpc.app import cli
 from jaxmpc.app import config as configs
-from jaxmpc.app.commands import linear_sweep, recursion
+from jaxmpc.app.commands import recursion, sweep
 from jaxmpc.feasible import label_workers
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.problem import FeasibilityProblem
@@ -149,7 +149,7 @@ def interruptible():
 
 @pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(linear_sweep, "CHUNK", 50)
+    monkeypatch.setattr(sweep, "CHUNK", 50)
     real = label_workers.label_parts
 
     def interrupted(*args, **kwargs):

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from jaxmpc.app import cli, page
+from jaxmpc.app import cli
+from jaxmpc.app.commands import report
 from jaxmpc.app.plots.style import save
 
 
@@ -81,7 +82,7 @@ def test_folders_without_results(tmp_path, capsys, content):
 
 def test_text_and_tables_are_escaped():
     read = Reader(
-        page.html_page("t<", [page.text("x < y", "a & b"), page.table("c", {"d<": "<e>"})])
+        report.html_page("t<", [report.text("x < y", "a & b"), report.table("c", {"d<": "<e>"})])
     )
     assert read.open == [] and {"x < y", "a & b", "d<", "<e>"} <= set(read.words)
 

@@ -317,7 +317,7 @@ def test_runs_with_orientations_and_of_linear_plants(tmp_path):
 FILM = """
 import sys
 import numpy as np
-from jaxmpc.app.commands.simulate_film import choose_renderer
+from jaxmpc.app.commands.simulate import choose_renderer
 choose_renderer()
 import jaxmpc as jm
 from jaxmpc.closed_loop.outcome import evaluate_runs

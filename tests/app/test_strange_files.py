@@ -10,8 +10,8 @@ import pytest
 from problems import MINIMAL_FILE
 
 import jaxmpc as jm
-from jaxmpc.app import cli, terminal
-from jaxmpc.app.config import files, load
+from jaxmpc.app import cli
+from jaxmpc.app.config import load, loading
 from jaxmpc.checks import installing, printable, require_package
 from jaxmpc.files import text_within
 
@@ -33,8 +33,10 @@ def test_long_keys_are_refused_before_they_are_parsed(tmp_path, text):
     path.write_text(text)
     tracemalloc.start()
     begun = time.monotonic()
-    with pytest.raises(ValueError, match=f"case.toml: holds a key of more than {files.MOST_DOTS}"):
-        files.read_toml(path)
+    with pytest.raises(
+        ValueError, match=f"case.toml: holds a key of more than {loading.MOST_DOTS}"
+    ):
+        loading.read_toml(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert time.monotonic() - begun < 5 and peak < 1e8
@@ -44,7 +46,7 @@ def test_large_files_are_refused_by_their_size(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text("#" * 1_500_000)
     with pytest.raises(ValueError, match=r"case.toml: 1,500,000 bytes .* 1,000,000"):
-        files.read_toml(path)
+        loading.read_toml(path)
     with pytest.raises(ValueError, match="/dev/zero: 101 bytes are more than the 100"):
         text_within("/dev/zero", 100)
 
@@ -92,7 +94,7 @@ def test_paths_are_printed_as_escapes(tmp_path, capsys):
 
 
 def test_progress_passes(capsys):
-    with terminal.plain_output():
+    with cli.plain_output():
         print("\r50 %\t\n\x1b[2J", end="")
     assert capsys.readouterr().out == "\r50 %\t\n\\x1b[2J"
 

@@ -10,7 +10,7 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.app import cli
-from jaxmpc.app.commands import tune_solver, weight_problem
+from jaxmpc.app.commands import tune_solver, tune_weights
 from jaxmpc.app.config import load, load_robot_config
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.tuning import tasks
@@ -38,7 +38,7 @@ def given_starts(monkeypatch):
     def uniform(mpc, lower, upper, count, seed, limits):
         return np.random.default_rng(seed).uniform(lower, upper, (count, len(lower))), 3
 
-    for module in (weight_problem, tune_solver):
+    for module in (tune_weights, tune_solver):
         monkeypatch.setattr(module, "feasible_states", uniform)
 
 
@@ -200,9 +200,10 @@ def test_penalties_write_a_solver_that_is_read_back(tmp_path, monkeypatch, capsy
     assert not record["finished"] and record["solved"] == [0.25, 0.5]
 
     # Where nothing learned is better the words say so.
-    default = replace(made[0], improved=False, build=lambda _: ADMM(newton_steps=0))
-    found = tune_solver.SolverResults(tmp_path, config, default, np.zeros((2, 4)), 0, 1.0)
-    table = dict(found.rows())
+    default = replace(made[0], improved=False, build=lambda _: ADMM(6, rho=1.0, newton_steps=0))
+    monkeypatch.setattr(tune_solver, "tune_solver", lambda *_, **__: default)
+    assert run(f"{line} --output kept") == 0
+    table = rows(capsys.readouterr().out)
     assert "the default is kept" in table["safeguard"]
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from jaxmpc.app import config as configs
-from jaxmpc.app import page
+from jaxmpc.app.commands import report as page
 from jaxmpc.app.commands.options import (
     POSITIVE,
     Horizon,

@@ -20,8 +20,7 @@ from jaxmpc.app.commands.options import (
     print_table,
     refuse,
 )
-from jaxmpc.app.commands.robot_sweep import map_robot_into
-from jaxmpc.app.config.states import recursion_states
+from jaxmpc.app.commands.sweep import map_robot_into
 from jaxmpc.checks import fail
 from jaxmpc.files import open_folder
 from jaxmpc.recursion import recursive_feasibility, smallest_horizon
@@ -149,7 +148,7 @@ class Recursion:
             configs.require_horizon(config, "--smallest", self.smallest)
         mpc, settings = config.build_mpc(), config.recursion
         asked = any(v is not None for v in (settings.grid, settings.lower, settings.upper))
-        states = recursion_states(config) if asked else None
+        states = configs.recursion_states(config) if asked else None
         there = [self.output / name for name in FILES if (self.output / name).exists()]
         if there and not self.overwrite:
             fail(str(there[0]), "exists", "Add --overwrite to replace it")

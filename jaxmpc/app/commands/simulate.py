@@ -3,6 +3,8 @@
 import dataclasses
 import importlib
 import os
+import sys
+from ctypes.util import find_library
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -28,7 +30,6 @@ from jaxmpc.app.commands.options import (
     print_table,
     require_lengths,
 )
-from jaxmpc.app.commands.simulate_film import choose_renderer, film
 from jaxmpc.app.config import load_robot_config
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, require_disk, require_memory, require_package
@@ -42,6 +43,7 @@ from jaxmpc.files import as_json, check_results, open_folder, remove_files, writ
 from jaxmpc.mpc.condense import condensed_bytes
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
+from jaxmpc.robots.film import render, save_video
 from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.robots.robot import Robot
 from jaxmpc.systems.riccati import lqr
@@ -309,3 +311,42 @@ class Simulate:
             }
         missing = {key: value for key, value in found.items() if getattr(self, key) is None}
         return dataclasses.replace(self, **missing)
+
+
+# Seconds between frames.
+FRAME = 0.04
+
+
+def film(robot: Robot, run: Run, reference: np.ndarray, count: int, path: Path) -> bool:
+    """Write a video of the first robots with finite states, and of the target, `reference` (n,).
+
+    Returns False, and prints a line on stderr, where nothing can be drawn.
+    """
+    finite = np.flatnonzero(np.isfinite(run.states).all(axis=(1, 2)))[:count]
+    every = max(1, round(FRAME / robot.dt))
+    try:
+        if not len(finite):
+            raise RuntimeError("no video: no robot has finite states")
+        with jax.enable_x64(True):
+            target = np.asarray(robot.state(reference))[: robot.mujoco.nq]
+        frames = render(
+            robot,
+            run.states[finite],
+            inputs=run.inputs[finite],
+            target=target,
+            every=every,
+            numbers=finite.tolist(),
+        )
+    except RuntimeError as error:
+        print(f"jaxmpc: {error}", file=sys.stderr)
+        return False
+    save_video(path, frames, 1 / (every * robot.dt))
+    return True
+
+
+def choose_renderer() -> None:
+    """Let MuJoCo, where it is not imported yet, render through EGL if there is no display."""
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    late = "mujoco" in sys.modules
+    if sys.platform == "linux" and not display and not late and find_library("EGL"):
+        os.environ.setdefault("MUJOCO_GL", "egl")

@@ -1,12 +1,13 @@
-"""What the commands `tune weights` and `tune solver` share: names of files and the optimizer."""
+"""What the commands `tune weights` and `tune solver` share."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import jax
 import numpy as np
 import optax
 
 from jaxmpc.checks import fail
+from jaxmpc.tuning.result import Interrupted, TuningRun
 
 TUNED = "tuned.toml"
 
@@ -24,6 +25,15 @@ def optimizer_of(name: str, rate: float) -> optax.GradientTransformation:
         cure = "Give one that takes a learning rate: adam, adamw, sgd, rmsprop, lion, ..."
         fail("--optimizer", f"{name!r} is no optimizer of optax that serves here", cure)
     return made
+
+
+def best_of_steps(tune: Callable[[], TuningRun]) -> TuningRun:
+    """Return the run of `tune`, or that of the finished steps where Ctrl-C ends it."""
+    try:
+        return tune()
+    except Interrupted as stop:
+        print("\nstopped; writing the best of the steps that were done")
+        return stop.run
 
 
 def two_columns(columns: Iterable[str], more: str = "") -> str:

@@ -24,7 +24,7 @@ from jaxmpc.app.commands.options import (
     option,
     print_table,
 )
-from jaxmpc.app.commands.tune_shared import TUNED, optimizer_of, two_columns
+from jaxmpc.app.commands.tune_shared import TUNED, best_of_steps, optimizer_of, two_columns
 from jaxmpc.app.plots.style import save
 from jaxmpc.app.plots.tuning import plot_solver
 from jaxmpc.checks import fail
@@ -34,12 +34,13 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.tuning.initial_states import feasible_states, initial_range
-from jaxmpc.tuning.result import Interrupted, TuningRun
+from jaxmpc.tuning.result import TuningRun
 from jaxmpc.tuning.run_folders import CHECKPOINT, run_folder
 from jaxmpc.tuning.solver import tune_solver
 
 FILES = ("solver.json", TUNED, "solver.png")
 GIVEN = ADMM(newton_steps=0)
+KEPT = "no step is better on the validation states: the default is kept"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,34 +151,35 @@ class TuneSolver:
             test = x0s[-for_validation:]
             what = f"penalties of {self.iterations} ADMM steps from {len(x0s):,} states"
             print(f"{config.name}: {what} -> {self.output}", flush=True)
-            learning, stopped = time.perf_counter(), False
-            try:
-                found = tune_solver(
+            learning = time.perf_counter()
+            run = best_of_steps(
+                lambda: tune_solver(
                     mpc,
                     x0s[:-for_validation],
-                    self.iterations,
-                    stages=self.stages,
-                    groups=self.groups,
                     solver=GIVEN,
-                    updates=self.updates,
                     optimizer=optimizer,
-                    batch=self.batch,
                     validation=test,
-                    seed=self.seed,
                     checkpoint=checkpoint,
                     progress=sys.stderr.isatty(),
+                    **given_options(
+                        self, "iterations", "stages", "groups", "updates", "batch", "seed"
+                    ),
                 )
-            except Interrupted as stop:
-                print("\nstopped; writing the best of the steps that were done")
-                found, stopped = stop.run, True
+            )
         seconds = time.perf_counter() - learning
         given = dataclasses.replace(GIVEN, iterations=self.iterations)
-        worst = largest_residuals(mpc, test, (given, found.solver))
-        results = SolverResults(self.output, config, found, worst, without_plan, seconds)
-        results.save(options)
-        print_table(results.rows(), 13)
-        print(f"  {'total':<13} {time.perf_counter() - begun:.1f} s with set-up and files")
-        if stopped:
+        worst = largest_residuals(mpc, test, (given, run.solver))
+        infeasible = without_plan + round(run.after["infeasible"])
+        save_run(self.output, config, run, options, worst, infeasible, seconds)
+        rows = [
+            *solver_rows(run, worst.shape[1], infeasible),
+            ("learning", f"{seconds:.1f} s, compiler included"),
+            ("safeguard", "passed: the tuned penalties are used" if run.improved else KEPT),
+            ("files", " ".join(str(self.output / name) for name in (*FILES, CHECKPOINT))),
+            ("total", f"{time.perf_counter() - begun:.1f} s with set-up and files"),
+        ]
+        print_table(rows, 13)
+        if run.history and run.history.interrupted:
             raise KeyboardInterrupt
 
     def record(self, config: configs.Config) -> dict[str, Any]:
@@ -189,81 +191,69 @@ class TuneSolver:
         return as_json({**found, "problem": config.to_dict("tune")})
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class SolverResults:
-    """A run of `tune_solver` that is written to a folder.
+def save_run(
+    folder: Path,
+    config: configs.Config,
+    run: TuningRun,
+    options: dict[str, Any],
+    worst: np.ndarray,
+    infeasible: int,
+    seconds: float,
+) -> None:
+    """Write tuned.toml, solver.json and solver.png.
 
     worst (2, B): the largest residual of the validation states with the solver given and the one
-    found. without_plan: number of states drawn that have none. seconds: of learning.
+    found. infeasible: number of states drawn that have no plan. seconds: of learning.
     """
+    h, rho, alpha = run.history, *penalties(run)
+    solver = configs.SolverSection(
+        iterations=run.solver.admm_steps(),
+        newton_steps=0,
+        alpha=alpha,
+        rho=float(rho) if rho.ndim == 0 else tuple(map(tuple, np.atleast_2d(rho).tolist())),
+    )
+    (folder / TUNED).write_text(dataclasses.replace(config, solver=solver).to_toml())
+    result = {"improved": run.improved, "before": run.before, "after": run.after}
+    document = {
+        "name": config.name,
+        "options": options,
+        "finished": not (h and h.interrupted),
+        "result": result | {"alpha": alpha},
+        "validation_states": worst.shape[1],
+        "states_without_plan": infeasible,
+        "learning_seconds": seconds,
+        "loss": h.loss if h else [],
+        "gradient_norm": h.gradient_norm if h else [],
+        "accepted": h.accepted if h else [],
+        "solved": h.validation_numbers["solved"] if h else [],
+        "residual": h.validation_numbers["residual"] if h else [],
+        "versions": versions(),
+    }
+    write_json(folder / FILES[0], document)
+    words = "tuned" if run.improved else "default kept, no step is better"
+    title = f"{config.name}: {solver.iterations} ADMM steps, {words}"
+    save(plot_solver(run, *worst, 1e-6, title), folder / "solver.png")
 
-    folder: Path
-    config: configs.Config
-    run: TuningRun
-    worst: np.ndarray
-    without_plan: int
-    seconds: float
 
-    @property
-    def infeasible(self) -> int:
-        """Return how many states drawn have no plan."""
-        return self.without_plan + round(self.run.after["infeasible"])
+def solver_rows(run: TuningRun, states: int, infeasible: int) -> list[tuple[str, str]]:
+    """Return the rows of the table with the default and the result."""
+    first, last, (rho, alpha) = run.before, run.after, penalties(run)
+    solved = (f"{100 * numbers['solved']:.2f} %" for numbers in (first, last))
+    spread = "-".join(f"{end:.3g}" for end in sorted({rho.min(), rho.max()}))
+    residual = (f"{numbers['residual']:.3g}" for numbers in (first, last))
+    return [
+        ("", two_columns(("default", "as written"))),
+        ("solved", two_columns(solved, f"of {states} states")),
+        ("residual", two_columns(residual, "median")),
+        ("rho", two_columns(("1", spread))),
+        ("alpha", two_columns(("1.6", f"{alpha:.4g}"))),
+        ("infeasible", f"{infeasible:,} states drawn have no plan: left out"),
+    ]
 
-    def save(self, options: dict[str, Any]) -> None:
-        """Write the files."""
-        run, h = self.run, self.run.history
-        rho, alpha = np.asarray(run.solver.rho, float), float(np.asarray(run.solver.alpha))
-        solver = configs.SolverSection(
-            iterations=run.solver.admm_steps(),
-            newton_steps=0,
-            alpha=alpha,
-            rho=float(rho) if rho.ndim == 0 else tuple(map(tuple, np.atleast_2d(rho).tolist())),
-        )
-        (self.folder / TUNED).write_text(dataclasses.replace(self.config, solver=solver).to_toml())
-        result = {"improved": run.improved, "before": run.before, "after": run.after}
-        document = {
-            "name": self.config.name,
-            "options": options,
-            "finished": not (h and h.interrupted),
-            "result": result | {"alpha": alpha},
-            "validation_states": self.worst.shape[1],
-            "states_without_plan": self.infeasible,
-            "learning_seconds": self.seconds,
-            "loss": h.loss if h else [],
-            "gradient_norm": h.gradient_norm if h else [],
-            "accepted": h.accepted if h else [],
-            "solved": h.validation_numbers["solved"] if h else [],
-            "residual": h.validation_numbers["residual"] if h else [],
-            "versions": versions(),
-        }
-        write_json(self.folder / FILES[0], as_json(document))
-        words = "tuned" if run.improved else "default kept, no step is better"
-        title = f"{self.config.name}: {solver.iterations} ADMM steps, {words}"
-        save(
-            plot_solver(run, self.worst[0], self.worst[1], 1e-6, title), self.folder / "solver.png"
-        )
 
-    def rows(self) -> list[tuple[str, str]]:
-        """Return the table."""
-        run, first, last = self.run, self.run.before, self.run.after
-        solved = (f"{100 * numbers['solved']:.2f} %" for numbers in (first, last))
-        rho, alpha = np.asarray(run.solver.rho, float), float(np.asarray(run.solver.alpha))
-        spread = "-".join(f"{end:.3g}" for end in sorted({rho.min(), rho.max()}))
-        safeguard = "no step is better on the validation states: the default is kept"
-        if run.improved:
-            safeguard = "passed: the tuned penalties are used"
-        residual = (f"{numbers['residual']:.3g}" for numbers in (first, last))
-        return [
-            ("", two_columns(("default", "as written"))),
-            ("solved", two_columns(solved, f"of {self.worst.shape[1]} states")),
-            ("residual", two_columns(residual, "median")),
-            ("rho", two_columns(("1", spread))),
-            ("alpha", two_columns(("1.6", f"{alpha:.4g}"))),
-            ("infeasible", f"{self.infeasible:,} states drawn have no plan: left out"),
-            ("learning", f"{self.seconds:.1f} s, compiler included"),
-            ("safeguard", safeguard),
-            ("files", " ".join(str(self.folder / name) for name in (*FILES, CHECKPOINT))),
-        ]
+def penalties(run: TuningRun) -> tuple[np.ndarray, float]:
+    """Return rho and alpha of the solver found."""
+    return np.asarray(run.solver.rho, float), float(np.asarray(run.solver.alpha))
 
 
 def largest_residuals(mpc: MPC, states: np.ndarray, solvers: tuple[ADMM, ADMM]) -> np.ndarray:

@@ -10,17 +10,29 @@
     [sweep]   grid, lower, upper, axes, fixed | projection, iterations, dtype
     [recursion]  steps, grid, lower, upper, regions, seconds
 
-The classes of `sections` document each key. Every error is a ValueError that names the file and the
+The classes of `problem` document each key. Every error is a ValueError that names the file and the
 key (or the option of the command line that set it), and how to correct it. A robot's weights have a
 file of their own, with the sections [robot] and [cost].
 """
 
-from jaxmpc.app.config.consistency import require_horizon, state_bytes
-from jaxmpc.app.config.loading import from_results, load, load_robot_config
-from jaxmpc.app.config.problem import Config
-from jaxmpc.app.config.robot_weights import RobotConfig, RobotCostSection, RobotSection
-from jaxmpc.app.config.sections import SolverSection
-from jaxmpc.app.config.states import SweepPoints, grid_shape, recursion_states, sweep_points
+from jaxmpc.app.config.loading import (
+    from_results,
+    load,
+    load_robot_config,
+    require_horizon,
+    state_bytes,
+)
+from jaxmpc.app.config.problem import (
+    Config,
+    RobotConfig,
+    RobotCostSection,
+    RobotSection,
+    SolverSection,
+    SweepPoints,
+    grid_shape,
+    recursion_states,
+    sweep_points,
+)
 
 __all__ = [
     "Config",

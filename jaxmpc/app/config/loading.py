@@ -1,17 +1,41 @@
 """From a TOML file and options of the command line to a checked configuration."""
 
 import dataclasses
+import math
+import re
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
 
-from pydantic import ValidationError
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
-from jaxmpc.app.config.consistency import check
-from jaxmpc.app.config.files import Origin, read_toml
-from jaxmpc.app.config.problem import ADAPTER, SECTION_COMMANDS, Config
-from jaxmpc.app.config.robot_weights import ROBOT_ADAPTER, RobotConfig
-from jaxmpc.checks import fail, nearest, shown
+from jaxmpc.app.config.problem import (
+    ADAPTER,
+    ROBOT_ADAPTER,
+    SECTION_COMMANDS,
+    Config,
+    Origin,
+    RobotConfig,
+    grid_shape,
+    mapped_axes,
+    recursion_shape,
+    section_ends,
+)
+from jaxmpc.batches import CHUNK
+from jaxmpc.checks import fail, nearest, require_memory, require_printable, shown
+from jaxmpc.files import text_within
+from jaxmpc.mpc.condense import condensed_bytes
+
+# A problem of a hundred states takes a tenth of that; what tomllib makes of a byte, up to 10 kB.
+MOST_BYTES = 10**6
+# Time and memory of tomllib grow as the square of the parts of a dotted key: one of 60 kB took
+# 4 GB. Keys, dots and blanks stand between the characters that DOTTED splits at.
+MOST_DOTS = 32
+QUOTED = re.compile(r'"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'')
+DOTTED = re.compile(r"[^\w\-. \t]+")
+
 
 # Inertia 0.05 kg m², period 0.01 s, x = (q, dq), u = τ.
 _JOINT: dict[str, Any] = {
@@ -59,10 +83,7 @@ def load(
             merged[name] = {**kept, **changes}
     origin = Origin("built-in joint" if path is None else str(path), frozenset(options))
     try:
-        config = ADAPTER.validate_python(merged)
-        check(config, command)
-    except ValidationError as error:
-        raise origin.error(_error_message(error, Config)) from None
+        config = from_results(merged, command)
     except ValueError as error:
         raise origin.error(str(error)) from None
     object.__setattr__(config, "origin", origin)  # the way to set a field of a frozen dataclass
@@ -71,10 +92,7 @@ def load(
 
 def from_results(document: Mapping[str, Any], command: str = "sweep") -> Config:
     """Return the configuration that results hold (`Config.to_dict`), checked as `load` does."""
-    try:
-        config = ADAPTER.validate_python(dict(document))
-    except ValidationError as error:
-        raise ValueError(_error_message(error, Config)) from None
+    config = _validated(ADAPTER, document, Config)
     check(config, command)
     return config
 
@@ -84,12 +102,36 @@ def load_robot_config(path: str | Path) -> RobotConfig:
     document = read_toml(path)
     if "robot" not in document:
         fail(str(path), "has no section [robot]", "Give what jaxmpc tune weights --robot wrote")
+    origin = Origin(str(path))
     try:
-        config = ROBOT_ADAPTER.validate_python(document)
-    except ValidationError as error:
-        raise ValueError(f"{path}: {_error_message(error, RobotConfig)}") from None
-    object.__setattr__(config, "origin", Origin(str(path)))
+        config = _validated(ROBOT_ADAPTER, document, RobotConfig)
+    except ValueError as error:
+        raise origin.error(str(error)) from None
+    object.__setattr__(config, "origin", origin)
     return config
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Return what a file holds, with or without a byte-order mark. Raises ValueError where it
+    cannot be read, is too large or is no TOML."""
+    text = text_within(path, MOST_BYTES, "TOML")
+    if any(run.count(".") > MOST_DOTS for run in DOTTED.split(QUOTED.sub("q", text))):
+        what = f"holds a key of more than {MOST_DOTS} dots"
+        fail(str(path), what, "No key takes more than rows of numbers")
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        fail(str(path), "is nested too deeply", "No key takes more than rows of numbers")
+    except ValueError as error:  # no TOML, or a number of thousands of digits
+        fail(str(path), f"is no TOML ({error})", "See the keys with: jaxmpc sweep --help")
+
+
+def _validated(adapter: TypeAdapter, document: Mapping[str, Any], whole: Any) -> Any:
+    """Return the configuration of class `whole`. Raises ValueError with the first thing wrong."""
+    try:
+        return adapter.validate_python(dict(document))
+    except ValidationError as error:
+        raise ValueError(_error_message(error, whole)) from None
 
 
 def _error_message(error: ValidationError, whole: Any) -> str:
@@ -130,3 +172,142 @@ def _keys(whole: Any, section: str | None = None) -> list[str]:
     # [solver] may be absent: its type is a union with None.
     kind = next(iter(get_args(found[section])), found[section])
     return [field.name for field in dataclasses.fields(kind)] if kind is not str else []
+
+
+def check(config: Config, command: str = "sweep") -> None:
+    """Raise ValueError where keys that are valid alone do not fit one another."""
+    s, limits = config.system, config.limits
+    n, m = len(s.A), len(s.B[0])
+    require_printable("name", config.name)
+    for key, value, count in (
+        ("system.A", s.A[0], n),
+        ("system.B", s.B, n),
+        ("system.c", s.c, n),
+        ("system.state_names", s.state_names, n),
+        ("system.state_units", s.state_units, n),
+        ("system.input_names", s.input_names, m),
+        ("system.input_units", s.input_units, m),
+        ("limits.x_min", limits.x_min, n),
+        ("limits.x_max", limits.x_max, n),
+        ("limits.u_min", limits.u_min, m),
+        ("limits.u_max", limits.u_max, m),
+        ("cost.Q", config.cost.Q, n),
+        ("cost.R", config.cost.R, m),
+        ("cost.P", None if isinstance(config.cost.P, str) else config.cost.P, n),
+    ):
+        if value is not None and len(value) != count:
+            what = f"{m} inputs" if count == m != n else f"{n} states, {m} inputs"
+            fail(key, f"has {len(value)} entries where {count} are needed", f"A, B: {what}")
+    _check_order("limits", limits, "x_min", "x_max")
+    _check_order("limits", limits, "u_min", "u_max")
+    _check_state_limits(config)
+    _check_terminal_set(config, n)
+    require_horizon(config, "mpc.horizon", config.mpc.horizon)
+    if command == "sweep":
+        _check_sweep(config, n)
+    elif command == "recursion":
+        _check_recursion(config, n)
+
+
+def require_horizon(config: Config, key: str, horizon: int) -> None:
+    """Raise ValueError, naming the key, where a horizon is too long for the memory."""
+    n, m = len(config.system.A), len(config.system.B[0])
+    rows = config.limits.h_x or config.limits.x_min or ()
+    needed = condensed_bytes(horizon, n, m, config.mpc.control_horizon, len(rows) + m)
+    require_memory(key, needed, "Give fewer steps")
+
+
+def _check_sweep(config: Config, n: int) -> None:
+    """Raise ValueError unless [sweep] fits a system of n states."""
+    sweep = config.sweep
+    d = len(mapped_axes(config))
+    for key, count in (("grid", d), ("lower", d), ("upper", d), ("fixed", n - d)):
+        value = getattr(sweep, key)
+        if value is not None and len(value) != count:
+            cure = f"{n} states, of which {d} are mapped (sweep.axes)"
+            fail(f"sweep.{key}", f"has {len(value)} entries where {count} are needed", cure)
+    _check_order("sweep", sweep, "lower", "upper")
+    if d < n and (sweep.fixed is None) != sweep.projection:
+        cure = f"Give the {n - d} other values in sweep.fixed (a slice) or projection = true"
+        both = "fixed and projection exclude each other"
+        fail("sweep.fixed", both if sweep.projection else f"{n} states, {d} mapped", cure)
+    if d == n and sweep.projection:
+        fail("sweep.projection", f"true, and all {n} states are mapped", "Name fewer in sweep.axes")
+    section_ends(config, mapped_axes(config), sweep)
+    # Blocks in work, and a hundred bytes of each other block.
+    count = math.prod(grid_shape(config))
+    needed = 8 * min(count, CHUNK) * state_bytes(config) + 100 * count / CHUNK
+    require_memory("sweep.grid", needed, "Map fewer points")
+
+
+def _check_recursion(config: Config, n: int) -> None:
+    """Raise ValueError unless [recursion] fits a system of n states."""
+    recursion = config.recursion
+    for key in ("grid", "lower", "upper"):
+        value = getattr(recursion, key)
+        if value is not None and len(value) != n:
+            what = f"has {len(value)} entries where {n} are needed"
+            fail(f"recursion.{key}", what, "One for each state")
+    _check_order("recursion", recursion, "lower", "upper")
+    shape = recursion_shape(config)
+    if shape is not None:
+        section_ends(config, range(n), recursion)
+        # The map of the samples, and the states of the loops: x, x⁺, two inputs, lost, undecided.
+        each = state_bytes(config, n) + 8 * (3 * n + 2 * len(config.system.B[0]) + 2)
+        require_memory("recursion.grid", math.prod(shape) * each, "Look at fewer states")
+
+
+def state_bytes(config: Config, d: int | None = None) -> int:
+    """Return the bytes of a state with its label and proofs in a map of d axes (None: those of
+    [sweep]): the point, x_0, the plan, the half-space, label and status."""
+    d = len(mapped_axes(config)) if d is None else d
+    n, m = len(config.system.A), len(config.system.B[0])
+    return 8 * (2 * d + n + config.mpc.horizon * m + 1) + 2
+
+
+def _check_state_limits(config: Config) -> None:
+    """Raise ValueError unless the state limits are either a box or rows of H_x, and complete."""
+    limits = config.limits
+    box = limits.x_min is not None or limits.x_max is not None
+    polytope = limits.H_x is not None or limits.h_x is not None
+    if (limits.x_min is None) != (limits.x_max is None):
+        fail("limits.x_min", "x_min and x_max go together", "Use inf for a side without limit")
+    if limits.margin and not box:
+        fail("limits.margin", "given without x_min, x_max", "A Box of limits has half-widths")
+    if (limits.H_x is None) != (limits.h_x is None):
+        fail("limits.H_x", "H_x and h_x go together", "Give both: H_x x <= h_x")
+    if box and polytope:
+        fail("limits.H_x", "given beside x_min, x_max", "Write the box as rows of H_x")
+    if limits.H_x is not None and limits.h_x is not None:
+        shape = np.shape(limits.H_x)
+        if shape != (len(limits.h_x), len(config.system.A)):
+            fail("limits.H_x", f"shape {shape} for {len(limits.h_x)} rows", "One h_x a row")
+    if not (box or polytope) and config.mpc.terminal != "none":
+        fail("mpc.terminal", f'"{config.mpc.terminal}" without state limits', "Give x_min, x_max")
+
+
+def _check_terminal_set(config: Config, n: int) -> None:
+    """Raise ValueError unless [mpc] gives at most one terminal set, complete and of size n."""
+    mpc = config.mpc
+    for rows, ends in (("H_f", "h_f"), ("P_f", "level_f")):
+        if (getattr(mpc, rows) is None) != (getattr(mpc, ends) is None):
+            fail(f"mpc.{rows}", f"{rows} and {ends} go together", "Give both")
+        if getattr(mpc, rows) is not None and mpc.terminal != "none":
+            fail(f"mpc.{rows}", f'given beside terminal "{mpc.terminal}"', "Choose one")
+    if mpc.H_f is not None and mpc.P_f is not None:
+        fail("mpc.P_f", "given beside H_f", "Choose one terminal set")
+    if mpc.H_f is not None and mpc.h_f is not None:
+        if np.shape(mpc.H_f) != (len(mpc.h_f), n):
+            what = f"shape {np.shape(mpc.H_f)} for {len(mpc.h_f)} rows"
+            fail("mpc.H_f", what, f"One h_f a row, {n} columns")
+    if mpc.P_f is not None and np.shape(mpc.P_f) != (n, n):
+        fail("mpc.P_f", f"shape {np.shape(mpc.P_f)}", f"Give ({n}, {n})")
+
+
+def _check_order(where: str, section: Any, low: str, high: str) -> None:
+    """Raise ValueError where a lower end lies above its upper end."""
+    pairs = zip(getattr(section, low) or (), getattr(section, high) or (), strict=False)
+    for i, (a, b) in enumerate(pairs):
+        if a > b or (where in SECTION_COMMANDS and a == b):
+            what = f"entry {i} is {a:g}, above {high} {b:g}"
+            fail(f"{where}.{low}", what, f"Check {low}, {high}")

@@ -1,28 +1,29 @@
-"""The problem that a TOML file describes, and the `MPC` made of it."""
+"""What TOML files hold, section by section, and what is made of it: MPC, solver, grid, weights."""
 
 import dataclasses
 import json
-from collections.abc import Callable
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
-from pydantic import Field, TypeAdapter
+import tomli_w
+from pydantic import (
+    AfterValidator,
+    AllowInfNan,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    Strict,
+    TypeAdapter,
+)
 from pydantic.dataclasses import dataclass
 
-from jaxmpc.app.config.files import Origin, to_toml
-from jaxmpc.app.config.sections import (
-    STRICT,
-    CostSection,
-    LimitsSection,
-    MPCSection,
-    RecursionSection,
-    SolverSection,
-    SweepSection,
-    SystemSection,
-    to_matrix,
-)
+from jaxmpc.checks import MOST_COUNT
 from jaxmpc.explicit.exact_penalties import exact_penalty
+from jaxmpc.grids import axis_indices, grid, grid_ends, mesh
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.softening import soften
 from jaxmpc.qp.admm import ADMM
@@ -33,23 +34,140 @@ from jaxmpc.sets.terminal_sets import named_terminal_set
 from jaxmpc.systems.riccati import lqr
 from jaxmpc.systems.system import LinearSystem
 
+
+def _infinity(value: Any) -> Any:
+    """Return the number for the texts that `Config.to_dict` writes, JSON having none."""
+    return float(value) if value in ("Infinity", "-Infinity") else value
+
+
+def _not_nan(value: float) -> float:
+    if np.isnan(value):
+        raise ValueError("is NaN; use inf or -inf where there is no limit")
+    return value
+
+
+def _rectangular(rows: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
+    if len({len(row) for row in rows}) != 1 or not rows[0]:
+        raise ValueError("is no matrix: give at least one row and rows of one length")
+    return rows
+
+
+STRICT = ConfigDict(extra="forbid", ser_json_inf_nan="strings")
+
+# Strict: true and "1.0" are no numbers, 1 and "yes" no booleans.
+Number = Annotated[float, Strict(), AllowInfNan(False)]
+Whole = Annotated[int, Strict(), Field(le=MOST_COUNT)]
+Switch = Annotated[bool, Strict()]
+Limit = Annotated[float, Strict(), AfterValidator(_not_nan), BeforeValidator(_infinity)]
+Limits = tuple[Limit, ...]
+Vector = tuple[Number, ...]
+Matrix = Annotated[tuple[Vector, ...], AfterValidator(_rectangular)]
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class SystemSection:
+    """x⁺ = A x + B u + c, or with `continuous` dx/dt = A x + B u + c held over dt."""
+
+    A: Matrix  # (n, n)
+    B: Matrix  # (n, m)
+    c: Vector | None = None  # (n,), none means zero
+    dt: Annotated[Number, Field(gt=0)]  # seconds
+    continuous: Switch = False  # True: convert by zero-order hold
+    state_names: tuple[str, ...] | None = None
+    state_units: tuple[str, ...] | None = None
+    input_names: tuple[str, ...] | None = None
+    input_units: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class LimitsSection:
+    """Box limits of states and inputs, or H_x x <= h_x in place of the state box."""
+
+    x_min: Limits | None = None  # (n,), -inf where free
+    x_max: Limits | None = None  # (n,), inf where free
+    # Fraction of the half-width of x_min, x_max that the MPC keeps away from them, on each side.
+    margin: Annotated[Number, Field(ge=0, lt=1)] = 0.0
+    H_x: Matrix | None = None  # (r, n)
+    h_x: Vector | None = None  # (r,)
+    u_min: Vector  # (m,)
+    u_max: Vector  # (m,)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class CostSection:
+    """J = Σ x'Qx + u'Ru + x_N'P x_N, without ½. A flat list is a diagonal."""
+
+    Q: Vector | Matrix
+    R: Vector | Matrix
+    P: Literal["lqr", "Q", "none"] | Vector | Matrix = "lqr"  # "lqr": the Riccati solution
+    # L1 weight that makes state and terminal limits soft in the controller; "exact": the least one
+    # that changes nothing where they can be kept, and a margin. Sets are those of the hard limits.
+    rho: Annotated[Number, Field(ge=0)] | Literal["exact"] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class MPCSection:
+    """Horizon and terminal set: "invariant" = O_inf of the LQR, "ellipsoid" = largest level set of
+    its cost inside the limits, "box" = the state limits; or the set itself."""
+
+    horizon: Annotated[Whole, Field(ge=1)]
+    terminal: Literal["none", "invariant", "ellipsoid", "box"] = "none"
+    H_f: Matrix | None = None  # (r, n): H_f x_N <= h_f
+    h_f: Vector | None = None  # (r,)
+    P_f: Matrix | None = None  # (n, n): x_N'P_f x_N <= level_f
+    level_f: Annotated[Number, Field(gt=0)] | None = None
+    control_horizon: Annotated[Whole, Field(ge=1)] | None = None  # free inputs
+    constrain_initial: Switch = True  # False: no state limits at k = 0
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class SweepSection:
+    """The initial states of a sweep: a grid over the mapped states."""
+
+    grid: Annotated[tuple[Annotated[Whole, Field(ge=2)], ...], Field(min_length=1)] | None = None
+    lower: Vector | None = None  # (d,), none means the state limits widened by 3 % each side
+    upper: Vector | None = None  # (d,)
+    axes: tuple[Whole | str, ...] | None = None  # names or indices, none means the first two
+    fixed: Vector | None = None  # (n - d,) values of the other states: a slice
+    projection: Switch = False  # True: some value of the other states
+    iterations: Annotated[Whole, Field(ge=1)] = 50  # ADMM steps in the first pass over all states
+    dtype: Literal["float32", "float64"] = "float32"  # of the iterates; proofs are float64
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class RecursionSection:
+    """How recursive feasibility is examined: sample states, closed loops, effort."""
+
+    steps: Annotated[Whole, Field(ge=1)] = 20  # length of the closed loops
+    grid: Annotated[tuple[Annotated[Whole, Field(ge=2)], ...], Field(min_length=1)] | None = None
+    lower: Vector | None = None  # (n,), none means the state limits widened by 3 % each side
+    upper: Vector | None = None  # (n,)
+    regions: Annotated[Whole, Field(ge=0)] = 2000  # critical regions at most, 0: none
+    seconds: Annotated[Number, Field(gt=0)] = 60.0  # for search and proofs
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class SolverSection:
+    """ADMM as the controller runs it; see `ADMM`. What jaxmpc tune solver learns."""
+
+    iterations: Annotated[Whole, Field(ge=0)] = 50
+    # Number, one a row of the QP, or (stages, rows); None: chosen from the problem.
+    rho: Number | Vector | Matrix | None = None
+    alpha: Annotated[Number, Field(gt=0, lt=2)] = 1.9
+    # Newton steps after them at most; None: as `ADMM`.
+    newton_steps: Annotated[Whole, Field(ge=0)] | None = None
+
+
 # Commands that have a section of their own.
 SECTION_COMMANDS = ("sweep", "recursion")
 # Arguments by which errors of the library name what these keys give.
 KEYS = {
     **{
-        name: f"system.{name}"
-        for name in (
-            "A",
-            "B",
-            "c",
-            "dt",
-            "state_names",
-            "state_units",
-            "input_names",
-            "input_units",
-        )
+        f"{kind}_{part}": f"system.{kind}_{part}"
+        for kind in ("state", "input")
+        for part in ("names", "units")
     },
+    **{name: f"system.{name}" for name in ("A", "B", "c", "dt")},
     "Q": "cost.Q",
     "R": "cost.R",
     "terminal_cost": "cost.P",
@@ -70,6 +188,22 @@ KEYS = {
     "terminal_set.level": "mpc.level_f",
 }
 Result = TypeVar("Result")
+
+
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """Where the keys of a configuration come from: a file, and options of the command line (keys
+    such as "mpc.horizon")."""
+
+    file: str = ""
+    options: frozenset[str] = frozenset()
+
+    def error(self, message: str) -> ValueError:
+        """Return the error with the file, or the option, that holds the key it begins with."""
+        key, _, rest = message.partition(": ")
+        if key in self.options:
+            return ValueError(f"command line: --{key.split('.')[-1]}: {rest}")
+        return ValueError(f"{self.file}: {message}" if self.file else message)
 
 
 def _in_keys(method: Callable[..., Result]) -> Callable[..., Result]:
@@ -211,3 +345,143 @@ class Config:
 
 
 ADAPTER = TypeAdapter(Config)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class RobotSection:
+    """Which robot's MPC this is, with arguments of `robot_mpc` and `RobotController`."""
+
+    name: str
+    horizon: Annotated[Whole, Field(ge=1)] = 20
+    margin: Annotated[Number, Field(ge=0, lt=1)] = 0.02
+    linearize: Literal["set-point", "state", "trajectory"] = "state"
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class RobotCostSection:
+    """J as in a linear problem. rho: the L1 weight of state limits, which are always soft."""
+
+    Q: Vector | Matrix
+    R: Vector | Matrix
+    P: Literal["lqr", "none"] | Matrix = "lqr"
+    rho: Annotated[Number, Field(gt=0)] = 1e4
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class RobotConfig:
+    """The weights of a robot's MPC: the sections of the file."""
+
+    robot: RobotSection
+    cost: RobotCostSection
+    origin: Annotated[Origin, Field(exclude=True)] = dataclasses.field(
+        init=False, compare=False, repr=False, default=Origin()
+    )
+
+    def weights(self, robot: Any) -> dict[str, Any]:
+        """Return Q, R and terminal_cost as `robot_mpc` takes them.
+
+        Raises ValueError where the file is of another robot, or of other sizes.
+        """
+        if self.robot.name != robot.name:
+            what = f"robot.name: {self.robot.name!r}, asked is {robot.name!r}. Give that --robot"
+            raise self.origin.error(what)
+        cost = self.cost
+        for key, value, size in (
+            ("Q", cost.Q, robot.n),
+            ("R", cost.R, robot.m),
+            ("P", cost.P, robot.n),
+        ):
+            if not isinstance(value, str) and len(value) != size:
+                what = f"cost.{key}: has {len(value)} entries. {robot.name} needs {size}"
+                raise self.origin.error(what)
+        P: Any = None if cost.P == "none" else cost.P
+        terminal = P if P is None or isinstance(P, str) else to_matrix(P)
+        return {"Q": to_matrix(cost.Q), "R": to_matrix(cost.R), "terminal_cost": terminal}
+
+    def to_toml(self) -> str:
+        """Return the text of a file that `load_robot_config` reads back."""
+        return to_toml(ROBOT_ADAPTER.dump_python(self, exclude_none=True))
+
+
+ROBOT_ADAPTER = TypeAdapter(RobotConfig)
+
+
+class SweepPoints(NamedTuple):
+    """Initial states of a sweep: a grid of mapped states, as `map_feasible_set` takes it."""
+
+    along: tuple[np.ndarray, ...]  # the coordinates along each of the d axes
+    axes: tuple[int, ...]  # the d states mapped
+    fixed: np.ndarray | None  # (n,) for a slice; None: all states mapped, or a projection
+
+    @property
+    def total(self) -> int:
+        """Return the number of points B."""
+        return math.prod(len(line) for line in self.along)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Return all points (B, d)."""
+        return mesh(self.along)
+
+
+def sweep_points(config: Config) -> SweepPoints:
+    """Return the grid of initial states that [sweep] describes."""
+    axes = mapped_axes(config)
+    lower, upper = section_ends(config, axes, config.sweep)
+    shape = grid_shape(config)
+    along = tuple(np.linspace(*ends) for ends in zip(lower, upper, shape, strict=True))
+    if config.sweep.fixed is None:
+        return SweepPoints(along, axes, None)
+    fixed = np.zeros(len(config.system.A))
+    fixed[[i for i in range(len(fixed)) if i not in axes]] = config.sweep.fixed
+    return SweepPoints(along, axes, fixed)
+
+
+def grid_shape(config: Config) -> tuple[int, ...]:
+    """Return the number of points of a sweep along each mapped axis."""
+    d = len(mapped_axes(config))
+    # 256 along each of two axes; about as many points in all along more.
+    return config.sweep.grid or (min(256, int(65_536.5 ** (1 / d))),) * d
+
+
+def recursion_states(config: Config) -> np.ndarray | None:
+    """Return states (B, n) for `recursive_feasibility`; None for its own choice (n > 3)."""
+    shape, axes = recursion_shape(config), range(len(config.system.A))
+    return None if shape is None else grid(*section_ends(config, axes, config.recursion), shape)
+
+
+def recursion_shape(config: Config) -> tuple[int, ...] | None:
+    """Return the number of sample states along each axis; None for those that
+    `recursive_feasibility` chooses itself (n > 3)."""
+    usual = {1: (1001,), 2: (128, 128), 3: (24, 24, 24)}
+    return config.recursion.grid or usual.get(len(config.system.A))
+
+
+def mapped_axes(config: Config) -> tuple[int, ...]:
+    """Return the indices of the mapped states, which [sweep] gives by name or index."""
+    n, axes = len(config.system.A), config.sweep.axes
+    given = tuple(range(min(2, n))) if axes is None else axes
+    return axis_indices("sweep.axes", "state", given, config.system.state_names or (), n)
+
+
+def section_ends(
+    config: Config, axes: Sequence[int], section: SweepSection | RecursionSection
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of the grid of [sweep] or [recursion]; see `grid_ends`."""
+    where = "sweep." if isinstance(section, SweepSection) else "recursion."
+    limits = lambda: tuple(end[list(axes)] for end in config.state_range())
+    return grid_ends(where, section.lower, section.upper, limits)
+
+
+def to_toml(document: Mapping[str, Any]) -> str:
+    """Return TOML text with each vector, and each row of a matrix, on a line."""
+    text = tomli_w.dumps(document)
+    line = lambda found: f"[{' '.join(part.strip() for part in found[1].splitlines())}]"
+    # What holds a bracket of its own, a matrix or a name with one, stays as it is.
+    return re.sub(r"\[\n([^\[\]]+?),?\n *\]", line, text)
+
+
+def to_matrix(value: Any) -> np.ndarray:
+    """Return a weight as a matrix (n, n); a flat list is a diagonal."""
+    array = np.asarray(value, dtype=np.float64)
+    return np.diag(array) if array.ndim == 1 else array
