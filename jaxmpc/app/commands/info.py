@@ -99,7 +99,7 @@ def _pictures(report: OfflineReport) -> list[str]:
     fmap = report.feasible_set
     if fmap is None or fmap.x0s.shape[1] != 2:
         return []
-    from jaxmpc.app.plots.feasible_set import plot_feasible_set
+    from jaxmpc.app.plots.maps import plot_feasible_set
     from jaxmpc.app.plots.style import save
 
     file = io.BytesIO()

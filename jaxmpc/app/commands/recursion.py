@@ -173,7 +173,7 @@ class Recursion:
         save_report(self.output, report, config.to_dict("recursion"), least)
         files = ["summary.json", "recursion.npz"]
         if mpc.dimension == 2:
-            from jaxmpc.app.plots.recursion import draw_recursion
+            from jaxmpc.app.plots.maps import draw_recursion
             from jaxmpc.app.plots.style import save
 
             save(draw_recursion(report), self.output / "recursion.png", config.name)

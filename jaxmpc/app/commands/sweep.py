@@ -240,7 +240,7 @@ def linear_sweep(
             part += f" with {len(store.own):,} of {len(store.regions):,} blocks"
         print(f"{config.name}: {region.total:,} initial states -> {output}{part}")
         # The compiler keeps one core busy; meanwhile another can load matplotlib.
-        plots = Thread(target=import_module, args=("jaxmpc.app.plots.feasible_set",), daemon=True)
+        plots = Thread(target=import_module, args=("jaxmpc.app.plots.maps",), daemon=True)
         plots.start()
 
     found = sweep_into(
@@ -279,7 +279,7 @@ def conclude(found: StoredMap, config: configs.Config, output: Path, start: floa
     axes = found.problem.view.axes
     files = [str(found.store.path), str(output / "summary.json")]
     if len(axes) == 2:
-        from jaxmpc.app.plots.feasible_set import plot_feasible_set
+        from jaxmpc.app.plots.maps import plot_feasible_set
         from jaxmpc.app.plots.style import save
 
         figure = plot_feasible_set(found.bounds, picture=found.picture()).figure
@@ -326,7 +326,7 @@ def map_robot_into(robot: str, output: Path, refine: bool = True, **options: Any
     rmap = sweep_robot(robot, output, gap=1e-6 if refine else None, progress=True, **options)
     files = ["summary.json", "robot_map.npz"]
     if rmap.x0s.shape[1] == 2:
-        from jaxmpc.app.plots.robot_map import plot_robot_map
+        from jaxmpc.app.plots.maps import plot_robot_map
         from jaxmpc.app.plots.style import save
 
         save(plot_robot_map(rmap).figure, output / "robot_map.png")

@@ -33,8 +33,9 @@ from jaxmpc.app.commands.options import (
     require_lengths,
 )
 from jaxmpc.app.commands.tune_shared import TUNED, best_of_steps, optimizer_of, two_columns
+from jaxmpc.app.plots.closed_loops import plot_before_after
 from jaxmpc.app.plots.style import save
-from jaxmpc.app.plots.tuning import plot_before_after, plot_maps, plot_tuning
+from jaxmpc.app.plots.tuning import plot_maps, plot_tuning
 from jaxmpc.batches import Compiled
 from jaxmpc.checks import MOST_COUNT, fail, require_memory
 from jaxmpc.closed_loop.robot_controller import RobotController, robot_mpc, robot_references

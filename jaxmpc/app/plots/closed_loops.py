@@ -1,4 +1,4 @@
-"""The plot of closed loops over time: positions, velocities and inputs with their limits."""
+"""Closed loops over time: positions, velocities and inputs with their limits."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,9 +8,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxmpc.app.plots.style import EDGE, INFEASIBLE, NOT_SOLVED, OUTER, TERMINAL, patch
+from jaxmpc.app.plots.style import (
+    AFTER,
+    BEFORE,
+    EDGE,
+    INFEASIBLE,
+    NOT_SOLVED,
+    OUTER,
+    SET_POINT,
+    TERMINAL,
+    Style,
+    patch,
+)
 from jaxmpc.checks import fail
-from jaxmpc.closed_loop.outcome import with_limits
+from jaxmpc.closed_loop.outcome import coordinates, with_limits
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.robot import Robot
@@ -44,9 +55,7 @@ def plot_runs(
     run = run.on_host()
     inputs, plans = np.asarray(run.inputs), plan_outcomes(run)
     count, samples = inputs.shape[:2]
-    shown = np.arange(min(count, 24)) if robots is None else np.asarray(robots, int)
-    if not len(shown) or np.any((shown < 0) | (shown >= count)):
-        fail("robots", f"{robots}", f"Give indices from 0 to {count - 1}")
+    shown = _chosen("robots", np.arange(min(count, 24)) if robots is None else robots, count)
     pairs = with_limits(plant, run)
     xi, kept = pairs[0][1], [violations.kept(*pair) for pair in pairs]
     time = plant.dt * np.arange(samples + 1)
@@ -58,12 +67,9 @@ def plot_runs(
         _draw_lines(ax, time, values.T, parts, broken.T)
         draw_limits(ax, plant, kind, i, (reference, input_reference)[kind])
     whole = kept[0].all(axis=(1, 2)) & kept[1].all(axis=(1, 2))
-    figure.suptitle(
+    title = (
         f"{plant.name}: {count:,} closed loop{'s' * (count > 1)} of {time[-1]:g} s, {len(shown):,} "
-        f"shown. Limits kept by {np.count_nonzero(whole):,} of {count:,}\n{_plans_text(plans)}",
-        fontsize=9,
-        x=0.01,
-        ha="left",
+        f"shown. Limits kept by {np.count_nonzero(whole):,} of {count:,}\n{_plans_text(plans)}"
     )
     line = lambda label, **style: Line2D([], [], label=label, **style)
     handles: list[Any] = [
@@ -71,17 +77,75 @@ def plot_runs(
         patch("beyond the limits", INFEASIBLE),
     ]
     if reference is not None or input_reference is not None:
-        handles.append(line("set-point", color=TERMINAL, lw=1.0, ls=(0, (4, 2))))
+        handles.append(line("set-point", **SET_POINT))
     for name, (colour, words) in PLANS.items():
         if plans[name][shown].any():
             handles.append(line(words, color=colour, lw=1.6))
     if not all(part[shown].all() for part in kept):
         handles.append(line("limit exceeded", color=BROKEN, marker="o", ms=3, ls=""))
     columns = max(1, min(len(handles), int(figure.get_figwidth() / 2.5)))
-    figure.legend(
-        handles=handles, loc="outside lower left", ncols=columns, fontsize=8, frameon=False
-    )
+    _title_and_legend(figure, title, handles, columns)
     return figure
+
+
+def plot_before_after(
+    before: Run,
+    after: Run,
+    plant: Any,
+    *,
+    reference: Any = None,
+    input_reference: Any = None,
+    loops: Sequence[int] | None = None,
+    title: str = "",
+) -> Figure:
+    """Draw the same closed loops before and after tuning: a panel a position, velocity and input.
+
+    before, after: of `simulate_many` from the same starts, of a Robot or LinearPlant, whose limits
+    are lines, grey outside. reference (n,), input_reference (m,): set-points to draw. loops: which
+    ones; None: 6 spread over all. Raises ValueError for loops that are not there.
+    """
+    before, after = before.on_host(), after.on_host()
+    count, samples = np.shape(before.inputs)[:2]
+    spread = np.unique(np.linspace(0, count - 1, min(count, 6)).astype(int))
+    shown = _chosen("loops", spread if loops is None else loops, count)
+    time = plant.dt * np.arange(samples + 1)
+    values = [
+        (coordinates(plant, run.states)[shown], np.asarray(run.inputs, float)[shown])
+        for run in (before, after)
+    ]
+    figure, panels = panel_grid(plant, time, 3.4, (1.35, 2.4, 1.0))
+    for ax, kind, i in panels:
+        # Broad lines below narrow ones, so that both are visible where they coincide.
+        for found, colour, width in zip(values, (BEFORE, AFTER), (2.2, 1.0), strict=True):
+            lines = found[kind][..., i].T
+            lines = np.concatenate([lines, lines[-1:]]) if kind else lines
+            style: dict[str, Any] = {"drawstyle": "steps-post"} if kind else {}
+            ax.plot(time, lines, color=colour, lw=width, alpha=0.9, **style)
+        draw_limits(ax, plant, kind, i, (reference, input_reference)[kind])
+    handles: list[Any] = [
+        Line2D([], [], color=BEFORE, lw=2.2, label="before"),
+        Line2D([], [], color=AFTER, lw=1.0, label="after"),
+        patch("outside limits", INFEASIBLE),
+    ]
+    if reference is not None or input_reference is not None:
+        handles.append(Line2D([], [], label="set-point", **SET_POINT))
+    _title_and_legend(figure, title, handles, len(handles))
+    return figure
+
+
+def _chosen(name: str, given: Any, count: int) -> np.ndarray:
+    """Return which of `count` loops to draw; raise ValueError for some that are not there."""
+    shown = np.asarray(given, int)
+    if not len(shown) or np.any((shown < 0) | (shown >= count)):
+        fail(name, f"{given}", f"Give indices from 0 to {count - 1}")
+    return shown
+
+
+def _title_and_legend(figure: Figure, title: str, handles: list[Any], columns: int) -> None:
+    """Put the title above all panels, and the legend below them."""
+    figure.suptitle(title, fontsize=9, x=0.01, ha="left")
+    style: Style = {"loc": "outside lower left", "fontsize": 8, "frameon": False}
+    figure.legend(handles=handles, ncols=columns, **style)
 
 
 def plan_outcomes(run: Run) -> dict[str, np.ndarray]:

@@ -1,6 +1,6 @@
 """Plots of tuning: losses and weights by step, closed loops, maps and penalties."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import matplotlib
@@ -8,20 +8,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
-from jaxmpc.app.plots.closed_loops import draw_limits, panel_grid
-from jaxmpc.app.plots.style import INFEASIBLE, TERMINAL, ring
-from jaxmpc.checks import fail
-from jaxmpc.closed_loop.outcome import coordinates
-from jaxmpc.closed_loop.simulation import Run
+from jaxmpc.app.plots.maps import ring
+from jaxmpc.app.plots.style import AFTER, BEFORE, EDGE, GRID
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.tuning.descent import Descent
 from jaxmpc.tuning.result import TuningRun
 
-# Okabe and Ito, as in `plots`.
-BEFORE, AFTER, REJECTED, BEST = "#d55e00", "#0072b2", "#a50f15", "#006f52"
+REJECTED, BEST = "#a50f15", "#006f52"
 FRACTIONS = (
     ("unsolved", "plans not solved", "#0072b2", "-"),
     ("infeasible", "plans proved infeasible", "#a50f15", "--"),
@@ -52,7 +47,7 @@ def plot_tuning(
     relative = validation[0] > 0 and len(loss) > 0 and loss[0] > 0
     if relative:
         loss, validation = loss / loss[0], validation / validation[0]
-    top.plot(steps, loss, color="#8a8a8a", lw=1, label="training loops of the step")
+    top.plot(steps, loss, color=EDGE, lw=1, label="training loops of the step")
     top.plot(every, validation, color=AFTER, lw=1.6, label="validation loops")
     label = f"best: {history.validation[best]:.6g} at step {best}"
     top.plot(best, validation[best], "o", color=BEST, ms=6, label=label, zorder=4)
@@ -91,7 +86,7 @@ def plot_tuning(
         ax.set_ylabel(name)
         ax.set_xlim(-0.02 * max(1, history.steps), 1.02 * max(1, history.steps))
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-        ax.grid(color="#ececec", lw=0.7)
+        ax.grid(**GRID)
         ax.set_axisbelow(True)
         if ax is not ratio and (ax is not norm or len(rejected)):
             ax.legend(fontsize=8, frameon=False)
@@ -141,7 +136,7 @@ def _draw_weights(
             colour = colours[g % len(colours)]
             label = f"{group} ({len(entries)})" if len(entries) > 1 else group
             handles.append(Line2D([], [], color=colour, label=label))
-    ax.axhline(1, color="#8a8a8a", lw=0.7, zorder=0)
+    ax.axhline(1, color=EDGE, lw=0.7, zorder=0)
     flat = np.concatenate([*ratios, np.ones(1)])
     flat = flat[np.isfinite(flat) & (flat > 0)]
     if flat.max() > 5 * flat.min():
@@ -153,57 +148,6 @@ def _draw_weights(
     ax.legend(
         handles=handles, fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.02)
     )
-
-
-def plot_before_after(
-    before: Run,
-    after: Run,
-    plant: Any,
-    *,
-    reference: Any = None,
-    input_reference: Any = None,
-    loops: Sequence[int] | None = None,
-    title: str = "",
-) -> Figure:
-    """Draw the same closed loops before and after tuning: a panel a position, velocity and input.
-
-    before, after: of `simulate_many` from the same starts, of a Robot or LinearPlant, whose limits
-    are lines, grey outside. reference (n,), input_reference (m,): set-points to draw. loops: which
-    ones; None: 6 spread over all. Raises ValueError for loops that are not there.
-    """
-    before, after = before.on_host(), after.on_host()
-    count, samples = np.shape(before.inputs)[:2]
-    shown = np.unique(np.linspace(0, count - 1, min(count, 6)).astype(int))
-    shown = shown if loops is None else np.asarray(loops, int)
-    if not len(shown) or np.any((shown < 0) | (shown >= count)):
-        fail("loops", f"{loops}", f"Give indices from 0 to {count - 1}")
-    time = plant.dt * np.arange(samples + 1)
-    values = [
-        (coordinates(plant, run.states)[shown], np.asarray(run.inputs, float)[shown])
-        for run in (before, after)
-    ]
-    figure, panels = panel_grid(plant, time, 3.4, (1.35, 2.4, 1.0))
-    for ax, kind, i in panels:
-        # Broad lines below narrow ones, so that both are visible where they coincide.
-        for found, colour, width in zip(values, (BEFORE, AFTER), (2.2, 1.0), strict=True):
-            lines = found[kind][..., i].T
-            lines = np.concatenate([lines, lines[-1:]]) if kind else lines
-            style: dict[str, Any] = {"drawstyle": "steps-post"} if kind else {}
-            ax.plot(time, lines, color=colour, lw=width, alpha=0.9, **style)
-        draw_limits(ax, plant, kind, i, (reference, input_reference)[kind])
-    handles: list[Any] = [
-        Line2D([], [], color=BEFORE, lw=2.2, label="before"),
-        Line2D([], [], color=AFTER, lw=1.0, label="after"),
-        Patch(facecolor=INFEASIBLE, edgecolor="#8a8a8a", linewidth=0.6, label="outside limits"),
-    ]
-    if reference is not None or input_reference is not None:
-        style = {"color": TERMINAL, "lw": 1.0, "ls": (0, (4, 2))}
-        handles.append(Line2D([], [], label="set-point", **style))
-    figure.suptitle(title, fontsize=9, x=0.01, ha="left")
-    figure.legend(
-        handles=handles, loc="outside lower left", ncols=len(handles), fontsize=8, frameon=False
-    )
-    return figure
 
 
 def plot_maps(before: FeasibleSetMap, after: FeasibleSetMap) -> Figure:
@@ -258,20 +202,20 @@ def plot_solver(
         ax.set_title(kind if len(steps) > 1 else f"{kind}, k = {steps[0]}", fontsize=10)
         ax.set_xlabel("step k" if len(steps) > 1 else "row")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
-        ax.grid(color="#ececec", lw=0.7)
+        ax.grid(**GRID)
     low, high = rho.min() / 1.5, rho.max() * 1.5
     for ax in axes[:-1]:
         _logarithmic(ax, np.array([low, high]))
         ax.set_ylim(min(low, 0.5), max(high, 2.0))
         ax.tick_params(labelleft=bool(ax is axes[0]))
-        ax.axhline(1.0, color="#8a8a8a", lw=0.7, zorder=0)
+        ax.axhline(1.0, color=EDGE, lw=0.7, zorder=0)
     axes[0].set_ylabel("penalty rho, scaled rows")
     stages = [
         Line2D([], [], color=colour, label=f"stage {i + 1}") for i, colour in enumerate(shades)
     ]
     widest = max((size for _, steps, size in blocks if len(steps) > 1), default=1)
     stages += [
-        Line2D([], [], color="#8a8a8a", ls=dashes, label=f"row {i + 1}")
+        Line2D([], [], color=EDGE, ls=dashes, label=f"row {i + 1}")
         for i, dashes in enumerate(DASHES[:widest])
         if widest > 1
     ]
@@ -290,12 +234,12 @@ def plot_solver(
             lw=1.6,
             label=f"{name}: {solved:.1f} % ≤ {eps:g}",
         )
-    last.axvline(eps, color="#8a8a8a", lw=0.9, ls=(0, (4, 2)))
+    last.axvline(eps, color=EDGE, lw=0.9, ls=(0, (4, 2)))
     last.set_xscale("log")
     last.set_ylim(0, 103)
     last.set_xlabel("largest residual")
     last.set_ylabel("fraction of validation states [%]")
-    last.grid(color="#ececec", lw=0.7)
+    last.grid(**GRID)
     last.set_axisbelow(True)
     last.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
