@@ -39,8 +39,7 @@ from jaxmpc.mpc.condense import Condensed, condense, in_float64
 from jaxmpc.qp.admm import ScaledProgram, factorise, iterate, read, splittings
 from jaxmpc.qp.residuals import residual_terms, worst
 from jaxmpc.tuning.result import TuningRun
-from jaxmpc.tuning.rho_schedule import transfer_penalties
-from jaxmpc.tuning.solver import tune_solver
+from jaxmpc.tuning.solver import transfer_penalties, tune_solver
 
 HERE = Path(__file__).parent
 RHOS, ALPHAS = np.logspace(-2, 2, 13), (1.0, 1.6, 1.9)

@@ -30,9 +30,9 @@ from rivals import RIVALS, Joint, with_torch
 import jaxmpc as jm
 from jaxmpc.batches import Compiled
 from jaxmpc.mpc.stagewise.nonlinear import as_argument
-from jaxmpc.tuning.closed_loop_objective import ClosedLoopObjective
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter, raw
+from jaxmpc.tuning.weights import ClosedLoopObjective
 
 JOINT = Joint()
 # Of the reference: at 1e-5 it steps across a change of active rows in one loop of 256, and the

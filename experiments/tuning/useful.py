@@ -38,10 +38,9 @@ import jaxmpc as jm
 from jaxmpc.batches import Compiled
 from jaxmpc.mpc.stagewise.nonlinear import as_argument
 from jaxmpc.robots.robot import Robot
-from jaxmpc.tuning.closed_loop_objective import ClosedLoopObjective
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter, raw
-from jaxmpc.tuning.weights import tune_weights
+from jaxmpc.tuning.weights import ClosedLoopObjective, tune_weights
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,11 @@ Interrupted                               what all of these raise on Ctrl-C, wit
 """
 
 from jaxmpc.tuning.feasible_set import tune_feasible_set
-from jaxmpc.tuning.initial_states import feasible_states
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
-from jaxmpc.tuning.result import Interrupted
-from jaxmpc.tuning.rho_schedule import transfer_penalties
-from jaxmpc.tuning.run_folders import run_folder
-from jaxmpc.tuning.solver import tune_solver
-from jaxmpc.tuning.tasks import linear_task, robot_task, weight_parameters
+from jaxmpc.tuning.result import Interrupted, run_folder
+from jaxmpc.tuning.solver import transfer_penalties, tune_solver
+from jaxmpc.tuning.tasks import feasible_states, linear_task, robot_task, weight_parameters
 from jaxmpc.tuning.weights import tune_weights
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Gradient descent with safeguards: the loop of all tuners.
+"""Gradient descent with safeguards: the loop of all tuners, and the settings that they share.
 
 The optimiser comes from optax. The best iterate is chosen by the loss on a validation set. Steps
 that lead to numbers which are not finite are undone and halved. A checkpoint is written after each
@@ -16,14 +16,91 @@ import numpy as np
 import optax
 from tqdm.std import tqdm
 
-from jaxmpc.checks import fail
+from jaxmpc.batches import chosen_devices
+from jaxmpc.checks import fail, whole
 from jaxmpc.files import fingerprint, read_arrays, remove_partial, write_arrays
 from jaxmpc.pytrees import record
-from jaxmpc.tuning.settings import Settings
 
 # (loss, numbers to record) and (loss, gradient, numbers to record).
 Validate = Callable[[Any], tuple[float, Mapping[str, float]]]
 Gradient = Callable[[Any, int], tuple[float, Any, Mapping[str, float]]]
+
+
+@record
+class Settings:
+    """Settings of the descent of a tuner.
+
+    updates: number of steps of the optimiser.
+    optimizer: from optax; None: Adam, with the step size that suits what is tuned.
+    batch: number of samples of each step, drawn again each time; None: all.
+    validation: fraction of the samples in the validation set, by which the best step is chosen, or
+        the samples of this set themselves.
+    seed: of batches and of the validation set.
+    checkpoint: file (.npz) that is replaced after every step. Where it exists the run resumes from
+        it, with the same result as without interruption; it must be of the same run.
+    progress: show a progress bar with the loss of the step and the best on the validation set.
+    devices: a number of them, or a sequence of JAX devices, which share the samples of a step;
+        None: the default device. A design loss is computed on each of them.
+    """
+
+    updates: int = 100
+    optimizer: optax.GradientTransformation | None = None
+    batch: int | None = None
+    validation: Any = 0.25
+    seed: int = 0
+    checkpoint: str | Path | None = None
+    progress: bool = False
+    devices: Any = None
+
+    def validate(self) -> None:
+        """Raise ValueError for a count or fraction that makes no sense, and for wrong devices."""
+        chosen_devices(self.devices)
+        whole("updates", self.updates, 0)
+        whole("seed", self.seed, 0)
+        if self.batch is not None:
+            whole("batch", self.batch, 1)
+        if self.splits and not 0 < float(self.validation) < 1:
+            fail("validation", f"{self.validation}", "Give a fraction in (0, 1), or samples")
+
+    @property
+    def splits(self) -> bool:
+        """Return whether `validation` is a fraction of the samples, not samples of its own."""
+        return not isinstance(self.validation, tuple) and np.ndim(self.validation) == 0
+
+    def split(self, samples: Any, least: int = 1, shuffle: bool = False) -> tuple[Any, Any]:
+        """Divide samples into those for training and those for validation.
+
+        samples: states (B, n), or a pytree (B, …) whose first leaf they are. Where `validation` is
+        a fraction the last samples are for validation, at least `least` of them, or random ones
+        where `shuffle`; else all are for training. Raises ValueError where none is left.
+        """
+        first = jax.tree.leaves(samples)[0]
+        total = len(first)
+        if not self.splits:
+            pair = isinstance(self.validation, tuple)
+            states = np.asarray(self.validation[0] if pair else self.validation, float)
+            if states.ndim != 2 or states.shape[1] != first.shape[1] or not len(states):
+                fail("validation", f"shape {states.shape}", f"Give states (B, {first.shape[1]})")
+            if isinstance(samples, tuple):
+                more = self.validation[1] if pair else {}
+                return samples, (states, {name: np.asarray(v) for name, v in more.items()})
+            return samples, states
+        count = max(least, round(float(self.validation) * total))
+        if count >= total:
+            cure = "Give more: some to learn from, some for validation"
+            fail("x0s", f"{total} states, {count} of them for validation", cure)
+        order = np.roll(np.arange(total), count)
+        if shuffle:
+            order = np.random.default_rng(self.seed).permutation(total)
+        part = lambda where: jax.tree.map(lambda v: v[where], samples)
+        return part(order[count:]), part(order[:count])
+
+    def minibatch(self, total: int, step: int) -> Any:
+        """Return which of `total` samples a step sees: a function of its number, so that a run can
+        go on."""
+        if self.batch is None or self.batch >= total:
+            return slice(None)
+        return np.random.default_rng([self.seed, step]).choice(total, self.batch, replace=False)
 
 
 @record
@@ -55,6 +132,11 @@ class Descent:
     def steps(self) -> int:
         """Return the number of steps T."""
         return len(self.loss)
+
+    def measured(self, k: int) -> dict[str, float]:
+        """Return loss and numbers of θ_k on the validation set."""
+        numbers = {name: float(v[k]) for name, v in self.validation_numbers.items()}
+        return {"loss": float(self.validation[k]), **numbers}
 
 
 @dataclass(eq=False)
@@ -140,16 +222,12 @@ def descend(
         except KeyboardInterrupt:
             if len(state.thetas) < 2:
                 raise
-            _drop_unfinished(state)
+            # The steps of which all is recorded.
+            done = min(len(state.rows), len(state.checks) - 1, len(state.thetas) - 1)
+            del state.rows[done:], state.checks[done + 1 :], state.thetas[done + 1 :]
             state.checks[-1] = state.checks[-1] or _checked(validate, state.thetas[-1])
             return replace(_record(state), interrupted=True)
     return _record(state)
-
-
-def _drop_unfinished(state: State) -> None:
-    """Leave the steps of which all is recorded."""
-    done = min(len(state.rows), len(state.checks) - 1, len(state.thetas) - 1)
-    del state.rows[done:], state.checks[done + 1 :], state.thetas[done + 1 :]
 
 
 def _progress(state: State, shown: str | None) -> str:

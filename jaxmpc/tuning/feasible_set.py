@@ -17,10 +17,9 @@ from jaxmpc.files import fingerprint
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.linalg import arrays
 from jaxmpc.tuning.batch_mean import BatchMean
-from jaxmpc.tuning.descent import descend
+from jaxmpc.tuning.descent import Settings, descend
 from jaxmpc.tuning.parameters import Parameters, raw, require_parameters, values
 from jaxmpc.tuning.result import TuningRun, finished
-from jaxmpc.tuning.settings import Settings
 
 
 def tune_feasible_set(

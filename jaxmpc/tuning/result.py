@@ -1,6 +1,9 @@
-"""TuningRun: the result of every tuner, its cache, and what an interrupt leaves of it."""
+"""TuningRun: the result of every tuner; what an interrupt leaves of it, its cache, its folder."""
 
-from collections.abc import Callable, Mapping
+import contextlib
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import field
 from pathlib import Path
 from typing import Any
@@ -8,13 +11,24 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail
-from jaxmpc.files import read_arrays, write_arrays
+from jaxmpc.files import (
+    check_results,
+    differences,
+    open_folder,
+    read_arrays,
+    text_within,
+    write_arrays,
+    write_json,
+)
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.tuning.descent import Descent
+from jaxmpc.tuning.descent import Descent, Settings
 from jaxmpc.tuning.parameters import Parameters, exact_values, trajectory
-from jaxmpc.tuning.settings import Settings
+
+CHECKPOINT = "checkpoint.npz"
+# Where the files of a run that is overwritten wait.
+ASIDE = "overwritten"
 
 
 @record
@@ -50,17 +64,13 @@ class TuningRun:
         build: Callable[[Mapping[str, Any]], Any],
     ) -> "TuningRun":
         """Return the run of a descent of `parameters`, whose start is what was given."""
-        at = lambda k: {
-            "loss": float(history.validation[k]),
-            **{name: float(v[k]) for name, v in history.validation_numbers.items()},
-        }
         initial = {name: np.asarray(p.value) for name, p in parameters.items()}
         improved = history.best > 0
         return cls(
             exact_values(parameters, history.theta) if improved else initial,
             initial,
-            at(0),
-            at(history.best),
+            history.measured(0),
+            history.measured(history.best),
             improved,
             settings,
             build,
@@ -172,3 +182,53 @@ def cached(
     plain = {name: getattr(run, name) for name in ("before", "after", "improved", "settings")}
     write_arrays(path, plain, **arrays)
     return run
+
+
+@contextlib.contextmanager
+def run_folder(
+    folder: Path, files: tuple[str, ...], options: dict[str, Any], resume: bool, overwrite: bool
+) -> Iterator[Path]:
+    """Open the folder of a new run, or of one that is resumed, and give the path of its checkpoint.
+
+    files[0] is the record of the run, a JSON file that holds the options. All files are removed,
+    and a new record is written. Those of a run that is overwritten are put aside, and come back
+    at the end, whatever ends it, unless the new run has a checkpoint.
+    Raises ValueError where the folder holds a run with other options, or any run without `resume`
+    or `overwrite`.
+    """
+    record, checkpoint = folder / files[0], folder / CHECKPOINT
+    _settle(folder)
+    for path in (record, checkpoint):
+        check_results(path, resume, overwrite)
+    if resume and record.exists():
+        try:
+            stored = json.loads(text_within(record))["options"]
+        except (ValueError, KeyError, TypeError, RecursionError):
+            fail(str(record), "holds no run", "Add --overwrite (overwrite=True) to start again")
+        if changes := differences(stored, options):
+            cure = "Give the same options, or --overwrite (overwrite=True)"
+            fail(str(record), "; ".join(changes), cure)
+    open_folder(folder)
+    if overwrite:
+        (folder / ASIDE).mkdir()
+    for name in filter(lambda name: (folder / name).exists(), (*files, CHECKPOINT)):
+        if overwrite:
+            (folder / name).replace(folder / ASIDE / name)
+        elif name != CHECKPOINT:  # which a resumed run reads
+            (folder / name).unlink()
+    write_json(record, {"options": options, "finished": False})
+    try:
+        yield checkpoint
+    finally:
+        _settle(folder)
+
+
+def _settle(folder: Path) -> None:
+    """Remove a run that was overwritten where the new one has a checkpoint, else bring it back."""
+    aside = folder / ASIDE
+    if not aside.is_dir():
+        return
+    if not (folder / CHECKPOINT).exists():
+        for path in aside.iterdir():
+            path.replace(folder / path.name)
+    shutil.rmtree(aside)

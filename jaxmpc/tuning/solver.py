@@ -1,5 +1,18 @@
-"""tune_solver: ADMM's penalties rho and over-relaxation alpha, tuned for one MPC problem."""
+"""tune_solver: ADMM's penalties rho and over-relaxation alpha, tuned for one MPC problem.
 
+ADMM with a fixed number of steps is a function of rho and alpha that can be differentiated; what
+is minimised is a smooth count of the sampled states that it leaves unsolved,
+
+    mean over states of softplus(2 (e + margin)) / 2,    e = log10 |residuals / tolerances|,
+
+with the residuals by which the status is decided. A solved state counts almost nothing, another one
+the number of digits that are missing. (Learning to optimise by unrolling: Gregor,
+LeCun 2010; penalties of ADMM for QPs: Ichnowski et al. 2021, by reinforcement; Stellato et al.
+2020, §5.2, adapt one number while iterating.) For every rho the fixed points of the
+iteration are the solutions: a bad rho costs steps but cannot make a solution wrong.
+"""
+
+import functools
 import warnings
 from dataclasses import replace
 from functools import partial
@@ -7,30 +20,28 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
+from jax import Array
 
 from jaxmpc.arrays import Reals
-from jaxmpc.batches import chosen_devices
+from jaxmpc.batches import Compiled, Devices, chosen_devices, divisible, each_part, over_devices
 from jaxmpc.checks import fail, require_finite, require_kind, whole
 from jaxmpc.files import fingerprint
 from jaxmpc.mpc.aim import checked_array
 from jaxmpc.mpc.condense import Condensed, condensed_in_float64
 from jaxmpc.mpc.plan import Plan, WarmStart
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.qp.admm import ADMM, factorise
+from jaxmpc.pytrees import pytree
+from jaxmpc.qp.admm import ADMM, ScaledProgram, factorise, iterate, read, splittings
+from jaxmpc.qp.problem import QP
+from jaxmpc.qp.residuals import residual_terms, with_fault
+from jaxmpc.qp.solve import solve_factored, warm
 from jaxmpc.qp.status import Status
-from jaxmpc.tuning.descent import descend
+from jaxmpc.tuning.batch_mean import BatchMean
+from jaxmpc.tuning.descent import Settings, descend
 from jaxmpc.tuning.result import TuningRun, cached
-from jaxmpc.tuning.rho_objective import (
-    PenaltyObjective,
-    Samples,
-    loss_and_gradient,
-    score,
-    solve_samples,
-)
-from jaxmpc.tuning.rho_schedule import KNOTS, interpolation
-from jaxmpc.tuning.settings import Settings
 
 # Version of the algorithm: results that an older version cached are not used.
 VERSION = 3
@@ -42,6 +53,13 @@ FEWEST, FEWEST_VALIDATION = 8, 2
 # set is solved, which costs as much as many steps.
 RATE, VALIDATIONS = 0.2, 15
 SOLVER = ADMM(newton_steps=0)
+# Digits by which the loss wants residuals below their tolerance.
+MARGIN = 0.3
+# Values of a group along the horizon, between which log rho is interpolated.
+KNOTS = 5
+
+# (kind, steps, rows a step) of each block of rows.
+Blocks = tuple[tuple[str, tuple[int, ...], int], ...]
 
 
 def tune_solver(
@@ -125,9 +143,9 @@ def tune_solver(
 
 
 def tune_schedule(
-    objective: PenaltyObjective,
-    train: Samples,
-    test: Samples,
+    objective: "PenaltyObjective",
+    train: "Samples",
+    test: "Samples",
     given: ADMM,
     stages: int,
     settings: Settings,
@@ -137,7 +155,7 @@ def tune_schedule(
     rows, parameters = objective.W.shape
     chunk, devices = len(test), chosen_devices(settings.devices)
 
-    def measure(rho: Any, alpha: Any, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
+    def measure(rho: Any, alpha: Any, samples: "Samples") -> tuple[np.ndarray, np.ndarray]:
         rho = np.atleast_2d(rho)  # one stage counts as many equal ones
         count = stages if len(rho) == 1 else len(rho)
         rho = np.broadcast_to(rho, (count, rows))
@@ -177,9 +195,7 @@ def tune_schedule(
     every = max(settings.updates // VALIDATIONS, 1)
     adam = optax.adam(schedule, b2=0.99)
     history = descend(theta, gradient, validate, adam, settings, decides, every, "solved")
-    after = {"loss": history.validation[history.best]} | {
-        name: float(v[history.best]) for name, v in history.validation_numbers.items()
-    }
+    after = history.measured(history.best)
     initial = {"rho": np.asarray(given.rho), "alpha": np.asarray(given.alpha)}
     before = score(*measure(**initial, samples=test))
     improved = bool(after["loss"] < before["loss"])
@@ -219,7 +235,7 @@ def _objective(
     groups: str,
     solver: ADMM,
     references: tuple[Reals | None, Reals | None],
-) -> PenaltyObjective:
+) -> "PenaltyObjective":
     """Return the objective; ValueError for bad input."""
     require_kind("mpc", mpc, MPC)
     mpc.validate()
@@ -248,7 +264,7 @@ def _objective(
 
 def _samples(
     mpc: MPC, c: Condensed, x0s: Reals, warm_start: Any, settings: Settings
-) -> tuple[Samples, Samples]:
+) -> "tuple[Samples, Samples]":
     """Return the samples for training and for validation; ValueError for bad input."""
     x = _states(mpc, "x0s", x0s)
     if len(x) < FEWEST:
@@ -276,3 +292,198 @@ def _states(mpc: MPC, name: str, x0s: Reals) -> np.ndarray:
         fail(name, f"shape {x.shape}", f"Give states (B, {mpc.system.n})")
     require_finite(name, x)
     return np.pad(x, ((0, 0), (0, mpc.dimension - x.shape[1])))
+
+
+@pytree
+class Samples:
+    """States to solve from: x (B, p), and warm starts (z (B, nz), y (B, rows)) or None."""
+
+    x: Any
+    start: Any = None
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def take(self, where: Any) -> "Samples":
+        """Return the samples at these places."""
+        return jax.tree.map(lambda v: v[where], self)
+
+
+@pytree
+class PenaltyObjective:
+    """The problem, references and iteration for which penalties are tuned.
+
+    W: from `interpolation`. solver: its iterations, eps and smoothing are used.
+    """
+
+    condensed: Condensed
+    W: Any
+    reference: Any
+    input_reference: Any
+    solver: ADMM
+
+    def qp(self, x: Array) -> QP:
+        """Return the quadratic program at a state."""
+        return self.condensed.qp(x, self.reference, self.input_reference)
+
+    def digits(self, theta: Any, samples: Samples) -> Array:
+        """Return e (B,): log10 of the norm of all residuals over their tolerances."""
+        rho, alpha = jnp.exp(theta["log_rho"] @ self.W.T), 2 * jax.nn.sigmoid(theta["alpha"])
+        solver, c = replace(self.solver, rho=rho, alpha=alpha), self.condensed
+        made = factorise(c.P, c.C, solver, c.balls)
+        eps = solver.eps
+
+        def one(sample: Samples) -> Array:
+            qp = self.qp(sample.x)
+            p = ScaledProgram.of(qp, made)
+            t = jnp.zeros_like(qp.l)
+            if sample.start is not None:
+                t = warm(p, sample.start)
+            t, _ = iterate(splittings(made, p.q), p.bounds, t, solver.admm_steps(), solver.alpha)
+            w, y = read(made, t, p.q, p.bounds)
+            typical = p.typical_sizes(w, y)
+            z, y = p.unscaled(w, y)
+            floor = 100 * jnp.finfo(z.dtype).eps
+            # A quarter of the rounding stays, for the sake of the logarithm's slope at 0.
+            parts = zip(*residual_terms(qp, z, y, typical), strict=True)
+            values, sizes, terms = map(jnp.concatenate, parts)
+            allowed = eps * sizes + floor * (sizes + terms)
+            squares = jnp.sum((values / jnp.where(allowed > 0, allowed, 1.0)) ** 2)
+            return 0.5 * jnp.log10((floor / 4) ** 2 + squares)
+
+        return jax.vmap(one)(samples)
+
+
+@functools.cache
+def loss_and_gradient(devices: Devices = None) -> BatchMean:
+    """Return the program (θ, objective, samples, weights (B,)) → ((loss, gradient), {}): the
+    weighted mean of the module's docstring."""
+
+    def loss(theta: Any, objective: PenaltyObjective, samples: Samples, weights: Array) -> Array:
+        e = objective.digits(theta, samples)
+        return jnp.sum(weights * jax.nn.softplus(2 * (e + MARGIN)) / 2) / jnp.sum(weights)
+
+    value_and_slope = jax.value_and_grad(loss)
+    return BatchMean(lambda *args: (value_and_slope(*args), {}), devices, (False, False, True))
+
+
+def solve_samples(
+    rho: np.ndarray,
+    alpha: Any,
+    objective: PenaltyObjective,
+    samples: Samples,
+    chunk: int,
+    devices: Devices = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return status and largest residual (B,) of the samples by the solver itself.
+
+    rho (stages, rows). chunk: samples at once; one size, so that it compiles once.
+    """
+    solve = _solve_batches(devices)
+    given = jnp.asarray(rho), jnp.asarray(alpha, float), objective
+
+    def program(part: Samples) -> tuple[np.ndarray, np.ndarray]:
+        return solve(*given, part)
+
+    found = [part.result for part in each_part(program, samples, divisible(chunk, devices))]
+    status, worst = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return status, worst
+
+
+@functools.cache
+def _solve_batches(devices: Devices) -> Compiled:
+    return over_devices(_solve_batch, devices, (False, False, False, True))
+
+
+def _solve_batch(
+    rho: Array, alpha: Array, objective: PenaltyObjective, samples: Samples
+) -> tuple[Array, Array]:
+    """Return status and largest residual (B,) of a batch, in JAX."""
+    c, solver = objective.condensed, replace(objective.solver, rho=rho, alpha=alpha)
+    made = factorise(c.P, c.C, solver, c.balls)
+
+    def one(sample: Samples) -> tuple[Array, Array]:
+        s = with_fault(*solve_factored(objective.qp(sample.x), made, solver, sample.start))
+        worst = jnp.maximum(jnp.maximum(s.primal_residual, s.dual_residual), jnp.abs(s.gap))
+        return s.status, worst
+
+    return jax.vmap(one)(samples)
+
+
+def score(status: np.ndarray, worst: np.ndarray) -> dict[str, float]:
+    """Return how well samples were solved, as `tune_solver` documents it.
+
+    loss: the states that are not solved, plus a fraction of one that grows with the median
+    residual from 1e-16 to 1e16: less is better. solved: fraction SOLVED. residual: median of the
+    largest residuals; NaN counts as infinite.
+    """
+    median = float(np.median(np.nan_to_num(worst, nan=np.inf)))
+    digits = float(np.log10(np.clip(median, 1e-16, 1e16)))
+    return {
+        "loss": float(np.sum(status != Status.SOLVED)) + (digits + 17) / 34,
+        "solved": float(np.mean(status == Status.SOLVED)),
+        "residual": median,
+    }
+
+
+def interpolation(
+    groups: str, blocks: Blocks, horizon: int, balls: tuple[int, ...] = (), knots: int = KNOTS
+) -> np.ndarray:
+    """Return W (rows, parameters): log rho = W θ.
+
+    groups "row": one parameter a row. "step": for each row of a block `knots` values at k/N in
+    [0, 1], linear between them; one value where a block has one step. The rows of a ball have the
+    same values, so that it stays a ball; the last len(balls) blocks are balls.
+    """
+    columns: list[np.ndarray] = []
+    for i, (_, steps, size) in enumerate(blocks):
+        ball = i >= len(blocks) - len(balls)
+        if groups == "row":
+            along = np.eye(len(steps))
+        elif len(steps) == 1:
+            along = np.ones((1, 1))
+        else:
+            ends, at = np.linspace(0, 1, knots), np.array(steps) / horizon
+            along = np.stack([np.interp(at, ends, hat) for hat in np.eye(knots)], axis=1)
+        columns.append(np.kron(along, np.ones((size, 1)) if ball else np.eye(size)))
+    rows, parameters = (sum(part.shape[k] for part in columns) for k in (0, 1))
+    W, row, column = np.zeros((rows, parameters)), 0, 0
+    for part in columns:
+        W[row : row + part.shape[0], column : column + part.shape[1]] = part
+        row, column = row + part.shape[0], column + part.shape[1]
+    return W
+
+
+def transfer_penalties(run: TuningRun, mpc: MPC, iterations: int | None = None) -> ADMM:
+    """Return the solver that `tune_solver` found, for a problem with another horizon.
+
+    run: of groups="step", unless mpc has the very rows of the problem tuned. Its penalties are
+    interpolated at k/N. mpc: a problem with the same blocks of rows. iterations: None for those
+    tuned with, divided evenly among the stages. How many states of the other problem it solves is
+    not guaranteed; its status tells. Where nothing better was found the given solver is returned.
+    Raises ValueError for a problem with other blocks.
+    """
+    mpc.validate()
+    solver, settings = run.solver, run.settings
+    rho = np.asarray(solver.rho)
+    if run.improved:
+        c = condensed_in_float64(mpc)
+        blocks = tuple((kind, tuple(steps), size) for kind, steps, size in settings["blocks"])
+        if settings["groups"] == "row" and c.layout != blocks:
+            fail("mpc", "has other rows than the problem tuned", 'Use groups="step"')
+        kinds = lambda blocks: [(kind, size) for kind, _, size in blocks]
+        if kinds(c.layout) != kinds(blocks) or len(c.balls) != len(settings["balls"]):
+            fail("mpc", f"blocks {kinds(c.layout)}", f"Needed: {kinds(blocks)}")
+        if c.layout != blocks:
+            shape = lambda blocks, N: interpolation("step", blocks, N, c.balls, settings["knots"])
+            old, new = shape(blocks, settings["horizon"]), shape(c.layout, mpc.horizon)
+            if old.shape[1] != new.shape[1]:
+                fail("mpc", "has blocks of one step, or more where one was", "Tune it anew")
+            # A parameter that no row depends on takes the mean of the others.
+            mean = np.mean(np.log(rho), axis=1, keepdims=True)
+            theta = np.linalg.lstsq(old, (np.log(rho) - mean).T, rcond=None)[0]
+            rho = np.exp(mean + theta.T @ new.T)
+    count = solver.admm_steps() if iterations is None else iterations
+    solver = replace(solver, iterations=count, rho=rho)
+    solver.validate(rho.shape[-1] if rho.ndim else 1)
+    return solver

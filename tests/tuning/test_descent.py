@@ -13,9 +13,8 @@ import numpy as np
 import optax
 import pytest
 
-from jaxmpc.tuning.descent import descend
+from jaxmpc.tuning.descent import Settings, descend
 from jaxmpc.tuning.parameters import Parameter, raw, require_parameters, values
-from jaxmpc.tuning.settings import Settings
 
 TARGET = {"a": np.array([1.0, -2.0]), "b": np.array(3.0)}
 START = {"a": np.zeros(2), "b": np.array(0.0)}

@@ -10,10 +10,8 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.tuning import solver as tuning_solver
-from jaxmpc.tuning.rho_objective import loss_and_gradient
-from jaxmpc.tuning.rho_schedule import interpolation, transfer_penalties
-from jaxmpc.tuning.settings import Settings
-from jaxmpc.tuning.solver import tune_solver
+from jaxmpc.tuning.descent import Settings
+from jaxmpc.tuning.solver import interpolation, loss_and_gradient, transfer_penalties, tune_solver
 
 # The double integrator of five steps: 5 variables, 17 rows.
 DEFAULT = jm.ADMM(rho=1.0, alpha=1.6, newton_steps=0)

@@ -15,8 +15,8 @@ from jaxmpc.app.config import load, load_robot_config
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.tuning import tasks
 from jaxmpc.tuning.descent import Descent
-from jaxmpc.tuning.initial_states import feasible_states
 from jaxmpc.tuning.result import Interrupted, TuningRun
+from jaxmpc.tuning.tasks import feasible_states
 
 # The built-in joint with a horizon that is too short for its terminal weight.
 LINE = (

@@ -8,9 +8,8 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.tuning.initial_states import initial_range
-from jaxmpc.tuning.run_folders import CHECKPOINT, run_folder
-from jaxmpc.tuning.tasks import TIGHTEST, weight_loss
+from jaxmpc.tuning.result import CHECKPOINT, run_folder
+from jaxmpc.tuning.tasks import TIGHTEST, initial_range, weight_loss
 
 SYSTEM = replace(problems.double_integrator(4).system, dt=1.0)
 MPC = replace(problems.double_integrator(4), system=SYSTEM, terminal_cost=np.eye(2))

@@ -12,10 +12,9 @@ from problems import symmetric
 import jaxmpc as jm
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.tuning import weights
-from jaxmpc.tuning.closed_loop_objective import operations
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
-from jaxmpc.tuning.weights import tune_weights
+from jaxmpc.tuning.weights import operations, tune_weights
 
 SYSTEM = jm.LinearSystem(np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[0.02], [0.2]]), dt=0.2)
 LIMITS = symmetric(1.0, 0.6)

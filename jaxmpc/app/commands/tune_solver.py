@@ -33,10 +33,9 @@ from jaxmpc.mpc.controller import solve
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
-from jaxmpc.tuning.initial_states import feasible_states, initial_range
-from jaxmpc.tuning.result import TuningRun
-from jaxmpc.tuning.run_folders import CHECKPOINT, run_folder
+from jaxmpc.tuning.result import CHECKPOINT, TuningRun, run_folder
 from jaxmpc.tuning.solver import tune_solver
+from jaxmpc.tuning.tasks import feasible_states, initial_range
 
 FILES = ("solver.json", TUNED, "solver.png")
 GIVEN = ADMM(newton_steps=0)

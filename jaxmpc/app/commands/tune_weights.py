@@ -51,10 +51,16 @@ from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.sets.ellipsoid import Ellipsoid
 from jaxmpc.sets.polytope import Polytope
-from jaxmpc.tuning.initial_states import feasible_states, initial_range
-from jaxmpc.tuning.result import TuningRun
-from jaxmpc.tuning.run_folders import CHECKPOINT, run_folder
-from jaxmpc.tuning.tasks import WeightTask, linear_task, robot_task, weight_loss, weight_parameters
+from jaxmpc.tuning.result import CHECKPOINT, TuningRun, run_folder
+from jaxmpc.tuning.tasks import (
+    WeightTask,
+    feasible_states,
+    initial_range,
+    linear_task,
+    robot_task,
+    weight_loss,
+    weight_parameters,
+)
 from jaxmpc.tuning.weights import SOLVER
 
 SPREAD = Values(lambda value: 0 < value <= 1, "Give a fraction above 0 and up to 1")
