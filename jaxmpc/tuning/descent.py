@@ -95,6 +95,18 @@ class Settings:
         part = lambda where: jax.tree.map(lambda v: v[where], samples)
         return part(order[count:]), part(order[:count])
 
+    def decides(self, parameters: Mapping[str, Any], train: Any, test: Any) -> dict[str, Any]:
+        """Return what determines a run over these samples of `split`, as JSON data."""
+        size, measured = (len(jax.tree.leaves(part)[0]) for part in (train, test))
+        return {
+            "parameters": {name: p.record() for name, p in parameters.items()},
+            "batch": min(self.batch or size, size),
+            "train": size,
+            "validation": measured,
+            "seed": self.seed,
+            "data": fingerprint(None, train, test),
+        }
+
     def minibatch(self, total: int, step: int) -> Any:
         """Return which of `total` samples a step sees: a function of its number, so that a run can
         go on."""

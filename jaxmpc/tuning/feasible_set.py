@@ -13,7 +13,6 @@ from jaxmpc.arrays import Reals
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail
 from jaxmpc.feasible.fraction import STEPS, membership
-from jaxmpc.files import fingerprint
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.linalg import arrays
 from jaxmpc.tuning.batch_mean import BatchMean
@@ -80,16 +79,7 @@ def tune_feasible_set(
             (loss, numbers), _ = value(*arrays((theta, test, np.ones(len(test)))))
         return float(loss), numbers
 
-    decides = {
-        "parameters": {name: p.record() for name, p in parameters.items()},
-        "width": float(width),
-        "batch": min(chosen.batch or len(train), len(train)),
-        "train": len(train),
-        "validation": len(test),
-        "newton_steps": newton_steps,
-        "seed": chosen.seed,
-        "dtype": "float64",
-        "data": fingerprint(None, train, test),
-    }
+    decides = chosen.decides(parameters, train, test)
+    decides |= {"width": float(width), "newton_steps": newton_steps, "dtype": "float64"}
     history = descend(raw(parameters), gradient, validate, optax.adam(0.05), chosen, decides)
     return finished(TuningRun.of_parameters(parameters, history, decides, make_mpc))

@@ -17,7 +17,6 @@ from jaxmpc.arrays import Reals
 from jaxmpc.batches import Devices, chosen_devices, device_bytes, program_bytes
 from jaxmpc.checks import fail, whole
 from jaxmpc.closed_loop.simulation import Conditions, Each, Run, require_variations, simulate_each
-from jaxmpc.files import fingerprint
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.softening import harden
@@ -127,16 +126,8 @@ def tune_weights(
     given = as_argument(plant), steps, loss, reference, input_reference, design_loss
     objective = ClosedLoopObjective(build, parameters, *given)
     objective.check(start, train)
-    decides = {
-        "parameters": {name: p.record() for name, p in parameters.items()},
-        "steps": steps,
-        "batch": min(chosen.batch or len(train[0]), len(train[0])),
-        "train": len(train[0]),
-        "validation": len(test[0]),
-        "seed": chosen.seed,
-        "data": fingerprint(None, train, test),
-        "dtype": np.dtype(controller.dtype).name,
-    }
+    decides = chosen.decides(parameters, train, test)
+    decides |= {"steps": steps, "dtype": np.dtype(controller.dtype).name}
     loops = _Loops(objective, chosen, start, train, test, mode)
     history = descend(start, loops.gradient, loops.validate, optax.adam(0.05), chosen, decides)
     decides["mode"] = loops.mode

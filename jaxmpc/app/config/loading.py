@@ -270,18 +270,13 @@ def _check_state_limits(config: Config) -> None:
     limits = config.limits
     box = limits.x_min is not None or limits.x_max is not None
     polytope = limits.H_x is not None or limits.h_x is not None
-    if (limits.x_min is None) != (limits.x_max is None):
-        fail("limits.x_min", "x_min and x_max go together", "Use inf for a side without limit")
+    _check_pair("limits", limits, "x_min", "x_max", "Use inf for a side without limit")
     if limits.margin and not box:
         fail("limits.margin", "given without x_min, x_max", "A Box of limits has half-widths")
-    if (limits.H_x is None) != (limits.h_x is None):
-        fail("limits.H_x", "H_x and h_x go together", "Give both: H_x x <= h_x")
+    _check_pair("limits", limits, "H_x", "h_x", "Give both: H_x x <= h_x")
     if box and polytope:
         fail("limits.H_x", "given beside x_min, x_max", "Write the box as rows of H_x")
-    if limits.H_x is not None and limits.h_x is not None:
-        shape = np.shape(limits.H_x)
-        if shape != (len(limits.h_x), len(config.system.A)):
-            fail("limits.H_x", f"shape {shape} for {len(limits.h_x)} rows", "One h_x a row")
+    _check_rows("limits.H_x", limits.H_x, limits.h_x, len(config.system.A), "One h_x a row")
     if not (box or polytope) and config.mpc.terminal != "none":
         fail("mpc.terminal", f'"{config.mpc.terminal}" without state limits', "Give x_min, x_max")
 
@@ -290,18 +285,26 @@ def _check_terminal_set(config: Config, n: int) -> None:
     """Raise ValueError unless [mpc] gives at most one terminal set, complete and of size n."""
     mpc = config.mpc
     for rows, ends in (("H_f", "h_f"), ("P_f", "level_f")):
-        if (getattr(mpc, rows) is None) != (getattr(mpc, ends) is None):
-            fail(f"mpc.{rows}", f"{rows} and {ends} go together", "Give both")
+        _check_pair("mpc", mpc, rows, ends, "Give both")
         if getattr(mpc, rows) is not None and mpc.terminal != "none":
             fail(f"mpc.{rows}", f'given beside terminal "{mpc.terminal}"', "Choose one")
     if mpc.H_f is not None and mpc.P_f is not None:
         fail("mpc.P_f", "given beside H_f", "Choose one terminal set")
-    if mpc.H_f is not None and mpc.h_f is not None:
-        if np.shape(mpc.H_f) != (len(mpc.h_f), n):
-            what = f"shape {np.shape(mpc.H_f)} for {len(mpc.h_f)} rows"
-            fail("mpc.H_f", what, f"One h_f a row, {n} columns")
+    _check_rows("mpc.H_f", mpc.H_f, mpc.h_f, n, f"One h_f a row, {n} columns")
     if mpc.P_f is not None and np.shape(mpc.P_f) != (n, n):
         fail("mpc.P_f", f"shape {np.shape(mpc.P_f)}", f"Give ({n}, {n})")
+
+
+def _check_pair(where: str, section: Any, first: str, second: str, cure: str) -> None:
+    """Raise ValueError unless both of two keys are given, or neither."""
+    if (getattr(section, first) is None) != (getattr(section, second) is None):
+        fail(f"{where}.{first}", f"{first} and {second} go together", cure)
+
+
+def _check_rows(key: str, H: Any, h: Any, n: int, cure: str) -> None:
+    """Raise ValueError unless H, where given, has a row of n entries for each entry of h."""
+    if H is not None and np.shape(H) != (len(h), n):
+        fail(key, f"shape {np.shape(H)} for {len(h)} rows", cure)
 
 
 def _check_order(where: str, section: Any, low: str, high: str) -> None:

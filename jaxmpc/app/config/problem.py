@@ -162,12 +162,8 @@ class SolverSection:
 SECTION_COMMANDS = ("sweep", "recursion")
 # Arguments by which errors of the library name what these keys give.
 KEYS = {
-    **{
-        f"{kind}_{part}": f"system.{kind}_{part}"
-        for kind in ("state", "input")
-        for part in ("names", "units")
-    },
-    **{name: f"system.{name}" for name in ("A", "B", "c", "dt")},
+    **{name: f"system.{name}" for name in ("A", "B", "c", "dt", "state_names", "state_units")},
+    **{name: f"system.{name}" for name in ("input_names", "input_units")},
     "Q": "cost.Q",
     "R": "cost.R",
     "terminal_cost": "cost.P",
