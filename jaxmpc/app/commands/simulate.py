@@ -51,6 +51,8 @@ from jaxmpc.systems.riccati import lqr
 FILES = ("summary.json", "runs.png", "robots.gif")
 # Defaults of options that --config can give too.
 USUAL = {"horizon": 20, "margin": 0.02, "linearize": "state", "rho": 1e4}
+# Seconds between frames of the video.
+FRAME = 0.04
 
 
 @dataclasses.dataclass(frozen=True)
@@ -265,19 +267,11 @@ class Simulate:
 
     def problem(self, robot: Robot, target: np.ndarray | None, file: dict[str, Any]) -> MPC:
         """Return the problem: weights of options before those of the file."""
-        options = {"Q": self.state_weights, "R": self.input_weights}
-        given = file | {key: np.array(v) for key, v in options.items() if v is not None}
-        horizon: Any = self.horizon
-        more = {"terminal_cost": given["terminal_cost"]} if "terminal_cost" in given else {}
-        return robot_mpc(
-            robot,
-            given.get("Q"),
-            given.get("R"),
-            horizon,
-            target=target,
-            margin=self.margin or 0.0,
-            **more,
-        )
+        given = file | {"horizon": self.horizon, "margin": self.margin, "target": target}
+        for name, diagonal in (("Q", self.state_weights), ("R", self.input_weights)):
+            if diagonal is not None:
+                given[name] = np.array(diagonal)
+        return robot_mpc(robot, **given)
 
     def controller(self, robot: Robot, mpc: MPC) -> RobotController | LinearFeedback:
         """Return the controller of --linearize."""
@@ -303,18 +297,10 @@ class Simulate:
         found: dict[str, Any] = dict(USUAL)
         if self.config is not None:
             file = load_robot_config(self.config)
-            found |= {
-                "horizon": file.robot.horizon,
-                "margin": file.robot.margin,
-                "linearize": file.robot.linearize,
-                "rho": file.cost.rho,
-            }
+            robot = {name: getattr(file.robot, name) for name in ("horizon", "margin", "linearize")}
+            found |= robot | {"rho": file.cost.rho}
         missing = {key: value for key, value in found.items() if getattr(self, key) is None}
         return dataclasses.replace(self, **missing)
-
-
-# Seconds between frames.
-FRAME = 0.04
 
 
 def film(robot: Robot, run: Run, reference: np.ndarray, count: int, path: Path) -> bool:
