@@ -231,7 +231,7 @@ def save_run(
     write_json(folder / FILES[0], document)
     words = "tuned" if run.improved else "default kept, no step is better"
     title = f"{config.name}: {solver.iterations} ADMM steps, {words}"
-    save(plot_solver(run, *worst, 1e-6, title), folder / "solver.png")
+    save(plot_solver(run, worst[0], worst[1], 1e-6, title), folder / "solver.png")
 
 
 def solver_rows(run: TuningRun, states: int, infeasible: int) -> list[tuple[str, str]]:
