@@ -221,12 +221,8 @@ def linear_sweep(
     others: as in `sweep_into`. A shard labels its own blocks, and is done unless it is the last.
     Raises ValueError before anything compiles.
     """
-    start, region, path = (
-        time.perf_counter(),
-        configs.sweep_points(config),
-        url or output / "sweep.zarr",
-    )
-    mpc, dimension = config.build_mpc(), len(region.axes)
+    start, path = time.perf_counter(), url or output / "sweep.zarr"
+    region, mpc = configs.sweep_points(config), config.build_mpc()
     if shard is None:
         check_results(location(path), resume, overwrite, exists(location(path)))
     open_folder(output)
@@ -252,7 +248,7 @@ def linear_sweep(
         iterations=config.sweep.iterations,
         dtype=config.sweep.dtype,
         chunk=CHUNK,
-        gap=1e-6 if refine and dimension <= 3 else None,
+        gap=1e-6 if refine and len(region.axes) <= 3 else None,
         settings=config.to_dict(),
         shard=shard,
         resume=resume,
@@ -334,5 +330,5 @@ def map_robot_into(robot: str, output: Path, refine: bool = True, **options: Any
     print(rmap)
     if rmap.recursion is not None:
         print(f"linear model, in deviations from the set-point\n{rmap.recursion}")
-    print(f"  {'total':<17} {time.perf_counter() - begun:.2f} s with set-up and files")
-    print(f"  {'files':<17} {' '.join(str(output / name) for name in files)}")
+    total = f"{time.perf_counter() - begun:.2f} s with set-up and files"
+    print_table([("total", total), ("files", " ".join(str(output / name) for name in files))], 17)

@@ -36,7 +36,6 @@ MOST_DOTS = 32
 QUOTED = re.compile(r'"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'')
 DOTTED = re.compile(r"[^\w\-. \t]+")
 
-
 # Inertia 0.05 kg m², period 0.01 s, x = (q, dq), u = τ.
 _JOINT: dict[str, Any] = {
     "name": "joint",
