@@ -53,11 +53,9 @@ if TYPE_CHECKING:
     from jaxmpc.recursion import recursive_feasibility
     from jaxmpc.robots.linear_plant import LinearPlant
     from jaxmpc.robots.load import load_robot
-    from jaxmpc.sets.box import Box
-    from jaxmpc.sets.ellipsoid import Ellipsoid
+    from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
     from jaxmpc.sets.invariant import maximal_invariant_set
     from jaxmpc.sets.limits import joint_limits
-    from jaxmpc.sets.polytope import Polytope
     from jaxmpc.systems.riccati import lqr
     from jaxmpc.systems.system import LinearSystem
     from jaxmpc.tuning.losses import ClosedLoopLoss
@@ -133,11 +131,9 @@ HOMES = {
     "recursion": "recursive_feasibility",
     "robots.linear_plant": "LinearPlant",
     "robots.load": "load_robot",
-    "sets.box": "Box",
-    "sets.ellipsoid": "Ellipsoid",
+    "sets.convex_sets": "Box Ellipsoid Polytope",
     "sets.invariant": "maximal_invariant_set",
     "sets.limits": "joint_limits",
-    "sets.polytope": "Polytope",
     "systems.riccati": "lqr",
     "systems.system": "LinearSystem",
     "tuning.losses": "ClosedLoopLoss",

@@ -11,7 +11,7 @@ from fractions import Fraction as Q
 import numpy as np
 
 import jaxmpc as jm
-from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.convex_sets import Ellipsoid
 
 
 def rational(array) -> list:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.convex_sets import Polytope
 
 
 def sorted_rows(points):

@@ -16,7 +16,7 @@ from scipy.linalg import solve_discrete_are
 from jaxmpc.checks import fail, nearest
 from jaxmpc.feasible.map import map_feasible_set
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex_sets import Box
 from jaxmpc.systems.system import LinearSystem
 
 # States of a family that differ from each other; more are these again.

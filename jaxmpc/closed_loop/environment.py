@@ -18,7 +18,7 @@ from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import matmul
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
-from jaxmpc.sets.violations import TOLERANCE, worst_violation
+from jaxmpc.sets.limits import TOLERANCE, worst_violation
 
 
 @pytree

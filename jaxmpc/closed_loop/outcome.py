@@ -17,8 +17,8 @@ from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.violations import TOLERANCE, kept, row_violations
+from jaxmpc.sets.convex_sets import Box
+from jaxmpc.sets.limits import TOLERANCE, row_violations, rows_kept
 
 
 @record
@@ -79,7 +79,7 @@ def evaluate_runs(
         state_excess=state_excess,
         input_excess=input_excess,
         band=band,
-        kept=np.all([kept(*pair).all(axis=(1, 2)) for pair in limits], axis=0),
+        kept=np.all([rows_kept(*pair).all(axis=(1, 2)) for pair in limits], axis=0),
         reached=inside[:, -1],
         settling=np.where(inside[:, -1], before * plant.dt, np.inf),
         cost=np.asarray(run.stage_cost, float).sum(axis=1),

@@ -27,7 +27,7 @@ from jaxmpc.qp.linalg import arrays, floating_dtype
 from jaxmpc.robots.equilibria import settled
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot, RobotModel
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex_sets import Box
 from jaxmpc.systems.riccati import least_reached, lqr
 from jaxmpc.systems.system import LinearSystem
 

@@ -39,7 +39,7 @@ from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import arrays, matmul
 from jaxmpc.qp.status import Status
 from jaxmpc.qp.transformations import own_modes, varying
-from jaxmpc.sets.violations import worst_violation
+from jaxmpc.sets.limits import worst_violation
 from jaxmpc.systems.system import LinearSystem
 
 

@@ -7,17 +7,21 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_kind, whole
-from jaxmpc.explicit.active_piece import ActivePiece, active_piece, capped_ball
-from jaxmpc.explicit.least_distance import SMALLEST, LeastDistanceForm, least_distance_form
-from jaxmpc.explicit.region_search import exchange, explore
-from jaxmpc.explicit.regions import CriticalRegions
+from jaxmpc.explicit.least_distance import (
+    SMALLEST,
+    ActivePiece,
+    LeastDistanceForm,
+    active_piece,
+    capped_ball,
+    least_distance_form,
+)
+from jaxmpc.explicit.regions import CriticalRegions, exchange, explore
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Row, row_table
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex_sets import Box, Polytope
 from jaxmpc.sets.lp import Program, maximise
-from jaxmpc.sets.polytope import Polytope
 
 # "auto" enumerates regions up to this dimension of the state.
 ENUMERATED = 4

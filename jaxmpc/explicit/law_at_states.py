@@ -17,7 +17,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex_sets import Box
 from jaxmpc.sets.geometry import unit_rows
 from jaxmpc.systems.system import host_matrices
 

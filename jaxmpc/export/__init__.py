@@ -8,8 +8,7 @@ check_fixed_steps     closed loops under the law of `export_c` beside precise pl
 """
 
 from jaxmpc.export.c_law import export_explicit_c
-from jaxmpc.export.c_solver import export_c
-from jaxmpc.export.fixed_steps_check import check_fixed_steps
+from jaxmpc.export.c_solver import check_fixed_steps, export_c
 from jaxmpc.export.jax_program import export_jax
 
 __all__ = [

@@ -12,7 +12,7 @@ from jaxmpc.files import versions
 from jaxmpc.mpc.plan import rate_ends
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex_sets import Box
 
 TEMPLATES = Path(__file__).parent
 REAL = {"float64": "double", "float32": "float"}

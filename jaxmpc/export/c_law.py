@@ -36,10 +36,8 @@ class Facets(NamedTuple):
     @classmethod
     def of(cls, regions: CriticalRegions, size: float) -> "Facets":
         """Return the facets of regions in X_N of this size."""
-        H = [np.asarray(region.polytope.H) for region in regions.regions]
-        h = np.concatenate([np.asarray(region.polytope.h) for region in regions.regions])
-        begin = np.cumsum([0, *(len(part) for part in H)])
-        whole = np.hstack([np.vstack(H), h[:, None]])
+        H, h, starts = regions.facets
+        whole = np.column_stack([H, h])
         rounded = np.round(np.hstack([whole[:, :-1], whole[:, -1:] / size]), DECIMALS)
         # The first entry that is not zero is positive, so that both sides are one plane.
         lead = rounded[np.arange(len(rounded)), np.argmax(rounded[:, :-1] != 0, axis=1)]
@@ -48,7 +46,7 @@ class Facets(NamedTuple):
             rounded * side[:, None] + 0.0, axis=0, return_index=True, return_inverse=True
         )
         planes = whole[first] * side[first, None]
-        return cls(planes[:, :-1], planes[:, -1], plane.ravel(), side, begin)
+        return cls(planes[:, :-1], planes[:, -1], plane.ravel(), side, np.append(starts, len(h)))
 
 
 class SearchTree(NamedTuple):

@@ -12,9 +12,7 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import Block
 from jaxmpc.mpc.rows import blocks as row_blocks
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.sets.any_set import set_bounds
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.convex_sets import Box, Ellipsoid, set_bounds
 from jaxmpc.sets.lp import power_of_two
 from jaxmpc.systems.system import host_matrices
 

@@ -10,9 +10,8 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from jaxmpc.pytrees import record
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex_sets import Box, Polytope
 from jaxmpc.sets.lp import power_of_two
-from jaxmpc.sets.polytope import Polytope
 
 # Points, or half-spaces, from which on they are reduced to those that matter, and the most mapped
 # states with which they are.

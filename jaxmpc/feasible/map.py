@@ -22,10 +22,9 @@ from jaxmpc.feasible.view import Axes
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
-from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.convex_sets import Ellipsoid, Polytope
 from jaxmpc.sets.geometry import hull_volume
 from jaxmpc.sets.lp import power_of_two
-from jaxmpc.sets.polytope import Polytope
 
 # Volumes are sums of rounded products; bounds are widened by more than that.
 VOLUME_ROUNDING = 1e-11

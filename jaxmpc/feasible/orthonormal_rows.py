@@ -16,7 +16,7 @@ from jaxmpc.mpc.rows import Block
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import matmul
 from jaxmpc.qp.problem import Bounds
-from jaxmpc.sets.any_set import set_bounds
+from jaxmpc.sets.convex_sets import set_bounds
 from jaxmpc.sets.lp import power_of_two, scaling
 
 

@@ -17,9 +17,9 @@ from scipy.optimize import nnls
 from jaxmpc.checks import fail
 from jaxmpc.mpc.condense import Inequalities, row_lengths
 from jaxmpc.pytrees import record
-from jaxmpc.sets.interior import affine_hull, framed
+from jaxmpc.sets.convex_sets import Polytope
+from jaxmpc.sets.geometry import affine_hull, framed
 from jaxmpc.sets.lp import Program, bound, extent, maximise, power_of_two
-from jaxmpc.sets.polytope import Polytope
 
 # Bounds of linear programs are trusted to this, relative to the size of the set.
 TOLERANCE = 1e-9

@@ -12,11 +12,9 @@ from jaxmpc.feasible.plan_polytope import DIMENSIONS, FACETS, CenteredPolytope, 
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 from jaxmpc.sets.geometry import unit_rows
-from jaxmpc.sets.one_step import predecessor
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.predecessors import predecessor
 
 
 def feasible_polytope(mpc: MPC) -> Polytope:

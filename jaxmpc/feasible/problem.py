@@ -20,13 +20,9 @@ from jaxmpc.mpc.condense import Condensed, condensed_in_float64
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
 from jaxmpc.mpc.rows import Block
 from jaxmpc.pytrees import record
-from jaxmpc.sets.any_set import set_bounds
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.ellipsoid import Ellipsoid
-from jaxmpc.sets.geometry import binding_rows, unit_rows
-from jaxmpc.sets.interior import implied_equalities
+from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope, set_bounds
+from jaxmpc.sets.geometry import binding_rows, implied_equalities, unit_rows
 from jaxmpc.sets.lp import FLAT, ROUNDING, scaling
-from jaxmpc.sets.polytope import Polytope
 
 
 @record

@@ -25,9 +25,9 @@ from jaxmpc.feasible.proofs import Cut
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.qp.transformations import own_modes
+from jaxmpc.sets.convex_sets import Polytope
 from jaxmpc.sets.geometry import hull_volume
 from jaxmpc.sets.lp import power_of_two
-from jaxmpc.sets.polytope import Polytope
 
 # How far a boundary point is moved towards the centre before it is proved: the least that works.
 BACKOFFS = 10.0 ** np.arange(-14, -1)

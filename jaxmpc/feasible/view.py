@@ -11,7 +11,7 @@ from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.sets.any_set import set_bounds
+from jaxmpc.sets.convex_sets import set_bounds
 
 # Indices or names of states, None for all.
 Axes: TypeAlias = Sequence[int | str] | np.ndarray | None

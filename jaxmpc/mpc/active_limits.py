@@ -7,7 +7,7 @@ import numpy as np
 from jaxmpc.mpc.plan import Plan, flat_multipliers
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import blocks, layout, row_table
-from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.convex_sets import Ellipsoid
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,7 @@ from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.solve import in_two_parts, solve_factored
 from jaxmpc.qp.status import Status
 from jaxmpc.qp.transformations import own_modes, varying
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.convex_sets import Box, Polytope
 
 T = TypeVar("T")
 

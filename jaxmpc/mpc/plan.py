@@ -18,7 +18,7 @@ from jaxmpc.qp.linalg import arrays, matmul
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.residuals import with_fault
 from jaxmpc.qp.status import Status, WithStatus
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex_sets import Box
 
 
 @pytree

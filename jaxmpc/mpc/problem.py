@@ -19,9 +19,7 @@ from jaxmpc.checks import (
 )
 from jaxmpc.pytrees import pytree, static, static_pytree
 from jaxmpc.qp.linalg import symmetric
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.ellipsoid import Ellipsoid
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
 # Curvature of the cost, relative to its terms, below which a direction of the inputs costs nothing.

@@ -21,9 +21,7 @@ from jaxmpc.mpc.problem import MPC, Outputs, Soft, output_stages
 from jaxmpc.pytrees import record
 from jaxmpc.qp.linalg import cholesky, matmul
 from jaxmpc.qp.problem import Bounds
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.ellipsoid import Ellipsoid
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 
 # (kind, steps, rows a step) of each block of rows.
 Layout = tuple[tuple[str, tuple[int, ...], int], ...]

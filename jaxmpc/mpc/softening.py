@@ -8,9 +8,8 @@ import numpy as np
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import concrete, fail, require_kind
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple, output_stages
-from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.convex_sets import Ellipsoid, Polytope
 from jaxmpc.sets.limits import output_limits
-from jaxmpc.sets.polytope import Polytope
 
 
 def soften(mpc: MPC, rho: Reals, quadratic: Reals = 0.0) -> MPC:

@@ -5,7 +5,7 @@ from scipy.optimize import lsq_linear
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite, require_shape
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex_sets import Box
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
 

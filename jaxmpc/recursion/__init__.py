@@ -5,9 +5,8 @@ smallest_horizon         the least horizon with a proof -> SmallestHorizon
 save_report              both as files, which `jaxmpc verify` proves again
 """
 
-from jaxmpc.recursion.analysis import recursive_feasibility
-from jaxmpc.recursion.horizons import smallest_horizon
-from jaxmpc.recursion.stored_report import save_report
+from jaxmpc.recursion.analysis import recursive_feasibility, smallest_horizon
+from jaxmpc.recursion.report import save_report
 
 __all__ = [
     "recursive_feasibility",

@@ -12,7 +12,7 @@ Diehl 2017, section 2.4), by linear programs over the polytope of all states and
 critical regions of the law (`proofs.py`). It is refuted by a counterexample: a state with a
 feasible plan, and a half-space that excludes the next state. The worst is at a vertex of a critical
 region; without all regions counterexamples are looked for among samples and by gradient ascent
-(`counterexample_search.py`).
+(`counterexamples.py`).
 """
 
 from dataclasses import replace
@@ -27,16 +27,20 @@ from jaxmpc.feasible.plan_polytope import CenteredPolytope
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.grids import grid
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.recursion.claims import Claim, Counterexample
-from jaxmpc.recursion.counterexample_search import ascend
 from jaxmpc.recursion.counterexamples import (
     STARTS,
+    Counterexample,
+    SampledLoops,
+    ascend,
     certified,
+    closed_loops,
     farthest_first,
+    labelled,
     outer_bound,
     worst_samples,
 )
 from jaxmpc.recursion.proofs import (
+    Claim,
     Claims,
     RegionVerdict,
     every_input_leaves,
@@ -44,8 +48,7 @@ from jaxmpc.recursion.proofs import (
     settle_by_regions,
     settle_claims,
 )
-from jaxmpc.recursion.report import RecursionReport
-from jaxmpc.recursion.sampled_loops import SampledLoops, closed_loops, labelled
+from jaxmpc.recursion.report import RecursionReport, SmallestHorizon
 from jaxmpc.recursion.time_budget import LABELS, PLANS, PROOFS, Budget
 
 
@@ -257,3 +260,50 @@ def _samples(claims: Claims, starts: np.ndarray, center: np.ndarray) -> np.ndarr
     random = np.random.default_rng(0)
     ends = starts[random.integers(len(starts), size=4096)] - center
     return center + random.uniform(0, 1, (len(ends), 1)) ** (1 / p) * ends
+
+
+def smallest_horizon(
+    mpc: MPC,
+    max_horizon: int = 20,
+    *,
+    max_regions: int = 2000,
+    seconds: float = 60.0,
+    progress: bool = False,
+) -> SmallestHorizon:
+    """Try horizons 1, 2, … up to `max_horizon` with proofs alone (no samples, no search).
+
+    seconds: time limit, after which larger horizons are left out (some linear programs are
+    finished); a horizon takes a second or so with two states, minutes with hundreds of facets or
+    thousands of regions. progress: print each horizon on stderr. The horizon of `mpc` itself has
+    no influence. The answer is the least horizon with a proof; a smaller one that is neither proved
+    nor refuted is in `reasons` with holds None, and one at which the problem is ill-posed (more
+    free moves than steps) is left out of it. Raises ValueError for an ill-posed problem.
+    """
+    mpc.validate()
+    max_horizon = whole("max_horizon", max_horizon, 1)
+    max_regions = whole("max_regions", max_regions, 0)
+    least: int | None = None
+    reasons: dict[int, Claim] = {}
+    budget = Budget.of(seconds, progress)
+    for N in range(1, max_horizon + 1):
+        if not budget.affords(0):
+            break
+        budget.say(f"horizon {N}")
+        changed = replace(mpc, horizon=N)
+        try:
+            problem = FeasibilityProblem.of(changed)
+        except ValueError:  # such as more free moves than steps
+            continue
+        try:
+            claims = settle_claims(changed, problem, budget.deadline)
+            law = claims.law
+            if law.holds is None and least is None and max_regions and np.isfinite(claims.volume):
+                law = settle_by_regions(claims, max_regions, budget.deadline).claim
+        except ValueError as error:  # too ill-conditioned: the other horizons stay settled
+            reasons[N] = Claim(None, f"not settled ({error})")
+            continue
+        reasons[N] = law
+        least = N if law.holds and least is None else least
+        if claims.strong.holds:
+            return SmallestHorizon(least, N, reasons, max_horizon)
+    return SmallestHorizon(least, None, reasons, max_horizon)

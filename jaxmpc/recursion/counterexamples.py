@@ -1,20 +1,69 @@
-"""Counterexamples to the MPC law: a state with a plan whose next state has none, both proved."""
+"""Counterexamples to the MPC law: a state with a plan whose next state has none, both proved.
 
+Candidates come from closed loops of sampled states, and from an ascent over the regions of the law:
+it is piecewise affine in the state, so that a convex function of the next state can be raised by
+its gradient, and on a region be maximised exactly by a linear program.
+"""
+
+import time
 from dataclasses import replace
 
 import numpy as np
+from tqdm.std import tqdm
 
 from jaxmpc.explicit.law_at_states import Law
+from jaxmpc.feasible.labels import Labels
+from jaxmpc.feasible.map import FeasibleSetMap, map_points
 from jaxmpc.feasible.plan_polytope import CenteredPolytope
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import first_of_block
 from jaxmpc.feasible.rays import BACKOFFS, Rays, ray_directions
+from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
-from jaxmpc.recursion.claims import CLEAR, Counterexample
-from jaxmpc.recursion.proofs import Claims
-from jaxmpc.recursion.sampled_loops import SampledLoops
+from jaxmpc.recursion.proofs import CLEAR, Claims, in_words
+from jaxmpc.recursion.time_budget import Budget
+from jaxmpc.sets.lp import maximise
 
+# States near the boundary of X_N from which samples and searches start.
 STARTS = 96
+# `lost_at` of states that are infeasible from the start, and of those that were not decided.
+NOT_FEASIBLE, UNDECIDED = -1, -2
+# Gradient ascent: distance kept from the half-spaces (on the boundary only one plan is feasible,
+# and solvers converge slowly), and step lengths; relative to the size of the set.
+INSET = 1e-6
+LENGTHS = 0.3 * 0.5 ** np.arange(16)
+# Then the search goes from region to region: with how many states at once, in how many rounds, from
+# how many neighbours at what distance.
+FOLLOWED, ROUNDS, NEIGHBOURS, NEAR = 6, 10, 4, 1e-4
+
+
+@record
+class Counterexample:
+    """A feasible state whose optimal first input leads to an infeasible one.
+
+    state x (p,) is feasible by proof: `feasible_inputs` (N, m) keep all rows in a float64 roll-out
+    with margins above rounding. inputs (N, m): the optimal plan, to the given residuals.
+    next_state: A x + B u_0 + c. The half-space normal'x ≤ offset holds on the whole feasible set,
+    by proof, and excludes next_state by `distance` = (normal'x⁺ − offset)/|normal|. found:
+    "search", "sample" or "regions". Where input rates are limited, states are (x, u_{−1}).
+    """
+
+    state: np.ndarray
+    inputs: np.ndarray
+    next_state: np.ndarray
+    normal: np.ndarray
+    offset: float
+    distance: float
+    feasible_inputs: np.ndarray
+    primal_residual: float
+    dual_residual: float
+    found: str
+
+    def __str__(self) -> str:
+        return (
+            f"from x = {in_words(self.state)} the optimal u = {in_words(self.inputs[0])} leads to "
+            f"{in_words(self.next_state)}, outside the feasible set by {self.distance:.6g}"
+        )
 
 
 def outer_bound(claims: Claims) -> tuple[CenteredPolytope | None, np.ndarray]:
@@ -57,10 +106,217 @@ def farthest_first(bound: CenteredPolytope, after: np.ndarray) -> np.ndarray:
     return np.argsort(-np.nan_to_num(bound.beyond(after), nan=-np.inf))
 
 
+# --- Closed loops from samples ----------------------------------------------------------
+
+
+@record
+class SampledLoops:
+    """Closed loops of `steps` steps from B states x0s (B, p); B = 0 where there are none.
+
+    labels: the labels of x0s with their proofs. inputs (B, m), next_states (B, p): the optimal
+    first input and where it leads (NaN where label ≠ 1). lost_at (B,): first step k ≥ 1 of the
+    closed loop at which the problem is proved infeasible; 0: feasible at all steps; −1: not proved
+    feasible at the start; −2: undecided, from step undecided_at (B,) on (0 elsewhere).
+    """
+
+    x0s: np.ndarray
+    labels: Labels
+    inputs: np.ndarray
+    next_states: np.ndarray
+    lost_at: np.ndarray
+    undecided_at: np.ndarray
+    steps: int
+
+    @classmethod
+    def undecided(cls, problem: FeasibilityProblem, x0s: np.ndarray, steps: int) -> "SampledLoops":
+        """Return loops from states (B, p) that there was no time to label."""
+        return cls._begun(problem, x0s, Labels.empty(len(x0s), problem), steps)
+
+    @classmethod
+    def _begun(
+        cls, problem: FeasibilityProblem, x0s: np.ndarray, labels: Labels, steps: int
+    ) -> "SampledLoops":
+        """Return loops from labelled states before the first step."""
+        return cls(
+            x0s=x0s,
+            labels=labels,
+            inputs=np.full((len(x0s), problem.mpc.system.m), np.nan),
+            next_states=np.full_like(x0s, np.nan),
+            lost_at=np.where(labels.label == 1, 0, NOT_FEASIBLE),
+            undecided_at=np.zeros(len(x0s), int),
+            steps=steps,
+        )
+
+    @property
+    def label(self) -> np.ndarray:
+        """Return the labels (B,): 1 proved feasible, −1 proved infeasible, 0 undecided."""
+        return self.labels.label
+
+    def counts(self) -> dict[str, int]:
+        """Return how many states are feasible, and how many of these are lost at once, lost later,
+        kept, undecided."""
+        lost = self.lost_at
+        return {
+            "feasible": int(np.sum(self.label == 1)),
+            "lost after one step": int(np.sum(lost == 1)),
+            "lost later": int(np.sum(lost > 1)),
+            "kept": int(np.sum(lost == 0)),
+            "undecided": int(np.sum(lost == UNDECIDED)),
+        }
+
+
+def labelled(law: Law, problem: FeasibilityProblem, states: np.ndarray) -> Labels:
+    """Return the labels of states (B, p or more columns), in programs of the law's shape."""
+    padded = law.filled(states[:, : problem.dimension])
+    fmap: FeasibleSetMap = map_points(problem, padded, chunk=law.chunk)
+    return fmap.labels.first(len(states))
+
+
+def closed_loops(
+    law: Law,
+    problem: FeasibilityProblem,
+    x0s: np.ndarray,
+    labels: Labels,
+    steps: int,
+    budget: Budget,
+) -> SampledLoops:
+    """Run the closed loop from every feasible state until it is lost, undecided or over.
+
+    The states that are left when the time is over are undecided.
+    """
+    loops, p = SampledLoops._begun(problem, x0s, labels, steps), x0s.shape[1]
+    lost_at, undecided_at = loops.lost_at, loops.undecided_at
+    feasible = labels.label == 1
+    center = x0s[feasible].mean(axis=0) if np.any(feasible) else np.zeros(p)
+    # The previous input travels along where the plan depends on it.
+    states = np.pad(x0s, ((0, 0), (0, law.mpc.dimension - p)))
+    for k in tqdm(range(1, steps + 1), unit=" steps", leave=False, disable=not budget.bar):
+        alive = np.flatnonzero(lost_at == 0)
+        if not len(alive):
+            break
+        if not budget.affords(0):
+            lost_at[alive], undecided_at[alive] = UNDECIDED, k
+            break
+        plans = law.plans(states[alive])
+        u = law.limited(plans.inputs[:, 0])
+        x = law.following(states[alive], u)
+        if k == 1:
+            loops.inputs[alive], loops.next_states[alive] = u, x[:, :p]
+        x[:, :p] = center + (1 - CLEAR) * (x[:, :p] - center)
+        label = labelled(law, problem, x).label
+        solved = plans.status == Status.SOLVED
+        undecided = alive[~solved | (label == 0)]
+        lost_at[alive[solved & (label == -1)]] = k
+        lost_at[undecided], undecided_at[undecided] = UNDECIDED, k
+        states[alive] = x
+    return loops
+
+
 def worst_samples(bound: CenteredPolytope, loops: SampledLoops) -> np.ndarray:
     """Return up to three of the samples (B, p) lost after one step, farthest outside."""
     lost = np.flatnonzero(loops.lost_at == 1)
     return loops.x0s[lost[farthest_first(bound, loops.next_states[lost])[:3]]]
+
+
+# --- Search by gradients and from region to region --------------------------------------
+
+
+def ascend(law: Law, bound: CenteredPolytope, starts: np.ndarray, deadline: float) -> np.ndarray:
+    """Return states (K, p) from which the next state lies farthest outside `bound`, the best first.
+
+    starts (S, p) follow the gradient (A + B ∂u_0/∂x)'a_j of v(x) = max_j (a_j'x⁺(x) − b_j) within
+    the half-spaces, in steps of halving length, in coordinates in which the set is about 1 wide;
+    a_j and b_j count relative to the facet's distance from the centre. A step is taken if it raises
+    v. Then the best go from region to region, each to the maximum of a_j'x⁺ on its region. The
+    method is local: that it finds no counterexample does not prove that there is none.
+    """
+    x = bound.nearest(starts, INSET)
+    value, gradient = _value_and_gradient(law, bound, x, deadline)
+    for length in LENGTHS:
+        if time.monotonic() > deadline:
+            break
+        trial = bound.nearest(x + length * bound.unit * gradient, INSET)
+        better, slope = _value_and_gradient(law, bound, trial, deadline, than=value)
+        grown = better > value
+        x[grown], value[grown], gradient[grown] = trial[grown], better[grown], slope[grown]
+    return _climb_regions(law, bound, x, value, deadline)
+
+
+def _value_and_gradient(
+    law: Law,
+    bound: CenteredPolytope,
+    x: np.ndarray,
+    deadline: float,
+    than: np.ndarray | float = -np.inf,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return v (S,) at x (S, p), −inf where there is no plan, and its unit gradient in coordinates
+    x / bound.unit where v > than, and before the deadline."""
+    plans = law.plans(x)
+    after = law.following(x, plans.inputs[:, 0])
+    beyond = (after @ bound.normals.T - bound.offsets) / bound.depths
+    value = np.where(plans.status == Status.SOLVED, beyond.max(axis=1), -np.inf)
+    gradient = np.zeros_like(x)
+    for i in np.flatnonzero((value > than) & np.isfinite(value)):
+        if time.monotonic() > deadline:
+            break
+        piece = law.piece(x[i], plans.inputs[i])
+        if piece is not None:
+            slope = bound.unit * (piece.E.T @ bound.normals[np.argmax(beyond[i])])
+            gradient[i] = slope / (np.linalg.norm(slope) or 1.0)
+    return value, gradient
+
+
+def _climb_regions(
+    law: Law, bound: CenteredPolytope, x: np.ndarray, value: np.ndarray, deadline: float
+) -> np.ndarray:
+    """Follow the best of x (S, p) to the best vertex of its region, and on from beside it; return
+    states (K, p)."""
+    random = np.random.default_rng(0)
+    order = np.argsort(-value)[:FOLLOWED]
+    best, top = x[order], value[order]
+    for tried in range(ROUNDS):
+        if time.monotonic() > deadline:
+            break
+        beside = random.standard_normal((NEIGHBOURS, *best.shape)) * NEAR * bound.unit
+        around = bound.nearest(np.concatenate([best, *(best + beside)]), INSET)
+        peaks, heights = _peaks(law, bound, around, deadline)
+        states, values = np.concatenate([best, peaks]), np.append(top, heights)
+        chosen: list[int] = []
+        for i in np.argsort(-values):
+            if all(np.any(np.abs(states[i] - states[j]) > 1e-6 * bound.unit) for j in chosen):
+                chosen.append(int(i))
+        before, chosen = top.max(initial=-np.inf), chosen[:FOLLOWED]
+        best, top = states[chosen], values[chosen]
+        if tried > 1 and top.max(initial=-np.inf) <= before + 1e-12:
+            break
+    return best
+
+
+def _peaks(
+    law: Law, bound: CenteredPolytope, around: np.ndarray, deadline: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the best states (K, p) of the regions of some states (B, p), and how far outside the
+    bound their next states lie (K,)."""
+    plans = law.plans(around)
+    peaks, values = [np.zeros((0, around.shape[1]))], []
+    for i in np.flatnonzero(plans.status == Status.SOLVED):
+        if time.monotonic() > deadline:
+            break
+        state, piece = around[i], law.piece(around[i], plans.inputs[i])
+        if piece is None:
+            continue
+        off = bound.normals @ (piece.E @ state + piece.e) - bound.offsets
+        facet = int(np.argmax(off / bound.depths))
+        up = piece.E.T @ bound.normals[facet]
+        R = np.vstack([piece.R, bound.normals])
+        peak = maximise(up, R, np.append(piece.r, bound.offsets)).x
+        if peak is not None:
+            peaks.append(peak[None])
+            values.append(float(bound.beyond((piece.E @ peak + piece.e)[None])[0]))
+    return np.concatenate(peaks), np.array(values)
+
+
+# --- Proof of the best candidate --------------------------------------------------------
 
 
 def certified(

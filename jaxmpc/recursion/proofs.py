@@ -18,13 +18,30 @@ from jaxmpc.feasible.polytope import backward, is_standard_form
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
-from jaxmpc.recursion.claims import CLEAR, Claim, in_words
-from jaxmpc.sets.any_set import set_bounds
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.convex_sets import Polytope, set_bounds
 from jaxmpc.sets.terminal_hypotheses import verify_terminal
 from jaxmpc.systems.system import host_matrices
 
+# Distance from a facet of X_N, relative to the facet's from the centre, from which a state counts
+# as outside: well above the residuals of plans. Next states are moved towards the centre by as much
+# before they are labelled.
+CLEAR = 1e-7
 LATE = "the time was over before its linear programs were solved"
+
+
+@record
+class Claim:
+    """A claim: holds True (proved), False (refuted) or None (open); and why.
+
+    state (p,): where it is refuted, the state of the counterexample; else None.
+    """
+
+    holds: bool | None
+    reason: str
+    state: np.ndarray | None = None
+
+    def __str__(self) -> str:
+        return f"{ {True: 'proved', False: 'refuted', None: 'open'}[self.holds] }: {self.reason}"
 
 
 @record
@@ -173,20 +190,11 @@ def _longer(
     outside = [x for (_, x), e in zip(tops, violation, strict=True) if e > CLEAR]
     seeds = np.array([x for x in outside if x is not None]).reshape(-1, len(body.center))
     if len(seeds):
-        x = seeds[0]
-        return Claim(
-            False, f"from x = {in_words(x)} every feasible first input leaves X_N", x
-        ), seeds
+        return every_input_leaves(seeds[0]), seeds
     nested = np.array([body.support(normal)[0] for normal in before.normals]) - before.offsets
     if max(violation[i], (nested / before.depths).max()) <= TOLERANCE:
         return Claim(True, f"X_N lies in X_N+1 and in X_N-1 ({len(tops)} facets, by LPs)"), seeds
     return Claim(None, "X_N lies in X_N+1, but not in X_N-1: its plans may lead elsewhere"), seeds
-
-
-def every_input_leaves(state: np.ndarray) -> Claim:
-    """Return the weak claim, refuted at a state."""
-    reason = f"from x = {in_words(state)} every feasible first input leaves X_N"
-    return Claim(False, reason, state)
 
 
 def no_input_stays(plans: PlanPolytope, state: np.ndarray) -> bool:
@@ -299,3 +307,14 @@ def _volume(body: Polytope) -> float:
         return body.volume()
     except ValueError:  # empty or flat
         return 0.0
+
+
+def every_input_leaves(state: np.ndarray) -> Claim:
+    """Return the weak claim, refuted at a state."""
+    reason = f"from x = {in_words(state)} every feasible first input leaves X_N"
+    return Claim(False, reason, state)
+
+
+def in_words(x: np.ndarray) -> str:
+    """Return a vector as text, such as "(0.5, -1)", rounded to 9 decimals and 6 digits."""
+    return "(" + ", ".join(f"{v:.6g}" for v in np.round(x, 9) + 0.0) + ")"

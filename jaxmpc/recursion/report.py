@@ -1,14 +1,21 @@
-"""RecursionReport: all that is known about the recursive feasibility of one MPC problem."""
+"""All that is known about the recursive feasibility of one MPC problem, in words and as files."""
 
+import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jaxmpc.feasible.problem import FeasibilityProblem
+from jaxmpc.files import remove_files, sha256, versions, write_arrays, write_results
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
-from jaxmpc.recursion.claims import Claim, Counterexample
-from jaxmpc.recursion.sampled_loops import SampledLoops
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.recursion.counterexamples import Counterexample, SampledLoops
+from jaxmpc.recursion.proofs import Claim
+from jaxmpc.sets.convex_sets import Polytope
+
+# The files of a report in its folder.
+FILES = ("summary.json", "recursion.npz", "recursion.png")
 
 
 @record
@@ -79,3 +86,64 @@ class RecursionReport:
         coordinates = list(self.mpc.labels[: loops.x0s.shape[1]])
         names = {"coordinate": coordinates, "move": list(system.input_labels)}
         return xarray.Dataset(data, coords=names, attrs={"steps": loops.steps})
+
+
+@record
+class SmallestHorizon:
+    """The least horizon at which the law is proved recursively feasible, None where none was found.
+
+    strong: the least at which every feasible first input is proved to stay (None: none). reasons:
+    the claim about the law at each horizon looked at, up to max_horizon.
+    """
+
+    horizon: int | None
+    strong: int | None
+    reasons: dict[int, Claim]
+    max_horizon: int
+
+    def __str__(self) -> str:
+        """Return the smallest horizon with its reason, or that none is proved."""
+        if self.horizon is None:
+            return f"none up to {self.max_horizon} is proved"
+        strong = f"; strong from {self.strong}" if self.strong is not None else ""
+        return f"{self.horizon} ({self.reasons[self.horizon].reason}){strong}"
+
+    __repr__ = __str__
+
+
+def save_report(
+    folder: Path, report: RecursionReport, config: dict[str, Any], least: SmallestHorizon | None
+) -> None:
+    """Write recursion.npz and summary.json, which `jaxmpc verify` proves again, and remove a
+    picture of an earlier report.
+
+    config: JSON data that the problem is made of, with its name. least: the smallest horizon, where
+    it was looked for.
+    """
+    loops, body, worst = report.loops, report.feasible_set, report.counterexample
+    facets = {}
+    if body is not None:
+        facets = {"facet_normals": np.asarray(body.H), "facet_offsets": np.asarray(body.h)}
+    remove_files(folder, *FILES)
+    arrays = folder / "recursion.npz"
+    problem = {"problem": FeasibilityProblem.of(report.mpc).plain()}
+    found = {name: getattr(loops, name) for name in ("lost_at", "undecided_at")}
+    found |= {"state": loops.x0s, "input": loops.inputs, "next_state": loops.next_states}
+    write_arrays(arrays, problem, **facets, **loops.labels.arrays(), **found)
+    summary = {
+        "name": config["name"],
+        "claims": {name: dataclasses.asdict(claim) for name, claim in report.claims.items()},
+        "counterexample": None if worst is None else dataclasses.asdict(worst),
+        "volume": report.volume,
+        "lost_by_any": report.lost_by_any,
+        "lost_by_law": report.lost_by_law,
+        "counts": loops.counts(),
+        "steps": loops.steps,
+        "seconds": report.seconds,
+        "config": config,
+        "sha256": sha256(arrays),
+        "versions": versions(),
+    }
+    if least is not None:
+        summary["smallest_horizon"] = dataclasses.asdict(least)
+    write_results(folder / "summary.json", summary)

@@ -10,9 +10,8 @@ from jaxmpc.closed_loop.robot_controller import robot_mpc
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
-from jaxmpc.sets.any_set import translated
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.terminal_sets import named_terminal_set
+from jaxmpc.sets.convex_sets import Box, translated
+from jaxmpc.sets.invariant import named_terminal_set
 from jaxmpc.systems.riccati import lqr
 from jaxmpc.systems.system import host_matrices
 

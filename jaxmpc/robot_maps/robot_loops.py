@@ -12,7 +12,7 @@ from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
-from jaxmpc.sets.violations import kept, worst_violation
+from jaxmpc.sets.limits import rows_kept, worst_violation
 
 
 @record
@@ -40,7 +40,9 @@ class RobotLoops:
         limits."""
         states, inputs = with_limits(robot, run)
         worst = np.maximum(worst_violation(*states), _with_last(worst_violation(*inputs)))
-        state_kept, input_kept = (np.all(kept(*pair, dtype), axis=-1) for pair in (states, inputs))
+        state_kept, input_kept = (
+            np.all(rows_kept(*pair, dtype), axis=-1) for pair in (states, inputs)
+        )
         beyond = ~state_kept | _with_last(np.logical_not(input_kept))
         status = np.asarray(run.status)
         solved = status == Status.SOLVED

@@ -15,7 +15,7 @@ from jaxmpc.qp.linalg import floating_dtype
 from jaxmpc.robots.configurations import difference, quaternions, retract, unit_orientations
 from jaxmpc.robots.mujoco_access import acts, equalities, mjx_module, mujoco, single_joints, word
 from jaxmpc.robots.physics import Physics
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex_sets import Box
 
 
 @record

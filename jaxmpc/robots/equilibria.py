@@ -13,7 +13,7 @@ from jaxmpc.checks import fail
 from jaxmpc.pytrees import record
 from jaxmpc.robots.description import RobotDescription
 from jaxmpc.robots.mujoco_access import BALL, FREE, flag, mujoco, name_of, single_joints
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex_sets import Box
 
 # Forces that count as balanced, relative to 1 + the largest one.
 BALANCED = 1e-6

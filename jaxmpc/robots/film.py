@@ -16,7 +16,7 @@ from jaxmpc.checks import fail, require_finite, require_shape, whole
 from jaxmpc.pytrees import record
 from jaxmpc.robots.mujoco_access import mujoco, number_of
 from jaxmpc.robots.robot import Robot
-from jaxmpc.sets.violations import kept, row_violations
+from jaxmpc.sets.limits import row_violations, rows_kept
 
 OPACITY = 0.3  # of the target
 
@@ -386,7 +386,7 @@ def exceeded_limits(robot: Robot, states: np.ndarray, inputs: Any, every: int) -
         pairs.append((robot.input_limits, held, slice(robot.n, None)))
     for limits, values, part in pairs:
         excess = row_violations(limits, values) / limits.half_widths()
-        over[..., part] = np.where(kept(limits, values), 0.0, excess)
+        over[..., part] = np.where(rows_kept(limits, values), 0.0, excess)
     worst = np.maximum.reduceat(over, np.arange(0, over.shape[1], every), axis=1)
     index = np.where(worst.max(axis=2) > 0, 1 + worst.argmax(axis=2), 0)
     return np.array(["", *labels])[index]

@@ -9,7 +9,7 @@ from jax import Array
 from jaxmpc.checks import fail
 from jaxmpc.mpc.steady_state import equilibrium
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex_sets import Box
 from jaxmpc.systems.system import LinearSystem
 
 

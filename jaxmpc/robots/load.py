@@ -31,7 +31,7 @@ from jaxmpc.robots.mujoco_access import (
 )
 from jaxmpc.robots.physics import RK4, Physics
 from jaxmpc.robots.robot import Robot
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex_sets import Box
 from jaxmpc.sets.limits import Limit, limit_pair
 from jaxmpc.systems.system import require_period
 

@@ -34,7 +34,7 @@ from jaxmpc.robots.mujoco_access import (
     word,
 )
 from jaxmpc.robots.physics import Physics
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex_sets import Box
 
 # Bits of MuJoCo's contype and conaffinity.
 _BITS = 31

@@ -10,18 +10,16 @@ named_terminal_set               terminal set from its name
 verify_terminal                  hypotheses of the stability theorems -> TerminalReport of Check
 """
 
-from jaxmpc.sets.box import Box
 from jaxmpc.sets.control_invariant import maximal_control_invariant_set
-from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 from jaxmpc.sets.invariant import (
     invariant_ellipsoid,
     maximal_invariant_set,
+    named_terminal_set,
 )
 from jaxmpc.sets.limits import joint_limits, output_limits
-from jaxmpc.sets.one_step import predecessor
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.predecessors import predecessor
 from jaxmpc.sets.terminal_hypotheses import verify_terminal
-from jaxmpc.sets.terminal_sets import named_terminal_set
 
 __all__ = [
     "Box",

@@ -15,13 +15,11 @@ from scipy.spatial import KDTree
 
 from jaxmpc.checks import fail
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.disturbance import supports
+from jaxmpc.sets.convex_sets import Box, Polytope, as_polytope
 from jaxmpc.sets.geometry import factors
 from jaxmpc.sets.invariant import maximal_invariant_set
 from jaxmpc.sets.lp import FLAT, ROUNDING, Program, extent, largest_margin, scaling
-from jaxmpc.sets.one_step import OneStep, one_step, tidy
-from jaxmpc.sets.polytope import Polytope, as_polytope
+from jaxmpc.sets.predecessors import OneStep, one_step, supports, tidy
 from jaxmpc.systems.riccati import lqr
 from jaxmpc.systems.system import LinearSystem
 
@@ -250,7 +248,8 @@ def _inside(
     margins = [m for m in 4 * cut * 30.0 ** np.arange(9) if m < 0.5] + [0.5]
     found = None
     for candidates in (
-        _shrunk(step, end.C, x_e, margins),
+        # C_k shrunk about the equilibrium.
+        (_if_invariant(step, _resized(end.C, x_e, 1 - margin)) for margin in margins),
         _of_regulator(step, X, center),
         _contractive(step, end.C, x_e, margins),
     ):
@@ -273,14 +272,6 @@ def _inside(
             break
         found, gap = larger, narrower
     return found.C, gap
-
-
-def _shrunk(
-    step: OneStep, C: Polytope, x_e: np.ndarray, margins: list[float]
-) -> Iterator[_Invariant | None]:
-    """Yield C_k shrunk about the equilibrium by each margin, where it is invariant."""
-    for margin in margins:
-        yield _if_invariant(step, _resized(C, x_e, 1 - margin))
 
 
 def _contractive(

@@ -1,4 +1,4 @@
-"""Invariant sets of x+ = A x + B u + w under u = K x: the maximal one, the largest ellipsoid."""
+"""Invariant sets of x+ = A x + B u + w under u = K x, and terminal sets by name."""
 
 from dataclasses import KW_ONLY
 
@@ -17,16 +17,17 @@ from jaxmpc.checks import (
 )
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import arrays, cholesky, eigh, floating_dtype, matmul, solve_triangular
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.disturbance import disturbance_set, largest_norm, supports
-from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope, as_polytope
 from jaxmpc.sets.lp import ROUNDING, Program, extent
-from jaxmpc.sets.polytope import Polytope, as_polytope
+from jaxmpc.sets.predecessors import disturbance_set, largest_norm, supports
+from jaxmpc.systems.riccati import LQR
 from jaxmpc.systems.system import LinearSystem
 
 # A row counts as redundant if it is exceeded by no more than this, relative to its bound.
 # Rounding alone makes rows that just touch the set exceed their bound by about 1e-16.
 _REDUNDANT = 1e-12
+# Names of terminal sets.
+TERMINAL_SETS = ("none", "box", "invariant", "ellipsoid")
 
 
 @pytree
@@ -203,6 +204,37 @@ def invariant_ellipsoid(
                 "Shrink the disturbance, widen the limits, or use another K and P",
             )
     return InvariantEllipsoid(P, level, contraction=gamma2)
+
+
+def named_terminal_set(
+    name: str,
+    system: LinearSystem,
+    law: LQR | None,
+    states: Box | Polytope | None,
+    inputs: Box | Polytope | None,
+) -> Box | Polytope | Ellipsoid | None:
+    """Return the terminal set of this name for x⁺ = A x + B u within the limits.
+
+    "none": None. "box": the state limits. "invariant": the maximal invariant set of the LQR `law`.
+    "ellipsoid": the largest level set of its cost inside the limits. Only the last two need the
+    law.
+
+    Raises ValueError for another name, for the last two without any limit, and as
+    `maximal_invariant_set` and `invariant_ellipsoid` do.
+    """
+    if name not in TERMINAL_SETS:
+        fail("terminal", f"{name!r}", f"Give a set, or one of {', '.join(TERMINAL_SETS)}")
+    if name == "none":
+        return None
+    if name == "box":
+        return states
+    if states is None and inputs is None:
+        fail("terminal", f"{name!r} without limits", "Give states or inputs, or 'none'")
+    assert law is not None
+    if name == "ellipsoid":
+        return invariant_ellipsoid(system, law.K, law.P, states, inputs)
+    free = Box(np.full(system.n, -np.inf), np.full(system.n, np.inf))
+    return maximal_invariant_set(system, law.K, free if states is None else states, inputs)
 
 
 def _traced_ellipsoid(

@@ -10,16 +10,12 @@ import numpy as np
 from jaxmpc.arrays import Reals, as_weight, host_array
 from jaxmpc.checks import fail, require_finite, require_kind, require_shape
 from jaxmpc.pytrees import record
-from jaxmpc.sets.any_set import translated, unit_half_spaces
-from jaxmpc.sets.box import Box
 from jaxmpc.sets.control_invariant import largest_cut
-from jaxmpc.sets.disturbance import disturbance_set, largest_norm, supports
-from jaxmpc.sets.ellipsoid import Ellipsoid
-from jaxmpc.sets.interior import Flat, affine_hull, framed
+from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope, translated, unit_half_spaces
+from jaxmpc.sets.geometry import Flat, affine_hull, framed
 from jaxmpc.sets.invariant import contraction
 from jaxmpc.sets.lp import Program, extent, maximise
-from jaxmpc.sets.one_step import OneStep, one_step
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.predecessors import OneStep, disturbance_set, largest_norm, one_step, supports
 from jaxmpc.systems.riccati import least_reached, lqr
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
@@ -166,11 +162,11 @@ def verify_terminal(
     name = "inputs of K admissible"
     if gain is None:
         loop = None
-        kept = _Invariance(Check("invariance under K", None, None, "", no_law))
+        under_K = _Invariance(Check("invariance under K", None, None, "", no_law))
         admissible = Check(name, None, None, "", no_law)
     else:
         loop = _Loop(A, B, gain, c, W)
-        kept = X_f.invariance(loop)
+        under_K = X_f.invariance(loop)
         admissible = _within(name, system.input_labels, U, gain, X_f)
     name = "terminal set within states"
     inside = _within(name, system.state_labels, X, np.eye(system.n), X_f, role)
@@ -179,8 +175,8 @@ def verify_terminal(
         _compact("states", "X", X),
         _compact("inputs", "U", U),
         replace(inside, theorems=(1, 3)),
-        _control_invariance(step, X_f, kept.check, admissible, role),
-        kept.check,
+        _control_invariance(step, X_f, under_K.check, admissible, role),
+        under_K.check,
         admissible,
         _lyapunov(loop, P, Q, R, no_law),
         *_weights(A, Q, R, P, no_law),
@@ -191,7 +187,7 @@ def verify_terminal(
         where = "x_N may leave X, where the Lyapunov inequality and K in U do not hold"
         sentence = f"{where}: Theorem 3 requires a terminal set."
         checks.append(Check("terminal cost where x_N is free", None, None, "", sentence))
-    return TerminalReport(tuple(checks), gain, kept.certificate, kept.factor, kept.exact_factor)
+    return TerminalReport(tuple(checks), gain, *under_K[1:])
 
 
 def _gain_and_cost(
@@ -252,7 +248,7 @@ class _Rows:
     G: np.ndarray
     g: np.ndarray
 
-    def top(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def maxima(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (upper bounds of max row x, M with M G = rows but for rounding); inf if
         unbounded."""
         bounds, M = np.zeros(len(rows)), np.zeros((len(rows), len(self.g)))
@@ -261,14 +257,13 @@ class _Rows:
             bounds[i] = np.inf
             if len(self.g):
                 best = program.maximise(rows[i])
-                bounds[i] = program.bound(rows[i], best, self.reach)
+                bounds[i] = program.bound(rows[i], best, self.extent)
                 M[i] = 0.0 if best.y is None else best.y
         return bounds, M
 
     @cached_property
-    def reach(self) -> np.ndarray:
-        """Return the bounds of |x_i| over the set, with a margin for the LP's error; inf if there
-        is none."""
+    def extent(self) -> np.ndarray:
+        """Return bounds of |x_i| over the set, `lp.extent`; inf if there is none."""
         if not len(self.g):
             return np.full(self.G.shape[1], np.inf)
         return extent(self.G, self.g)
@@ -277,7 +272,7 @@ class _Rows:
         """Return how far the set, with these maxima of the rows, reaches along each from a point
         inside; where that is rounding, as in a flat set, the size of the row's terms."""
         width = np.maximum(tops - rows @ Program(self.G, self.g).margin()[0], 0.0)
-        size = np.abs(tops) + np.abs(rows) @ np.where(np.isfinite(self.reach), self.reach, 0.0)
+        size = np.abs(tops) + np.abs(rows) @ np.where(np.isfinite(self.extent), self.extent, 0.0)
         return np.where(width > _TOUCH * size, width, np.where(size > 1e-280, size, 1.0))
 
     def invariance(self, loop: _Loop) -> _Invariance:
@@ -285,22 +280,22 @@ class _Rows:
         name, unit, G, g = "invariance under K", "of the extent", self.G, self.g
         if not len(g):
             return _Invariance(Check(name, True, np.inf, unit, "All of R^n is invariant."))
-        images, M = self.top(G @ loop.closed)
-        if np.isinf(images).any():
-            row = np.argmax(images) + 1
+        largest, M = self.maxima(G @ loop.closed)
+        if np.isinf(largest).any():
+            row = np.argmax(largest) + 1
             sentence = f"On this unbounded set (A+BK) x violates row {row} without limit."
             return _Invariance(Check(name, False, -np.inf, unit, sentence))
-        reached = images + G @ loop.c + supports(loop.W, G)
+        attained = largest + G @ loop.c + supports(loop.W, G)
         residual = float(np.abs(M @ G - G @ loop.closed).max())
-        slack = (g - reached) / self.width(G, g)
+        slack = (g - attained) / self.width(G, g)
         worst = int(np.argmin(slack))
         holds = bool(slack[worst] >= -_TOUCH)
         sentence, factor, exact = f"M >= 0 with M H = H(A+BK) up to {residual:.1e}", None, None
         if g.min() > 0:
-            factor = float((reached / g).max())
+            factor = float((attained / g).max())
             sentence += f" and M h{'' if loop.W is None else ' + max Hw'} <= {factor:.9g} h"
             exact = _exact_factor(M, self, loop)
-        ends = f"{reached[worst]:.9g} of {g[worst]:.9g}"
+        ends = f"{attained[worst]:.9g} of {g[worst]:.9g}"
         sentence += f"; the tightest row, {worst + 1}, is reached to {ends}."
         if exact is not None and exact <= 1:
             sentence += " In rational arithmetic the factor is at most 1."
@@ -340,7 +335,7 @@ class _Ellipse:
     P: np.ndarray
     level: float
 
-    def top(self, rows: np.ndarray) -> tuple[np.ndarray, None]:
+    def maxima(self, rows: np.ndarray) -> tuple[np.ndarray, None]:
         """Return (max row x, None)."""
         squares = np.einsum("ij,ij->i", rows, np.linalg.solve(self.P, rows.T).T)
         return np.sqrt(self.level * squares), None
@@ -369,8 +364,10 @@ class _Ellipse:
         c, W = loop.c, loop.W
         norm = float(np.sqrt(c @ P @ c)) if W is None else largest_norm(translated(W, c), P)
         slack = float(1 - np.sqrt(factor) - norm / np.sqrt(self.level))
-        image = f"the image reaches at most {1 - slack:.9g} of the radius"
-        sentence += f"; with |w + c|_P <= {norm:.6g} {image}"
+        sentence += (
+            f"; with |w + c|_P <= {norm:.6g} the image reaches at most {1 - slack:.9g} of the "
+            "radius"
+        )
         enough = True if slack >= -_TOUCH else None if factor <= 1 else False
         sentence += "." if enough else ", a bound that is sufficient only."
         check = Check(name, enough, slack, "of the radius", sentence)
@@ -399,11 +396,11 @@ def _terminal_set(given: Box | Polytope | Ellipsoid, n: int) -> _Rows | _Ellipse
 
 def _compact(name: str, letter: str, limits: _Rows) -> Check:
     """Check that a set of linear rows is bounded."""
-    top = float(limits.reach.max() / (1 + 1e-6))
+    top = float(limits.extent.max() / (1 + 1e-6))
     if np.isfinite(top):
         found = f"bounded: no coordinate exceeds {top:.6g}."
     else:
-        free = ", ".join(str(i + 1) for i in np.flatnonzero(np.isinf(limits.reach)))
+        free = ", ".join(str(i + 1) for i in np.flatnonzero(np.isinf(limits.extent)))
         found = (
             f"unbounded in coordinate {free}. The theorem as stated does not apply; its shifted "
             "plan uses convexity and compactness nowhere, so the conclusion stands if an optimal "
@@ -428,7 +425,7 @@ def _within(
     if not len(g):
         return Check(name, True, np.inf, unit, f"Nothing limits {', '.join(labels)}.")
     rows = G @ output
-    tops = X_f.top(rows)[0]
+    tops = X_f.maxima(rows)[0]
     slack = g - tops
     worst = int(np.argmin(slack))
     terms = [(f"{v:.6g} " if v != 1 else "") + labels[j] for j, v in enumerate(G[worst]) if v]
@@ -458,7 +455,7 @@ def _control_invariance(
     if not len(X_f.g):
         return check(True, np.inf, f"All of R^n is invariant{role}.")
     try:
-        usable = bool(np.isfinite(X_f.reach).all()) and framed("X_f", X_f.G, X_f.g).bounded
+        usable = bool(np.isfinite(X_f.extent).all()) and framed("X_f", X_f.G, X_f.g).bounded
     except Flat:
         usable = False
     if not usable:
@@ -597,9 +594,9 @@ def _exact_factor(M: np.ndarray, X_f: _Rows, loop: _Loop) -> Fraction | None:
             y = solved if solved is not None and min(solved) >= 0 else y
         left = abs(image - (y[:, None] * H[used]).sum(axis=0))
         off = np.flatnonzero(left)
-        if not np.isfinite(X_f.reach[off]).all():
+        if not np.isfinite(X_f.extent[off]).all():
             return None
-        bounds[i] += (y * h[used]).sum() + (left[off] * _fractions(X_f.reach[off])).sum()
+        bounds[i] += (y * h[used]).sum() + (left[off] * _fractions(X_f.extent[off])).sum()
     return max(bounds / h)
 
 

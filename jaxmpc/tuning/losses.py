@@ -11,9 +11,8 @@ from jaxmpc.checks import fail, require_symmetric_psd
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.pytrees import record
 from jaxmpc.qp.linalg import matmul
-from jaxmpc.sets import violations
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.convex_sets import Box, Polytope
+from jaxmpc.sets.limits import row_violations
 
 
 @record
@@ -86,7 +85,7 @@ class ClosedLoopLoss:
         """Return by how much the states x (T+1, n) violate each row of the limits, (T+1, rows)."""
         limits = jax.tree.map(lambda v: jnp.asarray(v, x.dtype), self.limits)
         size = self.limits.half_widths() if isinstance(self.limits, Box) else 1.0
-        return violations.row_violations(limits, x) / jnp.asarray(size, x.dtype)
+        return row_violations(limits, x) / jnp.asarray(size, x.dtype)
 
     def worst(self, run: Run) -> Array:
         """Return the largest violation of a run."""

@@ -28,10 +28,9 @@ from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
-from jaxmpc.sets import violations
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex_sets import Box, Polytope
+from jaxmpc.sets.limits import TOLERANCE, rows_kept
 from jaxmpc.sets.lp import Program
-from jaxmpc.sets.polytope import Polytope
 from jaxmpc.systems.riccati import lqr
 from jaxmpc.tuning.losses import ClosedLoopLoss
 from jaxmpc.tuning.parameters import Parameter
@@ -112,13 +111,13 @@ class WeightTask:
         kept = outcome.kept
         if isinstance(self.limits, Polytope):
             limits = jax.tree.map(lambda v: np.asarray(v, float), self.limits)
-            kept = kept & violations.kept(limits, outcome.coordinates).all(axis=(1, 2))
+            kept = kept & rows_kept(limits, outcome.coordinates).all(axis=(1, 2))
         status = np.asarray(run.status)
         return {
             "loops": len(kept),
             "plans": int(status.size),
             "violated": float(np.mean(~kept)),
-            "kept_to": violations.TOLERANCE["float64"],
+            "kept_to": TOLERANCE["float64"],
             "unsolved": float(np.mean(status != Status.SOLVED)),
             "infeasible": float(np.mean(status == Status.PRIMAL_INFEASIBLE)),
             "fallback": float(np.mean((status == Status.SOLVED) & np.asarray(run.fallback))),

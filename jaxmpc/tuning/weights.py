@@ -25,7 +25,7 @@ from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.linalg import arrays
 from jaxmpc.qp.status import Status
-from jaxmpc.sets.violations import TOLERANCE
+from jaxmpc.sets.limits import TOLERANCE
 from jaxmpc.tuning.batch_mean import BatchMean
 from jaxmpc.tuning.descent import Settings, descend
 from jaxmpc.tuning.losses import ClosedLoopLoss

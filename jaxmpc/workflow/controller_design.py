@@ -11,11 +11,9 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.softening import soften
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
+from jaxmpc.sets.invariant import named_terminal_set
 from jaxmpc.sets.limits import JointLimits
-from jaxmpc.sets.polytope import Polytope
-from jaxmpc.sets.terminal_sets import named_terminal_set
 from jaxmpc.systems.riccati import LQR, lqr
 from jaxmpc.systems.system import LinearSystem
 from jaxmpc.workflow.offline_checks import OfflineReport, offline_report

@@ -6,29 +6,74 @@ from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
+import jax
 import numpy as np
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_kind, whole
+from jaxmpc.closed_loop.simulation import Run, lyapunov_decrease, simulate
 from jaxmpc.explicit.exact_penalties import ExactPenalty, exact_penalty
 from jaxmpc.feasible.map import FeasibleSetMap, map_points
 from jaxmpc.feasible.polytope import is_standard_form
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import boundary
 from jaxmpc.grids import grid
-from jaxmpc.mpc.condense import condensed_in_float64
+from jaxmpc.mpc.condense import condensed_in_float64, in_float64
+from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.rows import row_table
 from jaxmpc.mpc.softening import harden
 from jaxmpc.pytrees import record
+from jaxmpc.qp.admm import ADMM
+from jaxmpc.qp.status import Status
 from jaxmpc.recursion.analysis import examine
 from jaxmpc.recursion.report import RecursionReport
 from jaxmpc.recursion.time_budget import LABELS, LOOPS, PROOFS, Budget
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex_sets import Box
 from jaxmpc.sets.terminal_hypotheses import TerminalReport, verify_terminal
-from jaxmpc.workflow.nominal_closed_loops import NominalLoops, nominal_loops
 
 T = TypeVar("T")
+# Rounding of optimal values, relative: a Lyapunov increase below that is none.
+ROUNDING = 1e-7
+
+
+@record
+class NominalLoops:
+    """The results of nominal closed loops from sampled feasible states.
+
+    x0s (B, n). steps: time steps of each loop. feasible: number of loops whose plans were all
+    SOLVED; the other fields are of these. violation: the worst of the state limits, in their units.
+    slack: the worst violation of soft rows. increase: the largest V(x⁺) − V(x) + x'Qx + u'Ru
+    relative to V(x); worst_x0: the start of the loop in which it was met. left: largest |x_T| of a
+    loop, relative to the largest of its start, each state in units of its size among the starts.
+    """
+
+    x0s: np.ndarray
+    steps: int
+    feasible: int
+    violation: float
+    slack: float
+    increase: float
+    worst_x0: np.ndarray
+    left: float
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.feasible:,} of {len(self.x0s):,} feasible starts kept every plan solved for "
+            f"{self.steps} steps",
+            f"worst violation of a hard state limit {self.violation:.3g}, "
+            f"of a soft row {self.slack:.3g}",
+            f"largest state left, relative to the start: {self.left:.3g}",
+        ]
+        if self.increase <= ROUNDING and np.isfinite(self.increase):
+            what = "Lyapunov decrease V(x+) - V(x) <= -(x'Qx + u'Ru): kept on every step, margin"
+            lines.append(f"{what} {-self.increase:.3g} V(x)")
+        elif np.isfinite(self.increase):
+            at = np.array2string(self.worst_x0, precision=4)
+            lines.append(f"Lyapunov decrease fails by {self.increase:.3g} V(x), from {at}")
+        return "\n".join(lines)
+
+    __repr__ = __str__
 
 
 @record
@@ -248,3 +293,39 @@ def limits_text(mpc: MPC) -> str:
         listed = ", ".join(names) if len(names) <= 8 else f"{len(names)} rows"
         lines.append(f"{what}, {when}: {listed}")
     return "\n".join(lines) or "no limits"
+
+
+def nominal_loops(mpc: MPC, x0s: np.ndarray, steps: int) -> NominalLoops:
+    """Simulate nominal closed loops in float64.
+
+    x0s: states (B, n), or (B, n + m) with the previous input where input rates are limited.
+    """
+    n = mpc.system.n
+    with jax.enable_x64(True):
+        controller = Controller(in_float64(mpc), ADMM(newton_steps=30))
+
+        def loop(x0: jax.Array) -> Run:  # x, or (x, u_{−1}) where input rates are limited
+            previous = x0[n:] if len(x0) > n else None
+            return simulate(controller, mpc.system, x0[:n], steps, previous_input=previous)
+
+        run = jax.jit(jax.vmap(loop))(x0s)
+        change = np.asarray(lyapunov_decrease(run))
+        run = jax.tree.map(np.asarray, run)
+    solved = np.all(run.status == Status.SOLVED, axis=1)
+    scale = np.abs(run.cost[:, :-1]) + 1e-12
+    relative = np.where(solved[:, None], change / scale, -np.inf)
+    worst = np.unravel_index(np.argmax(relative), relative.shape)
+    # Largest state of each loop, in units of its size among the starts.
+    size = np.abs(x0s[:, :n]).max(axis=0)
+    size = np.where(size > 0, size, 1.0)
+    first, last = (np.abs(x / size).max(axis=1) for x in (x0s[:, :n], run.states[:, -1]))
+    return NominalLoops(
+        x0s=x0s,
+        steps=steps,
+        feasible=int(solved.sum()),
+        violation=float(np.max(run.violation[solved], initial=0.0)),
+        slack=float(np.max(run.slack[solved], initial=0.0)),
+        increase=float(relative[worst]),
+        worst_x0=x0s[worst[0]],
+        left=float(np.max((last / np.maximum(first, 1e-9))[solved], initial=0.0)),
+    )

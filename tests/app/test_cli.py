@@ -23,11 +23,10 @@ from jaxmpc.feasible import label_workers
 from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.files import read_arrays, write_arrays
-from jaxmpc.recursion.claims import Claim, Counterexample
-from jaxmpc.recursion.horizons import SmallestHorizon
-from jaxmpc.recursion.report import RecursionReport
-from jaxmpc.recursion.sampled_loops import SampledLoops
-from jaxmpc.sets.box import Box
+from jaxmpc.recursion.counterexamples import Counterexample, SampledLoops
+from jaxmpc.recursion.proofs import Claim
+from jaxmpc.recursion.report import RecursionReport, SmallestHorizon
+from jaxmpc.sets.convex_sets import Box
 from jaxmpc.store.lock import Lock
 
 

@@ -12,9 +12,7 @@ from problems import MINIMAL_FILE
 from pydantic import TypeAdapter
 
 from jaxmpc.app.config import Config, load, load_robot_config, sweep_points
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.ellipsoid import Ellipsoid
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 

@@ -8,11 +8,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from jaxmpc.app.plots import plot_feasible_set, plot_recursion, plot_robot_map
-from jaxmpc.recursion.claims import Claim, Counterexample
+from jaxmpc.recursion.counterexamples import Counterexample, SampledLoops
+from jaxmpc.recursion.proofs import Claim
 from jaxmpc.recursion.report import RecursionReport
-from jaxmpc.recursion.sampled_loops import SampledLoops
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.convex_sets import Box, Polytope
 from jaxmpc.systems.system import LinearSystem
 
 

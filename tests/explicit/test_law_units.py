@@ -9,7 +9,7 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.explicit import critical_regions
-from jaxmpc.recursion import horizons, smallest_horizon
+from jaxmpc.recursion import analysis, smallest_horizon
 
 INTEGRATOR = jm.LinearSystem([[1, 1], [0, 1.0]], [0.5, 1])
 X = jm.Box([-5, -5], [5, 5])
@@ -332,14 +332,14 @@ def test_no_limits_of_the_states_is_unbounded_not_empty():
 
 
 def test_settled_horizons_survive_one_that_fails(monkeypatch):
-    settle = horizons.settle_claims
+    settle = analysis.settle_claims
 
     def fails_at_two(mpc, *rest):
         if mpc.horizon == 2:
             raise ValueError("LP: no answer")
         return settle(mpc, *rest)
 
-    monkeypatch.setattr(horizons, "settle_claims", fails_at_two)
+    monkeypatch.setattr(analysis, "settle_claims", fails_at_two)
     weak = jm.MPC(INTEGRATOR, [1.0, 1], 10.0, 3, X, jm.Box(-0.1, 0.1))
     found = smallest_horizon(weak, max_horizon=3, max_regions=0)
     assert list(found.reasons) == [1, 2, 3] and found.reasons[2].holds is None

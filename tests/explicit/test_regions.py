@@ -105,8 +105,8 @@ class TestRegions:
 
     def test_missing_part_is_seen(self, monkeypatch):
         """Completeness rests on volumes: a search that loses its way does not say so."""
-        monkeypatch.setattr("jaxmpc.explicit.region_search.RegionSearch.cross", lambda *_: None)
-        monkeypatch.setattr("jaxmpc.explicit.region_search.REPAIRS", 1)
+        monkeypatch.setattr("jaxmpc.explicit.regions.RegionSearch.cross", lambda *_: None)
+        monkeypatch.setattr("jaxmpc.explicit.regions.REPAIRS", 1)
         found = critical_regions(problems.lecture())
         assert not found.complete and "not found" in found.reason
 

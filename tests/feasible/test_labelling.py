@@ -17,7 +17,7 @@ from jaxmpc.feasible.labels import PROOFS
 from jaxmpc.feasible.map import label_chunks
 from jaxmpc.feasible.pipeline import Scope, label_parts
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.convex_sets import Ellipsoid
 
 POINTS = jm.grid([-1.2, -1.2], [1.2, 1.2], (20, 20))
 

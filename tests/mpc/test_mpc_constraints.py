@@ -23,7 +23,7 @@ from jaxmpc.mpc.problem import Outputs, Soft
 from jaxmpc.mpc.rows import row_table
 from jaxmpc.mpc.softening import soften
 from jaxmpc.mpc.steady_state import equilibrium
-from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.convex_sets import Ellipsoid
 
 ONE, EYE = np.ones(2), np.eye(2)
 FINE = jm.ADMM(iterations=300, newton_steps=30, eps=1e-8)

@@ -22,10 +22,10 @@ from jaxmpc.recursion import (
     smallest_horizon,
 )
 from jaxmpc.recursion import (
-    counterexample_search as search,
+    counterexamples as search,
 )
+from jaxmpc.recursion.counterexamples import closed_loops
 from jaxmpc.recursion.proofs import _by_theorem, settle_claims
-from jaxmpc.recursion.sampled_loops import closed_loops
 from jaxmpc.recursion.time_budget import Budget
 
 

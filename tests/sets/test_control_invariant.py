@@ -16,7 +16,7 @@ from jaxmpc.sets.control_invariant import (
     largest_cut,
     maximal_control_invariant_set,
 )
-from jaxmpc.sets.one_step import one_step
+from jaxmpc.sets.predecessors import one_step
 
 INF = np.inf
 

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.convex_sets import Ellipsoid
 
 INF = np.inf
 

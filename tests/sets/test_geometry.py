@@ -7,8 +7,8 @@ from polytopes import unimodular
 from scipy.optimize import linprog
 
 import jaxmpc.sets.geometry as geometry
+from jaxmpc.sets.convex_sets import Polytope
 from jaxmpc.sets.geometry import factors, irredundant
-from jaxmpc.sets.polytope import Polytope
 
 
 def test_factors_find_a_hidden_product():

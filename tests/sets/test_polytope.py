@@ -14,7 +14,7 @@ from polytopes import assert_same_points, cube, unimodular
 from scipy.optimize import linprog
 
 from jaxmpc import Box, Polytope
-from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.convex_sets import Ellipsoid
 from jaxmpc.sets.geometry import irredundant as _irredundant
 
 INF = np.inf

@@ -6,7 +6,7 @@ import pytest
 
 import jaxmpc as jm
 from jaxmpc.sets import (
-    interior,
+    geometry,
     lp,
     maximal_control_invariant_set,
     maximal_invariant_set,
@@ -89,7 +89,7 @@ def check_flat_set(seed):
     unit, row = units(rng, n, len(h))
     G, g = row[:, None] * H * unit, row * h
     for rows, right in ((H, h), (G, g)):
-        equal = interior.implied_equalities(rows, right)
+        equal = geometry.implied_equalities(rows, right)
         assert np.flatnonzero(equal).tolist() == [len(h) - 2, len(h) - 1]
         with pytest.raises(ValueError, match="flat"):
             jm.Polytope(rows, right).volume()

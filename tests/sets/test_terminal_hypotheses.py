@@ -11,7 +11,7 @@ from jaxmpc import Box, LinearSystem, lqr, maximal_invariant_set
 from jaxmpc.sets.control_invariant import (
     maximal_control_invariant_set,
 )
-from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.convex_sets import Ellipsoid
 from jaxmpc.sets.invariant import invariant_ellipsoid
 from jaxmpc.sets.terminal_hypotheses import _exact_factor, _Loop, _Rows, verify_terminal
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.sets.violations import TOLERANCE, kept, row_violations, worst_violation
+from jaxmpc.sets.limits import TOLERANCE, row_violations, rows_kept, worst_violation
 
 INF = np.inf
 BOX = jm.Box(np.array([-1.0, -INF]), np.array([2.0, 3.0]))
@@ -20,7 +20,7 @@ def test_box(array):
     assert isinstance(found, jax.Array) == (array is jnp.asarray)
     np.testing.assert_array_equal(found, EXPECTED)
     np.testing.assert_array_equal(worst_violation(BOX, array(POINTS)), [0, 0.5, 0, np.nan, np.nan])
-    np.testing.assert_array_equal(kept(BOX, array(POINTS)), EXPECTED == 0)
+    np.testing.assert_array_equal(rows_kept(BOX, array(POINTS)), EXPECTED == 0)
 
 
 @pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
@@ -32,7 +32,7 @@ def test_polytope_and_rows(array):
             worst_violation(limits, array(POINTS)), worst_violation(BOX, array(POINTS))
         )
         np.testing.assert_array_equal(
-            kept(limits, array(POINTS)).all(axis=-1), [True, False, True, False, False]
+            rows_kept(limits, array(POINTS)).all(axis=-1), [True, False, True, False, False]
         )
     slanted = jm.Polytope(np.array([[3.0, 4.0]]), np.array([5.0]))
     assert row_violations(slanted, array([1.0, 1.0])) == 2.0
@@ -41,15 +41,15 @@ def test_polytope_and_rows(array):
 def test_no_limits():
     assert row_violations(None, POINTS).shape == (5, 0)
     np.testing.assert_array_equal(worst_violation(None, np.zeros((2, 3))), [0, 0])
-    assert kept(None, np.zeros((2, 3))).all()
+    assert rows_kept(None, np.zeros((2, 3))).all()
 
 
 def test_tolerance_is_relative_above_one():
     limits = jm.Box(np.array([-0.5]), np.array([150.0]))
     at = TOLERANCE["float64"]
     points = np.array([[150 * (1 + 0.9 * at)], [150 * (1 + 1.1 * at)], [-0.5 - 0.9 * at], [-0.51]])
-    np.testing.assert_array_equal(kept(limits, points)[:, 0], [True, False, True, False])
-    assert kept(limits, points, np.float32)[:, 0].tolist() == [True, True, True, False]
+    np.testing.assert_array_equal(rows_kept(limits, points)[:, 0], [True, False, True, False])
+    assert rows_kept(limits, points, np.float32)[:, 0].tolist() == [True, True, True, False]
 
 
 def test_traced_limits():

@@ -21,8 +21,7 @@ from jaxmpc.app.commands.options import (
 from jaxmpc.checks import fail
 from jaxmpc.explicit.regions import critical_regions
 from jaxmpc.export.c_law import export_explicit_c
-from jaxmpc.export.c_solver import TOLERANCE, export_c
-from jaxmpc.export.fixed_steps_check import check_fixed_steps
+from jaxmpc.export.c_solver import TOLERANCE, check_fixed_steps, export_c
 from jaxmpc.export.jax_program import export_jax
 from jaxmpc.qp.admm import ADMM
 

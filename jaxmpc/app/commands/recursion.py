@@ -24,7 +24,7 @@ from jaxmpc.app.commands.sweep import map_robot_into
 from jaxmpc.checks import fail
 from jaxmpc.files import open_folder
 from jaxmpc.recursion import recursive_feasibility, smallest_horizon
-from jaxmpc.recursion.stored_report import FILES, save_report
+from jaxmpc.recursion.report import FILES, save_report
 from jaxmpc.robot_maps.stored_sweep import sweep_robot
 
 

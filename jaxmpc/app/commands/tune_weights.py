@@ -49,8 +49,7 @@ from jaxmpc.mpc.softening import soften
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.load import load_robot, model_hash
-from jaxmpc.sets.ellipsoid import Ellipsoid
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.convex_sets import Ellipsoid, Polytope
 from jaxmpc.tuning.result import CHECKPOINT, TuningRun, run_folder
 from jaxmpc.tuning.tasks import (
     WeightTask,

@@ -27,10 +27,8 @@ from jaxmpc.grids import axis_indices, grid, grid_ends, mesh
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.mpc.softening import soften
 from jaxmpc.qp.admm import ADMM
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.ellipsoid import Ellipsoid
-from jaxmpc.sets.polytope import Polytope
-from jaxmpc.sets.terminal_sets import named_terminal_set
+from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
+from jaxmpc.sets.invariant import named_terminal_set
 from jaxmpc.systems.riccati import lqr
 from jaxmpc.systems.system import LinearSystem
 

@@ -25,7 +25,7 @@ from jaxmpc.closed_loop.outcome import coordinates, with_limits
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.robot import Robot
-from jaxmpc.sets import violations
+from jaxmpc.sets.limits import rows_kept
 
 RUN, BROKEN = "#0072b2", "#a50f15"
 # Plans that stand out, by `plan_outcomes`: colour and words.
@@ -57,7 +57,7 @@ def plot_runs(
     count, samples = inputs.shape[:2]
     shown = _chosen("robots", np.arange(min(count, 24)) if robots is None else robots, count)
     pairs = with_limits(plant, run)
-    xi, kept = pairs[0][1], [violations.kept(*pair) for pair in pairs]
+    xi, kept = pairs[0][1], [rows_kept(*pair) for pair in pairs]
     time = plant.dt * np.arange(samples + 1)
     figure, panels = panel_grid(plant, time, 2.6, (1.15, 2.0, 1.1))
     for ax, kind, i in panels:

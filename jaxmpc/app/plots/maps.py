@@ -23,10 +23,10 @@ from jaxmpc.app.plots.style import (
 from jaxmpc.checks import fail
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.stored import Picture
-from jaxmpc.recursion.claims import Counterexample
+from jaxmpc.recursion.counterexamples import Counterexample
 from jaxmpc.recursion.report import RecursionReport
 from jaxmpc.robot_maps.robot_map import RobotMap
-from jaxmpc.sets.polytope import Polytope
+from jaxmpc.sets.convex_sets import Polytope
 
 
 def plot_feasible_set(

@@ -66,7 +66,7 @@ from jaxmpc.qp.residuals import Measured, Pair, Proof, assess, with_status
 from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
 from jaxmpc.qp.transformations import implicit, own_modes, repeat_while, varying
-from jaxmpc.sets.ellipsoid import Ellipsoid
+from jaxmpc.sets.convex_sets import Ellipsoid
 from jaxmpc.systems.system import LinearSystem
 
 # Most stages that the passes of an ADMM step write out, without a loop over them. Loops reorder

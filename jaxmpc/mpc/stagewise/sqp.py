@@ -71,7 +71,7 @@ from jaxmpc.qp.residuals import SHARE, Measured, Proof, Terms, assess
 from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
 from jaxmpc.qp.transformations import Undo, implicit, own_modes, repeat_while, varying
-from jaxmpc.sets.box import Box
+from jaxmpc.sets.convex_sets import Box
 
 # QPs at most, of `solve_nonlinear`.
 ITERATIONS = 100

@@ -1,15 +1,13 @@
-"""One step of x+ = A x + B u + c + w backwards: the states that some input takes into a set."""
+"""The states that some input of x+ = A x + B u + c + w takes into a set, for every w in a set."""
 
 import numpy as np
 
-from jaxmpc.checks import require_kind
+from jaxmpc.arrays import host_array
+from jaxmpc.checks import fail, require_kind
 from jaxmpc.pytrees import record
-from jaxmpc.sets.box import Box
-from jaxmpc.sets.disturbance import disturbance_set
-from jaxmpc.sets.geometry import irredundant_rows
-from jaxmpc.sets.interior import Flat, affine_hull
+from jaxmpc.sets.convex_sets import Box, Polytope, as_polytope
+from jaxmpc.sets.geometry import Flat, affine_hull, irredundant_rows
 from jaxmpc.sets.lp import FLAT, ROUNDING, extent
-from jaxmpc.sets.polytope import Polytope, as_polytope
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
 _MANY = 60  # rows of a target from which ridges are looked for, instead of pairs of rows
@@ -173,3 +171,29 @@ def tidy(polytope: Polytope) -> Polytope:
         return Polytope(*irredundant_rows("Polytope", G, g))
     except Flat:
         return Polytope(G, g)
+
+
+def disturbance_set(disturbance: Box | Polytope | None, n: int) -> Box | Polytope | None:
+    """Return the disturbance; raise ValueError unless it is None or a bounded set that holds 0."""
+    if disturbance is None:
+        return None
+    G, g = as_polytope("disturbance", disturbance, n).unit_rows("disturbance")
+    if not np.isfinite(extent(G, g)).all():
+        fail("disturbance", "is unbounded", "Bound every coordinate")
+    if g.min() < 0:
+        fail("disturbance", "does not hold the origin", "Add its center to the system's c")
+    return disturbance
+
+
+def supports(W: Box | Polytope | None, rows: np.ndarray) -> np.ndarray:
+    """Return max {row w : w in W} for each row; 0 if W is None."""
+    if W is None or not len(rows):
+        return np.zeros(len(rows))
+    limits = Polytope(rows, np.zeros(len(rows))).pontryagin_difference(W).h
+    return -host_array("disturbance", limits)
+
+
+def largest_norm(W: Box | Polytope, P: np.ndarray) -> float:
+    """Return max sqrt(w'P w) over W: a convex function is largest at a vertex."""
+    vertices = W.vertices()
+    return float(np.sqrt(np.einsum("ij,jk,ik->i", vertices, P, vertices).max()))

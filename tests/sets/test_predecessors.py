@@ -5,7 +5,7 @@ import pytest
 from problems import symmetric
 
 from jaxmpc import Box, LinearSystem, Polytope
-from jaxmpc.sets.one_step import predecessor
+from jaxmpc.sets.predecessors import predecessor
 
 UNSTABLE = LinearSystem([[2.0]], [[1.0]])
 
@@ -62,7 +62,7 @@ def test_predecessor_by_ridges_and_by_elimination(monkeypatch):
     system = LinearSystem(np.eye(4), rng.standard_normal((4, 2)))
     inputs = Box([-0.3, -0.1], [0.2, 0.4])
     by_ridges = predecessor(system, target, None, inputs)
-    monkeypatch.setattr("jaxmpc.sets.one_step._MANY", 1000)
+    monkeypatch.setattr("jaxmpc.sets.predecessors._MANY", 1000)
     by_pairs = predecessor(system, target, None, inputs)
     assert len(by_ridges.h) == len(by_pairs.h) > 250
     assert by_ridges.volume() == pytest.approx(by_pairs.volume(), rel=1e-12)

@@ -5,8 +5,8 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.sets.any_set import set_bounds
-from jaxmpc.sets.terminal_sets import TERMINAL_SETS, named_terminal_set
+from jaxmpc.sets.convex_sets import set_bounds
+from jaxmpc.sets.invariant import TERMINAL_SETS, named_terminal_set
 
 MPC = problems.joint(3)
 LAW = jm.lqr(MPC.system, MPC.Q, MPC.R)
