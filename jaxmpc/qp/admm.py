@@ -46,7 +46,7 @@ from jaxmpc.qp.residuals import (
     terms_of,
 )
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.transformations import has_kernels, varying
+from jaxmpc.qp.transformations import has_kernels, tree_where, varying
 from jaxmpc.qp.triton import in_one_program, indices
 
 # Eigenvalue, relative to the mean, below which a direction counts as without curvature, by the
@@ -317,7 +317,7 @@ def factorise(P: Array, A: Array, solver: ADMM, balls: tuple[int, ...] = ()) -> 
     one, failed = jnp.eye(n, dtype=P.dtype), jnp.int32(Status.ITERATION_LIMIT)
     ones = jnp.broadcast_to(one, Minv.shape)
     harmless = replace(none, T=one, H=one, Minv=ones, rho=rho, fault=failed)
-    return jax.tree.map(lambda a, b: jnp.where(sound, a, b), made, harmless)
+    return tree_where(sound, made, harmless)
 
 
 def default_rho(E: Array, n: int) -> Array:

@@ -36,7 +36,7 @@ from jaxmpc.qp.admm import ScaledProgram
 from jaxmpc.qp.linalg import infinity_norm, matmul, solve
 from jaxmpc.qp.problem import FREE, Bounds, sign
 from jaxmpc.qp.residuals import Pair
-from jaxmpc.qp.transformations import has_kernels, repeat_while, true_places
+from jaxmpc.qp.transformations import has_kernels, repeat_while, tree_where, true_places
 from jaxmpc.qp.triton import LEAST, Ref, barrier, call, indices, load, padded_side, store
 
 # Most rows in W.
@@ -302,7 +302,7 @@ def single_step(dual: Dual, point: DualPoint) -> DualPoint:
 def _search_step(steps: MostSteps, constants: tuple[Dual, DualPoint], s: DualSearch) -> DualSearch:
     dual, cold = constants
     again = s.steps == steps.first
-    point = jax.tree.map(lambda old, new: jnp.where(again, new, old), s.point, cold)
+    point = tree_where(again, cold, s.point)
     point, fits = dual_step(dual, point, again | (s.steps >= JOINTLY))
     largest = [jnp.max(v, initial=0.0) for v in sizes(dual.bounds, point.y, point.v)]
     after = after_step(largest, CONVERGED, dual.limit, s.steps + 1, fits, steps)
@@ -383,7 +383,7 @@ def dual_search_kernel(
         y, v, flags = search(dual.limit, cold.v, flags, y, v)
     # A search that began again has other multipliers, all of which count from the cold point.
     again = flags[0] > steps.first
-    begin = jax.tree.map(lambda old, new: jnp.where(again, new, old), point, cold)
+    begin = tree_where(again, cold, point)
     return begin.moved(dual.A, y - begin.y), flags[2] > 0
 
 

@@ -18,7 +18,7 @@ and proves that there is no solution where there is none.
 from dataclasses import replace
 from enum import IntEnum
 from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -48,9 +48,7 @@ from jaxmpc.qp.residuals import (
     row_sizes,
     to_length_one,
 )
-from jaxmpc.qp.transformations import repeat_while, varying
-
-T = TypeVar("T")
+from jaxmpc.qp.transformations import repeat_while, tree_where, varying
 
 # Steps of the line search, a scalar Newton method. Penalties put almost vertical pieces into the
 # derivative, which only bisection finds.
@@ -341,7 +339,7 @@ def improve(
     if fixed:
         length = most + 4 * proof_steps(most)
         s = varying(s, (s, given))
-        step = lambda s, _: (_where(s.open, advance(most, given, s), s), None)
+        step = lambda s, _: (tree_where(s.open, advance(most, given, s), s), None)
         s = lax.scan(step, s, length=length)[0]
     else:
         s = repeat_while(lambda s: s.open, partial(advance, most), given, s, steps="long")
@@ -378,7 +376,7 @@ def advance(most: int, given: RefinementData, s: Refinement) -> Refinement:
     at, phi = _minimised(given, s, primal, distance)
     step = newton_step(at, phi, f.A)
     stiff = s.point.rho >= Constants.of(s.w.dtype).rho[1]
-    point = _where(primal, multipliers_update(s.q, s.point, step), s.point)
+    point = tree_where(primal, multipliers_update(s.q, s.point, step), s.point)
     pair, gradient, tolerances = p.measure(point.w, point.y)
     # What rounding of T'PT hides of the gradient counts as a part of q (defect correction).
     q = s.q + gradient - (matmul(point.w, f.H) + s.q + matmul(point.y, f.A))
@@ -386,9 +384,9 @@ def advance(most: int, given: RefinementData, s: Refinement) -> Refinement:
     y = jnp.where(primal, point.change, step.excess)
     proof = s.proof.joined(prove(p.qp, f.T, f.E, given.correcting, tolerances, y, ray))
     # Where there is no answer, the best is the point of least violation, at which this ends.
-    best = _where(primal, s.best.or_better(pair), s.best)
+    best = tree_where(primal, s.best.or_better(pair), s.best)
     idle = jnp.where(best.error < 0.5 * s.best.error, 0, s.idle + 1)
-    best = _where(proof.beyond & ~best.finished, pair, best)
+    best = tree_where(proof.beyond & ~best.finished, pair, best)
     steps, left = s.steps + primal, s.left - 1
     new = replace(s, point=point, q=q, best=best, steps=steps, idle=idle, proof=proof, left=left)
     return next_phase(most, p, new, step, stiff, primal, distance)
@@ -452,18 +450,14 @@ def next_phase(
     return replace(
         s,
         bounds=s.bounds.widened(step.excess * widen),
-        point=_where(widen, anew, point),
-        q=_where(widen, p.q, s.q),
+        point=tree_where(widen, anew, point),
+        q=tree_where(widen, p.q, s.q),
         w=w,
         phase=jnp.where(widen, Phase.MULTIPLIERS, phase),
         left=jnp.where(widen, most - s.steps, left),
         widened=s.widened | widen,
         open=~ended,
     )
-
-
-def _where(condition: Array, new: T, old: T) -> T:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
 def least_violation(point: MultiplierState, infeasible: Array) -> MultiplierState:

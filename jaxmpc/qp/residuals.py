@@ -25,7 +25,6 @@ from dataclasses import replace
 from functools import reduce
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -34,6 +33,7 @@ from jaxmpc.pytrees import pytree
 from jaxmpc.qp.linalg import infinity_norm, matmul, precisely, rounding
 from jaxmpc.qp.problem import QP, Bounds, QPSolution, finite
 from jaxmpc.qp.status import Status
+from jaxmpc.qp.transformations import tree_where
 
 # Multiple of the rounding floor below which steps on ill-conditioned programs gain nothing.
 STALLED = 10
@@ -205,7 +205,7 @@ class Pair:
         more."""
         smaller = (other.error < self.error) & (other.near | ~self.near)
         take = ~self.finished & (other.finished | smaller)
-        best = jax.tree.map(lambda old, new: jnp.where(take, new, old), self, other)
+        best = tree_where(take, other, self)
         return replace(best, finished=best.finished | self.near)
 
 

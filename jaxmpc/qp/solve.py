@@ -50,7 +50,14 @@ from jaxmpc.qp.residuals import (
     worst,
 )
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.transformations import has_kernels, implicit, in_blocks, own_modes, varying
+from jaxmpc.qp.transformations import (
+    has_kernels,
+    implicit,
+    in_blocks,
+    own_modes,
+    tree_where,
+    varying,
+)
 from jaxmpc.qp.triton import EXACT, ROUGH, Product
 
 T = TypeVar("T")
@@ -196,7 +203,7 @@ def stepped_end(p: ScaledProgram, begin: MultiplierState, most: int) -> QPSoluti
         other = p.unscaled(end.w, end.y)
         error = lambda z, y: reduce(jnp.maximum, worst(residual_terms(qp, z, y), 0.0)[1])
         better = lax.stop_gradient(error(*other) < error(*pair))
-        pair = jax.tree.map(lambda old, new: jnp.where(better, new, old), pair, other)
+        pair = tree_where(better, other, pair)
     sizes = p.typical_sizes(end.w, end.y)
     allowed = p.eps * row_sizes(0.0, qp.row_sizes, sizes)
     certified = partial(prove, qp, factor.T, factor.E, correcting_rows(qp), allowed)

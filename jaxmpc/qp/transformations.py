@@ -110,6 +110,11 @@ def _axes(v: Any) -> frozenset[str]:
     return kind.mat.varying if hasattr(kind, "mat") else getattr(kind, "vma", frozenset())
 
 
+def tree_where(condition: Array, a: T, b: T) -> T:
+    """Return `jnp.where(condition, a, b)` for each leaf of two trees."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), a, b)
+
+
 def on_gpu() -> bool:
     """Return whether programs run by default on a GPU for which there are kernels."""
     return jax.default_backend() == "gpu" and has_triton()

@@ -319,8 +319,8 @@ def stage_residuals(s: Stages, u: Array, y: Array) -> Terms:
     """As `qp.residuals.residual_terms`, for the condensed QP in the inputs.
 
     With the gradient g of the Lagrangian the gap z'Pz + q'z + g(Az) + g*(y) is
-    u'g + g(rows) + g*(y) − y'rows: at the optimum both parts are zero. What is natural for a row
-    and for an input is what is the most of the same one over the horizon.
+    u'g + g(rows) + g*(y) − y'rows: at the optimum both parts are zero. What is typical of a row
+    and of an input is what is the most of the same one over the horizon.
     """
     found, bounds = conditions(s, u, y), s.bounds
     penalty, support, product = bounds.cost(found.rows), bounds.support(y), y * found.rows
