@@ -12,8 +12,8 @@ from test_store import AXES, CONFIG, FIELDS, array_files, bounds, rows
 from jaxmpc import store
 from jaxmpc.app.commands.options import chosen_shard
 from jaxmpc.store import Store
-from jaxmpc.store.lock import Lock
-from jaxmpc.store.places import zarr_place
+from jaxmpc.store.reading import zarr_place
+from jaxmpc.store.writing import Lock
 
 
 def open_shard(path, shard=None, config=CONFIG):

@@ -18,7 +18,8 @@ from damage import turned_bits
 from jaxmpc import store
 from jaxmpc.feasible.stored import BOUNDS, dimension_names, label_fields, stored_labels
 from jaxmpc.store import Constant, Store
-from jaxmpc.store.blocks import block_shape, regions
+from jaxmpc.store.reading import regions
+from jaxmpc.store.writing import block_shape
 
 AXES = {
     "q": Constant(np.linspace(-1, 1, 5), ("q",), {"units": "rad", "long_name": "q"}),

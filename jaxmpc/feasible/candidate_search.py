@@ -21,8 +21,8 @@ from jax.typing import DTypeLike
 
 from jaxmpc.batches import Compiled, Devices, over_devices
 from jaxmpc.feasible import proofs
+from jaxmpc.feasible.condensed_rows import ConstraintRows
 from jaxmpc.feasible.hard_constraints import ExactData
-from jaxmpc.feasible.orthonormal_rows import ConstraintRows
 from jaxmpc.feasible.proofs import Verdict
 from jaxmpc.qp.linalg import matmul
 from jaxmpc.qp.newton import least_distance
@@ -200,9 +200,6 @@ def newton_rounds(
     def waiting(now: Rounds) -> Array:
         return usable & (now.verdict.label == 0) & (now.rounds < NEWTON_ROUNDS)
 
-    def any_waiting(now: Rounds) -> Array:
-        return jnp.any(waiting(now))
-
     def newton(now: Rounds) -> Rounds:
         open_ = waiting(now)
         least = jnp.min(jnp.where(open_, now.rounds, NEWTON_ROUNDS))
@@ -219,7 +216,7 @@ def newton_rounds(
         return Rounds(verdict, put(now.w, better), now.rounds.at[index].add(1, mode="drop"))
 
     start = Rounds(verdict, w.astype(jnp.float64), jnp.zeros(len(points), int))
-    return jax.lax.while_loop(any_waiting, newton, start).verdict
+    return jax.lax.while_loop(lambda now: jnp.any(waiting(now)), newton, start).verdict
 
 
 @functools.cache

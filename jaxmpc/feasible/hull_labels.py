@@ -32,8 +32,8 @@ from scipy.spatial import ConvexHull, QhullError
 
 from jaxmpc.batches import Compiled, Devices, over_devices
 from jaxmpc.feasible import proofs
+from jaxmpc.feasible.condensed_rows import ConstraintRows
 from jaxmpc.feasible.hard_constraints import ExactData
-from jaxmpc.feasible.orthonormal_rows import ConstraintRows
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays, close_gap, filled
 from jaxmpc.pytrees import pytree
@@ -76,24 +76,24 @@ class Hull:
         if d > MOST_COORDINATES:
             return None
         try:
-            found = close_gap(Rays.of(problem), GAP, ROUNDS, MOST_RAYS)
+            rays = Rays.of(problem)
+            proved, gap = close_gap(rays, GAP, ROUNDS, MOST_RAYS)
         except ValueError:
             return None
-        if not found.gap <= USEFUL:
+        if not gap <= USEFUL:
             return None
-        center, proved = found.rays.center, found.proved
-        points = proved.points
+        center, points = rays.center, proved.points
         unit = np.ptp(points, axis=0)
         try:
             facets = hull_facets((points - center) / unit)
         except QhullError:
             return None
-        theta, w = np.vstack([points, center]), np.vstack([proved.w, found.rays.w])
+        theta, w = np.vstack([points, center]), np.vstack([proved.w, rays.w])
         facets = facets[np.linalg.cond(edges_of(theta, facets) / unit[:, None]) < 1e8]
         M = np.linalg.inv(edges_of(theta, facets))
         free = len(problem.view.others) if problem.view.projects else 0
-        value = vertex_values(found.rays.exact, rows, theta, w, free)
-        least, most = label_limits(found.rays.exact, theta, value, facets, M)
+        value = vertex_values(rays.exact, rows, theta, w, free)
+        least, most = label_limits(rays.exact, theta, value, facets, M)
         gauge, slope = M.sum(axis=1), edges_of(value, facets) @ M
         _, _, normals, offsets, cuts = proved
         return cls(center, M, gauge, least, most, value[-1], slope, normals, offsets, cuts)

@@ -13,12 +13,10 @@ from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import Part, chosen_devices, count, default_chunk, slices, work_off
 from jaxmpc.checks import fail, number, whole
 from jaxmpc.feasible import proofs
-from jaxmpc.feasible.label_workers import labelled_parts
-from jaxmpc.feasible.labels import Labels, OnDemand
-from jaxmpc.feasible.pipeline import Scope
+from jaxmpc.feasible.hard_constraints import Axes, ExactData
+from jaxmpc.feasible.pipeline import Labels, OnDemand, Scope, labelled_parts
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays, close_gap
-from jaxmpc.feasible.view import Axes
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
@@ -28,6 +26,12 @@ from jaxmpc.sets.lp import power_of_two
 
 # Volumes are sums of rounded products; bounds are widened by more than that.
 VOLUME_ROUNDING = 1e-11
+# What refinement proves, and its dimensions in data sets.
+BOUNDS = {
+    "bound_point": ("ray", "coordinate"),
+    "bound_normal": ("facet", "coordinate"),
+    "bound_offset": ("facet",),
+}
 
 
 @record
@@ -176,15 +180,16 @@ class FeasibleSetMap:
         is returned as it is.
         """
         try:
-            found = close_gap(Rays.of(self.problem), gap, rounds, deadline=deadline)
+            rays = Rays.of(self.problem)
+            proved, left = close_gap(rays, gap, rounds, deadline=deadline)
         except ValueError:
             return self
         box = self.problem.programs.bounding_box[0]
-        if found.gap > gap and box is not None and np.all(np.isfinite(box)):
-            what = f"differ by {found.gap:.2g} of it, more than the gap {gap:.2g}"
+        if left > gap and box is not None and np.all(np.isfinite(box)):
+            what = f"differ by {left:.2g} of it, more than the gap {gap:.2g}"
             warnings.warn(f"refine: the bounds of the volume {what}", stacklevel=2)
-        points, _, normals, offsets, _ = found.proved
-        labels = excluded(self.labels, found.rays, self.x0s, normals, offsets)
+        points, _, normals, offsets, _ = proved
+        labels = excluded(self.labels, rays.exact, self.x0s, normals, offsets)
         return replace(
             self, labels=labels, bound_point=points, bound_normal=normals, bound_offset=offsets
         )
@@ -195,21 +200,13 @@ class FeasibleSetMap:
         `bound_offset`."""
         import xarray as xr
 
-        further = {
-            "start": ("state",),
-            "plan": ("time", "input"),
-            "cut_normal": ("coordinate",),
-        }
+        further = {"start": ("state",), "plan": ("time", "input"), "cut_normal": ("coordinate",)}
         data = {
             name: (("sample", *further.get(name, ())), value)
             for name, value in self.labels.arrays().items()
         }
-        data |= {
-            "x0": (("sample", "coordinate"), self.x0s),
-            "bound_point": (("ray", "coordinate"), self.bound_point),
-            "bound_normal": (("facet", "coordinate"), self.bound_normal),
-            "bound_offset": (("facet",), self.bound_offset),
-        }
+        data["x0"] = ("sample", "coordinate"), self.x0s
+        data |= {name: (dimensions, getattr(self, name)) for name, dimensions in BOUNDS.items()}
         names = {
             "coordinate": list(self.axis_names),
             "state": list(self.mpc.labels),
@@ -242,14 +239,13 @@ def elliptic_section(
 
 
 def excluded(
-    labels: Labels, rays: Rays, points: np.ndarray, normals: np.ndarray, offsets: np.ndarray
+    labels: Labels, p: ExactData, points: np.ndarray, normals: np.ndarray, offsets: np.ndarray
 ) -> Labels:
     """Return labels where undecided points that one of the half-spaces excludes are infeasible.
 
     This is done only within the extent of the feasible set that LPs found: there a half-space of
     `proofs.everywhere` is one of `proofs.cut`, and no label depends on an LP.
     """
-    p = rays.exact
     within = np.all(np.abs(points) + p.side_0 * points <= p.reach_0, axis=1)
     left = np.flatnonzero((labels.status == Status.ITERATION_LIMIT) & within)
     if not len(left) or not len(offsets):
@@ -311,8 +307,6 @@ def map_feasible_set(
     else:
         problem = FeasibilityProblem.of(mpc, axes, fixed)
     whole("iterations", iterations, 1)
-    if chunk is not None:
-        whole("chunk", chunk, 1)
     if gap is not None:
         number("gap", gap, 0, "Give a gap of at least 0, or None")
     result = map_points(
@@ -363,9 +357,7 @@ def label_chunks(
         fail("x0s", f"shape {points.shape}", f"Give points (B, {d}), one column a mapped state")
     if chunk is None:
         chunk = count(chosen_devices(settings.get("devices"))) * default_chunk()
-    if chunk < 1:
-        fail("chunk", f"{chunk}", "Give a count of at least 1")
-    chunk = min(chunk, max(len(points), 1))
+    chunk = min(whole("chunk", chunk, 1), max(len(points), 1))
     places = slices(len(points), chunk)
     scope = Scope.of(points, len(places)) if scope is None else scope
     yield from labelled_parts(problem, places, points.__getitem__, scope, chunk, **settings)

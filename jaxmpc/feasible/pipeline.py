@@ -1,5 +1,6 @@
-"""The pipeline of stages that labels points, part by part. A point goes through them in this order
-until it is decided:
+"""Labels of points, each with its proof, and the pipeline of stages that makes them, part by part.
+
+A point goes through the stages in this order until it is decided:
 
     hull                   in the hull of proved points, or beyond a half-space; then the roll-out
                            of its plan. Only where so many points are worth the rays (`hull_for`)
@@ -11,39 +12,52 @@ The first of them takes a whole part on the device (`Pipeline.begin`), the other
 left (`Pipeline.stages`, `by_programs`).
 
 The labels and proofs of a part depend on its own points, on the shape of a part and on the `Scope`
-of all points, not on which other parts a process has labelled: any split among processes gives the
-same bits.
+of all points, not on which other parts a process has labelled, nor on who labels it: any split
+among processes gives the same bits. So parts may be labelled here (`label_parts`) or by an executor
+(`label_elsewhere`), anything with the interface of `concurrent.futures`: `submit(function,
+*arguments)` returns a future, whose `result()` waits.
 """
 
 import functools
 import itertools
+import pickle
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 import numpy as np
+from jax import Array
 
 from jaxmpc.batches import (
     Compiled,
+    Part,
     chosen_devices,
+    cores,
     count,
     divisible,
     gather_size,
+    joined,
     padded,
     placement,
+    side_by_side,
 )
 from jaxmpc.checks import fail, require_step_type
 from jaxmpc.feasible.candidate_search import compiled_admm, compiled_check, compiled_newton
+from jaxmpc.feasible.condensed_rows import ConstraintRows, RowPrograms
 from jaxmpc.feasible.hull_labels import compiled_labels, compiled_verdicts, hull_for
-from jaxmpc.feasible.labels import Labels, OnDemand
-from jaxmpc.feasible.orthonormal_rows import ConstraintRows
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import Verdict
-from jaxmpc.feasible.row_lps import RowPrograms
 from jaxmpc.pytrees import record
+from jaxmpc.qp.status import Status
 
+# The arrays of `Labels` that may still be on the device, and the label that each of them proves.
+PROOFS = {"start": 1, "plan": 1, "cut_normal": -1, "cut_offset": -1}
+# The status of labels −1, 0 and 1.
+STATUS = np.array([Status.PRIMAL_INFEASIBLE, Status.ITERATION_LIMIT, Status.SOLVED], np.int8)
 # Steps of the longer ADMM run, relative to the first, on points that Newton leaves undecided.
 LONGER = 20
 # Points that get linear programs, the first of each part in order: so many in all parts, each with
@@ -54,6 +68,184 @@ MOST_PROGRAMS, MOST_ENTRIES = 2000, 2 * 10**7
 ON_DEVICE = 2**31
 # Number of points from which their typical size is taken.
 SAMPLE = 4096
+# Parts that are submitted and not yet joined, at most: enough for some hundred workers.
+IN_FLIGHT = 256
+# How often a part is submitted again whose worker died.
+RETRIES = 3
+
+T = TypeVar("T")
+
+
+class OnDemand(Generic[T]):
+    """Something, mostly an array, that is fetched once, when it is first used."""
+
+    def __init__(self, fetch: Callable[[], T]) -> None:
+        self._fetch: Callable[[], T] | None = fetch
+        self._value: T | None = None
+
+    def get(self) -> T:
+        """Return it, and fetch it the first time."""
+        if self._fetch is not None:
+            self._value, self._fetch = self._fetch(), None
+        assert self._value is not None
+        return self._value
+
+
+@record
+class Labels:
+    """Labels of b points and their proofs: a `Verdict` of each point, and its status.
+
+    label (b,) int8: 1 proved feasible, −1 proved infeasible, 0 undecided. status (b,) int8:
+    `Status` (NOT_RUN, NON_FINITE, or SOLVED / PRIMAL_INFEASIBLE / ITERATION_LIMIT for the three
+    labels). compile_seconds, run_seconds: time spent compiling and running.
+
+    proofs: the arrays `start`, `plan`, `cut_normal`, `cut_offset`, which may still be on the
+    device, or not be made yet: each is fetched when it is first used.
+    """
+
+    label: np.ndarray
+    status: np.ndarray
+    proofs: Mapping[str, OnDemand[np.ndarray]]
+    compile_seconds: float = 0.0
+    run_seconds: float = 0.0
+
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{n:,} {name}" for name, n in self.counts().items() if n)
+        return f"Labels of {len(self.label):,} points: {counts or 'none'}"
+
+    @property
+    def start(self) -> np.ndarray:
+        """Return x_0 (b, n) of the points proved feasible, NaN elsewhere."""
+        return self.proofs["start"].get()
+
+    @property
+    def plan(self) -> np.ndarray:
+        """Return inputs (b, N, m) that prove points feasible, NaN elsewhere. Where equalities tie
+        inputs to states the inputs that prove it are real numbers within rounding of these."""
+        return self.proofs["plan"].get()
+
+    @property
+    def cut_normal(self) -> np.ndarray:
+        """Return the normals a (b, d) of half-spaces a'x ≤ b, valid on the whole feasible set, that
+        prove points infeasible, NaN elsewhere."""
+        return self.proofs["cut_normal"].get()
+
+    @property
+    def cut_offset(self) -> np.ndarray:
+        """Return the offsets (b,) of these half-spaces.
+
+        ∞ means that −1 is proved at the point but that no such half-space is known: on sets that
+        are unbounded in both directions, or very long, along a facet, the rounding of its normal
+        outweighs the distance of the point.
+        """
+        return self.proofs["cut_offset"].get()
+
+    def counts(self) -> dict[str, int]:
+        """Return how many points are feasible, infeasible, undecided, not finite, not run."""
+        return {
+            "feasible": int(np.sum(self.label == 1)),
+            "infeasible": int(np.sum(self.label == -1)),
+            "undecided": int(np.sum(self.status == Status.ITERATION_LIMIT)),
+            "not finite": int(np.sum(self.status == Status.NON_FINITE)),
+            "not run": int(np.sum(self.status == Status.NOT_RUN)),
+        }
+
+    @classmethod
+    def proved(
+        cls, label: np.ndarray | Array, verdict: Callable[[], Verdict], usable: np.ndarray
+    ) -> "Labels":
+        """Return labels (B,) of a batch, on the device, with the proofs in its verdict, which is
+        asked for when one is used; waits for the device. usable (B,): which points are finite."""
+        label = np.where(usable, np.asarray(label), np.int8(0))
+        status = np.where(usable, STATUS[label + 1], np.int8(Status.NON_FINITE))
+
+        def proof(name: str, of: int) -> OnDemand[np.ndarray]:  # NaN where it proves nothing
+            def fetch() -> np.ndarray:
+                return _put(np.asarray(getattr(verdict(), name)), label != of, np.nan)
+
+            return OnDemand(fetch)
+
+        return cls(label, status, {name: proof(name, of) for name, of in PROOFS.items()})
+
+    @classmethod
+    def empty(cls, count: int, problem: FeasibilityProblem) -> "Labels":
+        """Return labels of `count` points that have not been run."""
+        mpc = problem.mpc
+        shapes: dict[str, tuple[int, ...]] = {
+            "start": (mpc.dimension,),
+            "plan": (mpc.horizon, mpc.system.m),
+            "cut_normal": (problem.dimension,),
+            "cut_offset": (),
+        }
+        proofs = {
+            name: OnDemand(functools.partial(np.full, (count, *shape), np.nan))
+            for name, shape in shapes.items()
+        }
+        return cls(np.zeros(count, np.int8), np.full(count, Status.NOT_RUN, np.int8), proofs)
+
+    @classmethod
+    def joined(cls, parts: Sequence["Labels"]) -> "Labels":
+        """Return the labels of several batches of points, one after the other."""
+
+        def several(name: str) -> OnDemand[np.ndarray]:
+            def fetch() -> np.ndarray:
+                return joined(side_by_side(lambda part: part.proofs[name].get(), parts, cores()))
+
+            return OnDemand(fetch)
+
+        return cls(
+            np.concatenate([part.label for part in parts]),
+            np.concatenate([part.status for part in parts]),
+            {name: several(name) for name in PROOFS},
+            sum(part.compile_seconds for part in parts),
+            sum(part.run_seconds for part in parts),
+        )
+
+    def first(self, count: int) -> "Labels":
+        """Return the labels of the first `count` points."""
+
+        def head(proof: OnDemand[np.ndarray]) -> OnDemand[np.ndarray]:
+            return OnDemand(lambda: proof.get()[:count])
+
+        proofs = {name: head(proof) for name, proof in self.proofs.items()}
+        return replace(self, label=self.label[:count], status=self.status[:count], proofs=proofs)
+
+    def changed(
+        self,
+        where: np.ndarray,
+        label: np.ndarray | int,
+        status: np.ndarray | int,
+        proofs: Mapping[str, OnDemand[np.ndarray]],
+    ) -> "Labels":
+        """Return these labels with others at indices `where` (k,), and with these rows of their
+        proofs."""
+
+        def merged(name: str, rows: OnDemand[np.ndarray]) -> OnDemand[np.ndarray]:
+            return OnDemand(lambda: _put(self.proofs[name].get(), where, rows.get()))
+
+        return replace(
+            self,
+            label=_put(self.label, where, label),
+            status=_put(self.status, where, status),
+            proofs={**self.proofs, **{name: merged(name, rows) for name, rows in proofs.items()}},
+        )
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return label, status and all proofs by their names."""
+        proofs = {name: proof.get() for name, proof in self.proofs.items()}
+        return {"label": self.label, "status": self.status, **proofs}
+
+    def fetch(self) -> None:
+        """Copy all proofs from the device."""
+        for proof in self.proofs.values():
+            proof.get()
+
+
+def _put(array: np.ndarray, where: np.ndarray, rows: np.ndarray | float) -> np.ndarray:
+    """Return a copy of the array with `rows` at indices `where`."""
+    copy = array.copy()
+    copy[where] = rows
+    return copy
 
 
 @record
@@ -97,13 +289,6 @@ class BegunPart(NamedTuple):
     found: Any
 
 
-class Stage(NamedTuple):
-    """A stage for points that are undecided: its name, and points (batch, d) → labels."""
-
-    name: str
-    label: Callable[[np.ndarray], Labels]
-
-
 class Pipeline:
     """The stages for parts of up to `chunk` points of one problem, compiled for these sizes.
 
@@ -127,7 +312,7 @@ class Pipeline:
             fail("iterations", f"{iterations}", "Give a count of at least 1")
         require_step_type(dtype)
         self.devices = chosen_devices(devices)
-        self.problem, self.scope = problem, scope
+        self.problem = problem
         exact = problem.exact(scope.largest, scope.typical)
         self.margins = problem.row_margins(exact, scope.typical)
         programs = min(MOST_PROGRAMS, MOST_ENTRIES // max(problem.rows.U.size, 1))
@@ -143,17 +328,11 @@ class Pipeline:
             self.exact, self.rows, self.hull = jax.device_put(data, placement(self.devices))
 
     @property
-    def stages(self) -> list[Stage]:
-        """Return the stages after the first one in their order, but for the linear programs that
-        come last."""
-        longer = Stage("longer ADMM, Newton", functools.partial(self.by_admm, self.long))
-        if self.hull is None:
-            return [longer]
-        return [
-            Stage("roll-out of the hull's plans", self.by_hull),
-            Stage("ADMM, Newton", functools.partial(self.by_admm, self.short)),
-            longer,
-        ]
+    def stages(self) -> list[Callable[[np.ndarray], Labels]]:
+        """Return the stages after the first one in their order, points (batch, d) → labels, but for
+        the linear programs that come last."""
+        short, long = (functools.partial(self.by_admm, v) for v in (self.short, self.long))
+        return [long] if self.hull is None else [self.by_hull, short, long]
 
     def begin(self, points: np.ndarray) -> BegunPart:
         """Start the first stage of points (b, d), b ≤ chunk, on the device, and return at once."""
@@ -176,7 +355,7 @@ class Pipeline:
         for stage in self.stages:
             left = np.flatnonzero((labels.label == 0) & part.usable)
             for where in self.batches(left):
-                more = stage.label(padded(part.points[where], self.batch)).first(len(where))
+                more = stage(padded(part.points[where], self.batch)).first(len(where))
                 labels = labels.changed(where, more.label, more.status, more.proofs)
         left = np.flatnonzero((labels.label == 0) & part.usable)[: self.share]
         labels = self.by_programs(labels, part.points, left) if len(left) else labels
@@ -302,3 +481,90 @@ def last_programs(
 def _run(program: Compiled, *args: Any) -> Any:
     """Run the program and leave its result on the device."""
     return program.run(*args)
+
+
+def labelled_parts(
+    problem: FeasibilityProblem,
+    places: Sequence[T],
+    points: Callable[[T], np.ndarray],
+    scope: Scope,
+    size: int,
+    *,
+    executor: Any = None,
+    **settings: Any,
+) -> Iterator[Part[Labels]]:
+    """Label the points (b, d), b ≤ size, at each of the places, and yield the parts in order.
+
+    executor: None to label here. settings: those of `label_parts`.
+    """
+    label = label_parts if executor is None else functools.partial(label_elsewhere, executor)
+    found = label(problem, map(points, places), scope, size, **settings) if places else ()
+    for place, labels in zip(places, found, strict=True):
+        yield Part(place, len(labels.label), labels, labels.compile_seconds)
+
+
+def label_elsewhere(
+    executor: Any,
+    problem: FeasibilityProblem,
+    parts: Iterable[np.ndarray],
+    scope: Scope,
+    chunk: int,
+    **settings: Any,
+) -> Iterator[Labels]:
+    """Label parts by an executor; arguments and labels are those of `label_parts`.
+
+    A part whose future fails because its worker died is submitted again, `RETRIES` times at most,
+    with a warning. Raises what `label_parts` raises, and the executor's error after the last try.
+    """
+    if not callable(getattr(executor, "submit", None)):
+        what = f"is a {type(executor).__name__} without submit(function, *arguments)"
+        fail("executor", what, "Give a concurrent.futures.Executor or the like")
+    described = pickle.dumps(
+        (FeasibilityProblem(problem.mpc, problem.view), scope, chunk, settings)
+    )
+
+    def submit(points: np.ndarray) -> Any:
+        return executor.submit(label_part, described, points)
+
+    parts, waiting = iter(parts), deque[tuple[Any, np.ndarray]]()
+    try:
+        while True:
+            missing = IN_FLIGHT - len(waiting)
+            waiting.extend((submit(v), v) for v in itertools.islice(parts, missing))
+            if not waiting:
+                return
+            future, points = waiting.popleft()
+            for left in reversed(range(RETRIES + 1)):
+                try:
+                    found = future.result()
+                    break
+                except Exception as error:  # the executor's: those of the labels are returned
+                    if not left:
+                        raise
+                    what = f"no labels of {len(points):,} points came back"
+                    again = f"({type(error).__name__}); they are submitted again"
+                    warnings.warn(f"executor: {what} {again}", stacklevel=2)
+                    future = submit(points)
+            if isinstance(found, Exception):
+                raise found
+            yield found
+    finally:
+        for future, _ in waiting:
+            getattr(future, "cancel", int)()
+
+
+def label_part(described: bytes, points: np.ndarray) -> Labels | Exception:
+    """Return the labels of one part, all in host memory, or the error that they end in."""
+    try:
+        problem, scope, chunk, settings = _read(described)
+        (labels,) = label_parts(problem, [points], scope, chunk, **settings)
+        labels.fetch()
+        return labels
+    except Exception as error:
+        return error
+
+
+@functools.lru_cache(maxsize=4)
+def _read(described: bytes) -> Any:
+    """Return what was pickled; a worker keeps it with all that the problem has computed."""
+    return pickle.loads(described)

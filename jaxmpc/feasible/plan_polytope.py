@@ -58,10 +58,9 @@ class CenteredPolytope:
 
     def support(self, direction: np.ndarray) -> tuple[float, np.ndarray | None]:
         """Return an upper bound of max direction'θ, by weak duality, and where it is attained."""
-        top = Program(self.normals, self.offsets).maximise(direction)
-        if top.y is None:
-            return top.value, None
-        return bound(direction, top.y, self.normals, self.offsets, self.extent), top.x
+        program = Program(self.normals, self.offsets)
+        top = program.maximise(direction)
+        return program.bound(direction, top, self.extent), top.x
 
     @property
     def polytope(self) -> Polytope:
@@ -133,7 +132,7 @@ class PlanPolytope:
     def reduced(self) -> "PlanPolytope":
         """Return the polytope in coordinates (θ, w) in which it has volume, v = shift + basis (θ,
         w)."""
-        if Program(self.G, self.g).empty:
+        if self.program.empty:
             return self
         hull = affine_hull(self.G, self.g, keep=self.p)
         if hull is None:
@@ -157,6 +156,11 @@ class PlanPolytope:
         return len(self.t)
 
     @cached_property
+    def program(self) -> Program:
+        """Return the linear programs over the polytope."""
+        return Program(self.G, self.g)
+
+    @cached_property
     def extent(self) -> np.ndarray:
         """Return bounds |v_i| ≤ extent_i on the polytope."""
         return extent(self.G, self.g)
@@ -177,20 +181,14 @@ class PlanPolytope:
 
         The bound holds for any LP error, by weak duality.
         """
-        d = normal @ self.M
-        top, shift = maximise(d, self.G, self.g), float(normal @ self.t)
-        if top.x is None or top.y is None:
-            return top.value, top.value, None
-        return top.value + shift, self._bound(d, top.y) + shift, top.x
+        d, shift = normal @ self.M, float(normal @ self.t)
+        top = self.program.maximise(d)
+        return top.value + shift, self.program.bound(d, top, self.extent) + shift, top.x
 
     def support(self, direction: np.ndarray) -> float:
         """Return an upper bound of direction'θ over the polytope, as in `largest_next`."""
         d = np.append(direction, np.zeros(self.G.shape[1] - self.p))
-        top = maximise(d, self.G, self.g)
-        return top.value if top.y is None else self._bound(d, top.y)
-
-    def _bound(self, d: np.ndarray, y: np.ndarray) -> float:
-        return bound(d, y, self.G, self.g, self.extent)
+        return self.program.bound(d, self.program.maximise(d), self.extent)
 
     def center(self) -> np.ndarray:
         """Return the θ of a point well inside. Raises ValueError where there is none, because the
@@ -203,7 +201,7 @@ class PlanPolytope:
         """Return max s with center + s·direction in the projection, and a half-space a'θ ≤ b of it,
         as (s, a, b).
 
-        (s, a, b). The LP's multipliers y give a = G_θ'y and b = y'g, plus what their error G_z'y
+        The LP's multipliers y give a = G_θ'y and b = y'g, plus what their error G_z'y
         can add. Raises ValueError where the ray does not end.
         """
         p = self.p
@@ -212,7 +210,8 @@ class PlanPolytope:
         if top.x is None or top.y is None:
             fail("centre", "the ray does not end inside the set", "Give a bounded problem")
         normal = self.G[:, :p].T @ top.y
-        b = self._bound(np.append(normal, np.zeros(G.shape[1] - 1)), top.y)
+        along = np.append(normal, np.zeros(G.shape[1] - 1))
+        b = bound(along, top.y, self.G, self.g, self.extent)
         length = np.linalg.norm(normal)
         return top.value, normal / length, float(b / length)
 

@@ -9,12 +9,10 @@ from scipy.linalg import qr
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import require_kind
-from jaxmpc.feasible import hard_constraints, orthonormal_rows
-from jaxmpc.feasible.hard_constraints import ExactData
-from jaxmpc.feasible.orthonormal_rows import ConstraintRows
+from jaxmpc.feasible import condensed_rows, hard_constraints
+from jaxmpc.feasible.condensed_rows import ConstraintRows, RowPrograms
+from jaxmpc.feasible.hard_constraints import Axes, ExactData, View, make_view
 from jaxmpc.feasible.plan_polytope import PlanPolytope
-from jaxmpc.feasible.row_lps import RowPrograms
-from jaxmpc.feasible.view import Axes, View, make_view
 from jaxmpc.files import as_json
 from jaxmpc.mpc.condense import Condensed, condensed_in_float64
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
@@ -75,7 +73,7 @@ class FeasibilityProblem:
     @cached_property
     def rows(self) -> ConstraintRows:
         """Return the condensed rows in θ and an orthonormal basis."""
-        return orthonormal_rows.constraint_rows(self.mpc, self.view, self.condensed, self.blocks)
+        return condensed_rows.constraint_rows(self.mpc, self.view, self.condensed, self.blocks)
 
     @cached_property
     def programs(self) -> RowPrograms:
@@ -95,7 +93,7 @@ class FeasibilityProblem:
         free = replace(self.mpc, prestabilise=False)
         c = with_previous_inputs(free, condensed_in_float64(free))
         return tuple(
-            orthonormal_rows.constraint_rows(self.mpc, self.view, c, self.blocks, growth)
+            condensed_rows.constraint_rows(self.mpc, self.view, c, self.blocks, growth)
             for growth in ([slow, fast] if fast > (1 + 1e-6) * slow else [fast])
         )
 

@@ -18,8 +18,8 @@ from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.candidate_search import cut_of, inputs_of
+from jaxmpc.feasible.condensed_rows import ConstraintRows
 from jaxmpc.feasible.hard_constraints import ExactData
-from jaxmpc.feasible.orthonormal_rows import ConstraintRows
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import Cut
 from jaxmpc.mpc.problem import MPC
@@ -44,6 +44,15 @@ class ProvedBounds(NamedTuple):
     normals: np.ndarray
     offsets: np.ndarray
     cuts: Cut
+
+    @classmethod
+    def of(
+        cls, points: np.ndarray, w: np.ndarray, found: "Boundary | ProvedRays"
+    ) -> "ProvedBounds":
+        """Return points with their w, and of the half-spaces found those that exist."""
+        valid = np.isfinite(found.offsets)
+        cuts = Cut(*(part[valid] for part in found.cuts))
+        return cls(points, w, found.normals[valid], found.offsets[valid], cuts)
 
     def joined(self, more: "ProvedBounds") -> "ProvedBounds":
         """Return these points and half-spaces and more."""
@@ -81,11 +90,8 @@ class Boundary:
     @property
     def _proved(self) -> ProvedBounds:
         """Return the points and half-spaces of those rays that have them."""
-        inside, valid = np.isfinite(self.inner), np.isfinite(self.offsets)
-        cuts = Cut(*(part[valid] for part in self.cuts))
-        return ProvedBounds(
-            self.points[inside], self.w[inside], self.normals[valid], self.offsets[valid], cuts
-        )
+        inside = np.isfinite(self.inner)
+        return ProvedBounds.of(self.points[inside], self.w[inside], self)
 
 
 def boundary(
@@ -154,10 +160,7 @@ class Rays:
         # No rays go with these multipliers; the program is that of `cast`, so that one compiles.
         still = np.zeros((len(sides), len(BACKOFFS), 1))
         found = self.prove(still + self.center, still + self.w, sides)
-        valid = np.isfinite(found.offsets)
-        cuts = Cut(*(part[valid] for part in found.cuts))
-        none = self.center[None][:0], self.w[None][:0]
-        return ProvedBounds(*none, found.normals[valid], found.offsets[valid], cuts)
+        return ProvedBounds.of(self.center[None][:0], self.w[None][:0], found)
 
     def cast(self, directions: np.ndarray) -> Boundary:
         """Return the boundary points along every direction (K, d), moved inwards and proved."""
@@ -232,20 +235,15 @@ def leaving(
     return np.where(slope > 0, t, np.inf).min(axis=1, initial=np.inf)
 
 
-class ClosedGap(NamedTuple):
-    """What rays have proved. gap: of the volumes of hull and intersection, relative to the latter;
-    inf where one of them has none."""
-
-    rays: Rays
-    proved: ProvedBounds
-    gap: float
-
-
 def close_gap(
     rays: Rays, gap: float, rounds: int, most: int = MOST_RAYS, deadline: float = np.inf
-) -> ClosedGap:
+) -> tuple[ProvedBounds, float]:
     """Send rays through the vertices of the outer polytope until the volumes differ by no more than
-    `gap`, `most` of them a round, before `deadline` (of `time.monotonic`)."""
+    `gap`, `most` of them a round, before `deadline` (of `time.monotonic`).
+
+    Returns what they have proved, and the gap of the volumes of hull and intersection, relative to
+    the latter; inf where one of them has none.
+    """
     d = rays.problem.dimension
     box, _ = rays.problem.programs.bounding_box
     unit = power_of_two(np.zeros(d) if box is None else np.ptp(box, axis=0))
@@ -266,7 +264,7 @@ def close_gap(
         # Sets with a curved boundary have no end of vertices.
         if left <= gap or not 0 < len(directions) <= most:
             break
-    return ClosedGap(rays, proved, left)
+    return proved, left
 
 
 def of_length_one(directions: np.ndarray) -> np.ndarray:

@@ -15,38 +15,36 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from jaxmpc.arrays import Reals
 from jaxmpc.batches import CHUNK, Part, Timing, work_off
 from jaxmpc.checks import fail
-from jaxmpc.feasible import irredundant
-from jaxmpc.feasible.irredundant import HalfSpaces
-from jaxmpc.feasible.label_workers import labelled_parts
-from jaxmpc.feasible.labels import PROOFS, Labels, OnDemand
-from jaxmpc.feasible.map import FeasibleSetMap, excluded
-from jaxmpc.feasible.pipeline import Scope
+from jaxmpc.feasible.hard_constraints import Axes
+from jaxmpc.feasible.map import BOUNDS, FeasibleSetMap, excluded
+from jaxmpc.feasible.pipeline import PROOFS, Labels, OnDemand, Scope, labelled_parts
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays
-from jaxmpc.feasible.view import Axes
 from jaxmpc.files import check_results
 from jaxmpc.grids import mesh
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
+from jaxmpc.sets.convex_sets import Box, Polytope
+from jaxmpc.sets.lp import power_of_two
 from jaxmpc.store import Constant, Field, Store, exists, location, report_damage
 
 # Lines of a picture along each axis, at most.
 LINES = 1024
-# What refinement proves, and its dimensions.
-BOUNDS = {
-    "bound_point": ("ray", "coordinate"),
-    "bound_normal": ("facet", "coordinate"),
-    "bound_offset": ("facet",),
-}
 # Dimensions and files of a store that no mapped state may be called.
 TAKEN = {"checksum", "block", "state", "input", "time", "coordinate", "sample", "zarr.json"}
 # Bytes of the name of a dimension, at most; file systems have 255 for a name.
 MOST_NAME = 100
+# Points proved feasible, or half-spaces, from which on they are reduced to those that matter to the
+# bounds, and the most mapped states with which they are. To drop others makes no bound wrong.
+MANY, REDUCED = 10_000, 4
+# Half-spaces that cut nothing off within so many sizes of the grid around it do not matter.
+FAR = 100.0
 
 
 class Picture(NamedTuple):
@@ -104,7 +102,7 @@ class StoredMap:
         cls, problem: FeasibilityProblem, store: Store, along: Sequence[np.ndarray]
     ) -> "StoredMap":
         """Read all labels of an open store, and the proofs that matter, block by block: memory does
-        not grow with the grid up to `irredundant.REDUCED` mapped states."""
+        not grow with the grid up to `REDUCED` mapped states."""
         found = cls.unread(problem, store, along)
         points = found.bounds.bound_point
         cuts = HalfSpaces.none(np.array([[line[0], line[-1]] for line in along]).T)
@@ -113,10 +111,10 @@ class StoredMap:
             found._count(block, labels)
             if np.any(labels.status == Status.ITERATION_LIMIT):
                 found.undecided.append(block)
-            ends = irredundant.line_ends(labels.label == 1, store.regions[block][-1])
+            ends = line_ends(labels.label == 1, store.regions[block][-1])
             if len(ends):
                 points = np.concatenate([points, mesh(along, store.samples(block)[ends])])
-                points = irredundant.extreme(points) if len(points) > irredundant.MANY else points
+                points = extreme(points) if len(points) > MANY else points
             if np.any(labels.label == -1):
                 cuts = cuts.add(store.read("cut_normal", block), store.read("cut_offset", block))
         return found._with_bounds(points, cuts.normals, cuts.offsets)
@@ -127,11 +125,13 @@ class StoredMap:
         none = np.zeros((0, self.problem.dimension))
         alone = FeasibleSetMap.of(self.problem, none, Labels.empty(0, self.problem)).refine(gap)
         normals, offsets = alone.bound_normal, alone.bound_offset
-        for block in self.undecided if len(offsets) else ():
-            before = self._labels(block)
-            points = mesh(self.along, self.store.samples(block))
-            self._count(block, before, -1)
-            self._count(block, excluded(before, Rays.of(self.problem), points, normals, offsets))
+        if self.undecided and len(offsets):
+            exact = Rays.of(self.problem).exact
+            for block in self.undecided:
+                before = self._labels(block)
+                points = mesh(self.along, self.store.samples(block))
+                self._count(block, before, -1)
+                self._count(block, excluded(before, exact, points, normals, offsets))
         self.store.save(
             {name: Constant(getattr(alone, name), axes) for name, axes in BOUNDS.items()}
         )
@@ -225,11 +225,8 @@ def sweep_into(
     if shard is None:
         check_results(path, resume, overwrite, exists(path))
     elif overwrite:
-        fail(
-            "overwrite",
-            "given beside shard (--overwrite, --shard)",
-            "Delete the store before shards start",
-        )
+        what = "given beside shard (--overwrite, --shard)"
+        fail("overwrite", what, "Delete the store before shards start")
     problem = FeasibilityProblem.of(mpc, axes, fixed)
     settings = {"iterations": iterations, "dtype": dtype} if settings is None else settings
     how: dict[str, Any] = {"shard": shard, "overwrite": overwrite, "begun": begun}
@@ -252,9 +249,14 @@ def sweep_into(
             dtype=dtype,
             devices=devices,
         )
+
+        def commit(part: Part[Labels]) -> str:
+            store.commit(part.place, **part.result.arrays())
+            return f"{np.mean(part.result.label != 0):.2%} of the last block decided"
+
         total = sum(len(store.samples(block)) for block in pending)
         show = None if progress else False
-        timing = work_off(found, partial(commit_labels, store), total, unit="states", progress=show)
+        timing = work_off(found, commit, total, unit="states", progress=show)
         if left := store.unfinished():
             return StoredMap.unread(problem, store, along, timing, left)
         whole = replace(StoredMap.read(problem, store, along), timing=timing)
@@ -264,12 +266,6 @@ def sweep_into(
             whole = whole.refine(gap)
         concluded(whole)
         return whole
-
-
-def commit_labels(store: Store, part: Part[Labels]) -> str:
-    """Write the labels of a block; return a note for the progress bar."""
-    store.commit(part.place, **part.result.arrays())
-    return f"{np.mean(part.result.label != 0):.2%} of the last block decided"
 
 
 def open_labels(
@@ -310,32 +306,24 @@ def open_labels(
 def label_fields(n: int, horizon: int, m: int, d: int) -> dict[str, Field]:
     """Return the variables that hold `Labels` of d mapped states and plans (horizon, m) from states
     of size n."""
-    meanings = "infeasible undecided feasible", " ".join(s.name.lower() for s in Status)
-    values = [-1, 0, 1], [int(s) for s in Status]
-    label, status = (
-        {"flag_values": v, "flag_meanings": text} for v, text in zip(values, meanings, strict=True)
-    )
-    about = {
-        "label": "label",
-        "status": "status of the problem at this state",
-        "start": "initial state of the plan that proves feasible",
-        "plan": "inputs that prove feasible",
-        "cut_normal": (
-            "normal a of a half-space a'x <= b that no feasible state leaves and this one does"
-        ),
-        "cut_offset": "offset b of the half-space a'x <= b; inf: proved at this state alone",
-    }
-    fields = {
-        "label": Field((), "int8", 0, (), label),
-        "status": Field((), "int8", 0, (), status),
-        "start": Field((n,), "float64", np.nan, ("state",)),
-        "plan": Field((horizon, m), "float64", np.nan, ("time", "input")),
-        "cut_normal": Field((d,), "float64", np.nan, ("coordinate",)),
-        "cut_offset": Field((), "float64", np.nan, ()),
-    }
+
+    def flags(long_name: str, meanings: Mapping[str, int]) -> Field:
+        values = {"flag_values": [*meanings.values()], "flag_meanings": " ".join(meanings)}
+        return Field((), "int8", 0, (), {"long_name": long_name, **values})
+
+    def numbers(long_name: str, shape: tuple[int, ...], *dimensions: str) -> Field:
+        return Field(shape, "float64", np.nan, dimensions, {"long_name": long_name})
+
+    status = {s.name.lower(): int(s) for s in Status}
+    half_space = "a half-space a'x <= b that no feasible state leaves and this one does"
+    at_point = "offset b of the half-space a'x <= b; inf: proved at this state alone"
     return {
-        name: field._replace(attributes={"long_name": about[name], **field.attributes})
-        for name, field in fields.items()
+        "label": flags("label", {"infeasible": -1, "undecided": 0, "feasible": 1}),
+        "status": flags("status of the problem at this state", status),
+        "start": numbers("initial state of the plan that proves feasible", (n,), "state"),
+        "plan": numbers("inputs that prove feasible", (horizon, m), "time", "input"),
+        "cut_normal": numbers(f"normal a of {half_space}", (d,), "coordinate"),
+        "cut_offset": numbers(at_point, ()),
     }
 
 
@@ -366,3 +354,87 @@ def _name_and_unit(label: str) -> tuple[str, str]:
     """Split a label such as "q [rad]" into its name and its unit."""
     found = re.fullmatch(r"(.*?) \[(.*)\]", label)
     return (found[1], found[2]) if found else (label, "")
+
+
+def line_ends(flags: np.ndarray, last: slice) -> np.ndarray:
+    """Return the indices of samples of a block where flags (samples,) is set first and last along
+    each line of its last axis: on the line no other is extreme."""
+    lines = flags.reshape(-1, last.stop - last.start)
+    some = np.flatnonzero(lines.any(axis=1))
+    lines = lines[some]
+    size = last.stop - last.start
+    first, final = np.argmax(lines, axis=1), size - 1 - np.argmax(lines[:, ::-1], axis=1)
+    return np.unique(np.concatenate([some * size + first, some * size + final]))
+
+
+def extreme(points: np.ndarray) -> np.ndarray:
+    """Return those of the points (K, d) that span their hull; all where that is flat, and above
+    `REDUCED` dimensions."""
+    size, d = np.ptp(points, axis=0), points.shape[1]
+    if d == 1:
+        return points[[np.argmin(points), np.argmax(points)]]
+    if d > REDUCED or not size.all():
+        return points
+    try:
+        return points[np.sort(ConvexHull((points - points.mean(axis=0)) / size).vertices)]
+    except QhullError:
+        return points
+
+
+@record
+class HalfSpaces:
+    """Half-spaces normals (K, d) x ≤ offsets (K,) of which those that do not matter are dropped.
+
+    around (2, d): ends of a box, far around the grid, within which they matter. vertices: of their
+    intersection with it when it was computed last; a half-space that holds at all of them cuts
+    nothing off. None where it was not computed, or is empty or flat.
+    """
+
+    normals: np.ndarray
+    offsets: np.ndarray
+    around: np.ndarray
+    vertices: np.ndarray | None = None
+
+    @classmethod
+    def none(cls, ends: np.ndarray) -> "HalfSpaces":
+        """Return no half-spaces. ends (2, d): of the grid."""
+        far = FAR * np.ptp(ends, axis=0)
+        return cls(np.zeros((0, len(far))), np.zeros(0), ends + np.array([-far, far]))
+
+    def add(self, normals: np.ndarray, offsets: np.ndarray) -> "HalfSpaces":
+        """Return these half-spaces and others (those with finite offsets), without those that do
+        not matter."""
+        scale = np.max(np.abs(normals), axis=1)
+        known = np.isfinite(offsets) & (scale > 0) & np.isfinite(scale)
+        normals, offsets, scale = normals[known], offsets[known], scale[known]
+        if self.vertices is not None:
+            values = np.max(self.vertices @ (normals / scale[:, None]).T, axis=0)
+            reach = np.abs(normals / scale[:, None]) @ np.abs(self.vertices).max(axis=0)
+            cut = values > offsets / scale + 1e-12 * reach
+            normals, offsets, scale = normals[cut], offsets[cut], scale[cut]
+        # Of those that are equal but for rounding the tightest.
+        order = np.argsort(offsets / scale, kind="stable")
+        like = np.round(np.column_stack([normals, offsets])[order] / scale[order, None], 9)
+        first = np.sort(order[np.unique(like, axis=0, return_index=True)[1]])
+        found = replace(
+            self,
+            normals=np.concatenate([self.normals, normals[first]]),
+            offsets=np.concatenate([self.offsets, offsets[first]]),
+        )
+        return found.reduced() if len(found.offsets) > MANY else found
+
+    def reduced(self) -> "HalfSpaces":
+        """Return those that bound the intersection; the first ones where it is empty or flat."""
+        if self.normals.shape[1] > REDUCED:
+            return self
+        unit = power_of_two(np.ptp(self.around, axis=0))
+        names = tuple(map(str, range(len(self.offsets))))
+        box = Box(*(self.around / unit)).to_polytope()
+        try:
+            body = Polytope(self.normals * unit, self.offsets, names).intersect(box).reduce()
+            index, vertices = [int(name) for name in body.labels if name], body.vertices() * unit
+        except ValueError:
+            index, vertices = list(range(min(len(names), MANY))), None
+        return replace(
+            self, normals=self.normals[index], offsets=self.offsets[index], vertices=vertices
+        )

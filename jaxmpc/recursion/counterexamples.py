@@ -12,8 +12,8 @@ import numpy as np
 from tqdm.std import tqdm
 
 from jaxmpc.explicit.law_at_states import Law
-from jaxmpc.feasible.labels import Labels
 from jaxmpc.feasible.map import FeasibleSetMap, map_points
+from jaxmpc.feasible.pipeline import Labels
 from jaxmpc.feasible.plan_polytope import CenteredPolytope
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import first_of_block

@@ -1,31 +1,38 @@
-"""Make a robot map: the linear labels and the robot's closed loops, part by part."""
+"""Make a robot map: the linear labels and the robot's closed loops, part by part.
+
+Below that the linear problem itself: limits on x_0, terminal sets, deviations from a set-point.
+"""
 
 import math
 import time
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
-from jaxmpc.batches import Compiled, Part, default_chunk, first_rows, padded, work_off
+from jaxmpc.batches import Compiled, Part, default_chunk, first_rows, padded, slices, work_off
 from jaxmpc.checks import fail, require_shape
-from jaxmpc.closed_loop.robot_controller import RobotController
+from jaxmpc.closed_loop.robot_controller import RobotController, robot_mpc
 from jaxmpc.closed_loop.simulation import simulate_many
-from jaxmpc.feasible.labels import Labels
-from jaxmpc.feasible.map import FeasibleSetMap, label_chunks
-from jaxmpc.feasible.pipeline import Scope
+from jaxmpc.feasible.map import FeasibleSetMap
+from jaxmpc.feasible.pipeline import Labels, Scope, labelled_parts
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
 from jaxmpc.pytrees import record
 from jaxmpc.recursion.analysis import examine
 from jaxmpc.recursion.time_budget import Budget
-from jaxmpc.robot_maps.linear_problem import deviations, home_coordinates, with_initial_limits
-from jaxmpc.robot_maps.robot_loops import RobotLoops
-from jaxmpc.robot_maps.robot_map import CLAIMS, RobotMap
+from jaxmpc.robot_maps.robot_map import CLAIMS, RobotLoops, RobotMap
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
+from jaxmpc.sets.convex_sets import Box, translated
+from jaxmpc.sets.invariant import named_terminal_set
+from jaxmpc.systems.riccati import lqr
+from jaxmpc.systems.system import host_matrices
+
+T = TypeVar("T")
 
 
 def map_robot(
@@ -74,8 +81,8 @@ def map_robot(
     }
     setting = RobotSetting.of(robot, mpc, x0s, seconds, claim=claim, **given)
     found: list[tuple[Labels, RobotLoops]] = []
-    parts = setting.parts(setting.x0s, setting.chunk(chunk))
-    total = len(setting.x0s)
+    total, size = len(setting.x0s), setting.chunk(chunk)
+    parts = setting.parts(slices(total, size), setting.x0s.__getitem__, size)
     work_off(parts, lambda part: found.append(part.result), total, unit="loops", progress=progress)
     labels, loops = zip(*found, strict=True)
     return setting.map(Labels.joined(labels), RobotLoops.joined(loops), gap, search_seconds)
@@ -172,17 +179,23 @@ class RobotSetting:
         return min(default_chunk() // 32 if chunk is None else int(chunk), len(self.x0s))
 
     def parts(
-        self, x0s: np.ndarray, size: int, devices: Any = None, **settings: Any
+        self,
+        places: Sequence[T],
+        points: Callable[[T], np.ndarray],
+        size: int,
+        devices: Any = None,
+        **settings: Any,
     ) -> Iterator[Part[tuple[Labels, RobotLoops]]]:
-        """Yield labels and loops of points (b, d), `size` at a time, in one shape throughout.
+        """Yield labels and loops of the points (b, d), b ≤ size, at each of the places.
 
         devices: as in `map_feasible_set`. settings: iterations, dtype of the linear labels, as
         there.
         """
-        settings["scope"] = Scope.of(self.x0s, -(-len(self.x0s) // size))
-        for part in label_chunks(self.problem, x0s, chunk=size, devices=devices, **settings):
+        scope = Scope.of(self.x0s, -(-len(self.x0s) // size))
+        settings["devices"] = devices
+        for part in labelled_parts(self.problem, places, points, scope, size, **settings):
             compiled = Compiled.seconds
-            loops = self.run(x0s[part.place], size, devices)
+            loops = self.run(points(part.place), size, devices)
             seconds = part.compile_seconds + Compiled.seconds - compiled
             yield Part(part.place, part.size, (part.result, loops), seconds)
 
@@ -223,3 +236,71 @@ class RobotSetting:
     def deviations(self) -> MPC:
         """Return the linear problem about its set-point, whose law regulates to the origin."""
         return deviations(self.mpc, self.reference, self.input_reference)
+
+
+def home_coordinates(robot: Robot | LinearPlant) -> np.ndarray:
+    """Return the coordinates ξ (n,) of `robot.home`, in float64."""
+    with jax.enable_x64(True):
+        return np.array(robot.coordinates(np.asarray(robot.home)), np.float64)
+
+
+def mpc_with_terminal(robot: Robot, horizon: int, terminal: str) -> MPC:
+    """Return `robot_mpc(robot)` with the terminal set "none", "box" or "invariant" about home."""
+    mpc = robot_mpc(robot, horizon=horizon)
+    if terminal != "invariant":
+        found = named_terminal_set(terminal, mpc.system, None, mpc.states, None)
+        return replace(mpc, terminal_set=found)
+    x, (_, u) = home_coordinates(robot), robot.equilibrium()
+    about = deviations(mpc, x, u)
+    # At the set-point c is rounding.
+    system = replace(about.system, c=None)
+    regulator = lqr(system, mpc.Q, mpc.R)
+    found = named_terminal_set(terminal, system, regulator, about.states, about.inputs)
+    return replace(mpc, terminal_set=translated(found, x))
+
+
+def with_initial_limits(mpc: MPC, limits: Box) -> MPC:
+    """Return `mpc` with `limits` on x_0 as well, where its own state limits do not hold at k =
+    0."""
+    lower, upper = np.asarray(limits.lower, float), np.asarray(limits.upper, float)
+    bounded = np.isfinite(lower) | np.isfinite(upper)
+    if not bounded.any() or (mpc.states is not None and 0 in mpc.state_stages):
+        return mpc
+    system = mpc.system
+    names, units = (
+        tuple(str(text) for text in np.asarray(texts)[bounded]) if texts else ()
+        for texts in (system.state_names, system.state_units)
+    )
+    C = np.eye(len(bounded))[bounded]
+    rows = Outputs(C, lower[bounded], upper[bounded], stages=(0,), names=names, units=units)
+    return replace(mpc, outputs=(*as_tuple("outputs", mpc.outputs, Outputs), rows))
+
+
+def deviations(mpc: MPC, x: Reals, u: Reals) -> MPC:
+    """Return the same problem in z = ξ − x, v = u − u_ref, so that tracking (x, u_ref) becomes
+    regulation.
+
+    z⁺ = A z + B v + (A x + B u_ref + c − x); a set H ξ ≤ h is H z ≤ h − H x. Raises ValueError
+    for an Ellipsoid as terminal set away from x = 0.
+    """
+    x, u = np.asarray(x, float), np.asarray(u, float)
+    if not x.any() and not u.any():
+        return mpc
+    A, B, c = host_matrices(mpc.system)
+    return replace(
+        mpc,
+        system=replace(mpc.system, c=A @ x + B @ u + c - x),
+        states=translated(mpc.states, -x),
+        inputs=translated(mpc.inputs, -u),
+        terminal_set=translated(mpc.terminal_set, -x),
+        outputs=tuple(_moved(each, x, u) for each in as_tuple("outputs", mpc.outputs, Outputs)),
+    )
+
+
+def _moved(rows: Outputs, x: np.ndarray, u: np.ndarray) -> Outputs:
+    """Return limits of outputs as limits of their deviations from those at x (n,), u (m,)."""
+    at = np.asarray(rows.C) @ x
+    if rows.D is not None:
+        at = at + np.asarray(rows.D) @ u
+    lower, upper = (np.asarray(side) - at for side in rows.sides)
+    return replace(rows, lower=lower, upper=upper)

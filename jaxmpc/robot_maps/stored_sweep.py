@@ -5,7 +5,7 @@ robot_map.npz    the same as arrays, and what follows from it
 summary.json     counts and the configuration
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ import numpy as np
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import Part, work_off
 from jaxmpc.checks import fail, whole
-from jaxmpc.feasible.labels import Labels
+from jaxmpc.feasible.pipeline import Labels
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.stored import open_labels, stored_labels
 from jaxmpc.files import (
@@ -30,10 +30,8 @@ from jaxmpc.files import (
 from jaxmpc.grids import axis_indices, grid_ends, mesh
 from jaxmpc.qp.status import Status
 from jaxmpc.recursion.time_budget import Budget
-from jaxmpc.robot_maps.linear_problem import home_coordinates, mpc_with_terminal
-from jaxmpc.robot_maps.mapping import RobotSetting
-from jaxmpc.robot_maps.robot_loops import RobotLoops
-from jaxmpc.robot_maps.robot_map import RobotMap
+from jaxmpc.robot_maps.mapping import RobotSetting, home_coordinates, mpc_with_terminal
+from jaxmpc.robot_maps.robot_map import RobotLoops, RobotMap
 from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.robots.robot import Robot
 from jaxmpc.store import Field, Store, report_damage
@@ -218,30 +216,23 @@ def _label(
     settings: dict[str, Any],
 ) -> None:
     """Label the blocks that are not done, and commit each."""
-    todo, index = blocks.batches()
-    if not todo:
+    pending = blocks.pending()
+    if not pending:
         return
     budget.say("compiling labels and closed loops")
+
+    def points(block: int) -> np.ndarray:
+        return setting.x0s[blocks.rows(block)]
 
     def commit(part: Part[tuple[Labels, RobotLoops]]) -> None:
         labels, loops = part.result
         blocks.commit(part.place, **labels.arrays(), **vars(loops))
 
-    found = setting.parts(setting.x0s[index.ravel()], index.shape[1], devices, **settings)
-    total = sum(here.stop - here.start for _, here in todo)
+    found = setting.parts(pending, points, blocks.size, devices, **settings)
+    total = sum(len(blocks.samples(block)) for block in pending)
     progress = None if budget.progress else False
-    timing = work_off(_in_blocks(todo, found), commit, total, unit="loops", progress=progress)
+    timing = work_off(found, commit, total, unit="loops", progress=progress)
     budget.say(f"{timing.count:,} loops; {timing.compile_seconds:.0f} s of that was compiling")
-
-
-def _in_blocks(
-    todo: list[tuple[int, slice]], parts: Iterable[Part[tuple[Labels, RobotLoops]]]
-) -> Iterator[Part[tuple[Labels, RobotLoops]]]:
-    """Yield parts with the block that they are of as their place, without what fills it up."""
-    for (block, here), part in zip(todo, parts, strict=True):
-        count = here.stop - here.start
-        labels, loops = part.result
-        yield Part(block, count, (labels.first(count), loops.first(count)), part.compile_seconds)
 
 
 def _save(folder: Path, setting: RobotSetting, found: RobotMap, config: dict[str, Any]) -> None:

@@ -29,9 +29,8 @@ open_dataset            the same as an xarray data set
 remove                  delete a store, and nothing else
 """
 
-from jaxmpc.store.places import exists, location, remove
-from jaxmpc.store.reading import Check, Stored, open_dataset, read, reason
-from jaxmpc.store.writing import Constant, Field, Store, report_damage
+from jaxmpc.store.reading import Check, Stored, exists, location, open_dataset, read, reason
+from jaxmpc.store.writing import Constant, Field, Store, remove, report_damage
 
 __all__ = [
     "Check",

@@ -1,5 +1,10 @@
-"""A store as it lies on the disk, read without being changed, and distrusted."""
+"""A store as it lies at a path or URL: found, opened, and read without being changed or trusted.
 
+First where a store lies, then the blocks of its grid and the hashes of their data, then `read`.
+"""
+
+import hashlib
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field
@@ -9,11 +14,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import numpy as np
 
 from jaxmpc.checks import fail, in_units, require_memory, shortened, shown
-from jaxmpc.files import faithful
+from jaxmpc.files import faithful, fingerprint, text_within
 from jaxmpc.grids import mesh
 from jaxmpc.pytrees import record
-from jaxmpc.store.blocks import checksum, determining, digest_of, regions, store_fingerprint
-from jaxmpc.store.places import array_of, location, open_group, text_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -23,11 +26,115 @@ if TYPE_CHECKING:
 # files: a sweep's are some 13 times as large, one number throughout is far more.
 MOST_BLOCKS, SMALL, MOST_COMPRESSED = 2**17, 2**28, 1000
 
-
 # What looks at attributes and axes before data are read, and returns what is wrong with them.
 Check: TypeAlias = Callable[[Mapping[str, Any], Mapping[str, np.ndarray]], list[str]]
 # Returns the shapes of variables, a sample, that follow from attributes.
 Shapes: TypeAlias = Callable[[Mapping[str, Any]], Mapping[str, tuple[int, ...]]]
+
+
+def location(path: str | Path) -> Path | str:
+    """Return the path of a store, or its URL where it is one of objects."""
+    text = str(path)
+    if text.startswith("file://"):
+        return Path(text.removeprefix("file://"))
+    return text if "://" in text else Path(path)
+
+
+def exists(path: Path | str) -> bool:
+    """Return whether something lies at a path, or a complete store of objects at a URL."""
+    import zarr
+
+    if isinstance(path, Path):
+        return path.exists()
+    try:
+        group = zarr.open_group(zarr_place(path), mode="r", use_consolidated=False)
+    except FileNotFoundError:
+        return False
+    return "fingerprint" in group.attrs
+
+
+def open_group(path: Path | str, mode: Any) -> "zarr.Group":
+    """Open a store; raise ValueError where `path` holds something else."""
+    import zarr
+
+    try:
+        group = zarr.open_group(zarr_place(path), mode=mode, use_consolidated=False)
+        there = "fingerprint" in group.attrs
+    except Exception as error:  # of a file system, or of a parser of garbled metadata
+        if isinstance(path, Path) and (path / "zarr.json").is_file():
+            fail(str(path), "is damaged: its metadata cannot be read", "Overwrite it")
+        text = str(error).splitlines()[0] if str(error) else type(error).__name__
+        fail(str(path), f"is no sweep store ({text})", "Choose another output folder")
+    if not there:
+        fail(str(path), "is a zarr group but no sweep store", "Choose another output folder")
+    return group
+
+
+def zarr_place(path: Path | str) -> Any:
+    """Return what zarr opens at a path or URL. Raises ValueError where fsspec cannot open it."""
+    import zarr
+
+    if isinstance(path, Path):
+        return path
+    try:
+        return zarr.storage.FsspecStore.from_url(path)
+    except (ImportError, ValueError) as error:
+        fail(path, f"{error}", "Install fsspec and what it needs for this kind of URL")
+
+
+def array_of(group: "zarr.Group", name: str) -> "zarr.Array[Any]":
+    """Return the variable of this name."""
+    import zarr
+
+    array = group[name]
+    assert isinstance(array, zarr.Array)
+    return array
+
+
+def text_of(path: Path | str, name: str) -> str:
+    """Return the text of a file of metadata below a path or URL; see `text_within`."""
+    if isinstance(path, Path):
+        return text_within(path / name)
+    import fsspec
+
+    with fsspec.open(f"{path}/{name}", "r") as file:
+        return str(file.read())
+
+
+def regions(shape: Sequence[int], block: Sequence[int]) -> list[tuple[slice, ...]]:
+    """Return the parts of a grid that blocks of this shape cover, in C order."""
+    along = [
+        [slice(first, min(first + take, count)) for first in range(0, count, take)]
+        for count, take in zip(shape, block, strict=True)
+    ]
+    return list(itertools.product(*along))
+
+
+def checksum(arrays: Mapping[str, np.ndarray]) -> int:
+    """Return a hash of arrays in the order of their names, from 1 to 2⁶⁴ − 1."""
+    state = hashlib.blake2b(digest_size=8)
+    for name in sorted(arrays):
+        value = np.ascontiguousarray(arrays[name])
+        text = value.dtype.kind not in "biuf"
+        data = repr(value.tolist()).encode() if text else value.tobytes()
+        state.update(f"{name}{value.shape}{'' if text else value.dtype.str}".encode() + data)
+    return int.from_bytes(state.digest(), "little") or 1
+
+
+def determining(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those attributes that the fingerprint covers beside axes and constants."""
+    others = ("Conventions", "fingerprint", "versions", "digest")
+    return {name: value for name, value in attributes.items() if name not in others}
+
+
+def store_fingerprint(record: Mapping[str, Any], constants: Mapping[str, np.ndarray]) -> str:
+    """Return a hash of all that determines a store."""
+    return fingerprint([record, checksum(constants)])
+
+
+def digest_of(attributes: Mapping[str, Any]) -> str:
+    """Return a hash of all attributes: the fingerprint is of those that results depend on."""
+    return fingerprint({k: v for k, v in attributes.items() if k != "digest"})
 
 
 @record

@@ -5,32 +5,25 @@ import math
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Mapping
+import uuid
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from jaxmpc.batches import padded
 from jaxmpc.checks import fail
 from jaxmpc.files import differences, versions
-from jaxmpc.store.blocks import (
-    block_shape,
+from jaxmpc.store.reading import (
+    array_of,
     checksum,
     digest_of,
-    regions,
-    shard_of,
-    store_fingerprint,
-)
-from jaxmpc.store.lock import Lock
-from jaxmpc.store.places import (
-    array_of,
-    consolidate,
     exists,
     location,
     open_group,
-    require_removable,
-    side_path,
+    regions,
+    store_fingerprint,
     zarr_place,
 )
 
@@ -39,11 +32,54 @@ if TYPE_CHECKING:
     from zarr.abc.codec import BytesBytesCodec as Codec
 
 
-def codecs() -> "tuple[Codec, ...]":
-    """Return the codecs of each chunk; the last one adds a checksum of the file itself."""
-    from zarr.codecs import Crc32cCodec, ZstdCodec
+class Lock:
+    """A lock against other processes that write; the end of the process releases it too.
 
-    return ZstdCodec(), Crc32cCodec()
+    Of a folder, or of a file in it that is made for the lock and removed with it: file systems of a
+    network have locks of files, not of folders.
+    """
+
+    def __init__(
+        self, folder: Path, *, shared: bool = False, file: str = "", work: str = "writes there"
+    ) -> None:
+        """Raise ValueError where another process holds it, unless both share it. Where the system
+        or the file system has no such locks (Windows has none), nothing is locked."""
+        self._held: int | None = None
+        self.file = folder / file if file else None
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            import fcntl
+
+            kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+            while self._held is None:
+                place, flags = (self.file, os.O_RDWR | os.O_CREAT) if self.file else (folder, 0)
+                self._held = os.open(place, flags)
+                fcntl.flock(self._held, kind | fcntl.LOCK_NB)
+                try:
+                    there = os.path.samestat(os.fstat(self._held), os.stat(place))
+                except FileNotFoundError:
+                    there = False
+                if not there:  # its last holder removed the file after it was opened here
+                    self._close()
+        except BlockingIOError:
+            self._close()
+            cure = "Wait for it, or choose another output"
+            fail(str(folder), f"another process {work}", cure)
+        except (ImportError, OSError):
+            self._close()
+
+    def release(self) -> None:
+        """Let others write."""
+        if self._held is not None and self.file is not None:
+            self.file.unlink(missing_ok=True)
+        self._close()
+
+    def _close(self, close: Callable[[int], None] = os.close) -> None:
+        if self._held is not None:
+            close(self._held)
+            self._held = None
+
+    __del__ = _close
 
 
 class Field(NamedTuple):
@@ -104,9 +140,12 @@ class Store:
         self.dimensions = tuple(axes)
         self.block_shape = block_shape(self.shape, chunk)
         self.regions = regions(self.shape, self.block_shape)
-        self.own = range(len(self.regions))[
-            slice(None) if shard is None else slice(*shard_of(shard))
-        ]
+        i, n = (0, 1) if shard is None else shard
+        if not 0 <= i < n:
+            fail("shard", f"{i}/{n}", "Give i/n with i from 0 to n - 1")
+        self.own = range(i, len(self.regions), n)
+        about = {"long_name": "hash of a block; 0: not done"}
+        self._described = {**fields, "checksum": Field((), "uint64", 0, ("block",), about)}
         self._locks = list[Lock]()
         variables: dict[str, list] = {
             "axes": list(axes),
@@ -198,14 +237,6 @@ class Store:
         except Exception:
             return None
 
-    def batches(self) -> tuple[list[tuple[int, slice]], np.ndarray]:
-        """Return the blocks that are not done with their samples, and the indices (K, size) of
-        these samples: the first one of a smaller block fills it up to the size of the largest, so
-        that one compiled program takes them all."""
-        todo = [(block, self.rows(block)) for block in self.pending()]
-        index = [padded(self.samples(block), self.size) for block, _ in todo]
-        return todo, np.array(index, int).reshape(len(todo), self.size)
-
     def unfinished(self) -> str:
         """Return why a shard does not conclude the work of all: what is missing, in words; "" where
         nothing is. Then this process alone concludes, until it closes the store, and leftovers of
@@ -292,7 +323,7 @@ class Store:
         import zarr
 
         group = zarr.open_group(path, mode="w", zarr_format=3, attributes=self.attributes)
-        for name in self._names():
+        for name in (*self.constants, *self._described):
             self._create_array(group, name)
         consolidate(group)
 
@@ -317,7 +348,7 @@ class Store:
         if dict(group.attrs) not in ({}, maker) or (not dict(group.attrs) and list(group.keys())):
             fail(url, "is a zarr group but no sweep store", "Choose another output folder")
         group.update_attributes(maker)
-        for name in self._names():
+        for name in (*self.constants, *self._described):
             with contextlib.suppress(zarr.errors.ContainsArrayError):
                 self._create_array(group, name, overwrite=False)
         for name in self.constants:  # once more: whoever made the array may have been killed
@@ -339,9 +370,6 @@ class Store:
         for left in self.path.rglob("*.partial"):
             left.unlink(missing_ok=True)
 
-    def _names(self) -> list[str]:
-        return [*self.constants, *self.fields, "checksum"]
-
     def _create_array(self, group: "zarr.Group", name: str, overwrite: bool = True) -> None:
         """Create one variable, without values but for constants."""
         if name in self.constants:
@@ -349,7 +377,7 @@ class Store:
             kind = str if data.dtype.kind == "U" else data.dtype
             options: dict[str, Any] = {"shape": data.shape, "dtype": kind}
         else:
-            _, _, fill, further, attributes = self._field(name)
+            _, _, fill, further, attributes = self._described[name]
             dimensions = (*(() if name == "checksum" else self.dimensions), *further)
             options = {**self._layout(name), "fill_value": fill}
         options |= {"dimension_names": dimensions, "attributes": dict(attributes)}
@@ -357,18 +385,13 @@ class Store:
         if name in self.constants:
             self._write_constant(made, name)
 
-    def _field(self, name: str) -> Field:
-        """Return the description of a variable that is no constant."""
-        about = {"long_name": "hash of a block; 0: not done"}
-        return self.fields.get(name, Field((), "uint64", 0, ("block",), about))
-
     def _layout(self, name: str) -> dict[str, Any]:
-        """Return shape, chunks and type of such a variable."""
+        """Return shape, chunks and type of a variable that is no constant."""
         # One checksum a file: a kill while one is written leaves the others.
         shape, chunks = (
             ((len(self.regions),), (1,)) if name == "checksum" else (self.shape, self.block_shape)
         )
-        tail, dtype, *_ = self._field(name)
+        tail, dtype, *_ = self._described[name]
         return {"shape": (*shape, *tail), "chunks": (*chunks, *tail), "dtype": np.dtype(dtype)}
 
     def _write_constant(self, array: "zarr.Array[Any]", name: str) -> None:
@@ -396,7 +419,7 @@ class Store:
 
         Of blocks, a shard looks at its own. It does not make variables new, which are of all.
         """
-        renewed = [name for name in self._names() if not self._is_sound(name)]
+        renewed = [name for name in (*self.constants, *self._described) if not self._is_sound(name)]
         if renewed and self.shard is not None:
             what = f"{', '.join(renewed)}: missing or damaged"
             fail(str(self.path), what, "Stop all shards, and resume once without --shard")
@@ -426,7 +449,7 @@ class Store:
             array = array_of(self.group, name)
             if name in self.constants:
                 return bool(np.array_equal(np.asarray(array[...]), self.constants[name].data))
-            field = self._field(name)
+            field = self._described[name]
             same = all(getattr(array, key) == value for key, value in self._layout(name).items())
             nan = field.dtype != "bool"
             return same and bool(np.array_equal(array.fill_value, field.fill, equal_nan=nan))
@@ -450,3 +473,65 @@ def report_damage(store: Store) -> None:
         count = f"{store.damaged:,} of {len(store.regions):,}"
         text = f"{store.path}: {count} {what} missing or damaged, computed again"
         print(text, file=sys.stderr)
+
+
+def block_shape(shape: Sequence[int], most: int) -> tuple[int, ...]:
+    """Return the shape of blocks of at most `most` samples of a grid, of nearly equal size and
+    consecutive in C order."""
+    found, rest, whole = [], 1, True
+    for count in reversed(shape):
+        take = min(count, max(most // rest, 1)) if whole else 1
+        take = -(-count // -(-count // take))
+        whole, rest = whole and take == count, rest * take
+        found.append(take)
+    return tuple(reversed(found))
+
+
+def codecs() -> "tuple[Codec, ...]":
+    """Return the codecs of each chunk; the last one adds a checksum of the file itself."""
+    from zarr.codecs import Crc32cCodec, ZstdCodec
+
+    return ZstdCodec(), Crc32cCodec()
+
+
+def consolidate(group: "zarr.Group") -> None:
+    """Write the metadata of all variables to the group, so that readers need one file."""
+    import zarr
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # zarr says that its format 3 has no standard for it yet
+        zarr.consolidate_metadata(group.store)
+
+
+def side_path(path: Path) -> Path:
+    """Return a new name beside a path; what lies there is a leftover once its process has ended."""
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+
+
+def require_removable(path: str | Path) -> Path:
+    """Return the path of a store, damaged or not, that may be deleted; ValueError where it is none,
+    or a link to one: what others have put elsewhere is not deleted."""
+    path = location(path)
+    if not isinstance(path, Path):
+        fail(path, "is a store of objects", "Delete it with the tools of that store")
+    if path.is_symlink():
+        what = f"is a link to {path.readlink()}, which is not deleted"
+        fail(str(path), what, "Remove the link, or choose another output")
+    metadata = [path / "zarr.json", *path.glob("*/zarr.json")]
+    if not any(file.is_file() for file in metadata):
+        fail(str(path), "is no sweep store", "Choose another output folder")
+    foreign = [v.name for v in path.iterdir() if not v.is_dir() and v.name != "zarr.json"]
+    if foreign:
+        fail(str(path), f"holds {foreign[0]}, which is of no store", "Choose another output folder")
+    return path
+
+
+def remove(path: str | Path) -> None:
+    """Delete the store at `path`, damaged or not; ValueError, and nothing deleted, where it is no
+    store."""
+    path = require_removable(path)
+    lock = Lock(path.parent)
+    try:
+        shutil.rmtree(path)
+    finally:
+        lock.release()

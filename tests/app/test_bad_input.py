@@ -11,7 +11,7 @@ from problems import MINIMAL_FILE
 from jaxmpc import checks
 from jaxmpc.app import cli
 from jaxmpc.app.commands import recursion
-from jaxmpc.feasible import label_workers
+from jaxmpc.feasible import pipeline
 from jaxmpc.robots.load import load_robot
 
 FILE = f'\nname = "case"{MINIMAL_FILE}'
@@ -35,7 +35,7 @@ def refused(tmp_path, monkeypatch, capsys, compiled):
     """Run a command line that must be refused in one line before anything compiles; return it."""
     monkeypatch.chdir(tmp_path)
     forbidden = lambda *a, **k: pytest.fail("the work started")
-    monkeypatch.setattr(label_workers, "label_parts", forbidden)
+    monkeypatch.setattr(pipeline, "label_parts", forbidden)
     monkeypatch.setattr(recursion, "recursive_feasibility", forbidden)
 
     def run(line):

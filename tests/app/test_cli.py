@@ -19,15 +19,15 @@ import zarr
 from jaxmpc.app import cli
 from jaxmpc.app import config as configs
 from jaxmpc.app.commands import recursion, sweep
-from jaxmpc.feasible import label_workers
-from jaxmpc.feasible.labels import Labels
+from jaxmpc.feasible import pipeline
+from jaxmpc.feasible.pipeline import Labels
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.files import read_arrays, write_arrays
 from jaxmpc.recursion.counterexamples import Counterexample, SampledLoops
 from jaxmpc.recursion.proofs import Claim
 from jaxmpc.recursion.report import RecursionReport, SmallestHorizon
 from jaxmpc.sets.convex_sets import Box
-from jaxmpc.store.lock import Lock
+from jaxmpc.store.writing import Lock
 
 
 @pytest.fixture(autouse=True)
@@ -40,7 +40,7 @@ def _in_empty_folder(tmp_path, monkeypatch):
 def no_compile(monkeypatch):
     """Fail if the sweep starts: errors must be found before."""
     started = lambda *a, **k: pytest.fail("the sweep started")
-    monkeypatch.setattr(label_workers, "label_parts", started)
+    monkeypatch.setattr(pipeline, "label_parts", started)
 
 
 def run(line):
@@ -149,7 +149,7 @@ def interruptible():
 @pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sweep, "CHUNK", 50)
-    real = label_workers.label_parts
+    real = pipeline.label_parts
 
     def interrupted(*args, **kwargs):
         for k, chunk in enumerate(real(*args, **kwargs)):
@@ -157,7 +157,7 @@ def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsy
                 signal.raise_signal(signal.SIGINT)
             yield chunk
 
-    monkeypatch.setattr(label_workers, "label_parts", interrupted)
+    monkeypatch.setattr(pipeline, "label_parts", interrupted)
     assert run("sweep --grid 16 12 --horizon 5 --output 'my maps'") == 130
     out = capsys.readouterr().out
     assert "jaxmpc sweep --grid 16 12 --horizon 5 --output 'my maps' --resume" in out
@@ -168,7 +168,7 @@ def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsy
         asked.append(list(parts))
         return real(mpc, asked[-1], *args, **kwargs)
 
-    monkeypatch.setattr(label_workers, "label_parts", counted)
+    monkeypatch.setattr(pipeline, "label_parts", counted)
     resume = "sweep --grid 16 12 --horizon 5 --output 'my maps' --resume"
     assert run(resume) == 0
     data = xr.open_zarr(tmp_path / "my maps" / "sweep.zarr")

@@ -13,7 +13,7 @@ import zarr
 
 from jaxmpc.app import cli
 from jaxmpc.files import fingerprint, read_arrays, write_arrays
-from jaxmpc.store.blocks import checksum, determining, digest_of, regions, store_fingerprint
+from jaxmpc.store.reading import checksum, determining, digest_of, regions, store_fingerprint
 
 SECONDS, BYTES = 30.0, 2**30
 

@@ -12,7 +12,7 @@ import jaxmpc as jm
 from jaxmpc import store
 from jaxmpc.app import cli
 from jaxmpc.app.commands import recursion, sweep
-from jaxmpc.feasible import label_workers
+from jaxmpc.feasible import pipeline
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.stored import open_labels
 
@@ -46,7 +46,7 @@ def test_a_run_that_fails_keeps_the_results(folder, monkeypatch, capsys):
         yield
 
     for place, name, raises in (
-        (label_workers, "label_parts", broken),
+        (pipeline, "label_parts", broken),
         (FeasibilityProblem, "of", _raises),
     ):
         with monkeypatch.context() as patch:
@@ -64,14 +64,14 @@ def _raises(*_, **__):
 
 def test_a_run_that_is_stopped_after_a_block_keeps_that(folder, monkeypatch):
     monkeypatch.setattr(sweep, "CHUNK", 12)
-    real = label_workers.label_parts
+    real = pipeline.label_parts
 
     def one_block(*arguments, **settings):
         yield next(iter(real(*arguments, **settings)))
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(label_workers, "label_parts", one_block)
+        patch.setattr(pipeline, "label_parts", one_block)
         assert cli.main([*LINE, str(folder), "--overwrite", "--horizon", "5"]) == 130
     found = store.read(folder / "sweep.zarr")
     assert found.done == 1 and found.blocks == 3 and not found.problems

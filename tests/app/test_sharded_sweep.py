@@ -16,7 +16,7 @@ import xarray as xr
 from jaxmpc import store
 from jaxmpc.app import cli
 from jaxmpc.app.commands import sweep
-from jaxmpc.store.lock import Lock
+from jaxmpc.store.writing import Lock
 
 
 @pytest.fixture(autouse=True)

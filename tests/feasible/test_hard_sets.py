@@ -17,8 +17,8 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.feasible import pipeline
 from jaxmpc.feasible.candidate_search import compiled_check
+from jaxmpc.feasible.condensed_rows import RowPrograms
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.row_lps import RowPrograms
 
 sys.path.append(str(Path(__file__).parents[2] / "experiments"))
 hard_sets = importlib.import_module("hard_sets")

@@ -12,10 +12,9 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.feasible import label_workers
-from jaxmpc.feasible.labels import PROOFS
+from jaxmpc.feasible import pipeline
 from jaxmpc.feasible.map import label_chunks
-from jaxmpc.feasible.pipeline import Scope, label_parts
+from jaxmpc.feasible.pipeline import PROOFS, Scope, label_parts
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.sets.convex_sets import Ellipsoid
 
@@ -73,7 +72,7 @@ def test_threads(expected, threads):
 
 
 def test_what_is_sent_is_enough_and_few_are_in_flight(expected, monkeypatch):
-    monkeypatch.setattr(label_workers, "IN_FLIGHT", 3)
+    monkeypatch.setattr(pipeline, "IN_FLIGHT", 3)
     executor = Inline()
     same(
         jm.map_feasible_set(problems.lecture(), POINTS, chunk=64, executor=executor).labels,

@@ -16,10 +16,9 @@ from scipy.optimize import linprog
 
 import jaxmpc as jm
 from jaxmpc.feasible import proofs
-from jaxmpc.feasible.hard_constraints import exact_data, hard_blocks
+from jaxmpc.feasible.hard_constraints import exact_data, hard_blocks, make_view
 from jaxmpc.feasible.map import FeasibleSetMap
 from jaxmpc.feasible.problem import FeasibilityProblem
-from jaxmpc.feasible.view import make_view
 from jaxmpc.recursion.proofs import settle_claims
 
 NONE = (np.inf, 1e9, 1e12, 1e20)

@@ -13,8 +13,7 @@ from jax import enable_x64
 
 import jaxmpc as jm
 from jaxmpc.feasible import proofs
-from jaxmpc.feasible.hard_constraints import exact_data, hard_blocks
-from jaxmpc.feasible.view import make_view
+from jaxmpc.feasible.hard_constraints import exact_data, hard_blocks, make_view
 
 EMPTY = replace(problems.lecture(), terminal_set=jm.Box(np.array([5.0, 5.0]), np.array([6.0, 6.0])))
 

@@ -16,8 +16,7 @@ from jax import enable_x64
 
 import jaxmpc as jm
 from jaxmpc.feasible import proofs
-from jaxmpc.feasible.hard_constraints import exact_data, hard_blocks
-from jaxmpc.feasible.view import make_view
+from jaxmpc.feasible.hard_constraints import exact_data, hard_blocks, make_view
 from jaxmpc.mpc.active_limits import active_constraints
 from jaxmpc.mpc.problem import Outputs, Soft
 from jaxmpc.mpc.rows import row_table

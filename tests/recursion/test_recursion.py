@@ -12,7 +12,7 @@ import pytest
 import jaxmpc as jm
 from jaxmpc.explicit.law_at_states import RegionLaw
 from jaxmpc.explicit.regions import critical_regions
-from jaxmpc.feasible.labels import Labels
+from jaxmpc.feasible.pipeline import Labels
 from jaxmpc.feasible.plan_polytope import projected
 from jaxmpc.feasible.polytope import backward
 from jaxmpc.feasible.problem import FeasibilityProblem

@@ -14,11 +14,10 @@ from scipy.optimize import linprog
 import jaxmpc as jm
 from jaxmpc.app import cli
 from jaxmpc.app.plots import plot_robot_map
-from jaxmpc.feasible.labels import Labels
+from jaxmpc.feasible.pipeline import Labels
 from jaxmpc.robot_maps import OUTCOMES, map_robot, mapping
-from jaxmpc.robot_maps.linear_problem import deviations, with_initial_limits
-from jaxmpc.robot_maps.mapping import RobotSetting
-from jaxmpc.robot_maps.robot_loops import RobotLoops
+from jaxmpc.robot_maps.mapping import RobotSetting, deviations, with_initial_limits
+from jaxmpc.robot_maps.robot_map import RobotLoops
 
 SECONDS = 0.8
 

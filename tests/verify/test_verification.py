@@ -10,10 +10,10 @@ from damage import turned_bits
 
 import jaxmpc as jm
 from jaxmpc import store
-from jaxmpc.feasible.labels import PROOFS
+from jaxmpc.feasible.pipeline import PROOFS
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.stored import open_labels
-from jaxmpc.store.blocks import checksum, regions
+from jaxmpc.store.reading import checksum, regions
 from jaxmpc.verify.exact import beyond, integers, roll_out_exactly, roll_out_in_floats
 from jaxmpc.verify.half_spaces import Programs
 from jaxmpc.verify.stored_map import verify_map
