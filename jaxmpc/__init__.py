@@ -42,8 +42,7 @@ if TYPE_CHECKING:
     from jaxmpc.feasible import feasible_polytope, grid, map_feasible_set
     from jaxmpc.mpc.controller import Controller, solve
     from jaxmpc.mpc.many import solve_many
-    from jaxmpc.mpc.problem import MPC, Outputs, Soft
-    from jaxmpc.mpc.softening import soften
+    from jaxmpc.mpc.problem import MPC, Outputs, Soft, soften
     from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC
     from jaxmpc.mpc.stagewise.sqp import solve_nonlinear
     from jaxmpc.qp.admm import ADMM
@@ -120,8 +119,7 @@ HOMES = {
     "feasible": "feasible_polytope grid map_feasible_set",
     "mpc.controller": "Controller solve",
     "mpc.many": "solve_many",
-    "mpc.problem": "MPC Outputs Soft",
-    "mpc.softening": "soften",
+    "mpc.problem": "MPC Outputs Soft soften",
     "mpc.stagewise.nonlinear": "NonlinearMPC",
     "mpc.stagewise.sqp": "solve_nonlinear",
     "qp.admm": "ADMM",

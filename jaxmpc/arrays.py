@@ -85,3 +85,9 @@ def _array(value: Reals) -> jax.Array | np.ndarray:
 def as_array(value: Any) -> Any:
     """Return `value`, made an array if it is nested lists of traced numbers (lists under `jit`)."""
     return value if concrete(value) else jnp.asarray(value)
+
+
+def all_finite(tree: Any) -> jax.Array:
+    """Return whether all numbers of a tree are finite. Works inside jit, vmap and grad."""
+    tests = [jnp.all(jnp.isfinite(jnp.asarray(v))) for v in jax.tree.leaves(tree)]
+    return jnp.all(jnp.stack(tests))

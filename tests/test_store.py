@@ -16,7 +16,8 @@ import zarr
 from damage import turned_bits
 
 from jaxmpc import store
-from jaxmpc.feasible.stored import BOUNDS, dimension_names, label_fields, stored_labels
+from jaxmpc.feasible.map import BOUNDS
+from jaxmpc.feasible.stored import dimension_names, label_fields, stored_labels
 from jaxmpc.store import Constant, Store
 from jaxmpc.store.reading import regions
 from jaxmpc.store.writing import block_shape

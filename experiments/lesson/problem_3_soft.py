@@ -20,7 +20,7 @@ from lesson_joint import LIMITS, Q, R, joint
 
 import jaxmpc as jm
 from jaxmpc.mpc import Plan
-from jaxmpc.mpc.softening import soften
+from jaxmpc.mpc.problem import soften
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from jax import Array
 
 import jaxmpc as jm
 from jaxmpc.closed_loop.simulation import simulate
-from jaxmpc.mpc.softening import soften
+from jaxmpc.mpc.problem import soften
 from jaxmpc.sets.limits import JointLimits, joint_limits
 
 

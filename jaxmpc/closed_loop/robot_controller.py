@@ -15,9 +15,8 @@ from jaxmpc.arrays import Reals, as_weight
 from jaxmpc.checks import fail, whole
 from jaxmpc.mpc.controller import Controller, zeros_of
 from jaxmpc.mpc.plan import Control, Plan, WarmStart, anchored, applied, limited
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import MPC, soften
 from jaxmpc.mpc.rows import layout
-from jaxmpc.mpc.softening import soften
 from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, Task, task_layout
 from jaxmpc.mpc.stagewise.solve import factor_stages, solve_stagewise
 from jaxmpc.mpc.stagewise.sqp import solve_nonlinear

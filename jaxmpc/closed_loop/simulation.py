@@ -31,8 +31,7 @@ from jaxmpc.batches import (
 from jaxmpc.checks import fail, require_real, whole
 from jaxmpc.closed_loop.estimation import Belief, KalmanFilter, Noise, model_step
 from jaxmpc.closed_loop.feedback import Feedback, LinearFeedback, Plant, model_of
-from jaxmpc.mpc.aim import checked_aim, checked_array, reference_shapes
-from jaxmpc.mpc.plan import Control
+from jaxmpc.mpc.plan import Control, checked_aim, checked_array, reference_shapes
 from jaxmpc.mpc.problem import weights_of
 from jaxmpc.mpc.stagewise.nonlinear import ConstantModel, as_argument
 from jaxmpc.pytrees import pytree, static

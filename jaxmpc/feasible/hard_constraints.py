@@ -261,7 +261,7 @@ def previous_inputs(mpc: MPC) -> list[Block]:
         names = tuple(f"previous {label}" for label in mpc.system.input_labels)
     H = np.hstack([np.zeros((len(H), n)), H])
     D = np.zeros((len(H), m))
-    return [Block("previous input", H, D, lower, upper, (0,), names, ("",) * len(H))]
+    return [Block("previous input", H, D, (0,), False, lower, upper, names, ("",) * len(H))]
 
 
 def absorbed(mpc: MPC, block: Block) -> bool:

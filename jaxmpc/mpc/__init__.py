@@ -13,13 +13,11 @@ row_table             each row of the problem: kind, name, unit, step -> Row
 soften, harden        make rows soft or hard
 """
 
-from jaxmpc.mpc.active_limits import active_constraints
 from jaxmpc.mpc.controller import Controller, solve
 from jaxmpc.mpc.many import solve_many
-from jaxmpc.mpc.plan import Control, Plan, WarmStart
-from jaxmpc.mpc.problem import MPC, Outputs, Soft
+from jaxmpc.mpc.plan import Control, Plan, WarmStart, active_constraints
+from jaxmpc.mpc.problem import MPC, Outputs, Soft, harden, soften
 from jaxmpc.mpc.rows import row_table
-from jaxmpc.mpc.softening import harden, soften
 from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, Task
 from jaxmpc.mpc.stagewise.solve import solve_stagewise
 from jaxmpc.mpc.stagewise.sqp import solve_nonlinear

@@ -22,7 +22,7 @@ from jax import Array
 
 from jaxmpc.arrays import host_array
 from jaxmpc.checks import concrete, require_memory
-from jaxmpc.mpc.problem import MPC, Switch, weights_of
+from jaxmpc.mpc.problem import MPC, Switch, Weights, dynamics_of, weights_of
 from jaxmpc.mpc.rows import Layout, blocks, bounds_of, layout_of, split, stacked
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import arrays, floating_dtype, matmul, solve
@@ -40,10 +40,10 @@ class Condensed:
     Gamma (N+1, n, nz), phi (N+1, n): predicted states. Psi (N, m, p), Omega (N, m, nz), psi (N, m):
     predicted inputs. P (nz, nz), F (nz, p), f (nz,): cost. C, D, d, lower, upper: rows.
     soft_linear, soft_quadratic (rows,): weights of soft rows, inf and 0 where hard; None without
-    any. radius: of the terminal ball, whose rows are the last `balls`. Q, R, P_N, W: weights, W of
-    input rates, stage (N,) of the stages. K (m, n): prestabilising gain. K_N (m, n): gain of the
-    unconstrained input of one more step, u_N = K_N x_N. layout: (kind, steps, rows a step) of each
-    block of rows. begins: the first step of each move.
+    any. radius: of the terminal ball, whose rows are the last `balls`. weights: of the cost.
+    K (m, n): prestabilising gain. K_N (m, n): gain of the unconstrained input of one more step,
+    u_N = K_N x_N. layout: (kind, steps, rows a step) of each block of rows. begins: the first step
+    of each move.
     """
 
     Phi: Array
@@ -63,11 +63,7 @@ class Condensed:
     soft_linear: Any
     soft_quadratic: Any
     radius: Any
-    Q: Array
-    R: Array
-    P_N: Array
-    W: Array
-    stage: Array
+    weights: Weights
     K: Array
     K_N: Array
     layout: Layout = static()
@@ -80,11 +76,10 @@ class Condensed:
         """QP at θ (p,). reference (N+1, n), input_reference (N, m): what to track, None for 0."""
         q = matmul(self.F, theta) + self.f
         if reference is not None:
-            stages = self.stage[:, None] * matmul(reference[:-1], self.Q)
-            weighted = jnp.concatenate([stages, matmul(reference[-1:], self.P_N)])
+            weighted = self.weights.of_states(reference)
             q = q - 2 * jnp.einsum("kni,kn->i", self.Gamma, weighted, precision="highest")
         if input_reference is not None:
-            weighted = self.stage[:, None] * matmul(input_reference, self.R)
+            weighted = self.weights.of_inputs(input_reference)
             q = q - 2 * jnp.einsum("kmi,km->i", self.Omega, weighted, precision="highest")
         shift = matmul(self.D, theta) + self.d
         l, u = self.lower - shift, self.upper - shift
@@ -184,9 +179,8 @@ def _condense(mpc: MPC) -> Condensed:
     n, m, p = system.n, system.m, mpc.dimension
     dtype = floating_dtype(replace(mpc, prestabilise=None))
     cast = lambda v: jnp.asarray(v, dtype)
-    Q, R, P_N, W, stage = weights_of(mpc, dtype)
-    A, B = cast(system.A), cast(system.B)
-    c = jnp.zeros(n, dtype) if system.c is None else cast(system.c)
+    weights = Q, R, P_N, W, stage = weights_of(mpc, dtype)
+    A, B, c = dynamics_of(system, dtype)
     K = cast(mpc.prestabilise)
 
     A_K = A + matmul(B, K)
@@ -215,18 +209,18 @@ def _condense(mpc: MPC) -> Condensed:
         for M, M_0 in zip((Omega, Psi, psi), before, strict=True)
     )
 
-    weights = jnp.concatenate([stage[:, None, None] * Q, P_N[None]])
-    efforts = R if mpc.stage_weights is None else stage[:, None, None] * R
+    of_states = jnp.concatenate([stage[:, None, None] * Q, P_N[None]])
+    of_inputs = R if mpc.stage_weights is None else stage[:, None, None] * R
     product = lambda M, weight, X: jnp.einsum(
         f"kai,{'kab' if weight.ndim == 3 else 'ab'},kb...->i...", M, weight, X, precision="highest"
     )
     # 2 Σ_k M_k' W_k X_k with the weights of states, inputs and rates: the Hessian for X = Γ, the
     # part of the linear term in θ for X = Φ, its constant part for X = φ.
     form = lambda X, U, V: (
-        2 * (product(Gamma, weights, X) + product(Omega, efforts, U) + product(rates[0], W, V))
+        2 * (product(Gamma, of_states, X) + product(Omega, of_inputs, U) + product(rates[0], W, V))
     )
     if mpc.input_rate_weight is None:
-        form = lambda X, U, V: 2 * (product(Gamma, weights, X) + product(Omega, efforts, U))
+        form = lambda X, U, V: 2 * (product(Gamma, of_states, X) + product(Omega, of_inputs, U))
     P = form(Gamma, Omega, rates[0])
 
     # argmin over u of u'Ru + (Ax + Bu)'P(Ax + Bu), the least of them where there are several.
@@ -260,11 +254,7 @@ def _condense(mpc: MPC) -> Condensed:
         soft_linear=bounds.linear,
         soft_quadratic=bounds.quadratic,
         radius=bounds.radius,
-        Q=Q,
-        R=R,
-        P_N=P_N,
-        W=W,
-        stage=stage,
+        weights=weights,
         K=K,
         K_N=K_N,
         layout=layout_of(found),

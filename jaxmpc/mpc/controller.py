@@ -1,5 +1,21 @@
 """Controller: an MPC problem condensed and factored once, for plans at each time step; solve: one
-plan."""
+plan.
+
+The status of a plan is one of the problem as it was stated: in states and inputs, from its data.
+The condensed QP is solved in other variables, whose terms can be far larger than what they add up
+to: predictions of an unstable plant, limits less what the present state contributes. So what counts
+for the status of a plan is computed from A, B, c, the weights and the rows themselves:
+
+    rows       v = H x_k + D u_k beyond its bounds, relative to the larger of |bounds| and |v|;
+    dynamics   x_{k+1} − (A x_k + B u_k + c), relative to the largest value of the same state over
+               the horizon, and a small share of what it is made of, |A||x_k| + |B||u_k| + |c|: a
+               state that rests at 0 has no other size than that;
+    inputs     the gradient of the Lagrangian g = Γ'(∂J/∂x + H'y) + Ω'(∂J/∂u + D'y), with the
+               sensitivities Γ, Ω of the plan to its variables. In the metric of the Hessian, in
+               which the cost is ½|w|² + const, it is how far the plan is from the best one for the
+               multipliers y; it is compared with √(2J);
+    gap        Σ (penalty + conjugate − y v), how far y is from complementary, relative to J.
+"""
 
 from collections.abc import Callable
 from dataclasses import field, replace
@@ -11,11 +27,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import Reals
+from jaxmpc.arrays import Reals, all_finite
 from jaxmpc.checks import concrete, fail, require_kind
-from jaxmpc.mpc.aim import Aim, checked_aim
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.plan import (
+    Aim,
     Control,
     Multipliers,
     Plan,
@@ -23,23 +39,28 @@ from jaxmpc.mpc.plan import (
     WarmStart,
     answer,
     applied,
+    checked_aim,
     limited,
     require_warm_start,
     sorted_multipliers,
 )
-from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.stated_residuals import with_stated_status
+from jaxmpc.mpc.problem import MPC, dynamics_of
+from jaxmpc.mpc.rows import apply, blocks, dynamics_terms, split
 from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor, factorise
 from jaxmpc.qp.dual import has_dual_steps
-from jaxmpc.qp.linalg import arrays, matmul
+from jaxmpc.qp.linalg import arrays, matmul, rounding
 from jaxmpc.qp.problem import QPSolution
+from jaxmpc.qp.residuals import SHARE, Measured, Terms, worst
 from jaxmpc.qp.solve import in_two_parts, solve_factored
 from jaxmpc.qp.status import Status
 from jaxmpc.qp.transformations import own_modes, varying
 from jaxmpc.sets.convex_sets import Box, Polytope
 
 T = TypeVar("T")
+
+# Roundings of float32 that a plan, computed in float64 and then rounded, may be off.
+ROUNDED = 1000
 
 
 @prepared_pytree
@@ -203,8 +224,7 @@ def harmless(mpc: MPC) -> tuple[MPC, Any]:
 
 @own_modes
 def _harmless(data: dict[str, Any], R: np.ndarray) -> tuple[dict[str, Any], Array]:
-    leaves = [jnp.asarray(v) for v in jax.tree.leaves(data)]
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in leaves]))
+    finite = all_finite(data)
     clean = jax.tree.map(lambda v: jnp.where(finite, jnp.asarray(v), 0), data)
     return {**clean, "R": jnp.where(finite, jnp.asarray(data["R"]), R)}, finite
 
@@ -246,7 +266,7 @@ def _plan(controller: Controller, aim: Aim, start: WarmStart | None, *, whole: b
     N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
     aim = aim if mpc.input_in_state else aim._replace(previous_input=None)
     aim = jax.tree.map(lambda v: jnp.asarray(v, c.P.dtype), aim)
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(aim)]))
+    finite = all_finite(aim)
     # Harmless numbers until all is computed: the derivative of a product with NaN is NaN.
     aim = jax.tree.map(lambda v: jnp.where(finite, v, 0.0), aim)
     if aim.states is not None:
@@ -270,14 +290,90 @@ def _plan(controller: Controller, aim: Aim, start: WarmStart | None, *, whole: b
 def planned(
     controller: Controller, theta: Array, aim: Aim, found: QPSolution, fault: Array
 ) -> Plan:
-    """Return the plan of a solution of the condensed QP at θ (p,), with its status as the problem
-    was stated; fault: the status that faulty data give, NOT_RUN for none."""
-    c, mpc = controller.condensed, controller.mpc
-    states, inputs = c.trajectory(theta, found.z)
-    found = with_stated_status(
-        mpc, c, controller.factor, controller.solver, found, states, inputs, aim
-    )
-    return answer(mpc, c.layout, found, fault, states, inputs, aim)
+    """Return the plan of a solution of the condensed QP at θ (p,), with the status and residuals of
+    the problem as stated; fault: the status that faulty data give, NOT_RUN for none.
+
+    In float32 the status is that of the QP, which speaks of the plan before it was rounded; rows
+    and dynamics are checked to the precision that is left.
+    """
+    states, inputs = controller.condensed.trajectory(theta, found.z)
+    terms = stated_terms(*jax.lax.stop_gradient((controller, found.y, states, inputs, aim)))
+    eps, dtype = jnp.asarray(controller.solver.eps, states.dtype), states.dtype
+    if dtype == jnp.float64:
+        measured = Measured.of(terms, eps, rounding(dtype))
+        found = replace(
+            found, primal_residual=measured.primal, dual_residual=measured.dual, gap=measured.gap
+        )
+        solved = measured.within_tolerance
+    else:
+        allowed = eps + ROUNDED * jnp.finfo(dtype).eps
+        solved = (found.status == Status.SOLVED) & (worst(terms[:1], allowed)[1][0] <= allowed)
+    lost = jnp.where(found.status == Status.SOLVED, Status.INACCURATE, found.status)
+    found = replace(found, status=jnp.where(solved, Status.SOLVED, lost).astype(jnp.int32))
+    return answer(controller.mpc, controller.condensed.layout, found, fault, states, inputs, aim)
+
+
+def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim) -> Terms:
+    """Return the residuals at the top of this file, with their sizes and terms: rows and dynamics
+    (rows + N·n,), inputs (variables of the QP,), gap (1,)."""
+    mpc, c, factor = controller.mpc, controller.condensed, controller.factor
+    e = x if aim.states is None else x - aim.states
+    d = u if aim.inputs is None else u - aim.inputs
+    weights = c.weights
+    gx, gu = weights.of_states(e), weights.of_inputs(d)
+    J = jnp.sum(e * gx) + jnp.sum(d * gu)
+    # What the tracking errors are differences of.
+    cancels = J
+    if aim.states is not None or aim.inputs is not None:
+        cancels = J + jnp.sum(x * weights.of_states(x)) + jnp.sum(u * weights.of_inputs(u))
+    before = jnp.zeros_like(u[0]) if aim.previous_input is None else aim.previous_input
+    rates = jnp.diff(u, axis=0, prepend=before[None])
+    # Adds to a gradient in u that of what has the gradient g in the rates.
+    add_rates = lambda gu, g: gu + g - jnp.concatenate([g[1:], jnp.zeros_like(g[:1])])
+    if mpc.input_rate_weight is not None:
+        push = matmul(rates, weights.W)
+        J = J + jnp.sum(rates * push)
+        gu = add_rates(gu, push)
+    gx, gu = 2 * gx, 2 * gu
+
+    violations, sizes = [], []
+    gap = products = jnp.zeros((), x.dtype)
+    for block, y_block in zip(blocks(mpc, x.dtype), split(c.layout, y), strict=True):
+        if block.rate:
+            v = block.values(x, rates)
+            gu = add_rates(gu, block.pull(y_block, gx, jnp.zeros_like(gu))[1])
+        else:
+            v = block.values(x, u)
+            gx, gu = block.pull(y_block, gx, gu)
+        bounds, v, y_rows = block.bounds(), v.ravel(), y_block.ravel()
+        penalty, support = bounds.cost(v), bounds.support(y_rows)
+        J = J + jnp.sum(penalty)
+        gap = gap + jnp.sum(penalty + support - y_rows * v)
+        products = products + jnp.sum(jnp.abs(y_rows * v)) + jnp.sum(jnp.abs(support))
+        violations.append(bounds.violation(v))
+        sizes.append(jnp.maximum(bounds.sizes(), jnp.abs(v)))
+
+    moved = [M.reshape(-1, M.shape[-1]) for M in (c.Gamma, c.Omega)]
+    g = matmul(jnp.concatenate([gx.ravel(), gu.ravel()]), jnp.concatenate(moved))
+    length, rounds = (jnp.sqrt(2 * jnp.maximum(v, 0.0)) for v in (J, cancels))
+    rounds = rounds + jnp.max(jnp.abs(y) * factor.row_norms, initial=0.0)
+
+    A, B, drift = dynamics_of(mpc.system, x.dtype)
+    defects = x[1:] - (apply(A, x[:-1]) + apply(B, u) + drift)
+    terms = dynamics_terms(A, B, drift, x, u)
+    most = jnp.max(jnp.abs(x), axis=0) + SHARE * jnp.max(terms, axis=0)
+    most = jnp.broadcast_to(most, terms.shape)
+    row_size = jnp.concatenate([*sizes, y[:0]])
+    per_variable = 1 / jnp.sum(jnp.abs(factor.T), axis=1)
+    return [
+        (
+            jnp.concatenate([*violations, defects.ravel()]),
+            jnp.concatenate([row_size + SHARE * length * factor.row_norms, most.ravel()]),
+            jnp.concatenate([row_size + rounds * factor.row_norms, terms.ravel()]),
+        ),
+        (g, length * per_variable, rounds * per_variable),
+        (gap[None], 2 * J[None], (cancels + products)[None]),
+    ]
 
 
 def solve(

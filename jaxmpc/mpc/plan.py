@@ -1,6 +1,9 @@
-"""Plan, the answer of every solver; WarmStart; what a trajectory costs and violates."""
+"""What a plan begins with and tracks, checked in one place (Aim); Plan, the answer of every solver,
+with what it costs, violates and is held by; WarmStart and Control, from which the next one goes on.
+"""
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -9,16 +12,98 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxmpc.arrays import Reals, as_array, host_array
 from jaxmpc.checks import fail
-from jaxmpc.mpc.aim import Aim
 from jaxmpc.mpc.problem import MPC, weights_of
-from jaxmpc.mpc.rows import Block, Layout, blocks, row_count, split
+from jaxmpc.mpc.rows import Block, Layout, blocks, layout, row_count, row_table, split
 from jaxmpc.pytrees import named_pytree, pytree
 from jaxmpc.qp.linalg import arrays, matmul
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.residuals import with_fault
 from jaxmpc.qp.status import Status, WithStatus
-from jaxmpc.sets.convex_sets import Box
+from jaxmpc.sets.convex_sets import Box, Ellipsoid
+
+
+class Aim(NamedTuple):
+    """Where one plan begins and what it tracks.
+
+    x0 (n,). states and inputs: references (n,) or (N+1, n), and (m,) or (N, m); None for zero.
+    previous_input u_{−1} (m,), None for zero. Of nonlinear problems and their expansions: targets
+    of the tasks, (N+1, p) each, and slopes (N+1, n) and (N, m), the terms Σ slope_k·x_k +
+    Σ slope_k·u_k of the cost, None for none.
+    """
+
+    x0: Any
+    states: Any = None
+    inputs: Any = None
+    previous_input: Any = None
+    targets: tuple[Array, ...] = ()
+    slopes: tuple[Array, Array] | None = None
+
+
+def checked_aim(
+    mpc: MPC,
+    x0: Reals,
+    reference: Reals | None = None,
+    input_reference: Reals | None = None,
+    previous_input: Reals | None = None,
+    *,
+    steps: int = 1,
+    state_size: int | None = None,
+    widths: Sequence[int] | None = None,
+) -> Aim:
+    """Return the arguments of a plan, or of a closed loop of `steps` plans, as arrays.
+
+    A number will do for one state or input. state_size: length of x0, and widths: numbers of
+    columns that a reference may have, where these are not n. Raises ValueError that names argument,
+    shape and cure.
+    """
+    shapes = reference_shapes(mpc, steps, widths)
+    size = mpc.system.n if state_size is None else state_size
+
+    def checked(name: str, value: Reals | None, shapes: Sequence[tuple[int, ...]]) -> Any:
+        return None if value is None else checked_array(name, value, shapes)
+
+    return Aim(
+        checked_array("x0", x0, [(size,)]),
+        checked("reference", reference, shapes["reference"]),
+        checked("input_reference", input_reference, shapes["input_reference"]),
+        checked("previous_input", previous_input, [(mpc.system.m,)]),
+    )
+
+
+def reference_shapes(
+    mpc: MPC, steps: int = 1, widths: Sequence[int] | None = None
+) -> dict[str, list[tuple[int, ...]]]:
+    """Return the shapes that references of `steps` plans in a row may have; see `checked_aim`."""
+    N, m = mpc.horizon, mpc.system.m
+    states: list[tuple[int, ...]] = []
+    for k in widths or (mpc.system.n,):
+        states += [(k,), (N + steps, k)]
+    return {"reference": states, "input_reference": [(m,), (N + steps - 1, m)]}
+
+
+def checked_array(name: str, value: Any, shapes: Sequence[tuple[int, ...]]) -> Any:
+    """Return a value as an array of real numbers; ValueError unless it has one of the shapes. A
+    number will do for (1,)."""
+    value = _real_array(name, value)
+    if np.shape(value) == () and (1,) in shapes:
+        value = value.reshape(1)
+    if np.shape(value) not in shapes:
+        cure = f"Give {' or '.join(map(str, shapes))}; use jax.vmap for many"
+        fail(name, f"shape {np.shape(value)}", cure)
+    return value
+
+
+def _real_array(name: str, value: Any) -> Any:
+    if isinstance(value, np.ndarray) and value.dtype.kind in "iuf":  # the usual case, and fast
+        return value
+    value = as_array(value)
+    if not isinstance(value, jax.Array):
+        return host_array(name, value)
+    if jnp.issubdtype(value.dtype, jnp.complexfloating):
+        fail(name, f"entries of type {value.dtype} where real numbers are needed", "Use .real")
+    return value
 
 
 @pytree
@@ -97,10 +182,25 @@ class WarmStart(NamedTuple):
         x_N through the terminal set bounds it as a state from now on, where both have the same
         rows; not where it is an ellipsoid (terminal_is_ball), whose rows are no limits.
         """
+        y, horizon = self.multipliers, len(self.inputs)
+        blocks = list(zip(layout, split(layout, y), strict=True))
+        terminal = next((part[0] for (kind, *_), part in blocks if kind == "terminal"), y[:0])
+        moved = []
+        for (kind, steps, size), part in blocks:
+            if kind != "terminal":
+                # Stage k takes over from k + 1: from the block itself, else from the terminal set.
+                place = {k: j for j, k in enumerate(steps)}
+                same = kind == "state" and not terminal_is_ball and terminal.shape[0] == size
+                last = terminal if same else jnp.zeros(size, y.dtype)
+                source = jnp.concatenate([part, last[None], jnp.zeros((1, size), y.dtype)])
+                end = len(steps)
+                later = [place.get(k + 1, end if k + 1 == horizon else end + 1) for k in steps]
+                part = source[np.array(later, int)]
+            moved.append(part.ravel())
         return WarmStart(
             jnp.concatenate([self.states[1:], self.states[-1:]]),
             jnp.concatenate([self.inputs[1:], tail[None]]),
-            _shifted_multipliers(layout, len(self.inputs), self.multipliers, terminal_is_ball),
+            jnp.concatenate([*moved, y[:0]]),
         )
 
 
@@ -238,10 +338,7 @@ def _violations(mpc: MPC, states: Array, inputs: Array) -> list[tuple[Block, Arr
     found = []
     for block in blocks(mpc, states.dtype):
         if block.linear is not None:
-            steps = np.array(block.steps, int)
-            value = matmul(states[steps], block.H.T)
-            if block.D is not None:
-                value = value + matmul(inputs[steps], block.D.T)
+            value = block.values(states, inputs)
             beyond = jnp.maximum(value - block.upper, block.lower - value)
             found.append((block, jnp.maximum(beyond, 0.0)))
     return found
@@ -285,22 +382,67 @@ def flat_multipliers(layout: Layout, multipliers: Multipliers) -> Array:
     return jnp.concatenate(parts) if parts else jnp.zeros(0, jnp.result_type(y.states))
 
 
-def _shifted_multipliers(
-    layout: Layout, horizon: int, y: Array, terminal_is_ball: bool = False
-) -> Array:
-    """Return the multipliers (rows,) of a plan one time step later: see `WarmStart.shifted`."""
-    blocks = list(zip(layout, split(layout, y), strict=True))
-    terminal = next((part[0] for (kind, *_), part in blocks if kind == "terminal"), y[:0])
-    moved = []
-    for (kind, steps, size), part in blocks:
-        if kind != "terminal":
-            # Stage k takes over from k + 1: from the block itself, else from the terminal set.
-            place = {k: j for j, k in enumerate(steps)}
-            same = kind == "state" and not terminal_is_ball and terminal.shape[0] == size
-            last = terminal if same else jnp.zeros(size, y.dtype)
-            source = jnp.concatenate([part, last[None], jnp.zeros((1, size), y.dtype)])
-            end = len(steps)
-            later = [place.get(k + 1, end if k + 1 == horizon else end + 1) for k in steps]
-            part = source[np.array(later, int)]
-        moved.append(part.ravel())
-    return jnp.concatenate([*moved, y[:0]])
+@dataclass(frozen=True)
+class ActiveConstraint:
+    """One limit that shapes a plan.
+
+    constraint: kind of the row (see `Row`). name, unit: of the quantity that is bounded. stage: its
+    k. bound: "upper" or "lower". multiplier > 0: by how much the least cost J (without ½) falls for
+    each unit that this one bound is relaxed. For an ellipsoid bound is "radius", the root of its
+    level. violation: how far a soft row is broken.
+    """
+
+    constraint: str
+    name: str
+    unit: str
+    stage: int
+    bound: str
+    multiplier: float
+    violation: float = 0.0
+
+    def __str__(self) -> str:
+        unit = f" per {self.unit}" if self.unit else ""
+        broken = f", broken by {self.violation:.3g} {self.unit}".rstrip() if self.violation else ""
+        name = self.name
+        if not name.startswith(self.constraint):
+            name = f"{self.constraint} {name}"
+        return f"{name}, {self.bound} at k = {self.stage}: {self.multiplier:.6g}{unit}{broken}"
+
+
+def active_constraints(
+    mpc: MPC, plan: Plan, tolerance: float = 1e-6
+) -> tuple[ActiveConstraint, ...]:
+    """The limits with a multiplier above `tolerance`, largest first.
+
+    plan: of `mpc`, one instance. The multiplier of a bound is the sensitivity of the optimal cost:
+    dJ*/d(bound) = −multiplier for an upper bound, +multiplier for a lower one. Where rows coincide
+    (inputs of one block of a control horizon, states at N beside the terminal set) they share it in
+    an arbitrary way: only their sum is a sensitivity, of relaxing all of them. NumPy; not
+    traceable.
+    """
+    y = np.asarray(flat_multipliers(layout(mpc), plan.multipliers), np.float64)
+    ball = isinstance(mpc.terminal_set, Ellipsoid)
+    slack, columns = np.asarray(plan.slack), soft_columns(mpc)
+    found = []
+    for row, column, value in zip(row_table(mpc), columns, y, strict=True):
+        if abs(value) > tolerance and not (ball and row.kind == "terminal"):
+            bound, broken = "upper" if value > 0 else "lower", 0.0
+            if column is not None:
+                broken = float(slack[row.stage, column])
+            where = row.kind, row.name, row.unit, row.stage
+            found.append(ActiveConstraint(*where, bound, float(abs(value)), broken))
+    push = float(np.linalg.norm(np.asarray(plan.multipliers.terminal))) if ball else 0.0
+    if push > tolerance:
+        found.append(ActiveConstraint("terminal", "ellipsoid", "", mpc.horizon, "radius", push))
+    return tuple(sorted(found, key=lambda constraint: -constraint.multiplier))
+
+
+def soft_columns(mpc: MPC) -> list[int | None]:
+    """Column of `Plan.slack` for each row of the condensed QP, None for hard ones."""
+    columns: list[int | None] = []
+    first = 0
+    for b in blocks(mpc, float):
+        hard = b.linear is None
+        columns += [None if hard else first + j for _ in b.steps for j in range(b.size)]
+        first += 0 if hard else b.size
+    return columns

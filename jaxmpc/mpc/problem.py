@@ -1,6 +1,7 @@
-"""The constrained MPC problem as a user states it."""
+"""The constrained MPC problem as a user states it, and the same one with soft or hard limits."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -17,17 +18,32 @@ from jaxmpc.checks import (
     require_shape,
     require_symmetric_psd,
 )
-from jaxmpc.pytrees import pytree, static, static_pytree
-from jaxmpc.qp.linalg import symmetric
+from jaxmpc.pytrees import named_pytree, pytree, static, static_pytree
+from jaxmpc.qp.linalg import matmul, symmetric
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
+from jaxmpc.sets.limits import output_limits
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
 # Curvature of the cost, relative to its terms, below which a direction of the inputs costs nothing.
 FLAT = 1e-12
 
 
+class TwoSided:
+    """Rows with the sides lower and upper, either of them None."""
+
+    lower: Any
+    upper: Any
+
+    @property
+    def sides(self) -> tuple[Any, Any]:
+        """(lower, upper), infinite where there is no such side."""
+        lower, upper = self.lower, self.upper
+        free = np.full(np.shape(as_array(upper if lower is None else lower)), np.inf)
+        return (-free if lower is None else lower), (free if upper is None else upper)
+
+
 @pytree
-class Outputs:
+class Outputs(TwoSided):
     """Hard limits of outputs, lower ≤ C x_k + D u_k ≤ upper.
 
     C (p, n), lower and upper (p,), None where all rows lack that side (in single rows −inf, inf),
@@ -46,14 +62,9 @@ class Outputs:
     def __post_init__(self) -> None:
         store_floats(self, "C", "lower", "upper", "D")
 
-    @property
-    def sides(self) -> tuple[Any, Any]:
-        """(lower, upper), infinite where there is no such side."""
-        return _sides(self)
-
 
 @pytree
-class Soft:
+class Soft(TwoSided):
     """Rows that may be violated at a penalty:
 
         lower − ε_k ≤ C x_k + D u_k ≤ upper + ε_k,  ε_k ≥ 0,   cost + ρ Σ ε_k + quadratic Σ ε_k²
@@ -78,18 +89,8 @@ class Soft:
     def __post_init__(self) -> None:
         store_floats(self, "C", "lower", "upper", "rho", "quadratic", "D")
 
-    @property
-    def sides(self) -> tuple[Any, Any]:
-        """(lower, upper), infinite where there is no such side."""
-        return _sides(self)
 
-
-def _sides(rows: Outputs | Soft) -> tuple[Any, Any]:
-    free = np.full(np.shape(as_array(rows.upper if rows.lower is None else rows.lower)), np.inf)
-    lower, upper = rows.lower, rows.upper
-    return (-free if lower is None else lower), (free if upper is None else upper)
-
-
+@named_pytree
 class Weights(NamedTuple):
     """The weights of a cost as symmetric matrices of one floating type: Q (n, n), R (m, m),
     P (n, n) of x_N and W (m, m) of input rates, zero for None, and stage (N,)."""
@@ -99,6 +100,15 @@ class Weights(NamedTuple):
     P: Array
     W: Array
     stage: Array
+
+    def of_states(self, x: Array) -> Array:
+        """Return s_k Q x_k and P x_N (N+1, n): half the gradient of the cost."""
+        stages = self.stage[:, None] * matmul(x[:-1], self.Q)
+        return jnp.concatenate([stages, matmul(x[-1:], self.P)])
+
+    def of_inputs(self, u: Array) -> Array:
+        """Return s_k R u_k (N, m)."""
+        return self.stage[:, None] * matmul(u, self.R)
 
 
 @static_pytree
@@ -427,6 +437,12 @@ def weights_of(mpc: MPC, dtype: Any) -> Weights:
     return Weights(Q, R, P, matrix(mpc.input_rate_weight, m), jnp.asarray(stage, dtype))
 
 
+def dynamics_of(system: LinearSystem, dtype: Any) -> tuple[Array, Array, Array]:
+    """Return A, B and c, zero for None, in one floating type. Works inside jit, vmap and grad."""
+    A, B = jnp.asarray(system.A, dtype), jnp.asarray(system.B, dtype)
+    return A, B, jnp.zeros(system.n, dtype) if system.c is None else jnp.asarray(system.c, dtype)
+
+
 def _form(M: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Return the size of the terms of M'SM where those of S have this size."""
     return abs(M).T @ size @ abs(M)
@@ -454,3 +470,93 @@ def as_tuple(name: str, value: Any, kind: type) -> tuple:
     if not isinstance(value, tuple | list) or not all(isinstance(v, kind) for v in value):
         fail(name, f"{type(value).__name__}", f"Give a jm.{kind.__name__}, or a tuple of them")
     return tuple(value)
+
+
+def soften(mpc: MPC, rho: Reals, quadratic: Reals = 0.0) -> MPC:
+    """The same problem with all state, output and terminal rows soft; inputs and rates stay hard.
+
+    rho, quadratic: weights of every row, as in `Soft`. Rows keep their units: a violation is
+    measured as H x − h in the row as given. Raises ValueError for an Ellipsoid as terminal set,
+    which has no rows.
+    """
+    require_kind("mpc", mpc, MPC)
+    mpc.validate()
+    if isinstance(mpc.terminal_set, Ellipsoid):
+        fail("terminal_set", "is an Ellipsoid, which stays hard", "Use a Polytope inside it")
+    hard = []
+    for kind, limits, stages in (
+        ("state", mpc.states, mpc.state_stages),
+        ("terminal", mpc.terminal_set, (mpc.horizon,)),
+    ):
+        if limits is not None:
+            C, lower, upper = limits.rows()
+            names, units = mpc.system.state_names, mpc.system.state_units
+            if isinstance(limits, Polytope):
+                names, units = limits.labels, ()
+            names = names or _numbered(kind, np.size(lower))
+            hard.append(Outputs(C, lower, upper, None, stages, names, units))
+    for rows in as_tuple("outputs", mpc.outputs, Outputs):
+        names = rows.names or _numbered("output", np.size(rows.sides[0]))
+        hard.append(replace(rows, stages=output_stages(mpc, rows), names=names))
+    soft = list(as_tuple("soft", mpc.soft, Soft))
+    for rows in filter(None, map(_with_limits, hard)):
+        below, above = rows.sides
+        one_sided = concrete(below) and not np.isfinite(below).any()
+        more = (rows.D, rows.stages, rows.names, rows.units)
+        soft.append(Soft(rows.C, None if one_sided else below, above, rho, quadratic, *more))
+    softened = replace(mpc, states=None, terminal_set=None, outputs=(), soft=tuple(soft))
+    softened.validate()
+    return softened
+
+
+def _numbered(kind: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{kind} row {i + 1}" for i in range(count))
+
+
+def _with_limits(rows: Outputs) -> Outputs | None:
+    """Return the rows with a finite limit, None where there are none. Limits inside a trace cannot
+    be read: all their rows are taken."""
+    if not rows.stages or not concrete(rows):
+        return rows if rows.stages else None
+    lower, upper = rows.sides
+    bounded = np.isfinite(lower) | np.isfinite(upper)
+    keep = lambda v: np.asarray(v)[bounded]
+    text = lambda v: tuple(str(part) for part in keep(v)) if v else ()
+    limited = replace(
+        rows,
+        C=keep(rows.C),
+        lower=keep(lower),
+        upper=keep(upper),
+        D=None if rows.D is None else keep(rows.D),
+        names=text(rows.names),
+        units=text(rows.units),
+    )
+    return limited if bounded.any() else None
+
+
+def harden(mpc: MPC) -> MPC:
+    """The same problem with every soft row hard: what a large enough penalty enforces where it can.
+
+    The opposite of `soften`: rows that hold at all steps of the state limits join `states`, rows at
+    k = N the terminal set, where these are not sets of another kind; the rest become `outputs`.
+    """
+    N, every = mpc.horizon, mpc.state_stages
+    states, terminal, outputs = [], [], list(as_tuple("outputs", mpc.outputs, Outputs))
+    for s in as_tuple("soft", mpc.soft, Soft):
+        steps = tuple(range(N + (s.D is None))) if s.stages is None else s.stages
+        lower, upper = s.sides
+        rows = Polytope(s.C, upper, s.names)
+        if s.lower is not None:
+            rows = output_limits(s.C, lower, upper, s.names, s.units)
+        whole = s.D is None and every and set(every) <= set(steps) <= {*every, N}
+        if whole and mpc.states is None:
+            states.append(rows)
+            steps = tuple(set(steps) - set(every))
+        if s.D is None and steps == (N,) and mpc.terminal_set is None:
+            terminal.append(rows)
+            steps = ()
+        if steps:
+            outputs.append(Outputs(s.C, lower, upper, s.D, steps, s.names, s.units))
+    join = lambda given, found: reduce(Polytope.intersect, found) if found else given
+    sets = {"states": join(mpc.states, states), "terminal_set": join(mpc.terminal_set, terminal)}
+    return replace(mpc, soft=(), outputs=tuple(outputs), **sets)

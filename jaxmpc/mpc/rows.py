@@ -2,8 +2,10 @@
 
 A block asks lower ≤ H x_k + D v_k ≤ upper at some steps k, with v_k = u_k or, for rates,
 v_k = u_k − u_{k−1}. The order is inputs, states, outputs, rates, soft rows, terminal set; within
-a block step by step. The condensed QP, the proofs and the names of multipliers are all made from
-this one list.
+a block step by step. The condensed QP, the problem stage by stage, the proofs and the names of
+multipliers are all made from this one list.
+
+Along the horizon x are the states (N+1, n), u the inputs (N, m).
 """
 
 from collections.abc import Iterable
@@ -18,7 +20,7 @@ from jax.typing import DTypeLike
 
 from jaxmpc.checks import require_kind
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, output_stages
-from jaxmpc.pytrees import record
+from jaxmpc.pytrees import pytree, record, static
 from jaxmpc.qp.linalg import cholesky, matmul
 from jaxmpc.qp.problem import Bounds
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
@@ -27,34 +29,99 @@ from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 Layout = tuple[tuple[str, tuple[int, ...], int], ...]
 
 
-@record
-class Block:
-    """lower ≤ H x_k + D v_k ≤ upper at `steps`: H (r, n) or None, D (r, m) or None. box: the one of
-    them that is there is the identity.
+def consecutive(steps: tuple[int, ...]) -> bool:
+    """Return whether the steps are k, k + 1, …"""
+    return bool(steps) and steps == tuple(range(steps[0], steps[0] + len(steps)))
 
-    rate: v_k is Δu_k. linear, quadratic (r,): weights c and k of the penalty c e + ½ k e² of a
-    violation e where the rows are soft (k is twice `Soft.quadratic`), None where they are hard.
-    radius: the rows are those of a ball |H x| ≤ radius.
-    """
 
-    kind: str
+def at(v: Array, steps: tuple[int, ...]) -> Array:
+    """Return v_k at the steps, zero at the one after the last of v."""
+    if max(steps, default=0) == len(v):
+        v = jnp.pad(v, ((0, 1), *[(0, 0)] * (v.ndim - 1)))
+    if consecutive(steps):
+        return v[steps[0] : steps[0] + len(steps)]
+    return v[np.array(steps, int)]
+
+
+def spread(part: Array, steps: tuple[int, ...], length: int) -> Array:
+    """Return the array of so many steps that is `part` at the steps and zero elsewhere; a part at
+    the step after the last is left out."""
+    if max(steps, default=0) == length:
+        return spread(part, steps, length + 1)[:-1]
+    if consecutive(steps):
+        ends = (steps[0], length - steps[0] - len(steps))
+        return jnp.pad(part, (ends, *[(0, 0)] * (part.ndim - 1)))
+    return jnp.zeros((length, *part.shape[1:]), part.dtype).at[np.array(steps, int)].add(part)
+
+
+def apply(M: Array, v: Array) -> Array:
+    """Return M_k v_k, or M v_k, for all steps: M (N, a, b) or (a, b), v (N, b)."""
+    return matmul(v, M.T) if M.ndim == 2 else matmul(M, v[..., None])[..., 0]
+
+
+def apply_transposed(M: Array, v: Array) -> Array:
+    """Return M_k'v_k, or M'v_k, for all steps."""
+    return matmul(v, M) if M.ndim == 2 else matmul(v[..., None, :], M)[..., 0, :]
+
+
+@pytree
+class Rows:
+    """The rows H x_k + D v_k at `steps`: H (r, n) and D (r, m), or one a step, None for zero. At
+    step N, which has no input, D does not count. box: the one of them that is there is the
+    identity."""
+
+    kind: str = static()
     H: Any
     D: Any
+    steps: tuple[int, ...] = static()
+    box: bool = static()
+
+    @property
+    def size(self) -> int:
+        """Rows at each step."""
+        return (self.H if self.D is None else self.D).shape[-2]
+
+    def values(self, x: Array, v: Array) -> Array:
+        """Return H x_k + D v_k (steps, r)."""
+        value: Any = 0.0
+        for M, along in ((self.H, x), (self.D, v)):
+            if M is not None:
+                here = at(along, self.steps)
+                value = value + (here if self.box else apply(M, here))
+        return value
+
+    def pull(self, weights: Array, gx: Array, gv: Array) -> tuple[Array, Array]:
+        """Return gx, gv with Σ weights·(gradient of the row) added, weights (steps, r): the
+        transpose of `values`."""
+
+        def pulled(M: Array, length: int) -> Array:
+            part = weights if self.box else apply_transposed(M, weights)
+            return spread(part, self.steps, length)
+
+        if self.H is not None:
+            gx = gx + pulled(self.H, len(gx))
+        if self.D is not None:
+            gv = gv + pulled(self.D, len(gv))
+        return gx, gv
+
+
+@record
+class Block(Rows):
+    """lower ≤ H x_k + D v_k ≤ upper, lower and upper (r,).
+
+    names, units: of the rows. rate: v_k is Δu_k. linear, quadratic (r,): weights c and k of the
+    penalty c e + ½ k e² of a violation e where the rows are soft (k is twice `Soft.quadratic`),
+    None where they are hard. radius: the rows are those of a ball |H x| ≤ radius.
+    """
+
     lower: Any
     upper: Any
-    steps: tuple[int, ...]
     names: tuple[str, ...]
     units: tuple[str, ...]
     rate: bool = False
     linear: Any = None
     quadratic: Any = None
     radius: Any = None
-    box: bool = False
-
-    @property
-    def size(self) -> int:
-        """Rows at each step."""
-        return len(self.names)
 
     def bounds(self) -> Bounds:
         """What is asked of the rows of all steps (steps·r,), without what follows from x_0."""
@@ -94,7 +161,14 @@ def blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
         return jnp.asarray(v, dtype)
 
     def add(
-        kind: str, H: Any, D: Any, sides: tuple, stages: Iterable[int], texts: tuple, **more: Any
+        kind: str,
+        H: Any,
+        D: Any,
+        sides: tuple,
+        stages: Iterable[int],
+        texts: tuple,
+        box: bool = False,
+        **more: Any,
     ) -> None:
         H, D = (None if M is None else cast(M) for M in (H, D))
         r = (H if D is None else D).shape[0]
@@ -102,7 +176,7 @@ def blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
         names = tuple(names) or tuple(f"{kind} row {i + 1}" for i in range(r))
         units = tuple(units) or ("",) * r
         lower, upper = map(cast, sides)
-        found.append(Block(kind, H, D, lower, upper, tuple(stages), names, units, **more))
+        found.append(Block(kind, H, D, tuple(stages), box, lower, upper, names, units, **more))
 
     def add_set(kind: str, limits: Box | Polytope, stages: Iterable[int], texts: tuple) -> None:
         M, *sides = limits.rows()
@@ -131,8 +205,9 @@ def blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
         p = np.shape(soft.sides[0])
         linear = jnp.broadcast_to(cast(soft.rho), p)
         quadratic = 2 * jnp.broadcast_to(cast(soft.quadratic), p)
-        weights = {"linear": linear, "quadratic": quadratic}
-        add("soft", soft.C, soft.D, soft.sides, stages, (soft.names, soft.units), **weights)
+        texts = soft.names, soft.units
+        more: dict[str, Any] = {"linear": linear, "quadratic": quadratic}
+        add("soft", soft.C, soft.D, soft.sides, stages, texts, **more)
     last = mpc.terminal_set
     if isinstance(last, Ellipsoid):  # x'Px = |L'x|²
         P = cast(last.P)
@@ -219,8 +294,8 @@ def layout(mpc: MPC) -> Layout:
     return layout_of(blocks(mpc, float))
 
 
-def layout_of(found: list[Block]) -> Layout:
-    """Return the layout of some blocks."""
+def layout_of(found: Iterable[Rows]) -> Layout:
+    """Return (kind, steps, rows a step) of each."""
     return tuple((b.kind, b.steps, b.size) for b in found)
 
 
@@ -235,3 +310,8 @@ def split(layout: Layout, y: Array) -> list[Array]:
     shapes = [(len(steps), size) for _, steps, size in layout]
     parts = jnp.split(y, ends)[: len(shapes)]
     return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+
+
+def dynamics_terms(A: Array, B: Array, c: Array, x: Array, u: Array) -> Array:
+    """Return |A||x_k| + |B||u_k| + |c| (N, n), what x_{k+1} is made of."""
+    return apply(jnp.abs(A), jnp.abs(x[:-1])) + apply(jnp.abs(B), jnp.abs(u)) + jnp.abs(c)

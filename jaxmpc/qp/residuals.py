@@ -1,7 +1,7 @@
 """What is known of a pair (z, y): its residuals, proofs of infeasibility, and its status by them.
 
 Residuals come in parts, those of rows (m,), of variables (n,) and the gap (1,): `residual_terms`
-for a QP, `mpc.stated_residuals` for the plan of an MPC problem, `stage_residuals` in
+for a QP, `mpc.controller` for the plan of an MPC problem, `stage_residuals` in
 `mpc.stagewise.stages` for a problem stage by stage. With each entry come two numbers in its own
 unit, so that neither the units of rows and variables nor that of the cost change what is said of a
 pair:

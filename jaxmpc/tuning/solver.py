@@ -29,9 +29,8 @@ from jaxmpc.arrays import Reals
 from jaxmpc.batches import Compiled, Devices, chosen_devices, divisible, each_part, over_devices
 from jaxmpc.checks import fail, require_finite, require_kind, whole
 from jaxmpc.files import fingerprint
-from jaxmpc.mpc.aim import checked_array
 from jaxmpc.mpc.condense import Condensed, condensed_in_float64
-from jaxmpc.mpc.plan import Plan, WarmStart
+from jaxmpc.mpc.plan import Plan, WarmStart, checked_array
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ADMM, ScaledProgram, factorise, iterate, read, splittings

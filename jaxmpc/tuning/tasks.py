@@ -22,8 +22,7 @@ from jaxmpc.closed_loop.variations import plant_numbers
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.condense import Inequalities, prestabilising_gain
 from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.softening import soften
+from jaxmpc.mpc.problem import MPC, soften
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
 from jaxmpc.robots.linear_plant import LinearPlant

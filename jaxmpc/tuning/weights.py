@@ -18,8 +18,7 @@ from jaxmpc.batches import Devices, chosen_devices, device_bytes, program_bytes
 from jaxmpc.checks import fail, whole
 from jaxmpc.closed_loop.simulation import Conditions, Each, Run, require_variations, simulate_each
 from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.softening import harden
+from jaxmpc.mpc.problem import MPC, harden
 from jaxmpc.mpc.stagewise.nonlinear import as_argument
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM

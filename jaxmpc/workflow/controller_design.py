@@ -7,8 +7,7 @@ from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail
 from jaxmpc.explicit.exact_penalties import ExactPenalty, exact_penalty
 from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.softening import soften
+from jaxmpc.mpc.problem import MPC, soften
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope

@@ -20,9 +20,8 @@ from jaxmpc.feasible.rays import boundary
 from jaxmpc.grids import grid
 from jaxmpc.mpc.condense import condensed_in_float64, in_float64
 from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import MPC, harden
 from jaxmpc.mpc.rows import row_table
-from jaxmpc.mpc.softening import harden
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status

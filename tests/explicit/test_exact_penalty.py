@@ -14,8 +14,7 @@ from jaxmpc.explicit.exact_penalties import exact_penalty
 from jaxmpc.explicit.least_distance import least_distance_form
 from jaxmpc.explicit.regions import critical_regions
 from jaxmpc.mpc.condense import condensed_in_float64
-from jaxmpc.mpc.problem import Soft
-from jaxmpc.mpc.softening import soften
+from jaxmpc.mpc.problem import Soft, soften
 from jaxmpc.qp.status import Status
 
 

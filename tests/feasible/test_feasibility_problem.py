@@ -10,7 +10,7 @@ import jaxmpc as jm
 from jaxmpc.feasible import problem
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.condense import Inequalities, condensed_in_float64
-from jaxmpc.mpc.softening import soften
+from jaxmpc.mpc.problem import soften
 
 
 def test_everything_is_made_once(monkeypatch):

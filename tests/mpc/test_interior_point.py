@@ -12,7 +12,7 @@ from jax import enable_x64
 
 import jaxmpc as jm
 from jaxmpc.mpc import Plan, solve_stagewise
-from jaxmpc.mpc.softening import soften
+from jaxmpc.mpc.problem import soften
 
 N, n, m, COUNT = 12, 4, 2, 48
 SOLVER = jm.ADMM(iterations=0)

@@ -17,10 +17,9 @@ from jax import enable_x64
 import jaxmpc as jm
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.hard_constraints import exact_data, hard_blocks, make_view
-from jaxmpc.mpc.active_limits import active_constraints
-from jaxmpc.mpc.problem import Outputs, Soft
+from jaxmpc.mpc.plan import active_constraints
+from jaxmpc.mpc.problem import Outputs, Soft, soften
 from jaxmpc.mpc.rows import row_table
-from jaxmpc.mpc.softening import soften
 from jaxmpc.mpc.steady_state import equilibrium
 from jaxmpc.sets.convex_sets import Ellipsoid
 

@@ -6,7 +6,7 @@ import problems
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.mpc import active_set_reuse, many
+from jaxmpc.mpc import many
 from jaxmpc.mpc.condense import in_float64
 from jaxmpc.mpc.controller import Controller
 
@@ -18,7 +18,7 @@ def few(monkeypatch):
     """Transfer among `COUNT` states, in small programs; returns what was run on how many."""
     monkeypatch.setattr(many, "MANY", COUNT)
     monkeypatch.setattr(many, "BLOCK", 64)
-    monkeypatch.setattr(active_set_reuse, "STATES_A_CELL", 16)
+    monkeypatch.setattr(many, "STATES_A_CELL", 16)
     run, log = many.Batch._run, []
 
     def logged(self, program, arguments, index):
@@ -110,7 +110,7 @@ def test_own_residuals_decide(mpc, states, few, tolerance):
 @pytest.mark.slow
 def test_a_wrong_law_is_no_plan(mpc, states, solved, few, monkeypatch):
     """Laws of other states: whatever they give, all plans are those of the solver."""
-    monkeypatch.setattr(active_set_reuse.Cells, "nearest", lambda self, x: self.law[0])
+    monkeypatch.setattr(many.Cells, "nearest", lambda self, x: self.law[0])
     many._follow.cache_clear()
     found = jm.solve_many(mpc, states)
     many._follow.cache_clear()
@@ -161,9 +161,9 @@ def test_problems_that_do_not_qualify(mpc):
     wide = jm.MPC(jm.LinearSystem(np.eye(5), np.eye(5)), np.eye(5), np.eye(5), 3,
                   inputs=jm.Box(-1, 1))  # fmt: skip
     with jax.enable_x64(True):
-        assert active_set_reuse.transferable(Controller(in_float64(mpc)))
+        assert many.transferable(Controller(in_float64(mpc)))
         for other in (soft, wide):
-            assert not active_set_reuse.transferable(Controller(in_float64(other)))
+            assert not many.transferable(Controller(in_float64(other)))
 
 
 @pytest.mark.slow
@@ -181,7 +181,7 @@ def test_cells():
     """Each state follows a solved one of its cell or of those beside it."""
     x = np.random.default_rng(2).normal(size=(5000, 2))
     with jax.enable_x64(True):
-        index, cells = active_set_reuse.choose(x)
+        index, cells = many.choose(x)
         near = np.asarray(jax.vmap(cells.nearest)(x))
     assert len(np.unique(index)) == len(index)
     np.testing.assert_array_equal(np.asarray(cells.states)[: len(index)], x[index])
@@ -197,5 +197,5 @@ def test_cells_of_states_in_order(order):
     if order == "repeated":
         x = np.tile(np.random.default_rng(0).permutation(x)[:4096], (16, 1))
     with jax.enable_x64(True):
-        index, cells = active_set_reuse.choose(x)
+        index, cells = many.choose(x)
     assert len(index) >= 0.9 * len(cells.law)

@@ -12,9 +12,8 @@ from jax import enable_x64
 from problems import residuals, rows_of, symmetric
 
 import jaxmpc as jm
-from jaxmpc.mpc.aim import Aim
-from jaxmpc.mpc.plan import WarmStart
-from jaxmpc.mpc.stagewise import interior_point, solve, stages
+from jaxmpc.mpc.plan import Aim, WarmStart
+from jaxmpc.mpc.stagewise import newton_steps, solve, stages
 from jaxmpc.mpc.stagewise.solve import factor_stages, plan_stages, solve_stagewise
 from jaxmpc.qp import admm
 
@@ -239,7 +238,7 @@ def test_fixed_count_of_newton_steps():
     mpc = replace(problem(), system=varying())
     inputs = lambda x0: solve_stagewise(mpc, x0, solver=jm.ADMM(fixed=True)).inputs
     lengths = re.findall(r" length=(\d+)", str(jax.make_jaxpr(inputs)(X0)))
-    assert max(map(int, lengths)) == interior_point.INTERIOR_STEPS
+    assert max(map(int, lengths)) == newton_steps.INTERIOR_STEPS
 
 
 @pytest.mark.slow

@@ -44,8 +44,7 @@ from jaxmpc.feasible.map import map_feasible_set
 from jaxmpc.files import as_json, check_results, versions, write_json
 from jaxmpc.grids import grid
 from jaxmpc.mpc.controller import Controller
-from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.softening import soften
+from jaxmpc.mpc.problem import MPC, soften
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.load import load_robot, model_hash

@@ -24,8 +24,7 @@ from pydantic.dataclasses import dataclass
 from jaxmpc.checks import MOST_COUNT
 from jaxmpc.explicit.exact_penalties import exact_penalty
 from jaxmpc.grids import axis_indices, grid, grid_ends, mesh
-from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.softening import soften
+from jaxmpc.mpc.problem import MPC, soften
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
 from jaxmpc.sets.invariant import named_terminal_set

@@ -29,10 +29,10 @@ from jaxmpc.checks import (
     require_real,
     require_symmetric_psd,
 )
-from jaxmpc.mpc.aim import Aim
+from jaxmpc.mpc.plan import Aim
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.rows import joined_bounds
-from jaxmpc.mpc.stagewise.stages import Stages, apply, apply_transposed, at, spread
+from jaxmpc.mpc.rows import Rows, apply, apply_transposed, at, joined_bounds, spread
+from jaxmpc.mpc.stagewise.stages import Stages
 from jaxmpc.pytrees import named_pytree, pytree, static, static_pytree
 from jaxmpc.qp.linalg import matmul, symmetric
 from jaxmpc.qp.problem import Bounds
@@ -252,7 +252,7 @@ def task_cost(task: Task, value: Array, target: Array) -> Array:
 
 
 def total_cost(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Array:
-    """Return the cost of a trajectory without penalties; s: `stages` of the MPC."""
+    """Return the cost of a trajectory without penalties; s: `Stages` of the MPC."""
     aim = s.aim
     e, d = x - aim.states, u - aim.inputs
     J = jnp.sum(s.stage * (jnp.sum(e[:-1] * apply(s.Q, e[:-1]), 1) + jnp.sum(d * apply(s.R, d), 1)))
@@ -288,15 +288,13 @@ def linear_models(model: Any, x: Array, u: Array) -> tuple[Array, Array, Array]:
 
 
 def expanded(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Stages:
-    """Return the problem about x (N+1, n), u (N, m); s: `stages` of the MPC."""
+    """Return the problem about x (N+1, n), u (N, m); s: `Stages` of the MPC."""
     N, dtype = s.horizon, s.P.dtype
     A, B, c = linear_models(problem.model, x[:-1], u)
     weights = s.stage[:, None, None]
     Q, R, P, cross = weights * s.Q, weights * s.R, s.P, None
-    e, d = x - s.aim.states, u - s.aim.inputs
-    gx = 2 * jnp.concatenate([s.stage[:, None] * apply(s.Q, e[:-1]), matmul(e[-1:], s.P.T)])
-    gu = 2 * s.stage[:, None] * apply(s.R, d)
-    limited: list[TaskRows] = []
+    gx, gu = s.gradient(x, u)
+    blocks, bounds = list(s.blocks), [s.bounds]
     for task, target in zip(problem.tasks, s.aim.targets, strict=True):
         steps = task.at(N)
         pair = lambda x, u, task=task: (problem.value(task, x, u),) * 2
@@ -313,10 +311,8 @@ def expanded(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Stages:
             gu = gu + spread(apply_transposed(D, error), steps, N)
         if task.limited:
             about = apply(G, at(x, steps)) + apply(D, at(u, steps)) - value
-            limited.append(TaskRows(("task", steps, value.shape[1]), G, D, task.bounds(about)))
-    bounds = s.bounds
-    if limited:
-        bounds = joined_bounds([bounds, *(rows.bounds for rows in limited)], dtype)
+            blocks.append(Rows("task", G, D, steps, box=False))
+            bounds.append(task.bounds(about))
     return replace(
         s,
         A=A,
@@ -327,23 +323,10 @@ def expanded(s: Stages, problem: NonlinearMPC, x: Array, u: Array) -> Stages:
         P=P,
         cross=cross,
         stage=jnp.ones_like(s.stage),
-        H=(*s.H, *(rows.G for rows in limited)),
-        D=(*s.D, *(rows.D for rows in limited)),
-        bounds=bounds,
-        layout=(*s.layout, *(rows.layout for rows in limited)),
-        boxes=(*s.boxes, *(False for _ in limited)),
+        blocks=tuple(blocks),
+        bounds=joined_bounds(bounds, dtype),
         aim=Aim(s.aim.x0, x, u, slopes=(gx, gu)),
     )
-
-
-class TaskRows(NamedTuple):
-    """The limits of a task about a trajectory: their place in the layout, the Jacobians G (steps,
-    p, n) and D (steps, p, m) of its function, and what is asked of G x + D u."""
-
-    layout: tuple[str, tuple[int, ...], int]
-    G: Array
-    D: Array
-    bounds: Bounds
 
 
 def task_layout(problem: NonlinearMPC) -> tuple:
@@ -358,7 +341,7 @@ def curved(
 ) -> Stages:
     """Return the expansion s with the Hessian of the Lagrangian in place of Gauss and Newton's.
 
-    base: `stages` of the MPC; costates λ (N+1, n) of x_0 … x_N; y (rows,) of s.
+    base: `Stages` of the MPC; costates λ (N+1, n) of x_0 … x_N; y (rows,) of s.
     """
     N, n, dtype = s.horizon, s.P.shape[0], s.P.dtype
     hessian = lambda f, *args: jax.jacfwd(jax.grad(f))(*args) / 2

@@ -33,15 +33,13 @@ class Gains(NamedTuple):
     inverse: Array
 
 
-def recurrence(
-    M: Array, w: Array, start: Array, *, adjoint: bool = False, unroll: int = 1
-) -> Array:
+def recurrence(M: Array, w: Array, start: Array, *, adjoint: bool = False) -> Array:
     """y (N, n): y_k = M_k y_{k−1} + w_k for k = 0, 1, … from y_{−1} = start; or, adjoint,
     y_k = M_k' y_{k+1} + w_k for k = N−1, N−2, … from y_N = start.
 
     M (N, n, n), or (n, n) the same at all stages; w (N, n); start (n,).
     """
-    scan = partial(_scan, adjoint=adjoint, unroll=unroll)
+    scan = partial(_scan, adjoint=adjoint)
     return _or_kernel(scan, partial(_recurrence_kernel, adjoint=adjoint), M, w, start)
 
 
@@ -91,7 +89,7 @@ def _or_kernel(scan: Callable, kernel: Callable, *args: Array, lanes: Any = None
     return fast(*args)
 
 
-def _scan(M: Array, w: Array, start: Array, *, adjoint: bool, unroll: int) -> Array:
+def _scan(M: Array, w: Array, start: Array, *, adjoint: bool, unroll: int = 1) -> Array:
     def stage(y: Array, at: tuple) -> tuple[Array, Array]:
         own, w = at
         own = M if own is None else own

@@ -5,7 +5,7 @@ condensed matrices are never formed. A step needs "linear terms on the rows, min
 with its penalties", the LQR problem of `stages.py` with W = diag(ρE²): a backward and a forward
 pass over the stages, where the dense step reads a matrix of (rows)² entries. Newton steps on the
 active rows follow, a Riccati recursion each, and where these do not end at the solution an interior
-point method (`interior_point.py`).
+point method (`newton_steps.py`).
 
 The row scale E of `qp/admm.scale` makes the rows a_i of all inputs one unit long in the metric of
 the Hessian: 1/E_i² = a_i' P⁻¹ a_i. P⁻¹ is the covariance of inputs drawn with density exp(−J): by
@@ -24,30 +24,27 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
-from jaxmpc.arrays import Reals, as_array, host_array
+from jaxmpc.arrays import Reals, all_finite, as_array, host_array
 from jaxmpc.checks import concrete, fail, require_finite, require_kind
-from jaxmpc.mpc.aim import Aim, checked_aim
-from jaxmpc.mpc.plan import Plan, WarmStart, answer
+from jaxmpc.mpc.plan import Aim, Plan, WarmStart, answer, checked_aim
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.rows import layout, row_count
-from jaxmpc.mpc.stagewise.interior_point import INTERIOR_STEPS
-from jaxmpc.mpc.stagewise.recursion_kernels import Gains
-from jaxmpc.mpc.stagewise.semismooth_newton import (
+from jaxmpc.mpc.rows import at, layout, row_count
+from jaxmpc.mpc.stagewise.newton_steps import (
+    INTERIOR_STEPS,
     Search,
     distance,
     stage_conditions,
     stage_newton_step,
 )
+from jaxmpc.mpc.stagewise.recursion_kernels import Gains
 from jaxmpc.mpc.stagewise.stages import (
     Stages,
-    at,
     cleaned,
     measured_pair,
     minimise,
     predict,
     riccati,
     stage_residuals,
-    stages,
     unconstrained,
 )
 from jaxmpc.pytrees import pytree
@@ -180,15 +177,14 @@ class StageFactor:
 @partial(jax.jit, static_argnames="steps")
 @own_modes
 def _factor(mpc: MPC, rho: Any, scale: Any, steps: bool) -> StageFactor:
-    s, fault = cleaned(stages(mpc))
+    s, fault = cleaned(Stages.of(mpc))
     E = row_scale(s) if scale is None else jnp.asarray(scale, s.Q.dtype)
     inputs = s.horizon * s.B.shape[-1]
     rho = default_rho(E, inputs) if rho is None else jnp.asarray(rho, E.dtype)
     rho = jnp.broadcast_to(rho, (rho.shape[0] if rho.ndim == 2 else 1, E.shape[0]))
     gains = jax.lax.map(lambda rho: riccati(s, rho * E**2), rho) if steps else None
     # Finite data can still overflow, or be too near singular for their precision.
-    leaves = jax.tree.leaves((E, gains))
-    sound = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in leaves]))
+    sound = all_finite((E, gains))
     E, gains = jax.tree.map(lambda v: jnp.where(sound, v, 0.0), (E, gains))
     return StageFactor(s, E, rho, gains, jnp.where(sound, fault, jnp.int32(Status.ITERATION_LIMIT)))
 
@@ -209,9 +205,10 @@ def row_scale(s: Stages) -> Array:
     variance, own = [jnp.zeros(0, s.Q.dtype)], [jnp.zeros(0, s.Q.dtype)]
     square = lambda M, V: jnp.sum(matmul(M, V) * M, axis=-1)
     deviation = lambda V: jnp.sqrt(jnp.maximum(jnp.diagonal(V, axis1=-2, axis2=-1), 0.0))
-    for _, steps, _, H, D, _ in s.blocks():
+    for block in s.blocks:
         # H x + D (K x + e), e of covariance G⁻¹.
-        F: Any = 0.0 if H is None else H
+        steps, D = block.steps, block.D
+        F: Any = 0.0 if block.H is None else block.H
         noise: Any = 0.0
         V = at(Sigma, steps)
         if D is not None:
@@ -293,8 +290,7 @@ def full_aim(mpc: MPC, aim: Aim, dtype: DTypeLike) -> Aim:
 def _plan(
     factor: StageFactor, mpc: MPC, solver: ADMM, aim: Aim, warm_start: WarmStart | None
 ) -> Plan:
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(aim)]))
-    fault = jnp.where(finite, factor.fault, jnp.int32(Status.NON_FINITE))
+    fault = jnp.where(all_finite(aim), factor.fault, jnp.int32(Status.NON_FINITE))
     usable = fault == Status.NOT_RUN
     aim = jax.tree.map(lambda v: jnp.where(jnp.isfinite(v), v, 0), aim)
     # Only cost and slack are read from the problem as given.

@@ -27,12 +27,11 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
-from jaxmpc.arrays import Reals
+from jaxmpc.arrays import Reals, all_finite
 from jaxmpc.checks import fail, require_kind, whole
-from jaxmpc.mpc.aim import Aim, checked_aim, checked_array
-from jaxmpc.mpc.plan import Plan, WarmStart, answer
-from jaxmpc.mpc.rows import row_count, split
-from jaxmpc.mpc.stagewise.interior_point import INTERIOR_STEPS
+from jaxmpc.mpc.plan import Aim, Plan, WarmStart, answer, checked_aim, checked_array
+from jaxmpc.mpc.rows import apply, dynamics_terms, row_count, split, spread
+from jaxmpc.mpc.stagewise.newton_steps import INTERIOR_STEPS, Search, stage_conditions
 from jaxmpc.mpc.stagewise.nonlinear import (
     NonlinearMPC,
     all_rows,
@@ -42,7 +41,6 @@ from jaxmpc.mpc.stagewise.nonlinear import (
     total_cost,
 )
 from jaxmpc.mpc.stagewise.recursion_kernels import recurrence
-from jaxmpc.mpc.stagewise.semismooth_newton import Search, stage_conditions
 from jaxmpc.mpc.stagewise.solve import (
     NEWTON_STEPS,
     StageFactor,
@@ -53,15 +51,11 @@ from jaxmpc.mpc.stagewise.solve import (
 )
 from jaxmpc.mpc.stagewise.stages import (
     Stages,
-    apply,
     cleaned,
-    dynamics_terms,
     measured_pair,
     predict,
     riccati,
-    spread,
     stage_residuals,
-    stages,
 )
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, default_rho, scaled_multipliers
@@ -128,7 +122,7 @@ def solve_nonlinear(
         fail("hessian", f"{hessian!r}", 'Give "exact" or "gauss-newton"')
     if solver.differentiate != "implicit" and iterations > 1:
         fail("solver.differentiate", f"{solver.differentiate!r}", 'With iterations > 1: "implicit"')
-    s = jax.eval_shape(stages, mpc)
+    s = jax.eval_shape(Stages.of, mpc)
     aim = full_aim(mpc, checked_aim(mpc, x0, reference, input_reference), s.P.dtype)
     aim = aim._replace(targets=_full_targets(problem, targets, s.P.dtype))
     rows = (*s.layout, *task_layout(problem))
@@ -169,10 +163,9 @@ def _solve(
     iterations: int,
     hessian: str,
 ) -> Plan:
-    base, fault = cleaned(stages(problem.mpc))
+    base, fault = cleaned(Stages.of(problem.mpc))
     numbers = (aim, [(task.weight, task.rho) for task in problem.tasks])
-    finite = [jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(numbers)]
-    fault = jnp.where(jnp.all(jnp.stack(finite)), fault, jnp.int32(Status.NON_FINITE))
+    fault = jnp.where(all_finite(numbers), fault, jnp.int32(Status.NON_FINITE))
     usable = fault == Status.NOT_RUN
     base = replace(base, aim=jax.tree.map(lambda v: jnp.where(usable, v, 0), aim))
     eps = tolerance(solver, base.P.dtype)

@@ -21,12 +21,21 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from jaxmpc.mpc.aim import Aim
-from jaxmpc.mpc.problem import MPC, weights_of
-from jaxmpc.mpc.rows import Layout, blocks, bounds_of, layout_of
+from jaxmpc.mpc.plan import Aim
+from jaxmpc.mpc.problem import MPC, dynamics_of, weights_of
+from jaxmpc.mpc.rows import (
+    Layout,
+    Rows,
+    apply,
+    apply_transposed,
+    blocks,
+    bounds_of,
+    layout_of,
+    split,
+    spread,
+)
 from jaxmpc.mpc.stagewise.recursion_kernels import Gains, recurrence, riccati_recursion, tracking
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.admm import convex
@@ -43,11 +52,8 @@ class Stages:
     A (n, n), B (n, m), c (n,), or with a leading axis N. Q, R, P: weights, without ½; P of x_N; Q
     and R may have a leading axis N; cross M (N, m, n): of the term 2 u'M x, None for zero; stage
     (N,): weights of the stages, of all three.
-    H (r, n) and D (r, m) of each block of rows (`rows.blocks`), or one a step of the block, None
-    for zero; D does not count at step N, which has no input. bounds: what is asked of the
-    rows (rows,). layout: (kind, steps, rows a step) of each block; boxes: whether its
-    matrix is the identity. aim: where a plan begins and what it tracks, with full references; none
-    of it until it is known.
+    blocks, bounds: the rows of `rows.blocks`, and what is asked of all of them (rows,). aim: where
+    a plan begins and what it tracks, with full references; none of it until it is known.
     """
 
     A: Array
@@ -57,49 +63,42 @@ class Stages:
     R: Array
     P: Array
     stage: Array
-    H: tuple[Any, ...]
-    D: tuple[Any, ...]
+    blocks: tuple[Rows, ...]
     bounds: Bounds
-    layout: Layout = static()
-    boxes: tuple[bool, ...] = static()
     horizon: int = static()
     cross: Array | None = None
     aim: Aim = Aim(None)
 
-    def blocks(self) -> list[tuple[slice, tuple[int, ...], int, Any, Any, bool]]:
-        """(its rows, steps, rows a step, H, D, whether that is the identity) of each block."""
-        found, first = [], 0
-        for (_, steps, size), H, D, box in zip(
-            self.layout, self.H, self.D, self.boxes, strict=True
-        ):
-            last = first + len(steps) * size
-            found.append((slice(first, last), steps, size, H, D, box))
-            first = last
-        return found
+    @classmethod
+    def of(cls, mpc: MPC) -> "Stages":
+        """Return the data of `mpc`. Works inside jit, vmap and grad."""
+        dtype = floating_dtype(mpc)
+        A, B, c = dynamics_of(mpc.system, dtype)
+        Q, R, P, _, stage = weights_of(mpc, dtype)
+        found = blocks(mpc, dtype)
+        rows = tuple(Rows(b.kind, b.H, b.D, b.steps, b.box) for b in found)
+        return cls(A, B, c, Q, R, P, stage, rows, bounds_of(found, dtype), mpc.horizon)
+
+    @property
+    def layout(self) -> Layout:
+        """(kind, steps, rows a step) of each block."""
+        return layout_of(self.blocks)
+
+    def by_block(self, v: Array) -> list[tuple[Rows, Array]]:
+        """Each block with its part (steps, rows a step) of v (rows,)."""
+        return list(zip(self.blocks, split(self.layout, v), strict=True))
 
     def rows(self, x: Array, u: Array) -> Array:
         """H x_k + D u_k of all blocks (rows,) along x (N+1, n), u (N, m)."""
-        parts = [jnp.zeros(0, x.dtype)]
-        for _, steps, _, H, D, box in self.blocks():
-            value: Any = 0.0
-            for M, v in ((H, x), (D, u)):
-                if M is not None:
-                    v = at(v, steps)
-                    value = value + (v if box else apply(M, v))
-            parts.append(value.ravel())
-        return jnp.concatenate(parts)
+        values = [block.values(x, u).ravel() for block in self.blocks]
+        return jnp.concatenate([jnp.zeros(0, x.dtype), *values])
 
     def pull(self, weights: Array) -> tuple[Array, Array]:
         """Σ weights·(gradient of the row) in x (N+1, n) and u (N, m): the transpose of `rows`."""
         N, n, m = self.horizon, self.A.shape[-1], self.B.shape[-1]
-        gx: Any = jnp.zeros((N + 1, n), weights.dtype)
-        gu: Any = jnp.zeros((N, m), weights.dtype)
-        for rows, steps, size, H, D, box in self.blocks():
-            w = weights[rows].reshape(len(steps), size)
-            if H is not None:
-                gx = gx + spread(w if box else apply_transposed(H, w), steps, N + 1)
-            if D is not None:
-                gu = gu + spread(w if box else apply_transposed(D, w), steps, N)
+        gx, gu = jnp.zeros((N + 1, n), weights.dtype), jnp.zeros((N, m), weights.dtype)
+        for block, w in self.by_block(weights):
+            gx, gu = block.pull(w, gx, gu)
         return gx, gu
 
     def gradient(self, x: Array, u: Array) -> tuple[Array, Array]:
@@ -118,70 +117,6 @@ class Stages:
         return [v if v.ndim > dimensions else None for v, dimensions in values]
 
 
-def consecutive(steps: tuple[int, ...]) -> bool:
-    """Return whether the steps are k, k + 1, …"""
-    return bool(steps) and steps == tuple(range(steps[0], steps[0] + len(steps)))
-
-
-def at(v: Array, steps: tuple[int, ...]) -> Array:
-    """Return v_k at the steps, zero at the one after the last of v."""
-    if max(steps, default=0) == len(v):
-        v = jnp.pad(v, ((0, 1), *[(0, 0)] * (v.ndim - 1)))
-    if consecutive(steps):
-        return v[steps[0] : steps[0] + len(steps)]
-    return v[np.array(steps, int)]
-
-
-def spread(part: Array, steps: tuple[int, ...], length: int) -> Array:
-    """Return the array of so many steps that is `part` at the steps and zero elsewhere; a part at
-    the step after the last is left out."""
-    if max(steps, default=0) == length:
-        return spread(part, steps, length + 1)[:-1]
-    if consecutive(steps):
-        ends = (steps[0], length - steps[0] - len(steps))
-        return jnp.pad(part, (ends, *[(0, 0)] * (part.ndim - 1)))
-    return jnp.zeros((length, *part.shape[1:]), part.dtype).at[np.array(steps, int)].add(part)
-
-
-def apply(M: Array, v: Array) -> Array:
-    """Return M_k v_k, or M v_k, for all steps: M (N, a, b) or (a, b), v (N, b)."""
-    return matmul(v, M.T) if M.ndim == 2 else matmul(M, v[..., None])[..., 0]
-
-
-def apply_transposed(M: Array, v: Array) -> Array:
-    """Return M_k'v_k, or M'v_k, for all steps."""
-    return matmul(v, M) if M.ndim == 2 else matmul(v[..., None, :], M)[..., 0, :]
-
-
-def dynamics_terms(A: Array, B: Array, c: Array, x: Array, u: Array) -> Array:
-    """Return |A||x_k| + |B||u_k| + |c| (N, n), what x_{k+1} is made of."""
-    return apply(jnp.abs(A), jnp.abs(x[:-1])) + apply(jnp.abs(B), jnp.abs(u)) + jnp.abs(c)
-
-
-def stages(mpc: MPC) -> Stages:
-    """Return the data of `mpc`. Works inside jit, vmap and grad."""
-    system, n = mpc.system, mpc.system.n
-    dtype = floating_dtype(mpc)
-    weights = weights_of(mpc, dtype)
-    cast = lambda v: jnp.asarray(v, dtype)
-    found = blocks(mpc, dtype)
-    return Stages(
-        A=cast(system.A),
-        B=cast(system.B),
-        c=jnp.zeros(n, dtype) if system.c is None else cast(system.c),
-        Q=weights.Q,
-        R=weights.R,
-        P=weights.P,
-        stage=weights.stage,
-        H=tuple(b.H for b in found),
-        D=tuple(b.D for b in found),
-        bounds=bounds_of(found, dtype),
-        layout=layout_of(found),
-        boxes=tuple(b.box for b in found),
-        horizon=mpc.horizon,
-    )
-
-
 def cleaned(s: Stages) -> tuple[Stages, Array]:
     """The data with harmless numbers in place of those that are not usable, and the fault in them
     (see `qp.solve.cleaned`): NOT_RUN for none, NON_CONVEX where Q, R or P is indefinite.
@@ -189,7 +124,7 @@ def cleaned(s: Stages) -> tuple[Stages, Array]:
     Each array by itself: what a batch shares is read and cleaned once, whatever its instances hold.
     """
     everywhere = lambda *tests: jnp.all(jnp.stack([jnp.all(test) for test in tests]))
-    numbers = jax.tree.leaves((s.A, s.B, s.c, s.Q, s.R, s.P, s.stage, s.H, s.D))
+    numbers = jax.tree.leaves((s.A, s.B, s.c, s.Q, s.R, s.P, s.stage, s.blocks))
     lower, upper = s.bounds.l, s.bounds.u
     ordered = (lower <= upper) & ~jnp.isposinf(lower) & ~jnp.isneginf(upper)
     tests = [*map(jnp.isfinite, numbers), ordered]
@@ -218,8 +153,7 @@ def cleaned(s: Stages) -> tuple[Stages, Array]:
         R=R,
         P=P,
         stage=jnp.where(positive, s.stage, 1.0),
-        H=finite(s.H),
-        D=finite(s.D),
+        blocks=finite(s.blocks),
         bounds=Bounds(lower, upper, linear, quadratic),
     )
     return harmless, fault
@@ -231,8 +165,8 @@ def riccati(s: Stages, weights: Any = None) -> Gains:
     Q = 2 * jnp.concatenate([stage * s.Q, s.P[None]])
     R = 2 * stage * s.R
     cross = None if s.cross is None else 2 * stage * s.cross
-    for rows, steps, size, H, D, box in s.blocks() if weights is not None else ():
-        w = weights[rows].reshape(len(steps), size)
+    for block, w in () if weights is None else s.by_block(weights):
+        H, D, steps, box = block.H, block.D, block.steps, block.box
         diagonal = lambda w: w[:, :, None] * jnp.eye(w.shape[1], dtype=w.dtype)
         form = lambda M, L, w=w: matmul(jnp.swapaxes(M, -1, -2) * w[:, None, :], L)
         if H is not None:
@@ -250,13 +184,6 @@ def minimise(s: Stages, gains: Gains, gx: Array, gu: Array, unroll: int = 1) -> 
     return tracking(gains, s.A, s.B, gx, gu, unroll)
 
 
-def follow(gains: Gains, x0: Array, w: Array, unroll: int = 1) -> Array:
-    """x (N+1, n) of x⁺ = (A + BK) x + w from x0 (n,), w (N, n)."""
-
-    x = recurrence(gains.closed, w, x0, unroll=unroll)
-    return jnp.concatenate([x0[None], x])
-
-
 def predict(s: Stages, u: Array) -> Array:
     """x (N+1, n) from x_0 under the inputs u (N, m)."""
     x0 = s.aim.x0
@@ -267,7 +194,8 @@ def predict(s: Stages, u: Array) -> Array:
 def unconstrained(s: Stages, gains: Gains, weights: Array) -> tuple[Array, Array]:
     """x, u of least cost with the penalties ½ Σ weights·row²."""
     # From a trajectory that the gains keep bounded, one minimisation of what is left.
-    x = follow(gains, s.aim.x0, jnp.broadcast_to(s.c, (s.horizon, s.c.shape[-1])))
+    x0, c = s.aim.x0, jnp.broadcast_to(s.c, (s.horizon, s.c.shape[-1]))
+    x = jnp.concatenate([x0[None], recurrence(gains.closed, c, x0)])
     u = apply(gains.K, x[:-1])
     moved = jax.tree.map(jnp.add, s.gradient(x, u), s.pull(weights * s.rows(x, u)))
     dx, du = minimise(s, gains, -moved[0], -moved[1])
@@ -332,7 +260,7 @@ def stage_residuals(s: Stages, u: Array, y: Array) -> Terms:
     size = size + jnp.sum(jnp.abs(u) * found.gradient_size)
 
     def most(v: Array) -> Array:
-        parts = [v[rows].reshape(len(steps), size) for rows, steps, size, *_ in s.blocks()]
+        parts = split(s.layout, v)
         largest = [jnp.max(part, axis=0, initial=0.0) for part in parts]
         pairs = zip(parts, largest, strict=True)
         return jnp.concatenate([*(jnp.broadcast_to(m, p.shape).ravel() for p, m in pairs), v[:0]])
