@@ -238,7 +238,7 @@ class Model:
         matrix.format_ = highspy.MatrixFormat.kColwise
         matrix.start_, matrix.index_, matrix.value_ = sparse.indptr, sparse.indices, sparse.data
         self.size, self.equal, self._alone = (rows, n), equal, threading.Lock()
-        self.highs = highspy.Highs()
+        self.highs = highspy._Highs()  # `Highs`, made of it, prints a banner when it is made
         # On ill-conditioned data HiGHS may cycle: its steps are limited.
         steps = 1000 + 20 * (rows + n)
         limits = {"simplex_iteration_limit": steps, "ipm_iteration_limit": steps}

@@ -16,3 +16,21 @@ def test_bound_is_valid_for_inexact_multipliers():
         y = np.abs(top.y + size * random.standard_normal(4))
         above = lp.bound(d, y, rows, g, np.ones(2))
         assert 3 - 1e-15 <= above <= 3 + 10 * size + 1e-12
+
+
+def test_solver_prints_nothing(capfd):
+    rows = np.vstack([np.eye(2), -np.eye(2)])
+    lp.maximise(np.ones(2), rows, np.ones(4))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_programs_begin_where_the_last_one_ended_and_end_where_they_would():
+    random = np.random.default_rng(0)
+    rows, sides = random.standard_normal((30, 5)), random.uniform(1, 2, 30)
+    rows, sides = np.vstack([rows, np.eye(5), -np.eye(5)]), np.append(sides, np.full(10, 9.0))
+    program = lp.Program(rows, sides)
+    for d in random.standard_normal((40, 5)):
+        one, alone = program.maximise(d), lp.maximise(d, rows, sides)
+        assert one.value == pytest.approx(alone.value, rel=1e-12)
+        np.testing.assert_allclose(one.x, alone.x, atol=1e-11)
+        np.testing.assert_allclose(one.y @ rows, d, atol=1e-12)
