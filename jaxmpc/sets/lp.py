@@ -238,7 +238,8 @@ class Model:
         matrix.format_ = highspy.MatrixFormat.kColwise
         matrix.start_, matrix.index_, matrix.value_ = sparse.indptr, sparse.indices, sparse.data
         self.size, self.equal, self._alone = (rows, n), equal, threading.Lock()
-        self.highs = highspy._Highs()  # `Highs`, made of it, prints a banner when it is made
+        # (Its subclass `Highs` prints a banner when it is made.)
+        self.highs = highspy._Highs()  # type: ignore[attr-defined]
         # On ill-conditioned data HiGHS may cycle: its steps are limited.
         steps = 1000 + 20 * (rows + n)
         limits = {"simplex_iteration_limit": steps, "ipm_iteration_limit": steps}
