@@ -94,7 +94,7 @@ def test_one_bad_reading_is_forgotten_after_one_sample(tmp_path):
 
 @pytest.mark.parametrize("name", ["axisX0", "VERSION2", "NAMEs", "X0", "mpc"])
 def test_names_that_hold_words_of_the_templates(name, tmp_path):
-    export_c(pendulum(horizon=2), tmp_path, jm.ADMM(iterations=4, newton_steps=0), name=name)
+    export_c(CASES["all"][0](), tmp_path, jm.ADMM(iterations=4, newton_steps=0), name=name)
     command = [COMPILERS[0], *STRICT, f"{name}.c", f"{name}_example.c", "-lm", "-o", "example"]
     subprocess.run(command, cwd=tmp_path, check=True)
 
@@ -104,7 +104,7 @@ def test_names_of_headers_are_refused(tmp_path):
         export_c(pendulum(), tmp_path, name="math")
 
 
-@pytest.mark.parametrize("case", ["rates", "explicit"])
+@pytest.mark.parametrize("case", ["all", "explicit"])
 def test_fast_math_does_not_compile(case, tmp_path):
     exported(case, tmp_path, "float64")
     for option in ("-ffast-math", "-ffinite-math-only"):

@@ -23,6 +23,11 @@ def exact_form(mpc, extent):
     return exact_data(mpc, make_view(mpc), hard_blocks(mpc), extent)
 
 
+def prover(problem):
+    """The prover of feasible states, compiled once: (x, inputs) → (proved, inputs)."""
+    return jax.jit(lambda x, u: proofs.prove_feasible(problem, x, x[:0], u))
+
+
 class TestProofs:
     """The two provers on their own, fed with what no solver would give."""
 
@@ -40,7 +45,7 @@ class TestProofs:
             y[:100] = np.maximum(y[:100], 0)
             cut = lambda a, b: proofs.cut(self.problem, a, b, jnp.zeros(0))
             everywhere = lambda a, b: proofs.everywhere(self.problem, *cut(a, b))
-            normals, offsets = jax.vmap(everywhere)(y, y_N)
+            normals, offsets = jax.jit(jax.vmap(everywhere))(y, y_N)
         finite = np.flatnonzero(np.isfinite(offsets))
         assert len(finite) > 100
         for i in finite:
@@ -48,9 +53,10 @@ class TestProofs:
 
     def test_zero_and_nan_multipliers_say_nothing(self):
         with enable_x64(True):
+            cut = jax.jit(lambda y, y_N: proofs.cut(self.problem, y, y_N, jnp.zeros(0)))
             for fill in (0.0, np.nan, np.inf):
                 y, y_N = np.full((4, 5), fill), np.full(2, fill)
-                _, b, *_ = proofs.cut(self.problem, y, y_N, np.zeros(0))
+                _, b, *_ = cut(y, y_N)
                 assert b == np.inf
 
     @pytest.mark.slow
@@ -58,7 +64,7 @@ class TestProofs:
         """Random inputs, beyond their limits too, from random states."""
         rng = np.random.default_rng(1)
         x0s, plans = rng.uniform(-1.2, 1.2, (4000, 2)), rng.uniform(-0.6, 0.6, (4000, 4, 2))
-        prove = jax.vmap(lambda x, u: proofs.prove_feasible(self.problem, x, x[:0], u))
+        prove = jax.vmap(prover(self.problem))
         with enable_x64(True):
             proved, clipped = map(np.asarray, prove(x0s, plans))
         assert proved.sum() > 50
@@ -69,19 +75,20 @@ class TestProofs:
 
     def test_nan_inputs_prove_nothing(self):
         with enable_x64(True):
+            prove = prover(self.problem)
             for plan in (np.full((4, 2), np.nan), np.where(np.eye(4, 2), np.nan, 0.0)):
-                proved, _ = proofs.prove_feasible(self.problem, np.zeros(2), np.zeros(0), plan)
+                proved, _ = prove(np.zeros(2), plan)
                 assert not proved
 
     def test_margin_of_one_rounding(self):
         """Ties: x_N exactly on its limit in rationals must not be proved wrongly."""
         mpc = problems.scalar(a=1.0, horizon=3, x_max=None, u_max=0.1, terminal=0.3)
-        problem = exact_form(mpc, np.ones(1))
+        prove = prover(exact_form(mpc, np.ones(1)))
         with enable_x64(True):
             for ulps in range(-40, 41, 4):
                 x0 = np.array([0.6 + ulps * 2.0**-53])
                 plan = np.full((3, 1), -0.1)
-                proved, clipped = proofs.prove_feasible(problem, x0, x0[:0], plan)
+                proved, clipped = prove(x0, plan)
                 if proved:
                     assert exact.keeps_all_rows(mpc, x0, clipped)
 

@@ -45,11 +45,11 @@ def test_plans_are_those_of_solve(plans, states):
 
 def test_a_state_with_nan_is_marked_and_changes_nothing_else(states):
     mpc = problems.joint_o_inf(10)
-    clean = jm.solve_many(mpc, states[:50], chunk=50)
-    spoilt = states[:50].copy()
+    clean = jm.solve_many(mpc, states[:200], chunk=200)  # the program of `plans`
+    spoilt = states[:200].copy()
     spoilt[7] = np.nan
-    dirty = jm.solve_many(mpc, spoilt, chunk=50)
-    others = np.arange(50) != 7
+    dirty = jm.solve_many(mpc, spoilt, chunk=200)
+    others = np.arange(200) != 7
     assert dirty.status[7] == jm.Status.NON_FINITE
     assert np.isnan(dirty.inputs[7]).all() and np.isnan(dirty.cost[7])
     np.testing.assert_array_equal(clean.inputs[others], dirty.inputs[others])
@@ -71,7 +71,7 @@ def test_no_states_and_wrong_shapes():
 def test_solved_and_sentence(states):
     """Of one plan, and of many: one truth value each, and a print of a few lines."""
     mpc = problems.joint_o_inf(10)
-    plans = jm.solve_many(mpc, states[:3])
+    plans = jm.solve_many(mpc, states[:3], chunk=1)
     np.testing.assert_array_equal(plans.solved, plans.status == jm.Status.SOLVED)
     plan = jm.solve(mpc, np.array([0.1, 0.0]))
     assert plan.solved and plan.sentence == jm.Status.SOLVED.sentence

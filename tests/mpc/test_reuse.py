@@ -42,7 +42,7 @@ def states():
 
 @pytest.fixture(scope="module")
 def solved(mpc, states):
-    return jm.solve_many(mpc, states, transfer=False)
+    return jm.solve_many(mpc, states, transfer=False, chunk=64)  # a program of the tests below
 
 
 def same_plans(found, expected, tolerance=1e-6):

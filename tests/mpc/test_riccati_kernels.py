@@ -33,8 +33,8 @@ def test_kernels_equal_the_scans(staged):
     rng = np.random.default_rng(3)
     Q, R, A, B, gx, gu = batch(rng, 3, 5, 2, staged)
     both = lambda scan, kernel, *args, **options: (
-        jax.vmap(lambda *a: kernel(*a, **options))(*args),
-        jax.vmap(lambda *a: scan(*a, **options))(*args),
+        jax.jit(jax.vmap(lambda *a: kernel(*a, **options)))(*args),
+        jax.jit(jax.vmap(lambda *a: scan(*a, **options)))(*args),
     )
     found, gains = both(kernels._riccati_scan, kernels._riccati_kernel, Q, R, A, B)
     close(found, gains)
@@ -53,17 +53,17 @@ def test_a_batch_side_by_side_is_the_scan(staged):
         Q, R, A, B = (jnp.asarray(v, jnp.float64) for v in problems)
         last = lambda v: jnp.moveaxis(v, 0, -1)
         first = lambda v: jnp.moveaxis(v, -1, 0)
-        scan = jax.vmap(lambda *v: kernels._riccati_scan(*v))
-        own = lambda *v: jax.tree.map(first, kernels._riccati_lanes(*map(last, v)))
+        scan = jax.jit(jax.vmap(lambda *v: kernels._riccati_scan(*v)))
+        own = jax.jit(lambda *v: jax.tree.map(first, kernels._riccati_lanes(*map(last, v))))
         chosen = lambda Q, R, A, B: kernels.riccati_recursion(Q, R, None, A, B)
-        nested = jax.vmap(jax.vmap(chosen, (0, 0, None, 0)), (None, None, 0, None))
-        expected = jax.vmap(lambda A: scan(Q, R, jnp.stack([A, A]), B))(A)
+        nested = jax.jit(jax.vmap(jax.vmap(chosen, (0, 0, None, 0)), (None, None, 0, None)))
+        expected = jax.jit(jax.vmap(lambda A: scan(Q, R, jnp.stack([A, A]), B)))(A)
         for found, wanted in (
             (own(Q, R, A, B), scan(Q, R, A, B)), (nested(Q, R, A, B), expected)
         ):  # fmt: skip
             for a, b in zip(found, wanted, strict=True):
                 np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
-        slope = lambda of: jax.grad(lambda A: jnp.sum(of(Q, R, A, B).K ** 3))(A)
+        slope = lambda of: jax.jit(jax.grad(lambda A: jnp.sum(of(Q, R, A, B).K ** 3)))(A)
         np.testing.assert_allclose(slope(jax.vmap(chosen)), slope(scan), rtol=1e-10)
 
 

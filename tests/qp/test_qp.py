@@ -71,16 +71,24 @@ def as32(qp: jm.QP) -> jm.QP:
 
 
 def solve_small(qp: jm.QP):
-    """`jm.solve_qp` from plain Python, of a program with up to 3 variables and 4 rows: filled up by
-    variables that no row holds and rows that hold nothing, so that all of them share a program."""
-    (m, n), (rows, variables) = qp.A.shape, (4, 3)
+    """`jm.solve_qp` from plain Python, of a program with up to 3 variables and 4 rows."""
+    return solve_filled(qp, 3, 4, jm.solve_qp)
+
+
+def solve_fine(qp: jm.QP):
+    """`solve` to fine tolerances, of a program with up to 8 variables and 19 rows."""
+    return solve_filled(qp, 8, 19, lambda qp: solve(qp, FINE))
+
+
+def solve_filled(qp: jm.QP, variables: int, rows: int, solve):
+    """Fill up by variables that no row holds and rows that hold nothing, so that programs of many
+    shapes are compiled once."""
+    m, n = qp.A.shape
     P, A = np.eye(variables), np.zeros((rows, variables))
     P[:n, :n], A[:m, :n] = qp.P, qp.A
     free = np.full(rows - m, INF)
-    sol = jm.solve_qp(
-        jm.QP(P, np.append(qp.q, np.zeros(variables - n)), A, np.append(qp.l, -free),
-              np.append(qp.u, free))
-    )  # fmt: skip
+    q = np.append(qp.q, np.zeros(variables - n))
+    sol = solve(jm.QP(P, q, A, np.append(qp.l, -free), np.append(qp.u, free)))
     sol = jax.tree.map(np.asarray, sol)
     return replace(sol, z=sol.z[:n], ray=sol.ray[:n], y=sol.y[:m], certificate=sol.certificate[:m])
 
@@ -103,7 +111,7 @@ class TestKnownAnswers:
             np.testing.assert_allclose(sol.z, z, atol=1e-8 * (1 + np.abs(z).max()))
             np.testing.assert_allclose(sol.y, y, atol=1e-6)
 
-    @pytest.mark.parametrize("n", [1, 5, 20])
+    @pytest.mark.parametrize("n", [8, 1, 5, 20])
     @pytest.mark.first(1)
     def test_singular_hessian(self, x64, n):
         """Half of the directions have no curvature: only the active rows fix them."""
@@ -144,7 +152,7 @@ class TestKnownAnswers:
             np.testing.assert_allclose(sol.y, y, atol=2e-2)
 
     def test_default_settings_solve_most(self, x64):
-        status = [solve(constructed(10, seed)[0]).status for seed in range(20)]
+        status = [solve(constructed(6, seed)[0]).status for seed in range(20)]
         assert np.mean(np.array(status) == jm.Status.SOLVED) >= 0.9
 
     @pytest.mark.slow
@@ -196,12 +204,14 @@ class TestKnownAnswers:
             assert sol.status != jm.Status.PRIMAL_INFEASIBLE
 
     def test_duplicate_and_redundant_rows(self, x64):
-        qp, z, _ = constructed(5, 2)
+        qp, z, _ = constructed(2, 2)  # 7 rows, of which some hold nothing
+        some = np.argsort(np.isinf(qp.l) & np.isinf(qp.u), stable=True)[:5]
         twice = replace(
-            qp, A=np.vstack([qp.A, qp.A, 2 * qp.A]), l=np.concatenate([qp.l, qp.l, 2 * qp.l]),
-            u=np.concatenate([qp.u, qp.u, 2 * qp.u]),
+            qp, A=np.vstack([qp.A, qp.A, 2 * qp.A[some]]),
+            l=np.concatenate([qp.l, qp.l, 2 * qp.l[some]]),
+            u=np.concatenate([qp.u, qp.u, 2 * qp.u[some]]),
         )  # fmt: skip
-        sol = jm.solve_qp(twice, FINE)
+        sol = solve_fine(twice)
         assert sol.status == jm.Status.SOLVED
         np.testing.assert_allclose(sol.z, z, atol=1e-7)
 
@@ -267,7 +277,7 @@ class TestFromQpsolvers:
 
     def test_bounds_only_above(self, x64):
         qp = jm.QP.from_qpsolvers(np.eye(2), [-2, -2], ub=[1, 5])
-        np.testing.assert_allclose(jm.solve_qp(qp, FINE).z, [1, 2], atol=1e-9)
+        np.testing.assert_allclose(solve_fine(qp).z, [1, 2], atol=1e-9)
 
 
 class TestResiduals:
@@ -301,7 +311,7 @@ class TestResiduals:
     def test_multiplier_sign(self, x64):
         """min ½(z − 3)² over |z| ≤ 1: y = 2 pushes down from above; mirrored below."""
         for side in (1.0, -1.0):
-            sol = jm.solve_qp(box(1, q=np.array([-3 * side])), FINE)
+            sol = solve_fine(box(1, q=np.array([-3 * side])))
             np.testing.assert_allclose([sol.z[0], sol.y[0]], [side, 2 * side], atol=1e-8)
 
 
@@ -404,7 +414,7 @@ class TestHonestStatus:
             A = np.vstack([np.eye(5), a])
             l = np.append(-np.ones(5), np.abs(a).sum() + gap)
             u = np.append(np.ones(5), INF)
-            sol = solve(jm.QP(np.eye(5), rng.standard_normal(5), A, l, u), FINE)
+            sol = solve_fine(jm.QP(np.eye(5), rng.standard_normal(5), A, l, u))
             if gap < 0:
                 assert sol.status == jm.Status.SOLVED
             else:
@@ -521,7 +531,7 @@ class TestBatches:
         solve = jax.jit(chex.assert_max_traces(lambda qp: jm.solve_qp(qp).z, n=1))
         for seed in range(3):
             qp, _, _ = constructed(5, seed)
-            solve(jm.QP(qp.P, qp.q, qp.A, qp.l, qp.u))
+            solve.trace(jm.QP(qp.P, qp.q, qp.A, qp.l, qp.u))
 
 
 class TestFloat32:
@@ -585,7 +595,7 @@ class TestHardPrograms:
         """min |z|²/2, x ± s y ≤ −1: both rows push with 1/2 at (−1, 0)."""
         A = np.array([[1.0, s], [1.0, -s]])
         qp = jm.QP(np.eye(2), np.zeros(2), A, np.full(2, -np.inf), -np.ones(2))
-        found = jm.solve_qp(qp)
+        found = solve_small(qp)
         assert found.status == jm.Status.SOLVED
         np.testing.assert_allclose(found.z, [-1.0, 0.0], atol=1e-7)
 
@@ -595,7 +605,7 @@ class TestHardPrograms:
         q = np.array([-1.0, 0.5])
         for p in 10.0 ** np.arange(-10, 3):
             for size in 10.0 ** np.arange(-2, 7, 2):
-                found = jm.solve_qp(replace(box(2), P=p * np.eye(2), q=size * q))
+                found = solve_small(replace(box(2), P=p * np.eye(2), q=size * q))
                 assert found.status == jm.Status.SOLVED, (p, size)
                 np.testing.assert_allclose(found.z, np.clip(-size * q / p, -1, 1), atol=1e-9)
 

@@ -284,7 +284,7 @@ def test_retract_and_difference_are_mujocos(mixed):
 
 def test_coordinates_and_state_are_inverse(quadrotor, arm2):
     x, _ = draw(quadrotor, 10)
-    back = jax.vmap(lambda x: quadrotor.state(quadrotor.coordinates(x)))(x)
+    back = jax.jit(jax.vmap(lambda x: quadrotor.state(quadrotor.coordinates(x))))(x)
     same = np.sign(np.sum(np.asarray(back)[:, 3:7] * x[:, 3:7], axis=1, keepdims=True))
     x[:, 3:7] *= same  # q and −q are one orientation
     np.testing.assert_allclose(back, x, atol=1e-13)
