@@ -181,7 +181,7 @@ class TestAnotherSolver:
         np.testing.assert_allclose(plan.cost, cost, rtol=1e-6)
 
     @pytest.mark.parametrize("name", CASES)
-    @pytest.mark.first(2)
+    @pytest.mark.first(1)
     def test_optimality(self, name):
         """KKT of the stacked problem: costates recovered by the adjoint leave no gradient in u."""
         mpc, x0 = CASES[name](), start(name)
@@ -290,27 +290,22 @@ class TestPrestabilising:
 
 
 class TestReferences:
-    @pytest.mark.parametrize(
-        "name", [pytest.param("drifting", marks=pytest.mark.slow), "hidden product", "unstable"]
-    )
+    @pytest.mark.parametrize("moving", [True, False], ids=["moving", "constant"])
+    @pytest.mark.parametrize("name", ["hidden product", "drifting", "unstable"])
     @pytest.mark.first(1)
-    def test_tracking(self, name):
+    def test_tracking(self, name, moving):
         """Cost Σ (x − r)'Q(x − r) + u'Ru + …, with the states kept, by another solver."""
         mpc, x0 = CASES[name](), start(name)
-        stacked = Stacked(mpc)
-        rng = np.random.default_rng(0)
-        for shape in ((mpc.system.n,), (mpc.horizon + 1, mpc.system.n)):
-            reference = 0.3 * rng.standard_normal(shape)
-            r = np.zeros(stacked.size)
-            r[: stacked.states] = np.broadcast_to(
-                reference, (mpc.horizon + 1, mpc.system.n)
-            ).ravel()
-            cost, v = stacked.solve(x0, linear=-2 * stacked.W @ r)
-            plan = jm.solve(mpc, x0, reference=reference, solver=FINE)
-            assert plan.status == jm.Status.SOLVED
-            got = np.concatenate([np.ravel(plan.states), np.ravel(plan.inputs)])
-            np.testing.assert_allclose(got, v, atol=1e-5)
-            np.testing.assert_allclose(plan.cost, cost + r @ stacked.W @ r, rtol=1e-6)
+        stacked, n, N = Stacked(mpc), mpc.system.n, mpc.horizon
+        reference = 0.3 * np.random.default_rng(0).standard_normal((N + 1, n) if moving else n)
+        r = np.zeros(stacked.size)
+        r[: stacked.states] = np.broadcast_to(reference, (N + 1, n)).ravel()
+        cost, v = stacked.solve(x0, linear=-2 * stacked.W @ r)
+        plan = jm.solve(mpc, x0, reference=reference, solver=FINE)
+        assert plan.status == jm.Status.SOLVED
+        got = np.concatenate([np.ravel(plan.states), np.ravel(plan.inputs)])
+        np.testing.assert_allclose(got, v, atol=1e-5)
+        np.testing.assert_allclose(plan.cost, cost + r @ stacked.W @ r, rtol=1e-6)
 
     @pytest.mark.slow
     def test_zero_reference_is_none(self):
@@ -398,6 +393,7 @@ class TestManyStates:
         found = np.asarray(plans.status)
         assert {jm.Status.SOLVED, jm.Status.PRIMAL_INFEASIBLE} <= set(found)
 
+    @pytest.mark.slow
     def test_bad_states_stay_alone(self):
         mpc = problems.lecture()
         x0s = np.random.default_rng(0).uniform(-0.5, 0.5, (6, 2))

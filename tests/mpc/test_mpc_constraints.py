@@ -361,16 +361,22 @@ ACTIVE = {
 COUNT = 14
 
 
-@functools.cache
-def batch(name):
-    """(Explicit, states, previous inputs, references, input references, plans), solved once."""
-    mpc = PROBLEMS[name]()
+def instances(mpc):
+    """States, previous inputs, references and input references."""
     n, m, N = mpc.system.n, mpc.system.m, mpc.horizon
     rng = np.random.default_rng(11)
     x0 = rng.uniform(-1, 1, (COUNT, n)) * np.linspace(0.2, 1.0, COUNT)[:, None]
     previous = rng.uniform(-0.3, 0.3, (COUNT, m))
     reference = 0.4 * rng.standard_normal((COUNT, N + 1, n))
     effort = 0.2 * rng.standard_normal((COUNT, N, m))
+    return x0, previous, reference, effort
+
+
+@functools.cache
+def batch(name):
+    """(Explicit, states, previous inputs, references, input references, plans), solved once."""
+    mpc = PROBLEMS[name]()
+    x0, previous, reference, effort = instances(mpc)
     with enable_x64(True):
         plan = jm.Controller(mpc, FINE).plan
         plans = [
@@ -944,9 +950,8 @@ class TestSoften:
         """Clarabel: with a dear penalty the softened problem has the hard one's answer."""
         mpc = rated()
         hard, soft = Explicit(mpc), Explicit(soften(mpc, 1e4))
-        _, x0, previous, reference, effort, _ = batch("rated")
         same = 0
-        for arguments in zip(x0, previous, reference, effort, strict=True):
+        for arguments in zip(*instances(mpc), strict=True):
             cost, _, inputs, *_ = hard.solve(*arguments)
             softly = soft.solve(*arguments)
             if softly[0] is None:
