@@ -5,7 +5,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, as_weight
@@ -16,6 +15,7 @@ from jaxmpc.closed_loop.variations import start_room
 from jaxmpc.mpc.plan import limited
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import matmul
+from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.limits import TOLERANCE, worst_violation
@@ -103,9 +103,8 @@ class Environment:
         require_shape("R", R, (robot.m, robot.m), "Give a matrix, or its diagonal")
         x, u = robot.set_point(target)
         home, below, above = start_room(robot)
-        with jax.enable_x64(True):
-            reference = np.asarray(robot.coordinates(x))
         room = (home, spread * below, spread * above)
+        reference = host_coordinates(robot, x)
         return cls(robot, reference, u, Q, R, *room, length, stop_at_limits)
 
     def reset(self, key: Array) -> EnvironmentState:

@@ -6,7 +6,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax import Array
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite, require_shape
@@ -15,6 +14,7 @@ from jaxmpc.closed_loop.stored_runs import StoredRuns
 from jaxmpc.files import versions
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
+from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.convex_sets import Box
@@ -91,19 +91,9 @@ def with_limits(plant: Robot | LinearPlant, run: Run) -> list[tuple[Box, np.ndar
     """Return (limits, values) of the states, as coordinates, and of the inputs of a run, in
     float64 NumPy arrays."""
     return [
-        (Box(*plant.state_limits.bounds()), coordinates(plant, run.states)),
+        (Box(*plant.state_limits.bounds()), host_coordinates(plant, run.states)),
         (Box(*plant.input_limits.bounds()), np.asarray(run.inputs, float)),
     ]
-
-
-def coordinates(plant: Robot | LinearPlant, states: Array | np.ndarray) -> np.ndarray:
-    """Return the coordinates (..., n) of plant states (..., nq + nv), in float64."""
-    states = np.asarray(states, float)
-    if plant.n == plant.state_size:  # no orientation: the same numbers
-        return states
-    with jax.enable_x64(True):
-        flat = jax.vmap(plant.coordinates)(states.reshape(-1, states.shape[-1]))
-    return np.asarray(flat).reshape(*states.shape[:-1], plant.n)
 
 
 @record
@@ -180,12 +170,9 @@ def _by_name(names: tuple[str, ...], values: Reals) -> dict[str, float]:
 def _levels(values: np.ndarray) -> dict[str, float | None]:
     """Return the median and the 95 % quantile, None where they are not finite."""
     finite = np.where(np.isnan(values), np.inf, values)
-    median, most = np.quantile(finite, [0.5, 0.95], method="higher")
-    return {"median": _finite(median), "95 %": _finite(most)}
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+    levels = np.quantile(finite, [0.5, 0.95], method="higher").tolist()
+    median, most = (value if np.isfinite(value) else None for value in levels)
+    return {"median": median, "95 %": most}
 
 
 def _violations(robot: Robot, outcome: Outcome) -> dict[str, Any]:

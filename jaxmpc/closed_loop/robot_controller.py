@@ -23,6 +23,7 @@ from jaxmpc.mpc.stagewise.sqp import solve_nonlinear
 from jaxmpc.pytrees import prepared_pytree, static
 from jaxmpc.qp.admm import ADMM, DEFAULT
 from jaxmpc.qp.linalg import arrays, floating_dtype
+from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.equilibria import settled
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot, RobotModel
@@ -81,9 +82,8 @@ def robot_mpc(
     else:
         x, u = robot.equilibrium(target)
     names = robot.state_names or tuple(f"coordinate {i}" for i in range(robot.n))
+    states = _around(robot.state_limits, margin, host_coordinates(robot, x), names)
     with jax.enable_x64(True):
-        point = np.asarray(robot.coordinates(x))
-        states = _around(robot.state_limits, margin, point, names)
         system = jax.tree.map(np.asarray, robot.linearize(x, u, exact=exact))
     mpc = MPC(system, Q, R, horizon, states=states, inputs=robot.input_limits)
     mpc.validate()
@@ -188,8 +188,7 @@ def robot_references(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         state, inputs = robot.set_point(target)
-    with jax.enable_x64(True):
-        return np.asarray(robot.coordinates(state)), np.asarray(inputs)
+    return host_coordinates(robot, state), np.asarray(inputs)
 
 
 LINEARIZATIONS = ("set-point", "state", "trajectory")

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from jaxmpc.checks import fail, nearest, require_kind, require_shape, whole
+from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.mujoco_access import names, number_of
 from jaxmpc.robots.robot import Robot
@@ -157,8 +158,7 @@ def _places(robot: Robot, argument: str, name: str, kind: str) -> np.ndarray:
 def start_room(robot: Robot | LinearPlant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the coordinates (n,) of home, and how far the limits are below and above it, 1 where
     there are none."""
-    with jax.enable_x64(True):
-        home = np.asarray(robot.coordinates(np.asarray(robot.home)))
+    home = host_coordinates(robot, robot.home)
     below, above = (
         np.where(np.isfinite(end), np.abs(end - home), 1.0) for end in robot.state_limits.bounds()
     )

@@ -4,6 +4,7 @@ from collections import Counter
 from dataclasses import field
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -16,6 +17,47 @@ from jaxmpc.robots.configurations import difference, quaternions, retract, unit_
 from jaxmpc.robots.mujoco_access import acts, equalities, mjx_module, mujoco, single_joints, word
 from jaxmpc.robots.physics import Physics
 from jaxmpc.sets.convex_sets import Box
+
+
+@record
+class RobotReport:
+    """An account of a loaded robot; `print(robot.report())` shows it as a table.
+
+    read: what the file gave. limits: (coordinate or input, unit, lower, upper, source) for each of
+    the n coordinates and m inputs, ±inf where there is none. predictor_ignores: what acts in the
+    plant but not in linear models, equilibria and inverse dynamics. left_out: what the file has and
+    the plant has not, because MJX lacks it: motions differ from those of the file. cleared: what
+    was left out without a change of motion. mended: inertias changed on request.
+    """
+
+    name: str
+    read: tuple[str, ...]
+    limits: tuple[tuple[str, str, float, float, str], ...]
+    predictor_ignores: tuple[str, ...]
+    left_out: tuple[str, ...]
+    cleared: tuple[str, ...]
+    mended: tuple[str, ...]
+
+    def __str__(self) -> str:
+        lines = [f"robot {self.name}"]
+        accounts = {
+            "read": self.read,
+            "the predictor ignores": self.predictor_ignores,
+            "left out of the plant": self.left_out,
+            "cleared": self.cleared,
+            "mended": self.mended,
+        }
+        for title, items in accounts.items():
+            lines += [f"{title}:", *(f"  {item}" for item in items or ("nothing",))]
+        width = max(len(name) for name, *_ in self.limits)
+        lines.append(f"{'limits':{width + 2}}{'unit':>8}{'lower':>11}{'upper':>11}  source")
+        lines += [
+            f"  {name:{width}}{unit:>8}{lower:>11.4g}{upper:>11.4g}  {source}"
+            for name, unit, lower, upper, source in self.limits
+        ]
+        return "\n".join(lines)
+
+    __repr__ = __str__
 
 
 @record
@@ -99,6 +141,25 @@ class RobotDescription:
         dtype = floating_dtype((x, u))
         return jnp.asarray(x, dtype), jnp.asarray(u, dtype)
 
+    def report(self) -> RobotReport:
+        """Return an account of what was read, what is ignored, and where limits come from."""
+        notes = lambda key: tuple(text for name, text in self.notes if name == key)
+        ends = (self.state_limits.bounds(), self.input_limits.bounds())
+        lower, upper = (np.concatenate(end).tolist() for end in zip(*ends, strict=True))
+        names = (*self.state_names, *self.input_names)
+        units = (*self.state_units, *self.input_units)
+        sources = notes("limit") or ("",) * len(names)
+        home = tuple(f"home: {text}" for text in notes("home"))
+        return RobotReport(
+            name=self.name,
+            read=_read(self, (*home, *notes("welded"))),
+            limits=tuple(zip(names, units, lower, upper, sources, strict=True)),
+            predictor_ignores=_ignored(self.mujoco),
+            left_out=notes("left out"),
+            cleared=notes("cleared"),
+            mended=notes("mended"),
+        )
+
     def configurations(self, argument: str, q: Any) -> np.ndarray:
         """Return q (..., nq) in float64 with unit quaternions; raise ValueError for wrong ones."""
         q = host_array(argument, q)
@@ -108,65 +169,15 @@ class RobotDescription:
         return unit_orientations(argument, self.joints, q)
 
 
-@record
-class RobotReport:
-    """An account of a loaded robot; `print(robot.report())` shows it as a table.
-
-    read: what the file gave. limits: (coordinate or input, unit, lower, upper, source) for each of
-    the n coordinates and m inputs, ±inf where there is none. predictor_ignores: what acts in the
-    plant but not in linear models, equilibria and inverse dynamics. left_out: what the file has and
-    the plant has not, because MJX lacks it: motions differ from those of the file. cleared: what
-    was left out without a change of motion. mended: inertias changed on request.
-    """
-
-    name: str
-    read: tuple[str, ...]
-    limits: tuple[tuple[str, str, float, float, str], ...]
-    predictor_ignores: tuple[str, ...]
-    left_out: tuple[str, ...]
-    cleared: tuple[str, ...]
-    mended: tuple[str, ...]
-
-    def __str__(self) -> str:
-        lines = [f"robot {self.name}"]
-        accounts = {
-            "read": self.read,
-            "the predictor ignores": self.predictor_ignores,
-            "left out of the plant": self.left_out,
-            "cleared": self.cleared,
-            "mended": self.mended,
-        }
-        for title, items in accounts.items():
-            lines += [f"{title}:", *(f"  {item}" for item in items or ("nothing",))]
-        width = max(len(name) for name, *_ in self.limits)
-        lines.append(f"{'limits':{width + 2}}{'unit':>8}{'lower':>11}{'upper':>11}  source")
-        lines += [
-            f"  {name:{width}}{unit:>8}{lower:>11.4g}{upper:>11.4g}  {source}"
-            for name, unit, lower, upper, source in self.limits
-        ]
-        return "\n".join(lines)
-
-    __repr__ = __str__
-
-
-def report_of(robot: RobotDescription) -> RobotReport:
-    """Return the account of a robot."""
-    notes = lambda key: tuple(text for name, text in robot.notes if name == key)
-    ends = (robot.state_limits.bounds(), robot.input_limits.bounds())
-    lower, upper = (np.concatenate(end).tolist() for end in zip(*ends, strict=True))
-    names = (*robot.state_names, *robot.input_names)
-    units = (*robot.state_units, *robot.input_units)
-    sources = notes("limit") or ("",) * len(names)
-    home = tuple(f"home: {text}" for text in notes("home"))
-    return RobotReport(
-        name=robot.name,
-        read=_read(robot, (*home, *notes("welded"))),
-        limits=tuple(zip(names, units, lower, upper, sources, strict=True)),
-        predictor_ignores=_ignored(robot.mujoco),
-        left_out=notes("left out"),
-        cleared=notes("cleared"),
-        mended=notes("mended"),
-    )
+def host_coordinates(plant: Any, states: Any) -> np.ndarray:
+    """Return the coordinates (..., n) of states (..., nq + nv + na) of a Robot or LinearPlant, in
+    float64 NumPy arrays."""
+    states = np.asarray(states, float)
+    if plant.n == plant.state_size:  # no orientation: the same numbers
+        return states
+    with jax.enable_x64(True):
+        flat = jax.vmap(plant.coordinates)(states.reshape(-1, states.shape[-1]))
+    return np.asarray(flat).reshape(*states.shape[:-1], plant.n)
 
 
 def _read(robot: RobotDescription, more: tuple[str, ...]) -> tuple[str, ...]:

@@ -11,8 +11,9 @@ from scipy.optimize import least_squares, lsq_linear
 
 from jaxmpc.checks import fail
 from jaxmpc.pytrees import record
+from jaxmpc.robots.configurations import blocks
 from jaxmpc.robots.description import RobotDescription
-from jaxmpc.robots.mujoco_access import BALL, FREE, flag, mujoco, name_of, single_joints
+from jaxmpc.robots.mujoco_access import flag, mujoco, name_of, single_joints
 from jaxmpc.sets.convex_sets import Box
 
 # Forces that count as balanced, relative to 1 + the largest one.
@@ -322,11 +323,9 @@ def _room(model: "mujoco.MjModel", limits: Box, q: np.ndarray) -> tuple[np.ndarr
     """Return the bounds (nv,) of motions from q that keep position limits; ±inf for rotations."""
     low, high = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
     lower, upper = limits.bounds()
-    for kind, at, dof in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True):
-        # Free joints move along the world's axes.
-        count = 3 if kind == FREE else 0 if kind == BALL else 1
-        here, dofs = q[at : at + count], slice(dof, dof + count)
-        low[dofs], high[dofs] = lower[dofs] - here, upper[dofs] - here
+    for place, dofs, turns in blocks(model.jnt_type):
+        if not turns:
+            low[dofs], high[dofs] = lower[dofs] - q[place], upper[dofs] - q[place]
     return low, high
 
 

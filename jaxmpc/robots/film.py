@@ -6,14 +6,14 @@ import io
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import numpy as np
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_shape, whole
 from jaxmpc.pytrees import record
+from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.mujoco_access import mujoco, number_of
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.limits import row_violations, rows_kept
@@ -55,10 +55,10 @@ def render(
     MUJOCO_GL=egl must be set before mujoco is imported, hence before the first `load_robot`.
     Raises ValueError for wrong shapes and cameras, RuntimeError where nothing can be rendered.
     """
-    scenes = _checked(robot, states, inputs, target, every)
+    motions, inputs, ghosts = _checked(robot, states, inputs, target, every)
     for name, value in (("width", width), ("height", height)):
         whole(name, value, 1)
-    count = len(scenes.states)
+    count, samples = motions.shape[:2]
     if numbers is not None and len(numbers) != count:
         fail("numbers", f"{len(numbers)} of {count} robots", "Give one for each")
     model = _drawn(robot.mujoco, width, height)
@@ -68,51 +68,41 @@ def render(
             fail("camera", f"the model has none named {camera!r}", "Give one of its, or None")
         view = None
     if view is None:
-        poses = scenes.states[:, :: max(1, scenes.samples // 20), : model.nq].reshape(-1, model.nq)
-        poses = poses if scenes.target is None else np.concatenate([poses, scenes.target])
+        poses = motions[:, :: max(1, samples // 20), : model.nq].reshape(-1, model.nq)
+        poses = poses if ghosts is None else np.concatenate([poses, ghosts])
         view = _camera(model, poses, width / height)
     columns = int(np.ceil(np.sqrt(count)))
     rows = -(-count // columns)
     tiles = [(height * (i // columns), width * (i % columns)) for i in range(count)]
-    motions = scenes.states[:, :: scenes.every, : model.nq]
-    film = np.full((motions.shape[1], rows * height, columns * width, 3), 255, np.uint8)
+    drawn = motions[:, ::every, : model.nq]
+    film = np.full((drawn.shape[1], rows * height, columns * width, 3), 255, np.uint8)
     with _renderer(model, width, height) as renderer:
-        for (top, left), motion in zip(tiles, motions, strict=True):
+        for (top, left), motion in zip(tiles, drawn, strict=True):
             tile = film[:, top : top + height, left : left + width]
-            _draw(tile, renderer, model, view, motion, scenes.target)
+            _draw(tile, renderer, model, view, motion, ghosts)
     for row in range(1, rows):
         film[:, row * height - 1 : row * height + 1] = 255
     for column in range(1, columns):
         film[:, :, column * width - 1 : column * width + 1] = 255
     if not labels:
         return film
-    words = Captions(
-        robot=robot.name,
+    return captioned(
+        film,
+        tiles,
+        (height, width),
+        name=robot.name,
         numbers=range(count) if numbers is None else numbers,
-        times=robot.dt * scenes.every * np.arange(len(film)),
-        exceeded=exceeded_limits(robot, scenes.states, scenes.inputs, scenes.every),
-        has_target=scenes.target is not None,
+        times=robot.dt * every * np.arange(len(film)),
+        exceeded=exceeded_limits(robot, motions, inputs, every),
+        has_target=ghosts is not None,
     )
-    return captioned(film, tiles, (height, width), words)
 
 
-class _Scenes(NamedTuple):
-    """What is drawn: states (B, T+1, nq + nv), inputs (B, T, m) or None, of the target the qpos at
-    each frame (F, nq), or None, and how many samples lie between frames."""
-
-    states: np.ndarray
-    inputs: np.ndarray | None
-    target: np.ndarray | None
-    every: int
-
-    @property
-    def samples(self) -> int:
-        """Return T + 1."""
-        return self.states.shape[1]
-
-
-def _checked(robot: Robot, states: Reals, inputs: Reals | None, target: Any, every: int) -> _Scenes:
-    """Return the scenes; raise ValueError for wrong arguments of `render`."""
+def _checked(
+    robot: Robot, states: Reals, inputs: Reals | None, target: Any, every: int
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """Return states (B, T+1, nq + nv), inputs (B, T, m) and the target's qpos at each frame
+    (F, nq), None where there are none; raise ValueError for wrong arguments of `render`."""
     if not isinstance(robot, Robot):
         fail("robot", f"is a {type(robot).__name__}", "Only a Robot has a shape to draw")
     states = np.asarray(states, float)
@@ -132,7 +122,7 @@ def _checked(robot: Robot, states: Reals, inputs: Reals | None, target: Any, eve
         require_shape("target", target, shape, "Give one qpos, or one for each state")
         require_finite("target", target)
         target = np.broadcast_to(target, (samples, nq))[::every]
-    return _Scenes(states.reshape(-1, *states.shape[-2:]), inputs, target, int(every))
+    return states.reshape(-1, *states.shape[-2:]), inputs, target
 
 
 def _drawn(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.MjModel":
@@ -312,42 +302,38 @@ def write_gif(file: Any, frames: np.ndarray, fps: float) -> None:
 INK, PAPER, RED, TARGET = (40, 40, 40), (255, 255, 255), (200, 20, 20), (0, 158, 115)
 
 
-class Captions(NamedTuple):
-    """What is written on F frames of B tiles: the robot's name, the numbers of the robots, the
-    times (F,) in s, the name of the limit that is exceeded (B, F), "" for none, and whether there
-    is a target."""
-
-    robot: str
-    numbers: Sequence[int]
-    times: np.ndarray
-    exceeded: np.ndarray
-    has_target: bool
-
-
 def captioned(
-    film: np.ndarray, tiles: Sequence[tuple[int, int]], size: tuple[int, int], words: Captions
+    film: np.ndarray,
+    tiles: Sequence[tuple[int, int]],
+    size: tuple[int, int],
+    *,
+    name: str,
+    numbers: Sequence[int],
+    times: np.ndarray,
+    exceeded: np.ndarray,
+    has_target: bool,
 ) -> np.ndarray:
     """Return the frames (F, h, w, 3) with a line above and a legend below.
 
-    tiles: (top, left) of each of the B robots; size: (height, width) of a tile.
+    tiles: (top, left) of each of the B robots; size: (height, width) of a tile. Written are the
+    robot's name, the numbers of the robots, the times (F,) in s, and the name of the limit that is
+    exceeded (B, F), "" for none.
     """
     from PIL import Image, ImageDraw
 
     font = _font(round(np.clip(size[0] / 18, 12, 18)))
     line = font.size + 8
-    legend = _lines(_legend(words.has_target), font, film.shape[2] - 8)
+    legend = _lines(_legend(has_target), font, film.shape[2] - 8)
     room = ((0, 0), (line, line * len(legend)), (0, 0), (0, 0))
     film = np.pad(film, room, constant_values=255)
     edge = max(3, size[0] // 60)
     for k, frame in enumerate(film):
         picture = Image.fromarray(frame)
         draw = ImageDraw.Draw(picture)
-        clock = f"{words.times[k]:.2f} s"
-        draw.text((6, 3), words.robot, INK, font)
+        clock = f"{times[k]:.2f} s"
+        draw.text((6, 3), name, INK, font)
         draw.text((film.shape[2] - 6 - font.getlength(clock), 3), clock, INK, font)
-        for (top, left), number, limit in zip(
-            tiles, words.numbers, words.exceeded[:, k], strict=True
-        ):
+        for (top, left), number, limit in zip(tiles, numbers, exceeded[:, k], strict=True):
             top += line
             if limit:
                 corners = (left, top, left + size[1] - 1, top + size[0] - 1)
@@ -372,10 +358,7 @@ def exceeded_limits(robot: Robot, states: np.ndarray, inputs: Any, every: int) -
     It is the one that is exceeded most, as a fraction of half its range, at the samples from one
     frame to the next. states (B, T+1, nq + nv), inputs (B, T, m) or None.
     """
-    with jax.enable_x64(True):
-        xi = states
-        if robot.n != robot.state_size:
-            xi = np.asarray(jax.vmap(jax.vmap(robot.coordinates))(states))
+    xi = host_coordinates(robot, states)
     names = (*robot.state_names, *robot.input_names)
     units = (*robot.state_units, *robot.input_units)
     labels = [f"{n} [{unit}]" if unit else n for n, unit in zip(names, units, strict=True)]

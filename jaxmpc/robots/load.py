@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_package, require_printable, require_shape
-from jaxmpc.robots.configurations import unit_orientations
+from jaxmpc.robots.configurations import blocks, unit_orientations
 from jaxmpc.robots.mjx_gaps import compared, lacks, translate
 from jaxmpc.robots.mujoco_access import (
     BALL,
@@ -168,9 +168,8 @@ def _opened(
     try:
         if not urdf:
             return _File(mujoco.MjModel.from_xml_path(str(path)), path.stem, {}, (), False)
-        options = {"floating_base": floating_base, "mend_inertias": mend_inertias}
-        compiled = compiled_urdf(path.read_text(), **options)
-        return _File(compiled.model, path.stem, *compiled[1:], welded=not floating_base)
+        host, *found = compiled_urdf(path.read_text(), floating_base, mend_inertias)
+        return _File(host, path.stem, *found, welded=not floating_base)
     except (ValueError, ElementTree.ParseError) as error:
         text = " ".join(str(error).split())
         fail("model", f"{path} cannot be read: {text.rstrip('.')}", "Mend the file")
@@ -272,10 +271,9 @@ def _home(host: "mujoco.MjModel", home: Reals | None) -> tuple[np.ndarray, np.nd
 def _anchor(host: "mujoco.MjModel", home: np.ndarray) -> tuple[float, ...]:
     """Return zeros, with the orientations of the configuration `home`."""
     anchor = np.zeros(host.nq)
-    for kind, i in zip(host.jnt_type, host.jnt_qposadr, strict=True):
-        if kind in (FREE, BALL):
-            i = i + (3 if kind == FREE else 0)
-            anchor[i : i + 4] = home[i : i + 4] / np.linalg.norm(home[i : i + 4])
+    for place, _, turns in blocks(host.jnt_type):
+        if turns:
+            anchor[place] = home[place] / np.linalg.norm(home[place])
     return tuple(anchor.tolist())
 
 
@@ -431,16 +429,10 @@ _WATER = 1000.0
 _AXES = ("xx", "xy", "xz", "yy", "yz", "zz")
 
 
-class CompiledURDF(NamedTuple):
-    """The compiled model of a URDF, the velocity limit of each joint, and what was mended."""
-
-    model: "mujoco.MjModel"
-    velocities: dict[str, float]
-    mended: tuple[str, ...]
-
-
-def compiled_urdf(text: str, *, floating_base: bool, mend_inertias: bool) -> CompiledURDF:
-    """Return a URDF, compiled.
+def compiled_urdf(
+    text: str, floating_base: bool, mend_inertias: bool
+) -> "tuple[mujoco.MjModel, dict[str, float], tuple[str, ...]]":
+    """Return a URDF, compiled, the velocity limit of each joint, and what was mended.
 
     Visual and collision geometry is left out, so that no mesh is looked for. Each hinge and slide
     joint gets a motor, as a URDF cannot have any.
@@ -466,7 +458,7 @@ def compiled_urdf(text: str, *, floating_base: bool, mend_inertias: bool) -> Com
     try:
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
         _add_motors(spec)
-        return CompiledURDF(spec.compile(), velocities, changes)
+        return spec.compile(), velocities, changes
     except ValueError as error:
         if "inertia" in str(error) and not mend_inertias:
             problem = " ".join(str(error).split())

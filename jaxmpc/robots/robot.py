@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.scipy.spatial.transform import Rotation
 
 from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail, require_finite, require_shape
@@ -24,7 +25,7 @@ from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import eigh, matmul
 from jaxmpc.qp.transformations import own_modes, varying
 from jaxmpc.robots.configurations import difference, quaternions, retract
-from jaxmpc.robots.description import RobotDescription, RobotReport, report_of
+from jaxmpc.robots.description import RobotDescription
 from jaxmpc.robots.equilibria import (
     inverse_actuation,
     lacking,
@@ -189,10 +190,6 @@ class Robot(RobotDescription):
             warnings.warn(text, stacklevel=2)
         return rest.x, rest.u
 
-    def report(self) -> RobotReport:
-        """Return an account of what was read, what is ignored, and where limits come from."""
-        return report_of(self)
-
     def inverse_dynamics(self, q: Any, velocity: Any, acceleration: Any) -> np.ndarray:
         """Return the inputs u (..., m) that give `acceleration` (..., nv) at q (..., nq), velocity
         (..., nv).
@@ -320,36 +317,17 @@ def with_payload(
     mass, centre = of("body_mass")[i], of("body_ipos")[i]
     total = mass + payload
     middle = (mass * centre + payload * at) / total
-    w, v = of("body_iquat")[i, 0], of("body_iquat")[i, 1:]
-    turn = jnp.eye(3) + 2 * w * _cross(v) + 2 * matmul(_cross(v), _cross(v))
+    turn = Rotation.from_quat(jnp.roll(of("body_iquat")[i], -1)).as_matrix()
     inertia = matmul(turn * of("body_inertia")[i], turn.T)
     for m, place in ((mass, centre), (payload, at)):
-        inertia = inertia + m * matmul(_cross(place - middle).T, _cross(place - middle))
+        arm = place - middle
+        inertia = inertia + m * (jnp.sum(arm**2) * jnp.eye(3) - jnp.outer(arm, arm))
     principal, axes = eigh(inertia)
     axes = axes * jnp.sign(jnp.linalg.det(axes))
     new = {
         "body_mass": total,
         "body_ipos": middle,
         "body_inertia": principal,
-        "body_iquat": _quaternion(axes),
+        "body_iquat": jnp.roll(Rotation.from_matrix(axes).as_quat(), 1),
     }
     return {key: of(key).at[i].set(value) for key, value in new.items()}
-
-
-def _cross(a: Array) -> Array:
-    """Return the matrix of b → a × b."""
-    return jnp.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
-
-
-def _quaternion(R: Array) -> Array:
-    """Return the unit quaternion (w first) of a rotation matrix: the eigenvector of Bar-Itzhack's K
-    (2000, J. Guidance 23, eq. 6) with the largest eigenvalue, right for every rotation."""
-    x, y, z = R[:, 0], R[:, 1], R[:, 2]
-    K = jnp.array([
-        [x[0] - y[1] - z[2], y[0] + x[1], z[0] + x[2], y[2] - z[1]],
-        [y[0] + x[1], y[1] - x[0] - z[2], z[1] + y[2], z[0] - x[2]],
-        [z[0] + x[2], z[1] + y[2], z[2] - x[0] - y[1], x[1] - y[0]],
-        [y[2] - z[1], z[0] - x[2], x[1] - y[0], x[0] + y[1] + z[2]],
-    ])  # fmt: skip
-    q = eigh(K / 3)[1][:, -1]
-    return jnp.array([q[3], q[0], q[1], q[2]])

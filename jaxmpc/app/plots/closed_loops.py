@@ -21,9 +21,10 @@ from jaxmpc.app.plots.style import (
     patch,
 )
 from jaxmpc.checks import fail
-from jaxmpc.closed_loop.outcome import coordinates, with_limits
+from jaxmpc.closed_loop.outcome import with_limits
 from jaxmpc.closed_loop.simulation import Run
 from jaxmpc.qp.status import Status
+from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.limits import rows_kept
 
@@ -110,7 +111,7 @@ def plot_before_after(
     shown = _chosen("loops", spread if loops is None else loops, count)
     time = plant.dt * np.arange(samples + 1)
     values = [
-        (coordinates(plant, run.states)[shown], np.asarray(run.inputs, float)[shown])
+        (host_coordinates(plant, run.states)[shown], np.asarray(run.inputs, float)[shown])
         for run in (before, after)
     ]
     figure, panels = panel_grid(plant, time, 3.4, (1.35, 2.4, 1.0))
