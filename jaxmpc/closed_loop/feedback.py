@@ -70,6 +70,21 @@ def model_of(controller: Feedback) -> Any:
     return controller.mpc.system if robot is None else robot
 
 
+def one_state(controller: Feedback, x: Reals) -> Array:
+    """Return a state as an array of the controller's precision; raise ValueError for other
+    shapes."""
+    x = jnp.asarray(x, controller.dtype)
+    if x.shape != (controller.state_size,):
+        fail("x", f"shape {x.shape}", f"Give one state ({controller.state_size},)")
+    return x
+
+
+def first_row(reference: Reals, dtype: Any) -> Array:
+    """Return a reference, or the first of its rows, as an array."""
+    rows = jnp.asarray(reference, dtype)
+    return rows[0] if rows.ndim == 2 else rows
+
+
 @named_pytree
 class NoPlan(NamedTuple):
     """The plan of a law without plans: cost NaN, status NOT_RUN, no slack."""
@@ -132,20 +147,9 @@ class LinearFeedback:
     ) -> Control[NoPlan]:
         """Return the input (m,) at the state x, without plan and memory."""
         self.validate()
-        x = jnp.asarray(x, self.dtype)
-        if x.shape != (self.state_size,):
-            fail("x", f"shape {x.shape}", f"Give one state ({self.state_size},)")
-        r = _first_row(reference, self.mpc.system.n, x.dtype)
-        s = _first_row(input_reference, self.mpc.system.m, x.dtype)
+        x = one_state(self, x)
+        r, s = (0 if v is None else first_row(v, x.dtype) for v in (reference, input_reference))
         u = s + matmul(jnp.asarray(self.K, x.dtype), self.coordinates(x) - r)
         u = limited(self.mpc.inputs, u)
         not_run, no_slack = jnp.asarray(Status.NOT_RUN, jnp.int32), jnp.zeros((1, 0), x.dtype)
         return Control(u, NoPlan(jnp.asarray(jnp.nan, x.dtype), not_run, no_slack), None)
-
-
-def _first_row(reference: Reals | None, size: int, dtype: Any) -> Array:
-    """Return a reference, or the first of its rows; zeros for none."""
-    if reference is None:
-        return jnp.zeros(size, dtype)
-    rows = jnp.asarray(reference, dtype)
-    return rows if rows.ndim == 1 else rows[0]

@@ -13,6 +13,7 @@ from jax import Array
 
 from jaxmpc.arrays import Reals, as_weight
 from jaxmpc.checks import fail, whole
+from jaxmpc.closed_loop.feedback import first_row, one_state
 from jaxmpc.mpc.controller import Controller, zeros_of
 from jaxmpc.mpc.plan import Control, Plan, WarmStart, anchored, applied, limited
 from jaxmpc.mpc.problem import MPC, soften
@@ -290,9 +291,8 @@ class RobotController:
     def _resting(self, x: Array, input_reference: Any) -> tuple[Array, Array]:
         """Return states (N+1, n) that stay at x and inputs (N, m), the first of input_reference."""
         xi, N, m = self.coordinates(x), self.soft.horizon, self.robot.m
-        u = jnp.zeros(m, xi.dtype) if input_reference is None else jnp.asarray(input_reference)
-        u = jnp.broadcast_to(u[0] if u.ndim == 2 else u, (N, m)).astype(xi.dtype)
-        return jnp.broadcast_to(xi, (N + 1, len(xi))), u
+        u = first_row(np.zeros(m) if input_reference is None else input_reference, xi.dtype)
+        return jnp.broadcast_to(xi, (N + 1, len(xi))), jnp.broadcast_to(u, (N, m))
 
     def __call__(
         self,
@@ -304,9 +304,7 @@ class RobotController:
         previous_input: Reals | None = None,
     ) -> Control[Plan]:
         """Return the input (m,) at the state x, its plan, in ξ, and what to remember."""
-        x = jnp.asarray(x, self.dtype)
-        if np.shape(x) != (self.state_size,):
-            fail("x", f"shape {np.shape(x)}", f"Give one state ({self.state_size},)")
+        x = one_state(self, x)
         if self.fixed is not None:
             known = {"input_reference": input_reference, "previous_input": previous_input}
             return self.fixed(self.coordinates(x), before, reference, **known)

@@ -4,7 +4,7 @@ import functools
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ from jaxmpc.batches import (
 )
 from jaxmpc.checks import fail, require_real, whole
 from jaxmpc.closed_loop.estimation import Belief, KalmanFilter, Noise, model_step
-from jaxmpc.closed_loop.feedback import Feedback, LinearFeedback, Plant, model_of
+from jaxmpc.closed_loop.feedback import Feedback, LinearFeedback, Plant, first_row, model_of
 from jaxmpc.mpc.plan import Control, checked_aim, checked_array, reference_shapes
 from jaxmpc.mpc.problem import weights_of
 from jaxmpc.mpc.stagewise.nonlinear import ConstantModel, as_argument
@@ -241,23 +241,11 @@ def _checked_plant(plant: Any, n: int, m: int) -> Any:
     return plant if jax.tree_util.all_leaves([plant]) else arrays(plant)
 
 
-class Carried(NamedTuple):
-    """What goes from one time step to the next: the state, what the controller gave at the step
-    before, the input then, and the observer's belief."""
-
-    x: Array
-    before: Control
-    previous: Array
-    belief: Belief | None
-
-
-class Happening(NamedTuple):
-    """What befalls one time step: its number, the disturbance, the noise of plant and outputs."""
-
-    t: Array
-    disturbance: Array | None
-    process: Array | None
-    measurement: Array | None
+# What goes from one time step to the next: the state, what the controller gave at the step before,
+# the input then, and the observer's belief.
+Carried = tuple[Array, Control, Array, Belief | None]
+# What befalls a time step: its number, the disturbance, the noise of the plant and of the outputs.
+Exogenous = tuple[Array, Array | None, Array | None, Array | None]
 
 
 class Loop:
@@ -266,10 +254,8 @@ class Loop:
     def __init__(self, controller: Feedback, plant: Plant, given: Conditions, dtype: Any) -> None:
         self.controller, self.given = controller, given
         self.plant = plant = plant.given if isinstance(plant, ConstantModel) else plant
-        self.horizon, (self.Q, self.R, *_) = (
-            controller.mpc.horizon,
-            weights_of(controller.mpc, dtype),
-        )
+        self.horizon = controller.mpc.horizon
+        self.Q, self.R, *_ = weights_of(controller.mpc, dtype)
         # Steps by which plans begin later than what is measured.
         self.later = given.delay if given.compensate else 0
         # ξ of a state and the state of ξ, where the plant tells them apart.
@@ -322,11 +308,11 @@ class Loop:
         limits = jax.tree.map(lambda v: jnp.asarray(v, x.dtype), self.controller.limits)
         return worst_violation(limits, self.controller.coordinates(x))
 
-    def step(self, carried: Carried, now: Happening) -> tuple[Carried, Run]:
+    def step(self, carried: Carried, exogenous: Exogenous) -> tuple[Carried, Run]:
         """Return what goes on to the next time step, and the record of this one."""
-        x, before, previous, belief = carried
-        seen, estimate, belief = self.seen(x, previous, belief, now.measurement)
-        r, s = self.references(now.t + 1 if self.later else now.t)
+        (x, before, previous, belief), (t, disturbance, process, measurement) = carried, exogenous
+        seen, estimate, belief = self.seen(x, previous, belief, measurement)
+        r, s = self.references(t + 1 if self.later else t)
         control = self.controller(seen, before, r, input_reference=s, previous_input=previous)
         plan, u = control.plan, previous if self.given.delay else control.u
         record = Run(
@@ -334,27 +320,27 @@ class Loop:
             inputs=u,
             cost=plan.cost,
             status=plan.status,
-            stage_cost=self.stage_cost(x, u, *(self.references(now.t) if self.later else (r, s))),
+            stage_cost=self.stage_cost(x, u, *(self.references(t) if self.later else (r, s))),
             violation=self.violation(x),
             slack=plan.slack[0],
             fallback=jnp.any(plan.slack > SLACK[x.dtype.name]),
             estimates=estimate,
         )
         after = jnp.asarray(self.plant.step(x, u), x.dtype)
-        if now.process is not None:
-            after = self.state(self.coordinates(after) + now.process)
+        if process is not None:
+            after = self.state(self.coordinates(after) + process)
         observer = self.given.observer
         if observer is not None and belief is not None and not self.given.delay:
             belief = observer.predicted(belief, u)
-        after = after if now.disturbance is None else after + now.disturbance
-        return Carried(after, control, control.u, belief), record
+        after = after if disturbance is None else after + disturbance
+        return (after, control, control.u, belief), record
 
 
 def _distance(value: Array, target: Array | None) -> Array:
     """Return the distance from a reference, or from its first row."""
     if target is None:
         return value
-    return value - (target if target.ndim == 1 else target[0])[: len(value)]
+    return value - first_row(target, value.dtype)[: len(value)]
 
 
 @partial(jax.jit, static_argnames=("steps", "checkpoint"))
@@ -378,12 +364,12 @@ def _simulate(
         w, v = given.noise.draw(steps, system.n, outputs, x0.dtype)
     if observer is not None:
         belief = observer.first(loop.coordinates(x0))
-    first = Carried(x0, before, previous, belief)
-    steps_given = Happening(jnp.arange(steps), given.disturbance, w, v)
+    first = x0, before, previous, belief
+    exogenous = jnp.arange(steps), given.disturbance, w, v
     step = jax.checkpoint(loop.step, prevent_cse=False) if checkpoint else loop.step
-    last, run = jax.lax.scan(step, varying(first, first), steps_given, length=steps)
-    states = jnp.concatenate([run.states, last.x[None]])
-    return replace(run, states=states, violation=jnp.append(run.violation, loop.violation(last.x)))
+    (last, *_), run = jax.lax.scan(step, varying(first, first), exogenous, length=steps)
+    states = jnp.concatenate([run.states, last[None]])
+    return replace(run, states=states, violation=jnp.append(run.violation, loop.violation(last)))
 
 
 def simulate_many(

@@ -90,19 +90,19 @@ class Forces:
         act[self.model.actuator_actadr[self.active]] = drive[self.active]
         return np.where(self.integrators, 0.0, drive), act
 
-    def at(self, q: np.ndarray, drive: np.ndarray) -> np.ndarray:
-        """Return the sum (nv,) of all forces at rest."""
-        self.data.qpos, self.data.qvel = q, 0
+    def at(self, q: np.ndarray, drive: np.ndarray, v: np.ndarray | float = 0.0) -> np.ndarray:
+        """Return the sum (nv,) of all forces, at rest or at the velocity v (nv,)."""
+        self.data.qpos, self.data.qvel = q, v
         self.data.ctrl, act = self.parts(drive)
         if len(act):
             self.data.act = act
         mujoco.mj_forward(self.model, self.data)
         return self.data.qfrc_smooth.copy()
 
-    def affine(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def affine(self, q: np.ndarray, v: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """Return J (nv, m) and f (nv,) of the sum of forces J drive + f."""
-        f = self.at(q, np.zeros(self.m))
-        return np.array([self.at(q, e) - f for e in np.eye(self.m)]).T.reshape(-1, self.m), f
+        f = self.at(q, np.zeros(self.m), v)
+        return np.array([self.at(q, e, v) - f for e in np.eye(self.m)]).T.reshape(-1, self.m), f
 
     def rest(self, q: np.ndarray, drive: np.ndarray, f: np.ndarray) -> Rest:
         """Return the rest at q under a drive; f (nv,), the forces without any."""
@@ -330,20 +330,13 @@ def _room(model: "mujoco.MjModel", limits: Box, q: np.ndarray) -> tuple[np.ndarr
 
 
 def inverse_actuation(
-    model: "mujoco.MjModel", q: np.ndarray, v: np.ndarray, a: np.ndarray
+    robot: RobotDescription, q: np.ndarray, v: np.ndarray, a: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the inputs u (m,) that give the accelerations a (nv,) at q (nq,), v (nv,), the sizes
     (nv,) of the forces that they lack, and 1 + the largest force that is needed."""
-    data = mujoco.MjData(model)
-    data.qpos, data.qvel, data.qacc = q, v, a
-    mujoco.mj_inverse(model, data)
-    needed, forces = data.qfrc_inverse.copy(), []
-    for i in range(-1, model.nu):  # forces of the actuators are affine in u
-        data.ctrl = np.arange(model.nu) == i
-        mujoco.mj_fwdPosition(model, data)
-        mujoco.mj_fwdVelocity(model, data)
-        mujoco.mj_fwdActuation(model, data)
-        forces.append(data.qfrc_actuator.copy())
-    J, offset = np.array(forces[1:]).T - forces[0][:, None], forces[0]
-    u = np.linalg.lstsq(J, needed - offset, rcond=None)[0]
-    return u, np.abs(J @ u + offset - needed), 1 + np.abs(needed).max()
+    forces, inertial = Forces(robot), np.zeros(len(a))
+    J, f = forces.affine(q, v)
+    mujoco.mj_mulM(forces.model, forces.data, inertial, a)
+    needed = inertial - f
+    u = np.linalg.lstsq(J, needed, rcond=None)[0]
+    return u, np.abs(J @ u - needed), 1 + np.abs(needed).max()

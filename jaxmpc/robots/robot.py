@@ -195,7 +195,7 @@ class Robot(RobotDescription):
         (..., nv).
 
         They are of the predictor, in continuous time. Computed outside JAX in float64 by MuJoCo's C
-        engine (mj_inverse). Raises ValueError where no input does, as for a model whose actuators
+        engine. Raises ValueError where no input does, as for a model whose actuators
         have activation states.
         """
         nv = self.mujoco.nv
@@ -210,7 +210,7 @@ class Robot(RobotDescription):
             motions.append(host_array(argument, value).reshape(-1, nv))
         found = []
         for row in zip(*motions, strict=True):
-            u, missing, size = inverse_actuation(self.predictor.model, *row)
+            u, missing, size = inverse_actuation(self, *row)
             if np.any(missing > 1e-6 * size):
                 place = f"at {self.state_names[int(np.argmax(missing))]}"
                 problem = f"no input balances the forces; {missing.max():.3g} are missing {place}"
