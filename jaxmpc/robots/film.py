@@ -18,8 +18,9 @@ from jaxmpc.robots.mujoco_access import mujoco, number_of
 from jaxmpc.robots.robot import Robot
 from jaxmpc.sets.limits import row_violations, rows_kept
 
+# The target has the colour of set-points in the plots; red is for limits alone.
+INK, PAPER, RED, TARGET = (40, 40, 40), (255, 255, 255), (200, 20, 20), (0, 158, 115)
 OPACITY = 0.3  # of the target
-
 # Grey of what a model without a skybox leaves black.
 BACKGROUND = np.array([0.5, 0.5, 0.5, 1], np.float32)
 
@@ -298,10 +299,6 @@ def write_gif(file: Any, frames: np.ndarray, fps: float) -> None:
     first.save(file, format="GIF", save_all=True, append_images=rest, duration=milliseconds, loop=0)
 
 
-# The target has the colour of set-points in the plots; red is for limits alone.
-INK, PAPER, RED, TARGET = (40, 40, 40), (255, 255, 255), (200, 20, 20), (0, 158, 115)
-
-
 def captioned(
     film: np.ndarray,
     tiles: Sequence[tuple[int, int]],
@@ -323,7 +320,9 @@ def captioned(
 
     font = _font(round(np.clip(size[0] / 18, 12, 18)))
     line = font.size + 8
-    legend = _lines(_legend(has_target), font, film.shape[2] - 8)
+    target = [(TARGET, "see-through: target")] if has_target else []
+    entries = [*target, (RED, "red frame: beyond a limit")]
+    legend = _lines(entries, font, film.shape[2] - 8)
     room = ((0, 0), (line, line * len(legend)), (0, 0), (0, 0))
     film = np.pad(film, room, constant_values=255)
     edge = max(3, size[0] // 60)
@@ -373,12 +372,6 @@ def exceeded_limits(robot: Robot, states: np.ndarray, inputs: Any, every: int) -
     worst = np.maximum.reduceat(over, np.arange(0, over.shape[1], every), axis=1)
     index = np.where(worst.max(axis=2) > 0, 1 + worst.argmax(axis=2), 0)
     return np.array(["", *labels])[index]
-
-
-def _legend(has_target: bool) -> list[tuple[tuple[int, int, int], str]]:
-    """Return the colours of the video and what they say."""
-    target = [(TARGET, "see-through: target")] if has_target else []
-    return [*target, (RED, "red frame: beyond a limit")]
 
 
 def _lines(entries: list[Any], font: Any, width: float) -> list[list[Any]]:
