@@ -210,23 +210,23 @@ def _outcome_rows(s: dict[str, Any]) -> list[tuple[str, str]]:
     length = f"{s['samples']:,} samples of {s['control_period']:g} s each"
     rows = [
         ("robots", f"{s['robots']:>9,}  {length}"),
-        ("success", f"{_of_robots(s, 'success')}  limits kept, and at the target at the end"),
-        ("limits kept", f"{_of_robots(s, 'limits_kept')}  to {s['limits_kept_to']:g}, all samples"),
+        ("success", f"{_share(s, 'success')}  limits kept, and at the target at the end"),
+        ("limits kept", f"{_share(s, 'limits_kept')}  to {s['limits_kept_to']:g}, all samples"),
     ]
     if s["not_finite"]:
-        rows.append(("not finite", _of_robots(s, "not_finite")))
+        rows.append(("not finite", _share(s, "not_finite")))
     return rows
 
 
-def _of_robots(s: dict[str, Any], key: str) -> str:
-    return f"{s[key]:>9,}  {s[key] / s['robots']:8.2%}"
+def _share(s: dict[str, Any], key: str, of: str = "robots") -> str:
+    return f"{s[key]:>9,}  {s[key] / s[of]:8.2%}"
 
 
 def _plan_rows(s: dict[str, Any]) -> list[tuple[str, str]]:
     rows, worst = [], s["worst_violation"]
     if s["plans"]:
         kept = f"of these {s['plans_valid_and_kept']:,} kept all limits"
-        rows.append(("plans valid", f"{_of_robots(s, 'plans_valid')}  {kept}"))
+        rows.append(("plans valid", f"{_share(s, 'plans_valid')}  {kept}"))
     beyond = f"{worst['by']:.3g} {worst['unit']} beyond a limit of {worst['of']}"
     rows.append(("worst", beyond if worst["by"] else "no limit exceeded"))
     if s["plans"]:
@@ -235,8 +235,7 @@ def _plan_rows(s: dict[str, Any]) -> list[tuple[str, str]]:
             ("fallback_plans", "fallback", "  solved, but with slack in soft limits"),
             ("unsolved_plans", "unsolved", "  say nothing about limits"),
         ):
-            part = f"{s[key]:>9,}  {s[key] / s['plans']:8.2%}"
-            rows.append((label, f"{part}  of {s['plans']:,}{what}"))
+            rows.append((label, f"{_share(s, key, 'plans')}  of {s['plans']:,}{what}"))
     return rows
 
 

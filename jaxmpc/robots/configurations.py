@@ -74,7 +74,9 @@ def difference(joints: Sequence[int], start: Array, end: Array) -> Array:
     if not quaternions(joints):
         return end - start
     parts = [
-        _between(start[place], end[place]) if turns else end[place] - start[place]
+        _logarithm(_product(_inverse(start[place]), end[place]))
+        if turns
+        else end[place] - start[place]
         for place, _, turns in blocks(joints)
     ]
     return jnp.concatenate(parts)
@@ -102,11 +104,6 @@ def normalised(joints: Sequence[int], q: Array) -> Array:
     for place, _, turns in blocks(joints):
         q = q.at[place].set(q[place] / jnp.linalg.norm(q[place])) if turns else q
     return q
-
-
-def _between(start: Array, end: Array) -> Array:
-    """Return the rotation vector from one unit quaternion to another."""
-    return _logarithm(_product(_inverse(start), end))
 
 
 def _inverse(q: Array) -> Array:

@@ -168,8 +168,8 @@ def _opened(
     try:
         if not urdf:
             return _File(mujoco.MjModel.from_xml_path(str(path)), path.stem, {}, (), False)
-        host, *found = compiled_urdf(path.read_text(), floating_base, mend_inertias)
-        return _File(host, path.stem, *found, welded=not floating_base)
+        host, velocities, mended = compiled_urdf(path.read_text(), floating_base, mend_inertias)
+        return _File(host, path.stem, velocities, mended, welded=not floating_base)
     except (ValueError, ElementTree.ParseError) as error:
         text = " ".join(str(error).split())
         fail("model", f"{path} cannot be read: {text.rstrip('.')}", "Mend the file")
