@@ -207,6 +207,7 @@ class RowPrograms:
         both = both / np.maximum(np.linalg.norm(both, axis=1), 1e-300)[:, None]
         variables = both[:, : rows.U.shape[1]]
         self.equalities = equal & (_rank(variables[equal]) == _rank(both[equal]))
+        self._last: Program | None = None
 
     def solve_lp(
         self,
@@ -249,7 +250,7 @@ class RowPrograms:
             reach = radius + self.normals @ lower[R - balls :]
             G, g = np.vstack([A, planes, last]), np.concatenate([b, reach, limits])
             mask = np.append(equal, np.zeros(len(g) - len(b), bool))
-            top = Program(G[:, part], g - G @ fixed, mask).maximise(cost[part])
+            top = self._program(G[:, part], g - G @ fixed, mask).maximise(cost[part])
             if top.x is None or top.y is None:
                 return Solved(top.value, None, np.zeros(R))
             x = fixed.copy()
@@ -267,6 +268,23 @@ class RowPrograms:
         y[flat][has_low] -= top.y[first:second]
         y[R - balls :] = top.y[second : second + len(planes)] @ self.normals[: len(planes)]
         return Solved(float(cost @ x), x, y)
+
+    def _program(self, G: np.ndarray, g: np.ndarray, equal: np.ndarray) -> Program:
+        """Return the program over G x ≤ g: the last one with another last column where that is all
+        they differ in, as rays from one point do."""
+        last = self._last
+        same = (
+            last is not None
+            and last.G.shape == G.shape
+            and np.array_equal(last.g, g)
+            and np.array_equal(last.equal, equal)
+            and np.array_equal(last.G[:, :-1], G[:, :-1])
+        )
+        if last is not None and same:
+            last.change_last_column(G[:, -1])
+        else:
+            self._last = last = Program(G, g, equal)
+        return last
 
     def support(self, direction: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """Return max direction'θ over the feasible set: the optimum (inf: unbounded, −inf: empty),

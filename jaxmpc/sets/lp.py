@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import highspy
 import numpy as np
-from scipy.sparse import csc_array
 
 from jaxmpc.checks import fail
 
@@ -95,6 +94,16 @@ class Program:
                 if self._ray(cost) is not None:
                     return Optimum(np.inf)
         fail("LP", "HiGHS finds no answer that can be checked", "Scale the rows to like size")
+
+    def change_last_column(self, values: np.ndarray) -> None:
+        """Put other values (rows,) in place of the last column of G. The next program begins at the
+        basis in which the last one ended."""
+        scaled = self.row * values
+        self.column[-1] = 1 / power_of_two(np.abs(scaled).max(initial=0.0))
+        self.G[:, -1], self.M[:, -1] = values, scaled * self.column[-1]
+        self._model.change_last_column(self.M[:, -1])
+        for name in ("violation", "farkas"):
+            self.__dict__.pop(name, None)
 
     @cached_property
     def _model(self) -> "Model":
@@ -234,9 +243,10 @@ class Model:
         program.col_cost_ = np.zeros(n)
         program.col_lower_, program.col_upper_ = np.full(n, -np.inf), np.full(n, np.inf)
         program.row_lower_, program.row_upper_ = np.where(equal, b, -np.inf), b
-        matrix, sparse = program.a_matrix_, csc_array(M)
+        matrix, (columns, places) = program.a_matrix_, np.nonzero(M.T)
         matrix.format_ = highspy.MatrixFormat.kColwise
-        matrix.start_, matrix.index_, matrix.value_ = sparse.indptr, sparse.indices, sparse.data
+        matrix.start_ = np.searchsorted(columns, np.arange(n + 1))
+        matrix.index_, matrix.value_ = places, M[places, columns]
         self.size, self.equal, self._alone = (rows, n), equal, threading.Lock()
         # (Its subclass `Highs` prints a banner when it is made.)
         self.highs = highspy._Highs()  # type: ignore[attr-defined]
@@ -247,6 +257,13 @@ class Model:
             self.highs.setOptionValue(name, value)
         if self.highs.passModel(program) == highspy.HighsStatus.kError:
             fail("LP", "holds entries that are not finite", "Give finite rows")
+
+    def change_last_column(self, values: np.ndarray) -> None:
+        """Put other values (rows,) in place of the last column of M."""
+        rows, n = self.size
+        with self._alone:
+            for i in range(rows):
+                self.highs.changeCoeff(i, n - 1, values[i])
 
     def maximise(
         self, cost: np.ndarray, method: str = "simplex"
@@ -365,7 +382,7 @@ def extent(G: np.ndarray, g: np.ndarray, axes: Sequence[int] | None = None) -> n
     return np.max(np.abs(Program(G, g).bounds(axes)), axis=0) * (1 + 1e-6)
 
 
-def power_of_two(sizes: np.ndarray) -> np.ndarray:
+def power_of_two(sizes: np.ndarray | float) -> np.ndarray:
     """Return the powers of two next below sizes, 1 for those that are zero or infinite: units that
     change no digit."""
     usable = np.isfinite(sizes) & (sizes > 1e-200) & (sizes < 1e200)
