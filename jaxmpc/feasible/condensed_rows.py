@@ -4,6 +4,7 @@ Candidates for proofs are found with these: margins, ends of rays, the bounding 
 label depends on their numbers; proofs use `ExactData`.
 """
 
+import contextlib
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import matmul
 from jaxmpc.qp.problem import Bounds
 from jaxmpc.sets.convex_sets import set_bounds
-from jaxmpc.sets.lp import FLAT, Program, power_of_two, scaling
+from jaxmpc.sets.lp import FLAT, Optimum, Program, power_of_two, scaling
 
 # Tangents of a ball are added to a program up to so often.
 TANGENTS = 200
@@ -250,7 +251,7 @@ class RowPrograms:
             reach = radius + self.normals @ lower[R - balls :]
             G, g = np.vstack([A, planes, last]), np.concatenate([b, reach, limits])
             mask = np.append(equal, np.zeros(len(g) - len(b), bool))
-            top = self._program(G[:, part], g - G @ fixed, mask).maximise(cost[part])
+            top = self._maximise(cost[part], G[:, part], g - G @ fixed, mask)
             if top.x is None or top.y is None:
                 return Solved(top.value, None, np.zeros(R))
             x = fixed.copy()
@@ -269,9 +270,11 @@ class RowPrograms:
         y[R - balls :] = top.y[second : second + len(planes)] @ self.normals[: len(planes)]
         return Solved(float(cost @ x), x, y)
 
-    def _program(self, G: np.ndarray, g: np.ndarray, equal: np.ndarray) -> Program:
-        """Return the program over G x ≤ g: the last one with another last column where that is all
-        they differ in, as rays from one point do."""
+    def _maximise(
+        self, cost: np.ndarray, G: np.ndarray, g: np.ndarray, equal: np.ndarray
+    ) -> Optimum:
+        """Maximise cost'x over G x ≤ g, from the end of the last program where the two differ in
+        their last column alone, as those of rays from one point do."""
         last = self._last
         same = (
             last is not None
@@ -282,9 +285,10 @@ class RowPrograms:
         )
         if last is not None and same:
             last.change_last_column(G[:, -1])
-        else:
-            self._last = last = Program(G, g, equal)
-        return last
+            with contextlib.suppress(ValueError):  # in the units of another last column
+                return last.maximise(cost)
+        self._last = Program(G, g, equal)
+        return self._last.maximise(cost)
 
     def support(self, direction: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """Return max direction'θ over the feasible set: the optimum (inf: unbounded, −inf: empty),

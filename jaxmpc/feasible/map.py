@@ -359,5 +359,8 @@ def label_chunks(
         chunk = count(chosen_devices(settings.get("devices"))) * default_chunk()
     chunk = min(whole("chunk", chunk, 1), max(len(points), 1))
     places = slices(len(points), chunk)
-    scope = Scope.of(points, len(places)) if scope is None else scope
+    if scope is None:
+        before = problem.memory.get("points", 0)
+        scope = Scope.of(points, len(places), before)
+        problem.memory["points"] = before + len(points)
     yield from labelled_parts(problem, places, points.__getitem__, scope, chunk, **settings)

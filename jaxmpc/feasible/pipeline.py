@@ -20,6 +20,7 @@ among processes gives the same bits. So parts may be labelled here (`label_parts
 
 import functools
 import itertools
+import math
 import pickle
 import time
 import warnings
@@ -29,11 +30,13 @@ from dataclasses import replace
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxmpc.batches import (
     Compiled,
+    Devices,
     Part,
     chosen_devices,
     cores,
@@ -41,9 +44,12 @@ from jaxmpc.batches import (
     divisible,
     gather_size,
     joined,
+    over_devices,
     padded,
     placement,
     side_by_side,
+    slices,
+    to_host,
 )
 from jaxmpc.checks import fail, require_step_type
 from jaxmpc.feasible.candidate_search import compiled_admm, compiled_check, compiled_newton
@@ -56,8 +62,6 @@ from jaxmpc.qp.status import Status
 
 # The arrays of `Labels` that may still be on the device, and the label that each of them proves.
 PROOFS = {"start": 1, "plan": 1, "cut_normal": -1, "cut_offset": -1}
-# The status of labels −1, 0 and 1.
-STATUS = np.array([Status.PRIMAL_INFEASIBLE, Status.ITERATION_LIMIT, Status.SOLVED], np.int8)
 # Steps of the longer ADMM run, relative to the first, on points that Newton leaves undecided.
 LONGER = 20
 # Points that get linear programs, the first of each part in order: so many in all parts, each with
@@ -152,16 +156,14 @@ class Labels:
 
     @classmethod
     def proved(
-        cls, label: np.ndarray | Array, verdict: Callable[[], Verdict], usable: np.ndarray
+        cls, label: np.ndarray, status: np.ndarray, verdict: Callable[[], Verdict]
     ) -> "Labels":
-        """Return labels (B,) of a batch, on the device, with the proofs in its verdict, which is
-        asked for when one is used; waits for the device. usable (B,): which points are finite."""
-        label = np.where(usable, np.asarray(label), np.int8(0))
-        status = np.where(usable, STATUS[label + 1], np.int8(Status.NON_FINITE))
+        """Return labels with the proofs in a verdict on a device, which is asked for when one of
+        them is used."""
 
         def proof(name: str, of: int) -> OnDemand[np.ndarray]:  # NaN where it proves nothing
             def fetch() -> np.ndarray:
-                return _put(np.asarray(getattr(verdict(), name)), label != of, np.nan)
+                return _put(to_host(getattr(verdict(), name)), label != of, np.nan)
 
             return OnDemand(fetch)
 
@@ -230,6 +232,11 @@ class Labels:
             proofs={**self.proofs, **{name: merged(name, rows) for name, rows in proofs.items()}},
         )
 
+    @property
+    def undecided(self) -> np.ndarray:
+        """Return the indices of the points that are undecided so far."""
+        return np.flatnonzero(self.status == Status.ITERATION_LIMIT)
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Return label, status and all proofs by their names."""
         proofs = {name: proof.get() for name, proof in self.proofs.items()}
@@ -253,39 +260,48 @@ class Scope:
     """What the labels of a part take from all points together.
 
     largest, typical (d,): the largest and the median |θ|. parts: their number, which share the
-    linear programs.
+    linear programs. points: number of all points that are labelled of the problem, in this call and
+    before.
     """
 
     largest: np.ndarray
     typical: np.ndarray
     parts: int
+    points: int
 
     @classmethod
-    def of(cls, points: np.ndarray, parts: int) -> "Scope":
-        """Return the scope of points (B, d), of which some may not be finite."""
-        # Column by column: reductions along rows of few entries are slow.
-        usable = functools.reduce(np.logical_and, map(np.isfinite, points.T))
-        extent = np.array([np.max(np.abs(v), where=usable, initial=0.0) for v in points.T])
+    def of(cls, points: np.ndarray, parts: int, before: int = 0) -> "Scope":
+        """Return the scope of points (B, d), of which some may not be finite; before: points that
+        have been labelled of the same problem."""
+        pieces = slices(len(points), -(-len(points) // cores())) if len(points) else [slice(0)]
+        extent = np.max(side_by_side(lambda i: extent_of(points[i]), pieces, cores()), axis=0)
         sample = points[:: max(1, len(points) // SAMPLE)]
         sample = np.abs(sample[np.all(np.isfinite(sample), axis=1)])
         size = np.median(sample, axis=0) if len(sample) else np.zeros(points.shape[1])
-        return cls(extent, size, parts)
+        return cls(extent, size, parts, before + len(points))
 
     @classmethod
     def of_grid(cls, lines: Sequence[np.ndarray], parts: int) -> "Scope":
         """Return the scope of the grid with these d coordinates."""
         sizes = [np.abs(line) for line in lines]
         largest, typical = (np.array([f(v) for v in sizes]) for f in (np.max, np.median))
-        return cls(largest, typical, parts)
+        return cls(largest, typical, parts, math.prod(map(len, lines)))
+
+
+def extent_of(points: np.ndarray) -> np.ndarray:
+    """Return the largest |θ| (d,) of those points (B, d) that are finite."""
+    # Column by column: reductions along rows of few entries are slow.
+    usable = functools.reduce(np.logical_and, map(np.isfinite, points.T))
+    return np.array([np.max(np.abs(v), where=usable, initial=0.0) for v in points.T])
 
 
 class BegunPart(NamedTuple):
-    """A part as programs take it: points (whole, d), zeros where they are not usable, of which the
-    first `size` are the part's; found: what the first stage has left on the device."""
+    """A part and, on the device, as programs take it: points x (whole, d), zeros where they are not
+    `usable`, of which the first are the part's; found: what the first stage has left there."""
 
     points: np.ndarray
-    usable: np.ndarray
-    size: int
+    x: Array
+    usable: Array
     found: Any
 
 
@@ -323,7 +339,8 @@ class Pipeline:
         self.short = compiled_admm(iterations, np.dtype(dtype), self.devices)
         self.long = compiled_admm(LONGER * iterations, np.dtype(np.float64), self.devices)
         self.newton = compiled_newton(each, self.devices)
-        data = exact, problem.rows, hull_for(problem, scope.parts * chunk)
+        self.prepare, self.outcome = _compiled_ends(self.devices)
+        data = exact, problem.rows, hull_for(problem, scope.points)
         with jax.enable_x64(True):
             self.exact, self.rows, self.hull = jax.device_put(data, placement(self.devices))
 
@@ -336,60 +353,57 @@ class Pipeline:
 
     def begin(self, points: np.ndarray) -> BegunPart:
         """Start the first stage of points (b, d), b ≤ chunk, on the device, and return at once."""
-        x = padded(points, self.whole)
-        usable = np.all(np.isfinite(x), axis=1)
-        x = np.where(usable[:, None], x, 0.0)
+        full = points if len(points) == self.whole else padded(points, self.whole)
+        x, usable = self.prepare.run(full)
         if self.hull is not None:
             found = _run(compiled_labels(self.devices), self.hull, x)
         else:
             found = _run(self.short, self.exact, self.rows, x)
-        return BegunPart(x, usable, len(points), found)
+        return BegunPart(points, x, usable, found)
 
     def finish(self, part: BegunPart) -> Labels:
         """Return the labels of a part, by all stages."""
+        points, x, usable, found = part
         if self.hull is None:
-            labels = self.by_newton(part.points, part.usable, part.found)
+            labels = self.by_newton(x, usable, found)
         else:
-            verdict = OnDemand(functools.partial(self.hull_verdict, part.points))
-            labels = Labels.proved(part.found, verdict.get, part.usable)
+            verdict = OnDemand(functools.partial(self.hull_verdict, x))
+            labels = Labels.proved(*self.outcome(found, usable), verdict.get)
+        labels = labels.first(len(points))
         for stage in self.stages:
-            left = np.flatnonzero((labels.label == 0) & part.usable)
-            for where in self.batches(left):
-                more = stage(padded(part.points[where], self.batch)).first(len(where))
+            for where in self.batches(labels.undecided):
+                more = stage(padded(points[where], self.batch)).first(len(where))
                 labels = labels.changed(where, more.label, more.status, more.proofs)
-        left = np.flatnonzero((labels.label == 0) & part.usable)[: self.share]
-        labels = self.by_programs(labels, part.points, left) if len(left) else labels
-        return labels.first(part.size)
+        left = labels.undecided[: self.share]
+        return self.by_programs(labels, points, left) if len(left) else labels
 
     def batches(self, index: np.ndarray) -> Iterator[np.ndarray]:
         """Yield indices in batches of one size at most."""
         for first in range(0, len(index), self.batch):
             yield index[first : first + self.batch]
 
-    def hull_verdict(self, points: np.ndarray) -> Verdict:
+    def hull_verdict(self, x: Any) -> Verdict:
         """Return the verdicts of the hull on points, with their proofs."""
         with jax.enable_x64(True):
-            return _run(compiled_verdicts(self.devices), self.exact, self.hull, points)
+            return _run(compiled_verdicts(self.devices), self.exact, self.hull, x)
 
     def by_hull(self, points: np.ndarray) -> Labels:
         """Return the labels of points by roll-outs of the plans that the hull gives them."""
-        return decided(self.hull_verdict(points))
+        return self.decided(self.hull_verdict(points))
 
     def by_admm(self, admm: Compiled, points: np.ndarray) -> Labels:
         """Return the labels of points by steps of ADMM and of Newton."""
         found = _run(admm, self.exact, self.rows, points)
         return self.by_newton(points, np.ones(len(points), bool), found)
 
-    def by_newton(
-        self, points: np.ndarray, usable: np.ndarray, found: tuple[Verdict, Any]
-    ) -> Labels:
+    def by_newton(self, x: Any, usable: Any, found: tuple[Verdict, Any]) -> Labels:
         """Return the labels after Newton steps from the w of an ADMM stage, if it left any usable
         point undecided."""
         verdict, w = found
-        labels = decided(verdict, usable)
-        if np.any((labels.label == 0) & usable):
-            verdict = _run(self.newton, self.exact, self.rows, points, usable, verdict, w)
-            labels = decided(verdict, usable)
+        labels = self.decided(verdict, usable)
+        if len(labels.undecided):
+            verdict = _run(self.newton, self.exact, self.rows, x, usable, verdict, w)
+            labels = self.decided(verdict, usable)
         return labels
 
     def by_programs(self, labels: Labels, points: np.ndarray, last: np.ndarray) -> Labels:
@@ -401,15 +415,55 @@ class Pipeline:
                 solved = [program(theta) for theta in points[where]]
                 candidates = [padded(np.array(v), self.batch) for v in zip(*solved, strict=True)]
                 x = padded(points[where], self.batch)
-                more = decided(_run(check, self.exact, rows, x, *candidates)).first(len(where))
+                more = self.decided(_run(check, self.exact, rows, x, *candidates)).first(len(where))
                 labels = labels.changed(where, more.label, more.status, more.proofs)
         return labels
 
+    def decided(self, verdict: Verdict, usable: Any = None) -> Labels:
+        """Return the labels of a verdict; usable: which points are, None for all."""
+        usable = np.ones(len(verdict.label), bool) if usable is None else usable
+        return Labels.proved(*self.outcome(verdict.label, usable), lambda: verdict)
 
-def decided(verdict: Verdict, usable: np.ndarray | None = None) -> Labels:
-    """Return the labels of a verdict; usable: which points are, None for all."""
-    usable = np.ones(len(verdict.label), bool) if usable is None else usable
-    return Labels.proved(verdict.label, lambda: verdict, usable)
+
+@functools.cache
+def _compiled_ends(devices: Devices) -> tuple[Compiled, Compiled]:
+    """Return the compiled `without_nan` and `outcome` of a batch."""
+    prepare = over_devices(jax.vmap(without_nan), devices, (True,))
+    return prepare, over_devices(jax.vmap(outcome), devices, (True, True))
+
+
+def _run(program: Compiled, *args: Any) -> Any:
+    """Run the program and leave its result on the device."""
+    return program.run(*args)
+
+
+def pipeline_for(
+    problem: FeasibilityProblem, scope: Scope, chunk: int, **settings: Any
+) -> Pipeline:
+    """Return the pipeline of a problem: the last one of it, with all that lies on the devices,
+    where that was for the same scope and settings."""
+    devices = chosen_devices(settings.get("devices"))
+    others = tuple(repr(settings.get(name)) for name in ("iterations", "dtype"))
+    place = devices or jax.config.jax_default_device
+    numbers = scope.largest.tobytes(), scope.typical.tobytes(), scope.parts, chunk
+    key = *numbers, others, place, hull_for(problem, scope.points) is not None
+    if problem.memory.get("pipeline", (None,))[0] != key:
+        problem.memory["pipeline"] = key, Pipeline(problem, scope, chunk, **settings)
+    return problem.memory["pipeline"][1]
+
+
+def without_nan(theta: Array) -> tuple[Array, Array]:
+    """Return θ (d,), zeros where it is not finite, and whether it is."""
+    usable = jnp.all(jnp.isfinite(theta))
+    return jnp.where(usable, theta, 0.0), usable
+
+
+def outcome(label: Array, usable: Array) -> tuple[Array, Array]:
+    """Return the label of a point and its status; usable: whether it is finite."""
+    status = jnp.where(label == 1, Status.SOLVED, Status.PRIMAL_INFEASIBLE)
+    status = jnp.where(label == 0, Status.ITERATION_LIMIT, status)
+    status = jnp.where(usable, status, Status.NON_FINITE)
+    return jnp.where(usable, label, 0).astype(jnp.int8), status.astype(jnp.int8)
 
 
 def label_parts(
@@ -425,7 +479,7 @@ def label_parts(
     settings: iterations, dtype, devices, see `map_feasible_set`.
     """
     begun, compiled = time.perf_counter(), Compiled.seconds
-    pipeline = Pipeline(problem, scope, chunk, **settings)
+    pipeline = pipeline_for(problem, scope, chunk, **settings)
     waiting = None
     for points in itertools.chain(parts, [None]):
         with jax.enable_x64(True):
@@ -476,11 +530,6 @@ def last_programs(
         for rows in problem.weighted_rows:
             yield rows, functools.partial(end, RowPrograms(rows))
     yield problem.rows, functools.partial(found.margin, size=margins)
-
-
-def _run(program: Compiled, *args: Any) -> Any:
-    """Run the program and leave its result on the device."""
-    return program.run(*args)
 
 
 def labelled_parts(

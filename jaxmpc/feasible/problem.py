@@ -61,6 +61,11 @@ class FeasibilityProblem:
         return tuple(self.mpc.labels[i] for i in self.view.axes)
 
     @cached_property
+    def memory(self) -> dict[str, Any]:
+        """Return what those who label points keep from one call to the next."""
+        return {}
+
+    @cached_property
     def condensed(self) -> Condensed:
         """Return the condensed problem, of all states."""
         return with_previous_inputs(self.mpc, condensed_in_float64(self.mpc))
