@@ -368,7 +368,7 @@ class Pipeline:
             labels = self.by_newton(x, usable, found)
         else:
             verdict = OnDemand(functools.partial(self.hull_verdict, x))
-            labels = Labels.proved(*self.outcome(found, usable), verdict.get)
+            labels = self.labels(found, usable, verdict.get)
         labels = labels.first(len(points))
         for stage in self.stages:
             for where in self.batches(labels.undecided):
@@ -422,7 +422,12 @@ class Pipeline:
     def decided(self, verdict: Verdict, usable: Any = None) -> Labels:
         """Return the labels of a verdict; usable: which points are, None for all."""
         usable = np.ones(len(verdict.label), bool) if usable is None else usable
-        return Labels.proved(*self.outcome(verdict.label, usable), lambda: verdict)
+        return self.labels(verdict.label, usable, lambda: verdict)
+
+    def labels(self, label: Any, usable: Any, verdict: Callable[[], Verdict]) -> Labels:
+        """Return labels that lie on the device; waits for it."""
+        label, status = self.outcome(label, usable)
+        return Labels.proved(label, status, verdict)
 
 
 @functools.cache
