@@ -41,14 +41,15 @@ def scaled_batch(n, m, B, *, soft=False, balls=(), stages=1, dtype=jnp.float32, 
     if balls:
         fields |= {"balls": balls, "radius": rng.uniform(0.5, 1, len(balls))}
     rho = np.linspace(0.5, 2, stages)[:, None] * np.ones(m)
-    made = factorise(jnp.eye(n), A, ADMM(iterations=STEPS, rho=rho), balls)
+    settings = ADMM(iterations=STEPS, rho=rho)
+    made = jax.jit(lambda A: factorise(jnp.eye(n), A, settings, balls))(A)
 
     def one(q, l, u):
         qp = solve.as_arrays(jm.QP(jnp.eye(n), q, A, l, u, **fields))
         program = ScaledProgram.of(qp, made)
         return program.q, program.bounds
 
-    data = made, *jax.vmap(one)(q, l, u), rng.standard_normal((B, m))
+    data = made, *jax.jit(jax.vmap(one))(q, l, u), rng.standard_normal((B, m))
     return jax.tree.map(lambda v: jnp.asarray(v, dtype) if v.dtype.kind == "f" else v, data)
 
 
@@ -69,7 +70,7 @@ def test_admm_in_one_kernel_is_the_loop(case, x64):
     loop = lambda q, b, t: iterate(splittings(made, q), b, t, STEPS, alpha)
     found = iterate_batch(made, alpha, q, bounds, t, STEPS)
     rounding = 1e3 * jnp.finfo(t.dtype).eps
-    for ours, wanted in zip(found, jax.vmap(loop)(q, bounds, t), strict=True):
+    for ours, wanted in zip(found, jax.jit(jax.vmap(loop))(q, bounds, t), strict=True):
         np.testing.assert_allclose(ours, wanted, atol=rounding)
     assert iterate_batch(made, alpha, q, bounds, t, 0)[0] is t
 
@@ -87,7 +88,7 @@ def searches(case, first, more):
     made, q, bounds, t = scaled_batch(**case, dtype=jnp.float64)
     start = 0.02 * t * (jnp.abs(t) > 1)
     limit, steps = jnp.asarray(1e7), MostSteps(first, more)
-    points = jax.vmap(lambda q, b, y: DualPoint.of(made.A, q, b, y))
+    points = jax.jit(jax.vmap(lambda q, b, y: DualPoint.of(made.A, q, b, y)))
     cold, point = points(q, bounds, 0 * start), points(q, bounds, start)
 
     def loop(bounds, cold, point):

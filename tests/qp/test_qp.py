@@ -122,7 +122,7 @@ class TestKnownAnswers:
             np.testing.assert_allclose(sol.z, z, atol=1e-5)
 
     @pytest.mark.first(1)
-    @pytest.mark.parametrize("n", [1, 5, 20])
+    @pytest.mark.parametrize("n", [8, 1, 5, 20])
     def test_linear_programs(self, x64, n):
         """P = 0: ADMM is slow there; solved and right, or said to be unfinished."""
         for seed in range(3):
