@@ -223,9 +223,13 @@ CHUNK = 8192
 MANY = 100_000
 
 
-def default_chunk() -> int:
-    """Points a compiled program takes at once on the present device."""
-    return CHUNK if jax.default_backend() == "cpu" else 32 * CHUNK
+def default_chunk(numbers: int = 4096) -> int:
+    """Return how many points a compiled program takes at once on the present device. numbers: of
+    float64, that it holds of each; all of them take a quarter of the memory of a GPU at most."""
+    if jax.default_backend() == "cpu":
+        return CHUNK
+    fitting = device_bytes() / 4 / (8 * numbers)
+    return 2 ** int(np.log2(np.clip(fitting, CHUNK, 128 * CHUNK)))
 
 
 def cores() -> int:
@@ -261,6 +265,8 @@ def gather_size(chunk: int) -> int:
 
 def padded(x: np.ndarray, size: int) -> np.ndarray:
     """The first row repeated up to `size` rows."""
+    if len(x) == size:
+        return x
     return np.concatenate([x, np.broadcast_to(x[:1], (size - len(x), *x.shape[1:]))])
 
 

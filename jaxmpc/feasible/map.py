@@ -356,7 +356,8 @@ def label_chunks(
     if points.ndim != 2 or points.shape[1] != d:
         fail("x0s", f"shape {points.shape}", f"Give points (B, {d}), one column a mapped state")
     if chunk is None:
-        chunk = count(chosen_devices(settings.get("devices"))) * default_chunk()
+        held = 16 * sum(problem.rows.U.shape)  # vectors of rows and inputs
+        chunk = count(chosen_devices(settings.get("devices"))) * default_chunk(held)
     chunk = min(whole("chunk", chunk, 1), max(len(points), 1))
     places = slices(len(points), chunk)
     if scope is None:

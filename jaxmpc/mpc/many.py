@@ -38,10 +38,12 @@ from jaxmpc.batches import (
     default_chunk,
     divisible,
     first_rows,
+    joined,
     over_devices,
     padded,
     placement,
     side_by_side,
+    to_host,
     workers,
 )
 from jaxmpc.checks import fail, require_kind, require_memory, require_step_type, whole
@@ -145,14 +147,14 @@ class Batch:
     ) -> None:
         self.x, self.to_host, self.devices = x, to_host, devices
         self.controller = jax.device_put(controller, placement(devices))
-        # Of several devices two chunks at once: one is computed while the other goes to the host.
-        self.together = workers() if devices is None else 2
+        on_cpu = jax.default_backend() == "cpu"
+        # Elsewhere than on a CPU two chunks at once: one is computed while the other is copied.
+        self.together = workers() if on_cpu and devices is None else 2
+        self._begins: Any = nullcontext() if on_cpu else threading.Lock()
         shares = workers() if devices is None else 1
-        most = min(count(devices) * default_chunk(), -(-len(x) // shares))
+        most = min(count(devices) * default_chunk(numbers_held(controller)), -(-len(x) // shares))
         self.chunk = divisible(max(min(chunk or most, len(x)), 1), devices)
         self.block = divisible(min(self.chunk, count(devices) * BLOCK), devices)
-        # On several devices one program begins after the other, in the same order on all of them.
-        self._begins: Any = nullcontext() if devices is None else threading.Lock()
         self._stores = threading.Lock()
         self.answer: Plan | None = None
 
@@ -201,21 +203,35 @@ class Batch:
         `answer`."""
         size = self.chunk if len(index) >= self.chunk else self.block
 
-        def part(where: np.ndarray) -> None:
+        def solved(where: np.ndarray) -> Plan:
             with jax.enable_x64(True):
                 if isinstance(self.x, np.ndarray):
                     x = padded(self.x[places(where)], size)
                 else:
-                    x = _rows(self.x, padded(where, size))
+                    x = (
+                        self.x
+                        if len(where) == len(self.x) == size
+                        else _rows(self.x, padded(where, size))
+                    )
                 with self._begins:
                     plans = program.run(*arguments, x)
-                self._put(where, size, plans)
+                return to_host(plans) if self.to_host else plans
+
+        def put(where: np.ndarray) -> None:
+            self._put(where, size, solved(where))
 
         pieces = [index[i : i + size] for i in range(0, len(index), size)]
-        side_by_side(part, pieces, self.together)
+        # (On a CPU each chunk is copied at once, and its memory used again.)
+        at_end = len(pieces) == 1 or (self.to_host and jax.default_backend() != "cpu")
+        if at_end and len(index) == len(self.x):
+            found = side_by_side(solved, pieces, self.together)
+            parts = [first_rows(v, len(w)) for v, w in zip(found, pieces, strict=True)]
+            self.answer = parts[0] if len(parts) == 1 else joined(parts)
+        else:
+            side_by_side(put, pieces, self.together)
 
     def _put(self, where: np.ndarray, size: int, plans: Plan) -> None:
-        B, plans = len(self.x), jax.device_get(plans) if self.to_host else plans
+        B = len(self.x)
         with self._stores:
             if self.answer is None:
                 zeros = np.zeros if self.to_host else jnp.zeros
@@ -225,6 +241,13 @@ class Batch:
                 return
         for all_, rows in zip(*map(jax.tree.leaves, (self.answer, plans)), strict=True):
             all_[places(where)] = rows[: len(where)]
+
+
+def numbers_held(controller: Controller) -> int:
+    """Return about how many numbers a program holds of each plan: vectors of rows and inputs."""
+    c, mpc = controller.condensed, controller.mpc
+    size = sum(c.C.shape) if c is not None else mpc.horizon * (mpc.system.n + mpc.system.m)
+    return 16 * size
 
 
 def places(where: np.ndarray) -> np.ndarray | slice:
