@@ -9,6 +9,9 @@ A CPU bug of old jaxlibs: from 0.7.0 until 0.11.1, XLA's fusion emitters recompu
 small operations again and again (a step of a 7-joint robot is 500 times slower). The flag is
 unknown to later versions, which abort on it. And one thread for OpenBLAS, whose threads wait for
 each other on busy cores. The library itself never touches the environment.
+
+Traces make many small objects that live on, which Python's collector visits again and again: it
+runs more rarely (on Python 3.11, 4 and 7 % less CPU time in two groups of 60 tests).
 """
 
 import gc
@@ -19,6 +22,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+
+gc.set_threshold(100_000, 20, 100)
 
 _jaxlib = tuple(int(part) for part in re.findall(r"\d+", version("jaxlib"))[:3])
 if (0, 7, 0) <= _jaxlib < (0, 11, 1):
