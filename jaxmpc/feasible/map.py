@@ -362,6 +362,7 @@ def label_chunks(
     places = slices(len(points), chunk)
     if scope is None:
         before = problem.memory.get("points", 0)
-        scope = Scope.of(points, len(places), before)
+        empty = problem.programs.bounding_box[0] is None
+        scope = Scope.of(points, len(places), before, extent=empty)
         problem.memory["points"] = before + len(points)
     yield from labelled_parts(problem, places, points.__getitem__, scope, chunk, **settings)

@@ -48,7 +48,6 @@ from jaxmpc.batches import (
     padded,
     placement,
     side_by_side,
-    slices,
     to_host,
 )
 from jaxmpc.checks import fail, require_step_type
@@ -270,15 +269,17 @@ class Scope:
     points: int
 
     @classmethod
-    def of(cls, points: np.ndarray, parts: int, before: int = 0) -> "Scope":
-        """Return the scope of points (B, d), of which some may not be finite; before: points that
-        have been labelled of the same problem."""
-        pieces = slices(len(points), -(-len(points) // cores())) if len(points) else [slice(0)]
-        extent = np.max(side_by_side(lambda i: extent_of(points[i]), pieces, cores()), axis=0)
+    def of(cls, points: np.ndarray, parts: int, before: int = 0, *, extent: bool = True) -> "Scope":
+        """Return the scope of points (B, d), of which some may not be finite.
+
+        before: points that have been labelled of the same problem. extent: False leaves `largest`
+        at zero, for problems whose bounding box is known (`FeasibilityProblem.exact`).
+        """
+        largest = extent_of(points) if extent else np.zeros(points.shape[1])
         sample = points[:: max(1, len(points) // SAMPLE)]
         sample = np.abs(sample[np.all(np.isfinite(sample), axis=1)])
         size = np.median(sample, axis=0) if len(sample) else np.zeros(points.shape[1])
-        return cls(extent, size, parts, before + len(points))
+        return cls(largest, size, parts, before + len(points))
 
     @classmethod
     def of_grid(cls, lines: Sequence[np.ndarray], parts: int) -> "Scope":

@@ -278,7 +278,7 @@ def _damped(m: int, rows: int, side: int, damping: float, steps: int, dtype: jnp
     ) -> None:
         k, count = indices(side), count_ref[0]
 
-        def solution(_: Array) -> Array:
+        def solution(none: Array) -> Array:
             inside = k < count
             W = load(W_ref.at[k], inside, 0)
             Lambda, b = load(Lambda_ref.at[k], inside), load(b_ref.at[k], inside)
@@ -290,11 +290,11 @@ def _damped(m: int, rows: int, side: int, damping: float, steps: int, dtype: jnp
                 return whole + jnp.where(same, diagonal[:, None], 0.0)
 
             inverse = inverted(M(damping), k, count)
-            y = jnp.zeros_like(b)
+            found = jnp.zeros_like(b)
             for _ in range(steps):
-                left = b - jnp.sum(M(0.0) * y[None, :], axis=1)
-                y = y + jnp.sum(inverse * left[None, :], axis=1)
-            return jnp.where(inside, y, 0.0)
+                left = b - jnp.sum(M(0.0) * found[None, :], axis=1)
+                found = found + jnp.sum(inverse * left[None, :], axis=1)
+            return jnp.where(inside, found, 0.0)
 
         # Most instances belong to another kernel, and wait for nothing in this one.
         y = jax.lax.cond(count > 0, solution, lambda _: jnp.zeros(side, dtype), jnp.int32(0))
