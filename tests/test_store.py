@@ -18,9 +18,9 @@ from damage import turned_bits
 from jaxmpc import store
 from jaxmpc.feasible.map import BOUNDS
 from jaxmpc.feasible.stored import dimension_names, label_fields, stored_labels
-from jaxmpc.store import Constant, Store
+from jaxmpc.store import BlockWriter, Constant, Store
 from jaxmpc.store.reading import regions
-from jaxmpc.store.writing import block_shape
+from jaxmpc.store.writing import block_shape, default_block
 
 AXES = {
     "q": Constant(np.linspace(-1, 1, 5), ("q",), {"units": "rad", "long_name": "q"}),
@@ -47,9 +47,9 @@ def bounds(count):
     return {name: Constant(v, BOUNDS[name]) for name, v in zip(BOUNDS, values, strict=True)}
 
 
-def open_store(path, config=CONFIG, axes=AXES, chunk=8):
+def open_store(path, config=CONFIG, axes=AXES, chunk=8, **how):
     names = {"state": Constant(np.array(["q [rad]", "dq [rad/s]"]), ("state",))}
-    return Store(path, axes, FIELDS, config, chunk, constants=names)
+    return Store(path, axes, FIELDS, config, chunk, constants=names, **how)
 
 
 @pytest.fixture
@@ -78,6 +78,56 @@ class TestBlocks:
             np.testing.assert_array_equal(np.diff(part), 1)
             found.append(part)
         np.testing.assert_array_equal(np.concatenate(found), whole.ravel())
+
+    @pytest.mark.parametrize(
+        ("shape", "part", "processes", "expected"),
+        [
+            ((1024, 1024), 8192, 1, (128, 1024)),
+            ((1024, 1024), 8192, 16, (8, 1024)),
+            ((1000, 1000), 8192, 1, (120, 1000)),
+            ((256, 256), 8192, 1, (32, 256)),
+            ((4, 100_000), 8192, 1, (1, 46_158)),
+            ((50, 50, 50), 1000, 1, (6, 50, 50)),
+            ((30,), 7, 1, (6,)),
+            ((3, 5), 100, 1, (3, 5)),
+        ],
+    )
+    def test_consist_of_whole_parts(self, tmp_path, shape, part, processes, expected):
+        """The parts are those of a store with one part a block, whatever its number of blocks."""
+        block = default_block(shape, part, 200, processes)
+        assert block == expected
+        axes = {f"x{i}": Constant(np.arange(n), (f"x{i}",)) for i, n in enumerate(shape)}
+        found = []
+        for name, chunk in (("large.zarr", None), ("small.zarr", part)):
+            with Store(
+                tmp_path / name, axes, FIELDS, {}, chunk, part=part, shard=(0, processes)
+            ) as kept:
+                parts = [kept.parts(block, part) for block in range(len(kept.regions))]
+                for block, inside in enumerate(parts):
+                    assert (inside[0].start, inside[-1].stop) == (
+                        kept.rows(block).start,
+                        kept.rows(block).stop,
+                    )
+                found.append([each for inside in parts for each in inside])
+                sizes = [each.stop - each.start for each in found[-1]]
+                assert kept.part_size(part) == max(sizes)
+        assert found[0] == found[1]
+
+    def test_of_large_samples_are_smaller(self):
+        assert default_block((2**13, 2**13), 2**13, 100, 1) == (16, 2**13)
+        assert default_block((2**13, 2**13), 2**13, 1000, 1) == (4, 2**13)
+        assert default_block((2**13, 2**13), 2**13, 10**6, 1) == (1, 2**13)
+
+    def test_without_a_size_are_those_of_the_store_there(self, tmp_path):
+        path = tmp_path / "sweep.zarr"
+        with open_store(path, chunk=8) as kept:
+            kept.commit(1, **rows(8, 1))
+        with open_store(path, chunk=None, part=20) as kept:
+            assert kept.pending() == [0, 2] and kept.block_shape == (2, 4)
+        with open_store(path, chunk=None, part=20, overwrite=True) as kept:
+            assert kept.block_shape == (5, 4)
+            kept.commit(0, **rows(20, 1))
+        assert store.read(path).attributes["chunk"] == 20
 
     def test_resume(self, tmp_path):
         path = tmp_path / "sweep.zarr"
@@ -113,6 +163,57 @@ class TestBlocks:
                 assert kept.pending() == [0, 1, 2]
             kept.commit(1, **rows(8, 1))
             assert kept.pending() == [0, 2]
+
+
+class TestBlockWriter:
+    """Blocks of parts, written in a thread."""
+
+    def put(self, writer, block, parts=2):
+        """Give the rows of a block in so many parts, the last one first."""
+        place = writer.store.rows(block)
+        samples = np.arange(place.start, place.stop)
+        for part in reversed(np.array_split(samples, parts)):
+            values = rows(len(part), 1) | {"cut_offset": part.astype(float)}
+            writer.put(block, slice(part[0], part[-1] + 1), **values)
+
+    def test_writes_what_it_is_given(self, tmp_path):
+        path = tmp_path / "sweep.zarr"
+        with open_store(path) as kept, BlockWriter(kept) as writer:
+            for block, parts in ((1, 3), (0, 1), (2, 2)):
+                self.put(writer, block, parts)
+        found = store.read(path)
+        assert found.done == 3 and not found.problems
+        np.testing.assert_array_equal(found.arrays["cut_offset"], np.arange(20.0))
+        assert found.arrays["plan"].shape == (20, 3, 1) and (found.arrays["plan"] == 1).all()
+
+    @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+    def test_an_interruption_loses_the_block_in_hand(self, tmp_path, error):
+        path = tmp_path / "sweep.zarr"
+        with open_store(path) as kept:
+            with pytest.raises(error), BlockWriter(kept) as writer:
+                self.put(writer, 0)
+                writer.put(1, slice(8, 12), **rows(4, 1))
+                raise error
+            assert kept.pending() == [1, 2]
+        assert not store.read(path).problems
+
+    @pytest.mark.parametrize("more", [0, 1])
+    def test_an_error_of_the_thread_reaches_the_caller(self, tmp_path, monkeypatch, more):
+        """When the next block is whole, or at the end; and no block is marked as done by it."""
+
+        def full(array, where, value):
+            raise OSError("No space left on device")
+
+        with open_store(tmp_path / "sweep.zarr") as kept:
+            monkeypatch.setattr(zarr.Array, "__setitem__", full)
+            reached = []
+            with pytest.raises(OSError, match="No space"), BlockWriter(kept) as writer:
+                self.put(writer, 0)
+                for block in range(1, 1 + more):
+                    self.put(writer, block)
+                reached.append("end")
+            monkeypatch.undo()
+            assert reached == ([] if more else ["end"]) and kept.pending() == [0, 1, 2]
 
 
 class TestDataSet:
@@ -260,7 +361,7 @@ class TestDamage:
 WRITER = """
     import sys
     import numpy as np
-    from jaxmpc.store import Constant, Field, Store
+    from jaxmpc.store import BlockWriter, Constant, Field, Store
     count, chunk = 16_000, 1000
     points = np.arange(2.0 * count).reshape(count, 2)
     fields = {"label": Field((), "int8", 0, ()), "plan": Field((3,), "float64", np.nan, ("time",))}
@@ -268,9 +369,12 @@ WRITER = """
     constants = {"points": Constant(points, ("sample", "coordinate"))}
     kept = Store(sys.argv[1], axes, fields, {}, chunk, constants=constants)
     print("open", flush=True)
-    for block in kept.pending():
-        x = points[kept.rows(block), 0]
-        kept.commit(block, label=np.ones(chunk, np.int8), plan=np.stack([x, x, x], axis=1))
+    with BlockWriter(kept) as writer:
+        for block in kept.pending():
+            for part in kept.parts(block, 300):
+                x = points[part, 0]
+                label = np.ones(len(x), np.int8)
+                writer.put(block, part, label=label, plan=np.stack([x, x, x], axis=1))
 """
 
 

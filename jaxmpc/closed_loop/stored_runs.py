@@ -22,7 +22,7 @@ from jaxmpc.robots.load import model_hash
 from jaxmpc.robots.robot import Robot
 
 if TYPE_CHECKING:
-    from jaxmpc.store import Field, Store
+    from jaxmpc.store import BlockWriter, Field, Store
 
 # The fields of `Run` in a store. Stored runs have no observer, hence no estimates, and no soft rows
 # at k = 0: x_0 is measured, and no limit binds it.
@@ -74,7 +74,7 @@ def simulate_into(
 
     Raises ValueError for wrong arguments, and as `jaxmpc.store.Store` does.
     """
-    from jaxmpc.store import Constant, Store, report_damage
+    from jaxmpc.store import BlockWriter, Constant, Store, report_damage
 
     check_results(path, resume, overwrite)
     target = {"reference": reference, "input_reference": input_reference, "devices": devices}
@@ -90,8 +90,9 @@ def simulate_into(
     ) as store:
         report_damage(store)
         total = sum(len(store.samples(block)) for block in store.pending())
-        commit, parts = partial(loops.commit, store), loops.parts(store, timing)
-        work_off(parts, commit, total, unit="robots", progress=shown)
+        with BlockWriter(store) as writer:
+            put, parts = partial(loops.put, writer), loops.parts(store, timing)
+            work_off(parts, put, total, unit="robots", progress=shown)
         found: dict[str, Any] = {name: store.read(name) for name in STORED}
         found["slack"] = np.zeros((*found["status"].shape, 0))
         return StoredRuns(Run(**found), store.attributes["config"], timing)
@@ -159,11 +160,12 @@ class _Loops:
                 run = simulate_many(self.controller, self.robot, x0s, self.steps, **given)
             yield Part(block, size, first_rows(run, size))
 
-    def commit(self, store: "Store", part: Part[Run]) -> None:
-        """Write the runs of a block."""
-        rows = store.rows(part.place)
+    def put(self, writer: "BlockWriter", part: Part[Run]) -> None:
+        """Give the runs of a block to the writer."""
+        rows = writer.store.rows(part.place)
         own = {key: value[rows] for key, value in self.factors.items()}
-        store.commit(part.place, **{name: getattr(part.result, name) for name in STORED}, **own)
+        runs = {name: getattr(part.result, name) for name in STORED}
+        writer.put(part.place, rows, **runs, **own)
 
 
 def _constants(value: Any) -> Any:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from jaxmpc.arrays import Reals
-from jaxmpc.batches import CHUNK, Part, Timing, work_off
+from jaxmpc.batches import CHUNK, Part, Timing, default_chunk, work_off
 from jaxmpc.checks import fail
 from jaxmpc.feasible.hard_constraints import Axes
 from jaxmpc.feasible.map import BOUNDS, FeasibleSetMap, excluded
@@ -32,7 +32,15 @@ from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
 from jaxmpc.sets.convex_sets import Box, Polytope
 from jaxmpc.sets.lp import power_of_two
-from jaxmpc.store import Constant, Field, Store, exists, location, report_damage
+from jaxmpc.store import (
+    BlockWriter,
+    Constant,
+    Field,
+    Store,
+    exists,
+    location,
+    report_damage,
+)
 
 # Lines of a picture along each axis, at most.
 LINES = 1024
@@ -190,7 +198,7 @@ def sweep_into(
     fixed: Reals | None = None,
     iterations: int = 50,
     dtype: str = "float32",
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     gap: float | None = 1e-6,
     settings: Mapping[str, Any] | None = None,
     shard: tuple[int, int] | None = None,
@@ -207,8 +215,10 @@ def sweep_into(
 
     path: a folder or URL (`jaxmpc.store`), which xarray.open_zarr reads. mpc, axes, fixed,
     iterations, dtype, executor, devices: as in `map_feasible_set`. along: the coordinates of the
-    grid along each of the d mapped states. chunk: points of a block: what is written at once, and
-    lost at most. gap: of `StoredMap.refine` at the end, None to skip it.
+    grid along each of the d mapped states. chunk: points of a block at most: what is written at
+    once, and lost at most; None: as in the store to go on with, in a new one `default_block`
+    decides. Blocks are labelled in parts of `default_chunk` points at most. gap: of
+    `StoredMap.refine` at the end, None to skip it.
 
     settings: JSON data that determine the labels: a store with others is refused; None: iterations
     and dtype. shard: (i, n) to label the blocks k with k mod n = i, beside other processes; the
@@ -238,25 +248,29 @@ def sweep_into(
             fail(str(path), what, "Add --resume (resume=True) to go on with it")
         report_damage(store)
         opened(store)
+        parts = [store.parts(block, default_chunk()) for block in range(len(store.regions))]
+        places = [(block, part) for block in pending for part in parts[block]]
         found = labelled_parts(
             problem,
-            pending,
-            lambda block: mesh(along, store.samples(block)),
-            Scope.of_grid(along, len(store.regions)),
-            store.size,
+            places,
+            lambda place: mesh(along, np.r_[place[1]]),
+            Scope.of_grid(along, sum(map(len, parts))),
+            store.part_size(default_chunk()),
             executor=executor,
             iterations=iterations,
             dtype=dtype,
             devices=devices,
         )
-
-        def commit(part: Part[Labels]) -> str:
-            store.commit(part.place, **part.result.arrays())
-            return f"{np.mean(part.result.label != 0):.2%} of the last block decided"
-
-        total = sum(len(store.samples(block)) for block in pending)
+        total = sum(part.stop - part.start for _, part in places)
         show = None if progress else False
-        timing = work_off(found, commit, total, unit="states", progress=show)
+        with BlockWriter(store) as writer:
+
+            def put(part: Part[Labels]) -> str:
+                block, rows = part.place
+                writer.put(block, rows, **part.result.arrays())
+                return f"{np.mean(part.result.label != 0):.2%} of the last part decided"
+
+            timing = work_off(found, put, total, unit="states", progress=show)
         if left := store.unfinished():
             return StoredMap.unread(problem, store, along, timing, left)
         whole = replace(StoredMap.read(problem, store, along), timing=timing)
@@ -273,7 +287,7 @@ def open_labels(
     problem: FeasibilityProblem,
     along: Sequence[np.ndarray],
     config: Mapping[str, Any],
-    chunk: int,
+    chunk: int | None,
     fields: Mapping[str, Field] | None = None,
     **how: Any,
 ) -> Store:
@@ -299,7 +313,15 @@ def open_labels(
     constants["time"] = Constant(times, ("time",), about_time)
     attributes = {"problem": problem.plain()}
     return Store(
-        path, axes, all_fields, config, chunk, constants=constants, attributes=attributes, **how
+        path,
+        axes,
+        all_fields,
+        config,
+        chunk,
+        part=CHUNK,
+        constants=constants,
+        attributes=attributes,
+        **how,
     )
 
 

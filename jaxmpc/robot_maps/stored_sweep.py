@@ -34,7 +34,7 @@ from jaxmpc.robot_maps.mapping import RobotSetting, home_coordinates, mpc_with_t
 from jaxmpc.robot_maps.robot_map import RobotLoops, RobotMap
 from jaxmpc.robots.load import load_robot, model_hash
 from jaxmpc.robots.robot import Robot
-from jaxmpc.store import Field, Store, report_damage
+from jaxmpc.store import BlockWriter, Field, Store, report_damage
 
 # Points along each of two axes; total number of points for another number of axes.
 SIDE, POINTS = 32, 1024
@@ -224,14 +224,16 @@ def _label(
     def points(block: int) -> np.ndarray:
         return setting.x0s[blocks.rows(block)]
 
-    def commit(part: Part[tuple[Labels, RobotLoops]]) -> None:
-        labels, loops = part.result
-        blocks.commit(part.place, **labels.arrays(), **vars(loops))
-
     found = setting.parts(pending, points, blocks.size, devices, **settings)
     total = sum(len(blocks.samples(block)) for block in pending)
     progress = None if budget.progress else False
-    timing = work_off(found, commit, total, unit="loops", progress=progress)
+    with BlockWriter(blocks) as writer:
+
+        def put(part: Part[tuple[Labels, RobotLoops]]) -> None:
+            (labels, loops), block = part.result, part.place
+            writer.put(block, blocks.rows(block), **labels.arrays(), **vars(loops))
+
+        timing = work_off(found, put, total, unit="loops", progress=progress)
     budget.say(f"{timing.count:,} loops; {timing.compile_seconds:.0f} s of that was compiling")
 
 

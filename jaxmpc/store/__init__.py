@@ -24,15 +24,18 @@ processes that make the same store at once write the same. That no two processes
 shard is up to the caller there; two that do write the same data.
 
 Store, Field, Constant  an open store and what it holds, to write block by block
+BlockWriter             the same part by part, each block in a thread while the next is computed
 read                    what lies there, compared with its checksums -> Stored
 open_dataset            the same as an xarray data set
 remove                  delete a store, and nothing else
 """
 
+from jaxmpc.store.block_writer import BlockWriter
 from jaxmpc.store.reading import Check, Stored, exists, location, open_dataset, read, reason
 from jaxmpc.store.writing import Constant, Field, Store, remove, report_damage
 
 __all__ = [
+    "BlockWriter",
     "Check",
     "Constant",
     "Field",

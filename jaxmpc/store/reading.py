@@ -70,6 +70,21 @@ def open_group(path: Path | str, mode: Any) -> "zarr.Group":
     return group
 
 
+def blocks_there(path: Path | str, shape: Sequence[int]) -> tuple[int, tuple[int, ...]] | None:
+    """Return what the store of a grid of this shape says of its blocks, samples at most and their
+    shape; None where there is no such store, or where it cannot be read."""
+    try:
+        found: Any = open_group(path, "r").attrs
+        chunk, block = found["chunk"], found["variables"]["block"]
+        fine = type(chunk) is int and all(
+            type(size) is int and 0 < size <= count
+            for size, count in zip(block, shape, strict=True)
+        )
+    except (ValueError, LookupError, TypeError):
+        return None
+    return (chunk, tuple(block)) if fine else None
+
+
 def zarr_place(path: Path | str) -> Any:
     """Return what zarr opens at a path or URL. Raises ValueError where fsspec cannot open it."""
     import zarr
@@ -116,8 +131,8 @@ def checksum(arrays: Mapping[str, np.ndarray]) -> int:
     for name in sorted(arrays):
         value = np.ascontiguousarray(arrays[name])
         text = value.dtype.kind not in "biuf"
-        data = repr(value.tolist()).encode() if text else value.tobytes()
-        state.update(f"{name}{value.shape}{'' if text else value.dtype.str}".encode() + data)
+        state.update(f"{name}{value.shape}{'' if text else value.dtype.str}".encode())
+        state.update(repr(value.tolist()).encode() if text else value.ravel().data)
     return int.from_bytes(state.digest(), "little") or 1
 
 

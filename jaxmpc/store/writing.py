@@ -17,6 +17,7 @@ from jaxmpc.checks import fail
 from jaxmpc.files import differences, versions
 from jaxmpc.store.reading import (
     array_of,
+    blocks_there,
     checksum,
     digest_of,
     exists,
@@ -30,6 +31,9 @@ from jaxmpc.store.reading import (
 if TYPE_CHECKING:
     import zarr
     from zarr.abc.codec import BytesBytesCodec as Codec
+
+# Samples and bytes of a block at most, where its size is not given, and blocks of each process.
+BLOCK, BLOCK_BYTES, BLOCKS = 2**17, 2**25, 8
 
 
 class Lock:
@@ -111,8 +115,9 @@ class Store:
         axes: Mapping[str, Constant],
         fields: Mapping[str, Field],
         config: Mapping[str, Any],
-        chunk: int,
+        chunk: int | None,
         *,
+        part: int = 1,
         constants: Mapping[str, Constant] | None = None,
         attributes: Mapping[str, Any] | None = None,
         shard: tuple[int, int] | None = None,
@@ -123,10 +128,12 @@ class Store:
 
         axes: the coordinates of the samples, a grid's axes in their order or one array along
         `sample`. constants: further known variables. config: JSON data that describes the
-        computation; attributes: JSON data that follow from it. chunk: samples of a block at most.
-        shard: (i, n), 0 ≤ i < n, to write the blocks k with k mod n = i only, beside other
-        processes; None for all. overwrite: put a new store in the place of the one at `path`, once
-        it has its first block: until then, and if that never comes, the old one stays as it is.
+        computation; attributes: JSON data that follow from it. chunk: samples of a block at most;
+        None: blocks as in the store at `path`, or, in a new one, of whole parts of at most `part`
+        samples (`default_block`). shard: (i, n), 0 ≤ i < n, to write the blocks k with k mod n = i
+        only, beside other processes; None for all. overwrite: put a new store in the place of the
+        one at `path`, once it has its first block: until then, and if that never comes, the old one
+        stays as it is.
         begun: is called when the store lies at `path`. `damaged` becomes the number of these blocks
         that were done and whose data are not as written; they are to be computed again. Raises
         ValueError where the store was made with another configuration, where another process writes
@@ -138,11 +145,11 @@ class Store:
         self.constants = {**axes, **(constants or {})}
         self.shape = tuple(len(axis.data) for axis in axes.values())
         self.dimensions = tuple(axes)
-        self.block_shape = block_shape(self.shape, chunk)
-        self.regions = regions(self.shape, self.block_shape)
         i, n = (0, 1) if shard is None else shard
         if not 0 <= i < n:
             fail("shard", f"{i}/{n}", "Give i/n with i from 0 to n - 1")
+        chunk, self.block_shape = self._blocks(chunk, part, n, overwrite)
+        self.regions = regions(self.shape, self.block_shape)
         self.own = range(i, len(self.regions), n)
         about = {"long_name": "hash of a block; 0: not done"}
         self._described = {**fields, "checksum": Field((), "uint64", 0, ("block",), about)}
@@ -210,6 +217,33 @@ class Store:
         blocks, give each the same bits in every run."""
         return math.prod(self.block_shape)
 
+    def _blocks(
+        self, chunk: int | None, part: int, processes: int, overwrite: bool
+    ) -> tuple[int, tuple[int, ...]]:
+        """Return the samples of a block at most and its shape; see `__init__`."""
+        if chunk is not None:
+            return chunk, block_shape(self.shape, chunk)
+        there = None if overwrite else blocks_there(self.path, self.shape)
+        if there is not None:
+            return there
+        each = sum(math.prod(v.shape) * np.dtype(v.dtype).itemsize for v in self.fields.values())
+        found = default_block(self.shape, part, each, processes)
+        return math.prod(found), found
+
+    def part_size(self, most: int) -> int:
+        """Return the number of samples of the largest part of a block; see `parts`."""
+        return math.prod(block_shape(self.block_shape, most))
+
+    def parts(self, block: int, most: int) -> list[slice]:
+        """Return the samples of a block, counted in C order of the grid, in consecutive parts of at
+        most so many. Blocks of whole parts (`default_block`) have the same ones as smaller blocks.
+        """
+        region, shape = self.regions[block], block_shape(self.block_shape, most)
+        found = regions([along.stop - along.start for along in region], shape)
+        sizes = [math.prod(along.stop - along.start for along in part) for part in found]
+        ends = self.rows(block).start + np.cumsum(sizes)
+        return [slice(int(end) - size, int(end)) for size, end in zip(sizes, ends, strict=True)]
+
     def samples(self, block: int) -> np.ndarray:
         """Return the indices of the samples of a block."""
         return np.r_[self.rows(block)]
@@ -221,7 +255,7 @@ class Store:
 
     def _done(self) -> np.ndarray:
         """Return which blocks are marked as done; those whose marks cannot be read are not."""
-        marks = array_of(self.group, "checksum")
+        marks = self._array("checksum")
         try:
             return np.asarray(marks[:]) != 0
         except Exception:  # what a codec raises is its own
@@ -233,7 +267,7 @@ class Store:
         """Return the stored checksum of a block, 0 where it is not done, None where it cannot be
         read."""
         try:
-            return int(np.asarray(array_of(self.group, "checksum")[block]))
+            return int(np.asarray(self._array("checksum")[block]))
         except Exception:
             return None
 
@@ -256,23 +290,35 @@ class Store:
         self._remove_leftovers()
         return ""
 
+    def _enter(self, group: "zarr.Group") -> None:
+        """Work on this group from now on."""
+        self.group = group
+        self._arrays: dict[str, zarr.Array[Any]] = {}
+
+    def _array(self, name: str) -> "zarr.Array[Any]":
+        """Return the variable of this name, which stays open: to open one takes zarr longer than to
+        write a small block."""
+        if name not in self._arrays:
+            self._arrays[name] = array_of(self.group, name)
+        return self._arrays[name]
+
     def commit(self, block: int, **rows: np.ndarray) -> None:
         """Write all variables of a block, (samples of the block, ...), then mark it done."""
         region, written = self.regions[block], []
         for name, value in rows.items():
-            array = array_of(self.group, name)
+            array = self._array(name)
             here = tuple(part.stop - part.start for part in region)
             value = np.asarray(value, array.dtype).reshape(*here, *array.shape[len(here) :])
             array[region] = value
             written.append((name, value))
-        array_of(self.group, "checksum")[block] = checksum(dict(written))
+        self._array("checksum")[block] = checksum(dict(written))
         if self._aside is not None:
             self._replace(self._aside)
 
     def read(self, name: str, block: int | None = None) -> np.ndarray:
         """Return a variable (samples, ...), of one block or of all."""
         region = slice(None) if block is None else self.regions[block]
-        found = np.asarray(array_of(self.group, name)[region])
+        found = np.asarray(self._array(name)[region])
         return found.reshape(-1, *found.shape[len(self.shape) :])
 
     def save(self, values: Mapping[str, "Constant"]) -> None:
@@ -285,6 +331,7 @@ class Store:
                 "compressors": codecs(),
             }
             attributes = {**attributes, **mark}
+            self._arrays.pop(name, None)
             self.group.create_array(name, overwrite=True, attributes=attributes, **made)
         consolidate(self.group)
 
@@ -297,7 +344,7 @@ class Store:
                 self._create(self.path)
             else:
                 self._create_objects(self.path)
-        self.group = open_group(self.path, "r+")
+        self._enter(open_group(self.path, "r+"))
         self._require_configuration()
         self._repair()
 
@@ -306,7 +353,7 @@ class Store:
         self._remove_leftovers()
         self._aside = aside = side_path(path)
         self._make(aside)
-        self.group = open_group(aside, "r+")
+        self._enter(open_group(aside, "r+"))
 
     def _replace(self, aside: Path) -> None:
         """Put the new store in the place of the old one, and delete that."""
@@ -314,7 +361,8 @@ class Store:
         old = side_path(path)
         os.rename(path, old)
         os.rename(aside, path)
-        self._aside, self.group = None, open_group(path, "r+")
+        self._aside = None
+        self._enter(open_group(path, "r+"))
         shutil.rmtree(old, ignore_errors=True)
         self._begun()
 
@@ -424,6 +472,7 @@ class Store:
             what = f"{', '.join(renewed)}: missing or damaged"
             fail(str(self.path), what, "Stop all shards, and resume once without --shard")
         for name in renewed:
+            self._arrays.pop(name, None)
             del self.group[name]
             self._create_array(self.group, name)
         if renewed:
@@ -434,7 +483,7 @@ class Store:
     def _check(self, blocks: Iterable[int]) -> int:
         """Mark those of the blocks as not done whose data are not as written; return their
         number."""
-        marks, damaged = array_of(self.group, "checksum"), 0
+        marks, damaged = self._array("checksum"), 0
         for block in blocks:
             mark = self._mark(block)
             if mark != 0 and mark != self._checksum(block):
@@ -446,7 +495,7 @@ class Store:
         """Return whether a variable exists as it was created, with its values if it is a
         constant."""
         try:
-            array = array_of(self.group, name)
+            array = self._array(name)
             if name in self.constants:
                 return bool(np.array_equal(np.asarray(array[...]), self.constants[name].data))
             field = self._described[name]
@@ -460,7 +509,7 @@ class Store:
         """Return the checksum of the data of a block, −1 where they cannot be read."""
         region = self.regions[block]
         try:
-            return checksum({k: np.asarray(array_of(self.group, k)[region]) for k in self.fields})
+            return checksum({k: np.asarray(self._array(k)[region]) for k in self.fields})
         except Exception:
             return -1
 
@@ -485,6 +534,27 @@ def block_shape(shape: Sequence[int], most: int) -> tuple[int, ...]:
         whole, rest = whole and take == count, rest * take
         found.append(take)
     return tuple(reversed(found))
+
+
+def default_block(
+    shape: Sequence[int], part: int, sample_bytes: int, processes: int
+) -> tuple[int, ...]:
+    """Return the shape of blocks whose files are of megabytes and of which a killed run loses
+    little, of a grid that is labelled part by part.
+
+    They hold up to `BLOCK` samples and `BLOCK_BYTES` bytes, in whole parts of at most `part`
+    samples, so that the parts do not depend on the blocks; and each process gets `BLOCKS` of them
+    where there are so many parts.
+    """
+    found = list(block_shape(shape, part))
+    most = math.prod(shape) // (BLOCKS * processes)
+    most, whole = min(most, BLOCK, BLOCK_BYTES // sample_bytes), tuple(found)
+    for axis in reversed(range(len(shape))):
+        fit = max(most // math.prod(found), 1)
+        found[axis] = min(fit * whole[axis], shape[axis])
+        if found[axis] < shape[axis]:
+            break
+    return tuple(found)
 
 
 def codecs() -> "tuple[Codec, ...]":

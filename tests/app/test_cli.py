@@ -18,8 +18,8 @@ import zarr
 
 from jaxmpc.app import cli
 from jaxmpc.app import config as configs
-from jaxmpc.app.commands import recursion, sweep
-from jaxmpc.feasible import pipeline
+from jaxmpc.app.commands import recursion
+from jaxmpc.feasible import pipeline, stored
 from jaxmpc.feasible.pipeline import Labels
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.files import read_arrays, write_arrays
@@ -148,7 +148,7 @@ def interruptible():
 
 @pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(sweep, "CHUNK", 50)
+    monkeypatch.setattr(stored, "CHUNK", 50)
     real = pipeline.label_parts
 
     def interrupted(*args, **kwargs):

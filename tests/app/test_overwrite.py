@@ -11,8 +11,8 @@ from problems import MINIMAL_FILE
 import jaxmpc as jm
 from jaxmpc import store
 from jaxmpc.app import cli
-from jaxmpc.app.commands import recursion, sweep
-from jaxmpc.feasible import pipeline
+from jaxmpc.app.commands import recursion
+from jaxmpc.feasible import pipeline, stored
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.stored import open_labels
 
@@ -63,7 +63,7 @@ def _raises(*_, **__):
 
 
 def test_a_run_that_is_stopped_after_a_block_keeps_that(folder, monkeypatch):
-    monkeypatch.setattr(sweep, "CHUNK", 12)
+    monkeypatch.setattr(stored, "CHUNK", 12)
     real = pipeline.label_parts
 
     def one_block(*arguments, **settings):

@@ -15,7 +15,7 @@ import xarray as xr
 
 from jaxmpc import store
 from jaxmpc.app import cli
-from jaxmpc.app.commands import sweep
+from jaxmpc.feasible import stored
 from jaxmpc.store.writing import Lock
 
 
@@ -23,7 +23,7 @@ from jaxmpc.store.writing import Lock
 def _in_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.setattr(sweep, "CHUNK", 200)
+    monkeypatch.setattr(stored, "CHUNK", 200)
 
 
 def run(line):
@@ -129,9 +129,9 @@ def test_a_url(whole, tmp_path, capsys):
 SHARD = """
     import os, sys, time, zarr
     from jaxmpc.app import cli
-    from jaxmpc.app.commands import sweep
+    from jaxmpc.feasible import stored
     from jaxmpc.store import Store
-    sweep.CHUNK = 200
+    stored.CHUNK = 200
     commit, log = Store.commit, os.open(sys.argv[1], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
     write, delay = zarr.Array.__setitem__, float(sys.argv[2])
 

@@ -1,10 +1,13 @@
 """A map read block by block says what the map of all points says."""
 
+import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import problems
 import pytest
+import xarray as xr
 
 import jaxmpc as jm
 from jaxmpc import store
@@ -19,9 +22,11 @@ from jaxmpc.feasible.stored import (
     line_ends,
     open_labels,
     stored_labels,
+    sweep_into,
 )
 from jaxmpc.grids import mesh
 from jaxmpc.sets.geometry import hull_volume
+from jaxmpc.verify import verify_map
 
 
 def test_points_of_a_part_of_a_grid():
@@ -107,6 +112,46 @@ def test_undecided_states_that_rays_exclude_count_as_infeasible(tmp_path, monkey
         assert refined.counts == whole.counts()
         assert refined.counts["undecided"] < len(undecided)
         np.testing.assert_array_equal(refined.picture().label, whole.label)
+
+
+def test_large_blocks_hold_the_same_bits(tmp_path, monkeypatch):
+    """As blocks of one part, and as the blocks of shards; some states need linear programs."""
+    from jaxmpc import batches
+
+    monkeypatch.setattr(stored, "CHUNK", 48)
+    monkeypatch.setattr(batches, "CHUNK", 48)
+    lines = [np.linspace(-1.3, 1.3, 50), np.linspace(-1.3, 1.3, 23)]
+    mpc, found = problems.lecture(), []
+    for name, chunk, shards in (
+        ("a", None, [None]),
+        ("b", 48, [None]),
+        ("c", None, [(0, 2), (1, 2)]),
+    ):
+        for shard in shards:
+            sweep_into(tmp_path / name, mpc, lines, chunk=chunk, shard=shard, iterations=5)
+        found.append(store.read(tmp_path / name))
+        assert not found[-1].problems and found[-1].done == found[-1].blocks
+    assert [each.blocks for each in found] == [9, 25, 25]
+    for other in found[1:]:
+        for name, value in found[0].arrays.items():
+            np.testing.assert_array_equal(value, other.arrays[name], err_msg=name)
+
+
+def test_a_store_of_small_blocks_is_read_verified_and_resumed(tmp_path):
+    """The file was written when blocks were what a program takes at once, here 39 states."""
+    shutil.unpack_archive(Path(__file__).with_name("small_blocks.tar.xz"), tmp_path, filter="data")
+    path, lines = tmp_path / "small_blocks.zarr", [np.linspace(-2.1, 2.1, n) for n in (12, 13)]
+    before = xr.open_zarr(path).load()
+    assert int((before["label"] == 1).sum()) == 88 and not store.read(path).problems
+    assert verify_map(path).passed
+    (path / "plan" / "c" / "1" / "0" / "0" / "0").unlink()
+    assert len(store.read(path).problems) == 1
+    found = sweep_into(path, problems.joint(5), lines, resume=True)
+    assert found.store.damaged == 1 and found.timing.count == 39
+    assert found.store.block_shape == (3, 13)
+    after = xr.open_zarr(path).load()
+    np.testing.assert_array_equal(before["label"], after["label"])
+    assert verify_map(path).passed
 
 
 def test_ends_of_lines():

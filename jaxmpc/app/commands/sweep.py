@@ -27,7 +27,7 @@ from jaxmpc.app.commands.options import (
     print_table,
     refuse,
 )
-from jaxmpc.batches import CHUNK, chosen_devices
+from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail, require_disk
 from jaxmpc.feasible.stored import StoredMap, sweep_into
 from jaxmpc.files import check_results, open_folder, remove_files, versions, write_results
@@ -247,7 +247,6 @@ def linear_sweep(
         fixed=region.fixed,
         iterations=config.sweep.iterations,
         dtype=config.sweep.dtype,
-        chunk=CHUNK,
         gap=1e-6 if refine and len(region.axes) <= 3 else None,
         settings=config.to_dict(),
         shard=shard,
