@@ -4,9 +4,10 @@ The store is a zarr v3 group that opens as a data set, `xarray.open_zarr(path)`.
 dimension an axis, with its coordinates; other samples lie along `sample`. `Field`s have a value a
 sample, `Constant`s are known from the start or follow from all samples (`Store.save`).
 
-A block is a run of consecutive samples, one zarr chunk of each variable. checksum (block) is a hash
-of its data, written after them, and 0 before: a block whose data are missing, unreadable or others
-than were written counts as not done. Fill values (label and status 0, NaN) are no answers. The
+A block is a run of consecutive samples, one zarr chunk of each variable. It may be computed in
+several parts: files of megabytes are written at the speed of the disk, programs take fewer samples
+at once. checksum (block) is a hash of its data, written after them, and 0 before: a block whose
+data are missing, unreadable or others than were written counts as not done. Fill values (label and status 0, NaN) are no answers. The
 group appears under its name by one rename, complete with its attributes; zarr writes each chunk to
 a side file and renames it. A power cut can lose data, which the checksums show: zarr does not sync
 to the disk.

@@ -147,7 +147,7 @@ def interruptible():
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsys):
+def test_ctrl_c_keeps_blocks_and_says_how_to_resume(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(stored, "CHUNK", 50)
     real = pipeline.label_parts
 
@@ -161,7 +161,7 @@ def test_ctrl_c_keeps_chunks_and_says_how_to_resume(tmp_path, monkeypatch, capsy
     assert run("sweep --grid 16 12 --horizon 5 --output 'my maps'") == 130
     out = capsys.readouterr().out
     assert "jaxmpc sweep --grid 16 12 --horizon 5 --output 'my maps' --resume" in out
-    assert "chunks that were done are kept" in out
+    assert "blocks that were done are kept" in out
     asked = []
 
     def counted(mpc, parts, *args, **kwargs):

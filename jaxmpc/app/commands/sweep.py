@@ -63,8 +63,9 @@ class Sweep:
                     and the half-space cut_normal'x <= cut_offset that no feasible state leaves.
                     start holds the x_0 of the plan; bound_* the points and facets of the bounds.
                     Opens with xarray.open_zarr(path): a dimension a mapped state.
-      Ctrl-C        Stops; finished chunks are kept. --resume goes on from there, and computes
-                    again what is missing or damaged.
+      Ctrl-C        Stops; finished blocks are kept: up to 131,072 states each, at least eight in a
+                    large sweep. --resume goes on from there, and computes again what is missing or
+                    damaged.
       --shard       Several processes write one sweep.zarr, the same bits as one would.
       jaxmpc verify DIR proves every label again, from these files alone.
       Exit code     0 done, 2 error (one line on stderr says which), 130 stopped by Ctrl-C.
@@ -89,7 +90,7 @@ class Sweep:
       robot_map.npz  x0s, states, predicted, held (1 yes, -1 no, 0 undecided), within_limits,
                      recursive, feasible, depth, worst (most beyond a limit), broken_at, lost_at,
                      unsolved_at.
-      robot_map.zarr The state for --resume: a killed run loses one chunk of 256 states.
+      robot_map.zarr The state for --resume: a killed run loses one block of 256 states.
 
     What the TOML file holds (n states, m inputs; dt in seconds, other units are yours)
       name = "joint"
@@ -161,7 +162,7 @@ class Sweep:
     refine: Annotated[bool, option(None, "on")] = True
     """Move inner and outer bound together to a relative gap of 1e-6 (up to three axes)."""
 
-    keeps = "chunks"
+    keeps = "blocks"
 
     def run(self) -> None:
         """Label all states, write the files, print the table.
