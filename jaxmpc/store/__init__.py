@@ -7,10 +7,10 @@ sample, `Constant`s are known from the start or follow from all samples (`Store.
 A block is a run of consecutive samples, one zarr chunk of each variable. It may be computed in
 several parts: files of megabytes are written at the speed of the disk, programs take fewer samples
 at once. checksum (block) is a hash of its data, written after them, and 0 before: a block whose
-data are missing, unreadable or others than were written counts as not done. Fill values (label and status 0, NaN) are no answers. The
-group appears under its name by one rename, complete with its attributes; zarr writes each chunk to
-a side file and renames it. A power cut can lose data, which the checksums show: zarr does not sync
-to the disk.
+data are missing, unreadable or others than were written counts as not done. Fill values (label and
+status 0, NaN) are no answers. The group appears under its name by one rename, complete with its
+attributes; zarr writes each chunk to a side file and renames it. A power cut can lose data, which
+the checksums show: zarr does not sync to the disk.
 
 Several processes write one store as its shards: block k belongs to shard k mod n. A shared lock of
 the folder keeps out whoever would write it alone; each shard has a lock file beside the store. The
