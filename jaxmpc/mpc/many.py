@@ -218,7 +218,8 @@ class Batch:
                 return to_host(plans) if self.to_host else plans
 
         def put(where: np.ndarray) -> None:
-            self._put(where, size, solved(where))
+            with jax.enable_x64(True):
+                self._put(where, size, solved(where))
 
         pieces = [index[i : i + size] for i in range(0, len(index), size)]
         # (On a CPU each chunk is copied at once, and its memory used again.)

@@ -82,3 +82,12 @@ def test_solved_and_sentence():
     seen = []
     jax.eval_shape(lambda x: seen.append(repr(jm.solve(mpc, x))), np.zeros(2))
     assert "traced" in seen[0]
+
+
+def test_plans_that_stay_on_the_device_are_those_on_the_host(states):
+    mpc = problems.joint_o_inf(10)
+    for count in (200, 390):  # one chunk, and two of which the last is not full
+        host = jm.solve_many(mpc, states[:count], chunk=200)
+        there = jm.solve_many(mpc, states[:count], chunk=200, to_host=False)
+        assert there.inputs.dtype == np.float64 and isinstance(there.inputs, jax.Array)
+        jax.tree.map(np.testing.assert_array_equal, host, there)
