@@ -16,6 +16,7 @@ Derivatives. `implicit` gives the solution of a problem those of its optimality 
 
 import functools
 import importlib
+import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal, TypeVar
@@ -127,10 +128,14 @@ def has_kernels(rows: int) -> bool:
 
 @functools.cache
 def has_triton() -> bool:
-    """Return whether this JAX has the Triton backend of Pallas, which a later one may lack."""
+    """Return whether this JAX has the Triton backend of Pallas, which a later one may lack: then a
+    warning says once what that costs."""
     try:
         importlib.import_module("jax.experimental.pallas.triton")
     except ImportError:
+        what = f"JAX {jax.__version__} has no Triton backend of Pallas, so no GPU kernel runs"
+        cost = "plans take 8 to 10 times as long"
+        warnings.warn(f"jaxmpc: {what} and {cost}. Install 'jax<0.13'", stacklevel=2)
         return False
     return True
 

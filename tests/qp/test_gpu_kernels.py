@@ -226,14 +226,16 @@ def test_kernels_can_be_lowered_outside_64_bit_mode(soft, monkeypatch):
     assert text.count("xla.gpu.triton") > 3 and "f64" in text
 
 
-def test_without_triton_there_are_no_kernels(monkeypatch):
+def test_without_triton_there_are_no_kernels_and_one_line_says_so(monkeypatch):
     """Newer versions of JAX may leave it out."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert transformations.on_gpu()
     monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
     transformations.has_triton.cache_clear()
     try:
-        assert not transformations.on_gpu()
+        with pytest.warns(UserWarning, match="no GPU kernel runs and plans take .* Install"):
+            assert not transformations.on_gpu()
+        assert not transformations.on_gpu()  # without another warning, which would be an error
     finally:
         transformations.has_triton.cache_clear()
 
