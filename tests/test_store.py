@@ -216,6 +216,36 @@ class TestBlockWriter:
             assert reached == ([] if more else ["end"]) and kept.pending() == [0, 1, 2]
 
 
+class TestReadingByBlocks:
+    def test_visits_each_block_and_keeps_what_is_asked(self, full):
+        """The blocks, by threads in any order, hold what all of it holds."""
+        seen, everything = {}, store.read(full).arrays
+
+        def visit(found, first, arrays):
+            assert set(found.arrays) == {"label", "state", *BOUNDS} and found.done == 3
+            seen[first] = arrays
+
+        found = store.read(full, keep=("label",), visit=visit)
+        assert not found.problems and found.count == 20 and set(seen) == {0, 8, 16}
+        np.testing.assert_array_equal(found.arrays["label"], everything["label"])
+        np.testing.assert_array_equal(found.points_at(np.array([5, 19])), found.points[[5, 19]])
+        for name in FIELDS:
+            together = np.concatenate([seen[first][name] for first in sorted(seen)])
+            np.testing.assert_array_equal(together, everything[name])
+
+    def test_names_damaged_blocks(self, full):
+        with open_store(full) as kept:
+            for block in range(3):
+                here = kept.rows(block)
+                count = here.stop - here.start
+                kept.commit(block, **rows(count, 1) | {"cut_normal": np.ones((count, 2))})
+        zarr.open_group(full, mode="r+", use_consolidated=False)["plan"][3, 1] = 7.0
+        assert store.read(full, keep=()).problems == ["block 1: data are not as they were written"]
+        array_files(full, "start/c")[2].unlink()
+        found = store.read(full, keep=())
+        assert not found.whole and "block 2" in found.problems[-1] and "start" in found.problems[-1]
+
+
 class TestDataSet:
     def test_opens_without_arguments(self, full):
         with warnings.catch_warnings():

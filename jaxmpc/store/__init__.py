@@ -1,4 +1,4 @@
-"""A batch of results stored block by block, so that a killed run loses one block at most.
+"""A batch of results stored block by block, so that a killed run loses no more than those in hand.
 
 The store is a zarr v3 group that opens as a data set, `xarray.open_zarr(path)`. A grid has one
 dimension an axis, with its coordinates; other samples lie along `sample`. `Field`s have a value a

@@ -11,7 +11,8 @@ from jaxmpc.store.writing import Store
 class BlockWriter:
     """Puts the parts of blocks together, and writes each whole block in a thread of its own.
 
-    One block is filled and at most one is written at a time. An error of the thread, such as that
+    One block is filled and at most one is written at a time; a process that is killed loses these
+    two. An error of the thread, such as that
     of a full disk, is raised by a later `put`, or at the end of the context. Its end, by an
     interruption too, waits for the block that is written; one that is not whole is dropped.
     """

@@ -6,13 +6,14 @@ First where a store lies, then the blocks of its grid and the hashes of their da
 import hashlib
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from jaxmpc.batches import cores, side_by_side
 from jaxmpc.checks import fail, in_units, require_memory, shortened, shown
 from jaxmpc.files import faithful, fingerprint, text_within
 from jaxmpc.grids import mesh
@@ -175,17 +176,35 @@ class Stored:
         return cls({}, {}, {}, 0, 0, [reason], False)
 
     @property
+    def count(self) -> int:
+        """Return the number of samples."""
+        if "points" in self.arrays:
+            return len(self.arrays["points"])
+        return math.prod(map(len, self.axes.values()))
+
+    @property
     def points(self) -> np.ndarray:
         """Return the samples (B, d)."""
+        return self.points_at(np.arange(self.count))
+
+    def points_at(self, index: np.ndarray) -> np.ndarray:
+        """Return the samples (k, d) of these indices."""
         if "points" in self.arrays:
-            return self.arrays["points"]
-        return mesh(list(self.axes.values()))
+            return self.arrays["points"][index]
+        return mesh(list(self.axes.values()), index)
+
+
+# Is called with what is known of a store as a whole, the first sample of a block, and its fields.
+Visit: TypeAlias = Callable[[Stored, int, Mapping[str, np.ndarray]], None]
 
 
 def read(
     path: str | Path,
     check: Check = lambda attributes, axes: [],
     shapes: Shapes = lambda attributes: {},
+    *,
+    keep: Collection[str] | None = None,
+    visit: Visit = lambda found, first, arrays: None,
 ) -> Stored:
     """Read a store and compare it with its checksums; raises ValueError where there is none.
 
@@ -193,13 +212,18 @@ def read(
     but axes and constants before the fingerprint is found to be theirs. check: looks at these.
     shapes: of variables, a sample, that follow from the attributes; raises ValueError where these
     make no sense.
+
+    Blocks are read by as many threads as there are cores, each one whole and then no more. keep:
+    the fields that stay, None for all. visit: is called by these threads with each block, done or
+    not: with what is returned in the end but for the problems of blocks, the index of the first
+    sample, and all fields, (samples of the block, ...).
     """
     path = location(path)
     if isinstance(path, Path) and (path / "zarr.json").is_file():
         text_of(path, "zarr.json")  # raises for what is too large to be metadata
     group = open_group(path, "r")
     try:
-        return _read(path, group, check, shapes)
+        return _read(path, group, check, shapes, keep, visit)
     except Exception as error:  # of zarr, its codecs, JSON: what damaged bytes may raise
         text = reason(error)
         return Stored.damaged(text if isinstance(error, ValueError) else f"cannot be read ({text})")
@@ -212,14 +236,25 @@ def reason(error: Exception) -> str:
     return shortened(text if known else f"{type(error).__name__}: {text}")
 
 
-def _read(path: Path | str, group: "zarr.Group", check: Check, shapes: Shapes) -> Stored:
+def _read(
+    path: Path | str,
+    group: "zarr.Group",
+    check: Check,
+    shapes: Shapes,
+    keep: Collection[str] | None,
+    visit: Visit,
+) -> Stored:
     """Read an open store; raises where nothing can be said of its data."""
-    found, described = _described(path, shapes)
+    found, described = _described(path, shapes, keep)
     names, block = found["variables"], found["variables"]["block"]
 
-    def load(name: str) -> np.ndarray:
+    opened: dict[str, zarr.Array[Any]] = {}
+
+    def load(name: str, part: Any = ...) -> np.ndarray:
         try:
-            return np.asarray(array_of(group, name)[...])
+            if name not in opened:
+                opened[name] = array_of(group, name)
+            return np.asarray(opened[name][part])
         except Exception as error:
             fail(name, f"cannot be read ({type(error).__name__})", "Its file is damaged")
 
@@ -233,25 +268,43 @@ def _read(path: Path | str, group: "zarr.Group", check: Check, shapes: Shapes) -
     shape = tuple(len(axis) for axis in axes.values())
     parts = regions(shape, block)
     marks = _marks(path, group, len(parts))
-    arrays = {name: load(name) for name in names["fields"]}
-    problems = []
-    for k in np.flatnonzero(marks):
-        if marks[k] != checksum({name: v[parts[k]] for name, v in arrays.items()}):
-            _require_files(path, arrays, parts[k], block, f"block {k}")
-            problems.append(f"block {k}: data are not as they were written")
-    own = {*axes, *constants, *arrays, "checksum"}
+    kept = {name: load(name) for name in names["fields"] if keep is None or name in keep}
+    problems = list[str]()
+    own = {*axes, *constants, *names["fields"], "checksum"}
     for name in [name for name in described if name not in own]:  # what `Store.save` wrote
         constants[name] = load(name)
         stored = described[name]["attributes"].get("checksum")
         if stored != str(checksum({name: constants[name]})):
             problems.append(f"{name}: data are not as they were written")
-    flat = {k: v.reshape(-1, *v.shape[len(shape) :]) for k, v in arrays.items()} | constants
-    return Stored(found, flat, axes, len(parts), int(np.count_nonzero(marks)), problems)
+
+    def flat(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {name: v.reshape(-1, *v.shape[len(shape) :]) for name, v in arrays.items()}
+
+    done = int(np.count_nonzero(marks))
+    whole = Stored(found, flat(kept) | constants, axes, len(parts), done, problems)
+
+    def look(k: int) -> list[str]:
+        here = {
+            name: kept[name][parts[k]] if name in kept else load(name, parts[k])
+            for name in names["fields"]
+        }
+        sound = marks[k] in (0, checksum(here))
+        if not sound:
+            _require_files(path, here, parts[k], block, f"block {k}")
+        first = np.ravel_multi_index([along.start for along in parts[k]], shape)
+        visit(whole, int(first), flat(here))
+        return [] if sound else [f"block {k}: data are not as they were written"]
+
+    damaged = side_by_side(look, range(len(parts)), cores())
+    return replace(whole, problems=[*itertools.chain(*damaged), *problems])
 
 
-def _described(path: Path | str, shapes: Shapes) -> tuple[dict[str, Any], dict[str, Any]]:
+def _described(
+    path: Path | str, shapes: Shapes, keep: Collection[str] | None
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the attributes of a store and the metadata of each variable. Raises ValueError where
-    they do not fit each other, or describe more than the files can hold; no data are read."""
+    they do not fit each other, or describe more than the files can hold, or more to keep than the
+    memory can; no data are read."""
     root = faithful("zarr.json", text_of(path, "zarr.json"))
     try:
         found, together = root["attributes"], root["consolidated_metadata"]["metadata"]
@@ -296,6 +349,8 @@ def _described(path: Path | str, shapes: Shapes) -> tuple[dict[str, Any], dict[s
     if needed > max(SMALL, MOST_COMPRESSED * there):
         what = f"describes {in_units(needed)} of data, its files hold {in_units(there)}"
         fail("zarr.json", what, "Overwrite it")
+    kept = [name for name in sizes if keep is None or name in keep or name not in fields]
+    needed = sum(math.prod(sizes[name].shape) * sizes[name].itemsize for name in kept)
     require_memory("zarr.json", needed, "Read it on a larger machine")
     return found, together
 

@@ -4,12 +4,15 @@ Nothing here is shared with what made the labels: plans are rolled out by `exact
 are found anew by `half_spaces.py`.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 from tqdm.std import tqdm
 
+from jaxmpc.batches import slices
 from jaxmpc.checks import fail
 from jaxmpc.files import read_arrays, read_results, sha256
 from jaxmpc.pytrees import short_text
@@ -18,6 +21,11 @@ from jaxmpc.store import Check, Stored, read, reason
 from jaxmpc.verify.exact import roll_out_exactly, roll_out_in_floats
 from jaxmpc.verify.half_spaces import exclude
 from jaxmpc.verify.stored_problem import Constraints, label_shapes
+
+# What stays of a store when it has been read; what its labels are proved by; names of labels.
+KEPT = "label", "status"
+NEEDED = "start", "plan", "cut_normal", "cut_offset"
+NAMES = {1: "feasible", -1: "infeasible", 0: "undecided"}
 
 
 @dataclass(repr=False)
@@ -70,21 +78,29 @@ def verify_map(
     """
     path = find_store(path)
     report = isinstance(path, Path) and path.suffix == ".npz"
-    found = read_report(Path(path), check) if report else read(path, check, label_shapes)
-    result = Verification({}, problems=list(found.problems))
-    if not found.whole:
-        return result
-    try:
-        with np.errstate(all="ignore"):  # of numbers that are no plans: they fail
+    # None: where stderr is no terminal.
+    with tqdm(unit=" labels", delay=1, disable=None if progress else True) as bar:
+        proofs = _Proofs(exact, sample, seed, bar)
+        if report:
+            found = read_report(Path(path), check)
+        else:
+            found = read(path, check, label_shapes, keep=KEPT, visit=proofs.visit)
+        result = Verification({}, problems=list(found.problems))
+        if not found.whole:
+            return result
+        try:
             if _count(found, result):
-                _prove(_Labels.of(found), exact, sample, seed, progress, result)
                 if report:
-                    p = Constraints(found.attributes["problem"])
-                    result.problems += wrong_next_states(p, found)
-        if not report and isinstance(path, Path) and (path.parent / "summary.json").exists():
-            _compare_summary(path.parent / "summary.json", found, result)
-    except Exception as error:  # what numbers that fit no problem may raise
-        result.problems.append(f"its labels cannot be proved again ({reason(error)})")
+                    proofs.visit(found, 0, found.arrays)
+                with np.errstate(all="ignore"):
+                    proofs.conclude(found, result)
+                    if report:
+                        p = Constraints(found.attributes["problem"])
+                        result.problems += wrong_next_states(p, found)
+            if not report and isinstance(path, Path) and (path.parent / "summary.json").exists():
+                _compare_summary(path.parent / "summary.json", found, result)
+        except Exception as error:  # what numbers that fit no problem may raise
+            result.problems.append(f"its labels cannot be proved again ({reason(error)})")
     return result
 
 
@@ -104,84 +120,130 @@ def find_store(path: str | Path) -> str | Path:
     return inside[0]
 
 
-@dataclass(frozen=True, eq=False)
-class _Labels:
-    """Stored labels: the constraints, the states (B, d), the arrays, and the indices of the states
-    labelled feasible and infeasible."""
-
-    p: Constraints
-    points: np.ndarray
-    arrays: dict[str, np.ndarray]
-    feasible: np.ndarray
-    infeasible: np.ndarray
-
-    @classmethod
-    def of(cls, found: Stored) -> "_Labels":
-        label = found.arrays["label"]
-        where = np.flatnonzero(label == 1), np.flatnonzero(label == -1)
-        return cls(Constraints(found.attributes["problem"]), found.points, found.arrays, *where)
-
-
 def _count(found: Stored, result: Verification) -> bool:
     """Count the labels, compare them with their status, and return whether they can be proved."""
-    label, status = found.arrays.get("label"), found.arrays.get("status")
+    label = found.arrays.get("label")
     if found.done < found.blocks:
         left = found.blocks - found.done
         result.problems.append(f"{left} of {found.blocks} blocks are not done: resume the sweep")
-    needed = ("label", "status", "start", "plan", "cut_normal", "cut_offset")
-    missing = [name for name in needed if name not in found.arrays]
-    if (
-        label is None
-        or status is None
-        or missing
-        or not found.axes
-        or "problem" not in found.attributes
-    ):
+    fields = {*found.attributes.get("variables", {}).get("fields", ()), *found.arrays}
+    missing = [name for name in (*KEPT, *NEEDED) if name not in fields]
+    if label is None or missing or not found.axes or "problem" not in found.attributes:
         result.problems.append(f"cannot be verified without {missing or 'its problem'}")
         return False
-    names = {1: "feasible", -1: "infeasible", 0: "undecided"}
-    result.labels = {name: int(np.sum(label == value)) for value, name in names.items()}
-    if len(found.points) != len(label):
-        result.problems.append(f"{len(label)} labels for {len(found.points)} states")
+    result.labels = {name: int(np.sum(label == value)) for value, name in NAMES.items()}
+    if found.count != len(label):
+        result.problems.append(f"{len(label)} labels for {found.count} states")
         return False
-    for i in np.flatnonzero(~np.isin(label, list(names))):
-        result.failures[int(i)] = f"label {label[i]} means nothing"
-    for value, expected in {1: Status.SOLVED, -1: Status.PRIMAL_INFEASIBLE}.items():
-        for i in np.flatnonzero((label == value) & (status != expected)):
-            result.failures[int(i)] = f"label {value} with status {status[i]}"
     return True
 
 
-def _prove(
-    labels: _Labels, exact: bool, sample: int, seed: int, progress: bool, result: Verification
-) -> None:
-    """Prove all labels."""
-    count = len(labels.feasible) + len(labels.infeasible)
-    # None: where stderr is no terminal.
-    with tqdm(total=count, unit=" labels", disable=None if progress else True) as bar:
-        size = 4096
-        for i in range(0, len(labels.feasible), size):
-            here = labels.feasible[i : i + size]
-            draw = np.random.default_rng([seed, i]).random(len(here))
-            drawn = exact | (draw * len(labels.feasible) < sample)
-            _prove_feasible(labels, here, drawn, result)
-            bar.update(len(here))
-        _prove_infeasible(labels, result, bar)
-    _compare_half_spaces(labels, result)
-    result.failures = {
-        i: f"at {labels.points[i].tolist()}: {why}" for i, why in result.failures.items()
-    }
+@dataclass
+class _BlockProofs:
+    """What the proofs of a block are found to be, by the indices of its states: why labels are not
+    proved; how many of the feasible ones are, how many of these exactly, their least margin; and
+    the states labelled infeasible (k,) with their half-spaces."""
+
+    failures: dict[int, str]
+    infeasible: np.ndarray
+    normals: np.ndarray
+    offsets: np.ndarray
+    verified: int = 0
+    exactly: int = 0
+    margin: float = np.inf
+
+
+class _Proofs:
+    """Proofs of all labels of a store: of feasible ones block by block, of infeasible ones, for
+    which one half-space may serve many, in the end."""
+
+    def __init__(self, exact: bool, sample: int, seed: int, bar: tqdm) -> None:
+        self.exact, self.sample, self.seed, self.bar = exact, sample, seed, bar
+        self._blocks: dict[int, _BlockProofs | Exception] = {}
+        self._lock = Lock()
+        self._problem: Constraints | None = None
+        self._feasible = 0
+
+    def visit(self, found: Stored, first: int, arrays: Mapping[str, np.ndarray]) -> None:
+        """Prove the feasible labels of a block; several threads may call. See `store.read`."""
+        try:
+            with np.errstate(all="ignore"):  # of numbers that are no plans: they fail
+                block: _BlockProofs | Exception = self._prove(found, first, arrays)
+        except Exception as error:  # what numbers that fit no problem may raise
+            block = error
+        with self._lock:
+            self._blocks[first] = block
+
+    def conclude(self, found: Stored, result: Verification) -> None:
+        """Prove the infeasible labels, and add all that was found to the result. Raises the error
+        that a block ended in."""
+        p, blocks = self._begin(found), list[_BlockProofs]()
+        for _, block in sorted(self._blocks.items()):
+            if isinstance(block, Exception):
+                raise block
+            blocks.append(block)
+            result.failures |= block.failures
+            result.verified += block.verified
+            result.exactly += block.exactly
+            result.margin = min(result.margin, block.margin)
+        infeasible = np.concatenate([block.infeasible for block in blocks])
+        normals = np.concatenate([block.normals for block in blocks])
+        offsets = np.concatenate([block.offsets for block in blocks])
+        _prove_infeasible(p, found, infeasible, normals, result, self.bar)
+        _compare_half_spaces(found, infeasible, normals, offsets, result)
+        result.failures = {
+            i: f"at {found.points_at(np.array([i]))[0].tolist()}: {why}"
+            for i, why in result.failures.items()
+        }
+
+    def _begin(self, found: Stored) -> Constraints:
+        """Return the constraints; count the labels the first time."""
+        with self._lock:
+            if self._problem is None:
+                self._problem = Constraints(found.attributes["problem"])
+                self._feasible = int(np.sum(found.arrays["label"] == 1))
+                self.bar.total = int(np.count_nonzero(found.arrays["label"]))
+            return self._problem
+
+    def _prove(self, found: Stored, first: int, arrays: Mapping[str, np.ndarray]) -> _BlockProofs:
+        """Return the proofs of a block; first: the index of its first state."""
+        p, label, status = self._begin(found), arrays["label"], arrays["status"]
+        infeasible = np.flatnonzero(label == -1)
+        normals, offsets = arrays["cut_normal"][infeasible], arrays["cut_offset"][infeasible]
+        block = _BlockProofs({}, first + infeasible, normals, offsets)
+        for i in np.flatnonzero(~np.isin(label, list(NAMES))):
+            block.failures[first + int(i)] = f"label {label[i]} means nothing"
+        for value, expected in {1: Status.SOLVED, -1: Status.PRIMAL_INFEASIBLE}.items():
+            for i in np.flatnonzero((label == value) & (status != expected)):
+                block.failures[first + int(i)] = f"label {value} with status {status[i]}"
+        feasible = np.flatnonzero(label == 1)
+        for piece in slices(len(feasible), 4096):
+            here = feasible[piece]
+            draw = np.random.default_rng([self.seed, first + piece.start]).random(len(here))
+            drawn = self.exact | (draw * self._feasible < self.sample)
+            index = first + here
+            proofs = found.points_at(index), arrays["start"][here], arrays["plan"][here]
+            _prove_feasible(p, index, *proofs, drawn, block)
+            with self._lock:
+                self.bar.update(len(here))
+        return block
 
 
 def _prove_feasible(
-    labels: _Labels, here: np.ndarray, drawn: np.ndarray, result: Verification
+    p: Constraints,
+    index: np.ndarray,
+    points: np.ndarray,
+    starts: np.ndarray,
+    plans: np.ndarray,
+    drawn: np.ndarray,
+    block: _BlockProofs,
 ) -> None:
-    """Prove states `here` feasible by their plans, those that are drawn in exact arithmetic."""
-    p, same = labels.p, np.searchsorted(labels.p.moves, labels.p.moves)
-    starts, plans = labels.arrays["start"][here], labels.arrays["plan"][here]
+    """Prove states of these indices feasible by their plans, those that are drawn in exact
+    arithmetic."""
+    same = np.searchsorted(p.moves, p.moves)
     known = np.isfinite(starts).all(axis=1) & np.isfinite(plans).all(axis=(1, 2))
     others = starts[:, p.others]
-    at_point = (starts[:, p.axes] == labels.points[here]).all(axis=1)
+    at_point = (starts[:, p.axes] == points).all(axis=1)
     within = ((others >= p.low) & (others <= p.high)).all(axis=1)
     held = (plans == plans[:, same]).all(axis=(1, 2))
     reasons = {
@@ -190,23 +252,31 @@ def _prove_feasible(
         "inputs that a control horizon holds differ": held | ~known,
     }
     for why, fine in reasons.items():
-        result.failures |= {int(j): why for j in here[~fine]}
+        block.failures |= {int(i): why for i in index[~fine]}
     margin = np.where(known, 0.0, -np.inf)
     margin[known] = roll_out_in_floats(p, starts[known], plans[known])
     again = known & (drawn | ~(margin > 0))
     margin[again] = roll_out_exactly(p, starts[again], plans[again])
     for j in np.flatnonzero(again & (margin < 0)):
-        result.failures[int(here[j])] = f"its plan breaks a limit by {-margin[j]:.3g}"
-    good = [j for j, at in enumerate(here) if int(at) not in result.failures]
-    result.verified += len(good)
-    result.exactly += int(np.sum(again[good]))
-    result.margin = min(result.margin, float(margin[good].min(initial=np.inf)))
+        block.failures[int(index[j])] = f"its plan breaks a limit by {-margin[j]:.3g}"
+    good = [j for j, i in enumerate(index) if int(i) not in block.failures]
+    block.verified += len(good)
+    block.exactly += int(np.sum(again[good]))
+    block.margin = min(block.margin, float(margin[good].min(initial=np.inf)))
 
 
-def _prove_infeasible(labels: _Labels, result: Verification, bar: tqdm) -> None:
+def _prove_infeasible(
+    p: Constraints,
+    found: Stored,
+    infeasible: np.ndarray,
+    normals: np.ndarray,
+    result: Verification,
+    bar: tqdm,
+) -> None:
     """Prove that no trajectory starts at states labelled infeasible."""
-    where = np.array([i for i in labels.infeasible if int(i) not in result.failures], int)
-    excess = exclude(labels.p, labels.points[where], labels.arrays["cut_normal"][where], bar)
+    open_ = np.array([int(i) not in result.failures for i in infeasible], bool)
+    where = infeasible[open_]
+    excess = exclude(p, found.points_at(where), normals[open_], bar)
     result.failures |= {
         int(i): "no half-space is found that excludes it" for i in where[~(excess > 0)]
     }
@@ -216,13 +286,17 @@ def _prove_infeasible(labels: _Labels, result: Verification, bar: tqdm) -> None:
     result.excess = min(result.excess, float(proved.min(initial=np.inf)))
 
 
-def _compare_half_spaces(labels: _Labels, result: Verification) -> None:
+def _compare_half_spaces(
+    found: Stored,
+    infeasible: np.ndarray,
+    normals: np.ndarray,
+    offsets: np.ndarray,
+    result: Verification,
+) -> None:
     """Look for stored half-spaces that contradict the labels: that do not exclude their own state,
     or exclude a feasible one or a proved boundary point."""
-    points, arrays, infeasible = labels.points, labels.arrays, labels.infeasible
-    normals, offsets = arrays["cut_normal"][infeasible], arrays["cut_offset"][infeasible]
-    known = np.isfinite(offsets)
-    inside = known & ~(np.sum(normals * points[infeasible], axis=1) > offsets)
+    arrays, known = found.arrays, np.isfinite(offsets)
+    inside = known & ~(np.sum(normals * found.points_at(infeasible), axis=1) > offsets)
     result.failures |= {int(i): "its half-space does not exclude it" for i in infeasible[inside]}
     size = np.abs(normals).max(axis=1, initial=0.0, where=np.isfinite(normals))
     known &= size > 0
@@ -235,15 +309,20 @@ def _compare_half_spaces(labels: _Labels, result: Verification) -> None:
         if not np.all(np.isfinite(more)):
             result.problems.append("bound_normal, bound_offset: hold NaN or infinity")
         H, h = np.concatenate([H, more[:, :-1]]), np.append(h, more[:, -1])
-    proved = points[labels.feasible]
-    if "bound_point" in arrays:
-        proved = np.concatenate([proved, arrays["bound_point"]])
-    for i in range(0, len(H), 256):
-        off = np.max(proved @ H[i : i + 256].T - h[i : i + 256], axis=0, initial=-np.inf)
-        reach = np.abs(proved).max(axis=0, initial=0.0) @ np.abs(H[i : i + 256]).T
-        for j in np.flatnonzero(off > 1e-12 * (reach + np.abs(h[i : i + 256]))):
-            what = f"half-space {H[i + j].tolist()} x <= {h[i + j]:.9g}"
-            result.problems.append(f"{what} excludes a feasible state by {off[j]:.3g}")
+    feasible = np.flatnonzero(arrays["label"] == 1)
+    off, reach = np.full(len(H), -np.inf), np.zeros(len(H))
+    for proved in (
+        *(found.points_at(feasible[piece]) for piece in slices(len(feasible), 4096)),
+        arrays.get("bound_point", np.zeros((0, H.shape[1]))),
+    ):
+        most = np.abs(proved).max(axis=0, initial=0.0)
+        for piece in slices(len(H), 256):
+            values = proved @ H[piece].T - h[piece]
+            off[piece] = np.maximum(off[piece], np.max(values, axis=0, initial=-np.inf))
+            reach[piece] = np.maximum(reach[piece], most @ np.abs(H[piece]).T)
+    for j in np.flatnonzero(off > 1e-12 * (reach + np.abs(h))):
+        what = f"half-space {H[j].tolist()} x <= {h[j]:.9g}"
+        result.problems.append(f"{what} excludes a feasible state by {off[j]:.3g}")
 
 
 def _compare_summary(path: Path, found: Stored, result: Verification) -> None:
@@ -259,14 +338,14 @@ def _compare_summary(path: Path, found: Stored, result: Verification) -> None:
         result.problems.append(f"{path.name}: cannot be read, or holds no counts")
         return
     arrays, there = found.arrays, result.labels
-    open_, more = arrays["status"] == Status.ITERATION_LIMIT, infeasible - there["infeasible"]
-    beyond_bounds = np.zeros(len(open_), bool)
+    open_ = found.points_at(np.flatnonzero(arrays["status"] == Status.ITERATION_LIMIT))
+    more, beyond_bounds = infeasible - there["infeasible"], np.zeros(len(open_), bool)
     for a, b in zip(arrays.get("bound_normal", ()), arrays.get("bound_offset", ()), strict=True):
-        beyond_bounds |= found.points @ a > b
+        beyond_bounds |= open_ @ a > b
     fine = (
         feasible == there["feasible"]
-        and undecided == int(np.sum(open_)) - more
-        and 0 <= more <= int(np.sum(open_ & beyond_bounds))
+        and undecided == len(open_) - more
+        and 0 <= more <= int(np.sum(beyond_bounds))
     )
     if not fine and found.done == found.blocks:
         what = f"{feasible} feasible, {infeasible} infeasible, {undecided} undecided"
