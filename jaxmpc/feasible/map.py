@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.batches import Part, chosen_devices, count, default_chunk, slices, work_off
-from jaxmpc.checks import fail, number, whole
+from jaxmpc.checks import fail, number, require_step_type, whole
 from jaxmpc.feasible import proofs
 from jaxmpc.feasible.hard_constraints import Axes, ExactData
 from jaxmpc.feasible.pipeline import Labels, OnDemand, Scope, labelled_parts
@@ -307,6 +307,7 @@ def map_feasible_set(
     else:
         problem = FeasibilityProblem.of(mpc, axes, fixed)
     whole("iterations", iterations, 1)
+    require_step_type(dtype)
     if gap is not None:
         number("gap", gap, 0, "Give a gap of at least 0, or None")
     result = map_points(
@@ -356,8 +357,9 @@ def label_chunks(
     if points.ndim != 2 or points.shape[1] != d:
         fail("x0s", f"shape {points.shape}", f"Give points (B, {d}), one column a mapped state")
     if chunk is None:
+        devices = count(chosen_devices(settings.get("devices")))
         held = 16 * sum(problem.rows.U.shape)  # vectors of rows and inputs
-        chunk = count(chosen_devices(settings.get("devices"))) * default_chunk(held)
+        chunk = devices * default_chunk(held)
     chunk = min(whole("chunk", chunk, 1), max(len(points), 1))
     places = slices(len(points), chunk)
     if scope is None:

@@ -21,12 +21,14 @@ import numpy as np
 from jaxmpc.checks import fail
 
 # Options of HiGHS: tolerances in rows and columns that are scaled to about 1. Its presolve calls
-# some unbounded programs infeasible and needs scaling of its own, so it is off.
+# some unbounded programs infeasible and needs scaling of its own, so it is off. Entries below 1e-9
+# count as zeros unless told otherwise; 1e-12 is the least that it takes.
 HIGHS = {
     "output_flag": False,
     "presolve": "off",
     "primal_feasibility_tolerance": 1e-10,
     "dual_feasibility_tolerance": 1e-10,
+    "small_matrix_value": 1e-12,
 }
 METHODS = "simplex", "ipm"
 # A set is flat if its rows keep no larger common margin, relative to its own size.

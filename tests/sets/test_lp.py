@@ -34,3 +34,10 @@ def test_programs_begin_where_the_last_one_ended_and_end_where_they_would():
         assert one.value == pytest.approx(alone.value, rel=1e-12)
         np.testing.assert_allclose(one.x, alone.x, atol=1e-11)
         np.testing.assert_allclose(one.y @ rows, d, atol=1e-12)
+
+
+def test_small_entries_count_at_distant_points():
+    """y + 5e-10 x <= 1 and y >= 1 - 1e-7 end x at 200, not at its limit of 1000."""
+    rows = np.array([[1.0, 0.0], [-1.0, 0.0], [5e-10, 1.0], [0.0, -1.0]])
+    sides = np.array([1000.0, 1.0, 1.0, 1e-7 - 1])
+    assert lp.maximise(np.array([1.0, 0.0]), rows, sides).value == pytest.approx(200, rel=1e-6)
