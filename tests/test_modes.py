@@ -209,3 +209,19 @@ def test_several_devices(check):
 @pytest.mark.parametrize("check", ["shard_map", "explicit"])
 def test_several_devices_all(check):
     in_a_process(check, [name for name in FUNCTIONS if name not in FEW])
+
+
+def test_lightly_optimised_programs_are_whole_ones_inside_others():
+    """JAX refuses options of the compiler inside another program."""
+    from jaxmpc.qp.transformations import compiled_lightly
+
+    square = compiled_lightly(0, static_argnames="twice")(
+        lambda x, *, twice: x**2 * (2 if twice else 1)
+    )
+    x = jnp.arange(3.0)
+    for call in (square, jax.jit(square, static_argnames="twice")):
+        np.testing.assert_array_equal(call(x, twice=True), [0, 2, 8])
+    np.testing.assert_array_equal(jax.vmap(lambda v: square(v, twice=False))(x), [0, 1, 4])
+    np.testing.assert_array_equal(jax.grad(lambda v: square(v, twice=False)[1])(x), [0, 2, 0])
+    inside = jax.jit(lambda: square(jnp.ones(2), twice=False))
+    np.testing.assert_array_equal(inside(), [1, 1])

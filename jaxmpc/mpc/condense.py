@@ -27,7 +27,7 @@ from jaxmpc.mpc.rows import Layout, blocks, bounds_of, layout_of, split, stacked
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import arrays, floating_dtype, matmul, solve
 from jaxmpc.qp.problem import QP, Bounds
-from jaxmpc.qp.transformations import own_modes, varying
+from jaxmpc.qp.transformations import compiled_lightly, own_modes, varying
 from jaxmpc.systems.riccati import lqr
 from jaxmpc.systems.system import host_matrices
 
@@ -172,7 +172,7 @@ def in_float64(mpc: MPC) -> MPC:
     return jax.tree.map(np.float64, replace(mpc, prestabilise=prestabilising_gain(mpc)))
 
 
-@jax.jit
+@compiled_lightly(0)
 @own_modes
 def _condense(mpc: MPC) -> Condensed:
     system, N = mpc.system, mpc.horizon

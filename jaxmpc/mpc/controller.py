@@ -19,7 +19,6 @@ for the status of a plan is computed from A, B, c, the weights and the rows them
 
 from collections.abc import Callable
 from dataclasses import field, replace
-from functools import partial
 from typing import Any, TypeVar
 
 import jax
@@ -54,7 +53,7 @@ from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.residuals import SHARE, Measured, Terms, worst
 from jaxmpc.qp.solve import in_two_parts, solve_factored
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.transformations import own_modes, varying
+from jaxmpc.qp.transformations import compiled_lightly, own_modes, varying
 from jaxmpc.sets.convex_sets import Box, Polytope
 
 T = TypeVar("T")
@@ -236,14 +235,14 @@ def zeros_of(controller: Callable[[Array], Control[Planned]], x: Array) -> Contr
     return varying(zeros, (x, controller))
 
 
-@jax.jit
+@compiled_lightly(0)
 @own_modes
 def _factor(condensed: Condensed, solver: ADMM) -> Factor:
     made = factorise(condensed.P, condensed.C, solver, condensed.balls)
     return replace(made, row_norms=condensed.reach(made.row_norms))
 
 
-@partial(jax.jit, static_argnames="whole")
+@compiled_lightly(1, static_argnames="whole")
 @own_modes
 def _control(
     controller: Controller, aim: Aim, last: tuple[Array, WarmStart | None] | None, *, whole: bool
@@ -259,7 +258,7 @@ def _control(
     return applied(controller.mpc, controller.condensed.layout, plan, memory, aim.previous_input)
 
 
-@partial(jax.jit, static_argnames="whole")
+@compiled_lightly(1, static_argnames="whole")
 @own_modes
 def _plan(controller: Controller, aim: Aim, start: WarmStart | None, *, whole: bool) -> Plan:
     c, mpc = controller.condensed, controller.mpc

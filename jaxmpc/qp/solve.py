@@ -51,6 +51,7 @@ from jaxmpc.qp.residuals import (
 )
 from jaxmpc.qp.status import Status
 from jaxmpc.qp.transformations import (
+    compiled_lightly,
     has_kernels,
     implicit,
     in_blocks,
@@ -95,7 +96,7 @@ def solve_qp(qp: QP, solver: ADMM = DEFAULT, warm_start: WarmPair = None) -> QPS
     return in_two_parts(_solve, not has_dual_steps(qp.balls, qp.A), solver, *arguments)
 
 
-@partial(jax.jit, static_argnames="whole")
+@compiled_lightly(1, static_argnames="whole")
 @own_modes
 def _solve(qp: QP, solver: ADMM, warm_start: WarmPair, *, whole: bool) -> QPSolution:
     made = factorise(qp.P, qp.A, solver, qp.balls)
