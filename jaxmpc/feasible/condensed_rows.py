@@ -20,7 +20,7 @@ from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import matmul
 from jaxmpc.qp.problem import Bounds
 from jaxmpc.sets.convex_sets import set_bounds
-from jaxmpc.sets.lp import FLAT, Optimum, Program, power_of_two, scaling
+from jaxmpc.sets.lp import FLAT, Optimum, Program, cleaned, power_of_two, scaling
 
 # Tangents of a ball are added to a program up to so often.
 TANGENTS = 200
@@ -123,7 +123,10 @@ def constraint_rows(
     scaled = np.where(zero[:, None], 0.0, (weight * row_unit[keep])[:, None] * C[keep])
     U, singular, Vt = np.linalg.svd(scaled, full_matrices=False)
     rank = int(np.sum(singular > 1e-12 * singular.max(initial=0.0)))
-    U, back = np.where(zero[:, None], 0.0, U[:, :rank]), Vt[:rank].T / singular[:rank]
+    # Inputs that move no other row are columns of their own: what else stands there is rounding,
+    # which would decide the scaling of linear programs.
+    U = cleaned(np.where(zero[:, None], 0.0, U[:, :rank]), 1.0)
+    back = Vt[:rank].T / singular[:rank]
     back = unit[:, None] * back
     if growth is not None:
         U, back = scaled, np.diag(unit)

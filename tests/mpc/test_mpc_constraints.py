@@ -845,6 +845,11 @@ def test_feasible_set_with_previous_input(view):
     )  # fmt: skip
     rng = np.random.default_rng(6)
     explicit = Explicit(mpc)
+    for i in range(2):  # a previous input is one that could be applied
+        h = np.zeros(explicit.size)
+        h[explicit.before[i]] = 1
+        limit = mpc.inputs.upper[i]
+        explicit.rows["input", -1, f"u{i + 1}"] = (h, -limit, limit, None)
     fixed = None
     if view == "whole":
         axes, points = None, rng.uniform(-1.0, 1.0, (150, 4)) * [1.1, 1.0, 0.8, 0.8]
@@ -852,11 +857,6 @@ def test_feasible_set_with_previous_input(view):
     elif view == "projection":
         axes, points = (0, 1), rng.uniform(-1.2, 1.2, (150, 2))
         places = explicit.x[0]
-        for i in range(2):  # a previous input is one that could be applied
-            h = np.zeros(explicit.size)
-            h[explicit.before[i]] = 1
-            limit = mpc.inputs.upper[i]
-            explicit.rows["input", -1, f"u{i + 1}"] = (h, -limit, limit, None)
     else:
         axes, points = (0, 2), rng.uniform(-1.0, 1.0, (150, 2))
         fixed = np.array([0.0, 0.3, 0.0, -0.2])
@@ -894,6 +894,13 @@ def test_feasible_set_of_blocked_moves(moves):
         place = dict(zip(explicit.x[0], found.center + t * point, strict=True))
         assert abs(explicit.margin(place)) <= 1e-7
     assert np.all(found.outer - found.inner <= 1e-8)
+
+
+def test_a_move_that_no_other_row_sees_leaves_the_set_its_inside():
+    """The last of blocked moves moves no limited state: beside its own limits stands rounding."""
+    mpc = replace(moving(), terminal_set=None, input_rate_limit=None, control_horizon=(3, 1, 1))
+    found = jm.feasible.boundary(mpc, 4)
+    np.testing.assert_allclose(found.inner, found.outer, rtol=1e-8)
 
 
 def test_cut_of_an_asymmetric_ellipsoid():

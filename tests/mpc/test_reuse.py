@@ -101,10 +101,12 @@ def test_most_follow(mpc, states, solved, few):
 @pytest.mark.parametrize("tolerance", [1e-3, pytest.param(1e-9, marks=pytest.mark.slow)])
 @pytest.mark.slow
 def test_own_residuals_decide(mpc, states, few, tolerance):
+    """The tolerance is relative: terms of rows are below 10 here, those of the gap the cost's."""
     found = jm.solve_many(mpc, states, jm.ADMM(eps=tolerance))
     good = found.status == jm.Status.SOLVED
-    for residual in (found.primal_residual, found.dual_residual, found.gap):
-        assert residual[good].max() <= tolerance + 1e-11
+    for residual in (found.primal_residual, found.dual_residual):
+        assert residual[good].max() <= 10 * tolerance
+    assert np.all(found.gap[good] <= tolerance * np.maximum(found.cost[good], 1))
 
 
 @pytest.mark.slow
