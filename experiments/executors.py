@@ -176,17 +176,17 @@ def main() -> None:
 
 def stored(config: Any) -> None:
     """Label a stored sweep by pools of processes, the first of which dies; compare the files."""
-    sweep.CHUNK = CHUNK
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(StringIO()) as text:
         first, second = Path(folder) / "alone", Path(folder) / "pools"
-        sweep.linear_sweep(config, first)
+        sweep.linear_sweep(config, first, chunk=CHUNK)
         lost = 0
         for kill in (20, None):
             before = lost
             with processes() as pool:
                 try:
                     executor = Noting(pool, kill)
-                    sweep.linear_sweep(config, second, resume=bool(lost), executor=executor)
+                    how = {"resume": bool(lost), "chunk": CHUNK}
+                    sweep.linear_sweep(config, second, executor=executor, **how)
                 except BrokenProcessPool:
                     there = store.read(second / "sweep.zarr")
                     lost = there.blocks - there.done

@@ -218,8 +218,9 @@ def linear_sweep(
 ) -> None:
     """Label all states, write map and summary, print the table.
 
-    url: of the store, None for sweep.zarr in the folder output. work (executor, devices) and the
-    others: as in `sweep_into`. A shard labels its own blocks, and is done unless it is the last.
+    url: of the store, None for sweep.zarr in the folder output. work (chunk, executor, devices) and
+    the others: as in `sweep_into`. A shard labels its own blocks, and is done unless it is the
+    last.
     Raises ValueError before anything compiles.
     """
     start, path = time.perf_counter(), url or output / "sweep.zarr"
