@@ -16,9 +16,9 @@ from jaxmpc.checks import concrete, fail, require_real
 Reals: TypeAlias = ArrayLike | Sequence[ArrayLike | Sequence[ArrayLike]]
 
 
-def host_array(argument: str, value: Any) -> np.ndarray:
+def host_array(argument: str, value: Any, *, copy: bool = True) -> np.ndarray:
     """Return `value` as a float64 NumPy array; raise ValueError if it cannot be read as real
-    numbers.
+    numbers. copy: False gives the array itself where it is one of these.
 
     All NumPy code (LPs, qhull, Riccati) calls it, so it computes in float64 in either mode of JAX.
     """
@@ -26,7 +26,7 @@ def host_array(argument: str, value: Any) -> np.ndarray:
         what = "is traced by JAX, and this computation is not traceable"
         fail(argument, what, "Call it outside jit, vmap and grad")
     require_real(argument, value)
-    return np.asarray(value).astype(np.float64)
+    return np.asarray(value).astype(np.float64, copy=copy)
 
 
 def dimensions(value: Any) -> int | None:

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -333,11 +334,16 @@ def map_points(
 ) -> FeasibleSetMap:
     """Label the points (B, d) of a feasibility problem; settings: those of `label_chunks`. Points
     that are left at the deadline (of `time.monotonic`) get status NOT_RUN."""
-    x0s, parts = host_array("x0s", x0s), list[Part[Labels]]()
-    chunks = label_chunks(problem, x0s, **settings)
-    done = work_off(chunks, parts.append, len(x0s), unit="pt", progress=progress, deadline=deadline)
-    left = Labels.empty(len(x0s) - done.count, problem)
-    return FeasibleSetMap.of(problem, x0s, Labels.joined([*(p.result for p in parts), left]))
+    points, parts = host_array("x0s", x0s, copy=False), list[Part[Labels]]()
+    with ThreadPoolExecutor(1) as copies:
+        kept = copies.submit(np.array, points)  # while the device works
+        chunks = label_chunks(problem, points, **settings)
+        done = work_off(
+            chunks, parts.append, len(points), unit="pt", progress=progress, deadline=deadline
+        )
+        left = Labels.empty(len(points) - done.count, problem)
+        labels = Labels.joined([*(p.result for p in parts), left])
+        return FeasibleSetMap.of(problem, kept.result(), labels)
 
 
 def label_chunks(

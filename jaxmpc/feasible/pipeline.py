@@ -371,11 +371,13 @@ class Pipeline:
             verdict = OnDemand(functools.partial(self.hull_verdict, x))
             labels = self.labels(found, usable, verdict.get)
         labels = labels.first(len(points))
+        left = labels.undecided
         for stage in self.stages:
-            for where in self.batches(labels.undecided):
+            for where in self.batches(left):
                 more = stage(padded(points[where], self.batch)).first(len(where))
                 labels = labels.changed(where, more.label, more.status, more.proofs)
-        left = labels.undecided[: self.share]
+            left = left[labels.label[left] == 0]
+        left = left[: self.share]
         return self.by_programs(labels, points, left) if len(left) else labels
 
     def batches(self, index: np.ndarray) -> Iterator[np.ndarray]:
