@@ -70,14 +70,20 @@ class Compiled:
         return jax.tree.map(self._assembled, *parts)
 
     def shares(self, args: tuple) -> list[tuple]:
-        """Return the arguments that each device gets."""
+        """Return the arguments that each device gets: host arrays go to all of them at once."""
         if self.places is None:
             return [args]
-        mesh: Any = self.places[0].mesh
-        args = jax.device_put(args, self.places)
-        leaves, tree = jax.tree.flatten(args)
-        there = [{part.device: part.data for part in v.addressable_shards} for v in leaves]
-        return [jax.tree.unflatten(tree, [v[d] for v in there]) for d in mesh.devices.flat]
+        places, mesh = self.places, self.places[0].mesh
+        devices: list[jax.Device] = list(mesh.devices.flat)
+
+        def share(i: int) -> tuple:
+            at = functools.partial(_share, device=devices[i], i=i, count=len(devices))
+            return tuple(
+                jax.tree.map(functools.partial(at, batched=bool(place.spec)), arg)
+                for place, arg in zip(places, args, strict=True)
+            )
+
+        return side_by_side(share, range(len(devices)), len(devices))
 
     def program(self, *args: Any) -> Any:
         """Return the program for arguments of these shapes; of several devices, that of the
@@ -105,6 +111,14 @@ class Compiled:
         shape = sum(map(len, parts)), *parts[0].shape[1:]
         place = NamedSharding(self.places[0].mesh, PartitionSpec("batch"))
         return jax.make_array_from_single_device_arrays(shape, place, list(parts))
+
+
+def _share(v: Any, *, device: jax.Device, i: int, count: int, batched: bool) -> jax.Array:
+    """Return part i of `count` of an array, or all of it where it is not batched, on its device."""
+    if isinstance(v, jax.Array) and len(v.sharding.device_set) > 1:
+        return next(part.data for part in v.addressable_shards if part.device == device)
+    size = len(v) // count if batched else 0
+    return jax.device_put(v[i * size : (i + 1) * size] if batched else v, device)
 
 
 @dataclass
@@ -249,13 +263,19 @@ def side_by_side(
 ) -> list[Any]:
     """Return [call(item) for item in items], `count` at once, by default as many as `workers`.
 
-    `call` runs in threads of its own, which see none of the caller's JAX contexts.
+    `call` runs in threads of its own, which see of the caller's JAX contexts 64-bit mode alone.
     """
     items, count = list(items), workers() if count is None else count
     if min(count, len(items)) < 2:
         return [call(item) for item in items]
+    mode = bool(jax.config.jax_enable_x64)
+
+    def in_mode(item: Any) -> Any:
+        with jax.enable_x64(mode):
+            return call(item)
+
     with ThreadPoolExecutor(count) as pool:
-        return list(pool.map(call, items))
+        return list(pool.map(in_mode, items))
 
 
 def gather_size(chunk: int) -> int:
@@ -278,15 +298,15 @@ def first_rows(tree: Any, count: int) -> Any:
 def joined(parts: Sequence[Any]) -> Any:
     """The host arrays of pytrees one after the other, copied by as many threads as there are cores:
     a single one is slower than a fast device."""
-    ends = np.cumsum([len(jax.tree.leaves(part)[0]) for part in parts])
-    whole = jax.tree.map(lambda v: np.empty((ends[-1], *v.shape[1:]), v.dtype), parts[0])
-
-    def put(end: int, part: Any) -> None:
-        for out, v in zip(jax.tree.leaves(whole), jax.tree.leaves(part), strict=True):
-            out[end - len(v) : end] = v
-
-    side_by_side(lambda pair: put(*pair), zip(ends, parts, strict=True), cores())
-    return whole
+    leaves = list(zip(*map(jax.tree.leaves, parts), strict=True))  # the parts of each
+    whole = [np.empty((sum(map(len, vs)), *vs[0].shape[1:]), vs[0].dtype) for vs in leaves]
+    copies = [
+        (out[end - len(v) : end], v)
+        for out, vs in zip(whole, leaves, strict=True)
+        for end, v in zip(np.cumsum([len(v) for v in vs]), vs, strict=True)
+    ]
+    side_by_side(lambda pair: np.copyto(*pair), copies, cores())
+    return jax.tree.unflatten(jax.tree.structure(parts[0]), whole)
 
 
 # Bytes of an array from which on it goes to the host through pinned memory.
@@ -297,10 +317,21 @@ def to_host(tree: T) -> T:
     """Return the tree with leaves of NumPy. Large arrays go through pinned memory where the device
     has it, which an array then keeps: 50 GB/s from an H100, beside 1 to 3 through pageable memory.
     """
+    parts = host_parts(tree)
+    return parts[0] if len(parts) == 1 else joined(parts)
+
+
+def host_parts(tree: T) -> list[T]:
+    """Return `to_host` of a batch that lies on several devices device by device, in order, so that
+    it need not be copied to be joined; of one device, or of other leaves, the whole."""
     leaves, structure = jax.tree.flatten(tree)
     # All copies begin before the first is waited for.
     begun = [_begin_copy(v) if isinstance(v, jax.Array) else v for v in leaves]
-    return jax.tree.unflatten(structure, [_on_host(v) for v in begun])
+    parts = [_parts(v) for v in begun]
+    count = max(map(len, parts), default=1)
+    if any(len(part) != count for part in parts):
+        parts, count = [[np.asarray(v)] for v in begun], 1
+    return [jax.tree.unflatten(structure, [part[i] for part in parts]) for i in range(count)]
 
 
 def _begin_copy(v: jax.Array) -> jax.Array:
@@ -317,13 +348,13 @@ def _has_pinned(device: jax.Device) -> bool:
     return device.platform != "cpu" and "pinned_host" in kinds
 
 
-def _on_host(v: Any) -> np.ndarray:
-    if not isinstance(v, jax.Array) or len(v.sharding.device_set) == 1 or v.nbytes < PINNED:
-        return np.asarray(v)
-    if v.sharding.is_fully_replicated:
-        return np.asarray(v.addressable_shards[0].data)
-    parts = sorted(v.addressable_shards, key=lambda part: part.index[0].start or 0)
-    return joined([np.asarray(part.data) for part in parts])
+def _parts(v: Any) -> list[np.ndarray]:
+    """Return the parts of a batch on several devices, in order; else the whole."""
+    several = isinstance(v, jax.Array) and len(v.sharding.device_set) > 1
+    if not several or v.sharding.is_fully_replicated:
+        return [np.asarray(v)]
+    shards = sorted(v.addressable_shards, key=lambda part: part.index[0].start or 0)
+    return [np.asarray(part.data) for part in shards]
 
 
 class Part(NamedTuple, Generic[R]):

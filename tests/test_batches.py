@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 
-from jaxmpc.batches import Compiled, each_part, slices, work_off
+from jaxmpc.batches import Compiled, each_part, joined, side_by_side, slices, work_off
 
 
 def test_threads_compile_a_program_once():
@@ -51,3 +51,20 @@ def test_bar_counts_rows_and_shows_notes(capsys):
     assert "5/5" in (shown := capsys.readouterr().err) and "a note" in shown and " rows" in shown
     work_off(each_part(np.sin, np.ones(5), 2), lambda part: None, 5, unit="rows")
     assert capsys.readouterr().err == ""
+
+
+def test_parts_are_joined_leaf_by_leaf():
+    parts = [{"each": np.arange(3.0) + i, "mean": np.full((1, 2), i)} for i in range(3)]
+    found = joined(parts)
+    np.testing.assert_array_equal(found["each"], np.concatenate([p["each"] for p in parts]))
+    np.testing.assert_array_equal(found["mean"], [[0, 0], [1, 1], [2, 2]])
+
+
+def test_threads_see_the_64_bit_mode_of_the_caller():
+    import jax
+    import jax.numpy as jnp
+
+    for mode in (False, True):
+        with jax.enable_x64(mode):
+            kinds = side_by_side(lambda i: jnp.asarray(float(i)).dtype, range(3), 3)
+        assert set(kinds) == {np.dtype("float64" if mode else "float32")}

@@ -16,6 +16,7 @@ it. That needs few coordinates.
 """
 
 import functools
+import itertools
 import threading
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -38,6 +39,7 @@ from jaxmpc.batches import (
     default_chunk,
     divisible,
     first_rows,
+    host_parts,
     joined,
     over_devices,
     padded,
@@ -204,30 +206,30 @@ class Batch:
         size = self.chunk if len(index) >= self.chunk else self.block
 
         def solved(where: np.ndarray) -> Plan:
-            with jax.enable_x64(True):
-                if isinstance(self.x, np.ndarray):
-                    x = padded(self.x[places(where)], size)
-                else:
-                    x = (
-                        self.x
-                        if len(where) == len(self.x) == size
-                        else _rows(self.x, padded(where, size))
-                    )
-                with self._begins:
-                    plans = program.run(*arguments, x)
-                return to_host(plans) if self.to_host else plans
+            if isinstance(self.x, np.ndarray):
+                x = padded(self.x[places(where)], size)
+            elif len(where) == len(self.x) == size:
+                x = self.x
+            else:
+                x = _rows(self.x, padded(where, size))
+            with self._begins:
+                return program.run(*arguments, x)
 
         def put(where: np.ndarray) -> None:
-            with jax.enable_x64(True):
-                self._put(where, size, solved(where))
+            plans = solved(where)
+            self._put(where, size, to_host(plans) if self.to_host else plans)
+
+        def parts(where: np.ndarray) -> list[Plan]:
+            return host_parts(solved(where))
 
         pieces = [index[i : i + size] for i in range(0, len(index), size)]
+        whole = len(index) == len(self.x)
         # (On a CPU each chunk is copied at once, and its memory used again.)
-        at_end = len(pieces) == 1 or (self.to_host and jax.default_backend() != "cpu")
-        if at_end and len(index) == len(self.x):
-            found = side_by_side(solved, pieces, self.together)
-            parts = [first_rows(v, len(w)) for v, w in zip(found, pieces, strict=True)]
-            self.answer = parts[0] if len(parts) == 1 else joined(parts)
+        if whole and len(pieces) == 1 and not self.to_host:
+            self.answer = first_rows(solved(index), len(index))
+        elif whole and self.to_host and (len(pieces) == 1 or jax.default_backend() != "cpu"):
+            found = list(itertools.chain(*side_by_side(parts, pieces, self.together)))
+            self.answer = first_rows(found[0] if len(found) == 1 else joined(found), len(index))
         else:
             side_by_side(put, pieces, self.together)
 
