@@ -93,8 +93,9 @@ def test_a_part_whose_worker_died_is_submitted_again(expected):
 
 def test_errors_of_the_labels_are_raised_at_once():
     executor = Inline()
-    with pytest.raises(ValueError, match="^dtype: 'int8'"):
-        jm.map_feasible_set(problems.lecture(), POINTS, dtype="int8", executor=executor)
+    one_part = {"chunk": len(POINTS), "executor": executor}
+    with pytest.raises(ValueError, match="^devices: 999 where this process has"):
+        jm.map_feasible_set(problems.lecture(), POINTS, devices=999, **one_part)
     assert executor.submitted == 1
     with pytest.raises(ValueError, match="executor: is a int without submit"):
         jm.map_feasible_set(problems.lecture(), POINTS, executor=3)
