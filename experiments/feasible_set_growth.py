@@ -41,8 +41,8 @@ from jax.scipy.linalg import expm
 
 import jaxmpc as jm
 from jaxmpc.app.config import load
-from jaxmpc.feasible.fraction import feasible_fraction
 from jaxmpc.feasible.map import FeasibleSetMap
+from jaxmpc.feasible.smooth_fraction import feasible_fraction
 from jaxmpc.systems.riccati import cost_of_law
 from jaxmpc.tuning.feasible_set import tune_feasible_set
 from jaxmpc.tuning.losses import ClosedLoopLoss

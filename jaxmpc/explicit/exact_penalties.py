@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_kind, whole
-from jaxmpc.explicit.least_distance import (
+from jaxmpc.explicit.active_sets import (
     SMALLEST,
     ActivePiece,
     LeastDistanceForm,

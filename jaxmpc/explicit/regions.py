@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, whole
-from jaxmpc.explicit.least_distance import (
+from jaxmpc.explicit.active_sets import (
     DEPENDENT,
     Cell,
     GivenProgram,

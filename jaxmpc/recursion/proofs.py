@@ -14,7 +14,7 @@ from jaxmpc.feasible.plan_polytope import (
     PlanPolytope,
     projected,
 )
-from jaxmpc.feasible.polytope import backward, is_standard_form
+from jaxmpc.feasible.polytope_growth import backward, is_standard_form
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record

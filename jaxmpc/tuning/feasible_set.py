@@ -12,7 +12,7 @@ from jax import Array
 from jaxmpc.arrays import Reals
 from jaxmpc.batches import chosen_devices
 from jaxmpc.checks import fail
-from jaxmpc.feasible.fraction import STEPS, membership
+from jaxmpc.feasible.smooth_fraction import STEPS, membership
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp.linalg import arrays
 from jaxmpc.tuning.batch_mean import BatchMean

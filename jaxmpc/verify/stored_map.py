@@ -1,7 +1,7 @@
 """Prove the labels of a stored map, or of a recursion report, again: from what is stored alone.
 
 Nothing here is shared with what made the labels: plans are rolled out by `exact.py`, half-spaces
-are found anew by `half_spaces.py`.
+are found anew by `half_space_search.py`.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ from jaxmpc.pytrees import short_text
 from jaxmpc.qp.status import Status
 from jaxmpc.store import Check, Stored, read, reason
 from jaxmpc.verify.exact import roll_out_exactly, roll_out_in_floats
-from jaxmpc.verify.half_spaces import exclude
+from jaxmpc.verify.half_space_search import exclude
 from jaxmpc.verify.stored_problem import Constraints, label_shapes
 
 # What stays of a store when it has been read; what its labels are proved by; names of labels.

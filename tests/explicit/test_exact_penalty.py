@@ -10,8 +10,8 @@ import scipy.sparse as sparse
 from scipy.optimize import linprog
 
 import jaxmpc as jm
+from jaxmpc.explicit.active_sets import least_distance_form
 from jaxmpc.explicit.exact_penalties import exact_penalty
-from jaxmpc.explicit.least_distance import least_distance_form
 from jaxmpc.explicit.regions import critical_regions
 from jaxmpc.mpc.condense import condensed_in_float64
 from jaxmpc.mpc.problem import Soft, soften

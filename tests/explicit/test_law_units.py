@@ -142,9 +142,9 @@ def test_position_and_velocity_rows_in_unlike_units():
 
 def test_a_row_that_is_dropped_is_noticed(monkeypatch):
     """Completeness rests on the rows as given: where the search loses one, it is not claimed."""
-    from jaxmpc.explicit import least_distance, regions
+    from jaxmpc.explicit import active_sets, regions
 
-    form = least_distance.least_distance_form
+    form = active_sets.least_distance_form
 
     def lossy(mpc, within):
         p = form(mpc, within)

@@ -14,7 +14,7 @@ from jaxmpc.explicit.law_at_states import RegionLaw
 from jaxmpc.explicit.regions import critical_regions
 from jaxmpc.feasible.pipeline import Labels
 from jaxmpc.feasible.plan_polytope import projected
-from jaxmpc.feasible.polytope import backward
+from jaxmpc.feasible.polytope_growth import backward
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.recursion import (
     analysis,

@@ -11,7 +11,7 @@ from exact import feasible_polygon
 from problems import AREA_JOINT, AREA_JOINT_O_INF, O_INF_JOINT, P_JOINT, joint
 
 import jaxmpc as jm
-from jaxmpc.feasible.fraction import feasible_fraction, membership
+from jaxmpc.feasible.smooth_fraction import feasible_fraction, membership
 from jaxmpc.systems.riccati import cost_of_law
 from jaxmpc.tuning.feasible_set import tune_feasible_set
 from jaxmpc.tuning.parameters import Parameter

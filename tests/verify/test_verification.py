@@ -15,7 +15,7 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.stored import open_labels
 from jaxmpc.store.reading import checksum, regions
 from jaxmpc.verify.exact import beyond, integers, roll_out_exactly, roll_out_in_floats
-from jaxmpc.verify.half_spaces import Programs
+from jaxmpc.verify.half_space_search import Programs
 from jaxmpc.verify.stored_map import verify_map
 from jaxmpc.verify.stored_problem import Constraints
 
