@@ -416,7 +416,11 @@ def _own_plans(case: Case) -> Iterator[Contestant]:
     release = __version__
     yield Contestant("jaxmpc vmap", release, len(x), on_device, judge, work=work)
     if jax.default_backend() == "cpu":
-        make = lambda: lambda: solve_many(mpc, x, solver)
+
+        def make() -> Callable[[], Plan]:  # set up once, as rivals are
+            controller = Controller(in_float64(mpc), solver)
+            return lambda: solve_many(controller, x)
+
         yield Contestant("jaxmpc", release, len(x), make, judge, work=work)
 
 

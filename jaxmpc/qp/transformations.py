@@ -43,8 +43,10 @@ Conditions = Callable[[Any, Any, Array, Array], tuple[Callable[[Any], Any], Undo
 Steps = Literal["short", "long", "recursion"]
 # Instances in a block on a CPU, whose data stay within the cache. (On GPUs blocks gain nothing.)
 BLOCK = 128
-# Instances in a group on a CPU at most, and when fewer are open; small batches are one group.
-PART_CPU, FEW_CPU, SMALL_CPU = 512, 64, 128
+# Instances in a group on a CPU at most, and when fewer are open; smaller batches are one group. (Of
+# 2,000 states of springs8 nine take 12 to 71 steps on the dual: in groups of 64 these took a fifth
+# of the time of all plans.)
+GROUPS_CPU = (128, 16, 4)
 # The same of loops with long steps, or that few instances of a batch enter; then of recursions
 # over a horizon, always so many. (64 arms of 7 joints for 1 s: 1.23 s in groups of 32, 1.11 of 16,
 # 1.17 of 8.)
@@ -178,7 +180,7 @@ def group_sizes(batch: int, steps: Steps = "short") -> list[int]:
             return [min(batch, RECURSION_CPU)]
         if steps == "long":
             return [batch] if batch <= LONG_PART_CPU else [LONG_PART_CPU, LONG_FEW_CPU]
-        return [batch] if batch <= SMALL_CPU else [min(batch, PART_CPU), FEW_CPU]
+        return [batch] if batch <= GROUPS_CPU[0] else list(GROUPS_CPU)
     if batch <= PART * LEAST:
         return [batch]
     sizes = [batch if steps == "recursion" else -(-batch // PART)]
@@ -212,11 +214,7 @@ def in_blocks(
         def blocks(block: int, constants: C, data: S) -> R:
             if size <= block:
                 return together(constants, data)
-            missing = -size % block
-            padded = lambda v: jnp.pad(v, ((0, missing), *[(0, 0)] * (v.ndim - 1)), mode="edge")
-            grouped = jax.tree.map(lambda v: padded(v).reshape(-1, block, *v.shape[1:]), data)
-            out = lax.map(lambda block: together(constants, block), grouped)
-            return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:])[:size], out)
+            return map_blocks(partial(together, constants), block, data)
 
         small = not isinstance(size, int) or (size <= BLOCK and kernel is None)
         if any(jax.tree.leaves(in_batched[0])) or small:
@@ -229,12 +227,24 @@ def in_blocks(
     return one(constants, data)
 
 
+def map_blocks(many: Callable[[S], R], block: int, data: S) -> R:
+    """Return many(data) of a batch, computed for blocks of so many instances one after the other.
+    The last one is filled up with the last instance."""
+    size = jax.tree.leaves(data)[0].shape[0]
+    missing = -size % block
+    padded = lambda v: jnp.pad(v, ((0, missing), *[(0, 0)] * (v.ndim - 1)), mode="edge")
+    grouped = jax.tree.map(lambda v: padded(v).reshape(-1, block, *v.shape[1:]), data)
+    out = lax.map(many, grouped)
+    return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:])[:size], out)
+
+
 def repeat_while(
     is_open: Callable[[S], Array],
     step: Callable[[C, S], S],
     constants: C,
     state: S,
     steps: Steps = "short",
+    first: Callable[[C, S], S] | None = None,
 ) -> S:
     """Return `state` after state = step(constants, state) while is_open(state), a scalar.
 
@@ -242,7 +252,9 @@ def repeat_while(
     one `while_loop`. A batch, also one of nested `vmap`s, is worked off in groups (top of this
     file). steps: "long" where a step takes long or few instances are open at first; "recursion"
     where it is one over the stages of a horizon, which on a GPU takes as long for 4,096 instances
-    as for 1,024. Not differentiable.
+    as for 1,024. first: a step that costs less than `step` and may leave an instance as it is: a
+    batch of several groups on a CPU takes it once before all others, without groups. Not
+    differentiable.
     """
     one = lambda constants, state: lax.while_loop(is_open, lambda s: step(constants, s), state)
     single, state = custom_vmap(one), varying(state, (constants, state))
@@ -253,8 +265,13 @@ def repeat_while(
         leaves, tree = jax.tree.flatten(constants)
         batched = tuple(jax.tree.leaves(in_batched[0]))
         state = broadcast(size, in_batched[1], state)
-        advance = lambda leaves, state: step(jax.tree.unflatten(tree, leaves), state)
-        return all_batched(_in_groups(is_open, advance, batched, steps)(tuple(leaves), state))
+
+        def on_leaves(step: Callable[[C, S], S]) -> Callable[[tuple, S], S]:
+            return lambda leaves, state: step(jax.tree.unflatten(tree, leaves), state)
+
+        begin = None if first is None else on_leaves(first)
+        run = _in_groups(is_open, on_leaves(step), batched, steps, begin)
+        return all_batched(run(tuple(leaves), state))
 
     return single(constants, state)
 
@@ -264,16 +281,29 @@ def _in_groups(
     step: Callable[[tuple, S], S],
     batched: tuple[bool, ...],
     steps: Steps,
+    first: Callable[[tuple, S], S] | None,
 ) -> Callable[[tuple, S], S]:
     """Return the loop for a batch, (leaves of the constants, states) → states. batched: which
-    leaves have the batch axis."""
-    many = jax.vmap(step, in_axes=(tuple(0 if b else None for b in batched), 0))
-    open_ones = jax.vmap(is_open)
+    leaves have the batch axis. first: as in `repeat_while`."""
+    axes = tuple(0 if b else None for b in batched), 0
+    many, open_ones = jax.vmap(step, in_axes=axes), jax.vmap(is_open)
 
-    def advance_all(leaves: tuple, state: S) -> S:
+    def advance_all(many: Callable[[tuple, S], S], leaves: tuple, state: S) -> S:
         found, on = many(leaves, state), open_ones(state)
         choose = lambda new, old: jnp.where(on.reshape(-1, *[1] * (new.ndim - 1)), new, old)
         return jax.tree.map(choose, found, state)
+
+    def begin(first: Callable[[tuple, S], S], leaves: tuple, state: S) -> S:
+        """Return the states after the first step, taken block by block."""
+        advance = partial(advance_all, jax.vmap(first, in_axes=axes))
+        own = [v for v, b in zip(leaves, batched, strict=True) if b]
+
+        def of_block(block: tuple[list, S]) -> S:
+            rest = iter(block[0])
+            part = tuple(next(rest) if b else v for v, b in zip(leaves, batched, strict=True))
+            return advance(part, block[1])
+
+        return map_blocks(of_block, BLOCK, (own, state))
 
     def advance_group(leaves: tuple, count: int, state: S) -> S:
         where = true_places(open_ones(state), count)
@@ -288,11 +318,13 @@ def _in_groups(
         if not size:
             return state
         counts = group_sizes(size, steps)
+        if first is not None and jax.default_backend() == "cpu" and counts[0] < size:
+            state = begin(first, leaves, state)
         for count, least in zip(counts, [*counts[1:], 0], strict=True):
-            whole = count == size
-            step = partial(advance_all, leaves) if whole else partial(advance_group, leaves, count)
+            together = partial(advance_all, many, leaves)
+            advance = together if count == size else partial(advance_group, leaves, count)
             more = lambda state, least=least: jnp.sum(open_ones(state)) > least
-            state = lax.while_loop(more, step, state)
+            state = lax.while_loop(more, advance, state)
         return state
 
     batch = custom_vmap(run)

@@ -36,6 +36,29 @@ def test_each_instance_takes_its_own_number_of_steps(count):
     np.testing.assert_array_equal(found, [collatz(int(n)) for n in starts])
 
 
+@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("count", [1, 5, 300])
+def test_a_first_step_that_leaves_some_as_they_are(count, shared):
+    """A batch of several groups halves even numbers first; odd ones lose nothing by it."""
+    starts = np.arange(1, count + 1, dtype=np.int32)
+    is_open = lambda state: state[0] != 1
+
+    def step(multiplier, state):
+        n, steps = state
+        return jnp.where(n % 2 == 0, n // 2, multiplier * n + 1), steps + 1
+
+    def halved(multiplier, state):
+        n, steps = state
+        return jnp.where(n % 2 == 0, n // 2, n), steps + (n % 2 == 0)
+
+    def run(multiplier, start):
+        return repeat_while(is_open, step, multiplier, (start, jnp.int32(0)), first=halved)[1]
+
+    multiplier = jnp.int32(3) if shared else jnp.full(count, 3, jnp.int32)
+    found = jax.jit(jax.vmap(run, in_axes=(None if shared else 0, 0)))(multiplier, starts)
+    np.testing.assert_array_equal(found, [collatz(int(n)) for n in starts])
+
+
 @pytest.mark.parametrize("axes", [(None, 0), (0, 0), (0, None)])
 def test_nested_batches(axes):
     """The outer batch has constants of its own, or states of its own, or both."""
