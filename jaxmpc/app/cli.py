@@ -4,6 +4,7 @@ import ast
 import contextlib
 import importlib
 import io
+import os
 import re
 import shlex
 import signal
@@ -41,13 +42,16 @@ TUNERS = {"weights": ("tune_weights", "TuneWeights"), "solver": ("tune_solver", 
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command and return its exit code: 0 done, 2 error, 130 interrupted."""
+    """Run a command and return its exit code: 0 done, 2 error, 130 interrupted, 141 nobody reads
+    its output any more."""
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv == ["--version"]:
         print(f"jaxmpc {jaxmpc.__version__}")
         return 0
     try:
         command = parse(argv)
+    except BrokenPipeError:
+        return without_reader()
     except (ValueError, OSError, AssertionError) as error:  # tyro asserts that it knows a shell
         return report_error(str(error))
     with plain_output():
@@ -61,6 +65,8 @@ def run(command: Any, argv: Sequence[str]) -> int:
     try:
         check_values(command)
         return command.run() or 0
+    except BrokenPipeError:
+        return without_reader()
     except (ValueError, OSError, MemoryError, ImportError) as error:
         return report_error(named_options(str(error), command))
     except KeyboardInterrupt:
@@ -71,6 +77,13 @@ def run(command: Any, argv: Sequence[str]) -> int:
         resume = shlex.join(["jaxmpc", *again, "--resume"])
         print(f"\nstopped; {command.keeps} that were done are kept. Go on with:\n  {resume}")
         return 130
+
+
+def without_reader() -> int:
+    """Return the exit code of a command whose output goes to a program that has ended, such as
+    `head`: silently, and with nothing left to be written at the end of the process."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 128 + signal.SIGPIPE
 
 
 def named_options(message: str, command: Any) -> str:

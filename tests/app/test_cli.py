@@ -597,3 +597,16 @@ def test_verify_a_recursion_report(tmp_path, capsys):
     (tmp_path / "rec/recursion.npz").write_bytes(b"garbled")
     assert run("verify rec") == 1
     assert "cannot be read" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [["sweep", "--help"], ["init"]])
+def test_a_reader_that_has_ended_ends_a_command_silently(words, tmp_path):
+    """As in `jaxmpc sweep --help | head -1`."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "jaxmpc", *words],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path,
+    ) as process:  # fmt: skip
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        error = process.stderr.read()
+    assert (process.returncode, error) == (141, "")
