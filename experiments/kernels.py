@@ -22,7 +22,7 @@ from bench.roofline import best_seconds
 import jaxmpc as jm
 from jaxmpc.qp.admm import ScaledProgram
 from jaxmpc.qp.admm_kernel import iterate_batch
-from jaxmpc.qp.transformations import on_gpu
+from jaxmpc.qp.jax_transformations import on_gpu
 from jaxmpc.qp.triton import ROUGH
 
 PLANS = [("joint", 2**20), ("springs4", 2**20), ("springs8", 2**16)]

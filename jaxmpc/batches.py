@@ -31,7 +31,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from tqdm.std import tqdm
 
 from jaxmpc.checks import fail, shown, whole
-from jaxmpc.qp.transformations import own_modes
+from jaxmpc.qp.jax_transformations import own_modes
 
 T = TypeVar("T")
 R = TypeVar("R")

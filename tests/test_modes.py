@@ -213,7 +213,7 @@ def test_several_devices_all(check):
 
 def test_lightly_optimised_programs_are_whole_ones_inside_others():
     """JAX refuses options of the compiler inside another program."""
-    from jaxmpc.qp.transformations import compiled_lightly
+    from jaxmpc.qp.jax_transformations import compiled_lightly
 
     square = compiled_lightly(0, static_argnames="twice")(
         lambda x, *, twice: x**2 * (2 if twice else 1)

@@ -35,9 +35,9 @@ from jaxmpc.mpc.plan import Control, checked_aim, checked_array, reference_shape
 from jaxmpc.mpc.problem import weights_of
 from jaxmpc.mpc.stagewise.nonlinear import ConstantModel, as_argument
 from jaxmpc.pytrees import pytree, static
+from jaxmpc.qp.jax_transformations import own_modes, varying
 from jaxmpc.qp.linalg import arrays, matmul
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.transformations import own_modes, varying
 from jaxmpc.sets.limits import worst_violation
 from jaxmpc.systems.system import LinearSystem
 

@@ -37,7 +37,7 @@ from jaxmpc.feasible.hard_constraints import ExactData
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.rays import Rays, close_gap, filled
 from jaxmpc.pytrees import pytree
-from jaxmpc.qp.transformations import own_modes
+from jaxmpc.qp.jax_transformations import own_modes
 
 # Coordinates up to which the polytopes have few facets.
 MOST_COORDINATES = 4

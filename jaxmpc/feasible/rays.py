@@ -24,7 +24,7 @@ from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.feasible.proofs import Cut
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
-from jaxmpc.qp.transformations import own_modes
+from jaxmpc.qp.jax_transformations import own_modes
 from jaxmpc.sets.convex_sets import Polytope
 from jaxmpc.sets.geometry import hull_volume
 from jaxmpc.sets.lp import power_of_two

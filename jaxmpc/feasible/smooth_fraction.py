@@ -25,10 +25,10 @@ from jaxmpc.checks import concrete, fail, require_shape
 from jaxmpc.mpc.condense import Condensed, condense
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.qp import linalg
+from jaxmpc.qp.jax_transformations import own_modes, varying
 from jaxmpc.qp.linalg import arrays, matmul
 from jaxmpc.qp.newton import Augmented, Constants, newton_step, ridged
 from jaxmpc.qp.problem import Bounds
-from jaxmpc.qp.transformations import own_modes, varying
 
 # Newton steps at most: most states need 3 to 20.
 STEPS = 60

@@ -25,9 +25,9 @@ from jaxmpc.checks import concrete, require_memory
 from jaxmpc.mpc.problem import MPC, Switch, Weights, dynamics_of, weights_of
 from jaxmpc.mpc.rows import Layout, blocks, bounds_of, layout_of, split, stacked
 from jaxmpc.pytrees import pytree, static
+from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes, varying
 from jaxmpc.qp.linalg import arrays, floating_dtype, matmul, solve
 from jaxmpc.qp.problem import QP, Bounds
-from jaxmpc.qp.transformations import compiled_lightly, own_modes, varying
 from jaxmpc.systems.riccati import lqr
 from jaxmpc.systems.system import host_matrices
 

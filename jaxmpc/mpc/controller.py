@@ -48,12 +48,12 @@ from jaxmpc.mpc.rows import apply, blocks, dynamics_terms, split
 from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor, factorise
 from jaxmpc.qp.dual import has_dual_steps
+from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes, varying
 from jaxmpc.qp.linalg import arrays, matmul, rounding
 from jaxmpc.qp.problem import QPSolution
 from jaxmpc.qp.residuals import SHARE, Measured, Terms, worst
 from jaxmpc.qp.solve import in_two_parts, solve_factored
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.transformations import compiled_lightly, own_modes, varying
 from jaxmpc.sets.convex_sets import Box, Polytope
 
 T = TypeVar("T")

@@ -56,10 +56,10 @@ from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, scaled_multipliers
 from jaxmpc.qp.dual import MORE_STEPS, MOST_STEPS, RIDGE, has_dual_steps, most_rows
+from jaxmpc.qp.jax_transformations import true_places
 from jaxmpc.qp.linalg import matmul, solve
 from jaxmpc.qp.solve import solve_from
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.transformations import true_places
 
 # States from which on transfer is tried: below, compiling its programs costs more than it saves.
 MANY = 32_768

@@ -19,9 +19,9 @@ from jax.typing import DTypeLike
 from jaxmpc.pytrees import record
 from jaxmpc.qp import triton
 from jaxmpc.qp.admm import Factor
+from jaxmpc.qp.jax_transformations import LARGE
 from jaxmpc.qp.linalg import matmul
 from jaxmpc.qp.problem import FREE, Bounds
-from jaxmpc.qp.transformations import LARGE
 from jaxmpc.qp.triton import (
     EXACT,
     LEAST,

@@ -33,10 +33,10 @@ from jax import Array
 
 from jaxmpc.qp.admm import Factor, ScaledProgram
 from jaxmpc.qp.dual import KERNEL_ROWS, inverted, sides
+from jaxmpc.qp.jax_transformations import Undo, in_blocks, on_gpu, repeat_while, true_places
 from jaxmpc.qp.linalg import definite_solver, matmul
 from jaxmpc.qp.newton import Constants, gram, ridged
 from jaxmpc.qp.problem import QP, Bounds
-from jaxmpc.qp.transformations import Undo, in_blocks, on_gpu, repeat_while, true_places
 from jaxmpc.qp.triton import LEAST, Ref, call, indices, load, store
 
 # Rows of the reduced system at most, where there is no kernel, steps of the method of multipliers,

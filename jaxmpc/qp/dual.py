@@ -33,10 +33,10 @@ from jax import Array
 
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ScaledProgram
+from jaxmpc.qp.jax_transformations import has_kernels, repeat_while, tree_where, true_places
 from jaxmpc.qp.linalg import infinity_norm, matmul, solve
 from jaxmpc.qp.problem import FREE, Bounds, sign
 from jaxmpc.qp.residuals import Pair
-from jaxmpc.qp.transformations import has_kernels, repeat_while, tree_where, true_places
 from jaxmpc.qp.triton import LEAST, Ref, barrier, call, indices, load, padded_side, store
 
 # Most rows in W.

@@ -31,7 +31,7 @@ from jax import Array, lax
 from jax.custom_batching import custom_vmap
 from jax.typing import DTypeLike
 
-from jaxmpc.qp.transformations import all_batched, broadcast, own_modes, varying
+from jaxmpc.qp.jax_transformations import all_batched, broadcast, own_modes, varying
 
 T = TypeVar("T")
 A = TypeVar("A", Array, np.ndarray)

@@ -36,6 +36,7 @@ from jaxmpc.qp.dual import (
     has_dual_steps,
     solve_dual,
 )
+from jaxmpc.qp.jax_transformations import repeat_while, tree_where, varying
 from jaxmpc.qp.linalg import infinity_norm, matmul, solve
 from jaxmpc.qp.problem import Bounds
 from jaxmpc.qp.residuals import (
@@ -48,7 +49,6 @@ from jaxmpc.qp.residuals import (
     row_sizes,
     to_length_one,
 )
-from jaxmpc.qp.transformations import repeat_while, tree_where, varying
 
 # Steps of the line search, a scalar Newton method. Penalties put almost vertical pieces into the
 # derivative, which only bisection finds.

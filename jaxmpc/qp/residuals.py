@@ -30,10 +30,10 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.pytrees import pytree
+from jaxmpc.qp.jax_transformations import tree_where
 from jaxmpc.qp.linalg import infinity_norm, matmul, precisely, rounding
 from jaxmpc.qp.problem import QP, Bounds, QPSolution, finite
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.transformations import tree_where
 
 # Multiple of the rounding floor below which steps on ill-conditioned programs gain nothing.
 STALLED = 10

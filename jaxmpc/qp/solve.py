@@ -34,6 +34,15 @@ from jaxmpc.qp.admm import (
 from jaxmpc.qp.admm_kernel import iterate_batch, suits
 from jaxmpc.qp.derivative import dense_conditions
 from jaxmpc.qp.dual import has_dual_steps, solve_dual
+from jaxmpc.qp.jax_transformations import (
+    compiled_lightly,
+    has_kernels,
+    implicit,
+    in_blocks,
+    own_modes,
+    tree_where,
+    varying,
+)
 from jaxmpc.qp.linalg import arrays, cast, floating_dtype, matmul, precisely, symmetric
 from jaxmpc.qp.newton import MultiplierState, improve, multipliers_start, multipliers_step
 from jaxmpc.qp.problem import QP, QPSolution
@@ -50,15 +59,6 @@ from jaxmpc.qp.residuals import (
     worst,
 )
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.transformations import (
-    compiled_lightly,
-    has_kernels,
-    implicit,
-    in_blocks,
-    own_modes,
-    tree_where,
-    varying,
-)
 from jaxmpc.qp.triton import EXACT, ROUGH, Product
 
 T = TypeVar("T")

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxmpc.qp.transformations import on_gpu
+from jaxmpc.qp.jax_transformations import on_gpu
 
 # Least side of a matrix in Triton's products.
 LEAST = 16

@@ -22,8 +22,8 @@ from jax.scipy.spatial.transform import Rotation
 from jaxmpc.arrays import host_array
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.pytrees import pytree, static
+from jaxmpc.qp.jax_transformations import own_modes, varying
 from jaxmpc.qp.linalg import eigh, matmul
-from jaxmpc.qp.transformations import own_modes, varying
 from jaxmpc.robots.configurations import difference, quaternions, retract
 from jaxmpc.robots.description import RobotDescription
 from jaxmpc.robots.equilibria import (

@@ -12,8 +12,8 @@ from jax import Array
 from jaxmpc.arrays import Reals, as_weight, host_array
 from jaxmpc.checks import concrete, fail, require_kind, require_shape, require_symmetric_psd
 from jaxmpc.pytrees import pytree
+from jaxmpc.qp.jax_transformations import own_modes, varying
 from jaxmpc.qp.linalg import arrays, floating_dtype, in_float64, matmul, solve, solve_general
-from jaxmpc.qp.transformations import own_modes, varying
 from jaxmpc.systems.system import LinearSystem
 
 # Modes closer than this to unreachable (least singular value, relative) count as such.

@@ -11,12 +11,12 @@ import pytest
 from bench.families import joint
 
 import jaxmpc as jm
-from jaxmpc.qp import admm, derivative, dual, solve, transformations, triton
+from jaxmpc.qp import admm, derivative, dual, jax_transformations, solve, triton
 from jaxmpc.qp.admm import ADMM, ScaledProgram, factorise, iterate, splittings
 from jaxmpc.qp.admm_kernel import iterate_batch, pieces
 from jaxmpc.qp.admm_kernel import suits as suits_kernel
 from jaxmpc.qp.dual import Dual, DualPoint, MostSteps, dual_search, dual_search_kernel
-from jaxmpc.qp.transformations import true_places
+from jaxmpc.qp.jax_transformations import true_places
 
 STEPS = 12
 
@@ -187,7 +187,7 @@ def lowered(function, states, monkeypatch):
     mesh_module = pytest.importorskip("jax._src.mesh")
     if not hasattr(mesh_module, "AbstractDevice"):
         pytest.skip("this JAX lowers kernels on machines with a GPU alone")
-    for module in (transformations, triton, derivative):
+    for module in (jax_transformations, triton, derivative):
         monkeypatch.setattr(module, "on_gpu", lambda: True)
     device = mesh_module.AbstractDevice("NVIDIA H100 80GB HBM3", 132, "gpu")
     axes = dict(axis_types=(jax.sharding.AxisType.Auto,), abstract_device=device)
@@ -229,15 +229,15 @@ def test_kernels_can_be_lowered_outside_64_bit_mode(soft, monkeypatch):
 def test_without_triton_there_are_no_kernels_and_one_line_says_so(monkeypatch):
     """Newer versions of JAX may leave it out."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert transformations.on_gpu()
+    assert jax_transformations.on_gpu()
     monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
-    transformations.has_triton.cache_clear()
+    jax_transformations.has_triton.cache_clear()
     try:
         with pytest.warns(UserWarning, match="no GPU kernel runs and plans take .* Install"):
-            assert not transformations.on_gpu()
-        assert not transformations.on_gpu()  # without another warning, which would be an error
+            assert not jax_transformations.on_gpu()
+        assert not jax_transformations.on_gpu()  # without another warning, which would be an error
     finally:
-        transformations.has_triton.cache_clear()
+        jax_transformations.has_triton.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -246,7 +246,7 @@ def test_without_triton_there_are_no_kernels_and_one_line_says_so(monkeypatch):
 )
 def test_matrices_beyond_shared_memory_are_left_to_xla(n, m, taken, monkeypatch):
     """As are iterates in float64, and rows that no program's registers hold."""
-    monkeypatch.setattr(transformations, "on_gpu", lambda: True)
+    monkeypatch.setattr(jax_transformations, "on_gpu", lambda: True)
     made = SimpleNamespace(A=np.zeros((m, n)))
     suits = lambda dtype, product: suits_kernel(made, (), np.dtype(dtype), product)
     assert suits("float32", triton.ROUGH) == taken == suits("float32", triton.EXACT)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jaxmpc as jm
-from jaxmpc.qp import transformations
-from jaxmpc.qp.transformations import BLOCK, group_sizes, in_blocks, repeat_while, true_places
+from jaxmpc.qp import jax_transformations
+from jaxmpc.qp.jax_transformations import BLOCK, group_sizes, in_blocks, repeat_while, true_places
 
 
 def collatz(start: int) -> int:
@@ -82,7 +82,7 @@ def test_groups_cover_and_shrink():
 @pytest.mark.parametrize("long", [10, 5])
 def test_true_places(long, monkeypatch):
     """Put in their places, and looked up."""
-    monkeypatch.setattr(transformations, "LONG", long)
+    monkeypatch.setattr(jax_transformations, "LONG", long)
     mask = np.array([0, 1, 1, 0, 1], bool)
     np.testing.assert_array_equal(true_places(mask, 2), [1, 2])
     np.testing.assert_array_equal(true_places(mask, 4), [1, 2, 4, 5])

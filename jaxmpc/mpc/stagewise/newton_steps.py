@@ -43,10 +43,10 @@ from jax import Array
 from jaxmpc.mpc.stagewise.stages import Stages, conditions, measured_pair, minimise, riccati
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import scaled_multipliers
+from jaxmpc.qp.jax_transformations import Undo
 from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.problem import Bounds
 from jaxmpc.qp.residuals import Pair
-from jaxmpc.qp.transformations import Undo
 
 # Steps of the interior point method at most.
 INTERIOR_STEPS = 40

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxmpc.qp import triton
+from jaxmpc.qp.jax_transformations import on_gpu, own_modes
 from jaxmpc.qp.linalg import WAITS, batched, inverse_root_side_by_side, matmul, solve
-from jaxmpc.qp.transformations import on_gpu, own_modes
 from jaxmpc.qp.triton import barrier, call, indices, load, padded_side, store
 
 # Numbers along a side that a warp's registers hold.

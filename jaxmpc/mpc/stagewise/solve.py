@@ -57,12 +57,12 @@ from jaxmpc.qp.admm import (
     scaled_multipliers,
     start,
 )
+from jaxmpc.qp.jax_transformations import implicit, own_modes, repeat_while, varying
 from jaxmpc.qp.linalg import arrays, matmul, precisely
 from jaxmpc.qp.problem import Bounds, QPSolution
 from jaxmpc.qp.residuals import Measured, Pair, Proof, assess, with_status
 from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.transformations import implicit, own_modes, repeat_while, varying
 from jaxmpc.sets.convex_sets import Ellipsoid
 from jaxmpc.systems.system import LinearSystem
 

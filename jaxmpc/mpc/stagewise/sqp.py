@@ -59,12 +59,12 @@ from jaxmpc.mpc.stagewise.stages import (
 )
 from jaxmpc.pytrees import pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, default_rho, scaled_multipliers
+from jaxmpc.qp.jax_transformations import Undo, implicit, own_modes, repeat_while, varying
 from jaxmpc.qp.linalg import arrays, cholesky, precisely, rounding
 from jaxmpc.qp.newton import Constants
 from jaxmpc.qp.residuals import SHARE, Measured, Proof, Terms, assess
 from jaxmpc.qp.solve import tolerance
 from jaxmpc.qp.status import Status
-from jaxmpc.qp.transformations import Undo, implicit, own_modes, repeat_while, varying
 from jaxmpc.sets.convex_sets import Box
 
 # QPs at most, of `solve_nonlinear`.
