@@ -138,7 +138,7 @@ def _count(found: Stored, result: Verification) -> bool:
     return True
 
 
-@dataclass
+@dataclass(eq=False)
 class _BlockProofs:
     """What the proofs of a block are found to be, by the indices of its states: why labels are not
     proved; how many of the feasible ones are, how many of these exactly, their least margin; and
