@@ -172,10 +172,16 @@ class Controller:
         previous_input: Reals | None = None,
     ) -> Plan:
         """Plan from x0 (n,); arguments as in `solve`."""
-        aim = self._checked(x0, reference, input_reference, previous_input)
+        return self._plan_by(_plan, warm_start, x0, reference, input_reference, previous_input)
+
+    def _plan_by(
+        self, program: Callable[..., Plan], warm_start: Plan | WarmStart | None, *aim: Any
+    ) -> Plan:
+        """Plan by one of the programs made of `planned_from`."""
+        checked = self._checked(*aim)
         if warm_start is not None:
             warm_start = arrays(WarmStart.of(warm_start, self.condensed.layout, self.mpc))
-        return self._in_two_parts(_plan, aim, warm_start)
+        return self._in_two_parts(program, checked, warm_start)
 
     def _in_two_parts(self, program: Callable[..., T], *given: Any, **status: Any) -> T:
         hard = not has_dual_steps(self.condensed.balls, self.condensed.C)
@@ -258,9 +264,9 @@ def _control(
     return applied(controller.mpc, controller.condensed.layout, plan, memory, aim.previous_input)
 
 
-@compiled_lightly(1, static_argnames="whole")
 @own_modes
-def _plan(controller: Controller, aim: Aim, start: WarmStart | None, *, whole: bool) -> Plan:
+def planned_from(controller: Controller, aim: Aim, start: WarmStart | None, *, whole: bool) -> Plan:
+    """Return the plan of an aim; whole: see `qp.solve.in_two_parts`."""
     c, mpc = controller.condensed, controller.mpc
     N, n, m = mpc.horizon, mpc.system.n, mpc.system.m
     aim = aim if mpc.input_in_state else aim._replace(previous_input=None)
@@ -284,6 +290,11 @@ def _plan(controller: Controller, aim: Aim, start: WarmStart | None, *, whole: b
     found, fault = solve_factored(qp, controller.factor, controller.solver, pair, whole=whole)
     fault = jnp.where(finite, fault, Status.NON_FINITE)
     return planned(controller, theta, aim, found, fault)
+
+
+_plan = compiled_lightly(1, static_argnames="whole")(planned_from)
+# Of `solve`, which makes a controller for each plan: that takes more time than the plan.
+_plan_once = compiled_lightly(0, static_argnames="whole")(planned_from)
 
 
 def planned(
@@ -401,4 +412,6 @@ def solve(
     mpc.require_sizes()
     checked_aim(mpc, x0, reference, input_reference, previous_input)
     require_warm_start(warm_start)
-    return Controller(mpc, solver).plan(x0, reference, warm_start, input_reference, previous_input)
+    controller = Controller(mpc, solver)
+    aim = x0, reference, input_reference, previous_input
+    return controller._plan_by(_plan_once, warm_start, *aim)
