@@ -5,6 +5,7 @@ label depends on their numbers; proofs use `ExactData`.
 """
 
 import contextlib
+import threading
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -212,6 +213,7 @@ class RowPrograms:
         variables = both[:, : rows.U.shape[1]]
         self.equalities = equal & (_rank(variables[equal]) == _rank(both[equal]))
         self._last: Program | None = None
+        self._alone = threading.Lock()  # the last program is changed and solved as one
 
     def solve_lp(
         self,
@@ -278,20 +280,20 @@ class RowPrograms:
     ) -> Optimum:
         """Maximise cost'x over G x ≤ g, from the end of the last program where the two differ in
         their last column alone, as those of rays from one point do."""
-        last = self._last
-        same = (
-            last is not None
-            and last.G.shape == G.shape
-            and np.array_equal(last.g, g)
-            and np.array_equal(last.equal, equal)
-            and np.array_equal(last.G[:, :-1], G[:, :-1])
-        )
-        if last is not None and same:
-            last.change_last_column(G[:, -1])
-            with contextlib.suppress(ValueError):  # in the units of another last column
-                return last.maximise(cost)
-        self._last = Program(G, g, equal)
-        return self._last.maximise(cost)
+        with self._alone:
+            last = self._last
+            if (
+                last is not None
+                and last.G.shape == G.shape
+                and np.array_equal(last.g, g)
+                and np.array_equal(last.equal, equal)
+                and np.array_equal(last.G[:, :-1], G[:, :-1])
+            ):
+                last.change_last_column(G[:, -1])
+                with contextlib.suppress(ValueError):  # in the units of another last column
+                    return last.maximise(cost)
+            self._last = Program(G, g, equal)
+            return self._last.maximise(cost)
 
     def support(self, direction: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """Return max direction'θ over the feasible set: the optimum (inf: unbounded, −inf: empty),
