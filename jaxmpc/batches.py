@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from tqdm.std import tqdm
@@ -268,7 +269,7 @@ def side_by_side(
     items, count = list(items), workers() if count is None else count
     if min(count, len(items)) < 2:
         return [call(item) for item in items]
-    mode = bool(jax.config.jax_enable_x64)
+    mode = jnp.result_type(float) == jnp.float64
 
     def in_mode(item: Any) -> Any:
         with jax.enable_x64(mode):

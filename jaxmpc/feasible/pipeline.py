@@ -452,7 +452,7 @@ def pipeline_for(
     where that was for the same scope and settings."""
     devices = chosen_devices(settings.get("devices"))
     others = tuple(repr(settings.get(name)) for name in ("iterations", "dtype"))
-    place = devices or jax.config.jax_default_device
+    place = devices or tuple(jax.device_put(0).devices())  # the default device
     numbers = scope.largest.tobytes(), scope.typical.tobytes(), scope.parts, chunk
     key = *numbers, others, place, hull_for(problem, scope.points) is not None
     if problem.memory.get("pipeline", (None,))[0] != key:
