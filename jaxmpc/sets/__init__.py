@@ -1,6 +1,6 @@
 """Sets of states and inputs, in the coordinates and units of the system that they constrain.
 
-Box, Polytope, Ellipsoid         sets that contain, intersect, support, project
+Box, Polytope, Zonotope, Ellipsoid  sets that contain, intersect, support, project
 maximal_invariant_set            largest set that u = K x keeps within limits -> InvariantSet
 invariant_ellipsoid              the same, a level set of x'Px -> InvariantEllipsoid
 maximal_control_invariant_set    largest set that some input keeps -> ControlInvariantSet
@@ -11,7 +11,7 @@ verify_terminal                  hypotheses of the stability theorems -> Termina
 """
 
 from jaxmpc.sets.control_invariant import maximal_control_invariant_set
-from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
+from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope, Zonotope
 from jaxmpc.sets.invariant import (
     invariant_ellipsoid,
     maximal_invariant_set,
@@ -25,6 +25,7 @@ __all__ = [
     "Box",
     "Ellipsoid",
     "Polytope",
+    "Zonotope",
     "invariant_ellipsoid",
     "joint_limits",
     "maximal_control_invariant_set",

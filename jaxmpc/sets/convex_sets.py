@@ -1,4 +1,4 @@
-"""Convex sets in R^n: boxes, polytopes, and ellipsoids about the origin.
+"""Convex sets in R^n: boxes, polytopes, zonotopes, and ellipsoids about the origin.
 
 `contains`, `Box.support` and `Ellipsoid.support` are JAX functions of one point (map them with
 `jax.vmap`); outside of JAX's transformations they answer in float64, whatever JAX's own precision.
@@ -25,6 +25,7 @@ from jaxmpc.arrays import Reals, as_array, dimensions, host_array, store_floats
 from jaxmpc.checks import (
     concrete,
     fail,
+    number,
     require_finite,
     require_printable,
     require_real,
@@ -33,18 +34,18 @@ from jaxmpc.checks import (
 )
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import solve
-from jaxmpc.sets import geometry
+from jaxmpc.sets import generators, geometry
 from jaxmpc.sets.geometry import Flat, Frame, affine_hull, framed
 from jaxmpc.sets.lp import FLAT, ROUNDING, Program, cleaned, extent, maximise, scaling
 
 # An array, a number, True or False, of JAX or NumPy.
 AnyArray: TypeAlias = jax.Array | np.ndarray
 AnyNumber: TypeAlias = jax.Array | np.floating | float
-AnyTruth: TypeAlias = jax.Array | np.bool
+AnyTruth: TypeAlias = jax.Array | np.ndarray | np.bool
 
 
 class ConvexSet(ABC):
-    """A convex set in R^n: Box, Polytope or Ellipsoid."""
+    """A convex set in R^n: Box, Polytope, Zonotope or Ellipsoid."""
 
     @property
     @abstractmethod
@@ -70,7 +71,7 @@ class ConvexSet(ABC):
 
 
 class LinearSet(ConvexSet):
-    """A set of linear inequalities: Box or Polytope."""
+    """A set of linear inequalities: Box, Polytope or Zonotope."""
 
     def spread(self, n: int) -> Self:
         """Return the set, a Box of two numbers as the box with these bounds of n coordinates."""
@@ -502,9 +503,8 @@ class Polytope(LinearSet):
         Raises ValueError if the projection is empty or flat, or there are too many rows to
         eliminate.
         """
-        axes, n = list(axes), self.dimension
-        if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(range(n)):
-            fail("axes", f"{axes} are not distinct numbers in 0..{n - 1}", "Name those to keep")
+        n = self.dimension
+        axes = _axes(axes, n)
         try:
             Z, center, scale = self.frame()
         except Flat:
@@ -660,6 +660,160 @@ class Polytope(LinearSet):
         return frame
 
 
+@pytree
+class Zonotope(LinearSet):
+    """{center + generators w : |w_i| <= 1}, the sum of a point and m segments in R^n.
+
+    Arguments:
+        center: (n,), in the units of x.
+        generators: (n, m), one column each; m = 0 makes it the point `center`. It may be flat.
+
+    Sums, images and supports are exact in any dimension, with m or fewer operations a number.
+    Vertices, half-spaces and volume need subsets of the generators: few dimensions or few
+    generators. All methods but `support` run in NumPy, not traceable.
+    """
+
+    center: Reals
+    generators: Reals
+
+    def __post_init__(self) -> None:
+        store_floats(self, "center", "generators")
+
+    @classmethod
+    def from_box(cls, box: Box) -> "Zonotope":
+        """Return a bounded box as a zonotope, one generator a coordinate of positive width."""
+        lower, upper = box._finite_bounds()
+        half = (upper - lower) / 2
+        return cls(lower + half, np.diag(half)[:, half > 0])
+
+    @property
+    def dimension(self) -> int:
+        """Return n, the number of coordinates."""
+        return np.shape(as_array(self.center))[-1]
+
+    def validate(self, argument: str, dimension: int | None = None) -> None:
+        """Raise ValueError, naming `argument`, for wrong shapes, NaN or infinity."""
+        self._require_fields(argument, dimension)
+        require_finite(f"{argument}.center", self.center)
+        require_finite(f"{argument}.generators", self.generators)
+
+    def support(self, d: Reals) -> AnyNumber:
+        """Return max d'x over the zonotope = d'center + |generators'd|_1, for one direction d (n,)
+        or for each of many (k, n)."""
+        self._require_fields("Zonotope")
+        d = as_array(d)
+        if np.ndim(d) != 2 or np.shape(d)[1] != self.dimension:
+            require_shape("d", d, (self.dimension,), "Give one direction, or one a row")
+        xp, (along, center, G) = numbers(d, self.center, self.generators)
+        return product(xp, along, center) + xp.abs(product(xp, along, G)).sum(axis=-1)
+
+    def contains(self, x: Reals, tolerance: float = 0.0) -> AnyTruth:
+        """Return whether a point x (n,), or each of many (k, n), lies within `tolerance` of the
+        zonotope in each coordinate.
+
+        By one LP a point. A point counts as inside up to 1e-10 of the half-widths.
+        """
+        center, G = self._values()
+        points = host_array("x", x)
+        if points.ndim != 2 or points.shape[1] != self.dimension:
+            require_shape("x", points, (self.dimension,), "Give one point, or one a row")
+        number("tolerance", tolerance, 0.0, "Give a distance, or 0")
+        inside = np.array(
+            [generators.holds(center, G, point, tolerance) for point in np.atleast_2d(points)], bool
+        )
+        return inside if points.ndim == 2 else np.bool(inside.item())
+
+    def minkowski_sum(self, other: "LinearSet | Reals") -> "Zonotope | Polytope":
+        """Return {x + w : x in the set, w in other}: a Zonotope with a Zonotope, a bounded Box or a
+        point (1, n); a Polytope with a Polytope or with points (k, n), which stand for their convex
+        hull."""
+        if isinstance(other, Box):
+            other.validate("other", self.dimension)
+            other = Zonotope.from_box(other) if np.isfinite(other.bounds()).all() else other
+        if isinstance(other, Zonotope):
+            other.validate("other", self.dimension)
+            (center, G), (center_too, G_too) = self._values(), other._values()
+            return Zonotope(center + center_too, np.hstack([G, G_too]))
+        if not isinstance(other, LinearSet):
+            points = _points(other, self.dimension)
+            if len(points) == 1:
+                center, G = self._values()
+                return Zonotope(center + points[0], G)
+        return self.to_polytope().minkowski_sum(other)
+
+    def image(self, M: Reals, t: Reals | None = None) -> "Zonotope":
+        """Return {M x + t : x in the set}, with any matrix M (k, n); t (k,), or None for 0."""
+        center, G = self._values()
+        M, t = _affine(M, t, (None, len(center)))
+        return Zonotope(M @ center + t, M @ G)
+
+    def project(self, axes: Sequence[int]) -> "Zonotope":
+        """Return the set of (x_i for i in axes) over all x in the set."""
+        center, G = self._values()
+        axes = _axes(axes, len(center))
+        return Zonotope(center[axes], G[axes])
+
+    def bounding_box(self) -> Box:
+        """Return the smallest box around it."""
+        center, G = self._values()
+        half = generators.reach(G)
+        return Box(center - half, center + half)
+
+    def half_spaces(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (H, h) of its facets H x <= h, unit rows; opposite rows for the equalities of a
+        flat set.
+
+        The offsets are supports, exact to rounding. Raises ValueError where there are more than
+        300,000 sets of n - 1 generators.
+        """
+        center, G = self._values()
+        unit, U, N = generators.span(G)
+        parts = [np.zeros((0, len(center)))]
+        if U.shape[1]:
+            S = generators.merged(U.T @ (G / unit[:, None]))
+            parts.append(generators.facet_normals(S) @ U.T)
+        d = np.vstack([*parts, N.T]) / unit
+        d = cleaned(d, np.abs(d).max(axis=1, keepdims=True, initial=0.0))
+        d = d / np.linalg.norm(d, axis=1)[:, None]
+        middle, half = d @ center, np.abs(d @ G).sum(axis=1)
+        half[len(d) - N.shape[1] :] = 0.0
+        return np.vstack([d, -d]) + 0.0, np.concatenate([middle + half, half - middle])
+
+    def to_polytope(self) -> "Polytope":
+        """Return the same set as H x <= h, as `half_spaces` does."""
+        return Polytope(*self.half_spaces())
+
+    def vertices(self) -> np.ndarray:
+        """Return the vertices (k, n), counter-clockwise in 2-D; those of a flat set too.
+
+        Each is the center and all generators with their signs. Raises ValueError as `half_spaces`
+        does.
+        """
+        center, G = self._values()
+        G = generators.merged(G)
+        unit, U, _ = generators.span(G)
+        return center + generators.vertex_signs(U.T @ (G / unit[:, None])) @ G.T
+
+    def volume(self) -> float:
+        """Return the length, area or volume, 2^n sum |det| over all sets of n generators; 0 if
+        flat. Raises ValueError where there are more than 5,000,000 of them."""
+        return generators.volume(self._values()[1])
+
+    def _values(self) -> tuple[np.ndarray, np.ndarray]:
+        self.validate("Zonotope")
+        center = host_array("Zonotope.center", self.center)
+        return center, host_array("Zonotope.generators", self.generators)
+
+    def _require_fields(self, argument: str, dimension: int | None = None) -> None:
+        center, G = np.shape(as_array(self.center)), np.shape(as_array(self.generators))
+        if len(center) != 1 or not center[0]:
+            fail(f"{argument}.center", f"shape {center} is not (n,)", "Give a list or array")
+        if len(G) != 2 or G[0] != center[0]:
+            wanted = f"({center[0]}, m)"
+            fail(f"{argument}.generators", f"shape {G} is not {wanted}", "Give one a column")
+        require_dimension(argument, center[0], dimension)
+
+
 def _affine(
     M: Reals, t: Reals | None, shape: tuple[int | None, int | None]
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -681,6 +835,14 @@ def _scaled(M: np.ndarray) -> np.ndarray:
     """Return M in scaled rows and columns: units must not decide its rank."""
     row, column = scaling(M, np.zeros(len(M)))
     return row[:, None] * M * column
+
+
+def _axes(axes: Sequence[int], n: int) -> list[int]:
+    """Return the coordinates of an argument `axes`, checked."""
+    axes = list(axes)
+    if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(range(n)):
+        fail("axes", f"{axes} are not distinct numbers in 0..{n - 1}", "Name those to keep")
+    return axes
 
 
 def _points(points: Reals, n: int) -> np.ndarray:
