@@ -29,7 +29,7 @@ from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes, varying
 from jaxmpc.qp.linalg import arrays, floating_dtype, matmul, solve
 from jaxmpc.qp.problem import QP, Bounds
 from jaxmpc.systems.riccati import lqr
-from jaxmpc.systems.system import host_matrices
+from jaxmpc.systems.system import LinearSystem, host_matrices
 
 
 @pytree
@@ -71,9 +71,14 @@ class Condensed:
     begins: tuple[int, ...] = static()
 
     def qp(
-        self, theta: Array, reference: Array | None = None, input_reference: Array | None = None
+        self,
+        theta: Array,
+        reference: Array | None = None,
+        input_reference: Array | None = None,
+        shift: Array | None = None,
     ) -> QP:
-        """QP at θ (p,). reference (N+1, n), input_reference (N, m): what to track, None for 0."""
+        """QP at θ (p,). reference (N+1, n), input_reference (N, m): what to track, None for 0.
+        shift (rows,): added to the rows, None for 0."""
         q = matmul(self.F, theta) + self.f
         if reference is not None:
             weighted = self.weights.of_states(reference)
@@ -81,8 +86,9 @@ class Condensed:
         if input_reference is not None:
             weighted = self.weights.of_inputs(input_reference)
             q = q - 2 * jnp.einsum("kmi,km->i", self.Omega, weighted, precision="highest")
-        shift = matmul(self.D, theta) + self.d
-        l, u = self.lower - shift, self.upper - shift
+        constant = matmul(self.D, theta) + self.d
+        constant = constant if shift is None else constant + shift
+        l, u = self.lower - constant, self.upper - constant
         soft = self.soft_linear, self.soft_quadratic
         return QP(self.P, q, self.C, l, u, *soft, self.radius, self.limits.sizes(), self.balls)
 
@@ -114,6 +120,15 @@ class Condensed:
         states = one(self.Phi, theta) + one(self.Gamma, z) + self.phi
         inputs = one(self.Psi, theta) + one(self.Omega, z) + self.psi
         return states, inputs
+
+    def response(self, system: LinearSystem, forecast: Array) -> tuple[Array, Array]:
+        """States (N+1, n) and inputs (N, m) that a forecast e (N, n) adds to those of z and θ:
+        x̃_{k+1} = (A + BK) x̃_k + e_k from x̃_0 = 0, ũ_k = K x̃_k."""
+        A, B, _ = dynamics_of(system, forecast.dtype)
+        closed = A + matmul(B, self.K)
+        move = lambda x, e: (matmul(closed, x) + e, x)
+        last, states = jax.lax.scan(move, jnp.zeros_like(forecast[0]), forecast)
+        return jnp.concatenate([states, last[None]]), matmul(states, self.K.T)
 
 
 def prestabilising_gain(mpc: MPC) -> Any:

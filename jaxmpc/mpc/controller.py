@@ -50,7 +50,7 @@ from jaxmpc.qp.admm import ADMM, DEFAULT, Factor, factorise
 from jaxmpc.qp.dual import has_dual_steps
 from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes, varying
 from jaxmpc.qp.linalg import arrays, matmul, rounding
-from jaxmpc.qp.problem import QPSolution
+from jaxmpc.qp.problem import QP, QPSolution
 from jaxmpc.qp.residuals import SHARE, Measured, Terms, worst
 from jaxmpc.qp.solve import in_two_parts, solve_factored
 from jaxmpc.qp.status import Status
@@ -141,13 +141,14 @@ class Controller:
         *,
         input_reference: Reals | None = None,
         previous_input: Reals | None = None,
+        forecast: Reals | None = None,
     ) -> Control[Plan]:
         """The input at the state x (n,), the plan that it belongs to, and what to remember.
 
-        before: None, or what was returned at the time step before. References and previous_input as
-        in `solve`; previous_input None: the input of `before`.
+        before: None, or what was returned at the time step before. References, previous_input and
+        forecast as in `solve`; previous_input None: the input of `before`.
         """
-        aim = self._checked(x, reference, input_reference, previous_input)
+        aim = self._checked(x, reference, input_reference, previous_input, forecast)
         last = None if before is None else (before.u, before.memory)
         return self._in_two_parts(_control, aim, last, status=lambda found: found.plan.status)
 
@@ -170,9 +171,11 @@ class Controller:
         warm_start: Plan | WarmStart | None = None,
         input_reference: Reals | None = None,
         previous_input: Reals | None = None,
+        forecast: Reals | None = None,
     ) -> Plan:
         """Plan from x0 (n,); arguments as in `solve`."""
-        return self._plan_by(_plan, warm_start, x0, reference, input_reference, previous_input)
+        aim = x0, reference, input_reference, previous_input, forecast
+        return self._plan_by(_plan, warm_start, *aim)
 
     def _plan_by(
         self, program: Callable[..., Plan], warm_start: Plan | WarmStart | None, *aim: Any
@@ -278,6 +281,8 @@ def planned_from(controller: Controller, aim: Aim, start: WarmStart | None, *, w
         aim = aim._replace(states=jnp.broadcast_to(aim.states, (N + 1, n)))
     if aim.inputs is not None:
         aim = aim._replace(inputs=jnp.broadcast_to(aim.inputs, (N, m)))
+    if aim.forecast is not None:
+        aim = aim._replace(forecast=jnp.broadcast_to(aim.forecast, (N, n)))
     theta = aim.x0
     if mpc.input_in_state:
         previous = aim.previous_input
@@ -285,7 +290,7 @@ def planned_from(controller: Controller, aim: Aim, start: WarmStart | None, *, w
             previous_input=jnp.zeros(m, theta.dtype) if previous is None else previous
         )
         theta = jnp.concatenate([theta, aim.previous_input])
-    qp = c.qp(theta, aim.states, aim.inputs)
+    qp = _qp(controller, theta, aim)
     pair = None if start is None else (c.variables(start.states, start.inputs), start.multipliers)
     found, fault = solve_factored(qp, controller.factor, controller.solver, pair, whole=whole)
     fault = jnp.where(finite, fault, Status.NON_FINITE)
@@ -295,6 +300,31 @@ def planned_from(controller: Controller, aim: Aim, start: WarmStart | None, *, w
 _plan = compiled_lightly(1, static_argnames="whole")(planned_from)
 # Of `solve`, which makes a controller for each plan: that takes more time than the plan.
 _plan_once = compiled_lightly(0, static_argnames="whole")(planned_from)
+
+
+def _qp(controller: Controller, theta: Array, aim: Aim) -> QP:
+    """Return the condensed QP of an aim at θ (p,).
+
+    What a forecast adds to states and inputs, x̃ and ũ, is known: the rest tracks the references
+    less these, and keeps the limits less the rows of these.
+    """
+    c, mpc = controller.condensed, controller.mpc
+    if aim.forecast is None:
+        return c.qp(theta, aim.states, aim.inputs)
+    x, u = c.response(mpc.system, aim.forecast)
+    rates = jnp.diff(u, axis=0, prepend=jnp.zeros_like(u[:1]))
+    along = [b.values(x, rates if b.rate else u).ravel() for b in blocks(mpc, x.dtype)]
+    states, inputs = (0.0 if r is None else r for r in (aim.states, aim.inputs))
+    qp = c.qp(theta, states - x, inputs - u, jnp.concatenate([*along, x[0, :0]]))
+    if mpc.input_rate_weight is None:
+        return qp
+    push = _of_rates(2 * matmul(rates, c.weights.W))
+    return replace(qp, q=qp.q + jnp.einsum("kmi,km->i", c.Omega, push, precision="highest"))
+
+
+def _of_rates(g: Array) -> Array:
+    """Return the gradient (N, m) in u of what has the gradient g in the rates u_k − u_{k−1}."""
+    return g - jnp.concatenate([g[1:], jnp.zeros_like(g[:1])])
 
 
 def planned(
@@ -307,6 +337,9 @@ def planned(
     and dynamics are checked to the precision that is left.
     """
     states, inputs = controller.condensed.trajectory(theta, found.z)
+    if aim.forecast is not None:
+        more = controller.condensed.response(controller.mpc.system, aim.forecast)
+        states, inputs = states + more[0], inputs + more[1]
     terms = stated_terms(*jax.lax.stop_gradient((controller, found.y, states, inputs, aim)))
     eps, dtype = jnp.asarray(controller.solver.eps, states.dtype), states.dtype
     if dtype == jnp.float64:
@@ -338,12 +371,10 @@ def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim)
         cancels = J + jnp.sum(x * weights.of_states(x)) + jnp.sum(u * weights.of_inputs(u))
     before = jnp.zeros_like(u[0]) if aim.previous_input is None else aim.previous_input
     rates = jnp.diff(u, axis=0, prepend=before[None])
-    # Adds to a gradient in u that of what has the gradient g in the rates.
-    add_rates = lambda gu, g: gu + g - jnp.concatenate([g[1:], jnp.zeros_like(g[:1])])
     if mpc.input_rate_weight is not None:
         push = matmul(rates, weights.W)
         J = J + jnp.sum(rates * push)
-        gu = add_rates(gu, push)
+        gu = gu + _of_rates(push)
     gx, gu = 2 * gx, 2 * gu
 
     violations, sizes = [], []
@@ -351,7 +382,7 @@ def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim)
     for block, y_block in zip(blocks(mpc, x.dtype), split(c.layout, y), strict=True):
         if block.rate:
             v = block.values(x, rates)
-            gu = add_rates(gu, block.pull(y_block, gx, jnp.zeros_like(gu))[1])
+            gu = gu + _of_rates(block.pull(y_block, gx, jnp.zeros_like(gu))[1])
         else:
             v = block.values(x, u)
             gx, gu = block.pull(y_block, gx, gu)
@@ -369,6 +400,7 @@ def stated_terms(controller: Controller, y: Array, x: Array, u: Array, aim: Aim)
     rounds = rounds + jnp.max(jnp.abs(y) * factor.row_norms, initial=0.0)
 
     A, B, drift = dynamics_of(mpc.system, x.dtype)
+    drift = drift if aim.forecast is None else drift + aim.forecast
     defects = x[1:] - (apply(A, x[:-1]) + apply(B, u) + drift)
     terms = dynamics_terms(A, B, drift, x, u)
     most = jnp.max(jnp.abs(x), axis=0) + SHARE * jnp.max(terms, axis=0)
@@ -395,6 +427,7 @@ def solve(
     *,
     input_reference: Reals | None = None,
     previous_input: Reals | None = None,
+    forecast: Reals | None = None,
 ) -> Plan:
     """Solve one MPC problem from the state x0 (n,).
 
@@ -402,6 +435,8 @@ def solve(
     Σ (x_k − r_k)'Q(x_k − r_k) + …; constraints, the terminal set too, stay where they are.
     input_reference: input to track, (m,) or (N, m), such as that of `equilibrium`; None for zero.
     previous_input: u_{−1} (m,) where the problem limits or weighs input rates; None for zero.
+    forecast: disturbance that is known ahead, (n,) or (N, n), row k of which is added to x_{k+1};
+    None for zero.
     warm_start: an earlier Plan or a WarmStart.
 
     `jax.vmap(solve, in_axes=(None, 0))(mpc, x0s)` solves for many states and factors
@@ -410,8 +445,8 @@ def solve(
     """
     require_kind("mpc", mpc, MPC)
     mpc.require_sizes()
-    checked_aim(mpc, x0, reference, input_reference, previous_input)
+    aim = x0, reference, input_reference, previous_input, forecast
+    checked_aim(mpc, *aim)
     require_warm_start(warm_start)
     controller = Controller(mpc, solver)
-    aim = x0, reference, input_reference, previous_input
     return controller._plan_by(_plan_once, warm_start, *aim)

@@ -28,15 +28,17 @@ class Aim(NamedTuple):
     """Where one plan begins and what it tracks.
 
     x0 (n,). states and inputs: references (n,) or (N+1, n), and (m,) or (N, m); None for zero.
-    previous_input u_{−1} (m,), None for zero. Of nonlinear problems and their expansions: targets
-    of the tasks, (N+1, p) each, and slopes (N+1, n) and (N, m), the terms Σ slope_k·x_k +
-    Σ slope_k·u_k of the cost, None for none.
+    previous_input u_{−1} (m,), None for zero. forecast: what is known to be added to the next
+    states, (n,) or (N, n), None for zero; of condensed problems only. Of nonlinear problems and
+    their expansions: targets of the tasks, (N+1, p) each, and slopes (N+1, n) and (N, m), the terms
+    Σ slope_k·x_k + Σ slope_k·u_k of the cost, None for none.
     """
 
     x0: Any
     states: Any = None
     inputs: Any = None
     previous_input: Any = None
+    forecast: Any = None
     targets: tuple[Array, ...] = ()
     slopes: tuple[Array, Array] | None = None
 
@@ -47,6 +49,7 @@ def checked_aim(
     reference: Reals | None = None,
     input_reference: Reals | None = None,
     previous_input: Reals | None = None,
+    forecast: Reals | None = None,
     *,
     steps: int = 1,
     state_size: int | None = None,
@@ -69,6 +72,7 @@ def checked_aim(
         checked("reference", reference, shapes["reference"]),
         checked("input_reference", input_reference, shapes["input_reference"]),
         checked("previous_input", previous_input, [(mpc.system.m,)]),
+        checked("forecast", forecast, shapes["forecast"]),
     )
 
 
@@ -80,7 +84,9 @@ def reference_shapes(
     states: list[tuple[int, ...]] = []
     for k in widths or (mpc.system.n,):
         states += [(k,), (N + steps, k)]
-    return {"reference": states, "input_reference": [(m,), (N + steps - 1, m)]}
+    n, last = mpc.system.n, N + steps - 1
+    inputs, forecast = [(m,), (last, m)], [(n,), (last, n)]
+    return {"reference": states, "input_reference": inputs, "forecast": forecast}
 
 
 def checked_array(name: str, value: Any, shapes: Sequence[tuple[int, ...]]) -> Any:
