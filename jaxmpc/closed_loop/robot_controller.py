@@ -375,6 +375,9 @@ def _prepared(given: RobotController, solver: ADMM) -> dict[str, Any]:
     for name, there in (("tasks", len(given.tasks) > 0), ("sqp_steps", given.sqp_steps > 1)):
         if there and linearize != "trajectory":
             fail(name, f"given with linearize={linearize!r}", 'Give linearize="trajectory"')
+    if mpc.disturbance is not None and linearize != "set-point":
+        what = "given, and its rows are tightened for one linear model"
+        fail("mpc.disturbance", what, 'Give linearize="set-point", or leave it out')
     soft = soften(mpc, given.rho)
     if linearize == "set-point":
         return {"soft": arrays(soft), "fixed": Controller(soft, solver), "scale": None}

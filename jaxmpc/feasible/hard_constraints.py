@@ -6,7 +6,7 @@ First a `View`: which initial states a point stands for. Then `ExactData`, and w
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +16,9 @@ from jax import Array
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_finite, require_shape
 from jaxmpc.mpc.problem import MPC
-from jaxmpc.mpc.rows import Block
-from jaxmpc.mpc.rows import blocks as row_blocks
-from jaxmpc.pytrees import pytree, static
+from jaxmpc.mpc.rows import Block, given_blocks
+from jaxmpc.mpc.tightening import require_room, require_tightened, with_bounds
+from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, set_bounds
 from jaxmpc.sets.lp import power_of_two
 from jaxmpc.systems.system import host_matrices
@@ -94,17 +94,30 @@ def make_view(mpc: MPC, axes: Axes = None, fixed: Reals | None = None) -> View:
     return View(axes, others, None, lower[list(others)], upper[list(others)])
 
 
+@named_pytree
+class Sides(NamedTuple):
+    """Bounds of the rows of the stages (N, r) and of the last state (r_N,), see `ExactData`."""
+
+    lower: Any
+    upper: Any
+    lower_N: Any
+    upper_N: Any
+
+
 @pytree
 class ExactData:
     """The hard constraints of an MPC problem as float64 arrays: exact data for proofs.
 
     lower_k ≤ H x_k + D u_k ≤ upper_k for k < N: H (r, n), D (r, m), lower and upper (N, r), ±inf at
-    steps where a row does not hold. lower_N ≤ H_N x_N ≤ upper_N. P, level: terminal ellipsoid
-    x'Px ≤ level, None without; back (n, rows) leads from multipliers of its rows L'x to v.
-    u_lower, u_upper (m,): a box around the inputs; move_lower, move_upper (moves, m): the part of
-    it that limits on the states leave to each free move. left (N, n): 1 where errors of the
-    costates p_k, k = 1..N, are passed to the step before (side and reach are 0 there), else 0, with
-    |x_k| + side∘x_k ≤ reach on every feasible trajectory. side_0, reach_0 (d,): the same for every
+    steps where a row does not hold. lower_N ≤ H_N x_N ≤ upper_N. widest: the same four bounds no
+    narrower than they are exactly, for half-spaces, where the others are no wider, for plans: of a
+    robust problem they are sums that are rounded; else they are the same arrays. P, level: terminal
+    ellipsoid x'Px ≤ level, None without; back (n, rows) leads from multipliers of its rows L'x to
+    v. u_lower, u_upper (N, m): a box around the inputs; move_lower, move_upper (moves, m): the
+    part of it, at its widest, that limits on the states leave to each free move. left (N, n): 1
+    where errors of the costates p_k, k = 1..N, are passed to the step before (side and reach are 0
+    there), else 0, with |x_k| + side∘x_k ≤ reach on every feasible trajectory. side_0, reach_0
+    (d,): the same for every
     feasible θ, ∞ where nothing bounds it. equalities: how inputs keep equalities, None where there
     are none, or none that inputs can keep. moves: index of the free move that each input equals.
     """
@@ -119,6 +132,7 @@ class ExactData:
     H_N: np.ndarray
     lower_N: np.ndarray
     upper_N: np.ndarray
+    widest: "Sides"
     P: Any  # an array, or None
     level: Any
     back: Any
@@ -168,7 +182,8 @@ class Equalities:
         """
         (n, m), N = np.shape(p.B), p.horizon
         moves = np.equal.outer(np.array(p.moves), np.arange(max(p.moves) + 1)).astype(float)
-        free = np.tile(p.u_lower < p.u_upper, moves.shape[1])
+        first = np.unique(p.moves, return_index=True)[1]
+        free = np.ravel((p.u_lower < p.u_upper)[first])
         gain, off = np.zeros((n, free.size)), np.zeros((n, free.size))
         unit = 2.0**-52 * (n + m + 4)
         values, errors, at, at_N = [], [], p.lower == p.upper, p.lower_N == p.upper_N
@@ -189,7 +204,8 @@ class Equalities:
         if not len(E):
             return None
         # In units of the inputs' limits, which must not decide what is independent.
-        unit_u = np.tile(power_of_two(largest_magnitude(p.u_lower, p.u_upper)), moves.shape[1])
+        unit_u = np.ravel(power_of_two(largest_magnitude(p.u_lower, p.u_upper)))
+        unit_u = unit_u.reshape(N, m)[first].ravel()
         rows = np.linalg.norm(E * unit_u, axis=1)
         E, e = E / rows[:, None], e / rows[:, None]
         X = unit_u[:, None] * np.linalg.pinv(E * unit_u, rcond=1e-10)
@@ -228,16 +244,21 @@ def augmented_dynamics(mpc: MPC) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return A, B, c
 
 
-def hard_blocks(mpc: MPC) -> list[Block]:
+def hard_blocks(mpc: MPC, *, widest: bool = False) -> list[Block]:
     """Return the blocks of hard rows as float64 NumPy arrays, those of rates as rows of (x, u_{−1})
-    and u."""
+    and u. Of a robust problem their bounds are no wider than exactly, or no narrower (`widest`).
+
+    Raises ValueError for a policy that no sequence of inputs stands for, and where the disturbance
+    leaves nothing between two bounds."""
+    require_tightened(mpc, "a label by one sequence of inputs")
     with jax.enable_x64(True):
-        found = row_blocks(mpc, np.float64)
+        found = [b for b in given_blocks(mpc, np.float64) if b.linear is None]
+    if mpc.disturbance is not None:
+        found = with_bounds(mpc, found, widest=widest)
+        require_room(mpc, found)
     n, m, p = mpc.system.n, mpc.system.m, mpc.dimension
     hard = previous_inputs(mpc)
     for b in found:
-        if b.linear is not None:
-            continue
         H = np.zeros((b.size, p))
         D = np.zeros((b.size, m)) if b.D is None else np.asarray(b.D, np.float64)
         if b.rate:
@@ -271,9 +292,15 @@ def absorbed(mpc: MPC, block: Block) -> bool:
 
 
 def exact_data(
-    mpc: MPC, view: View, blocks: list[Block], extent: np.ndarray, size: np.ndarray | None = None
+    mpc: MPC,
+    view: View,
+    blocks: list[Block],
+    extent: np.ndarray,
+    size: np.ndarray | None = None,
+    widest: list[Block] | None = None,
 ) -> ExactData:
-    """Collect the exact data of a problem without soft rows; blocks: its `hard_blocks`.
+    """Collect the exact data of a problem without soft rows; blocks, widest (None: the same): its
+    `hard_blocks`.
 
     extent (2, d): lower and upper bounds of every feasible θ, on which no label depends; (d,): of
     |θ|. size (d,): typical size of θ (None: that of extent), which selects how rounding errors are
@@ -302,12 +329,33 @@ def exact_data(
     implied = input_size(A[:n, :n], B[:n], c[:n], x_size)
     same_move = [np.equal(mpc.moves, i) for i in range(max(mpc.moves) + 1)]
     implied = np.array([implied[same].min(axis=0) for same in same_move])
-    rows: list[Any] = [*staged_rows(mpc, blocks), *terminal_ball(mpc)]
-    inputs = u_lower, u_upper, np.maximum(u_lower, -implied), np.minimum(u_upper, implied)
+    widest = blocks if widest is None else widest
+    H, D, lower, upper, H_N, lower_N, upper_N = staged_rows(mpc, blocks)
+    _, _, *others = staged_rows(mpc, widest)
+    rows = H, D, lower, upper, H_N, lower_N, upper_N, Sides(*others[:2], *others[3:])
+    moves = list(mpc.moves)
+    each = [part[moves] for part in move_limits(mpc, blocks, (u_lower, u_upper))]
+    most = move_limits(mpc, widest, (u_lower, u_upper))
+    inputs = *each, np.maximum(most[0], -implied), np.minimum(most[1], implied)
     errors = left, sides, reach, side_0, reach_0
-    parts: tuple[Any, ...] = (A, B, c, *rows, *inputs, *errors, None, view, mpc.moves)
+    ball = terminal_ball(mpc)
+    parts: tuple[Any, ...] = (A, B, c, *rows, *ball, *inputs, *errors, None, view, mpc.moves)
     data = ExactData(*parts)
     return replace(data, equalities=Equalities.of(data))
+
+
+def move_limits(
+    mpc: MPC, blocks: list[Block], box: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return bounds (moves, m) of each free move: the box (m,) around the inputs, and where these
+    are limited by a box what its rows leave at all steps of the move."""
+    lower, upper = (np.tile(side, (max(mpc.moves) + 1, 1)) for side in box)
+    for b in blocks:
+        if absorbed(mpc, b) and np.ndim(b.lower) == 2:
+            for k, low, high in zip(b.steps, b.lower, b.upper, strict=True):
+                i = mpc.moves[k]
+                lower[i], upper[i] = np.maximum(lower[i], low), np.minimum(upper[i], high)
+    return lower, upper
 
 
 def start_sizes(view: View, size: np.ndarray) -> np.ndarray:
@@ -329,18 +377,19 @@ def staged_rows(mpc: MPC, blocks: list[Block]) -> list[np.ndarray]:
     rows = [b for b in blocks if not absorbed(mpc, b) and b.radius is None]
     staged = [b for b in rows if any(k < N for k in b.steps)]
     last = [b for b in rows if N in b.steps]
-    holds = [np.isin(np.arange(N), b.steps)[:, None] for b in staged]
-    lower = [np.where(at, b.lower, -np.inf) for at, b in zip(holds, staged, strict=True)]
-    upper = [np.where(at, b.upper, np.inf) for at, b in zip(holds, staged, strict=True)]
+    lower = [b.at_steps(b.lower, N + 1, -np.inf) for b in staged]
+    upper = [b.at_steps(b.upper, N + 1, np.inf) for b in staged]
+    lower_N = [b.at_steps(b.lower, N + 1, -np.inf)[N] for b in last]
+    upper_N = [b.at_steps(b.upper, N + 1, np.inf)[N] for b in last]
     none = np.zeros((0, p)), np.zeros((0, mpc.system.m)), np.zeros((N, 0)), np.zeros(0)
     return [
         np.concatenate([none[0], *(b.H for b in staged)]),
         np.concatenate([none[1], *(b.D for b in staged)]),
-        np.concatenate([none[2], *lower], axis=1),
-        np.concatenate([none[2], *upper], axis=1),
+        np.concatenate([none[2], *(side[:N] for side in lower)], axis=1),
+        np.concatenate([none[2], *(side[:N] for side in upper)], axis=1),
         np.concatenate([none[0], *(b.H for b in last)]),
-        np.concatenate([none[3], *(b.lower for b in last)]),
-        np.concatenate([none[3], *(b.upper for b in last)]),
+        np.concatenate([none[3], *lower_N]),
+        np.concatenate([none[3], *upper_N]),
     ]
 
 

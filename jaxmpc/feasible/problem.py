@@ -17,8 +17,10 @@ from jaxmpc.files import as_json
 from jaxmpc.mpc.condense import Condensed, condensed_in_float64
 from jaxmpc.mpc.problem import MPC, Outputs, as_tuple
 from jaxmpc.mpc.rows import Block
+from jaxmpc.mpc.tightening import feedback_gain, without_disturbance
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope, set_bounds
+from jaxmpc.sets.disturbances import disturbance_columns, with_vertices
 from jaxmpc.sets.geometry import binding_rows, implied_equalities, unit_rows
 from jaxmpc.sets.lp import FLAT, ROUNDING, scaling
 
@@ -76,6 +78,13 @@ class FeasibilityProblem:
         return hard_constraints.hard_blocks(self.mpc)
 
     @cached_property
+    def widest_blocks(self) -> list[Block]:
+        """Return them with bounds no narrower than exactly, of a robust problem; else the same."""
+        if self.mpc.disturbance is None:
+            return self.blocks
+        return hard_constraints.hard_blocks(self.mpc, widest=True)
+
+    @cached_property
     def rows(self) -> ConstraintRows:
         """Return the condensed rows in θ and an orthonormal basis."""
         return condensed_rows.constraint_rows(self.mpc, self.view, self.condensed, self.blocks)
@@ -117,21 +126,25 @@ class FeasibilityProblem:
         """
         extent, _ = self.programs.bounding_box
         extent = np.array([-region, region]) if extent is None else extent
-        return hard_constraints.exact_data(self.mpc, self.view, self.blocks, extent, size)
+        return hard_constraints.exact_data(
+            self.mpc, self.view, self.blocks, extent, size, self.widest_blocks
+        )
 
     def plain(self) -> dict[str, Any]:
         """Return the hard constraints as JSON data, from which stored labels can be verified.
 
         A, B, c of x⁺ = Ax + Bu + c over `horizon` steps; moves: index of the free move that each
         input equals. rows: lower ≤ Hx + Du ≤ upper at steps (None: no bound). ellipsoid: P and
-        level of x_N'Px_N ≤ level, or None. axes: the mapped states; others: the index of those
-        that are not, and their value or bounds.
+        level of x_N'Px_N ≤ level, or None. disturbance: of a robust problem, whose rows are those
+        before they are tightened, the matrix E, the gain K and the set W. axes: the mapped states;
+        others: the index of those that are not, and their value or bounds.
         """
         mpc, view, set_ = self.mpc, self.view, self.mpc.terminal_set
         A, B, c = hard_constraints.augmented_dynamics(mpc)
+        given = hard_constraints.hard_blocks(without_disturbance(mpc))
         rows = [
             {"steps": list(b.steps), "H": b.H, "D": b.D, "lower": b.lower, "upper": b.upper}
-            for b in self.blocks
+            for b in given
             if b.radius is None
         ]
         ellipsoid = {"P": set_.P, "level": set_.level} if isinstance(set_, Ellipsoid) else None
@@ -141,6 +154,8 @@ class FeasibilityProblem:
         elif view.others:
             others["value"] = np.asarray(view.fixed)[list(view.others)]
         plain = {"A": A, "B": B, "c": c, "horizon": mpc.horizon, "moves": list(mpc.moves)}
+        if mpc.disturbance is not None:
+            plain["disturbance"] = described_policy(mpc)
         plain |= {"rows": rows, "ellipsoid": ellipsoid, "axes": list(view.axes), "others": others}
         return as_json(plain)
 
@@ -152,6 +167,22 @@ class FeasibilityProblem:
         found = np.zeros(len(self.rows.lower) + 1)
         found[self.rows.index] = np.concatenate([np.ravel(part) for part in rounding])
         return np.clip(found[:-1] * self.rows.weight, self.rows.size, 1e8 * self.rows.size)
+
+
+def described_policy(mpc: MPC) -> dict[str, Any]:
+    """Return the disturbances and the policy of a robust problem, as `plain` has them: E (n, p),
+    gain (m, n), and W as center and generators, or as points."""
+    W: Any = mpc.disturbance
+    if isinstance(W, Box):
+        lower, upper = np.asarray(W.lower, float), np.asarray(W.upper, float)
+        set_ = {"lower": lower, "upper": upper}
+    elif hasattr(W, "generators"):
+        set_ = {"center": np.asarray(W.center, float), "generators": np.asarray(W.generators)}
+    else:
+        set_ = {"points": np.asarray(with_vertices(W).points, float)}
+    E = disturbance_columns(mpc.disturbance_matrix, mpc.system.n)
+    gain = np.asarray(feedback_gain(mpc), np.float64)
+    return {"policy": mpc.policy, "E": E, "gain": gain, "set": set_}
 
 
 def with_previous_inputs(mpc: MPC, c: Condensed) -> Condensed:

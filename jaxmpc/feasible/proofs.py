@@ -206,7 +206,7 @@ def cut(p: ExactData, y_states: Array, y_N: Array, y_ball: Array) -> Cut:
         found = jnp.maximum(worth(value + unit * moved), worth(value - unit * moved))
         return jnp.sum(found), jnp.sum(jnp.abs(found))
 
-    y_N, total, size = support(y_N * scale, p.lower_N, p.upper_N)
+    y_N, total, size = support(y_N * scale, p.widest.lower_N, p.widest.upper_N)
     # Errors are counted in units: p_k is off by no more than unit·moved.
     p_N, moved = jnp.asarray(p.H_N).T @ y_N, jnp.abs(p.H_N).T @ jnp.abs(y_N)
     if p.P is not None:
@@ -232,7 +232,8 @@ def cut(p: ExactData, y_states: Array, y_N: Array, y_ball: Array) -> Cut:
         return (A.T @ p_next + H.T @ y, moved, total, size), (slope, slope_size)
 
     errors = map(jnp.asarray, (p.left, p.side, p.reach))
-    steps = (y_states * scale, jnp.asarray(p.lower), jnp.asarray(p.upper), *errors)
+    sides = jnp.asarray(p.widest.lower), jnp.asarray(p.widest.upper)
+    steps = (y_states * scale, *sides, *errors)
     start = (p_N, moved, total, size)
     (p_0, moved, total, size), inputs = jax.lax.scan(back, start, steps, reverse=True)
     same = np.equal.outer(np.arange(max(p.moves) + 1), np.array(p.moves)).astype(float)

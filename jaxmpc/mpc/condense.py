@@ -24,6 +24,7 @@ from jaxmpc.arrays import host_array
 from jaxmpc.checks import concrete, require_memory
 from jaxmpc.mpc.problem import MPC, Switch, Weights, dynamics_of, weights_of
 from jaxmpc.mpc.rows import Layout, blocks, bounds_of, layout_of, split, stacked
+from jaxmpc.mpc.tightening import require_room, with_gain
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes, varying
 from jaxmpc.qp.linalg import arrays, floating_dtype, matmul, solve
@@ -169,7 +170,15 @@ def condense(mpc: MPC) -> Condensed:
     sizes = mpc.horizon, mpc.system.n, mpc.system.m, mpc.control_horizon, a_step
     needed = condensed_bytes(*sizes) * jax.dtypes.canonicalize_dtype(float).itemsize / 8
     require_memory("horizon", needed, "Give fewer steps, or use jm.mpc.solve_stagewise")
-    return _condense(arrays(replace(mpc, prestabilise=prestabilising_gain(mpc))))
+    mpc = filled_in(mpc)
+    if mpc.disturbance is not None and concrete(mpc):
+        require_room(mpc, blocks(mpc, float))
+    return _condense(arrays(mpc))
+
+
+def filled_in(mpc: MPC) -> MPC:
+    """Return the problem with its gains: the prestabilising one, and that of its policy."""
+    return with_gain(replace(mpc, prestabilise=prestabilising_gain(mpc)))
 
 
 def condensed_bytes(
@@ -183,8 +192,8 @@ def condensed_bytes(
 
 
 def in_float64(mpc: MPC) -> MPC:
-    """The problem as host arrays in float64, with the prestabilising gain filled in."""
-    return jax.tree.map(np.float64, replace(mpc, prestabilise=prestabilising_gain(mpc)))
+    """The problem as host arrays in float64, with its gains filled in."""
+    return jax.tree.map(np.float64, filled_in(mpc))
 
 
 @compiled_lightly(0)

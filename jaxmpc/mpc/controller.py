@@ -45,6 +45,7 @@ from jaxmpc.mpc.plan import (
 )
 from jaxmpc.mpc.problem import MPC, dynamics_of
 from jaxmpc.mpc.rows import apply, blocks, dynamics_terms, split
+from jaxmpc.mpc.tightening import with_gain
 from jaxmpc.pytrees import prepared_pytree
 from jaxmpc.qp.admm import ADMM, DEFAULT, Factor, factorise
 from jaxmpc.qp.dual import has_dual_steps
@@ -90,7 +91,7 @@ class Controller:
         self.mpc.validate()
         require_kind("solver", self.solver, ADMM)
         self.solver.validate()
-        mpc, finite = harmless(self.mpc)
+        mpc, finite = harmless(with_gain(self.mpc))
         condensed = condense(mpc)
         # The factorization reads from P what is wrong with the data.
         condensed = replace(condensed, P=jnp.where(finite, condensed.P, jnp.nan))

@@ -8,7 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxmpc.arrays import Reals, as_array, as_weight, dimensions, host_array, store_floats
+from jaxmpc.arrays import (
+    Reals,
+    as_array,
+    as_column,
+    as_weight,
+    dimensions,
+    host_array,
+    store_floats,
+)
 from jaxmpc.checks import (
     concrete,
     fail,
@@ -21,11 +29,14 @@ from jaxmpc.checks import (
 from jaxmpc.pytrees import named_pytree, pytree, static, static_pytree
 from jaxmpc.qp.linalg import matmul, symmetric
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope
+from jaxmpc.sets.disturbances import require_disturbance
 from jaxmpc.sets.limits import output_limits
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
 # Curvature of the cost, relative to its terms, below which a direction of the inputs costs nothing.
 FLAT = 1e-12
+# How inputs answer to disturbances: see `MPC`.
+POLICIES = ("tightened",)
 
 
 class TwoSided:
@@ -155,6 +166,14 @@ class MPC:
     has an eigenvalue outside the unit circle. It changes rounding, not the problem; with
     control_horizon there is none. Inside `jit` with A as an argument give K itself: None and True
     read values.
+
+    disturbance W: the plant is x⁺ = A x + B u + c + E w, and all rows, the terminal set and soft
+    rows too, are kept for every w_k ∈ W: a bounded Box, Polytope or zonotope that holds the origin.
+    disturbance_matrix E (n, p), None for the identity. policy: how later inputs answer to
+    disturbances. "tightened": u_k = v_k + K (x_k − z_k) with z the nominal states of the plan v and
+    K = gain (m, n), u = Kx; None: the LQR gain of Q and R. Plans, costs and multipliers are those
+    of z and v, whose rows are tightened by what the disturbance can do (`tightening.py`). Labels of
+    feasible sets are claims about this policy.
     """
 
     system: LinearSystem
@@ -174,10 +193,17 @@ class MPC:
     input_rate_weight: Any = None
     input_rate_limit: Any = None
     stage_weights: Any = None
+    disturbance: Any = None
+    disturbance_matrix: Any = None
+    policy: str = static(default="tightened")
+    gain: Any = None
 
     def __post_init__(self) -> None:
         weights = ("Q", "R", "terminal_cost", "input_rate_weight", "stage_weights")
         store_floats(self, *weights, "prestabilise", "input_rate_limit")
+        store_floats(self, "disturbance_matrix", "gain")
+        if dimensions(self.disturbance_matrix) == 1:
+            object.__setattr__(self, "disturbance_matrix", as_column(self.disturbance_matrix))
         # JAX rebuilds this object with placeholders, and `in_axes` are one without arrays.
         if isinstance(self.prestabilise, bool | np.bool_):
             object.__setattr__(self, "prestabilise", Switch(bool(self.prestabilise)))
@@ -190,9 +216,16 @@ class MPC:
         n, m = system.n, system.m
         for name, size in (("Q", n), ("R", m), ("terminal_cost", n)):
             object.__setattr__(self, name, as_weight(getattr(self, name), size))
-        for name, size in (("states", n), ("inputs", m), ("terminal_set", n)):
+        sets = {"states": n, "inputs": m, "terminal_set": n, "disturbance": self.disturbances}
+        for name, size in sets.items():
             if isinstance(getattr(self, name), Box):
                 object.__setattr__(self, name, getattr(self, name).spread(size))
+
+    @property
+    def disturbances(self) -> int:
+        """Number p of coordinates of the disturbance: the columns of E, n without it."""
+        E = self.disturbance_matrix
+        return self.system.n if E is None else (np.shape(as_array(E)) or (1,))[-1]
 
     @property
     def rate_limited(self) -> bool:
@@ -279,6 +312,7 @@ class MPC:
         for i, outputs in enumerate(as_tuple("outputs", self.outputs, Outputs)):
             self._validate_rows(f"outputs[{i}]", outputs)
         self._validate_rates()
+        self._validate_disturbance()
         self.require_unique_inputs(first=1)
 
     def require_sizes(self) -> None:
@@ -360,6 +394,29 @@ class MPC:
                 fail("input_rate_limit", f"shape {np.shape(limit)}", f"Give ({m},) or a Box")
             if concrete(limit) and not np.all(np.asarray(limit, float) >= 0):
                 fail("input_rate_limit", f"{limit}", "|Δu| ≤ limit needs limit ≥ 0 (inf: none)")
+
+    def _validate_disturbance(self) -> None:
+        n, m, W = self.system.n, self.system.m, self.disturbance
+        if self.policy not in POLICIES:
+            fail("policy", f"{self.policy!r}", f"Give one of {', '.join(map(repr, POLICIES))}")
+        if W is None:
+            for name in ("disturbance_matrix", "gain"):
+                if getattr(self, name) is not None:
+                    fail(name, "given without a disturbance", "Give disturbance=jm.Box(…) too")
+            return
+        if self.disturbance_matrix is not None:
+            p = self.disturbances
+            require_real("disturbance_matrix", self.disturbance_matrix)
+            require_shape("disturbance_matrix", self.disturbance_matrix, (n, p), "One row a state")
+            require_finite("disturbance_matrix", self.disturbance_matrix)
+        require_disturbance("disturbance", W, self.disturbances)
+        if self.gain is not None:
+            require_real("gain", self.gain)
+            require_shape("gain", self.gain, (m, n), "A gain K with u = v + K (x − z)")
+            require_finite("gain", self.gain)
+        if isinstance(self.terminal_set, Ellipsoid):
+            cure = "Give a Polytope, such as maximal_invariant_set(..., disturbance=...)"
+            fail("terminal_set", "is an Ellipsoid, which has no rows to tighten", cure)
 
     def require_unique_inputs(self, first: int = 0) -> None:
         """Raise ValueError where R is not definite and the other weights do not make up for it.

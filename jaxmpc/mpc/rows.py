@@ -20,6 +20,7 @@ from jax.typing import DTypeLike
 
 from jaxmpc.checks import require_kind
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, output_stages
+from jaxmpc.mpc.tightening import tightened
 from jaxmpc.pytrees import pytree, record, static
 from jaxmpc.qp.linalg import cholesky, matmul
 from jaxmpc.qp.problem import Bounds
@@ -107,7 +108,8 @@ class Rows:
 
 @record
 class Block(Rows):
-    """lower ≤ H x_k + D v_k ≤ upper, lower and upper (r,).
+    """lower ≤ H x_k + D v_k ≤ upper, lower and upper (r,), or (steps, r) where they differ from
+    step to step.
 
     names, units: of the rows. rate: v_k is Δu_k. linear, quadratic (r,): weights c and k of the
     penalty c e + ½ k e² of a violation e where the rows are soft (k is twice `Soft.quadratic`),
@@ -125,11 +127,23 @@ class Block(Rows):
 
     def bounds(self) -> Bounds:
         """What is asked of the rows of all steps (steps·r,), without what follows from x_0."""
-        tiled = lambda v: None if v is None else jnp.tile(v, len(self.steps))
+
+        def tiled(v: Any) -> Any:
+            if v is None or np.ndim(v) == 2:
+                return None if v is None else v.ravel()
+            return jnp.tile(v, len(self.steps))
+
         l, u, linear, quadratic = map(tiled, (self.lower, self.upper, self.linear, self.quadratic))
         if self.radius is None:
             return Bounds(l, u, linear, quadratic)
         return Bounds(l, u, linear, quadratic, self.radius[None], (self.size,))
+
+    def at_steps(self, side: np.ndarray, length: int, free: float) -> np.ndarray:
+        """Return one of the two bounds (length, r), `free` at steps where the rows do not hold, of
+        a block of NumPy."""
+        found = np.full((length, self.size), free)
+        found[np.array(self.steps, int)] = side
+        return found
 
 
 @dataclass(frozen=True)
@@ -149,7 +163,14 @@ class Row:
 
 
 def blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
-    """Return the blocks of a problem, arrays in `dtype`. Works inside jit, vmap and grad."""
+    """Return the blocks of a problem, arrays in `dtype`; of a robust one those of the nominal
+    problem it stands for (`tightening.py`). Works inside jit, vmap and grad."""
+    found = given_blocks(mpc, dtype)
+    return found if mpc.disturbance is None else tightened(mpc, found, dtype)
+
+
+def given_blocks(mpc: MPC, dtype: DTypeLike) -> list[Block]:
+    """Return the blocks of a problem with their bounds as they are given."""
     system, N, n, m = mpc.system, mpc.horizon, mpc.system.n, mpc.system.m
     found: list[Block] = []
     state_names = system.state_names or tuple(f"x{i + 1}" for i in range(n))

@@ -94,6 +94,10 @@ def recursive_feasibility(
     lie on limits and residuals decide on which side; then it is labelled, and counts as lost when
     it is proved infeasible.
 
+    Of a robust problem the claims are about every disturbance, x⁺ = A x + B u_0(x) + c + E w: the
+    theorem, linear programs and regions prove them or refute the strong one; what is left is open,
+    and no samples are followed.
+
     Raises ValueError for ill-posed problems and wrong arguments before anything compiles, and
     where x0s is None and X_N is empty, flat or unbounded.
 
@@ -118,6 +122,9 @@ def examine(
     problem = FeasibilityProblem.of(mpc)
     p = problem.dimension
     steps, max_regions = whole("steps", steps, 1), whole("max_regions", max_regions, 0)
+    if x0s is not None and mpc.disturbance is not None:
+        cure = "Leave them out, and simulate loops with jm.simulate(..., disturbance=...)"
+        fail("x0s", "given for a robust problem, of which no samples are followed", cure)
     given = np.zeros((0, p)) if x0s is None else host_array("x0s", x0s)
     if x0s is not None and (given.ndim != 2 or given.shape[1] != p or not len(given)):
         fail("x0s", f"shape {given.shape}", f"Give at least one state, (B, {p})")
@@ -134,6 +141,8 @@ def examine(
     loops = SampledLoops.undecided(problem, given, steps)
     if x0s is None and claims.law.holds:
         return _report(claims, None, lost, loops, budget)
+    if mpc.disturbance is not None:
+        return _report(_robust(claims, verdict), None, lost, loops, budget)
     if not budget.affords(PROOFS):
         budget.say("the time is over before a counterexample is proved")
         return _report(_open(claims, verdict, None), None, lost, loops, budget)
@@ -223,6 +232,15 @@ def _open(
     what = f"{lost:,} lost after one step, but no" if lost else "no"
     reason = f"{what} counterexample among {tried}; no proof: {reason}"
     return replace(claims, law=Claim(None, reason))
+
+
+def _robust(claims: Claims, verdict: RegionVerdict) -> Claims:
+    """Return the claims under a disturbance: what no proof settles is open, for no counterexample
+    is certified."""
+    if verdict.claim.holds is not False:
+        return claims
+    reason = f"{verdict.claim.reason} under a disturbance, which is not certified"
+    return replace(claims, law=Claim(None, reason, verdict.claim.state))
 
 
 def _report(

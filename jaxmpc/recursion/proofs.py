@@ -17,8 +17,10 @@ from jaxmpc.feasible.plan_polytope import (
 from jaxmpc.feasible.polytope_growth import backward, is_standard_form
 from jaxmpc.feasible.problem import FeasibilityProblem
 from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.tightening import feedback_gain
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Polytope, set_bounds
+from jaxmpc.sets.disturbances import disturbance_set, supports
 from jaxmpc.sets.terminal_hypotheses import verify_terminal
 from jaxmpc.systems.system import host_matrices
 
@@ -82,6 +84,7 @@ def settle_claims(mpc: MPC, problem: FeasibilityProblem, deadline: float = np.in
         sets = backward(replace(mpc, soft=(), input_rate_weight=None), deadline)
         before, body, after = (None, sets, None) if isinstance(sets, str) else sets
     found, why = (None, body) if isinstance(body, str) else (body, "")
+    disturbed = mpc.disturbance is not None
     volume = np.nan
     if found is not None and len(found.vertices):
         volume = found.polytope.volume()
@@ -97,7 +100,9 @@ def settle_claims(mpc: MPC, problem: FeasibilityProblem, deadline: float = np.in
         follows, lost = Claim(True, "follows from strong"), 0 * volume
         return Claims(mpc, problem, found, why, strong, follows, follows, volume, lost, none)
     weak, lost, stuck = Claim(None, why), np.nan, none
-    if found is not None and before is not None and after is not None:
+    if disturbed:
+        weak = Claim(None, "under a disturbance the weak claim is not examined")
+    elif found is not None and before is not None and after is not None:
         weak, stuck = _longer(before, found, after, deadline)
     elif found is not None:
         weak, lost, stuck = _some_input(plans, found, deadline)
@@ -116,8 +121,9 @@ def _every_input(
     tops = [plans.largest_next(normal) for normal in body.normals if time.monotonic() < deadline]
     if len(tops) < len(body.normals):
         return Claim(None, LATE), np.zeros((0, plans.p))
-    violation = (np.array([top[1] for top in tops]) - body.offsets) / body.depths
-    beyond = (np.array([top[0] for top in tops]) - body.offsets) / body.depths
+    room = body.offsets - pushed(mpc, body)
+    violation = (np.array([top[1] for top in tops]) - room) / body.depths
+    beyond = (np.array([top[0] for top in tops]) - room) / body.depths
     i, p = int(np.argmax(beyond)), plans.p
     outside = np.flatnonzero(beyond > CLEAR)
     points = [v for _, _, v in tops if v is not None]
@@ -129,16 +135,24 @@ def _every_input(
         reason = f"an LP is within {CLEAR:g} of the size of X_N, {violation.max():.1e}"
         return Claim(None, reason), np.zeros((0, p))
     where, after = points[i][:p], plans.M @ points[i] + plans.t
+    by = "" if mpc.disturbance is None else ", and a disturbance from there"
     reason = (
-        f"from x = {in_words(where)} a feasible first input leads to {in_words(after)}, "
+        f"from x = {in_words(where)} a feasible first input leads to {in_words(after)}{by}, "
         f"{beyond[i] * body.depths[i]:.6g} beyond a facet of X_N"
     )
     return Claim(False, reason, where), np.array(points)[outside, :p]
 
 
+def pushed(mpc: MPC, body: CenteredPolytope) -> np.ndarray:
+    """Return how far a disturbance can push a state across each facet (K,), zero without one."""
+    n = mpc.system.n
+    W = disturbance_set(mpc.disturbance, n, mpc.disturbance_matrix)
+    return supports(W, body.normals[:, :n])
+
+
 def _set_before(mpc: MPC, body: CenteredPolytope) -> str:
     """Return a text saying that one step less gives the same set, empty where it does not."""
-    if mpc.horizon < 2 or not is_standard_form(mpc):
+    if mpc.horizon < 2 or not is_standard_form(mpc) or mpc.disturbance is not None:
         return ""
     shorter = FeasibilityProblem.of(replace(mpc, horizon=mpc.horizon - 1)).plan_polytope
     ends = [shorter.support(normal) for normal in body.normals]
@@ -215,25 +229,32 @@ def _by_theorem(mpc: MPC) -> Claim:
     """Settle the strong claim by Theorem 1: a plan shifted by one step and ended inside the
     terminal set is a plan.
 
-    It covers limits on states and inputs alone, at the usual steps, and inputs free at each step.
-    Without a terminal set, X takes its place at horizon N − 1. Convexity and compactness, which
-    the theorem asks for, are used nowhere in this argument.
+    Under disturbances the terminal set must be invariant under the gain of the policy for all of
+    them (Chisci, Rossiter & Zappa 2001). It covers limits on states and inputs alone, at the usual
+    steps, and inputs free at each step. Without a terminal set, X takes its place at horizon N − 1.
+    Convexity and compactness, which the theorem asks for, are used nowhere in this argument.
     """
     if not is_standard_form(mpc) or (mpc.terminal_set is None and mpc.horizon == 1):
         return Claim(None, "Theorem 1 does not cover these limits")
     last = mpc.states if mpc.terminal_set is None else mpc.terminal_set
     if not np.isfinite(set_bounds(last, mpc.system.n)).all():
         return Claim(None, "Theorem 1 is checked for bounded sets alone")
+    K, disturbed = None, mpc.disturbance is not None
     try:
-        report = verify_terminal(
-            mpc.system, mpc.Q, mpc.R, mpc.terminal_cost, mpc.terminal_set, mpc.states, mpc.inputs
-        )
+        K = feedback_gain(mpc) if disturbed else None
+        costs, sets = (mpc.Q, mpc.R, mpc.terminal_cost), (mpc.terminal_set, mpc.states, mpc.inputs)
+        against = mpc.disturbance, mpc.disturbance_matrix
+        report = verify_terminal(mpc.system, *costs, *sets, K, *against)
     except ValueError as error:  # such as a set too long for its width
         return Claim(None, f"Theorem 1 is not checked ({error})")
     needed = [report["terminal set within states"], report["control invariance"]]
+    if disturbed:  # the plan shifted by one step ends with K, whose answer to w it contains
+        needed[1:] = [report["invariance under K"], report["inputs of K admissible"]]
     if all(check.holds for check in needed):
         what = "the terminal set" if mpc.terminal_set is not None else "the set of state limits"
         words = f"{what} is within the limits and control invariant"
+        if disturbed:
+            words = f"{what} is within the limits, and the gain keeps it for all disturbances"
         return Claim(True, f"Theorem 1: {words}. {needed[1].sentence}")
     missing = next(check for check in needed if not check.holds)
     return Claim(None, f"Theorem 1 does not apply: {missing.name}")
@@ -272,15 +293,17 @@ def settle_by_regions(claims: Claims, max_regions: int, deadline: float = np.inf
         return RegionVerdict.none(claims.problem.dimension, f"no critical regions ({error})")
     A, B, c = host_matrices(mpc.system)
     violation, parts, lost = [-np.inf], [none], 0.0
+    room = body.offsets - pushed(mpc, body)
     for region in found.regions:
         E, e = A + B @ region.K, B @ region.k + c
-        beyond = body.beyond(region.vertices @ E.T + e)
+        after = (region.vertices @ E.T + e) @ body.normals.T
+        beyond = np.max((after - room) / body.depths, axis=1)
         violation.extend(beyond)
         parts.append(region.vertices)
         if found.complete and beyond.max() > CLEAR:
             H, h = np.asarray(region.polytope.H), np.asarray(region.polytope.h)
             stays = Polytope(
-                np.vstack([H, body.normals @ E]), np.append(h, body.offsets - body.normals @ e)
+                np.vstack([H, body.normals @ E]), np.append(h, room - body.normals @ e)
             )
             lost += region.volume - _volume(stays)
     values, states = np.array(violation[1:]), np.concatenate(parts)

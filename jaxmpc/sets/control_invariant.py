@@ -13,13 +13,15 @@ import numpy as np
 import scipy
 from scipy.spatial import KDTree
 
+from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.sets.convex_sets import Box, Polytope, as_polytope
+from jaxmpc.sets.convex_sets import Box, ConvexSet, Polytope, as_polytope
+from jaxmpc.sets.disturbances import supports
 from jaxmpc.sets.geometry import factors
 from jaxmpc.sets.invariant import maximal_invariant_set
 from jaxmpc.sets.lp import FLAT, ROUNDING, Program, extent, largest_margin, scaling
-from jaxmpc.sets.predecessors import OneStep, one_step, supports, tidy
+from jaxmpc.sets.predecessors import OneStep, one_step, tidy
 from jaxmpc.systems.riccati import lqr
 from jaxmpc.systems.system import LinearSystem
 
@@ -52,20 +54,22 @@ def maximal_control_invariant_set(
     states: Box | Polytope,
     inputs: Box | Polytope | None,
     *,
-    disturbance: Box | Polytope | None = None,
+    disturbance: ConvexSet | None = None,
+    disturbance_matrix: Reals | None = None,
     max_iterations: int = 100,
     tolerance: float = 1e-9,
 ) -> ControlInvariantSet:
     """Return C_inf, the states from which some inputs keep all constraints for ever.
 
     C_inf is the largest set C within `states` such that for every x in C there is a u in
-    `inputs` with A x + B u + c + w in C for all w in `disturbance`.
+    `inputs` with A x + B u + c + E w in C for all w in `disturbance`.
 
     Arguments:
         system: n states, m inputs; A may be singular, c may be anything.
         states: bounded set in R^n with volume.
         inputs: set in R^m, or None for all of R^m.
-        disturbance: bounded set in R^n that holds the origin, or None for w = 0.
+        disturbance: bounded set in R^p that holds the origin, or None for w = 0.
+        disturbance_matrix: E (n, p), None for the identity.
         max_iterations: largest k of the recursion C_0 = states, C_{k+1} = Pre(C_k) & C_k.
         tolerance: gap below which an inner and an outer set count as one.
 
@@ -98,7 +102,7 @@ def maximal_control_invariant_set(
         fail("max_iterations", f"{max_iterations!r} is no positive integer", "Give one")
     if not 0 < tolerance < 1:
         fail("tolerance", f"{tolerance!r} is not between 0 and 1", "Give a relative gap")
-    step = one_step(system, inputs, disturbance)
+    step = one_step(system, inputs, disturbance, disturbance_matrix)
     X = as_polytope("states", states, step.n)
     if not X.frame("states").bounded:
         fail("states", "is unbounded", "Bound every coordinate")

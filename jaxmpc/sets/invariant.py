@@ -17,9 +17,9 @@ from jaxmpc.checks import (
 )
 from jaxmpc.pytrees import pytree, static
 from jaxmpc.qp.linalg import arrays, cholesky, eigh, floating_dtype, matmul, solve_triangular
-from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope, as_polytope
+from jaxmpc.sets.convex_sets import Box, ConvexSet, Ellipsoid, Polytope, as_polytope
+from jaxmpc.sets.disturbances import disturbance_set, largest_norm, supports
 from jaxmpc.sets.lp import ROUNDING, Program, extent
-from jaxmpc.sets.predecessors import disturbance_set, largest_norm, supports
 from jaxmpc.systems.riccati import LQR
 from jaxmpc.systems.system import LinearSystem
 
@@ -58,25 +58,27 @@ def maximal_invariant_set(
     states: Box | Polytope,
     inputs: Box | Polytope | None,
     *,
-    disturbance: Box | Polytope | None = None,
+    disturbance: ConvexSet | None = None,
+    disturbance_matrix: Reals | None = None,
     max_iterations: int = 500,
 ) -> InvariantSet:
     """Return O_inf, the states from which u = K x keeps all constraints for ever.
 
     O_inf = {x : x_k in states and K x_k in inputs for all k >= 0 and all w_k in disturbance},
-    x_{k+1} = (A + BK) x_k + w_k.
+    x_{k+1} = (A + BK) x_k + E w_k.
 
     Arguments:
         system: n states, m inputs; c must be None or zero.
         K: (m, n), with the sign of u = K x (as `lqr` returns it).
         states: set in R^n with the origin in its interior; it need not be bounded.
         inputs: set in R^m with the origin in its interior, or None.
-        disturbance: bounded set in R^n that holds the origin, or None for w = 0.
+        disturbance: bounded set W in R^p that holds the origin, or None for w = 0.
+        disturbance_matrix: E (n, p), None for the identity.
         max_iterations: how far ahead to look at most.
 
     Returns O_inf with irredundant rows of norm 1, and its index of determination.
 
-    With the constraints written as F x <= 1 and W the disturbance, O_t = {x : F_i (A+BK)^j x <=
+    With the constraints written as F x <= 1 and W for E W, O_t = {x : F_i (A+BK)^j x <=
     b_ij, j = 0..t}, where b_i0 = 1 and b_i,j+1 = b_ij - max {F_i (A+BK)^j w : w in W}; O_inf = O_t
     as soon as max {F_i (A+BK)^(t+1) x : x in O_t} <= b_i,t+1 for every i. An upper bound of the
     maximum is checked, made from the LP's multipliers and valid for any LP error; it may exceed the
@@ -95,7 +97,7 @@ def maximal_invariant_set(
         as_polytope("states", states)
     closed, F = _closed_loop(system, K, states, inputs)
     n = system.n
-    W = disturbance_set(disturbance, n)
+    W = disturbance_set(disturbance, n, disturbance_matrix)
     radius = np.abs(np.linalg.eigvals(closed)).max()
     if not radius < 1:
         cure = "Use a stabilizing K with u = Kx (python-control's K has the other sign)"
@@ -212,12 +214,14 @@ def named_terminal_set(
     law: LQR | None,
     states: Box | Polytope | None,
     inputs: Box | Polytope | None,
+    disturbance: ConvexSet | None = None,
+    disturbance_matrix: Reals | None = None,
 ) -> Box | Polytope | Ellipsoid | None:
     """Return the terminal set of this name for x⁺ = A x + B u within the limits.
 
-    "none": None. "box": the state limits. "invariant": the maximal invariant set of the LQR `law`.
-    "ellipsoid": the largest level set of its cost inside the limits. Only the last two need the
-    law.
+    "none": None. "box": the state limits. "invariant": the maximal invariant set of `law`, for all
+    disturbances where there are some. "ellipsoid": the largest level set of its cost inside the
+    limits. Only the last two need the law.
 
     Raises ValueError for another name, for the last two without any limit, and as
     `maximal_invariant_set` and `invariant_ellipsoid` do.
@@ -234,7 +238,14 @@ def named_terminal_set(
     if name == "ellipsoid":
         return invariant_ellipsoid(system, law.K, law.P, states, inputs)
     free = Box(np.full(system.n, -np.inf), np.full(system.n, np.inf))
-    return maximal_invariant_set(system, law.K, free if states is None else states, inputs)
+    return maximal_invariant_set(
+        system,
+        law.K,
+        free if states is None else states,
+        inputs,
+        disturbance=disturbance,
+        disturbance_matrix=disturbance_matrix,
+    )
 
 
 def _traced_ellipsoid(

@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from jaxmpc.arrays import host_array
-from jaxmpc.checks import fail, require_kind
+from jaxmpc.arrays import Reals
+from jaxmpc.checks import require_kind
 from jaxmpc.pytrees import record
-from jaxmpc.sets.convex_sets import Box, Polytope, as_polytope
+from jaxmpc.sets.convex_sets import Box, ConvexSet, Polytope, as_polytope
+from jaxmpc.sets.disturbances import disturbance_set
 from jaxmpc.sets.geometry import Flat, affine_hull, irredundant_rows
 from jaxmpc.sets.lp import FLAT, ROUNDING, extent
 from jaxmpc.systems.system import LinearSystem, host_matrices
@@ -18,11 +19,12 @@ def predecessor(
     target: Box | Polytope,
     states: Box | Polytope | None,
     inputs: Box | Polytope | None,
-    disturbance: Box | Polytope | None = None,
+    disturbance: ConvexSet | None = None,
+    disturbance_matrix: Reals | None = None,
 ) -> Polytope:
     """Return the states that some input takes into a target within one step for every w.
 
-    Pre = {x in states : there is u in inputs with A x + B u + c + w in target for all w in
+    Pre = {x in states : there is u in inputs with A x + B u + c + E w in target for all w in
     disturbance}, the one-step controllable set.
 
     Arguments:
@@ -31,8 +33,9 @@ def predecessor(
         states: set in R^n, or None for all of R^n.
         inputs: set in R^m, or None for all of R^m. It may be flat (an input that is off, two that
             are equal).
-        disturbance: bounded set in R^n that holds the origin, or None for w = 0. If it leaves
+        disturbance: bounded set in R^p that holds the origin, or None for w = 0. If it leaves
             of the target a flat set only, that is enlarged by 4e-9 of its size.
+        disturbance_matrix: E (n, p), None for the identity.
 
     Returns irredundant rows of norm 1; rows of a flat set are not reduced. An empty set comes
     as the row 0'x <= -1 (`is_empty()` is True), all of R^n as 0'x <= 1.
@@ -46,14 +49,14 @@ def predecessor(
 
     Source: Kerrigan 2000, thesis, Cambridge, section 2.3.
     """
-    step = one_step(system, inputs, disturbance)
+    step = one_step(system, inputs, disturbance, disturbance_matrix)
     X = None if states is None else as_polytope("states", states, step.n)
     return step.back(as_polytope("target", target, step.n), X)
 
 
 @record
 class OneStep:
-    """x+ = A x + B u + c + w with u in U, w in W (None: w = 0).
+    """x+ = A x + B u + c + w with u in U, w in W (None: w = 0), which is E W of a given E.
 
     U is {u : u = basis v + shift, v in V}, with V None if nothing bounds v; where V is a
     bounded box, `ends` has (lower, upper) of each v, else it is None.
@@ -65,7 +68,7 @@ class OneStep:
     V: Polytope | None
     basis: np.ndarray
     shift: np.ndarray
-    W: Box | Polytope | None
+    W: ConvexSet | None
     ends: np.ndarray | None
 
     @property
@@ -99,7 +102,7 @@ class OneStep:
         return tidy(before if states is None else states.intersect(before))
 
     @staticmethod
-    def _shrunk(target: Polytope, W: Box | Polytope) -> Polytope:
+    def _shrunk(target: Polytope, W: ConvexSet) -> Polytope:
         """Return the target less W, with volume unless empty: an elimination needs it."""
         T = Polytope(target.H, target.h).pontryagin_difference(W)
         try:
@@ -114,9 +117,12 @@ class OneStep:
 
 
 def one_step(
-    system: LinearSystem, inputs: Box | Polytope | None, disturbance: Box | Polytope | None
+    system: LinearSystem,
+    inputs: Box | Polytope | None,
+    disturbance: ConvexSet | None,
+    disturbance_matrix: Reals | None = None,
 ) -> OneStep:
-    """Return the data of x⁺ = A x + B u + c + w, checked, with what equalities fix of the inputs
+    """Return the data of x⁺ = A x + B u + c + E w, checked, with what equalities fix of the inputs
     (lower = upper, or two opposite rows) taken out."""
     require_kind("system", system, LinearSystem)
     system.validate()
@@ -131,7 +137,7 @@ def one_step(
         # Each v is one of the inputs.
         bounds = np.column_stack([*inputs.spread(m).bounds()])[basis.argmax(axis=0)]
         ends = bounds if np.isfinite(bounds).all() else None
-    W = disturbance_set(disturbance, system.n)
+    W = disturbance_set(disturbance, system.n, disturbance_matrix)
     return OneStep(*host_matrices(system), V, basis, shift, W, ends)
 
 
@@ -171,29 +177,3 @@ def tidy(polytope: Polytope) -> Polytope:
         return Polytope(*irredundant_rows("Polytope", G, g))
     except Flat:
         return Polytope(G, g)
-
-
-def disturbance_set(disturbance: Box | Polytope | None, n: int) -> Box | Polytope | None:
-    """Return the disturbance; raise ValueError unless it is None or a bounded set that holds 0."""
-    if disturbance is None:
-        return None
-    G, g = as_polytope("disturbance", disturbance, n).unit_rows("disturbance")
-    if not np.isfinite(extent(G, g)).all():
-        fail("disturbance", "is unbounded", "Bound every coordinate")
-    if g.min() < 0:
-        fail("disturbance", "does not hold the origin", "Add its center to the system's c")
-    return disturbance
-
-
-def supports(W: Box | Polytope | None, rows: np.ndarray) -> np.ndarray:
-    """Return max {row w : w in W} for each row; 0 if W is None."""
-    if W is None or not len(rows):
-        return np.zeros(len(rows))
-    limits = Polytope(rows, np.zeros(len(rows))).pontryagin_difference(W).h
-    return -host_array("disturbance", limits)
-
-
-def largest_norm(W: Box | Polytope, P: np.ndarray) -> float:
-    """Return max sqrt(w'P w) over W: a convex function is largest at a vertex."""
-    vertices = W.vertices()
-    return float(np.sqrt(np.einsum("ij,jk,ik->i", vertices, P, vertices).max()))

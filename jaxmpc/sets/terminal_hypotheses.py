@@ -11,11 +11,12 @@ from jaxmpc.arrays import Reals, as_weight, host_array
 from jaxmpc.checks import fail, require_finite, require_kind, require_shape
 from jaxmpc.pytrees import record
 from jaxmpc.sets.control_invariant import largest_cut
-from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope, translated, unit_half_spaces
+from jaxmpc.sets.convex_sets import Box, ConvexSet, Ellipsoid, Polytope, unit_half_spaces
+from jaxmpc.sets.disturbances import Image, disturbance_set, largest_norm, supports
 from jaxmpc.sets.geometry import Flat, affine_hull, framed
 from jaxmpc.sets.invariant import contraction
 from jaxmpc.sets.lp import Program, extent, maximise
-from jaxmpc.sets.predecessors import OneStep, disturbance_set, largest_norm, one_step, supports
+from jaxmpc.sets.predecessors import OneStep, one_step
 from jaxmpc.systems.riccati import least_reached, lqr
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
@@ -112,7 +113,8 @@ def verify_terminal(
     states: Box | Polytope | None,
     inputs: Box | Polytope | None,
     K: Reals | None = None,
-    disturbance: Box | Polytope | None = None,
+    disturbance: ConvexSet | None = None,
+    disturbance_matrix: Reals | None = None,
 ) -> TerminalReport:
     """Check each hypothesis of the theorems on recursive feasibility (1) and stability (3).
 
@@ -132,6 +134,7 @@ def verify_terminal(
         states, inputs: X and U; None for no limit.
         K: (m, n), of u = K x; None for that of `lqr`.
         disturbance: bounded set of w that holds the origin, or None.
+        disturbance_matrix: E (n, p) of x+ = A x + B u + c + E w, None for the identity.
 
     {H x <= h} is invariant under K if there is M >= 0 with M H = H (A+BK) and M h + H c + max Hw
     <= factor h, factor <= 1 (Farkas). M comes from LPs; its residual E = M H - H (A+BK) is
@@ -155,7 +158,7 @@ def verify_terminal(
     X = _Rows(*unit_half_spaces("states", states, system.n))
     U = _Rows(*unit_half_spaces("inputs", inputs, system.m))
     gain, P, no_law = _gain_and_cost(system, Q, R, K, terminal_cost)
-    W = disturbance_set(disturbance, system.n)
+    W = disturbance_set(disturbance, system.n, disturbance_matrix)
     X_f = X if terminal_set is None else _terminal_set(terminal_set, system.n)
     role = " (there is no terminal set: X in its role, at horizon N - 1)"
     role = role if terminal_set is None else ""
@@ -170,7 +173,7 @@ def verify_terminal(
         admissible = _within(name, system.input_labels, U, gain, X_f)
     name = "terminal set within states"
     inside = _within(name, system.state_labels, X, np.eye(system.n), X_f, role)
-    step = one_step(system, inputs, disturbance)
+    step = one_step(system, inputs, disturbance, disturbance_matrix)
     checks = [
         _compact("states", "X", X),
         _compact("inputs", "U", U),
@@ -219,7 +222,7 @@ class _Loop(NamedTuple):
     B: np.ndarray
     K: np.ndarray
     c: np.ndarray
-    W: Box | Polytope | None
+    W: ConvexSet | None
 
     @property
     def closed(self) -> np.ndarray:
@@ -362,7 +365,7 @@ class _Ellipse:
             check = Check(name, holds, 1 - factor, "of the level", f"{sentence}.")
             return _Invariance(check, factor=factor)
         c, W = loop.c, loop.W
-        norm = float(np.sqrt(c @ P @ c)) if W is None else largest_norm(translated(W, c), P)
+        norm = float(np.sqrt(c @ P @ c)) if W is None else largest_norm(W, P, c)
         slack = float(1 - np.sqrt(factor) - norm / np.sqrt(self.level))
         sentence += (
             f"; with |w + c|_P <= {norm:.6g} the image reaches at most {1 - slack:.9g} of the "
@@ -576,16 +579,18 @@ def _exact_factor(M: np.ndarray, X_f: _Rows, loop: _Loop) -> Fraction | None:
 
     Where the rows that M uses are n and independent, their multipliers are computed again from
     M H = H(A+BK), so that no residual is left. |x| is bounded by LPs and a margin. None where the
-    set is too large for it, or unbounded where a residual is left, or W is no Box.
+    set is too large for it, or unbounded where a residual is left, or W is no Box or image of one.
     """
     n = len(loop.c)
-    if len(X_f.g) ** 2 * n > _EXACT_PRODUCTS or isinstance(loop.W, Polytope):
+    E, box = (loop.W.E, loop.W.of) if isinstance(loop.W, Image) else (np.eye(n), loop.W)
+    exact_ends = box is None or isinstance(box, Box)
+    if len(X_f.g) ** 2 * n > _EXACT_PRODUCTS or not exact_ends:
         return None
     H, h = _fractions(X_f.G), _fractions(X_f.g)
     images, bounds = H @ loop.exactly_closed, H @ _fractions(loop.c)
-    if loop.W is not None:
-        ends = _fractions(loop.W.lower), _fractions(loop.W.upper)
-        bounds = bounds + np.maximum(H * ends[0], H * ends[1]).sum(axis=1)
+    if isinstance(box, Box):
+        ends, along = (_fractions(box.lower), _fractions(box.upper)), H @ _fractions(E)
+        bounds = bounds + np.maximum(along * ends[0], along * ends[1]).sum(axis=1)
     for i, image in enumerate(images):
         used = np.flatnonzero(M[i] > 0)
         y = _fractions(M[i, used])

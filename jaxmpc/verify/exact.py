@@ -4,7 +4,8 @@ Every float is a whole number times a power of two, and so are sums and products
 data of a problem written as integers over one 2ᵉ, a state after k steps is integers over
 2^((k+1)e): no rounding, no tolerance. What is checked is the problem as it is stored
 (`stored_problem.Constraints`): x⁺ = Ax + Bu + c, rows lower ≤ Hx + Du ≤ upper, and a terminal
-ellipsoid x'Px ≤ level.
+ellipsoid x'Px ≤ level. Of a robust problem the rows are tightened in rational arithmetic first
+(`stored_policy.py`).
 
 *Feasible* (`roll_out_exactly`): the plan, rolled out from the state, keeps every row. Equalities
 are missed by rounding; there the plan counts that keeps them and differs by as little.
@@ -180,12 +181,13 @@ def beyond(
     A, B, c = (integers(v, e) for v in (p.A, p.B, p.c))
     # Sums are over 2^top. The costate p_k is over 2^((N−k+2)e): each step multiplies by A.
     top, total = (p.N + 4) * e, 0
+    lowers, uppers = p.widest
     costate, slopes = np.zeros(n, object), np.zeros(low.shape, object)
     for k in range(p.N, -1, -1):
-        weight = np.where(np.isinf(p.upper[k]), np.minimum(y[k], 0.0), y[k])
-        weight = np.where(np.isinf(p.lower[k]), np.maximum(weight, 0.0), weight)
+        weight = np.where(np.isinf(uppers[k]), np.minimum(y[k], 0.0), y[k])
+        weight = np.where(np.isinf(lowers[k]), np.maximum(weight, 0.0), weight)
         w = integers(weight, e)
-        bound = np.where(weight > 0, p.upper[k], np.where(weight < 0, p.lower[k], 0.0))
+        bound = np.where(weight > 0, uppers[k], np.where(weight < 0, lowers[k], 0.0))
         total += int(w @ integers(bound, e)) << top - 2 * e
         if k < p.N:
             total -= int(costate @ c) << top - (p.N - k + 2) * e

@@ -64,7 +64,7 @@ class Programs:
                 motion[k * n : (k + 1) * n, x] = -p.A
                 motion[k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = np.eye(n)
                 motion[k * n : (k + 1) * n, u] = -p.B
-            for bound, sign in ((p.upper[k], 1.0), (p.lower[k], -1.0)):
+            for bound, sign in ((p.widest[1][k], 1.0), (p.widest[0][k], -1.0)):
                 there = np.flatnonzero(np.isfinite(bound))
                 parts.append(sign * block.tocsr()[there])
                 bounds.append(sign * bound[there])

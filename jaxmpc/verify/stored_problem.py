@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxmpc.checks import fail
+from jaxmpc.verify.stored_policy import fits, tightened
 
 
 def label_shapes(attributes: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
@@ -34,6 +35,7 @@ def label_shapes(attributes: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
                 for b in problem["rows"]
             )
             and (ball is None or len(np.shape(ball["P"])) == 2)
+            and ("disturbance" not in problem or fits(problem["disturbance"], n, m))
         )
     except (LookupError, TypeError, ValueError):
         fine = False
@@ -46,7 +48,8 @@ def label_shapes(attributes: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
 
 class Constraints:
     """The hard constraints as float64 arrays: of each step k = 0..N the rows H[k], D[k], lower[k],
-    upper[k], D[N] being zero. plain: the attribute `problem` of the
+    upper[k], D[N] being zero. widest: lower and upper of a robust problem rounded outwards, where
+    lower and upper are rounded inwards; else the same. plain: the attribute `problem` of the
     store, JSON data that `FeasibilityProblem.plain` describes."""
 
     def __init__(self, plain: Mapping[str, Any]) -> None:
@@ -65,6 +68,10 @@ class Constraints:
         none = np.zeros((0, n)), np.zeros((0, m)), np.zeros(0), np.zeros(0)
         stacked = [[np.concatenate(v) for v in zip(none, *at, strict=True)] for at in rows]
         self.H, self.D, self.lower, self.upper = (list(v) for v in zip(*stacked, strict=True))
+        self.widest = self.lower, self.upper
+        if "disturbance" in plain:
+            arrays = self.A, self.B, self.H, self.D, self.lower, self.upper
+            (self.lower, self.upper), self.widest = tightened(plain["disturbance"], *arrays)
         ball = plain["ellipsoid"]
         self.P = None if ball is None else np.zeros((n, n))
         if ball is not None:
@@ -107,7 +114,7 @@ class Constraints:
             alone = (self.H[k] == 0).all(axis=1) & (np.sum(D != 0, axis=1) == 1)
             for row in np.flatnonzero(alone & (np.abs(D).sum(axis=1) == 1)):
                 i = int(np.flatnonzero(D[row])[0])
-                ends = self.lower[k][row], self.upper[k][row]
+                ends = self.widest[0][k][row], self.widest[1][k][row]
                 lower, upper = ends if D[row, i] > 0 else (-ends[1], -ends[0])
                 yield int(self.moves[k]), i, lower, upper
 
@@ -115,6 +122,7 @@ class Constraints:
         """Return e such that all data, and these arrays, are integers over 2ᵉ."""
         parts = [self.A, self.B, self.c, self.low, self.high]
         parts += [*self.H, *self.D, *self.lower, *self.upper, *more]
+        parts += [*self.widest[0], *self.widest[1]]
         if self.P is not None:
             parts += [self.P, np.array(self.level)]
         return max(0, *(_bits(v) for v in parts))

@@ -77,7 +77,10 @@ def design(
             system = replace(system, **named)
     regulator = lqr(system, Q, R)
     if isinstance(terminal, str):
-        last = named_terminal_set(terminal, system, regulator, states, inputs)
+        against = (settings.get(name) for name in ("disturbance", "disturbance_matrix"))
+        gain = settings.get("gain")
+        law = regulator if gain is None else LQR(K=gain, P=regulator.P)
+        last = named_terminal_set(terminal, system, law, states, inputs, *against)
     else:
         last = terminal
     settings = {"terminal_cost": regulator.P, **settings}

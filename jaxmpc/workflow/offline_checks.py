@@ -22,6 +22,7 @@ from jaxmpc.mpc.condense import condensed_in_float64, in_float64
 from jaxmpc.mpc.controller import Controller
 from jaxmpc.mpc.problem import MPC, harden
 from jaxmpc.mpc.rows import row_table
+from jaxmpc.mpc.tightening import feedback_gain
 from jaxmpc.pytrees import record
 from jaxmpc.qp.admm import ADMM
 from jaxmpc.qp.status import Status
@@ -248,7 +249,11 @@ def theorems(mpc: MPC, K: Reals | None = None) -> TerminalReport:
     if mpc.stage_weights is not None:
         fail("mpc", "weighs its stages", "The theorems' optimal value has one cost for all stages")
     P = np.zeros((mpc.system.n,) * 2) if mpc.terminal_cost is None else mpc.terminal_cost
-    return verify_terminal(mpc.system, mpc.Q, mpc.R, P, mpc.terminal_set, mpc.states, mpc.inputs, K)
+    if mpc.disturbance is not None and K is None:
+        K = feedback_gain(mpc)
+    sets = mpc.terminal_set, mpc.states, mpc.inputs
+    against = mpc.disturbance, mpc.disturbance_matrix
+    return verify_terminal(mpc.system, mpc.Q, mpc.R, P, *sets, K, *against)
 
 
 def sample_states(mpc: MPC, d: int) -> np.ndarray:

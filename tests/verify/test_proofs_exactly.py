@@ -40,7 +40,7 @@ def exact(problem: FeasibilityProblem) -> tuple:
     """Return the data of the proofs and of the exact check, without limits from elsewhere."""
     p = problem.exact(np.full((2, n), [[-9.0], [9.0]]), np.ones(n))
     p = replace(
-        p, move_lower=np.tile(p.u_lower, (N, 1)), move_upper=np.tile(p.u_upper, (N, 1)),
+        p, move_lower=p.u_lower, move_upper=p.u_upper,
         left=np.ones((N, n)), side=np.zeros((N, n)), reach=np.zeros((N, n)),
     )  # fmt: skip
     return p, Constraints(problem.plain())

@@ -194,6 +194,9 @@ class NonlinearMPC:
         """Raise ValueError for a bad problem, before any compile."""
         require_kind("mpc", self.mpc, MPC)
         self.mpc.validate()
+        if self.mpc.disturbance is not None:
+            what = "given beside a nonlinear model, for which the tightened rows prove nothing"
+            fail("mpc.disturbance", what, "Leave it out, or use jm.solve with a linear model")
         self.mpc.require_unique_inputs()
         if not callable(getattr(self.model, "step", None)):
             fail("model", f"is a {type(self.model).__name__}", "Give f(x, u) -> x⁺, or its object")

@@ -106,7 +106,7 @@ def solve_stagewise(
 
     `jax.vmap` over x0, references or the arrays of `mpc`, its system's among them. Raises
     ValueError for bad data that can be read, and for what only `solve` supports: Ellipsoids,
-    control horizons, input rates.
+    control horizons, input rates, disturbances.
     """
     factor = factor_stages(mpc, solver, scale)
     return plan_stages(
@@ -138,6 +138,7 @@ def checked(mpc: MPC, solver: ADMM) -> MPC:
         ("terminal_set is an Ellipsoid", isinstance(mpc.terminal_set, Ellipsoid)),
         ("control_horizon is given", mpc.control_horizon is not None),
         ("input rates are limited or weighed", mpc.input_in_state),
+        ("disturbance is given", mpc.disturbance is not None),
     ):
         if found:
             fail("mpc", name, "Stage by stage there is no such thing: use jm.solve")
