@@ -3,6 +3,7 @@
 Box, Polytope, Zonotope, Ellipsoid  sets that contain, intersect, support, project
 maximal_invariant_set            largest set that u = K x keeps within limits -> InvariantSet
 invariant_ellipsoid              the same, a level set of x'Px -> InvariantEllipsoid
+minimal_robust_invariant_set     least set that u = K x keeps under disturbances, from outside
 maximal_control_invariant_set    largest set that some input keeps -> ControlInvariantSet
 predecessor                      states from which some input leads into a set
 joint_limits, output_limits      limits of robot joints and of outputs -> JointLimits, Box, Polytope
@@ -18,6 +19,7 @@ from jaxmpc.sets.invariant import (
     named_terminal_set,
 )
 from jaxmpc.sets.limits import joint_limits, output_limits
+from jaxmpc.sets.minimal_invariant import minimal_robust_invariant_set
 from jaxmpc.sets.predecessors import predecessor
 from jaxmpc.sets.terminal_hypotheses import verify_terminal
 
@@ -30,6 +32,7 @@ __all__ = [
     "joint_limits",
     "maximal_control_invariant_set",
     "maximal_invariant_set",
+    "minimal_robust_invariant_set",
     "named_terminal_set",
     "output_limits",
     "predecessor",

@@ -22,6 +22,7 @@ from jaxmpc.sets.convex_sets import (
     ConvexSet,
     Ellipsoid,
     Polytope,
+    Zonotope,
     as_polytope,
     numbers,
     product,
@@ -100,11 +101,11 @@ def require_disturbance(argument: str, W: Any, dimension: int) -> None:
     origin. Of a set that is traced by JAX the kind and the shapes are checked."""
     if isinstance(W, Ellipsoid) or not isinstance(W, ConvexSet):
         what = f"is a {type(W).__name__}"
-        fail(argument, what, "Give a Box, a Polytope or a zonotope of w, or None")
+        fail(argument, what, "Give a Box, a Polytope or a Zonotope of w, or None")
     W.validate(argument, dimension)
     if not concrete(W):
         if isinstance(W, Polytope):
-            cure = "Give a Box or a zonotope, or make the problem outside of the trace"
+            cure = "Give a Box or a Zonotope, or make the problem outside of the trace"
             fail(argument, "is a Polytope inside a trace", cure)
         return
     if isinstance(W, Box | Polytope):
@@ -145,6 +146,15 @@ def supports(W: Any, rows: np.ndarray) -> np.ndarray:
     """Return max {row w : w in W} for each row; 0 if W is None. NumPy; not traceable."""
     if W is None or not len(rows):
         return np.zeros(len(rows))
+    if isinstance(W, Image):
+        return supports(W.of, rows @ host_array("disturbance_matrix", W.E))
+    if isinstance(W, Box):
+        lower, upper = W.spread(rows.shape[1]).bounds("disturbance")
+        return np.maximum(rows * lower, rows * upper).sum(axis=1)
+    if isinstance(W, Zonotope):
+        return host_array("disturbance", W.support(rows))
+    if isinstance(W, Vertices):
+        return (rows @ host_array("disturbance", W.points).T).max(axis=1)
     limits = Polytope(rows, np.zeros(len(rows))).pontryagin_difference(W).h
     return -host_array("disturbance", limits)
 

@@ -29,6 +29,7 @@ E = np.array([[0.3], [1.0]])
 SETS = {
     "box": jm.Box([-0.1], [0.2]),
     "polytope": jm.Polytope([[1.0], [-2.0]], [0.2, 0.2]),
+    "zonotope": jm.sets.Zonotope([0.05], [[0.1, -0.03]]),
 }
 
 
@@ -255,7 +256,7 @@ def test_recursive_feasibility_needs_a_robust_terminal_set():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"disturbance": jm.Ellipsoid(np.eye(2), 1.0)}, "Give a Box, a Polytope or a zonotope"),
+        ({"disturbance": jm.Ellipsoid(np.eye(2), 1.0)}, "Give a Box, a Polytope or a Zonotope"),
         ({"disturbance": jm.Box([0.1, 0.1], [0.2, 0.2])}, "does not hold the origin"),
         ({"disturbance": jm.Box([-np.inf, 0.0], [0.0, 0.0])}, "is unbounded"),
         ({"disturbance": jm.Box([-1.0] * 3, [1.0] * 3)}, "disturbance"),
