@@ -1,14 +1,17 @@
-"""The MPC problem as a least-distance problem in scaled coordinates, in NumPy in float64.
+"""A parametric QP as a least-distance problem in scaled coordinates, in NumPy in float64.
 
-With the Cholesky factor P = ℓℓ' of the condensed cost, y = ℓ'z + ℓ⁻¹(F x + f) is the distance
-from the unconstrained plan, and the QP at x is a least-distance problem:
+With the Cholesky factor P = ℓℓ' of the cost, y = ℓ'z + ℓ⁻¹(F x + f) is the distance from the
+unconstrained optimum, and the QP at the parameters x is a least-distance problem:
 
     min ½|y|²  subject to  M y ≤ v + V x          (rows of M of length 1).
 
-Where the rows A hold with equality, y = −M_A'λ and M_A M_A'λ = −(v_A + V_A x): plan and
+Where the rows A hold with equality, y = −M_A'λ and M_A M_A'λ = −(v_A + V_A x): optimum and
 multipliers are affine in x on the polytope where λ ≥ 0 and all other rows hold, the critical
 region of A. Equalities that rows imply (two opposite rows, a terminal point) are taken out
 first: z is affine in x and in coordinates w that they leave free, and w takes the place of z above.
+Where they tie the parameters to each other, some of these are free and the others affine in them
+(`FreeParameters`). Where the set of parameters is unbounded, the search looks at it through a
+window, a box about a point inside (`Window`).
 Seen as a problem with v + δε for a fixed ε > 0 and δ → 0+, every active set has
 independent rows; so regions where rows are dependent (duplicates, apexes of a limit) are divided
 without overlap, and rows that vanish identically are decided by their first order in δ.
@@ -20,14 +23,25 @@ import numpy as np
 from scipy.optimize import nnls
 
 from jaxmpc.checks import fail
-from jaxmpc.mpc.condense import Condensed, Inequalities, condensed_in_float64
+from jaxmpc.explicit.parametric_qp import Output, ParametricQP, Quadratic, cost_of_parameters
+from jaxmpc.mpc.condense import Inequalities, condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Polytope, unit_half_spaces
-from jaxmpc.sets.geometry import AffineHull, affine_hull, distinct, dual_hull, framed
+from jaxmpc.sets.geometry import (
+    AffineHull,
+    affine_hull,
+    distinct,
+    dual_hull,
+    framed,
+    implied_equalities,
+    plain_null_space,
+)
 from jaxmpc.sets.lp import (
+    FLAT,
     ROUNDING,
     Program,
+    cleaned,
     largest_margin,
     maximise,
     maximise_nonnegative,
@@ -40,24 +54,29 @@ SMALLEST = 1e-9
 DEPENDENT = 1e-7
 # Relative rounding of a law: below it a coefficient is zero.
 ZERO = 1e-11
+# Size of the window onto an unbounded set, relative to that of the rows' data.
+REACH = 64.0
+# How far outside the window vertices are looked for, relative to its size.
+FAR = 1e5
 
 
 @record
 class LeastDistanceForm:
     """min ½|y|² s.t. M y ≤ v + V ξ, one-sided rows; x = center + size·ξ with X_N in [−1, 1]^n.
 
-    length (r,): multipliers of the rows as given are those of M divided by it. row (r,): index
-    into `condensed`. side (r,): 1 upper, −1 lower. zero_row (r,): M_i = 0, a half-space on ξ alone.
-    typical (r,): size of v + V ξ, for tolerances. epsilon (r,): direction of the perturbation.
-    factor: ℓ. U: orthonormal columns that span those of M.
-    shift (N·m, n + 1): ℓ⁻¹(F, f). interior (n,): ξ with a margin.
-    given: the program as it is stated, before any row is scaled or left out. hull: the affine hull
-    of its points (x, z).
+    x are the free parameters, and X_N the set of those with a feasible z, as far as the window
+    shows it. length (r,): multipliers of the rows as given are those of M divided by it. row (r,):
+    their number in `given`. side (r,): 1 upper, −1 lower. zero_row (r,): M_i = 0, a half-space on ξ
+    alone. typical (r,): size of v + V ξ, for tolerances. epsilon (r,): direction of the
+    perturbation. factor: ℓ. U: orthonormal columns that span those of M.
+    shift (nz, n + 1): ℓ⁻¹(F, f). interior (n,): ξ with a margin.
+    given: the program as it is stated, before any row is scaled or left out, in the free
+    parameters. hull: the affine hull of its points (x, z).
     """
 
     given: "GivenProgram"
     hull: AffineHull
-    condensed: Condensed
+    window: "Window"
     factor: np.ndarray
     shift: np.ndarray
     M: np.ndarray
@@ -188,33 +207,149 @@ class PointSolution(NamedTuple):
     y: np.ndarray
 
 
-class GivenProgram(NamedTuple):
-    """The rows C z + D x ≤ b as they are given, with those of the set of initial states: row (r,)
-    and side (r,) as in `Inequalities`, row −1 for these. condensed: the QP they belong to."""
+class FreeParameters(NamedTuple):
+    """The parameters θ = shift + basis x (p,), x = θ[free] (d,), on rows (k, p) θ = offsets (k,)
+    that the program implies; x = θ without any."""
 
-    condensed: Condensed
+    shift: np.ndarray
+    basis: np.ndarray
+    free: np.ndarray
+    rows: np.ndarray
+    offsets: np.ndarray
+
+    @classmethod
+    def all(cls, p: int) -> "FreeParameters":
+        """Return p parameters that are free."""
+        none = np.zeros((0, p)), np.zeros(0)
+        return cls(np.zeros(p), np.eye(p), np.arange(p), *none)
+
+    @property
+    def tied(self) -> bool:
+        """Return whether equalities tie parameters to each other."""
+        return len(self.offsets) > 0
+
+    def widened(self, gain: np.ndarray) -> np.ndarray:
+        """Return what is gain (r, d) in x as a gain (r, p) in θ."""
+        wide = np.zeros((len(gain), len(self.shift)))
+        wide[:, self.free] = gain
+        return wide
+
+
+class GivenProgram(NamedTuple):
+    """min ½ z'Pz + (F x + f)'z over the rows C z + D x ≤ b as they are given, with those of the set
+    of parameters.
+
+    row (r,) and side (r,): of the problem's own rows, R of them with these `coefficients` (R, nz),
+    which may have two sides, as in `Inequalities`; −1 for rows of the set of parameters, −2 for
+    those of a window. alone: what the cost has in x alone. output: of the law. parameters: what x
+    are.
+    """
+
+    P: np.ndarray
+    F: np.ndarray
+    f: np.ndarray
     C: np.ndarray
     D: np.ndarray
     b: np.ndarray
     row: np.ndarray
     side: np.ndarray
+    coefficients: np.ndarray
+    alone: Quadratic
+    output: Output
+    parameters: FreeParameters
     program: Program
 
     @classmethod
-    def of(cls, mpc: MPC, within: Box | Polytope | None) -> "GivenProgram":
-        """Return the program of `mpc`, all rows hard, on X_N or on X_N ∩ within."""
-        c = condensed_in_float64(mpc)
-        if c.balls:
-            fail("terminal_set", "is an ellipsoid: its law is not affine", "Give a Polytope")
-        C, D, b, row, side = Inequalities.of(c)
-        H, h = unit_half_spaces("within", within, mpc.dimension)
-        if mpc.input_in_state and mpc.inputs is not None:  # one that was applied
-            H_u, h_u = unit_half_spaces("inputs", mpc.inputs, mpc.system.m)
-            H, h = np.vstack([H, np.pad(H_u, ((0, 0), (mpc.system.n, 0)))]), np.append(h, h_u)
+    def of(cls, problem: MPC | ParametricQP, within: Box | Polytope | None) -> "GivenProgram":
+        """Return the program of a problem, all rows hard, on X_N or on X_N ∩ within."""
+        p, (H, h) = problem.dimension, unit_half_spaces("within", within, problem.dimension)
+        if isinstance(problem, ParametricQP):
+            q = problem.in_numpy()
+            C, D, b = q.G, -q.S, q.h
+            row, side, coefficients = np.arange(len(b)), np.ones(len(b)), C
+            cost, alone, output = (q.P, q.F, q.q), Quadratic(q.Y, q.y, q.c), q.output
+        else:
+            c = condensed_in_float64(problem)
+            if c.balls:
+                fail("terminal_set", "is an ellipsoid: its law is not affine", "Give a Polytope")
+            C, D, b, row, side = Inequalities.of(c)
+            coefficients, cost = c.C, (c.P, c.F, c.f)
+            alone, output = (
+                cost_of_parameters(problem, c)[2],
+                Output(c.Omega[0], c.Psi[0], c.psi[0]),
+            )
+            if problem.input_in_state and problem.inputs is not None:  # one that was applied
+                H_u, h_u = unit_half_spaces("inputs", problem.inputs, problem.system.m)
+                H_u = np.pad(H_u, ((0, 0), (problem.system.n, 0)))
+                H, h = np.vstack([H, H_u]), np.append(h, h_u)
         C, D = np.vstack([C, np.zeros((len(h), C.shape[1]))]), np.vstack([D, H])
         b, side = np.append(b, h), np.append(side, np.ones(len(h)))
         row = np.append(row, np.full(len(h), -1))
-        return cls(c, C, D, b, row, side, Program(np.hstack([D, C]), b))
+        able = np.isfinite(b)
+        C, D, b, row, side = C[able], D[able], b[able], row[able], side[able]
+        program = Program(np.hstack([D, C]), b)
+        free = FreeParameters.all(p)
+        return cls(*cost, C, D, b, row, side, coefficients, alone, output, free, program)
+
+    def within(self, window: "Window") -> "GivenProgram":
+        """Return the program with the rows of a window."""
+        H, h = window.rows()
+        if not len(h):
+            return self
+        C, D = np.vstack([self.C, np.zeros((len(h), self.C.shape[1]))]), np.vstack([self.D, H])
+        b = np.append(self.b, h)
+        return self._replace(
+            C=C,
+            D=D,
+            b=b,
+            row=np.append(self.row, np.full(len(h), -2)),
+            side=np.append(self.side, np.ones(len(h))),
+            program=Program(np.hstack([D, C]), b),
+        )
+
+    def in_free_parameters(self, equal: np.ndarray) -> "GivenProgram":
+        """Return the program in parameters that the rows `equal`, which hold with equality, leave
+        free.
+
+        With E_z z + E_x x = e and E_z = U Σ V', the rows (1 − U U')(E_x x − e) = 0 tie parameters.
+        """
+        n = self.D.shape[1]
+        row, column = scaling(self.program.G, self.b)
+        E = (row[:, None] * self.program.G * column)[equal]
+        U, size, _ = np.linalg.svd(E[:, n:], full_matrices=False)
+        U = U[:, size > 1e-10 * max(size.max(initial=0.0), 1e-300)]
+        both = np.column_stack([E[:, :n], (row * self.b)[equal]])
+        both = both - U @ (U.T @ both)
+        _, size, Vt = np.linalg.svd(both[:, :n], full_matrices=False)
+        rank = int((size > FLAT).sum())
+        if not rank:
+            return self
+        if rank == n:
+            fail("within", "and the rows leave one value of the parameters", "Solve that one QP")
+        rows = np.where(np.abs(Vt[:rank]) <= 1e-14, 0.0, Vt[:rank])
+        offsets = rows @ np.linalg.lstsq(both[:, :n], both[:, n], rcond=FLAT)[0]
+        basis, free = plain_null_space(rows)
+        shift = column[:n] * np.linalg.lstsq(rows, offsets, rcond=None)[0]
+        basis = column[:n, None] * basis / column[free]
+        shift = shift - basis @ shift[free]  # so that x = θ[free]
+        D, (gain, direct, constant) = self.D @ basis, self.output
+        D = cleaned(D, np.abs(self.D) @ np.abs(basis) * 1e3)
+        moved = self.D @ shift
+        b = cleaned(self.b - moved, np.abs(self.b) + np.abs(self.D) @ np.abs(shift))
+        on = np.any(D != 0, axis=1) | np.any(self.C != 0, axis=1)  # the others tie parameters
+        return self._replace(
+            F=self.F @ basis,
+            f=self.f + self.F @ shift,
+            C=self.C[on],
+            D=D[on],
+            b=b[on],
+            row=self.row[on],
+            side=self.side[on],
+            alone=self.alone.along(shift, basis),
+            output=Output(gain, direct @ basis, constant + direct @ shift),
+            parameters=FreeParameters(shift, basis, free, rows / column[:n], offsets),
+            program=Program(np.hstack([D, self.C])[on], b[on]),
+        )
 
     def support(self, d: np.ndarray) -> tuple[float, np.ndarray | None]:
         """Return max d'x over X_N, and where it is attained (None: nowhere)."""
@@ -222,22 +357,88 @@ class GivenProgram(NamedTuple):
         return found.value, None if found.x is None else found.x[: len(d)]
 
 
-def least_distance_form(mpc: MPC, within: Box | Polytope | None = None) -> LeastDistanceForm:
-    """Return the least-distance form with all rows of `mpc` hard, on X_N or on X_N ∩ within."""
-    given, n = GivenProgram.of(mpc, within), mpc.dimension
-    c = given.condensed
+class Window(NamedTuple):
+    """lower ≤ x ≤ upper (n,): what is looked at of a set, its bounds where it has some.
+
+    inside (n,): a point of the set. cut (2, n): where lower and upper are no bounds of the set.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    inside: np.ndarray
+    cut: np.ndarray
+
+    @classmethod
+    def of(cls, program: Program, unit: np.ndarray, reach: float) -> "Window":
+        """Return the window onto a program, whose first variables x have these typical sizes (n,):
+        `reach` times these about a point inside, in directions in which x is unbounded, and the
+        bounds of what is seen then."""
+        n = len(unit)
+        low, high = program.bounds(range(n))
+        cut = ~np.isfinite([low, high])
+        if not cut.any():
+            return cls(low, high, (low + high) / 2, cut)
+        inside = program.margin()[0][:n]
+        size = reach * np.maximum(unit, np.abs(inside))
+        edge = cls(np.where(cut[0], inside - size, low), np.where(cut[1], inside + size, high),
+                   inside, cut)  # fmt: skip
+        H, h = edge.rows()
+        G = np.vstack([program.G, np.pad(H, ((0, 0), (0, program.G.shape[1] - n)))])
+        low, high = Program(G, np.append(program.g, h)).bounds(range(n))
+        return cls(low, high, inside, cut)
+
+    @property
+    def open(self) -> bool:
+        """Return whether the set reaches beyond the window."""
+        return bool(self.cut.any())
+
+    def rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the half-spaces H x ≤ h by which the window cuts off what lies beyond it."""
+        unit, on = np.eye(len(self.lower)), np.append(self.cut[1], self.cut[0])
+        return np.vstack([unit, -unit])[on], np.append(self.upper, -self.lower)[on]
+
+    def fraction(self, points: np.ndarray) -> float:
+        """Return how far points (k, n) lie from the point inside towards where the window cuts, at
+        most, relative to its size."""
+        up = ((points - self.inside) / (self.upper - self.inside))[:, self.cut[1]]
+        down = ((points - self.inside) / (self.lower - self.inside))[:, self.cut[0]]
+        return float(max(up.max(initial=0.0), down.max(initial=0.0)))
+
+
+def least_distance_form(
+    problem: MPC | ParametricQP, within: Box | Polytope | None = None, reach: float = REACH
+) -> LeastDistanceForm:
+    """Return the least-distance form of a problem, all rows hard, on X_N or on X_N ∩ within.
+
+    reach: size of the window, where this is unbounded, relative to the size of the rows' data.
+    """
+    given = GivenProgram.of(problem, within)
+    mpc = isinstance(problem, MPC)
+    name = "mpc" if mpc else "problem"
+    relax = "Relax a limit or " + ("lengthen the horizon" if mpc else "enlarge within")
     if given.program.empty:
-        fail("mpc", "its feasible set is empty", "Relax a limit or lengthen the horizon")
+        fail(name, "its feasible set is empty", relax)
     flat = "its feasible set is flat: no initial state keeps a margin"
+    equal = implied_equalities(given.program.G, given.b)
+    if equal.any():
+        given = given.in_free_parameters(equal)
+    n = given.D.shape[1]
     hull = affine_hull(given.program.G, given.b, keep=n)
     if hull is None:
-        fail("mpc", f"{flat}, as equalities tie the states to each other", "Relax one of them")
+        fail(name, f"{flat}, as equalities tie the states to each other", "Relax one of them")
     # z = shift + S x + N w
     N, S, shift_z = hull.basis[n:, n:], hull.basis[n:, :n], hull.shift[n:]
     try:
-        factor = np.linalg.cholesky(N.T @ c.P @ N)
+        factor = np.linalg.cholesky(N.T @ given.P @ N)
     except np.linalg.LinAlgError:
-        fail("R", "leaves the condensed cost singular in float64", "Put a larger weight on inputs")
+        if mpc:
+            fail(
+                "R",
+                "leaves the condensed cost singular in float64",
+                "Put a larger weight on inputs",
+            )
+        what = "is singular in float64 where rows leave z free: the optimum is not unique"
+        fail("P", what, "Add a small multiple of the unit matrix")
     G, V, v = hull.G[:, n:], -hull.G[:, :n], hull.g
     row, side = given.row[hull.rows], given.side[hull.rows]
 
@@ -251,19 +452,31 @@ def least_distance_form(mpc: MPC, within: Box | Polytope | None = None) -> Least
     length = np.where(zero_row, 1.0, np.linalg.norm(M, axis=1))
     M, V, v = M / length[:, None], V / length[:, None], v / length
     shift = np.linalg.solve(
-        factor, N.T @ (np.column_stack([c.F, c.f]) + c.P @ np.column_stack([S, shift_z]))
+        factor,
+        N.T @ (np.column_stack([given.F, given.f]) + given.P @ np.column_stack([S, shift_z])),
     )
-    V, v = V + M @ shift[:, :n], v + M @ shift[:, n]
+    # A row that the unconstrained optimum meets for all x (such as one that says that a derivative
+    # of the cost is zero) leaves rounding here, which must not make facets.
+    data = np.column_stack([V, v])
+    data = cleaned(data + M @ shift, 10 * (np.abs(data) + np.abs(M) @ np.abs(shift)))
+    V, v = data[:, :n], data[:, n]
 
-    program = Program(np.hstack([-V, M]), v)
-    low, high = program.bounds(range(n))
-    free = ~np.isfinite(high - low)
-    if free.any():
-        i = int(np.argmax(free))
-        fail("mpc", f"its feasible set is unbounded along coordinate {i}", "Give within=jm.Box(…)")
+    window = Window.of(Program(np.hstack([-V, M]), v), scaling(V, v)[1], reach)
+    if window.open:
+        H, h = window.rows()
+        given, none = given.within(window), np.zeros(len(h))
+        M, V, v = (
+            np.vstack([M, np.zeros((len(h), M.shape[1]))]),
+            np.vstack([V, -H]),
+            np.append(v, h),
+        )
+        row, side = np.append(row, none - 2).astype(int), np.append(side, none + 1)
+        length, zero_row = np.append(length, none + 1), np.append(zero_row, none == 0)
+        hull = hull._replace(equal=np.append(hull.equal, none != 0))
+    low, high = window.lower, window.upper
     center, size = (high + low) / 2, (high - low) / 2
     if np.any(size <= ROUNDING * np.abs(center)):
-        fail("mpc", flat, "Relax a limit or lengthen the horizon")
+        fail(name, flat, relax)
     V, v = V * size, v + V @ center
     # Rows on ξ alone get length 1; the others are as long as y, in units of cost, is.
     reach = np.linalg.norm(V, axis=1)
@@ -272,15 +485,18 @@ def least_distance_form(mpc: MPC, within: Box | Polytope | None = None) -> Least
     typical = np.where(
         zero_row, 1.0, np.median((reach + np.abs(v))[~zero_row]) if any(~zero_row) else 1.0
     )
-    # An orthonormal basis of the columns of M keeps tiny coefficients out of the LPs.
-    U = np.linalg.svd(M, full_matrices=False)[0]
-    ball = framed("mpc: its feasible set", np.hstack([U, -V]), v).center
+    # An orthonormal basis of the columns of M keeps tiny coefficients out of the LPs; what is
+    # rounding in it would decide how they are scaled. (M has dependent columns where rows leave
+    # some of z alone.)
+    U, singular, _ = np.linalg.svd(M, full_matrices=False)
+    U = cleaned(U[:, singular > 1e-12 * singular.max(initial=0.0)], 1.0)
+    ball = framed(f"{name}: its feasible set", np.hstack([U, -V]), v).center
     # Multiples of the golden ratio spread evenly and have no small integer relations.
     epsilon = 1 + np.modf(np.arange(1, len(v) + 1) * (np.sqrt(5) - 1) / 2)[0]
     return LeastDistanceForm(
         given=given,
         hull=hull,
-        condensed=c,
+        window=window,
         factor=factor,
         shift=shift,
         M=M,
@@ -318,9 +534,11 @@ class ActivePiece:
     which: np.ndarray
 
 
-def active_piece(p: LeastDistanceForm, active: tuple[int, ...]) -> ActivePiece | None:
+def active_piece(
+    p: LeastDistanceForm, active: tuple[int, ...], far: float = 1.0
+) -> ActivePiece | None:
     """Return the affine law of an active set; None where its rows are dependent or it holds
-    nowhere."""
+    nowhere. Rows that [−far, far]^n does not reach are left out."""
     solved = p.solve_active(active)
     if solved is None:
         return None
@@ -338,8 +556,7 @@ def active_piece(p: LeastDistanceForm, active: tuple[int, ...]) -> ActivePiece |
     zero = constant & (np.abs(b) <= 10 * ZERO * terms)
     if np.any(constant & ~zero & (b < 0)) or np.any(zero & (c < 0)):
         return None
-    # Rows at a distance that [−1, 1]^n does not reach cannot cut.
-    which = np.flatnonzero(~constant & (b <= 2 * np.sqrt(n) * size))
+    which = np.flatnonzero(~constant & (b <= 2 * far * np.sqrt(n) * size))
     H, h = -a[which] / size[which, None], b[which] / size[which]
     h = np.where(np.abs(b[which]) <= 1e-3 * ZERO * terms[which], 0.0, h)
     zero[rows] = False
@@ -397,11 +614,22 @@ def cell(p: LeastDistanceForm, active: tuple[int, ...]) -> Cell | None:
     )
 
 
-def interior(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Return the vertices (k, n) and inner radius of H ξ ≤ h (unit rows) in [−2, 2]^n; None if it
-    is flat."""
+def far_vertices(p: LeastDistanceForm, active: tuple[int, ...]) -> np.ndarray:
+    """Return the vertices (k, n) of the region of an active set, without the window, that lie
+    within `FAR` times its size."""
+    piece = active_piece(p, active, FAR)
+    assert piece is not None
+    own = p.row[piece.which] != -2
+    body = interior(piece.H[own], piece.h[own], FAR)
+    vertices = np.zeros((0, len(p.center))) if body is None else body[0]
+    return vertices[np.abs(vertices).max(axis=1, initial=0.0) < FAR / 10]
+
+
+def interior(H: np.ndarray, h: np.ndarray, far: float = 2.0) -> tuple[np.ndarray, float] | None:
+    """Return the vertices (k, n) and inner radius of H ξ ≤ h (unit rows) in [−far, far]^n; None if
+    it is flat."""
     n = H.shape[1]
-    H, h = np.vstack([H, np.eye(n), -np.eye(n)]), np.append(h, np.full(2 * n, 2.0))
+    H, h = np.vstack([H, np.eye(n), -np.eye(n)]), np.append(h, np.full(2 * n, far))
     if n == 1:
         high, low = h[H[:, 0] > 0].min(), -h[H[:, 0] < 0].min()
         return (np.array([[low], [high]]), (high - low) / 2) if high - low > SMALLEST else None

@@ -16,7 +16,7 @@ from jaxmpc.explicit.active_sets import (
     least_distance_form,
 )
 from jaxmpc.explicit.regions import CriticalRegions, exchange, explore
-from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.problem import MPC, Soft, as_tuple
 from jaxmpc.mpc.rows import Row, row_table
 from jaxmpc.pytrees import record
 from jaxmpc.qp.status import Status
@@ -142,6 +142,12 @@ def exact_penalty(
         fail("x0s", f"shape {x0s.shape}", f"Give states (B, {mpc.dimension})")
 
     p, table = least_distance_form(mpc, within), row_table(mpc)
+    if p.given.parameters.tied:
+        what = "its feasible set is flat, as equalities tie the states to each other"
+        fail("mpc", what, "Relax one of them")
+    if p.window.open:
+        i = int(np.argmax(p.window.cut.any(axis=0)))
+        fail("mpc", f"its feasible set is unbounded along coordinate {i}", "Give within=jm.Box(…)")
     weigh = Thresholds(p, softened(p, table))
     search = PenaltySearch(p, weigh, np.random.default_rng(seed), deadline)
     regions: CriticalRegions | None = None
@@ -170,7 +176,7 @@ def exact_penalty(
         advised=(1.1 if exact else 2.0) * value if value > 0 else 1.0,
         thresholds=thresholds,
         status=status,
-        sufficient=is_sufficient(p, value, exact, rho),
+        sufficient=is_sufficient(mpc, value, exact, rho),
         regions=regions,
         evaluated=len(worsts),
     )
@@ -190,14 +196,13 @@ def softened(p: LeastDistanceForm, table: tuple[Row, ...]) -> np.ndarray:
     return mine & ~p.zero_row
 
 
-def is_sufficient(
-    p: LeastDistanceForm, value: float, exact: bool, rho: float | None
-) -> bool | None:
+def is_sufficient(mpc: MPC, value: float, exact: bool, rho: float | None) -> bool | None:
     """Return whether the weight rho (None: those of the soft rows) is exact; None where unknown."""
-    weights = p.condensed.soft_linear if rho is None else np.array([rho])
-    if weights is None:
+    soft = as_tuple("soft", mpc.soft, Soft)
+    weights = [np.ravel(np.asarray(s.rho, float)) for s in soft] if rho is None else [[rho]]
+    if not weights:
         return None
-    weights = np.asarray(weights)[np.isfinite(weights)]
+    weights = np.concatenate(weights)
     # Rows may have weights of their own: the least decides for, the greatest against.
     if exact and weights.min() >= value * (1 - ROUNDING):
         return True

@@ -1,26 +1,30 @@
-"""The explicit solution of an MPC problem: its critical regions, and the law on them."""
+"""Explicit solutions: critical regions of parametric QPs and MPC problems, law and value."""
 
 import time
 from collections import deque
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from jaxmpc.arrays import Reals
-from jaxmpc.checks import fail, whole
+from jaxmpc.checks import fail, require_kind, whole
 from jaxmpc.explicit.active_sets import (
     DEPENDENT,
+    REACH,
     Cell,
-    GivenProgram,
+    FreeParameters,
     LeastDistanceForm,
     cell,
+    far_vertices,
     least_distance_form,
 )
+from jaxmpc.explicit.parametric_qp import ParametricQP
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, Polytope
 from jaxmpc.sets.geometry import hull_volume, unit_rows
-from jaxmpc.sets.lp import maximise_nonnegative, scaling
+from jaxmpc.sets.lp import ROUNDING, maximise_nonnegative, scaling
 
 # Residual of the optimality conditions at a vertex, relative to the size of the terms, up to which
 # a region counts as one of the program as given.
@@ -33,20 +37,24 @@ STEPS = (1e-2, 1e-4, 1e-6)
 # Rounds of the search from what is missing, and random points of X_N from which each starts again.
 REPAIRS, RESTARTS = 20, 50
 DIMENSIONS = 6
+# An unbounded set is looked at through windows, up to so many, until one holds all vertices with so
+# much room on each side.
+WINDOWS, ROOM = 8, 8.0
 
 
 @record
 class Region:
-    """One critical region and its affine law.
+    """One critical region and its affine law, in the p parameters θ, such as the state.
 
-    rows (a,): active rows of `Condensed.C`. On the region the optimal decision is z = Z x + z0
-    (nz,), its multipliers y = L x + l0 (a,) for the cost without ½ (y ≥ 0 at an upper bound,
-    y ≤ 0 at a lower one, any sign where both are equal; the last rows are those of equalities that
-    the rows imply, if there are any), the first input u_0 = K x + k (m,), a prestabilising gain
-    included.
+    rows (a,): active rows of `Condensed.C`, or of `ParametricQP.G`. On the region the optimum is
+    z = Z θ + z0 (nz,), its multipliers y = L θ + l0 (a,) for the cost without ½ (y ≥ 0 at an upper
+    bound, y ≤ 0 at a lower one, any sign where both are equal; the last rows are those of
+    equalities that the rows imply, if there are any), the law K θ + k (m,): the first input of an
+    MPC, a prestabilising gain included. The cost is ½ θ'V θ + v'θ + v0.
     also_active: rows that are active all over the region and depend on `rows`.
-    polytope: irredundant unit rows in the p = mpc.dimension coordinates of the state;
-    vertices (k, p); volume.
+    polytope: irredundant unit rows in θ, and where equalities tie the parameters to each other
+    these as two rows each. vertices (k, p): of what lies in the window. volume: in the free
+    parameters; inf where the region reaches beyond the window.
     """
 
     rows: np.ndarray
@@ -57,6 +65,9 @@ class Region:
     l0: np.ndarray
     K: np.ndarray
     k: np.ndarray
+    V: np.ndarray
+    v: np.ndarray
+    v0: float
     polytope: Polytope
     vertices: np.ndarray
     volume: float
@@ -64,36 +75,59 @@ class Region:
 
 @record
 class CriticalRegions:
-    """Critical regions of an MPC problem: the polytopes on which its plan is affine in x0.
+    """Critical regions of a parametric QP: the polytopes on which its optimum is affine.
+
+    Of an MPC problem the parameters are x0, or (x, u_{−1}) where input rates matter, and X_N holds
+    those with u_{−1} in the input limits. Else X_N is the set of parameters with a feasible z.
 
     complete: the regions fill X_N, i.e. the volumes sum to that of the hull of all vertices, and
     no support LP over the rows as given finds a point of X_N beyond a facet of that hull (both to
     1e-9 of its size); and at the vertices of each, hence all over it, the law meets the optimality
-    conditions of the program as given, to 1e-6 of their terms. Where input rates matter the state
-    is (x, u_{−1}), and X_N holds those with u_{−1} in the input limits.
-    volume: their sum. reason: what was checked, or what stopped the search.
+    conditions of the program as given, to 1e-6 of their terms. Where X_N is unbounded all this was
+    checked in a window, lower and upper bounds (2, d) of the free parameters, that holds the
+    vertices of all regions in its inner eighth; None else. Regions reach beyond it as their rows
+    say.
+    free (d,): the indices of the free parameters; where equalities tie the others to these, volumes
+    are in these. volume: the sum. reason: what was checked, or what stopped the search.
     """
 
-    mpc: MPC
+    problem: MPC | ParametricQP
     regions: tuple[Region, ...]
     complete: bool
     volume: float
     reason: str
     seconds: float
+    free: tuple[int, ...]
+    window: np.ndarray | None
 
     @classmethod
-    def of(cls, mpc: MPC, search: "RegionSearch") -> "CriticalRegions":
-        """Return what a search has found, in the coordinates of x, and whether it fills X_N."""
+    def of(cls, problem: MPC | ParametricQP, search: "RegionSearch") -> "CriticalRegions":
+        """Return what a search has found, in the coordinates of θ, and whether it fills X_N."""
         complete, reason = search.fill()
-        regions = tuple(region(search.p, c) for c in search.found)
-        worst = max((residual(search.p.given, r) for r in regions), default=0.0)
+        p = search.p
+        found = [region(p, c) for c in search.found]
+        worst = max((residual(p, r) for r in found), default=0.0)
         reason += f"; optimality conditions of the program as given hold to {worst:.0e}"
         if not worst <= OPTIMAL:
             complete = False
             reason += ", which is no law: the program is too ill-conditioned"
+        regions = tuple(in_all_parameters(p.given.parameters, r) for r in found)
         total = float(sum(r.volume for r in regions))
         seconds = time.perf_counter() - search.begun
-        return cls(mpc, regions, complete, total, reason, seconds)
+        window = None
+        if p.window.open:
+            window = np.array([p.window.lower, p.window.upper])
+            complete = complete and search.seen <= 1 / ROOM
+            reason += f"; its vertices lie in {search.seen:.1e} of a window onto the unbounded set"
+        free = tuple(p.given.parameters.free.tolist())
+        return cls(problem, regions, complete, total, reason, seconds, free, window)
+
+    @property
+    def mpc(self) -> MPC:
+        """Return the MPC problem; ValueError where the regions are of a ParametricQP."""
+        if not isinstance(self.problem, MPC):
+            fail("regions", "are those of a ParametricQP", "Give the regions of an MPC problem")
+        return self.problem
 
     def __len__(self) -> int:
         return len(self.regions)
@@ -108,16 +142,24 @@ class CriticalRegions:
             f"CriticalRegions: {len(self)} regions {what}, volume {self.volume:.6g}; {self.reason}"
         )
 
-    def find(self, x0s: Reals, tolerance: float = 1e-9) -> np.ndarray:
-        """Return the index (B,) of the region that holds each state x0s (B, p), −1 where none does.
+    @property
+    def tied(self) -> bool:
+        """Return whether equalities tie parameters to each other: regions have no volume then."""
+        return len(self.free) < self.problem.dimension
 
-        tolerance: how far outside all regions a state may lie, relative to the width of X_N across
+    def find(self, x0s: Reals, tolerance: float = 1e-9) -> np.ndarray:
+        """Return the index (B,) of the region that holds each θ of x0s (B, p), −1 where none does.
+
+        tolerance: how far outside all regions a θ may lie, relative to the width of X_N across
         the facet that it exceeds.
         """
         x = self._states(x0s)
         H, h, starts = self.facets
         answer = np.full(len(x), -1)
         finite = np.flatnonzero(np.all(np.isfinite(x), axis=1))
+        if not len(h):  # one region that is all of R^p
+            answer[finite] = 0
+            return answer
         for i in range(0, len(finite), 256):
             chunk = finite[i : i + 256]
             beyond = np.maximum.reduceat((x[chunk] @ H.T - h) / self._widths, starts, axis=1)
@@ -126,17 +168,27 @@ class CriticalRegions:
         return answer
 
     def plan(self, x0s: Reals) -> np.ndarray:
-        """Return optimal decisions z (B, nz) at states x0s (B, p); NaN where no region holds a
-        state."""
+        """Return optimal z (B, nz) at the parameters x0s (B, p); NaN where no region holds them."""
         return self._evaluate(x0s, [(region.Z, region.z0) for region in self.regions])
 
     def law(self, x0s: Reals) -> np.ndarray:
-        """Return first inputs u_0 (B, m) at states x0s (B, p); NaN where no region holds a
-        state."""
+        """Return the law (B, m) at the parameters x0s (B, p): first inputs u_0 of an MPC; NaN where
+        no region holds them."""
         return self._evaluate(x0s, [(region.K, region.k) for region in self.regions])
 
+    def value(self, x0s: Reals) -> np.ndarray:
+        """Return the least cost (B,) at the parameters x0s (B, p), NaN where no region holds them:
+        a piecewise quadratic function."""
+        x, where = self._states(x0s), self.find(x0s)
+        values = np.full(len(x), np.nan)
+        for i in np.unique(where[where >= 0]):
+            region, here = self.regions[i], x[where == i]
+            values[where == i] = (here @ region.V / 2 * here).sum(axis=1) + here @ region.v
+            values[where == i] += region.v0
+        return values
+
     def _evaluate(self, x0s: Reals, laws: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """Return gain x + offset of the region that holds each state."""
+        """Return gain x + offset of the region that holds each θ."""
         x, where = self._states(x0s), self.find(x0s)
         values = np.full((len(x), len(laws[0][1])), np.nan)
         for i in np.unique(where[where >= 0]):
@@ -145,7 +197,7 @@ class CriticalRegions:
         return values
 
     def _states(self, x0s: Reals) -> np.ndarray:
-        x, p = np.asarray(x0s, np.float64), self.mpc.dimension
+        x, p = np.asarray(x0s, np.float64), self.problem.dimension
         if x.ndim != 2 or x.shape[1] != p:
             fail("x0s", f"shape {x.shape}", f"Give states (B, {p})")
         return x
@@ -159,44 +211,58 @@ class CriticalRegions:
 
     @cached_property
     def _widths(self) -> np.ndarray:
-        """Return the width of X_N across each facet."""
+        """Return the width of X_N across each facet; across a fixed parameter its size."""
         points = np.concatenate([region.vertices for region in self.regions])
-        return np.abs(self.facets[0]) @ np.ptp(points, axis=0)
+        normals = np.abs(self.facets[0])
+        width, size = normals @ np.ptp(points, axis=0), normals @ np.abs(points).max(axis=0)
+        return np.where(width > ROUNDING * size, width, np.where(size > 0, size, 1.0))
 
 
 def critical_regions(
-    mpc: MPC,
+    problem: MPC | ParametricQP,
+    within: Box | Polytope | None = None,
     *,
     max_regions: int = 5000,
-    within: Box | Polytope | None = None,
     seconds: float = np.inf,
 ) -> CriticalRegions:
-    """Return all critical regions of positive volume of the MPC problem (multiparametric QP).
+    """Return all critical regions of positive volume of a multi-parametric QP.
 
-    The state is x, or (x, u_{−1}) with u_{−1} within `mpc.inputs` where input rates matter, as for
-    `feasible_polytope`. Equalities that rows imply, as two opposite ones do, are taken out first.
+    problem: a `ParametricQP`, or an MPC problem, whose parameters are the state x, or (x, u_{−1})
+    with u_{−1} within `mpc.inputs` where input rates matter, as for `feasible_polytope`;
+    `parametric_qp` makes references parameters. within: the set of parameters that matter, None
+    for all. Equalities that rows imply, as two opposite ones do, are taken out first; where they
+    tie parameters to each other, regions are those of the parameters that are left free. The set
+    may be unbounded.
 
-    max_regions: the most regions to look for. within: the set of initial states, needed where the
-    feasible set X_N is unbounded. seconds: after which the search stops (some linear programs and
-    the hull of all vertices are finished; in five and six dimensions that may take long). The
-    search crosses every facet of every region: a row that becomes active joins the active set, a
-    multiplier that vanishes leaves it, and where the new row depends on the others each of those
-    that the dual ratio test may drop is tried; what this leaves open is found by solving the QP
-    just behind the facet. `complete` does not rest on the search having ended but on the volumes
-    (see `CriticalRegions`). NumPy in float64; not traceable.
+    max_regions: the most regions to look for. seconds: after which the search stops (some linear
+    programs and the hull of all vertices are finished; in five and six dimensions that may take
+    long). The search crosses every facet of every region: a row that becomes active joins the
+    active set, a multiplier that vanishes leaves it, and where the new row depends on the others
+    each of those that the dual ratio test may drop is tried; what this leaves open is found by
+    solving the QP just behind the facet. `complete` does not rest on the search having ended but
+    on the volumes (see `CriticalRegions`). NumPy in float64; not traceable.
 
     Raises ValueError for ill-posed problems, soft rows or an ellipsoidal terminal set (their
-    laws are not piecewise affine in this form), and where X_N is empty, flat or unbounded.
+    laws are not piecewise affine in this form), where P leaves the optimum open, and where X_N is
+    empty or flat.
 
     Sources: Bemporad, Morari, Dua & Pistikopoulos 2002, Automatica 38; Tøndel, Johansen &
     Bemporad 2003, Automatica 39 (crossing facets by active sets); Lawson & Hanson 1974, ch. 23
     (least distance by NNLS).
     """
     deadline = time.monotonic() + seconds
-    mpc.validate()
-    if mpc.soft:
+    require_kind("problem", problem, MPC, ParametricQP)
+    problem.validate()
+    if isinstance(problem, MPC) and problem.soft:
         fail("mpc.soft", "has rows, and slacks make another QP", "Make the rows hard first")
-    return CriticalRegions.of(mpc, explore(least_distance_form(mpc, within), max_regions, deadline))
+    reach = REACH
+    for _ in range(WINDOWS):
+        search = explore(least_distance_form(problem, within, reach), max_regions, deadline)
+        seen = search.seen
+        if seen <= 1 / ROOM or search.full:
+            break
+        reach *= max(4.0, 2 * ROOM * seen)
+    return CriticalRegions.of(problem, search)
 
 
 # --- The search, across facets ----------------------------------------------------------
@@ -218,6 +284,18 @@ class RegionSearch:
     def full(self) -> bool:
         """Return True once there are `max_regions`, or the deadline."""
         return len(self.found) >= self.max_regions or self.late
+
+    @property
+    def seen(self) -> float:
+        """Return how far the vertices of all regions lie from the point inside, relative to the
+        window; 0 for a bounded set."""
+        p, found = self.p, [0.0]
+        for c in self.found if p.window.open else ():
+            vertices = c.vertices
+            if any(np.all(p.row[rows] == -2) for rows in c.behind):
+                vertices = far_vertices(p, c.law.active)
+            found.append(p.window.fraction(p.center + vertices * p.size))
+        return max(found)
 
     @property
     def late(self) -> bool:
@@ -332,7 +410,7 @@ def explore(p: LeastDistanceForm, max_regions: int, deadline: float = np.inf) ->
     `time.monotonic`, and return it."""
     max_regions = whole("max_regions", max_regions, 1)
     if len(p.center) > DIMENSIONS:
-        what = f"its states have {len(p.center)} coordinates, too many for vertices"
+        what = f"has {len(p.center)} parameters, too many for vertices"
         cure = f"Regions serve up to {DIMENSIONS}; exact_penalty(method='samples') serves more"
         fail("mpc", what, cure)
     search = RegionSearch(p, max_regions, deadline)
@@ -377,9 +455,8 @@ def exchange(
 
 
 def region(p: LeastDistanceForm, c: Cell) -> Region:
-    """Return a cell in the coordinates of x, with the law of z, the multipliers and the first
-    input."""
-    n, rows = len(p.center), list(c.law.active)
+    """Return a cell in the free parameters x, with the laws of z, the multipliers and the value."""
+    n, rows, given = len(p.center), list(c.law.active), p.given
     L, l0 = p.in_states(c.law.multipliers)
     Y, y0 = p.in_states(c.law.y)
     W = np.linalg.solve(p.factor.T, Y - p.shift[:, :n])
@@ -388,13 +465,17 @@ def region(p: LeastDistanceForm, c: Cell) -> Region:
     Z, z0 = S + N @ W, p.hull.shift[n:] + N @ w0
     sign = p.side[rows] / p.length[rows]
     L, l0 = sign[:, None] * L, sign * l0
-    H, h = c.H / p.size, c.h + c.H / p.size @ p.center
+    # The sides of the window are no facets.
+    own = [i for i, behind in enumerate(c.behind) if np.any(p.row[behind] != -2)]
+    H, h = c.H[own] / p.size, c.h[own] + c.H[own] / p.size @ p.center
     vertices = p.center + c.vertices * p.size
-    condensed, active = p.condensed, p.row[rows]
+    active = p.row[rows]
     if p.hull.equal.any():
         tied, both = of_equalities(p, active, np.column_stack([L, l0]), Z, z0, vertices)
         active = np.append(active, tied)
         L, l0 = np.vstack([L, both[:, :-1]]), np.append(l0, both[:, -1])
+    PZ, alone = given.P @ Z, given.alone
+    ends = len(own) < len(c.h)
     return Region(
         rows=active,
         also_active=p.row[list(c.law.also_active)],
@@ -402,11 +483,36 @@ def region(p: LeastDistanceForm, c: Cell) -> Region:
         z0=z0,
         L=L,
         l0=l0,
-        K=np.asarray(condensed.Psi[0] + condensed.Omega[0] @ Z),
-        k=np.asarray(condensed.Omega[0] @ z0 + condensed.psi[0]),
+        K=given.output.direct + given.output.gain @ Z,
+        k=given.output.gain @ z0 + given.output.constant,
+        V=Z.T @ PZ + Z.T @ given.F + given.F.T @ Z + alone.Y,
+        v=PZ.T @ z0 + Z.T @ given.f + given.F.T @ z0 + alone.y,
+        v0=float(z0 @ (given.P @ z0 / 2 + given.f) + alone.c),
         polytope=Polytope(*unit_rows(H, h)),
         vertices=vertices,
-        volume=hull_volume(c.vertices, thin=True) * float(np.prod(p.size)),
+        volume=np.inf if ends else hull_volume(c.vertices, thin=True) * float(np.prod(p.size)),
+    )
+
+
+def in_all_parameters(free: FreeParameters, r: Region) -> Region:
+    """Return a region of the free parameters x as one of all parameters θ."""
+    if not free.tied:
+        return r
+    p, index = len(free.shift), free.free
+    V, v = np.zeros((p, p)), np.zeros(p)
+    V[np.ix_(index, index)], v[index] = r.V, r.v
+    rows = np.vstack([free.widened(np.asarray(r.polytope.H)), free.rows, -free.rows])
+    return replace(
+        r,
+        Z=free.widened(r.Z),
+        L=free.widened(r.L),
+        K=free.widened(r.K),
+        V=V,
+        v=v,
+        polytope=Polytope(
+            *unit_rows(rows, np.concatenate([r.polytope.h, free.offsets, -free.offsets]))
+        ),
+        vertices=free.shift + r.vertices @ free.basis.T,
     )
 
 
@@ -423,9 +529,10 @@ def of_equalities(
     They balance what is left of the gradient, E'y = −(P z + F x + f + C_a'y_a). One-sided rows that
     imply equalities have E'ν = 0 for some ν > 0: so much of ν is added that y ≥ 0 on the region.
     """
-    c, given = p.condensed, p.given
+    given = p.given
     usable = np.flatnonzero(p.hull.equal & (given.row >= 0))
-    left = -(c.P @ np.column_stack([Z, z0]) + np.column_stack([c.F, c.f]) + c.C[active].T @ L)
+    left = given.P @ np.column_stack([Z, z0]) + np.column_stack([given.F, given.f])
+    left = -(left + given.coefficients[active].T @ L)
     row, column = scaling(given.C[usable], np.zeros(len(usable)))
     E = row[:, None] * given.C[usable] * column
     y = np.linalg.lstsq(E.T, column[:, None] * left, rcond=1e-10)[0]
@@ -439,34 +546,43 @@ def of_equalities(
     return rows, np.array([y[given.row[usable] == i].sum(axis=0) for i in rows])
 
 
-def residual(given: GivenProgram, r: Region) -> float:
+def residual(p: LeastDistanceForm, r: Region) -> float:
     """Return the largest residual of the optimality conditions of the program as given at the
     vertices of a region, each relative to the size of its terms.
 
     All four conditions are affine in x under the region's law, so that its vertices stand for it.
     """
-    c, x = given.condensed, r.vertices
+    x, given = r.vertices, p.given
     z, y = x @ r.Z.T + r.z0, x @ r.L.T + r.l0
     # In columns of like size, with entries that are rounding beside those of their row left out.
-    size_z = np.abs(z).max(axis=0)
+    # An optimum may be zero: it is the difference of terms as large as the unconstrained one, and
+    # where this is zero too, rounding is relative to the limits.
+    one = np.column_stack([x, np.ones(len(x))])
+    free = np.abs(np.linalg.solve(p.factor.T, p.shift @ one.T)) if len(p.factor) else p.factor
+    basis = np.abs(p.hull.basis[x.shape[1] :, x.shape[1] :])
+    size_z = np.abs(z).max(axis=0) + (basis @ free).max(axis=1, initial=0.0)
+    limits = given.program.column[x.shape[1] :]
+    size_z = np.where(size_z > ROUNDING * limits, size_z, limits)
     terms = np.abs(given.C) @ size_z + np.abs(given.D) @ np.abs(x).max(axis=0) + np.abs(given.b)
     terms = np.where(terms > 0, terms, 1.0)
     gap = (z @ given.C.T + x @ given.D.T - given.b) / terms
     primal = gap.max(initial=0.0)
-    total = np.zeros((len(x), len(c.C)))
+    coefficients = given.coefficients
+    total = np.zeros((len(x), len(coefficients)))
     np.add.at(total.T, r.rows, y.T)
-    gradient = z @ c.P.T + x @ c.F.T + c.f + total @ c.C
-    parts = np.abs(z) @ np.abs(c.P) + np.abs(x) @ np.abs(c.F).T + np.abs(c.f)
-    parts = (parts + np.abs(total) @ np.abs(c.C)).max(axis=0)
-    dual = (np.abs(gradient) / np.where(parts > 0, parts, 1.0)).max(initial=0.0)
-    # y > 0 only on an upper bound that is met, y < 0 only on a lower one.
-    load = np.abs(total).max(axis=0)
-    load = np.where(load > 0, load, 1.0)
+    gradient = z @ given.P.T + x @ given.F.T + given.f + total @ coefficients
+    parts = size_z @ np.abs(given.P) + np.abs(x).max(axis=0) @ np.abs(given.F).T + np.abs(given.f)
+    parts = parts + np.abs(total).max(axis=0) @ np.abs(coefficients)
+    parts = np.where(parts > 0, parts, 1.0)
+    dual = (np.abs(gradient) / parts).max(initial=0.0)
+    # y > 0 only on an upper bound that is met, y < 0 only on a lower one: or so small that the
+    # gradient does without.
+    share = (np.abs(coefficients) / parts).max(axis=1, initial=0.0)
     wrong = 0.0
     for side in (1.0, -1.0):
         mine = (given.side == side) & (given.row >= 0)
-        met = np.zeros(len(c.C), bool)
+        met = np.zeros(len(coefficients), bool)
         met[given.row[mine]] = np.abs(gap[:, mine]).max(axis=0) <= OPTIMAL
-        pushed = np.maximum(side * total, 0.0) / load
+        pushed = np.maximum(side * total, 0.0) * share
         wrong = max(wrong, pushed[:, ~met].max(initial=0.0))
     return float(max(primal, dual, wrong))
