@@ -17,13 +17,20 @@ independent rows; so regions where rows are dependent (duplicates, apexes of a l
 without overlap, and rows that vanish identically are decided by their first order in δ.
 """
 
+import contextlib
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import nnls
 
 from jaxmpc.checks import fail
-from jaxmpc.explicit.parametric_qp import Output, ParametricQP, Quadratic, cost_of_parameters
+from jaxmpc.explicit.parametric_qp import (
+    Output,
+    ParametricQP,
+    Quadratic,
+    cost_of_parameters,
+    in_numpy,
+)
 from jaxmpc.mpc.condense import Inequalities, condensed_in_float64
 from jaxmpc.mpc.problem import MPC
 from jaxmpc.pytrees import record
@@ -135,10 +142,12 @@ class LeastDistanceForm:
         """Return the slack (r, n + 2) of all rows under y, and the size (r,) of its terms, for
         rounding.
 
-        Not from the multipliers: these are large, and cancel, where rows are nearly dependent.
+        Not from the multipliers: these are large, and cancel, where rows are nearly dependent. The
+        entries of y are rounded relative to its length, not each to its own.
         """
         data = np.column_stack([self.V, self.v, self.epsilon])
-        slack, terms = data - self.M @ y, np.abs(data) + np.abs(self.M) @ np.abs(y)
+        length = np.linalg.norm(self.M, axis=1)[:, None] * np.linalg.norm(y, axis=0)
+        slack, terms = data - self.M @ y, np.abs(data) + length
         slack[list(active)] = 0.0
         return slack, terms[:, :-1].sum(axis=1)
 
@@ -264,20 +273,18 @@ class GivenProgram(NamedTuple):
         """Return the program of a problem, all rows hard, on X_N or on X_N ∩ within."""
         p, (H, h) = problem.dimension, unit_half_spaces("within", within, problem.dimension)
         if isinstance(problem, ParametricQP):
-            q = problem.in_numpy()
+            q = in_numpy(problem)
             C, D, b = q.G, -q.S, q.h
             row, side, coefficients = np.arange(len(b)), np.ones(len(b)), C
-            cost, alone, output = (q.P, q.F, q.q), Quadratic(q.Y, q.y, q.c), q.output
+            P, F, f, alone, output = q.P, q.F, q.q, q.alone, q.output
         else:
             c = condensed_in_float64(problem)
             if c.balls:
                 fail("terminal_set", "is an ellipsoid: its law is not affine", "Give a Polytope")
             C, D, b, row, side = Inequalities.of(c)
-            coefficients, cost = c.C, (c.P, c.F, c.f)
-            alone, output = (
-                cost_of_parameters(problem, c)[2],
-                Output(c.Omega[0], c.Psi[0], c.psi[0]),
-            )
+            coefficients, P, F, f = (np.asarray(part) for part in (c.C, c.P, c.F, c.f))
+            alone = cost_of_parameters(problem, c)[2]
+            output = Output(*(np.asarray(part[0]) for part in (c.Omega, c.Psi, c.psi)))
             if problem.input_in_state and problem.inputs is not None:  # one that was applied
                 H_u, h_u = unit_half_spaces("inputs", problem.inputs, problem.system.m)
                 H_u = np.pad(H_u, ((0, 0), (problem.system.n, 0)))
@@ -289,7 +296,7 @@ class GivenProgram(NamedTuple):
         C, D, b, row, side = C[able], D[able], b[able], row[able], side[able]
         program = Program(np.hstack([D, C]), b)
         free = FreeParameters.all(p)
-        return cls(*cost, C, D, b, row, side, coefficients, alone, output, free, program)
+        return cls(P, F, f, C, D, b, row, side, coefficients, alone, output, free, program)
 
     def within(self, window: "Window") -> "GivenProgram":
         """Return the program with the rows of a window."""
@@ -325,7 +332,8 @@ class GivenProgram(NamedTuple):
         if not rank:
             return self
         if rank == n:
-            fail("within", "and the rows leave one value of the parameters", "Solve that one QP")
+            what = "leaves, with the rows, one value of the parameters"
+            fail("within", what, "Solve that one QP")
         rows = np.where(np.abs(Vt[:rank]) <= 1e-14, 0.0, Vt[:rank])
         offsets = rows @ np.linalg.lstsq(both[:, :n], both[:, n], rcond=FLAT)[0]
         basis, free = plain_null_space(rows)
@@ -432,11 +440,8 @@ def least_distance_form(
         factor = np.linalg.cholesky(N.T @ given.P @ N)
     except np.linalg.LinAlgError:
         if mpc:
-            fail(
-                "R",
-                "leaves the condensed cost singular in float64",
-                "Put a larger weight on inputs",
-            )
+            what = "leaves the condensed cost singular in float64"
+            fail("R", what, "Put a larger weight on inputs")
         what = "is singular in float64 where rows leave z free: the optimum is not unique"
         fail("P", what, "Add a small multiple of the unit matrix")
     G, V, v = hull.G[:, n:], -hull.G[:, :n], hull.g
@@ -647,7 +652,9 @@ def interior(H: np.ndarray, h: np.ndarray, far: float = 2.0) -> tuple[np.ndarray
     points = middle + hull.intersections * scale
     for i, meeting in enumerate(hull.dual_facets):
         if len(meeting) == n:
-            points[i] = np.linalg.solve(H[meeting], h[meeting])
+            with contextlib.suppress(np.linalg.LinAlgError):
+                points[i] = np.linalg.solve(H[meeting], h[meeting])
+    points = points[np.all(np.isfinite(points), axis=1)]
     return points[distinct(points, 1e-7 * radius)], radius
 
 

@@ -199,10 +199,10 @@ def softened(p: LeastDistanceForm, table: tuple[Row, ...]) -> np.ndarray:
 def is_sufficient(mpc: MPC, value: float, exact: bool, rho: float | None) -> bool | None:
     """Return whether the weight rho (None: those of the soft rows) is exact; None where unknown."""
     soft = as_tuple("soft", mpc.soft, Soft)
-    weights = [np.ravel(np.asarray(s.rho, float)) for s in soft] if rho is None else [[rho]]
-    if not weights:
+    given = [np.ravel(np.asarray(s.rho, float)) for s in soft] if rho is None else [np.array([rho])]
+    if not given:
         return None
-    weights = np.concatenate(weights)
+    weights = np.concatenate(given)
     # Rows may have weights of their own: the least decides for, the greatest against.
     if exact and weights.min() >= value * (1 - ROUNDING):
         return True

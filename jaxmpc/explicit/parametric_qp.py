@@ -41,6 +41,19 @@ class Quadratic(NamedTuple):
         return Quadratic(basis.T @ self.Y @ basis, basis.T @ slope, float(constant))
 
 
+class ProgramArrays(NamedTuple):
+    """The fields of a `ParametricQP` as arrays; alone: what the cost has in θ alone."""
+
+    P: np.ndarray
+    q: np.ndarray
+    F: np.ndarray
+    G: np.ndarray
+    h: np.ndarray
+    S: np.ndarray
+    alone: Quadratic
+    output: Output
+
+
 @record
 class ParametricQP:
     """The multi-parametric QP
@@ -133,26 +146,29 @@ class ParametricQP:
             require_shape(f"output: {name}", part, shape, "k rows each, k that of the constant")
             require_finite(f"output: {name}", part)
 
-    def in_numpy(self) -> "ParametricQP":
-        """Return the program with all fields as arrays of float64, zeros for None."""
-        nz, p, r = np.shape(self.P)[0], self.dimension, np.shape(self.G)[0]
-        shapes = {"q": nz, "F": (nz, p), "S": (r, p), "Y": (p, p), "y": p}
-        filled = {
-            name: np.zeros(shape)
-            if getattr(self, name) is None
-            else host_array(name, getattr(self, name))
-            for name, shape in shapes.items()
-        }
-        given = {name: host_array(name, getattr(self, name)) for name in ("P", "G", "h")}
-        given["P"] = (given["P"] + given["P"].T) / 2
-        filled["Y"] = (filled["Y"] + filled["Y"].T) / 2
-        output = (np.eye(nz), np.zeros((nz, p)), np.zeros(nz))
-        if self.output is not None:
-            gain, direct, constant = (host_array("output", part) for part in self.output)
-            output = gain, direct, constant
-        return ParametricQP(
-            **given, **filled, c=float(self.c), output=Output(*output), names=self.names
-        )
+
+def in_numpy(qp: ParametricQP) -> ProgramArrays:
+    """Return all fields of a program as arrays of float64, zeros for None."""
+    nz, p, r = np.shape(qp.P)[0], qp.dimension, np.shape(qp.G)[0]
+
+    def filled(name: str, *shape: int) -> np.ndarray:
+        value = getattr(qp, name)
+        return np.zeros(shape) if value is None else host_array(name, value)
+
+    P, Y = host_array("P", qp.P), filled("Y", p, p)
+    output = Output(np.eye(nz), np.zeros((nz, p)), np.zeros(nz))
+    if qp.output is not None:
+        output = Output(*(host_array("output", part) for part in qp.output))
+    return ProgramArrays(
+        P=(P + P.T) / 2,
+        q=filled("q", nz),
+        F=filled("F", nz, p),
+        G=host_array("G", qp.G),
+        h=host_array("h", qp.h),
+        S=filled("S", r, p),
+        alone=Quadratic((Y + Y.T) / 2, filled("y", p), float(qp.c)),
+        output=output,
+    )
 
 
 def parametric_qp(
@@ -177,11 +193,10 @@ def parametric_qp(
     n, m = mpc.system.n, mpc.system.m
     given = [v for v in (reference, input_reference) if v is not None]
     k = np.shape(given[0])[1] if given and np.ndim(given[0]) == 2 else 0
-    of_states, of_inputs = (
-        np.zeros((size, k)) if value is None else host_array(name, value)
-        for name, value, size in (("reference", reference, n),
-                                  ("input_reference", input_reference, m))
-    )  # fmt: skip
+    of_states = np.zeros((n, k)) if reference is None else host_array("reference", reference)
+    of_inputs = np.zeros((m, k))
+    if input_reference is not None:
+        of_inputs = host_array("input_reference", input_reference)
     for name, value, size in (("reference", of_states, n), ("input_reference", of_inputs, m)):
         require_shape(name, value, (size, k), "Give a matrix, one column an entry of r")
         require_finite(name, value)
@@ -234,12 +249,12 @@ def cost_of_parameters(
         before = np.zeros((1, m, p))
         before[0, :, n:] = np.eye(m)
         none = np.zeros((1, m, c.P.shape[0])), before, np.zeros((1, m))
-        E, T, t = (
-            M - np.concatenate([first, M[:-1]])
+        change = [
+            np.asarray(M) - np.concatenate([first, M[:-1]])
             for M, first in zip((c.Omega, c.Psi, c.psi), none, strict=True)
-        )
+        ]
         W = np.broadcast_to(np.asarray(c.weights.W), (N, m, m))
-        terms.append((W, E, track(T, np.zeros((m, k))), t))
+        terms.append((W, change[0], track(change[1], np.zeros((m, k))), change[2]))
     nz, d = c.P.shape[0], p + k
     q, F, Y, y, constant = np.zeros(nz), np.zeros((nz, d)), np.zeros((d, d)), np.zeros(d), 0.0
     for W, E, T, t in terms:

@@ -368,9 +368,12 @@ class RegionSearch:
             if self.full:
                 return False, f"stopped at the limit of {self.max_regions} regions"
             points = np.concatenate([c.vertices for c in self.found])
-            volumes = sum(hull_volume(c.vertices, thin=True) for c in self.found)
-            whole = hull_volume(points, thin=True)
-            hull = Polytope.from_points(points)
+            try:
+                volumes = sum(hull_volume(c.vertices, thin=True) for c in self.found)
+                whole = hull_volume(points, thin=True)
+                hull = Polytope.from_points(points)
+            except ValueError as error:
+                return False, f"the hull of all regions is not found ({error})"
             tops = [self.p.support(a) for a in np.asarray(hull.H) if not self.late]
             if self.late:
                 continue
@@ -558,9 +561,10 @@ def residual(p: LeastDistanceForm, r: Region) -> float:
     # An optimum may be zero: it is the difference of terms as large as the unconstrained one, and
     # where this is zero too, rounding is relative to the limits.
     one = np.column_stack([x, np.ones(len(x))])
-    free = np.abs(np.linalg.solve(p.factor.T, p.shift @ one.T)) if len(p.factor) else p.factor
+    free = np.abs(np.linalg.solve(p.factor.T, p.shift @ one.T))
     basis = np.abs(p.hull.basis[x.shape[1] :, x.shape[1] :])
-    size_z = np.abs(z).max(axis=0) + (basis @ free).max(axis=1, initial=0.0)
+    reach: np.ndarray = basis @ free
+    size_z = np.abs(z).max(axis=0) + reach.max(axis=1, initial=0.0)
     limits = given.program.column[x.shape[1] :]
     size_z = np.where(size_z > ROUNDING * limits, size_z, limits)
     terms = np.abs(given.C) @ size_z + np.abs(given.D) @ np.abs(x).max(axis=0) + np.abs(given.b)
@@ -578,11 +582,11 @@ def residual(p: LeastDistanceForm, r: Region) -> float:
     # y > 0 only on an upper bound that is met, y < 0 only on a lower one: or so small that the
     # gradient does without.
     share = (np.abs(coefficients) / parts).max(axis=1, initial=0.0)
-    wrong = 0.0
+    wrong = [0.0]
     for side in (1.0, -1.0):
         mine = (given.side == side) & (given.row >= 0)
         met = np.zeros(len(coefficients), bool)
         met[given.row[mine]] = np.abs(gap[:, mine]).max(axis=0) <= OPTIMAL
         pushed = np.maximum(side * total, 0.0) * share
-        wrong = max(wrong, pushed[:, ~met].max(initial=0.0))
-    return float(max(primal, dual, wrong))
+        wrong.append(float(np.max(pushed[:, ~met], initial=0.0)))
+    return float(max(primal, dual, *wrong))

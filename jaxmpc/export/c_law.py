@@ -122,6 +122,10 @@ def export_explicit_c(
     if not regions.complete:
         cure = "Raise max_regions or seconds"
         fail("regions", f"are not all of the law ({regions.reason})", cure)
+    if regions.window is not None or regions.tied:
+        what = "unbounded" if regions.window is not None else "flat"
+        cure = "Give critical_regions a bounded set within that has volume"
+        fail("regions", f"are those of a feasible set that is {what}", cure)
     vertices = [region.vertices for region in regions.regions]
     size = float(np.ptp(np.concatenate(vertices), axis=0).max())
     facets = Facets.of(regions, size)

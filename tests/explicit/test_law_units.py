@@ -240,8 +240,14 @@ def test_a_constant_state_is_no_reason_to_be_undecided():
     np.testing.assert_array_equal(labels, jm.map_feasible_set(with_drift, POINTS).label)
     with pytest.raises(ValueError, match="flat"):
         jm.feasible_polytope(mpc)
-    with pytest.raises(ValueError, match="flat: .* as equalities tie the states"):
-        critical_regions(mpc)
+    regions, plain = critical_regions(mpc), critical_regions(with_drift)
+    assert regions.complete and regions.free == (0, 1) and len(regions) == len(plain)
+    assert regions.volume == pytest.approx(plain.volume, rel=1e-9)
+    law = regions.law(np.column_stack([POINTS, np.ones(64)]))
+    np.testing.assert_allclose(law, plain.law(POINTS), atol=1e-9)
+    assert np.isnan(regions.law(np.column_stack([POINTS, 1.1 * np.ones(64)]))).all()
+    with pytest.raises(ValueError, match="flat, as equalities tie the states"):
+        jm.explicit.exact_penalty(mpc)
 
 
 def test_invariant_sets_with_coupled_inputs():
@@ -325,7 +331,7 @@ def test_a_law_starts_at_random_points_where_the_centre_is_degenerate():
 def test_no_limits_of_the_states_is_unbounded_not_empty():
     mpc = integrator(states=None, terminal_set=None)
     with pytest.raises(ValueError, match="unbounded along coordinate 0"):
-        critical_regions(mpc)
+        jm.explicit.exact_penalty(mpc)
     empty = integrator(terminal_set=jm.Box([8, 8], [9, 9]))
     with pytest.raises(ValueError, match="is empty"):
         critical_regions(empty)
