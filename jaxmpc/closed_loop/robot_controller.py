@@ -2,6 +2,7 @@
 by linear models."""
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import field, replace
 from functools import partial
 from typing import Any
@@ -12,11 +13,11 @@ import numpy as np
 from jax import Array
 
 from jaxmpc.arrays import Reals, as_weight
-from jaxmpc.checks import fail, whole
+from jaxmpc.checks import concrete, fail, whole
 from jaxmpc.closed_loop.feedback import first_row, one_state
 from jaxmpc.mpc.controller import Controller, zeros_of
 from jaxmpc.mpc.plan import Control, Plan, WarmStart, anchored, applied, limited
-from jaxmpc.mpc.problem import MPC, soften
+from jaxmpc.mpc.problem import MPC, Outputs, Soft, as_tuple, soften
 from jaxmpc.mpc.rows import layout
 from jaxmpc.mpc.stagewise.nonlinear import NonlinearMPC, Task, task_layout
 from jaxmpc.mpc.stagewise.solve import factor_stages, solve_stagewise
@@ -26,6 +27,7 @@ from jaxmpc.qp.admm import ADMM, DEFAULT
 from jaxmpc.qp.linalg import arrays, floating_dtype
 from jaxmpc.robots.description import host_coordinates
 from jaxmpc.robots.equilibria import settled
+from jaxmpc.robots.force_limits import ForceLimits, force_limits, stopping_limits
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot, RobotModel
 from jaxmpc.sets.convex_sets import Box
@@ -62,7 +64,9 @@ def robot_mpc(
             where the set-point does not rest: no cost to go is finite there; or P (n, n), None.
         exact: which model, see `Robot.linearize`.
         fields: of `MPC`, in place of the defaults here: state limits at k = 1 … N (no input moves
-            x_0), no terminal set.
+            x_0), no terminal set. `outputs` join the limits of forces that the file has beside
+            those of inputs (`forcerange` of servos, `actuatorfrcrange`), and at k = 0 and N that
+            these can stop the joints inside their limits.
 
     Track the target with reference = robot.coordinates(x) and input_reference = u of
     `robot.equilibrium(target)`, or of `robot.set_point()`. Raises ValueError as MPC and
@@ -94,8 +98,25 @@ def robot_mpc(
         terminal_cost = _terminal_cost(system, np.asarray(Q), R, names) if rests else None
     usual = {"constrained_stages": tuple(range(1, horizon + 1)), "terminal_cost": terminal_cost}
     mpc = replace(mpc, **{**usual, **fields})
+    if isinstance(robot, Robot):
+        added = _limits_of_forces(robot, x, u, states, horizon)
+        mpc = replace(mpc, outputs=(*as_tuple("outputs", mpc.outputs, Outputs), *added))
     mpc.validate()
     return mpc
+
+
+def _limits_of_forces(
+    robot: Robot, x: np.ndarray, u: np.ndarray, states: Box, horizon: int
+) -> Iterator[Outputs]:
+    """Yield the limits of forces at all stages, and at the first and the last what they need to
+    stop: no input moves x_0, but a plan from where nothing stops the robot says so."""
+    forces = force_limits(robot, x, u)
+    if forces is None:
+        return
+    yield replace(forces, stages=tuple(range(horizon)))
+    stopping = stopping_limits(robot, x[: robot.mujoco.nq], states)
+    if stopping is not None:
+        yield replace(stopping, stages=(0, horizon))
 
 
 def _weights(robot: Robot | LinearPlant, Q: Reals | None, R: Reals | None) -> tuple[Reals, Reals]:
@@ -219,7 +240,8 @@ class RobotController:
     rho: L1 weight (cost per unit) with which state limits and terminal rows are soft. Where it
       exceeds the multipliers of the hard problem, plans keep the limits whenever the model can
       (exact penalty), and elsewhere trade violations against the cost by that weight. Each such
-      plan is counted: `Run.fallback`. Input limits are hard.
+      plan is counted: `Run.fallback`. Input limits are hard. Limits of forces (`robot_mpc`) weigh
+      100 times as much a unit of the input, for the plant keeps them against any plan.
 
     `controller(x, before, reference, input_reference=)` as `Controller`, x (nq + nv,) the state of
     the robot, references in its coordinates (see `robot.trajectory`). `start` gives the first
@@ -355,6 +377,27 @@ def as_model(robot: Any, exact: bool = True) -> Any:
     return RobotModel(robot, exact=exact) if isinstance(robot, Robot) else robot
 
 
+# How much more than a violated limit of a state a violated limit of a force costs.
+_FORCES = 100
+
+
+def _softened(mpc: MPC, rho: Reals) -> MPC:
+    """Return the problem with soft state limits, outputs and terminal rows, and limits of forces
+    that weigh more."""
+    outputs = as_tuple("outputs", mpc.outputs, Outputs)
+    others = tuple(rows for rows in outputs if not isinstance(rows, ForceLimits))
+    soft = soften(replace(mpc, outputs=others), rho)
+    heavy, xp = [], np if concrete(rho) else jnp
+    for rows in outputs:
+        if isinstance(rows, ForceLimits):
+            of_inputs, of_states = (np.abs(part).max(axis=1) for part in (rows.D, rows.C))
+            size = np.where(of_inputs > 0, of_inputs, of_states)
+            names = rows.stages, rows.names, rows.units
+            weight = _FORCES * xp.max(rho) / size
+            heavy.append(Soft(rows.C, rows.lower, rows.upper, weight, 0.0, rows.D, *names))
+    return replace(soft, soft=(*as_tuple("soft", soft.soft, Soft), *heavy))
+
+
 def _prepared(given: RobotController, solver: ADMM) -> dict[str, Any]:
     """Check the arguments of a controller and compute what all its time steps share.
 
@@ -378,7 +421,7 @@ def _prepared(given: RobotController, solver: ADMM) -> dict[str, Any]:
     if mpc.disturbance is not None and linearize != "set-point":
         what = "given, and its rows are tightened for one linear model"
         fail("mpc.disturbance", what, 'Give linearize="set-point", or leave it out')
-    soft = soften(mpc, given.rho)
+    soft = _softened(mpc, given.rho)
     if linearize == "set-point":
         return {"soft": arrays(soft), "fixed": Controller(soft, solver), "scale": None}
     if linearize == "trajectory":

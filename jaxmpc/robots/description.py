@@ -221,5 +221,5 @@ def _ignored(model: "mujoco.MjModel") -> tuple[str, ...]:
         counts["stops of ball joints, no limits of the MPC"] = np.sum(limited[~single])
         counts["stops of tendons, no limits of the MPC"] = np.sum(model.tendon_limited)
     limited = (model.actuator_forcelimited, model.jnt_actfrclimited, model.tendon_actfrclimited)
-    counts["limits of forces that are no limits of inputs"] = sum(map(np.sum, limited))
+    counts["limits of forces, which are rows of the MPC"] = sum(map(np.sum, limited))
     return tuple(f"{count} {text}" for text, count in counts.items() if count)

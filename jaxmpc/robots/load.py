@@ -2,6 +2,7 @@
 
 import copy
 import hashlib
+import re
 import warnings
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
@@ -72,7 +73,11 @@ def load_robot(
     Defaults where the file lacks `<numeric name="velocity_limit">`, `<numeric name=
     "control_period">` and `<key name="home">`: none, 10 ms (rounded to physics steps), and the
     model's qpos0 moved inside the joint ranges. Input limits are the narrowest of `ctrlrange`,
-    and for motors `forcerange` and the joint's `actuatorfrcrange`.
+    and for motors `forcerange` and the joint's `actuatorfrcrange`. Other limits of forces, those of
+    servos, become rows in ξ and u of `robot_mpc`.
+
+    Shapes of an MJCF file whose meshes are missing are left out, with a UserWarning, where their
+    bodies have inertias of their own.
 
     What MJX lacks is taken out: where that changes no motion in silence (switches of diagnostics,
     sensors), else with a UserWarning (contacts between shapes for which it has no function, noslip
@@ -103,16 +108,17 @@ def load_robot(
     smooth.opt.disableflags |= flag("constraint")
     smooth.actuator_forcelimited[:] = 0
     smooth.jnt_actfrclimited[:] = 0
+    smooth.tendon_actfrclimited[:] = 0
     labels, units = coordinate_names(host)
     require_printable("model", name, *labels)
     states, sources = state_limits(host, position, velocity, file.velocities)
     q, act, origin = _home(host, home)
     start, plant = np.concatenate([q, np.zeros(host.nv), act]), Physics(host)
     idle, without, unlike = compared(given, plant, missing, inputs, start)
-    _warn_of_differences(name, host, without, unlike)
+    _warn_of_differences(name, host, without, unlike, file.lost)
     notes = {
         "cleared": [*cleared, *(f"{text}, without effect" for text in idle)],
-        "left out": [*without, *unlike],
+        "left out": [*file.lost, *without, *unlike],
         "mended": file.mended,
         "home": [origin],
         "limit": [*sources, *input_sources],
@@ -138,14 +144,15 @@ def load_robot(
 
 
 class _File(NamedTuple):
-    """A copy of the compiled model, its name, and of a URDF the velocity limits by joint, what was
-    mended, and whether its root link is welded to the world."""
+    """A copy of the compiled model, its name, of a URDF the velocity limits by joint, what was
+    mended, and whether its root link is welded to the world, and shapes whose files are missing."""
 
     model: "mujoco.MjModel"
     name: str
     velocities: dict[str, float]
     mended: tuple[str, ...]
     welded: bool
+    lost: tuple[str, ...] = ()
 
 
 def _opened(
@@ -167,7 +174,8 @@ def _opened(
         fail("model", f"{str(model)!r} is no file", f"Give a path, or one of {', '.join(MODELS)}")
     try:
         if not urdf:
-            return _File(mujoco.MjModel.from_xml_path(str(path)), path.stem, {}, (), False)
+            host, lost = compiled_mjcf(path)
+            return _File(host, path.stem, {}, (), False, lost)
         host, velocities, mended = compiled_urdf(path.read_text(), floating_base, mend_inertias)
         return _File(host, path.stem, velocities, mended, welded=not floating_base)
     except (ValueError, ElementTree.ParseError) as error:
@@ -207,10 +215,14 @@ def _periods(
 
 
 def _warn_of_differences(
-    name: str, host: "mujoco.MjModel", without: list[str], unlike: tuple[str, ...]
+    name: str,
+    host: "mujoco.MjModel",
+    without: list[str],
+    unlike: tuple[str, ...],
+    lost: tuple[str, ...],
 ) -> None:
     """Warn where the plant moves otherwise than its file, or linear models otherwise than it."""
-    texts = []
+    texts = [f"lacks {'; '.join(lost)}"] if lost else []
     if without:
         texts.append(f"moves without {'; '.join(without)} of its file, which MJX lacks")
     if unlike:
@@ -417,6 +429,48 @@ def overridden(argument: str, limits: Box, override: Limit, part: slice) -> Box:
             ends[part] = end
     Box(lower[part], upper[part]).validate(argument)
     return Box(lower, upper)
+
+
+def compiled_mjcf(path: Path) -> "tuple[mujoco.MjModel, tuple[str, ...]]":
+    """Return an MJCF file, compiled, and what was left out because files are missing.
+
+    Shapes whose meshes are missing are left out where their bodies have inertias of their own, and
+    textures that are missing. Raises ValueError where a body's mass is that of such a shape.
+    """
+    spec, lost = None, list[str]()
+    while True:
+        try:
+            if spec is None:
+                return mujoco.MjModel.from_xml_path(str(path)), ()
+            return spec.compile(), tuple(lost)
+        except ValueError as error:
+            missing = re.search(r"rror opening file '(.*)'", str(error))
+            spec = mujoco.MjSpec.from_file(str(path)) if spec is None else spec
+            if missing is None or not (text := _without_file(spec, missing[1])):
+                raise
+            lost.append(text)
+
+
+def _without_file(spec: "mujoco.MjSpec", file: str) -> str:
+    """Take out of a model what needs a file that is missing; return it in words, "" for nothing."""
+    named = lambda asset: asset.file and Path(file).name == Path(asset.file).name
+    textures = [texture for texture in spec.textures if named(texture)]
+    for texture in textures:
+        texture.file, texture.builtin = "", mujoco.mjtBuiltin.mjBUILTIN_FLAT
+        texture.width = texture.height = 1
+    if textures:
+        return f"the texture {file}, which is missing"
+    meshes = [mesh for mesh in spec.meshes if named(mesh)]
+    shapes = [geom for geom in spec.geoms if geom.meshname in {mesh.name for mesh in meshes}]
+    for shape in shapes:
+        body = shape.parent
+        if body.name != "world" and not body.explicitinertial:
+            problem = f"the mesh {file} is missing, whose shape gives body {body.name} its mass"
+            raise ValueError(f"{problem}; put the file there, or give the body an <inertial>")
+    for part in (*shapes, *meshes):
+        spec.delete(part)
+    count = "1 shape" if len(shapes) == 1 else f"{len(shapes)} shapes"
+    return f"{count} of the mesh {file}, which is missing" if meshes else ""
 
 
 # A mended inertia keeps a + b ≥ c with this much room, relative to c: rounding in MuJoCo's own

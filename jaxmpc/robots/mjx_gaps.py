@@ -126,7 +126,7 @@ def translate(model: "mujoco.MjModel") -> list[str]:
     without = "" if acts(model, "contact") else _leave_out_contacts(model)
     if without:
         cleared.append(f"contacts of {without}, switched off in the file")
-    return cleared
+    return cleared + _without_frictionless(model)
 
 
 def lacks(model: "mujoco.MjModel") -> list[Lack]:
@@ -146,6 +146,9 @@ def lacks(model: "mujoco.MjModel") -> list[Lack]:
     without = _leave_out_contacts(copy.deepcopy(model)) if contacts else ""
     if without:
         found.append(Lack(f"contacts of {without}", _leave_out_contacts, True))
+    if contacts and _frictionless(model):
+        text = "elliptic friction cones beside contacts of condim 1: pyramidal ones"
+        found.append(Lack(text, _with_pyramids, True))
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
         found.append(Lack("sleep of bodies at rest", _awake, True))
     for field, words, kind, in_contact in _DROPPED:
@@ -164,6 +167,77 @@ def lacks(model: "mujoco.MjModel") -> list[Lack]:
             text = f"the plugin of {_listed(model, kind, field, rows)}"
             found.append(Lack(text, lambda model: None, True))
     return found
+
+
+# The least friction that MuJoCo knows (mjMINMU).
+_LEAST_FRICTION = 1e-5
+
+
+def _frictionless(model: "mujoco.MjModel") -> list[tuple[int, int, int]]:
+    """Return the possible contacts (geom, geom, pair or −1) of one dimension beside elliptic cones,
+    which MJX does not have together."""
+    if model.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC or not acts(model, "contact"):
+        return []
+    return [contact for contact in _possible_contacts(model) if _dimension(model, *contact) == 1]
+
+
+def _possible_contacts(model: "mujoco.MjModel") -> list[tuple[int, int, int]]:
+    mjx_module()
+    from mujoco.mjx._src import collision_driver
+
+    return [(int(a), int(b), int(pair)) for a, b, pair in collision_driver.geom_pairs(model)]
+
+
+def _dimension(model: "mujoco.MjModel", first: int, second: int, pair: int) -> int:
+    """Return condim of a contact: of the pair, of the geom of higher priority, or the larger."""
+    if pair >= 0:
+        return int(model.pair_dim[pair])
+    condim, priority = model.geom_condim, model.geom_priority
+    if priority[first] == priority[second]:
+        return int(max(condim[first], condim[second]))
+    return int(condim[first if priority[first] > priority[second] else second])
+
+
+def _without_frictionless(model: "mujoco.MjModel") -> list[str]:
+    """Write contacts without friction beside elliptic cones as MJX knows them; return what was
+    changed.
+
+    Where all contacts are such, both kinds of cones mean the same. Else those shapes get the least
+    friction, where that of other contacts, the larger of two, stays what it is.
+    """
+    found = _frictionless(model)
+    if not found:
+        return []
+    if len(found) == len(_possible_contacts(model)):
+        _with_pyramids(model)
+        return ["cone elliptic, pyramidal in its place (all contacts have condim 1)"]
+    changed = copy.deepcopy(model)
+    shapes = {geom for first, second, pair in found if pair < 0 for geom in (first, second)}
+    smooth = [geom for geom in shapes if model.geom_condim[geom] == 1]
+    changed.geom_condim[smooth], changed.geom_friction[smooth] = 3, _LEAST_FRICTION
+    pairs = [pair for *_, pair in found if pair >= 0]
+    changed.pair_dim[pairs], changed.pair_friction[pairs] = 3, _LEAST_FRICTION
+    for contact in _possible_contacts(model):
+        if contact in found or contact[2] >= 0:
+            continue
+        before, after = (_friction(m, *contact[:2]) for m in (model, changed))
+        if not np.array_equal(before, after):
+            return []
+    for field in ("geom_condim", "geom_friction", "pair_dim", "pair_friction"):
+        getattr(model, field)[:] = getattr(changed, field)
+    return [f"condim 1 of {len(found)} contacts, 3 with a friction of 1e-5 in its place"]
+
+
+def _friction(model: "mujoco.MjModel", first: int, second: int) -> np.ndarray:
+    """Return the friction of a contact of two geoms: of higher priority, or the larger."""
+    friction, priority = model.geom_friction, model.geom_priority
+    if priority[first] == priority[second]:
+        return np.maximum(friction[first], friction[second])
+    return friction[first if priority[first] > priority[second] else second]
+
+
+def _with_pyramids(model: "mujoco.MjModel") -> None:
+    model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
 
 
 def _zero(model: "mujoco.MjModel", field: str) -> None:

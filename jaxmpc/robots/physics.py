@@ -185,7 +185,7 @@ class Physics:
             if not self.model.opt.disableflags & NO_EULER_DAMPING:
                 added = added + jnp.diag(h * model.dof_damping)
         elif damped:
-            slope = mjx_module().deriv_smooth_vel(model, data)
+            slope = mjx_module().deriv_smooth_vel(_without_saturated(model, data), data)
             added = added if slope is None else added - h * slope
         return added
 
@@ -281,6 +281,19 @@ class Physics:
         table = jnp.array([[0, 1 / 6], [1 / 2, 1 / 3], [1 / 2, 1 / 3], [1, 1 / 6]], v.dtype)
         end, _ = jax.lax.scan(in_pieces(stage), (jnp.zeros_like(v),) * 4, table)
         return jnp.concatenate([move(end[2]), v + h * end[3]])
+
+
+def _without_saturated(model: Any, data: Any) -> Any:
+    """Return the model whose actuators at the limit of their force have no slope in the speed: as
+    in MuJoCo's own implicit integrators, and other than in MJX's."""
+    if not np.any(model.actuator_forcelimited):
+        return model
+    low, high = model.actuator_forcerange.T
+    at_limit = (data.actuator_force <= low) | (data.actuator_force >= high)
+    at_limit = at_limit & (np.asarray(model.actuator_forcelimited) != 0)
+    still = lambda parameters: jnp.asarray(parameters).at[:, 2].multiply(~at_limit)
+    names = "actuator_gainprm", "actuator_biasprm"
+    return model.replace(**{name: still(getattr(model, name)) for name in names})
 
 
 def _without_margins(model: Any) -> dict[str, np.ndarray]:

@@ -290,7 +290,7 @@ def test_report_names_what_the_predictor_ignores():
         "1 pairs of shapes in contact", "1 equalities of type joint", "1 joints with dry friction",
         "1 stops of joints, whose ranges are limits of the MPC",
         "1 stops of tendons, no limits of the MPC",
-        "1 limits of forces that are no limits of inputs",
+        "1 limits of forces, which are rows of the MPC",
     )  # fmt: skip
     assert [source for *_, source in report.limits] == [
         "none", "file, range", "argument", "argument", "file, ctrlrange",

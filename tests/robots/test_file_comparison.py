@@ -378,6 +378,49 @@ def test_a_tendon_that_only_touches_has_derivatives(q):
             np.testing.assert_allclose(part, wanted, atol=1e-6)
 
 
+FALLING = """<mujoco><option cone="elliptic"/><worldbody><geom type="plane" size="1 1 .1"
+condim="{0}"/><body pos="0 0 .1" euler="20 10 0"><freejoint name="f"/><geom size=".1 .04"
+type="capsule" mass="1" condim="{1}" friction="{2}"/></body><body pos=".1 0 .35"><freejoint/>
+<geom size=".1" mass="1" condim="{1}"/></body></worldbody>
+<actuator><motor joint="f" gear="1 0 0 0 0 0" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    "given, words",
+    [((1, 1, 1), "all contacts"), ((3, 1, 1), "friction of 1e-5"), ((3, 1, 2), "pyramidal ones")],
+)
+def test_contacts_without_friction_beside_elliptic_cones(given, words):
+    """The same motion as in the C engine, but where no model of MJX has it, which is said."""
+    model = mujoco.MjModel.from_xml_string(FALLING.format(*given))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        robot = jm.load_robot(model)
+    told = " ".join(str(warning.message) for warning in said)
+    assert (words in told) == (words == "pyramidal ones"), told
+    assert words in repr(robot.report().cleared) + repr(robot.report().left_out)
+
+
+SHAPED = """<mujoco><compiler meshdir="parts"/><asset><mesh name="m" file="link.stl"/>
+<mesh file="wall.obj"/><texture name="t" type="2d" file="skin.png"/><material name="k" texture="t"/>
+</asset><worldbody><geom type="mesh" mesh="wall"/><body name="arm" pos="0 0 1">{0}
+<joint name="j" axis="0 1 0"/><geom type="mesh" mesh="m" material="k"/></body></worldbody>
+<actuator><motor joint="j" ctrlrange="-5 5"/></actuator></mujoco>"""
+
+
+def test_shapes_of_missing_meshes_are_left_out(tmp_path):
+    """A body that has its own inertia needs no shape; one that has none is refused."""
+    path = tmp_path / "shaped.xml"
+    path.write_text(SHAPED.format('<inertial pos=".1 0 0" mass="1" diaginertia=".01 .01 .01"/>'))
+    with pytest.warns(UserWarning, match="1 shape of the mesh parts/link.stl, which is missing"):
+        robot = jm.load_robot(path)
+    left_out = robot.report().left_out
+    assert len(left_out) == 3 and "texture skin.png" in left_out[2]
+    assert robot.mujoco.body_mass[1] == 1 and robot.mujoco.ngeom == 0
+    path.write_text(SHAPED.format(""))
+    with pytest.raises(ValueError, match="link.stl is missing, whose shape gives body arm its ma"):
+        jm.load_robot(path)
+
+
 SERVO = '<position joint="j" kp="30" kv="2" ctrlrange="-2 2" forcerange="{0} {1}"/>'
 
 
