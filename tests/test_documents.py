@@ -85,7 +85,15 @@ def holds_theory(after, said):
     assert after[-1]["controller"].mpc.soft
 
 
+def holds_offset_free(after, said):
+    """No error under a load on another plant, nor under one that is known ahead."""
+    assert abs(after[0]["run"].states[-1, 0] - 1) < 1e-6
+    assert abs(after[1]["run"].states[:, 0]).max() < 1e-5
+    assert "'infeasible': 0" not in said
+
+
 HOLDS = {
+    "docs/how-to/offset-free.md": holds_offset_free,
     "docs/how-to/robots.md": holds_robots,
     "docs/how-to/tuning.md": holds_tuning,
     "docs/theory/index.md": holds_theory,

@@ -10,6 +10,9 @@ robot_mpc                  the MPC of a robot, from the limits of its model
 LinearFeedback             LQR or PD with clipping, to compare with
 Noise                      random disturbances of the plant and of what is measured
 KalmanFilter               estimates of the state from noisy outputs -> Belief
+Disturbance                a constant disturbance that a KalmanFilter estimates too
+OffsetFreeController       an MPC without steady-state error under such disturbances
+augmented                  the MPC problem with such disturbances as states
 Environment                a robot with a task, reset and step as pure functions
                            -> EnvironmentState; gymnasium_env.RobotEnv is Gymnasium's form
 MPCPolicy                  a controller as a policy of observations
@@ -18,8 +21,9 @@ randomised                 random masses, damping, payloads of robots, for `vari
 """
 
 from jaxmpc.closed_loop.environment import Environment, MPCPolicy
-from jaxmpc.closed_loop.estimation import KalmanFilter, Noise
+from jaxmpc.closed_loop.estimation import Disturbance, KalmanFilter, Noise
 from jaxmpc.closed_loop.feedback import LinearFeedback
+from jaxmpc.closed_loop.offset_free import OffsetFreeController, augmented
 from jaxmpc.closed_loop.outcome import evaluate_runs, summarise_runs
 from jaxmpc.closed_loop.robot_controller import RobotController, robot_mpc
 from jaxmpc.closed_loop.simulation import Run, lyapunov_decrease, simulate, simulate_many
@@ -27,13 +31,16 @@ from jaxmpc.closed_loop.stored_runs import simulate_into
 from jaxmpc.closed_loop.variations import draw_robots, randomised
 
 __all__ = [
+    "Disturbance",
     "Environment",
     "KalmanFilter",
     "LinearFeedback",
     "MPCPolicy",
     "Noise",
+    "OffsetFreeController",
     "RobotController",
     "Run",
+    "augmented",
     "draw_robots",
     "evaluate_runs",
     "lyapunov_decrease",

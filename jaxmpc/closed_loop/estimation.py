@@ -1,4 +1,5 @@
-"""Noise of a plant and of its measurements, and the Kalman filter that estimates the state."""
+"""Noise of a plant and of its measurements, and the Kalman filter that estimates the state, with
+constant disturbances beside it."""
 
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -6,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax import Array
 
 from jaxmpc.checks import (
@@ -17,12 +19,15 @@ from jaxmpc.checks import (
     require_shape,
     require_symmetric_psd,
 )
-from jaxmpc.pytrees import named_pytree, pytree
+from jaxmpc.pytrees import named_pytree, pytree, static
 from jaxmpc.qp.linalg import arrays, eigh, matmul, solve, symmetric
 from jaxmpc.robots.linear_plant import LinearPlant
 from jaxmpc.robots.robot import Robot, RobotModel
-from jaxmpc.systems.riccati import least_reached, lqr
-from jaxmpc.systems.system import LinearSystem
+from jaxmpc.systems.riccati import balanced, least_reached, lqr
+from jaxmpc.systems.system import LinearSystem, host_matrices
+
+# Singular values of balanced matrices, relative to the largest, that count as zero.
+UNDETECTED = 1e-10
 
 
 @pytree
@@ -120,9 +125,39 @@ def _drawn(key: Array, spread: Any, shape: tuple[int, int], dtype: Any) -> Array
     return matmul(draws * jnp.sqrt(jnp.maximum(variances, 0)), axes.T)
 
 
+# What a disturbance is added to.
+KINDS = ("input", "output", "state")
+
+
+@pytree
+class Disturbance:
+    """Disturbances d (k,) that a Kalman filter estimates beside the state: constant but for the
+    white noise w that moves them, d⁺ = d + w.
+
+    kind: what M d is added to:
+        "input"    u, M (m, k): ξ⁺ = f(ξ, u + M d), loads such as friction and payloads;
+        "output"   what is measured, M (p, k): y = C ξ + M d, such as a sensor's offset;
+        "state"    the next state, M (n, k): ξ⁺ = f(ξ, u) + M d.
+    process: of w, of one time step, in the unit of d; as in `Noise`. The larger, the sooner a
+        change of d is followed, and the more measurement noise is taken for one.
+    matrix M: None for one d for each input, output or state.
+    initial: of the error of the first estimate d = 0, where the filter has `initial`.
+
+    No more disturbances than measured outputs can be told from each other. With as many, and with
+    any model errors that leave the loop stable, `OffsetFreeController` has no steady-state error
+    in the outputs that it tracks.
+    """
+
+    kind: str = static()
+    process: Any
+    matrix: Any = None
+    initial: Any = None
+
+
 @named_pytree
 class Belief(NamedTuple):
-    """An estimate ξ̂ (n,), and the covariance (n, n) of its error; None with a constant gain."""
+    """An estimate of ξ and disturbances (n + k,), and the covariance (n + k, n + k) of its error;
+    None with a constant gain."""
 
     mean: Array
     covariance: Array | None
@@ -142,7 +177,8 @@ class KalmanFilter:
         constant, that of the steady state,
             L = P C'(C P C' + V)⁻¹,   P = A P A' + W − A P C'(C P C' + V)⁻¹ C P A'.
     start (n,): first estimate, before the first output is measured; None: the true initial state.
-    gain (n, p): filled in by `prepared`; leave it None.
+    disturbance: `Disturbance`, or a tuple of them, estimated beside the state; none by default.
+    gain (n + k, p): filled in by `prepared`; leave it None.
 
     ξ_t is estimated from y_0 … y_t (filtered estimate, corrected before the input is computed):
         ξ̂_t|t = ξ̂_t|t−1 + L (y_t − C ξ̂_t|t−1),   ξ̂_t+1|t = f(ξ̂_t|t, u_t).
@@ -155,6 +191,7 @@ class KalmanFilter:
     C: Any = None
     initial: Any = None
     start: Any = None
+    disturbance: tuple[Disturbance, ...] | Disturbance = ()
     gain: Any = None
 
     def prepared(self) -> "KalmanFilter":
@@ -183,13 +220,127 @@ class KalmanFilter:
         if self.start is not None:
             require_shape("observer.start", self.start, (n,), "Coordinates of the first estimate")
         names = ("process", "measurement", "C", "initial", "start")
-        given = {name: whole_array(getattr(self, name)) for name in names}
+        given: dict[str, Any] = {name: whole_array(getattr(self, name)) for name in names}
+        given["disturbance"] = self._prepared_disturbances(p)
         if self.initial is not None or self.gain is not None:
             return replace(self, **given)
         if isinstance(self.model, Robot):
             cure = "Give standard deviations, or use the LinearSystem of the set-point as the model"
             fail("observer.initial", "is None for a Robot", cure)
-        return replace(self, **given, gain=self._steady_gain())
+        made = replace(self, **given)
+        system = made.linear_model
+        if made.disturbance and concrete(system, made.C, made.disturbance):
+            made.require_detectable(system)
+        return replace(made, gain=made._steady_gain(system))
+
+    def _prepared_disturbances(self, p: int) -> tuple[Disturbance, ...]:
+        """Return the disturbances with their matrices; raise ValueError where one is wrong."""
+        found, sizes = [], {"input": self.model.m, "output": p, "state": self.model.n}
+        given = self._each
+        if not all(isinstance(one, Disturbance) for one in given):
+            what = f"is a {type(self.disturbance).__name__}"
+            fail("observer.disturbance", what, "Give a closed_loop.Disturbance, or several")
+        for i, one in enumerate(given):
+            name = f"observer.disturbance[{i}]"
+            if one.kind not in KINDS:
+                fail(f"{name}.kind", f"{one.kind!r}", f"Give one of {', '.join(KINDS)}")
+            rows = sizes[one.kind]
+            M = whole_array(np.eye(rows) if one.matrix is None else one.matrix)
+            if M.ndim != 2 or M.shape[0] != rows or not M.shape[1]:
+                cure = f"Give ({rows}, k), a row for each {one.kind}, or None"
+                fail(f"{name}.matrix", f"shape {M.shape}", cure)
+            require_finite(f"{name}.matrix", M)
+            k = M.shape[1]
+            if one.process is None:
+                fail(f"{name}.process", "is None", "Give standard deviations or a covariance")
+            require_spread(f"{name}.process", one.process, k)
+            require_spread(f"{name}.initial", one.initial, k)
+            W = covariance(one.process, k)
+            if concrete(W) and np.linalg.eigvalsh(W)[0] <= 0:
+                what, cure = "leaves a disturbance without noise", "Give it some, or leave it out"
+                fail(f"{name}.process", what, cure)
+            if self.initial is not None and one.initial is None:
+                fail(f"{name}.initial", "is None, and observer.initial is given", "Give it too")
+            spreads = (whole_array(one.process), M, whole_array(one.initial))
+            found.append(Disturbance(one.kind, *spreads))
+        k = sum(np.shape(one.matrix)[1] for one in found)
+        if k > p:
+            what = f"has {k} disturbances, and {p} outputs are measured"
+            fail("observer.disturbance", what, "Give at most one for each measured output")
+        return tuple(found)
+
+    @property
+    def linear_model(self) -> LinearSystem:
+        """Return the LinearSystem of a linear model."""
+        return self.model if isinstance(self.model, LinearSystem) else self.model.system
+
+    @property
+    def disturbances(self) -> int:
+        """Return k, the number of disturbances of a prepared filter."""
+        return sum(np.shape(one.matrix)[1] for one in self._each)
+
+    @property
+    def _each(self) -> tuple[Disturbance, ...]:
+        """Return the disturbances as a tuple."""
+        given = self.disturbance
+        return tuple(given) if isinstance(given, tuple | list) else (given,)
+
+    def split(self, mean: Array) -> tuple[Array, Array]:
+        """Return the state (n,) and the disturbances (k,) of an estimate."""
+        return mean[: self.model.n], mean[self.model.n :]
+
+    def matrix(self, kind: str) -> Any:
+        """Return M with M d added to inputs, outputs or states (rows, k) of a prepared filter."""
+        rows = {"input": self.model.m, "output": self.p, "state": self.model.n}[kind]
+        sizes = [(one, np.shape(one.matrix)[1]) for one in self._each]
+        parts = [one.matrix if one.kind == kind else np.zeros((rows, k)) for one, k in sizes]
+        return (np if concrete(parts) else jnp).concatenate([np.zeros((rows, 0)), *parts], axis=1)
+
+    def on_states(self, B: Any) -> Any:
+        """Return what the disturbances add to the next state, B M_input + M_state (n, k)."""
+        return B @ self.matrix("input") + self.matrix("state")
+
+    def require_detectable(self, system: LinearSystem) -> None:
+        """Raise ValueError unless outputs tell states and disturbances of this model apart.
+
+        Where the model without disturbances is detectable, that is so if and only if
+            [[A − I, B_d], [C, C_d]]
+        has n + k independent columns (Pannocchia & Rawlings 2003, AIChE Journal 49(2), lemma 1;
+        Maeder, Borrelli & Morari 2009, Automatica 45(10), proposition 1). Rows and columns are put
+        in units of their size first, so that no choice of units decides.
+        """
+        A, B, _ = host_matrices(system)
+        n, k = system.n, self.disturbances
+        C = np.asarray(self._matrix(float))
+        M = np.block([[A - np.eye(n), self.on_states(B)], [C, self.matrix("output")]])
+        row, column = balanced(M)
+        _, values, axes = np.linalg.svd(row[:, None] * M * column)
+        if values[n + k - 1] > UNDETECTED * values[0]:
+            return
+        hidden = np.abs(axes[values <= UNDETECTED * values[0]])
+        large = np.any(hidden > 0.1 * hidden.max(axis=1, keepdims=True), axis=0)
+        names = system.state_names or tuple(f"x{i + 1}" for i in range(n))
+        states = [name for name, one in zip(names, large[:n], strict=True) if one]
+        loads = [name for name, one in zip(self._load_names(), large[n:], strict=True) if one]
+        if not loads:
+            what = f"no output shows {', '.join(states)} at rest"
+            fail("observer.C", what, "Measure it")
+        if not states:
+            what = f"outputs do not tell {', '.join(loads)} apart at rest"
+            fail("observer.disturbance", what, "Leave one out, or measure more outputs")
+        what = f"outputs do not tell {', '.join(loads)} from {', '.join(states)} at rest"
+        cure = "Let disturbances act on inputs where states integrate, or measure more outputs"
+        fail("observer.disturbance", what, cure)
+
+    def _load_names(self) -> list[str]:
+        """Return a name for each disturbance, such as "the disturbance of output 2"."""
+        found = []
+        for one in self._each:
+            for column in np.asarray(one.matrix).T:
+                (where,) = np.nonzero(column)
+                places = " and ".join(str(i + 1) for i in where) or "nothing"
+                found.append(f"the disturbance of {one.kind} {places}")
+        return found
 
     @property
     def p(self) -> int:
@@ -201,49 +352,90 @@ class KalmanFilter:
         return xi[: self.p] if self.C is None else matmul(self._matrix(xi.dtype), xi)
 
     def first(self, xi: Array) -> Belief:
-        """Return the estimate before the first output, where the plant starts at ξ."""
-        mean = xi if self.start is None else jnp.asarray(self.start, xi.dtype)
+        """Return the estimate before the first output, where the plant starts at ξ; d is 0."""
+        state = xi if self.start is None else jnp.asarray(self.start, xi.dtype)
+        mean = jnp.concatenate([state, jnp.zeros(self.disturbances, xi.dtype)])
         if self.gain is not None:
             return Belief(mean, None)
-        return Belief(mean, jnp.asarray(covariance(self.initial, self.model.n), xi.dtype))
+        return Belief(mean, jnp.asarray(self._covariance("initial"), xi.dtype))
 
     def corrected(self, belief: Belief, y: Array) -> Belief:
         """Return the estimate after the output y (p,)."""
-        xi, P = belief
+        mean, P = belief
+        C = self._outputs_of_all(mean.dtype)
+        error = y - matmul(C, mean)
         if P is None:
-            L = jnp.asarray(self.gain, xi.dtype)
-            return Belief(xi + matmul(L, y - self.outputs(xi)), None)
-        C, V = self._matrix(xi.dtype), jnp.asarray(covariance(self.measurement, self.p), xi.dtype)
+            return Belief(mean + matmul(jnp.asarray(self.gain, mean.dtype), error), None)
+        V = jnp.asarray(covariance(self.measurement, self.p), mean.dtype)
         L = _gain(P, C, V)
         # Joseph's form: a sum of semidefinite terms, whatever the rounding of L.
-        left = jnp.eye(self.model.n, dtype=xi.dtype) - matmul(L, C)
+        left = jnp.eye(len(mean), dtype=mean.dtype) - matmul(L, C)
         P = matmul(left, matmul(P, left.T)) + matmul(L, matmul(V, L.T))
-        return Belief(xi + matmul(L, y - self.outputs(xi)), P)
+        return Belief(mean + matmul(L, error), P)
 
-    def predicted(self, belief: Belief, u: Array) -> Belief:
-        """Return the estimate one time step later, under the input u (m,)."""
-        xi, P = belief
+    def predicted(self, belief: Belief, u: Array, known: Array | None = None) -> Belief:
+        """Return the estimate one time step later, under the input u (m,) and what is known to be
+        added to the next state (n,), None for nothing."""
+        mean, P = belief
+        xi, d = self.split(mean)
+        of_states = None
+        if len(d):
+            on_inputs, on_states = (
+                jnp.asarray(self.matrix(k), d.dtype) for k in ("input", "state")
+            )
+            u, of_states = u + matmul(on_inputs, d), matmul(on_states, d)
         after = model_step(self.model, xi, u)
+        for more in (of_states, known):
+            after = after if more is None else after + more
+        after = jnp.concatenate([after, d])
         if P is None:
             return Belief(after, None)
         model = self.model
         if not isinstance(model, LinearSystem):
             model = model.linearize(model.state(xi), u)
-        A = jnp.asarray(model.A, xi.dtype)
-        W = jnp.asarray(covariance(self.process, self.model.n), xi.dtype)
+        A, _ = self._with_disturbances(jnp.asarray(model.A, d.dtype), jnp.asarray(model.B, d.dtype))
+        W = jnp.asarray(self._covariance("process"), d.dtype)
         return Belief(after, matmul(A, matmul(P, A.T)) + W)
 
     def _matrix(self, dtype: Any) -> Array:
         C = np.eye(self.p, self.model.n) if self.C is None else self.C
         return jnp.asarray(C, dtype)
 
-    def _steady_gain(self) -> Any:
+    def _outputs_of_all(self, dtype: Any) -> Array:
+        """Return (C, C_d) (p, n + k), the outputs of states and disturbances."""
+        return jnp.concatenate(
+            [self._matrix(dtype), jnp.asarray(self.matrix("output"), dtype)], axis=1
+        )
+
+    def _with_disturbances(self, A: Any, B: Any) -> tuple[Any, Any]:
+        """Return the matrices of the model of states and disturbances (n + k): of these themselves,
+        and of the inputs."""
+        k = self.disturbances
+        xp = np if concrete(A, B, self.disturbance) else jnp
+        A, B = xp.asarray(A), xp.asarray(B)
+        zeros = lambda *shape: xp.zeros(shape, A.dtype)
+        top = xp.concatenate([A, xp.asarray(self.on_states(B), A.dtype)], axis=1)
+        rest = xp.concatenate([zeros(k, len(A)), xp.eye(k, dtype=A.dtype)], axis=1)
+        return xp.concatenate([top, rest]), xp.concatenate([B, zeros(k, B.shape[1])])
+
+    def _covariance(self, name: str) -> Any:
+        """Return the covariance (n + k, n + k) of `process` or `initial`, of states and
+        disturbances."""
+        parts = [covariance(getattr(self, name), self.model.n)]
+        for one in self._each:
+            parts.append(covariance(getattr(one, name), np.shape(one.matrix)[1]))
+        if len(parts) == 1:
+            return parts[0]
+        return (scipy.linalg if concrete(parts) else jax.scipy.linalg).block_diag(*parts)
+
+    def _steady_gain(self, system: LinearSystem) -> Any:
         """Return L of the steady state. P solves the Riccati equation of the LQR of the dual system
         ζ⁺ = A'ζ + C'ν with the weights W and V."""
-        system = self.model if isinstance(self.model, LinearSystem) else self.model.system
-        W, V = covariance(self.process, system.n), covariance(self.measurement, self.p)
-        A: Any = system.A
+        W, V = self._covariance("process"), covariance(self.measurement, self.p)
+        A, _ = self._with_disturbances(system.A, system.B)
         C: Any = np.eye(self.p, system.n) if self.C is None else self.C
+        of_loads = self.matrix("output")
+        C = (np if concrete(C, of_loads) else jnp).concatenate([C, of_loads], axis=1)
         if concrete(A, C, W, V):
             A, C, W, V = (np.asarray(v, float) for v in (A, C, W, V))
             variances, axes = np.linalg.eigh((W + W.T) / 2)

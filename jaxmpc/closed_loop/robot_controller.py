@@ -293,6 +293,11 @@ class RobotController:
         return self.robot.state_size
 
     @property
+    def takes_forecasts(self) -> bool:
+        """Return whether plans take what is known ahead of disturbances."""
+        return self.fixed is not None
+
+    @property
     def limits(self) -> Box:
         """Return the robot's own state limits, without margin."""
         return self.robot.state_limits
@@ -324,12 +329,20 @@ class RobotController:
         *,
         input_reference: Reals | None = None,
         previous_input: Reals | None = None,
+        forecast: Reals | None = None,
     ) -> Control[Plan]:
-        """Return the input (m,) at the state x, its plan, in ξ, and what to remember."""
+        """Return the input (m,) at the state x, its plan, in ξ, and what to remember.
+
+        forecast: as in `solve`, in ξ, with linearize="set-point" only.
+        """
         x = one_state(self, x)
         if self.fixed is not None:
             known = {"input_reference": input_reference, "previous_input": previous_input}
+            known["forecast"] = forecast
             return self.fixed(self.coordinates(x), before, reference, **known)
+        if forecast is not None:
+            what = f"given with linearize={self.linearize!r}"
+            fail("forecast", what, 'Give linearize="set-point", or leave it out')
         problem = self.problem
         rows = layout(self.soft) + task_layout(problem)
         memory = None if before is None else before.memory

@@ -54,7 +54,8 @@ class Run:
     of the soft rows at k = 0 of each plan, hence of what happens. fallback (T,): whether the plan
     violates soft rows anywhere on its horizon by more than 1e-6 (1e-3 in float32), as happens
     where the limits cannot all be kept. estimates (T, n): the states as an observer estimates them
-    from the outputs so far; None without an observer. Batches have their axes in front. For robots
+    from the outputs so far, and disturbances (T, k), where it estimates them; None without an
+    observer. Batches have their axes in front. For robots
     states are the plant's, (qpos, qvel), and x in costs and limits means their
     coordinates.
     """
@@ -68,6 +69,7 @@ class Run:
     slack: Array
     fallback: Array
     estimates: Any = None
+    disturbances: Any = None
 
     def __repr__(self) -> str:
         """Return the shapes, in one line: the arrays may be long."""
@@ -112,6 +114,8 @@ def simulate(
     reference: Reals | None = None,
     input_reference: Reals | None = None,
     disturbance: Reals | None = None,
+    output_disturbance: Reals | None = None,
+    forecast: Reals | None = None,
     previous_input: Reals | None = None,
     noise: Noise | None = None,
     observer: KalmanFilter | None = None,
@@ -121,7 +125,7 @@ def simulate(
 ) -> Run:
     """Simulate `plant` under `controller` from the state x0 (n,) for T = steps time steps.
 
-    controller: a Controller, RobotController or LinearFeedback.
+    controller: a Controller, RobotController, OffsetFreeController or LinearFeedback.
     plant: a LinearSystem, LinearPlant or Robot, or any object with `step(x, u) -> x` written in
         JAX; the controller's own `mpc.system` gives the nominal loop. A plant that is a pytree is
         an argument of the compiled program, any other object a constant of it.
@@ -129,12 +133,16 @@ def simulate(
         step t sees the rows t … t+N. None: their origin, also where a robot's problem was made
         about another target.
     input_reference: input to track, (m,), or (T + N − 1, m); None: zero.
-    disturbance (T, n): added to the next states.
+    disturbance (T, n): added to the next states. output_disturbance (T, p): to what is measured.
+    forecast: what the controller and its observer know of `disturbance`, in the coordinates of the
+        controller, (n,), or (T + N − 1, n): the plan at step t sees the rows t … t+N−1. It does not
+        act by itself. None: nothing is known ahead.
     previous_input (m,): u_{−1} where the problem limits or weighs input rates, or where inputs are
         delayed; None for zero.
     noise: `Noise` of the plant and of what is measured; None for none.
-    observer: a `KalmanFilter`; the controller sees its estimate, `run.estimates`. None: the
-        controller sees the state, with the measurement noise if there is any.
+    observer: a `KalmanFilter`; the controller sees its estimate, `run.estimates`. None: that of an
+        OffsetFreeController, or the controller sees the state, with the measurement noise if there
+        is any.
     delay: steps from the measurement to the input that follows from it, 0 or 1. With 1 the input
         computed at step t acts at t + 1, and previous_input at 0.
     compensate: with a delay, plan from the state one step later, which the controller's own model
@@ -151,7 +159,8 @@ def simulate(
     status NON_FINITE.
     """
     aims = (reference, input_reference)
-    given = Conditions(*aims, disturbance, previous_input, noise, observer, delay, bool(compensate))
+    added = disturbance, output_disturbance, forecast
+    given = Conditions(*aims, *added, previous_input, noise, observer, delay, bool(compensate))
     plant, x0, given = checked_loop(controller, plant, x0, steps, given)
     return _simulate(controller, plant, x0, given, steps=int(steps), checkpoint=checkpoint)
 
@@ -163,6 +172,8 @@ class Conditions:
     reference: Any = None
     input_reference: Any = None
     disturbance: Any = None
+    output_disturbance: Any = None
+    forecast: Any = None
     previous_input: Any = None
     noise: Noise | None = None
     observer: KalmanFilter | None = None
@@ -188,6 +199,7 @@ def checked_loop(
         given.reference,
         given.input_reference,
         given.previous_input,
+        given.forecast,
         steps=steps,
         state_size=size,
         widths=getattr(controller, "reference_sizes", None),
@@ -198,7 +210,14 @@ def checked_loop(
     if whole("delay", given.delay, 0) > 1:
         fail("delay", f"{given.delay}", "Give 0 or 1 samples; put longer delays into the model")
     plant = _checked_plant(plant, size, controller.mpc.system.m)
+    if given.forecast is not None and not getattr(controller, "takes_forecasts", False):
+        what = f"given to a {type(controller).__name__} whose plans take none"
+        cure = 'Give a Controller, or a RobotController with linearize="set-point"'
+        fail("forecast", what, cure)
     observer, noise = given.observer, given.noise
+    own = getattr(controller, "observer", None)
+    if own is not None and observer is not None:
+        fail("observer", "given beside that of the controller", "Leave it out")
     if observer is not None:
         if not isinstance(observer, KalmanFilter):
             fail("observer", f"is a {type(observer).__name__}", "Give a closed_loop.KalmanFilter")
@@ -206,19 +225,27 @@ def checked_loop(
         if observer.model.n != n:
             what = f"has {observer.model.n} states, the controller's model {n}"
             fail("observer.model", what, "Give the model of the same plant")
+    outputs = next((one.p for one in (observer, own) if one is not None), n)
     if noise is not None:
         if not isinstance(noise, Noise):
             fail("noise", f"is a {type(noise).__name__}", "Give a closed_loop.Noise")
-        noise = noise.prepared(n, n if observer is None else observer.p)
-    if size != n and (noise is not None or observer is not None) and not hasattr(plant, "state"):
+        noise = noise.prepared(n, outputs)
+    measured = given.output_disturbance
+    if measured is not None:
+        measured = checked_array("output_disturbance", measured, [(steps, outputs)])
+    seen = any(part is not None for part in (noise, observer, own, measured))
+    if size != n and seen and not hasattr(plant, "state"):
         what = f"a {type(plant).__name__} does not say which state has the coordinates ξ"
         fail("plant", what, "Give a Robot, or an object with coordinates(x) and state(ξ)")
-    aim, disturbance = jax.tree.map(lambda v: jnp.asarray(v, controller.dtype), (aim, disturbance))
+    cast = lambda v: jnp.asarray(v, controller.dtype)
+    aim, disturbance, measured = jax.tree.map(cast, (aim, disturbance, measured))
     given = replace(
         given,
         reference=aim.states,
         input_reference=aim.inputs,
         disturbance=disturbance,
+        output_disturbance=measured,
+        forecast=aim.forecast,
         previous_input=aim.previous_input,
         noise=noise,
         observer=observer,
@@ -253,6 +280,8 @@ class Loop:
 
     def __init__(self, controller: Feedback, plant: Plant, given: Conditions, dtype: Any) -> None:
         self.controller, self.given = controller, given
+        own = getattr(controller, "observer", None)
+        self.observer: KalmanFilter | None = given.observer if own is None else own
         self.plant = plant = plant.given if isinstance(plant, ConstantModel) else plant
         self.horizon = controller.mpc.horizon
         self.Q, self.R, *_ = weights_of(controller.mpc, dtype)
@@ -276,26 +305,32 @@ class Loop:
         return self.rows(given.reference, t, N + 1), self.rows(given.input_reference, t, N)
 
     def seen(
-        self, x: Array, previous: Array, belief: Belief | None, noise: Array | None
+        self, x: Array, t: Array, previous: Array, belief: Belief | None, noise: Array | None
     ) -> tuple[Array, Array | None, Belief | None]:
-        """Return the state that the controller plans from, the observer's estimate of the state,
-        and its belief."""
-        observer, seen = self.given.observer, x
+        """Return the state that the controller plans from, the observer's estimate of state and
+        disturbances from the outputs so far, and what it goes on with."""
+        observer, seen, estimate = self.observer, x, None
         if observer is not None and belief is not None:
             y = observer.outputs(self.coordinates(x))
             belief = observer.corrected(belief, y if noise is None else y + noise)
-            seen = self.state(belief.mean)
+            estimate = belief.mean
+            seen = self.state(observer.split(estimate)[0])
         elif noise is not None:
             seen = self.state(self.coordinates(x) + noise)
-        estimate = None if observer is None else seen
         if self.given.delay and observer is not None and belief is not None:
-            belief = observer.predicted(belief, previous)
-        if self.later and belief is not None:
-            seen = self.state(belief.mean)
+            belief = observer.predicted(belief, previous, self.known(t))
+            if self.later:
+                seen = self.state(observer.split(belief.mean)[0])
         elif self.later:
-            model = model_of(self.controller)
-            seen = self.state(model_step(model, self.coordinates(seen), previous))
+            known, model = self.known(t), model_of(self.controller)
+            after = model_step(model, self.coordinates(seen), previous)
+            seen = self.state(after if known is None else after + known)
         return seen, estimate, belief
+
+    def known(self, t: Array) -> Array | None:
+        """Return what is known to be added to the state after step t."""
+        forecast = self.given.forecast
+        return forecast if forecast is None or forecast.ndim == 1 else forecast[t]
 
     def stage_cost(self, x: Array, u: Array, r: Array | None, s: Array | None) -> Array:
         """Return (x − r)'Q(x − r) + (u − s)'R(u − s), r and s the first rows of references."""
@@ -311,9 +346,20 @@ class Loop:
     def step(self, carried: Carried, exogenous: Exogenous) -> tuple[Carried, Run]:
         """Return what goes on to the next time step, and the record of this one."""
         (x, before, previous, belief), (t, disturbance, process, measurement) = carried, exogenous
-        seen, estimate, belief = self.seen(x, previous, belief, measurement)
-        r, s = self.references(t + 1 if self.later else t)
-        control = self.controller(seen, before, r, input_reference=s, previous_input=previous)
+        observer = self.observer
+        seen, estimate, belief = self.seen(x, t, previous, belief, measurement)
+        begin = t + 1 if self.later else t
+        r, s = self.references(begin)
+        told: dict[str, Any] = {"input_reference": s, "previous_input": previous}
+        if self.given.forecast is not None:
+            told["forecast"] = self.rows(self.given.forecast, begin, self.horizon)
+        state = disturbances = None
+        if observer is not None and estimate is not None:
+            state, found = observer.split(estimate)
+            state, disturbances = self.state(state), found if len(found) else None
+        if getattr(self.controller, "observer", None) is not None:
+            told["disturbance"] = disturbances
+        control = self.controller(seen, before, r, **told)
         plan, u = control.plan, previous if self.given.delay else control.u
         record = Run(
             states=x,
@@ -324,14 +370,14 @@ class Loop:
             violation=self.violation(x),
             slack=plan.slack[0],
             fallback=jnp.any(plan.slack > SLACK[x.dtype.name]),
-            estimates=estimate,
+            estimates=state,
+            disturbances=disturbances,
         )
         after = jnp.asarray(self.plant.step(x, u), x.dtype)
         if process is not None:
             after = self.state(self.coordinates(after) + process)
-        observer = self.given.observer
         if observer is not None and belief is not None and not self.given.delay:
-            belief = observer.predicted(belief, u)
+            belief = observer.predicted(belief, u, self.known(t))
         after = after if disturbance is None else after + disturbance
         return (after, control, control.u, belief), record
 
@@ -355,13 +401,15 @@ def _simulate(
     checkpoint: bool,
 ) -> Run:
     loop, system = Loop(controller, plant, given, x0.dtype), controller.mpc.system
-    observer, previous = given.observer, given.previous_input
+    observer, previous = loop.observer, given.previous_input
     before = controller.start(x0, loop.rows(given.input_reference, loop.later, loop.horizon))
     previous = jnp.zeros(system.m, x0.dtype) if previous is None else previous
     outputs = system.n if observer is None else observer.p
     w = v = belief = None
     if given.noise is not None:
         w, v = given.noise.draw(steps, system.n, outputs, x0.dtype)
+    if given.output_disturbance is not None:
+        v = given.output_disturbance if v is None else v + given.output_disturbance
     if observer is not None:
         belief = observer.first(loop.coordinates(x0))
     first = x0, before, previous, belief
@@ -382,6 +430,9 @@ def simulate_many(
     input_reference: Reals | None = None,
     references: Reals | None = None,
     input_references: Reals | None = None,
+    disturbance: Reals | None = None,
+    output_disturbance: Reals | None = None,
+    forecast: Reals | None = None,
     previous_input: Reals | None = None,
     noise: Noise | None = None,
     observer: KalmanFilter | None = None,
@@ -395,7 +446,8 @@ def simulate_many(
     """Simulate closed loops from many initial states x0s (B, n); return NumPy arrays (B, ...).
 
     controller, plant, steps, previous_input, observer, delay, compensate: as in `simulate`.
-    reference, input_reference: as in `simulate`, the same for all loops.
+    reference, input_reference, disturbance, output_disturbance, forecast: as in `simulate`, the
+        same for all loops.
     references, input_references: one for each loop, (B, n) and (B, m), or over time (B, T + N, n)
         and (B, T + N − 1, m); in place of those for all.
     noise: as in `simulate`, each loop with its own (see `Noise.seed`).
@@ -420,7 +472,8 @@ def simulate_many(
         fail("chunk", f"{chunk}", "Give a count of at least 1")
     devices = chosen_devices(devices)
     aims = (reference, input_reference)
-    given = Conditions(*aims, None, previous_input, noise, observer, delay, bool(compensate))
+    added = disturbance, output_disturbance, forecast
+    given = Conditions(*aims, *added, previous_input, noise, observer, delay, bool(compensate))
     plant, _, shared = checked_loop(controller, plant, x0s[0], steps, given)
     several = {"reference": references, "input_reference": input_references}
     own = {name: np.asarray(value) for name, value in several.items() if value is not None}

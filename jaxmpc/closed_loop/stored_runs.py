@@ -26,7 +26,9 @@ if TYPE_CHECKING:
 
 # The fields of `Run` in a store. Stored runs have no observer, hence no estimates, and no soft rows
 # at k = 0: x_0 is measured, and no limit binds it.
-STORED = tuple(field.name for field in fields(Run) if field.name not in ("slack", "estimates"))
+STORED = tuple(
+    field.name for field in fields(Run) if field.name not in ("slack", "estimates", "disturbances")
+)
 
 
 @record

@@ -115,6 +115,11 @@ class Controller:
         return self.condensed.P.dtype
 
     @property
+    def takes_forecasts(self) -> bool:
+        """True: plans take what is known ahead of disturbances."""
+        return True
+
+    @property
     def state_size(self) -> int:
         """Length n of the state."""
         return self.mpc.system.n

@@ -1,12 +1,36 @@
-"""Equilibria of a linear system: the steady state and input that a reference requires."""
+"""Equilibria of a linear system: the steady state and input that a reference requires, and the
+nearest ones within the limits of a problem, again and again under other loads."""
 
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from scipy.optimize import lsq_linear
 
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, require_finite, require_shape
+from jaxmpc.mpc.problem import MPC
+from jaxmpc.mpc.rows import Block, blocks, joined_bounds
+from jaxmpc.pytrees import named_pytree, pytree, static
+from jaxmpc.qp.admm import ADMM, Factor, factorise
+from jaxmpc.qp.jax_transformations import compiled_lightly, own_modes
+from jaxmpc.qp.linalg import arrays, floating_dtype, matmul
+from jaxmpc.qp.problem import QP, Bounds
+from jaxmpc.qp.residuals import with_fault
+from jaxmpc.qp.solve import solve_factored
 from jaxmpc.sets.convex_sets import Box
+from jaxmpc.systems.riccati import balanced
 from jaxmpc.systems.system import LinearSystem, host_matrices
+
+# Singular values of balanced matrices, relative to the largest, that count as zero.
+FLAT = 1e-10
+# Cost of effort beside that of the outputs, where outputs leave inputs free. Twice as far from the
+# last answer as from the first one (`SteadyStates.nearest`), so outputs are off by its square.
+EFFORT = 1e-6
+TIGHT = ADMM(eps=1e-10)
 
 
 def equilibrium(
@@ -67,3 +91,125 @@ def equilibrium(
         what = f"{target} is held by no equilibrium ({away})"
         fail("target", what, "Choose another target or widen the limits")
     return found[:n], found[n:]
+
+
+@named_pytree
+class SteadyState(NamedTuple):
+    """A state x (n,) that the input u (m,) holds, and the status of the search for it."""
+
+    x: Array
+    u: Array
+    status: Array
+
+
+@pytree
+class SteadyStates:
+    """The steady states x = A x + B u + c + load of an MPC problem within its limits, for any load.
+
+    All solutions of [I − A, −B] (x, u) = c + load are (x, u) = held (c + load) + free w, w (m,): of
+    the problem for a target of the outputs C x only w is left. With the singular values σ of the
+    outputs of `free`, in units, w is turned and scaled so that the first `count` entries of
+    v = σ V'w move outputs; the others, if any, move none, and are as small as the limits let them.
+
+    held (n + m, n), free (n + m, m), outputs (q, n), rows: H (r, n + m), bounds. unit (q,).
+    seen (m, q): from errors of outputs to v. count: of the entries of v that outputs see.
+    """
+
+    held: Any
+    free: Any
+    c: Any
+    outputs: Any
+    unit: Any
+    seen: Any
+    H: Any
+    bounds: Bounds
+    factor: Factor
+    solver: ADMM
+    count: int = static()
+
+    @classmethod
+    def of(cls, mpc: MPC, system: LinearSystem, outputs: np.ndarray, unit: np.ndarray) -> Any:
+        """Return the steady states of a problem for outputs (q, n), whose errors are measured in
+        these units (q,). system: its model, with values that can be read; limits may be traced.
+        Raises ValueError where the inputs do not hold every load."""
+        A, B, c = host_matrices(system)
+        n, m = B.shape
+        M = np.hstack([np.eye(n) - A, -B])
+        row, column = balanced(M)
+        left, values, right = np.linalg.svd(row[:, None] * M * column)
+        if values[-1] <= FLAT * values[0]:
+            names = system.state_names or tuple(f"x{i + 1}" for i in range(n))
+            entry = np.abs(left[:, -1])
+            which = [name for name, v in zip(names, entry, strict=True) if v > 0.1 * entry.max()]
+            what = f"no input holds a load on {', '.join(which)}, which integrates it"
+            fail("mpc.system", what, "Actuate it, or leave it out of the model")
+        held = column[:, None] * (right[:n].T / values) @ left.T * row
+        free = column[:, None] * right[n:].T
+        U, sigma, V = np.linalg.svd(outputs / unit[:, None] @ free[:n])
+        count = int(np.sum(sigma > 1e-8 * max(sigma.max(initial=0.0), np.finfo(float).tiny)))
+        free = free @ V.T * np.append(1 / sigma[:count], np.ones(m - count))
+        seen = np.zeros((m, len(unit)))
+        seen[:count] = U.T[:count]
+        dtype = floating_dtype(mpc)
+        held_rows = [replace(b, steps=b.steps[:1]) for b in blocks(mpc, dtype) if not b.rate]
+        rows = [_hard_at_rest(b) for b in held_rows if b.steps]
+        bounds = joined_bounds([b.bounds() for b in rows], dtype)
+        parts = [jnp.zeros((0, n + m), dtype)]
+        for b in rows:
+            sides = ((b.H, n), (b.D, m))
+            columns = [jnp.zeros((b.size, size), dtype) if M is None else M for M, size in sides]
+            parts.append(jnp.concatenate(columns, axis=1))
+        given = arrays((held, free, c, outputs, unit, seen, jnp.concatenate(parts), bounds))
+        factor = _factor(given[1], given[6], TIGHT, count=count, balls=bounds.balls)
+        return cls(*given, factor, arrays(TIGHT), count)
+
+    def nearest(self, target: Array, load: Array) -> SteadyState:
+        """Return the steady state under a load (n,) whose outputs are nearest to the target (q,).
+
+        Of several, the one of least effort: the second of two proximal steps, each from the answer
+        before, so that effort moves outputs by EFFORT² only.
+        """
+        return _nearest(self, target, load)
+
+
+def _hard_at_rest(block: Block) -> Block:
+    """Return the rows of a block, hard, at one step, with the bounds that hold at all of them."""
+    if np.ndim(block.lower) == 2:
+        lower, upper = jnp.max(block.lower, axis=0), jnp.min(block.upper, axis=0)
+        block = replace(block, lower=lower, upper=upper)
+    return replace(block, linear=None, quadratic=None)
+
+
+@compiled_lightly(0, static_argnames=("count", "balls"))
+@own_modes
+def _factor(free: Array, H: Array, solver: ADMM, *, count: int, balls: tuple[int, ...]) -> Factor:
+    price = _price(free, count)
+    return factorise(2 * jnp.diag(price), matmul(H, free.astype(H.dtype)), solver, balls)
+
+
+def _price(free: Array, count: int) -> Array:
+    """Return the weights (m,) of the distances in v: 1 where outputs see them, else EFFORT."""
+    m = free.shape[1]
+    return jnp.where(np.arange(m) < count, 1.0, EFFORT).astype(free.dtype)
+
+
+@compiled_lightly(1)
+@own_modes
+def _nearest(p: SteadyStates, target: Array, load: Array) -> SteadyState:
+    dtype = target.dtype
+    p = jax.tree.map(lambda v: v.astype(dtype) if v.dtype.kind == "f" else v, p)
+    n, m = p.outputs.shape[1], p.free.shape[1]
+    base = matmul(p.held, p.c + load)
+    aim = matmul(p.seen, (target - matmul(p.outputs, base[:n])) / p.unit)
+    price = _price(p.free, p.count)
+    H, shift, limits = matmul(p.H, p.free), matmul(p.H, base), p.bounds
+    lower, upper = limits.l - shift, limits.u - shift
+    rest = limits.radius, limits.sizes(), limits.balls
+    v = aim
+    for _ in range(1 if p.count == m else 2):
+        v = jnp.where(np.arange(m) < p.count, aim, v)
+        qp = QP(2 * jnp.diag(price), -2 * price * v, H, lower, upper, None, None, *rest)
+        found = with_fault(*solve_factored(qp, p.factor, p.solver))
+        v = found.z
+    z = base + matmul(p.free, v)
+    return SteadyState(z[:n], z[n:], found.status)

@@ -307,6 +307,22 @@ def _rank_tests(A: np.ndarray, B: np.ndarray) -> list[_RankTest]:
     return tests
 
 
+def balanced(M: np.ndarray, sweeps: int = 10) -> tuple[np.ndarray, np.ndarray]:
+    """Return powers of two (row, column) with which the largest entry of each row and column of
+    row_i M_ij column_j is about 1, so that no choice of units decides what counts as zero.
+
+    Each sweep divides rows and columns by the roots of their largest entries (Ruiz 2001, report
+    RAL-TR-2001-034). Rows and columns of zeros keep the unit 1.
+    """
+    row, column = np.ones(M.shape[0]), np.ones(M.shape[1])
+    for _ in range(sweeps):
+        size = np.abs(row[:, None] * M * column)
+        ends = size.max(axis=1, initial=0.0), size.max(axis=0, initial=0.0)
+        each = [2.0 ** -np.round(np.log2(np.where(end > 0, end, 1.0)) / 2) for end in ends]
+        row, column = row * each[0], column * each[1]
+    return row, column
+
+
 def _least(tests: list[_RankTest]) -> tuple[float, str]:
     if not tests:
         return np.inf, "none"
