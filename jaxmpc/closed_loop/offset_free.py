@@ -214,7 +214,8 @@ def augmented(mpc: MPC, observer: KalmanFilter) -> MPC:
     the estimate (x, d), and the target (x_s, 0) and u_s of `OffsetFreeController.target` as
     references.
 
-    Raises ValueError for an Ellipsoid as terminal set, of which (x, d) has none.
+    Raises ValueError for an Ellipsoid as terminal set, of which (x, d) has none, and for robust
+    problems.
     """
     require_kind("mpc", mpc, MPC)
     mpc.validate()
@@ -226,6 +227,9 @@ def augmented(mpc: MPC, observer: KalmanFilter) -> MPC:
         fail("observer.model", what, f"The problem has {system.n} and {system.m}")
     if isinstance(mpc.terminal_set, Ellipsoid):
         fail("terminal_set", "is an Ellipsoid", "Use a Polytope inside it")
+    if mpc.disturbance is not None:
+        what = "is given, and (x, d) has no gain that stabilises d"
+        fail("mpc.disturbance", what, "Leave it out, or give the mean of d as the system's c")
     k = observer.disturbances
     A, B, c = host_matrices(system)
     top, zeros = np.hstack([A, host_array("observer", observer.on_states(B))]), np.zeros

@@ -393,6 +393,10 @@ def test_bad_arguments_are_named(controller):
             "forecast: given to a LinearFeedback whose plans take none. Give a Controller",
         ),
         (lambda: augmented(ball, good), "terminal_set: is an Ellipsoid. Use a Polytope"),
+        (
+            lambda: augmented(replace(MPC, disturbance=jm.Box([-0.01] * 3, [0.01] * 3)), good),
+            "mpc.disturbance: is given",
+        ),
         (lambda: augmented(drifting_mpc, good), "observer.model: has 3 states and 2 inputs"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
