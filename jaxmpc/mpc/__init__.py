@@ -11,9 +11,11 @@ equilibrium           steady state and input for a reference
 active_constraints    which rows of a plan are active -> ActiveConstraint
 row_table             each row of the problem: kind, name, unit, step -> Row
 soften, harden        make rows soft or hard
+first_step_in         keep a robust control invariant set by its first step -> MPC
 """
 
 from jaxmpc.mpc.controller import Controller, solve
+from jaxmpc.mpc.first_step import first_step_in
 from jaxmpc.mpc.many import solve_many
 from jaxmpc.mpc.plan import Control, Plan, WarmStart, active_constraints
 from jaxmpc.mpc.problem import MPC, Outputs, Soft, harden, soften
@@ -35,6 +37,7 @@ __all__ = [
     "WarmStart",
     "active_constraints",
     "equilibrium",
+    "first_step_in",
     "harden",
     "row_table",
     "soften",

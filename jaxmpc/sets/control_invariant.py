@@ -5,7 +5,7 @@ afterwards, by upper bounds from LP multipliers, valid for any LP error, and by 
 vertices.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY
 from typing import NamedTuple
 
@@ -50,7 +50,7 @@ class ControlInvariantSet(Polytope):
 
 
 def maximal_control_invariant_set(
-    system: LinearSystem,
+    system: LinearSystem | Sequence[LinearSystem],
     states: Box | Polytope,
     inputs: Box | Polytope | None,
     *,
@@ -65,7 +65,9 @@ def maximal_control_invariant_set(
     `inputs` with A x + B u + c + E w in C for all w in `disturbance`.
 
     Arguments:
-        system: n states, m inputs; A may be singular, c may be anything.
+        system: n states, m inputs; A may be singular, c may be anything. A sequence of systems: the
+            vertices of a hull, in which (A, B, c) may be anywhere at each step, unknown to the
+            input.
         states: bounded set in R^n with volume.
         inputs: set in R^m, or None for all of R^m.
         disturbance: bounded set in R^p that holds the origin, or None for w = 0.
@@ -388,18 +390,20 @@ def _vertex_proof(step: OneStep, C: Polytope) -> _VertexProof:
     G, g = C.unit_rows()
     depth = g - G @ C.frame().center
     g = g - supports(step.W, G)
-    BU = step.B @ step.basis
-    k = BU.shape[1]
+    k = step.basis.shape[1]
     H, h, room = np.zeros((0, k)), np.zeros(0), np.zeros(0)
     if step.V is not None:
         H, h = step.V.unit_rows()
         room = h - H @ step.V.frame("inputs").center
-    rows, depths, worst = np.vstack([G @ BU, H]), np.append(depth, np.zeros(len(H))), 0.0
+    rows = np.vstack([*(G @ B for _, B, _ in step.plants), H])
+    depths, worst = np.append(np.tile(depth, len(step.plants)), np.zeros(len(H))), 0.0
     for v in vertices:
-        drift = step.A @ v + step.c + step.B @ step.shift
-        u, _ = largest_margin(rows, np.append(g - G @ drift, h), depths)
+        drifts = [A @ v + c for A, _, c in step.plants]
+        limits = np.concatenate([*(g - G @ drift for drift in drifts), h])
+        u, _ = largest_margin(rows, limits, depths)
         assert u is not None  # any u within its limits is feasible, with a slack low enough
-        worst = max(worst, float(((G @ (drift + BU @ u) - g) / depth).max()))
+        for drift, (_, B, _) in zip(drifts, step.plants, strict=True):
+            worst = max(worst, float(((G @ (drift + B @ u) - g) / depth).max()))
         worst = max(worst, float(((H @ u - h) / room).max(initial=0.0)))
     count = len(vertices)
     text = f"; each of its {count} vertices has an input that keeps it in, to {worst:.0e}"

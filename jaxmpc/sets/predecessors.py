@@ -1,9 +1,11 @@
 """The states that some input of x+ = A x + B u + c + w takes into a set, for every w in a set."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from jaxmpc.arrays import Reals
-from jaxmpc.checks import require_kind
+from jaxmpc.checks import fail, require_kind
 from jaxmpc.pytrees import record
 from jaxmpc.sets.convex_sets import Box, ConvexSet, Polytope, as_polytope
 from jaxmpc.sets.disturbances import disturbance_set
@@ -15,7 +17,7 @@ _MANY = 60  # rows of a target from which ridges are looked for, instead of pair
 
 
 def predecessor(
-    system: LinearSystem,
+    system: LinearSystem | Sequence[LinearSystem],
     target: Box | Polytope,
     states: Box | Polytope | None,
     inputs: Box | Polytope | None,
@@ -28,7 +30,8 @@ def predecessor(
     disturbance}, the one-step controllable set.
 
     Arguments:
-        system: n states, m inputs; A may be singular, c may be anything.
+        system: n states, m inputs; A may be singular, c may be anything. A sequence of systems: the
+            vertices of a hull, in which (A, B, c) may be anywhere; the input suits all of them.
         target: set in R^n with volume.
         states: set in R^n, or None for all of R^n.
         inputs: set in R^m, or None for all of R^m. It may be flat (an input that is off, two that
@@ -59,7 +62,8 @@ class OneStep:
     """x+ = A x + B u + c + w with u in U, w in W (None: w = 0), which is E W of a given E.
 
     U is {u : u = basis v + shift, v in V}, with V None if nothing bounds v; where V is a
-    bounded box, `ends` has (lower, upper) of each v, else it is None.
+    bounded box, `ends` has (lower, upper) of each v, else it is None. others: further A, B, c, for
+    all of which at once an input has to do.
     """
 
     A: np.ndarray
@@ -70,6 +74,7 @@ class OneStep:
     shift: np.ndarray
     W: ConvexSet | None
     ends: np.ndarray | None
+    others: tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...] = ()
 
     @property
     def n(self) -> int:
@@ -82,6 +87,8 @@ class OneStep:
         T = Polytope(target.H, target.h) if self.W is None else self._shrunk(target, self.W)
         if self.W is not None and T.is_empty():
             return tidy(T)
+        if self.others:
+            return self._back_of_all(T, states)
         # y in T - B u, where the inputs are u = basis v + shift
         T, BU = T.preimage(np.eye(n), self.B @ self.shift), self.B @ self.basis
         many = n in (3, 4) and np.asarray(T.h).size > _MANY
@@ -101,6 +108,26 @@ class OneStep:
         before = Polytope(H, h)
         return tidy(before if states is None else states.intersect(before))
 
+    @property
+    def plants(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Return (A, B, c) of each system, in terms of v: A x + B v + c."""
+        every = (self.A, self.B, self.c), *self.others
+        return [(A, B @ self.basis, c + B @ self.shift) for A, B, c in every]
+
+    def _back_of_all(self, T: Polytope, states: Polytope | None) -> Polytope:
+        """Return {x in states: one v leads to T by each of the systems}: v is eliminated."""
+        n, k = self.n, self.basis.shape[1]
+        H, h = T.unit_rows()
+        G = np.vstack([np.hstack([H @ A, H @ B]) for A, B, _ in self.plants])
+        both = Polytope(G, np.concatenate([h - H @ c for _, _, c in self.plants]))
+        if self.V is not None:
+            both = both.intersect(self.V.preimage(np.hstack([np.zeros((k, n)), np.eye(k)])))
+        if states is not None:
+            both = both.intersect(states.preimage(np.eye(n, n + k)))
+        if both.is_empty():
+            return Polytope(np.zeros((1, n)), np.array([-1.0]))
+        return tidy(both.project(range(n)) if k else Polytope(*both.half_spaces()))
+
     @staticmethod
     def _shrunk(target: Polytope, W: ConvexSet) -> Polytope:
         """Return the target less W, with volume unless empty: an elimination needs it."""
@@ -117,15 +144,25 @@ class OneStep:
 
 
 def one_step(
-    system: LinearSystem,
+    system: LinearSystem | Sequence[LinearSystem],
     inputs: Box | Polytope | None,
     disturbance: ConvexSet | None,
     disturbance_matrix: Reals | None = None,
 ) -> OneStep:
     """Return the data of x⁺ = A x + B u + c + E w, checked, with what equalities fix of the inputs
     (lower = upper, or two opposite rows) taken out."""
-    require_kind("system", system, LinearSystem)
-    system.validate()
+    every = (system,) if isinstance(system, LinearSystem) else tuple(system)
+    if not every:
+        fail("system", "holds no system", "Give one, or the vertices of a hull")
+    for one in every:
+        require_kind("system", one, LinearSystem)
+        one.validate()
+        if (one.n, one.m) != (every[0].n, every[0].m):
+            what = (
+                f"holds systems of {(one.n, one.m)} and {(every[0].n, every[0].m)} states, inputs"
+            )
+            fail("system", what, "Give vertices of one hull")
+    system, *others = every
     m = system.m
     V, basis, shift, ends = None, np.eye(m), np.zeros(m), None
     if inputs is not None:
@@ -138,7 +175,8 @@ def one_step(
         bounds = np.column_stack([*inputs.spread(m).bounds()])[basis.argmax(axis=0)]
         ends = bounds if np.isfinite(bounds).all() else None
     W = disturbance_set(disturbance, system.n, disturbance_matrix)
-    return OneStep(*host_matrices(system), V, basis, shift, W, ends)
+    rest = tuple(host_matrices(other) for other in others)
+    return OneStep(*host_matrices(system), V, basis, shift, W, ends, rest)
 
 
 def _plus_segment(T: Polytope, b: np.ndarray, lower: float, upper: float) -> Polytope:
