@@ -371,7 +371,7 @@ class RegionSearch:
             try:
                 volumes = sum(hull_volume(c.vertices, thin=True) for c in self.found)
                 whole = hull_volume(points, thin=True)
-                hull = Polytope.from_points(points)
+                hull = Polytope.from_points(points).require_body()
             except ValueError as error:
                 return False, f"the hull of all regions is not found ({error})"
             tops = [self.p.support(a) for a in np.asarray(hull.H) if not self.late]

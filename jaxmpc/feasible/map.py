@@ -120,7 +120,9 @@ class FeasibleSetMap:
 
         Raises ValueError while these points have no interior.
         """
-        return scaled_back(Polytope.from_points(self._inside / self._unit), self._unit)
+        return scaled_back(
+            Polytope.from_points(self._inside / self._unit).require_body(), self._unit
+        )
 
     def outer(self) -> Polytope:
         """Return the intersection of all half-spaces proved valid: a superset of the feasible set.
@@ -131,7 +133,9 @@ class FeasibleSetMap:
         if not len(offsets):
             what = "no half-space is proved that holds on the whole set"
             fail("outer", what, "Map points outside the set, or refine(), if it is bounded")
-        return scaled_back(Polytope(normals * self._unit, offsets).reduce(), self._unit)
+        return scaled_back(
+            Polytope(normals * self._unit, offsets).require_body().reduce(), self._unit
+        )
 
     def volume_bounds(self) -> tuple[float, float]:
         """Return certified bounds on the volume (area in 2-D) of the feasible set, or of its
@@ -146,7 +150,8 @@ class FeasibleSetMap:
         if len(offsets) and outer.is_empty():
             return low, 0.0
         try:
-            high = float(outer.reduce().volume() * np.prod(self._unit)) * (1 + VOLUME_ROUNDING)
+            whole = outer.require_body().reduce().volume()
+            high = float(whole * np.prod(self._unit)) * (1 + VOLUME_ROUNDING)
         except ValueError:
             high = np.inf
         return low, high

@@ -252,7 +252,7 @@ def projected(plans: PlanPolytope, deadline: float = np.inf) -> CenteredPolytope
             normals, offsets = np.vstack([normals, normal]), np.append(offsets, offset)
         reached = np.vstack([reached, (center + directions)[~np.array(short)]])
         try:
-            outer = Polytope(normals, offsets).reduce()
+            outer = Polytope(normals, offsets).require_body().reduce()
             vertices = outer.vertices()
         except ValueError as error:
             return f"its facets are too ill-conditioned ({error})"

@@ -98,7 +98,7 @@ def backward(
     found = []
     for k in range(count):
         try:
-            body = predecessor(mpc.system, body, mpc.states, mpc.inputs).reduce()
+            body = predecessor(mpc.system, body, mpc.states, mpc.inputs).require_body().reduce()
         except ValueError as error:
             return f"its facets are not found ({error})"
         if time.monotonic() > deadline or np.asarray(body.h).size > FACETS // 4:

@@ -254,7 +254,7 @@ def close_gap(
             break
         proved = proved.joined(rays.cast(directions * unit)._proved)
         try:
-            outer = Polytope(proved.normals * unit, proved.offsets).reduce()
+            outer = Polytope(proved.normals * unit, proved.offsets).require_body().reduce()
             low, high = hull_volume(proved.points / unit), outer.volume()
             directions = fresh(outer.vertices() - rays.center / unit, sent)
             sent = np.concatenate([sent, of_length_one(directions)])

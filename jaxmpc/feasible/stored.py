@@ -453,7 +453,8 @@ class HalfSpaces:
         names = tuple(map(str, range(len(self.offsets))))
         box = Box(*(self.around / unit)).to_polytope()
         try:
-            body = Polytope(self.normals * unit, self.offsets, names).intersect(box).reduce()
+            body = Polytope(self.normals * unit, self.offsets, names).intersect(box)
+            body = body.require_body().reduce()
             index, vertices = [int(name) for name in body.labels if name], body.vertices() * unit
         except ValueError:
             index, vertices = list(range(min(len(names), MANY))), None

@@ -294,6 +294,8 @@ class MPC:
                 wanted = " or ".join(kind.__name__ for kind in kinds)
                 fail(name, f"is a {type(value).__name__}", f"Give a {wanted}, or None")
             value.validate(name, size)
+            if isinstance(value, Ellipsoid):
+                value.require_origin(name)
         if not isinstance(self.prestabilise, Switch | None):
             require_shape("prestabilise", self.prestabilise, (m, n), "A gain K with u = Kx + v")
         if not isinstance(self.constrain_initial, bool | np.bool_):

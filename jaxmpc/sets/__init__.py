@@ -6,6 +6,9 @@ invariant_ellipsoid              the same, a level set of x'Px -> InvariantEllip
 minimal_robust_invariant_set     least set that u = K x keeps under disturbances, from outside
 maximal_control_invariant_set    largest set that some input keeps -> ControlInvariantSet
 predecessor                      states from which some input leads into a set
+reachable_sets                   sets that a system runs through, forward or backward
+set_difference                   points of a set in none of others -> PolytopeUnion
+plot                             pictures of sets in two and three dimensions
 joint_limits, output_limits      limits of robot joints and of outputs -> JointLimits, Box, Polytope
 named_terminal_set               terminal set from its name
 verify_terminal                  hypotheses of the stability theorems -> TerminalReport of Check
@@ -13,6 +16,7 @@ verify_terminal                  hypotheses of the stability theorems -> Termina
 
 from jaxmpc.sets.control_invariant import maximal_control_invariant_set
 from jaxmpc.sets.convex_sets import Box, Ellipsoid, Polytope, Zonotope
+from jaxmpc.sets.drawing import plot
 from jaxmpc.sets.invariant import (
     invariant_ellipsoid,
     maximal_invariant_set,
@@ -21,12 +25,15 @@ from jaxmpc.sets.invariant import (
 from jaxmpc.sets.limits import joint_limits, output_limits
 from jaxmpc.sets.minimal_invariant import minimal_robust_invariant_set
 from jaxmpc.sets.predecessors import predecessor
+from jaxmpc.sets.reachability import reachable_sets
 from jaxmpc.sets.terminal_hypotheses import verify_terminal
+from jaxmpc.sets.unions import PolytopeUnion, set_difference
 
 __all__ = [
     "Box",
     "Ellipsoid",
     "Polytope",
+    "PolytopeUnion",
     "Zonotope",
     "invariant_ellipsoid",
     "joint_limits",
@@ -35,6 +42,9 @@ __all__ = [
     "minimal_robust_invariant_set",
     "named_terminal_set",
     "output_limits",
+    "plot",
     "predecessor",
+    "reachable_sets",
+    "set_difference",
     "verify_terminal",
 ]

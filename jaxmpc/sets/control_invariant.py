@@ -178,7 +178,7 @@ def _recursion(step: OneStep, X: Polytope, max_iterations: int, tolerance: float
                 if width <= FLAT:
                     why = f"C_k converges to a set without volume (margin {width:.0e})"
                     return _End(C, k, why, cut=cut, flat=following)
-                C, last = following.reduce(), cut
+                C, last = following.require_body().reduce(), cut
     except ValueError as error:
         return _End(C, k, f"the recursion is given up at step {k} ({error})", cut=cut)
     return _End(C, k, "max_iterations is reached", cut=cut)

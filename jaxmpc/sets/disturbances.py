@@ -53,9 +53,9 @@ class Vertices(ConvexSet):
         require_finite(f"{argument}.points", self.points)
 
     def support(self, d: Reals) -> AnyNumber:
-        """Return max d'x over the points, d (n,)."""
+        """Return max d'x over the points, for one direction d (n,) or for each of many (k, n)."""
         xp, (along, points) = numbers(d, self.points)
-        return xp.max(points @ along)
+        return xp.max(product(xp, along, points.T), axis=-1)
 
     def _require_fields(self, argument: str, dimension: int | None = None) -> None:
         shape = np.shape(as_array(self.points))
@@ -82,9 +82,9 @@ class Image(ConvexSet):
         self.of.validate(argument, np.shape(as_array(self.E))[1])
 
     def support(self, d: Reals) -> AnyNumber:
-        """Return max d'E w over W, d (n,)."""
+        """Return max d'E w over W, for one direction d (n,) or for each of many (k, n)."""
         xp, (along, E) = numbers(d, self.E)
-        return self.of.support(product(xp, E.T, along))
+        return self.of.support(product(xp, along, E))
 
     def vertices(self) -> np.ndarray:
         """Return points (k, n) whose hull it is. NumPy; not traceable."""

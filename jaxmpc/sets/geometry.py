@@ -39,6 +39,10 @@ class Flat(ValueError):
     """A set without volume, where one with volume is needed."""
 
 
+class Empty(ValueError):
+    """A set without a point, where one with volume is needed."""
+
+
 class Frame(NamedTuple):
     """{G x <= g} about a point inside, in coordinates of like size: Z ((x - center) / scale) <= 1.
 
@@ -74,7 +78,7 @@ def framed(argument: str, G: np.ndarray, g: np.ndarray) -> Frame:
     program = Program(G, g)
     center, margin, _ = program.margin()
     if margin <= ROUNDING and program.empty:
-        fail(argument, "is empty: no point satisfies all its rows", "Loosen its rows")
+        raise Empty(f"{argument}: is empty: no point satisfies all its rows. Loosen its rows")
 
     def slack_at(x: np.ndarray) -> np.ndarray:
         slack, size = g - G @ x, np.abs(g) + np.abs(G) @ np.abs(x)
@@ -235,7 +239,8 @@ def binding_rows(H: np.ndarray, h: np.ndarray, argument: str = "Polytope") -> np
         fail(f"{argument}.h", "holds NaN", "Use inf for a row that does not bind")
     zero = ~H.any(axis=1)
     if np.any((h == -np.inf) | (zero & (h < 0))):
-        fail(argument, "is empty: a row reads 0'x <= h < 0 or has h = -inf", "Remove that row")
+        what = "is empty: a row reads 0'x <= h < 0 or has h = -inf"
+        raise Empty(f"{argument}: {what}. Remove that row")
     return np.flatnonzero(~zero & (h < np.inf))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxmpc.arrays import Reals
 from jaxmpc.checks import fail, require_kind
 from jaxmpc.pytrees import record
-from jaxmpc.sets.convex_sets import Box, ConvexSet, Polytope, as_polytope
+from jaxmpc.sets.convex_sets import Box, ConvexSet, LinearSet, Polytope, as_polytope
 from jaxmpc.sets.disturbances import disturbance_set
 from jaxmpc.sets.geometry import Flat, affine_hull, irredundant_rows
 from jaxmpc.sets.lp import FLAT, ROUNDING, extent
@@ -18,9 +18,9 @@ _MANY = 60  # rows of a target from which ridges are looked for, instead of pair
 
 def predecessor(
     system: LinearSystem | Sequence[LinearSystem],
-    target: Box | Polytope,
-    states: Box | Polytope | None,
-    inputs: Box | Polytope | None,
+    target: LinearSet,
+    states: LinearSet | None,
+    inputs: LinearSet | None,
     disturbance: ConvexSet | None = None,
     disturbance_matrix: Reals | None = None,
 ) -> Polytope:
@@ -32,7 +32,7 @@ def predecessor(
     Arguments:
         system: n states, m inputs; A may be singular, c may be anything. A sequence of systems: the
             vertices of a hull, in which (A, B, c) may be anywhere; the input suits all of them.
-        target: set in R^n with volume.
+        target: set in R^n; it may be flat, a segment or a point.
         states: set in R^n, or None for all of R^n.
         inputs: set in R^m, or None for all of R^m. It may be flat (an input that is off, two that
             are equal).
@@ -40,15 +40,14 @@ def predecessor(
             of the target a flat set only, that is enlarged by 4e-9 of its size.
         disturbance_matrix: E (n, p), None for the identity.
 
-    Returns irredundant rows of norm 1; rows of a flat set are not reduced. An empty set comes
-    as the row 0'x <= -1 (`is_empty()` is True), all of R^n as 0'x <= 1.
+    Returns irredundant rows of norm 1, of a flat set with its equalities as opposite rows. An empty
+    set comes as the row 0'x <= -1 (`is_empty()` is True), all of R^n as 0'x <= 1.
 
     With T = {H y <= h - max Hw} the target shrunk by the disturbance, Pre is the preimage of the
     Minkowski sum T + (-B inputs) under x -> A x + c. The sum is the projection to y of {(y, u) : y
     + B u in T, u in inputs}, so that A need not be inverted. NumPy in float64; not traceable.
 
-    Raises ValueError for wrong shapes, empty arguments, a target from which no input leads to a set
-    with volume, or as `Polytope.project` does.
+    Raises ValueError for wrong shapes, empty arguments, or as `Polytope.project` does.
 
     Source: Kerrigan 2000, thesis, Cambridge, section 2.3.
     """
@@ -91,8 +90,9 @@ class OneStep:
             return self._back_of_all(T, states)
         # y in T - B u, where the inputs are u = basis v + shift
         T, BU = T.preimage(np.eye(n), self.B @ self.shift), self.B @ self.basis
-        many = n in (3, 4) and np.asarray(T.h).size > _MANY
-        if k and self.ends is not None and many and T.frame().bounded:
+        many = k and self.ends is not None and n in (3, 4) and np.asarray(T.h).size > _MANY
+        if many and _is_body(T):
+            assert self.ends is not None
             for b, (lower, upper) in zip(BU.T, self.ends, strict=True):
                 T = _plus_segment(T, -b, lower, upper)
         elif k:
@@ -145,7 +145,7 @@ class OneStep:
 
 def one_step(
     system: LinearSystem | Sequence[LinearSystem],
-    inputs: Box | Polytope | None,
+    inputs: LinearSet | None,
     disturbance: ConvexSet | None,
     disturbance_matrix: Reals | None = None,
 ) -> OneStep:
@@ -177,6 +177,14 @@ def one_step(
     W = disturbance_set(disturbance, system.n, disturbance_matrix)
     rest = tuple(host_matrices(other) for other in others)
     return OneStep(*host_matrices(system), V, basis, shift, W, ends, rest)
+
+
+def _is_body(T: Polytope) -> bool:
+    """Return whether a set, which is not empty, is bounded and has volume."""
+    try:
+        return T.frame().bounded
+    except Flat:
+        return False
 
 
 def _plus_segment(T: Polytope, b: np.ndarray, lower: float, upper: float) -> Polytope:
@@ -214,4 +222,4 @@ def tidy(polytope: Polytope) -> Polytope:
     try:
         return Polytope(*irredundant_rows("Polytope", G, g))
     except Flat:
-        return Polytope(G, g)
+        return Polytope(G, g).reduce()

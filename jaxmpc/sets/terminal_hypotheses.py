@@ -393,6 +393,7 @@ def _terminal_set(given: Box | Polytope | Ellipsoid, n: int) -> _Rows | _Ellipse
     if not isinstance(given, Ellipsoid):
         return _Rows(*unit_half_spaces("terminal_set", given, n))
     given.validate("terminal_set", n)
+    given.require_origin("terminal_set")
     P = host_array("terminal_set.P", given.P)
     return _Ellipse((P + P.T) / 2, float(host_array("terminal_set.level", given.level)))
 

@@ -66,14 +66,13 @@ def test_box_errors(box, message):
 
 
 def test_box_errors_in_use():
-    with pytest.raises(ValueError, match="Box: is unbounded"):
-        Box([0], [INF]).volume()
+    assert Box([0], [INF]).volume() == INF
     with pytest.raises(ValueError, match="Box: is unbounded"):
         Box([0], [INF]).vertices()
     with pytest.raises(ValueError, match="x: shape"):
         Box(-1, 1).contains([0.0, 0.0])
-    with pytest.raises(ValueError, match=r"x: shape \(3, 2\).*jax.vmap"):
-        Box([0, 0], [1, 1]).contains(np.zeros((3, 2)))
+    with pytest.raises(ValueError, match=r"x: shape \(3, 2\)"):
+        Box([0, 0, 0], [1, 1, 1]).contains(np.zeros((3, 2)))
     with pytest.raises(ValueError, match="d: shape"):
         Box([0, 0], [1, 1]).support([1.0])
     with pytest.raises(ValueError, match="traced"):

@@ -339,7 +339,7 @@ def ring(make: Callable[[], Polytope | None]) -> np.ndarray:
     """Return the vertices of a polygon, the first again at the end; (0, 2) if there is none."""
     try:
         polytope = make()
-        corners = np.zeros((0, 2)) if polytope is None else polytope.vertices()
+        corners = np.zeros((0, 2)) if polytope is None else polytope.require_body().vertices()
     except ValueError:  # not bounded yet, or without interior: nothing to draw
         return np.zeros((0, 2))
     return np.vstack([corners, corners[:1]])

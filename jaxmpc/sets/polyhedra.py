@@ -1,0 +1,185 @@
+"""Sets {G x <= g} that may be flat, and hulls of points that may lie in a plane, in NumPy in
+float64: what `geometry` does with sets that have volume, carried over to these."""
+
+import numpy as np
+import scipy
+from scipy.spatial import ConvexHull, Delaunay, QhullError
+
+from jaxmpc.checks import fail
+from jaxmpc.sets.geometry import (
+    AffineHull,
+    Empty,
+    Flat,
+    affine_hull,
+    distinct,
+    explained,
+    framed,
+    unit_rows,
+)
+from jaxmpc.sets.lp import FLAT, ROUNDING, cleaned, scaling
+
+# Samples are drawn from a triangulation in up to so many dimensions.
+TRIANGULATED = 6
+
+
+def full_part(G: np.ndarray, g: np.ndarray, argument: str = "Polytope") -> AffineHull | None:
+    """Return the affine hull x = shift + basis w of {G x <= g}, and the set in its coordinates,
+    where it has volume (basis (n, k); k = 0 for a point); None if the set is empty.
+
+    A set counts as flat in a direction where it is thinner than about 1e-9 of its size.
+    """
+    n = G.shape[1]
+    none = np.zeros(len(g), bool)
+    whole = AffineHull(np.zeros(n), np.eye(n), none, np.arange(len(g)), G, g)
+    for _ in range(n + 1):
+        if not whole.basis.shape[1]:
+            return whole
+        try:
+            framed(argument, whole.G, whole.g)
+            return whole
+        except Empty:
+            return None
+        except Flat:
+            pass
+        part = _equalities(argument, whole)
+        equal = whole.equal.copy()
+        equal[whole.rows[part.equal]] = True
+        whole = AffineHull(
+            whole.shift + whole.basis @ part.shift,
+            whole.basis @ part.basis,
+            equal,
+            whole.rows[part.rows],
+            part.G,
+            part.g,
+        )
+    return whole
+
+
+def _equalities(argument: str, whole: AffineHull) -> AffineHull:
+    """Return the affine hull of a flat set, by rows that hold all over it."""
+    for tolerance in (FLAT, 10 * FLAT, 100 * FLAT):
+        part = affine_hull(whole.G, whole.g, tolerance=tolerance)
+        if part is not None and part.equal.any():
+            return part
+    fail(argument, "is flat in a direction that its rows do not show", "Rescale its rows")
+
+
+def independent(G: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """Return the indices of independent ones of rows G x = g, as many as there are."""
+    if not len(g):
+        return np.zeros(0, int)
+    row, column = scaling(G, g)
+    scaled = row[:, None] * G * column
+    _, R, order = scipy.linalg.qr(scaled.T, mode="economic", pivoting=True)
+    size = np.abs(np.diag(R))
+    return np.sort(order[: int((size > 1e-9 * size[0]).sum())])
+
+
+def hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (H, h) of the convex hull of points (k, n), one unit row a facet; opposite rows for
+    the equalities where the points lie in a plane."""
+    n = points.shape[1]
+    center = points.mean(axis=0)
+    size = np.abs(points - center).max(axis=0)
+    # Rounding of the center is no width.
+    size = np.where(size > 8 * np.finfo(float).eps * np.abs(points).max(axis=0), size, 0.0)
+    scale = np.where(size > 0, size, 1.0)
+    scaled = np.where(size > 0, (points - center) / scale, 0.0)
+    _, widths, Vt = np.linalg.svd(scaled, full_matrices=True)
+    rank = int((widths > FLAT * max(widths.max(initial=0.0), 1e-300)).sum())
+    if rank == n:
+        normals, offsets = _full_hull(scaled)
+        return _unscaled(normals, offsets, scale, center)
+    # In coordinates of the plane: some of the scaled ones, on which the others depend.
+    basis, free = Vt[:rank].T, np.zeros(0, int)
+    if rank:
+        free = np.sort(scipy.linalg.qr(basis.T, mode="r", pivoting=True)[1][:rank])
+    tied = np.setdiff1d(np.arange(n), free)
+    C = basis[tied] @ np.linalg.pinv(basis[free]) if rank else np.zeros((n, 0))
+    C = np.where(np.abs(C) <= 1e-13, 0.0, C)
+    E = np.zeros((len(tied), n))
+    E[np.arange(len(tied)), tied] = 1.0
+    E[:, free] = -C
+    normals, offsets = np.zeros((0, n)), np.zeros(0)
+    if rank:
+        inner, offsets = _full_hull(scaled[:, free])
+        normals = np.zeros((len(inner), n))
+        normals[:, free] = inner
+    H = np.vstack([E, -E, normals])
+    return _unscaled(H, np.concatenate([np.zeros(2 * len(E)), offsets]), scale, center)
+
+
+def _full_hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the facets of points that span their space, about 1 wide."""
+    if points.shape[1] == 1:
+        return np.array([[1.0], [-1.0]]), np.array([points.max(), -points.min()])
+    # qhull's facets are simplices: a facet with more corners comes several times.
+    with explained("points"):
+        facets = ConvexHull(points).equations
+    facets = facets[distinct(facets, 1e-10)]
+    return facets[:, :-1], -facets[:, -1]
+
+
+def _unscaled(
+    normals: np.ndarray, offsets: np.ndarray, scale: np.ndarray, center: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    normals = normals / scale
+    size = np.abs(offsets) + np.abs(normals) @ np.abs(center)
+    return unit_rows(normals, cleaned(offsets + normals @ center, size))
+
+
+def independent_rows(M: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (own, others, C): rows M[own] that are independent, and M[others] = C M[own]. Units of
+    rows and columns do not matter; what is below 1e-9 of the rest counts as zero."""
+    row, column = scaling(M, np.zeros(len(M)))
+    scaled = row[:, None] * M * column
+    values = np.linalg.svd(scaled, compute_uv=False)
+    rank = int((values > FLAT * max(values.max(initial=0.0), 1e-300)).sum())
+    order = scipy.linalg.qr(scaled.T, mode="r", pivoting=True)[1]
+    own = np.sort(order[:rank])
+    others = np.setdiff1d(np.arange(len(M)), own)
+    C = np.linalg.lstsq(scaled[own].T, scaled[others].T, rcond=None)[0].T
+    C = np.where(np.abs(C) <= 1e-13, 0.0, C)
+    return own, others, C * row[own] / row[others][:, None]
+
+
+def closest(G: np.ndarray, g: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the point of {G y <= g}, not empty, closest to x: least |u| with -G u >= G x - g, by
+    nonnegative least squares (Lawson & Hanson 1974, chapter 23), then exactly on its rows."""
+    beyond = G @ x - g
+    if not np.any(beyond > 0):
+        return x.copy()
+    # In units of the violation, in which u is about 1 long.
+    length = np.linalg.norm(G, axis=1)
+    unit = float((beyond / length).max())
+    A = np.vstack([-(G / length[:, None]).T, beyond / length / unit])
+    z, _ = scipy.optimize.nnls(A, np.eye(len(A))[-1], maxiter=100 * len(g))
+    r = A @ z - np.eye(len(A))[-1]
+    u = -unit * r[:-1] / r[-1]
+    on = z > 1e-10 * z.max(initial=0.0)
+    exact = np.linalg.lstsq(G[on], -beyond[on], rcond=None)[0]
+    room = ROUNDING * (np.abs(g) + np.abs(G) @ (np.abs(x) + np.abs(u)))
+    if np.all(G @ exact <= -beyond + room) and np.allclose(exact, u, rtol=1e-6, atol=1e-9 * unit):
+        u = exact
+    return x + u
+
+
+def spread(vertices: np.ndarray, count: int, random: np.random.Generator) -> np.ndarray:
+    """Return points (count, k) uniformly distributed over the hull of vertices that span R^k: a
+    simplex of a triangulation by its volume, then a point in it."""
+    k = vertices.shape[1]
+    if k == 1:
+        return random.uniform(vertices.min(), vertices.max(), (count, 1))
+    if k > TRIANGULATED:
+        problem = f"has dimension {k}, and samples are drawn in up to {TRIANGULATED}"
+        fail("sample", problem, "Draw from bounding_box() and keep what the set contains")
+    center, scale = vertices.mean(axis=0), np.ptp(vertices, axis=0)
+    scaled = (vertices - center) / scale
+    try:
+        simplices = scaled[Delaunay(scaled).simplices]
+    except QhullError:
+        simplices = scaled[Delaunay(scaled, qhull_options="QJ").simplices]
+    size = np.abs(np.linalg.det(simplices[:, 1:] - simplices[:, :1]))
+    which = random.choice(len(size), count, p=size / size.sum())
+    weights = random.dirichlet(np.ones(k + 1), count)
+    return center + scale * np.einsum("ij,ijk->ik", weights, simplices[which])
