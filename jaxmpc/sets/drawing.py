@@ -37,43 +37,46 @@ def plot(*sets: Any, ax: Any = None, **style: Any) -> Any:
     if n not in (2, 3) or any(s.dimension != n for s in sets):
         dims = ", ".join(str(s.dimension) for s in sets)
         fail("sets", f"have dimensions {dims}", "Draw sets of 2 or of 3; `project` or `slice` them")
-    fresh = ax is None
     if ax is None:
         _, ax = plt.subplots(subplot_kw={"projection": "3d"} if n == 3 else {})
     if n == 3 and ax.name != "3d":
         fail("ax", "has two dimensions", "Make it by plt.subplots(subplot_kw={'projection': '3d'})")
-    view = _view(sets, ax, fresh)
+    view, used = _view(sets, ax), _colors(ax)
     for i, one in enumerate(sets):
         if not one.is_empty():
             own = {key: _own(value, i, len(sets)) for key, value in style.items()}
-            own.setdefault("color", f"C{(_drawn(ax) + i) % 10}")
+            own.setdefault("color", f"C{(used + i) % 10}")
             (_draw_plane if n == 2 else _draw_space)(ax, one, view, **own)
-    if fresh or n == 3:
-        for axis, (low, high) in zip("xyz"[:n], view.T, strict=True):
-            getattr(ax, f"set_{axis}lim")(low, high)
-            getattr(ax, f"set_{axis}label")(f"$x_{'xyz'.index(axis) + 1}$")
-    if any(style.get("label") or ()) if isinstance(style.get("label"), list) else "label" in style:
+    for k, (axis, (low, high)) in enumerate(zip("xyz"[:n], view.T, strict=True)):
+        if ax.get_autoscale_on():
+            getattr(ax, f"set_{axis}lim")(low, high, auto=None)
+        if not getattr(ax, f"get_{axis}label")():
+            getattr(ax, f"set_{axis}label")(f"$x_{k + 1}$")
+    if ax.get_legend_handles_labels()[1]:
         ax.legend()
     return ax
 
 
-def _drawn(ax: Any) -> int:
-    """Return how many sets were drawn before, for the next color."""
-    return len(ax.patches) + len(ax.collections) if not ax.lines else len(ax.lines)
+def _colors(ax: Any) -> int:
+    """Return how many colors the axes show, so that the next set gets another one."""
+    from matplotlib.colors import to_hex
+
+    lines = [line.get_color() for line in ax.lines]
+    return len({to_hex(color) for color in lines})
 
 
 def _own(value: Any, i: int, count: int) -> Any:
-    return value[i] if isinstance(value, list | tuple) and len(value) == count > 1 else value
+    return value[i] if isinstance(value, list) and len(value) == count else value
 
 
-def _view(sets: tuple[Any, ...], ax: Any, fresh: bool) -> np.ndarray:
-    """Return the corners (2, n) of the picture: round all finite bounds of the sets, and what the
-    axes show already."""
+def _view(sets: tuple[Any, ...], ax: Any) -> np.ndarray:
+    """Return the corners (2, n) of the picture: the limits of the axes where they are set, else
+    round all finite bounds of the sets and what the axes show already."""
     n = sets[0].dimension
+    shown = np.sort([getattr(ax, f"get_{axis}lim")() for axis in "xyz"[:n]]).T
+    if not ax.get_autoscale_on():
+        return shown
     boxes = [np.array(s.bounding_box().bounds()) for s in sets if not s.is_empty()]
-    if not fresh and ax.has_data():
-        limits = [getattr(ax, f"get_{axis}lim")() for axis in "xyz"[:n]]
-        boxes.append(np.sort(np.transpose(limits), axis=0))
     ends = np.array(boxes).reshape(-1, n)
     finite = np.isfinite(ends)
     low = np.where(finite, ends, np.inf).min(axis=0, initial=np.inf)
@@ -85,7 +88,10 @@ def _view(sets: tuple[Any, ...], ax: Any, fresh: bool) -> np.ndarray:
     # Room beside the only bound that is finite.
     open_ended = np.any(~finite, axis=0) if len(ends) else np.ones(n, bool)
     room = np.where(open_ended, 0.5, _MARGIN) * width
-    return np.array([low - room, high + room])
+    view = np.array([low - room, high + room])
+    if ax.has_data():
+        view = np.array([np.minimum(view[0], shown[0]), np.maximum(view[1], shown[1])])
+    return view
 
 
 def _corners(one: Any, view: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -126,10 +132,13 @@ def _draw_plane(
         return
     ax.fill(*V.T, facecolor=color, alpha=alpha, edgecolor="none", label=label, **style)
     ring = np.vstack([V, V[:1]])
+    if not cut:
+        ax.plot(*ring.T, color=color, linewidth=1.2)
+        return
     width = np.ptp(view, axis=0)
     for start, end in zip(ring[:-1], ring[1:], strict=True):
         sides = np.abs(np.array([start, end]) - view[:, None]) <= _ON * width
-        if not (cut and sides.all(axis=1).any()):  # both ends on one side of the picture
+        if not sides.all(axis=1).any():  # not both ends on one side of the picture
             ax.plot(*np.array([start, end]).T, color=color, linewidth=1.2)
 
 
@@ -156,7 +165,7 @@ def _draw_space(
     label = _named(label, cut)
     if len(V) == 0:
         return
-    faces = _faces(V)
+    faces = polygons(V)
     if faces is None:  # a segment or a point
         marker = {"marker": "o", "markersize": 4} if len(V) == 1 else {}
         ax.plot(*V.T, color=color, label=label, **marker)
@@ -174,7 +183,7 @@ def _draw_space(
     )
 
 
-def _faces(V: np.ndarray) -> list[np.ndarray] | None:
+def polygons(V: np.ndarray) -> list[np.ndarray] | None:
     """Return the polygons, corners in order, that bound the hull of points (k, 3); the polygon
     itself if they lie in a plane, None if in a line."""
     center, scale = V.mean(axis=0), np.ptp(V, axis=0)

@@ -65,11 +65,11 @@ class PolytopeUnion:
 
     def plot(self, ax: Any = None, *, label: str | None = None, **style: Any) -> Any:
         """Draw all pieces in one color, as `plot` of a set does; return the axes."""
+        if self.is_empty():
+            fail("plot", "of an empty union", "Ask is_empty() first")
         style.setdefault("color", "C0")
-        for piece in self.pieces:
-            ax = drawing.plot(piece, ax=ax, label=label, **style)
-            label = None
-        return ax
+        labels = [label, *[None] * (len(self.pieces) - 1)]
+        return drawing.plot(*self.pieces, ax=ax, label=labels, **style)
 
 
 def set_difference(minuend: LinearSet, *others: LinearSet) -> PolytopeUnion:
