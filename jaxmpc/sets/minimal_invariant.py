@@ -17,13 +17,14 @@ import numpy as np
 from jaxmpc.arrays import Reals, host_array
 from jaxmpc.checks import fail, number, require_finite, require_kind, require_shape, whole
 from jaxmpc.pytrees import pytree, static
-from jaxmpc.sets.convex_sets import Box, ConvexSet, Polytope, Zonotope
+from jaxmpc.sets.convex_sets import AnyNumber, Box, ConvexSet, Polytope, Zonotope
 from jaxmpc.sets.disturbances import (
     disturbance_columns,
     require_disturbance,
     supports,
     with_vertices,
 )
+from jaxmpc.sets.fields import one_or_many
 from jaxmpc.systems.system import LinearSystem, host_matrices
 
 # What rounding may add to α, and to a generator of F relative to its size.
@@ -66,10 +67,11 @@ class MinimalInvariantSet(ConvexSet):
         """Raise ValueError, naming `argument`, for another number of coordinates."""
         self._require_fields(argument, dimension)
 
-    def support(self, d: Reals) -> float:
-        """Return max d'x over the set, d (n,)."""
-        self._require_vector("d", d, "direction")
-        return float(self.supports(host_array("d", d)[None])[0])
+    def support(self, d: Reals) -> AnyNumber:
+        """Return max d'x over the set, for one direction d (n,) or for each of many (k, n)."""
+        given, many = one_or_many("d", d, self.dimension)
+        values = self.supports(np.atleast_2d(host_array("d", given)))
+        return values if many else float(values[0])
 
     def supports(self, rows: np.ndarray) -> np.ndarray:
         """Return max g'x over the set for each row g (k, n)."""
